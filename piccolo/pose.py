@@ -1,0 +1,94 @@
+"""SE(3) in NumPy, float64: `x_cam = R_cam_from_world @ (x_world - center_world)`."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where the camera is and how it is turned."""
+
+    R_cam_from_world: Array  # (3, 3) rotation, camera axes: +x image centre, +y left, +z up
+    center_world: Array  # (3,) camera position [m]
+
+
+def skew(w: Array) -> Array:
+    """The (3, 3) matrix of the cross product `w x .`."""
+    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+
+
+def exp_so3(w: Array) -> Array:
+    """Rotation matrix (3, 3) by the rotation vector `w` (3,) [rad] (Rodrigues)."""
+    angle = float(np.linalg.norm(w))
+    K = skew(np.asarray(w, dtype=np.float64))
+    # np.sinc(x) is sin(pi x) / (pi x): exact at angle 0
+    a = np.sinc(angle / np.pi)
+    b = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
+    return np.asarray(np.eye(3) + a * K + b * (K @ K))
+
+
+def step(pose: Pose, delta: Array) -> Pose:
+    """`pose` moved by `delta` (6,), rotation [rad] then translation [m], both in the camera's frame.
+
+    R <- exp([w]x) R, center <- center + R^T d (ENGINE.md's left perturbation, R before the turn).
+    """
+    center_world = pose.center_world + pose.R_cam_from_world.T @ delta[3:]
+    return Pose(orthonormal(exp_so3(delta[:3]) @ pose.R_cam_from_world), center_world)
+
+
+def orthonormal(R: Array) -> Array:
+    """The rotation (3, 3) nearest to `R` (3, 3), for products that drift by rounding."""
+    U, _, Vt = np.linalg.svd(R)
+    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+
+
+def angle_between(R_a: Array, R_b: Array) -> float:
+    """Angle [rad] of the rotation that takes one orientation (3, 3) to the other; exact near 0 and pi."""
+    relative = R_a @ R_b.T
+    sine = 0.5 * np.linalg.norm(relative - relative.T) / np.sqrt(2.0)
+    return float(np.arctan2(sine, 0.5 * (np.trace(relative) - 1.0)))
+
+
+def yaw_rotation(yaw: float) -> Array:
+    """R_cam_from_world (3, 3) of an upright camera whose image centre looks along azimuth `yaw` [rad]."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def quaternion_wxyz(R: Array) -> Array:
+    """Unit quaternion (4,), scalar first and not negative, of a rotation (3, 3)."""
+    # The eigenvector of Bar-Itzhack's symmetric matrix: no case distinction, accurate for every angle.
+    K = np.array(
+        [
+            [R[0, 0] + R[1, 1] + R[2, 2], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]],
+            [R[2, 1] - R[1, 2], R[0, 0] - R[1, 1] - R[2, 2], R[0, 1] + R[1, 0], R[0, 2] + R[2, 0]],
+            [R[0, 2] - R[2, 0], R[0, 1] + R[1, 0], R[1, 1] - R[0, 0] - R[2, 2], R[1, 2] + R[2, 1]],
+            [R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1], R[2, 2] - R[0, 0] - R[1, 1]],
+        ]
+    )
+    q = np.linalg.eigh(K)[1][:, -1]
+    return np.asarray(q if q[0] >= 0 else -q)
+
+
+def rotation_from_quaternion_wxyz(q: Array) -> Array:
+    """Rotation (3, 3) of a quaternion (4,), scalar first, any length but zero."""
+    w, x, y, z = np.asarray(q, dtype=np.float64) / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def T_world_from_cam(pose: Pose) -> Array:
+    """Homogeneous matrix (4, 4): `x_world = T_world_from_cam @ x_cam`."""
+    T = np.eye(4)
+    T[:3, :3] = pose.R_cam_from_world.T
+    T[:3, 3] = pose.center_world
+    return T
