@@ -14,7 +14,7 @@ import numba
 import numpy as np
 
 # Without error_model="numpy" every float division carries a branch that raises ZeroDivisionError, and that
-# branch alone stops LLVM vectorising a loop. "nnan" and "ninf" stay off: a point at the camera divides by zero.
+# branch alone stops LLVM vectorising a loop. "nnan" and "ninf" stay off: a point at the camera divides by 0.
 FASTMATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
 STALE_AFTER_S = 30 * 24 * 3600.0
 
