@@ -31,6 +31,15 @@ def exp_so3(w: Array) -> Array:
     return np.asarray(np.eye(3) + a * K + b * (K @ K))
 
 
+def left_jacobian(w: Array) -> Array:
+    """The (3, 3) matrix J with exp([w + dw]x) = exp([J dw]x) exp([w]x) to first order in `dw`."""
+    angle = float(np.linalg.norm(w))
+    K = skew(np.asarray(w, dtype=np.float64))
+    a = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
+    b = 1.0 / 6.0 if angle < 1e-4 else (angle - np.sin(angle)) / angle**3
+    return np.asarray(np.eye(3) + a * K + b * (K @ K))
+
+
 def step(pose: Pose, delta: Array) -> Pose:
     """`pose` moved by `delta` (6,), rotation [rad] then translation [m], both in the camera's frame.
 

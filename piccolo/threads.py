@@ -1,9 +1,10 @@
 """Serial kernels on several threads: whole items are spread, and results come back in the items' order."""
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 Item = TypeVar("Item")
 Value = TypeVar("Value")
@@ -14,19 +15,29 @@ def num_cores() -> int:
     return len(os.sched_getaffinity(0))
 
 
-def in_order(
-    function: Callable[[Item], Value], items: Iterable[Item], num_threads: int
-) -> Iterator[Value]:
-    """Yield function(item) for each item, in order, computed on `num_threads` threads.
+def _unseen(values: Iterator[Value], total: int, label: str) -> Iterator[Value]:
+    """Progress that nobody watches."""
+    return values
 
-    Nothing is summed across items here, so results have the same bits for any number of threads. An error or
-    Ctrl-C drops the items that have not begun.
-    """
-    if num_threads == 1:
-        yield from map(function, items)
-        return
-    pool = ThreadPoolExecutor(num_threads)
-    try:
-        yield from pool.map(function, items)
-    finally:
-        pool.shutdown(cancel_futures=True)
+
+@dataclass(frozen=True)
+class Workers:
+    """How many threads do the work, and who is told how far it is."""
+
+    num_threads: int = 1
+    show: Callable[[Iterator[Any], int, str], Iterator[Any]] = _unseen  # wraps the values, as tqdm does
+
+    def each(self, function: Callable[[Item], Value], items: Sequence[Item], label: str) -> Iterator[Value]:
+        """Yield function(item) for each item, in order.
+
+        Nothing is summed across items here, so results have the same bits for any number of threads. An error
+        or Ctrl-C drops the items that have not begun.
+        """
+        if self.num_threads == 1:
+            yield from self.show(map(function, items), len(items), label)
+            return
+        pool = ThreadPoolExecutor(self.num_threads)
+        try:
+            yield from self.show(pool.map(function, items), len(items), label)
+        finally:
+            pool.shutdown(cancel_futures=True)

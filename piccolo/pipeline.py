@@ -1,0 +1,104 @@
+"""The method in order, one line a step."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .cloud.model import Cloud
+from .cloud.packed import PackedPoints, pack_points
+from .panorama import Panorama
+from .pose import Pose
+from .refine import Refined, refine
+from .result import LOCALIZED, NOT_LOCALIZED
+from .sampling import pack_texels
+from .search import are_same, search
+from .settings import PaperSettings
+from .starts import free_grid, uniform_rotations, uniform_yaws
+from .threads import Workers
+from .verify import MIN_MARGIN, MIN_SCORE, Evidence, evidence_at
+
+INLIER_RESIDUAL = 0.1  # RGB norm below which a direction's colours agree
+RIVAL_DISTANCE = 0.5  # [m]
+RIVAL_ANGLE = np.radians(15.0)
+
+
+@dataclass(frozen=True)
+class PaperMap:
+    """What the paper's method prepares once per cloud."""
+
+    points: PackedPoints
+    origin_world: NDArray[np.float64]  # (3,) [m]
+    positions: NDArray[np.float64]  # (M, 3) starts in free space, relative to origin_world [m]
+
+
+@dataclass
+class Stopwatch:
+    """Seconds per named stage."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the time spent inside to the stage `name`."""
+        begin = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+
+
+@dataclass(frozen=True)
+class Localization:
+    """The best pose for one panorama, in world coordinates, and what speaks for it."""
+
+    status: str
+    pose: Pose | None
+    loss: float | None
+    evidence: Evidence | None
+    margin: float | None  # of the score, to the best distinct rival
+
+
+def prepare(cloud: Cloud, settings: PaperSettings) -> PaperMap:
+    """Everything that does not depend on the panorama."""
+    points = pack_points(cloud.points, cloud.colors)
+    if len(points) > settings.max_points:  # every so many of the Morton order: even in space, as dense as before
+        points = points.take(np.linspace(0, len(points) - 1, settings.max_points).astype(np.int64))
+    return PaperMap(
+        points=points,
+        origin_world=cloud.origin_world,
+        positions=free_grid(points, settings.num_translations, settings.grid_margin),
+    )
+
+
+def localize(
+    paper_map: PaperMap, panorama: Panorama, settings: PaperSettings, workers: Workers, watch: Stopwatch
+) -> Localization:
+    """Algorithm 1 of the paper: search, refine, select; then judge what was selected."""
+    points = paper_map.points
+    known = settings.gravity == "known"
+    rotations = (uniform_yaws if known else uniform_rotations)(settings.effective_num_rotations)
+    texels = pack_texels(panorama.rgb, panorama.is_valid)
+    with watch.stage("search"):
+        starts = search(points, panorama, texels, (paper_map.positions, rotations), settings, workers)
+    with watch.stage("refine"):
+        refined = list(workers.each(lambda s: refine(points, texels, s.pose, settings), starts, "refine"))
+        best = min(refined, key=lambda r: r.loss, default=None)
+    if best is None or not np.isfinite(best.loss):
+        return Localization(NOT_LOCALIZED, None, None, None, None)
+    with watch.stage("refine"):
+        evidence, margin = judge(points, panorama, best, refined)
+    status = LOCALIZED if evidence.score >= MIN_SCORE and margin >= MIN_MARGIN else NOT_LOCALIZED
+    pose = replace(best.pose, center_world=best.pose.center_world + paper_map.origin_world)
+    return Localization(status, pose, best.loss, evidence, margin)
+
+
+def judge(
+    points: PackedPoints, panorama: Panorama, best: Refined, refined: list[Refined]
+) -> tuple[Evidence, float]:
+    """Evidence at the best pose, and its score's margin to the best distinct rival (to 0 if there is none)."""
+    evidence = evidence_at(points, panorama, best.pose, INLIER_RESIDUAL)
+    rivals = [r for r in refined if not are_same(r.pose, best.pose, RIVAL_DISTANCE, RIVAL_ANGLE)]
+    scores = [evidence_at(points, panorama, r.pose, INLIER_RESIDUAL).score for r in rivals]
+    return evidence, evidence.score - max([0.0, *scores])

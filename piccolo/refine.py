@@ -1,0 +1,124 @@
+"""Step 4 of the paper's Algorithm 1: descend on the sampling loss from one start."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import minimize
+
+from .cloud.packed import PackedPoints
+from .loss import normal_equations, sampling_loss
+from .pose import Array, Pose, exp_so3, left_jacobian, orthonormal, step
+from .render import visible_points
+from .sampling import Texels
+from .settings import PaperSettings
+
+LossAndGradient = Callable[[Pose], tuple[float, Array]]
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Where a descent arrived."""
+
+    pose: Pose
+    loss: float  # sampling loss over the points seen from there
+    num_iterations: int
+
+
+@dataclass
+class Best:
+    """The best pose that a descent has passed."""
+
+    pose: Pose
+    loss: float = np.inf
+
+    def offer(self, pose: Pose, loss: float) -> None:
+        """Keep `pose` if it is better."""
+        if loss < self.loss:
+            self.pose, self.loss = pose, loss
+
+
+@dataclass
+class Adam:
+    """Adam (Kingma and Ba, 2015) on steps (rotation, translation), with the paper's decay of the step."""
+
+    step_size: float  # [rad, m]
+    step_decay: float
+    patience: int
+    mean: Array = field(default_factory=lambda: np.zeros(6))
+    mean_square: Array = field(default_factory=lambda: np.zeros(6))
+    num_updates: int = 0
+    best_loss: float = np.inf
+    num_stalled: int = 0
+
+    def update(self, loss: float, gradient: Array) -> Array:
+        """The step (6,) to take at a place with this loss and gradient (6,)."""
+        self.num_stalled = 0 if loss < self.best_loss else self.num_stalled + 1
+        self.best_loss = min(self.best_loss, loss)
+        if self.num_stalled == self.patience:
+            self.step_size *= self.step_decay
+            self.num_stalled = 0
+        self.num_updates += 1
+        self.mean = 0.9 * self.mean + 0.1 * gradient
+        self.mean_square = 0.999 * self.mean_square + 0.001 * gradient**2
+        mean = self.mean / (1.0 - 0.9**self.num_updates)
+        mean_square = self.mean_square / (1.0 - 0.999**self.num_updates)
+        return np.asarray(-self.step_size * mean / (np.sqrt(mean_square) + 1e-8))
+
+
+def descend_adam(objective: LossAndGradient, pose: Pose, adam: Adam, num_iterations: int) -> Best:
+    """The best pose of `num_iterations` steps of `adam`, which is left ready to go on."""
+    best = Best(pose)
+    for _ in range(num_iterations):
+        loss, gradient = objective(pose)
+        if not np.isfinite(loss):
+            break
+        best.offer(pose, loss)
+        pose = step(pose, adam.update(loss, gradient))
+    return best
+
+
+def descend_lbfgs(objective: LossAndGradient, start: Pose, num_iterations: int) -> Best:
+    """The best pose of at most `num_iterations` of SciPy's L-BFGS-B.
+
+    Parameters are the rotation vector of a turn of the start, R = exp([w]x) R_start, and the camera's shift.
+    """
+    best = Best(start)
+
+    def value(parameters: Array) -> tuple[float, Array]:
+        w = parameters[:3]
+        R_cam_from_world = orthonormal(exp_so3(w) @ start.R_cam_from_world)
+        pose = Pose(R_cam_from_world, start.center_world + parameters[3:])
+        loss, gradient = objective(pose)
+        best.offer(pose, loss)
+        by_w = left_jacobian(w).T @ gradient[:3]
+        by_center = R_cam_from_world.T @ gradient[3:]
+        return loss, np.concatenate([by_w, by_center])
+
+    minimize(value, np.zeros(6), jac=True, method="L-BFGS-B", options={"maxiter": num_iterations})
+    return best
+
+
+def refine(points: PackedPoints, texels: Texels, start: Pose, settings: PaperSettings) -> Refined:
+    """Descend from `start`; the points that the camera does not see are left out anew `num_culls` times.
+
+    A cull changes the function, so that losses before and after it do not compare: the best pose of the last
+    part is what counts.
+    """
+    adam = Adam(settings.step_size, settings.step_decay, settings.patience)
+    bounds = np.linspace(0, settings.num_iterations, settings.num_culls + 1).astype(int)
+    pose = start
+    for num_iterations in np.diff(bounds):
+        visible = visible_points(points, pose.center_world)
+
+        def objective(at: Pose, visible: PackedPoints = visible) -> tuple[float, Array]:
+            loss, gradient, _ = normal_equations(visible, texels, at)
+            return loss, gradient
+
+        adam.best_loss = np.inf
+        if settings.solver == "adam":
+            pose = descend_adam(objective, pose, adam, int(num_iterations)).pose
+        else:
+            pose = descend_lbfgs(objective, pose, int(num_iterations)).pose
+    loss = sampling_loss(visible_points(points, pose.center_world), texels, pose)
+    return Refined(pose, loss, settings.num_iterations)

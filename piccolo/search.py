@@ -1,0 +1,87 @@
+"""Steps 1 to 3 of the paper's Algorithm 1: score poses on a grid, keep the diverse best."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .cloud.packed import PackedPoints
+from .color import color_histogram, histogram_intersection
+from .loss import sampling_loss
+from .panorama import Panorama
+from .pose import Array, Pose, angle_between
+from .pyramid import shrink
+from .render import render_view, visible_points
+from .sampling import Texels
+from .settings import PaperSettings
+from .threads import Workers
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A pose and its score, smaller is better."""
+
+    pose: Pose
+    score: float
+
+
+def are_same(a: Pose, b: Pose, min_distance: float, min_angle: float) -> bool:
+    """True for poses closer than `min_distance` [m] and turned by less than `min_angle` [rad]."""
+    distance = float(np.linalg.norm(a.center_world - b.center_world))
+    return distance < min_distance and angle_between(a.R_cam_from_world, b.R_cam_from_world) < min_angle
+
+
+def keep_diverse(candidates: Sequence[Scored], count: int, min_distance: float, min_angle: float) -> list[Scored]:
+    """The `count` candidates of the smallest finite scores of which no two are the same pose."""
+    kept: list[Scored] = []
+    for candidate in sorted(candidates, key=lambda c: c.score):
+        if len(kept) == count or not np.isfinite(candidate.score):
+            break
+        if not any(are_same(candidate.pose, other.pose, min_distance, min_angle) for other in kept):
+            kept.append(candidate)
+    return kept
+
+
+def losses_at(
+    points: PackedPoints, texels: Texels, center_world: Array, rotations: NDArray[np.float64]
+) -> list[Scored]:
+    """Sampling loss of every rotation (N, 3, 3) at one position (3,), over the points seen from there."""
+    visible = visible_points(points, center_world)
+    poses = [Pose(R_cam_from_world, center_world) for R_cam_from_world in rotations]
+    return [Scored(pose, sampling_loss(visible, texels, pose)) for pose in poses]
+
+
+def histogram_distance(points: PackedPoints, panorama: Panorama, pose: Pose, bins: int) -> float:
+    """One minus the histogram intersection of the panorama and the cloud seen at `pose`, where both show something."""
+    view = render_view(points, pose, panorama.rgb.shape[1])
+    counts = view.is_seen & panorama.is_valid
+    of_cloud = color_histogram(view.rgb, counts, bins)
+    of_panorama = color_histogram(panorama.rgb.astype(np.float32) / 255.0, counts, bins)
+    return 1.0 - histogram_intersection(of_cloud, of_panorama)
+
+
+def search(
+    points: PackedPoints,
+    panorama: Panorama,
+    texels: Texels,
+    grid: tuple[NDArray[np.float64], NDArray[np.float64]],
+    settings: PaperSettings,
+    workers: Workers,
+) -> list[Scored]:
+    """The K2 poses to descend from, of all positions (N_t, 3) and rotations (N_r, 3, 3) of `grid`."""
+    positions, rotations = grid
+    distance, angle = settings.min_distance, np.radians(settings.min_angle_deg)
+
+    def losses(center_world: Array) -> list[Scored]:
+        return losses_at(points, texels, center_world, rotations)
+
+    scored = [s for batch in workers.each(losses, list(positions), "search") for s in batch]
+    by_loss = keep_diverse(scored, settings.num_by_loss, distance, angle)
+    small = shrink(panorama, settings.histogram_width)
+
+    def rescored(candidate: Scored) -> Scored:
+        return Scored(candidate.pose, histogram_distance(points, small, candidate.pose, settings.histogram_bins))
+
+    by_histogram = list(workers.each(rescored, by_loss, "compare colours"))
+    return keep_diverse(by_histogram, settings.num_by_histogram, distance, angle)

@@ -1,0 +1,83 @@
+"""Where to begin: camera positions in free space, and rotations."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .cloud.packed import PackedPoints
+from .pose import Array, Pose, rotation_from_quaternion_wxyz, yaw_rotation
+from .render import nearest_depth
+from .sphere import solid_angles
+
+MIN_CLEARANCE = 0.25  # a camera is not nearer to a surface than this [m]
+MIN_SEEN_SHARE = 0.4  # and sees points over at least this share of the sphere: it is inside the scan
+PROBE_WIDTH = 48  # cells of 7.5 degrees for the two tests
+
+# Psi, the real root of x^4 = x + 4 (Alexa, "Super-Fibonacci Spirals: Fast, Low-Discrepancy Sampling of SO(3)",
+# CVPR 2022).
+SUPER_FIBONACCI_PSI = 1.533751168755204288118041
+
+
+def uniform_yaws(num_rotations: int) -> NDArray[np.float64]:
+    """R_cam_from_world (num_rotations, 3, 3) of an upright camera at evenly spaced yaws."""
+    return np.stack([yaw_rotation(2.0 * math.pi * k / num_rotations) for k in range(num_rotations)])
+
+
+def uniform_rotations(num_rotations: int) -> NDArray[np.float64]:
+    """Rotations (num_rotations, 3, 3) spread evenly over SO(3) by the super-Fibonacci spiral."""
+    s = np.arange(num_rotations) + 0.5
+    r, R = np.sqrt(s / num_rotations), np.sqrt(1.0 - s / num_rotations)
+    alpha, beta = 2.0 * np.pi * s / math.sqrt(2.0), 2.0 * np.pi * s / SUPER_FIBONACCI_PSI
+    quaternions = np.stack([r * np.sin(alpha), r * np.cos(alpha), R * np.sin(beta), R * np.cos(beta)], axis=1)
+    return np.stack([rotation_from_quaternion_wxyz(q) for q in quaternions])
+
+
+def is_free(points: PackedPoints, center_world: Array) -> bool:
+    """True if a camera fits at `center_world` (3,) and finds itself inside the scan."""
+    depth = nearest_depth(points, Pose(np.eye(3), center_world), PROBE_WIDTH).reshape(-1, PROBE_WIDTH)
+    seen = np.isfinite(depth).sum(axis=1) @ solid_angles(PROBE_WIDTH) / (4.0 * math.pi)
+    return bool(depth.min() > MIN_CLEARANCE and seen > MIN_SEEN_SHARE)
+
+
+def box_grid(low: Array, high: Array, num_cells: int) -> NDArray[np.float64]:
+    """Centres (M, 3) of a uniform grid of near-cubic cells over a box, M near `num_cells`, at least 1 an axis."""
+    size = np.maximum(high - low, 1e-3)
+    edge = (size.prod() / num_cells) ** (1.0 / 3.0)
+    for _ in range(3):  # an axis shorter than the edge gets one cell: the others share the number
+        is_long = size > edge
+        if is_long.any():
+            edge = (size[is_long].prod() / num_cells) ** (1.0 / is_long.sum())
+    counts = np.maximum(np.round(size / edge), 1).astype(int)
+    axes = [low[k] + size[k] * (np.arange(counts[k]) + 0.5) / counts[k] for k in range(3)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def spread(positions: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """At most `count` of the positions (N, 3), each the farthest from those before it, in their old order."""
+    if len(positions) <= count:
+        return positions
+    chosen = [0]
+    distance = np.linalg.norm(positions - positions[0], axis=1)
+    while len(chosen) < count:
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(positions - positions[chosen[-1]], axis=1))
+    return positions[np.sort(chosen)]
+
+
+def free_grid(points: PackedPoints, num_translations: int, margin: float) -> NDArray[np.float64]:
+    """Camera positions (M, 3), M <= num_translations, of a uniform grid over the box that lie in free space.
+
+    The box is that of the points, made smaller by `margin` of its size on every side. The grid is refined until
+    enough of its positions are free; what is over is thinned out evenly. Empty if nothing is free.
+    """
+    low = np.array([points.x.min(), points.y.min(), points.z.min()], dtype=np.float64)
+    high = np.array([points.x.max(), points.y.max(), points.z.max()], dtype=np.float64)
+    low, high = low + margin * (high - low), high - margin * (high - low)
+    free = np.empty((0, 3))
+    for growth in (1.0, 1.5, 2.25, 3.4, 5.0, 7.6, 11.4, 17.0, 26.0):
+        grid = box_grid(low, high, round(num_translations * growth))
+        free = grid[[is_free(points, center_world) for center_world in grid]]
+        if len(free) >= num_translations:
+            break
+    return spread(free, num_translations)
