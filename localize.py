@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from piccolo.panorama import read_panorama
 from tqdm import tqdm
 
 from piccolo import __version__
@@ -19,7 +20,6 @@ from piccolo.errors import InputError
 from piccolo.files import check_output, write_atomically
 from piccolo.jit import KERNEL_FOLDER, is_first_use
 from piccolo.overlay import overlay_png
-from piccolo.panorama import read_panorama
 from piccolo.pipeline import INLIER_RESIDUAL, PaperMap, Stopwatch, localize, prepare
 from piccolo.pose import Pose
 from piccolo.result import LOCALIZED, Result
@@ -44,43 +44,49 @@ exit codes: 0 all localized, 1 some not, 2 wrong usage, 3 bad input, 4 internal 
 
 def build_parser() -> argparse.ArgumentParser:
     """All options, with their defaults from the settings."""
-    d = PaperSettings()
     parser = argparse.ArgumentParser(
-        "localize.py", description=DESCRIPTION, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+        "localize.py",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"piccolo {__version__}")
     files = parser.add_argument_group("files")
     files.add_argument("--cloud", type=Path, required=True, help="coloured scan: PLY, or text x y z r g b")
-    files.add_argument("--pano", type=Path, required=True, nargs="+", help="equirectangular JPEG or PNG, W = 2 H")
+    files.add_argument("--pano", type=Path, required=True, nargs="+", help="full sphere JPEG or PNG, W = 2 H")
     files.add_argument("--out", type=Path, help="write the JSON here, not to stdout")
-    files.add_argument("--overlay", type=Path, help="PNG: panorama, cloud from the pose, checkerboard of both")
+    files.add_argument("--overlay", type=Path, help="PNG: panorama, cloud at the pose, checkerboard of both")
     files.add_argument("--scale", type=float, default=1.0, help="metres per unit of the cloud (default 1)")
-    method = parser.add_argument_group("method (preset paper: Kim et al., ICCV 2021, Algorithm 1)")
-    method.add_argument("--preset", choices=["paper"], default="paper", help="(default paper)")
-    method.add_argument("--gravity", choices=["known", "unknown"], default=d.gravity,
-                        help="known: camera upright and the cloud's z up; unknown: any rotation (default known)")  # fmt: skip
-    method.add_argument("--solver", choices=["adam", "lbfgs"], default=d.solver, help="(default adam)")
-    method.add_argument("--translations", type=int, default=d.num_translations, metavar="N",
-                        help=f"N_t, start positions in free space (default {d.num_translations})")  # fmt: skip
-    method.add_argument("--rotations", type=int, default=d.num_rotations, metavar="N",
-                        help="N_r, start rotations (default 8 yaws if gravity is known, 32 of SO(3) if not)")  # fmt: skip
-    method.add_argument("--keep-by-loss", type=int, default=d.num_by_loss, metavar="K1",
-                        help=f"poses kept by the loss (default {d.num_by_loss})")  # fmt: skip
-    method.add_argument("--keep-by-histogram", type=int, default=d.num_by_histogram, metavar="K2",
-                        help=f"poses kept by colour histograms and refined (default {d.num_by_histogram})")  # fmt: skip
-    method.add_argument("--iterations", type=int, default=d.num_iterations, metavar="N",
-                        help=f"of the solver (default {d.num_iterations})")  # fmt: skip
-    method.add_argument("--histogram-bins", type=int, default=d.histogram_bins, metavar="N",
-                        help=f"a channel (default {d.histogram_bins})")  # fmt: skip
-    method.add_argument("--grid-margin", type=float, default=d.grid_margin, metavar="SHARE",
-                        help="share of the cloud's box left out on each side of the grid (default 0)")  # fmt: skip
-    method.add_argument("--max-points", type=int, default=d.max_points, metavar="N",
-                        help=f"points used of a larger cloud (default {d.max_points})")  # fmt: skip
+    add_method_options(parser)
     run = parser.add_argument_group("run")
     run.add_argument("--threads", type=int, default=num_cores(), metavar="N", help="(default all cores)")
     run.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
     run.add_argument("--debug", action="store_true", help="show the traceback of an error")
     return parser
+
+
+def add_method_options(parser: argparse.ArgumentParser) -> None:
+    """The settings of the preset as options, with their defaults."""
+    d = PaperSettings()
+    group = parser.add_argument_group("method (preset paper: Kim et al., ICCV 2021, Algorithm 1)")
+    group.add_argument("--preset", choices=["paper"], default="paper", help="(default paper)")
+    text = "known: camera upright and the cloud's z up; unknown: any rotation (default known)"
+    group.add_argument("--gravity", choices=["known", "unknown"], default=d.gravity, help=text)
+    group.add_argument("--solver", choices=["adam", "lbfgs"], default=d.solver, help="(default adam)")
+    group.add_argument("--no-visibility", action="store_true", help="let the camera see through walls")
+    text = "N_r, start rotations (default 8 yaws if gravity is known, 32 of SO(3) if not)"
+    group.add_argument("--rotations", type=int, default=d.num_rotations, metavar="N", help=text)
+    for option, metavar, default, text in (
+        ("--translations", "N", d.num_translations, "N_t, start positions in free space"),
+        ("--keep-by-loss", "K1", d.num_by_loss, "poses kept by the loss"),
+        ("--keep-by-histogram", "K2", d.num_by_histogram, "poses kept by colour histograms, and refined"),
+        ("--iterations", "N", d.num_iterations, "iterations of the solver"),
+        ("--histogram-bins", "N", d.histogram_bins, "bins a channel"),
+        ("--grid-margin", "SHARE", d.grid_margin, "share of the box left out on each side of the grid"),
+        ("--max-points", "N", d.max_points, "points used of a larger cloud"),
+    ):
+        help_text = f"{text} (default {default})"
+        group.add_argument(option, type=type(default), default=default, metavar=metavar, help=help_text)
 
 
 def settings_from(arguments: argparse.Namespace) -> PaperSettings:
@@ -96,6 +102,7 @@ def settings_from(arguments: argparse.Namespace) -> PaperSettings:
         histogram_bins=arguments.histogram_bins,
         grid_margin=arguments.grid_margin,
         max_points=arguments.max_points,
+        use_visibility=not arguments.no_visibility,
     )
 
 
@@ -128,7 +135,9 @@ class Session:
 
     def show(self, values: Iterator[Any], total: int, label: str) -> Iterator[Any]:
         """The values under a progress bar that vanishes when they end."""
-        bar = tqdm(values, label, total, leave=False, disable=self.arguments.quiet, file=sys.stderr, delay=0.5)
+        bar = tqdm(
+            values, label, total, leave=False, disable=self.arguments.quiet, file=sys.stderr, delay=0.5
+        )
         return iter(bar)
 
     def localize(self, pano: Path) -> Result:
@@ -237,7 +246,9 @@ def main(argv: list[str] | None = None) -> int:
     arguments = build_parser().parse_args(argv)
     try:
         return run(arguments)
-    except BrokenPipeError:  # the reader of stdout has gone: say nothing, not even when Python flushes at exit
+    except (
+        BrokenPipeError
+    ):  # the reader of stdout has gone: say nothing, not even when Python flushes at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_BROKEN_PIPE
     except (OSError, InputError) as error:

@@ -6,12 +6,10 @@ from numpy.typing import NDArray
 from .sphere import solid_angles
 
 
-def color_histogram(
-    rgb: NDArray[np.float32], counts: NDArray[np.bool_], bins: int
-) -> NDArray[np.float64]:
-    """Share (bins ** 3,) of the solid angle of an image (H, W, 3) in [0, 1] in each colour, where `counts` (H, W).
+def color_histogram(rgb: NDArray[np.float32], counts: NDArray[np.bool_], bins: int) -> NDArray[np.float64]:
+    """Share (bins ** 3,) of the solid angle in each colour, of an image (H, W, 3) in [0, 1].
 
-    All zero if nothing counts.
+    Only pixels of `counts` (H, W) are counted; all zero if none is.
     """
     level = np.minimum((rgb * bins).astype(np.int64), bins - 1)
     index = (level[..., 0] * bins + level[..., 1]) * bins + level[..., 2]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from .cloud.packed import PackedPoints
 from .jit import F0, kernel
 from .pose import Array, Pose
-from .sampling import Texels, blend, blend_with_gradient, bilinear_weights, channel
+from .sampling import Texels, bilinear_weights, blend, blend_with_gradient, channel
 from .sphere import direction_to_pixel, pixel_jacobian
 from .threads import Workers
 
@@ -33,7 +33,7 @@ TO_UNIT = 1.0 / 255.0
 
 @kernel
 def loss_blocks(x, y, z, rgbx, R, t, texels, width, first_block, sums):
-    """Write for each block the sum of the residual norms [8-bit levels] and the count of points: (blocks, 2)."""
+    """Write for each block (blocks, 2): the sum of the residual norms [8-bit levels], the count of points."""
     W, stride = np.float32(width), np.int32(width + 2)
     r00, r01, r02 = np.float32(R[0, 0]), np.float32(R[0, 1]), np.float32(R[0, 2])
     r10, r11, r12 = np.float32(R[1, 0]), np.float32(R[1, 1]), np.float32(R[1, 2])
@@ -70,7 +70,10 @@ def loss_blocks(x, y, z, rgbx, R, t, texels, width, first_block, sums):
 
 @kernel
 def normal_blocks(x, y, z, rgbx, R, t, texels, width, first_block, sums):
-    """Write for each block (blocks, 29): loss, count, gradient, upper triangle of sum w J^T J, w = 1 / norm."""
+    """Write for each block (blocks, 29): loss, count, gradient, upper triangle of sum J^T J / norm.
+
+    Longer than other kernels: split, its 28 sums would leave the registers.
+    """
     W, stride = np.float32(width), np.int32(width + 2)
     r00, r01, r02 = np.float32(R[0, 0]), np.float32(R[0, 1]), np.float32(R[0, 2])
     r10, r11, r12 = np.float32(R[1, 0]), np.float32(R[1, 1]), np.float32(R[1, 2])
@@ -155,7 +158,7 @@ def _sum_blocks(
 
 
 def sampling_loss(points: PackedPoints, texels: Texels, pose: Pose, num_threads: int = 1) -> float:
-    """The paper's Eq. 2 at `pose`, in [0, sqrt(3)]; inf where masked pixels hide half of the points or more."""
+    """The paper's Eq. 2 at `pose`, in [0, sqrt(3)]; inf where masked pixels hide half of the points."""
     total, count = _sum_blocks(loss_blocks, points, texels, pose, num_threads)[:2]
     if count <= (1.0 - MAX_MASKED_SHARE) * len(points):
         return math.inf

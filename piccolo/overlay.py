@@ -35,7 +35,9 @@ def render_closed(points: PackedPoints, pose: Pose, width: int) -> NDArray[np.ui
 def overlay_png(points: PackedPoints, panorama: Panorama, pose: Pose) -> bytes:
     """PNG file of three images, one above the other: panorama, cloud from the pose, checkerboard of both."""
     photo = cv2.resize(
-        shrink(panorama, OVERLAY_WIDTH).rgb, (OVERLAY_WIDTH, OVERLAY_WIDTH // 2), interpolation=cv2.INTER_LINEAR
+        shrink(panorama, OVERLAY_WIDTH).rgb,
+        (OVERLAY_WIDTH, OVERLAY_WIDTH // 2),
+        interpolation=cv2.INTER_LINEAR,
     )
     cloud = render_closed(points, pose, OVERLAY_WIDTH)
     tile = OVERLAY_WIDTH // NUM_TILES

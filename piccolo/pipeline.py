@@ -63,7 +63,9 @@ class Localization:
 def prepare(cloud: Cloud, settings: PaperSettings) -> PaperMap:
     """Everything that does not depend on the panorama."""
     points = pack_points(cloud.points, cloud.colors)
-    if len(points) > settings.max_points:  # every so many of the Morton order: even in space, as dense as before
+    if (
+        len(points) > settings.max_points
+    ):  # every so many of the Morton order: even in space, as dense as before
         points = points.take(np.linspace(0, len(points) - 1, settings.max_points).astype(np.int64))
     return PaperMap(
         points=points,
@@ -97,7 +99,7 @@ def localize(
 def judge(
     points: PackedPoints, panorama: Panorama, best: Refined, refined: list[Refined]
 ) -> tuple[Evidence, float]:
-    """Evidence at the best pose, and its score's margin to the best distinct rival (to 0 if there is none)."""
+    """Evidence at the best pose, and its margin over the best distinct rival (over 0 if there is none)."""
     evidence = evidence_at(points, panorama, best.pose, INLIER_RESIDUAL)
     rivals = [r for r in refined if not are_same(r.pose, best.pose, RIVAL_DISTANCE, RIVAL_ANGLE)]
     scores = [evidence_at(points, panorama, r.pose, INLIER_RESIDUAL).score for r in rivals]

@@ -108,8 +108,12 @@ def refine(points: PackedPoints, texels: Texels, start: Pose, settings: PaperSet
     adam = Adam(settings.step_size, settings.step_decay, settings.patience)
     bounds = np.linspace(0, settings.num_iterations, settings.num_culls + 1).astype(int)
     pose = start
+
+    def seen_from(at: Pose) -> PackedPoints:
+        return visible_points(points, at.center_world) if settings.use_visibility else points
+
     for num_iterations in np.diff(bounds):
-        visible = visible_points(points, pose.center_world)
+        visible = seen_from(pose)
 
         def objective(at: Pose, visible: PackedPoints = visible) -> tuple[float, Array]:
             loss, gradient, _ = normal_equations(visible, texels, at)
@@ -120,5 +124,5 @@ def refine(points: PackedPoints, texels: Texels, start: Pose, settings: PaperSet
             pose = descend_adam(objective, pose, adam, int(num_iterations)).pose
         else:
             pose = descend_lbfgs(objective, pose, int(num_iterations)).pose
-    loss = sampling_loss(visible_points(points, pose.center_world), texels, pose)
+    loss = sampling_loss(seen_from(pose), texels, pose)
     return Refined(pose, loss, settings.num_iterations)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cloud.packed import PackedPoints
-from .jit import F0, HALF, kernel
+from .jit import kernel
 from .pose import Array, Pose
 from .sampling import channel
 from .sphere import direction_to_pixel
@@ -110,7 +110,7 @@ def nearest_depth(points: PackedPoints, pose: Pose, width: int) -> NDArray[np.fl
 
 
 def render_view(points: PackedPoints, pose: Pose, width: int, band: float = 0.15) -> View:
-    """The cloud at `pose` as an image of `width`: nearest range, and colour of the points within 1 + band of it."""
+    """The cloud at `pose`, `width` cells around; colours are of the points within 1 + band of the nearest."""
     depth = nearest_depth(points, pose, width)
     sums = np.zeros((len(depth), 4))
     R, t = pose.R_cam_from_world, pose.center_world

@@ -13,9 +13,9 @@ FORMAT = "piccolo-pose/1"
 LOCALIZED = "localized"
 NOT_LOCALIZED = "not_localized"
 CONVENTION = (
-    "x_cam = R_cam_from_world @ (x_world - center_world) in metres; +x_cam points to the image centre, +y_cam "
-    "left, +z_cam up; u = (1/2 - atan2(y, x) / 2 pi) W, v = (1/2 - atan2(z, hypot(x, y)) / pi) H, pixel centres "
-    "at half-integers"
+    "x_cam = R_cam_from_world @ (x_world - center_world) in metres; +x_cam points to the image centre, "
+    "+y_cam left, +z_cam up; u = (1/2 - atan2(y, x) / 2 pi) W, v = (1/2 - atan2(z, hypot(x, y)) / pi) H, "
+    "pixel centres at half-integers"
 )
 
 
@@ -75,7 +75,9 @@ class Result:
                 **{name: document[name] for name in _PLAIN_FIELDS},
             )
         except (json.JSONDecodeError, KeyError, TypeError) as error:
-            raise InputError(f"result: found {error!r}, wanted one JSON object of format {FORMAT!r}") from error
+            raise InputError(
+                f"result: found {error!r}, wanted one JSON object of format {FORMAT!r}"
+            ) from error
 
 
 _PLAIN_FIELDS = (

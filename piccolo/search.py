@@ -32,7 +32,9 @@ def are_same(a: Pose, b: Pose, min_distance: float, min_angle: float) -> bool:
     return distance < min_distance and angle_between(a.R_cam_from_world, b.R_cam_from_world) < min_angle
 
 
-def keep_diverse(candidates: Sequence[Scored], count: int, min_distance: float, min_angle: float) -> list[Scored]:
+def keep_diverse(
+    candidates: Sequence[Scored], count: int, min_distance: float, min_angle: float
+) -> list[Scored]:
     """The `count` candidates of the smallest finite scores of which no two are the same pose."""
     kept: list[Scored] = []
     for candidate in sorted(candidates, key=lambda c: c.score):
@@ -46,14 +48,13 @@ def keep_diverse(candidates: Sequence[Scored], count: int, min_distance: float, 
 def losses_at(
     points: PackedPoints, texels: Texels, center_world: Array, rotations: NDArray[np.float64]
 ) -> list[Scored]:
-    """Sampling loss of every rotation (N, 3, 3) at one position (3,), over the points seen from there."""
-    visible = visible_points(points, center_world)
+    """Sampling loss of every rotation (N, 3, 3) at one position (3,)."""
     poses = [Pose(R_cam_from_world, center_world) for R_cam_from_world in rotations]
-    return [Scored(pose, sampling_loss(visible, texels, pose)) for pose in poses]
+    return [Scored(pose, sampling_loss(points, texels, pose)) for pose in poses]
 
 
 def histogram_distance(points: PackedPoints, panorama: Panorama, pose: Pose, bins: int) -> float:
-    """One minus the histogram intersection of the panorama and the cloud seen at `pose`, where both show something."""
+    """One minus the histogram intersection of panorama and cloud at `pose`, where both show something."""
     view = render_view(points, pose, panorama.rgb.shape[1])
     counts = view.is_seen & panorama.is_valid
     of_cloud = color_histogram(view.rgb, counts, bins)
@@ -74,14 +75,17 @@ def search(
     distance, angle = settings.min_distance, np.radians(settings.min_angle_deg)
 
     def losses(center_world: Array) -> list[Scored]:
-        return losses_at(points, texels, center_world, rotations)
+        seen = visible_points(points, center_world) if settings.use_visibility else points
+        return losses_at(seen, texels, center_world, rotations)
 
     scored = [s for batch in workers.each(losses, list(positions), "search") for s in batch]
     by_loss = keep_diverse(scored, settings.num_by_loss, distance, angle)
     small = shrink(panorama, settings.histogram_width)
 
     def rescored(candidate: Scored) -> Scored:
-        return Scored(candidate.pose, histogram_distance(points, small, candidate.pose, settings.histogram_bins))
+        return Scored(
+            candidate.pose, histogram_distance(points, small, candidate.pose, settings.histogram_bins)
+        )
 
     by_histogram = list(workers.each(rescored, by_loss, "compare colours"))
     return keep_diverse(by_histogram, settings.num_by_histogram, distance, angle)

@@ -16,7 +16,9 @@ class PaperSettings:
     gravity: Gravity = "known"  # known: the camera is upright, only its yaw is searched
     solver: Solver = "adam"
     num_translations: int = 50  # [N_t] positions on a uniform grid over the cloud's box, all in free space
-    num_rotations: int = 0  # [N_r] 0 for the paper's: 8 yaws where gravity is known, 32 rotations of SO(3) if not
+    num_rotations: int = (
+        0  # [N_r] 0 for the paper's: 8 yaws where gravity is known, 32 rotations of SO(3) if not
+    )
     num_by_loss: int = 50  # [K1] poses kept by the sampling loss
     num_by_histogram: int = 6  # [K2] poses kept by the colour histograms, and refined
     num_iterations: int = 100  # [N_iter] of the solver
@@ -26,8 +28,11 @@ class PaperSettings:
     grid_margin: float = 0.0  # share of the box left out of the grid on each side
     histogram_bins: int = 8  # a channel
     histogram_width: int = 256  # [px] of the views and of the panorama that are compared
-    min_distance: float = 0.3  # poses closer than this [m] and than `min_angle_deg` are one: the better is kept
+    min_distance: float = (
+        0.3  # poses closer than this [m] and than `min_angle_deg` are one: the better is kept
+    )
     min_angle_deg: float = 15.0
+    use_visibility: bool = True  # leave out the points that the camera can't see
     num_culls: int = 4  # times during the descent at which hidden points are left out anew
     max_points: int = 1_000_000  # of a larger cloud, this many are taken, evenly in space
     seed: int = 0  # repeated in the result; this preset draws nothing at random
@@ -39,7 +44,9 @@ class PaperSettings:
             if getattr(self, name) < 1:
                 raise InputError(f"{name}: found {getattr(self, name)}, wanted at least 1")
         if self.num_rotations < 0:
-            raise InputError(f"num_rotations: found {self.num_rotations}, wanted 1 or more, or 0 for the paper's")
+            raise InputError(
+                f"num_rotations: found {self.num_rotations}, wanted 1 or more, or 0 for the paper's"
+            )
         if not 0.0 <= self.grid_margin < 0.5:
             raise InputError(f"grid_margin: found {self.grid_margin}, wanted 0 to below 0.5")
         if not 2 <= self.histogram_bins <= 64:

@@ -34,7 +34,7 @@ def atan2(y, x):
     """Angle [rad] of (x, y) in (-pi, pi], float32, within 5e-7 of math.atan2; 0 at the origin."""
     abs_x = abs(x)
     abs_y = abs(y)
-    q = min(abs_x, abs_y) / max(max(abs_x, abs_y), TINY)
+    q = min(abs_x, abs_y) / max(abs_x, abs_y, TINY)
     s = q * q
     angle = q * (A0 + s * (A1 + s * (A2 + s * (A3 + s * (A4 + s * (A5 + s * A6))))))
     angle = HALF_PI - angle if abs_y > abs_x else angle
@@ -44,7 +44,7 @@ def atan2(y, x):
 
 @scalar
 def direction_to_pixel(x, y, z, rho, width):
-    """Continuous pixel (u, v) of the camera direction (x, y, z), rho = hypot(x, y), in an image of `width`."""
+    """Continuous pixel (u, v) of the camera direction (x, y, z), rho = hypot(x, y), in a `width` image."""
     scale = width / (PI + PI)
     u = HALF * width - scale * atan2(y, x)
     v = HALF * HALF * width - scale * atan2(z, rho)

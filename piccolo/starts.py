@@ -14,8 +14,8 @@ MIN_CLEARANCE = 0.25  # a camera is not nearer to a surface than this [m]
 MIN_SEEN_SHARE = 0.4  # and sees points over at least this share of the sphere: it is inside the scan
 PROBE_WIDTH = 48  # cells of 7.5 degrees for the two tests
 
-# Psi, the real root of x^4 = x + 4 (Alexa, "Super-Fibonacci Spirals: Fast, Low-Discrepancy Sampling of SO(3)",
-# CVPR 2022).
+# Psi, the real root of x^4 = x + 4 (Alexa, "Super-Fibonacci Spirals: Fast,
+# Low-Discrepancy Sampling of SO(3)", CVPR 2022).
 SUPER_FIBONACCI_PSI = 1.533751168755204288118041
 
 
@@ -41,7 +41,7 @@ def is_free(points: PackedPoints, center_world: Array) -> bool:
 
 
 def box_grid(low: Array, high: Array, num_cells: int) -> NDArray[np.float64]:
-    """Centres (M, 3) of a uniform grid of near-cubic cells over a box, M near `num_cells`, at least 1 an axis."""
+    """Centres (M, 3) of near-cubic cells that fill a box, M near `num_cells`, at least one an axis."""
     size = np.maximum(high - low, 1e-3)
     edge = (size.prod() / num_cells) ** (1.0 / 3.0)
     for _ in range(3):  # an axis shorter than the edge gets one cell: the others share the number
@@ -68,8 +68,8 @@ def spread(positions: NDArray[np.float64], count: int) -> NDArray[np.float64]:
 def free_grid(points: PackedPoints, num_translations: int, margin: float) -> NDArray[np.float64]:
     """Camera positions (M, 3), M <= num_translations, of a uniform grid over the box that lie in free space.
 
-    The box is that of the points, made smaller by `margin` of its size on every side. The grid is refined until
-    enough of its positions are free; what is over is thinned out evenly. Empty if nothing is free.
+    The box is that of the points, made smaller by `margin` of its size on every side. The grid is refined
+    until enough of its positions are free; what is over is thinned out evenly. Empty if nothing is free.
     """
     low = np.array([points.x.min(), points.y.min(), points.z.min()], dtype=np.float64)
     high = np.array([points.x.max(), points.y.max(), points.z.max()], dtype=np.float64)

@@ -45,7 +45,7 @@ def _blur(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def local_contrast(channels: NDArray[np.float32], counts: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Channels (C, H, W) minus their local mean, by their local deviation, clipped; 0 where not `counts` (H, W)."""
+    """Channels (C, H, W) less their local mean, by their local deviation, clipped; 0 where not `counts`."""
     weight = counts.astype(np.float32)
     share = np.maximum(_blur(weight), 1e-3)
     normalized = []
@@ -57,7 +57,7 @@ def local_contrast(channels: NDArray[np.float32], counts: NDArray[np.bool_]) -> 
 
 
 def evidence_at(points: PackedPoints, panorama: Panorama, pose: Pose, residual: float) -> Evidence:
-    """How well the cloud, seen at `pose`, explains the panorama; colours agree within `residual` (RGB norm)."""
+    """How well the cloud at `pose` explains the panorama; colours agree within `residual` (RGB norm)."""
     small = shrink(panorama, VIEW_WIDTH)
     rgb = small.rgb.astype(np.float32) / np.float32(255.0)
     view = render_view(points, pose, VIEW_WIDTH)
@@ -69,7 +69,7 @@ def evidence_at(points: PackedPoints, panorama: Panorama, pose: Pose, residual: 
     correlation = float((weights * of_view * of_panorama).sum()) / max(energy, 1e-9)
     agrees = np.linalg.norm(view.rgb - rgb, axis=-1) < residual
     area = max(float(weights.sum()), 1e-9)
-    # A view of which little is seen can't be sure: the score is charged for a share of the sphere below a half.
+    # A view of which little is seen can't be sure: below half of the sphere, the score is charged.
     seen_share = area / (4.0 * math.pi)
     score = correlation * min(1.0, 2.0 * seen_share)
     return Evidence(score, float((weights * agrees).sum()) / area, seen_share)
