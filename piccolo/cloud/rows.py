@@ -68,10 +68,10 @@ def has_word(data, i, word):
     """True if the lower-case `word` stands at `i`, in any case."""
     if i + len(word) > len(data):
         return False
+    num_alike = 0
     for k in range(len(word)):
-        if data[i + k] | LOWER != word[k]:
-            return False
-    return True
+        num_alike += data[i + k] | LOWER == word[k]
+    return num_alike == len(word)
 
 
 @scalar
@@ -133,7 +133,7 @@ def parse_number(data, i):
 @scalar
 def skip_field(data, i, separator):
     """Index just behind the field that begins at `i`, whatever it holds."""
-    while not is_line_end(data, i) and data[i] != separator and data[i] != TAB:
+    while not is_line_end(data, i) and data[i] != separator and (separator != SPACE or data[i] != TAB):
         i += 1
     return i
 
@@ -171,9 +171,9 @@ def parse_rows(data, start, separator, targets, is_exact, rows):
     """Fill `rows` (R, C) with numbers from the lines of text that begin at byte `start` of `data` (uint8).
 
     Field k of a line goes to column `targets[k]`, or nowhere if that is below 0. `separator` is a comma, a
-    semicolon or a space; spaces and tabs around fields never count. Blank lines and lines that begin with # or
-    // are passed over; with `is_exact` a line may hold no further field. Gives the number of rows filled, the
-    number of lines read, the byte behind the last of them (or where the broken one begins), and a status.
+    semicolon or a space; spaces and tabs around fields never count. Blank lines and lines that begin with #
+    or // are passed over; with `is_exact` a line may hold no further field. Gives the number of rows filled,
+    the number of lines read, the byte behind the last of them (or where the broken one begins), a status.
     """
     i, num_lines, num_rows = start, 0, 0
     while i < len(data) and num_rows < len(rows):
