@@ -1,7 +1,7 @@
 """Lines of numbers to rows of float64, at the speed at which a disk delivers them.
 
-np.loadtxt takes some 2 s for a million lines, and says nothing of the line's number when one is broken in
-the way that real scans are broken.
+np.loadtxt takes 1 s for a million lines, several times as long, knows one comment mark and one separator,
+and can't be asked what the broken line looks like.
 """
 
 import numpy as np
