@@ -31,7 +31,7 @@ A6 = np.float32(0.00681171109960)
 
 @scalar
 def atan2(y, x):
-    """Angle [rad] of (x, y) in (-pi, pi], float32, within 5e-7 of math.atan2; 0 at the origin."""
+    """Angle [rad] of (x, y) in (-pi, pi], float32, within 6e-7 of math.atan2; 0 at the origin."""
     abs_x = abs(x)
     abs_y = abs(y)
     q = min(abs_x, abs_y) / max(abs_x, abs_y, TINY)

@@ -12,6 +12,7 @@ from .sphere import solid_angles
 
 MIN_CLEARANCE = 0.25  # a camera is not nearer to a surface than this [m]
 MIN_SEEN_SHARE = 0.4  # and sees points over at least this share of the sphere: it is inside the scan
+PROBE_POINTS = 200_000  # about this many points are asked, evenly in space
 PROBE_WIDTH = 48  # cells of 7.5 degrees for the two tests
 
 # Psi, the real root of x^4 = x + 4 (Alexa, "Super-Fibonacci Spirals: Fast,
@@ -74,10 +75,11 @@ def free_grid(points: PackedPoints, num_translations: int, margin: float) -> NDA
     low = np.array([points.x.min(), points.y.min(), points.z.min()], dtype=np.float64)
     high = np.array([points.x.max(), points.y.max(), points.z.max()], dtype=np.float64)
     low, high = low + margin * (high - low), high - margin * (high - low)
+    probed = points.take(slice(None, None, max(1, len(points) // PROBE_POINTS)))
     free = np.empty((0, 3))
     for growth in (1.0, 1.5, 2.25, 3.4, 5.0, 7.6, 11.4, 17.0, 26.0):
         grid = box_grid(low, high, round(num_translations * growth))
-        free = grid[[is_free(points, center_world) for center_world in grid]]
+        free = grid[[is_free(probed, center_world) for center_world in grid]]
         if len(free) >= num_translations:
             break
     return spread(free, num_translations)

@@ -1,0 +1,104 @@
+import math
+
+import naive
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from piccolo import sphere
+from piccolo.pose import exp_so3
+
+TILTED = exp_so3(np.array([0.4, -1.1, 0.7]))
+CENTER = np.array([0.3, -0.2, 1.5])
+WIDTH = 2048
+RAYS = sphere.pixel_rays(WIDTH)
+
+
+def _pixels(points, R_cam_from_world=TILTED, center_world=CENTER, width=WIDTH):
+    pixels = np.empty((len(points), 2))
+    sphere.project(points.astype(np.float32), R_cam_from_world, center_world, width, pixels)
+    return pixels
+
+
+def test_project_equals_its_twin():
+    points = np.random.default_rng(0).normal(size=(20_000, 3)) * [5, 4, 2]
+    points = points.astype(np.float32)
+    difference = np.abs(_pixels(points) - naive.project(points, TILTED, CENTER, WIDTH))
+    difference[:, 0] = np.minimum(difference[:, 0], WIDTH - difference[:, 0])
+    # float32: a point near a pole moves far in u by rounding, so u is judged by the arc it spans
+    x_cam = (points - CENTER) @ TILTED.T
+    sine = np.hypot(x_cam[:, 0], x_cam[:, 1]) / np.linalg.norm(x_cam, axis=1)
+    assert (difference[:, 0] * sine).max() < 2e-3
+    assert difference[:, 1].max() < 2e-3
+
+
+def test_arctangent_polynomial_error():
+    angles = np.linspace(-np.pi, np.pi, 100_001)[1:]
+    x, y = np.cos(angles).astype(np.float32), np.sin(angles).astype(np.float32)
+    ours = np.array([sphere.atan2(b, a) for a, b in zip(x[::50], y[::50], strict=True)], dtype=np.float64)
+    theirs = np.arctan2(y[::50].astype(np.float64), x[::50].astype(np.float64))
+    assert np.abs(ours - theirs).max() < 6e-7
+    assert sphere.atan2(np.float32(0), np.float32(0)) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("direction", "pixel"),
+    [
+        ((1, 0, 0), (1024, 512)),
+        ((0, 1, 0), (512, 512)),
+        ((0, -1, 0), (1536, 512)),
+        ((1, 0, 1), (1024, 256)),
+        ((1, 0, -1), (1024, 768)),
+    ],
+)
+def test_axes_fall_where_the_convention_says(direction, pixel):
+    at = _pixels(np.array([direction], dtype=np.float64), np.eye(3), np.zeros(3))
+    np.testing.assert_allclose(at[0], pixel, atol=1e-3)
+
+
+def test_seam_has_both_sides():
+    left = _pixels(np.array([[-1.0, 1e-4, 0.0]]), np.eye(3), np.zeros(3))[0, 0]
+    right = _pixels(np.array([[-1.0, -1e-4, 0.0]]), np.eye(3), np.zeros(3))[0, 0]
+    assert 0 <= left < 0.1
+    assert WIDTH - 0.1 < right < WIDTH
+
+
+@given(st.integers(0, WIDTH - 1), st.integers(0, WIDTH // 2 - 1))
+@settings(max_examples=100, deadline=None)
+def test_pixel_to_ray_to_pixel(column, row):
+    ray = RAYS[row, column]
+    pixel = _pixels(ray[None] * 3.0, np.eye(3), np.zeros(3))[0]
+    sine = math.cos((0.5 - (row + 0.5) / (WIDTH // 2)) * math.pi)
+    assert abs(pixel[0] - (column + 0.5)) * sine < 1e-3
+    assert abs(pixel[1] - (row + 0.5)) < 1e-3
+
+
+def test_solid_angles_sum_to_the_sphere():
+    assert 512 * sphere.solid_angles(512).sum() == pytest.approx(4 * math.pi)
+    row = sphere.solid_angles(512)
+    assert row[0] == pytest.approx((1 - math.cos(math.pi / 256)) * 2 * math.pi / 512)
+
+
+@pytest.mark.parametrize("where", ["anywhere", "seam", "zenith", "nadir"])
+def test_pixel_jacobian_against_central_differences(where):
+    rng = np.random.default_rng(1)
+    base = {"anywhere": (1, 2, 0.5), "seam": (-2, 0, 0.3), "zenith": (0, 0, 2), "nadir": (0, 0, -2)}[where]
+    for p in np.array(base) + rng.normal(size=(50, 3)) * 0.05:
+        ux, uy, vx, vy, vz = sphere.pixel_jacobian(*p, p[0] ** 2 + p[1] ** 2, float(WIDTH))
+        numbers = np.empty((2, 3))
+        for axis in range(3):
+            h = 1e-6 * np.eye(3)[axis]
+            ahead, behind = (
+                naive.project((p + s * h)[None], np.eye(3), np.zeros(3), WIDTH)[0] for s in (1, -1)
+            )
+            difference = ahead - behind
+            difference[0] -= WIDTH * np.round(difference[0] / WIDTH)
+            numbers[:, axis] = difference / 2e-6
+        np.testing.assert_allclose(numbers, [[ux, uy, 0.0], [vx, vy, vz]], rtol=1e-4, atol=1e-2)
+
+
+def test_pixel_jacobian_is_finite_at_the_camera_and_at_a_pole():
+    zero = np.float32(0)
+    for z in (zero, np.float32(1)):
+        assert np.isfinite(sphere.pixel_jacobian(zero, zero, z, zero, np.float32(WIDTH))).all()

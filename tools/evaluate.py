@@ -1,0 +1,140 @@
+#!/usr/bin/env python3
+"""Compare results of localize.py with true poses: a table of errors, and what share is correct."""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from piccolo.errors import InputError
+from piccolo.pose import Pose, angle_between
+from piccolo.result import LOCALIZED, Result
+
+EPILOG = """\
+example:
+  python localize.py --cloud scene/cloud.ply --pano scene/images/*.jpg --out poses.jsonl
+  python tools/evaluate.py --truth scene/queries.json --results poses.jsonl
+
+queries.json: {"queries": [{"image", "variant", "R_cam_from_world", "center_world"}]}; a panorama
+belongs to the query whose image has the same file name. The table is Markdown, on stdout.
+exit codes: 0 done, 2 wrong usage, 3 bad input.
+"""
+
+
+@dataclass(frozen=True)
+class Query:
+    """A panorama with its true pose."""
+
+    variant: str
+    pose: Pose
+
+
+@dataclass(frozen=True)
+class Row:
+    """One result against the truth."""
+
+    image: str
+    variant: str
+    result: Result
+    position_error: float  # [m], inf without a pose
+    rotation_error: float  # [rad], inf without a pose
+
+    @property
+    def seconds(self) -> float:
+        """Search and refinement, without reading and preparing."""
+        return sum(self.result.seconds.get(stage, 0.0) for stage in ("search", "refine"))
+
+
+def read_truth(path: Path) -> dict[str, Query]:
+    """The queries of a queries.json by file name."""
+    try:
+        entries = json.loads(path.read_text())["queries"]
+        return {
+            Path(entry["image"]).name: Query(
+                entry["variant"],
+                Pose(np.array(entry["R_cam_from_world"], float), np.array(entry["center_world"], float)),
+            )
+            for entry in entries
+        }
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: found {error!r}, wanted a queries.json with true poses") from error
+
+
+def compare(result: Result, truth: dict[str, Query]) -> Row:
+    """The errors of one result."""
+    name = Path(result.pano).name
+    if name not in truth:
+        raise InputError(f"{name}: found a result without a true pose, wanted one of {sorted(truth)[:3]} ...")
+    query = truth[name]
+    if result.pose is None:
+        return Row(name, query.variant, result, np.inf, np.inf)
+    offset = result.pose.center_world - query.pose.center_world
+    angle = angle_between(result.pose.R_cam_from_world, query.pose.R_cam_from_world)
+    return Row(name, query.variant, result, float(np.linalg.norm(offset)), angle)
+
+
+def print_rows(rows: Sequence[Row]) -> None:
+    """One line a panorama."""
+    print("| panorama | status | error [m] | error [deg] | score | margin | loss | seconds |")
+    print("|---|---|---:|---:|---:|---:|---:|---:|")
+    for row in rows:
+        r = row.result
+        numbers = [f"{value:.2f}" if value is not None else "-" for value in (r.score, r.margin)]
+        numbers.append(f"{r.loss:.3f}" if r.loss is not None else "-")
+        errors = f"{row.position_error:.4f} | {np.degrees(row.rotation_error):.3f}"
+        print(f"| {row.image} | {r.status} | {errors} | {' | '.join(numbers)} | {row.seconds:.2f} |")
+
+
+def print_summary(rows: Sequence[Row], max_distance: float, max_angle_deg: float) -> None:
+    """One line a variant, and one for all."""
+    print(f"\ncorrect: under {max_distance} m and {max_angle_deg} deg; medians are of the correct ones\n")
+    print("| variant | queries | correct | localized | wrong of these | mm | deg | s |")
+    print("|---|---:|---:|---:|---:|---:|---:|---:|")
+    variants = list(dict.fromkeys(row.variant for row in rows))
+    for variant in [*variants, *(["all"] if len(variants) > 1 else [])]:
+        some = [row for row in rows if variant in (row.variant, "all")]
+        correct = [
+            r
+            for r in some
+            if r.position_error < max_distance and np.degrees(r.rotation_error) < max_angle_deg
+        ]
+        localized = [row for row in some if row.result.status == LOCALIZED]
+        wrong = sum(row not in correct for row in localized)
+        mm = f"{1000 * np.median([r.position_error for r in correct]):.1f}" if correct else "-"
+        deg = f"{np.degrees(np.median([r.rotation_error for r in correct])):.3f}" if correct else "-"
+        counts = f"{len(some)} | {len(correct)} | {len(localized)} | {wrong}"
+        print(f"| {variant} | {counts} | {mm} | {deg} | {np.median([r.seconds for r in some]):.2f} |")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--truth", type=Path, required=True, help="queries.json with true poses")
+    parser.add_argument("--results", type=Path, required=True, help="JSON lines of localize.py")
+    parser.add_argument("--max-distance", type=float, default=0.1, metavar="M", help="(default 0.1)")
+    parser.add_argument("--max-angle", type=float, default=5.0, metavar="DEG", help="(default 5)")
+    arguments = parser.parse_args(argv)
+    try:
+        truth = read_truth(arguments.truth)
+        lines = arguments.results.read_text().splitlines()
+        rows = [compare(Result.from_json(line), truth) for line in lines if line.strip()]
+        if not rows:
+            raise InputError(f"{arguments.results}: found no result, wanted JSON lines of localize.py")
+    except (OSError, InputError) as error:
+        print(f"evaluate.py: {error}", file=sys.stderr)
+        return 3
+    print_rows(rows)
+    print_summary(rows, arguments.max_distance, arguments.max_angle)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
