@@ -43,3 +43,33 @@ def nearest_depth(points, R_cam_from_world, center_world, width):
     row = np.minimum(pixels[:, 1].astype(int), width // 2 - 1)
     np.minimum.at(depth, (row, column), np.linalg.norm(points - center_world, axis=1))
     return depth
+
+
+def interleave(cells):
+    """Morton codes of cells (N, 3), bit by bit as text."""
+    codes = []
+    for cell in cells:
+        digits = zip(*(format(int(index), "021b") for index in cell[::-1]), strict=True)
+        codes.append(int("".join(digit for triple in digits for digit in triple), 2))
+    return np.array(codes, dtype=np.int64)
+
+
+def thin(points, colors, voxel_size):
+    """Mean position and colour of each voxel, by a dictionary, in ascending order of Morton codes."""
+    voxels = {}
+    for point, color in zip(points.astype(np.float64), colors.astype(int), strict=True):
+        voxels.setdefault(tuple(int(k) for k in np.floor(point / voxel_size)), []).append((*point, *color))
+    cells = np.array(list(voxels))
+    means = np.array([np.mean(members, axis=0) for members in voxels.values()])
+    means = means[np.argsort(interleave(cells - cells.min(axis=0)))]
+    return means[:, :3], np.floor(means[:, 3:] + 0.5)
+
+
+def parse_rows(text, separator, targets):
+    """Rows of numbers by Python's own float(), from text without broken lines."""
+    rows = []
+    for line in text.splitlines():
+        if line.strip() and not line.strip().startswith(("#", "//")):
+            fields = line.split(separator if separator != " " else None)
+            rows.append([float(fields[list(targets).index(column)]) for column in range(max(targets) + 1)])
+    return np.array(rows)

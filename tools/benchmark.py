@@ -30,7 +30,7 @@ examples:
   python tools/benchmark.py --cloud scan.ply --pano query.jpg
 
 Every contender is timed once in each round, so that a disturbance hits all; ratios are of the medians.
-The reference is cv2.remap: 8-bit, 3 channels, bilinear, one thread, a coherent map of as many pixels as points.
+The reference is cv2.remap: 8-bit, 3 channels, bilinear, one thread, a coherent map, a pixel a point.
 exit codes: 0 done, 2 wrong usage, 3 bad input.
 """
 
