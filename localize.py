@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from piccolo.panorama import read_panorama
 from tqdm import tqdm
 
 from piccolo import __version__
@@ -20,6 +19,7 @@ from piccolo.errors import InputError
 from piccolo.files import check_output, write_atomically
 from piccolo.jit import KERNEL_FOLDER, is_first_use
 from piccolo.overlay import overlay_png
+from piccolo.panorama import read_panorama
 from piccolo.pipeline import INLIER_RESIDUAL, PaperMap, Stopwatch, localize, prepare
 from piccolo.pose import Pose
 from piccolo.result import LOCALIZED, Result
@@ -158,9 +158,9 @@ class Session:
             pano=str(pano),
             pose=found.pose,
             loss=found.loss,
-            score=evidence and evidence.score,
+            score=evidence.score if evidence else None,
             margin=found.margin,
-            inlier_share=evidence and evidence.inlier_share,
+            inlier_share=evidence.inlier_share if evidence else None,
             inlier_residual=INLIER_RESIDUAL,
             seconds=watch.seconds,
             settings={"preset": self.arguments.preset, **self.settings.to_json()},

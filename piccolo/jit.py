@@ -70,7 +70,7 @@ def _prepare_kernel_folder() -> Path:
 
 
 KERNEL_FOLDER = Path(os.environ.get("NUMBA_CACHE_DIR") or _prepare_kernel_folder())
-numba.config.CACHE_DIR = str(KERNEL_FOLDER)
+numba.config.CACHE_DIR = str(KERNEL_FOLDER)  # type: ignore[attr-defined]  # made at import
 
 
 def is_first_use() -> bool:

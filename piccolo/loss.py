@@ -39,7 +39,7 @@ def loss_blocks(x, y, z, rgbx, R, t, texels, width, first_block, sums):
     r10, r11, r12 = np.float32(R[1, 0]), np.float32(R[1, 1]), np.float32(R[1, 2])
     r20, r21, r22 = np.float32(R[2, 0]), np.float32(R[2, 1]), np.float32(R[2, 2])
     tx, ty, tz = np.float32(t[0]), np.float32(t[1]), np.float32(t[2])
-    # An unsigned index needs no test for being negative, and four bases with one index make the shortest gathers.
+    # An unsigned index needs no test for being negative; four bases and one 32-bit index gather fastest.
     right, below, below_right = texels[1:], texels[stride:], texels[stride + 1 :]
     for block in range(len(sums)):
         lo = (first_block + block) * BLOCK
@@ -81,7 +81,7 @@ def normal_blocks(x, y, z, rgbx, R, t, texels, width, first_block, sums):
     r10, r11, r12 = np.float32(R[1, 0]), np.float32(R[1, 1]), np.float32(R[1, 2])
     r20, r21, r22 = np.float32(R[2, 0]), np.float32(R[2, 1]), np.float32(R[2, 2])
     tx, ty, tz = np.float32(t[0]), np.float32(t[1]), np.float32(t[2])
-    # An unsigned index needs no test for being negative, and four bases with one index make the shortest gathers.
+    # An unsigned index needs no test for being negative; four bases and one 32-bit index gather fastest.
     right, below, below_right = texels[1:], texels[stride:], texels[stride + 1 :]
     for block in range(len(sums)):
         lo = (first_block + block) * BLOCK

@@ -8,16 +8,18 @@ from .cloud.packed import PackedPoints
 from .panorama import Panorama
 from .pose import Pose
 from .pyramid import shrink
-from .render import render_view
+from .render import render_view, visible_points
 
 OVERLAY_WIDTH = 1024
-COARSEST_WIDTH = 64
+COARSEST_WIDTH = 16
 BAND = 0.03  # of several surfaces in one pixel the nearest is drawn
 NUM_TILES = 16  # columns of the checkerboard
 
 
 def render_closed(points: PackedPoints, pose: Pose, width: int) -> NDArray[np.uint8]:
     """The cloud at `pose` as an image (width / 2, width, 3); holes take the colour of a coarser view."""
+    # What shows through the gaps of a sparse wall is left out by the coarser cells of the visibility test.
+    points = visible_points(points, pose.center_world)
     view = render_view(points, pose, width, BAND)
     rgb, is_seen = view.rgb, view.is_seen
     coarse_width = width // 2

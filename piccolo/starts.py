@@ -51,7 +51,7 @@ def box_grid(low: Array, high: Array, num_cells: int) -> NDArray[np.float64]:
             edge = (size[is_long].prod() / num_cells) ** (1.0 / is_long.sum())
     counts = np.maximum(np.round(size / edge), 1).astype(int)
     axes = [low[k] + size[k] * (np.arange(counts[k]) + 0.5) / counts[k] for k in range(3)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    return np.column_stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")])
 
 
 def spread(positions: NDArray[np.float64], count: int) -> NDArray[np.float64]:

@@ -99,12 +99,13 @@ def parse_exponent(data, i):
 
 @scalar
 def times_power(mantissa, power):
-    """Mantissa x 10^power, within two roundings of the nearest float64."""
-    if power >= 0:
-        return mantissa * POWERS[power] if power <= MAX_POWER or mantissa == 0.0 else np.inf
-    if power >= -MAX_POWER:
+    """Mantissa x 10^power within a few roundings of the nearest float64; below 1e-290 it may be 0."""
+    # No second division by a power: fastmath joins the two, and the joint divisor overflows.
+    if power < -MAX_POWER or mantissa == 0.0:
+        return 0.0
+    if power < 0:
         return mantissa / POWERS[-power]
-    return mantissa / POWERS[MAX_POWER] / POWERS[min(-power - MAX_POWER, MAX_POWER)]
+    return mantissa * POWERS[power] if power <= MAX_POWER else np.inf
 
 
 @scalar
