@@ -1,0 +1,22 @@
+"""What tests of damaged files share."""
+
+from piccolo.errors import InputError
+
+
+def read_or_refused(read, path):
+    """What `read` makes of a file, or the one line, naming the file, with which it refuses."""
+    try:
+        return read(path), ""
+    except InputError as error:
+        message = str(error)
+    if str(path) not in message or "\n" in message:
+        raise AssertionError(f"no line that names {path}: {message}")
+    return None, message
+
+
+def mutated(draw, integers, content, num_flips=4):
+    """`content` with some bytes drawn anew and, in half of the draws, cut off; draws by hypothesis."""
+    changed = bytearray(content)
+    for _ in range(draw(integers(0, num_flips))):
+        changed[draw(integers(0, len(changed) - 1))] = draw(integers(0, 255))
+    return bytes(changed[: draw(integers(0, len(changed)))] if draw(integers(0, 1)) else changed)

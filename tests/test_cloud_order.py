@@ -1,0 +1,168 @@
+import math
+
+import naive
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from piccolo.cloud import Cloud
+from piccolo.cloud.clean import clean
+from piccolo.cloud.order import canonical_order, morton_codes, thin
+from piccolo.cloud.raw import RawCloud
+from piccolo.errors import InputError
+
+
+def seeded_cloud(seed, num_points=1500, size=(6.0, 5.0, 2.5), step=0.0):
+    """Points in a box, float64, and colours; snapped to a grid of `step` if given, so that many coincide."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-0.5, 0.5, (num_points, 3)) * size
+    if step:
+        points = np.round(points / step) * step
+    return RawCloud(points, rng.integers(0, 256, (num_points, 3), dtype=np.uint8))
+
+
+def same_bits(a: Cloud, b: Cloud):
+    return (
+        a.points.tobytes() == b.points.tobytes()
+        and a.colors.tobytes() == b.colors.tobytes()
+        and a.origin_world.tobytes() == b.origin_world.tobytes()
+        and (a.num_dropped, a.warnings) == (b.num_dropped, b.warnings)
+    )
+
+
+def test_morton_codes_equal_twin():
+    rng = np.random.default_rng(1)
+    cells = rng.integers(0, 1 << 21, (300, 3))
+    cells[0], cells[1] = 0, (1 << 21) - 1
+    codes = morton_codes(cells)
+    np.testing.assert_array_equal(codes, naive.interleave(cells))
+    assert codes[1] == (1 << 63) - 1
+
+
+def test_thin_equals_twin():
+    raw = seeded_cloud(2, num_points=3000)
+    points, colors = thin(raw.points_world.astype(np.float32), raw.colors, 0.7)
+    expected_points, expected_colors = naive.thin(raw.points_world.astype(np.float32), raw.colors, 0.7)
+    assert points.dtype == np.float32
+    assert colors.dtype == np.uint8
+    np.testing.assert_allclose(points, expected_points, atol=1e-6)
+    np.testing.assert_array_equal(colors, expected_colors)
+
+
+def test_thin_keeps_one_point_in_each_voxel():
+    raw = seeded_cloud(3)
+    points, _ = thin(raw.points_world.astype(np.float32), raw.colors, 0.5)
+    assert len(np.unique(np.floor(points / 0.5), axis=0)) == len(points)
+
+
+def test_thin_refuses_more_voxels_than_the_code_holds():
+    points = np.array([[0, 0, 0], [1e6, 0, 0]], dtype=np.float32)
+    with pytest.raises(InputError, match=r"spans 1e\+06 m, wanted under 4.19e\+04 m for voxels of 0.02 m"):
+        thin(points, np.zeros((2, 3), dtype=np.uint8), 0.02)
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=st.integers(0, 2**32 - 1), step=st.sampled_from([0.0, 0.01, 0.5, 3.0]))
+def test_shuffling_points_changes_no_bit(seed, step, tmp_path_factory):
+    raw = seeded_cloud(seed, step=step)
+    raw.points_world[::7] = np.nan
+    shuffle = np.random.default_rng(seed + 1).permutation(len(raw.colors))
+    shuffled = RawCloud(raw.points_world[shuffle], raw.colors[shuffle])
+    path = tmp_path_factory.getbasetemp()
+    a, b = clean(path, raw, 1.0), clean(path, shuffled, 1.0)
+    assert same_bits(a, b)
+    thin_a, thin_b = thin(a.points, a.colors, 0.3), thin(b.points, b.colors, 0.3)
+    assert thin_a[0].tobytes() == thin_b[0].tobytes()
+    assert thin_a[1].tobytes() == thin_b[1].tobytes()
+
+
+def test_signed_zeros_do_not_tell_points_apart():
+    raw = seeded_cloud(4, step=1.0)
+    flipped = RawCloud(np.where(raw.points_world == 0.0, -raw.points_world, raw.points_world), raw.colors)
+    assert same_bits(clean("a", raw, 1.0), clean("a", flipped, 1.0))
+
+
+def test_order_keeps_neighbours_together():
+    raw = seeded_cloud(5, num_points=20_000)
+    points = raw.points_world.astype(np.float32)
+    steps = np.linalg.norm(np.diff(points[canonical_order(points, raw.colors)], axis=0), axis=1)
+    spacing = (6.0 * 5.0 * 2.5 / 20_000) ** (1 / 3)
+    assert np.median(steps) < 1.5 * spacing
+
+
+def test_order_of_points_in_one_place():
+    points = np.ones((1200, 3), dtype=np.float32)
+    colors = seeded_cloud(6, num_points=1200).colors
+    ordered = colors[canonical_order(points, colors)]
+    assert ordered.tolist() == sorted(colors.tolist())
+
+
+def test_utm_coordinates_keep_their_millimetres():
+    raw = seeded_cloud(7)
+    origin = np.array([637_012.25, 5_849_028.75, 431.5])
+    far = clean("a", RawCloud(raw.points_world + origin, raw.colors), 1.0)
+    assert np.abs(far.origin_world - origin).max() < 1.0
+    np.testing.assert_array_equal(far.origin_world, np.round(far.origin_world))
+    assert np.abs(far.points).max() < 4.0
+    restored = far.points + far.origin_world
+    gaps = np.linalg.norm(restored[:50, None] - (raw.points_world + origin)[None], axis=2).min(axis=1)
+    assert gaps.max() < 1e-6
+
+
+def test_origin_is_the_middle_of_the_box_in_whole_metres():
+    raw = seeded_cloud(8)
+    raw.points_world[:2] = [[0, 0, 0], [20.9, 10, 3.2]]
+    assert clean("a", RawCloud(np.abs(raw.points_world), raw.colors), 1.0).origin_world.tolist() == [10, 5, 2]
+
+
+def test_scale_turns_millimetres_to_metres():
+    raw = seeded_cloud(9)
+    millimetres = RawCloud(raw.points_world * 1000, raw.colors)
+    (warning,) = clean("room.ply", millimetres, 1.0).warnings
+    assert "--scale 0.001" in warning
+    assert "room.ply" in warning
+    metres = clean("room.ply", millimetres, 0.001)
+    assert metres.warnings == ()
+    np.testing.assert_allclose(np.ptp(metres.points, axis=0), np.ptp(raw.points_world, axis=0), rtol=1e-5)
+
+
+def test_one_long_axis_or_few_outliers_are_no_millimetres():
+    raw = seeded_cloud(10, size=(5000.0, 30.0, 10.0))
+    assert clean("a", raw, 1.0).warnings == ()
+    raw = seeded_cloud(11)
+    raw.points_world[:5] = 9000.0
+    assert clean("a", raw, 1.0).warnings == ()
+
+
+def test_points_that_are_not_finite_are_dropped_and_counted():
+    raw = seeded_cloud(12)
+    raw.points_world[10, 0] = math.nan
+    raw.points_world[20, 2] = math.inf
+    raw.points_world[30, 1] = -math.inf
+    cloud = clean("a", raw, 1.0)
+    assert cloud.num_dropped == 3
+    assert len(cloud.points) == len(cloud.colors) == 1497
+    assert np.isfinite(cloud.points).all()
+
+
+def test_too_few_finite_points_are_refused():
+    raw = seeded_cloud(13)
+    raw.points_world[999:] = np.nan
+    with pytest.raises(InputError, match=r"found 999 finite points \(501 with NaN.*wanted at least 1000"):
+        clean("a", raw, 1.0)
+
+
+@pytest.mark.parametrize("value", [0, 1])
+def test_black_clouds_are_refused(value):
+    raw = seeded_cloud(14)
+    with pytest.raises(InputError, match=f"all points are black .brightest value {value} of 255"):
+        clean("a", RawCloud(raw.points_world, np.full_like(raw.colors, value)), 1.0)
+
+
+@pytest.mark.parametrize("value", [1e20, -1.7e308])
+def test_coordinates_beyond_the_earth_are_refused(value):
+    raw = seeded_cloud(15)
+    raw.points_world[3, 1] = value
+    with pytest.raises(InputError, match=r"a coordinate of 1.*wanted all within 1e\+08 m"):
+        clean("a", raw, 1.0)

@@ -1,0 +1,225 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plyfile import PlyData, PlyElement
+from refusals import mutated, read_or_refused
+from test_cloud_order import same_bits, seeded_cloud
+
+from piccolo.cloud import read_cloud
+from piccolo.cloud.ply import read_ply
+from piccolo.errors import InputError
+
+RAW = seeded_cloud(1, num_points=1200)
+RGB = ("red", "green", "blue")
+TRIANGLES = PlyElement.describe(
+    np.array([([0, 1, 2],), ([2, 3, 4],)], dtype=[("vertex_indices", "i4", (3,))]), "face"
+)
+
+
+def vertices(raw=RAW, coordinate="f4", color="u1", names=RGB, brightest=255, extra=()):
+    """The vertex element of a cloud; `extra` names float properties put first."""
+    fields = [*((n, "f4") for n in extra), *((n, coordinate) for n in "xyz"), *((n, color) for n in names)]
+    table = np.zeros(len(raw.colors), dtype=fields)
+    for k in range(3):
+        table["xyz"[k]] = raw.points_world[:, k]
+        table[names[k]] = raw.colors[:, k] * (brightest / 255)
+    return PlyElement.describe(table, "vertex")
+
+
+def write(path, *elements, text=False, byte_order="<", comments=()):
+    PlyData(list(elements), text=text, byte_order=byte_order, comments=list(comments)).write(str(path))
+    return path
+
+
+def content_of(tmp_path, **options):
+    return write(tmp_path / "whole.ply", vertices(), **options).read_bytes()
+
+
+def assert_read_as_written(path, coordinate="f4"):
+    read = read_ply(path)
+    assert read.points_world.dtype == np.float64
+    expected = RAW.points_world.astype(coordinate).astype(np.float64)
+    # in ASCII a number may come back two roundings away
+    np.testing.assert_allclose(read.points_world, expected, rtol=1e-15)
+    np.testing.assert_array_equal(read.colors, RAW.colors)
+
+
+@pytest.mark.parametrize("encoding", [{"byte_order": "<"}, {"byte_order": ">"}, {"text": True}])
+@pytest.mark.parametrize(("color", "brightest"), [("u1", 255), ("u2", 65535), ("f4", 1), ("f8", 1)])
+def test_encodings_and_color_types(tmp_path, encoding, color, brightest):
+    path = write(tmp_path / "a.ply", vertices(color=color, brightest=brightest), **encoding)
+    assert_read_as_written(path)
+
+
+@pytest.mark.parametrize("names", [RGB, ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue")])
+def test_color_names_and_further_properties(tmp_path, names):
+    assert_read_as_written(write(tmp_path / "a.ply", vertices(names=names, extra=("nx", "alpha"))))
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_other_elements_are_left_out(tmp_path, text):
+    cameras = PlyElement.describe(np.ones(3, dtype=[("fx", "f4"), ("id", "u1")]), "camera")
+    path = write(tmp_path / "a.ply", cameras, vertices(), TRIANGLES, text=text)
+    assert_read_as_written(path)
+
+
+@pytest.mark.parametrize("end", [b"\r\n", b"\r"])
+def test_line_ends_and_foreign_comments(tmp_path, end):
+    content = content_of(tmp_path, text=True, comments=["scan by Andre"])
+    path = tmp_path / "a.ply"
+    path.write_bytes(content.replace(b"Andre", "Andr\u00e9 element vertex 5".encode()).replace(b"\n", end))
+    assert_read_as_written(path)
+
+
+def test_content_comes_before_extension(tmp_path):
+    path = write(tmp_path / "cloud with space.txt", vertices())
+    np.testing.assert_array_equal(read_cloud(path).colors, read_cloud(path.rename(tmp_path / "b")).colors)
+
+
+def test_double_coordinates_are_shifted_before_they_are_rounded(tmp_path):
+    far = type(RAW)(RAW.points_world + np.array([637_012.0, 5_849_028.0, 431.0]), RAW.colors)
+    cloud = read_cloud(write(tmp_path / "a.ply", vertices(far, coordinate="f8")))
+    near = read_cloud(write(tmp_path / "b.ply", vertices(coordinate="f8")))
+    assert (cloud.origin_world - near.origin_world).tolist() == [637_012.0, 5_849_028.0, 431.0]
+    np.testing.assert_allclose(cloud.points, near.points, atol=1e-6)
+
+
+@settings(deadline=None, max_examples=10)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_shuffling_vertices_changes_no_bit(seed, tmp_path_factory):
+    folder = tmp_path_factory.getbasetemp()
+    raw = seeded_cloud(seed, num_points=1100, step=0.4)
+    shuffle = np.random.default_rng(seed).permutation(1100)
+    shuffled = type(raw)(raw.points_world[shuffle], raw.colors[shuffle])
+    a = read_cloud(write(folder / "a.ply", vertices(raw)))
+    b = read_cloud(write(folder / "b.ply", vertices(shuffled), text=True))
+    assert same_bits(a, b)
+
+
+def test_nan_vertices_are_dropped_whatever_their_color(tmp_path):
+    element = vertices(color="f4", brightest=1)
+    element.data["x"][:3] = np.nan
+    element.data["red"][:3] = np.nan
+    cloud = read_cloud(write(tmp_path / "a.ply", element))
+    assert (cloud.num_dropped, len(cloud.points)) == (3, 1197)
+
+
+@pytest.mark.parametrize("brightness", [1.5, -0.1, np.nan])
+def test_float_colors_out_of_range_are_refused(tmp_path, brightness):
+    element = vertices(color="f4", brightest=1)
+    element.data["green"][7] = brightness
+    with pytest.raises(InputError, match=r"a colour of .*, wanted 0 to 1 as the header declares the type f4"):
+        read_cloud(write(tmp_path / "a.ply", element))
+
+
+@pytest.mark.parametrize("count", [1201, 10**9, 10**15 - 1])
+@pytest.mark.parametrize("text", [False, True])
+def test_promises_of_more_vertices_are_refused_before_memory_is_taken(tmp_path, text, count):
+    path = tmp_path / "a.ply"
+    content = content_of(tmp_path, text=text)
+    path.write_bytes(content.replace(b"element vertex 1200", b"element vertex %d" % count))
+    with pytest.raises(InputError, match=f"the header promises {count} vertices"):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_cut_files_are_refused(tmp_path, text):
+    path = tmp_path / "a.ply"
+    path.write_bytes(content_of(tmp_path, text=text)[:-40])
+    with pytest.raises(InputError, match=r"the header promises 1200 vertices|has fewer than 6 numbers"):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b"ply\n", b"plx\n", r"begins with b'plx\\n', wanted 'ply'"),
+        (b"end_header", b"end_haeder", "the header has no line 'end_header'"),
+        (b"ascii 1.0", b"ascii 9.0", "broken header .*expected version '1.0'"),
+        (b"property float x", b"property flaot x", "broken header .*flaot"),
+        (b"property float x", b"property float y", "broken header .*two properties with same name"),
+        (b"property float x", b"property list uchar float x", "'vertex' has the list property 'x'"),
+        (b"element vertex 1200", b"element vertex -1", "the header counts '-1' elements"),
+        (b"element vertex 1200", b"element vertex " + b"9" * 5000, "the header counts '9999"),
+        (b"element vertex 1200", b"element points 1200", "no element 'vertex'"),
+        (b"element vertex 1200", b"element vertex 1 200", "broken header"),
+        (b"element vertex 1200", b"element vertex 0", "found 0 finite points"),
+        (b"property uchar red", b"property uchar label", "vertices have x y z label green blue, wanted"),
+        (b"property float z", b"property float h", "vertices have x y h red green blue, wanted"),
+        (b"property uchar red", b"property int red", "'red' is of type i4, wanted uchar 0-255, ushort"),
+        (b"property float z\n", b"", "line 1 after the header has more than 5 numbers|vertices have x y red"),
+        (b"end_header\n", b"end_header\n1 2 3 4 5 6 7\n", "line 1 after the header has more than 6 numbers"),
+        (b"end_header\n", b"end_header\n1 2 3 4 5\n", "line 1 after the header has fewer than 6 numbers"),
+        (
+            b"end_header\n",
+            b"end_header\n1 2 3 4 \x7f 5\n",
+            r"line 1 after .* not all numbers: '1 2 3 4 \\x7f",
+        ),
+        (b"end_header\n", b"end_header\n1 2 3 4 5 256\n", "a colour of 256, wanted 0 to 255"),
+    ],
+)
+def test_broken_files_are_refused(tmp_path, old, new, message):
+    path = tmp_path / "a.ply"
+    path.write_bytes(content_of(tmp_path, text=True).replace(old, new, 1))
+    with pytest.raises(InputError, match=message) as error:
+        read_cloud(path)
+    assert str(path) in str(error.value)
+    assert len(str(error.value)) < 500 + len(str(path))
+
+
+def test_gaussian_splats_are_refused(tmp_path):
+    names = ("f_dc_0", "f_dc_1", "f_dc_2")
+    with pytest.raises(InputError, match="Gaussian splats without red green blue, the vertices have x y z"):
+        read_cloud(write(tmp_path / "a.ply", vertices(color="f4", names=names)))
+
+
+def test_lists_before_the_vertices_are_refused(tmp_path):
+    with pytest.raises(InputError, match="'face' has the list property 'vertex_indices', wanted vertices"):
+        read_cloud(write(tmp_path / "a.ply", TRIANGLES, vertices()))
+
+
+def test_paths_that_are_no_cloud_are_refused(tmp_path):
+    (tmp_path / "empty.ply").touch()
+    (tmp_path / "scan.doc").write_text("1 2 3 4 5 6")
+    for name, message in [
+        ("none.ply", "no such file"),
+        (".", "not a file but a folder"),
+        ("empty.ply", "the file is empty"),
+        ("scan.doc", "unknown format '.doc', wanted a coloured point cloud: .ply, or text"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            read_cloud(tmp_path / name)
+
+
+def test_unreadable_files_are_refused(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise PermissionError(13, "Permission denied")
+
+    path = write(tmp_path / "a.ply", vertices())
+    monkeypatch.setattr(Path, "open", refuse)  # file modes don't stop root, and tests may run as root
+    with pytest.raises(InputError, match=r"a.ply: cannot be read \(Permission denied\)"):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf])
+def test_scales_are_above_zero(tmp_path, scale):
+    with pytest.raises(InputError, match=r"--scale: found .*, wanted a number above 0"):
+        read_cloud(tmp_path / "a.ply", scale=scale)
+
+
+@pytest.mark.parametrize("encoding", [{"byte_order": ">"}, {"text": True}])
+@settings(deadline=None, max_examples=100)
+@given(data=st.data())
+def test_mutated_files_raise_nothing_but_input_error(encoding, data, tmp_path_factory):
+    folder = tmp_path_factory.getbasetemp()
+    content = content_of(folder, **encoding)
+    header_size = content.index(b"end_header\n") + 11
+    header = mutated(data.draw, st.integers, content[:header_size])
+    body = mutated(data.draw, st.integers, content[header_size:])
+    path = folder / "mutated.ply"
+    path.write_bytes(header + body)
+    cloud, _ = read_or_refused(read_cloud, path)
+    assert cloud is None or 1000 <= len(cloud.points) <= 1200

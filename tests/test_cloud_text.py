@@ -1,0 +1,199 @@
+import naive
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from refusals import mutated, read_or_refused
+from test_cloud_order import same_bits, seeded_cloud
+
+from piccolo.cloud import read_cloud
+from piccolo.cloud.rows import NOT_A_NUMBER, PARSED, TOO_FEW, TOO_MANY, parse_rows
+from piccolo.cloud.text import read_text
+from piccolo.errors import InputError
+
+RAW = seeded_cloud(1)
+
+
+def lines_of(raw, separator=" ", color_format="d"):
+    return [
+        separator.join(
+            [*(f"{value:.6f}" for value in point), *(f"{value:{color_format}}" for value in color)]
+        )
+        for point, color in zip(raw.points_world, raw.colors, strict=True)
+    ]
+
+
+def write(path, lines, end="\n"):
+    path.write_bytes((end.join(lines) + end).encode())
+    return path
+
+
+def parsed(text, separator=" ", targets=(0, 1, 2), is_exact=False):
+    """Rows and status of `text`."""
+    data = np.frombuffer(text.encode(), dtype=np.uint8)
+    rows = np.empty((text.count("\n") + text.count("\r") + 1, max(targets) + 1))
+    num_rows, num_lines, _, status = parse_rows(data, 0, ord(separator), np.array(targets), is_exact, rows)
+    return rows[:num_rows], status, num_lines
+
+
+def assert_read_as_written(path, raw=RAW):
+    read = read_text(path)
+    np.testing.assert_allclose(read.points_world, np.round(raw.points_world, 6), rtol=1e-15, atol=1e-15)
+    np.testing.assert_array_equal(read.colors, raw.colors)
+
+
+@pytest.mark.parametrize("separator", [" ", "\t", "   ", ",", ", ", ";"])
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_separators_and_line_ends(tmp_path, separator, end):
+    assert_read_as_written(write(tmp_path / "a.txt", lines_of(RAW, separator), end))
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        ["# made by hand", "", "// another"],
+        ["//X Y Z R G B"],
+        ["X Y Z Red Green Blue", "1500"],
+        ["\ufeffx y z r g b"],
+        ["name of the scan"],
+        ["1500"],
+    ],
+)
+def test_headers_are_passed_over(tmp_path, header):
+    assert_read_as_written(write(tmp_path / "a.asc", header + lines_of(RAW)))
+
+
+def test_comments_and_blank_lines_between_points(tmp_path):
+    lines = lines_of(RAW)
+    assert_read_as_written(write(tmp_path / "a.xyz", [*lines[:700], "# half", "", "  ", "//", *lines[700:]]))
+
+
+def test_header_names_columns(tmp_path):
+    lines = [f"{k},wall,{line}" for k, line in enumerate(lines_of(RAW, ","))]
+    assert_read_as_written(write(tmp_path / "a.csv", ['index,"class",x,y,z,R,G,B', *lines]))
+
+
+def test_further_columns_are_left_out(tmp_path):
+    assert_read_as_written(write(tmp_path / "a.txt", [line + " 0.5 label" for line in lines_of(RAW)]))
+
+
+def test_pts_has_intensity_in_the_fourth_column(tmp_path):
+    lines = [" ".join([*f[:3], "-1613", *f[3:]]) for f in map(str.split, lines_of(RAW))]
+    assert_read_as_written(write(tmp_path / "a.pts", ["1500", *lines]))
+    with pytest.raises(InputError, match="line 2 has the colour -1613"):
+        read_text(write(tmp_path / "a.txt", ["1500", *lines]))
+
+
+def test_float_colors_and_last_line_without_end(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("\n".join(lines_of(RAW, color_format=".2f")))
+    assert_read_as_written(path)
+
+
+def test_nan_points_need_no_color(tmp_path):
+    cloud = read_cloud(
+        write(tmp_path / "a.txt", ["nan nan nan nan nan nan", *lines_of(RAW), "inf 0 0 0 0 -1"])
+    )
+    assert cloud.num_dropped == 2
+    assert len(cloud.points) == 1500
+
+
+def test_shuffling_lines_changes_no_bit(tmp_path):
+    lines = lines_of(seeded_cloud(2, step=0.5))
+    a = read_cloud(write(tmp_path / "a.txt", lines))
+    b = read_cloud(write(tmp_path / "b.txt", np.random.default_rng(3).permutation(lines).tolist()))
+    assert same_bits(a, b)
+
+
+NUMBERS = st.one_of(
+    st.floats(allow_nan=False, width=32).map(repr),
+    st.floats(-1e7, 1e7).map(lambda value: f"{value:.6f}"),
+    st.floats().map(repr),
+    st.integers(-(10**25), 10**25).map(str),
+    st.sampled_from(["+1.5", ".5", "-.25", "7.", "1E3", "1e-320", "1e999", "-1e-999", "0e5", "0e999", "NaN",
+                     "-Inf", "Infinity", "0.1000000000000000055511151231257827021181583404541015625"]),
+)  # fmt: skip
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    table=st.lists(st.lists(NUMBERS, min_size=3, max_size=3), min_size=1, max_size=8),
+    separator=st.sampled_from([" ", ",", ";"]),
+)
+def test_rows_equal_twin(table, separator):
+    text = "\n".join(separator.join(line) for line in table)
+    for targets in [(0, 1, 2), (1, -1, 0)]:
+        expected = naive.parse_rows(text, separator, targets)
+        rows, status, num_lines = parsed(text, separator, targets)
+        assert (status, num_lines) == (PARSED, len(table))
+        np.testing.assert_allclose(rows, expected, rtol=1e-15, atol=1e-290)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("1 2 3\n4 5", (TOO_FEW, 2)),
+        ("1 2 3 4", (TOO_MANY, 1)),
+        ("1 2 3\n\n1 2 x", (NOT_A_NUMBER, 3)),
+        ("1 2 3\r\n1 2 3e\r\n", (NOT_A_NUMBER, 2)),
+        ("1 2 3x", (NOT_A_NUMBER, 1)),
+        ("1 2,5 3", (NOT_A_NUMBER, 1)),
+        ("1 2 .", (NOT_A_NUMBER, 1)),
+        ("1 2 --3", (NOT_A_NUMBER, 1)),
+        ("1 2 na", (NOT_A_NUMBER, 1)),
+        ("1 2\x10 3", (NOT_A_NUMBER, 1)),
+        ("1 2 e5", (NOT_A_NUMBER, 1)),
+    ],
+)
+def test_broken_rows_are_found(text, expected):
+    assert parsed(text, is_exact=True)[1:] == expected
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        ("1.0 2.0 3.0 4 5", r"line 1001 has fewer than 6 columns: '1.0 2.0 3.0 4 5'"),
+        ("1.0 2.\x100 3.0 4 5 6", r"line 1001 is not all numbers: '1.0 2.\\x100 3.0"),
+        ("1,0 2,0 3,0 4 5 6", r"line 1001 is not all numbers"),
+        ("1 2 3 4 5 256", r"line 1001 has the colour 4 5 256, wanted .* colours 0-255"),
+        ("1 2 3 4 -5 6", r"line 1001 has the colour 4 -5 6"),
+        ("1 2 3 4 nan 6", r"line 1001 has the colour 4 nan 6"),
+    ],
+)
+def test_broken_lines_are_named(tmp_path, broken, message):
+    lines = ["# a comment counts", *lines_of(RAW)]
+    path = write(tmp_path / "a.txt", [*lines[:1000], broken, *lines[1000:]])
+    with pytest.raises(InputError, match=message):
+        read_text(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"1 2 3\n" * 2000, r"line 1 has 3 columns \(no colours\?\): '1 2 3', wanted lines of numbers"),
+        (b"\x7fELF\x00\x00\x01 1 2 3 4 5 6\n" * 2000, "holds bytes that are no text"),
+        (b"lorem ipsum\n" * 2000, "no line of numbers at its beginning"),
+        (b"\xff\xfe" + "1 2 3 4 5 6\n".encode("utf-16-le") * 2000, "holds bytes that are no text"),
+        (b"1,5;2,5;3,5;10;20;30\n" * 2000, "line 1 is not all numbers"),
+        (b"1 2 3 4 5 6\n" * 999, "found 999 finite points"),
+        (b"1 2 3 0 0 0\n" * 1000, "all points are black"),
+        (b"", "the file is empty"),
+    ],
+)
+def test_other_content_is_refused(tmp_path, content, message):
+    path = tmp_path / "a.txt"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=message) as error:
+        read_cloud(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@settings(deadline=None, max_examples=60)
+@given(data=st.data())
+def test_mutated_text_raises_nothing_but_input_error(data, tmp_path_factory):
+    path = tmp_path_factory.getbasetemp() / "mutated.txt"
+    content = "\n".join(lines_of(RAW)[:1005]).encode()
+    path.write_bytes(mutated(data.draw, st.integers, content))
+    cloud, _ = read_or_refused(read_cloud, path)
+    assert cloud is None or 1000 <= len(cloud.points) <= 1007
