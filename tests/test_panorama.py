@@ -1,0 +1,296 @@
+import os
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from refusals import mutated, read_or_refused
+
+from piccolo.errors import InputError
+from piccolo.panorama import read_panorama
+
+PNG_HEADER_SIZE = 33  # [byte] magic and IHDR
+
+
+def smooth_rgb(height=64, width=128):
+    """A picture without two like corners, smooth enough for JPEG."""
+    v, u = np.mgrid[:height, :width]
+    channels = [u * 255 // width, v * 255 // height, (u + v) * 200 // (width + height)]
+    return np.stack(channels, axis=2).astype(np.uint8)
+
+
+RGB = smooth_rgb()
+
+
+def encoded(rgb, suffix, options=()):
+    bgr = rgb[:, :, [2, 1, 0, 3][: rgb.shape[2]]] if rgb.ndim == 3 else rgb
+    return cv2.imencode(suffix, bgr, list(options))[1].tobytes()
+
+
+def write(path, content):
+    path.write_bytes(content)
+    return path
+
+
+def png_chunk(kind, content):
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+def png_header(width, height, depth=8, color_type=2):
+    return b"\x89PNG\r\n\x1a\n" + png_chunk(
+        b"IHDR", struct.pack(">IIBBBBB", width, height, depth, color_type, 0, 0, 0)
+    )
+
+
+def tiff(orientation):
+    """EXIF's body with nothing but the orientation."""
+    return b"MM\0*\0\0\0\x08" + struct.pack(">HHHIHHI", 1, 0x112, 3, 1, orientation, 0, 0)
+
+
+def with_orientation(content, orientation):
+    """The JPEG or PNG with EXIF added."""
+    if content.startswith(b"\xff\xd8"):
+        body = b"Exif\0\0" + tiff(orientation)
+        return content[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + content[2:]
+    chunk = png_chunk(b"eXIf", tiff(orientation))
+    return content[:PNG_HEADER_SIZE] + chunk + content[PNG_HEADER_SIZE:]
+
+
+# What a viewer does to the stored picture, by EXIF's number.
+TURNS = {
+    1: lambda image: image,
+    2: np.fliplr,
+    3: lambda image: np.rot90(image, 2),
+    4: np.flipud,
+    5: lambda image: np.swapaxes(image, 0, 1),
+    6: lambda image: np.rot90(image, -1),
+    7: lambda image: np.swapaxes(np.rot90(image, 2), 0, 1),
+    8: np.rot90,
+}
+
+
+def test_png_comes_back_exactly(tmp_path):
+    panorama = read_panorama(write(tmp_path / "a.png", encoded(RGB, ".png")))
+    np.testing.assert_array_equal(panorama.rgb, RGB)
+    assert panorama.rgb.dtype == np.uint8
+    assert panorama.is_valid.shape == (64, 128)
+    assert panorama.is_valid.dtype == np.bool_
+    assert panorama.is_valid.all()
+
+
+@pytest.mark.parametrize("progressive", [0, 1])
+def test_jpeg_comes_back_nearly(tmp_path, progressive):
+    options = [cv2.IMWRITE_JPEG_QUALITY, 98, cv2.IMWRITE_JPEG_PROGRESSIVE, progressive]
+    path = write(tmp_path / "Bild \u00fc 1", encoded(RGB, ".jpg", options))  # content alone tells the format
+    difference = read_panorama(path).rgb.astype(int) - RGB
+    assert np.abs(difference).max() <= 8
+
+
+def test_grey_becomes_rgb(tmp_path):
+    grey = RGB[:, :, 0]
+    for suffix in (".png", ".jpg"):
+        rgb = read_panorama(write(tmp_path / "a", encoded(grey, suffix, [cv2.IMWRITE_JPEG_QUALITY, 100]))).rgb
+        assert rgb.shape == (64, 128, 3)
+        assert np.abs(rgb.astype(int) - grey[:, :, None]).max() <= 2
+
+
+def test_sixteen_bits_become_eight(tmp_path):
+    for image in (RGB, RGB[:, :, 0], np.dstack([RGB, np.full((64, 128), 9, dtype=np.uint8)])):
+        rgb = read_panorama(write(tmp_path / "a.png", encoded(image.astype(np.uint16) * 257, ".png"))).rgb
+        expected = image[:, :, :3] if image.ndim == 3 else image[:, :, None]
+        np.testing.assert_array_equal(rgb, np.broadcast_to(expected, rgb.shape))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_alpha_zero_is_not_valid(tmp_path, dtype):
+    alpha = np.full((64, 128), np.iinfo(dtype).max, dtype=dtype)
+    alpha[50:], alpha[0, 0] = 0, 1
+    rgba = np.dstack([RGB.astype(dtype), alpha])
+    panorama = read_panorama(write(tmp_path / "a.png", encoded(rgba, ".png")))
+    np.testing.assert_array_equal(panorama.is_valid, alpha > 0)
+
+
+def test_transparent_color_is_not_valid(tmp_path):
+    content = encoded(RGB, ".png")
+    transparent = png_chunk(b"tRNS", struct.pack(">HHH", *map(int, RGB[5, 7])))
+    path = write(tmp_path / "a.png", content[:PNG_HEADER_SIZE] + transparent + content[PNG_HEADER_SIZE:])
+    np.testing.assert_array_equal(read_panorama(path).is_valid, (RGB[5, 7] != RGB).any(axis=2))
+
+
+@pytest.mark.parametrize("orientation", TURNS)
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_exif_orientation_is_applied(tmp_path, suffix, orientation):
+    stored = RGB if orientation < 5 else smooth_rgb(128, 64)
+    content = encoded(stored, suffix, [cv2.IMWRITE_JPEG_QUALITY, 98])
+    rgb = read_panorama(write(tmp_path / "a", with_orientation(content, orientation))).rgb
+    assert np.abs(rgb.astype(int) - TURNS[orientation](stored)).max() <= (8 if suffix == ".jpg" else 0)
+
+
+@pytest.mark.parametrize("orientation", TURNS)
+def test_alpha_is_turned_with_the_colors(tmp_path, orientation):
+    stored = RGB if orientation < 5 else smooth_rgb(128, 64)
+    alpha = np.where(stored[:, :, 0] + stored[:, :, 1] // 2 < 90, 0, 200).astype(np.uint8)
+    content = with_orientation(encoded(np.dstack([stored, alpha]), ".png"), orientation)
+    panorama = read_panorama(write(tmp_path / "a.png", content))
+    np.testing.assert_array_equal(panorama.rgb, TURNS[orientation](stored))
+    np.testing.assert_array_equal(panorama.is_valid, TURNS[orientation](alpha) > 0)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "expected"),
+    [
+        (1000, 500, (500, 1000)),
+        (1001, 500, (500, 1000)),
+        (1001, 501, (500, 1000)),
+        (1006, 500, (500, 1000)),
+        (999, 501, (499, 998)),
+        (990, 500, (495, 990)),
+    ],
+)
+def test_nearly_two_to_one_is_shrunk(tmp_path, width, height, expected):
+    stored = np.dstack([smooth_rgb(height, width), np.full((height, width), 255, dtype=np.uint8)])
+    stored[height // 2 :, :, 3] = 0
+    panorama = read_panorama(write(tmp_path / "a.png", encoded(stored, ".png")))
+    assert panorama.rgb.shape == (*expected, 3)
+    np.testing.assert_allclose(panorama.rgb[:, 400].mean(axis=0), stored[:, 400, :3].mean(axis=0), atol=1.5)
+    assert panorama.is_valid[: height // 2 - 4].all()
+    assert not panorama.is_valid[height // 2 :].any()
+
+
+@pytest.mark.parametrize(("width", "height"), [(1000, 700), (400, 195), (64, 128), (500, 500)])
+def test_other_shapes_are_refused(tmp_path, width, height):
+    path = write(tmp_path / "a.png", encoded(smooth_rgb(height, width), ".png"))
+    with pytest.raises(InputError, match=f"found {width} x {height}, wanted width = 2 x height .a full equi"):
+        read_panorama(path)
+
+
+def test_small_pictures_are_refused(tmp_path):
+    for suffix in (".png", ".jpg"):
+        with pytest.raises(InputError, match="found 126 x 63, wanted at least 128 x 64"):
+            read_panorama(write(tmp_path / "a", encoded(smooth_rgb(63, 126), suffix)))
+
+
+def resized_jpeg(width, height):
+    """A JPEG whose header claims another size."""
+    content = encoded(RGB, ".jpg")
+    place = content.index(b"\xff\xc0") + 5
+    return content[:place] + struct.pack(">HH", height, width) + content[place + 4 :]
+
+
+@pytest.mark.parametrize("make", [png_header, resized_jpeg])
+def test_huge_claims_are_refused_before_memory_is_taken(tmp_path, make):
+    ending = png_chunk(b"IDAT", zlib.compress(bytes(100))) + png_chunk(b"IEND", b"")
+    path = write(tmp_path / "a", make(60000, 30000) + ending)
+    with pytest.raises(InputError, match="found 60000 x 30000, wanted at most 32768 x 16384"):
+        read_panorama(path)
+    path = write(tmp_path / "a", make(32768, 16384) + ending)
+    with pytest.raises(InputError, match="found 32768 x 16384 in a file too small for it"):
+        read_panorama(path)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+@pytest.mark.parametrize("part", [0.02, 0.5, 0.9, 0.999])
+def test_cut_files_are_refused(tmp_path, suffix, part, capfd):
+    content = encoded(RGB, suffix)
+    for padding in (0, len(content)):
+        path = write(tmp_path / "a", content[: max(int(part * len(content)), 12)] + bytes(padding))
+        with pytest.raises(InputError, match="cut off"):
+            read_panorama(path)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("progressive", [0, 1])
+@pytest.mark.parametrize("num_zeros", [0, 5000])
+def test_jpeg_cut_in_a_scan_and_mended_is_refused(tmp_path, progressive, num_zeros, capfd):
+    noise = np.random.default_rng(1).integers(0, 256, RGB.shape, dtype=np.uint8)
+    content = encoded(noise, ".jpg", [cv2.IMWRITE_JPEG_PROGRESSIVE, progressive])
+    path = write(tmp_path / "a.jpg", content[: len(content) // 2] + bytes(num_zeros) + b"\xff\xd9")
+    with pytest.raises(InputError, match=r"the picture is damaged \(Corrupt JPEG data"):
+        read_panorama(path)
+    assert capfd.readouterr().err == ""
+
+
+def test_jpeg_with_little_padding_and_things_behind_it_is_read(tmp_path, capfd):
+    noise = np.random.default_rng(2).integers(0, 256, RGB.shape, dtype=np.uint8)
+    content = encoded(noise, ".jpg")
+    whole = read_panorama(write(tmp_path / "a.jpg", content)).rgb
+    padded = read_panorama(
+        write(tmp_path / "b.jpg", content[:-2] + bytes(20) + b"\xff\xd9" + b"film" * 99)
+    ).rgb
+    np.testing.assert_array_equal(whole, padded)
+    assert capfd.readouterr().err == ""
+
+
+def test_stderr_is_given_back(tmp_path, capfd):
+    read_panorama(write(tmp_path / "a.png", encoded(RGB, ".png")))
+    os.write(2, b"heard")
+    assert capfd.readouterr().err == "heard"
+
+
+PNG = encoded(RGB, ".png")
+
+
+def png_of(packed):
+    """A PNG of RGB's size with these packed bytes and right checksums."""
+    return PNG[:PNG_HEADER_SIZE] + png_chunk(b"IDAT", packed) + png_chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "the file is empty"),
+        (b"GIF89a" + bytes(99), "begins with b'GIF89a.*', wanted a whole JPEG or PNG panorama"),
+        (b"\xff\xd8", "the JPEG ends without its end mark"),
+        (b"\xff\xd8" + bytes(999), "the JPEG ends without its end mark"),
+        (PNG[:60] + b"\x01\x02\x03" + PNG[63:], "wrong checksum in the PNG's chunk b'IDAT'"),
+        (PNG[:8] + PNG[PNG_HEADER_SIZE:], "the PNG does not begin with its header"),
+        (png_of(zlib.compress(bytes(9000))), "the picture can't be decoded"),
+        (PNG[:PNG_HEADER_SIZE] + png_chunk(b"IEND", b""), "the picture can't be decoded"),
+    ],
+)
+def test_other_content_is_refused(tmp_path, content, message, capfd):
+    path = write(tmp_path / "a b.jpg", content)
+    with pytest.raises(InputError, match=message) as error:
+        read_panorama(path)
+    assert str(path) in str(error.value)
+    assert capfd.readouterr().err == ""
+
+
+def test_paths_that_are_no_picture_are_refused(tmp_path, monkeypatch):
+    with pytest.raises(InputError, match=r"none.jpg: cannot be read \(No such file or directory\)"):
+        read_panorama(tmp_path / "none.jpg")
+    with pytest.raises(InputError, match="not a file but a folder"):
+        read_panorama(tmp_path)
+
+    def refuse(_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    with pytest.raises(InputError, match=r"cannot be read \(Permission denied\)"):
+        read_panorama(write(tmp_path / "a.png", PNG))
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+@settings(deadline=None, max_examples=120)
+@given(data=st.data())
+def test_mutated_files_raise_nothing_but_input_error(suffix, data, tmp_path_factory):
+    content = encoded(RGB, suffix)
+    begin = data.draw(st.integers(0, len(content) // 3))
+    path = tmp_path_factory.getbasetemp() / "mutated"
+    path.write_bytes(content[:begin] + mutated(data.draw, st.integers, content[begin:]))
+    panorama, _ = read_or_refused(read_panorama, path)
+    assert panorama is None or panorama.rgb.shape[1] == 2 * panorama.rgb.shape[0]
+
+
+@settings(deadline=None, max_examples=60)
+@given(data=st.data())
+def test_mutated_png_with_right_checksums_is_read_or_refused(data, tmp_path_factory):
+    path = tmp_path_factory.getbasetemp() / "mutated.png"
+    rows = np.concatenate([np.zeros((64, 1), dtype=np.uint8), RGB.reshape(64, -1)], axis=1)
+    packed = mutated(data.draw, st.integers, zlib.compress(rows.tobytes()))
+    panorama, message = read_or_refused(read_panorama, write(path, png_of(packed)))
+    assert (panorama is None) == bool(message)
