@@ -63,7 +63,7 @@ def spread(positions: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     while len(chosen) < count:
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, np.linalg.norm(positions - positions[chosen[-1]], axis=1))
-    return positions[np.sort(chosen)]
+    return np.asarray(positions[np.sort(chosen)])
 
 
 def free_grid(points: PackedPoints, num_translations: int, margin: float) -> NDArray[np.float64]:

@@ -1,0 +1,95 @@
+"""The structure of the package, read from its sources."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "piccolo"
+
+# A module may import from the lines above its own, and from its own line only if the line says so.
+LAYERS = [
+    {"errors"},
+    {"jit", "threads", "files"},
+    {"pose", "settings"},
+    {"sphere"},
+    {"panorama", "cloud", "synthetic", "sampling", "pyramid"},
+    {"color", "loss", "render"},
+    {"starts", "overlay"},
+    {"search", "refine", "verify", "result"},
+    {"pipeline"},
+]
+# pyramid shrinks panoramas; points are packed as texels are; the descent needs nothing of the search
+SIDEWAYS = {("pyramid", "panorama"), ("cloud", "sampling")}
+LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
+
+
+def _modules():
+    return sorted(PACKAGE.rglob("*.py"))
+
+
+def _module_name(path):
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def _imported(path):
+    """Names of the package's modules that a file imports."""
+    depth = len(path.relative_to(PACKAGE).parts)
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.level == depth:
+            yield from [node.module.split(".")[0]] if node.module else [alias.name for alias in node.names]
+
+
+@pytest.mark.parametrize("path", _modules(), ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_imports_go_up_the_list(path):
+    name = _module_name(path)
+    if name == "__init__":
+        return
+    assert name in LEVEL, f"{name} has no place in the list of layers"
+    for other in _imported(path):
+        if other in ("__version__", name):
+            continue
+        allowed = LEVEL[other] < LEVEL[name] or (name, other) in SIDEWAYS
+        assert allowed, f"{path.name} imports {other}, which is not above it"
+
+
+@pytest.mark.parametrize("path", [ROOT / "localize.py", *_modules()], ids=lambda p: str(p.relative_to(ROOT)))
+def test_every_function_but_a_kernel_is_annotated(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.FunctionDef):
+            decorators = {d.id for d in node.decorator_list if isinstance(d, ast.Name)}
+            if not decorators & {"kernel", "scalar"}:
+                assert node.returns is not None, f"{path.name}: {node.name} has no annotations"
+
+
+@pytest.mark.parametrize("path", _modules(), ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_print_and_argparse_stay_in_the_command_lines(path):
+    tree = ast.parse(path.read_text())
+    names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+    imports = {a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
+    assert "print" not in names
+    assert "argparse" not in imports
+
+
+def test_every_kernel_has_a_twin_or_a_test_that_names_it():
+    tests = "".join(path.read_text() for path in (ROOT / "tests").glob("*.py"))
+    for path in _modules():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef) and any(
+                isinstance(d, ast.Name) and d.id == "kernel" for d in node.decorator_list
+            ):
+                users = _users(path, node.name)
+                assert any(name in tests for name in users), f"{path.name}: no test reaches {node.name}"
+
+
+def _users(path, name):
+    """The kernel itself and the functions of its file that use it, by any number of steps."""
+    functions = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.FunctionDef)]
+    calls = {f.name: {n.id for n in ast.walk(f) if isinstance(n, ast.Name)} for f in functions}
+    users = {name}
+    while True:
+        more = {f for f, used in calls.items() if used & users} | users
+        if more == users:
+            return users
+        users = more

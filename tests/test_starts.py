@@ -1,0 +1,77 @@
+import numpy as np
+import pytest
+
+from piccolo.cloud.packed import pack_points
+from piccolo.pose import angle_between
+from piccolo.starts import box_grid, free_grid, is_free, spread, uniform_rotations, uniform_yaws
+
+
+def _hollow_box(seed=0, count=40_000):
+    """Points on the walls of a 6 x 4 x 3 m box around (10, 20, 1.5), and of a pillar in it."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-0.5, 0.5, (count, 3))
+    axis = rng.integers(0, 3, count)
+    points[np.arange(count), axis] = rng.choice([-0.5, 0.5], count)
+    walls = points * [6, 4, 3]
+    pillar = points[: count // 4] * [1, 1, 3]
+    return pack_points(
+        (np.concatenate([walls, pillar]) + np.array([10, 20, 1.5])).astype(np.float32),
+        np.full((count + count // 4, 3), 128, dtype=np.uint8),
+    )
+
+
+def test_free_is_inside_and_clear_of_surfaces():
+    points = _hollow_box()
+    assert is_free(points, np.array([8.5, 20.0, 1.5]))
+    assert not is_free(points, np.array([8.5, 21.9, 1.5]))  # 0.1 m from a wall
+    assert not is_free(points, np.array([20.0, 20.0, 1.5]))  # outside
+
+
+@pytest.mark.parametrize("num_translations", [1, 5, 50])
+def test_free_grid_gives_the_number_asked_for_all_free(num_translations):
+    points = _hollow_box()
+    grid = free_grid(points, num_translations, margin=0.0)
+    assert len(grid) == num_translations
+    assert all(is_free(points, position) for position in grid)
+    assert len(np.unique(grid, axis=0)) == num_translations
+
+
+def test_nothing_is_free_in_a_solid():
+    rng = np.random.default_rng(0)
+    solid = pack_points(rng.uniform(0, 1, (20_000, 3)).astype(np.float32), np.zeros((20_000, 3), np.uint8))
+    assert len(free_grid(solid, 5, 0.0)) == 0
+
+
+def test_grid_is_even_and_inside_the_box():
+    grid = box_grid(np.zeros(3), np.array([20.0, 10.0, 2.5]), 50)
+    assert 35 <= len(grid) <= 70
+    assert (grid > 0).all()
+    assert (grid < [20.0, 10.0, 2.5]).all()
+    np.testing.assert_allclose(np.diff(np.unique(grid[:, 0])), np.diff(np.unique(grid[:, 0]))[0])
+
+
+def test_spread_keeps_far_ones():
+    line = np.column_stack([np.arange(11.0), np.zeros(11), np.zeros(11)])
+    np.testing.assert_array_equal(spread(line, 3)[:, 0], [0, 5, 10])
+    assert spread(line, 20) is line
+
+
+def test_yaws_are_even():
+    yaws = uniform_yaws(8)
+    assert angle_between(yaws[0], yaws[1]) == pytest.approx(np.pi / 4)
+    assert angle_between(yaws[7], yaws[0]) == pytest.approx(np.pi / 4)
+
+
+@pytest.mark.parametrize("count", [32, 500])
+def test_rotations_cover_so3_evenly(count):
+    rotations = uniform_rotations(count)
+    np.testing.assert_allclose(
+        rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (count, 1, 1)), atol=1e-12
+    )
+    traces = np.einsum("aij,bij->ab", rotations, rotations)
+    np.fill_diagonal(traces, -1.0)
+    nearest = np.arccos(np.clip((traces.max(axis=1) - 1.0) / 2.0, -1.0, 1.0))
+    # the volume of SO(3) shared evenly gives each rotation a ball of this radius
+    ideal = 2.0 * (6.0 * np.pi / (8.0 * count)) ** (1.0 / 3.0)
+    assert nearest.min() > 0.5 * ideal
+    assert nearest.max() < 2.0 * ideal
