@@ -33,8 +33,9 @@ def interleave(cells, codes):
 def voxel_sums(points, colors, order, begins, positions, color_sums):
     """Sum positions (M, 3) float64 and colours (M, 3) int64 of each run of `order`; begins (M + 1,)."""
     for m in range(len(begins) - 1):
-        x, y, z = 0.0, 0.0, 0.0
-        red, green, blue = 0, 0, 0
+        # typed, so that they don't shrink to float32 and uint8 when run without Numba
+        x, y, z = np.float64(0.0), np.float64(0.0), np.float64(0.0)
+        red, green, blue = np.int64(0), np.int64(0), np.int64(0)
         for k in range(begins[m], begins[m + 1]):
             i = order[k]
             x += points[i, 0]
