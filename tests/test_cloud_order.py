@@ -135,6 +135,13 @@ def test_one_long_axis_or_few_outliers_are_no_millimetres():
     assert clean("a", raw, 1.0).warnings == ()
 
 
+def test_far_outliers_are_warned_of():
+    raw = seeded_cloud(16)
+    raw.points_world[0] = 5e6
+    (warning,) = clean("a", raw, 1.0).warnings
+    assert warning == "a: points 5000004 m apart blur the rest to 0.25 m; remove the outliers"
+
+
 def test_points_that_are_not_finite_are_dropped_and_counted():
     raw = seeded_cloud(12)
     raw.points_world[10, 0] = math.nan

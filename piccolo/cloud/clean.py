@@ -14,6 +14,7 @@ MIN_POINTS = 1000
 MAX_COORDINATE = 1e8  # [m], ten times the Earth: beyond it lie only broken numbers, and float32 gives way
 MIN_BRIGHTEST = 2  # of 255; 16-bit fields that hold 8-bit values come out at 1
 METRES_LIMIT = 2000.0  # [m], a scan wider than this along two axes is more likely in millimetres
+FAR = 16_384.0  # [m] from the origin, where float32 steps by 2 mm
 MAX_SAMPLES = 100_000  # points that the estimate of the extent looks at
 
 
@@ -57,13 +58,19 @@ def _finite(raw: RawCloud) -> tuple[NDArray[np.float64], NDArray[np.uint8], int]
 
 
 def _unit_warnings(path: Path, points: NDArray[np.float32]) -> tuple[str, ...]:
-    """A line if the cloud (N, 3), in canonical order, looks like millimetres.
+    """A line if the cloud (N, 3), in canonical order, looks like millimetres or is too wide for float32.
 
-    The rule: 98 % of the points span more than 2,000 along at least two axes.
+    Millimetres: 98 % of the points span more than 2,000 along at least two axes.
     """
     samples = points[:: 1 + len(points) // MAX_SAMPLES]
     low, high = np.percentile(samples, [1.0, 99.0], axis=0)
-    if np.count_nonzero(high - low > METRES_LIMIT) < 2:
-        return ()
-    size = " x ".join(f"{extent:.0f}" for extent in high - low)
-    return (f"{path}: the cloud spans {size} m; if its unit is the millimetre, set --scale 0.001",)
+    if np.count_nonzero(high - low > METRES_LIMIT) >= 2:
+        size = " x ".join(f"{extent:.0f}" for extent in high - low)
+        return (f"{path}: the cloud spans {size} m; if its unit is the millimetre, set --scale 0.001",)
+    farthest = np.abs(points).max()
+    if farthest > FAR:
+        step = np.spacing(farthest)
+        return (
+            f"{path}: points {2 * farthest:.0f} m apart blur the rest to {step:.2g} m; remove the outliers",
+        )
+    return ()
