@@ -26,7 +26,8 @@ from piccolo.result import LOCALIZED, Result
 from piccolo.settings import PaperSettings
 from piccolo.threads import Workers, num_cores
 
-EXIT_ALL_LOCALIZED, EXIT_SOME_NOT, EXIT_BAD_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED = 0, 1, 3, 4, 130
+EXIT_ALL_LOCALIZED, EXIT_SOME_NOT, EXIT_BAD_USAGE, EXIT_BAD_INPUT, EXIT_INTERNAL = range(5)
+EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
 
 DESCRIPTION = "Find where in a coloured point cloud 360-degree panoramas were taken."
@@ -107,15 +108,13 @@ def settings_from(arguments: argparse.Namespace) -> PaperSettings:
 
 
 def check_arguments(arguments: argparse.Namespace) -> None:
-    """Refuse what can be refused before any file is read."""
+    """Refuse values that no file could make right."""
     if arguments.threads < 1:
         raise InputError(f"--threads: found {arguments.threads}, wanted at least 1")
     if not 0.0 < arguments.scale < 1e6:
         raise InputError(f"--scale: found {arguments.scale}, wanted metres per unit, above 0")
     if arguments.overlay and len(arguments.pano) > 1:
         raise InputError(f"--overlay: found {len(arguments.pano)} panoramas, wanted one")
-    for output in filter(None, (arguments.out, arguments.overlay)):
-        check_output(output, [arguments.cloud, *arguments.pano])
 
 
 @dataclass(frozen=True)
@@ -168,10 +167,10 @@ class Session:
         )
 
 
-def open_session(arguments: argparse.Namespace) -> Session:
-    """Read and prepare the cloud."""
-    settings = settings_from(arguments)
-    check_arguments(arguments)
+def open_session(arguments: argparse.Namespace, settings: PaperSettings) -> Session:
+    """Read and prepare the cloud, after a look at what is to be written."""
+    for output in filter(None, (arguments.out, arguments.overlay)):
+        check_output(output, [arguments.cloud, *arguments.pano])
     if is_first_use() and not arguments.quiet:
         text = f"first use: compiling kernels, once (under half a minute), into {KERNEL_FOLDER}"
         print(text, file=sys.stderr, flush=True)
@@ -214,11 +213,11 @@ def results_of(session: Session) -> Iterator[Result | None]:
         yield result
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace, settings: PaperSettings) -> int:
     """Localize every panorama, write the results, return the exit code."""
     lines: list[str] = []
     is_bad = some_not = False
-    for result in results_of(open_session(arguments)):
+    for result in results_of(open_session(arguments, settings)):
         is_bad |= result is None
         if result is None:
             continue
@@ -245,7 +244,13 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     arguments = build_parser().parse_args(argv)
     try:
-        return run(arguments)
+        check_arguments(arguments)
+        settings = settings_from(arguments)
+    except InputError as error:
+        complain(arguments, error)
+        return EXIT_BAD_USAGE
+    try:
+        return run(arguments, settings)
     except (
         BrokenPipeError
     ):  # the reader of stdout has gone: say nothing, not even when Python flushes at exit

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import minimize
 
 from .cloud.packed import PackedPoints
 from .loss import normal_equations, sampling_loss
@@ -83,6 +82,8 @@ def descend_lbfgs(objective: LossAndGradient, start: Pose, num_iterations: int) 
 
     Parameters are the rotation vector of a turn of the start, R = exp([w]x) R_start, and the camera's shift.
     """
+    from scipy.optimize import minimize  # noqa: PLC0415: a quarter of a second that Adam need not wait for
+
     best = Best(start)
 
     def value(parameters: Array) -> tuple[float, Array]:

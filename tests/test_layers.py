@@ -14,9 +14,10 @@ LAYERS = [
     {"jit", "threads", "files"},
     {"pose", "settings"},
     {"sphere"},
-    {"panorama", "cloud", "synthetic", "sampling", "pyramid"},
+    {"panorama", "cloud", "sampling", "pyramid"},
     {"color", "loss", "render"},
     {"starts", "overlay"},
+    {"synthetic"},
     {"search", "refine", "verify", "result"},
     {"pipeline"},
 ]

@@ -1,0 +1,31 @@
+"""Panoramas of a room at known poses, and what light, lens and file do to them."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from ..pose import Array, Pose
+from ..sphere import pixel_rays
+from ..threads import Workers
+from .raycast import cast
+from .room import Room
+
+SUPERSAMPLING = 2  # rays a pixel, each way
+
+
+def photograph(room: Room, pose: Pose, width: int, workers: Workers) -> NDArray[np.uint8]:
+    """Equirectangular image (width / 2, width, 3) of a room at `pose`."""
+    fine = SUPERSAMPLING * width
+    rays = pixel_rays(fine).reshape(-1, 3) @ pose.R_cam_from_world
+    _, rgb = cast(room, pose.center_world, rays, workers, "panorama")
+    blocks = rgb.reshape(width // 2, SUPERSAMPLING, width, SUPERSAMPLING, 3)
+    return np.asarray(np.round(blocks.mean(axis=(1, 3)) * 255.0).astype(np.uint8))
+
+
+def other_light(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """The image (H, W, 3) with another exposure, white balance and gamma, blurred and noisy."""
+    gain = rng.uniform(0.7, 1.3) * rng.uniform(0.85, 1.15, 3)
+    linear = (rgb / 255.0) ** rng.uniform(0.8, 1.25)
+    blurred: Array = gaussian_filter(linear * gain, (0.8, 0.8, 0.0), mode=("nearest", "wrap", "nearest"))
+    noisy = blurred + rng.normal(0.0, 0.02, rgb.shape)
+    return np.asarray(np.round(noisy.clip(0.0, 1.0) * 255.0).astype(np.uint8))

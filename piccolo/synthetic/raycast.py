@@ -1,0 +1,79 @@
+"""Rays against the boxes of a room: nearest hit and its lit colour."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..jit import kernel
+from ..pose import Array
+from ..threads import Workers
+from .room import Room
+from .texture import pattern_share
+
+AMBIENT = 0.55
+CHUNK = 16_384
+
+
+@kernel
+def hit_boxes(origin, directions, boxes, ranges, hits):
+    """Write the range [m] of the first hit of each ray (N, 3), inf for none, and 3 * box + axis of the face."""
+    for n in range(len(directions)):
+        nearest, hit = np.inf, -1
+        dx, dy, dz = directions[n, 0], directions[n, 1], directions[n, 2]
+        for b in range(len(boxes)):
+            ox, oy, oz = origin[0] - boxes[b, 0], origin[1] - boxes[b, 1], origin[2] - boxes[b, 2]
+            c, s = math.cos(boxes[b, 6]), math.sin(boxes[b, 6])
+            px, py, qx, qy = c * ox + s * oy, c * oy - s * ox, c * dx + s * dy, c * dy - s * dx
+            # A ray along a face divides by zero on purpose: infinities compare as they should.
+            ix, iy, iz = 1.0 / qx, 1.0 / qy, 1.0 / dz
+            hx, hy, hz = abs(boxes[b, 3] * ix), abs(boxes[b, 4] * iy), abs(boxes[b, 5] * iz)
+            near_x, near_y, near_z = -px * ix - hx, -py * iy - hy, -oz * iz - hz
+            near = max(near_x, near_y, near_z)
+            far = min(hx - px * ix, hy - py * iy, hz - oz * iz)
+            if 1e-6 < near < nearest and near <= far:
+                nearest = near
+                hit = 3 * b + (0 if near == near_x else 1 if near == near_y else 2)
+        ranges[n] = nearest
+        hits[n] = hit
+
+
+@kernel
+def shade(origin, directions, ranges, hits, boxes, materials, light, rgb):
+    """Write the colour (N, 3) in [0, 1] of each hit; black where a ray hits nothing."""
+    for n in range(len(directions)):
+        rgb[n, :] = 0.0
+        if hits[n] < 0:
+            continue
+        b, axis = hits[n] // 3, hits[n] % 3
+        x = origin[0] + ranges[n] * directions[n, 0]
+        y = origin[1] + ranges[n] * directions[n, 1]
+        z = origin[2] + ranges[n] * directions[n, 2]
+        c, s = math.cos(boxes[b, 6]), math.sin(boxes[b, 6])
+        ox, oy, oz = x - boxes[b, 0], y - boxes[b, 1], z - boxes[b, 2]
+        px, py = c * ox + s * oy, c * oy - s * ox
+        along, up = (py, oz) if axis == 0 else (px, oz) if axis == 1 else (px, py)
+        m = materials[b]
+        share = pattern_share(np.int64(m[0]), along, up, m[1], np.int64(m[8]) + axis)
+        lx, ly, lz = light[0] - x, light[1] - y, light[2] - z
+        distance2 = lx * lx + ly * ly + lz * lz
+        towards = abs((c * lx + s * ly) if axis == 0 else (c * ly - s * lx) if axis == 1 else lz)
+        lit = AMBIENT + 0.9 * towards / math.sqrt(distance2) / (1.0 + 0.15 * distance2)
+        for k in range(3):
+            rgb[n, k] = min(1.0, lit * (m[2 + k] * (1.0 - share) + m[5 + k] * share))
+
+
+def cast(
+    room: Room, origin: Array, directions: NDArray[np.float64], workers: Workers, label: str
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Ranges (N,) [m] and colours (N, 3) in [0, 1] along unit world `directions` (N, 3) from `origin`."""
+    ranges, rgb = np.empty(len(directions)), np.empty((len(directions), 3))
+
+    def run(lo: int) -> None:
+        part = slice(lo, lo + CHUNK)
+        hits = np.empty(len(ranges[part]), dtype=np.int64)
+        hit_boxes(origin, directions[part], room.boxes, ranges[part], hits)
+        shade(origin, directions[part], ranges[part], hits, room.boxes, room.materials, room.light, rgb[part])
+
+    list(workers.each(run, range(0, len(directions), CHUNK), label))
+    return ranges, rgb

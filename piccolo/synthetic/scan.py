@@ -1,0 +1,49 @@
+"""A laser scanner in a room: ranges from several stations, with noise, shadows and uneven density."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..pose import Array, yaw_rotation
+from ..sphere import pixel_rays
+from ..threads import Workers
+from .raycast import cast
+from .room import Room
+
+RANGE_NOISE = 0.003  # standard deviation [m]
+MIN_CLEARANCE = 0.35  # of a station or camera [m]
+PROBE_WIDTH = 64  # rays that look for the nearest surface
+
+
+def free_position(room: Room, rng: np.random.Generator, heights: tuple[float, float]) -> Array:
+    """A random position (3,) at least MIN_CLEARANCE from every surface, at a height [m] above the floor."""
+    rays = pixel_rays(PROBE_WIDTH).reshape(-1, 3)
+    best, best_clearance = room.corner + room.size / 2, -1.0
+    for _ in range(200):
+        low = np.array([MIN_CLEARANCE, MIN_CLEARANCE, heights[0]])
+        high = np.array([*(room.size[:2] - MIN_CLEARANCE), heights[1]])
+        position = room.corner + rng.uniform(low, high)
+        clearance = float(cast(room, position, rays, Workers(), "probe")[0].min())
+        if clearance >= MIN_CLEARANCE:
+            return position
+        if clearance > best_clearance:
+            best, best_clearance = position, clearance
+    return best  # a room so full that nothing is clear: the clearest
+
+
+def scan_room(
+    room: Room, num_points: int, rng: np.random.Generator, workers: Workers
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Points (num_points, 3) [m] and colours (num_points, 3) of a room, from three stations."""
+    num_stations = 3
+    width = 2 * int(np.ceil(np.sqrt(1.15 * num_points / num_stations / 2.0)))
+    points, colors = [], []
+    for station in range(num_stations):
+        position = free_position(room, rng, (1.2, 1.8))
+        rays = pixel_rays(width).reshape(-1, 3) @ yaw_rotation(rng.uniform(0, 2 * np.pi))
+        ranges, rgb = cast(room, position, rays, workers, f"scan, station {station + 1}")
+        ranges = ranges + rng.normal(0.0, RANGE_NOISE, len(ranges))
+        points.append((position + ranges[:, None] * rays).astype(np.float32))
+        colors.append(np.round(rgb * 255.0).astype(np.uint8))
+    is_hit = np.isfinite(np.concatenate(points)).all(axis=1)
+    chosen = np.sort(rng.choice(np.flatnonzero(is_hit), num_points, replace=False))
+    return np.concatenate(points)[chosen], np.concatenate(colors)[chosen]

@@ -1,0 +1,129 @@
+#!/usr/bin/env python3
+"""Make a seeded furnished room: a coloured scan of it, and panoramas with true poses."""
+
+import argparse
+import json
+import sys
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement
+from tqdm import tqdm
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from piccolo.errors import InputError
+from piccolo.files import write_atomically
+from piccolo.result import CONVENTION
+from piccolo.synthetic.world import VARIANTS, Query, World, make_query, make_world, scan_world
+from piccolo.threads import Workers, num_cores
+
+EPILOG = """\
+examples:
+  python tools/make_room.py --out room --seed 3
+  python tools/make_room.py --out flats --rooms 16 --points 2000000 --panoramas 4 --variants clean photo
+
+Writes FOLDER/cloud.ply, FOLDER/images/VARIANT_K.jpg and FOLDER/queries.json with the true poses.
+clean: as scanned; tilt: the camera turned anyhow; photo: other exposure, white balance, gamma, blur, noise;
+change: furniture moved and added. One JSON object on stdout says what was written.
+exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """All options."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="made if it is not there")
+    parser.add_argument("--seed", type=int, default=0, help="equal seeds, equal bits (default 0)")
+    parser.add_argument("--points", type=int, default=300_000, help="(default 300000)")
+    parser.add_argument("--panoramas", type=int, default=3, help="of each variant (default 3)")
+    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=["clean"], help="(default clean)")
+    parser.add_argument("--width", type=int, default=2048, help="of the panoramas [px] (default 2048)")
+    parser.add_argument("--size", type=float, nargs=3, default=[6.0, 5.0, 2.7], metavar=("X", "Y", "Z"),
+                        help="of a room [m] (default 6 5 2.7)")  # fmt: skip
+    parser.add_argument("--rooms", type=int, default=1, help="side by side, at most 64 (default 1)")
+    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    return parser
+
+
+def ply_bytes(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> bytes:
+    """A binary PLY header and vertices of points (N, 3) and colours (N, 3)."""
+    fields = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+    vertex = np.empty(len(points), dtype=fields)
+    for k, (name, _) in enumerate(fields):
+        vertex[name] = points[:, k] if k < 3 else colors[:, k - 3]
+    header = PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").header
+    return bytes(header.encode("ascii") + b"\n" + vertex.tobytes())
+
+
+def write_query(folder: Path, name: str, query: Query) -> dict[str, object]:
+    """Write the image of a query and return its entry in queries.json."""
+    image = Path("images") / f"{name}.jpg"
+    bgr = cv2.cvtColor(query.rgb, cv2.COLOR_RGB2BGR)
+    quality = 70 if query.variant == "photo" else 95
+    _, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    write_atomically(folder / image, bytes(encoded))
+    return {
+        "image": str(image),
+        "variant": query.variant,
+        "R_cam_from_world": query.pose.R_cam_from_world.tolist(),
+        "center_world": query.pose.center_world.tolist(),
+    }
+
+
+def write_world(arguments: argparse.Namespace, world: World, workers: Workers) -> dict[str, object]:
+    """Write everything and return what was written."""
+    folder: Path = arguments.out
+    points, colors = scan_world(world, arguments.points, workers)
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    write_atomically(folder / "cloud.ply", ply_bytes(points, colors))
+    entries = [
+        write_query(folder, f"{v}_{k}", make_query(world, k, v, arguments.width, workers))
+        for v in arguments.variants
+        for k in range(arguments.panoramas)
+    ]
+    document = {"cloud": "cloud.ply", "convention": CONVENTION, "queries": entries}
+    write_atomically(folder / "queries.json", json.dumps(document, indent=1).encode())
+    return {"folder": str(folder), "points": len(points), "queries": len(entries), "seed": arguments.seed}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    arguments = build_parser().parse_args(argv)
+
+    def show(values: Iterator[Any], total: int, label: str) -> Iterator[Any]:
+        return iter(tqdm(values, label, total, leave=False, disable=arguments.quiet, file=sys.stderr))
+
+    try:
+        if arguments.panoramas < 0 or arguments.seed < 0:
+            raise InputError("--panoramas, --seed: found a negative number, wanted 0 or more")
+        world = make_world(arguments.seed, np.array(arguments.size), arguments.rooms)
+        written = write_world(arguments, world, Workers(num_cores(), show))
+    except KeyboardInterrupt:
+        return complain(arguments, "interrupted", 130)
+    except (OSError, InputError) as error:
+        return complain(arguments, str(error), 3)
+    except Exception as error:  # the last line of defence: a code and one line for the shell
+        return complain(arguments, f"internal error: {error!r}; --debug shows where", 4)
+    print(json.dumps(written))
+    return 0
+
+
+def complain(arguments: argparse.Namespace, text: str, exit_code: int) -> int:
+    """One line on stderr, the traceback if --debug; returns the exit code."""
+    if arguments.debug:
+        traceback.print_exc()
+    print(f"make_room.py: {text}", file=sys.stderr)
+    return exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
