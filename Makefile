@@ -16,7 +16,7 @@ $(VENV)/ready: requirements.lock requirements-dev.lock
 	@touch $@
 
 demo: $(VENV)/ready
-	$(BIN)/python tools/make_room.py --out demo --seed 7 --points 200000 --panoramas 1 --variants clean > /dev/null
+	$(BIN)/python tools/make_room.py --out demo --seed 7 --points 200000 --panoramas 1 > /dev/null
 	$(BIN)/python localize.py --cloud demo/cloud.ply --pano demo/images/clean_0.jpg --out demo/pose.json --overlay demo/overlay.png
 	$(BIN)/python tools/evaluate.py --truth demo/queries.json --results demo/pose.json
 

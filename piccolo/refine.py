@@ -82,7 +82,7 @@ def descend_lbfgs(objective: LossAndGradient, start: Pose, num_iterations: int) 
 
     Parameters are the rotation vector of a turn of the start, R = exp([w]x) R_start, and the camera's shift.
     """
-    from scipy.optimize import minimize  # noqa: PLC0415: a quarter of a second that Adam need not wait for
+    from scipy.optimize import minimize  # noqa: PLC0415  # Adam need not wait for it: 0.25 s
 
     best = Best(start)
 

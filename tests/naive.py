@@ -73,3 +73,21 @@ def parse_rows(text, separator, targets):
             fields = line.split(separator if separator != " " else None)
             rows.append([float(fields[list(targets).index(column)]) for column in range(max(targets) + 1)])
     return np.array(rows)
+
+
+def nearest_box(origin, directions, boxes):
+    """Range (N,) of the first of the boxes (B, 7) along each direction (N, 3): by planes, not by slabs."""
+    best = np.full(len(directions), np.inf)
+    for x, y, z, hx, hy, hz, yaw in boxes:
+        c, s = math.cos(yaw), math.sin(yaw)
+        to_box = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        start, rays, half = to_box @ (origin - [x, y, z]), directions @ to_box.T, np.array([hx, hy, hz])
+        for axis in range(3):
+            for side in (-1.0, 1.0):
+                with np.errstate(divide="ignore"):
+                    at = (side * half[axis] - start[axis]) / rays[:, axis]
+                hits = np.abs(start + at[:, None] * rays) <= half + 1e-12
+                hits[:, axis] = True
+                entering = side * rays[:, axis] < 0
+                best = np.where(hits.all(axis=1) & (at > 1e-6) & entering & (at < best), at, best)
+    return best

@@ -17,7 +17,7 @@ CHUNK = 16_384
 
 @kernel
 def hit_boxes(origin, directions, boxes, ranges, hits):
-    """Write the range [m] of the first hit of each ray (N, 3), inf for none, and 3 * box + axis of the face."""
+    """Write the range [m] of each ray's (N, 3) first hit, inf for none, and 3 * box + axis of the face."""
     for n in range(len(directions)):
         nearest, hit = np.inf, -1
         dx, dy, dz = directions[n, 0], directions[n, 1], directions[n, 2]

@@ -126,7 +126,7 @@ def _crate(b: _Builder, at: Array, yaw: float) -> None:
 
 
 def _furniture(b: _Builder, size: Array, moves: np.random.Generator | None) -> None:
-    """Pieces on the floor, about one in 3 m2, and a rug; half of the pieces go elsewhere if there are `moves`."""
+    """A rug and about one piece in 3 m2; half of the pieces go elsewhere if there are `moves`."""
     num_pieces = max(3, round(size[0] * size[1] / 3.0))
     seeds = b.rng.integers(0, 1 << 30, num_pieces)
     rug = [size[0] * b.rng.uniform(0.3, 0.6), size[1] * b.rng.uniform(0.3, 0.6), 0.01]

@@ -1,0 +1,44 @@
+"""Seeded synthetic rooms, small and quick, kept for all tests of a run."""
+
+import functools
+
+import numpy as np
+
+from piccolo.cloud.model import Cloud
+from piccolo.cloud.order import canonical_order
+from piccolo.panorama import Panorama
+from piccolo.pose import angle_between
+from piccolo.synthetic.world import make_query, make_world, scan_world
+from piccolo.threads import Workers
+
+SIZE = (4.5, 3.5, 2.5)
+NUM_POINTS = 60_000
+WIDTH = 512
+
+
+@functools.lru_cache
+def room(seed):
+    """World of one room, and its cloud as a file would be read: shifted and in Morton order."""
+    world = make_world(seed, np.array(SIZE))
+    points, colors = scan_world(world, NUM_POINTS, Workers(2))
+    origin_world = np.round((points.min(axis=0).astype(float) + points.max(axis=0)) / 2)
+    points = (points - origin_world).astype(np.float32)
+    order = canonical_order(points, colors)
+    return world, Cloud(points[order], colors[order], origin_world)
+
+
+@functools.lru_cache
+def query(seed, variant="clean", index=0):
+    """A panorama of a room with its true pose in the world."""
+    return make_query(room(seed)[0], index, variant, WIDTH, Workers(2))
+
+
+def as_panorama(rgb):
+    """An image (H, W, 3) as it is read, all pixels valid."""
+    return Panorama(rgb, np.ones(rgb.shape[:2], dtype=bool))
+
+
+def errors(pose, true_pose):
+    """Position error [m] and rotation error [deg]."""
+    distance = np.linalg.norm(pose.center_world - true_pose.center_world)
+    return distance, np.degrees(angle_between(pose.R_cam_from_world, true_pose.R_cam_from_world))

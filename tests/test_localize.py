@@ -1,0 +1,235 @@
+"""The command line, in processes of its own where signals and streams matter."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from rooms import errors, query
+
+import localize
+from piccolo.pose import Pose
+from piccolo.result import Result
+from tools import evaluate, make_room
+
+ROOT = Path(__file__).resolve().parents[1]
+QUICK = ["--translations", "30", "--iterations", "60", "--max-points", "30000"]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A folder, with a space in its name, of one room and two panoramas."""
+    folder = tmp_path_factory.mktemp("a scene")
+    arguments = [
+        "--out",
+        str(folder),
+        "--seed",
+        "7",
+        "--points",
+        "60000",
+        "--panoramas",
+        "2",
+        "--width",
+        "512",
+    ]
+    assert make_room.main([*arguments, "--size", "4.5", "3.5", "2.5", "--quiet"]) == 0
+    return folder
+
+
+def _arguments(scene, *more):
+    return [
+        "--cloud",
+        str(scene / "cloud.ply"),
+        "--pano",
+        str(scene / "images" / "clean_0.jpg"),
+        *QUICK,
+        *more,
+    ]
+
+
+def _truth(scene, k):
+    entry = json.loads((scene / "queries.json").read_text())["queries"][k]
+    return Pose(np.array(entry["R_cam_from_world"]), np.array(entry["center_world"]))
+
+
+def test_pose_on_stdout_and_a_summary_on_stderr(scene, capsys):
+    assert localize.main(_arguments(scene)) == 0
+    out, err = capsys.readouterr()
+    result = Result.from_json(out)
+    distance, angle_deg = errors(result.pose, _truth(scene, 0))
+    assert distance < 0.03
+    assert angle_deg < 0.5
+    assert set(result.seconds) == {"read", "prepare", "search", "refine"}
+    assert "localized at" in err
+    assert out.count("\n") == 1
+
+
+def test_quiet_says_nothing(scene, capsys):
+    assert localize.main(_arguments(scene, "--quiet")) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_files_are_written_and_look_right(scene, tmp_path, capsys):
+    out, overlay = tmp_path / "pose.json", tmp_path / "overlay.png"
+    assert localize.main(_arguments(scene, "--out", str(out), "--overlay", str(overlay), "--quiet")) == 0
+    assert capsys.readouterr().out == ""
+    assert Result.from_json(out.read_text()).status == "localized"
+    photo, cloud, checkerboard = np.split(cv2.imread(str(overlay)).astype(float), 3)
+    assert photo.shape == (512, 1024, 3)
+    assert np.abs(photo - cloud).mean() < 20
+    tile = np.s_[128:192, 0:64], np.s_[128:192, 64:128]
+    assert (checkerboard[tile[0]] == photo[tile[0]]).all()
+    assert (checkerboard[tile[1]] == cloud[tile[1]]).all()
+
+
+def test_many_panoramas_one_line_each_and_one_bad_among_them(scene, tmp_path, capsys):
+    bad = tmp_path / "bad.jpg"
+    bad.write_bytes(b"\xff\xd8\xff nothing more")
+    panos = [str(scene / "images" / "clean_0.jpg"), str(bad), str(scene / "images" / "clean_1.jpg")]
+    code = localize.main(["--cloud", str(scene / "cloud.ply"), "--pano", *panos, *QUICK, "--quiet"])
+    out, err = capsys.readouterr()
+    assert code == 3
+    assert [Path(json.loads(line)["pano"]).name for line in out.splitlines()] == [
+        "clean_0.jpg",
+        "clean_1.jpg",
+    ]
+    assert err.count("\n") == 1
+    assert "bad.jpg" in err
+
+
+def test_panorama_from_elsewhere_exits_with_one(scene, tmp_path, capsys):
+    elsewhere = tmp_path / "elsewhere.png"
+    cv2.imwrite(str(elsewhere), query(1).rgb)
+    code = localize.main(["--cloud", str(scene / "cloud.ply"), "--pano", str(elsewhere), *QUICK, "--quiet"])
+    assert code == 1
+    assert json.loads(capsys.readouterr().out)["status"] == "not_localized"
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "message"),
+    [
+        (["--threads", "0"], 2, "--threads: found 0, wanted at least 1"),
+        (["--scale", "-1"], 2, "--scale: found -1.0"),
+        (["--translations", "0"], 2, "num_translations: found 0"),
+        (["--overlay", "x.png", "--pano", "a", "b"], 2, "--overlay: found 2 panoramas, wanted one"),
+        (["--cloud", "no such.ply"], 3, "no such.ply"),
+        (["--pano", "no such.jpg"], 3, "no such.jpg"),
+        (["--out", "/no such folder/pose.json"], 3, "found no folder /no such folder"),
+    ],
+)
+def test_bad_input_is_one_line_and_a_code(scene, options, code, message, capsys):
+    assert localize.main(_arguments(scene, "--quiet", *options)) == code
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert err.startswith("localize.py: ")
+    assert message in err
+
+
+def test_input_is_never_overwritten(scene, capsys):
+    cloud = scene / "cloud.ply"
+    before = cloud.stat().st_mtime_ns
+    assert localize.main(_arguments(scene, "--out", str(cloud))) == 3
+    assert "an input as the output" in capsys.readouterr().err
+    assert cloud.stat().st_mtime_ns == before
+
+
+def test_traceback_only_with_debug(scene, capsys):
+    localize.main(_arguments(scene, "--cloud", "no.ply"))
+    assert "Traceback" not in capsys.readouterr().err
+    localize.main(_arguments(scene, "--cloud", "no.ply", "--debug"))
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_internal_error_has_its_code(scene, capsys, monkeypatch):
+    def fail(*_):
+        raise ZeroDivisionError("made by the test")
+
+    monkeypatch.setattr(localize, "prepare", fail)
+    assert localize.main(_arguments(scene, "--quiet")) == 4
+    assert "internal error: ZeroDivisionError" in capsys.readouterr().err
+
+
+def test_usage_and_version(capsys):
+    for options, code in ((["--version"], 0), (["--help"], 0), ([], 2), (["--cloud", "a", "--odd"], 2)):
+        with pytest.raises(SystemExit) as stop:
+            localize.main(options)
+        assert stop.value.code == code
+    assert "exit codes" in capsys.readouterr().out
+
+
+def _process(arguments, **options):
+    command = [sys.executable, str(ROOT / "localize.py"), *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
+
+
+def test_interrupt_leaves_nothing_half_written(scene, tmp_path):
+    out = tmp_path / "pose.json"
+    process = _process(_arguments(scene, "--translations", "5000", "--out", str(out)), cwd=tmp_path)
+    time.sleep(2.0)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_closed_pipe_is_no_error_message(scene):
+    with _process(_arguments(scene, "--quiet")) as process:
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 141
+
+
+def test_first_use_is_announced_and_two_processes_may_share_it(scene, tmp_path):
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
+    processes = [_process(_arguments(scene, "--translations", "4"), env=environment) for _ in range(2)]
+    said = [process.communicate(timeout=120) for process in processes]
+    assert all("first use: compiling kernels" in err for _, err in said)
+    poses = [json.loads(out)["center_world"] for out, _ in said]
+    assert poses[0] == poses[1]
+    again = _process(_arguments(scene, "--translations", "4"), env=environment)
+    out, err = again.communicate(timeout=60)
+    assert "compiling" not in err
+    assert json.loads(out)["center_world"] == poses[0]
+
+
+def test_results_are_evaluated_against_the_truth(scene, tmp_path, capsys):
+    panos = [str(scene / "images" / f"clean_{k}.jpg") for k in (0, 1)]
+    results = tmp_path / "poses.jsonl"
+    localize.main(
+        ["--cloud", str(scene / "cloud.ply"), "--pano", *panos, *QUICK, "--quiet", "--out", str(results)]
+    )
+    truth = str(scene / "queries.json")
+    assert evaluate.main(["--truth", truth, "--results", str(results)]) == 0
+    table = capsys.readouterr().out
+    assert re.search(r"\| clean_0.jpg \| localized \| 0\.0\d+ \|", table)
+    assert re.search(r"\| clean \| 2 \|", table)
+    (tmp_path / "odd.json").write_text("{}")
+    assert evaluate.main(["--truth", str(tmp_path / "odd.json"), "--results", str(results)]) == 3
+    assert "wanted a queries.json" in capsys.readouterr().err
+    (tmp_path / "empty.jsonl").write_text("\n")
+    assert evaluate.main(["--truth", truth, "--results", str(tmp_path / "empty.jsonl")]) == 3
+    assert "found no result" in capsys.readouterr().err
+
+
+def _readme_commands():
+    blocks = re.findall(r"(?:^    python .*\n)+", (ROOT / "README.md").read_text(), flags=re.MULTILINE)
+    return next(block for block in blocks if "make_room" in block).strip().splitlines()
+
+
+def test_readme_pipeline_runs_as_written(tmp_path):
+    for command in _readme_commands():
+        script = command.strip().replace("python ", f"'{sys.executable}' '{ROOT}'/", 1)
+        done = subprocess.run(
+            ["bash", "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+    assert "| clean | 2 | 2 |" in done.stdout

@@ -1,0 +1,73 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from rooms import as_panorama, errors, query, room
+
+from piccolo.cloud.packed import pack_points
+from piccolo.pose import Pose, step, yaw_rotation
+from piccolo.refine import Adam, Best, descend_lbfgs, refine
+from piccolo.sampling import pack_texels
+from piccolo.settings import PaperSettings
+
+PERTURBATION = np.array([0.05, -0.04, 0.12, 0.15, -0.12, 0.08])  # rad, m
+
+
+@pytest.fixture(scope="module")
+def scene():
+    cloud = room(1)[1]
+    taken = query(1)
+    center = taken.pose.center_world - cloud.origin_world
+    points = pack_points(cloud.points, cloud.colors)
+    return points, pack_texels(as_panorama(taken.rgb).rgb), Pose(taken.pose.R_cam_from_world, center)
+
+
+@pytest.mark.parametrize("solver", ["adam", "lbfgs"])
+@pytest.mark.parametrize("use_visibility", [True, False])
+def test_descent_recovers_the_true_pose(scene, solver, use_visibility):
+    points, texels, true_pose = scene
+    settings = dataclasses.replace(PaperSettings(), solver=solver, use_visibility=use_visibility)
+    refined = refine(points, texels, step(true_pose, PERTURBATION), settings)
+    distance, angle_deg = errors(refined.pose, true_pose)
+    assert distance < 0.010
+    assert angle_deg < 0.3
+
+
+def test_adam_decays_after_patience_stalled_losses():
+    adam = Adam(step_size=0.1, step_decay=0.8, patience=5)
+    for loss in [1.0] + [1.0] * 4:
+        adam.update(loss, np.ones(6))
+    assert adam.step_size == 0.1
+    adam.update(1.0, np.ones(6))
+    assert adam.step_size == pytest.approx(0.08)
+
+
+def test_adams_first_step_is_the_step_size_against_the_gradient():
+    delta = Adam(0.1, 0.8, 5).update(1.0, np.array([3.0, -0.001, 0, 0, 0, 7.0]))
+    np.testing.assert_allclose(delta, [-0.1, 0.1, 0, 0, 0, -0.1], rtol=1e-4)
+
+
+def test_best_iterate_is_kept_not_the_last():
+    best = Best(Pose(np.eye(3), np.zeros(3)))
+    for x, loss in ((1.0, 0.5), (2.0, 0.3), (3.0, 0.4)):
+        best.offer(Pose(np.eye(3), np.array([x, 0, 0])), loss)
+    assert best.loss == 0.3
+    assert best.pose.center_world[0] == 2.0
+
+
+def test_lbfgs_follows_a_gradient_in_steps_of_the_camera():
+    """A bowl about a known pose, its gradient by steps: a wrong chain rule would not arrive."""
+    goal = step(
+        Pose(yaw_rotation(0.5), np.array([1.0, 2.0, 3.0])), np.array([0.3, -0.2, 0.4, 0.5, 0.4, -0.3])
+    )
+    x_world = np.random.default_rng(0).normal(size=(20, 3))
+
+    def objective(pose):
+        p = (x_world - pose.center_world) @ pose.R_cam_from_world.T
+        e = p - (x_world - goal.center_world) @ goal.R_cam_from_world.T
+        return 0.5 * (e**2).sum(), np.concatenate([np.cross(p, e).sum(axis=0), -e.sum(axis=0)])
+
+    start = Pose(yaw_rotation(0.5), np.array([1.0, 2.0, 3.0]))
+    best = descend_lbfgs(objective, start, 100)
+    np.testing.assert_allclose(best.pose.center_world, goal.center_world, atol=1e-4)
+    np.testing.assert_allclose(best.pose.R_cam_from_world, goal.R_cam_from_world, atol=1e-4)

@@ -1,0 +1,116 @@
+import json
+
+import naive
+import numpy as np
+import pytest
+from rooms import WIDTH, query, room
+
+from piccolo.cloud import read_cloud
+from piccolo.errors import InputError
+from piccolo.sphere import pixel_rays
+from piccolo.synthetic.raycast import cast
+from piccolo.synthetic.room import make_room
+from piccolo.synthetic.world import make_query, make_world, scan_world
+from piccolo.threads import Workers
+from tools import make_room as tool
+
+SMALL = np.array([3.0, 3.0, 2.4])
+
+
+def test_rays_equal_their_twin():
+    this = make_room(5, SMALL, np.zeros(3))
+    rng = np.random.default_rng(0)
+    rays = rng.normal(size=(2000, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    origin = np.array([1.4, 1.6, 1.7])
+    ranges, rgb = cast(this, origin, rays, Workers(), "")
+    np.testing.assert_allclose(ranges, naive.nearest_box(origin, rays, this.boxes), rtol=1e-9)
+    assert ((rgb >= 0) & (rgb <= 1)).all()
+    assert (rgb.max(axis=1) > 0.02).mean() > 0.99
+
+
+def test_same_seed_same_bits_at_any_number_of_threads():
+    a, b = (scan_world(make_world(1, SMALL), 5000, Workers(n)) for n in (1, 2))
+    np.testing.assert_array_equal(a[0], b[0])
+    np.testing.assert_array_equal(a[1], b[1])
+
+
+def test_rooms_of_equal_size_do_not_look_alike():
+    rays = pixel_rays(64).reshape(-1, 3)
+    views = [cast(make_room(s, SMALL, np.zeros(3)), SMALL / 2, rays, Workers(), "")[1] for s in range(4)]
+    for i in range(4):
+        for j in range(i):
+            assert np.abs(views[i] - views[j]).mean() > 0.05
+
+
+def test_scan_stays_inside_the_walls_and_keeps_rooms_apart():
+    world = make_world(2, SMALL, num_rooms=2)
+    points, _ = scan_world(world, 8000, Workers(2))
+    inside = [
+        ((points > r.corner - 0.03) & (points < r.corner + r.size + 0.03)).all(axis=1) for r in world.rooms
+    ]
+    assert (inside[0] | inside[1]).all()
+    assert inside[0].sum() == inside[1].sum() == 4000
+
+
+@pytest.mark.parametrize("variant", ["clean", "tilt"])
+def test_panorama_shows_the_scans_colours_where_the_convention_puts_them(variant):
+    """A wrong frame, a mirrored axis or a seam half a turn off would make the colours disagree."""
+    cloud = room(1)[1]
+    taken = query(1, variant)
+    points = cloud.points + cloud.origin_world
+    pose = taken.pose
+    depth = naive.nearest_depth(points, pose.R_cam_from_world, pose.center_world, 180)
+    pixels = naive.project(points, pose.R_cam_from_world, pose.center_world, WIDTH)
+    cells = np.minimum((pixels * 180 / WIDTH).astype(int), [179, 89])
+    ranges = np.linalg.norm(points - pose.center_world, axis=1)
+    visible = ranges <= depth[cells[:, 1], cells[:, 0]] * 1.05 + 0.05
+    difference = np.abs(naive.sample(taken.rgb, pixels[visible]) - cloud.colors[visible])
+    assert visible.mean() > 0.3
+    assert np.median(difference) < 4.0
+
+
+def test_change_alters_a_part_of_the_sphere_and_photo_all_of_it():
+    world = make_world(4, SMALL)
+    rays = pixel_rays(128).reshape(-1, 3)
+    before, after = (make_room(4 * 64, SMALL, np.zeros(3), changed) for changed in (0, 1))
+    a, b = (cast(r, SMALL / 2, rays, Workers(), "")[1] for r in (before, after))
+    assert 0.05 < (np.abs(a - b).max(axis=1) > 0.02).mean() < 0.7
+    clean, photo = (make_query(world, 0, v, 128, Workers()).rgb for v in ("clean", "photo"))
+    assert clean.shape == photo.shape == (64, 128, 3)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: make_world(0, np.array([1.0, 3.0, 2.4])), r"size: found \[1.0, 3.0, 2.4\], wanted at least"),
+        (lambda: make_world(0, SMALL, 65), "rooms: found 65, wanted 1 to 64"),
+        (lambda: scan_world(make_world(0, SMALL), 10, Workers()), "points: found 10, wanted at least 1000"),
+        (lambda: make_query(make_world(0, SMALL), 0, "odd", 128, Workers()), "variant: found 'odd'"),
+        (lambda: make_query(make_world(0, SMALL), 0, "clean", 127, Workers()), "width: found 127"),
+    ],
+)
+def test_refusals(call, message):
+    with pytest.raises(InputError, match=message):
+        call()
+
+
+def test_command_line_writes_a_world_that_reads_back(tmp_path, capsys):
+    folder = tmp_path / "a room"
+    arguments = ["--out", str(folder), "--points", "3000", "--width", "128", "--panoramas", "2"]
+    assert tool.main([*arguments, "--size", "3", "3", "2.4", "--variants", "clean", "photo", "--quiet"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["queries"] == 4
+    assert err == ""
+    assert len(read_cloud(folder / "cloud.ply").points) == 3000
+    document = json.loads((folder / "queries.json").read_text())
+    assert [e["image"] for e in document["queries"]] == [
+        f"images/{v}_{k}.jpg" for v in ("clean", "photo") for k in (0, 1)
+    ]
+    assert all((folder / e["image"]).is_file() for e in document["queries"])
+
+
+def test_command_line_refuses_in_one_line(tmp_path, capsys):
+    assert tool.main(["--out", str(tmp_path / "r"), "--points", "10"]) == 3
+    assert capsys.readouterr().err == "make_room.py: points: found 10, wanted at least 1000 a room\n"
+    assert not (tmp_path / "r").exists()
