@@ -6,8 +6,9 @@ import numpy as np
 
 from piccolo.cloud.model import Cloud
 from piccolo.cloud.order import canonical_order
+from piccolo.cloud.packed import pack_points
 from piccolo.panorama import Panorama
-from piccolo.pose import angle_between
+from piccolo.pose import Pose, angle_between
 from piccolo.synthetic.world import make_query, make_world, scan_world
 from piccolo.threads import Workers
 
@@ -42,3 +43,10 @@ def errors(pose, true_pose):
     """Position error [m] and rotation error [deg]."""
     distance = np.linalg.norm(pose.center_world - true_pose.center_world)
     return distance, np.degrees(angle_between(pose.R_cam_from_world, true_pose.R_cam_from_world))
+
+
+def scene(seed):
+    """A room's points as kernels read them, a panorama of it, and its true pose near the local origin."""
+    cloud, taken = room(seed)[1], query(seed)
+    pose = Pose(taken.pose.R_cam_from_world, taken.pose.center_world - cloud.origin_world)
+    return pack_points(cloud.points, cloud.colors), as_panorama(taken.rgb), pose

@@ -2,9 +2,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-from rooms import as_panorama, errors, query, room
+import rooms
+from rooms import errors
 
-from piccolo.cloud.packed import pack_points
 from piccolo.pose import Pose, step, yaw_rotation
 from piccolo.refine import Adam, Best, descend_lbfgs, refine
 from piccolo.sampling import pack_texels
@@ -15,17 +15,14 @@ PERTURBATION = np.array([0.05, -0.04, 0.12, 0.15, -0.12, 0.08])  # rad, m
 
 @pytest.fixture(scope="module")
 def scene():
-    cloud = room(1)[1]
-    taken = query(1)
-    center = taken.pose.center_world - cloud.origin_world
-    points = pack_points(cloud.points, cloud.colors)
-    return points, pack_texels(as_panorama(taken.rgb).rgb), Pose(taken.pose.R_cam_from_world, center)
+    return rooms.scene(1)
 
 
 @pytest.mark.parametrize("solver", ["adam", "lbfgs"])
 @pytest.mark.parametrize("use_visibility", [True, False])
 def test_descent_recovers_the_true_pose(scene, solver, use_visibility):
-    points, texels, true_pose = scene
+    points, panorama, true_pose = scene
+    texels = pack_texels(panorama.rgb)
     settings = dataclasses.replace(PaperSettings(), solver=solver, use_visibility=use_visibility)
     refined = refine(points, texels, step(true_pose, PERTURBATION), settings)
     distance, angle_deg = errors(refined.pose, true_pose)

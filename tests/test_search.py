@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
-from rooms import as_panorama, query, room
+import rooms
 
-from piccolo.cloud.packed import pack_points
 from piccolo.pose import Pose, yaw_rotation
 from piccolo.pyramid import shrink
 from piccolo.sampling import pack_texels
@@ -37,14 +36,7 @@ def test_diverse_best_are_kept_and_infinite_scores_are_not():
 
 @pytest.fixture(scope="module")
 def scene():
-    cloud = room(1)[1]
-    taken = query(1)
-    center = taken.pose.center_world - cloud.origin_world
-    return (
-        pack_points(cloud.points, cloud.colors),
-        as_panorama(taken.rgb),
-        Pose(taken.pose.R_cam_from_world, center),
-    )
+    return rooms.scene(1)
 
 
 def test_true_rotation_has_the_smallest_loss(scene):

@@ -1,23 +1,16 @@
 import numpy as np
 import pytest
-from rooms import as_panorama, query, room
+import rooms
+from rooms import as_panorama
 
-from piccolo.cloud.packed import pack_points
 from piccolo.panorama import Panorama
-from piccolo.pose import Pose, step
+from piccolo.pose import step
 from piccolo.verify import MIN_SCORE, evidence_at, local_contrast
 
 
 @pytest.fixture(scope="module")
 def scene():
-    cloud = room(1)[1]
-    taken = query(1)
-    center = taken.pose.center_world - cloud.origin_world
-    return (
-        pack_points(cloud.points, cloud.colors),
-        as_panorama(taken.rgb),
-        Pose(taken.pose.R_cam_from_world, center),
-    )
+    return rooms.scene(1)
 
 
 def test_true_pose_scores_high_and_wrong_ones_low(scene):
