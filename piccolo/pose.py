@@ -62,6 +62,12 @@ def angle_between(R_a: Array, R_b: Array) -> float:
     return float(np.arctan2(sine, 0.5 * (np.trace(relative) - 1.0)))
 
 
+def are_same(a: Pose, b: Pose, min_distance: float, min_angle: float) -> bool:
+    """True for poses closer than `min_distance` [m] and turned by less than `min_angle` [rad]."""
+    distance = float(np.linalg.norm(a.center_world - b.center_world))
+    return distance < min_distance and angle_between(a.R_cam_from_world, b.R_cam_from_world) < min_angle
+
+
 def yaw_rotation(yaw: float) -> Array:
     """R_cam_from_world (3, 3) of an upright camera whose image centre looks along azimuth `yaw` [rad]."""
     c, s = np.cos(yaw), np.sin(yaw)

@@ -8,6 +8,7 @@ import numpy as np
 from . import __version__
 from .errors import InputError
 from .pose import Pose, T_world_from_cam, quaternion_wxyz
+from .verify import Evidence
 
 FORMAT = "piccolo-pose/1"
 LOCALIZED = "localized"
@@ -17,6 +18,17 @@ CONVENTION = (
     "+y_cam left, +z_cam up; u = (1/2 - atan2(y, x) / 2 pi) W, v = (1/2 - atan2(z, hypot(x, y)) / pi) H, "
     "pixel centres at half-integers"
 )
+
+
+@dataclass(frozen=True)
+class Localization:
+    """The best pose for one panorama, in world coordinates, and what speaks for it."""
+
+    status: str
+    pose: Pose | None
+    loss: float | None
+    evidence: Evidence | None
+    margin: float | None  # of the score, to the best distinct rival
 
 
 @dataclass(frozen=True)

@@ -11,17 +11,16 @@ PACKAGE = ROOT / "piccolo"
 # A module may import from the lines above its own, and from its own line only if the line says so.
 LAYERS = [
     {"errors"},
-    {"jit", "threads", "files"},
+    {"jit", "threads", "files", "stopwatch"},
     {"pose", "settings"},
-    {"sphere"},
+    {"sphere", "rotations"},
     {"panorama", "cloud", "sampling", "pyramid"},
-    {"color", "loss", "render"},
-    {"starts", "overlay"},
-    {"synthetic"},
-    {"search", "refine", "verify", "result"},
-    {"pipeline"},
+    {"loss", "render", "gravity"},
+    {"overlay", "verify", "synthetic"},
+    {"result"},
+    {"paper", "engine"},
 ]
-# pyramid shrinks panoramas; points are packed as texels are; the descent needs nothing of the search
+# pyramid shrinks panoramas; points are packed as texels are
 SIDEWAYS = {("pyramid", "panorama"), ("cloud", "sampling")}
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 

@@ -54,6 +54,15 @@ class Room:
     materials: NDArray[np.float64]  # (B, 9), see MATERIAL_FIELDS
     light: Array  # (3,) position of the lamp [m]
 
+    def clearance(self, position: Array) -> float:
+        """Distance [m] from `position` (3,) to the nearest surface, negative inside a box: no ray sees that."""
+        offset = position - self.boxes[:, :3]
+        c, s = np.cos(self.boxes[:, 6]), np.sin(self.boxes[:, 6])
+        along, across = c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]
+        beyond = np.abs(np.stack([along, across, offset[:, 2]], axis=1)) - self.boxes[:, 3:6]
+        outside, inside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1), np.minimum(beyond.max(axis=1), 0.0)
+        return float((outside + inside).min())
+
 
 def _shell(b: _Builder, size: Array) -> None:
     """Floor, ceiling and four walls."""

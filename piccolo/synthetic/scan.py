@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import InputError
 from ..pose import Array, yaw_rotation
 from ..sphere import pixel_rays
 from ..threads import Workers
@@ -11,23 +12,24 @@ from .room import Room
 
 RANGE_NOISE = 0.003  # standard deviation [m]
 MIN_CLEARANCE = 0.35  # of a station or camera [m]
-PROBE_WIDTH = 64  # rays that look for the nearest surface
+NUM_TRIES = 2000
 
 
 def free_position(room: Room, rng: np.random.Generator, heights: tuple[float, float]) -> Array:
-    """A random position (3,) at least MIN_CLEARANCE from every surface, at a height [m] above the floor."""
-    rays = pixel_rays(PROBE_WIDTH).reshape(-1, 3)
-    best, best_clearance = room.corner + room.size / 2, -1.0
-    for _ in range(200):
+    """A random position (3,) at least MIN_CLEARANCE from every surface, at a height [m] above the floor.
+
+    Raises InputError if the room is so full that none is found.
+    """
+    for _ in range(NUM_TRIES):
         low = np.array([MIN_CLEARANCE, MIN_CLEARANCE, heights[0]])
         high = np.array([*(room.size[:2] - MIN_CLEARANCE), heights[1]])
         position = room.corner + rng.uniform(low, high)
-        clearance = float(cast(room, position, rays, Workers(), "probe")[0].min())
-        if clearance >= MIN_CLEARANCE:
+        if room.clearance(position) >= MIN_CLEARANCE:
             return position
-        if clearance > best_clearance:
-            best, best_clearance = position, clearance
-    return best  # a room so full that nothing is clear: the clearest
+    size = room.size.tolist()
+    raise InputError(
+        f"size: found no place {MIN_CLEARANCE} m from everything in a room of {size} m, wanted more"
+    )
 
 
 def scan_room(

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..pose import Array, Pose, exp_so3, yaw_rotation
-from ..starts import uniform_rotations
+from ..rotations import uniform_rotations
 from ..threads import Workers
 from .photo import other_light, photograph
 from .room import Room, make_room

@@ -5,12 +5,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .cloud.packed import PackedPoints
-from .loss import normal_equations, sampling_loss
-from .pose import Array, Pose, exp_so3, left_jacobian, orthonormal, step
-from .render import visible_points
-from .sampling import Texels
-from .settings import PaperSettings
+from ..cloud.packed import PackedPoints
+from ..loss import normal_equations, sampling_loss
+from ..pose import Array, Pose, exp_so3, left_jacobian, orthonormal, step
+from ..render import visible_points
+from ..sampling import Texels
+from ..settings import PaperSettings
 
 LossAndGradient = Callable[[Pose], tuple[float, Array]]
 

@@ -1,25 +1,24 @@
-"""The method in order, one line a step."""
+"""The paper's method in order, one line a step."""
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .cloud.model import Cloud
-from .cloud.packed import PackedPoints, pack_points
-from .panorama import Panorama
-from .pose import Pose
-from .refine import Refined, refine
-from .result import LOCALIZED, NOT_LOCALIZED
-from .sampling import pack_texels
-from .search import are_same, search
-from .settings import PaperSettings
-from .starts import free_grid, uniform_rotations, uniform_yaws
-from .threads import Workers
-from .verify import MIN_MARGIN, MIN_SCORE, Evidence, evidence_at
+from ..cloud.model import Cloud
+from ..cloud.packed import PackedPoints, pack_points
+from ..panorama import Panorama
+from ..pose import are_same
+from ..result import LOCALIZED, NOT_LOCALIZED, Localization
+from ..rotations import uniform_rotations, uniform_yaws
+from ..sampling import pack_texels
+from ..settings import PaperSettings
+from ..stopwatch import Stopwatch
+from ..threads import Workers
+from ..verify import MIN_MARGIN, MIN_SCORE, Evidence, evidence_at
+from .descent import Refined, refine
+from .search import search
+from .starts import free_grid
 
 INLIER_RESIDUAL = 0.1  # RGB norm below which a direction's colours agree
 RIVAL_DISTANCE = 0.5  # [m]
@@ -33,31 +32,6 @@ class PaperMap:
     points: PackedPoints
     origin_world: NDArray[np.float64]  # (3,) [m]
     positions: NDArray[np.float64]  # (M, 3) starts in free space, relative to origin_world [m]
-
-
-@dataclass
-class Stopwatch:
-    """Seconds per named stage."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Add the time spent inside to the stage `name`."""
-        begin = time.perf_counter()
-        yield
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
-
-
-@dataclass(frozen=True)
-class Localization:
-    """The best pose for one panorama, in world coordinates, and what speaks for it."""
-
-    status: str
-    pose: Pose | None
-    loss: float | None
-    evidence: Evidence | None
-    margin: float | None  # of the score, to the best distinct rival
 
 
 def prepare(cloud: Cloud, settings: PaperSettings) -> PaperMap:

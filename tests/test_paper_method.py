@@ -7,8 +7,9 @@ import pytest
 from rooms import as_panorama, errors, query, room
 
 from piccolo.errors import InputError
-from piccolo.pipeline import Stopwatch, localize, prepare
+from piccolo.paper.method import localize, prepare
 from piccolo.settings import PaperSettings
+from piccolo.stopwatch import Stopwatch
 from piccolo.threads import Workers
 
 GOLDEN = Path(__file__).parent / "golden" / "paper.json"

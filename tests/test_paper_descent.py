@@ -5,8 +5,8 @@ import pytest
 import rooms
 from rooms import errors
 
+from piccolo.paper.descent import Adam, Best, descend_lbfgs, refine
 from piccolo.pose import Pose, step, yaw_rotation
-from piccolo.refine import Adam, Best, descend_lbfgs, refine
 from piccolo.sampling import pack_texels
 from piccolo.settings import PaperSettings
 

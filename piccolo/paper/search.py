@@ -6,16 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .cloud.packed import PackedPoints
-from .color import color_histogram, histogram_intersection
-from .loss import sampling_loss
-from .panorama import Panorama
-from .pose import Array, Pose, angle_between
-from .pyramid import shrink
-from .render import render_view, visible_points
-from .sampling import Texels
-from .settings import PaperSettings
-from .threads import Workers
+from ..cloud.packed import PackedPoints
+from ..loss import sampling_loss
+from ..panorama import Panorama
+from ..pose import Array, Pose, are_same
+from ..pyramid import shrink
+from ..render import render_view, visible_points
+from ..sampling import Texels
+from ..settings import PaperSettings
+from ..threads import Workers
+from .histogram import color_histogram, histogram_intersection
 
 
 @dataclass(frozen=True)
@@ -24,12 +24,6 @@ class Scored:
 
     pose: Pose
     score: float
-
-
-def are_same(a: Pose, b: Pose, min_distance: float, min_angle: float) -> bool:
-    """True for poses closer than `min_distance` [m] and turned by less than `min_angle` [rad]."""
-    distance = float(np.linalg.norm(a.center_world - b.center_world))
-    return distance < min_distance and angle_between(a.R_cam_from_world, b.R_cam_from_world) < min_angle
 
 
 def keep_diverse(

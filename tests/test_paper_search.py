@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 import rooms
 
-from piccolo.pose import Pose, yaw_rotation
+from piccolo.paper.search import Scored, histogram_distance, keep_diverse, losses_at
+from piccolo.pose import Pose, are_same, yaw_rotation
 from piccolo.pyramid import shrink
 from piccolo.sampling import pack_texels
-from piccolo.search import Scored, are_same, histogram_distance, keep_diverse, losses_at
 
 AT = np.array([1.0, 2.0, 1.5])
 
