@@ -1,0 +1,1 @@
+"""The default engine: a prepared map of views, one search over all of them, descent on normalised colours."""
