@@ -32,8 +32,9 @@ TO_UNIT = 1.0 / 255.0
 
 
 @kernel
-def loss_blocks(x, y, z, rgbx, R, t, texels, width, first_block, sums):
+def loss_blocks(x, y, z, rgbx, R_cam_from_world, center_world, texels, width, first_block, sums):
     """Write for each block (blocks, 2): the sum of the residual norms [8-bit levels], the count of points."""
+    R, t = R_cam_from_world, center_world
     W, stride = np.float32(width), np.int32(width + 2)
     r00, r01, r02 = np.float32(R[0, 0]), np.float32(R[0, 1]), np.float32(R[0, 2])
     r10, r11, r12 = np.float32(R[1, 0]), np.float32(R[1, 1]), np.float32(R[1, 2])
@@ -71,11 +72,12 @@ def loss_blocks(x, y, z, rgbx, R, t, texels, width, first_block, sums):
 
 
 @kernel
-def normal_blocks(x, y, z, rgbx, R, t, texels, width, first_block, sums):
+def normal_blocks(x, y, z, rgbx, R_cam_from_world, center_world, texels, width, first_block, sums):
     """Write for each block (blocks, 29): loss, count, gradient, upper triangle of sum J^T J / norm.
 
     Longer than other kernels: split, its 28 sums would leave the registers.
     """
+    R, t = R_cam_from_world, center_world
     W, stride = np.float32(width), np.int32(width + 2)
     r00, r01, r02 = np.float32(R[0, 0]), np.float32(R[0, 1]), np.float32(R[0, 2])
     r10, r11, r12 = np.float32(R[1, 0]), np.float32(R[1, 1]), np.float32(R[1, 2])

@@ -36,8 +36,9 @@ class View:
 
 
 @kernel
-def cells_and_ranges(x, y, z, R, t, width, cells, ranges):
+def cells_and_ranges(x, y, z, R_cam_from_world, center_world, width, cells, ranges):
     """Write for each point the cell (row * width + column) and the range [m] at which the camera sees it."""
+    R, t = R_cam_from_world, center_world
     W = np.float32(width)
     last_column, last_row = np.int32(width - 1), np.int32(width // 2 - 1)
     r00, r01, r02 = np.float32(R[0, 0]), np.float32(R[0, 1]), np.float32(R[0, 2])
@@ -56,8 +57,9 @@ def cells_and_ranges(x, y, z, R, t, width, cells, ranges):
 
 
 @kernel
-def nearest_ranges(x, y, z, R, t, width, depth):
+def nearest_ranges(x, y, z, R_cam_from_world, center_world, width, depth):
     """Write the range [m] of the nearest point of each cell into `depth` (H * W,), which holds inf before."""
+    R, t = R_cam_from_world, center_world
     cells = np.empty(CHUNK, np.int32)
     ranges = np.empty(CHUNK, np.float32)
     for lo in range(0, len(x), CHUNK):
@@ -69,8 +71,9 @@ def nearest_ranges(x, y, z, R, t, width, depth):
 
 
 @kernel
-def mean_colors(x, y, z, rgbx, R, t, width, band, depth, sums):
+def mean_colors(x, y, z, rgbx, R_cam_from_world, center_world, width, band, depth, sums):
     """Add up (H * W, 4): R, G, B [8-bit levels] and count of the points within (1 + band) of the nearest."""
+    R, t = R_cam_from_world, center_world
     cells = np.empty(CHUNK, np.int32)
     ranges = np.empty(CHUNK, np.float32)
     for lo in range(0, len(x), CHUNK):
@@ -87,8 +90,9 @@ def mean_colors(x, y, z, rgbx, R, t, width, band, depth, sums):
 
 
 @kernel
-def select_visible(x, y, z, R, t, width, depth, indices):
+def select_visible(x, y, z, R_cam_from_world, center_world, width, depth, indices):
     """Write the indices of the points near the front of their cells; returns how many."""
+    R, t = R_cam_from_world, center_world
     cells = np.empty(CHUNK, np.int32)
     ranges = np.empty(CHUNK, np.float32)
     count = 0
