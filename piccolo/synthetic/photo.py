@@ -11,15 +11,23 @@ from .raycast import cast
 from .room import Room
 
 SUPERSAMPLING = 2  # rays a pixel, each way
+BAND = 8  # rows cast at once: all rays of a large image at once would take a gigabyte
 
 
 def photograph(room: Room, pose: Pose, width: int, workers: Workers) -> NDArray[np.uint8]:
     """Equirectangular image (width / 2, width, 3) of a room at `pose`."""
-    fine = SUPERSAMPLING * width
-    rays = pixel_rays(fine).reshape(-1, 3) @ pose.R_cam_from_world
-    _, rgb = cast(room, pose.center_world, rays, workers, "panorama")
-    blocks = rgb.reshape(width // 2, SUPERSAMPLING, width, SUPERSAMPLING, 3)
-    return np.asarray(np.round(blocks.mean(axis=(1, 3)) * 255.0).astype(np.uint8))
+    rays_cam = pixel_rays(SUPERSAMPLING * width)
+    image = np.empty((width // 2, width, 3), dtype=np.uint8)
+
+    def run(top: int) -> None:
+        band = image[top : top + BAND]
+        rows = rays_cam[SUPERSAMPLING * top : SUPERSAMPLING * (top + BAND)].reshape(-1, 3)
+        _, rgb = cast(room, pose.center_world, rows @ pose.R_cam_from_world, Workers(), "band")
+        blocks = rgb.reshape(len(band), SUPERSAMPLING, width, SUPERSAMPLING, 3)
+        band[:] = np.round(blocks.mean(axis=(1, 3)) * 255.0)
+
+    list(workers.each(run, range(0, width // 2, BAND), "panorama"))
+    return image
 
 
 def other_light(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:

@@ -12,30 +12,34 @@ from .room import Room
 from .texture import pattern_share
 
 AMBIENT = 0.55
-CHUNK = 16_384
+CHUNK = 4_096
 
 
 @kernel
 def hit_boxes(origin, directions, boxes, ranges, hits):
-    """Write the range [m] of each ray's (N, 3) first hit, inf for none, and 3 * box + axis of the face."""
-    for n in range(len(directions)):
-        nearest, hit = np.inf, -1
-        dx, dy, dz = directions[n, 0], directions[n, 1], directions[n, 2]
-        for b in range(len(boxes)):
-            ox, oy, oz = origin[0] - boxes[b, 0], origin[1] - boxes[b, 1], origin[2] - boxes[b, 2]
-            c, s = math.cos(boxes[b, 6]), math.sin(boxes[b, 6])
-            px, py, qx, qy = c * ox + s * oy, c * oy - s * ox, c * dx + s * dy, c * dy - s * dx
+    """Write the range [m] of each ray (N, 3) to its first hit or inf, and 3 * box + axis of the face or -1.
+
+    A box around the origin is not hit. Boxes outside, rays inside: the inner loop has no branch to stop SIMD.
+    """
+    ranges[:] = np.inf
+    hits[:] = -1
+    for b in range(len(boxes)):
+        ox, oy, oz = origin[0] - boxes[b, 0], origin[1] - boxes[b, 1], origin[2] - boxes[b, 2]
+        c, s = math.cos(boxes[b, 6]), math.sin(boxes[b, 6])
+        px, py = c * ox + s * oy, c * oy - s * ox
+        half_x, half_y, half_z = boxes[b, 3], boxes[b, 4], boxes[b, 5]
+        for n in range(len(directions)):
+            dx, dy, dz = directions[n, 0], directions[n, 1], directions[n, 2]
             # A ray along a face divides by zero on purpose: infinities compare as they should.
-            ix, iy, iz = 1.0 / qx, 1.0 / qy, 1.0 / dz
-            hx, hy, hz = abs(boxes[b, 3] * ix), abs(boxes[b, 4] * iy), abs(boxes[b, 5] * iz)
+            ix, iy, iz = 1.0 / (c * dx + s * dy), 1.0 / (c * dy - s * dx), 1.0 / dz
+            hx, hy, hz = half_x * abs(ix), half_y * abs(iy), half_z * abs(iz)
             near_x, near_y, near_z = -px * ix - hx, -py * iy - hy, -oz * iz - hz
             near = max(near_x, near_y, near_z)
             far = min(hx - px * ix, hy - py * iy, hz - oz * iz)
-            if 1e-6 < near < nearest and near <= far:
-                nearest = near
-                hit = 3 * b + (0 if near == near_x else 1 if near == near_y else 2)
-        ranges[n] = nearest
-        hits[n] = hit
+            face = 0 if near == near_x else 1 if near == near_y else 2
+            is_nearer = (near > 1e-6) & (near < ranges[n]) & (near <= far)
+            ranges[n] = near if is_nearer else ranges[n]
+            hits[n] = 3 * b + face if is_nearer else hits[n]
 
 
 @kernel

@@ -55,7 +55,7 @@ class Room:
     light: Array  # (3,) position of the lamp [m]
 
     def clearance(self, position: Array) -> float:
-        """Distance [m] from `position` (3,) to the nearest surface, negative inside a box: no ray sees that."""
+        """Distance [m] from `position` (3,) to the nearest surface; negative inside a box, unseen by rays."""
         offset = position - self.boxes[:, :3]
         c, s = np.cos(self.boxes[:, 6]), np.sin(self.boxes[:, 6])
         along, across = c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]
