@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import naive
@@ -10,7 +11,8 @@ from piccolo.errors import InputError
 from piccolo.sphere import pixel_rays
 from piccolo.synthetic.raycast import cast
 from piccolo.synthetic.room import make_room
-from piccolo.synthetic.world import make_query, make_world, scan_world
+from piccolo.synthetic.scan import MIN_CLEARANCE, RANGE_NOISE, free_position
+from piccolo.synthetic.world import VARIANTS, make_query, make_world, scan_world
 from piccolo.threads import Workers
 from tools import make_room as tool
 
@@ -27,6 +29,42 @@ def test_rays_equal_their_twin():
     np.testing.assert_allclose(ranges, naive.nearest_box(origin, rays, this.boxes), rtol=1e-9)
     assert ((rgb >= 0) & (rgb <= 1)).all()
     assert (rgb.max(axis=1) > 0.02).mean() > 0.99
+
+
+def test_clearance_is_the_distance_to_the_nearest_surface():
+    """Negative inside a box, where rays see no surface: a camera was put into a crate because of that."""
+    this = make_room(5, SMALL, np.zeros(3))
+    rays = pixel_rays(512).reshape(-1, 3)
+    rng = np.random.default_rng(1)
+    for _ in range(5):
+        position = free_position(this, rng, (1.0, 1.9))
+        nearest = cast(this, position, rays, Workers(), "")[0].min()
+        assert nearest - 0.02 < this.clearance(position) <= nearest + 1e-9
+    assert all(this.clearance(box[:3]) < 0 for box in this.boxes)
+
+
+def test_cameras_stand_clear_of_everything_in_full_rooms():
+    for seed in range(20):
+        for variant in (0, 1):
+            this = make_room(seed, np.array([2.0, 2.0, 2.0]), np.zeros(3), variant)
+            position = free_position(this, np.random.default_rng(seed), (1.0, 1.6))
+            assert this.clearance(position) >= MIN_CLEARANCE
+            assert (position > 0).all()
+            assert (position < 2.0).all()
+
+
+def test_room_without_a_free_place_is_refused():
+    this = make_room(5, SMALL, np.zeros(3))
+    full = dataclasses.replace(this, boxes=np.array([[*(SMALL / 2), *(SMALL / 2), 0.0]]))
+    with pytest.raises(InputError, match=r"size: found no place 0\.35 m from everything"):
+        free_position(full, np.random.default_rng(0), (1.0, 1.9))
+
+
+def test_points_lie_on_surfaces():
+    world = make_world(3, SMALL)
+    points, _ = scan_world(world, 2000, Workers(2))
+    distances = [abs(world.rooms[0].clearance(point)) for point in points.astype(float)]
+    assert max(distances) < 5 * RANGE_NOISE
 
 
 def test_same_seed_same_bits_at_any_number_of_threads():
@@ -80,10 +118,23 @@ def test_change_alters_a_part_of_the_sphere_and_photo_all_of_it():
     assert clean.shape == photo.shape == (64, 128, 3)
 
 
+def test_same_query_same_bits_at_any_number_of_threads():
+    world = make_world(1, SMALL)
+    for variant in VARIANTS:
+        a, b = (make_query(world, 0, variant, 128, Workers(n)) for n in (1, 2))
+        np.testing.assert_array_equal(a.rgb, b.rgb)
+        np.testing.assert_array_equal(a.pose.center_world, b.pose.center_world)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: make_world(0, np.array([1.0, 3.0, 2.4])), r"size: found \[1.0, 3.0, 2.4\], wanted at least"),
+        (
+            lambda: make_world(0, np.array([1.0, 3.0, 2.4])),
+            r"size: found \[1.0, 3.0, 2.4\], wanted 2.0 to 50.0 m",
+        ),
+        (lambda: make_world(0, np.array([np.nan, 3.0, 2.4])), r"size: found \[nan, 3.0, 2.4\], wanted"),
+        (lambda: make_world(0, np.array([np.inf, 3.0, 2.4])), r"size: found \[inf, 3.0, 2.4\], wanted"),
         (lambda: make_world(0, SMALL, 65), "rooms: found 65, wanted 1 to 64"),
         (lambda: scan_world(make_world(0, SMALL), 10, Workers()), "points: found 10, wanted at least 1000"),
         (lambda: make_query(make_world(0, SMALL), 0, "odd", 128, Workers()), "variant: found 'odd'"),
@@ -98,7 +149,10 @@ def test_refusals(call, message):
 def test_command_line_writes_a_world_that_reads_back(tmp_path, capsys):
     folder = tmp_path / "a room"
     arguments = ["--out", str(folder), "--points", "3000", "--width", "128", "--panoramas", "2"]
-    assert tool.main([*arguments, "--size", "3", "3", "2.4", "--variants", "clean", "photo", "--quiet"]) == 0
+    assert (
+        tool.main([*arguments, "--size", "3", "3", "2.4", "--variants", "clean", "photo", "clean", "--quiet"])
+        == 0
+    )
     out, err = capsys.readouterr()
     assert json.loads(out)["queries"] == 4
     assert err == ""
@@ -110,7 +164,17 @@ def test_command_line_writes_a_world_that_reads_back(tmp_path, capsys):
     assert all((folder / e["image"]).is_file() for e in document["queries"])
 
 
-def test_command_line_refuses_in_one_line(tmp_path, capsys):
-    assert tool.main(["--out", str(tmp_path / "r"), "--points", "10"]) == 3
-    assert capsys.readouterr().err == "make_room.py: points: found 10, wanted at least 1000 a room\n"
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--points", "10"], "points: found 10, wanted at least 1000 a room"),
+        (["--width", "127"], "width: found 127, wanted an even number of at least 128"),
+        (["--size", "nan", "3", "2.4"], "size: found [nan, 3.0, 2.4], wanted 2.0 to 50.0 m each way"),
+        (["--rooms", "65"], "rooms: found 65, wanted 1 to 64"),
+        (["--seed", "-1"], "--panoramas, --seed: found a negative number, wanted 0 or more"),
+    ],
+)
+def test_command_line_refuses_in_one_line_before_anything_is_written(options, message, tmp_path, capsys):
+    assert tool.main(["--out", str(tmp_path / "r"), *options]) == 3
+    assert capsys.readouterr() == ("", f"make_room.py: {message}\n")
     assert not (tmp_path / "r").exists()

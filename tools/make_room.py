@@ -20,7 +20,16 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from piccolo.errors import InputError
 from piccolo.files import write_atomically
 from piccolo.result import CONVENTION
-from piccolo.synthetic.world import VARIANTS, Query, World, make_query, make_world, scan_world
+from piccolo.synthetic.world import (
+    VARIANTS,
+    Query,
+    World,
+    check_num_points,
+    check_width,
+    make_query,
+    make_world,
+    scan_world,
+)
 from piccolo.threads import Workers, num_cores
 
 EPILOG = """\
@@ -82,12 +91,14 @@ def write_query(folder: Path, name: str, query: Query) -> dict[str, object]:
 def write_world(arguments: argparse.Namespace, world: World, workers: Workers) -> dict[str, object]:
     """Write everything and return what was written."""
     folder: Path = arguments.out
-    points, colors = scan_world(world, arguments.points, workers)
+    check_num_points(world, arguments.points)
+    check_width(arguments.width)
     (folder / "images").mkdir(parents=True, exist_ok=True)
+    points, colors = scan_world(world, arguments.points, workers)
     write_atomically(folder / "cloud.ply", ply_bytes(points, colors))
     entries = [
         write_query(folder, f"{v}_{k}", make_query(world, k, v, arguments.width, workers))
-        for v in arguments.variants
+        for v in dict.fromkeys(arguments.variants)
         for k in range(arguments.panoramas)
     ]
     document = {"cloud": "cloud.ply", "convention": CONVENTION, "queries": entries}

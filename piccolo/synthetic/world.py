@@ -15,8 +15,9 @@ from .scan import free_position, scan_room
 
 VARIANTS = ("clean", "tilt", "photo", "change")
 GAP = 0.4  # between rooms [m]
-MIN_SIZE = (2.0, 2.0, 2.0)
+MIN_SIZE, MAX_SIZE = 2.0, 50.0  # of a room, each way [m]
 MAX_ROOMS = 64
+MIN_POINTS = 1000  # of a room
 
 
 @dataclass(frozen=True)
@@ -39,8 +40,8 @@ class Query:
 def make_world(seed: int, size: Array, num_rooms: int = 1) -> World:
     """`num_rooms` rooms of `size` (3,) [m], all different."""
     size = np.asarray(size, dtype=float)
-    if (size < MIN_SIZE).any():
-        raise InputError(f"size: found {size.tolist()}, wanted at least {list(MIN_SIZE)} m")
+    if not ((size >= MIN_SIZE) & (size <= MAX_SIZE)).all():  # so that NaN is refused too
+        raise InputError(f"size: found {size.tolist()}, wanted {MIN_SIZE} to {MAX_SIZE} m each way")
     if not 1 <= num_rooms <= MAX_ROOMS:
         raise InputError(f"rooms: found {num_rooms}, wanted 1 to {MAX_ROOMS}")
     columns = int(np.ceil(np.sqrt(num_rooms)))
@@ -51,12 +52,23 @@ def make_world(seed: int, size: Array, num_rooms: int = 1) -> World:
     return World(seed, tuple(rooms))
 
 
+def check_num_points(world: World, num_points: int) -> None:
+    """Refuse, before any work is done, a scan too sparse to show the rooms."""
+    if num_points < MIN_POINTS * len(world.rooms):
+        raise InputError(f"points: found {num_points}, wanted at least {MIN_POINTS} a room")
+
+
+def check_width(width: int) -> None:
+    """Refuse, before any work is done, a panorama too small or of an odd width [px]."""
+    if width < 128 or width % 2:
+        raise InputError(f"width: found {width}, wanted an even number of at least 128")
+
+
 def scan_world(
     world: World, num_points: int, workers: Workers
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Points (num_points, 3) [m] and colours (num_points, 3) of all rooms."""
-    if num_points < 1000 * len(world.rooms):
-        raise InputError(f"points: found {num_points}, wanted at least 1000 a room")
+    check_num_points(world, num_points)
     shares = np.diff(np.linspace(0, num_points, len(world.rooms) + 1).astype(int))
     rng = np.random.default_rng([world.seed, 10])
     parts = [scan_room(room, int(n), rng, workers) for room, n in zip(world.rooms, shares, strict=True)]
@@ -67,8 +79,7 @@ def make_query(world: World, index: int, variant: str, width: int, workers: Work
     """Query number `index` of a variant: upright but for `tilt`, in a room drawn at random."""
     if variant not in VARIANTS:
         raise InputError(f"variant: found {variant!r}, wanted one of {', '.join(VARIANTS)}")
-    if width < 128 or width % 2:
-        raise InputError(f"width: found {width}, wanted an even number of at least 128")
+    check_width(width)
     rng = np.random.default_rng([world.seed, 20, VARIANTS.index(variant), index])
     number = int(rng.integers(len(world.rooms)))
     room = world.rooms[number]
