@@ -20,12 +20,13 @@ from piccolo.files import check_output, write_atomically
 from piccolo.jit import KERNEL_FOLDER, is_first_use
 from piccolo.overlay import overlay_png
 from piccolo.panorama import read_panorama
-from piccolo.paper.method import INLIER_RESIDUAL, PaperMap, localize, prepare
+from piccolo.paper.method import PaperMap, localize, prepare
 from piccolo.pose import Pose
 from piccolo.result import LOCALIZED, Result
 from piccolo.settings import PaperSettings
 from piccolo.stopwatch import Stopwatch
 from piccolo.threads import Workers, num_cores
+from piccolo.verify import INLIER_RESIDUAL
 
 EXIT_ALL_LOCALIZED, EXIT_SOME_NOT, EXIT_BAD_USAGE, EXIT_BAD_INPUT, EXIT_INTERNAL = range(5)
 EXIT_INTERRUPTED = 130

@@ -18,6 +18,7 @@ VIEW_WIDTH = 96  # cells of 3.75 degrees
 LOCAL_SIGMA = 4.0  # cells: the neighbourhood in which contrast is judged, 15 degrees
 EPSILON = 0.03  # contrast below this counts as noise
 CLIP = 2.0
+INLIER_RESIDUAL = 0.1  # RGB norm below which a direction's colours agree
 
 # Locally normalised correlation is 0.34 to 0.79 at right poses and below 0.25 in wrong basins, the margin to
 # the best distinct rival at least 0.21 and at most 0.11 (ENGINE prototypes); the lines lie between.

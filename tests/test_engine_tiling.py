@@ -26,7 +26,7 @@ def test_random_directions_fall_into_cells_by_solid_angle():
 
 
 def test_neighbours_are_near_and_weighted_by_a_gaussian():
-    near, fine, coarse = make_neighbors(48, 14.0), make_tiling(48), make_tiling(24)
+    near, fine, coarse = make_neighbors(48, 24, 14.0), make_tiling(48), make_tiling(24)
     for cell in (0, len(fine) // 2, len(fine) - 1):
         rows = slice(near.row[cell], near.row[cell + 1])
         angle = np.arccos(np.clip(coarse.directions[near.cell[rows]] @ fine.directions[cell], -1, 1))

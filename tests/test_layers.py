@@ -16,7 +16,7 @@ LAYERS = [
     {"sphere", "rotations"},
     {"panorama", "cloud", "sampling", "pyramid"},
     {"loss", "render", "gravity"},
-    {"overlay", "verify", "synthetic"},
+    {"overlay", "verify", "refine", "synthetic"},
     {"result"},
     {"paper", "engine"},
 ]

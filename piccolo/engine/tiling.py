@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-STATS_RINGS = 24  # local means vary over 10 degrees and more: 7.5 degree cells carry them
+SEARCH_RINGS = 24  # of the views that are searched: cells of 7.5 degrees
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Tiling:
 
 @dataclass(frozen=True)
 class Neighbors:
-    """Gaussian weights from the cells of the statistics tiling to those of another, as compressed rows."""
+    """Gaussian weights from the cells of one tiling to those of another, as compressed rows."""
 
     row: NDArray[np.int32]  # (cells + 1,)
     cell: NDArray[np.int32]
@@ -54,12 +54,12 @@ def make_tiling(num_rings: int) -> Tiling:
 
 
 @lru_cache(maxsize=8)
-def make_neighbors(num_rings: int, sigma_deg: float, cutoff: float = 2.3) -> Neighbors:
-    """Gaussian weights of the statistics cells within `cutoff` sigmas of each cell of a tiling."""
-    fine, coarse = make_tiling(num_rings), make_tiling(STATS_RINGS)
+def make_neighbors(num_rings: int, stats_rings: int, sigma_deg: float) -> Neighbors:
+    """Gaussian weights of the statistics cells within 2.3 sigmas of each cell of a tiling."""
+    fine, coarse = make_tiling(num_rings), make_tiling(stats_rings)
     sigma = np.radians(sigma_deg)
     cosine = fine.directions @ coarse.directions.T
-    rows, cells = np.nonzero(cosine > np.cos(cutoff * sigma))
+    rows, cells = np.nonzero(cosine > np.cos(2.3 * sigma))
     weight = np.exp((cosine[rows, cells] - 1) / sigma**2) * coarse.solid_angle[cells]
     row = np.searchsorted(rows, np.arange(len(fine) + 1)).astype(np.int32)
     return Neighbors(row, cells.astype(np.int32), weight.astype(np.float32))
@@ -67,8 +67,8 @@ def make_neighbors(num_rings: int, sigma_deg: float, cutoff: float = 2.3) -> Nei
 
 @lru_cache(maxsize=4)
 def averaging(num_rings: int) -> NDArray[np.float32]:
-    """Matrix (cells of STATS_RINGS, cells of num_rings) that sums cells times solid angle into wider ones."""
-    tiling, wide = make_tiling(STATS_RINGS), make_tiling(num_rings)
+    """Matrix (cells of SEARCH_RINGS, cells of num_rings) that sums cells times solid angle into wider ones."""
+    tiling, wide = make_tiling(SEARCH_RINGS), make_tiling(num_rings)
     matrix = np.zeros((len(tiling), len(wide)), np.float32)
     matrix[np.arange(len(tiling)), cell_of(tiling.directions, num_rings)] = tiling.solid_angle
     return matrix
@@ -83,9 +83,3 @@ def cell_of(directions: NDArray[np.float32], num_rings: int) -> NDArray[np.int32
     n = tiling.num_columns[ring]
     column = np.minimum(((np.arctan2(d[:, 1], d[:, 0]) / (2 * np.pi) + 0.5) * n).astype(int), n - 1)
     return np.asarray(tiling.first[ring] + column, dtype=np.int32)
-
-
-@lru_cache(maxsize=4)
-def coarse_cell_of(num_rings: int) -> NDArray[np.int32]:
-    """The statistics cell (cells,) in which the centre of each cell of a tiling lies."""
-    return cell_of(make_tiling(num_rings).directions, STATS_RINGS)

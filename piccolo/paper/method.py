@@ -9,18 +9,17 @@ from ..cloud.model import Cloud
 from ..cloud.packed import PackedPoints, pack_points
 from ..panorama import Panorama
 from ..pose import are_same
+from ..refine import Refined, refine
 from ..result import LOCALIZED, NOT_LOCALIZED, Localization
 from ..rotations import uniform_rotations, uniform_yaws
 from ..sampling import pack_texels
 from ..settings import PaperSettings
 from ..stopwatch import Stopwatch
 from ..threads import Workers
-from ..verify import MIN_MARGIN, MIN_SCORE, Evidence, evidence_at
-from .descent import Refined, refine
+from ..verify import INLIER_RESIDUAL, MIN_MARGIN, MIN_SCORE, Evidence, evidence_at
 from .search import search
 from .starts import free_grid
 
-INLIER_RESIDUAL = 0.1  # RGB norm below which a direction's colours agree
 RIVAL_DISTANCE = 0.5  # [m]
 RIVAL_ANGLE = np.radians(15.0)
 

@@ -5,8 +5,8 @@ import pytest
 import rooms
 from rooms import errors
 
-from piccolo.paper.descent import Adam, Best, descend_lbfgs, refine
 from piccolo.pose import Pose, step, yaw_rotation
+from piccolo.refine import Adam, Best, descend_lbfgs, refine
 from piccolo.sampling import pack_texels
 from piccolo.settings import PaperSettings
 
@@ -18,7 +18,7 @@ def scene():
     return rooms.scene(1)
 
 
-@pytest.mark.parametrize("solver", ["adam", "lbfgs"])
+@pytest.mark.parametrize("solver", ["adam", "lbfgs", "gauss-newton"])
 @pytest.mark.parametrize("use_visibility", [True, False])
 def test_descent_recovers_the_true_pose(scene, solver, use_visibility):
     points, panorama, true_pose = scene
@@ -62,7 +62,8 @@ def test_lbfgs_follows_a_gradient_in_steps_of_the_camera():
     def objective(pose):
         p = (x_world - pose.center_world) @ pose.R_cam_from_world.T
         e = p - (x_world - goal.center_world) @ goal.R_cam_from_world.T
-        return 0.5 * (e**2).sum(), np.concatenate([np.cross(p, e).sum(axis=0), -e.sum(axis=0)])
+        gradient = np.concatenate([np.cross(p, e).sum(axis=0), -e.sum(axis=0)])
+        return 0.5 * (e**2).sum(), gradient, np.eye(6)
 
     start = Pose(yaw_rotation(0.5), np.array([1.0, 2.0, 3.0]))
     best = descend_lbfgs(objective, start, 100)

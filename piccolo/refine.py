@@ -1,18 +1,21 @@
-"""Step 4 of the paper's Algorithm 1: descend on the sampling loss from one start."""
+"""Descend on the sampling loss from one start: step 4 of the paper's Algorithm 1, and other solvers."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
-from ..cloud.packed import PackedPoints
-from ..loss import normal_equations, sampling_loss
-from ..pose import Array, Pose, exp_so3, left_jacobian, orthonormal, step
-from ..render import visible_points
-from ..sampling import Texels
-from ..settings import PaperSettings
+from .cloud.packed import PackedPoints
+from .loss import normal_equations, sampling_loss
+from .pose import Array, Pose, exp_so3, left_jacobian, orthonormal, step
+from .render import visible_points
+from .sampling import Texels
+from .settings import DescentSettings
 
-LossAndGradient = Callable[[Pose], tuple[float, Array]]
+MAX_STEP = 0.2  # [rad, m] of Gauss-Newton
+
+Objective = Callable[[Pose], tuple[float, Array, Array]]  # loss, gradient (6,), normal matrix (6, 6)
 
 
 @dataclass(frozen=True)
@@ -65,11 +68,11 @@ class Adam:
         return np.asarray(-self.step_size * mean / (np.sqrt(mean_square) + 1e-8))
 
 
-def descend_adam(objective: LossAndGradient, pose: Pose, adam: Adam, num_iterations: int) -> Best:
+def descend_adam(objective: Objective, pose: Pose, adam: Adam, num_iterations: int) -> Best:
     """The best pose of `num_iterations` steps of `adam`, which is left ready to go on."""
     best = Best(pose)
     for _ in range(num_iterations):
-        loss, gradient = objective(pose)
+        loss, gradient, _ = objective(pose)
         if not np.isfinite(loss):
             break
         best.offer(pose, loss)
@@ -77,7 +80,7 @@ def descend_adam(objective: LossAndGradient, pose: Pose, adam: Adam, num_iterati
     return best
 
 
-def descend_lbfgs(objective: LossAndGradient, start: Pose, num_iterations: int) -> Best:
+def descend_lbfgs(objective: Objective, start: Pose, num_iterations: int) -> Best:
     """The best pose of at most `num_iterations` of SciPy's L-BFGS-B.
 
     Parameters are the rotation vector of a turn of the start, R = exp([w]x) R_start, and the camera's shift.
@@ -90,7 +93,7 @@ def descend_lbfgs(objective: LossAndGradient, start: Pose, num_iterations: int) 
         w = parameters[:3]
         R_cam_from_world = orthonormal(exp_so3(w) @ start.R_cam_from_world)
         pose = Pose(R_cam_from_world, start.center_world + parameters[3:])
-        loss, gradient = objective(pose)
+        loss, gradient, _ = objective(pose)
         best.offer(pose, loss)
         by_w = left_jacobian(w).T @ gradient[:3]
         by_center = R_cam_from_world.T @ gradient[3:]
@@ -100,7 +103,30 @@ def descend_lbfgs(objective: LossAndGradient, start: Pose, num_iterations: int) 
     return best
 
 
-def refine(points: PackedPoints, texels: Texels, start: Pose, settings: PaperSettings) -> Refined:
+def descend_gauss_newton(objective: Objective, pose: Pose, num_iterations: int) -> Best:
+    """The best pose of at most `num_iterations` Levenberg-Marquardt steps on the reweighted least squares."""
+    best = Best(pose)
+    loss, gradient, matrix = objective(pose)
+    best.offer(pose, loss)
+    damping = 1e-3
+    for _ in range(num_iterations):
+        damped = matrix + damping * np.diag(np.diag(matrix)) + 1e-12 * np.eye(6)
+        delta = -np.linalg.solve(damped, gradient)
+        # A step of a radian or a metre would leave the region in which the matrix means anything.
+        delta *= min(1.0, MAX_STEP / max(float(np.abs(delta).max()), 1e-12))
+        trial = step(best.pose, delta)
+        loss, trial_gradient, trial_matrix = objective(trial)
+        if loss < best.loss:
+            best.offer(trial, loss)
+            gradient, matrix, damping = trial_gradient, trial_matrix, max(damping * 0.2, 1e-6)
+        else:
+            damping *= 8.0
+        if damping > 1e4 or float(np.abs(delta).max()) < 1e-7:
+            break
+    return best
+
+
+def refine(points: PackedPoints, texels: Texels, start: Pose, settings: DescentSettings) -> Refined:
     """Descend from `start`; the points that the camera does not see are left out anew `num_culls` times.
 
     A cull changes the function, so that losses before and after it do not compare: the best pose of the last
@@ -113,17 +139,14 @@ def refine(points: PackedPoints, texels: Texels, start: Pose, settings: PaperSet
     def seen_from(at: Pose) -> PackedPoints:
         return visible_points(points, at.center_world) if settings.use_visibility else points
 
-    for num_iterations in np.diff(bounds):
-        visible = seen_from(pose)
-
-        def objective(at: Pose, visible: PackedPoints = visible) -> tuple[float, Array]:
-            loss, gradient, _ = normal_equations(visible, texels, at)
-            return loss, gradient
-
-        adam.best_loss = np.inf
+    for num_iterations in np.diff(bounds).tolist():
+        objective = partial(normal_equations, seen_from(pose), texels)
         if settings.solver == "adam":
-            pose = descend_adam(objective, pose, adam, int(num_iterations)).pose
+            adam.best_loss = np.inf
+            pose = descend_adam(objective, pose, adam, num_iterations).pose
+        elif settings.solver == "lbfgs":
+            pose = descend_lbfgs(objective, pose, num_iterations).pose
         else:
-            pose = descend_lbfgs(objective, pose, int(num_iterations)).pose
+            pose = descend_gauss_newton(objective, pose, num_iterations).pose
     loss = sampling_loss(seen_from(pose), texels, pose)
     return Refined(pose, loss, settings.num_iterations)

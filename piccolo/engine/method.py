@@ -1,0 +1,271 @@
+"""The default engine in order, one line a step: one panorama in a prepared map."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..loss import sampling_loss
+from ..panorama import Panorama
+from ..pose import Array, Pose, are_same, orthonormal
+from ..refine import refine
+from ..render import visible_points
+from ..result import LOCALIZED, NOT_LOCALIZED, Localization
+from ..rotations import uniform_rotations, uniform_yaws
+from ..sampling import Texels, pack_texels
+from ..settings import DescentSettings, EngineSettings, Gravity
+from ..stopwatch import Stopwatch
+from ..threads import Workers
+from ..verify import INLIER_RESIDUAL, evidence_at
+from .channels import LEVELS_PER_UNIT, ZERO_LEVEL
+from .contrast import Scale, comparable
+from .descent import correlate, descend, descend_shaken, descend_starts
+from .prior import allowed_rotations, narrowed
+from .scan_map import SEARCH_VIEW, ScanMap
+from .search import best_poses, correlate_pairs, pick_distinct, score_poses, score_poses_wide, turn_panorama
+from .tiling import make_tiling
+from .view import Cells, ViewKind, render_view, seen_points
+
+MIDDLE_VIEW = ViewKind(num_rings=48, stats_rings=24, sigma_deg=14.0, voxel_per_range=1 / 30)
+FINE_VIEW = ViewKind(num_rings=96, stats_rings=24, sigma_deg=10.0, voxel_per_range=1 / 80)
+FINISH_VIEW = ViewKind(num_rings=96, stats_rings=24, sigma_deg=10.0, voxel_per_range=1 / 150)
+SCALES = (  # of the panorama for the last millimetres and for the fine, middle and searched views
+    Scale(1024, 0.0, FINISH_VIEW.sigma_deg),
+    Scale(256, 0.0, FINE_VIEW.sigma_deg),
+    Scale(128, 0.0, MIDDLE_VIEW.sigma_deg),
+    Scale(128, 7.5, SEARCH_VIEW.sigma_deg),
+)
+COARSE_LOSS, FINE_LOSS, FINISH_LOSS = 1.2, 1.0, 0.7  # scales of the Geman-McClure loss [deviations]
+START_DISTANCE, START_ANGLE_DEG = 0.5, 20.0  # starts nearer than this are one
+SAME_DISTANCE, SAME_ANGLE_DEG = 0.15, 5.0  # so are poses on their way down
+RIVAL_DISTANCE, RIVAL_ANGLE = 0.5, math.radians(15.0)
+FINISH_ROUNDS = 2
+
+# A right pose scores 0.32 and more on the scenes of BENCHMARK.md, a wrong one 0.15; a wrong basin has a rival
+# nearly as good.
+MIN_SCORE = 0.25
+MIN_MARGIN = 0.05
+
+# Steps (rotation [rad], translation [m]) from which a pose is found again; the first is none.
+SHAKES = np.array(
+    [(0.0,) * 6]
+    + [
+        (0.08 * c, 0.08 * b, 0.08 * a, 0.144 * a, 0.144 * b, 0.144 * c)
+        for a in (-1, 1)
+        for b in (-1, 1)
+        for c in (-1, 1)
+    ]
+)
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A pose in the map's frame, and how well it explains the panorama."""
+
+    pose: Pose
+    score: float  # locally normalised correlation, times the root of the share of the sphere that both show
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Poses in arrays, best first, and the candidate on whose view each descends."""
+
+    R_cam_from_map: NDArray[np.float64]  # (n, 3, 3)
+    center_map: NDArray[np.float64]  # (n, 3) [m]
+    candidate: NDArray[np.int64]  # (n,)
+    score: NDArray[np.float64]  # (n,)
+
+    def hypotheses(self) -> list[Hypothesis]:
+        """One object each."""
+        poses = zip(self.R_cam_from_map, self.center_map, self.score, strict=True)
+        return [Hypothesis(Pose(R, center), float(score)) for R, center, score in poses]
+
+
+def unique_best(hypotheses: Sequence[Hypothesis], count: int) -> list[Hypothesis]:
+    """The `count` best of which no two are the same."""
+    kept: list[Hypothesis] = []
+    for h in sorted(hypotheses, key=lambda h: -h.score):
+        near = (are_same(h.pose, k.pose, SAME_DISTANCE, math.radians(SAME_ANGLE_DEG)) for k in kept)
+        if not any(near):
+            kept.append(h)
+        if len(kept) == count:
+            break
+    return kept
+
+
+def as_levels(features: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Channels in deviations as 8-bit levels, not rounded."""
+    return np.asarray(features * np.float32(LEVELS_PER_UNIT) + np.float32(ZERO_LEVEL))
+
+
+def descend_cells(
+    cells: Cells, center: Array, texels: Texels, pose: Pose, limits: tuple[float, int, float]
+) -> Hypothesis:
+    """Descend from `pose` on cells around `center` (3,); limits are loss scale, iterations and least step.
+
+    Coordinates relative to the centre keep float32 exact.
+    """
+    offsets, features, weights = cells
+    loss_scale, num_iterations, tolerance = limits
+    R, t = pose.R_cam_from_world.copy(), pose.center_world - center
+    levels, width = as_levels(features), texels.width
+    scale = loss_scale * LEVELS_PER_UNIT
+    descend(offsets, levels, weights, texels.rgbx, width, scale, num_iterations, tolerance, R, t)
+    score, shared = correlate(offsets, levels, weights, texels.rgbx, width, R, t)
+    return Hypothesis(Pose(orthonormal(R), t + center), float(score * math.sqrt(shared)))
+
+
+@dataclass(frozen=True)
+class Engine:
+    """A prepared map, a panorama at the scales of SCALES, and how to search."""
+
+    scan_map: ScanMap
+    images: Sequence[Texels]
+    settings: EngineSettings
+    workers: Workers
+
+    def search(self, gravity: Gravity) -> Starts:
+        """Every candidate position with every rotation as matrix products; the distinct best."""
+        m, settings = self.scan_map, self.settings
+        num_starts = len(m.centers) // settings.candidates_per_start
+        num_starts = min(max(num_starts, settings.min_starts), settings.max_starts)
+        num_pool = num_starts * settings.poses_per_start
+        is_known = gravity == "known"
+        rotations = uniform_yaws(settings.num_yaws) if is_known else uniform_rotations(settings.num_rotations)
+        rotations = allowed_rotations(rotations @ m.R_map_from_world, settings.prior) @ m.R_map_from_world.T
+        samples, validity = turn_panorama(self.images[3], rotations)
+        if is_known:
+            candidate, rotation, scores = best_poses(score_poses(m, samples, validity), num_pool)
+        else:  # on wide cells and fewer positions first, as there are so many rotations
+            candidate, rotation, _ = best_poses(score_poses_wide(m, samples, validity), num_pool)
+            candidate, scores = m.sparse[candidate], np.empty(len(candidate), np.float32)
+            area = make_tiling(SEARCH_VIEW.num_rings).solid_angle
+            correlate_pairs(m.features, m.is_seen, area, samples, validity, candidate, rotation, scores)
+            order = np.lexsort((rotation, candidate, -scores))
+            candidate, rotation, scores = candidate[order], rotation[order], scores[order]
+        kept = pick_distinct(
+            rotations[rotation], m.centers[candidate], num_starts, START_DISTANCE, START_ANGLE_DEG
+        )
+        candidate, rotation, scores = candidate[kept], rotation[kept], scores[kept]
+        return Starts(rotations[rotation], m.centers[candidate], candidate, scores.astype(np.float64))
+
+    def descend_searched(self, starts: Starts, num_iterations: int, count: int) -> Starts:
+        """Descend from each start on its candidate's prepared view; keep the distinct best."""
+        m, image = self.scan_map, self.images[3]
+        R, t = starts.R_cam_from_map.copy(), starts.center_map.copy()
+        scores = np.empty(len(t))
+        area, scale = make_tiling(SEARCH_VIEW.num_rings).solid_angle, COARSE_LOSS * LEVELS_PER_UNIT
+        views = m.offsets, m.offset_unit, m.features, m.is_seen, area, m.centers
+        how = image.rgbx, image.width, scale, num_iterations
+
+        def run(lo: int) -> None:
+            part = slice(lo, lo + 16)
+            descend_starts(*views, *how, starts.candidate[part], R[part], t[part], scores[part])
+
+        list(self.workers.each(run, range(0, len(t), 16), "descend"))
+        order = np.lexsort((np.arange(len(t)), -scores))
+        kept = order[pick_distinct(R[order], t[order], count, SAME_DISTANCE, SAME_ANGLE_DEG)]
+        return Starts(R[kept], t[kept], starts.candidate[kept], scores[kept])
+
+    def descend_middle(self, h: Hypothesis) -> Hypothesis:
+        """Descend on middle cells, seen from where the pose is now."""
+        center = h.pose.center_world
+        cells = render_view(self.scan_map.octree, center, MIDDLE_VIEW)
+        return descend_cells(cells, center, self.images[2], h.pose, (COARSE_LOSS, 12, 1e-3))
+
+    def shake(self, h: Hypothesis) -> Hypothesis:
+        """Descend again from around a pose, wide basin first; the best of these and of the pose itself."""
+        center, wide, image = h.pose.center_world, self.images[3], self.images[2]
+        offsets, features, weights = render_view(self.scan_map.octree, center, MIDDLE_VIEW)
+        R, t = np.repeat(h.pose.R_cam_from_world[None], len(SHAKES), axis=0), np.zeros((len(SHAKES), 3))
+        scores = np.empty(len(SHAKES))
+        images = wide.rgbx, wide.width, image.rgbx, image.width
+        scale = COARSE_LOSS * LEVELS_PER_UNIT
+        descend_shaken(offsets, as_levels(features), weights, *images, scale, SHAKES, R, t, scores)
+        best = int(np.argmax(scores))
+        return Hypothesis(Pose(orthonormal(R[best]), t[best] + center), float(scores[best]))
+
+    def descend_fine(self, h: Hypothesis) -> Hypothesis:
+        """Descend twice on fine cells, the second time seen from where the first led."""
+        for _ in range(2):
+            center = h.pose.center_world
+            cells = render_view(self.scan_map.octree, center, FINE_VIEW)
+            h = descend_cells(cells, center, self.images[1], h.pose, (FINE_LOSS, 12, 1e-4))
+        return h
+
+    def finish(self, h: Hypothesis) -> Hypothesis:
+        """The last millimetres: the visible points themselves in the finest image. The score stays."""
+        for _ in range(FINISH_ROUNDS):
+            center = h.pose.center_world
+            points = seen_points(self.scan_map.octree, center, FINISH_VIEW, self.settings.num_points)
+            refined = descend_cells(points, center, self.images[0], h.pose, (FINISH_LOSS, 10, 1e-4))
+            h = Hypothesis(refined.pose, h.score)
+        return h
+
+    def refine(self, starts: Starts) -> list[Hypothesis]:
+        """Successive halving from the starts to a few poses on fine cells, best first."""
+        each, settings = self.workers.each, self.settings
+        coarse = self.descend_searched(starts, 4, settings.num_coarse)
+        coarse = self.descend_searched(coarse, 12, settings.num_middle)
+        middle = unique_best(
+            list(each(self.descend_middle, coarse.hypotheses(), "descend")), settings.num_fine
+        )
+        shaken = unique_best(list(each(self.shake, middle, "descend")), settings.num_fine)
+        fine = each(self.descend_fine, shaken, "descend")
+        return sorted(fine, key=lambda h: -h.score)
+
+
+@dataclass(frozen=True)
+class Found:
+    """The best hypothesis of one search, and its margin over the best elsewhere (over 0 if there is none)."""
+
+    best: Hypothesis
+    margin: float
+
+    @property
+    def is_convincing(self) -> bool:
+        """True if score and margin pass."""
+        return self.best.score >= MIN_SCORE and self.margin >= MIN_MARGIN
+
+
+def find(engine: Engine, gravity: Gravity, watch: Stopwatch) -> Found:
+    """Search, refine, and finish the best."""
+    with watch.stage("search"):
+        starts = engine.search(gravity)
+    with watch.stage("refine"):
+        fine = engine.refine(starts)
+        best = engine.finish(fine[0])
+    rivals = [h.score for h in fine[1:] if not are_same(h.pose, fine[0].pose, RIVAL_DISTANCE, RIVAL_ANGLE)]
+    return Found(best, best.score - max([0.0, *rivals]))
+
+
+def localize(
+    scan_map: ScanMap, panorama: Panorama, settings: EngineSettings, workers: Workers, watch: Stopwatch
+) -> Localization:
+    """Where the panorama was taken: search, refine, judge."""
+    allowed = narrowed(scan_map, settings.prior)
+    if len(allowed.centers) == 0 or not panorama.is_valid.any():
+        return Localization(NOT_LOCALIZED, None, None, None, None)
+    with watch.stage("search"):
+        engine = Engine(allowed, comparable(panorama, SCALES), settings, workers)
+    found = find(engine, "unknown" if settings.gravity == "unknown" else "known", watch)
+    if settings.gravity == "auto" and not found.is_convincing:
+        found = max(found, find(engine, "unknown", watch), key=lambda f: (f.is_convincing, f.best.score))
+    with watch.stage("refine"):
+        return judged(scan_map, panorama, settings, found)
+
+
+def judged(scan_map: ScanMap, panorama: Panorama, settings: EngineSettings, found: Found) -> Localization:
+    """The verdict on what was found, in world coordinates, after the descent that the solver asks for."""
+    pose, points = found.best.pose, scan_map.points
+    texels = pack_texels(panorama.rgb, panorama.is_valid)
+    if settings.solver != "gauss-newton":
+        pose = refine(points, texels, pose, DescentSettings(solver=settings.solver, step_size=0.01)).pose
+    loss = sampling_loss(visible_points(points, pose.center_world), texels, pose)
+    if not math.isfinite(loss):
+        return Localization(NOT_LOCALIZED, None, None, None, None)
+    evidence = replace(evidence_at(points, panorama, pose, INLIER_RESIDUAL), score=found.best.score)
+    status = LOCALIZED if found.is_convincing else NOT_LOCALIZED
+    return Localization(status, scan_map.to_world(pose), loss, evidence, found.margin)

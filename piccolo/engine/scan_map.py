@@ -1,0 +1,133 @@
+"""What is prepared once per cloud: the octree, the places where a camera can be, and what it sees from each."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cloud.model import Cloud
+from ..cloud.packed import PackedPoints, pack_points
+from ..gravity import find_up, rotation_to_z_up
+from ..pose import Array, Pose
+from ..threads import Workers
+from .candidates import BLOCK, COARSE_SPACING, candidate_centers
+from .octree import Octree, build_octree
+from .tiling import SEARCH_RINGS, averaging, make_tiling
+from .view import ViewKind, render_block, thread_scratch
+
+WIDE_RINGS = 12
+SEARCH_VIEW = ViewKind(num_rings=SEARCH_RINGS, stats_rings=16, sigma_deg=22.0, voxel_per_range=1 / 15)
+MIN_UP_CONFIDENCE = 0.5
+MIN_TILT = np.radians(5.0)  # a cloud whose up is nearer to its z is taken as it is
+
+
+@dataclass(frozen=True)
+class ScanMap:
+    """A prepared cloud, in a frame of its own: x_map = R_map_from_world @ (x_world - origin_world), z up."""
+
+    octree: Octree
+    R_map_from_world: Array  # (3, 3), identity where the cloud's z is up
+    origin_world: Array  # (3,) [m]
+    centers: NDArray[np.float64]  # (candidates, 3) [m]
+    offsets: NDArray[np.int16]  # (candidates, 3, cells) from the centre to what is seen, in units of
+    offset_unit: NDArray[np.float32]  # (candidates,) [m]
+    features: NDArray[
+        np.int8
+    ]  # (candidates, 3, cells) normalised channels in levels, 0 where nothing is seen
+    is_seen: NDArray[np.bool_]  # (candidates, cells)
+    sparse: NDArray[np.int64]  # candidates of which no two share a cell of the coarse grid
+    wide_features: NDArray[
+        np.int8
+    ]  # (sparse, 3 * wide cells) means over wider cells, for the search over SO(3)
+    wide_seen: NDArray[np.uint8]  # (sparse, wide cells) share seen of each, 255 for all
+    warnings: tuple[str, ...] = ()
+
+    @cached_property
+    def points(self) -> PackedPoints:
+        """The leaves of the octree as coloured points, in the map's frame."""
+        leaves = self.octree.level(self.octree.leaf_size)
+        return pack_points(leaves[:, :3], np.round(leaves[:, 3:] * 255.0).astype(np.uint8))
+
+    def to_world(self, pose: Pose) -> Pose:
+        """A pose of the map's frame in the world."""
+        R_map_from_world = self.R_map_from_world
+        center_world = R_map_from_world.T @ pose.center_world + self.origin_world
+        return Pose(pose.R_cam_from_world @ R_map_from_world, center_world)
+
+    def from_world(self, pose: Pose) -> Pose:
+        """A pose of the world in the map's frame."""
+        center = self.R_map_from_world @ (pose.center_world - self.origin_world)
+        return Pose(pose.R_cam_from_world @ self.R_map_from_world.T, center)
+
+
+def render_candidates(
+    octree: Octree, centers: NDArray[np.float64], workers: Workers
+) -> tuple[NDArray[np.int16], NDArray[np.float32], NDArray[np.int8], NDArray[np.bool_]]:
+    """Offsets, their units, channels and seen cells of the view from each centre, as ScanMap holds them."""
+    cells = len(make_tiling(SEARCH_VIEW.num_rings))
+    offsets, unit = np.empty((len(centers), 3, cells), np.int16), np.empty(len(centers), np.float32)
+    levels, is_seen = np.empty((len(centers), 3, cells), np.int8), np.empty((len(centers), cells), np.bool_)
+    kind = SEARCH_VIEW.arrays
+
+    def run(lo: int) -> None:
+        part = slice(lo, lo + BLOCK)
+        out = offsets[part], unit[part], levels[part], is_seen[part]
+        voxels = SEARCH_VIEW.voxel_per_range
+        render_block(octree.arrays(), centers[part], voxels, kind, thread_scratch(), *out)
+
+    list(workers.each(run, range(0, len(centers), BLOCK), "render views"))
+    return offsets, unit, levels, is_seen
+
+
+def widen(
+    levels: NDArray[np.int8], is_seen: NDArray[np.bool_], rows: NDArray[np.int64]
+) -> tuple[NDArray[np.int8], NDArray[np.uint8]]:
+    """Some rows of views (N, 3, cells) averaged over the wider cells, and the share seen of these."""
+    matrix, area = averaging(WIDE_RINGS), make_tiling(WIDE_RINGS).solid_angle
+    features = np.empty((len(rows), 3, len(area)), np.int8)
+    share = np.empty((len(rows), len(area)), np.uint8)
+    for lo in range(0, len(rows), 1024):
+        part = rows[lo : lo + 1024]
+        mean = levels[part].astype(np.float32) @ matrix / area
+        features[lo : lo + 1024] = np.rint(np.clip(mean, -127, 127))
+        seen = np.minimum(is_seen[part].astype(np.float32) @ matrix / area, 1.0)
+        share[lo : lo + 1024] = np.rint(seen * 255.0)
+    return features.reshape(len(rows), -1), share
+
+
+def level_out(octree: Octree) -> tuple[Array, tuple[str, ...]]:
+    """Rotation (3, 3) that turns the cloud's up to +z, identity where it is there already or not known."""
+    up = find_up(octree.level(0.08)[:, :3])
+    tilt = np.arccos(np.clip(up.direction_world[2], -1.0, 1.0))
+    if up.confidence < MIN_UP_CONFIDENCE or tilt < MIN_TILT:
+        return np.eye(3), ()
+    text = f"the cloud's z is {np.degrees(tilt):.0f} deg off its up direction; levelled by its own planes"
+    return rotation_to_z_up(up.direction_world), (text,)
+
+
+def prepare_map(cloud: Cloud, workers: Workers) -> ScanMap:
+    """Everything about a cloud that does not depend on the panorama."""
+    octree = build_octree(cloud.points, cloud.colors)
+    R_map_from_world, warnings = level_out(octree)
+    if warnings:
+        turned = (cloud.points @ R_map_from_world.T).astype(np.float32)
+        octree = build_octree(turned, cloud.colors)
+    centers = candidate_centers(octree, workers)
+    offsets, unit, levels, is_seen = render_candidates(octree, centers, workers)
+    _, sparse = np.unique(np.floor(centers / COARSE_SPACING), axis=0, return_index=True)
+    wide_features, wide_seen = widen(levels, is_seen, sparse)
+    return ScanMap(
+        octree=octree,
+        R_map_from_world=R_map_from_world,
+        origin_world=cloud.origin_world,
+        centers=centers,
+        offsets=offsets,
+        offset_unit=unit,
+        features=levels,
+        is_seen=is_seen,
+        sparse=sparse,
+        wide_features=wide_features,
+        wide_seen=wide_seen,
+        warnings=cloud.warnings + warnings,
+    )

@@ -1,0 +1,337 @@
+"""The cloud seen from a position: z-buffered cells of the sphere, from voxels of the size the cells ask for."""
+
+import math
+import threading
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..jit import F0, F1, HALF, kernel
+from ..sphere import atan2
+from .channels import LEVELS_PER_UNIT, opponent, per_deviation, standardized
+from .octree import Octree
+from .tiling import cell_of, make_neighbors, make_tiling
+
+PI = np.float32(math.pi)
+FAR = np.float32(1e30)
+BAND = np.float32(1.15)  # a cell's colour is the mean of points up to this times its nearest range
+VISIBLE_FACTOR = np.float32(1.08)  # lets grazing floors and walls through
+VISIBLE_OFFSET = np.float32(0.1)  # [m] and range noise
+
+
+Kind = tuple[Any, ...]  # what ViewKind.arrays gives; kernels read it by position
+Cells = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+
+
+@dataclass(frozen=True)
+class ViewKind:
+    """How a view is made: cells, the sphere's share over which colours are normalised, voxels' angular size."""
+
+    num_rings: int
+    stats_rings: int  # cells of these rings carry the local statistics: no wider than sigma
+    sigma_deg: float
+    voxel_per_range: float  # largest voxel size by its distance
+
+    @cached_property
+    def arrays(self) -> Kind:
+        """What the kernels read."""
+        tiling = make_tiling(self.num_rings)
+        neighbors = make_neighbors(self.num_rings, self.stats_rings, self.sigma_deg)
+        return (
+            tiling.num_columns, tiling.first, cell_of(tiling.directions, self.stats_rings), len(make_tiling(self.stats_rings)),
+            tiling.solid_angle, neighbors.row, neighbors.cell, neighbors.weight,
+        )  # fmt: skip
+
+
+@kernel
+def collect(nodes, first_child, level_start, leaf_size, center, voxel_per_range, found, directions):
+    """Write the indices of the nodes that, seen from `center`, are as small as asked, or leaves; returns how many.
+
+    `directions` (3, N) get the positions relative to the centre [m].
+    """
+    num_levels = len(level_start) - 1
+    stack = np.empty(8 * num_levels, np.int32)
+    levels = np.empty(8 * num_levels, np.int32)
+    cx, cy, cz = np.float32(center[0]), np.float32(center[1]), np.float32(center[2])
+    per2 = np.float32(1.0 / (voxel_per_range * voxel_per_range))
+    min_d2 = np.empty(num_levels, np.float32)
+    for level in range(num_levels):
+        size = np.float32(leaf_size * 2.0 ** (num_levels - 1 - level))
+        min_d2[level] = size * size * per2
+    min_d2[num_levels - 1] = F0
+    count = 0
+    for root in range(level_start[1]):
+        stack[0] = root
+        levels[0] = 0
+        top = 1
+        while top > 0:
+            top -= 1
+            node = stack[top]
+            level = levels[top]
+            dx, dy, dz = nodes[node, 0] - cx, nodes[node, 1] - cy, nodes[node, 2] - cz
+            if dx * dx + dy * dy + dz * dz >= min_d2[level]:
+                if count < len(found):
+                    found[count] = node
+                    directions[0, count], directions[1, count], directions[2, count] = dx, dy, dz
+                    count += 1
+            else:
+                for child in range(first_child[node], first_child[node + 1]):
+                    stack[top] = child
+                    levels[top] = level + 1
+                    top += 1
+    return count
+
+
+@kernel
+def locate(X, Y, Z, num_columns, first, cells, ranges, turns):
+    """Write the cell and the range [m] of each position relative to the centre; `turns` is scratch."""
+    num_rings = np.float32(len(num_columns))
+    per_pi = np.float32(len(num_columns) / math.pi)
+    per_turn = np.float32(0.5 / math.pi)
+    # Two loops: the arithmetic is vectorised, the look-ups that follow can't be.
+    for i in range(len(cells)):
+        x, y, z = X[i], Y[i], Z[i]
+        rho2 = x * x + y * y
+        ring = (HALF * PI - atan2(z, math.sqrt(rho2))) * per_pi
+        cells[i] = np.int32(min(max(ring, F0), num_rings - F1))
+        turns[i] = atan2(y, x) * per_turn + HALF
+        ranges[i] = math.sqrt(rho2 + z * z)
+    for i in range(len(cells)):
+        ring = cells[i]
+        n = num_columns[ring]
+        cells[i] = first[ring] + min(np.int32(turns[i] * np.float32(n)), n - np.int32(1))
+
+
+@kernel
+def average_cells(nodes, found, directions, cells, ranges, sums):
+    """Write (cells, 8): sums of x, y, z, r, g, b and the count over each cell's front, and its nearest range."""
+    sums[:] = F0
+    sums[:, 7] = FAR
+    for i in range(len(cells)):
+        cell = cells[i]
+        sums[cell, 7] = min(sums[cell, 7], ranges[i])
+    for i in range(len(cells)):
+        cell = cells[i]
+        if ranges[i] <= sums[cell, 7] * BAND:
+            node = found[i]
+            for k in range(3):
+                sums[cell, k] += directions[k, i]
+                sums[cell, k + 3] += nodes[node, k + 3]
+            sums[cell, 6] += F1
+
+
+@kernel
+def average_colors(sums, kind, offsets, features, weights, moments):
+    """Turn sums into positions relative to the centre, opponent channels and weights of cells; add up moments."""
+    coarse_cell, solid_angle = kind[2], kind[4]
+    moments[:] = F0
+    for c in range(len(sums)):
+        if sums[c, 6] > F0:
+            per = F1 / sums[c, 6]
+            for k in range(3):
+                offsets[k, c] = sums[c, k] * per
+            channels = opponent(sums[c, 3] * per, sums[c, 4] * per, sums[c, 5] * per)
+            w = solid_angle[c]
+            weights[c] = w
+            m = moments[coarse_cell[c]]
+            m[0] += w
+            for k in range(3):
+                features[k, c] = channels[k]
+                m[1 + k] += w * channels[k]
+                m[4 + k] += w * channels[k] * channels[k]
+        else:
+            weights[c] = F0
+            for k in range(3):
+                offsets[k, c] = F0
+                features[k, c] = F0
+
+
+@kernel
+def local_statistics(moments, kind, weights, stats):
+    """Write the local mean of each channel and 1 / its local deviation (6, cells) around cells of positive weight."""
+    row, neighbor, weight = kind[5], kind[6], kind[7]
+    for c in range(len(weights)):
+        if weights[c] <= F0:
+            continue
+        s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = F0
+        for j in range(row[c], row[c + 1]):
+            w = weight[j]
+            m = moments[neighbor[j]]
+            s0 += w * m[0]
+            s1 += w * m[1]
+            s2 += w * m[2]
+            s3 += w * m[3]
+            s4 += w * m[4]
+            s5 += w * m[5]
+            s6 += w * m[6]
+            s7 += w * m[7]  # always 0: eight sums fill a vector register
+        per = F1 / s0
+        stats[0, c], stats[1, c], stats[2, c] = s1 * per, s2 * per, s3 * per
+        stats[3, c] = per_deviation(s1 * per, s4 * per)
+        stats[4, c] = per_deviation(s2 * per, s5 * per)
+        stats[5, c] = per_deviation(s3 * per, s6 * per)
+
+
+@kernel
+def render_cells(tree, center, voxel_per_range, kind, scratch, offsets, features, weights, sums, stats):
+    """One view: relative position, opponent channels, their local statistics and weight of each cell."""
+    found, directions, cells, ranges, turns = scratch
+    n = collect(tree[0], tree[1], tree[2], tree[3], center, voxel_per_range, found, directions)
+    locate(
+        directions[0, :n],
+        directions[1, :n],
+        directions[2, :n],
+        kind[0],
+        kind[1],
+        cells[:n],
+        ranges[:n],
+        turns,
+    )
+    average_cells(tree[0], found, directions, cells[:n], ranges, sums)
+    moments = np.empty((kind[3], 8), np.float32)
+    average_colors(sums, kind, offsets, features, weights, moments)
+    local_statistics(moments, kind, weights, stats)
+    return n
+
+
+@kernel
+def render(tree, center, voxel_per_range, kind, scratch, offsets, features, weights):
+    """One view: position relative to the centre, normalised channels and weight of each cell."""
+    sums = np.empty((len(weights), 8), np.float32)
+    stats = np.empty((6, len(weights)), np.float32)
+    render_cells(tree, center, voxel_per_range, kind, scratch, offsets, features, weights, sums, stats)
+    for k in range(3):
+        for c in range(len(weights)):
+            if weights[c] > F0:
+                features[k, c] = standardized(features[k, c], stats[k, c], stats[3 + k, c])
+
+
+@kernel
+def render_block(tree, centers, voxel_per_range, kind, scratch, offsets, unit, levels, is_seen):
+    """Views from several centres in few bits: offsets in units of their own, channels in levels."""
+    n = len(kind[4])
+    points, features, weights = (
+        np.empty((3, n), np.float32),
+        np.empty((3, n), np.float32),
+        np.empty(n, np.float32),
+    )
+    for k in range(len(centers)):
+        render(tree, centers[k], voxel_per_range, kind, scratch, points, features, weights)
+        largest = np.float32(1e-3)
+        for i in range(3):
+            for c in range(n):
+                largest = max(largest, abs(points[i, c]))
+        unit[k] = largest / np.float32(32767)
+        for i in range(3):
+            for c in range(n):
+                offsets[k, i, c] = np.int16(points[i, c] / unit[k])
+                level = features[i, c] * np.float32(LEVELS_PER_UNIT)
+                levels[k, i, c] = np.int8(
+                    min(max(math.floor(level + HALF), np.float32(-127)), np.float32(127))
+                )
+        for c in range(n):
+            is_seen[k, c] = weights[c] > F0
+
+
+@kernel
+def render_points(tree, center, voxel_per_range, kind, scratch, offsets, features, weights):
+    """The visible points themselves, evenly thinned to what fits: relative position, normalised channels, weight 1.
+
+    Returns how many.
+    """
+    num_cells = len(kind[4])
+    sums, stats = np.empty((num_cells, 8), np.float32), np.empty((6, num_cells), np.float32)
+    cell_offsets, cell_features = np.empty((3, num_cells), np.float32), np.empty((3, num_cells), np.float32)
+    cell_weights = np.empty(num_cells, np.float32)
+    n = render_cells(
+        tree, center, voxel_per_range, kind, scratch, cell_offsets, cell_features, cell_weights, sums, stats
+    )
+    found, directions, cells, ranges, _ = scratch
+    visible = 0
+    for i in range(n):
+        if ranges[i] <= sums[cells[i], 7] * VISIBLE_FACTOR + VISIBLE_OFFSET:
+            visible += 1
+    stride = (visible + len(weights) - 1) // len(weights)
+    count = seen = 0
+    for i in range(n):
+        if ranges[i] <= sums[cells[i], 7] * VISIBLE_FACTOR + VISIBLE_OFFSET:
+            seen += 1
+            if seen % stride == 0:
+                node, c = found[i], cells[i]
+                channels = opponent(tree[0][node, 3], tree[0][node, 4], tree[0][node, 5])
+                for k in range(3):
+                    offsets[k, count] = directions[k, i]
+                    features[k, count] = standardized(channels[k], stats[k, c], stats[3 + k, c])
+                weights[count] = F1
+                count += 1
+    return count
+
+
+@kernel
+def filled_shares(tree, centers, voxel_per_range, kind, scratch, share):
+    """Write the share of the sphere (n,) around each centre (n, 3) whose cells hold any node."""
+    found, directions, cells, ranges, turns = scratch
+    is_filled = np.empty(len(kind[4]), np.bool_)
+    for k in range(len(centers)):
+        n = collect(tree[0], tree[1], tree[2], tree[3], centers[k], voxel_per_range, found, directions)
+        locate(
+            directions[0, :n],
+            directions[1, :n],
+            directions[2, :n],
+            kind[0],
+            kind[1],
+            cells[:n],
+            ranges[:n],
+            turns,
+        )
+        is_filled[:] = False
+        for i in range(n):
+            is_filled[cells[i]] = True
+        share[k] = F0
+        for c in range(len(is_filled)):
+            if is_filled[c]:
+                share[k] += kind[4][c]
+
+
+MAX_NODES = 1_000_000
+
+
+def make_scratch() -> tuple[Any, ...]:
+    """Arrays that one thread needs to render."""
+    return (
+        np.empty(MAX_NODES, np.int32), np.empty((3, MAX_NODES), np.float32),
+        np.empty(MAX_NODES, np.int32), np.empty(MAX_NODES, np.float32), np.empty(MAX_NODES, np.float32),
+    )  # fmt: skip
+
+
+_local = threading.local()
+
+
+def thread_scratch() -> Any:
+    """The calling thread's own scratch: fresh memory costs as much as a view."""
+    if not hasattr(_local, "scratch"):
+        _local.scratch = make_scratch()
+    return _local.scratch
+
+
+def render_view(octree: Octree, center_world: NDArray[np.float64], kind: ViewKind) -> Cells:
+    """Offsets from the centre (3, cells) [m], channels (3, cells), weights (cells,), 0 where nothing is seen."""
+    n = len(make_tiling(kind.num_rings))
+    view = np.empty((3, n), np.float32), np.empty((3, n), np.float32), np.empty(n, np.float32)
+    center = np.asarray(center_world, np.float64)
+    render(octree.arrays(), center, kind.voxel_per_range, kind.arrays, thread_scratch(), *view)
+    return view
+
+
+def seen_points(octree: Octree, center_world: NDArray[np.float64], kind: ViewKind, max_points: int) -> Cells:
+    """The same of at most `max_points` visible points instead of cells, with equal weights."""
+    n = max_points
+    points = np.empty((3, n), np.float32), np.empty((3, n), np.float32), np.empty(n, np.float32)
+    center = np.asarray(center_world, np.float64)
+    count = render_points(
+        octree.arrays(), center, kind.voxel_per_range, kind.arrays, thread_scratch(), *points
+    )
+    return points[0][:, :count].copy(), points[1][:, :count].copy(), points[2][:count].copy()
