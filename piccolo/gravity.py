@@ -1,9 +1,9 @@
 """Which way is up in a cloud, from its own planes.
 
 Every axis that many surfaces face is a candidate, in both senses. For each of these hypotheses the evidence
-is added up as log-odds: how much of the cloud lies in a few sheets across it (floors, ceilings), how much
-stands parallel to it (walls), how low the cloud is along it, whether clutter lies at the bottom of the storeys,
-whether one sheet carries everything, and the convention that scans have z up.
+is added up as log-odds: how much of the cloud lies in a few sheets across it (floors, ceilings), how little
+is aslant to it (floors and walls are not), how low the cloud is along it, whether clutter lies at the bottom
+of the storeys, whether one sheet carries everything, and the convention that scans have z up.
 """
 
 from collections.abc import Iterator
@@ -18,7 +18,8 @@ from .pose import Array, exp_so3
 
 MAX_POINTS = 40_000  # that are looked at
 MIN_POINTS = 300
-NUM_NEIGHBORS = 12  # of a normal
+NUM_NEIGHBORS = 24  # of a normal
+MAX_FLATNESS = 0.05  # variance across a flat neighbourhood to the lesser variance along it
 NUM_CELLS = 4000  # of the sphere of directions, about 3 deg wide
 CELLS_PER_MODE = 12  # neighbouring cells whose votes are one direction's, about 6 deg wide
 MAX_MODES = 6
@@ -41,14 +42,12 @@ CHANCE_SHARP = 0.25  # share of these that do so within 2 deg
 
 # Log-odds a unit of evidence: chosen by hand, rounded
 SHEET_WEIGHT = 2.0  # of the logarithm of the share of the cloud in the sheets
-SLANT_WEIGHT = (
-    1.5  # of the logarithm of the share of flat surfaces that neither face the axis nor stand along it
-)
+SLANT_WEIGHT = 2.0  # of the logarithm of the share of flat surfaces that are aslant to the axis, against
 EXTENT_WEIGHT = 2.0  # of the logarithm of the extent, against
 CLUTTER_WEIGHT = 2.0  # of the logarithm of clutter below to clutter above the middle of the storeys
 MAX_CLUTTER = 1.2  # beyond which that logarithm says no more
 CARRY_WEIGHT = 3.0  # of what stands on all sheets less what hangs below all of them, as a share of both
-PRIOR_WEIGHT = 2.0  # of z up
+PRIOR_WEIGHT = 1.5  # of z up
 DOUBT = 0.05  # odds that it is none of the hypotheses
 
 
@@ -81,16 +80,14 @@ class _Evidence:
     sharpness: float  # share of these that do so within 2 deg
     extent: float  # of the cloud along the axis [m]
     clutter: float  # logarithm of clutter below to clutter above the middle of the storeys
-    carried: (
-        float  # [-1, 1] what lies beyond the last sheet in the sense of the axis, or (negative) the other
-    )
+    carried: float  # [-1, 1] what lies above the last sheet less what lies below the first, to both
 
     @property
     def log_odds(self) -> float:
         """Of the axis pointing up."""
         is_conventional = self.axis[2] > np.cos(PRIOR_ANGLE)
         return float(
-            SHEET_WEIGHT * np.log(self.sheets + 0.01)
+            SHEET_WEIGHT * np.log(self.sheets + 0.03)
             - SLANT_WEIGHT * np.log(self.slanted + 0.01)
             - EXTENT_WEIGHT * np.log(self.extent + 0.1)
             + CLUTTER_WEIGHT * np.clip(self.clutter, -MAX_CLUTTER, MAX_CLUTTER)
@@ -103,11 +100,11 @@ def find_up(points: NDArray[np.float32]) -> Up:
     """The direction that points up in a cloud (N, 3) [m], thinned evenly in space (5 to 20 cm).
 
     By convention scans have z up: this counts for a direction within 10 deg of +z, decides between close
-    alternatives and often the sense, and within 0.2 deg +z itself is returned. In a frame that is known to be
-    turned arbitrarily this is as likely to mislead by chance as such a direction is: one time in a hundred.
+    alternatives and often the sense; within 0.2 deg of it, +z itself is returned. In a frame turned at random
+    the convention speaks for a wall or the ground below one time in 25, and sometimes misleads.
 
-    The confidence is the winner's share of the odds of all directions, lessened where few surfaces are flat
-    or along the winner: a bare room, the same upside down, stays below 0.5.
+    The confidence is the winner's share of the odds of all directions, less where few surfaces are flat or
+    they face about it. A bare room turned at random stays below 0.5, for its floor may be its ceiling.
 
     Raises
     ------
@@ -147,7 +144,7 @@ def _surfaces(points: NDArray[np.float32]) -> _Surfaces:
     neighbors = sample[cKDTree(sample).query(sample, NUM_NEIGHBORS)[1]]
     neighbors -= neighbors.mean(axis=1, keepdims=True)
     variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", neighbors, neighbors))
-    is_flat = (variances[:, 0] < 0.03 * variances[:, 1]) & (variances[:, 1] > 0.1 * variances[:, 2])
+    is_flat = (variances[:, 0] < MAX_FLATNESS * variances[:, 1]) & (variances[:, 1] > 0.1 * variances[:, 2])
     return _Surfaces(sample, axes[:, :, 0], is_flat)
 
 
@@ -197,7 +194,7 @@ def _across(axes: list[Array]) -> Iterator[Array]:
 
 
 def _refine(normals: Array, axis: Array) -> Array:
-    """`axis` by least squares: parallel to the normals that face it, perpendicular to those of walls along it."""
+    """`axis` by least squares: parallel to normals that face it, perpendicular to those of walls."""
     for angle in INLIER_ANGLES:
         cosines = np.abs(_cosines(normals, axis))
         facing, along = normals[cosines > np.cos(angle)], normals[cosines < np.sin(angle)]
@@ -212,7 +209,7 @@ def _evidence(surfaces: _Surfaces, axis: Array) -> _Evidence:
     faces = surfaces.is_flat & (cosines > np.cos(FACING_ANGLE))
     stands = surfaces.is_flat & (cosines < np.sin(FACING_ANGLE))
     heights = _cosines(surfaces.points, axis)
-    num_points, num_explained = len(heights), np.count_nonzero(faces | stands)
+    num_points, num_explained = len(heights), int(np.count_nonzero(faces | stands))
     low, high = np.quantile(heights, [0.01, 0.99])
     levels, shares = _sheets(heights[faces], num_points)
     sharp = (cosines > np.cos(INLIER_ANGLES[-1])) | (cosines < np.sin(INLIER_ANGLES[-1]))
@@ -245,10 +242,10 @@ def _sheets(heights: Array, num_points: int) -> tuple[Array, Array]:
         share = pairs[k] / num_points
         if found and share < MIN_SHEET * found[0][1]:
             break
-        found.append((low + k * size, share))
+        found.append((float(low) + k * size, share))
         pairs[max(k - 2, 0) : k + 3] = 0
-    levels, shares = np.array(sorted(found)).T
-    return levels, shares
+    found.sort()
+    return np.array([level for level, _ in found]), np.array([share for _, share in found])
 
 
 def _clutter(heights: Array, levels: Array, softening: float) -> float:
@@ -276,7 +273,8 @@ def _verdict(hypotheses: list[_Evidence]) -> Up:
     quality *= np.clip((best.sharpness - CHANCE_SHARP) / CHANCE_SHARP, 0.0, 1.0)
     rival = "upside down" if best.axis @ second.axis < -0.9 else "another axis"
     reason = (
-        f"{best.explained:.0%} of the points are flat across or along it, {best.sharpness:.0%} of these sharply;"
+        f"{best.explained:.0%} of the points are flat across or along it,"
+        f" {best.sharpness:.0%} of these sharply;"
         f" clutter below to above {np.exp(best.clutter):.1f} : 1; next is {rival}, {odds[rank[1]]:.0%}"
     )
     direction = np.array([0.0, 0.0, 1.0]) if best.axis[2] > np.cos(SNAP_ANGLE) else best.axis

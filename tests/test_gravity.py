@@ -1,0 +1,172 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rooms import room
+
+from piccolo.cloud.order import thin
+from piccolo.errors import InputError
+from piccolo.gravity import find_up, rotation_to_z_up
+from piccolo.pose import angle_between, exp_so3
+
+Z = np.array([0.0, 0.0, 1.0])
+TURNS = [np.array(w) for w in ([0.3, -0.2, 0.9], [1.4, 0.6, -0.3], [-0.7, 2.2, 1.0], [2.9, -0.5, 0.4])]
+Y_UP, Z_DOWN = np.array([-np.pi / 2, 0.0, 0.0]), np.array([np.pi, 0.0, 0.0])
+DIRECTIONS = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda d: np.linalg.norm(d) > 1e-3)
+
+
+def thinned(seed):
+    cloud = room(seed)[1]
+    return thin(cloud.points, cloud.colors, 0.07)[0]
+
+
+def turned(points, w):
+    return (points @ exp_so3(w).T).astype(np.float32)
+
+
+def error_deg(up, true_up):
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(up, true_up)), up @ true_up))
+
+
+def plane(rng, num_points, spread):
+    """Points (N, 3) evenly over a slab around the origin, `spread` (3,) each way [m]."""
+    return rng.uniform(-1.0, 1.0, (num_points, 3)) * spread
+
+
+def bare_room(rng):
+    """A closed box of 5 x 4 x 2.6 m with nothing in it: points (N, 3) [m]."""
+    size, faces = np.array([5.0, 4.0, 2.6]), []
+    for axis, side in np.ndindex(3, 2):
+        face = rng.uniform(0.0, 1.0, (int(400 * np.delete(size, axis).prod()), 3)) * size
+        face[:, axis] = side * size[axis] + rng.normal(0.0, 0.003, len(face))
+        faces.append(face)
+    return np.concatenate(faces)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("w", TURNS, ids=str)
+def test_up_is_found_in_a_turned_room(seed, w):
+    up = find_up(turned(thinned(seed), w))
+    assert error_deg(up.direction_world, exp_so3(w) @ Z) < 0.5
+    assert np.linalg.norm(up.direction_world) == pytest.approx(1.0)
+    assert 0.5 < up.confidence <= 1.0
+    assert "\n" not in up.reason
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("w", [Y_UP, Z_DOWN], ids=["y up", "z down"])
+def test_planes_outvote_the_convention_where_it_is_wrong(seed, w):
+    up = find_up(turned(thinned(seed), w))
+    assert error_deg(up.direction_world, exp_so3(w) @ Z) < 0.5
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_z_up_stays_exactly_so(seed):
+    up = find_up(thinned(seed))
+    np.testing.assert_array_equal(up.direction_world, Z)
+    np.testing.assert_array_equal(rotation_to_z_up(up.direction_world), np.eye(3))
+    assert up.confidence > 0.8
+
+
+@pytest.mark.parametrize("w", TURNS, ids=str)
+def test_ground_with_things_on_it_needs_no_ceiling(w):
+    rng = np.random.default_rng(5)
+    trees = [rng.normal([x, y, 4.0], [1.0, 1.0, 1.5], (400, 3)) for x, y in rng.uniform(-15, 15, (15, 2))]
+    points = np.concatenate([plane(rng, 15_000, np.array([18.0, 18.0, 0.02])), *trees])
+    up = find_up(turned(points, w))
+    assert error_deg(up.direction_world, exp_so3(w) @ Z) < 0.5
+    assert up.confidence > 0.8
+
+
+def test_walls_at_odd_angles_tell_up_without_floor_or_ceiling():
+    rng = np.random.default_rng(6)
+    walls = [
+        plane(rng, 2500, np.array([0.005, 3.0, 1.3])) @ exp_so3(np.array([0.0, 0.0, a])).T
+        + 4.0 * np.array([np.cos(a), np.sin(a), 0.0])
+        for a in (0.0, 1.0, 2.3, 3.5, 5.0)
+    ]
+    up = find_up(turned(np.concatenate(walls), TURNS[1]))
+    assert abs(up.direction_world @ exp_so3(TURNS[1]) @ Z) > np.cos(np.radians(0.5))
+    assert up.confidence < 0.5  # nothing says which end is up
+
+
+def test_a_bare_room_may_be_upside_down():
+    up = find_up(turned(bare_room(np.random.default_rng(7)), TURNS[0]))
+    assert abs(up.direction_world @ exp_so3(TURNS[0]) @ Z) > np.cos(np.radians(0.5))
+    assert up.confidence < 0.5
+
+
+def test_by_convention_a_bare_room_has_z_up():
+    points = bare_room(np.random.default_rng(7)).astype(np.float32)
+    up = find_up(points)
+    np.testing.assert_array_equal(up.direction_world, Z)
+    assert up.confidence > 0.5
+    tilted = exp_so3(
+        np.array([0.1, 0.0, 0.0])
+    )  # 5.7 deg: the convention gives the sense, planes the direction
+    assert error_deg(find_up((points @ tilted.T).astype(np.float32)).direction_world, tilted @ Z) < 0.5
+
+
+def test_two_far_strays_change_little():
+    points = np.concatenate([turned(thinned(1), TURNS[2]), np.float32([[1e9, 0, 0], [0, -1e6, 1e6]])])
+    up = find_up(points)
+    assert error_deg(up.direction_world, exp_so3(TURNS[2]) @ Z) < 0.5
+    assert up.confidence > 0.5
+
+
+@pytest.mark.parametrize("kind", ["volume", "ball", "sphere", "line", "one place", "few", "none"])
+def test_no_planes_no_confidence(kind):
+    rng = np.random.default_rng(8)
+    normal = rng.normal(size=(20_000, 3))
+    points = {
+        "volume": rng.uniform(-3.0, 3.0, (20_000, 3)),
+        "ball": normal,
+        "sphere": 3.0 * normal / np.linalg.norm(normal, axis=1, keepdims=True),
+        "line": np.linspace(0.0, 9.0, 1000)[:, None] * [1.0, 2.0, 3.0],
+        "one place": np.ones((1000, 3)),
+        "few": normal[:20],
+        "none": np.empty((0, 3)),
+    }[kind]
+    up = find_up(points.astype(np.float32))
+    assert up.confidence < 0.1
+    assert np.linalg.norm(up.direction_world) == pytest.approx(1.0)
+
+
+def test_same_points_same_bits():
+    points = turned(thinned(1), TURNS[0])
+    a, b = find_up(points), find_up(points.copy())
+    assert a.direction_world.tobytes() == b.direction_world.tobytes()
+    assert (a.confidence, a.reason) == (b.confidence, b.reason)
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (np.zeros((5, 2)), "found shape"),
+        (np.zeros(3), "found shape"),
+        (np.full((9, 3), np.nan), "not finite"),
+    ],
+)
+def test_what_is_no_cloud_is_refused(points, message):
+    with pytest.raises(InputError, match=message):
+        find_up(points.astype(np.float32))
+
+
+@given(DIRECTIONS)
+def test_rotation_takes_the_direction_to_z_by_the_smallest_turn(direction):
+    direction = np.array(direction) / np.linalg.norm(direction)
+    R = rotation_to_z_up(direction)
+    np.testing.assert_allclose(R @ direction, Z, atol=1e-12)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) == pytest.approx(1.0)
+    smallest = np.arctan2(np.hypot(*direction[:2]), direction[2])
+    assert angle_between(R, np.eye(3)) == pytest.approx(smallest, abs=1e-7)
+
+
+@pytest.mark.parametrize("tiny", [0.0, 1e-300, 1e-12])
+def test_rotation_near_the_poles(tiny):
+    np.testing.assert_allclose(rotation_to_z_up(np.array([tiny, 0.0, 1.0])), np.eye(3), atol=2e-12)
+    R = rotation_to_z_up(np.array([tiny, tiny, -1.0]))
+    np.testing.assert_allclose(R @ [0.0, 0.0, -1.0], Z, atol=2e-12)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) == pytest.approx(1.0)
