@@ -13,24 +13,20 @@ from typing import Any
 from tqdm import tqdm
 
 from piccolo import __version__
-from piccolo.cloud import read_cloud
-from piccolo.cloud.model import Cloud
 from piccolo.errors import InputError
 from piccolo.files import check_output, write_atomically
 from piccolo.jit import KERNEL_FOLDER, is_first_use
 from piccolo.overlay import overlay_png
 from piccolo.panorama import read_panorama
-from piccolo.paper.method import PaperMap, localize, prepare
-from piccolo.pose import Pose
+from piccolo.pipeline import CachePolicy, Localizer, open_localizer
 from piccolo.result import LOCALIZED, Result
-from piccolo.settings import PaperSettings
+from piccolo.settings import EngineSettings, PaperSettings, Prior
 from piccolo.stopwatch import Stopwatch
 from piccolo.threads import Workers, num_cores
 from piccolo.verify import INLIER_RESIDUAL
 
 EXIT_ALL_LOCALIZED, EXIT_SOME_NOT, EXIT_BAD_USAGE, EXIT_BAD_INPUT, EXIT_INTERNAL = range(5)
-EXIT_INTERRUPTED = 130
-EXIT_BROKEN_PIPE = 141
+EXIT_INTERRUPTED, EXIT_BROKEN_PIPE = 130, 141
 
 DESCRIPTION = "Find where in a coloured point cloud 360-degree panoramas were taken."
 EPILOG = """\
@@ -38,15 +34,40 @@ examples:
   python localize.py --cloud scan.ply --pano query.jpg
   python localize.py --cloud scan.ply --pano query.jpg --out pose.json --overlay overlay.png
   python localize.py --cloud scan.ply --pano photos/*.jpg --out poses.jsonl
-  python localize.py --cloud scan.ply --pano query.jpg --gravity unknown --solver lbfgs
+  python localize.py --cloud scan.ply --pano query.jpg --near 12 3 1.5 --radius 4
+  python localize.py --cloud scan.ply --pano query.jpg --preset paper --solver lbfgs
 
 output: one JSON object a panorama, one a line, in the order given; messages and progress go to stderr.
 exit codes: 0 all localized, 1 some not, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
+# option, metavar, type, help: settings that only one preset has, named as the setting
+Option = tuple[str, str, type, str]
+ENGINE_OPTIONS: tuple[Option, ...] = (
+    ("--num-yaws", "N", int, "rotations searched where gravity is known"),
+    ("--num-rotations", "N", int, "rotations of SO(3) searched where it is not"),
+    ("--max-starts", "N", int, "poses from which a descent begins, at most"),
+)
+PAPER_OPTIONS: tuple[Option, ...] = (
+    ("--translations", "N_t", int, "start positions in free space"),
+    ("--rotations", "N_r", int, "start rotations; 0: 8 yaws if gravity is known, 32 of SO(3) if not"),
+    ("--keep-by-loss", "K1", int, "poses kept by the loss"),
+    ("--keep-by-histogram", "K2", int, "poses kept by colour histograms, and refined"),
+    ("--iterations", "N", int, "iterations of the solver"),
+    ("--histogram-bins", "N", int, "bins a channel"),
+    ("--grid-margin", "SHARE", float, "share of the box left out on each side of the grid"),
+    ("--max-points", "N", int, "points used of a larger cloud"),
+)
+PAPER_SETTING = {
+    "translations": "num_translations",
+    "rotations": "num_rotations",
+    "keep_by_loss": "num_by_loss",
+    "keep_by_histogram": "num_by_histogram",
+    "iterations": "num_iterations",
+}
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """All options, with their defaults from the settings."""
+    """All options. A setting that is not given stays None, and keeps its preset's default."""
     parser = argparse.ArgumentParser(
         "localize.py",
         description=DESCRIPTION,
@@ -55,12 +76,16 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"piccolo {__version__}")
     files = parser.add_argument_group("files")
-    files.add_argument("--cloud", type=Path, required=True, help="coloured scan: PLY, or text x y z r g b")
+    text = "coloured scan: PLY, or text x y z r g b; or a map by tools/prepare_map.py"
+    files.add_argument("--cloud", type=Path, required=True, help=text)
     files.add_argument("--pano", type=Path, required=True, nargs="+", help="full sphere JPEG or PNG, W = 2 H")
     files.add_argument("--out", type=Path, help="write the JSON here, not to stdout")
     files.add_argument("--overlay", type=Path, help="PNG: panorama, cloud at the pose, checkerboard of both")
     files.add_argument("--scale", type=float, default=1.0, help="metres per unit of the cloud (default 1)")
+    files.add_argument("--cache", type=Path, metavar="FOLDER", help="of prepared maps (default the user's)")
+    files.add_argument("--no-cache", action="store_true", help="prepare the map anew and keep none")
     add_method_options(parser)
+    add_prior_options(parser)
     run = parser.add_argument_group("run")
     run.add_argument("--threads", type=int, default=num_cores(), metavar="N", help="(default all cores)")
     run.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
@@ -69,44 +94,63 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def add_method_options(parser: argparse.ArgumentParser) -> None:
-    """The settings of the preset as options, with their defaults."""
-    d = PaperSettings()
-    group = parser.add_argument_group("method (preset paper: Kim et al., ICCV 2021, Algorithm 1)")
-    group.add_argument("--preset", choices=["paper"], default="paper", help="(default paper)")
-    text = "known: camera upright and the cloud's z up; unknown: any rotation (default known)"
-    group.add_argument("--gravity", choices=["known", "unknown"], default=d.gravity, help=text)
-    group.add_argument("--solver", choices=["adam", "lbfgs"], default=d.solver, help="(default adam)")
-    group.add_argument("--no-visibility", action="store_true", help="let the camera see through walls")
-    text = "N_r, start rotations (default 8 yaws if gravity is known, 32 of SO(3) if not)"
-    group.add_argument("--rotations", type=int, default=d.num_rotations, metavar="N", help=text)
-    for option, metavar, default, text in (
-        ("--translations", "N", d.num_translations, "N_t, start positions in free space"),
-        ("--keep-by-loss", "K1", d.num_by_loss, "poses kept by the loss"),
-        ("--keep-by-histogram", "K2", d.num_by_histogram, "poses kept by colour histograms, and refined"),
-        ("--iterations", "N", d.num_iterations, "iterations of the solver"),
-        ("--histogram-bins", "N", d.histogram_bins, "bins a channel"),
-        ("--grid-margin", "SHARE", d.grid_margin, "share of the box left out on each side of the grid"),
-        ("--max-points", "N", d.max_points, "points used of a larger cloud"),
+    """The preset and its settings."""
+    group = parser.add_argument_group("method")
+    text = "default: prepared views, all positions searched; paper: Kim et al., ICCV 2021, Algorithm 1"
+    group.add_argument("--preset", choices=["default", "paper"], default="default", help=text)
+    text = "known: camera upright and the cloud level; unknown: any rotation; auto: both (default auto)"
+    group.add_argument("--gravity", choices=["auto", "known", "unknown"], help=text)
+    text = "of the descent (default gauss-newton, with the preset paper adam)"
+    group.add_argument("--solver", choices=["gauss-newton", "lbfgs", "adam"], help=text)
+    for title, options, settings in (
+        ("preset default", ENGINE_OPTIONS, EngineSettings()),
+        ("preset paper", PAPER_OPTIONS, PaperSettings()),
     ):
-        help_text = f"{text} (default {default})"
-        group.add_argument(option, type=type(default), default=default, metavar=metavar, help=help_text)
+        group = parser.add_argument_group(title)
+        for option, metavar, kind, text in options:
+            name = option[2:].replace("-", "_")
+            default = getattr(settings, PAPER_SETTING.get(name, name))
+            group.add_argument(option, type=kind, metavar=metavar, help=f"{text} (default {default})")
+    group.add_argument("--no-visibility", action="store_const", const=True, help="see through walls")
 
 
-def settings_from(arguments: argparse.Namespace) -> PaperSettings:
-    """The settings that the options ask for."""
-    return PaperSettings(
-        gravity=arguments.gravity,
-        solver=arguments.solver,
-        num_translations=arguments.translations,
-        num_rotations=arguments.rotations,
-        num_by_loss=arguments.keep_by_loss,
-        num_by_histogram=arguments.keep_by_histogram,
-        num_iterations=arguments.iterations,
-        histogram_bins=arguments.histogram_bins,
-        grid_margin=arguments.grid_margin,
-        max_points=arguments.max_points,
-        use_visibility=not arguments.no_visibility,
+def add_prior_options(parser: argparse.ArgumentParser) -> None:
+    """What the user knows beforehand."""
+    group = parser.add_argument_group("prior knowledge (preset default); each narrows the search")
+    group.add_argument("--near", type=float, nargs=3, metavar=("X", "Y", "Z"), help="rough position [m]")
+    group.add_argument("--radius", type=float, metavar="M", help="the camera is within M metres of --near")
+    group.add_argument("--height", type=float, nargs=2, metavar=("MIN", "MAX"), help="above the floor [m]")
+    text = "of the image centre, clockwise from the cloud's +y"
+    group.add_argument("--heading", type=float, metavar="DEG", help=text)
+    group.add_argument("--heading-tolerance", type=float, metavar="DEG", help="(default 20)")
+
+
+def settings_from(arguments: argparse.Namespace) -> EngineSettings | PaperSettings:
+    """The settings that the options ask for; an option of the other preset is refused."""
+    given = {k: v for k, v in vars(arguments).items() if v is not None}
+    own, other = ENGINE_OPTIONS, PAPER_OPTIONS
+    if arguments.preset == "paper":
+        own, other = other, own
+    foreign = [option for option, *_ in other if option[2:].replace("-", "_") in given]
+    priors = [n for n in ("near", "radius", "height", "heading", "heading_tolerance") if n in given]
+    if arguments.preset == "default":
+        foreign += ["--no-visibility"] if "no_visibility" in given else []
+    else:
+        foreign += ["--" + name.replace("_", "-") for name in priors]
+    if foreign:
+        raise InputError(f"{foreign[0]}: not an option of the preset {arguments.preset}")
+    names = [option[2:].replace("-", "_") for option, *_ in own]
+    chosen = {PAPER_SETTING.get(n, n): given[n] for n in ("gravity", "solver", *names) if n in given}
+    if arguments.preset == "paper":
+        return PaperSettings(use_visibility="no_visibility" not in given, **chosen)
+    prior = Prior(
+        near_world=tuple(arguments.near) if arguments.near else None,
+        radius=arguments.radius,
+        height=tuple(arguments.height) if arguments.height else None,
+        heading_deg=arguments.heading,
+        heading_tolerance_deg=given.get("heading_tolerance", Prior.heading_tolerance_deg),
     )
+    return EngineSettings(prior=prior, **chosen)
 
 
 def check_arguments(arguments: argparse.Namespace) -> None:
@@ -117,6 +161,8 @@ def check_arguments(arguments: argparse.Namespace) -> None:
         raise InputError(f"--scale: found {arguments.scale}, wanted metres per unit, above 0")
     if arguments.overlay and len(arguments.pano) > 1:
         raise InputError(f"--overlay: found {len(arguments.pano)} panoramas, wanted one")
+    if arguments.cache and arguments.no_cache:
+        raise InputError("--cache, --no-cache: found both, wanted one of them or none")
 
 
 @dataclass(frozen=True)
@@ -124,9 +170,8 @@ class Session:
     """One prepared cloud and how to treat the panoramas."""
 
     arguments: argparse.Namespace
-    settings: PaperSettings
-    cloud: Cloud
-    paper_map: PaperMap
+    localizer: Localizer
+    workers: Workers
     seconds: dict[str, float]  # spent once, on the cloud
 
     def say(self, text: str) -> None:
@@ -134,23 +179,14 @@ class Session:
         if not self.arguments.quiet:
             tqdm.write(text, file=sys.stderr)
 
-    def show(self, values: Iterator[Any], total: int, label: str) -> Iterator[Any]:
-        """The values under a progress bar that vanishes when they end."""
-        bar = tqdm(
-            values, label, total, leave=False, disable=self.arguments.quiet, file=sys.stderr, delay=0.5
-        )
-        return iter(bar)
-
     def localize(self, pano: Path) -> Result:
         """Read one panorama, localize it, write its overlay if one is asked for."""
-        watch = Stopwatch(dict(self.seconds))
+        watch, localizer = Stopwatch(dict(self.seconds)), self.localizer
         with watch.stage("read"):
             panorama = read_panorama(pano)
-        workers = Workers(self.arguments.threads, self.show)
-        found = localize(self.paper_map, panorama, self.settings, workers, watch)
+        found = localizer.localize(panorama, self.workers, watch)
         if self.arguments.overlay and found.pose is not None:
-            local = Pose(found.pose.R_cam_from_world, found.pose.center_world - self.cloud.origin_world)
-            png = overlay_png(self.paper_map.points, panorama, local)
+            png = overlay_png(localizer.points, panorama, localizer.from_world(found.pose))
             write_atomically(self.arguments.overlay, png)
         evidence = found.evidence
         return Result(
@@ -164,25 +200,30 @@ class Session:
             inlier_share=evidence.inlier_share if evidence else None,
             inlier_residual=INLIER_RESIDUAL,
             seconds=watch.seconds,
-            settings={"preset": self.arguments.preset, **self.settings.to_json()},
-            warnings=self.cloud.warnings,
+            settings={"preset": self.arguments.preset, **localizer.settings.to_json()},
+            warnings=localizer.warnings,
         )
 
 
-def open_session(arguments: argparse.Namespace, settings: PaperSettings) -> Session:
+def open_session(arguments: argparse.Namespace, settings: EngineSettings | PaperSettings) -> Session:
     """Read and prepare the cloud, after a look at what is to be written."""
     for output in filter(None, (arguments.out, arguments.overlay)):
         check_output(output, [arguments.cloud, *arguments.pano])
     if is_first_use() and not arguments.quiet:
         text = f"first use: compiling kernels, once (under half a minute), into {KERNEL_FOLDER}"
         print(text, file=sys.stderr, flush=True)
+
+    def show(values: Iterator[Any], total: int, label: str) -> Iterator[Any]:
+        """The values under a progress bar that vanishes when they end."""
+        bar = tqdm(values, label, total, leave=False, disable=arguments.quiet, file=sys.stderr, delay=0.5)
+        return iter(bar)
+
     watch = Stopwatch()
-    with watch.stage("read"):
-        cloud = read_cloud(arguments.cloud, arguments.scale)
-    with watch.stage("prepare"):
-        paper_map = prepare(cloud, settings)
-    session = Session(arguments, settings, cloud, paper_map, watch.seconds)
-    for warning in cloud.warnings:
+    cache = CachePolicy(not arguments.no_cache, arguments.cache)
+    workers = Workers(arguments.threads, show)
+    localizer = open_localizer(arguments.cloud, arguments.scale, settings, cache, workers, watch)
+    session = Session(arguments, localizer, workers, watch.seconds)
+    for warning in localizer.warnings:
         session.say(f"warning: {warning}")
     return session
 
@@ -215,7 +256,7 @@ def results_of(session: Session) -> Iterator[Result | None]:
         yield result
 
 
-def run(arguments: argparse.Namespace, settings: PaperSettings) -> int:
+def run(arguments: argparse.Namespace, settings: EngineSettings | PaperSettings) -> int:
     """Localize every panorama, write the results, return the exit code."""
     lines: list[str] = []
     is_bad = some_not = False
@@ -253,9 +294,7 @@ def main(argv: list[str] | None = None) -> int:
         return EXIT_BAD_USAGE
     try:
         return run(arguments, settings)
-    except (
-        BrokenPipeError
-    ):  # the reader of stdout has gone: say nothing, not even when Python flushes at exit
+    except BrokenPipeError:  # the reader of stdout has gone: say nothing, not even at the flush at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_BROKEN_PIPE
     except (OSError, InputError) as error:

@@ -6,6 +6,7 @@ by `piccolo.threads`.
 
 import hashlib
 import os
+import shutil
 import tempfile
 import time
 from pathlib import Path
@@ -52,20 +53,24 @@ def cache_root() -> Path:
     return Path(tempfile.gettempdir()) / f"piccolo-{os.getuid()}"
 
 
-def _remove_stale(folder: Path) -> None:
-    """Delete the kernels of versions that nobody has started for a month."""
-    for other in folder.parent.iterdir():
-        if other != folder and time.time() - other.stat().st_mtime > STALE_AFTER_S:
-            for file in sorted(other.rglob("*"), reverse=True):
-                file.rmdir() if file.is_dir() else file.unlink()
-            other.rmdir()
+def remove_stale(folder: Path) -> None:
+    """Delete what lies in a folder of the cache and has not been used for a month."""
+    for entry in folder.iterdir():
+        try:
+            if time.time() - entry.stat().st_mtime > STALE_AFTER_S:
+                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+        except FileNotFoundError:  # another process was faster
+            continue
+
+
+SOURCE_DIGEST = _source_digest()
 
 
 def _prepare_kernel_folder() -> Path:
-    folder = cache_root() / "kernels" / _source_digest()
-    if not folder.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        _remove_stale(folder)
+    folder = cache_root() / "kernels" / SOURCE_DIGEST
+    folder.mkdir(parents=True, exist_ok=True)
+    folder.touch()
+    remove_stale(folder.parent)
     return folder
 
 

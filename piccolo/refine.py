@@ -114,7 +114,7 @@ def descend_gauss_newton(objective: Objective, pose: Pose, num_iterations: int) 
         delta = -np.linalg.solve(damped, gradient)
         # A step of a radian or a metre would leave the region in which the matrix means anything.
         delta *= min(1.0, MAX_STEP / max(float(np.abs(delta).max()), 1e-12))
-        trial = step(best.pose, delta)
+        trial = step(best.pose, np.asarray(delta, dtype=np.float64))
         loss, trial_gradient, trial_matrix = objective(trial)
         if loss < best.loss:
             best.offer(trial, loss)

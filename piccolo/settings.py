@@ -89,9 +89,7 @@ class Prior:
         if self.height is not None and not self.height[0] < self.height[1]:
             raise InputError(f"--height: found {list(self.height)}, wanted MIN below MAX")
         if not 0.0 < self.heading_tolerance_deg <= 180.0:
-            raise InputError(
-                f"--heading-tolerance: found {self.heading_tolerance_deg}, wanted above 0 to 180"
-            )
+            raise InputError(f"--heading-tolerance: found {self.heading_tolerance_deg}, wanted 0 to 180")
 
 
 @dataclass(frozen=True)

@@ -91,3 +91,36 @@ def nearest_box(origin, directions, boxes):
                 entering = side * rays[:, axis] < 0
                 best = np.where(hits.all(axis=1) & (at > 1e-6) & entering & (at < best), at, best)
     return best
+
+
+def cells_view(leaves, center, cell, num_cells):
+    """Mean relative position, mean colour and count over the front of each cell, of leaves (N, 6) in `cell` (N,)."""
+    relative = leaves[:, :3] - center
+    ranges = np.linalg.norm(relative, axis=1)
+    nearest = np.full(num_cells, np.inf)
+    np.minimum.at(nearest, cell, ranges)
+    front = ranges <= 1.15 * nearest[cell]
+    count = np.bincount(cell[front], minlength=num_cells)
+    values = np.column_stack([relative, leaves[:, 3:]])[front]
+    sums = np.stack([np.bincount(cell[front], v, minlength=num_cells) for v in values.T], axis=1)
+    means = sums / np.maximum(count, 1)[:, None]
+    return means[:, :3], means[:, 3:], count
+
+
+def normalized_cells(rgb, is_seen, num_rings, stats_rings, sigma_deg):
+    """Opponent channels (cells, 3) less their Gaussian local mean, by the local deviation, clipped to 2."""
+    from piccolo.engine.tiling import cell_of, make_tiling
+
+    fine, coarse = make_tiling(num_rings), make_tiling(stats_rings)
+    r, g, b = rgb.T
+    channels = np.stack([(r + g + b) / 3, (r - b) / 2, (2 * g - r - b) / 4], axis=1)
+    moments = np.zeros((len(coarse), 7))
+    rows = np.column_stack([np.ones(len(r)), channels, channels**2]) * (fine.solid_angle * is_seen)[:, None]
+    np.add.at(moments, cell_of(fine.directions, stats_rings), rows)
+    cosine = fine.directions.astype(float) @ coarse.directions.T
+    weight = np.exp((cosine - 1) / math.radians(sigma_deg) ** 2) * coarse.solid_angle
+    weight[cosine <= math.cos(2.3 * math.radians(sigma_deg))] = 0
+    sums = weight @ moments
+    mean, square = (sums[:, k : k + 3] / np.maximum(sums[:, :1], 1e-12) for k in (1, 4))
+    deviation = np.sqrt(np.maximum(square - mean**2, 0) + 0.03**2)
+    return np.clip((channels - mean) / deviation, -2, 2)

@@ -19,6 +19,7 @@ LAYERS = [
     {"overlay", "verify", "refine", "synthetic"},
     {"result"},
     {"paper", "engine"},
+    {"pipeline"},
 ]
 # pyramid shrinks panoramas; points are packed as texels are
 SIDEWAYS = {("pyramid", "panorama"), ("cloud", "sampling")}

@@ -17,10 +17,11 @@ from rooms import errors, query
 import localize
 from piccolo.pose import Pose
 from piccolo.result import Result
-from tools import evaluate, make_room
+from tools import evaluate, make_room, prepare_map
 
 ROOT = Path(__file__).resolve().parents[1]
-QUICK = ["--translations", "30", "--iterations", "60", "--max-points", "30000"]
+QUICK = ["--no-cache"]
+PAPER = ["--preset", "paper", "--translations", "30", "--iterations", "60", "--max-points", "30000"]
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +72,51 @@ def test_pose_on_stdout_and_a_summary_on_stderr(scene, capsys):
     assert out.count("\n") == 1
 
 
+def test_preset_paper_with_its_own_options(scene, capsys):
+    paper = ["--cloud", str(scene / "cloud.ply"), "--pano", str(scene / "images" / "clean_0.jpg"), *PAPER]
+    assert localize.main([*paper, "--quiet"]) == 0
+    result = Result.from_json(capsys.readouterr().out)
+    assert errors(result.pose, _truth(scene, 0))[0] < 0.03
+    assert result.settings["preset"] == "paper"
+    assert result.settings["num_rotations"] == 8
+
+
+def test_map_is_cached_prepared_and_read_back_to_the_same_bits(scene, tmp_path, capsys):
+    pano, cache, built = str(scene / "images" / "clean_0.jpg"), tmp_path / "cache", tmp_path / "scan.map"
+    cloud = ["--cloud", str(scene / "cloud.ply"), "--pano", pano, "--quiet", "--cache", str(cache)]
+    assert prepare_map.main(["--cloud", str(scene / "cloud.ply"), "--out", str(built), "--quiet"]) == 0
+    assert json.loads(capsys.readouterr().out)["candidates"] > 50
+    poses = []
+    for arguments in (cloud, cloud, ["--cloud", str(built), "--pano", pano, "--quiet"]):
+        assert localize.main(arguments) == 0
+        poses.append(Result.from_json(capsys.readouterr().out))
+    assert "prepare" in poses[0].seconds
+    assert "prepare" not in poses[1].seconds
+    assert len({json.dumps(p.pose.center_world.tolist()) for p in poses}) == 1
+    (cached,) = cache.iterdir()
+    damaged = bytearray(cached.read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    cached.write_bytes(damaged)
+    assert localize.main(cloud) == 0
+    rebuilt = Result.from_json(capsys.readouterr().out)
+    assert "prepare" in rebuilt.seconds
+    np.testing.assert_array_equal(rebuilt.pose.center_world, poses[0].pose.center_world)
+    built.write_bytes(bytes(damaged))
+    assert localize.main(["--cloud", str(built), "--pano", pano, "--quiet"]) == 3
+    assert "wanted a whole map by tools/prepare_map.py" in capsys.readouterr().err
+
+
+def test_prior_narrows_the_search_and_stands_in_the_result(scene, capsys):
+    x, y, z = _truth(scene, 0).center_world
+    near = ["--near", f"{x + 0.4:.2f}", f"{y:.2f}", f"{z:.2f}", "--radius", "1", "--height", "0.5", "2"]
+    assert localize.main(_arguments(scene, "--quiet", *near)) == 0
+    result = Result.from_json(capsys.readouterr().out)
+    assert errors(result.pose, _truth(scene, 0))[0] < 0.03
+    assert result.settings["prior"]["radius"] == 1.0
+    assert localize.main(_arguments(scene, "--quiet", "--near", "900", "0", "0", "--radius", "1")) == 1
+    assert json.loads(capsys.readouterr().out)["center_world"] is None
+
+
 def test_quiet_says_nothing(scene, capsys):
     assert localize.main(_arguments(scene, "--quiet")) == 0
     assert capsys.readouterr().err == ""
@@ -117,7 +163,15 @@ def test_panorama_from_elsewhere_exits_with_one(scene, tmp_path, capsys):
     [
         (["--threads", "0"], 2, "--threads: found 0, wanted at least 1"),
         (["--scale", "-1"], 2, "--scale: found -1.0"),
-        (["--translations", "0"], 2, "num_translations: found 0"),
+        (["--preset", "paper", "--translations", "0"], 2, "num_translations: found 0"),
+        (["--translations", "9"], 2, "--translations: not an option of the preset default"),
+        (["--preset", "paper", "--near", "0", "0", "0"], 2, "--near: not an option of the preset paper"),
+        (["--preset", "paper", "--gravity", "auto"], 2, "gravity: found auto"),
+        (["--near", "0", "0", "0"], 2, "--near, --radius: found one of them"),
+        (["--height", "2", "1"], 2, "--height: found [2.0, 1.0]"),
+        (["--heading-tolerance", "0"], 2, "--heading-tolerance: found 0.0"),
+        (["--max-starts", "0"], 2, "max_starts: found 0"),
+        (["--cache", "x"], 2, "--cache, --no-cache: found both"),
         (["--overlay", "x.png", "--pano", "a", "b"], 2, "--overlay: found 2 panoramas, wanted one"),
         (["--cloud", "no such.ply"], 3, "no such.ply"),
         (["--pano", "no such.jpg"], 3, "no such.jpg"),
@@ -152,7 +206,7 @@ def test_internal_error_has_its_code(scene, capsys, monkeypatch):
     def fail(*_):
         raise ZeroDivisionError("made by the test")
 
-    monkeypatch.setattr(localize, "prepare", fail)
+    monkeypatch.setattr(localize, "open_localizer", fail)
     assert localize.main(_arguments(scene, "--quiet")) == 4
     assert "internal error: ZeroDivisionError" in capsys.readouterr().err
 
@@ -172,7 +226,9 @@ def _process(arguments, **options):
 
 def test_interrupt_leaves_nothing_half_written(scene, tmp_path):
     out = tmp_path / "pose.json"
-    process = _process(_arguments(scene, "--translations", "5000", "--out", str(out)), cwd=tmp_path)
+    process = _process(
+        [*_arguments(scene, "--out", str(out)), *PAPER, "--translations", "5000"], cwd=tmp_path
+    )
     time.sleep(2.0)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
@@ -190,12 +246,12 @@ def test_closed_pipe_is_no_error_message(scene):
 
 def test_first_use_is_announced_and_two_processes_may_share_it(scene, tmp_path):
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
-    processes = [_process(_arguments(scene, "--translations", "4"), env=environment) for _ in range(2)]
+    processes = [_process([*_arguments(scene), *PAPER], env=environment) for _ in range(2)]
     said = [process.communicate(timeout=120) for process in processes]
     assert all("first use: compiling kernels" in err for _, err in said)
     poses = [json.loads(out)["center_world"] for out, _ in said]
     assert poses[0] == poses[1]
-    again = _process(_arguments(scene, "--translations", "4"), env=environment)
+    again = _process([*_arguments(scene), *PAPER], env=environment)
     out, err = again.communicate(timeout=60)
     assert "compiling" not in err
     assert json.loads(out)["center_world"] == poses[0]

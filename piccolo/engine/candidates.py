@@ -1,5 +1,7 @@
 """Where a camera can be: free space at a camera's height above something that carries it."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -47,7 +49,7 @@ def supported_cells(surfaces: NDArray[np.float32]) -> NDArray[np.int64]:
     return np.asarray(np.unique((base[:, None] + steps).reshape(-1, 3), axis=0))
 
 
-def coverage(octree: Octree, centers: NDArray[np.float64], workers: Workers) -> NDArray[np.float32]:
+def coverage(octree: Octree, centers: NDArray[np.floating[Any]], workers: Workers) -> NDArray[np.float32]:
     """Share of the sphere (N,) around each centre (N, 3) that is not empty, at a glance."""
     share = np.empty(len(centers), np.float32)
     kind = GLANCE_VIEW.arrays
@@ -78,9 +80,8 @@ def candidate_centers(octree: Octree, workers: Workers) -> NDArray[np.float64]:
     # Nothing of a cell is free if its centre is deeper in a surface than the cell is wide.
     half = COARSE_SPACING / 2
     corners = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
-    finer = (
-        2 * cells[is_tight & (clearance + 0.87 * COARSE_SPACING > MIN_CLEARANCE)][:, None] + corners
-    ).reshape(-1, 3)
+    is_split = is_tight & (clearance + 0.87 * COARSE_SPACING > MIN_CLEARANCE)
+    finer = (2 * cells[is_split][:, None] + corners).reshape(-1, 3)
     middle = (finer + 0.5) * half
     clearance, _ = tree.query(middle, workers=workers.num_threads)
     middle = middle[clearance > MIN_CLEARANCE]
@@ -88,7 +89,7 @@ def candidate_centers(octree: Octree, workers: Workers) -> NDArray[np.float64]:
 
 
 def heights_above_floor(octree: Octree, centers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Height (N,) [m] of each centre (N, 3) above the highest surface below it within SUPPORT_RADIUS; inf if none."""
+    """Height (N,) [m] of each centre (N, 3) above the highest surface near and below it; inf if none."""
     surfaces = top_surfaces(octree)
     near = cKDTree(surfaces[:, :2]).query_ball_point(centers[:, :2], SUPPORT_RADIUS)
     heights = np.full(len(centers), np.inf)

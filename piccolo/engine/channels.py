@@ -1,4 +1,4 @@
-"""The channels in which cloud and panorama are compared: opponent colours, locally normalised, as 8-bit levels."""
+"""What cloud and panorama are compared in: opponent colours, locally normalised, as 8-bit levels."""
 
 import math
 

@@ -101,7 +101,7 @@ def pack_standardized(channels, share, stats, texels):
 
 @kernel
 def finish_statistics(sums):
-    """Turn weighted sums (h, w, 7) of 1, channels and squares into means and 1 / deviations (h, w, 1:7), in place."""
+    """Turn weighted sums (h, w, 7) of 1, channels, squares into means and 1 / deviations (h, w, 1:7)."""
     for i in range(sums.shape[0]):
         for j in range(sums.shape[1]):
             s = sums[i, j]
@@ -142,7 +142,7 @@ def comparable(panorama: Panorama, scales: Sequence[Scale]) -> list[Texels]:
 
 @kernel
 def sample_channels(texels, width, directions, rotations, samples, validity):
-    """Write the channels (rotations, 3, cells), less the zero level, and validity along every turned direction."""
+    """Write channels (rotations, 3, cells), less the zero level, and validity along each turned direction."""
     stride = np.int32(width + 2)
     scale = np.float32(width / (2.0 * math.pi))
     half_u, half_v = HALF * np.float32(width + 1), HALF * np.float32(width // 2 + 1)

@@ -1,4 +1,4 @@
-"""Gauss-Newton on image channels sampled at projected points: the whole descent of one start is one kernel."""
+"""Gauss-Newton on image channels at projected points: the whole descent of one start is one kernel."""
 
 import math
 
@@ -17,11 +17,10 @@ TINY = np.float32(1e-12)
 
 @kernel
 def add_block(X, Y, Z, A, B, C, weights, texels, width, R_cam_from_world, center_world, inverse_scale2, sums):
-    """Add to `sums` (28,) the upper normal matrix (21), the gradient (6) and the loss (1) of a block of points.
+    """Add to `sums` (28,) the normal matrix (21, upper), gradient (6) and loss (1) of a block of points.
 
-    With Ju, Jv the derivatives (6,) of the pixel by a turn and a move, and G the sum over channels of the outer
-    products of the image gradient, the matrix is the sum of w [Ju Jv] G [Ju Jv]^T, and only six products of
-    the halves of Ju and Jv differ: p x ju | -ju.
+    With Ju, Jv the derivatives (6,) of the pixel by a turn and a move, and G the sum over channels of the
+    outer products of the image gradient, the matrix is the sum of w [Ju Jv] G [Ju Jv]^T.
     """
     R, t = R_cam_from_world, center_world
     stride = np.int32(width + 2)
@@ -158,7 +157,7 @@ def normal_equations(points, features, weights, texels, width, R_cam_from_world,
 
 
 @kernel
-def solve_damped(sums, damping, step):
+def solve_damped(sums, damping, step):  # noqa: C901, PLR0912  # Cholesky by hand: LAPACK costs more for 6 x 6
     """Write the damped Gauss-Newton step (6,), by Cholesky; False if the matrix is not positive."""
     A = np.empty((6, 6))
     m = 0
@@ -244,7 +243,7 @@ def descend(
 
 @kernel
 def correlate(points, features, weights, texels, width, R_cam_from_world, center_world):
-    """Correlation of the points' channels with the image's at the pose, where both show; and the share they do."""
+    """Correlation of the points' channels with the image's at the pose, and the weight of what both show."""
     R, t = R_cam_from_world, center_world
     stride = np.int32(width + 2)
     scale = np.float32(width / (2.0 * math.pi))
@@ -289,7 +288,7 @@ def descend_starts(
     center_world,
     scores,
 ):
-    """Descend from each start, (n, 3, 3) and (n, 3), changed in place, on the cells of its candidate's view."""
+    """Descend from each start, (n, 3, 3) and (n, 3) in place, on the cells of its candidate's view."""
     R, t = R_cam_from_world, center_world
     n = len(solid_angle)
     points, levels = np.empty((3, n), np.float32), np.empty((3, n), np.float32)

@@ -43,7 +43,7 @@ def voxel_codes(xyz, origin, size, codes):
 
 @kernel
 def average_points(xyz, rgb, order, codes, origin, nodes, node_codes):
-    """Write the mean of the points of each voxel, return how many; `order` sorts the points by their `codes`."""
+    """Write the mean of the points of each voxel, return how many; `order` sorts the points by `codes`."""
     count = -1
     n = len(order)
     lo = 0

@@ -39,7 +39,7 @@ def narrowed(scan_map: ScanMap, prior: Prior) -> ScanMap:
 
 
 def allowed_rotations(R_cam_from_world: NDArray[np.float64], prior: Prior) -> NDArray[np.float64]:
-    """Those of the rotations (N, 3, 3) whose image centre looks where the prior says; the nearest if none does."""
+    """The rotations (N, 3, 3) whose image centre looks where the prior says; the nearest if none does."""
     if prior.heading_deg is None:
         return R_cam_from_world
     forward = R_cam_from_world[:, 0]  # of the camera's +x, in the world

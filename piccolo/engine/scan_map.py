@@ -1,4 +1,4 @@
-"""What is prepared once per cloud: the octree, the places where a camera can be, and what it sees from each."""
+"""What is prepared once per cloud: octree, places where a camera can be, and what it sees from each."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -32,14 +32,10 @@ class ScanMap:
     centers: NDArray[np.float64]  # (candidates, 3) [m]
     offsets: NDArray[np.int16]  # (candidates, 3, cells) from the centre to what is seen, in units of
     offset_unit: NDArray[np.float32]  # (candidates,) [m]
-    features: NDArray[
-        np.int8
-    ]  # (candidates, 3, cells) normalised channels in levels, 0 where nothing is seen
+    features: NDArray[np.int8]  # (candidates, 3, cells) channels in levels, 0 where nothing is seen
     is_seen: NDArray[np.bool_]  # (candidates, cells)
     sparse: NDArray[np.int64]  # candidates of which no two share a cell of the coarse grid
-    wide_features: NDArray[
-        np.int8
-    ]  # (sparse, 3 * wide cells) means over wider cells, for the search over SO(3)
+    wide_features: NDArray[np.int8]  # (sparse, 3 * wide cells) means over wider cells, for SO(3)
     wide_seen: NDArray[np.uint8]  # (sparse, wide cells) share seen of each, 255 for all
     warnings: tuple[str, ...] = ()
 

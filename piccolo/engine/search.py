@@ -35,7 +35,7 @@ def masked_correlation(
 ) -> Samples:
     """Correlation (views, rotations) over the cells that both show.
 
-    Views (views, 3 * cells) in 8 bits; seen(lo, hi) is the share seen of each cell (hi - lo, cells) in [0, 1].
+    Views (views, 3 * cells) in 8 bits; seen(lo, hi) is the share seen of each cell (hi - lo, cells).
     The panorama has samples (rotations, 3, cells) and validity (rotations, cells).
     """
     weighted = (samples * area).reshape(len(samples), -1)
@@ -95,8 +95,8 @@ def correlate_pairs(features, is_seen, area, samples, validity, candidate, rotat
 
 
 @kernel
-def suppress(rotations, centers, min_distance, min_trace, kept):
-    """Write the indices of the poses (n, 3, 3), (n, 3), best first, that are near none kept; returns how many."""
+def suppress(rotations, centers, min_distance, min_trace, kept):  # noqa: C901  # one loop nest
+    """Write the indices of the poses, best first, that are near none kept before; returns how many."""
     R, t = rotations, centers
     count = 0
     near2 = np.float32(min_distance * min_distance)

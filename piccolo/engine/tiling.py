@@ -67,7 +67,7 @@ def make_neighbors(num_rings: int, stats_rings: int, sigma_deg: float) -> Neighb
 
 @lru_cache(maxsize=4)
 def averaging(num_rings: int) -> NDArray[np.float32]:
-    """Matrix (cells of SEARCH_RINGS, cells of num_rings) that sums cells times solid angle into wider ones."""
+    """Matrix (search cells, cells of num_rings) that sums search cells times solid angle into wider ones."""
     tiling, wide = make_tiling(SEARCH_RINGS), make_tiling(num_rings)
     matrix = np.zeros((len(tiling), len(wide)), np.float32)
     matrix[np.arange(len(tiling)), cell_of(tiling.directions, num_rings)] = tiling.solid_angle

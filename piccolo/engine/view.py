@@ -1,4 +1,4 @@
-"""The cloud seen from a position: z-buffered cells of the sphere, from voxels of the size the cells ask for."""
+"""The cloud seen from a position: z-buffered cells of the sphere, from voxels as fine as the cells ask."""
 
 import math
 import threading
@@ -28,7 +28,7 @@ Cells = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 
 @dataclass(frozen=True)
 class ViewKind:
-    """How a view is made: cells, the sphere's share over which colours are normalised, voxels' angular size."""
+    """How a view is made: its cells, the neighbourhood that normalises colours, the voxels' angular size."""
 
     num_rings: int
     stats_rings: int  # cells of these rings carry the local statistics: no wider than sigma
@@ -41,14 +41,20 @@ class ViewKind:
         tiling = make_tiling(self.num_rings)
         neighbors = make_neighbors(self.num_rings, self.stats_rings, self.sigma_deg)
         return (
-            tiling.num_columns, tiling.first, cell_of(tiling.directions, self.stats_rings), len(make_tiling(self.stats_rings)),
-            tiling.solid_angle, neighbors.row, neighbors.cell, neighbors.weight,
-        )  # fmt: skip
+            tiling.num_columns,
+            tiling.first,
+            cell_of(tiling.directions, self.stats_rings),
+            len(make_tiling(self.stats_rings)),
+            tiling.solid_angle,
+            neighbors.row,
+            neighbors.cell,
+            neighbors.weight,
+        )
 
 
 @kernel
 def collect(nodes, first_child, level_start, leaf_size, center, voxel_per_range, found, directions):
-    """Write the indices of the nodes that, seen from `center`, are as small as asked, or leaves; returns how many.
+    """Write the nodes that, seen from `center`, are as small as asked, or leaves; returns how many.
 
     `directions` (3, N) get the positions relative to the centre [m].
     """
@@ -107,7 +113,7 @@ def locate(X, Y, Z, num_columns, first, cells, ranges, turns):
 
 @kernel
 def average_cells(nodes, found, directions, cells, ranges, sums):
-    """Write (cells, 8): sums of x, y, z, r, g, b and the count over each cell's front, and its nearest range."""
+    """Write (cells, 8): sums of x, y, z, r, g, b and the count of each cell's front, and its range."""
     sums[:] = F0
     sums[:, 7] = FAR
     for i in range(len(cells)):
@@ -125,7 +131,7 @@ def average_cells(nodes, found, directions, cells, ranges, sums):
 
 @kernel
 def average_colors(sums, kind, offsets, features, weights, moments):
-    """Turn sums into positions relative to the centre, opponent channels and weights of cells; add up moments."""
+    """Turn sums into relative positions, opponent channels and weights of cells; add up their moments."""
     coarse_cell, solid_angle = kind[2], kind[4]
     moments[:] = F0
     for c in range(len(sums)):
@@ -151,7 +157,7 @@ def average_colors(sums, kind, offsets, features, weights, moments):
 
 @kernel
 def local_statistics(moments, kind, weights, stats):
-    """Write the local mean of each channel and 1 / its local deviation (6, cells) around cells of positive weight."""
+    """Write the local means of the channels and 1 / deviations (6, cells) around cells of positive weight."""
     row, neighbor, weight = kind[5], kind[6], kind[7]
     for c in range(len(weights)):
         if weights[c] <= F0:
@@ -238,7 +244,7 @@ def render_block(tree, centers, voxel_per_range, kind, scratch, offsets, unit, l
 
 @kernel
 def render_points(tree, center, voxel_per_range, kind, scratch, offsets, features, weights):
-    """The visible points themselves, evenly thinned to what fits: relative position, normalised channels, weight 1.
+    """The visible points, evenly thinned to what fits: relative position, normalised channels, weight 1.
 
     Returns how many.
     """
@@ -318,7 +324,7 @@ def thread_scratch() -> Any:
 
 
 def render_view(octree: Octree, center_world: NDArray[np.float64], kind: ViewKind) -> Cells:
-    """Offsets from the centre (3, cells) [m], channels (3, cells), weights (cells,), 0 where nothing is seen."""
+    """Offsets from the centre (3, cells) [m], channels (3, cells), weights (cells,), 0 where unseen."""
     n = len(make_tiling(kind.num_rings))
     view = np.empty((3, n), np.float32), np.empty((3, n), np.float32), np.empty(n, np.float32)
     center = np.asarray(center_world, np.float64)

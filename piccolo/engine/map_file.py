@@ -1,0 +1,98 @@
+"""A prepared map on disk: a NumPy archive, and the cache of such files.
+
+A file of another format, of other sources, or damaged in any byte (each member of an archive has a checksum)
+is never trusted: it is made anew.
+"""
+
+import hashlib
+import zipfile
+from collections.abc import Callable
+from dataclasses import asdict, fields
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from ..files import replacing
+from ..jit import SOURCE_DIGEST, cache_root, remove_stale
+from ..stopwatch import Stopwatch
+from .octree import Octree
+from .scan_map import ScanMap
+
+FORMAT = "piccolo-map/1"
+ARRAYS = [f.name for f in fields(ScanMap) if f.name not in ("octree", "warnings")]
+ZIP_MAGIC = b"PK\x03\x04"
+
+
+def save_map(scan_map: ScanMap, path: Path) -> None:
+    """Write a map to `path`, whole or not at all."""
+    members = {name: getattr(scan_map, name) for name in ARRAYS}
+    members.update({f"octree_{name}": value for name, value in asdict(scan_map.octree).items()})
+    with replacing(path) as file:
+        np.savez(
+            file,
+            format=np.array(FORMAT),
+            sources=np.array(SOURCE_DIGEST),
+            warnings=np.array(scan_map.warnings, dtype=np.str_),
+            allow_pickle=False,
+            **members,
+        )
+
+
+def is_map_file(path: Path) -> bool:
+    """True if the file is an archive as `save_map` writes it, whatever is in it."""
+    with path.open("rb") as file:
+        return file.read(len(ZIP_MAGIC)) == ZIP_MAGIC
+
+
+def load_map(path: Path) -> ScanMap:
+    """Read what `save_map` wrote; InputError for anything else."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            members = {name: archive[name] for name in archive.files}
+        if str(members["format"]) != FORMAT or str(members["sources"]) != SOURCE_DIGEST:
+            raise InputError(f"{path}: found a map of another version, wanted one by this; prepare it again")
+        octree = Octree(
+            nodes=members["octree_nodes"],
+            first_child=members["octree_first_child"],
+            level_start=members["octree_level_start"],
+            leaf_size=float(members["octree_leaf_size"]),
+        )
+        warnings = tuple(str(line) for line in members["warnings"])
+        return ScanMap(octree=octree, warnings=warnings, **{name: members[name] for name in ARRAYS})
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: found {error}, wanted a whole map by tools/prepare_map.py") from error
+
+
+def content_key(path: Path, scale: float) -> str:
+    """Name for the map of a cloud file: by its content and scale, wherever it lies."""
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256")
+    digest.update(f"{FORMAT} {SOURCE_DIGEST} {scale!r}".encode())
+    return digest.hexdigest()[:32]
+
+
+def cached_map(folder: Path | None, key: str, build: Callable[[], ScanMap], watch: Stopwatch) -> ScanMap:
+    """The map named `key` of a cache folder, or built and put there; the user's cache if `folder` is None.
+
+    Two processes may build one map at once: each writes its own file whole, the last stays, both are equal.
+    """
+    folder = folder or cache_root() / "maps"
+    path = folder / f"{key}.npz"
+    if path.exists():
+        try:
+            with watch.stage("read"):
+                scan_map = load_map(path)
+        except InputError:
+            path.unlink(missing_ok=True)
+        else:
+            path.touch()
+            return scan_map
+    scan_map = build()
+    with watch.stage("prepare"):
+        folder.mkdir(parents=True, exist_ok=True)
+        remove_stale(folder)
+        save_map(scan_map, path)
+    return scan_map

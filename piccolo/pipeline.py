@@ -1,0 +1,137 @@
+"""The two presets behind one interface: a cloud is opened once, and panoramas are localized in it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from .cloud import read_cloud
+from .cloud.packed import PackedPoints
+from .engine import method as engine
+from .engine.map_file import cached_map, content_key, is_map_file, load_map
+from .engine.scan_map import ScanMap, prepare_map
+from .errors import InputError
+from .panorama import Panorama
+from .paper import method as paper
+from .pose import Pose
+from .result import Localization
+from .settings import EngineSettings, PaperSettings
+from .stopwatch import Stopwatch
+from .threads import Workers
+
+
+class Localizer(Protocol):
+    """A prepared cloud."""
+
+    @property
+    def points(self) -> PackedPoints:
+        """The cloud's points, near a local origin, for pictures."""
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the user should know about the cloud, one line each."""
+
+    @property
+    def settings(self) -> EngineSettings | PaperSettings:
+        """What it localizes with."""
+
+    def from_world(self, pose: Pose) -> Pose:
+        """A pose of the world in the frame of `points`."""
+
+    def localize(self, panorama: Panorama, workers: Workers, watch: Stopwatch) -> Localization:
+        """Where a panorama was taken."""
+
+
+@dataclass(frozen=True)
+class PaperLocalizer:
+    """Preset `paper`."""
+
+    paper_map: paper.PaperMap
+    settings: PaperSettings
+    warnings: tuple[str, ...]
+
+    @property
+    def points(self) -> PackedPoints:
+        """See Localizer."""
+        return self.paper_map.points
+
+    def from_world(self, pose: Pose) -> Pose:
+        """See Localizer."""
+        return Pose(pose.R_cam_from_world, pose.center_world - self.paper_map.origin_world)
+
+    def localize(self, panorama: Panorama, workers: Workers, watch: Stopwatch) -> Localization:
+        """See Localizer."""
+        return paper.localize(self.paper_map, panorama, self.settings, workers, watch)
+
+
+@dataclass(frozen=True)
+class EngineLocalizer:
+    """Preset `default`."""
+
+    scan_map: ScanMap
+    settings: EngineSettings
+
+    @property
+    def points(self) -> PackedPoints:
+        """See Localizer."""
+        return self.scan_map.points
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """See Localizer."""
+        return self.scan_map.warnings
+
+    def from_world(self, pose: Pose) -> Pose:
+        """See Localizer."""
+        return self.scan_map.from_world(pose)
+
+    def localize(self, panorama: Panorama, workers: Workers, watch: Stopwatch) -> Localization:
+        """See Localizer."""
+        return engine.localize(self.scan_map, panorama, self.settings, workers, watch)
+
+
+@dataclass(frozen=True)
+class CachePolicy:
+    """Where prepared maps are kept."""
+
+    is_used: bool = True
+    folder: Path | None = None  # None for the user's cache
+
+
+def open_map(path: Path, scale: float, cache: CachePolicy, workers: Workers, watch: Stopwatch) -> ScanMap:
+    """The map of a cloud file: prepared already, from the cache, or built now. `path` may be a map itself."""
+    is_file = path.is_file()
+    if is_file and is_map_file(path):
+        with watch.stage("read"):
+            return load_map(path)
+
+    def build() -> ScanMap:
+        with watch.stage("read"):
+            cloud = read_cloud(path, scale)
+        with watch.stage("prepare"):
+            return prepare_map(cloud, workers)
+
+    if not (cache.is_used and is_file):
+        return build()
+    with watch.stage("read"):
+        key = content_key(path, scale)
+    return cached_map(cache.folder, key, build, watch)
+
+
+def open_localizer(
+    path: Path,
+    scale: float,
+    settings: EngineSettings | PaperSettings,
+    cache: CachePolicy,
+    workers: Workers,
+    watch: Stopwatch,
+) -> Localizer:
+    """Read and prepare a cloud for the preset that the settings belong to."""
+    if isinstance(settings, EngineSettings):
+        return EngineLocalizer(open_map(path, scale, cache, workers, watch), settings)
+    if path.is_file() and is_map_file(path):
+        raise InputError(f"{path}: found a prepared map, wanted a cloud with the preset paper")
+    with watch.stage("read"):
+        cloud = read_cloud(path, scale)
+    with watch.stage("prepare"):
+        paper_map = paper.prepare(cloud, settings)
+    return PaperLocalizer(paper_map, settings, cloud.warnings)

@@ -1,0 +1,85 @@
+#!/usr/bin/env python3
+"""Prepare a cloud once: the map file that localize.py takes in place of the cloud."""
+
+import argparse
+import json
+import sys
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from piccolo.engine.map_file import save_map
+from piccolo.errors import InputError
+from piccolo.files import check_output
+from piccolo.pipeline import CachePolicy, open_map
+from piccolo.stopwatch import Stopwatch
+from piccolo.threads import Workers, num_cores
+
+EPILOG = """\
+example:
+  python tools/prepare_map.py --cloud scan.ply --out scan.map
+  python localize.py --cloud scan.map --pano query.jpg
+
+localize.py prepares and caches a map by itself; this tool is for maps that are copied, or made beforehand.
+One JSON object on stdout says what was made.
+exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
+"""
+
+
+def prepare(arguments: argparse.Namespace) -> dict[str, object]:
+    """Build and write the map; returns what was made."""
+    check_output(arguments.out, [arguments.cloud])
+
+    def show(values: Iterator[Any], total: int, label: str) -> Iterator[Any]:
+        return iter(tqdm(values, label, total, leave=False, disable=arguments.quiet, file=sys.stderr))
+
+    watch = Stopwatch()
+    workers = Workers(num_cores(), show)
+    scan_map = open_map(arguments.cloud, arguments.scale, CachePolicy(is_used=False), workers, watch)
+    save_map(scan_map, arguments.out)
+    return {
+        "map": str(arguments.out),
+        "points": len(scan_map.points),
+        "candidates": len(scan_map.centers),
+        "seconds": {stage: round(seconds, 3) for stage, seconds in watch.seconds.items()},
+        "warnings": list(scan_map.warnings),
+    }
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--cloud", type=Path, required=True, help="coloured scan, as for localize.py")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the map")
+    parser.add_argument("--scale", type=float, default=1.0, help="metres per unit of the cloud (default 1)")
+    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    arguments = parser.parse_args(argv)
+    try:
+        print(json.dumps(prepare(arguments)))
+    except KeyboardInterrupt:
+        return complain(arguments, "interrupted", 130)
+    except (OSError, InputError) as error:
+        return complain(arguments, str(error), 3)
+    except Exception as error:  # the last line of defence: a code and one line for the shell
+        return complain(arguments, f"internal error: {error!r}; --debug shows where", 4)
+    return 0
+
+
+def complain(arguments: argparse.Namespace, text: str, exit_code: int) -> int:
+    """One line on stderr, the traceback if --debug; returns the exit code."""
+    if arguments.debug:
+        traceback.print_exc()
+    print(f"prepare_map.py: {text}", file=sys.stderr)
+    return exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
