@@ -33,7 +33,11 @@ SNAP_ANGLE = np.radians(0.2)  # of +z to a direction that is called +z itself
 BIN = 0.1  # of the histogram of heights, half a sheet's thickness [m]
 MAX_BINS = 10_000
 MAX_SHEETS = 6
-MIN_SHEET = 0.25  # share of the largest sheet
+MIN_SHEET = 0.1  # share of the largest sheet: of a floor, furniture may leave little to see
+MIN_INNER = (
+    0.5  # share of the weaker of the outermost sheets, of a sheet between them: a table is not a floor
+)
+CLOSE = 4  # bins: sheets closer than this are one that bends
 MIN_STOREY = 1.5  # height [m]
 FAR = 0.5  # beyond a sheet, further than it bends [m]
 MIDDLE = (0.15, 0.5, 0.85)  # of a storey: skirting below, clutter or air, lamps and beams above
@@ -243,8 +247,10 @@ def _sheets(heights: Array, num_points: int) -> tuple[Array, Array]:
         if found and share < MIN_SHEET * found[0][1]:
             break
         found.append((float(low) + k * size, share))
-        pairs[max(k - 2, 0) : k + 3] = 0
+        pairs[max(k - CLOSE, 0) : k + CLOSE + 1] = 0
     found.sort()
+    least = MIN_INNER * min(found[0][1], found[-1][1])
+    found = [sheet for sheet in found if sheet in (found[0], found[-1]) or sheet[1] > least]
     return np.array([level for level, _ in found]), np.array([share for _, share in found])
 
 

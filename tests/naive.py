@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 
+from piccolo.engine.tiling import cell_of, make_tiling
+
 
 def project(points, R_cam_from_world, center_world, width):
     """Pixels (N, 2) of world points (N, 3); elevation by the arcsine of the unit direction."""
@@ -94,7 +96,7 @@ def nearest_box(origin, directions, boxes):
 
 
 def cells_view(leaves, center, cell, num_cells):
-    """Mean relative position, mean colour and count over the front of each cell, of leaves (N, 6) in `cell` (N,)."""
+    """Mean relative position, mean colour and count of each cell's front, of leaves (N, 6) in `cell` (N,)."""
     relative = leaves[:, :3] - center
     ranges = np.linalg.norm(relative, axis=1)
     nearest = np.full(num_cells, np.inf)
@@ -109,8 +111,6 @@ def cells_view(leaves, center, cell, num_cells):
 
 def normalized_cells(rgb, is_seen, num_rings, stats_rings, sigma_deg):
     """Opponent channels (cells, 3) less their Gaussian local mean, by the local deviation, clipped to 2."""
-    from piccolo.engine.tiling import cell_of, make_tiling
-
     fine, coarse = make_tiling(num_rings), make_tiling(stats_rings)
     r, g, b = rgb.T
     channels = np.stack([(r + g + b) / 3, (r - b) / 2, (2 * g - r - b) / 4], axis=1)

@@ -9,15 +9,20 @@ from piccolo.engine.descent import (
     correlate,
     descend,
     descend_shaken,
+    descend_starts,
     normal_equations,
     solve_damped,
     take_step,
 )
 from piccolo.engine.method import FINE_VIEW, SHAKES, as_levels
 from piccolo.engine.octree import build_octree
+from piccolo.engine.scan_map import SEARCH_VIEW, prepare_map
+from piccolo.engine.tiling import make_tiling
 from piccolo.engine.view import render_view
 from piccolo.pose import Pose, exp_so3, step
 from piccolo.pyramid import resize
+from piccolo.sampling import pack_texels
+from piccolo.threads import Workers
 
 TILTED = Pose(exp_so3(np.array([0.4, -1.1, 0.7])), np.array([0.2, -0.3, 0.1]))
 SCALE = 60.0
@@ -43,8 +48,6 @@ def _loss(problem, pose):
 
 
 def _sums(problem, pose):
-    from piccolo.sampling import pack_texels
-
     points, levels, weights, rgb = problem
     sums = np.empty(28)
     texels = pack_texels(rgb)
@@ -139,12 +142,35 @@ def test_descent_finds_the_true_pose_again(fine):
     assert shared == pytest.approx(weights.sum(), rel=1e-5)
 
 
-def test_shaken_descents_start_where_the_steps_say_and_come_back(fine):
-    offsets, levels, weights, image, R_true = fine
+def test_shaken_descents_lead_out_of_a_place_a_quarter_of_a_metre_off(fine):
+    offsets, levels, weights, _, R_true = fine
+    image = normalized_channels(resize(rooms.scene(1)[1], 128), 7.5, 22.0)
+    off = step(Pose(R_true, np.zeros(3)), SHAKES[1])
     n = len(SHAKES)
-    R, t, scores = np.repeat(R_true[None], n, axis=0), np.zeros((n, 3)), np.empty(n)
-    args = offsets, levels, weights, image.rgbx, image.width, image.rgbx, image.width, LEVELS_PER_UNIT
+    R = np.repeat(off.R_cam_from_world[None], n, axis=0)
+    t, scores = np.tile(off.center_world, (n, 1)), np.empty(n)
+    args = offsets, levels, weights, image.rgbx, image.width, image.rgbx, image.width, 1.2 * LEVELS_PER_UNIT
     descend_shaken(*args, SHAKES, R, t, scores)
-    assert np.linalg.norm(t[0]) < 0.02
-    assert np.median(np.linalg.norm(t, axis=1)) < 0.05
-    assert scores.max() > 0.6
+    assert np.linalg.norm(off.center_world) > 0.2
+    assert np.linalg.norm(t[np.argmax(scores)]) < 0.06
+
+
+def test_starts_descend_on_their_candidates_views_as_one_does_alone():
+    scan_map = prepare_map(rooms.room(1)[1], Workers(2))
+    _, panorama, true_pose = rooms.scene(1)
+    image = normalized_channels(resize(panorama, 128), 7.5, SEARCH_VIEW.sigma_deg)
+    k = int(np.argmin(np.linalg.norm(scan_map.centers - true_pose.center_world, axis=1)))
+    area, scale = make_tiling(24).solid_angle, 1.2 * LEVELS_PER_UNIT
+    R, t, scores = true_pose.R_cam_from_world[None].copy(), scan_map.centers[k][None].copy(), np.empty(1)
+    m = scan_map
+    views = m.offsets, m.offset_unit, m.features, m.is_seen, area, m.centers
+    descend_starts(*views, image.rgbx, image.width, scale, 12, np.array([k]), R, t, scores)
+    offsets = (scan_map.offsets[k] * scan_map.offset_unit[k]).astype(np.float32)
+    levels = scan_map.features[k].astype(np.float32) + np.float32(127.5)
+    weights = (scan_map.is_seen[k] * area).astype(np.float32)
+    R_alone, t_alone = true_pose.R_cam_from_world.copy(), np.zeros(3)
+    descend(offsets, levels, weights, image.rgbx, image.width, scale, 12, 2e-3, R_alone, t_alone)
+    np.testing.assert_allclose(t[0], scan_map.centers[k] + t_alone, atol=1e-4)
+    np.testing.assert_allclose(R[0], R_alone, atol=1e-4)
+    assert np.linalg.norm(t[0] - true_pose.center_world) < 0.1
+    assert scores[0] > 0.4

@@ -96,6 +96,16 @@ def test_a_bare_room_may_be_upside_down():
     assert up.confidence < 0.5
 
 
+def test_a_ceiling_is_not_the_ground_though_furniture_hides_the_floor():
+    rng = np.random.default_rng(9)
+    points = bare_room(rng)
+    furniture = rng.uniform(0.0, 1.0, (4000, 3)) * [5.0, 4.0, 1.0]
+    is_hidden = (points[:, 2] < 0.02) & (rng.uniform(size=len(points)) < 0.8)
+    up = find_up(turned(np.concatenate([points[~is_hidden], furniture]), TURNS[3]))
+    assert error_deg(up.direction_world, exp_so3(TURNS[3]) @ Z) < 0.5
+    assert up.confidence > 0.5
+
+
 def test_by_convention_a_bare_room_has_z_up():
     points = bare_room(np.random.default_rng(7)).astype(np.float32)
     up = find_up(points)

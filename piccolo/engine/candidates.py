@@ -17,6 +17,7 @@ MIN_ENCLOSED = 0.2  # share of the free places that are closed in, else the land
 GLANCE_VIEW = ViewKind(num_rings=12, stats_rings=12, sigma_deg=22.0, voxel_per_range=1 / 8)
 MIN_HEIGHT, MAX_HEIGHT = 0.3, 2.4  # [m] above a surface that can carry a tripod or a person
 SUPPORT_RADIUS = 0.9  # [m] the floor right below a scanner is never scanned
+STOREY = 2.6  # [m] a floor is not farther below a camera
 SURFACE_VOXEL = 0.16  # [m]
 COARSE_SPACING = 0.6  # [m] of the grid; the half of it where surfaces are near
 NEAR = 0.3  # [m] clearance below which the grid is refined
@@ -89,11 +90,14 @@ def candidate_centers(octree: Octree, workers: Workers) -> NDArray[np.float64]:
 
 
 def heights_above_floor(octree: Octree, centers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Height (N,) [m] of each centre (N, 3) above the highest surface near and below it; inf if none."""
+    """Height (N,) [m] of each centre (N, 3) above the floor: the lowest surface below, but not a storey below.
+
+    inf where there is none within SUPPORT_RADIUS and STOREY.
+    """
     surfaces = top_surfaces(octree)
     near = cKDTree(surfaces[:, :2]).query_ball_point(centers[:, :2], SUPPORT_RADIUS)
     heights = np.full(len(centers), np.inf)
     for k, indices in enumerate(near):
         gaps = centers[k, 2] - surfaces[indices, 2]
-        heights[k] = gaps[gaps > 0.0].min(initial=np.inf)
-    return heights
+        heights[k] = gaps[(gaps > 0.0) & (gaps < STOREY)].max(initial=-np.inf)
+    return np.where(np.isfinite(heights), heights, np.inf)

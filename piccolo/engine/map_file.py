@@ -48,7 +48,7 @@ def is_map_file(path: Path) -> bool:
 def load_map(path: Path) -> ScanMap:
     """Read what `save_map` wrote; InputError for anything else."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             members = {name: archive[name] for name in archive.files}
         if str(members["format"]) != FORMAT or str(members["sources"]) != SOURCE_DIGEST:
             raise InputError(f"{path}: found a map of another version, wanted one by this; prepare it again")
