@@ -101,13 +101,14 @@ class EngineSettings:
     prior: Prior = Prior()
     num_yaws: int = 48  # gravity known
     num_rotations: int = 2000  # of SO(3), gravity unknown
-    min_starts: int = 500
+    min_starts: int = 1000
     max_starts: int = 4000
     candidates_per_start: int = 4  # a start for so many places, within these bounds
     poses_per_start: int = 12  # scored poses from which distinct ones are picked, a start
-    num_coarse: int = 300  # poses kept after a short descent from each start
+    num_coarse: int = 400  # poses kept after a short descent from each start
     num_middle: int = 48  # poses kept after the descent on wide cells
     num_fine: int = 8  # poses kept after the descent on middle cells
+    num_polished: int = 2  # poses shaken and refined for as long as that helps
     num_points: int = 30_000  # for the last millimetres
     seed: int = 0  # repeated in the result; nothing is drawn at random
 

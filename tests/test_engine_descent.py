@@ -14,7 +14,7 @@ from piccolo.engine.descent import (
     solve_damped,
     take_step,
 )
-from piccolo.engine.method import FINE_VIEW, SHAKES, as_levels
+from piccolo.engine.method import FINE_VIEW, as_levels, shakes
 from piccolo.engine.octree import build_octree
 from piccolo.engine.scan_map import SEARCH_VIEW, prepare_map
 from piccolo.engine.tiling import make_tiling
@@ -145,12 +145,12 @@ def test_descent_finds_the_true_pose_again(fine):
 def test_shaken_descents_lead_out_of_a_place_a_quarter_of_a_metre_off(fine):
     offsets, levels, weights, _, R_true = fine
     image = normalized_channels(resize(rooms.scene(1)[1], 128), 7.5, 22.0)
-    off = step(Pose(R_true, np.zeros(3)), SHAKES[1])
-    n = len(SHAKES)
+    off = step(Pose(R_true, np.zeros(3)), shakes(1.0)[1])
+    n = len(shakes(1.0))
     R = np.repeat(off.R_cam_from_world[None], n, axis=0)
     t, scores = np.tile(off.center_world, (n, 1)), np.empty(n)
     args = offsets, levels, weights, image.rgbx, image.width, image.rgbx, image.width, 1.2 * LEVELS_PER_UNIT
-    descend_shaken(*args, SHAKES, R, t, scores)
+    descend_shaken(*args, shakes(1.0), R, t, scores)
     assert np.linalg.norm(off.center_world) > 0.2
     assert np.linalg.norm(t[np.argmax(scores)]) < 0.06
 

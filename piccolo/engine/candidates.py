@@ -90,7 +90,7 @@ def candidate_centers(octree: Octree, workers: Workers) -> NDArray[np.float64]:
 
 
 def heights_above_floor(octree: Octree, centers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Height (N,) [m] of each centre (N, 3) above the floor: the lowest surface below, but not a storey below.
+    """Height (N,) [m] of each centre (N, 3) above the floor: the lowest surface below in its storey.
 
     inf where there is none within SUPPORT_RADIUS and STOREY.
     """

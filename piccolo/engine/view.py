@@ -17,9 +17,7 @@ from .tiling import cell_of, make_neighbors, make_tiling
 
 PI = np.float32(math.pi)
 FAR = np.float32(1e30)
-BAND = np.float32(1.15)  # a cell's colour is the mean of points up to this times its nearest range
-VISIBLE_FACTOR = np.float32(1.08)  # lets grazing floors and walls through
-VISIBLE_OFFSET = np.float32(0.1)  # [m] and range noise
+VISIBLE_OFFSET = np.float32(0.1)  # [m] of range noise
 
 
 Kind = tuple[Any, ...]  # what ViewKind.arrays gives; kernels read it by position
@@ -34,6 +32,8 @@ class ViewKind:
     stats_rings: int  # cells of these rings carry the local statistics: no wider than sigma
     sigma_deg: float
     voxel_per_range: float  # largest voxel size by its distance
+    front: float = 1.15  # a cell's colour is the mean of points up to this times its nearest range
+    visible: float = 1.08  # a point is seen up to this times (and VISIBLE_OFFSET): grazing floors pass
 
     @cached_property
     def arrays(self) -> Kind:
@@ -49,6 +49,8 @@ class ViewKind:
             neighbors.row,
             neighbors.cell,
             neighbors.weight,
+            np.float32(self.front),
+            np.float32(self.visible),
         )
 
 
@@ -112,7 +114,7 @@ def locate(X, Y, Z, num_columns, first, cells, ranges, turns):
 
 
 @kernel
-def average_cells(nodes, found, directions, cells, ranges, sums):
+def average_cells(nodes, found, directions, cells, ranges, front, sums):
     """Write (cells, 8): sums of x, y, z, r, g, b and the count of each cell's front, and its range."""
     sums[:] = F0
     sums[:, 7] = FAR
@@ -121,7 +123,7 @@ def average_cells(nodes, found, directions, cells, ranges, sums):
         sums[cell, 7] = min(sums[cell, 7], ranges[i])
     for i in range(len(cells)):
         cell = cells[i]
-        if ranges[i] <= sums[cell, 7] * BAND:
+        if ranges[i] <= sums[cell, 7] * front:
             node = found[i]
             for k in range(3):
                 sums[cell, k] += directions[k, i]
@@ -196,7 +198,7 @@ def render_cells(tree, center, voxel_per_range, kind, scratch, offsets, features
         ranges[:n],
         turns,
     )
-    average_cells(tree[0], found, directions, cells[:n], ranges, sums)
+    average_cells(tree[0], found, directions, cells[:n], ranges, kind[8], sums)
     moments = np.empty((kind[3], 8), np.float32)
     average_colors(sums, kind, offsets, features, weights, moments)
     local_statistics(moments, kind, weights, stats)
@@ -258,12 +260,12 @@ def render_points(tree, center, voxel_per_range, kind, scratch, offsets, feature
     found, directions, cells, ranges, _ = scratch
     visible = 0
     for i in range(n):
-        if ranges[i] <= sums[cells[i], 7] * VISIBLE_FACTOR + VISIBLE_OFFSET:
+        if ranges[i] <= sums[cells[i], 7] * kind[9] + VISIBLE_OFFSET:
             visible += 1
     stride = (visible + len(weights) - 1) // len(weights)
     count = seen = 0
     for i in range(n):
-        if ranges[i] <= sums[cells[i], 7] * VISIBLE_FACTOR + VISIBLE_OFFSET:
+        if ranges[i] <= sums[cells[i], 7] * kind[9] + VISIBLE_OFFSET:
             seen += 1
             if seen % stride == 0:
                 node, c = found[i], cells[i]
