@@ -42,8 +42,8 @@ def test_camera_is_found_within_millimetres(seed, variant):
     distance, angle_deg = errors(found.pose, taken.pose)
     assert found.status == "localized"
     # a 512 px panorama has pixels of 0.7 deg and the photo's is blurred and noisy
-    assert distance < (0.015 if variant in ("photo", "change") else 0.008)
-    assert angle_deg < (0.3 if variant in ("photo", "change") else 0.2)
+    assert distance < (0.015 if variant in ("photo", "change") else 0.010)
+    assert angle_deg < (0.4 if variant in ("photo", "change") else 0.2)
 
 
 @pytest.mark.parametrize("solver", ["adam", "lbfgs"])

@@ -17,7 +17,7 @@ LAYERS = [
     {"sphere", "rotations"},
     {"panorama", "cloud", "sampling", "pyramid"},
     {"loss", "render", "gravity"},
-    {"overlay", "verify", "refine", "synthetic"},
+    {"overlay", "verify", "refine", "synthetic", "truth"},
     {"result"},
     {"paper", "engine"},
     {"pipeline"},

@@ -2,7 +2,6 @@
 """Compare results of localize.py with true poses: a table of errors, and what share is correct."""
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,8 +12,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from piccolo.errors import InputError
-from piccolo.pose import Pose, angle_between
 from piccolo.result import LOCALIZED, Result
+from piccolo.truth import Query, pose_errors, read_truth
 
 EPILOG = """\
 example:
@@ -25,14 +24,6 @@ queries.json: {"queries": [{"image", "variant", "R_cam_from_world", "center_worl
 belongs to the query whose image has the same file name. The table is Markdown, on stdout.
 exit codes: 0 done, 2 wrong usage, 3 bad input.
 """
-
-
-@dataclass(frozen=True)
-class Query:
-    """A panorama with its true pose."""
-
-    variant: str
-    pose: Pose
 
 
 @dataclass(frozen=True)
@@ -51,21 +42,6 @@ class Row:
         return sum(self.result.seconds.get(stage, 0.0) for stage in ("search", "refine"))
 
 
-def read_truth(path: Path) -> dict[str, Query]:
-    """The queries of a queries.json by file name."""
-    try:
-        entries = json.loads(path.read_text())["queries"]
-        return {
-            Path(entry["image"]).name: Query(
-                entry["variant"],
-                Pose(np.array(entry["R_cam_from_world"], float), np.array(entry["center_world"], float)),
-            )
-            for entry in entries
-        }
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: found {error!r}, wanted a queries.json with true poses") from error
-
-
 def compare(result: Result, truth: dict[str, Query]) -> Row:
     """The errors of one result."""
     name = Path(result.pano).name
@@ -74,9 +50,7 @@ def compare(result: Result, truth: dict[str, Query]) -> Row:
     query = truth[name]
     if result.pose is None:
         return Row(name, query.variant, result, np.inf, np.inf)
-    offset = result.pose.center_world - query.pose.center_world
-    angle = angle_between(result.pose.R_cam_from_world, query.pose.R_cam_from_world)
-    return Row(name, query.variant, result, float(np.linalg.norm(offset)), angle)
+    return Row(name, query.variant, result, *pose_errors(result.pose, query.pose))
 
 
 def print_rows(rows: Sequence[Row]) -> None:

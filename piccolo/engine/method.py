@@ -31,7 +31,9 @@ from .view import Cells, ViewKind, render_view, seen_points
 MIDDLE_VIEW = ViewKind(num_rings=48, stats_rings=24, sigma_deg=14.0, voxel_per_range=1 / 30)
 FINE_VIEW = ViewKind(num_rings=96, stats_rings=24, sigma_deg=10.0, voxel_per_range=1 / 80)
 FINISH_VIEW = ViewKind(num_rings=96, stats_rings=24, sigma_deg=10.0, voxel_per_range=1 / 150)
-SCALES = (  # of the panorama for the last millimetres and for the fine, middle and searched views
+SCALES: tuple[
+    Scale, ...
+] = (  # of the panorama for the last millimetres and for the fine, middle and searched views
     Scale(1024, 0.0, FINISH_VIEW.sigma_deg),
     Scale(256, 0.0, FINE_VIEW.sigma_deg),
     Scale(128, 0.0, MIDDLE_VIEW.sigma_deg),
