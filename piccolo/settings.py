@@ -1,6 +1,6 @@
 """Frozen, typed settings with units; a result repeats the ones it was made with."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
 from .errors import InputError
@@ -117,6 +117,16 @@ class EngineSettings:
         for name, value in asdict(self).items():
             if isinstance(value, int) and name != "seed" and value < 1:
                 raise InputError(f"{name}: found {value}, wanted at least 1")
+
+    def wider(self) -> "EngineSettings":
+        """Settings that keep more poses on the way down, for a second look."""
+        return replace(
+            self,
+            num_coarse=2 * self.num_coarse,
+            num_middle=4 * self.num_middle,
+            num_fine=3 * self.num_fine,
+            num_polished=2 * self.num_polished,
+        )
 
     def to_json(self) -> dict[str, object]:
         """The settings as they took effect."""

@@ -287,6 +287,24 @@ def find(engine: Engine, gravity: Gravity, watch: Stopwatch) -> Found:
     return Found(best, best.score - max([0.0, *rivals]))
 
 
+def best_found(engine: Engine, watch: Stopwatch) -> Found:
+    """The quick look, or two where gravity is `auto`; and if that is not sure, a wider look at more poses."""
+    gravity = engine.settings.gravity
+    looks: list[tuple[Gravity, Engine]] = [("unknown" if gravity == "unknown" else "known", engine)]
+    if gravity == "auto":
+        looks.append(("unknown", engine))
+    looks += [(g, replace(engine, settings=engine.settings.wider())) for g, _ in looks]
+    best = find(engine, looks[0][0], watch)
+    for g, how in looks[1:]:
+        if best.is_sure:
+            break
+        found = find(how, g, watch)
+        # A wider look knows more rivals: of the same pose, its margin is the one to believe.
+        if found.best.score > best.best.score - MAX_FINISH_LOSS:
+            best = found
+    return best
+
+
 def localize(
     scan_map: ScanMap, panorama: Panorama, settings: EngineSettings, workers: Workers, watch: Stopwatch
 ) -> Localization:
@@ -296,9 +314,7 @@ def localize(
         return Localization(NOT_LOCALIZED, None, None, None, None)
     with watch.stage("search"):
         engine = Engine(allowed, comparable(panorama, SCALES), settings, workers)
-    found = find(engine, "unknown" if settings.gravity == "unknown" else "known", watch)
-    if settings.gravity == "auto" and not found.is_sure:
-        found = max(found, find(engine, "unknown", watch), key=lambda f: f.best.score)
+    found = best_found(engine, watch)
     with watch.stage("refine"):
         return judged(scan_map, panorama, settings, found)
 
