@@ -228,19 +228,6 @@ def open_session(arguments: argparse.Namespace, settings: EngineSettings | Paper
     return session
 
 
-def summary(result: Result) -> str:
-    """Two lines for a person."""
-    if result.pose is None:
-        return f"{result.pano}: {result.status}\n  no start in free space, or nothing of the panorama counts"
-    x, y, z = result.pose.center_world
-    total = sum(result.seconds.values())
-    return (
-        f"{result.pano}: {result.status} at ({x:.3f}, {y:.3f}, {z:.3f}) m in {total:.1f} s\n"
-        f"  score {result.score:.2f}, margin {result.margin:.2f}, loss {result.loss:.3f}, "
-        f"{100.0 * (result.inlier_share or 0.0):.0f} % of the seen directions agree"
-    )
-
-
 def results_of(session: Session) -> Iterator[Result | None]:
     """The result of each panorama in order; None for one that can't be read, after saying why."""
     arguments = session.arguments
@@ -252,7 +239,7 @@ def results_of(session: Session) -> Iterator[Result | None]:
             complain(arguments, error)
             yield None
             continue
-        session.say(summary(result))
+        session.say(result.summary())
         yield result
 
 

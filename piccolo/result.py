@@ -48,6 +48,18 @@ class Result:
     settings: dict[str, object]  # effective settings, seed included
     warnings: tuple[str, ...] = field(default=())
 
+    def summary(self) -> str:
+        """Two lines for a person."""
+        if self.pose is None:
+            return f"{self.pano}: {self.status}\n  no place for a camera found, or nothing of the panorama counts"
+        x, y, z = self.pose.center_world
+        total = sum(self.seconds.values())
+        return (
+            f"{self.pano}: {self.status} at ({x:.3f}, {y:.3f}, {z:.3f}) m in {total:.1f} s\n"
+            f"  score {self.score:.2f}, margin {self.margin:.2f}, loss {self.loss:.3f}, "
+            f"{100.0 * (self.inlier_share or 0.0):.0f} % of the seen directions agree"
+        )
+
     def to_json(self) -> str:
         """One JSON object on one line. Numbers only: NaN and infinity raise ValueError."""
         pose = self.pose

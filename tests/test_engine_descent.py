@@ -10,11 +10,11 @@ from piccolo.engine.descent import (
     descend,
     descend_shaken,
     descend_starts,
-    normal_equations,
-    solve_damped,
     take_step,
 )
-from piccolo.engine.method import FINE_VIEW, as_levels, shakes
+from piccolo.engine.hypotheses import shakes
+from piccolo.engine.least_squares import normal_equations, solve_damped
+from piccolo.engine.method import FINE_VIEW, as_levels
 from piccolo.engine.octree import build_octree
 from piccolo.engine.scan_map import SEARCH_VIEW, prepare_map
 from piccolo.engine.tiling import make_tiling

@@ -74,6 +74,15 @@ def test_panorama_of_which_nothing_counts_has_no_pose():
     assert found.pose is None
 
 
+def test_cloud_without_a_place_for_a_camera_is_no_error():
+    rng = np.random.default_rng(0)
+    solid = rng.uniform(0.0, 1.0, (20_000, 3)).astype(np.float32)
+    cloud = Cloud(solid, rng.integers(0, 256, (20_000, 3), dtype=np.uint8), np.zeros(3))
+    scan_map = prepare_map(cloud, Workers(1))
+    found = localize(scan_map, as_panorama(query(1).rgb), EngineSettings(), Workers(1), Stopwatch())
+    assert found.status == "not_localized"
+
+
 def test_cloud_that_lies_on_its_side_is_levelled():
     cloud, taken = room(1)[1], query(1)
     turn = exp_so3(np.array([np.pi / 2, 0.0, 0.0])) @ exp_so3(np.array([0.0, 0.3, 0.0]))

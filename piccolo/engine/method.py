@@ -22,6 +22,19 @@ from ..verify import INLIER_RESIDUAL, evidence_at
 from .channels import LEVELS_PER_UNIT, ZERO_LEVEL
 from .contrast import Scale, comparable
 from .descent import correlate, descend, descend_shaken, descend_starts
+from .hypotheses import (
+    RIVAL_ANGLE_DEG,
+    RIVAL_DISTANCE,
+    SAME_ANGLE_DEG,
+    SAME_DISTANCE,
+    START_ANGLE_DEG,
+    START_DISTANCE,
+    Hypothesis,
+    Starts,
+    best_and_rivals,
+    distinct_best,
+    shakes,
+)
 from .prior import allowed_rotations, narrowed
 from .scan_map import SEARCH_VIEW, ScanMap
 from .search import best_poses, correlate_pairs, pick_distinct, score_poses, score_poses_wide, turn_panorama
@@ -40,9 +53,6 @@ SCALES: tuple[
     Scale(128, 7.5, SEARCH_VIEW.sigma_deg),
 )
 COARSE_LOSS, FINE_LOSS, FINISH_LOSS = 1.2, 1.0, 0.7  # scales of the Geman-McClure loss [deviations]
-START_DISTANCE, START_ANGLE_DEG = 0.5, 20.0  # starts nearer than this are one
-SAME_DISTANCE, SAME_ANGLE_DEG = 0.15, 5.0  # so are poses on their way down
-RIVAL_DISTANCE, RIVAL_ANGLE_DEG = 0.5, 15.0
 FINISH_ROUNDS = 2
 
 # Of 36 panoramas searched in a wrong building none had a margin over 0.045 or a score over 0.18; of those in
@@ -50,60 +60,9 @@ FINISH_ROUNDS = 2
 MIN_SCORE, MIN_MARGIN = 0.2, 0.08
 SURE_SCORE, SURE_MARGIN = 0.25, 0.15  # with less, gravity `auto` looks at all rotations too
 
-SHAKE_DISTANCE, SHAKE_ANGLE = 0.25, math.radians(8.0)  # [m], [rad] from a pose, to find it again from
 POLISH_SHARE = 0.4  # of these, for the last shakes
 MAX_POLISHES, MIN_POLISH_GAIN = 5, 0.01
 MAX_FINISH_LOSS = 0.01  # of the score, in exchange for millimetres
-
-
-@dataclass(frozen=True)
-class Hypothesis:
-    """A pose in the map's frame, and how well it explains the panorama."""
-
-    pose: Pose
-    score: float  # locally normalised correlation, times the root of the share of the sphere that both show
-
-
-@dataclass(frozen=True)
-class Starts:
-    """Poses in arrays, best first, and the candidate on whose view each descends."""
-
-    R_cam_from_map: NDArray[np.float64]  # (n, 3, 3)
-    center_map: NDArray[np.float64]  # (n, 3) [m]
-    candidate: NDArray[np.int64]  # (n,)
-    score: NDArray[np.float64]  # (n,)
-
-    def hypotheses(self) -> list[Hypothesis]:
-        """One object each."""
-        poses = zip(self.R_cam_from_map, self.center_map, self.score, strict=True)
-        return [Hypothesis(Pose(R, center), float(score)) for R, center, score in poses]
-
-
-def distinct_best(
-    hypotheses: Sequence[Hypothesis], count: int, min_distance: float, min_angle: float
-) -> list[Hypothesis]:
-    """At most `count` by falling score, none within distance [m] and angle [rad] of a better one."""
-    kept: list[Hypothesis] = []
-    for h in sorted(hypotheses, key=lambda h: -h.score):
-        if len(kept) < count and not any(are_same(h.pose, k.pose, min_distance, min_angle) for k in kept):
-            kept.append(h)
-    return kept
-
-
-def best_and_rivals(hypotheses: Sequence[Hypothesis], count: int) -> list[Hypothesis]:
-    """The best that differ a little and, in a quarter of the places, the best that lie far apart."""
-    kept = distinct_best(hypotheses, count - count // 4, 0.1, math.radians(SAME_ANGLE_DEG))
-    for rival in distinct_best(hypotheses, count, RIVAL_DISTANCE, math.radians(RIVAL_ANGLE_DEG)):
-        if len(kept) < count and not any(rival is k for k in kept):
-            kept.append(rival)
-    return kept
-
-
-def shakes(share: float) -> NDArray[np.float64]:
-    """Steps (9, 6), rotation [rad] and translation [m]: none, then to the corners of a cube."""
-    signs = np.array([(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) / math.sqrt(3.0)
-    steps = np.concatenate([signs[:, ::-1] * SHAKE_ANGLE, signs * SHAKE_DISTANCE], axis=1) * share
-    return np.concatenate([np.zeros((1, 6)), steps])
 
 
 def as_levels(features: NDArray[np.float32]) -> NDArray[np.float32]:

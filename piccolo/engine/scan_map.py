@@ -89,7 +89,7 @@ def widen(
         features[lo : lo + 1024] = np.rint(np.clip(mean, -127, 127))
         seen = np.minimum(is_seen[part].astype(np.float32) @ matrix / area, 1.0)
         share[lo : lo + 1024] = np.rint(seen * 255.0)
-    return features.reshape(len(rows), -1), share
+    return features.reshape(len(rows), 3 * len(area)), share
 
 
 def level_out(octree: Octree) -> tuple[Array, tuple[str, ...]]:
