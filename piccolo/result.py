@@ -51,7 +51,7 @@ class Result:
     def summary(self) -> str:
         """Two lines for a person."""
         if self.pose is None:
-            return f"{self.pano}: {self.status}\n  no place for a camera found, or nothing of the panorama counts"
+            return f"{self.pano}: {self.status}\n  no place for a camera, or nothing of the panorama counts"
         x, y, z = self.pose.center_world
         total = sum(self.seconds.values())
         return (
