@@ -287,6 +287,7 @@ def judged(scan_map: ScanMap, panorama: Panorama, settings: EngineSettings, foun
     loss = sampling_loss(visible_points(points, pose.center_world), texels, pose)
     if not math.isfinite(loss):
         return Localization(NOT_LOCALIZED, None, None, None, None)
-    evidence = replace(evidence_at(points, panorama, pose, INLIER_RESIDUAL), score=found.best.score)
+    evidence = evidence_at(scan_map.coarse_points, panorama, pose, INLIER_RESIDUAL)
+    evidence = replace(evidence, score=found.best.score)
     status = LOCALIZED if found.is_localized else NOT_LOCALIZED
     return Localization(status, scan_map.to_world(pose), loss, evidence, found.margin)
