@@ -105,6 +105,7 @@ def test_nan_vertices_are_dropped_whatever_their_color(tmp_path):
     element.data["red"][:3] = np.nan
     cloud = read_cloud(write(tmp_path / "a.ply", element))
     assert (cloud.num_dropped, len(cloud.points)) == (3, 1197)
+    assert "3 points with NaN or infinite coordinates left out" in cloud.warnings[0]
 
 
 @pytest.mark.parametrize("brightness", [1.5, -0.1, np.nan])

@@ -45,7 +45,10 @@ def clean(path: Path, raw: RawCloud, scale: float) -> Cloud:
     points = (points_world - origin_world + 0.0).astype(np.float32)
     order = canonical_order(points, colors)
     points, colors = points[order], colors[order]
-    return Cloud(points, colors, origin_world, num_dropped, _unit_warnings(path, points))
+    warnings = _unit_warnings(path, points)
+    if num_dropped:
+        warnings = (f"{path}: {num_dropped} points with NaN or infinite coordinates left out", *warnings)
+    return Cloud(points, colors, origin_world, num_dropped, warnings)
 
 
 def _finite(raw: RawCloud) -> tuple[NDArray[np.float64], NDArray[np.uint8], int]:
