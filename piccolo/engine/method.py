@@ -55,9 +55,9 @@ SCALES: tuple[
 COARSE_LOSS, FINE_LOSS, FINISH_LOSS = 1.2, 1.0, 0.7  # scales of the Geman-McClure loss [deviations]
 FINISH_ROUNDS = 2
 
-# Of 36 panoramas searched in a wrong building none had a margin over 0.04 or a score over 0.21; in a room of the
-# same shape with other furniture 3 of 92 reached scores of 0.24 to 0.29 with margins of 0.08 to 0.15. Of 132 in
-# the right place none had a margin under 0.15 or a score under 0.29.
+# Of 36 panoramas searched in a wrong building none had a margin over 0.04 or a score over 0.21; in a room of
+# the same shape with other furniture 3 of 92 reached scores of 0.24 to 0.29 with margins of 0.08 to 0.15. Of
+# 132 in the right place none had a margin under 0.15 or a score under 0.29.
 MIN_SCORE, MIN_MARGIN = 0.25, 0.12
 SURE_SCORE, SURE_MARGIN = 0.25, 0.15  # with less, gravity `auto` looks at all rotations too
 
