@@ -1,19 +1,21 @@
 """Point clouds: one reader a format, then the same checks and the same order for all."""
 
 import math
-from collections.abc import Callable
 from pathlib import Path
+
+import numpy as np
 
 from ..errors import InputError
 from .clean import clean
 from .model import Cloud
-from .ply import has_ply_magic, read_ply
-from .raw import RawCloud
-from .text import TEXT_SUFFIXES, read_text
+from .ply import PLY
+from .raw import HEAD_SIZE, Format, PointSource, RawCloud
+from .text import TEXT
 
 __all__ = ["Cloud", "read_cloud"]
 
-WANTED = f"wanted a coloured point cloud: .ply, or text x y z r g b ({' '.join(sorted(TEXT_SUFFIXES))})"
+FORMATS = (PLY, TEXT)
+WANTED = f"wanted a coloured point cloud: {', '.join(f.name for f in FORMATS)}"
 
 
 def read_cloud(path: Path, scale: float = 1.0) -> Cloud:
@@ -33,26 +35,33 @@ def read_cloud(path: Path, scale: float = 1.0) -> Cloud:
     if not (math.isfinite(scale) and scale > 0.0):
         raise InputError(f"--scale: found {scale}, wanted a number above 0 (metres a unit of the file)")
     try:
-        raw = _reader(path)(path)
+        source = open_source(path)
+        chunks = [RawCloud(np.empty((0, 3)), np.empty((0, 3), np.uint8)), *source.read_chunks()]
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}), {WANTED}") from error
+    points_world = np.concatenate([chunk.points_world for chunk in chunks])
+    raw = RawCloud(points_world, np.concatenate([chunk.colors for chunk in chunks]))
     return clean(path, raw, scale)
 
 
-def _reader(path: Path) -> Callable[[Path], RawCloud]:
-    """The reader for a file: by its first bytes, then by its name's end."""
+def open_source(path: Path) -> PointSource:
+    """The points of a file in any format that is read here."""
+    return _format_of(path).open_source(path)
+
+
+def _format_of(path: Path) -> Format:
+    """The format of a file: by its first bytes, then by its name's end."""
     if not path.exists():
         raise InputError(f"{path}: no such file, {WANTED}")
     if not path.is_file():
         raise InputError(f"{path}: not a file but a folder or a device, {WANTED}")
     with path.open("rb") as file:
-        head = file.read(4)
+        head = file.read(HEAD_SIZE)
     if not head:
         raise InputError(f"{path}: the file is empty, {WANTED}")
-    if has_ply_magic(head):
-        return read_ply
-    if path.suffix.lower() in TEXT_SUFFIXES:
-        return read_text
-    if path.suffix.lower() == ".ply":
-        raise InputError(f"{path}: begins with {head!r}, wanted 'ply' and a line end")
-    raise InputError(f"{path}: unknown format '{path.suffix}', {WANTED}")
+    suffix = path.suffix.lower()
+    by_content = [f for f in FORMATS if f.has_magic(head)]
+    by_name = [f for f in FORMATS if suffix in f.suffixes]
+    if not by_content and not by_name:
+        raise InputError(f"{path}: unknown format '{path.suffix}', {WANTED}")
+    return (by_content or by_name)[0]

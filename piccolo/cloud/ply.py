@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from ..errors import InputError
-from .raw import RawCloud
+from .raw import Format, PointSource, RawCloud
 from .rows import NOT_A_NUMBER, PARSED, SPACE, TOO_FEW, TOO_MANY, parse_rows
 from .text import quoted
 
@@ -44,6 +44,11 @@ class Header:
     size: int  # [byte], the data begin here
 
 
+def open_ply(path: Path) -> PointSource:
+    """The vertices of a PLY file; see read_ply."""
+    return PointSource(path, lambda: iter([read_ply(path)]))
+
+
 def has_ply_magic(head: bytes) -> bool:
     """True if a file that begins with the bytes `head` says it is PLY."""
     return head.startswith((b"ply\n", b"ply\r"))
@@ -71,6 +76,8 @@ def read_ply(path: Path) -> RawCloud:
 def _read_header(path: Path) -> Header:
     with path.open("rb") as file:
         head = file.read(MAX_HEADER_SIZE)
+    if not has_ply_magic(head):
+        raise InputError(f"{path}: begins with {head[:4]!r}, wanted 'ply' and a line end")
     line_end = next(end for end in LINE_ENDS if head.startswith(b"ply" + end))
     size = head.find(line_end + b"end_header" + line_end)
     if size < 0:
@@ -189,3 +196,6 @@ def _color(
             f"header declares the type {type_}"
         )
     return np.rint(values * (255.0 / BRIGHTEST[type_])).astype(np.uint8)
+
+
+PLY = Format("PLY", frozenset({".ply"}), has_ply_magic, open_ply)

@@ -1,9 +1,13 @@
-"""What a reader hands on: a file's points as they stand there."""
+"""What a reader hands on: a file's points as they stand there, a chunk at a time."""
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+CHUNK = 1 << 20  # points that a reader hands on at once, at most
 
 
 @dataclass(frozen=True)
@@ -12,3 +16,28 @@ class RawCloud:
 
     points_world: NDArray[np.float64]  # (N, 3) in the file's unit, maybe NaN or infinite
     colors: NDArray[np.uint8]  # (N, 3) RGB
+
+
+@dataclass(frozen=True)
+class PointSource:
+    """A file whose header has been checked, and the way to its points."""
+
+    path: Path
+    read_chunks: Callable[
+        [], Iterator[RawCloud]
+    ]  # each call anew; InputError where the data break
+    num_points: int | None = None  # for the progress; None if only reading can tell
+    warnings: tuple[str, ...] = ()  # one line each, for the user: what was decided about this file
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format and its reader."""
+
+    name: str
+    suffixes: frozenset[str]  # lower case, with the dot
+    has_magic: Callable[[bytes], bool]  # of a file's first HEAD_SIZE bytes; content goes before names
+    open_source: Callable[[Path], PointSource]
+
+
+HEAD_SIZE = 512  # [byte]

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .raw import RawCloud
+from .raw import Format, PointSource, RawCloud
 from .rows import NOT_A_NUMBER, SPACE, TOO_FEW, parse_rows
 
 TEXT_SUFFIXES = frozenset({".txt", ".xyz", ".asc", ".csv", ".xyzrgb", ".pts"})
@@ -48,6 +48,11 @@ def read_text(path: Path) -> RawCloud:
     rows = rows[:num_rows]
     _check_colors(path, data, layout, rows)
     return RawCloud(np.ascontiguousarray(rows[:, :3]), np.rint(np.nan_to_num(rows[:, 3:])).astype(np.uint8))
+
+
+def open_text(path: Path) -> PointSource:
+    """The points of a text file; see read_text."""
+    return PointSource(path, lambda: iter([read_text(path)]))
 
 
 def quoted(line: bytes) -> str:
@@ -150,3 +155,6 @@ def _check_colors(path: Path, data: NDArray[np.uint8], layout: Layout, rows: NDA
     )
     found = " ".join(f"{value:g}" for value in colors[first])
     raise InputError(f"{path}: line {layout.num_lines + num_lines} has the colour {found}, {WANTED}")
+
+
+TEXT = Format("text x y z r g b", TEXT_SUFFIXES, lambda head: False, open_text)
