@@ -23,9 +23,7 @@ class PointSource:
     """A file whose header has been checked, and the way to its points."""
 
     path: Path
-    read_chunks: Callable[
-        [], Iterator[RawCloud]
-    ]  # each call anew; InputError where the data break
+    read_chunks: Callable[[], Iterator[RawCloud]]  # each call anew; InputError where the data break
     num_points: int | None = None  # for the progress; None if only reading can tell
     warnings: tuple[str, ...] = ()  # one line each, for the user: what was decided about this file
 
