@@ -12,7 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from piccolo import __version__
+from command_line import build_parser, check_arguments, settings_from
 from piccolo.errors import InputError
 from piccolo.files import check_output, write_atomically
 from piccolo.jit import KERNEL_FOLDER, is_first_use
@@ -20,149 +20,13 @@ from piccolo.overlay import overlay_png
 from piccolo.panorama import read_panorama
 from piccolo.pipeline import CachePolicy, Localizer, open_localizer
 from piccolo.result import LOCALIZED, Result
-from piccolo.settings import EngineSettings, PaperSettings, Prior
+from piccolo.settings import EngineSettings, PaperSettings
 from piccolo.stopwatch import Stopwatch
-from piccolo.threads import Workers, num_cores
+from piccolo.threads import Workers
 from piccolo.verify import INLIER_RESIDUAL
 
 EXIT_ALL_LOCALIZED, EXIT_SOME_NOT, EXIT_BAD_USAGE, EXIT_BAD_INPUT, EXIT_INTERNAL = range(5)
 EXIT_INTERRUPTED, EXIT_BROKEN_PIPE = 130, 141
-
-DESCRIPTION = "Find where in a coloured point cloud 360-degree panoramas were taken."
-EPILOG = """\
-examples:
-  python localize.py --cloud scan.ply --pano query.jpg
-  python localize.py --cloud scan.ply --pano query.jpg --out pose.json --overlay overlay.png
-  python localize.py --cloud scan.ply --pano photos/*.jpg --out poses.jsonl
-  python localize.py --cloud scan.ply --pano query.jpg --near 12 3 1.5 --radius 4
-  python localize.py --cloud scan.ply --pano query.jpg --preset paper --solver lbfgs
-
-output: one JSON object a panorama, one a line, in the order given; messages and progress go to stderr.
-exit codes: 0 all localized, 1 some not, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
-"""
-# option, metavar, type, help: settings that only one preset has, named as the setting
-Option = tuple[str, str, type, str]
-ENGINE_OPTIONS: tuple[Option, ...] = (
-    ("--num-yaws", "N", int, "rotations searched where gravity is known"),
-    ("--num-rotations", "N", int, "rotations of SO(3) searched where it is not"),
-    ("--max-starts", "N", int, "poses from which a descent begins, at most"),
-)
-PAPER_OPTIONS: tuple[Option, ...] = (
-    ("--translations", "N_t", int, "start positions in free space"),
-    ("--rotations", "N_r", int, "start rotations; 0: 8 yaws if gravity is known, 32 of SO(3) if not"),
-    ("--keep-by-loss", "K1", int, "poses kept by the loss"),
-    ("--keep-by-histogram", "K2", int, "poses kept by colour histograms, and refined"),
-    ("--iterations", "N", int, "iterations of the solver"),
-    ("--histogram-bins", "N", int, "bins a channel"),
-    ("--grid-margin", "SHARE", float, "share of the box left out on each side of the grid"),
-    ("--max-points", "N", int, "points used of a larger cloud"),
-)
-PAPER_SETTING = {
-    "translations": "num_translations",
-    "rotations": "num_rotations",
-    "keep_by_loss": "num_by_loss",
-    "keep_by_histogram": "num_by_histogram",
-    "iterations": "num_iterations",
-}
-
-
-def build_parser() -> argparse.ArgumentParser:
-    """All options. A setting that is not given stays None, and keeps its preset's default."""
-    parser = argparse.ArgumentParser(
-        "localize.py",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--version", action="version", version=f"piccolo {__version__}")
-    files = parser.add_argument_group("files")
-    text = "coloured scan: PLY, or text x y z r g b; or a map by tools/prepare_map.py"
-    files.add_argument("--cloud", type=Path, required=True, help=text)
-    files.add_argument("--pano", type=Path, required=True, nargs="+", help="full sphere JPEG or PNG, W = 2 H")
-    files.add_argument("--out", type=Path, help="write the JSON here, not to stdout")
-    files.add_argument("--overlay", type=Path, help="PNG: panorama, cloud at the pose, checkerboard of both")
-    files.add_argument("--scale", type=float, default=1.0, help="metres per unit of the cloud (default 1)")
-    files.add_argument("--cache", type=Path, metavar="FOLDER", help="of prepared maps (default the user's)")
-    files.add_argument("--no-cache", action="store_true", help="prepare the map anew and keep none")
-    add_method_options(parser)
-    add_prior_options(parser)
-    run = parser.add_argument_group("run")
-    run.add_argument("--threads", type=int, default=num_cores(), metavar="N", help="(default all cores)")
-    run.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
-    run.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    return parser
-
-
-def add_method_options(parser: argparse.ArgumentParser) -> None:
-    """The preset and its settings."""
-    group = parser.add_argument_group("method")
-    text = "default: prepared views, all positions searched; paper: Kim et al., ICCV 2021, Algorithm 1"
-    group.add_argument("--preset", choices=["default", "paper"], default="default", help=text)
-    text = "known: camera upright and the cloud level; unknown: any rotation; auto: both (default auto)"
-    group.add_argument("--gravity", choices=["auto", "known", "unknown"], help=text)
-    text = "of the descent (default gauss-newton, with the preset paper adam)"
-    group.add_argument("--solver", choices=["gauss-newton", "lbfgs", "adam"], help=text)
-    for title, options, settings in (
-        ("preset default", ENGINE_OPTIONS, EngineSettings()),
-        ("preset paper", PAPER_OPTIONS, PaperSettings()),
-    ):
-        group = parser.add_argument_group(title)
-        for option, metavar, kind, text in options:
-            name = option[2:].replace("-", "_")
-            default = getattr(settings, PAPER_SETTING.get(name, name))
-            group.add_argument(option, type=kind, metavar=metavar, help=f"{text} (default {default})")
-    group.add_argument("--no-visibility", action="store_const", const=True, help="see through walls")
-
-
-def add_prior_options(parser: argparse.ArgumentParser) -> None:
-    """What the user knows beforehand."""
-    group = parser.add_argument_group("prior knowledge (preset default); each narrows the search")
-    group.add_argument("--near", type=float, nargs=3, metavar=("X", "Y", "Z"), help="rough position [m]")
-    group.add_argument("--radius", type=float, metavar="M", help="the camera is within M metres of --near")
-    group.add_argument("--height", type=float, nargs=2, metavar=("MIN", "MAX"), help="above the floor [m]")
-    text = "of the image centre, clockwise from the cloud's +y"
-    group.add_argument("--heading", type=float, metavar="DEG", help=text)
-    group.add_argument("--heading-tolerance", type=float, metavar="DEG", help="(default 20)")
-
-
-def settings_from(arguments: argparse.Namespace) -> EngineSettings | PaperSettings:
-    """The settings that the options ask for; an option of the other preset is refused."""
-    given = {k: v for k, v in vars(arguments).items() if v is not None}
-    own, other = ENGINE_OPTIONS, PAPER_OPTIONS
-    if arguments.preset == "paper":
-        own, other = other, own
-    foreign = [option for option, *_ in other if option[2:].replace("-", "_") in given]
-    priors = [n for n in ("near", "radius", "height", "heading", "heading_tolerance") if n in given]
-    if arguments.preset == "default":
-        foreign += ["--no-visibility"] if "no_visibility" in given else []
-    else:
-        foreign += ["--" + name.replace("_", "-") for name in priors]
-    if foreign:
-        raise InputError(f"{foreign[0]}: not an option of the preset {arguments.preset}")
-    names = [option[2:].replace("-", "_") for option, *_ in own]
-    chosen = {PAPER_SETTING.get(n, n): given[n] for n in ("gravity", "solver", *names) if n in given}
-    if arguments.preset == "paper":
-        return PaperSettings(use_visibility="no_visibility" not in given, **chosen)
-    prior = Prior(
-        near_world=tuple(arguments.near) if arguments.near else None,
-        radius=arguments.radius,
-        height=tuple(arguments.height) if arguments.height else None,
-        heading_deg=arguments.heading,
-        heading_tolerance_deg=given.get("heading_tolerance", Prior.heading_tolerance_deg),
-    )
-    return EngineSettings(prior=prior, **chosen)
-
-
-def check_arguments(arguments: argparse.Namespace) -> None:
-    """Refuse values that no file could make right."""
-    if arguments.threads < 1:
-        raise InputError(f"--threads: found {arguments.threads}, wanted at least 1")
-    if not 0.0 < arguments.scale < 1e6:
-        raise InputError(f"--scale: found {arguments.scale}, wanted metres per unit, above 0")
-    if arguments.overlay and len(arguments.pano) > 1:
-        raise InputError(f"--overlay: found {len(arguments.pano)} panoramas, wanted one")
-    if arguments.cache and arguments.no_cache:
-        raise InputError("--cache, --no-cache: found both, wanted one of them or none")
 
 
 @dataclass(frozen=True)

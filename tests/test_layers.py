@@ -8,6 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "piccolo"
+SCRIPTS = [ROOT / "localize.py", ROOT / "command_line.py"]
 
 # A module may import from the lines above its own, and from its own line only if the line says so.
 LAYERS = [
@@ -56,7 +57,7 @@ def test_imports_go_up_the_list(path):
         assert allowed, f"{path.name} imports {other}, which is not above it"
 
 
-@pytest.mark.parametrize("path", [ROOT / "localize.py", *_modules()], ids=lambda p: str(p.relative_to(ROOT)))
+@pytest.mark.parametrize("path", [*SCRIPTS, *_modules()], ids=lambda p: str(p.relative_to(ROOT)))
 def test_every_function_but_a_kernel_is_annotated(path):
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.FunctionDef):
