@@ -6,7 +6,7 @@ import os
 import sys
 import traceback
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +19,11 @@ from piccolo.jit import KERNEL_FOLDER, is_first_use
 from piccolo.overlay import overlay_png
 from piccolo.panorama import read_panorama
 from piccolo.pipeline import CachePolicy, Localizer, open_localizer
-from piccolo.result import LOCALIZED, Result
+from piccolo.result import Result, result_of
 from piccolo.settings import EngineSettings, PaperSettings
 from piccolo.stopwatch import Stopwatch
 from piccolo.threads import Workers
-from piccolo.verify import INLIER_RESIDUAL
+from piccolo.verdict import LOCALIZED
 
 EXIT_ALL_LOCALIZED, EXIT_SOME_NOT, EXIT_BAD_USAGE, EXIT_BAD_INPUT, EXIT_INTERNAL = range(5)
 EXIT_INTERRUPTED, EXIT_BROKEN_PIPE = 130, 141
@@ -52,21 +52,9 @@ class Session:
         if self.arguments.overlay and found.pose is not None:
             png = overlay_png(localizer.points, panorama, localizer.from_world(found.pose))
             write_atomically(self.arguments.overlay, png)
-        evidence = found.evidence
-        return Result(
-            status=found.status,
-            cloud=str(self.arguments.cloud),
-            pano=str(pano),
-            pose=found.pose,
-            loss=found.loss,
-            score=evidence.score if evidence else None,
-            margin=found.margin,
-            inlier_share=evidence.inlier_share if evidence else None,
-            inlier_residual=INLIER_RESIDUAL,
-            seconds=watch.seconds,
-            settings={"preset": self.arguments.preset, **localizer.settings.to_json()},
-            warnings=localizer.warnings,
-        )
+        settings = {"preset": self.arguments.preset, **localizer.settings.to_json()}
+        result = result_of(found, str(self.arguments.cloud), str(pano), watch.seconds, settings)
+        return replace(result, warnings=localizer.warnings)
 
 
 def open_session(arguments: argparse.Namespace, settings: EngineSettings | PaperSettings) -> Session:

@@ -1,18 +1,20 @@
 """The result of one localization, and its JSON."""
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any
 
 import numpy as np
 
 from . import __version__
+from .certainty import Certainty
 from .errors import InputError
+from .hypotheses import Hypothesis
 from .pose import Pose, T_world_from_cam, quaternion_wxyz
+from .verdict import AMBIGUOUS, NOT_LOCALIZED
 from .verify import Evidence
 
-FORMAT = "piccolo-pose/1"
-LOCALIZED = "localized"
-NOT_LOCALIZED = "not_localized"
+FORMAT = "piccolo-pose/2"
 CONVENTION = (
     "x_cam = R_cam_from_world @ (x_world - center_world) in metres; +x_cam points to the image centre, "
     "+y_cam left, +z_cam up; u = (1/2 - atan2(y, x) / 2 pi) W, v = (1/2 - atan2(z, hypot(x, y)) / pi) H, "
@@ -20,30 +22,38 @@ CONVENTION = (
 )
 
 
+COVARIANCE_CONVENTION = (
+    "of (w, d), rotation [rad] about the camera's axes, then translation [m] along the world's: "
+    "R_true = exp([w]x) R_cam_from_world, center_true = center_world + d"
+)
+
+
 @dataclass(frozen=True)
 class Localization:
-    """The best pose for one panorama, in world coordinates, and what speaks for it."""
+    """The best pose for one panorama, in world coordinates, and what speaks for it and against it."""
 
-    status: str
-    pose: Pose | None
-    loss: float | None
-    evidence: Evidence | None
-    margin: float | None  # of the score, to the best distinct rival
+    status: str = NOT_LOCALIZED
+    confidence: float = 0.0
+    pose: Pose | None = None  # None if there was no start, and then all that follows
+    loss: float | None = None
+    evidence: Evidence | None = None
+    rivals: tuple[Hypothesis, ...] = ()  # poses elsewhere, best first
+    certainty: Certainty | None = None
 
 
 @dataclass(frozen=True)
 class Result:
     """Where one panorama was taken, and what speaks for it."""
 
-    status: str  # "localized" or "not_localized"
+    status: str  # "localized", "ambiguous" or "not_localized"
+    confidence: float  # [0, 1] how likely the pose is right, as piccolo.verdict has it
     cloud: str  # path as given
     pano: str  # path as given
     pose: Pose | None  # the best pose found, in the file's own coordinates; None if there was no start
     loss: float | None  # sampling loss [0, sqrt(3)] over the points seen from the pose
-    score: float | None  # locally normalised correlation, [-1, 1]
-    margin: float | None  # score minus that of the best distinct rival; None if there is none
-    inlier_share: float | None  # share of the seen solid angle with a residual below `inlier_residual`
-    inlier_residual: float  # RGB norm
+    evidence: Evidence | None
+    rivals: tuple[Hypothesis, ...]  # poses elsewhere, best first, at most 5
+    certainty: Certainty | None  # None with the preset paper, and where the points do not fix the pose
     seconds: dict[str, float]  # read, prepare, search, refine
     settings: dict[str, object]  # effective settings, seed included
     warnings: tuple[str, ...] = field(default=())
@@ -54,11 +64,19 @@ class Result:
             return f"{self.pano}: {self.status}\n  no place for a camera, or nothing of the panorama counts"
         x, y, z = self.pose.center_world
         total = sum(self.seconds.values())
-        return (
-            f"{self.pano}: {self.status} at ({x:.3f}, {y:.3f}, {z:.3f}) m in {total:.1f} s\n"
-            f"  score {self.score:.2f}, margin {self.margin:.2f}, loss {self.loss:.3f}, "
-            f"{100.0 * (self.inlier_share or 0.0):.0f} % of the seen directions agree"
-        )
+        lines = [f"{self.pano}: {self.status} at ({x:.3f}, {y:.3f}, {z:.3f}) m in {total:.1f} s"]
+        if self.evidence is not None:
+            e = self.evidence
+            lines.append(
+                f"  confidence {self.confidence:.3f}, score {e.score:.2f}, margin {e.margin:.2f}, "
+                f"{100.0 * e.explained_share:.0f} % of the panorama explained"
+            )
+        if self.certainty is not None:
+            mm, deg = 1000.0 * self.certainty.largest_std, self.certainty.std_deg.max()
+            lines.append(f"  one sigma {mm:.1f} mm ({self.certainty.weakest_direction}), {deg:.2f} deg")
+        if self.status == AMBIGUOUS:
+            lines += [f"  or {_place(rival)}" for rival in self.rivals]
+        return "\n".join(lines)
 
     def to_json(self) -> str:
         """One JSON object on one line. Numbers only: NaN and infinity raise ValueError."""
@@ -66,17 +84,20 @@ class Result:
         document = {
             "format": FORMAT,
             "status": self.status,
+            "confidence": self.confidence,
             "cloud": self.cloud,
             "pano": self.pano,
-            "R_cam_from_world": pose and pose.R_cam_from_world.tolist(),
-            "center_world": pose and pose.center_world.tolist(),
+            **_pose_json(pose),
             "quaternion_wxyz": pose and quaternion_wxyz(pose.R_cam_from_world).tolist(),
             "T_world_from_cam": pose and T_world_from_cam(pose).tolist(),
             "loss": self.loss,
-            "score": self.score,
-            "margin": self.margin,
-            "inlier_share": self.inlier_share,
-            "inlier_residual": self.inlier_residual,
+            "evidence": self.evidence and asdict(self.evidence),
+            "rivals": [_pose_json(rival.pose) | {"score": rival.score} for rival in self.rivals],
+            "covariance": self.certainty and self.certainty.covariance.tolist(),
+            "covariance_convention": COVARIANCE_CONVENTION,
+            "std_mm": self.certainty and self.certainty.std_mm.tolist(),
+            "std_deg": self.certainty and self.certainty.std_deg.tolist(),
+            "weakest_direction": self.certainty and self.certainty.weakest_direction,
             "convention": CONVENTION,
             "seconds": {stage: round(seconds, 4) for stage, seconds in self.seconds.items()},
             "settings": self.settings,
@@ -92,9 +113,12 @@ class Result:
             document = json.loads(text)
             if document["format"] != FORMAT:
                 raise InputError(f"result: found format {document['format']!r}, wanted {FORMAT!r}")
-            R, center = document["R_cam_from_world"], document["center_world"]
+            covariance = document["covariance"]
             return cls(
-                pose=None if R is None else Pose(np.array(R), np.array(center)),
+                pose=_pose_from_json(document),
+                evidence=document["evidence"] and Evidence(**document["evidence"]),
+                rivals=tuple(_rival_from_json(rival) for rival in document["rivals"]),
+                certainty=covariance and Certainty(np.array(covariance), document["weakest_direction"]),
                 warnings=tuple(document["warnings"]),
                 **{name: document[name] for name in _PLAIN_FIELDS},
             )
@@ -104,7 +128,34 @@ class Result:
             ) from error
 
 
-_PLAIN_FIELDS = (
-    *("status", "cloud", "pano", "loss", "score", "margin"),
-    *("inlier_share", "inlier_residual", "seconds", "settings"),
-)
+def result_of(
+    found: Localization, cloud: str, pano: str, seconds: dict[str, float], settings: dict[str, object]
+) -> Result:
+    """The result of a localization, with the names of the files and what it took."""
+    values = {f.name: getattr(found, f.name) for f in fields(found)}
+    return Result(cloud=cloud, pano=pano, seconds=seconds, settings=settings, **values)
+
+
+_PLAIN_FIELDS = ("status", "confidence", "cloud", "pano", "loss", "seconds", "settings")
+
+
+def _pose_json(pose: Pose | None) -> dict[str, object]:
+    return {
+        "R_cam_from_world": pose and pose.R_cam_from_world.tolist(),
+        "center_world": pose and pose.center_world.tolist(),
+    }
+
+
+def _pose_from_json(document: dict[str, Any]) -> Pose | None:
+    R, center = document["R_cam_from_world"], document["center_world"]
+    return None if R is None else Pose(np.array(R), np.array(center))
+
+
+def _rival_from_json(document: dict[str, Any]) -> Hypothesis:
+    pose = Pose(np.array(document["R_cam_from_world"]), np.array(document["center_world"]))
+    return Hypothesis(pose, document["score"])
+
+
+def _place(rival: Hypothesis) -> str:
+    x, y, z = rival.pose.center_world
+    return f"({x:.3f}, {y:.3f}, {z:.3f}) m, score {rival.score:.2f}"

@@ -6,7 +6,14 @@ from typing import Literal
 from .errors import InputError
 
 Gravity = Literal["auto", "known", "unknown"]
+MIN_CONFIDENCE = 0.9
 Solver = Literal["gauss-newton", "lbfgs", "adam"]
+
+
+def check_confidence(min_confidence: float) -> None:
+    """Refuse a line that no confidence can pass or fail."""
+    if not 0.0 < min_confidence < 1.0:
+        raise InputError(f"min_confidence: found {min_confidence}, wanted above 0 and below 1")
 
 
 @dataclass(frozen=True)
@@ -41,6 +48,7 @@ class PaperSettings(DescentSettings):
     )
     min_angle_deg: float = 15.0
     max_points: int = 1_000_000  # of a larger cloud, this many are taken, evenly in space
+    min_confidence: float = MIN_CONFIDENCE  # below it a pose is not called localized
     seed: int = 0  # repeated in the result; this preset draws nothing at random
 
     def __post_init__(self) -> None:
@@ -57,6 +65,7 @@ class PaperSettings(DescentSettings):
             raise InputError("gravity: found auto, wanted known or unknown with the preset paper")
         if not 0.0 <= self.grid_margin < 0.5:
             raise InputError(f"grid_margin: found {self.grid_margin}, wanted 0 to below 0.5")
+        check_confidence(self.min_confidence)
         if not 2 <= self.histogram_bins <= 64:
             raise InputError(f"histogram_bins: found {self.histogram_bins}, wanted 2 to 64")
 
@@ -110,6 +119,7 @@ class EngineSettings:
     num_fine: int = 8  # poses kept after the descent on middle cells
     num_polished: int = 2  # poses shaken and refined for as long as that helps
     num_points: int = 30_000  # for the last millimetres
+    min_confidence: float = MIN_CONFIDENCE  # below it a pose is not called localized
     seed: int = 0  # repeated in the result; nothing is drawn at random
 
     def __post_init__(self) -> None:
@@ -117,6 +127,7 @@ class EngineSettings:
         for name, value in asdict(self).items():
             if isinstance(value, int) and name != "seed" and value < 1:
                 raise InputError(f"{name}: found {value}, wanted at least 1")
+        check_confidence(self.min_confidence)
 
     def wider(self) -> "EngineSettings":
         """Settings that keep more poses on the way down, for a second look."""

@@ -18,12 +18,7 @@ VIEW_WIDTH = 96  # cells of 3.75 degrees
 LOCAL_SIGMA = 4.0  # cells: the neighbourhood in which contrast is judged, 15 degrees
 EPSILON = 0.03  # contrast below this counts as noise
 CLIP = 2.0
-INLIER_RESIDUAL = 0.1  # RGB norm below which a direction's colours agree
-
-# Locally normalised correlation is 0.34 to 0.79 at right poses and below 0.25 in wrong basins, the margin to
-# the best distinct rival at least 0.21 and at most 0.11 (ENGINE prototypes); the lines lie between.
-MIN_SCORE = 0.3
-MIN_MARGIN = 0.1
+AGREEING = 1.0  # deviations of local contrast by which two colours that agree may differ
 
 
 @dataclass(frozen=True)
@@ -31,8 +26,14 @@ class Evidence:
     """What a verdict rests on."""
 
     score: float  # locally normalised correlation of cloud and panorama at the pose, [-1, 1]
-    inlier_share: float  # of the sphere's part that both show, the share whose colours agree
-    seen_share: float  # share of the sphere on which the cloud shows anything
+    margin: float  # score less that of the best pose elsewhere, or less 0 if there is none above
+    agreement: float  # correlation over what both show, charged where that is under half of the sphere
+    explained_share: float  # of what the panorama shows, by solid angle, the share explained
+    inlier_share: float  # of what both show, the share that agrees
+    seen_share: float  # of the sphere, the share on which the cloud shows anything
+    residual_p20: float  # 20th percentile of the colours' difference (RGB norm) over what both show
+    halves_distance: float | None = None  # between the poses that two halves of the points lead to [m]
+    halves_angle: float | None = None  # [rad]
 
 
 def opponent_channels(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -57,8 +58,8 @@ def local_contrast(channels: NDArray[np.float32], counts: NDArray[np.bool_]) -> 
     return np.stack(normalized)
 
 
-def evidence_at(points: PackedPoints, panorama: Panorama, pose: Pose, residual: float) -> Evidence:
-    """How well the cloud at `pose` explains the panorama; colours agree within `residual` (RGB norm)."""
+def evidence_at(points: PackedPoints, panorama: Panorama, pose: Pose) -> Evidence:
+    """How well the cloud at `pose` explains the panorama, by cells of the sphere; no rival is known yet."""
     small = shrink(panorama, VIEW_WIDTH)
     rgb = small.rgb.astype(np.float32) / np.float32(255.0)
     view = render_view(points, pose, VIEW_WIDTH)
@@ -68,9 +69,23 @@ def evidence_at(points: PackedPoints, panorama: Panorama, pose: Pose, residual: 
     of_panorama = local_contrast(opponent_channels(rgb), counts)
     energy = math.sqrt(float((weights * of_view**2).sum()) * float((weights * of_panorama**2).sum()))
     correlation = float((weights * of_view * of_panorama).sum()) / max(energy, 1e-9)
-    agrees = np.linalg.norm(view.rgb - rgb, axis=-1) < residual
+    agreeing = float((weights * (np.linalg.norm(of_view - of_panorama, axis=0) < AGREEING)).sum())
     area = max(float(weights.sum()), 1e-9)
+    shown = max(float((small.is_valid * solid_angles(VIEW_WIDTH)[:, None]).sum()), 1e-9)
     # A view of which little is seen can't be sure: below half of the sphere, the score is charged.
     seen_share = area / (4.0 * math.pi)
     score = correlation * min(1.0, 2.0 * seen_share)
-    return Evidence(score, float((weights * agrees).sum()) / area, seen_share)
+    residuals = np.linalg.norm(view.rgb - rgb, axis=-1)
+    return Evidence(
+        score=score,
+        margin=max(score, 0.0),
+        agreement=score,
+        explained_share=agreeing / shown,
+        inlier_share=agreeing / area,
+        seen_share=seen_share,
+        residual_p20=_weighted_percentile(residuals, weights, 20.0) if counts.any() else math.sqrt(3.0),
+    )
+
+
+def _weighted_percentile(values: NDArray[np.float32], weights: NDArray[np.float64], percent: float) -> float:
+    return float(np.percentile(values.ravel(), percent, weights=weights.ravel(), method="inverted_cdf"))

@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from piccolo.cloud import read_cloud
 from piccolo.cloud.model import Cloud
-from piccolo.engine import method, scan_map
+from piccolo.engine import look, method, scan_map
 from piccolo.engine.contrast import Scale
 from piccolo.errors import InputError
 from piccolo.panorama import read_panorama
@@ -45,7 +45,7 @@ SETTINGS = {
 
 def change_views(part: str) -> None:
     """Take local normalisation or visibility out of every view, in place."""
-    for module, names in ((method, VIEWS), (scan_map, ("SEARCH_VIEW",)), (method, ("SEARCH_VIEW",))):
+    for module, names in ((look, VIEWS), (scan_map, ("SEARCH_VIEW",)), (look, ("SEARCH_VIEW",))):
         for name in names:
             kind = getattr(module, name)
             if part == "no local normalisation":
@@ -54,7 +54,7 @@ def change_views(part: str) -> None:
                 kind = replace(kind, front=SEE_THROUGH, visible=SEE_THROUGH)
             setattr(module, name, kind)
     if part == "no local normalisation":
-        method.SCALES = tuple(Scale(s.width, s.cell_deg, EVERYTHING) for s in method.SCALES)
+        look.SCALES = tuple(Scale(s.width, s.cell_deg, EVERYTHING) for s in look.SCALES)
 
 
 def row(part: str, scenes: list[tuple[Path, Cloud, dict[str, Query]]]) -> str:
@@ -95,12 +95,12 @@ def main(argv: list[str] | None = None) -> int:
         row("all of it", scenes[:1])  # compiles
         for part in SETTINGS:
             print(row(part, scenes), flush=True)
-        kept = {name: getattr(method, name) for name in (*VIEWS, "SEARCH_VIEW", "SCALES")}
+        kept = {name: getattr(look, name) for name in (*VIEWS, "SEARCH_VIEW", "SCALES")}
         for part in ("no local normalisation", "no visibility"):
             change_views(part)
             print(row(part, scenes), flush=True)
             for name, value in kept.items():
-                setattr(method, name, value)
+                setattr(look, name, value)
             scan_map.SEARCH_VIEW = kept["SEARCH_VIEW"]
     except (OSError, InputError) as error:
         print(f"ablation.py: {error}", file=sys.stderr)

@@ -12,8 +12,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from piccolo.errors import InputError
-from piccolo.result import LOCALIZED, Result
+from piccolo.result import Result
 from piccolo.truth import Query, pose_errors, read_truth
+from piccolo.verdict import LOCALIZED
 
 EPILOG = """\
 example:
@@ -55,11 +56,12 @@ def compare(result: Result, truth: dict[str, Query]) -> Row:
 
 def print_rows(rows: Sequence[Row]) -> None:
     """One line a panorama."""
-    print("| panorama | status | error [m] | error [deg] | score | margin | loss | seconds |")
-    print("|---|---|---:|---:|---:|---:|---:|---:|")
+    print("| panorama | status | error [m] | error [deg] | confidence | score | margin | loss | seconds |")
+    print("|---|---|---:|---:|---:|---:|---:|---:|---:|")
     for row in rows:
         r = row.result
-        numbers = [f"{value:.2f}" if value is not None else "-" for value in (r.score, r.margin)]
+        e = r.evidence
+        numbers = [f"{r.confidence:.3f}", *([f"{e.score:.2f}", f"{e.margin:.2f}"] if e else ["-", "-"])]
         numbers.append(f"{r.loss:.3f}" if r.loss is not None else "-")
         errors = f"{row.position_error:.4f} | {np.degrees(row.rotation_error):.3f}"
         print(f"| {row.image} | {r.status} | {errors} | {' | '.join(numbers)} | {row.seconds:.2f} |")

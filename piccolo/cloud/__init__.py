@@ -12,7 +12,7 @@ from .ply import PLY
 from .raw import HEAD_SIZE, Format, PointSource, RawCloud
 from .text import TEXT
 
-__all__ = ["Cloud", "read_cloud"]
+__all__ = ["Cloud", "clean", "read_cloud"]
 
 FORMATS = (PLY, TEXT)
 WANTED = f"wanted a coloured point cloud: {', '.join(f.name for f in FORMATS)}"

@@ -1,4 +1,4 @@
-"""Poses on their way down: one, many in arrays, and which of them go on."""
+"""Poses on their way down: in arrays, and which of them go on."""
 
 import math
 from collections.abc import Sequence
@@ -7,20 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..pose import Pose, are_same
+from ..hypotheses import RIVAL_ANGLE, RIVAL_DISTANCE, Hypothesis, distinct_best
+from ..pose import Pose
 
 START_DISTANCE, START_ANGLE_DEG = 0.5, 20.0  # starts nearer than this are one
 SAME_DISTANCE, SAME_ANGLE_DEG = 0.15, 5.0  # so are poses on their way down
-RIVAL_DISTANCE, RIVAL_ANGLE_DEG = 0.5, 15.0
 SHAKE_DISTANCE, SHAKE_ANGLE = 0.25, math.radians(8.0)  # [m], [rad] from a pose, to find it again from
-
-
-@dataclass(frozen=True)
-class Hypothesis:
-    """A pose in the map's frame, and how well it explains the panorama."""
-
-    pose: Pose
-    score: float  # locally normalised correlation, times the root of the share of the sphere that both show
 
 
 @dataclass(frozen=True)
@@ -38,21 +30,10 @@ class Starts:
         return [Hypothesis(Pose(R, center), float(score)) for R, center, score in poses]
 
 
-def distinct_best(
-    hypotheses: Sequence[Hypothesis], count: int, min_distance: float, min_angle: float
-) -> list[Hypothesis]:
-    """At most `count` by falling score, none within distance [m] and angle [rad] of a better one."""
-    kept: list[Hypothesis] = []
-    for h in sorted(hypotheses, key=lambda h: -h.score):
-        if len(kept) < count and not any(are_same(h.pose, k.pose, min_distance, min_angle) for k in kept):
-            kept.append(h)
-    return kept
-
-
 def best_and_rivals(hypotheses: Sequence[Hypothesis], count: int) -> list[Hypothesis]:
     """The best that differ a little and, in a quarter of the places, the best that lie far apart."""
     kept = distinct_best(hypotheses, count - count // 4, 0.1, math.radians(SAME_ANGLE_DEG))
-    for rival in distinct_best(hypotheses, count, RIVAL_DISTANCE, math.radians(RIVAL_ANGLE_DEG)):
+    for rival in distinct_best(hypotheses, count, RIVAL_DISTANCE, RIVAL_ANGLE):
         if len(kept) < count and not any(rival is k for k in kept):
             kept.append(rival)
     return kept

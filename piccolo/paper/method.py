@@ -7,21 +7,20 @@ from numpy.typing import NDArray
 
 from ..cloud.model import Cloud
 from ..cloud.packed import PackedPoints, pack_points
+from ..hypotheses import Hypothesis, lead, rivals_of
 from ..panorama import Panorama
-from ..pose import are_same
+from ..pose import Pose
 from ..refine import Refined, refine
-from ..result import LOCALIZED, NOT_LOCALIZED, Localization
+from ..result import Localization
 from ..rotations import uniform_rotations, uniform_yaws
 from ..sampling import pack_texels
 from ..settings import PaperSettings
 from ..stopwatch import Stopwatch
 from ..threads import Workers
-from ..verify import INLIER_RESIDUAL, MIN_MARGIN, MIN_SCORE, Evidence, evidence_at
+from ..verdict import verdict
+from ..verify import Evidence, evidence_at
 from .search import search
 from .starts import free_grid
-
-RIVAL_DISTANCE = 0.5  # [m]
-RIVAL_ANGLE = np.radians(15.0)
 
 
 @dataclass(frozen=True)
@@ -61,19 +60,25 @@ def localize(
         refined = list(workers.each(lambda s: refine(points, texels, s.pose, settings), starts, "refine"))
         best = min(refined, key=lambda r: r.loss, default=None)
     if best is None or not np.isfinite(best.loss):
-        return Localization(NOT_LOCALIZED, None, None, None, None)
+        return Localization()
     with watch.stage("refine"):
-        evidence, margin = judge(points, panorama, best, refined)
-    status = LOCALIZED if evidence.score >= MIN_SCORE and margin >= MIN_MARGIN else NOT_LOCALIZED
-    pose = replace(best.pose, center_world=best.pose.center_world + paper_map.origin_world)
-    return Localization(status, pose, best.loss, evidence, margin)
+        evidence, rivals = judge(points, panorama, best, refined)
+    status, confidence = verdict(evidence, None, settings.min_confidence)
+    origin_world = paper_map.origin_world
+    in_world = tuple(replace(r, pose=shifted(r.pose, origin_world)) for r in rivals)
+    return Localization(status, confidence, shifted(best.pose, origin_world), best.loss, evidence, in_world)
+
+
+def shifted(pose: Pose, origin_world: NDArray[np.float64]) -> Pose:
+    """A pose relative to the local origin (3,) [m] in the world."""
+    return replace(pose, center_world=pose.center_world + origin_world)
 
 
 def judge(
     points: PackedPoints, panorama: Panorama, best: Refined, refined: list[Refined]
-) -> tuple[Evidence, float]:
-    """Evidence at the best pose, and its margin over the best distinct rival (over 0 if there is none)."""
-    evidence = evidence_at(points, panorama, best.pose, INLIER_RESIDUAL)
-    rivals = [r for r in refined if not are_same(r.pose, best.pose, RIVAL_DISTANCE, RIVAL_ANGLE)]
-    scores = [evidence_at(points, panorama, r.pose, INLIER_RESIDUAL).score for r in rivals]
-    return evidence, evidence.score - max([0.0, *scores])
+) -> tuple[Evidence, list[Hypothesis]]:
+    """Evidence at the best pose, and its rivals, best first."""
+    evidence = evidence_at(points, panorama, best.pose)
+    others = [Hypothesis(r.pose, evidence_at(points, panorama, r.pose).score) for r in refined]
+    rivals = rivals_of(best.pose, others)
+    return replace(evidence, margin=lead(evidence.score, rivals)), rivals

@@ -17,7 +17,7 @@ BOX_FIELDS, MATERIAL_FIELDS = 7, 9
 
 
 @dataclass
-class _Builder:
+class Builder:
     """Boxes as they are put into a room whose floor's corner is at `corner` (3,)."""
 
     rng: np.random.Generator
@@ -64,7 +64,7 @@ class Room:
         return float((outside + inside).min())
 
 
-def _shell(b: _Builder, size: Array) -> None:
+def _shell(b: Builder, size: Array) -> None:
     """Floor, ceiling and four walls."""
     x, y, z = size
     d = WALL_THICKNESS
@@ -78,7 +78,7 @@ def _shell(b: _Builder, size: Array) -> None:
             b.put(center, extent, b.paint((PLAIN, PLAIN, STRIPES, TILES), 0.5, 0.9))
 
 
-def _wall_hangings(b: _Builder, size: Array) -> None:
+def _wall_hangings(b: Builder, size: Array) -> None:
     """Pictures, a door and windows: thin boxes on the walls."""
     for axis in (0, 1):
         along = 1 - axis
@@ -98,7 +98,7 @@ def _wall_hangings(b: _Builder, size: Array) -> None:
                 b.put(center, extent, b.paint(patterns, low, high))
 
 
-def _table(b: _Builder, at: Array, yaw: float) -> None:
+def _table(b: Builder, at: Array, yaw: float) -> None:
     length, width, height = b.rng.uniform([0.9, 0.6, 0.5], [1.6, 0.9, 0.8])
     wood = b.paint((PLANKS, PLAIN), 0.2, 0.7)
     b.put([*at, height], [length, width, 0.04], wood, yaw)
@@ -109,7 +109,7 @@ def _table(b: _Builder, at: Array, yaw: float) -> None:
     b.put([*at, height + 0.12], b.rng.uniform(0.1, 0.25, 3), b.paint((CHECKS, PICTURE), 0.1, 1.0), yaw)
 
 
-def _shelf(b: _Builder, at: Array, yaw: float) -> None:
+def _shelf(b: Builder, at: Array, yaw: float) -> None:
     height = b.rng.uniform(1.2, 2.0)
     frame = b.paint((PLANKS, PLAIN), 0.2, 0.8)
     b.put([*at, height / 2], [0.9, 0.02, height], frame, yaw)
@@ -121,7 +121,7 @@ def _shelf(b: _Builder, at: Array, yaw: float) -> None:
         b.put([at[0] + c * x, at[1] + s * x, level + books[2] / 2], books, b.paint((STRIPES,), 0.1, 0.9), yaw)
 
 
-def _sofa(b: _Builder, at: Array, yaw: float) -> None:
+def _sofa(b: Builder, at: Array, yaw: float) -> None:
     length = b.rng.uniform(1.2, 2.0)
     cloth = b.paint((PLAIN, STRIPES, CHECKS), 0.15, 0.8)
     c, s = np.cos(yaw), np.sin(yaw)
@@ -129,12 +129,12 @@ def _sofa(b: _Builder, at: Array, yaw: float) -> None:
     b.put([at[0] - s * 0.35, at[1] + c * 0.35, 0.5], [length, 0.15, 0.9], cloth, yaw)
 
 
-def _crate(b: _Builder, at: Array, yaw: float) -> None:
+def _crate(b: Builder, at: Array, yaw: float) -> None:
     size = b.rng.uniform([0.3, 0.3, 0.3], [0.7, 0.7, 1.3])
     b.put([*at, size[2] / 2], size, b.paint((PLANKS, CHECKS, PICTURE, PLAIN), 0.15, 0.9), yaw)
 
 
-def _furniture(b: _Builder, size: Array, moves: np.random.Generator | None) -> None:
+def _furniture(b: Builder, size: Array, moves: np.random.Generator | None) -> None:
     """A rug and about one piece in 3 m2; half of the pieces go elsewhere if there are `moves`."""
     num_pieces = max(3, round(size[0] * size[1] / 3.0))
     seeds = b.rng.integers(0, 1 << 30, num_pieces)
@@ -152,11 +152,11 @@ def _furniture(b: _Builder, size: Array, moves: np.random.Generator | None) -> N
 
 def make_room(seed: int, size: Array, corner: Array, changed: int = 0) -> Room:
     """The room of `seed`; the same shell with other furniture and more crates for each `changed` above 0."""
-    fixed = _Builder(np.random.default_rng([seed, 0]), np.asarray(corner, dtype=float))
+    fixed = Builder(np.random.default_rng([seed, 0]), np.asarray(corner, dtype=float))
     size = np.asarray(size, dtype=float)
     _shell(fixed, size)
     _wall_hangings(fixed, size)
-    loose = _Builder(np.random.default_rng([seed, 1]), fixed.corner)
+    loose = Builder(np.random.default_rng([seed, 1]), fixed.corner)
     moves = np.random.default_rng([seed, 2, changed]) if changed else None
     _furniture(loose, size, moves)
     if moves is not None:

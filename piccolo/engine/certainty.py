@@ -1,0 +1,109 @@
+"""Covariance of a pose from blocks of the sphere, and poses from two disjoint halves of the points."""
+
+import math
+
+import numpy as np
+
+from ..certainty import Certainty, weakest_direction
+from ..pose import Array, Pose, angle_between, exp_so3, orthonormal
+from .channels import LEVELS_PER_UNIT
+from .descent import descend
+from .least_squares import normal_equations
+from .look import FINISH_LOSS, FINISH_VIEW, Look, as_levels
+from .tiling import cell_of
+from .view import Cells, seen_points
+
+BLOCK_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
+SCALE = FINISH_LOSS * LEVELS_PER_UNIT
+TURN_STEP, MOVE_STEP = math.radians(0.1), 0.005  # [rad], [m]
+INFLATION = 1.0
+
+
+def points_at(look: Look, pose: Pose) -> Cells:
+    """Offsets, channels in levels and weights of the points that the last descent goes by."""
+    octree, count = look.scan_map.octree, look.settings.num_points
+    offsets, features, weights = seen_points(octree, pose.center_world, FINISH_VIEW, count)
+    return offsets, as_levels(features), weights
+
+
+def gradient_at(look: Look, points: Cells, R_cam_from_map: Array, shift: Array) -> Array:
+    """Half the gradient (6,) of the robust loss, in the camera's frame, at a shift (3,) [m] of the centre."""
+    sums, image = np.empty(28), look.images[0]
+    normal_equations(*points, image.rgbx, image.width, R_cam_from_map, shift, SCALE, sums)
+    return np.asarray(sums[21:27])
+
+
+def hessian_at(look: Look, points: Cells, pose: Pose) -> Array:
+    """Half the Hessian (6, 6) of the robust loss, by central differences over steps as large as errors are.
+
+    The Gauss-Newton matrix leaves out that the loss flattens: with it, deviations come out several times too
+    small.
+    """
+    rows = []
+    for step in np.diag([TURN_STEP] * 3 + [MOVE_STEP] * 3):
+        gradients = []
+        for sign in (1.0, -1.0):
+            R = exp_so3(sign * step[:3]) @ pose.R_cam_from_world
+            gradients.append(gradient_at(look, points, R, sign * pose.R_cam_from_world.T @ step[3:]))
+        rows.append((gradients[0] - gradients[1]) / (2.0 * step.sum()))
+    return 0.5 * (np.array(rows) + np.array(rows).T)
+
+
+def block_gradients(look: Look, points: Cells, pose: Pose) -> Array:
+    """Half the gradients (B, 6), in the camera's frame, of the points in each block of the sphere."""
+    offsets, levels, weights = points
+    block = cell_of(offsets.T / np.linalg.norm(offsets, axis=0)[:, None], BLOCK_RINGS)
+    gradients = []
+    for b in np.unique(block):
+        chosen = np.flatnonzero(block == b)
+        part = offsets[:, chosen], levels[:, chosen], weights[chosen]
+        gradients.append(gradient_at(look, part, pose.R_cam_from_world, np.zeros(3)))
+    return np.array(gradients)
+
+
+def covariance_of(hessian: Array, gradients: Array) -> Array | None:
+    """Covariance (6, 6) [rad, m] in the camera's frame, robust to errors that go together within a block.
+
+    The sandwich H^-1 (sum g g^T) H^-1 (Huber 1967; Liang and Zeger 1986 for clusters), with the usual factor
+    for few blocks. None where the points do not fix the pose.
+    """
+    variances, axes = np.linalg.eigh(hessian)
+    if len(gradients) <= 12 or variances[0] <= 1e-9 * variances[-1]:
+        return None
+    inverse = (axes / variances) @ axes.T
+    middle = gradients.T @ gradients * (len(gradients) / (len(gradients) - 6))
+    return np.asarray(inverse @ middle @ inverse)
+
+
+def certainty_at(look: Look, points: Cells, pose: Pose) -> Certainty | None:
+    """How sure the pose is, in world axes; None where the points do not fix it."""
+    covariance = covariance_of(hessian_at(look, points, pose), block_gradients(look, points, pose))
+    if covariance is None:
+        return None
+    covariance = INFLATION * covariance
+    R_map_from_cam, R_map_from_world = pose.R_cam_from_world.T, look.scan_map.R_map_from_world
+    J = np.eye(6)
+    J[3:, 3:] = R_map_from_cam
+    covariance_map = J @ covariance @ J.T
+    J[3:, 3:] = R_map_from_world.T
+    covariance_world = J @ covariance_map @ J.T
+    words = weakest_direction(covariance_map[3:, 3:], covariance_world[3:, 3:], points[0])
+    return Certainty(0.5 * (covariance_world + covariance_world.T), words)
+
+
+def disagreement_of_halves(look: Look, points: Cells, pose: Pose) -> tuple[float, float]:
+    """Distance [m] and angle [rad] between the poses that two halves of the points lead to.
+
+    The halves are opposite octants by turns, so each looks all ways, and no surface is in both but at the
+    borders.
+    """
+    offsets, levels, weights = points
+    is_first = np.signbit(offsets[0] * offsets[1] * offsets[2])
+    image, poses = look.images[0], []
+    for chosen in (np.flatnonzero(is_first), np.flatnonzero(~is_first)):
+        R, t = pose.R_cam_from_world.copy(), np.zeros(3)
+        part = offsets[:, chosen], levels[:, chosen], weights[chosen]
+        descend(*part, image.rgbx, image.width, SCALE, 15, 1e-4, R, t)
+        poses.append(Pose(orthonormal(R), t))
+    a, b = poses
+    return math.dist(a.center_world, b.center_world), angle_between(a.R_cam_from_world, b.R_cam_from_world)

@@ -1,0 +1,163 @@
+#!/usr/bin/env python3
+"""Try the verdict: seeded queries with and without an answer, and how often each was called localized."""
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from piccolo.cloud import Cloud, clean, read_cloud
+from piccolo.cloud.raw import RawCloud
+from piccolo.engine import method
+from piccolo.engine.scan_map import prepare_map
+from piccolo.errors import InputError
+from piccolo.panorama import Panorama, read_panorama
+from piccolo.pose import Pose
+from piccolo.result import Result, result_of
+from piccolo.settings import EngineSettings
+from piccolo.stopwatch import Stopwatch
+from piccolo.synthetic.trials import (
+    SPARSE_SHARE,
+    Points,
+    Trial,
+    repeated_trials,
+    room_trials,
+    upside_down,
+    without_scene,
+)
+from piccolo.threads import Workers, num_cores
+from piccolo.truth import is_correct, read_truth
+from piccolo.verdict import AMBIGUOUS, LOCALIZED
+
+EPILOG = """\
+examples:
+  python tools/trials.py --seeds 0 40 --out trials.jsonl
+  python tools/trials.py --seeds 0 0 --scenes BENCH/house BENCH/hospital --out bench.jsonl
+
+Seeds make rooms, and places that look the same from several positions; scenes are folders with cloud.ply,
+queries.json and images, each panorama tried in each cloud. A false answer is a pose called localized that is
+over 0.1 m or 5 degrees off. Each trial is a line {"case", "scene", "truth", "result"}; a table on stdout.
+exit codes: 0 no false answer, 1 some, 2 wrong usage, 3 bad input, 130 interrupted.
+"""
+
+
+def cloud_of(points: Points) -> Cloud:
+    """Points as a file of them would be read."""
+    return clean(Path("trial"), RawCloud(points[0].astype(np.float64), points[1]), 1.0)
+
+
+def as_panorama(rgb: np.ndarray[tuple[int, int, int], np.dtype[np.uint8]]) -> Panorama:
+    """An image (H, W, 3) of which every pixel counts."""
+    return Panorama(rgb, np.ones(rgb.shape[:2], np.bool_))
+
+
+def scene_trials(folder: Path, others: Sequence[Path]) -> Iterator[tuple[Cloud, list[Trial]]]:
+    """Every panorama of every scene in one scene's cloud; its own also spoilt, and in a thinned cloud."""
+    cloud, truth = read_cloud(folder / "cloud.ply"), read_truth(folder / "queries.json")
+    rng = np.random.default_rng([len(truth), 52])
+    own = [
+        Trial(query.variant, read_panorama(folder / "images" / name).rgb, query.pose)
+        for name, query in truth.items()
+    ]
+    upright = [trial for trial in own if trial.case == "clean"]
+    spoilt = [Trial(name, rgb, t.true_pose if name == "blurred" else None)
+              for t in upright[:2] for name, rgb in without_scene(t.rgb, rng)]  # fmt: skip
+    elsewhere = [
+        Trial("elsewhere", read_panorama(path).rgb, None)
+        for other in others
+        for path in sorted((other / "images").iterdir())
+    ]
+    yield cloud, [*own, *elsewhere, *spoilt, *map(upside_down, upright)]
+    sparse = np.sort(rng.choice(len(cloud.points), int(SPARSE_SHARE * len(cloud.points)), replace=False))
+    thinned = replace(cloud, points=cloud.points[sparse], colors=cloud.colors[sparse])
+    yield thinned, [Trial("sparse", t.rgb, t.true_pose) for t in upright]
+
+
+def all_trials(arguments: argparse.Namespace, workers: Workers) -> Iterator[tuple[str, Cloud, list[Trial]]]:
+    """Name of a scene, its cloud, its trials."""
+    for seed in range(*arguments.seeds):
+        for points, trials in chain(room_trials(seed, workers), repeated_trials(seed, workers)):
+            yield f"seed {seed}", cloud_of(points), trials
+    for folder in arguments.scenes:
+        others = [other for other in arguments.scenes if other != folder]
+        for cloud, trials in scene_trials(folder, others):
+            yield folder.name, cloud, trials
+
+
+def run(arguments: argparse.Namespace) -> Iterator[tuple[str, Trial, Result]]:
+    """Localize every trial; the scene's name, the trial and its result."""
+    workers = Workers(arguments.threads)
+    for scene, cloud, trials in all_trials(arguments, workers):
+        scan_map = prepare_map(cloud, workers)
+        for trial in trials:
+            settings, watch = EngineSettings(gravity=trial.gravity), Stopwatch()
+            found = method.localize(scan_map, as_panorama(trial.rgb), settings, workers, watch)
+            yield scene, trial, result_of(found, scene, trial.case, watch.seconds, settings.to_json())
+
+
+def as_line(scene: str, trial: Trial, result: Result) -> str:
+    """One JSON object."""
+    pose: Pose | None = trial.true_pose
+    truth = pose and {
+        "R_cam_from_world": pose.R_cam_from_world.tolist(),
+        "center_world": pose.center_world.tolist(),
+    }
+    return json.dumps(
+        {"case": trial.case, "scene": scene, "truth": truth, "result": json.loads(result.to_json())}
+    )
+
+
+def print_table(counts: dict[str, list[tuple[str, bool]]]) -> int:
+    """One line a case; returns the number of false answers."""
+    print("| case | trials | correct | localized | ambiguous | false |")
+    print("|---|---:|---:|---:|---:|---:|")
+    total = 0
+    for case, rows in counts.items():
+        localized = [ok for status, ok in rows if status == LOCALIZED]
+        false = localized.count(False)
+        ambiguous = sum(status == AMBIGUOUS for status, _ in rows)
+        correct = sum(ok for _, ok in rows)
+        print(f"| {case} | {len(rows)} | {correct} | {len(localized)} | {ambiguous} | {false} |")
+        total += false
+    return total
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), required=True)
+    parser.add_argument("--scenes", type=Path, nargs="*", default=[], metavar="FOLDER")
+    parser.add_argument("--out", type=Path, required=True, help="JSON lines, written as they come")
+    parser.add_argument("--threads", type=int, default=num_cores(), metavar="N")
+    arguments = parser.parse_args(argv)
+    counts: dict[str, list[tuple[str, bool]]] = {}
+    try:
+        with arguments.out.open("w") as file:
+            for scene, trial, result in run(arguments):
+                ok = trial.true_pose is not None and is_correct(result.pose, trial.true_pose)
+                counts.setdefault(trial.case, []).append((result.status, ok))
+                file.write(as_line(scene, trial, result) + "\n")
+                file.flush()
+                print(
+                    f"{scene}: {trial.case}: {result.status}, {'right' if ok else 'wrong'}", file=sys.stderr
+                )
+    except (OSError, InputError) as error:
+        print(f"trials.py: {error}", file=sys.stderr)
+        return 3
+    except KeyboardInterrupt:
+        print("trials.py: interrupted", file=sys.stderr)
+        return 130
+    return 1 if print_table(counts) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
