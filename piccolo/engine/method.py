@@ -24,7 +24,7 @@ SURE_SCORE, SURE_MARGIN = (
     0.25,
     0.15,
 )  # with less, another look is taken
-NEAR_SCORE = 0.25  # a rival within this of the best is refined as carefully as the best
+NEAR_SHARE = 0.4  # a rival with this share of the best score is refined as carefully as the best
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def find(look: Look, gravity: Gravity, watch: Stopwatch) -> Found:
         fine = look.refine(starts)
         best = look.finish(fine[0])
         rivals = rivals_of(best.pose, fine)
-        near = [h for h in rivals if h.score > best.score - NEAR_SCORE]
+        near = [h for h in rivals if h.score > NEAR_SHARE * best.score]
         finished = list(look.workers.each(lambda h: look.finish(look.polish(h)), near, "descend"))
         best, *others = sorted([best, *finished, *rivals[len(near) :]], key=lambda h: -h.score)
         return Found(best, tuple(rivals_of(best.pose, others)))
@@ -104,7 +104,7 @@ def judged(look: Look, panorama: Panorama, found: Found) -> Localization:
     points = points_at(look, pose)
     distance, angle = disagreement_of_halves(look, points, pose)
     evidence = evidence_at(scan_map.coarse_points, panorama, pose)
-    near = [h for h in found.rivals if h.score > found.best.score - NEAR_SCORE]
+    near = [h for h in found.rivals if h.score > NEAR_SHARE * found.best.score]
     agreements = [evidence_at(scan_map.coarse_points, panorama, h.pose).agreement for h in near]
     evidence = replace(
         evidence,
