@@ -29,10 +29,19 @@ def distinct_best(
     return kept
 
 
-def rivals_of(best: Pose, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """The best hypotheses of which only one can be right, and none of them if `best` is."""
-    elsewhere = [h for h in hypotheses if not are_same(h.pose, best, RIVAL_DISTANCE, RIVAL_ANGLE)]
-    return distinct_best(elsewhere, MAX_RIVALS, RIVAL_DISTANCE, RIVAL_ANGLE)
+def rivals_of(
+    best: Pose, hypotheses: Sequence[Hypothesis], more: Sequence[Hypothesis] = ()
+) -> list[Hypothesis]:
+    """The best hypotheses of which only one can be right, and none of them if `best` is.
+
+    Of `more`, which are less refined, those take part that are near none of the others.
+    """
+    found: list[Hypothesis] = []
+    for some in (hypotheses, more):
+        known = [best, *(h.pose for h in found)]
+        apart = [h for h in some if not any(are_same(h.pose, k, RIVAL_DISTANCE, RIVAL_ANGLE) for k in known)]
+        found += distinct_best(apart, MAX_RIVALS - len(found), RIVAL_DISTANCE, RIVAL_ANGLE)
+    return sorted(found, key=lambda h: -h.score)
 
 
 def lead(score: float, rivals: Sequence[Hypothesis]) -> float:

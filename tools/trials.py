@@ -4,7 +4,7 @@
 import argparse
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -15,13 +15,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from piccolo.cloud import Cloud, clean, read_cloud
 from piccolo.cloud.raw import RawCloud
-from piccolo.engine import method
 from piccolo.engine.scan_map import prepare_map
 from piccolo.errors import InputError
 from piccolo.panorama import Panorama, read_panorama
+from piccolo.paper import method as paper
+from piccolo.pipeline import EngineLocalizer, Localizer, PaperLocalizer
 from piccolo.pose import Pose
 from piccolo.result import Result, result_of
-from piccolo.settings import EngineSettings
+from piccolo.settings import EngineSettings, Gravity, PaperSettings
 from piccolo.stopwatch import Stopwatch
 from piccolo.synthetic.trials import (
     SPARSE_SHARE,
@@ -91,15 +92,26 @@ def all_trials(arguments: argparse.Namespace, workers: Workers) -> Iterator[tupl
             yield folder.name, cloud, trials
 
 
+def localizer_of(cloud: Cloud, preset: str, workers: Workers) -> Callable[[Gravity], Localizer]:
+    """What prepares once and localizes with any gravity. The paper knows no `auto`: it is told `known`."""
+    if preset == "paper":
+        paper_map = paper.prepare(cloud, PaperSettings())
+        return lambda gravity: PaperLocalizer(
+            paper_map, PaperSettings(gravity="known" if gravity == "auto" else gravity), ()
+        )
+    scan_map = prepare_map(cloud, workers)
+    return lambda gravity: EngineLocalizer(scan_map, EngineSettings(gravity=gravity))
+
+
 def run(arguments: argparse.Namespace) -> Iterator[tuple[str, Trial, Result]]:
     """Localize every trial; the scene's name, the trial and its result."""
     workers = Workers(arguments.threads)
     for scene, cloud, trials in all_trials(arguments, workers):
-        scan_map = prepare_map(cloud, workers)
+        localizer = localizer_of(cloud, arguments.preset, workers)
         for trial in trials:
-            settings, watch = EngineSettings(gravity=trial.gravity), Stopwatch()
-            found = method.localize(scan_map, as_panorama(trial.rgb), settings, workers, watch)
-            yield scene, trial, result_of(found, scene, trial.case, watch.seconds, settings.to_json())
+            how, watch = localizer(trial.gravity), Stopwatch()
+            found = how.localize(as_panorama(trial.rgb), workers, watch)
+            yield scene, trial, result_of(found, scene, trial.case, watch.seconds, how.settings.to_json())
 
 
 def as_line(scene: str, trial: Trial, result: Result) -> str:
@@ -137,6 +149,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), required=True)
     parser.add_argument("--scenes", type=Path, nargs="*", default=[], metavar="FOLDER")
     parser.add_argument("--out", type=Path, required=True, help="JSON lines, written as they come")
+    parser.add_argument("--preset", choices=["default", "paper"], default="default")
     parser.add_argument("--threads", type=int, default=num_cores(), metavar="N")
     arguments = parser.parse_args(argv)
     counts: dict[str, list[tuple[str, bool]]] = {}

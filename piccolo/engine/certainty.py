@@ -1,11 +1,13 @@
 """Covariance of a pose from blocks of the sphere, and poses from two disjoint halves of the points."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..certainty import Certainty, weakest_direction
 from ..pose import Array, Pose, angle_between, exp_so3, orthonormal
+from ..sampling import Texels
 from .channels import LEVELS_PER_UNIT
 from .descent import descend
 from .least_squares import normal_equations
@@ -15,8 +17,20 @@ from .view import Cells, seen_points
 
 BLOCK_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
 SCALE = FINISH_LOSS * LEVELS_PER_UNIT
-TURN_STEP, MOVE_STEP = math.radians(0.1), 0.005  # [rad], [m]
-INFLATION = 1.0
+
+
+@dataclass(frozen=True)
+class Probe:
+    """At what detail the loss is looked at for a covariance."""
+
+    image: int  # of the look's
+    turn: float  # step of the differences [rad]
+    move: float  # [m]
+    inflation: float  # so that 95 % of true poses lie in the 95 % region (tools/calibrate.py)
+
+
+# Noise roughens the loss in the finest image; where it has no bottom there, the next image tells.
+PROBES = (Probe(0, math.radians(0.1), 0.005, 2.5), Probe(1, math.radians(0.3), 0.015, 0.8))
 
 
 def points_at(look: Look, pose: Pose) -> Cells:
@@ -26,30 +40,30 @@ def points_at(look: Look, pose: Pose) -> Cells:
     return offsets, as_levels(features), weights
 
 
-def gradient_at(look: Look, points: Cells, R_cam_from_map: Array, shift: Array) -> Array:
+def gradient_at(image: Texels, points: Cells, R_cam_from_map: Array, shift: Array) -> Array:
     """Half the gradient (6,) of the robust loss, in the camera's frame, at a shift (3,) [m] of the centre."""
-    sums, image = np.empty(28), look.images[0]
+    sums = np.empty(28)
     normal_equations(*points, image.rgbx, image.width, R_cam_from_map, shift, SCALE, sums)
     return np.asarray(sums[21:27])
 
 
-def hessian_at(look: Look, points: Cells, pose: Pose) -> Array:
+def hessian_at(image: Texels, points: Cells, pose: Pose, probe: Probe) -> Array:
     """Half the Hessian (6, 6) of the robust loss, by central differences over steps as large as errors are.
 
     The Gauss-Newton matrix leaves out that the loss flattens: with it, deviations come out several times too
     small.
     """
     rows = []
-    for step in np.diag([TURN_STEP] * 3 + [MOVE_STEP] * 3):
+    for step in np.diag([probe.turn] * 3 + [probe.move] * 3):
         gradients = []
         for sign in (1.0, -1.0):
             R = exp_so3(sign * step[:3]) @ pose.R_cam_from_world
-            gradients.append(gradient_at(look, points, R, sign * pose.R_cam_from_world.T @ step[3:]))
+            gradients.append(gradient_at(image, points, R, sign * pose.R_cam_from_world.T @ step[3:]))
         rows.append((gradients[0] - gradients[1]) / (2.0 * step.sum()))
-    return 0.5 * (np.array(rows) + np.array(rows).T)
+    return np.asarray(0.5 * (np.array(rows) + np.array(rows).T))
 
 
-def block_gradients(look: Look, points: Cells, pose: Pose) -> Array:
+def block_gradients(image: Texels, points: Cells, pose: Pose) -> Array:
     """Half the gradients (B, 6), in the camera's frame, of the points in each block of the sphere."""
     offsets, levels, weights = points
     block = cell_of(offsets.T / np.linalg.norm(offsets, axis=0)[:, None], BLOCK_RINGS)
@@ -57,7 +71,7 @@ def block_gradients(look: Look, points: Cells, pose: Pose) -> Array:
     for b in np.unique(block):
         chosen = np.flatnonzero(block == b)
         part = offsets[:, chosen], levels[:, chosen], weights[chosen]
-        gradients.append(gradient_at(look, part, pose.R_cam_from_world, np.zeros(3)))
+        gradients.append(gradient_at(image, part, pose.R_cam_from_world, np.zeros(3)))
     return np.array(gradients)
 
 
@@ -75,12 +89,22 @@ def covariance_of(hessian: Array, gradients: Array) -> Array | None:
     return np.asarray(inverse @ middle @ inverse)
 
 
+def covariance_at(look: Look, points: Cells, pose: Pose) -> Array | None:
+    """Covariance (6, 6) [rad, m] in the camera's frame, by the finest image where the loss has a bottom."""
+    for probe in PROBES:
+        image = look.images[probe.image]
+        hessian = hessian_at(image, points, pose, probe)
+        covariance = covariance_of(hessian, block_gradients(image, points, pose))
+        if covariance is not None:
+            return probe.inflation * covariance
+    return None
+
+
 def certainty_at(look: Look, points: Cells, pose: Pose) -> Certainty | None:
     """How sure the pose is, in world axes; None where the points do not fix it."""
-    covariance = covariance_of(hessian_at(look, points, pose), block_gradients(look, points, pose))
+    covariance = covariance_at(look, points, pose)
     if covariance is None:
         return None
-    covariance = INFLATION * covariance
     R_map_from_cam, R_map_from_world = pose.R_cam_from_world.T, look.scan_map.R_map_from_world
     J = np.eye(6)
     J[3:, 3:] = R_map_from_cam

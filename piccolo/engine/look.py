@@ -185,8 +185,11 @@ class Look:
         score = self.score_at(pose)
         return Hypothesis(pose, score) if score > before - MAX_FINISH_LOSS else Hypothesis(h.pose, before)
 
-    def refine(self, starts: Starts) -> list[Hypothesis]:
-        """Successive halving from the starts to a few poses on fine cells, the polished best first."""
+    def refine(self, starts: Starts) -> tuple[list[Hypothesis], list[Hypothesis]]:
+        """Successive halving from the starts to a few poses on fine cells, the polished best first.
+
+        Then the many on middle cells, for the rivals among them.
+        """
         settings = self.settings
 
         def each(function: Callable[[Hypothesis], Hypothesis], some: list[Hypothesis]) -> list[Hypothesis]:
@@ -199,7 +202,7 @@ class Look:
         fine = each(self.descend_fine, best_and_rivals(shaken, settings.num_fine))
         angle = math.radians(SAME_ANGLE_DEG)
         polished = each(self.polish, distinct_best(fine, settings.num_polished, 0.1, angle))
-        return sorted([*polished, *fine], key=lambda h: -h.score)
+        return sorted([*polished, *fine], key=lambda h: -h.score), middle
 
 
 def look_for(panorama: Panorama, scan_map: ScanMap, settings: EngineSettings, workers: Workers) -> Look:

@@ -3,9 +3,12 @@
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from ..hypotheses import Hypothesis, lead, rivals_of
 from ..loss import sampling_loss
 from ..panorama import Panorama
+from ..pose import Pose
 from ..refine import refine
 from ..render import visible_points
 from ..result import Localization
@@ -24,6 +27,7 @@ SURE_SCORE, SURE_MARGIN = (
     0.25,
     0.15,
 )  # with less, another look is taken
+HOPELESS_SCORE = 0.05  # of black, white and noisy pictures; views of other places have 0.1 and more
 NEAR_SHARE = 0.4  # a rival with this share of the best score is refined as carefully as the best
 
 
@@ -46,17 +50,22 @@ class Found:
 
 
 def find(look: Look, gravity: Gravity, watch: Stopwatch) -> Found:
-    """Search and refine; finish the best, and the rivals that come near it."""
+    """Search, refine, and finish the best."""
     with watch.stage("search"):
         starts = look.search(gravity)
     with watch.stage("refine"):
-        fine = look.refine(starts)
+        fine, middle = look.refine(starts)
         best = look.finish(fine[0])
-        rivals = rivals_of(best.pose, fine)
-        near = [h for h in rivals if h.score > NEAR_SHARE * best.score]
-        finished = list(look.workers.each(lambda h: look.finish(look.polish(h)), near, "descend"))
-        best, *others = sorted([best, *finished, *rivals[len(near) :]], key=lambda h: -h.score)
-        return Found(best, tuple(rivals_of(best.pose, others)))
+    return Found(best, tuple(rivals_of(best.pose, fine, middle)))
+
+
+def challenged(look: Look, found: Found) -> Found:
+    """The same, with the rivals that come near the best refined as carefully; the better of them wins."""
+    is_near = [h.score > NEAR_SHARE * found.best.score for h in found.rivals]
+    near = [h for h, yes in zip(found.rivals, is_near, strict=True) if yes]
+    finished = list(look.workers.each(lambda h: look.finish(look.polish(h)), near, "descend"))
+    best, *others = sorted([found.best, *finished, *found.rivals[len(near) :]], key=lambda h: -h.score)
+    return Found(best, tuple(rivals_of(best.pose, others)))
 
 
 def best_found(look: Look, watch: Stopwatch) -> Found:
@@ -66,15 +75,21 @@ def best_found(look: Look, watch: Stopwatch) -> Found:
     if gravity == "auto":
         looks.append(("unknown", look))
     looks += [(g, replace(look, settings=look.settings.wider())) for g, _ in looks]
-    best = find(look, looks[0][0], watch)
-    for g, how in looks[1:]:
-        if best.is_sure:
+    best = Found(Hypothesis(Pose(np.eye(3), np.zeros(3)), -1.0), ())
+    for g, how in looks:
+        if how is not look and best.best.score < HOPELESS_SCORE:
             break
         found = find(how, g, watch)
         # A wider look knows more rivals: of the same pose, its margin is the one to believe.
         if found.best.score > best.best.score - MAX_FINISH_LOSS:
             best = found
-    return best
+        if best.is_sure:
+            with watch.stage("refine"):
+                best = challenged(look, best)
+            if best.is_sure:
+                return best
+    with watch.stage("refine"):
+        return challenged(look, best)
 
 
 def localize(
