@@ -31,6 +31,12 @@ CROP_NAMES = (
 )
 END = re.compile(rb"</([A-Za-z_][\w.-]{0,40}):RDF\s{0,9}>")
 ABOUT = re.compile(rb":about\s{0,9}=\s{0,9}(\"[^\"<]{0,999}\"|'[^'<]{0,999}')")
+# what is left of a description that had nothing but the pose
+LEFTOVER = re.compile(
+    rb"<[\w.-]{1,40}:Description [\w.-]{1,40}:about=(\"[^\"<]{0,999}\"|'[^'<]{0,999}') xmlns:GPano=\""
+    + re.escape(NAMESPACE)
+    + rb"\"/>"
+)
 EMPTY_PACKET = (
     b'<?xpacket begin="\xef\xbb\xbf" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/">'
     b'<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"></rdf:RDF></x:xmpmeta>'
@@ -105,7 +111,7 @@ def without_pose(packet: bytes) -> bytes:
             field = re.escape(prefix) + b":" + name.encode()
             packet = re.sub(rb"\s" + field + rb"\s{0,9}=\s{0,9}(\"[^\"<>]*\"|'[^'<>]*')", b"", packet)
             packet = re.sub(rb"<" + field + rb"\s{0,9}(/>|>[^<>]*</" + field + rb"\s{0,9}>)", b"", packet)
-    return packet
+    return LEFTOVER.sub(b"", packet)
 
 
 def _with_fields(
