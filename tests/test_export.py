@@ -97,6 +97,10 @@ def test_colmap_has_a_camera_a_size_and_refuses_blanks_in_names(tmp_path):
     assert [words[2:] for words in cameras] == [["512", "256"] * 2, ["256", "128"] * 2]
     model = pycolmap.Reconstruction(str(tmp_path / "model"))
     assert {image.name: image.camera.width for image in model.images.values()} == {"a.jpg": 512, "b.jpg": 256}
+    narrow = "\u202f"  # macOS has this blank in names; COLMAP reads over it
+    export([result(f"my{narrow}ph\u00f6to.jpg", POSES[0])], "colmap", tmp_path / "narrow", SIZED)
+    (image,) = pycolmap.Reconstruction(str(tmp_path / "narrow")).images.values()
+    assert image.name == f"my{narrow}ph\u00f6to.jpg"
     with pytest.raises(InputError, match="found ' ' in the name"):
         export([result("my photo.jpg", POSES[0])], "colmap", tmp_path / "other", SIZED)
     assert not (tmp_path / "other").exists()

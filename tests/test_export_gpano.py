@@ -6,7 +6,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from poses import SIZE, jpeg, result, tilted_poses
+from refusals import mutated, read_or_refused
 from test_export_tables import rotation
 
 from piccolo.errors import InputError
@@ -146,6 +149,17 @@ def test_refusals(tmp_path):
         with_pose(path, _with_segments(data, _segment(XMP_MARK + full)), ANGLES)
     with pytest.raises(InputError, match=r"found 512 x 128, wanted width = 2 x height"):
         with_pose(path, jpeg(path, (512, 128)), ANGLES)
+
+
+@given(st.data())
+@settings(max_examples=100, deadline=None)
+def test_any_damage_of_a_picture_is_refused_or_copied(tmp_path_factory, data):
+    path = tmp_path_factory.mktemp("damaged") / "a.jpg"
+    whole = _with_segments(jpeg(path, (64, 32)), _segment(XMP_MARK + CAMERA_PACKET))
+    path.write_bytes(mutated(data.draw, st.integers, whole))
+    read_or_refused(picture_size, path)
+    copy, _ = read_or_refused(lambda path: with_pose(path, path.read_bytes(), ANGLES), path)
+    assert copy is None or b"".join(_packets(copy)).count(b"GPano:PoseHeadingDegrees") >= 1
 
 
 def test_sizes_are_read_from_headers(tmp_path):

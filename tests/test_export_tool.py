@@ -9,7 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from poses import jpeg, lines_of, result, tilted_poses, write_results
+from refusals import mutated, read_or_refused
 
 from piccolo.errors import InputError
 from piccolo.export import FORMATS, read_results, select
@@ -145,6 +148,8 @@ DAMAGED = {
     "number as name": json.dumps(DOCUMENT | {"pano": 7}),
     "line break in a name": json.dumps(DOCUMENT | {"pano": "a\nb.jpg"}),
     "half a character": json.dumps(DOCUMENT | {"pano": "\ud800.jpg"}),
+    "infinite score": json.dumps(DOCUMENT | {"evidence": DOCUMENT["evidence"] | {"score": float("inf")}}),
+    "confidence in words": json.dumps(DOCUMENT | {"confidence": "high"}),
     "list": json.dumps(DOCUMENT | {"evidence": [1]}),
 }
 
@@ -161,6 +166,17 @@ def test_damaged_results_are_refused_with_file_and_line(tmp_path, what):
         read_results(path)
     with pytest.raises(InputError, match="not a file but a folder"):
         read_results(tmp_path)
+
+
+@given(st.data())
+@settings(max_examples=100, deadline=None)
+def test_any_damage_of_results_is_refused_or_harmless(tmp_path_factory, data):
+    path = tmp_path_factory.mktemp("damaged") / "r.jsonl"
+    content = (MIXED[0].to_json() + "\n").encode() * 2
+    path.write_bytes(mutated(data.draw, st.integers, content))
+    results, _ = read_or_refused(read_results, path)
+    for r in results or []:
+        np.testing.assert_allclose(r.pose.R_cam_from_world @ r.pose.R_cam_from_world.T, np.eye(3), atol=1e-5)
 
 
 def test_selection_keeps_the_order():

@@ -42,5 +42,5 @@ COLMAP = Format(
     write,
     frozenset({"size", "offset"}),
     is_folder=True,
-    forbidden=r"\s",
+    forbidden=" ",
 )

@@ -1,5 +1,6 @@
 """From lines of JSON to the pictures and poses that are to be written."""
 
+import math
 import os
 import re
 from collections import Counter
@@ -18,6 +19,8 @@ from .pictures import picture_size
 
 MAX_ROTATION_ERROR = 1e-6  # of R R^T from the identity
 TIMESTAMP = re.compile(r"\d+(\.\d+)?")
+# control characters, line ends, halves of characters
+UNWRITABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 WANTED = "wanted JSON lines of localize.py"
 
 
@@ -57,10 +60,13 @@ def read_results(path: Path) -> list[Result]:
 
 
 def _check(result: Result) -> None:
-    """Refuse a pose that is none, and names that can't be written."""
+    """Refuse names and numbers that can't be written, and a pose that is none."""
     for label, value in (("status", result.status), ("cloud", result.cloud), ("pano", result.pano)):
-        if not isinstance(value, str) or not value.isprintable():
-            raise InputError(f"result: found {label} {value!r}, wanted printable text")
+        if not isinstance(value, str) or UNWRITABLE.search(value):
+            raise InputError(f"result: found {label} {value!r}, wanted text on one line")
+    values = [result.confidence, *([result.evidence.score] if result.evidence else [])]
+    if not all(isinstance(value, int | float) and math.isfinite(value) for value in values):
+        raise InputError(f"result: found confidence and score {values}, wanted finite numbers")
     if result.pose is None:
         return
     R, center = result.pose.R_cam_from_world, result.pose.center_world
@@ -110,8 +116,9 @@ def shots_of(results: Sequence[Result], form: Format, options: Options) -> list[
             raise InputError(
                 f"{name}: found two results of it (clouds {clouds}), wanted one; --cloud chooses"
             )
-        size = options.size or picture_size(path) if "size" in form.options else (0, 0)
-        if size != (0, 0):
+        size = (0, 0)
+        if "size" in form.options:
+            size = options.size or picture_size(path)
             check_size(str(path), size)
         time = str(index) if options.timestamps == "index" else _timestamp(path)
         pose = Pose(result.pose.R_cam_from_world, result.pose.center_world - offset)
