@@ -31,6 +31,14 @@ def exp_so3(w: Array) -> Array:
     return np.asarray(np.eye(3) + a * K + b * (K @ K))
 
 
+def log_so3(R: Array) -> Array:
+    """Rotation vector (3,) [rad] of a rotation (3, 3), of length [0, pi]: `exp_so3` turned round."""
+    w, *v = quaternion_wxyz(R)
+    sine = float(np.linalg.norm(v))
+    scale = 2.0 * float(np.arctan2(sine, w)) / sine if sine > 0.0 else 2.0
+    return scale * np.array(v)
+
+
 def left_jacobian(w: Array) -> Array:
     """The (3, 3) matrix J with exp([w + dw]x) = exp([J dw]x) exp([w]x) to first order in `dw`."""
     angle = float(np.linalg.norm(w))

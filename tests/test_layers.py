@@ -21,7 +21,7 @@ LAYERS = [
     {"overlay", "verify", "refine", "synthetic", "truth", "hypotheses", "certainty"},
     {"verdict"},
     {"result"},
-    {"paper", "engine"},
+    {"paper", "engine", "export"},
     {"pipeline"},
 ]
 # pyramid shrinks panoramas; points are packed as texels are

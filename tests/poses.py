@@ -1,0 +1,60 @@
+"""Made-up results with tilted poses at UTM-size coordinates, and where their pixels are in the world."""
+
+import json
+
+import cv2
+import numpy as np
+
+from piccolo.pose import Pose, exp_so3
+from piccolo.result import Result
+from piccolo.sphere import pixel_rays
+from piccolo.verify import Evidence
+
+WIDTH = 512
+SIZE = (WIDTH, WIDTH // 2)
+CENTER = np.array([500_123.456789, 5_400_987.654321, 312.25])
+EVIDENCE = Evidence(0.7, 0.5, 0.8, 0.9, 0.6, 0.95, 0.02)
+WORDS = {"loss": 0.05, "evidence": EVIDENCE, "rivals": (), "certainty": None, "seconds": {}, "settings": {}}
+
+
+def tilted_poses(num_poses, center=CENTER):
+    """Any rotation, centres some metres apart."""
+    rng = np.random.default_rng(3)
+    return [Pose(exp_so3(2.0 * rng.normal(size=3)), center + rng.normal(size=3)) for _ in range(num_poses)]
+
+
+def result(pano, pose, status="localized", cloud="a.ply", **changes):
+    return Result(status, 0.9, cloud, str(pano), pose, **(WORDS | changes))
+
+
+def write_results(path, results):
+    path.write_text("".join(r.to_json() + "\n" for r in results))
+    return path
+
+
+def jpeg(path, size=SIZE, seed=0):
+    """A small picture; returns its bytes."""
+    pixels = np.random.default_rng(seed).integers(0, 255, (size[1] // 8, size[0] // 8, 3), np.uint8)
+    path.write_bytes(cv2.imencode(".jpg", cv2.resize(pixels, size))[1].tobytes())
+    return path.read_bytes()
+
+
+def pixels_and_points(pose, seed=0, num_points=200):
+    """Pixels (N, 2) and world points (N, 3) seen there, by piccolo/sphere.py, up to 80 degrees of elevation.
+
+    Nearer to a pole the rounding of UTM-size coordinates alone moves u by more than the tests allow.
+    """
+    rng = np.random.default_rng(seed)
+    margin = WIDTH // 36
+    rows = rng.integers(margin, WIDTH // 2 - margin, num_points)
+    columns = np.concatenate([[0, WIDTH - 1], rng.integers(0, WIDTH, num_points - 2)])  # the seam too
+    rays = pixel_rays(WIDTH)[rows, columns] * rng.uniform(3.0, 30.0, (num_points, 1))
+    return np.stack([columns + 0.5, rows + 0.5], axis=1), pose.center_world + rays @ pose.R_cam_from_world
+
+
+def lines_of(path):
+    return path.read_text(encoding="utf-8").splitlines()
+
+
+def json_of(path):
+    return json.loads(path.read_text(encoding="utf-8"))

@@ -1,0 +1,182 @@
+"""Exports whose readers project pixels: each reader's own projection finds ours."""
+
+import numpy as np
+import pycolmap
+import pytest
+from poses import CENTER, SIZE, WIDTH, jpeg, json_of, lines_of, pixels_and_points, result, tilted_poses
+
+from piccolo.errors import InputError
+from piccolo.export import Options, export
+from piccolo.pose import exp_so3, log_so3
+
+POSES = tilted_poses(4)
+TOLERANCE = 1e-6  # px
+SIZED = Options(size=SIZE)
+
+
+def _results(poses=POSES):
+    return [result(f"photos/{i}.jpg", pose) for i, pose in enumerate(poses)]
+
+
+def _rotation(axis, degrees):
+    return exp_so3(np.radians(degrees) * np.eye(3)["xyz".index(axis)])
+
+
+def _check_pixels(found, wanted):
+    difference = np.abs(found - wanted)
+    difference[:, 0] = np.minimum(difference[:, 0], WIDTH - difference[:, 0])
+    assert difference.max() < TOLERANCE
+
+
+def nerfstudio_pixels(document, frame, points):
+    """Pixels by the rays of EQUIRECTANGULAR in nerfstudio/cameras/cameras.py, solved for x and y.
+
+    theta = -pi (x - cx) / fx, phi = pi (0.5 - coord_y) with coord_y = -(y - cy) / fy;
+    direction = (-sin(theta) sin(phi), cos(phi), -cos(theta) sin(phi)), turned by camera_to_world.
+    """
+    T = np.array(frame["transform_matrix"])
+    d = (points - T[:3, 3]) @ T[:3, :3]
+    theta = np.arctan2(-d[:, 0], -d[:, 2])
+    phi = np.arccos(d[:, 1] / np.linalg.norm(d, axis=1))
+    x = document["cx"] - theta / np.pi * document["fl_x"]
+    y = document["cy"] + (phi / np.pi - 0.5) * document["fl_y"]
+    return np.stack([x, y], axis=1)
+
+
+def opensfm_pixels(reconstruction, name, points):
+    """Pixels by opensfm.org/docs/geometry.html, "Spherical Camera" and "Pixel Coordinates".
+
+    u = lon / 2 pi, v = -lat / 2 pi in units of the larger side from the middle; its pixel coordinates begin
+    at the centre of the first pixel, ours at its corner.
+    """
+    shot = reconstruction["shots"][name]
+    camera = reconstruction["cameras"][shot["camera"]]
+    assert camera["projection_type"] == "spherical"
+    x, y, z = exp_so3(np.array(shot["rotation"])) @ points.T + np.array(shot["translation"])[:, None]
+    lon, lat = np.arctan2(x, z), np.arctan2(-y, np.hypot(x, z))
+    normalized = np.stack([lon, -lat], axis=1) / (2.0 * np.pi)
+    w, h = camera["width"], camera["height"]
+    return max(w, h) * normalized + [(w - 1) / 2, (h - 1) / 2] + 0.5
+
+
+def potree_pixels(row, points):
+    """Pixels by potree/src/modules/Images360/Images360.js and three.js' SphereGeometry and Euler.
+
+    sphere.rotation.set(roll + 90, -pitch, -course + 90, "ZYX") is R_z R_y R_x; a vertex at (u, v) is
+    (-cos(2 pi u) sin(pi v), cos(pi v), sin(2 pi u) sin(pi v)) with texture coordinates (u, 1 - v), v from the
+    picture's top; texture.repeat.x = -1 mirrors u.
+    """
+    x, y, z, course, pitch, roll = map(float, row.split("\t")[2:])
+    R_world_from_sphere = _rotation("z", -course + 90) @ _rotation("y", -pitch) @ _rotation("x", roll + 90)
+    d = (points - [x, y, z]) @ R_world_from_sphere
+    u = np.arctan2(d[:, 2], -d[:, 0]) / (2.0 * np.pi) % 1.0
+    v = np.arccos(d[:, 1] / np.linalg.norm(d, axis=1)) / np.pi
+    return np.stack([WIDTH * (1.0 - u), WIDTH / 2 * v], axis=1)
+
+
+def test_colmap_is_read_by_pycolmap_and_projects_to_our_pixels(tmp_path):
+    export(_results(), "colmap", tmp_path / "model", SIZED)
+    model = pycolmap.Reconstruction(str(tmp_path / "model"))
+    images = {image.name: image for image in model.images.values()}
+    assert sorted(images) == [f"photos/{i}.jpg" for i in range(4)]
+    assert model.num_cameras() == 1
+    for i, pose in enumerate(POSES):
+        image = images[f"photos/{i}.jpg"]
+        assert image.camera.model_name == "EQUIRECTANGULAR"
+        pixels, points = pixels_and_points(pose)
+        _check_pixels(np.array([image.project_point(point) for point in points]), pixels)
+        np.testing.assert_allclose(image.projection_center(), pose.center_world, rtol=0, atol=1e-8)
+
+
+def test_colmap_has_a_camera_a_size_and_refuses_blanks_in_names(tmp_path):
+    jpeg(tmp_path / "a.jpg")
+    jpeg(tmp_path / "b.jpg", (256, 128))
+    results = [result(tmp_path / name, POSES[0]) for name in ("a.jpg", "b.jpg")]
+    export(results, "colmap", tmp_path / "model", Options(images=tmp_path))
+    cameras = [line.split() for line in lines_of(tmp_path / "model" / "cameras.txt")[1:]]
+    assert [words[2:] for words in cameras] == [["512", "256"] * 2, ["256", "128"] * 2]
+    model = pycolmap.Reconstruction(str(tmp_path / "model"))
+    assert {image.name: image.camera.width for image in model.images.values()} == {"a.jpg": 512, "b.jpg": 256}
+    narrow = "\u202f"  # macOS has this blank in names; COLMAP reads over it
+    export([result(f"my{narrow}ph\u00f6to.jpg", POSES[0])], "colmap", tmp_path / "narrow", SIZED)
+    (image,) = pycolmap.Reconstruction(str(tmp_path / "narrow")).images.values()
+    assert image.name == f"my{narrow}ph\u00f6to.jpg"
+    with pytest.raises(InputError, match="found ' ' in the name"):
+        export([result("my photo.jpg", POSES[0])], "colmap", tmp_path / "other", SIZED)
+    assert not (tmp_path / "other").exists()
+
+
+def test_nerfstudio_projects_to_our_pixels(tmp_path):
+    export(_results(), "nerfstudio", tmp_path / "transforms.json", SIZED)
+    document = json_of(tmp_path / "transforms.json")
+    assert document["camera_model"] == "EQUIRECTANGULAR"
+    assert [frame["file_path"] for frame in document["frames"]] == [f"photos/{i}.jpg" for i in range(4)]
+    for pose, frame in zip(POSES, document["frames"], strict=True):
+        pixels, points = pixels_and_points(pose)
+        _check_pixels(nerfstudio_pixels(document, frame, points), pixels)
+        back = np.array(frame["transform_matrix"])[:3, 2]
+        np.testing.assert_allclose(back, -pose.R_cam_from_world[0], atol=1e-15)  # -z is the image centre
+
+
+def test_nerfstudio_with_two_sizes_and_an_offset(tmp_path):
+    jpeg(tmp_path / "a.jpg")
+    jpeg(tmp_path / "b.jpg", (256, 128))
+    results = [result(tmp_path / name, POSES[1]) for name in ("a.jpg", "b.jpg")]
+    offset = (500_000.0, 5_400_000.0, 300.0)
+    export(results, "nerfstudio", tmp_path / "t.json", Options(images=tmp_path, offset=offset))
+    document = json_of(tmp_path / "t.json")
+    assert "w" not in document
+    assert [(frame["w"], frame["fl_x"]) for frame in document["frames"]] == [(512, 256.0), (256, 128.0)]
+    applied = np.array(document["applied_transform"])
+    for frame in document["frames"]:
+        moved = np.array(frame["transform_matrix"])[:3, 3]
+        np.testing.assert_array_equal(moved, POSES[1].center_world - offset)
+        np.testing.assert_allclose(applied @ [*POSES[1].center_world, 1.0], moved, atol=1e-9)
+
+
+def test_opensfm_projects_to_our_pixels(tmp_path):
+    export(_results(), "opensfm", tmp_path / "reconstruction.json", SIZED)
+    (reconstruction,) = json_of(tmp_path / "reconstruction.json")
+    for i, pose in enumerate(POSES):
+        pixels, points = pixels_and_points(pose)
+        _check_pixels(opensfm_pixels(reconstruction, f"photos/{i}.jpg", points), pixels)
+    with pytest.raises(InputError, match="wanted W = 2 H exactly"):
+        export(_results(), "opensfm", tmp_path / "r.json", Options(size=(512, 257)))
+
+
+def test_rotation_vectors_at_all_angles():
+    axis = np.array([2.0, -1.0, 2.0]) / 3.0
+    for angle in (0.0, 1e-9, 1e-4, 1.0, np.pi - 1e-9, np.pi):
+        R = exp_so3(angle * axis)
+        np.testing.assert_allclose(exp_so3(log_so3(R)), R, atol=1e-14)
+        assert np.linalg.norm(log_so3(R)) == pytest.approx(angle, abs=1e-15)
+
+
+def test_potree_projects_to_our_pixels(tmp_path):
+    export(_results(), "potree", tmp_path / "coordinates.txt", Options())
+    first, *rows = lines_of(tmp_path / "coordinates.txt")
+    assert first == ""  # skipped as a header by Potree 1.8, as an empty line by later versions
+    for i, (pose, row) in enumerate(zip(POSES, rows, strict=True)):
+        assert row.split("\t")[:2] == [f"photos/{i}.jpg", str(i)]
+        pixels, points = pixels_and_points(pose)
+        _check_pixels(potree_pixels(row, points), pixels)
+    with pytest.raises(InputError, match="found '\"' in the name"):
+        export([result('a".jpg', POSES[0])], "potree", tmp_path / "c.txt", Options())
+
+
+def test_the_offset_is_written_beside_what_has_no_place_for_it(tmp_path):
+    offset = (500_000.0, 5_400_000.0, 0.1)
+    export(_results(), "opensfm", tmp_path / "r.json", Options(size=SIZE, offset=offset))
+    written = np.array(lines_of(tmp_path / "r.json.offset.txt")[1].split(), float)
+    np.testing.assert_array_equal(written, offset)
+    (reconstruction,) = json_of(tmp_path / "r.json")
+    for i, pose in enumerate(POSES):
+        pixels, points = pixels_and_points(pose)
+        _check_pixels(opensfm_pixels(reconstruction, f"photos/{i}.jpg", points - written), pixels)
+    export(_results(), "colmap", tmp_path / "model", Options(size=SIZE, offset=offset))
+    assert "# world position = position here + 500000.0 5400000.0 0.1" in lines_of(
+        tmp_path / "model/images.txt"
+    )
+    image = pycolmap.Reconstruction(str(tmp_path / "model")).images[1]
+    np.testing.assert_allclose(image.projection_center(), POSES[0].center_world - offset, atol=1e-9)
+    assert np.linalg.norm(image.projection_center()) < 0.01 * np.linalg.norm(CENTER)

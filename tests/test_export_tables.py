@@ -1,0 +1,166 @@
+"""Exports that are lists of poses: trajectories, tables, maps."""
+
+import csv
+import sys
+from importlib import import_module
+
+import numpy as np
+import pytest
+from poses import json_of, lines_of, result, tilted_poses
+
+from piccolo.errors import InputError
+from piccolo.export import Options, export
+from piccolo.export.axes import heading_pitch_roll_deg
+from piccolo.pose import Pose, exp_so3, rotation_from_quaternion_wxyz
+
+POSES = tilted_poses(4)
+EYE = np.eye(3)
+RIGHT_DOWN_FORWARD = np.stack([-EYE[1], -EYE[2], EYE[0]])  # these axes of the camera, in ours
+
+
+@pytest.fixture(scope="module")
+def evo(tmp_path_factory):
+    """evo's readers; at the first import evo writes its settings into the home folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HOME", str(tmp_path_factory.mktemp("home")))
+        return import_module("evo.tools.file_interface")
+
+
+def rotation(heading, pitch, roll):
+    """R_world_from_cam of angles in degrees: R_z(90 - heading) R_y(-pitch) R_x(roll)."""
+    z, y, x = np.radians([90.0 - heading, -pitch, roll])
+    return exp_so3(z * EYE[2]) @ exp_so3(y * EYE[1]) @ exp_so3(x * EYE[0])
+
+
+def _results(names=("a", "b", "c", "d"), **changes):
+    return [result(f"{name}.jpg", pose, **changes) for name, pose in zip(names, POSES, strict=True)]
+
+
+def _check_poses(matrices, axes):
+    for T, pose in zip(matrices, POSES, strict=True):
+        np.testing.assert_allclose(T[:3, :3], (axes @ pose.R_cam_from_world).T, atol=1e-12)
+        np.testing.assert_array_equal(T[:3, 3], pose.center_world)
+
+
+@pytest.mark.parametrize(("name", "axes"), [("optical", RIGHT_DOWN_FORWARD), ("piccolo", EYE)])
+def test_trajectories_are_read_by_evo(tmp_path, evo, name, axes):
+    export(_results(), "tum", tmp_path / "p.tum", Options(axes=name))
+    trajectory = evo.read_tum_trajectory_file(str(tmp_path / "p.tum"))
+    _check_poses(trajectory.poses_se3, axes)
+    np.testing.assert_array_equal(trajectory.timestamps, [0, 1, 2, 3])
+    assert trajectory.check()[0]
+    export(_results(), "kitti", tmp_path / "p.kitti", Options(axes=name))
+    _check_poses(evo.read_kitti_poses_file(str(tmp_path / "p.kitti")).poses_se3, axes)
+
+
+def test_timestamps_by_name_are_exact_and_in_order(tmp_path, evo):
+    names = ["1305031102.275", "1305031102.1753041", "3", "1305031102.175304"]
+    export(_results(names), "tum", tmp_path / "p.tum", Options(timestamps="name", offset=(1e5, 2e5, 0)))
+    comment, offset, *rows = lines_of(tmp_path / "p.tum")
+    assert comment.endswith("optical")
+    assert offset.endswith("100000.0 200000.0 0.0")
+    assert [row.split()[0] for row in rows] == [names[i] for i in (2, 3, 1, 0)]
+    positions = evo.read_tum_trajectory_file(str(tmp_path / "p.tum")).positions_xyz
+    np.testing.assert_array_equal(positions[0], POSES[2].center_world - [1e5, 2e5, 0])
+    with pytest.raises(InputError, match="found the name 'a', wanted a number"):
+        export(_results(), "tum", tmp_path / "q.tum", Options(timestamps="name"))
+
+
+def test_table_has_every_number_to_the_last_bit(tmp_path):
+    results = [*_results(), result("a.jpg", POSES[0], "ambiguous", 'other, "cloud".ply', evidence=None)]
+    export(results, "csv", tmp_path / "p.csv", Options())
+    with (tmp_path / "p.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    for row, pose in zip(rows, [*POSES, POSES[0]], strict=True):
+        np.testing.assert_array_equal([float(row[k]) for k in "xyz"], pose.center_world)
+        q = np.array([float(row[f"quaternion_{k}"]) for k in "wxyz"])
+        np.testing.assert_allclose(rotation_from_quaternion_wxyz(q), pose.R_cam_from_world, atol=1e-14)
+        angles = [float(row[f"{k}_deg"]) for k in ("heading", "pitch", "roll")]
+        np.testing.assert_allclose(rotation(*angles), pose.R_cam_from_world.T, atol=1e-10)
+    assert (rows[0]["image"], rows[0]["status"], rows[0]["score"]) == ("a.jpg", "localized", "0.7")
+    assert (rows[4]["cloud"], rows[4]["confidence"], rows[4]["score"]) == ('other, "cloud".ply', "0.9", "")
+
+
+@pytest.mark.parametrize(
+    ("direction", "angles"),
+    [
+        ((0, 1, 0), (0, 0, 0)),
+        ((1, 0, 0), (90, 0, 0)),
+        ((-1, 0, 1), (270, 45, 0)),
+        ((0, -1, -1), (180, -45, 0)),
+    ],
+)
+def test_heading_is_clockwise_from_y_and_pitch_upwards(direction, angles):
+    forward = np.array(direction) / np.linalg.norm(direction)
+    left = np.cross([0.0, 0.0, 1.0], forward) / np.linalg.norm(np.cross([0.0, 0.0, 1.0], forward))
+    pose = Pose(np.stack([forward, left, np.cross(forward, left)]), np.zeros(3))
+    assert heading_pitch_roll_deg(pose) == pytest.approx(angles, abs=1e-9)
+
+
+def test_horizon_turns_counterclockwise_as_roll_grows():
+    pose = Pose(rotation(30.0, 0.0, 10.0).T, np.zeros(3))
+    assert heading_pitch_roll_deg(pose) == pytest.approx((30.0, 0.0, 10.0), abs=1e-9)
+    on_the_right = np.radians(30.0 + 20.0)
+    _, y, z = pose.R_cam_from_world @ [np.sin(on_the_right), np.cos(on_the_right), 0.0]
+    assert y < 0.0  # right of the image centre
+    assert z > 0.0  # and above the middle row
+
+
+@pytest.mark.parametrize("pitch", [90.0, -90.0, 89.9999999, 90.0 - 1e-12])
+def test_angles_give_the_pose_back_at_the_zenith_too(pitch):
+    R = rotation(200.0, pitch, -170.0)
+    heading, found, roll = heading_pitch_roll_deg(Pose(R.T, np.zeros(3)))
+    assert found == pytest.approx(pitch, abs=1e-7)
+    np.testing.assert_allclose(rotation(heading, found, roll), R, atol=1e-10)
+
+
+def test_angles_stay_in_their_ranges():
+    for heading, roll in ((-1e-12, -180.0), (359.9999999999, 180.0), (0.0, -180.0 + 1e-11)):
+        found = heading_pitch_roll_deg(Pose(rotation(heading, 5.0, roll).T, np.zeros(3)))
+        assert found == pytest.approx((0.0, 5.0, 180.0), abs=1e-9)
+        assert found[0] < 360.0
+
+
+def test_geojson_is_in_wgs84(tmp_path):
+    pytest.importorskip("pyproj")
+    # Zone 32 has its meridian at 9 degrees east, where x is 500,000 and grid north is true north.
+    on_meridian = Pose(rotation(75.0, 10.0, -5.0).T, np.array([500_000.0, 5_538_630.7026, 80.5]))
+    east_of_it = Pose(rotation(75.0, 10.0, -5.0).T, np.array([700_000.0, 5_538_630.7026, 80.5]))
+    results = [result("a.jpg", on_meridian), result("b.jpg", east_of_it)]
+    export(results, "geojson", tmp_path / "p.geojson", Options(crs="EPSG:32632"))
+    document = json_of(tmp_path / "p.geojson")
+    assert document["type"] == "FeatureCollection"
+    first, second = document["features"]
+    assert first["geometry"]["type"] == "Point"
+    np.testing.assert_allclose(first["geometry"]["coordinates"], [9.0, 50.0], atol=1e-8)
+    assert first["properties"]["heading_deg"] == pytest.approx(75.0)
+    assert first["properties"]["heading_true_deg"] == pytest.approx(75.0, abs=1e-3)
+    assert first["properties"]["z"] == 80.5
+    # The meridians converge by about (longitude - 9 degrees) sin(latitude).
+    longitude, latitude = second["geometry"]["coordinates"]
+    convergence = (longitude - 9.0) * np.sin(np.radians(latitude))
+    assert convergence > 2.0
+    assert second["properties"]["heading_true_deg"] == pytest.approx(75.0 + convergence, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("crs", "center", "message"),
+    [
+        ("EPSG:99999999", (0, 0, 0), "wanted a coordinate system such as"),
+        ("EPSG:4326", (0, 0, 0), "wanted a projected system in metres"),
+        ("EPSG:2263", (0, 0, 0), "wanted a projected system in metres"),  # feet
+        ("EPSG:32632", (1e12, 0, 0), "wanted one where EPSG:32632 holds"),
+    ],
+)
+def test_geojson_refuses_systems_and_places_that_do_not_fit(tmp_path, crs, center, message):
+    pytest.importorskip("pyproj")
+    one = result("a.jpg", Pose(POSES[0].R_cam_from_world, np.array(center, float)))
+    with pytest.raises(InputError, match=message):
+        export([one], "geojson", tmp_path / "p.geojson", Options(crs=crs))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_geojson_without_the_library_says_how_to_get_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyproj", None)
+    with pytest.raises(InputError, match="pip install pyproj"):
+        export(_results(), "geojson", tmp_path / "p.geojson", Options(crs="EPSG:32632"))

@@ -1,0 +1,210 @@
+"""The command line of tools/export_poses.py, and which results it writes."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from poses import jpeg, lines_of, result, tilted_poses, write_results
+from refusals import mutated, read_or_refused
+
+from piccolo.errors import InputError
+from piccolo.export import FORMATS, read_results, select
+from piccolo.files import check_output_folder, replacing_folder
+from tools import export_poses
+
+ROOT = Path(__file__).resolve().parents[1]
+POSES = tilted_poses(5)
+MIXED = [
+    result("p/a.jpg", POSES[0]),
+    result("p/b.jpg", POSES[1], "not_localized"),
+    result("p/c.jpg", POSES[2], "ambiguous", cloud="b.ply"),
+    result("p/d.jpg", None, "not_localized"),
+    result("p/e.jpg", POSES[4], cloud="b.ply"),
+]
+
+
+@pytest.fixture
+def run(tmp_path, capsys):
+    """Run the tool on MIXED; returns exit code, stdout as JSON and stderr."""
+    write_results(tmp_path / "1.jsonl", MIXED[:3])
+    write_results(tmp_path / "2.jsonl", MIXED[3:])
+
+    def call(*arguments, results=("1.jsonl", "2.jsonl")):
+        paths = [str(tmp_path / name) for name in results]
+        code = export_poses.main(["--results", *paths, *map(str, arguments)])
+        out, err = capsys.readouterr()
+        return code, json.loads(out) if out else None, err
+
+    return call
+
+
+def test_only_localized_poses_are_written_and_the_others_counted(run, tmp_path):
+    code, document, err = run("--format", "csv", "--out", tmp_path / "p.csv")
+    assert code == 0
+    assert document["poses"] == 2
+    assert document["left_out"] == {"not_localized": 1, "ambiguous": 1, "without a pose": 1}
+    assert "left out 3 of 5 results: 1 not_localized, 1 ambiguous, 1 without a pose" in err
+    assert "poses in 2 clouds are taken as in one coordinate system" in err
+    assert [line.split(",")[0] for line in lines_of(tmp_path / "p.csv")[1:]] == ["p/a.jpg", "p/e.jpg"]
+
+
+def test_all_and_clouds(run, tmp_path):
+    code, document, _ = run("--format", "csv", "--out", tmp_path / "p.csv", "--all")
+    assert (code, document["poses"]) == (0, 4)
+    code, document, err = run("--format", "csv", "--out", tmp_path / "p.csv", "--all", "--cloud", "b.ply")
+    assert (code, document["poses"], document["left_out"]["other clouds"]) == (0, 2, 3)
+    assert "coordinate system" not in err
+    code, _, err = run("--format", "csv", "--out", tmp_path / "p.csv", "--cloud", "c.ply")
+    assert (code, "found no result for c.ply, wanted one of a.ply, b.ply" in err) == (3, True)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_writes_whole_files_and_nothing_else(run, tmp_path, name, monkeypatch):
+    if name == "geojson":
+        pytest.importorskip("pyproj")
+    monkeypatch.chdir(tmp_path)
+    Path("p").mkdir()
+    for picture in ("a", "e"):
+        jpeg(Path("p", f"{picture}.jpg"))
+    before = {path.name for path in tmp_path.iterdir()}
+    extra = ["--crs", "EPSG:32632"] if name == "geojson" else []
+    assert run("--format", name, "--images", "p", "--out", "made", *extra)[0] == 0
+    assert {path.name for path in tmp_path.iterdir()} == before | {"made"}
+    assert Path("made").is_dir() == FORMATS[name].is_folder
+    texts = [path.read_bytes() for path in Path("made").rglob("*")] if Path("made").is_dir() else []
+    assert (b"a.jpg" in b"".join([*texts, *([] if texts else [Path("made").read_bytes()])])) == (
+        name not in ("tum", "kitti", "gpano")
+    )
+    assert "p/a.jpg" not in str(texts)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--format", "csv", "--axes", "optical"], "--axes: not an option of the format csv"),
+        (["--format", "gpano", "--offset", "1", "2", "3"], "--offset: not an option of the format gpano"),
+        (["--format", "geojson"], "--crs: not given"),
+        (["--format", "colmap", "--size", "100", "80"], "--size: found 100 x 80, wanted width = 2 x height"),
+        (["--format", "csv", "--offset", "nan", "0", "0"], "--offset: found"),
+    ],
+)
+def test_wrong_usage(run, tmp_path, arguments, message):
+    code, document, err = run(*arguments, "--out", tmp_path / "p")
+    assert (code, document) == (2, None)
+    assert message in err
+
+
+def test_bad_input(run, tmp_path):
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "x").touch()
+    for arguments, message in (
+        (["--format", "colmap", "--out", tmp_path / "full"], "found a folder that is not empty"),
+        (["--format", "colmap", "--out", tmp_path / "1.jsonl"], "found a file, wanted a folder"),
+        (["--format", "colmap", "--out", tmp_path / "no" / "x"], "found no folder"),
+        (["--format", "csv", "--out", tmp_path / "full"], "found a folder, wanted a file name"),
+        (["--format", "csv", "--out", tmp_path / "1.jsonl"], "found an input as the output"),
+        (["--format", "colmap", "--out", tmp_path / "x"], "p/a.jpg: found no such file"),
+        (["--format", "gpano", "--out", tmp_path / "x"], "p/a.jpg"),
+        (["--format", "csv", "--images", "q", "--out", tmp_path / "x"], "found outside of --images q"),
+    ):
+        code, document, err = run(*arguments)
+        assert (code, document) == (3, None), arguments
+        assert message in err
+    code, _, err = run("--format", "csv", "--out", tmp_path / "x", results=("full/x",))
+    assert (code, "found no result, wanted JSON lines" in err) == (3, True)
+    write_results(tmp_path / "none.jsonl", MIXED[3:4])
+    code, _, err = run("--format", "csv", "--out", tmp_path / "x", results=("none.jsonl",))
+    assert (code, "found no pose to write" in err) == (3, True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["1.jsonl", "2.jsonl", "full", "none.jsonl"]
+
+
+def test_two_results_of_one_picture_are_refused_where_the_name_is_the_key(run, tmp_path):
+    write_results(tmp_path / "3.jsonl", [MIXED[0], replace(MIXED[0], cloud="b.ply")])
+    out = tmp_path / "out"
+    code, _, err = run("--format", "opensfm", "--size", "64", "32", "--out", out, results=["3.jsonl"])
+    assert code == 3
+    assert "p/a.jpg: found two results of it (clouds a.ply, b.ply), wanted one; --cloud chooses" in err
+    assert run("--format", "csv", "--out", out, results=["3.jsonl"])[1]["poses"] == 2
+
+
+DOCUMENT = json.loads(MIXED[0].to_json())
+DAMAGED = {
+    "no JSON": "{",
+    "brackets": "[" * 100_000,
+    "other format": json.dumps(DOCUMENT | {"format": "x"}),
+    "ragged": json.dumps(DOCUMENT | {"R_cam_from_world": [[1, 0], [0, 1, 0], [0]]}),
+    "text": json.dumps(DOCUMENT | {"center_world": ["a", "b", "c"]}),
+    "null": json.dumps(DOCUMENT | {"center_world": None}),
+    "infinite": json.dumps(DOCUMENT | {"center_world": [1, 2, float("inf")]}),
+    "mirrored": json.dumps(DOCUMENT | {"R_cam_from_world": np.diag([1.0, 1.0, -1.0]).tolist()}),
+    "NaN": json.dumps(DOCUMENT | {"R_cam_from_world": np.full((3, 3), np.nan).tolist()}),
+    "number as name": json.dumps(DOCUMENT | {"pano": 7}),
+    "line break in a name": json.dumps(DOCUMENT | {"pano": "a\nb.jpg"}),
+    "half a character": json.dumps(DOCUMENT | {"pano": "\ud800.jpg"}),
+    "infinite score": json.dumps(DOCUMENT | {"evidence": DOCUMENT["evidence"] | {"score": float("inf")}}),
+    "confidence in words": json.dumps(DOCUMENT | {"confidence": "high"}),
+    "list": json.dumps(DOCUMENT | {"evidence": [1]}),
+}
+
+
+@pytest.mark.parametrize("what", DAMAGED)
+def test_damaged_results_are_refused_with_file_and_line(tmp_path, what):
+    path = tmp_path / "r.jsonl"
+    path.write_text(MIXED[0].to_json() + "\n\n" + DAMAGED[what] + "\n")
+    with pytest.raises(InputError, match=r"r\.jsonl, line 3: ") as caught:
+        read_results(path)
+    assert "\n" not in str(caught.value)
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(InputError, match=r"r\.jsonl, line 1: "):
+        read_results(path)
+    with pytest.raises(InputError, match="not a file but a folder"):
+        read_results(tmp_path)
+
+
+@given(st.data())
+@settings(max_examples=100, deadline=None)
+def test_any_damage_of_results_is_refused_or_harmless(tmp_path_factory, data):
+    path = tmp_path_factory.mktemp("damaged") / "r.jsonl"
+    content = (MIXED[0].to_json() + "\n").encode() * 2
+    path.write_bytes(mutated(data.draw, st.integers, content))
+    results, _ = read_or_refused(read_results, path)
+    for r in results or []:
+        np.testing.assert_allclose(r.pose.R_cam_from_world @ r.pose.R_cam_from_world.T, np.eye(3), atol=1e-5)
+
+
+def test_selection_keeps_the_order():
+    assert [r.pano for r in select(MIXED, use_all=True).results] == [MIXED[i].pano for i in (0, 1, 2, 4)]
+
+
+def test_folder_is_whole_or_not_there(tmp_path):
+    (tmp_path / "empty").mkdir()
+    before = os.umask(0o027)
+    try:
+        for name in ("empty", "new"):
+            check_output_folder(tmp_path / name)
+            with replacing_folder(tmp_path / name) as folder:
+                (folder / "a").touch()
+                assert not (tmp_path / name / "a").exists()
+            assert (tmp_path / name / "a").exists()
+            assert (tmp_path / name).stat().st_mode & 0o777 == 0o750
+    finally:
+        os.umask(before)
+    with pytest.raises(FileNotFoundError), replacing_folder(tmp_path / "broken") as folder:
+        Path(folder, "no", "a").touch()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "new"]
+
+
+def test_help_runs_and_names_every_format():
+    command = [sys.executable, ROOT / "tools" / "export_poses.py", "--help"]
+    text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert all(name in text for name in FORMATS)
+    with pytest.raises(SystemExit) as caught:
+        export_poses.main(["--format", "xyz"])
+    assert caught.value.code == 2
