@@ -129,6 +129,6 @@ def judged(look: Look, panorama: Panorama, found: Found) -> Localization:
         halves_angle=angle,
     )
     certainty = certainty_at(look, points, pose)
-    status, confidence = verdict(evidence, certainty, settings.min_confidence)
+    status, confidence = verdict(evidence, len(found.rivals) > 0, settings.min_confidence)
     rivals = tuple(Hypothesis(scan_map.to_world(h.pose), h.score) for h in found.rivals)
     return Localization(status, confidence, scan_map.to_world(pose), loss, evidence, rivals, certainty)
