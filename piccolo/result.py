@@ -36,7 +36,7 @@ class Result:
     """Where one panorama was taken, and what speaks for it."""
 
     status: str  # "localized" or "not_localized"
-    cloud: str  # path as given
+    cloud: str | tuple[str, ...]  # path as given, or the paths of several files that are one cloud
     pano: str  # path as given
     pose: Pose | None  # the best pose found, in the file's own coordinates; None if there was no start
     loss: float | None  # sampling loss [0, sqrt(3)] over the points seen from the pose
@@ -93,7 +93,9 @@ class Result:
             if document["format"] != FORMAT:
                 raise InputError(f"result: found format {document['format']!r}, wanted {FORMAT!r}")
             R, center = document["R_cam_from_world"], document["center_world"]
+            cloud = document.pop("cloud")
             return cls(
+                cloud=cloud if isinstance(cloud, str) else _paths(cloud),
                 pose=None if R is None else Pose(np.array(R), np.array(center)),
                 warnings=tuple(document["warnings"]),
                 **{name: document[name] for name in _PLAIN_FIELDS},
@@ -104,7 +106,14 @@ class Result:
             ) from error
 
 
+def _paths(value: object) -> tuple[str, ...]:
+    """A list of paths; TypeError for anything else."""
+    if not isinstance(value, list) or not all(isinstance(path, str) for path in value):
+        raise TypeError("a cloud that is neither a path nor a list of paths")
+    return tuple(value)
+
+
 _PLAIN_FIELDS = (
-    *("status", "cloud", "pano", "loss", "score", "margin"),
+    *("status", "pano", "loss", "score", "margin"),
     *("inlier_share", "inlier_residual", "seconds", "settings"),
 )
