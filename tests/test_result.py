@@ -46,6 +46,16 @@ def test_result_without_a_pose():
     assert Result.from_json(none.to_json()).pose is None
 
 
+def test_several_files_of_a_cloud_are_a_list():
+    several = dataclasses.replace(RESULT, cloud=("b.ply", "a.ply"), pose=None)
+    assert json.loads(several.to_json())["cloud"] == ["b.ply", "a.ply"]
+    assert Result.from_json(several.to_json()) == several
+    for cloud in (7, ["a", 7], None):
+        document = json.loads(several.to_json()) | {"cloud": cloud}
+        with pytest.raises(InputError, match="neither a path nor a list of paths"):
+            Result.from_json(json.dumps(document))
+
+
 def test_nan_is_never_written():
     with pytest.raises(ValueError, match="not JSON compliant"):
         dataclasses.replace(RESULT, loss=float("nan")).to_json()

@@ -32,7 +32,7 @@ MAX_LOAD = 0.6  # share of the rows in use
 def find_row(table, x, y, z):
     """The row of a cell in the table, or the free one where it belongs."""
     mask = len(table) - 1
-    # products of less than 64 bits: none overflows, so that this also runs without Numba
+    # Teschner et al., VMV 2003. Products of less than 63 bits: none overflows, with or without Numba.
     mixed = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
     row = (mixed ^ (mixed >> 17)) & mask
     while table[row, COUNT] != 0 and not (
@@ -105,6 +105,7 @@ class VoxelTable:
 
     def add(self, points: NDArray[np.float64], colors: NDArray[np.uint8]) -> None:
         """Add finite points (N, 3) [m], in the map's axes, with colours (N, 3)."""
+        points, colors = np.ascontiguousarray(points), np.ascontiguousarray(colors)  # one kernel for all
         if self.base is None and len(points):
             self.base = np.floor(points[0] / LEAF_SIZE).astype(np.int64)
         while len(points):
@@ -136,15 +137,16 @@ class VoxelTable:
         rows = self.table[self.table[:, COUNT] > 0]
         self.table = self.table[:0]
         cells = rows[:, :COUNT] + (np.zeros(3, np.int64) if self.base is None else self.base)
-        is_near = np.all(np.abs(cells - np.floor(np.median(cells, axis=0))) <= WINDOW, axis=1)
+        middle = [np.partition(column, len(column) // 2)[len(column) // 2] for column in cells.T]
+        is_near = np.all(np.abs(cells - middle) <= WINDOW, axis=1)
         warnings: tuple[str, ...] = ()
         if not is_near.all():
             num_far = int(rows[~is_near, COUNT].sum(dtype=np.int64))
+            text = f"{num_far} points farther than {WINDOW * LEAF_SIZE / 1000:.0f} km from the middle"
             rows, cells = rows[is_near], cells[is_near]
-            warnings = (
-                f"{self.label}: {num_far} points farther than {WINDOW * LEAF_SIZE / 1000:.0f} km from the "
-                "rest left out",
-            )
+            if len(rows) == 0:
+                raise InputError(f"{self.label}: {text}, and none nearer, wanted one scene")
+            warnings = (f"{self.label}: {text} left out",)
         low, high = cells.min(axis=0), cells.max(axis=0) + 1
         codes = morton_codes(cells - low // COARSEST * COARSEST)
         order = np.argsort(codes)
