@@ -78,7 +78,7 @@ def complain(arguments: argparse.Namespace, text: str, exit_code: int) -> int:
     """One line on stderr, the traceback if --debug; returns the exit code."""
     if arguments.debug:
         traceback.print_exc()
-    print(f"prepare_map.py: {text}", file=sys.stderr)
+    tqdm.write(f"prepare_map.py: {text}", file=sys.stderr)
     return exit_code
 
 

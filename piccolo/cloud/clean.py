@@ -1,6 +1,6 @@
 """Checks that every cloud passes, whatever file it came from, while its points stream by."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,8 +28,6 @@ class Census:
     num_finite: int = 0
     num_dropped: int = 0  # with NaN or infinite coordinates
     brightest: int = 0
-    low: NDArray[np.float64] = field(default_factory=lambda: np.full(3, np.inf))  # [m]
-    high: NDArray[np.float64] = field(default_factory=lambda: np.full(3, -np.inf))  # [m]
 
     def pass_on(self, raw: RawCloud) -> Chunk:
         """The finite points of a chunk, after they have been counted."""
@@ -43,13 +41,11 @@ class Census:
         if num_finite:
             points = points * self.scale
             self.brightest = max(self.brightest, int(colors.max()))
-            self.low = np.minimum(self.low, points.min(axis=0))
-            self.high = np.maximum(self.high, points.max(axis=0))
-            self._check_coordinates()
+            self._check_coordinates(points)
         return points, colors
 
-    def _check_coordinates(self) -> None:
-        farthest = float(max(-self.low.min(), self.high.max()))
+    def _check_coordinates(self, points: NDArray[np.float64]) -> None:
+        farthest = max(-float(points.min()), float(points.max()))
         if farthest > MAX_COORDINATE:
             raise InputError(
                 f"{self.path}: a coordinate of {farthest:.3g} m, wanted all within {MAX_COORDINATE:.0e} m; "

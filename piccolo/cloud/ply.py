@@ -76,6 +76,8 @@ def open_ply(path: Path, options: ReadOptions = PLAIN) -> PointSource:
     index = _vertex_index(header)
     vertices = Vertices(header, index, _property_names(header, index, options))
     count = header.counts[index]
+    if not header.is_ascii:
+        _rows_of(vertices)
     if len(vertices.names) > 4:
         return PointSource(path, lambda: _read_colored(vertices), count)
     return PointSource(path, in_gray(path, lambda: _read_measured(vertices)), count)
@@ -183,19 +185,25 @@ def _check_size(header: Header, index: int, offset: int, row_size: int) -> int:
     return count
 
 
-def _read_binary(vertices: Vertices) -> Iterator[list[NDArray[np.generic]]]:
-    """Yield the columns of up to CHUNK vertices. Not by a map of the file, which a cut would turn deadly."""
+def _rows_of(vertices: Vertices) -> tuple[int, int, np.dtype[np.void]]:
+    """Where the rows of a binary file begin [byte], how many there are, and what is in one."""
     header, index = vertices.header, vertices.index
     before = zip(header.elements[:index], header.counts, strict=False)
     offset = header.size + sum(count * element.dtype().itemsize for element, count in before)
     dtype = vertices.element.dtype(header.byte_order)
-    count = _check_size(header, index, offset, dtype.itemsize)
-    with header.path.open("rb") as file:
+    return offset, _check_size(header, index, offset, dtype.itemsize), dtype
+
+
+def _read_binary(vertices: Vertices) -> Iterator[list[NDArray[np.generic]]]:
+    """Yield the columns of up to CHUNK vertices. Not by a map of the file, which a cut would turn deadly."""
+    path = vertices.header.path
+    offset, count, dtype = _rows_of(vertices)
+    with path.open("rb") as file:
         file.seek(offset)
         for begin in range(0, count, CHUNK):
             rows = np.empty(min(CHUNK, count - begin), dtype)
             if file.readinto(rows.view(np.uint8).data) < rows.nbytes:
-                raise InputError(f"{header.path}: became shorter while it was read, wanted a whole file")
+                raise InputError(f"{path}: became shorter while it was read, wanted a whole file")
             yield [rows[name] for name in vertices.names]
 
 
