@@ -56,11 +56,13 @@ def interleave(cells):
     return np.array(codes, dtype=np.int64)
 
 
-def voxels(points, colors, size):
-    """Mean position and colour (M, 6) of each voxel, by a dictionary, in any order."""
+def voxels(points, colors, size, corner):
+    """Mean position and colour (M, 6) of each voxel of a grid with that corner, by a dictionary."""
     members = {}
     for point, color in zip(points, colors.astype(int), strict=True):
-        members.setdefault(tuple(int(k) for k in np.floor(point / size)), []).append((*point, *color))
+        members.setdefault(tuple(int(k) for k in np.floor((point - corner) / size)), []).append(
+            (*point, *color)
+        )
     return np.array([np.mean(rows, axis=0) for rows in members.values()])
 
 

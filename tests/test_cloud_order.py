@@ -1,5 +1,5 @@
 import math
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import naive
@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from piccolo.cloud import Cloud, CloudStream
+from piccolo.cloud import Cloud, stream_of
 from piccolo.cloud.order import canonical_order, morton_codes
-from piccolo.cloud.raw import PLAIN, PointSource, RawCloud
+from piccolo.cloud.raw import PLAIN, RawCloud
 from piccolo.errors import InputError
 
 A = Path("a")
@@ -27,7 +27,7 @@ def seeded_cloud(seed, num_points=1500, size=(6.0, 5.0, 2.5), step=0.0):
 
 def clean(path, raw, scale):
     """The cloud of points in memory as if they had been read from a file."""
-    return CloudStream([PointSource(path, lambda: iter([raw]))], scale).read()
+    return replace(stream_of(path, raw), scale=scale).read()
 
 
 def whole(open_source, path, options=PLAIN):

@@ -9,10 +9,10 @@ from ..threads import Show, unseen
 from .model import Cloud
 from .ply import PLY
 from .raw import HEAD_SIZE, Format, PointSource, ReadOptions
-from .stream import CloudStream
+from .stream import CloudStream, stream_of
 from .text import TEXT
 
-__all__ = ["Cloud", "CloudStream", "open_cloud", "read_cloud"]
+__all__ = ["Cloud", "CloudStream", "open_cloud", "read_cloud", "stream_of"]
 
 FORMATS = (PLY, TEXT)
 WANTED = f"wanted a coloured point cloud: {', '.join(f.name for f in FORMATS)}"

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +13,13 @@ from ..threads import Show, unseen
 from .clean import Census, Chunk, unit_warnings
 from .model import Cloud
 from .order import canonical_order
-from .raw import CHUNK, PointSource
+from .raw import CHUNK, PointSource, RawCloud
 from .voxels import Voxels, VoxelTable, turned
+
+
+def stream_of(path: Path, raw: RawCloud) -> "CloudStream":
+    """Points in memory as if they stood in a file named `path`."""
+    return CloudStream([PointSource(path, lambda: iter([raw]), len(raw.colors))])
 
 
 @dataclass(frozen=True)

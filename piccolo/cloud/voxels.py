@@ -1,7 +1,7 @@
 """Points averaged voxel by voxel as they stream by: the memory grows with the scene, not with the points.
 
-The grid has a corner at zero of the map's axes, and all sums are integers: neither the order of the points
-nor how they are cut into chunks changes a bit.
+The grid is fixed in the map's axes, and all sums are integers: neither the order of the points nor how they
+are cut into chunks changes a bit.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,10 @@ QUANTA_PER_METRE = (1 << QUANTUM_BITS) / LEAF_SIZE
 MAX_COUNT = 1 << 23  # points of a voxel that are summed, at most: int32 holds no more of their colours
 MAX_CELL = 1 << 31  # cells from the first point to any other, below this: 43,000 km
 WINDOW = (NUM_CELLS // 2) - 128  # cells from the median to those kept: 21 km
-COARSEST = 128  # leaves along a voxel of the coarsest level: all levels' grids have a corner at zero
+COARSEST = 128  # leaves along a voxel of the coarsest level
+# From a corner of all levels' grids to zero, in quanta: a third of the coarsest voxel, so that zero and whole
+# metres lie on no voxel's border. A floor at z = 0 would fall to both sides by its noise, and count twice.
+PHASE = (COARSEST << QUANTUM_BITS) // 3 + 1
 
 # columns of the table: cell, number of points (0: the row is free), sums of quanta, sums of colours
 CELL, COUNT, POSITION, COLOR, NUM_COLUMNS = 0, 3, 4, 7, 10
@@ -52,9 +55,9 @@ def add_points(points, colors, base, table, num_voxels, max_voxels):
     for i in range(len(points)):
         if num_voxels == max_voxels:
             return i, num_voxels
-        qx = np.int64(np.floor(points[i, 0] * QUANTA_PER_METRE))
-        qy = np.int64(np.floor(points[i, 1] * QUANTA_PER_METRE))
-        qz = np.int64(np.floor(points[i, 2] * QUANTA_PER_METRE))
+        qx = np.int64(np.floor(points[i, 0] * QUANTA_PER_METRE)) + PHASE
+        qy = np.int64(np.floor(points[i, 1] * QUANTA_PER_METRE)) + PHASE
+        qz = np.int64(np.floor(points[i, 2] * QUANTA_PER_METRE)) + PHASE
         x = (qx >> QUANTUM_BITS) - base[0]
         y = (qy >> QUANTUM_BITS) - base[1]
         z = (qz >> QUANTUM_BITS) - base[2]
@@ -151,7 +154,7 @@ class VoxelTable:
         codes = morton_codes(cells - low // COARSEST * COARSEST)
         order = np.argsort(codes)
         # + 0.0 turns -0.0 into 0.0
-        origin = np.round(0.5 * LEAF_SIZE * (low + high)) + 0.0
+        origin = np.round(0.5 * LEAF_SIZE * (low + high) - PHASE / QUANTA_PER_METRE) + 0.0
         return Voxels(codes[order], _means(rows, cells, order, origin), origin, warnings)
 
 
@@ -163,7 +166,7 @@ def _means(
     counts = rows[order, COUNT].astype(np.float64)
     for k in range(3):  # one at a time, for the memory's sake
         corners = cells[order, k] * LEAF_SIZE - origin[k]
-        nodes[:, k] = corners + (rows[order, POSITION + k] / counts + 0.5) / QUANTA_PER_METRE
+        nodes[:, k] = corners + (rows[order, POSITION + k] / counts + 0.5 - PHASE) / QUANTA_PER_METRE
         nodes[:, 3 + k] = rows[order, COLOR + k] / counts / 255.0
     return nodes
 
