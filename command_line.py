@@ -1,11 +1,13 @@
 """The options of localize.py: what they are, and the settings that they ask for."""
 
 import argparse
+import sys
 from pathlib import Path
+from typing import get_args
 
 from piccolo import __version__
 from piccolo.errors import InputError
-from piccolo.settings import EngineSettings, PaperSettings, Prior
+from piccolo.settings import METRES, CloudSettings, EngineSettings, PaperSettings, Prior, UpAxis
 from piccolo.threads import num_cores
 
 DESCRIPTION = "Find where in a coloured point cloud 360-degree panoramas were taken."
@@ -55,13 +57,12 @@ def build_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"piccolo {__version__}")
+    text = "coloured scan, one file or several: PLY, or text x y z r g b; or a map by tools/prepare_map.py"
+    add_cloud_options(parser, text)
     files = parser.add_argument_group("files")
-    text = "coloured scan: PLY, or text x y z r g b; or a map by tools/prepare_map.py"
-    files.add_argument("--cloud", type=Path, required=True, help=text)
     files.add_argument("--pano", type=Path, required=True, nargs="+", help="full sphere JPEG or PNG, W = 2 H")
     files.add_argument("--out", type=Path, help="write the JSON here, not to stdout")
     files.add_argument("--overlay", type=Path, help="PNG: panorama, cloud at the pose, checkerboard of both")
-    files.add_argument("--scale", type=float, default=1.0, help="metres per unit of the cloud (default 1)")
     files.add_argument("--cache", type=Path, metavar="FOLDER", help="of prepared maps (default the user's)")
     files.add_argument("--no-cache", action="store_true", help="prepare the map anew and keep none")
     add_method_options(parser)
@@ -71,6 +72,41 @@ def build_parser() -> argparse.ArgumentParser:
     run.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
     run.add_argument("--debug", action="store_true", help="show the traceback of an error")
     return parser
+
+
+def add_cloud_options(parser: argparse.ArgumentParser, text: str) -> None:
+    """The cloud's files, described by `text`, and how to understand them."""
+    group = parser.add_argument_group("cloud")
+    group.add_argument("--cloud", type=Path, required=True, nargs="+", help=text)
+    unit = group.add_mutually_exclusive_group()
+    unit.add_argument("--units", choices=list(METRES), help="of the cloud's coordinates (default m)")
+    unit.add_argument("--scale", type=float, metavar="S", help="metres per unit of the cloud, in place of it")
+    text = "axis of the cloud that points up, not to be found out (default auto; preset default)"
+    group.add_argument("--up", choices=get_args(UpAxis), default="auto", help=text)
+    text = "of clouds without colours"
+    group.add_argument("--intensity-as-gray", action="store_true", help=text)
+
+
+def cloud_settings_from(arguments: argparse.Namespace) -> CloudSettings:
+    """What add_cloud_options asked for."""
+    scale = METRES[arguments.units or "m"] if arguments.scale is None else arguments.scale
+    return CloudSettings(scale, arguments.up, arguments.intensity_as_gray)
+
+
+def parse(parser: argparse.ArgumentParser, argv: list[str] | None) -> argparse.Namespace:
+    """The options given; argparse alone would take the value of `--up -y` for an option."""
+    words: list[str] = []
+    for word in sys.argv[1:] if argv is None else argv:
+        if words[-1:] == ["--up"]:
+            words[-1] = f"--up={word}"
+        else:
+            words.append(word)
+    return parser.parse_args(words)
+
+
+def named(paths: list[Path]) -> str | tuple[str, ...]:
+    """The cloud's files as a result names them."""
+    return str(paths[0]) if len(paths) == 1 else tuple(map(str, paths))
 
 
 def add_method_options(parser: argparse.ArgumentParser) -> None:
@@ -117,6 +153,7 @@ def settings_from(arguments: argparse.Namespace) -> EngineSettings | PaperSettin
         foreign += ["--no-visibility"] if "no_visibility" in given else []
     else:
         foreign += ["--" + name.replace("_", "-") for name in priors]
+        foreign += ["--up"] if arguments.up != "auto" else []
     if foreign:
         raise InputError(f"{foreign[0]}: not an option of the preset {arguments.preset}")
     names = [option[2:].replace("-", "_") for option, *_ in own]
@@ -137,8 +174,7 @@ def check_arguments(arguments: argparse.Namespace) -> None:
     """Refuse values that no file could make right."""
     if arguments.threads < 1:
         raise InputError(f"--threads: found {arguments.threads}, wanted at least 1")
-    if not 0.0 < arguments.scale < 1e6:
-        raise InputError(f"--scale: found {arguments.scale}, wanted metres per unit, above 0")
+    cloud_settings_from(arguments)
     if arguments.overlay and len(arguments.pano) > 1:
         raise InputError(f"--overlay: found {len(arguments.pano)} panoramas, wanted one")
     if arguments.cache and arguments.no_cache:

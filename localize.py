@@ -12,7 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from command_line import build_parser, check_arguments, settings_from
+from command_line import build_parser, check_arguments, cloud_settings_from, named, parse, settings_from
 from piccolo.errors import InputError
 from piccolo.files import check_output, write_atomically
 from piccolo.jit import KERNEL_FOLDER, is_first_use
@@ -53,19 +53,19 @@ class Session:
             png = overlay_png(localizer.points, panorama, localizer.from_world(found.pose))
             write_atomically(self.arguments.overlay, png)
         settings = {"preset": self.arguments.preset, **localizer.settings.to_json()}
-        result = result_of(found, str(self.arguments.cloud), str(pano), watch.seconds, settings)
+        result = result_of(found, named(self.arguments.cloud), str(pano), watch.seconds, settings)
         return replace(result, warnings=localizer.warnings)
 
 
 def open_session(arguments: argparse.Namespace, settings: EngineSettings | PaperSettings) -> Session:
     """Read and prepare the cloud, after a look at what is to be written."""
     for output in filter(None, (arguments.out, arguments.overlay)):
-        check_output(output, [arguments.cloud, *arguments.pano])
+        check_output(output, [*arguments.cloud, *arguments.pano])
     if is_first_use() and not arguments.quiet:
         text = f"first use: compiling kernels, once (under half a minute), into {KERNEL_FOLDER}"
         print(text, file=sys.stderr, flush=True)
 
-    def show(values: Iterator[Any], total: int, label: str) -> Iterator[Any]:
+    def show(values: Iterator[Any], total: int | None, label: str) -> Iterator[Any]:
         """The values under a progress bar that vanishes when they end."""
         bar = tqdm(values, label, total, leave=False, disable=arguments.quiet, file=sys.stderr, delay=0.5)
         return iter(bar)
@@ -73,7 +73,8 @@ def open_session(arguments: argparse.Namespace, settings: EngineSettings | Paper
     watch = Stopwatch()
     cache = CachePolicy(not arguments.no_cache, arguments.cache)
     workers = Workers(arguments.threads, show)
-    localizer = open_localizer(arguments.cloud, arguments.scale, settings, cache, workers, watch)
+    clouds = arguments.cloud, cloud_settings_from(arguments)
+    localizer = open_localizer(*clouds, settings, cache, workers, watch)
     session = Session(arguments, localizer, workers, watch.seconds)
     for warning in localizer.warnings:
         session.say(f"warning: {warning}")
@@ -124,7 +125,7 @@ def complain(arguments: argparse.Namespace, error: BaseException, text: str = ""
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    arguments = build_parser().parse_args(argv)
+    arguments = parse(build_parser(), argv)
     try:
         check_arguments(arguments)
         settings = settings_from(arguments)

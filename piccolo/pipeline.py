@@ -1,10 +1,11 @@
 """The two presets behind one interface: a cloud is opened once, and panoramas are localized in it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from .cloud import read_cloud
+from .cloud import open_cloud
 from .cloud.packed import PackedPoints
 from .engine import method as engine
 from .engine.map_file import cached_map, content_key, is_map_file, load_map
@@ -14,7 +15,7 @@ from .panorama import Panorama
 from .paper import method as paper
 from .pose import Pose
 from .result import Localization
-from .settings import EngineSettings, PaperSettings
+from .settings import IN_METRES, CloudSettings, EngineSettings, PaperSettings
 from .stopwatch import Stopwatch
 from .threads import Workers
 
@@ -97,29 +98,43 @@ class CachePolicy:
     folder: Path | None = None  # None for the user's cache
 
 
-def open_map(path: Path, scale: float, cache: CachePolicy, workers: Workers, watch: Stopwatch) -> ScanMap:
-    """The map of a cloud file: prepared already, from the cache, or built now. `path` may be a map itself."""
-    is_file = path.is_file()
-    if is_file and is_map_file(path):
+def open_map(
+    paths: Sequence[Path],
+    cloud_settings: CloudSettings,
+    cache: CachePolicy,
+    workers: Workers,
+    watch: Stopwatch,
+) -> ScanMap:
+    """The map of a cloud's files: prepared already, from the cache, or built now.
+
+    A prepared map may stand in place of the files.
+    """
+    map_path = _map_among(paths)
+    if map_path:
+        if len(paths) > 1 or cloud_settings != IN_METRES:
+            raise InputError(f"{map_path}: found a prepared map, wanted it alone, without options for clouds")
         with watch.stage("read"):
-            return load_map(path)
+            return load_map(map_path)
 
     def build() -> ScanMap:
         with watch.stage("read"):
-            cloud = read_cloud(path, scale)
-        with watch.stage("prepare"):
-            return prepare_map(cloud, workers)
+            cloud = open_cloud(paths, cloud_settings, workers.show)
+        return prepare_map(cloud, workers, cloud_settings.up, watch)
 
-    if not (cache.is_used and is_file):
+    if not (cache.is_used and all(path.is_file() for path in paths)):
         return build()
     with watch.stage("read"):
-        key = content_key(path, scale)
+        key = content_key(paths, cloud_settings)
     return cached_map(cache.folder, key, build, watch)
 
 
+def _map_among(paths: Sequence[Path]) -> Path | None:
+    return next((path for path in paths if path.is_file() and is_map_file(path)), None)
+
+
 def open_localizer(
-    path: Path,
-    scale: float,
+    paths: Sequence[Path],
+    cloud_settings: CloudSettings,
     settings: EngineSettings | PaperSettings,
     cache: CachePolicy,
     workers: Workers,
@@ -127,11 +142,12 @@ def open_localizer(
 ) -> Localizer:
     """Read and prepare a cloud for the preset that the settings belong to."""
     if isinstance(settings, EngineSettings):
-        return EngineLocalizer(open_map(path, scale, cache, workers, watch), settings)
-    if path.is_file() and is_map_file(path):
-        raise InputError(f"{path}: found a prepared map, wanted a cloud with the preset paper")
+        return EngineLocalizer(open_map(paths, cloud_settings, cache, workers, watch), settings)
+    map_path = _map_among(paths)
+    if map_path:
+        raise InputError(f"{map_path}: found a prepared map, wanted a cloud with the preset paper")
     with watch.stage("read"):
-        cloud = read_cloud(path, scale)
+        cloud = open_cloud(paths, cloud_settings, workers.show).read()
     with watch.stage("prepare"):
         paper_map = paper.prepare(cloud, settings)
     return PaperLocalizer(paper_map, settings, cloud.warnings)

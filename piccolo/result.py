@@ -47,7 +47,7 @@ class Result:
 
     status: str  # "localized", "ambiguous" or "not_localized"
     confidence: float  # [0, 1] how likely the pose is right, as piccolo.verdict has it
-    cloud: str  # path as given
+    cloud: str | tuple[str, ...]  # path as given, or the paths of several files that are one cloud
     pano: str  # path as given
     pose: Pose | None  # the best pose found, in the file's own coordinates; None if there was no start
     loss: float | None  # sampling loss [0, sqrt(3)] over the points seen from the pose
@@ -57,6 +57,11 @@ class Result:
     seconds: dict[str, float]  # read, prepare, search, refine
     settings: dict[str, object]  # effective settings, seed included
     warnings: tuple[str, ...] = field(default=())
+
+    @property
+    def cloud_name(self) -> str:
+        """The cloud's path, or those of its files, separated by commas."""
+        return self.cloud if isinstance(self.cloud, str) else ", ".join(self.cloud)
 
     def summary(self) -> str:
         """Two lines for a person."""
@@ -114,7 +119,9 @@ class Result:
             if document["format"] != FORMAT:
                 raise InputError(f"result: found format {document['format']!r}, wanted {FORMAT!r}")
             covariance = document["covariance"]
+            cloud = document.pop("cloud")
             return cls(
+                cloud=cloud if isinstance(cloud, str) else _paths(cloud),
                 pose=_pose_from_json(document),
                 evidence=document["evidence"] and Evidence(**document["evidence"]),
                 rivals=tuple(_rival_from_json(rival) for rival in document["rivals"]),
@@ -129,14 +136,18 @@ class Result:
 
 
 def result_of(
-    found: Localization, cloud: str, pano: str, seconds: dict[str, float], settings: dict[str, object]
+    found: Localization,
+    cloud: str | tuple[str, ...],
+    pano: str,
+    seconds: dict[str, float],
+    settings: dict[str, object],
 ) -> Result:
     """The result of a localization, with the names of the files and what it took."""
     values = {f.name: getattr(found, f.name) for f in fields(found)}
     return Result(cloud=cloud, pano=pano, seconds=seconds, settings=settings, **values)
 
 
-_PLAIN_FIELDS = ("status", "confidence", "cloud", "pano", "loss", "seconds", "settings")
+_PLAIN_FIELDS = ("status", "confidence", "pano", "loss", "seconds", "settings")
 
 
 def _pose_json(pose: Pose | None) -> dict[str, object]:
@@ -159,3 +170,10 @@ def _rival_from_json(document: dict[str, Any]) -> Hypothesis:
 def _place(rival: Hypothesis) -> str:
     x, y, z = rival.pose.center_world
     return f"({x:.3f}, {y:.3f}, {z:.3f}) m, score {rival.score:.2f}"
+
+
+def _paths(value: object) -> tuple[str, ...]:
+    """A list of paths; TypeError for anything else."""
+    if not isinstance(value, list) or not all(isinstance(path, str) for path in value):
+        raise TypeError("a cloud that is neither a path nor a list of paths")
+    return tuple(value)

@@ -1,5 +1,6 @@
 """Frozen, typed settings with units; a result repeats the ones it was made with."""
 
+import math
 from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
@@ -8,6 +9,28 @@ from .errors import InputError
 Gravity = Literal["auto", "known", "unknown"]
 MIN_CONFIDENCE = 0.9
 Solver = Literal["gauss-newton", "lbfgs", "adam"]
+UpAxis = Literal["auto", "z", "y", "x", "-z", "-y", "-x"]
+
+METRES = {"mm": 0.001, "cm": 0.01, "m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}  # per unit of length
+
+
+@dataclass(frozen=True)
+class CloudSettings:
+    """How the files of a cloud are to be understood."""
+
+    scale: float = 1.0  # metres per unit of the files
+    up: UpAxis = "auto"  # the axis that points up; auto: z, or what the cloud's own planes say
+    intensity_as_gray: bool = False  # where a file has no colours
+
+    def __post_init__(self) -> None:
+        """Refuse a scale that means nothing."""
+        if not (math.isfinite(self.scale) and self.scale > 0.0):
+            raise InputError(
+                f"--scale: found {self.scale}, wanted a number above 0 (metres a unit of the file)"
+            )
+
+
+IN_METRES = CloudSettings()
 
 
 def check_confidence(min_confidence: float) -> None:

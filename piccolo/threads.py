@@ -15,7 +15,11 @@ def num_cores() -> int:
     return len(os.sched_getaffinity(0))
 
 
-def _unseen(values: Iterator[Value], total: int, label: str) -> Iterator[Value]:
+# wraps values as tqdm does: how many there will be, None if unknown, and what they are
+Show = Callable[[Iterator[Any], int | None, str], Iterator[Any]]
+
+
+def unseen(values: Iterator[Value], total: int | None, label: str) -> Iterator[Value]:
     """Progress that nobody watches."""
     return values
 
@@ -25,7 +29,7 @@ class Workers:
     """How many threads do the work, and who is told how far it is."""
 
     num_threads: int = 1
-    show: Callable[[Iterator[Any], int, str], Iterator[Any]] = _unseen  # wraps the values, as tqdm does
+    show: Show = unseen  # progress
 
     def each(self, function: Callable[[Item], Value], items: Sequence[Item], label: str) -> Iterator[Value]:
         """Yield function(item) for each item, in order.

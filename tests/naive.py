@@ -56,15 +56,14 @@ def interleave(cells):
     return np.array(codes, dtype=np.int64)
 
 
-def thin(points, colors, voxel_size):
-    """Mean position and colour of each voxel, by a dictionary, in ascending order of Morton codes."""
-    voxels = {}
-    for point, color in zip(points.astype(np.float64), colors.astype(int), strict=True):
-        voxels.setdefault(tuple(int(k) for k in np.floor(point / voxel_size)), []).append((*point, *color))
-    cells = np.array(list(voxels))
-    means = np.array([np.mean(members, axis=0) for members in voxels.values()])
-    means = means[np.argsort(interleave(cells - cells.min(axis=0)))]
-    return means[:, :3], np.floor(means[:, 3:] + 0.5)
+def voxels(points, colors, size, corner):
+    """Mean position and colour (M, 6) of each voxel of a grid with that corner, by a dictionary."""
+    members = {}
+    for point, color in zip(points, colors.astype(int), strict=True):
+        members.setdefault(tuple(int(k) for k in np.floor((point - corner) / size)), []).append(
+            (*point, *color)
+        )
+    return np.array([np.mean(rows, axis=0) for rows in members.values()])
 
 
 def parse_rows(text, separator, targets):

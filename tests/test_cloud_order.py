@@ -1,4 +1,6 @@
 import math
+from dataclasses import astuple, replace
+from pathlib import Path
 
 import naive
 import numpy as np
@@ -6,11 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from piccolo.cloud import Cloud
-from piccolo.cloud.clean import clean
-from piccolo.cloud.order import canonical_order, morton_codes, thin
-from piccolo.cloud.raw import RawCloud
+from piccolo.cloud import Cloud, stream_of
+from piccolo.cloud.order import canonical_order, morton_codes
+from piccolo.cloud.raw import PLAIN, RawCloud
 from piccolo.errors import InputError
+
+A = Path("a")
 
 
 def seeded_cloud(seed, num_points=1500, size=(6.0, 5.0, 2.5), step=0.0):
@@ -20,6 +23,17 @@ def seeded_cloud(seed, num_points=1500, size=(6.0, 5.0, 2.5), step=0.0):
     if step:
         points = np.round(points / step) * step
     return RawCloud(points, rng.integers(0, 256, (num_points, 3), dtype=np.uint8))
+
+
+def clean(path, raw, scale):
+    """The cloud of points in memory as if they had been read from a file."""
+    return replace(stream_of(path, raw), scale=scale).read()
+
+
+def whole(open_source, path, options=PLAIN):
+    """All points that a reader finds in a file."""
+    chunks = list(open_source(path, options).read_chunks())
+    return RawCloud(*(np.concatenate(arrays) for arrays in zip(*map(astuple, chunks), strict=True)))
 
 
 def same_bits(a: Cloud, b: Cloud):
@@ -40,28 +54,6 @@ def test_morton_codes_equal_twin():
     assert codes[1] == (1 << 63) - 1
 
 
-def test_thin_equals_twin():
-    raw = seeded_cloud(2, num_points=3000)
-    points, colors = thin(raw.points_world.astype(np.float32), raw.colors, 0.7)
-    expected_points, expected_colors = naive.thin(raw.points_world.astype(np.float32), raw.colors, 0.7)
-    assert points.dtype == np.float32
-    assert colors.dtype == np.uint8
-    np.testing.assert_allclose(points, expected_points, atol=1e-6)
-    np.testing.assert_array_equal(colors, expected_colors)
-
-
-def test_thin_keeps_one_point_in_each_voxel():
-    raw = seeded_cloud(3)
-    points, _ = thin(raw.points_world.astype(np.float32), raw.colors, 0.5)
-    assert len(np.unique(np.floor(points / 0.5), axis=0)) == len(points)
-
-
-def test_thin_refuses_more_voxels_than_the_code_holds():
-    points = np.array([[0, 0, 0], [1e6, 0, 0]], dtype=np.float32)
-    with pytest.raises(InputError, match=r"spans 1e\+06 m, wanted under 4.19e\+04 m for voxels of 0.02 m"):
-        thin(points, np.zeros((2, 3), dtype=np.uint8), 0.02)
-
-
 @settings(deadline=None, max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), step=st.sampled_from([0.0, 0.01, 0.5, 3.0]))
 def test_shuffling_points_changes_no_bit(seed, step, tmp_path_factory):
@@ -72,15 +64,12 @@ def test_shuffling_points_changes_no_bit(seed, step, tmp_path_factory):
     path = tmp_path_factory.getbasetemp()
     a, b = clean(path, raw, 1.0), clean(path, shuffled, 1.0)
     assert same_bits(a, b)
-    thin_a, thin_b = thin(a.points, a.colors, 0.3), thin(b.points, b.colors, 0.3)
-    assert thin_a[0].tobytes() == thin_b[0].tobytes()
-    assert thin_a[1].tobytes() == thin_b[1].tobytes()
 
 
 def test_signed_zeros_do_not_tell_points_apart():
     raw = seeded_cloud(4, step=1.0)
     flipped = RawCloud(np.where(raw.points_world == 0.0, -raw.points_world, raw.points_world), raw.colors)
-    assert same_bits(clean("a", raw, 1.0), clean("a", flipped, 1.0))
+    assert same_bits(clean(A, raw, 1.0), clean(A, flipped, 1.0))
 
 
 def test_order_keeps_neighbours_together():
@@ -101,7 +90,7 @@ def test_order_of_points_in_one_place():
 def test_utm_coordinates_keep_their_millimetres():
     raw = seeded_cloud(7)
     origin = np.array([637_012.25, 5_849_028.75, 431.5])
-    far = clean("a", RawCloud(raw.points_world + origin, raw.colors), 1.0)
+    far = clean(A, RawCloud(raw.points_world + origin, raw.colors), 1.0)
     assert np.abs(far.origin_world - origin).max() < 1.0
     np.testing.assert_array_equal(far.origin_world, np.round(far.origin_world))
     assert np.abs(far.points).max() < 4.0
@@ -113,32 +102,32 @@ def test_utm_coordinates_keep_their_millimetres():
 def test_origin_is_the_middle_of_the_box_in_whole_metres():
     raw = seeded_cloud(8)
     raw.points_world[:2] = [[0, 0, 0], [20.9, 10, 3.2]]
-    assert clean("a", RawCloud(np.abs(raw.points_world), raw.colors), 1.0).origin_world.tolist() == [10, 5, 2]
+    assert clean(A, RawCloud(np.abs(raw.points_world), raw.colors), 1.0).origin_world.tolist() == [10, 5, 2]
 
 
 def test_scale_turns_millimetres_to_metres():
     raw = seeded_cloud(9)
     millimetres = RawCloud(raw.points_world * 1000, raw.colors)
-    (warning,) = clean("room.ply", millimetres, 1.0).warnings
-    assert "--scale 0.001" in warning
+    (warning,) = clean(Path("room.ply"), millimetres, 1.0).warnings
+    assert "--units mm" in warning
     assert "room.ply" in warning
-    metres = clean("room.ply", millimetres, 0.001)
+    metres = clean(Path("room.ply"), millimetres, 0.001)
     assert metres.warnings == ()
     np.testing.assert_allclose(np.ptp(metres.points, axis=0), np.ptp(raw.points_world, axis=0), rtol=1e-5)
 
 
 def test_one_long_axis_or_few_outliers_are_no_millimetres():
     raw = seeded_cloud(10, size=(5000.0, 30.0, 10.0))
-    assert clean("a", raw, 1.0).warnings == ()
+    assert clean(A, raw, 1.0).warnings == ()
     raw = seeded_cloud(11)
     raw.points_world[:5] = 9000.0
-    assert clean("a", raw, 1.0).warnings == ()
+    assert clean(A, raw, 1.0).warnings == ()
 
 
 def test_far_outliers_are_warned_of():
     raw = seeded_cloud(16)
     raw.points_world[0] = 5e6
-    (warning,) = clean("a", raw, 1.0).warnings
+    (warning,) = clean(A, raw, 1.0).warnings
     assert warning == "a: points 5000004 m apart blur the rest to 0.25 m; remove the outliers"
 
 
@@ -147,7 +136,7 @@ def test_points_that_are_not_finite_are_dropped_and_counted():
     raw.points_world[10, 0] = math.nan
     raw.points_world[20, 2] = math.inf
     raw.points_world[30, 1] = -math.inf
-    cloud = clean("a", raw, 1.0)
+    cloud = clean(A, raw, 1.0)
     assert cloud.num_dropped == 3
     assert len(cloud.points) == len(cloud.colors) == 1497
     assert np.isfinite(cloud.points).all()
@@ -157,14 +146,14 @@ def test_too_few_finite_points_are_refused():
     raw = seeded_cloud(13)
     raw.points_world[999:] = np.nan
     with pytest.raises(InputError, match=r"found 999 finite points \(501 with NaN.*wanted at least 1000"):
-        clean("a", raw, 1.0)
+        clean(A, raw, 1.0)
 
 
 @pytest.mark.parametrize("value", [0, 1])
 def test_black_clouds_are_refused(value):
     raw = seeded_cloud(14)
     with pytest.raises(InputError, match=f"all points are black .brightest value {value} of 255"):
-        clean("a", RawCloud(raw.points_world, np.full_like(raw.colors, value)), 1.0)
+        clean(A, RawCloud(raw.points_world, np.full_like(raw.colors, value)), 1.0)
 
 
 @pytest.mark.parametrize("value", [1e20, -1.7e308])
@@ -172,4 +161,4 @@ def test_coordinates_beyond_the_earth_are_refused(value):
     raw = seeded_cloud(15)
     raw.points_world[3, 1] = value
     with pytest.raises(InputError, match=r"a coordinate of 1.*wanted all within 1e\+08 m"):
-        clean("a", raw, 1.0)
+        clean(A, raw, 1.0)

@@ -6,11 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 from refusals import mutated, read_or_refused
-from test_cloud_order import same_bits, seeded_cloud
+from test_cloud_order import same_bits, seeded_cloud, whole
 
 from piccolo.cloud import read_cloud
-from piccolo.cloud.ply import read_ply
+from piccolo.cloud.ply import open_ply
 from piccolo.errors import InputError
+from piccolo.settings import CloudSettings
 
 RAW = seeded_cloud(1, num_points=1200)
 RGB = ("red", "green", "blue")
@@ -39,7 +40,7 @@ def content_of(tmp_path, **options):
 
 
 def assert_read_as_written(path, coordinate="f4"):
-    read = read_ply(path)
+    read = whole(open_ply, path)
     assert read.points_world.dtype == np.float64
     expected = RAW.points_world.astype(coordinate).astype(np.float64)
     # in ASCII a number may come back two roundings away
@@ -206,9 +207,9 @@ def test_unreadable_files_are_refused(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf])
-def test_scales_are_above_zero(tmp_path, scale):
+def test_scales_are_above_zero(scale):
     with pytest.raises(InputError, match=r"--scale: found .*, wanted a number above 0"):
-        read_cloud(tmp_path / "a.ply", scale=scale)
+        CloudSettings(scale)
 
 
 @pytest.mark.parametrize("encoding", [{"byte_order": ">"}, {"text": True}])

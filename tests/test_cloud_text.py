@@ -4,11 +4,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import mutated, read_or_refused
-from test_cloud_order import same_bits, seeded_cloud
+from test_cloud_order import same_bits, seeded_cloud, whole
 
 from piccolo.cloud import read_cloud
 from piccolo.cloud.rows import NOT_A_NUMBER, PARSED, TOO_FEW, TOO_MANY, parse_rows
-from piccolo.cloud.text import read_text
+from piccolo.cloud.text import open_text
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1)
@@ -37,7 +37,7 @@ def parsed(text, separator=" ", targets=(0, 1, 2), is_exact=False):
 
 
 def assert_read_as_written(path, raw=RAW):
-    read = read_text(path)
+    read = whole(open_text, path)
     np.testing.assert_allclose(read.points_world, np.round(raw.points_world, 6), rtol=1e-15, atol=1e-15)
     np.testing.assert_array_equal(read.colors, raw.colors)
 
@@ -81,7 +81,7 @@ def test_pts_has_intensity_in_the_fourth_column(tmp_path):
     lines = [" ".join([*f[:3], "-1613", *f[3:]]) for f in map(str.split, lines_of(RAW))]
     assert_read_as_written(write(tmp_path / "a.pts", ["1500", *lines]))
     with pytest.raises(InputError, match="line 2 has the colour -1613"):
-        read_text(write(tmp_path / "a.txt", ["1500", *lines]))
+        whole(open_text, write(tmp_path / "a.txt", ["1500", *lines]))
 
 
 def test_float_colors_and_last_line_without_end(tmp_path):
@@ -164,7 +164,7 @@ def test_broken_lines_are_named(tmp_path, broken, message):
     lines = ["# a comment counts", *lines_of(RAW)]
     path = write(tmp_path / "a.txt", [*lines[:1000], broken, *lines[1000:]])
     with pytest.raises(InputError, match=message):
-        read_text(path)
+        whole(open_text, path)
 
 
 @pytest.mark.parametrize(

@@ -123,7 +123,7 @@ def fine():
     cloud = rooms.room(1)[1]
     _, panorama, true_pose = rooms.scene(1)
     offsets, features, weights = render_view(
-        build_octree(cloud.points, cloud.colors), true_pose.center_world, FINE_VIEW
+        build_octree(cloud.voxels(np.eye(3))), true_pose.center_world, FINE_VIEW
     )
     image = normalized_channels(resize(panorama, 256), 0.0, FINE_VIEW.sigma_deg)
     return offsets, as_levels(features), weights, image, true_pose.R_cam_from_world

@@ -57,7 +57,7 @@ def test_same_bits_for_any_number_of_threads():
     one, two = (_localize(1, query(1).rgb, KNOWN, n) for n in (1, 2))
     np.testing.assert_array_equal(one.pose.center_world, two.pose.center_world)
     np.testing.assert_array_equal(one.pose.R_cam_from_world, two.pose.R_cam_from_world)
-    assert (one.loss, one.evidence, one.margin) == (two.loss, two.evidence, two.margin)
+    assert (one.loss, one.evidence, one.confidence) == (two.loss, two.evidence, two.confidence)
 
 
 @pytest.mark.parametrize("name", ["elsewhere", "black", "noise"])

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial import cKDTree
 
+from piccolo.cloud import Cloud
+from piccolo.cloud.voxels import LEAF_SIZE
 from piccolo.engine.octree import NUM_LEVELS, build_octree
 
 
@@ -13,24 +14,17 @@ def _cloud(count=5000, seed=0):
     return points, rng.integers(0, 256, (count, 3), dtype=np.uint8)
 
 
-def test_leaves_are_the_means_of_their_voxels():
-    points, colors = _cloud()
-    octree = build_octree(points, colors)
-    origin = np.floor(points.min(axis=0).astype(np.float64)) - 1.0
-    cells = np.floor((points - origin) / octree.leaf_size).astype(np.int64)
-    _, index = np.unique(cells, axis=0, return_inverse=True)
-    counts = np.bincount(index.ravel())
-    expected = np.stack(
-        [np.bincount(index.ravel(), values) / counts for values in (*points.T, *(colors.T / 255.0))]
-    )
-    leaves = octree.level(octree.leaf_size)
-    _, match = cKDTree(leaves[:, :3]).query(expected[:3].T)
-    assert len(np.unique(match)) == len(leaves) == len(counts)
-    np.testing.assert_allclose(leaves[match], expected.T, atol=2e-4)
+def _octree(points, colors):
+    return build_octree(Cloud(points, colors, np.zeros(3)).voxels(np.eye(3)))
+
+
+def test_leaves_are_the_voxels():
+    voxels = Cloud(*_cloud(), np.zeros(3)).voxels(np.eye(3))
+    np.testing.assert_array_equal(build_octree(voxels).level(LEAF_SIZE), voxels.nodes)
 
 
 def test_parents_are_the_means_of_their_children():
-    octree = build_octree(*_cloud())
+    octree = _octree(*_cloud())
     for level in range(NUM_LEVELS - 1):
         lo, hi = octree.level_start[level : level + 2]
         for node in (lo, (lo + hi) // 2, hi - 1):
@@ -40,7 +34,7 @@ def test_parents_are_the_means_of_their_children():
 
 
 def test_every_node_but_a_root_has_one_parent():
-    octree = build_octree(*_cloud())
+    octree = _octree(*_cloud())
     last = octree.level_start[-2]
     assert octree.first_child[0] == octree.level_start[1]
     assert (np.diff(octree.first_child[: last + 1]) >= 1).all()
@@ -52,14 +46,14 @@ def test_every_node_but_a_root_has_one_parent():
 def test_shuffling_points_changes_no_bit(seed):
     points, colors = _cloud(2000)
     order = np.random.default_rng(seed).permutation(len(points))
-    a, b = build_octree(points, colors), build_octree(points[order], colors[order])
+    a, b = _octree(points, colors), _octree(points[order], colors[order])
     np.testing.assert_array_equal(a.nodes, b.nodes)
     np.testing.assert_array_equal(a.first_child, b.first_child)
 
 
 @pytest.mark.parametrize(("size", "level"), [(0.02, 7), (0.04, 6), (0.16, 4), (100.0, 0), (0.001, 7)])
 def test_level_is_the_nearest_in_size(size, level):
-    octree = build_octree(*_cloud())
+    octree = _octree(*_cloud())
     np.testing.assert_array_equal(
         octree.level(size), octree.nodes[octree.level_start[level] : octree.level_start[level + 1]]
     )

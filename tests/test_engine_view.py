@@ -25,7 +25,7 @@ KIND = ViewKind(num_rings=24, stats_rings=16, sigma_deg=22.0, voxel_per_range=1e
 @pytest.fixture(scope="module")
 def octree():
     cloud = rooms.room(1)[1]
-    return build_octree(cloud.points, cloud.colors)
+    return build_octree(cloud.voxels(np.eye(3)))
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rooms import room
 
-from piccolo.cloud.order import thin
+from piccolo.engine.octree import build_octree
 from piccolo.errors import InputError
 from piccolo.gravity import find_up, rotation_to_z_up
 from piccolo.pose import angle_between, exp_so3
@@ -16,8 +16,7 @@ DIRECTIONS = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda d: np.linalg.n
 
 
 def thinned(seed):
-    cloud = room(seed)[1]
-    return thin(cloud.points, cloud.colors, 0.07)[0]
+    return build_octree(room(seed)[1].voxels(np.eye(3))).level(0.08)[:, :3]
 
 
 def turned(points, w):

@@ -50,7 +50,7 @@ def test_same_bits_for_any_number_of_threads():
     one, two = (_localize(1, "clean", QUICK, n)[0] for n in (1, 2))
     np.testing.assert_array_equal(one.pose.center_world, two.pose.center_world)
     np.testing.assert_array_equal(one.pose.R_cam_from_world, two.pose.R_cam_from_world)
-    assert (one.loss, one.evidence, one.margin) == (two.loss, two.evidence, two.margin)
+    assert (one.loss, one.evidence, one.confidence) == (two.loss, two.evidence, two.confidence)
 
 
 @pytest.mark.parametrize("name", ["room 1", "black", "noise"])

@@ -4,36 +4,63 @@ import json
 import numpy as np
 import pytest
 
+from piccolo.certainty import Certainty
 from piccolo.errors import InputError
+from piccolo.hypotheses import Hypothesis
 from piccolo.pose import Pose, exp_so3
 from piccolo.result import Result
+from piccolo.verify import Evidence
 
+POSE = Pose(exp_so3(np.array([0.3, -0.2, 0.9])), np.array([500_000.123, 4_000_000.456, 12.0]))
+EVIDENCE = Evidence(0.7, 0.5, 0.8, 0.6, 0.7, 0.9, 0.01, 0.002, 0.001)
+RIVAL = Hypothesis(Pose(exp_so3(np.array([0.1, 0.2, -2.0])), np.array([1.0, 2.0, 3.0])), 0.2)
 RESULT = Result(
     status="localized",
+    confidence=0.99,
     cloud="a scan.ply",
     pano="b.jpg",
-    pose=Pose(exp_so3(np.array([0.3, -0.2, 0.9])), np.array([500_000.123, 4_000_000.456, 12.0])),
+    pose=POSE,
     loss=0.05,
-    score=0.7,
-    margin=0.5,
-    inlier_share=0.8,
-    inlier_residual=0.1,
+    evidence=EVIDENCE,
+    rivals=(RIVAL,),
+    certainty=Certainty(np.diag([1e-6, 1e-6, 1e-6, 4e-6, 9e-6, 16e-6]), "up and down"),
     seconds={"read": 0.1, "search": 0.2},
     settings={"preset": "paper", "seed": 0},
     warnings=("odd",),
 )
+WITHOUT_ARRAYS = {"pose": None, "rivals": (), "certainty": None}
 
 
 def test_json_round_trip_keeps_every_bit_of_the_pose():
     back = Result.from_json(RESULT.to_json())
     np.testing.assert_array_equal(back.pose.R_cam_from_world, RESULT.pose.R_cam_from_world)
     np.testing.assert_array_equal(back.pose.center_world, RESULT.pose.center_world)
-    assert dataclasses.replace(back, pose=None) == dataclasses.replace(RESULT, pose=None)
+    np.testing.assert_array_equal(back.rivals[0].pose.R_cam_from_world, RIVAL.pose.R_cam_from_world)
+    np.testing.assert_array_equal(back.certainty.covariance, RESULT.certainty.covariance)
+    assert (back.rivals[0].score, back.certainty.weakest_direction) == (0.2, "up and down")
+    plain = dataclasses.replace(RESULT, **WITHOUT_ARRAYS)
+    assert dataclasses.replace(back, **WITHOUT_ARRAYS) == plain
+
+
+def test_deviations_are_in_millimetres_and_degrees():
+    document = json.loads(RESULT.to_json())
+    assert document["std_mm"] == pytest.approx([2.0, 3.0, 4.0])
+    assert document["std_deg"] == pytest.approx([np.degrees(1e-3)] * 3)
+    assert "R_true = exp([w]x) R_cam_from_world" in document["covariance_convention"]
+
+
+def test_summary_says_what_a_person_asks_first():
+    text = dataclasses.replace(RESULT, status="ambiguous").summary()
+    assert "ambiguous at (500000.123, 4000000.456, 12.000) m" in text
+    assert "confidence 0.990" in text
+    assert "one sigma 4.0 mm (up and down)" in text
+    assert "or (1.000, 2.000, 3.000) m, score 0.20" in text
+    assert "or (" not in RESULT.summary()
 
 
 def test_json_names_what_the_next_tool_needs():
     document = json.loads(RESULT.to_json())
-    assert document["format"] == "piccolo-pose/1"
+    assert document["format"] == "piccolo-pose/2"
     T = np.array(document["T_world_from_cam"])
     np.testing.assert_allclose(T[:3, 3], RESULT.pose.center_world)
     np.testing.assert_allclose(T[:3, :3], np.array(document["R_cam_from_world"]).T)
@@ -41,9 +68,19 @@ def test_json_names_what_the_next_tool_needs():
 
 
 def test_result_without_a_pose():
-    none = dataclasses.replace(RESULT, status="not_localized", pose=None, loss=None, score=None, margin=None)
+    none = dataclasses.replace(RESULT, status="not_localized", loss=None, evidence=None, **WITHOUT_ARRAYS)
     assert json.loads(none.to_json())["T_world_from_cam"] is None
     assert Result.from_json(none.to_json()).pose is None
+
+
+def test_several_files_of_a_cloud_are_a_list():
+    several = dataclasses.replace(RESULT, cloud=("b.ply", "a.ply"), **WITHOUT_ARRAYS)
+    assert json.loads(several.to_json())["cloud"] == ["b.ply", "a.ply"]
+    assert Result.from_json(several.to_json()) == several
+    for cloud in (7, ["a", 7], None):
+        document = json.loads(several.to_json()) | {"cloud": cloud}
+        with pytest.raises(InputError, match="neither a path nor a list of paths"):
+            Result.from_json(json.dumps(document))
 
 
 def test_nan_is_never_written():
@@ -52,8 +89,8 @@ def test_nan_is_never_written():
 
 
 @pytest.mark.parametrize(
-    "text", ["{", "[]", "{}", '{"format": "piccolo-pose/2"}', '{"format": "piccolo-pose/1"}']
+    "text", ["{", "[]", "{}", '{"format": "piccolo-pose/1"}', '{"format": "piccolo-pose/2"}']
 )
 def test_other_text_is_refused(text):
-    with pytest.raises(InputError, match="piccolo-pose/1"):
+    with pytest.raises(InputError, match="piccolo-pose/2"):
         Result.from_json(text)

@@ -110,7 +110,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     arguments = build_parser().parse_args(argv)
 
-    def show(values: Iterator[Any], total: int, label: str) -> Iterator[Any]:
+    def show(values: Iterator[Any], total: int | None, label: str) -> Iterator[Any]:
         return iter(tqdm(values, label, total, leave=False, disable=arguments.quiet, file=sys.stderr))
 
     try:

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from command_line import add_cloud_options, cloud_settings_from, parse
 from piccolo.engine.map_file import save_map
 from piccolo.errors import InputError
 from piccolo.files import check_output
@@ -33,14 +34,15 @@ exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupte
 
 def prepare(arguments: argparse.Namespace) -> dict[str, object]:
     """Build and write the map; returns what was made."""
-    check_output(arguments.out, [arguments.cloud])
+    check_output(arguments.out, arguments.cloud)
 
-    def show(values: Iterator[Any], total: int, label: str) -> Iterator[Any]:
+    def show(values: Iterator[Any], total: int | None, label: str) -> Iterator[Any]:
         return iter(tqdm(values, label, total, leave=False, disable=arguments.quiet, file=sys.stderr))
 
     watch = Stopwatch()
     workers = Workers(num_cores(), show)
-    scan_map = open_map(arguments.cloud, arguments.scale, CachePolicy(is_used=False), workers, watch)
+    cloud_settings = cloud_settings_from(arguments)
+    scan_map = open_map(arguments.cloud, cloud_settings, CachePolicy(is_used=False), workers, watch)
     save_map(scan_map, arguments.out)
     return {
         "map": str(arguments.out),
@@ -56,12 +58,11 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--cloud", type=Path, required=True, help="coloured scan, as for localize.py")
+    add_cloud_options(parser, "coloured scan, as for localize.py")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the map")
-    parser.add_argument("--scale", type=float, default=1.0, help="metres per unit of the cloud (default 1)")
     parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    arguments = parser.parse_args(argv)
+    arguments = parse(parser, argv)
     try:
         print(json.dumps(prepare(arguments)))
     except KeyboardInterrupt:
@@ -77,7 +78,7 @@ def complain(arguments: argparse.Namespace, text: str, exit_code: int) -> int:
     """One line on stderr, the traceback if --debug; returns the exit code."""
     if arguments.debug:
         traceback.print_exc()
-    print(f"prepare_map.py: {text}", file=sys.stderr)
+    tqdm.write(f"prepare_map.py: {text}", file=sys.stderr)
     return exit_code
 
 

@@ -5,7 +5,6 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from piccolo.cloud import Cloud, clean, read_cloud
+from piccolo.cloud import CloudStream, read_cloud, stream_of
 from piccolo.cloud.raw import RawCloud
 from piccolo.engine.scan_map import prepare_map
 from piccolo.errors import InputError
@@ -49,9 +48,9 @@ exit codes: 0 no false answer, 1 some, 2 wrong usage, 3 bad input, 130 interrupt
 """
 
 
-def cloud_of(points: Points) -> Cloud:
+def cloud_of(points: Points) -> CloudStream:
     """Points as a file of them would be read."""
-    return clean(Path("trial"), RawCloud(points[0].astype(np.float64), points[1]), 1.0)
+    return stream_of(Path("trial"), RawCloud(points[0].astype(np.float64), points[1]))
 
 
 def as_panorama(rgb: np.ndarray[tuple[int, int, int], np.dtype[np.uint8]]) -> Panorama:
@@ -59,7 +58,7 @@ def as_panorama(rgb: np.ndarray[tuple[int, int, int], np.dtype[np.uint8]]) -> Pa
     return Panorama(rgb, np.ones(rgb.shape[:2], np.bool_))
 
 
-def scene_trials(folder: Path, others: Sequence[Path]) -> Iterator[tuple[Cloud, list[Trial]]]:
+def scene_trials(folder: Path, others: Sequence[Path]) -> Iterator[tuple[CloudStream, list[Trial]]]:
     """Every panorama of every scene in one scene's cloud; its own also spoilt, and in a thinned cloud."""
     cloud, truth = read_cloud(folder / "cloud.ply"), read_truth(folder / "queries.json")
     rng = np.random.default_rng([len(truth), 52])
@@ -75,13 +74,16 @@ def scene_trials(folder: Path, others: Sequence[Path]) -> Iterator[tuple[Cloud, 
         for other in others
         for path in sorted((other / "images").iterdir())
     ]
-    yield cloud, [*own, *elsewhere, *spoilt, *map(upside_down, upright)]
-    sparse = np.sort(rng.choice(len(cloud.points), int(SPARSE_SHARE * len(cloud.points)), replace=False))
-    thinned = replace(cloud, points=cloud.points[sparse], colors=cloud.colors[sparse])
+    points_world = cloud.points + cloud.origin_world
+    yield cloud_of((points_world, cloud.colors)), [*own, *elsewhere, *spoilt, *map(upside_down, upright)]
+    sparse = np.sort(rng.choice(len(points_world), int(SPARSE_SHARE * len(points_world)), replace=False))
+    thinned = cloud_of((points_world[sparse], cloud.colors[sparse]))
     yield thinned, [Trial("sparse", t.rgb, t.true_pose) for t in upright]
 
 
-def all_trials(arguments: argparse.Namespace, workers: Workers) -> Iterator[tuple[str, Cloud, list[Trial]]]:
+def all_trials(
+    arguments: argparse.Namespace, workers: Workers
+) -> Iterator[tuple[str, CloudStream, list[Trial]]]:
     """Name of a scene, its cloud, its trials."""
     for seed in range(*arguments.seeds):
         for points, trials in chain(room_trials(seed, workers), repeated_trials(seed, workers)):
@@ -92,10 +94,10 @@ def all_trials(arguments: argparse.Namespace, workers: Workers) -> Iterator[tupl
             yield folder.name, cloud, trials
 
 
-def localizer_of(cloud: Cloud, preset: str, workers: Workers) -> Callable[[Gravity], Localizer]:
+def localizer_of(cloud: CloudStream, preset: str, workers: Workers) -> Callable[[Gravity], Localizer]:
     """What prepares once and localizes with any gravity. The paper knows no `auto`: it is told `known`."""
     if preset == "paper":
-        paper_map = paper.prepare(cloud, PaperSettings())
+        paper_map = paper.prepare(cloud.read(), PaperSettings())
         return lambda gravity: PaperLocalizer(
             paper_map, PaperSettings(gravity="known" if gravity == "auto" else gravity), ()
         )

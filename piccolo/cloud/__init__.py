@@ -1,52 +1,55 @@
 """Point clouds: one reader a format, then the same checks and the same order for all."""
 
-import math
+from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from ..errors import InputError
-from .clean import clean
+from ..settings import IN_METRES, CloudSettings
+from ..threads import Show, unseen
 from .model import Cloud
 from .ply import PLY
-from .raw import HEAD_SIZE, Format, PointSource, RawCloud
+from .raw import HEAD_SIZE, Format, PointSource, ReadOptions
+from .stream import CloudStream, stream_of
 from .text import TEXT
 
-__all__ = ["Cloud", "clean", "read_cloud"]
+__all__ = ["Cloud", "CloudStream", "open_cloud", "read_cloud", "stream_of"]
 
 FORMATS = (PLY, TEXT)
 WANTED = f"wanted a coloured point cloud: {', '.join(f.name for f in FORMATS)}"
 
 
-def read_cloud(path: Path, scale: float = 1.0) -> Cloud:
-    """The coloured cloud in a file, checked, in metres, in canonical order.
-
-    The file's coordinates are multiplied by `scale`; the middle of their bounding box, rounded to whole
-    metres, becomes `origin_world` and is subtracted in float64. This is done for every cloud, so that UTM
-    coordinates and a room at the origin take the same path.
+def open_cloud(
+    paths: Sequence[Path], settings: CloudSettings = IN_METRES, show: Show = unseen
+) -> CloudStream:
+    """The coloured cloud in one or several files, before its points are read.
 
     Raises
     ------
     InputError
-        The file is missing, damaged, has no colours or fewer than 1,000 finite points, or is no format
-        that is read here.
+        A file is missing, has a damaged header, no colours, or is no format that is read here. Reading the
+        points raises it where the data break or fail the checks of `clean.Census`.
     """
-    path = Path(path)
-    if not (math.isfinite(scale) and scale > 0.0):
-        raise InputError(f"--scale: found {scale}, wanted a number above 0 (metres a unit of the file)")
+    options = ReadOptions(settings.intensity_as_gray)
+    sources = [open_source(path, options) for path in sorted(paths)]
+    return CloudStream(sources, settings.scale, show)
+
+
+def read_cloud(path: Path, settings: CloudSettings = IN_METRES) -> Cloud:
+    """The coloured cloud in a file, checked, in metres, in canonical order.
+
+    The file's coordinates are multiplied by the scale; the middle of their bounding box, rounded to whole
+    metres, becomes `origin_world` and is subtracted in float64. This is done for every cloud, so that UTM
+    coordinates and a room at the origin take the same path. InputError as by open_cloud.
+    """
+    return open_cloud([path], settings).read()
+
+
+def open_source(path: Path, options: ReadOptions) -> PointSource:
+    """The points of a file in any format that is read here."""
     try:
-        source = open_source(path)
-        chunks = [RawCloud(np.empty((0, 3)), np.empty((0, 3), np.uint8)), *source.read_chunks()]
+        return _format_of(path).open_source(path, options)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}), {WANTED}") from error
-    points_world = np.concatenate([chunk.points_world for chunk in chunks])
-    raw = RawCloud(points_world, np.concatenate([chunk.colors for chunk in chunks]))
-    return clean(path, raw, scale)
-
-
-def open_source(path: Path) -> PointSource:
-    """The points of a file in any format that is read here."""
-    return _format_of(path).open_source(path)
 
 
 def _format_of(path: Path) -> Format:

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .voxels import Voxels, VoxelTable, turned
+
 
 @dataclass(frozen=True)
 class Cloud:
@@ -15,3 +17,10 @@ class Cloud:
     origin_world: NDArray[np.float64]  # (3,) what was subtracted from the file's coordinates [m]
     num_dropped: int = 0  # points with NaN or infinite coordinates, left out
     warnings: tuple[str, ...] = ()  # one line each, for the user
+
+    def voxels(self, R_map_from_world: NDArray[np.float64]) -> Voxels:
+        """The points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
+        table = VoxelTable("cloud")
+        table.add(turned(self.points + self.origin_world, R_map_from_world), self.colors)
+        voxels = table.finish()
+        return Voxels(voxels.codes, voxels.nodes, voxels.origin, self.warnings + voxels.warnings)

@@ -1,9 +1,8 @@
-"""The canonical order of points along Morton's curve, and thinning to one point a voxel."""
+"""The canonical order of points along Morton's curve."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
 from ..jit import kernel, scalar
 
 NUM_CELLS = 1 << 21  # along an axis; three axes fill 63 bits
@@ -27,25 +26,6 @@ def interleave(cells, codes):
         codes[i] = (
             spread_bits(cells[i, 0]) | (spread_bits(cells[i, 1]) << 1) | (spread_bits(cells[i, 2]) << 2)
         )
-
-
-@kernel
-def voxel_sums(points, colors, order, begins, positions, color_sums):
-    """Sum positions (M, 3) float64 and colours (M, 3) int64 of each run of `order`; begins (M + 1,)."""
-    for m in range(len(begins) - 1):
-        # typed, so that they don't shrink to float32 and uint8 when run without Numba
-        x, y, z = np.float64(0.0), np.float64(0.0), np.float64(0.0)
-        red, green, blue = np.int64(0), np.int64(0), np.int64(0)
-        for k in range(begins[m], begins[m + 1]):
-            i = order[k]
-            x += points[i, 0]
-            y += points[i, 1]
-            z += points[i, 2]
-            red += colors[i, 0]
-            green += colors[i, 1]
-            blue += colors[i, 2]
-        positions[m, 0], positions[m, 1], positions[m, 2] = x, y, z
-        color_sums[m, 0], color_sums[m, 1], color_sums[m, 2] = red, green, blue
 
 
 def morton_codes(cells: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -89,32 +69,3 @@ def _settle_ties(
     tied = order[places]
     keys = [*colors[tied].T[::-1], *points[tied].T[::-1], codes[places]]  # lexsort's last key counts first
     order[places] = tied[np.lexsort(keys)]
-
-
-def thin(
-    points: NDArray[np.float32], colors: NDArray[np.uint8], voxel_size: float
-) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """One point a voxel: mean position (M, 3) and mean colour (M, 3), in Morton order.
-
-    Points (N, 3) and colours (N, 3) come in canonical order, as a `Cloud` holds them: the float64 sums run in
-    that order, so that the means' bits are the cloud's alone. Voxels are cubes of `voxel_size` [m] with a
-    corner at the local origin.
-    """
-    cells = np.floor(points / np.float64(voxel_size)).astype(np.int64)
-    cells -= cells.min(axis=0)
-    if int(cells.max()) >= NUM_CELLS:
-        raise InputError(
-            f"cloud: spans {cells.max() * voxel_size:.3g} m, wanted under {NUM_CELLS * voxel_size:.3g} m for "
-            f"voxels of {voxel_size:g} m; remove far outliers or set --scale"
-        )
-    codes = morton_codes(cells)
-    order = np.argsort(codes, kind="stable")
-    codes = codes[order]
-    begins = np.flatnonzero(np.concatenate([[True], codes[1:] != codes[:-1], [True]]))
-    num_voxels = len(begins) - 1
-    positions = np.empty((num_voxels, 3))
-    color_sums = np.empty((num_voxels, 3), dtype=np.int64)
-    voxel_sums(points, colors, order, begins, positions, color_sums)
-    counts = np.diff(begins)[:, None]
-    means = (2 * color_sums + counts) // (2 * counts)  # rounded half up, in integers
-    return (positions / counts).astype(np.float32), means.astype(np.uint8)

@@ -5,6 +5,7 @@ promises, and read ASCII and lists line by line in Python, so the numbers are re
 """
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -14,8 +15,10 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from ..errors import InputError
-from .raw import Format, PointSource, RawCloud
-from .rows import NOT_A_NUMBER, PARSED, SPACE, TOO_FEW, TOO_MANY, parse_rows
+from .intensity import INTENSITY_NAMES, OPTION, Measured, in_gray
+from .lines import LineReader
+from .raw import CHUNK, PLAIN, Format, PointSource, RawCloud, ReadOptions
+from .rows import NOT_A_NUMBER, SPACE, TOO_FEW, TOO_MANY
 from .text import quoted
 
 MAX_HEADER_SIZE = 1 << 20  # [byte]
@@ -44,17 +47,26 @@ class Header:
     size: int  # [byte], the data begin here
 
 
-def open_ply(path: Path) -> PointSource:
-    """The vertices of a PLY file; see read_ply."""
-    return PointSource(path, lambda: iter([read_ply(path)]))
+@dataclass(frozen=True)
+class Vertices:
+    """The vertices of a PLY file, and the properties that are wanted of them."""
+
+    header: Header
+    index: int  # of the element
+    names: tuple[str, ...]  # x y z and three colours, or x y z and intensity
+
+    @property
+    def element(self) -> PlyElement:
+        """The element in the header."""
+        return self.header.elements[self.index]
+
+    @property
+    def types(self) -> list[str]:
+        """The properties' types."""
+        return [self.element.ply_property(name).val_dtype for name in self.names]
 
 
-def has_ply_magic(head: bytes) -> bool:
-    """True if a file that begins with the bytes `head` says it is PLY."""
-    return head.startswith((b"ply\n", b"ply\r"))
-
-
-def read_ply(path: Path) -> RawCloud:
+def open_ply(path: Path, options: ReadOptions = PLAIN) -> PointSource:
     """The vertices of a PLY file, binary or ASCII.
 
     Colours are uchar 0-255, ushort 0-65535, or float and double 0-1. Other properties and elements are left
@@ -62,15 +74,38 @@ def read_ply(path: Path) -> RawCloud:
     """
     header = _read_header(path)
     index = _vertex_index(header)
-    names = _property_names(header, header.elements[index])
-    columns = (_ascii_columns if header.is_ascii else _binary_columns)(header, index, names)
-    types = [header.elements[index].ply_property(name).val_dtype for name in names]
-    points = np.stack(columns[:3], axis=1, dtype=np.float64)
-    is_finite: NDArray[np.bool_] = np.all(np.isfinite(points), axis=1)
-    colors = [
-        _color(path, column, type_, is_finite) for column, type_ in zip(columns[3:], types[3:], strict=True)
-    ]
-    return RawCloud(points, np.stack(colors, axis=1))
+    vertices = Vertices(header, index, _property_names(header, index, options))
+    count = header.counts[index]
+    if not header.is_ascii:
+        _rows_of(vertices)
+    if len(vertices.names) > 4:
+        return PointSource(path, lambda: _read_colored(vertices), count)
+    return PointSource(path, in_gray(path, lambda: _read_measured(vertices)), count)
+
+
+def has_ply_magic(head: bytes) -> bool:
+    """True if a file that begins with the bytes `head` says it is PLY."""
+    return head.startswith((b"ply\n", b"ply\r"))
+
+
+def _read_columns(vertices: Vertices) -> Iterator[list[NDArray[np.generic]]]:
+    return (_read_ascii if vertices.header.is_ascii else _read_binary)(vertices)
+
+
+def _read_colored(vertices: Vertices) -> Iterator[RawCloud]:
+    for columns in _read_columns(vertices):
+        points = np.stack(columns[:3], axis=1, dtype=np.float64)
+        is_finite: NDArray[np.bool_] = np.all(np.isfinite(points), axis=1)
+        colors = [
+            _color(vertices.header.path, column, type_, is_finite)
+            for column, type_ in zip(columns[3:], vertices.types[3:], strict=True)
+        ]
+        yield RawCloud(points, np.stack(colors, axis=1))
+
+
+def _read_measured(vertices: Vertices) -> Iterator[Measured]:
+    for columns in _read_columns(vertices):
+        yield np.stack(columns[:3], axis=1, dtype=np.float64), columns[3].astype(np.float64)
 
 
 def _read_header(path: Path) -> Header:
@@ -114,22 +149,29 @@ def _vertex_index(header: Header) -> int:
     return index
 
 
-def _property_names(header: Header, vertex: PlyElement) -> list[str]:
-    """The vertices' properties for x, y, z, red, green, blue."""
-    found = {prop.name: prop.val_dtype for prop in vertex.properties}
-    names = next((names for names in COLOR_NAMES if all(name in found for name in names)), None)
-    if not all(axis in found for axis in "xyz") or names is None:
+def _property_names(header: Header, index: int, options: ReadOptions) -> tuple[str, ...]:
+    """The vertices' properties for x, y, z, red, green, blue, or for x, y, z, intensity."""
+    found = {prop.name: prop.val_dtype for prop in header.elements[index].properties}
+    names = next((names for names in COLOR_NAMES if all(name in found for name in names)), ())
+    intensity = next((name for name in found if name.lower() in INTENSITY_NAMES), None)
+    if not all(axis in found for axis in "xyz") or not (names or intensity):
         kind = "Gaussian splats without red green blue, " if "f_dc_0" in found else ""
         raise InputError(
             f"{header.path}: {kind}the vertices have {' '.join(list(found)[:9]) or 'no properties'}, {WANTED}"
         )
+    if intensity and not names:
+        if not options.intensity_as_gray:
+            raise InputError(
+                f"{header.path}: the vertices have {intensity} and no colours, {WANTED}; {OPTION}"
+            )
+        return (*"xyz", intensity)
     for name in names:
         if found[name] not in BRIGHTEST:
             raise InputError(
                 f"{header.path}: '{name}' is of type {found[name]}, "
                 "wanted uchar 0-255, ushort 0-65535 or float 0-1"
             )
-    return [*"xyz", *names]
+    return (*"xyz", *names)
 
 
 def _check_size(header: Header, index: int, offset: int, row_size: int) -> int:
@@ -143,43 +185,57 @@ def _check_size(header: Header, index: int, offset: int, row_size: int) -> int:
     return count
 
 
-def _binary_columns(header: Header, index: int, names: list[str]) -> list[NDArray[np.generic]]:
+def _rows_of(vertices: Vertices) -> tuple[int, int, np.dtype[np.void]]:
+    """Where the rows of a binary file begin [byte], how many there are, and what is in one."""
+    header, index = vertices.header, vertices.index
     before = zip(header.elements[:index], header.counts, strict=False)
     offset = header.size + sum(count * element.dtype().itemsize for element, count in before)
-    dtype = header.elements[index].dtype(header.byte_order)
-    count = _check_size(header, index, offset, dtype.itemsize)
-    if count == 0:
-        return [np.empty(0, dtype=dtype[name]) for name in names]
-    vertices = np.memmap(header.path, dtype=dtype, mode="r", offset=offset, shape=(count,))
-    return [np.asarray(vertices[name]) for name in names]
+    dtype = vertices.element.dtype(header.byte_order)
+    return offset, _check_size(header, index, offset, dtype.itemsize), dtype
 
 
-def _ascii_columns(header: Header, index: int, names: list[str]) -> list[NDArray[np.generic]]:
-    data = np.asarray(np.memmap(header.path, dtype=np.uint8, mode="r"))
-    offset = header.size
+def _read_binary(vertices: Vertices) -> Iterator[list[NDArray[np.generic]]]:
+    """Yield the columns of up to CHUNK vertices. Not by a map of the file, which a cut would turn deadly."""
+    path = vertices.header.path
+    offset, count, dtype = _rows_of(vertices)
+    with path.open("rb") as file:
+        file.seek(offset)
+        for begin in range(0, count, CHUNK):
+            rows = np.empty(min(CHUNK, count - begin), dtype)
+            if file.readinto(rows.view(np.uint8).data) < rows.nbytes:
+                raise InputError(f"{path}: became shorter while it was read, wanted a whole file")
+            yield [rows[name] for name in vertices.names]
+
+
+def _read_ascii(vertices: Vertices) -> Iterator[list[NDArray[np.generic]]]:
+    """Yield the columns of up to CHUNK vertices."""
+    header, index = vertices.header, vertices.index
+    reader = LineReader(header.path, header.size)
     for element, count in zip(header.elements[:index], header.counts, strict=False):
-        _, _, offset, _ = parse_rows(
-            data, offset, SPACE, np.full(len(element.properties), -1), True, np.empty((count, 0))
-        )
-    properties = [prop.name for prop in header.elements[index].properties]
+        passed_over = np.full(len(element.properties), -1)
+        reader.read(SPACE, passed_over, True, np.empty((count, 0)))
+    properties = [prop.name for prop in vertices.element.properties]
     # a digit and a separator a number; the last line may have no end
-    count = _check_size(header, index, offset - 1, 2 * len(properties))
+    count = _check_size(header, index, reader.offset - 1, 2 * len(properties))
+    names = vertices.names
     targets = np.array([names.index(name) if name in names else -1 for name in properties])
-    rows = np.empty((count, len(names)))
-    num_rows, num_lines, position, status = parse_rows(data, offset, SPACE, targets, True, rows)
-    if status != PARSED:
-        what = {
-            NOT_A_NUMBER: "is not all numbers",
-            TOO_FEW: f"has fewer than {len(properties)} numbers",
-            TOO_MANY: f"has more than {len(properties)} numbers",
-        }[status]
-        line = bytes(data[position : position + 400])
-        raise InputError(f"{header.path}: line {num_lines} after the header {what}: {quoted(line)}, {WANTED}")
-    if num_rows < count:
-        raise InputError(
-            f"{header.path}: the header promises {count} vertices, found {num_rows}; the file is cut off"
-        )
-    return list(rows.T)
+    for begin in range(0, count, CHUNK):
+        rows = np.empty((min(CHUNK, count - begin), len(names)))
+        num_rows, status = reader.read(SPACE, targets, True, rows)
+        if num_rows < len(rows):
+            raise InputError(f"{header.path}: {_complaint(reader, status, len(properties), count)}")
+        yield list(rows.T)
+
+
+def _complaint(reader: LineReader, status: int, num_wanted: int, count: int) -> str:
+    what = {
+        NOT_A_NUMBER: "is not all numbers",
+        TOO_FEW: f"has fewer than {num_wanted} numbers",
+        TOO_MANY: f"has more than {num_wanted} numbers",
+    }.get(status)
+    if what is None:
+        return f"the header promises {count} vertices, found fewer; the file is cut off"
+    return f"line {reader.num_lines} after the header {what}: {quoted(reader.line())}, {WANTED}"
 
 
 def _color(

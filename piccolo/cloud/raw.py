@@ -11,6 +11,16 @@ CHUNK = 1 << 20  # points that a reader hands on at once, at most
 
 
 @dataclass(frozen=True)
+class ReadOptions:
+    """What the user wants of a reader."""
+
+    intensity_as_gray: bool = False  # take intensity for a gray where a file has no colours
+
+
+PLAIN = ReadOptions()
+
+
+@dataclass(frozen=True)
 class RawCloud:
     """Points in the file's order and unit, not yet checked."""
 
@@ -35,7 +45,7 @@ class Format:
     name: str
     suffixes: frozenset[str]  # lower case, with the dot
     has_magic: Callable[[bytes], bool]  # of a file's first HEAD_SIZE bytes; content goes before names
-    open_source: Callable[[Path], PointSource]
+    open_source: Callable[[Path, ReadOptions], PointSource]
 
 
 HEAD_SIZE = 512  # [byte]

@@ -1,5 +1,6 @@
 """Text files of lines x y z r g b."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -7,12 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .raw import Format, PointSource, RawCloud
-from .rows import NOT_A_NUMBER, SPACE, TOO_FEW, parse_rows
+from .intensity import INTENSITY_NAMES, OPTION, Measured, in_gray
+from .lines import LineReader
+from .raw import CHUNK, PLAIN, Format, PointSource, RawCloud, ReadOptions
+from .rows import NOT_A_NUMBER, PARSED, SPACE, TOO_FEW
 
 TEXT_SUFFIXES = frozenset({".txt", ".xyz", ".asc", ".csv", ".xyzrgb", ".pts"})
 COLUMN_NAMES = ("xyzrgb", ("x", "y", "z", "red", "green", "blue"))
 PTS_COLUMNS = (0, 1, 2, 4, 5, 6)  # x y z intensity r g b
+NUM_WITH_INTENSITY = 4  # columns: x y z intensity
 HEAD_SIZE = 1 << 16  # bytes in which the header is looked for
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 WANTED = "wanted lines of numbers x y z r g b, colours 0-255"
@@ -25,34 +29,51 @@ class Layout:
     start: int  # [byte] of the first line of numbers
     num_lines: int  # lines before it
     separator: int  # byte between fields
-    columns: tuple[int, ...]  # the fields of x, y, z, r, g, b
+    columns: tuple[int, ...]  # the fields of x, y, z and r, g, b, or x, y, z and intensity
 
 
-def read_text(path: Path) -> RawCloud:
+def open_text(path: Path, options: ReadOptions = PLAIN) -> PointSource:
     """The points of a text file: whitespace, comma or semicolon between numbers, colours 0-255.
 
-    A header line is passed over, or obeyed if it names x y z and r g b (or red green blue). Without one the
-    first six columns count; in a .pts file with seven or more, the fourth is intensity.
+    A header line is passed over, or obeyed if it names x y z and r g b (or red green blue), or x y z and an
+    intensity. Without one the first six columns count; in a .pts file with seven or more, the fourth is
+    intensity. So is the last of four columns.
     """
-    data = np.asarray(np.memmap(path, dtype=np.uint8, mode="r"))
-    layout = _layout(path, bytes(data[:HEAD_SIZE]))
+    with path.open("rb") as file:
+        layout = _layout(path, file.read(HEAD_SIZE))
+    if len(layout.columns) > NUM_WITH_INTENSITY:
+        return PointSource(path, lambda: _read_colored(path, layout))
+    if not options.intensity_as_gray:
+        raise InputError(f"{path}: has intensity and no colours, {WANTED}; {OPTION}")
+    return PointSource(path, in_gray(path, lambda: _read_measured(path, layout)))
+
+
+def _read_rows(path: Path, layout: Layout) -> Iterator[NDArray[np.float64]]:
+    """Yield the wanted columns (N, C)."""
     targets = np.full(max(layout.columns) + 1, -1)
-    targets[list(layout.columns)] = np.arange(6)
-    rows = np.empty((_max_rows(data, layout), 6))
-    num_rows, num_lines, position, status = parse_rows(
-        data, layout.start, layout.separator, targets, False, rows
-    )
-    if status < 0:
-        line = bytes(data[position : position + 400])
-        raise InputError(f"{path}: {_complaint(layout.num_lines + num_lines, line, status, len(targets))}")
-    rows = rows[:num_rows]
-    _check_colors(path, data, layout, rows)
-    return RawCloud(np.ascontiguousarray(rows[:, :3]), np.rint(np.nan_to_num(rows[:, 3:])).astype(np.uint8))
+    targets[list(layout.columns)] = np.arange(len(layout.columns))
+    reader = LineReader(path, layout.start)
+    num_rows = CHUNK
+    while num_rows == CHUNK:
+        rows = np.empty((CHUNK, len(layout.columns)))
+        num_rows, status = reader.read(layout.separator, targets, False, rows)
+        if status != PARSED:
+            line_number = layout.num_lines + reader.num_lines
+            raise InputError(f"{path}: {_complaint(line_number, reader.line(), status, len(targets))}")
+        yield rows[:num_rows]
 
 
-def open_text(path: Path) -> PointSource:
-    """The points of a text file; see read_text."""
-    return PointSource(path, lambda: iter([read_text(path)]))
+def _read_colored(path: Path, layout: Layout) -> Iterator[RawCloud]:
+    num_before = 0
+    for rows in _read_rows(path, layout):
+        _check_colors(path, layout, rows, num_before)
+        num_before += len(rows)
+        yield RawCloud(np.ascontiguousarray(rows[:, :3]), np.rint(rows[:, 3:]).astype(np.uint8))
+
+
+def _read_measured(path: Path, layout: Layout) -> Iterator[Measured]:
+    for rows in _read_rows(path, layout):
+        yield np.ascontiguousarray(rows[:, :3]), rows[:, 3]
 
 
 def quoted(line: bytes) -> str:
@@ -67,15 +88,6 @@ def _complaint(line_number: int, line: bytes, status: int, num_wanted: int) -> s
         TOO_FEW: f"has fewer than {num_wanted} columns",
     }[status]
     return f"line {line_number} {what}: {quoted(line)}, {WANTED}"
-
-
-def _max_rows(data: NDArray[np.uint8], layout: Layout) -> int:
-    """No fewer rows than there are: a line end closes each but the last, and six fields take 12 bytes."""
-    num_ends = sum(
-        int(np.count_nonzero((block == ord("\n")) | (block == ord("\r"))))
-        for block in np.array_split(data[layout.start :], 1 + len(data) // (1 << 24))
-    )
-    return min(num_ends, len(data) // 12) + 1
 
 
 def _layout(path: Path, head: bytes) -> Layout:
@@ -104,6 +116,8 @@ def _layout(path: Path, head: bytes) -> Layout:
 
 
 def _usual_columns(path: Path, num_fields: int) -> tuple[int, ...]:
+    if num_fields == NUM_WITH_INTENSITY:
+        return (0, 1, 2, 3)
     if path.suffix.lower() == ".pts" and num_fields > 6:
         return PTS_COLUMNS
     return (0, 1, 2, 3, 4, 5)
@@ -133,15 +147,16 @@ def _is_number(field: str) -> bool:
 
 
 def _named_columns(header: str) -> tuple[int, ...] | None:
-    """The fields of x, y, z, r, g, b in a header line that names them all, else None."""
+    """The fields of x, y, z and r, g, b, or of x, y, z and intensity, if a header line names them."""
     names = [name.strip(' "').lower() for name in _fields(header.lstrip("#/ "))]
-    for wanted in COLUMN_NAMES:
+    with_intensity = (("x", "y", "z", name) for name in sorted(INTENSITY_NAMES))
+    for wanted in (*COLUMN_NAMES, *with_intensity):
         if all(names.count(name) == 1 for name in wanted):
             return tuple(names.index(name) for name in wanted)
     return None
 
 
-def _check_colors(path: Path, data: NDArray[np.uint8], layout: Layout, rows: NDArray[np.float64]) -> None:
+def _check_colors(path: Path, layout: Layout, rows: NDArray[np.float64], num_before: int) -> None:
     """Refuse a colour outside 0-255 in `rows` (N, 6), naming its line; black out those without a position."""
     rows[~np.isfinite(rows[:, :3]).all(axis=1), 3:] = 0.0
     colors = rows[:, 3:]
@@ -149,12 +164,10 @@ def _check_colors(path: Path, data: NDArray[np.uint8], layout: Layout, rows: NDA
     if not is_wrong.any():
         return
     first = int(np.argmax(is_wrong))
-    targets = np.empty(0, dtype=np.int64)
-    _, num_lines, _, _ = parse_rows(
-        data, layout.start, layout.separator, targets, False, np.empty((first + 1, 0))
-    )
+    reader = LineReader(path, layout.start)
+    reader.read(layout.separator, np.empty(0, np.int64), False, np.empty((num_before + first + 1, 0)))
     found = " ".join(f"{value:g}" for value in colors[first])
-    raise InputError(f"{path}: line {layout.num_lines + num_lines} has the colour {found}, {WANTED}")
+    raise InputError(f"{path}: line {layout.num_lines + reader.num_lines} has the colour {found}, {WANTED}")
 
 
 TEXT = Format("text x y z r g b", TEXT_SUFFIXES, lambda head: False, open_text)

@@ -6,7 +6,7 @@ is never trusted: it is made anew.
 
 import hashlib
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 
@@ -15,6 +15,7 @@ import numpy as np
 from ..errors import InputError
 from ..files import replacing
 from ..jit import SOURCE_DIGEST, cache_root, remove_stale
+from ..settings import CloudSettings
 from ..stopwatch import Stopwatch
 from .octree import Octree
 from .scan_map import ScanMap
@@ -66,12 +67,16 @@ def load_map(path: Path) -> ScanMap:
         raise InputError(f"{path}: found {error}, wanted a whole map by tools/prepare_map.py") from error
 
 
-def content_key(path: Path, scale: float) -> str:
-    """Name for the map of a cloud file: by its content and scale, wherever it lies."""
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256")
-    digest.update(f"{FORMAT} {SOURCE_DIGEST} {scale!r}".encode())
+def content_key(paths: Sequence[Path], settings: CloudSettings) -> str:
+    """Name for the map of a cloud's files: by what is in them and the settings, wherever they lie."""
+    digests = sorted(_file_digest(path) for path in paths)
+    digest = hashlib.sha256(" ".join([FORMAT, SOURCE_DIGEST, repr(settings), *digests]).encode())
     return digest.hexdigest()[:32]
+
+
+def _file_digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def cached_map(folder: Path | None, key: str, build: Callable[[], ScanMap], watch: Stopwatch) -> ScanMap:

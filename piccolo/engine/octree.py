@@ -5,11 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cloud.order import spread_bits
+from ..cloud.voxels import COARSEST, LEAF_SIZE, Voxels
 from ..jit import kernel
 
-NUM_LEVELS = 8  # from 128 leaves wide (2.56 m) down to one
-QUANTUM = 2.0**-14  # [m] positions are summed as integers: no order of the points changes a bit
+NUM_LEVELS = COARSEST.bit_length()  # from 128 leaves wide (2.56 m) down to one
 
 
 @dataclass(frozen=True)
@@ -29,48 +28,6 @@ class Octree:
         """The nodes of the level whose voxels are nearest to `size` [m]."""
         level = NUM_LEVELS - 1 - int(np.clip(np.rint(np.log2(size / self.leaf_size)), 0, NUM_LEVELS - 1))
         return self.nodes[self.level_start[level] : self.level_start[level + 1]]
-
-
-@kernel
-def voxel_codes(xyz, origin, size, codes):
-    """Write the Morton code of the voxel of each point (N, 3)."""
-    for i in range(len(xyz)):
-        a = spread_bits(np.int64((xyz[i, 0] - origin[0]) / size))
-        b = spread_bits(np.int64((xyz[i, 1] - origin[1]) / size))
-        c = spread_bits(np.int64((xyz[i, 2] - origin[2]) / size))
-        codes[i] = a | (b << 1) | (c << 2)
-
-
-@kernel
-def average_points(xyz, rgb, order, codes, origin, nodes, node_codes):
-    """Write the mean of the points of each voxel, return how many; `order` sorts the points by `codes`."""
-    count = -1
-    n = len(order)
-    lo = 0
-    while lo < n:
-        hi = lo
-        sx = sy = sz = np.int64(0)
-        sr = sg = sb = np.int64(0)
-        while hi < n and codes[hi] == codes[lo]:
-            i = order[hi]
-            sx += np.int64((xyz[i, 0] - origin[0]) / QUANTUM)
-            sy += np.int64((xyz[i, 1] - origin[1]) / QUANTUM)
-            sz += np.int64((xyz[i, 2] - origin[2]) / QUANTUM)
-            sr += rgb[i, 0]
-            sg += rgb[i, 1]
-            sb += rgb[i, 2]
-            hi += 1
-        count += 1
-        per = 1.0 / (hi - lo)
-        nodes[count, 0] = origin[0] + sx * per * QUANTUM
-        nodes[count, 1] = origin[1] + sy * per * QUANTUM
-        nodes[count, 2] = origin[2] + sz * per * QUANTUM
-        nodes[count, 3] = sr * per / 255.0
-        nodes[count, 4] = sg * per / 255.0
-        nodes[count, 5] = sb * per / 255.0
-        node_codes[count] = codes[lo]
-        lo = hi
-    return count + 1
 
 
 @kernel
@@ -105,15 +62,9 @@ def average_children(child_nodes, child_codes, nodes, codes, first_child):
     return count
 
 
-def build_octree(xyz: NDArray[np.float32], rgb: NDArray[np.uint8], leaf_size: float = 0.02) -> Octree:
-    """Octree of finite points (N, 3) [m] with colours (N, 3); the order of the points changes no bit."""
-    origin = np.floor(xyz.min(axis=0).astype(np.float64)) - 1.0
-    codes = np.empty(len(xyz), np.int64)
-    voxel_codes(xyz, origin, leaf_size, codes)
-    order = np.argsort(codes)
-    nodes, node_codes = np.empty((len(xyz), 6), np.float32), np.empty(len(xyz), np.int64)
-    count = average_points(xyz, rgb, order, codes[order], origin, nodes, node_codes)
-    nodes, node_codes = nodes[:count].copy(), node_codes[:count].copy()
+def build_octree(voxels: Voxels) -> Octree:
+    """The octree whose leaves are the voxels."""
+    nodes, node_codes = voxels.nodes, voxels.codes
     levels, children = [nodes], [np.zeros(len(nodes), np.int32)]
     for _ in range(NUM_LEVELS - 1):
         parents, parent_codes = np.empty_like(nodes), np.empty_like(node_codes)
@@ -126,5 +77,5 @@ def build_octree(xyz: NDArray[np.float32], rgb: NDArray[np.uint8], leaf_size: fl
     first_child = np.concatenate([c + s for c, s in zip(children[:-1], start[1:-1], strict=True)])
     leaves = np.full(len(levels[-1]) + 1, start[-1], np.int32)
     return Octree(
-        np.concatenate(levels), np.concatenate([first_child, leaves]).astype(np.int32), start, leaf_size
+        np.concatenate(levels), np.concatenate([first_child, leaves]).astype(np.int32), start, LEAF_SIZE
     )

@@ -2,14 +2,17 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cloud.model import Cloud
 from ..cloud.packed import PackedPoints, pack_points
+from ..cloud.voxels import Voxels
 from ..gravity import find_up, rotation_to_z_up
 from ..pose import Array, Pose
+from ..settings import UpAxis
+from ..stopwatch import Stopwatch
 from ..threads import Workers
 from .candidates import BLOCK, COARSE_SPACING, candidate_centers
 from .octree import Octree, build_octree
@@ -29,7 +32,7 @@ class ScanMap:
 
     octree: Octree
     R_map_from_world: Array  # (3, 3), identity where the cloud's z is up
-    origin_world: Array  # (3,) [m]
+    origin_world: Array  # (3,) [m] middle of the leaves' box, in whole metres along the map's axes
     centers: NDArray[np.float64]  # (candidates, 3) [m]
     offsets: NDArray[np.int16]  # (candidates, 3, cells) from the centre to what is seen, in units of
     offset_unit: NDArray[np.float32]  # (candidates,) [m]
@@ -111,21 +114,59 @@ def level_out(octree: Octree) -> tuple[Array, tuple[str, ...]]:
     return rotation_to_z_up(up.direction_world), (text,)
 
 
-def prepare_map(cloud: Cloud, workers: Workers) -> ScanMap:
+class Voxelized(Protocol):
+    """A cloud in memory, or in files that are read anew."""
+
+    def voxels(self, R_map_from_world: Array) -> Voxels:
+        """Its points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
+
+
+@dataclass(frozen=True)
+class Levelled:
+    """A cloud as an octree with z up; the other fields as in ScanMap."""
+
+    octree: Octree
+    R_map_from_world: Array
+    origin_world: Array
+    warnings: tuple[str, ...]
+
+
+def level(cloud: Voxelized, up: UpAxis) -> Levelled:
+    """A cloud whose axis `up` points up, as octree; `auto` asks the cloud, and reads a tilted one anew."""
+    more: tuple[str, ...] = ()
+    R_map_from_world = np.eye(3)
+    if up != "auto":
+        axis = (-1.0 if up.startswith("-") else 1.0) * np.eye(3)["xyz".index(up[-1])]
+        R_map_from_world = np.round(rotation_to_z_up(axis)) + 0.0
+    voxels = cloud.voxels(R_map_from_world)
+    octree = build_octree(voxels)
+    if up == "auto":
+        R_map_from_world, more = level_out(octree)
+        if more:
+            del voxels, octree  # their room is needed
+            voxels = cloud.voxels(R_map_from_world)
+            octree = build_octree(voxels)
+    origin_world = R_map_from_world.T @ voxels.origin
+    return Levelled(octree, R_map_from_world, origin_world, voxels.warnings + more)
+
+
+def prepare_map(
+    cloud: Voxelized, workers: Workers, up: UpAxis = "auto", watch: Stopwatch | None = None
+) -> ScanMap:
     """Everything about a cloud that does not depend on the panorama."""
-    octree = build_octree(cloud.points, cloud.colors)
-    R_map_from_world, warnings = level_out(octree)
-    if warnings:
-        turned = (cloud.points @ R_map_from_world.T).astype(np.float32)
-        octree = build_octree(turned, cloud.colors)
-    centers = candidate_centers(octree, workers)
-    offsets, unit, levels, is_seen = render_candidates(octree, centers, workers)
-    _, sparse = np.unique(np.floor(centers / COARSE_SPACING), axis=0, return_index=True)
-    wide_features, wide_seen = widen(levels, is_seen, sparse)
+    watch = watch or Stopwatch()
+    with watch.stage("read"):
+        levelled = level(cloud, up)
+    with watch.stage("prepare"):
+        octree = levelled.octree
+        centers = candidate_centers(octree, workers)
+        offsets, unit, levels, is_seen = render_candidates(octree, centers, workers)
+        _, sparse = np.unique(np.floor(centers / COARSE_SPACING), axis=0, return_index=True)
+        wide_features, wide_seen = widen(levels, is_seen, sparse)
     return ScanMap(
         octree=octree,
-        R_map_from_world=R_map_from_world,
-        origin_world=cloud.origin_world,
+        R_map_from_world=levelled.R_map_from_world,
+        origin_world=levelled.origin_world,
         centers=centers,
         offsets=offsets,
         offset_unit=unit,
@@ -134,5 +175,5 @@ def prepare_map(cloud: Cloud, workers: Workers) -> ScanMap:
         sparse=sparse,
         wide_features=wide_features,
         wide_seen=wide_seen,
-        warnings=cloud.warnings + warnings,
+        warnings=levelled.warnings,
     )

@@ -173,7 +173,7 @@ def filled_shares(tree, centers, voxel_per_range, kind, scratch, share):
                 share[k] += kind[4][c]
 
 
-MAX_NODES = 1_000_000
+MAX_NODES = 1 << 22  # of a view; reserved, but used only as far as a dense cloud fills it
 
 
 def make_scratch() -> tuple[Any, ...]:

@@ -64,7 +64,7 @@ def _feature(shot: Shot, transformer: Any, geod: Any, crs: str) -> dict[str, obj
         "geometry": {"type": "Point", "coordinates": [longitudes[0], latitudes[0]]},
         "properties": {
             "image": shot.name,
-            "cloud": result.cloud,
+            "cloud": result.cloud_name,
             "status": result.status,
             "confidence": result.confidence,
             "score": result.evidence.score if result.evidence else None,

@@ -34,7 +34,7 @@ class Selection:
     @property
     def clouds(self) -> tuple[str, ...]:
         """The clouds of the results, in order."""
-        return tuple(dict.fromkeys(result.cloud for result in self.results))
+        return tuple(dict.fromkeys(result.cloud_name for result in self.results))
 
 
 def read_results(path: Path) -> list[Result]:
@@ -61,7 +61,7 @@ def read_results(path: Path) -> list[Result]:
 
 def _check(result: Result) -> None:
     """Refuse names and numbers that can't be written, and a pose that is none."""
-    for label, value in (("status", result.status), ("cloud", result.cloud), ("pano", result.pano)):
+    for label, value in (("status", result.status), ("cloud", result.cloud_name), ("pano", result.pano)):
         if not isinstance(value, str) or UNWRITABLE.search(value):
             raise InputError(f"result: found {label} {value!r}, wanted text on one line")
     values = [result.confidence, *([result.evidence.score] if result.evidence else [])]
@@ -81,14 +81,14 @@ def _check(result: Result) -> None:
 
 def select(results: Sequence[Result], clouds: Sequence[str] = (), use_all: bool = False) -> Selection:
     """The results with a pose that are localized, or all with a pose; those of `clouds` only, if given."""
-    known = {result.cloud for result in results}
+    known = {result.cloud_name for result in results}
     if missing := [cloud for cloud in clouds if cloud not in known]:
         raise InputError(
             f"--cloud: found no result for {missing[0]}, wanted one of {', '.join(sorted(known))}"
         )
     chosen, left_out = [], Counter[str]()
     for result in results:
-        if clouds and result.cloud not in clouds:
+        if clouds and result.cloud_name not in clouds:
             left_out["other clouds"] += 1
         elif result.pose is None:
             left_out["without a pose"] += 1
@@ -112,7 +112,7 @@ def shots_of(results: Sequence[Result], form: Format, options: Options) -> list[
                 f"{name}: found {found.group()!r} in the name, wanted one that {form.name} can read"
             )
         if form.has_unique_names and name in shots:
-            clouds = f"{shots[name].result.cloud}, {result.cloud}"
+            clouds = f"{shots[name].result.cloud_name}, {result.cloud_name}"
             raise InputError(
                 f"{name}: found two results of it (clouds {clouds}), wanted one; --cloud chooses"
             )

@@ -32,7 +32,7 @@ def _row(shot: Shot) -> list[object]:
     result, pose = shot.result, shot.pose
     score = result.evidence.score if result.evidence else None
     return [
-        *(shot.name, result.cloud, result.status, result.confidence, score),
+        *(shot.name, result.cloud_name, result.status, result.confidence, score),
         *pose.center_world.tolist(),
         *quaternion_wxyz(pose.R_cam_from_world).tolist(),
         *heading_pitch_roll_deg(pose),

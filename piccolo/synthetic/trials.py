@@ -19,7 +19,7 @@ SPARSE_SHARE = 0.05
 WALL_DEPTH = 0.15  # [m]
 BLUR = 0.02  # of the width: blurred beyond recognition
 Image = NDArray[np.uint8]
-Points = tuple[NDArray[np.float32], NDArray[np.uint8]]
+Points = tuple[NDArray[np.floating], NDArray[np.uint8]]
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,82 @@
+"""Clouds in files, read as often as they are needed: into voxels, or into memory."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..threads import Show, unseen
+from .clean import Census, Chunk, unit_warnings
+from .model import Cloud
+from .order import canonical_order
+from .raw import CHUNK, PointSource, RawCloud
+from .voxels import Voxels, VoxelTable, turned
+
+
+def stream_of(path: Path, raw: RawCloud) -> "CloudStream":
+    """Points in memory as if they stood in a file named `path`."""
+    return CloudStream([PointSource(path, lambda: iter([raw]), len(raw.colors))])
+
+
+@dataclass(frozen=True)
+class CloudStream:
+    """One cloud in one or several files. Each reading begins anew, and ends with the same checks."""
+
+    sources: Sequence[PointSource]  # in an order of their own: the user's changes nothing
+    scale: float = 1.0  # metres per unit of the files
+    show: Show = unseen  # progress
+
+    @property
+    def label(self) -> str:
+        """What messages about all files together call them."""
+        first, num_more = self.sources[0].path, len(self.sources) - 1
+        return f"{first} and {num_more} more" if num_more else str(first)
+
+    def chunks(self, censuses: list[Census]) -> Iterator[Chunk]:
+        """Yield the finite points in metres; `censuses` gets what is then known of each file."""
+        for source in self.sources:
+            census = Census(source.path, self.scale)
+            total = None if source.num_points is None else math.ceil(source.num_points / CHUNK)
+            try:
+                for raw in self.show(source.read_chunks(), total, f"read {source.path.name}"):
+                    yield census.pass_on(raw)
+            except OSError as error:
+                text = f"{source.path}: cannot be read ({error.strerror or error}), wanted a whole file"
+                raise InputError(text) from error
+            census.check()
+            censuses.append(census)
+
+    def _warnings(self, censuses: list[Census]) -> list[str]:
+        pairs = zip(self.sources, censuses, strict=True)
+        return [line for source, census in pairs for line in (*source.warnings, *census.warnings())]
+
+    def voxels(self, R_map_from_world: NDArray[np.float64]) -> Voxels:
+        """The points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
+        censuses: list[Census] = []
+        table = VoxelTable(self.label)
+        for points_world, colors in self.chunks(censuses):
+            table.add(turned(points_world, R_map_from_world), colors)
+        voxels = table.finish()
+        of_all = (*voxels.warnings, *unit_warnings(self.label, voxels.nodes[:, :3]))
+        return replace(voxels, warnings=(*self._warnings(censuses), *of_all))
+
+    def read(self) -> Cloud:
+        """All points, in canonical order."""
+        censuses: list[Census] = []
+        chunks = list(self.chunks(censuses))
+        points_world = np.concatenate([points_world for points_world, _ in chunks])
+        colors = np.concatenate([colors for _, colors in chunks])
+        chunks.clear()
+        # Rounded to metres, so that adding it back costs no digit; of the box, so that no order matters.
+        # + 0.0 turns -0.0 into 0.0: equal points have equal bits.
+        origin_world = np.round(0.5 * (points_world.min(axis=0) + points_world.max(axis=0))) + 0.0
+        points = (points_world - origin_world + 0.0).astype(np.float32)
+        order = canonical_order(points, colors)
+        points, colors = points[order], colors[order]
+        warnings = (*self._warnings(censuses), *unit_warnings(self.label, points))
+        num_dropped = sum(census.num_dropped for census in censuses)
+        return Cloud(points, colors, origin_world, num_dropped, warnings)

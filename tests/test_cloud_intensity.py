@@ -1,0 +1,128 @@
+"""Intensity taken for a gray."""
+
+import numpy as np
+import pytest
+from plyfile import PlyData, PlyElement
+from test_cloud_order import seeded_cloud, whole
+
+from piccolo.cloud import open_cloud, read_cloud
+from piccolo.cloud.intensity import as_gray, in_gray
+from piccolo.cloud.ply import open_ply
+from piccolo.cloud.raw import ReadOptions
+from piccolo.cloud.text import open_text
+from piccolo.errors import InputError
+from piccolo.settings import CloudSettings
+
+POINTS = seeded_cloud(1, num_points=3000).points_world
+GRAY = ReadOptions(intensity_as_gray=True)
+AS_GRAY = CloudSettings(intensity_as_gray=True)
+
+
+def _measured(seed, kind):
+    rng = np.random.default_rng(seed)
+    return {
+        "bytes": rng.integers(0, 256, 3000).astype(float),
+        "16 bits": rng.integers(0, 60_000, 3000).astype(float),
+        "decibels": rng.normal(-30.0, 9.0, 3000),
+        "mirrors": np.where(np.arange(3000) % 300 == 0, 1e6, rng.random(3000)),
+    }[kind]
+
+
+def _in_gray(intensity, points=POINTS, chunk=701):
+    def read():
+        for lo in range(0, len(points), chunk):
+            yield points[lo : lo + chunk], intensity[lo : lo + chunk]
+
+    return np.concatenate([raw.colors for raw in in_gray("a", read)()])
+
+
+@pytest.mark.parametrize("kind", ["bytes", "16 bits", "decibels", "mirrors"])
+def test_percentiles_become_black_and_white(kind):
+    intensity = _measured(1, kind)
+    low, high = np.percentile(intensity, [1, 99], method="inverted_cdf")
+    expected = np.clip((intensity - low) / (high - low), 0.0, 1.0) * 255.0
+    gray = _in_gray(intensity)
+    assert (gray == gray[:, :1]).all()
+    assert np.abs(gray[:, 0] - expected).max() <= (0.5 if kind == "bytes" else 5.0)
+    assert (gray.min(), gray.max()) == (0, 255)
+
+
+def test_order_and_chunks_change_no_bit():
+    intensity = _measured(2, "decibels")
+    shuffle = np.random.default_rng(3).permutation(3000)
+    np.testing.assert_array_equal(
+        _in_gray(intensity)[shuffle], _in_gray(intensity[shuffle], POINTS[shuffle], 47)
+    )
+
+
+def test_what_has_no_position_or_no_intensity_does_not_count():
+    intensity, points = _measured(4, "bytes"), POINTS.copy()
+    expected = _in_gray(intensity[:2000], points[:2000])
+    intensity[2000:2500] = np.nan
+    intensity[2500:], points[2500:, 1] = 1e30, np.nan
+    np.testing.assert_array_equal(_in_gray(intensity, points)[:2000], expected)
+
+
+def test_gray_of_what_is_not_finite():
+    gray = as_gray(np.array([np.nan, -np.inf, np.inf, 0.5]), 0.0, 1.0)
+    assert gray[:, 0].tolist() == [0, 0, 255, 128]
+
+
+def test_one_intensity_for_all_is_refused():
+    with pytest.raises(InputError, match="a: the intensity is 7 nearly everywhere, wanted colours"):
+        _in_gray(np.full(3000, 7.0))
+
+
+def _ply(path, name, kind="f4", text=False, values=None):
+    table = np.zeros(3000, [(n, "f8") for n in "xyz"] + [(name, kind)])
+    for k, n in enumerate("xyz"):
+        table[n] = POINTS[:, k]
+    table[name] = _measured(5, "16 bits") if values is None else values
+    PlyData([PlyElement.describe(table, "vertex")], text=text).write(str(path))
+    return path
+
+
+@pytest.mark.parametrize("name", ["intensity", "scalar_Intensity", "reflectance"])
+@pytest.mark.parametrize(("kind", "text"), [("u2", False), ("f4", False), ("f8", True)])
+def test_ply(tmp_path, name, kind, text):
+    path = _ply(tmp_path / "a.ply", name, kind, text)
+    np.testing.assert_array_equal(whole(open_ply, path, GRAY).colors, _in_gray(_measured(5, "16 bits")))
+    with pytest.raises(InputError, match=f"the vertices have {name} and no colours.*--intensity-as-gray"):
+        read_cloud(path)
+
+
+LAYOUTS = {
+    "a.xyz": lambda rows: [f"{x} {y} {z} {i}" for x, y, z, i in rows],
+    "a.pts": lambda rows: ["3000", *(f"{x} {y} {z} {i}" for x, y, z, i in rows)],
+    "a.csv": lambda rows: [
+        "id,Intensity,x,y,z,ring,a,b",
+        *(f"9,{i},{x},{y},{z},3,1,2" for x, y, z, i in rows),
+    ],
+}
+
+
+@pytest.mark.parametrize("name", list(LAYOUTS))
+def test_text(tmp_path, name):
+    path = tmp_path / name
+    intensity = _measured(6, "decibels")
+    path.write_text("\n".join(LAYOUTS[name](np.column_stack([POINTS, intensity]).tolist())))
+    read = whole(open_text, path, GRAY)
+    np.testing.assert_allclose(read.points_world, POINTS, rtol=1e-14)
+    np.testing.assert_array_equal(read.colors, _in_gray(intensity))
+    with pytest.raises(InputError, match=r"has intensity and no colours.*--intensity-as-gray"):
+        read_cloud(path)
+
+
+def test_colours_come_first_and_the_map_is_gray(tmp_path):
+    lines = ["x y z intensity r g b", *(f"{x} {y} {z} 5 10 20 30" for x, y, z in POINTS.tolist())]
+    (tmp_path / "a.txt").write_text("\n".join(lines))
+    assert (whole(open_text, tmp_path / "a.txt", GRAY).colors == [10, 20, 30]).all()
+    nodes = open_cloud([_ply(tmp_path / "b.ply", "intensity")], AS_GRAY).voxels(np.eye(3)).nodes
+    assert (nodes[:, 3] == nodes[:, 5]).all()
+    assert np.ptp(nodes[:, 4]) == 1.0
+
+
+def test_files_without_a_finite_point_are_refused_as_such(tmp_path):
+    path = _ply(tmp_path / "a.ply", "intensity", values=np.nan)
+    with pytest.raises(InputError, match="all points are black"):
+        open_cloud([path], AS_GRAY).read()

@@ -1,0 +1,131 @@
+"""Files are read in blocks and chunks: small ones here, so that every border is met."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plyfile import PlyElement
+from test_cloud_order import seeded_cloud, whole
+from test_cloud_ply import vertices, write
+from test_cloud_text import lines_of
+
+from piccolo.cloud import lines, ply, text
+from piccolo.cloud.lines import line_blocks
+from piccolo.cloud.ply import open_ply
+from piccolo.cloud.text import open_text
+from piccolo.errors import InputError
+
+RAW = seeded_cloud(1, num_points=1200)
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """Blocks of two or three lines, chunks of a few blocks."""
+    monkeypatch.setattr(lines, "BLOCK", 101)
+    monkeypatch.setattr(text, "CHUNK", 13)
+    monkeypatch.setattr(ply, "CHUNK", 13)
+
+
+@settings(deadline=None)
+@given(
+    parts=st.lists(st.sampled_from([b"\n", b"\r", b"\r\n", b"1", b"22"]), max_size=30), size=st.integers(4, 9)
+)
+def test_blocks_hold_whole_lines_and_all_bytes(parts, size, tmp_path_factory):
+    path = tmp_path_factory.getbasetemp() / "blocks.txt"
+    content = b"".join(parts)
+    path.write_bytes(b"head" + content)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lines, "BLOCK", size)
+        try:
+            blocks = [block.tobytes() for block in line_blocks(path, 4)]
+        except InputError:
+            assert max(map(len, content.splitlines())) >= size
+            return
+    assert b"".join(blocks) == content
+    for block, following in itertools.pairwise(blocks):
+        assert block.endswith((b"\n", b"\r"))
+        assert not (block.endswith(b"\r") and following.startswith(b"\n"))
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("last", ["", "\n"])
+def test_text_in_small_blocks_is_the_same(tmp_path, small, end, last):
+    path = tmp_path / "a.txt"
+    path.write_bytes((end.join(["\ufeff// x y z r g b", *lines_of(RAW), "", "# end"]) + last).encode())
+    read = whole(open_text, path)
+    np.testing.assert_allclose(read.points_world, np.round(RAW.points_world, 6), rtol=1e-15, atol=1e-15)
+    np.testing.assert_array_equal(read.colors, RAW.colors)
+    assert max(len(chunk.colors) for chunk in open_text(path).read_chunks()) <= 13
+
+
+@pytest.mark.parametrize("encoding", [{"byte_order": "<"}, {"byte_order": ">"}, {"text": True}])
+def test_ply_in_small_chunks_is_the_same(tmp_path, small, encoding):
+    cameras = PlyElement.describe(vertices(seeded_cloud(2, num_points=40)).data, "camera")
+    path = write(tmp_path / "a.ply", cameras, vertices(RAW), **encoding)
+    source = open_ply(path)
+    assert source.num_points == 1200
+    chunks = list(source.read_chunks())
+    assert [len(chunk.colors) for chunk in chunks] == [13] * 92 + [4]
+    read = whole(open_ply, path)
+    np.testing.assert_allclose(read.points_world, RAW.points_world.astype("f4").astype(float), rtol=1e-15)
+    np.testing.assert_array_equal(read.colors, RAW.colors)
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize(
+    ("broken", "message"), [("1 2 x 4 5 6", "is not all"), ("1 2 3 4 5 256", "has the colour")]
+)
+def test_line_numbers_count_across_blocks(tmp_path, small, end, broken, message):
+    path = tmp_path / "a.txt"
+    path.write_bytes(end.join(["# one", "", *lines_of(RAW)[:700], "", broken, *lines_of(RAW)[:9]]).encode())
+    with pytest.raises(InputError, match=f"line 704 {message}"):
+        whole(open_text, path)
+
+
+def test_line_numbers_of_ply_count_across_blocks(tmp_path, small):
+    path = write(tmp_path / "a.ply", vertices(RAW), text=True)
+    content = path.read_bytes().split(b"\n")
+    header = content.index(b"end_header") + 1
+    content[header + 600] = b"1 2 3"
+    path.write_bytes(b"\n".join(content))
+    with pytest.raises(
+        InputError, match="line 601 after the header has fewer than 6 numbers: '1 2 3', wanted"
+    ):
+        whole(open_ply, path)
+
+
+def test_endless_lines_take_no_memory(tmp_path, small):
+    path = tmp_path / "a.txt"
+    path.write_bytes("\n".join(lines_of(RAW)[:50]).encode() + b"\n1 2 3 4 5 6" + b" " * 500)
+    with pytest.raises(
+        InputError, match=r"a\.txt: a line of more than 101 bytes, wanted lines of a few numbers"
+    ):
+        whole(open_text, path)
+
+
+@pytest.mark.parametrize("encoding", [{"byte_order": "<"}, {"text": True}])
+def test_files_that_shrink_while_they_are_read_are_refused(tmp_path, small, encoding):
+    path = write(tmp_path / "a.ply", vertices(RAW), **encoding)
+    chunks = open_ply(path).read_chunks()
+    next(chunks)
+    with path.open("r+b") as file:
+        file.truncate(path.stat().st_size // 2)
+    with pytest.raises(
+        InputError, match=r"became shorter while it was read|found fewer; the file is cut off|fewer than 6"
+    ):
+        list(chunks)
+
+
+def test_each_reading_begins_anew(tmp_path, small):
+    source = open_text(_text(tmp_path))
+    first = next(source.read_chunks())
+    again = next(source.read_chunks())
+    np.testing.assert_array_equal(first.points_world, again.points_world)
+
+
+def _text(folder):
+    path = folder / "a.txt"
+    path.write_text("\n".join(lines_of(RAW)))
+    return path

@@ -1,0 +1,357 @@
+"""Clouds that stream into voxels: the same bits whatever the order, the chunks and the files."""
+
+import dataclasses
+import itertools
+import subprocess
+import sys
+from pathlib import Path
+
+import naive
+import numpy as np
+import pytest
+from rooms import as_panorama, errors, query, room
+from scipy.spatial import cKDTree
+from test_cloud_order import seeded_cloud
+
+from piccolo.cloud import CloudStream, voxels
+from piccolo.cloud.raw import PointSource, RawCloud
+from piccolo.cloud.voxels import (
+    COUNT,
+    LEAF_SIZE,
+    NUM_COLUMNS,
+    POSITION,
+    VoxelTable,
+    add_points,
+    move_voxels,
+    turned,
+)
+from piccolo.engine.map_file import content_key
+from piccolo.engine.method import localize
+from piccolo.engine.octree import build_octree
+from piccolo.engine.scan_map import prepare_map
+from piccolo.errors import InputError
+from piccolo.gravity import rotation_to_z_up
+from piccolo.pipeline import CachePolicy, open_map
+from piccolo.pose import Pose, exp_so3
+from piccolo.settings import METRES, CloudSettings, EngineSettings
+from piccolo.stopwatch import Stopwatch
+from piccolo.threads import Workers
+
+ROOT = Path(__file__).resolve().parents[1]
+TURN = exp_so3(np.array([0.3, -0.7, 1.9]))
+LEVEL = np.eye(3)
+CORNER = -voxels.PHASE / voxels.QUANTA_PER_METRE
+
+
+def part(raw, indices):
+    return RawCloud(raw.points_world[indices], raw.colors[indices])
+
+
+def stream(*raws, chunk=10**9, scale=1.0):
+    """A cloud of as many files, each handed on in chunks."""
+
+    def source(k, raw):
+        begins = range(0, len(raw.colors), chunk)
+        return PointSource(
+            Path(f"{k}.ply"), lambda: (part(raw, slice(lo, lo + chunk)) for lo in begins), len(raw.colors)
+        )
+
+    return CloudStream([source(k, raw) for k, raw in enumerate(raws)], scale)
+
+
+def same_voxels(a, b):
+    return all(getattr(a, f.name).tobytes() == getattr(b, f.name).tobytes() for f in ARRAYS)
+
+
+ARRAYS = [f for f in dataclasses.fields(voxels.Voxels) if f.name != "warnings"]
+
+
+@pytest.mark.parametrize("turn", [LEVEL, TURN])
+@pytest.mark.parametrize("size", [0.3, 300.0])  # many points a voxel, or one, so that the table grows
+def test_voxels_equal_their_twin(size, turn):
+    raw = seeded_cloud(1, 60_000 if size > 1 else 20_000, size=(size, 0.9 * size, 0.8 * size))
+    found = stream(raw, chunk=7001).voxels(turn)
+    expected = naive.voxels(raw.points_world @ turn.T, raw.colors, LEAF_SIZE, CORNER)
+    assert len(found.nodes) == len(expected)
+    distance, match = cKDTree(found.nodes[:, :3] + found.origin).query(expected[:, :3])
+    assert distance.max() < 7e-5 + 1e-7 * size  # half a quantum along each axis
+    np.testing.assert_allclose(found.nodes[match, 3:], expected[:, 3:] / 255.0, atol=1e-6)
+    np.testing.assert_array_equal(found.origin, np.round(found.origin))
+    assert (np.diff(found.codes) > 0).all()
+
+
+@pytest.mark.parametrize("turn", [LEVEL, TURN])
+def test_same_bits_for_any_order_chunks_and_files(turn):
+    raw = seeded_cloud(2, 60_000, size=(2.0, 3.0, 2.5))
+    raw.points_world[::77] = np.nan
+    whole = stream(raw).voxels(turn)
+    shuffle = np.random.default_rng(3).permutation(60_000)
+    first, second = part(raw, slice(0, 20_000)), part(raw, slice(20_000, None))
+    for other in (
+        stream(part(raw, shuffle)),
+        stream(raw, chunk=997),
+        stream(first, second),
+        stream(second, first, chunk=5000),
+    ):
+        assert same_voxels(other.voxels(turn), whole)
+
+
+def test_whole_metres_move_the_origin_and_no_bit_of_the_rest():
+    raw = seeded_cloud(4, size=(2.0, 2.0, 2.0))
+    raw = RawCloud(np.round(raw.points_world * 4096) / 4096, raw.colors)  # exact at either place
+    shift = np.array([637_012.0, 5_849_028.0, -431.0])
+    near, far = (stream(RawCloud(raw.points_world + s, raw.colors)).voxels(LEVEL) for s in (0 * shift, shift))
+    np.testing.assert_array_equal(far.origin - near.origin, shift)
+    by_place = [v.nodes[np.lexsort(v.nodes.T)] for v in (near, far)]
+    np.testing.assert_allclose(by_place[0], by_place[1], atol=1e-6)
+
+
+@pytest.mark.parametrize("z", [0.0, 3.0, -17.0, 0.1])
+def test_a_floor_at_a_round_height_is_one_layer_at_every_level(z):
+    raw = seeded_cloud(17, 5000, size=(3.0, 2.0, 0.005))
+    raw.points_world[:, 2] += z
+    flat = stream(raw).voxels(LEVEL)
+    octree = build_octree(flat)
+    for k, (begin, end) in enumerate(itertools.pairwise(octree.level_start)):
+        size = voxels.COARSEST * LEAF_SIZE / 2**k
+        columns = np.floor((octree.nodes[begin:end, :2] + flat.origin[:2] - CORNER) / size)
+        assert len(np.unique(columns, axis=0)) == end - begin
+
+
+def test_in_memory_and_in_a_file_are_one():
+    raw = seeded_cloud(5)
+    cloud = stream(raw).read()
+    same = RawCloud(cloud.points + cloud.origin_world, cloud.colors)
+    assert same_voxels(cloud.voxels(TURN), stream(same).voxels(TURN))
+
+
+def test_a_larger_table_holds_the_same_rows():
+    table, larger = np.zeros((64, NUM_COLUMNS), np.int32), np.zeros((256, NUM_COLUMNS), np.int32)
+    raw = seeded_cloud(16, 40)
+    assert add_points(raw.points_world, raw.colors, np.zeros(3, np.int64), table, 0, 40) == (40, 40)
+    move_voxels(table, larger)
+    kept = [set(map(tuple, rows[rows[:, COUNT] > 0].tolist())) for rows in (table, larger)]
+    assert kept[0] == kept[1]
+    assert len(kept[0]) == 40
+    assert add_points(raw.points_world, raw.colors, np.zeros(3, np.int64), larger, 40, 99) == (40, 40)
+
+
+def test_a_full_voxel_takes_no_more(monkeypatch):
+    monkeypatch.setattr(voxels, "MAX_COUNT", 3)
+    table = np.zeros((8, NUM_COLUMNS), np.int32)
+    points, colors = np.full((5, 3), 0.01), np.full((5, 3), 200, np.uint8)
+    done = add_points.py_func(points, colors, np.zeros(3, np.int64), table, 0, 4)
+    assert done == (5, 1)
+    (row,) = table[table[:, COUNT] > 0]
+    assert row[COUNT] == 3
+    assert row[POSITION] == 3 * ((128 + voxels.PHASE) % 256)
+
+
+def test_the_most_points_of_a_voxel_fit_its_sums():
+    assert voxels.MAX_COUNT * max(255, voxels.QUANTUM_MASK) <= np.iinfo(np.int32).max
+
+
+def test_turning_gives_each_point_the_same_bits_alone_as_among_others():
+    points = seeded_cloud(6).points_world
+    alone = np.concatenate([turned(p[None], TURN) for p in points])
+    assert alone.tobytes() == turned(points, TURN).tobytes()
+    np.testing.assert_allclose(alone, points @ TURN.T, atol=1e-12)
+
+
+def test_points_too_far_away_are_left_out_and_counted():
+    raw = seeded_cloud(7)
+    raw.points_world[5:8] += [0.0, 30_000.0, 0.0]
+    found = stream(raw).voxels(LEVEL)
+    assert "0.ply: 3 points farther than 21 km from the middle left out" in found.warnings
+    assert np.abs(found.nodes[:, :3]).max() < 4.0
+    raw.points_world[5] = [0.0, 0.0, -9e7]
+    with pytest.raises(InputError, match=r"0\.ply: points more than 42950 km apart, wanted one scene"):
+        stream(raw).voxels(LEVEL)
+
+
+def test_two_scenes_far_from_each_other_are_no_map():
+    raw = seeded_cloud(8, 2000)
+    raw.points_world[:1000, 0] += 50_000.0
+    assert len(stream(raw).voxels(LEVEL).nodes) >= 900  # one of them
+    raw.points_world[:] = np.diag([1e5, 1e5, 1e5])[np.arange(2000) % 3]
+    with pytest.raises(InputError, match=r"2000 points farther than 21 km .*none nearer, wanted one scene"):
+        stream(raw).voxels(LEVEL)
+
+
+def test_too_many_voxels_are_refused(monkeypatch):
+    monkeypatch.setattr(voxels, "MAX_ROWS", voxels.FIRST_ROWS)
+    with pytest.raises(InputError, match=r"more than 39321 voxels of 0\.02 m are filled.*--units"):
+        stream(seeded_cloud(9, 50_000, size=(900.0, 900.0, 900.0))).voxels(LEVEL)
+
+
+BROKEN = {
+    "found 999 finite points": lambda p, c: (np.where(np.arange(len(p))[:, None] < 999, p, np.nan), c),
+    "all points are black": lambda p, c: (p, c // 255),
+    "a coordinate of 1e+20 m": lambda p, c: (np.where(np.arange(len(p))[:, None] == 3, 1e20, p), c),
+}
+
+
+@pytest.mark.parametrize("message", list(BROKEN))
+@pytest.mark.parametrize("what", ["read", "voxels"])
+def test_both_ways_refuse_the_same(what, message):
+    raw = seeded_cloud(10)
+    broken = stream(raw, RawCloud(*BROKEN[message](raw.points_world, raw.colors)), chunk=600)
+    with pytest.raises(InputError) as error:
+        broken.read() if what == "read" else broken.voxels(LEVEL)
+    assert str(error.value).startswith(f"1.ply: {message}")
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.001])
+def test_both_ways_warn_of_the_same(scale):
+    raw = seeded_cloud(11, size=(6000.0, 5000.0, 2500.0))
+    raw.points_world[:4] = np.inf
+    cloud = dataclasses.replace(stream(raw, scale=scale), sources=_with_a_word(stream(raw)))
+    warnings = cloud.read().warnings
+    assert cloud.voxels(LEVEL).warnings == warnings
+    assert warnings[:2] == ("a word", "0.ply: 4 points with NaN or infinite coordinates left out")
+    assert [("--units mm" in line) for line in warnings[2:]] == ([True] if scale == 1.0 else [])
+
+
+def _with_a_word(cloud):
+    return [dataclasses.replace(source, warnings=("a word",)) for source in cloud.sources]
+
+
+def test_several_files_are_named_together():
+    raw = seeded_cloud(12, size=(6000.0, 5000.0, 2500.0))
+    (warning,) = stream(raw, raw, raw).voxels(LEVEL).warnings
+    assert warning.startswith("0.ply and 2 more: the cloud spans")
+
+
+def test_progress_knows_how_many_chunks_come():
+    seen = []
+
+    def show(values, total, label):
+        seen.append((total, label))
+        return values
+
+    raw = seeded_cloud(13)
+    dataclasses.replace(stream(raw), show=show).read()
+    assert seen == [(1, "read 0.ply")]
+
+
+def test_a_broken_disk_is_one_line():
+    def read_chunks():
+        yield seeded_cloud(14)
+        raise OSError(5, "Input/output error")
+
+    cloud = CloudStream([PointSource(Path("a.xyz"), read_chunks)])
+    with pytest.raises(InputError, match=r"^a\.xyz: cannot be read \(Input/output error\), wanted"):
+        cloud.voxels(LEVEL)
+
+
+def _lying(turn):
+    """The cloud of room 1, turned, as a file, and the true pose in it of a panorama."""
+    cloud, taken = room(1)[1], query(1)
+    points = (cloud.points @ turn.T).astype(np.float64) + cloud.origin_world
+    center = turn @ (taken.pose.center_world - cloud.origin_world) + cloud.origin_world
+    return stream(RawCloud(points, cloud.colors), chunk=9999), Pose(
+        taken.pose.R_cam_from_world @ turn.T, center
+    )
+
+
+@pytest.mark.parametrize("up", ["y", "-x"])
+def test_up_axis_is_believed_and_poses_stay_in_the_files_frame(up):
+    axis = np.eye(3)["xyz".index(up[-1])] * (-1 if up[0] == "-" else 1)
+    yaw = exp_so3(np.array([0.0, 0.0, 0.4]))
+    cloud, truth = _lying(rotation_to_z_up(axis).T @ yaw)
+    scan_map = prepare_map(cloud, Workers(2), up)
+    np.testing.assert_array_equal(scan_map.R_map_from_world @ axis, [0.0, 0.0, 1.0])
+    np.testing.assert_array_equal(np.abs(scan_map.R_map_from_world).sum(axis=0), 1.0)
+    assert np.linalg.det(scan_map.R_map_from_world) == 1.0
+    assert scan_map.warnings == ()
+    panorama = as_panorama(query(1).rgb)
+    found = localize(scan_map, panorama, EngineSettings(gravity="known"), Workers(2), Stopwatch())
+    distance, angle_deg = errors(found.pose, truth)
+    assert distance < 0.01
+    assert angle_deg < 0.2
+
+
+def test_a_tilted_cloud_is_read_twice_and_another_once():
+    lying, _ = _lying(exp_so3(np.array([1.2, 0.3, 0.0])))
+    counts = []
+    for up in ("auto", "z"):
+        readings = []
+
+        def show(values, total, label, readings=readings):
+            readings.append(label)
+            return values
+
+        scan_map = prepare_map(dataclasses.replace(lying, show=show), Workers(2), up)
+        counts.append((len(readings), np.array_equal(scan_map.R_map_from_world, LEVEL)))
+    assert counts == [(2, False), (1, True)]
+
+
+def _write_text(path, raw, decimals=6):
+    np.savetxt(path, np.column_stack([raw.points_world, raw.colors]), fmt=[f"%.{decimals}f"] * 3 + ["%d"] * 3)
+    return path
+
+
+def test_order_of_files_changes_no_bit_of_a_map(tmp_path):
+    cloud = room(2)[1]
+    raw = RawCloud(cloud.points.astype(np.float64), cloud.colors)
+    half = len(raw.colors) // 2
+    a = _write_text(tmp_path / "a.txt", part(raw, slice(0, half)))
+    b = _write_text(tmp_path / "b.txt", part(raw, slice(half, None)))
+    settings = CloudSettings()
+    assert content_key([a, b], settings) == content_key([b, a], settings)
+    others = [dataclasses.replace(settings, up="z"), dataclasses.replace(settings, scale=2.0)]
+    others.append(dataclasses.replace(settings, intensity_as_gray=True))
+    keys = {content_key([a, b], s) for s in (settings, *others)} | {content_key([a], settings)}
+    assert len(keys) == 5
+    maps = [
+        open_map(paths, settings, CachePolicy(is_used=False), Workers(n), Stopwatch())
+        for paths, n in (([a, b], 1), ([b, a], 2))
+    ]
+    for f in dataclasses.fields(maps[0]):
+        if f.name not in ("octree", "warnings"):
+            assert getattr(maps[0], f.name).tobytes() == getattr(maps[1], f.name).tobytes(), f.name
+    assert maps[0].octree.nodes.tobytes() == maps[1].octree.nodes.tobytes()
+
+
+def test_units_are_what_surveyors_mean():
+    assert METRES["ft"] == 0.3048
+    assert METRES["us-ft"] == pytest.approx(0.3048006096, abs=1e-10)
+    feet = stream(seeded_cloud(15), scale=METRES["ft"]).voxels(LEVEL)
+    assert np.ptp(feet.nodes[:, 0]) == pytest.approx(6.0 * 0.3048, abs=0.02)
+
+
+MEASURE = """
+import resource
+from pathlib import Path
+import numpy as np
+from piccolo.cloud import CloudStream
+from piccolo.cloud.raw import CHUNK, PointSource, RawCloud
+
+def read_chunks():
+    rng = np.random.default_rng(0)
+    for _ in range({num_chunks}):
+        points = rng.random((CHUNK // 4, 3)) * [4.0, 4.0, 0.005]
+        yield RawCloud(points, np.full((CHUNK // 4, 3), 200, np.uint8))
+
+found = CloudStream([PointSource(Path("a"), read_chunks)]).voxels(np.eye(3))
+assert 40_000 < len(found.nodes) < 41_000, len(found.nodes)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+"""
+
+
+def test_memory_grows_with_the_scene_and_not_with_the_points():
+    peaks_mb = []
+    for num_chunks in (2, 20):  # 0.5 and 5 million points, which would take 135 MB at once
+        command = [sys.executable, "-c", MEASURE.format(num_chunks=num_chunks)]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+        peaks_mb.append(int(done.stdout))
+    assert peaks_mb[1] - peaks_mb[0] < 30
+
+
+def test_voxel_table_may_be_fed_with_nothing():
+    table = VoxelTable("a")
+    table.add(np.empty((0, 3)), np.empty((0, 3), np.uint8))
+    table.add(np.full((2, 3), 7.5), np.full((2, 3), 51, np.uint8))
+    found = table.finish()
+    np.testing.assert_allclose(found.nodes[0, 3:], 0.2)
+    np.testing.assert_allclose(found.nodes[0, :3] + found.origin, 7.5, atol=4e-5)

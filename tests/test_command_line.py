@@ -1,0 +1,105 @@
+"""The options that say what a cloud is."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from rooms import errors, query, room
+
+import localize
+from command_line import build_parser, cloud_settings_from, named, parse
+from piccolo.result import Result
+from piccolo.settings import IN_METRES, CloudSettings
+from tools import prepare_map
+
+ONE = ["--cloud", "a.ply", "--pano", "b.jpg"]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A room in two scans, in feet and with y up, and a panorama."""
+    folder = tmp_path_factory.mktemp("scene")
+    cloud = room(1)[1]
+    x, y, z = (cloud.points + cloud.origin_world).T / 0.3048
+    rows = np.column_stack([x, z, -y, cloud.colors])
+    for k in range(2):
+        np.savetxt(folder / f"{k}.xyz", rows[k::2], fmt=["%.5f"] * 3 + ["%d"] * 3)
+    cv2.imwrite(str(folder / "pano.png"), query(1).rgb[..., ::-1])
+    return folder
+
+
+def _cloud(scene, *order):
+    return ["--cloud", *(str(scene / f"{k}.xyz") for k in order), "--units", "ft", "--up", "y"]
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ([], IN_METRES),
+        (["--units", "mm"], CloudSettings(scale=0.001)),
+        (["--scale", "0.5", "--up", "x"], CloudSettings(scale=0.5, up="x")),
+        (["--up", "-z", "--intensity-as-gray"], CloudSettings(up="-z", intensity_as_gray=True)),
+        (["--up=-y"], CloudSettings(up="-y")),
+    ],
+)
+def test_options_of_a_cloud(options, expected):
+    assert cloud_settings_from(parse(build_parser(), [*ONE, *options])) == expected
+
+
+@pytest.mark.parametrize(
+    "options", [["--units", "ft", "--scale", "1"], ["--units", "yd"], ["--up", "w"], ["--up", "-q"], ["--up"]]
+)
+def test_wrong_usage(options, capsys):
+    with pytest.raises(SystemExit) as stop:
+        parse(build_parser(), [*ONE, *options])
+    assert stop.value.code == 2
+    assert "usage" in capsys.readouterr().err
+
+
+def test_preset_paper_has_no_up(capsys):
+    assert localize.main([*ONE, "--preset", "paper", "--up", "-y"]) == 2
+    assert "--up: not an option of the preset paper" in capsys.readouterr().err
+
+
+def test_one_file_is_named_by_a_string(tmp_path):
+    assert named([tmp_path]) == str(tmp_path)
+    assert named([tmp_path, tmp_path / "b"]) == (str(tmp_path), str(tmp_path / "b"))
+
+
+def test_several_files_in_feet_with_y_up(scene, tmp_path, capsys):
+    pano = ["--pano", str(scene / "pano.png"), "--quiet"]
+    cache = ["--cache", str(tmp_path)]
+    results = []
+    for order in ((0, 1), (1, 0)):
+        assert localize.main([*_cloud(scene, *order), *pano, *cache]) == 0
+        results.append(Result.from_json(capsys.readouterr().out))
+    assert results[0].cloud == (str(scene / "0.xyz"), str(scene / "1.xyz"))
+    assert "prepare" in results[0].seconds
+    assert "prepare" not in results[1].seconds  # the order of the files matters not
+    turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    found, truth = results[0].pose, query(1).pose
+    assert np.linalg.norm(turn.T @ found.center_world - truth.center_world) < 0.01
+    np.testing.assert_allclose(found.R_cam_from_world @ turn, truth.R_cam_from_world, atol=0.003)
+    assert errors(results[1].pose, found) == (0.0, 0.0)
+
+
+def test_a_map_is_prepared_of_several_files_and_stands_alone(scene, tmp_path, capsys):
+    built = str(tmp_path / "scan.map")
+    assert prepare_map.main([*_cloud(scene, 1, 0), "--out", built, "--quiet"]) == 0
+    assert json.loads(capsys.readouterr().out)["candidates"] > 50
+    pano = ["--pano", str(scene / "pano.png"), "--quiet"]
+    assert localize.main(["--cloud", built, *pano]) == 0
+    assert Result.from_json(capsys.readouterr().out).status == "localized"
+    for options in (["--units", "ft"], ["--up", "-y"], [str(scene / "0.xyz")]):
+        assert localize.main(["--cloud", built, *options, *pano]) == 3
+        assert "found a prepared map, wanted it alone, without options" in capsys.readouterr().err
+
+
+def test_no_file_of_a_cloud_is_overwritten(scene, capsys):
+    second = scene / "1.xyz"
+    before = second.read_bytes()
+    assert localize.main([*_cloud(scene, 0, 1), "--pano", "b.jpg", "--out", str(second)]) == 3
+    assert "an input as the output" in capsys.readouterr().err
+    assert prepare_map.main([*_cloud(scene, 0, 1), "--out", str(second)]) == 3
+    assert second.read_bytes() == before
