@@ -109,7 +109,7 @@ def test_sixteen_bits_become_eight(tmp_path):
 def test_alpha_zero_is_not_valid(tmp_path, dtype):
     alpha = np.full((64, 128), np.iinfo(dtype).max, dtype=dtype)
     alpha[50:], alpha[0, 0] = 0, 1
-    rgba = np.dstack([RGB.astype(dtype), alpha])
+    rgba = np.dstack([RGB.astype(dtype) * (np.iinfo(dtype).max // 255), alpha])
     panorama = read_panorama(write(tmp_path / "a.png", encoded(rgba, ".png")))
     np.testing.assert_array_equal(panorama.is_valid, alpha > 0)
 
@@ -243,7 +243,7 @@ def png_of(packed):
     ("content", "message"),
     [
         (b"", "the file is empty"),
-        (b"GIF89a" + bytes(99), "begins with b'GIF89a.*', wanted a whole JPEG or PNG panorama"),
+        (b"GIF89a" + bytes(99), "begins with b'GIF89a.*', wanted a whole JPEG, PNG, TIFF or WebP panorama"),
         (b"\xff\xd8", "the JPEG ends without its end mark"),
         (b"\xff\xd8" + bytes(999), "the JPEG ends without its end mark"),
         (PNG[:60] + b"\x01\x02\x03" + PNG[63:], "wrong checksum in the PNG's chunk b'IDAT'"),

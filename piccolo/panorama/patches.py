@@ -1,0 +1,103 @@
+"""What is no picture of the scene, found by itself: black borders, and discs put over a pole.
+
+Each rule is narrow, as what is masked wrongly is lost: the lines below are far from what scenes show.
+"""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+NEAR_BLACK, BLACK = 8, 2  # levels: where a border goes on, and what most of it has
+MIN_FULL_EDGE = 0.99  # of a full sphere's edge: its rows at the poles and its seam are black as a whole
+MIN_CROP_EDGE = 1.0 / 64.0  # of a crop's edge, which may be ragged
+MIN_PURE = 0.95  # of a border's pixels that are BLACK
+RIM = 4  # [px] that JPEG smears a border's edge
+
+DISC_WIDTH = 720  # [px] discs are looked for at this size, rows of half a degree; not in smaller pictures
+ROWS_PER_DEG = DISC_WIDTH / 360.0
+NUM_ROWS = round(45.0 * ROWS_PER_DEG)  # around a pole
+# numbers of rows inside a disc, largest first: half angles of 40 to 3 deg
+CANDIDATES = range(round(40.0 * ROWS_PER_DEG), round(3.0 * ROWS_PER_DEG) - 1, -1)
+MIN_STEP = 12.0  # levels between inside and outside of a disc's edge
+MIN_EDGE_SHARE, MAX_CALM_SHARE = 0.9, 0.5  # of columns with a step: at the edge, in the rows near it
+NUM_SECTORS = 16
+DETAIL_DEG = 0.5  # over which detail is measured
+MIN_DETAIL = 6.0  # levels, around a disc without detail
+MIN_DETAIL_RATIO = 5.0  # of detail outside by detail inside
+OUTSIDE_ROWS = round(2.0 * ROWS_PER_DEG)
+
+
+def black_borders(rgb: NDArray[np.uint8], is_full: bool) -> NDArray[np.bool_] | None:
+    """Where (H, W) the picture is unfilled, None if nowhere.
+
+    From each edge inwards, pixels up to the first that is not near black, if the edge is near black: of a
+    full sphere as a whole (a pole is one point, the seam one line), of a crop in part. 95 % of them must be
+    black to two levels; shadows carry noise.
+    """
+    found: NDArray[np.bool_] | None = None
+    for axis in (0, 1):
+        for step in (1, -1):
+            is_border = _border(rgb, axis, step, MIN_FULL_EDGE if is_full else MIN_CROP_EDGE)
+            if is_border is not None:
+                found = is_border if found is None else found | is_border
+    if found is None:
+        return None
+    return np.asarray(cv2.dilate(found.astype(np.uint8), np.ones((2 * RIM + 1,) * 2, np.uint8)) > 0)
+
+
+def _border(rgb: NDArray[np.uint8], axis: int, step: int, min_share: float) -> NDArray[np.bool_] | None:
+    """The border (H, W) along one edge: the first of `axis` (0 rows, 1 columns), or by `step` -1 the last."""
+    edge = rgb.take(0 if step > 0 else -1, axis)
+    if (edge.max(axis=1) <= NEAR_BLACK).mean() < min_share:
+        return None
+    is_near_black = cv2.inRange(rgb, (0, 0, 0), (NEAR_BLACK,) * 3) > 0
+    inwards = is_near_black.swapaxes(0, axis)[::step]
+    depth = np.where(inwards.all(axis=0), len(inwards), inwards.argmin(axis=0))
+    is_border = (np.arange(len(inwards))[:, None] < depth)[::step].swapaxes(0, axis)
+    is_black = cv2.inRange(rgb, (0, 0, 0), (BLACK,) * 3) > 0
+    return is_border if is_black[is_border].mean() >= MIN_PURE else None
+
+
+def polar_disc(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], pole: str) -> float:
+    """Half angle [deg] of a disc put over the `pole`, zenith or nadir, of a full sphere; 0 if there is none.
+
+    It is bounded by a circle of latitude, which is an edge in 90 % of all directions while the rows near it
+    are not (a logo, a plain colour), or at which all detail ends in every direction (a blur). Scenes have no
+    such circles, save for round things right over or under the camera, such as its own stand.
+    """
+    num_rows = round(NUM_ROWS / DISC_WIDTH * rgb.shape[1])
+    rows = slice(num_rows) if pole == "zenith" else slice(-num_rows, None)
+    if rgb.shape[1] < DISC_WIDTH or not is_valid[rows].all():
+        return 0.0
+    cap = cv2.resize(rgb[rows], (DISC_WIDTH, NUM_ROWS), interpolation=cv2.INTER_AREA).astype(np.float32)
+    cap = cap if pole == "zenith" else cap[::-1]
+    num_inside = max(_edge_circle(cap), _detail_circle(cap))
+    return (num_inside + 1) / ROWS_PER_DEG if num_inside else 0.0
+
+
+def _edge_circle(cap: NDArray[np.float32]) -> int:
+    """Number of rows from the pole (row 0) to the outermost circle that is an edge, 0 if there is none."""
+    pairs = (cap[1:] + cap[:-1]) / 2.0
+    is_step = np.abs(pairs[2:] - pairs[:-2]).max(axis=2) > MIN_STEP
+    share = np.concatenate([[0.0, 0.0], is_step.mean(axis=1)])  # share[k]: k rows are inside
+    for k in CANDIDATES:
+        near = np.concatenate([share[max(k - 8, 0) : k - 2], share[k + 3 : k + 9]])
+        if share[k] >= MIN_EDGE_SHARE and np.median(near) <= MAX_CALM_SHARE:
+            return k
+    return 0
+
+
+def _detail_circle(cap: NDArray[np.float32]) -> int:
+    """Number of rows from the pole (row 0) to the outermost circle at which all detail ends, 0 if none."""
+    grey = cap.mean(axis=2)
+    around = np.sin(np.radians((np.arange(NUM_ROWS) + 0.5) / ROWS_PER_DEG))
+    spacing = np.clip(np.round(DETAIL_DEG * ROWS_PER_DEG / around), 1, DISC_WIDTH // 8).astype(int)
+    second = [np.roll(row, k) + np.roll(row, -k) - 2.0 * row for row, k in zip(grey, spacing, strict=True)]
+    detail = np.abs(np.stack(second)).reshape(NUM_ROWS, NUM_SECTORS, -1).mean(axis=2)
+    total = np.cumsum(detail, axis=0)
+    for k in CANDIDATES:
+        inside = total[k - 2] / (k - 1)
+        outside = (total[k + OUTSIDE_ROWS] - total[k]) / OUTSIDE_ROWS
+        if (outside >= np.maximum(MIN_DETAIL_RATIO * inside, MIN_DETAIL)).all():
+            return k
+    return 0
