@@ -87,7 +87,7 @@ def _finished(
     notes = [*picture.warnings, *notes]
     masks = _user_masks(path, [size, picture.size], options, notes)
     is_valid = picture.is_valid & masks[1] if 1 in masks else picture.is_valid
-    borders = black_borders(picture.rgb, region.is_full)
+    borders = black_borders(picture.rgb, is_valid, region.is_full)
     if borders is not None:
         is_valid = is_valid & ~borders
     rgb, is_valid = place(path, picture.rgb, is_valid, region)

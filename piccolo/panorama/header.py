@@ -17,5 +17,5 @@ class Header:
     has_alpha: bool = False
     is_deep: bool = False  # decode all 16 bits: OpenCV rounds those of TIFF in its own way
     xmp: bytes = b""
-    patch: tuple[int, bytes] | None = None  # place and bytes to put there before decoding
+    patches: tuple[tuple[int, bytes], ...] = ()  # places, and bytes to put there before decoding
     warnings: tuple[str, ...] = ()

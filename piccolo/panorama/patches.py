@@ -27,17 +27,24 @@ MIN_DETAIL_RATIO = 5.0  # of detail outside by detail inside
 OUTSIDE_ROWS = round(2.0 * ROWS_PER_DEG)
 
 
-def black_borders(rgb: NDArray[np.uint8], is_full: bool) -> NDArray[np.bool_] | None:
-    """Where (H, W) the picture is unfilled, None if nowhere.
+def black_borders(
+    rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], is_full: bool
+) -> NDArray[np.bool_] | None:
+    """Where (H, W) the picture is unfilled but valid so far, None if nowhere.
 
     From each edge inwards, pixels up to the first that is not near black, if the edge is near black: of a
     full sphere as a whole (a pole is one point, the seam one line), of a crop in part. 95 % of them must be
     black to two levels; shadows carry noise.
     """
+    min_share = MIN_FULL_EDGE if is_full else MIN_CROP_EDGE
     found: NDArray[np.bool_] | None = None
     for axis in (0, 1):
         for step in (1, -1):
-            is_border = _border(rgb, axis, step, MIN_FULL_EDGE if is_full else MIN_CROP_EDGE)
+            place = 0 if step > 0 else -1
+            is_black = rgb.take(place, axis).max(axis=1) <= NEAR_BLACK
+            if (is_black & is_valid.take(place, axis)).mean() < min_share:
+                continue
+            is_border = _border(rgb, axis, step)
             if is_border is not None:
                 found = is_border if found is None else found | is_border
     if found is None:
@@ -45,11 +52,8 @@ def black_borders(rgb: NDArray[np.uint8], is_full: bool) -> NDArray[np.bool_] | 
     return np.asarray(cv2.dilate(found.astype(np.uint8), np.ones((2 * RIM + 1,) * 2, np.uint8)) > 0)
 
 
-def _border(rgb: NDArray[np.uint8], axis: int, step: int, min_share: float) -> NDArray[np.bool_] | None:
+def _border(rgb: NDArray[np.uint8], axis: int, step: int) -> NDArray[np.bool_] | None:
     """The border (H, W) along one edge: the first of `axis` (0 rows, 1 columns), or by `step` -1 the last."""
-    edge = rgb.take(0 if step > 0 else -1, axis)
-    if (edge.max(axis=1) <= NEAR_BLACK).mean() < min_share:
-        return None
     is_near_black = cv2.inRange(rgb, (0, 0, 0), (NEAR_BLACK,) * 3) > 0
     inwards = is_near_black.swapaxes(0, axis)[::step]
     depth = np.where(inwards.all(axis=0), len(inwards), inwards.argmin(axis=0))

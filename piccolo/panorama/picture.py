@@ -144,9 +144,8 @@ def _decoded(path: Path, data: bytes, header: Header) -> NDArray[Any]:
     flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
     flags = cv2.IMREAD_UNCHANGED if _keeps_all(header) else flags
     encoded = np.frombuffer(data, dtype=np.uint8)
-    if header.patch:
-        place, patch = header.patch
-        encoded = encoded.copy()
+    encoded = encoded.copy() if header.patches else encoded
+    for place, patch in header.patches:
         encoded[place : place + len(patch)] = np.frombuffer(patch, dtype=np.uint8)
     messages: list[str] = []
     pixels = None

@@ -21,7 +21,8 @@ class Directory:
 
     values: dict[int, NDArray[np.int64] | NDArray[np.uint8]]  # bytes stay uint8
     places: dict[int, int]  # where in the file each value begins [byte]
-    next_begin: int  # of the next picture's directory, 0 if this is the last
+    next_place: tuple[int, int]  # and size [byte] of what points to the next directory
+    has_next: bool
 
     def number(self, tag: int, default: int) -> int:
         """The first value of a tag."""
@@ -78,7 +79,7 @@ def _read_directory(data: bytes) -> Directory:
         array = np.frombuffer(data, dtype, count, place)
         values[tag] = array if dtype.itemsize == 1 else array.astype(np.int64)
         places[tag] = place
-    return Directory(values, places, next_begin)
+    return Directory(values, places, (end, num_bytes), next_begin != 0)
 
 
 def exif_orientation(body: bytes) -> int:

@@ -18,7 +18,16 @@ WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC, SAMPLES = 256, 257, 258, 259, 262
 STRIPS, ROWS_PER_STRIP, STRIP_SIZES, TILES, TILE_SIZES = 273, 278, 279, 324, 325
 TILE_WIDTH, TILE_HEIGHT, EXTRA_SAMPLES, SAMPLE_FORMAT, XMP = 322, 323, 338, 339, 700
 COLORS = {0: "grey", 1: "grey", 2: "RGB", 3: "palette", 6: "YCbCr"}
-OTHER_COLORS = {4: "a mask", 5: "CMYK", 8: "CIELab", 9: "ICCLab", 32803: "raw sensor values", 34892: "raw"}
+WHITE_IS_ZERO_16 = (0, 16)  # which OpenCV would leave inverted
+OTHER_COLORS = {
+    0: "16-bit grey with 0 for white",
+    4: "a mask",
+    5: "CMYK",
+    8: "CIELab",
+    9: "ICCLab",
+    32803: "raw sensor values",
+    34892: "raw",
+}
 FORMATS = {2: "signed", 3: "float", 5: "complex integer", 6: "complex"}
 NONE, DEFLATE = 1, (8, 32946)
 MAX_RATIO = 3840  # bytes that one byte unpacks to, LZW's longest code; Deflate has 1032, JPEG 512
@@ -48,8 +57,8 @@ def tiff_header(path: Path, data: bytes) -> Header:
         has_alpha=has_alpha,
         is_deep=True,
         xmp=xmp.astype(np.uint8).tobytes() if len(xmp) <= MAX_XMP_SIZE else b"",
-        patch=_as_associated(data, tags) if has_alpha else None,
-        warnings=("found more than one picture in the TIFF, the first was read",) if tags.next_begin else (),
+        patches=_patches(data, tags),
+        warnings=("found more than one picture in the TIFF, the first was read",) if tags.has_next else (),
     )
 
 
@@ -60,7 +69,7 @@ def _check_kind(path: Path, tags: Directory, samples: int, bits: int) -> None:
     if sample_format in FORMATS or bits not in (8, 16) or (tags.numbers(BITS) != bits).any():
         kind = FORMATS.get(sample_format, "unsigned")
         raise InputError(f"{path}: found a TIFF of {bits}-bit {kind} samples, wanted 8 or 16 bits, unsigned")
-    if photometric not in COLORS:
+    if photometric not in COLORS or (photometric, bits) == WHITE_IS_ZERO_16:
         kind = OTHER_COLORS.get(photometric, f"photometric {photometric}")
         raise InputError(f"{path}: found a TIFF of {kind}, wanted RGB or grey")
     wanted = (1,) if photometric in (0, 1, 3) else (3, 4)
@@ -114,8 +123,14 @@ def _unpacked_size(packed: bytes, limit: int) -> int:
     return size if unpacker.eof else limit
 
 
-def _as_associated(data: bytes, tags: Directory) -> tuple[int, bytes] | None:
-    """Where unassociated alpha is said to be associated: libtiff multiplies 8-bit colours by the former."""
-    if tags.number(EXTRA_SAMPLES, 0) != UNASSOCIATED:
-        return None
-    return tags.places[EXTRA_SAMPLES], ASSOCIATED.to_bytes(2, "little" if data[:2] == b"II" else "big")
+def _patches(data: bytes, tags: Directory) -> tuple[tuple[int, bytes], ...]:
+    """What libtiff is not to see: further pictures, and that alpha is unassociated.
+
+    It would look at the former, and multiply 8-bit colours by the latter.
+    """
+    place, size = tags.next_place
+    patches = [(place, bytes(size))] if tags.has_next else []
+    if tags.number(EXTRA_SAMPLES, 0) == UNASSOCIATED:
+        associated = ASSOCIATED.to_bytes(2, "little" if data[:2] == b"II" else "big")
+        patches.append((tags.places[EXTRA_SAMPLES], associated))
+    return tuple(patches)
