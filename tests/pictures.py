@@ -50,6 +50,19 @@ def xmp_packet(fields, form="attributes", prefix="GPano"):
     ).encode()
 
 
+def crop_fields(left, top, width, height, full=(400, 200)):
+    """Photo Sphere fields of a crop."""
+    return {
+        "ProjectionType": "equirectangular",
+        "CroppedAreaLeftPixels": left,
+        "CroppedAreaTopPixels": top,
+        "CroppedAreaImageWidthPixels": width,
+        "CroppedAreaImageHeightPixels": height,
+        "FullPanoWidthPixels": full[0],
+        "FullPanoHeightPixels": full[1],
+    }
+
+
 def with_metadata(content, orientation=None, xmp=None):
     """The JPEG, PNG or WebP with EXIF and XMP added."""
     if content.startswith(b"\xff\xd8"):

@@ -11,7 +11,8 @@ NEAR_BLACK, BLACK = 8, 2  # levels: where a border goes on, and what most of it 
 MIN_FULL_EDGE = 0.99  # of a full sphere's edge: its rows at the poles and its seam are black as a whole
 MIN_CROP_EDGE = 1.0 / 64.0  # of a crop's edge, which may be ragged
 MIN_PURE = 0.95  # of a border's pixels that are BLACK
-RIM = 4  # [px] that JPEG smears a border's edge
+RIM = 8  # [px] that JPEG smears a border's edge: a block
+RIM_KERNEL = np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8)
 
 DISC_WIDTH = 720  # [px] discs are looked for at this size, rows of half a degree; not in smaller pictures
 ROWS_PER_DEG = DISC_WIDTH / 360.0
@@ -22,9 +23,9 @@ MIN_STEP = 12.0  # levels between inside and outside of a disc's edge
 MIN_EDGE_SHARE, MAX_CALM_SHARE = 0.9, 0.5  # of columns with a step: at the edge, in the rows near it
 NUM_SECTORS = 16
 DETAIL_DEG = 0.5  # over which detail is measured
-MIN_DETAIL = 6.0  # levels, around a disc without detail
+MIN_DETAIL = 4.0  # levels, around a disc without detail
 MIN_DETAIL_RATIO = 5.0  # of detail outside by detail inside
-OUTSIDE_ROWS = round(2.0 * ROWS_PER_DEG)
+NEAR_ROWS = round(2.0 * ROWS_PER_DEG)  # on each side, in which it is
 
 
 def black_borders(
@@ -33,8 +34,8 @@ def black_borders(
     """Where (H, W) the picture is unfilled but valid so far, None if nowhere.
 
     From each edge inwards, pixels up to the first that is not near black, if the edge is near black: of a
-    full sphere as a whole (a pole is one point, the seam one line), of a crop in part. 95 % of them must be
-    black to two levels; shadows carry noise.
+    full sphere as a whole (a pole is one point, the seam one line), of a crop in part. 95 % of them, save
+    for a rim of 8 pixels, must be black to two levels; shadows carry noise.
     """
     min_share = MIN_FULL_EDGE if is_full else MIN_CROP_EDGE
     found: NDArray[np.bool_] | None = None
@@ -49,7 +50,7 @@ def black_borders(
                 found = is_border if found is None else found | is_border
     if found is None:
         return None
-    return np.asarray(cv2.dilate(found.astype(np.uint8), np.ones((2 * RIM + 1,) * 2, np.uint8)) > 0)
+    return np.asarray(cv2.dilate(found.astype(np.uint8), RIM_KERNEL) > 0)
 
 
 def _border(rgb: NDArray[np.uint8], axis: int, step: int) -> NDArray[np.bool_] | None:
@@ -59,7 +60,9 @@ def _border(rgb: NDArray[np.uint8], axis: int, step: int) -> NDArray[np.bool_] |
     depth = np.where(inwards.all(axis=0), len(inwards), inwards.argmin(axis=0))
     is_border = (np.arange(len(inwards))[:, None] < depth)[::step].swapaxes(0, axis)
     is_black = cv2.inRange(rgb, (0, 0, 0), (BLACK,) * 3) > 0
-    return is_border if is_black[is_border].mean() >= MIN_PURE else None
+    is_core = cv2.erode(is_border.astype(np.uint8), RIM_KERNEL) > 0
+    is_core = is_core if is_core.any() else is_border
+    return is_border if is_black[is_core].mean() >= MIN_PURE else None
 
 
 def polar_disc(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], pole: str) -> float:
@@ -98,10 +101,12 @@ def _detail_circle(cap: NDArray[np.float32]) -> int:
     spacing = np.clip(np.round(DETAIL_DEG * ROWS_PER_DEG / around), 1, DISC_WIDTH // 8).astype(int)
     second = [np.roll(row, k) + np.roll(row, -k) - 2.0 * row for row, k in zip(grey, spacing, strict=True)]
     detail = np.abs(np.stack(second)).reshape(NUM_ROWS, NUM_SECTORS, -1).mean(axis=2)
-    total = np.cumsum(detail, axis=0)
     for k in CANDIDATES:
-        inside = total[k - 2] / (k - 1)
-        outside = (total[k + OUTSIDE_ROWS] - total[k]) / OUTSIDE_ROWS
+        # row k - 1 is half a step: left out
+        inside = np.maximum(
+            np.median(detail[: k - 1], axis=0), detail[k - 1 - NEAR_ROWS : k - 1].mean(axis=0)
+        )
+        outside = detail[k + 1 : k + 1 + NEAR_ROWS].mean(axis=0)
         if (outside >= np.maximum(MIN_DETAIL_RATIO * inside, MIN_DETAIL)).all():
             return k
     return 0
