@@ -85,7 +85,7 @@ def logo(image):
     return changed
 
 
-@pytest.mark.parametrize("half_angle", [8.0, 15.0, 33.0])
+@pytest.mark.parametrize("half_angle", [10.0, 20.0, 33.0])
 @pytest.mark.parametrize("pole", ["nadir", "zenith"])
 @pytest.mark.parametrize("fill", [(250, 250, 250), (10, 10, 60), logo, blurred])
 def test_a_disc_over_a_pole_is_found(tmp_path, half_angle, pole, fill):
