@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..sphere import solid_angles
 from .cube_files import cube_of_cells, read_cube_folder
 from .fisheye import is_dual_fisheye
 from .gpano import Region, attitude, crop_region, gpano_fields, projection, rotation_to_level
@@ -92,7 +91,7 @@ def _finished(
         is_valid = is_valid & ~borders
     rgb, is_valid = place(path, picture.rgb, is_valid, region)
     if borders is not None:
-        share = _sphere_share(place(path, picture.rgb, borders, region)[1])
+        share = _sphere_share(borders, region)
         if share >= MIN_REPORTED:
             notes.append(f"{100 * share:.1f} % of the sphere are a black border, not counted")
     for pole in ("zenith", "nadir"):
@@ -124,6 +123,8 @@ def _user_masks(
     return {index: counts}
 
 
-def _sphere_share(is_there: NDArray[np.bool_]) -> float:
-    """Share of the sphere's area."""
-    return float((is_there.sum(axis=1) * solid_angles(is_there.shape[1])).sum() / (4.0 * np.pi))
+def _sphere_share(is_there: NDArray[np.bool_], region: Region) -> float:
+    """Share of the sphere's area that a part (H, W) of a picture of `region` has."""
+    rows = (np.arange(len(is_there)) + 0.5) / len(is_there) * region.height + region.top
+    per_row = is_there.mean(axis=1) * np.sin(np.clip(rows, 0.0, 1.0) * np.pi)
+    return float(per_row.mean() * region.width * region.height * np.pi / 2.0)

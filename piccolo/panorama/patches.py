@@ -6,13 +6,14 @@ Each rule is narrow, as what is masked wrongly is lost: the lines below are far 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 NEAR_BLACK, BLACK = 8, 2  # levels: where a border goes on, and what most of it has
 MIN_FULL_EDGE = 0.99  # of a full sphere's edge: its rows at the poles and its seam are black as a whole
 MIN_CROP_EDGE = 1.0 / 64.0  # of a crop's edge, which may be ragged
 MIN_PURE = 0.95  # of a border's pixels that are BLACK
 RIM = 8  # [px] that JPEG smears a border's edge: a block
-RIM_KERNEL = np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8)
+BAND = 64  # rows at a time
 
 DISC_WIDTH = 720  # [px] discs are looked for at this size, rows of half a degree; not in smaller pictures
 ROWS_PER_DEG = DISC_WIDTH / 360.0
@@ -38,31 +39,44 @@ def black_borders(
     for a rim of 8 pixels, must be black to two levels; shadows carry noise.
     """
     min_share = MIN_FULL_EDGE if is_full else MIN_CROP_EDGE
-    found: NDArray[np.bool_] | None = None
+    found = np.zeros(is_valid.shape, dtype=np.bool_)
     for axis in (0, 1):
         for step in (1, -1):
-            place = 0 if step > 0 else -1
-            is_black = rgb.take(place, axis).max(axis=1) <= NEAR_BLACK
-            if (is_black & is_valid.take(place, axis)).mean() < min_share:
+            inwards = rgb.swapaxes(0, axis)[::step]
+            is_black = (inwards[0].max(axis=1) <= NEAR_BLACK) & is_valid.swapaxes(0, axis)[::step][0]
+            if is_black.mean() < min_share:
                 continue
-            is_border = _border(rgb, axis, step)
-            if is_border is not None:
-                found = is_border if found is None else found | is_border
-    if found is None:
-        return None
-    return np.asarray(cv2.dilate(found.astype(np.uint8), RIM_KERNEL) > 0)
+            depth = _depth_of_black(inwards, is_black)
+            core = np.maximum(minimum_filter1d(depth, 2 * RIM + 1) - RIM, 0)
+            if _pure_share(inwards, core if core.any() else depth) >= MIN_PURE:
+                depth = np.where(depth > 0, depth + RIM, 0)
+                border = found.swapaxes(0, axis)[::step][: depth.max()]
+                border |= np.arange(len(border))[:, None] < maximum_filter1d(depth, 2 * RIM + 1)
+    return found if found.any() else None
 
 
-def _border(rgb: NDArray[np.uint8], axis: int, step: int) -> NDArray[np.bool_] | None:
-    """The border (H, W) along one edge: the first of `axis` (0 rows, 1 columns), or by `step` -1 the last."""
-    is_near_black = cv2.inRange(rgb, (0, 0, 0), (NEAR_BLACK,) * 3) > 0
-    inwards = is_near_black.swapaxes(0, axis)[::step]
-    depth = np.where(inwards.all(axis=0), len(inwards), inwards.argmin(axis=0))
-    is_border = (np.arange(len(inwards))[:, None] < depth)[::step].swapaxes(0, axis)
-    is_black = cv2.inRange(rgb, (0, 0, 0), (BLACK,) * 3) > 0
-    is_core = cv2.erode(is_border.astype(np.uint8), RIM_KERNEL) > 0
-    is_core = is_core if is_core.any() else is_border
-    return is_border if is_black[is_core].mean() >= MIN_PURE else None
+def _depth_of_black(inwards: NDArray[np.uint8], is_black: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Number of near black pixels from the edge (row 0) inwards, of the columns that are black there."""
+    depth = np.zeros(len(is_black), dtype=np.int64)
+    for begin in range(0, len(inwards), BAND):
+        band = np.ascontiguousarray(inwards[begin : begin + BAND])
+        is_near_black = cv2.inRange(band, (0, 0, 0), (NEAR_BLACK,) * 3) > 0
+        run = np.where(is_near_black.all(axis=0), len(band), is_near_black.argmin(axis=0))
+        depth += run * is_black
+        is_black = is_black & (run == len(band))
+        if not is_black.any():
+            break
+    return depth
+
+
+def _pure_share(inwards: NDArray[np.uint8], depth: NDArray[np.int64]) -> float:
+    """Share of BLACK pixels among those within `depth` (columns,) of the edge."""
+    num_black = 0
+    for begin in range(0, int(depth.max()), BAND):
+        band = np.ascontiguousarray(inwards[begin : begin + BAND])
+        is_within = np.arange(begin, begin + len(band))[:, None] < depth
+        num_black += int(((cv2.inRange(band, (0, 0, 0), (BLACK,) * 3) > 0) & is_within).sum())
+    return num_black / float(depth.sum())
 
 
 def polar_disc(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], pole: str) -> float:
