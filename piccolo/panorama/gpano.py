@@ -18,6 +18,7 @@ NAMESPACE = rb"http://ns\.google\.com/photos/1\.0/panorama/"
 PREFIX = re.compile(rb"xmlns:([A-Za-z_][\w.-]{0,40})\s{0,9}=\s{0,9}[\"']" + NAMESPACE)
 FIELD = rb"\b%s:(\w{1,60})(?:\s{0,9}=\s{0,9}[\"']([^\"'<>]{0,80})[\"']|\s{0,9}>([^<>]{0,80})</)"
 MAX_NUMBER = 1e9
+MAX_PREFIXES = 4  # of one namespace: each is a search of its own
 CROP_FIELDS = (
     "CroppedAreaLeftPixels",
     "CroppedAreaTopPixels",
@@ -46,7 +47,7 @@ class Region:
 def gpano_fields(xmp: bytes) -> dict[str, str]:
     """Names and texts of the Photo Sphere fields in an XMP packet, without the namespace."""
     fields: dict[str, str] = {}
-    for prefix in dict.fromkeys(PREFIX.findall(xmp)):
+    for prefix in list(dict.fromkeys(PREFIX.findall(xmp)))[:MAX_PREFIXES]:
         for name, attribute, element in re.findall(FIELD % re.escape(prefix), xmp):
             text = (attribute or element).decode("utf-8", "replace").strip()
             fields.setdefault(name.decode("ascii", "replace"), text)

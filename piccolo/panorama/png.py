@@ -18,7 +18,7 @@ KEPT = (b"IHDR", b"eXIf", b"iTXt")
 def png_header(path: Path, data: bytes) -> Header:
     """The size in the first chunk, once all chunks' checksums are found right and the last chunk is there."""
     chunks: dict[bytes, bytes] = {}
-    xmp = b""
+    text = b""
     begin = len(MAGIC)
     while b"IEND" not in chunks:
         if begin + 12 > len(data):
@@ -28,7 +28,7 @@ def png_header(path: Path, data: bytes) -> Header:
         if data[end - 4 : end] != struct.pack(">I", zlib.crc32(data[begin + 4 : end - 4])):
             raise InputError(f"{path}: wrong checksum in the PNG's chunk {kind!r} (cut off?), {WANTED}")
         chunks[kind] = data[begin + 8 : end - 4] if kind in KEPT else b""
-        xmp = _xmp(chunks[kind]) or xmp if kind == b"iTXt" else xmp
+        text = text or (chunks[kind] if chunks[kind].startswith(XMP_KEYWORD) else b"")
         begin = end
     if next(iter(chunks)) != b"IHDR" or len(chunks[b"IHDR"]) != 13:
         raise InputError(f"{path}: the PNG does not begin with its header, {WANTED}")
@@ -40,13 +40,13 @@ def png_header(path: Path, data: bytes) -> Header:
         max_num_pixels=len(data) * MAX_RATIO * 8 // max(bits, 1),
         orientation=exif_orientation(chunks.get(b"eXIf", b"")),
         has_alpha=color_type in (4, 6) or b"tRNS" in chunks,
-        xmp=xmp,
+        xmp=_xmp(text),
     )
 
 
 def _xmp(text: bytes) -> bytes:
-    """XMP in an iTXt chunk, unpacked where it is packed; empty for other text and for damaged or long XMP."""
-    if not text.startswith(XMP_KEYWORD) or len(text) < len(XMP_KEYWORD) + 2:
+    """XMP in an iTXt chunk's `text`, unpacked where it is packed; empty if it is missing, damaged or long."""
+    if len(text) < len(XMP_KEYWORD) + 2:
         return b""
     is_packed = text[len(XMP_KEYWORD)] == 1
     body = text[len(XMP_KEYWORD) + 2 :].split(b"\0", 2)[-1]  # after the language and its keyword
