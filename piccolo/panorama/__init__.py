@@ -55,7 +55,7 @@ def _region_and_attitude(
         return region_of_fov(options.fov_deg, width, height), gpano, []
     name = projection(fields)
     if name not in ("", "equirectangular"):
-        raise InputError(f"{path}: found the projection {name} in its metadata, wanted equirectangular")
+        raise InputError(f"{path}: found the projection {name!r} in its metadata, wanted equirectangular")
     notes: list[str] = []
     region = crop_region(fields, width / height)
     is_two_to_one = abs(width - 2 * height) <= ASPECT_TOLERANCE * 2 * height
