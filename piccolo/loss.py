@@ -25,7 +25,9 @@ from .threads import Workers
 
 BLOCK = 4096
 NUM_SUMS = 29  # loss, count, gradient (6), upper triangle of the normal matrix (21)
-MAX_MASKED_SHARE = 0.5  # a pose that hides more of the cloud behind masked pixels has no loss
+# A pose that hides more of the cloud behind masked pixels has no loss. Of a panorama valid in part, the least
+# share of points that must show goes with the square of that part: a crop may face the nearer wall.
+MIN_SHOWN_SHARE = 0.5
 HALF_LEVEL = np.float32(0.5)  # a residual below half an 8-bit level has the weight of half a level
 FARTHEST = 1e7  # [m] from the local origin; squares stay finite in float32 and the loss is inf beyond
 TO_UNIT = 1.0 / 255.0
@@ -164,9 +166,9 @@ def _sum_blocks(
 
 
 def sampling_loss(points: PackedPoints, texels: Texels, pose: Pose, num_threads: int = 1) -> float:
-    """The paper's Eq. 2 at `pose`, in [0, sqrt(3)]; inf where masked pixels hide half of the points."""
+    """The paper's Eq. 2 at `pose`, in [0, sqrt(3)]; inf where masked pixels hide too many of the points."""
     total, count = _sum_blocks(loss_blocks, points, texels, pose, num_threads)[:2]
-    if count <= (1.0 - MAX_MASKED_SHARE) * len(points):
+    if count <= MIN_SHOWN_SHARE * texels.valid_share**2 * len(points):
         return math.inf
     return float(total / count * TO_UNIT)
 
@@ -180,7 +182,7 @@ def normal_equations(
     """
     sums = _sum_blocks(normal_blocks, points, texels, pose, num_threads)
     total, count = sums[:2]
-    if count <= (1.0 - MAX_MASKED_SHARE) * len(points):
+    if count <= MIN_SHOWN_SHARE * texels.valid_share**2 * len(points):
         return math.inf, np.zeros(6), np.eye(6)
     per_point = TO_UNIT / count
     matrix = np.zeros((6, 6))

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .jit import F1, scalar
+from .sphere import solid_angles
 
 BYTE = np.int32(255)
 
@@ -16,6 +17,7 @@ class Texels:
 
     rgbx: NDArray[np.int32]  # ((H + 2) * (W + 2),) R, G, B from the lowest byte up, X = 1 where valid
     width: int  # W [px], H = W / 2
+    valid_share: float = 1.0  # of the sphere
 
     @property
     def stride(self) -> int:
@@ -42,7 +44,8 @@ def pack_texels(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = Non
     padded[1:-1, -1] = inner[:, 0]
     padded[0] = padded[1]
     padded[-1] = padded[-2]
-    return Texels(padded.reshape(-1), width)
+    share = 1.0 if is_valid is None else float(solid_angles(width) @ is_valid.sum(axis=1)) / (4.0 * np.pi)
+    return Texels(padded.reshape(-1), width, share)
 
 
 @scalar

@@ -80,11 +80,11 @@ def project(points, R_cam_from_world, center_world, width, pixels):
         pixels[i, 1] = v
 
 
-def pixel_rays(width: int) -> NDArray[np.float64]:
-    """Unit camera directions (width / 2, width, 3) of the pixel centres of an image of `width`."""
+def pixel_rays(width: int, rows: slice = slice(None)) -> NDArray[np.float64]:
+    """Unit camera directions (width / 2, width, 3) of pixel centres of a `width` image, or of its `rows`."""
     azimuth = (0.5 - (np.arange(width) + 0.5) / width) * 2.0 * np.pi
-    elevation = (0.5 - (np.arange(width // 2) + 0.5) / (width // 2)) * np.pi
-    rays = np.empty((width // 2, width, 3))
+    elevation = (0.5 - (np.arange(width // 2)[rows] + 0.5) / (width // 2)) * np.pi
+    rays = np.empty((len(elevation), width, 3))
     rays[..., 0] = np.cos(elevation)[:, None] * np.cos(azimuth)
     rays[..., 1] = np.cos(elevation)[:, None] * np.sin(azimuth)
     rays[..., 2] = np.sin(elevation)[:, None]

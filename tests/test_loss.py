@@ -75,6 +75,18 @@ def test_pose_that_hides_half_of_the_cloud_behind_the_mask_has_no_loss():
     assert normal_equations(pack_points(points, colors), texels, POSES["tilted"])[0] == math.inf
 
 
+def test_a_crop_has_a_loss_where_it_shows_a_quarter_of_the_points_that_a_full_panorama_must():
+    """Half of the sphere valid: an eighth of the points must show."""
+    points, colors = _points("anywhere")
+    is_valid = np.ones((WIDTH // 2, WIDTH), dtype=bool)
+    is_valid[:, : WIDTH // 2] = False
+    texels = pack_texels(_smooth_image(), is_valid)
+    assert texels.valid_share == pytest.approx(0.5)
+    yaw = POSES["tilted"]
+    losses = [sampling_loss(pack_points(points[:n], colors[:n]), texels, yaw) for n in (50, 500, len(points))]
+    assert all(math.isfinite(loss) for loss in losses)
+
+
 @pytest.mark.parametrize("where", ["anywhere", "seam", "zenith", "nadir"])
 def test_gradient_against_central_differences(where):
     points, colors = _points(where)

@@ -8,69 +8,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pictures import PNG_HEADER_SIZE, TURNS, encoded, png_chunk, smooth_rgb, with_metadata, write
 from refusals import mutated, read_or_refused
 
 from piccolo.errors import InputError
 from piccolo.panorama import read_panorama
 
-PNG_HEADER_SIZE = 33  # [byte] magic and IHDR
-
-
-def smooth_rgb(height=64, width=128):
-    """A picture without two like corners, smooth enough for JPEG."""
-    v, u = np.mgrid[:height, :width]
-    channels = [u * 255 // width, v * 255 // height, (u + v) * 200 // (width + height)]
-    return np.stack(channels, axis=2).astype(np.uint8)
-
-
 RGB = smooth_rgb()
-
-
-def encoded(rgb, suffix, options=()):
-    bgr = rgb[:, :, [2, 1, 0, 3][: rgb.shape[2]]] if rgb.ndim == 3 else rgb
-    return cv2.imencode(suffix, bgr, list(options))[1].tobytes()
-
-
-def write(path, content):
-    path.write_bytes(content)
-    return path
-
-
-def png_chunk(kind, content):
-    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
 
 
 def png_header(width, height, depth=8, color_type=2):
     return b"\x89PNG\r\n\x1a\n" + png_chunk(
         b"IHDR", struct.pack(">IIBBBBB", width, height, depth, color_type, 0, 0, 0)
     )
-
-
-def tiff(orientation):
-    """EXIF's body with nothing but the orientation."""
-    return b"MM\0*\0\0\0\x08" + struct.pack(">HHHIHHI", 1, 0x112, 3, 1, orientation, 0, 0)
-
-
-def with_orientation(content, orientation):
-    """The JPEG or PNG with EXIF added."""
-    if content.startswith(b"\xff\xd8"):
-        body = b"Exif\0\0" + tiff(orientation)
-        return content[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + content[2:]
-    chunk = png_chunk(b"eXIf", tiff(orientation))
-    return content[:PNG_HEADER_SIZE] + chunk + content[PNG_HEADER_SIZE:]
-
-
-# What a viewer does to the stored picture, by EXIF's number.
-TURNS = {
-    1: lambda image: image,
-    2: np.fliplr,
-    3: lambda image: np.rot90(image, 2),
-    4: np.flipud,
-    5: lambda image: np.swapaxes(image, 0, 1),
-    6: lambda image: np.rot90(image, -1),
-    7: lambda image: np.swapaxes(np.rot90(image, 2), 0, 1),
-    8: np.rot90,
-}
 
 
 def test_png_comes_back_exactly(tmp_path):
@@ -109,7 +59,7 @@ def test_sixteen_bits_become_eight(tmp_path):
 def test_alpha_zero_is_not_valid(tmp_path, dtype):
     alpha = np.full((64, 128), np.iinfo(dtype).max, dtype=dtype)
     alpha[50:], alpha[0, 0] = 0, 1
-    rgba = np.dstack([RGB.astype(dtype), alpha])
+    rgba = np.dstack([RGB.astype(dtype) * (np.iinfo(dtype).max // 255), alpha])
     panorama = read_panorama(write(tmp_path / "a.png", encoded(rgba, ".png")))
     np.testing.assert_array_equal(panorama.is_valid, alpha > 0)
 
@@ -126,7 +76,7 @@ def test_transparent_color_is_not_valid(tmp_path):
 def test_exif_orientation_is_applied(tmp_path, suffix, orientation):
     stored = RGB if orientation < 5 else smooth_rgb(128, 64)
     content = encoded(stored, suffix, [cv2.IMWRITE_JPEG_QUALITY, 98])
-    rgb = read_panorama(write(tmp_path / "a", with_orientation(content, orientation))).rgb
+    rgb = read_panorama(write(tmp_path / "a", with_metadata(content, orientation))).rgb
     assert np.abs(rgb.astype(int) - TURNS[orientation](stored)).max() <= (8 if suffix == ".jpg" else 0)
 
 
@@ -134,7 +84,7 @@ def test_exif_orientation_is_applied(tmp_path, suffix, orientation):
 def test_alpha_is_turned_with_the_colors(tmp_path, orientation):
     stored = RGB if orientation < 5 else smooth_rgb(128, 64)
     alpha = np.where(stored[:, :, 0] + stored[:, :, 1] // 2 < 90, 0, 200).astype(np.uint8)
-    content = with_orientation(encoded(np.dstack([stored, alpha]), ".png"), orientation)
+    content = with_metadata(encoded(np.dstack([stored, alpha]), ".png"), orientation)
     panorama = read_panorama(write(tmp_path / "a.png", content))
     np.testing.assert_array_equal(panorama.rgb, TURNS[orientation](stored))
     np.testing.assert_array_equal(panorama.is_valid, TURNS[orientation](alpha) > 0)
@@ -243,7 +193,7 @@ def png_of(packed):
     ("content", "message"),
     [
         (b"", "the file is empty"),
-        (b"GIF89a" + bytes(99), "begins with b'GIF89a.*', wanted a whole JPEG or PNG panorama"),
+        (b"GIF89a" + bytes(99), "begins with b'GIF89a.*', wanted a whole JPEG, PNG, TIFF or WebP panorama"),
         (b"\xff\xd8", "the JPEG ends without its end mark"),
         (b"\xff\xd8" + bytes(999), "the JPEG ends without its end mark"),
         (PNG[:60] + b"\x01\x02\x03" + PNG[63:], "wrong checksum in the PNG's chunk b'IDAT'"),

@@ -1,0 +1,130 @@
+"""Panoramas: one reader a format, then one place in the sphere for all, and what is not to be counted."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from .cube_files import cube_of_cells, read_cube_folder
+from .fisheye import is_dual_fisheye
+from .gpano import Region, attitude, crop_region, gpano_fields, projection, rotation_to_level
+from .masks import find_mask, mask_cap, read_mask
+from .model import GPano, Panorama, ReadOptions
+from .patches import black_borders, polar_disc
+from .picture import Picture, read_picture
+from .placing import ASPECT_TOLERANCE, full_size, place, region_of_fov
+
+__all__ = ["GPano", "Panorama", "ReadOptions", "read_panorama", "rotation_to_level"]
+
+DEFAULT_OPTIONS = ReadOptions()
+MIN_REPORTED = 0.001  # of the sphere: borders below this are masked without a word
+
+
+def read_panorama(path: Path, options: ReadOptions = DEFAULT_OPTIONS) -> Panorama:
+    """The panorama in a JPEG, PNG, TIFF or WebP file or in a folder of six cube faces, as a full sphere.
+
+    Colours have 8 bits (of 16 the upper 8, v >> 8), grey becomes RGB, EXIF's orientation is applied. Not
+    valid are pixels of alpha 0, what a crop leaves open, masks, black borders and discs put over a pole.
+
+    Raises
+    ------
+    InputError
+        The file is missing or damaged, of another format or projection, its size is out of range, or nothing
+        tells which part of the sphere it shows.
+    """
+    path = Path(path)
+    is_folder = path.is_dir()
+    picture = read_cube_folder(path) if is_folder else read_picture(path)
+    cube = None if is_folder else cube_of_cells(path, picture, options.cube_order)
+    if is_folder or cube:
+        region, gpano, notes = Region(), None, list[str]()
+    else:
+        region, gpano, notes = _region_and_attitude(path, picture, options)
+    return _finished(path, cube or picture, region, options, gpano, notes)
+
+
+def _region_and_attitude(
+    path: Path, picture: Picture, options: ReadOptions
+) -> tuple[Region, GPano | None, list[str]]:
+    """Which part of the sphere a picture shows, how the camera was held, and what the user should know."""
+    fields = gpano_fields(picture.xmp)
+    gpano = attitude(fields) if fields else None
+    width, height = picture.size
+    if options.fov_deg is not None:
+        return region_of_fov(options.fov_deg, width, height), gpano, []
+    name = projection(fields)
+    if name not in ("", "equirectangular"):
+        raise InputError(f"{path}: found the projection {name!r} in its metadata, wanted equirectangular")
+    notes: list[str] = []
+    region = crop_region(fields, width / height)
+    is_two_to_one = abs(width - 2 * height) <= ASPECT_TOLERANCE * 2 * height
+    if region is None and is_two_to_one:
+        region = Region()
+        notes = [
+            "found a crop in the metadata that makes no sense or is of another shape, taken as uncropped"
+        ]
+    if region is None or (region.is_full and not is_two_to_one):
+        wrong = " and a crop in the metadata that does not fit it" if region is None else ""
+        raise InputError(
+            f"{path}: found {width} x {height}{wrong}, wanted width = 2 x height (a full "
+            "equirectangular panorama), GPano metadata of a crop, a field of view, or the order of cube faces"
+        )
+    if region.is_full and is_dual_fisheye(picture.rgb):
+        raise InputError(
+            f"{path}: found two fisheye pictures side by side, wanted an equirectangular panorama: "
+            "stitch it with the camera's program first"
+        )
+    return region, gpano, notes
+
+
+def _finished(
+    path: Path, picture: Picture, region: Region, options: ReadOptions, gpano: GPano | None, notes: list[str]
+) -> Panorama:
+    """The picture at its place, with everything masked that is not to be counted."""
+    size = full_size(path, region, picture.size)
+    notes = [*picture.warnings, *notes]
+    masks = _user_masks(path, [size, picture.size], options, notes)
+    is_valid = picture.is_valid & masks[1] if 1 in masks else picture.is_valid
+    borders = black_borders(picture.rgb, is_valid, region.is_full)
+    if borders is not None:
+        is_valid = is_valid & ~borders
+    rgb, is_valid = place(path, picture.rgb, is_valid, region)
+    if borders is not None:
+        share = _sphere_share(borders, region)
+        if share >= MIN_REPORTED:
+            notes.append(f"{100 * share:.1f} % of the sphere are a black border, not counted")
+    for pole in ("zenith", "nadir"):
+        half_angle = polar_disc(rgb, is_valid, pole)
+        if half_angle:
+            notes.append(f"found a patch of {half_angle:.1f} deg over the {pole}, not counted")
+            cap = is_valid if pole == "nadir" else is_valid[::-1]
+            is_valid = mask_cap(cap, half_angle)
+            is_valid = is_valid if pole == "nadir" else is_valid[::-1]
+    if 0 in masks:
+        is_valid = is_valid & masks[0]
+    is_valid = mask_cap(is_valid, options.mask_nadir_deg) if options.mask_nadir_deg else is_valid
+    if not is_valid.any():
+        raise InputError(f"{path}: found no pixel that counts, all are masked or black")
+    return Panorama(rgb, np.ascontiguousarray(is_valid), gpano, tuple(notes))
+
+
+def _user_masks(
+    path: Path, sizes: list[tuple[int, int]], options: ReadOptions, notes: list[str]
+) -> dict[int, NDArray[np.bool_]]:
+    """The user's mask, where to count, by the index of the size that it has the shape of."""
+    if options.mask is None:
+        return {}
+    file = find_mask(options.mask, path)
+    if file is None:
+        notes.append(f"found no mask {path.stem} in {options.mask}")
+        return {}
+    index, counts = read_mask(file, sizes)
+    return {index: counts}
+
+
+def _sphere_share(is_there: NDArray[np.bool_], region: Region) -> float:
+    """Share of the sphere's area that a part (H, W) of a picture of `region` has."""
+    rows = (np.arange(len(is_there)) + 0.5) / len(is_there) * region.height + region.top
+    per_row = is_there.mean(axis=1) * np.sin(np.clip(rows, 0.0, 1.0) * np.pi)
+    return float(per_row.mean() * region.width * region.height * np.pi / 2.0)

@@ -1,0 +1,121 @@
+"""Google's Photo Sphere XMP: which part of the sphere a picture shows, and how the camera was held.
+
+https://developers.google.com/streetview/spherical-metadata. The few fields are searched in the text, once as
+attributes and once as elements, without an XML parser: there are no entities that could be expanded, and
+damaged XML costs nothing but its damaged fields.
+"""
+
+import math
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..pose import Array
+from .model import GPano
+
+NAMESPACE = rb"http://ns\.google\.com/photos/1\.0/panorama/"
+PREFIX = re.compile(rb"xmlns:([A-Za-z_][\w.-]{0,40})\s{0,9}=\s{0,9}[\"']" + NAMESPACE)
+FIELD = rb"\b%s:(\w{1,60})(?:\s{0,9}=\s{0,9}[\"']([^\"'<>]{0,80})[\"']|\s{0,9}>([^<>]{0,80})</)"
+MAX_NUMBER = 1e9
+MAX_PREFIXES = 4  # of one namespace: each is a search of its own
+CROP_FIELDS = (
+    "CroppedAreaLeftPixels",
+    "CroppedAreaTopPixels",
+    "CroppedAreaImageWidthPixels",
+    "CroppedAreaImageHeightPixels",
+    "FullPanoWidthPixels",
+    "FullPanoHeightPixels",
+)
+
+
+@dataclass(frozen=True)
+class Region:
+    """The part of the sphere that a picture shows, in shares of the full width and height."""
+
+    left: float = 0.0
+    top: float = 0.0
+    width: float = 1.0
+    height: float = 1.0
+
+    @property
+    def is_full(self) -> bool:
+        """True for the whole sphere."""
+        return self == Region()
+
+
+def gpano_fields(xmp: bytes) -> dict[str, str]:
+    """Names and texts of the Photo Sphere fields in an XMP packet, without the namespace."""
+    fields: dict[str, str] = {}
+    for prefix in list(dict.fromkeys(PREFIX.findall(xmp)))[:MAX_PREFIXES]:
+        for name, attribute, element in re.findall(FIELD % re.escape(prefix), xmp):
+            text = (attribute or element).decode("utf-8", "replace").strip()
+            fields.setdefault(name.decode("ascii", "replace"), text)
+    return fields
+
+
+def _number(fields: dict[str, str], name: str) -> float | None:
+    """The number in a field; None if it is missing, no number or not finite."""
+    try:
+        value = float(fields[name])
+    except (KeyError, ValueError):
+        return None
+    return value if abs(value) <= MAX_NUMBER else None  # NaN is not
+
+
+def attitude(fields: dict[str, str]) -> GPano:
+    """Heading, pitch and roll; what is out of range counts as not said."""
+    heading = _number(fields, "PoseHeadingDegrees")
+    pitch = _number(fields, "PosePitchDegrees")
+    roll = _number(fields, "PoseRollDegrees")
+    return GPano(
+        heading % 360.0 if heading is not None else None,
+        pitch if pitch is not None and abs(pitch) <= 90.0 else None,
+        roll if roll is not None and abs(roll) <= 180.0 else None,
+    )
+
+
+def projection(fields: dict[str, str]) -> str:
+    """The projection's name, lower case; empty if not said."""
+    return fields.get("ProjectionType", "").lower()
+
+
+def crop_region(fields: dict[str, str], aspect: float) -> Region | None:
+    """The part of the sphere that a picture of `aspect` (width by height) shows; full if nothing is said.
+
+    The fields count pixels of the picture as it was made: only their ratios are used, so that a picture made
+    smaller since is placed right. None if the fields make no sense or are of a picture of another shape.
+    """
+    given = [_number(fields, name) for name in CROP_FIELDS]
+    if not any(name in fields for name in CROP_FIELDS):
+        return Region()
+    numbers = [number for number in given if number is not None]
+    if len(numbers) < len(CROP_FIELDS):
+        return None
+    left, top, width, height, full_width, full_height = numbers
+    if min(width, height, full_width, full_height) < 1.0:
+        return None
+    is_inside = width <= full_width and -1.0 <= top <= full_height - height + 1.0 and abs(left) <= full_width
+    # a pixel more or less by rounding, or one per cent
+    is_same_shape = abs(width / height / aspect - 1.0) <= max(0.01, 1.5 / width, 1.5 / height)
+    if not (is_inside and is_same_shape):
+        return None
+    return Region(left / full_width, top / full_height, width / full_width, height / full_height)
+
+
+def rotation_to_level(gpano: GPano) -> Array | None:
+    """R_level_from_cam (3, 3) from pitch and roll, None if neither is known; one alone counts with 0.
+
+    `x_level = R_level_from_cam @ x_cam`; both frames have +x towards the image centre, +y left, +z up, level
+    with z against gravity and x at the heading. Google's reference: pitch is the image centre's elevation
+    above the horizon, and as roll grows the horizon turns counterclockwise in the image, so the camera's
+    right side goes down. Euler angles are taken in the order heading, pitch, roll about its own axes:
+    R_level_from_cam = R_y(-pitch) R_x(roll).
+    """
+    if gpano.pitch_deg is None and gpano.roll_deg is None:
+        return None
+    pitch, roll = math.radians(gpano.pitch_deg or 0.0), math.radians(gpano.roll_deg or 0.0)
+    c, s = math.cos(pitch), math.sin(pitch)
+    R_pitch = np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
+    c, s = math.cos(roll), math.sin(roll)
+    return np.asarray(R_pitch @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]))

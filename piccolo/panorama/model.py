@@ -1,0 +1,53 @@
+"""A panorama, what is known of it, and how it is to be read."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+
+FACE_LETTERS = "rludfb"  # right, left, up, down, front, back
+
+
+@dataclass(frozen=True)
+class GPano:
+    """How the camera was held, by the file's Photo Sphere XMP; None where the file does not say."""
+
+    heading_deg: float | None = None  # compass heading of the image centre, clockwise from north, [0, 360)
+    pitch_deg: float | None = None  # of the image centre above the horizon, [-90, 90]
+    roll_deg: float | None = None  # about the view axis, the camera's right side down, [-180, 180]
+
+
+@dataclass(frozen=True)
+class Panorama:
+    """A full equirectangular picture, W = 2 H."""
+
+    rgb: NDArray[np.uint8]  # (H, W, 3)
+    is_valid: NDArray[np.bool_]  # (H, W), False where the picture shows nothing
+    gpano: GPano | None = None  # None for a file without such metadata
+    warnings: tuple[str, ...] = ()  # what the user should know of the reading
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """What a picture can't say of itself."""
+
+    fov_deg: float | None = None  # horizontal, of a picture centred on the horizon; goes before metadata
+    mask: Path | None = None  # picture, white where the panorama is to be ignored, or a folder of such
+    mask_nadir_deg: float = 0.0  # the cap of this half angle about the camera's down axis is ignored
+    cube_order: str | None = None  # the picture is six cube faces in this order, such as rludfb
+
+    def __post_init__(self) -> None:
+        """Refuse values that mean nothing, naming the option."""
+        if self.fov_deg is not None and not (math.isfinite(self.fov_deg) and 0.0 < self.fov_deg <= 360.0):
+            raise InputError(f"fov_deg: found {self.fov_deg}, wanted above 0 and at most 360")
+        if not (math.isfinite(self.mask_nadir_deg) and 0.0 <= self.mask_nadir_deg <= 90.0):
+            raise InputError(f"mask_nadir_deg: found {self.mask_nadir_deg}, wanted 0 to 90")
+        if self.cube_order is not None and sorted(self.cube_order) != sorted(FACE_LETTERS):
+            raise InputError(
+                f"cube_order: found {self.cube_order}, wanted each of the letters {FACE_LETTERS} once "
+                "(right, left, up, down, front, back)"
+            )

@@ -1,0 +1,227 @@
+import time
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pictures import (
+    XMP_NAMESPACE,
+    crop_fields,
+    encoded,
+    png_chunk,
+    smooth_rgb,
+    tiff,
+    with_metadata,
+    write,
+    xmp_packet,
+)
+from refusals import read_or_refused
+
+from piccolo.errors import InputError
+from piccolo.panorama import GPano, ReadOptions, read_panorama, rotation_to_level
+from piccolo.panorama.gpano import gpano_fields
+from piccolo.sphere import pixel_rays
+
+RGB = smooth_rgb(200, 400)
+LOSSLESS = [cv2.IMWRITE_WEBP_QUALITY, 101]
+
+
+def file_of(rgb, fields, suffix=".png", **form):
+    xmp = xmp_packet(fields, **form)
+    if suffix == ".tif":
+        return tiff(rgb, {700: (1, list(xmp))})
+    options = LOSSLESS if suffix == ".webp" else [cv2.IMWRITE_JPEG_QUALITY, 98]
+    return with_metadata(encoded(rgb, suffix, options), xmp=xmp)
+
+
+def expected_crop(left, top, width, height):
+    is_valid = np.zeros((200, 400), bool)
+    is_valid[top : top + height, left : left + width] = True
+    return np.where(is_valid[..., None], RGB, 0), is_valid
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif", ".webp"])
+@pytest.mark.parametrize("form", ["attributes", "elements"])
+def test_a_crop_is_placed_in_the_sphere(tmp_path, suffix, form):
+    content = file_of(RGB[30:170, 50:290], crop_fields(50, 30, 240, 140), suffix, form=form, prefix="pano")
+    panorama = read_panorama(write(tmp_path / "a", content))
+    rgb, is_valid = expected_crop(50, 30, 240, 140)
+    np.testing.assert_array_equal(panorama.is_valid, is_valid)
+    assert np.abs(panorama.rgb.astype(int) - rgb).max() <= (8 if suffix == ".jpg" else 0)
+    assert panorama.gpano == GPano()
+    assert panorama.warnings == ()
+
+
+def test_packed_xmp_in_png_is_read_and_a_bomb_is_not(tmp_path):
+    crop = encoded(RGB[30:170, 50:290], ".png")
+    for xmp, is_read in ((xmp_packet(crop_fields(50, 30, 240, 140)), True), (bytes(50_000_000), False)):
+        chunk = png_chunk(b"iTXt", b"XML:com.adobe.xmp\0\1\0\0\0" + zlib.compress(xmp))
+        panorama, message = read_or_refused(
+            read_panorama, write(tmp_path / "a.png", crop[:33] + chunk + crop[33:])
+        )
+        assert (panorama is not None) == is_read
+        assert is_read or "found 240 x 140, wanted width = 2 x height" in message
+
+
+def test_the_crop_of_a_picture_made_smaller_is_placed_by_ratio(tmp_path):
+    crop = cv2.resize(RGB[40:180, 100:300], (100, 70), interpolation=cv2.INTER_AREA)
+    large = np.kron(crop, np.ones((2, 2, 1), np.uint8))
+    content = file_of(large, crop_fields(1000, 400, 2000, 1400, (4000, 2000)))
+    panorama = read_panorama(write(tmp_path / "a", content))
+    rows, columns = np.nonzero(panorama.is_valid)
+    assert panorama.rgb.shape == (200, 400, 3)
+    assert (rows.min(), rows.max(), columns.min(), columns.max()) == (40, 179, 100, 299)
+    assert np.abs(panorama.rgb.astype(int) - RGB)[panorama.is_valid].max() <= 3
+
+
+@pytest.mark.parametrize("left", [-100, 300])
+def test_a_crop_over_the_seam_goes_on_at_the_other_side(tmp_path, left):
+    rolled = np.roll(RGB, 100, axis=1)[20:180, :260]
+    panorama = read_panorama(write(tmp_path / "a", file_of(rolled, crop_fields(left, 20, 260, 160))))
+    is_valid = np.zeros((200, 400), bool)
+    is_valid[20:180, :160] = is_valid[20:180, 300:] = True
+    np.testing.assert_array_equal(panorama.is_valid, is_valid)
+    np.testing.assert_array_equal(panorama.rgb[is_valid], RGB[is_valid])
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        crop_fields(0, 0, 0, 0),
+        crop_fields(0, 0, -400, -200),
+        crop_fields(0, 0, "nan", "nan"),
+        crop_fields(0, 0, "inf", 200),
+        crop_fields(0, 0, 1e300, 200),
+        crop_fields(0, 0, "many", 200),
+        crop_fields(0, 150, 400, 200, (800, 300)),
+        crop_fields(999, 0, 400, 200),
+        crop_fields(0, 0, 400, 100),
+        {"FullPanoWidthPixels": 800},
+    ],
+)
+def test_a_crop_that_makes_no_sense_is_refused_or_left_aside(tmp_path, fields):
+    panorama = read_panorama(write(tmp_path / "a", file_of(RGB, fields)))
+    np.testing.assert_array_equal(panorama.rgb, RGB)
+    assert panorama.is_valid.all()
+    assert "found a crop in the metadata that makes no sense" in panorama.warnings[0]
+    with pytest.raises(InputError, match="found 300 x 200 and a crop in the metadata that does not fit it"):
+        read_panorama(write(tmp_path / "b", file_of(RGB[:, :300], fields)))
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        (
+            crop_fields(0, 0, 300, 200, (70_000, 35_000)),
+            "found 300 x 200 of a sphere 70000 wide, wanted at most",
+        ),
+        (
+            crop_fields(0, 0, 300, 200, (9000, 4500)),
+            "found 300 x 200, 0.15 % of the sphere, wanted at least 2 %",
+        ),
+        (crop_fields(0, 0, 300, 200, (900, 200)), "of a sphere of 900 x 200, wanted that width = 2 x height"),
+        (
+            {"ProjectionType": "Cylin\ndrical"},
+            r"found the projection .cylin.+ndrical. in its metadata, wanted equirect",
+        ),
+    ],
+)
+def test_crops_are_refused_by_name(tmp_path, fields, message):
+    with pytest.raises(InputError, match=message):
+        read_panorama(write(tmp_path / "a", file_of(RGB[:, :300], fields)))
+
+
+def test_the_attitude_is_read(tmp_path):
+    fields = {"PoseHeadingDegrees": "-75", "PosePitchDegrees": "+3.5", "PoseRollDegrees": -120.25}
+    assert read_panorama(write(tmp_path / "a", file_of(RGB, fields))).gpano == GPano(285.0, 3.5, -120.25)
+    fields = {"PoseHeadingDegrees": "nan", "PosePitchDegrees": 91, "PoseRollDegrees": "1e999"}
+    assert read_panorama(write(tmp_path / "a", file_of(RGB, fields))).gpano == GPano()
+    assert read_panorama(write(tmp_path / "a", encoded(RGB, ".png"))).gpano is None
+
+
+def test_an_entity_bomb_is_not_expanded(tmp_path):
+    bomb = b'<!DOCTYPE a [<!ENTITY a "aaaaaaaa">' + b"".join(
+        f'<!ENTITY {chr(98 + k)} "{f"&{chr(97 + k)};" * 10}">'.encode() for k in range(20)
+    )
+    xmp = bomb + b"]>" + xmp_packet({"PosePitchDegrees": "&u;"})
+    panorama = read_panorama(write(tmp_path / "a.jpg", with_metadata(encoded(RGB, ".jpg"), xmp=xmp)))
+    assert panorama.gpano == GPano()
+
+
+def test_pitch_raises_the_image_centre_and_roll_lowers_the_right_side():
+    R_level_from_cam = rotation_to_level(GPano(pitch_deg=30.0))
+    np.testing.assert_allclose(R_level_from_cam @ [1, 0, 0], [np.cos(np.pi / 6), 0, 0.5], atol=1e-12)
+    np.testing.assert_allclose(R_level_from_cam @ [0, 1, 0], [0, 1, 0], atol=1e-12)
+    R_level_from_cam = rotation_to_level(GPano(roll_deg=20.0))
+    np.testing.assert_allclose(R_level_from_cam @ [1, 0, 0], [1, 0, 0], atol=1e-12)
+    assert (R_level_from_cam @ [0, -1, 0])[2] == pytest.approx(-np.sin(np.radians(20)))
+    assert rotation_to_level(GPano(heading_deg=90.0)) is None
+
+
+@pytest.mark.parametrize(("pitch", "roll"), [(25.0, -40.0), (-10.0, 170.0), (89.0, 5.0)])
+def test_the_order_is_heading_pitch_roll_about_the_cameras_axes(pitch, roll):
+    R_level_from_cam = rotation_to_level(GPano(pitch_deg=pitch, roll_deg=roll))
+    np.testing.assert_allclose(R_level_from_cam @ R_level_from_cam.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R_level_from_cam) == pytest.approx(1.0)
+    # roll leaves the image centre where pitch put it
+    elevation = np.degrees(np.arcsin((R_level_from_cam @ [1, 0, 0])[2]))
+    assert elevation == pytest.approx(pitch)
+    # the camera's left axis is at the roll's angle against the level one before pitch
+    left = R_level_from_cam @ [0, 1, 0]
+    assert left[2] == pytest.approx(np.sin(np.radians(roll)) * np.cos(np.radians(pitch)))
+
+
+def test_the_horizon_turns_counterclockwise_in_the_image_as_roll_grows():
+    R_level_from_cam = rotation_to_level(GPano(roll_deg=10.0))
+    is_below = pixel_rays(360) @ R_level_from_cam[2] < 0  # in the image, row by row downwards
+    horizon = is_below.argmax(axis=0)
+    assert horizon[180 - 60] > horizon[180] > horizon[180 + 60]  # lower at the left, higher at the right
+
+
+def test_a_field_of_view_is_centred_on_the_horizon(tmp_path):
+    path = write(tmp_path / "a.png", encoded(RGB[60:140, 100:300], ".png"))
+    with pytest.raises(InputError, match=r"found 200 x 80, wanted width = 2 x height .* field of view"):
+        read_panorama(path)
+    panorama = read_panorama(path, ReadOptions(fov_deg=180.0))
+    rgb, is_valid = expected_crop(100, 60, 200, 80)
+    np.testing.assert_array_equal(panorama.is_valid, is_valid)
+    np.testing.assert_array_equal(panorama.rgb, rgb)
+    around = read_panorama(path, ReadOptions(fov_deg=360.0))
+    assert around.rgb.shape == (100, 200, 3)
+    assert around.is_valid[10:90].all()
+    with pytest.raises(
+        InputError, match=r"found 200 x 200, higher than the sphere .* wanted a smaller fov_deg"
+    ):
+        read_panorama(write(path, encoded(RGB[:, :200], ".png")), ReadOptions(fov_deg=270.0))
+
+
+@pytest.mark.parametrize("fov_deg", [0.0, -90.0, 361.0, float("nan")])
+def test_other_fields_of_view_are_refused(fov_deg):
+    with pytest.raises(InputError, match=r"fov_deg: found .*, wanted above 0 and at most 360"):
+        ReadOptions(fov_deg=fov_deg)
+
+
+NUMBERS = st.one_of(
+    st.integers(-10, 2_000_000_000), st.floats(), st.text(max_size=9), st.sampled_from([200, 400, 800, 32768])
+)
+
+
+@settings(deadline=None, max_examples=150)
+@given(values=st.lists(NUMBERS, min_size=6, max_size=6), width=st.sampled_from([300, 400]))
+def test_any_numbers_in_a_crop_are_read_or_refused(values, width, tmp_path_factory):
+    fields = dict(zip(list(crop_fields(0, 0, 1, 1))[1:], values, strict=True))
+    path = tmp_path_factory.getbasetemp() / "crop.png"
+    panorama, _ = read_or_refused(read_panorama, write(path, file_of(RGB[:, :width], fields)))
+    assert panorama is None or panorama.rgb.shape[1] == 2 * panorama.rgb.shape[0]
+    assert panorama is None or panorama.is_valid.mean() > 0.015
+
+
+def test_many_prefixes_of_the_namespace_cost_no_time():
+    xmp = b"".join(
+        f'xmlns:p{k}="{XMP_NAMESPACE}" p{k}:PosePitchDegrees="{k}" '.encode() for k in range(12_000)
+    )
+    begin = time.perf_counter()
+    assert gpano_fields(xmp) == {"PosePitchDegrees": "0"}
+    assert time.perf_counter() - begin < 2.0
