@@ -8,13 +8,17 @@ import numpy as np
 from ..errors import InputError
 from .clean import clean
 from .model import Cloud
+from .npz import NPY, NPZ
+from .pcd import PCD
 from .ply import PLY
+from .pts import PTS
+from .ptx import PTX
 from .raw import HEAD_SIZE, Format, PointSource, RawCloud
 from .text import TEXT
 
 __all__ = ["Cloud", "read_cloud"]
 
-FORMATS = (PLY, TEXT)
+FORMATS = (PLY, PCD, PTX, PTS, NPZ, NPY, TEXT)
 WANTED = f"wanted a coloured point cloud: {', '.join(f.name for f in FORMATS)}"
 
 

@@ -29,7 +29,8 @@ def clean(path: Path, raw: RawCloud, scale: float) -> Cloud:
     brightest = int(colors.max())
     if brightest < MIN_BRIGHTEST:
         raise InputError(
-            f"{path}: all points are black (brightest value {brightest} of 255), wanted a coloured cloud"
+            f"{path}: all points are black (brightest value {brightest} of 255), wanted a coloured cloud; "
+            "numbers without a declared range are 0-255, not 0-1"
         )
     points_world = points_world * scale
     low, high = points_world.min(axis=0), points_world.max(axis=0)

@@ -10,12 +10,12 @@ from ..errors import InputError
 from .raw import Format, PointSource, RawCloud
 from .rows import NOT_A_NUMBER, SPACE, TOO_FEW, parse_rows
 
-TEXT_SUFFIXES = frozenset({".txt", ".xyz", ".asc", ".csv", ".xyzrgb", ".pts"})
+TEXT_SUFFIXES = frozenset({".txt", ".xyz", ".asc", ".csv", ".xyzrgb"})
 COLUMN_NAMES = ("xyzrgb", ("x", "y", "z", "red", "green", "blue"))
-PTS_COLUMNS = (0, 1, 2, 4, 5, 6)  # x y z intensity r g b
+USUAL_COLUMNS = (0, 1, 2, 3, 4, 5)
 HEAD_SIZE = 1 << 16  # bytes in which the header is looked for
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
-WANTED = "wanted lines of numbers x y z r g b, colours 0-255"
+WANTED = "wanted lines of numbers x y z r g b, with decimal points, colours 0-255"
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ class Layout:
 def read_text(path: Path) -> RawCloud:
     """The points of a text file: whitespace, comma or semicolon between numbers, colours 0-255.
 
-    A header line is passed over, or obeyed if it names x y z and r g b (or red green blue). Without one the
-    first six columns count; in a .pts file with seven or more, the fourth is intensity.
+    A header line is passed over, or obeyed if it names x y z and r g b (or red green blue), or refused if it
+    names a line's columns, x y z among them, but no colours. Without one the first six columns count.
     """
     data = np.asarray(np.memmap(path, dtype=np.uint8, mode="r"))
     layout = _layout(path, bytes(data[:HEAD_SIZE]))
@@ -84,6 +84,7 @@ def _layout(path: Path, head: bytes) -> Layout:
         raise InputError(f"{path}: holds bytes that are no text, {WANTED}")
     start = len(BYTE_ORDER_MARK) if head.startswith(BYTE_ORDER_MARK) else 0
     named: tuple[int, ...] | None = None
+    header = ""
     num_lines = 0
     for line in head[start:].splitlines(keepends=True):
         text = line.decode("latin-1").strip()
@@ -91,22 +92,20 @@ def _layout(path: Path, head: bytes) -> Layout:
         if _begins_numbers(text, fields):
             break
         named = _named_columns(text) or named
+        if {*"xyz"} <= {*_names(text)}:
+            header = text
         start += len(line)
         num_lines += 1
     else:
         raise InputError(f"{path}: no line of numbers at its beginning, {WANTED}")
-    columns = named or _usual_columns(path, len(fields))
+    if named is None and len(_names(header)) == len(fields):
+        raise InputError(f"{path}: the columns are {quoted(header.encode())}, {WANTED}")
+    columns = named or USUAL_COLUMNS
     if len(fields) <= max(columns):
         raise InputError(
             f"{path}: line {num_lines + 1} has {len(fields)} columns (no colours?): {quoted(line)}, {WANTED}"
         )
     return Layout(start, num_lines, _separator(text), columns)
-
-
-def _usual_columns(path: Path, num_fields: int) -> tuple[int, ...]:
-    if path.suffix.lower() == ".pts" and num_fields > 6:
-        return PTS_COLUMNS
-    return (0, 1, 2, 3, 4, 5)
 
 
 def _separator(line: str) -> int:
@@ -132,9 +131,14 @@ def _is_number(field: str) -> bool:
     return True
 
 
+def _names(header: str) -> list[str]:
+    """The names of columns in a header line, in lower case."""
+    return [name.strip(' "').lower() for name in _fields(header.lstrip("#/ "))]
+
+
 def _named_columns(header: str) -> tuple[int, ...] | None:
     """The fields of x, y, z, r, g, b in a header line that names them all, else None."""
-    names = [name.strip(' "').lower() for name in _fields(header.lstrip("#/ "))]
+    names = _names(header)
     for wanted in COLUMN_NAMES:
         if all(names.count(name) == 1 for name in wanted):
             return tuple(names.index(name) for name in wanted)

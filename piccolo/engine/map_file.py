@@ -22,6 +22,9 @@ from .scan_map import ScanMap
 FORMAT = "piccolo-map/1"
 ARRAYS = [f.name for f in fields(ScanMap) if f.name not in ("octree", "warnings")]
 ZIP_MAGIC = b"PK\x03\x04"
+# What is near the beginning of a map and of no other archive: the name of its first member, and its value.
+MARKERS = (b"format.npy", FORMAT.partition("/")[0].encode("utf-32-le"))
+MARKERS_WITHIN = 512  # [byte]
 
 
 def save_map(scan_map: ScanMap, path: Path) -> None:
@@ -40,9 +43,13 @@ def save_map(scan_map: ScanMap, path: Path) -> None:
 
 
 def is_map_file(path: Path) -> bool:
-    """True if the file is an archive as `save_map` writes it, whatever is in it."""
+    """True if the file begins as `save_map` writes it, of whatever version; clouds may be archives too.
+
+    One of two markers is enough, so that a damaged map is still refused as a map.
+    """
     with path.open("rb") as file:
-        return file.read(len(ZIP_MAGIC)) == ZIP_MAGIC
+        head = file.read(MARKERS_WITHIN)
+    return head.startswith(ZIP_MAGIC) and any(marker in head for marker in MARKERS)
 
 
 def load_map(path: Path) -> ScanMap:
