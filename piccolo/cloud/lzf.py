@@ -10,7 +10,7 @@ LONG_COPY = 7  # the length in the control byte's upper three bits that has a by
 
 @scalar
 def append(source, begin, length, out, filled):
-    """Copy `length` bytes of `source` behind the first `filled` of `out`; how many there are now, or BROKEN."""
+    """The bytes of `out` filled, after `length` bytes of `source` follow the first `filled`, or BROKEN."""
     if begin < 0 or begin + length > len(source) or filled + length > len(out):
         return BROKEN
     for k in range(length):  # one by one: a copy that reaches into itself repeats a pattern
