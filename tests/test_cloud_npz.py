@@ -83,6 +83,23 @@ def test_pairs_of_arrays(tmp_path, monkeypatch, saver, names, type_, brightest):
     assert not is_map_file(path)
 
 
+def test_a_cloud_is_no_map_whatever_its_arrays_are_called(tmp_path):
+    np.savez(tmp_path / "a.npz", point_format=np.arange(3), points=XYZ, colors=RGB)
+    assert_read_as_written(tmp_path / "a.npz")
+    assert not is_map_file(tmp_path / "a.npz")
+
+
+def test_an_archive_that_points_before_its_beginning_is_refused(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, cloud=WHOLE)
+    content = bytearray(path.read_bytes())
+    at = content.rindex(b"PK\x05\x06") + 12  # the size of the archive's table
+    content[at : at + 4] = (int.from_bytes(content[at : at + 4], "little") + 40).to_bytes(4, "little")
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"damaged"):
+        open_source(path)
+
+
 def test_nan_points_need_no_color(tmp_path):
     whole = WHOLE.copy()
     whole[:3, [0, 4]] = np.nan

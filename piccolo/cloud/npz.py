@@ -3,6 +3,7 @@
 Nothing is unpickled. Arrays are read in chunks, from compressed archives too, whatever size they promise.
 """
 
+import errno
 import math
 import struct
 import tokenize
@@ -10,7 +11,7 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -63,8 +64,9 @@ class Array:
         num_columns = self.shape[1] if len(self.shape) > 1 else 1
         num_files = num_columns if self.is_fortran else 1
         row_size = self.dtype.itemsize * num_columns // num_files
-        files = [self.open_at(self.offset + k * row_size * num_rows) for k in range(num_files)]
-        try:
+        starts = [self.offset + k * row_size * num_rows for k in range(num_files)]
+        with ExitStack() as stack:
+            files = [stack.enter_context(self.open_at(start)) for start in starts]
             chunk = max(1, min(raw.CHUNK, MAX_CHUNK_SIZE // row_size))
             for begin in range(0, num_rows, chunk):
                 count = min(chunk, num_rows - begin)
@@ -73,9 +75,6 @@ class Array:
                     yield parts[0]
                 else:
                     yield np.concatenate([part.reshape(count, -1) for part in parts], axis=1)
-        finally:
-            for file in files:
-                file.close()
 
 
 def open_npy(path: Path) -> PointSource:
@@ -121,7 +120,9 @@ def _damage_named(path: Path) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except DAMAGES as error:
+    except (*DAMAGES, OSError) as error:
+        if isinstance(error, OSError) and error.errno != errno.EINVAL:
+            raise  # the disk's or the user's trouble; EINVAL is zipfile going to a place before the beginning
         raise InputError(f"{path}: damaged ({quoted(str(error).encode())}), {WANTED}") from error
 
 
@@ -152,12 +153,13 @@ def _open_member(path: Path, info: zipfile.ZipInfo) -> Array:
         )
 
     def open_at(offset: int) -> IO[bytes]:
-        with zipfile.ZipFile(path) as archive:
-            file = archive.open(info.filename)  # outlives the archive
-        # reading, not seeking, so that the checksum covers all
-        for begin in range(0, offset, SKIP_SIZE):
-            _read(file, min(SKIP_SIZE, offset - begin))
-        return file
+        with zipfile.ZipFile(path) as archive, ExitStack() as stack:
+            file = stack.enter_context(archive.open(info.filename))
+            # reading, not seeking, so that the checksum covers all
+            for begin in range(0, offset, SKIP_SIZE):
+                _read(file, min(SKIP_SIZE, offset - begin))
+            stack.pop_all()  # it outlives the archive
+            return file
 
     return _open_array(path, open_at, info.file_size)
 
