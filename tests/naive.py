@@ -123,3 +123,25 @@ def normalized_cells(rgb, is_seen, num_rings, stats_rings, sigma_deg):
     mean, square = (sums[:, k : k + 3] / np.maximum(sums[:, :1], 1e-12) for k in (1, 4))
     deviation = np.sqrt(np.maximum(square - mean**2, 0) + 0.03**2)
     return np.clip((channels - mean) / deviation, -2, 2)
+
+
+def decompress_lzf(data):
+    """What LZF data (bytes) stand for, by slices; None if they are broken."""
+    out, rest = bytearray(), bytearray(data)
+    while rest:
+        control = rest.pop(0)
+        if control < 32:
+            if len(rest) <= control:
+                return None
+            out += rest[: control + 1]
+            del rest[: control + 1]
+            continue
+        if len(rest) < 1 + (control >= 224):
+            return None
+        length = 2 + (7 + rest.pop(0) if control >= 224 else control // 32)
+        distance = 1 + 256 * (control % 32) + rest.pop(0)
+        if distance > len(out):
+            return None
+        pattern = out[len(out) - distance :]
+        out += (pattern * length)[:length]
+    return bytes(out)

@@ -190,7 +190,7 @@ def test_paths_that_are_no_cloud_are_refused(tmp_path):
         ("none.ply", "no such file"),
         (".", "not a file but a folder"),
         ("empty.ply", "the file is empty"),
-        ("scan.doc", "unknown format '.doc', wanted a coloured point cloud: PLY, text"),
+        ("scan.doc", "unknown format '.doc', wanted a coloured point cloud: PLY, .*text"),
     ]:
         with pytest.raises(InputError, match=message):
             read_cloud(tmp_path / name)

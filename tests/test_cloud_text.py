@@ -77,11 +77,22 @@ def test_further_columns_are_left_out(tmp_path):
     assert_read_as_written(write(tmp_path / "a.txt", [line + " 0.5 label" for line in lines_of(RAW)]))
 
 
-def test_pts_has_intensity_in_the_fourth_column(tmp_path):
-    lines = [" ".join([*f[:3], "-1613", *f[3:]]) for f in map(str.split, lines_of(RAW))]
-    assert_read_as_written(write(tmp_path / "a.pts", ["1500", *lines]))
-    with pytest.raises(InputError, match="line 2 has the colour -1613"):
-        whole(open_text, write(tmp_path / "a.txt", ["1500", *lines]))
+def test_header_names_columns_in_any_case(tmp_path):
+    lines = [" ".join([*f[:3], "0.25", *f[3:]]) for f in map(str.split, lines_of(RAW))]
+    for k, header in enumerate(
+        ["//X Y Z Intensity R G B", "x y z i Red Green Blue", '"X" "Y" "Z" "I" r g b']
+    ):
+        assert_read_as_written(write(tmp_path / f"{k}.asc", [header, "1500", *lines]))
+
+
+@pytest.mark.parametrize("header", ["//X Y Z Classification Row Column", "x y z Rf Gf Bf"])
+def test_columns_without_colors_are_refused(tmp_path, header):
+    with pytest.raises(InputError, match=f"the columns are '{header}', wanted lines of numbers x y z r g b"):
+        whole(open_text, write(tmp_path / "a.txt", [header, *lines_of(RAW)]))
+
+
+def test_a_remark_about_x_y_z_is_no_header(tmp_path):
+    assert_read_as_written(write(tmp_path / "a.txt", ["# x y z are metres", *lines_of(RAW)]))
 
 
 def test_float_colors_and_last_line_without_end(tmp_path):
@@ -174,7 +185,10 @@ def test_broken_lines_are_named(tmp_path, broken, message):
         (b"\x7fELF\x00\x00\x01 1 2 3 4 5 6\n" * 2000, "holds bytes that are no text"),
         (b"lorem ipsum\n" * 2000, "no line of numbers at its beginning"),
         (b"\xff\xfe" + "1 2 3 4 5 6\n".encode("utf-16-le") * 2000, "holds bytes that are no text"),
-        (b"1,5;2,5;3,5;10;20;30\n" * 2000, "line 1 is not all numbers"),
+        (b"1,5;2,5;3,5;10;20;30\n" * 2000, "line 1 is not all numbers: .* with decimal points"),
+        (b"1,5;2,5;3,5;0,1;0,2;0,3\n" * 2000, "no line of numbers at its beginning, .* with decimal points"),
+        (b"1,5 2,5 3,5 10 20 30\n" * 2000, r"line 1 has 4 columns .* with decimal points"),
+        (b"1 2 3 0.25 0.75 1\n" * 2000, "all points are black .* declared range are 0-255, not 0-1"),
         (b"1 2 3 4 5 6\n" * 999, "found 999 finite points"),
         (b"1 2 3 0 0 0\n" * 1000, "all points are black"),
         (b"", "the file is empty"),

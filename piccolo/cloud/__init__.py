@@ -7,14 +7,18 @@ from ..errors import InputError
 from ..settings import IN_METRES, CloudSettings
 from ..threads import Show, unseen
 from .model import Cloud
+from .npz import NPY, NPZ
+from .pcd import PCD
 from .ply import PLY
-from .raw import HEAD_SIZE, Format, PointSource, ReadOptions
+from .pts import PTS
+from .ptx import PTX
+from .raw import HEAD_SIZE, PLAIN, Format, PointSource, ReadOptions
 from .stream import CloudStream, stream_of
 from .text import TEXT
 
 __all__ = ["Cloud", "CloudStream", "open_cloud", "read_cloud", "stream_of"]
 
-FORMATS = (PLY, TEXT)
+FORMATS = (PLY, PCD, PTX, PTS, NPZ, NPY, TEXT)
 WANTED = f"wanted a coloured point cloud: {', '.join(f.name for f in FORMATS)}"
 
 
@@ -44,7 +48,7 @@ def read_cloud(path: Path, settings: CloudSettings = IN_METRES) -> Cloud:
     return open_cloud([path], settings).read()
 
 
-def open_source(path: Path, options: ReadOptions) -> PointSource:
+def open_source(path: Path, options: ReadOptions = PLAIN) -> PointSource:
     """The points of a file in any format that is read here."""
     try:
         return _format_of(path).open_source(path, options)

@@ -62,7 +62,7 @@ class Census:
         if self.brightest < MIN_BRIGHTEST:
             raise InputError(
                 f"{self.path}: all points are black (brightest value {self.brightest} of 255), wanted a "
-                "coloured cloud"
+                "coloured cloud; numbers without a declared range are 0-255, not 0-1"
             )
 
     def warnings(self) -> tuple[str, ...]:

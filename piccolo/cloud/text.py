@@ -13,13 +13,13 @@ from .lines import LineReader
 from .raw import CHUNK, PLAIN, Format, PointSource, RawCloud, ReadOptions
 from .rows import NOT_A_NUMBER, PARSED, SPACE, TOO_FEW
 
-TEXT_SUFFIXES = frozenset({".txt", ".xyz", ".asc", ".csv", ".xyzrgb", ".pts"})
+TEXT_SUFFIXES = frozenset({".txt", ".xyz", ".asc", ".csv", ".xyzrgb"})
 COLUMN_NAMES = ("xyzrgb", ("x", "y", "z", "red", "green", "blue"))
-PTS_COLUMNS = (0, 1, 2, 4, 5, 6)  # x y z intensity r g b
 NUM_WITH_INTENSITY = 4  # columns: x y z intensity
+USUAL_COLUMNS = (0, 1, 2, 3, 4, 5)
 HEAD_SIZE = 1 << 16  # bytes in which the header is looked for
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
-WANTED = "wanted lines of numbers x y z r g b, colours 0-255"
+WANTED = "wanted lines of numbers x y z r g b, with decimal points, colours 0-255"
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ def open_text(path: Path, options: ReadOptions = PLAIN) -> PointSource:
     """The points of a text file: whitespace, comma or semicolon between numbers, colours 0-255.
 
     A header line is passed over, or obeyed if it names x y z and r g b (or red green blue), or x y z and an
-    intensity. Without one the first six columns count; in a .pts file with seven or more, the fourth is
-    intensity. So is the last of four columns.
+    intensity, or refused if it names a line's columns, x y z among them, but neither. Without one the first
+    six columns count; four are x y z and intensity.
     """
     with path.open("rb") as file:
         layout = _layout(path, file.read(HEAD_SIZE))
@@ -96,6 +96,7 @@ def _layout(path: Path, head: bytes) -> Layout:
         raise InputError(f"{path}: holds bytes that are no text, {WANTED}")
     start = len(BYTE_ORDER_MARK) if head.startswith(BYTE_ORDER_MARK) else 0
     named: tuple[int, ...] | None = None
+    header = ""
     num_lines = 0
     for line in head[start:].splitlines(keepends=True):
         text = line.decode("latin-1").strip()
@@ -103,11 +104,15 @@ def _layout(path: Path, head: bytes) -> Layout:
         if _begins_numbers(text, fields):
             break
         named = _named_columns(text) or named
+        if {*"xyz"} <= {*_names(text)}:
+            header = text
         start += len(line)
         num_lines += 1
     else:
         raise InputError(f"{path}: no line of numbers at its beginning, {WANTED}")
-    columns = named or _usual_columns(path, len(fields))
+    if named is None and len(_names(header)) == len(fields):
+        raise InputError(f"{path}: the columns are {quoted(header.encode())}, {WANTED}")
+    columns = named or _usual_columns(fields)
     if len(fields) <= max(columns):
         raise InputError(
             f"{path}: line {num_lines + 1} has {len(fields)} columns (no colours?): {quoted(line)}, {WANTED}"
@@ -115,12 +120,9 @@ def _layout(path: Path, head: bytes) -> Layout:
     return Layout(start, num_lines, _separator(text), columns)
 
 
-def _usual_columns(path: Path, num_fields: int) -> tuple[int, ...]:
-    if num_fields == NUM_WITH_INTENSITY:
-        return (0, 1, 2, 3)
-    if path.suffix.lower() == ".pts" and num_fields > 6:
-        return PTS_COLUMNS
-    return (0, 1, 2, 3, 4, 5)
+def _usual_columns(fields: list[str]) -> tuple[int, ...]:
+    has_intensity = len(fields) == NUM_WITH_INTENSITY and all(map(_is_number, fields))
+    return USUAL_COLUMNS[:NUM_WITH_INTENSITY] if has_intensity else USUAL_COLUMNS
 
 
 def _separator(line: str) -> int:
@@ -146,9 +148,14 @@ def _is_number(field: str) -> bool:
     return True
 
 
+def _names(header: str) -> list[str]:
+    """The names of columns in a header line, in lower case."""
+    return [name.strip(' "').lower() for name in _fields(header.lstrip("#/ "))]
+
+
 def _named_columns(header: str) -> tuple[int, ...] | None:
     """The fields of x, y, z and r, g, b, or of x, y, z and intensity, if a header line names them."""
-    names = [name.strip(' "').lower() for name in _fields(header.lstrip("#/ "))]
+    names = _names(header)
     with_intensity = (("x", "y", "z", name) for name in sorted(INTENSITY_NAMES))
     for wanted in (*COLUMN_NAMES, *with_intensity):
         if all(names.count(name) == 1 for name in wanted):

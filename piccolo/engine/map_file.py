@@ -23,6 +23,9 @@ from .scan_map import ScanMap
 FORMAT = "piccolo-map/1"
 ARRAYS = [f.name for f in fields(ScanMap) if f.name not in ("octree", "warnings")]
 ZIP_MAGIC = b"PK\x03\x04"
+# The first member of a map: its name and where that stands, and the beginning of its value somewhere behind.
+FIRST_NAME, FIRST_NAME_AT = b"format.npy", 30
+FIRST_VALUE, FIRST_VALUE_WITHIN = FORMAT.partition("/")[0].encode("utf-32-le"), 512
 
 
 def save_map(scan_map: ScanMap, path: Path) -> None:
@@ -41,9 +44,14 @@ def save_map(scan_map: ScanMap, path: Path) -> None:
 
 
 def is_map_file(path: Path) -> bool:
-    """True if the file is an archive as `save_map` writes it, whatever is in it."""
+    """True if the file begins as `save_map` writes it, of whatever version; clouds may be archives too.
+
+    The first member's name or its value is enough, so that a damaged map is still refused as a map.
+    """
     with path.open("rb") as file:
-        return file.read(len(ZIP_MAGIC)) == ZIP_MAGIC
+        head = file.read(FIRST_VALUE_WITHIN)
+    has_name = head.startswith(FIRST_NAME, FIRST_NAME_AT)
+    return head.startswith(ZIP_MAGIC) and (has_name or FIRST_VALUE in head)
 
 
 def load_map(path: Path) -> ScanMap:

@@ -1,0 +1,194 @@
+"""PCD files of the Point Cloud Library, 0.5 to 0.7: ascii, binary and binary_compressed.
+
+VIEWPOINT is where the sensor was; the points are already in the cloud's frame, so it is not applied.
+"""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from . import raw
+from .colors import BRIGHTEST, TYPES_WANTED, in_words, to_bytes
+from .lzf import MAX_RATIO, decompress_lzf
+from .pcd_header import WANTED, Field, Header, read_header
+from .raw import PLAIN, Format, PointSource, RawCloud, ReadOptions
+from .scan_lines import TextLines, mapped
+from .text import quoted
+
+FIRST_LINES = re.compile(rb"(?:#[^\n]*\n|[ \t\r\n])*(?:# \.PCD|VERSION[ \t]+0?\.\d)")
+PADDING = "_"
+PACKED_NAMES = ("rgb", "rgba")  # 0xAARRGGBB in one number
+PACKED_TYPES = ("f4", "u4", "i4")
+COLOR_NAMES = (("r", "g", "b"), ("red", "green", "blue"))
+
+
+def open_pcd(path: Path, options: ReadOptions = PLAIN) -> PointSource:
+    """The points of a PCD file.
+
+    Colours are `rgb` or `rgba`, three bytes in one integer or, if the field is declared a float, in its bits,
+    in ASCII too; or r g b (red green blue) of uint8 0-255, uint16 0-65535 or float 0-1. Alpha and all other
+    fields are left out. The file's size is held against the header before memory is reserved.
+    """
+    header = read_header(path)
+    fields = _wanted_fields(header)
+    read = {"ascii": _read_ascii, "binary": _read_binary, "binary_compressed": _read_compressed}
+    _check_size(header)
+    return PointSource(path, lambda: read[header.encoding](header, fields), header.num_points)
+
+
+def has_pcd_magic(head: bytes) -> bool:
+    """True if a file that begins with the bytes `head` says it is PCD."""
+    return FIRST_LINES.match(head) is not None
+
+
+def _wanted_fields(header: Header) -> tuple[Field, ...]:
+    """The fields x y z and the colour's one or three."""
+    found = {field.name: field for field in header.fields if field.count == 1}
+    names = [field.name for field in header.fields]
+    choices = [*((name,) for name in PACKED_NAMES), *COLOR_NAMES]
+    color = next((choice for choice in choices if all(name in found for name in choice)), None)
+    if not all(names.count(axis) == 1 and axis in found for axis in "xyz") or color is None:
+        listed = " ".join(names[:12]) or "none"
+        raise InputError(f"{header.path}: the fields are {quoted(listed.encode())}, {WANTED}")
+    wanted = tuple(found[name] for name in (*"xyz", *color))
+    types = ("f4", "f8"), (PACKED_TYPES if len(color) == 1 else tuple(BRIGHTEST))
+    for k, field in enumerate(wanted):
+        if field.type not in types[k >= 3]:
+            kinds = ("float32 or float64", "uint32, int32 or float32" if len(color) == 1 else TYPES_WANTED)
+            raise InputError(f"{header.path}: '{field.name}' is of type {field.type}, wanted {kinds[k >= 3]}")
+    if len({field.type for field in wanted[3:]}) > 1:
+        found_types = " ".join(field.type for field in wanted[3:])
+        raise InputError(f"{header.path}: {' '.join(color)} are of types {found_types}, wanted one for all")
+    return wanted
+
+
+def _check_size(header: Header) -> None:
+    """Refuse a header that promises more than the file has."""
+    found = header.path.stat().st_size - header.size
+    if header.encoding == "ascii":
+        promised = 2 * header.num_columns * header.num_points - 1  # a digit and a separator a number
+    elif header.encoding == "binary":
+        promised = header.row_size * header.num_points
+    else:
+        promised = 8  # what stands there is checked when it is unpacked
+    if promised > found:
+        raise InputError(
+            f"{header.path}: the header promises {header.num_points} points in {promised} bytes or more, "
+            f"found {found} bytes; the file is cut off or broken"
+        )
+
+
+def _read_ascii(header: Header, fields: tuple[Field, ...]) -> Iterator[RawCloud]:
+    targets = np.full(header.num_columns, -1)
+    targets[[field.column for field in fields]] = np.arange(len(fields))
+    lines = TextLines(header.path, mapped(header.path), WANTED, header.size, header.num_lines)
+    num_left = header.num_points
+    while num_left:
+        before = lines.copy()
+        rows = np.empty((min(num_left, raw.CHUNK), len(fields)))
+        num_rows = lines.take_rows(targets, True, rows)
+        if num_rows == 0:
+            raise InputError(
+                f"{header.path}: the header promises {header.num_points} points, found "
+                f"{header.num_points - num_left}; the file is cut off"
+            )
+        num_left -= num_rows
+        points_world, values = rows[:num_rows, :3].copy(), rows[:num_rows, 3:]
+        colors, wrong = _colors_of_text(fields[3:], values, points_world)
+        if wrong >= 0:
+            place = f"line {before.line_number(wrong)}"
+            raise InputError(_color_complaint(header, fields, place, values[wrong]))
+        yield RawCloud(points_world, colors)
+
+
+def _colors_of_text(
+    fields: tuple[Field, ...], values: NDArray[np.float64], points_world: NDArray[np.float64]
+) -> tuple[NDArray[np.uint8], int]:
+    """Colours (N, 3) of the numbers (N, 1) or (N, 3) of ASCII; and the first that is wrong, or -1."""
+    if len(fields) == 3:
+        return to_bytes(values, points_world, BRIGHTEST[fields[0].type])
+    is_finite: NDArray[np.bool_] = np.all(np.isfinite(points_world), axis=1)
+    packed = np.where(is_finite, values[:, 0], 0.0)
+    if fields[0].type == "f4":
+        # alpha 255 and a red above 127 make a NaN, which in text has lost its bits
+        is_right = np.abs(packed) <= np.finfo(np.float32).max
+        bits = np.where(is_right, packed, 0.0).astype(np.float32).view(np.uint32)
+    else:
+        is_right = (packed >= -(2.0**31)) & (packed < 2.0**32) & (packed == np.floor(packed))
+        bits = np.where(is_right, packed, 0.0).astype(np.int64).astype(np.uint32)
+    return _unpacked(bits), -1 if is_right.all() else int(np.argmin(is_right))
+
+
+def _read_binary(header: Header, fields: tuple[Field, ...]) -> Iterator[RawCloud]:
+    if header.num_points == 0:
+        return
+    dtype = np.dtype(
+        {
+            "names": [field.name for field in fields],
+            "formats": ["<" + field.type for field in fields],
+            "offsets": [field.offset for field in fields],
+            "itemsize": header.row_size,
+        }
+    )
+    shape = (header.num_points,)
+    table = np.memmap(header.path, dtype=dtype, mode="r", offset=header.size, shape=shape)
+    yield from _in_chunks(header, fields, [table[field.name] for field in fields])
+
+
+def _read_compressed(header: Header, fields: tuple[Field, ...]) -> Iterator[RawCloud]:
+    data = mapped(header.path)[header.size :]
+    packed_size, size = (int(value) for value in data[:8].view("<u4"))
+    kept = [field for field in header.fields if field.name != PADDING]  # PCL leaves padding out
+    promised = header.num_points * sum(field.size for field in kept)
+    if packed_size > len(data) - 8 or size > MAX_RATIO * packed_size or size != promised:
+        raise InputError(
+            f"{header.path}: {size} bytes packed into {packed_size}, found {len(data) - 8}, wanted "
+            f"{promised} for {header.num_points} points; the file is cut off or broken"
+        )
+    table = np.empty(size, dtype=np.uint8)
+    if decompress_lzf(data[8 : 8 + packed_size], table) != size:
+        raise InputError(f"{header.path}: the compressed data are broken, {WANTED}")
+    columns = {}
+    begin = 0
+    for field in kept:  # all points' values of a field, then those of the next
+        end = begin + field.size * header.num_points
+        if field in fields:
+            columns[field.name] = table[begin:end].view("<" + field.type)
+        begin = end
+    yield from _in_chunks(header, fields, [columns[field.name] for field in fields])
+
+
+def _in_chunks(
+    header: Header, fields: tuple[Field, ...], columns: list[NDArray[np.generic]]
+) -> Iterator[RawCloud]:
+    for begin in range(0, header.num_points, raw.CHUNK):
+        parts = [column[begin : begin + raw.CHUNK] for column in columns]
+        points_world = np.stack(parts[:3], axis=1, dtype=np.float64)
+        if len(fields) == 4:
+            yield RawCloud(points_world, _unpacked(np.ascontiguousarray(parts[3]).view(np.uint32)))
+            continue
+        values = np.stack(parts[3:], axis=1)
+        colors, wrong = to_bytes(values, points_world, BRIGHTEST[fields[3].type])
+        if wrong >= 0:
+            raise InputError(_color_complaint(header, fields, f"point {begin + wrong + 1}", values[wrong]))
+        yield RawCloud(points_world, colors)
+
+
+def _unpacked(bits: NDArray[np.uint32]) -> NDArray[np.uint8]:
+    """Colours (N, 3) of numbers (N,) 0xAARRGGBB."""
+    return np.stack([bits >> 16, bits >> 8, bits], axis=1).astype(np.uint8)
+
+
+def _color_complaint(
+    header: Header, fields: tuple[Field, ...], place: str, color: NDArray[np.generic]
+) -> str:
+    type_ = fields[3].type
+    wanted = f"0 to {BRIGHTEST[type_]:g}" if len(fields) == 6 else "32 bits"
+    return f"{header.path}: {place} has the colour {in_words(color)}, wanted {wanted} of the type {type_}"
+
+
+PCD = Format("PCD", frozenset({".pcd"}), has_pcd_magic, open_pcd)

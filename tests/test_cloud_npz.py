@@ -1,0 +1,286 @@
+import io
+import shutil
+import zipfile
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from refusals import mutated, read_or_refused
+from test_cloud_order import seeded_cloud
+
+from piccolo.cloud import open_source, raw, read_cloud
+from piccolo.engine.map_file import FORMAT, is_map_file, load_map
+from piccolo.errors import InputError
+
+RAW = seeded_cloud(1, num_points=1200)
+XYZ, RGB = RAW.points_world, RAW.colors
+WHOLE = np.hstack([XYZ, RGB])
+SAVERS = [np.savez, np.savez_compressed]
+
+
+def save(path, array):
+    np.save(path, array, allow_pickle=False)
+    return path
+
+
+def table(names=("x", "y", "z", "r", "g", "b"), color="u1", brightest=255.0):
+    fields = [("label", "i2"), *((n, ">f8") for n in names[:3]), *((n, color) for n in names[3:])]
+    out = np.zeros(1200, dtype=fields)
+    for k in range(3):
+        out[names[k]] = XYZ[:, k]
+        out[names[3 + k]] = RGB[:, k] * (brightest / 255)
+    return out
+
+
+def read(path):
+    chunks = list(open_source(path).read_chunks())
+    return np.concatenate([c.points_world for c in chunks]), np.concatenate([c.colors for c in chunks])
+
+
+def assert_read_as_written(path, points_world=XYZ):
+    assert open_source(path).num_points == 1200
+    found, colors = read(path)
+    np.testing.assert_array_equal(found, points_world)
+    np.testing.assert_array_equal(colors, RGB)
+
+
+ARRAYS = {
+    "float": WHOLE,
+    "fortran": np.asfortranarray(WHOLE),
+    "big-endian": WHOLE.astype(">f8"),
+    "r g b": table(),
+    "red green blue": table(("x", "y", "z", "red", "green", "blue"), "<u2", 65535.0),
+    "float r g b": table(color=">f4", brightest=1.0),
+}
+
+
+@pytest.mark.parametrize("kind", ARRAYS)
+@pytest.mark.parametrize("chunk", [7, 1200, 1 << 20])
+def test_single_arrays(tmp_path, monkeypatch, kind, chunk):
+    monkeypatch.setattr(raw, "CHUNK", chunk)
+    assert_read_as_written(save(tmp_path / "a.npy", ARRAYS[kind]))
+    shutil.copy(tmp_path / "a.npy", tmp_path / "scan.txt")
+    assert_read_as_written(tmp_path / "scan.txt")
+    for saver in SAVERS:
+        saver(tmp_path / "a.npz", cloud=ARRAYS[kind])
+        assert_read_as_written(tmp_path / "a.npz")
+    sizes = [len(part.colors) for part in open_source(tmp_path / "a.npz").read_chunks()]
+    assert max(sizes) == min(chunk, 1200)
+
+
+@pytest.mark.parametrize("saver", SAVERS)
+@pytest.mark.parametrize("names", [("points", "colors"), ("xyz", "rgb"), ("points", "rgb")])
+@pytest.mark.parametrize(
+    ("type_", "brightest"), [("u1", 255), ("<u2", 65535), (">u2", 65535), ("f4", 1), ("f8", 1)]
+)
+def test_pairs_of_arrays(tmp_path, monkeypatch, saver, names, type_, brightest):
+    monkeypatch.setattr(raw, "CHUNK", 500)
+    colors = (RGB * (brightest / 255.0)).astype(type_)
+    path = tmp_path / "a.npz"
+    saver(path, other=np.arange(5), **{names[1]: colors, names[0]: np.asfortranarray(XYZ.astype("f4"))})
+    assert_read_as_written(path, XYZ.astype("f4"))
+    assert not is_map_file(path)
+
+
+def test_a_cloud_is_no_map_whatever_its_arrays_are_called(tmp_path):
+    np.savez(tmp_path / "a.npz", point_format=np.arange(3), points=XYZ, colors=RGB)
+    assert_read_as_written(tmp_path / "a.npz")
+    assert not is_map_file(tmp_path / "a.npz")
+
+
+def test_an_archive_that_points_before_its_beginning_is_refused(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, cloud=WHOLE)
+    content = bytearray(path.read_bytes())
+    at = content.rindex(b"PK\x05\x06") + 12  # the size of the archive's table
+    content[at : at + 4] = (int.from_bytes(content[at : at + 4], "little") + 40).to_bytes(4, "little")
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"damaged"):
+        open_source(path)
+
+
+def test_nan_points_need_no_color(tmp_path):
+    whole = WHOLE.copy()
+    whole[:3, [0, 4]] = np.nan
+    assert read_cloud(save(tmp_path / "a.npy", whole)).num_dropped == 3
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        (XYZ, r"an array \(1200, 3\) of type 'float64', wanted an array \(N, 6\)"),
+        (np.hstack([WHOLE, XYZ]), r"an array \(1200, 9\)"),
+        (WHOLE[:, :, None], r"an array \(1200, 6, 1\)"),
+        (WHOLE.astype(str), r"an array \(1200, 6\) of type '<U32'"),
+        (WHOLE.astype(complex), r"an array \(1200, 6\) of type 'complex128'"),
+        (np.array(5.0), r"an array \(\) of type"),
+        (table(("x", "y", "z", "r", "g", "c")), r"the fields are 'label x y z r g c'"),
+        (table(("x", "y", "w", "r", "g", "b")), r"the fields are 'label x y w r g b'"),
+        (table(color="i8"), r"the colours are of type 'int64 int64 int64', wanted uint8 0-255, uint16"),
+        (table(color="f2"), r"of type 'float16 float16 float16', wanted uint8"),
+        (WHOLE + 400.0, r"row 0 has the colour .*, wanted 0 to 255 of the type float64"),
+        (table(color="f4", brightest=2.0), r"row \d+ has the colour .*, wanted 0 to 1 of the type float32"),
+        (WHOLE / [1, 1, 1, 255, 255, 255], r"numbers without a declared range are 0-255, not 0-1"),
+        (WHOLE[:999], r"found 999 finite points"),
+        (WHOLE[:0], r"found 0 finite points"),
+    ],
+)
+def test_other_arrays_are_refused(tmp_path, array, message):
+    np.savez_compressed(tmp_path / "a.npz", array)
+    for path in (save(tmp_path / "a.npy", array), tmp_path / "a.npz"):
+        with pytest.raises(InputError, match=message) as error:
+            read_cloud(path)
+        assert str(error.value).startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"points": XYZ, "c": RGB}, r"the arrays are 'points c', wanted"),
+        ({"points": XYZ, "xyz": XYZ, "colors": RGB}, r"the arrays are 'points xyz colors'"),
+        ({"colors": RGB, "rgb": RGB}, r"the arrays are 'colors rgb'"),
+        ({}, r"the arrays are ''|damaged|unknown format"),
+        (
+            {"points": XYZ, "colors": RGB[:-1]},
+            r"the arrays are '\(1200, 3\) of float64 and \(1199, 3\) of uint8'",
+        ),
+        ({"points": XYZ, "colors": RGB.astype(int)}, r"the colours are of type 'int64', wanted uint8 0-255"),
+        ({"points": XYZ, "colors": table()}, r"the arrays are .\(1200, 3\) of float64 and \(1200,\) of"),
+        (
+            {"points": XYZ, "colors": RGB / 200.0},
+            r"row \d+ has the colour .*, wanted 0 to 1 of the type float64",
+        ),
+    ],
+)
+def test_other_archives_are_refused(tmp_path, arrays, message):
+    path = tmp_path / "a.npz"
+    np.savez(path, **arrays)
+    with pytest.raises(InputError, match=message):
+        read_cloud(path)
+
+
+def test_nothing_is_unpickled(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return (pytest.fail, ("unpickled",))
+
+    objects = np.array([[Trap()] * 6] * 1000, dtype=object)
+    np.save(tmp_path / "a.npy", objects, allow_pickle=True)
+    np.savez(tmp_path / "a.npz", objects)
+    for name in ("a.npy", "a.npz"):
+        with pytest.raises(InputError, match=r"an array \(1000, 6\) of type 'object'"):
+            read_cloud(tmp_path / name)
+
+
+def npy_bytes(header, body=b""):
+    header += " " * (-(len(header) + 11) % 64) + "\n"
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode() + body
+
+
+def described(shape="(1200, 6)", descr="'<f8'", order="False"):
+    return f"{{'descr': {descr}, 'fortran_order': {order}, 'shape': {shape}, }}"
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        (
+            described("(10000000000000, 6)"),
+            r"promises 480000000000000 bytes, found 57600; the file is cut off",
+        ),
+        (described("(1199, 6)"), r"promises 57552 bytes, found 57600"),
+        (described("(-1200, 6)"), r"an array \(-1200, 6\) of type"),
+        (described("(10**9, 6)"), r"damaged"),
+        (described("(1200.0, 6)"), r"damaged"),
+        (described(f"({10**30}, 6)"), r"promises 48000"),
+        (described("(True, 6)"), r"promises 48 bytes|damaged"),
+        (described("(1200L, 6)"), r"damaged"),
+        (described(descr="'|O'"), r"of type 'object'"),
+        (described(descr="'|V0'"), r"an array|damaged"),
+        (described(descr="'a8'"), r"damaged|of type"),
+        (described(descr="[('x', '<f8', (1000000000, 1000000000))]"), r"damaged|promises"),
+        (described(descr="[(1,)]"), r"damaged"),
+        (described(descr="5"), r"damaged"),
+        (described(order="7"), r"damaged"),
+        ("(" * 3000, r"damaged"),
+        ("-" * 3900 + "1", r"damaged"),
+        ("[" * 90 + "]" * 90, r"damaged"),
+        ("{[]: 1}", r"damaged"),
+        ("'''", r"damaged"),
+        (described() + " " * 5000, r"damaged"),
+        ("", r"damaged"),
+    ],
+)
+def test_broken_headers_are_refused(tmp_path, header, message):
+    content = npy_bytes(header, WHOLE.tobytes())
+    (tmp_path / "a.npy").write_bytes(content)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("cloud.npy", content)
+    for name in ("a.npy", "a.npz"):
+        with pytest.raises(InputError, match=message) as error:
+            read_cloud(tmp_path / name)
+        assert "\n" not in str(error.value)
+
+
+def test_other_versions_are_refused(tmp_path):
+    (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\x03\x00" + npy_bytes(described())[8:])
+    with pytest.raises(InputError, match=r"an array of version 3.0, wanted 1.0 or 2.0"):
+        read_cloud(tmp_path / "a.npy")
+
+
+def test_bombs_are_refused(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez_compressed(path, np.zeros((200_000, 6)))
+    with pytest.raises(
+        InputError, match=r"promises 9600128 bytes in a file of \d+, wanted 200 times as many at"
+    ):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_other_compressions_are_refused(tmp_path, method):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", method) as archive:
+        archive.writestr("cloud.npy", npy_bytes(described(), WHOLE.tobytes()))
+    with pytest.raises(InputError, match=r"'cloud.npy' is encrypted or compressed in another way"):
+        read_cloud(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("saver", SAVERS)
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_a_flipped_byte_of_an_archive_is_found(tmp_path, saver, order):
+    file = io.BytesIO()
+    saver(file, cloud=np.asarray(WHOLE, order=order))
+    content = bytearray(file.getvalue())
+    content[len(content) // 2] ^= 1
+    (tmp_path / "a.npz").write_bytes(content)
+    with pytest.raises(InputError, match=r"damaged"):
+        read_cloud(tmp_path / "a.npz")
+
+
+def test_a_damaged_map_is_still_a_map(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, format=np.array(FORMAT), sources=np.array("x"))
+    content = path.read_bytes()
+    for k in range(4, len(content), 3):
+        path.write_bytes(content[:k] + bytes([content[k] ^ 0x55]) + content[k + 1 :])
+        assert is_map_file(path)
+    path.write_bytes(content[: len(content) // 2])
+    assert is_map_file(path)
+    with pytest.raises(InputError, match=r"wanted a whole map by tools/prepare_map.py"):
+        load_map(path)
+
+
+@pytest.mark.parametrize("kind", ["npy", *SAVERS])
+@settings(deadline=None, max_examples=100)
+@given(data=st.data())
+def test_mutated_files_raise_nothing_but_input_error(kind, data, tmp_path_factory):
+    file = io.BytesIO()
+    np.save(file, table()) if kind == "npy" else kind(file, points=XYZ, colors=RGB)
+    content = file.getvalue()
+    cut = data.draw(st.sampled_from([120, 300, len(content) - 200]))
+    head = mutated(data.draw, st.integers, content[:cut])
+    path = tmp_path_factory.getbasetemp() / f"mutated{'.npy' if kind == 'npy' else '.npz'}"
+    path.write_bytes(head + mutated(data.draw, st.integers, content[cut:]))
+    cloud, _ = read_or_refused(read_cloud, path)
+    assert cloud is None or 1000 <= len(cloud.points) <= 1200

@@ -1,0 +1,309 @@
+import struct
+
+import naive
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from refusals import mutated, read_or_refused
+from test_cloud_order import seeded_cloud
+
+from piccolo.cloud import open_source, raw, read_cloud
+from piccolo.cloud.lzf import BROKEN, MAX_RATIO, decompress_lzf
+from piccolo.errors import InputError
+
+RAW = seeded_cloud(1, num_points=1200)
+PACKED = (RAW.colors.astype(np.uint32) << [16, 8, 0]).sum(axis=1, dtype=np.uint32) | np.uint32(0x3F000000)
+XYZ = [(axis, "f4", 1, RAW.points_world[:, k]) for k, axis in enumerate("xyz")]
+ENCODINGS = ["ascii", "binary", "binary_compressed"]
+
+
+def compress(data):
+    """LZF data: the last place of each three bytes is remembered, and copied from as far as it goes."""
+    out, places, literals, i = bytearray(), {}, bytearray(), 0
+
+    def flush():
+        for k in range(0, len(literals), 32):
+            out.append(len(literals[k : k + 32]) - 1)
+            out.extend(literals[k : k + 32])
+        literals.clear()
+
+    while i < len(data):
+        at, key = places.get(data[i : i + 3], -9000), data[i : i + 3]
+        places[key] = i
+        length = 0
+        if i - at <= 8192 and len(key) == 3:
+            while length < 264 and i + length < len(data) and data[at + length] == data[i + length]:
+                length += 1
+        if length < 3:
+            literals.append(data[i])
+            i += 1
+            continue
+        flush()
+        high, low = divmod(i - at - 1, 256)
+        out.extend([(length - 2) * 32 + high, low] if length < 9 else [224 + high, length - 9, low])
+        i += length
+    flush()
+    return bytes(out)
+
+
+def number(value, type_):
+    return repr(float(np.float32(value))) if type_ == "f4" else repr(value.item())
+
+
+def content_of(fields, encoding, num_points=1200, **lines):
+    """A PCD file of fields (name, type, count, values (N,) or (N, count))."""
+    header = {
+        "VERSION": "0.7",
+        "FIELDS": " ".join(name for name, *_ in fields),
+        "SIZE": " ".join(type_[1:] for _, type_, *_ in fields),
+        "TYPE": " ".join(type_[0].upper() for _, type_, *_ in fields),
+        "COUNT": " ".join(str(count) for _, _, count, _ in fields),
+        "WIDTH": str(num_points // 2),
+        "HEIGHT": "2",
+        "VIEWPOINT": "5 6 7 0 1 0 0",
+        "POINTS": str(num_points),
+        "DATA": encoding,
+    } | lines
+    text = "".join(f"{name} {value}\n" for name, value in header.items() if value is not None)
+    columns = [np.asarray(values).reshape(1200, -1).astype("<" + type_) for _, type_, _, values in fields]
+    if encoding == "ascii":
+        types = [type_ for _, type_, *_ in fields]
+        rows = zip(*columns, strict=True)
+        body = "\n".join(
+            " ".join(number(v, t) for part, t in zip(row, types, strict=True) for v in part) for row in rows
+        ).encode()
+    elif encoding == "binary":
+        body = np.hstack([column.view(np.uint8) for column in columns]).tobytes()
+    else:
+        table = b"".join(c.tobytes() for c, field in zip(columns, fields, strict=True) if field[0] != "_")
+        packed = compress(table)
+        body = struct.pack("<II", len(packed), len(table)) + packed
+    return b"# .PCD v0.7 - Point Cloud Data file format\n" + text.encode() + body
+
+
+def write(path, fields, encoding="binary", **options):
+    path.write_bytes(content_of(fields, encoding, **options))
+    return path
+
+
+def read(path):
+    chunks = list(open_source(path).read_chunks())
+    return np.concatenate([c.points_world for c in chunks]), np.concatenate([c.colors for c in chunks])
+
+
+def assert_read_as_written(path, type_="f4"):
+    points_world, colors = read(path)
+    expected = RAW.points_world.astype(type_).astype(np.float64)
+    np.testing.assert_allclose(points_world, expected, rtol=1e-15)
+    np.testing.assert_array_equal(colors, RAW.colors)
+
+
+def separate(type_, brightest, names="rgb"):
+    values = RAW.colors.astype(np.float64) * (brightest / 255)
+    return [*XYZ, *((name, type_, 1, values[:, k]) for k, name in enumerate(names))]
+
+
+COLORS = {
+    "float rgb": [*XYZ, ("rgb", "f4", 1, PACKED.view(np.float32))],
+    "uint rgb": [("rgb", "u4", 1, PACKED), *XYZ],
+    "int rgba": [*XYZ, ("rgba", "i4", 1, (PACKED | np.uint32(1 << 31)).view(np.int32))],
+    "r g b": separate("u1", 255),
+    "red green blue": separate("u2", 65535, ("red", "green", "blue")),
+    "float r g b": separate("f4", 1),
+}
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("kind", COLORS)
+def test_encodings_and_colors(tmp_path, encoding, kind, monkeypatch):
+    assert_read_as_written(write(tmp_path / "a.pcd", COLORS[kind], encoding))
+    monkeypatch.setattr(raw, "CHUNK", 500)
+    chunks = list(open_source(tmp_path / "a.pcd").read_chunks())
+    assert [len(chunk.colors) for chunk in chunks] == [500, 500, 200]
+    assert_read_as_written(tmp_path / "a.pcd")
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_padding_counts_and_other_fields_are_passed_over(tmp_path, encoding):
+    noise = np.random.default_rng(2).integers(0, 256, (1200, 3))
+    fields = [("_", "u1", 3, noise), ("label", "u4", 1, noise[:, 0]), ("fpfh", "f4", 3, noise), *XYZ]
+    fields += [("_", "u1", 3, noise), ("rgb", "u4", 1, PACKED), ("rgbs", "i2", 3, noise)]
+    assert_read_as_written(write(tmp_path / "a.pcd", fields, encoding))
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_doubles_stay_doubles(tmp_path, encoding):
+    xyz = [(name, "f8", 1, values) for name, _, _, values in XYZ]
+    assert_read_as_written(write(tmp_path / "a.pcd", [*xyz, ("rgb", "u4", 1, PACKED)], encoding), "f8")
+
+
+@pytest.mark.parametrize("lines", [{"COUNT": None}, {"WIDTH": None, "HEIGHT": None}, {"POINTS": None}])
+def test_lines_that_old_files_leave_out(tmp_path, lines):
+    fields = [*XYZ, ("rgb", "f4", 1, PACKED.view(np.float32))]
+    assert_read_as_written(write(tmp_path / "a.pcd", fields, VERSION="0.5", VIEWPOINT=None, **lines))
+
+
+def test_old_names_and_line_ends(tmp_path):
+    fields = [*XYZ, ("rgb", "f4", 1, PACKED.view(np.float32))]
+    content = content_of(fields, "ascii", SIZE=None, TYPE=None, COUNT=None).replace(b"FIELDS", b"COLUMNS")
+    (tmp_path / "a.txt").write_bytes(b"# scan\n\n" + content.split(b"\n", 1)[1].replace(b"\n", b"\r\n"))
+    assert_read_as_written(tmp_path / "a.txt")
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("kind", COLORS)
+def test_nan_points_of_a_grid_need_no_color(tmp_path, encoding, kind):
+    fields = [list(field) for field in COLORS[kind]]
+    for field in fields:
+        if field[1].startswith("f"):
+            field[3] = field[3].copy()
+            field[3][:30] = np.nan
+    cloud = read_cloud(write(tmp_path / "a.pcd", fields, encoding))
+    assert (cloud.num_dropped, len(cloud.points)) == (30, 1170)
+
+
+@pytest.mark.parametrize(
+    ("fields", "lines", "message"),
+    [
+        (XYZ, {}, "the fields are 'x y z', wanted a PCD file with the fields x y z and rgb"),
+        ([*XYZ[:2], ("rgb", "u4", 1, PACKED)], {}, "the fields are 'x y rgb'"),
+        ([*XYZ, *XYZ[:1], ("rgb", "u4", 1, PACKED)], {}, "the fields are 'x y z x rgb'"),
+        ([*XYZ, ("rgb", "f8", 1, PACKED)], {}, "'rgb' is of type f8, wanted uint32, int32 or float32"),
+        (separate("i4", 255), {}, "'r' is of type i4, wanted uint8 0-255, uint16 0-65535 or float 0-1"),
+        ([*separate("u1", 255)[:5], ("b", "u2", 1, PACKED)], {}, "of types u1 u1 u2, wanted one for all"),
+        ([("x", "i2", 1, PACKED), *XYZ[1:], ("rgb", "u4", 1, PACKED)], {}, "'x' is of type i2, wanted float"),
+        (None, {"SIZE": "4 4 4"}, "4 FIELDS, 3 of SIZE, 4 of TYPE"),
+        (None, {"SIZE": "4 4 4 3"}, "'rgb 3 U 1', wanted SIZE 1 2 4 or 8"),
+        (None, {"TYPE": "F F F X"}, "'rgb 4 X 1', wanted SIZE"),
+        (None, {"COUNT": "1 1 1 -1"}, "'rgb 4 U -1', wanted SIZE"),
+        (None, {"COUNT": "1 1 1 \u00b2"}, "COUNT 'rgb 4 U"),
+        (None, {"COUNT": "1 1 1 999999"}, "promises 4000008 bytes a point"),
+        (None, {"POINTS": "-5"}, "counts the points by 'WIDTH 600 HEIGHT 2 POINTS -5'"),
+        (None, {"POINTS": None, "WIDTH": None, "HEIGHT": None}, "counts the points by ''"),
+        (None, {"POINTS": "1201"}, "promises 1201 points in a grid of 1200"),
+        (None, {"POINTS": "1201", "WIDTH": "1201", "HEIGHT": "1"}, "promises 1201 points in 19216 bytes"),
+        (None, {"POINTS": "9999999999", "WIDTH": None}, "promises 9999999999 points in 1599"),
+        (None, {"DATA": "zip"}, "DATA is 'zip', wanted ascii, binary, binary_compressed"),
+        (None, {"DATA": None}, "no lines FIELDS and DATA"),
+    ],
+)
+def test_broken_headers_are_refused(tmp_path, fields, lines, message):
+    path = tmp_path / "a.pcd"
+    path.write_bytes(content_of(fields or [*XYZ, ("rgb", "u4", 1, PACKED)], "binary", **lines))
+    with pytest.raises(InputError, match=message) as error:
+        open_source(path)
+    assert str(error.value).startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b"", b" 1", "line 12 has more than 4 columns"),
+        (b"", b" x", "line 12 has more than 4 columns"),
+        (b"4294967296", None, "line 12 has the colour 4.29497e.09, wanted 32 bits of the type u4"),
+        (b"1.5", None, "line 12 has the colour 1.5, wanted 32 bits"),
+        (b"nan", None, "line 12 has the colour nan, wanted 32 bits"),
+        (b"red", None, "line 12 is not all numbers"),
+    ],
+)
+def test_broken_lines_are_named(tmp_path, old, new, message):
+    head, first, rest = content_of([*XYZ, ("rgb", "u4", 1, PACKED)], "ascii").partition(b"DATA ascii\n")
+    line, _, rest = rest.partition(b"\n")
+    line = line + new if new else line.rsplit(b" ", 1)[0] + b" " + old
+    path = tmp_path / "a.pcd"
+    path.write_bytes(head + first + line + b"\n" + rest)
+    with pytest.raises(InputError, match=message):
+        read(path)
+
+
+def test_a_colour_that_text_has_lost_is_refused(tmp_path):
+    fields = [*XYZ, ("rgb", "f4", 1, (PACKED | np.uint32(0xFF800000)).view(np.float32))]
+    with pytest.raises(InputError, match="line 12 has the colour nan, wanted 32 bits of the type f4"):
+        read(write(tmp_path / "a.pcd", fields, "ascii"))
+    _, colors = read(write(tmp_path / "b.pcd", fields))
+    np.testing.assert_array_equal(colors, RAW.colors | [128, 0, 0])
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_float_colors_out_of_range_are_refused(tmp_path, encoding):
+    fields = separate("f4", 1)
+    fields[4][3][7] = 1.5
+    place = "line 19" if encoding == "ascii" else "point 8"
+    with pytest.raises(InputError, match=f"{place} has the colour .* wanted 0 to 1 of the type f4"):
+        read(write(tmp_path / "a.pcd", fields, encoding))
+
+
+def test_cut_text_is_refused(tmp_path):
+    path = write(tmp_path / "a.pcd", [*XYZ, ("rgb", "u4", 1, PACKED)], "ascii")
+    path.write_bytes(b"\n".join(path.read_bytes().split(b"\n")[:-3]))
+    with pytest.raises(InputError, match="promises 1200 points, found 1197; the file is cut off"):
+        read(path)
+
+
+@pytest.mark.parametrize(
+    ("packed_size", "size"), [(2**32 - 1, 19200), (1, 19200), (100, 19200), (None, 2**32 - 1), (None, 0)]
+)
+def test_compressed_sizes_are_checked_before_memory_is_taken(tmp_path, packed_size, size):
+    content = content_of([*XYZ, ("rgb", "u4", 1, PACKED)], "binary_compressed")
+    at = content.index(b"binary_compressed\n") + 18
+    sizes = struct.unpack("<II", content[at : at + 8])
+    path = tmp_path / "a.pcd"
+    path.write_bytes(content[:at] + struct.pack("<II", packed_size or sizes[0], size) + content[at + 8 :])
+    with pytest.raises(InputError, match=r"wanted 19200 for 1200 points|compressed data are broken"):
+        read(path)
+
+
+def unpacked(data, size):
+    out = np.full(size, 77, dtype=np.uint8)
+    filled = decompress_lzf(np.frombuffer(data, np.uint8), out)
+    return None if filled == BROKEN else out[:filled].tobytes()
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    words=st.lists(st.binary(min_size=1, max_size=12), min_size=1, max_size=4),
+    picks=st.lists(st.integers(0, 3), max_size=400),
+)
+def test_lzf_brings_back_what_was_compressed(words, picks):
+    data = b"".join(words[pick % len(words)] for pick in picks)
+    packed = compress(data)
+    assert naive.decompress_lzf(packed) == data
+    assert unpacked(packed, len(data)) == data
+    assert unpacked(packed, len(data) - 1) is None if data else True
+
+
+def test_lzf_copies_far_and_long():
+    noise = np.random.default_rng(1).bytes(8192)
+    for data in (noise + noise, bytes(100_000), noise[:4000] + bytes(3000) + noise[:4000]):
+        assert unpacked(compress(data), len(data)) == data
+    assert len(compress(bytes(100_000))) > 100_000 / MAX_RATIO
+    assert unpacked(b"\x00a\xe0\xff\x00", 264 + 1) == b"a" * 265
+
+
+@settings(deadline=None, max_examples=300)
+@given(data=st.binary(max_size=60), size=st.integers(0, 3000))
+def test_lzf_equals_twin_on_any_bytes(data, size):
+    expected = naive.decompress_lzf(data)
+    found = unpacked(data, size)
+    if expected is None or len(expected) > size:
+        assert found is None
+    else:
+        assert found == expected
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@settings(deadline=None, max_examples=60)
+@given(data=st.data())
+def test_mutated_files_raise_nothing_but_input_error(encoding, data, tmp_path_factory):
+    content = MUTABLE[encoding]
+    size = content.index(b"DATA ") + 30
+    header = mutated(data.draw, st.integers, content[:size])
+    body = mutated(data.draw, st.integers, content[size:])
+    path = tmp_path_factory.getbasetemp() / "mutated.pcd"
+    path.write_bytes(header + body)
+    cloud, _ = read_or_refused(read_cloud, path)
+    assert cloud is None or 1000 <= len(cloud.points) <= 1200
+
+
+MUTABLE = {encoding: content_of(COLORS["uint rgb"], encoding) for encoding in ENCODINGS}

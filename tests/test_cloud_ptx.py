@@ -1,0 +1,224 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from refusals import mutated, read_or_refused
+from test_cloud_order import seeded_cloud
+
+from piccolo.cloud import open_source, raw, read_cloud
+from piccolo.errors import InputError
+
+RAW = seeded_cloud(1, num_points=1200)
+
+
+def placed(yaw, pitch, translation):
+    """A PTX matrix: for row vectors, the rotation transposed above the translation."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    about_z = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    c, s = math.cos(pitch), math.sin(pitch)
+    matrix = np.eye(4)
+    matrix[:3, :3] = (about_z @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])).T
+    matrix[3, :3] = translation
+    return matrix
+
+
+HERE = placed(0.7, 0.3, [12.5, -3.0, 1.75])
+THERE = placed(-2.1, -0.8, [637_012.25, 5_849_028.5, 431.125])
+
+
+def points_of(points_world, colors, intensity="0.5 "):
+    return [
+        " ".join(map(repr, point.tolist())) + f" {intensity}{r} {g} {b}"
+        for point, (r, g, b) in zip(points_world, colors.tolist(), strict=True)
+    ]
+
+
+def in_scanner(points_world, matrix):
+    return (points_world - matrix[3, :3]) @ np.linalg.inv(matrix[:3, :3])
+
+
+def scan(points_world, colors, matrix=HERE, count=None):
+    """The lines of a scan whose points are given in the world."""
+    header = [*np.vstack([matrix[3, :3], matrix[:3, :3]]), *matrix]
+    return [
+        f"{len(colors) if count is None else count}",
+        "1",
+        *(" ".join(map(repr, line.tolist())) for line in header),
+        *points_of(in_scanner(points_world, matrix), colors),
+    ]
+
+
+def write(path, lines, end="\n"):
+    path.write_bytes((end.join(lines) + end).encode())
+    return path
+
+
+def read(path):
+    chunks = list(open_source(path).read_chunks())
+    return np.concatenate([c.points_world for c in chunks]), np.concatenate([c.colors for c in chunks])
+
+
+def assert_read_as_written(path, raw_cloud=RAW, atol=1e-12):
+    points_world, colors = read(path)
+    np.testing.assert_allclose(points_world, raw_cloud.points_world, rtol=0, atol=atol)
+    np.testing.assert_array_equal(colors, raw_cloud.colors)
+
+
+TWO_SCANS = [
+    *scan(RAW.points_world[:500], RAW.colors[:500], HERE),
+    *scan(RAW.points_world[500:], RAW.colors[500:], THERE),
+]
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_scans_are_put_in_the_world(tmp_path, end):
+    path = write(tmp_path / "a.ptx", TWO_SCANS, end)
+    assert_read_as_written(path, atol=1e-8)
+    assert open_source(path).num_points == 1200
+    assert open_source(path).warnings == ()
+
+
+def test_large_coordinates_keep_their_digits(tmp_path):
+    far = type(RAW)(RAW.points_world + THERE[3, :3], RAW.colors)
+    assert_read_as_written(write(tmp_path / "a.ptx", scan(far.points_world, far.colors, THERE)), far, 2e-9)
+
+
+@pytest.mark.parametrize("chunk", [1, 3, 499, 500, 501])
+def test_chunk_size_changes_nothing(tmp_path, monkeypatch, chunk):
+    path = write(tmp_path / "a.ptx", TWO_SCANS)
+    whole = read(path)
+    monkeypatch.setattr(raw, "CHUNK", chunk)
+    assert max(len(part.colors) for part in open_source(path).read_chunks()) == chunk
+    for a, b in zip(whole, read(path), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_points_that_did_not_return_are_left_out(tmp_path):
+    lines = scan(RAW.points_world, RAW.colors, count=1202)
+    path = write(tmp_path / "a.ptx", [*lines[:100], "0 0 0 0.5 9 9 9", *lines[100:], "0.0 -0.0 0 0 0 0 0"])
+    assert_read_as_written(path)
+
+
+def test_content_comes_before_the_name(tmp_path):
+    assert_read_as_written(write(tmp_path / "a.txt", TWO_SCANS), atol=1e-8)
+
+
+def test_a_header_that_promises_too_much(tmp_path):
+    lines = scan(RAW.points_world, RAW.colors, count=999_999_999)
+    lines[1] = "999999999"
+    path = write(tmp_path / "a.ptx", lines)
+    assert_read_as_written(path)
+    source = open_source(path)
+    assert source.num_points == 1200
+    assert "line 10 promises 999999998000000001 points, found 1200; the file may be cut off" in str(
+        source.warnings
+    )
+
+
+def test_a_line_that_may_be_cut_off_is_not_read(tmp_path):
+    path = write(tmp_path / "a.ptx", [*TWO_SCANS, *scan(RAW.points_world[:9], RAW.colors[:9], count=10)])
+    path.write_bytes(path.read_bytes()[:-2])
+    assert len(read(path)[1]) == 1208
+    assert "promises 10 points, found 8" in open_source(path).warnings[0]
+
+
+def test_infinite_points_are_handed_on_in_silence(tmp_path):
+    lines = [*scan(RAW.points_world, RAW.colors, count=1202), "nan 1 2 0 1 2 3", "inf 1e308 1e308 0 1 2 3"]
+    assert read_cloud(write(tmp_path / "a.ptx", lines)).num_dropped == 2
+
+
+@pytest.mark.parametrize(
+    ("number", "line", "message"),
+    [
+        (1, "12.5", r"line 1 is '12.5', wanted a count of a scan's header"),
+        (2, "-4", r"line 2 is '-4', wanted a count"),
+        (2, "9" * 10, r"line 2 is '9999999999', wanted a count"),
+        (3, "1 2", r"line 3 is '1 2', wanted 3 numbers of a scan's header"),
+        (8, "0 nan 0 0", r"line 8 is '0 nan 0 0', wanted 4 numbers"),
+        (8, "0 1 0 5", r"matrix that ends at line 10 has the last column .*, wanted 0 0 0 1"),
+        (11, "1 2 3 0.5", r"line 11 has x y z intensity, no colours: '1 2 3 0.5'"),
+        (12, "1 2 3 0.5", r"line 12 has fewer than 7 columns: '1 2 3 0.5'"),
+        (13, "1 2 3 0.5 4 five 6", r"line 13 is not all numbers: '1 2 3 0.5 4 five 6'"),
+        (14, "1 2 3 0.5 4 5 256", r"line 14 has the colour 4 5 256, wanted .* colours 0-255"),
+        (700, "1 2 3 0.5 4 -5 6", r"line 700 has the colour 4 -5 6"),
+        (1210, None, r"line 1212 is '12.5 -3.0 1.75', wanted a count"),
+        (1210, "1 2 3 4 5 6 7\n1 2 3 4 5 6 7", r"line 1211 is '1 2 3 4 5 6 7', wanted a count"),
+    ],
+)
+def test_broken_lines_are_named(tmp_path, monkeypatch, number, line, message):
+    monkeypatch.setattr(raw, "CHUNK", 64)
+    lines = [*scan(RAW.points_world, RAW.colors), *scan(RAW.points_world[:5], RAW.colors[:5])]
+    lines[number - 1 : number] = [] if line is None else [line]
+    path = write(tmp_path / "a.ptx", lines)
+    with pytest.raises(InputError, match=message) as error:
+        read(path)
+    assert str(path) in str(error.value)
+
+
+@settings(deadline=None, max_examples=100)
+@given(data=st.data())
+def test_mutated_scans_raise_nothing_but_input_error(data, tmp_path_factory):
+    content = "\n".join(TWO_SCANS).encode()
+    path = tmp_path_factory.getbasetemp() / "mutated.ptx"
+    head = mutated(data.draw, st.integers, content[:300])
+    path.write_bytes(head + mutated(data.draw, st.integers, content[300:]))
+    cloud, _ = read_or_refused(read_cloud, path)
+    assert cloud is None or 1000 <= len(cloud.points) <= 1202
+
+
+def pts(intensity="-1613 ", raw_cloud=RAW):
+    return points_of(raw_cloud.points_world, raw_cloud.colors, intensity)
+
+
+@pytest.mark.parametrize("intensity", ["", "-1613 ", "0.25 "])
+def test_columns_of_pts(tmp_path, intensity):
+    assert_read_as_written(write(tmp_path / "a.pts", ["1200", *pts(intensity)]))
+    assert_read_as_written(write(tmp_path / "b.pts", pts(intensity)))
+
+
+def test_further_columns_of_pts_are_passed_over(tmp_path):
+    assert_read_as_written(write(tmp_path / "a.pts", [line + " 0 0 1" for line in pts()]))
+
+
+@pytest.mark.parametrize("chunk", [1, 7, 400, 1 << 20])
+def test_counts_stand_between_scans_of_pts(tmp_path, monkeypatch, chunk):
+    monkeypatch.setattr(raw, "CHUNK", chunk)
+    lines = pts()
+    assert_read_as_written(
+        write(tmp_path / "a.pts", ["", "400", *lines[:400], "0", "800", *lines[400:], "", "0"])
+    )
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (
+            ["1200", *["1 2 3 4"] * 1200],
+            r"line 2 has 4 columns, no colours: '1 2 3 4', wanted lines x y z inten",
+        ),
+        (["1 2 3"] * 1200, r"line 1 has 3 columns, no colours"),
+        (["5", "6"], r"no line of numbers"),
+        (["400", *pts()[:400], "800", *pts("")[400:]], r"line 403 has fewer than 7 columns"),
+        (["400", *pts("")[:400], "800", *pts()[400:]], r"line 403 has more than 6 columns"),
+        ([*pts()[:900], "12.5", *pts()[900:]], r"line 901 has fewer than 7 columns: '12.5'"),
+        (["400", *pts()[:400], "5", "", "1 2 3 4 5 6 777"], r"line 404 has the colour 5 6 777"),
+        (["lorem ipsum dolor sit amet consectetur"], r"line 1 is not all numbers"),
+    ],
+)
+def test_broken_pts_are_refused(tmp_path, lines, message):
+    path = write(tmp_path / "a.pts", lines)
+    with pytest.raises(InputError, match=message) as error:
+        read(path)
+    assert str(path) in str(error.value)
+
+
+@settings(deadline=None, max_examples=60)
+@given(data=st.data())
+def test_mutated_pts_raise_nothing_but_input_error(data, tmp_path_factory):
+    path = tmp_path_factory.getbasetemp() / "mutated.pts"
+    content = "\n".join(["600", *pts()[:600], "600", *pts()[600:]]).encode()
+    path.write_bytes(mutated(data.draw, st.integers, content))
+    cloud, _ = read_or_refused(read_cloud, path)
+    assert cloud is None or 1000 <= len(cloud.points) <= 1202
