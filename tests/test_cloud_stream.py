@@ -1,33 +1,20 @@
 """Clouds that stream into voxels: the same bits whatever the order, the chunks and the files."""
 
 import dataclasses
-import itertools
 import subprocess
 import sys
 from pathlib import Path
 
-import naive
 import numpy as np
 import pytest
 from rooms import as_panorama, errors, query, room
-from scipy.spatial import cKDTree
 from test_cloud_order import seeded_cloud
 
-from piccolo.cloud import CloudStream, voxels
+from piccolo.cloud import CloudStream
 from piccolo.cloud.raw import PointSource, RawCloud
-from piccolo.cloud.voxels import (
-    COUNT,
-    LEAF_SIZE,
-    NUM_COLUMNS,
-    POSITION,
-    VoxelTable,
-    add_points,
-    move_voxels,
-    turned,
-)
+from piccolo.cloud.voxels import Voxels
 from piccolo.engine.map_file import content_key
 from piccolo.engine.method import localize
-from piccolo.engine.octree import build_octree
 from piccolo.engine.scan_map import prepare_map
 from piccolo.errors import InputError
 from piccolo.gravity import rotation_to_z_up
@@ -40,7 +27,6 @@ from piccolo.threads import Workers
 ROOT = Path(__file__).resolve().parents[1]
 TURN = exp_so3(np.array([0.3, -0.7, 1.9]))
 LEVEL = np.eye(3)
-CORNER = -voxels.PHASE / voxels.QUANTA_PER_METRE
 
 
 def part(raw, indices):
@@ -63,21 +49,7 @@ def same_voxels(a, b):
     return all(getattr(a, f.name).tobytes() == getattr(b, f.name).tobytes() for f in ARRAYS)
 
 
-ARRAYS = [f for f in dataclasses.fields(voxels.Voxels) if f.name != "warnings"]
-
-
-@pytest.mark.parametrize("turn", [LEVEL, TURN])
-@pytest.mark.parametrize("size", [0.3, 300.0])  # many points a voxel, or one, so that the table grows
-def test_voxels_equal_their_twin(size, turn):
-    raw = seeded_cloud(1, 60_000 if size > 1 else 20_000, size=(size, 0.9 * size, 0.8 * size))
-    found = stream(raw, chunk=7001).voxels(turn)
-    expected = naive.voxels(raw.points_world @ turn.T, raw.colors, LEAF_SIZE, CORNER)
-    assert len(found.nodes) == len(expected)
-    distance, match = cKDTree(found.nodes[:, :3] + found.origin).query(expected[:, :3])
-    assert distance.max() < 7e-5 + 1e-7 * size  # half a quantum along each axis
-    np.testing.assert_allclose(found.nodes[match, 3:], expected[:, 3:] / 255.0, atol=1e-6)
-    np.testing.assert_array_equal(found.origin, np.round(found.origin))
-    assert (np.diff(found.codes) > 0).all()
+ARRAYS = [f for f in dataclasses.fields(Voxels) if f.name != "warnings"]
 
 
 @pytest.mark.parametrize("turn", [LEVEL, TURN])
@@ -96,92 +68,11 @@ def test_same_bits_for_any_order_chunks_and_files(turn):
         assert same_voxels(other.voxels(turn), whole)
 
 
-def test_whole_metres_move_the_origin_and_no_bit_of_the_rest():
-    raw = seeded_cloud(4, size=(2.0, 2.0, 2.0))
-    raw = RawCloud(np.round(raw.points_world * 4096) / 4096, raw.colors)  # exact at either place
-    shift = np.array([637_012.0, 5_849_028.0, -431.0])
-    near, far = (stream(RawCloud(raw.points_world + s, raw.colors)).voxels(LEVEL) for s in (0 * shift, shift))
-    np.testing.assert_array_equal(far.origin - near.origin, shift)
-    by_place = [v.nodes[np.lexsort(v.nodes.T)] for v in (near, far)]
-    np.testing.assert_allclose(by_place[0], by_place[1], atol=1e-6)
-
-
-@pytest.mark.parametrize("z", [0.0, 3.0, -17.0, 0.1])
-def test_a_floor_at_a_round_height_is_one_layer_at_every_level(z):
-    raw = seeded_cloud(17, 5000, size=(3.0, 2.0, 0.005))
-    raw.points_world[:, 2] += z
-    flat = stream(raw).voxels(LEVEL)
-    octree = build_octree(flat)
-    for k, (begin, end) in enumerate(itertools.pairwise(octree.level_start)):
-        size = voxels.COARSEST * LEAF_SIZE / 2**k
-        columns = np.floor((octree.nodes[begin:end, :2] + flat.origin[:2] - CORNER) / size)
-        assert len(np.unique(columns, axis=0)) == end - begin
-
-
 def test_in_memory_and_in_a_file_are_one():
     raw = seeded_cloud(5)
     cloud = stream(raw).read()
     same = RawCloud(cloud.points + cloud.origin_world, cloud.colors)
     assert same_voxels(cloud.voxels(TURN), stream(same).voxels(TURN))
-
-
-def test_a_larger_table_holds_the_same_rows():
-    table, larger = np.zeros((64, NUM_COLUMNS), np.int32), np.zeros((256, NUM_COLUMNS), np.int32)
-    raw = seeded_cloud(16, 40)
-    assert add_points(raw.points_world, raw.colors, np.zeros(3, np.int64), table, 0, 40) == (40, 40)
-    move_voxels(table, larger)
-    kept = [set(map(tuple, rows[rows[:, COUNT] > 0].tolist())) for rows in (table, larger)]
-    assert kept[0] == kept[1]
-    assert len(kept[0]) == 40
-    assert add_points(raw.points_world, raw.colors, np.zeros(3, np.int64), larger, 40, 99) == (40, 40)
-
-
-def test_a_full_voxel_takes_no_more(monkeypatch):
-    monkeypatch.setattr(voxels, "MAX_COUNT", 3)
-    table = np.zeros((8, NUM_COLUMNS), np.int32)
-    points, colors = np.full((5, 3), 0.01), np.full((5, 3), 200, np.uint8)
-    done = add_points.py_func(points, colors, np.zeros(3, np.int64), table, 0, 4)
-    assert done == (5, 1)
-    (row,) = table[table[:, COUNT] > 0]
-    assert row[COUNT] == 3
-    assert row[POSITION] == 3 * ((128 + voxels.PHASE) % 256)
-
-
-def test_the_most_points_of_a_voxel_fit_its_sums():
-    assert voxels.MAX_COUNT * max(255, voxels.QUANTUM_MASK) <= np.iinfo(np.int32).max
-
-
-def test_turning_gives_each_point_the_same_bits_alone_as_among_others():
-    points = seeded_cloud(6).points_world
-    alone = np.concatenate([turned(p[None], TURN) for p in points])
-    assert alone.tobytes() == turned(points, TURN).tobytes()
-    np.testing.assert_allclose(alone, points @ TURN.T, atol=1e-12)
-
-
-def test_points_too_far_away_are_left_out_and_counted():
-    raw = seeded_cloud(7)
-    raw.points_world[5:8] += [0.0, 30_000.0, 0.0]
-    found = stream(raw).voxels(LEVEL)
-    assert "0.ply: 3 points farther than 21 km from the middle left out" in found.warnings
-    assert np.abs(found.nodes[:, :3]).max() < 4.0
-    raw.points_world[5] = [0.0, 0.0, -9e7]
-    with pytest.raises(InputError, match=r"0\.ply: points more than 42950 km apart, wanted one scene"):
-        stream(raw).voxels(LEVEL)
-
-
-def test_two_scenes_far_from_each_other_are_no_map():
-    raw = seeded_cloud(8, 2000)
-    raw.points_world[:1000, 0] += 50_000.0
-    assert len(stream(raw).voxels(LEVEL).nodes) >= 900  # one of them
-    raw.points_world[:] = np.diag([1e5, 1e5, 1e5])[np.arange(2000) % 3]
-    with pytest.raises(InputError, match=r"2000 points farther than 21 km .*none nearer, wanted one scene"):
-        stream(raw).voxels(LEVEL)
-
-
-def test_too_many_voxels_are_refused(monkeypatch):
-    monkeypatch.setattr(voxels, "MAX_ROWS", voxels.FIRST_ROWS)
-    with pytest.raises(InputError, match=r"more than 39321 voxels of 0\.02 m are filled.*--units"):
-        stream(seeded_cloud(9, 50_000, size=(900.0, 900.0, 900.0))).voxels(LEVEL)
 
 
 BROKEN = {
@@ -346,12 +237,3 @@ def test_memory_grows_with_the_scene_and_not_with_the_points():
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
         peaks_mb.append(int(done.stdout))
     assert peaks_mb[1] - peaks_mb[0] < 30
-
-
-def test_voxel_table_may_be_fed_with_nothing():
-    table = VoxelTable("a")
-    table.add(np.empty((0, 3)), np.empty((0, 3), np.uint8))
-    table.add(np.full((2, 3), 7.5), np.full((2, 3), 51, np.uint8))
-    found = table.finish()
-    np.testing.assert_allclose(found.nodes[0, 3:], 0.2)
-    np.testing.assert_allclose(found.nodes[0, :3] + found.origin, 7.5, atol=4e-5)
