@@ -7,6 +7,7 @@ import numpy as np
 
 from ..errors import InputError
 from .clean import clean
+from .las import LAS
 from .model import Cloud
 from .ply import PLY
 from .raw import HEAD_SIZE, Format, PointSource, RawCloud
@@ -14,7 +15,7 @@ from .text import TEXT
 
 __all__ = ["Cloud", "read_cloud"]
 
-FORMATS = (PLY, TEXT)
+FORMATS = (PLY, TEXT, LAS)
 WANTED = f"wanted a coloured point cloud: {', '.join(f.name for f in FORMATS)}"
 
 
