@@ -7,6 +7,7 @@ import numpy as np
 
 from ..errors import InputError
 from .clean import clean
+from .e57 import E57
 from .las import LAS
 from .model import Cloud
 from .ply import PLY
@@ -15,7 +16,7 @@ from .text import TEXT
 
 __all__ = ["Cloud", "read_cloud"]
 
-FORMATS = (PLY, TEXT, LAS)
+FORMATS = (PLY, TEXT, LAS, E57)
 WANTED = f"wanted a coloured point cloud: {', '.join(f.name for f in FORMATS)}"
 
 
