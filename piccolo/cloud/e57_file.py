@@ -68,7 +68,7 @@ def refusing(path: Path, libe57: ModuleType) -> Iterator[None]:
     """Turn what libE57 says of a broken file into an InputError."""
     try:
         yield
-    except (libe57.E57Exception, RuntimeError) as error:
+    except (libe57.E57Exception, RuntimeError, UnicodeDecodeError) as error:  # the last in its own message
         raise InputError(f"{path}: broken E57 file ({quoted(str(error).encode())})") from error
 
 
