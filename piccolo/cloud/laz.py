@@ -44,6 +44,8 @@ MAX_CHUNK = 1 << 23  # points of a chunk, for it is decompressed at once; 50,000
 # What is wanted of formats 6 to 10, where fields can be passed over.
 SELECTED = ("XY_RETURNS_CHANNEL", "Z", "FLAGS", "RGB")
 
+BROKEN = "the file is cut off or broken"
+
 Chunk = tuple[int, int]  # points, bytes
 
 
@@ -141,8 +143,7 @@ def _table(header: Header, file: BinaryIO, offset: int) -> bytes:
     max_chunks = (offset - header.points_offset - OFFSET_SIZE) // header.record_size
     if not 0 < num_chunks <= max_chunks:
         raise InputError(
-            f"{header.path}: the chunk table promises {num_chunks} chunks, wanted 1 to {max_chunks}; "
-            "the file is cut off or broken"
+            f"{header.path}: the chunk table promises {num_chunks} chunks, wanted 1 to {max_chunks}; {BROKEN}"
         )
     file.seek(offset)
     return file.read(MAX_ENTRY_SIZE * (num_chunks + 32))
@@ -191,17 +192,22 @@ def decompress(
 
 
 def _check_layers(path: Path, compression: Compression, data: bytes, chunks: Iterable[Chunk]) -> None:
-    """Refuse layers larger than the chunk they lie in.
+    """Refuse layers larger than the chunk they lie in, and another number of points than was promised.
 
     A chunk is a whole point, the number of points, the bytes of each layer, the layers.
     """
     begin = 0
-    for _, size in chunks:
-        sizes_at = compression.record_size + 4
-        layers_at = sizes_at + 4 * compression.num_layers
-        sizes = np.frombuffer(data[begin + sizes_at : begin + min(layers_at, size)], dtype="<u4")
-        if layers_at > size or int(sizes.sum(dtype=np.uint64)) > size - layers_at:
-            raise InputError(f"{path}: a chunk of {size} bytes promises larger layers; the file is broken")
+    head_size = compression.record_size + 4 * (1 + compression.num_layers)
+    for num_points, size in chunks:
+        if size < head_size:
+            raise InputError(f"{path}: a chunk of {size} bytes, wanted {head_size} or more; {BROKEN}")
+        head = data[begin + compression.record_size : begin + head_size]
+        found, *layers = np.frombuffer(head, dtype="<u4").tolist()
+        if sum(layers) > size - head_size or found != num_points:
+            raise InputError(
+                f"{path}: a chunk of {found} points with layers of {sum(layers)} bytes, wanted "
+                f"{num_points} points and {size - head_size} bytes at most; {BROKEN}"
+            )
         begin += size
 
 
