@@ -190,6 +190,21 @@ def test_files_without_points_are_refused(tmp_path):
         open_source(write(tmp_path / "b.e57"))
 
 
+def test_points_that_are_not_finite_are_handed_on(tmp_path):
+    raw = type(RAW)(RAW.points_world.copy(), RAW.colors)
+    raw.points_world[:3] = [[np.inf, 0.0, 0.0], [np.nan, 1.0, 1.0], [1.7e308, 1.7e308, 1.7e308]]
+    written = ScanToWrite(cartesian(raw) | colored(), BYTES, rotation_wxyz=QUATERNION)
+    path = write(tmp_path / "a.e57", [written])
+    assert (read_cloud(path).num_dropped, len(read_cloud(path).points)) == (3, 1197)
+
+
+def test_a_reader_may_stop_early(tmp_path, monkeypatch):
+    monkeypatch.setattr(e57, "CHUNK", 100)
+    chunks = open_source(write(tmp_path / "a.e57", [scan(), scan()])).read_chunks()
+    np.testing.assert_array_equal(next(chunks).points_world, RAW.points_world[:100])
+    chunks.close()
+
+
 def test_foreign_fields_change_nothing(tmp_path):
     normals = dict.fromkeys(("nor:normalX", "nor:normalY", "nor:normalZ"), np.full(1200, 0.5, np.float32))
     extra = normals | {"intensity": np.linspace(0.0, 1.0, 1200), "rowIndex": np.arange(1200)}
@@ -301,6 +316,8 @@ BOMB = b'<?xml version="1.0"?><!DOCTYPE e [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&
         ),
         (b'recordCount="1200"', b'recordCount="' + b"9" * 5000 + b'"', "wanted an integer"),
         (b'recordCount="1200"', b'recordCount="many"', "found 'many' in the XML section, wanted an integer"),
+        (b'recordCount="1200"', b'recordCount="+-5"', "wanted an integer"),
+        (b'recordCount="1200"', b'recordCount="-5"', r"scan 1 of 1 \('a scan'\) has -5 points"),
         (b'maximum="255"', b'maximum="0"', "colours without a range: colorRed is declared 0 to 0"),
         (b'<?xml version="1.0" encoding="UTF-8"?>\n<e57Root', BOMB, "a document type definition"),
         (b"<e57Root", b'<e57Root xsi:noNamespaceSchemaLocation="/etc/x"', "XML section is broken"),
@@ -313,7 +330,8 @@ BOMB = b'<?xml version="1.0"?><!DOCTYPE e [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&
         (b"2010-e57-v1.0", b"2010-e57-v9.0", "no element e57Root of E57 1.0"),
         (b"</data3D>", b"", "the XML section is broken"),
         (b"</data3D>", b"<x>" * 40 + b"</x>" * 40 + b"</data3D>", "or 32 levels"),
-        (b"</data3D>", b"<x/>" * 20_001 + b"</data3D>", "more than 20000 elements in one"),
+        (b"</data3D>", b"<x/>" * 20_001 + b"</data3D>", "more than 500 elements .* or 20000 in a vector"),
+        (b"</e57Root>", b"<x/>" * 500 + b"</e57Root>", "more than 500 elements in a structure"),
         (b">2.5e-01</w>", b">nan</w>", "found 'nan' in the XML section, wanted a finite number"),
         (b">2.5e-01</w>", b">0</w>", r"rotation is \[0.0, 0.0, 0.0, 0.0\], wanted a quaternion"),
         (b'"UTF-8"', b'"UTF-99"', "XML section is broken"),
@@ -331,8 +349,9 @@ def test_damaged_xml_is_refused(tmp_path, old, new, message):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (b'length="25"', b'length="99999999"', "image 0 promises '99999999' bytes"),
-        (b'length="25"', b'length="-1"', "image 0 promises '-1' bytes"),
+        (b'length="25"', b'length="99999999"', "image 0 promises 99999999 bytes, found"),
+        (b'length="25"', b'length="-1"', "image 0 promises -1 bytes, found"),
+        (b'length="25"', 'length="²"'.encode(), "wanted an integer"),
         (b">30</imageWidth>", b">0</imageWidth>", "an image's imageWidth is 0, wanted 1 to"),
         (b">30</imageWidth>", b">1e999</imageWidth>", "found '1e999' in the XML section"),
     ],

@@ -225,8 +225,7 @@ def test_a_wrong_number_of_vlrs_does_no_harm(tmp_path):
     [
         (0, "<H", 1, "LASzip's compressor 1 in point format 3, wanted 2, the chunked one"),
         (0, "<H", 3, "LASzip's compressor 3 in point format 3, wanted 2"),
-        (12, "<I", 0, "chunks of 0 points, wanted 8388608 at most"),
-        (12, "<I", 0xFFFFFFFE, "chunks of 4294967294 points, wanted 8388608 at most"),
+        (12, "<I", 0, "chunk 1 of 0 points|the compressed points are broken"),
         (12, "<I", 400, "promises 1200 points, the chunk table has 800|chunk table promises"),
         (32, "<H", 2, "LASzip's record lists items"),
         (32, "<H", 65535, "LASzip's record lists items"),
@@ -281,6 +280,19 @@ def test_layers_larger_than_their_chunk_are_refused(tmp_path, point_format):
         position = begin + laz.OFFSET_SIZE + record_size + 4 + 4 * layer
         with pytest.raises(InputError, match=r"a chunk of 600 points with layers of \d+ bytes, wanted 600"):
             open_source(write(tmp_path, patched(content, position, "<I", 0xFFFFFFFF)))
+
+
+def test_chunks_that_would_fill_the_memory_are_refused(tmp_path, monkeypatch):
+    path = write(tmp_path, laz_bytes(las_bytes(RAW), 600))
+    monkeypatch.setattr(laz, "MAX_CHUNK_SIZE", 34 * 600 - 1)
+    with pytest.raises(InputError, match=r"chunk 1 of 600 points in \d+ bytes, wanted 1 to 599 points"):
+        open_source(path)
+
+
+def test_coordinates_that_overflow_are_infinite(tmp_path):
+    points, _ = read(write(tmp_path, patched(las_bytes(RAW), SCALE_X, "<d", 1e308)))
+    assert np.isinf(points[:, 0]).any()
+    assert np.isfinite(points[:, 1:]).all()
 
 
 def test_broken_points_are_refused(tmp_path):

@@ -15,9 +15,11 @@ from .e57_file import (
     E57File,
     Placement,
     child,
+    children,
     has_e57_magic,
     number_of,
     opened,
+    parsed_integer,
     parsed_number,
     placement_of,
     refusing,
@@ -62,7 +64,7 @@ def open_e57(path: Path) -> PointSource:
     without colours beside others are left out, with a warning.
     """
     with opened(path) as file:
-        elements = list(child(file.root, "data3D") or ())
+        elements = children(file.root, "data3D")
         scans: list[Scan] = []
         left_out: list[str] = []
         for index, element in enumerate(elements):
@@ -85,9 +87,9 @@ def _scan(file: E57File, element: Element, index: int, label: str) -> Scan:
     prototype = child(points, "prototype")
     if points is None or prototype is None or points.get("type") != "CompressedVector":
         raise _UnusableError("has no points")
-    num_points = _integer(file.path, points.get("recordCount", "0"))
-    if num_points == 0:
-        raise _UnusableError("has 0 points")
+    num_points = parsed_integer(file.path, points.get("recordCount", "0"))
+    if num_points <= 0:
+        raise _UnusableError(f"has {num_points} points")
     fields = {field.tag.removeprefix(NAMESPACE): field for field in prototype}
     coordinates = next((names for names in (CARTESIAN, SPHERICAL) if fields.keys() >= set(names)), None)
     if coordinates is None:
@@ -122,25 +124,19 @@ def _num_bits(path: Path, field: Element) -> int:
     if type_ == "Float":
         return 32 if field.get("precision") == "single" else 64
     if type_ in ("Integer", "ScaledInteger"):
-        low = _integer(path, field.get("minimum", str(-(1 << 63))))
-        high = _integer(path, field.get("maximum", str((1 << 63) - 1)))
+        low = parsed_integer(path, field.get("minimum", str(-(1 << 63))))
+        high = parsed_integer(path, field.get("maximum", str((1 << 63) - 1)))
         return max(high - low, 0).bit_length()
     return 0
-
-
-def _integer(path: Path, text: str) -> int:
-    if not text.lstrip("+-").isdigit() or len(text) > 20:
-        raise InputError(f"{path}: found {text[:40]!r} in the XML section, wanted an integer")
-    return int(text)
 
 
 def _color_range(path: Path, element: Element, field: Element) -> tuple[float, float]:
     """The values of a channel that mean dark and full brightness."""
     name = field.tag.removeprefix(NAMESPACE)
     limits = child(element, "colorLimits")
-    low, high = (child(limits, name + end) for end in ("Minimum", "Maximum"))
-    if low is not None and high is not None and number_of(path, low) < number_of(path, high):
-        return number_of(path, low), number_of(path, high)
+    low, high = (number_of(path, child(limits, name + end)) for end in ("Minimum", "Maximum"))
+    if low is not None and high is not None and low < high:
+        return low, high
     declared = [field.get(end) for end in ("minimum", "maximum")]
     if None in declared:
         raise _UnusableError(f"has colours without a range: neither colorLimits nor a declared {name}")
@@ -164,14 +160,15 @@ def _read_scan(file: E57File, scan: Scan) -> Iterator[RawCloud]:
     num_read = 0
     with refusing(file.path, file.libe57):
         reader = _reader(file, scan, columns)
-    while True:
+    while num_read < scan.num_points:
         with refusing(file.path, file.libe57):
             count = reader.read()
         if count == 0:
             break
         num_read += count
-        if num_read <= scan.num_points:
-            yield _cloud(file.path, scan, {name: column[:count] for name, column in columns.items()})
+        with np.errstate(over="ignore", invalid="ignore"):  # broken points may be infinite
+            cloud = _cloud(file.path, scan, {name: column[:count] for name, column in columns.items()})
+        yield cloud
     reader.close()
     if num_read != scan.num_points:
         raise InputError(

@@ -5,6 +5,7 @@ definition or a schema to other files, and nest and count without end.
 """
 
 import math
+import re
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,7 +28,9 @@ HEADER = struct.Struct("<8sIIQQQQ")  # magic, major, minor, file size, XML offse
 PAGE_SIZE, PAGE_CONTENT = 1024, 1020  # [byte]; the rest of a page is its checksum
 NAMESPACE = "{http://www.astm.org/COMMIT/E57/2010-e57-v1.0}"
 MAX_XML_SIZE = 1 << 26  # [byte]
-MAX_ELEMENTS, MAX_CHILDREN, MAX_DEPTH = 1_000_000, 20_000, 32
+# libE57 takes time with the square of a structure's parts; a vector holds scans and images
+MAX_ELEMENTS, MAX_PARTS, MAX_IN_VECTOR, MAX_DEPTH = 500_000, 500, 20_000, 32
+INTEGER = re.compile(r"[+-]?[0-9]{1,19}")
 CHECK_ALL = 100  # [%] of the pages have their checksum verified
 
 
@@ -112,24 +115,24 @@ class _Limited(TreeBuilder):
     def __init__(self) -> None:
         super().__init__()
         self.num_elements = 0
-        self.num_children = [0]  # of each open element
+        self.room = [1]  # for children, in each open element
 
     def start(self, tag: str, attrs: dict[str, str]) -> Element:
         """Open an element."""
         self.num_elements += 1
-        self.num_children[-1] += 1
-        self.num_children.append(0)
-        if self.num_elements > MAX_ELEMENTS or len(self.num_children) > MAX_DEPTH:
+        self.room[-1] -= 1
+        if self.num_elements > MAX_ELEMENTS or len(self.room) > MAX_DEPTH:
             raise ValueError(f"more than {MAX_ELEMENTS} elements or {MAX_DEPTH} levels")
-        if self.num_children[-2] > MAX_CHILDREN:
-            raise ValueError(f"more than {MAX_CHILDREN} elements in one")
+        if self.room[-1] < 0:
+            raise ValueError(f"more than {MAX_PARTS} elements in a structure or {MAX_IN_VECTOR} in a vector")
+        self.room.append(MAX_IN_VECTOR if attrs.get("type") == "Vector" else MAX_PARTS)
         if any(name.lower().endswith("schemalocation") for name in attrs):
             raise ValueError("a schema in another file")
         return super().start(tag, attrs)
 
     def end(self, tag: str) -> Element:
         """Close an element."""
-        self.num_children.pop()
+        self.room.pop()
         return super().end(tag)
 
     def doctype(self, *_: str | None) -> None:
@@ -154,14 +157,22 @@ def child(element: Element | None, name: str) -> Element | None:
     return None if element is None else element.find(NAMESPACE + name)
 
 
+def children(element: Element, name: str) -> list[Element]:
+    """The children of the child of that name."""
+    found = child(element, name)
+    return [] if found is None else list(found)
+
+
 def text_of(element: Element | None, name: str) -> str:
     """The text of a child, empty if there is none."""
     found = child(element, name)
     return "" if found is None else (found.text or "").strip()
 
 
-def number_of(path: Path, element: Element) -> float:
-    """The value of a number's element; an empty one is 0, a scaled integer is scaled."""
+def number_of(path: Path, element: Element | None) -> float | None:
+    """The value of a number's element, None without one; an empty one is 0, a scaled integer is scaled."""
+    if element is None:
+        return None
     value = parsed_number(path, (element.text or "").strip() or "0")
     if element.get("type") == "ScaledInteger":
         return scaled(path, element, value)
@@ -186,6 +197,13 @@ def parsed_number(path: Path, text: str) -> float:
     return value
 
 
+def parsed_integer(path: Path, text: str) -> int:
+    """An integer of 64 bits or little more; InputError if the text is none."""
+    if not INTEGER.fullmatch(text):
+        raise InputError(f"{path}: found {quoted(text.encode())} in the XML section, wanted an integer")
+    return int(text)
+
+
 def placement_of(path: Path, element: Element) -> Placement | None:
     """The pose of a scan or an image; None if it has none. A part that is missing is the identity's."""
     pose = child(element, "pose")
@@ -206,5 +224,4 @@ def placement_of(path: Path, element: Element) -> Placement | None:
 
 
 def _numbers(path: Path, element: Element, names: str) -> NDArray[np.float64]:
-    parts = [child(element, name) for name in names]
-    return np.array([0.0 if part is None else number_of(path, part) for part in parts])
+    return np.array([number_of(path, child(element, name)) or 0.0 for name in names])

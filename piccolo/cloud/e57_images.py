@@ -7,7 +7,18 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from ..errors import InputError
-from .e57_file import E57File, Placement, child, number_of, opened, placement_of, refusing, text_of
+from .e57_file import (
+    E57File,
+    Placement,
+    child,
+    children,
+    number_of,
+    opened,
+    parsed_integer,
+    placement_of,
+    refusing,
+    text_of,
+)
 
 KINDS = {
     "spherical": "sphericalRepresentation",
@@ -55,7 +66,7 @@ def read_image(path: Path, index: int) -> bytes:
 
 
 def _listed(file: E57File) -> list[E57Image]:
-    elements = enumerate(child(file.root, "images2D") or ())
+    elements = enumerate(children(file.root, "images2D"))
     return [image for number, element in elements for image in _images(file, number, element)]
 
 
@@ -83,18 +94,17 @@ def _images(file: E57File, number: int, element: Element) -> Iterator[E57Image]:
 
 def _blob_size(file: E57File, number: int, blob: Element) -> int:
     """The length [byte] of a blob, if the file has room for it: libE57 reserves it."""
-    text = blob.get("length", "")
-    if not text.isdigit() or len(text) > 18 or int(text) > file.size:
+    size = parsed_integer(file.path, blob.get("length", ""))
+    if not 0 < size <= file.size:
         raise InputError(
-            f"{file.path}: image {number} promises {text[:40]!r} bytes, wanted a number within the file's "
-            f"{file.size}"
+            f"{file.path}: image {number} promises {size} bytes, found a file of {file.size} bytes; "
+            "it is broken"
         )
-    return int(text)
+    return size
 
 
 def _side(path: Path, representation: Element, name: str) -> int:
-    found = child(representation, name)
-    value = 0.0 if found is None else number_of(path, found)
+    value = number_of(path, child(representation, name)) or 0.0
     if not 0 < value <= MAX_SIDE:
         raise InputError(f"{path}: an image's {name} is {value:g}, wanted 1 to {MAX_SIDE}")
     return int(value)
@@ -102,9 +112,9 @@ def _side(path: Path, representation: Element, name: str) -> int:
 
 def _fov_deg(path: Path, representation: Element) -> tuple[float, float] | None:
     """What a spherical image covers [deg], across and down, if the file says how large its pixels are."""
-    width, height = (child(representation, name) for name in ("pixelWidth", "pixelHeight"))
+    width, height = (number_of(path, child(representation, name)) for name in ("pixelWidth", "pixelHeight"))
     if width is None or height is None:
         return None
-    across = number_of(path, width) * _side(path, representation, "imageWidth")
-    down = number_of(path, height) * _side(path, representation, "imageHeight")
+    across = width * _side(path, representation, "imageWidth")
+    down = height * _side(path, representation, "imageHeight")
     return math.degrees(across), math.degrees(down)

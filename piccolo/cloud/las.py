@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .las_header import WANTED, Header, has_las_magic, read_header
-from .laz import Compression, decompress, read_compression
+from .laz import MAX_CHUNK_SIZE, Compression, decompress, read_compression
 from .raw import CHUNK, Format, PointSource, RawCloud
 
 WITHHELD_OLD, WITHHELD = 0x80, 0x04  # bits of the flags' byte, in the formats 0-5 and 6-10
@@ -57,14 +57,15 @@ def open_las(path: Path) -> PointSource:
 
 def _runs(header: Header, compression: Compression | None) -> Iterator[Run]:
     """All points in order, CHUNK or fewer at once unless one chunk of LAZ holds more."""
+    most = max(1, min(CHUNK, MAX_CHUNK_SIZE // header.record_size))
     if compression is None:
-        for first in range(0, header.num_points, CHUNK):
-            yield _plain_run(header, first, CHUNK)
+        for first in range(0, header.num_points, most):
+            yield _plain_run(header, first, most)
         return
     offset, size, num_points = compression.offset, 0, 0
     waiting: list[tuple[int, int]] = []
     for chunk in compression.chunks:
-        if waiting and num_points + chunk[0] > CHUNK:
+        if waiting and num_points + chunk[0] > most:
             yield Run(num_points, offset, size, tuple(waiting))
             offset, size, num_points, waiting = offset + size, 0, 0, []
         waiting.append(chunk)
@@ -130,7 +131,8 @@ def _cloud(header: Header, records: Records, is_8_bit: bool) -> RawCloud:
     is_withheld = (records["flags"] & withheld) != 0
     if is_withheld.any():
         records = records[~is_withheld]
-    points_world = records["xyz"] * header.scales + header.offsets
+    with np.errstate(over="ignore"):  # to infinity, and such points are dropped
+        points_world = records["xyz"] * header.scales + header.offsets
     rgb = records["rgb"]
     if not is_8_bit:
         return RawCloud(points_world, TO_8_BIT[rgb])

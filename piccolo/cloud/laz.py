@@ -40,7 +40,7 @@ ITEMS = {
 }
 EXTRA_BYTES = frozenset({0, 14})  # item types
 NUM_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # by item type; extra bytes have one each
-MAX_CHUNK = 1 << 23  # points of a chunk, for it is decompressed at once; 50,000 are usual
+MAX_CHUNK_SIZE = 1 << 29  # [byte] of a chunk's records, for it is decompressed at once; 2 MB are usual
 # What is wanted of formats 6 to 10, where fields can be passed over.
 SELECTED = ("XY_RETURNS_CHANNEL", "Z", "FLAGS", "RGB")
 
@@ -102,8 +102,6 @@ def _check_items(header: Header, laszip: bytes) -> tuple[int, int]:
             f"{header.path}: LASzip's compressor {compressor} in point format {header.point_format}, wanted "
             f"{expected}, the chunked one that LASzip 2 and later write"
         )
-    if chunk_size != VARIABLE and not 0 < chunk_size <= MAX_CHUNK:
-        raise InputError(f"{header.path}: chunks of {chunk_size} points, wanted {MAX_CHUNK} at most")
     items = [ITEM.unpack_from(item) for item in _split(laszip[LASZIP.size :], ITEM.size)][:num_items]
     known = ITEMS[header.point_format]
     extra = items[len(known) :]
@@ -153,16 +151,18 @@ def _checked_chunks(header: Header, entries: list[Chunk], num_bytes: int) -> tup
     """The chunks that hold the promised points, the last no more than is left."""
     chunks: list[Chunk] = []
     num_left = header.num_points
-    for count, size in entries:
+    max_count = MAX_CHUNK_SIZE // header.record_size
+    for full_count, size in entries:
         if num_left == 0:
             break
-        if not (0 < count <= MAX_CHUNK and header.record_size <= size <= num_bytes):
+        count = min(full_count, num_left)
+        if not (0 < count <= max_count and header.record_size <= size <= num_bytes):
             raise InputError(
-                f"{header.path}: chunk {len(chunks) + 1} of {count} points in {size} bytes, wanted up to "
-                f"{MAX_CHUNK} points and within the file; the chunk table is broken"
+                f"{header.path}: chunk {len(chunks) + 1} of {count} points in {size} bytes, wanted 1 to "
+                f"{max_count} points and within the file; the chunk table is broken"
             )
-        chunks.append((min(count, num_left), size))
-        num_left -= chunks[-1][0]
+        chunks.append((count, size))
+        num_left -= count
         num_bytes -= size
     if num_left:
         raise InputError(
