@@ -102,7 +102,8 @@ def _check_items(header: Header, laszip: bytes) -> tuple[int, int]:
             f"{header.path}: LASzip's compressor {compressor} in point format {header.point_format}, wanted "
             f"{expected}, the chunked one that LASzip 2 and later write"
         )
-    items = [ITEM.unpack_from(item) for item in _split(laszip[LASZIP.size :], ITEM.size)][:num_items]
+    num_whole = min(num_items, (len(laszip) - LASZIP.size) // ITEM.size)
+    items = list(ITEM.iter_unpack(laszip[LASZIP.size : LASZIP.size + num_whole * ITEM.size]))
     known = ITEMS[header.point_format]
     extra = items[len(known) :]
     is_known = tuple(items[: len(known)]) == known and all(type_ in EXTRA_BYTES for type_, _ in extra)
@@ -114,10 +115,6 @@ def _check_items(header: Header, laszip: bytes) -> tuple[int, int]:
     if compressor != LAYERED:
         return 0, chunk_size
     return sum(NUM_LAYERS.get(type_, size) for type_, size in items), chunk_size
-
-
-def _split(data: bytes, size: int) -> Iterable[bytes]:
-    return (data[k : k + size] for k in range(0, len(data) - size + 1, size))
 
 
 def _table_offset(header: Header, file: BinaryIO) -> int:
