@@ -196,7 +196,7 @@ def test_counts_stand_between_scans_of_pts(tmp_path, monkeypatch, chunk):
     [
         (
             ["1200", *["1 2 3 4"] * 1200],
-            r"line 2 has 4 columns, no colours: '1 2 3 4', wanted lines x y z inten",
+            r"has intensity and no colours, wanted lines x y z intensity",
         ),
         (["1 2 3"] * 1200, r"line 1 has 3 columns, no colours"),
         (["5", "6"], r"no line of numbers"),

@@ -6,6 +6,8 @@ from pathlib import Path
 from ..errors import InputError
 from ..settings import IN_METRES, CloudSettings
 from ..threads import Show, unseen
+from .e57 import E57
+from .las import LAS
 from .model import Cloud
 from .npz import NPY, NPZ
 from .pcd import PCD
@@ -18,7 +20,7 @@ from .text import TEXT
 
 __all__ = ["Cloud", "CloudStream", "open_cloud", "read_cloud", "stream_of"]
 
-FORMATS = (PLY, PCD, PTX, PTS, NPZ, NPY, TEXT)
+FORMATS = (PLY, LAS, E57, PCD, PTX, PTS, NPZ, NPY, TEXT)
 WANTED = f"wanted a coloured point cloud: {', '.join(f.name for f in FORMATS)}"
 
 

@@ -1,0 +1,131 @@
+"""The header of LAS and LAZ files, read and checked.
+
+laspy would loop and reserve as a damaged header tells it. A header that was checked has told all there is
+to know: what follows are records of a fixed length.
+"""
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+
+MAGIC = b"LASF"
+MIN_HEADER_SIZE, MIN_HEADER_SIZE_1_4 = 227, 375  # [byte]
+COMPRESSED_BIT = 0x80  # of the point format
+# Point formats with colours: the least length of a record and where red green blue begin in it [byte].
+COLOR_FORMATS = {2: (26, 20), 3: (34, 28), 5: (63, 28), 7: (36, 30), 8: (38, 30), 10: (67, 30)}
+COLORLESS_FORMATS = frozenset({0, 1, 4, 6, 9})
+FLAGS_BYTE = 15
+WANTED = "wanted LAS or LAZ with red green blue (point format 2, 3, 5, 7, 8 or 10)"
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a LAS file says of itself."""
+
+    path: Path
+    size: int  # [byte]
+    header_size: int  # [byte]
+    points_offset: int  # [byte]
+    num_vlrs: int
+    point_format: int
+    record_size: int  # [byte]
+    num_points: int
+    scales: NDArray[np.float64]  # (3,) x y z
+    offsets: NDArray[np.float64]  # (3,)
+    is_compressed: bool
+
+    @property
+    def dtype(self) -> np.dtype[np.void]:
+        """The fields that are wanted of a record."""
+        return np.dtype(
+            {
+                "names": ["xyz", "flags", "rgb"],
+                "formats": ["3<i4", "u1", "3<u2"],
+                "offsets": [0, FLAGS_BYTE, COLOR_FORMATS[self.point_format][1]],
+                "itemsize": self.record_size,
+            }
+        )
+
+
+def has_las_magic(head: bytes) -> bool:
+    """True if a file that begins with the bytes `head` says it is LAS or LAZ."""
+    return head.startswith(MAGIC)
+
+
+def read_header(path: Path) -> Header:
+    """The header of a LAS or LAZ file; InputError if it is broken, or promises no colours or too much."""
+    with path.open("rb") as file:
+        head = file.read(MIN_HEADER_SIZE_1_4)
+    if not has_las_magic(head) or len(head) < MIN_HEADER_SIZE:
+        raise InputError(
+            f"{path}: begins with {head[:4]!r} and {len(head)} bytes, wanted 'LASF' and a header of "
+            f"{MIN_HEADER_SIZE} bytes or more"
+        )
+    major, minor = head[24], head[25]
+    header_size, points_offset, num_vlrs, format_id, record_size, num_points = struct.unpack_from(
+        "<HIIBHI", head, 94
+    )
+    if minor >= 4 and len(head) == MIN_HEADER_SIZE_1_4:
+        num_points = struct.unpack_from("<Q", head, 247)[0] or num_points
+    header = Header(
+        path=path,
+        size=path.stat().st_size,
+        header_size=header_size,
+        points_offset=points_offset,
+        num_vlrs=num_vlrs,
+        point_format=format_id & ~COMPRESSED_BIT,
+        record_size=record_size,
+        num_points=num_points,
+        scales=np.frombuffer(head, "<f8", 3, 131),
+        offsets=np.frombuffer(head, "<f8", 3, 155),
+        is_compressed=bool(format_id & COMPRESSED_BIT),
+    )
+    if major != 1 or minor > 5:
+        raise InputError(f"{path}: found LAS {major}.{minor}, wanted LAS 1.0 to 1.5")
+    least = MIN_HEADER_SIZE_1_4 if minor >= 4 else MIN_HEADER_SIZE
+    if not least <= header_size <= points_offset <= header.size:
+        raise InputError(
+            f"{path}: a header of {header_size} bytes and points from byte {points_offset} on, wanted a "
+            f"header of {least} or more and points behind it, within the file's {header.size} bytes"
+        )
+    _check_header(header)
+    return header
+
+
+def _check_header(header: Header) -> None:
+    """Refuse what no points could make right."""
+    path = header.path
+    if header.point_format in COLORLESS_FORMATS:
+        raise InputError(
+            f"{path}: no colours: point format {header.point_format} has intensity only, {WANTED}"
+        )
+    if header.point_format not in COLOR_FORMATS:
+        raise InputError(f"{path}: unknown point format {header.point_format}, {WANTED}")
+    least = COLOR_FORMATS[header.point_format][0]
+    if header.record_size < least:
+        raise InputError(
+            f"{path}: records of {header.record_size} bytes, wanted {least} or more in point format "
+            f"{header.point_format}"
+        )
+    if not (np.isfinite(header.scales).all() and np.isfinite(header.offsets).all() and header.scales.all()):
+        raise InputError(
+            f"{path}: scales {_listed(header.scales)} and offsets {_listed(header.offsets)}, wanted finite "
+            "ones and no scale of 0"
+        )
+    if header.num_points == 0:
+        raise InputError(f"{path}: the header promises 0 points, wanted a coloured cloud")
+    room = (header.size - header.points_offset) // header.record_size
+    if not header.is_compressed and header.num_points > room:
+        raise InputError(
+            f"{path}: the header promises {header.num_points} points of {header.record_size} bytes, found "
+            f"room for {room}; the file is cut off or broken"
+        )
+
+
+def _listed(values: NDArray[np.float64]) -> str:
+    return " ".join(f"{value:g}" for value in values)

@@ -1,0 +1,55 @@
+"""LAS files for tests, written by laspy, and LAZ files with chunks as small as wanted, by lazrs."""
+
+import io
+import struct
+
+import numpy as np
+import pytest
+
+laspy = pytest.importorskip("laspy")
+lazrs = pytest.importorskip("lazrs")
+
+SCALES, OFFSETS = np.array([1e-3, 1e-4, 2e-3]), np.array([637_000.0, 5_849_000.0, -100.0])
+PLAIN_SIZE = {2: 26, 3: 34, 5: 63, 7: 36, 8: 38, 10: 67}
+
+
+def las_bytes(raw, point_format=3, colors=None, withheld=None, extra_bytes=0):
+    """A LAS file of a cloud; `colors` (N, 3) uint16 default to the cloud's in full 16 bits."""
+    header = laspy.LasHeader(point_format=point_format, version="1.4" if point_format > 5 else "1.3")
+    header.scales, header.offsets = SCALES, OFFSETS
+    for k in range(extra_bytes):
+        header.add_extra_dim(laspy.ExtraBytesParams(f"extra{k}", "u1"))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = raw.points_world.T
+    colors = raw.colors.astype(np.uint16) * 257 if colors is None else colors
+    las.red, las.green, las.blue = colors.T
+    if withheld is not None:
+        las.withheld = withheld
+    content = io.BytesIO()
+    las.write(content)
+    return content.getvalue()
+
+
+def laz_bytes(las, chunk=None, cuts=()):
+    """A LAS file compressed in chunks of `chunk` points, or between the points in `cuts`."""
+    header_size, offset, num_vlrs, point_format, size, count = struct.unpack_from("<HIIBHI", las, 94)
+    if las[25] >= 4:
+        (count,) = struct.unpack_from("<Q", las, 247)
+    laszip = lazrs.LazVlr.new_for_compression(point_format, size - PLAIN_SIZE[point_format], chunk is None)
+    record = bytearray(laszip.record_data())
+    if chunk is not None:
+        struct.pack_into("<I", record, 12, chunk)
+        laszip = lazrs.LazVlr(bytes(record))
+    vlr = struct.pack("<2x16sHH32s", b"laszip encoded", 22204, len(record), b"") + record
+    head = bytearray(las[:offset]) + vlr
+    struct.pack_into("<HIIB", head, 94, header_size, len(head), num_vlrs + 1, point_format | 0x80)
+    content = io.BytesIO()
+    content.write(head)
+    compressor = lazrs.LasZipCompressor(content, laszip)
+    points = np.frombuffer(las, np.uint8, count * size, offset)
+    if chunk is None:
+        compressor.compress_chunks(np.split(points, np.array(cuts, dtype=int) * size))
+    else:
+        compressor.compress_many(points)
+    compressor.done()
+    return content.getvalue()

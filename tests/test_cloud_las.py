@@ -1,0 +1,248 @@
+import struct
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from las_files import OFFSETS, SCALES, las_bytes, laz_bytes
+from refusals import mutated, read_or_refused
+from test_cloud_order import seeded_cloud
+
+from piccolo.cloud import las, open_source, read_cloud
+from piccolo.cloud.raw import RawCloud
+from piccolo.errors import InputError
+
+RAW = seeded_cloud(2, num_points=1200)
+# Where the file's steps of SCALES put them.
+RAW = RawCloud(np.rint(RAW.points_world / SCALES) * SCALES + OFFSETS, RAW.colors)
+FORMATS = [2, 3, 5, 7, 8, 10]
+EIGHT_BIT = RAW.colors.astype(np.uint16)
+COUNT, COUNT_1_4, POINTS_OFFSET, NUM_VLRS, FORMAT, RECORD_SIZE, SCALE_X = 107, 247, 96, 100, 104, 105, 131
+
+
+def write(tmp_path, content, name="a.las"):
+    path = tmp_path / name
+    path.write_bytes(content)
+    return path
+
+
+def read(path):
+    chunks = list(open_source(path).read_chunks())
+    return np.concatenate([c.points_world for c in chunks]), np.concatenate([c.colors for c in chunks])
+
+
+def assert_read_as_written(path, is_kept=slice(None)):
+    points, colors = read(path)
+    assert (points.dtype, colors.dtype) == (np.float64, np.uint8)
+    np.testing.assert_allclose(points, RAW.points_world[is_kept], rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(colors, RAW.colors[is_kept])
+
+
+@pytest.mark.parametrize("point_format", FORMATS)
+@pytest.mark.parametrize("extra_bytes", [0, 3])
+def test_point_formats_with_colors(tmp_path, point_format, extra_bytes):
+    content = las_bytes(RAW, point_format, extra_bytes=extra_bytes)
+    path = write(tmp_path, content)
+    assert open_source(path).num_points == 1200
+    assert open_source(path).warnings == ()
+    assert_read_as_written(path)
+    assert_read_as_written(write(tmp_path, laz_bytes(content, 50_000), "a.laz"))
+    assert_read_as_written(write(tmp_path, laz_bytes(content, 500), "b.laz"))
+    assert_read_as_written(write(tmp_path, laz_bytes(content, 1200), "c.laz"))
+    assert_read_as_written(write(tmp_path, laz_bytes(content, cuts=(1, 2, 700, 701)), "copc.laz"))
+
+
+def test_utm_coordinates_lose_nothing(tmp_path):
+    cloud = read_cloud(write(tmp_path, las_bytes(RAW)))
+    # the middle of the box, in whole metres
+    expected = np.round(0.5 * (RAW.points_world.min(axis=0) + RAW.points_world.max(axis=0)))
+    np.testing.assert_array_equal(cloud.origin_world, expected)
+    assert abs(cloud.points).max() < 4.0
+    steps = (cloud.points.astype(np.float64) + cloud.origin_world - OFFSETS) / SCALES
+    np.testing.assert_allclose(steps, np.rint(steps), atol=5e-3)
+
+
+@pytest.mark.parametrize("chunk", [1, 7, 500, 1199, 1200, 1201])
+@pytest.mark.parametrize("compressed", [None, 100, 450, "variable"])
+def test_chunks_hold_no_more_points_than_asked(tmp_path, monkeypatch, chunk, compressed):
+    monkeypatch.setattr(las, "CHUNK", chunk)
+    content = las_bytes(RAW, 7)
+    if compressed is not None:
+        options = {"cuts": (3, 600, 1100)} if compressed == "variable" else {"chunk": compressed}
+        content = laz_bytes(content, **options)
+    source = open_source(write(tmp_path, content))
+    for _ in range(2):  # each call reads anew
+        chunks = list(source.read_chunks())
+        assert max(len(c.colors) for c in chunks) <= chunk
+        np.testing.assert_array_equal(np.concatenate([c.colors for c in chunks]), RAW.colors)
+
+
+@pytest.mark.parametrize("point_format", FORMATS)
+def test_withheld_points_are_left_out(tmp_path, point_format):
+    is_withheld = np.arange(1200) % 3 == 1
+    content = las_bytes(RAW, point_format, withheld=is_withheld)
+    assert_read_as_written(write(tmp_path, content), ~is_withheld)
+    assert_read_as_written(write(tmp_path, laz_bytes(content, 500)), ~is_withheld)
+
+
+def test_16_bit_colors_are_rounded_to_the_nearest(tmp_path):
+    colors = np.random.default_rng(5).integers(0, 1 << 16, (1200, 3)).astype(np.uint16)
+    colors[0] = (0, 1, 65535)
+    _, found = read(write(tmp_path, las_bytes(RAW, colors=colors)))
+    np.testing.assert_array_equal(found, np.floor(colors / 257.0 + 0.5))
+
+
+@pytest.mark.parametrize("is_compressed", [False, True])
+def test_8_bit_colors_in_16_bit_fields_are_told_of(tmp_path, is_compressed):
+    content = las_bytes(RAW, colors=EIGHT_BIT)
+    path = write(tmp_path, laz_bytes(content, 100) if is_compressed else content)
+    assert open_source(path).warnings == (
+        f"{path}: the colours are read as 8-bit values in 16-bit fields (largest value {RAW.colors.max()} in "
+        "1200 points looked at)",
+    )
+    assert_read_as_written(path)
+
+
+@pytest.mark.parametrize("is_compressed", [False, True])
+def test_the_sample_is_spread_over_the_file(tmp_path, monkeypatch, is_compressed):
+    """128 of 1200 points, in 8 runs or from 4 chunks of 30."""
+    monkeypatch.setattr(las, "MAX_SAMPLES", 128)
+    monkeypatch.setattr(las, "NUM_SAMPLE_RUNS", 8)
+
+    def written(index, value):
+        colors = EIGHT_BIT.copy()
+        colors[index] = value
+        content = las_bytes(RAW, colors=colors)
+        return write(tmp_path, laz_bytes(content, 30) if is_compressed else content)
+
+    assert open_source(written(0, 300)).warnings == ()
+    assert open_source(written(1199, 300)).warnings == ()
+    path = written(25 if is_compressed else 20, 255)
+    assert "8-bit values in 16-bit fields" in open_source(path).warnings[0]
+    path = written(100, 40_000)  # outside of the sample
+    assert (
+        "in 120 points" in open_source(path).warnings[0] or "in 128 points" in open_source(path).warnings[0]
+    )
+    with pytest.raises(InputError, match="a colour of 40000 in a file whose other colours are 8-bit"):
+        read(path)
+
+
+def test_files_without_colors_are_refused(tmp_path, monkeypatch):
+    black = las_bytes(RAW, colors=np.zeros((1200, 3), np.uint16))
+    for content in (black, laz_bytes(black, 500)):
+        with pytest.raises(InputError, match="no colours: red green blue are 0 in all 1200 points looked at"):
+            open_source(write(tmp_path, content))
+    monkeypatch.setattr(las, "MAX_SAMPLES", 64)  # a larger file is not read to its end
+    with pytest.raises(InputError, match="are 0 in all 64 points looked at"):
+        open_source(write(tmp_path, black))
+
+
+@pytest.mark.parametrize("point_format", [0, 1, 4, 6, 9])
+def test_formats_without_color_fields_are_refused(tmp_path, point_format):
+    content = bytearray(las_bytes(RAW))
+    content[FORMAT] = point_format
+    with pytest.raises(InputError, match=f"no colours: point format {point_format} has intensity only"):
+        open_source(write(tmp_path, content))
+
+
+def patched(content, position, form, value):
+    changed = bytearray(content)
+    struct.pack_into(form, changed, position, value)
+    return bytes(changed)
+
+
+CUT = "the file is cut off or broken"
+
+
+@pytest.mark.parametrize(
+    ("position", "form", "value", "message"),
+    [
+        (0, "4s", b"LASX", "begins with b'LASX'"),
+        (24, "B", 2, r"found LAS 2\.3, wanted LAS 1\.0 to 1\.5"),
+        (94, "<H", 100, "a header of 100 bytes and points from byte"),
+        (POINTS_OFFSET, "<I", 0, "and points from byte 0 on, wanted"),
+        (POINTS_OFFSET, "<I", 0xFFFFFFFF, "and points from byte 4294967295 on, wanted"),
+        (FORMAT, "B", 11, "unknown point format 11, wanted LAS or LAZ"),
+        (FORMAT, "B", 0x43, "unknown point format 67, wanted LAS or LAZ"),
+        (FORMAT, "B", 0x83, "compressed, but no record says how"),
+        (RECORD_SIZE, "<H", 33, "records of 33 bytes, wanted 34 or more in point format 3"),
+        (RECORD_SIZE, "<H", 65535, f"promises 1200 points of 65535 bytes, found room for 0; {CUT}"),
+        (COUNT, "<I", 1201, f"promises 1201 points of 34 bytes, found room for 1200; {CUT}"),
+        (COUNT, "<I", 0xFFFFFFFF, "promises 4294967295 points of 34 bytes"),
+        (COUNT, "<I", 0, "promises 0 points"),
+        (SCALE_X, "<d", 0.0, "scales 0 0.0001 0.002 and offsets .*, wanted finite ones and no scale of 0"),
+        (SCALE_X, "<d", float("nan"), "scales nan 0.0001"),
+        (SCALE_X + 24, "<d", float("inf"), "offsets inf 5.849e"),
+    ],
+)
+def test_damaged_headers_are_refused(tmp_path, position, form, value, message):
+    path = write(tmp_path, patched(las_bytes(RAW), position, form, value))
+    with pytest.raises(InputError, match=message) as error:
+        las.open_las(path)
+    assert str(path) in str(error.value)
+    assert len(str(error.value)) < 400 + len(str(path))
+
+
+@pytest.mark.parametrize("length", [3, 150, 230, 5000])
+def test_cut_files_are_refused(tmp_path, length):
+    for content in (las_bytes(RAW, 7), laz_bytes(las_bytes(RAW, 7), 500), laz_bytes(las_bytes(RAW, 3), 500)):
+        with pytest.raises(InputError):
+            las.open_las(write(tmp_path, content[:length]))
+
+
+def test_a_file_cut_while_it_is_read_is_refused(tmp_path):
+    path = write(tmp_path, las_bytes(RAW))
+    source = open_source(path)
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(InputError, match="the file ended while it was read"):
+        list(source.read_chunks())
+
+
+@pytest.mark.parametrize("count", [1201, 10**15, 2**64 - 1])
+def test_counts_of_las_1_4_are_refused_before_memory_is_taken(tmp_path, count):
+    content = las_bytes(RAW, 7)
+    with pytest.raises(InputError, match=f"promises {count} points of 36 bytes, found room for 1200"):
+        open_source(write(tmp_path, patched(content, COUNT_1_4, "<Q", count)))
+    message = (
+        f"promises {count} points, the chunk table has 1500" if count > 1500 else "a chunk of 200 points"
+    )
+    with pytest.raises(InputError, match=message):
+        open_source(write(tmp_path, patched(laz_bytes(content, 500), COUNT_1_4, "<Q", count)))
+
+
+def test_a_wrong_number_of_vlrs_does_no_harm(tmp_path):
+    content = las_bytes(RAW)
+    assert_read_as_written(write(tmp_path, patched(content, NUM_VLRS, "<I", 0xFFFFFFFF)))
+    compressed = laz_bytes(content, 500)
+    assert_read_as_written(write(tmp_path, patched(compressed, NUM_VLRS, "<I", 0xFFFFFFFF)))
+    with pytest.raises(InputError, match="compressed, but no record says how"):
+        open_source(write(tmp_path, patched(compressed, NUM_VLRS, "<I", 0)))
+
+
+def test_coordinates_that_overflow_are_infinite(tmp_path):
+    points, _ = read(write(tmp_path, patched(las_bytes(RAW), SCALE_X, "<d", 1e308)))
+    assert np.isinf(points[:, 0]).any()
+    assert np.isfinite(points[:, 1:]).all()
+
+
+def test_a_missing_library_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "lazrs", None)
+    assert_read_as_written(write(tmp_path, las_bytes(RAW)))
+    with pytest.raises(InputError, match=r"needs lazrs, .*pip install -r requirements-formats\.txt"):
+        open_source(write(tmp_path, laz_bytes(las_bytes(RAW), 600)))
+
+
+SMALL = RawCloud(RAW.points_world[:60], RAW.colors[:60])
+WHOLE = [las_bytes(SMALL, 3)] + [laz_bytes(las_bytes(SMALL, f, extra_bytes=1), 25) for f in (2, 5, 7, 10)]
+WHOLE += [laz_bytes(las_bytes(SMALL, f), cuts=(1, 40)) for f in (3, 8)]
+
+
+@settings(deadline=None, max_examples=400)
+@given(data=st.data(), content=st.sampled_from(WHOLE))
+def test_mutated_files_raise_nothing_but_input_error(tmp_path_factory, data, content):
+    path = tmp_path_factory.getbasetemp() / "mutated.las"
+    path.write_bytes(mutated(data.draw, st.integers, content))
+    result, _ = read_or_refused(lambda p: read(p) if p.stat().st_size > 8 else None, path)
+    if result is not None:
+        assert result[0].shape == result[1].shape
