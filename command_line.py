@@ -7,6 +7,7 @@ from typing import get_args
 
 from piccolo import __version__
 from piccolo.errors import InputError
+from piccolo.panorama import ReadOptions
 from piccolo.settings import METRES, CloudSettings, EngineSettings, PaperSettings, Prior, UpAxis
 from piccolo.threads import num_cores
 
@@ -57,10 +58,10 @@ def build_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"piccolo {__version__}")
-    text = "coloured scan, one file or several: PLY, or text x y z r g b; or a map by tools/prepare_map.py"
+    text = "coloured scan in any format of the README, one file or several; or a map by tools/prepare_map.py"
     add_cloud_options(parser, text)
     files = parser.add_argument_group("files")
-    files.add_argument("--pano", type=Path, required=True, nargs="+", help="full sphere JPEG or PNG, W = 2 H")
+    add_panorama_options(parser)
     files.add_argument("--out", type=Path, help="write the JSON here, not to stdout")
     files.add_argument("--overlay", type=Path, help="PNG: panorama, cloud at the pose, checkerboard of both")
     files.add_argument("--cache", type=Path, metavar="FOLDER", help="of prepared maps (default the user's)")
@@ -85,6 +86,26 @@ def add_cloud_options(parser: argparse.ArgumentParser, text: str) -> None:
     group.add_argument("--up", choices=get_args(UpAxis), default="auto", help=text)
     text = "of clouds without colours"
     group.add_argument("--intensity-as-gray", action="store_true", help=text)
+
+
+def add_panorama_options(parser: argparse.ArgumentParser) -> None:
+    """The panoramas' files, and what the pictures do not say of themselves."""
+    group = parser.add_argument_group("panorama")
+    text = "JPEG, PNG, TIFF or WebP: 2:1, or a crop with Photo Sphere metadata; or a folder of six cube faces"
+    group.add_argument("--pano", type=Path, required=True, nargs="+", help=text)
+    text = "horizontal field of view of a part of the sphere, its middle row the horizon"
+    group.add_argument("--fov", type=float, metavar="DEG", help=text)
+    text = "picture, white where the panorama is to be ignored, or a folder of such named as the panoramas"
+    group.add_argument("--mask", type=Path, help=text)
+    text = "ignore the cap of this half angle straight down: tripod, car roof"
+    group.add_argument("--mask-nadir", type=float, default=0.0, metavar="DEG", help=text)
+    text = "the picture is a strip or grid of cube faces in this order, such as rludfb"
+    group.add_argument("--cube-order", metavar="LETTERS", help=text)
+
+
+def read_options_from(arguments: argparse.Namespace) -> ReadOptions:
+    """What add_panorama_options asked for."""
+    return ReadOptions(arguments.fov, arguments.mask, arguments.mask_nadir, arguments.cube_order)
 
 
 def cloud_settings_from(arguments: argparse.Namespace) -> CloudSettings:
@@ -118,6 +139,8 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--gravity", choices=["auto", "known", "unknown"], help=text)
     text = "of the descent (default gauss-newton, with the preset paper adam)"
     group.add_argument("--solver", choices=["gauss-newton", "lbfgs", "adam"], help=text)
+    text = f"below it a pose is not called localized (default {EngineSettings().min_confidence})"
+    group.add_argument("--min-confidence", type=float, metavar="X", help=text)
     for title, options, settings in (
         ("preset default", ENGINE_OPTIONS, EngineSettings()),
         ("preset paper", PAPER_OPTIONS, PaperSettings()),
@@ -156,8 +179,8 @@ def settings_from(arguments: argparse.Namespace) -> EngineSettings | PaperSettin
         foreign += ["--up"] if arguments.up != "auto" else []
     if foreign:
         raise InputError(f"{foreign[0]}: not an option of the preset {arguments.preset}")
-    names = [option[2:].replace("-", "_") for option, *_ in own]
-    chosen = {PAPER_SETTING.get(n, n): given[n] for n in ("gravity", "solver", *names) if n in given}
+    names = ["gravity", "solver", "min_confidence", *(option[2:].replace("-", "_") for option, *_ in own)]
+    chosen = {PAPER_SETTING.get(n, n): given[n] for n in names if n in given}
     if arguments.preset == "paper":
         return PaperSettings(use_visibility="no_visibility" not in given, **chosen)
     prior = Prior(

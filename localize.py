@@ -12,12 +12,20 @@ from typing import Any
 
 from tqdm import tqdm
 
-from command_line import build_parser, check_arguments, cloud_settings_from, named, parse, settings_from
+from command_line import (
+    build_parser,
+    check_arguments,
+    cloud_settings_from,
+    named,
+    parse,
+    read_options_from,
+    settings_from,
+)
 from piccolo.errors import InputError
 from piccolo.files import check_output, write_atomically
 from piccolo.jit import KERNEL_FOLDER, is_first_use
 from piccolo.overlay import overlay_png
-from piccolo.panorama import read_panorama
+from piccolo.panorama import ReadOptions, read_panorama
 from piccolo.pipeline import CachePolicy, Localizer, open_localizer
 from piccolo.result import Result, result_of
 from piccolo.settings import EngineSettings, PaperSettings
@@ -34,6 +42,7 @@ class Session:
     """One prepared cloud and how to treat the panoramas."""
 
     arguments: argparse.Namespace
+    read_options: ReadOptions
     localizer: Localizer
     workers: Workers
     seconds: dict[str, float]  # spent once, on the cloud
@@ -47,17 +56,21 @@ class Session:
         """Read one panorama, localize it, write its overlay if one is asked for."""
         watch, localizer = Stopwatch(dict(self.seconds)), self.localizer
         with watch.stage("read"):
-            panorama = read_panorama(pano)
+            panorama = read_panorama(pano, self.read_options)
         found = localizer.localize(panorama, self.workers, watch)
         if self.arguments.overlay and found.pose is not None:
             png = overlay_png(localizer.points, panorama, localizer.from_world(found.pose))
             write_atomically(self.arguments.overlay, png)
         settings = {"preset": self.arguments.preset, **localizer.settings.to_json()}
         result = result_of(found, named(self.arguments.cloud), str(pano), watch.seconds, settings)
-        return replace(result, warnings=localizer.warnings)
+        for warning in panorama.warnings:
+            self.say(f"warning: {warning}")
+        return replace(result, warnings=localizer.warnings + panorama.warnings)
 
 
-def open_session(arguments: argparse.Namespace, settings: EngineSettings | PaperSettings) -> Session:
+def open_session(
+    arguments: argparse.Namespace, settings: EngineSettings | PaperSettings, read_options: ReadOptions
+) -> Session:
     """Read and prepare the cloud, after a look at what is to be written."""
     for output in filter(None, (arguments.out, arguments.overlay)):
         check_output(output, [*arguments.cloud, *arguments.pano])
@@ -75,7 +88,7 @@ def open_session(arguments: argparse.Namespace, settings: EngineSettings | Paper
     workers = Workers(arguments.threads, show)
     clouds = arguments.cloud, cloud_settings_from(arguments)
     localizer = open_localizer(*clouds, settings, cache, workers, watch)
-    session = Session(arguments, localizer, workers, watch.seconds)
+    session = Session(arguments, read_options, localizer, workers, watch.seconds)
     for warning in localizer.warnings:
         session.say(f"warning: {warning}")
     return session
@@ -96,11 +109,11 @@ def results_of(session: Session) -> Iterator[Result | None]:
         yield result
 
 
-def run(arguments: argparse.Namespace, settings: EngineSettings | PaperSettings) -> int:
+def run(session: Session) -> int:
     """Localize every panorama, write the results, return the exit code."""
-    lines: list[str] = []
+    arguments, lines = session.arguments, list[str]()
     is_bad = some_not = False
-    for result in results_of(open_session(arguments, settings)):
+    for result in results_of(session):
         is_bad |= result is None
         if result is None:
             continue
@@ -128,12 +141,12 @@ def main(argv: list[str] | None = None) -> int:
     arguments = parse(build_parser(), argv)
     try:
         check_arguments(arguments)
-        settings = settings_from(arguments)
+        settings, read_options = settings_from(arguments), read_options_from(arguments)
     except InputError as error:
         complain(arguments, error)
         return EXIT_BAD_USAGE
     try:
-        return run(arguments, settings)
+        return run(open_session(arguments, settings, read_options))
     except BrokenPipeError:  # the reader of stdout has gone: say nothing, not even at the flush at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_BROKEN_PIPE

@@ -19,11 +19,13 @@ def resize(panorama: Panorama, width: int) -> Panorama:
     if panorama.rgb.shape[1] == width:
         return panorama
     size = (width, width // 2)
-    weight = cv2.resize(panorama.is_valid.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    if weight.min() == 1.0:
-        rgb = cv2.resize(panorama.rgb, size, interpolation=cv2.INTER_AREA)
-    else:
-        masked = panorama.rgb * panorama.is_valid[..., None].astype(np.float32)
-        total = cv2.resize(masked, size, interpolation=cv2.INTER_AREA)
-        rgb = np.round(total / np.maximum(weight, 1e-6)[..., None]).clip(0, 255)
-    return Panorama(rgb.astype(np.uint8), weight >= 0.5)
+    if panorama.is_valid.all():
+        rgb = np.asarray(cv2.resize(panorama.rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+        return Panorama(rgb, np.ones(rgb.shape[:2], np.bool_))
+    # in bytes, as floating-point copies of a large picture would take gigabytes
+    counts = panorama.is_valid.view(np.uint8) * np.uint8(255)
+    weight = cv2.resize(counts, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
+    masked = cv2.bitwise_and(panorama.rgb, panorama.rgb, mask=counts)
+    total = cv2.resize(masked, size, interpolation=cv2.INTER_AREA)
+    rgb = np.round(total / np.maximum(weight, 1e-6)[..., None]).clip(0, 255).astype(np.uint8)
+    return Panorama(rgb, weight >= 0.5)

@@ -4,9 +4,7 @@ import struct
 from dataclasses import dataclass, field
 
 import numpy as np
-import pytest
-
-libe57 = pytest.importorskip("pye57.libe57")
+from pye57 import libe57
 
 NORMALS = ("nor", "http://www.libe57.org/E57_NOR_surface_normals.txt")
 

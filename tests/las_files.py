@@ -3,11 +3,9 @@
 import io
 import struct
 
+import laspy
+import lazrs
 import numpy as np
-import pytest
-
-laspy = pytest.importorskip("laspy")
-lazrs = pytest.importorskip("lazrs")
 
 SCALES, OFFSETS = np.array([1e-3, 1e-4, 2e-3]), np.array([637_000.0, 5_849_000.0, -100.0])
 PLAIN_SIZE = {2: 26, 3: 34, 5: 63, 7: 36, 8: 38, 10: 67}

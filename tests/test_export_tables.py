@@ -122,7 +122,6 @@ def test_angles_stay_in_their_ranges():
 
 
 def test_geojson_is_in_wgs84(tmp_path):
-    pytest.importorskip("pyproj")
     # Zone 32 has its meridian at 9 degrees east, where x is 500,000 and grid north is true north.
     on_meridian = Pose(rotation(75.0, 10.0, -5.0).T, np.array([500_000.0, 5_538_630.7026, 80.5]))
     east_of_it = Pose(rotation(75.0, 10.0, -5.0).T, np.array([700_000.0, 5_538_630.7026, 80.5]))
@@ -153,7 +152,6 @@ def test_geojson_is_in_wgs84(tmp_path):
     ],
 )
 def test_geojson_refuses_systems_and_places_that_do_not_fit(tmp_path, crs, center, message):
-    pytest.importorskip("pyproj")
     one = result("a.jpg", Pose(POSES[0].R_cam_from_world, np.array(center, float)))
     with pytest.raises(InputError, match=message):
         export([one], "geojson", tmp_path / "p.geojson", Options(crs=crs))

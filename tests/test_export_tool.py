@@ -67,8 +67,6 @@ def test_all_and_clouds(run, tmp_path):
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_writes_whole_files_and_nothing_else(run, tmp_path, name, monkeypatch):
-    if name == "geojson":
-        pytest.importorskip("pyproj")
     monkeypatch.chdir(tmp_path)
     Path("p").mkdir()
     for picture in ("a", "e"):

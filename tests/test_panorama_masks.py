@@ -222,5 +222,5 @@ def test_the_nadir_is_masked(tmp_path):
     is_valid = read(tmp_path / "a.jpg", room(), options=ReadOptions(mask_nadir_deg=20.0)).is_valid
     np.testing.assert_array_equal(is_valid, np.repeat((FROM_NADIR >= 20)[:, None], WIDTH, axis=1))
     for degrees in (-1.0, 91.0, float("nan")):
-        with pytest.raises(InputError, match=r"mask_nadir_deg: found .*, wanted 0 to 90"):
+        with pytest.raises(InputError, match=r"--mask-nadir: found .*, wanted 0 to 90"):
             ReadOptions(mask_nadir_deg=degrees)

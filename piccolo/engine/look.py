@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..hypotheses import RIVAL_ANGLE, RIVAL_DISTANCE, Hypothesis, distinct_best
-from ..panorama import Panorama
+from ..panorama import Panorama, rotation_to_level
 from ..pose import Array, Pose, orthonormal
 from ..rotations import uniform_rotations, uniform_yaws
 from ..sampling import Texels
@@ -79,6 +79,7 @@ class Look:
 
     scan_map: ScanMap
     images: Sequence[Texels]
+    R_cam_from_level: Array  # (3, 3) how the camera was tilted where gravity is known
     settings: EngineSettings
     workers: Workers
 
@@ -89,7 +90,10 @@ class Look:
         num_starts = min(max(num_starts, settings.min_starts), settings.max_starts)
         num_pool = num_starts * settings.poses_per_start
         is_known = gravity == "known"
-        rotations = uniform_yaws(settings.num_yaws) if is_known else uniform_rotations(settings.num_rotations)
+        if is_known:
+            rotations = self.R_cam_from_level @ uniform_yaws(settings.num_yaws)
+        else:
+            rotations = uniform_rotations(settings.num_rotations)
         rotations = allowed_rotations(rotations @ m.R_map_from_world, settings.prior) @ m.R_map_from_world.T
         samples, validity = turn_panorama(self.images[3], rotations)
         if is_known:
@@ -206,5 +210,7 @@ class Look:
 
 
 def look_for(panorama: Panorama, scan_map: ScanMap, settings: EngineSettings, workers: Workers) -> Look:
-    """The look for a panorama among a map's candidates."""
-    return Look(scan_map, comparable(panorama, SCALES), settings, workers)
+    """The look for a panorama among a map's candidates; its metadata say how the camera was tilted."""
+    R_level_from_cam = rotation_to_level(panorama.gpano) if panorama.gpano else None
+    R_cam_from_level = np.eye(3) if R_level_from_cam is None else R_level_from_cam.T
+    return Look(scan_map, comparable(panorama, SCALES), R_cam_from_level, settings, workers)

@@ -9,6 +9,7 @@ from ..hypotheses import Hypothesis, lead, rivals_of
 from ..loss import sampling_loss
 from ..panorama import Panorama
 from ..pose import Pose
+from ..pyramid import shrink
 from ..refine import refine
 from ..render import visible_points
 from ..result import Localization
@@ -27,6 +28,7 @@ SURE_SCORE, SURE_MARGIN = (
     0.25,
     0.15,
 )  # with less, another look is taken
+MAX_WIDTH = 4096  # [px] of the panorama that the loss is taken from: more costs seconds and tells nothing
 HOPELESS_SCORE = 0.05  # of black, white and noisy pictures; views of other places have 0.1 and more
 NEAR_SHARE = 0.4  # a rival with this share of the best score is refined as carefully as the best
 
@@ -109,6 +111,7 @@ def localize(
 def judged(look: Look, panorama: Panorama, found: Found) -> Localization:
     """The verdict on what was found, in world coordinates, after the descent that the solver asks for."""
     scan_map, settings, pose = look.scan_map, look.settings, found.best.pose
+    panorama = shrink(panorama, MAX_WIDTH)
     texels = pack_texels(panorama.rgb, panorama.is_valid)
     if settings.solver != "gauss-newton":
         how = DescentSettings(solver=settings.solver, step_size=0.01)

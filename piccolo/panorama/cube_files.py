@@ -92,7 +92,7 @@ def _grid(path: Path, picture: Picture, order: str) -> Faces:
         if width * num_rows == height * num_columns and width % num_columns == 0:
             cell = _cells(picture, width // num_columns)
             return {letter: cell(k // num_columns, k % num_columns) for k, letter in enumerate(order)}
-    raise InputError(f"{path}: found {width} x {height}, wanted six equal squares as cube_order says")
+    raise InputError(f"{path}: found {width} x {height}, wanted six equal squares as --cube-order says")
 
 
 def _cross(picture: Picture, layout: tuple[str, ...]) -> Faces | None:

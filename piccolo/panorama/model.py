@@ -43,11 +43,11 @@ class ReadOptions:
     def __post_init__(self) -> None:
         """Refuse values that mean nothing, naming the option."""
         if self.fov_deg is not None and not (math.isfinite(self.fov_deg) and 0.0 < self.fov_deg <= 360.0):
-            raise InputError(f"fov_deg: found {self.fov_deg}, wanted above 0 and at most 360")
+            raise InputError(f"--fov: found {self.fov_deg}, wanted above 0 and at most 360")
         if not (math.isfinite(self.mask_nadir_deg) and 0.0 <= self.mask_nadir_deg <= 90.0):
-            raise InputError(f"mask_nadir_deg: found {self.mask_nadir_deg}, wanted 0 to 90")
+            raise InputError(f"--mask-nadir: found {self.mask_nadir_deg}, wanted 0 to 90")
         if self.cube_order is not None and sorted(self.cube_order) != sorted(FACE_LETTERS):
             raise InputError(
-                f"cube_order: found {self.cube_order}, wanted each of the letters {FACE_LETTERS} once "
+                f"--cube-order: found {self.cube_order}, wanted each of the letters {FACE_LETTERS} once "
                 "(right, left, up, down, front, back)"
             )
