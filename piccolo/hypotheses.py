@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from .pose import Pose, are_same
 
 RIVAL_DISTANCE, RIVAL_ANGLE = 0.5, math.radians(15.0)  # [m], [rad] poses nearer than both are no rivals
-MAX_RIVALS = 5
+MAX_RIVALS = 5  # reported
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ def distinct_best(
 
 
 def rivals_of(
-    best: Pose, hypotheses: Sequence[Hypothesis], more: Sequence[Hypothesis] = ()
+    best: Pose, hypotheses: Sequence[Hypothesis], more: Sequence[Hypothesis] = (), count: int = MAX_RIVALS
 ) -> list[Hypothesis]:
-    """The best hypotheses of which only one can be right, and none of them if `best` is.
+    """The `count` best hypotheses of which only one can be right, and none of them if `best` is.
 
     Of `more`, which are less refined, those take part that are near none of the others.
     """
@@ -40,7 +40,7 @@ def rivals_of(
     for some in (hypotheses, more):
         known = [best, *(h.pose for h in found)]
         apart = [h for h in some if not any(are_same(h.pose, k, RIVAL_DISTANCE, RIVAL_ANGLE) for k in known)]
-        found += distinct_best(apart, MAX_RIVALS - len(found), RIVAL_DISTANCE, RIVAL_ANGLE)
+        found += distinct_best(apart, count - len(found), RIVAL_DISTANCE, RIVAL_ANGLE)
     return sorted(found, key=lambda h: -h.score)
 
 

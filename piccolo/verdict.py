@@ -6,35 +6,36 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from .certainty import Certainty
 from .verify import Evidence
 
 LOCALIZED = "localized"
 AMBIGUOUS = "ambiguous"
 NOT_LOCALIZED = "not_localized"
 
-LEAST_DISTANCE, MOST_DISTANCE = 0.003, 0.3  # [m] between halves: closer or farther tells nothing more
-# Logistic regression by tools/calibrate.py on tools/trials.py --seeds 0 16 and the scene house.
-FEATURES = ("score", "margin", "agreement", "log10 of the halves' distance [m]")
-BIAS, WEIGHTS = -4.0, (4.0, 20.0, 0.0, 0.0)
-# The preset paper knows no halves, and few rivals.
+LEAST_STD, MOST_STD = 0.001, 0.3  # [m] smaller or larger tells nothing more
+# Logistic regressions by tools/calibrate.py on tools/trials.py --seeds 0 16.
+FEATURES = ("score", "margin", "agreement", "log10 of the largest deviation [m]", "rival share")
+BIAS, WEIGHTS = -4.0, (4.0, 20.0, 0.0, 0.0, 0.0)
+# The preset paper knows no deviations, and few rivals.
 BIAS_OF_PAPER, WEIGHTS_OF_PAPER = -4.0, (4.0, 20.0)
 
 
-def features_of(evidence: Evidence) -> NDArray[np.float64]:
-    """What the confidence goes by, as FEATURES; without halves the first two only."""
+def features_of(evidence: Evidence, certainty: Certainty | None) -> NDArray[np.float64]:
+    """What the confidence goes by: FEATURES, or the first two of them with the preset paper."""
     values = [evidence.score, evidence.margin]
     if evidence.halves_distance is not None:
-        distance = min(max(evidence.halves_distance, LEAST_DISTANCE), MOST_DISTANCE)
-        values += [evidence.agreement, math.log10(distance)]
+        std = MOST_STD if certainty is None else min(max(certainty.largest_std, LEAST_STD), MOST_STD)
+        values += [evidence.agreement, math.log10(std), evidence.rival_share]
     return np.array(values)
 
 
-def confidence_of(evidence: Evidence) -> float:
+def confidence_of(evidence: Evidence, certainty: Certainty | None) -> float:
     """How likely it is that the pose is within 0.1 m and 5 degrees: of those with 0.9, nine in ten.
 
     It holds where half of all queries have an answer, as in the trials from which it was learnt.
     """
-    features = features_of(evidence)
+    features = features_of(evidence, certainty)
     if len(features) == len(WEIGHTS):
         logit = BIAS + float(features @ np.array(WEIGHTS))
     else:
@@ -42,12 +43,14 @@ def confidence_of(evidence: Evidence) -> float:
     return 1.0 / (1.0 + math.exp(-min(max(logit, -30.0), 30.0)))
 
 
-def verdict(evidence: Evidence, has_rivals: bool, min_confidence: float) -> tuple[str, float]:
+def verdict(
+    evidence: Evidence, certainty: Certainty | None, has_rivals: bool, min_confidence: float
+) -> tuple[str, float]:
     """Status and confidence; ambiguous is a pose that would be called localized if it had no rival."""
-    confidence = confidence_of(evidence)
+    confidence = confidence_of(evidence, certainty)
     if confidence >= min_confidence:
         return LOCALIZED, confidence
-    alone = replace(evidence, margin=max(evidence.score, evidence.margin))
-    if has_rivals and confidence_of(alone) >= min_confidence:
+    alone = replace(evidence, margin=max(evidence.score, evidence.margin), rival_share=0.0)
+    if has_rivals and confidence_of(alone, certainty) >= min_confidence:
         return AMBIGUOUS, confidence
     return NOT_LOCALIZED, confidence

@@ -32,6 +32,9 @@ class Evidence:
     inlier_share: float  # of what both show, the share that agrees
     seen_share: float  # of the sphere, the share on which the cloud shows anything
     residual_p20: float  # 20th percentile of the colours' difference (RGB norm) over what both show
+    rival_share: float = (
+        0.0  # score of the best rival that is a bottom of the loss too, as a share of the own
+    )
     halves_distance: float | None = None  # between the poses that two halves of the points lead to [m]
     halves_angle: float | None = None  # [rad]
 

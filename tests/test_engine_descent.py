@@ -14,7 +14,7 @@ from piccolo.engine.descent import (
 )
 from piccolo.engine.hypotheses import shakes
 from piccolo.engine.least_squares import normal_equations, solve_damped
-from piccolo.engine.method import FINE_VIEW, as_levels
+from piccolo.engine.look import FINE_VIEW, as_levels
 from piccolo.engine.octree import build_octree
 from piccolo.engine.scan_map import SEARCH_VIEW, prepare_map
 from piccolo.engine.tiling import make_tiling

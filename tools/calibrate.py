@@ -74,7 +74,7 @@ def outcome_of(trial: dict[str, object]) -> Outcome | None:
 
 def fit(outcomes: Sequence[Outcome]) -> tuple[float, Array]:
     """Bias and weights of the logistic regression with the least penalised loss."""
-    X = np.array([features_of(o.evidence) for o in outcomes])
+    X = np.array([features_of(o.evidence, o.certainty) for o in outcomes])
     y = np.array([o.is_correct for o in outcomes], float)
     mean, deviation = X.mean(axis=0), X.std(axis=0)
     Z = np.column_stack([np.ones(len(X)), (X - mean) / deviation])
@@ -95,7 +95,7 @@ def print_reliability(name: str, outcomes: Sequence[Outcome]) -> None:
     print(f"\n| confidence, {name} | poses | right | wrong |")
     print("|---|---:|---:|---:|")
     for low, high in pairwise(LEVELS):
-        some = [o for o in outcomes if low <= confidence_of(o.evidence) < high]
+        some = [o for o in outcomes if low <= confidence_of(o.evidence, o.certainty) < high]
         right = sum(o.is_correct for o in some)
         print(f"| {low} to {min(high, 1.0)} | {len(some)} | {right} | {len(some) - right} |")
 

@@ -15,6 +15,7 @@ from .look import FINISH_LOSS, FINISH_VIEW, Look, as_levels
 from .tiling import cell_of
 from .view import Cells, seen_points
 
+MAX_STD = 0.05  # [m] a bottom wider than this is none
 BLOCK_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
 SCALE = FINISH_LOSS * LEVELS_PER_UNIT
 
@@ -98,6 +99,12 @@ def covariance_at(look: Look, points: Cells, pose: Pose) -> Array | None:
         if covariance is not None:
             return probe.inflation * covariance
     return None
+
+
+def has_bottom(look: Look, pose: Pose) -> bool:
+    """True if the loss has a bottom at the pose: where the panorama may have been taken, hardly elsewhere."""
+    covariance = covariance_at(look, points_at(look, pose), pose)
+    return covariance is not None and float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) < MAX_STD**2
 
 
 def certainty_at(look: Look, points: Cells, pose: Pose) -> Certainty | None:

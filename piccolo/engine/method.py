@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..hypotheses import Hypothesis, lead, rivals_of
+from ..hypotheses import MAX_RIVALS, Hypothesis, lead, rivals_of
 from ..loss import sampling_loss
 from ..panorama import Panorama
 from ..pose import Pose
@@ -19,7 +19,7 @@ from ..stopwatch import Stopwatch
 from ..threads import Workers
 from ..verdict import verdict
 from ..verify import evidence_at
-from .certainty import certainty_at, disagreement_of_halves, points_at
+from .certainty import certainty_at, disagreement_of_halves, has_bottom, points_at
 from .look import MAX_FINISH_LOSS, Look, look_for
 from .prior import narrowed
 from .scan_map import ScanMap
@@ -30,6 +30,7 @@ SURE_SCORE, SURE_MARGIN = (
 )  # with less, another look is taken
 MAX_WIDTH = 4096  # [px] of the panorama that the loss is taken from: more costs seconds and tells nothing
 HOPELESS_SCORE = 0.05  # of black, white and noisy pictures; views of other places have 0.1 and more
+MAX_CHALLENGERS = 10  # rivals looked at
 NEAR_SHARE = 0.4  # a rival with this share of the best score is refined as carefully as the best
 
 
@@ -39,6 +40,7 @@ class Found:
 
     best: Hypothesis
     rivals: tuple[Hypothesis, ...]
+    credible: tuple[Hypothesis, ...] = ()  # of the rivals, those at which the loss has a bottom too
 
     @property
     def margin(self) -> float:
@@ -50,6 +52,16 @@ class Found:
         """True if no other look need be taken."""
         return self.best.score >= SURE_SCORE and self.margin >= SURE_MARGIN
 
+    @property
+    def rival_share(self) -> float:
+        """Score of the best credible rival, as a share of the best score."""
+        return max([0.0, *(h.score for h in self.credible)]) / max(self.best.score, 1e-9)
+
+    def reported(self) -> list[Hypothesis]:
+        """The rivals for the user: the credible ones first."""
+        others = [h for h in self.rivals if not any(h is c for c in self.credible)]
+        return [*self.credible, *others][:MAX_RIVALS]
+
 
 def find(look: Look, gravity: Gravity, watch: Stopwatch) -> Found:
     """Search, refine, and finish the best."""
@@ -58,16 +70,19 @@ def find(look: Look, gravity: Gravity, watch: Stopwatch) -> Found:
     with watch.stage("refine"):
         fine, middle = look.refine(starts)
         best = look.finish(fine[0])
-    return Found(best, tuple(rivals_of(best.pose, fine, middle)))
+    return Found(best, tuple(rivals_of(best.pose, fine, middle, MAX_CHALLENGERS)))
 
 
 def challenged(look: Look, found: Found) -> Found:
     """The same, with the rivals that come near the best refined as carefully; the better of them wins."""
-    is_near = [h.score > NEAR_SHARE * found.best.score for h in found.rivals]
-    near = [h for h, yes in zip(found.rivals, is_near, strict=True) if yes]
+    num_near = sum(h.score > NEAR_SHARE * found.best.score for h in found.rivals)
+    near, far = found.rivals[:num_near], found.rivals[num_near:]
     finished = list(look.workers.each(lambda h: look.finish(look.polish(h)), near, "descend"))
-    best, *others = sorted([found.best, *finished, *found.rivals[len(near) :]], key=lambda h: -h.score)
-    return Found(best, tuple(rivals_of(best.pose, others)))
+    best, *others = sorted([found.best, *finished, *far], key=lambda h: -h.score)
+    rivals = rivals_of(best.pose, others, count=MAX_CHALLENGERS)
+    near = tuple(h for h in rivals if h.score > NEAR_SHARE * best.score)
+    credible = look.workers.each(lambda h: has_bottom(look, h.pose), near, "descend")
+    return Found(best, tuple(rivals), tuple(h for h, yes in zip(near, credible, strict=True) if yes))
 
 
 def best_found(look: Look, watch: Stopwatch) -> Found:
@@ -127,11 +142,12 @@ def judged(look: Look, panorama: Panorama, found: Found) -> Localization:
     evidence = replace(
         evidence,
         score=found.best.score,
+        rival_share=found.rival_share,
         margin=min([found.margin, *(evidence.agreement - a for a in agreements)]),
         halves_distance=distance,
         halves_angle=angle,
     )
     certainty = certainty_at(look, points, pose)
-    status, confidence = verdict(evidence, len(found.rivals) > 0, settings.min_confidence)
-    rivals = tuple(Hypothesis(scan_map.to_world(h.pose), h.score) for h in found.rivals)
+    status, confidence = verdict(evidence, certainty, len(found.rivals) > 0, settings.min_confidence)
+    rivals = tuple(Hypothesis(scan_map.to_world(h.pose), h.score) for h in found.reported())
     return Localization(status, confidence, scan_map.to_world(pose), loss, evidence, rivals, certainty)

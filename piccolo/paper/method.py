@@ -63,7 +63,7 @@ def localize(
         return Localization()
     with watch.stage("refine"):
         evidence, rivals = judge(points, panorama, best, refined)
-    status, confidence = verdict(evidence, len(rivals) > 0, settings.min_confidence)
+    status, confidence = verdict(evidence, None, len(rivals) > 0, settings.min_confidence)
     origin_world = paper_map.origin_world
     in_world = tuple(replace(r, pose=shifted(r.pose, origin_world)) for r in rivals)
     return Localization(status, confidence, shifted(best.pose, origin_world), best.loss, evidence, in_world)
