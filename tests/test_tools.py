@@ -2,6 +2,7 @@
 
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from piccolo.errors import InputError
 from piccolo.pose import Pose, exp_so3
 from piccolo.truth import is_correct, pose_errors, read_truth
-from tools import ablation, benchmark, growth, make_room
+from tools import ablation, benchmark, calibrate, evaluate, growth, make_room, trials
 
 
 @pytest.fixture(scope="module")
@@ -93,3 +94,37 @@ def test_truth_is_read_and_a_pose_judged(tmp_path):
     (tmp_path / "queries.json").write_text("{}")
     with pytest.raises(InputError, match=r"wanted a queries\.json with true poses"):
         read_truth(tmp_path / "queries.json")
+
+
+def test_trials_of_a_scene_and_what_is_learnt_from_them(scene, tmp_path, capsys):
+    out = tmp_path / "trials.jsonl"
+    assert trials.main(["--seeds", "0", "0", "--scenes", str(scene), "--out", str(out)]) == 0
+    table = capsys.readouterr().out
+    assert re.search(r"\| clean \| 1 \| 1 \| 1 \| 0 \| 0 \|", table)
+    assert re.search(r"\| upside down \| 1 \| \d \| 0 \| \d \| 0 \|", table)
+    cases = [json.loads(line)["case"] for line in out.read_text().splitlines()]
+    assert cases[:2] == ["clean", "black"]
+    assert calibrate.main(["--fit", str(out), "--check", str(out)]) == 0
+    told = capsys.readouterr().out
+    assert re.search(r"bias -?\d+\.\d+, weights (-?\d+\.\d+, ){4}-?\d+\.\d+", told)
+    assert "| covariance, others | right poses |" in told
+    assert calibrate.main(["--fit", str(tmp_path / "none.jsonl")]) == 3
+    (tmp_path / "odd.jsonl").write_text("{}")
+    assert calibrate.main(["--check", str(tmp_path / "odd.jsonl")]) == 3
+
+
+def _row(confidence, is_right):
+    error = 0.0 if is_right else 1.0
+    result = SimpleNamespace(confidence=confidence)
+    return evaluate.Row("a.jpg", "clean", result, error, error)
+
+
+def test_risk_over_coverage():
+    rows = [_row(0.9, True), _row(0.5, False), _row(0.95, True), _row(0.5, True)]
+    points = evaluate.risk_and_coverage(rows, 0.1, 5.0)
+    assert [(p.confidence, p.coverage, p.num_wrong) for p in points] == [
+        (0.95, 0.25, 0),
+        (0.9, 0.5, 0),
+        (0.5, 1.0, 1),
+    ]
+    assert points[-1].risk == 0.25
