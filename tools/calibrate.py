@@ -77,6 +77,7 @@ def fit(outcomes: Sequence[Outcome]) -> tuple[float, Array]:
     X = np.array([features_of(o.evidence, o.certainty) for o in outcomes])
     y = np.array([o.is_correct for o in outcomes], float)
     mean, deviation = X.mean(axis=0), X.std(axis=0)
+    deviation[deviation == 0.0] = 1.0  # a feature that is the same in all trials
     Z = np.column_stack([np.ones(len(X)), (X - mean) / deviation])
 
     def loss(w: Array) -> tuple[float, Array]:
