@@ -15,8 +15,8 @@ NOT_LOCALIZED = "not_localized"
 
 LEAST_STD, MOST_STD = 0.001, 0.3  # [m] smaller or larger tells nothing more
 # Logistic regressions by tools/calibrate.py on tools/trials.py --seeds 0 16.
-FEATURES = ("score", "margin", "agreement", "log10 of the largest deviation [m]", "rival share")
-BIAS, WEIGHTS = -4.0, (4.0, 20.0, 0.0, 0.0, 0.0)
+FEATURES = ("score", "margin", "agreement", "log10 of the largest deviation [m]", "has a credible rival")
+BIAS, WEIGHTS = -5.91, (-0.52, 5.75, 12.86, -0.76, -7.72)
 # The preset paper knows no deviations, and few rivals.
 BIAS_OF_PAPER, WEIGHTS_OF_PAPER = -4.0, (4.0, 20.0)
 
@@ -26,7 +26,7 @@ def features_of(evidence: Evidence, certainty: Certainty | None) -> NDArray[np.f
     values = [evidence.score, evidence.margin]
     if evidence.halves_distance is not None:
         std = MOST_STD if certainty is None else min(max(certainty.largest_std, LEAST_STD), MOST_STD)
-        values += [evidence.agreement, math.log10(std), evidence.rival_share]
+        values += [evidence.agreement, math.log10(std), float(evidence.rival_share > 0.0)]
     return np.array(values)
 
 
