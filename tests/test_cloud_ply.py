@@ -16,7 +16,7 @@ from piccolo.settings import CloudSettings
 RAW = seeded_cloud(1, num_points=1200)
 RGB = ("red", "green", "blue")
 TRIANGLES = PlyElement.describe(
-    np.array([([0, 1, 2],), ([2, 3, 4],)], dtype=[("vertex_indices", "i4", (3,))]), "face"
+    np.array([([0, 1, 2],), ([2, 3, 4],)], dtype=[("vertex_indices", "i4", (3,))]), "strip"
 )
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from ..errors import InputError
 from ..settings import IN_METRES, CloudSettings
 from ..threads import Show, unseen
+from .mesh import MESH
 from .model import Cloud
 from .ply import PLY
 from .raw import HEAD_SIZE, Format, PointSource, ReadOptions
@@ -14,7 +15,7 @@ from .text import TEXT
 
 __all__ = ["Cloud", "CloudStream", "open_cloud", "read_cloud", "stream_of"]
 
-FORMATS = (PLY, TEXT)
+FORMATS = (PLY, TEXT, MESH)
 WANTED = f"wanted a coloured point cloud: {', '.join(f.name for f in FORMATS)}"
 
 
