@@ -85,7 +85,7 @@ class Sampling:
             area_before = float(self.ends[i - 1]) if i else 0.0
             for begin in range(first, end, CHUNK):
                 k = np.arange(begin, min(begin + CHUNK, end))
-                shares = (k + 0.5) * area_a_point - area_before
+                shares = np.asarray((k + 0.5) * area_a_point - area_before, dtype=np.float64)
                 yield _points(part, k, _triangles_at(within, shares), texels)
 
 
