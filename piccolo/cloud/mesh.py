@@ -34,6 +34,7 @@ BRIGHTEST = {"u1": 255.0, "u2": 65535.0}  # of whole numbers; fractions go to 1
 ODD_FACE = re.compile(rb"^f(?=[ \t])[^\n]*?[ \t/](?:-|0+[ \t/\r\n])", re.MULTILINE)
 LIBRARY_LINE = re.compile(rb"^[ \t]*mtllib[ \t]+(.*?)[ \t\r]*$", re.MULTILINE)
 TEXTURE_LINE = re.compile(r"^[ \t]*map_Kd[ \t]+(.*?)[ \t\r]*$", re.MULTILINE | re.IGNORECASE)
+TEXTURE_COMMENT = re.compile(r"TextureFile[ \t]*(.*?)[ \t\r]*$", re.MULTILINE | re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,11 @@ def open_mesh(path: Path, options: ReadOptions = PLAIN) -> PointSource:
 
 def open_ply_mesh(path: Path) -> PointSource:
     """The points on the faces of a PLY file, as by open_mesh; with a texture if a comment names one."""
+    library(path, "PIL.Image")
     content = path.read_bytes()
     beside = Beside(path)
+    header = content.partition(b"end_header")[0].decode("utf-8", "replace")
+    _check_textures(beside, TEXTURE_COMMENT.findall(header))
     loaded = Loaded(path, _scene(beside, content, "ply"))
     for mesh in loaded.scene.geometry.values():
         _check_ply(path, mesh.metadata.get("_ply_raw", {}))
@@ -98,8 +102,12 @@ def _check_libraries(beside: Beside, content: bytes) -> None:
         raise InputError(f"{beside.path}: names {len(names)} files of materials, wanted one")
     for name in names:
         text = beside.get(name.decode()).decode("utf-8", "replace")
-        for texture in sorted(set(TEXTURE_LINE.findall(text))):
-            check_image(beside.path, ascii(texture[:100]), beside.get(texture))
+        _check_textures(beside, TEXTURE_LINE.findall(text))
+
+
+def _check_textures(beside: Beside, names: list[str]) -> None:
+    for name in sorted(set(names)):
+        check_image(beside.path, ascii(name[:100]), beside.get(name))
 
 
 def _scene(beside: Beside, content: bytes, kind: str) -> Any:

@@ -220,8 +220,11 @@ class _Narrower:
             return None
         given = primitive["attributes"]
         materials = self.tree.get("materials", [])
-        row = _count(primitive.get("material", len(materials)))
-        texture = (_base(materials[row]).get("baseColorTexture") if row < len(materials) else None) or {}
+        row, material = len(materials), {}
+        if "material" in primitive:
+            row = _count(primitive["material"])
+            material = materials[row]
+        texture = _base(material).get("baseColorTexture") or {}
         names = {
             "POSITION": "POSITION",
             "TEXCOORD_0": f"TEXCOORD_{_count(texture.get('texCoord', 0))}",

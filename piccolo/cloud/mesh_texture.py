@@ -14,6 +14,7 @@ from ..errors import InputError
 from .optional import library
 
 MAX_TEXELS = 1 << 28  # 16,384 x 16,384, 1 GiB while it is looked up
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "TGA", "GIF")
 MODES = frozenset({"1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr"})  # 8 bits a channel or less
 
 
@@ -29,7 +30,7 @@ class Texture:
         images = library(self.path, "PIL.Image")
         with own_limit(self.path):
             try:
-                with images.open(BytesIO(self.content)) as image:
+                with images.open(BytesIO(self.content), formats=FORMATS) as image:
                     _check(self.path, image)
                     return np.asarray(image.convert("RGBA"))
             except InputError:
@@ -50,10 +51,10 @@ def texture_of(path: Path, image: Any) -> Texture | None:
 
 @contextmanager
 def own_limit(path: Path) -> Iterator[None]:
-    """Lift Pillow's limit, which is lower and warns, to MAX_TEXELS: above it Pillow refuses to open."""
+    """Lift Pillow's limit, which real textures exceed: MAX_TEXELS is held here before they are decoded."""
     images: Any = library(path, "PIL.Image")
     limit = images.MAX_IMAGE_PIXELS
-    images.MAX_IMAGE_PIXELS = MAX_TEXELS
+    images.MAX_IMAGE_PIXELS = None
     try:
         yield
     finally:
@@ -65,7 +66,7 @@ def check_image(path: Path, name: str, content: bytes) -> None:
     images: Any = library(path, "PIL.Image")
     with own_limit(path):
         try:
-            with images.open(BytesIO(content)) as image:
+            with images.open(BytesIO(content), formats=FORMATS) as image:
                 _check(path, image)
         except InputError:
             raise
