@@ -209,6 +209,11 @@ def _surface(loaded: Loaded, mesh: Any) -> Surface | None:
     triangles = np.array(mesh.faces, dtype=np.int64)
     if not len(triangles):
         return None
+    if (vertices.shape[1:], triangles.shape[1:]) != ((3,), (3,)):
+        raise InputError(
+            f"{loaded.path}: vertices of shape {vertices.shape} and triangles of shape {triangles.shape}, wanted "
+            "three numbers each"
+        )
     if triangles.min() < 0 or triangles.max() >= len(vertices):
         raise InputError(
             f"{loaded.path}: a face names vertex {triangles.max()} (from {triangles.min()}), found "
