@@ -17,6 +17,7 @@ from meshes import (
     write_obj,
     write_ply,
 )
+from PIL import Image
 from scipy.spatial.transform import Rotation
 from test_cloud_order import whole
 
@@ -27,6 +28,7 @@ from piccolo.cloud.mesh_sampling import decoded, encoded, look_up, weights_of
 from piccolo.cloud.ply import open_ply
 from piccolo.errors import InputError
 
+CORNER_COLORS = np.array([[0, 0, 40], [255, 0, 40], [255, 255, 40], [0, 255, 40]], np.uint8)
 CORNERS = {RED: (0, 1), GREEN: (1, 1), BLUE: (0, 0), YELLOW: (1, 0)}  # of the square's x and y
 
 
@@ -58,7 +60,7 @@ def test_a_gltf_texture_stands_upright(tmp_path, kind):
 
 def test_a_glb_by_trimesh_stands_upright(tmp_path):
     trimesh = pytest.importorskip("trimesh")
-    image = mesh_module.library(tmp_path, "PIL.Image").fromarray(QUADRANTS)
+    image = Image.fromarray(QUADRANTS)
     material = trimesh.visual.material.PBRMaterial(baseColorTexture=image)
     visual = trimesh.visual.TextureVisuals(uv=UV_FROM_BELOW, material=material)
     trimesh.Trimesh(SQUARE, TRIANGLES, visual=visual, process=False).export(tmp_path / "a.glb")
@@ -76,7 +78,7 @@ def test_a_ply_texture_stands_upright(tmp_path, text):
 def test_images_in_other_encodings(tmp_path):
     path = write_obj(tmp_path, texture=png(format="JPEG", quality=100, subsampling=0))
     assert_quadrants(whole(open_mesh, path), tolerance=12)
-    image = mesh_module.library(tmp_path, "PIL.Image").open(tmp_path / "wall.png")
+    image = Image.open(tmp_path / "wall.png")
     image.quantize(8).save(tmp_path / "wall.png", "PNG")
     assert_quadrants(whole(open_mesh, path), tolerance=12)
 
@@ -142,6 +144,22 @@ def test_a_mesh_placed_twice(tmp_path):
     assert (np.count_nonzero(near), np.count_nonzero(~near)) == (20_000, 10_000)
 
 
+def test_the_order_of_surfaces_is_no_chance(tmp_path):
+    """trimesh gives the nodes of a mesh of several parts random names."""
+    gltf = textured_gltf()
+    primitives = gltf.tree["meshes"][0]["primitives"]
+    for i in range(1, 9):
+        part = gltf.mesh(SQUARE * i / 8, colors=CORNER_COLORS)
+        primitives += gltf.tree["meshes"][part]["primitives"]
+    gltf.node(mesh=0, translation=[0, 0, 3])
+    path = gltf.glb(tmp_path / "a.glb")
+    first = whole(open_mesh, path)
+    for _ in range(5):
+        again = whole(open_mesh, path)
+        assert again.points_world.tobytes() == first.points_world.tobytes()
+        assert again.colors.tobytes() == first.colors.tobytes()
+
+
 def test_density_is_the_same_on_large_and_small_triangles(tmp_path):
     rng = np.random.default_rng(3)
     sizes = 10 ** rng.uniform(-3, -0.8, 4000)
@@ -204,9 +222,6 @@ def test_texels_of_alpha_0_leave_their_points_out(tmp_path):
     raw = whole(open_mesh, write_obj(tmp_path, texture=png(np.concatenate([QUADRANTS, alpha], axis=2))))
     assert len(raw.colors) == pytest.approx(7500, rel=0.02)
     assert not np.any(np.all(raw.points_world[:, :2] > 0.5, axis=1))
-
-
-CORNER_COLORS = np.array([[0, 0, 40], [255, 0, 40], [255, 255, 40], [0, 255, 40]], np.uint8)
 
 
 @pytest.mark.parametrize("text", [False, True])

@@ -4,12 +4,6 @@ Coordinates are taken as they stand in the file, after its own scene graph: a gl
 unit. trimesh reads the files; what it would pass over in silence is checked before and after.
 """
 
-import re
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -17,33 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .mesh_files import Beside
 from .mesh_glb import has_glb_magic
-from .mesh_gltf import Material, narrow
+from .mesh_gltf import Material
+from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply
 from .mesh_sampling import Floats, Placed, Sampling, Surface
-from .mesh_texture import check_image, first_line, own_limit, texture_of
-from .optional import library
+from .mesh_texture import texture_of
 from .raw import PLAIN, Format, PointSource, ReadOptions
 
 DENSITY = 10_000.0  # points on a square unit, 1 cm apart if the unit is the metre
 MAX_POINTS = 30_000_000
 MAX_TRIANGLES = 200_000_000  # counted anew wherever a scene places its mesh
-WANTED = "wanted a mesh with textures, vertex colours or materials"
 BRIGHTEST = {"u1": 255.0, "u2": 65535.0}  # of whole numbers; fractions go to 1
-# faces whose indices count back from the last vertex, or are 0; trimesh would take wrong vertices
-ODD_FACE = re.compile(rb"^f(?=[ \t])[^\n]*?[ \t/](?:-|0+[ \t/\r\n])", re.MULTILINE)
-LIBRARY_LINE = re.compile(rb"^[ \t]*mtllib[ \t]+(.*?)[ \t\r]*$", re.MULTILINE)
-TEXTURE_LINE = re.compile(r"^[ \t]*map_Kd[ \t]+(.*?)[ \t\r]*$", re.MULTILINE | re.IGNORECASE)
-TEXTURE_COMMENT = re.compile(r"TextureFile[ \t]*(.*?)[ \t\r]*$", re.MULTILINE | re.IGNORECASE)
-
-
-@dataclass(frozen=True)
-class Loaded:
-    """What trimesh made of a file."""
-
-    path: Path
-    scene: Any  # trimesh.Scene
-    materials: list[Material] | None = None  # of glTF, named by their rows
 
 
 def open_mesh(path: Path, options: ReadOptions = PLAIN) -> PointSource:
@@ -51,100 +29,18 @@ def open_mesh(path: Path, options: ReadOptions = PLAIN) -> PointSource:
 
     A file that would give more than 30 million is sampled at a lower density, with a warning. Colours: from
     the texture, whose texels of alpha 0 leave their points out; else from the vertices, the faces, the
-    material.
-    In glTF the texture is multiplied by the base colour's factor and the vertex colours, in linear light.
+    material. In glTF they are multiplied in linear light: texture, base colour's factor, vertex colours.
     Textures repeat beyond their edges. Surfaces without colours are left out, with a warning.
     """
     content = path.read_bytes()
     if has_glb_magic(content) or path.suffix.lower() in (".glb", ".gltf"):
-        return _source(_load_gltf(path, content))
-    return _source(_load_obj(path, content))
+        return _source(load_gltf(path, content))
+    return _source(load_obj(path, content))
 
 
 def open_ply_mesh(path: Path) -> PointSource:
     """The points on the faces of a PLY file, as by open_mesh; with a texture if a comment names one."""
-    library(path, "PIL.Image")
-    content = path.read_bytes()
-    beside = Beside(path)
-    header = content.partition(b"end_header")[0].decode("utf-8", "replace")
-    _check_textures(beside, TEXTURE_COMMENT.findall(header))
-    loaded = Loaded(path, _scene(beside, content, "ply"))
-    for mesh in loaded.scene.geometry.values():
-        _check_ply(path, mesh.metadata.get("_ply_raw", {}))
-    return _source(loaded)
-
-
-def _load_gltf(path: Path, content: bytes) -> Loaded:
-    library(path, "PIL.Image")
-    beside = Beside(path)
-    narrowed = narrow(content, beside)
-    return Loaded(path, _scene(beside, narrowed.content, "gltf"), narrowed.materials)
-
-
-def _load_obj(path: Path, content: bytes) -> Loaded:
-    library(path, "PIL.Image")
-    try:
-        content.decode()
-    except UnicodeDecodeError:
-        content = content.decode("latin-1").encode()  # names in an older code
-    odd = ODD_FACE.search(content)
-    if odd:
-        raise InputError(f"{path}: a face {odd[0][:40].decode('latin-1')!a}, wanted indices from 1 upwards")
-    beside = Beside(path)
-    _check_libraries(beside, content)
-    return Loaded(path, _scene(beside, content, "obj"))
-
-
-def _check_libraries(beside: Beside, content: bytes) -> None:
-    """Refuse materials that trimesh would do without."""
-    names = sorted(set(LIBRARY_LINE.findall(content)))
-    if len(names) > 1:
-        raise InputError(f"{beside.path}: names {len(names)} files of materials, wanted one")
-    for name in names:
-        text = beside.get(name.decode()).decode("utf-8", "replace")
-        _check_textures(beside, TEXTURE_LINE.findall(text))
-
-
-def _check_textures(beside: Beside, names: list[str]) -> None:
-    for name in sorted(set(names)):
-        check_image(beside.path, ascii(name[:100]), beside.get(name))
-
-
-def _scene(beside: Beside, content: bytes, kind: str) -> Any:
-    trimesh = library(beside.path, "trimesh")
-    try:
-        with own_limit(beside.path), _strict_numbers():
-            scene = trimesh.load_scene(BytesIO(content), file_type=kind, resolver=beside, process=False)
-    except InputError:
-        raise
-    except Exception as error:  # whatever trimesh stumbles over
-        if beside.refusal is None:
-            text = f"{beside.path}: trimesh can't read it ({first_line(error)}), {WANTED}"
-            raise InputError(text) from error
-    if beside.refusal is not None:
-        raise beside.refusal
-    return scene
-
-
-@contextmanager
-def _strict_numbers() -> Iterator[None]:
-    """Make an error of the warning with which NumPy stops reading at what is no number."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        warnings.filterwarnings(
-            "error", message="string or file could not be read", category=DeprecationWarning
-        )
-        yield
-
-
-def _check_ply(path: Path, elements: dict[str, Any]) -> None:
-    """Refuse a file with fewer rows than promised."""
-    for name in ("vertex", "face"):
-        data, count = elements[name].get("data"), elements[name]["length"]
-        columns = data.values() if isinstance(data, dict) else [data]
-        found = min((len(column) for column in columns if column is not None), default=0)
-        if found != count:
-            raise InputError(f"{path}: the header promises {count} rows of '{name}', found {found}")
+    return _source(load_ply(path))
 
 
 def _source(loaded: Loaded) -> PointSource:
@@ -153,9 +49,12 @@ def _source(loaded: Loaded) -> PointSource:
     num_triangles = sum(len(part.surface.triangles) for part in parts)
     if num_triangles > MAX_TRIANGLES:
         raise InputError(f"{path}: {num_triangles} triangles, wanted at most {MAX_TRIANGLES}")
-    areas = [part.areas() for part in parts]
-    ends = np.cumsum([area.sum() for area in areas])
-    num_flat = sum(int(np.count_nonzero(area == 0.0)) for area in areas)
+    sums, num_flat = [], 0
+    for part in parts:
+        areas = part.areas()
+        sums.append(areas.sum())
+        num_flat += int(np.count_nonzero(areas == 0.0))
+    ends = np.cumsum(sums, dtype=np.float64)
     total = float(ends[-1])
     if not 0.0 < total < np.inf:
         raise InputError(f"{path}: {num_triangles} triangles with an area of {total:g}, {WANTED}")
@@ -179,8 +78,9 @@ def _placed(loaded: Loaded) -> tuple[list[Placed], list[str]]:
         name: _surface(loaded, mesh) for name, mesh in scene.geometry.items() if hasattr(mesh, "faces")
     }
     parts, num_bare = [], 0
-    for node in sorted(scene.graph.nodes_geometry):
-        matrix, name = scene.graph.get(node)
+    nodes = [scene.graph.get(node) for node in scene.graph.nodes_geometry]
+    # not by the nodes' names: trimesh makes some up by chance
+    for matrix, name in sorted(nodes, key=lambda node: (node[1], node[0].tobytes())):
         surface = surfaces.get(name)
         if surface is None:
             continue
@@ -211,8 +111,8 @@ def _surface(loaded: Loaded, mesh: Any) -> Surface | None:
         return None
     if (vertices.shape[1:], triangles.shape[1:]) != ((3,), (3,)):
         raise InputError(
-            f"{loaded.path}: vertices of shape {vertices.shape} and triangles of shape {triangles.shape}, wanted "
-            "three numbers each"
+            f"{loaded.path}: vertices of shape {vertices.shape} and triangles of shape {triangles.shape}, "
+            "wanted three numbers each"
         )
     if triangles.min() < 0 or triangles.max() >= len(vertices):
         raise InputError(
