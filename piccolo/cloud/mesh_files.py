@@ -19,9 +19,7 @@ class Beside:
     """
 
     path: Path  # the mesh
-    in_memory: dict[str, bytes] = field(
-        default_factory=dict
-    )  # parts of the mesh's own file, by made-up names
+    in_memory: dict[str, bytes] = field(default_factory=dict)  # by name, made up for what has none
     refusal: InputError | None = None
 
     def get(self, name: str) -> bytes:
@@ -29,10 +27,11 @@ class Beside:
         if name in self.in_memory:
             return self.in_memory[name]
         try:
-            return self._content(name)
+            content = self.in_memory[name] = self._content(name)
         except InputError as refusal:
             self.refusal = self.refusal or refusal
             raise
+        return content
 
     __getitem__ = get
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from .mesh_files import DATA_URI, Beside
+from .mesh_files import Beside
 from .mesh_glb import WANTED, glb_parts, has_glb_magic
 from .mesh_texture import check_image, first_line
 
@@ -76,7 +76,7 @@ class _Narrower:
         images = self._images(buffers)
         given = self.tree.get("materials", [])
         materials = [self._material(material) for material in given]
-        kept = [_kept_material(i, material) for i, material in enumerate(given)]
+        kept = [self._kept_material(i, material) for i, material in enumerate(given)]
         meshes = [
             {"primitives": [p for p in map(self._primitive, mesh["primitives"]) if p]}
             for mesh in self.tree.get("meshes", [])
@@ -87,7 +87,7 @@ class _Narrower:
             "bufferViews": self.tree.get("bufferViews", []),
             "accessors": self.tree.get("accessors", []),
             "images": images,
-            "textures": [{"source": _source(texture)} for texture in self.tree.get("textures", [])],
+            "textures": [{"source": i} for i in range(len(images))],
             "materials": [*kept, {"name": str(len(kept))}],
             "meshes": meshes,
             "nodes": [_kept_node(node) for node in self.tree.get("nodes", [])],
@@ -117,7 +117,7 @@ class _Narrower:
                     f"{self.path}: buffer {i} promises {buffer['byteLength']} bytes, found {len(content)}"
                 )
             buffers.append(content)
-        self.num_bytes += sum(map(len, buffers))
+        self.num_bytes += sum({id(content): len(content) for content in buffers}.values())
         return buffers
 
     def _in_memory(self, buffers: list[bytes]) -> list[str]:
@@ -159,9 +159,9 @@ class _Narrower:
 
     def _roots(self) -> list[int]:
         scenes = self.tree.get("scenes", [])
-        return (
-            [_count(i) for i in scenes[_count(self.tree.get("scene", 0))].get("nodes", [])] if scenes else []
-        )
+        if not scenes:
+            return []
+        return [_count(i) for i in scenes[_count(self.tree.get("scene", 0))].get("nodes", [])]
 
     def _check_nodes(self) -> None:
         """Refuse nodes that are no tree: they could stand for any number of meshes."""
@@ -178,7 +178,8 @@ class _Narrower:
     def _images(self, buffers: list[bytes]) -> list[Json]:
         """The images of base colours, checked; empty ones instead of all others."""
         textures = [_base(material).get("baseColorTexture") for material in self.tree.get("materials", [])]
-        wanted = {_source(self.tree["textures"][_count(t["index"])]) for t in textures if t is not None}
+        wanted = {self._image_row(texture) for texture in textures if texture}
+        views = dict[int, bytes]()  # one copy, however many images share it
         kept: list[Json] = []
         for i, image in enumerate(self.tree.get("images", [])):
             if i not in wanted:
@@ -186,13 +187,15 @@ class _Narrower:
                 continue
             name = f":image {i}"
             if "bufferView" in image:
-                view = self.tree["bufferViews"][_count(image["bufferView"])]
+                row = _count(image["bufferView"])
+                view = self.tree["bufferViews"][row]
                 start = view.get("byteOffset", 0)
-                content = buffers[view["buffer"]][start : start + view["byteLength"]]
+                if row not in views:
+                    views[row] = buffers[view["buffer"]][start : start + view["byteLength"]]
+                content = views[row]
             else:
                 content = self.beside.uri_content(image["uri"])
-            label = str(image["uri"]) if not str(image.get("uri", DATA_URI)).startswith(DATA_URI) else str(i)
-            check_image(self.path, ascii(label[:100]), content)
+            check_image(self.path, f"of image {i}", content)
             self.beside.in_memory[name] = content
             kept.append({"uri": name})
         return kept
@@ -210,6 +213,17 @@ class _Narrower:
         if not all(0.0 <= value <= 1.0 for value in (red, green, blue)):
             raise InputError(f"{self.path}: a base colour of {red:g} {green:g} {blue:g}, wanted 0 to 1")
         return Material((red, green, blue), "baseColorTexture" in base)
+
+    def _image_row(self, texture: Json) -> int:
+        """Which image a material's texture shows."""
+        given = self.tree["textures"][_count(texture["index"])]
+        webp = given.get("extensions", {}).get("EXT_texture_webp", {})
+        return _count(webp.get("source", given.get("source")))
+
+    def _kept_material(self, i: int, material: Json) -> Json:
+        texture = _base(material).get("baseColorTexture")
+        base = {"baseColorTexture": {"index": self._image_row(texture)}} if texture else {}
+        return {"name": str(i), "pbrMetallicRoughness": base}
 
     def _primitive(self, primitive: Json) -> Json | None:
         """A primitive with its positions, colours and the uv of its base colour; None for points, lines."""
@@ -261,17 +275,6 @@ def _count(value: object) -> int:
 def _base(material: Json) -> Json:
     base: Json = material.get("pbrMetallicRoughness", {})
     return base
-
-
-def _source(texture: Json) -> int:
-    webp = texture.get("extensions", {}).get("EXT_texture_webp", {})
-    return _count(webp.get("source", texture.get("source")))
-
-
-def _kept_material(i: int, material: Json) -> Json:
-    texture = _base(material).get("baseColorTexture")
-    base = {"baseColorTexture": {"index": _count(texture["index"])}} if texture else {}
-    return {"name": str(i), "pbrMetallicRoughness": base}
 
 
 def _kept_node(node: Json) -> Json:

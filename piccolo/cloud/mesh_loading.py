@@ -91,7 +91,8 @@ def _scene(beside: Beside, content: bytes, kind: str) -> Any:
 def _strict() -> Iterator[None]:
     """Make an error of NumPy's warning that it stopped at what is no number; keep trimesh from printing."""
     logger = logging.getLogger("trimesh")
-    was_disabled, logger.disabled = logger.disabled, True
+    level = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.filterwarnings(
@@ -100,7 +101,7 @@ def _strict() -> Iterator[None]:
         try:
             yield
         finally:
-            logger.disabled = was_disabled
+            logger.setLevel(level)
 
 
 def load_ply(path: Path) -> Loaded:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from .optional import library
 
-MAX_TEXELS = 1 << 28  # 16,384 x 16,384, 1 GiB while it is looked up
+MAX_TEXELS = 1 << 28  # 16,384 x 16,384: 1 GiB while it is looked up, three while it is decoded
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "TGA", "GIF")
 MODES = frozenset({"1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr"})  # 8 bits a channel or less
 
