@@ -306,3 +306,21 @@ def test_flat_triangles_and_nan_vertices_are_left_out_with_a_warning(tmp_path):
 def test_meshes_without_colors_are_refused(tmp_path, options):
     with pytest.raises(InputError, match=r"room\.obj: no colours"):
         open_mesh(write_obj(tmp_path, **options))
+
+
+def test_gltf_images_that_give_no_color_are_passed_over(tmp_path):
+    gltf = textured_gltf()
+    gltf.tree["images"] += [{"uri": "gone.png"}, {"mimeType": "image/ktx2", "uri": "normals.ktx2"}]
+    gltf.tree["textures"] += [{"source": 1}, {"extensions": {"KHR_texture_basisu": {"source": 2}}}]
+    gltf.tree["materials"][0]["normalTexture"] = {"index": 1}
+    gltf.tree["materials"][0]["emissiveTexture"] = {"index": 2}
+    assert_quadrants(whole(open_mesh, gltf.glb(tmp_path / "a.glb")))
+
+
+def test_a_second_set_of_texture_coordinates(tmp_path):
+    gltf = textured_gltf()
+    attributes = gltf.tree["meshes"][0]["primitives"][0]["attributes"]
+    attributes["TEXCOORD_1"] = attributes["TEXCOORD_0"]
+    attributes["TEXCOORD_0"] = gltf.accessor(np.zeros((4, 2), np.float32))
+    gltf.tree["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]["texCoord"] = 1
+    assert_quadrants(whole(open_mesh, gltf.glb(tmp_path / "a.glb")))
