@@ -16,7 +16,7 @@ from piccolo.settings import CloudSettings
 RAW = seeded_cloud(1, num_points=1200)
 RGB = ("red", "green", "blue")
 TRIANGLES = PlyElement.describe(
-    np.array([([0, 1, 2],), ([2, 3, 4],)], dtype=[("vertex_indices", "i4", (3,))]), "face"
+    np.array([([0, 1, 2],), ([2, 3, 4],)], dtype=[("vertex_indices", "i4", (3,))]), "strip"
 )
 
 
@@ -179,7 +179,7 @@ def test_gaussian_splats_are_refused(tmp_path):
 
 
 def test_lists_before_the_vertices_are_refused(tmp_path):
-    with pytest.raises(InputError, match="'face' has the list property 'vertex_indices', wanted vertices"):
+    with pytest.raises(InputError, match="'strip' has the list property 'vertex_indices', wanted vertices"):
         read_cloud(write(tmp_path / "a.ply", TRIANGLES, vertices()))
 
 

@@ -8,6 +8,7 @@ from ..settings import IN_METRES, CloudSettings
 from ..threads import Show, unseen
 from .e57 import E57
 from .las import LAS
+from .mesh import MESH
 from .model import Cloud
 from .npz import NPY, NPZ
 from .pcd import PCD
@@ -20,7 +21,7 @@ from .text import TEXT
 
 __all__ = ["Cloud", "CloudStream", "open_cloud", "read_cloud", "stream_of"]
 
-FORMATS = (PLY, LAS, E57, PCD, PTX, PTS, NPZ, NPY, TEXT)
+FORMATS = (PLY, LAS, E57, PCD, PTX, PTS, NPZ, NPY, MESH, TEXT)
 WANTED = f"wanted a coloured point cloud: {', '.join(f.name for f in FORMATS)}"
 
 

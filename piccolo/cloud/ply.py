@@ -17,6 +17,7 @@ from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 from ..errors import InputError
 from .intensity import INTENSITY_NAMES, OPTION, Measured, in_gray
 from .lines import LineReader
+from .mesh import open_ply_mesh
 from .raw import CHUNK, PLAIN, Format, PointSource, RawCloud, ReadOptions
 from .rows import NOT_A_NUMBER, SPACE, TOO_FEW, TOO_MANY
 from .text import quoted
@@ -67,13 +68,15 @@ class Vertices:
 
 
 def open_ply(path: Path, options: ReadOptions = PLAIN) -> PointSource:
-    """The vertices of a PLY file, binary or ASCII.
+    """The vertices of a PLY file, binary or ASCII; points on its faces if it has any.
 
     Colours are uchar 0-255, ushort 0-65535, or float and double 0-1. Other properties and elements are left
     out. The file's size is held against the header's counts before memory is reserved.
     """
     header = _read_header(path)
     index = _vertex_index(header)
+    if _has_faces(header):
+        return open_ply_mesh(path)
     vertices = Vertices(header, index, _property_names(header, index, options))
     count = header.counts[index]
     if not header.is_ascii:
@@ -81,6 +84,21 @@ def open_ply(path: Path, options: ReadOptions = PLAIN) -> PointSource:
     if len(vertices.names) > 4:
         return PointSource(path, lambda: _read_colored(vertices), count)
     return PointSource(path, in_gray(path, lambda: _read_measured(vertices)), count)
+
+
+def _has_faces(header: Header) -> bool:
+    """True for a mesh; colours whose range trimesh would get wrong are refused."""
+    found = dict(zip((element.name for element in header.elements), header.counts, strict=True))
+    if not found.get("face"):
+        return False
+    for element in header.elements:
+        for prop in element.properties:
+            if prop.name in COLOR_NAMES[0] and prop.val_dtype not in ("u1", "f4", "f8"):
+                raise InputError(
+                    f"{header.path}: '{prop.name}' is of type {prop.val_dtype}, wanted uchar 0-255 or "
+                    "float 0-1 in a mesh"
+                )
+    return True
 
 
 def has_ply_magic(head: bytes) -> bool:

@@ -1,0 +1,326 @@
+import numpy as np
+import pytest
+from meshes import (
+    BLUE,
+    GREEN,
+    QUADRANTS,
+    RED,
+    SQUARE,
+    TRIANGLES,
+    UV_FROM_ABOVE,
+    UV_FROM_BELOW,
+    YELLOW,
+    Gltf,
+    obj_text,
+    png,
+    textured_gltf,
+    write_obj,
+    write_ply,
+)
+from PIL import Image
+from scipy.spatial.transform import Rotation
+from test_cloud_order import whole
+
+from piccolo.cloud import mesh as mesh_module
+from piccolo.cloud import mesh_sampling, read_cloud
+from piccolo.cloud.mesh import open_mesh
+from piccolo.cloud.mesh_sampling import decoded, encoded, look_up, weights_of
+from piccolo.cloud.ply import open_ply
+from piccolo.errors import InputError
+
+CORNER_COLORS = np.array([[0, 0, 40], [255, 0, 40], [255, 255, 40], [0, 255, 40]], np.uint8)
+CORNERS = {RED: (0, 1), GREEN: (1, 1), BLUE: (0, 0), YELLOW: (1, 0)}  # of the square's x and y
+
+
+def assert_quadrants(raw, tolerance=0):
+    """Each quadrant of the texture lies on its own corner of the square."""
+    assert len(raw.colors) == 10_000
+    is_clear = np.all(np.abs(raw.points_world[:, :2] - 0.5) > 1e-6, axis=1)  # of the borders within
+    raw = type(raw)(raw.points_world[is_clear], raw.colors[is_clear])
+    quadrant = (raw.points_world[:, :2] > 0.5).astype(int)
+    for color, corner in CORNERS.items():
+        found = raw.colors[np.all(quadrant == corner, axis=1)].astype(int)
+        assert len(found) == pytest.approx(2500, rel=0.02)
+        np.testing.assert_allclose(found, np.broadcast_to(color, found.shape), atol=tolerance)
+
+
+def test_an_obj_texture_stands_upright(tmp_path):
+    assert_quadrants(whole(open_mesh, write_obj(tmp_path)))
+
+
+@pytest.mark.parametrize("kind", ["glb", "gltf", "buffer beside"])
+def test_a_gltf_texture_stands_upright(tmp_path, kind):
+    gltf = textured_gltf()
+    if kind == "glb":
+        path = gltf.glb(tmp_path / "a.glb")
+    else:
+        path = gltf.gltf(tmp_path / "a.gltf", "a b.bin" if kind == "buffer beside" else None)
+    assert_quadrants(whole(open_mesh, path))
+
+
+def test_a_glb_by_trimesh_stands_upright(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    image = Image.fromarray(QUADRANTS)
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=image)
+    visual = trimesh.visual.TextureVisuals(uv=UV_FROM_BELOW, material=material)
+    trimesh.Trimesh(SQUARE, TRIANGLES, visual=visual, process=False).export(tmp_path / "a.glb")
+    assert_quadrants(whole(open_mesh, tmp_path / "a.glb"))
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_a_ply_texture_stands_upright(tmp_path, text):
+    (tmp_path / "wall.png").write_bytes(png())
+    options = {"text": text, "comments": ["TextureFile wall.png"]}
+    path = write_ply(tmp_path / "a.ply", uv=UV_FROM_BELOW, options=options)
+    assert_quadrants(whole(open_ply, path))
+
+
+def test_images_in_other_encodings(tmp_path):
+    path = write_obj(tmp_path, texture=png(format="JPEG", quality=100, subsampling=0))
+    assert_quadrants(whole(open_mesh, path), tolerance=12)
+    image = Image.open(tmp_path / "wall.png")
+    image.quantize(8).save(tmp_path / "wall.png", "PNG")
+    assert_quadrants(whole(open_mesh, path), tolerance=12)
+
+
+@pytest.mark.parametrize("shift", [(1, 0), (-3, 2), (0, -1)])
+def test_textures_repeat(tmp_path, shift):
+    uv = UV_FROM_BELOW + np.array(shift)
+    assert_quadrants(whole(open_mesh, write_obj(tmp_path, uv=uv)))
+    gltf = Gltf()
+    gltf.node(mesh=gltf.mesh(uv=UV_FROM_ABOVE + np.array(shift), material=gltf.material(png())))
+    assert_quadrants(whole(open_mesh, gltf.glb(tmp_path / "a.glb")))
+
+
+def test_look_up_against_texels_named_by_their_place():
+    texels = np.arange(3 * 5 * 4, dtype=np.uint8).reshape(3, 5, 4)
+    for row in range(3):
+        for column in range(5):
+            uv = np.array([[(column + 0.5) / 5 + 7, 1 - (row + 0.5) / 3 - 4]])
+            np.testing.assert_array_equal(look_up(texels, uv)[0], texels[row, column])
+    assert look_up(texels, np.array([[-1e-18, 1e-18]])).shape == (1, 4)
+
+
+def test_several_materials_and_quads(tmp_path):
+    mtl = "newmtl wall\nmap_Kd wall.png\nnewmtl door\nKd 0.2 0.4 0.6\n"
+    path = write_obj(tmp_path, mtl=mtl, triangles=np.array([[0, 1, 2, 3]]))
+    text = path.read_text() + "".join(f"v {x} {y} 1\n" for x, y, _ in SQUARE.tolist())
+    path.write_text(text + "usemtl door\nf 5 6 7 8\n")
+    raw = whole(open_mesh, path)
+    is_door = raw.points_world[:, 2] > 0.5
+    assert np.unique(raw.colors[is_door], axis=0).tolist() == [[51, 102, 153]]
+    assert np.count_nonzero(is_door) == 10_000
+    assert_quadrants(type(raw)(raw.points_world[~is_door], raw.colors[~is_door]))
+
+
+def test_gltf_nodes_turn_shift_and_scale(tmp_path):
+    rotation = Rotation.from_euler("xyz", [20, -35, 110], degrees=True)
+    inner = np.eye(4)
+    inner[:3, :3] = 0.5 * Rotation.from_rotvec([0.3, 0.9, -0.2]).as_matrix()
+    inner[:3, 3] = [1, -2, 3]
+    gltf = Gltf()
+    mesh = gltf.mesh(material=gltf.material(png()))
+    child = gltf.node(is_root=False, mesh=mesh, matrix=inner.T.reshape(-1).tolist())
+    translation, scale = [4.0, 5.0, -6.0], [2.0, 3.0, 0.5]
+    gltf.node(children=[child], translation=translation, scale=scale, rotation=rotation.as_quat().tolist())
+    raw = whole(open_mesh, gltf.glb(tmp_path / "a.glb"))
+    in_inner = rotation.inv().apply(raw.points_world - translation) / scale
+    in_square = (in_inner - inner[:3, 3]) @ np.linalg.inv(inner[:3, :3]).T
+    is_clear = np.all(np.abs(in_square[:, :2] - 0.5) > 1e-6, axis=1)
+    np.testing.assert_allclose(in_square[:, 2], 0, atol=1e-12)
+    edges = rotation.apply((SQUARE[[1, 3]] @ inner[:3, :3].T) * scale)
+    area = np.linalg.norm(np.cross(*edges))
+    assert len(raw.colors) == pytest.approx(10_000 * area, rel=0.001)
+    for color, corner in CORNERS.items():
+        is_here = is_clear & np.all((in_square[:, :2] > 0.5) == corner, axis=1)
+        assert np.unique(raw.colors[is_here], axis=0).tolist() == [list(color)]
+
+
+def test_a_mesh_placed_twice(tmp_path):
+    gltf = textured_gltf(translation=[0, 0, 5.0])
+    gltf.node(mesh=0, scale=[1, 2, 1])
+    raw = whole(open_mesh, gltf.glb(tmp_path / "a.glb"))
+    near = raw.points_world[:, 2] < 1
+    assert (np.count_nonzero(near), np.count_nonzero(~near)) == (20_000, 10_000)
+
+
+def test_the_order_of_surfaces_is_no_chance(tmp_path):
+    """trimesh gives the nodes of a mesh of several parts random names."""
+    gltf = textured_gltf()
+    primitives = gltf.tree["meshes"][0]["primitives"]
+    for i in range(1, 9):
+        part = gltf.mesh(SQUARE * i / 8, colors=CORNER_COLORS)
+        primitives += gltf.tree["meshes"][part]["primitives"]
+    gltf.node(mesh=0, translation=[0, 0, 3])
+    path = gltf.glb(tmp_path / "a.glb")
+    first = whole(open_mesh, path)
+    for _ in range(5):
+        again = whole(open_mesh, path)
+        assert again.points_world.tobytes() == first.points_world.tobytes()
+        assert again.colors.tobytes() == first.colors.tobytes()
+
+
+def test_density_is_the_same_on_large_and_small_triangles(tmp_path):
+    rng = np.random.default_rng(3)
+    sizes = 10 ** rng.uniform(-3, -0.8, 4000)
+    corners = rng.uniform(0, 50, (4000, 1, 3)) + sizes[:, None, None] * rng.normal(size=(4000, 3, 3))
+    vertices = np.concatenate([corners.reshape(-1, 3), rng.uniform(size=(12_000, 3))], axis=1)
+    path = tmp_path / "a.obj"
+    triangles = np.arange(12_000).reshape(-1, 3)
+    path.write_text(obj_text(vertices, None, triangles, library="", material=""))
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = 0.5 * np.linalg.norm(normals, axis=1)
+    source = open_mesh(path)
+    raw = whole(open_mesh, path)
+    assert source.num_points == len(raw.colors) == round(10_000 * areas.sum())
+    # the triangles in the file's order: each has its share to within a point
+    shares = np.concatenate([[0], np.cumsum(areas)]) * 10_000
+    first = np.ceil(shares - 0.5).astype(int)
+    for i in range(0, 4000, 37):
+        points = raw.points_world[first[i] + 1 : max(first[i + 1] - 1, 0)]
+        if len(points):
+            plane = (points - corners[i, 0]) @ (normals[i] / np.linalg.norm(normals[i]))
+            np.testing.assert_allclose(plane, 0, atol=1e-9)
+    small = areas < np.median(areas)
+    assert np.diff(first)[small].sum() == pytest.approx(10_000 * areas[small].sum(), rel=0.02)
+
+
+def test_points_leave_no_gaps_and_no_clumps(tmp_path):
+    points = whole(open_mesh, write_obj(tmp_path)).points_world
+    counts = np.histogram2d(points[:, 0], points[:, 1], bins=20)[0]
+    assert abs(counts - 25).max() <= 7  # chance would give +-18
+
+
+def test_weights_are_barycentric_and_uniform():
+    weights = weights_of(np.arange(30_000_000 - 9000, 30_000_000))
+    assert weights.min() >= 0
+    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-15)
+    np.testing.assert_allclose(weights.mean(axis=0), 1 / 3, atol=1e-3)
+
+
+def test_chunks_and_readings_change_no_bit(tmp_path, monkeypatch):
+    path = write_obj(tmp_path)
+    source = open_mesh(path)
+    first = [raw.points_world for raw in source.read_chunks()]
+    monkeypatch.setattr(mesh_sampling, "CHUNK", 777)
+    again = [raw.points_world for raw in source.read_chunks()]
+    assert (len(first), len(again)) == (1, 13)
+    np.testing.assert_array_equal(np.concatenate(again), first[0])
+
+
+def test_too_many_points_lower_the_density(tmp_path, monkeypatch):
+    monkeypatch.setattr(mesh_module, "MAX_POINTS", 2000)
+    source = open_mesh(write_obj(tmp_path))
+    assert source.num_points == 2000
+    assert "1 square units of surface, sampled with 2e+03 points" in source.warnings[0]
+    assert sum(len(raw.colors) for raw in source.read_chunks()) == 2000
+
+
+def test_texels_of_alpha_0_leave_their_points_out(tmp_path):
+    alpha = np.full((8, 8, 1), 255, np.uint8)
+    alpha[:4, 4:] = 0  # the green ones
+    raw = whole(open_mesh, write_obj(tmp_path, texture=png(np.concatenate([QUADRANTS, alpha], axis=2))))
+    assert len(raw.colors) == pytest.approx(7500, rel=0.02)
+    assert not np.any(np.all(raw.points_world[:, :2] > 0.5, axis=1))
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_ply_vertex_colors_are_interpolated(tmp_path, text):
+    path = write_ply(tmp_path / "a.ply", colors=CORNER_COLORS, options={"text": text})
+    raw = whole(open_ply, path)
+    np.testing.assert_allclose(raw.colors[:, :2], 255 * raw.points_world[:, :2], atol=0.51)
+    assert np.unique(raw.colors[:, 2]).tolist() == [40]
+    assert len(read_cloud(path).colors) == 10_000
+
+
+def test_obj_vertex_colors_come_before_the_material(tmp_path):
+    vertices = np.concatenate([SQUARE, CORNER_COLORS / 255], axis=1)
+    for options in ({"library": "", "material": ""}, {"mtl": "newmtl wall\nKd 1 1 1\n"}):
+        raw = whole(open_mesh, write_obj(tmp_path, vertices=vertices, uv=None, **options))
+        np.testing.assert_allclose(raw.colors[:, :2], 255 * raw.points_world[:, :2], atol=1.01)
+
+
+def test_ply_face_colors(tmp_path):
+    path = write_ply(tmp_path / "a.ply", face_colors=np.array([RED, BLUE], np.uint8))
+    raw = whole(open_ply, path)
+    is_first = raw.points_world[:, 0] > raw.points_world[:, 1]
+    assert np.unique(raw.colors[is_first], axis=0).tolist() == [list(RED)]
+    assert np.unique(raw.colors[~is_first], axis=0).tolist() == [list(BLUE)]
+
+
+@pytest.mark.parametrize("type_", [np.float32, np.uint8, np.uint16])
+@pytest.mark.parametrize("has_material", [False, True])
+def test_gltf_vertex_colors_are_linear_light(tmp_path, type_, has_material):
+    brightest = 1 if type_ == np.float32 else np.iinfo(type_).max
+    gltf = Gltf()
+    colors = np.round(CORNER_COLORS / 255.0, 2) * brightest
+    material = gltf.material() if has_material else None
+    gltf.node(mesh=gltf.mesh(uv=None, colors=colors.astype(type_), material=material))
+    raw = whole(open_mesh, gltf.glb(tmp_path / "a.glb"))
+    x = raw.points_world[:, 0]
+    srgb = np.where(x < 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+    np.testing.assert_allclose(raw.colors[:, 0], 255 * srgb, atol=1)
+
+
+def test_gltf_factors_multiply_in_linear_light(tmp_path):
+    gltf = Gltf()
+    gltf.node(mesh=gltf.mesh(material=gltf.material(png(), (0.5, 1.0, 0.25))))
+    raw = whole(open_mesh, gltf.glb(tmp_path / "a.glb"))
+    red = raw.colors[np.all((raw.points_world[:, :2] > 0.5) == (0, 1), axis=1)]
+    linear = ((250 / 255 + 0.055) / 1.055) ** 2.4 / 2
+    expected = round(255 * (1.055 * linear ** (1 / 2.4) - 0.055))
+    assert np.unique(red[:, 0]).tolist() == [expected]
+    assert np.unique(red[:, 1]).tolist() == [10]
+
+
+def test_srgb_there_and_back():
+    levels = np.arange(256, dtype=np.uint8)
+    np.testing.assert_array_equal(np.rint(255 * encoded(decoded(levels))), levels)
+
+
+def test_surfaces_without_colors_are_left_out_with_a_warning(tmp_path):
+    gltf = textured_gltf()
+    gltf.node(mesh=gltf.mesh(uv=None), translation=[0, 0, 2.0])
+    source = open_mesh(gltf.glb(tmp_path / "a.glb"))
+    assert "1 surfaces without colours left out" in source.warnings[0]
+    assert source.num_points == 10_000
+
+
+def test_flat_triangles_and_nan_vertices_are_left_out_with_a_warning(tmp_path):
+    vertices = np.concatenate([SQUARE, [[np.nan, 0, 0], [0.5, 0, 0]]])
+    triangles = np.concatenate([[[0, 1, 4], [0, 1, 5]], TRIANGLES])
+    uv = np.concatenate([UV_FROM_BELOW, [[0, 0], [0, 0]]])
+    path = write_obj(tmp_path, vertices=vertices, uv=uv, triangles=triangles)
+    assert "2 triangles without an area or with NaN" in open_mesh(path).warnings[0]
+    assert_quadrants(whole(open_mesh, path))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"library": "", "material": "", "mtl": ""},
+        {"mtl": "newmtl wall\nKd 0.2 0.3 0.4\n"},
+        {"material": "unknown"},
+    ],
+)
+def test_meshes_without_colors_are_refused(tmp_path, options):
+    with pytest.raises(InputError, match=r"room\.obj: no colours"):
+        open_mesh(write_obj(tmp_path, **options))
+
+
+def test_gltf_images_that_give_no_color_are_passed_over(tmp_path):
+    gltf = textured_gltf()
+    gltf.tree["images"] += [{"uri": "gone.png"}, {"mimeType": "image/ktx2", "uri": "normals.ktx2"}]
+    gltf.tree["textures"] += [{"source": 1}, {"extensions": {"KHR_texture_basisu": {"source": 2}}}]
+    gltf.tree["materials"][0]["normalTexture"] = {"index": 1}
+    gltf.tree["materials"][0]["emissiveTexture"] = {"index": 2}
+    assert_quadrants(whole(open_mesh, gltf.glb(tmp_path / "a.glb")))
+
+
+def test_a_second_set_of_texture_coordinates(tmp_path):
+    gltf = textured_gltf()
+    attributes = gltf.tree["meshes"][0]["primitives"][0]["attributes"]
+    attributes["TEXCOORD_1"] = attributes["TEXCOORD_0"]
+    attributes["TEXCOORD_0"] = gltf.accessor(np.zeros((4, 2), np.float32))
+    gltf.tree["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]["texCoord"] = 1
+    assert_quadrants(whole(open_mesh, gltf.glb(tmp_path / "a.glb")))
