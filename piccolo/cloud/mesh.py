@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .mesh_glb import has_glb_magic
-from .mesh_gltf import Material
 from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply
 from .mesh_sampling import Floats, Placed, Sampling, Surface
-from .mesh_texture import texture_of
 from .raw import PLAIN, Format, PointSource, ReadOptions
 
 DENSITY = 10_000.0  # points on a square unit, 1 cm apart if the unit is the metre
@@ -92,6 +90,9 @@ def _placed(loaded: Loaded) -> tuple[list[Placed], list[str]]:
         raise InputError(f"{path}: no triangles, {WANTED}")
     if not parts or _is_one_color([part.surface for part in parts]):
         raise InputError(f"{path}: no colours, {WANTED}")
+    # surfaces of one texture next to each other: it is decoded once
+    first = {id(part.surface.texture): i for i, part in reversed(list(enumerate(parts)))}
+    parts.sort(key=lambda part: first[id(part.surface.texture)])
     return parts, [f"{path}: {num_bare} surfaces without colours left out"] if num_bare else []
 
 
@@ -120,10 +121,12 @@ def _surface(loaded: Loaded, mesh: Any) -> Surface | None:
             f"{len(vertices)} vertices"
         )
     if loaded.materials is not None:
-        return _gltf_surface(loaded.path, mesh, vertices, triangles, loaded.materials)
+        return _gltf_surface(loaded, mesh, vertices, triangles)
     material = getattr(mesh.visual, "material", None)
-    uv, texture = getattr(mesh.visual, "uv", None), texture_of(loaded.path, getattr(material, "image", None))
-    if texture is not None and uv is not None:
+    uv, texture = getattr(mesh.visual, "uv", None), loaded.texture(getattr(material, "image", None))
+    if texture is not None:
+        if uv is None:
+            return Surface(vertices, triangles)  # the material's colour would only be multiplied
         uv = _checked_uv(loaded.path, uv, vertices)
         return Surface(vertices, triangles, uv, texture)
     colors, corners = _colors(loaded.path, mesh, triangles)
@@ -140,12 +143,10 @@ def _checked_uv(path: Path, raw: Any, vertices: Floats) -> Floats:
     return uv
 
 
-def _gltf_surface(
-    path: Path, mesh: Any, vertices: Floats, triangles: NDArray[np.int64], materials: list[Material]
-) -> Surface:
-    visual = mesh.visual
+def _gltf_surface(loaded: Loaded, mesh: Any, vertices: Floats, triangles: NDArray[np.int64]) -> Surface:
+    visual, path, materials = mesh.visual, loaded.path, loaded.materials or []
     material = materials[int(visual.material.name)]
-    texture = texture_of(path, visual.material.baseColorTexture)
+    texture = loaded.texture(visual.material.baseColorTexture)
     if material.has_texture and (texture is None or visual.uv is None):
         raise InputError(f"{path}: a texture or its coordinates are missing, {WANTED}")
     raw = visual.vertex_attributes.get("color")
@@ -166,16 +167,14 @@ def _colors(
     path: Path, mesh: Any, triangles: NDArray[np.int64]
 ) -> tuple[Floats, NDArray[np.int64]] | tuple[None, None]:
     """Colours (C, 3) of vertices, faces or the material, and the corners' (T, 3) rows in them."""
-    visual = mesh.visual
-    kind = getattr(visual, "kind", None)
-    of_vertices = visual.vertex_colors if kind == "vertex" else mesh.vertex_attributes.get("color")
+    of_vertices = mesh.vertex_attributes.get("color")
     if of_vertices is not None:
         return _fractions(path, of_vertices, len(mesh.vertices)), triangles
-    of_faces = visual.face_colors if kind == "face" else mesh.face_attributes.get("color")
+    of_faces = mesh.face_attributes.get("color")
     if of_faces is not None:
         rows = np.broadcast_to(np.arange(len(triangles))[:, None], triangles.shape)
         return _fractions(path, of_faces, len(triangles)), rows
-    material: Any = getattr(visual, "material", None)
+    material: Any = getattr(mesh.visual, "material", None)
     if "kd" in getattr(material, "kwargs", {}):
         color = np.array(material.diffuse[:3], dtype=np.float64)[None] / 255.0
         return color, np.broadcast_to(np.int64(0), triangles.shape)

@@ -15,6 +15,7 @@ from .mesh_texture import check_image, first_line
 
 KNOWN_EXTENSIONS = frozenset({"KHR_materials_unlit", "EXT_texture_webp"})  # of those a file may require
 MAX_DEPTH = 200  # nodes below each other: a chain of n costs n^2
+MAX_ROWS = 20_000_000  # vertices and indices of all primitives; more only in a file of more bytes
 MAX_SHARING = 4  # times that a byte may be part of an accessor, on average
 
 BYTES_OF_TYPE = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
@@ -66,6 +67,7 @@ class _Narrower:
     tree: Json
     binary: bytes | None
     num_bytes: int
+    num_rows: int = 0  # of the primitives so far
 
     def narrowed(self) -> Narrowed:
         self._check_extensions()
@@ -248,10 +250,22 @@ class _Narrower:
         if not texture:
             attributes.pop("TEXCOORD_0", None)
         self._check_types(attributes)
+        self._count_rows(attributes, primitive)
         kept = {"mode": mode, "attributes": attributes, "material": row}
         if "indices" in primitive:
             kept["indices"] = _count(primitive["indices"])
         return kept
+
+    def _count_rows(self, attributes: dict[str, int], primitive: Json) -> None:
+        """Refuse attributes of different lengths, and data that primitives share without end."""
+        accessors = self.tree["accessors"]
+        counts = {accessors[row]["count"] for row in attributes.values()}
+        if len(counts) > 1:
+            raise InputError(f"{self.path}: a primitive with {sorted(counts)} rows, wanted as many of each")
+        rows = [_count(primitive["indices"])] if "indices" in primitive else []
+        self.num_rows += sum(counts) + sum(accessors[row]["count"] for row in rows)
+        if self.num_rows > max(MAX_ROWS, self.num_bytes):
+            raise InputError(f"{self.path}: over {MAX_ROWS} vertices and indices in {self.num_bytes} bytes")
 
     def _check_types(self, attributes: dict[str, int]) -> None:
         wanted = {"POSITION": ({FLOAT}, {"VEC3"}), "TEXCOORD_0": ({FLOAT}, {"VEC2"})}
