@@ -106,7 +106,7 @@ def test_trials_of_a_scene_and_what_is_learnt_from_them(scene, tmp_path, capsys)
     assert cases[:2] == ["clean", "black"]
     assert calibrate.main(["--fit", str(out), "--check", str(out)]) == 0
     told = capsys.readouterr().out
-    assert re.search(r"bias -?\d+\.\d+, weights (-?\d+\.\d+, ){4}-?\d+\.\d+", told)
+    assert re.search(r"bias -?\d+\.\d+, weights (-?\d+\.\d+, ){3}-?\d+\.\d+", told)
     assert "| covariance, others | right poses |" in told
     assert calibrate.main(["--fit", str(tmp_path / "none.jsonl")]) == 3
     (tmp_path / "odd.jsonl").write_text("{}")
