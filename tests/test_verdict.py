@@ -29,7 +29,7 @@ def test_right_and_wrong_evidence():
     assert verdict(RIGHT, SURE, True, 0.9) == (LOCALIZED, confidence_of(RIGHT, SURE))
     assert verdict(WRONG, None, True, 0.9)[0] == NOT_LOCALIZED
     assert confidence_of(RIGHT, SURE) > 0.99
-    assert confidence_of(WRONG, None) < 0.05
+    assert confidence_of(WRONG, None) < 0.2
     assert verdict(OF_PAPER, None, True, 0.9)[0] == LOCALIZED
 
 

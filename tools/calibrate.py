@@ -25,8 +25,9 @@ from piccolo.verdict import FEATURES, confidence_of, features_of
 from piccolo.verify import Evidence
 
 EPILOG = """\
-example:
-  python tools/calibrate.py --fit trials.jsonl bench.jsonl --check others.jsonl
+examples:
+  python tools/calibrate.py --fit trials.jsonl --check others.jsonl bench.jsonl
+  python tools/calibrate.py --fit paper.jsonl --without twins hall corridor
 
 Files are those of tools/trials.py. The weights printed go into piccolo/verdict.py; the tables say how the
 confidence in use fares on each set, and what share of the true poses lies in the region of the covariance.
@@ -129,9 +130,11 @@ def main(argv: list[str] | None = None) -> int:
         "--fit", type=Path, nargs="+", default=[], metavar="FILE", help="trials to learn from"
     )
     parser.add_argument("--check", type=Path, nargs="+", default=[], metavar="FILE", help="other trials")
+    parser.add_argument("--without", nargs="+", default=[], metavar="CASE", help="leave these cases out")
     arguments = parser.parse_args(argv)
     try:
         sets = {"learnt from": read_outcomes(arguments.fit), "others": read_outcomes(arguments.check)}
+        sets = {k: [o for o in rows if o.case not in arguments.without] for k, rows in sets.items()}
     except (OSError, InputError, json.JSONDecodeError, KeyError) as error:
         print(f"calibrate.py: {error!r}", file=sys.stderr)
         return 3
