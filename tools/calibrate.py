@@ -20,8 +20,9 @@ from piccolo.certainty import Certainty
 from piccolo.errors import InputError
 from piccolo.pose import Pose, log_so3
 from piccolo.result import Result
+from piccolo.settings import MIN_CONFIDENCE
 from piccolo.truth import is_correct
-from piccolo.verdict import FEATURES, confidence_of, features_of
+from piccolo.verdict import AMBIGUOUS, FEATURES, LOCALIZED, confidence_of, features_of, verdict
 from piccolo.verify import Evidence
 
 EPILOG = """\
@@ -45,6 +46,7 @@ class Outcome:
     case: str
     evidence: Evidence
     certainty: Certainty | None
+    has_rivals: bool
     is_correct: bool
     error: Array  # (6,) of the pose, as Certainty has it; NaN without truth
 
@@ -70,7 +72,7 @@ def outcome_of(trial: dict[str, object]) -> Outcome | None:
         turn = log_so3(true_pose.R_cam_from_world @ result.pose.R_cam_from_world.T)
         error = np.concatenate([turn, true_pose.center_world - result.pose.center_world])
         ok = is_correct(result.pose, true_pose)
-    return Outcome(str(trial["case"]), result.evidence, result.certainty, ok, error)
+    return Outcome(str(trial["case"]), result.evidence, result.certainty, len(result.rivals) > 0, ok, error)
 
 
 def fit(outcomes: Sequence[Outcome]) -> tuple[float, Array]:
@@ -102,9 +104,23 @@ def print_reliability(name: str, outcomes: Sequence[Outcome]) -> None:
         print(f"| {low} to {min(high, 1.0)} | {len(some)} | {right} | {len(some) - right} |")
 
 
+def print_cases(name: str, outcomes: Sequence[Outcome], min_confidence: float) -> None:
+    """What each case is called by the confidence in use."""
+    print(f"\n| case, {name} | poses | right | localized | ambiguous | false |")
+    print("|---|---:|---:|---:|---:|---:|")
+    for case in dict.fromkeys(o.case for o in outcomes):
+        some = [o for o in outcomes if o.case == case]
+        called = [verdict(o.evidence, o.certainty, o.has_rivals, min_confidence)[0] for o in some]
+        false = sum(s == LOCALIZED and not o.is_correct for s, o in zip(called, some, strict=True))
+        counts = sum(o.is_correct for o in some), called.count(LOCALIZED), called.count(AMBIGUOUS), false
+        print(f"| {case} | {len(some)} | {' | '.join(map(str, counts))} |")
+
+
 def print_coverage(name: str, outcomes: Sequence[Outcome]) -> None:
     """What share of right poses has its error in the covariance's 95 % region."""
     some = [o for o in outcomes if o.is_correct and o.certainty is not None]
+    if not some:
+        return
     print(f"\n| covariance, {name} | right poses | in the 95 % region | in the 50 % region |")
     print("|---|---:|---:|---:|")
     for part, rows in (
@@ -144,6 +160,7 @@ def main(argv: list[str] | None = None) -> int:
         print(f"of {', '.join(FEATURES[: len(weights)])}")
     for name, outcomes in sets.items():
         if outcomes:
+            print_cases(name, outcomes, MIN_CONFIDENCE)
             print_reliability(name, outcomes)
             print_coverage(name, outcomes)
     return 0
