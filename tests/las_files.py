@@ -8,10 +8,10 @@ import lazrs
 import numpy as np
 
 SCALES, OFFSETS = np.array([1e-3, 1e-4, 2e-3]), np.array([637_000.0, 5_849_000.0, -100.0])
-PLAIN_SIZE = {2: 26, 3: 34, 5: 63, 7: 36, 8: 38, 10: 67}
+PLAIN_SIZE = {0: 20, 1: 28, 2: 26, 3: 34, 4: 57, 5: 63, 6: 30, 7: 36, 8: 38, 9: 59, 10: 67}
 
 
-def las_bytes(raw, point_format=3, colors=None, withheld=None, extra_bytes=0):
+def las_bytes(raw, point_format=3, colors=None, withheld=None, extra_bytes=0, intensity=None):
     """A LAS file of a cloud; `colors` (N, 3) uint16 default to the cloud's in full 16 bits."""
     header = laspy.LasHeader(point_format=point_format, version="1.4" if point_format > 5 else "1.3")
     header.scales, header.offsets = SCALES, OFFSETS
@@ -20,7 +20,10 @@ def las_bytes(raw, point_format=3, colors=None, withheld=None, extra_bytes=0):
     las = laspy.LasData(header)
     las.x, las.y, las.z = raw.points_world.T
     colors = raw.colors.astype(np.uint16) * 257 if colors is None else colors
-    las.red, las.green, las.blue = colors.T
+    if "red" in header.point_format.dimension_names:
+        las.red, las.green, las.blue = colors.T
+    if intensity is not None:
+        las.intensity = intensity
     if withheld is not None:
         las.withheld = withheld
     content = io.BytesIO()

@@ -2,15 +2,22 @@
 
 import numpy as np
 import pytest
+from e57_files import ScanToWrite
+from e57_files import write as write_e57
+from las_files import OFFSETS, las_bytes, laz_bytes
 from plyfile import PlyData, PlyElement
 from test_cloud_order import seeded_cloud, whole
 
 from piccolo.cloud import open_cloud, read_cloud
+from piccolo.cloud.e57 import open_e57
 from piccolo.cloud.intensity import as_gray, in_gray
+from piccolo.cloud.las import open_las
 from piccolo.cloud.ply import open_ply
-from piccolo.cloud.raw import ReadOptions
+from piccolo.cloud.ptx import open_ptx
+from piccolo.cloud.raw import RawCloud, ReadOptions
 from piccolo.cloud.text import open_text
 from piccolo.errors import InputError
+from piccolo.pose import exp_so3
 from piccolo.settings import CloudSettings
 
 POINTS = seeded_cloud(1, num_points=3000).points_world
@@ -126,3 +133,53 @@ def test_files_without_a_finite_point_are_refused_as_such(tmp_path):
     path = _ply(tmp_path / "a.ply", "intensity", values=np.nan)
     with pytest.raises(InputError, match="all points are black"):
         open_cloud([path], AS_GRAY).read()
+
+
+@pytest.mark.parametrize("point_format", [0, 1, 3, 4, 6, 7, 9])
+@pytest.mark.parametrize("is_compressed", [False, True])
+def test_las(tmp_path, point_format, is_compressed):
+    intensity = _measured(7, "16 bits")
+    raw = RawCloud(np.round(POINTS, 2) + OFFSETS, np.zeros((3000, 3), np.uint8))
+    content = las_bytes(raw, point_format, intensity=intensity.astype(np.uint16))
+    path = tmp_path / "a.las"
+    path.write_bytes(laz_bytes(content, chunk=700) if is_compressed else content)
+    read = whole(open_las, path, GRAY)
+    np.testing.assert_array_equal(read.colors, _in_gray(intensity))
+    np.testing.assert_allclose(read.points_world, raw.points_world, atol=0.002)
+    with pytest.raises(InputError, match=r"has intensity and no colours.*--intensity-as-gray"):
+        read_cloud(path)
+
+
+def test_ptx_at_its_pose_without_beams_that_did_not_return(tmp_path):
+    intensity = _measured(8, "decibels")
+    R = exp_so3(np.array([0.2, -0.4, 1.0]))
+    header = ["3001", "1", "0 0 0", "1 0 0", "0 1 0", "0 0 1"]
+    matrix = [" ".join(map(repr, [*map(float, row), 0.0])) for row in R.T] + ["5.0 6.0 7.0 1.0"]
+    rows = np.column_stack([POINTS, intensity]).tolist()
+    lines = [*header, *matrix, "0 0 0 0.5", *(" ".join(map(repr, row)) for row in rows)]
+    path = tmp_path / "a.ptx"
+    path.write_text("\n".join(lines) + "\n")
+    read = whole(open_ptx, path, GRAY)
+    np.testing.assert_array_equal(read.colors, _in_gray(intensity))
+    np.testing.assert_allclose(read.points_world, POINTS @ R.T + [5.0, 6.0, 7.0], atol=1e-9)
+    with pytest.raises(InputError, match=r"has intensity and no colours.*--intensity-as-gray"):
+        read_cloud(path)
+
+
+def _e57_scan(points, **more):
+    columns = {f"cartesian{axis}": points[:, k] for k, axis in enumerate("XYZ")}
+    return ScanToWrite({**columns, **more}, rotation_wxyz=(0.0, 0.0, 0.0, 1.0), center_world=(1.0, 2.0, 3.0))
+
+
+def test_e57_scans_have_one_gray_for_all(tmp_path):
+    intensity = _measured(9, "decibels")
+    halves = [_e57_scan(POINTS[part], intensity=intensity[part]) for part in (slice(1000), slice(1000, None))]
+    path = write_e57(tmp_path / "a.e57", halves)
+    read = whole(open_e57, path, GRAY)
+    np.testing.assert_array_equal(read.colors, _in_gray(intensity))
+    np.testing.assert_allclose(read.points_world, POINTS * [-1, -1, 1] + [1.0, 2.0, 3.0], atol=1e-9)
+    with pytest.raises(InputError, match=r"has intensity and no colours.*--intensity-as-gray"):
+        read_cloud(path)
+    bare = write_e57(tmp_path / "b.e57", [_e57_scan(POINTS)])
+    with pytest.raises(InputError, match="has no colours, wanted scans with"):
+        open_e57(bare, GRAY)

@@ -138,7 +138,7 @@ def test_infinite_points_are_handed_on_in_silence(tmp_path):
         (3, "1 2", r"line 3 is '1 2', wanted 3 numbers of a scan's header"),
         (8, "0 nan 0 0", r"line 8 is '0 nan 0 0', wanted 4 numbers"),
         (8, "0 1 0 5", r"matrix that ends at line 10 has the last column .*, wanted 0 0 0 1"),
-        (11, "1 2 3 0.5", r"line 11 has x y z intensity, no colours: '1 2 3 0.5'"),
+        (11, "1 2 3 0.5", r"has intensity and no colours, line 11: '1 2 3 0.5'"),
         (12, "1 2 3 0.5", r"line 12 has fewer than 7 columns: '1 2 3 0.5'"),
         (13, "1 2 3 0.5 4 five 6", r"line 13 is not all numbers: '1 2 3 0.5 4 five 6'"),
         (14, "1 2 3 0.5 4 5 256", r"line 14 has the colour 4 5 256, wanted .* colours 0-255"),

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -26,13 +27,15 @@ from .e57_file import (
     scaled,
     text_of,
 )
+from .intensity import OPTION, Measured, in_gray
 from .raw import CHUNK, PLAIN, Format, PointSource, RawCloud, ReadOptions
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 COLORS = ("colorRed", "colorGreen", "colorBlue")
 INVALID = {CARTESIAN: "cartesianInvalidState", SPHERICAL: "sphericalInvalidState"}
-INVALID_COLOR = "isColorInvalid"
+INTENSITY = "intensity"
+INVALID_COLOR, INVALID_INTENSITY = "isColorInvalid", "isIntensityInvalid"
 TOLERANCE = 0.01  # of 255, what a float colour may lie outside of its range
 WANTED = "wanted scans with colorRed colorGreen colorBlue"
 
@@ -47,8 +50,9 @@ class Scan:
     label: str  # for messages
     num_points: int
     coordinates: tuple[str, ...]  # CARTESIAN or SPHERICAL
+    channels: tuple[str, ...]  # COLORS or INTENSITY alone
     invalid: tuple[str, ...]  # fields that are 0 in points that count
-    color_ranges: tuple[tuple[float, float], ...]  # darkest and brightest value of each channel
+    color_ranges: tuple[tuple[float, float], ...]  # of each channel; none: the intensity is read
     placement: Placement | None
 
 
@@ -64,24 +68,35 @@ def open_e57(path: Path, options: ReadOptions = PLAIN) -> PointSource:
     without colours beside others are left out, with a warning.
     """
     with opened(path) as file:
-        elements = children(file.root, "data3D")
-        scans: list[Scan] = []
-        left_out: list[str] = []
-        for index, element in enumerate(elements):
-            label = f"scan {index + 1} of {len(elements)} ({text_of(element, 'name')[:40]!r})"
-            try:
-                scans.append(_scan(file, element, index, label))
-            except _UnusableError as reason:
-                left_out.append(f"{label} {reason}")
-    if not scans:
+        scans, left_out = _scans(file, COLORS)
+        measured, _ = ([], []) if scans else _scans(file, (INTENSITY,))
+    if not scans and not (measured and options.intensity_as_gray):
         found = left_out[0] if left_out else "no scans"
-        raise InputError(f"{path}: {found}, {WANTED}")
-    warnings = tuple(f"{path}: {what}; left out" for what in left_out)
-    num_points = sum(scan.num_points for scan in scans)
-    return PointSource(path, lambda: _read_chunks(path, scans), num_points, warnings)
+        more = f"; {found.split(' (')[0]} has intensity and no colours, {OPTION}" if measured else ""
+        raise InputError(f"{path}: {found}, {WANTED}{more}")
+    warnings = tuple(f"{path}: {what}; left out" for what in (left_out if scans else ()))
+    num_points = sum(scan.num_points for scan in scans or measured)
+    read_chunks = in_gray(path, lambda: _read_measured(path, measured))
+    if scans:
+        read_chunks = partial(_read_chunks, path, scans)
+    return PointSource(path, read_chunks, num_points, warnings)
 
 
-def _scan(file: E57File, element: Element, index: int, label: str) -> Scan:
+def _scans(file: E57File, channels: tuple[str, ...]) -> tuple[list[Scan], list[str]]:
+    """The scans that have the channels, and why others have not."""
+    elements = children(file.root, "data3D")
+    scans: list[Scan] = []
+    left_out: list[str] = []
+    for index, element in enumerate(elements):
+        label = f"scan {index + 1} of {len(elements)} ({text_of(element, 'name')[:40]!r})"
+        try:
+            scans.append(_scan(file, element, channels, index, label))
+        except _UnusableError as reason:
+            left_out.append(f"{label} {reason}")
+    return scans, left_out
+
+
+def _scan(file: E57File, element: Element, channels: tuple[str, ...], index: int, label: str) -> Scan:
     """What is to be read of a scan; _UnusableError if nothing is."""
     points = child(element, "points")
     prototype = child(points, "prototype")
@@ -94,16 +109,20 @@ def _scan(file: E57File, element: Element, index: int, label: str) -> Scan:
     coordinates = next((names for names in (CARTESIAN, SPHERICAL) if fields.keys() >= set(names)), None)
     if coordinates is None:
         raise _UnusableError("has neither cartesian nor spherical coordinates")
-    if not fields.keys() >= set(COLORS):
-        raise _UnusableError("has no colours")
+    if not fields.keys() >= set(channels):
+        raise _UnusableError("has no colours" if channels == COLORS else "has no intensity")
+    invalid = (INVALID[coordinates], INVALID_COLOR if channels == COLORS else INVALID_INTENSITY)
     _check_size(file, label, num_points, prototype)
     return Scan(
         index=index,
         label=label,
         num_points=num_points,
         coordinates=coordinates,
-        invalid=tuple(name for name in (INVALID[coordinates], INVALID_COLOR) if name in fields),
-        color_ranges=tuple(_color_range(file.path, element, fields[name]) for name in COLORS),
+        channels=channels,
+        invalid=tuple(name for name in invalid if name in fields),
+        color_ranges=tuple(
+            _color_range(file.path, element, fields[name]) for name in channels if name != INTENSITY
+        ),
         placement=placement_of(file.path, element),
     )
 
@@ -151,11 +170,24 @@ def _color_range(path: Path, element: Element, field: Element) -> tuple[float, f
 def _read_chunks(path: Path, scans: list[Scan]) -> Iterator[RawCloud]:
     with opened(path) as file:
         for scan in scans:
-            yield from _read_scan(file, scan)
+            for columns in _read_scan(file, scan):
+                with np.errstate(over="ignore", invalid="ignore"):  # broken points may be infinite
+                    cloud = _cloud(path, scan, columns)
+                yield cloud
 
 
-def _read_scan(file: E57File, scan: Scan) -> Iterator[RawCloud]:
-    names = (*scan.coordinates, *COLORS, *scan.invalid)
+def _read_measured(path: Path, scans: list[Scan]) -> Iterator[Measured]:
+    with opened(path) as file:
+        for scan in scans:
+            for columns in _read_scan(file, scan):
+                with np.errstate(over="ignore", invalid="ignore"):
+                    points_world, is_valid = _points(scan, columns)
+                yield points_world, columns[INTENSITY][is_valid]
+
+
+def _read_scan(file: E57File, scan: Scan) -> Iterator[dict[str, Array]]:
+    """The columns of a scan, a chunk at a time, in room that is used again."""
+    names = (*scan.coordinates, *scan.channels, *scan.invalid)
     columns = {name: np.empty(min(scan.num_points, CHUNK)) for name in names}
     num_read = 0
     with refusing(file.path, file.libe57):
@@ -166,9 +198,7 @@ def _read_scan(file: E57File, scan: Scan) -> Iterator[RawCloud]:
         if count == 0:
             break
         num_read += count
-        with np.errstate(over="ignore", invalid="ignore"):  # broken points may be infinite
-            cloud = _cloud(file.path, scan, {name: column[:count] for name, column in columns.items()})
-        yield cloud
+        yield {name: column[:count] for name, column in columns.items()}
     reader.close()
     if num_read != scan.num_points:
         raise InputError(
@@ -185,9 +215,9 @@ def _reader(file: E57File, scan: Scan, columns: dict[str, Array]) -> Any:
     return file.image_file.root()["data3D"][scan.index]["points"].reader(buffers)
 
 
-def _cloud(path: Path, scan: Scan, columns: dict[str, Array]) -> RawCloud:
-    """The points that count, in the world, from the columns of a chunk."""
-    is_valid = np.ones(len(columns[COLORS[0]]), dtype=np.bool_)
+def _points(scan: Scan, columns: dict[str, Array]) -> tuple[Array, NDArray[np.bool_]]:
+    """The points that count (N, 3), in the world, from the columns of a chunk, and which these are."""
+    is_valid = np.ones(len(columns[scan.coordinates[0]]), dtype=np.bool_)
     for name in scan.invalid:
         is_valid &= columns[name] == 0
     a, b, c = (columns[name][is_valid] for name in scan.coordinates)
@@ -196,6 +226,12 @@ def _cloud(path: Path, scan: Scan, columns: dict[str, Array]) -> RawCloud:
     points_world = np.stack([a, b, c], axis=1)
     if scan.placement is not None:
         points_world = points_world @ scan.placement.R_world_from_local.T + scan.placement.center_world
+    return points_world, is_valid
+
+
+def _cloud(path: Path, scan: Scan, columns: dict[str, Array]) -> RawCloud:
+    """The points that count, in the world, and their colours."""
+    points_world, is_valid = _points(scan, columns)
     channels = [
         _channel(path, scan, columns[name][is_valid], *range_)
         for name, range_ in zip(COLORS, scan.color_ranges, strict=True)

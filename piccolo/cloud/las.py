@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from .intensity import OPTION, Measured, in_gray
 from .las_header import WANTED, Header, has_las_magic, read_header
 from .laz import MAX_CHUNK_SIZE, Compression, decompress, read_compression
 from .raw import CHUNK, PLAIN, Format, PointSource, RawCloud, ReadOptions
@@ -35,15 +36,13 @@ def open_las(path: Path, options: ReadOptions = PLAIN) -> PointSource:
 
     Colours are 16-bit, as the format says. They are taken for 8-bit if none of a million points, spread
     evenly over the file, exceeds 255; the source's warnings then say so, and a larger value met later is
-    refused. If all of those points are black, the file has no colours.
+    refused. If all of those points are black, the file has no colours, as in point formats without them.
     """
     header = read_header(path)
     compression = read_compression(header) if header.is_compressed else None
-    brightest, num_samples = _brightest(header, compression)
+    brightest, num_samples = _brightest(header, compression) if header.has_colors else (0, 0)
     if brightest == 0:
-        raise InputError(
-            f"{path}: no colours: red green blue are 0 in all {num_samples} points looked at, {WANTED}"
-        )
+        return _gray_source(header, compression, options, num_samples)
     warnings = []
     if is_8_bit := brightest <= 255:
         warnings.append(
@@ -53,6 +52,19 @@ def open_las(path: Path, options: ReadOptions = PLAIN) -> PointSource:
     return PointSource(
         path, lambda: _read_chunks(header, compression, is_8_bit), header.num_points, tuple(warnings)
     )
+
+
+def _gray_source(
+    header: Header, compression: Compression | None, options: ReadOptions, num_samples: int
+) -> PointSource:
+    """The points with their intensity for a gray, if that is wanted, of a file without colours."""
+    if not options.intensity_as_gray:
+        why = f"red green blue are 0 in all {num_samples} points looked at"
+        if not header.has_colors:
+            why = f"point format {header.point_format} has intensity only"
+        raise InputError(f"{header.path}: has intensity and no colours: {why}, {WANTED}; {OPTION}")
+    read_chunks = in_gray(header.path, lambda: _read_measured(header, compression))
+    return PointSource(header.path, read_chunks, header.num_points)
 
 
 def _runs(header: Header, compression: Compression | None) -> Iterator[Run]:
@@ -126,13 +138,27 @@ def _read_chunks(header: Header, compression: Compression | None, is_8_bit: bool
                 yield _cloud(header, records[first : first + CHUNK], is_8_bit)
 
 
-def _cloud(header: Header, records: Records, is_8_bit: bool) -> RawCloud:
+def _read_measured(header: Header, compression: Compression | None) -> Iterator[Measured]:
+    with header.path.open("rb") as file:
+        for run in _runs(header, compression):
+            records = _load(file, header, compression, run)
+            for first in range(0, len(records), CHUNK):
+                points_world, kept = _points(header, records[first : first + CHUNK])
+                yield points_world, kept["intensity"].astype(np.float64)
+
+
+def _points(header: Header, records: Records) -> tuple[NDArray[np.float64], Records]:
+    """Positions (N, 3) of the records that are not withheld, and these."""
     withheld = WITHHELD_OLD if header.point_format < 6 else WITHHELD
     is_withheld = (records["flags"] & withheld) != 0
     if is_withheld.any():
         records = records[~is_withheld]
     with np.errstate(over="ignore"):  # to infinity, and such points are dropped
-        points_world = records["xyz"] * header.scales + header.offsets
+        return records["xyz"] * header.scales + header.offsets, records
+
+
+def _cloud(header: Header, records: Records, is_8_bit: bool) -> RawCloud:
+    points_world, records = _points(header, records)
     rgb = records["rgb"]
     if not is_8_bit:
         return RawCloud(points_world, TO_8_BIT[rgb])

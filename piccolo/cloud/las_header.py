@@ -16,10 +16,10 @@ from ..errors import InputError
 MAGIC = b"LASF"
 MIN_HEADER_SIZE, MIN_HEADER_SIZE_1_4 = 227, 375  # [byte]
 COMPRESSED_BIT = 0x80  # of the point format
-# Point formats with colours: the least length of a record and where red green blue begin in it [byte].
-COLOR_FORMATS = {2: (26, 20), 3: (34, 28), 5: (63, 28), 7: (36, 30), 8: (38, 30), 10: (67, 30)}
-COLORLESS_FORMATS = frozenset({0, 1, 4, 6, 9})
-FLAGS_BYTE = 15
+# The least length of a record by point format, and where red green blue begin in those that have them [byte].
+RECORD_SIZES = {0: 20, 1: 28, 2: 26, 3: 34, 4: 57, 5: 63, 6: 30, 7: 36, 8: 38, 9: 59, 10: 67}
+COLORS_BYTE = {2: 20, 3: 28, 5: 28, 7: 30, 8: 30, 10: 30}
+INTENSITY_BYTE, FLAGS_BYTE = 12, 15
 WANTED = "wanted LAS or LAZ with red green blue (point format 2, 3, 5, 7, 8 or 10)"
 
 
@@ -42,14 +42,22 @@ class Header:
     @property
     def dtype(self) -> np.dtype[np.void]:
         """The fields that are wanted of a record."""
+        fields = {"xyz": ("3<i4", 0), "intensity": ("<u2", INTENSITY_BYTE), "flags": ("u1", FLAGS_BYTE)}
+        if self.has_colors:
+            fields["rgb"] = ("3<u2", COLORS_BYTE[self.point_format])
         return np.dtype(
             {
-                "names": ["xyz", "flags", "rgb"],
-                "formats": ["3<i4", "u1", "3<u2"],
-                "offsets": [0, FLAGS_BYTE, COLOR_FORMATS[self.point_format][1]],
+                "names": list(fields),
+                "formats": [kind for kind, _ in fields.values()],
+                "offsets": [begin for _, begin in fields.values()],
                 "itemsize": self.record_size,
             }
         )
+
+    @property
+    def has_colors(self) -> bool:
+        """True if the records have fields for colours, whatever is in them."""
+        return self.point_format in COLORS_BYTE
 
 
 def has_las_magic(head: bytes) -> bool:
@@ -58,7 +66,7 @@ def has_las_magic(head: bytes) -> bool:
 
 
 def read_header(path: Path) -> Header:
-    """The header of a LAS or LAZ file; InputError if it is broken, or promises no colours or too much."""
+    """The header of a LAS or LAZ file; InputError if it is broken or promises too much."""
     with path.open("rb") as file:
         head = file.read(MIN_HEADER_SIZE_1_4)
     if not has_las_magic(head) or len(head) < MIN_HEADER_SIZE:
@@ -100,13 +108,9 @@ def read_header(path: Path) -> Header:
 def _check_header(header: Header) -> None:
     """Refuse what no points could make right."""
     path = header.path
-    if header.point_format in COLORLESS_FORMATS:
-        raise InputError(
-            f"{path}: no colours: point format {header.point_format} has intensity only, {WANTED}"
-        )
-    if header.point_format not in COLOR_FORMATS:
+    if header.point_format not in RECORD_SIZES:
         raise InputError(f"{path}: unknown point format {header.point_format}, {WANTED}")
-    least = COLOR_FORMATS[header.point_format][0]
+    least = RECORD_SIZES[header.point_format]
     if header.record_size < least:
         raise InputError(
             f"{path}: records of {header.record_size} bytes, wanted {least} or more in point format "

@@ -31,18 +31,23 @@ POINTWISE_CHUNKED, LAYERED = 2, 3  # compressors
 VARIABLE = 0xFFFFFFFF  # points a chunk, if each says its own
 # The items of a record, (type, size [byte]), by point format; extra bytes may follow.
 ITEMS = {
+    0: ((6, 20),),
+    1: ((6, 20), (7, 8)),
     2: ((6, 20), (8, 6)),
     3: ((6, 20), (7, 8), (8, 6)),
+    4: ((6, 20), (7, 8), (9, 29)),
     5: ((6, 20), (7, 8), (8, 6), (9, 29)),
+    6: ((10, 30),),
     7: ((10, 30), (11, 6)),
     8: ((10, 30), (12, 8)),
+    9: ((10, 30), (13, 29)),
     10: ((10, 30), (12, 8), (13, 29)),
 }
 EXTRA_BYTES = frozenset({0, 14})  # item types
 NUM_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # by item type; extra bytes have one each
 MAX_CHUNK_SIZE = 1 << 29  # [byte] of a chunk's records, for it is decompressed at once; 2 MB are usual
 # What is wanted of formats 6 to 10, where fields can be passed over.
-SELECTED = ("XY_RETURNS_CHANNEL", "Z", "FLAGS", "RGB")
+SELECTED = ("XY_RETURNS_CHANNEL", "Z", "INTENSITY", "FLAGS", "RGB")
 
 BROKEN = "the file is cut off or broken"
 

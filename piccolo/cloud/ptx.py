@@ -7,6 +7,7 @@ row vectors: [x y z 1]_world = [x y z 1] @ matrix. Then a line x y z intensity r
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from . import raw
+from .intensity import OPTION, Measured, in_gray
 from .raw import PLAIN, Format, PointSource, RawCloud, ReadOptions
 from .scan_lines import TextLines, mapped
 from .text import quoted
@@ -22,6 +24,7 @@ NUMBERS_A_LINE = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
 MAX_COUNT_DIGITS = 9
 TARGETS = np.array([0, 1, 2, -1, 3, 4, 5])  # x y z intensity r g b
 AFFINE = (0.0, 0.0, 0.0, 1.0)  # the matrix' last column
+NUM_WITH_INTENSITY = 4  # columns: x y z intensity
 WANTED = "wanted a PTX file with lines x y z intensity r g b, colours 0-255"
 
 
@@ -43,11 +46,12 @@ def open_ptx(path: Path, options: ReadOptions = PLAIN) -> PointSource:
     lines = TextLines(path, mapped(path), WANTED)
     scans: list[Scan] = []
     warnings: list[str] = []
+    has_colors = True
     while (header := _take_header(lines)) is not None:
         count, matrix = header
         begin = lines.copy()
         if not scans:
-            _check_has_colors(begin.copy())
+            has_colors = _has_colors(begin.copy(), options)
         found = lines.skip_points(count)
         if found < count:
             found -= bool(found) and lines.data[-1] not in b"\r\n"
@@ -56,9 +60,11 @@ def open_ptx(path: Path, options: ReadOptions = PLAIN) -> PointSource:
                 f"{found}; the file may be cut off"
             )
         scans.append(Scan(begin, found, matrix))
-    return PointSource(
-        path, lambda: _read_chunks(scans), sum(scan.num_points for scan in scans), tuple(warnings)
-    )
+    num_points = sum(scan.num_points for scan in scans)
+    read_chunks = in_gray(path, lambda: _read_measured(scans))
+    if has_colors:
+        read_chunks = partial(_read_chunks, scans)
+    return PointSource(path, read_chunks, num_points, tuple(warnings))
 
 
 def has_ptx_magic(head: bytes) -> bool:
@@ -102,12 +108,27 @@ def _numbers(line: bytes, num_wanted: int) -> list[float] | None:
     return values if len(values) == num_wanted and all(map(math.isfinite, values)) else None
 
 
-def _check_has_colors(lines: TextLines) -> None:
+def _has_colors(lines: TextLines, options: ReadOptions) -> bool:
+    """False if the next line is x y z intensity, and that is welcome."""
     line = lines.take_line() or b""
-    if len(line.split()) == 4:
+    if len(line.split()) == NUM_WITH_INTENSITY and not options.intensity_as_gray:
         raise InputError(
-            f"{lines.path}: line {lines.num_lines} has x y z intensity, no colours: {quoted(line)}, {WANTED}"
+            f"{lines.path}: has intensity and no colours, line {lines.num_lines}: {quoted(line)}, {WANTED}; "
+            f"{OPTION}"
         )
+    return len(line.split()) != NUM_WITH_INTENSITY
+
+
+def _read_measured(scans: list[Scan]) -> Iterator[Measured]:
+    for scan in scans:
+        lines = scan.lines.copy()
+        num_left = scan.num_points
+        while num_left:
+            rows = np.empty((min(num_left, raw.CHUNK), NUM_WITH_INTENSITY))
+            rows = rows[: lines.take_rows(np.arange(NUM_WITH_INTENSITY), False, rows)]
+            num_left -= len(rows)
+            rows = rows[np.any(rows[:, :3] != 0.0, axis=1)]
+            yield _in_world(rows[:, :3], scan.matrix), rows[:, 3].copy()
 
 
 def _read_chunks(scans: list[Scan]) -> Iterator[RawCloud]:
