@@ -29,7 +29,9 @@ def test_upright_camera_is_found(seed, variant):
     distance, angle_deg = errors(found.pose, query(seed, variant).pose)
     assert distance < 0.05
     assert angle_deg < 1.0
-    assert found.status == "localized"
+    assert found.confidence > 0.5
+    # furniture that has moved costs a sixth of the confidence, and the line is at 0.9
+    assert found.status == ("not_localized" if variant == "change" else "localized")
     assert set(watch.seconds) == {"search", "refine"}
 
 
