@@ -22,7 +22,7 @@ from piccolo.pose import Pose, log_so3
 from piccolo.result import Result
 from piccolo.settings import MIN_CONFIDENCE
 from piccolo.truth import is_correct
-from piccolo.verdict import AMBIGUOUS, FEATURES, LOCALIZED, confidence_of, features_of, verdict
+from piccolo.verdict import AMBIGUOUS, DIRECTIONS, FEATURES, LOCALIZED, confidence_of, features_of, verdict
 from piccolo.verify import Evidence
 
 EPILOG = """\
@@ -89,7 +89,8 @@ def fit(outcomes: Sequence[Outcome]) -> tuple[float, Array]:
         gradient = Z.T @ (p - y) + PENALTY * np.r_[0.0, w[1:]]
         return float(np.logaddexp(0.0, logit).sum() - y @ logit + 0.5 * PENALTY * w[1:] @ w[1:]), gradient
 
-    w = minimize(loss, np.zeros(Z.shape[1]), jac=True, method="L-BFGS-B").x
+    ranges = [(0.0, None) if sign > 0 else (None, 0.0) for sign in DIRECTIONS[: X.shape[1]]]
+    w = minimize(loss, np.zeros(Z.shape[1]), jac=True, method="L-BFGS-B", bounds=[(None, None), *ranges]).x
     weights = w[1:] / deviation
     return float(w[0] - weights @ mean), weights
 
