@@ -105,9 +105,10 @@ def test_deviations_are_of_the_size_of_the_errors():
 def test_halves_agree_at_the_right_pose_only(found):
     look, pose, _ = found
     assert disagreement_of_halves(look, points_at(look, pose), pose)[0] < 0.02
-    assert has_bottom(look, pose)
+    assert has_bottom(look, pose, 0.8)
+    assert has_bottom(look, pose, 0.0)
     wrong = Pose(exp_so3(np.array([0.0, 0.0, 2.0])) @ pose.R_cam_from_world, pose.center_world)
-    assert not has_bottom(look, wrong)
+    assert not has_bottom(look, wrong, 0.8)
 
 
 @pytest.mark.parametrize("kind", KINDS)

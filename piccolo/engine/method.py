@@ -40,7 +40,6 @@ class Found:
 
     best: Hypothesis
     rivals: tuple[Hypothesis, ...]
-    credible: tuple[Hypothesis, ...] = ()  # of the rivals, those at which the loss has a bottom too
 
     @property
     def margin(self) -> float:
@@ -53,14 +52,9 @@ class Found:
         return self.best.score >= SURE_SCORE and self.margin >= SURE_MARGIN
 
     @property
-    def rival_share(self) -> float:
-        """Score of the best credible rival, as a share of the best score."""
-        return max([0.0, *(h.score for h in self.credible)]) / max(self.best.score, 1e-9)
-
-    def reported(self) -> list[Hypothesis]:
-        """The rivals for the user: the credible ones first."""
-        others = [h for h in self.rivals if not any(h is c for c in self.credible)]
-        return [*self.credible, *others][:MAX_RIVALS]
+    def near(self) -> list[Hypothesis]:
+        """The rivals that come near the best."""
+        return [h for h in self.rivals if h.score > NEAR_SHARE * self.best.score]
 
 
 def find(look: Look, gravity: Gravity, watch: Stopwatch) -> Found:
@@ -75,14 +69,10 @@ def find(look: Look, gravity: Gravity, watch: Stopwatch) -> Found:
 
 def challenged(look: Look, found: Found) -> Found:
     """The same, with the rivals that come near the best refined as carefully; the better of them wins."""
-    num_near = sum(h.score > NEAR_SHARE * found.best.score for h in found.rivals)
-    near, far = found.rivals[:num_near], found.rivals[num_near:]
+    near, far = found.near, found.rivals[len(found.near) :]
     finished = list(look.workers.each(lambda h: look.finish(look.polish(h)), near, "descend"))
     best, *others = sorted([found.best, *finished, *far], key=lambda h: -h.score)
-    rivals = rivals_of(best.pose, others, count=MAX_CHALLENGERS)
-    near = tuple(h for h in rivals if h.score > NEAR_SHARE * best.score)
-    credible = look.workers.each(lambda h: has_bottom(look, h.pose), near, "descend")
-    return Found(best, tuple(rivals), tuple(h for h, yes in zip(near, credible, strict=True) if yes))
+    return Found(best, tuple(rivals_of(best.pose, others, count=MAX_CHALLENGERS)))
 
 
 def best_found(look: Look, watch: Stopwatch) -> Found:
@@ -137,17 +127,21 @@ def judged(look: Look, panorama: Panorama, found: Found) -> Localization:
     points = points_at(look, pose)
     distance, angle = disagreement_of_halves(look, points, pose)
     evidence = evidence_at(scan_map.coarse_points, panorama, pose)
-    near = [h for h in found.rivals if h.score > NEAR_SHARE * found.best.score]
-    agreements = [evidence_at(scan_map.coarse_points, panorama, h.pose).agreement for h in near]
+    agreements = [evidence_at(scan_map.coarse_points, panorama, h.pose).agreement for h in found.near]
+    is_credible = [
+        has_bottom(look, h.pose, agreement) for h, agreement in zip(found.near, agreements, strict=True)
+    ]
+    credible = [h for h, yes in zip(found.near, is_credible, strict=True) if yes]
     evidence = replace(
         evidence,
         score=found.best.score,
-        rival_share=found.rival_share,
+        rival_share=max([0.0, *(h.score for h in credible)]) / max(found.best.score, 1e-9),
         margin=min([found.margin, *(evidence.agreement - a for a in agreements)]),
         halves_distance=distance,
         halves_angle=angle,
     )
     certainty = certainty_at(look, points, pose)
     status, confidence = verdict(evidence, certainty, len(found.rivals) > 0, settings.min_confidence)
-    rivals = tuple(Hypothesis(scan_map.to_world(h.pose), h.score) for h in found.reported())
+    reported = [*credible, *(h for h in found.rivals if not any(h is c for c in credible))][:MAX_RIVALS]
+    rivals = tuple(Hypothesis(scan_map.to_world(h.pose), h.score) for h in reported)
     return Localization(status, confidence, scan_map.to_world(pose), loss, evidence, rivals, certainty)
