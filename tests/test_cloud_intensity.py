@@ -183,3 +183,23 @@ def test_e57_scans_have_one_gray_for_all(tmp_path):
     bare = write_e57(tmp_path / "b.e57", [_e57_scan(POINTS)])
     with pytest.raises(InputError, match="has no colours, wanted scans with"):
         open_e57(bare, GRAY)
+
+
+def test_e57_scans_without_intensity_are_named(tmp_path):
+    intensity = _measured(9, "decibels")
+    scans = [_e57_scan(POINTS[:1000]), _e57_scan(POINTS[1000:], intensity=intensity[1000:])]
+    path = write_e57(tmp_path / "a.e57", scans)
+    with pytest.raises(InputError, match=r"scan 2 of 2 .* has intensity and no colours"):
+        open_e57(path)
+    source = open_e57(path, GRAY)
+    assert len(source.warnings) == 1
+    assert "scan 1 of 2 ('a scan') has no intensity; left out" in source.warnings[0]
+    assert sum(len(chunk.colors) for chunk in source.read_chunks()) == 2000
+
+
+def test_ptx_scan_with_colors_after_one_without_is_refused(tmp_path):
+    header = ["1", "1", "0 0 0", "1 0 0", "0 1 0", "0 0 1", "1 0 0 0", "0 1 0 0", "0 0 1 0", "0 0 0 1"]
+    path = tmp_path / "a.ptx"
+    path.write_text("\n".join([*header, "1 2 3 0.5", *header, "1 2 3 0.5 10 20 30"]) + "\n")
+    with pytest.raises(InputError, match="has more than 4 columns"):
+        whole(open_ptx, path, GRAY)

@@ -69,12 +69,12 @@ def open_e57(path: Path, options: ReadOptions = PLAIN) -> PointSource:
     """
     with opened(path) as file:
         scans, left_out = _scans(file, COLORS)
-        measured, _ = ([], []) if scans else _scans(file, (INTENSITY,))
+        measured, not_measured = ([], []) if scans else _scans(file, (INTENSITY,))
     if not scans and not (measured and options.intensity_as_gray):
         found = left_out[0] if left_out else "no scans"
-        more = f"; {found.split(' (')[0]} has intensity and no colours, {OPTION}" if measured else ""
+        more = f"; {measured[0].label} has intensity and no colours, {OPTION}" if measured else ""
         raise InputError(f"{path}: {found}, {WANTED}{more}")
-    warnings = tuple(f"{path}: {what}; left out" for what in (left_out if scans else ()))
+    warnings = tuple(f"{path}: {what}; left out" for what in (left_out if scans else not_measured))
     num_points = sum(scan.num_points for scan in scans or measured)
     read_chunks = in_gray(path, lambda: _read_measured(path, measured))
     if scans:
@@ -111,6 +111,8 @@ def _scan(file: E57File, element: Element, channels: tuple[str, ...], index: int
         raise _UnusableError("has neither cartesian nor spherical coordinates")
     if not fields.keys() >= set(channels):
         raise _UnusableError("has no colours" if channels == COLORS else "has no intensity")
+    if channels != COLORS and fields.keys() >= set(COLORS):
+        raise _UnusableError("has colours, but without a range")
     invalid = (INVALID[coordinates], INVALID_COLOR if channels == COLORS else INVALID_INTENSITY)
     _check_size(file, label, num_points, prototype)
     return Scan(

@@ -125,7 +125,7 @@ def _read_measured(scans: list[Scan]) -> Iterator[Measured]:
         num_left = scan.num_points
         while num_left:
             rows = np.empty((min(num_left, raw.CHUNK), NUM_WITH_INTENSITY))
-            rows = rows[: lines.take_rows(np.arange(NUM_WITH_INTENSITY), False, rows)]
+            rows = rows[: lines.take_rows(np.arange(NUM_WITH_INTENSITY), True, rows)]
             num_left -= len(rows)
             rows = rows[np.any(rows[:, :3] != 0.0, axis=1)]
             yield _in_world(rows[:, :3], scan.matrix), rows[:, 3].copy()
