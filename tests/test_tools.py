@@ -10,7 +10,7 @@ import pytest
 from piccolo.errors import InputError
 from piccolo.pose import Pose, exp_so3
 from piccolo.truth import is_correct, pose_errors, read_truth
-from tools import ablation, benchmark, calibrate, evaluate, growth, make_room, trials
+from tools import ablation, benchmark, calibrate, evaluate, fuzz_readers, growth, make_room, trials
 
 
 @pytest.fixture(scope="module")
@@ -128,3 +128,20 @@ def test_risk_over_coverage():
         (0.5, 1.0, 1),
     ]
     assert points[-1].risk == 0.25
+
+
+def test_fuzzing_finds_nothing_in_a_second_and_knows_every_format(tmp_path, capsys):
+    assert {"ply", "las", "e57", "pcd", "npz", "panorama", "map"} <= set(fuzz_readers.READERS)
+    found = tmp_path / "found"
+    assert fuzz_readers.main(["--reader", "truth", "--seconds", "1", "--crashes", str(found)]) == 0
+    assert re.search(r"truth: \d+ inputs, ok", capsys.readouterr().out)
+    assert list(found.iterdir()) == []
+    with pytest.raises(SystemExit):
+        fuzz_readers.main(["--reader", "doc", "--crashes", str(found)])
+
+
+def test_a_reader_that_breaks_is_found(tmp_path, monkeypatch):
+    (tmp_path / "a").write_bytes(b"")
+    monkeypatch.setitem(fuzz_readers.READERS, "truth", ((".json",), lambda path: 1 // 0))
+    with pytest.raises(ZeroDivisionError):
+        fuzz_readers.try_file("truth", tmp_path / "a")

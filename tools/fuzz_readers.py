@@ -1,0 +1,145 @@
+#!/usr/bin/env python3
+"""Fuzz the readers for a given time: coverage-guided mutations of small files, by atheris."""
+
+import argparse
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from types import FunctionType
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from piccolo.cloud import FORMATS
+from piccolo.cloud.raw import PLAIN, Format
+from piccolo.engine.map_file import load_map
+from piccolo.errors import InputError
+from piccolo.panorama import read_panorama
+from piccolo.result import Result
+from piccolo.truth import read_truth
+
+EPILOG = """\
+examples:
+  python tools/fuzz_readers.py --seconds 60 --crashes found
+  python tools/fuzz_readers.py --reader las --seconds 3600 --corpus samples --crashes found
+
+Each reader gets the files of --corpus that end as its formats do, or one of a few bytes, and mutations of
+them. A good result or an InputError is right; anything else, over 20 s or over 2 GB is a finding: the file
+is kept in --crashes, named after its reader. atheris: pip install atheris.
+exit codes: 0 nothing found, 1 something, 2 wrong usage, 3 bad input, 130 interrupted.
+"""
+TIMEOUT_S, MEMORY_MB, MAX_SIZE = 20, 2048, 1 << 16
+
+
+def read_format(form: Format) -> Callable[[Path], object]:
+    """Reads all chunks of a file by one format's reader."""
+
+    def read(path: Path) -> object:
+        return [len(chunk.colors) for chunk in form.open_source(path, PLAIN).read_chunks()]
+
+    return read
+
+
+def named(form: Format) -> str:
+    """A format's name on the command line."""
+    return min(form.suffixes, key=len).removeprefix(".")
+
+
+READERS: dict[str, tuple[tuple[str, ...], Callable[[Path], object]]] = {
+    **{named(form): (tuple(sorted(form.suffixes)), read_format(form)) for form in FORMATS},
+    "panorama": ((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp"), read_panorama),
+    "result": ((".jsonl",), lambda path: Result.from_json(path.read_text())),
+    "truth": ((".json",), read_truth),
+    "map": ((".map", ".npz"), load_map),
+}
+
+
+def try_file(name: str, path: Path) -> None:
+    """Read a file; errors that users are meant to see pass."""
+    try:
+        READERS[name][1](path)
+    except (InputError, OSError, UnicodeDecodeError):  # what the command lines catch or turn into one
+        return
+
+
+def readers_functions() -> list[FunctionType]:
+    """The plain functions of the readers' modules; compiled kernels can't be instrumented."""
+    names = [name for name in sorted(sys.modules) if name.startswith(("piccolo.cloud", "piccolo.panorama"))]
+    values = [value for name in names for value in vars(sys.modules[name]).values()]
+    unique = {id(v): v for v in values if isinstance(v, FunctionType) and v.__module__.startswith("piccolo")}
+    return list(unique.values())
+
+
+def fuzz(name: str, flags: list[str]) -> None:
+    """Fuzz in this process, which libFuzzer ends."""
+    import atheris  # noqa: PLC0415  # an optional library
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"a{READERS[name][0][0]}"
+
+        def one(data: bytes) -> None:
+            path.write_bytes(data)
+            try_file(name, path)
+
+        one(b"0")
+        for function in readers_functions():
+            atheris.instrument_func(function)
+        atheris.Setup([sys.argv[0], *flags], one)
+        atheris.Fuzz()
+
+
+def run(name: str, arguments: argparse.Namespace) -> bool:
+    """Fuzz one reader in a process of its own; True if something was found."""
+    suffixes = READERS[name][0]
+    with tempfile.TemporaryDirectory() as corpus:
+        (Path(corpus) / "seed").write_bytes(np.arange(64, dtype=np.uint8).tobytes())
+        for path in sorted(arguments.corpus.rglob("*")) if arguments.corpus else []:
+            if path.suffix.lower() in suffixes and path.stat().st_size <= MAX_SIZE:
+                (Path(corpus) / path.name).write_bytes(path.read_bytes())
+        prefix = arguments.crashes / f"{name}-"
+        command = [sys.executable, __file__, "--inside", name, corpus, f"-artifact_prefix={prefix}"]
+        command += [
+            f"-max_total_time={arguments.seconds}",
+            f"-timeout={TIMEOUT_S}",
+            f"-seed={arguments.seed}",
+        ]
+        command += [f"-rss_limit_mb={MEMORY_MB}", f"-max_len={MAX_SIZE}", "-print_final_stats=1"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    stats = [line for line in done.stderr.splitlines() if "number_of_executed_units" in line]
+    print(f"{name}: {stats[0].split()[-1] if stats else '?'} inputs, {'FOUND' if done.returncode else 'ok'}")
+    if done.returncode:
+        print("\n".join(done.stderr.splitlines()[-25:]), file=sys.stderr)
+    return done.returncode != 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    words = sys.argv[1:] if argv is None else argv
+    if words[:1] == ["--inside"]:
+        fuzz(words[1], words[2:])
+    parser = argparse.ArgumentParser(
+        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--reader", choices=list(READERS), nargs="+", default=list(READERS))
+    parser.add_argument("--seconds", type=int, default=60, help="for each reader (default 60)")
+    parser.add_argument("--seed", type=int, default=1, help="(default 1)")
+    parser.add_argument("--corpus", type=Path, metavar="FOLDER", help="files to begin with")
+    parser.add_argument("--crashes", type=Path, metavar="FOLDER", required=True, help="for what is found")
+    arguments = parser.parse_args(words)
+    try:
+        arguments.crashes.mkdir(parents=True, exist_ok=True)
+        found = [run(name, arguments) for name in arguments.reader]
+    except OSError as error:
+        print(f"fuzz_readers.py: {error}", file=sys.stderr)
+        return 3
+    except KeyboardInterrupt:
+        print("fuzz_readers.py: interrupted", file=sys.stderr)
+        return 130
+    return int(any(found))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
