@@ -8,6 +8,8 @@ from refusals import mutated, read_or_refused
 from test_cloud_order import seeded_cloud
 
 from piccolo.cloud import open_source, raw, read_cloud
+from piccolo.cloud.pts import open_pts
+from piccolo.cloud.ptx import open_ptx
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)
@@ -222,3 +224,10 @@ def test_mutated_pts_raise_nothing_but_input_error(data, tmp_path_factory):
     path.write_bytes(mutated(data.draw, st.integers, content))
     cloud, _ = read_or_refused(read_cloud, path)
     assert cloud is None or 1000 <= len(cloud.points) <= 1202
+
+
+def test_empty_files_are_refused_by_the_readers_themselves(tmp_path):
+    (tmp_path / "a").touch()
+    for reader in (open_ptx, open_pts):
+        with pytest.raises(InputError, match="the file is empty, wanted lines of numbers"):
+            reader(tmp_path / "a")

@@ -45,7 +45,7 @@ def read_format(form: Format) -> Callable[[Path], object]:
 
 def named(form: Format) -> str:
     """A format's name on the command line."""
-    return min(form.suffixes, key=len).removeprefix(".")
+    return min(form.suffixes, key=lambda suffix: (len(suffix), suffix)).removeprefix(".")
 
 
 READERS: dict[str, tuple[tuple[str, ...], Callable[[Path], object]]] = {

@@ -94,5 +94,7 @@ class TextLines:
 
 
 def mapped(path: Path) -> NDArray[np.uint8]:
-    """The bytes of a file, read when they are looked at."""
+    """The bytes of a file, read when they are looked at; no file of size 0 can be mapped."""
+    if path.stat().st_size == 0:
+        raise InputError(f"{path}: the file is empty, wanted lines of numbers")
     return np.asarray(np.memmap(path, dtype=np.uint8, mode="r"))
