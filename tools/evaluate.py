@@ -138,7 +138,12 @@ def risk_png(points: Sequence[Point]) -> bytes:
         inside = [p for p in points if p.confidence >= line]
         if inside:
             axes.plot(100 * inside[-1].coverage, 100 * inside[-1].risk, "o", label=f"confidence {line}")
-    axes.set(xlabel="accepted [%]", ylabel="wrong of the accepted [%]", xlim=(0, 100), ylim=(0, None))
+    axes.set(
+        xlabel="accepted [%]",
+        ylabel="wrong of the accepted [%]",
+        xlim=(0, 100),
+        ylim=(0, max(5.0, 1.1 * max(risk))),
+    )
     axes.grid(alpha=0.3)
     if axes.get_legend_handles_labels()[0]:
         axes.legend()
