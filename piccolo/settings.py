@@ -36,7 +36,7 @@ IN_METRES = CloudSettings()
 def check_confidence(min_confidence: float) -> None:
     """Refuse a line that no confidence can pass or fail."""
     if not 0.0 < min_confidence < 1.0:
-        raise InputError(f"min_confidence: found {min_confidence}, wanted above 0 and below 1")
+        raise InputError(f"--min-confidence: found {min_confidence}, wanted above 0 and below 1")
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from piccolo.cloud import open_cloud, read_cloud
 from piccolo.cloud.e57 import open_e57
 from piccolo.cloud.intensity import as_gray, in_gray
 from piccolo.cloud.las import open_las
+from piccolo.cloud.pcd import open_pcd
 from piccolo.cloud.ply import open_ply
 from piccolo.cloud.ptx import open_ptx
 from piccolo.cloud.raw import RawCloud, ReadOptions
@@ -203,3 +204,19 @@ def test_ptx_scan_with_colors_after_one_without_is_refused(tmp_path):
     path.write_text("\n".join([*header, "1 2 3 0.5", *header, "1 2 3 0.5 10 20 30"]) + "\n")
     with pytest.raises(InputError, match="has more than 4 columns"):
         whole(open_ptx, path, GRAY)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+def test_pcd(tmp_path, encoding):
+    intensity = _measured(11, "decibels").astype(np.float32)
+    table = np.column_stack([POINTS, intensity]).astype("<f4")
+    header = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
+    header += f"WIDTH 3000\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3000\nDATA {encoding}\n"
+    rows = "\n".join(" ".join(map(repr, row)) for row in table.astype(float).tolist()) + "\n"
+    path = tmp_path / "a.pcd"
+    path.write_bytes(header.encode() + (rows.encode() if encoding == "ascii" else table.tobytes()))
+    read = whole(open_pcd, path, GRAY)
+    np.testing.assert_array_equal(read.colors, _in_gray(intensity.astype(float)))
+    np.testing.assert_allclose(read.points_world, table[:, :3], rtol=1e-6)
+    with pytest.raises(InputError, match=r"has intensity and no colours, --intensity-as-gray"):
+        open_pcd(path)

@@ -73,5 +73,5 @@ def test_deviations_beyond_reason_change_nothing_more():
 @pytest.mark.parametrize("settings", [EngineSettings, PaperSettings])
 @pytest.mark.parametrize("value", [0.0, 1.0, -1.0, float("nan")])
 def test_lines_that_mean_nothing_are_refused(settings, value):
-    with pytest.raises(InputError, match=f"min_confidence: found {value}, wanted above 0 and below 1"):
+    with pytest.raises(InputError, match=f"--min-confidence: found {value}, wanted above 0 and below 1"):
         settings(min_confidence=value)

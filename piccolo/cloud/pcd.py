@@ -4,8 +4,10 @@ VIEWPOINT is where the sensor was; the points are already in the cloud's frame, 
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from . import raw
 from .colors import BRIGHTEST, TYPES_WANTED, in_words, to_bytes
+from .intensity import OPTION, in_gray
 from .lzf import MAX_RATIO, decompress_lzf
 from .pcd_header import WANTED, Field, Header, read_header
 from .raw import PLAIN, Format, PointSource, RawCloud, ReadOptions
@@ -23,6 +26,8 @@ FIRST_LINES = re.compile(rb"(?:#[^\n]*\n|[ \t\r\n])*(?:# \.PCD|VERSION[ \t]+0?\.
 PADDING = "_"
 PACKED_NAMES = ("rgb", "rgba")  # 0xAARRGGBB in one number
 PACKED_TYPES = ("f4", "u4", "i4")
+INTENSITY = "intensity"
+INTENSITY_TYPES = ("f4", "f8", "u1", "u2", "u4", "i1", "i2", "i4")
 COLOR_NAMES = (("r", "g", "b"), ("red", "green", "blue"))
 
 
@@ -31,13 +36,17 @@ def open_pcd(path: Path, options: ReadOptions = PLAIN) -> PointSource:
 
     Colours are `rgb` or `rgba`, three bytes in one integer or, if the field is declared a float, in its bits,
     in ASCII too; or r g b (red green blue) of uint8 0-255, uint16 0-65535 or float 0-1. Alpha and all other
-    fields are left out. The file's size is held against the header before memory is reserved.
+    fields are left out. The options may welcome `intensity` in place of colours. The file's size is held
+    against the header before memory is reserved.
     """
     header = read_header(path)
-    fields = _wanted_fields(header)
+    fields = _wanted_fields(header, options)
     read = {"ascii": _read_ascii, "binary": _read_binary, "binary_compressed": _read_compressed}
     _check_size(header)
-    return PointSource(path, lambda: read[header.encoding](header, fields), header.num_points)
+    read_chunks: Callable[[], Iterator[Any]] = partial(read[header.encoding], header, fields)
+    if fields[3].name == INTENSITY:
+        read_chunks = in_gray(path, read_chunks)
+    return PointSource(path, read_chunks, header.num_points)
 
 
 def has_pcd_magic(head: bytes) -> bool:
@@ -45,17 +54,23 @@ def has_pcd_magic(head: bytes) -> bool:
     return FIRST_LINES.match(head) is not None
 
 
-def _wanted_fields(header: Header) -> tuple[Field, ...]:
-    """The fields x y z and the colour's one or three."""
+def _wanted_fields(header: Header, options: ReadOptions) -> tuple[Field, ...]:
+    """The fields x y z and the colour's one or three, or the intensity if that is welcome."""
     found = {field.name: field for field in header.fields if field.count == 1}
     names = [field.name for field in header.fields]
     choices = [*((name,) for name in PACKED_NAMES), *COLOR_NAMES]
     color = next((choice for choice in choices if all(name in found for name in choice)), None)
+    has_intensity = color is None and INTENSITY in found
+    if has_intensity and options.intensity_as_gray:
+        color = (INTENSITY,)
     if not all(names.count(axis) == 1 and axis in found for axis in "xyz") or color is None:
         listed = " ".join(names[:12]) or "none"
-        raise InputError(f"{header.path}: the fields are {quoted(listed.encode())}, {WANTED}")
+        more = f"; has intensity and no colours, {OPTION}" if has_intensity else ""
+        raise InputError(f"{header.path}: the fields are {quoted(listed.encode())}, {WANTED}{more}")
     wanted = tuple(found[name] for name in (*"xyz", *color))
     types = ("f4", "f8"), (PACKED_TYPES if len(color) == 1 else tuple(BRIGHTEST))
+    if color == (INTENSITY,):
+        types = types[0], INTENSITY_TYPES
     for k, field in enumerate(wanted):
         if field.type not in types[k >= 3]:
             kinds = ("float32 or float64", "uint32, int32 or float32" if len(color) == 1 else TYPES_WANTED)
@@ -82,7 +97,7 @@ def _check_size(header: Header) -> None:
         )
 
 
-def _read_ascii(header: Header, fields: tuple[Field, ...]) -> Iterator[RawCloud]:
+def _read_ascii(header: Header, fields: tuple[Field, ...]) -> Iterator[Any]:
     targets = np.full(header.num_columns, -1)
     targets[[field.column for field in fields]] = np.arange(len(fields))
     lines = TextLines(header.path, mapped(header.path), WANTED, header.size, header.num_lines)
@@ -98,6 +113,9 @@ def _read_ascii(header: Header, fields: tuple[Field, ...]) -> Iterator[RawCloud]
             )
         num_left -= num_rows
         points_world, values = rows[:num_rows, :3].copy(), rows[:num_rows, 3:]
+        if fields[3].name == INTENSITY:
+            yield points_world, values[:, 0].copy()
+            continue
         colors, wrong = _colors_of_text(fields[3:], values, points_world)
         if wrong >= 0:
             place = f"line {before.line_number(wrong)}"
@@ -123,7 +141,7 @@ def _colors_of_text(
     return _unpacked(bits), -1 if is_right.all() else int(np.argmin(is_right))
 
 
-def _read_binary(header: Header, fields: tuple[Field, ...]) -> Iterator[RawCloud]:
+def _read_binary(header: Header, fields: tuple[Field, ...]) -> Iterator[Any]:
     if header.num_points == 0:
         return
     dtype = np.dtype(
@@ -139,7 +157,7 @@ def _read_binary(header: Header, fields: tuple[Field, ...]) -> Iterator[RawCloud
     yield from _in_chunks(header, fields, [table[field.name] for field in fields])
 
 
-def _read_compressed(header: Header, fields: tuple[Field, ...]) -> Iterator[RawCloud]:
+def _read_compressed(header: Header, fields: tuple[Field, ...]) -> Iterator[Any]:
     data = mapped(header.path)[header.size :]
     packed_size, size = (int(value) for value in data[:8].view("<u4"))
     kept = [field for field in header.fields if field.name != PADDING]  # PCL leaves padding out
@@ -164,10 +182,14 @@ def _read_compressed(header: Header, fields: tuple[Field, ...]) -> Iterator[RawC
 
 def _in_chunks(
     header: Header, fields: tuple[Field, ...], columns: list[NDArray[np.generic]]
-) -> Iterator[RawCloud]:
+) -> Iterator[Any]:
     for begin in range(0, header.num_points, raw.CHUNK):
         parts = [column[begin : begin + raw.CHUNK] for column in columns]
-        points_world = np.stack(parts[:3], axis=1, dtype=np.float64)
+        with np.errstate(invalid="ignore"):  # a NaN of the kind that signals
+            points_world = np.stack(parts[:3], axis=1, dtype=np.float64)
+        if fields[3].name == INTENSITY:
+            yield points_world, parts[3].astype(np.float64)
+            continue
         if len(fields) == 4:
             yield RawCloud(points_world, _unpacked(np.ascontiguousarray(parts[3]).view(np.uint32)))
             continue
