@@ -5,11 +5,11 @@ import argparse
 import json
 import re
 import sys
-import traceback
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from exit_codes import EXIT_BAD_INPUT, complain, guarded
 from piccolo.cloud.e57_images import E57Image, list_images, read_image
 from piccolo.errors import InputError
 from piccolo.files import write_atomically
@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
             try:
                 row["file"] = str(extract(arguments.e57, index, image, arguments.extract))
             except InputError as error:
-                exit_code = complain(arguments, str(error), 3)
+                exit_code = complain("e57_images.py", arguments.debug, str(error), EXIT_BAD_INPUT)
         print(json.dumps(row, allow_nan=False), flush=True)
     return exit_code
 
@@ -83,22 +83,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--extract", type=Path, metavar="FOLDER", help="write the images here")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
     arguments = parser.parse_args(argv)
-    try:
-        return run(arguments)
-    except KeyboardInterrupt:
-        return complain(arguments, "interrupted", 130)
-    except (OSError, InputError) as error:
-        return complain(arguments, str(error), 3)
-    except Exception as error:  # the last line of defence: a code and one line for the shell
-        return complain(arguments, f"internal error: {error!r}; --debug shows where", 4)
-
-
-def complain(arguments: argparse.Namespace, text: str, exit_code: int) -> int:
-    """One line on stderr, the traceback if --debug; returns the exit code."""
-    if arguments.debug:
-        traceback.print_exc()
-    print(f"e57_images.py: {text}", file=sys.stderr)
-    return exit_code
+    return guarded("e57_images.py", arguments.debug, lambda: run(arguments))
 
 
 if __name__ == "__main__":

@@ -4,12 +4,12 @@
 import argparse
 import json
 import sys
-import traceback
 from collections.abc import Iterable
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from exit_codes import EXIT_BAD_USAGE, complain, guarded
 from piccolo.errors import InputError
 from piccolo.export import FORMATS, Options, Selection, export, read_results, select
 from piccolo.export.axes import CAMERA_AXES
@@ -122,24 +122,13 @@ def main(argv: list[str] | None = None) -> int:
     try:
         options = options_from(arguments)
     except InputError as error:
-        return complain(arguments, str(error), 2)
-    try:
+        return complain("export_poses.py", arguments.debug, str(error), EXIT_BAD_USAGE)
+
+    def export() -> int:
         print(json.dumps(run(arguments, options)))
-    except KeyboardInterrupt:
-        return complain(arguments, "interrupted", 130)
-    except (OSError, InputError) as error:
-        return complain(arguments, str(error), 3)
-    except Exception as error:  # the last line of defence: a code and one line for the shell
-        return complain(arguments, f"internal error: {error!r}; --debug shows where", 4)
-    return 0
+        return 0
 
-
-def complain(arguments: argparse.Namespace, text: str, exit_code: int) -> int:
-    """One line on stderr, the traceback if --debug; returns the exit code."""
-    if arguments.debug:
-        traceback.print_exc()
-    print(f"export_poses.py: {text}", file=sys.stderr)
-    return exit_code
+    return guarded("export_poses.py", arguments.debug, export)
 
 
 if __name__ == "__main__":

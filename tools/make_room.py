@@ -4,7 +4,6 @@
 import argparse
 import json
 import sys
-import traceback
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from exit_codes import guarded
 from piccolo.errors import InputError
 from piccolo.files import write_atomically
 from piccolo.result import CONVENTION
@@ -113,27 +113,14 @@ def main(argv: list[str] | None = None) -> int:
     def show(values: Iterator[Any], total: int | None, label: str) -> Iterator[Any]:
         return iter(tqdm(values, label, total, leave=False, disable=arguments.quiet, file=sys.stderr))
 
-    try:
+    def run() -> int:
         if arguments.panoramas < 0 or arguments.seed < 0:
             raise InputError("--panoramas, --seed: found a negative number, wanted 0 or more")
         world = make_world(arguments.seed, np.array(arguments.size), arguments.rooms)
-        written = write_world(arguments, world, Workers(num_cores(), show))
-    except KeyboardInterrupt:
-        return complain(arguments, "interrupted", 130)
-    except (OSError, InputError) as error:
-        return complain(arguments, str(error), 3)
-    except Exception as error:  # the last line of defence: a code and one line for the shell
-        return complain(arguments, f"internal error: {error!r}; --debug shows where", 4)
-    print(json.dumps(written))
-    return 0
+        print(json.dumps(write_world(arguments, world, Workers(num_cores(), show))))
+        return 0
 
-
-def complain(arguments: argparse.Namespace, text: str, exit_code: int) -> int:
-    """One line on stderr, the traceback if --debug; returns the exit code."""
-    if arguments.debug:
-        traceback.print_exc()
-    print(f"make_room.py: {text}", file=sys.stderr)
-    return exit_code
+    return guarded("make_room.py", arguments.debug, run)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,6 @@
 import argparse
 import json
 import sys
-import traceback
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,8 +13,8 @@ from tqdm import tqdm
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from command_line import add_cloud_options, cloud_settings_from, parse
+from exit_codes import guarded
 from piccolo.engine.map_file import save_map
-from piccolo.errors import InputError
 from piccolo.files import check_output
 from piccolo.pipeline import CachePolicy, open_map
 from piccolo.stopwatch import Stopwatch
@@ -63,23 +62,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
     arguments = parse(parser, argv)
-    try:
+
+    def run() -> int:
         print(json.dumps(prepare(arguments)))
-    except KeyboardInterrupt:
-        return complain(arguments, "interrupted", 130)
-    except (OSError, InputError) as error:
-        return complain(arguments, str(error), 3)
-    except Exception as error:  # the last line of defence: a code and one line for the shell
-        return complain(arguments, f"internal error: {error!r}; --debug shows where", 4)
-    return 0
+        return 0
 
-
-def complain(arguments: argparse.Namespace, text: str, exit_code: int) -> int:
-    """One line on stderr, the traceback if --debug; returns the exit code."""
-    if arguments.debug:
-        traceback.print_exc()
-    tqdm.write(f"prepare_map.py: {text}", file=sys.stderr)
-    return exit_code
+    return guarded("prepare_map.py", arguments.debug, run)
 
 
 if __name__ == "__main__":

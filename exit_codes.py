@@ -1,0 +1,32 @@
+"""How the tools end: what an error says on stderr, and the exit code that a shell script sees."""
+
+import sys
+import traceback
+from collections.abc import Callable
+
+from tqdm import tqdm
+
+from piccolo.errors import InputError
+
+EXIT_BAD_USAGE, EXIT_BAD_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED = 2, 3, 4, 130
+
+
+def complain(program: str, is_debug: bool, text: str, exit_code: int) -> int:
+    """One line on stderr, the traceback of the error at hand if `is_debug`; returns the exit code."""
+    if is_debug:
+        traceback.print_exc()
+    tqdm.write(f"{program}: {text}", file=sys.stderr)
+    return exit_code
+
+
+def guarded(program: str, is_debug: bool, action: Callable[[], int]) -> int:
+    """The exit code of a tool's work, or of the error that ended it."""
+    try:
+        return action()
+    except KeyboardInterrupt:
+        return complain(program, is_debug, "interrupted", EXIT_INTERRUPTED)
+    except (OSError, InputError) as error:
+        return complain(program, is_debug, str(error), EXIT_BAD_INPUT)
+    except Exception as error:  # the last line of defence: a code and one line for the shell
+        text = f"internal error: {error!r}; --debug shows where"
+        return complain(program, is_debug, text, EXIT_INTERNAL)
