@@ -6,7 +6,7 @@ import os
 import sys
 import traceback
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +62,8 @@ class Session:
             png = overlay_png(localizer.points, panorama, localizer.from_world(found.pose))
             write_atomically(self.arguments.overlay, png)
         settings = {"preset": self.arguments.preset, **localizer.settings.to_json()}
+        if self.read_options.labels:
+            settings["labels"] = asdict(self.read_options.labels)
         result = result_of(found, named(self.arguments.cloud), str(pano), watch.seconds, settings)
         for warning in panorama.warnings:
             self.say(f"warning: {warning}")
