@@ -26,9 +26,10 @@ from piccolo.synthetic.world import (
     World,
     check_num_points,
     check_width,
+    make_labels,
     make_query,
     make_world,
-    scan_world,
+    scan_labelled,
 )
 from piccolo.threads import Workers, num_cores
 
@@ -39,7 +40,8 @@ examples:
 
 Writes FOLDER/cloud.ply, FOLDER/images/VARIANT_K.jpg and FOLDER/queries.json with the true poses.
 clean: as scanned; tilt: the camera turned anyhow; photo: other exposure, white balance, gamma, blur, noise;
-change: furniture moved and added. One JSON object on stdout says what was written.
+change: furniture moved and added. With --labels the points have a label too, and each panorama a picture
+of labels, FOLDER/labels/VARIANT_K.png. One JSON object on stdout says what was written.
 exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 
@@ -58,17 +60,24 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--size", type=float, nargs=3, default=[6.0, 5.0, 2.7], metavar=("X", "Y", "Z"),
                         help="of a room [m] (default 6 5 2.7)")  # fmt: skip
     parser.add_argument("--rooms", type=int, default=1, help="side by side, at most 64 (default 1)")
+    text = "label each point and pixel by its kind of surface, for localize.py --labels"
+    parser.add_argument("--labels", action="store_true", help=text)
     parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
     return parser
 
 
-def ply_bytes(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> bytes:
-    """A binary PLY header and vertices of points (N, 3) and colours (N, 3)."""
+def ply_bytes(
+    points: NDArray[np.float32], colors: NDArray[np.uint8], labels: NDArray[np.int64] | None = None
+) -> bytes:
+    """A binary PLY header and vertices of points (N, 3), colours (N, 3) and maybe labels (N,)."""
     fields = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+    fields += [] if labels is None else [("label", "<u2")]
     vertex = np.empty(len(points), dtype=fields)
-    for k, (name, _) in enumerate(fields):
+    for k, (name, _) in enumerate(fields[:6]):
         vertex[name] = points[:, k] if k < 3 else colors[:, k - 3]
+    if labels is not None:
+        vertex["label"] = labels
     header = PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").header
     return bytes(header.encode("ascii") + b"\n" + vertex.tobytes())
 
@@ -88,19 +97,31 @@ def write_query(folder: Path, name: str, query: Query) -> dict[str, object]:
     }
 
 
+def write_labels(folder: Path, name: str, labels: NDArray[np.uint16]) -> str:
+    """Write an image of labels; returns its path in the folder."""
+    image = Path("labels") / f"{name}.png"
+    _, encoded = cv2.imencode(".png", labels)
+    (folder / image).parent.mkdir(exist_ok=True)
+    write_atomically(folder / image, bytes(encoded))
+    return str(image)
+
+
 def write_world(arguments: argparse.Namespace, world: World, workers: Workers) -> dict[str, object]:
     """Write everything and return what was written."""
     folder: Path = arguments.out
     check_num_points(world, arguments.points)
     check_width(arguments.width)
     (folder / "images").mkdir(parents=True, exist_ok=True)
-    points, colors = scan_world(world, arguments.points, workers)
-    write_atomically(folder / "cloud.ply", ply_bytes(points, colors))
-    entries = [
-        write_query(folder, f"{v}_{k}", make_query(world, k, v, arguments.width, workers))
-        for v in dict.fromkeys(arguments.variants)
-        for k in range(arguments.panoramas)
-    ]
+    points, colors, labels = scan_labelled(world, arguments.points, workers)
+    write_atomically(folder / "cloud.ply", ply_bytes(points, colors, labels if arguments.labels else None))
+    entries = []
+    for v in dict.fromkeys(arguments.variants):
+        for k in range(arguments.panoramas):
+            query = make_query(world, k, v, arguments.width, workers)
+            entries.append(write_query(folder, f"{v}_{k}", query))
+            if arguments.labels:
+                image = make_labels(world, k, query, workers)
+                entries[-1]["labels"] = write_labels(folder, f"{v}_{k}", image)
     document = {"cloud": "cloud.ply", "convention": CONVENTION, "queries": entries}
     write_atomically(folder / "queries.json", json.dumps(document, indent=1).encode())
     return {"folder": str(folder), "points": len(points), "queries": len(entries), "seed": arguments.seed}
