@@ -12,7 +12,7 @@ from piccolo.errors import InputError
 from piccolo.evaluation import pictures, tables
 from piccolo.evaluation.compare import changes, pair_up, side_by_side
 from piccolo.evaluation.row import Row, match_results, row_of
-from piccolo.evaluation.run_file import appending, check_settings, read_rows
+from piccolo.evaluation.run_file import appending, read_rows
 from piccolo.evaluation.statistics import PAPER_LIMITS, accuracies, quartiles, risk_and_coverage, summarize
 from piccolo.pose import Pose, exp_so3
 from piccolo.scenes import Query, Scene
@@ -179,11 +179,3 @@ def test_a_run_is_taken_up_after_its_last_whole_line(tmp_path):
     path.write_text("{}\n")
     with pytest.raises(InputError, match=r"run\.jsonl: line 1: evaluation: found"):
         read_rows(path)
-
-
-def test_a_run_of_other_settings_is_not_taken_up(tmp_path):
-    row = _row("a.jpg", 0.0, 0.0)
-    row.result.settings.update(preset="paper", seed=0)
-    check_settings(tmp_path, [row], {"preset": "paper", "seed": 0})
-    with pytest.raises(InputError, match="rows made with preset 'paper', wanted 'default'"):
-        check_settings(tmp_path, [row], {"preset": "default", "seed": 0})

@@ -4,15 +4,12 @@
 import argparse
 import json
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -33,6 +30,7 @@ from piccolo.synthetic.world import (
     scan_labelled,
 )
 from piccolo.threads import Workers, num_cores
+from progress import shown
 
 EPILOG = """\
 examples:
@@ -113,14 +111,11 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     arguments = build_parser().parse_args(argv)
 
-    def show(values: Iterator[Any], total: int | None, label: str) -> Iterator[Any]:
-        return iter(tqdm(values, label, total, leave=False, disable=arguments.quiet, file=sys.stderr))
-
     def run() -> int:
         if arguments.panoramas < 0 or arguments.seed < 0:
             raise InputError("--panoramas, --seed: found a negative number, wanted 0 or more")
         world = make_world(arguments.seed, np.array(arguments.size), arguments.rooms)
-        print(json.dumps(write_world(arguments, world, Workers(num_cores(), show))))
+        print(json.dumps(write_world(arguments, world, Workers(num_cores(), shown(arguments.quiet)))))
         return 0
 
     return guarded("make_room.py", arguments.debug, run)
