@@ -130,14 +130,21 @@ def test_descent_recovers_the_true_pose(solver):
 
 
 @pytest.mark.parametrize("initialization", ["two-stage", "loss-only"])
-def test_camera_is_found(initialization):
+def test_camera_is_found_with_the_same_bits_for_any_number_of_threads(initialization):
     settings = PaperSettings(
-        loss="photometric", initialization=initialization, num_translations=20, max_points=30_000,
-        num_iterations=40, photometric_width=128, num_by_histogram=3,
-    )  # fmt: skip
-    paper_map = prepare(room(1)[1], settings)
-    found = localize(paper_map, as_panorama(query(1).rgb), settings, Workers(2), Stopwatch())
-    assert errors(found.pose, query(1).pose)[0] < 0.1
+        loss="photometric",
+        initialization=initialization,
+        num_translations=20,
+        max_points=30_000,
+        num_iterations=40,
+        photometric_width=128,
+        num_by_histogram=3,
+    )
+    paper_map, panorama = prepare(room(1)[1], settings), as_panorama(query(1).rgb)
+    one, two = (localize(paper_map, panorama, settings, Workers(n), Stopwatch()) for n in (1, 2))
+    assert errors(one.pose, query(1).pose)[0] < 0.1
+    np.testing.assert_array_equal(one.pose.center_world, two.pose.center_world)
+    assert (one.loss, one.evidence) == (two.loss, two.evidence)
 
 
 def test_masked_or_empty_views_have_no_loss():

@@ -18,7 +18,7 @@ from ..panorama import Panorama
 from ..pose import Pose
 from ..refine import Equations, Loss
 from ..render import View, render_view
-from ..sphere import pixel_rays
+from ..sphere import pixel_rays, ray_jacobian
 
 Image = NDArray[np.float32]
 
@@ -96,14 +96,7 @@ def view_gradient(view: View) -> tuple[Image, Image]:
 def _unit_motion(width: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Derivatives (H, W, 6) of u and v by a step, of what is 1 m off at each pixel's centre."""
     rays = pixel_rays(width)
-    x, y, z = np.moveaxis(rays, -1, 0)
-    rho = np.hypot(x, y)
-    scale = width / (2.0 * math.pi)
-    by_p_of_u = scale * np.stack([y, -x, np.zeros_like(x)], axis=-1) / rho[..., None] ** 2
-    by_p_of_v = scale * np.stack([x * z, y * z, -(rho**2)], axis=-1) / rho[..., None]
-    rows_u, rows_v = (
-        np.concatenate([np.cross(rays, by_p), -by_p], axis=-1) for by_p in (by_p_of_u, by_p_of_v)
-    )
+    rows_u, rows_v = (np.concatenate([np.cross(rays, by_p), -by_p], axis=-1) for by_p in ray_jacobian(rays))
     return rows_u, rows_v
 
 
