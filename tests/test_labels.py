@@ -165,7 +165,9 @@ def test_ignored_labels_and_masks_do_not_count_and_nothing_else_is_masked(tmp_pa
     expected = (labels != 0) & (labels != 5) & (np.arange(128) >= 20)
     expected[-7:] = False
     np.testing.assert_array_equal(panorama.is_valid, expected)
-    with pytest.raises(InputError, match="found no pixel that counts, all are masked, black or of ignored"):
+    with pytest.raises(
+        InputError, match="found no pixel that counts, all are masked or black, or of ignored"
+    ):
         read_panorama(path, PanoramaOptions(labels=Labels(tuple(range(256)))))
 
 

@@ -129,7 +129,7 @@ def _masked(
     is_valid = panorama.is_valid if counts is None else panorama.is_valid & counts
     is_valid = mask_cap(is_valid, options.mask_nadir_deg) if options.mask_nadir_deg else is_valid
     if not is_valid.any():
-        raise InputError(f"{path}: found no pixel that counts, all are masked, black or of ignored labels")
+        raise InputError(f"{path}: found no pixel that counts, all are masked or black, or of ignored labels")
     return replace(panorama, is_valid=np.ascontiguousarray(is_valid))
 
 
