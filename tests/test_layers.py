@@ -22,6 +22,7 @@ LAYERS = [
     {"verdict"},
     {"result", "scenes"},
     {"paper", "engine", "export"},
+    {"datasets"},
     {"pipeline"},
     {"evaluation"},
 ]
