@@ -13,10 +13,11 @@ from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from exit_codes import EXIT_BAD_INPUT, complain, guarded
+from exit_codes import EXIT_BAD_INPUT, EXIT_BAD_USAGE, complain, guarded
 from piccolo.datasets import DATASETS
 from piccolo.datasets.checking import Check, check_scene
 from piccolo.datasets.model import Plan, Request
+from piccolo.datasets.poses import AXES, DIRECTIONS
 from piccolo.datasets.writing import Written, write_scene
 from piccolo.errors import InputError
 from piccolo.scenes import read_scene
@@ -53,8 +54,8 @@ def build_parser() -> argparse.ArgumentParser:
     for name, dataset in DATASETS.items():
         subparser = subparsers.add_parser(name, description=dataset.about, formatter_class=how)
         add_common_options(subparser)
-        for add in OWN_OPTIONS.get(name, ()):
-            add(subparser)
+        if name in OWN_OPTIONS:
+            OWN_OPTIONS[name](subparser)
     return parser
 
 
@@ -85,7 +86,30 @@ def add_stanford_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--labels", action="store_true", help=text)
 
 
-OWN_OPTIONS = {"stanford2d3ds": (add_stanford_options,)}
+def add_mpo_options(parser: argparse.ArgumentParser) -> None:
+    """The motions."""
+    parser.add_argument("--seed", type=int, default=0, help="of the random motions (default 0)")
+
+
+def add_generic_options(parser: argparse.ArgumentParser) -> None:
+    """Where things are, and what the list does not say of its poses."""
+    text = "the list (default poses.csv, .json, .txt or .tum of --from)"
+    parser.add_argument("--poses", type=Path, metavar="FILE", help=text)
+    parser.add_argument("--cloud", type=Path, metavar="FILE", help="(default the one cloud in --from)")
+    text = "pictures named by the times of a trajectory (default images of --from)"
+    parser.add_argument("--images", type=Path, metavar="FOLDER", help=text)
+    text = "the camera's, where the list has no such column: piccolo is forward, left, up; optical is right, "
+    text += "down, forward; opengl is right, up, back"
+    parser.add_argument("--axes", choices=AXES, help=text)
+    text = "where the list has none: what a row's [R | t] takes camera coordinates to, or from"
+    parser.add_argument("--direction", choices=DIRECTIONS, help=text)
+
+
+OWN_OPTIONS = {
+    "stanford2d3ds": add_stanford_options,
+    "mpo": add_mpo_options,
+    "generic": add_generic_options,
+}
 
 
 def request_from(arguments: argparse.Namespace) -> Request:
@@ -143,8 +167,10 @@ def convert(arguments: argparse.Namespace, show: Show) -> int:
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     arguments = build_parser().parse_args(argv)
-    if arguments.check < 0:
-        return complain(PROGRAM, arguments.debug, f"--check: found {arguments.check}, wanted 0 or more", 2)
+    for name in ("check", "seed"):
+        if getattr(arguments, name, 0) < 0:
+            text = f"--{name}: found {getattr(arguments, name)}, wanted 0 or more"
+            return complain(PROGRAM, arguments.debug, text, EXIT_BAD_USAGE)
 
     def show(values: Iterator[Any], total: int | None, label: str) -> Iterator[Any]:
         return iter(tqdm(values, label, total, leave=False, disable=arguments.quiet, file=sys.stderr))

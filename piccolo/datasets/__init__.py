@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from . import stanford
+from . import generic, loc360, matterport, mpo, omniscenes, stanford
 from .model import Listing, Request
 
 __all__ = ["DATASETS", "Dataset"]
@@ -19,4 +19,9 @@ class Dataset:
 
 DATASETS = {
     stanford.NAME: Dataset("Stanford2D-3D-S panoramas with S3DIS room clouds", stanford.listing),
+    omniscenes.NAME: Dataset("OmniScenes, all splits", omniscenes.listing),
+    mpo.NAME: Dataset("MPO scans with panoramas, moved at random as in the PICCOLO paper", mpo.listing),
+    matterport.NAME: Dataset("Matterport3D skyboxes and house meshes", matterport.listing),
+    loc360.NAME: Dataset("360Loc 360-degree queries, with a cloud of your own", loc360.listing),
+    generic.NAME: Dataset("any panoramas with poses in a CSV, JSON or TUM file", generic.listing),
 }
