@@ -215,3 +215,44 @@ def test_rooms_without_a_cloud_are_counted(dataset, tmp_path, capsys):
     arguments = ["stanford2d3ds", "--from", str(dataset), "--out", str(tmp_path / "out")]
     assert convert_dataset.main(arguments) == 0
     assert "1 rooms without a cloud: area_1/pantry_1" in capsys.readouterr().err
+
+
+def test_rooms_without_objects_have_no_labels(dataset, tmp_path, capsys):
+    for path in dataset.rglob("Annotations/*.txt"):
+        path.unlink()
+    code, _, err = run(capsys, "stanford2d3ds", dataset, tmp_path / "out", "--labels")
+    assert code == 3
+    assert "for labels Annotations beside it" in err
+    (dataset / "assets" / "semantic_labels.json").write_text("{}")
+    assert "wanted a list of names" in run(capsys, "stanford2d3ds", dataset, tmp_path / "out", "--labels")[2]
+    (dataset / "assets" / "semantic_labels.json").unlink()
+    assert "found no assets/semantic_labels.json" in run(
+        capsys, "stanford2d3ds", dataset, tmp_path / "out", "--labels"
+    )[2]  # fmt: skip
+
+
+def test_a_folder_with_something_else_in_it_is_not_touched(dataset, tmp_path, capsys):
+    folder = tmp_path / "out" / "area_1" / "office_1"
+    folder.mkdir(parents=True)
+    (folder / "notes.txt").write_text("mine")
+    code, lines, err = run(capsys, "stanford2d3ds", dataset, tmp_path / "out")
+    assert (code, lines) == (3, [])
+    assert "wanted a folder that is new or empty" in err
+    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+
+
+def test_points_that_are_left_out_are_told(dataset, tmp_path, capsys):
+    (path,) = dataset.rglob("office_1.txt")
+    path.write_text(path.read_text() + "nan 2.0 3.0 1 2 3\n")
+    arguments = ["stanford2d3ds", "--from", str(dataset), "--out", str(tmp_path / "out")]
+    assert convert_dataset.main(arguments) == 0
+    captured = capsys.readouterr()
+    assert "1 points with NaN or infinite coordinates left out" in captured.err
+    assert json.loads(captured.out)["points"] == 20_000
+
+
+def test_wrong_usage(dataset, tmp_path, capsys):
+    assert run(capsys, "stanford2d3ds", dataset, tmp_path / "out", "--check", -1)[0] == 2
+    with pytest.raises(SystemExit) as caught:
+        run(capsys, "stanford2d3ds", dataset, tmp_path / "out", "--link", "--copy")
+    assert caught.value.code == 2

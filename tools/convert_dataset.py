@@ -4,7 +4,8 @@
 import argparse
 import json
 import sys
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -122,10 +123,19 @@ def request_from(arguments: argparse.Namespace) -> Request:
 
 def chosen(plans: tuple[Plan, ...], rooms: list[str]) -> list[Plan]:
     """The plans of some rooms, or all."""
+    counts = Counter(plan.name for plan in plans)
+    if twice := [name for name, count in counts.items() if count > 1]:
+        raise InputError(f"--from: found the scene {twice[0]} twice, wanted it once")
     names = {plan.name.split("/")[-1] for plan in plans}
     if missing := [room for room in rooms if room not in names]:
         raise InputError(f"--rooms: found no {missing[0]}, wanted one of {', '.join(sorted(names))}")
     return [plan for plan in plans if not rooms or plan.name.split("/")[-1] in rooms]
+
+
+def tell(notes: Iterable[str], arguments: argparse.Namespace) -> None:
+    """Lines for the user, unless he wants quiet."""
+    for note in notes if not arguments.quiet else ():
+        tqdm.write(f"{PROGRAM}: {note}", file=sys.stderr)
 
 
 def report(plan: Plan, written: Written, check: Check | None) -> dict[str, object]:
@@ -144,24 +154,26 @@ def convert(arguments: argparse.Namespace, show: Show) -> int:
     """Write the scenes one by one; returns the exit code."""
     listing = DATASETS[arguments.dataset].listing(request_from(arguments))
     plans = chosen(listing.plans, arguments.rooms)
-    for note in listing.notes if not arguments.quiet else ():
-        tqdm.write(f"{PROGRAM}: {note}", file=sys.stderr)
-    exit_code = 0
-    for plan in plans:
-        try:
-            written = write_scene(plan, arguments.out, arguments.transfer, show)
-            check = None
-            if arguments.check:
-                scene = read_scene(written.folder, plan.name)
-                check = check_scene(scene, arguments.check, Workers(num_cores(), show), show)
-        except InputError as error:
-            exit_code = complain(PROGRAM, arguments.debug, f"{plan.name}: {error}", EXIT_BAD_INPUT)
-            continue
-        print(json.dumps(report(plan, written, check)), flush=True)
-        if check and not check.is_passed:
-            complain(PROGRAM, False, f"{plan.name}: {check.advice}", EXIT_BAD_FIT)
-            exit_code = exit_code or EXIT_BAD_FIT
-    return exit_code
+    tell(listing.notes, arguments)
+    # bad input goes before a bad fit
+    return max((convert_scene(plan, arguments, show) for plan in plans), default=0)
+
+
+def convert_scene(plan: Plan, arguments: argparse.Namespace, show: Show) -> int:
+    """Write a scene, check it, and print its line; returns the exit code."""
+    try:
+        written = write_scene(plan, arguments.out, arguments.transfer, show)
+        check = None
+        if arguments.check:
+            scene = read_scene(written.folder, plan.name)
+            check = check_scene(scene, arguments.check, Workers(num_cores(), show), show)
+    except InputError as error:
+        return complain(PROGRAM, arguments.debug, f"{plan.name}: {error}", EXIT_BAD_INPUT)
+    tell(written.warnings, arguments)
+    print(json.dumps(report(plan, written, check)), flush=True)
+    if check and not check.is_passed:
+        return complain(PROGRAM, False, f"{plan.name}: {check.advice}", EXIT_BAD_FIT)
+    return 0
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -12,9 +12,10 @@ from ..cloud.packed import PackedPoints, pack_points
 from ..engine.octree import build_octree
 from ..panorama import Panorama, read_panorama
 from ..pose import Array, Pose
+from ..pyramid import shrink
 from ..scenes import Query, Scene
 from ..threads import Show, Workers, unseen
-from ..verify import evidence_at
+from ..verify import VIEW_WIDTH, evidence_at
 from .poses import AXES
 
 VOXEL_SIZE = 0.08  # [m] enough for views of a few degrees
@@ -69,7 +70,8 @@ def check_scene(scene: Scene, num_queries: int, workers: Workers, show: Show = u
 
     def fit(query: Query) -> Fit:
         pose = Pose(query.pose.R_cam_from_world, query.pose.center_world - voxels.origin)
-        return _fit(scene.name_of(query), points, read_panorama(query.image), pose, voxels.origin)
+        panorama = shrink(read_panorama(query.image), VIEW_WIDTH)  # once for all readings
+        return _fit(scene.name_of(query), points, panorama, pose, voxels.origin)
 
     return Check(tuple(workers.each(fit, chosen, f"{scene.name}: check")))
 

@@ -1,17 +1,16 @@
 """What a reader of a dataset finds: the scenes that can be written, with their clouds and panoramas."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cloud.voxels import turned
 from ..pose import Array, Pose
 
 Labels = NDArray[np.uint16]  # (H, W) what each pixel shows, 0 where nobody says
-# What can't be used and is passed over, and how much of it there is: kept short, as datasets are large.
-Notes = Sequence[str]
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,7 @@ class Motion:
 
     def of_points(self, points: Array) -> Array:
         """Points (N, 3) moved."""
-        return np.asarray(points @ self.R_written_from_dataset.T + self.shift)
+        return turned(points, self.R_written_from_dataset) + self.shift
 
     def of_pose(self, pose: Pose) -> Pose:
         """The same camera, moved with the points."""

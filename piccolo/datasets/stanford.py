@@ -56,22 +56,22 @@ class Picture:
 def listing(request: Request) -> Listing:
     """The rooms for which there are panoramas and a cloud."""
     table = _read_table(request.folder) if request.labels else None
-    plans, without_cloud = [], []
+    plans, missing = [], []
     for (area, room), pictures in sorted(_pictures(request.folder).items()):
         if request.areas and area not in request.areas:
             continue
-        cloud = _cloud_of(request.folder, area, room)
-        if cloud is None:
-            without_cloud.append(f"area_{area}/{room}")
+        name = f"area_{area}/{room}"
+        parts = _cloud_of(request.folder, area, room, request.labels)
+        if parts:
+            plans.append(_plan(name, parts, pictures, table))
         else:
-            plans.append(_plan(f"area_{area}/{room}", cloud, pictures, table))
+            missing.append(name)
     if not plans:
         raise InputError(
-            f"{request.folder}: found no room with panoramas ({PANORAMAS[0]}) and a cloud ({CLOUDS[0]}), "
-            "wanted the layout in docs/DATASETS.md"
+            f"{request.folder}: found no room with panoramas ({PANORAMAS[0]}) and a cloud ({CLOUDS[0]}, for "
+            "labels Annotations beside it), wanted the layout in docs/DATASETS.md"
         )
-    names = ", ".join(without_cloud)
-    notes = (f"{len(without_cloud)} rooms without a cloud: {names}",) if without_cloud else ()
+    notes = (f"{len(missing)} rooms without a cloud: {', '.join(missing)}",) if missing else ()
     return Listing(tuple(plans), notes)
 
 
@@ -98,8 +98,8 @@ def _globbed(folder: Path, patterns: Iterable[str]) -> list[Path]:
     return [path for pattern in patterns for path in sorted(folder.glob(pattern))]
 
 
-def _cloud_of(folder: Path, area: str, room: str) -> Path | None:
-    """The room's points, one `x y z r g b` a line."""
+def _cloud_of(folder: Path, area: str, room: str, has_labels: bool) -> tuple[CloudPart, ...]:
+    """The room's points, one `x y z r g b` a line; with labels the same, an object a file named by class."""
     found = _globbed(folder, [pattern.format(area=area, room=room) for pattern in CLOUDS])
     usable = [path for path in found if not any(ALIGNED in part for part in path.parts)]
     if found and not usable:
@@ -107,12 +107,15 @@ def _cloud_of(folder: Path, area: str, room: str) -> Path | None:
             f"{found[0]}: found a cloud of the {ALIGNED}, whose rooms are turned one by one, wanted those of "
             "Stanford3dDataset_v1.2"
         )
-    return usable[0] if usable else None
+    if not has_labels:
+        return tuple(CloudPart(path) for path in usable[:1])
+    objects = [path for cloud in usable[:1] for path in sorted(cloud.parent.glob("Annotations/*.txt"))]
+    return tuple(CloudPart(path, NUMBERS.get(path.name.split("_")[0], 0)) for path in objects)
 
 
-def _plan(name: str, cloud: Path, pictures: list[Picture], table: NDArray[np.uint16] | None) -> Plan:
-    parts = (CloudPart(cloud),) if table is None else _annotated(cloud)
-
+def _plan(
+    name: str, parts: tuple[CloudPart, ...], pictures: list[Picture], table: NDArray[np.uint16] | None
+) -> Plan:
     def read_shots() -> list[Shot]:
         return [_shot(picture, table) for picture in pictures]
 
@@ -120,15 +123,6 @@ def _plan(name: str, cloud: Path, pictures: list[Picture], table: NDArray[np.uin
     if table is not None:
         source["label_names"] = ["unknown", *CLASSES]
     return Plan(name, parts, read_shots, has_labels=table is not None, source=source)
-
-
-def _annotated(cloud: Path) -> tuple[CloudPart, ...]:
-    """The same points, an object a file, with the classes in the files' names."""
-    folder = cloud.parent / "Annotations"
-    files = sorted(folder.glob("*.txt"))
-    if not files:
-        raise InputError(f"{folder}: found no object (*.txt), wanted those with the labels")
-    return tuple(CloudPart(path, NUMBERS.get(path.name.split("_")[0], 0)) for path in files)
 
 
 def _shot(picture: Picture, table: NDArray[np.uint16] | None) -> Shot:

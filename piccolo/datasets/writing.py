@@ -22,7 +22,7 @@ from .labels import write_labels
 from .model import Plan, Shot
 
 IMAGES, LABELS = "images", "labels"  # folders of a scene
-Transfer = Literal["symlink", "hardlink", "copy"]
+Transfer = Literal["symlink", "copy"]
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,7 @@ class Written:
     folder: Path
     num_points: int | None  # None if it was there already
     num_queries: int
+    warnings: tuple[str, ...] = ()  # one line each, for the user
 
 
 def write_scene(plan: Plan, out: Path, transfer: Transfer = "symlink", show: Show = unseen) -> Written:
@@ -51,10 +52,11 @@ def write_scene(plan: Plan, out: Path, transfer: Transfer = "symlink", show: Sho
     if not shots:
         raise InputError(f"{plan.cloud[0].path}: found no panorama with a pose for it, wanted at least one")
     with replacing_folder(folder) as unfinished:
-        num_points = _write_cloud(plan, unfinished / CLOUD_NAME, show)
+        warnings: list[str] = []
+        num_points = _write_cloud(plan, unfinished / CLOUD_NAME, warnings, show)
         queries = [_write_shot(plan, shot, unfinished, transfer) for shot in shots]
         write_queries(unfinished, queries, source=dict(plan.source))
-    return Written(folder, num_points, len(queries))
+    return Written(folder, num_points, len(queries), tuple(warnings))
 
 
 def _there_already(plan: Plan, folder: Path) -> Written:
@@ -66,16 +68,17 @@ def _there_already(plan: Plan, folder: Path) -> Written:
     return Written(folder, None, len(scene.queries))
 
 
-def _write_cloud(plan: Plan, path: Path, show: Show) -> int:
+def _write_cloud(plan: Plan, path: Path, warnings: list[str], show: Show) -> int:
     """Stream the cloud's files into one PLY; returns how many points it has."""
     census = Census(plan.cloud[0].path, 1.0)
     dtype = vertex_rows(*_no_points(), np.empty(0, np.int32) if plan.has_labels else None).dtype
     with writing_ply(path, dtype) as writer:
-        for (points, colors), label in _chunks(plan, census, show):
+        for (points, colors), label in _chunks(plan, census, warnings, show):
             moved = points if plan.motion is None else plan.motion.of_points(points)
             labels = np.full(len(points), label, np.int32) if plan.has_labels else None
             writer.add(vertex_rows(moved, colors, labels))
         census.check()
+    warnings += census.warnings()
     return census.num_finite
 
 
@@ -83,10 +86,11 @@ def _no_points() -> Chunk:
     return np.empty((0, 3)), np.empty((0, 3), np.uint8)
 
 
-def _chunks(plan: Plan, census: Census, show: Show) -> Iterator[tuple[Chunk, int]]:
+def _chunks(plan: Plan, census: Census, warnings: list[str], show: Show) -> Iterator[tuple[Chunk, int]]:
     """Finite points of all files with their labels; one census counts them all, as an object may be small."""
     for part in plan.cloud:
         source = open_source(part.path)
+        warnings += source.warnings
         census.path = part.path
         total = None if source.num_points is None else math.ceil(source.num_points / CHUNK)
         try:
@@ -116,7 +120,5 @@ def _bring(file: Path, target: Path, transfer: Transfer) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     if transfer == "symlink":
         target.symlink_to(file.resolve())
-    elif transfer == "hardlink":
-        target.hardlink_to(file.resolve())
     else:
         shutil.copyfile(file, target)
