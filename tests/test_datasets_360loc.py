@@ -55,7 +55,7 @@ def test_matrices_taken_the_other_way_fail_the_check(dataset, tmp_path, capsys):
         ([1], "found no object"),
         ({"a.jpg": [[1, 0], [0, 1]]}, "found the shape (2, 2)"),
         ({"a.jpg": [[1, 0], [0]]}, "wanted JSON"),
-        ({"a.jpg": np.eye(4).tolist()}, "no such file, wanted a panorama"),
+        ({"a.jpg": np.eye(4).tolist()}, "no such file that can be read"),
     ],
 )
 def test_damaged_poses_are_refused(dataset, tmp_path, capsys, document, message):

@@ -68,13 +68,21 @@ def _rows(path: Path, request: Request, notes: list[str]) -> Iterator[Row]:
             raise InputError(f"{path}: found no list of objects, {WANTED}")
         rows = [{key: str(value) for key, value in row.items() if value is not None} for row in document]
     elif path.suffix.lower() == ".csv":
-        rows = [
-            {key.strip(): value.strip() for key, value in row.items() if key and isinstance(value, str)}
-            for row in csv.DictReader(io.StringIO(read_text(path, WANTED)))
-        ]
+        rows = _table(path)
     else:
         rows = _trajectory(path, request, notes)
     return ({key: value for key, value in row.items() if value} for row in rows)
+
+
+def _table(path: Path) -> list[dict[str, str]]:
+    try:
+        rows = list(csv.DictReader(io.StringIO(read_text(path, WANTED))))
+    except csv.Error as error:
+        raise InputError(f"{path}: found damaged CSV ({error}), {WANTED}") from error
+    return [
+        {key.strip(): value.strip() for key, value in row.items() if key and isinstance(value, str)}
+        for row in rows
+    ]
 
 
 def _trajectory(path: Path, request: Request, notes: list[str]) -> list[dict[str, str]]:
@@ -107,7 +115,7 @@ def _entry(where: str, path: Path, row: Row, request: Request) -> Entry:
         raise InputError(f"{where}: found no {missing[0]}, {WANTED}")
     image = path.parent / row["image"]
     room = row.get("room", request.folder.resolve().name)
-    if room != Path(room).name or room.startswith("."):
+    if room != Path(room).name or room.startswith(".") or not room.isprintable():
         raise InputError(f"{where}: found the room {room!r}, wanted a name for a folder")
     shot = Shot(image.name, {image.name: image}, row.get("variant", VARIANT), _pose(where, row, request))
     return Entry(room, path.parent / row["cloud"] if "cloud" in row else None, shot)

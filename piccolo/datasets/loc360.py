@@ -47,7 +47,7 @@ def _shots(path: Path) -> list[Shot]:
         where = f"{path}, {file}"
         try:
             matrix = np.array(value, dtype=np.float64)
-        except (TypeError, ValueError) as error:
+        except (OverflowError, TypeError, ValueError) as error:
             raise InputError(f"{where}: found {error}, {WANTED}") from error
         if matrix.shape not in ((4, 4), (3, 4)):
             raise InputError(f"{where}: found the shape {matrix.shape}, {WANTED}")

@@ -33,9 +33,9 @@ def listing(request: Request) -> Listing:
             notes.append(f"{folder}: no mesh")
             continue
         faces = _faces_in(folder / SKYBOXES)
-        posed = {place: faces[place] for place in faces if _pose_file(folder, place, SKYBOX_YAW).exists()}
+        posed = {place: files for place, files in faces.items() if _is_whole(folder, place, files)}
         if len(posed) < len(faces):
-            notes.append(f"{folder}: {len(faces) - len(posed)} skyboxes without a pose")
+            notes.append(f"{folder}: {len(faces) - len(posed)} skyboxes without a pose or without six faces")
         plans.append(_plan(folder, meshes, posed))
     if not plans:
         wanted = "wanted the layout in docs/DATASETS.md"
@@ -44,12 +44,16 @@ def listing(request: Request) -> Listing:
 
 
 def _faces_in(folder: Path) -> dict[str, dict[str, Path]]:
-    """The faces by place: all six, each under its name in the scene's images/."""
+    """The faces by place, each under its name in the scene's images/."""
     faces: dict[str, dict[str, Path]] = defaultdict(dict)
     for path in sorted(folder.iterdir()):
         if match := FACE.match(path.name):
             faces[match[1]][f"{match[1]}/{path.name}"] = path
-    return {place: files for place, files in faces.items() if len(files) == NUM_FACES}
+    return faces
+
+
+def _is_whole(folder: Path, place: str, files: dict[str, Path]) -> bool:
+    return len(files) == NUM_FACES and _pose_file(folder, place, SKYBOX_YAW).exists()
 
 
 def _pose_file(folder: Path, place: str, yaw: int) -> Path:

@@ -147,7 +147,7 @@ def _read_pose(picture: Picture) -> Pose:
 def _three(path: Path, document: Any, name: str) -> Array:
     try:
         values = np.array(document[name], dtype=np.float64)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, OverflowError, TypeError, ValueError) as error:
         raise InputError(f"{path}: found {error!r}, {WANTED_POSE}") from error
     if values.shape != (3,):
         raise InputError(f"{path}: {name} has the shape {values.shape}, wanted three numbers")

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -115,8 +116,8 @@ def _write_shot(plan: Plan, shot: Shot, folder: Path, transfer: Transfer) -> Que
 
 def _bring(file: Path, target: Path, transfer: Transfer) -> None:
     """The picture at another place: a link, or a copy."""
-    if not file.is_file():
-        raise InputError(f"{file}: no such file, wanted a panorama")
+    if not (file.is_file() and os.access(file, os.R_OK)):
+        raise InputError(f"{file}: no such file that can be read, wanted a panorama")
     target.parent.mkdir(parents=True, exist_ok=True)
     if transfer == "symlink":
         target.symlink_to(file.resolve())
