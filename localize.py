@@ -8,7 +8,6 @@ import traceback
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
@@ -31,6 +30,7 @@ from piccolo.settings import EngineSettings, PaperSettings
 from piccolo.stopwatch import Stopwatch
 from piccolo.threads import Workers
 from piccolo.verdict import LOCALIZED
+from progress import shown
 
 EXIT_ALL_LOCALIZED, EXIT_SOME_NOT, EXIT_BAD_USAGE, EXIT_BAD_INPUT, EXIT_INTERNAL = range(5)
 EXIT_INTERRUPTED, EXIT_BROKEN_PIPE = 130, 141
@@ -73,14 +73,9 @@ def open_session(
         text = f"first use: compiling kernels, once (under half a minute), into {KERNEL_FOLDER}"
         print(text, file=sys.stderr, flush=True)
 
-    def show(values: Iterator[Any], total: int | None, label: str) -> Iterator[Any]:
-        """The values under a progress bar that vanishes when they end."""
-        bar = tqdm(values, label, total, leave=False, disable=arguments.quiet, file=sys.stderr, delay=0.5)
-        return iter(bar)
-
     watch = Stopwatch()
     cache = CachePolicy(not arguments.no_cache, arguments.cache)
-    workers = Workers(arguments.threads, show)
+    workers = Workers(arguments.threads, shown(arguments.quiet))
     inputs = Inputs(tuple(arguments.cloud), cloud_settings_from(arguments), read_options)
     localizer = open_localizer(inputs, settings, cache, workers, watch)
     session = Session(arguments, inputs, localizer, workers, watch.seconds)

@@ -123,7 +123,7 @@ class Result:
                 warnings=tuple(document["warnings"]),
                 **{name: document[name] for name in _PLAIN_FIELDS},
             )
-        except (json.JSONDecodeError, KeyError, TypeError) as error:
+        except (json.JSONDecodeError, KeyError, RecursionError, TypeError) as error:
             raise InputError(
                 f"result: found {error!r}, wanted one JSON object of format {FORMAT!r}"
             ) from error

@@ -1,4 +1,4 @@
-"""Rotations to try: upright at even yaws, or spread evenly over SO(3)."""
+"""Rotations to try: upright at even yaws, spread evenly over SO(3), or drawn from it."""
 
 import math
 
@@ -24,3 +24,9 @@ def uniform_rotations(num_rotations: int) -> NDArray[np.float64]:
     alpha, beta = 2.0 * np.pi * s / math.sqrt(2.0), 2.0 * np.pi * s / SUPER_FIBONACCI_PSI
     quaternions = np.stack([r * np.sin(alpha), r * np.cos(alpha), R * np.sin(beta), R * np.cos(beta)], axis=1)
     return np.stack([rotation_from_quaternion_wxyz(q) for q in quaternions])
+
+
+def random_rotation(rng: np.random.Generator) -> NDArray[np.float64]:
+    """A rotation (3, 3) drawn evenly from SO(3) (Shoemake, 1992: a normalised Gaussian quaternion)."""
+    quaternion = rng.normal(size=4)
+    return rotation_from_quaternion_wxyz(quaternion / np.linalg.norm(quaternion))

@@ -57,7 +57,13 @@ def read_scene(folder: Path, name: str | None = None) -> Scene:
         cloud = path.parent / str(document.get("cloud", CLOUD_NAME))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}), wanted true poses") from error
-    except (AttributeError, KeyError, TypeError, ValueError) as error:  # bad JSON and bad UTF-8 among them
+    except (
+        AttributeError,
+        KeyError,
+        RecursionError,
+        TypeError,
+        ValueError,
+    ) as error:  # bad JSON too
         raise InputError(f"{path}: found {error!r}, wanted a queries.json with true poses") from error
     return Scene(name or path.parent.resolve().name, path.parent, cloud, queries)
 

@@ -6,11 +6,14 @@ import struct
 from io import BytesIO
 
 import numpy as np
+import pytest
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
 RED, GREEN, BLUE, YELLOW = (250, 10, 10), (10, 250, 10), (10, 10, 250), (250, 250, 10)
 QUADRANTS = np.array([[RED, GREEN], [BLUE, YELLOW]], np.uint8).repeat(4, axis=0).repeat(4, axis=1)
+CORNER_COLORS = np.array([[0, 0, 40], [255, 0, 40], [255, 255, 40], [0, 255, 40]], np.uint8)  # of SQUARE
+CORNERS = {RED: (0, 1), GREEN: (1, 1), BLUE: (0, 0), YELLOW: (1, 0)}  # of the square's x and y
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
 TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
 UV_FROM_BELOW = SQUARE[:, :2]  # v upwards, as in OBJ
@@ -150,3 +153,30 @@ def write_ply(path, vertices=SQUARE, colors=None, face_colors=None, uv=None, opt
     elements = [PlyElement.describe(vertex, "vertex"), PlyElement.describe(faces, "face")]
     PlyData(elements, **(options or {})).write(str(path))
     return path
+
+
+def assert_quadrants(raw, tolerance=0):
+    """Each quadrant of the texture lies on its own corner of the square."""
+    assert len(raw.colors) == 10_000
+    is_clear = np.all(np.abs(raw.points_world[:, :2] - 0.5) > 1e-6, axis=1)  # of the borders within
+    raw = type(raw)(raw.points_world[is_clear], raw.colors[is_clear])
+    quadrant = (raw.points_world[:, :2] > 0.5).astype(int)
+    for color, corner in CORNERS.items():
+        found = raw.colors[np.all(quadrant == corner, axis=1)].astype(int)
+        assert len(found) == pytest.approx(2500, rel=0.02)
+        np.testing.assert_allclose(found, np.broadcast_to(color, found.shape), atol=tolerance)
+
+
+def change(path, value):
+    """A change of glTF's JSON: the entry at `path` becomes `value`, or goes if that is None."""
+
+    def apply(tree):
+        *way, last = path
+        for key in way:
+            tree = tree[key]
+        if value is None:
+            del tree[last]
+        else:
+            tree[last] = value
+
+    return apply

@@ -2,14 +2,11 @@
 """Localize the panoramas of scenes with true poses, and tell how good the poses are."""
 
 import argparse
-import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -27,14 +24,15 @@ from piccolo.errors import InputError
 from piccolo.evaluation import pictures, tables
 from piccolo.evaluation.compare import changes, pair_up, side_by_side
 from piccolo.evaluation.row import Row, match_results
-from piccolo.evaluation.run_file import appending, check_settings, read_rows
-from piccolo.evaluation.runner import Failure, Plan, jobs_of, run
+from piccolo.evaluation.run_file import open_run, read_rows
+from piccolo.evaluation.runner import Plan
 from piccolo.evaluation.statistics import Limits, risk_and_coverage
 from piccolo.files import check_output, write_atomically
-from piccolo.pipeline import CachePolicy, Inputs, settings_json
+from piccolo.pipeline import CachePolicy
 from piccolo.result import Result
 from piccolo.scenes import Scene, find_scenes
-from piccolo.threads import Show, num_cores
+from piccolo.threads import num_cores
+from progress import shown
 
 EPILOG = """\
 examples:
@@ -91,46 +89,6 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
     return Plan(settings_from(arguments), *reading, CachePolicy(True, arguments.cache), num_threads)
 
 
-def bar_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """How progress is shown."""
-    return {"disable": arguments.quiet, "file": sys.stderr}
-
-
-def show_for(arguments: argparse.Namespace) -> Show:
-    """Progress within one query, below that of the queries."""
-
-    def show(values: Iterator[Any], total: int | None, label: str) -> Iterator[Any]:
-        return iter(tqdm(values, label, total, leave=False, delay=1.0, **bar_options(arguments)))
-
-    return show
-
-
-def run_rows(arguments: argparse.Namespace, plan: Plan, scenes: Sequence[Scene]) -> tuple[list[Row], int]:
-    """All rows of the scenes, old ones and new ones, and how many queries could not be tried."""
-    out: Path = arguments.out
-    check_output(out, [])
-    rows, size = read_rows(out) if out.exists() else ([], 0)
-    inputs = Inputs((), plan.cloud_settings, plan.read_options)
-    wanted = json.loads(json.dumps(settings_json(inputs, plan.settings)))
-    check_settings(out, rows, wanted)
-    jobs = jobs_of(scenes, {row.key for row in rows}, arguments.variants)
-    names = {scene.name for scene in scenes}
-    rows = [row for row in rows if row.scene in names]
-    failures: list[Failure] = []
-    bar = tqdm(desc="queries", total=sum(len(job.queries) for job in jobs), unit="", **bar_options(arguments))
-    with appending(out, size) as append, bar:
-        for found in run(plan, jobs, arguments.jobs, show_for(arguments)):
-            if isinstance(found, Failure):
-                complain(PROGRAM, False, found.text, EXIT_BAD_INPUT)
-                failures.append(found)
-                bar.update(found.num_queries)
-            else:
-                append(found)
-                rows.append(found)
-                bar.update()
-    return rows, sum(failure.num_queries for failure in failures)
-
-
 def read_results(path: Path, scenes: Sequence[Scene]) -> list[Row]:
     """The rows of a file of localize.py."""
     lines = [line for line in path.read_text().splitlines() if line.strip()]
@@ -138,6 +96,11 @@ def read_results(path: Path, scenes: Sequence[Scene]) -> list[Row]:
     if not rows:
         raise InputError(f"{path}: found no result, wanted JSON lines of localize.py")
     return rows
+
+
+def say(text: str) -> None:
+    """Tell what could not be tried."""
+    complain(PROGRAM, False, text, EXIT_BAD_INPUT)
 
 
 def report(rows: Sequence[Row], limits: Limits) -> list[tables.Table]:
@@ -199,7 +162,8 @@ def evaluate(arguments: argparse.Namespace, plan: Plan) -> int:
     if arguments.results:
         rows = read_results(arguments.results, scenes)
     else:
-        rows, num_failed = run_rows(arguments, plan, scenes)
+        run = open_run(arguments.out, plan, scenes, arguments.variants)
+        rows, num_failed = run.finish(arguments.jobs, shown(arguments.quiet), say)
     if arguments.variants:
         rows = [row for row in rows if row.variant in arguments.variants]
     if not rows:

@@ -4,13 +4,10 @@
 import argparse
 import json
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -30,6 +27,7 @@ from piccolo.synthetic.world import (
     scan_world,
 )
 from piccolo.threads import Workers, num_cores
+from progress import shown
 
 EPILOG = """\
 examples:
@@ -93,14 +91,11 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     arguments = build_parser().parse_args(argv)
 
-    def show(values: Iterator[Any], total: int | None, label: str) -> Iterator[Any]:
-        return iter(tqdm(values, label, total, leave=False, disable=arguments.quiet, file=sys.stderr))
-
     def run() -> int:
         if arguments.panoramas < 0 or arguments.seed < 0:
             raise InputError("--panoramas, --seed: found a negative number, wanted 0 or more")
         world = make_world(arguments.seed, np.array(arguments.size), arguments.rooms)
-        print(json.dumps(write_world(arguments, world, Workers(num_cores(), show))))
+        print(json.dumps(write_world(arguments, world, Workers(num_cores(), shown(arguments.quiet)))))
         return 0
 
     return guarded("make_room.py", arguments.debug, run)

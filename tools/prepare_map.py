@@ -4,11 +4,7 @@
 import argparse
 import json
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
-
-from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -19,6 +15,7 @@ from piccolo.files import check_output
 from piccolo.pipeline import CachePolicy, open_map
 from piccolo.stopwatch import Stopwatch
 from piccolo.threads import Workers, num_cores
+from progress import shown
 
 EPILOG = """\
 example:
@@ -35,11 +32,8 @@ def prepare(arguments: argparse.Namespace) -> dict[str, object]:
     """Build and write the map; returns what was made."""
     check_output(arguments.out, arguments.cloud)
 
-    def show(values: Iterator[Any], total: int | None, label: str) -> Iterator[Any]:
-        return iter(tqdm(values, label, total, leave=False, disable=arguments.quiet, file=sys.stderr))
-
     watch = Stopwatch()
-    workers = Workers(num_cores(), show)
+    workers = Workers(num_cores(), shown(arguments.quiet))
     cloud_settings = cloud_settings_from(arguments)
     scan_map = open_map(arguments.cloud, cloud_settings, CachePolicy(is_used=False), workers, watch)
     save_map(scan_map, arguments.out)

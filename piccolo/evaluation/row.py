@@ -77,7 +77,7 @@ class Row:
                 rotation_error=np.inf if angle_deg is None else float(np.radians(angle_deg)),
                 result=Result.from_json(json.dumps(row["result"])),
             )
-        except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+        except (KeyError, RecursionError, TypeError, ValueError) as error:  # bad JSON is among them
             if isinstance(error, InputError):
                 raise
             raise InputError(f"evaluation: found {error!r}, wanted a line of tools/evaluate.py") from error

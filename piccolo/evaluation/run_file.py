@@ -1,12 +1,19 @@
-"""The rows of a run on disk: one JSON line each, flushed as it comes, so that a run can be taken up again."""
+"""A run on disk: one JSON line a query, flushed as it comes, so that a run can be taken up again."""
 
 import fcntl
+import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import InputError
+from ..files import check_output
+from ..pipeline import Inputs, settings_json
+from ..scenes import Scene
+from ..threads import Show, unseen
 from .row import Row
+from .runner import Failure, Job, Plan, jobs_of, run
 
 
 def read_rows(path: Path) -> tuple[list[Row], int]:
@@ -29,8 +36,66 @@ def read_rows(path: Path) -> tuple[list[Row], int]:
     return list(rows.values()), size
 
 
-def check_settings(path: Path, rows: Sequence[Row], settings: dict[str, object]) -> None:
-    """Refuse to take up a run that was made with other settings."""
+@dataclass(frozen=True)
+class Run:
+    """A run over scenes: what a file has of it, and what is left to do."""
+
+    path: Path
+    plan: Plan
+    rows: tuple[Row, ...]  # of these scenes and variants, that are done
+    jobs: tuple[Job, ...]  # that are left
+    size: int  # of the file, up to its last whole line [byte]
+
+    @property
+    def num_left(self) -> int:
+        """Queries that are left."""
+        return sum(len(job.queries) for job in self.jobs)
+
+    def go_on(self, num_processes: int, show: Show = unseen) -> Iterator[Row | Failure]:
+        """The rows that were left, each written before it is handed on.
+
+        Raises
+        ------
+        InputError
+            Another process is writing the file.
+        """
+        with appending(self.path, self.size) as append:
+            for found in run(self.plan, self.jobs, num_processes, show):
+                if isinstance(found, Row):
+                    append(found)
+                yield found
+
+    def finish(self, num_processes: int, show: Show, tell: Callable[[str], None]) -> tuple[list[Row], int]:
+        """All rows, old and new, and how many queries could not be tried; `tell` gets a line for each."""
+        rows, num_failed = list(self.rows), 0
+        for found in show(self.go_on(num_processes, show), self.num_left, "queries"):
+            if isinstance(found, Failure):
+                tell(found.text)
+                num_failed += found.num_queries
+            else:
+                rows.append(found)
+        return rows, num_failed
+
+
+def open_run(path: Path, plan: Plan, scenes: Sequence[Scene], variants: Sequence[str]) -> Run:
+    """Take up a run, or begin one; no variants stands for all.
+
+    Raises
+    ------
+    InputError
+        The file can't be written, holds something else, or rows made with other settings.
+    """
+    check_output(path, [])
+    rows, size = read_rows(path) if path.exists() else ([], 0)
+    inputs = Inputs((), plan.cloud_settings, plan.read_options)
+    _check_settings(path, rows, json.loads(json.dumps(settings_json(inputs, plan.settings))))
+    keys = {(scene.name, scene.name_of(query)) for scene in scenes for query in scene.queries}
+    own = tuple(row for row in rows if row.key in keys and (not variants or row.variant in variants))
+    jobs = jobs_of(scenes, {row.key for row in rows}, variants)
+    return Run(path, plan, own, tuple(jobs), size)
+
+
+def _check_settings(path: Path, rows: Sequence[Row], settings: dict[str, object]) -> None:
     for row in rows:
         made_with = row.result.settings
         names = sorted({*made_with, *settings})
@@ -38,7 +103,7 @@ def check_settings(path: Path, rows: Sequence[Row], settings: dict[str, object])
         if differing:
             name = differing[0]
             found = f"rows made with {name} {made_with.get(name)!r}"
-            raise InputError(f"{path}: found {found}, wanted {settings.get(name)!r}, or another --out")
+            raise InputError(f"{path}: found {found}, wanted {settings.get(name)!r}, or another file")
 
 
 @contextmanager

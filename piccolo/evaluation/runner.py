@@ -93,9 +93,12 @@ def _run_in_processes(plan: Plan, jobs: Sequence[Job], num_processes: int) -> It
         todo.put(job)
     count = min(num_processes, len(jobs))
     processes = [context.Process(target=_work, args=(plan, todo, found), daemon=True) for _ in range(count)]
+    # Ctrl-C reaches every process: the new ones inherit that it is ignored, and this one ends them.
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         for process in processes:
             process.start()
+        signal.signal(signal.SIGINT, handler)
         yield from _collect(found, processes)
     finally:
         for process in processes:
@@ -122,7 +125,6 @@ def _collect(found: "Queue[Row | Failure | None]", processes: Sequence[Any]) -> 
 
 def _work(plan: Plan, todo: "Queue[Job]", found: "Queue[Row | Failure | None]") -> None:
     """One process: take jobs until there are none."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the first process ends the others
     put: Callable[[Row | Failure | None], None] = found.put
     while True:
         try:
