@@ -93,7 +93,7 @@ ODD = ("1e999", "-1e300", "1" + "0" * 400, "9" * 5000, "NaN", "[[[[]]]]", "null"
 @pytest.mark.parametrize("number", ODD)
 def test_odd_numbers_are_refused(dataset, number):
     name, folder, path, content = dataset
-    token = {"generic tum": " 1 ", "matterport3d": "1.0 "}.get(name, "1.5")  # of a coordinate or an axis
+    token = {"generic tum": " 1 ", "matterport3d": "1.0", "360loc": "1.0"}.get(name, "1.5")
     odd = token.replace(token.strip(), number)
     path.write_text(content.decode().replace(token, odd, 1))
     poses, message = read_or_refused(lambda _: read_poses(name, folder), path)

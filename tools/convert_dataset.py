@@ -5,10 +5,9 @@ import argparse
 import json
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
@@ -23,6 +22,7 @@ from piccolo.datasets.writing import Written, write_scene
 from piccolo.errors import InputError
 from piccolo.scenes import read_scene
 from piccolo.threads import Show, Workers, num_cores
+from progress import shown
 
 PROGRAM = "convert_dataset.py"
 EXIT_BAD_FIT = 1
@@ -184,10 +184,7 @@ def main(argv: list[str] | None = None) -> int:
             text = f"--{name}: found {getattr(arguments, name)}, wanted 0 or more"
             return complain(PROGRAM, arguments.debug, text, EXIT_BAD_USAGE)
 
-    def show(values: Iterator[Any], total: int | None, label: str) -> Iterator[Any]:
-        return iter(tqdm(values, label, total, leave=False, disable=arguments.quiet, file=sys.stderr))
-
-    return guarded(PROGRAM, arguments.debug, lambda: convert(arguments, show))
+    return guarded(PROGRAM, arguments.debug, lambda: convert(arguments, shown(arguments.quiet)))
 
 
 if __name__ == "__main__":
