@@ -1,5 +1,7 @@
 """Matterport3D: skyboxes rendered by hand around the level camera's last stop, a mesh of small triangles."""
 
+import shutil
+
 import numpy as np
 import pytest
 from dataset_rooms import assert_fits, cameras, look, points_and_colors, run, write_picture
@@ -94,3 +96,10 @@ def test_damaged_files_are_refused(dataset, tmp_path, capsys):
     code, _, err = run(capsys, "matterport3d", dataset, tmp_path / "out")
     assert code == 3
     assert "with a mesh" in err
+
+
+def test_a_house_that_is_there_twice_is_refused(dataset, tmp_path, capsys):
+    shutil.copytree(dataset / "v1" / "scans" / HOUSE / HOUSE, dataset / HOUSE)
+    code, lines, err = run(capsys, "matterport3d", dataset, tmp_path / "out")
+    assert (code, lines) == (3, [])
+    assert f"--from: found the scene {HOUSE} twice" in err
