@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 from dataset_rooms import (
     FORWARD_LEFT_UP,
@@ -16,6 +17,9 @@ from dataset_rooms import (
     write_text_cloud,
 )
 from scipy.spatial.transform import Rotation
+
+from piccolo.scenes import read_scene
+from tools import export_poses
 
 AXES = {"optical": OPTICAL, "piccolo": FORWARD_LEFT_UP, "opengl": OPENGL}
 COLUMNS = ("image", "tx", "ty", "tz", "qw", "qx", "qy", "qz", "direction", "axes", "variant", "room")
@@ -161,3 +165,22 @@ def test_refused_lists_and_clouds(folder, tmp_path, capsys):
     no_list = folder / "list.json"
     no_list.write_text("{}")
     assert "found no list of objects" in run(capsys, "generic", folder, out, "--poses", no_list)[2]
+
+
+def test_a_table_of_exported_poses_comes_back(folder, tmp_path, capsys):
+    write_csv(folder / "poses.csv", rows_of(folder))
+    assert run(capsys, "generic", folder, tmp_path / "first")[0] == 0
+    first = tmp_path / "first" / "my photos"
+    (folder / "poses.csv").unlink()
+    table = folder / "exported.csv"
+    words = ["--scenes", str(first), "--format", "csv", "--images", str(first), "--out", str(table)]
+    assert export_poses.main(words) == 0
+    capsys.readouterr()
+    code, _, err = run(capsys, "generic", folder, tmp_path / "second", "--poses", table)
+    assert (code, err) == (0, "")
+    pairs = zip(
+        read_scene(first).queries, assert_fits(tmp_path / "second" / "my photos").queries, strict=True
+    )
+    for one, other in pairs:
+        np.testing.assert_allclose(other.pose.R_cam_from_world, one.pose.R_cam_from_world, atol=1e-14)
+        assert np.array_equal(other.pose.center_world, one.pose.center_world)

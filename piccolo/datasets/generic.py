@@ -20,6 +20,7 @@ LISTS = ("poses.csv", "poses.json", "poses.txt", "poses.tum")
 NUMBERS = ("tx", "ty", "tz", "qw", "qx", "qy", "qz")
 TUM_COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
+OWN_QUATERNION = {f"quaternion_{letter}" for letter in "wxyz"}  # of R_cam_from_world, in a CSV of ours
 MAX_LENGTH_ERROR = 1e-2  # of a quaternion
 VARIANT = "generic"
 WANTED = f"wanted rows with image, {', '.join(NUMBERS)}, direction, axes"
@@ -79,10 +80,23 @@ def _table(path: Path) -> list[dict[str, str]]:
         rows = list(csv.DictReader(io.StringIO(read_text(path, WANTED))))
     except csv.Error as error:
         raise InputError(f"{path}: found damaged CSV ({error}), {WANTED}") from error
-    return [
+    texts = [
         {key.strip(): value.strip() for key, value in row.items() if key and isinstance(value, str)}
         for row in rows
     ]
+    return [_renamed(row) if row.keys() >= OWN_QUATERNION else row for row in texts]
+
+
+def _renamed(row: dict[str, str]) -> dict[str, str]:
+    """A row of tools/export_poses.py as one of a list, its rotation inverted to go with the position."""
+    w, x, y, z = (row[f"quaternion_{letter}"] for letter in "wxyz")
+    inverse = {"qw": w, "qx": _negated(x), "qy": _negated(y), "qz": _negated(z)}
+    position = {f"t{letter}": row.get(letter, "") for letter in "xyz"}
+    return {**row, **inverse, **position, "direction": WORLD_FROM_CAM, "axes": "piccolo", "cloud": ""}
+
+
+def _negated(number: str) -> str:
+    return number[1:] if number.startswith("-") else f"-{number}"
 
 
 def _trajectory(path: Path, request: Request, notes: list[str]) -> list[dict[str, str]]:
