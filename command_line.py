@@ -3,12 +3,22 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 from piccolo import __version__
 from piccolo.errors import InputError
+from piccolo.labels import Labels
 from piccolo.panorama import ReadOptions
-from piccolo.settings import METRES, CloudSettings, EngineSettings, PaperSettings, Prior, UpAxis
+from piccolo.settings import (
+    METRES,
+    CloudSettings,
+    EngineSettings,
+    Initialization,
+    PaperSettings,
+    PoseLoss,
+    Prior,
+    UpAxis,
+)
 from piccolo.threads import num_cores
 
 DESCRIPTION = "Find where in a coloured point cloud 360-degree panoramas were taken."
@@ -23,8 +33,8 @@ examples:
 output: one JSON object a panorama, one a line, in the order given; messages and progress go to stderr.
 exit codes: 0 all localized, 1 some not, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
-# option, metavar, type, help: settings that only one preset has, named as the setting
-Option = tuple[str, str, type, str]
+# option, metavar, type or choices, help: settings that only one preset has, named as the setting
+Option = tuple[str, str | None, type | tuple[str, ...], str]
 ENGINE_OPTIONS: tuple[Option, ...] = (
     ("--num-yaws", "N", int, "rotations searched where gravity is known"),
     ("--num-rotations", "N", int, "rotations of SO(3) searched where it is not"),
@@ -33,6 +43,9 @@ ENGINE_OPTIONS: tuple[Option, ...] = (
 PAPER_OPTIONS: tuple[Option, ...] = (
     ("--translations", "N_t", int, "start positions in free space"),
     ("--rotations", "N_r", int, "start rotations; 0: 8 yaws if gravity is known, 32 of SO(3) if not"),
+    ("--loss", None, get_args(PoseLoss), "photometric: pixels of the rendered cloud, the paper's comparison"),
+    ("--photometric-width", "PX", int, "of rendered cloud and panorama with the photometric loss, at most"),
+    ("--initialization", None, get_args(Initialization), "loss-only: K2 poses by the loss, no histograms"),
     ("--keep-by-loss", "K1", int, "poses kept by the loss"),
     ("--keep-by-histogram", "K2", int, "poses kept by colour histograms, and refined"),
     ("--iterations", "N", int, "iterations of the solver"),
@@ -91,6 +104,12 @@ def add_cloud_reading_options(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--up", choices=get_args(UpAxis), default="auto", help=text)
     text = "of clouds without colours"
     group.add_argument("--intensity-as-gray", action="store_true", help=text)
+    text = (
+        "semantic labels in place of colours: of the points (PLY, LAS, LAZ, PCD), and PNG panoramas of such"
+    )
+    group.add_argument("--labels", action="store_true", help=text)
+    text = "labels that say nothing: left out of the cloud, masked in panoramas"
+    group.add_argument("--ignore-labels", type=int, nargs="+", metavar="N", help=text)
 
 
 def add_panorama_options(parser: argparse.ArgumentParser) -> None:
@@ -115,13 +134,21 @@ def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
 
 def read_options_from(arguments: argparse.Namespace) -> ReadOptions:
     """What add_panorama_options asked for."""
-    return ReadOptions(arguments.fov, arguments.mask, arguments.mask_nadir, arguments.cube_order)
+    pictures = arguments.fov, arguments.mask, arguments.mask_nadir, arguments.cube_order
+    return ReadOptions(*pictures, labels_from(arguments))
 
 
 def cloud_settings_from(arguments: argparse.Namespace) -> CloudSettings:
     """What add_cloud_options asked for."""
     scale = METRES[arguments.units or "m"] if arguments.scale is None else arguments.scale
-    return CloudSettings(scale, arguments.up, arguments.intensity_as_gray)
+    return CloudSettings(scale, arguments.up, arguments.intensity_as_gray, labels_from(arguments))
+
+
+def labels_from(arguments: argparse.Namespace) -> Labels | None:
+    """How labels are to be read, None for colours."""
+    if arguments.ignore_labels and not arguments.labels:
+        raise InputError("--ignore-labels: found without --labels, wanted both")
+    return Labels(tuple(sorted(set(arguments.ignore_labels or ())))) if arguments.labels else None
 
 
 def parse(parser: argparse.ArgumentParser, argv: list[str] | None) -> argparse.Namespace:
@@ -154,7 +181,8 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
         for option, metavar, kind, text in options:
             name = option[2:].replace("-", "_")
             default = getattr(settings, PAPER_SETTING.get(name, name))
-            group.add_argument(option, type=kind, metavar=metavar, help=f"{text} (default {default})")
+            checked: dict[str, Any] = {"choices": kind} if isinstance(kind, tuple) else {"type": kind}
+            group.add_argument(option, **checked, metavar=metavar, help=f"{text} (default {default})")
     group.add_argument("--no-visibility", action="store_const", const=True, help="see through walls")
 
 

@@ -98,6 +98,16 @@ def pixel_rays(width: int, rows: slice = slice(None)) -> NDArray[np.float64]:
     return rays
 
 
+def ray_jacobian(rays: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Derivatives (H, W, 3) of u and of v by the camera coordinates, at pixel_rays, 1 m from the camera."""
+    x, y, z = np.moveaxis(rays, -1, 0)
+    rho = np.hypot(x, y)
+    scale = rays.shape[1] / (2.0 * math.pi)
+    by_u = np.stack([y, -x, np.zeros_like(x)], axis=-1) / rho[..., None] ** 2
+    by_v = np.stack([x * z, y * z, -(rho**2)], axis=-1) / rho[..., None]
+    return scale * by_u, scale * by_v
+
+
 def solid_angles(width: int) -> NDArray[np.float64]:
     """Solid angle [sr] of a pixel of each row, (width / 2,), of an image of `width`; exact, sums to 4 pi."""
     edges = np.sin((0.5 - np.arange(width // 2 + 1) / (width // 2)) * np.pi)

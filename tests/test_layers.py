@@ -13,7 +13,7 @@ SCRIPTS = [ROOT / "localize.py", ROOT / "command_line.py"]
 # A module may import from the lines above its own, and from its own line only if the line says so.
 LAYERS = [
     {"errors"},
-    {"jit", "threads", "files", "stopwatch"},
+    {"jit", "threads", "files", "stopwatch", "labels"},
     {"pose", "settings"},
     {"sphere", "rotations"},
     {"panorama", "cloud", "sampling", "pyramid"},

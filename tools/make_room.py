@@ -4,10 +4,12 @@
 import argparse
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -22,9 +24,10 @@ from piccolo.synthetic.world import (
     World,
     check_num_points,
     check_width,
+    make_labels,
     make_query,
     make_world,
-    scan_world,
+    scan_labelled,
 )
 from piccolo.threads import Workers, num_cores
 from progress import shown
@@ -36,7 +39,8 @@ examples:
 
 Writes FOLDER/cloud.ply, FOLDER/images/VARIANT_K.jpg and FOLDER/queries.json with the true poses.
 clean: as scanned; tilt: the camera turned anyhow; photo: other exposure, white balance, gamma, blur, noise;
-change: furniture moved and added. One JSON object on stdout says what was written.
+change: furniture moved and added. With --labels the points have a label too, and each panorama a picture
+of labels, FOLDER/labels/VARIANT_K.png. One JSON object on stdout says what was written.
 exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 
@@ -55,6 +59,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--size", type=float, nargs=3, default=[6.0, 5.0, 2.7], metavar=("X", "Y", "Z"),
                         help="of a room [m] (default 6 5 2.7)")  # fmt: skip
     parser.add_argument("--rooms", type=int, default=1, help="side by side, at most 64 (default 1)")
+    text = "label each point and pixel by its kind of surface, for localize.py --labels"
+    parser.add_argument("--labels", action="store_true", help=text)
     parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
     return parser
@@ -70,19 +76,33 @@ def write_query(folder: Path, name: str, query: Query) -> scenes.Query:
     return scenes.Query(image, query.variant, query.pose)
 
 
+def write_labels(folder: Path, name: str, labels: NDArray[np.uint16]) -> Path:
+    """Write an image of labels (H, W) and return its path."""
+    image = folder / "labels" / f"{name}.png"
+    image.parent.mkdir(exist_ok=True)
+    _, encoded = cv2.imencode(".png", labels)
+    write_atomically(image, bytes(encoded))
+    return image
+
+
 def write_world(arguments: argparse.Namespace, world: World, workers: Workers) -> dict[str, object]:
     """Write everything and return what was written."""
     folder: Path = arguments.out
     check_num_points(world, arguments.points)
     check_width(arguments.width)
     (folder / "images").mkdir(parents=True, exist_ok=True)
-    points, colors = scan_world(world, arguments.points, workers)
-    write_ply(folder / scenes.CLOUD_NAME, vertex_rows(points, colors))
-    queries = [
-        write_query(folder, f"{v}_{k}", make_query(world, k, v, arguments.width, workers))
-        for v in dict.fromkeys(arguments.variants)
-        for k in range(arguments.panoramas)
-    ]
+    points, colors, labels = scan_labelled(world, arguments.points, workers)
+    rows = vertex_rows(points, colors, labels.astype(np.int32) if arguments.labels else None)
+    write_ply(folder / scenes.CLOUD_NAME, rows)
+    queries = []
+    for v in dict.fromkeys(arguments.variants):
+        for k in range(arguments.panoramas):
+            query = make_query(world, k, v, arguments.width, workers)
+            written = write_query(folder, f"{v}_{k}", query)
+            if arguments.labels:
+                labels_path = write_labels(folder, f"{v}_{k}", make_labels(world, k, query, workers))
+                written = replace(written, labels=labels_path)
+            queries.append(written)
     scenes.write_queries(folder, queries)
     return {"folder": str(folder), "points": len(points), "queries": len(queries), "seed": arguments.seed}
 

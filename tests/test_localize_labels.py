@@ -1,0 +1,137 @@
+"""Labels, and the comparisons of the paper, through the command line."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from plyfile import PlyData
+from rooms import errors
+
+import localize
+from piccolo.errors import InputError
+from piccolo.evaluation.runner import Failure, Job, Plan, run_job
+from piccolo.labels import Labels
+from piccolo.panorama import ReadOptions
+from piccolo.pipeline import CachePolicy
+from piccolo.result import Result
+from piccolo.scenes import read_scene
+from piccolo.settings import CloudSettings, EngineSettings, PaperSettings
+from piccolo.synthetic.room import KINDS
+from tools import make_room, prepare_map
+
+PAPER = ["--preset", "paper", "--translations", "30", "--iterations", "60", "--max-points", "30000"]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A room with labels, and one panorama."""
+    folder = tmp_path_factory.mktemp("labels")
+    size = ["--size", "4.5", "3.5", "2.5", "--width", "512", "--points", "60000", "--panoramas", "1"]
+    assert make_room.main(["--out", str(folder), "--seed", "7", *size, "--labels", "--quiet"]) == 0
+    return folder
+
+
+def _localized(scene, capsys, *options, pano="labels/clean_0.png"):
+    files = ["--cloud", str(scene / "cloud.ply"), "--pano", str(scene / pano), "--no-cache", "--quiet"]
+    code = localize.main([*files, *options])
+    out, err = capsys.readouterr()
+    return (Result.from_json(out) if out else None), code, err
+
+
+def test_room_maker_labels_points_and_pixels_alike(scene):
+    (query,) = read_scene(scene).queries
+    picture = cv2.imread(str(query.labels), cv2.IMREAD_UNCHANGED)
+    vertices = PlyData.read(str(scene / "cloud.ply"))["vertex"]
+    points = np.stack([vertices[axis] for axis in "xyz"], axis=1)
+    x, y, z = query.pose.R_cam_from_world @ (points - query.pose.center_world).T
+    column = (512 * (0.5 - np.arctan2(y, x) / (2 * np.pi))).astype(int) % 512
+    row = (512 * (0.25 - np.arctan2(z, np.hypot(x, y)) / (2 * np.pi))).astype(int)
+    assert (picture[row, column] == vertices["label"]).mean() > 0.7  # the rest is hidden
+    assert picture.dtype == np.uint16
+    assert set(np.unique(picture)) <= set(range(1, len(KINDS)))
+    for kind, side in (("floor", points[:, 2] < 0.02), ("ceiling", points[:, 2] > 2.48)):
+        assert (vertices["label"][side] == KINDS.index(kind)).mean() > 0.3
+    assert (picture[[0, -1]] == [[KINDS.index("ceiling")], [picture[-1, 0]]]).all()
+
+
+@pytest.mark.parametrize("preset", [[], PAPER])
+def test_camera_is_found_by_labels(scene, capsys, preset):
+    result, code, _ = _localized(scene, capsys, "--labels", *preset)
+    distance, angle_deg = errors(result.pose, read_scene(scene).queries[0].pose)
+    assert distance < 0.05
+    assert angle_deg < 1.0
+    assert code == (0 if result.status == "localized" else 1)
+    assert result.settings["cloud"]["labels"] == result.settings["panorama"]["labels"] == {"ignored": []}
+
+
+def test_ignored_labels_stand_in_the_result_and_everything_ignored_is_refused(scene, capsys):
+    ceiling = str(KINDS.index("ceiling"))
+    result, _, _ = _localized(scene, capsys, "--labels", "--ignore-labels", "99", ceiling)
+    assert errors(result.pose, read_scene(scene).queries[0].pose)[0] < 0.05
+    assert result.settings["cloud"]["labels"] == {"ignored": [int(ceiling), 99]}
+    _, code, err = _localized(scene, capsys, "--labels", "--ignore-labels", *map(str, range(len(KINDS))))
+    assert code == 3
+    assert "cloud.ply: found 0 finite points" in err
+
+
+def test_wrong_use_of_labels_is_refused(scene, capsys):
+    for options, expected, told in (
+        (["--ignore-labels", "3"], 2, "--ignore-labels: found without --labels, wanted both"),
+        (["--labels", "--intensity-as-gray"], 2, "--labels, --intensity-as-gray: found both"),
+        (["--labels", "--fov", "90"], 2, "--labels: found --fov or --cube-order too"),
+    ):
+        _, code, err = _localized(scene, capsys, *options)
+        assert (code, told in err) == (expected, True)
+    _, code, err = _localized(scene, capsys, "--labels", pano="images/clean_0.jpg")
+    assert code == 3
+    assert "clean_0.jpg: found another kind of picture, wanted labels in a PNG" in err
+
+
+def test_prepared_map_of_labels_wants_labels(scene, tmp_path, capsys):
+    built, cloud = str(tmp_path / "scan.map"), ["--cloud", str(scene / "cloud.ply")]
+    assert prepare_map.main([*cloud, "--labels", "--out", built, "--quiet"]) == 0
+    capsys.readouterr()
+    pano = ["--pano", str(scene / "labels" / "clean_0.png"), "--quiet"]
+    localize.main(["--cloud", built, *pano, "--labels"])
+    of_map = Result.from_json(capsys.readouterr().out)
+    of_cloud, _, _ = _localized(scene, capsys, "--labels")
+    np.testing.assert_array_equal(of_map.pose.center_world, of_cloud.pose.center_world)
+    assert localize.main(["--cloud", built, *pano]) == 3
+    assert "scan.map: found a prepared map of labels, wanted --labels too" in capsys.readouterr().err
+    assert prepare_map.main([*cloud, "--out", built, "--quiet"]) == 0
+    assert localize.main(["--cloud", built, *pano, "--labels"]) == 3
+    assert "scan.map: found a prepared map of colours, wanted no --labels" in capsys.readouterr().err
+
+
+def test_evaluation_takes_the_pictures_of_labels(scene):
+    labels = Labels()
+    settings = EngineSettings(min_starts=100, max_starts=100)
+    plan = Plan(settings, CloudSettings(labels=labels), ReadOptions(labels=labels), CachePolicy(False), 2)
+    here = read_scene(scene)
+    (row,) = run_job(plan, Job(here, here.queries))
+    assert row.result.pano == str(here.queries[0].labels)
+    document = json.loads((scene / "queries.json").read_text())
+    del document["queries"][0]["labels"]
+    (scene / "unlabelled.json").write_text(json.dumps(document))
+    here = read_scene(scene / "unlabelled.json")
+    (failure,) = run_job(plan, Job(here, here.queries))
+    assert isinstance(failure, Failure)
+    assert "images/clean_0.jpg has no labels in queries.json" in failure.text
+
+
+def test_losses_and_initializations_of_the_preset_paper(scene, capsys):
+    options = ["--loss", "photometric", "--photometric-width", "128", "--initialization", "loss-only"]
+    result, _, _ = _localized(scene, capsys, *PAPER, *options, pano="images/clean_0.jpg")
+    assert errors(result.pose, read_scene(scene).queries[0].pose)[0] < 0.1
+    expected = {"loss": "photometric", "photometric_width": 128, "initialization": "loss-only"}
+    assert expected.items() <= result.settings.items()
+    for option in ("--loss", "--initialization"):
+        value = options[options.index(option) + 1]
+        _, code, err = _localized(scene, capsys, option, value)
+        assert (code, f"{option}: not an option of the preset default" in err) == (2, True)
+        with pytest.raises(SystemExit):
+            localize.main(["--cloud", "a", "--pano", "b", *PAPER, option, "both"])
+        assert "invalid choice" in capsys.readouterr().err
+    with pytest.raises(InputError, match="photometric_width: found 7"):
+        PaperSettings(photometric_width=7)
