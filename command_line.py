@@ -7,6 +7,7 @@ from typing import get_args
 
 from piccolo import __version__
 from piccolo.errors import InputError
+from piccolo.labels import Labels
 from piccolo.panorama import ReadOptions
 from piccolo.settings import METRES, CloudSettings, EngineSettings, PaperSettings, Prior, UpAxis
 from piccolo.threads import num_cores
@@ -91,6 +92,12 @@ def add_cloud_reading_options(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--up", choices=get_args(UpAxis), default="auto", help=text)
     text = "of clouds without colours"
     group.add_argument("--intensity-as-gray", action="store_true", help=text)
+    text = (
+        "semantic labels in place of colours: of the points (PLY, LAS, LAZ, PCD), and PNG panoramas of such"
+    )
+    group.add_argument("--labels", action="store_true", help=text)
+    text = "labels that say nothing: left out of the cloud, masked in panoramas"
+    group.add_argument("--ignore-labels", type=int, nargs="+", metavar="N", help=text)
 
 
 def add_panorama_options(parser: argparse.ArgumentParser) -> None:
@@ -115,13 +122,21 @@ def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
 
 def read_options_from(arguments: argparse.Namespace) -> ReadOptions:
     """What add_panorama_options asked for."""
-    return ReadOptions(arguments.fov, arguments.mask, arguments.mask_nadir, arguments.cube_order)
+    pictures = arguments.fov, arguments.mask, arguments.mask_nadir, arguments.cube_order
+    return ReadOptions(*pictures, labels_from(arguments))
 
 
 def cloud_settings_from(arguments: argparse.Namespace) -> CloudSettings:
     """What add_cloud_options asked for."""
     scale = METRES[arguments.units or "m"] if arguments.scale is None else arguments.scale
-    return CloudSettings(scale, arguments.up, arguments.intensity_as_gray)
+    return CloudSettings(scale, arguments.up, arguments.intensity_as_gray, labels_from(arguments))
+
+
+def labels_from(arguments: argparse.Namespace) -> Labels | None:
+    """How labels are to be read, None for colours."""
+    if arguments.ignore_labels and not arguments.labels:
+        raise InputError("--ignore-labels: found without --labels, wanted both")
+    return Labels(tuple(sorted(set(arguments.ignore_labels or ())))) if arguments.labels else None
 
 
 def parse(parser: argparse.ArgumentParser, argv: list[str] | None) -> argparse.Namespace:

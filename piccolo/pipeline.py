@@ -130,15 +130,20 @@ def open_map(
     """
     map_path = _map_among(paths)
     if map_path:
-        if len(paths) > 1 or cloud_settings != IN_METRES:
+        if len(paths) > 1 or replace(cloud_settings, labels=None) != IN_METRES:
             raise InputError(f"{map_path}: found a prepared map, wanted it alone, without options for clouds")
         with watch.stage("read"):
-            return load_map(map_path)
+            scan_map = load_map(map_path)
+        if scan_map.has_labels != (cloud_settings.labels is not None):
+            kind = "labels, wanted --labels too" if scan_map.has_labels else "colours, wanted no --labels"
+            raise InputError(f"{map_path}: found a prepared map of {kind}")
+        return scan_map
 
     def build() -> ScanMap:
         with watch.stage("read"):
             cloud = open_cloud(paths, cloud_settings, workers.show)
-        return prepare_map(cloud, workers, cloud_settings.up, watch)
+        scan_map = prepare_map(cloud, workers, cloud_settings.up, watch)
+        return replace(scan_map, has_labels=cloud_settings.labels is not None)
 
     if not (cache.is_used and all(path.is_file() for path in paths)):
         return build()

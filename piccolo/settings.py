@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
 from .errors import InputError
+from .labels import Labels
 
 Gravity = Literal["auto", "known", "unknown"]
 MIN_CONFIDENCE = 0.9
@@ -21,9 +22,12 @@ class CloudSettings:
     scale: float = 1.0  # metres per unit of the files
     up: UpAxis = "auto"  # the axis that points up; auto: z, or what the cloud's own planes say
     intensity_as_gray: bool = False  # where a file has no colours
+    labels: Labels | None = None  # the points' labels are taken for their colours
 
     def __post_init__(self) -> None:
-        """Refuse a scale that means nothing."""
+        """Refuse a scale that means nothing, and two things to make colours of."""
+        if self.intensity_as_gray and self.labels:
+            raise InputError("--labels, --intensity-as-gray: found both, wanted one of them")
         if not (math.isfinite(self.scale) and self.scale > 0.0):
             raise InputError(
                 f"--scale: found {self.scale}, wanted a number above 0 (metres a unit of the file)"

@@ -13,7 +13,7 @@ SCRIPTS = [ROOT / "localize.py", ROOT / "command_line.py"]
 # A module may import from the lines above its own, and from its own line only if the line says so.
 LAYERS = [
     {"errors"},
-    {"jit", "threads", "files", "stopwatch"},
+    {"jit", "threads", "files", "stopwatch", "labels"},
     {"pose", "settings"},
     {"sphere", "rotations"},
     {"panorama", "cloud", "sampling", "pyramid"},
@@ -24,6 +24,7 @@ LAYERS = [
     {"paper", "engine", "export"},
     {"pipeline"},
     {"evaluation"},
+    {"experiments"},
 ]
 # pyramid shrinks panoramas; points are packed as texels are
 SIDEWAYS = {("pyramid", "panorama"), ("cloud", "sampling")}

@@ -36,7 +36,7 @@ def open_cloud(
         A file is missing, has a damaged header, no colours, or is no format that is read here. Reading the
         points raises it where the data break or fail the checks of `clean.Census`.
     """
-    options = ReadOptions(settings.intensity_as_gray)
+    options = ReadOptions(settings.intensity_as_gray, settings.labels)
     sources = [open_source(path, options) for path in sorted(paths)]
     return CloudStream(sources, settings.scale, show)
 
@@ -54,7 +54,11 @@ def read_cloud(path: Path, settings: CloudSettings = IN_METRES) -> Cloud:
 def open_source(path: Path, options: ReadOptions = PLAIN) -> PointSource:
     """The points of a file in any format that is read here."""
     try:
-        return _format_of(path).open_source(path, options)
+        format_ = _format_of(path)
+        if options.labels and not format_.has_labels:
+            known = ", ".join(f.name for f in FORMATS if f.has_labels)
+            raise InputError(f"{path}: labels are not read from {format_.name}, wanted {known}")
+        return format_.open_source(path, options)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}), {WANTED}") from error
 

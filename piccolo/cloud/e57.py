@@ -27,8 +27,8 @@ from .e57_file import (
     scaled,
     text_of,
 )
-from .intensity import OPTION, Measured, in_gray
-from .raw import CHUNK, PLAIN, Format, PointSource, RawCloud, ReadOptions
+from .intensity import OPTION, in_gray
+from .raw import CHUNK, PLAIN, Format, Measured, PointSource, RawCloud, ReadOptions
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")

@@ -12,15 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .raw import RawCloud
+from .raw import Measured, RawCloud
 
 INTENSITY_NAMES = frozenset({"intensity", "scalar_intensity", "reflectance", "scalar_reflectance"})
 OPTION = "--intensity-as-gray takes it for a gray"
 BLACK, WHITE = 0.01, 0.99  # share of the points that are darker
 LARGEST = float(np.finfo(np.float32).max)
 NUM_BINS = 1 << 16
-
-Measured = tuple[NDArray[np.float64], NDArray[np.float64]]  # points (N, 3) in the file's unit, intensity (N,)
 
 
 def in_gray(path: Path, read_measured: Callable[[], Iterator[Measured]]) -> Callable[[], Iterator[RawCloud]]:

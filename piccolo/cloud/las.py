@@ -9,12 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .intensity import OPTION, Measured, in_gray
+from .intensity import OPTION, in_gray
+from .labels import in_palette
 from .las_header import WANTED, Header, has_las_magic, read_header
 from .laz import MAX_CHUNK_SIZE, Compression, decompress, read_compression
-from .raw import CHUNK, PLAIN, Format, PointSource, RawCloud, ReadOptions
+from .raw import CHUNK, PLAIN, Format, Measured, PointSource, RawCloud, ReadOptions
 
 WITHHELD_OLD, WITHHELD = 0x80, 0x04  # bits of the flags' byte, in the formats 0-5 and 6-10
+CLASS_OLD, CLASS = 0x1F, 0xFF  # bits of the class, in the same
 MAX_SAMPLES, NUM_SAMPLE_RUNS = 1 << 20, 64
 TO_8_BIT = ((np.arange(1 << 16, dtype=np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
 
@@ -40,6 +42,9 @@ def open_las(path: Path, options: ReadOptions = PLAIN) -> PointSource:
     """
     header = read_header(path)
     compression = read_compression(header) if header.is_compressed else None
+    if options.labels:
+        read_chunks = in_palette(path, lambda: _read_measured(header, compression, "class"), options.labels)
+        return PointSource(path, read_chunks, header.num_points)
     brightest, num_samples = _brightest(header, compression) if header.has_colors else (0, 0)
     if brightest == 0:
         return _gray_source(header, compression, options, num_samples)
@@ -63,7 +68,7 @@ def _gray_source(
         if not header.has_colors:
             why = f"point format {header.point_format} has intensity only"
         raise InputError(f"{header.path}: has intensity and no colours: {why}, {WANTED}; {OPTION}")
-    read_chunks = in_gray(header.path, lambda: _read_measured(header, compression))
+    read_chunks = in_gray(header.path, lambda: _read_measured(header, compression, "intensity"))
     return PointSource(header.path, read_chunks, header.num_points)
 
 
@@ -138,13 +143,15 @@ def _read_chunks(header: Header, compression: Compression | None, is_8_bit: bool
                 yield _cloud(header, records[first : first + CHUNK], is_8_bit)
 
 
-def _read_measured(header: Header, compression: Compression | None) -> Iterator[Measured]:
+def _read_measured(header: Header, compression: Compression | None, name: str) -> Iterator[Measured]:
+    """The points with their `intensity` or `class`."""
+    bits = 0xFFFF if name == "intensity" else CLASS_OLD if header.point_format < 6 else CLASS
     with header.path.open("rb") as file:
         for run in _runs(header, compression):
             records = _load(file, header, compression, run)
             for first in range(0, len(records), CHUNK):
                 points_world, kept = _points(header, records[first : first + CHUNK])
-                yield points_world, kept["intensity"].astype(np.float64)
+                yield points_world, (kept[name] & bits).astype(np.float64)
 
 
 def _points(header: Header, records: Records) -> tuple[NDArray[np.float64], Records]:
@@ -170,4 +177,4 @@ def _cloud(header: Header, records: Records, is_8_bit: bool) -> RawCloud:
     return RawCloud(points_world, rgb.astype(np.uint8))
 
 
-LAS = Format("LAS, LAZ", frozenset({".las", ".laz"}), has_las_magic, open_las)
+LAS = Format("LAS, LAZ", frozenset({".las", ".laz"}), has_las_magic, open_las, has_labels=True)

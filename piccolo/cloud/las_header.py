@@ -20,6 +20,7 @@ COMPRESSED_BIT = 0x80  # of the point format
 RECORD_SIZES = {0: 20, 1: 28, 2: 26, 3: 34, 4: 57, 5: 63, 6: 30, 7: 36, 8: 38, 9: 59, 10: 67}
 COLORS_BYTE = {2: 20, 3: 28, 5: 28, 7: 30, 8: 30, 10: 30}
 INTENSITY_BYTE, FLAGS_BYTE = 12, 15
+CLASS_BYTE_OLD, CLASS_BYTE = 15, 16  # in the formats 0-5, whose upper three bits are flags, and 6-10
 WANTED = "wanted LAS or LAZ with red green blue (point format 2, 3, 5, 7, 8 or 10)"
 
 
@@ -43,6 +44,7 @@ class Header:
     def dtype(self) -> np.dtype[np.void]:
         """The fields that are wanted of a record."""
         fields = {"xyz": ("3<i4", 0), "intensity": ("<u2", INTENSITY_BYTE), "flags": ("u1", FLAGS_BYTE)}
+        fields["class"] = ("u1", CLASS_BYTE_OLD if self.point_format < 6 else CLASS_BYTE)
         if self.has_colors:
             fields["rgb"] = ("3<u2", COLORS_BYTE[self.point_format])
         return np.dtype(

@@ -16,6 +16,7 @@ from ..errors import InputError
 from . import raw
 from .colors import BRIGHTEST, TYPES_WANTED, in_words, to_bytes
 from .intensity import OPTION, in_gray
+from .labels import in_palette
 from .lzf import MAX_RATIO, decompress_lzf
 from .pcd_header import WANTED, Field, Header, read_header
 from .raw import PLAIN, Format, PointSource, RawCloud, ReadOptions
@@ -26,8 +27,8 @@ FIRST_LINES = re.compile(rb"(?:#[^\n]*\n|[ \t\r\n])*(?:# \.PCD|VERSION[ \t]+0?\.
 PADDING = "_"
 PACKED_NAMES = ("rgb", "rgba")  # 0xAARRGGBB in one number
 PACKED_TYPES = ("f4", "u4", "i4")
-INTENSITY = "intensity"
-INTENSITY_TYPES = ("f4", "f8", "u1", "u2", "u4", "i1", "i2", "i4")
+INTENSITY, LABEL = "intensity", "label"
+MEASURED_TYPES = ("f4", "f8", "u1", "u2", "u4", "i1", "i2", "i4")
 COLOR_NAMES = (("r", "g", "b"), ("red", "green", "blue"))
 
 
@@ -36,15 +37,17 @@ def open_pcd(path: Path, options: ReadOptions = PLAIN) -> PointSource:
 
     Colours are `rgb` or `rgba`, three bytes in one integer or, if the field is declared a float, in its bits,
     in ASCII too; or r g b (red green blue) of uint8 0-255, uint16 0-65535 or float 0-1. Alpha and all other
-    fields are left out. The options may welcome `intensity` in place of colours. The file's size is held
-    against the header before memory is reserved.
+    fields are left out. The options may welcome `intensity` or `label` in place of colours. The file's size
+    is held against the header before memory is reserved.
     """
     header = read_header(path)
     fields = _wanted_fields(header, options)
     read = {"ascii": _read_ascii, "binary": _read_binary, "binary_compressed": _read_compressed}
     _check_size(header)
     read_chunks: Callable[[], Iterator[Any]] = partial(read[header.encoding], header, fields)
-    if fields[3].name == INTENSITY:
+    if options.labels:
+        read_chunks = in_palette(path, read_chunks, options.labels)
+    elif fields[3].name == INTENSITY:
         read_chunks = in_gray(path, read_chunks)
     return PointSource(path, read_chunks, header.num_points)
 
@@ -58,19 +61,20 @@ def _wanted_fields(header: Header, options: ReadOptions) -> tuple[Field, ...]:
     """The fields x y z and the colour's one or three, or the intensity if that is welcome."""
     found = {field.name: field for field in header.fields if field.count == 1}
     names = [field.name for field in header.fields]
-    choices = [*((name,) for name in PACKED_NAMES), *COLOR_NAMES]
+    choices = [(LABEL,)] if options.labels else [*((name,) for name in PACKED_NAMES), *COLOR_NAMES]
     color = next((choice for choice in choices if all(name in found for name in choice)), None)
-    has_intensity = color is None and INTENSITY in found
+    has_intensity = color is None and INTENSITY in found and not options.labels
     if has_intensity and options.intensity_as_gray:
         color = (INTENSITY,)
     if not all(names.count(axis) == 1 and axis in found for axis in "xyz") or color is None:
+        wanted_fields = "wanted x y z and label" if options.labels else WANTED
         listed = " ".join(names[:12]) or "none"
         more = f"; has intensity and no colours, {OPTION}" if has_intensity else ""
-        raise InputError(f"{header.path}: the fields are {quoted(listed.encode())}, {WANTED}{more}")
+        raise InputError(f"{header.path}: the fields are {quoted(listed.encode())}, {wanted_fields}{more}")
     wanted = tuple(found[name] for name in (*"xyz", *color))
     types = ("f4", "f8"), (PACKED_TYPES if len(color) == 1 else tuple(BRIGHTEST))
-    if color == (INTENSITY,):
-        types = types[0], INTENSITY_TYPES
+    if color[0] in (INTENSITY, LABEL):
+        types = types[0], MEASURED_TYPES
     for k, field in enumerate(wanted):
         if field.type not in types[k >= 3]:
             kinds = ("float32 or float64", "uint32, int32 or float32" if len(color) == 1 else TYPES_WANTED)
@@ -113,7 +117,7 @@ def _read_ascii(header: Header, fields: tuple[Field, ...]) -> Iterator[Any]:
             )
         num_left -= num_rows
         points_world, values = rows[:num_rows, :3].copy(), rows[:num_rows, 3:]
-        if fields[3].name == INTENSITY:
+        if fields[3].name in (INTENSITY, LABEL):
             yield points_world, values[:, 0].copy()
             continue
         colors, wrong = _colors_of_text(fields[3:], values, points_world)
@@ -187,7 +191,7 @@ def _in_chunks(
         parts = [column[begin : begin + raw.CHUNK] for column in columns]
         with np.errstate(invalid="ignore"):  # a NaN of the kind that signals
             points_world = np.stack(parts[:3], axis=1, dtype=np.float64)
-        if fields[3].name == INTENSITY:
+        if fields[3].name in (INTENSITY, LABEL):
             yield points_world, parts[3].astype(np.float64)
             continue
         if len(fields) == 4:
@@ -213,4 +217,4 @@ def _color_complaint(
     return f"{header.path}: {place} has the colour {in_words(color)}, wanted {wanted} of the type {type_}"
 
 
-PCD = Format("PCD", frozenset({".pcd"}), has_pcd_magic, open_pcd)
+PCD = Format("PCD", frozenset({".pcd"}), has_pcd_magic, open_pcd, has_labels=True)

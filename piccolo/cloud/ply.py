@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from ..errors import InputError
-from .intensity import INTENSITY_NAMES, OPTION, Measured, in_gray
+from .intensity import INTENSITY_NAMES, OPTION, in_gray
+from .labels import LABEL_NAMES, in_palette
 from .lines import LineReader
 from .mesh import open_ply_mesh
-from .raw import CHUNK, PLAIN, Format, PointSource, RawCloud, ReadOptions
+from .raw import CHUNK, PLAIN, Format, Measured, PointSource, RawCloud, ReadOptions
 from .rows import NOT_A_NUMBER, SPACE, TOO_FEW, TOO_MANY
 from .text import quoted
 
@@ -54,7 +55,7 @@ class Vertices:
 
     header: Header
     index: int  # of the element
-    names: tuple[str, ...]  # x y z and three colours, or x y z and intensity
+    names: tuple[str, ...]  # x y z and three colours, or x y z and intensity or label
 
     @property
     def element(self) -> PlyElement:
@@ -76,11 +77,15 @@ def open_ply(path: Path, options: ReadOptions = PLAIN) -> PointSource:
     header = _read_header(path)
     index = _vertex_index(header)
     if _has_faces(header):
+        if options.labels:
+            raise InputError(f"{path}: found a mesh, wanted points with labels")
         return open_ply_mesh(path)
     vertices = Vertices(header, index, _property_names(header, index, options))
     count = header.counts[index]
     if not header.is_ascii:
         _rows_of(vertices)
+    if options.labels:
+        return PointSource(path, in_palette(path, lambda: _read_measured(vertices), options.labels), count)
     if len(vertices.names) > 4:
         return PointSource(path, lambda: _read_colored(vertices), count)
     return PointSource(path, in_gray(path, lambda: _read_measured(vertices)), count)
@@ -171,6 +176,8 @@ def _property_names(header: Header, index: int, options: ReadOptions) -> tuple[s
     """The vertices' properties for x, y, z, red, green, blue, or for x, y, z, intensity."""
     found = {prop.name: prop.val_dtype for prop in header.elements[index].properties}
     names = next((names for names in COLOR_NAMES if all(name in found for name in names)), ())
+    if options.labels:
+        return _labelled_names(header, found)
     intensity = next((name for name in found if name.lower() in INTENSITY_NAMES), None)
     if not all(axis in found for axis in "xyz") or not (names or intensity):
         kind = "Gaussian splats without red green blue, " if "f_dc_0" in found else ""
@@ -190,6 +197,18 @@ def _property_names(header: Header, index: int, options: ReadOptions) -> tuple[s
                 "wanted uchar 0-255, ushort 0-65535 or float 0-1"
             )
     return (*"xyz", *names)
+
+
+def _labelled_names(header: Header, found: dict[str, str]) -> tuple[str, ...]:
+    """The vertices' properties for x, y, z, label."""
+    by_lower = {name.lower(): name for name in found}
+    label = next((by_lower[name] for name in LABEL_NAMES if name in by_lower), None)
+    if not all(axis in found for axis in "xyz") or label is None:
+        raise InputError(
+            f"{header.path}: the vertices have {' '.join(list(found)[:9]) or 'no properties'}, wanted x y z "
+            "and a label (label, class or classification, or these after scalar_)"
+        )
+    return (*"xyz", label)
 
 
 def _check_size(header: Header, index: int, offset: int, row_size: int) -> int:
@@ -272,4 +291,4 @@ def _color(
     return np.rint(values * (255.0 / BRIGHTEST[type_])).astype(np.uint8)
 
 
-PLY = Format("PLY", frozenset({".ply"}), has_ply_magic, open_ply)
+PLY = Format("PLY", frozenset({".ply"}), has_ply_magic, open_ply, has_labels=True)

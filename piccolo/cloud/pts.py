@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from . import raw
-from .intensity import OPTION, Measured, in_gray
-from .raw import PLAIN, Format, PointSource, RawCloud, ReadOptions
+from .intensity import OPTION, in_gray
+from .raw import PLAIN, Format, Measured, PointSource, RawCloud, ReadOptions
 from .scan_lines import TextLines, mapped
 from .text import quoted
 

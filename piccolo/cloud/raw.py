@@ -7,7 +7,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..labels import Labels
+
 CHUNK = 1 << 20  # points that a reader hands on at once, at most
+
+# points (N, 3) in the file's unit, and a number (N,) of each: intensity or label
+Measured = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -15,6 +20,7 @@ class ReadOptions:
     """What the user wants of a reader."""
 
     intensity_as_gray: bool = False  # take intensity for a gray where a file has no colours
+    labels: Labels | None = None  # take the points' labels for their colours
 
 
 PLAIN = ReadOptions()
@@ -46,6 +52,7 @@ class Format:
     suffixes: frozenset[str]  # lower case, with the dot
     has_magic: Callable[[bytes], bool]  # of a file's first HEAD_SIZE bytes; content goes before names
     open_source: Callable[[Path, ReadOptions], PointSource]
+    has_labels: bool = False  # the reader knows them
 
 
 HEAD_SIZE = 512  # [byte]

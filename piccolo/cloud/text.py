@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .intensity import INTENSITY_NAMES, OPTION, Measured, in_gray
+from .intensity import INTENSITY_NAMES, OPTION, in_gray
 from .lines import LineReader
-from .raw import CHUNK, PLAIN, Format, PointSource, RawCloud, ReadOptions
+from .raw import CHUNK, PLAIN, Format, Measured, PointSource, RawCloud, ReadOptions
 from .rows import NOT_A_NUMBER, PARSED, SPACE, TOO_FEW
 
 TEXT_SUFFIXES = frozenset({".txt", ".xyz", ".asc", ".csv", ".xyzrgb"})

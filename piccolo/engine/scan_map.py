@@ -41,6 +41,7 @@ class ScanMap:
     sparse: NDArray[np.int64]  # candidates of which no two share a cell of the coarse grid
     wide_features: NDArray[np.int8]  # (sparse, 3 * wide cells) means over wider cells, for SO(3)
     wide_seen: NDArray[np.uint8]  # (sparse, wide cells) share seen of each, 255 for all
+    has_labels: bool = False  # colours are those of labels
     warnings: tuple[str, ...] = ()
 
     @cached_property

@@ -6,6 +6,7 @@ import signal
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.queues import Queue
+from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
@@ -70,10 +71,20 @@ def run_job(plan: Plan, job: Job, show: Show = unseen) -> Iterator[Row | Failure
         return
     for query in job.queries:
         try:
-            result, _ = localize_file(localizer, inputs, query.image, workers, watch.seconds)
+            image = _image_of(scene, query, plan.read_options)
+            result, _ = localize_file(localizer, inputs, image, workers, watch.seconds)
             yield row_of(scene, query, result, is_in_box(localizer, query.pose))
         except (OSError, InputError) as error:
             yield Failure(str(error), 1)
+
+
+def _image_of(scene: Scene, query: Query, read_options: ReadOptions) -> Path:
+    """What is localized of a query: its picture of labels if labels are to be read."""
+    if not read_options.labels:
+        return query.image
+    if query.labels is None:
+        raise InputError(f"{scene.folder}: {scene.name_of(query)} has no labels in queries.json")
+    return query.labels
 
 
 def run(plan: Plan, jobs: Sequence[Job], num_processes: int, show: Show = unseen) -> Iterator[Row | Failure]:

@@ -1,18 +1,20 @@
 """Panoramas: one reader a format, then one place in the sphere for all, and what is not to be counted."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..labels import Labels
 from .cube_files import cube_of_cells, read_cube_folder
 from .fisheye import is_dual_fisheye
 from .gpano import Region, attitude, crop_region, gpano_fields, projection, rotation_to_level
 from .masks import find_mask, mask_cap, read_mask
 from .model import GPano, Panorama, ReadOptions
 from .patches import black_borders, polar_disc
-from .picture import Picture, read_picture
+from .picture import Picture, read_labels, read_picture
 from .placing import ASPECT_TOLERANCE, full_size, place, region_of_fov
 
 __all__ = ["AS_STORED", "GPano", "Panorama", "ReadOptions", "read_panorama", "rotation_to_level"]
@@ -26,6 +28,7 @@ def read_panorama(path: Path, options: ReadOptions = AS_STORED) -> Panorama:
 
     Colours have 8 bits (of 16 the upper 8, v >> 8), grey becomes RGB, EXIF's orientation is applied. Not
     valid are pixels of alpha 0, what a crop leaves open, masks, black borders and discs put over a pole.
+    Labels become colours, and only masks and ignored labels are not valid.
 
     Raises
     ------
@@ -34,6 +37,8 @@ def read_panorama(path: Path, options: ReadOptions = AS_STORED) -> Panorama:
         tells which part of the sphere it shows.
     """
     path = Path(path)
+    if options.labels:
+        return _read_labelled(path, options, options.labels)
     is_folder = path.is_dir()
     picture = read_cube_folder(path) if is_folder else read_picture(path)
     cube = None if is_folder else cube_of_cells(path, picture, options.cube_order)
@@ -42,6 +47,19 @@ def read_panorama(path: Path, options: ReadOptions = AS_STORED) -> Panorama:
     else:
         region, gpano, notes = _region_and_attitude(path, picture, options)
     return _finished(path, cube or picture, region, options, gpano, notes)
+
+
+def _read_labelled(path: Path, options: ReadOptions, labels: Labels) -> Panorama:
+    """The panorama in a PNG file of labels. Nothing is searched in it: a black border is a label too."""
+    picture = read_labels(path, labels)
+    width, height = picture.size
+    if width != 2 * height:
+        raise InputError(f"{path}: found labels of {width} x {height}, wanted the full sphere, W = 2 H")
+    notes = list(picture.warnings)
+    counts = _user_masks(path, [picture.size], options, notes).get(0)
+    fields = gpano_fields(picture.xmp)
+    gpano = attitude(fields) if fields else None
+    return _masked(path, Panorama(picture.rgb, picture.is_valid, gpano, tuple(notes)), counts, options)
 
 
 def _region_and_attitude(
@@ -101,12 +119,18 @@ def _finished(
             cap = is_valid if pole == "nadir" else is_valid[::-1]
             is_valid = mask_cap(cap, half_angle)
             is_valid = is_valid if pole == "nadir" else is_valid[::-1]
-    if 0 in masks:
-        is_valid = is_valid & masks[0]
+    return _masked(path, Panorama(rgb, is_valid, gpano, tuple(notes)), masks.get(0), options)
+
+
+def _masked(
+    path: Path, panorama: Panorama, counts: NDArray[np.bool_] | None, options: ReadOptions
+) -> Panorama:
+    """The panorama less what a mask of its size, or the user's cap, takes out."""
+    is_valid = panorama.is_valid if counts is None else panorama.is_valid & counts
     is_valid = mask_cap(is_valid, options.mask_nadir_deg) if options.mask_nadir_deg else is_valid
     if not is_valid.any():
-        raise InputError(f"{path}: found no pixel that counts, all are masked or black")
-    return Panorama(rgb, np.ascontiguousarray(is_valid), gpano, tuple(notes))
+        raise InputError(f"{path}: found no pixel that counts, all are masked, black or of ignored labels")
+    return replace(panorama, is_valid=np.ascontiguousarray(is_valid))
 
 
 def _user_masks(

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..labels import Labels
 
 FACE_LETTERS = "rludfb"  # right, left, up, down, front, back
 
@@ -39,6 +40,7 @@ class ReadOptions:
     mask: Path | None = None  # picture, white where the panorama is to be ignored, or a folder of such
     mask_nadir_deg: float = 0.0  # the cap of this half angle about the camera's down axis is ignored
     cube_order: str | None = None  # the picture is six cube faces in this order, such as rludfb
+    labels: Labels | None = None  # the picture holds labels, not colours
 
     def __post_init__(self) -> None:
         """Refuse values that mean nothing, naming the option."""
@@ -46,6 +48,8 @@ class ReadOptions:
             raise InputError(f"--fov: found {self.fov_deg}, wanted above 0 and at most 360")
         if not (math.isfinite(self.mask_nadir_deg) and 0.0 <= self.mask_nadir_deg <= 90.0):
             raise InputError(f"--mask-nadir: found {self.mask_nadir_deg}, wanted 0 to 90")
+        if self.labels and (self.fov_deg is not None or self.cube_order is not None):
+            raise InputError("--labels: found --fov or --cube-order too, wanted a picture of the full sphere")
         if self.cube_order is not None and sorted(self.cube_order) != sorted(FACE_LETTERS):
             raise InputError(
                 f"--cube-order: found {self.cube_order}, wanted each of the letters {FACE_LETTERS} once "

@@ -11,7 +11,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..labels import Labels, colors_of
 from . import jpeg, png, tiff, webp
 from .header import WANTED, Header
 
@@ -78,6 +79,30 @@ def read_picture(path: Path, min_size: tuple[int, int] = (MIN_WIDTH, MIN_HEIGHT)
         turn = TURNS[header.orientation]
         rgb, is_valid = np.ascontiguousarray(turn(rgb)), np.ascontiguousarray(turn(is_valid))
     return Picture(rgb, is_valid, header.xmp, header.warnings)
+
+
+def read_labels(path: Path, labels: Labels) -> Picture:
+    """The picture in a PNG file of labels, in their colours; of RGB, a label is R 65536 + G 256 + B.
+
+    Raises
+    ------
+    InputError
+        The file is missing or damaged, its size is out of range, or it is of no kind that keeps labels.
+    """
+    data = _file_bytes(path)
+    header = _header(path, data)
+    _check_size(path, header, (MIN_WIDTH, MIN_HEIGHT))
+    if not (data.startswith(png.MAGIC) and png.keeps_labels(data)) or header.has_alpha:
+        raise InputError(
+            f"{path}: found another kind of picture, wanted labels in a PNG, grey of 8 or 16 bits or RGB of "
+            "8, without alpha"
+        )
+    pixels = _decoded(path, data, replace(header, is_deep=True)).astype(np.int32)
+    if pixels.ndim == 3:
+        pixels = pixels[..., 2] << 16 | pixels[..., 1] << 8 | pixels[..., 0]
+    if header.orientation in TURNS:
+        pixels = np.ascontiguousarray(TURNS[header.orientation](pixels))
+    return Picture(colors_of(pixels), labels.are_kept(pixels), header.xmp, header.warnings)
 
 
 def _file_bytes(path: Path) -> bytes:

@@ -13,6 +13,8 @@ CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
 MAX_RATIO = 1040  # zlib packs 1032 bytes into one at best
 XMP_KEYWORD = b"XML:com.adobe.xmp\0"
 KEPT = (b"IHDR", b"eXIf", b"iTXt")
+DEPTH_AT = 24  # [byte] and behind it the colour type
+LABEL_KINDS = (b"\x08\x00", b"\x10\x00", b"\x08\x02")  # grey of 8 and 16 bits, RGB of 8
 
 
 def png_header(path: Path, data: bytes) -> Header:
@@ -42,6 +44,11 @@ def png_header(path: Path, data: bytes) -> Header:
         has_alpha=color_type in (4, 6) or b"tRNS" in chunks,
         xmp=_xmp(text),
     )
+
+
+def keeps_labels(data: bytes) -> bool:
+    """True for a PNG whose numbers are decoded as they were written; a palette would change them."""
+    return data[DEPTH_AT : DEPTH_AT + 2] in LABEL_KINDS
 
 
 def _xmp(text: bytes) -> bytes:

@@ -7,7 +7,7 @@ from scipy.ndimage import gaussian_filter
 from ..pose import Array, Pose
 from ..sphere import pixel_rays
 from ..threads import Workers
-from .raycast import cast
+from .raycast import cast, cast_labelled
 from .room import Room
 
 SUPERSAMPLING = 2  # rays a pixel, each way
@@ -27,6 +27,19 @@ def photograph(room: Room, pose: Pose, width: int, workers: Workers) -> NDArray[
         band[:] = np.round(blocks.mean(axis=(1, 3)) * 255.0)
 
     list(workers.each(run, range(0, width // 2, BAND), "panorama"))
+    return image
+
+
+def label_image(room: Room, pose: Pose, width: int, workers: Workers) -> NDArray[np.uint16]:
+    """Equirectangular image (width / 2, width) of a room's labels at `pose`, of pixels' centres."""
+    image = np.empty((width // 2, width), dtype=np.uint16)
+
+    def run(top: int) -> None:
+        rays = pixel_rays(width, slice(top, top + BAND)).reshape(-1, 3) @ pose.R_cam_from_world
+        labels = cast_labelled(room, pose.center_world, rays, Workers(), "band")[2]
+        image[top : top + BAND] = labels.reshape(-1, width)
+
+    list(workers.each(run, range(0, width // 2, BAND), "labels"))
     return image
 
 

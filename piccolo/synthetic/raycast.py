@@ -71,13 +71,22 @@ def cast(
     room: Room, origin: Array, directions: NDArray[np.float64], workers: Workers, label: str
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Ranges (N,) [m] and colours (N, 3) in [0, 1] along unit world `directions` (N, 3) from `origin`."""
+    return cast_labelled(room, origin, directions, workers, label)[:2]
+
+
+def cast_labelled(
+    room: Room, origin: Array, directions: NDArray[np.float64], workers: Workers, label: str
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Ranges (N,), colours (N, 3) and labels (N,) along `directions`; label 0 where nothing is hit."""
     ranges, rgb = np.empty(len(directions)), np.empty((len(directions), 3))
+    labels = np.empty(len(directions), dtype=np.int64)
 
     def run(lo: int) -> None:
         part = slice(lo, lo + CHUNK)
         hits = np.empty(len(ranges[part]), dtype=np.int64)
         hit_boxes(origin, directions[part], room.boxes, ranges[part], hits)
         shade(origin, directions[part], ranges[part], hits, room.boxes, room.materials, room.light, rgb[part])
+        labels[part] = np.where(hits < 0, 0, room.labels[hits // 3])
 
     list(workers.each(run, range(0, len(directions), CHUNK), label))
-    return ranges, rgb
+    return ranges, rgb, labels

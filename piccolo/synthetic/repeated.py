@@ -1,5 +1,7 @@
 """Places that look the same from several positions: no honest answer is a single pose."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..pose import Array
@@ -22,7 +24,7 @@ def twin_rooms(seed: int, size: Array) -> tuple[Room, Room]:
     room = make_room(seed, size, np.zeros(3))
     shift = np.array([room.size[0] + GAP, 0.0, 0.0])
     boxes = room.boxes + np.array([*shift, 0.0, 0.0, 0.0, 0.0])
-    return room, Room(room.corner + shift, room.size, boxes, room.materials, room.light + shift)
+    return room, replace(room, corner=room.corner + shift, boxes=boxes, light=room.light + shift)
 
 
 def symmetric_hall(seed: int, size: Array) -> Room:
@@ -33,11 +35,12 @@ def symmetric_hall(seed: int, size: Array) -> Room:
     boxes = room.boxes.copy()
     boxes[is_long, 0], boxes[is_long, 3] = 0.25 * x - 0.5 * WALL_THICKNESS, 0.25 * x + 0.5 * WALL_THICKNESS
     is_kept = boxes[:, 0] < 0.5 * x
-    half, materials = boxes[is_kept], room.materials[is_kept]
+    half, materials = boxes[is_kept], np.tile(room.materials[is_kept], (2, 1))
     turned = half.copy()
     turned[:, 0], turned[:, 1], turned[:, 6] = x - half[:, 0], y - half[:, 1], half[:, 6] + np.pi
     light = np.array([0.5 * x, 0.5 * y, room.light[2]])
-    return Room(room.corner, room.size, np.vstack([half, turned]), np.vstack([materials, materials]), light)
+    labels = np.tile(room.labels[is_kept], 2)
+    return Room(room.corner, room.size, np.vstack([half, turned]), materials, light, labels)
 
 
 def corridor(seed: int, height: float) -> Room:
@@ -59,4 +62,4 @@ def corridor(seed: int, height: float) -> Room:
         b.put([x, width / 2, height / 2], [d, width, height], walls[0])
     size = np.array([NUM_DOORS * length, width, height])
     light = size * [0.5, 0.5, 0.93]
-    return Room(b.corner, size, np.stack(b.boxes), np.stack(b.materials), light)
+    return Room(b.corner, size, np.stack(b.boxes), np.stack(b.materials), light, np.array(b.labels))

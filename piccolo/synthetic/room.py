@@ -9,6 +9,10 @@ from ..pose import Array
 
 PLAIN, PLANKS, TILES, STRIPES, CHECKS, PICTURE = range(6)
 WALL_THICKNESS = 0.1  # [m]
+KINDS = (  # of surfaces; a label is the place in this list, and 0 is nothing
+    *("nothing", "floor", "ceiling", "wall", "picture", "window", "door"),
+    *("rug", "table", "shelf", "sofa", "crate"),
+)
 SATURATION = 0.5  # paints are paler than colours drawn at random
 
 # row of Room.boxes: center (3) [m], half size (3) [m], yaw [rad]
@@ -24,6 +28,8 @@ class Builder:
     corner: Array
     boxes: list[Array] = field(default_factory=list)
     materials: list[Array] = field(default_factory=list)
+    labels: list[int] = field(default_factory=list)
+    kind: str = "nothing"  # of what is put next, one of KINDS
 
     def material(self, pattern: int, scale: float, colors: tuple[Array, Array]) -> Array:
         """A material row."""
@@ -42,6 +48,7 @@ class Builder:
         middle, half = np.asarray(center) + self.corner, np.asarray(size) / 2
         self.boxes.append(np.array([*middle, *half, yaw]))
         self.materials.append(material)
+        self.labels.append(KINDS.index(self.kind))
 
 
 @dataclass(frozen=True)
@@ -53,6 +60,7 @@ class Room:
     boxes: NDArray[np.float64]  # (B, 7), see BOX_FIELDS
     materials: NDArray[np.float64]  # (B, 9), see MATERIAL_FIELDS
     light: Array  # (3,) position of the lamp [m]
+    labels: NDArray[np.int64]  # (B,) see KINDS
 
     def clearance(self, position: Array) -> float:
         """Distance [m] from `position` (3,) to the nearest surface; negative inside a box, unseen by rays."""
@@ -69,8 +77,11 @@ def _shell(b: Builder, size: Array) -> None:
     x, y, z = size
     d = WALL_THICKNESS
     ceiling = b.paint((PLAIN,), 0.75, 0.95)
+    b.kind = "floor"
     b.put([x / 2, y / 2, -d / 2], [x + 2 * d, y + 2 * d, d], b.paint((PLANKS, TILES), 0.35, 0.75))
+    b.kind = "ceiling"
     b.put([x / 2, y / 2, z + d / 2], [x + 2 * d, y + 2 * d, d], ceiling)
+    b.kind = "wall"
     for axis in (0, 1):
         for side in (-d / 2, size[axis] + d / 2):
             center, extent = size / 2, size.copy()
@@ -94,6 +105,7 @@ def _wall_hangings(b: Builder, size: Array) -> None:
                 center[along] = b.rng.uniform(width / 2, size[along] - width / 2)
                 extent[along], extent[2] = width, height
                 patterns = {"picture": (PICTURE,), "window": (CHECKS,), "door": (PLAIN, PLANKS)}[kind]
+                b.kind = str(kind)
                 low, high = {"picture": (0.1, 1.0), "window": (0.7, 1.0), "door": (0.2, 0.6)}[kind]
                 b.put(center, extent, b.paint(patterns, low, high))
 
@@ -139,15 +151,17 @@ def _furniture(b: Builder, size: Array, moves: np.random.Generator | None) -> No
     num_pieces = max(3, round(size[0] * size[1] / 3.0))
     seeds = b.rng.integers(0, 1 << 30, num_pieces)
     rug = [size[0] * b.rng.uniform(0.3, 0.6), size[1] * b.rng.uniform(0.3, 0.6), 0.01]
+    b.kind = "rug"
     b.put([size[0] / 2, size[1] / 2, 0.005], rug, b.paint((CHECKS, STRIPES, PICTURE), 0.1, 0.8))
-    pieces = (_table, _shelf, _sofa, _crate, _crate)
+    pieces = {"table": _table, "shelf": _shelf, "sofa": _sofa, "crate": _crate}
+    kinds = ("table", "shelf", "sofa", "crate", "crate")
     for seed in seeds:  # each of its own stream, so that a piece that moves stays what it is
         b.rng = np.random.default_rng(seed)
-        piece = pieces[b.rng.integers(len(pieces))]
+        b.kind = kinds[b.rng.integers(len(kinds))]
         where = moves if moves is not None and moves.random() < 0.5 else np.random.default_rng([seed, 1])
         at = where.uniform([0.5, 0.5], size[:2] - 0.5)
         yaw = float(where.choice([0.0, np.pi / 2, np.pi, -np.pi / 2]) + where.normal(0, 0.2))
-        piece(b, at, yaw)
+        pieces[b.kind](b, at, yaw)
 
 
 def make_room(seed: int, size: Array, corner: Array, changed: int = 0) -> Room:
@@ -160,9 +174,9 @@ def make_room(seed: int, size: Array, corner: Array, changed: int = 0) -> Room:
     moves = np.random.default_rng([seed, 2, changed]) if changed else None
     _furniture(loose, size, moves)
     if moves is not None:
-        loose.rng = moves
+        loose.rng, loose.kind = moves, "crate"
         for _ in range(3):
             _crate(loose, moves.uniform([0.5, 0.5], size[:2] - 0.5), float(moves.uniform(0, np.pi)))
     light = fixed.corner + size * [*fixed.rng.uniform(0.35, 0.65, 2), 0.93]
-    boxes = np.stack(fixed.boxes + loose.boxes)
-    return Room(fixed.corner, size, boxes, np.stack(fixed.materials + loose.materials), light)
+    boxes, materials = np.stack(fixed.boxes + loose.boxes), np.stack(fixed.materials + loose.materials)
+    return Room(fixed.corner, size, boxes, materials, light, np.array(fixed.labels + loose.labels))

@@ -7,7 +7,7 @@ from ..errors import InputError
 from ..pose import Array, yaw_rotation
 from ..sphere import pixel_rays
 from ..threads import Workers
-from .raycast import cast
+from .raycast import cast_labelled
 from .room import Room
 
 RANGE_NOISE = 0.003  # standard deviation [m]
@@ -34,18 +34,19 @@ def free_position(room: Room, rng: np.random.Generator, heights: tuple[float, fl
 
 def scan_room(
     room: Room, num_points: int, rng: np.random.Generator, workers: Workers
-) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Points (num_points, 3) [m] and colours (num_points, 3) of a room, from three stations."""
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int64]]:
+    """Points (N, 3) [m], colours (N, 3) and labels (N,) of a room, N = num_points, from three stations."""
     num_stations = 3
     width = 2 * int(np.ceil(np.sqrt(1.15 * num_points / num_stations / 2.0)))
-    points, colors = [], []
+    points, colors, labels = [], [], []
     for station in range(num_stations):
         position = free_position(room, rng, (1.2, 1.8))
         rays = pixel_rays(width).reshape(-1, 3) @ yaw_rotation(rng.uniform(0, 2 * np.pi))
-        ranges, rgb = cast(room, position, rays, workers, f"scan, station {station + 1}")
+        ranges, rgb, kinds = cast_labelled(room, position, rays, workers, f"scan, station {station + 1}")
         ranges = ranges + rng.normal(0.0, RANGE_NOISE, len(ranges))
         points.append((position + ranges[:, None] * rays).astype(np.float32))
         colors.append(np.round(rgb * 255.0).astype(np.uint8))
+        labels.append(kinds)
     is_hit = np.isfinite(np.concatenate(points)).all(axis=1)
     chosen = np.sort(rng.choice(np.flatnonzero(is_hit), num_points, replace=False))
-    return np.concatenate(points)[chosen], np.concatenate(colors)[chosen]
+    return np.concatenate(points)[chosen], np.concatenate(colors)[chosen], np.concatenate(labels)[chosen]

@@ -9,7 +9,7 @@ from ..errors import InputError
 from ..pose import Array, Pose, exp_so3, yaw_rotation
 from ..rotations import uniform_rotations
 from ..threads import Workers
-from .photo import other_light, photograph
+from .photo import label_image, other_light, photograph
 from .room import Room, make_room
 from .scan import free_position, scan_room
 
@@ -68,11 +68,29 @@ def scan_world(
     world: World, num_points: int, workers: Workers
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Points (num_points, 3) [m] and colours (num_points, 3) of all rooms."""
+    return scan_labelled(world, num_points, workers)[:2]
+
+
+def scan_labelled(
+    world: World, num_points: int, workers: Workers
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int64]]:
+    """The points and colours of scan_world, and the points' labels (num_points,)."""
     check_num_points(world, num_points)
     shares = np.diff(np.linspace(0, num_points, len(world.rooms) + 1).astype(int))
     rng = np.random.default_rng([world.seed, 10])
     parts = [scan_room(room, int(n), rng, workers) for room, n in zip(world.rooms, shares, strict=True)]
-    return np.concatenate([p for p, _ in parts]), np.concatenate([c for _, c in parts])
+    points, colors, labels = zip(*parts, strict=True)
+    return np.concatenate(points), np.concatenate(colors), np.concatenate(labels)
+
+
+def room_of_query(world: World, index: int, variant: str) -> tuple[Room, np.random.Generator]:
+    """The room as query number `index` of a variant finds it, and what else of the query is drawn from."""
+    rng = np.random.default_rng([world.seed, 20, VARIANTS.index(variant), index])
+    number = int(rng.integers(len(world.rooms)))
+    room = world.rooms[number]
+    if variant == "change":
+        room = make_room(world.seed * MAX_ROOMS + number, room.size, room.corner, changed=index + 1)
+    return room, rng
 
 
 def make_query(world: World, index: int, variant: str, width: int, workers: Workers) -> Query:
@@ -80,11 +98,7 @@ def make_query(world: World, index: int, variant: str, width: int, workers: Work
     if variant not in VARIANTS:
         raise InputError(f"variant: found {variant!r}, wanted one of {', '.join(VARIANTS)}")
     check_width(width)
-    rng = np.random.default_rng([world.seed, 20, VARIANTS.index(variant), index])
-    number = int(rng.integers(len(world.rooms)))
-    room = world.rooms[number]
-    if variant == "change":
-        room = make_room(world.seed * MAX_ROOMS + number, room.size, room.corner, changed=index + 1)
+    room, rng = room_of_query(world, index, variant)
     center_world = free_position(room, rng, (1.0, min(1.9, float(room.size[2]) - 0.4)))
     R_cam_from_world = yaw_rotation(rng.uniform(0, 2 * np.pi))
     if variant == "tilt":
@@ -92,3 +106,9 @@ def make_query(world: World, index: int, variant: str, width: int, workers: Work
     pose = Pose(R_cam_from_world, center_world)
     rgb = photograph(room, pose, width, workers)
     return Query(other_light(rgb, rng) if variant == "photo" else rgb, pose, variant)
+
+
+def make_labels(world: World, index: int, query: Query, workers: Workers) -> NDArray[np.uint16]:
+    """Image (H, W) of the labels that query number `index` of its variant shows."""
+    room, _ = room_of_query(world, index, query.variant)
+    return label_image(room, query.pose, query.rgb.shape[1], workers)

@@ -1,0 +1,44 @@
+"""Semantic labels as colours: each label's own, far apart in RGB, the same in clouds and panoramas."""
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+NUM_LEVELS = 16  # of a channel that colours are made of
+NUM_COLORS = 4093  # a prime: labels that count in steps of 256 or 65,536 do not fall together
+
+
+@dataclass(frozen=True)
+class Labels:
+    """How labels are to be understood."""
+
+    ignored: tuple[int, ...] = ()  # values that say nothing: masked in panoramas, left out of clouds
+
+    def are_kept(self, labels: NDArray[np.integer]) -> NDArray[np.bool_]:
+        """True for the labels (...) that are not ignored."""
+        return np.isin(labels, self.ignored, invert=True)
+
+
+@functools.cache
+def palette() -> NDArray[np.uint8]:
+    """RGB (NUM_COLORS, 3), each the farthest of a grid's colours from all those before it; none is black.
+
+    The loss is a norm in RGB: a label mistaken for another costs their distance.
+    """
+    levels = np.round(np.linspace(0.0, 255.0, NUM_LEVELS)).astype(np.int64)
+    grid = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1).reshape(-1, 3)[1:]
+    colors = np.empty((NUM_COLORS, 3), dtype=np.uint8)
+    distance = np.full(len(grid), np.iinfo(np.int64).max)
+    farthest = len(grid) - 1  # white
+    for k in range(NUM_COLORS):
+        colors[k] = grid[farthest]
+        distance = np.minimum(distance, ((grid - grid[farthest]) ** 2).sum(axis=1))
+        farthest = int(distance.argmax())
+    return colors
+
+
+def colors_of(labels: NDArray[np.integer]) -> NDArray[np.uint8]:
+    """Colour (..., 3) of each label (...); labels that differ by a multiple of NUM_COLORS share theirs."""
+    return np.asarray(palette()[labels % NUM_COLORS])
