@@ -9,8 +9,6 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from piccolo.labels import Labels
-
 from exit_codes import EXIT_BAD_INPUT, complain, guarded
 from piccolo.errors import InputError
 from piccolo.evaluation.row import Row
@@ -19,6 +17,7 @@ from piccolo.evaluation.runner import Plan
 from piccolo.experiments.arms import EXPERIMENTS, Arm, Settings
 from piccolo.experiments.report import plot_png, table
 from piccolo.files import write_atomically
+from piccolo.labels import Labels
 from piccolo.panorama import ReadOptions
 from piccolo.pipeline import CachePolicy
 from piccolo.scenes import Scene, find_scenes
@@ -76,24 +75,33 @@ def chosen_variants(arm: Arm, wanted: Sequence[str]) -> tuple[str, ...]:
     return tuple(variant for variant in arm.variants if not wanted or variant in wanted)
 
 
+def changed_scenes(arm: Arm, scenes: Sequence[Scene], root: Path) -> tuple[list[Scene], int]:
+    """The scenes as an arm wants them, and the number of queries of those that can't be so."""
+    changed, num_failed = [], 0
+    for number, scene in enumerate(scenes):
+        folder = root / str(number)
+        folder.mkdir()
+        try:
+            changed.append(arm.change(scene, folder))
+        except InputError as error:
+            tell(str(error))
+            num_failed += len(scene.queries)
+    return changed, num_failed
+
+
 def run_arm(
     arm: Arm, scenes: Sequence[Scene], out: Path, arguments: argparse.Namespace
 ) -> tuple[list[Row], int]:
     """The rows of one arm, and how many queries could not be tried."""
     labels = Labels() if arm.use_labels else None
+    reading = CloudSettings(labels=labels), ReadOptions(labels=labels)
     with tempfile.TemporaryDirectory(prefix="piccolo-") as temporary:
-        changed = []
-        for number, scene in enumerate(scenes):
-            folder = Path(temporary) / str(number)
-            folder.mkdir()
-            changed.append(arm.change(scene, folder))
+        changed, num_failed = changed_scenes(arm, scenes, Path(temporary))
         cache = CachePolicy(True, Path(temporary))
-        num_threads = max(1, num_cores() // arguments.jobs)
-        plan = Plan(
-            arm.settings, CloudSettings(labels=labels), ReadOptions(labels=labels), cache, num_threads
-        )
+        plan = Plan(arm.settings, *reading, cache, max(1, num_cores() // arguments.jobs))
         run = open_run(out / file_name(arm), plan, changed, chosen_variants(arm, arguments.variants))
-        return run.finish(arguments.jobs, shown(arguments.quiet), tell)
+        rows, num_failed_later = run.finish(arguments.jobs, shown(arguments.quiet), tell)
+    return rows, num_failed + num_failed_later
 
 
 def tell(text: str) -> None:
