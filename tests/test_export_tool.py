@@ -17,6 +17,7 @@ from refusals import mutated, read_or_refused
 from piccolo.errors import InputError
 from piccolo.export import FORMATS, read_results, select
 from piccolo.files import check_output_folder, replacing_folder
+from piccolo.scenes import Query, write_queries
 from tools import export_poses
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -206,3 +207,17 @@ def test_help_runs_and_names_every_format():
     with pytest.raises(SystemExit) as caught:
         export_poses.main(["--format", "xyz"])
     assert caught.value.code == 2
+
+
+def test_true_poses_are_written_as_a_reference(tmp_path, capsys):
+    room = tmp_path / "a room"
+    room.mkdir()
+    queries = [Query(room / f"{k}.jpg", "clean", pose) for k, pose in enumerate(POSES)]
+    write_queries(room, queries)
+    out = tmp_path / "p.csv"
+    assert export_poses.main(["--scenes", str(tmp_path), "--format", "csv", "--out", str(out)]) == 0
+    assert json.loads(capsys.readouterr().out)["poses"] == len(POSES)
+    rows = [line.split(",") for line in lines_of(out)[1:]]
+    assert [row[0] for row in rows] == [str(query.image) for query in queries]
+    for row, pose in zip(rows, POSES, strict=True):
+        assert [float(value) for value in row[5:8]] == pose.center_world.tolist()

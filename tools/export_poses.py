@@ -11,9 +11,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from exit_codes import EXIT_BAD_USAGE, complain, guarded
 from piccolo.errors import InputError
-from piccolo.export import FORMATS, Options, Selection, export, read_results, select
+from piccolo.export import FORMATS, Options, Selection, export, read_results, select, true_results
 from piccolo.export.axes import CAMERA_AXES
 from piccolo.files import check_output
+from piccolo.scenes import find_scenes
 
 EPILOG = """\
 formats:
@@ -25,6 +26,7 @@ examples:
   python tools/export_poses.py --results poses.jsonl --format nerfstudio --images . --out transforms.json
   python tools/export_poses.py --results poses.jsonl --format tum --timestamps name --out poses.tum
   python tools/export_poses.py --results poses.jsonl --format geojson --crs EPSG:25832 --out poses.geojson
+  python tools/export_poses.py --scenes room --format tum --out reference.tum
   python tools/export_poses.py --results *.jsonl --format gpano --images photos --out photos_with_pose
 
 Results that are not localized are left out and counted on stderr. docs/CONVENTIONS.md has axes and angles.
@@ -43,8 +45,11 @@ def build_parser() -> argparse.ArgumentParser:
         epilog=EPILOG.format(formats=formats),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    source = parser.add_mutually_exclusive_group(required=True)
     text = "JSON lines of localize.py"
-    parser.add_argument("--results", type=Path, required=True, nargs="+", metavar="FILE", help=text)
+    source.add_argument("--results", type=Path, default=[], nargs="+", metavar="FILE", help=text)
+    text = "scenes whose true poses are written, as a reference for other tools (docs/DATASETS.md)"
+    source.add_argument("--scenes", type=Path, default=[], nargs="+", metavar="FOLDER", help=text)
     parser.add_argument("--format", choices=FORMATS, required=True, help="see below")
     parser.add_argument("--out", type=Path, required=True, help="file, or new folder for colmap and gpano")
     text = "folder to which the pictures' names are written relative (default: as in the results)"
@@ -102,6 +107,8 @@ def report(selection: Selection) -> Iterable[str]:
 def run(arguments: argparse.Namespace, options: Options) -> dict[str, object]:
     """Read, choose, write; returns what was written."""
     results = [result for path in arguments.results for result in read_results(path)]
+    if arguments.scenes:
+        results = [result for scene in find_scenes(arguments.scenes) for result in true_results(scene)]
     if not FORMATS[arguments.format].is_folder:
         check_output(arguments.out, arguments.results)
     selection = select(results, arguments.cloud, arguments.all)

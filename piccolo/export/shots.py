@@ -13,6 +13,7 @@ import numpy as np
 from ..errors import InputError
 from ..pose import Pose
 from ..result import Result
+from ..scenes import Scene
 from ..verdict import LOCALIZED
 from .model import Format, Options, Shot, check_size
 from .pictures import picture_size
@@ -57,6 +58,15 @@ def read_results(path: Path) -> list[Result]:
     if not results:
         raise InputError(f"{path}: found no result, {WANTED}")
     return results
+
+
+def true_results(scene: Scene) -> list[Result]:
+    """The true poses of a scene, as if they had been found beyond doubt: a reference for other tools."""
+    cloud = str(scene.cloud)
+    return [
+        Result(LOCALIZED, 1.0, cloud, str(query.image), query.pose, None, None, (), None, {}, {})
+        for query in scene.queries
+    ]
 
 
 def _check(result: Result) -> None:
