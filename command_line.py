@@ -3,13 +3,22 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 from piccolo import __version__
 from piccolo.errors import InputError
 from piccolo.labels import Labels
 from piccolo.panorama import ReadOptions
-from piccolo.settings import METRES, CloudSettings, EngineSettings, PaperSettings, Prior, UpAxis
+from piccolo.settings import (
+    METRES,
+    CloudSettings,
+    EngineSettings,
+    Initialization,
+    PaperSettings,
+    PoseLoss,
+    Prior,
+    UpAxis,
+)
 from piccolo.threads import num_cores
 
 DESCRIPTION = "Find where in a coloured point cloud 360-degree panoramas were taken."
@@ -24,8 +33,8 @@ examples:
 output: one JSON object a panorama, one a line, in the order given; messages and progress go to stderr.
 exit codes: 0 all localized, 1 some not, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
-# option, metavar, type, help: settings that only one preset has, named as the setting
-Option = tuple[str, str, type, str]
+# option, metavar, type or choices, help: settings that only one preset has, named as the setting
+Option = tuple[str, str | None, type | tuple[str, ...], str]
 ENGINE_OPTIONS: tuple[Option, ...] = (
     ("--num-yaws", "N", int, "rotations searched where gravity is known"),
     ("--num-rotations", "N", int, "rotations of SO(3) searched where it is not"),
@@ -34,6 +43,9 @@ ENGINE_OPTIONS: tuple[Option, ...] = (
 PAPER_OPTIONS: tuple[Option, ...] = (
     ("--translations", "N_t", int, "start positions in free space"),
     ("--rotations", "N_r", int, "start rotations; 0: 8 yaws if gravity is known, 32 of SO(3) if not"),
+    ("--loss", None, get_args(PoseLoss), "photometric: pixels of the rendered cloud, the paper's comparison"),
+    ("--photometric-width", "PX", int, "of rendered cloud and panorama with the photometric loss, at most"),
+    ("--initialization", None, get_args(Initialization), "loss-only: K2 poses by the loss, no histograms"),
     ("--keep-by-loss", "K1", int, "poses kept by the loss"),
     ("--keep-by-histogram", "K2", int, "poses kept by colour histograms, and refined"),
     ("--iterations", "N", int, "iterations of the solver"),
@@ -169,7 +181,8 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
         for option, metavar, kind, text in options:
             name = option[2:].replace("-", "_")
             default = getattr(settings, PAPER_SETTING.get(name, name))
-            group.add_argument(option, type=kind, metavar=metavar, help=f"{text} (default {default})")
+            checked: dict[str, Any] = {"choices": kind} if isinstance(kind, tuple) else {"type": kind}
+            group.add_argument(option, **checked, metavar=metavar, help=f"{text} (default {default})")
     group.add_argument("--no-visibility", action="store_const", const=True, help="see through walls")
 
 

@@ -1,4 +1,4 @@
-"""Descend on the sampling loss from one start: step 4 of the paper's Algorithm 1, and other solvers."""
+"""Descend on a loss from one start: step 4 of the paper's Algorithm 1, and other solvers."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,7 +15,24 @@ from .settings import DescentSettings
 
 MAX_STEP = 0.2  # [rad, m] of Gauss-Newton
 
-Objective = Callable[[Pose], tuple[float, Array, Array]]  # loss, gradient (6,), normal matrix (6, 6)
+Equations = tuple[float, Array, Array]  # loss, its gradient (6,) by a step, normal matrix (6, 6)
+Objective = Callable[[Pose], Equations]
+
+
+@dataclass(frozen=True)
+class Loss:
+    """What a pose is judged by: functions of the points that count and of the pose; small is good."""
+
+    value: Callable[[PackedPoints, Pose], float]
+    equations: Callable[[PackedPoints, Pose], Equations]
+
+
+def sampling_loss_of(texels: Texels) -> Loss:
+    """The paper's sampling loss of a panorama."""
+    return Loss(
+        lambda points, pose: sampling_loss(points, texels, pose),
+        lambda points, pose: normal_equations(points, texels, pose),
+    )
 
 
 @dataclass(frozen=True)
@@ -23,7 +40,7 @@ class Refined:
     """Where a descent arrived."""
 
     pose: Pose
-    loss: float  # sampling loss over the points seen from there
+    loss: float  # over the points seen from there
     num_iterations: int
 
 
@@ -126,7 +143,7 @@ def descend_gauss_newton(objective: Objective, pose: Pose, num_iterations: int) 
     return best
 
 
-def refine(points: PackedPoints, texels: Texels, start: Pose, settings: DescentSettings) -> Refined:
+def refine(points: PackedPoints, loss: Loss, start: Pose, settings: DescentSettings) -> Refined:
     """Descend from `start`; the points that the camera does not see are left out anew `num_culls` times.
 
     A cull changes the function, so that losses before and after it do not compare: the best pose of the last
@@ -140,7 +157,7 @@ def refine(points: PackedPoints, texels: Texels, start: Pose, settings: DescentS
         return visible_points(points, at.center_world) if settings.use_visibility else points
 
     for num_iterations in np.diff(bounds).tolist():
-        objective = partial(normal_equations, seen_from(pose), texels)
+        objective = partial(loss.equations, seen_from(pose))
         if settings.solver == "adam":
             adam.best_loss = np.inf
             pose = descend_adam(objective, pose, adam, num_iterations).pose
@@ -148,5 +165,4 @@ def refine(points: PackedPoints, texels: Texels, start: Pose, settings: DescentS
             pose = descend_lbfgs(objective, pose, num_iterations).pose
         else:
             pose = descend_gauss_newton(objective, pose, num_iterations).pose
-    loss = sampling_loss(seen_from(pose), texels, pose)
-    return Refined(pose, loss, settings.num_iterations)
+    return Refined(pose, loss.value(seen_from(pose), pose), settings.num_iterations)

@@ -9,7 +9,10 @@ from .labels import Labels
 
 Gravity = Literal["auto", "known", "unknown"]
 MIN_CONFIDENCE = 0.9
+MIN_VIEW_WIDTH, MAX_VIEW_WIDTH = 32, 4096  # [px] of a rendered view
 Solver = Literal["gauss-newton", "lbfgs", "adam"]
+PoseLoss = Literal["sampling", "photometric"]
+Initialization = Literal["two-stage", "loss-only"]
 UpAxis = Literal["auto", "z", "y", "x", "-z", "-y", "-x"]
 
 METRES = {"mm": 0.001, "cm": 0.01, "m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}  # per unit of length
@@ -45,7 +48,7 @@ def check_confidence(min_confidence: float) -> None:
 
 @dataclass(frozen=True)
 class DescentSettings:
-    """A descent on the sampling loss; the paper's names in brackets."""
+    """A descent on a loss; the paper's names in brackets."""
 
     solver: Solver = "adam"
     num_iterations: int = 100  # [N_iter] of the solver
@@ -65,10 +68,13 @@ class PaperSettings(DescentSettings):
     num_rotations: int = (
         0  # [N_r] 0 for the paper's: 8 yaws where gravity is known, 32 rotations of SO(3) if not
     )
-    num_by_loss: int = 50  # [K1] poses kept by the sampling loss
+    loss: PoseLoss = "sampling"  # photometric: of the rendered cloud, pixel by pixel
+    initialization: Initialization = "two-stage"  # loss-only: K2 poses by the loss, without histograms
+    num_by_loss: int = 50  # [K1] poses kept by the loss
     num_by_histogram: int = 6  # [K2] poses kept by the colour histograms, and refined
     grid_margin: float = 0.0  # share of the box left out of the grid on each side
     histogram_bins: int = 8  # a channel
+    photometric_width: int = 256  # [px] at most, of the views and of the panorama for the photometric loss
     histogram_width: int = 256  # [px] of the views and of the panorama that are compared
     min_distance: float = (
         0.3  # poses closer than this [m] and than `min_angle_deg` are one: the better is kept
@@ -95,6 +101,11 @@ class PaperSettings(DescentSettings):
         check_confidence(self.min_confidence)
         if not 2 <= self.histogram_bins <= 64:
             raise InputError(f"histogram_bins: found {self.histogram_bins}, wanted 2 to 64")
+        if not MIN_VIEW_WIDTH <= self.photometric_width <= MAX_VIEW_WIDTH or self.photometric_width % 2:
+            raise InputError(
+                f"photometric_width: found {self.photometric_width}, wanted an even number of "
+                f"{MIN_VIEW_WIDTH} to {MAX_VIEW_WIDTH}"
+            )
 
     @property
     def effective_num_rotations(self) -> int:

@@ -11,7 +11,7 @@ SCALES, OFFSETS = np.array([1e-3, 1e-4, 2e-3]), np.array([637_000.0, 5_849_000.0
 PLAIN_SIZE = {0: 20, 1: 28, 2: 26, 3: 34, 4: 57, 5: 63, 6: 30, 7: 36, 8: 38, 9: 59, 10: 67}
 
 
-def las_bytes(raw, point_format=3, colors=None, withheld=None, extra_bytes=0, intensity=None):
+def las_bytes(raw, point_format=3, colors=None, withheld=None, extra_bytes=0, intensity=None, classes=None):
     """A LAS file of a cloud; `colors` (N, 3) uint16 default to the cloud's in full 16 bits."""
     header = laspy.LasHeader(point_format=point_format, version="1.4" if point_format > 5 else "1.3")
     header.scales, header.offsets = SCALES, OFFSETS
@@ -24,6 +24,8 @@ def las_bytes(raw, point_format=3, colors=None, withheld=None, extra_bytes=0, in
         las.red, las.green, las.blue = colors.T
     if intensity is not None:
         las.intensity = intensity
+    if classes is not None:
+        las.classification = classes
     if withheld is not None:
         las.withheld = withheld
     content = io.BytesIO()

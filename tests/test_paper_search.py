@@ -5,6 +5,7 @@ import rooms
 from piccolo.paper.search import Scored, histogram_distance, keep_diverse, losses_at
 from piccolo.pose import Pose, are_same, yaw_rotation
 from piccolo.pyramid import shrink
+from piccolo.refine import sampling_loss_of
 from piccolo.sampling import pack_texels
 
 AT = np.array([1.0, 2.0, 1.5])
@@ -44,7 +45,7 @@ def test_true_rotation_has_the_smallest_loss(scene):
     turns = np.stack(
         [yaw_rotation(a) @ true_pose.R_cam_from_world for a in np.radians([0, 45, 90, 180, 270])]
     )
-    scored = losses_at(points, pack_texels(panorama.rgb), true_pose.center_world, turns)
+    scored = losses_at(points, sampling_loss_of(pack_texels(panorama.rgb)), true_pose.center_world, turns)
     assert np.argmin([s.score for s in scored]) == 0
 
 

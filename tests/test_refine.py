@@ -6,7 +6,7 @@ import rooms
 from rooms import errors
 
 from piccolo.pose import Pose, step, yaw_rotation
-from piccolo.refine import Adam, Best, descend_lbfgs, refine
+from piccolo.refine import Adam, Best, descend_lbfgs, refine, sampling_loss_of
 from piccolo.sampling import pack_texels
 from piccolo.settings import PaperSettings
 
@@ -24,7 +24,7 @@ def test_descent_recovers_the_true_pose(scene, solver, use_visibility):
     points, panorama, true_pose = scene
     texels = pack_texels(panorama.rgb)
     settings = dataclasses.replace(PaperSettings(), solver=solver, use_visibility=use_visibility)
-    refined = refine(points, texels, step(true_pose, PERTURBATION), settings)
+    refined = refine(points, sampling_loss_of(texels), step(true_pose, PERTURBATION), settings)
     distance, angle_deg = errors(refined.pose, true_pose)
     assert distance < 0.010
     assert angle_deg < 0.3

@@ -47,7 +47,7 @@ EXTRA_BYTES = frozenset({0, 14})  # item types
 NUM_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # by item type; extra bytes have one each
 MAX_CHUNK_SIZE = 1 << 29  # [byte] of a chunk's records, for it is decompressed at once; 2 MB are usual
 # What is wanted of formats 6 to 10, where fields can be passed over.
-SELECTED = ("XY_RETURNS_CHANNEL", "Z", "INTENSITY", "FLAGS", "RGB")
+SELECTED = ("XY_RETURNS_CHANNEL", "Z", "INTENSITY", "FLAGS", "CLASSIFICATION", "RGB")
 
 BROKEN = "the file is cut off or broken"
 

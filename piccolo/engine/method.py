@@ -10,7 +10,7 @@ from ..loss import sampling_loss
 from ..panorama import Panorama
 from ..pose import Pose
 from ..pyramid import shrink
-from ..refine import refine
+from ..refine import refine, sampling_loss_of
 from ..render import visible_points
 from ..result import Localization
 from ..sampling import pack_texels
@@ -120,7 +120,7 @@ def judged(look: Look, panorama: Panorama, found: Found) -> Localization:
     texels = pack_texels(panorama.rgb, panorama.is_valid)
     if settings.solver != "gauss-newton":
         how = DescentSettings(solver=settings.solver, step_size=0.01)
-        pose = refine(scan_map.points, texels, pose, how).pose
+        pose = refine(scan_map.points, sampling_loss_of(texels), pose, how).pose
     loss = sampling_loss(visible_points(scan_map.points, pose.center_world), texels, pose)
     if not math.isfinite(loss):
         return Localization()

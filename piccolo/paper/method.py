@@ -10,7 +10,8 @@ from ..cloud.packed import PackedPoints, pack_points
 from ..hypotheses import Hypothesis, lead, rivals_of
 from ..panorama import Panorama
 from ..pose import Pose
-from ..refine import Refined, refine
+from ..pyramid import shrink
+from ..refine import Loss, Refined, refine, sampling_loss_of
 from ..result import Localization
 from ..rotations import uniform_rotations, uniform_yaws
 from ..sampling import pack_texels
@@ -19,6 +20,7 @@ from ..stopwatch import Stopwatch
 from ..threads import Workers
 from ..verdict import verdict
 from ..verify import Evidence, evidence_at
+from .photometric import photometric_loss_of
 from .search import search
 from .starts import free_grid
 
@@ -46,6 +48,13 @@ def prepare(cloud: Cloud, settings: PaperSettings) -> PaperMap:
     )
 
 
+def loss_of(panorama: Panorama, settings: PaperSettings) -> Loss:
+    """The loss that the settings ask for."""
+    if settings.loss == "photometric":
+        return photometric_loss_of(shrink(panorama, settings.photometric_width))
+    return sampling_loss_of(pack_texels(panorama.rgb, panorama.is_valid))
+
+
 def localize(
     paper_map: PaperMap, panorama: Panorama, settings: PaperSettings, workers: Workers, watch: Stopwatch
 ) -> Localization:
@@ -53,11 +62,11 @@ def localize(
     points = paper_map.points
     known = settings.gravity == "known"
     rotations = (uniform_yaws if known else uniform_rotations)(settings.effective_num_rotations)
-    texels = pack_texels(panorama.rgb, panorama.is_valid)
+    loss = loss_of(panorama, settings)
     with watch.stage("search"):
-        starts = search(points, panorama, texels, (paper_map.positions, rotations), settings, workers)
+        starts = search(points, panorama, loss, (paper_map.positions, rotations), settings, workers)
     with watch.stage("refine"):
-        refined = list(workers.each(lambda s: refine(points, texels, s.pose, settings), starts, "refine"))
+        refined = list(workers.each(lambda s: refine(points, loss, s.pose, settings), starts, "refine"))
         best = min(refined, key=lambda r: r.loss, default=None)
     if best is None or not np.isfinite(best.loss):
         return Localization()

@@ -7,12 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cloud.packed import PackedPoints
-from ..loss import sampling_loss
 from ..panorama import Panorama
 from ..pose import Array, Pose, are_same
 from ..pyramid import shrink
+from ..refine import Loss
 from ..render import render_view, visible_points
-from ..sampling import Texels
 from ..settings import PaperSettings
 from ..threads import Workers
 from .histogram import color_histogram, histogram_intersection
@@ -40,11 +39,11 @@ def keep_diverse(
 
 
 def losses_at(
-    points: PackedPoints, texels: Texels, center_world: Array, rotations: NDArray[np.float64]
+    points: PackedPoints, loss: Loss, center_world: Array, rotations: NDArray[np.float64]
 ) -> list[Scored]:
-    """Sampling loss of every rotation (N, 3, 3) at one position (3,)."""
+    """Loss of every rotation (N, 3, 3) at one position (3,)."""
     poses = [Pose(R_cam_from_world, center_world) for R_cam_from_world in rotations]
-    return [Scored(pose, sampling_loss(points, texels, pose)) for pose in poses]
+    return [Scored(pose, loss.value(points, pose)) for pose in poses]
 
 
 def histogram_distance(points: PackedPoints, panorama: Panorama, pose: Pose, bins: int) -> float:
@@ -59,7 +58,7 @@ def histogram_distance(points: PackedPoints, panorama: Panorama, pose: Pose, bin
 def search(
     points: PackedPoints,
     panorama: Panorama,
-    texels: Texels,
+    loss: Loss,
     grid: tuple[NDArray[np.float64], NDArray[np.float64]],
     settings: PaperSettings,
     workers: Workers,
@@ -70,9 +69,11 @@ def search(
 
     def losses(center_world: Array) -> list[Scored]:
         seen = visible_points(points, center_world) if settings.use_visibility else points
-        return losses_at(seen, texels, center_world, rotations)
+        return losses_at(seen, loss, center_world, rotations)
 
     scored = [s for batch in workers.each(losses, list(positions), "search") for s in batch]
+    if settings.initialization == "loss-only":
+        return keep_diverse(scored, settings.num_by_histogram, distance, angle)
     by_loss = keep_diverse(scored, settings.num_by_loss, distance, angle)
     small = shrink(panorama, settings.histogram_width)
 

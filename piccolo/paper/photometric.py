@@ -1,0 +1,118 @@
+"""The photometric loss, the paper's comparison: the cloud is rendered, and pixels are compared.
+
+    L(R, t) = (1 / N') sum_u || V(u) - I(u) ||_2
+
+over the N' pixels u in which the view V, z-buffered at the pose, shows points, and the panorama I counts. A
+pixel's depth says which point p it shows. A step (w, d) moves it by dp = w x p - d and in the image by
+du = J dp, so at a fixed pixel V changes by -grad V . J dp. Rasterisation and occlusions have no derivative.
+"""
+
+import functools
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cloud.packed import PackedPoints
+from ..panorama import Panorama
+from ..pose import Pose
+from ..refine import Equations, Loss
+from ..render import View, render_view
+from ..sphere import pixel_rays
+
+Image = NDArray[np.float32]
+
+MIN_SHOWN_SHARE = 0.5  # of what is rendered, as of the sampling loss: masked pixels may not hide more
+MIN_FILLED_SHARE = 0.1  # of the pixels that the points could fill: fewer are seen from outside of a scan
+LEAST_DEPTH = 1e-3  # [m]
+LEAST_NORM = 0.5 / 255.0  # a residual below half an 8-bit level has the weight of half a level
+
+
+def photometric_loss(points: PackedPoints, panorama: Panorama, pose: Pose) -> float:
+    """The loss at `pose`, in [0, sqrt(3)], over the panorama's own pixels; inf where too little is shown."""
+    view = render_view(points, pose, panorama.rgb.shape[1])
+    residuals, counts = _compared(view, panorama)
+    if not _shows_enough(view, panorama, counts, len(points)):
+        return math.inf
+    return float(np.linalg.norm(residuals[counts], axis=-1).mean(dtype=np.float64))
+
+
+def photometric_loss_of(panorama: Panorama) -> Loss:
+    """The photometric loss of a panorama, at its own size."""
+    return Loss(
+        lambda points, pose: photometric_loss(points, panorama, pose),
+        lambda points, pose: photometric_equations(points, panorama, pose),
+    )
+
+
+def photometric_equations(points: PackedPoints, panorama: Panorama, pose: Pose) -> Equations:
+    """Loss, its gradient (6,) and the matrix (6, 6) of iteratively reweighted least squares at `pose`."""
+    view = render_view(points, pose, panorama.rgb.shape[1])
+    residuals, counts = _compared(view, panorama)
+    if not _shows_enough(view, panorama, counts, len(points)):
+        return math.inf, np.zeros(6), np.eye(6)
+    residuals = residuals[counts]
+    norms = np.linalg.norm(residuals, axis=-1)
+    by_u, by_v = (gradient[counts] for gradient in view_gradient(view))
+    rows_u, rows_v = pixel_motion(view.depth, counts)
+    weights = 1.0 / np.maximum(norms, LEAST_NORM)
+    e_u, e_v = weights * (by_u * residuals).sum(axis=1), weights * (by_v * residuals).sum(axis=1)
+    gradient = -(e_u @ rows_u + e_v @ rows_v)
+    a_uu, a_uv, a_vv = (weights * (a * b).sum(axis=1) for a, b in ((by_u, by_u), (by_u, by_v), (by_v, by_v)))
+    cross = (rows_u * a_uv[:, None]).T @ rows_v
+    matrix = (rows_u * a_uu[:, None]).T @ rows_u + (rows_v * a_vv[:, None]).T @ rows_v + cross + cross.T
+    count = len(norms)
+    return float(norms.mean(dtype=np.float64)), gradient / count, matrix / count
+
+
+def _compared(view: View, panorama: Panorama) -> tuple[Image, NDArray[np.bool_]]:
+    """Differences (H, W, 3) of view and panorama in [-1, 1], and where both show something."""
+    return view.rgb - panorama.rgb.astype(np.float32) / np.float32(255.0), view.is_seen & panorama.is_valid
+
+
+def _shows_enough(view: View, panorama: Panorama, counts: NDArray[np.bool_], num_points: int) -> bool:
+    """False where masked pixels hide too much of the view, or it is nearly empty, as from outside a scan."""
+    num_seen = int(view.is_seen.sum())
+    least_shown = MIN_SHOWN_SHARE * float(panorama.is_valid.mean()) ** 2 * num_seen
+    least_seen = MIN_FILLED_SHARE * min(view.is_seen.size, num_points)
+    return num_seen > least_seen and int(counts.sum()) > least_shown
+
+
+def view_gradient(view: View) -> tuple[Image, Image]:
+    """Derivatives (H, W, 3) of a view by u and v [1/px]: central, one-sided beside a hole, 0 between two."""
+    seen = view.is_seen[..., None].astype(np.float32)
+    gradients = []
+    for axis in (1, 0):
+        ahead, behind = (np.roll(view.rgb, -step, axis=axis) for step in (1, -1))
+        has_ahead, has_behind = (np.roll(seen, -step, axis=axis) for step in (1, -1))
+        if axis == 0:  # rows do not wrap
+            has_ahead[-1], has_behind[0] = 0.0, 0.0
+        total = (ahead - view.rgb) * has_ahead + (view.rgb - behind) * has_behind
+        gradients.append(total / np.maximum(has_ahead + has_behind, 1.0))
+    return gradients[0], gradients[1]
+
+
+@functools.lru_cache(maxsize=2)
+def _unit_motion(width: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Derivatives (H, W, 6) of u and v by a step, of what is 1 m off at each pixel's centre."""
+    rays = pixel_rays(width)
+    x, y, z = np.moveaxis(rays, -1, 0)
+    rho = np.hypot(x, y)
+    scale = width / (2.0 * math.pi)
+    by_p_of_u = scale * np.stack([y, -x, np.zeros_like(x)], axis=-1) / rho[..., None] ** 2
+    by_p_of_v = scale * np.stack([x * z, y * z, -(rho**2)], axis=-1) / rho[..., None]
+    rows_u, rows_v = (
+        np.concatenate([np.cross(rays, by_p), -by_p], axis=-1) for by_p in (by_p_of_u, by_p_of_v)
+    )
+    return rows_u, rows_v
+
+
+def pixel_motion(
+    depth: NDArray[np.float32], counts: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Derivatives (N, 6) of u and v [px] by a step, of what pixels of `counts` show at `depth` (H, W)."""
+    rows_u, rows_v = (rows[counts] for rows in _unit_motion(depth.shape[1]))
+    per_depth = 1.0 / np.maximum(depth[counts], LEAST_DEPTH)[:, None]
+    rows_u[:, 3:] *= per_depth  # a turn moves pixels alike at every depth
+    rows_v[:, 3:] *= per_depth
+    return rows_u, rows_v

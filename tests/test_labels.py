@@ -1,0 +1,190 @@
+"""Semantic labels as colours: the palette, labels of points, pictures of labels."""
+
+import re
+
+import cv2
+import numpy as np
+import pytest
+from las_files import OFFSETS, las_bytes, laz_bytes
+from pictures import write
+from plyfile import PlyData, PlyElement
+from scipy.spatial.distance import pdist
+from test_cloud_order import seeded_cloud, whole
+
+from piccolo.cloud import open_cloud, open_source
+from piccolo.cloud.raw import RawCloud, ReadOptions
+from piccolo.errors import InputError
+from piccolo.labels import NUM_COLORS, Labels, colors_of, palette
+from piccolo.panorama import ReadOptions as PanoramaOptions
+from piccolo.panorama import read_panorama
+from piccolo.settings import CloudSettings
+
+POINTS = seeded_cloud(1, num_points=3000).points_world
+LABELS = np.random.default_rng(2).integers(0, 21, 3000)
+READ = ReadOptions(labels=Labels())
+IMAGE = np.random.default_rng(3).integers(0, 200, (64, 128))
+READ_IMAGE = PanoramaOptions(labels=Labels())
+
+
+@pytest.mark.parametrize(("count", "least"), [(16, 120.0), (64, 65.0), (256, 36.0), (NUM_COLORS, 16.0)])
+def test_colors_of_the_first_labels_are_far_apart(count, least):
+    assert pdist(colors_of(np.arange(count)).astype(float)).min() >= least
+
+
+def test_no_color_is_black_and_a_label_alone_decides():
+    assert palette().max(axis=1).min() > 0
+    shuffled = np.array([[5, 70_000], [-1, 5]])
+    np.testing.assert_array_equal(colors_of(shuffled)[0, 0], colors_of(shuffled)[1, 1])
+    np.testing.assert_array_equal(colors_of(shuffled)[1, 0], palette()[NUM_COLORS - 1])
+
+
+def test_labels_in_the_upper_bytes_keep_colors_of_their_own():
+    for step in (256, 65_536):
+        assert len(np.unique(colors_of(step * np.arange(256)), axis=0)) == 256
+
+
+def _ply(path, name="label", kind="i4", text=False, values=LABELS):
+    table = np.zeros(len(POINTS), [(n, "f8") for n in "xyz"] + [("red", "u1"), (name, kind)])
+    for k, n in enumerate("xyz"):
+        table[n] = POINTS[:, k]
+    table[name] = values
+    PlyData([PlyElement.describe(table, "vertex")], text=text).write(str(path))
+    return path
+
+
+@pytest.mark.parametrize(
+    "name", ["label", "class", "Classification", "scalar_Label", "scalar_Classification"]
+)
+@pytest.mark.parametrize(("kind", "text"), [("u1", False), ("i4", True), ("f4", False), ("f8", True)])
+def test_ply(tmp_path, name, kind, text):
+    read = whole(open_source, _ply(tmp_path / "a.ply", name, kind, text), READ)
+    np.testing.assert_array_equal(read.colors, colors_of(LABELS))
+    np.testing.assert_allclose(read.points_world, POINTS, rtol=1e-14)
+
+
+def test_ignored_labels_are_left_out(tmp_path):
+    read = whole(open_source, _ply(tmp_path / "a.ply"), ReadOptions(labels=Labels((0, 7, 99))))
+    is_kept = (LABELS != 0) & (LABELS != 7)
+    np.testing.assert_array_equal(read.points_world, POINTS[is_kept])
+    np.testing.assert_array_equal(read.colors, colors_of(LABELS[is_kept]))
+    everything = CloudSettings(labels=Labels(tuple(range(21))))
+    with pytest.raises(InputError, match="found 0 finite points"):
+        open_cloud([tmp_path / "a.ply"], everything).read()
+
+
+@pytest.mark.parametrize("wrong", [3.5, np.nan, -np.inf, 1e12])
+def test_labels_that_are_no_whole_numbers_are_refused(tmp_path, wrong):
+    path = _ply(tmp_path / "a.ply", kind="f8", values=np.where(np.arange(3000) == 1700, wrong, LABELS))
+    with pytest.raises(
+        InputError, match=re.escape(f"a.ply: found the label {wrong:g}, wanted whole numbers")
+    ):
+        whole(open_source, path, READ)
+
+
+def test_points_without_a_position_need_no_label(tmp_path, monkeypatch):
+    broken = POINTS.copy()
+    broken[5] = np.nan
+    monkeypatch.setattr("test_labels.POINTS", broken)
+    path = _ply(tmp_path / "a.ply", kind="f4", values=np.where(np.arange(3000) == 5, np.nan, LABELS))
+    cloud = open_cloud([path], CloudSettings(labels=Labels())).read()
+    assert (len(cloud.points), cloud.num_dropped) == (2999, 1)
+
+
+@pytest.mark.parametrize(("point_format", "most"), [(0, 31), (3, 31), (6, 255), (7, 255)])
+@pytest.mark.parametrize("is_compressed", [False, True])
+def test_las(tmp_path, point_format, most, is_compressed):
+    raw = RawCloud(np.round(POINTS, 2) + OFFSETS, np.zeros((3000, 3), np.uint8))
+    classes, withheld = np.arange(3000) % (most + 1), np.arange(3000) >= 2900
+    content = las_bytes(raw, point_format, classes=classes, withheld=withheld)
+    path = write(tmp_path / "a.las", laz_bytes(content, chunk=700) if is_compressed else content)
+    read = whole(open_source, path, READ)
+    np.testing.assert_array_equal(read.colors, colors_of(classes[:2900]))
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+def test_pcd(tmp_path, encoding):
+    table = np.zeros(3000, [*((axis, "<f4") for axis in "xyz"), ("label", "<u4")])
+    for k, axis in enumerate("xyz"):
+        table[axis] = POINTS[:, k]
+    table["label"] = LABELS
+    header = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z label\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\n"
+    header += f"WIDTH 3000\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3000\nDATA {encoding}\n"
+    rows = "\n".join(" ".join(map(str, row)) for row in table.tolist()) + "\n"
+    path = write(
+        tmp_path / "a.pcd", header.encode() + (rows.encode() if encoding == "ascii" else table.tobytes())
+    )
+    np.testing.assert_array_equal(whole(open_source, path, READ).colors, colors_of(LABELS))
+    write(path, path.read_bytes().replace(b"label", b"ring_"))
+    with pytest.raises(InputError, match="the fields are 'x y z ring_', wanted x y z and label"):
+        open_source(path, READ)
+
+
+def test_clouds_without_labels_are_refused(tmp_path):
+    with pytest.raises(InputError, match="the vertices have x y z red thing, wanted x y z and a label"):
+        open_source(_ply(tmp_path / "a.ply", "thing"), READ)
+    with pytest.raises(InputError, match=r"a.pts: labels are not read from PTS, wanted PLY, LAS, LAZ, PCD"):
+        open_source(write(tmp_path / "a.pts", b"3\n1 2 3 9 1 1 1\n"), READ)
+    mesh = PlyData.read(str(tmp_path / "a.ply"))
+    faces = np.array([([0, 1, 2],)], dtype=[("vertex_indices", "i4", (3,))])
+    PlyData([mesh["vertex"], PlyElement.describe(faces, "face")]).write(str(tmp_path / "mesh.ply"))
+    with pytest.raises(InputError, match=r"mesh.ply: found a mesh, wanted points with labels"):
+        open_source(tmp_path / "mesh.ply", READ)
+    with pytest.raises(InputError, match="--labels, --intensity-as-gray: found both"):
+        CloudSettings(intensity_as_gray=True, labels=Labels())
+
+
+def _png(path, pixels):
+    assert cv2.imwrite(str(path), pixels)
+    return path
+
+
+def test_pictures_of_labels_in_8_16_and_24_bits(tmp_path):
+    deep = IMAGE * 300
+    of_24_bits = deep * 256 + 9
+    bgr = np.stack([of_24_bits & 255, of_24_bits >> 8 & 255, of_24_bits >> 16], axis=-1)
+    for labels, pixels in (
+        (IMAGE, IMAGE.astype(np.uint8)),
+        (deep, deep.astype(np.uint16)),
+        (of_24_bits, bgr),
+    ):
+        panorama = read_panorama(_png(tmp_path / "a.png", pixels), READ_IMAGE)
+        np.testing.assert_array_equal(panorama.rgb, colors_of(labels))
+        assert panorama.is_valid.all()
+
+
+def test_ignored_labels_and_masks_do_not_count_and_nothing_else_is_masked(tmp_path):
+    labels = IMAGE.copy()
+    labels[:9], labels[-9:] = 0, 1  # as a black border and a disc over the nadir look in colours
+    path = _png(tmp_path / "a.png", labels.astype(np.uint8))
+    assert read_panorama(path, READ_IMAGE).is_valid.all()
+    mask = _png(
+        tmp_path / "mask.png",
+        np.where(np.arange(128) < 20, 255, 0).astype(np.uint8) * np.ones((64, 1), np.uint8),
+    )
+    panorama = read_panorama(path, PanoramaOptions(mask=mask, mask_nadir_deg=20.0, labels=Labels((0, 5))))
+    expected = (labels != 0) & (labels != 5) & (np.arange(128) >= 20)
+    expected[-7:] = False
+    np.testing.assert_array_equal(panorama.is_valid, expected)
+    with pytest.raises(InputError, match="found no pixel that counts, all are masked, black or of ignored"):
+        read_panorama(path, PanoramaOptions(labels=Labels(tuple(range(256)))))
+
+
+def test_pictures_that_do_not_keep_labels_are_refused(tmp_path):
+    gray, rgba = IMAGE.astype(np.uint8), np.zeros((64, 128, 4), np.uint8)
+    wanted = "found another kind of picture, wanted labels in a PNG, grey of 8 or 16 bits or RGB of 8"
+    deep_rgb = np.zeros((64, 128, 3), np.uint16)
+    for path in (
+        _png(tmp_path / "a.jpg", gray),
+        _png(tmp_path / "a.webp", gray),
+        _png(tmp_path / "rgba.png", rgba),
+        _png(tmp_path / "deep.png", deep_rgb),
+    ):
+        with pytest.raises(InputError, match=f"{path.name}: {wanted}"):
+            read_panorama(path, READ_IMAGE)
+    _, bits = cv2.imencode(".png", gray, [cv2.IMWRITE_PNG_BILEVEL, 1])
+    with pytest.raises(InputError, match=wanted):
+        read_panorama(write(tmp_path / "b.png", bytes(bits)), READ_IMAGE)
+    with pytest.raises(InputError, match=r"found labels of 128 x 65, wanted the full sphere, W = 2 H"):
+        read_panorama(_png(tmp_path / "c.png", np.zeros((65, 128), np.uint8)), READ_IMAGE)
+    with pytest.raises(InputError, match="--labels: found --fov or --cube-order too"):
+        PanoramaOptions(fov_deg=90.0, labels=Labels())
