@@ -25,6 +25,7 @@ LAYERS = [
     {"datasets"},
     {"pipeline"},
     {"evaluation"},
+    {"experiments"},
 ]
 # pyramid shrinks panoramas; points are packed as texels are
 SIDEWAYS = {("pyramid", "panorama"), ("cloud", "sampling")}
