@@ -1,6 +1,7 @@
 """Scenes on disk: a folder with a cloud, panoramas, and a queries.json with their true poses."""
 
 import json
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,7 +40,7 @@ class Scene:
 
     def name_of(self, query: Query) -> str:
         """A query's image as queries.json has it."""
-        return query.image.relative_to(self.folder).as_posix()
+        return Path(os.path.relpath(query.image, self.folder)).as_posix()
 
 
 def read_scene(folder: Path, name: str | None = None) -> Scene:
@@ -118,11 +119,11 @@ def write_queries(folder: Path, queries: Iterable[Query], **more: object) -> Non
 
 def _entry(folder: Path, query: Query) -> dict[str, object]:
     entry: dict[str, object] = {
-        "image": query.image.relative_to(folder).as_posix(),
+        "image": Path(os.path.relpath(query.image, folder)).as_posix(),
         "variant": query.variant,
         "R_cam_from_world": query.pose.R_cam_from_world.tolist(),
         "center_world": query.pose.center_world.tolist(),
     }
     if query.labels:
-        entry["labels"] = query.labels.relative_to(folder).as_posix()
+        entry["labels"] = Path(os.path.relpath(query.labels, folder)).as_posix()
     return entry

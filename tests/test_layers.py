@@ -22,8 +22,10 @@ LAYERS = [
     {"verdict"},
     {"result", "scenes"},
     {"paper", "engine", "export"},
+    {"datasets"},
     {"pipeline"},
     {"evaluation"},
+    {"experiments"},
 ]
 # pyramid shrinks panoramas; points are packed as texels are
 SIDEWAYS = {("pyramid", "panorama"), ("cloud", "sampling")}

@@ -32,6 +32,15 @@ def test_a_scene_comes_back_as_it_was_written(tmp_path):
     assert json.loads((tmp_path / "queries.json").read_text())["source"] == "made up"
 
 
+def test_images_may_stand_elsewhere(tmp_path):
+    far = tmp_path / "elsewhere" / "a.jpg"
+    (tmp_path / "room").mkdir()
+    write_queries(tmp_path / "room", [Query(far, "robot", POSE)])
+    scene = read_scene(tmp_path / "room")
+    assert scene.name_of(scene.queries[0]) == "../elsewhere/a.jpg"
+    assert scene.queries[0].image.resolve() == far.resolve()
+
+
 def test_scenes_are_found_at_any_depth_and_named_by_it(tmp_path):
     for name in ("area_1/office 1", "area_1/hall", "area_2/hall"):
         _written(tmp_path / name)

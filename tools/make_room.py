@@ -35,12 +35,13 @@ from progress import shown
 EPILOG = """\
 examples:
   python tools/make_room.py --out room --seed 3
+  python tools/make_room.py --out rooms --scenes 25 --panoramas 2 --labels
   python tools/make_room.py --out flats --rooms 16 --points 2000000 --panoramas 4 --variants clean photo
 
 Writes FOLDER/cloud.ply, FOLDER/images/VARIANT_K.jpg and FOLDER/queries.json with the true poses.
 clean: as scanned; tilt: the camera turned anyhow; photo: other exposure, white balance, gamma, blur, noise;
 change: furniture moved and added. With --labels the points have a label too, and each panorama a picture
-of labels, FOLDER/labels/VARIANT_K.png. One JSON object on stdout says what was written.
+of labels, FOLDER/labels/VARIANT_K.png. One JSON object a scene on stdout says what was written.
 exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 
@@ -61,6 +62,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--rooms", type=int, default=1, help="side by side, at most 64 (default 1)")
     text = "label each point and pixel by its kind of surface, for localize.py --labels"
     parser.add_argument("--labels", action="store_true", help=text)
+    text = "a number of scenes, FOLDER/000 on, of the seeds from --seed on (default: one, in FOLDER itself)"
+    parser.add_argument("--scenes", type=int, default=0, metavar="N", help=text)
     parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
     return parser
@@ -85,9 +88,10 @@ def write_labels(folder: Path, name: str, labels: NDArray[np.uint16]) -> Path:
     return image
 
 
-def write_world(arguments: argparse.Namespace, world: World, workers: Workers) -> dict[str, object]:
-    """Write everything and return what was written."""
-    folder: Path = arguments.out
+def write_world(
+    arguments: argparse.Namespace, world: World, folder: Path, workers: Workers
+) -> dict[str, object]:
+    """Write one scene and return what was written."""
     check_num_points(world, arguments.points)
     check_width(arguments.width)
     (folder / "images").mkdir(parents=True, exist_ok=True)
@@ -104,7 +108,7 @@ def write_world(arguments: argparse.Namespace, world: World, workers: Workers) -
                 written = replace(written, labels=labels_path)
             queries.append(written)
     scenes.write_queries(folder, queries)
-    return {"folder": str(folder), "points": len(points), "queries": len(queries), "seed": arguments.seed}
+    return {"folder": str(folder), "points": len(points), "queries": len(queries), "seed": world.seed}
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -112,10 +116,13 @@ def main(argv: list[str] | None = None) -> int:
     arguments = build_parser().parse_args(argv)
 
     def run() -> int:
-        if arguments.panoramas < 0 or arguments.seed < 0:
-            raise InputError("--panoramas, --seed: found a negative number, wanted 0 or more")
-        world = make_world(arguments.seed, np.array(arguments.size), arguments.rooms)
-        print(json.dumps(write_world(arguments, world, Workers(num_cores(), shown(arguments.quiet)))))
+        if min(arguments.panoramas, arguments.seed, arguments.scenes) < 0:
+            raise InputError("--panoramas, --seed, --scenes: found a negative number, wanted 0 or more")
+        workers = Workers(num_cores(), shown(arguments.quiet))
+        for number in range(max(1, arguments.scenes)):
+            world = make_world(arguments.seed + number, np.array(arguments.size), arguments.rooms)
+            folder = arguments.out / f"{number:03}" if arguments.scenes else arguments.out
+            print(json.dumps(write_world(arguments, world, folder, workers)), flush=True)
         return 0
 
     return guarded("make_room.py", arguments.debug, run)

@@ -1,0 +1,27 @@
+"""Research datasets, read from their own folders and written as scenes with true poses."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from . import generic, loc360, matterport, mpo, omniscenes, stanford
+from .model import Listing, Request
+
+__all__ = ["DATASETS", "Dataset"]
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A dataset that can be converted."""
+
+    about: str  # in a line
+    listing: Callable[[Request], Listing]  # InputError if there is nothing of it in the folder
+
+
+DATASETS = {
+    stanford.NAME: Dataset("Stanford2D-3D-S panoramas with S3DIS room clouds", stanford.listing),
+    omniscenes.NAME: Dataset("OmniScenes, all splits", omniscenes.listing),
+    mpo.NAME: Dataset("MPO scans with panoramas, moved at random as in the PICCOLO paper", mpo.listing),
+    matterport.NAME: Dataset("Matterport3D skyboxes and house meshes", matterport.listing),
+    loc360.NAME: Dataset("360Loc 360-degree queries, with a cloud of your own", loc360.listing),
+    generic.NAME: Dataset("any panoramas with poses in a CSV, JSON or TUM file", generic.listing),
+}

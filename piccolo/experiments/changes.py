@@ -1,0 +1,95 @@
+"""Scenes with one thing changed: fewer points, the cloud turned, the camera upside down.
+
+Each writes what differs into a folder and leaves the scene itself alone.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from zlib import crc32
+
+import cv2
+import numpy as np
+
+from ..cloud import read_cloud
+from ..cloud.model import Cloud
+from ..cloud.ply_writing import vertex_rows, write_ply
+from ..errors import InputError
+from ..files import write_atomically
+from ..panorama import read_panorama
+from ..pose import Array, Pose
+from ..rotations import random_rotation
+from ..scenes import Query, Scene
+
+# A changed copy of a scene; the folder is there, and the copy's alone.
+Change = Callable[[Scene, Path], Scene]
+UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])  # half a turn about the view axis
+
+
+def as_it_is(scene: Scene, folder: Path) -> Scene:
+    """The scene itself."""
+    return scene
+
+
+def with_share(share: float) -> Change:
+    """A change to a share of the points, drawn at random."""
+
+    def change(scene: Scene, folder: Path) -> Scene:
+        cloud = read_cloud(scene.cloud)
+        return _with_points(scene, folder, cloud, max(1, round(share * len(cloud.points))))
+
+    return change
+
+
+def with_count(num_points: int) -> Change:
+    """A change to a number of points, drawn at random; InputError where there are fewer."""
+
+    def change(scene: Scene, folder: Path) -> Scene:
+        cloud = read_cloud(scene.cloud)
+        if len(cloud.points) < num_points:
+            raise InputError(f"{scene.cloud}: found {len(cloud.points)} points, wanted at least {num_points}")
+        return _with_points(scene, folder, cloud, num_points)
+
+    return change
+
+
+def turned_at_random(scene: Scene, folder: Path) -> Scene:
+    """The cloud turned by a rotation drawn from all of SO(3), the true poses with it."""
+    cloud = read_cloud(scene.cloud)
+    R_new_from_old = random_rotation(_rng(scene))
+    points = (cloud.points.astype(np.float64) + cloud.origin_world) @ R_new_from_old.T
+    path = folder / "cloud.ply"
+    write_ply(path, vertex_rows(points, cloud.colors))
+    queries = tuple(replace(query, pose=_turned(query.pose, R_new_from_old)) for query in scene.queries)
+    return replace(scene, cloud=path, queries=queries)
+
+
+def flipped(scene: Scene, folder: Path) -> Scene:
+    """Every picture taken with the camera upside down: turned by half a turn about the view axis."""
+    (folder / "images").mkdir()
+    queries = []
+    for number, query in enumerate(scene.queries):
+        rgb = read_panorama(query.image).rgb[::-1, ::-1]
+        image = folder / "images" / f"{number}_{query.image.stem}.png"
+        _, png = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+        write_atomically(image, bytes(png))
+        pose = Pose(UPSIDE_DOWN @ query.pose.R_cam_from_world, query.pose.center_world)
+        queries.append(Query(image, query.variant, pose))
+    return Scene(scene.name, folder, scene.cloud, tuple(queries))
+
+
+def _with_points(scene: Scene, folder: Path, cloud: Cloud, num_points: int) -> Scene:
+    chosen = np.sort(_rng(scene).choice(len(cloud.points), num_points, replace=False))
+    path = folder / "cloud.ply"
+    points = cloud.points[chosen].astype(np.float64) + cloud.origin_world
+    write_ply(path, vertex_rows(points, cloud.colors[chosen]))
+    return replace(scene, cloud=path)
+
+
+def _turned(pose: Pose, R_new_from_old: Array) -> Pose:
+    return Pose(pose.R_cam_from_world @ R_new_from_old.T, R_new_from_old @ pose.center_world)
+
+
+def _rng(scene: Scene) -> np.random.Generator:
+    """Of a scene's name: the same draw whatever else is tried."""
+    return np.random.default_rng([crc32(scene.name.encode()), len(scene.queries)])

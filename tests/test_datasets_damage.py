@@ -1,0 +1,108 @@
+"""Damaged files of poses: read or refused in one line that names them, and nothing else."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from poses import jpeg
+from refusals import mutated, read_or_refused
+
+from piccolo.datasets import DATASETS
+from piccolo.datasets.model import Request
+from piccolo.datasets.poses import MAX_MATRIX_SIZE
+
+T = np.eye(4)[[1, 2, 0, 3]]
+STEM = "camera_00_office_1_frame_equirectangular_domain"
+STANFORD = {"camera_location": [1.5, 2.0, 1.0], "final_camera_rotation": [1.5, 0.1, -2.0]}
+ROW = {
+    "image": "a.jpg", "tx": "1.5", "ty": 2, "tz": 3, "qw": 0.5, "qx": 0.5, "qy": 0.5, "qz": 0.5,
+    "direction": "world_from_cam", "axes": "optical", "room": "r",
+}  # fmt: skip
+CSV = f"{','.join(ROW)}\n{','.join(map(str, ROW.values()))}\n"
+SKYBOX = "house/matterport_skybox_images/ab_skybox"
+# by dataset: the file of poses, its content, and what else must be there
+FILES = {
+    "stanford2d3ds": (
+        f"area_1/pano/pose/{STEM}_pose.json",
+        json.dumps(STANFORD),
+        (f"area_1/pano/rgb/{STEM}_rgb.png", "Area_1/office_1/office_1.txt"),
+    ),
+    "omniscenes": (
+        "a_pose/b_hall_1_scene_1/c.txt",
+        "0 1 0 1.5\n0 0 1 2\n1 0 0 3\n",
+        ("a_pano/b_hall_1_scene_1/c.jpg", "pcd/hall_1.txt"),
+    ),
+    "360loc": (
+        "hall/query_360/s/camera_pose.json",
+        json.dumps({"a.jpg": T.tolist()}),
+        ("hall/cloud.xyz",),
+    ),
+    "matterport3d": (
+        "house/matterport_camera_poses/ab_pose_1_5.txt",
+        "\n".join(" ".join(map(str, row)) for row in T),
+        ("house/house_segmentations/house.ply", *(f"{SKYBOX}{k}_sami.jpg" for k in range(6))),
+    ),
+    "generic": ("poses.csv", CSV, ("cloud.xyz",)),
+    "generic json": ("poses.json", json.dumps([ROW]), ("cloud.xyz",)),
+    "generic tum": ("poses.txt", "1.5 1 2 3 0 0 0 1\n2.5 1 2 3 0 0 1 0\n", ("cloud.xyz", "images/1.5.jpg")),
+}  # fmt: skip
+
+
+def read_poses(name, folder):
+    request = Request(folder, axes="optical" if name == "generic tum" else None)
+    listing = DATASETS[name.split()[0]].listing(request)
+    return [shot.pose for plan in listing.plans for shot in plan.read_shots()]
+
+
+@pytest.fixture(scope="module", params=FILES)
+def dataset(request, tmp_path_factory):
+    """Name, folder, path of the poses and their whole content."""
+    folder = tmp_path_factory.mktemp("data set")
+    name, content, others = FILES[request.param]
+    for other in (name, *others):
+        (folder / other).parent.mkdir(parents=True, exist_ok=True)
+        jpeg(folder / other)
+    (folder / name).write_text(content)
+    return request.param, folder, folder / name, content.encode()
+
+
+def test_whole_files_are_read(dataset):
+    name, folder, path, content = dataset
+    path.write_bytes(content)
+    poses = read_poses(name, folder)
+    assert len(poses) == 1
+    np.testing.assert_allclose(poses[0].R_cam_from_world @ poses[0].R_cam_from_world.T, np.eye(3), atol=1e-12)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_damaged_files_are_read_or_refused(dataset, data):
+    name, folder, path, content = dataset
+    path.write_bytes(mutated(data.draw, st.integers, content))
+    poses, _ = read_or_refused(lambda _: read_poses(name, folder), path)
+    for pose in poses or []:
+        assert np.isfinite(pose.center_world).all()
+        assert np.linalg.det(pose.R_cam_from_world) == pytest.approx(1.0)
+
+
+ODD = ("1e999", "-1e300", "1" + "0" * 400, "9" * 5000, "NaN", "[[[[]]]]", "null", '"x"')
+
+
+@pytest.mark.parametrize("number", ODD)
+def test_odd_numbers_are_refused(dataset, number):
+    name, folder, path, content = dataset
+    token = {"generic tum": " 1 ", "matterport3d": "1.0", "360loc": "1.0"}.get(name, "1.5")
+    odd = token.replace(token.strip(), number)
+    path.write_text(content.decode().replace(token, odd, 1))
+    poses, message = read_or_refused(lambda _: read_poses(name, folder), path)
+    assert poses is None
+    assert message
+
+
+def test_large_files_are_not_split_into_words(dataset):
+    name, folder, path, content = dataset
+    if path.suffix == ".txt" and name != "generic tum":
+        path.write_bytes(content + b" 1" * MAX_MATRIX_SIZE)
+        assert "bytes, wanted" in read_or_refused(lambda _: read_poses(name, folder), path)[1]
