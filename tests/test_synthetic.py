@@ -171,7 +171,7 @@ def test_command_line_writes_a_world_that_reads_back(tmp_path, capsys):
         (["--width", "127"], "width: found 127, wanted an even number of at least 128"),
         (["--size", "nan", "3", "2.4"], "size: found [nan, 3.0, 2.4], wanted 2.0 to 50.0 m each way"),
         (["--rooms", "65"], "rooms: found 65, wanted 1 to 64"),
-        (["--seed", "-1"], "--panoramas, --seed: found a negative number, wanted 0 or more"),
+        (["--seed", "-1"], "--panoramas, --seed, --scenes: found a negative number, wanted 0 or more"),
     ],
 )
 def test_command_line_refuses_in_one_line_before_anything_is_written(options, message, tmp_path, capsys):
