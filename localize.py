@@ -59,7 +59,7 @@ class Session:
             panorama = read_panorama(pano, self.read_options)
         found = localizer.localize(panorama, self.workers, watch)
         if self.arguments.overlay and found.pose is not None:
-            png = overlay_png(localizer.points, panorama, localizer.from_world(found.pose))
+            png = overlay_png(localizer.points, panorama, localizer.from_world(found.pose), self.workers)
             write_atomically(self.arguments.overlay, png)
         settings = {"preset": self.arguments.preset, **localizer.settings.to_json()}
         result = result_of(found, named(self.arguments.cloud), str(pano), watch.seconds, settings)

@@ -16,6 +16,9 @@ from .settings import DescentSettings
 MAX_STEP = 0.2  # [rad, m] of Gauss-Newton
 
 Objective = Callable[[Pose], tuple[float, Array, Array]]  # loss, gradient (6,), normal matrix (6, 6)
+Watch = Callable[
+    [int, Pose, float], None
+]  # is told the part of the descent, a pose tried, and the loss there
 
 
 @dataclass(frozen=True)
@@ -126,7 +129,24 @@ def descend_gauss_newton(objective: Objective, pose: Pose, num_iterations: int) 
     return best
 
 
-def refine(points: PackedPoints, texels: Texels, start: Pose, settings: DescentSettings) -> Refined:
+def watched(objective: Objective, watch: Callable[[Pose, float], None]) -> Objective:
+    """The objective, which tells of every place where it is asked."""
+
+    def value(pose: Pose) -> tuple[float, Array, Array]:
+        found = objective(pose)
+        watch(pose, found[0])
+        return found
+
+    return value
+
+
+def unwatched(part: int, pose: Pose, loss: float) -> None:
+    """A descent that nobody watches."""
+
+
+def refine(
+    points: PackedPoints, texels: Texels, start: Pose, settings: DescentSettings, watch: Watch = unwatched
+) -> Refined:
     """Descend from `start`; the points that the camera does not see are left out anew `num_culls` times.
 
     A cull changes the function, so that losses before and after it do not compare: the best pose of the last
@@ -139,8 +159,8 @@ def refine(points: PackedPoints, texels: Texels, start: Pose, settings: DescentS
     def seen_from(at: Pose) -> PackedPoints:
         return visible_points(points, at.center_world) if settings.use_visibility else points
 
-    for num_iterations in np.diff(bounds).tolist():
-        objective = partial(normal_equations, seen_from(pose), texels)
+    for part, num_iterations in enumerate(np.diff(bounds).tolist()):
+        objective = watched(partial(normal_equations, seen_from(pose), texels), partial(watch, part))
         if settings.solver == "adam":
             adam.best_loss = np.inf
             pose = descend_adam(objective, pose, adam, num_iterations).pose
