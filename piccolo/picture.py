@@ -38,17 +38,26 @@ class Picture:
 
 def picture_at(points: PackedPoints, pose: Pose, width: int, workers: Workers) -> Picture:
     """The cloud at `pose`, `width` x width / 2 pixels."""
-    return draw(surfels_of(not_hidden(points, pose.center_world), workers), pose, width, workers)
+    indices = evenly(not_hidden(points, pose.center_world), MAX_SURFELS)
+    return draw(surfels_of(points.take(indices), workers), pose, width, workers)
 
 
-def not_hidden(points: PackedPoints, center_world: Array) -> PackedPoints:
-    """The points but those behind a surface that goes on around them.
+def evenly(indices: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """At most `count` of the indices; of points in Morton order, evenly in space."""
+    if len(indices) <= count:
+        return indices
+    return indices[np.linspace(0, len(indices) - 1, count).astype(np.int64)]
+
+
+def not_hidden(points: PackedPoints, center_world: Array) -> NDArray[np.int64]:
+    """Indices of the points but those behind a surface that goes on around them.
 
     `render.visible_points` lets what is in front in a cell hide all of the cell: a rim of two degrees around
     each thing would be missing in a picture. Here nine cells must agree, of any of three sizes.
     """
     pose = Pose(np.eye(3), center_world)
     R, t = pose.R_cam_from_world, pose.center_world
+    kept = np.arange(len(points))
     for width in (VISIBLE_WIDTH, 2 * VISIBLE_WIDTH, 4 * VISIBLE_WIDTH):
         depth = nearest_depth(points, pose, width).reshape(-1, width)
         around = np.pad(depth, ((1, 1), (1, 1)), mode="wrap")
@@ -56,10 +65,8 @@ def not_hidden(points: PackedPoints, center_world: Array) -> PackedPoints:
         farthest = cv2.dilate(around, np.ones((3, 3), np.uint8))[1:-1, 1:-1].reshape(-1)
         indices = np.empty(len(points), np.int64)
         count = select_visible(points.x, points.y, points.z, R, t, width, farthest, indices)
-        points = points.take(indices[:count])
-    if len(points) > MAX_SURFELS:
-        points = points.take(np.linspace(0, len(points) - 1, MAX_SURFELS).astype(np.int64))
-    return points
+        points, kept = points.take(indices[:count]), kept[indices[:count]]
+    return kept
 
 
 def draw(surfels: Surfels, pose: Pose, width: int, workers: Workers) -> Picture:

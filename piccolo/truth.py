@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,15 +26,17 @@ def read_truth(path: Path) -> dict[str, Query]:
     """The queries of a queries.json by file name."""
     try:
         entries = json.loads(path.read_text())["queries"]
-        return {
-            Path(entry["image"]).name: Query(
-                entry["variant"],
-                Pose(np.array(entry["R_cam_from_world"], float), np.array(entry["center_world"], float)),
-            )
-            for entry in entries
-        }
+        return {Path(entry["image"]).name: Query(entry["variant"], _pose(entry)) for entry in entries}
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: found {error!r}, wanted a queries.json with true poses") from error
+
+
+def _pose(entry: dict[str, Any]) -> Pose:
+    """The pose of a query; ValueError unless it is as many finite numbers as a pose has."""
+    R, center = np.array(entry["R_cam_from_world"], float), np.array(entry["center_world"], float)
+    if R.shape != (3, 3) or center.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(center).all()):
+        raise ValueError("a pose that is not 3 x 3 and 3 finite numbers")
+    return Pose(R, center)
 
 
 def pose_errors(pose: Pose, true_pose: Pose) -> tuple[float, float]:
