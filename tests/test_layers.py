@@ -24,6 +24,7 @@ LAYERS = [
     {"result"},
     {"paper", "engine", "export"},
     {"pipeline"},
+    {"surface_files"},
 ]
 # pyramid shrinks panoramas; points are packed as texels are
 SIDEWAYS = {("pyramid", "panorama"), ("cloud", "sampling")}
