@@ -20,6 +20,7 @@ MAX_ANGLE = 0.3  # [rad] as which a disc's radius is seen, at most
 MIN_COSINE = 0.15  # a disc seen flatter than this is turned towards the camera: normals are not that sure
 # What is left of rooms behind gaps are lone points with large discs. Large discs far off are sparse surfaces.
 MAX_RADIUS = 1.5  # by the radius that 95 % of the discs stay below
+MIN_RANGE = 1e-3  # [m] nearer to the camera nothing is drawn
 FAR_ANGLE = 0.02  # [rad] as which a far disc's radius is seen
 
 
@@ -53,12 +54,12 @@ def not_hidden(points: PackedPoints, center_world: Array) -> NDArray[np.int64]:
     """Indices of the points but those behind a surface that goes on around them.
 
     `render.visible_points` lets what is in front in a cell hide all of the cell: a rim of two degrees around
-    each thing would be missing in a picture. Here nine cells must agree, of any of three sizes.
+    each thing would be missing in a picture. Here nine cells must agree, of any of four sizes.
     """
     pose = Pose(np.eye(3), center_world)
     R, t = pose.R_cam_from_world, pose.center_world
     kept = np.arange(len(points))
-    for width in (VISIBLE_WIDTH, 2 * VISIBLE_WIDTH, 4 * VISIBLE_WIDTH):
+    for width in (VISIBLE_WIDTH // 2, VISIBLE_WIDTH, 2 * VISIBLE_WIDTH, 4 * VISIBLE_WIDTH):
         depth = nearest_depth(points, pose, width).reshape(-1, width)
         around = np.pad(depth, ((1, 1), (1, 1)), mode="wrap")
         around[[0, -1]] = -np.inf  # no row beyond a pole
@@ -97,10 +98,11 @@ def draw(surfels: Surfels, pose: Pose, width: int, workers: Workers) -> Picture:
 
 
 def _without_lone(surfels: Surfels, center_world: Array) -> Surfels:
+    """The discs but lone ones, and those at the camera itself."""
     p = surfels.points
     ranges = np.linalg.norm(np.stack([p.x, p.y, p.z], axis=1) - center_world, axis=1)
     largest = np.maximum(MAX_RADIUS * np.percentile(surfels.radii, 95.0), FAR_ANGLE * ranges)
-    return surfels.take(np.flatnonzero(surfels.radii <= largest))
+    return surfels.take(np.flatnonzero((surfels.radii <= largest) & (ranges > MIN_RANGE)))
 
 
 def _discs(
@@ -109,7 +111,7 @@ def _discs(
     """Discs (N, 9), directions (N, 2) and angles (N,) as `splatting.splat` reads them."""
     p, R = surfels.points, pose.R_cam_from_world
     x_cam = (np.stack([p.x, p.y, p.z], axis=1) - pose.center_world) @ R.T
-    ranges = np.maximum(np.linalg.norm(x_cam, axis=1), 1e-6)
+    ranges = np.linalg.norm(x_cam, axis=1)
     rays = x_cam / ranges[:, None]
     normals = surfels.normals @ R.T
     cosine = np.einsum("ni,ni->n", normals, rays)

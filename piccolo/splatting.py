@@ -16,6 +16,7 @@ MIN_RADIUS_PX = np.float32(0.75)  # every disc reaches the centre of a pixel
 BAND = np.float32(1.01)
 BAND_OFFSET = np.float32(0.02)  # [m]
 LEAST_WEIGHT = np.float32(1e-4)  # at the rim: whatever is seen has a colour
+MAX_SLOPE = np.float32(1.25)  # of the range within a disc or a pixel
 TWO = np.float32(2.0)
 
 
@@ -27,8 +28,10 @@ def hit(disc, dx, dy, dz, px_angle2):
     t = along / facing
     ex, ey, ez = t * dx - x, t * dy - y, t * dz - z
     q = (ex * ex + ey * ey + ez * ez) * per_radius2
-    if not (facing * along > F0 and q < F1):  # a plane along the ray divides by zero: NaN is no hit
+    if not facing * along > F0:  # a plane along the ray divides by zero: NaN is no hit
         q, t = TWO, distance
+    # What the ray meets beside the disc, in the same pixel: the surface goes on, but nobody knows how far.
+    t = min(max(t, distance / MAX_SLOPE), distance * MAX_SLOPE)
     ex, ey, ez = dx - x / distance, dy - y / distance, dz - z / distance
     return min(q, (ex * ex + ey * ey + ez * ez) / px_angle2), t
 
