@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from .cloud.packed import PackedPoints
 from .pose import Array, Pose
-from .render import VISIBLE_WIDTH, nearest_depth, select_visible
+from .render import nearest_depth, select_visible
 from .splatting import MIN_RADIUS_PX, splat
 from .surfels import Surfels, surfels_of
 from .threads import Workers
@@ -21,6 +21,7 @@ MIN_COSINE = 0.15  # a disc seen flatter than this is turned towards the camera:
 # What is left of rooms behind gaps are lone points with large discs. Large discs far off are sparse surfaces.
 MAX_RADIUS = 1.5  # by the radius that 95 % of the discs stay below
 MIN_RANGE = 1e-3  # [m] nearer to the camera nothing is drawn
+HIDING_WIDTHS = (360, 720)  # cells of 1 and 1/2 degrees; wider ones hide what is seen through a door ajar
 FAR_ANGLE = 0.02  # [rad] as which a far disc's radius is seen
 
 
@@ -54,12 +55,12 @@ def not_hidden(points: PackedPoints, center_world: Array) -> NDArray[np.int64]:
     """Indices of the points but those behind a surface that goes on around them.
 
     `render.visible_points` lets what is in front in a cell hide all of the cell: a rim of two degrees around
-    each thing would be missing in a picture. Here nine cells must agree, of any of four sizes.
+    each thing would be missing in a picture. Here nine cells must agree, of one or the other size.
     """
     pose = Pose(np.eye(3), center_world)
     R, t = pose.R_cam_from_world, pose.center_world
     kept = np.arange(len(points))
-    for width in (VISIBLE_WIDTH // 2, VISIBLE_WIDTH, 2 * VISIBLE_WIDTH, 4 * VISIBLE_WIDTH):
+    for width in HIDING_WIDTHS:
         depth = nearest_depth(points, pose, width).reshape(-1, width)
         around = np.pad(depth, ((1, 1), (1, 1)), mode="wrap")
         around[[0, -1]] = -np.inf  # no row beyond a pole
@@ -143,18 +144,21 @@ def _filled(rgb: NDArray[np.uint8], is_seen: NDArray[np.bool_]) -> NDArray[np.ui
         return rgb
     counts = is_seen.view(np.uint8) * np.uint8(255)
     masked = cv2.bitwise_and(rgb, rgb, mask=counts)
-    odd = ((0, height % 2), (0, width % 2))  # a column more is the first again, a row more counts nothing
-    counts = np.pad(np.pad(counts, (odd[0], (0, 0))), ((0, 0), odd[1]), mode="wrap")
-    masked = np.pad(np.pad(masked, (odd[0], (0, 0), (0, 0))), ((0, 0), odd[1], (0, 0)), mode="wrap")
+    if height % 2 or width % 2:  # a row more counts nothing, a column more is the first again
+        counts = np.pad(np.pad(counts, ((0, height % 2), (0, 0))), ((0, 0), (0, width % 2)), mode="wrap")
+        masked = np.pad(masked, ((0, height % 2), (0, 0), (0, 0)))
+        masked = np.pad(masked, ((0, 0), (0, width % 2), (0, 0)), mode="wrap")
     size = (counts.shape[1] // 2, counts.shape[0] // 2)
     share = cv2.resize(counts, size, interpolation=cv2.INTER_AREA)
     total = cv2.resize(masked, size, interpolation=cv2.INTER_AREA)
+    del counts, masked
     mean = cv2.divide(total, cv2.merge([share, share, share]), scale=255.0)
     coarse = _filled(np.asarray(mean, np.uint8), share > 0)
     around = np.concatenate([coarse[:, -1:], coarse, coarse[:, :1]], axis=1)
     double = (2 * around.shape[1], 2 * len(around))
     smooth = cv2.resize(around, double, interpolation=cv2.INTER_LINEAR)[:height, 2 : 2 + width]
-    return np.asarray(np.where(is_seen[..., None], rgb, smooth), np.uint8)
+    np.copyto(smooth, rgb, where=is_seen[..., None])
+    return np.asarray(smooth, np.uint8)
 
 
 def encoded(picture: NDArray[np.uint8] | NDArray[np.uint16], suffix: str) -> bytes:

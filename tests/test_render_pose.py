@@ -19,7 +19,7 @@ from piccolo import animation
 from piccolo.animation import shaken, watched_descent, write_animation
 from piccolo.cloud.packed import pack_points
 from piccolo.export.axes import R_cam_from_angles, heading_pitch_roll_deg
-from piccolo.picture import Picture, closed, encoded, not_hidden, picture_at
+from piccolo.picture import Picture, closed, encoded, picture_at
 from piccolo.pose import Pose, T_world_from_cam, angle_between, exp_so3, step
 from piccolo.pose_file import read_pose_matrix
 from piccolo.refine import refine
@@ -123,16 +123,15 @@ def test_holes_are_marked_where_points_are_missing_and_nowhere_else(points, tilt
     pose = _local(rooms.query(SEED, "tilt").pose)
     rays = pixel_rays(WIDTH) @ pose.R_cam_from_world
     surface = pose.center_world + rays * true_ranges[..., None]
-    low, high = np.percentile(points.x, [30, 55])
-    keep = np.flatnonzero(~((points.x > low) & (points.x < high)))
-    picture = picture_at(points.take(keep), pose, WIDTH, WORKERS)
-    is_missing = (surface[..., 0] > low) & (surface[..., 0] < high)
-    border = np.minimum(abs(surface[..., 0] - low), abs(surface[..., 0] - high)) < 0.06
-    certain = ~border & tilted.is_seen
-    assert is_missing.mean() > 0.05
-    assert picture.is_seen[certain & ~is_missing].mean() > 0.99
-    # behind what is missing there may be something else
-    assert picture.is_seen[certain & is_missing].mean() < 0.1
+    low = points.z.max() - 0.1  # the ceiling: nothing is behind it
+    picture = picture_at(points.take(np.flatnonzero(points.z < low)), pose, WIDTH, WORKERS)
+    is_missing, is_there = surface[..., 2] > low, (surface[..., 2] < low) & tilted.is_seen
+    # discs at the upper end of the walls reach some pixels into it
+    inner, other = (cv2.erode(m.astype(np.uint8), np.ones((9, 9))) > 0 for m in (is_missing, is_there))
+    assert inner.mean() > 0.1
+    assert not picture.is_seen[inner].any()
+    assert other.mean() > 0.4
+    assert picture.is_seen[other].all()
     is_seen = picture.is_seen.copy()
     marked = render_pose.colors_of(picture, "mark")
     np.testing.assert_array_equal((marked == render_pose.MAGENTA).all(axis=-1), ~is_seen)
@@ -145,8 +144,6 @@ def test_a_sparse_wall_hides_what_is_behind_it():
     colors = np.repeat(np.array([[255, 0, 0], [0, 0, 255]], np.uint8), [4000, 40000], axis=0)
     cloud = pack_points(np.concatenate([near, far]).astype(np.float32), colors)
     pose = Pose(np.eye(3), np.zeros(3))
-    kept = not_hidden(cloud, pose.center_world)
-    assert (kept >= 4000).mean() < 0.3  # those around the near wall stay
     picture = picture_at(cloud, pose, 1024, WORKERS)
     front = np.s_[200:312, 450:574]
     assert picture.is_seen[front].mean() > 0.97
