@@ -56,7 +56,7 @@ class Session:
         localizer = self.localizer
         result, panorama = localize_file(localizer, self.inputs, pano, self.workers, self.seconds)
         if self.arguments.overlay and result.pose is not None:
-            png = overlay_png(localizer.points, panorama, localizer.from_world(result.pose))
+            png = overlay_png(localizer.points, panorama, localizer.from_world(result.pose), self.workers)
             write_atomically(self.arguments.overlay, png)
         for warning in panorama.warnings:
             self.say(f"warning: {warning}")

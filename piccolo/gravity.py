@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from .errors import InputError
 from .pose import Array, exp_so3
+from .settings import UpAxis
 
 MAX_POINTS = 40_000  # that are looked at
 MIN_POINTS = 300
@@ -139,6 +140,14 @@ def rotation_to_z_up(direction_world: Array) -> Array:
     if sine == 0.0:
         return np.diag([1.0, 1.0, 1.0] if z > 0.0 else [1.0, -1.0, -1.0])
     return exp_so3(np.arctan2(sine, z) * np.array([y / sine, -x / sine, 0.0]))
+
+
+def R_z_from_axis(up: UpAxis) -> Array:
+    """The rotation (3, 3) that turns a named axis to z; identity for auto."""
+    if up == "auto":
+        return np.eye(3)
+    axis = (-1.0 if up.startswith("-") else 1.0) * np.eye(3)["xyz".index(up[-1])]
+    return np.round(rotation_to_z_up(axis)) + 0.0
 
 
 def _surfaces(points: NDArray[np.float32]) -> _Surfaces:

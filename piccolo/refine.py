@@ -35,6 +35,10 @@ def sampling_loss_of(texels: Texels) -> Loss:
     )
 
 
+# is told the part of the descent, a pose tried, and the loss there
+Watch = Callable[[int, Pose, float], None]
+
+
 @dataclass(frozen=True)
 class Refined:
     """Where a descent arrived."""
@@ -143,7 +147,24 @@ def descend_gauss_newton(objective: Objective, pose: Pose, num_iterations: int) 
     return best
 
 
-def refine(points: PackedPoints, loss: Loss, start: Pose, settings: DescentSettings) -> Refined:
+def watched(objective: Objective, watch: Callable[[Pose, float], None]) -> Objective:
+    """The objective, which tells of every place where it is asked."""
+
+    def value(pose: Pose) -> Equations:
+        found = objective(pose)
+        watch(pose, found[0])
+        return found
+
+    return value
+
+
+def unwatched(part: int, pose: Pose, loss: float) -> None:
+    """A descent that nobody watches."""
+
+
+def refine(
+    points: PackedPoints, loss: Loss, start: Pose, settings: DescentSettings, watch: Watch = unwatched
+) -> Refined:
     """Descend from `start`; the points that the camera does not see are left out anew `num_culls` times.
 
     A cull changes the function, so that losses before and after it do not compare: the best pose of the last
@@ -156,8 +177,8 @@ def refine(points: PackedPoints, loss: Loss, start: Pose, settings: DescentSetti
     def seen_from(at: Pose) -> PackedPoints:
         return visible_points(points, at.center_world) if settings.use_visibility else points
 
-    for num_iterations in np.diff(bounds).tolist():
-        objective = partial(loss.equations, seen_from(pose))
+    for part, num_iterations in enumerate(np.diff(bounds).tolist()):
+        objective = watched(partial(loss.equations, seen_from(pose)), partial(watch, part))
         if settings.solver == "adam":
             adam.best_loss = np.inf
             pose = descend_adam(objective, pose, adam, num_iterations).pose

@@ -38,6 +38,11 @@ class Scene:
     cloud: Path
     queries: tuple[Query, ...]
 
+    @property
+    def by_name(self) -> dict[str, Query]:
+        """The queries by their images' file names."""
+        return {query.image.name: query for query in self.queries}
+
     def name_of(self, query: Query) -> str:
         """A query's image as queries.json has it."""
         return Path(os.path.relpath(query.image, self.folder)).as_posix()

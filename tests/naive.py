@@ -145,3 +145,25 @@ def decompress_lzf(data):
         pattern = out[len(out) - distance :]
         out += (pattern * length)[:length]
     return bytes(out)
+
+
+def splat(discs, rgb, width, min_radius_px, max_slope, band, band_offset):
+    """Range (H, W) and colour (H, W, 3) of discs (N, 9), each pixel's ray against every disc."""
+    azimuth = math.pi - (np.arange(width) + 0.5) * math.tau / width
+    elevation = math.pi / 2 - (np.arange(width // 2) + 0.5) * math.tau / width
+    level = np.cos(elevation)[:, None]
+    ray_z = np.broadcast_to(np.sin(elevation)[:, None], (width // 2, width))
+    rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), ray_z], axis=-1)[..., None, :]
+    center, normal = discs[:, :3], discs[:, 3:6]
+    distance = np.linalg.norm(center, axis=1)
+    t = (center * normal).sum(axis=1) / (rays * normal).sum(axis=-1)
+    q = np.linalg.norm(t[..., None] * rays - center, axis=-1) ** 2 * discs[:, 7]
+    is_met = (t > 0) & (q < 1)
+    by_pixel = 2 * (1 - (rays * center).sum(axis=-1) / distance) / (min_radius_px * math.tau / width) ** 2
+    q = np.minimum(np.where(is_met, q, 2), by_pixel)
+    t = np.clip(np.where(t > 0, t, distance), distance / max_slope, distance * max_slope)
+    nearest = np.where(q < 1, t, np.inf).min(axis=-1, keepdims=True)
+    weight = ((1 - np.minimum(q, 1)) ** 3 + 1e-4) * ((q < 1) & (t <= nearest * band + band_offset))
+    total = np.maximum(weight.sum(axis=-1), 1e-12)
+    depth = np.where(weight.sum(axis=-1) > 0, (weight * t).sum(axis=-1) / total, np.inf)
+    return depth, weight @ rgb / total[..., None]

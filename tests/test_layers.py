@@ -17,15 +17,17 @@ LAYERS = [
     {"pose", "settings"},
     {"sphere", "rotations"},
     {"panorama", "cloud", "sampling", "pyramid"},
-    {"loss", "render", "gravity"},
-    {"overlay", "verify", "refine", "synthetic", "truth", "hypotheses", "certainty"},
-    {"verdict"},
+    {"loss", "render", "gravity", "surfels", "splatting"},
+    {"picture"},
+    {"overlay", "verify", "refine", "synthetic", "truth", "hypotheses", "certainty", "pose_file"},
+    {"verdict", "animation", "loss_surface"},
     {"result", "scenes"},
     {"paper", "engine", "export"},
     {"datasets"},
     {"pipeline"},
     {"evaluation"},
     {"experiments"},
+    {"surface_files"},
 ]
 # pyramid shrinks panoramas; points are packed as texels are
 SIDEWAYS = {("pyramid", "panorama"), ("cloud", "sampling")}

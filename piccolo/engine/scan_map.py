@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..cloud.packed import PackedPoints, pack_points
 from ..cloud.voxels import Voxels
-from ..gravity import find_up, rotation_to_z_up
+from ..gravity import R_z_from_axis, find_up, rotation_to_z_up
 from ..pose import Array, Pose
 from ..settings import UpAxis
 from ..stopwatch import Stopwatch
@@ -135,10 +135,7 @@ class Levelled:
 def level(cloud: Voxelized, up: UpAxis) -> Levelled:
     """A cloud whose axis `up` points up, as octree; `auto` asks the cloud, and reads a tilted one anew."""
     more: tuple[str, ...] = ()
-    R_map_from_world = np.eye(3)
-    if up != "auto":
-        axis = (-1.0 if up.startswith("-") else 1.0) * np.eye(3)["xyz".index(up[-1])]
-        R_map_from_world = np.round(rotation_to_z_up(axis)) + 0.0
+    R_map_from_world = R_z_from_axis(up)
     voxels = cloud.voxels(R_map_from_world)
     octree = build_octree(voxels)
     if up == "auto":

@@ -6,7 +6,7 @@ R_cam_from_world, and the camera's position stays as it is.
 
 import numpy as np
 
-from ..pose import Array, Pose
+from ..pose import Array, Pose, exp_so3
 
 OPTICAL_FROM_CAM = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # right, down, forward
 OPENGL_FROM_CAM = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])  # right, up, back
@@ -22,6 +22,13 @@ def turned(pose: Pose, other_from_cam: Array) -> Pose:
 def translation(pose: Pose) -> Array:
     """The t (3,) of x_cam = R x_world + t."""
     return np.asarray(-pose.R_cam_from_world @ pose.center_world)
+
+
+def R_cam_from_angles(heading_deg: float, pitch_deg: float, roll_deg: float) -> Array:
+    """R_cam_from_world (3, 3) of the angles [deg] that `heading_pitch_roll_deg` gives."""
+    yaw = exp_so3(np.radians([0.0, 0.0, 90.0 - heading_deg]))
+    pitch, roll = exp_so3(np.radians([0.0, -pitch_deg, 0.0])), exp_so3(np.radians([roll_deg, 0.0, 0.0]))
+    return np.asarray((yaw @ pitch @ roll).T)
 
 
 def heading_pitch_roll_deg(pose: Pose) -> tuple[float, float, float]:

@@ -1,0 +1,238 @@
+"""The loss over a plan, and the command line of tools/loss_surface.py."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import poses
+import pytest
+import rooms
+
+from piccolo.cloud.packed import pack_points
+from piccolo.loss import sampling_loss
+from piccolo.loss_surface import LossSurface, PoseGrid, loss_surface
+from piccolo.pose import Pose, angle_between
+from piccolo.render import visible_points
+from piccolo.rotations import uniform_yaws
+from piccolo.sampling import pack_texels
+from piccolo.scenes import read_scene
+from piccolo.threads import Workers
+from tools import loss_surface as tool
+from tools import make_room
+
+ROOT = Path(__file__).resolve().parents[1]
+STEP = 0.3
+COARSE = ["--step", STEP, "--rotations", 24, "--max-points", 3000, "--width", 128]
+
+
+def _scene(variant):
+    cloud, query = rooms.room(2)[1], rooms.query(2, variant)
+    pose = Pose(query.pose.R_cam_from_world, query.pose.center_world - cloud.origin_world)
+    small = cv2.resize(query.rgb, (128, 64), interpolation=cv2.INTER_AREA)
+    return pack_points(cloud.points, cloud.colors), pack_texels(small), pose
+
+
+def _grid(pose, num_yaws=24):
+    x, y = (pose.center_world[k] + STEP * np.arange(-3, 4) for k in range(2))
+    heights = pose.center_world[2] + np.array([-0.3, 0.0, 0.3])
+    return PoseGrid(x, y, heights, pose.R_cam_from_world @ uniform_yaws(num_yaws))
+
+
+@pytest.mark.parametrize("variant", ["clean", "tilt"])
+def test_the_least_loss_is_at_the_true_pose(variant):
+    points, texels, pose = _scene(variant)
+    grid = _grid(pose)
+    surface = loss_surface(points, texels, grid, 5000, True, Workers(2))
+    assert surface.lowest() == (3, 3)
+    assert surface.height[3, 3] == pose.center_world[2]
+    assert surface.rotation[3, 3] == 0
+    assert surface.loss[3, 3] < 0.8 * np.median(surface.loss)
+    assert surface.is_free[3, 3]
+    assert 1 <= surface.num_minima() < 12
+    assert grid.num_poses == 7 * 7 * 3 * 24
+
+
+def test_a_place_has_the_least_of_its_losses_with_the_same_bits_on_any_number_of_threads():
+    points, texels, pose = _scene("tilt")
+    grid = _grid(pose, 5)
+    one = loss_surface(points, texels, grid, 10**6, True, Workers(1))
+    two = loss_surface(points, texels, grid, 10**6, True, Workers(2))
+    for name in ("loss", "height", "rotation", "is_free"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    losses = {}
+    for z in grid.heights:
+        center = np.array([grid.x[5], grid.y[1], z])
+        seen = visible_points(points, center)
+        for k, R in enumerate(grid.R_cam_from_local):
+            losses[sampling_loss(seen, texels, Pose(R, center))] = (z, k)
+    least = min(losses)
+    assert one.loss[1, 5] == least
+    assert (one.height[1, 5], one.rotation[1, 5]) == losses[least]
+
+
+def test_walls_and_outside_are_not_free():
+    points, texels, pose = _scene("clean")
+    low, high = points.x.min(), points.x.max()
+    x = np.array([low - 2.0, low, pose.center_world[0], high, high + 2.0])
+    grid = PoseGrid(x, pose.center_world[1:2], pose.center_world[2:], pose.R_cam_from_world[None])
+    surface = loss_surface(points, texels, grid, 5000, True, Workers(2))
+    assert surface.is_free.tolist() == [[False, False, True, False, False]]
+
+
+def test_minima_are_counted_in_free_space():
+    loss = np.full((7, 9), 0.5)
+    loss[1, 1], loss[1, 2], loss[5, 8], loss[3, 5], loss[0, 5] = 0.1, 0.2, 0.3, 0.4, np.inf
+    is_free = np.ones(loss.shape, np.bool_)
+    surface = LossSurface(loss, loss, np.zeros(loss.shape, np.int64), is_free)
+    assert surface.lowest() == (1, 1)
+    assert surface.num_minima() == 3
+    is_free[5, 8] = False
+    assert surface.num_minima() == 2
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A made room and a result for one panorama, in a folder with a blank in its name."""
+    folder = tmp_path_factory.mktemp("my room")
+    arguments = ["--seed", "5", "--points", "30000", "--panoramas", "1", "--width", "256", "--quiet"]
+    variants = ["--size", "4", "3", "2.5", "--variants", "clean", "tilt"]
+    assert make_room.main(["--out", str(folder), *arguments, *variants]) == 0
+    pose = read_scene(folder).by_name["tilt_0.jpg"].pose
+    found = Pose(pose.R_cam_from_world, pose.center_world + 0.05)
+    poses.write_results(folder / "pose.json", [poses.result("x/tilt_0.jpg", found)])
+    return folder
+
+
+@pytest.fixture
+def run(scene, capsys):
+    def call(*arguments, pano="clean_0.jpg"):
+        files = ["--cloud", scene / "cloud.ply", "--pano", scene / "images" / pano]
+        code = tool.main([*map(str, [*files, *arguments]), "--quiet"])
+        out, err = capsys.readouterr()
+        return code, json.loads(out) if out else None, err
+
+    return call
+
+
+def test_picture_and_arrays_of_a_tilted_panorama(run, scene, tmp_path):
+    files = ["--truth", scene / "queries.json", "--result", scene / "pose.json"]
+    out, npz = tmp_path / "a surface.png", tmp_path / "a.npz"
+    code, told, err = run(*files, *COARSE, "--out", out, "--npz", npz, pano="tilt_0.jpg")
+    assert (code, err) == (0, "")
+    assert told["distance_to_true"] < STEP
+    assert told["distance_to_found"] < STEP + 0.1
+    assert told["num_minima"] >= 1
+    assert told["poses_per_s"] > 0
+    picture = cv2.imread(str(out))
+    assert min(picture.shape[:2]) > 400
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100
+    truth = read_scene(scene).by_name["tilt_0.jpg"].pose
+    with np.load(npz, allow_pickle=False) as arrays:
+        shape = (len(arrays["y"]), len(arrays["x"]))
+        assert [len(arrays["y"]), len(arrays["x"])] == told["places"]
+        row, column = np.unravel_index(arrays["loss"].argmin(), shape)
+        lowest = [arrays["x"][column], arrays["y"][row], arrays["height"][row, column]]
+        np.testing.assert_allclose(lowest, told["lowest_world"], atol=1e-6)
+        assert abs(lowest[0] - truth.center_world[0]) < STEP
+        assert abs(lowest[1] - truth.center_world[1]) < STEP
+        R_cam_from_world = arrays["R_cam_from_world"]
+        assert R_cam_from_world.shape == (*shape, 3, 3)
+        assert angle_between(R_cam_from_world[row, column], truth.R_cam_from_world) < 1e-6
+        np.testing.assert_allclose(arrays["true_world"], truth.center_world, atol=1e-5)
+        np.testing.assert_allclose(arrays["found_world"], truth.center_world + 0.05, atol=1e-5)
+        np.testing.assert_array_equal(arrays["R_plan_from_world"], np.eye(3))
+        assert arrays["is_free"].any()
+        assert not arrays["is_free"].all()
+
+
+def test_without_a_pose_known_and_through_walls(run, scene, tmp_path):
+    truth = read_scene(scene).by_name["clean_0.jpg"].pose
+    x, y, z = truth.center_world
+    box = ["--box", x - 0.6, y - 0.6, x + 0.7, y + 0.7, "--heights", z, z + 0.5, 2]
+    code, told, _ = run(*COARSE, *box, "--no-visibility", "--npz", tmp_path / "a.npz")
+    assert (code, told["places"]) == (0, [5, 5])
+    assert told["poses"] == 5 * 5 * 2 * 24
+    assert np.hypot(*(told["lowest_world"][:2] - truth.center_world[:2])) < 1.5 * STEP
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert np.isnan(arrays["true_world"]).all()
+        assert set(np.unique(arrays["height"])) <= set(np.round([z, z + 0.5], 12)) | {z, z + 0.5}
+    more = ["--gravity", "unknown", "--rotations", 30]
+    code, told, _ = run("--step", 1.0, *more, "--out", tmp_path / "b.png")
+    assert (code, told["poses"]) == (0, np.prod(told["places"]) * 5 * 30)
+
+
+def test_a_cloud_with_another_axis_up(run, scene, tmp_path):
+    """y up: the plan's axes are the world's x and -z, and world positions stay the world's."""
+    cloud = tmp_path / "y up.txt"
+    from piccolo.cloud import read_cloud  # noqa: PLC0415
+
+    read = read_cloud(scene / "cloud.ply")
+    x, y, z = (read.points + read.origin_world).T
+    np.savetxt(cloud, np.column_stack([x, z, -y, read.colors]), fmt="%.4f %.4f %.4f %d %d %d")
+    truth = read_scene(scene).by_name["clean_0.jpg"].pose
+    R_z_up = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    turned = Pose(truth.R_cam_from_world @ R_z_up, R_z_up.T @ truth.center_world)
+    poses.write_results(tmp_path / "pose.json", [poses.result("clean_0.jpg", turned)])
+    arguments = ["--up", "y", "--result", tmp_path / "pose.json", "--npz", tmp_path / "a.npz"]
+    code, told, err = run("--cloud", cloud, *COARSE, *arguments)
+    assert (code, err) == (0, "")
+    assert told["distance_to_found"] < STEP
+    assert np.linalg.norm(told["lowest_world"] - turned.center_world) < STEP
+    with np.load(tmp_path / "a.npz") as arrays:
+        np.testing.assert_allclose(arrays["R_plan_from_world"], R_z_up, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "--out, --npz: found none"),
+        (["--out", "a.png", "--step", 0], "--step: found 0.0, wanted metres above 0"),
+        (["--out", "a.png", "--step", "nan"], "--step: found nan"),
+        (["--out", "a.png", "--rotations", 0], "--rotations: found 0, wanted at least 1"),
+        (["--out", "a.png", "--max-points", 3], "--max-points: found 3"),
+        (["--out", "a.png", "--box", 0, 0, 0, 1], "--box: found"),
+        (["--out", "a.png", "--heights", 2, 1, 3], "--heights: found"),
+        (["--out", "a.png", "--heights", 1, 2, 1.5], "--heights: found"),
+    ],
+)
+def test_wrong_usage(run, arguments, message):
+    code, told, err = run(*arguments)
+    assert (code, told) == (2, None)
+    assert message in err
+
+
+def test_bad_input_leaves_nothing(run, scene, tmp_path):
+    out = ["--out", tmp_path / "a.png"]
+    for arguments, message in (
+        ([*out, "--step", 1e-5], "places, wanted at most"),
+        ([*out, "--result", scene / "pose.json"], "found 0 poses of clean_0.jpg, wanted one"),
+        ([*out, "--truth", scene / "pose.json"], "wanted a queries.json with true poses"),
+        (["--out", tmp_path / "no" / "a.png"], "found no folder"),
+        (["--npz", scene / "cloud.ply"], "found an input as the output"),
+    ):
+        code, told, err = run(*arguments)
+        assert (code, told) == (3, None)
+        assert message in err
+        assert err.count("\n") == 1
+    assert run(*out, pano="no.jpg")[0] == 3
+    assert not list(tmp_path.iterdir())
+
+
+def test_interrupts_and_surprises_have_codes_of_their_own(run, tmp_path, monkeypatch):
+    for error, code in ((KeyboardInterrupt, 130), (ZeroDivisionError, 4)):
+
+        def fail(*arguments, error=error):
+            raise error
+
+        monkeypatch.setattr(tool, "loss_surface", fail)
+        assert run("--out", tmp_path / "a.png")[0] == code
+    assert not list(tmp_path.iterdir())
+
+
+def test_help_runs():
+    command = [sys.executable, ROOT / "tools" / "loss_surface.py", "--help"]
+    text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "--no-visibility" in text
