@@ -14,6 +14,7 @@ from .engine.map_file import cached_map, content_key, is_map_file, load_map
 from .engine.scan_map import ScanMap, prepare_map
 from .errors import InputError
 from .gravity import R_z_from_axis
+from .loss import FARTHEST
 from .panorama import AS_STORED, Panorama, ReadOptions, read_panorama
 from .paper import method as paper
 from .pose import Array, Pose
@@ -169,9 +170,15 @@ class PlacedPoints:
     warnings: tuple[str, ...]
 
     def from_world(self, pose: Pose) -> Pose:
-        """A pose of the world in the frame of `points`."""
+        """A pose of the world in the frame of `points`; one too far for float32 is an InputError."""
+        center_world = pose.center_world
+        if not np.abs(center_world - self.origin_world).max() < FARTHEST:
+            text = (
+                f"found a camera at {center_world.tolist()}, wanted one within {FARTHEST:.0e} m of the cloud"
+            )
+            raise InputError(text)
         R = self.R_local_from_world
-        return Pose(pose.R_cam_from_world @ R.T, R @ (pose.center_world - self.origin_world))
+        return Pose(pose.R_cam_from_world @ R.T, R @ (center_world - self.origin_world))
 
     def to_world(self, pose: Pose) -> Pose:
         """A pose of the frame of `points` in the world."""

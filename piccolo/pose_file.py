@@ -14,6 +14,8 @@ WANTED = "wanted the 4 x 4 numbers of T_world_from_cam"
 
 def read_pose_matrix(path: Path) -> Pose:
     """The pose in a text file of T_world_from_cam, 4 x 4 numbers; lines that begin with # are comments."""
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: not a file but a folder or a device, {WANTED}")
     if path.stat().st_size > MAX_SIZE:
         raise InputError(f"{path}: found {path.stat().st_size} bytes, {WANTED}")
     try:
@@ -26,7 +28,12 @@ def read_pose_matrix(path: Path) -> Pose:
         shape = " x ".join(map(str, T_world_from_cam.shape))
         raise InputError(f"{path}: found {shape} numbers, not all finite or not as many, {WANTED}")
     R = T_world_from_cam[:3, :3]
-    is_rotation = np.abs(R @ R.T - np.eye(3)).max() < MAX_SKEW and np.linalg.det(R) > 0.0
-    if not is_rotation or not np.allclose(T_world_from_cam[3], [0.0, 0.0, 0.0, 1.0]):
+    # the first test keeps the product of the second finite
+    is_orthogonal = np.abs(R).max() < 2.0 and np.abs(R @ R.T - np.eye(3)).max() < MAX_SKEW
+    if (
+        not is_orthogonal
+        or np.linalg.det(R) < 0.0
+        or not np.allclose(T_world_from_cam[3], [0.0, 0.0, 0.0, 1.0])
+    ):
         raise InputError(f"{path}: found no rotation on the left or no 0 0 0 1 below, {WANTED}")
     return Pose(orthonormal(R).T, T_world_from_cam[:3, 3])

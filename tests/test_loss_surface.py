@@ -208,6 +208,8 @@ def test_bad_input_leaves_nothing(run, scene, tmp_path):
     out = ["--out", tmp_path / "a.png"]
     for arguments, message in (
         ([*out, "--step", 1e-5], "places, wanted at most"),
+        ([*out, "--box", 1e20, 0, 1.1e20, 1, "--step", 1e19], "found places too far from the cloud"),
+        ([*out, "--heights", 0, 1e30, 2], "found places too far from the cloud"),
         ([*out, "--result", scene / "pose.json"], "found 0 poses of clean_0.jpg, wanted one"),
         ([*out, "--truth", scene / "pose.json"], "wanted a queries.json with true poses"),
         (["--out", tmp_path / "no" / "a.png"], "found no folder"),

@@ -18,8 +18,10 @@ from refusals import mutated, read_or_refused
 from piccolo import animation
 from piccolo.animation import shaken, watched_descent, write_animation
 from piccolo.cloud.packed import pack_points
+from piccolo.errors import InputError
 from piccolo.export.axes import R_cam_from_angles, heading_pitch_roll_deg
 from piccolo.picture import Picture, closed, encoded, picture_at
+from piccolo.pipeline import PlacedPoints
 from piccolo.pose import Pose, T_world_from_cam, angle_between, exp_so3, step
 from piccolo.pose_file import read_pose_matrix
 from piccolo.refine import refine, sampling_loss_of
@@ -299,6 +301,22 @@ def test_animations_read_back(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.gif", "a.mp4", "frames"]
 
 
+def test_without_pillow_a_gif_is_refused_beforehand(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "PIL.Image", None)
+    with pytest.raises(InputError, match=r"pip install -r requirements-formats\.txt"):
+        animation.check_animation(tmp_path / "a.gif")
+    animation.check_animation(tmp_path / "a.mp4")
+
+
+def test_a_camera_too_far_for_the_kernels_is_refused(points):
+    placed = PlacedPoints(points, np.eye(3), np.array([5e5, 5e6, 0.0]), ())
+    for far in (1e9, 1e300, np.nan):
+        with pytest.raises(InputError, match="wanted one within 1e"):
+            placed.from_world(Pose(np.eye(3), np.array([0.0, far, 0.0])))
+    pose = Pose(exp_so3(np.array([0.3, 0.4, 0.5])), np.array([5e5 + 1, 5e6 + 2, 3.0]))
+    np.testing.assert_allclose(placed.to_world(placed.from_world(pose)).center_world, pose.center_world)
+
+
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     """A made room with a result for each of two panoramas, in a folder with a blank in its name."""
@@ -428,6 +446,7 @@ def test_bad_input_leaves_nothing(run, scene, tmp_path):
         ([*result, "--out", tmp_path / "no" / "a.png"], "found no folder"),
         (["--pose", tmp_path / "T.txt", "--out", tmp_path / "a.png"], "wanted the 4 x 4 numbers"),
         (["--pose", tmp_path / "no.txt", "--out", tmp_path / "a.png"], "no.txt"),
+        (["--at", 0, 0, 1e30, "--out", tmp_path / "a.png"], "found a camera at [0.0, 0.0, 1e+30]"),
         (["--at", 0, 0, 1, "--photo", tmp_path / "no.jpg", "--animate", tmp_path / "a.gif"], "no.jpg"),
     ):
         code, lines, err = run(*arguments)

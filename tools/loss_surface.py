@@ -19,6 +19,7 @@ from exit_codes import EXIT_BAD_USAGE, complain, guarded
 from piccolo.errors import InputError
 from piccolo.export import read_results
 from piccolo.files import check_output, write_atomically
+from piccolo.loss import FARTHEST
 from piccolo.loss_surface import LossSurface, PoseGrid, loss_surface
 from piccolo.panorama import read_panorama
 from piccolo.pipeline import PlacedPoints, open_points
@@ -131,6 +132,9 @@ def grid_from(arguments: argparse.Namespace, placed: PlacedPoints, known: Known)
     counts = np.floor((corners[1] - corners[0]) / arguments.step) + 1.0
     if counts.prod() > MAX_CELLS:
         raise InputError(f"--step: found {counts.prod():.3g} places, wanted at most {MAX_CELLS}")
+    heights = heights_from(arguments, placed, known)
+    if not max(np.abs(corners).max(), np.abs(heights).max()) < FARTHEST:
+        raise InputError("--box, --heights: found places too far from the cloud, wanted them in it")
     x, y = (corners[0, k] + arguments.step * np.arange(counts[k]) for k in range(2))
     is_known = arguments.gravity == "known"
     rotations = (uniform_yaws if is_known else uniform_rotations)(
@@ -138,7 +142,7 @@ def grid_from(arguments: argparse.Namespace, placed: PlacedPoints, known: Known)
     )
     # Turned from a pose that is known, so that it is among them.
     start = known.all[0].R_cam_from_world if known.all else np.eye(3)
-    return PoseGrid(x, y, heights_from(arguments, placed, known), start @ rotations @ rotations[0].T)
+    return PoseGrid(x, y, heights, start @ rotations @ rotations[0].T)
 
 
 def heights_from(arguments: argparse.Namespace, placed: PlacedPoints, known: Known) -> Array:
