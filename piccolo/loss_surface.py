@@ -53,8 +53,13 @@ class LossSurface:
     is_free: NDArray[np.bool_]  # (ny, nx) false too near to a point, or outside of the cloud
 
     def lowest(self) -> tuple[int, int]:
-        """Row and column of the least loss."""
-        row, column = np.unravel_index(int(np.argmin(self.loss)), self.loss.shape)
+        """Row and column of the least loss in free space; anywhere if none is free.
+
+        From outside a cloud few points are seen, and a plain wall before a plain picture has little loss.
+        """
+        is_free = self.is_free & np.isfinite(self.loss)
+        loss = np.where(is_free, self.loss, np.inf) if is_free.any() else self.loss
+        row, column = np.unravel_index(int(np.argmin(loss)), loss.shape)
         return int(row), int(column)
 
     def num_minima(self) -> int:

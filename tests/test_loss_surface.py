@@ -91,6 +91,10 @@ def test_minima_are_counted_in_free_space():
     assert surface.num_minima() == 3
     is_free[5, 8] = False
     assert surface.num_minima() == 2
+    is_free[1, 1] = False
+    assert surface.lowest() == (1, 2)
+    is_free[:] = False
+    assert surface.lowest() == (1, 1)
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +137,8 @@ def test_picture_and_arrays_of_a_tilted_panorama(run, scene, tmp_path):
     with np.load(npz, allow_pickle=False) as arrays:
         shape = (len(arrays["y"]), len(arrays["x"]))
         assert [len(arrays["y"]), len(arrays["x"])] == told["places"]
-        row, column = np.unravel_index(arrays["loss"].argmin(), shape)
+        free_loss = np.where(arrays["is_free"], arrays["loss"], np.inf)
+        row, column = np.unravel_index(free_loss.argmin(), shape)
         lowest = [arrays["x"][column], arrays["y"][row], arrays["height"][row, column]]
         np.testing.assert_allclose(lowest, told["lowest_world"], atol=1e-6)
         assert abs(lowest[0] - truth.center_world[0]) < STEP

@@ -39,7 +39,7 @@ examples:
 At each place of a grid the least sampling loss (Eq. 2 of the paper) over --heights and --rotations is taken,
 over the points seen from there. If a pose is known, the rotations are its own, turned evenly, and the heights
 are about its own. z is up, or what --up or a prepared map says. Places too near to a point or outside of the
-cloud are computed too, and drawn pale.
+cloud are computed too, and drawn pale; the lowest place and the minima are of the others.
 
 NPZ, in the world's axes turned so that z is up (R_plan_from_world, identity for clouds with z up): x (nx,)
 and y (ny,) [m]; loss, height, is_free (ny, nx); R_cam_from_world (ny, nx, 3, 3) of the best pose; found_world
