@@ -79,6 +79,11 @@ def add_cloud_options(parser: argparse.ArgumentParser, text: str) -> None:
     """The cloud's files, described by `text`, and how to understand them."""
     group = parser.add_argument_group("cloud")
     group.add_argument("--cloud", type=Path, required=True, nargs="+", help=text)
+    add_cloud_reading_options(group)
+
+
+def add_cloud_reading_options(group: argparse._ArgumentGroup) -> None:
+    """How to understand a cloud's files."""
     unit = group.add_mutually_exclusive_group()
     unit.add_argument("--units", choices=list(METRES), help="of the cloud's coordinates (default m)")
     unit.add_argument("--scale", type=float, metavar="S", help="metres per unit of the cloud, in place of it")
@@ -89,10 +94,15 @@ def add_cloud_options(parser: argparse.ArgumentParser, text: str) -> None:
 
 
 def add_panorama_options(parser: argparse.ArgumentParser) -> None:
-    """The panoramas' files, and what the pictures do not say of themselves."""
+    """The panoramas' files, and how to understand them."""
     group = parser.add_argument_group("panorama")
     text = "JPEG, PNG, TIFF or WebP: 2:1, or a crop with Photo Sphere metadata; or a folder of six cube faces"
     group.add_argument("--pano", type=Path, required=True, nargs="+", help=text)
+    add_panorama_reading_options(group)
+
+
+def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
+    """What the pictures do not say of themselves."""
     text = "horizontal field of view of a part of the sphere, its middle row the horizon"
     group.add_argument("--fov", type=float, metavar="DEG", help=text)
     text = "picture, white where the panorama is to be ignored, or a folder of such named as the panoramas"
@@ -123,11 +133,6 @@ def parse(parser: argparse.ArgumentParser, argv: list[str] | None) -> argparse.N
         else:
             words.append(word)
     return parser.parse_args(words)
-
-
-def named(paths: list[Path]) -> str | tuple[str, ...]:
-    """The cloud's files as a result names them."""
-    return str(paths[0]) if len(paths) == 1 else tuple(map(str, paths))
 
 
 def add_method_options(parser: argparse.ArgumentParser) -> None:
@@ -184,10 +189,10 @@ def settings_from(arguments: argparse.Namespace) -> EngineSettings | PaperSettin
     if arguments.preset == "paper":
         return PaperSettings(use_visibility="no_visibility" not in given, **chosen)
     prior = Prior(
-        near_world=tuple(arguments.near) if arguments.near else None,
-        radius=arguments.radius,
-        height=tuple(arguments.height) if arguments.height else None,
-        heading_deg=arguments.heading,
+        near_world=tuple(given["near"]) if "near" in given else None,
+        radius=given.get("radius"),
+        height=tuple(given["height"]) if "height" in given else None,
+        heading_deg=given.get("heading"),
         heading_tolerance_deg=given.get("heading_tolerance", Prior.heading_tolerance_deg),
     )
     return EngineSettings(prior=prior, **chosen)

@@ -6,7 +6,7 @@ import os
 import sys
 import traceback
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from command_line import (
     build_parser,
     check_arguments,
     cloud_settings_from,
-    named,
     parse,
     read_options_from,
     settings_from,
@@ -25,9 +24,9 @@ from piccolo.errors import InputError
 from piccolo.files import check_output, write_atomically
 from piccolo.jit import KERNEL_FOLDER, is_first_use
 from piccolo.overlay import overlay_png
-from piccolo.panorama import ReadOptions, read_panorama
-from piccolo.pipeline import CachePolicy, Localizer, open_localizer
-from piccolo.result import Result, result_of
+from piccolo.panorama import ReadOptions
+from piccolo.pipeline import CachePolicy, Inputs, Localizer, localize_file, open_localizer
+from piccolo.result import Result
 from piccolo.settings import EngineSettings, PaperSettings
 from piccolo.stopwatch import Stopwatch
 from piccolo.threads import Workers
@@ -42,7 +41,7 @@ class Session:
     """One prepared cloud and how to treat the panoramas."""
 
     arguments: argparse.Namespace
-    read_options: ReadOptions
+    inputs: Inputs
     localizer: Localizer
     workers: Workers
     seconds: dict[str, float]  # spent once, on the cloud
@@ -54,18 +53,14 @@ class Session:
 
     def localize(self, pano: Path) -> Result:
         """Read one panorama, localize it, write its overlay if one is asked for."""
-        watch, localizer = Stopwatch(dict(self.seconds)), self.localizer
-        with watch.stage("read"):
-            panorama = read_panorama(pano, self.read_options)
-        found = localizer.localize(panorama, self.workers, watch)
-        if self.arguments.overlay and found.pose is not None:
-            png = overlay_png(localizer.points, panorama, localizer.from_world(found.pose))
+        localizer = self.localizer
+        result, panorama = localize_file(localizer, self.inputs, pano, self.workers, self.seconds)
+        if self.arguments.overlay and result.pose is not None:
+            png = overlay_png(localizer.points, panorama, localizer.from_world(result.pose))
             write_atomically(self.arguments.overlay, png)
-        settings = {"preset": self.arguments.preset, **localizer.settings.to_json()}
-        result = result_of(found, named(self.arguments.cloud), str(pano), watch.seconds, settings)
         for warning in panorama.warnings:
             self.say(f"warning: {warning}")
-        return replace(result, warnings=localizer.warnings + panorama.warnings)
+        return result
 
 
 def open_session(
@@ -86,9 +81,9 @@ def open_session(
     watch = Stopwatch()
     cache = CachePolicy(not arguments.no_cache, arguments.cache)
     workers = Workers(arguments.threads, show)
-    clouds = arguments.cloud, cloud_settings_from(arguments)
-    localizer = open_localizer(*clouds, settings, cache, workers, watch)
-    session = Session(arguments, read_options, localizer, workers, watch.seconds)
+    inputs = Inputs(tuple(arguments.cloud), cloud_settings_from(arguments), read_options)
+    localizer = open_localizer(inputs, settings, cache, workers, watch)
+    session = Session(arguments, inputs, localizer, workers, watch.seconds)
     for warning in localizer.warnings:
         session.say(f"warning: {warning}")
     return session

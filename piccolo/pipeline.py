@@ -1,7 +1,7 @@
 """The two presets behind one interface: a cloud is opened once, and panoramas are localized in it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -11,10 +11,10 @@ from .engine import method as engine
 from .engine.map_file import cached_map, content_key, is_map_file, load_map
 from .engine.scan_map import ScanMap, prepare_map
 from .errors import InputError
-from .panorama import Panorama
+from .panorama import AS_STORED, Panorama, ReadOptions, read_panorama
 from .paper import method as paper
 from .pose import Pose
-from .result import Localization
+from .result import Localization, Result, result_of
 from .settings import IN_METRES, CloudSettings, EngineSettings, PaperSettings
 from .stopwatch import Stopwatch
 from .threads import Workers
@@ -91,6 +91,25 @@ class EngineLocalizer:
 
 
 @dataclass(frozen=True)
+class Inputs:
+    """A cloud's files, and how they and the panoramas are to be read."""
+
+    clouds: tuple[Path, ...]
+    cloud_settings: CloudSettings = IN_METRES
+    read_options: ReadOptions = AS_STORED
+
+    def to_json(self) -> dict[str, object]:
+        """What a result repeats of them."""
+        panorama = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(self.read_options).items()}
+        return {"cloud": asdict(self.cloud_settings), "panorama": panorama}
+
+    @property
+    def cloud_name(self) -> str | tuple[str, ...]:
+        """The cloud's files as a result names them."""
+        return str(self.clouds[0]) if len(self.clouds) == 1 else tuple(map(str, self.clouds))
+
+
+@dataclass(frozen=True)
 class CachePolicy:
     """Where prepared maps are kept."""
 
@@ -133,14 +152,14 @@ def _map_among(paths: Sequence[Path]) -> Path | None:
 
 
 def open_localizer(
-    paths: Sequence[Path],
-    cloud_settings: CloudSettings,
+    inputs: Inputs,
     settings: EngineSettings | PaperSettings,
     cache: CachePolicy,
     workers: Workers,
     watch: Stopwatch,
 ) -> Localizer:
     """Read and prepare a cloud for the preset that the settings belong to."""
+    paths, cloud_settings = inputs.clouds, inputs.cloud_settings
     if isinstance(settings, EngineSettings):
         return EngineLocalizer(open_map(paths, cloud_settings, cache, workers, watch), settings)
     map_path = _map_among(paths)
@@ -151,3 +170,27 @@ def open_localizer(
     with watch.stage("prepare"):
         paper_map = paper.prepare(cloud, settings)
     return PaperLocalizer(paper_map, settings, cloud.warnings)
+
+
+def settings_json(inputs: Inputs, settings: EngineSettings | PaperSettings) -> dict[str, object]:
+    """What a result repeats of how it was made."""
+    return {**settings.to_json(), **inputs.to_json()}
+
+
+def localize_file(
+    localizer: Localizer, inputs: Inputs, pano: Path, workers: Workers, seconds: dict[str, float]
+) -> tuple[Result, Panorama]:
+    """The result of one panorama, and the panorama; `seconds` were spent on the cloud.
+
+    Raises
+    ------
+    InputError
+        The panorama can't be read.
+    """
+    watch = Stopwatch(dict(seconds))
+    with watch.stage("read"):
+        panorama = read_panorama(pano, inputs.read_options)
+    found = localizer.localize(panorama, workers, watch)
+    settings = settings_json(inputs, localizer.settings)
+    result = result_of(found, inputs.cloud_name, str(pano), watch.seconds, settings)
+    return replace(result, warnings=localizer.warnings + panorama.warnings), panorama

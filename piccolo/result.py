@@ -11,17 +11,11 @@ from .certainty import Certainty
 from .errors import InputError
 from .hypotheses import Hypothesis
 from .pose import Pose, T_world_from_cam, quaternion_wxyz
+from .sphere import CONVENTION
 from .verdict import AMBIGUOUS, NOT_LOCALIZED
 from .verify import Evidence
 
 FORMAT = "piccolo-pose/2"
-CONVENTION = (
-    "x_cam = R_cam_from_world @ (x_world - center_world) in metres; +x_cam points to the image centre, "
-    "+y_cam left, +z_cam up; u = (1/2 - atan2(y, x) / 2 pi) W, v = (1/2 - atan2(z, hypot(x, y)) / pi) H, "
-    "pixel centres at half-integers"
-)
-
-
 COVARIANCE_CONVENTION = (
     "of (w, d), rotation [rad] about the camera's axes, then translation [m] along the world's: "
     "R_true = exp([w]x) R_cam_from_world, center_true = center_world + d"
@@ -129,7 +123,7 @@ class Result:
                 warnings=tuple(document["warnings"]),
                 **{name: document[name] for name in _PLAIN_FIELDS},
             )
-        except (json.JSONDecodeError, KeyError, TypeError) as error:
+        except (json.JSONDecodeError, KeyError, RecursionError, TypeError) as error:
             raise InputError(
                 f"result: found {error!r}, wanted one JSON object of format {FORMAT!r}"
             ) from error

@@ -99,7 +99,7 @@ class PaperSettings(DescentSettings):
 
     def to_json(self) -> dict[str, object]:
         """The settings as they took effect."""
-        return {**asdict(self), "num_rotations": self.effective_num_rotations}
+        return {"preset": "paper", **asdict(self), "num_rotations": self.effective_num_rotations}
 
 
 @dataclass(frozen=True)
@@ -164,4 +164,4 @@ class EngineSettings:
 
     def to_json(self) -> dict[str, object]:
         """The settings as they took effect."""
-        return asdict(self)
+        return {"preset": "default", **asdict(self)}

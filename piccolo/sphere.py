@@ -18,6 +18,13 @@ PI = np.float32(math.pi)
 HALF_PI = np.float32(math.pi / 2)
 TINY = np.float32(1e-18)
 
+# what files with poses say of them
+CONVENTION = (
+    "x_cam = R_cam_from_world @ (x_world - center_world) in metres; +x_cam points to the image centre, "
+    "+y_cam left, +z_cam up; u = (1/2 - atan2(y, x) / 2 pi) W, v = (1/2 - atan2(z, hypot(x, y)) / pi) H, "
+    "pixel centres at half-integers"
+)
+
 # atan(q) = q P(q^2) on [0, 1], minimax in the absolute error: 2.5e-7 rad, 3.4e-7 with float32 rounding.
 # math.atan2 is a library call that keeps a loop from being vectorised.
 A0 = np.float32(0.99999612569809)

@@ -1,39 +1,12 @@
-"""True poses, and how far a pose is from them."""
+"""How far a pose is from the true one, and what counts as correct."""
 
-import json
 import math
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from .errors import InputError
 from .pose import Pose, angle_between
 
 MAX_DISTANCE, MAX_ANGLE = 0.1, math.radians(5.0)  # the paper's line between correct and wrong [m], [rad]
-
-
-@dataclass(frozen=True)
-class Query:
-    """A panorama with its true pose."""
-
-    variant: str
-    pose: Pose
-
-
-def read_truth(path: Path) -> dict[str, Query]:
-    """The queries of a queries.json by file name."""
-    try:
-        entries = json.loads(path.read_text())["queries"]
-        return {
-            Path(entry["image"]).name: Query(
-                entry["variant"],
-                Pose(np.array(entry["R_cam_from_world"], float), np.array(entry["center_world"], float)),
-            )
-            for entry in entries
-        }
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: found {error!r}, wanted a queries.json with true poses") from error
 
 
 def pose_errors(pose: Pose, true_pose: Pose) -> tuple[float, float]:

@@ -14,7 +14,15 @@ WIDTH = 512
 SIZE = (WIDTH, WIDTH // 2)
 CENTER = np.array([500_123.456789, 5_400_987.654321, 312.25])
 EVIDENCE = Evidence(0.7, 0.5, 0.8, 0.9, 0.6, 0.95, 0.02)
-WORDS = {"loss": 0.05, "evidence": EVIDENCE, "rivals": (), "certainty": None, "seconds": {}, "settings": {}}
+WORDS = {
+    "confidence": 0.9,
+    "loss": 0.05,
+    "evidence": EVIDENCE,
+    "rivals": (),
+    "certainty": None,
+    "seconds": {},
+    "settings": {},
+}
 
 
 def tilted_poses(num_poses, center=CENTER):
@@ -24,7 +32,7 @@ def tilted_poses(num_poses, center=CENTER):
 
 
 def result(pano, pose, status="localized", cloud="a.ply", **changes):
-    return Result(status, 0.9, cloud, str(pano), pose, **(WORDS | changes))
+    return Result(status=status, cloud=cloud, pano=str(pano), pose=pose, **(WORDS | changes))
 
 
 def write_results(path, results):

@@ -8,7 +8,8 @@ import pytest
 from rooms import errors, query, room
 
 import localize
-from command_line import build_parser, cloud_settings_from, named, parse
+from command_line import build_parser, cloud_settings_from, parse
+from piccolo.pipeline import Inputs
 from piccolo.result import Result
 from piccolo.settings import IN_METRES, CloudSettings
 from tools import prepare_map
@@ -63,8 +64,8 @@ def test_preset_paper_has_no_up(capsys):
 
 
 def test_one_file_is_named_by_a_string(tmp_path):
-    assert named([tmp_path]) == str(tmp_path)
-    assert named([tmp_path, tmp_path / "b"]) == (str(tmp_path), str(tmp_path / "b"))
+    assert Inputs((tmp_path,)).cloud_name == str(tmp_path)
+    assert Inputs((tmp_path, tmp_path / "b")).cloud_name == (str(tmp_path), str(tmp_path / "b"))
 
 
 def test_several_files_in_feet_with_y_up(scene, tmp_path, capsys):

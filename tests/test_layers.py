@@ -20,9 +20,10 @@ LAYERS = [
     {"loss", "render", "gravity"},
     {"overlay", "verify", "refine", "synthetic", "truth", "hypotheses", "certainty"},
     {"verdict"},
-    {"result"},
+    {"result", "scenes"},
     {"paper", "engine", "export"},
     {"pipeline"},
+    {"evaluation"},
 ]
 # pyramid shrinks panoramas; points are packed as texels are
 SIDEWAYS = {("pyramid", "panorama"), ("cloud", "sampling")}

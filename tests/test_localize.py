@@ -262,16 +262,16 @@ def test_results_are_evaluated_against_the_truth(scene, tmp_path, capsys):
     localize.main(
         ["--cloud", str(scene / "cloud.ply"), "--pano", *panos, *QUICK, "--quiet", "--out", str(results)]
     )
-    truth = str(scene / "queries.json")
-    assert evaluate.main(["--truth", truth, "--results", str(results)]) == 0
+    truth = str(scene)
+    assert evaluate.main(["--scenes", truth, "--results", str(results)]) == 0
     table = capsys.readouterr().out
-    assert re.search(r"\| clean_0.jpg \| localized \| 0\.0\d+ \|", table)
-    assert re.search(r"\| clean \| 2 \|", table)
+    assert re.search(r"\| images/clean_0.jpg \| localized \| 0\.0\d+ \|", table)
+    assert re.search(r"\| all \| 2 \| 2 \| 1.000 \|", table)
     (tmp_path / "odd.json").write_text("{}")
-    assert evaluate.main(["--truth", str(tmp_path / "odd.json"), "--results", str(results)]) == 3
+    assert evaluate.main(["--scenes", str(tmp_path / "odd.json"), "--results", str(results)]) == 3
     assert "wanted a queries.json" in capsys.readouterr().err
     (tmp_path / "empty.jsonl").write_text("\n")
-    assert evaluate.main(["--truth", truth, "--results", str(tmp_path / "empty.jsonl")]) == 3
+    assert evaluate.main(["--scenes", truth, "--results", str(tmp_path / "empty.jsonl")]) == 3
     assert "found no result" in capsys.readouterr().err
 
 
@@ -289,6 +289,6 @@ def test_readme_pipeline_runs_as_written(tmp_path):
         )
         assert done.returncode == 0, done.stderr
         printed.append(done.stdout)
-    assert "| clean | 2 | 2 |" in "".join(printed)
+    assert "| all | 2 | 2 | 1.000 |" in "".join(printed)
     assert (tmp_path / "room" / "risk.png").read_bytes().startswith(b"\x89PNG")
     assert len((tmp_path / "room" / "poses.csv").read_text().splitlines()) == 3

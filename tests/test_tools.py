@@ -2,15 +2,15 @@
 
 import json
 import re
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from piccolo.errors import InputError
 from piccolo.pose import Pose, exp_so3
-from piccolo.truth import is_correct, pose_errors, read_truth
-from tools import ablation, benchmark, calibrate, evaluate, fuzz_readers, growth, make_room, trials
+from piccolo.scenes import read_scene
+from piccolo.truth import is_correct, pose_errors
+from tools import ablation, benchmark, calibrate, fuzz_readers, growth, make_room, trials
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_truth_is_read_and_a_pose_judged(tmp_path):
     entry = {"image": "images/a.jpg", "variant": "clean", "center_world": [1, 2, 3]}
     entry["R_cam_from_world"] = np.eye(3).tolist()
     (tmp_path / "queries.json").write_text(json.dumps({"queries": [entry]}))
-    pose = read_truth(tmp_path / "queries.json")["a.jpg"].pose
+    pose = read_scene(tmp_path).queries[0].pose
     near = Pose(
         exp_so3(np.array([0.0, 0.0, np.radians(4.9)])), pose.center_world + np.array([0.0, 0.09, 0.0])
     )
@@ -93,7 +93,7 @@ def test_truth_is_read_and_a_pose_judged(tmp_path):
     assert not is_correct(None, pose)
     (tmp_path / "queries.json").write_text("{}")
     with pytest.raises(InputError, match=r"wanted a queries\.json with true poses"):
-        read_truth(tmp_path / "queries.json")
+        read_scene(tmp_path)
 
 
 def test_trials_of_a_scene_and_what_is_learnt_from_them(scene, tmp_path, capsys):
@@ -113,28 +113,11 @@ def test_trials_of_a_scene_and_what_is_learnt_from_them(scene, tmp_path, capsys)
     assert calibrate.main(["--check", str(tmp_path / "odd.jsonl")]) == 3
 
 
-def _row(confidence, is_right):
-    error = 0.0 if is_right else 1.0
-    result = SimpleNamespace(confidence=confidence)
-    return evaluate.Row("a.jpg", "clean", result, error, error)
-
-
-def test_risk_over_coverage():
-    rows = [_row(0.9, True), _row(0.5, False), _row(0.95, True), _row(0.5, True)]
-    points = evaluate.risk_and_coverage(rows, 0.1, 5.0)
-    assert [(p.confidence, p.coverage, p.num_wrong) for p in points] == [
-        (0.95, 0.25, 0),
-        (0.9, 0.5, 0),
-        (0.5, 1.0, 1),
-    ]
-    assert points[-1].risk == 0.25
-
-
 def test_fuzzing_finds_nothing_in_a_second_and_knows_every_format(tmp_path, capsys):
     assert {"ply", "las", "e57", "pcd", "npz", "panorama", "map"} <= set(fuzz_readers.READERS)
     found = tmp_path / "found"
-    assert fuzz_readers.main(["--reader", "truth", "--seconds", "1", "--crashes", str(found)]) == 0
-    assert re.search(r"truth: \d+ inputs, ok", capsys.readouterr().out)
+    assert fuzz_readers.main(["--reader", "scene", "--seconds", "1", "--crashes", str(found)]) == 0
+    assert re.search(r"scene: \d+ inputs, ok", capsys.readouterr().out)
     assert list(found.iterdir()) == []
     with pytest.raises(SystemExit):
         fuzz_readers.main(["--reader", "doc", "--crashes", str(found)])
@@ -142,6 +125,6 @@ def test_fuzzing_finds_nothing_in_a_second_and_knows_every_format(tmp_path, caps
 
 def test_a_reader_that_breaks_is_found(tmp_path, monkeypatch):
     (tmp_path / "a").write_bytes(b"")
-    monkeypatch.setitem(fuzz_readers.READERS, "truth", ((".json",), lambda path: 1 // 0))
+    monkeypatch.setitem(fuzz_readers.READERS, "scene", ((".json",), lambda path: 1 // 0))
     with pytest.raises(ZeroDivisionError):
-        fuzz_readers.try_file("truth", tmp_path / "a")
+        fuzz_readers.try_file("scene", tmp_path / "a")

@@ -17,10 +17,11 @@ from piccolo.engine import look, method, scan_map
 from piccolo.engine.contrast import Scale
 from piccolo.errors import InputError
 from piccolo.panorama import read_panorama
+from piccolo.scenes import Scene, read_scene
 from piccolo.settings import EngineSettings, Gravity
 from piccolo.stopwatch import Stopwatch
 from piccolo.threads import Workers, num_cores
-from piccolo.truth import Query, is_correct, read_truth
+from piccolo.truth import is_correct
 
 EPILOG = """\
 example:
@@ -57,16 +58,16 @@ def change_views(part: str) -> None:
         look.SCALES = tuple(Scale(s.width, s.cell_deg, EVERYTHING) for s in look.SCALES)
 
 
-def row(part: str, scenes: list[tuple[Path, Cloud, dict[str, Query]]]) -> str:
+def row(part: str, scenes: list[tuple[Scene, Cloud]]) -> str:
     """One line of the table."""
     counts = dict.fromkeys(VARIANTS, 0)
     totals = dict.fromkeys(VARIANTS, 0)
     seconds, errors = [], []
     workers = Workers(num_cores())
-    for folder, cloud, truth in scenes:
+    for scene, cloud in scenes:
         prepared = scan_map.prepare_map(cloud, workers)
-        for name, query in truth.items():
-            panorama = read_panorama(folder / "images" / name)
+        for query in scene.queries:
+            panorama = read_panorama(query.image)
             gravity: Gravity = "unknown" if query.variant == "tilt" else "known"
             settings = replace(SETTINGS.get(part, EngineSettings()), gravity=gravity)
             begin = time.perf_counter()
@@ -89,7 +90,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("scenes", type=Path, nargs="+", metavar="FOLDER", help="scenes with true poses")
     arguments = parser.parse_args(argv)
     try:
-        scenes = [(f, read_cloud(f / "cloud.ply"), read_truth(f / "queries.json")) for f in arguments.scenes]
+        scenes = [(scene, read_cloud(scene.cloud)) for scene in map(read_scene, arguments.scenes)]
         print("| part | clean | tilt | photo | change | median mm | s |")
         print("|---|---:|---:|---:|---:|---:|---:|")
         row("all of it", scenes[:1])  # compiles

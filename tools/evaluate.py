@@ -1,186 +1,226 @@
 #!/usr/bin/env python3
-"""Compare results of localize.py with true poses: a table of errors, and what share is correct."""
+"""Localize the panoramas of scenes with true poses, and tell how good the poses are."""
 
 import argparse
+import json
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
-from io import BytesIO
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
+from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from command_line import (
+    add_cloud_reading_options,
+    add_method_options,
+    add_panorama_reading_options,
+    cloud_settings_from,
+    parse,
+    read_options_from,
+    settings_from,
+)
+from exit_codes import EXIT_BAD_INPUT, complain, guarded
 from piccolo.errors import InputError
-from piccolo.files import write_atomically
+from piccolo.evaluation import pictures, tables
+from piccolo.evaluation.compare import changes, pair_up, side_by_side
+from piccolo.evaluation.row import Row, match_results
+from piccolo.evaluation.run_file import appending, check_settings, read_rows
+from piccolo.evaluation.runner import Failure, Plan, jobs_of, run
+from piccolo.evaluation.statistics import Limits, risk_and_coverage
+from piccolo.files import check_output, write_atomically
+from piccolo.pipeline import CachePolicy, Inputs, settings_json
 from piccolo.result import Result
-from piccolo.truth import Query, pose_errors, read_truth
-from piccolo.verdict import LOCALIZED
+from piccolo.scenes import Scene, find_scenes
+from piccolo.threads import Show, num_cores
 
 EPILOG = """\
-example:
-  python localize.py --cloud scene/cloud.ply --pano scene/images/*.jpg --out poses.jsonl
-  python tools/evaluate.py --truth scene/queries.json --results poses.jsonl
+examples:
+  python tools/evaluate.py --scenes datasets/stanford --out run.jsonl --jobs 4
+  python tools/evaluate.py --scenes datasets/stanford --out paper.jsonl --preset paper --errors paper.png
+  python tools/evaluate.py --scenes room --results poses.jsonl
+  python tools/evaluate.py --compare paper.jsonl run.jsonl
 
-queries.json: {"queries": [{"image", "variant", "R_cam_from_world", "center_world"}]}; a panorama
-belongs to the query whose image has the same file name. The table is Markdown, on stdout.
-exit codes: 0 done, 2 wrong usage, 3 bad input.
+Scenes are folders with a queries.json, a cloud and images, at any depth below --scenes (docs/DATASETS.md).
+--out runs the queries that it does not have yet, and appends a line for each as it comes: give the same
+command again to take up a run that was stopped. --results are lines of localize.py instead; each belongs to
+the query of the same path, or else of the same file name. Tables are Markdown, on stdout.
+exit codes: 0 done, 2 wrong usage, 3 bad input (the rest of a run is done), 4 internal error, 130 interrupted.
 """
+PROGRAM = "evaluate.py"
 
 
-LINES = (0.999, 0.99, 0.95, 0.9, 0.7, 0.5, 0.2, 0.0)
-
-
-@dataclass(frozen=True)
-class Row:
-    """One result against the truth."""
-
-    image: str
-    variant: str
-    result: Result
-    position_error: float  # [m], inf without a pose
-    rotation_error: float  # [rad], inf without a pose
-
-    @property
-    def seconds(self) -> float:
-        """Search and refinement, without reading and preparing."""
-        return sum(self.result.seconds.get(stage, 0.0) for stage in ("search", "refine"))
-
-    def is_correct(self, max_distance: float, max_angle_deg: float) -> bool:
-        """True if both errors are below the lines."""
-        return self.position_error < max_distance and np.degrees(self.rotation_error) < max_angle_deg
-
-
-@dataclass(frozen=True)
-class Point:
-    """One point of the curve of risk over coverage."""
-
-    confidence: float  # results from here on are accepted
-    coverage: float  # share that is accepted
-    risk: float  # share of these that is wrong
-    num_wrong: int
-
-
-def compare(result: Result, truth: dict[str, Query]) -> Row:
-    """The errors of one result."""
-    name = Path(result.pano).name
-    if name not in truth:
-        raise InputError(f"{name}: found a result without a true pose, wanted one of {sorted(truth)[:3]} ...")
-    query = truth[name]
-    if result.pose is None:
-        return Row(name, query.variant, result, np.inf, np.inf)
-    return Row(name, query.variant, result, *pose_errors(result.pose, query.pose))
-
-
-def print_rows(rows: Sequence[Row]) -> None:
-    """One line a panorama."""
-    print("| panorama | status | error [m] | error [deg] | confidence | score | margin | loss | seconds |")
-    print("|---|---|---:|---:|---:|---:|---:|---:|---:|")
-    for row in rows:
-        r = row.result
-        e = r.evidence
-        numbers = [f"{r.confidence:.3f}", *([f"{e.score:.2f}", f"{e.margin:.2f}"] if e else ["-", "-"])]
-        numbers.append(f"{r.loss:.3f}" if r.loss is not None else "-")
-        errors = f"{row.position_error:.4f} | {np.degrees(row.rotation_error):.3f}"
-        print(f"| {row.image} | {r.status} | {errors} | {' | '.join(numbers)} | {row.seconds:.2f} |")
-
-
-def print_summary(rows: Sequence[Row], max_distance: float, max_angle_deg: float) -> None:
-    """One line a variant, and one for all."""
-    print(f"\ncorrect: under {max_distance} m and {max_angle_deg} deg; medians are of the correct ones\n")
-    print("| variant | queries | correct | localized | wrong of these | mm | deg | s |")
-    print("|---|---:|---:|---:|---:|---:|---:|---:|")
-    variants = list(dict.fromkeys(row.variant for row in rows))
-    for variant in [*variants, *(["all"] if len(variants) > 1 else [])]:
-        some = [row for row in rows if variant in (row.variant, "all")]
-        correct = [r for r in some if r.is_correct(max_distance, max_angle_deg)]
-        localized = [row for row in some if row.result.status == LOCALIZED]
-        wrong = sum(row not in correct for row in localized)
-        mm = f"{1000 * np.median([r.position_error for r in correct]):.1f}" if correct else "-"
-        deg = f"{np.degrees(np.median([r.rotation_error for r in correct])):.3f}" if correct else "-"
-        counts = f"{len(some)} | {len(correct)} | {len(localized)} | {wrong}"
-        print(f"| {variant} | {counts} | {mm} | {deg} | {np.median([r.seconds for r in some]):.2f} |")
-
-
-def risk_and_coverage(rows: Sequence[Row], max_distance: float, max_angle_deg: float) -> list[Point]:
-    """What is accepted and what is wrong of it, as the line moves down from one confidence to the next."""
-    points: list[Point] = []
-    by_confidence = sorted(rows, key=lambda row: -row.result.confidence)
-    num_wrong = 0
-    for k, row in enumerate(by_confidence, 1):
-        num_wrong += not row.is_correct(max_distance, max_angle_deg)
-        is_last = k == len(rows) or by_confidence[k].result.confidence < row.result.confidence
-        if is_last:
-            points.append(Point(row.result.confidence, k / len(rows), num_wrong / k, num_wrong))
-    return points
-
-
-def print_risks(points: Sequence[Point]) -> None:
-    """The curve at a few confidences."""
-    print("\n| accepted from confidence | accepted | wrong of these | wrong share |")
-    print("|---:|---:|---:|---:|")
-    for line in LINES:
-        inside = [point for point in points if point.confidence >= line]
-        if inside:
-            last = inside[-1]
-            print(f"| {line} | {100 * last.coverage:.1f} % | {last.num_wrong} | {100 * last.risk:.2f} % |")
-
-
-def risk_png(points: Sequence[Point]) -> bytes:
-    """The curve as a picture."""
-    figure = Figure(figsize=(6, 4), layout="constrained")
-    axes = figure.add_subplot()
-    coverage, risk = [100 * p.coverage for p in points], [100 * p.risk for p in points]
-    axes.step([0.0, *coverage], [risk[0], *risk], where="pre")
-    for line in (0.99, 0.9, 0.5):
-        inside = [p for p in points if p.confidence >= line]
-        if inside:
-            axes.plot(100 * inside[-1].coverage, 100 * inside[-1].risk, "o", label=f"confidence {line}")
-    axes.set(
-        xlabel="accepted [%]",
-        ylabel="wrong of the accepted [%]",
-        xlim=(0, 100),
-        ylim=(0, max(5.0, 1.1 * max(risk))),
+def build_parser() -> argparse.ArgumentParser:
+    """All options."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    axes.grid(alpha=0.3)
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend()
-    file = BytesIO()
-    figure.savefig(file, format="png", dpi=120)
-    return file.getvalue()
+    source = parser.add_argument_group("what")
+    source.add_argument("--scenes", type=Path, nargs="+", metavar="FOLDER", help="scenes with true poses")
+    source.add_argument("--variants", nargs="+", metavar="NAME", default=[], help="only these splits")
+    kind = source.add_mutually_exclusive_group(required=True)
+    kind.add_argument("--out", type=Path, metavar="JSONL", help="run, or go on with this run")
+    kind.add_argument("--results", type=Path, metavar="JSONL", help="results of localize.py; nothing is run")
+    kind.add_argument("--compare", type=Path, nargs=2, metavar="JSONL", help="two runs, side by side")
+    text = "processes; each with its share of the cores (default 1)"
+    source.add_argument("--jobs", type=int, default=1, metavar="N", help=text)
+    source.add_argument("--cache", type=Path, metavar="FOLDER", help="of prepared maps (default the user's)")
+    told = parser.add_argument_group("tables and pictures")
+    told.add_argument("--max-distance", type=float, default=0.1, metavar="M", help="correct is under (0.1)")
+    told.add_argument("--max-angle", type=float, default=5.0, metavar="DEG", help="and under (5)")
+    told.add_argument("--csv", type=Path, metavar="FILE", help="a line a query")
+    told.add_argument("--markdown", type=Path, metavar="FILE", help="the tables, here too")
+    text = "picture: share of queries under each error, and recall over thresholds"
+    told.add_argument("--errors", type=Path, metavar="PNG", help=text)
+    text = "picture: share that is wrong against share that is accepted, as the confidence asked for falls"
+    told.add_argument("--risk", type=Path, metavar="PNG", help=text)
+    add_cloud_reading_options(parser.add_argument_group("clouds"))
+    add_panorama_reading_options(parser.add_argument_group("panoramas"))
+    add_method_options(parser)
+    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    return parser
+
+
+def plan_of(arguments: argparse.Namespace) -> Plan:
+    """How the options want queries localized."""
+    num_threads = max(1, num_cores() // arguments.jobs)
+    reading = cloud_settings_from(arguments), read_options_from(arguments)
+    return Plan(settings_from(arguments), *reading, CachePolicy(True, arguments.cache), num_threads)
+
+
+def bar_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """How progress is shown."""
+    return {"disable": arguments.quiet, "file": sys.stderr}
+
+
+def show_for(arguments: argparse.Namespace) -> Show:
+    """Progress within one query, below that of the queries."""
+
+    def show(values: Iterator[Any], total: int | None, label: str) -> Iterator[Any]:
+        return iter(tqdm(values, label, total, leave=False, delay=1.0, **bar_options(arguments)))
+
+    return show
+
+
+def run_rows(arguments: argparse.Namespace, plan: Plan, scenes: Sequence[Scene]) -> tuple[list[Row], int]:
+    """All rows of the scenes, old ones and new ones, and how many queries could not be tried."""
+    out: Path = arguments.out
+    check_output(out, [])
+    rows, size = read_rows(out) if out.exists() else ([], 0)
+    inputs = Inputs((), plan.cloud_settings, plan.read_options)
+    wanted = json.loads(json.dumps(settings_json(inputs, plan.settings)))
+    check_settings(out, rows, wanted)
+    jobs = jobs_of(scenes, {row.key for row in rows}, arguments.variants)
+    names = {scene.name for scene in scenes}
+    rows = [row for row in rows if row.scene in names]
+    failures: list[Failure] = []
+    bar = tqdm(desc="queries", total=sum(len(job.queries) for job in jobs), unit="", **bar_options(arguments))
+    with appending(out, size) as append, bar:
+        for found in run(plan, jobs, arguments.jobs, show_for(arguments)):
+            if isinstance(found, Failure):
+                complain(PROGRAM, False, found.text, EXIT_BAD_INPUT)
+                failures.append(found)
+                bar.update(found.num_queries)
+            else:
+                append(found)
+                rows.append(found)
+                bar.update()
+    return rows, sum(failure.num_queries for failure in failures)
+
+
+def read_results(path: Path, scenes: Sequence[Scene]) -> list[Row]:
+    """The rows of a file of localize.py."""
+    lines = [line for line in path.read_text().splitlines() if line.strip()]
+    rows = list(match_results(scenes, [Result.from_json(line) for line in lines]))
+    if not rows:
+        raise InputError(f"{path}: found no result, wanted JSON lines of localize.py")
+    return rows
+
+
+def report(rows: Sequence[Row], limits: Limits) -> list[tables.Table]:
+    """All tables of one run."""
+    inside = [row for row in rows if row.is_in_box]
+    boxes = [row for row in rows if row.is_in_box is not None]
+    told = [tables.per_query(rows), tables.summary_table(rows, limits, f"all {len(rows)} queries")]
+    if boxes:
+        num_outside = len(boxes) - len(inside)
+        title = f"without the {num_outside} queries taken outside the cloud's bounding box"
+        told += [tables.summary_table(inside, limits, title)] if num_outside and inside else []
+    told.append(tables.threshold_table(rows, limits))
+    told.append(tables.risk_table(risk_and_coverage(rows, limits)))
+    return told
+
+
+def tell(arguments: argparse.Namespace, rows: Sequence[Row], limits: Limits) -> None:
+    """Print the tables of one run, and write what else is asked for."""
+    rows = sorted(rows, key=lambda row: row.key)
+    text = "\n".join(table.markdown() for table in report(rows, limits))
+    name = (arguments.out or arguments.results).stem
+    print(text, end="")
+    if arguments.csv:
+        write_atomically(arguments.csv, tables.csv_text(rows).encode())
+    if arguments.markdown:
+        write_atomically(arguments.markdown, text.encode())
+    if arguments.errors:
+        write_atomically(arguments.errors, pictures.errors_png({name: rows}, limits))
+    if arguments.risk:
+        write_atomically(arguments.risk, pictures.risk_png(risk_and_coverage(rows, limits)))
+
+
+def compare(arguments: argparse.Namespace, limits: Limits) -> int:
+    """Print two runs side by side."""
+    runs = [read_rows(path)[0] for path in arguments.compare]
+    pairs = pair_up(*runs)
+    first, second = names = tuple(str(path) for path in arguments.compare)
+    if not pairs:
+        raise InputError(f"{first}, {second}: found no query that both have, wanted runs of the same scenes")
+    text = side_by_side(pairs, (first, second), limits).markdown()
+    for path, rows in zip(names, runs, strict=True):
+        text += f"\nonly in {path}: {len(rows) - len(pairs)} queries"
+    print(f"{text}\n\n{changes(pairs, limits).markdown()}", end="")
+    if arguments.errors:
+        both = {first: [p.first for p in pairs], second: [p.second for p in pairs]}
+        write_atomically(arguments.errors, pictures.errors_png(both, limits))
+    return 0
+
+
+def evaluate(arguments: argparse.Namespace, plan: Plan) -> int:
+    """Do what is asked; returns the exit code."""
+    limits = Limits(arguments.max_distance, float(np.radians(arguments.max_angle)))
+    for output in filter(None, (arguments.csv, arguments.markdown, arguments.errors, arguments.risk)):
+        check_output(output, [])
+    if arguments.compare:
+        return compare(arguments, limits)
+    scenes = find_scenes(arguments.scenes)
+    num_failed = 0
+    if arguments.results:
+        rows = read_results(arguments.results, scenes)
+    else:
+        rows, num_failed = run_rows(arguments, plan, scenes)
+    if arguments.variants:
+        rows = [row for row in rows if row.variant in arguments.variants]
+    if not rows:
+        raise InputError("--scenes, --variants: found no query that could be tried, wanted some")
+    tell(arguments, rows, limits)
+    return EXIT_BAD_INPUT if num_failed else 0
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--truth", type=Path, required=True, help="queries.json with true poses")
-    parser.add_argument("--results", type=Path, required=True, help="JSON lines of localize.py")
-    parser.add_argument("--max-distance", type=float, default=0.1, metavar="M", help="(default 0.1)")
-    parser.add_argument("--max-angle", type=float, default=5.0, metavar="DEG", help="(default 5)")
-    text = "picture: share that is wrong against share that is accepted, as the confidence asked for falls"
-    parser.add_argument("--risk", type=Path, metavar="PNG", help=text)
-    arguments = parser.parse_args(argv)
+    parser = build_parser()
+    arguments = parse(parser, argv)
+    if (arguments.scenes is None) == (arguments.compare is None):
+        parser.error("--scenes goes with --out or --results; --compare stands alone")
+    if arguments.jobs < 1:
+        parser.error(f"--jobs: found {arguments.jobs}, wanted at least 1")
     try:
-        truth = read_truth(arguments.truth)
-        lines = arguments.results.read_text().splitlines()
-        rows = [compare(Result.from_json(line), truth) for line in lines if line.strip()]
-        if not rows:
-            raise InputError(f"{arguments.results}: found no result, wanted JSON lines of localize.py")
-        limits = arguments.max_distance, arguments.max_angle
-        points = risk_and_coverage(rows, *limits)
-        if arguments.risk:
-            write_atomically(arguments.risk, risk_png(points))
-    except (OSError, InputError) as error:
-        print(f"evaluate.py: {error}", file=sys.stderr)
-        return 3
-    print_rows(rows)
-    print_summary(rows, *limits)
-    print_risks(points)
-    return 0
+        plan = plan_of(arguments)
+    except InputError as error:
+        parser.error(str(error))
+    return guarded(PROGRAM, arguments.debug, lambda: evaluate(arguments, plan))
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from piccolo.engine.map_file import load_map
 from piccolo.errors import InputError
 from piccolo.panorama import read_panorama
 from piccolo.result import Result
-from piccolo.truth import read_truth
+from piccolo.scenes import read_scene
 
 EPILOG = """\
 examples:
@@ -52,7 +52,7 @@ READERS: dict[str, tuple[tuple[str, ...], Callable[[Path], object]]] = {
     **{named(form): (tuple(sorted(form.suffixes)), read_format(form)) for form in FORMATS},
     "panorama": ((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp"), read_panorama),
     "result": ((".jsonl",), lambda path: Result.from_json(path.read_text())),
-    "truth": ((".json",), read_truth),
+    "scene": ((".json",), read_scene),
     "map": ((".map", ".npz"), load_map),
 }
 

@@ -24,11 +24,12 @@ from piccolo.engine.scan_map import prepare_map
 from piccolo.errors import InputError
 from piccolo.panorama import Panorama, read_panorama
 from piccolo.pose import Pose
+from piccolo.scenes import read_scene
 from piccolo.settings import EngineSettings, Gravity
 from piccolo.stopwatch import Stopwatch
 from piccolo.synthetic.world import make_query, make_world, scan_world
 from piccolo.threads import Workers, num_cores
-from piccolo.truth import is_correct, read_truth
+from piccolo.truth import is_correct
 
 EPILOG = """\
 examples:
@@ -63,8 +64,8 @@ def ordered(
 
 def scene_case(folder: Path, num_points: int) -> Case:
     """A scene with as many points."""
-    cloud = read_cloud(folder / "cloud.ply")
-    truth = read_truth(folder / "queries.json")
+    scene = read_scene(folder)
+    cloud = read_cloud(scene.cloud)
     rng = np.random.default_rng(0)
     index = rng.permutation(len(cloud.points))[:num_points]
     if num_points > len(index):
@@ -72,8 +73,8 @@ def scene_case(folder: Path, num_points: int) -> Case:
     points = cloud.points[index]
     if num_points > len(cloud.points):
         points = points + rng.normal(0.0, 0.005, points.shape).astype(np.float32)
-    names = [name for name, query in truth.items() if query.variant == "clean"][:NUM_QUERIES]
-    queries = [(read_panorama(folder / "images" / name), truth[name].pose) for name in names]
+    taken = [query for query in scene.queries if query.variant == "clean"][:NUM_QUERIES]
+    queries = [(read_panorama(query.image), query.pose) for query in taken]
     return Case(ordered(points, cloud.colors[index], cloud.origin_world), queries)
 
 

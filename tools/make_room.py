@@ -10,16 +10,15 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
-from plyfile import PlyData, PlyElement
 from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from exit_codes import guarded
+from piccolo import scenes
+from piccolo.cloud.ply_writing import vertex_rows, write_ply
 from piccolo.errors import InputError
 from piccolo.files import write_atomically
-from piccolo.result import CONVENTION
 from piccolo.synthetic.world import (
     VARIANTS,
     Query,
@@ -63,29 +62,14 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def ply_bytes(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> bytes:
-    """A binary PLY header and vertices of points (N, 3) and colours (N, 3)."""
-    fields = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
-    vertex = np.empty(len(points), dtype=fields)
-    for k, (name, _) in enumerate(fields):
-        vertex[name] = points[:, k] if k < 3 else colors[:, k - 3]
-    header = PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").header
-    return bytes(header.encode("ascii") + b"\n" + vertex.tobytes())
-
-
-def write_query(folder: Path, name: str, query: Query) -> dict[str, object]:
-    """Write the image of a query and return its entry in queries.json."""
-    image = Path("images") / f"{name}.jpg"
+def write_query(folder: Path, name: str, query: Query) -> scenes.Query:
+    """Write the image of a query and return what queries.json has of it."""
+    image = folder / "images" / f"{name}.jpg"
     bgr = cv2.cvtColor(query.rgb, cv2.COLOR_RGB2BGR)
     quality = 70 if query.variant == "photo" else 95
     _, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    write_atomically(folder / image, bytes(encoded))
-    return {
-        "image": str(image),
-        "variant": query.variant,
-        "R_cam_from_world": query.pose.R_cam_from_world.tolist(),
-        "center_world": query.pose.center_world.tolist(),
-    }
+    write_atomically(image, bytes(encoded))
+    return scenes.Query(image, query.variant, query.pose)
 
 
 def write_world(arguments: argparse.Namespace, world: World, workers: Workers) -> dict[str, object]:
@@ -95,15 +79,14 @@ def write_world(arguments: argparse.Namespace, world: World, workers: Workers) -
     check_width(arguments.width)
     (folder / "images").mkdir(parents=True, exist_ok=True)
     points, colors = scan_world(world, arguments.points, workers)
-    write_atomically(folder / "cloud.ply", ply_bytes(points, colors))
-    entries = [
+    write_ply(folder / scenes.CLOUD_NAME, vertex_rows(points, colors))
+    queries = [
         write_query(folder, f"{v}_{k}", make_query(world, k, v, arguments.width, workers))
         for v in dict.fromkeys(arguments.variants)
         for k in range(arguments.panoramas)
     ]
-    document = {"cloud": "cloud.ply", "convention": CONVENTION, "queries": entries}
-    write_atomically(folder / "queries.json", json.dumps(document, indent=1).encode())
-    return {"folder": str(folder), "points": len(points), "queries": len(entries), "seed": arguments.seed}
+    scenes.write_queries(folder, queries)
+    return {"folder": str(folder), "points": len(points), "queries": len(queries), "seed": arguments.seed}
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -21,6 +21,7 @@ from piccolo.paper import method as paper
 from piccolo.pipeline import EngineLocalizer, Localizer, PaperLocalizer
 from piccolo.pose import Pose
 from piccolo.result import Result, result_of
+from piccolo.scenes import Scene, read_scene
 from piccolo.settings import EngineSettings, Gravity, PaperSettings
 from piccolo.stopwatch import Stopwatch
 from piccolo.synthetic.trials import (
@@ -33,7 +34,7 @@ from piccolo.synthetic.trials import (
     without_scene,
 )
 from piccolo.threads import Workers, num_cores
-from piccolo.truth import is_correct, read_truth
+from piccolo.truth import is_correct
 from piccolo.verdict import AMBIGUOUS, LOCALIZED
 
 EPILOG = """\
@@ -58,21 +59,18 @@ def as_panorama(rgb: np.ndarray[tuple[int, int, int], np.dtype[np.uint8]]) -> Pa
     return Panorama(rgb, np.ones(rgb.shape[:2], np.bool_))
 
 
-def scene_trials(folder: Path, others: Sequence[Path]) -> Iterator[tuple[CloudStream, list[Trial]]]:
+def scene_trials(scene: Scene, others: Sequence[Scene]) -> Iterator[tuple[CloudStream, list[Trial]]]:
     """Every panorama of every scene in one scene's cloud; its own also spoilt, and in a thinned cloud."""
-    cloud, truth = read_cloud(folder / "cloud.ply"), read_truth(folder / "queries.json")
-    rng = np.random.default_rng([len(truth), 52])
-    own = [
-        Trial(query.variant, read_panorama(folder / "images" / name).rgb, query.pose)
-        for name, query in truth.items()
-    ]
+    cloud = read_cloud(scene.cloud)
+    rng = np.random.default_rng([len(scene.queries), 52])
+    own = [Trial(query.variant, read_panorama(query.image).rgb, query.pose) for query in scene.queries]
     upright = [trial for trial in own if trial.case == "clean"]
     spoilt = [Trial(name, rgb, t.true_pose if name == "blurred" else None)
               for t in upright[:2] for name, rgb in without_scene(t.rgb, rng)]  # fmt: skip
     elsewhere = [
-        Trial("elsewhere", read_panorama(path).rgb, None)
+        Trial("elsewhere", read_panorama(query.image).rgb, None)
         for other in others
-        for path in sorted((other / "images").iterdir())
+        for query in other.queries
     ]
     points_world = cloud.points + cloud.origin_world
     yield cloud_of((points_world, cloud.colors)), [*own, *elsewhere, *spoilt, *map(upside_down, upright)]
@@ -88,10 +86,11 @@ def all_trials(
     for seed in range(*arguments.seeds):
         for points, trials in chain(room_trials(seed, workers), repeated_trials(seed, workers)):
             yield f"seed {seed}", cloud_of(points), trials
-    for folder in arguments.scenes:
-        others = [other for other in arguments.scenes if other != folder]
-        for cloud, trials in scene_trials(folder, others):
-            yield folder.name, cloud, trials
+    scenes = [read_scene(folder) for folder in arguments.scenes]
+    for scene in scenes:
+        others = [other for other in scenes if other is not scene]
+        for cloud, trials in scene_trials(scene, others):
+            yield scene.name, cloud, trials
 
 
 def localizer_of(cloud: CloudStream, preset: str, workers: Workers) -> Callable[[Gravity], Localizer]:

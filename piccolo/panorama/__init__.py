@@ -15,13 +15,13 @@ from .patches import black_borders, polar_disc
 from .picture import Picture, read_picture
 from .placing import ASPECT_TOLERANCE, full_size, place, region_of_fov
 
-__all__ = ["GPano", "Panorama", "ReadOptions", "read_panorama", "rotation_to_level"]
+__all__ = ["AS_STORED", "GPano", "Panorama", "ReadOptions", "read_panorama", "rotation_to_level"]
 
-DEFAULT_OPTIONS = ReadOptions()
+AS_STORED = ReadOptions()
 MIN_REPORTED = 0.001  # of the sphere: borders below this are masked without a word
 
 
-def read_panorama(path: Path, options: ReadOptions = DEFAULT_OPTIONS) -> Panorama:
+def read_panorama(path: Path, options: ReadOptions = AS_STORED) -> Panorama:
     """The panorama in a JPEG, PNG, TIFF or WebP file or in a folder of six cube faces, as a full sphere.
 
     Colours have 8 bits (of 16 the upper 8, v >> 8), grey becomes RGB, EXIF's orientation is applied. Not

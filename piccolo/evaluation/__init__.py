@@ -1,0 +1,1 @@
+"""How good results are: rows of errors, statistics, tables, pictures, and runs over whole datasets."""

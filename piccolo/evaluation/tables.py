@@ -1,0 +1,111 @@
+"""Tables of an evaluation, as Markdown and CSV."""
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .row import Row
+from .statistics import THRESHOLDS, Limits, Point, Summary, accuracies, summarize
+
+CONFIDENCES = (0.999, 0.99, 0.95, 0.9, 0.7, 0.5, 0.2, 0.0)
+ALL = "all"
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of text; the first `num_left` columns are words."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    num_left: int = 1
+
+    def markdown(self) -> str:
+        """Title and table."""
+        marks = ["---"] * self.num_left + ["---:"] * (len(self.columns) - self.num_left)
+        lines = [" | ".join(cells) for cells in (self.columns, *self.rows)]
+        lines = [f"| {line} |" for line in lines]
+        head = [self.title, ""] if self.title else []
+        return "\n".join([*head, lines[0], f"|{'|'.join(marks)}|", *lines[1:], ""])
+
+
+def per_query(rows: Sequence[Row]) -> Table:
+    """One line a query."""
+    columns = "scene", "panorama", "status", "error [m]", "error [deg]", "confidence", "score", "margin"
+    return Table("", (*columns, "loss", "seconds"), tuple(_query_cells(row) for row in rows), 3)
+
+
+def _query_cells(row: Row) -> tuple[str, ...]:
+    result = row.result
+    evidence = result.evidence
+    score = (f"{evidence.score:.2f}", f"{evidence.margin:.2f}") if evidence else ("-", "-")
+    errors = f"{row.position_error:.4f}", f"{np.degrees(row.rotation_error):.3f}"
+    loss = "-" if result.loss is None else f"{result.loss:.3f}"
+    words = row.scene, row.image, result.status
+    return (*words, *errors, f"{result.confidence:.3f}", *score, loss, f"{row.seconds:.2f}")
+
+
+def groups(rows: Sequence[Row]) -> Iterator[tuple[str, list[Row]]]:
+    """The rows of each split, of each room, and all; a grouping of one group is left out."""
+    for kind in ("variant", "scene"):
+        names = sorted({getattr(row, kind) for row in rows})
+        if len(names) > 1:
+            yield from ((name, [row for row in rows if getattr(row, kind) == name]) for name in names)
+    yield ALL, list(rows)
+
+
+def summary_table(rows: Sequence[Row], limits: Limits, title: str) -> Table:
+    """Quartiles of the errors, accuracy and verdicts of every group."""
+    words = f"{title}; correct: under {limits.max_distance:g} m and {np.degrees(limits.max_angle):g} deg"
+    errors = "t 25 % [m]", "t 50 %", "t 75 %", "R 25 % [deg]", "R 50 %", "R 75 %"
+    columns = "queries", "number", "correct", "accuracy", *errors, "localized", "wrong of these", "s"
+    cells = tuple((name, *_summary_cells(summarize(some, limits))) for name, some in groups(rows))
+    return Table(words, columns, cells)
+
+
+def _summary_cells(s: Summary) -> tuple[str, ...]:
+    meters = [f"{value:.4f}" for value in s.position_quartiles]
+    degrees = [f"{value:.3f}" for value in np.degrees(s.rotation_quartiles)]
+    shares = f"{s.num_queries}", f"{s.num_correct}", f"{s.accuracy:.3f}"
+    return (*shares, *meters, *degrees, f"{s.num_localized}", f"{s.num_wrong}", f"{s.seconds:.2f}")
+
+
+def threshold_table(rows: Sequence[Row], limits: Limits) -> Table:
+    """Accuracy at several distances."""
+    title = f"accuracy: share under the distance and {np.degrees(limits.max_angle):g} deg"
+    cells = tuple(
+        (name, *(f"{share:.3f}" for share in accuracies(some, limits.max_angle)))
+        for name, some in groups(rows)
+    )
+    return Table(title, ("queries", *(f"{line:g} m" for line in THRESHOLDS)), cells)
+
+
+def risk_table(points: Sequence[Point]) -> Table:
+    """What is wrong of what is accepted, at a few confidences."""
+    cells = []
+    for line in CONFIDENCES:
+        inside = [point for point in points if point.confidence >= line]
+        if inside:
+            p = inside[-1]
+            cells.append((f"{line}", f"{100 * p.coverage:.1f} %", f"{p.num_wrong}", f"{100 * p.risk:.2f} %"))
+    columns = "accepted from confidence", "accepted", "wrong of these", "wrong share"
+    return Table("", columns, tuple(cells), 0)
+
+
+def csv_text(rows: Sequence[Row]) -> str:
+    """One line a query, in base units, every digit; empty where there is no pose."""
+    file = io.StringIO()
+    columns = ("scene", "image", "variant", "is_in_box", "status", "confidence", "position_error_m")
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow((*columns, "rotation_error_deg", "loss", "seconds"))
+    for row in rows:
+        has_pose = row.result.pose is not None
+        errors = (row.position_error, float(np.degrees(row.rotation_error))) if has_pose else ("", "")
+        box = "" if row.is_in_box is None else str(row.is_in_box).lower()
+        verdict = row.result.status, row.result.confidence
+        words = row.scene, row.image, row.variant, box
+        writer.writerow((*words, *verdict, *errors, row.result.loss, round(row.seconds, 4)))
+    return file.getvalue()

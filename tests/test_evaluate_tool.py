@@ -1,0 +1,170 @@
+"""tools/evaluate.py over scenes: run, stopped, taken up again, in several processes, compared."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from piccolo.evaluation.run_file import read_rows
+from piccolo.scenes import Query, read_scene, write_queries
+from tools import evaluate, make_room
+
+ROOT = Path(__file__).resolve().parents[1]
+QUICK = [
+    "--preset",
+    "paper",
+    "--translations",
+    "12",
+    "--iterations",
+    "30",
+    "--max-points",
+    "20000",
+    "--quiet",
+]
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    """Two rooms below a folder; in the second a panorama of the first, said to be far outside."""
+    root = tmp_path_factory.mktemp("all scenes")
+    for seed, name in ((7, "room"), (8, "hall 2")):
+        words = ["--seed", str(seed), "--points", "20000", "--panoramas", "2", "--width", "256", "--quiet"]
+        words += ["--size", "4.5", "3.5", "2.5"]
+        assert make_room.main(["--out", str(root / name), *words]) == 0
+    scene = read_scene(root / "hall 2")
+    shutil.copy(root / "room" / "images" / "clean_0.jpg", root / "hall 2" / "images" / "far.jpg")
+    pose = scene.queries[0].pose
+    far = Query(
+        scene.folder / "images" / "far.jpg", "far", type(pose)(pose.R_cam_from_world, np.full(3, 99.0))
+    )
+    write_queries(scene.folder, [*scene.queries, far])
+    return root
+
+
+def _run(scenes, out, *more):
+    return evaluate.main(["--scenes", str(scenes), "--out", str(out), *QUICK, *more])
+
+
+def test_a_run_its_tables_and_files(scenes, tmp_path, capsys):
+    out = tmp_path / "run.jsonl"
+    files = {name: tmp_path / f"a {name}" for name in ("csv", "markdown", "errors", "risk")}
+    options = [word for name, path in files.items() for word in (f"--{name}", str(path))]
+    assert _run(scenes, out, *options) == 0
+    text = capsys.readouterr().out
+    rows = read_rows(out)[0]
+    assert [(row.scene, row.is_in_box) for row in rows] == [
+        *[("hall 2", True), ("hall 2", True), ("hall 2", False), ("room", True), ("room", True)]
+    ]
+    assert rows[2].position_error > 50.0
+    assert "all 5 queries; correct" in text
+    assert "without the 1 queries taken outside the cloud's bounding box; correct" in text
+    assert files["markdown"].read_text() == text
+    assert len(files["csv"].read_text().splitlines()) == 6
+    assert files["errors"].read_bytes()[1:4] == files["risk"].read_bytes()[1:4] == b"PNG"
+    assert json.loads(out.read_text().splitlines()[0])["result"]["settings"]["num_translations"] == 12
+
+
+def test_a_stopped_run_is_taken_up_and_gives_the_same(scenes, tmp_path, capsys):
+    whole, torn = tmp_path / "whole.jsonl", tmp_path / "torn.jsonl"
+    assert _run(scenes, whole, "--variants", "clean") == 0
+    lines = whole.read_text().splitlines(keepends=True)
+    torn.write_text(lines[0] + lines[1][:99])
+    assert _run(scenes, torn, "--variants", "clean", "--jobs", "2") == 0
+    capsys.readouterr()
+    first, second = ({row.key: row for row in read_rows(path)[0]} for path in (whole, torn))
+    assert torn.read_text().startswith(lines[0])
+    assert set(first) == set(second)
+    assert len(first) == 4
+    for key, row in first.items():
+        assert np.array_equal(row.result.pose.center_world, second[key].result.pose.center_world)
+    assert evaluate.main(["--compare", str(whole), str(torn)]) == 0
+    text = capsys.readouterr().out
+    assert f"only in {torn}: 0 queries" in text
+    assert text.rstrip().endswith("|---|---|---|---|---|")  # no query has changed
+
+
+def test_other_settings_do_not_go_into_the_same_file(scenes, tmp_path, capsys):
+    out = tmp_path / "run.jsonl"
+    assert _run(scenes, out, "--variants", "far") == 0
+    before = out.read_bytes()
+    assert _run(scenes, out, "--solver", "lbfgs") == 3
+    assert "found rows made with solver 'adam', wanted 'lbfgs'" in capsys.readouterr().err
+    assert out.read_bytes() == before
+
+
+def test_what_cannot_be_read_is_told_and_the_rest_done(scenes, tmp_path, capsys):
+    root = tmp_path / "scenes"
+    shutil.copytree(scenes, root)
+    (root / "room" / "images" / "clean_0.jpg").write_bytes(b"no picture")
+    (root / "hall 2" / "cloud.ply").write_bytes(b"ply\nno cloud")
+    out = tmp_path / "run.jsonl"
+    assert _run(root, out) == 3
+    told = capsys.readouterr()
+    assert len(told.err.splitlines()) == 2
+    assert "hall 2/cloud.ply: the header has no line" in told.err
+    assert "clean_0.jpg: " in told.err
+    assert [row.key for row in read_rows(out)[0]] == [("room", "images/clean_1.jpg")]
+    assert "| all | 1 |" in told.out
+
+
+def _is_alive(group):
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_interrupt_ends_all_processes_and_keeps_what_was_done(scenes, tmp_path):
+    out = tmp_path / "run.jsonl"
+    command = [
+        sys.executable,
+        str(ROOT / "tools" / "evaluate.py"),
+        "--scenes",
+        str(scenes),
+        "--out",
+        str(out),
+    ]
+    slow = ["--preset", "paper", "--translations", "3000", "--jobs", "2"]
+    with subprocess.Popen([*command, *slow], stderr=subprocess.PIPE, start_new_session=True) as process:
+        while not out.exists():
+            time.sleep(0.1)
+        time.sleep(1.5)
+        os.killpg(process.pid, signal.SIGINT)
+        assert process.wait(timeout=60) == 130
+        assert b"Traceback" not in process.stderr.read()
+    deadline = time.monotonic() + 20.0
+    while _is_alive(process.pid) and time.monotonic() < deadline:
+        time.sleep(0.1)  # multiprocessing's own helper ends a moment later
+    assert not _is_alive(process.pid)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--scenes", "x"],
+        ["--out", "x"],
+        ["--scenes", "x", "--compare", "a", "b"],
+        ["--scenes", "x", "--out", "y", "--jobs", "0"],
+        ["--scenes", "x", "--out", "y", "--translations", "9"],
+    ],
+)
+def test_wrong_usage(words, capsys):
+    with pytest.raises(SystemExit) as stop:
+        evaluate.main(words)
+    assert stop.value.code == 2
+    assert "usage: " in capsys.readouterr().err
+
+
+def test_runs_of_other_scenes_do_not_compare(scenes, tmp_path, capsys):
+    (tmp_path / "a").write_text("")
+    (tmp_path / "b").write_text("")
+    assert evaluate.main(["--compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 3
+    assert "found no query that both have" in capsys.readouterr().err

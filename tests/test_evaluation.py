@@ -1,0 +1,189 @@
+"""Rows, statistics, tables, pictures and comparisons of an evaluation."""
+
+import csv
+import io
+
+import cv2
+import numpy as np
+import pytest
+from poses import result
+
+from piccolo.errors import InputError
+from piccolo.evaluation import pictures, tables
+from piccolo.evaluation.compare import changes, pair_up, side_by_side
+from piccolo.evaluation.row import Row, match_results, row_of
+from piccolo.evaluation.run_file import appending, check_settings, read_rows
+from piccolo.evaluation.statistics import PAPER_LIMITS, accuracies, quartiles, risk_and_coverage, summarize
+from piccolo.pose import Pose, exp_so3
+from piccolo.scenes import Query, Scene
+
+TRUE_POSE = Pose(exp_so3(np.array([0.4, 0.1, -2.0])), np.array([10.0, -4.0, 1.5]))
+
+
+def _pose(distance, angle_deg):
+    """A pose that is off by so much."""
+    turn = exp_so3(np.radians(angle_deg) * np.array([0.0, 0.6, 0.8]))
+    return Pose(
+        turn @ TRUE_POSE.R_cam_from_world, TRUE_POSE.center_world + distance * np.array([0.8, 0.6, 0])
+    )
+
+
+def _scene(tmp_path, names=("a.jpg", "b.jpg"), name="room"):
+    queries = tuple(Query(tmp_path / name / "images" / n, "clean", TRUE_POSE) for n in names)
+    return Scene(name, tmp_path / name, tmp_path / name / "cloud.ply", queries)
+
+
+def _row(image, distance, angle_deg, **more):
+    kind = {"scene": "room", "variant": "clean", "is_in_box": True} | more
+    status, confidence = kind.pop("status", "localized"), kind.pop("confidence", 0.95)
+    has_pose = np.isfinite(distance)
+    found = result(image, _pose(distance, angle_deg) if has_pose else None, status, confidence=confidence)
+    return Row(
+        kind["scene"], image, kind["variant"], kind["is_in_box"], distance, np.radians(angle_deg), found
+    )
+
+
+ROWS = [
+    _row("a.jpg", 0.01, 0.2),
+    _row("b.jpg", 0.03, 0.4, variant="photo", status="ambiguous", confidence=0.5),
+    _row("c.jpg", 0.09, 6.0, scene="hall"),
+    _row("d.jpg", np.inf, np.inf, scene="hall", status="not_localized", confidence=0.0, is_in_box=False),
+]
+
+
+def test_errors_of_a_row(tmp_path):
+    scene = _scene(tmp_path)
+    row = row_of(scene, scene.queries[0], result("a.jpg", _pose(0.05, 3.0)), True)
+    assert row.position_error == pytest.approx(0.05)
+    assert np.degrees(row.rotation_error) == pytest.approx(3.0)
+    assert (row.scene, row.image, row.variant) == ("room", "images/a.jpg", "clean")
+    assert row.is_correct(0.1, np.radians(5.0))
+    assert not row.is_correct(0.04, np.radians(5.0))
+    assert not row.is_correct(0.1, np.radians(2.0))
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.image)
+def test_a_row_comes_back(row):
+    back = Row.from_json(row.to_json())
+    assert back.to_json() == row.to_json()
+    assert (back.key, back.variant, back.is_in_box) == (row.key, row.variant, row.is_in_box)
+    assert back.position_error == row.position_error
+    assert back.rotation_error == pytest.approx(row.rotation_error, abs=1e-15)
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[]", '{"format": "piccolo-pose/2"}'])
+def test_what_is_no_row_is_refused(text):
+    with pytest.raises(InputError, match="evaluation: found"):
+        Row.from_json(text)
+
+
+def test_results_find_their_queries_by_path_then_by_name(tmp_path):
+    first, second = _scene(tmp_path), _scene(tmp_path, ("a.jpg", "c.jpg"), "hall")
+    scenes = [first, second]
+    by_path = result(str(tmp_path / "hall" / "images" / "a.jpg"), _pose(0.0, 0.0))
+    by_name = result("elsewhere/c.jpg", _pose(0.0, 0.0))
+    rows = list(match_results(scenes, [by_path, by_name]))
+    assert [row.key for row in rows] == [("hall", "images/a.jpg"), ("hall", "images/c.jpg")]
+    with pytest.raises(InputError, match=r"a\.jpg: found 2 queries of this name"):
+        list(match_results(scenes, [result("a.jpg", None)]))
+    with pytest.raises(InputError, match=r"z\.jpg: found a result without a true pose"):
+        list(match_results(scenes, [result("z.jpg", None)]))
+
+
+def test_quartiles_of_errors_some_of_which_are_infinite():
+    assert quartiles([1.0, 2.0, 3.0, 4.0, 5.0]).tolist() == [2.0, 3.0, 4.0]
+    assert quartiles([1.0, 2.0, 3.0, 4.0, np.inf]).tolist() == [2.0, 3.0, 4.0]
+    assert quartiles([1.0, np.inf]).tolist() == [np.inf] * 3
+    assert quartiles([1.0, 1.0, 1.0, np.inf]).tolist() == [1.0, 1.0, np.inf]
+
+
+def test_summary_and_accuracies():
+    summary = summarize(ROWS)
+    assert (summary.num_queries, summary.num_correct, summary.num_localized) == (4, 2, 2)
+    assert (summary.num_wrong, summary.accuracy) == (1, 0.5)
+    assert summary.position_quartiles[1] == pytest.approx(0.06)
+    assert accuracies(ROWS, np.radians(5.0)) == [0.25, 0.5, 0.5, 0.5, 0.5, 0.5]
+    assert accuracies(ROWS, np.radians(10.0)) == [0.25, 0.5, 0.75, 0.75, 0.75, 0.75]
+
+
+def test_risk_over_coverage():
+    rows = [
+        _row(f"{k}.jpg", 0.0 if is_right else 1.0, 0.0, confidence=confidence)
+        for k, (confidence, is_right) in enumerate([(0.9, True), (0.5, False), (0.95, True), (0.5, True)])
+    ]
+    points = risk_and_coverage(rows)
+    assert [(p.confidence, p.coverage, p.num_wrong) for p in points] == [
+        (0.95, 0.25, 0),
+        (0.9, 0.5, 0),
+        (0.5, 1.0, 1),
+    ]
+    assert points[-1].risk == 0.25
+    text = tables.risk_table(points).markdown()
+    assert "| 0.9 | 50.0 % | 0 | 0.00 % |" in text
+    assert "| 0.0 | 100.0 % | 1 | 25.00 % |" in text
+
+
+def test_tables_have_a_line_a_split_a_room_and_all():
+    text = tables.summary_table(ROWS, PAPER_LIMITS, "all 4 queries").markdown()
+    assert text.startswith("all 4 queries; correct: under 0.1 m and 5 deg\n\n| queries | number |")
+    names = [line.split(" | ")[0] for line in text.splitlines()[4:]]
+    assert names == ["| clean", "| photo", "| hall", "| room", "| all"]
+    assert text.splitlines()[7].startswith(
+        "| room | 2 | 2 | 1.000 | 0.0150 | 0.0200 | 0.0250 | 0.250 | 0.300 "
+    )
+    assert "| all | 0.250 | 0.500 | 0.500 |" in tables.threshold_table(ROWS, PAPER_LIMITS).markdown()
+    assert "| hall | d.jpg | not_localized | inf | inf | 0.000 |" in tables.per_query(ROWS).markdown()
+
+
+def test_csv_has_base_units_and_blanks_where_there_is_no_pose():
+    lines = list(csv.DictReader(io.StringIO(tables.csv_text(ROWS))))
+    assert [line["image"] for line in lines] == ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]
+    assert float(lines[2]["position_error_m"]) == 0.09
+    assert float(lines[2]["rotation_error_deg"]) == pytest.approx(6.0)
+    assert (lines[3]["position_error_m"], lines[3]["is_in_box"]) == ("", "false")
+
+
+def test_pictures_are_drawn():
+    for png in (
+        pictures.errors_png({"one": ROWS, "two": ROWS[:2]}, PAPER_LIMITS),
+        pictures.risk_png(risk_and_coverage(ROWS)),
+    ):
+        image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+        assert min(image.shape[:2]) > 300
+        assert image.std() > 10.0
+
+
+def test_two_runs_side_by_side():
+    second = [_row("a.jpg", 0.01, 0.2), _row("b.jpg", 0.5, 0.4, variant="photo"), ROWS[2]]
+    pairs = pair_up(ROWS, second)
+    assert [pair.first.image for pair in pairs] == ["c.jpg", "a.jpg", "b.jpg"]
+    text = side_by_side(pairs, ("old", "new"), PAPER_LIMITS).markdown()
+    assert "| old | 3 | 2 | 0.667 | 2 | 1 |" in text
+    assert "| new | 3 | 1 | 0.333 | 3 | 2 |" in text
+    changed = changes(pairs, PAPER_LIMITS).markdown().splitlines()[4:]
+    assert changed == [
+        "| room | b.jpg | worse | ambiguous 0.50: 0.030 m, 0.40 deg | localized 0.95: 0.500 m, 0.40 deg |"
+    ]
+
+
+def test_a_run_is_taken_up_after_its_last_whole_line(tmp_path):
+    path = tmp_path / "run.jsonl"
+    path.write_text("".join(row.to_json() + "\n" for row in ROWS[:2]) + ROWS[2].to_json()[:50])
+    rows, size = read_rows(path)
+    assert [row.image for row in rows] == ["a.jpg", "b.jpg"]
+    with appending(path, size) as append:
+        append(ROWS[3])
+        with pytest.raises(InputError, match="another process is writing"), appending(path, size):
+            pass
+    assert [row.image for row in read_rows(path)[0]] == ["a.jpg", "b.jpg", "d.jpg"]
+    path.write_text("{}\n")
+    with pytest.raises(InputError, match=r"run\.jsonl: line 1: evaluation: found"):
+        read_rows(path)
+
+
+def test_a_run_of_other_settings_is_not_taken_up(tmp_path):
+    row = _row("a.jpg", 0.0, 0.0)
+    row.result.settings.update(preset="paper", seed=0)
+    check_settings(tmp_path, [row], {"preset": "paper", "seed": 0})
+    with pytest.raises(InputError, match="rows made with preset 'paper', wanted 'default'"):
+        check_settings(tmp_path, [row], {"preset": "default", "seed": 0})

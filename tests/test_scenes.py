@@ -1,0 +1,83 @@
+"""Scenes on disk: written, read back, found, refused."""
+
+import json
+
+import numpy as np
+import pytest
+
+from piccolo.errors import InputError
+from piccolo.pose import Pose, exp_so3
+from piccolo.scenes import Query, find_scenes, read_scene, write_queries
+
+POSE = Pose(exp_so3(np.array([0.3, -1.2, 2.0])), np.array([500_123.25, -3.5, 1.125]))
+
+
+def _written(folder, names=("images/a.jpg",), **more):
+    folder.mkdir(parents=True, exist_ok=True)
+    write_queries(folder, [Query(folder / name, "robot", POSE) for name in names], **more)
+    return folder
+
+
+def test_a_scene_comes_back_as_it_was_written(tmp_path):
+    labels = Query(tmp_path / "images" / "b c.png", "robot", POSE, tmp_path / "labels" / "b c.png")
+    write_queries(tmp_path, [Query(tmp_path / "images/a.jpg", "handheld", POSE), labels], source="made up")
+    scene = read_scene(tmp_path, "room")
+    assert (scene.name, scene.cloud) == ("room", tmp_path / "cloud.ply")
+    assert [scene.name_of(query) for query in scene.queries] == ["images/a.jpg", "images/b c.png"]
+    assert [query.variant for query in scene.queries] == ["handheld", "robot"]
+    assert [query.labels for query in scene.queries] == [None, tmp_path / "labels" / "b c.png"]
+    for query in scene.queries:
+        assert np.array_equal(query.pose.R_cam_from_world, POSE.R_cam_from_world)
+        assert np.array_equal(query.pose.center_world, POSE.center_world)
+    assert json.loads((tmp_path / "queries.json").read_text())["source"] == "made up"
+
+
+def test_scenes_are_found_at_any_depth_and_named_by_it(tmp_path):
+    for name in ("area_1/office 1", "area_1/hall", "area_2/hall"):
+        _written(tmp_path / name)
+    assert [scene.name for scene in find_scenes([tmp_path])] == [
+        "area_1/hall",
+        "area_1/office 1",
+        "area_2/hall",
+    ]
+    alone = find_scenes([tmp_path / "area_1" / "hall" / "queries.json"])
+    assert [(scene.name, scene.cloud.parent.name) for scene in alone] == [("hall", "hall")]
+    with pytest.raises(InputError, match="found a second scene named hall"):
+        find_scenes([tmp_path / "area_1", tmp_path / "area_2"])
+
+
+def test_no_scene_is_told(tmp_path):
+    with pytest.raises(InputError, match=r"found no queries\.json in or below it"):
+        find_scenes([tmp_path])
+    with pytest.raises(InputError, match=r"queries\.json: cannot be read \(No such file"):
+        read_scene(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"R_cam_from_world": np.diag([1.0, 1.0, -1.0]).tolist()}, "is no rotation"),
+        ({"R_cam_from_world": (1.01 * np.eye(3)).tolist()}, "is no rotation"),
+        ({"R_cam_from_world": [[float("nan")] * 3] * 3}, "is no rotation"),
+        ({"R_cam_from_world": [1, 0, 0]}, "wrong shape"),
+        ({"center_world": [0, 0, float("inf")]}, "not finite"),
+        ({"center_world": "here"}, "wanted a queries.json"),
+        ({"variant": None, "image": 3}, None),
+    ],
+)
+def test_what_is_no_pose_is_refused(tmp_path, change, message):
+    document = json.loads((_written(tmp_path) / "queries.json").read_text())
+    document["queries"][0].update(change)
+    (tmp_path / "queries.json").write_text(json.dumps(document))
+    if message is None:
+        assert read_scene(tmp_path).queries[0].variant == "None"
+        return
+    with pytest.raises(InputError, match=message):
+        read_scene(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"queries": 1}', '{"queries": [1]}', "\xff", "[" * 2000])
+def test_what_is_no_document_is_refused(tmp_path, text):
+    (tmp_path / "queries.json").write_bytes(text.encode("latin-1"))
+    with pytest.raises(InputError, match=r"queries\.json: found .*wanted a queries\.json with true poses"):
+        read_scene(tmp_path)
