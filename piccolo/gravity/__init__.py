@@ -1,5 +1,21 @@
-"""Which way is up in a cloud, from its own planes."""
+"""Which way is up in a cloud, which planes it has, and along which directions its walls stand."""
 
-from .up import Up, find_up, rotation_to_z_up
+from .planes import Plane, find_planes, name_planes, refine_up
+from .surfaces import Surfaces, surfaces_of
+from .up import Up, find_up, rotation_to_z_up, up_of
+from .yaw import wall_yaw, yaw_turn
 
-__all__ = ["Up", "find_up", "rotation_to_z_up"]
+__all__ = [
+    "Plane",
+    "Surfaces",
+    "Up",
+    "find_planes",
+    "find_up",
+    "name_planes",
+    "refine_up",
+    "rotation_to_z_up",
+    "surfaces_of",
+    "up_of",
+    "wall_yaw",
+    "yaw_turn",
+]

@@ -21,8 +21,8 @@ FAR = 0.5  # beyond a sheet, further than it bends [m]
 TOPS = (0.3, 1.2)  # height of seats, beds, tables, boxes [m]
 MIDDLE = (0.15, 0.5, 0.85)  # of a storey: skirting below, clutter or air, lamps and beams above
 
-# Log-odds a unit of evidence: rounded from a fit to buildings made from seeds (synthetic/buildings.py), of which
-# each kind weighs the same
+# Log-odds a unit of evidence: rounded from a fit to buildings made from seeds (synthetic/buildings.py), of
+# which each kind weighs the same
 SHEET_WEIGHT = 0.5  # of the logarithm of the share of the cloud in the sheets
 SLANT_WEIGHT = 0.5  # of the logarithm of the share of flat surfaces that are aslant to the axis, against
 LOOSE_WEIGHT = 2.0  # of the logarithm of the share that are more than 2 deg off, against
@@ -73,25 +73,25 @@ def evidence_for(surfaces: Surfaces, axis: Array) -> Evidence:
     stands = is_flat & (cosines < np.sin(FACING_ANGLE))
     sharp = is_flat & ((cosines > np.cos(SHARP_ANGLE)) | (cosines < np.sin(SHARP_ANGLE)))
     heights = cosines_to(surfaces.points, axis)
-    num_points, num_flat = len(heights), np.count_nonzero(is_flat)
-    num_explained, num_sharp = np.count_nonzero(faces | stands), np.count_nonzero(sharp)
+    num_points, num_flat = len(heights), int(np.count_nonzero(is_flat))
+    num_explained, num_sharp = int(np.count_nonzero(faces | stands)), int(np.count_nonzero(sharp))
     low, high = map(float, np.quantile(heights, [0.01, 0.99]))
     levels, shares = _sheets(heights[faces], num_points)
     storeys = _with_missing(levels, low, high)
-    above = np.count_nonzero(heights > levels.max() + FAR) if len(levels) else 0
-    below = np.count_nonzero(heights < levels.min() - FAR) if len(levels) else 0
+    above = int(np.count_nonzero(heights > levels.max() + FAR)) if len(levels) else 0
+    below = int(np.count_nonzero(heights < levels.min() - FAR)) if len(levels) else 0
     return Evidence(
         axis=axis,
         sheets=float(np.sqrt(np.sum(shares**2))),
-        slanted=float(1.0 - num_explained / num_flat),
-        loose=float(1.0 - num_sharp / num_flat),
-        skewed=_num_skewed(surfaces.normals[stands], axis) / float(num_flat),
-        explained=float(num_explained / num_points),
-        sharpness=float(num_sharp / max(num_explained, 1)),
+        slanted=1.0 - num_explained / num_flat,
+        loose=1.0 - num_sharp / num_flat,
+        skewed=_num_skewed(surfaces.normals[stands], axis) / num_flat,
+        explained=num_explained / num_points,
+        sharpness=num_sharp / max(num_explained, 1),
         extent=high - low,
         clutter=_clutter(heights[~stands], storeys, 0.003 * num_points),
         tops=_tops(heights[faces], storeys, 0.001 * num_points),
-        carried=float((above - below) / (above + below + 0.1 * num_points)),
+        carried=(above - below) / (above + below + 0.1 * num_points),
     )
 
 
@@ -147,7 +147,7 @@ def _tops(heights: Array, levels: Array, softening: float) -> float:
 
 
 def _with_missing(levels: Array, low: float, high: float) -> Array:
-    """The levels and, where a storey's floor or ceiling was not scanned, the end of the cloud in its place."""
+    """The levels; where a storey's floor or ceiling was not scanned, the end of the cloud in its place."""
     if len(levels) == 0:
         return levels
     ends = [low] if MIN_STOREY < levels[0] - low < MAX_STOREY else []
@@ -162,5 +162,5 @@ def _num_skewed(normals: Array, axis: Array) -> int:
     a, b = np.linalg.svd(axis[None])[2][1:]
     yaw = np.degrees(np.arctan2(cosines_to(normals, b), cosines_to(normals, a))) % 90.0
     counts = np.bincount((yaw / 2.0).astype(np.int64) % 45, minlength=45)
-    wide = sum(np.roll(counts, k) for k in range(-4, 5))
-    return len(normals) - int(np.max(wide))
+    wide = np.sum([np.roll(counts, k) for k in range(-4, 5)], axis=0)  # 18 deg
+    return len(normals) - int(wide.max())

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from ..errors import InputError
 from ..pose import Array
 
 MAX_POINTS = 40_000  # that are looked at
@@ -23,7 +24,21 @@ class Surfaces:
 
 
 def surfaces_of(points: NDArray[np.float32]) -> Surfaces:
-    """Normals of an evenly strided sample of the cloud (N, 3), by PCA of the nearest of all its points."""
+    """Normals of an evenly strided sample of a cloud (N, 3) [m], by PCA of the nearest of all its points.
+
+    Raises
+    ------
+    InputError
+        The shape is not (N, 3), or a coordinate is not finite.
+    """
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"points: found shape {points.shape}, wanted (N, 3)")
+    if not np.isfinite(points).all():
+        raise InputError("points: found a coordinate that is not finite, wanted metres")
+    if len(points) < NUM_NEIGHBORS:
+        return Surfaces(
+            points.astype(np.float64), np.zeros((len(points), 3)), np.zeros(len(points), np.bool_)
+        )
     stride = -(-len(points) // MAX_POINTS)
     all_points = points.astype(np.float64)
     sample = all_points[::stride]

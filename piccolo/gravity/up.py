@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
 from ..pose import Array, exp_so3
 from .axes import MIN_POINTS, candidate_axes
 from .evidence import Evidence, evidence_for
-from .surfaces import surfaces_of
+from .surfaces import Surfaces, surfaces_of
 
 PRIOR_ANGLE = np.radians(10.0)  # of +z to a direction that the convention speaks for
 SNAP_ANGLE = np.radians(0.2)  # of +z to a direction that is called +z itself
@@ -55,13 +54,13 @@ def find_up(points: NDArray[np.float32], z_up_log_odds: float = Z_UP) -> Up:
     InputError
         The shape is not (N, 3), or a coordinate is not finite.
     """
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"points: found shape {points.shape}, wanted (N, 3)")
-    if not np.isfinite(points).all():
-        raise InputError("points: found a coordinate that is not finite, wanted metres")
-    if len(points) < MIN_POINTS:
-        return Up(np.array([0.0, 0.0, 1.0]), 0.0, f"only {len(points)} points: +z is assumed")
-    surfaces = surfaces_of(points)
+    return up_of(surfaces_of(points), z_up_log_odds)
+
+
+def up_of(surfaces: Surfaces, z_up_log_odds: float = Z_UP) -> Up:
+    """As find_up, from surfaces that are known."""
+    if len(surfaces.points) < MIN_POINTS:
+        return Up(np.array([0.0, 0.0, 1.0]), 0.0, f"only {len(surfaces.points)} points: +z is assumed")
     axes = candidate_axes(surfaces)
     if not axes:
         return Up(np.array([0.0, 0.0, 1.0]), 0.0, "no direction that flat surfaces share: +z is assumed")

@@ -18,6 +18,7 @@ from .world import make_world, scan_world
 DENSITY = 250.0  # points a m2
 ROOM_POINTS = 80_000
 CLUTTER_SHARE = 0.4
+WALL_DISTANCE = np.array([0.5, 0.5, 0.0])  # of furniture [m]
 MARGIN = 0.05  # [m] of a floor or ceiling that is taken away
 Points = tuple[NDArray[np.float64], NDArray[np.uint8]]
 
@@ -58,7 +59,7 @@ class Sampler:
     def furnish(self, low: Array, high: Array, num_pieces: int) -> None:
         """Boxes on the floor between two corners (3,)."""
         for _ in range(num_pieces):
-            at = self.rng.uniform(low + [0.5, 0.5, 0.0], high - [0.5, 0.5, 0.0])
+            at = self.rng.uniform(low + WALL_DISTANCE, high - WALL_DISTANCE)
             size = self.rng.uniform([0.3, 0.3, 0.3], [1.6, 0.8, 1.2])
             self.box([at[0], at[1], low[2]], size, float(self.rng.normal(0.0, 0.3)))
 
@@ -134,7 +135,7 @@ def _stairwell(seed: int) -> Points:
         for k in range(num_steps):
             foot = np.array([begin + sign * k * tread, at_y, flight * height + k * rise])
             s.patch(foot, [0, width, 0], [0, 0, rise])
-            s.patch(foot + [0, 0, rise], [0, width, 0], [sign * tread, 0, 0])
+            s.patch(foot + np.array([0, 0, rise]), [0, width, 0], [sign * tread, 0, 0])
         if flight:
             s.patch([begin, at_y, flight * height - 0.2], [0, width, 0], [sign * length, 0, height])
         landing = 0.0 if flight % 2 else x - width
