@@ -22,7 +22,7 @@ LAYERS = [
     {"verdict"},
     {"result", "scenes"},
     {"paper", "engine", "export"},
-    {"pipeline"},
+    {"pipeline", "alignment"},
     {"evaluation"},
 ]
 # pyramid shrinks panoramas; points are packed as texels are

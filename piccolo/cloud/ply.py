@@ -107,6 +107,7 @@ def has_ply_magic(head: bytes) -> bool:
 
 
 def read_columns(vertices: Vertices) -> Iterator[list[NDArray[np.generic]]]:
+    """Yield the columns of up to CHUNK vertices; those of an ASCII file are float64, whatever their type."""
     return (_read_ascii if vertices.header.is_ascii else _read_binary)(vertices)
 
 
@@ -127,6 +128,7 @@ def _read_measured(vertices: Vertices) -> Iterator[Measured]:
 
 
 def read_header(path: Path) -> Header:
+    """What a PLY file says of itself; InputError if that can't be made out."""
     with path.open("rb") as file:
         head = file.read(MAX_HEADER_SIZE)
     if not has_ply_magic(head):
