@@ -17,6 +17,8 @@ MIN_SHEET = 0.1  # share of the largest sheet: of a floor, furniture may leave l
 MIN_INNER = 0.5  # of the weaker of the outermost sheets, of one between them: a table is not a floor
 CLOSE = 4  # bins: sheets closer than this are one that bends
 MIN_STOREY, MAX_STOREY = 1.5, 5.0  # height [m]
+MIN_WALLS = 0.05  # share of the flat surfaces
+MAX_HALL = 15.0  # of a storey whose floor and ceiling are both there [m]
 FAR = 0.5  # beyond a sheet, further than it bends [m]
 TOPS = (0.3, 1.2)  # height of seats, beds, tables, boxes [m]
 MIDDLE = (0.15, 0.5, 0.85)  # of a storey: skirting below, clutter or air, lamps and beams above
@@ -77,7 +79,9 @@ def evidence_for(surfaces: Surfaces, axis: Array) -> Evidence:
     num_explained, num_sharp = int(np.count_nonzero(faces | stands)), int(np.count_nonzero(sharp))
     low, high = map(float, np.quantile(heights, [0.01, 0.99]))
     levels, shares = _sheets(heights[faces], num_points)
-    storeys = _with_missing(levels, low, high)
+    # without walls there are no rooms: roofs and ground from above
+    has_walls = np.count_nonzero(stands) > MIN_WALLS * num_flat
+    storeys = _with_missing(levels, low, high) if has_walls else np.empty(0)
     above = int(np.count_nonzero(heights > levels.max() + FAR)) if len(levels) else 0
     below = int(np.count_nonzero(heights < levels.min() - FAR)) if len(levels) else 0
     return Evidence(
@@ -128,7 +132,7 @@ def _clutter(heights: Array, levels: Array, softening: float) -> float:
     is_between = (upper_level > 0) & (upper_level < len(levels))
     floors, ceilings = levels[upper_level[is_between] - 1], levels[upper_level[is_between]]
     parts = (heights[is_between] - floors) / (ceilings - floors)
-    parts = parts[ceilings - floors > MIN_STOREY]
+    parts = parts[(ceilings - floors > MIN_STOREY) & (ceilings - floors < MAX_HALL)]
     lower = np.count_nonzero((parts > MIDDLE[0]) & (parts < MIDDLE[1]))
     upper = np.count_nonzero((parts > MIDDLE[1]) & (parts < MIDDLE[2]))
     return float(np.log((lower + softening) / (upper + softening)))

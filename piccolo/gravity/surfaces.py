@@ -21,6 +21,7 @@ class Surfaces:
     points: Array  # (M, 3) [m]
     normals: Array  # (M, 3) unit, of either sign
     is_flat: NDArray[np.bool_]  # (M,) the neighbourhood is a plane
+    reach: float  # median radius of the neighbourhoods [m]
 
 
 def surfaces_of(points: NDArray[np.float32]) -> Surfaces:
@@ -36,17 +37,17 @@ def surfaces_of(points: NDArray[np.float32]) -> Surfaces:
     if not np.isfinite(points).all():
         raise InputError("points: found a coordinate that is not finite, wanted metres")
     if len(points) < NUM_NEIGHBORS:
-        return Surfaces(
-            points.astype(np.float64), np.zeros((len(points), 3)), np.zeros(len(points), np.bool_)
-        )
+        blank = np.zeros((len(points), 3))
+        return Surfaces(points.astype(np.float64), blank, np.zeros(len(points), np.bool_), np.inf)
     stride = -(-len(points) // MAX_POINTS)
     all_points = points.astype(np.float64)
     sample = all_points[::stride]
-    neighbors = all_points[cKDTree(all_points).query(sample, NUM_NEIGHBORS)[1]]
+    distances, indices = cKDTree(all_points).query(sample, NUM_NEIGHBORS)
+    neighbors = all_points[indices]
     neighbors -= neighbors.mean(axis=1, keepdims=True)
     variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", neighbors, neighbors))
     is_flat = (variances[:, 0] < MAX_FLATNESS * variances[:, 1]) & (variances[:, 1] > 0.1 * variances[:, 2])
-    return Surfaces(sample, axes[:, :, 0], is_flat)
+    return Surfaces(sample, axes[:, :, 0], is_flat, float(np.median(distances[:, -1])))
 
 
 def cosines_to(vectors: Array, axis: Array) -> Array:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..pose import Array, exp_so3
+from ..pose import Array
 from .axes import MIN_POINTS, candidate_axes
 from .evidence import Evidence, evidence_for
 from .surfaces import Surfaces, surfaces_of
@@ -21,6 +21,7 @@ PRIOR_ANGLE = np.radians(10.0)  # of +z to a direction that the convention speak
 SNAP_ANGLE = np.radians(0.2)  # of +z to a direction that is called +z itself
 CHANCE = 0.15  # share of directions in space that face an axis or stand along it, within FACING_ANGLE
 CHANCE_SHARP = 0.25  # share of these that do so within 2 deg
+CLEAR, BLURRED = 1.0, 2.5  # reach of neighbourhoods from which on furniture fades, and can't be seen [m]
 DOUBT = 0.05  # odds that it is none of the hypotheses
 OPEN = 0.3  # carried at least by a plane with open space on one side: ground, or the front of a house
 OPEN_RIVAL = 0.2  # size of such a plane across the winner's axis, to its own, from which on they are mixed up
@@ -65,7 +66,7 @@ def up_of(surfaces: Surfaces, z_up_log_odds: float = Z_UP) -> Up:
     if not axes:
         return Up(np.array([0.0, 0.0, 1.0]), 0.0, "no direction that flat surfaces share: +z is assumed")
     hypotheses = [evidence_for(surfaces, sense * axis) for axis in axes for sense in (1.0, -1.0)]
-    return _verdict(hypotheses, z_up_log_odds)
+    return _verdict(hypotheses, z_up_log_odds, surfaces.reach)
 
 
 def rotation_to_z_up(direction_world: Array) -> Array:
@@ -77,10 +78,18 @@ def rotation_to_z_up(direction_world: Array) -> Array:
     sine = float(np.hypot(x, y))
     if sine == 0.0:
         return np.diag([1.0, 1.0, 1.0] if z > 0.0 else [1.0, -1.0, -1.0])
-    return exp_so3(np.arctan2(sine, z) * np.array([y / sine, -x / sine, 0.0]))
+    # Rodrigues by sine and cosine themselves: an angle near pi would lose digits
+    a, b, versine = y / sine, -x / sine, 1.0 - z
+    return np.array(
+        [
+            [z + versine * a * a, versine * a * b, -x],
+            [versine * a * b, z + versine * b * b, -y],
+            [x, y, z],
+        ]
+    )
 
 
-def _verdict(hypotheses: list[Evidence], z_up_log_odds: float) -> Up:
+def _verdict(hypotheses: list[Evidence], z_up_log_odds: float, reach: float) -> Up:
     """The hypothesis that the evidence favours, with its share of the odds."""
     log_odds = np.array([h.log_odds + z_up_log_odds * (h.axis[2] > np.cos(PRIOR_ANGLE)) for h in hypotheses])
     odds = np.exp(log_odds - log_odds.max())
@@ -89,6 +98,7 @@ def _verdict(hypotheses: list[Evidence], z_up_log_odds: float) -> Up:
     best, second = hypotheses[rank[0]], hypotheses[rank[1]]
     quality = np.clip((best.explained - CHANCE) / CHANCE, 0.0, 1.0)
     quality *= np.clip((best.sharpness - CHANCE_SHARP) / CHANCE_SHARP, 0.0, 1.0)
+    quality *= np.clip((BLURRED - reach) / (BLURRED - CLEAR), 0.0, 1.0)
     if is_open := _is_open(best, hypotheses):
         quality *= OPEN_DOUBT
     rival = "upside down" if best.axis @ second.axis < -0.9 else "another axis"
@@ -98,6 +108,7 @@ def _verdict(hypotheses: list[Evidence], z_up_log_odds: float) -> Up:
         f" clutter below to above {np.exp(best.clutter):.1f} : 1, level tops {np.exp(best.tops):.1f} : 1;"
         f" next is {rival}, {odds[rank[1]]:.0%}"
     )
+    reason += f"; points so sparse that 24 neighbours reach {reach:.1f} m" if reach > CLEAR else ""
     reason += "; ground and the front of a building look alike" if is_open else ""
     is_z = z_up_log_odds > 0.0 and best.axis[2] > np.cos(SNAP_ANGLE)
     return Up(np.array([0.0, 0.0, 1.0]) if is_z else best.axis, float(odds[rank[0]] * quality), reason)

@@ -174,6 +174,29 @@ def _outdoors(seed: int) -> Points:
     return s.cloud()
 
 
+def _aerial(seed: int) -> Points:
+    """Houses and trees as a drone sees them: roofs, ground, no walls."""
+    s = Sampler(np.random.default_rng([seed, 68]))
+    size = s.rng.uniform(40.0, 90.0)
+    xy = s.rng.uniform(0.0, size, (int(8 * size * size), 2))
+    slope = s.rng.normal(0.0, 0.01, 2)
+    level = xy @ slope + 0.05 * np.sin(xy[:, 0] / 9.0) + s.rng.normal(0.0, 0.03, len(xy))
+    for at in s.rng.uniform(8.0, size - 8.0, (int(s.rng.integers(3, 15)), 2)):
+        half, eaves = s.rng.uniform([4.0, 3.0], [8.0, 6.0]), s.rng.uniform(3.0, 8.0)
+        pitch = float(s.rng.choice([0.0, s.rng.uniform(0.4, 0.9)]))
+        place = np.abs(xy - at)
+        is_roof = np.all(place < half, axis=1)
+        level[is_roof] = at @ slope + eaves + pitch * (half[1] - place[is_roof, 1])
+    for at in s.rng.uniform(0.0, size, (int(s.rng.integers(5, 40)), 2)):
+        radius = s.rng.uniform(1.0, 3.5)
+        distance = np.linalg.norm(xy - at, axis=1)
+        is_crown = distance < radius
+        crown = 2.0 * radius + np.sqrt(radius**2 - distance[is_crown] ** 2)
+        level[is_crown] = at @ slope + crown + s.rng.normal(0.0, 0.3, len(crown))
+    s.add(np.column_stack([xy, level]))
+    return s.cloud()
+
+
 def _front(seed: int) -> Points:
     """A house front and a strip of ground before it."""
     s = Sampler(np.random.default_rng([seed, 65]))
@@ -215,6 +238,7 @@ BUILDINGS: dict[str, Callable[[int], Points]] = {
     "attic": _attic,
     "stairs": _stairwell,
     "outdoors": _outdoors,
+    "aerial": _aerial,
     "front": _front,
     "corridor": _corridor,
     "bare": _bare,
