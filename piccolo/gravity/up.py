@@ -75,11 +75,12 @@ def rotation_to_z_up(direction_world: Array) -> Array:
     Identity for +z, half a turn about x for -z.
     """
     x, y, z = direction_world
-    sine = float(np.hypot(x, y))
-    if sine == 0.0:
+    largest = max(abs(x), abs(y))
+    if largest == 0.0:
         return np.diag([1.0, 1.0, 1.0] if z > 0.0 else [1.0, -1.0, -1.0])
     # Rodrigues by sine and cosine themselves: an angle near pi would lose digits
-    a, b, versine = y / sine, -x / sine, 1.0 - z
+    a, b = np.array([y, -x]) / largest / np.hypot(x / largest, y / largest)  # numbers near 1e-310 have few
+    versine = 1.0 - z
     return np.array(
         [
             [z + versine * a * a, versine * a * b, -x],
