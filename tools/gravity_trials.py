@@ -5,6 +5,7 @@ import argparse
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ examples:
   python tools/gravity_trials.py --seeds 0 20 --turns 2
   python tools/gravity_trials.py --scenes BENCH/house BENCH/hospital --turns 250
 
-Each cloud is turned by --turns seeded rotations, uniform over all, and goes through what align_gravity.py does.
+Each cloud is turned by --turns seeded rotations, uniform over all, and goes the way of align_gravity.py.
 Seeds make places of each kind; scenes are folders with a cloud.ply whose z is up, thinned to 4 cm once, but
 for the first --full turns. A Markdown table on stdout: right is within 0.5 degrees, rough within 5; accepted
 is a confidence of --min-confidence or more.
@@ -98,17 +99,14 @@ def run(arguments: argparse.Namespace) -> dict[str, list[Answer]]:
     workers = Workers(arguments.threads, show)
     answers: dict[str, list[Answer]] = {}
     for case in cases_of(arguments):
-        points = case.points
-        found = workers.each(lambda R, points=points: try_turn(points, R), case.rotations, case.name)
+        found = workers.each(partial(try_turn, case.points), case.rotations, case.name)
         answers.setdefault(case.name, []).extend(found)
     return answers
 
 
 def print_table(answers: dict[str, list[Answer]], min_confidence: float) -> int:
     """One line a case; returns how many wrong answers were accepted."""
-    print(
-        "| case | trials | right | rough | wrong | accepted | accepted wrong | largest confidence of a wrong |"
-    )
+    print("| case | trials | right | rough | wrong | accepted | of these wrong | surest wrong |")
     print("|---|---:|---:|---:|---:|---:|---:|---:|")
     total = 0
     for name, rows in answers.items():

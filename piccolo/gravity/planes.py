@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ..pose import Array
 from .surfaces import Surfaces, cosines_to
 
-Kind = Literal["floor", "ceiling", "wall", "slanted"]
+Kind = Literal["floor", "ceiling", "level", "wall", "slanted"]
 
 SEED = 20
 MAX_PLANES = 24
@@ -118,27 +118,39 @@ def refine_up(up: Array, planes: list[Plane]) -> tuple[Array, float | None]:
 
 
 def name_planes(planes: list[Plane], surfaces: Surfaces, up: Array) -> list[Plane]:
-    """The planes with their kinds: a ceiling has more things within a metre below it than above it."""
-    heights = cosines_to(surfaces.points, up)
-    things = np.sort(
-        heights[~surfaces.is_flat | (np.abs(cosines_to(surfaces.normals, up)) < np.sin(KIND_ANGLE))]
-    )
-    lowest = float(np.quantile(heights, 0.01))
+    """The planes, the largest first, with their kinds.
+
+    A ceiling has more things within a metre below it than above it. What is level and less than a storey from
+    a floor or ceiling twice as large is a table or a platform: `level`.
+    """
     named: list[Plane] = []
+    found: list[tuple[float, Plane]] = []  # floors and ceilings with their heights
+    heights = cosines_to(surfaces.points, up)
+    is_upright = np.abs(cosines_to(surfaces.normals, up)) < np.sin(KIND_ANGLE)
+    things = np.sort(heights[~surfaces.is_flat | is_upright])
+    lowest = float(np.quantile(heights, 0.01))
     for plane in planes:
         sine = float(plane.normal_world @ up)
         if abs(sine) < np.cos(KIND_ANGLE):
             named.append(replace(plane, kind="wall" if abs(sine) < np.sin(KIND_ANGLE) else "slanted"))
             continue
-        level = float(np.median(heights[_on(plane, surfaces)]))
-        ends = np.searchsorted(things, level + np.array([-NEAR, -2.0 * TOLERANCE, 2.0 * TOLERANCE, NEAR]))
-        is_ceiling = level - lowest > MIN_STOREY and ends[3] - ends[2] < ends[1] - ends[0]
-        kind: Kind = "ceiling" if is_ceiling else "floor"
-        sign = float(np.sign(sine))
+        height, sign = float(np.median(heights[_on(plane, surfaces)])), float(np.sign(sine))
+        kind: Kind = "ceiling" if height - lowest > MIN_STOREY and _hangs(things, height) else "floor"
+        near = (other for level, other in found if abs(level - height) < MIN_STOREY)
+        if any(other.num_inliers > 2 * plane.num_inliers for other in near):
+            kind = "level"
         named.append(
             replace(plane, normal_world=sign * plane.normal_world, offset=sign * plane.offset, kind=kind)
         )
+        if kind != "level":
+            found.append((height, named[-1]))
     return named
+
+
+def _hangs(things: Array, height: float) -> bool:
+    """True if more of the things, at ascending heights (N,), lie just below `height` than just above."""
+    ends = np.searchsorted(things, height + np.array([-NEAR, -2.0 * TOLERANCE, 2.0 * TOLERANCE, NEAR]))
+    return bool(ends[1] - ends[0] > ends[3] - ends[2])
 
 
 def _on(plane: Plane, surfaces: Surfaces) -> NDArray[np.bool_]:
