@@ -138,19 +138,19 @@ def test_ascii_and_big_endian_are_read_too(run, tmp_path, text, byte_order):
         np.testing.assert_allclose(a[name], b[name], atol=1e-4)
 
 
-def test_faces_stay(run, tmp_path, capsys):
+def test_faces_stay(run, tmp_path):
     size = np.array([5.0, 4.0, 2.6])
     corners = np.array(list(np.ndindex(2, 2, 2))) * size @ exp_so3(TURN).T
     vertex = np.zeros(8, [(n, "<f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")])
     for k, name in enumerate("xyz"):
         vertex[name] = corners[:, k]
-    vertex["red"] = 200
+    vertex["red"] = vertex["green"] = np.arange(8) * 20 + 90
     faces = np.empty(12, [("vertex_indices", "<i4", (3,))])
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     faces["vertex_indices"] = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
     elements = [PlyElement.describe(vertex, "vertex"), PlyElement.describe(faces, "face")]
     PlyData(elements, byte_order="<").write(tmp_path / "mesh.ply")
-    code, report, err = run("--cloud", tmp_path / "mesh.ply", "--up", "-y", "--out", tmp_path / "out.ply")
+    code, _, err = run("--cloud", tmp_path / "mesh.ply", "--up", "-y", "--out", tmp_path / "out.ply")
     assert (code, err) == (0, "")
     after = PlyData.read(tmp_path / "out.ply")
     np.testing.assert_array_equal(np.stack(after["face"]["vertex_indices"]), faces["vertex_indices"])

@@ -18,6 +18,7 @@ MIN_INNER = 0.5  # of the weaker of the outermost sheets, of one between them: a
 CLOSE = 4  # bins: sheets closer than this are one that bends
 MIN_STOREY, MAX_STOREY = 1.5, 5.0  # height [m]
 MIN_WALLS = 0.05  # share of the flat surfaces
+MISSING_CARRY = 0.3  # of what such a room carries, the share that counts
 MAX_HALL = 15.0  # of a storey whose floor and ceiling are both there [m]
 FAR = 0.5  # beyond a sheet, further than it bends [m]
 TOPS = (0.3, 1.2)  # height of seats, beds, tables, boxes [m]
@@ -84,6 +85,11 @@ def evidence_for(surfaces: Surfaces, axis: Array) -> Evidence:
     storeys = _with_missing(levels, low, high) if has_walls else np.empty(0)
     above = int(np.count_nonzero(heights > levels.max() + FAR)) if len(levels) else 0
     below = int(np.count_nonzero(heights < levels.min() - FAR)) if len(levels) else 0
+    carried = (above - below) / (above + below + 0.1 * num_points)
+    if len(storeys) > len(
+        levels
+    ):  # a room of which floor or ceiling was not scanned: which one, its things say
+        carried *= MISSING_CARRY
     return Evidence(
         axis=axis,
         sheets=float(np.sqrt(np.sum(shares**2))),
@@ -95,7 +101,7 @@ def evidence_for(surfaces: Surfaces, axis: Array) -> Evidence:
         extent=high - low,
         clutter=_clutter(heights[~stands], storeys, 0.003 * num_points),
         tops=_tops(heights[faces], storeys, 0.001 * num_points),
-        carried=(above - below) / (above + below + 0.1 * num_points),
+        carried=carried,
     )
 
 
