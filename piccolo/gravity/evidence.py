@@ -26,7 +26,7 @@ MIDDLE = (0.15, 0.5, 0.85)  # of a storey: skirting below, clutter or air, lamps
 
 # Log-odds a unit of evidence: rounded from a fit to buildings made from seeds (synthetic/buildings.py), of
 # which each kind weighs the same
-SHEET_WEIGHT = 0.5  # of the logarithm of the share of the cloud in the sheets
+SHEET_WEIGHT = 1.0  # of the logarithm of the share of the cloud in the sheets
 SLANT_WEIGHT = 0.5  # of the logarithm of the share of flat surfaces that are aslant to the axis, against
 LOOSE_WEIGHT = 2.0  # of the logarithm of the share that are more than 2 deg off, against
 SKEW_WEIGHT = 4.0  # of the share of walls at odd angles, against: along a gable roof, all surfaces are walls
