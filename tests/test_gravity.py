@@ -8,6 +8,7 @@ from piccolo.engine.octree import build_octree
 from piccolo.errors import InputError
 from piccolo.gravity import find_up, rotation_to_z_up
 from piccolo.pose import angle_between, exp_so3
+from piccolo.synthetic.buildings import make_building
 
 Z = np.array([0.0, 0.0, 1.0])
 TURNS = [np.array(w) for w in ([0.3, -0.2, 0.9], [1.4, 0.6, -0.3], [-0.7, 2.2, 1.0], [2.9, -0.5, 0.4])]
@@ -67,6 +68,20 @@ def test_z_up_stays_exactly_so(seed):
     assert up.confidence > 0.8
 
 
+@pytest.mark.parametrize("w", [*TURNS, Y_UP, Z_DOWN], ids=str)
+def test_without_the_convention_the_answer_turns_with_the_cloud(w):
+    level, up = find_up(thinned(1), 0.0), find_up(turned(thinned(1), w), 0.0)
+    np.testing.assert_allclose(up.direction_world, exp_so3(w) @ level.direction_world, atol=1e-3)
+    assert up.confidence == pytest.approx(level.confidence, abs=0.02)
+    assert level.direction_world[2] < 1.0  # as found, not rounded to +z
+
+
+def test_the_convention_counts_as_much_as_it_is_given():
+    points = bare_room(np.random.default_rng(7)).astype(np.float32)
+    confidences = [find_up(points, log_odds).confidence for log_odds in (0.0, 1.5, 3.0)]
+    assert confidences[0] < 0.4 < confidences[1] < confidences[2]
+
+
 @pytest.mark.parametrize("w", TURNS, ids=str)
 def test_ground_with_things_on_it_needs_no_ceiling(w):
     rng = np.random.default_rng(5)
@@ -87,6 +102,50 @@ def test_walls_at_odd_angles_tell_up_without_floor_or_ceiling():
     up = find_up(turned(np.concatenate(walls), TURNS[1]))
     assert abs(up.direction_world @ exp_so3(TURNS[1]) @ Z) > np.cos(np.radians(0.5))
     assert up.confidence < 0.5  # nothing says which end is up
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("missing", ["floor", "ceiling"])
+def test_a_room_without_floor_or_ceiling_is_not_turned_over(seed, missing):
+    points, z = thinned(seed), thinned(seed)[:, 2]
+    points = points[z > z.min() + 0.1] if missing == "floor" else points[z < z.max() - 0.1]
+    up = find_up(turned(points, TURNS[0]), 0.0)
+    assert error_deg(up.direction_world, exp_so3(TURNS[0]) @ Z) < 0.5 or up.confidence < 0.75
+
+
+def test_from_above_roofs_are_no_furniture():
+    rng = np.random.default_rng(4)
+    xy = rng.uniform(0.0, 50.0, (20_000, 2))
+    z = rng.normal(0.0, 0.03, len(xy))
+    for at in rng.uniform(8.0, 42.0, (9, 2)):
+        z[np.all(np.abs(xy - at) < [6.0, 4.0], axis=1)] += 4.0
+    up = find_up(turned(np.column_stack([xy, z]), Z_DOWN), 0.0)
+    assert error_deg(up.direction_world, -Z) < 1.0
+
+
+def test_points_too_sparse_for_furniture_are_no_evidence():
+    rng = np.random.default_rng(5)
+    ground = plane(rng, 9000, np.array([400.0, 400.0, 0.02]))
+    sparse = find_up(
+        np.concatenate([ground, rng.uniform(-400, 400, (900, 3)) * [1, 1, 0.02] + [0, 0, 8.0]]).astype(
+            np.float32
+        )
+    )
+    assert sparse.confidence == 0.0
+    assert "so sparse" in sparse.reason
+
+
+def test_a_front_with_a_strip_of_ground_is_uncertain():
+    up = find_up(turned(make_building("front", 1)[0], TURNS[2]), 0.0)
+    assert up.confidence < 0.75
+    assert "front" in up.reason
+
+
+def test_a_few_points_on_a_face_are_no_sheet():
+    points = np.concatenate(
+        [plane(np.random.default_rng(1), 2000, np.array([0.002, 3.0, 3.0])), [[5.0, 0, 0]]]
+    )
+    assert find_up(points.astype(np.float32)).confidence < 0.5
 
 
 def test_a_bare_room_may_be_upside_down():

@@ -24,7 +24,7 @@ LAYERS = [
     {"result", "scenes"},
     {"paper", "engine", "export"},
     {"datasets"},
-    {"pipeline"},
+    {"pipeline", "alignment"},
     {"evaluation"},
     {"experiments"},
     {"surface_files"},

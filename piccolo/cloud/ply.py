@@ -74,8 +74,8 @@ def open_ply(path: Path, options: ReadOptions = PLAIN) -> PointSource:
     Colours are uchar 0-255, ushort 0-65535, or float and double 0-1. Other properties and elements are left
     out. The file's size is held against the header's counts before memory is reserved.
     """
-    header = _read_header(path)
-    index = _vertex_index(header)
+    header = read_header(path)
+    index = vertex_index(header)
     if _has_faces(header):
         if options.labels:
             raise InputError(f"{path}: found a mesh, wanted points with labels")
@@ -111,12 +111,13 @@ def has_ply_magic(head: bytes) -> bool:
     return head.startswith((b"ply\n", b"ply\r"))
 
 
-def _read_columns(vertices: Vertices) -> Iterator[list[NDArray[np.generic]]]:
+def read_columns(vertices: Vertices) -> Iterator[list[NDArray[np.generic]]]:
+    """Yield the columns of up to CHUNK vertices; those of an ASCII file are float64, whatever their type."""
     return (_read_ascii if vertices.header.is_ascii else _read_binary)(vertices)
 
 
 def _read_colored(vertices: Vertices) -> Iterator[RawCloud]:
-    for columns in _read_columns(vertices):
+    for columns in read_columns(vertices):
         points = np.stack(columns[:3], axis=1, dtype=np.float64)
         is_finite: NDArray[np.bool_] = np.all(np.isfinite(points), axis=1)
         colors = [
@@ -127,11 +128,12 @@ def _read_colored(vertices: Vertices) -> Iterator[RawCloud]:
 
 
 def _read_measured(vertices: Vertices) -> Iterator[Measured]:
-    for columns in _read_columns(vertices):
+    for columns in read_columns(vertices):
         yield np.stack(columns[:3], axis=1, dtype=np.float64), columns[3].astype(np.float64)
 
 
-def _read_header(path: Path) -> Header:
+def read_header(path: Path) -> Header:
+    """What a PLY file says of itself; InputError if that can't be made out."""
     with path.open("rb") as file:
         head = file.read(MAX_HEADER_SIZE)
     if not has_ply_magic(head):
@@ -156,7 +158,7 @@ def _read_header(path: Path) -> Header:
     return Header(path, ply.elements, tuple(int(count) for count in counts), ply.byte_order, ply.text, size)
 
 
-def _vertex_index(header: Header) -> int:
+def vertex_index(header: Header) -> int:
     """Which element the vertices are; it and all before it have rows of a fixed length."""
     names = [element.name for element in header.elements]
     if "vertex" not in names:

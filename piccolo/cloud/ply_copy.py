@@ -1,0 +1,95 @@
+"""A PLY file with all that it holds, to be written again with other coordinates."""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .ply import Header, Vertices, read_columns, read_header, vertex_index
+from .ply_writing import Rows
+from .raw import CHUNK, HEAD_SIZE
+
+BLOCK = 1 << 22  # [byte] copied at once
+
+
+@dataclass(frozen=True)
+class PlyCopy:
+    """The vertices' rows with all their properties, and what stands around them."""
+
+    dtype: np.dtype[Any]  # little-endian
+    read_rows: Callable[[], Iterator[Rows]]  # each call anew
+    num_chunks: int
+    comments: tuple[str, ...]
+    more: tuple[str, ...]  # the header's lines about the elements that follow the vertices
+    read_rest: Callable[[], Iterator[bytes]]  # these elements
+    left_out: tuple[str, ...]  # names of elements that can't be copied
+
+
+def open_copy(path: Path) -> PlyCopy:
+    """A PLY file that open_ply reads; InputError as there.
+
+    Elements after the vertices are copied as bytes, so those of ASCII and big-endian files are left out, as
+    are elements before the vertices.
+    """
+    header = read_header(path)
+    index = vertex_index(header)
+    element = header.elements[index]
+    vertices = Vertices(header, index, tuple(prop.name for prop in element.properties))
+    dtype = element.dtype("<")
+    full = [k for k, count in enumerate(header.counts) if count and k != index]
+    copied = [k for k in full if k > index and header.byte_order == "<"]
+    return PlyCopy(
+        dtype=dtype,
+        read_rows=lambda: (_rows(columns, dtype) for columns in read_columns(vertices)),
+        num_chunks=math.ceil(header.counts[index] / CHUNK),
+        comments=_comments(header),
+        more=tuple(line for k in copied for line in _lines(header, k)),
+        read_rest=lambda: _blocks(path, _end_of_vertices(header, index)) if copied else iter(()),
+        left_out=tuple(header.elements[k].name for k in full if k not in copied),
+    )
+
+
+def is_ply(path: Path) -> bool:
+    """True if a file's first bytes say that it is PLY."""
+    with path.open("rb") as file:
+        return file.read(HEAD_SIZE).startswith((b"ply\n", b"ply\r"))
+
+
+def _rows(columns: list[NDArray[np.generic]], dtype: np.dtype[Any]) -> Rows:
+    rows = np.empty(len(columns[0]), dtype)
+    for name, column in zip(dtype.names or (), columns, strict=True):
+        if dtype[name].kind in "iu" and column.dtype.kind == "f":  # of an ASCII file
+            limits = np.iinfo(dtype[name])
+            rows[name] = np.clip(np.nan_to_num(np.rint(column)), limits.min, limits.max)
+        else:
+            rows[name] = column
+    return rows
+
+
+def _comments(header: Header) -> tuple[str, ...]:
+    with header.path.open("rb") as file:
+        lines = file.read(header.size).decode("ascii", "replace").splitlines()
+    return tuple(line.removeprefix("comment ") for line in lines if line.startswith("comment "))
+
+
+def _lines(header: Header, k: int) -> list[str]:
+    """What the header says of an element; plyfile was told that it is empty."""
+    element = header.elements[k]
+    return [f"element {element.name} {header.counts[k]}", *map(str, element.properties)]
+
+
+def _end_of_vertices(header: Header, index: int) -> int:
+    """Where the elements after the vertices begin [byte]."""
+    elements = zip(header.elements[: index + 1], header.counts, strict=False)
+    return header.size + sum(count * int(element.dtype().itemsize) for element, count in elements)
+
+
+def _blocks(path: Path, begin: int) -> Iterator[bytes]:
+    with path.open("rb") as file:
+        file.seek(begin)
+        while block := file.read(BLOCK):
+            yield block

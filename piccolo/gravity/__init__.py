@@ -1,0 +1,23 @@
+"""Which way is up in a cloud, which planes it has, and along which directions its walls stand."""
+
+from .planes import Plane, find_planes, name_planes, refine_up
+from .surfaces import Surfaces, surfaces_of
+from .up import R_z_from_axis, Up, find_up, named_axis, rotation_to_z_up, up_of
+from .yaw import wall_yaw, yaw_turn
+
+__all__ = [
+    "Plane",
+    "R_z_from_axis",
+    "Surfaces",
+    "Up",
+    "find_planes",
+    "find_up",
+    "name_planes",
+    "named_axis",
+    "refine_up",
+    "rotation_to_z_up",
+    "surfaces_of",
+    "up_of",
+    "wall_yaw",
+    "yaw_turn",
+]
