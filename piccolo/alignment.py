@@ -23,10 +23,10 @@ from .gravity import (
     wall_yaw,
     yaw_turn,
 )
-from .pose import Array, orthonormal
+from .pose import Array, Pose, orthonormal
 from .settings import UpAxis
 
-FORMAT = 1
+FORMAT = "piccolo-alignment/1"
 CONVENTION = "x_aligned = T_aligned_from_scan @ (x_scan, 1) in the unit given; z_aligned is up"
 # Of places made from seeds, and of small rooms in the tests, the surest wrong answers reach 0.73
 MIN_CONFIDENCE = 0.75
@@ -58,6 +58,11 @@ class Alignment:
         T[:3, :3] = R.T
         T[:3, 3] = -np.einsum("ji,j->i", R, self.T_aligned_from_scan[:3, 3]) + 0.0
         return replace(self, T_aligned_from_scan=T)
+
+    def moved(self, pose: Pose) -> Pose:
+        """A pose of the scan in aligned coordinates, both in the unit of the transform."""
+        R, t = self.T_aligned_from_scan[:3, :3], self.T_aligned_from_scan[:3, 3]
+        return Pose(orthonormal(pose.R_cam_from_world @ R.T), R @ pose.center_world + t)
 
     def to_json(self) -> str:
         """One JSON object; every number reads back as the same float64."""
@@ -139,7 +144,7 @@ def read_alignment(path: Path) -> Alignment:
     except (ValueError, RecursionError) as error:  # broken JSON or UTF-8, or brackets without end
         raise InputError(f"{path}: found no JSON, wanted a transform by align_gravity.py") from error
     if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise InputError(f"{path}: found no field format of {FORMAT}, wanted a transform by align_gravity.py")
+        raise InputError(f"{path}: found no format {FORMAT!r}, wanted a transform by align_gravity.py")
     T = _rigid(path, document.get("T_aligned_from_scan"))
     metres_per_unit = _number(path, document, "metres_per_unit", math.inf)
     confidence = _number(path, document, "confidence", 1.0)

@@ -4,9 +4,8 @@
 import argparse
 import json
 import sys
-from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -20,7 +19,9 @@ from piccolo.cloud import open_cloud
 from piccolo.cloud.moving import MeasuredStream, measured, write_moved
 from piccolo.errors import InputError
 from piccolo.files import check_output, write_atomically
+from piccolo.scenes import QUERIES_NAME, Scene, read_scene, write_queries
 from piccolo.settings import CloudSettings, check_confidence
+from progress import shown
 
 PROGRAM = "align_gravity.py"
 EXIT_ALIGNED, EXIT_UNCERTAIN = 0, 1
@@ -29,6 +30,7 @@ examples:
   python tools/align_gravity.py --cloud scan.ply --out aligned.ply
   python tools/align_gravity.py --cloud scan.e57 --out aligned.ply --yaw-walls
   python tools/align_gravity.py --cloud a.las b.las --units us-ft --out aligned.ply --transform T.json
+  python tools/align_gravity.py --cloud room/cloud.ply --queries room/queries.json --out aligned/cloud.ply
   python tools/align_gravity.py --cloud scan.ply | jq .planes
   python tools/align_gravity.py --cloud other.ply --apply aligned.json --out other_aligned.ply
   python tools/align_gravity.py --cloud aligned.ply --apply aligned.json --inverse --out as_scanned.ply
@@ -54,6 +56,8 @@ def build_parser() -> argparse.ArgumentParser:
     files.add_argument("--out", type=Path, metavar="FILE", help="the turned cloud, a PLY file")
     text = "of the transform (default --out's name with .json); .txt is written beside it"
     files.add_argument("--transform", type=Path, metavar="FILE.json", help=text)
+    text = "true poses in the scan, which are turned with it and written beside --out"
+    files.add_argument("--queries", type=Path, metavar="queries.json", help=text)
     text = "write no file, whatever else is given; report on stdout"
     files.add_argument("--transform-only", action="store_true", help=text)
     group = parser.add_argument_group("method")
@@ -81,48 +85,62 @@ def check_arguments(arguments: argparse.Namespace) -> None:
                "--up": arguments.up != "auto", "--transform-only": arguments.transform_only}  # fmt: skip
     if arguments.apply and (wrong := [option for option, is_given in finding.items() if is_given]):
         raise InputError(f"{wrong[0]}: found with --apply, which finds nothing, wanted one of them")
-    if arguments.apply and not arguments.out:
-        raise InputError("--apply: found no --out, wanted a file to write")
+    for option in ("apply", "queries"):
+        if getattr(arguments, option) and not arguments.out:
+            raise InputError(f"--{option}: found no --out, wanted a file to write")
     for path in filter(None, (arguments.out, arguments.transform)):
         if (path.suffix == ".json") != (path is arguments.transform):
             raise InputError(f"{path}: wanted a PLY file as --out, and .json as --transform")
 
 
-def outputs_of(arguments: argparse.Namespace) -> list[Path]:
-    """The files of the transform, JSON and text, that are to be written; refused if they can't be."""
+@dataclass(frozen=True)
+class Outputs:
+    """What is to be written."""
+
+    cloud: Path | None
+    transforms: list[Path]  # JSON and text, or none
+    scene: Scene | None  # whose poses go along
+
+
+def outputs_of(arguments: argparse.Namespace) -> Outputs:
+    """What is to be written; refused if it can't be."""
     path = arguments.transform
     if arguments.out and not arguments.apply:
         path = path or arguments.out.with_suffix(".json")
-    outputs = [path, path.with_suffix(".txt")] if path else []
-    inputs = [*arguments.cloud, *([arguments.apply] if arguments.apply else [])]
-    for output in filter(None, (arguments.out, *outputs)):
+    transforms = [path, path.with_suffix(".txt")] if path else []
+    outputs = [arguments.out, *transforms]
+    outputs += [arguments.out.with_name(QUERIES_NAME)] if arguments.queries else []
+    inputs = [*arguments.cloud, *filter(None, (arguments.apply, arguments.queries))]
+    for output in filter(None, outputs):
         check_output(output, inputs)
-    if arguments.out in outputs:
+    if arguments.out in transforms:
         raise InputError(f"{arguments.out}: found the same name for cloud and transform, wanted a .ply")
-    return outputs
+    scene = read_scene(arguments.queries) if arguments.queries else None
+    return Outputs(arguments.out, transforms, scene)
 
 
 def open_measured(arguments: argparse.Namespace, settings: CloudSettings) -> MeasuredStream:
-    """The cloud, with a progress bar that vanishes."""
-
-    def show(values: Iterator[Any], total: int | None, label: str) -> Iterator[Any]:
-        bar = tqdm(values, label, total, leave=False, disable=arguments.quiet, file=sys.stderr, delay=0.5)
-        return iter(bar)
-
-    return measured(open_cloud(arguments.cloud, settings, show))
+    """The cloud, which shows how far its reading is."""
+    return measured(open_cloud(arguments.cloud, settings, shown(arguments.quiet)))
 
 
-def write(cloud: MeasuredStream, alignment: Alignment, out: Path | None, transforms: list[Path]) -> list[str]:
-    """Write the cloud and the transform, the cloud's name last; returns warnings."""
+def write(cloud: MeasuredStream, alignment: Alignment, outputs: Outputs) -> list[str]:
+    """Write the cloud and what goes with it, the cloud's name last; returns warnings."""
+    out = outputs.cloud
 
-    def write_transforms() -> None:
-        for path, text in zip(transforms, (alignment.to_json(), alignment.to_text()), strict=False):
+    def write_others() -> None:
+        texts = alignment.to_json(), alignment.to_text()
+        for path, text in zip(outputs.transforms, texts, strict=False):
             write_atomically(path, text.encode())
+        if out and outputs.scene:
+            in_metres = alignment.in_unit(1.0)
+            queries = [replace(query, pose=in_metres.moved(query.pose)) for query in outputs.scene.queries]
+            write_queries(out.parent, queries, cloud=out.name)
 
     if out is None:
-        write_transforms()
+        write_others()
         return []
-    return list(write_moved(cloud, alignment.T_aligned_from_scan, out, write_transforms))
+    return list(write_moved(cloud, alignment.T_aligned_from_scan, out, write_others))
 
 
 def report_of(arguments: argparse.Namespace, status: str, alignment: Alignment) -> dict[str, object]:
@@ -169,7 +187,7 @@ def say(arguments: argparse.Namespace, warnings: list[str]) -> None:
 
 def align(arguments: argparse.Namespace) -> int:
     """Find the alignment, write what is sure enough; returns the exit code."""
-    transforms = outputs_of(arguments)
+    outputs = outputs_of(arguments)
     cloud = open_measured(arguments, cloud_settings_from(arguments))
     finding, warnings = find_alignment(cloud, arguments.up, arguments.yaw_walls)
     say(arguments, list(warnings))
@@ -181,7 +199,7 @@ def align(arguments: argparse.Namespace) -> int:
     elif arguments.yaw_walls and finding.yaw is None:
         doubt = "--yaw-walls: found no wall among the dominant planes"
     if not doubt:
-        say(arguments, write(cloud, alignment, arguments.out, transforms))
+        say(arguments, write(cloud, alignment, outputs))
     report = report_of(arguments, "uncertain" if doubt else "aligned", alignment)
     print(json.dumps({**report, **details_of(finding)}, allow_nan=False))
     return complain(PROGRAM, False, doubt, EXIT_UNCERTAIN) if doubt else EXIT_ALIGNED
@@ -189,16 +207,16 @@ def align(arguments: argparse.Namespace) -> int:
 
 def apply(arguments: argparse.Namespace) -> int:
     """Apply the transform of a file to the cloud; returns the exit code."""
-    transforms = outputs_of(arguments)
+    outputs = outputs_of(arguments)
     given = read_alignment(arguments.apply)
     settings = cloud_settings_from(arguments)
     if arguments.units is None and arguments.scale is None:
-        settings = CloudSettings(given.metres_per_unit, settings.up, settings.intensity_as_gray)
+        settings = replace(settings, scale=given.metres_per_unit)
     alignment = (given.inverse() if arguments.inverse else given).in_unit(settings.scale)
     cloud = open_measured(arguments, settings)
     for _ in cloud.chunks([]):  # for its box
         pass
-    say(arguments, write(cloud, alignment, arguments.out, transforms))
+    say(arguments, write(cloud, alignment, outputs))
     print(json.dumps(report_of(arguments, "applied", alignment), allow_nan=False))
     return EXIT_ALIGNED
 
