@@ -1,6 +1,5 @@
 """The command line of tools/align_gravity.py, and the files it writes."""
 
-import functools
 import json
 import os
 import subprocess
@@ -11,10 +10,9 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 from poses import tilted_poses
-from rooms import room
+from scans import points_of, scan, write_scan
 
 from piccolo.alignment import FORMAT, MIN_CONFIDENCE, read_alignment
-from piccolo.cloud.moving import Box, needs_double
 from piccolo.pose import exp_so3
 from piccolo.scenes import Query, read_scene, write_queries
 from tools import align_gravity
@@ -23,34 +21,6 @@ ROOT = Path(__file__).resolve().parents[1]
 TURN = np.array([1.4, 0.6, -0.3])
 UTM = np.array([691_234.0, 5_335_678.0, 512.0])
 ANGLE = 0.01
-
-
-@functools.lru_cache
-def scan():
-    """Points (N, 3) of a furnished room, its walls along x and y, and colours (N, 3)."""
-    cloud = room(1)[1]
-    return cloud.points.astype(np.float64)[::2], cloud.colors[::2]
-
-
-def write_scan(path, points, dtype="<f4", **options):
-    """A PLY with normals, intensity and labels as further properties, and a face if asked for."""
-    colors = scan()[1]
-    fields = [(n, dtype) for n in "xyz"] + [(n, "<f4") for n in ("nx", "ny", "nz")]
-    fields += [("red", "u1"), ("green", "u1"), ("blue", "u1"), ("scalar_intensity", "<f4"), ("label", "<i4")]
-    rows = np.zeros(len(points), dtype=fields)
-    for k, name in enumerate("xyz"):
-        rows[name] = points[:, k]
-    for k, name in enumerate(("red", "green", "blue")):
-        rows[name] = colors[:, k]
-    rows["nz"], rows["label"] = 1.0, np.arange(len(points)) - 7
-    rows["scalar_intensity"] = np.linspace(0.0, 1.0, len(points))
-    options = {"text": False, "byte_order": "<", "comments": ["made by hand"], **options}
-    PlyData([PlyElement.describe(rows, "vertex")], **options).write(path)
-
-
-def points_of(path):
-    vertex = PlyData.read(path)["vertex"]
-    return np.stack([vertex["x"], vertex["y"], vertex["z"]], axis=1).astype(np.float64)
 
 
 @pytest.fixture
@@ -332,9 +302,3 @@ def test_a_read_only_folder_is_named(run, tilted, tmp_path, monkeypatch):
     code, _, err = run("--cloud", tilted, "--out", tmp_path / "o.ply")
     assert code == 3
     assert f"{tmp_path / 'o.ply'}: found a folder without write permission" in err
-
-
-def test_float32_is_kept_where_it_holds_a_tenth_of_a_millimetre():
-    for size, is_double in ((500.0, False), (5000.0, True)):
-        assert needs_double(Box(np.zeros(3), np.full(3, size)), np.eye(4), 1.0) == is_double
-    assert not needs_double(Box(np.zeros(3), np.full(3, 500.0)), np.eye(4), 0.001)

@@ -5,6 +5,7 @@ import pytest
 from plyfile import PlyData
 
 from piccolo.cloud import open_cloud
+from piccolo.cloud.moving import Box, needs_double
 from piccolo.cloud.ply_writing import vertex_rows, write_ply, writing_ply
 
 
@@ -48,3 +49,9 @@ def test_an_error_leaves_nothing(tmp_path):
     ):
         writer.add(rows["x"].astype(str))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_float32_is_kept_where_it_holds_a_tenth_of_a_millimetre():
+    for size, is_double in ((500.0, False), (5000.0, True)):
+        assert needs_double(Box(np.zeros(3), np.full(3, size)), np.eye(4), 1.0) == is_double
+    assert not needs_double(Box(np.zeros(3), np.full(3, 500.0)), np.eye(4), 0.001)

@@ -273,22 +273,3 @@ def test_results_are_evaluated_against_the_truth(scene, tmp_path, capsys):
     (tmp_path / "empty.jsonl").write_text("\n")
     assert evaluate.main(["--scenes", truth, "--results", str(tmp_path / "empty.jsonl")]) == 3
     assert "found no result" in capsys.readouterr().err
-
-
-def _readme_commands():
-    blocks = re.findall(r"(?:^    python .*\n)+", (ROOT / "README.md").read_text(), flags=re.MULTILINE)
-    return next(block for block in blocks if "make_room" in block).strip().splitlines()
-
-
-def test_readme_pipeline_runs_as_written(tmp_path):
-    printed = []
-    for command in _readme_commands():
-        script = command.strip().replace("python ", f"'{sys.executable}' '{ROOT}'/", 1)
-        done = subprocess.run(
-            ["bash", "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr
-        printed.append(done.stdout)
-    assert "| all | 2 | 2 | 1.000 |" in "".join(printed)
-    assert (tmp_path / "room" / "risk.png").read_bytes().startswith(b"\x89PNG")
-    assert len((tmp_path / "room" / "poses.csv").read_text().splitlines()) == 3

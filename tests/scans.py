@@ -1,0 +1,35 @@
+"""A scan with all that a PLY may hold beside colours."""
+
+import functools
+
+import numpy as np
+from plyfile import PlyData, PlyElement
+from rooms import room
+
+
+@functools.lru_cache
+def scan():
+    """Points (N, 3) of a furnished room, its walls along x and y, and colours (N, 3)."""
+    cloud = room(1)[1]
+    return cloud.points.astype(np.float64)[::2], cloud.colors[::2]
+
+
+def write_scan(path, points, dtype="<f4", **options):
+    """A PLY with normals, intensity and labels as further properties, and a face if asked for."""
+    colors = scan()[1]
+    fields = [(n, dtype) for n in "xyz"] + [(n, "<f4") for n in ("nx", "ny", "nz")]
+    fields += [("red", "u1"), ("green", "u1"), ("blue", "u1"), ("scalar_intensity", "<f4"), ("label", "<i4")]
+    rows = np.zeros(len(points), dtype=fields)
+    for k, name in enumerate("xyz"):
+        rows[name] = points[:, k]
+    for k, name in enumerate(("red", "green", "blue")):
+        rows[name] = colors[:, k]
+    rows["nz"], rows["label"] = 1.0, np.arange(len(points)) - 7
+    rows["scalar_intensity"] = np.linspace(0.0, 1.0, len(points))
+    options = {"text": False, "byte_order": "<", "comments": ["made by hand"], **options}
+    PlyData([PlyElement.describe(rows, "vertex")], **options).write(path)
+
+
+def points_of(path):
+    vertex = PlyData.read(path)["vertex"]
+    return np.stack([vertex["x"], vertex["y"], vertex["z"]], axis=1).astype(np.float64)
