@@ -122,9 +122,9 @@ def _runtime(presets: Sequence[Settings], variants: Sequence[str]) -> list[Arm]:
 def _variants(presets: Sequence[Settings], variants: Sequence[str]) -> list[Arm]:
     figures = {
         "handheld": "accuracy 0.71 (OmniScenes)",
-        "robot": "accuracy 0.77 (OmniScenes)",
+        "turtlebot": "accuracy 0.77 (OmniScenes)",
         "change_handheld": "accuracy 0.43 (OmniScenes)",
-        "change_robot": "accuracy 0.55 (OmniScenes)",
+        "change_turtlebot": "accuracy 0.55 (OmniScenes)",
         "mpo": "accuracy 0.45 (MPO)",
     }
     return [
