@@ -19,8 +19,21 @@ def complain(program: str, is_debug: bool, text: str, exit_code: int) -> int:
     return exit_code
 
 
-def guarded(program: str, is_debug: bool, action: Callable[[], int]) -> int:
-    """The exit code of a tool's work, or of the error that ended it."""
+def nothing_to_check() -> None:
+    """No option that could be wrong by itself."""
+
+
+def guarded(
+    program: str, is_debug: bool, action: Callable[[], int], check: Callable[[], object] = nothing_to_check
+) -> int:
+    """The exit code of a tool's work, or of the error that ended it.
+
+    `check` comes first, and says by InputError that the options are wrong, whatever the files hold.
+    """
+    try:
+        check()
+    except InputError as error:
+        return complain(program, is_debug, str(error), EXIT_BAD_USAGE)
     try:
         return action()
     except KeyboardInterrupt:

@@ -13,7 +13,7 @@ from tqdm import tqdm
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from command_line import add_cloud_options, cloud_settings_from, parse
-from exit_codes import EXIT_BAD_USAGE, complain, guarded
+from exit_codes import complain, guarded
 from piccolo.alignment import MIN_CONFIDENCE, Alignment, Finding, find_alignment, read_alignment
 from piccolo.cloud import open_cloud
 from piccolo.cloud.moving import MeasuredStream, measured, write_moved
@@ -226,11 +226,8 @@ def main(argv: list[str] | None = None) -> int:
     arguments = parse(build_parser(), argv)
     if arguments.transform_only:
         arguments.out = arguments.transform = None
-    try:
-        check_arguments(arguments)
-    except InputError as error:
-        return complain(PROGRAM, arguments.debug, str(error), EXIT_BAD_USAGE)
-    return guarded(PROGRAM, arguments.debug, lambda: (apply if arguments.apply else align)(arguments))
+    work = apply if arguments.apply else align
+    return guarded(PROGRAM, arguments.debug, lambda: work(arguments), lambda: check_arguments(arguments))
 
 
 if __name__ == "__main__":

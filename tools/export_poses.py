@@ -9,7 +9,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from exit_codes import EXIT_BAD_USAGE, complain, guarded
+from exit_codes import guarded
 from piccolo.errors import InputError
 from piccolo.export import FORMATS, Options, Selection, export, read_results, select, true_results
 from piccolo.export.axes import CAMERA_AXES
@@ -126,16 +126,12 @@ def run(arguments: argparse.Namespace, options: Options) -> dict[str, object]:
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     arguments = build_parser().parse_args(argv)
-    try:
-        options = options_from(arguments)
-    except InputError as error:
-        return complain("export_poses.py", arguments.debug, str(error), EXIT_BAD_USAGE)
 
     def export() -> int:
-        print(json.dumps(run(arguments, options)))
+        print(json.dumps(run(arguments, options_from(arguments))))
         return 0
 
-    return guarded("export_poses.py", arguments.debug, export)
+    return guarded("export_poses.py", arguments.debug, export, lambda: options_from(arguments))
 
 
 if __name__ == "__main__":

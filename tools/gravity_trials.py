@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -25,6 +24,7 @@ from piccolo.pose import Array, rotation_from_quaternion_wxyz
 from piccolo.settings import check_confidence
 from piccolo.synthetic.buildings import BUILDINGS, make_building
 from piccolo.threads import Workers, num_cores
+from progress import shown
 
 PROGRAM = "gravity_trials.py"
 RIGHT, ROUGH = 0.5, 5.0  # [deg]
@@ -92,11 +92,7 @@ def try_turn(points: NDArray[np.floating[Any]], R: Array) -> Answer:
 
 def run(arguments: argparse.Namespace) -> dict[str, list[Answer]]:
     """All answers, case by case."""
-
-    def show(values: Iterator[Any], total: int | None, label: str) -> Iterator[Any]:
-        return iter(tqdm(values, label, total, leave=False, disable=arguments.quiet, file=sys.stderr))
-
-    workers = Workers(arguments.threads, show)
+    workers = Workers(arguments.threads, shown(arguments.quiet))
     answers: dict[str, list[Answer]] = {}
     for case in cases_of(arguments):
         found = workers.each(partial(try_turn, case.points), case.rotations, case.name)

@@ -5,17 +5,14 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from command_line import add_cloud_options, cloud_settings_from, parse
-from exit_codes import EXIT_BAD_USAGE, complain, guarded
+from exit_codes import guarded
 from piccolo.errors import InputError
 from piccolo.export import read_results
 from piccolo.files import check_output, write_atomically
@@ -30,6 +27,7 @@ from piccolo.sampling import Texels, pack_texels
 from piccolo.scenes import read_scene
 from piccolo.surface_files import Known, plan_shift, surface_npz, surface_png
 from piccolo.threads import Workers, num_cores
+from progress import shown
 
 EPILOG = """\
 examples:
@@ -188,10 +186,7 @@ def run(arguments: argparse.Namespace) -> int:
     for path in outputs:
         check_output(path, inputs)
 
-    def show(values: Iterator[Any], total: int | None, label: str) -> Iterator[Any]:
-        return iter(tqdm(values, label, total, leave=False, disable=arguments.quiet, file=sys.stderr))
-
-    workers = Workers(arguments.threads, show)
+    workers = Workers(arguments.threads, shown(arguments.quiet))
     texels = texels_of(arguments.pano, arguments.width)
     placed = open_points(arguments.cloud, cloud_settings_from(arguments), workers)
     for warning in () if arguments.quiet else placed.warnings:
@@ -217,11 +212,7 @@ def run(arguments: argparse.Namespace) -> int:
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     arguments = parse(build_parser(), argv)
-    try:
-        check_usage(arguments)
-    except InputError as error:
-        return complain("loss_surface.py", arguments.debug, str(error), EXIT_BAD_USAGE)
-    return guarded("loss_surface.py", arguments.debug, lambda: run(arguments))
+    return guarded("loss_surface.py", arguments.debug, lambda: run(arguments), lambda: check_usage(arguments))
 
 
 if __name__ == "__main__":

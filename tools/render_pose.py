@@ -4,19 +4,16 @@
 import argparse
 import json
 import sys
-from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from command_line import add_cloud_options, cloud_settings_from, parse
-from exit_codes import EXIT_BAD_USAGE, complain, guarded
+from exit_codes import guarded
 from piccolo.animation import (
     FRAME_WIDTH,
     check_animation,
@@ -40,6 +37,7 @@ from piccolo.scenes import read_scene
 from piccolo.settings import DescentSettings
 from piccolo.threads import Workers, num_cores
 from piccolo.truth import pose_errors
+from progress import shown
 
 EPILOG = """\
 examples:
@@ -261,11 +259,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_files(arguments)
     poses = poses_from(arguments)
 
-    def show(values: Iterator[Any], total: int | None, label: str) -> Iterator[Any]:
-        hidden = arguments.quiet
-        return iter(tqdm(values, label, total, leave=False, disable=hidden, file=sys.stderr, delay=0.5))
-
-    workers = Workers(num_cores(), show)
+    workers = Workers(num_cores(), shown(arguments.quiet))
     placed = open_points(arguments.cloud, cloud_settings_from(arguments), workers)
     for warning in () if arguments.quiet else placed.warnings:
         print(f"render_pose.py: warning: {warning}", file=sys.stderr)
@@ -279,11 +273,7 @@ def run(arguments: argparse.Namespace) -> int:
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     arguments = parse(build_parser(), argv)
-    try:
-        check_usage(arguments)
-    except InputError as error:
-        return complain("render_pose.py", arguments.debug, str(error), EXIT_BAD_USAGE)
-    return guarded("render_pose.py", arguments.debug, lambda: run(arguments))
+    return guarded("render_pose.py", arguments.debug, lambda: run(arguments), lambda: check_usage(arguments))
 
 
 if __name__ == "__main__":
