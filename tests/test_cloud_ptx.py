@@ -229,5 +229,5 @@ def test_mutated_pts_raise_nothing_but_input_error(data, tmp_path_factory):
 def test_empty_files_are_refused_by_the_readers_themselves(tmp_path):
     (tmp_path / "a").touch()
     for reader in (open_ptx, open_pts):
-        with pytest.raises(InputError, match="the file is empty, wanted lines of numbers"):
+        with pytest.raises(InputError, match="no line of numbers, wanted"):
             reader(tmp_path / "a")

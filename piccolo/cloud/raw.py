@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ..labels import Labels
 
 CHUNK = 1 << 20  # points that a reader hands on at once, at most
+CUT = "the file was cut while it was read, wanted a whole file"
 
 # points (N, 3) in the file's unit, and a number (N,) of each: intensity or label
 Measured = tuple[NDArray[np.float64], NDArray[np.float64]]
