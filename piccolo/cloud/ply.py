@@ -80,7 +80,7 @@ def open_ply(path: Path, options: ReadOptions = PLAIN) -> PointSource:
     if _has_faces(header):
         if options.labels:
             raise InputError(f"{path}: found a mesh, wanted points with labels")
-        return open_ply_mesh(path)
+        return open_ply_mesh(path, options)
     vertices = Vertices(header, index, _property_names(header, index, options))
     count = header.counts[index]
     if not header.is_ascii:

@@ -22,6 +22,7 @@ class ReadOptions:
 
     intensity_as_gray: bool = False  # take intensity for a gray where a file has no colours
     labels: Labels | None = None  # take the points' labels for their colours
+    scale: float = 1.0  # metres per unit of the file, for what counts by metres; points stay in its unit
 
 
 PLAIN = ReadOptions()
