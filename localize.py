@@ -30,7 +30,7 @@ from piccolo.settings import EngineSettings, PaperSettings
 from piccolo.stopwatch import Stopwatch
 from piccolo.threads import Workers
 from piccolo.verdict import LOCALIZED
-from progress import shown
+from progress import shown, warned
 
 EXIT_ALL_LOCALIZED, EXIT_SOME_NOT, EXIT_BAD_USAGE, EXIT_BAD_INPUT, EXIT_INTERNAL = range(5)
 EXIT_INTERRUPTED, EXIT_BROKEN_PIPE = 130, 141
@@ -75,13 +75,12 @@ def open_session(
 
     watch = Stopwatch()
     cache = CachePolicy(not arguments.no_cache, arguments.cache)
-    workers = Workers(arguments.threads, shown(arguments.quiet))
+    workers = Workers(arguments.threads, shown(arguments.quiet), warned(arguments.quiet))
     inputs = Inputs(tuple(arguments.cloud), cloud_settings_from(arguments), read_options)
     localizer = open_localizer(inputs, settings, cache, workers, watch)
-    session = Session(arguments, inputs, localizer, workers, watch.seconds)
-    for warning in localizer.warnings:
-        session.say(f"warning: {warning}")
-    return session
+    for warning in localizer.warnings:  # those of a map prepared earlier; others have been written
+        workers.warn(warning)
+    return Session(arguments, inputs, localizer, workers, watch.seconds)
 
 
 def results_of(session: Session) -> Iterator[Result | None]:

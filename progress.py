@@ -1,7 +1,7 @@
-"""How the tools show how far they are: bars on stderr that vanish when they are full."""
+"""How the tools show on stderr how far they are, by bars that vanish when full, and warn."""
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from tqdm import tqdm
@@ -18,3 +18,15 @@ def shown(is_quiet: bool) -> Show:
         return iter(tqdm(values, label, total, leave=False, disable=is_quiet, file=sys.stderr, delay=DELAY))
 
     return show
+
+
+def warned(is_quiet: bool) -> Callable[[str], None]:
+    """What writes a warning, once however often it comes, or nothing."""
+    said: set[str] = set()
+
+    def warn(warning: str) -> None:
+        if not is_quiet and warning not in said:
+            said.add(warning)
+            tqdm.write(f"warning: {warning}", file=sys.stderr)
+
+    return warn

@@ -215,6 +215,8 @@ def open_localizer(
         raise InputError(f"{map_path}: found a prepared map, wanted a cloud with the preset paper")
     with watch.stage("read"):
         cloud = open_cloud(paths, cloud_settings, workers.show).read()
+    for warning in cloud.warnings:
+        workers.warn(warning)
     with watch.stage("prepare"):
         paper_map = paper.prepare(cloud, settings)
     return PaperLocalizer(paper_map, settings, cloud.warnings)

@@ -24,12 +24,17 @@ def unseen(values: Iterator[Value], total: int | None, label: str) -> Iterator[V
     return values
 
 
+def unheard(warning: str) -> None:
+    """A warning that the result alone repeats."""
+
+
 @dataclass(frozen=True)
 class Workers:
     """How many threads do the work, and who is told how far it is."""
 
     num_threads: int = 1
     show: Show = unseen  # progress
+    warn: Callable[[str], None] = unheard  # of what should be known before the work is done
 
     def each(self, function: Callable[[Item], Value], items: Sequence[Item], label: str) -> Iterator[Value]:
         """Yield function(item) for each item, in order.

@@ -18,6 +18,7 @@ RAW = seeded_cloud(2, num_points=1200)
 RAW = RawCloud(np.rint(RAW.points_world / SCALES) * SCALES + OFFSETS, RAW.colors)
 FORMATS = [2, 3, 5, 7, 8, 10]
 EIGHT_BIT = RAW.colors.astype(np.uint16)
+INTENSITY = np.where(np.arange(1200) == 1000, 7, 0).astype(np.uint16)  # of one point
 COUNT, COUNT_1_4, POINTS_OFFSET, NUM_VLRS, FORMAT, RECORD_SIZE, SCALE_X = 107, 247, 96, 100, 104, 105, 131
 
 
@@ -129,10 +130,11 @@ def test_the_sample_is_spread_over_the_file(tmp_path, monkeypatch, is_compressed
 
 
 def test_files_without_colors_are_refused(tmp_path, monkeypatch):
-    black = las_bytes(RAW, colors=np.zeros((1200, 3), np.uint16))
+    black = las_bytes(RAW, colors=np.zeros((1200, 3), np.uint16), intensity=INTENSITY)
     for content in (black, laz_bytes(black, 500)):
         with pytest.raises(InputError, match="no colours: red green blue are 0 in all 1200 points looked at"):
             open_source(write(tmp_path, content))
+    black = las_bytes(RAW, colors=np.zeros((1200, 3), np.uint16), intensity=INTENSITY + 1)
     monkeypatch.setattr(las, "MAX_SAMPLES", 64)  # a larger file is not read to its end
     with pytest.raises(InputError, match="are 0 in all 64 points looked at"):
         open_source(write(tmp_path, black))
@@ -141,7 +143,20 @@ def test_files_without_colors_are_refused(tmp_path, monkeypatch):
 @pytest.mark.parametrize("point_format", [0, 1, 4, 6, 9])
 def test_formats_without_color_fields_are_refused(tmp_path, point_format):
     with pytest.raises(InputError, match=f"no colours: point format {point_format} has intensity only"):
-        open_source(write(tmp_path, las_bytes(RAW, point_format)))
+        open_source(write(tmp_path, las_bytes(RAW, point_format, intensity=INTENSITY)))
+
+
+@pytest.mark.parametrize("point_format", [1, 3, 6, 7])
+def test_an_intensity_of_0_is_not_recommended(tmp_path, point_format):
+    black = np.zeros((1200, 3), np.uint16)
+    for intensity in (np.zeros(1200, np.uint16), INTENSITY):
+        plain = las_bytes(RAW, point_format, colors=black, intensity=intensity)
+        for content in (plain, laz_bytes(plain, 500)):
+            with pytest.raises(InputError) as error:
+                open_source(write(tmp_path, content))
+            is_there = bool(intensity.any())
+            assert ("--intensity-as-gray" in str(error.value)) == is_there
+            assert ("its intensity is 0 in all 1200 points looked at, wanted" in str(error.value)) != is_there
 
 
 def patched(content, position, form, value):

@@ -21,10 +21,11 @@ from scipy.spatial.transform import Rotation
 from test_cloud_order import whole
 
 from piccolo.cloud import mesh as mesh_module
-from piccolo.cloud import mesh_sampling
+from piccolo.cloud import mesh_sampling, open_cloud, read_cloud
 from piccolo.cloud.mesh import open_mesh
 from piccolo.cloud.mesh_sampling import look_up, weights_of
 from piccolo.cloud.ply import open_ply
+from piccolo.settings import CloudSettings
 
 
 def test_an_obj_texture_stands_upright(tmp_path):
@@ -195,8 +196,22 @@ def test_too_many_points_lower_the_density(tmp_path, monkeypatch):
     monkeypatch.setattr(mesh_module, "MAX_POINTS", 2000)
     source = open_mesh(write_obj(tmp_path))
     assert source.num_points == 2000
-    assert "1 square units of surface, sampled with 2e+03 points" in source.warnings[0]
+    assert "1 square metres of surface, sampled with 2e+03 points" in source.warnings[0]
     assert sum(len(raw.colors) for raw in source.read_chunks()) == 2000
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("mm", 0.001), ("km", 1000.0), ("ft", 0.3048)])
+def test_density_counts_by_square_metres(tmp_path, unit, scale):
+    """A square metre in any unit, as OBJ and as PLY, gives the same 10,000 points."""
+    path = write_obj(tmp_path, vertices=SQUARE / scale)
+    ply = write_ply(tmp_path / "a.ply", SQUARE / scale, colors=np.array(CORNER_COLORS[:, :3] * 255, "u1"))
+    for source in (path, ply):
+        (opened,) = open_cloud([source], CloudSettings(scale=scale)).sources
+        assert abs(opened.num_points - 10_000) <= 1
+        assert opened.warnings == ()
+    cloud = read_cloud(path, CloudSettings(scale=scale))
+    extent = np.ptp(cloud.points, axis=0)
+    np.testing.assert_allclose(extent, [1, 1, 0], atol=0.01)
 
 
 def test_texels_of_alpha_0_leave_their_points_out(tmp_path):

@@ -8,7 +8,7 @@ from refusals import mutated, read_or_refused
 from test_cloud_lzf import compress
 from test_cloud_order import seeded_cloud
 
-from piccolo.cloud import open_source, raw, read_cloud
+from piccolo.cloud import lines, open_source, raw, read_cloud, records
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)
@@ -236,6 +236,37 @@ def test_mutated_files_raise_nothing_but_input_error(encoding, data, tmp_path_fa
     path.write_bytes(header + body)
     cloud, _ = read_or_refused(read_cloud, path)
     assert cloud is None or 1000 <= len(cloud.points) <= 1200
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_a_file_cut_while_it_is_read_is_refused(tmp_path, monkeypatch, encoding):
+    monkeypatch.setattr(raw, "CHUNK", 50)
+    monkeypatch.setattr(lines, "BLOCK", 2048)
+    path = write(tmp_path / "a.pcd", COLORS["r g b"], encoding)
+    source = open_source(path)
+    chunks = source.read_chunks()
+    next(chunks)
+    content = path.read_bytes()
+    size = len(content) // 2
+    with path.open("r+b") as file:
+        file.truncate(content.rindex(b"\n", 0, size) + 1 if encoding == "ascii" else size)
+    if encoding == "binary_compressed":  # it was in memory; the next reading tells
+        assert sum(len(chunk.colors) for chunk in chunks) == 1150
+        chunks = source.read_chunks()
+    with pytest.raises(InputError, match=r"the file was cut while it was read|the file is cut off") as error:
+        list(chunks)
+    assert str(error.value).startswith(f"{path}: ")
+
+
+def test_long_records_come_in_smaller_chunks(tmp_path, monkeypatch):
+    monkeypatch.setattr(records, "MAX_BLOCK_SIZE", 1000)
+    path = write(tmp_path / "a.pcd", separate("f4", 1))
+    assert [len(chunk.colors) for chunk in open_source(path).read_chunks()] == [41] * 29 + [11]
+    assert_read_as_written(path)
+    fields = separate("f4", 1)
+    fields[4][3][107] = 1.5
+    with pytest.raises(InputError, match="point 108 has the colour"):
+        read(write(path, fields))
 
 
 MUTABLE = {encoding: content_of(COLORS["uint rgb"], encoding) for encoding in ENCODINGS}

@@ -7,9 +7,12 @@ from hypothesis import strategies as st
 from refusals import mutated, read_or_refused
 from test_cloud_order import seeded_cloud
 
+from piccolo.cloud import lines as lines_module
 from piccolo.cloud import open_source, raw, read_cloud
+from piccolo.cloud.lines import line_blocks
 from piccolo.cloud.pts import open_pts
 from piccolo.cloud.ptx import open_ptx
+from piccolo.cloud.raw import ReadOptions
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)
@@ -229,5 +232,54 @@ def test_mutated_pts_raise_nothing_but_input_error(data, tmp_path_factory):
 def test_empty_files_are_refused_by_the_readers_themselves(tmp_path):
     (tmp_path / "a").touch()
     for reader in (open_ptx, open_pts):
-        with pytest.raises(InputError, match="the file is empty, wanted lines of numbers"):
+        with pytest.raises(InputError, match="no line of numbers, wanted"):
             reader(tmp_path / "a")
+
+
+@pytest.mark.parametrize("name", ["a.ptx", "a.pts"])
+@pytest.mark.parametrize("gray", [False, True])
+def test_a_file_cut_while_it_is_read_is_refused(tmp_path, monkeypatch, name, gray):
+    """At a line's end, where no line is broken, and by all that had not been read yet."""
+    monkeypatch.setattr(raw, "CHUNK", 50)
+    monkeypatch.setattr(lines_module, "BLOCK", 4096)
+    lines = TWO_SCANS if name == "a.ptx" else ["1200", *pts()]
+    if gray:
+        lines = [
+            " ".join([*f[:3], str(k)]) if len(f) == 7 else " ".join(f)
+            for k, f in enumerate(map(str.split, lines))
+        ]
+    path = write(tmp_path / name, lines)
+    chunks = open_source(path, ReadOptions(intensity_as_gray=gray)).read_chunks()
+    next(chunks)
+    content = path.read_bytes()
+    with path.open("r+b") as file:
+        file.truncate(content.rindex(b"\n", 0, len(content) // 2) + 1)
+    with pytest.raises(InputError, match="the file was cut while it was read, wanted a whole file") as error:
+        list(chunks)
+    assert str(error.value).startswith(f"{path}: ")
+
+
+def test_a_scan_that_has_gone_between_two_readings_is_refused(tmp_path):
+    path = write(tmp_path / "a.ptx", TWO_SCANS)
+    source = open_source(path)
+    write(path, TWO_SCANS[:300])
+    with pytest.raises(InputError, match="the file was cut while it was read"):
+        list(source.read_chunks())
+
+
+def test_many_small_scans_are_read_once(tmp_path, monkeypatch):
+    """A block is read once, however many scans begin in it."""
+    blocks = []
+
+    def counted(path, start):
+        for block in line_blocks(path, start):
+            blocks.append(len(block))
+            yield block
+
+    monkeypatch.setattr(lines_module, "line_blocks", counted)
+    small = [scan(RAW.points_world[k : k + 3], RAW.colors[k : k + 3]) for k in range(0, 1200, 3)]
+    path = write(tmp_path / "a.ptx", [line for lines in small for line in lines])
+    assert_read_as_written(path)
+    counts = [line for k in range(0, 1200, 3) for line in ("3", *pts()[k : k + 3])]
+    assert_read_as_written(write(tmp_path / "a.pts", counts))
+    assert len(blocks) == 4  # each file when it is opened and when it is read

@@ -10,6 +10,7 @@ import pytest
 from rooms import as_panorama, errors, query, room
 from test_cloud_order import seeded_cloud
 
+from piccolo import pipeline
 from piccolo.cloud import CloudStream
 from piccolo.cloud.raw import PointSource, RawCloud
 from piccolo.cloud.voxels import Voxels
@@ -20,7 +21,7 @@ from piccolo.errors import InputError
 from piccolo.gravity import rotation_to_z_up
 from piccolo.pipeline import CachePolicy, open_map
 from piccolo.pose import Pose, exp_so3
-from piccolo.settings import METRES, CloudSettings, EngineSettings
+from piccolo.settings import METRES, CloudSettings, EngineSettings, PaperSettings
 from piccolo.stopwatch import Stopwatch
 from piccolo.threads import Workers
 
@@ -199,11 +200,8 @@ def test_order_of_files_changes_no_bit_of_a_map(tmp_path):
         for paths, n in (([a, b], 1), ([b, a], 2))
     ]
     for f in dataclasses.fields(maps[0]):
-        if f.name not in ("octree", "warnings"):
-            assert (
-                np.asarray(getattr(maps[0], f.name)).tobytes()
-                == np.asarray(getattr(maps[1], f.name)).tobytes()
-            )
+        if f.name not in ("octree", "warnings", "has_labels"):
+            assert getattr(maps[0], f.name).tobytes() == getattr(maps[1], f.name).tobytes(), f.name
     assert maps[0].octree.nodes.tobytes() == maps[1].octree.nodes.tobytes()
 
 
@@ -218,6 +216,7 @@ MEASURE = """
 import resource
 from pathlib import Path
 import numpy as np
+from piccolo import pipeline
 from piccolo.cloud import CloudStream
 from piccolo.cloud.raw import CHUNK, PointSource, RawCloud
 
@@ -240,3 +239,28 @@ def test_memory_grows_with_the_scene_and_not_with_the_points():
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
         peaks_mb.append(int(done.stdout))
     assert peaks_mb[1] - peaks_mb[0] < 30
+
+
+@pytest.mark.parametrize("preset", [EngineSettings(), PaperSettings()])
+def test_a_wrong_unit_is_told_before_the_long_work_begins(tmp_path, monkeypatch, preset):
+    heard = []
+
+    def begin(*_):
+        raise InterruptedError
+
+    monkeypatch.setattr("piccolo.engine.scan_map.candidate_centers", begin)
+    monkeypatch.setattr("piccolo.paper.method.prepare", begin)
+    path = tmp_path / "mm.xyz"
+    raw = seeded_cloud(1, 1500, size=(6000.0, 5000.0, 2500.0))
+    np.savetxt(path, np.hstack([raw.points_world, raw.colors]), fmt="%.3f")
+    with pytest.raises(InterruptedError):
+        pipeline.open_localizer(
+            pipeline.Inputs((path,)),
+            preset,
+            CachePolicy(is_used=False),
+            Workers(1, warn=heard.append),
+            Stopwatch(),
+        )
+    (warning,) = heard
+    assert warning.startswith(f"{path}: the cloud spans")
+    assert warning.endswith("set --units mm")

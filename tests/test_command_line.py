@@ -1,6 +1,7 @@
 """The options that say what a cloud is."""
 
 import json
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -9,9 +10,10 @@ from rooms import errors, query, room
 
 import localize
 from command_line import build_parser, cloud_settings_from, parse
+from piccolo.panorama import AS_STORED
 from piccolo.pipeline import Inputs
 from piccolo.result import Result
-from piccolo.settings import IN_METRES, CloudSettings
+from piccolo.settings import IN_METRES, CloudSettings, EngineSettings
 from tools import prepare_map
 
 ONE = ["--cloud", "a.ply", "--pano", "b.jpg"]
@@ -104,3 +106,17 @@ def test_no_file_of_a_cloud_is_overwritten(scene, capsys):
     assert "an input as the output" in capsys.readouterr().err
     assert prepare_map.main([*_cloud(scene, 0, 1), "--out", str(second)]) == 3
     assert second.read_bytes() == before
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_a_warning_is_written_once_whenever_it_comes(monkeypatch, capsys, quiet):
+    def opened(inputs, settings, cache, workers, watch):
+        workers.warn("early")
+        return SimpleNamespace(warnings=("early", "late"))
+
+    monkeypatch.setattr(localize, "open_localizer", opened)
+    monkeypatch.setattr(localize, "is_first_use", lambda: False)
+    arguments = parse(build_parser(), [*ONE, *["--quiet"] * quiet])
+    session = localize.open_session(arguments, EngineSettings(), AS_STORED)
+    assert session.localizer.warnings == ("early", "late")
+    assert capsys.readouterr().err == ("" if quiet else "warning: early\nwarning: late\n")

@@ -15,7 +15,7 @@ from piccolo.files import check_output
 from piccolo.pipeline import CachePolicy, open_map
 from piccolo.stopwatch import Stopwatch
 from piccolo.threads import Workers, num_cores
-from progress import shown
+from progress import shown, warned
 
 EPILOG = """\
 example:
@@ -33,7 +33,7 @@ def prepare(arguments: argparse.Namespace) -> dict[str, object]:
     check_output(arguments.out, arguments.cloud)
 
     watch = Stopwatch()
-    workers = Workers(num_cores(), shown(arguments.quiet))
+    workers = Workers(num_cores(), shown(arguments.quiet), warned(arguments.quiet))
     cloud_settings = cloud_settings_from(arguments)
     scan_map = open_map(arguments.cloud, cloud_settings, CachePolicy(is_used=False), workers, watch)
     save_map(scan_map, arguments.out)

@@ -36,7 +36,7 @@ def open_cloud(
         A file is missing, has a damaged header, no colours, or is no format that is read here. Reading the
         points raises it where the data break or fail the checks of `clean.Census`.
     """
-    options = ReadOptions(settings.intensity_as_gray, settings.labels)
+    options = ReadOptions(settings.intensity_as_gray, settings.labels, settings.scale)
     sources = [open_source(path, options) for path in sorted(paths)]
     return CloudStream(sources, settings.scale, show)
 

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..pose import rotation_from_quaternion_wxyz
+from .lines import quoted
 from .optional import library
-from .text import quoted
 
 MAGIC = b"ASTM-E57"
 HEADER = struct.Struct("<8sIIQQQQ")  # magic, major, minor, file size, XML offset, XML size, page size

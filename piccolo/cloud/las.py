@@ -45,7 +45,7 @@ def open_las(path: Path, options: ReadOptions = PLAIN) -> PointSource:
     if options.labels:
         read_chunks = in_palette(path, lambda: _read_measured(header, compression, "class"), options.labels)
         return PointSource(path, read_chunks, header.num_points)
-    brightest, num_samples = _brightest(header, compression) if header.has_colors else (0, 0)
+    brightest, num_samples = _largest(header, compression, "rgb") if header.has_colors else (0, 0)
     if brightest == 0:
         return _gray_source(header, compression, options, num_samples)
     warnings = []
@@ -67,6 +67,10 @@ def _gray_source(
         why = f"red green blue are 0 in all {num_samples} points looked at"
         if not header.has_colors:
             why = f"point format {header.point_format} has intensity only"
+        largest, num_samples = _largest(header, compression, "intensity")
+        if largest == 0:
+            why += f"; its intensity is 0 in all {num_samples} points looked at"
+            raise InputError(f"{header.path}: has neither colours nor intensity: {why}, {WANTED}")
         raise InputError(f"{header.path}: has intensity and no colours: {why}, {WANTED}; {OPTION}")
     read_chunks = in_gray(header.path, lambda: _read_measured(header, compression, "intensity"))
     return PointSource(header.path, read_chunks, header.num_points)
@@ -124,15 +128,15 @@ def _load(file: BinaryIO, header: Header, compression: Compression | None, run: 
     return np.frombuffer(data, dtype=header.dtype)
 
 
-def _brightest(header: Header, compression: Compression | None) -> tuple[int, int]:
-    """The largest colour value in a sample of the points, and the number of those."""
-    brightest = num_samples = 0
+def _largest(header: Header, compression: Compression | None, name: str) -> tuple[int, int]:
+    """The largest `rgb` or `intensity` in a sample of the points, and the number of those."""
+    largest = num_samples = 0
     with header.path.open("rb") as file:
         for run in _sample_runs(header, compression):
             records = _load(file, header, compression, run)
-            brightest = max(brightest, int(records["rgb"].max()))
+            largest = max(largest, int(records[name].max()))
             num_samples += len(records)
-    return brightest, num_samples
+    return largest, num_samples
 
 
 def _read_chunks(header: Header, compression: Compression | None, is_8_bit: bool) -> Iterator[RawCloud]:

@@ -16,32 +16,33 @@ from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply
 from .mesh_sampling import Floats, Placed, Sampling, Surface
 from .raw import PLAIN, Format, PointSource, ReadOptions
 
-DENSITY = 10_000.0  # points on a square unit, 1 cm apart if the unit is the metre
+DENSITY = 10_000.0  # points on a square metre, 1 cm apart
 MAX_POINTS = 30_000_000
 MAX_TRIANGLES = 200_000_000  # counted anew wherever a scene places its mesh
 BRIGHTEST = {"u1": 255.0, "u2": 65535.0}  # of whole numbers; fractions go to 1
 
 
 def open_mesh(path: Path, options: ReadOptions = PLAIN) -> PointSource:
-    """The points on the triangles of an OBJ, GLB or glTF file, 10,000 on a square unit of the file.
+    """The points on the triangles of an OBJ, GLB or glTF file, 10,000 on a square metre.
 
-    A file that would give more than 30 million is sampled at a lower density, with a warning. Colours: from
-    the texture, whose texels of alpha 0 leave their points out; else from the vertices, the faces, the
-    material. In glTF they are multiplied in linear light: texture, base colour's factor, vertex colours.
-    Textures repeat beyond their edges. Surfaces without colours are left out, with a warning.
+    The options' scale tells what a metre is in the file. A file that would give more than 30 million is
+    sampled at a lower density, with a warning. Colours: from the texture, whose texels of alpha 0 leave their
+    points out; else from the vertices, the faces, the material. In glTF they are multiplied in linear light:
+    texture, base colour's factor, vertex colours. Textures repeat beyond their edges. Surfaces without
+    colours are left out, with a warning.
     """
     content = path.read_bytes()
     if has_glb_magic(content) or path.suffix.lower() in (".glb", ".gltf"):
-        return _source(load_gltf(path, content))
-    return _source(load_obj(path, content))
+        return _source(load_gltf(path, content), options.scale)
+    return _source(load_obj(path, content), options.scale)
 
 
-def open_ply_mesh(path: Path) -> PointSource:
+def open_ply_mesh(path: Path, options: ReadOptions = PLAIN) -> PointSource:
     """The points on the faces of a PLY file, as by open_mesh; with a texture if a comment names one."""
-    return _source(load_ply(path))
+    return _source(load_ply(path), options.scale)
 
 
-def _source(loaded: Loaded) -> PointSource:
+def _source(loaded: Loaded, scale: float) -> PointSource:
     path = loaded.path
     parts, notes = _placed(loaded)
     num_triangles = sum(len(part.surface.triangles) for part in parts)
@@ -58,12 +59,13 @@ def _source(loaded: Loaded) -> PointSource:
         raise InputError(f"{path}: {num_triangles} triangles with an area of {total:g}, {WANTED}")
     if num_flat:
         notes.append(f"{path}: {num_flat} triangles without an area or with NaN coordinates left out")
-    num_points = round(min(total * DENSITY, MAX_POINTS))
+    area = total * scale * scale  # [m^2]
+    num_points = round(min(area * DENSITY, MAX_POINTS))
     if num_points == 0:
-        raise InputError(f"{path}: an area of {total:.2g} square units, too small for points; set --units")
-    if total * DENSITY > MAX_POINTS:
+        raise InputError(f"{path}: an area of {area:.2g} square metres, too small for points; set --units")
+    if area * DENSITY > MAX_POINTS:
         notes.append(
-            f"{path}: {total:.3g} square units of surface, sampled with {num_points / total:.3g} points on "
+            f"{path}: {area:.3g} square metres of surface, sampled with {num_points / area:.3g} points on "
             f"each instead of {DENSITY:.0f}"
         )
     return PointSource(path, Sampling(parts, ends, num_points).read, num_points, tuple(notes))

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from . import raw
 from .colors import BRIGHTEST, TYPES_WANTED, in_words, to_bytes
+from .lines import quoted
 from .raw import PLAIN, Format, PointSource, RawCloud, ReadOptions
-from .text import quoted
 
 NPY_MAGIC, ZIP_MAGIC = b"\x93NUMPY", b"PK\x03\x04"
 ZIP_NAME_AT = 30  # [byte] in an archive: the name of its first member

@@ -17,11 +17,12 @@ from . import raw
 from .colors import BRIGHTEST, TYPES_WANTED, in_words, to_bytes
 from .intensity import OPTION, in_gray
 from .labels import in_palette
+from .lines import quoted
 from .lzf import MAX_RATIO, decompress_lzf
 from .pcd_header import WANTED, Field, Header, read_header
+from .point_lines import PointLines
 from .raw import PLAIN, Format, PointSource, RawCloud, ReadOptions
-from .scan_lines import TextLines, mapped
-from .text import quoted
+from .records import read_records, take_records
 
 FIRST_LINES = re.compile(rb"(?:#[^\n]*\n|[ \t\r\n])*(?:# \.PCD|VERSION[ \t]+0?\.\d)")
 PADDING = "_"
@@ -104,7 +105,7 @@ def _check_size(header: Header) -> None:
 def _read_ascii(header: Header, fields: tuple[Field, ...]) -> Iterator[Any]:
     targets = np.full(header.num_columns, -1)
     targets[[field.column for field in fields]] = np.arange(len(fields))
-    lines = TextLines(header.path, mapped(header.path), WANTED, header.size, header.num_lines)
+    lines = PointLines(header.path, WANTED, header.size, header.num_lines)
     num_left = header.num_points
     while num_left:
         before = lines.copy()
@@ -146,8 +147,6 @@ def _colors_of_text(
 
 
 def _read_binary(header: Header, fields: tuple[Field, ...]) -> Iterator[Any]:
-    if header.num_points == 0:
-        return
     dtype = np.dtype(
         {
             "names": [field.name for field in fields],
@@ -156,23 +155,27 @@ def _read_binary(header: Header, fields: tuple[Field, ...]) -> Iterator[Any]:
             "itemsize": header.row_size,
         }
     )
-    shape = (header.num_points,)
-    table = np.memmap(header.path, dtype=dtype, mode="r", offset=header.size, shape=shape)
-    yield from _in_chunks(header, fields, [table[field.name] for field in fields])
+    num_before = 0
+    for records in read_records(header.path, header.size, header.num_points, dtype):
+        yield _chunk(header, fields, [records[field.name] for field in fields], num_before)
+        num_before += len(records)
 
 
 def _read_compressed(header: Header, fields: tuple[Field, ...]) -> Iterator[Any]:
-    data = mapped(header.path)[header.size :]
-    packed_size, size = (int(value) for value in data[:8].view("<u4"))
     kept = [field for field in header.fields if field.name != PADDING]  # PCL leaves padding out
     promised = header.num_points * sum(field.size for field in kept)
-    if packed_size > len(data) - 8 or size > MAX_RATIO * packed_size or size != promised:
-        raise InputError(
-            f"{header.path}: {size} bytes packed into {packed_size}, found {len(data) - 8}, wanted "
-            f"{promised} for {header.num_points} points; the file is cut off or broken"
-        )
+    found = header.path.stat().st_size - header.size - 8
+    with header.path.open("rb") as file:
+        file.seek(header.size)
+        packed_size, size = take_records(file, header.path, 2, np.dtype("<u4")).tolist()
+        if packed_size > found or size > MAX_RATIO * packed_size or size != promised:
+            raise InputError(
+                f"{header.path}: {size} bytes packed into {packed_size}, found {found}, wanted "
+                f"{promised} for {header.num_points} points; the file is cut off or broken"
+            )
+        packed = take_records(file, header.path, packed_size, np.dtype(np.uint8))
     table = np.empty(size, dtype=np.uint8)
-    if decompress_lzf(data[8 : 8 + packed_size], table) != size:
+    if decompress_lzf(packed, table) != size:
         raise InputError(f"{header.path}: the compressed data are broken, {WANTED}")
     columns = {}
     begin = 0
@@ -181,27 +184,27 @@ def _read_compressed(header: Header, fields: tuple[Field, ...]) -> Iterator[Any]
         if field in fields:
             columns[field.name] = table[begin:end].view("<" + field.type)
         begin = end
-    yield from _in_chunks(header, fields, [columns[field.name] for field in fields])
-
-
-def _in_chunks(
-    header: Header, fields: tuple[Field, ...], columns: list[NDArray[np.generic]]
-) -> Iterator[Any]:
     for begin in range(0, header.num_points, raw.CHUNK):
-        parts = [column[begin : begin + raw.CHUNK] for column in columns]
-        with np.errstate(invalid="ignore"):  # a NaN of the kind that signals
-            points_world = np.stack(parts[:3], axis=1, dtype=np.float64)
-        if fields[3].name in (INTENSITY, LABEL):
-            yield points_world, parts[3].astype(np.float64)
-            continue
-        if len(fields) == 4:
-            yield RawCloud(points_world, _unpacked(np.ascontiguousarray(parts[3]).view(np.uint32)))
-            continue
-        values = np.stack(parts[3:], axis=1)
-        colors, wrong = to_bytes(values, points_world, BRIGHTEST[fields[3].type])
-        if wrong >= 0:
-            raise InputError(_color_complaint(header, fields, f"point {begin + wrong + 1}", values[wrong]))
-        yield RawCloud(points_world, colors)
+        chunk = slice(begin, begin + raw.CHUNK)
+        yield _chunk(header, fields, [columns[field.name][chunk] for field in fields], begin)
+
+
+def _chunk(
+    header: Header, fields: tuple[Field, ...], columns: list[NDArray[np.generic]], num_before: int
+) -> Any:
+    """Points of the wanted fields' columns, behind `num_before` others; with a colour or what is measured."""
+    with np.errstate(invalid="ignore"):  # a NaN of the kind that signals
+        points_world = np.stack(columns[:3], axis=1, dtype=np.float64)
+    if fields[3].name in (INTENSITY, LABEL):
+        return points_world, columns[3].astype(np.float64)
+    if len(fields) == 4:
+        return RawCloud(points_world, _unpacked(np.ascontiguousarray(columns[3]).view(np.uint32)))
+    values = np.stack(columns[3:], axis=1)
+    colors, wrong = to_bytes(values, points_world, BRIGHTEST[fields[3].type])
+    if wrong >= 0:
+        place = f"point {num_before + wrong + 1}"
+        raise InputError(_color_complaint(header, fields, place, values[wrong]))
+    return RawCloud(points_world, colors)
 
 
 def _unpacked(bits: NDArray[np.uint32]) -> NDArray[np.uint8]:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import InputError
-from .text import quoted
+from .lines import quoted
 
 MAX_HEADER_SIZE = 1 << 16  # [byte]
 MAX_COUNT_DIGITS = 10

@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from ..errors import InputError
+from . import raw
 from .intensity import INTENSITY_NAMES, OPTION, in_gray
 from .labels import LABEL_NAMES, in_palette
-from .lines import LineReader
+from .lines import LineReader, quoted
 from .mesh import open_ply_mesh
-from .raw import CHUNK, PLAIN, Format, Measured, PointSource, RawCloud, ReadOptions
-from .rows import NOT_A_NUMBER, SPACE, TOO_FEW, TOO_MANY
-from .text import quoted
+from .raw import PLAIN, Format, Measured, PointSource, RawCloud, ReadOptions
+from .records import read_records
+from .rows import NOT_A_NUMBER, TOO_FEW, TOO_MANY
 
 MAX_HEADER_SIZE = 1 << 20  # [byte]
 LINE_ENDS = (b"\r\n", b"\n", b"\r")
@@ -79,7 +80,7 @@ def open_ply(path: Path, options: ReadOptions = PLAIN) -> PointSource:
     if _has_faces(header):
         if options.labels:
             raise InputError(f"{path}: found a mesh, wanted points with labels")
-        return open_ply_mesh(path)
+        return open_ply_mesh(path, options)
     vertices = Vertices(header, index, _property_names(header, index, options))
     count = header.counts[index]
     if not header.is_ascii:
@@ -234,33 +235,26 @@ def _rows_of(vertices: Vertices) -> tuple[int, int, np.dtype[np.void]]:
 
 
 def _read_binary(vertices: Vertices) -> Iterator[list[NDArray[np.generic]]]:
-    """Yield the columns of up to CHUNK vertices. Not by a map of the file, which a cut would turn deadly."""
-    path = vertices.header.path
-    offset, count, dtype = _rows_of(vertices)
-    with path.open("rb") as file:
-        file.seek(offset)
-        for begin in range(0, count, CHUNK):
-            rows = np.empty(min(CHUNK, count - begin), dtype)
-            if file.readinto(rows.view(np.uint8).data) < rows.nbytes:
-                raise InputError(f"{path}: became shorter while it was read, wanted a whole file")
-            yield [rows[name] for name in vertices.names]
+    """Yield the columns of up to raw.CHUNK vertices."""
+    for rows in read_records(vertices.header.path, *_rows_of(vertices)):
+        yield [rows[name] for name in vertices.names]
 
 
 def _read_ascii(vertices: Vertices) -> Iterator[list[NDArray[np.generic]]]:
-    """Yield the columns of up to CHUNK vertices."""
+    """Yield the columns of up to raw.CHUNK vertices."""
     header, index = vertices.header, vertices.index
     reader = LineReader(header.path, header.size)
     for element, count in zip(header.elements[:index], header.counts, strict=False):
         passed_over = np.full(len(element.properties), -1)
-        reader.read(SPACE, passed_over, True, np.empty((count, 0)))
+        reader.read(passed_over, True, np.empty((count, 0)))
     properties = [prop.name for prop in vertices.element.properties]
     # a digit and a separator a number; the last line may have no end
     count = _check_size(header, index, reader.offset - 1, 2 * len(properties))
     names = vertices.names
     targets = np.array([names.index(name) if name in names else -1 for name in properties])
-    for begin in range(0, count, CHUNK):
-        rows = np.empty((min(CHUNK, count - begin), len(names)))
-        num_rows, status = reader.read(SPACE, targets, True, rows)
+    for begin in range(0, count, raw.CHUNK):
+        rows = np.empty((min(raw.CHUNK, count - begin), len(names)))
+        num_rows, status = reader.read(targets, True, rows)
         if num_rows < len(rows):
             raise InputError(f"{header.path}: {_complaint(reader, status, len(properties), count)}")
         yield list(rows.T)

@@ -5,10 +5,11 @@ row vectors: [x y z 1]_world = [x y z 1] @ matrix. Then a line x y z intensity r
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +17,9 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from . import raw
 from .intensity import OPTION, in_gray
-from .raw import PLAIN, Format, Measured, PointSource, RawCloud, ReadOptions
-from .scan_lines import TextLines, mapped
-from .text import quoted
+from .lines import quoted
+from .point_lines import PointLines
+from .raw import CUT, PLAIN, Format, PointSource, RawCloud, ReadOptions
 
 NUMBERS_A_LINE = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
 MAX_COUNT_DIGITS = 9
@@ -30,9 +31,8 @@ WANTED = "wanted a PTX file with lines x y z intensity r g b, colours 0-255"
 
 @dataclass(frozen=True)
 class Scan:
-    """Where a scan's points are in the file and in the world."""
+    """How many points a scan has, and where they are in the world."""
 
-    lines: TextLines  # before the first point
     num_points: int  # lines that are there, whether the beam came back or not
     matrix: NDArray[np.float64]  # (4, 4), world from scanner, for row vectors
 
@@ -43,27 +43,29 @@ def open_ptx(path: Path, options: ReadOptions = PLAIN) -> PointSource:
     0 0 0 stands where no beam came back and is left out. A last scan with fewer lines than its header
     promises is read as far as it goes, with a warning; a line without end is then taken for cut off.
     """
-    lines = TextLines(path, mapped(path), WANTED)
+    lines = PointLines(path, WANTED)
     scans: list[Scan] = []
     warnings: list[str] = []
     has_colors = True
     while (header := _take_header(lines)) is not None:
         count, matrix = header
-        begin = lines.copy()
+        end_of_header = lines.num_lines
         if not scans:
-            has_colors = _has_colors(begin.copy(), options)
-        found = lines.skip_points(count)
+            has_colors = _has_colors(lines, options)
+        found = lines.skip(count)
         if found < count:
-            found -= bool(found) and lines.data[-1] not in b"\r\n"
+            found -= bool(found) and not lines.has_line_end
             warnings.append(
-                f"{path}: the header that ends at line {begin.num_lines} promises {count} points, found "
+                f"{path}: the header that ends at line {end_of_header} promises {count} points, found "
                 f"{found}; the file may be cut off"
             )
-        scans.append(Scan(begin, found, matrix))
+        scans.append(Scan(found, matrix))
+    if not scans:
+        raise InputError(f"{path}: no line of numbers, {WANTED}")
     num_points = sum(scan.num_points for scan in scans)
-    read_chunks = in_gray(path, lambda: _read_measured(scans))
+    read_chunks = in_gray(path, partial(_read, path, scans, _take_measured))
     if has_colors:
-        read_chunks = partial(_read_chunks, scans)
+        read_chunks = partial(_read_colored, path, scans)
     return PointSource(path, read_chunks, num_points, tuple(warnings))
 
 
@@ -73,7 +75,7 @@ def has_ptx_magic(head: bytes) -> bool:
     return len(lines) == 3 and None not in map(_numbers, lines, NUMBERS_A_LINE)
 
 
-def _take_header(lines: TextLines) -> tuple[int, NDArray[np.float64]] | None:
+def _take_header(lines: PointLines) -> tuple[int, NDArray[np.float64]] | None:
     """How many points the next scan's header promises, and its matrix; None at the file's end."""
     numbers: list[list[float]] = []
     for num_wanted in NUMBERS_A_LINE:
@@ -108,38 +110,50 @@ def _numbers(line: bytes, num_wanted: int) -> list[float] | None:
     return values if len(values) == num_wanted and all(map(math.isfinite, values)) else None
 
 
-def _has_colors(lines: TextLines, options: ReadOptions) -> bool:
+def _has_colors(lines: PointLines, options: ReadOptions) -> bool:
     """False if the next line is x y z intensity, and that is welcome."""
-    line = lines.take_line() or b""
+    line = lines.next_line() or b""
     if len(line.split()) == NUM_WITH_INTENSITY and not options.intensity_as_gray:
+        number = lines.line_number(0)
         raise InputError(
-            f"{lines.path}: has intensity and no colours, line {lines.num_lines}: {quoted(line)}, {WANTED}; "
-            f"{OPTION}"
+            f"{lines.path}: has intensity and no colours, line {number}: {quoted(line)}, {WANTED}; {OPTION}"
         )
     return len(line.split()) != NUM_WITH_INTENSITY
 
 
-def _read_measured(scans: list[Scan]) -> Iterator[Measured]:
-    for scan in scans:
-        lines = scan.lines.copy()
-        num_left = scan.num_points
-        while num_left:
-            rows = np.empty((min(num_left, raw.CHUNK), NUM_WITH_INTENSITY))
-            rows = rows[: lines.take_rows(np.arange(NUM_WITH_INTENSITY), True, rows)]
-            num_left -= len(rows)
-            rows = rows[np.any(rows[:, :3] != 0.0, axis=1)]
-            yield _in_world(rows[:, :3], scan.matrix), rows[:, 3].copy()
+def _read_colored(path: Path, scans: list[Scan]) -> Iterator[RawCloud]:
+    for points_world, colors in _read(path, scans, _take_colored):
+        yield RawCloud(points_world, colors)
 
 
-def _read_chunks(scans: list[Scan]) -> Iterator[RawCloud]:
+def _take_colored(lines: PointLines, count: int) -> tuple[NDArray[np.float64], NDArray[Any]]:
+    found = lines.take_points(TARGETS, False, np.empty((count, 6)))
+    return found.points_world, found.colors
+
+
+def _take_measured(lines: PointLines, count: int) -> tuple[NDArray[np.float64], NDArray[Any]]:
+    rows = np.empty((count, NUM_WITH_INTENSITY))
+    rows = rows[: lines.take_rows(np.arange(NUM_WITH_INTENSITY), True, rows)]
+    return rows[:, :3], rows[:, 3]
+
+
+def _read(
+    path: Path,
+    scans: list[Scan],
+    take: Callable[[PointLines, int], tuple[NDArray[np.float64], NDArray[Any]]],
+) -> Iterator[tuple[NDArray[np.float64], NDArray[Any]]]:
+    """Yield the points in the world that came back, and what else `take` finds in their lines."""
+    lines = PointLines(path, WANTED)
     for scan in scans:
-        lines = scan.lines.copy()
+        lines.skip(len(NUMBERS_A_LINE))
         num_left = scan.num_points
         while num_left:
-            found = lines.take_points(TARGETS, False, np.empty((min(num_left, raw.CHUNK), 6)))
-            num_left -= len(found.colors)
-            is_return: NDArray[np.bool_] = np.any(found.points_world != 0.0, axis=1)
-            yield RawCloud(_in_world(found.points_world[is_return], scan.matrix), found.colors[is_return])
+            points, values = take(lines, min(num_left, raw.CHUNK))
+            if not len(points):
+                raise InputError(f"{path}: {CUT}")
+            num_left -= len(points)
+            is_return: NDArray[np.bool_] = np.any(points != 0.0, axis=1)
+            yield _in_world(points[is_return], scan.matrix), values[is_return]
 
 
 def _in_world(points: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ..labels import Labels
 
 CHUNK = 1 << 20  # points that a reader hands on at once, at most
+CUT = "the file was cut while it was read, wanted a whole file"
 
 # points (N, 3) in the file's unit, and a number (N,) of each: intensity or label
 Measured = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -21,6 +22,7 @@ class ReadOptions:
 
     intensity_as_gray: bool = False  # take intensity for a gray where a file has no colours
     labels: Labels | None = None  # take the points' labels for their colours
+    scale: float = 1.0  # metres per unit of the file, for what counts by metres; points stay in its unit
 
 
 PLAIN = ReadOptions()

@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from . import raw
 from .intensity import INTENSITY_NAMES, OPTION, in_gray
-from .lines import LineReader
-from .raw import CHUNK, PLAIN, Format, Measured, PointSource, RawCloud, ReadOptions
-from .rows import NOT_A_NUMBER, PARSED, SPACE, TOO_FEW
+from .lines import quoted
+from .point_lines import PointLines
+from .raw import PLAIN, Format, Measured, PointSource, RawCloud, ReadOptions
+from .rows import SPACE
 
 TEXT_SUFFIXES = frozenset({".txt", ".xyz", ".asc", ".csv", ".xyzrgb"})
 COLUMN_NAMES = ("xyzrgb", ("x", "y", "z", "red", "green", "blue"))
@@ -48,46 +50,24 @@ def open_text(path: Path, options: ReadOptions = PLAIN) -> PointSource:
     return PointSource(path, in_gray(path, lambda: _read_measured(path, layout)))
 
 
-def _read_rows(path: Path, layout: Layout) -> Iterator[NDArray[np.float64]]:
-    """Yield the wanted columns (N, C)."""
+def _lines(path: Path, layout: Layout) -> tuple[PointLines, NDArray[np.int64], NDArray[np.float64]]:
+    """The lines of numbers, what their columns are, and room for a chunk."""
     targets = np.full(max(layout.columns) + 1, -1)
     targets[list(layout.columns)] = np.arange(len(layout.columns))
-    reader = LineReader(path, layout.start)
-    num_rows = CHUNK
-    while num_rows == CHUNK:
-        rows = np.empty((CHUNK, len(layout.columns)))
-        num_rows, status = reader.read(layout.separator, targets, False, rows)
-        if status != PARSED:
-            line_number = layout.num_lines + reader.num_lines
-            raise InputError(f"{path}: {_complaint(line_number, reader.line(), status, len(targets))}")
-        yield rows[:num_rows]
+    lines = PointLines(path, WANTED, layout.start, layout.num_lines, layout.separator)
+    return lines, targets, np.empty((raw.CHUNK, len(layout.columns)))
 
 
 def _read_colored(path: Path, layout: Layout) -> Iterator[RawCloud]:
-    num_before = 0
-    for rows in _read_rows(path, layout):
-        _check_colors(path, layout, rows, num_before)
-        num_before += len(rows)
-        yield RawCloud(np.ascontiguousarray(rows[:, :3]), np.rint(rows[:, 3:]).astype(np.uint8))
+    lines, targets, rows = _lines(path, layout)
+    while len((found := lines.take_points(targets, False, rows)).colors):
+        yield found
 
 
 def _read_measured(path: Path, layout: Layout) -> Iterator[Measured]:
-    for rows in _read_rows(path, layout):
-        yield np.ascontiguousarray(rows[:, :3]), rows[:, 3]
-
-
-def quoted(line: bytes) -> str:
-    """The first line of `line`, short and printable, control characters as escapes."""
-    text = line.splitlines()[0] if line else b""
-    return ascii(text[:60].decode("latin-1")) + ("..." if len(text) > 60 else "")
-
-
-def _complaint(line_number: int, line: bytes, status: int, num_wanted: int) -> str:
-    what = {
-        NOT_A_NUMBER: "is not all numbers",
-        TOO_FEW: f"has fewer than {num_wanted} columns",
-    }[status]
-    return f"line {line_number} {what}: {quoted(line)}, {WANTED}"
+    lines, targets, rows = _lines(path, layout)
+    while count := lines.take_rows(targets, False, rows):
+        yield rows[:count, :3].copy(), rows[:count, 3].copy()
 
 
 def _layout(path: Path, head: bytes) -> Layout:
@@ -161,20 +141,6 @@ def _named_columns(header: str) -> tuple[int, ...] | None:
         if all(names.count(name) == 1 for name in wanted):
             return tuple(names.index(name) for name in wanted)
     return None
-
-
-def _check_colors(path: Path, layout: Layout, rows: NDArray[np.float64], num_before: int) -> None:
-    """Refuse a colour outside 0-255 in `rows` (N, 6), naming its line; black out those without a position."""
-    rows[~np.isfinite(rows[:, :3]).all(axis=1), 3:] = 0.0
-    colors = rows[:, 3:]
-    is_wrong = ~((colors >= 0.0) & (colors <= 255.0)).all(axis=1)
-    if not is_wrong.any():
-        return
-    first = int(np.argmax(is_wrong))
-    reader = LineReader(path, layout.start)
-    reader.read(layout.separator, np.empty(0, np.int64), False, np.empty((num_before + first + 1, 0)))
-    found = " ".join(f"{value:g}" for value in colors[first])
-    raise InputError(f"{path}: line {layout.num_lines + reader.num_lines} has the colour {found}, {WANTED}")
 
 
 TEXT = Format("text x y z r g b", TEXT_SUFFIXES, lambda head: False, open_text)

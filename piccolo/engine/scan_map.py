@@ -155,6 +155,8 @@ def prepare_map(
     watch = watch or Stopwatch()
     with watch.stage("read"):
         levelled = level(cloud, up)
+    for warning in levelled.warnings:  # now: a wrong unit makes what follows long
+        workers.warn(warning)
     with watch.stage("prepare"):
         octree = levelled.octree
         centers = candidate_centers(octree, workers)
