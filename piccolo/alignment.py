@@ -28,8 +28,6 @@ from .settings import UpAxis
 
 FORMAT = "piccolo-alignment/1"
 CONVENTION = "x_aligned = T_aligned_from_scan @ (x_scan, 1) in the unit given; z_aligned is up"
-# Of places made from seeds, and of small rooms in the tests, the surest wrong answers reach 0.73
-MIN_CONFIDENCE = 0.75
 SPACING = 0.08  # of the points that are looked at [m]
 NO_CONVENTION = 0.0  # log-odds of z up: a scan that is to be aligned may lie anyhow
 MAX_FILE_SIZE = 1 << 20  # [byte]

@@ -46,6 +46,9 @@ class Localizer(Protocol):
         """Where a panorama was taken."""
 
 
+LABELS_WARNING = "labels: the confidence was learnt on colours, and is a rough guide only"
+
+
 @dataclass(frozen=True)
 class PaperLocalizer:
     """Preset `paper`."""
@@ -243,4 +246,6 @@ def localize_file(
     found = localizer.localize(panorama, workers, watch)
     settings = settings_json(inputs, localizer.settings)
     result = result_of(found, inputs.cloud_name, str(pano), watch.seconds, settings)
-    return replace(result, warnings=localizer.warnings + panorama.warnings), panorama
+    warnings = localizer.warnings + panorama.warnings
+    warnings += (LABELS_WARNING,) if inputs.read_options.labels else ()
+    return replace(result, warnings=warnings), panorama

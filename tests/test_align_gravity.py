@@ -12,7 +12,8 @@ from plyfile import PlyData, PlyElement
 from poses import tilted_poses
 from scans import points_of, scan, write_scan
 
-from piccolo.alignment import FORMAT, MIN_CONFIDENCE, read_alignment
+from piccolo.alignment import FORMAT, read_alignment
+from piccolo.gravity import MIN_CONFIDENCE
 from piccolo.pose import exp_so3
 from piccolo.scenes import Query, read_scene, write_queries
 from tools import align_gravity

@@ -14,11 +14,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from command_line import add_cloud_options, cloud_settings_from, parse
 from exit_codes import complain, guarded
-from piccolo.alignment import MIN_CONFIDENCE, Alignment, Finding, find_alignment, read_alignment
+from piccolo.alignment import Alignment, Finding, find_alignment, read_alignment
 from piccolo.cloud import open_cloud
 from piccolo.cloud.moving import MeasuredStream, measured, write_moved
 from piccolo.errors import InputError
 from piccolo.files import check_output, write_atomically
+from piccolo.gravity import MIN_CONFIDENCE
 from piccolo.scenes import QUERIES_NAME, Scene, read_scene, write_queries
 from piccolo.settings import CloudSettings, check_confidence
 from progress import shown

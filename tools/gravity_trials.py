@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from exit_codes import EXIT_BAD_USAGE, complain, guarded
-from piccolo.alignment import MIN_CONFIDENCE, find_alignment
+from piccolo.alignment import find_alignment
 from piccolo.cloud import open_cloud, stream_of
 from piccolo.cloud.raw import RawCloud
 from piccolo.engine.octree import build_octree
 from piccolo.errors import InputError
+from piccolo.gravity import MIN_CONFIDENCE
 from piccolo.pose import Array, rotation_from_quaternion_wxyz
 from piccolo.settings import check_confidence
 from piccolo.synthetic.buildings import BUILDINGS, make_building

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..cloud.packed import PackedPoints, pack_points
 from ..cloud.voxels import Voxels
-from ..gravity import R_z_from_axis, find_up, rotation_to_z_up
+from ..gravity import MIN_CONFIDENCE, R_z_from_axis, find_up, rotation_to_z_up
 from ..pose import Array, Pose
 from ..settings import UpAxis
 from ..stopwatch import Stopwatch
@@ -21,8 +21,6 @@ from .view import ViewKind, render_block, thread_scratch
 
 WIDE_RINGS = 12
 SEARCH_VIEW = ViewKind(num_rings=SEARCH_RINGS, stats_rings=16, sigma_deg=22.0, voxel_per_range=1 / 15)
-# Upside-down answers reach 0.63 on scans turned at random, right ones begin at 0.68.
-MIN_UP_CONFIDENCE = 0.65
 MIN_TILT = np.radians(5.0)  # a cloud whose up is nearer to its z is taken as it is
 
 
@@ -109,7 +107,7 @@ def level_out(octree: Octree) -> tuple[Array, tuple[str, ...]]:
     """Rotation (3, 3) that turns the cloud's up to +z, identity where it is there already or not known."""
     up = find_up(octree.level(0.08)[:, :3])
     tilt = np.arccos(np.clip(up.direction_world[2], -1.0, 1.0))
-    if up.confidence < MIN_UP_CONFIDENCE or tilt < MIN_TILT:
+    if up.confidence < MIN_CONFIDENCE or tilt < MIN_TILT:
         return np.eye(3), ()
     text = f"the cloud's z is {np.degrees(tilt):.0f} deg off its up direction; levelled by its own planes"
     return rotation_to_z_up(up.direction_world), (text,)

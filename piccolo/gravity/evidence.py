@@ -35,6 +35,7 @@ CLUTTER_WEIGHT = 2.5  # of the logarithm of clutter below to clutter above the m
 MAX_CLUTTER = 1.2  # beyond which that logarithm says no more
 TOPS_WEIGHT = 2.5  # of the logarithm of level tops above a floor to those below a ceiling
 MAX_TOPS = 1.5
+SENSE_SHARE = 0.5  # 0: what tells the senses apart speaks for the axis in full; 1: not at all
 CARRY_WEIGHT = 2.5  # of what stands on all sheets less what hangs below all of them, as a share of both
 
 
@@ -56,15 +57,21 @@ class Evidence:
 
     @property
     def log_odds(self) -> float:
-        """Of the axis pointing up, before any convention."""
+        """Of the axis pointing up, before any convention.
+
+        Clutter and tops tell one sense of an axis from the other. What they say is shared out between the two
+        by SENSE_SHARE, so that shelves along a wall do not make it a floor.
+        """
+        sense = CLUTTER_WEIGHT * np.clip(self.clutter, -MAX_CLUTTER, MAX_CLUTTER)
+        sense += TOPS_WEIGHT * np.clip(self.tops, -MAX_TOPS, MAX_TOPS)
         return float(
             SHEET_WEIGHT * np.log(self.sheets + 0.03)
             - SLANT_WEIGHT * np.log(self.slanted + 0.05)
             - LOOSE_WEIGHT * np.log(self.loose + 0.02)
             - SKEW_WEIGHT * self.skewed
             - EXTENT_WEIGHT * np.log(self.extent + 0.1)
-            + CLUTTER_WEIGHT * np.clip(self.clutter, -MAX_CLUTTER, MAX_CLUTTER)
-            + TOPS_WEIGHT * np.clip(self.tops, -MAX_TOPS, MAX_TOPS)
+            + sense
+            - SENSE_SHARE * np.log(2.0 * np.cosh(sense))
             + CARRY_WEIGHT * self.carried
         )
 

@@ -26,7 +26,12 @@ CLEAR, BLURRED = 1.0, 2.5  # reach of neighbourhoods from which on furniture fad
 DOUBT = 0.05  # odds that it is none of the hypotheses
 OPEN = 0.3  # carried at least by a plane with open space on one side: ground, or the front of a house
 OPEN_RIVAL = 0.2  # size of such a plane across the winner's axis, to its own, from which on they are mixed up
+WIDE_OPEN, WIDE_RIVAL = 0.8, 0.15  # the same where the winner has no open space before it
 OPEN_DOUBT = 0.6  # factor on the confidence
+SLAB = 2.0  # extent along up [m] below which nobody stands in the scan: a front, a table
+SLAB_DOUBT = 0.6  # factor on the confidence
+# Below it up is not relied on. Of places made from seeds the surest wrong answer was 0.76.
+MIN_CONFIDENCE = 0.8
 Z_UP = 1.5  # log-odds of the convention that scans have z up
 
 
@@ -115,6 +120,8 @@ def _verdict(hypotheses: list[Evidence], z_up_log_odds: float, reach: float) -> 
     quality *= np.clip((BLURRED - reach) / (BLURRED - CLEAR), 0.0, 1.0)
     if is_open := _is_open(best, hypotheses):
         quality *= OPEN_DOUBT
+    if is_slab := best.extent < SLAB:
+        quality *= SLAB_DOUBT
     rival = "upside down" if best.axis @ second.axis < -0.9 else "another axis"
     reason = (
         f"{best.explained:.0%} of the points are flat across or along it,"
@@ -124,14 +131,16 @@ def _verdict(hypotheses: list[Evidence], z_up_log_odds: float, reach: float) -> 
     )
     reason += f"; points so sparse that 24 neighbours reach {reach:.1f} m" if reach > CLEAR else ""
     reason += "; ground and the front of a building look alike" if is_open else ""
+    reason += f"; only {best.extent:.1f} m high, maybe a wall" if is_slab else ""
     is_z = z_up_log_odds > 0.0 and best.axis[2] > np.cos(SNAP_ANGLE)
     return Up(np.array([0.0, 0.0, 1.0]) if is_z else best.axis, float(odds[rank[0]] * quality), reason)
 
 
 def _is_open(best: Evidence, hypotheses: list[Evidence]) -> bool:
-    """True if open space lies before two planes of similar size: either may be the ground."""
-    return best.carried > OPEN and any(
-        other.carried > OPEN and other.sheets > OPEN_RIVAL * best.sheets
+    """True if a plane across the best one has open space before it, and so may be the ground."""
+    least, rival = (OPEN, OPEN_RIVAL) if best.carried > OPEN else (WIDE_OPEN, WIDE_RIVAL)
+    return any(
+        other.carried > least and other.sheets > rival * best.sheets
         for other in hypotheses
         if abs(other.axis @ best.axis) < 0.3
     )
