@@ -2,9 +2,7 @@
 """Command line: a coloured scan and 360-degree photos in, camera poses out."""
 
 import argparse
-import os
 import sys
-import traceback
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +17,7 @@ from command_line import (
     read_options_from,
     settings_from,
 )
+from exit_codes import EXIT_BAD_INPUT, complain, guarded, words_of
 from piccolo.errors import InputError
 from piccolo.files import check_output, write_atomically
 from piccolo.jit import KERNEL_FOLDER, is_first_use
@@ -32,8 +31,8 @@ from piccolo.threads import Workers
 from piccolo.verdict import LOCALIZED
 from progress import shown, warned
 
-EXIT_ALL_LOCALIZED, EXIT_SOME_NOT, EXIT_BAD_USAGE, EXIT_BAD_INPUT, EXIT_INTERNAL = range(5)
-EXIT_INTERRUPTED, EXIT_BROKEN_PIPE = 130, 141
+PROGRAM = "localize.py"
+EXIT_ALL_LOCALIZED, EXIT_SOME_NOT = 0, 1
 
 
 @dataclass(frozen=True)
@@ -91,7 +90,7 @@ def results_of(session: Session) -> Iterator[Result | None]:
         try:
             result = session.localize(pano)
         except (OSError, InputError) as error:
-            complain(arguments, error)
+            complain(PROGRAM, arguments.debug, words_of(error), EXIT_BAD_INPUT)
             yield None
             continue
         session.say(result.summary())
@@ -118,36 +117,15 @@ def run(session: Session) -> int:
     return EXIT_SOME_NOT if some_not else EXIT_ALL_LOCALIZED
 
 
-def complain(arguments: argparse.Namespace, error: BaseException, text: str = "") -> None:
-    """One line about an error on stderr, its own words if `text` is empty, and its traceback if --debug."""
-    if arguments.debug:
-        traceback.print_exception(error)
-    tqdm.write(f"localize.py: {text or error}", file=sys.stderr)
-
-
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     arguments = parse(build_parser(), argv)
-    try:
+
+    def check() -> tuple[EngineSettings | PaperSettings, ReadOptions]:
         check_arguments(arguments)
-        settings, read_options = settings_from(arguments), read_options_from(arguments)
-    except InputError as error:
-        complain(arguments, error)
-        return EXIT_BAD_USAGE
-    try:
-        return run(open_session(arguments, settings, read_options))
-    except BrokenPipeError:  # the reader of stdout has gone: say nothing, not even at the flush at exit
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return EXIT_BROKEN_PIPE
-    except (OSError, InputError) as error:
-        complain(arguments, error)
-        return EXIT_BAD_INPUT
-    except KeyboardInterrupt as error:
-        complain(arguments, error, "interrupted")
-        return EXIT_INTERRUPTED
-    except Exception as error:  # the last line of defence: a code and one line for the shell, no traceback
-        complain(arguments, error, f"internal error: {error!r}; --debug shows where")
-        return EXIT_INTERNAL
+        return settings_from(arguments), read_options_from(arguments)
+
+    return guarded(PROGRAM, arguments.debug, lambda: run(open_session(arguments, *check())), check)
 
 
 if __name__ == "__main__":
