@@ -43,7 +43,9 @@ def guarded(
     except InputError as error:
         return complain(program, is_debug, str(error), EXIT_BAD_USAGE)
     try:
-        return action()
+        code = action()
+        sys.stdout.flush()  # here, where a closed pipe is caught
+        return code
     except BrokenPipeError:  # the reader of stdout has gone: say nothing, not even at the flush at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_BROKEN_PIPE

@@ -16,6 +16,8 @@ from .sphere import CONVENTION
 
 QUERIES_NAME = "queries.json"
 CLOUD_NAME = "cloud.ply"
+# what damaged JSON, or JSON of another kind, raises
+DAMAGES = (AttributeError, KeyError, OverflowError, RecursionError, TypeError, ValueError)
 MAX_SKEW = 1e-4  # of what is called a rotation
 
 
@@ -59,17 +61,13 @@ def read_scene(folder: Path, name: str | None = None) -> Scene:
     path = folder if folder.suffix == ".json" else folder / QUERIES_NAME
     try:
         document = json.loads(path.read_text())
-        queries = tuple(_query(path.parent, entry) for entry in document["queries"])
+        queries = tuple(_query(path.parent, k, entry) for k, entry in enumerate(document["queries"]))
         cloud = path.parent / str(document.get("cloud", CLOUD_NAME))
+        if len({query.image for query in queries}) < len(queries):
+            raise ValueError("an image twice")
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}), wanted true poses") from error
-    except (
-        AttributeError,
-        KeyError,
-        RecursionError,
-        TypeError,
-        ValueError,
-    ) as error:  # bad JSON too
+    except DAMAGES as error:
         raise InputError(f"{path}: found {error!r}, wanted a queries.json with true poses") from error
     return Scene(name or path.parent.resolve().name, path.parent, cloud, queries)
 
@@ -84,6 +82,8 @@ def find_scenes(roots: Sequence[Path]) -> list[Scene]:
     """
     scenes: dict[str, Scene] = {}
     for root in roots:
+        if root.is_file() and root.suffix != ".json":
+            raise InputError(f"{root}: found a file, wanted a folder with scenes or a {QUERIES_NAME}")
         folders = [root] if root.is_file() else [p.parent for p in sorted(root.rglob(QUERIES_NAME))]
         if not folders:
             raise InputError(f"{root}: found no {QUERIES_NAME} in or below it, wanted a folder with scenes")
@@ -95,8 +95,14 @@ def find_scenes(roots: Sequence[Path]) -> list[Scene]:
     return [scenes[name] for name in sorted(scenes)]
 
 
-def _query(folder: Path, entry: dict[str, Any]) -> Query:
-    """One entry; ValueError if its numbers are no pose."""
+def _query(folder: Path, number: int, entry: dict[str, Any]) -> Query:
+    """One entry; ValueError if it lacks something, or its numbers are no pose."""
+    fields = ("image", "variant", "R_cam_from_world", "center_world")
+    if not isinstance(entry, dict) or not all(name in entry for name in fields):
+        raise ValueError(f"queries[{number}] without one of {', '.join(fields)}")
+    texts = [entry[name] for name in ("image", "variant", "labels") if entry.get(name) is not None]
+    if not all(isinstance(text, str) and text.isprintable() for text in texts) or len(texts) < 2:
+        raise ValueError(f"queries[{number}] with an image, a variant or labels that are no plain text")
     R_cam_from_world = np.array(entry["R_cam_from_world"], float)
     center_world = np.array(entry["center_world"], float)
     if R_cam_from_world.shape != (3, 3) or center_world.shape != (3,) or not np.isfinite(center_world).all():
@@ -109,6 +115,11 @@ def _query(folder: Path, entry: dict[str, Any]) -> Query:
     return Query(
         folder / str(entry["image"]), str(entry["variant"]), pose, folder / str(labels) if labels else None
     )
+
+
+def _relative(path: Path, folder: Path) -> str:
+    """A path as a folder's files may give it, whatever links lead to either; a link itself stays one."""
+    return Path(os.path.relpath(path.parent.resolve() / path.name, folder.resolve())).as_posix()
 
 
 def write_queries(folder: Path, queries: Iterable[Query], **more: object) -> None:
@@ -124,11 +135,11 @@ def write_queries(folder: Path, queries: Iterable[Query], **more: object) -> Non
 
 def _entry(folder: Path, query: Query) -> dict[str, object]:
     entry: dict[str, object] = {
-        "image": Path(os.path.relpath(query.image, folder)).as_posix(),
+        "image": _relative(query.image, folder),
         "variant": query.variant,
         "R_cam_from_world": query.pose.R_cam_from_world.tolist(),
         "center_world": query.pose.center_world.tolist(),
     }
     if query.labels:
-        entry["labels"] = Path(os.path.relpath(query.labels, folder)).as_posix()
+        entry["labels"] = _relative(query.labels, folder)
     return entry

@@ -99,6 +99,71 @@ def test_other_settings_do_not_go_into_the_same_file(scenes, tmp_path, capsys):
     assert out.read_bytes() == before
 
 
+def test_another_scene_of_the_same_name_does_not_go_into_the_same_file(scenes, tmp_path, capsys):
+    out = tmp_path / "run.jsonl"
+    assert _run(scenes / "room", out) == 0
+    other = tmp_path / "room"
+    shutil.copytree(scenes / "room", other)
+    document = json.loads((other / "queries.json").read_text())
+    document["queries"][0]["center_world"][0] += 0.5
+    (other / "queries.json").write_text(json.dumps(document))
+    before = out.read_bytes()
+    assert _run(other, out) == 3
+    assert "made with another true pose or another scene of this name" in capsys.readouterr().err
+    assert out.read_bytes() == before
+
+
+@pytest.mark.parametrize("option", ["--csv", "--markdown", "--errors"])
+def test_no_output_replaces_an_input_or_another_output(scenes, tmp_path, capsys, option):
+    truth = scenes / "room" / "queries.json"
+    before = truth.read_bytes()
+    assert _run(scenes / "room", tmp_path / "run.jsonl", option, str(truth)) == 3
+    assert "found an input as the output" in capsys.readouterr().err
+    assert truth.read_bytes() == before
+    out = tmp_path / "run.jsonl"
+    assert _run(scenes / "room", out, option, str(out)) == 3
+    assert "found the name of two outputs" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_a_split_that_is_not_there_is_told(scenes, tmp_path, capsys):
+    assert _run(scenes, tmp_path / "run.jsonl", "--variants", "nope") == 3
+    assert "--variants: found no nope, wanted some of clean, far" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_closed_pipe_is_no_message(scenes, tmp_path):
+    out = tmp_path / "run.jsonl"
+    assert _run(scenes, out, "--variants", "far") == 0
+    command = f"'{sys.executable}' '{ROOT}/tools/evaluate.py' --compare '{out}' '{out}' | true"
+    command += "; exit ${PIPESTATUS[0]}"
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
+    done = subprocess.run(["bash", "-c", command], env=environment, capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
+def test_a_killed_parent_takes_its_workers_along(scenes, tmp_path):
+    out = tmp_path / "run.jsonl"
+    command = [
+        sys.executable,
+        str(ROOT / "tools" / "evaluate.py"),
+        "--scenes",
+        str(scenes),
+        "--out",
+        str(out),
+    ]
+    slow = ["--preset", "paper", "--translations", "100", "--jobs", "2", "--quiet"]
+    with subprocess.Popen([*command, *slow], start_new_session=True) as process:
+        while not out.exists():
+            time.sleep(0.1)
+        time.sleep(1.0)
+        process.kill()
+    deadline = time.monotonic() + 30.0
+    while _is_alive(process.pid) and time.monotonic() < deadline:
+        time.sleep(0.2)
+    assert not _is_alive(process.pid)
+
+
 def test_what_cannot_be_read_is_told_and_the_rest_done(scenes, tmp_path, capsys):
     root = tmp_path / "scenes"
     shutil.copytree(scenes, root)
@@ -153,6 +218,8 @@ def test_interrupt_ends_all_processes_and_keeps_what_was_done(scenes, tmp_path):
         ["--out", "x"],
         ["--scenes", "x", "--compare", "a", "b"],
         ["--scenes", "x", "--out", "y", "--jobs", "0"],
+        ["--scenes", "x", "--out", "y", "--max-distance", "-1"],
+        ["--compare", "a", "b", "--csv", "c"],
         ["--scenes", "x", "--out", "y", "--translations", "9"],
     ],
 )

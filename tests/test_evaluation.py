@@ -84,6 +84,8 @@ def test_results_find_their_queries_by_path_then_by_name(tmp_path):
     by_name = result("elsewhere/c.jpg", _pose(0.0, 0.0))
     rows = list(match_results(scenes, [by_path, by_name]))
     assert [row.key for row in rows] == [("hall", "images/a.jpg"), ("hall", "images/c.jpg")]
+    with pytest.raises(InputError, match="found a second result of this panorama"):
+        list(match_results(scenes, [by_path, by_path]))
     with pytest.raises(InputError, match=r"a\.jpg: found 2 queries of this name"):
         list(match_results(scenes, [result("a.jpg", None)]))
     with pytest.raises(InputError, match=r"z\.jpg: found a result without a true pose"):
@@ -176,6 +178,9 @@ def test_a_run_is_taken_up_after_its_last_whole_line(tmp_path):
         with pytest.raises(InputError, match="another process is writing"), appending(path, size):
             pass
     assert [row.image for row in read_rows(path)[0]] == ["a.jpg", "b.jpg", "d.jpg"]
+    path.write_text('{"my": "notes"}')
+    with pytest.raises(InputError, match="found a last line that is no row"):
+        read_rows(path)
     path.write_text("{}\n")
     with pytest.raises(InputError, match=r"run\.jsonl: line 1: evaluation: found"):
         read_rows(path)

@@ -226,7 +226,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     arguments = parse(build_parser(), argv)
     if arguments.transform_only:
-        arguments.out = arguments.transform = None
+        arguments.out = arguments.transform = arguments.queries = None
     work = apply if arguments.apply else align
     return guarded(PROGRAM, arguments.debug, lambda: work(arguments), lambda: check_arguments(arguments))
 

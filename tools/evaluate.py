@@ -24,7 +24,7 @@ from piccolo.errors import InputError
 from piccolo.evaluation import pictures, tables
 from piccolo.evaluation.compare import changes, pair_up, side_by_side
 from piccolo.evaluation.row import Row, match_results
-from piccolo.evaluation.run_file import open_run, read_rows
+from piccolo.evaluation.run_file import inputs_of, open_run, read_rows
 from piccolo.evaluation.runner import Plan
 from piccolo.evaluation.statistics import Limits, risk_and_coverage
 from piccolo.files import check_output, write_atomically
@@ -91,8 +91,13 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
 
 def read_results(path: Path, scenes: Sequence[Scene]) -> list[Row]:
     """The rows of a file of localize.py."""
-    lines = [line for line in path.read_text().splitlines() if line.strip()]
-    rows = list(match_results(scenes, [Result.from_json(line) for line in lines]))
+    results = []
+    for number, line in enumerate(path.read_bytes().splitlines(), 1):
+        try:
+            results += [Result.from_json(line.decode())] if line.strip() else []
+        except (InputError, UnicodeDecodeError) as error:
+            raise InputError(f"{path}: line {number}: {error}") from error
+    rows = list(match_results(scenes, results))
     if not rows:
         raise InputError(f"{path}: found no result, wanted JSON lines of localize.py")
     return rows
@@ -122,7 +127,6 @@ def tell(arguments: argparse.Namespace, rows: Sequence[Row], limits: Limits) -> 
     rows = sorted(rows, key=lambda row: row.key)
     text = "\n".join(table.markdown() for table in report(rows, limits))
     name = (arguments.out or arguments.results).stem
-    print(text, end="")
     if arguments.csv:
         write_atomically(arguments.csv, tables.csv_text(rows).encode())
     if arguments.markdown:
@@ -131,11 +135,14 @@ def tell(arguments: argparse.Namespace, rows: Sequence[Row], limits: Limits) -> 
         write_atomically(arguments.errors, pictures.errors_png({name: rows}, limits))
     if arguments.risk:
         write_atomically(arguments.risk, pictures.risk_png(risk_and_coverage(rows, limits)))
+    print(text, end="")
 
 
 def compare(arguments: argparse.Namespace, limits: Limits) -> int:
     """Print two runs side by side."""
     runs = [read_rows(path)[0] for path in arguments.compare]
+    if arguments.variants:
+        runs = [[row for row in rows if row.variant in arguments.variants] for rows in runs]
     pairs = pair_up(*runs)
     first, second = names = tuple(str(path) for path in arguments.compare)
     if not pairs:
@@ -143,21 +150,28 @@ def compare(arguments: argparse.Namespace, limits: Limits) -> int:
     text = side_by_side(pairs, (first, second), limits).markdown()
     for path, rows in zip(names, runs, strict=True):
         text += f"\nonly in {path}: {len(rows) - len(pairs)} queries"
-    print(f"{text}\n\n{changes(pairs, limits).markdown()}", end="")
+    text += f"\n\n{changes(pairs, limits).markdown()}"
+    if arguments.markdown:
+        write_atomically(arguments.markdown, text.encode())
     if arguments.errors:
         both = {first: [p.first for p in pairs], second: [p.second for p in pairs]}
         write_atomically(arguments.errors, pictures.errors_png(both, limits))
+    print(text, end="")
     return 0
 
 
 def evaluate(arguments: argparse.Namespace, plan: Plan) -> int:
     """Do what is asked; returns the exit code."""
     limits = Limits(arguments.max_distance, float(np.radians(arguments.max_angle)))
-    for output in filter(None, (arguments.csv, arguments.markdown, arguments.errors, arguments.risk)):
-        check_output(output, [])
+    scenes = find_scenes(arguments.scenes or [])
+    outputs = [p for p in (arguments.csv, arguments.markdown, arguments.errors, arguments.risk) if p]
+    runs = [path for path in (arguments.out, arguments.results, *(arguments.compare or ())) if path]
+    for output in outputs:
+        check_output(output, [*inputs_of(scenes), *runs])
+        if outputs.count(output) > 1 or output == arguments.out:
+            raise InputError(f"{output}: found the name of two outputs, wanted one each")
     if arguments.compare:
         return compare(arguments, limits)
-    scenes = find_scenes(arguments.scenes)
     num_failed = 0
     if arguments.results:
         rows = read_results(arguments.results, scenes)
@@ -178,6 +192,10 @@ def main(argv: list[str] | None = None) -> int:
     arguments = parse(parser, argv)
     if (arguments.scenes is None) == (arguments.compare is None):
         parser.error("--scenes goes with --out or --results; --compare stands alone")
+    if arguments.compare and (arguments.csv or arguments.risk):
+        parser.error("--csv, --risk: of one run, wanted without --compare")
+    if not (0.0 < arguments.max_distance < np.inf and 0.0 < arguments.max_angle < np.inf):
+        parser.error("--max-distance, --max-angle: wanted numbers above 0")
     if arguments.jobs < 1:
         parser.error(f"--jobs: found {arguments.jobs}, wanted at least 1")
     try:

@@ -124,7 +124,7 @@ def run_experiment(name: str, scenes: Sequence[Scene], arguments: argparse.Names
             found.append((arm, sorted(rows, key=lambda row: row.key)))
     if not found:
         raise InputError(f"{name}: found no query that could be tried, wanted some")
-    num_scenes = len(scenes)
+    num_scenes = len({row.scene for _, rows in found for row in rows})
     title = f"{experiment.title}: {experiment.note}; {num_scenes} scenes"
     text = table(title, found).markdown()
     print(text, flush=True)

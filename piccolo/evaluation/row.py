@@ -77,7 +77,7 @@ class Row:
                 rotation_error=np.inf if angle_deg is None else float(np.radians(angle_deg)),
                 result=Result.from_json(json.dumps(row["result"])),
             )
-        except (KeyError, RecursionError, TypeError, ValueError) as error:  # bad JSON is among them
+        except DAMAGES as error:
             if isinstance(error, InputError):
                 raise
             raise InputError(f"evaluation: found {error!r}, wanted a line of tools/evaluate.py") from error
@@ -107,13 +107,24 @@ def match_results(scenes: Sequence[Scene], results: Sequence[Result]) -> Iterato
     InputError
         A result belongs to no query, or its name to several.
     """
-    queries = [(scene, query) for scene in scenes for query in scene.queries]
-    by_path = {query.image.resolve(): (scene, query) for scene, query in queries}
+    queries = [
+        (scene, query, path)
+        for scene in scenes
+        for query in scene.queries
+        for path in (query.image, query.labels)
+        if path is not None
+    ]
+    by_path = {path.resolve(): (scene, query) for scene, query, path in queries}
+    done: set[tuple[str, str]] = set()
     for result in results:
         found = by_path.get(Path(result.pano).resolve())
-        named = [pair for pair in queries if pair[1].image.name == Path(result.pano).name]
+        named = [(scene, query) for scene, query, path in queries if path.name == Path(result.pano).name]
         if found is None and len(named) != 1:
-            names = sorted(query.image.name for _, query in queries)[:3]
+            names = sorted(path.name for _, _, path in queries)[:3]
             text = f"{len(named)} queries of this name" if named else "a result without a true pose"
             raise InputError(f"{result.pano}: found {text}, wanted one of {names} ...")
-        yield row_of(*(found or named[0]), result, None)
+        row = row_of(*(found or named[0]), result, None)
+        if row.key in done:
+            raise InputError(f"{result.pano}: found a second result of this panorama, wanted one")
+        done.add(row.key)
+        yield row

@@ -10,9 +10,9 @@ from pathlib import Path
 from ..errors import InputError
 from ..files import check_output
 from ..pipeline import Inputs, settings_json
-from ..scenes import Scene
+from ..scenes import QUERIES_NAME, Query, Scene
 from ..threads import Show, unseen
-from .row import Row
+from .row import FORMAT, Row, row_of
 from .runner import Failure, Job, Plan, jobs_of, run
 
 
@@ -26,6 +26,9 @@ def read_rows(path: Path) -> tuple[list[Row], int]:
     """
     content = path.read_bytes()
     size = content.rfind(b"\n") + 1
+    rest = content[size : size + len(ROW_BEGINS)]
+    if rest != ROW_BEGINS[: len(rest)]:
+        raise InputError(f"{path}: found a last line that is no row, wanted a run of tools/evaluate.py")
     rows: dict[tuple[str, str], Row] = {}
     for number, line in enumerate(content[:size].splitlines(), 1):
         try:
@@ -34,6 +37,10 @@ def read_rows(path: Path) -> tuple[list[Row], int]:
             raise InputError(f"{path}: line {number}: {error}") from error
         rows[row.key] = row
     return list(rows.values()), size
+
+
+ROW_BEGINS = f'{{"format": "{FORMAT}"'.encode()
+MAX_DIFFERENCE = 1e-6  # [m], [rad] between errors of the same poses
 
 
 @dataclass(frozen=True)
@@ -59,6 +66,8 @@ class Run:
         InputError
             Another process is writing the file.
         """
+        if not self.jobs:
+            return
         with appending(self.path, self.size) as append:
             for found in run(self.plan, self.jobs, num_processes, show):
                 if isinstance(found, Row):
@@ -85,14 +94,37 @@ def open_run(path: Path, plan: Plan, scenes: Sequence[Scene], variants: Sequence
     InputError
         The file can't be written, holds something else, or rows made with other settings.
     """
-    check_output(path, [])
     rows, size = read_rows(path) if path.exists() else ([], 0)
     inputs = Inputs((), plan.cloud_settings, plan.read_options)
     _check_settings(path, rows, json.loads(json.dumps(settings_json(inputs, plan.settings))))
-    keys = {(scene.name, scene.name_of(query)) for scene in scenes for query in scene.queries}
-    own = tuple(row for row in rows if row.key in keys and (not variants or row.variant in variants))
+    queries = {
+        (scene.name, scene.name_of(query)): (scene, query) for scene in scenes for query in scene.queries
+    }
+    known = {query.variant for _, query in queries.values()}
+    if missing := [variant for variant in variants if variant not in known]:
+        raise InputError(f"--variants: found no {missing[0]}, wanted some of {', '.join(sorted(known))}")
+    for row in rows:
+        if row.key in queries and not _is_of(row, *queries[row.key]):
+            text = "made with another true pose or another scene of this name, wanted another file"
+            raise InputError(f"{path}: found a row of {row.scene}, {row.image} {text}")
+    own = tuple(row for row in rows if row.key in queries and (not variants or row.variant in variants))
     jobs = jobs_of(scenes, {row.key for row in rows}, variants)
+    if jobs:
+        check_output(path, inputs_of(scenes))
     return Run(path, plan, own, tuple(jobs), size)
+
+
+def inputs_of(scenes: Sequence[Scene]) -> list[Path]:
+    """The files of scenes, which no output may replace."""
+    of_all = [path for scene in scenes for path in (scene.folder / QUERIES_NAME, scene.cloud)]
+    return of_all + [query.image for scene in scenes for query in scene.queries]
+
+
+def _is_of(row: Row, scene: Scene, query: Query) -> bool:
+    """True if a row's errors are those of its pose against a query's."""
+    again = row_of(scene, query, row.result, row.is_in_box)
+    pairs = (row.position_error, again.position_error), (row.rotation_error, again.rotation_error)
+    return all(a == b or abs(a - b) < MAX_DIFFERENCE for a, b in pairs)
 
 
 def _check_settings(path: Path, rows: Sequence[Row], settings: dict[str, object]) -> None:

@@ -67,7 +67,7 @@ def run_job(plan: Plan, job: Job, show: Show = unseen) -> Iterator[Row | Failure
     try:
         localizer = open_localizer(inputs, plan.settings, plan.cache, workers, watch)
     except (OSError, InputError) as error:
-        yield Failure(str(error), len(job.queries))
+        yield Failure(f"{scene.name}: {error}", len(job.queries))
         return
     for query in job.queries:
         try:
@@ -143,5 +143,8 @@ def _work(plan: Plan, todo: "Queue[Job]", found: "Queue[Row | Failure | None]") 
         except queue.Empty:
             break
         for value in run_job(plan, job):
+            parent = multiprocessing.parent_process()
+            if parent is None or not parent.is_alive():
+                return  # nobody is left to write it
             put(value)
     put(None)
