@@ -11,7 +11,7 @@ from ..errors import InputError
 from ..pipeline import Localizer
 from ..pose import Array, Pose
 from ..result import Result
-from ..scenes import Query, Scene
+from ..scenes import DAMAGES, Query, Scene
 from ..truth import pose_errors
 
 FORMAT = "piccolo-evaluation/1"
