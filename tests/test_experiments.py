@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -17,7 +18,7 @@ from piccolo.panorama import read_panorama
 from piccolo.pose import Pose, angle_between
 from piccolo.render import visible_points
 from piccolo.sampling import pack_texels
-from piccolo.scenes import read_scene
+from piccolo.scenes import Query, read_scene, write_queries
 from piccolo.settings import EngineSettings, PaperSettings
 from tools import experiments, make_room
 
@@ -71,9 +72,27 @@ def test_what_a_change_leaves_alone(rooms, tmp_path):
     assert (folders[0] / "cloud.ply").read_bytes() == (folders[1] / "cloud.ply").read_bytes()
     upside_down = flipped(scene, folders[2])
     assert upside_down.cloud == scene.cloud
+    assert [upside_down.name_of(q) for q in upside_down.queries] == [scene.name_of(q) for q in scene.queries]
     up_in_camera = upside_down.queries[0].pose.R_cam_from_world @ [0.0, 0.0, 1.0]
     np.testing.assert_allclose(up_in_camera, [0.0, 0.0, -1.0], atol=1e-12)
     assert len(read_cloud(with_share(0.1)(scene, folders[3]).cloud).points) == 4000
+
+
+def test_pictures_beside_the_scene_and_masked_ones_are_flipped_too(rooms, tmp_path):
+    rgba = np.full((64, 128, 4), 200, np.uint8)
+    rgba[:20, :, 3] = 0
+    (tmp_path / "raw").mkdir()
+    cv2.imwrite(str(tmp_path / "raw" / "a.png"), rgba)
+    pose = read_scene(rooms / "000").queries[0].pose
+    (tmp_path / "room").mkdir()
+    write_queries(tmp_path / "room", [Query(tmp_path / "raw" / "a.png", "clean", pose)])
+    (tmp_path / "new").mkdir()
+    changed = flipped(read_scene(tmp_path / "room"), tmp_path / "new")
+    assert changed.name_of(changed.queries[0]) == "../raw/a.png"
+    assert changed.queries[0].image.resolve().is_relative_to(tmp_path / "new")
+    is_valid = read_panorama(changed.queries[0].image).is_valid
+    assert is_valid[:44].all()
+    assert not is_valid[44:].any()
 
 
 def test_too_few_points_are_told(rooms, tmp_path):

@@ -65,17 +65,31 @@ def turned_at_random(scene: Scene, folder: Path) -> Scene:
 
 
 def flipped(scene: Scene, folder: Path) -> Scene:
-    """Every picture taken with the camera upside down: turned by half a turn about the view axis."""
-    (folder / "images").mkdir()
+    """Every picture taken with the camera upside down: turned by half a turn about the view axis.
+
+    They are PNG, under the names that the scene gives them: rows of both find each other.
+    """
+    names = [scene.name_of(query) for query in scene.queries]
+    depth = max(Path(name).parts.count("..") for name in names) if names else 0
+    inner = folder.joinpath(*["in"] * depth)  # so deep that no name leads out of the folder
+    inner.mkdir(parents=True, exist_ok=True)
     queries = []
-    for number, query in enumerate(scene.queries):
-        rgb = read_panorama(query.image).rgb[::-1, ::-1]
-        image = folder / "images" / f"{number}_{query.image.stem}.png"
-        _, png = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
-        write_atomically(image, bytes(png))
+    for name, query in zip(names, scene.queries, strict=True):
+        image = inner / name
+        image.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(image, _upside_down_png(query.image))
         pose = Pose(UPSIDE_DOWN @ query.pose.R_cam_from_world, query.pose.center_world)
         queries.append(Query(image, query.variant, pose))
-    return Scene(scene.name, folder, scene.cloud, tuple(queries))
+    return Scene(scene.name, inner, scene.cloud, tuple(queries))
+
+
+def _upside_down_png(image: Path) -> bytes:
+    """A panorama turned by half a turn, transparent where it shows nothing."""
+    panorama = read_panorama(image)
+    bgra = cv2.cvtColor(panorama.rgb, cv2.COLOR_RGB2BGRA)
+    bgra[..., 3] = np.where(panorama.is_valid, 255, 0)
+    _, png = cv2.imencode(".png", bgra[::-1, ::-1])
+    return bytes(png)
 
 
 def _with_points(scene: Scene, folder: Path, cloud: Cloud, num_points: int) -> Scene:
