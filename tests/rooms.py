@@ -45,8 +45,18 @@ def errors(pose, true_pose):
     return distance, np.degrees(angle_between(pose.R_cam_from_world, true_pose.R_cam_from_world))
 
 
+def local(seed, pose):
+    """A pose of the world near a room's local origin."""
+    return Pose(pose.R_cam_from_world, pose.center_world - room(seed)[1].origin_world)
+
+
+def packed(seed):
+    """A room's points as kernels read them."""
+    cloud = room(seed)[1]
+    return pack_points(cloud.points, cloud.colors)
+
+
 def scene(seed):
     """A room's points as kernels read them, a panorama of it, and its true pose near the local origin."""
-    cloud, taken = room(seed)[1], query(seed)
-    pose = Pose(taken.pose.R_cam_from_world, taken.pose.center_world - cloud.origin_world)
-    return pack_points(cloud.points, cloud.colors), as_panorama(taken.rgb), pose
+    taken = query(seed)
+    return packed(seed), as_panorama(taken.rgb), local(seed, taken.pose)

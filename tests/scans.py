@@ -33,3 +33,13 @@ def write_scan(path, points, dtype="<f4", **options):
 def points_of(path):
     vertex = PlyData.read(path)["vertex"]
     return np.stack([vertex["x"], vertex["y"], vertex["z"]], axis=1).astype(np.float64)
+
+
+def bare_room():
+    """Points (N, 3) of a closed box with nothing in it."""
+    rng, size, faces = np.random.default_rng(7), np.array([5.0, 4.0, 2.6]), []
+    for axis, side in np.ndindex(3, 2):
+        face = rng.uniform(0.0, 1.0, (3000, 3)) * size
+        face[:, axis] = side * size[axis]
+        faces.append(face)
+    return np.concatenate(faces)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 from poses import tilted_poses
-from scans import points_of, scan, write_scan
+from scans import bare_room, points_of, scan, write_scan
 
 from piccolo.alignment import FORMAT, read_alignment
 from piccolo.gravity import MIN_CONFIDENCE
@@ -206,16 +206,6 @@ def test_same_bits_every_run_and_for_every_thread_count(run, tilted, tmp_path):
     assert (done.returncode, done.stderr) == (0, b"")
     for suffix in (".ply", ".json", ".txt"):
         assert outs[0].with_suffix(suffix).read_bytes() == outs[1].with_suffix(suffix).read_bytes()
-
-
-def bare_room():
-    """Points (N, 3) of a closed box with nothing in it."""
-    rng, size, faces = np.random.default_rng(7), np.array([5.0, 4.0, 2.6]), []
-    for axis, side in np.ndindex(3, 2):
-        face = rng.uniform(0.0, 1.0, (3000, 3)) * size
-        face[:, axis] = side * size[axis]
-        faces.append(face)
-    return np.concatenate(faces)
 
 
 def test_nothing_is_written_where_up_is_uncertain(run, tmp_path):

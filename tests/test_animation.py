@@ -1,7 +1,6 @@
 """Descents as they are watched, and the animations of them."""
 
 import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,35 +9,24 @@ import rooms
 
 from piccolo import animation
 from piccolo.animation import shaken, watched_descent, write_animation
-from piccolo.cloud.packed import pack_points
 from piccolo.errors import InputError
-from piccolo.pose import Pose
 from piccolo.refine import refine, sampling_loss_of
 from piccolo.sampling import pack_texels
 from piccolo.settings import DescentSettings
-from piccolo.threads import Workers
 from piccolo.truth import pose_errors
 
-ROOT = Path(__file__).resolve().parents[1]
-WORKERS = Workers(2)
-WIDTH = 256
 SEED = 3
-
-
-def _local(pose):
-    return Pose(pose.R_cam_from_world, pose.center_world - rooms.room(SEED)[1].origin_world)
 
 
 @pytest.fixture(scope="module")
 def points():
-    cloud = rooms.room(SEED)[1]
-    return pack_points(cloud.points, cloud.colors)
+    return rooms.packed(SEED)
 
 
 @pytest.mark.parametrize("solver", ["adam", "lbfgs", "gauss-newton"])
 def test_a_watched_descent_is_the_descent(points, solver):
     query = rooms.query(SEED, "tilt")
-    texels, goal = pack_texels(query.rgb), _local(query.pose)
+    texels, goal = pack_texels(query.rgb), rooms.local(SEED, query.pose)
     start = shaken(goal, 0.15, 4.0, seed=1)
     assert pose_errors(start, goal) == pytest.approx((0.15, np.radians(4.0)))
     how = DescentSettings(solver=solver, num_iterations=40, step_size=0.02)

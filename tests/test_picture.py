@@ -1,7 +1,5 @@
 """Pictures of the cloud from discs: kernel, closing, hiding; poses in files."""
 
-from pathlib import Path
-
 import cv2
 import naive
 import numpy as np
@@ -26,20 +24,14 @@ from piccolo.synthetic.raycast import cast
 from piccolo.threads import Workers
 from tools import render_pose
 
-ROOT = Path(__file__).resolve().parents[1]
 WORKERS = Workers(2)
 WIDTH = 256
 SEED = 3
 
 
-def _local(pose):
-    return Pose(pose.R_cam_from_world, pose.center_world - rooms.room(SEED)[1].origin_world)
-
-
 @pytest.fixture(scope="module")
 def points():
-    cloud = rooms.room(SEED)[1]
-    return pack_points(cloud.points, cloud.colors)
+    return rooms.packed(SEED)
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +45,7 @@ def true_ranges():
 
 @pytest.fixture(scope="module")
 def tilted(points):
-    return picture_at(points, _local(rooms.query(SEED, "tilt").pose), WIDTH, WORKERS)
+    return picture_at(points, rooms.local(SEED, rooms.query(SEED, "tilt").pose), WIDTH, WORKERS)
 
 
 def test_splat_equals_its_twin_over_seam_and_poles():
@@ -98,7 +90,7 @@ def test_the_picture_at_the_true_pose_is_the_photo(points, variant):
         rgb = closed(picture_at(points, pose, WIDTH, WORKERS)).astype(float)
         return np.corrcoef(rgb.ravel(), photo.ravel())[0, 1]
 
-    true_pose = _local(query.pose)
+    true_pose = rooms.local(SEED, query.pose)
     away = step(true_pose, np.array([0.0, 0.0, 0.0, 0.2, -0.2, 0.1]))
     assert correlation(true_pose) > 0.9
     assert correlation(true_pose) > correlation(away) + 0.05
@@ -113,7 +105,7 @@ def test_depth_is_that_of_cast_rays(tilted, true_ranges):
 
 
 def test_holes_are_marked_where_points_are_missing_and_nowhere_else(points, tilted, true_ranges):
-    pose = _local(rooms.query(SEED, "tilt").pose)
+    pose = rooms.local(SEED, rooms.query(SEED, "tilt").pose)
     rays = pixel_rays(WIDTH) @ pose.R_cam_from_world
     surface = pose.center_world + rays * true_ranges[..., None]
     low = points.z.max() - 0.1  # the ceiling: nothing is behind it
@@ -159,7 +151,7 @@ def test_the_rim_beside_a_thing_in_front_is_seen():
 
 
 def test_turning_the_camera_rolls_the_picture_with_the_same_bits_on_any_number_of_threads(points):
-    pose = _local(rooms.query(SEED).pose)
+    pose = rooms.local(SEED, rooms.query(SEED).pose)
     straight = picture_at(points, pose, 128, Workers(1))
     again = picture_at(points, pose, 128, Workers(2))
     np.testing.assert_array_equal(straight.rgb, again.rgb)

@@ -9,23 +9,14 @@ import cv2
 import numpy as np
 import poses
 import pytest
-import rooms
 
 from piccolo import animation
 from piccolo.export.axes import heading_pitch_roll_deg
-from piccolo.pose import Pose, T_world_from_cam
+from piccolo.pose import T_world_from_cam
 from piccolo.scenes import read_scene
-from piccolo.threads import Workers
 from tools import make_room, prepare_map, render_pose
 
 ROOT = Path(__file__).resolve().parents[1]
-WORKERS = Workers(2)
-WIDTH = 256
-SEED = 3
-
-
-def _local(pose):
-    return Pose(pose.R_cam_from_world, pose.center_world - rooms.room(SEED)[1].origin_world)
 
 
 @pytest.fixture(scope="module")
