@@ -3,7 +3,7 @@
 import multiprocessing
 import queue
 import signal
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.queues import Queue
 from pathlib import Path
@@ -98,11 +98,13 @@ def run(plan: Plan, jobs: Sequence[Job], num_processes: int, show: Show = unseen
 
 def _run_in_processes(plan: Plan, jobs: Sequence[Job], num_processes: int) -> Iterator[Row | Failure]:
     context = multiprocessing.get_context("spawn")
-    todo: Queue[Job] = context.Queue()
+    todo: Queue[Job | None] = context.Queue()
     found: Queue[Row | Failure | None] = context.Queue()
     for job in jobs:
         todo.put(job)
     count = min(num_processes, len(jobs))
+    for _ in range(count):
+        todo.put(None)  # no more
     processes = [context.Process(target=_work, args=(plan, todo, found), daemon=True) for _ in range(count)]
     # Ctrl-C reaches every process: the new ones inherit that it is ignored, and this one ends them.
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -134,17 +136,22 @@ def _collect(found: "Queue[Row | Failure | None]", processes: Sequence[Any]) -> 
             yield value
 
 
-def _work(plan: Plan, todo: "Queue[Job]", found: "Queue[Row | Failure | None]") -> None:
-    """One process: take jobs until there are none."""
-    put: Callable[[Row | Failure | None], None] = found.put
-    while True:
+def _work(plan: Plan, todo: "Queue[Job | None]", found: "Queue[Row | Failure | None]") -> None:
+    """One process: take jobs until there are none, or nobody is left to write what comes of them."""
+    while _has_parent():
         try:
             job = todo.get(timeout=PATIENCE)
         except queue.Empty:
-            break
+            continue
+        if job is None:
+            found.put(None)
+            return
         for value in run_job(plan, job):
-            parent = multiprocessing.parent_process()
-            if parent is None or not parent.is_alive():
-                return  # nobody is left to write it
-            put(value)
-    put(None)
+            if not _has_parent():
+                return
+            found.put(value)
+
+
+def _has_parent() -> bool:
+    parent = multiprocessing.parent_process()
+    return parent is not None and parent.is_alive()
