@@ -8,20 +8,22 @@ from typing import Protocol
 import numpy as np
 
 from .cloud import open_cloud
-from .cloud.packed import PackedPoints, pack_points
-from .engine import method as engine
-from .engine.map_file import cached_map, content_key, is_map_file, load_map
-from .engine.scan_map import ScanMap, prepare_map
+from .cloud.settings import IN_METRES, CloudSettings
+from .cloud.soa import LocalCloud, PackedPoints, pack_points
+from .coarse_to_fine import localize as engine
+from .coarse_to_fine.map_file import cached_map, content_key, is_map_file, load_map
+from .coarse_to_fine.scan_map import ScanMap, prepare_map
+from .coarse_to_fine.settings import EngineSettings
+from .confidence.localization import Localization
 from .errors import InputError
+from .geometry.pose import Pose
 from .gravity import R_z_from_axis
-from .loss import FARTHEST
 from .panorama import AS_STORED, Panorama, ReadOptions, read_panorama
-from .paper import method as paper
-from .pose import Array, Pose
-from .result import Localization, Result, result_of
-from .settings import IN_METRES, CloudSettings, EngineSettings, PaperSettings
-from .stopwatch import Stopwatch
-from .threads import Workers
+from .paper import localize as paper
+from .paper.settings import PaperSettings
+from .result import Result, result_of
+from .runtime.stopwatch import Stopwatch
+from .runtime.threads import Workers
 
 
 class Localizer(Protocol):
@@ -163,43 +165,17 @@ def _map_among(paths: Sequence[Path]) -> Path | None:
     return next((path for path in paths if path.is_file() and is_map_file(path)), None)
 
 
-@dataclass(frozen=True)
-class PlacedPoints:
-    """A cloud's points near a local origin, and where that is: x_local = R (x_world - origin_world)."""
-
-    points: PackedPoints
-    R_local_from_world: Array  # (3, 3) turns the axis that --up names, or the map's up, to z; else identity
-    origin_world: Array  # (3,) [m]
-    warnings: tuple[str, ...]
-
-    def from_world(self, pose: Pose) -> Pose:
-        """A pose of the world in the frame of `points`; one too far for float32 is an InputError."""
-        center_world = pose.center_world
-        if not np.abs(center_world - self.origin_world).max() < FARTHEST:
-            text = (
-                f"found a camera at {center_world.tolist()}, wanted one within {FARTHEST:.0e} m of the cloud"
-            )
-            raise InputError(text)
-        R = self.R_local_from_world
-        return Pose(pose.R_cam_from_world @ R.T, R @ (center_world - self.origin_world))
-
-    def to_world(self, pose: Pose) -> Pose:
-        """A pose of the frame of `points` in the world."""
-        R = self.R_local_from_world
-        return Pose(pose.R_cam_from_world @ R, R.T @ pose.center_world + self.origin_world)
-
-
-def open_points(paths: Sequence[Path], settings: CloudSettings, workers: Workers) -> PlacedPoints:
+def open_points(paths: Sequence[Path], settings: CloudSettings, workers: Workers) -> LocalCloud:
     """All points of a cloud's files, or the voxels of the prepared map that stands in place of them."""
     if _map_among(paths):
         scan_map = open_map(paths, settings, CachePolicy(is_used=False), workers, Stopwatch())
-        return PlacedPoints(
+        return LocalCloud(
             scan_map.points, scan_map.R_map_from_world, scan_map.origin_world, scan_map.warnings
         )
     cloud = open_cloud(paths, settings, workers.show).read()
     R_local_from_world = R_z_from_axis(settings.up)
     points = pack_points((cloud.points @ R_local_from_world.T).astype(np.float32), cloud.colors)
-    return PlacedPoints(points, R_local_from_world, cloud.origin_world, cloud.warnings)
+    return LocalCloud(points, R_local_from_world, cloud.origin_world, cloud.warnings)
 
 
 def open_localizer(

@@ -7,32 +7,20 @@ from typing import Any
 import numpy as np
 
 from . import __version__
-from .certainty import Certainty
+from .confidence.alternatives import Hypothesis
+from .confidence.confidence import AMBIGUOUS
+from .confidence.covariance import Certainty
+from .confidence.localization import Localization
+from .confidence.score import Evidence
 from .errors import InputError
-from .hypotheses import Hypothesis
-from .pose import Pose, T_world_from_cam, quaternion_wxyz
-from .sphere import CONVENTION
-from .verdict import AMBIGUOUS, NOT_LOCALIZED
-from .verify import Evidence
+from .geometry.pose import Pose, T_world_from_cam, quaternion_wxyz
+from .geometry.sphere import CONVENTION
 
 FORMAT = "piccolo-pose/2"
 COVARIANCE_CONVENTION = (
     "of (w, d), rotation [rad] about the camera's axes, then translation [m] along the world's: "
     "R_true = exp([w]x) R_cam_from_world, center_true = center_world + d"
 )
-
-
-@dataclass(frozen=True)
-class Localization:
-    """The best pose for one panorama, in world coordinates, and what speaks for it and against it."""
-
-    status: str = NOT_LOCALIZED
-    confidence: float = 0.0
-    pose: Pose | None = None  # None if there was no start, and then all that follows
-    loss: float | None = None
-    evidence: Evidence | None = None
-    rivals: tuple[Hypothesis, ...] = ()  # poses elsewhere, best first
-    certainty: Certainty | None = None
 
 
 @dataclass(frozen=True)

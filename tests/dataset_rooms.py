@@ -11,17 +11,17 @@ from pictures import encoded
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
-from piccolo.cloud.packed import pack_points
-from piccolo.loss import sampling_loss
+from piccolo.cli import convert_dataset
+from piccolo.cloud.soa import pack_points
+from piccolo.geometry.pose import Pose
+from piccolo.geometry.sphere import project
+from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama import read_panorama
-from piccolo.pose import Pose
-from piccolo.render import visible_points
-from piccolo.sampling import pack_texels
-from piccolo.scenes import read_scene
-from piccolo.sphere import project
-from piccolo.synthetic.raycast import cast
-from piccolo.threads import Workers
-from tools import convert_dataset
+from piccolo.panorama.texels import pack_texels
+from piccolo.render.zbuffer import visible_points
+from piccolo.runtime.threads import Workers
+from piccolo.scenes.scene import read_scene
+from piccolo.scenes.synthetic.raycast import cast
 
 SEED = 5
 WIDTH = 256

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from piccolo.engine.tiling import cell_of, make_tiling
+from piccolo.geometry.sphere_grid import cell_of, make_tiling
 
 
 def project(points, R_cam_from_world, center_world, width):

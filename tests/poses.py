@@ -5,10 +5,10 @@ import json
 import cv2
 import numpy as np
 
-from piccolo.pose import Pose, exp_so3
+from piccolo.confidence.score import Evidence
+from piccolo.geometry.pose import Pose, exp_so3
+from piccolo.geometry.sphere import pixel_rays
 from piccolo.result import Result
-from piccolo.sphere import pixel_rays
-from piccolo.verify import Evidence
 
 WIDTH = 512
 SIZE = (WIDTH, WIDTH // 2)

@@ -5,12 +5,12 @@ import functools
 import numpy as np
 
 from piccolo.cloud.model import Cloud
-from piccolo.cloud.order import canonical_order
-from piccolo.cloud.packed import pack_points
+from piccolo.cloud.morton import canonical_order
+from piccolo.cloud.soa import pack_points
+from piccolo.geometry.pose import Pose, angle_between
 from piccolo.panorama import Panorama
-from piccolo.pose import Pose, angle_between
-from piccolo.synthetic.world import make_query, make_world, scan_world
-from piccolo.threads import Workers
+from piccolo.runtime.threads import Workers
+from piccolo.scenes.synthetic.world import make_query, make_world, scan_world
 
 SIZE = (4.5, 3.5, 2.5)
 NUM_POINTS = 60_000

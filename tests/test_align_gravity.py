@@ -12,11 +12,11 @@ from plyfile import PlyData, PlyElement
 from poses import tilted_poses
 from scans import bare_room, points_of, scan, write_scan
 
-from piccolo.alignment import FORMAT, read_alignment
+from piccolo.cli import align_gravity
+from piccolo.geometry.pose import exp_so3
 from piccolo.gravity import MIN_CONFIDENCE
-from piccolo.pose import exp_so3
-from piccolo.scenes import Query, read_scene, write_queries
-from tools import align_gravity
+from piccolo.gravity.alignment import FORMAT, read_alignment
+from piccolo.scenes.scene import Query, read_scene, write_queries
 
 ROOT = Path(__file__).resolve().parents[1]
 TURN = np.array([1.4, 0.6, -0.3])

@@ -1,11 +1,12 @@
 import numpy as np
 import pytest
 from e57_files import ScanToWrite, write
-from test_cloud_order import seeded_cloud
+from test_cloud_morton import seeded_cloud
 
-from piccolo.cloud import e57, open_source, read_cloud
+from piccolo.cloud import open_source, read_cloud
+from piccolo.cloud.readers import e57
 from piccolo.errors import InputError
-from piccolo.pose import exp_so3, quaternion_wxyz
+from piccolo.geometry.pose import exp_so3, quaternion_wxyz
 
 RAW = seeded_cloud(3, num_points=1200)
 R_WORLD = exp_so3(np.array([0.4, -1.1, 2.0]))

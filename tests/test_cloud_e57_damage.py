@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 from refusals import mutated, read_or_refused
 from test_cloud_e57 import BYTES, cartesian, colored, read, scan
 
-from piccolo.cloud import e57_file, open_source
-from piccolo.cloud.e57_images import list_images, read_image
+from piccolo.cloud import open_source
+from piccolo.cloud.readers import e57_file
+from piccolo.cloud.readers.e57_images import list_images, read_image
 from piccolo.errors import InputError
 
 

@@ -5,10 +5,10 @@ import pytest
 from e57_files import ImageToWrite, with_xml, write
 from test_cloud_e57 import CENTER, QUATERNION, R_WORLD, scan
 
-from piccolo.cloud.e57_images import list_images, read_image
+from piccolo.cli import e57_images
+from piccolo.cloud.readers.e57_images import list_images, read_image
 from piccolo.errors import InputError
-from piccolo.pose import quaternion_wxyz
-from tools import e57_images
+from piccolo.geometry.pose import quaternion_wxyz
 
 SPHERE = {"imageWidth": 400, "imageHeight": 200, "pixelWidth": np.pi / 200, "pixelHeight": np.pi / 200}
 SMALL = {"imageWidth": 30, "imageHeight": 20}

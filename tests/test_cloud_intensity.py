@@ -6,20 +6,20 @@ from e57_files import ScanToWrite
 from e57_files import write as write_e57
 from las_files import OFFSETS, las_bytes, laz_bytes
 from plyfile import PlyData, PlyElement
-from test_cloud_order import seeded_cloud, whole
+from test_cloud_morton import seeded_cloud, whole
 
 from piccolo.cloud import open_cloud, read_cloud
-from piccolo.cloud.e57 import open_e57
-from piccolo.cloud.intensity import as_gray, in_gray
-from piccolo.cloud.las import open_las
-from piccolo.cloud.pcd import open_pcd
-from piccolo.cloud.ply import open_ply
-from piccolo.cloud.ptx import open_ptx
-from piccolo.cloud.raw import RawCloud, ReadOptions
-from piccolo.cloud.text import open_text
+from piccolo.cloud.readers.e57 import open_e57
+from piccolo.cloud.readers.intensity import as_gray, in_gray
+from piccolo.cloud.readers.las import open_las
+from piccolo.cloud.readers.pcd import open_pcd
+from piccolo.cloud.readers.ply import open_ply
+from piccolo.cloud.readers.ptx import open_ptx
+from piccolo.cloud.readers.reader import RawCloud, ReadOptions
+from piccolo.cloud.readers.text import open_text
+from piccolo.cloud.settings import CloudSettings
 from piccolo.errors import InputError
-from piccolo.pose import exp_so3
-from piccolo.settings import CloudSettings
+from piccolo.geometry.pose import exp_so3
 
 POINTS = seeded_cloud(1, num_points=3000).points_world
 GRAY = ReadOptions(intensity_as_gray=True)

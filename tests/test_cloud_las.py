@@ -7,10 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from las_files import OFFSETS, SCALES, las_bytes, laz_bytes
 from refusals import mutated, read_or_refused
-from test_cloud_order import seeded_cloud
+from test_cloud_morton import seeded_cloud
 
-from piccolo.cloud import las, open_source, read_cloud
-from piccolo.cloud.raw import RawCloud
+from piccolo.cloud import open_source, read_cloud
+from piccolo.cloud.readers import las
+from piccolo.cloud.readers.reader import RawCloud
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(2, num_points=1200)

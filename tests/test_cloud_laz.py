@@ -6,7 +6,8 @@ from las_files import las_bytes, laz_bytes
 from refusals import read_or_refused
 from test_cloud_las import POINTS_OFFSET, RAW, RECORD_SIZE, assert_read_as_written, patched, read, write
 
-from piccolo.cloud import laz, open_source
+from piccolo.cloud import open_source
+from piccolo.cloud.readers import laz
 from piccolo.errors import InputError
 
 

@@ -7,14 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plyfile import PlyElement
-from test_cloud_order import seeded_cloud, whole
+from test_cloud_morton import seeded_cloud, whole
 from test_cloud_ply import vertices, write
 from test_cloud_text import lines_of
 
-from piccolo.cloud import lines, raw
-from piccolo.cloud.lines import line_blocks
-from piccolo.cloud.ply import open_ply
-from piccolo.cloud.text import open_text
+from piccolo.cloud.readers import lines
+from piccolo.cloud.readers import reader as raw
+from piccolo.cloud.readers.lines import line_blocks
+from piccolo.cloud.readers.ply import open_ply
+from piccolo.cloud.readers.text import open_text
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)

@@ -5,7 +5,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from piccolo.cloud.lzf import BROKEN, MAX_RATIO, decompress_lzf
+from piccolo.cloud.readers.lzf import BROKEN, MAX_RATIO, decompress_lzf
 
 
 def compress(data):

@@ -18,14 +18,15 @@ from meshes import (
 )
 from PIL import Image
 from scipy.spatial.transform import Rotation
-from test_cloud_order import whole
+from test_cloud_morton import whole
 
-from piccolo.cloud import mesh as mesh_module
-from piccolo.cloud import mesh_sampling, open_cloud, read_cloud
-from piccolo.cloud.mesh import open_mesh
-from piccolo.cloud.mesh_sampling import look_up, weights_of
-from piccolo.cloud.ply import open_ply
-from piccolo.settings import CloudSettings
+from piccolo.cloud import open_cloud, read_cloud
+from piccolo.cloud.readers import mesh as mesh_module
+from piccolo.cloud.readers import mesh_sampling
+from piccolo.cloud.readers.mesh import open_mesh
+from piccolo.cloud.readers.mesh_sampling import look_up, weights_of
+from piccolo.cloud.readers.ply import open_ply
+from piccolo.cloud.settings import CloudSettings
 
 
 def test_an_obj_texture_stands_upright(tmp_path):

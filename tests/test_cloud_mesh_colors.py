@@ -16,12 +16,12 @@ from meshes import (
     write_obj,
     write_ply,
 )
-from test_cloud_order import whole
+from test_cloud_morton import whole
 
 from piccolo.cloud import read_cloud
-from piccolo.cloud.mesh import open_mesh
-from piccolo.cloud.mesh_sampling import decoded, encoded
-from piccolo.cloud.ply import open_ply
+from piccolo.cloud.readers.mesh import open_mesh
+from piccolo.cloud.readers.mesh_sampling import decoded, encoded
+from piccolo.cloud.readers.ply import open_ply
 from piccolo.errors import InputError
 
 

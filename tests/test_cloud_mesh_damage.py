@@ -16,11 +16,12 @@ from meshes import (
     write_ply,
 )
 from refusals import read_or_refused
-from test_cloud_order import whole
+from test_cloud_morton import whole
 
-from piccolo.cloud import mesh_texture, open_cloud, read_cloud
-from piccolo.cloud.mesh import open_mesh
-from piccolo.cloud.ply import open_ply
+from piccolo.cloud import open_cloud, read_cloud
+from piccolo.cloud.readers import mesh_texture
+from piccolo.cloud.readers.mesh import open_mesh
+from piccolo.cloud.readers.ply import open_ply
 from piccolo.errors import InputError
 
 

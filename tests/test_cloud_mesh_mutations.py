@@ -10,7 +10,7 @@ from meshes import CORNER_COLORS, SQUARE, Gltf, change, obj_text, textured_gltf,
 from refusals import mutated, read_or_refused
 
 from piccolo.cloud import read_cloud
-from piccolo.cloud.mesh import open_mesh
+from piccolo.cloud.readers.mesh import open_mesh
 
 
 def contents(folder):
@@ -57,7 +57,7 @@ def test_mutated_meshes_raise_nothing_but_input_error(name, data, tmp_path_facto
 def monkeypatch_small():
     """Few points of a mesh that a flipped bit has made huge."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("piccolo.cloud.mesh.MAX_POINTS", 20_000)
+        patch.setattr("piccolo.cloud.readers.mesh.MAX_POINTS", 20_000)
         yield
 
 

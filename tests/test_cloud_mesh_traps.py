@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 from meshes import QUADRANTS, SQUARE, UV_FROM_ABOVE, Gltf, obj_text, png, write_obj
-from test_cloud_order import whole
+from test_cloud_morton import whole
 
-from piccolo.cloud import mesh_gltf, mesh_texture
-from piccolo.cloud.mesh import open_mesh
-from piccolo.cloud.ply import open_ply
+from piccolo.cloud.readers import mesh_gltf, mesh_texture
+from piccolo.cloud.readers.mesh import open_mesh
+from piccolo.cloud.readers.ply import open_ply
 from piccolo.errors import InputError
 
 COLORS = np.array([[10, 0, 40], [250, 0, 40], [250, 250, 40], [0, 250, 40]], np.float64)

@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import mutated, read_or_refused
-from test_cloud_order import seeded_cloud
+from test_cloud_morton import seeded_cloud
 
-from piccolo.cloud import open_source, raw, read_cloud
-from piccolo.engine.map_file import FORMAT, is_map_file, load_map
+from piccolo.cloud import open_source, read_cloud
+from piccolo.cloud.readers import reader as raw
+from piccolo.coarse_to_fine.map_file import FORMAT, is_map_file, load_map
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)

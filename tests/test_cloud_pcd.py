@@ -6,9 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import mutated, read_or_refused
 from test_cloud_lzf import compress
-from test_cloud_order import seeded_cloud
+from test_cloud_morton import seeded_cloud
 
-from piccolo.cloud import lines, open_source, raw, read_cloud, records
+from piccolo.cloud import open_source, read_cloud
+from piccolo.cloud.readers import lines, records
+from piccolo.cloud.readers import reader as raw
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)

@@ -6,12 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 from refusals import mutated, read_or_refused
-from test_cloud_order import same_bits, seeded_cloud, whole
+from test_cloud_morton import same_bits, seeded_cloud, whole
 
 from piccolo.cloud import read_cloud
-from piccolo.cloud.ply import open_ply
+from piccolo.cloud.readers.ply import open_ply
+from piccolo.cloud.settings import CloudSettings
 from piccolo.errors import InputError
-from piccolo.settings import CloudSettings
 
 RAW = seeded_cloud(1, num_points=1200)
 RGB = ("red", "green", "blue")

@@ -5,8 +5,8 @@ import pytest
 from plyfile import PlyData
 
 from piccolo.cloud import open_cloud
-from piccolo.cloud.moving import Box, needs_double
-from piccolo.cloud.ply_writing import vertex_rows, write_ply, writing_ply
+from piccolo.cloud.ply_writer import vertex_rows, write_ply, writing_ply
+from piccolo.cloud.transform import Box, needs_double
 
 
 def _cloud(num_points, dtype):

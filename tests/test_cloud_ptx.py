@@ -5,14 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import mutated, read_or_refused
-from test_cloud_order import seeded_cloud
+from test_cloud_morton import seeded_cloud
 
-from piccolo.cloud import lines as lines_module
-from piccolo.cloud import open_source, raw, read_cloud
-from piccolo.cloud.lines import line_blocks
-from piccolo.cloud.pts import open_pts
-from piccolo.cloud.ptx import open_ptx
-from piccolo.cloud.raw import ReadOptions
+from piccolo.cloud import open_source, read_cloud
+from piccolo.cloud.readers import lines as lines_module
+from piccolo.cloud.readers import reader as raw
+from piccolo.cloud.readers.lines import line_blocks
+from piccolo.cloud.readers.pts import open_pts
+from piccolo.cloud.readers.ptx import open_ptx
+from piccolo.cloud.readers.reader import ReadOptions
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)

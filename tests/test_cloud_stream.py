@@ -8,22 +8,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rooms import as_panorama, errors, query, room
-from test_cloud_order import seeded_cloud
+from test_cloud_morton import seeded_cloud
 
 from piccolo import pipeline
 from piccolo.cloud import CloudStream
-from piccolo.cloud.raw import PointSource, RawCloud
+from piccolo.cloud.readers.reader import PointSource, RawCloud
+from piccolo.cloud.settings import METRES, CloudSettings
 from piccolo.cloud.voxels import Voxels
-from piccolo.engine.map_file import content_key
-from piccolo.engine.method import localize
-from piccolo.engine.scan_map import prepare_map
+from piccolo.coarse_to_fine.localize import localize
+from piccolo.coarse_to_fine.map_file import content_key
+from piccolo.coarse_to_fine.scan_map import prepare_map
+from piccolo.coarse_to_fine.settings import EngineSettings
 from piccolo.errors import InputError
+from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.gravity import rotation_to_z_up
+from piccolo.paper.settings import PaperSettings
 from piccolo.pipeline import CachePolicy, open_map
-from piccolo.pose import Pose, exp_so3
-from piccolo.settings import METRES, CloudSettings, EngineSettings, PaperSettings
-from piccolo.stopwatch import Stopwatch
-from piccolo.threads import Workers
+from piccolo.runtime.stopwatch import Stopwatch
+from piccolo.runtime.threads import Workers
 
 ROOT = Path(__file__).resolve().parents[1]
 TURN = exp_so3(np.array([0.3, -0.7, 1.9]))
@@ -218,7 +220,7 @@ from pathlib import Path
 import numpy as np
 from piccolo import pipeline
 from piccolo.cloud import CloudStream
-from piccolo.cloud.raw import CHUNK, PointSource, RawCloud
+from piccolo.cloud.readers.reader import CHUNK, PointSource, RawCloud
 
 def read_chunks():
     rng = np.random.default_rng(0)
@@ -248,8 +250,8 @@ def test_a_wrong_unit_is_told_before_the_long_work_begins(tmp_path, monkeypatch,
     def begin(*_):
         raise InterruptedError
 
-    monkeypatch.setattr("piccolo.engine.scan_map.candidate_centers", begin)
-    monkeypatch.setattr("piccolo.paper.method.prepare", begin)
+    monkeypatch.setattr("piccolo.coarse_to_fine.scan_map.candidate_centers", begin)
+    monkeypatch.setattr("piccolo.paper.localize.prepare", begin)
     path = tmp_path / "mm.xyz"
     raw = seeded_cloud(1, 1500, size=(6000.0, 5000.0, 2500.0))
     np.savetxt(path, np.hstack([raw.points_world, raw.colors]), fmt="%.3f")

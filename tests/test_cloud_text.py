@@ -4,11 +4,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import mutated, read_or_refused
-from test_cloud_order import same_bits, seeded_cloud, whole
+from test_cloud_morton import same_bits, seeded_cloud, whole
 
 from piccolo.cloud import read_cloud
-from piccolo.cloud.rows import NOT_A_NUMBER, PARSED, TOO_FEW, TOO_MANY, parse_rows
-from piccolo.cloud.text import open_text
+from piccolo.cloud.readers.rows import NOT_A_NUMBER, PARSED, TOO_FEW, TOO_MANY, parse_rows
+from piccolo.cloud.readers.text import open_text
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1)

@@ -6,11 +6,12 @@ import naive
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from test_cloud_order import seeded_cloud
+from test_cloud_morton import seeded_cloud
 from test_cloud_stream import LEVEL, TURN, stream
 
 from piccolo.cloud import voxels
-from piccolo.cloud.raw import RawCloud
+from piccolo.cloud.octree import build_octree
+from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.voxels import (
     COUNT,
     LEAF_SIZE,
@@ -21,7 +22,6 @@ from piccolo.cloud.voxels import (
     move_voxels,
     turned,
 )
-from piccolo.engine.octree import build_octree
 from piccolo.errors import InputError
 
 CORNER = -voxels.PHASE / voxels.QUANTA_PER_METRE

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from rooms import errors, query, room
 
-import localize
-from command_line import build_parser, cloud_settings_from, parse
+from piccolo.cli import localize, prepare_map
+from piccolo.cli.options import build_parser, cloud_settings_from, parse
+from piccolo.cloud.settings import IN_METRES, CloudSettings
+from piccolo.coarse_to_fine.settings import EngineSettings
 from piccolo.panorama import AS_STORED
 from piccolo.pipeline import Inputs
 from piccolo.result import Result
-from piccolo.settings import IN_METRES, CloudSettings, EngineSettings
-from tools import prepare_map
 
 ONE = ["--cloud", "a.ply", "--pano", "b.jpg"]
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from poses import tilted_poses
 
-from piccolo.datasets.checking import AS_GIVEN, Check, Fit, axes_named, axis_turns, readings, spread
-from piccolo.datasets.poses import AXES, DIRECTIONS, pose_of_transform
+from piccolo.scenes.datasets.checking import AS_GIVEN, Check, Fit, axes_named, axis_turns, readings, spread
+from piccolo.scenes.datasets.poses import AXES, DIRECTIONS, pose_of_transform
 
 ORIGIN = np.array([10.0, -4.0, 2.0])
 

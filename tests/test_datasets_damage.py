@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from poses import jpeg
 from refusals import mutated, read_or_refused
 
-from piccolo.datasets import DATASETS
-from piccolo.datasets.model import Request
-from piccolo.datasets.poses import MAX_MATRIX_SIZE
+from piccolo.scenes.datasets import DATASETS
+from piccolo.scenes.datasets.model import Request
+from piccolo.scenes.datasets.poses import MAX_MATRIX_SIZE
 
 T = np.eye(4)[[1, 2, 0, 3]]
 STEM = "camera_00_office_1_frame_equirectangular_domain"

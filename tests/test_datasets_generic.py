@@ -18,8 +18,8 @@ from dataset_rooms import (
 )
 from scipy.spatial.transform import Rotation
 
-from piccolo.scenes import read_scene
-from tools import export_poses
+from piccolo.cli import export_poses
+from piccolo.scenes.scene import read_scene
 
 AXES = {"optical": OPTICAL, "piccolo": FORWARD_LEFT_UP, "opengl": OPENGL}
 COLUMNS = ("image", "tx", "ty", "tz", "qw", "qx", "qy", "qz", "direction", "axes", "variant", "room")

@@ -15,7 +15,7 @@ from dataset_rooms import (
     write_text_cloud,
 )
 
-from piccolo.scenes import read_scene
+from piccolo.scenes.scene import read_scene
 
 
 @pytest.fixture

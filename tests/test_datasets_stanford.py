@@ -19,8 +19,8 @@ from dataset_rooms import (
 )
 from scipy.spatial.transform import Rotation
 
-from piccolo.scenes import find_scenes
-from tools import convert_dataset
+from piccolo.cli import convert_dataset
+from piccolo.scenes.scene import find_scenes
 
 LABELS = ["<UNK>_0_<UNK>_0_0", "chair_1_office_1_1", "wall_1_office_1_1", "clutter_7_office_1_1"]
 CHAIR, WALL, CLUTTER = 9, 3, 13

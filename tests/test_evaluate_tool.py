@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from piccolo.evaluation.run_file import read_rows
-from piccolo.scenes import Query, read_scene, write_queries
-from tools import evaluate, make_room
+from piccolo.cli import evaluate, make_room
+from piccolo.scenes.evaluation.run_file import read_rows
+from piccolo.scenes.scene import Query, read_scene, write_queries
 
 ROOT = Path(__file__).resolve().parents[1]
 QUICK = [

@@ -9,13 +9,19 @@ import pytest
 from poses import result
 
 from piccolo.errors import InputError
-from piccolo.evaluation import pictures, tables
-from piccolo.evaluation.compare import changes, pair_up, side_by_side
-from piccolo.evaluation.row import Row, match_results, row_of
-from piccolo.evaluation.run_file import appending, read_rows
-from piccolo.evaluation.statistics import PAPER_LIMITS, accuracies, quartiles, risk_and_coverage, summarize
-from piccolo.pose import Pose, exp_so3
-from piccolo.scenes import Query, Scene
+from piccolo.geometry.pose import Pose, exp_so3
+from piccolo.scenes.evaluation import pictures, tables
+from piccolo.scenes.evaluation.compare import changes, pair_up, side_by_side
+from piccolo.scenes.evaluation.row import Row, match_results, row_of
+from piccolo.scenes.evaluation.run_file import appending, read_rows
+from piccolo.scenes.evaluation.statistics import (
+    PAPER_LIMITS,
+    accuracies,
+    quartiles,
+    risk_and_coverage,
+    summarize,
+)
+from piccolo.scenes.scene import Query, Scene
 
 TRUE_POSE = Pose(exp_so3(np.array([0.4, 0.1, -2.0])), np.array([10.0, -4.0, 1.5]))
 

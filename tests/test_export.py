@@ -6,8 +6,8 @@ import pytest
 from poses import CENTER, SIZE, WIDTH, jpeg, json_of, lines_of, pixels_and_points, result, tilted_poses
 
 from piccolo.errors import InputError
-from piccolo.export import Options, export
-from piccolo.pose import exp_so3, log_so3
+from piccolo.geometry.pose import exp_so3, log_so3
+from piccolo.scenes.export import Options, export
 
 POSES = tilted_poses(4)
 TOLERANCE = 1e-6  # px

@@ -13,10 +13,10 @@ from refusals import mutated, read_or_refused
 from test_export_tables import rotation
 
 from piccolo.errors import InputError
-from piccolo.export import Options, export
-from piccolo.export.gpano import EMPTY_PACKET, with_pose, without_pose
-from piccolo.export.pictures import SCAN, jpeg_segments, picture_size
 from piccolo.panorama import read_panorama
+from piccolo.scenes.export import Options, export
+from piccolo.scenes.export.gpano import EMPTY_PACKET, with_pose, without_pose
+from piccolo.scenes.export.pictures import SCAN, jpeg_segments, picture_size
 
 ANGLES = (123.25, -10.5, 7.0)
 XMP_MARK = b"http://ns.adobe.com/xap/1.0/\0"

@@ -9,9 +9,9 @@ import pytest
 from poses import json_of, lines_of, result, tilted_poses
 
 from piccolo.errors import InputError
-from piccolo.export import Options, export
-from piccolo.export.axes import heading_pitch_roll_deg
-from piccolo.pose import Pose, exp_so3, rotation_from_quaternion_wxyz
+from piccolo.geometry.camera_axes import heading_pitch_roll_deg
+from piccolo.geometry.pose import Pose, exp_so3, rotation_from_quaternion_wxyz
+from piccolo.scenes.export import Options, export
 
 POSES = tilted_poses(4)
 EYE = np.eye(3)

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from poses import jpeg, lines_of, result, tilted_poses, write_results
 from refusals import mutated, read_or_refused
 
+from piccolo.cli import export_poses
 from piccolo.errors import InputError
-from piccolo.export import FORMATS, read_results, select
-from piccolo.files import check_output_folder, replacing_folder
-from piccolo.scenes import Query, write_queries
-from tools import export_poses
+from piccolo.runtime.atomic import check_output_folder, replacing_folder
+from piccolo.scenes.export import FORMATS, read_results, select
+from piccolo.scenes.scene import Query, write_queries
 
 ROOT = Path(__file__).resolve().parents[1]
 POSES = tilted_poses(5)

@@ -4,11 +4,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rooms import room
 
-from piccolo.engine.octree import build_octree
+from piccolo.cloud.octree import build_octree
 from piccolo.errors import InputError
+from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.gravity import find_up, rotation_to_z_up
-from piccolo.pose import angle_between, exp_so3
-from piccolo.synthetic.buildings import make_building
+from piccolo.scenes.synthetic.buildings import make_building
 
 Z = np.array([0.0, 0.0, 1.0])
 TURNS = [np.array(w) for w in ([0.3, -0.2, 0.9], [1.4, 0.6, -0.3], [-0.7, 2.2, 1.0], [2.9, -0.5, 0.4])]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from piccolo.geometry.pose import exp_so3
 from piccolo.gravity import (
     Plane,
     Surfaces,
@@ -14,7 +15,6 @@ from piccolo.gravity import (
     wall_yaw,
     yaw_turn,
 )
-from piccolo.pose import exp_so3
 
 TURN = exp_so3(np.array([0.7, -1.9, 0.5]))
 UP = TURN[:, 2]

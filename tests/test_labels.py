@@ -9,15 +9,15 @@ from las_files import OFFSETS, las_bytes, laz_bytes
 from pictures import write
 from plyfile import PlyData, PlyElement
 from scipy.spatial.distance import pdist
-from test_cloud_order import seeded_cloud, whole
+from test_cloud_morton import seeded_cloud, whole
 
 from piccolo.cloud import open_cloud, open_source
-from piccolo.cloud.raw import RawCloud, ReadOptions
+from piccolo.cloud.label_colors import NUM_COLORS, Labels, colors_of, palette
+from piccolo.cloud.readers.reader import RawCloud, ReadOptions
+from piccolo.cloud.settings import CloudSettings
 from piccolo.errors import InputError
-from piccolo.labels import NUM_COLORS, Labels, colors_of, palette
 from piccolo.panorama import ReadOptions as PanoramaOptions
 from piccolo.panorama import read_panorama
-from piccolo.settings import CloudSettings
 
 POINTS = seeded_cloud(1, num_points=3000).points_world
 LABELS = np.random.default_rng(2).integers(0, 21, 3000)

@@ -1,104 +1,98 @@
 """The structure of the package, read from its sources."""
 
 import ast
-import re
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "piccolo"
-SCRIPTS = [ROOT / "localize.py", ROOT / "command_line.py"]
 
-# A module may import from the lines above its own, and from its own line only if the line says so.
+# A module imports from its own folder or from one further down this list.
 LAYERS = [
-    {"errors"},
-    {"jit", "threads", "files", "stopwatch", "labels"},
-    {"pose", "settings"},
-    {"sphere", "rotations"},
-    {"panorama", "cloud", "sampling", "pyramid"},
-    {"loss", "render", "gravity", "surfels", "splatting"},
-    {"picture"},
-    {"overlay", "verify", "refine", "synthetic", "truth", "hypotheses", "certainty", "pose_file"},
-    {"verdict", "animation", "loss_surface"},
-    {"result", "scenes"},
-    {"paper", "engine", "export"},
-    {"datasets"},
-    {"pipeline", "alignment"},
-    {"evaluation"},
-    {"experiments"},
-    {"surface_files"},
+    "cli",
+    "scenes.experiments",
+    "scenes.evaluation",
+    "scenes.datasets",
+    "scenes.synthetic",
+    "scenes.export",
+    "scenes",
+    "pipeline",
+    "result",
+    "coarse_to_fine",
+    "paper",
+    "optimize",
+    "gravity",
+    "confidence",
+    "render",
+    "panorama",
+    "cloud",
+    "geometry",
+    "runtime",
+    "errors",
 ]
-# pyramid shrinks panoramas; points are packed as texels are
-SIDEWAYS = {("pyramid", "panorama"), ("cloud", "sampling")}
-LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 
 
-def _modules():
-    return sorted(PACKAGE.rglob("*.py"))
+def _module(path):
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
 
-def _module_name(path):
-    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+MODULES = {_module(path): path for path in sorted(PACKAGE.rglob("*.py"))}
 
 
-def _imported(path):
-    """Names of the package's modules that a file imports."""
-    depth = len(path.relative_to(PACKAGE).parts)
+def _folder(module):
+    """The longest entry of LAYERS that a module belongs to."""
+    name = module.removeprefix("piccolo.")
+    parts = name.split(".")
+    return next(p for p in (".".join(parts[:n]) for n in range(len(parts), 0, -1)) if p in LAYERS)
+
+
+def _imported(module):
+    """The package's modules that one imports."""
+    path = MODULES[module]
+    base = module.split(".") if path.name == "__init__.py" else module.split(".")[:-1]
     for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and node.level == depth:
-            yield from [node.module.split(".")[0]] if node.module else [alias.name for alias in node.names]
+        if isinstance(node, ast.ImportFrom) and node.level:
+            parent = ".".join([*base[: len(base) - node.level + 1], *filter(None, [node.module])])
+            for alias in node.names:
+                name = f"{parent}.{alias.name}"
+                yield name if name in MODULES else parent
 
 
-@pytest.mark.parametrize("path", _modules(), ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_imports_go_up_the_list(path):
-    name = _module_name(path)
-    if name == "__init__":
-        return
-    assert name in LEVEL, f"{name} has no place in the list of layers"
-    for other in _imported(path):
-        if other in ("__version__", name):
-            continue
-        allowed = LEVEL[other] < LEVEL[name] or (name, other) in SIDEWAYS
-        assert allowed, f"{path.name} imports {other}, which is not above it"
+def _graph():
+    return {module: set(_imported(module)) - {"piccolo"} for module in MODULES if module != "piccolo"}
 
 
-@pytest.mark.parametrize("path", [*SCRIPTS, *_modules()], ids=lambda p: str(p.relative_to(ROOT)))
-def test_every_function_but_a_kernel_is_annotated(path):
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.FunctionDef):
-            decorators = {d.id for d in node.decorator_list if isinstance(d, ast.Name)}
-            if not decorators & {"kernel", "scalar"}:
-                assert node.returns is not None, f"{path.name}: {node.name} has no annotations"
+def test_imports_go_down_the_list():
+    for module, imported in _graph().items():
+        for other in imported:
+            above, below = LAYERS.index(_folder(module)), LAYERS.index(_folder(other))
+            assert above <= below, f"{module} imports {other}, which is above it"
 
 
-@pytest.mark.parametrize("path", _modules(), ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_print_and_argparse_stay_in_the_command_lines(path):
-    tree = ast.parse(path.read_text())
-    names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
-    imports = {a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
-    assert "print" not in names
-    assert "argparse" not in imports
+def test_no_modules_import_each_other():
+    try:
+        TopologicalSorter(_graph()).prepare()
+    except CycleError as error:
+        pytest.fail(" -> ".join(error.args[1]))
 
 
-def test_a_test_reaches_every_kernel():
-    """Each is named in the tests, or is used, by any number of steps, by a function that is."""
-    tests = "".join(path.read_text() for path in (ROOT / "tests").glob("*.py"))
-    trees = [ast.parse(path.read_text()) for path in _modules()]
-    functions = [n for tree in trees for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)]
-    uses: dict[str, set[str]] = {}
-    for f in functions:
-        uses.setdefault(f.name, set()).update(n.id for n in ast.walk(f) if isinstance(n, ast.Name))
-    kernels = [f.name for f in functions if {"kernel"} & {getattr(d, "id", "") for d in f.decorator_list}]
-    assert len(kernels) > 20
-    for kernel in kernels:
-        assert any(re.search(rf"\b{name}\b", tests) for name in _users(kernel, uses)), kernel
+def test_every_function_but_a_kernel_is_annotated():
+    for module, path in MODULES.items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef):
+                decorators = {d.id for d in node.decorator_list if isinstance(d, ast.Name)}
+                if not decorators & {"kernel", "scalar"}:
+                    assert node.returns is not None, f"{module}: {node.name} has no annotations"
 
 
-def _users(name, uses):
-    """A function and those that use it, by any number of steps."""
-    users, more = set(), {name}
-    while more - users:
-        users |= more
-        more = {f for f, used in uses.items() if used & users}
-    return users
+def test_only_commands_know_argparse():
+    for module, path in MODULES.items():
+        imports = {
+            a.name
+            for n in ast.walk(ast.parse(path.read_text()))
+            if isinstance(n, ast.Import)
+            for a in n.names
+        }
+        assert "argparse" not in imports or _folder(module) == "cli", module

@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 from rooms import errors, query
 
-import localize
-from piccolo.pose import Pose
+from piccolo.cli import evaluate, localize, make_room, prepare_map
+from piccolo.geometry.pose import Pose
 from piccolo.result import Result
-from tools import evaluate, make_room, prepare_map
 
 ROOT = Path(__file__).resolve().parents[1]
 QUICK = ["--no-cache"]

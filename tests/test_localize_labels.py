@@ -8,17 +8,18 @@ import pytest
 from plyfile import PlyData
 from rooms import errors
 
-import localize
+from piccolo.cli import localize, make_room, prepare_map
+from piccolo.cloud.label_colors import Labels
+from piccolo.cloud.settings import CloudSettings
+from piccolo.coarse_to_fine.settings import EngineSettings
 from piccolo.errors import InputError
-from piccolo.evaluation.runner import Failure, Job, Plan, run_job
-from piccolo.labels import Labels
 from piccolo.panorama import ReadOptions
+from piccolo.paper.settings import PaperSettings
 from piccolo.pipeline import CachePolicy
 from piccolo.result import Result
-from piccolo.scenes import read_scene
-from piccolo.settings import CloudSettings, EngineSettings, PaperSettings
-from piccolo.synthetic.room import KINDS
-from tools import make_room, prepare_map
+from piccolo.scenes.evaluation.runner import Failure, Job, Plan, run_job
+from piccolo.scenes.scene import read_scene
+from piccolo.scenes.synthetic.room import KINDS
 
 PAPER = ["--preset", "paper", "--translations", "30", "--iterations", "60", "--max-points", "30000"]
 

@@ -11,17 +11,18 @@ import poses
 import pytest
 import rooms
 
-from piccolo.cloud.packed import pack_points
-from piccolo.loss import sampling_loss
-from piccolo.loss_surface import LossSurface, PoseGrid, loss_surface
-from piccolo.pose import Pose, angle_between
-from piccolo.render import visible_points
-from piccolo.rotations import uniform_yaws
-from piccolo.sampling import pack_texels
-from piccolo.scenes import read_scene
-from piccolo.threads import Workers
-from tools import loss_surface as tool
-from tools import make_room
+from piccolo.cli import loss_surface as tool
+from piccolo.cli import make_room
+from piccolo.cloud import read_cloud
+from piccolo.cloud.soa import pack_points
+from piccolo.geometry.pose import Pose, angle_between
+from piccolo.geometry.rotations import uniform_yaws
+from piccolo.optimize.loss_surface import LossSurface, PoseGrid, loss_surface
+from piccolo.optimize.sampling_loss import sampling_loss
+from piccolo.panorama.texels import pack_texels
+from piccolo.render.zbuffer import visible_points
+from piccolo.runtime.threads import Workers
+from piccolo.scenes.scene import read_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 STEP = 0.3
@@ -172,8 +173,6 @@ def test_without_a_pose_known_and_through_walls(run, scene, tmp_path):
 def test_a_cloud_with_another_axis_up(run, scene, tmp_path):
     """y up: the plan's axes are the world's x and -z, and world positions stay the world's."""
     cloud = tmp_path / "y up.txt"
-    from piccolo.cloud import read_cloud  # noqa: PLC0415
-
     read = read_cloud(scene / "cloud.ply")
     x, y, z = (read.points + read.origin_world).T
     np.savetxt(cloud, np.column_stack([x, z, -y, read.colors]), fmt="%.4f %.4f %.4f %d %d %d")

@@ -4,8 +4,8 @@ import pytest
 from pictures import encoded, write
 
 from piccolo.errors import InputError
+from piccolo.geometry.sphere import pixel_rays
 from piccolo.panorama import ReadOptions, read_panorama
-from piccolo.sphere import pixel_rays
 
 SIZE = 64
 # forward, right and up of each face's picture, by hand: +x the panorama's centre, +y left, +z up

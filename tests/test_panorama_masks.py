@@ -6,9 +6,9 @@ import pytest
 from pictures import crop_fields, encoded, with_metadata, write, xmp_packet
 
 from piccolo.errors import InputError
+from piccolo.geometry.pose import exp_so3
+from piccolo.geometry.sphere import pixel_rays, solid_angles
 from piccolo.panorama import ReadOptions, read_panorama
-from piccolo.pose import exp_so3
-from piccolo.sphere import pixel_rays, solid_angles
 
 WIDTH, HEIGHT = 1024, 512
 

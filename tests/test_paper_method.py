@@ -7,10 +7,10 @@ import pytest
 from rooms import as_panorama, errors, query, room
 
 from piccolo.errors import InputError
-from piccolo.paper.method import localize, prepare
-from piccolo.settings import PaperSettings
-from piccolo.stopwatch import Stopwatch
-from piccolo.threads import Workers
+from piccolo.paper.localize import localize, prepare
+from piccolo.paper.settings import PaperSettings
+from piccolo.runtime.stopwatch import Stopwatch
+from piccolo.runtime.threads import Workers
 
 GOLDEN = Path(__file__).parent / "golden" / "paper.json"
 QUICK = dataclasses.replace(PaperSettings(), num_translations=30, max_points=30_000, num_iterations=60)

@@ -9,18 +9,18 @@ import pytest
 import rooms
 from rooms import as_panorama, errors, query, room
 
-from piccolo.cloud.packed import pack_points
+from piccolo.cloud.soa import pack_points
 from piccolo.errors import InputError
-from piccolo.paper.method import localize, loss_of, prepare
+from piccolo.geometry.pose import Pose, exp_so3, step
+from piccolo.geometry.sphere import pixel_rays
+from piccolo.optimize.refine import refine
+from piccolo.panorama.resize import shrink
+from piccolo.paper.localize import localize, loss_of, prepare
 from piccolo.paper.photometric import photometric_equations, photometric_loss, pixel_motion, view_gradient
-from piccolo.pose import Pose, exp_so3, step
-from piccolo.pyramid import shrink
-from piccolo.refine import refine
-from piccolo.render import View, render_view
-from piccolo.settings import PaperSettings
-from piccolo.sphere import pixel_rays
-from piccolo.stopwatch import Stopwatch
-from piccolo.threads import Workers
+from piccolo.paper.settings import PaperSettings
+from piccolo.render.zbuffer import View, render_view
+from piccolo.runtime.stopwatch import Stopwatch
+from piccolo.runtime.threads import Workers
 
 HALF_SIZE = np.array([2.5, 2.0, 1.3])
 WIDTH = 128

@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 import rooms
 
+from piccolo.geometry.pose import Pose, are_same, yaw_rotation
+from piccolo.optimize.refine import sampling_loss_of
+from piccolo.panorama.resize import shrink
+from piccolo.panorama.texels import pack_texels
 from piccolo.paper.search import Scored, histogram_distance, keep_diverse, losses_at
-from piccolo.pose import Pose, are_same, yaw_rotation
-from piccolo.pyramid import shrink
-from piccolo.refine import sampling_loss_of
-from piccolo.sampling import pack_texels
 
 AT = np.array([1.0, 2.0, 1.5])
 

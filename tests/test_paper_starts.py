@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from piccolo.cloud.packed import pack_points
+from piccolo.cloud.soa import pack_points
+from piccolo.geometry.pose import angle_between
+from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
 from piccolo.paper.starts import box_grid, free_grid, is_free, spread
-from piccolo.pose import angle_between
-from piccolo.rotations import uniform_rotations, uniform_yaws
 
 
 def _hollow_box(seed=0, count=40_000):

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from piccolo.pose import (
+from piccolo.geometry.pose import (
     Pose,
     T_world_from_cam,
     angle_between,

@@ -5,10 +5,10 @@ import pytest
 import rooms
 from rooms import errors
 
-from piccolo.pose import Pose, step, yaw_rotation
-from piccolo.refine import Adam, Best, descend_lbfgs, refine, sampling_loss_of
-from piccolo.sampling import pack_texels
-from piccolo.settings import PaperSettings
+from piccolo.geometry.pose import Pose, step, yaw_rotation
+from piccolo.optimize.refine import Adam, Best, descend_lbfgs, refine, sampling_loss_of
+from piccolo.panorama.texels import pack_texels
+from piccolo.paper.settings import PaperSettings
 
 PERTURBATION = np.array([0.05, -0.04, 0.12, 0.15, -0.12, 0.08])  # rad, m
 

@@ -10,11 +10,11 @@ import numpy as np
 import poses
 import pytest
 
-from piccolo import animation
-from piccolo.export.axes import heading_pitch_roll_deg
-from piccolo.pose import T_world_from_cam
-from piccolo.scenes import read_scene
-from tools import make_room, prepare_map, render_pose
+from piccolo.cli import make_room, prepare_map, render_pose
+from piccolo.geometry.camera_axes import heading_pitch_roll_deg
+from piccolo.geometry.pose import T_world_from_cam
+from piccolo.optimize import descent_animation as animation
+from piccolo.scenes.scene import read_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -4,12 +4,12 @@ import json
 import numpy as np
 import pytest
 
-from piccolo.certainty import Certainty
+from piccolo.confidence.alternatives import Hypothesis
+from piccolo.confidence.covariance import Certainty
+from piccolo.confidence.score import Evidence
 from piccolo.errors import InputError
-from piccolo.hypotheses import Hypothesis
-from piccolo.pose import Pose, exp_so3
+from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.result import Result
-from piccolo.verify import Evidence
 
 POSE = Pose(exp_so3(np.array([0.3, -0.2, 0.9])), np.array([500_000.123, 4_000_000.456, 12.0]))
 EVIDENCE = Evidence(0.7, 0.5, 0.8, 0.6, 0.7, 0.9, 0.01, 0.002, 0.001)

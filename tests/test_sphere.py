@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from piccolo import sphere
-from piccolo.pose import exp_so3
+from piccolo.geometry import sphere
+from piccolo.geometry.pose import exp_so3
 
 TILTED = exp_so3(np.array([0.4, -1.1, 0.7]))
 CENTER = np.array([0.3, -0.2, 1.5])

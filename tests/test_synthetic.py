@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from rooms import WIDTH, query, room
 
+from piccolo.cli import make_room as tool
 from piccolo.cloud import read_cloud
 from piccolo.errors import InputError
-from piccolo.sphere import pixel_rays
-from piccolo.synthetic.raycast import cast
-from piccolo.synthetic.room import make_room
-from piccolo.synthetic.scan import MIN_CLEARANCE, RANGE_NOISE, free_position
-from piccolo.synthetic.world import VARIANTS, make_query, make_world, scan_world
-from piccolo.threads import Workers
-from tools import make_room as tool
+from piccolo.geometry.sphere import pixel_rays
+from piccolo.runtime.threads import Workers
+from piccolo.scenes.synthetic.raycast import cast
+from piccolo.scenes.synthetic.room import make_room
+from piccolo.scenes.synthetic.scan import MIN_CLEARANCE, RANGE_NOISE, free_position
+from piccolo.scenes.synthetic.world import VARIANTS, make_query, make_world, scan_world
 
 SMALL = np.array([3.0, 3.0, 2.4])
 

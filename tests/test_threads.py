@@ -2,7 +2,7 @@ import threading
 
 import pytest
 
-from piccolo.threads import Workers
+from piccolo.runtime.threads import Workers
 
 
 @pytest.mark.parametrize("num_threads", [1, 3])

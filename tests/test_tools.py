@@ -3,14 +3,20 @@
 import json
 import re
 
+import ablation
+import benchmark
+import benchmark_scaling as growth
+import calibrate_confidence as calibrate
+import evaluate_confidence as trials
+import fuzz_readers
 import numpy as np
 import pytest
 
+from piccolo.cli import make_room
 from piccolo.errors import InputError
-from piccolo.pose import Pose, exp_so3
-from piccolo.scenes import read_scene
-from piccolo.truth import is_correct, pose_errors
-from tools import ablation, benchmark, calibrate, fuzz_readers, growth, make_room, trials
+from piccolo.geometry.pose import Pose, exp_so3
+from piccolo.geometry.pose_error import is_correct, pose_errors
+from piccolo.scenes.scene import read_scene
 
 
 @pytest.fixture(scope="module")

@@ -7,21 +7,23 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import _checkout  # noqa: F401
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from piccolo.cloud import read_cloud
 from piccolo.cloud.model import Cloud
-from piccolo.engine import look, method, scan_map
-from piccolo.engine.contrast import Scale
+from piccolo.coarse_to_fine import localize as method
+from piccolo.coarse_to_fine import query as look
+from piccolo.coarse_to_fine import scan_map
+from piccolo.coarse_to_fine.settings import EngineSettings
 from piccolo.errors import InputError
+from piccolo.geometry.pose_error import is_correct
+from piccolo.geometry.rotations import Gravity
 from piccolo.panorama import read_panorama
-from piccolo.scenes import Scene, read_scene
-from piccolo.settings import EngineSettings, Gravity
-from piccolo.stopwatch import Stopwatch
-from piccolo.threads import Workers, num_cores
-from piccolo.truth import is_correct
+from piccolo.panorama.local_normalization import Scale
+from piccolo.runtime.stopwatch import Stopwatch
+from piccolo.runtime.threads import Workers, num_cores
+from piccolo.scenes.scene import Scene, read_scene
 
 EPILOG = """\
 example:

@@ -8,21 +8,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import _checkout  # noqa: F401
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from piccolo.cloud import read_cloud
-from piccolo.cloud.order import canonical_order
-from piccolo.cloud.packed import PackedPoints, pack_points
+from piccolo.cloud.morton import canonical_order
+from piccolo.cloud.soa import PackedPoints, pack_points
 from piccolo.errors import InputError
-from piccolo.loss import normal_equations, sampling_loss
+from piccolo.geometry.pose import Pose, yaw_rotation
+from piccolo.optimize.sampling_loss import normal_equations, sampling_loss
 from piccolo.panorama import read_panorama
-from piccolo.pose import Pose, yaw_rotation
-from piccolo.sampling import pack_texels
-from piccolo.threads import num_cores
+from piccolo.panorama.texels import pack_texels
+from piccolo.runtime.threads import num_cores
 
 EPILOG = """\
 examples:

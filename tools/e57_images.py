@@ -1,90 +1,11 @@
 #!/usr/bin/env python3
 """List the images inside an E57 file, one JSON object a line, and write them as files if asked."""
 
-import argparse
-import json
-import re
 import sys
-from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import _checkout  # noqa: F401
 
-from exit_codes import EXIT_BAD_INPUT, complain, guarded
-from piccolo.cloud.e57_images import E57Image, list_images, read_image
-from piccolo.errors import InputError
-from piccolo.files import write_atomically
-from piccolo.pose import quaternion_wxyz
-
-EPILOG = """\
-example:
-  python tools/e57_images.py scan.e57 --extract photos
-  python localize.py --cloud scan.e57 --pano photos/scan_0.jpg
-
-is_usable: the image is spherical, as localize.py wants it; fov_deg tells whether it is the full sphere.
-pose: x_world = R_world_from_image @ x_image + center_world, as the file has it.
-exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
-"""
-SUFFIX = {"jpeg": ".jpg", "png": ".png"}
-
-
-def row_of(index: int, image: E57Image) -> dict[str, object]:
-    """What is said of an image."""
-    placement = image.placement
-    return {
-        "index": index,
-        "name": image.name,
-        "kind": image.kind,
-        "is_usable": image.kind == "spherical",
-        "width": image.width,
-        "height": image.height,
-        "fov_deg": image.fov_deg,
-        "encoding": image.encoding,
-        "bytes": image.size,
-        "pose": placement
-        and {
-            "quaternion_wxyz_world_from_image": quaternion_wxyz(placement.R_world_from_local).tolist(),
-            "center_world": placement.center_world.tolist(),
-        },
-        "scan_guid": image.scan_guid or None,
-    }
-
-
-def extract(path: Path, index: int, image: E57Image, folder: Path) -> Path:
-    """Write an image as a file in a folder; returns its path."""
-    stem = re.sub(r"[^\w.-]", "_", path.stem)
-    file = folder / f"{stem}_{index}{SUFFIX[image.encoding]}"
-    write_atomically(file, read_image(path, index))
-    return file
-
-
-def run(arguments: argparse.Namespace) -> int:
-    """List and, if asked, write the images; returns the exit code. A broken one doesn't stop the others."""
-    images = list_images(arguments.e57)
-    exit_code = 0
-    if arguments.extract:
-        arguments.extract.mkdir(exist_ok=True)
-    for index, image in enumerate(images):
-        row = row_of(index, image)
-        if arguments.extract:
-            try:
-                row["file"] = str(extract(arguments.e57, index, image, arguments.extract))
-            except InputError as error:
-                exit_code = complain("e57_images.py", arguments.debug, str(error), EXIT_BAD_INPUT)
-        print(json.dumps(row, allow_nan=False), flush=True)
-    return exit_code
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("e57", type=Path, metavar="FILE", help="an E57 file")
-    parser.add_argument("--extract", type=Path, metavar="FOLDER", help="write the images here")
-    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    arguments = parser.parse_args(argv)
-    return guarded("e57_images.py", arguments.debug, lambda: run(arguments))
-
+from piccolo.cli.e57_images import main
 
 if __name__ == "__main__":
     sys.exit(main())

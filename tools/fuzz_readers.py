@@ -9,17 +9,16 @@ from collections.abc import Callable
 from pathlib import Path
 from types import FunctionType
 
+import _checkout  # noqa: F401
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from piccolo.cloud import FORMATS
-from piccolo.cloud.raw import PLAIN, Format
-from piccolo.engine.map_file import load_map
+from piccolo.cloud.readers.reader import PLAIN, Format
+from piccolo.coarse_to_fine.map_file import load_map
 from piccolo.errors import InputError
 from piccolo.panorama import read_panorama
 from piccolo.result import Result
-from piccolo.scenes import read_scene
+from piccolo.scenes.scene import read_scene
 
 EPILOG = """\
 examples:

@@ -4,20 +4,20 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import InputError
-from ..settings import IN_METRES, CloudSettings
-from ..threads import Show, unseen
-from .e57 import E57
-from .las import LAS
-from .mesh import MESH
+from ..runtime.threads import Show, unseen
 from .model import Cloud
-from .npz import NPY, NPZ
-from .pcd import PCD
-from .ply import PLY
-from .pts import PTS
-from .ptx import PTX
-from .raw import HEAD_SIZE, PLAIN, Format, PointSource, ReadOptions
+from .readers.e57 import E57
+from .readers.las import LAS
+from .readers.mesh import MESH
+from .readers.npz import NPY, NPZ
+from .readers.pcd import PCD
+from .readers.ply import PLY
+from .readers.pts import PTS
+from .readers.ptx import PTX
+from .readers.reader import HEAD_SIZE, PLAIN, Format, PointSource, ReadOptions
+from .readers.text import TEXT
+from .settings import IN_METRES, CloudSettings
 from .stream import CloudStream, stream_of
-from .text import TEXT
 
 __all__ = ["Cloud", "CloudStream", "open_cloud", "read_cloud", "stream_of"]
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .ply import Header, Vertices, read_columns, read_header, vertex_index
-from .ply_writing import Rows
-from .raw import CHUNK, HEAD_SIZE
+from .ply_writer import Rows
+from .readers.ply import Header, Vertices, read_columns, read_header, vertex_index
+from .readers.reader import CHUNK, HEAD_SIZE
 
 BLOCK = 1 << 22  # [byte] copied at once
 

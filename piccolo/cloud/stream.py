@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..threads import Show, unseen
-from .clean import Census, Chunk, unit_warnings
+from ..runtime.threads import Show, unseen
 from .model import Cloud
-from .order import canonical_order
-from .raw import CHUNK, PointSource, RawCloud
+from .morton import canonical_order
+from .readers.reader import CHUNK, PointSource, RawCloud
+from .validation import Census, Chunk, unit_warnings
 from .voxels import Voxels, VoxelTable, turned
 
 

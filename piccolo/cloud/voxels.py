@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..jit import kernel, scalar
-from .order import NUM_CELLS, morton_codes
+from ..runtime.jit import kernel, scalar
+from .morton import NUM_CELLS, morton_codes
 
 LEAF_SIZE = 0.02  # [m]
 QUANTUM_BITS = 8  # a voxel is 256 quanta wide: positions are summed in steps of 78 um

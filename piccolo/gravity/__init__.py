@@ -1,9 +1,9 @@
 """Which way is up in a cloud, which planes it has, and along which directions its walls stand."""
 
+from .manhattan import wall_yaw, yaw_turn
+from .normals import Surfaces, surfaces_of
 from .planes import Plane, find_planes, name_planes, refine_up
-from .surfaces import Surfaces, surfaces_of
 from .up import MIN_CONFIDENCE, R_z_from_axis, Up, find_up, named_axis, rotation_to_z_up, up_of
-from .yaw import wall_yaw, yaw_turn
 
 __all__ = [
     "MIN_CONFIDENCE",

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..pose import Array
-from .surfaces import Surfaces, cosines_to
+from ..geometry.pose import Array
+from .normals import Surfaces, cosines_to
 
 MIN_POINTS = 300
 NUM_CELLS = 4000  # of the sphere of directions, about 3 deg wide

@@ -6,8 +6,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..pose import Array
-from .surfaces import Surfaces, cosines_to
+from ..geometry.pose import Array
+from .normals import Surfaces, cosines_to
 
 Kind = Literal["floor", "ceiling", "level", "wall", "slanted"]
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..pose import Array
-from ..settings import UpAxis
+from ..cloud.settings import UpAxis
+from ..geometry.pose import Array
 from .axes import MIN_POINTS, candidate_axes
-from .evidence import Evidence, evidence_for
-from .surfaces import Surfaces, surfaces_of
+from .normals import Surfaces, surfaces_of
+from .up_features import Evidence, evidence_for
 
 PRIOR_ANGLE = np.radians(10.0)  # of +z to a direction that the convention speaks for
 SNAP_ANGLE = np.radians(0.2)  # of +z to a direction that is called +z itself

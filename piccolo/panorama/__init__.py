@@ -6,16 +6,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cloud.label_colors import Labels
 from ..errors import InputError
-from ..labels import Labels
+from .auto_mask import black_borders, polar_disc
+from .crop import ASPECT_TOLERANCE, full_size, place, region_of_fov
 from .cube_files import cube_of_cells, read_cube_folder
 from .fisheye import is_dual_fisheye
 from .gpano import Region, attitude, crop_region, gpano_fields, projection, rotation_to_level
 from .masks import find_mask, mask_cap, read_mask
 from .model import GPano, Panorama, ReadOptions
-from .patches import black_borders, polar_disc
 from .picture import Picture, read_labels, read_picture
-from .placing import ASPECT_TOLERANCE, full_size, place, region_of_fov
 
 __all__ = ["AS_STORED", "GPano", "Panorama", "ReadOptions", "read_panorama", "rotation_to_level"]
 

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..sphere import pixel_rays
-from .placing import Pixels
+from ..geometry.sphere import pixel_rays
+from .crop import Pixels
 
 CHUNK = 16384  # directions at a time: cv2.remap takes fewer than 32767 rows
 BAND = 32  # rows at a time

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..pose import Array
+from ..geometry.pose import Array
 from .model import GPano
 
 NAMESPACE = rb"http://ns\.google\.com/photos/1\.0/panorama/"

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cloud.label_colors import Labels
 from ..errors import InputError
-from ..labels import Labels
 
 FACE_LETTERS = "rludfb"  # right, left, up, down, front, back
 

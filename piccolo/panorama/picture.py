@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cloud.label_colors import Labels, colors_of
 from ..errors import InputError
-from ..labels import Labels, colors_of
 from . import jpeg, png, tiff, webp
 from .header import WANTED, Header
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from ..sphere import solid_angles
+from ..geometry.sphere import solid_angles
 
 
 def color_histogram(rgb: NDArray[np.float32], counts: NDArray[np.bool_], bins: int) -> NDArray[np.float64]:

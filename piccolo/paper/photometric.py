@@ -13,12 +13,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cloud.packed import PackedPoints
+from ..cloud.soa import PackedPoints
+from ..geometry.pose import Pose
+from ..geometry.sphere import pixel_rays, ray_jacobian
+from ..optimize.refine import Equations, Loss
 from ..panorama import Panorama
-from ..pose import Pose
-from ..refine import Equations, Loss
-from ..render import View, render_view
-from ..sphere import pixel_rays, ray_jacobian
+from ..render.zbuffer import View, render_view
 
 Image = NDArray[np.float32]
 

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cloud.packed import PackedPoints
+from ..cloud.soa import PackedPoints
+from ..geometry.pose import Array, Pose, are_same
+from ..optimize.refine import Loss
 from ..panorama import Panorama
-from ..pose import Array, Pose, are_same
-from ..pyramid import shrink
-from ..refine import Loss
-from ..render import render_view, visible_points
-from ..settings import PaperSettings
-from ..threads import Workers
+from ..panorama.resize import shrink
+from ..render.zbuffer import render_view, visible_points
+from ..runtime.threads import Workers
 from .histogram import color_histogram, histogram_intersection
+from .settings import PaperSettings
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cloud.packed import PackedPoints
-from ..pose import Array, Pose
-from ..render import nearest_depth
-from ..sphere import solid_angles
+from ..cloud.soa import PackedPoints
+from ..geometry.pose import Array, Pose
+from ..geometry.sphere import solid_angles
+from ..render.zbuffer import nearest_depth
 
 MIN_CLEARANCE = 0.25  # a camera is not nearer to a surface than this [m]
 MIN_SEEN_SHARE = 0.4  # and sees points over at least this share of the sphere: it is inside the scan

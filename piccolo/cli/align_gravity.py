@@ -1,0 +1,229 @@
+"""Turn a coloured scan so that z is up: find up from its planes, write the cloud and the 4 x 4 transform."""
+
+import argparse
+import json
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from ..cloud import open_cloud
+from ..cloud.settings import CloudSettings
+from ..cloud.transform import MeasuredStream, measured, write_moved
+from ..confidence.confidence import check_confidence
+from ..errors import InputError
+from ..gravity import MIN_CONFIDENCE
+from ..gravity.alignment import Alignment, Finding, find_alignment, read_alignment
+from ..runtime.atomic import check_output, write_atomically
+from ..scenes.scene import QUERIES_NAME, Scene, read_scene, write_queries
+from .errors import complain, guarded
+from .options import add_cloud_options, cloud_settings_from, parse
+from .progress import shown
+
+PROGRAM = "align_gravity.py"
+EXIT_ALIGNED, EXIT_UNCERTAIN = 0, 1
+EPILOG = f"""\
+examples:
+  python tools/align_gravity.py --cloud scan.ply --out aligned.ply
+  python tools/align_gravity.py --cloud scan.e57 --out aligned.ply --yaw-walls
+  python tools/align_gravity.py --cloud a.las b.las --units us-ft --out aligned.ply --transform T.json
+  python tools/align_gravity.py --cloud room/cloud.ply --queries room/queries.json --out aligned/cloud.ply
+  python tools/align_gravity.py --cloud scan.ply | jq .planes
+  python tools/align_gravity.py --cloud other.ply --apply aligned.json --out other_aligned.ply
+  python tools/align_gravity.py --cloud aligned.ply --apply aligned.json --inverse --out as_scanned.ply
+
+Writes the cloud as binary PLY in the unit of the scan, and beside it the transform: aligned.json, and
+aligned.txt with four rows of four numbers, as CloudCompare reads them. The turn is about the middle of the
+cloud in whole metres, so map coordinates stay near theirs. One PLY file keeps its other properties and its
+faces, its normals are turned; other formats and several files become x y z and red green blue.
+One JSON object on stdout: status, up, yaw, planes, transform. Without --out nothing else is written.
+Nothing is written either where the confidence is below --min-confidence (default {MIN_CONFIDENCE}): a room
+without furniture may be upside down, steep roofs and stairs mislead. --up says what you know.
+exit codes: 0 done, 1 not sure enough, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """All options."""
+    parser = argparse.ArgumentParser(
+        PROGRAM, description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add_cloud_options(parser, "coloured scan, as for localize.py")
+    files = parser.add_argument_group("files")
+    files.add_argument("--out", type=Path, metavar="FILE", help="the turned cloud, a PLY file")
+    text = "of the transform (default --out's name with .json); .txt is written beside it"
+    files.add_argument("--transform", type=Path, metavar="FILE.json", help=text)
+    text = "true poses in the scan, which are turned with it and written beside --out"
+    files.add_argument("--queries", type=Path, metavar="queries.json", help=text)
+    text = "write no file, whatever else is given; report on stdout"
+    files.add_argument("--transform-only", action="store_true", help=text)
+    group = parser.add_argument_group("method")
+    text = "turn about z too, the least that puts the dominant walls along x and y"
+    group.add_argument("--yaw-walls", action="store_true", help=text)
+    text = f"below it nothing is written (default {MIN_CONFIDENCE})"
+    group.add_argument("--min-confidence", type=float, metavar="X", help=text)
+    text = "a transform to apply, in place of finding one"
+    group.add_argument("--apply", type=Path, metavar="T.json", help=text)
+    group.add_argument("--inverse", action="store_true", help="of the one applied")
+    run = parser.add_argument_group("run")
+    run.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
+    run.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    return parser
+
+
+def check_arguments(arguments: argparse.Namespace) -> None:
+    """Refuse options that do not go together, and values that no file could make right."""
+    cloud_settings_from(arguments)
+    if arguments.min_confidence is not None:
+        check_confidence(arguments.min_confidence)
+    if arguments.inverse and not arguments.apply:
+        raise InputError("--inverse: found no --apply, wanted a transform to apply")
+    finding = {"--yaw-walls": arguments.yaw_walls, "--min-confidence": arguments.min_confidence is not None,
+               "--up": arguments.up != "auto", "--transform-only": arguments.transform_only}  # fmt: skip
+    if arguments.apply and (wrong := [option for option, is_given in finding.items() if is_given]):
+        raise InputError(f"{wrong[0]}: found with --apply, which finds nothing, wanted one of them")
+    for option in ("apply", "queries"):
+        if getattr(arguments, option) and not arguments.out:
+            raise InputError(f"--{option}: found no --out, wanted a file to write")
+    for path in filter(None, (arguments.out, arguments.transform)):
+        if (path.suffix == ".json") != (path is arguments.transform):
+            raise InputError(f"{path}: wanted a PLY file as --out, and .json as --transform")
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """What is to be written."""
+
+    cloud: Path | None
+    transforms: list[Path]  # JSON and text, or none
+    scene: Scene | None  # whose poses go along
+
+
+def outputs_of(arguments: argparse.Namespace) -> Outputs:
+    """What is to be written; refused if it can't be."""
+    path = arguments.transform
+    if arguments.out and not arguments.apply:
+        path = path or arguments.out.with_suffix(".json")
+    transforms = [path, path.with_suffix(".txt")] if path else []
+    outputs = [arguments.out, *transforms]
+    outputs += [arguments.out.with_name(QUERIES_NAME)] if arguments.queries else []
+    inputs = [*arguments.cloud, *filter(None, (arguments.apply, arguments.queries))]
+    for output in filter(None, outputs):
+        check_output(output, inputs)
+    if arguments.out in transforms:
+        raise InputError(f"{arguments.out}: found the same name for cloud and transform, wanted a .ply")
+    scene = read_scene(arguments.queries) if arguments.queries else None
+    return Outputs(arguments.out, transforms, scene)
+
+
+def open_measured(arguments: argparse.Namespace, settings: CloudSettings) -> MeasuredStream:
+    """The cloud, which shows how far its reading is."""
+    return measured(open_cloud(arguments.cloud, settings, shown(arguments.quiet)))
+
+
+def write(cloud: MeasuredStream, alignment: Alignment, outputs: Outputs) -> list[str]:
+    """Write the cloud and what goes with it, the cloud's name last; returns warnings."""
+    out = outputs.cloud
+
+    def write_others() -> None:
+        texts = alignment.to_json(), alignment.to_text()
+        for path, text in zip(outputs.transforms, texts, strict=False):
+            write_atomically(path, text.encode())
+        if out and outputs.scene:
+            in_metres = alignment.in_unit(1.0)
+            queries = [replace(query, pose=in_metres.moved(query.pose)) for query in outputs.scene.queries]
+            write_queries(out.parent, queries, cloud=out.name)
+
+    if out is None:
+        write_others()
+        return []
+    return list(write_moved(cloud, alignment.T_aligned_from_scan, out, write_others))
+
+
+def report_of(arguments: argparse.Namespace, status: str, alignment: Alignment) -> dict[str, object]:
+    """What all reports say."""
+    return {
+        "status": status,
+        "cloud": [str(path) for path in arguments.cloud],
+        "out": str(arguments.out) if arguments.out and status != "uncertain" else None,
+        "confidence": alignment.confidence,
+        "explanation": alignment.explanation,
+        "metres_per_unit": alignment.metres_per_unit,
+        "T_aligned_from_scan": alignment.T_aligned_from_scan.tolist(),
+    }
+
+
+def details_of(finding: Finding) -> dict[str, object]:
+    """The evidence: up, yaw and planes in the scan's frame."""
+    x, y, z = finding.up_scan
+    scale = finding.alignment.metres_per_unit
+    return {
+        "up_scan": finding.up_scan.tolist(),
+        "tilt_deg": float(np.degrees(np.arctan2(np.hypot(x, y), z))),
+        "spread_deg": None if finding.spread is None else float(np.degrees(finding.spread)),
+        "yaw_deg": None if finding.yaw is None else float(np.degrees(finding.yaw)),
+        "planes": [
+            {
+                "kind": plane.kind,
+                "normal_scan": plane.normal_world.tolist(),
+                "offset": plane.offset / scale,
+                "inliers": plane.num_inliers,
+                "share": plane.share,
+                "rms": plane.rms / scale,
+            }
+            for plane in finding.planes
+        ],
+    }
+
+
+def say(arguments: argparse.Namespace, warnings: list[str]) -> None:
+    """Lines for the user."""
+    for warning in [] if arguments.quiet else warnings:
+        tqdm.write(f"{PROGRAM}: warning: {warning}", file=sys.stderr)
+
+
+def align(arguments: argparse.Namespace) -> int:
+    """Find the alignment, write what is sure enough; returns the exit code."""
+    outputs = outputs_of(arguments)
+    cloud = open_measured(arguments, cloud_settings_from(arguments))
+    finding, warnings = find_alignment(cloud, arguments.up, arguments.yaw_walls)
+    say(arguments, list(warnings))
+    alignment = finding.alignment
+    least = MIN_CONFIDENCE if arguments.min_confidence is None else arguments.min_confidence
+    doubt = ""
+    if alignment.confidence < least:
+        doubt = f"confidence {alignment.confidence:.2f} is below {least:g}: {alignment.explanation}"
+    elif arguments.yaw_walls and finding.yaw is None:
+        doubt = "--yaw-walls: found no wall among the dominant planes"
+    if not doubt:
+        say(arguments, write(cloud, alignment, outputs))
+    report = report_of(arguments, "uncertain" if doubt else "aligned", alignment)
+    print(json.dumps({**report, **details_of(finding)}, allow_nan=False))
+    return complain(PROGRAM, False, doubt, EXIT_UNCERTAIN) if doubt else EXIT_ALIGNED
+
+
+def apply(arguments: argparse.Namespace) -> int:
+    """Apply the transform of a file to the cloud; returns the exit code."""
+    outputs = outputs_of(arguments)
+    given = read_alignment(arguments.apply)
+    settings = cloud_settings_from(arguments)
+    if arguments.units is None and arguments.scale is None:
+        settings = replace(settings, scale=given.metres_per_unit)
+    alignment = (given.inverse() if arguments.inverse else given).in_unit(settings.scale)
+    cloud = open_measured(arguments, settings)
+    for _ in cloud.chunks([]):  # for its box
+        pass
+    say(arguments, write(cloud, alignment, outputs))
+    print(json.dumps(report_of(arguments, "applied", alignment), allow_nan=False))
+    return EXIT_ALIGNED
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    arguments = parse(build_parser(), argv)
+    if arguments.transform_only:
+        arguments.out = arguments.transform = arguments.queries = None
+    work = apply if arguments.apply else align
+    return guarded(PROGRAM, arguments.debug, lambda: work(arguments), lambda: check_arguments(arguments))

@@ -1,0 +1,212 @@
+"""Draw the sampling loss over a plan of the cloud: its least value over height and rotation at each place."""
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from ..cloud.soa import FARTHEST, LocalCloud
+from ..errors import InputError
+from ..geometry.pose import Array, Pose
+from ..geometry.rotations import uniform_rotations, uniform_yaws
+from ..optimize.loss_surface import LossSurface, PoseGrid, loss_surface
+from ..optimize.loss_surface_io import Known, plan_shift, surface_npz, surface_png
+from ..panorama import read_panorama
+from ..panorama.resize import shrink
+from ..panorama.texels import Texels, pack_texels
+from ..pipeline import open_points
+from ..runtime.atomic import check_output, write_atomically
+from ..runtime.threads import Workers, num_cores
+from ..scenes.export import read_results
+from ..scenes.scene import read_scene
+from .errors import guarded
+from .options import add_cloud_options, cloud_settings_from, parse
+from .progress import shown
+
+EPILOG = """\
+examples:
+  python tools/loss_surface.py --cloud scan.ply --pano a.jpg --truth queries.json --out surface.png
+  python tools/loss_surface.py --cloud scan.ply --pano a.jpg --result pose.json --step 0.1 --npz surface.npz
+
+At each place of a grid the least sampling loss (Eq. 2 of the paper) over --heights and --rotations is taken,
+over the points seen from there. If a pose is known, the rotations are its own, turned evenly, and the heights
+are about its own. z is up, or what --up or a prepared map says. Places too near to a point or outside of the
+cloud are computed too, and drawn pale; the lowest place and the minima are of the others.
+
+NPZ, in the world's axes turned so that z is up (R_plan_from_world, identity for clouds with z up): x (nx,)
+and y (ny,) [m]; loss, height, is_free (ny, nx); R_cam_from_world (ny, nx, 3, 3) of the best pose; found_world
+and true_world (3,), NaN where not known. One JSON object on stdout.
+exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
+"""
+MAX_CELLS = 1_000_000
+HEIGHTS_ABOUT = (-0.15, 0.0, 0.15)  # [m] of the known one
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """All options."""
+    parser = argparse.ArgumentParser(
+        "loss_surface.py",
+        description=__doc__,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_cloud_options(parser, "coloured scan, as for localize.py, or a map by tools/prepare_map.py")
+    parser.add_argument("--pano", type=Path, required=True, help="the panorama")
+    parser.add_argument("--result", type=Path, metavar="FILE", help="JSON lines of localize.py: pose found")
+    parser.add_argument("--truth", type=Path, metavar="FILE", help="queries.json: true pose")
+    parser.add_argument("--out", type=Path, metavar="PNG", help="the picture")
+    parser.add_argument("--npz", type=Path, metavar="FILE", help="the surface as arrays")
+    group = parser.add_argument_group("poses tried")
+    group.add_argument("--step", type=float, default=0.2, metavar="M", help="of the grid (default 0.2)")
+    text = "corners of the grid (default: all of the cloud)"
+    group.add_argument("--box", type=float, nargs=4, metavar=("X0", "Y0", "X1", "Y1"), help=text)
+    text = "least, greatest and how many (default: about the pose known, else 5 in the middle of the room)"
+    group.add_argument("--heights", type=float, nargs=3, metavar=("MIN", "MAX", "NUM"), help=text)
+    text = "known: yaws; unknown: all of SO(3) (default known)"
+    group.add_argument("--gravity", choices=["known", "unknown"], default="known", help=text)
+    group.add_argument("--rotations", type=int, metavar="N", help="(default 64, of SO(3) 1000)")
+    group = parser.add_argument_group("loss")
+    group.add_argument("--width", type=int, default=256, metavar="PX", help="of the panorama (default 256)")
+    text = "used at a position, of those seen from there (default 30000)"
+    group.add_argument("--max-points", type=int, default=30_000, metavar="N", help=text)
+    group.add_argument("--no-visibility", action="store_true", help="see through walls")
+    parser.add_argument("--threads", type=int, default=num_cores(), metavar="N", help="(default all cores)")
+    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    return parser
+
+
+def check_usage(arguments: argparse.Namespace) -> None:
+    """Refuse options that make no sense, whatever the files hold."""
+    cloud_settings_from(arguments)
+    if not (arguments.out or arguments.npz):
+        raise InputError("--out, --npz: found none, wanted one of them or both")
+    if not 0.0 < arguments.step < np.inf:
+        raise InputError(f"--step: found {arguments.step}, wanted metres above 0")
+    least = {"rotations": 1, "width": 16, "max_points": 100, "threads": 1}
+    for name, limit in least.items():
+        value = getattr(arguments, name)
+        if value is not None and value < limit:
+            raise InputError(f"--{name.replace('_', '-')}: found {value}, wanted at least {limit}")
+    x0, y0, x1, y1 = arguments.box or (0.0, 0.0, 1.0, 1.0)
+    if not (x0 < x1 and y0 < y1 and np.isfinite([x0, y0, x1, y1]).all()):
+        raise InputError(f"--box: found {arguments.box}, wanted X0 below X1 and Y0 below Y1")
+    low, high, num = arguments.heights or (0.0, 0.0, 1.0)
+    if not (low <= high and np.isfinite([low, high]).all() and num in range(1, 1001)):
+        raise InputError(f"--heights: found {arguments.heights}, wanted MIN up to MAX and 1 to 1000 of them")
+
+
+def known_poses(arguments: argparse.Namespace, placed: LocalCloud) -> Known:
+    """The pose found and the true one of the panorama, as far as files are given."""
+    name, found, true = arguments.pano.name, None, None
+    if arguments.result:
+        poses = [r.pose for r in read_results(arguments.result) if Path(r.pano).name == name and r.pose]
+        if len(poses) != 1:
+            raise InputError(f"{arguments.result}: found {len(poses)} poses of {name}, wanted one")
+        found = placed.from_world(poses[0])
+    if arguments.truth:
+        queries = read_scene(arguments.truth).by_name
+        if name not in queries:
+            raise InputError(f"{arguments.truth}: found no true pose of {name}, wanted one")
+        true = placed.from_world(queries[name].pose)
+    return Known(found, true)
+
+
+def grid_from(arguments: argparse.Namespace, placed: LocalCloud, known: Known) -> PoseGrid:
+    """The poses to try, in the frame of the points."""
+    shift = plan_shift(placed)
+    if arguments.box:
+        corners = np.array(arguments.box).reshape(2, 2) - shift[:2]
+    else:
+        ends = [np.percentile(c, [0.5, 99.5]) for c in (placed.points.x, placed.points.y)]
+        places = np.array([*np.transpose(ends), *(pose.center_world[:2] for pose in known.all)], np.float64)
+        corners = np.stack([places.min(axis=0), places.max(axis=0)])
+    counts = np.floor((corners[1] - corners[0]) / arguments.step) + 1.0
+    if counts.prod() > MAX_CELLS:
+        raise InputError(f"--step: found {counts.prod():.3g} places, wanted at most {MAX_CELLS}")
+    heights = heights_from(arguments, placed, known)
+    if not max(np.abs(corners).max(), np.abs(heights).max()) < FARTHEST:
+        raise InputError("--box, --heights: found places too far from the cloud, wanted them in it")
+    x, y = (corners[0, k] + arguments.step * np.arange(counts[k]) for k in range(2))
+    is_known = arguments.gravity == "known"
+    rotations = (uniform_yaws if is_known else uniform_rotations)(
+        arguments.rotations or (64 if is_known else 1000)
+    )
+    # Turned from a pose that is known, so that it is among them.
+    start = known.all[0].R_cam_from_world if known.all else np.eye(3)
+    return PoseGrid(x, y, heights, start @ rotations @ rotations[0].T)
+
+
+def heights_from(arguments: argparse.Namespace, placed: LocalCloud, known: Known) -> Array:
+    """The heights to try, in the frame of the points."""
+    if arguments.heights:
+        low, high, num = arguments.heights
+        return np.asarray(np.linspace(low, high, int(num)) - plan_shift(placed)[2])
+    if known.all:
+        return np.asarray(known.all[0].center_world[2] + np.array(HEIGHTS_ABOUT))
+    floor, ceiling = np.percentile(placed.points.z, [1.0, 99.0])
+    return np.asarray(floor + (ceiling - floor) * np.linspace(0.25, 0.75, 5))
+
+
+def summary(surface: LossSurface, grid: PoseGrid, placed: LocalCloud, known: Known) -> dict[str, object]:
+    """What the JSON on stdout says of the surface."""
+    row, column = surface.lowest()
+    lowest = np.array([grid.x[column], grid.y[row], surface.height[row, column]])
+    pose = placed.to_world(Pose(grid.R_cam_from_local[surface.rotation[row, column]], lowest))
+    told: dict[str, object] = {
+        "places": [len(grid.y), len(grid.x)],
+        "poses": grid.num_poses,
+        "lowest_world": np.round(pose.center_world, 6).tolist(),
+        "lowest_loss": float(surface.loss[row, column]),
+        "median_loss": float(np.median(surface.loss[np.isfinite(surface.loss)])),
+        "num_minima": surface.num_minima(),
+    }
+    for name, other in (("found", known.found), ("true", known.true)):
+        if other is not None:
+            told[f"distance_to_{name}"] = round(float(np.linalg.norm(lowest - other.center_world)), 6)
+    return told
+
+
+def texels_of(path: Path, width: int) -> Texels:
+    """The panorama as the loss reads it."""
+    panorama = shrink(read_panorama(path), width)
+    return pack_texels(panorama.rgb, panorama.is_valid)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Read, compute, write."""
+    outputs = [path for path in (arguments.out, arguments.npz) if path]
+    inputs = [*arguments.cloud, arguments.pano, *filter(None, (arguments.result, arguments.truth))]
+    for path in outputs:
+        check_output(path, inputs)
+
+    workers = Workers(arguments.threads, shown(arguments.quiet))
+    texels = texels_of(arguments.pano, arguments.width)
+    placed = open_points(arguments.cloud, cloud_settings_from(arguments), workers)
+    for warning in () if arguments.quiet else placed.warnings:
+        print(f"loss_surface.py: warning: {warning}", file=sys.stderr)
+    known = known_poses(arguments, placed)
+    grid = grid_from(arguments, placed, known)
+    begin = time.perf_counter()
+    see = not arguments.no_visibility
+    surface = loss_surface(placed.points, texels, grid, arguments.max_points, see, workers)
+    seconds = time.perf_counter() - begin
+    if not np.isfinite(surface.loss).any():
+        raise InputError(f"{arguments.pano}: found no pose with a loss, wanted a panorama less masked")
+    if arguments.npz:
+        write_atomically(arguments.npz, surface_npz(surface, grid, placed, known))
+    if arguments.out:
+        write_atomically(arguments.out, surface_png(surface, grid, placed, known, arguments.pano.name))
+    told = {"seconds": round(seconds, 3), "poses_per_s": round(grid.num_poses / seconds)}
+    files = {"out": arguments.out and str(arguments.out), "npz": arguments.npz and str(arguments.npz)}
+    print(json.dumps(files | summary(surface, grid, placed, known) | told))
+    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    arguments = parse(build_parser(), argv)
+    return guarded("loss_surface.py", arguments.debug, lambda: run(arguments), lambda: check_usage(arguments))

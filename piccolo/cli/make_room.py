@@ -1,0 +1,124 @@
+"""Make a seeded furnished room: a coloured scan of it, and panoramas with true poses."""
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cloud.ply_writer import vertex_rows, write_ply
+from ..errors import InputError
+from ..runtime.atomic import write_atomically
+from ..runtime.threads import Workers, num_cores
+from ..scenes import scene as scenes
+from ..scenes.synthetic.world import (
+    VARIANTS,
+    Query,
+    World,
+    check_num_points,
+    check_width,
+    make_labels,
+    make_query,
+    make_world,
+    scan_labelled,
+)
+from .errors import guarded
+from .progress import shown
+
+EPILOG = """\
+examples:
+  python tools/make_room.py --out room --seed 3
+  python tools/make_room.py --out rooms --scenes 25 --panoramas 2 --labels
+  python tools/make_room.py --out flats --rooms 16 --points 2000000 --panoramas 4 --variants clean photo
+
+Writes FOLDER/cloud.ply, FOLDER/images/VARIANT_K.jpg and FOLDER/queries.json with the true poses.
+clean: as scanned; tilt: the camera turned anyhow; photo: other exposure, white balance, gamma, blur, noise;
+change: furniture moved and added. With --labels the points have a label too, and each panorama a picture
+of labels, FOLDER/labels/VARIANT_K.png. One JSON object a scene on stdout says what was written.
+exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """All options."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="made if it is not there")
+    parser.add_argument("--seed", type=int, default=0, help="equal seeds, equal bits (default 0)")
+    parser.add_argument("--points", type=int, default=300_000, help="(default 300000)")
+    parser.add_argument("--panoramas", type=int, default=3, help="of each variant (default 3)")
+    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=["clean"], help="(default clean)")
+    parser.add_argument("--width", type=int, default=2048, help="of the panoramas [px] (default 2048)")
+    parser.add_argument("--size", type=float, nargs=3, default=[6.0, 5.0, 2.7], metavar=("X", "Y", "Z"),
+                        help="of a room [m] (default 6 5 2.7)")  # fmt: skip
+    parser.add_argument("--rooms", type=int, default=1, help="side by side, at most 64 (default 1)")
+    text = "label each point and pixel by its kind of surface, for localize.py --labels"
+    parser.add_argument("--labels", action="store_true", help=text)
+    text = "a number of scenes, FOLDER/000 on, of the seeds from --seed on (default: one, in FOLDER itself)"
+    parser.add_argument("--scenes", type=int, default=0, metavar="N", help=text)
+    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    return parser
+
+
+def write_query(folder: Path, name: str, query: Query) -> scenes.Query:
+    """Write the image of a query and return what queries.json has of it."""
+    image = folder / "images" / f"{name}.jpg"
+    bgr = cv2.cvtColor(query.rgb, cv2.COLOR_RGB2BGR)
+    quality = 70 if query.variant == "photo" else 95
+    _, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    write_atomically(image, bytes(encoded))
+    return scenes.Query(image, query.variant, query.pose)
+
+
+def write_labels(folder: Path, name: str, labels: NDArray[np.uint16]) -> Path:
+    """Write an image of labels (H, W) and return its path."""
+    image = folder / "labels" / f"{name}.png"
+    image.parent.mkdir(exist_ok=True)
+    _, encoded = cv2.imencode(".png", labels)
+    write_atomically(image, bytes(encoded))
+    return image
+
+
+def write_world(
+    arguments: argparse.Namespace, world: World, folder: Path, workers: Workers
+) -> dict[str, object]:
+    """Write one scene and return what was written."""
+    check_num_points(world, arguments.points)
+    check_width(arguments.width)
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    points, colors, labels = scan_labelled(world, arguments.points, workers)
+    rows = vertex_rows(points, colors, labels.astype(np.int32) if arguments.labels else None)
+    write_ply(folder / scenes.CLOUD_NAME, rows)
+    queries = []
+    for v in dict.fromkeys(arguments.variants):
+        for k in range(arguments.panoramas):
+            query = make_query(world, k, v, arguments.width, workers)
+            written = write_query(folder, f"{v}_{k}", query)
+            if arguments.labels:
+                labels_path = write_labels(folder, f"{v}_{k}", make_labels(world, k, query, workers))
+                written = replace(written, labels=labels_path)
+            queries.append(written)
+    scenes.write_queries(folder, queries)
+    return {"folder": str(folder), "points": len(points), "queries": len(queries), "seed": world.seed}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    arguments = build_parser().parse_args(argv)
+
+    def run() -> int:
+        if min(arguments.panoramas, arguments.seed, arguments.scenes) < 0:
+            raise InputError("--panoramas, --seed, --scenes: found a negative number, wanted 0 or more")
+        workers = Workers(num_cores(), shown(arguments.quiet))
+        for number in range(max(1, arguments.scenes)):
+            world = make_world(arguments.seed + number, np.array(arguments.size), arguments.rooms)
+            folder = arguments.out / f"{number:03}" if arguments.scenes else arguments.out
+            print(json.dumps(write_world(arguments, world, folder, workers)), flush=True)
+        return 0
+
+    return guarded("make_room.py", arguments.debug, run)

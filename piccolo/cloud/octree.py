@@ -1,0 +1,81 @@
+"""The cloud as a pyramid of voxels: mean position and mean colour of each, children next to each other."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..runtime.jit import kernel
+from .voxels import COARSEST, LEAF_SIZE, Voxels
+
+NUM_LEVELS = COARSEST.bit_length()  # from 128 leaves wide (2.56 m) down to one
+
+
+@dataclass(frozen=True)
+class Octree:
+    """Nodes of all levels, coarsest first, in Morton order within a level."""
+
+    nodes: NDArray[np.float32]  # (nodes, 6) mean x, y, z [m], r, g, b in [0, 1]
+    first_child: NDArray[np.int32]  # (nodes + 1,) children of i are first_child[i]:first_child[i + 1]
+    level_start: NDArray[np.int32]  # (levels + 1,)
+    leaf_size: float  # [m]
+
+    def arrays(self) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int32], float]:
+        """What the kernels read."""
+        return self.nodes, self.first_child, self.level_start, self.leaf_size
+
+    def level(self, size: float) -> NDArray[np.float32]:
+        """The nodes of the level whose voxels are nearest to `size` [m]."""
+        level = NUM_LEVELS - 1 - int(np.clip(np.rint(np.log2(size / self.leaf_size)), 0, NUM_LEVELS - 1))
+        return self.nodes[self.level_start[level] : self.level_start[level + 1]]
+
+
+@kernel
+def average_children(child_nodes, child_codes, nodes, codes, first_child):
+    """Write the mean of the children of each parent voxel and where they begin. Returns how many parents."""
+    count = 0
+    n = len(child_codes)
+    lo = 0
+    while lo < n:
+        hi = lo
+        code = child_codes[lo] >> 3
+        s0 = s1 = s2 = s3 = s4 = s5 = 0.0
+        while hi < n and (child_codes[hi] >> 3) == code:
+            s0 += child_nodes[hi, 0]
+            s1 += child_nodes[hi, 1]
+            s2 += child_nodes[hi, 2]
+            s3 += child_nodes[hi, 3]
+            s4 += child_nodes[hi, 4]
+            s5 += child_nodes[hi, 5]
+            hi += 1
+        per = 1.0 / (hi - lo)
+        nodes[count, 0] = s0 * per
+        nodes[count, 1] = s1 * per
+        nodes[count, 2] = s2 * per
+        nodes[count, 3] = s3 * per
+        nodes[count, 4] = s4 * per
+        nodes[count, 5] = s5 * per
+        codes[count] = code
+        first_child[count] = lo
+        count += 1
+        lo = hi
+    return count
+
+
+def build_octree(voxels: Voxels) -> Octree:
+    """The octree whose leaves are the voxels."""
+    nodes, node_codes = voxels.nodes, voxels.codes
+    levels, children = [nodes], [np.zeros(len(nodes), np.int32)]
+    for _ in range(NUM_LEVELS - 1):
+        parents, parent_codes = np.empty_like(nodes), np.empty_like(node_codes)
+        first = np.empty(len(nodes), np.int32)
+        count = average_children(nodes, node_codes, parents, parent_codes, first)
+        nodes, node_codes = parents[:count].copy(), parent_codes[:count].copy()
+        levels.insert(0, nodes)
+        children.insert(0, first[:count].copy())
+    start = np.concatenate([[0], np.cumsum([len(level) for level in levels])]).astype(np.int32)
+    first_child = np.concatenate([c + s for c, s in zip(children[:-1], start[1:-1], strict=True)])
+    leaves = np.full(len(levels[-1]) + 1, start[-1], np.int32)
+    return Octree(
+        np.concatenate(levels), np.concatenate([first_child, leaves]).astype(np.int32), start, LEAF_SIZE
+    )

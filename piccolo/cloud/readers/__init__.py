@@ -1,0 +1,1 @@
+"""Readers of point clouds, one file a format."""

@@ -1,0 +1,227 @@
+"""What E57 files have in common for their scans and their images: header, XML section, numbers, poses.
+
+The XML is read here, within limits, before libE57 sees the file: its parser would follow a document type
+definition or a schema to other files, and nest and count without end.
+"""
+
+import math
+import re
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError
+from ...geometry.pose import rotation_from_quaternion_wxyz
+from ...runtime.optional import library
+from .lines import quoted
+
+MAGIC = b"ASTM-E57"
+HEADER = struct.Struct("<8sIIQQQQ")  # magic, major, minor, file size, XML offset, XML size, page size
+PAGE_SIZE, PAGE_CONTENT = 1024, 1020  # [byte]; the rest of a page is its checksum
+NAMESPACE = "{http://www.astm.org/COMMIT/E57/2010-e57-v1.0}"
+MAX_XML_SIZE = 1 << 26  # [byte]
+# libE57 takes time with the square of a structure's parts; a vector holds scans and images
+MAX_ELEMENTS, MAX_PARTS, MAX_IN_VECTOR, MAX_DEPTH = 500_000, 500, 20_000, 32
+INTEGER = re.compile(r"[+-]?[0-9]{1,19}")
+CHECK_ALL = 100  # [%] of the pages have their checksum verified
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a scan or an image stands: `x_world = R_world_from_local @ x_local + center_world`."""
+
+    R_world_from_local: NDArray[np.float64]  # (3, 3)
+    center_world: NDArray[np.float64]  # (3,)
+
+
+@dataclass(frozen=True)
+class E57File:
+    """An E57 file opened by libE57, and its XML."""
+
+    path: Path
+    size: int  # [byte]
+    root: Element
+    libe57: ModuleType
+    image_file: Any
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[E57File]:
+    """An E57 file whose header and XML were checked, open to be read."""
+    root = read_xml(path)
+    libe57 = library(path, "pye57.libe57")
+    with refusing(path, libe57):
+        image_file = libe57.ImageFile(str(path), "r", CHECK_ALL)
+    try:
+        yield E57File(path, path.stat().st_size, root, libe57, image_file)
+    finally:
+        image_file.close()
+
+
+@contextmanager
+def refusing(path: Path, libe57: ModuleType) -> Iterator[None]:
+    """Turn what libE57 says of a broken file into an InputError."""
+    try:
+        yield
+    except (libe57.E57Exception, RuntimeError, UnicodeDecodeError) as error:  # the last in its own message
+        raise InputError(f"{path}: broken E57 file ({quoted(str(error).encode())})") from error
+
+
+def read_xml(path: Path) -> Element:
+    """The root of a file's XML section."""
+    with path.open("rb") as file:
+        head = file.read(HEADER.size)
+        if len(head) < HEADER.size or not has_e57_magic(head):
+            raise InputError(f"{path}: begins with {head[:8]!r} and {len(head)} bytes, wanted 'ASTM-E57'")
+        _, major, _, size, offset, length, page_size = HEADER.unpack(head)
+        found = path.stat().st_size
+        if major != 1 or page_size != PAGE_SIZE:
+            raise InputError(
+                f"{path}: E57 version {major} in pages of {page_size} bytes, wanted 1 and {PAGE_SIZE}"
+            )
+        if size != found or found % PAGE_SIZE:
+            raise InputError(
+                f"{path}: the header promises {size} bytes in pages of {PAGE_SIZE}, found {found}; "
+                "the file is cut off or broken"
+            )
+        num_bytes = (offset % PAGE_SIZE + length) // PAGE_CONTENT * PAGE_SIZE + PAGE_SIZE
+        if length > MAX_XML_SIZE or offset + length > found:
+            raise InputError(
+                f"{path}: the header promises {length} bytes of XML from byte {offset} on, wanted "
+                f"{MAX_XML_SIZE} at most and within the file's {found} bytes"
+            )
+        file.seek(offset - offset % PAGE_SIZE)
+        pages = file.read(num_bytes)
+    content = b"".join(pages[k : k + PAGE_CONTENT] for k in range(0, len(pages), PAGE_SIZE))
+    return _parsed(path, content[offset % PAGE_SIZE :][:length])
+
+
+def has_e57_magic(head: bytes) -> bool:
+    """True if a file that begins with the bytes `head` says it is E57."""
+    return head.startswith(MAGIC)
+
+
+class _Limited(TreeBuilder):
+    """A tree of elements that grows within limits and takes in nothing from elsewhere."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.num_elements = 0
+        self.room = [1]  # for children, in each open element
+
+    def start(self, tag: str, attrs: dict[str, str]) -> Element:
+        """Open an element."""
+        self.num_elements += 1
+        self.room[-1] -= 1
+        if self.num_elements > MAX_ELEMENTS or len(self.room) > MAX_DEPTH:
+            raise ValueError(f"more than {MAX_ELEMENTS} elements or {MAX_DEPTH} levels")
+        if self.room[-1] < 0:
+            raise ValueError(f"more than {MAX_PARTS} elements in a structure or {MAX_IN_VECTOR} in a vector")
+        self.room.append(MAX_IN_VECTOR if attrs.get("type") == "Vector" else MAX_PARTS)
+        if any(name.lower().endswith("schemalocation") for name in attrs):
+            raise ValueError("a schema in another file")
+        return super().start(tag, attrs)
+
+    def end(self, tag: str) -> Element:
+        """Close an element."""
+        self.room.pop()
+        return super().end(tag)
+
+    def doctype(self, *_: str | None) -> None:
+        """Refuse a document type, where entities are declared."""
+        raise ValueError("a document type definition")
+
+
+def _parsed(path: Path, xml: bytes) -> Element:
+    parser = XMLParser(target=_Limited())
+    try:
+        parser.feed(xml.rstrip(b"\0"))
+        root = parser.close()
+    except (ParseError, ValueError, LookupError) as error:
+        raise InputError(f"{path}: the XML section is broken ({quoted(str(error).encode())})") from error
+    if not isinstance(root, Element) or root.tag != f"{NAMESPACE}e57Root":
+        raise InputError(f"{path}: the XML section has no element e57Root of E57 1.0")
+    return root
+
+
+def child(element: Element | None, name: str) -> Element | None:
+    """The child of that name in E57's namespace, if there is one."""
+    return None if element is None else element.find(NAMESPACE + name)
+
+
+def children(element: Element, name: str) -> list[Element]:
+    """The children of the child of that name."""
+    found = child(element, name)
+    return [] if found is None else list(found)
+
+
+def text_of(element: Element | None, name: str) -> str:
+    """The text of a child, empty if there is none."""
+    found = child(element, name)
+    return "" if found is None else (found.text or "").strip()
+
+
+def number_of(path: Path, element: Element | None) -> float | None:
+    """The value of a number's element, None without one; an empty one is 0, a scaled integer is scaled."""
+    if element is None:
+        return None
+    value = parsed_number(path, (element.text or "").strip() or "0")
+    if element.get("type") == "ScaledInteger":
+        return scaled(path, element, value)
+    return value
+
+
+def scaled(path: Path, element: Element, raw: float) -> float:
+    """The value of a scaled integer's raw value."""
+    return raw * parsed_number(path, element.get("scale", "1")) + parsed_number(
+        path, element.get("offset", "0")
+    )
+
+
+def parsed_number(path: Path, text: str) -> float:
+    """A finite number; InputError if the text is none."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(f"{path}: found {quoted(text.encode())} in the XML section, wanted a finite number")
+    return value
+
+
+def parsed_integer(path: Path, text: str) -> int:
+    """An integer of 64 bits or little more; InputError if the text is none."""
+    if not INTEGER.fullmatch(text):
+        raise InputError(f"{path}: found {quoted(text.encode())} in the XML section, wanted an integer")
+    return int(text)
+
+
+def placement_of(path: Path, element: Element) -> Placement | None:
+    """The pose of a scan or an image; None if it has none. A part that is missing is the identity's."""
+    pose = child(element, "pose")
+    if pose is None:
+        return None
+    R_world_from_local = np.eye(3)
+    rotation = child(pose, "rotation")
+    if rotation is not None:
+        quaternion_wxyz = _numbers(path, rotation, "wxyz")
+        if not 0.0 < np.linalg.norm(quaternion_wxyz) < math.inf:
+            raise InputError(
+                f"{path}: a pose's rotation is {quaternion_wxyz.tolist()}, wanted a quaternion w x y z"
+            )
+        R_world_from_local = rotation_from_quaternion_wxyz(quaternion_wxyz)
+    translation = child(pose, "translation")
+    center_world = np.zeros(3) if translation is None else _numbers(path, translation, "xyz")
+    return Placement(R_world_from_local, center_world)
+
+
+def _numbers(path: Path, element: Element, names: str) -> NDArray[np.float64]:
+    return np.array([number_of(path, child(element, name)) or 0.0 for name in names])

@@ -1,0 +1,197 @@
+"""Textured and coloured meshes as point clouds: OBJ, glTF, GLB, and PLY files with faces.
+
+Coordinates are taken as they stand in the file, after its own scene graph: a glTF file's y stays y, in its
+unit. trimesh reads the files; what it would pass over in silence is checked before and after.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError
+from .mesh_glb import has_glb_magic
+from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply
+from .mesh_sampling import Floats, Placed, Sampling, Surface
+from .reader import PLAIN, Format, PointSource, ReadOptions
+
+DENSITY = 10_000.0  # points on a square metre, 1 cm apart
+MAX_POINTS = 30_000_000
+MAX_TRIANGLES = 200_000_000  # counted anew wherever a scene places its mesh
+BRIGHTEST = {"u1": 255.0, "u2": 65535.0}  # of whole numbers; fractions go to 1
+
+
+def open_mesh(path: Path, options: ReadOptions = PLAIN) -> PointSource:
+    """The points on the triangles of an OBJ, GLB or glTF file, 10,000 on a square metre.
+
+    The options' scale tells what a metre is in the file. A file that would give more than 30 million is
+    sampled at a lower density, with a warning. Colours: from the texture, whose texels of alpha 0 leave their
+    points out; else from the vertices, the faces, the material. In glTF they are multiplied in linear light:
+    texture, base colour's factor, vertex colours. Textures repeat beyond their edges. Surfaces without
+    colours are left out, with a warning.
+    """
+    content = path.read_bytes()
+    if has_glb_magic(content) or path.suffix.lower() in (".glb", ".gltf"):
+        return _source(load_gltf(path, content), options.scale)
+    return _source(load_obj(path, content), options.scale)
+
+
+def open_ply_mesh(path: Path, options: ReadOptions = PLAIN) -> PointSource:
+    """The points on the faces of a PLY file, as by open_mesh; with a texture if a comment names one."""
+    return _source(load_ply(path), options.scale)
+
+
+def _source(loaded: Loaded, scale: float) -> PointSource:
+    path = loaded.path
+    parts, notes = _placed(loaded)
+    num_triangles = sum(len(part.surface.triangles) for part in parts)
+    if num_triangles > MAX_TRIANGLES:
+        raise InputError(f"{path}: {num_triangles} triangles, wanted at most {MAX_TRIANGLES}")
+    sums, num_flat = [], 0
+    for part in parts:
+        areas = part.areas()
+        sums.append(areas.sum())
+        num_flat += int(np.count_nonzero(areas == 0.0))
+    ends = np.cumsum(sums, dtype=np.float64)
+    total = float(ends[-1])
+    if not 0.0 < total < np.inf:
+        raise InputError(f"{path}: {num_triangles} triangles with an area of {total:g}, {WANTED}")
+    if num_flat:
+        notes.append(f"{path}: {num_flat} triangles without an area or with NaN coordinates left out")
+    area = total * scale * scale  # [m^2]
+    num_points = round(min(area * DENSITY, MAX_POINTS))
+    if num_points == 0:
+        raise InputError(f"{path}: an area of {area:.2g} square metres, too small for points; set --units")
+    if area * DENSITY > MAX_POINTS:
+        notes.append(
+            f"{path}: {area:.3g} square metres of surface, sampled with {num_points / area:.3g} points on "
+            f"each instead of {DENSITY:.0f}"
+        )
+    return PointSource(path, Sampling(parts, ends, num_points).read, num_points, tuple(notes))
+
+
+def _placed(loaded: Loaded) -> tuple[list[Placed], list[str]]:
+    """The coloured surfaces where the scene puts them, and what the user should know."""
+    scene, path = loaded.scene, loaded.path
+    surfaces = {
+        name: _surface(loaded, mesh) for name, mesh in scene.geometry.items() if hasattr(mesh, "faces")
+    }
+    parts, num_bare = [], 0
+    nodes = [scene.graph.get(node) for node in scene.graph.nodes_geometry]
+    # not by the nodes' names: trimesh makes some up by chance
+    for matrix, name in sorted(nodes, key=lambda node: (node[1], node[0].tobytes())):
+        surface = surfaces.get(name)
+        if surface is None:
+            continue
+        if surface.colors is None and surface.texture is None:
+            num_bare += 1
+            continue
+        parts.append(Placed(surface, np.array(matrix, dtype=np.float64)))
+    if not parts and not num_bare:
+        raise InputError(f"{path}: no triangles, {WANTED}")
+    if not parts or _is_one_color([part.surface for part in parts]):
+        raise InputError(f"{path}: no colours, {WANTED}")
+    # surfaces of one texture next to each other: it is decoded once
+    first = {id(part.surface.texture): i for i, part in reversed(list(enumerate(parts)))}
+    parts.sort(key=lambda part: first[id(part.surface.texture)])
+    return parts, [f"{path}: {num_bare} surfaces without colours left out"] if num_bare else []
+
+
+def _is_one_color(surfaces: list[Surface]) -> bool:
+    if any(surface.texture for surface in surfaces):
+        return False
+    extremes = [(s.colors.min(axis=0), s.colors.max(axis=0)) for s in surfaces if s.colors is not None]
+    low = np.min([low for low, _ in extremes], axis=0)
+    return bool(np.all(low == np.max([high for _, high in extremes], axis=0)))
+
+
+def _surface(loaded: Loaded, mesh: Any) -> Surface | None:
+    """The triangles of a mesh with its colours; None if it has none."""
+    vertices = np.array(mesh.vertices, dtype=np.float64)
+    triangles = np.array(mesh.faces, dtype=np.int64)
+    if not len(triangles):
+        return None
+    if (vertices.shape[1:], triangles.shape[1:]) != ((3,), (3,)):
+        raise InputError(
+            f"{loaded.path}: vertices of shape {vertices.shape} and triangles of shape {triangles.shape}, "
+            "wanted three numbers each"
+        )
+    if triangles.min() < 0 or triangles.max() >= len(vertices):
+        raise InputError(
+            f"{loaded.path}: a face names vertex {triangles.max()} (from {triangles.min()}), found "
+            f"{len(vertices)} vertices"
+        )
+    if loaded.materials is not None:
+        return _gltf_surface(loaded, mesh, vertices, triangles)
+    material = getattr(mesh.visual, "material", None)
+    uv, texture = getattr(mesh.visual, "uv", None), loaded.texture(getattr(material, "image", None))
+    if texture is not None:
+        if uv is None:
+            return Surface(vertices, triangles)  # the material's colour would only be multiplied
+        uv = _checked_uv(loaded.path, uv, vertices)
+        return Surface(vertices, triangles, uv, texture)
+    colors, corners = _colors(loaded.path, mesh, triangles)
+    return Surface(vertices, triangles, colors=colors, corners=corners)
+
+
+def _checked_uv(path: Path, raw: Any, vertices: Floats) -> Floats:
+    """Texture coordinates (V, 2); vertices without finite ones become NaN."""
+    uv: Floats = np.array(raw, dtype=np.float64)
+    if uv.shape != (len(vertices), 2):
+        raise InputError(f"{path}: {len(uv)} texture coordinates, wanted {len(vertices)}")
+    is_wrong: NDArray[np.bool_] = ~np.all(np.abs(uv) < 1e6, axis=1)
+    vertices[is_wrong], uv[is_wrong] = np.nan, 0.0
+    return uv
+
+
+def _gltf_surface(loaded: Loaded, mesh: Any, vertices: Floats, triangles: NDArray[np.int64]) -> Surface:
+    visual, path, materials = mesh.visual, loaded.path, loaded.materials or []
+    material = materials[int(visual.material.name)]
+    texture = loaded.texture(visual.material.baseColorTexture)
+    if material.has_texture and (texture is None or visual.uv is None):
+        raise InputError(f"{path}: a texture or its coordinates are missing, {WANTED}")
+    raw = visual.vertex_attributes.get("color")
+    if raw is None and not material.is_given:
+        return Surface(vertices, triangles)
+    uv = None if texture is None else _checked_uv(path, visual.uv, vertices)
+    factor = np.array([material.factor])
+    if raw is not None:
+        colors, corners = _fractions(path, raw, len(vertices)) * factor, triangles
+    elif texture is not None and np.all(factor == 1.0):
+        return Surface(vertices, triangles, uv, texture)
+    else:
+        colors, corners = factor, np.broadcast_to(np.int64(0), triangles.shape)
+    return Surface(vertices, triangles, uv, texture, colors, corners, is_linear=True)
+
+
+def _colors(
+    path: Path, mesh: Any, triangles: NDArray[np.int64]
+) -> tuple[Floats, NDArray[np.int64]] | tuple[None, None]:
+    """Colours (C, 3) of vertices, faces or the material, and the corners' (T, 3) rows in them."""
+    of_vertices = mesh.vertex_attributes.get("color")
+    if of_vertices is not None:
+        return _fractions(path, of_vertices, len(mesh.vertices)), triangles
+    of_faces = mesh.face_attributes.get("color")
+    if of_faces is not None:
+        rows = np.broadcast_to(np.arange(len(triangles))[:, None], triangles.shape)
+        return _fractions(path, of_faces, len(triangles)), rows
+    material: Any = getattr(mesh.visual, "material", None)
+    if "kd" in getattr(material, "kwargs", {}):
+        color = np.array(material.diffuse[:3], dtype=np.float64)[None] / 255.0
+        return color, np.broadcast_to(np.int64(0), triangles.shape)
+    return None, None
+
+
+def _fractions(path: Path, raw: Any, count: int) -> Floats:
+    """Colours (N, 3) in [0, 1] of a range that follows from their type."""
+    colors = np.array(raw)
+    if colors.ndim != 2 or len(colors) != count or colors.shape[1] < 3:
+        raise InputError(f"{path}: colours of shape {colors.shape}, wanted {count} rows of red green blue")
+    fractions: Floats = colors[:, :3] / BRIGHTEST.get(colors.dtype.str[1:], 1.0)
+    if not np.all((fractions >= 0.0) & (fractions <= 1.0)):
+        raise InputError(f"{path}: a colour of {np.abs(colors).max():g}, wanted 0 to 1 or bytes")
+    return np.asarray(fractions, dtype=np.float64)
+
+
+MESH = Format("OBJ, GLB and glTF meshes", frozenset({".obj", ".glb", ".gltf"}), has_glb_magic, open_mesh)

@@ -1,0 +1,165 @@
+"""Meshes read by trimesh, and what it passes over in silence checked before and after."""
+
+import logging
+import re
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib import import_module
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+from ...errors import InputError
+from ...runtime.optional import library
+from .mesh_files import Beside
+from .mesh_gltf import Material, narrow
+from .mesh_texture import Texture, check_image, first_line, own_limit, texture_of
+
+WANTED = "wanted a mesh with textures, vertex colours or materials"
+# faces whose indices count back from the last vertex, or are 0; trimesh would take wrong vertices
+ODD_FACE = re.compile(rb"^f(?=[ \t])[^\n]*?[ \t/](?:-|0+[ \t/\r\n])", re.MULTILINE)
+# trimesh knows a line by its very first letters and one space, and finds `usemtl` in comments too
+ODD_STARTS = (
+    (re.compile(rb"\\\r?\n"), b" "),  # a line that goes on in the next
+    (re.compile(rb"\n[ \t]+"), b"\n"),
+    (re.compile(rb"\n#[^\n]*"), b"\n"),
+    (re.compile(rb"\n(v[tn]?|f|usemtl|mtllib)\t"), rb"\n\1 "),
+)
+LIBRARY_LINE = re.compile(rb"^[ \t]*mtllib[ \t]+(.*?)[ \t\r]*$", re.MULTILINE)
+TEXTURE_LINE = re.compile(r"^[ \t]*map_Kd[ \t]+(.*?)[ \t\r]*$", re.MULTILINE | re.IGNORECASE)
+TEXTURE_COMMENT = re.compile(r"TextureFile[ \t]*(.*?)[ \t\r]*$", re.MULTILINE | re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """What trimesh made of a file."""
+
+    path: Path
+    scene: Any  # trimesh.Scene
+    materials: list[Material] | None = None  # of glTF, named by their rows
+    textures: dict[int, Texture | None] = field(default_factory=dict)  # by their images' identity
+
+    def texture(self, image: Any) -> Texture | None:
+        """The texture in an image, the same one for all surfaces that share it."""
+        if id(image) not in self.textures:
+            self.textures[id(image)] = texture_of(self.path, image)
+        return self.textures[id(image)]
+
+
+def load_gltf(path: Path, content: bytes) -> Loaded:
+    """A glTF or GLB file."""
+    library(path, "PIL.Image")
+    beside = Beside(path)
+    narrowed = narrow(content, beside)
+    return Loaded(path, _scene(beside, narrowed.content, "gltf"), narrowed.materials)
+
+
+def load_obj(path: Path, content: bytes) -> Loaded:
+    """An OBJ file with its materials."""
+    library(path, "PIL.Image")
+    try:
+        content.decode()
+    except UnicodeDecodeError:
+        content = content.decode("latin-1").encode()  # names in an older code
+    content = b"\n" + content
+    for odd_start, plain in ODD_STARTS:
+        content = odd_start.sub(plain, content)
+    odd = ODD_FACE.search(content)
+    if odd:
+        raise InputError(f"{path}: a face {odd[0][:40].decode('latin-1')!a}, wanted indices from 1 upwards")
+    beside = Beside(path)
+    _check_libraries(beside, content)
+    return Loaded(path, _scene(beside, content, "obj"))
+
+
+def _check_libraries(beside: Beside, content: bytes) -> None:
+    """Refuse materials that trimesh would do without."""
+    names = sorted(set(LIBRARY_LINE.findall(content)))
+    if len(names) > 1:
+        raise InputError(f"{beside.path}: names {len(names)} files of materials, wanted one")
+    for name in names:
+        text = beside.get(name.decode()).decode("utf-8", "replace")
+        _check_textures(beside, TEXTURE_LINE.findall(text))
+
+
+def _check_textures(beside: Beside, names: list[str]) -> None:
+    for name in sorted(set(names)):
+        check_image(beside.path, ascii(name[:100]), beside.get(name))
+
+
+def _with_raw_colors(parsed: dict[str, Any]) -> dict[str, Any]:
+    """What a loader of trimesh gives, its colours moved to where no range is guessed and none is cut off."""
+    for mesh in (parsed, *parsed.get("geometry", {}).values()):
+        if "faces" in mesh:
+            mesh["process"] = False
+        for kind in ("vertex", "face"):
+            colors = mesh.pop(f"{kind}_colors", None)
+            if colors is not None:
+                mesh[f"{kind}_attributes"] = {"color": colors}
+    return parsed
+
+
+def _scene(beside: Beside, content: bytes, kind: str, has_texture: bool = True) -> Any:
+    trimesh = library(beside.path, "trimesh")
+    try:
+        with own_limit(beside.path), _strict():
+            # a texture's corners are told apart only where there is a texture: colours go by vertices
+            options = {"fix_texture": has_texture} if kind == "ply" else {}
+            load = getattr(import_module(f"trimesh.exchange.{kind}"), f"load_{kind}")
+            parsed = load(BytesIO(content), resolver=beside, **options)
+            scene = trimesh.load_scene(_with_raw_colors(parsed))
+    except InputError:
+        raise
+    except Exception as error:  # whatever trimesh stumbles over
+        if beside.refusal is None:
+            text = f"{beside.path}: trimesh can't read it ({first_line(error)}), {WANTED}"
+            raise InputError(text) from error
+    if beside.refusal is not None:
+        raise beside.refusal
+    return scene
+
+
+@contextmanager
+def _strict() -> Iterator[None]:
+    """Make an error of NumPy's warning that it stopped at what is no number; keep trimesh from printing."""
+    logger = logging.getLogger("trimesh")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings(
+            "error", message="string or file could not be read", category=DeprecationWarning
+        )
+        try:
+            yield
+        finally:
+            logger.setLevel(level)
+
+
+def load_ply(path: Path) -> Loaded:
+    """A PLY file with faces."""
+    library(path, "PIL.Image")
+    content = path.read_bytes()
+    beside = Beside(path)
+    header = content.partition(b"end_header")[0].decode("utf-8", "replace")
+    textures = TEXTURE_COMMENT.findall(header)
+    if len(textures) > 1:
+        raise InputError(f"{path}: names {len(textures)} textures, wanted one")
+    _check_textures(beside, textures)
+    loaded = Loaded(path, _scene(beside, content, "ply", bool(textures)))
+    for mesh in loaded.scene.geometry.values():
+        if "_ply_raw" in mesh.metadata:
+            _check_ply(path, mesh.metadata["_ply_raw"])
+    return loaded
+
+
+def _check_ply(path: Path, elements: dict[str, Any]) -> None:
+    """Refuse a file with fewer rows than promised."""
+    for name in ("vertex", "face"):
+        data, count = elements[name].get("data"), elements[name]["length"]
+        columns = data.values() if isinstance(data, dict) else [data]
+        found = min((len(column) for column in columns if column is not None), default=0)
+        if found != count:
+            raise InputError(f"{path}: the header promises {count} rows of '{name}', found {found}")

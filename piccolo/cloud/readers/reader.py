@@ -1,0 +1,60 @@
+"""What a reader hands on: a file's points as they stand there, a chunk at a time."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..label_colors import Labels
+
+CHUNK = 1 << 20  # points that a reader hands on at once, at most
+CUT = "the file was cut while it was read, wanted a whole file"
+
+# points (N, 3) in the file's unit, and a number (N,) of each: intensity or label
+Measured = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """What the user wants of a reader."""
+
+    intensity_as_gray: bool = False  # take intensity for a gray where a file has no colours
+    labels: Labels | None = None  # take the points' labels for their colours
+    scale: float = 1.0  # metres per unit of the file, for what counts by metres; points stay in its unit
+
+
+PLAIN = ReadOptions()
+
+
+@dataclass(frozen=True)
+class RawCloud:
+    """Points in the file's order and unit, not yet checked."""
+
+    points_world: NDArray[np.float64]  # (N, 3) in the file's unit, maybe NaN or infinite
+    colors: NDArray[np.uint8]  # (N, 3) RGB
+
+
+@dataclass(frozen=True)
+class PointSource:
+    """A file whose header has been checked, and the way to its points."""
+
+    path: Path
+    read_chunks: Callable[[], Iterator[RawCloud]]  # each call anew; InputError where the data break
+    num_points: int | None = None  # for the progress; None if only reading can tell
+    warnings: tuple[str, ...] = ()  # one line each, for the user: what was decided about this file
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format and its reader."""
+
+    name: str
+    suffixes: frozenset[str]  # lower case, with the dot
+    has_magic: Callable[[bytes], bool]  # of a file's first HEAD_SIZE bytes; content goes before names
+    open_source: Callable[[Path, ReadOptions], PointSource]
+    has_labels: bool = False  # the reader knows them
+
+
+HEAD_SIZE = 512  # [byte]

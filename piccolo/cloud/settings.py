@@ -1,0 +1,34 @@
+"""How the files of a cloud are to be understood."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from ..errors import InputError
+from .label_colors import Labels
+
+UpAxis = Literal["auto", "z", "y", "x", "-z", "-y", "-x"]
+
+METRES = {"mm": 0.001, "cm": 0.01, "m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}  # per unit of length
+
+
+@dataclass(frozen=True)
+class CloudSettings:
+    """How the files of a cloud are to be understood."""
+
+    scale: float = 1.0  # metres per unit of the files
+    up: UpAxis = "auto"  # the axis that points up; auto: z, or what the cloud's own planes say
+    intensity_as_gray: bool = False  # where a file has no colours
+    labels: Labels | None = None  # the points' labels are taken for their colours
+
+    def __post_init__(self) -> None:
+        """Refuse a scale that means nothing, and two things to make colours of."""
+        if self.intensity_as_gray and self.labels:
+            raise InputError("--labels, --intensity-as-gray: found both, wanted one of them")
+        if not (math.isfinite(self.scale) and self.scale > 0.0):
+            raise InputError(
+                f"--scale: found {self.scale}, wanted a number above 0 (metres a unit of the file)"
+            )
+
+
+IN_METRES = CloudSettings()

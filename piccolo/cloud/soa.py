@@ -1,0 +1,63 @@
+"""The points as kernels read them: structure of arrays, colours packed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..geometry.pose import Array, Pose
+
+FARTHEST = 1e7  # [m] from the local origin; squares stay finite in float32 and the loss is inf beyond
+
+
+@dataclass(frozen=True)
+class PackedPoints:
+    """Coloured points, one contiguous array a coordinate, in the order in which they are to be summed."""
+
+    x: NDArray[np.float32]  # (N,) [m]
+    y: NDArray[np.float32]  # (N,) [m]
+    z: NDArray[np.float32]  # (N,) [m]
+    rgbx: NDArray[np.int32]  # (N,) as piccolo.sampling.pack_rgbx
+
+    def __len__(self) -> int:
+        """How many points there are."""
+        return len(self.x)
+
+    def take(self, indices: NDArray[np.integer] | slice) -> "PackedPoints":
+        """The points at `indices`, in that order."""
+        return PackedPoints(self.x[indices], self.y[indices], self.z[indices], self.rgbx[indices])
+
+
+@dataclass(frozen=True)
+class LocalCloud:
+    """A cloud's points near a local origin, and where that is: x_local = R (x_world - origin_world)."""
+
+    points: PackedPoints
+    R_local_from_world: Array  # (3, 3) turns the axis that --up names, or the map's up, to z; else identity
+    origin_world: Array  # (3,) [m]
+    warnings: tuple[str, ...]
+
+    def from_world(self, pose: Pose) -> Pose:
+        """A pose of the world in the frame of `points`; one too far for float32 is an InputError."""
+        center_world = pose.center_world
+        if not np.abs(center_world - self.origin_world).max() < FARTHEST:
+            text = (
+                f"found a camera at {center_world.tolist()}, wanted one within {FARTHEST:.0e} m of the cloud"
+            )
+            raise InputError(text)
+        R = self.R_local_from_world
+        return Pose(pose.R_cam_from_world @ R.T, R @ (center_world - self.origin_world))
+
+    def to_world(self, pose: Pose) -> Pose:
+        """A pose of the frame of `points` in the world."""
+        R = self.R_local_from_world
+        return Pose(pose.R_cam_from_world @ R, R.T @ pose.center_world + self.origin_world)
+
+
+def pack_points(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> PackedPoints:
+    """Points (N, 3) [m] with colours (N, 3) as PackedPoints."""
+    x, y, z = np.ascontiguousarray(points.T, dtype=np.float32)
+    rgbx = np.ones((len(points), 4), dtype=np.uint8)
+    rgbx[:, :3] = colors
+    return PackedPoints(x, y, z, rgbx.view("<i4")[:, 0].astype(np.int32, copy=False))

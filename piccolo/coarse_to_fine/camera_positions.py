@@ -1,0 +1,103 @@
+"""Where a camera can be: free space at a camera's height above something that carries it."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ..cloud.octree import Octree
+from ..runtime.threads import Workers
+from .view import ViewKind, filled_shares, thread_scratch
+
+MIN_CLEARANCE = 0.25  # [m] a camera is not nearer to a surface
+MIN_COVERAGE = 0.55  # share of the sphere in which something is seen: flat ground or a roof alone fills half
+OPEN_COVERAGE = 0.3  # the same where hardly any place is closed in: open land
+MIN_ENCLOSED = 0.2  # share of the free places that are closed in, else the land counts as open
+GLANCE_VIEW = ViewKind(num_rings=12, stats_rings=12, sigma_deg=22.0, voxel_per_range=1 / 8)
+MIN_HEIGHT, MAX_HEIGHT = 0.3, 2.4  # [m] above a surface that can carry a tripod or a person
+SUPPORT_RADIUS = 0.9  # [m] the floor right below a scanner is never scanned
+STOREY = 2.6  # [m] a floor is not farther below a camera
+SURFACE_VOXEL = 0.16  # [m]
+COARSE_SPACING = 0.6  # [m] of the grid; the half of it where surfaces are near
+NEAR = 0.3  # [m] clearance below which the grid is refined
+BLOCK = 64  # views a thread makes at a time
+
+
+def top_surfaces(octree: Octree) -> NDArray[np.float32]:
+    """Voxel means (N, 3) above which the next two voxels are empty."""
+    xyz = octree.level(SURFACE_VOXEL)[:, :3]
+    ijk = np.floor(xyz / SURFACE_VOXEL).astype(np.int64)
+    ijk -= ijk.min(axis=0) - 1
+    shape = ijk.max(axis=0) + 4
+    code = (ijk[:, 0] * shape[1] + ijk[:, 1]) * shape[2] + ijk[:, 2]
+    is_covered = np.isin(code + 1, code) | np.isin(code + 2, code)
+    return np.asarray(xyz[~is_covered])
+
+
+def supported_cells(surfaces: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Cells (N, 3) of the coarse grid whose centres are at a camera's height above a surface (M, 3)."""
+    s = COARSE_SPACING
+    reach = int(np.ceil(SUPPORT_RADIUS / s))
+    base = np.floor(surfaces / s).astype(np.int64)
+    base[:, 2] = np.ceil((surfaces[:, 2] + MIN_HEIGHT) / s - 0.5)
+    base = np.unique(base, axis=0)
+    around = np.arange(-reach, reach + 1)
+    layers = np.arange(int(np.ceil((MAX_HEIGHT - MIN_HEIGHT) / s)))
+    steps = np.stack(np.meshgrid(around, around, layers, indexing="ij"), axis=-1).reshape(-1, 3)
+    gap = np.maximum(np.abs(steps[:, :2]) - 0.5, 0.0) * s
+    steps = steps[np.hypot(gap[:, 0], gap[:, 1]) < SUPPORT_RADIUS]
+    return np.asarray(np.unique((base[:, None] + steps).reshape(-1, 3), axis=0))
+
+
+def coverage(octree: Octree, centers: NDArray[np.floating[Any]], workers: Workers) -> NDArray[np.float32]:
+    """Share of the sphere (N,) around each centre (N, 3) that is not empty, at a glance."""
+    share = np.empty(len(centers), np.float32)
+    kind = GLANCE_VIEW.arrays
+
+    def glance(lo: int) -> None:
+        part = slice(lo, lo + BLOCK)
+        voxels = GLANCE_VIEW.voxel_per_range
+        filled_shares(octree.arrays(), centers[part], voxels, kind, thread_scratch(), share[part])
+
+    list(workers.each(glance, range(0, len(centers), BLOCK), "find free space"))
+    return share
+
+
+def candidate_centers(octree: Octree, workers: Workers) -> NDArray[np.float64]:
+    """Positions (N, 3) [m] in free space, 0.6 m apart, or 0.3 m where surfaces are near."""
+    tree = cKDTree(octree.level(0.08)[:, :3], balanced_tree=False, compact_nodes=False)
+    cells = supported_cells(top_surfaces(octree))
+    middle = (cells + 0.5) * COARSE_SPACING
+    clearance, _ = tree.query(middle, workers=workers.num_threads)
+    share = coverage(octree, middle, workers)
+    is_free = clearance > MIN_CLEARANCE
+    is_open = np.mean(share[is_free] > MIN_COVERAGE) < MIN_ENCLOSED if is_free.any() else False
+    min_coverage = OPEN_COVERAGE if is_open else MIN_COVERAGE
+    is_enclosed = share > min_coverage
+    is_tight = (clearance < NEAR) & (is_enclosed | ~is_free)
+    kept = middle[~is_tight & is_free & is_enclosed]
+
+    # Nothing of a cell is free if its centre is deeper in a surface than the cell is wide.
+    half = COARSE_SPACING / 2
+    corners = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
+    is_split = is_tight & (clearance + 0.87 * COARSE_SPACING > MIN_CLEARANCE)
+    finer = (2 * cells[is_split][:, None] + corners).reshape(-1, 3)
+    middle = (finer + 0.5) * half
+    clearance, _ = tree.query(middle, workers=workers.num_threads)
+    middle = middle[clearance > MIN_CLEARANCE]
+    return np.concatenate([kept, middle[coverage(octree, middle, workers) > min_coverage]])
+
+
+def heights_above_floor(octree: Octree, centers: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Height (N,) [m] of each centre (N, 3) above the floor: the lowest surface below in its storey.
+
+    inf where there is none within SUPPORT_RADIUS and STOREY.
+    """
+    surfaces = top_surfaces(octree)
+    near = cKDTree(surfaces[:, :2]).query_ball_point(centers[:, :2], SUPPORT_RADIUS)
+    heights = np.full(len(centers), np.inf)
+    for k, indices in enumerate(near):
+        gaps = centers[k, 2] - surfaces[indices, 2]
+        heights[k] = gaps[(gaps > 0.0) & (gaps < STOREY)].max(initial=-np.inf)
+    return np.where(np.isfinite(heights), heights, np.inf)

@@ -1,0 +1,141 @@
+"""From voxels to cells of the sphere: which voxels, where they fall, what is in front, how colours vary."""
+
+import math
+
+import numpy as np
+
+from ..geometry.sphere import atan2
+from ..panorama.channels import opponent, per_deviation
+from ..runtime.jit import F0, F1, HALF, kernel
+
+PI = np.float32(math.pi)
+FAR = np.float32(1e30)
+
+
+@kernel
+def collect(nodes, first_child, level_start, leaf_size, center, voxel_per_range, found, directions):
+    """Write the nodes that, seen from `center`, are as small as asked, or leaves; returns how many.
+
+    `directions` (3, N) get the positions relative to the centre [m].
+    """
+    num_levels = len(level_start) - 1
+    stack = np.empty(8 * num_levels, np.int32)
+    levels = np.empty(8 * num_levels, np.int32)
+    cx, cy, cz = np.float32(center[0]), np.float32(center[1]), np.float32(center[2])
+    per2 = np.float32(1.0 / (voxel_per_range * voxel_per_range))
+    min_d2 = np.empty(num_levels, np.float32)
+    for level in range(num_levels):
+        size = np.float32(leaf_size * 2.0 ** (num_levels - 1 - level))
+        min_d2[level] = size * size * per2
+    min_d2[num_levels - 1] = F0
+    count = 0
+    for root in range(level_start[1]):
+        stack[0] = root
+        levels[0] = 0
+        top = 1
+        while top > 0:
+            top -= 1
+            node = stack[top]
+            level = levels[top]
+            dx, dy, dz = nodes[node, 0] - cx, nodes[node, 1] - cy, nodes[node, 2] - cz
+            if dx * dx + dy * dy + dz * dz >= min_d2[level]:
+                if count < len(found):
+                    found[count] = node
+                    directions[0, count], directions[1, count], directions[2, count] = dx, dy, dz
+                    count += 1
+            else:
+                for child in range(first_child[node], first_child[node + 1]):
+                    stack[top] = child
+                    levels[top] = level + 1
+                    top += 1
+    return count
+
+
+@kernel
+def locate(X, Y, Z, num_columns, first, cells, ranges, turns):
+    """Write the cell and the range [m] of each position relative to the centre; `turns` is scratch."""
+    num_rings = np.float32(len(num_columns))
+    per_pi = np.float32(len(num_columns) / math.pi)
+    per_turn = np.float32(0.5 / math.pi)
+    # Two loops: the arithmetic is vectorised, the look-ups that follow can't be.
+    for i in range(len(cells)):
+        x, y, z = X[i], Y[i], Z[i]
+        rho2 = x * x + y * y
+        ring = (HALF * PI - atan2(z, math.sqrt(rho2))) * per_pi
+        cells[i] = np.int32(min(max(ring, F0), num_rings - F1))
+        turns[i] = atan2(y, x) * per_turn + HALF
+        ranges[i] = math.sqrt(rho2 + z * z)
+    for i in range(len(cells)):
+        ring = cells[i]
+        n = num_columns[ring]
+        cells[i] = first[ring] + min(np.int32(turns[i] * np.float32(n)), n - np.int32(1))
+
+
+@kernel
+def average_cells(nodes, found, directions, cells, ranges, front, sums):
+    """Write (cells, 8): sums of x, y, z, r, g, b and the count of each cell's front, and its range."""
+    sums[:] = F0
+    sums[:, 7] = FAR
+    for i in range(len(cells)):
+        cell = cells[i]
+        sums[cell, 7] = min(sums[cell, 7], ranges[i])
+    for i in range(len(cells)):
+        cell = cells[i]
+        if ranges[i] <= sums[cell, 7] * front:
+            node = found[i]
+            for k in range(3):
+                sums[cell, k] += directions[k, i]
+                sums[cell, k + 3] += nodes[node, k + 3]
+            sums[cell, 6] += F1
+
+
+@kernel
+def average_colors(sums, kind, offsets, features, weights, moments):
+    """Turn sums into relative positions, opponent channels and weights of cells; add up their moments."""
+    coarse_cell, solid_angle = kind[2], kind[4]
+    moments[:] = F0
+    for c in range(len(sums)):
+        if sums[c, 6] > F0:
+            per = F1 / sums[c, 6]
+            for k in range(3):
+                offsets[k, c] = sums[c, k] * per
+            channels = opponent(sums[c, 3] * per, sums[c, 4] * per, sums[c, 5] * per)
+            w = solid_angle[c]
+            weights[c] = w
+            m = moments[coarse_cell[c]]
+            m[0] += w
+            for k in range(3):
+                features[k, c] = channels[k]
+                m[1 + k] += w * channels[k]
+                m[4 + k] += w * channels[k] * channels[k]
+        else:
+            weights[c] = F0
+            for k in range(3):
+                offsets[k, c] = F0
+                features[k, c] = F0
+
+
+@kernel
+def local_statistics(moments, kind, weights, stats):
+    """Write the local means of the channels and 1 / deviations (6, cells) around cells of positive weight."""
+    row, neighbor, weight = kind[5], kind[6], kind[7]
+    for c in range(len(weights)):
+        if weights[c] <= F0:
+            continue
+        s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = F0
+        for j in range(row[c], row[c + 1]):
+            w = weight[j]
+            m = moments[neighbor[j]]
+            s0 += w * m[0]
+            s1 += w * m[1]
+            s2 += w * m[2]
+            s3 += w * m[3]
+            s4 += w * m[4]
+            s5 += w * m[5]
+            s6 += w * m[6]
+            s7 += w * m[7]  # always 0: eight sums fill a vector register
+        per = F1 / s0
+        stats[0, c], stats[1, c], stats[2, c] = s1 * per, s2 * per, s3 * per
+        stats[3, c] = per_deviation(s1 * per, s4 * per)
+        stats[4, c] = per_deviation(s2 * per, s5 * per)
+        stats[5, c] = per_deviation(s3 * per, s6 * per)

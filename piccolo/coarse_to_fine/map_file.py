@@ -1,0 +1,111 @@
+"""A prepared map on disk: a NumPy archive, and the cache of such files.
+
+A file of another format, of other sources, or damaged in any byte (each member of an archive has a checksum)
+is never trusted: it is made anew.
+"""
+
+import hashlib
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+
+import numpy as np
+
+from ..cloud.octree import Octree
+from ..cloud.settings import CloudSettings
+from ..errors import InputError
+from ..runtime.atomic import replacing
+from ..runtime.jit import SOURCE_DIGEST, cache_root, remove_stale
+from ..runtime.stopwatch import Stopwatch
+from .scan_map import ScanMap
+
+FORMAT = "piccolo-map/1"
+ARRAYS = [f.name for f in fields(ScanMap) if f.name not in ("octree", "warnings")]
+ZIP_MAGIC = b"PK\x03\x04"
+# The first member of a map: its name and where that stands, and the beginning of its value somewhere behind.
+FIRST_NAME, FIRST_NAME_AT = b"format.npy", 30
+FIRST_VALUE, FIRST_VALUE_WITHIN = FORMAT.partition("/")[0].encode("utf-32-le"), 512
+
+
+def save_map(scan_map: ScanMap, path: Path) -> None:
+    """Write a map to `path`, whole or not at all."""
+    members = {name: getattr(scan_map, name) for name in ARRAYS}
+    members.update({f"octree_{name}": value for name, value in asdict(scan_map.octree).items()})
+    with replacing(path) as file:
+        np.savez(
+            file,
+            format=np.array(FORMAT),
+            sources=np.array(SOURCE_DIGEST),
+            warnings=np.array(scan_map.warnings, dtype=np.str_),
+            allow_pickle=False,
+            **members,
+        )
+
+
+def is_map_file(path: Path) -> bool:
+    """True if the file begins as `save_map` writes it, of whatever version; clouds may be archives too.
+
+    The first member's name or its value is enough, so that a damaged map is still refused as a map.
+    """
+    with path.open("rb") as file:
+        head = file.read(FIRST_VALUE_WITHIN)
+    has_name = head.startswith(FIRST_NAME, FIRST_NAME_AT)
+    return head.startswith(ZIP_MAGIC) and (has_name or FIRST_VALUE in head)
+
+
+def load_map(path: Path) -> ScanMap:
+    """Read what `save_map` wrote; InputError for anything else."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            members = {name: archive[name] for name in archive.files}
+        if str(members["format"]) != FORMAT or str(members["sources"]) != SOURCE_DIGEST:
+            raise InputError(f"{path}: found a map of another version, wanted one by this; prepare it again")
+        octree = Octree(
+            nodes=members["octree_nodes"],
+            first_child=members["octree_first_child"],
+            level_start=members["octree_level_start"],
+            leaf_size=float(members["octree_leaf_size"]),
+        )
+        warnings = tuple(str(line) for line in members["warnings"])
+        return ScanMap(octree=octree, warnings=warnings, **{name: members[name] for name in ARRAYS})
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: found {error}, wanted a whole map by tools/prepare_map.py") from error
+
+
+def content_key(paths: Sequence[Path], settings: CloudSettings) -> str:
+    """Name for the map of a cloud's files: by what is in them and the settings, wherever they lie."""
+    digests = sorted(_file_digest(path) for path in paths)
+    digest = hashlib.sha256(" ".join([FORMAT, SOURCE_DIGEST, repr(settings), *digests]).encode())
+    return digest.hexdigest()[:32]
+
+
+def _file_digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def cached_map(folder: Path | None, key: str, build: Callable[[], ScanMap], watch: Stopwatch) -> ScanMap:
+    """The map named `key` of a cache folder, or built and put there; the user's cache if `folder` is None.
+
+    Two processes may build one map at once: each writes its own file whole, the last stays, both are equal.
+    """
+    folder = folder or cache_root() / "maps"
+    path = folder / f"{key}.npz"
+    if path.exists():
+        try:
+            with watch.stage("read"):
+                scan_map = load_map(path)
+        except InputError:
+            path.unlink(missing_ok=True)
+        else:
+            path.touch()
+            return scan_map
+    scan_map = build()
+    with watch.stage("prepare"):
+        folder.mkdir(parents=True, exist_ok=True)
+        remove_stale(folder)
+        save_map(scan_map, path)
+    return scan_map

@@ -1,0 +1,49 @@
+"""What the user knows beforehand, as fewer positions and fewer rotations."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .camera_positions import COARSE_SPACING, heights_above_floor
+from .scan_map import ScanMap
+from .settings import Prior
+
+
+def narrowed(scan_map: ScanMap, prior: Prior) -> ScanMap:
+    """The map with only the candidates that the prior allows, by half a grid spacing more than it says."""
+    is_allowed = np.ones(len(scan_map.centers), dtype=bool)
+    if prior.near_world is not None and prior.radius is not None:
+        near = scan_map.R_map_from_world @ (np.array(prior.near_world) - scan_map.origin_world)
+        distance = np.linalg.norm(scan_map.centers - near, axis=1)
+        is_allowed &= distance <= prior.radius + COARSE_SPACING / 2
+    if prior.height is not None:
+        heights = heights_above_floor(scan_map.octree, scan_map.centers)
+        low, high = prior.height[0] - COARSE_SPACING / 2, prior.height[1] + COARSE_SPACING / 2
+        is_allowed &= (heights >= low) & (heights <= high)
+    if is_allowed.all():
+        return scan_map
+    index = np.cumsum(is_allowed) - 1
+    is_kept = is_allowed[scan_map.sparse]
+    return replace(
+        scan_map,
+        centers=scan_map.centers[is_allowed],
+        offsets=scan_map.offsets[is_allowed],
+        offset_unit=scan_map.offset_unit[is_allowed],
+        features=scan_map.features[is_allowed],
+        is_seen=scan_map.is_seen[is_allowed],
+        sparse=index[scan_map.sparse[is_kept]],
+        wide_features=scan_map.wide_features[is_kept],
+        wide_seen=scan_map.wide_seen[is_kept],
+    )
+
+
+def allowed_rotations(R_cam_from_world: NDArray[np.float64], prior: Prior) -> NDArray[np.float64]:
+    """The rotations (N, 3, 3) whose image centre looks where the prior says; the nearest if none does."""
+    if prior.heading_deg is None:
+        return R_cam_from_world
+    forward = R_cam_from_world[:, 0]  # of the camera's +x, in the world
+    heading = np.arctan2(forward[:, 0], forward[:, 1])
+    off = np.abs((heading - np.radians(prior.heading_deg) + np.pi) % (2.0 * np.pi) - np.pi)
+    is_allowed = off <= max(np.radians(prior.heading_tolerance_deg), float(off.min()))
+    return np.asarray(R_cam_from_world[is_allowed])

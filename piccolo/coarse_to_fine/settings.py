@@ -1,0 +1,73 @@
+"""Settings of the default method, and what is known of a camera beforehand."""
+
+from dataclasses import asdict, dataclass, replace
+
+from ..confidence.confidence import MIN_CONFIDENCE, check_confidence
+from ..errors import InputError
+from ..geometry.rotations import Gravity
+from ..optimize.settings import Solver
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What the user knows beforehand; each narrows the search."""
+
+    near_world: tuple[float, float, float] | None = None  # [m] the camera is within `radius` of this
+    radius: float | None = None  # [m]
+    height: tuple[float, float] | None = None  # [m] least and most above the floor
+    heading_deg: float | None = None  # of the image centre, clockwise from the cloud's +y, as GPano counts
+    heading_tolerance_deg: float = 20.0
+
+    def __post_init__(self) -> None:
+        """Refuse what contradicts itself, naming the option."""
+        if (self.near_world is None) != (self.radius is None):
+            raise InputError("--near, --radius: found one of them, wanted both or none")
+        if self.radius is not None and self.radius <= 0.0:
+            raise InputError(f"--radius: found {self.radius}, wanted metres above 0")
+        if self.height is not None and not self.height[0] < self.height[1]:
+            raise InputError(f"--height: found {list(self.height)}, wanted MIN below MAX")
+        if not 0.0 < self.heading_tolerance_deg <= 180.0:
+            raise InputError(f"--heading-tolerance: found {self.heading_tolerance_deg}, wanted 0 to 180")
+
+
+@dataclass(frozen=True)
+class EngineSettings:
+    """The default engine."""
+
+    gravity: Gravity = "auto"  # auto: as known first, and as unknown if that does not convince
+    solver: Solver = "gauss-newton"  # of the last descent
+    prior: Prior = Prior()
+    num_yaws: int = 48  # gravity known
+    num_rotations: int = 2000  # of SO(3), gravity unknown
+    min_starts: int = 1000
+    max_starts: int = 4000
+    candidates_per_start: int = 4  # a start for so many places, within these bounds
+    poses_per_start: int = 12  # scored poses from which distinct ones are picked, a start
+    num_coarse: int = 400  # poses kept after a short descent from each start
+    num_middle: int = 48  # poses kept after the descent on wide cells
+    num_fine: int = 8  # poses kept after the descent on middle cells
+    num_polished: int = 2  # poses shaken and refined for as long as that helps
+    num_points: int = 30_000  # for the last millimetres
+    min_confidence: float = MIN_CONFIDENCE  # below it a pose is not called localized
+    seed: int = 0  # repeated in the result; nothing is drawn at random
+
+    def __post_init__(self) -> None:
+        """Refuse counts that mean nothing, naming the setting."""
+        for name, value in asdict(self).items():
+            if isinstance(value, int) and name != "seed" and value < 1:
+                raise InputError(f"{name}: found {value}, wanted at least 1")
+        check_confidence(self.min_confidence)
+
+    def wider(self) -> "EngineSettings":
+        """Settings that keep more poses on the way down, for a second look."""
+        return replace(
+            self,
+            num_coarse=2 * self.num_coarse,
+            num_middle=4 * self.num_middle,
+            num_fine=3 * self.num_fine,
+            num_polished=2 * self.num_polished,
+        )
+
+    def to_json(self) -> dict[str, object]:
+        """The settings as they took effect."""
+        return {"preset": "default", **asdict(self)}

@@ -1,0 +1,1 @@
+"""How far a pose can be trusted: score, alternatives, covariance, status."""

@@ -1,0 +1,80 @@
+"""From evidence to a verdict: how likely a pose is right, and what to call it."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..geometry.pose_error import MAX_DISTANCE
+from .covariance import Certainty
+from .score import Evidence
+
+LOCALIZED = "localized"
+AMBIGUOUS = "ambiguous"
+NOT_LOCALIZED = "not_localized"
+MIN_CONFIDENCE = 0.9
+
+LEAST_STD, MOST_STD = 0.003, 0.3  # [m] smaller or larger tells nothing more
+LEAST_SCORE = 0.02
+SAFETY = 2.0  # errors that the whole sphere shares, as by blur, are not in the deviations
+# Logistic regression by tools/calibrate_confidence.py on tools/evaluate_confidence.py --seeds 0 14 and the
+# scene house. Each feature counts in one direction only: for the pose, or (the last two) against it.
+FEATURES = (
+    "margin",
+    "log of the agreement",
+    "log of the score",
+    "log10 of the largest deviation [m]",
+    "has a credible rival",
+)
+DIRECTIONS = (1, 1, 1, -1, -1)
+BIAS, WEIGHTS = 4.94, (6.29, 4.37, 1.10, -1.10, -7.31)
+# The preset paper knows no deviations, and too few rivals to tell places that repeat: learnt without those,
+# on tools/evaluate_confidence.py --preset paper --seeds 0 6 and --seeds 100 104.
+BIAS_OF_PAPER, WEIGHTS_OF_PAPER = -0.20, (6.37, 2.51)
+
+
+def features_of(evidence: Evidence, certainty: Certainty | None) -> NDArray[np.float64]:
+    """What the confidence goes by: FEATURES, or the first two of them with the preset paper."""
+    values = [evidence.margin, math.log(max(evidence.agreement, LEAST_SCORE))]
+    if evidence.halves_distance is not None:
+        std = MOST_STD if certainty is None else min(max(certainty.largest_std, LEAST_STD), MOST_STD)
+        log_score = math.log(max(evidence.score, LEAST_SCORE))
+        values += [log_score, math.log10(std), float(evidence.rival_share > 0.0)]
+    return np.array(values)
+
+
+def confidence_of(evidence: Evidence, certainty: Certainty | None) -> float:
+    """How likely it is that the pose is within 0.1 m and 5 degrees: of those with 0.9, nine in ten.
+
+    It holds where half of all queries have an answer, as in the trials from which it was learnt. A pose whose
+    own deviation makes 0.1 m doubtful has less.
+    """
+    features = features_of(evidence, certainty)
+    is_paper = len(features) < len(FEATURES)
+    bias, weights = (BIAS_OF_PAPER, WEIGHTS_OF_PAPER) if is_paper else (BIAS, WEIGHTS)
+    logit = bias + float(features @ np.array(weights))
+    exactness = 1.0
+    if certainty is not None:
+        exactness = math.erf(MAX_DISTANCE / (SAFETY * certainty.largest_std * math.sqrt(2.0)))
+    return exactness / (1.0 + math.exp(-min(max(logit, -30.0), 30.0)))
+
+
+def verdict(
+    evidence: Evidence, certainty: Certainty | None, has_rivals: bool, min_confidence: float
+) -> tuple[str, float]:
+    """Status and confidence; ambiguous is a pose that would be called localized if it had no rival."""
+    confidence = confidence_of(evidence, certainty)
+    if confidence >= min_confidence:
+        return LOCALIZED, confidence
+    alone = replace(evidence, margin=max(evidence.score, evidence.margin), rival_share=0.0)
+    if has_rivals and confidence_of(alone, certainty) >= min_confidence:
+        return AMBIGUOUS, confidence
+    return NOT_LOCALIZED, confidence
+
+
+def check_confidence(min_confidence: float) -> None:
+    """Refuse a line that no confidence can pass or fail."""
+    if not 0.0 < min_confidence < 1.0:
+        raise InputError(f"--min-confidence: found {min_confidence}, wanted above 0 and below 1")

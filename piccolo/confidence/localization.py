@@ -1,0 +1,22 @@
+"""What a method finds for one panorama."""
+
+from dataclasses import dataclass
+
+from ..geometry.pose import Pose
+from .alternatives import Hypothesis
+from .confidence import NOT_LOCALIZED
+from .covariance import Certainty
+from .score import Evidence
+
+
+@dataclass(frozen=True)
+class Localization:
+    """The best pose for one panorama, in world coordinates, and what speaks for it and against it."""
+
+    status: str = NOT_LOCALIZED
+    confidence: float = 0.0
+    pose: Pose | None = None  # None if there was no start, and then all that follows
+    loss: float | None = None
+    evidence: Evidence | None = None
+    rivals: tuple[Hypothesis, ...] = ()  # poses elsewhere, best first
+    certainty: Certainty | None = None

@@ -1,0 +1,1 @@
+"""Poses, rotations and the spherical camera."""

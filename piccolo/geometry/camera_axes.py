@@ -1,0 +1,49 @@
+"""Other tools' camera axes and angles. Ours: +x the image centre, +y left, +z up.
+
+A matrix other_from_cam takes our camera coordinates to theirs: R_other_from_world = other_from_cam @
+R_cam_from_world, and the camera's position stays as it is.
+"""
+
+import numpy as np
+
+from .pose import Array, Pose, exp_so3
+
+OPTICAL_FROM_CAM = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # right, down, forward
+OPENGL_FROM_CAM = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])  # right, up, back
+CAMERA_AXES = {"optical": OPTICAL_FROM_CAM, "piccolo": np.eye(3)}  # by the name in the options
+DECIMALS = 9  # of degrees
+
+
+def turned(pose: Pose, other_from_cam: Array) -> Pose:
+    """The same camera, its rotation to other axes."""
+    return Pose(other_from_cam @ pose.R_cam_from_world, pose.center_world)
+
+
+def translation(pose: Pose) -> Array:
+    """The t (3,) of x_cam = R x_world + t."""
+    return np.asarray(-pose.R_cam_from_world @ pose.center_world)
+
+
+def R_cam_from_angles(heading_deg: float, pitch_deg: float, roll_deg: float) -> Array:
+    """R_cam_from_world (3, 3) of the angles [deg] that `heading_pitch_roll_deg` gives."""
+    yaw = exp_so3(np.radians([0.0, 0.0, 90.0 - heading_deg]))
+    pitch, roll = exp_so3(np.radians([0.0, -pitch_deg, 0.0])), exp_so3(np.radians([roll_deg, 0.0, 0.0]))
+    return np.asarray((yaw @ pitch @ roll).T)
+
+
+def heading_pitch_roll_deg(pose: Pose) -> tuple[float, float, float]:
+    """Heading in [0, 360), pitch in [-90, 90], roll in (-180, 180], by Photo Sphere XMP's definitions [deg].
+
+    Heading is of the image centre, clockwise from the world's +y; pitch its elevation above the horizon; as
+    roll grows the camera's right side goes down, so the horizon turns counterclockwise in the image:
+    R_world_from_cam = R_z(90 deg - heading) R_y(-pitch) R_x(roll).
+    https://developers.google.com/streetview/spherical-metadata
+    """
+    forward, left, up = pose.R_cam_from_world  # the camera's axes in the world
+    heading = np.arctan2(forward[0], forward[1])
+    pitch = np.arctan2(forward[2], np.hypot(forward[0], forward[1]))
+    # Against the level left of this very heading: right at the zenith too, where any heading would do.
+    level_left = np.array([-np.cos(heading), np.sin(heading), 0.0])
+    roll = np.arctan2(-up @ level_left, left @ level_left)
+    rounded = [round(float(np.degrees(angle)), DECIMALS) for angle in (heading, pitch, roll)]
+    return rounded[0] % 360.0, rounded[1], 180.0 if rounded[2] == -180.0 else rounded[2]

@@ -1,0 +1,1 @@
+"""The sampling loss and the ways to descend on it."""

@@ -1,0 +1,107 @@
+"""A loss surface as a picture over the cloud's plan, and as a file of arrays."""
+
+from dataclasses import dataclass
+from io import BytesIO
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from ..cloud.soa import LocalCloud
+from ..geometry.pose import Array, Pose
+from .loss_surface import LossSurface, PoseGrid
+
+MAX_PIXELS = 1500  # of the plan, the longer way
+MIN_PIXEL = 0.03  # [m]
+MARKS = {"true": ("*", "white", 260), "found": ("X", "red", 110), "lowest": ("o", "none", 130)}
+
+
+@dataclass(frozen=True)
+class Known:
+    """Poses in the frame of the points; None where not known."""
+
+    found: Pose | None
+    true: Pose | None
+
+    @property
+    def all(self) -> list[Pose]:
+        """Those that are known, the true one first."""
+        return [pose for pose in (self.true, self.found) if pose is not None]
+
+
+def plan_shift(placed: LocalCloud) -> Array:
+    """What is to be added to a position (3,) in the frame of the points to have it in the plan's."""
+    return np.asarray(placed.R_local_from_world @ placed.origin_world)
+
+
+def plan_of(placed: LocalCloud, grid: PoseGrid) -> tuple[NDArray[np.float32], tuple[float, ...]]:
+    """Where walls and furniture are, (rows, columns) in [0, 1] from -y, and the edges x0, x1, y0, y1 [m]."""
+    p = placed.points
+    floor, ceiling = np.percentile(p.z, [1.0, 99.0])
+    inside = (p.z > floor + 0.15 * (ceiling - floor)) & (p.z < ceiling - 0.15 * (ceiling - floor))
+    edges = (grid.x[0], grid.x[-1], grid.y[0], grid.y[-1])
+    pixel = max(MIN_PIXEL, (edges[1] - edges[0]) / MAX_PIXELS, (edges[3] - edges[2]) / MAX_PIXELS)
+    bins = [max(1, round((edges[k + 1] - edges[k]) / pixel)) for k in (0, 2)]
+    limits = ((edges[0], edges[1] + 1e-6), (edges[2], edges[3] + 1e-6))
+    counts = np.histogram2d(p.x[inside], p.y[inside], bins=bins, range=limits)[0].T
+    many = max(float(np.percentile(counts[counts > 0], 90.0)) if counts.any() else 1.0, 1.0)
+    return np.minimum(counts / many, 1.0).astype(np.float32), edges
+
+
+def surface_png(surface: LossSurface, grid: PoseGrid, placed: LocalCloud, known: Known, title: str) -> bytes:
+    """The surface over the plan, with the poses known."""
+    shift = plan_shift(placed)
+    plan, edges = plan_of(placed, grid)
+    extent = np.array(edges) + shift[[0, 0, 1, 1]]
+    aspect = (extent[3] - extent[2] + 1.0) / (extent[1] - extent[0] + 1.0)
+    figure = Figure(figsize=(10.0, float(np.clip(8.5 * aspect + 1.0, 4.0, 16.0))), layout="constrained")
+    axes = figure.add_subplot()
+    loss = np.where(np.isfinite(surface.loss), surface.loss, np.nan)
+    x, y = grid.x + shift[0], grid.y + shift[1]
+    mesh = axes.pcolormesh(x, y, loss, cmap="viridis", shading="nearest")
+    pale = np.zeros((*surface.is_free.shape, 4))
+    pale[~surface.is_free] = (1.0, 1.0, 1.0, 0.55)
+    axes.pcolormesh(x, y, pale, shading="nearest")
+    walls = np.zeros((*plan.shape, 4), np.float32)
+    walls[..., 3] = plan
+    axes.imshow(walls, extent=extent.tolist(), origin="lower", interpolation="nearest", zorder=2)
+    row, column = surface.lowest()
+    marks = {"lowest": (x[column], y[row])}
+    for name, pose in (("found", known.found), ("true", known.true)):
+        if pose is not None:
+            marks[name] = (pose.center_world[0] + shift[0], pose.center_world[1] + shift[1])
+    for name, place in marks.items():
+        symbol, color, size = MARKS[name]
+        edge = "red" if color == "none" else "black"
+        axes.scatter(*place, s=size, marker=symbol, facecolor=color, edgecolor=edge, zorder=3, label=name)
+    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title=title)
+    axes.legend(loc="upper right")
+    figure.colorbar(mesh, ax=axes, label="least sampling loss over height and rotation", shrink=0.8)
+    file = BytesIO()
+    figure.savefig(file, format="png", dpi=120)
+    return file.getvalue()
+
+
+def surface_npz(surface: LossSurface, grid: PoseGrid, placed: LocalCloud, known: Known) -> bytes:
+    """The surface and the poses known, as arrays."""
+    shift = plan_shift(placed)
+    nowhere = np.full(3, np.nan)
+    positions = {
+        f"{name}_world": placed.to_world(pose).center_world if pose else nowhere
+        for name, pose in (("found", known.found), ("true", known.true))
+    }
+    rotations = grid.R_cam_from_local @ placed.R_local_from_world
+    file = BytesIO()
+    np.savez_compressed(
+        file,
+        x=grid.x + shift[0],
+        y=grid.y + shift[1],
+        loss=surface.loss,
+        height=surface.height + shift[2],
+        R_cam_from_world=rotations[surface.rotation],
+        is_free=surface.is_free,
+        R_plan_from_world=placed.R_local_from_world,
+        allow_pickle=False,
+        **positions,
+    )
+    return file.getvalue()

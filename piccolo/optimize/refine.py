@@ -1,0 +1,189 @@
+"""Descend on a loss from one start: step 4 of the paper's Algorithm 1, and other solvers."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+
+from ..cloud.soa import PackedPoints
+from ..geometry.pose import Array, Pose, exp_so3, left_jacobian, orthonormal, step
+from ..panorama.texels import Texels
+from ..render.zbuffer import visible_points
+from .sampling_loss import normal_equations, sampling_loss
+from .settings import DescentSettings
+
+MAX_STEP = 0.2  # [rad, m] of Gauss-Newton
+
+Equations = tuple[float, Array, Array]  # loss, its gradient (6,) by a step, normal matrix (6, 6)
+Objective = Callable[[Pose], Equations]
+
+
+@dataclass(frozen=True)
+class Loss:
+    """What a pose is judged by: functions of the points that count and of the pose; small is good."""
+
+    value: Callable[[PackedPoints, Pose], float]
+    equations: Callable[[PackedPoints, Pose], Equations]
+
+
+def sampling_loss_of(texels: Texels) -> Loss:
+    """The paper's sampling loss of a panorama."""
+    return Loss(
+        lambda points, pose: sampling_loss(points, texels, pose),
+        lambda points, pose: normal_equations(points, texels, pose),
+    )
+
+
+# is told the part of the descent, a pose tried, and the loss there
+Watch = Callable[[int, Pose, float], None]
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Where a descent arrived."""
+
+    pose: Pose
+    loss: float  # over the points seen from there
+    num_iterations: int
+
+
+@dataclass
+class Best:
+    """The best pose that a descent has passed."""
+
+    pose: Pose
+    loss: float = np.inf
+
+    def offer(self, pose: Pose, loss: float) -> None:
+        """Keep `pose` if it is better."""
+        if loss < self.loss:
+            self.pose, self.loss = pose, loss
+
+
+@dataclass
+class Adam:
+    """Adam (Kingma and Ba, 2015) on steps (rotation, translation), with the paper's decay of the step."""
+
+    step_size: float  # [rad, m]
+    step_decay: float
+    patience: int
+    mean: Array = field(default_factory=lambda: np.zeros(6))
+    mean_square: Array = field(default_factory=lambda: np.zeros(6))
+    num_updates: int = 0
+    best_loss: float = np.inf
+    num_stalled: int = 0
+
+    def update(self, loss: float, gradient: Array) -> Array:
+        """The step (6,) to take at a place with this loss and gradient (6,)."""
+        self.num_stalled = 0 if loss < self.best_loss else self.num_stalled + 1
+        self.best_loss = min(self.best_loss, loss)
+        if self.num_stalled == self.patience:
+            self.step_size *= self.step_decay
+            self.num_stalled = 0
+        self.num_updates += 1
+        self.mean = 0.9 * self.mean + 0.1 * gradient
+        self.mean_square = 0.999 * self.mean_square + 0.001 * gradient**2
+        mean = self.mean / (1.0 - 0.9**self.num_updates)
+        mean_square = self.mean_square / (1.0 - 0.999**self.num_updates)
+        return np.asarray(-self.step_size * mean / (np.sqrt(mean_square) + 1e-8))
+
+
+def descend_adam(objective: Objective, pose: Pose, adam: Adam, num_iterations: int) -> Best:
+    """The best pose of `num_iterations` steps of `adam`, which is left ready to go on."""
+    best = Best(pose)
+    for _ in range(num_iterations):
+        loss, gradient, _ = objective(pose)
+        if not np.isfinite(loss):
+            break
+        best.offer(pose, loss)
+        pose = step(pose, adam.update(loss, gradient))
+    return best
+
+
+def descend_lbfgs(objective: Objective, start: Pose, num_iterations: int) -> Best:
+    """The best pose of at most `num_iterations` of SciPy's L-BFGS-B.
+
+    Parameters are the rotation vector of a turn of the start, R = exp([w]x) R_start, and the camera's shift.
+    """
+    from scipy.optimize import minimize  # noqa: PLC0415  # Adam need not wait for it: 0.25 s
+
+    best = Best(start)
+
+    def value(parameters: Array) -> tuple[float, Array]:
+        w = parameters[:3]
+        R_cam_from_world = orthonormal(exp_so3(w) @ start.R_cam_from_world)
+        pose = Pose(R_cam_from_world, start.center_world + parameters[3:])
+        loss, gradient, _ = objective(pose)
+        best.offer(pose, loss)
+        by_w = left_jacobian(w).T @ gradient[:3]
+        by_center = R_cam_from_world.T @ gradient[3:]
+        return loss, np.concatenate([by_w, by_center])
+
+    minimize(value, np.zeros(6), jac=True, method="L-BFGS-B", options={"maxiter": num_iterations})
+    return best
+
+
+def descend_gauss_newton(objective: Objective, pose: Pose, num_iterations: int) -> Best:
+    """The best pose of at most `num_iterations` Levenberg-Marquardt steps on the reweighted least squares."""
+    best = Best(pose)
+    loss, gradient, matrix = objective(pose)
+    best.offer(pose, loss)
+    damping = 1e-3
+    for _ in range(num_iterations):
+        damped = matrix + damping * np.diag(np.diag(matrix)) + 1e-12 * np.eye(6)
+        delta = -np.linalg.solve(damped, gradient)
+        # A step of a radian or a metre would leave the region in which the matrix means anything.
+        delta *= min(1.0, MAX_STEP / max(float(np.abs(delta).max()), 1e-12))
+        trial = step(best.pose, np.asarray(delta, dtype=np.float64))
+        loss, trial_gradient, trial_matrix = objective(trial)
+        if loss < best.loss:
+            best.offer(trial, loss)
+            gradient, matrix, damping = trial_gradient, trial_matrix, max(damping * 0.2, 1e-6)
+        else:
+            damping *= 8.0
+        if damping > 1e4 or float(np.abs(delta).max()) < 1e-7:
+            break
+    return best
+
+
+def watched(objective: Objective, watch: Callable[[Pose, float], None]) -> Objective:
+    """The objective, which tells of every place where it is asked."""
+
+    def value(pose: Pose) -> Equations:
+        found = objective(pose)
+        watch(pose, found[0])
+        return found
+
+    return value
+
+
+def unwatched(part: int, pose: Pose, loss: float) -> None:
+    """A descent that nobody watches."""
+
+
+def refine(
+    points: PackedPoints, loss: Loss, start: Pose, settings: DescentSettings, watch: Watch = unwatched
+) -> Refined:
+    """Descend from `start`; the points that the camera does not see are left out anew `num_culls` times.
+
+    A cull changes the function, so that losses before and after it do not compare: the best pose of the last
+    part is what counts.
+    """
+    adam = Adam(settings.step_size, settings.step_decay, settings.patience)
+    bounds = np.linspace(0, settings.num_iterations, settings.num_culls + 1).astype(int)
+    pose = start
+
+    def seen_from(at: Pose) -> PackedPoints:
+        return visible_points(points, at.center_world) if settings.use_visibility else points
+
+    for part, num_iterations in enumerate(np.diff(bounds).tolist()):
+        objective = watched(partial(loss.equations, seen_from(pose)), partial(watch, part))
+        if settings.solver == "adam":
+            adam.best_loss = np.inf
+            pose = descend_adam(objective, pose, adam, num_iterations).pose
+        elif settings.solver == "lbfgs":
+            pose = descend_lbfgs(objective, pose, num_iterations).pose
+        else:
+            pose = descend_gauss_newton(objective, pose, num_iterations).pose
+    return Refined(pose, loss.value(seen_from(pose), pose), settings.num_iterations)

@@ -1,0 +1,166 @@
+"""The panorama made comparable with views: opponent channels, locally normalised, at a few scales."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.sphere import atan2, pixel_rays, solid_angles
+from ..runtime.jit import F0, F1, HALF, kernel
+from . import Panorama
+from .channels import LEVELS_PER_UNIT, OPPONENT, ZERO_LEVEL, per_deviation, standardized
+from .resize import resize
+from .texels import Texels, bilinear_weights, blend
+
+STATS_WIDTH = 128  # [px] local means vary over 10 degrees and more
+LEAST_WEIGHT = np.float32(1e-9)  # of neighbours that count, where hardly any does
+
+
+@dataclass(frozen=True)
+class Scale:
+    """One size of the panorama."""
+
+    width: int  # [px] a multiple of STATS_WIDTH
+    cell_deg: float  # colours are averaged over cells this wide
+    sigma_deg: float  # of the Gaussian in which contrast is judged
+
+
+@lru_cache(maxsize=8)
+def sphere_gaussian(width: int, sigma_deg: float) -> NDArray[np.float32]:
+    """Spectra over the azimuth (W / 2 + 1, H, H) of the Gaussian weights between rows, times solid angle."""
+    rays = pixel_rays(width)
+    sigma = np.radians(sigma_deg)
+    weight = np.empty((width // 2, width // 2, width))
+    for i in range(width // 2):
+        weight[i] = np.exp((rays @ rays[i, 0] - 1) / sigma**2) * solid_angles(width)[:, None]
+    return np.ascontiguousarray(np.fft.rfft(weight, axis=2).real.transpose(2, 0, 1)).astype(np.float32)
+
+
+def blur_sphere(image: NDArray[np.float32], sigma_deg: float) -> NDArray[np.float32]:
+    """Gaussian weighted sums (H, W, C) over the sphere of an equirectangular image (H, W, C)."""
+    spectrum = np.fft.rfft(image, axis=1).astype(np.complex64).transpose(1, 0, 2)
+    gains = sphere_gaussian(image.shape[1], sigma_deg)
+    blurred = (gains @ spectrum.real) + 1j * (gains @ spectrum.imag)
+    return np.ascontiguousarray(
+        np.fft.irfft(blurred.transpose(1, 0, 2), n=image.shape[1], axis=1), np.float32
+    )
+
+
+@kernel
+def block_moments(channels, share, moments):
+    """Write (h, w, 7): weighted sums of 1, the channels and their squares over equal blocks of the image."""
+    step = channels.shape[0] // moments.shape[0]
+    moments[:] = 0
+    for i in range(channels.shape[0]):
+        for j in range(channels.shape[1]):
+            m, w = moments[i // step, j // step], share[i, j]
+            m[0] += w
+            for c in range(3):
+                m[1 + c] += w * channels[i, j, c]
+                m[4 + c] += w * channels[i, j, c] * channels[i, j, c]
+
+
+@kernel
+def pack_standardized(channels, share, stats, texels):
+    """Write padded RGBX texels (H + 2, W + 2): (channel - mean) / deviation in levels, and validity.
+
+    `stats` (h, w, 6) are means and 1 / deviations, read bilinearly; a column of texels is wrapped and a row
+    clamped on each side.
+    """
+    height, width = share.shape
+    per = np.float32(stats.shape[1]) / np.float32(width)
+    for i in range(height):
+        v = min(max((np.float32(i) + HALF) * per - HALF, F0), np.float32(stats.shape[0] - 1))
+        i0 = min(np.int32(v), stats.shape[0] - 2)
+        fv = v - np.float32(i0)
+        for j in range(width):
+            u = (np.float32(j) + HALF) * per - HALF
+            j0 = np.int32(math.floor(u))
+            fu = u - np.float32(j0)
+            j1 = (j0 + 1) % stats.shape[1]
+            j0 = j0 % stats.shape[1]
+            texel = np.int32(0)
+            for c in range(3):
+                mean = (F1 - fv) * ((F1 - fu) * stats[i0, j0, c] + fu * stats[i0, j1, c])
+                mean += fv * ((F1 - fu) * stats[i0 + 1, j0, c] + fu * stats[i0 + 1, j1, c])
+                gain = (F1 - fv) * ((F1 - fu) * stats[i0, j0, 3 + c] + fu * stats[i0, j1, 3 + c])
+                gain += fv * ((F1 - fu) * stats[i0 + 1, j0, 3 + c] + fu * stats[i0 + 1, j1, 3 + c])
+                value = standardized(channels[i, j, c], mean, gain)
+                level = np.int32(value * np.float32(LEVELS_PER_UNIT) + np.float32(ZERO_LEVEL + 0.5))
+                texel |= min(level, np.int32(255)) << np.int32(8 * c)
+            if share[i, j] > HALF:
+                texel |= np.int32(1 << 24)
+            texels[i + 1, j + 1] = texel
+        texels[i + 1, 0], texels[i + 1, width + 1] = texels[i + 1, width], texels[i + 1, 1]
+    texels[0], texels[height + 1] = texels[1], texels[height]
+
+
+@kernel
+def finish_statistics(sums):
+    """Turn weighted sums (h, w, 7) of 1, channels, squares into means and 1 / deviations (h, w, 1:7)."""
+    for i in range(sums.shape[0]):
+        for j in range(sums.shape[1]):
+            s = sums[i, j]
+            per = F1 / max(s[0], LEAST_WEIGHT)
+            for c in range(3):
+                s[1 + c] *= per
+                s[4 + c] = per_deviation(s[1 + c], s[4 + c] * per)
+
+
+def normalized_channels(panorama: Panorama, cell_deg: float, sigma_deg: float) -> Texels:
+    """Opponent channels averaged over `cell_deg`, less the local mean, by the local deviation (`sigma_deg`).
+
+    The width of the panorama is a multiple of STATS_WIDTH.
+    """
+    height, width = panorama.is_valid.shape
+    share = panorama.is_valid.astype(np.float32)
+    channels = cv2.transform(panorama.rgb.astype(np.float32), OPPONENT / np.float32(255.0))
+    if cell_deg * width / 360.0 > 1.5:  # cells wider than pixels: a Gaussian with a cell's second moment
+        sums = blur_sphere(np.dstack([channels * share[..., None], share]), cell_deg / math.sqrt(12.0))
+        channels = sums[..., :3] / np.maximum(sums[..., 3:], LEAST_WEIGHT)
+    moments = np.empty((STATS_WIDTH // 2, STATS_WIDTH, 7), np.float32)
+    block_moments(channels, share, moments)
+    statistics = blur_sphere(moments, sigma_deg)
+    finish_statistics(statistics)
+    texels = np.empty((height + 2, width + 2), np.int32)
+    pack_standardized(channels, share, statistics[..., 1:], texels)
+    return Texels(texels.reshape(-1), width)
+
+
+def comparable(panorama: Panorama, scales: Sequence[Scale]) -> list[Texels]:
+    """The panorama at several scales, widest first, each made from the one before."""
+    images = []
+    for scale in scales:
+        panorama = resize(panorama, scale.width)
+        images.append(normalized_channels(panorama, scale.cell_deg, scale.sigma_deg))
+    return images
+
+
+@kernel
+def sample_channels(texels, width, directions, rotations, samples, validity):
+    """Write channels (rotations, 3, cells), less the zero level, and validity along each turned direction."""
+    stride = np.int32(width + 2)
+    scale = np.float32(width / (2.0 * math.pi))
+    half_u, half_v = HALF * np.float32(width + 1), HALF * np.float32(width // 2 + 1)
+    for k in range(len(rotations)):
+        R = rotations[k]
+        for c in range(len(directions)):
+            d0, d1, d2 = directions[c, 0], directions[c, 1], directions[c, 2]
+            x = R[0, 0] * d0 + R[0, 1] * d1 + R[0, 2] * d2
+            y = R[1, 0] * d0 + R[1, 1] * d1 + R[1, 2] * d2
+            z = R[2, 0] * d0 + R[2, 1] * d1 + R[2, 2] * d2
+            u = half_u - scale * atan2(y, x)
+            v = half_v - scale * atan2(z, math.sqrt(x * x + y * y))
+            j, i = np.int32(u), np.int32(v)
+            bilinear = bilinear_weights(u - np.float32(j), v - np.float32(i))
+            n = i * stride + j
+            t00, t10, t01, t11 = texels[n], texels[n + 1], texels[n + stride], texels[n + stride + 1]
+            is_valid = np.float32(((t00 & t10 & t01 & t11) >> 24) & 1)
+            validity[k, c] = is_valid
+            for ch in range(3):
+                value = blend(t00, t10, t01, t11, bilinear, 8 * ch) - np.float32(ZERO_LEVEL)
+                samples[k, ch, c] = value * is_valid

@@ -1,0 +1,82 @@
+"""The panorama as texels: one int32 a pixel, and the bilinear value and gradient at a continuous pixel."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.sphere import solid_angles
+from ..runtime.jit import F1, scalar
+
+BYTE = np.int32(255)
+
+
+@dataclass(frozen=True)
+class Texels:
+    """An equirectangular image for gathering: a column is wrapped and a row clamped on each side."""
+
+    rgbx: NDArray[np.int32]  # ((H + 2) * (W + 2),) R, G, B from the lowest byte up, X = 1 where valid
+    width: int  # W [px], H = W / 2
+    valid_share: float = 1.0  # of the sphere
+
+    @property
+    def stride(self) -> int:
+        """Texels from one row to the next."""
+        return self.width + 2
+
+
+def pack_rgbx(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = None) -> NDArray[np.int32]:
+    """One int32 (...) for each colour (..., 3): R, G, B from the lowest byte up and 1 where valid on top."""
+    rgbx = np.ones((*rgb.shape[:-1], 4), dtype=np.uint8)
+    rgbx[..., :3] = rgb
+    if is_valid is not None:
+        rgbx[..., 3] = is_valid
+    return rgbx.view("<i4")[..., 0].astype(np.int32, copy=False)
+
+
+def pack_texels(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = None) -> Texels:
+    """Texels of an image (H, W, 3), W = 2 H, with the pixels that count (H, W), all if None."""
+    inner = pack_rgbx(rgb, is_valid)
+    height, width = inner.shape
+    padded = np.empty((height + 2, width + 2), dtype=np.int32)
+    padded[1:-1, 1:-1] = inner
+    padded[1:-1, 0] = inner[:, -1]
+    padded[1:-1, -1] = inner[:, 0]
+    padded[0] = padded[1]
+    padded[-1] = padded[-2]
+    share = 1.0 if is_valid is None else float(solid_angles(width) @ is_valid.sum(axis=1)) / (4.0 * np.pi)
+    return Texels(padded.reshape(-1), width, share)
+
+
+@scalar
+def channel(texel, shift):
+    """The 8-bit channel of a texel as float32; shift 0, 8 or 16."""
+    return np.float32((texel >> shift) & BYTE)
+
+
+@scalar
+def bilinear_weights(fu, fv):
+    """Weights of the texels (0, 0), (1, 0), (0, 1), (1, 1) at the fraction (fu, fv)."""
+    w11 = fu * fv
+    w10 = fu - w11
+    w01 = fv - w11
+    return F1 - fu - w01, w10, w01, w11
+
+
+@scalar
+def blend(t00, t10, t01, t11, weights, shift):
+    """Bilinear value of one channel of four texels."""
+    value = weights[0] * channel(t00, shift) + weights[1] * channel(t10, shift)
+    return value + weights[2] * channel(t01, shift) + weights[3] * channel(t11, shift)
+
+
+@scalar
+def blend_with_gradient(t00, t10, t01, t11, fu, fv, shift):
+    """Bilinear value of one channel of four texels and its derivatives by u and v."""
+    c00 = channel(t00, shift)
+    c10 = channel(t10, shift) - c00
+    c01 = channel(t01, shift)
+    c11 = channel(t11, shift) - c01
+    top = c00 + fu * c10
+    by_v = c01 + fu * c11 - top
+    return top + fv * by_v, c10 + fv * (c11 - c10), by_v

@@ -1,0 +1,93 @@
+"""The paper's method in order, one line a step."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cloud.model import Cloud
+from ..cloud.soa import PackedPoints, pack_points
+from ..confidence.alternatives import Hypothesis, lead, rivals_of
+from ..confidence.confidence import verdict
+from ..confidence.localization import Localization
+from ..confidence.score import Evidence, evidence_at
+from ..geometry.pose import Pose
+from ..geometry.rotations import uniform_rotations, uniform_yaws
+from ..optimize.refine import Loss, Refined, refine, sampling_loss_of
+from ..panorama import Panorama
+from ..panorama.resize import shrink
+from ..panorama.texels import pack_texels
+from ..runtime.stopwatch import Stopwatch
+from ..runtime.threads import Workers
+from .photometric import photometric_loss_of
+from .search import search
+from .settings import PaperSettings
+from .starts import free_grid
+
+
+@dataclass(frozen=True)
+class PaperMap:
+    """What the paper's method prepares once per cloud."""
+
+    points: PackedPoints
+    origin_world: NDArray[np.float64]  # (3,) [m]
+    positions: NDArray[np.float64]  # (M, 3) starts in free space, relative to origin_world [m]
+
+
+def prepare(cloud: Cloud, settings: PaperSettings) -> PaperMap:
+    """Everything that does not depend on the panorama."""
+    points = pack_points(cloud.points, cloud.colors)
+    if (
+        len(points) > settings.max_points
+    ):  # every so many of the Morton order: even in space, as dense as before
+        points = points.take(np.linspace(0, len(points) - 1, settings.max_points).astype(np.int64))
+    return PaperMap(
+        points=points,
+        origin_world=cloud.origin_world,
+        positions=free_grid(points, settings.num_translations, settings.grid_margin),
+    )
+
+
+def loss_of(panorama: Panorama, settings: PaperSettings) -> Loss:
+    """The loss that the settings ask for."""
+    if settings.loss == "photometric":
+        return photometric_loss_of(shrink(panorama, settings.photometric_width))
+    return sampling_loss_of(pack_texels(panorama.rgb, panorama.is_valid))
+
+
+def localize(
+    paper_map: PaperMap, panorama: Panorama, settings: PaperSettings, workers: Workers, watch: Stopwatch
+) -> Localization:
+    """Algorithm 1 of the paper: search, refine, select; then judge what was selected."""
+    points = paper_map.points
+    known = settings.gravity == "known"
+    rotations = (uniform_yaws if known else uniform_rotations)(settings.effective_num_rotations)
+    loss = loss_of(panorama, settings)
+    with watch.stage("search"):
+        starts = search(points, panorama, loss, (paper_map.positions, rotations), settings, workers)
+    with watch.stage("refine"):
+        refined = list(workers.each(lambda s: refine(points, loss, s.pose, settings), starts, "refine"))
+        best = min(refined, key=lambda r: r.loss, default=None)
+    if best is None or not np.isfinite(best.loss):
+        return Localization()
+    with watch.stage("refine"):
+        evidence, rivals = judge(points, panorama, best, refined)
+    status, confidence = verdict(evidence, None, len(rivals) > 0, settings.min_confidence)
+    origin_world = paper_map.origin_world
+    in_world = tuple(replace(r, pose=shifted(r.pose, origin_world)) for r in rivals)
+    return Localization(status, confidence, shifted(best.pose, origin_world), best.loss, evidence, in_world)
+
+
+def shifted(pose: Pose, origin_world: NDArray[np.float64]) -> Pose:
+    """A pose relative to the local origin (3,) [m] in the world."""
+    return replace(pose, center_world=pose.center_world + origin_world)
+
+
+def judge(
+    points: PackedPoints, panorama: Panorama, best: Refined, refined: list[Refined]
+) -> tuple[Evidence, list[Hypothesis]]:
+    """Evidence at the best pose, and its rivals, best first."""
+    evidence = evidence_at(points, panorama, best.pose)
+    others = [Hypothesis(r.pose, evidence_at(points, panorama, r.pose).score) for r in refined]
+    rivals = rivals_of(best.pose, others)
+    return replace(evidence, margin=lead(evidence.score, rivals)), rivals

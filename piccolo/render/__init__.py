@@ -1,0 +1,1 @@
+"""The cloud as a camera sees it: depths, surfaces, pictures."""

@@ -1,0 +1,173 @@
+"""The cloud at a pose as a picture of any size: surfaces closed, what nobody scanned filled or left open."""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cloud.soa import PackedPoints
+from ..geometry.pose import Array, Pose
+from ..runtime.threads import Workers
+from .splatting import MIN_RADIUS_PX, splat
+from .surfels import Surfels, surfels_of
+from .zbuffer import nearest_depth, select_visible
+
+STRIP = 1 << 21  # pixels that one thread draws at a time
+MAX_SURFELS = 8_000_000  # of more points that may be seen, this many are drawn, evenly in space
+MAX_ANGLE = 0.3  # [rad] as which a disc's radius is seen, at most
+MIN_COSINE = 0.15  # a disc seen flatter than this is turned towards the camera: normals are not that sure
+# What is left of rooms behind gaps are lone points with large discs. Large discs far off are sparse surfaces.
+MAX_RADIUS = 1.5  # by the radius that 95 % of the discs stay below
+MIN_RANGE = 1e-3  # [m] nearer to the camera nothing is drawn
+HIDING_WIDTHS = (360, 720)  # cells of 1 and 1/2 degrees; wider ones hide what is seen through a door ajar
+FAR_ANGLE = 0.02  # [rad] as which a far disc's radius is seen
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What the camera sees of the cloud."""
+
+    rgb: NDArray[np.uint8]  # (H, W, 3), black where nothing is seen
+    depth: NDArray[np.float32]  # (H, W) range [m] along the ray, inf where nothing is seen
+
+    @property
+    def is_seen(self) -> NDArray[np.bool_]:
+        """(H, W), true where there is a surface."""
+        return np.isfinite(self.depth)
+
+
+def picture_at(points: PackedPoints, pose: Pose, width: int, workers: Workers) -> Picture:
+    """The cloud at `pose`, `width` x width / 2 pixels."""
+    indices = evenly(not_hidden(points, pose.center_world), MAX_SURFELS)
+    return draw(surfels_of(points.take(indices), workers), pose, width, workers)
+
+
+def evenly(indices: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """At most `count` of the indices; of points in Morton order, evenly in space."""
+    if len(indices) <= count:
+        return indices
+    return indices[np.linspace(0, len(indices) - 1, count).astype(np.int64)]
+
+
+def not_hidden(points: PackedPoints, center_world: Array) -> NDArray[np.int64]:
+    """Indices of the points but those behind a surface that goes on around them.
+
+    `render.visible_points` lets what is in front in a cell hide all of the cell: a rim of two degrees around
+    each thing would be missing in a picture. Here nine cells must agree, of one or the other size.
+    """
+    pose = Pose(np.eye(3), center_world)
+    R, t = pose.R_cam_from_world, pose.center_world
+    kept = np.arange(len(points))
+    for width in HIDING_WIDTHS:
+        depth = nearest_depth(points, pose, width).reshape(-1, width)
+        around = np.pad(depth, ((1, 1), (1, 1)), mode="wrap")
+        around[[0, -1]] = -np.inf  # no row beyond a pole
+        farthest = cv2.dilate(around, np.ones((3, 3), np.uint8))[1:-1, 1:-1].reshape(-1)
+        indices = np.empty(len(points), np.int64)
+        count = select_visible(points.x, points.y, points.z, R, t, width, farthest, indices)
+        points, kept = points.take(indices[:count]), kept[indices[:count]]
+    return kept
+
+
+def draw(surfels: Surfels, pose: Pose, width: int, workers: Workers) -> Picture:
+    """The discs seen from `pose`."""
+    surfels = _without_lone(surfels, pose.center_world)
+    discs, directions, angles = _discs(surfels, pose, width)
+    rgb = np.zeros((width // 2, width, 3), np.uint8)
+    depth = np.full((width // 2, width), np.inf, np.float32)
+    num_rows = max(1, STRIP // width)
+    rows_per_rad = width / (2.0 * math.pi)
+    top = (0.5 * math.pi - directions[:, 1] - angles) * rows_per_rad
+    bottom = (0.5 * math.pi - directions[:, 1] + angles) * rows_per_rad
+
+    def run(first: int) -> None:
+        rows = slice(first, first + num_rows)
+        inside = np.flatnonzero((bottom >= first) & (top <= first + num_rows))
+        some = discs[inside], surfels.points.rgbx[inside], directions[inside], angles[inside], first
+        sums = np.zeros((*depth[rows].shape, 5), np.float32)
+        splat(*some, depth[rows], sums[:0])
+        splat(*some, depth[rows], sums)
+        is_seen = sums[..., 4] > 0.0
+        means = sums[..., :4] / np.where(is_seen, sums[..., 4], np.float32(1.0))[..., None]
+        rgb[rows] = np.rint(means[..., :3])
+        depth[rows] = np.where(is_seen, means[..., 3], np.float32(np.inf))
+
+    list(workers.each(run, range(0, width // 2, num_rows), "draw"))
+    return Picture(rgb, depth)
+
+
+def _without_lone(surfels: Surfels, center_world: Array) -> Surfels:
+    """The discs but lone ones, and those at the camera itself."""
+    p = surfels.points
+    ranges = np.linalg.norm(np.stack([p.x, p.y, p.z], axis=1) - center_world, axis=1)
+    largest = np.maximum(MAX_RADIUS * np.percentile(surfels.radii, 95.0), FAR_ANGLE * ranges)
+    return surfels.take(np.flatnonzero((surfels.radii <= largest) & (ranges > MIN_RANGE)))
+
+
+def _discs(
+    surfels: Surfels, pose: Pose, width: int
+) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
+    """Discs (N, 9), directions (N, 2) and angles (N,) as `splatting.splat` reads them."""
+    p, R = surfels.points, pose.R_cam_from_world
+    x_cam = (np.stack([p.x, p.y, p.z], axis=1) - pose.center_world) @ R.T
+    ranges = np.linalg.norm(x_cam, axis=1)
+    rays = x_cam / ranges[:, None]
+    normals = surfels.normals @ R.T
+    cosine = np.einsum("ni,ni->n", normals, rays)
+    normals *= np.where(cosine < 0.0, -1.0, 1.0)[:, None]
+    # without a plane the normal is 0, and becomes the ray
+    normals += np.maximum(MIN_COSINE - np.abs(cosine), 0.0)[:, None] / (1.0 - MIN_COSINE) * rays
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    radii = np.clip(surfels.radii, 1e-9, MAX_ANGLE * ranges)
+    along = np.einsum("ni,ni->n", normals, x_cam)
+    discs = np.column_stack([x_cam, normals, along, 1.0 / radii**2, ranges]).astype(np.float32)
+    azimuth = np.arctan2(x_cam[:, 1], x_cam[:, 0])
+    elevation = np.arctan2(x_cam[:, 2], np.hypot(x_cam[:, 0], x_cam[:, 1]))
+    angles = np.maximum(np.arcsin(radii / ranges), MIN_RADIUS_PX * 2.0 * math.pi / width)
+    return discs, np.stack([azimuth, elevation], axis=1), angles
+
+
+def closed(picture: Picture) -> NDArray[np.uint8]:
+    """The picture's colours; what is not seen takes those around it, the farther away the smoother."""
+    return _filled(picture.rgb, picture.is_seen)
+
+
+def _filled(rgb: NDArray[np.uint8], is_seen: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Holes filled from the same at half the size; black if nothing is seen at all.
+
+    In bytes, as floating-point copies of a large picture would take gigabytes.
+    """
+    height, width = is_seen.shape
+    if is_seen.all() or width == 1:
+        return rgb
+    counts = is_seen.view(np.uint8) * np.uint8(255)
+    masked = cv2.bitwise_and(rgb, rgb, mask=counts)
+    if height % 2 or width % 2:  # a row more counts nothing, a column more is the first again
+        counts = np.pad(np.pad(counts, ((0, height % 2), (0, 0))), ((0, 0), (0, width % 2)), mode="wrap")
+        masked = np.pad(masked, ((0, height % 2), (0, 0), (0, 0)))
+        masked = np.pad(masked, ((0, 0), (0, width % 2), (0, 0)), mode="wrap")
+    size = (counts.shape[1] // 2, counts.shape[0] // 2)
+    share = cv2.resize(counts, size, interpolation=cv2.INTER_AREA)
+    total = cv2.resize(masked, size, interpolation=cv2.INTER_AREA)
+    del counts, masked
+    mean = cv2.divide(total, cv2.merge([share, share, share]), scale=255.0)
+    coarse = _filled(np.asarray(mean, np.uint8), share > 0)
+    around = np.concatenate([coarse[:, -1:], coarse, coarse[:, :1]], axis=1)
+    double = (2 * around.shape[1], 2 * len(around))
+    smooth = cv2.resize(around, double, interpolation=cv2.INTER_LINEAR)[:height, 2 : 2 + width]
+    np.copyto(smooth, rgb, where=is_seen[..., None])
+    return np.asarray(smooth, np.uint8)
+
+
+def encoded(picture: NDArray[np.uint8] | NDArray[np.uint16], suffix: str) -> bytes:
+    """File of a picture (H, W, 3) RGB or (H, W) gray, of the kind that the suffix names."""
+    bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR) if picture.ndim == 3 else picture
+    options = [cv2.IMWRITE_JPEG_QUALITY, 95] if suffix in (".jpg", ".jpeg") else []
+    is_encoded, content = cv2.imencode(suffix, bgr, options)
+    if not is_encoded:
+        raise OSError(
+            f"a picture of {picture.shape[1]} x {picture.shape[0]} could not be encoded as {suffix}"
+        )
+    return content.tobytes()

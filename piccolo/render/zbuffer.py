@@ -1,0 +1,134 @@
+"""The cloud seen from a pose: z-buffered equirectangular views, and which points the camera sees."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cloud.soa import PackedPoints
+from ..geometry.pose import Array, Pose
+from ..geometry.sphere import direction_to_pixel
+from ..panorama.texels import channel
+from ..runtime.jit import kernel
+
+CHUNK = 4096
+EMPTY = np.float32(np.inf)
+
+# A point is visible if it is not farther than the nearest in its cell by this much. The factor lets grazing
+# floors and walls through, whose ranges vary within a cell; the offset [m] covers range noise nearby.
+VISIBLE_FACTOR = np.float32(1.08)
+VISIBLE_OFFSET = np.float32(0.1)
+MIN_VIEW_WIDTH, MAX_VIEW_WIDTH = 32, 4096  # [px] of a rendered view
+VISIBLE_WIDTH = 180  # cells of 2 degrees
+
+
+@dataclass(frozen=True)
+class View:
+    """What the camera sees of the cloud, on an equirectangular grid."""
+
+    depth: NDArray[np.float32]  # (H, W) range of the nearest point [m], inf where there is none
+    rgb: NDArray[np.float32]  # (H, W, 3) mean colour in [0, 1] of the points near that range, 0 where empty
+
+    @property
+    def is_seen(self) -> NDArray[np.bool_]:
+        """(H, W), true where a point was seen."""
+        return np.isfinite(self.depth)
+
+
+@kernel
+def cells_and_ranges(x, y, z, R_cam_from_world, center_world, width, cells, ranges):
+    """Write for each point the cell (row * width + column) and the range [m] at which the camera sees it."""
+    R, t = R_cam_from_world, center_world
+    W = np.float32(width)
+    last_column, last_row = np.int32(width - 1), np.int32(width // 2 - 1)
+    r00, r01, r02 = np.float32(R[0, 0]), np.float32(R[0, 1]), np.float32(R[0, 2])
+    r10, r11, r12 = np.float32(R[1, 0]), np.float32(R[1, 1]), np.float32(R[1, 2])
+    r20, r21, r22 = np.float32(R[2, 0]), np.float32(R[2, 1]), np.float32(R[2, 2])
+    tx, ty, tz = np.float32(t[0]), np.float32(t[1]), np.float32(t[2])
+    for i in range(len(x)):
+        dx, dy, dz = x[i] - tx, y[i] - ty, z[i] - tz
+        px = r00 * dx + r01 * dy + r02 * dz
+        py = r10 * dx + r11 * dy + r12 * dz
+        pz = r20 * dx + r21 * dy + r22 * dz
+        rho2 = px * px + py * py
+        u, v = direction_to_pixel(px, py, pz, math.sqrt(rho2), W)
+        cells[i] = min(np.int32(v), last_row) * np.int32(width) + min(np.int32(u), last_column)
+        ranges[i] = math.sqrt(rho2 + pz * pz)
+
+
+@kernel
+def nearest_ranges(x, y, z, R_cam_from_world, center_world, width, depth):
+    """Write the range [m] of the nearest point of each cell into `depth` (H * W,), which holds inf before."""
+    R, t = R_cam_from_world, center_world
+    cells = np.empty(CHUNK, np.int32)
+    ranges = np.empty(CHUNK, np.float32)
+    for lo in range(0, len(x), CHUNK):
+        hi = min(len(x), lo + CHUNK)
+        # The arithmetic is vectorised chunk by chunk; the scatter that follows can't be.
+        cells_and_ranges(x[lo:hi], y[lo:hi], z[lo:hi], R, t, width, cells, ranges)
+        for i in range(hi - lo):
+            depth[cells[i]] = min(depth[cells[i]], ranges[i])
+
+
+@kernel
+def mean_colors(x, y, z, rgbx, R_cam_from_world, center_world, width, band, depth, sums):
+    """Add up (H * W, 4): R, G, B [8-bit levels] and count of the points within (1 + band) of the nearest."""
+    R, t = R_cam_from_world, center_world
+    cells = np.empty(CHUNK, np.int32)
+    ranges = np.empty(CHUNK, np.float32)
+    for lo in range(0, len(x), CHUNK):
+        hi = min(len(x), lo + CHUNK)
+        cells_and_ranges(x[lo:hi], y[lo:hi], z[lo:hi], R, t, width, cells, ranges)
+        for i in range(hi - lo):
+            cell = cells[i]
+            if ranges[i] <= depth[cell] * band:
+                c = rgbx[lo + i]
+                sums[cell, 0] += channel(c, 0)
+                sums[cell, 1] += channel(c, 8)
+                sums[cell, 2] += channel(c, 16)
+                sums[cell, 3] += 1
+
+
+@kernel
+def select_visible(x, y, z, R_cam_from_world, center_world, width, depth, indices):
+    """Write the indices of the points near the front of their cells; returns how many."""
+    R, t = R_cam_from_world, center_world
+    cells = np.empty(CHUNK, np.int32)
+    ranges = np.empty(CHUNK, np.float32)
+    count = 0
+    for lo in range(0, len(x), CHUNK):
+        hi = min(len(x), lo + CHUNK)
+        cells_and_ranges(x[lo:hi], y[lo:hi], z[lo:hi], R, t, width, cells, ranges)
+        for i in range(hi - lo):
+            if ranges[i] <= depth[cells[i]] * VISIBLE_FACTOR + VISIBLE_OFFSET:
+                indices[count] = lo + i
+                count += 1
+    return count
+
+
+def nearest_depth(points: PackedPoints, pose: Pose, width: int) -> NDArray[np.float32]:
+    """Range (width / 2 * width,) [m] of the nearest point in each cell, inf where there is none."""
+    depth = np.full(width // 2 * width, EMPTY, dtype=np.float32)
+    nearest_ranges(points.x, points.y, points.z, pose.R_cam_from_world, pose.center_world, width, depth)
+    return depth
+
+
+def render_view(points: PackedPoints, pose: Pose, width: int, band: float = 0.15) -> View:
+    """The cloud at `pose`, `width` cells around; colours are of the points within 1 + band of the nearest."""
+    depth = nearest_depth(points, pose, width)
+    sums = np.zeros((len(depth), 4))
+    R, t = pose.R_cam_from_world, pose.center_world
+    mean_colors(points.x, points.y, points.z, points.rgbx, R, t, width, np.float32(1.0 + band), depth, sums)
+    rgb = (sums[:, :3] / np.maximum(sums[:, 3:], 1.0) / 255.0).astype(np.float32)
+    return View(depth.reshape(width // 2, width), rgb.reshape(width // 2, width, 3))
+
+
+def visible_points(points: PackedPoints, center_world: Array) -> PackedPoints:
+    """The points that a camera at `center_world` (3,) sees, whichever way it is turned."""
+    pose = Pose(np.eye(3), center_world)
+    depth = nearest_depth(points, pose, VISIBLE_WIDTH)
+    indices = np.empty(len(points), dtype=np.int64)
+    R, t = pose.R_cam_from_world, pose.center_world
+    count = select_visible(points.x, points.y, points.z, R, t, VISIBLE_WIDTH, depth, indices)
+    return points.take(indices[:count])

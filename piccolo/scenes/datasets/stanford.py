@@ -1,0 +1,174 @@
+"""Stanford2D-3D-S (Armeni et al., 2017) with the room clouds of S3DIS (Armeni et al., CVPR 2016)."""
+
+import json
+import re
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError
+from ...geometry.pose import Array, Pose
+from .labels import labels_by_index
+from .model import CloudPart, Listing, Motion, Plan, Request, Shot
+from .poses import checked_pose, read_json
+
+NAME = "stanford2d3ds"
+# As most users of S3DIS number them, less one: theirs begin at 0. Other names, <UNK> among them, are 0.
+CLASSES = (
+    "ceiling", "floor", "wall", "beam", "column", "window", "door", "table", "chair", "sofa", "bookcase",
+    "board", "clutter",
+)  # fmt: skip
+NUMBERS = {name: number for number, name in enumerate(CLASSES, 1)}
+# The dataset's own folders, below the one given or one more; and those of the PICCOLO authors.
+PANORAMAS = ("area_*/pano/rgb", "*/area_*/pano/rgb", "pano/area_*")
+CLOUDS = (
+    "Area_{area}/{room}/{room}.txt",
+    "*/Area_{area}/{room}/{room}.txt",
+    "pcd_not_aligned/area_{area}/{room}.txt",
+    "pcd/area_{area}/{room}.txt",
+)
+LABEL_FILES = ("semantic_labels.json", "assets/semantic_labels.json", "*/assets/semantic_labels.json")
+ALIGNED = "Aligned_Version"
+AREA = re.compile(r"area_(\d)([ab]?)$")
+PICTURE = re.compile(r"camera_[0-9a-zA-Z]+_([A-Za-z]+_\d+)_frame_equirectangular_domain_rgb\.png$")
+# The poses of area 5b are in a frame of their own. Nobody gives the transform to the frame of the clouds but
+# DeepViewAgg (Robert et al., CVPR 2022), calibrated by hand: good to a centimetre or so.
+AREA_5B = Motion(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([-4.10, 6.25, 0.0]))
+WANTED_POSE = "wanted JSON with camera_location and final_camera_rotation"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A panorama and the files that belong to it."""
+
+    path: Path
+    part: str  # of the building: 1 to 6, 5a and 5b
+    pose: Path
+    semantic: Path
+
+
+def listing(request: Request) -> Listing:
+    """The rooms for which there are panoramas and a cloud."""
+    table = _read_table(request.folder) if request.labels else None
+    plans, missing = [], []
+    for (area, room), pictures in sorted(_pictures(request.folder).items()):
+        if request.areas and area not in request.areas:
+            continue
+        name = f"area_{area}/{room}"
+        parts = _cloud_of(request.folder, area, room, request.labels)
+        if parts:
+            plans.append(_plan(name, parts, pictures, table))
+        else:
+            missing.append(name)
+    if not plans:
+        raise InputError(
+            f"{request.folder}: found no room with panoramas ({PANORAMAS[0]}) and a cloud ({CLOUDS[0]}, for "
+            "labels Annotations beside it), wanted the layout in docs/DATASETS.md"
+        )
+    notes = (f"{len(missing)} rooms without a cloud: {', '.join(missing)}",) if missing else ()
+    return Listing(tuple(plans), notes)
+
+
+def _pictures(folder: Path) -> dict[tuple[str, str], list[Picture]]:
+    """The panoramas by area and room; 5a and 5b are both of area 5."""
+    pictures: dict[tuple[str, str], list[Picture]] = defaultdict(list)
+    for rgb in _globbed(folder, PANORAMAS):
+        is_original = rgb.name == "rgb"
+        area_folder = rgb.parents[1] if is_original else rgb
+        match = AREA.match(area_folder.name)
+        if not match:
+            continue
+        folders = (rgb.parent, "") if is_original else (folder, area_folder.name)
+        pose, semantic = (folders[0] / name / folders[1] for name in ("pose", "semantic"))
+        for path in sorted(rgb.glob("camera_*_rgb.png")):
+            if room := PICTURE.match(path.name):
+                stem = path.name.removesuffix("_rgb.png")
+                files = pose / f"{stem}_pose.json", semantic / f"{stem}_semantic.png"
+                pictures[match[1], room[1]].append(Picture(path, match[1] + match[2], *files))
+    return pictures
+
+
+def _globbed(folder: Path, patterns: Iterable[str]) -> list[Path]:
+    return [path for pattern in patterns for path in sorted(folder.glob(pattern))]
+
+
+def _cloud_of(folder: Path, area: str, room: str, has_labels: bool) -> tuple[CloudPart, ...]:
+    """The room's points, one `x y z r g b` a line; with labels the same, an object a file named by class."""
+    found = _globbed(folder, [pattern.format(area=area, room=room) for pattern in CLOUDS])
+    usable = [path for path in found if not any(ALIGNED in part for part in path.parts)]
+    if found and not usable:
+        raise InputError(
+            f"{found[0]}: found a cloud of the {ALIGNED}, whose rooms are turned one by one, wanted those of "
+            "Stanford3dDataset_v1.2"
+        )
+    if not has_labels:
+        return tuple(CloudPart(path) for path in usable[:1])
+    objects = [path for cloud in usable[:1] for path in sorted(cloud.parent.glob("Annotations/*.txt"))]
+    return tuple(CloudPart(path, NUMBERS.get(path.name.split("_")[0], 0)) for path in objects)
+
+
+def _plan(
+    name: str, parts: tuple[CloudPart, ...], pictures: list[Picture], table: NDArray[np.uint16] | None
+) -> Plan:
+    def read_shots() -> list[Shot]:
+        return [_shot(picture, table) for picture in pictures]
+
+    source: dict[str, object] = {"dataset": NAME, "labels": table is not None}
+    if table is not None:
+        source["label_names"] = ["unknown", *CLASSES]
+    return Plan(name, parts, read_shots, has_labels=table is not None, source=source)
+
+
+def _shot(picture: Picture, table: NDArray[np.uint16] | None) -> Shot:
+    name = picture.path.name
+    read_labels = None if table is None else partial(labels_by_index, picture.semantic, table)
+    return Shot(name, {name: picture.path}, f"area_{picture.part}", _read_pose(picture), read_labels)
+
+
+def _read_pose(picture: Picture) -> Pose:
+    """The pose in a JSON file: Blender's Euler angles of a camera that looks along -z, y up.
+
+    R_world_from_opengl = R_z(c) R_y(b) R_x(a) with final_camera_rotation = (a, b, c) [rad].
+    """
+    document = read_json(picture.pose, WANTED_POSE)
+    angles = _three(picture.pose, document, "final_camera_rotation")
+    center_world = _three(picture.pose, document, "camera_location")
+    R_world_from_opengl = rotation_from_euler_xyz(angles)
+    pose = checked_pose(str(picture.pose), R_world_from_opengl.T, center_world, "opengl")
+    return AREA_5B.of_pose(pose) if picture.part == "5b" else pose
+
+
+def _three(path: Path, document: Any, name: str) -> Array:
+    try:
+        values = np.array(document[name], dtype=np.float64)
+    except (KeyError, OverflowError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: found {error!r}, {WANTED_POSE}") from error
+    if values.shape != (3,):
+        raise InputError(f"{path}: {name} has the shape {values.shape}, wanted three numbers")
+    return values
+
+
+def rotation_from_euler_xyz(angles: Array) -> Array:
+    """R_z(c) R_y(b) R_x(a) (3, 3) of angles (a, b, c) [rad]: about x first, all about fixed axes."""
+    (ca, cb, cc), (sa, sb, sc) = np.cos(angles), np.sin(angles)
+    R_x = np.array([[1.0, 0.0, 0.0], [0.0, ca, -sa], [0.0, sa, ca]])
+    R_y = np.array([[cb, 0.0, sb], [0.0, 1.0, 0.0], [-sb, 0.0, cb]])
+    R_z = np.array([[cc, -sc, 0.0], [sc, cc, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(R_z @ R_y @ R_x)
+
+
+def _read_table(folder: Path) -> NDArray[np.uint16]:
+    """The class of each index in the semantic pictures."""
+    found = _globbed(folder, LABEL_FILES)
+    if not found:
+        raise InputError(f"{folder}: found no {LABEL_FILES[1]}, wanted the names of the semantic indices")
+    names = read_json(found[0], "wanted a list of names")
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise InputError(f"{found[0]}: found {json.dumps(names)[:60]}, wanted a list of names")
+    return np.array([NUMBERS.get(name.split("_")[0], 0) for name in names], dtype=np.uint16)

@@ -1,0 +1,130 @@
+"""One result against the truth."""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import InputError
+from ...geometry.pose import Array, Pose
+from ...geometry.pose_error import pose_errors
+from ...pipeline import Localizer
+from ...result import Result
+from ..scene import DAMAGES, Query, Scene
+
+FORMAT = "piccolo-evaluation/1"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One query of one scene."""
+
+    scene: str
+    image: str  # as the scene's queries.json names it
+    variant: str
+    is_in_box: bool | None  # the true position lies in the box of the cloud's points; None if not known
+    position_error: float  # [m], inf without a pose
+    rotation_error: float  # [rad], inf without a pose
+    result: Result
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """What makes it one query."""
+        return self.scene, self.image
+
+    @property
+    def seconds(self) -> float:
+        """Search and refinement, without reading and preparing."""
+        return sum(self.result.seconds.get(stage, 0.0) for stage in ("search", "refine"))
+
+    def is_correct(self, max_distance: float, max_angle: float) -> bool:
+        """True if both errors are below the lines [m], [rad]."""
+        return self.position_error < max_distance and self.rotation_error < max_angle
+
+    def to_json(self) -> str:
+        """One line."""
+        has_pose = self.result.pose is not None
+        return json.dumps(
+            {
+                "format": FORMAT,
+                "scene": self.scene,
+                "image": self.image,
+                "variant": self.variant,
+                "is_in_box": self.is_in_box,
+                "position_error": self.position_error if has_pose else None,
+                "rotation_error_deg": float(np.degrees(self.rotation_error)) if has_pose else None,
+                "result": json.loads(self.result.to_json()),
+            },
+            allow_nan=False,
+        )
+
+    @classmethod
+    def from_json(cls, text: str) -> "Row":
+        """A row as `to_json` wrote it; InputError for anything else."""
+        try:
+            row = json.loads(text)
+            if row["format"] != FORMAT:
+                raise InputError(f"evaluation: found format {row['format']!r}, wanted {FORMAT!r}")
+            distance, angle_deg = row["position_error"], row["rotation_error_deg"]
+            return cls(
+                scene=str(row["scene"]),
+                image=str(row["image"]),
+                variant=str(row["variant"]),
+                is_in_box=row["is_in_box"],
+                position_error=np.inf if distance is None else float(distance),
+                rotation_error=np.inf if angle_deg is None else float(np.radians(angle_deg)),
+                result=Result.from_json(json.dumps(row["result"])),
+            )
+        except DAMAGES as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"evaluation: found {error!r}, wanted a line of tools/evaluate.py") from error
+
+
+def row_of(scene: Scene, query: Query, result: Result, is_in_box: bool | None) -> Row:
+    """The errors of one result."""
+    errors = (np.inf, np.inf) if result.pose is None else pose_errors(result.pose, query.pose)
+    return Row(scene.name, scene.name_of(query), query.variant, is_in_box, *errors, result)
+
+
+def is_in_box(localizer: Localizer, pose: Pose) -> bool:
+    """True if a pose's position lies in the bounding box of a localizer's cloud (the paper's protocol)."""
+    points = localizer.points
+    center: Array = localizer.from_world(pose).center_world
+    axes = zip(center, (points.x, points.y, points.z), strict=True)
+    return all(bool(axis.min() <= value <= axis.max()) for value, axis in axes)
+
+
+def match_results(scenes: Sequence[Scene], results: Sequence[Result]) -> Iterator[Row]:
+    """The rows of results of localize.py: each belongs to the query whose image it names.
+
+    By its path, or else by its file's name if one query alone has that.
+
+    Raises
+    ------
+    InputError
+        A result belongs to no query, or its name to several.
+    """
+    queries = [
+        (scene, query, path)
+        for scene in scenes
+        for query in scene.queries
+        for path in (query.image, query.labels)
+        if path is not None
+    ]
+    by_path = {path.resolve(): (scene, query) for scene, query, path in queries}
+    done: set[tuple[str, str]] = set()
+    for result in results:
+        found = by_path.get(Path(result.pano).resolve())
+        named = [(scene, query) for scene, query, path in queries if path.name == Path(result.pano).name]
+        if found is None and len(named) != 1:
+            names = sorted(path.name for _, _, path in queries)[:3]
+            text = f"{len(named)} queries of this name" if named else "a result without a true pose"
+            raise InputError(f"{result.pano}: found {text}, wanted one of {names} ...")
+        row = row_of(*(found or named[0]), result, None)
+        if row.key in done:
+            raise InputError(f"{result.pano}: found a second result of this panorama, wanted one")
+        done.add(row.key)
+        yield row

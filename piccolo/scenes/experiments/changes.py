@@ -1,0 +1,109 @@
+"""Scenes with one thing changed: fewer points, the cloud turned, the camera upside down.
+
+Each writes what differs into a folder and leaves the scene itself alone.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from zlib import crc32
+
+import cv2
+import numpy as np
+
+from ...cloud import read_cloud
+from ...cloud.model import Cloud
+from ...cloud.ply_writer import vertex_rows, write_ply
+from ...errors import InputError
+from ...geometry.pose import Array, Pose
+from ...geometry.rotations import random_rotation
+from ...panorama import read_panorama
+from ...runtime.atomic import write_atomically
+from ..scene import Query, Scene
+
+# A changed copy of a scene; the folder is there, and the copy's alone.
+Change = Callable[[Scene, Path], Scene]
+UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])  # half a turn about the view axis
+
+
+def as_it_is(scene: Scene, folder: Path) -> Scene:
+    """The scene itself."""
+    return scene
+
+
+def with_share(share: float) -> Change:
+    """A change to a share of the points, drawn at random."""
+
+    def change(scene: Scene, folder: Path) -> Scene:
+        cloud = read_cloud(scene.cloud)
+        return _with_points(scene, folder, cloud, max(1, round(share * len(cloud.points))))
+
+    return change
+
+
+def with_count(num_points: int) -> Change:
+    """A change to a number of points, drawn at random; InputError where there are fewer."""
+
+    def change(scene: Scene, folder: Path) -> Scene:
+        cloud = read_cloud(scene.cloud)
+        if len(cloud.points) < num_points:
+            raise InputError(f"{scene.cloud}: found {len(cloud.points)} points, wanted at least {num_points}")
+        return _with_points(scene, folder, cloud, num_points)
+
+    return change
+
+
+def turned_at_random(scene: Scene, folder: Path) -> Scene:
+    """The cloud turned by a rotation drawn from all of SO(3), the true poses with it."""
+    cloud = read_cloud(scene.cloud)
+    R_new_from_old = random_rotation(_rng(scene))
+    points = (cloud.points.astype(np.float64) + cloud.origin_world) @ R_new_from_old.T
+    path = folder / "cloud.ply"
+    write_ply(path, vertex_rows(points, cloud.colors))
+    queries = tuple(replace(query, pose=_turned(query.pose, R_new_from_old)) for query in scene.queries)
+    return replace(scene, cloud=path, queries=queries)
+
+
+def flipped(scene: Scene, folder: Path) -> Scene:
+    """Every picture taken with the camera upside down: turned by half a turn about the view axis.
+
+    They are PNG, under the names that the scene gives them: rows of both find each other.
+    """
+    names = [scene.name_of(query) for query in scene.queries]
+    depth = max(Path(name).parts.count("..") for name in names) if names else 0
+    inner = folder.joinpath(*["in"] * depth)  # so deep that no name leads out of the folder
+    inner.mkdir(parents=True, exist_ok=True)
+    queries = []
+    for name, query in zip(names, scene.queries, strict=True):
+        image = inner / name
+        image.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(image, _upside_down_png(query.image))
+        pose = Pose(UPSIDE_DOWN @ query.pose.R_cam_from_world, query.pose.center_world)
+        queries.append(Query(image, query.variant, pose))
+    return Scene(scene.name, inner, scene.cloud, tuple(queries))
+
+
+def _upside_down_png(image: Path) -> bytes:
+    """A panorama turned by half a turn, transparent where it shows nothing."""
+    panorama = read_panorama(image)
+    bgra = cv2.cvtColor(panorama.rgb, cv2.COLOR_RGB2BGRA)
+    bgra[..., 3] = np.where(panorama.is_valid, 255, 0)
+    _, png = cv2.imencode(".png", bgra[::-1, ::-1])
+    return bytes(png)
+
+
+def _with_points(scene: Scene, folder: Path, cloud: Cloud, num_points: int) -> Scene:
+    chosen = np.sort(_rng(scene).choice(len(cloud.points), num_points, replace=False))
+    path = folder / "cloud.ply"
+    points = cloud.points[chosen].astype(np.float64) + cloud.origin_world
+    write_ply(path, vertex_rows(points, cloud.colors[chosen]))
+    return replace(scene, cloud=path)
+
+
+def _turned(pose: Pose, R_new_from_old: Array) -> Pose:
+    return Pose(pose.R_cam_from_world @ R_new_from_old.T, R_new_from_old @ pose.center_world)
+
+
+def _rng(scene: Scene) -> np.random.Generator:
+    """Of a scene's name: the same draw whatever else is tried."""
+    return np.random.default_rng([crc32(scene.name.encode()), len(scene.queries)])

@@ -1,0 +1,86 @@
+"""GeoJSON (RFC 7946): points in WGS84, longitude and latitude, for maps. pyproj converts, if installed."""
+
+import json
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import InputError
+from ...geometry.camera_axes import heading_pitch_roll_deg
+from ...runtime.atomic import write_atomically
+from .model import Format, Options, Shot
+
+STEP = 10.0  # [m] ahead, to find true north
+
+
+def write(shots: Sequence[Shot], out: Path, options: Options) -> None:
+    """A FeatureCollection with a point a result."""
+    pyproj = _pyproj()
+    if options.crs is None:
+        raise InputError("--crs: not given, wanted the cloud's coordinate system, such as EPSG:25832")
+    transformer = _transformer(pyproj, options.crs)
+    features = [_feature(shot, transformer, pyproj.Geod(ellps="WGS84"), options.crs) for shot in shots]
+    document = {"type": "FeatureCollection", "features": features}
+    write_atomically(out, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
+
+
+def _pyproj() -> Any:
+    try:
+        return import_module("pyproj")
+    except ImportError as error:
+        raise InputError(
+            "GeoJSON: the library pyproj is missing, wanted: python -m pip install pyproj"
+        ) from error
+
+
+def _transformer(pyproj: Any, crs: str) -> Any:
+    """From the cloud's coordinates to longitude and latitude."""
+    try:
+        system = pyproj.CRS.from_user_input(crs)
+    except pyproj.exceptions.CRSError as error:
+        raise InputError(f"--crs: found {crs!r}, wanted a coordinate system such as EPSG:25832") from error
+    units = {axis.unit_name for axis in system.axis_info[:2]}
+    if not system.is_projected or units != {"metre"}:
+        raise InputError(f"--crs: found {crs} ({system.name}), wanted a projected system in metres")
+    return pyproj.Transformer.from_crs(system, "EPSG:4326", always_xy=True)
+
+
+def _feature(shot: Shot, transformer: Any, geod: Any, crs: str) -> dict[str, object]:
+    """The point without a height, which would have to be above WGS84's ellipsoid: z is a property."""
+    result, (x, y, z) = shot.result, shot.pose.center_world.tolist()
+    heading, pitch, roll = heading_pitch_roll_deg(shot.pose)
+    ahead = np.radians(heading)
+    longitudes, latitudes = transformer.transform(
+        [x, x + STEP * np.sin(ahead)], [y, y + STEP * np.cos(ahead)]
+    )
+    if not np.isfinite([*longitudes, *latitudes]).all():
+        raise InputError(f"{shot.path}: found a camera at ({x}, {y}), wanted one where {crs} holds")
+    true_heading, _, _ = geod.inv(longitudes[0], latitudes[0], longitudes[1], latitudes[1])
+    return {
+        "type": "Feature",
+        "geometry": {"type": "Point", "coordinates": [longitudes[0], latitudes[0]]},
+        "properties": {
+            "image": shot.name,
+            "cloud": result.cloud_name,
+            "status": result.status,
+            "confidence": result.confidence,
+            "score": result.evidence.score if result.evidence else None,
+            **{"crs": crs, "x": x, "y": y, "z": z},
+            "heading_deg": heading,
+            "heading_true_deg": true_heading % 360.0,
+            "pitch_deg": pitch,
+            "roll_deg": roll,
+        },
+    }
+
+
+GEOJSON = Format(
+    "geojson",
+    "points for maps, in WGS84; needs --crs and the library pyproj",
+    write,
+    frozenset({"crs"}),
+    has_unique_names=False,
+)

@@ -1,0 +1,153 @@
+"""Photo Sphere XMP: copies of JPEGs that carry heading, pitch and roll. The picture's bytes stay as they are.
+
+https://developers.google.com/streetview/spherical-metadata. The XMP packet is changed as text, so that what
+others wrote into it stays as they wrote it.
+"""
+
+import re
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+
+from ...errors import InputError
+from ...geometry.camera_axes import DECIMALS, heading_pitch_roll_deg
+from ...runtime.atomic import replacing_folder, write_atomically
+from .model import Format, Options, Shot, check_size
+from .pictures import JPEG_MAGIC, SCAN, Segment, jpeg_segments, jpeg_size
+
+NAMESPACE = b"http://ns.google.com/photos/1.0/panorama/"
+APP0, APP1 = 0xE0, 0xE1
+EXIF_MARK, XMP_MARK = b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0"
+MAX_BODY_SIZE = 0xFFFF - 2
+PREFIX = re.compile(rb"xmlns:([A-Za-z_][\w.-]{0,40})\s{0,9}=\s{0,9}[\"']" + re.escape(NAMESPACE))
+POSE_NAMES = ("PoseHeadingDegrees", "PosePitchDegrees", "PoseRollDegrees")
+CROP_NAMES = (
+    "CroppedAreaLeftPixels",
+    "CroppedAreaTopPixels",
+    "CroppedAreaImageWidthPixels",
+    "CroppedAreaImageHeightPixels",
+    "FullPanoWidthPixels",
+    "FullPanoHeightPixels",
+)
+END = re.compile(rb"</([A-Za-z_][\w.-]{0,40}):RDF\s{0,9}>")
+ABOUT = re.compile(rb":about\s{0,9}=\s{0,9}(\"[^\"<]{0,999}\"|'[^'<]{0,999}')")
+# what is left of a description that had nothing but the pose
+LEFTOVER = re.compile(
+    rb"<[\w.-]{1,40}:Description [\w.-]{1,40}:about=(\"[^\"<]{0,999}\"|'[^'<]{0,999}') xmlns:GPano=\""
+    + re.escape(NAMESPACE)
+    + rb"\"/>"
+)
+EMPTY_PACKET = (
+    b'<?xpacket begin="\xef\xbb\xbf" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/">'
+    b'<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"></rdf:RDF></x:xmpmeta>'
+    b'<?xpacket end="w"?>'
+)
+
+
+def write(shots: Sequence[Shot], out: Path, options: Options) -> None:
+    """A copy of each picture in a new folder, under its name in --images or its file name."""
+    names = [shot.name if options.images else Path(shot.name).name for shot in shots]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(
+            f"{twice}: found two pictures of that name, wanted --images FOLDER to tell them apart"
+        )
+    with replacing_folder(out) as folder:
+        for name, shot in zip(names, shots, strict=True):
+            angles = heading_pitch_roll_deg(shot.pose)
+            copy = with_pose(shot.path, shot.path.read_bytes(), angles)
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(folder / name, copy)
+
+
+def with_pose(path: Path, data: bytes, angles_deg: tuple[float, float, float]) -> bytes:
+    """The JPEG `data` with heading, pitch and roll in its XMP packet; other segments keep their bytes.
+
+    Fields of the pose that were there are replaced. Without a packet one is put behind JFIF's and EXIF's.
+    """
+    segments = list(jpeg_segments(data)) if data.startswith(JPEG_MAGIC) else []
+    size = jpeg_size(data) if segments and segments[-1].marker == SCAN else None
+    if size is None:
+        raise InputError(f"{path}: found no JPEG, or a damaged one, wanted a whole JPEG to write XMP into")
+    bodies = [data[begin + 4 : end] if marker == APP1 else b"" for marker, begin, end in segments]
+    packets = [i for i, body in enumerate(bodies) if body.startswith(XMP_MARK)]
+    edits = []  # begin, end, what comes there
+    for i in packets:
+        packet = without_pose(bodies[i][len(XMP_MARK) :])
+        if i == packets[0]:
+            packet = _with_fields(path, packet, angles_deg, size)
+        edits.append((segments[i].begin, segments[i].end, _segment(path, packet)))
+    if not packets:
+        place = _end_of_first_segments(segments, bodies)
+        edits = [(place, place, _segment(path, _with_fields(path, EMPTY_PACKET, angles_deg, size)))]
+    pieces, begin = [], 0
+    for edit_begin, edit_end, new in edits:
+        pieces += [data[begin:edit_begin], new]
+        begin = edit_end
+    return b"".join([*pieces, data[begin:]])
+
+
+def _end_of_first_segments(segments: Sequence[Segment], bodies: Sequence[bytes]) -> int:
+    """Behind JFIF's and EXIF's segments, which have to be the first."""
+    place = len(JPEG_MAGIC)
+    for segment, body in zip(segments, bodies, strict=True):
+        if segment.marker != APP0 and not body.startswith(EXIF_MARK):
+            break
+        place = segment.end
+    return place
+
+
+def _segment(path: Path, packet: bytes) -> bytes:
+    body = XMP_MARK + packet
+    if len(body) > MAX_BODY_SIZE:
+        raise InputError(f"{path}: found XMP that leaves no room for the pose, wanted less than 64 KB of it")
+    return struct.pack(">BBH", 0xFF, APP1, len(body) + 2) + body
+
+
+def without_pose(packet: bytes) -> bytes:
+    """The packet without the fields of a pose, as attributes or as elements."""
+    for prefix in dict.fromkeys(PREFIX.findall(packet)):
+        for name in POSE_NAMES:
+            field = re.escape(prefix) + b":" + name.encode()
+            packet = re.sub(rb"\s" + field + rb"\s{0,9}=\s{0,9}(\"[^\"<>]*\"|'[^'<>]*')", b"", packet)
+            packet = re.sub(rb"<" + field + rb"\s{0,9}(/>|>[^<>]*</" + field + rb"\s{0,9}>)", b"", packet)
+    return LEFTOVER.sub(b"", packet)
+
+
+def _with_fields(
+    path: Path, packet: bytes, angles_deg: tuple[float, float, float], size: tuple[int, int]
+) -> bytes:
+    """The packet with a description more, of the pose and of what a viewer needs and is not there yet.
+
+    A packet without an end of its RDF is damaged and gives way to a new one.
+    """
+    found = list(END.finditer(packet))
+    if not found:
+        packet = EMPTY_PACKET
+        found = list(END.finditer(packet))
+    prefixes = dict.fromkeys(PREFIX.findall(packet))
+    known = {
+        name.decode()
+        for prefix in prefixes
+        for name in re.findall(re.escape(prefix) + rb":(\w{1,60})", packet)
+    }
+    fields = {} if "ProjectionType" in known else {"ProjectionType": "equirectangular"}
+    if not known & set(CROP_NAMES):
+        check_size(f"{path}: without GPano's crop", size)
+        fields |= {name: str(value) for name, value in zip(CROP_NAMES, (0, 0, *size, *size), strict=True)}
+    fields |= {n: f"{angle:.{DECIMALS}f}" for n, angle in zip(POSE_NAMES, angles_deg, strict=True)}
+    attributes = "".join(f' GPano:{name}="{value}"' for name, value in fields.items()).encode()
+    about = ABOUT.search(packet)  # has to be the same in all descriptions
+    rdf = found[-1].group(1)
+    description = b"<%s:Description %s:about=%s" % (rdf, rdf, about.group(1) if about else b'""')
+    description += b' xmlns:GPano="%s"%s/>' % (NAMESPACE, attributes)
+    place = found[-1].start()
+    return packet[:place] + description + packet[place:]
+
+
+GPANO = Format(
+    "gpano",
+    "copies of the JPEGs with heading, pitch and roll as Photo Sphere XMP; --out is a new folder",
+    write,
+    is_folder=True,
+)

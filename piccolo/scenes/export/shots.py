@@ -1,0 +1,153 @@
+"""From lines of JSON to the pictures and poses that are to be written."""
+
+import math
+import os
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...confidence.confidence import LOCALIZED
+from ...errors import InputError
+from ...geometry.pose import Pose
+from ...result import Result
+from ..scene import Scene
+from .model import Format, Options, Shot, check_size
+from .pictures import picture_size
+
+MAX_ROTATION_ERROR = 1e-6  # of R R^T from the identity
+TIMESTAMP = re.compile(r"\d+(\.\d+)?")
+# control characters, line ends, halves of characters
+UNWRITABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+WANTED = "wanted JSON lines of localize.py"
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The results to write, and why others are not."""
+
+    results: tuple[Result, ...]
+    left_out: dict[str, int]  # how many, by status or "without a pose"
+
+    @property
+    def clouds(self) -> tuple[str, ...]:
+        """The clouds of the results, in order."""
+        return tuple(dict.fromkeys(result.cloud_name for result in self.results))
+
+
+def read_results(path: Path) -> list[Result]:
+    """The results in a file of JSON lines, their poses checked; any other file is an InputError."""
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: not a file but a folder or a device, {WANTED}")
+    lines = path.read_bytes().splitlines()
+    results = []
+    for number, line in enumerate(lines, 1):
+        if not line.strip():
+            continue
+        try:
+            result = Result.from_json(line.decode())
+            _check(result)
+        except RecursionError as error:
+            raise InputError(f"{path}, line {number}: found too many brackets, {WANTED}") from error
+        except (ValueError, AttributeError) as error:  # InputError too, which does not know the file
+            raise InputError(f"{path}, line {number}: {error}") from error
+        results.append(result)
+    if not results:
+        raise InputError(f"{path}: found no result, {WANTED}")
+    return results
+
+
+def true_results(scene: Scene) -> list[Result]:
+    """The true poses of a scene, as if they had been found beyond doubt: a reference for other tools."""
+    cloud = str(scene.cloud)
+    return [
+        Result(LOCALIZED, 1.0, cloud, str(query.image), query.pose, None, None, (), None, {}, {})
+        for query in scene.queries
+    ]
+
+
+def _check(result: Result) -> None:
+    """Refuse names and numbers that can't be written, and a pose that is none."""
+    for label, value in (("status", result.status), ("cloud", result.cloud_name), ("pano", result.pano)):
+        if not isinstance(value, str) or UNWRITABLE.search(value):
+            raise InputError(f"result: found {label} {value!r}, wanted text on one line")
+    values = [result.confidence, *([result.evidence.score] if result.evidence else [])]
+    if not all(isinstance(value, int | float) and math.isfinite(value) for value in values):
+        raise InputError(f"result: found confidence and score {values}, wanted finite numbers")
+    if result.pose is None:
+        return
+    R, center = result.pose.R_cam_from_world, result.pose.center_world
+    is_number = R.dtype.kind in "fiu" and center.dtype.kind in "fiu"
+    if not is_number or R.shape != (3, 3) or center.shape != (3,) or not np.isfinite(center).all():
+        raise InputError("result: found no numbers of a pose, wanted R_cam_from_world 3 x 3 and center_world")
+    # NaN is not below the limit either
+    is_orthonormal = np.abs(R @ R.T - np.eye(3)).max() < MAX_ROTATION_ERROR
+    if not (is_orthonormal and np.linalg.det(R) > 0.0):
+        raise InputError("result: found an R_cam_from_world that is no rotation, wanted one")
+
+
+def select(results: Sequence[Result], clouds: Sequence[str] = (), use_all: bool = False) -> Selection:
+    """The results with a pose that are localized, or all with a pose; those of `clouds` only, if given."""
+    known = {result.cloud_name for result in results}
+    if missing := [cloud for cloud in clouds if cloud not in known]:
+        raise InputError(
+            f"--cloud: found no result for {missing[0]}, wanted one of {', '.join(sorted(known))}"
+        )
+    chosen, left_out = [], Counter[str]()
+    for result in results:
+        if clouds and result.cloud_name not in clouds:
+            left_out["other clouds"] += 1
+        elif result.pose is None:
+            left_out["without a pose"] += 1
+        elif result.status != LOCALIZED and not use_all:
+            left_out[result.status] += 1
+        else:
+            chosen.append(result)
+    return Selection(tuple(chosen), dict(left_out))
+
+
+def shots_of(results: Sequence[Result], form: Format, options: Options) -> list[Shot]:
+    """Pictures and poses by the names, times and offset that the options ask for."""
+    offset = np.array(options.offset or (0.0, 0.0, 0.0))
+    shots: dict[str, Shot] = {}
+    for index, result in enumerate(results):
+        if result.pose is None:
+            raise InputError(f"{result.pano}: found a result without a pose, wanted one with")
+        name, path = _name(result.pano, options.images), Path(result.pano)
+        if form.forbidden and (found := re.search(form.forbidden, name)):
+            raise InputError(
+                f"{name}: found {found.group()!r} in the name, wanted one that {form.name} can read"
+            )
+        if form.has_unique_names and name in shots:
+            clouds = f"{shots[name].result.cloud_name}, {result.cloud_name}"
+            raise InputError(
+                f"{name}: found two results of it (clouds {clouds}), wanted one; --cloud chooses"
+            )
+        size = (0, 0)
+        if "size" in form.options:
+            size = options.size or picture_size(path)
+            check_size(str(path), size)
+        time = str(index) if options.timestamps == "index" else _timestamp(path)
+        pose = Pose(result.pose.R_cam_from_world, result.pose.center_world - offset)
+        key = name if form.has_unique_names else str(index)
+        shots[key] = Shot(name, path, time, pose, size, result)
+    return list(shots.values())
+
+
+def _name(pano: str, images: Path | None) -> str:
+    """The picture's name in the folder of images, with slashes; as given if there is no such folder."""
+    if images is None:
+        return Path(pano).as_posix()
+    name = Path(os.path.relpath(pano, images))
+    if ".." in name.parts:
+        raise InputError(f"{pano}: found outside of --images {images}, wanted a picture in that folder")
+    return name.as_posix()
+
+
+def _timestamp(path: Path) -> str:
+    if not TIMESTAMP.fullmatch(path.stem):
+        raise InputError(f"{path}: found the name {path.stem!r}, wanted a number for --timestamps name")
+    return path.stem

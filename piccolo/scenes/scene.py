@@ -1,0 +1,145 @@
+"""Scenes on disk: a folder with a cloud, panoramas, and a queries.json with their true poses."""
+
+import json
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..geometry.pose import Pose
+from ..geometry.sphere import CONVENTION
+from ..runtime.atomic import write_atomically
+
+QUERIES_NAME = "queries.json"
+CLOUD_NAME = "cloud.ply"
+# what damaged JSON, or JSON of another kind, raises
+DAMAGES = (AttributeError, KeyError, OverflowError, RecursionError, TypeError, ValueError)
+MAX_SKEW = 1e-4  # of what is called a rotation
+
+
+@dataclass(frozen=True)
+class Query:
+    """A panorama with its true pose."""
+
+    image: Path  # a file, or a folder of cube faces
+    variant: str  # what sets it apart: how it was taken, or the split of its dataset
+    pose: Pose  # in the cloud's coordinates
+    labels: Path | None = None  # a picture of what each pixel shows, as numbers
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A cloud and the panoramas taken in it."""
+
+    name: str  # its folder, below the folder that was asked for: a room, or area/room
+    folder: Path
+    cloud: Path
+    queries: tuple[Query, ...]
+
+    @property
+    def by_name(self) -> dict[str, Query]:
+        """The queries by their images' file names."""
+        return {query.image.name: query for query in self.queries}
+
+    def name_of(self, query: Query) -> str:
+        """A query's image as queries.json has it."""
+        return Path(os.path.relpath(query.image, self.folder)).as_posix()
+
+
+def read_scene(folder: Path, name: str | None = None) -> Scene:
+    """The scene of a folder, or of the queries.json in it.
+
+    Raises
+    ------
+    InputError
+        There is no queries.json, or it is not as `write_queries` writes it.
+    """
+    path = folder if folder.suffix == ".json" else folder / QUERIES_NAME
+    try:
+        document = json.loads(path.read_text())
+        queries = tuple(_query(path.parent, k, entry) for k, entry in enumerate(document["queries"]))
+        cloud = path.parent / str(document.get("cloud", CLOUD_NAME))
+        if len({query.image for query in queries}) < len(queries):
+            raise ValueError("an image twice")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}), wanted true poses") from error
+    except DAMAGES as error:
+        raise InputError(f"{path}: found {error!r}, wanted a queries.json with true poses") from error
+    return Scene(name or path.parent.resolve().name, path.parent, cloud, queries)
+
+
+def find_scenes(roots: Sequence[Path]) -> list[Scene]:
+    """The scenes in and below folders, by name; a queries.json may stand for its folder.
+
+    Raises
+    ------
+    InputError
+        There is none below one of the roots, or two have the same name.
+    """
+    scenes: dict[str, Scene] = {}
+    for root in roots:
+        if root.is_file() and root.suffix != ".json":
+            raise InputError(f"{root}: found a file, wanted a folder with scenes or a {QUERIES_NAME}")
+        folders = [root] if root.is_file() else [p.parent for p in sorted(root.rglob(QUERIES_NAME))]
+        if not folders:
+            raise InputError(f"{root}: found no {QUERIES_NAME} in or below it, wanted a folder with scenes")
+        for folder in folders:
+            name = "" if folder == root else folder.relative_to(root).as_posix()
+            scene = read_scene(folder, name or None)
+            if scenes.setdefault(scene.name, scene) is not scene:
+                raise InputError(f"{folder}: found a second scene named {scene.name}, wanted other names")
+    return [scenes[name] for name in sorted(scenes)]
+
+
+def _query(folder: Path, number: int, entry: dict[str, Any]) -> Query:
+    """One entry; ValueError if it lacks something, or its numbers are no pose."""
+    fields = ("image", "variant", "R_cam_from_world", "center_world")
+    if not isinstance(entry, dict) or not all(name in entry for name in fields):
+        raise ValueError(f"queries[{number}] without one of {', '.join(fields)}")
+    texts = [entry[name] for name in ("image", "variant", "labels") if entry.get(name) is not None]
+    if not all(isinstance(text, str) and text.isprintable() for text in texts) or len(texts) < 2:
+        raise ValueError(f"queries[{number}] with an image, a variant or labels that are no plain text")
+    R_cam_from_world = np.array(entry["R_cam_from_world"], float)
+    center_world = np.array(entry["center_world"], float)
+    if R_cam_from_world.shape != (3, 3) or center_world.shape != (3,) or not np.isfinite(center_world).all():
+        raise ValueError(f"{entry['image']}: a pose of the wrong shape, or not finite")
+    skew = np.abs(R_cam_from_world @ R_cam_from_world.T - np.eye(3)).max()
+    if not skew < MAX_SKEW or np.linalg.det(R_cam_from_world) < 0.0:
+        raise ValueError(f"{entry['image']}: R_cam_from_world is no rotation")
+    labels = entry.get("labels")
+    pose = Pose(R_cam_from_world, center_world)
+    return Query(
+        folder / str(entry["image"]), str(entry["variant"]), pose, folder / str(labels) if labels else None
+    )
+
+
+def _relative(path: Path, folder: Path) -> str:
+    """A path as a folder's files may give it, whatever links lead to either; a link itself stays one."""
+    return Path(os.path.relpath(path.parent.resolve() / path.name, folder.resolve())).as_posix()
+
+
+def write_queries(folder: Path, queries: Iterable[Query], **more: object) -> None:
+    """Write the queries.json of a folder that holds the cloud and the images; `more` goes in beside them."""
+    document = {
+        "cloud": CLOUD_NAME,
+        "convention": CONVENTION,
+        **more,
+        "queries": [_entry(folder, query) for query in queries],
+    }
+    write_atomically(folder / QUERIES_NAME, json.dumps(document, indent=1).encode())
+
+
+def _entry(folder: Path, query: Query) -> dict[str, object]:
+    entry: dict[str, object] = {
+        "image": _relative(query.image, folder),
+        "variant": query.variant,
+        "R_cam_from_world": query.pose.R_cam_from_world.tolist(),
+        "center_world": query.pose.center_world.tolist(),
+    }
+    if query.labels:
+        entry["labels"] = _relative(query.labels, folder)
+    return entry

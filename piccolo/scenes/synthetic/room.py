@@ -1,0 +1,182 @@
+"""The seeded layout of a room: boxes, each with a material."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...geometry.pose import Array
+
+PLAIN, PLANKS, TILES, STRIPES, CHECKS, PICTURE = range(6)
+WALL_THICKNESS = 0.1  # [m]
+KINDS = (  # of surfaces; a label is the place in this list, and 0 is nothing
+    *("nothing", "floor", "ceiling", "wall", "picture", "window", "door"),
+    *("rug", "table", "shelf", "sofa", "crate"),
+)
+SATURATION = 0.5  # paints are paler than colours drawn at random
+
+# row of Room.boxes: center (3) [m], half size (3) [m], yaw [rad]
+# row of Room.materials: pattern, scale [m], color_a (3), color_b (3) in [0, 1], seed
+BOX_FIELDS, MATERIAL_FIELDS = 7, 9
+
+
+@dataclass
+class Builder:
+    """Boxes as they are put into a room whose floor's corner is at `corner` (3,)."""
+
+    rng: np.random.Generator
+    corner: Array
+    boxes: list[Array] = field(default_factory=list)
+    materials: list[Array] = field(default_factory=list)
+    labels: list[int] = field(default_factory=list)
+    kind: str = "nothing"  # of what is put next, one of KINDS
+
+    def material(self, pattern: int, scale: float, colors: tuple[Array, Array]) -> Array:
+        """A material row."""
+        return np.array([pattern, scale, *colors[0], *colors[1], self.rng.integers(1, 1 << 20)], dtype=float)
+
+    def paint(self, patterns: tuple[int, ...], low: float, high: float) -> Array:
+        """A material of a random pattern in two related colours whose channels lie in [low, high]."""
+        base = self.rng.uniform(low, high, 3)
+        base = base.mean() + SATURATION * (base - base.mean())
+        other = np.clip(base * self.rng.uniform(0.55, 0.9) + self.rng.normal(0, 0.05, 3), 0, 1)
+        pattern, scale = int(self.rng.choice(patterns)), float(self.rng.uniform(0.12, 0.5))
+        return self.material(pattern, scale, (base, other))
+
+    def put(self, center: ArrayLike, size: ArrayLike, material: Array, yaw: float = 0.0) -> None:
+        """Add a box of `size` (3,) [m] at `center` (3,), relative to the corner [m]."""
+        middle, half = np.asarray(center) + self.corner, np.asarray(size) / 2
+        self.boxes.append(np.array([*middle, *half, yaw]))
+        self.materials.append(material)
+        self.labels.append(KINDS.index(self.kind))
+
+
+@dataclass(frozen=True)
+class Room:
+    """A closed room full of boxes, z up."""
+
+    corner: Array  # (3,) least corner of the free space [m]
+    size: Array  # (3,) [m]
+    boxes: NDArray[np.float64]  # (B, 7), see BOX_FIELDS
+    materials: NDArray[np.float64]  # (B, 9), see MATERIAL_FIELDS
+    light: Array  # (3,) position of the lamp [m]
+    labels: NDArray[np.int64]  # (B,) see KINDS
+
+    def clearance(self, position: Array) -> float:
+        """Distance [m] from `position` (3,) to the nearest surface; negative inside a box, unseen by rays."""
+        offset = position - self.boxes[:, :3]
+        c, s = np.cos(self.boxes[:, 6]), np.sin(self.boxes[:, 6])
+        along, across = c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]
+        beyond = np.abs(np.stack([along, across, offset[:, 2]], axis=1)) - self.boxes[:, 3:6]
+        outside, inside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1), np.minimum(beyond.max(axis=1), 0.0)
+        return float((outside + inside).min())
+
+
+def _shell(b: Builder, size: Array) -> None:
+    """Floor, ceiling and four walls."""
+    x, y, z = size
+    d = WALL_THICKNESS
+    ceiling = b.paint((PLAIN,), 0.75, 0.95)
+    b.kind = "floor"
+    b.put([x / 2, y / 2, -d / 2], [x + 2 * d, y + 2 * d, d], b.paint((PLANKS, TILES), 0.35, 0.75))
+    b.kind = "ceiling"
+    b.put([x / 2, y / 2, z + d / 2], [x + 2 * d, y + 2 * d, d], ceiling)
+    b.kind = "wall"
+    for axis in (0, 1):
+        for side in (-d / 2, size[axis] + d / 2):
+            center, extent = size / 2, size.copy()
+            center[axis], extent[axis] = side, d
+            b.put(center, extent, b.paint((PLAIN, PLAIN, STRIPES, TILES), 0.5, 0.9))
+
+
+def _wall_hangings(b: Builder, size: Array) -> None:
+    """Pictures, a door and windows: thin boxes on the walls."""
+    for axis in (0, 1):
+        along = 1 - axis
+        for side in (0.0, size[axis]):
+            for kind in b.rng.permutation(["picture", "picture", "window", "door"])[: b.rng.integers(2, 5)]:
+                width, height, middle = {
+                    "picture": (b.rng.uniform(0.4, 1.1), b.rng.uniform(0.3, 0.8), b.rng.uniform(1.3, 1.8)),
+                    "window": (b.rng.uniform(0.8, 1.4), b.rng.uniform(0.8, 1.1), 1.5),
+                    "door": (0.9, 2.0, 1.0),
+                }[kind]
+                center, extent = np.zeros(3), np.full(3, 0.03)
+                center[axis], center[2] = side, min(middle, size[2] - height / 2)
+                center[along] = b.rng.uniform(width / 2, size[along] - width / 2)
+                extent[along], extent[2] = width, height
+                patterns = {"picture": (PICTURE,), "window": (CHECKS,), "door": (PLAIN, PLANKS)}[kind]
+                b.kind = str(kind)
+                low, high = {"picture": (0.1, 1.0), "window": (0.7, 1.0), "door": (0.2, 0.6)}[kind]
+                b.put(center, extent, b.paint(patterns, low, high))
+
+
+def _table(b: Builder, at: Array, yaw: float) -> None:
+    length, width, height = b.rng.uniform([0.9, 0.6, 0.5], [1.6, 0.9, 0.8])
+    wood = b.paint((PLANKS, PLAIN), 0.2, 0.7)
+    b.put([*at, height], [length, width, 0.04], wood, yaw)
+    c, s = np.cos(yaw), np.sin(yaw)
+    for dx, dy in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
+        x, y = dx * (length / 2 - 0.05), dy * (width / 2 - 0.05)
+        b.put([at[0] + c * x - s * y, at[1] + s * x + c * y, height / 2], [0.06, 0.06, height], wood, yaw)
+    b.put([*at, height + 0.12], b.rng.uniform(0.1, 0.25, 3), b.paint((CHECKS, PICTURE), 0.1, 1.0), yaw)
+
+
+def _shelf(b: Builder, at: Array, yaw: float) -> None:
+    height = b.rng.uniform(1.2, 2.0)
+    frame = b.paint((PLANKS, PLAIN), 0.2, 0.8)
+    b.put([*at, height / 2], [0.9, 0.02, height], frame, yaw)
+    c, s = np.cos(yaw), np.sin(yaw)
+    for level in np.arange(0.05, height, 0.35):
+        b.put([*at, level], [0.9, 0.35, 0.03], frame, yaw)
+        x = b.rng.uniform(-0.2, 0.2)
+        books = [b.rng.uniform(0.3, 0.5), 0.2, b.rng.uniform(0.15, 0.28)]
+        b.put([at[0] + c * x, at[1] + s * x, level + books[2] / 2], books, b.paint((STRIPES,), 0.1, 0.9), yaw)
+
+
+def _sofa(b: Builder, at: Array, yaw: float) -> None:
+    length = b.rng.uniform(1.2, 2.0)
+    cloth = b.paint((PLAIN, STRIPES, CHECKS), 0.15, 0.8)
+    c, s = np.cos(yaw), np.sin(yaw)
+    b.put([*at, 0.22], [length, 0.8, 0.44], cloth, yaw)
+    b.put([at[0] - s * 0.35, at[1] + c * 0.35, 0.5], [length, 0.15, 0.9], cloth, yaw)
+
+
+def _crate(b: Builder, at: Array, yaw: float) -> None:
+    size = b.rng.uniform([0.3, 0.3, 0.3], [0.7, 0.7, 1.3])
+    b.put([*at, size[2] / 2], size, b.paint((PLANKS, CHECKS, PICTURE, PLAIN), 0.15, 0.9), yaw)
+
+
+def _furniture(b: Builder, size: Array, moves: np.random.Generator | None) -> None:
+    """A rug and about one piece in 3 m2; half of the pieces go elsewhere if there are `moves`."""
+    num_pieces = max(3, round(size[0] * size[1] / 3.0))
+    seeds = b.rng.integers(0, 1 << 30, num_pieces)
+    rug = [size[0] * b.rng.uniform(0.3, 0.6), size[1] * b.rng.uniform(0.3, 0.6), 0.01]
+    b.kind = "rug"
+    b.put([size[0] / 2, size[1] / 2, 0.005], rug, b.paint((CHECKS, STRIPES, PICTURE), 0.1, 0.8))
+    pieces = {"table": _table, "shelf": _shelf, "sofa": _sofa, "crate": _crate}
+    kinds = ("table", "shelf", "sofa", "crate", "crate")
+    for seed in seeds:  # each of its own stream, so that a piece that moves stays what it is
+        b.rng = np.random.default_rng(seed)
+        b.kind = kinds[b.rng.integers(len(kinds))]
+        where = moves if moves is not None and moves.random() < 0.5 else np.random.default_rng([seed, 1])
+        at = where.uniform([0.5, 0.5], size[:2] - 0.5)
+        yaw = float(where.choice([0.0, np.pi / 2, np.pi, -np.pi / 2]) + where.normal(0, 0.2))
+        pieces[b.kind](b, at, yaw)
+
+
+def make_room(seed: int, size: Array, corner: Array, changed: int = 0) -> Room:
+    """The room of `seed`; the same shell with other furniture and more crates for each `changed` above 0."""
+    fixed = Builder(np.random.default_rng([seed, 0]), np.asarray(corner, dtype=float))
+    size = np.asarray(size, dtype=float)
+    _shell(fixed, size)
+    _wall_hangings(fixed, size)
+    loose = Builder(np.random.default_rng([seed, 1]), fixed.corner)
+    moves = np.random.default_rng([seed, 2, changed]) if changed else None
+    _furniture(loose, size, moves)
+    if moves is not None:
+        loose.rng, loose.kind = moves, "crate"
+        for _ in range(3):
+            _crate(loose, moves.uniform([0.5, 0.5], size[:2] - 0.5), float(moves.uniform(0, np.pi)))
+    light = fixed.corner + size * [*fixed.rng.uniform(0.35, 0.65, 2), 0.93]
+    boxes, materials = np.stack(fixed.boxes + loose.boxes), np.stack(fixed.materials + loose.materials)
+    return Room(fixed.corner, size, boxes, materials, light, np.array(fixed.labels + loose.labels))

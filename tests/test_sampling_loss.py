@@ -1,0 +1,176 @@
+import math
+
+import naive
+import numpy as np
+import pytest
+
+from piccolo.cloud.soa import pack_points
+from piccolo.geometry.pose import Pose, exp_so3, step, yaw_rotation
+from piccolo.optimize.sampling_loss import BLOCK, normal_equations, sampling_loss
+from piccolo.panorama.texels import pack_texels
+
+WIDTH = 256
+CENTER = np.array([0.2, -0.3, 0.1])
+POSES = {
+    "upright": Pose(yaw_rotation(2.0), CENTER),
+    "tilted": Pose(exp_so3(np.array([0.4, -1.1, 0.7])), CENTER),
+    "upside down": Pose(exp_so3(np.array([3.0, 0.2, 0.1])), CENTER),
+}
+
+
+def _smooth_image(seed=0, width=WIDTH):
+    """An 8-bit image (H, W, 3) that is smooth over the seam, so that differences have a meaning."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[0 : width // 2, 0:width] / width * 2 * np.pi
+    image = np.zeros((width // 2, width, 3))
+    for channel in range(3):
+        for k in range(1, 5):
+            a, b = rng.normal(size=2)
+            phase = rng.uniform(0, 6, size=2)
+            image[..., channel] += a * np.sin(k * u + phase[0]) + b * np.cos(2 * k * v + phase[1])
+    image -= image.min()
+    return np.round(image / image.max() * 255).astype(np.uint8)
+
+
+def _points(where, count=6000, seed=1):
+    """Points (N, 3) around CENTER in a part of the sphere of the tilted camera, and their colours (N, 3)."""
+    rng = np.random.default_rng(seed)
+    axis = {"anywhere": None, "seam": (-1, 0, 0), "zenith": (0, 0, 1), "nadir": (0, 0, -1)}[where]
+    x_cam = rng.normal(size=(count, 3))
+    if axis is not None:
+        x_cam = np.array(axis) * 2.0 + 0.3 * x_cam
+    x_cam *= rng.uniform(0.8, 2.0, size=(count, 1)) / np.linalg.norm(x_cam, axis=1, keepdims=True)
+    points = (x_cam @ POSES["tilted"].R_cam_from_world + CENTER).astype(np.float32)
+    return points, rng.integers(0, 256, size=(count, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("name", POSES)
+def test_loss_equals_its_twin(name):
+    points, colors = _points("anywhere", 3 * BLOCK + 17)
+    image, pose = _smooth_image(), POSES[name]
+    is_valid = np.ones(image.shape[:2], dtype=bool)
+    expected = naive.sampling_loss(points, colors, image, is_valid, pose.R_cam_from_world, pose.center_world)
+    packed, texels = pack_points(points, colors), pack_texels(image)
+    assert sampling_loss(packed, texels, pose) == pytest.approx(expected, rel=1e-5)
+    assert normal_equations(packed, texels, pose)[0] == pytest.approx(expected, rel=1e-5)
+
+
+def test_masked_pixels_are_left_out_of_sum_and_count():
+    points, colors = _points("anywhere")
+    image, pose = _smooth_image(), POSES["tilted"]
+    is_valid = np.ones(image.shape[:2], dtype=bool)
+    is_valid[90:] = False
+    image[90:] = 0
+    expected = naive.sampling_loss(points, colors, image, is_valid, pose.R_cam_from_world, pose.center_world)
+    texels = pack_texels(image, is_valid)
+    assert sampling_loss(pack_points(points, colors), texels, pose) == pytest.approx(expected, rel=1e-5)
+
+
+def test_pose_that_hides_half_of_the_cloud_behind_the_mask_has_no_loss():
+    points, colors = _points("zenith")
+    is_valid = np.ones((WIDTH // 2, WIDTH), dtype=bool)
+    is_valid[: WIDTH // 4] = False
+    texels = pack_texels(_smooth_image(), is_valid)
+    assert sampling_loss(pack_points(points, colors), texels, POSES["tilted"]) == math.inf
+    assert normal_equations(pack_points(points, colors), texels, POSES["tilted"])[0] == math.inf
+
+
+def test_a_crop_has_a_loss_where_it_shows_a_quarter_of_the_points_that_a_full_panorama_must():
+    """Half of the sphere valid: an eighth of the points must show."""
+    points, colors = _points("anywhere")
+    is_valid = np.ones((WIDTH // 2, WIDTH), dtype=bool)
+    is_valid[:, : WIDTH // 2] = False
+    texels = pack_texels(_smooth_image(), is_valid)
+    assert texels.valid_share == pytest.approx(0.5)
+    yaw = POSES["tilted"]
+    losses = [sampling_loss(pack_points(points[:n], colors[:n]), texels, yaw) for n in (50, 500, len(points))]
+    assert all(math.isfinite(loss) for loss in losses)
+
+
+@pytest.mark.parametrize("where", ["anywhere", "seam", "zenith", "nadir"])
+def test_gradient_against_central_differences(where):
+    points, colors = _points(where)
+    image, pose = _smooth_image(), POSES["tilted"]
+    is_valid = np.ones(image.shape[:2], dtype=bool)
+    _, gradient, _ = normal_equations(pack_points(points, colors), pack_texels(image), pose)
+
+    def loss(delta):
+        at = step(pose, delta)
+        return naive.sampling_loss(points, colors, image, is_valid, at.R_cam_from_world, at.center_world)
+
+    numbers = np.array([(loss(1e-6 * e) - loss(-1e-6 * e)) / 2e-6 for e in np.eye(6)])
+    np.testing.assert_allclose(gradient, numbers, atol=0.02 * np.abs(numbers).max())
+
+
+def test_normal_matrix_equals_jacobians_stacked():
+    points, colors = _points("anywhere", 500)
+    image, pose = _smooth_image(), POSES["tilted"]
+    _, _, matrix = normal_equations(pack_points(points, colors), pack_texels(image), pose)
+
+    def residuals(delta):
+        at = step(pose, delta)
+        pixels = naive.project(points, at.R_cam_from_world, at.center_world, WIDTH)
+        return (naive.sample(image, pixels) - colors) / 255.0
+
+    J = np.stack([(residuals(1e-6 * e) - residuals(-1e-6 * e)) / 2e-6 for e in np.eye(6)], axis=-1)
+    weights = 1.0 / np.linalg.norm(residuals(np.zeros(6)), axis=1)
+    expected = np.einsum("n,nci,ncj->ij", weights, J, J) / len(points)
+    np.testing.assert_allclose(matrix, expected, rtol=2e-3, atol=2e-3 * np.abs(expected).max())
+
+
+def test_same_bits_for_any_number_of_threads():
+    points, colors = _points("anywhere", 5 * BLOCK + 3)
+    packed, texels, pose = pack_points(points, colors), pack_texels(_smooth_image()), POSES["tilted"]
+    assert len({sampling_loss(packed, texels, pose, n) for n in (1, 2, 3, 7)}) == 1
+    one, two = (normal_equations(packed, texels, pose, n) for n in (1, 2))
+    assert one[0] == two[0]
+    np.testing.assert_array_equal(one[1], two[1])
+    np.testing.assert_array_equal(one[2], two[2])
+
+
+def test_turning_the_camera_by_whole_pixels_rolls_the_image():
+    points, colors = _points("anywhere")
+    packed, image = pack_points(points, colors), _smooth_image()
+    k = 37
+    turned = Pose(yaw_rotation(2.0 * math.pi * k / WIDTH) @ POSES["tilted"].R_cam_from_world, CENTER)
+    rolled = pack_texels(np.roll(image, k, axis=1))
+    expected = sampling_loss(packed, pack_texels(image), POSES["tilted"])
+    assert sampling_loss(packed, rolled, turned) == pytest.approx(expected, rel=1e-5)
+
+
+def test_moving_world_and_camera_together_changes_nothing():
+    points, colors = _points("anywhere")
+    texels, pose = pack_texels(_smooth_image()), POSES["tilted"]
+    turn, shift = exp_so3(np.array([0.5, 0.2, -0.9])), np.array([3.0, -2.0, 1.0])
+    moved = Pose(pose.R_cam_from_world @ turn.T, turn @ pose.center_world + shift)
+    expected = sampling_loss(pack_points(points, colors), texels, pose)
+    moved_points = (points.astype(np.float64) @ turn.T + shift).astype(np.float32)
+    assert sampling_loss(pack_points(moved_points, colors), texels, moved) == pytest.approx(
+        expected, rel=1e-4
+    )
+
+
+def test_point_at_the_camera_and_pose_out_of_range_are_harmless():
+    points, colors = _points("anywhere")
+    points[0] = CENTER.astype(np.float32)
+    pose = Pose(np.eye(3), points[0].astype(np.float64))
+    loss, gradient, matrix = normal_equations(pack_points(points, colors), pack_texels(_smooth_image()), pose)
+    assert np.isfinite(loss)
+    assert np.isfinite(gradient).all()
+    assert np.isfinite(matrix).all()
+    for center in ([1e9, 0, 0], [np.nan, 0, 0]):
+        far = Pose(np.eye(3), np.array(center))
+        assert sampling_loss(pack_points(points, colors), pack_texels(_smooth_image()), far) == math.inf
+
+
+def test_seam_and_poles_sample_like_the_twin():
+    """The public code clips coordinates short of the seam: a band of 1.8 degrees without a gradient."""
+    image = np.random.default_rng(3).integers(0, 256, (WIDTH // 2, WIDTH, 3), dtype=np.uint8)
+    is_valid = np.ones(image.shape[:2], dtype=bool)
+    for where in ("seam", "zenith", "nadir"):
+        points, colors = _points(where)
+        pose = POSES["tilted"]
+        expected = naive.sampling_loss(points, colors, image, is_valid, pose.R_cam_from_world, CENTER)
+        assert sampling_loss(pack_points(points, colors), pack_texels(image), pose) == pytest.approx(
+            expected, rel=1e-4
+        )

@@ -1,0 +1,118 @@
+import naive
+import numpy as np
+import pytest
+import rooms
+from scipy.spatial import cKDTree
+
+from piccolo.cloud.octree import build_octree
+from piccolo.coarse_to_fine.camera_positions import (
+    MIN_CLEARANCE,
+    candidate_centers,
+    coverage,
+    heights_above_floor,
+    supported_cells,
+    top_surfaces,
+)
+from piccolo.coarse_to_fine.scan_map import SEARCH_VIEW, prepare_map, render_candidates
+from piccolo.coarse_to_fine.view import ViewKind, render_view, seen_points
+from piccolo.geometry.sphere_grid import cell_of, make_tiling
+from piccolo.panorama.channels import LEVELS_PER_UNIT
+from piccolo.runtime.threads import Workers
+
+KIND = ViewKind(num_rings=24, stats_rings=16, sigma_deg=22.0, voxel_per_range=1e-6)  # the leaves themselves
+
+
+@pytest.fixture(scope="module")
+def octree():
+    cloud = rooms.room(1)[1]
+    return build_octree(cloud.voxels(np.eye(3)))
+
+
+@pytest.fixture(scope="module")
+def scan_map():
+    return prepare_map(rooms.room(1)[1], Workers(2))
+
+
+def _cells(positions):
+    return cell_of(positions / np.linalg.norm(positions, axis=1, keepdims=True), 24)
+
+
+def test_view_of_the_leaves_equals_its_twin(octree):
+    center = rooms.scene(1)[2].center_world
+    offsets, features, weights = render_view(octree, center, KIND)
+    leaves = octree.level(octree.leaf_size).astype(np.float64)
+    twin = naive.cells_view(leaves, center, _cells(leaves[:, :3] - center), len(make_tiling(24)))
+    seen = twin[2] > 0
+    # float32 may put a voxel on the edge of a cell into the next one
+    assert (seen == (weights > 0)).mean() > 0.995
+    both = seen & (weights > 0)
+    assert np.isclose(offsets[:, both], twin[0][both].T, atol=1e-3).all(axis=0).mean() > 0.97
+    channels = naive.normalized_cells(twin[1], seen, 24, 16, 22.0)
+    assert np.abs(features[:, both] - channels[both].T).mean() < 0.01
+
+
+def test_coarser_voxels_far_away_change_a_view_little(octree):
+    center = rooms.scene(1)[2].center_world
+    exact, coarse = (render_view(octree, center, kind) for kind in (KIND, SEARCH_VIEW))
+    both = (exact[2] > 0) & (coarse[2] > 0)
+    product = (exact[1] * coarse[1])[:, both].sum()
+    assert product / np.sqrt((exact[1][:, both] ** 2).sum() * (coarse[1][:, both] ** 2).sum()) > 0.8
+
+
+def test_points_that_are_seen_lie_at_the_front_and_are_bounded(octree):
+    center = rooms.scene(1)[2].center_world
+    offsets, _, weights = seen_points(octree, center, KIND, 3000)
+    assert 1000 < len(weights) <= 3000
+    ranges = np.linalg.norm(offsets, axis=0)
+    nearest = np.full(len(make_tiling(24)), np.inf)
+    leaves = octree.level(octree.leaf_size)[:, :3] - center
+    np.minimum.at(nearest, _cells(leaves), np.linalg.norm(leaves, axis=1))
+    assert (ranges <= nearest[_cells(offsets.T)] * 1.09 + 0.11).mean() > 0.99
+
+
+def test_every_free_place_at_a_cameras_height_has_a_candidate_near(octree):
+    room, origin = rooms.room(1)[0].rooms[0], rooms.room(1)[1].origin_world
+    centers = candidate_centers(octree, Workers(2)) + origin
+    rng = np.random.default_rng(0)
+    places = room.corner + rng.uniform([0.4, 0.4, 0.8], [*(room.size[:2] - 0.4), 2.0], (300, 3))
+    places = [p for p in places if room.clearance(p) > 0.4]
+    assert len(places) > 50
+    gaps = np.array([np.linalg.norm(centers - p, axis=1).min() for p in places])
+    assert gaps.max() < 0.7
+    heights = heights_above_floor(octree, centers - origin)
+    assert heights.min() > 0.2
+    assert np.median(heights) < 2.0
+
+
+def test_candidates_keep_their_distance_from_points(octree):
+    tree = cKDTree(octree.level(octree.leaf_size)[:, :3])
+    clearance, _ = tree.query(candidate_centers(octree, Workers(2)))
+    assert clearance.min() > MIN_CLEARANCE - 0.08  # the width of the voxels that are asked
+
+
+def test_top_surfaces_have_nothing_right_above(octree):
+    surfaces = top_surfaces(octree)
+    cells = supported_cells(surfaces)
+    assert len(np.unique(cells, axis=0)) == len(cells)
+    assert surfaces[:, 2].min() < -1.0  # the floor is among them
+
+
+def test_coverage_is_all_inside_and_little_outside(octree):
+    share = coverage(octree, np.array([[0.3, 0.2, 0.3], [30.0, 0.0, 0.0]]), Workers(1))
+    assert share[0] > 0.9
+    assert share[1] < 0.2
+
+
+def test_candidates_views_are_views_in_few_bits(octree, scan_map):
+    k = len(scan_map.centers) // 2
+    offsets, features, weights = render_view(octree, scan_map.centers[k], SEARCH_VIEW)
+    np.testing.assert_array_equal(scan_map.is_seen[k], weights > 0)
+    unit = scan_map.offset_unit[k]
+    np.testing.assert_allclose(scan_map.offsets[k] * unit, offsets, atol=2 * unit)
+    np.testing.assert_allclose(scan_map.features[k] / LEVELS_PER_UNIT, features, atol=0.01)
+
+
+def test_map_has_the_same_bits_for_any_number_of_threads(octree, scan_map):
+    one, two = (render_candidates(octree, scan_map.centers[:200], Workers(n)) for n in (1, 2))
+    for a, b in zip(one, two, strict=True):
+        np.testing.assert_array_equal(a, b)

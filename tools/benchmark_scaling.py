@@ -1,0 +1,151 @@
+#!/usr/bin/env python3
+"""How the cost of the default engine grows with points and with rooms: time, memory, share found."""
+
+import argparse
+import multiprocessing
+import resource
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import _checkout  # noqa: F401
+import numpy as np
+from numpy.typing import NDArray
+
+from piccolo.cloud import read_cloud
+from piccolo.cloud.model import Cloud
+from piccolo.cloud.morton import canonical_order
+from piccolo.coarse_to_fine.localize import localize
+from piccolo.coarse_to_fine.scan_map import prepare_map
+from piccolo.coarse_to_fine.settings import EngineSettings
+from piccolo.errors import InputError
+from piccolo.geometry.pose import Pose
+from piccolo.geometry.pose_error import is_correct
+from piccolo.geometry.rotations import Gravity
+from piccolo.panorama import Panorama, read_panorama
+from piccolo.runtime.stopwatch import Stopwatch
+from piccolo.runtime.threads import Workers, num_cores
+from piccolo.scenes.scene import read_scene
+from piccolo.scenes.synthetic.world import make_query, make_world, scan_world
+
+EPILOG = """\
+examples:
+  python tools/benchmark_scaling.py --scene BENCH/house --points 10000 100000 1000000
+  python tools/benchmark_scaling.py --rooms 1 4 16 64
+
+--scene: a folder with cloud.ply, queries.json and images; more points than it has are made by repeating it
+with 5 mm noise, fewer by leaving some out. --rooms: rooms of tools/make_room.py, 50,000 points each.
+Each row is measured in a process of its own; queries are the first six clean ones, gravity known and unknown.
+exit codes: 0 done, 2 wrong usage, 3 bad input.
+"""
+NUM_QUERIES = 6
+GRAVITIES: tuple[Gravity, ...] = ("known", "unknown")
+HEAD = "case | points | candidates | prepare s | known s | found | unknown s | found | peak MB | before"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A cloud and panoramas in it."""
+
+    cloud: Cloud
+    queries: list[tuple[Panorama, Pose]]
+
+
+def ordered(
+    points: NDArray[np.float32], colors: NDArray[np.uint8], origin_world: NDArray[np.float64]
+) -> Cloud:
+    """A cloud as a file would be read."""
+    order = canonical_order(points, colors)
+    return Cloud(points[order], colors[order], origin_world)
+
+
+def scene_case(folder: Path, num_points: int) -> Case:
+    """A scene with as many points."""
+    scene = read_scene(folder)
+    cloud = read_cloud(scene.cloud)
+    rng = np.random.default_rng(0)
+    index = rng.permutation(len(cloud.points))[:num_points]
+    if num_points > len(index):
+        index = np.resize(index, num_points)
+    points = cloud.points[index]
+    if num_points > len(cloud.points):
+        points = points + rng.normal(0.0, 0.005, points.shape).astype(np.float32)
+    taken = [query for query in scene.queries if query.variant == "clean"][:NUM_QUERIES]
+    queries = [(read_panorama(query.image), query.pose) for query in taken]
+    return Case(ordered(points, cloud.colors[index], cloud.origin_world), queries)
+
+
+def rooms_case(num_rooms: int) -> Case:
+    """Seeded rooms side by side."""
+    workers = Workers(num_cores())
+    world = make_world(11, np.array([5.0, 4.0, 2.6]), num_rooms)
+    points, colors = scan_world(world, 50_000 * num_rooms, workers)
+    taken = [make_query(world, k, "clean", 1024, workers) for k in range(NUM_QUERIES)]
+    queries = [(Panorama(q.rgb, np.ones(q.rgb.shape[:2], dtype=bool)), q.pose) for q in taken]
+    return Case(ordered(points, colors, np.zeros(3)), queries)
+
+
+def measure(label: str, make: Callable[[], Case], results: "multiprocessing.Queue[str]") -> None:
+    """Put one row of the table."""
+    case, workers = make(), Workers(num_cores())
+    every = max(1, len(case.cloud.points) // 20_000)
+    small = Cloud(case.cloud.points[::every], case.cloud.colors[::every], case.cloud.origin_world)
+    for gravity in GRAVITIES:  # compiles
+        settings = EngineSettings(gravity=gravity)
+        localize(prepare_map(small, workers), case.queries[0][0], settings, workers, Stopwatch())
+    before_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    begin = time.perf_counter()
+    scan_map = prepare_map(case.cloud, workers)
+    seconds = time.perf_counter() - begin
+    columns = [label, str(len(case.cloud.points)), str(len(scan_map.centers)), f"{seconds:.1f}"]
+    for gravity in GRAVITIES:
+        settings = EngineSettings(gravity=gravity)
+        times, correct = [], 0
+        for panorama, truth in case.queries:
+            begin = time.perf_counter()
+            found = localize(scan_map, panorama, settings, workers, Stopwatch())
+            times.append(time.perf_counter() - begin)
+            correct += is_correct(found.pose, truth)
+        columns += [f"{np.median(times):.2f}", f"{correct}/{len(case.queries)}"]
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    results.put(f"| {' | '.join([*columns, f'{peak_mb:.0f}', f'{before_mb:.0f}'])} |")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--scene", type=Path, metavar="FOLDER", help="with --points")
+    parser.add_argument("--points", type=int, nargs="+", default=[], metavar="N", help="with --scene")
+    parser.add_argument("--rooms", type=int, nargs="+", default=[], metavar="N", help="1 to 64")
+    arguments = parser.parse_args(argv)
+    if bool(arguments.scene) != bool(arguments.points) or not (arguments.points or arguments.rooms):
+        parser.error("wanted --scene with --points, or --rooms")
+    rows = [(f"{n} points", partial(scene_case, arguments.scene, n)) for n in arguments.points]
+    rows += [(f"{n} rooms", partial(rooms_case, n)) for n in arguments.rooms]
+    print(
+        "| case | points | candidates | prepare s | known s | found | unknown s | found | peak MB | before |"
+    )
+    print("|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|")
+    context = multiprocessing.get_context("spawn")
+    for label, make in rows:
+        results: multiprocessing.Queue[str] = context.Queue()
+        process = context.Process(target=measure, args=(label, make, results))
+        process.start()
+        process.join()
+        if process.exitcode != 0:
+            print(f"growth.py: {label}: failed, see above", file=sys.stderr)
+            return 3
+        print(results.get(), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except (OSError, InputError) as error:
+        sys.exit(f"growth.py: {error}")

@@ -1,0 +1,179 @@
+#!/usr/bin/env python3
+"""Learn the confidence from trials, and check it, and the covariances, on others."""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import _checkout  # noqa: F401
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.stats import chi2
+
+from piccolo.confidence.confidence import (
+    AMBIGUOUS,
+    DIRECTIONS,
+    FEATURES,
+    LOCALIZED,
+    MIN_CONFIDENCE,
+    confidence_of,
+    features_of,
+    verdict,
+)
+from piccolo.confidence.covariance import Certainty
+from piccolo.confidence.score import Evidence
+from piccolo.errors import InputError
+from piccolo.geometry.pose import Pose, log_so3
+from piccolo.geometry.pose_error import is_correct
+from piccolo.result import Result
+
+EPILOG = """\
+examples:
+  python tools/calibrate_confidence.py --fit trials.jsonl --check others.jsonl bench.jsonl
+  python tools/calibrate_confidence.py --fit paper.jsonl --without twins hall corridor
+
+Files are those of tools/evaluate_confidence.py. The weights printed go into
+piccolo/confidence/confidence.py; the tables say how the
+confidence in use fares on each set, and what share of the true poses lies in the region of the covariance.
+exit codes: 0 done, 2 wrong usage, 3 bad input.
+"""
+PENALTY = 0.05  # on squared weights of features of deviation 1: without, easy trials ask for ever larger ones
+LEVELS = (0.0, 0.5, 0.9, 0.99, 1.01)
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One trial's evidence, and whether its pose was right."""
+
+    case: str
+    evidence: Evidence
+    certainty: Certainty | None
+    has_rivals: bool
+    is_correct: bool
+    error: Array  # (6,) of the pose, as Certainty has it; NaN without truth
+
+
+def read_outcomes(paths: Sequence[Path]) -> list[Outcome]:
+    """The trials of some files that came to a pose."""
+    return [
+        outcome
+        for path in paths
+        for line in path.read_text().splitlines()
+        if (outcome := outcome_of(json.loads(line))) is not None
+    ]
+
+
+def outcome_of(trial: dict[str, object]) -> Outcome | None:
+    """One line of tools/evaluate_confidence.py; None if no pose was found."""
+    result, truth = Result.from_json(json.dumps(trial["result"])), trial["truth"]
+    if result.pose is None or result.evidence is None:
+        return None
+    error, ok = np.full(6, np.nan), False
+    if isinstance(truth, dict):
+        true_pose = Pose(np.array(truth["R_cam_from_world"]), np.array(truth["center_world"]))
+        turn = log_so3(true_pose.R_cam_from_world @ result.pose.R_cam_from_world.T)
+        error = np.concatenate([turn, true_pose.center_world - result.pose.center_world])
+        ok = is_correct(result.pose, true_pose)
+    return Outcome(str(trial["case"]), result.evidence, result.certainty, len(result.rivals) > 0, ok, error)
+
+
+def fit(outcomes: Sequence[Outcome]) -> tuple[float, Array]:
+    """Bias and weights of the logistic regression with the least penalised loss."""
+    X = np.array([features_of(o.evidence, o.certainty) for o in outcomes])
+    y = np.array([o.is_correct for o in outcomes], float)
+    mean, deviation = X.mean(axis=0), X.std(axis=0)
+    deviation[deviation == 0.0] = 1.0  # a feature that is the same in all trials
+    Z = np.column_stack([np.ones(len(X)), (X - mean) / deviation])
+
+    def loss(w: Array) -> tuple[float, Array]:
+        logit = Z @ w
+        p = 1.0 / (1.0 + np.exp(-logit))
+        gradient = Z.T @ (p - y) + PENALTY * np.r_[0.0, w[1:]]
+        return float(np.logaddexp(0.0, logit).sum() - y @ logit + 0.5 * PENALTY * w[1:] @ w[1:]), gradient
+
+    ranges = [(0.0, None) if sign > 0 else (None, 0.0) for sign in DIRECTIONS[: X.shape[1]]]
+    w = minimize(loss, np.zeros(Z.shape[1]), jac=True, method="L-BFGS-B", bounds=[(None, None), *ranges]).x
+    weights = w[1:] / deviation
+    return float(w[0] - weights @ mean), weights
+
+
+def print_reliability(name: str, outcomes: Sequence[Outcome]) -> None:
+    """How many poses were right in each range of confidence."""
+    print(f"\n| confidence, {name} | poses | right | wrong |")
+    print("|---|---:|---:|---:|")
+    for low, high in pairwise(LEVELS):
+        some = [o for o in outcomes if low <= confidence_of(o.evidence, o.certainty) < high]
+        right = sum(o.is_correct for o in some)
+        print(f"| {low} to {min(high, 1.0)} | {len(some)} | {right} | {len(some) - right} |")
+
+
+def print_cases(name: str, outcomes: Sequence[Outcome], min_confidence: float) -> None:
+    """What each case is called by the confidence in use."""
+    print(f"\n| case, {name} | poses | right | localized | ambiguous | false |")
+    print("|---|---:|---:|---:|---:|---:|")
+    for case in dict.fromkeys(o.case for o in outcomes):
+        some = [o for o in outcomes if o.case == case]
+        called = [verdict(o.evidence, o.certainty, o.has_rivals, min_confidence)[0] for o in some]
+        false = sum(s == LOCALIZED and not o.is_correct for s, o in zip(called, some, strict=True))
+        counts = sum(o.is_correct for o in some), called.count(LOCALIZED), called.count(AMBIGUOUS), false
+        print(f"| {case} | {len(some)} | {' | '.join(map(str, counts))} |")
+
+
+def print_coverage(name: str, outcomes: Sequence[Outcome]) -> None:
+    """What share of right poses has its error in the covariance's 95 % region."""
+    some = [o for o in outcomes if o.is_correct and o.certainty is not None]
+    if not some:
+        return
+    print(f"\n| covariance, {name} | right poses | in the 95 % region | in the 50 % region |")
+    print("|---|---:|---:|---:|")
+    for part, rows in (
+        ("rotation and position", slice(6)),
+        ("rotation", slice(3)),
+        ("position", slice(3, 6)),
+    ):
+        squares = [
+            o.error[rows] @ np.linalg.solve(o.certainty.covariance[rows, rows], o.error[rows])
+            for o in some
+            if o.certainty is not None
+        ]
+        shares = [np.mean(squares < chi2.ppf(p, len(range(6)[rows]))) for p in (0.95, 0.5)]
+        print(f"| {part} | {len(some)} | {shares[0]:.3f} | {shares[1]:.3f} |")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--fit", type=Path, nargs="+", default=[], metavar="FILE", help="trials to learn from"
+    )
+    parser.add_argument("--check", type=Path, nargs="+", default=[], metavar="FILE", help="other trials")
+    parser.add_argument("--without", nargs="+", default=[], metavar="CASE", help="leave these cases out")
+    arguments = parser.parse_args(argv)
+    try:
+        sets = {"learnt from": read_outcomes(arguments.fit), "others": read_outcomes(arguments.check)}
+        sets = {k: [o for o in rows if o.case not in arguments.without] for k, rows in sets.items()}
+    except (OSError, InputError, json.JSONDecodeError, KeyError) as error:
+        print(f"calibrate.py: {error!r}", file=sys.stderr)
+        return 3
+    if arguments.fit:
+        bias, weights = fit(sets["learnt from"])
+        print(f"bias {bias:.2f}, weights " + ", ".join(f"{w:.2f}" for w in weights))
+        print(f"of {', '.join(FEATURES[: len(weights)])}")
+    for name, outcomes in sets.items():
+        if outcomes:
+            print_cases(name, outcomes, MIN_CONFIDENCE)
+            print_reliability(name, outcomes)
+            print_coverage(name, outcomes)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,178 @@
+#!/usr/bin/env python3
+"""Try the verdict: seeded queries with and without an answer, and how often each was called localized."""
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
+from pathlib import Path
+
+import _checkout  # noqa: F401
+import numpy as np
+
+from piccolo.cloud import CloudStream, read_cloud, stream_of
+from piccolo.cloud.readers.reader import RawCloud
+from piccolo.coarse_to_fine.scan_map import prepare_map
+from piccolo.coarse_to_fine.settings import EngineSettings
+from piccolo.confidence.confidence import AMBIGUOUS, LOCALIZED
+from piccolo.errors import InputError
+from piccolo.geometry.pose import Pose
+from piccolo.geometry.pose_error import is_correct
+from piccolo.geometry.rotations import Gravity
+from piccolo.panorama import Panorama, read_panorama
+from piccolo.paper import localize as paper
+from piccolo.paper.settings import PaperSettings
+from piccolo.pipeline import EngineLocalizer, Localizer, PaperLocalizer
+from piccolo.result import Result, result_of
+from piccolo.runtime.stopwatch import Stopwatch
+from piccolo.runtime.threads import Workers, num_cores
+from piccolo.scenes.scene import Scene, read_scene
+from piccolo.scenes.synthetic.trials import (
+    SPARSE_SHARE,
+    Points,
+    Trial,
+    repeated_trials,
+    room_trials,
+    upside_down,
+    without_scene,
+)
+
+EPILOG = """\
+examples:
+  python tools/evaluate_confidence.py --seeds 0 40 --out trials.jsonl
+  python tools/evaluate_confidence.py --seeds 0 0 --scenes BENCH/house BENCH/hospital --out bench.jsonl
+
+Seeds make rooms, and places that look the same from several positions; scenes are folders with cloud.ply,
+queries.json and images, each panorama tried in each cloud. A false answer is a pose called localized that is
+over 0.1 m or 5 degrees off. Each trial is a line {"case", "scene", "truth", "result"}; a table on stdout.
+exit codes: 0 no false answer, 1 some, 2 wrong usage, 3 bad input, 130 interrupted.
+"""
+
+
+def cloud_of(points: Points) -> CloudStream:
+    """Points as a file of them would be read."""
+    return stream_of(Path("trial"), RawCloud(points[0].astype(np.float64), points[1]))
+
+
+def as_panorama(rgb: np.ndarray[tuple[int, int, int], np.dtype[np.uint8]]) -> Panorama:
+    """An image (H, W, 3) of which every pixel counts."""
+    return Panorama(rgb, np.ones(rgb.shape[:2], np.bool_))
+
+
+def scene_trials(scene: Scene, others: Sequence[Scene]) -> Iterator[tuple[CloudStream, list[Trial]]]:
+    """Every panorama of every scene in one scene's cloud; its own also spoilt, and in a thinned cloud."""
+    cloud = read_cloud(scene.cloud)
+    rng = np.random.default_rng([len(scene.queries), 52])
+    own = [Trial(query.variant, read_panorama(query.image).rgb, query.pose) for query in scene.queries]
+    upright = [trial for trial in own if trial.case == "clean"]
+    spoilt = [Trial(name, rgb, t.true_pose if name == "blurred" else None)
+              for t in upright[:2] for name, rgb in without_scene(t.rgb, rng)]  # fmt: skip
+    elsewhere = [
+        Trial("elsewhere", read_panorama(query.image).rgb, None)
+        for other in others
+        for query in other.queries
+    ]
+    points_world = cloud.points + cloud.origin_world
+    yield cloud_of((points_world, cloud.colors)), [*own, *elsewhere, *spoilt, *map(upside_down, upright)]
+    sparse = np.sort(rng.choice(len(points_world), int(SPARSE_SHARE * len(points_world)), replace=False))
+    thinned = cloud_of((points_world[sparse], cloud.colors[sparse]))
+    yield thinned, [Trial("sparse", t.rgb, t.true_pose) for t in upright]
+
+
+def all_trials(
+    arguments: argparse.Namespace, workers: Workers
+) -> Iterator[tuple[str, CloudStream, list[Trial]]]:
+    """Name of a scene, its cloud, its trials."""
+    for seed in range(*arguments.seeds):
+        for points, trials in chain(room_trials(seed, workers), repeated_trials(seed, workers)):
+            yield f"seed {seed}", cloud_of(points), trials
+    scenes = [read_scene(folder) for folder in arguments.scenes]
+    for scene in scenes:
+        others = [other for other in scenes if other is not scene]
+        for cloud, trials in scene_trials(scene, others):
+            yield scene.name, cloud, trials
+
+
+def localizer_of(cloud: CloudStream, preset: str, workers: Workers) -> Callable[[Gravity], Localizer]:
+    """What prepares once and localizes with any gravity. The paper knows no `auto`: it is told `known`."""
+    if preset == "paper":
+        paper_map = paper.prepare(cloud.read(), PaperSettings())
+        return lambda gravity: PaperLocalizer(
+            paper_map, PaperSettings(gravity="known" if gravity == "auto" else gravity), ()
+        )
+    scan_map = prepare_map(cloud, workers)
+    return lambda gravity: EngineLocalizer(scan_map, EngineSettings(gravity=gravity))
+
+
+def run(arguments: argparse.Namespace) -> Iterator[tuple[str, Trial, Result]]:
+    """Localize every trial; the scene's name, the trial and its result."""
+    workers = Workers(arguments.threads)
+    for scene, cloud, trials in all_trials(arguments, workers):
+        localizer = localizer_of(cloud, arguments.preset, workers)
+        for trial in trials:
+            how, watch = localizer(trial.gravity), Stopwatch()
+            found = how.localize(as_panorama(trial.rgb), workers, watch)
+            yield scene, trial, result_of(found, scene, trial.case, watch.seconds, how.settings.to_json())
+
+
+def as_line(scene: str, trial: Trial, result: Result) -> str:
+    """One JSON object."""
+    pose: Pose | None = trial.true_pose
+    truth = pose and {
+        "R_cam_from_world": pose.R_cam_from_world.tolist(),
+        "center_world": pose.center_world.tolist(),
+    }
+    return json.dumps(
+        {"case": trial.case, "scene": scene, "truth": truth, "result": json.loads(result.to_json())}
+    )
+
+
+def print_table(counts: dict[str, list[tuple[str, bool]]]) -> int:
+    """One line a case; returns the number of false answers."""
+    print("| case | trials | correct | localized | ambiguous | false |")
+    print("|---|---:|---:|---:|---:|---:|")
+    total = 0
+    for case, rows in counts.items():
+        localized = [ok for status, ok in rows if status == LOCALIZED]
+        false = localized.count(False)
+        ambiguous = sum(status == AMBIGUOUS for status, _ in rows)
+        correct = sum(ok for _, ok in rows)
+        print(f"| {case} | {len(rows)} | {correct} | {len(localized)} | {ambiguous} | {false} |")
+        total += false
+    return total
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), required=True)
+    parser.add_argument("--scenes", type=Path, nargs="*", default=[], metavar="FOLDER")
+    parser.add_argument("--out", type=Path, required=True, help="JSON lines, written as they come")
+    parser.add_argument("--preset", choices=["default", "paper"], default="default")
+    parser.add_argument("--threads", type=int, default=num_cores(), metavar="N")
+    arguments = parser.parse_args(argv)
+    counts: dict[str, list[tuple[str, bool]]] = {}
+    try:
+        with arguments.out.open("w") as file:
+            for scene, trial, result in run(arguments):
+                ok = trial.true_pose is not None and is_correct(result.pose, trial.true_pose)
+                counts.setdefault(trial.case, []).append((result.status, ok))
+                file.write(as_line(scene, trial, result) + "\n")
+                file.flush()
+                print(
+                    f"{scene}: {trial.case}: {result.status}, {'right' if ok else 'wrong'}", file=sys.stderr
+                )
+    except (OSError, InputError) as error:
+        print(f"trials.py: {error}", file=sys.stderr)
+        return 3
+    except KeyboardInterrupt:
+        print("trials.py: interrupted", file=sys.stderr)
+        return 130
+    return 1 if print_table(counts) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
