@@ -13,7 +13,7 @@ from .cloud.soa import LocalCloud, PackedPoints, pack_points
 from .coarse_to_fine import localize as engine
 from .coarse_to_fine.map_file import cached_map, content_key, is_map_file, load_map
 from .coarse_to_fine.scan_map import ScanMap, prepare_map
-from .coarse_to_fine.settings import EngineSettings
+from .coarse_to_fine.settings import CoarseToFineSettings
 from .confidence.localization import Localization
 from .errors import InputError
 from .geometry.pose import Pose
@@ -38,7 +38,7 @@ class Localizer(Protocol):
         """What the user should know about the cloud, one line each."""
 
     @property
-    def settings(self) -> EngineSettings | PaperSettings:
+    def settings(self) -> CoarseToFineSettings | PaperSettings:
         """What it localizes with."""
 
     def from_world(self, pose: Pose) -> Pose:
@@ -74,11 +74,11 @@ class PaperLocalizer:
 
 
 @dataclass(frozen=True)
-class EngineLocalizer:
+class DefaultLocalizer:
     """Preset `default`."""
 
     scan_map: ScanMap
-    settings: EngineSettings
+    settings: CoarseToFineSettings
 
     @property
     def points(self) -> PackedPoints:
@@ -180,15 +180,15 @@ def open_points(paths: Sequence[Path], settings: CloudSettings, workers: Workers
 
 def open_localizer(
     inputs: Inputs,
-    settings: EngineSettings | PaperSettings,
+    settings: CoarseToFineSettings | PaperSettings,
     cache: CachePolicy,
     workers: Workers,
     watch: Stopwatch,
 ) -> Localizer:
     """Read and prepare a cloud for the preset that the settings belong to."""
     paths, cloud_settings = inputs.clouds, inputs.cloud_settings
-    if isinstance(settings, EngineSettings):
-        return EngineLocalizer(open_map(paths, cloud_settings, cache, workers, watch), settings)
+    if isinstance(settings, CoarseToFineSettings):
+        return DefaultLocalizer(open_map(paths, cloud_settings, cache, workers, watch), settings)
     map_path = _map_among(paths)
     if map_path:
         raise InputError(f"{map_path}: found a prepared map, wanted a cloud with the preset paper")
@@ -201,7 +201,7 @@ def open_localizer(
     return PaperLocalizer(paper_map, settings, cloud.warnings)
 
 
-def settings_json(inputs: Inputs, settings: EngineSettings | PaperSettings) -> dict[str, object]:
+def settings_json(inputs: Inputs, settings: CoarseToFineSettings | PaperSettings) -> dict[str, object]:
     """What a result repeats of how it was made."""
     return {**settings.to_json(), **inputs.to_json()}
 

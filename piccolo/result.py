@@ -9,14 +9,14 @@ import numpy as np
 from . import __version__
 from .confidence.alternatives import Hypothesis
 from .confidence.confidence import AMBIGUOUS
-from .confidence.covariance import Certainty
+from .confidence.covariance import PoseCovariance
 from .confidence.localization import Localization
 from .confidence.score import Evidence
 from .errors import InputError
 from .geometry.pose import Pose, T_world_from_cam, quaternion_wxyz
 from .geometry.sphere import CONVENTION
 
-FORMAT = "piccolo-pose/2"
+FORMAT = "piccolo-pose/3"
 COVARIANCE_CONVENTION = (
     "of (w, d), rotation [rad] about the camera's axes, then translation [m] along the world's: "
     "R_true = exp([w]x) R_cam_from_world, center_true = center_world + d"
@@ -34,8 +34,8 @@ class Result:
     pose: Pose | None  # the best pose found, in the file's own coordinates; None if there was no start
     loss: float | None  # sampling loss [0, sqrt(3)] over the points seen from the pose
     evidence: Evidence | None
-    rivals: tuple[Hypothesis, ...]  # poses elsewhere, best first, at most 5
-    certainty: Certainty | None  # None with the preset paper, and where the points do not fix the pose
+    alternatives: tuple[Hypothesis, ...]  # poses elsewhere, best first, at most 5
+    covariance: PoseCovariance | None  # None with the preset paper, and where the points do not fix the pose
     seconds: dict[str, float]  # read, prepare, search, refine
     settings: dict[str, object]  # effective settings, seed included
     warnings: tuple[str, ...] = field(default=())
@@ -56,13 +56,15 @@ class Result:
             e = self.evidence
             lines.append(
                 f"  confidence {self.confidence:.3f}, score {e.score:.2f}, margin {e.margin:.2f}, "
-                f"{100.0 * e.explained_share:.0f} % of the panorama explained"
+                f"{100.0 * e.explained_fraction:.0f} % of the panorama explained"
             )
-        if self.certainty is not None:
-            mm, deg = 1000.0 * self.certainty.largest_std, self.certainty.std_deg.max()
-            lines.append(f"  one sigma {mm:.1f} mm ({self.certainty.weakest_direction}), {deg:.2f} deg")
+        if self.covariance is not None:
+            mm, deg = 1000.0 * self.covariance.largest_std, self.covariance.std_deg.max()
+            lines.append(
+                f"  one sigma {mm:.1f} mm ({self.covariance.least_constrained_direction}), {deg:.2f} deg"
+            )
         if self.status == AMBIGUOUS:
-            lines += [f"  or {_place(rival)}" for rival in self.rivals]
+            lines += [f"  or {_place(h)}" for h in self.alternatives]
         return "\n".join(lines)
 
     def to_json(self) -> str:
@@ -79,12 +81,12 @@ class Result:
             "T_world_from_cam": pose and T_world_from_cam(pose).tolist(),
             "loss": self.loss,
             "evidence": self.evidence and asdict(self.evidence),
-            "rivals": [_pose_json(rival.pose) | {"score": rival.score} for rival in self.rivals],
-            "covariance": self.certainty and self.certainty.covariance.tolist(),
+            "alternatives": [_pose_json(h.pose) | {"score": h.score} for h in self.alternatives],
+            "covariance": self.covariance and self.covariance.matrix.tolist(),
             "covariance_convention": COVARIANCE_CONVENTION,
-            "std_mm": self.certainty and self.certainty.std_mm.tolist(),
-            "std_deg": self.certainty and self.certainty.std_deg.tolist(),
-            "weakest_direction": self.certainty and self.certainty.weakest_direction,
+            "std_mm": self.covariance and self.covariance.std_mm.tolist(),
+            "std_deg": self.covariance and self.covariance.std_deg.tolist(),
+            "least_constrained_direction": self.covariance and self.covariance.least_constrained_direction,
             "convention": CONVENTION,
             "seconds": {stage: round(seconds, 4) for stage, seconds in self.seconds.items()},
             "settings": self.settings,
@@ -100,14 +102,13 @@ class Result:
             document = json.loads(text)
             if document["format"] != FORMAT:
                 raise InputError(f"result: found format {document['format']!r}, wanted {FORMAT!r}")
-            covariance = document["covariance"]
             cloud = document.pop("cloud")
             return cls(
                 cloud=cloud if isinstance(cloud, str) else _paths(cloud),
                 pose=_pose_from_json(document),
                 evidence=document["evidence"] and Evidence(**document["evidence"]),
-                rivals=tuple(_rival_from_json(rival) for rival in document["rivals"]),
-                certainty=covariance and Certainty(np.array(covariance), document["weakest_direction"]),
+                alternatives=tuple(map(_alternative_from_json, document["alternatives"])),
+                covariance=_covariance_from_json(document),
                 warnings=tuple(document["warnings"]),
                 **{name: document[name] for name in _PLAIN_FIELDS},
             )
@@ -144,14 +145,21 @@ def _pose_from_json(document: dict[str, Any]) -> Pose | None:
     return None if R is None else Pose(np.array(R), np.array(center))
 
 
-def _rival_from_json(document: dict[str, Any]) -> Hypothesis:
+def _covariance_from_json(document: dict[str, Any]) -> PoseCovariance | None:
+    matrix = document["covariance"]
+    return (
+        None if matrix is None else PoseCovariance(np.array(matrix), document["least_constrained_direction"])
+    )
+
+
+def _alternative_from_json(document: dict[str, Any]) -> Hypothesis:
     pose = Pose(np.array(document["R_cam_from_world"]), np.array(document["center_world"]))
     return Hypothesis(pose, document["score"])
 
 
-def _place(rival: Hypothesis) -> str:
-    x, y, z = rival.pose.center_world
-    return f"({x:.3f}, {y:.3f}, {z:.3f}) m, score {rival.score:.2f}"
+def _place(h: Hypothesis) -> str:
+    x, y, z = h.pose.center_world
+    return f"({x:.3f}, {y:.3f}, {z:.3f}) m, score {h.score:.2f}"
 
 
 def _paths(value: object) -> tuple[str, ...]:

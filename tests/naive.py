@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from piccolo.geometry.sphere_grid import cell_of, make_tiling
+from piccolo.geometry.sphere_grid import cell_of, make_grid
 
 
 def project(points, R_cam_from_world, center_world, width):
@@ -110,7 +110,7 @@ def cells_view(leaves, center, cell, num_cells):
 
 def normalized_cells(rgb, is_seen, num_rings, stats_rings, sigma_deg):
     """Opponent channels (cells, 3) less their Gaussian local mean, by the local deviation, clipped to 2."""
-    fine, coarse = make_tiling(num_rings), make_tiling(stats_rings)
+    fine, coarse = make_grid(num_rings), make_grid(stats_rings)
     r, g, b = rgb.T
     channels = np.stack([(r + g + b) / 3, (r - b) / 2, (2 * g - r - b) / 4], axis=1)
     moments = np.zeros((len(coarse), 7))

@@ -18,7 +18,7 @@ from piccolo.cloud.voxels import Voxels
 from piccolo.coarse_to_fine.localize import localize
 from piccolo.coarse_to_fine.map_file import content_key
 from piccolo.coarse_to_fine.scan_map import prepare_map
-from piccolo.coarse_to_fine.settings import EngineSettings
+from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.gravity import rotation_to_z_up
@@ -159,7 +159,7 @@ def test_up_axis_is_believed_and_poses_stay_in_the_files_frame(up):
     assert np.linalg.det(scan_map.R_map_from_world) == 1.0
     assert scan_map.warnings == ()
     panorama = as_panorama(query(1).rgb)
-    found = localize(scan_map, panorama, EngineSettings(gravity="known"), Workers(2), Stopwatch())
+    found = localize(scan_map, panorama, CoarseToFineSettings(gravity="known"), Workers(2), Stopwatch())
     distance, angle_deg = errors(found.pose, truth)
     assert distance < 0.01
     assert angle_deg < 0.2
@@ -243,7 +243,7 @@ def test_memory_grows_with_the_scene_and_not_with_the_points():
     assert peaks_mb[1] - peaks_mb[0] < 30
 
 
-@pytest.mark.parametrize("preset", [EngineSettings(), PaperSettings()])
+@pytest.mark.parametrize("preset", [CoarseToFineSettings(), PaperSettings()])
 def test_a_wrong_unit_is_told_before_the_long_work_begins(tmp_path, monkeypatch, preset):
     heard = []
 

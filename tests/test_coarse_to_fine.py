@@ -12,7 +12,7 @@ from piccolo.coarse_to_fine.localize import localize
 from piccolo.coarse_to_fine.map_file import load_map, save_map
 from piccolo.coarse_to_fine.prior import allowed_rotations, narrowed
 from piccolo.coarse_to_fine.scan_map import prepare_map
-from piccolo.coarse_to_fine.settings import EngineSettings, Prior
+from piccolo.coarse_to_fine.settings import CoarseToFineSettings, Prior
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.geometry.rotations import uniform_yaws
@@ -20,7 +20,7 @@ from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers
 
 GOLDEN = Path(__file__).parent / "golden" / "engine.json"
-KNOWN, UNKNOWN = EngineSettings(gravity="known"), EngineSettings(gravity="unknown")
+KNOWN, UNKNOWN = CoarseToFineSettings(gravity="known"), CoarseToFineSettings(gravity="unknown")
 MAPS = {}
 
 
@@ -38,7 +38,7 @@ def _localize(seed, rgb, settings, num_threads=2):
 @pytest.mark.parametrize("variant", ["clean", "photo", "change", "tilt"])
 def test_camera_is_found_within_millimetres(seed, variant):
     taken = query(seed, variant)
-    found = _localize(seed, taken.rgb, EngineSettings())
+    found = _localize(seed, taken.rgb, CoarseToFineSettings())
     distance, angle_deg = errors(found.pose, taken.pose)
     assert found.status == "localized"
     # a 512 px panorama has pixels of 0.7 deg and the photo's is blurred and noisy
@@ -64,7 +64,7 @@ def test_same_bits_for_any_number_of_threads():
 def test_panorama_from_elsewhere_is_not_localized(name):
     noise = np.random.default_rng(0).integers(0, 256, (256, 512, 3), dtype=np.uint8)
     rgb = {"elsewhere": query(1).rgb, "black": np.zeros_like(noise), "noise": noise}[name]
-    assert _localize(2, rgb, EngineSettings()).status == "not_localized"
+    assert _localize(2, rgb, CoarseToFineSettings()).status == "not_localized"
 
 
 def test_panorama_of_which_nothing_counts_has_no_pose():
@@ -79,7 +79,7 @@ def test_cloud_without_a_place_for_a_camera_is_no_error():
     solid = rng.uniform(0.0, 1.0, (20_000, 3)).astype(np.float32)
     cloud = Cloud(solid, rng.integers(0, 256, (20_000, 3), dtype=np.uint8), np.zeros(3))
     scan_map = prepare_map(cloud, Workers(1))
-    found = localize(scan_map, as_panorama(query(1).rgb), EngineSettings(), Workers(1), Stopwatch())
+    found = localize(scan_map, as_panorama(query(1).rgb), CoarseToFineSettings(), Workers(1), Stopwatch())
     assert found.status == "not_localized"
 
 
@@ -149,7 +149,7 @@ def test_map_file_round_trip(tmp_path):
 def test_golden_poses():
     """A change that moves one says so in CHANGELOG.md under Numbers; the file is made anew from this loop."""
     for entry in json.loads(GOLDEN.read_text()):
-        found = _localize(entry["seed"], query(entry["seed"], entry["variant"]).rgb, EngineSettings())
+        found = _localize(entry["seed"], query(entry["seed"], entry["variant"]).rgb, CoarseToFineSettings())
         distance = np.linalg.norm(found.pose.center_world - entry["center_world"])
         assert distance < 0.001, entry
         assert np.abs(found.pose.R_cam_from_world - entry["R_cam_from_world"]).max() < np.radians(0.01), entry

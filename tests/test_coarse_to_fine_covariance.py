@@ -23,14 +23,14 @@ from piccolo.coarse_to_fine.covariance import (
 from piccolo.coarse_to_fine.localize import localize
 from piccolo.coarse_to_fine.query import look_for
 from piccolo.coarse_to_fine.scan_map import prepare_map
-from piccolo.coarse_to_fine.settings import EngineSettings
+from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.geometry.pose import Pose, exp_so3, log_so3, step
 from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers
 from piccolo.scenes.synthetic.repeated import KINDS, make_repeated
 from piccolo.scenes.synthetic.world import World, make_query, scan_world
 
-SETTINGS = EngineSettings(gravity="known")
+SETTINGS = CoarseToFineSettings(gravity="known")
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_deviations_are_of_the_size_of_the_errors():
         scan_map = prepare_map(room(seed)[1], Workers(2))
         for variant in ("clean", "tilt", "change"):
             taken = query(seed, variant)
-            how = EngineSettings(gravity="unknown" if variant == "tilt" else "known")
+            how = CoarseToFineSettings(gravity="unknown" if variant == "tilt" else "known")
             result = localize(scan_map, as_panorama(taken.rgb), how, Workers(2), Stopwatch())
             turn = log_so3(taken.pose.R_cam_from_world @ result.pose.R_cam_from_world.T)
             error = np.concatenate([turn, taken.pose.center_world - result.pose.center_world])
@@ -119,7 +119,7 @@ def test_truth_is_among_the_poses_of_a_place_that_repeats(kind):
     cloud = stream_of(Path("repeated"), RawCloud(points.astype(float), colors))
     taken = make_query(world, 0, "clean", rooms.WIDTH, Workers(2))
     result = localize(
-        prepare_map(cloud, Workers(2)), as_panorama(taken.rgb), EngineSettings(), Workers(2), Stopwatch()
+        prepare_map(cloud, Workers(2)), as_panorama(taken.rgb), CoarseToFineSettings(), Workers(2), Stopwatch()
     )
     distances = [errors(pose, taken.pose)[0] for pose in (result.pose, *(r.pose for r in result.rivals))]
     assert min(distances) < 0.1

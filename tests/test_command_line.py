@@ -11,7 +11,7 @@ from rooms import errors, query, room
 from piccolo.cli import localize, prepare_map
 from piccolo.cli.options import build_parser, cloud_settings_from, parse
 from piccolo.cloud.settings import IN_METRES, CloudSettings
-from piccolo.coarse_to_fine.settings import EngineSettings
+from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.panorama import AS_STORED
 from piccolo.pipeline import Inputs
 from piccolo.result import Result
@@ -117,6 +117,6 @@ def test_a_warning_is_written_once_whenever_it_comes(monkeypatch, capsys, quiet)
     monkeypatch.setattr(localize, "open_localizer", opened)
     monkeypatch.setattr(localize, "is_first_use", lambda: False)
     arguments = parse(build_parser(), [*ONE, *["--quiet"] * quiet])
-    session = localize.open_session(arguments, EngineSettings(), AS_STORED)
+    session = localize.open_session(arguments, CoarseToFineSettings(), AS_STORED)
     assert session.localizer.warnings == ("early", "late")
     assert capsys.readouterr().err == ("" if quiet else "warning: early\nwarning: late\n")

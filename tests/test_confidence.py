@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from piccolo.coarse_to_fine.settings import EngineSettings
+from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.confidence.confidence import (
     AMBIGUOUS,
     LOCALIZED,
@@ -78,7 +78,7 @@ def test_deviations_beyond_reason_change_nothing_more():
     np.testing.assert_array_equal(features_of(RIGHT, wide), features_of(RIGHT, wider))
 
 
-@pytest.mark.parametrize("settings", [EngineSettings, PaperSettings])
+@pytest.mark.parametrize("settings", [CoarseToFineSettings, PaperSettings])
 @pytest.mark.parametrize("value", [0.0, 1.0, -1.0, float("nan")])
 def test_lines_that_mean_nothing_are_refused(settings, value):
     with pytest.raises(InputError, match=f"--min-confidence: found {value}, wanted above 0 and below 1"):

@@ -9,7 +9,7 @@ from piccolo.coarse_to_fine.scan_map import SEARCH_VIEW, prepare_map
 from piccolo.coarse_to_fine.starts import shakes
 from piccolo.coarse_to_fine.view import render_view
 from piccolo.geometry.pose import Pose, exp_so3, step
-from piccolo.geometry.sphere_grid import make_tiling
+from piccolo.geometry.sphere_grid import make_grid
 from piccolo.optimize.descent import correlate, descend, descend_shaken, descend_starts, take_step
 from piccolo.optimize.normal_equations import normal_equations, solve_damped
 from piccolo.panorama.channels import LEVELS_PER_UNIT
@@ -154,7 +154,7 @@ def test_starts_descend_on_their_candidates_views_as_one_does_alone():
     _, panorama, true_pose = rooms.scene(1)
     image = normalized_channels(resize(panorama, 128), 7.5, SEARCH_VIEW.sigma_deg)
     k = int(np.argmin(np.linalg.norm(scan_map.centers - true_pose.center_world, axis=1)))
-    area, scale = make_tiling(24).solid_angle, 1.2 * LEVELS_PER_UNIT
+    area, scale = make_grid(24).solid_angle, 1.2 * LEVELS_PER_UNIT
     R, t, scores = true_pose.R_cam_from_world[None].copy(), scan_map.centers[k][None].copy(), np.empty(1)
     m = scan_map
     views = m.offsets, m.offset_unit, m.features, m.is_seen, area, m.centers

@@ -11,7 +11,7 @@ from rooms import errors
 from piccolo.cli import localize, make_room, prepare_map
 from piccolo.cloud.label_colors import Labels
 from piccolo.cloud.settings import CloudSettings
-from piccolo.coarse_to_fine.settings import EngineSettings
+from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.errors import InputError
 from piccolo.panorama import ReadOptions
 from piccolo.paper.settings import PaperSettings
@@ -107,7 +107,7 @@ def test_prepared_map_of_labels_wants_labels(scene, tmp_path, capsys):
 
 def test_evaluation_takes_the_pictures_of_labels(scene):
     labels = Labels()
-    settings = EngineSettings(min_starts=100, max_starts=100)
+    settings = CoarseToFineSettings(min_starts=100, max_starts=100)
     plan = Plan(settings, CloudSettings(labels=labels), ReadOptions(labels=labels), CachePolicy(False), 2)
     here = read_scene(scene)
     (row,) = run_job(plan, Job(here, here.queries))

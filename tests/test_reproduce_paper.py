@@ -11,7 +11,7 @@ from piccolo.cli import make_room
 from piccolo.cli import reproduce_paper as experiments
 from piccolo.cloud import read_cloud
 from piccolo.cloud.soa import pack_points
-from piccolo.coarse_to_fine.settings import EngineSettings
+from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, angle_between
 from piccolo.optimize.sampling_loss import sampling_loss
@@ -24,7 +24,7 @@ from piccolo.scenes.experiments.arms import EXPERIMENTS
 from piccolo.scenes.experiments.changes import as_it_is, flipped, turned_at_random, with_count, with_share
 from piccolo.scenes.scene import Query, read_scene, write_queries
 
-PRESETS = [PaperSettings(), EngineSettings()]
+PRESETS = [PaperSettings(), CoarseToFineSettings()]
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from piccolo.coarse_to_fine.search import (
 )
 from piccolo.geometry.pose import angle_between
 from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
-from piccolo.geometry.sphere_grid import make_tiling
+from piccolo.geometry.sphere_grid import make_grid
 from piccolo.panorama import Panorama
 from piccolo.panorama.local_normalization import Scale, comparable, normalized_channels, sample_channels
 from piccolo.panorama.resize import resize
@@ -79,7 +79,7 @@ def test_scores_equal_correlations_one_by_one(scan_map):
     validity[:, rng.random(validity.shape[1]) < 0.2] = 0
     samples *= validity[:, None]
     scores = score_poses(scan_map, samples, validity)
-    area = make_tiling(24).solid_angle
+    area = make_grid(24).solid_angle
     candidate, rotation = rng.integers(0, len(scores), 40), rng.integers(0, 50, 40)
     pairs = np.empty(40, np.float32)
     correlate_pairs(scan_map.features, scan_map.is_seen, area, samples, validity, candidate, rotation, pairs)

@@ -1,32 +1,32 @@
 import numpy as np
 import pytest
 
-from piccolo.geometry.sphere_grid import averaging, cell_of, make_neighbors, make_tiling
+from piccolo.geometry.sphere_grid import averaging, cell_of, make_neighbors, make_grid
 
 
 @pytest.mark.parametrize("num_rings", [12, 24, 96])
 def test_cells_share_the_sphere_nearly_evenly(num_rings):
-    tiling = make_tiling(num_rings)
-    assert tiling.solid_angle.sum() == pytest.approx(1.0, abs=1e-5)
-    assert tiling.solid_angle.max() / tiling.solid_angle.min() < 2.0
-    np.testing.assert_allclose(np.linalg.norm(tiling.directions, axis=1), 1.0, atol=1e-6)
+    grid = make_grid(num_rings)
+    assert grid.solid_angle.sum() == pytest.approx(1.0, abs=1e-5)
+    assert grid.solid_angle.max() / grid.solid_angle.min() < 2.0
+    np.testing.assert_allclose(np.linalg.norm(grid.directions, axis=1), 1.0, atol=1e-6)
 
 
 @pytest.mark.parametrize("num_rings", [12, 24])
 def test_a_cells_centre_lies_in_it(num_rings):
-    tiling = make_tiling(num_rings)
-    np.testing.assert_array_equal(cell_of(tiling.directions, num_rings), np.arange(len(tiling)))
+    grid = make_grid(num_rings)
+    np.testing.assert_array_equal(cell_of(grid.directions, num_rings), np.arange(len(grid)))
 
 
 def test_random_directions_fall_into_cells_by_solid_angle():
     directions = np.random.default_rng(0).normal(size=(200_000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    counts = np.bincount(cell_of(directions, 12), minlength=len(make_tiling(12)))
-    np.testing.assert_allclose(counts / 200_000, make_tiling(12).solid_angle, rtol=0.2)
+    counts = np.bincount(cell_of(directions, 12), minlength=len(make_grid(12)))
+    np.testing.assert_allclose(counts / 200_000, make_grid(12).solid_angle, rtol=0.2)
 
 
 def test_neighbours_are_near_and_weighted_by_a_gaussian():
-    near, fine, coarse = make_neighbors(48, 24, 14.0), make_tiling(48), make_tiling(24)
+    near, fine, coarse = make_neighbors(48, 24, 14.0), make_grid(48), make_grid(24)
     for cell in (0, len(fine) // 2, len(fine) - 1):
         rows = slice(near.row[cell], near.row[cell + 1])
         angle = np.arccos(np.clip(coarse.directions[near.cell[rows]] @ fine.directions[cell], -1, 1))
@@ -38,4 +38,4 @@ def test_neighbours_are_near_and_weighted_by_a_gaussian():
 def test_averaging_keeps_the_solid_angle():
     matrix = averaging(12)
     assert matrix.sum() == pytest.approx(1.0, abs=1e-5)
-    np.testing.assert_allclose(matrix.sum(axis=0), make_tiling(12).solid_angle, rtol=0.5)
+    np.testing.assert_allclose(matrix.sum(axis=0), make_grid(12).solid_angle, rtol=0.5)

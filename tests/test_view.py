@@ -15,7 +15,7 @@ from piccolo.coarse_to_fine.camera_positions import (
 )
 from piccolo.coarse_to_fine.scan_map import SEARCH_VIEW, prepare_map, render_candidates
 from piccolo.coarse_to_fine.view import ViewKind, render_view, seen_points
-from piccolo.geometry.sphere_grid import cell_of, make_tiling
+from piccolo.geometry.sphere_grid import cell_of, make_grid
 from piccolo.panorama.channels import LEVELS_PER_UNIT
 from piccolo.runtime.threads import Workers
 
@@ -41,7 +41,7 @@ def test_view_of_the_leaves_equals_its_twin(octree):
     center = rooms.scene(1)[2].center_world
     offsets, features, weights = render_view(octree, center, KIND)
     leaves = octree.level(octree.leaf_size).astype(np.float64)
-    twin = naive.cells_view(leaves, center, _cells(leaves[:, :3] - center), len(make_tiling(24)))
+    twin = naive.cells_view(leaves, center, _cells(leaves[:, :3] - center), len(make_grid(24)))
     seen = twin[2] > 0
     # float32 may put a voxel on the edge of a cell into the next one
     assert (seen == (weights > 0)).mean() > 0.995
@@ -64,7 +64,7 @@ def test_points_that_are_seen_lie_at_the_front_and_are_bounded(octree):
     offsets, _, weights = seen_points(octree, center, KIND, 3000)
     assert 1000 < len(weights) <= 3000
     ranges = np.linalg.norm(offsets, axis=0)
-    nearest = np.full(len(make_tiling(24)), np.inf)
+    nearest = np.full(len(make_grid(24)), np.inf)
     leaves = octree.level(octree.leaf_size)[:, :3] - center
     np.minimum.at(nearest, _cells(leaves), np.linalg.norm(leaves, axis=1))
     assert (ranges <= nearest[_cells(offsets.T)] * 1.09 + 0.11).mean() > 0.99

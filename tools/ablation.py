@@ -4,6 +4,7 @@
 import argparse
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,15 +13,15 @@ import numpy as np
 
 from piccolo.cloud import read_cloud
 from piccolo.cloud.model import Cloud
-from piccolo.coarse_to_fine import localize as method
-from piccolo.coarse_to_fine import query as look
-from piccolo.coarse_to_fine import scan_map
-from piccolo.coarse_to_fine.settings import EngineSettings
+from piccolo.coarse_to_fine.config import METHOD, Beam, ImageScales, MethodConfig
+from piccolo.coarse_to_fine.localize import localize
+from piccolo.coarse_to_fine.scan_map import SEARCH_VIEW, prepare_map
+from piccolo.coarse_to_fine.settings import CoarseToFineSettings
+from piccolo.coarse_to_fine.view import ViewConfig
 from piccolo.errors import InputError
 from piccolo.geometry.pose_error import is_correct
 from piccolo.geometry.rotations import Gravity
 from piccolo.panorama import read_panorama
-from piccolo.panorama.local_normalization import Scale
 from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers, num_cores
 from piccolo.scenes.scene import Scene, read_scene
@@ -34,30 +35,30 @@ correct is under 0.1 m and 5 degrees. Seconds are medians of a query.
 exit codes: 0 done, 2 wrong usage, 3 bad input.
 """
 VARIANTS = ("clean", "tilt", "photo", "change")
-VIEWS = ("MIDDLE_VIEW", "FINE_VIEW", "FINISH_VIEW")
 EVERYTHING = 120.0  # [deg] a neighbourhood that is the whole sphere: one mean and one deviation for all
 SEE_THROUGH = 1e6  # times the nearest range
-SETTINGS = {
-    "all of it": EngineSettings(),
-    "12 starts": EngineSettings(min_starts=12, max_starts=12),
-    "300 starts": EngineSettings(min_starts=300, max_starts=300),
-    "no halving": EngineSettings(num_coarse=1000, num_middle=1000, num_fine=48),
-    "no polish": EngineSettings(num_polished=1, num_fine=1),
+Parts = tuple[MethodConfig, ViewConfig, int]  # the method, its search view, the most starts
+
+
+def with_views(change: Callable[[ViewConfig], ViewConfig], scales: ImageScales = METHOD.scales) -> Parts:
+    """The method with every view changed."""
+    m = METHOD
+    method = m._replace(
+        middle_view=change(m.middle_view), fine_view=change(m.fine_view), full_view=change(m.full_view)
+    )
+    return method._replace(scales=scales), change(SEARCH_VIEW), 4000
+
+
+GLOBAL_SCALES = ImageScales(*(replace(scale, sigma_deg=EVERYTHING) for scale in METHOD.scales))
+PARTS: dict[str, Parts] = {
+    "all of it": (METHOD, SEARCH_VIEW, 4000),
+    "12 starts": (METHOD._replace(min_starts=12), SEARCH_VIEW, 12),
+    "300 starts": (METHOD._replace(min_starts=300), SEARCH_VIEW, 300),
+    "no halving": (METHOD._replace(beam=Beam(1000, 1000, 48, 2)), SEARCH_VIEW, 4000),
+    "no perturbation": (METHOD._replace(beam=Beam(400, 48, 1, 1)), SEARCH_VIEW, 4000),
+    "no local normalisation": with_views(lambda v: replace(v, sigma_deg=EVERYTHING), GLOBAL_SCALES),
+    "no visibility": with_views(lambda v: replace(v, front=SEE_THROUGH, visible=SEE_THROUGH)),
 }
-
-
-def change_views(part: str) -> None:
-    """Take local normalisation or visibility out of every view, in place."""
-    for module, names in ((look, VIEWS), (scan_map, ("SEARCH_VIEW",)), (look, ("SEARCH_VIEW",))):
-        for name in names:
-            kind = getattr(module, name)
-            if part == "no local normalisation":
-                kind = replace(kind, sigma_deg=EVERYTHING)
-            elif part == "no visibility":
-                kind = replace(kind, front=SEE_THROUGH, visible=SEE_THROUGH)
-            setattr(module, name, kind)
-    if part == "no local normalisation":
-        look.SCALES = tuple(Scale(s.width, s.cell_deg, EVERYTHING) for s in look.SCALES)
 
 
 def row(part: str, scenes: list[tuple[Scene, Cloud]]) -> str:
@@ -66,14 +67,15 @@ def row(part: str, scenes: list[tuple[Scene, Cloud]]) -> str:
     totals = dict.fromkeys(VARIANTS, 0)
     seconds, errors = [], []
     workers = Workers(num_cores())
+    method, search_view, max_starts = PARTS[part]
     for scene, cloud in scenes:
-        prepared = scan_map.prepare_map(cloud, workers)
+        prepared = prepare_map(cloud, workers, view=search_view)
         for query in scene.queries:
             panorama = read_panorama(query.image)
             gravity: Gravity = "unknown" if query.variant == "tilt" else "known"
-            settings = replace(SETTINGS.get(part, EngineSettings()), gravity=gravity)
+            settings = CoarseToFineSettings(gravity=gravity, max_starts=max_starts)
             begin = time.perf_counter()
-            found = method.localize(prepared, panorama, settings, workers, Stopwatch())
+            found = localize(prepared, panorama, settings, workers, Stopwatch(), method)
             seconds.append(time.perf_counter() - begin)
             totals[query.variant] += 1
             if found.pose is not None and is_correct(found.pose, query.pose):
@@ -96,15 +98,8 @@ def main(argv: list[str] | None = None) -> int:
         print("| part | clean | tilt | photo | change | median mm | s |")
         print("|---|---:|---:|---:|---:|---:|---:|")
         row("all of it", scenes[:1])  # compiles
-        for part in SETTINGS:
+        for part in PARTS:
             print(row(part, scenes), flush=True)
-        kept = {name: getattr(look, name) for name in (*VIEWS, "SEARCH_VIEW", "SCALES")}
-        for part in ("no local normalisation", "no visibility"):
-            change_views(part)
-            print(row(part, scenes), flush=True)
-            for name, value in kept.items():
-                setattr(look, name, value)
-            scan_map.SEARCH_VIEW = kept["SEARCH_VIEW"]
     except (OSError, InputError) as error:
         print(f"ablation.py: {error}", file=sys.stderr)
         return 3

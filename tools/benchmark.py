@@ -18,7 +18,7 @@ from piccolo.cloud.morton import canonical_order
 from piccolo.cloud.soa import PackedPoints, pack_points
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, yaw_rotation
-from piccolo.optimize.sampling_loss import normal_equations, sampling_loss
+from piccolo.optimize.sampling_loss import sampling_equations, sampling_loss
 from piccolo.panorama import read_panorama
 from piccolo.panorama.texels import pack_texels
 from piccolo.runtime.threads import num_cores
@@ -101,8 +101,8 @@ def run_kernels(case: Case, num_rounds: int) -> None:
             "cv2.remap, 1 thread": lambda: cv2.remap(case.rgb, map_u, map_v, cv2.INTER_LINEAR),
             "loss, 1 thread": lambda: sampling_loss(points, texels, pose, 1),
             "loss, 2 threads": lambda: sampling_loss(points, texels, pose, 2),
-            "loss + gradient + normal matrix, 1 thread": lambda: normal_equations(points, texels, pose, 1),
-            "loss + gradient + normal matrix, 2 threads": lambda: normal_equations(points, texels, pose, 2),
+            "loss + gradient + normal matrix, 1 thread": lambda: sampling_equations(points, texels, pose, 1),
+            "loss + gradient + normal matrix, 2 threads": lambda: sampling_equations(points, texels, pose, 2),
         },
         num_rounds,
     )

@@ -20,7 +20,7 @@ from piccolo.cloud.model import Cloud
 from piccolo.cloud.morton import canonical_order
 from piccolo.coarse_to_fine.localize import localize
 from piccolo.coarse_to_fine.scan_map import prepare_map
-from piccolo.coarse_to_fine.settings import EngineSettings
+from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose
 from piccolo.geometry.pose_error import is_correct
@@ -94,7 +94,7 @@ def measure(label: str, make: Callable[[], Case], results: "multiprocessing.Queu
     every = max(1, len(case.cloud.points) // 20_000)
     small = Cloud(case.cloud.points[::every], case.cloud.colors[::every], case.cloud.origin_world)
     for gravity in GRAVITIES:  # compiles
-        settings = EngineSettings(gravity=gravity)
+        settings = CoarseToFineSettings(gravity=gravity)
         localize(prepare_map(small, workers), case.queries[0][0], settings, workers, Stopwatch())
     before_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     begin = time.perf_counter()
@@ -102,7 +102,7 @@ def measure(label: str, make: Callable[[], Case], results: "multiprocessing.Queu
     seconds = time.perf_counter() - begin
     columns = [label, str(len(case.cloud.points)), str(len(scan_map.centers)), f"{seconds:.1f}"]
     for gravity in GRAVITIES:
-        settings = EngineSettings(gravity=gravity)
+        settings = CoarseToFineSettings(gravity=gravity)
         times, correct = [], 0
         for panorama, truth in case.queries:
             begin = time.perf_counter()

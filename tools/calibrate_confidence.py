@@ -21,11 +21,14 @@ from piccolo.confidence.confidence import (
     FEATURES,
     LOCALIZED,
     MIN_CONFIDENCE,
+    MODEL,
+    PAPER_MODEL,
+    LogisticModel,
+    classify,
     confidence_of,
     features_of,
-    verdict,
 )
-from piccolo.confidence.covariance import Certainty
+from piccolo.confidence.covariance import PoseCovariance
 from piccolo.confidence.score import Evidence
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, log_so3
@@ -53,10 +56,11 @@ class Outcome:
 
     case: str
     evidence: Evidence
-    certainty: Certainty | None
-    has_rivals: bool
+    covariance: PoseCovariance | None
+    has_alternatives: bool
+    model: LogisticModel  # in use for the preset
     is_correct: bool
-    error: Array  # (6,) of the pose, as Certainty has it; NaN without truth
+    error: Array  # (6,) of the pose, as PoseCovariance has it; NaN without truth
 
 
 def read_outcomes(paths: Sequence[Path]) -> list[Outcome]:
@@ -80,12 +84,14 @@ def outcome_of(trial: dict[str, object]) -> Outcome | None:
         turn = log_so3(true_pose.R_cam_from_world @ result.pose.R_cam_from_world.T)
         error = np.concatenate([turn, true_pose.center_world - result.pose.center_world])
         ok = is_correct(result.pose, true_pose)
-    return Outcome(str(trial["case"]), result.evidence, result.certainty, len(result.rivals) > 0, ok, error)
+    model = PAPER_MODEL if result.settings["preset"] == "paper" else MODEL
+    has_alternatives = len(result.alternatives) > 0
+    return Outcome(str(trial["case"]), result.evidence, result.covariance, has_alternatives, model, ok, error)
 
 
 def fit(outcomes: Sequence[Outcome]) -> tuple[float, Array]:
     """Bias and weights of the logistic regression with the least penalised loss."""
-    X = np.array([features_of(o.evidence, o.certainty) for o in outcomes])
+    X = np.array([features_of(o.evidence, o.covariance)[: len(o.model.weights)] for o in outcomes])
     y = np.array([o.is_correct for o in outcomes], float)
     mean, deviation = X.mean(axis=0), X.std(axis=0)
     deviation[deviation == 0.0] = 1.0  # a feature that is the same in all trials
@@ -108,9 +114,14 @@ def print_reliability(name: str, outcomes: Sequence[Outcome]) -> None:
     print(f"\n| confidence, {name} | poses | right | wrong |")
     print("|---|---:|---:|---:|")
     for low, high in pairwise(LEVELS):
-        some = [o for o in outcomes if low <= confidence_of(o.evidence, o.certainty) < high]
+        some = [o for o in outcomes if low <= confidence_of(o.evidence, o.covariance, o.model) < high]
         right = sum(o.is_correct for o in some)
         print(f"| {low} to {min(high, 1.0)} | {len(some)} | {right} | {len(some) - right} |")
+
+
+def status_of(o: Outcome, min_confidence: float) -> str:
+    """What the pose is called by the model in use."""
+    return classify(o.evidence, o.covariance, o.has_alternatives, min_confidence, o.model)[0]
 
 
 def print_cases(name: str, outcomes: Sequence[Outcome], min_confidence: float) -> None:
@@ -119,7 +130,7 @@ def print_cases(name: str, outcomes: Sequence[Outcome], min_confidence: float) -
     print("|---|---:|---:|---:|---:|---:|")
     for case in dict.fromkeys(o.case for o in outcomes):
         some = [o for o in outcomes if o.case == case]
-        called = [verdict(o.evidence, o.certainty, o.has_rivals, min_confidence)[0] for o in some]
+        called = [status_of(o, min_confidence) for o in some]
         false = sum(s == LOCALIZED and not o.is_correct for s, o in zip(called, some, strict=True))
         counts = sum(o.is_correct for o in some), called.count(LOCALIZED), called.count(AMBIGUOUS), false
         print(f"| {case} | {len(some)} | {' | '.join(map(str, counts))} |")
@@ -127,7 +138,7 @@ def print_cases(name: str, outcomes: Sequence[Outcome], min_confidence: float) -
 
 def print_coverage(name: str, outcomes: Sequence[Outcome]) -> None:
     """What share of right poses has its error in the covariance's 95 % region."""
-    some = [o for o in outcomes if o.is_correct and o.certainty is not None]
+    some = [o for o in outcomes if o.is_correct and o.covariance is not None]
     if not some:
         return
     print(f"\n| covariance, {name} | right poses | in the 95 % region | in the 50 % region |")
@@ -138,9 +149,9 @@ def print_coverage(name: str, outcomes: Sequence[Outcome]) -> None:
         ("position", slice(3, 6)),
     ):
         squares = [
-            o.error[rows] @ np.linalg.solve(o.certainty.covariance[rows, rows], o.error[rows])
+            o.error[rows] @ np.linalg.solve(o.covariance.matrix[rows, rows], o.error[rows])
             for o in some
-            if o.certainty is not None
+            if o.covariance is not None
         ]
         shares = [np.mean(squares < chi2.ppf(p, len(range(6)[rows]))) for p in (0.95, 0.5)]
         print(f"| {part} | {len(some)} | {shares[0]:.3f} | {shares[1]:.3f} |")

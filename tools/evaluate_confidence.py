@@ -14,7 +14,7 @@ import numpy as np
 from piccolo.cloud import CloudStream, read_cloud, stream_of
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.coarse_to_fine.scan_map import prepare_map
-from piccolo.coarse_to_fine.settings import EngineSettings
+from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.confidence.confidence import AMBIGUOUS, LOCALIZED
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose
@@ -23,7 +23,7 @@ from piccolo.geometry.rotations import Gravity
 from piccolo.panorama import Panorama, read_panorama
 from piccolo.paper import localize as paper
 from piccolo.paper.settings import PaperSettings
-from piccolo.pipeline import EngineLocalizer, Localizer, PaperLocalizer
+from piccolo.pipeline import DefaultLocalizer, Localizer, PaperLocalizer
 from piccolo.result import Result, result_of
 from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers, num_cores
@@ -102,7 +102,7 @@ def localizer_of(cloud: CloudStream, preset: str, workers: Workers) -> Callable[
             paper_map, PaperSettings(gravity="known" if gravity == "auto" else gravity), ()
         )
     scan_map = prepare_map(cloud, workers)
-    return lambda gravity: EngineLocalizer(scan_map, EngineSettings(gravity=gravity))
+    return lambda gravity: DefaultLocalizer(scan_map, CoarseToFineSettings(gravity=gravity))
 
 
 def run(arguments: argparse.Namespace) -> Iterator[tuple[str, Trial, Result]]:

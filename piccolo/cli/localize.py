@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from ..coarse_to_fine.settings import EngineSettings
+from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..confidence.confidence import LOCALIZED
 from ..errors import InputError
 from ..panorama import ReadOptions
@@ -17,7 +17,7 @@ from ..pipeline import CachePolicy, Inputs, Localizer, localize_file, open_local
 from ..render.overlay import overlay_png
 from ..result import Result
 from ..runtime.atomic import check_output, write_atomically
-from ..runtime.jit import KERNEL_FOLDER, is_first_use
+from ..runtime.kernel_cache import is_first_use, kernel_folder
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from .errors import EXIT_BAD_INPUT, complain, guarded, words_of
@@ -63,13 +63,13 @@ class Session:
 
 
 def open_session(
-    arguments: argparse.Namespace, settings: EngineSettings | PaperSettings, read_options: ReadOptions
+    arguments: argparse.Namespace, settings: CoarseToFineSettings | PaperSettings, read_options: ReadOptions
 ) -> Session:
     """Read and prepare the cloud, after a look at what is to be written."""
     for output in filter(None, (arguments.out, arguments.overlay)):
         check_output(output, [*arguments.cloud, *arguments.pano])
     if is_first_use() and not arguments.quiet:
-        text = f"first use: compiling kernels, once (under half a minute), into {KERNEL_FOLDER}"
+        text = f"first use: compiling kernels, once (under half a minute), into {kernel_folder()}"
         print(text, file=sys.stderr, flush=True)
 
     watch = Stopwatch()
@@ -121,7 +121,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     arguments = parse(build_parser(), argv)
 
-    def check() -> tuple[EngineSettings | PaperSettings, ReadOptions]:
+    def check() -> tuple[CoarseToFineSettings | PaperSettings, ReadOptions]:
         check_arguments(arguments)
         return settings_from(arguments), read_options_from(arguments)
 

@@ -8,7 +8,7 @@ from typing import Any, get_args
 from .. import __version__
 from ..cloud.label_colors import Labels
 from ..cloud.settings import METRES, CloudSettings, UpAxis
-from ..coarse_to_fine.settings import EngineSettings, Prior
+from ..coarse_to_fine.settings import CoarseToFineSettings, Prior
 from ..errors import InputError
 from ..panorama import ReadOptions
 from ..paper.settings import Initialization, PaperSettings, PoseLoss
@@ -164,10 +164,10 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--gravity", choices=["auto", "known", "unknown"], help=text)
     text = "of the descent (default gauss-newton, with the preset paper adam)"
     group.add_argument("--solver", choices=["gauss-newton", "lbfgs", "adam"], help=text)
-    text = f"below it a pose is not called localized (default {EngineSettings().min_confidence})"
+    text = f"below it a pose is not called localized (default {CoarseToFineSettings().min_confidence})"
     group.add_argument("--min-confidence", type=float, metavar="X", help=text)
     for title, options, settings in (
-        ("preset default", ENGINE_OPTIONS, EngineSettings()),
+        ("preset default", ENGINE_OPTIONS, CoarseToFineSettings()),
         ("preset paper", PAPER_OPTIONS, PaperSettings()),
     ):
         group = parser.add_argument_group(title)
@@ -190,7 +190,7 @@ def add_prior_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--heading-tolerance", type=float, metavar="DEG", help="(default 20)")
 
 
-def settings_from(arguments: argparse.Namespace) -> EngineSettings | PaperSettings:
+def settings_from(arguments: argparse.Namespace) -> CoarseToFineSettings | PaperSettings:
     """The settings that the options ask for; an option of the other preset is refused."""
     given = {k: v for k, v in vars(arguments).items() if v is not None}
     own, other = ENGINE_OPTIONS, PAPER_OPTIONS
@@ -216,7 +216,7 @@ def settings_from(arguments: argparse.Namespace) -> EngineSettings | PaperSettin
         heading_deg=given.get("heading"),
         heading_tolerance_deg=given.get("heading_tolerance", Prior.heading_tolerance_deg),
     )
-    return EngineSettings(prior=prior, **chosen)
+    return CoarseToFineSettings(prior=prior, **chosen)
 
 
 def check_arguments(arguments: argparse.Namespace) -> None:

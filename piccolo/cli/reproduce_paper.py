@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ..cloud.label_colors import Labels
 from ..cloud.settings import CloudSettings
-from ..coarse_to_fine.settings import EngineSettings
+from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..errors import InputError
 from ..panorama import ReadOptions
 from ..paper.settings import PaperSettings
@@ -37,7 +37,7 @@ same command takes up an experiment that was stopped. Changed clouds and images 
 exit codes: 0 done, 2 wrong usage, 3 bad input (the rest is done), 4 internal error, 130 interrupted.
 """
 PROGRAM = "experiments.py"
-PRESETS: dict[str, Settings] = {"paper": PaperSettings(), "default": EngineSettings(gravity="known")}
+PRESETS: dict[str, Settings] = {"paper": PaperSettings(), "default": CoarseToFineSettings(gravity="known")}
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -3,12 +3,12 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from ..runtime.jit import kernel, scalar
+from ..runtime.jit import inline_kernel, kernel
 
 NUM_CELLS = 1 << 21  # along an axis; three axes fill 63 bits
 
 
-@scalar
+@inline_kernel
 def spread_bits(cell):
     """The lowest 21 bits of an int64, each followed by two zeros."""
     bits = cell & 0x1FFFFF

@@ -1,6 +1,7 @@
 """The cloud as a pyramid of voxels: mean position and mean colour of each, children next to each other."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,15 @@ from ..runtime.jit import kernel
 from .voxels import COARSEST, LEAF_SIZE, Voxels
 
 NUM_LEVELS = COARSEST.bit_length()  # from 128 leaves wide (2.56 m) down to one
+
+
+class OctreeArrays(NamedTuple):
+    """An octree as kernels read it; fields as in Octree."""
+
+    nodes: NDArray[np.float32]
+    first_child: NDArray[np.int32]
+    level_start: NDArray[np.int32]
+    leaf_size: float
 
 
 @dataclass(frozen=True)
@@ -20,9 +30,9 @@ class Octree:
     level_start: NDArray[np.int32]  # (levels + 1,)
     leaf_size: float  # [m]
 
-    def arrays(self) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int32], float]:
+    def arrays(self) -> OctreeArrays:
         """What the kernels read."""
-        return self.nodes, self.first_child, self.level_start, self.leaf_size
+        return OctreeArrays(self.nodes, self.first_child, self.level_start, self.leaf_size)
 
     def level(self, size: float) -> NDArray[np.float32]:
         """The nodes of the level whose voxels are nearest to `size` [m]."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..runtime.jit import kernel, scalar
+from ..runtime.jit import inline_kernel, kernel
 from .morton import NUM_CELLS, morton_codes
 
 LEAF_SIZE = 0.02  # [m]
@@ -31,7 +31,7 @@ FIRST_ROWS, MAX_ROWS = 1 << 16, 1 << 27  # 40 bytes a row; the most are 80 milli
 MAX_LOAD = 0.6  # share of the rows in use
 
 
-@scalar
+@inline_kernel
 def find_row(table, x, y, z):
     """The row of a cell in the table, or the free one where it belongs."""
     mask = len(table) - 1

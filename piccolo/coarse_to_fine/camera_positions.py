@@ -8,13 +8,13 @@ from scipy.spatial import cKDTree
 
 from ..cloud.octree import Octree
 from ..runtime.threads import Workers
-from .view import ViewKind, filled_shares, thread_scratch
+from .view import ViewConfig, filled_fractions, thread_scratch
 
 MIN_CLEARANCE = 0.25  # [m] a camera is not nearer to a surface
-MIN_COVERAGE = 0.55  # share of the sphere in which something is seen: flat ground or a roof alone fills half
+MIN_COVERAGE = 0.55  # fraction of the sphere that shows something: flat ground or a roof alone fills half
 OPEN_COVERAGE = 0.3  # the same where hardly any place is closed in: open land
-MIN_ENCLOSED = 0.2  # share of the free places that are closed in, else the land counts as open
-GLANCE_VIEW = ViewKind(num_rings=12, stats_rings=12, sigma_deg=22.0, voxel_per_range=1 / 8)
+MIN_ENCLOSED = 0.2  # fraction of the free places that are closed in, else the land counts as open
+FREE_SPACE_VIEW = ViewConfig(num_rings=12, stats_rings=12, sigma_deg=22.0, voxel_per_range=1 / 8)
 MIN_HEIGHT, MAX_HEIGHT = 0.3, 2.4  # [m] above a surface that can carry a tripod or a person
 SUPPORT_RADIUS = 0.9  # [m] the floor right below a scanner is never scanned
 STOREY = 2.6  # [m] a floor is not farther below a camera
@@ -51,17 +51,17 @@ def supported_cells(surfaces: NDArray[np.float32]) -> NDArray[np.int64]:
 
 
 def coverage(octree: Octree, centers: NDArray[np.floating[Any]], workers: Workers) -> NDArray[np.float32]:
-    """Share of the sphere (N,) around each centre (N, 3) that is not empty, at a glance."""
-    share = np.empty(len(centers), np.float32)
-    kind = GLANCE_VIEW.arrays
+    """Share of the sphere (N,) around each centre (N, 3) that is not empty, seen at a low resolution."""
+    fraction = np.empty(len(centers), np.float32)
+    view = FREE_SPACE_VIEW.arrays
 
     def glance(lo: int) -> None:
         part = slice(lo, lo + BLOCK)
-        voxels = GLANCE_VIEW.voxel_per_range
-        filled_shares(octree.arrays(), centers[part], voxels, kind, thread_scratch(), share[part])
+        voxels = FREE_SPACE_VIEW.voxel_per_range
+        filled_fractions(octree.arrays(), centers[part], voxels, view, thread_scratch(), fraction[part])
 
     list(workers.each(glance, range(0, len(centers), BLOCK), "find free space"))
-    return share
+    return fraction
 
 
 def candidate_centers(octree: Octree, workers: Workers) -> NDArray[np.float64]:
@@ -70,11 +70,11 @@ def candidate_centers(octree: Octree, workers: Workers) -> NDArray[np.float64]:
     cells = supported_cells(top_surfaces(octree))
     middle = (cells + 0.5) * COARSE_SPACING
     clearance, _ = tree.query(middle, workers=workers.num_threads)
-    share = coverage(octree, middle, workers)
+    fraction = coverage(octree, middle, workers)
     is_free = clearance > MIN_CLEARANCE
-    is_open = np.mean(share[is_free] > MIN_COVERAGE) < MIN_ENCLOSED if is_free.any() else False
+    is_open = np.mean(fraction[is_free] > MIN_COVERAGE) < MIN_ENCLOSED if is_free.any() else False
     min_coverage = OPEN_COVERAGE if is_open else MIN_COVERAGE
-    is_enclosed = share > min_coverage
+    is_enclosed = fraction > min_coverage
     is_tight = (clearance < NEAR) & (is_enclosed | ~is_free)
     kept = middle[~is_tight & is_free & is_enclosed]
 

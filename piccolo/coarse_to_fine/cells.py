@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from ..geometry.sphere import atan2
-from ..panorama.channels import opponent, per_deviation
+from ..panorama.channels import inverse_std, opponent
 from ..runtime.jit import F0, F1, HALF, kernel
 
 PI = np.float32(math.pi)
@@ -13,23 +13,24 @@ FAR = np.float32(1e30)
 
 
 @kernel
-def collect(nodes, first_child, level_start, leaf_size, center, voxel_per_range, found, directions):
+def collect(tree, center, voxel_per_range, found, directions):
     """Write the nodes that, seen from `center`, are as small as asked, or leaves; returns how many.
 
     `directions` (3, N) get the positions relative to the centre [m].
     """
-    num_levels = len(level_start) - 1
+    nodes, first_child = tree.nodes, tree.first_child
+    num_levels = len(tree.level_start) - 1
     stack = np.empty(8 * num_levels, np.int32)
     levels = np.empty(8 * num_levels, np.int32)
     cx, cy, cz = np.float32(center[0]), np.float32(center[1]), np.float32(center[2])
     per2 = np.float32(1.0 / (voxel_per_range * voxel_per_range))
     min_d2 = np.empty(num_levels, np.float32)
     for level in range(num_levels):
-        size = np.float32(leaf_size * 2.0 ** (num_levels - 1 - level))
+        size = np.float32(tree.leaf_size * 2.0 ** (num_levels - 1 - level))
         min_d2[level] = size * size * per2
     min_d2[num_levels - 1] = F0
     count = 0
-    for root in range(level_start[1]):
+    for root in range(tree.level_start[1]):
         stack[0] = root
         levels[0] = 0
         top = 1
@@ -90,35 +91,34 @@ def average_cells(nodes, found, directions, cells, ranges, front, sums):
 
 
 @kernel
-def average_colors(sums, kind, offsets, features, weights, moments):
+def average_colors(sums, view, offsets, channels, weights, moments):
     """Turn sums into relative positions, opponent channels and weights of cells; add up their moments."""
-    coarse_cell, solid_angle = kind[2], kind[4]
     moments[:] = F0
     for c in range(len(sums)):
         if sums[c, 6] > F0:
             per = F1 / sums[c, 6]
             for k in range(3):
                 offsets[k, c] = sums[c, k] * per
-            channels = opponent(sums[c, 3] * per, sums[c, 4] * per, sums[c, 5] * per)
-            w = solid_angle[c]
+            colors = opponent(sums[c, 3] * per, sums[c, 4] * per, sums[c, 5] * per)
+            w = view.solid_angle[c]
             weights[c] = w
-            m = moments[coarse_cell[c]]
+            m = moments[view.stats_cell[c]]
             m[0] += w
             for k in range(3):
-                features[k, c] = channels[k]
-                m[1 + k] += w * channels[k]
-                m[4 + k] += w * channels[k] * channels[k]
+                channels[k, c] = colors[k]
+                m[1 + k] += w * colors[k]
+                m[4 + k] += w * colors[k] * colors[k]
         else:
             weights[c] = F0
             for k in range(3):
                 offsets[k, c] = F0
-                features[k, c] = F0
+                channels[k, c] = F0
 
 
 @kernel
-def local_statistics(moments, kind, weights, stats):
+def local_statistics(moments, view, weights, stats):
     """Write the local means of the channels and 1 / deviations (6, cells) around cells of positive weight."""
-    row, neighbor, weight = kind[5], kind[6], kind[7]
+    row, neighbor, weight = view.neighbor_row, view.neighbor_cell, view.neighbor_weight
     for c in range(len(weights)):
         if weights[c] <= F0:
             continue
@@ -136,6 +136,6 @@ def local_statistics(moments, kind, weights, stats):
             s7 += w * m[7]  # always 0: eight sums fill a vector register
         per = F1 / s0
         stats[0, c], stats[1, c], stats[2, c] = s1 * per, s2 * per, s3 * per
-        stats[3, c] = per_deviation(s1 * per, s4 * per)
-        stats[4, c] = per_deviation(s2 * per, s5 * per)
-        stats[5, c] = per_deviation(s3 * per, s6 * per)
+        stats[3, c] = inverse_std(s1 * per, s4 * per)
+        stats[4, c] = inverse_std(s2 * per, s5 * per)
+        stats[5, c] = inverse_std(s3 * per, s6 * per)

@@ -1,13 +1,16 @@
 """A prepared map on disk: a NumPy archive, and the cache of such files.
 
-A file of another format, of other sources, or damaged in any byte (each member of an archive has a checksum)
-is never trusted: it is made anew.
+A file of another format, or damaged in any byte (each member of an archive has a checksum), is never trusted.
+FORMAT changes with what the arrays mean, so that a file outlives an update; the cache also knows the sources
+by which a map was made, and makes it anew when they have changed.
 """
 
 import hashlib
+import re
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +19,14 @@ from ..cloud.octree import Octree
 from ..cloud.settings import CloudSettings
 from ..errors import InputError
 from ..runtime.atomic import replacing
-from ..runtime.jit import SOURCE_DIGEST, cache_root, remove_stale
+from ..runtime.cache import cache_root, mark_used, remove_stale
 from ..runtime.stopwatch import Stopwatch
 from .scan_map import ScanMap
 
-FORMAT = "piccolo-map/1"
+FORMAT = "piccolo-map/2"
+NAME = re.compile(r"[0-9a-f]{32}\.piccolo-map")  # of a file in the cache
+# What makes a map: folders of the package. The cache makes maps anew when one of their files has changed.
+MAKERS = ("cloud", "coarse_to_fine", "geometry", "gravity", "panorama")
 ARRAYS = [f.name for f in fields(ScanMap) if f.name not in ("octree", "warnings")]
 ZIP_MAGIC = b"PK\x03\x04"
 # The first member of a map: its name and where that stands, and the beginning of its value somewhere behind.
@@ -36,7 +42,6 @@ def save_map(scan_map: ScanMap, path: Path) -> None:
         np.savez(
             file,
             format=np.array(FORMAT),
-            sources=np.array(SOURCE_DIGEST),
             warnings=np.array(scan_map.warnings, dtype=np.str_),
             allow_pickle=False,
             **members,
@@ -59,8 +64,11 @@ def load_map(path: Path) -> ScanMap:
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             members = {name: archive[name] for name in archive.files}
-        if str(members["format"]) != FORMAT or str(members["sources"]) != SOURCE_DIGEST:
-            raise InputError(f"{path}: found a map of another version, wanted one by this; prepare it again")
+        if str(members["format"]) != FORMAT:
+            found = members["format"]
+            raise InputError(
+                f"{path}: a map of format {found}, but this version reads {FORMAT}; prepare it again"
+            )
         octree = Octree(
             nodes=members["octree_nodes"],
             first_child=members["octree_first_child"],
@@ -78,8 +86,18 @@ def load_map(path: Path) -> ScanMap:
 def content_key(paths: Sequence[Path], settings: CloudSettings) -> str:
     """Name for the map of a cloud's files: by what is in them and the settings, wherever they lie."""
     digests = sorted(_file_digest(path) for path in paths)
-    digest = hashlib.sha256(" ".join([FORMAT, SOURCE_DIGEST, repr(settings), *digests]).encode())
+    digest = hashlib.sha256(" ".join([FORMAT, sources_digest(), repr(settings), *digests]).encode())
     return digest.hexdigest()[:32]
+
+
+@cache
+def sources_digest() -> str:
+    """Digest of the sources by which a map is made."""
+    digest = hashlib.sha256()
+    for folder in MAKERS:
+        for path in sorted((Path(__file__).parents[1] / folder).rglob("*.py")):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def _file_digest(path: Path) -> str:
@@ -93,7 +111,7 @@ def cached_map(folder: Path | None, key: str, build: Callable[[], ScanMap], watc
     Two processes may build one map at once: each writes its own file whole, the last stays, both are equal.
     """
     folder = folder or cache_root() / "maps"
-    path = folder / f"{key}.npz"
+    path = folder / f"{key}.piccolo-map"
     if path.exists():
         try:
             with watch.stage("read"):
@@ -101,11 +119,11 @@ def cached_map(folder: Path | None, key: str, build: Callable[[], ScanMap], watc
         except InputError:
             path.unlink(missing_ok=True)
         else:
-            path.touch()
+            mark_used(path)
             return scan_map
     scan_map = build()
     with watch.stage("prepare"):
         folder.mkdir(parents=True, exist_ok=True)
-        remove_stale(folder)
+        remove_stale(folder, NAME)
         save_map(scan_map, path)
     return scan_map

@@ -10,7 +10,7 @@ from .scan_map import ScanMap
 from .settings import Prior
 
 
-def narrowed(scan_map: ScanMap, prior: Prior) -> ScanMap:
+def apply_prior(scan_map: ScanMap, prior: Prior) -> ScanMap:
     """The map with only the candidates that the prior allows, by half a grid spacing more than it says."""
     is_allowed = np.ones(len(scan_map.centers), dtype=bool)
     if prior.near_world is not None and prior.radius is not None:

@@ -12,15 +12,15 @@ from ..cloud.settings import UpAxis
 from ..cloud.soa import PackedPoints, pack_points
 from ..cloud.voxels import Voxels
 from ..geometry.pose import Array, Pose
-from ..geometry.sphere_grid import SEARCH_RINGS, averaging, make_tiling
+from ..geometry.sphere_grid import SEARCH_RINGS, averaging, make_grid
 from ..gravity import MIN_CONFIDENCE, R_z_from_axis, find_up, rotation_to_z_up
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from .camera_positions import BLOCK, COARSE_SPACING, candidate_centers
-from .view import ViewKind, render_block, thread_scratch
+from .view import ViewConfig, render_block, thread_scratch
 
 WIDE_RINGS = 12
-SEARCH_VIEW = ViewKind(num_rings=SEARCH_RINGS, stats_rings=16, sigma_deg=22.0, voxel_per_range=1 / 15)
+SEARCH_VIEW = ViewConfig(num_rings=SEARCH_RINGS, stats_rings=16, sigma_deg=22.0, voxel_per_range=1 / 15)
 MIN_TILT = np.radians(5.0)  # a cloud whose up is nearer to its z is taken as it is
 
 
@@ -38,7 +38,7 @@ class ScanMap:
     is_seen: NDArray[np.bool_]  # (candidates, cells)
     sparse: NDArray[np.int64]  # candidates of which no two share a cell of the coarse grid
     wide_features: NDArray[np.int8]  # (sparse, 3 * wide cells) means over wider cells, for SO(3)
-    wide_seen: NDArray[np.uint8]  # (sparse, wide cells) share seen of each, 255 for all
+    wide_seen: NDArray[np.uint8]  # (sparse, wide cells) fraction seen of each, 255 for all
     has_labels: bool = False  # colours are those of labels
     warnings: tuple[str, ...] = ()
 
@@ -69,19 +69,19 @@ def _as_points(nodes: NDArray[np.float32]) -> PackedPoints:
 
 
 def render_candidates(
-    octree: Octree, centers: NDArray[np.float64], workers: Workers
+    octree: Octree, centers: NDArray[np.float64], config: ViewConfig, workers: Workers
 ) -> tuple[NDArray[np.int16], NDArray[np.float32], NDArray[np.int8], NDArray[np.bool_]]:
     """Offsets, their units, channels and seen cells of the view from each centre, as ScanMap holds them."""
-    cells = len(make_tiling(SEARCH_VIEW.num_rings))
+    cells = len(make_grid(config.num_rings))
     offsets, unit = np.empty((len(centers), 3, cells), np.int16), np.empty(len(centers), np.float32)
     levels, is_seen = np.empty((len(centers), 3, cells), np.int8), np.empty((len(centers), cells), np.bool_)
-    kind = SEARCH_VIEW.arrays
+    view = config.arrays
 
     def run(lo: int) -> None:
         part = slice(lo, lo + BLOCK)
         out = offsets[part], unit[part], levels[part], is_seen[part]
-        voxels = SEARCH_VIEW.voxel_per_range
-        render_block(octree.arrays(), centers[part], voxels, kind, thread_scratch(), *out)
+        voxels = config.voxel_per_range
+        render_block(octree.arrays(), centers[part], voxels, view, thread_scratch(), *out)
 
     list(workers.each(run, range(0, len(centers), BLOCK), "render views"))
     return offsets, unit, levels, is_seen
@@ -90,20 +90,21 @@ def render_candidates(
 def widen(
     levels: NDArray[np.int8], is_seen: NDArray[np.bool_], rows: NDArray[np.int64]
 ) -> tuple[NDArray[np.int8], NDArray[np.uint8]]:
-    """Some rows of views (N, 3, cells) averaged over the wider cells, and the share seen of these."""
-    matrix, area = averaging(WIDE_RINGS), make_tiling(WIDE_RINGS).solid_angle
+    """Some rows of views (N, 3, cells) averaged over the wider cells, and the fraction seen of these."""
+    matrix = averaging(WIDE_RINGS)
+    area = matrix.sum(axis=0)
     features = np.empty((len(rows), 3, len(area)), np.int8)
-    share = np.empty((len(rows), len(area)), np.uint8)
+    fraction = np.empty((len(rows), len(area)), np.uint8)
     for lo in range(0, len(rows), 1024):
         part = rows[lo : lo + 1024]
         mean = levels[part].astype(np.float32) @ matrix / area
         features[lo : lo + 1024] = np.rint(np.clip(mean, -127, 127))
         seen = np.minimum(is_seen[part].astype(np.float32) @ matrix / area, 1.0)
-        share[lo : lo + 1024] = np.rint(seen * 255.0)
-    return features.reshape(len(rows), 3 * len(area)), share
+        fraction[lo : lo + 1024] = np.rint(seen * 255.0)
+    return features.reshape(len(rows), 3 * len(area)), fraction
 
 
-def level_out(octree: Octree) -> tuple[Array, tuple[str, ...]]:
+def align_to_gravity(octree: Octree) -> tuple[Array, tuple[str, ...]]:
     """Rotation (3, 3) that turns the cloud's up to +z, identity where it is there already or not known."""
     up = find_up(octree.level(0.08)[:, :3])
     tilt = np.arccos(np.clip(up.direction_world[2], -1.0, 1.0))
@@ -121,7 +122,7 @@ class Voxelized(Protocol):
 
 
 @dataclass(frozen=True)
-class Levelled:
+class AlignedCloud:
     """A cloud as an octree with z up; the other fields as in ScanMap."""
 
     octree: Octree
@@ -130,41 +131,45 @@ class Levelled:
     warnings: tuple[str, ...]
 
 
-def level(cloud: Voxelized, up: UpAxis) -> Levelled:
+def read_aligned(cloud: Voxelized, up: UpAxis) -> AlignedCloud:
     """A cloud whose axis `up` points up, as octree; `auto` asks the cloud, and reads a tilted one anew."""
     more: tuple[str, ...] = ()
     R_map_from_world = R_z_from_axis(up)
     voxels = cloud.voxels(R_map_from_world)
     octree = build_octree(voxels)
     if up == "auto":
-        R_map_from_world, more = level_out(octree)
+        R_map_from_world, more = align_to_gravity(octree)
         if more:
             del voxels, octree  # their room is needed
             voxels = cloud.voxels(R_map_from_world)
             octree = build_octree(voxels)
     origin_world = R_map_from_world.T @ voxels.origin
-    return Levelled(octree, R_map_from_world, origin_world, voxels.warnings + more)
+    return AlignedCloud(octree, R_map_from_world, origin_world, voxels.warnings + more)
 
 
 def prepare_map(
-    cloud: Voxelized, workers: Workers, up: UpAxis = "auto", watch: Stopwatch | None = None
+    cloud: Voxelized,
+    workers: Workers,
+    up: UpAxis = "auto",
+    watch: Stopwatch | None = None,
+    view: ViewConfig = SEARCH_VIEW,
 ) -> ScanMap:
     """Everything about a cloud that does not depend on the panorama."""
     watch = watch or Stopwatch()
     with watch.stage("read"):
-        levelled = level(cloud, up)
-    for warning in levelled.warnings:  # now: a wrong unit makes what follows long
+        aligned = read_aligned(cloud, up)
+    for warning in aligned.warnings:  # now: a wrong unit makes what follows long
         workers.warn(warning)
     with watch.stage("prepare"):
-        octree = levelled.octree
+        octree = aligned.octree
         centers = candidate_centers(octree, workers)
-        offsets, unit, levels, is_seen = render_candidates(octree, centers, workers)
+        offsets, unit, levels, is_seen = render_candidates(octree, centers, view, workers)
         _, sparse = np.unique(np.floor(centers / COARSE_SPACING), axis=0, return_index=True)
         wide_features, wide_seen = widen(levels, is_seen, sparse)
     return ScanMap(
         octree=octree,
-        R_map_from_world=levelled.R_map_from_world,
-        origin_world=levelled.origin_world,
+        R_map_from_world=aligned.R_map_from_world,
+        origin_world=aligned.origin_world,
         centers=centers,
         offsets=offsets,
         offset_unit=unit,
@@ -173,5 +178,5 @@ def prepare_map(
         sparse=sparse,
         wide_features=wide_features,
         wide_seen=wide_seen,
-        warnings=levelled.warnings,
+        warnings=aligned.warnings,
     )

@@ -1,57 +1,87 @@
-"""Score every candidate position with every rotation, and keep the diverse best."""
+"""Score every candidate position with every rotation, and keep the distinct best.
+
+All sums are of whole numbers that stay below 2^24: exact in float32 in any order, so that matrix products
+come out the same whatever the processor and its BLAS.
+"""
 
 import math
-from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.sphere_grid import SEARCH_RINGS, averaging, make_tiling
+from ..geometry.rotations import Gravity, uniform_rotations, uniform_yaws
+from ..geometry.sphere_grid import AREA_UNITS, SEARCH_RINGS, averaging, make_grid
+from ..geometry.suppression import non_maximum_suppression
 from ..panorama.local_normalization import sample_channels
 from ..panorama.texels import Texels
-from ..runtime.jit import F0, kernel
+from ..runtime.jit import kernel
+from .prior import allowed_rotations
+from .query import Query
 from .scan_map import WIDE_RINGS, ScanMap
+from .starts import START_ANGLE, START_DISTANCE, Starts
 
 BLOCK = 2048  # views a matrix product
+EXACT = (1 << 24) - 1  # whole numbers up to this are exact in float32
+MOST_LEVEL = 127.5  # of a channel
+MOST_ENERGY = 3.0 * MOST_LEVEL**2  # of a cell
+CANDIDATES_PER_START, POSES_PER_START = 4, 12
 Samples = NDArray[np.float32]
 
 
+class TurnedPanorama(NamedTuple):
+    """The panorama on the cells of the sphere, turned many ways; whole numbers."""
+
+    samples: Samples  # (rotations, 3, cells) channels times solid angle
+    energy: Samples  # (rotations, cells) squared channels times solid angle, 0 where nothing is shown
+    validity: Samples  # (rotations, cells) 1 where the panorama shows something
+
+
+def whole(values: Samples, most: float, most_other: int, num_terms: int) -> Samples:
+    """Values up to `most`, scaled and rounded: sums of products with numbers up to another are exact."""
+    return np.asarray(np.rint(values * np.float32(EXACT // (most_other * num_terms) / most)))
+
+
+def turned(samples: Samples, validity: Samples, area: Samples, most_seen: int) -> TurnedPanorama:
+    """Channels (rotations, 3, cells) [levels] and validity (rotations, cells) by area, as whole numbers."""
+    num_cells = len(area)
+    relative = area / area.max()
+    energy = np.square(samples).sum(axis=1) * relative
+    return TurnedPanorama(
+        whole(samples * relative, MOST_LEVEL, 127, 3 * num_cells),
+        whole(energy, MOST_ENERGY, most_seen, num_cells),
+        validity,
+    )
+
+
 def turn_panorama(texels: Texels, rotations: NDArray[np.float64]) -> tuple[Samples, Samples]:
-    """Channels (rotations, 3, cells) of the search tiling, in levels, and validity (rotations, cells)."""
-    tiling = make_tiling(SEARCH_RINGS)
-    samples = np.empty((len(rotations), 3, len(tiling)), np.float32)
-    validity = np.empty((len(rotations), len(tiling)), np.float32)
+    """Channels (rotations, 3, cells) of the search grid, in levels, and validity (rotations, cells)."""
+    grid = make_grid(SEARCH_RINGS)
+    samples = np.empty((len(rotations), 3, len(grid)), np.float32)
+    validity = np.empty((len(rotations), len(grid)), np.float32)
     turns = rotations.astype(np.float32)
-    sample_channels(texels.rgbx, texels.width, tiling.directions, turns, samples, validity)
+    sample_channels(texels.rgbx, texels.width, grid.directions, turns, samples, validity)
     return samples, validity
 
 
 def masked_correlation(
-    features: NDArray[np.int8],
-    seen: Callable[[int, int], Samples],
-    area: Samples,
-    samples: Samples,
-    validity: Samples,
+    features: NDArray[np.int8], seen: NDArray[np.uint8], area: Samples, panorama: TurnedPanorama
 ) -> Samples:
-    """Correlation (views, rotations) over the cells that both show.
+    """Correlation (views, rotations), up to a factor, over the cells that both show.
 
-    Views (views, 3 * cells) in 8 bits; seen(lo, hi) is the share seen of each cell (hi - lo, cells).
-    The panorama has samples (rotations, 3, cells) and validity (rotations, cells).
+    Views (views, 3 * cells) in 8 bits; seen (views, cells) is how much of each cell is seen.
     """
-    weighted = (samples * area).reshape(len(samples), -1)
-    energy = np.square(samples).sum(axis=1) * area
-    is_full = bool(validity.all())
-    scores = np.empty((len(features), len(samples)), np.float32)
+    weighted = panorama.samples.reshape(len(panorama.samples), -1)
+    relative, num_cells = area / area.max(), len(area)
+    scores = np.empty((len(features), len(weighted)), np.float32)
+    is_full = bool(panorama.validity.all())
     for lo in range(0, len(scores), BLOCK):
         view = features[lo : lo + BLOCK].astype(np.float32)
-        share = seen(lo, lo + BLOCK)
-        norm = share @ energy.T
-        view_energy = np.square(view).reshape(len(view), 3, -1).sum(axis=1)
-        if is_full:
-            norm *= (view_energy @ area)[:, None]
-        else:
-            norm *= (view_energy * area) @ validity.T
-        np.sqrt(np.maximum(norm, 1e-12, out=norm), out=norm)
+        norm = seen[lo : lo + BLOCK].astype(np.float32) @ panorama.energy.T
+        energy = np.square(view).reshape(len(view), 3, num_cells).sum(axis=1) * relative
+        energy = whole(energy, MOST_ENERGY, 1, num_cells)
+        norm *= energy.sum(axis=1)[:, None] if is_full else energy @ panorama.validity.T
+        np.sqrt(np.maximum(norm, 1.0, out=norm), out=norm)
         np.matmul(view, weighted.T, out=scores[lo : lo + BLOCK])
         scores[lo : lo + BLOCK] /= norm
     return scores
@@ -60,71 +90,38 @@ def masked_correlation(
 def score_poses(scan_map: ScanMap, samples: Samples, validity: Samples) -> Samples:
     """Masked correlation (candidates, rotations) of all views with the turned panorama."""
     features = scan_map.features.reshape(len(scan_map.features), -1)
-
-    def seen(lo: int, hi: int) -> Samples:
-        return scan_map.is_seen[lo:hi].astype(np.float32)
-
-    return masked_correlation(features, seen, make_tiling(SEARCH_RINGS).solid_angle, samples, validity)
+    area = make_grid(SEARCH_RINGS).solid_angle
+    panorama = turned(samples, validity, area, 1)
+    return masked_correlation(features, scan_map.is_seen.view(np.uint8), area, panorama)
 
 
 def score_poses_wide(scan_map: ScanMap, samples: Samples, validity: Samples) -> Samples:
     """The same over wide cells for the sparse candidates: (sparse, rotations)."""
-    matrix, area = averaging(WIDE_RINGS), make_tiling(WIDE_RINGS).solid_angle
-    wide_samples, wide_validity = samples @ matrix / area, validity @ matrix / area
-
-    def seen(lo: int, hi: int) -> Samples:
-        return scan_map.wide_seen[lo:hi] * np.float32(1 / 255)
-
-    return masked_correlation(scan_map.wide_features, seen, area, wide_samples, wide_validity)
+    weights = averaging(WIDE_RINGS)
+    area = weights.sum(axis=0)
+    wide_samples, wide_validity = np.rint(samples) @ weights / area, validity @ weights / area
+    panorama = turned(wide_samples, np.rint(wide_validity), area, 255)
+    return masked_correlation(scan_map.wide_features, scan_map.wide_seen, area, panorama)
 
 
 @kernel
-def correlate_pairs(features, is_seen, area, samples, validity, candidate, rotation, scores):
-    """Write the masked correlation of each pair of a view and a turned panorama."""
+def correlate_pairs(features, is_seen, area, panorama, candidate, rotation, scores):
+    """Write the masked correlation, up to a factor, of each pair of a view and a turned panorama.
+
+    Whole numbers in float64, exact in any order. The area (cells,) is in whole numbers too.
+    """
     for k in range(len(scores)):
-        f, s = features[candidate[k]], samples[rotation[k]]
-        seen, valid = is_seen[candidate[k]], validity[rotation[k]]
-        product = view_energy = energy = F0
+        f, s = features[candidate[k]], panorama.samples[rotation[k]]
+        seen, valid = is_seen[candidate[k]], panorama.validity[rotation[k]]
+        energies = panorama.energy[rotation[k]]
+        product = view_energy = energy = 0.0
         for c in range(len(area)):
-            w = area[c] * np.float32(seen[c]) * valid[c]
+            is_shared = np.float32(seen[c]) * valid[c]
             f0, f1, f2 = np.float32(f[0, c]), np.float32(f[1, c]), np.float32(f[2, c])
-            product += w * (f0 * s[0, c] + f1 * s[1, c] + f2 * s[2, c])
-            view_energy += w * (f0 * f0 + f1 * f1 + f2 * f2)
-            energy += w * (s[0, c] * s[0, c] + s[1, c] * s[1, c] + s[2, c] * s[2, c])
-        scores[k] = product / math.sqrt(max(view_energy * energy, np.float32(1e-12)))
-
-
-@kernel
-def suppress(rotations, centers, min_distance, min_trace, kept):  # noqa: C901  # one loop nest
-    """Write the indices of the poses, best first, that are near none kept before; returns how many."""
-    R, t = rotations, centers
-    count = 0
-    near2 = np.float32(min_distance * min_distance)
-    x, y, z = (
-        np.empty(len(kept), np.float32),
-        np.empty(len(kept), np.float32),
-        np.empty(len(kept), np.float32),
-    )
-    for k in range(len(t)):
-        tx, ty, tz = np.float32(t[k, 0]), np.float32(t[k, 1]), np.float32(t[k, 2])
-        is_new = True
-        for m in range(count):
-            dx, dy, dz = x[m] - tx, y[m] - ty, z[m] - tz
-            if dx * dx + dy * dy + dz * dz < near2:
-                trace = 0.0
-                for i in range(3):
-                    for j in range(3):
-                        trace += R[k, i, j] * R[kept[m], i, j]
-                if trace > min_trace:
-                    is_new = False
-                    break
-        if is_new:
-            kept[count] = k
-            x[count], y[count], z[count] = tx, ty, tz
-            count += 1
-            if count == len(kept):
-                break
-    return count
+            product += is_shared * (f0 * s[0, c] + f1 * s[1, c] + f2 * s[2, c])
+            view_energy += np.float64(is_shared * area[c]) * (f0 * f0 + f1 * f1 + f2 * f2)
+            energy += is_shared * energies[c]
+        scores[k] = product / math.sqrt(max(view_energy * energy, 1.0))
 
 
 @kernel
@@ -154,14 +151,29 @@ def best_poses(scores: Samples, pool: int) -> tuple[NDArray[np.int64], NDArray[n
     return *np.divmod(top, scores.shape[1]), flat[top]
 
 
-def pick_distinct(
-    rotations: NDArray[np.float64],
-    centers: NDArray[np.float64],
-    count: int,
-    min_distance: float,
-    min_angle_deg: float,
-) -> NDArray[np.int64]:
-    """Indices of the first `count` poses (n, 3, 3), (n, 3), best first, that are near none before."""
-    kept = np.empty(count, np.int64)
-    min_trace = 1 + 2 * math.cos(math.radians(min_angle_deg))
-    return kept[: suppress(rotations, centers, min_distance, min_trace, kept)]
+def search_poses(query: Query, gravity: Gravity) -> Starts:
+    """Every candidate position with every rotation as matrix products; the distinct best."""
+    m, settings = query.scan_map, query.settings
+    num_starts = min(
+        max(len(m.centers) // CANDIDATES_PER_START, query.method.min_starts), settings.max_starts
+    )
+    num_pool = num_starts * POSES_PER_START
+    if gravity == "known":
+        rotations = query.R_cam_from_level @ uniform_yaws(settings.num_yaws)
+    else:
+        rotations = uniform_rotations(settings.num_rotations)
+    rotations = allowed_rotations(rotations @ m.R_map_from_world, settings.prior) @ m.R_map_from_world.T
+    samples, validity = turn_panorama(query.images.search, rotations)
+    if gravity == "known":
+        candidate, rotation, scores = best_poses(score_poses(m, samples, validity), num_pool)
+    else:  # on wide cells and fewer positions first, as there are so many rotations
+        sparse, rotation, scores = best_poses(score_poses_wide(m, samples, validity), num_pool)
+        candidate, area = m.sparse[sparse], make_grid(SEARCH_RINGS).solid_angle
+        units = np.rint(area / area.max() * np.float32(AREA_UNITS))
+        panorama = turned(samples, validity, area, 1)
+        correlate_pairs(m.features, m.is_seen, units, panorama, candidate, rotation, scores)
+        order = np.lexsort((rotation, candidate, -scores))
+        candidate, rotation, scores = candidate[order], rotation[order], scores[order]
+    R, centers = rotations[rotation], m.centers[candidate]
+    kept = non_maximum_suppression(R, centers, num_starts, START_DISTANCE, START_ANGLE)
+    return Starts(R, centers, candidate, scores.astype(np.float64)).take(kept)

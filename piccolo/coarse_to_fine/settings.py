@@ -1,6 +1,6 @@
 """Settings of the default method, and what is known of a camera beforehand."""
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 
 from ..confidence.confidence import MIN_CONFIDENCE, check_confidence
 from ..errors import InputError
@@ -31,42 +31,23 @@ class Prior:
 
 
 @dataclass(frozen=True)
-class EngineSettings:
-    """The default engine."""
+class CoarseToFineSettings:
+    """The default method."""
 
     gravity: Gravity = "auto"  # auto: as known first, and as unknown if that does not convince
     solver: Solver = "gauss-newton"  # of the last descent
     prior: Prior = Prior()
     num_yaws: int = 48  # gravity known
     num_rotations: int = 2000  # of SO(3), gravity unknown
-    min_starts: int = 1000
-    max_starts: int = 4000
-    candidates_per_start: int = 4  # a start for so many places, within these bounds
-    poses_per_start: int = 12  # scored poses from which distinct ones are picked, a start
-    num_coarse: int = 400  # poses kept after a short descent from each start
-    num_middle: int = 48  # poses kept after the descent on wide cells
-    num_fine: int = 8  # poses kept after the descent on middle cells
-    num_polished: int = 2  # poses shaken and refined for as long as that helps
-    num_points: int = 30_000  # for the last millimetres
+    max_starts: int = 4000  # poses from which a descent begins
     min_confidence: float = MIN_CONFIDENCE  # below it a pose is not called localized
-    seed: int = 0  # repeated in the result; nothing is drawn at random
 
     def __post_init__(self) -> None:
         """Refuse counts that mean nothing, naming the setting."""
-        for name, value in asdict(self).items():
-            if isinstance(value, int) and name != "seed" and value < 1:
-                raise InputError(f"{name}: found {value}, wanted at least 1")
+        for name in ("num_yaws", "num_rotations", "max_starts"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name}: found {getattr(self, name)}, wanted at least 1")
         check_confidence(self.min_confidence)
-
-    def wider(self) -> "EngineSettings":
-        """Settings that keep more poses on the way down, for a second look."""
-        return replace(
-            self,
-            num_coarse=2 * self.num_coarse,
-            num_middle=4 * self.num_middle,
-            num_fine=3 * self.num_fine,
-            num_polished=2 * self.num_polished,
-        )
 
     def to_json(self) -> dict[str, object]:
         """The settings as they took effect."""

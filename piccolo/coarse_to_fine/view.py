@@ -4,26 +4,58 @@ import math
 import threading
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cloud.octree import Octree
-from ..geometry.sphere_grid import cell_of, make_neighbors, make_tiling
-from ..panorama.channels import LEVELS_PER_UNIT, opponent, standardized
-from ..runtime.jit import F0, F1, HALF, kernel
+from ..geometry.sphere_grid import cell_of, make_grid, make_neighbors
+from ..panorama.channels import LEVELS_PER_UNIT, opponent, zscore
+from ..runtime.jit import F0, F1, HALF, inline_kernel, kernel
 from .cells import average_cells, average_colors, collect, local_statistics, locate
 
 VISIBLE_OFFSET = np.float32(0.1)  # [m] of range noise
+U15, U16, LOW_32 = np.uint64(15), np.uint64(16), np.uint64(0xFFFFFFFF)
+MIX_1, MIX_2 = np.uint64(0x7FEB352D), np.uint64(0x846CA68B)
+FILLED = 0.97  # of the room for points; the rest is for chance
 
 
-Kind = tuple[Any, ...]  # what ViewKind.arrays gives; kernels read it by position
-Cells = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+class Cells(NamedTuple):
+    """What a camera sees around a centre, on cells of the sphere or as points."""
+
+    offsets: NDArray[np.float32]  # (3, N) [m] from the centre
+    channels: NDArray[np.float32]  # (3, N) opponent colours, locally normalised [standard deviations]
+    weights: NDArray[np.float32]  # (N,) fraction of the sphere; 0 where nothing is seen; 1 of a point
+
+
+class ViewArrays(NamedTuple):
+    """A view's configuration as kernels read it."""
+
+    num_columns: NDArray[np.int32]  # (rings,) of the cells
+    first: NDArray[np.int32]  # (rings,) index of each ring's first cell
+    stats_cell: NDArray[np.int32]  # (cells,) the wider cell that each lies in
+    num_stats: int  # wider cells
+    solid_angle: NDArray[np.float32]  # (cells,) fraction of the sphere
+    neighbor_row: NDArray[np.int32]  # (cells + 1,) where each cell's neighbours begin
+    neighbor_cell: NDArray[np.int32]  # wider cells
+    neighbor_weight: NDArray[np.float32]
+    front: np.float32
+    visible: np.float32
+
+
+class Scratch(NamedTuple):
+    """Arrays that one thread needs to render."""
+
+    nodes: NDArray[np.int32]
+    directions: NDArray[np.float32]  # (3, N)
+    cells: NDArray[np.int32]
+    ranges: NDArray[np.float32]
+    turns: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class ViewKind:
+class ViewConfig:
     """How a view is made: its cells, the neighbourhood that normalises colours, the voxels' angular size."""
 
     num_rings: int
@@ -34,16 +66,16 @@ class ViewKind:
     visible: float = 1.08  # a point is seen up to this times (and VISIBLE_OFFSET): grazing floors pass
 
     @cached_property
-    def arrays(self) -> Kind:
+    def arrays(self) -> ViewArrays:
         """What the kernels read."""
-        tiling = make_tiling(self.num_rings)
+        grid = make_grid(self.num_rings)
         neighbors = make_neighbors(self.num_rings, self.stats_rings, self.sigma_deg)
-        return (
-            tiling.num_columns,
-            tiling.first,
-            cell_of(tiling.directions, self.stats_rings),
-            len(make_tiling(self.stats_rings)),
-            tiling.solid_angle,
+        return ViewArrays(
+            grid.num_columns,
+            grid.first,
+            cell_of(grid.directions, self.stats_rings),
+            len(make_grid(self.stats_rings)),
+            grid.solid_angle,
             neighbors.row,
             neighbors.cell,
             neighbors.weight,
@@ -53,50 +85,47 @@ class ViewKind:
 
 
 @kernel
-def render_cells(tree, center, voxel_per_range, kind, scratch, offsets, features, weights, sums, stats):
-    """One view: relative position, opponent channels, their local statistics and weight of each cell."""
-    found, directions, cells, ranges, turns = scratch
-    n = collect(tree[0], tree[1], tree[2], tree[3], center, voxel_per_range, found, directions)
-    locate(
-        directions[0, :n],
-        directions[1, :n],
-        directions[2, :n],
-        kind[0],
-        kind[1],
-        cells[:n],
-        ranges[:n],
-        turns,
-    )
-    average_cells(tree[0], found, directions, cells[:n], ranges, kind[8], sums)
-    moments = np.empty((kind[3], 8), np.float32)
-    average_colors(sums, kind, offsets, features, weights, moments)
-    local_statistics(moments, kind, weights, stats)
+def locate_nodes(tree, center, voxel_per_range, view, scratch):
+    """Fill the scratch with the nodes to draw, their offsets, cells and ranges; returns how many."""
+    s = scratch
+    n = collect(tree, center, voxel_per_range, s.nodes, s.directions)
+    x, y, z = s.directions[0, :n], s.directions[1, :n], s.directions[2, :n]
+    locate(x, y, z, view.num_columns, view.first, s.cells[:n], s.ranges[:n], s.turns)
     return n
 
 
 @kernel
-def render(tree, center, voxel_per_range, kind, scratch, offsets, features, weights):
-    """One view: position relative to the centre, normalised channels and weight of each cell."""
-    sums = np.empty((len(weights), 8), np.float32)
-    stats = np.empty((6, len(weights)), np.float32)
-    render_cells(tree, center, voxel_per_range, kind, scratch, offsets, features, weights, sums, stats)
-    for k in range(3):
-        for c in range(len(weights)):
-            if weights[c] > F0:
-                features[k, c] = standardized(features[k, c], stats[k, c], stats[3 + k, c])
+def render_cells(tree, center, voxel_per_range, view, scratch, offsets, channels, weights, sums, stats):
+    """One view: relative position, opponent channels, their local statistics and weight of each cell."""
+    n = locate_nodes(tree, center, voxel_per_range, view, scratch)
+    s = scratch
+    average_cells(tree.nodes, s.nodes, s.directions, s.cells[:n], s.ranges, view.front, sums)
+    moments = np.empty((view.num_stats, 8), np.float32)
+    average_colors(sums, view, offsets, channels, weights, moments)
+    local_statistics(moments, view, weights, stats)
+    return n
 
 
 @kernel
-def render_block(tree, centers, voxel_per_range, kind, scratch, offsets, unit, levels, is_seen):
+def render(tree, center, voxel_per_range, view, scratch, offsets, channels, weights):
+    """One view: position relative to the centre, normalised channels and weight of each cell."""
+    sums = np.empty((len(weights), 8), np.float32)
+    stats = np.empty((6, len(weights)), np.float32)
+    render_cells(tree, center, voxel_per_range, view, scratch, offsets, channels, weights, sums, stats)
+    for k in range(3):
+        for c in range(len(weights)):
+            if weights[c] > F0:
+                channels[k, c] = zscore(channels[k, c], stats[k, c], stats[3 + k, c])
+
+
+@kernel
+def render_block(tree, centers, voxel_per_range, view, scratch, offsets, unit, levels, is_seen):
     """Views from several centres in few bits: offsets in units of their own, channels in levels."""
-    n = len(kind[4])
-    points, features, weights = (
-        np.empty((3, n), np.float32),
-        np.empty((3, n), np.float32),
-        np.empty(n, np.float32),
-    )
+    n = len(view.solid_angle)
+    points, channels = np.empty((3, n), np.float32), np.empty((3, n), np.float32)
+    weights = np.empty(n, np.float32)
     for k in range(len(centers)):
-        render(tree, centers[k], voxel_per_range, kind, scratch, points, features, weights)
+        render(tree, centers[k], voxel_per_range, view, scratch, points, channels, weights)
         largest = np.float32(1e-3)
         for i in range(3):
             for c in range(n):
@@ -105,7 +134,7 @@ def render_block(tree, centers, voxel_per_range, kind, scratch, offsets, unit, l
         for i in range(3):
             for c in range(n):
                 offsets[k, i, c] = np.int16(points[i, c] / unit[k])
-                level = features[i, c] * np.float32(LEVELS_PER_UNIT)
+                level = channels[i, c] * np.float32(LEVELS_PER_UNIT)
                 levels[k, i, c] = np.int8(
                     min(max(math.floor(level + HALF), np.float32(-127)), np.float32(127))
                 )
@@ -113,102 +142,106 @@ def render_block(tree, centers, voxel_per_range, kind, scratch, offsets, unit, l
             is_seen[k, c] = weights[c] > F0
 
 
-@kernel
-def render_points(tree, center, voxel_per_range, kind, scratch, offsets, features, weights):
-    """The visible points, evenly thinned to what fits: relative position, normalised channels, weight 1.
+@inline_kernel
+def node_fraction(node):
+    """A number in [0, 1) that is drawn from a node's index, always the same (lowbias32, Wellons 2018)."""
+    h = np.uint64(node)
+    h = ((h ^ (h >> U16)) * MIX_1) & LOW_32
+    h = ((h ^ (h >> U15)) * MIX_2) & LOW_32
+    return np.float32(h ^ (h >> U16)) * np.float32(2.0**-32)
 
-    Returns how many.
+
+@kernel
+def render_points(tree, center, voxel_per_range, view, scratch, offsets, channels, weights):
+    """The visible points, thinned to what fits: relative position, normalised channels, weight 1.
+
+    Each node is kept or left out by its own number, so that a camera a little farther on sees nearly the same
+    points: a descent that is begun again from where it ended then ends there. Returns how many.
     """
-    num_cells = len(kind[4])
+    num_cells = len(view.solid_angle)
     sums, stats = np.empty((num_cells, 8), np.float32), np.empty((6, num_cells), np.float32)
-    cell_offsets, cell_features = np.empty((3, num_cells), np.float32), np.empty((3, num_cells), np.float32)
+    cell_offsets, cell_channels = np.empty((3, num_cells), np.float32), np.empty((3, num_cells), np.float32)
     cell_weights = np.empty(num_cells, np.float32)
     n = render_cells(
-        tree, center, voxel_per_range, kind, scratch, cell_offsets, cell_features, cell_weights, sums, stats
+        tree, center, voxel_per_range, view, scratch, cell_offsets, cell_channels, cell_weights, sums, stats
     )
-    found, directions, cells, ranges, _ = scratch
-    visible = 0
+    s = scratch
+    num_visible = 0
     for i in range(n):
-        if ranges[i] <= sums[cells[i], 7] * kind[9] + VISIBLE_OFFSET:
-            visible += 1
-    stride = (visible + len(weights) - 1) // len(weights)
-    count = seen = 0
+        if s.ranges[i] <= sums[s.cells[i], 7] * view.visible + VISIBLE_OFFSET:
+            num_visible += 1
+    kept = np.float32(FILLED * len(weights) / max(num_visible, 1))
+    count = 0
     for i in range(n):
-        if ranges[i] <= sums[cells[i], 7] * kind[9] + VISIBLE_OFFSET:
-            seen += 1
-            if seen % stride == 0:
-                node, c = found[i], cells[i]
-                channels = opponent(tree[0][node, 3], tree[0][node, 4], tree[0][node, 5])
-                for k in range(3):
-                    offsets[k, count] = directions[k, i]
-                    features[k, count] = standardized(channels[k], stats[k, c], stats[3 + k, c])
-                weights[count] = F1
-                count += 1
+        is_visible = s.ranges[i] <= sums[s.cells[i], 7] * view.visible + VISIBLE_OFFSET
+        if is_visible and node_fraction(s.nodes[i]) < kept and count < len(weights):
+            node, c = s.nodes[i], s.cells[i]
+            colors = opponent(tree.nodes[node, 3], tree.nodes[node, 4], tree.nodes[node, 5])
+            for k in range(3):
+                offsets[k, count] = s.directions[k, i]
+                channels[k, count] = zscore(colors[k], stats[k, c], stats[3 + k, c])
+            weights[count] = F1
+            count += 1
     return count
 
 
 @kernel
-def filled_shares(tree, centers, voxel_per_range, kind, scratch, share):
-    """Write the share of the sphere (n,) around each centre (n, 3) whose cells hold any node."""
-    found, directions, cells, ranges, turns = scratch
-    is_filled = np.empty(len(kind[4]), np.bool_)
+def filled_fractions(tree, centers, voxel_per_range, view, scratch, fraction):
+    """Write the fraction of the sphere (n,) around each centre (n, 3) whose cells hold any node."""
+    is_filled = np.empty(len(view.solid_angle), np.bool_)
     for k in range(len(centers)):
-        n = collect(tree[0], tree[1], tree[2], tree[3], centers[k], voxel_per_range, found, directions)
-        locate(
-            directions[0, :n],
-            directions[1, :n],
-            directions[2, :n],
-            kind[0],
-            kind[1],
-            cells[:n],
-            ranges[:n],
-            turns,
-        )
+        n = locate_nodes(tree, centers[k], voxel_per_range, view, scratch)
         is_filled[:] = False
         for i in range(n):
-            is_filled[cells[i]] = True
-        share[k] = F0
+            is_filled[scratch.cells[i]] = True
+        fraction[k] = F0
         for c in range(len(is_filled)):
             if is_filled[c]:
-                share[k] += kind[4][c]
+                fraction[k] += view.solid_angle[c]
 
 
 MAX_NODES = 1 << 22  # of a view; reserved, but used only as far as a dense cloud fills it
 
 
-def make_scratch() -> tuple[Any, ...]:
-    """Arrays that one thread needs to render."""
-    return (
-        np.empty(MAX_NODES, np.int32), np.empty((3, MAX_NODES), np.float32),
-        np.empty(MAX_NODES, np.int32), np.empty(MAX_NODES, np.float32), np.empty(MAX_NODES, np.float32),
-    )  # fmt: skip
+def make_scratch() -> Scratch:
+    """Arrays for the largest view."""
+    n = MAX_NODES
+    directions = np.empty((3, n), np.float32)
+    return Scratch(
+        np.empty(n, np.int32),
+        directions,
+        np.empty(n, np.int32),
+        np.empty(n, np.float32),
+        np.empty(n, np.float32),
+    )
 
 
 _local = threading.local()
 
 
-def thread_scratch() -> Any:
+def thread_scratch() -> Scratch:
     """The calling thread's own scratch: fresh memory costs as much as a view."""
     if not hasattr(_local, "scratch"):
         _local.scratch = make_scratch()
-    return _local.scratch
+    scratch: Scratch = _local.scratch
+    return scratch
 
 
-def render_view(octree: Octree, center_world: NDArray[np.float64], kind: ViewKind) -> Cells:
-    """Offsets from the centre (3, cells) [m], channels (3, cells), weights (cells,), 0 where unseen."""
-    n = len(make_tiling(kind.num_rings))
-    view = np.empty((3, n), np.float32), np.empty((3, n), np.float32), np.empty(n, np.float32)
-    center = np.asarray(center_world, np.float64)
-    render(octree.arrays(), center, kind.voxel_per_range, kind.arrays, thread_scratch(), *view)
-    return view
+def _empty_cells(n: int) -> Cells:
+    return Cells(np.empty((3, n), np.float32), np.empty((3, n), np.float32), np.empty(n, np.float32))
 
 
-def seen_points(octree: Octree, center_world: NDArray[np.float64], kind: ViewKind, max_points: int) -> Cells:
-    """The same of at most `max_points` visible points instead of cells, with equal weights."""
-    n = max_points
-    points = np.empty((3, n), np.float32), np.empty((3, n), np.float32), np.empty(n, np.float32)
-    center = np.asarray(center_world, np.float64)
-    count = render_points(
-        octree.arrays(), center, kind.voxel_per_range, kind.arrays, thread_scratch(), *points
-    )
-    return points[0][:, :count].copy(), points[1][:, :count].copy(), points[2][:count].copy()
+def render_view(octree: Octree, center_map: NDArray[np.float64], config: ViewConfig) -> Cells:
+    """What is seen around a centre (3,) [m], on the cells of `config`."""
+    cells = _empty_cells(len(make_grid(config.num_rings)))
+    center = np.asarray(center_map, np.float64)
+    render(octree.arrays(), center, config.voxel_per_range, config.arrays, thread_scratch(), *cells)
+    return cells
+
+
+def visible_points(octree: Octree, center_map: NDArray[np.float64], config: ViewConfig, count: int) -> Cells:
+    """The same of at most `count` visible points instead of cells, with equal weights."""
+    cells = _empty_cells(count)
+    center, view = np.asarray(center_map, np.float64), config.arrays
+    n = render_points(octree.arrays(), center, config.voxel_per_range, view, thread_scratch(), *cells)
+    return Cells(cells.offsets[:, :n].copy(), cells.channels[:, :n].copy(), cells.weights[:n].copy())

@@ -4,46 +4,60 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ..geometry.pose import Pose, are_same
+import numpy as np
 
-RIVAL_DISTANCE, RIVAL_ANGLE = 0.5, math.radians(15.0)  # [m], [rad] poses nearer than both are no rivals
-MAX_RIVALS = 5  # reported
+from ..geometry.pose import Pose
+from ..geometry.suppression import non_maximum_suppression
+
+MIN_DISTANCE, MIN_ANGLE = 0.5, math.radians(15.0)  # [m], [rad] poses nearer than both are one answer
+MAX_ALTERNATIVES = 5  # reported
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A pose, and how well it explains the panorama."""
+    """A pose, and how well it explains the panorama: more is better."""
 
     pose: Pose
     score: float
 
 
-def distinct_best(
+def by_score(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """The best first; of equal ones, the first."""
+    return sorted(hypotheses, key=lambda h: -h.score)
+
+
+def suppressed(
+    ranked: Sequence[Hypothesis], count: int, min_distance: float, min_angle: float
+) -> list[Hypothesis]:
+    """The first `count` hypotheses that are near (distance [m] and angle [rad]) none before."""
+    if not ranked:
+        return []
+    rotations = np.array([h.pose.R_cam_from_world for h in ranked])
+    centers = np.array([h.pose.center_world for h in ranked])
+    return [ranked[k] for k in non_maximum_suppression(rotations, centers, count, min_distance, min_angle)]
+
+
+def best_distinct(
     hypotheses: Sequence[Hypothesis], count: int, min_distance: float, min_angle: float
 ) -> list[Hypothesis]:
     """At most `count` by falling score, none within distance [m] and angle [rad] of a better one."""
-    kept: list[Hypothesis] = []
-    for h in sorted(hypotheses, key=lambda h: -h.score):
-        if len(kept) < count and not any(are_same(h.pose, k.pose, min_distance, min_angle) for k in kept):
-            kept.append(h)
-    return kept
+    return suppressed(by_score(hypotheses), count, min_distance, min_angle)
 
 
-def rivals_of(
-    best: Pose, hypotheses: Sequence[Hypothesis], more: Sequence[Hypothesis] = (), count: int = MAX_RIVALS
+def alternative_poses(
+    best: Pose,
+    hypotheses: Sequence[Hypothesis],
+    less_refined: Sequence[Hypothesis] = (),
+    count: int = MAX_ALTERNATIVES,
 ) -> list[Hypothesis]:
-    """The `count` best hypotheses of which only one can be right, and none of them if `best` is.
+    """The `count` best-scoring hypotheses that are distinct from `best` and from each other.
 
-    Of `more`, which are less refined, those take part that are near none of the others.
+    Of the less refined ones, those take part that are near none of the others.
     """
-    found: list[Hypothesis] = []
-    for some in (hypotheses, more):
-        known = [best, *(h.pose for h in found)]
-        apart = [h for h in some if not any(are_same(h.pose, k, RIVAL_DISTANCE, RIVAL_ANGLE) for k in known)]
-        found += distinct_best(apart, count - len(found), RIVAL_DISTANCE, RIVAL_ANGLE)
-    return sorted(found, key=lambda h: -h.score)
+    ranked = [Hypothesis(best, math.inf), *by_score(hypotheses), *by_score(less_refined)]
+    return by_score(suppressed(ranked, count + 1, MIN_DISTANCE, MIN_ANGLE)[1:])
 
 
-def lead(score: float, rivals: Sequence[Hypothesis]) -> float:
-    """Margin of a score over the best rival's, or over 0 if none has more."""
-    return score - max([0.0, *(h.score for h in rivals)])
+def score_margin(score: float, alternatives: Sequence[Hypothesis]) -> float:
+    """Lead of a score over the best alternative's, or over 0 if none has more."""
+    return score - max([0.0, *(h.score for h in alternatives)])

@@ -1,15 +1,24 @@
-"""From evidence to a verdict: how likely a pose is right, and what to call it."""
+"""From evidence to a status: how likely a pose is right, and what to call it."""
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry.pose_error import MAX_DISTANCE
-from .covariance import Certainty
+from .covariance import PoseCovariance
 from .score import Evidence
+
+
+class LogisticModel(NamedTuple):
+    """Logistic regression on the first features."""
+
+    bias: float
+    weights: tuple[float, ...]
+
 
 LOCALIZED = "localized"
 AMBIGUOUS = "ambiguous"
@@ -26,50 +35,56 @@ FEATURES = (
     "log of the agreement",
     "log of the score",
     "log10 of the largest deviation [m]",
-    "has a credible rival",
+    "has a credible alternative",
 )
 DIRECTIONS = (1, 1, 1, -1, -1)
-BIAS, WEIGHTS = 4.94, (6.29, 4.37, 1.10, -1.10, -7.31)
-# The preset paper knows no deviations, and too few rivals to tell places that repeat: learnt without those,
-# on tools/evaluate_confidence.py --preset paper --seeds 0 6 and --seeds 100 104.
-BIAS_OF_PAPER, WEIGHTS_OF_PAPER = -0.20, (6.37, 2.51)
+MODEL = LogisticModel(4.94, (6.29, 4.37, 1.10, -1.10, -7.31))
+# The preset paper knows no covariance, and too few alternatives to tell places that repeat: learnt without
+# those, on tools/evaluate_confidence.py --preset paper --seeds 0 6 and --seeds 100 104.
+PAPER_MODEL = LogisticModel(-0.20, (6.37, 2.51))
 
 
-def features_of(evidence: Evidence, certainty: Certainty | None) -> NDArray[np.float64]:
-    """What the confidence goes by: FEATURES, or the first two of them with the preset paper."""
-    values = [evidence.margin, math.log(max(evidence.agreement, LEAST_SCORE))]
-    if evidence.halves_distance is not None:
-        std = MOST_STD if certainty is None else min(max(certainty.largest_std, LEAST_STD), MOST_STD)
-        log_score = math.log(max(evidence.score, LEAST_SCORE))
-        values += [log_score, math.log10(std), float(evidence.rival_share > 0.0)]
-    return np.array(values)
+def features_of(evidence: Evidence, covariance: PoseCovariance | None) -> NDArray[np.float64]:
+    """What the confidence goes by, (5,), as FEATURES names them."""
+    std = MOST_STD if covariance is None else min(max(covariance.largest_std, LEAST_STD), MOST_STD)
+    return np.array(
+        [
+            evidence.margin,
+            math.log(max(evidence.agreement, LEAST_SCORE)),
+            math.log(max(evidence.score, LEAST_SCORE)),
+            math.log10(std),
+            float(evidence.alternative_score_ratio > 0.0),
+        ]
+    )
 
 
-def confidence_of(evidence: Evidence, certainty: Certainty | None) -> float:
+def confidence_of(evidence: Evidence, covariance: PoseCovariance | None, model: LogisticModel) -> float:
     """How likely it is that the pose is within 0.1 m and 5 degrees: of those with 0.9, nine in ten.
 
     It holds where half of all queries have an answer, as in the trials from which it was learnt. A pose whose
     own deviation makes 0.1 m doubtful has less.
     """
-    features = features_of(evidence, certainty)
-    is_paper = len(features) < len(FEATURES)
-    bias, weights = (BIAS_OF_PAPER, WEIGHTS_OF_PAPER) if is_paper else (BIAS, WEIGHTS)
-    logit = bias + float(features @ np.array(weights))
+    features = features_of(evidence, covariance)[: len(model.weights)]
+    logit = model.bias + float(features @ np.array(model.weights))
     exactness = 1.0
-    if certainty is not None:
-        exactness = math.erf(MAX_DISTANCE / (SAFETY * certainty.largest_std * math.sqrt(2.0)))
+    if covariance is not None:
+        exactness = math.erf(MAX_DISTANCE / (SAFETY * covariance.largest_std * math.sqrt(2.0)))
     return exactness / (1.0 + math.exp(-min(max(logit, -30.0), 30.0)))
 
 
-def verdict(
-    evidence: Evidence, certainty: Certainty | None, has_rivals: bool, min_confidence: float
+def classify(
+    evidence: Evidence,
+    covariance: PoseCovariance | None,
+    has_alternatives: bool,
+    min_confidence: float,
+    model: LogisticModel = MODEL,
 ) -> tuple[str, float]:
-    """Status and confidence; ambiguous is a pose that would be called localized if it had no rival."""
-    confidence = confidence_of(evidence, certainty)
+    """Status and confidence; ambiguous is a pose that would be called localized if it had no alternative."""
+    confidence = confidence_of(evidence, covariance, model)
     if confidence >= min_confidence:
         return LOCALIZED, confidence
-    alone = replace(evidence, margin=max(evidence.score, evidence.margin), rival_share=0.0)
-    if has_rivals and confidence_of(alone, certainty) >= min_confidence:
+    alone = replace(evidence, margin=max(evidence.score, evidence.margin), alternative_score_ratio=0.0)
+    if has_alternatives and confidence_of(alone, covariance, model) >= min_confidence:
         return AMBIGUOUS, confidence
     return NOT_LOCALIZED, confidence
 

@@ -1,4 +1,4 @@
-"""How far off a pose may be: its covariance, and the direction in which it is least sure."""
+"""Pose covariance and its least constrained direction."""
 
 import math
 from dataclasses import dataclass
@@ -9,38 +9,38 @@ from numpy.typing import NDArray
 from ..geometry.pose import Array
 
 CORRIDOR_RATIO = 2.5  # what is seen reaches so many times as far one way as across
-SAME_STD_RATIO = 1.5  # deviations that differ by less have no weakest direction
+SAME_STD_RATIO = 1.5  # deviations that differ by less have no such direction
 BAND = math.sin(math.radians(30.0))  # walls: what is seen up to 30 degrees above and below the horizon
 
 
 @dataclass(frozen=True)
-class Certainty:
+class PoseCovariance:
     """Covariance (6, 6) of a pose: rotation [rad] about the camera's axes, then translation [m] in the world.
 
     The true pose is R_true = exp([w]x) R_cam_from_world, center_true = center_world + d, with (w, d) of mean
     zero and this covariance.
     """
 
-    covariance: Array
-    weakest_direction: str  # of the translation, in words
+    matrix: Array
+    least_constrained_direction: str  # of the translation, in words
 
     @property
     def std_deg(self) -> Array:
         """Standard deviations (3,) of the rotation about the camera's axes [deg]."""
-        return np.asarray(np.degrees(np.sqrt(np.diag(self.covariance)[:3])))
+        return np.asarray(np.degrees(np.sqrt(np.diag(self.matrix)[:3])))
 
     @property
     def std_mm(self) -> Array:
         """Standard deviations (3,) of the position along the world's axes [mm]."""
-        return np.asarray(1000.0 * np.sqrt(np.diag(self.covariance)[3:]))
+        return np.asarray(1000.0 * np.sqrt(np.diag(self.matrix)[3:]))
 
     @property
     def largest_std(self) -> float:
-        """Standard deviation of the position in its weakest direction [m]."""
-        return float(math.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1]))
+        """Standard deviation of the position in its least constrained direction [m]."""
+        return float(math.sqrt(np.linalg.eigvalsh(self.matrix[3:, 3:])[-1]))
 
 
-def weakest_direction(covariance_up: Array, covariance: Array, offsets: NDArray[np.float32]) -> str:
+def least_constrained_direction(covariance_up: Array, covariance: Array, offsets: NDArray[np.float32]) -> str:
     """The direction of the largest translational deviation, in words.
 
     Both are covariances (3, 3) of the position: in a frame whose z is up, with the offsets (3, N) [m] from
@@ -49,13 +49,13 @@ def weakest_direction(covariance_up: Array, covariance: Array, offsets: NDArray[
     variances, axes = np.linalg.eigh(covariance_up)
     if variances[2] < SAME_STD_RATIO**2 * max(variances[0], 0.0):
         return "much the same in all directions"
-    weakest = axes[:, 2]
-    if abs(weakest[2]) > math.cos(math.radians(30.0)):
+    direction = axes[:, 2]
+    if abs(direction[2]) > math.cos(math.radians(30.0)):
         return "up and down"
     _, axes_world = np.linalg.eigh(covariance)
     heading = math.degrees(math.atan2(axes_world[0, 2], axes_world[1, 2])) % 180.0
     words = f"heading {heading:.0f} or {heading + 180.0:.0f} deg"
-    return f"along the corridor, {words}" if _is_corridor(weakest, offsets) else words
+    return f"along the corridor, {words}" if _is_corridor(direction, offsets) else words
 
 
 def _is_corridor(direction: Array, offsets: NDArray[np.float32]) -> bool:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from ..geometry.pose import Pose
 from .alternatives import Hypothesis
 from .confidence import NOT_LOCALIZED
-from .covariance import Certainty
+from .covariance import PoseCovariance
 from .score import Evidence
 
 
@@ -18,5 +18,5 @@ class Localization:
     pose: Pose | None = None  # None if there was no start, and then all that follows
     loss: float | None = None
     evidence: Evidence | None = None
-    rivals: tuple[Hypothesis, ...] = ()  # poses elsewhere, best first
-    certainty: Certainty | None = None
+    alternatives: tuple[Hypothesis, ...] = ()  # poses elsewhere, best first
+    covariance: PoseCovariance | None = None

@@ -32,7 +32,7 @@ def exp_so3(w: Array) -> Array:
 
 
 def log_so3(R: Array) -> Array:
-    """Rotation vector (3,) [rad] of a rotation (3, 3), of length [0, pi]: `exp_so3` turned round."""
+    """Rotation vector (3,) [rad] of a rotation (3, 3), of length [0, pi]: the inverse of `exp_so3`."""
     w, *v = quaternion_wxyz(R)
     sine = float(np.linalg.norm(v))
     scale = 2.0 * float(np.arctan2(sine, w)) / sine if sine > 0.0 else 2.0
@@ -70,7 +70,7 @@ def angle_between(R_a: Array, R_b: Array) -> float:
     return float(np.arctan2(sine, 0.5 * (np.trace(relative) - 1.0)))
 
 
-def are_same(a: Pose, b: Pose, min_distance: float, min_angle: float) -> bool:
+def is_close(a: Pose, b: Pose, min_distance: float, min_angle: float) -> bool:
     """True for poses closer than `min_distance` [m] and turned by less than `min_angle` [rad]."""
     distance = float(np.linalg.norm(a.center_world - b.center_world))
     return distance < min_distance and angle_between(a.R_cam_from_world, b.R_cam_from_world) < min_angle

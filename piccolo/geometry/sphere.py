@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..runtime.jit import F0, HALF, kernel, scalar
+from ..runtime.jit import F0, HALF, inline_kernel
 
 PI = np.float32(math.pi)
 HALF_PI = np.float32(math.pi / 2)
@@ -36,7 +36,7 @@ A5 = np.float32(-0.03360421210527)
 A6 = np.float32(0.00681171109960)
 
 
-@scalar
+@inline_kernel
 def atan2(y, x):
     """Angle [rad] of (x, y) in (-pi, pi], float32, within 6e-7 of math.atan2; 0 at the origin."""
     abs_x = abs(x)
@@ -49,7 +49,7 @@ def atan2(y, x):
     return -angle if y < F0 else angle
 
 
-@scalar
+@inline_kernel
 def direction_to_pixel(x, y, z, rho, width):
     """Continuous pixel (u, v) of the camera direction (x, y, z), rho = hypot(x, y), in a `width` image."""
     scale = width / (PI + PI)
@@ -58,7 +58,7 @@ def direction_to_pixel(x, y, z, rho, width):
     return u, v
 
 
-@scalar
+@inline_kernel
 def pixel_jacobian(x, y, z, rho2, width):
     """Derivative of (u, v) by the camera coordinates: (du/dx, du/dy, dv/dx, dv/dy, dv/dz); du/dz is 0.
 
@@ -69,22 +69,6 @@ def pixel_jacobian(x, y, z, rho2, width):
     per_rho2 = scale / rho2
     per_rho_r2 = scale / (math.sqrt(rho2) * (rho2 + z * z))
     return y * per_rho2, -x * per_rho2, x * z * per_rho_r2, y * z * per_rho_r2, -rho2 * per_rho_r2
-
-
-@kernel
-def project(points, R_cam_from_world, center_world, width, pixels):
-    """Write the pixel (N, 2) of each world point (N, 3): u in [0, width), v in [0, width / 2] downwards."""
-    R = R_cam_from_world.astype(np.float32)
-    c = center_world.astype(np.float32)
-    w = np.float32(width)
-    for i in range(len(points)):
-        dx, dy, dz = points[i, 0] - c[0], points[i, 1] - c[1], points[i, 2] - c[2]
-        x = R[0, 0] * dx + R[0, 1] * dy + R[0, 2] * dz
-        y = R[1, 0] * dx + R[1, 1] * dy + R[1, 2] * dz
-        z = R[2, 0] * dx + R[2, 1] * dy + R[2, 2] * dz
-        u, v = direction_to_pixel(x, y, z, math.sqrt(x * x + y * y), w)
-        pixels[i, 0] = u if u < w else F0
-        pixels[i, 1] = v
 
 
 def pixel_rays(width: int, rows: slice = slice(None)) -> NDArray[np.float64]:

@@ -10,10 +10,12 @@ from ..cloud.soa import PackedPoints
 from ..geometry.pose import Array, Pose, exp_so3, left_jacobian, orthonormal, step
 from ..panorama.texels import Texels
 from ..render.zbuffer import visible_points
-from .sampling_loss import normal_equations, sampling_loss
+from .levenberg_marquardt import levenberg_marquardt
+from .normal_equations import GRADIENT, LOSS, MATRIX
+from .sampling_loss import sampling_equations, sampling_loss
 from .settings import DescentSettings
 
-MAX_STEP = 0.2  # [rad, m] of Gauss-Newton
+LEAST_STEP = 1e-7  # [rad + m] of Gauss-Newton: a shorter one ends the descent
 
 Equations = tuple[float, Array, Array]  # loss, its gradient (6,) by a step, normal matrix (6, 6)
 Objective = Callable[[Pose], Equations]
@@ -31,7 +33,7 @@ def sampling_loss_of(texels: Texels) -> Loss:
     """The paper's sampling loss of a panorama."""
     return Loss(
         lambda points, pose: sampling_loss(points, texels, pose),
-        lambda points, pose: normal_equations(points, texels, pose),
+        lambda points, pose: sampling_equations(points, texels, pose),
     )
 
 
@@ -124,26 +126,18 @@ def descend_lbfgs(objective: Objective, start: Pose, num_iterations: int) -> Bes
     return best
 
 
-def descend_gauss_newton(objective: Objective, pose: Pose, num_iterations: int) -> Best:
+def descend_gauss_newton(objective: Objective, start: Pose, num_iterations: int) -> Best:
     """The best pose of at most `num_iterations` Levenberg-Marquardt steps on the reweighted least squares."""
-    best = Best(pose)
-    loss, gradient, matrix = objective(pose)
-    best.offer(pose, loss)
-    damping = 1e-3
-    for _ in range(num_iterations):
-        damped = matrix + damping * np.diag(np.diag(matrix)) + 1e-12 * np.eye(6)
-        delta = -np.linalg.solve(damped, gradient)
-        # A step of a radian or a metre would leave the region in which the matrix means anything.
-        delta *= min(1.0, MAX_STEP / max(float(np.abs(delta).max()), 1e-12))
-        trial = step(best.pose, np.asarray(delta, dtype=np.float64))
-        loss, trial_gradient, trial_matrix = objective(trial)
-        if loss < best.loss:
-            best.offer(trial, loss)
-            gradient, matrix, damping = trial_gradient, trial_matrix, max(damping * 0.2, 1e-6)
-        else:
-            damping *= 8.0
-        if damping > 1e4 or float(np.abs(delta).max()) < 1e-7:
-            break
+    best = Best(start)
+
+    def equations(_: None, R_cam_from_world: Array, center_world: Array, sums: Array) -> None:
+        pose = Pose(orthonormal(R_cam_from_world), center_world.copy())
+        sums[LOSS], sums[GRADIENT:MATRIX], matrix = objective(pose)
+        sums[MATRIX:] = matrix[np.triu_indices(6)]
+        best.offer(pose, sums[LOSS])
+
+    R, t = start.R_cam_from_world.copy(), start.center_world.copy()
+    levenberg_marquardt(equations)(None, num_iterations, LEAST_STEP, R, t)
     return best
 
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from ..runtime.jit import F0, F1, HALF, scalar
+from ..runtime.jit import F0, F1, HALF, inline_kernel
 
 CLIP = 2.0  # deviations; what differs more from its surroundings counts no more
 MIN_DEVIATION = 0.03  # of a channel in [0, 1]: flatter surroundings are not amplified further
@@ -16,19 +16,19 @@ _CLIP = np.float32(CLIP)
 _MIN_VARIANCE = np.float32(MIN_DEVIATION * MIN_DEVIATION)
 
 
-@scalar
+@inline_kernel
 def opponent(r, g, b):
     """Luminance, (R - B) / 2 and (2 G - R - B) / 4: OPPONENT times the colour."""
     return (r + g + b) / np.float32(3.0), HALF * (r - b), HALF * g - np.float32(0.25) * (r + b)
 
 
-@scalar
-def standardized(value, mean, per_deviation):
-    """(value - mean) / deviation, clipped."""
-    return min(max((value - mean) * per_deviation, -_CLIP), _CLIP)
+@inline_kernel
+def zscore(value, mean, inverse_std):
+    """(value - mean) / standard deviation, clipped."""
+    return min(max((value - mean) * inverse_std, -_CLIP), _CLIP)
 
 
-@scalar
-def per_deviation(mean, mean_square):
-    """1 / deviation, bounded where nothing varies."""
+@inline_kernel
+def inverse_std(mean, mean_square):
+    """1 / standard deviation, bounded where nothing varies."""
     return F1 / math.sqrt(max(mean_square - mean * mean, F0) + _MIN_VARIANCE)

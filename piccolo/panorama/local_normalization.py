@@ -1,4 +1,4 @@
-"""The panorama made comparable with views: opponent channels, locally normalised, at a few scales."""
+"""Local normalisation on the sphere: opponent channels less their local mean, by their local deviation."""
 
 import math
 from collections.abc import Sequence
@@ -9,19 +9,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.sphere import atan2, pixel_rays, solid_angles
+from ..geometry.sphere import pixel_rays, solid_angles
 from ..runtime.jit import F0, F1, HALF, kernel
 from . import Panorama
-from .channels import LEVELS_PER_UNIT, OPPONENT, ZERO_LEVEL, per_deviation, standardized
+from .channels import CLIP, LEVELS_PER_UNIT, OPPONENT, ZERO_LEVEL, inverse_std, zscore
 from .resize import resize
-from .texels import Texels, bilinear_weights, blend
+from .texels import Texels, bilinear_weights, blend, is_valid, texel_at
 
 STATS_WIDTH = 128  # [px] local means vary over 10 degrees and more
 LEAST_WEIGHT = np.float32(1e-9)  # of neighbours that count, where hardly any does
 
 
 @dataclass(frozen=True)
-class Scale:
+class ImageScale:
     """One size of the panorama."""
 
     width: int  # [px] a multiple of STATS_WIDTH
@@ -30,19 +30,22 @@ class Scale:
 
 
 @lru_cache(maxsize=8)
-def sphere_gaussian(width: int, sigma_deg: float) -> NDArray[np.float32]:
+def sphere_gaussian(width: int, sigma_deg: float) -> NDArray[np.float64]:
     """Spectra over the azimuth (W / 2 + 1, H, H) of the Gaussian weights between rows, times solid angle."""
     rays = pixel_rays(width)
     sigma = np.radians(sigma_deg)
     weight = np.empty((width // 2, width // 2, width))
     for i in range(width // 2):
         weight[i] = np.exp((rays @ rays[i, 0] - 1) / sigma**2) * solid_angles(width)[:, None]
-    return np.ascontiguousarray(np.fft.rfft(weight, axis=2).real.transpose(2, 0, 1)).astype(np.float32)
+    return np.ascontiguousarray(np.fft.rfft(weight, axis=2).real.transpose(2, 0, 1))
 
 
 def blur_sphere(image: NDArray[np.float32], sigma_deg: float) -> NDArray[np.float32]:
-    """Gaussian weighted sums (H, W, C) over the sphere of an equirectangular image (H, W, C)."""
-    spectrum = np.fft.rfft(image, axis=1).astype(np.complex64).transpose(1, 0, 2)
+    """Gaussian weighted sums (H, W, C) over the sphere of an equirectangular image (H, W, C).
+
+    In float64: what BLAS rounds one way or the other is then rounded away.
+    """
+    spectrum = np.fft.rfft(image.astype(np.float64), axis=1).transpose(1, 0, 2)
     gains = sphere_gaussian(image.shape[1], sigma_deg)
     blurred = (gains @ spectrum.real) + 1j * (gains @ spectrum.imag)
     return np.ascontiguousarray(
@@ -51,13 +54,13 @@ def blur_sphere(image: NDArray[np.float32], sigma_deg: float) -> NDArray[np.floa
 
 
 @kernel
-def block_moments(channels, share, moments):
+def block_moments(channels, weight, moments):
     """Write (h, w, 7): weighted sums of 1, the channels and their squares over equal blocks of the image."""
     step = channels.shape[0] // moments.shape[0]
     moments[:] = 0
     for i in range(channels.shape[0]):
         for j in range(channels.shape[1]):
-            m, w = moments[i // step, j // step], share[i, j]
+            m, w = moments[i // step, j // step], weight[i, j]
             m[0] += w
             for c in range(3):
                 m[1 + c] += w * channels[i, j, c]
@@ -65,13 +68,13 @@ def block_moments(channels, share, moments):
 
 
 @kernel
-def pack_standardized(channels, share, stats, texels):
+def pack_normalized(channels, weight, stats, texels):
     """Write padded RGBX texels (H + 2, W + 2): (channel - mean) / deviation in levels, and validity.
 
-    `stats` (h, w, 6) are means and 1 / deviations, read bilinearly; a column of texels is wrapped and a row
-    clamped on each side.
+    `stats` (h, w, 6) are means and 1 / standard deviations, read bilinearly; a column of texels is wrapped
+    and a row clamped on each side.
     """
-    height, width = share.shape
+    height, width = weight.shape
     per = np.float32(stats.shape[1]) / np.float32(width)
     for i in range(height):
         v = min(max((np.float32(i) + HALF) * per - HALF, F0), np.float32(stats.shape[0] - 1))
@@ -89,10 +92,10 @@ def pack_standardized(channels, share, stats, texels):
                 mean += fv * ((F1 - fu) * stats[i0 + 1, j0, c] + fu * stats[i0 + 1, j1, c])
                 gain = (F1 - fv) * ((F1 - fu) * stats[i0, j0, 3 + c] + fu * stats[i0, j1, 3 + c])
                 gain += fv * ((F1 - fu) * stats[i0 + 1, j0, 3 + c] + fu * stats[i0 + 1, j1, 3 + c])
-                value = standardized(channels[i, j, c], mean, gain)
+                value = zscore(channels[i, j, c], mean, gain)
                 level = np.int32(value * np.float32(LEVELS_PER_UNIT) + np.float32(ZERO_LEVEL + 0.5))
                 texel |= min(level, np.int32(255)) << np.int32(8 * c)
-            if share[i, j] > HALF:
+            if weight[i, j] > HALF:
                 texel |= np.int32(1 << 24)
             texels[i + 1, j + 1] = texel
         texels[i + 1, 0], texels[i + 1, width + 1] = texels[i + 1, width], texels[i + 1, 1]
@@ -108,35 +111,61 @@ def finish_statistics(sums):
             per = F1 / max(s[0], LEAST_WEIGHT)
             for c in range(3):
                 s[1 + c] *= per
-                s[4 + c] = per_deviation(s[1 + c], s[4 + c] * per)
+                s[4 + c] = inverse_std(s[1 + c], s[4 + c] * per)
 
 
-def normalized_channels(panorama: Panorama, cell_deg: float, sigma_deg: float) -> Texels:
+def opponent_channels(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Luminance and two opponent colours (H, W, 3) of an image (H, W, 3)."""
+    return np.asarray(cv2.transform(rgb, OPPONENT))
+
+
+def local_statistics(
+    channels: NDArray[np.float32], weight: NDArray[np.float32], width: int, sigma_deg: float
+) -> NDArray[np.float32]:
+    """Local means and 1 / standard deviations (width / 2, width, 6) of channels (H, W, 3).
+
+    Over a Gaussian on the sphere, weighted by (H, W) and the solid angle; W is a multiple of the width.
+    """
+    moments = np.empty((width // 2, width, 7), np.float32)
+    block_moments(channels, weight, moments)
+    sums = blur_sphere(moments, sigma_deg)
+    finish_statistics(sums)
+    return np.asarray(sums[..., 1:])
+
+
+def normalize_locally(
+    rgb: NDArray[np.float32], counts: NDArray[np.bool_], sigma_deg: float
+) -> NDArray[np.float32]:
+    """Opponent channels (H, W, 3) of an image, locally normalised over what `counts`; elsewhere 0."""
+    channels, weight = opponent_channels(rgb), counts.astype(np.float32)
+    statistics = local_statistics(channels, weight, rgb.shape[1], sigma_deg)
+    normalized = (channels - statistics[..., :3]) * statistics[..., 3:]
+    return np.asarray(np.clip(normalized, -CLIP, CLIP) * weight[..., None])
+
+
+def normalize_panorama(panorama: Panorama, cell_deg: float, sigma_deg: float) -> Texels:
     """Opponent channels averaged over `cell_deg`, less the local mean, by the local deviation (`sigma_deg`).
 
     The width of the panorama is a multiple of STATS_WIDTH.
     """
     height, width = panorama.is_valid.shape
-    share = panorama.is_valid.astype(np.float32)
-    channels = cv2.transform(panorama.rgb.astype(np.float32), OPPONENT / np.float32(255.0))
+    weight = panorama.is_valid.astype(np.float32)
+    channels = opponent_channels(panorama.rgb.astype(np.float32) / np.float32(255.0))
     if cell_deg * width / 360.0 > 1.5:  # cells wider than pixels: a Gaussian with a cell's second moment
-        sums = blur_sphere(np.dstack([channels * share[..., None], share]), cell_deg / math.sqrt(12.0))
-        channels = sums[..., :3] / np.maximum(sums[..., 3:], LEAST_WEIGHT)
-    moments = np.empty((STATS_WIDTH // 2, STATS_WIDTH, 7), np.float32)
-    block_moments(channels, share, moments)
-    statistics = blur_sphere(moments, sigma_deg)
-    finish_statistics(statistics)
+        sums = blur_sphere(np.dstack([channels * weight[..., None], weight]), cell_deg / math.sqrt(12.0))
+        channels = np.asarray(sums[..., :3] / np.maximum(sums[..., 3:], LEAST_WEIGHT), np.float32)
+    statistics = local_statistics(channels, weight, STATS_WIDTH, sigma_deg)
     texels = np.empty((height + 2, width + 2), np.int32)
-    pack_standardized(channels, share, statistics[..., 1:], texels)
+    pack_normalized(channels, weight, statistics, texels)
     return Texels(texels.reshape(-1), width)
 
 
-def comparable(panorama: Panorama, scales: Sequence[Scale]) -> list[Texels]:
-    """The panorama at several scales, widest first, each made from the one before."""
+def image_pyramid(panorama: Panorama, scales: Sequence[ImageScale]) -> list[Texels]:
+    """The panorama's channels at several scales, widest first, each made from the one before."""
     images = []
     for scale in scales:
         panorama = resize(panorama, scale.width)
-        images.append(normalized_channels(panorama, scale.cell_deg, scale.sigma_deg))
+        images.append(normalize_panorama(panorama, scale.cell_deg, scale.sigma_deg))
     return images
 
 
@@ -144,8 +173,6 @@ def comparable(panorama: Panorama, scales: Sequence[Scale]) -> list[Texels]:
 def sample_channels(texels, width, directions, rotations, samples, validity):
     """Write channels (rotations, 3, cells), less the zero level, and validity along each turned direction."""
     stride = np.int32(width + 2)
-    scale = np.float32(width / (2.0 * math.pi))
-    half_u, half_v = HALF * np.float32(width + 1), HALF * np.float32(width // 2 + 1)
     for k in range(len(rotations)):
         R = rotations[k]
         for c in range(len(directions)):
@@ -153,14 +180,10 @@ def sample_channels(texels, width, directions, rotations, samples, validity):
             x = R[0, 0] * d0 + R[0, 1] * d1 + R[0, 2] * d2
             y = R[1, 0] * d0 + R[1, 1] * d1 + R[1, 2] * d2
             z = R[2, 0] * d0 + R[2, 1] * d1 + R[2, 2] * d2
-            u = half_u - scale * atan2(y, x)
-            v = half_v - scale * atan2(z, math.sqrt(x * x + y * y))
-            j, i = np.int32(u), np.int32(v)
-            bilinear = bilinear_weights(u - np.float32(j), v - np.float32(i))
-            n = i * stride + j
+            n, fu, fv = texel_at(x, y, z, math.sqrt(x * x + y * y), width)
+            bilinear = bilinear_weights(fu, fv)
             t00, t10, t01, t11 = texels[n], texels[n + 1], texels[n + stride], texels[n + stride + 1]
-            is_valid = np.float32(((t00 & t10 & t01 & t11) >> 24) & 1)
-            validity[k, c] = is_valid
+            validity[k, c] = is_valid(t00, t10, t01, t11)
             for ch in range(3):
                 value = blend(t00, t10, t01, t11, bilinear, 8 * ch) - np.float32(ZERO_LEVEL)
-                samples[k, ch, c] = value * is_valid
+                samples[k, ch, c] = value * validity[k, c]

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.sphere import solid_angles
-from ..runtime.jit import F1, scalar
+from ..geometry.sphere import direction_to_pixel, solid_angles
+from ..runtime.jit import F1, HALF, inline_kernel
 
 BYTE = np.int32(255)
 
@@ -48,13 +48,32 @@ def pack_texels(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = Non
     return Texels(padded.reshape(-1), width, share)
 
 
-@scalar
+@inline_kernel
 def channel(texel, shift):
     """The 8-bit channel of a texel as float32; shift 0, 8 or 16."""
     return np.float32((texel >> shift) & BYTE)
 
 
-@scalar
+@inline_kernel
+def texel_at(x, y, z, rho, width):
+    """Index of the upper left of four texels around a camera direction, and the fraction (fu, fv) beyond it.
+
+    rho = hypot(x, y). Texel centres are at half-integers of the pixel coordinates, and a column and a row of
+    padding come before them. The other three are 1, stride and stride + 1 further.
+    """
+    u, v = direction_to_pixel(x, y, z, rho, np.float32(width))
+    u, v = u + HALF, v + HALF
+    j, i = np.int32(u), np.int32(v)
+    return np.int32(i * np.int32(width + 2) + j), u - np.float32(j), v - np.float32(i)
+
+
+@inline_kernel
+def is_valid(t00, t10, t01, t11):
+    """1 if all four texels count, 0 if one is masked; float32."""
+    return np.float32(((t00 & t10 & t01 & t11) >> 24) & 1)
+
+
+@inline_kernel
 def bilinear_weights(fu, fv):
     """Weights of the texels (0, 0), (1, 0), (0, 1), (1, 1) at the fraction (fu, fv)."""
     w11 = fu * fv
@@ -63,14 +82,14 @@ def bilinear_weights(fu, fv):
     return F1 - fu - w01, w10, w01, w11
 
 
-@scalar
+@inline_kernel
 def blend(t00, t10, t01, t11, weights, shift):
     """Bilinear value of one channel of four texels."""
     value = weights[0] * channel(t00, shift) + weights[1] * channel(t10, shift)
     return value + weights[2] * channel(t01, shift) + weights[3] * channel(t11, shift)
 
 
-@scalar
+@inline_kernel
 def blend_with_gradient(t00, t10, t01, t11, fu, fv, shift):
     """Bilinear value of one channel of four texels and its derivatives by u and v."""
     c00 = channel(t00, shift)

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from ..cloud.model import Cloud
 from ..cloud.soa import PackedPoints, pack_points
-from ..confidence.alternatives import Hypothesis, lead, rivals_of
-from ..confidence.confidence import verdict
+from ..confidence.alternatives import Hypothesis, alternative_poses, score_margin
+from ..confidence.confidence import PAPER_MODEL, classify
 from ..confidence.localization import Localization
-from ..confidence.score import Evidence, evidence_at
+from ..confidence.score import Evidence, agreement_at
 from ..geometry.pose import Pose
 from ..geometry.rotations import uniform_rotations, uniform_yaws
 from ..optimize.refine import Loss, Refined, refine, sampling_loss_of
@@ -58,7 +58,7 @@ def loss_of(panorama: Panorama, settings: PaperSettings) -> Loss:
 def localize(
     paper_map: PaperMap, panorama: Panorama, settings: PaperSettings, workers: Workers, watch: Stopwatch
 ) -> Localization:
-    """Algorithm 1 of the paper: search, refine, select; then judge what was selected."""
+    """Algorithm 1 of the paper: search, refine, select; then evaluate what was selected."""
     points = paper_map.points
     known = settings.gravity == "known"
     rotations = (uniform_yaws if known else uniform_rotations)(settings.effective_num_rotations)
@@ -71,10 +71,10 @@ def localize(
     if best is None or not np.isfinite(best.loss):
         return Localization()
     with watch.stage("refine"):
-        evidence, rivals = judge(points, panorama, best, refined)
-    status, confidence = verdict(evidence, None, len(rivals) > 0, settings.min_confidence)
+        evidence, others = evaluate(points, panorama, best, refined)
+    status, confidence = classify(evidence, None, len(others) > 0, settings.min_confidence, PAPER_MODEL)
     origin_world = paper_map.origin_world
-    in_world = tuple(replace(r, pose=shifted(r.pose, origin_world)) for r in rivals)
+    in_world = tuple(replace(h, pose=shifted(h.pose, origin_world)) for h in others)
     return Localization(status, confidence, shifted(best.pose, origin_world), best.loss, evidence, in_world)
 
 
@@ -83,11 +83,18 @@ def shifted(pose: Pose, origin_world: NDArray[np.float64]) -> Pose:
     return replace(pose, center_world=pose.center_world + origin_world)
 
 
-def judge(
+def evaluate(
     points: PackedPoints, panorama: Panorama, best: Refined, refined: list[Refined]
 ) -> tuple[Evidence, list[Hypothesis]]:
-    """Evidence at the best pose, and its rivals, best first."""
-    evidence = evidence_at(points, panorama, best.pose)
-    others = [Hypothesis(r.pose, evidence_at(points, panorama, r.pose).score) for r in refined]
-    rivals = rivals_of(best.pose, others)
-    return replace(evidence, margin=lead(evidence.score, rivals)), rivals
+    """Evidence at the best pose, and the alternatives, best first."""
+    at_pose = agreement_at(points, panorama, best.pose)
+    others = [Hypothesis(r.pose, agreement_at(points, panorama, r.pose).score) for r in refined]
+    others = alternative_poses(best.pose, others)
+    evidence = Evidence(
+        score=at_pose.score,
+        margin=score_margin(at_pose.score, others),
+        agreement=at_pose.value,
+        explained_fraction=at_pose.explained_fraction,
+        seen_fraction=at_pose.seen_fraction,
+    )
+    return evidence, others

@@ -11,7 +11,7 @@ from ..geometry.sphere import solid_angles
 from ..render.zbuffer import nearest_depth
 
 MIN_CLEARANCE = 0.25  # a camera is not nearer to a surface than this [m]
-MIN_SEEN_SHARE = 0.4  # and sees points over at least this share of the sphere: it is inside the scan
+MIN_SEEN_FRACTION = 0.4  # and sees points over at least this share of the sphere: it is inside the scan
 PROBE_POINTS = 200_000  # about this many points are asked, evenly in space
 PROBE_WIDTH = 48  # cells of 7.5 degrees for the two tests
 
@@ -20,7 +20,7 @@ def is_free(points: PackedPoints, center_world: Array) -> bool:
     """True if a camera fits at `center_world` (3,) and finds itself inside the scan."""
     depth = nearest_depth(points, Pose(np.eye(3), center_world), PROBE_WIDTH).reshape(-1, PROBE_WIDTH)
     seen = np.isfinite(depth).sum(axis=1) @ solid_angles(PROBE_WIDTH) / (4.0 * math.pi)
-    return bool(depth.min() > MIN_CLEARANCE and seen > MIN_SEEN_SHARE)
+    return bool(depth.min() > MIN_CLEARANCE and seen > MIN_SEEN_FRACTION)
 
 
 def box_grid(low: Array, high: Array, num_cells: int) -> NDArray[np.float64]:
@@ -36,7 +36,7 @@ def box_grid(low: Array, high: Array, num_cells: int) -> NDArray[np.float64]:
     return np.column_stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")])
 
 
-def spread(positions: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+def farthest_point_sampling(positions: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     """At most `count` of the positions (N, 3), each the farthest from those before it, in their old order."""
     if len(positions) <= count:
         return positions
@@ -64,4 +64,4 @@ def free_grid(points: PackedPoints, num_translations: int, margin: float) -> NDA
         free = grid[[is_free(probed, center_world) for center_world in grid]]
         if len(free) >= num_translations:
             break
-    return spread(free, num_translations)
+    return farthest_point_sampling(free, num_translations)

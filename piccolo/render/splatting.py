@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from ..panorama.texels import channel
-from ..runtime.jit import F0, F1, kernel, scalar
+from ..runtime.jit import F0, F1, inline_kernel, kernel
 
 MIN_RADIUS_PX = np.float32(0.75)  # every disc reaches the centre of a pixel
 # Layers nearer to each other than this are one surface: noise of a scanner.
@@ -20,7 +20,7 @@ MAX_SLOPE = np.float32(1.25)  # of the range within a disc or a pixel
 TWO = np.float32(2.0)
 
 
-@scalar
+@inline_kernel
 def hit(disc, dx, dy, dz, px_angle2):
     """Squared distance of the unit ray (dx, dy, dz) from a disc's centre by its radius, and range [m]."""
     x, y, z, nx, ny, nz, along, per_radius2, distance = disc
@@ -36,7 +36,7 @@ def hit(disc, dx, dy, dz, px_angle2):
     return min(q, (ex * ex + ey * ey + ez * ez) / px_angle2), t
 
 
-@scalar
+@inline_kernel
 def half_width(elevation, of_center, angle):
     """Azimuths [rad] on a row to each side of a centre that are within `angle` of it; -1 if none are."""
     over = math.sin(0.5 * angle) ** 2 - math.sin(0.5 * (elevation - of_center)) ** 2

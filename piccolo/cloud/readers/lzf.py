@@ -1,6 +1,6 @@
 """LZF, the compression inside PCD files: runs of bytes as they are, and copies of what came before."""
 
-from ...runtime.jit import kernel, scalar
+from ...runtime.jit import inline_kernel, kernel
 
 BROKEN = -1
 MAX_RATIO = 88  # three bytes can stand for a copy of 264
@@ -8,7 +8,7 @@ MAX_LITERALS = 32  # a control byte below it is a run of one more bytes than it 
 LONG_COPY = 7  # the length in the control byte's upper three bits that has a byte of its own behind it
 
 
-@scalar
+@inline_kernel
 def append(source, begin, length, out, filled):
     """The bytes of `out` filled, after `length` bytes of `source` follow the first `filled`, or BROKEN."""
     if begin < 0 or begin + length > len(source) or filled + length > len(out):

@@ -6,7 +6,7 @@ and can't be asked what the broken line looks like.
 
 import numpy as np
 
-from ...runtime.jit import kernel, scalar
+from ...runtime.jit import inline_kernel, kernel
 
 PARSED, NOT_A_NUMBER, TOO_FEW, TOO_MANY = 0, -1, -2, -3
 
@@ -20,7 +20,7 @@ MAX_POWER = 308
 FULL = 10**17  # a mantissa from here on takes no further digit: 18 digits are more than float64 holds
 
 
-@scalar
+@inline_kernel
 def skip_blanks(data, i):
     """Index of the first byte from `i` that is neither space nor tab."""
     while i < len(data) and (data[i] == SPACE or data[i] == TAB):
@@ -28,19 +28,19 @@ def skip_blanks(data, i):
     return i
 
 
-@scalar
+@inline_kernel
 def is_line_end(data, i):
     """True at a newline, a return or the end of the file."""
     return i >= len(data) or data[i] == NEWLINE or data[i] == RETURN
 
 
-@scalar
+@inline_kernel
 def is_comment(data, i):
     """True where # or // begins."""
     return data[i] == HASH or (data[i] == SLASH and i + 1 < len(data) and data[i + 1] == SLASH)
 
 
-@scalar
+@inline_kernel
 def next_line(data, i):
     """Index of the first byte of the next line; its end may be LF, CR LF or CR."""
     while not is_line_end(data, i):
@@ -50,7 +50,7 @@ def next_line(data, i):
     return i + 1
 
 
-@scalar
+@inline_kernel
 def parse_digits(data, i, mantissa):
     """The mantissa with the digits from `i` appended, how many found no room in it, and where they end."""
     num_left_out = 0
@@ -63,7 +63,7 @@ def parse_digits(data, i, mantissa):
     return mantissa, num_left_out, i
 
 
-@scalar
+@inline_kernel
 def has_word(data, i, word):
     """True if the lower-case `word` stands at `i`, in any case."""
     if i + len(word) > len(data):
@@ -74,7 +74,7 @@ def has_word(data, i, word):
     return num_alike == len(word)
 
 
-@scalar
+@inline_kernel
 def parse_word(data, i):
     """NaN or infinity and where the word ends; -1 if neither stands at `i`."""
     if has_word(data, i, NAN):
@@ -86,7 +86,7 @@ def parse_word(data, i):
     return 0.0, -1
 
 
-@scalar
+@inline_kernel
 def parse_exponent(data, i):
     """The power of ten written from `i`, just after the e, and where it ends; -1 if there is none."""
     is_negative = i < len(data) and data[i] == MINUS
@@ -97,7 +97,7 @@ def parse_exponent(data, i):
     return (-power if is_negative else power), (end if end > i else -1)
 
 
-@scalar
+@inline_kernel
 def times_power(mantissa, power):
     """Mantissa x 10^power within a few roundings of the nearest float64; below 1e-290 it may be 0."""
     # No second division by a power: fastmath joins the two, and the joint divisor overflows.
@@ -108,7 +108,7 @@ def times_power(mantissa, power):
     return mantissa * POWERS[power] if power <= MAX_POWER else np.inf
 
 
-@scalar
+@inline_kernel
 def parse_number(data, i):
     """The number that begins at `i` and where it ends; -1 if none does."""
     is_negative = i < len(data) and data[i] == MINUS
@@ -131,7 +131,7 @@ def parse_number(data, i):
     return (-value if is_negative else value), end
 
 
-@scalar
+@inline_kernel
 def skip_field(data, i, separator):
     """Index just behind the field that begins at `i`, whatever it holds."""
     while not is_line_end(data, i) and data[i] != separator and (separator != SPACE or data[i] != TAB):
@@ -139,7 +139,7 @@ def skip_field(data, i, separator):
     return i
 
 
-@scalar
+@inline_kernel
 def next_field(data, i, separator):
     """Where the next field begins, or the line ends, from `i` just behind a field; -1 if neither."""
     begin = skip_blanks(data, i)
@@ -150,7 +150,7 @@ def next_field(data, i, separator):
     return begin if begin > i else -1
 
 
-@scalar
+@inline_kernel
 def parse_line(data, i, separator, targets, row):
     """Fill `row` from the line at `i`; where the next field or the line's end is, or a status below 0."""
     for k in range(len(targets)):

@@ -10,7 +10,7 @@ import numpy as np
 from ...cloud import open_cloud
 from ...cloud.octree import build_octree
 from ...cloud.soa import PackedPoints, pack_points
-from ...confidence.score import VIEW_WIDTH, evidence_at
+from ...confidence.score import VIEW_WIDTH, agreement_at
 from ...geometry.pose import Array, Pose
 from ...panorama import Panorama, read_panorama
 from ...panorama.resize import shrink
@@ -84,7 +84,7 @@ def spread(queries: Sequence[Query], count: int) -> list[Query]:
 
 def _fit(image: str, points: PackedPoints, panorama: Panorama, pose: Pose, origin: Array) -> Fit:
     scores = {
-        words: evidence_at(points, panorama, other).score for words, other in readings(pose, origin).items()
+        words: agreement_at(points, panorama, other).score for words, other in readings(pose, origin).items()
     }
     best = max(scores, key=lambda words: scores[words])
     return Fit(image, scores[AS_GIVEN], scores[best], best)

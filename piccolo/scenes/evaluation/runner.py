@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ...cloud.settings import CloudSettings
-from ...coarse_to_fine.settings import EngineSettings
+from ...coarse_to_fine.settings import CoarseToFineSettings
 from ...errors import InputError
 from ...panorama import ReadOptions
 from ...paper.settings import PaperSettings
@@ -28,7 +28,7 @@ PATIENCE = 1.0  # seconds between two looks at whether a process has died
 class Plan:
     """How queries are localized; goes to other processes as it is."""
 
-    settings: EngineSettings | PaperSettings
+    settings: CoarseToFineSettings | PaperSettings
     cloud_settings: CloudSettings
     read_options: ReadOptions
     cache: CachePolicy

@@ -7,11 +7,11 @@ The paper's figures are of its own data (Stanford2D-3D-S, OmniScenes, MPO) on an
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from ...coarse_to_fine.settings import EngineSettings
+from ...coarse_to_fine.settings import CoarseToFineSettings
 from ...paper.settings import PaperSettings
 from .changes import Change, as_it_is, flipped, turned_at_random, with_count, with_share
 
-Settings = EngineSettings | PaperSettings
+Settings = CoarseToFineSettings | PaperSettings
 NO_FIGURE = "-"
 
 
@@ -129,7 +129,7 @@ def _variants(presets: Sequence[Settings], variants: Sequence[str]) -> list[Arm]
         "mpo": "accuracy 0.45 (MPO)",
     }
     # Splits may be tilted. The paper's preset is told one way or the other; the engine finds out.
-    tried = [replace(s, gravity="auto") if isinstance(s, EngineSettings) else s for s in presets]
+    tried = [replace(s, gravity="auto") if isinstance(s, CoarseToFineSettings) else s for s in presets]
     return [
         Arm(variant, settings, variants=(variant,), paper=figures.get(variant, NO_FIGURE))
         for variant in variants

@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 
-from ...runtime.jit import scalar
+from ...runtime.jit import inline_kernel
 
 
-@scalar
+@inline_kernel
 def hash_unit(i, j, seed):
     """A number in [0, 1) that looks random, of two integers and a seed."""
     h = (i * 374761393 + j * 668265263 + seed * 2147483647) & 0x7FFFFFFF
@@ -16,7 +16,7 @@ def hash_unit(i, j, seed):
     return ((h ^ (h >> 16)) & 0xFFFF) / 65536.0
 
 
-@scalar
+@inline_kernel
 def value_noise(s, t, seed):
     """Smooth noise in [0, 1] with cells of size 1."""
     i, j = math.floor(s), math.floor(t)
@@ -28,14 +28,14 @@ def value_noise(s, t, seed):
     return top * (1.0 - y) + bottom * y
 
 
-@scalar
+@inline_kernel
 def cloudy(s, t, seed):
     """Noise in [0, 1] of three scales: 1 m, 0.25 m, 0.06 m."""
     coarse, middle = value_noise(s, t, seed), value_noise(4.0 * s, 4.0 * t, seed + 1)
     return 0.55 * coarse + 0.3 * middle + 0.15 * value_noise(16.0 * s, 16.0 * t, seed + 2)
 
 
-@scalar
+@inline_kernel
 def pattern_share(pattern, s, t, scale, seed):
     """Share in [0, 1] of the second colour at (s, t) [m]; patterns as in room.py."""
     i, j = np.int64(math.floor(s / scale)), np.int64(math.floor(t / scale))

@@ -1,0 +1,132 @@
+"""Descents on the cells of a view: from many starts, from one pose, and from around a pose."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..confidence.alternatives import Hypothesis
+from ..geometry.pose import Array, Pose, orthonormal
+from ..geometry.sphere_grid import make_grid
+from ..optimize.channel_loss import descend_channels, score
+from ..optimize.levenberg_marquardt import retract
+from ..panorama.channels import LEVELS_PER_UNIT, ZERO_LEVEL
+from ..panorama.texels import Texels
+from ..runtime.jit import F0, kernel
+from ..runtime.threads import Workers
+from .scan_map import SEARCH_VIEW, ScanMap
+from .starts import Starts
+from .view import Cells
+
+COARSE_LOSS, FINE_LOSS, FULL_LOSS = 1.2, 1.0, 0.7  # scales of the loss [standard deviations]
+START_TOLERANCE, PERTURBED_TOLERANCE = 2e-3, 1e-3  # [rad + m] a shorter step ends a descent
+WIDE_ITERATIONS, NARROW_ITERATIONS = 6, 8  # of a descent from around a pose
+PERTURBED_DISTANCE, PERTURBED_ANGLE = 0.25, math.radians(8.0)  # [m], [rad]
+BATCH = 16  # starts a thread takes at a time
+
+
+@kernel
+def descend_starts(views, image, scale, num_iterations, candidate, R_cam_from_map, center_map, scores):
+    """Descend from each start, (n, 3, 3) and (n, 3) in place, on the cells of its candidate's view."""
+    offsets, unit, features, is_seen, solid_angle, centers = views
+    texels, width = image
+    R, t = R_cam_from_map, center_map
+    n = len(solid_angle)
+    points, levels = np.empty((3, n), np.float32), np.empty((3, n), np.float32)
+    weights = np.empty(n, np.float32)
+    for k in range(len(candidate)):
+        c = candidate[k]
+        for i in range(3):
+            for j in range(n):
+                points[i, j] = np.float32(offsets[c, i, j]) * unit[c]
+                levels[i, j] = np.float32(features[c, i, j]) + np.float32(ZERO_LEVEL)
+        for j in range(n):
+            weights[j] = solid_angle[j] if is_seen[c, j] else F0
+        for i in range(3):
+            t[k, i] -= centers[c, i]
+        problem = points, levels, weights, texels, width, scale
+        descend_channels(problem, num_iterations, START_TOLERANCE, R[k], t[k])
+        scores[k] = score(points, levels, weights, texels, width, R[k], t[k])
+        for i in range(3):
+            t[k, i] += centers[c, i]
+
+
+@kernel
+def descend_perturbed(points, levels, weights, wide, narrow, scale, steps, R_cam_from_map, center, scores):
+    """Descend from each step (n, 6) away from (n, 3, 3), (n, 3): on the wide image, then on the other."""
+    R, t = R_cam_from_map, center
+    for k in range(len(steps)):
+        retract(R[k].copy(), t[k].copy(), steps[k], R[k], t[k])
+        if k > 0:
+            problem = points, levels, weights, wide[0], wide[1], scale
+            descend_channels(problem, WIDE_ITERATIONS, PERTURBED_TOLERANCE, R[k], t[k])
+        problem = points, levels, weights, narrow[0], narrow[1], scale
+        descend_channels(problem, NARROW_ITERATIONS, PERTURBED_TOLERANCE, R[k], t[k])
+        scores[k] = score(points, levels, weights, narrow[0], narrow[1], R[k], t[k])
+
+
+def as_levels(channels: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Channels in standard deviations as 8-bit levels, not rounded."""
+    return np.asarray(channels * np.float32(LEVELS_PER_UNIT) + np.float32(ZERO_LEVEL))
+
+
+def perturbations(size: float) -> NDArray[np.float64]:
+    """Steps (9, 6), rotation [rad] and translation [m]: none, then to the corners of a cube."""
+    signs = np.array([(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) / math.sqrt(3.0)
+    steps = np.concatenate([signs[:, ::-1] * PERTURBED_ANGLE, signs * PERTURBED_DISTANCE], axis=1) * size
+    return np.concatenate([np.zeros((1, 6)), steps])
+
+
+def descend_all(
+    scan_map: ScanMap, image: Texels, starts: Starts, num_iterations: int, workers: Workers
+) -> Starts:
+    """Where a descent from each start ends, on its candidate's prepared view; best first."""
+    m = scan_map
+    R, t = starts.R_cam_from_map.copy(), starts.center_map.copy()
+    scores = np.empty(len(t))
+    solid_angle = make_grid(SEARCH_VIEW.num_rings).solid_angle
+    views = m.offsets, m.offset_unit, m.features, m.is_seen, solid_angle, m.centers
+    scale = COARSE_LOSS * LEVELS_PER_UNIT
+
+    def run(lo: int) -> None:
+        part = slice(lo, lo + BATCH)
+        some = starts.candidate[part], R[part], t[part], scores[part]
+        descend_starts(views, (image.rgbx, image.width), scale, num_iterations, *some)
+
+    list(workers.each(run, range(0, len(t), BATCH), "descend"))
+    return Starts(R, t, starts.candidate, scores).take(np.argsort(-scores, kind="stable"))
+
+
+def descend(cells: Cells, center: Array, image: Texels, pose: Pose, limits: tuple[float, int, float]) -> Pose:
+    """The pose where a descent from `pose` ends, on cells around `center` (3,).
+
+    Limits are the loss' scale [standard deviations], the iterations, the least step [rad + m]. Coordinates
+    relative to the centre keep float32 exact.
+    """
+    loss_scale, num_iterations, tolerance = limits
+    R, t = pose.R_cam_from_world.copy(), pose.center_world - center
+    levels, scale = as_levels(cells.channels), loss_scale * LEVELS_PER_UNIT
+    problem = cells.offsets, levels, cells.weights, image.rgbx, image.width, scale
+    descend_channels(problem, num_iterations, tolerance, R, t)
+    return Pose(orthonormal(R), t + center)
+
+
+def score_on(cells: Cells, center: Array, image: Texels, pose: Pose) -> float:
+    """The score of a pose on cells around `center` (3,)."""
+    levels, R, t = as_levels(cells.channels), pose.R_cam_from_world, pose.center_world - center
+    return float(score(cells.offsets, levels, cells.weights, image.rgbx, image.width, R, t))
+
+
+def descend_around(cells: Cells, images: tuple[Texels, Texels], pose: Pose, size: float) -> Hypothesis:
+    """The best end of descents from around a pose, the wider image first, and from the pose itself.
+
+    The cells are those around the pose.
+    """
+    steps, (wide, narrow) = perturbations(size), images
+    R, t = np.repeat(pose.R_cam_from_world[None], len(steps), axis=0), np.zeros((len(steps), 3))
+    scores = np.empty(len(steps))
+    both = (wide.rgbx, wide.width), (narrow.rgbx, narrow.width)
+    levels, scale = as_levels(cells.channels), COARSE_LOSS * LEVELS_PER_UNIT
+    descend_perturbed(cells.offsets, levels, cells.weights, *both, scale, steps, R, t, scores)
+    best = int(np.argmax(scores))
+    return Hypothesis(Pose(orthonormal(R[best]), t[best] + pose.center_world), float(scores[best]))

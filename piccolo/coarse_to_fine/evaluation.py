@@ -1,0 +1,52 @@
+"""What speaks for the pose that was found and against it, and the status that follows."""
+
+import math
+
+from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
+from ..confidence.confidence import classify
+from ..confidence.localization import Localization
+from ..confidence.score import Evidence, agreement_at
+from ..optimize.refine import refine, sampling_loss_of
+from ..optimize.sampling_loss import sampling_loss
+from ..optimize.settings import DescentSettings
+from ..panorama import Panorama
+from ..panorama.resize import shrink
+from ..panorama.texels import pack_texels
+from ..render.zbuffer import visible_points
+from .covariance import estimate_covariance, is_local_minimum
+from .query import Query
+from .search_result import SearchResult
+
+MAX_WIDTH = 4096  # [px] of the panorama that the loss is taken from: more costs seconds and tells nothing
+LAST_STEP = 0.01  # [rad, m] of Adam and the first of L-BFGS, where they take the last descent
+
+
+def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localization:
+    """The pose found in world coordinates, after the descent that the solver asks for, with its evidence."""
+    scan_map, settings, pose = query.scan_map, query.settings, found.best.pose
+    panorama = shrink(panorama, MAX_WIDTH)
+    texels = pack_texels(panorama.rgb, panorama.is_valid)
+    if settings.solver != "gauss-newton":
+        how = DescentSettings(solver=settings.solver, step_size=LAST_STEP)
+        pose = refine(scan_map.points, sampling_loss_of(texels), pose, how).pose
+    loss = sampling_loss(visible_points(scan_map.points, pose.center_world), texels, pose)
+    if not math.isfinite(loss):
+        return Localization()
+    at_pose = agreement_at(scan_map.coarse_points, panorama, pose)
+    agreements = [agreement_at(scan_map.coarse_points, panorama, h.pose).value for h in found.near]
+    is_credible = [is_local_minimum(query, h.pose, a) for h, a in zip(found.near, agreements, strict=True)]
+    credible = [h for h, yes in zip(found.near, is_credible, strict=True) if yes]
+    evidence = Evidence(
+        score=found.best.score,
+        margin=min([found.margin, *(at_pose.value - a for a in agreements)]),
+        agreement=at_pose.value,
+        explained_fraction=at_pose.explained_fraction,
+        seen_fraction=at_pose.seen_fraction,
+        alternative_score_ratio=max([0.0, *(h.score for h in credible)]) / max(found.best.score, 1e-9),
+    )
+    covariance = estimate_covariance(query, pose)
+    status, confidence = classify(evidence, covariance, len(found.alternatives) > 0, settings.min_confidence)
+    others = [h for h in found.alternatives if not any(h is c for c in credible)]
+    reported = [*credible, *others][:MAX_ALTERNATIVES]
+    alternatives = tuple(Hypothesis(scan_map.to_world(h.pose), h.score) for h in reported)
+    return Localization(status, confidence, scan_map.to_world(pose), loss, evidence, alternatives, covariance)

@@ -1,0 +1,49 @@
+"""Non-maximum suppression of poses."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..runtime.jit import kernel
+
+
+@kernel
+def suppress(rotations, centers, min_distance, min_trace, kept):
+    """Write the indices of the poses, best first, that are near none kept before; returns how many."""
+    R, t = rotations, centers
+    x, y, z = np.empty(len(kept)), np.empty(len(kept)), np.empty(len(kept))
+    count = 0
+    for k in range(len(t)):
+        is_new = True
+        for m in range(count):
+            dx, dy, dz = x[m] - t[k, 0], y[m] - t[k, 1], z[m] - t[k, 2]
+            if dx * dx + dy * dy + dz * dz < min_distance * min_distance:
+                trace = 0.0
+                for i in range(9):
+                    trace += R[k, i // 3, i % 3] * R[kept[m], i // 3, i % 3]
+                if trace > min_trace:
+                    is_new = False
+                    break
+        if is_new:
+            kept[count], x[count], y[count], z[count] = k, t[k, 0], t[k, 1], t[k, 2]
+            count += 1
+            if count == len(kept):
+                break
+    return count
+
+
+def non_maximum_suppression(
+    rotations: NDArray[np.float64],
+    centers: NDArray[np.float64],
+    count: int,
+    min_distance: float,
+    min_angle: float,
+) -> NDArray[np.int64]:
+    """Indices of the first `count` poses (n, 3, 3), (n, 3), best first, that are near none before.
+
+    Near is within both the distance [m] and the angle [rad].
+    """
+    kept = np.empty(count, np.int64)
+    min_trace = 1.0 + 2.0 * math.cos(min_angle)
+    return kept[: suppress(rotations, centers, min_distance, min_trace, kept)]

@@ -1,0 +1,107 @@
+"""Levenberg-Marquardt on a pose: one loop, in Python for any objective and compiled for those in kernels."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ..runtime.jit import kernel
+from .normal_equations import GRADIENT, LOSS, MATRIX, NUM_SUMS
+
+MAX_TURN, MAX_MOVE = 0.15, 0.3  # [rad], [m] a step: farther away the matrix means nothing
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-6, 1e4  # of the diagonal
+FALL, RISE = 0.2, 8.0  # of the damping after a step that was taken, and one that was not
+# Float32 sums differ by this share from one pose to the next: what rises by less has not risen. Without it a
+# descent ends where rounding says, some hundredths of a millimetre from the minimum.
+ROUNDING = 1e-7
+
+
+@kernel
+def retract(R_cam_from_world, center_world, step, R_new, center_new):
+    """Write R <- exp([w]x) R and t <- t + R^T d; returns how far the step went, limited, in rad + m."""
+    R, t = R_cam_from_world, center_world
+    turn = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
+    move = math.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
+    limit = min(1.0, MAX_TURN / max(turn, 1e-30), MAX_MOVE / max(move, 1e-30))
+    angle = turn * limit
+    wx, wy, wz = step[0] * limit, step[1] * limit, step[2] * limit
+    a = 1.0 - angle * angle / 6.0 + angle**4 / 120.0
+    b = 0.5 - angle * angle / 24.0 + angle**4 / 720.0
+    E = np.empty((3, 3))
+    E[0, 0] = 1.0 - b * (wy * wy + wz * wz)
+    E[1, 1] = 1.0 - b * (wx * wx + wz * wz)
+    E[2, 2] = 1.0 - b * (wx * wx + wy * wy)
+    E[0, 1], E[1, 0] = b * wx * wy - a * wz, b * wx * wy + a * wz
+    E[0, 2], E[2, 0] = b * wx * wz + a * wy, b * wx * wz - a * wy
+    E[1, 2], E[2, 1] = b * wy * wz - a * wx, b * wy * wz + a * wx
+    for i in range(3):
+        center_new[i] = t[i] + limit * (R[0, i] * step[3] + R[1, i] * step[4] + R[2, i] * step[5])
+        for j in range(3):
+            R_new[i, j] = E[i, 0] * R[0, j] + E[i, 1] * R[1, j] + E[i, 2] * R[2, j]
+    return angle + move * limit
+
+
+@kernel
+def solve_damped(sums, damping, step):  # noqa: C901, PLR0912  # Cholesky by hand: LAPACK costs more for 6 x 6
+    """Write the damped Gauss-Newton step (6,), by Cholesky; False if the matrix is not positive."""
+    A = np.empty((6, 6))
+    m = MATRIX
+    for a in range(6):
+        for b in range(a, 6):
+            A[a, b] = A[b, a] = sums[m]
+            m += 1
+    for a in range(6):
+        A[a, a] += damping * A[a, a] + 1e-9
+        step[a] = -sums[GRADIENT + a]
+    for a in range(6):
+        for b in range(a):
+            A[a, a] -= A[a, b] * A[a, b]
+        if A[a, a] <= 0.0:
+            return False
+        A[a, a] = math.sqrt(A[a, a])
+        for c in range(a + 1, 6):
+            for b in range(a):
+                A[c, a] -= A[c, b] * A[a, b]
+            A[c, a] /= A[a, a]
+    for a in range(6):
+        for b in range(a):
+            step[a] -= A[a, b] * step[b]
+        step[a] /= A[a, a]
+    for k in range(6):
+        a = 5 - k
+        for b in range(a + 1, 6):
+            step[a] -= A[b, a] * step[b]
+        step[a] /= A[a, a]
+    return True
+
+
+def levenberg_marquardt(equations: Any) -> Callable[..., float]:
+    """A descent for `equations(problem, R, t, sums)`, which writes the sums (29,) of normal_equations.
+
+    The descent takes a problem, the most iterations, a tolerance [rad + m], and R (3, 3), t (3,), which end
+    at the best pose found; it returns the loss there. Compile it with `kernel` if `equations` is one.
+    """
+
+    def descend(problem, num_iterations, tolerance, R_cam_from_world, center_world):
+        R, t = R_cam_from_world, center_world
+        sums, new_sums, step = np.empty(NUM_SUMS), np.empty(NUM_SUMS), np.empty(6)
+        R_new, t_new = np.empty((3, 3)), np.empty(3)
+        damping = FIRST_DAMPING
+        equations(problem, R, t, sums)
+        for _ in range(num_iterations):
+            if not solve_damped(sums, damping, step):
+                break
+            length = retract(R, t, step, R_new, t_new)
+            equations(problem, R_new, t_new, new_sums)
+            if new_sums[LOSS] <= sums[LOSS] * (1.0 + ROUNDING):
+                R[:], t[:] = R_new, t_new
+                sums[:] = new_sums
+                damping = max(damping * FALL, LEAST_DAMPING)
+            else:
+                damping *= RISE
+            if length < tolerance or damping > MOST_DAMPING:
+                break
+        return sums[LOSS]
+
+    return descend
