@@ -124,10 +124,11 @@ def result_of(
     pano: str,
     seconds: dict[str, float],
     settings: dict[str, object],
+    warnings: tuple[str, ...] = (),
 ) -> Result:
     """The result of a localization, with the names of the files and what it took."""
     values = {f.name: getattr(found, f.name) for f in fields(found)}
-    return Result(cloud=cloud, pano=pano, seconds=seconds, settings=settings, **values)
+    return Result(cloud=cloud, pano=pano, seconds=seconds, settings=settings, warnings=warnings, **values)
 
 
 _PLAIN_FIELDS = ("status", "confidence", "pano", "loss", "seconds", "settings")

@@ -5,28 +5,18 @@ FORMAT changes with what the arrays mean, so that a file outlives an update; the
 by which a map was made, and makes it anew when they have changed.
 """
 
-import hashlib
-import re
 import zipfile
-from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from ..cloud.octree import Octree
-from ..cloud.settings import CloudSettings
 from ..errors import InputError
 from ..runtime.atomic import replacing
-from ..runtime.cache import cache_root, mark_used, remove_stale
-from ..runtime.stopwatch import Stopwatch
 from .scan_map import ScanMap
 
 FORMAT = "piccolo-map/2"
-NAME = re.compile(r"[0-9a-f]{32}\.piccolo-map")  # of a file in the cache
-# What makes a map: folders of the package. The cache makes maps anew when one of their files has changed.
-MAKERS = ("cloud", "coarse_to_fine", "geometry", "gravity", "panorama")
 ARRAYS = [f.name for f in fields(ScanMap) if f.name not in ("octree", "warnings")]
 ZIP_MAGIC = b"PK\x03\x04"
 # The first member of a map: its name and where that stands, and the beginning of its value somewhere behind.
@@ -81,49 +71,3 @@ def load_map(path: Path) -> ScanMap:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: found {error}, wanted a whole map by tools/prepare_map.py") from error
-
-
-def content_key(paths: Sequence[Path], settings: CloudSettings) -> str:
-    """Name for the map of a cloud's files: by what is in them and the settings, wherever they lie."""
-    digests = sorted(_file_digest(path) for path in paths)
-    digest = hashlib.sha256(" ".join([FORMAT, sources_digest(), repr(settings), *digests]).encode())
-    return digest.hexdigest()[:32]
-
-
-@cache
-def sources_digest() -> str:
-    """Digest of the sources by which a map is made."""
-    digest = hashlib.sha256()
-    for folder in MAKERS:
-        for path in sorted((Path(__file__).parents[1] / folder).rglob("*.py")):
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
-
-
-def _file_digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def cached_map(folder: Path | None, key: str, build: Callable[[], ScanMap], watch: Stopwatch) -> ScanMap:
-    """The map named `key` of a cache folder, or built and put there; the user's cache if `folder` is None.
-
-    Two processes may build one map at once: each writes its own file whole, the last stays, both are equal.
-    """
-    folder = folder or cache_root() / "maps"
-    path = folder / f"{key}.piccolo-map"
-    if path.exists():
-        try:
-            with watch.stage("read"):
-                scan_map = load_map(path)
-        except InputError:
-            path.unlink(missing_ok=True)
-        else:
-            mark_used(path)
-            return scan_map
-    scan_map = build()
-    with watch.stage("prepare"):
-        folder.mkdir(parents=True, exist_ok=True)
-        remove_stale(folder, NAME)
-        save_map(scan_map, path)
-    return scan_map

@@ -32,9 +32,18 @@ class PaperMap:
     points: PackedPoints
     origin_world: NDArray[np.float64]  # (3,) [m]
     positions: NDArray[np.float64]  # (M, 3) starts in free space, relative to origin_world [m]
+    warnings: tuple[str, ...] = ()
+
+    def from_world(self, pose: Pose) -> Pose:
+        """A pose of the world in the frame of the points."""
+        return replace(pose, center_world=pose.center_world - self.origin_world)
+
+    def to_world(self, pose: Pose) -> Pose:
+        """A pose relative to the local origin in the world."""
+        return replace(pose, center_world=pose.center_world + self.origin_world)
 
 
-def prepare(cloud: Cloud, settings: PaperSettings) -> PaperMap:
+def prepare_by_paper(cloud: Cloud, settings: PaperSettings) -> PaperMap:
     """Everything that does not depend on the panorama."""
     points = pack_points(cloud.points, cloud.colors)
     if (
@@ -45,6 +54,7 @@ def prepare(cloud: Cloud, settings: PaperSettings) -> PaperMap:
         points=points,
         origin_world=cloud.origin_world,
         positions=free_grid(points, settings.num_translations, settings.grid_margin),
+        warnings=cloud.warnings,
     )
 
 
@@ -55,7 +65,7 @@ def loss_of(panorama: Panorama, settings: PaperSettings) -> Loss:
     return sampling_loss_of(pack_texels(panorama.rgb, panorama.is_valid))
 
 
-def localize(
+def localize_by_paper(
     paper_map: PaperMap, panorama: Panorama, settings: PaperSettings, workers: Workers, watch: Stopwatch
 ) -> Localization:
     """Algorithm 1 of the paper: search, refine, select; then evaluate what was selected."""
@@ -73,14 +83,8 @@ def localize(
     with watch.stage("refine"):
         evidence, others = evaluate(points, panorama, best, refined)
     status, confidence = classify(evidence, None, len(others) > 0, settings.min_confidence, PAPER_MODEL)
-    origin_world = paper_map.origin_world
-    in_world = tuple(replace(h, pose=shifted(h.pose, origin_world)) for h in others)
-    return Localization(status, confidence, shifted(best.pose, origin_world), best.loss, evidence, in_world)
-
-
-def shifted(pose: Pose, origin_world: NDArray[np.float64]) -> Pose:
-    """A pose relative to the local origin (3,) [m] in the world."""
-    return replace(pose, center_world=pose.center_world + origin_world)
+    in_world = tuple(replace(h, pose=paper_map.to_world(h.pose)) for h in others)
+    return Localization(status, confidence, paper_map.to_world(best.pose), best.loss, evidence, in_world)
 
 
 def evaluate(

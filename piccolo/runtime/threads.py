@@ -24,6 +24,21 @@ def unseen(values: Iterator[Value], total: int | None, label: str) -> Iterator[V
     return values
 
 
+# is told what is being done, how many are done, and of how many, None if unknown
+ProgressCallback = Callable[[str, int, int | None], None]
+
+
+def progress_to(callback: ProgressCallback) -> Show:
+    """Progress that a callback is told of."""
+
+    def watched(values: Iterator[Value], total: int | None, label: str) -> Iterator[Value]:
+        for done, value in enumerate(values, start=1):
+            callback(label, done, total)
+            yield value
+
+    return watched
+
+
 def unheard(warning: str) -> None:
     """A warning that the result alone repeats."""
 

@@ -1,0 +1,277 @@
+"""A scan that photos are localized in: what `import piccolo` gives."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from os import PathLike
+from pathlib import Path
+from typing import Any, Literal, TypedDict, Unpack
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .cloud import open_cloud, stream_of
+from .cloud.readers.colors import to_bytes
+from .cloud.readers.reader import RawCloud
+from .cloud.settings import METRES, CloudSettings, UpAxis
+from .cloud.soa import PackedPoints
+from .cloud.stream import CloudStream
+from .coarse_to_fine.localize import localize
+from .coarse_to_fine.open_map import CachePolicy, open_map, prepared_map_among
+from .coarse_to_fine.scan_map import ScanMap, prepare_map
+from .coarse_to_fine.settings import CoarseToFineSettings, Prior
+from .confidence.localization import Localization
+from .errors import InputError
+from .geometry.pose import Pose
+from .geometry.rotations import Gravity
+from .optimize.settings import Solver
+from .panorama import Panorama, ReadOptions, read_panorama
+from .paper.localize import PaperMap, localize_by_paper, prepare_by_paper
+from .paper.settings import PaperSettings
+from .result import Result, result_of
+from .runtime.stopwatch import Stopwatch
+from .runtime.threads import ProgressCallback, Workers, num_cores, progress_to
+
+File = str | PathLike[str]
+Settings = CoarseToFineSettings | PaperSettings
+ARRAYS = Path("arrays")  # how messages and results name a scan that is no file
+LABELS_WARNING = "labels: the confidence was learnt on colours, and is a rough guide only"
+
+
+class ScanOptions(TypedDict, total=False):
+    """How `open_scan` understands and prepares a scan; all may be left out."""
+
+    units: Literal["mm", "cm", "m", "ft", "us-ft"]  # of the coordinates; metres if not given
+    up: UpAxis  # the axis that points up; "auto" (default): z, or what the cloud's own planes say
+    intensity_as_gray: bool  # for files without colours
+    cache: bool | File  # keep the prepared map in the user's cache (default), nowhere, or in a folder
+    num_threads: int  # all cores if not given
+    progress: ProgressCallback  # is told (what is done, how many are done, of how many or None)
+    settings: Settings  # of the method; the default method's if not given
+
+
+class QueryOptions(TypedDict, total=False):
+    """What `Scan.localize` may be told about a photo; all may be left out."""
+
+    mask: File | NDArray[np.bool_]  # what is to be ignored: white pixels of a picture, True of an array
+    mask_nadir_deg: float  # the cap of this half angle about the camera's down axis is ignored
+    fov_deg: float  # horizontal field of view of a picture that is a part of the sphere
+    cube_order: str  # the picture is six cube faces in this order, such as "rludfb"
+    gravity: Gravity  # "known": upright camera, "unknown": any rotation, "auto": both are tried
+    solver: Solver  # of the last descent
+    near_world: tuple[float, float, float]  # [m] the camera is within `radius` of this
+    radius: float  # [m]
+    height: tuple[float, float]  # [m] least and most above the floor
+    heading_deg: float  # of the image centre, clockwise from the cloud's +y
+    heading_tolerance_deg: float
+    min_confidence: float  # below it a pose is not called localized
+
+
+READ_FIELDS = {f.name for f in fields(ReadOptions)}
+PRIOR_FIELDS = {f.name for f in fields(Prior)}
+
+
+@dataclass(frozen=True)
+class Scan:
+    """A prepared scan. `open_scan` makes one; it may be used from several threads at once."""
+
+    prepared: ScanMap | PaperMap
+    name: str | tuple[str, ...]  # path as given, or the paths of several files that are one scan
+    cloud_settings: CloudSettings
+    settings: Settings  # of photos that say nothing else
+    workers: Workers
+    seconds: dict[str, float]  # spent once, on the scan
+
+    @property
+    def points(self) -> PackedPoints:
+        """Coloured points of the scan, in the frame of `from_world`, for pictures."""
+        return self.prepared.points
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the user should know about the scan, one line each."""
+        return self.prepared.warnings
+
+    def from_world(self, pose: Pose) -> Pose:
+        """A pose of the world in the frame of `points`."""
+        return self.prepared.from_world(pose)
+
+    def localize(self, panorama: File | NDArray[np.uint8], **options: Unpack[QueryOptions]) -> Result:
+        """Where a 360-degree photo was taken.
+
+        Parameters
+        ----------
+        panorama
+            Path of a picture (JPEG, PNG, TIFF, WebP) or of a folder of six cube faces; or an equirectangular
+            image (H, W, 3), W = 2 H, RGB in 8 bits.
+        **options
+            See QueryOptions; what is not given is as in `settings`.
+
+        Returns
+        -------
+        Result
+            Its `status` is "localized", "ambiguous" or "not_localized"; a photo that can't be found is a
+            result too.
+
+        Raises
+        ------
+        InputError
+            The picture can't be read, or an option means nothing.
+
+        Examples
+        --------
+        >>> result = scan.localize("query.jpg", gravity="known")  # doctest: +SKIP
+        >>> result.status, result.pose.center_world.round(2)  # doctest: +SKIP
+        ('localized', array([2.41, 1.07, 1.58]))
+        """
+        given: dict[str, Any] = dict(options)
+        prior = {k: given.pop(k) for k in PRIOR_FIELDS & given.keys()}
+        if prior:
+            given["prior"] = Prior(**prior)
+        read_options = ReadOptions(
+            labels=self.cloud_settings.labels, **{k: given.pop(k) for k in READ_FIELDS & given.keys()}
+        )
+        return self.localize_query(panorama, read_options, replace(self.settings, **given))
+
+    def localize_many(
+        self, panoramas: Iterable[File | NDArray[np.uint8]], **options: Unpack[QueryOptions]
+    ) -> Iterator[Result]:
+        """The result of each panorama in order, as it comes; options as in `localize`."""
+        for panorama in panoramas:
+            yield self.localize(panorama, **options)
+
+    def localize_query(
+        self, panorama: File | NDArray[np.uint8], read_options: ReadOptions, settings: Settings
+    ) -> Result:
+        """The same with all options as objects."""
+        watch = Stopwatch(dict(self.seconds))
+        with watch.stage("read"):
+            picture = read_query(panorama, read_options)
+        found = self._method(picture, settings, watch)
+        name = "array" if isinstance(panorama, np.ndarray) else str(panorama)
+        how = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(read_options).items()}
+        repeated = {**settings.to_json(), "cloud": asdict(self.cloud_settings), "panorama": how}
+        warnings = self.warnings + picture.warnings + ((LABELS_WARNING,) if read_options.labels else ())
+        return result_of(found, self.name, name, watch.seconds, repeated, warnings)
+
+    def _method(self, panorama: Panorama, settings: Settings, watch: Stopwatch) -> Localization:
+        if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
+            return localize(self.prepared, panorama, settings, self.workers, watch)
+        if isinstance(self.prepared, PaperMap) and isinstance(settings, PaperSettings):
+            return localize_by_paper(self.prepared, panorama, settings, self.workers, watch)
+        raise InputError("settings: of another method than the one that the scan was prepared for")
+
+
+def read_query(panorama: File | NDArray[np.uint8], options: ReadOptions) -> Panorama:
+    """The panorama in a file, or the image in an array with what of it counts."""
+    if not isinstance(panorama, np.ndarray):
+        if isinstance(options.mask, np.ndarray):
+            raise InputError("mask: an array goes with an image that is an array; give a picture's path")
+        return read_panorama(Path(panorama), options)
+    if panorama.dtype != np.uint8 or panorama.ndim != 3 or panorama.shape[1:] != (2 * len(panorama), 3):
+        found = f"{panorama.dtype} of shape {panorama.shape}"
+        raise InputError(f"panorama: found {found}, wanted RGB in uint8 of shape (H, 2 H, 3)")
+    is_valid = np.ones(panorama.shape[:2], np.bool_)
+    if options.mask is not None:
+        if not isinstance(options.mask, np.ndarray) or options.mask.shape != is_valid.shape:
+            raise InputError(f"mask: wanted an array of shape {is_valid.shape}, as the image is one")
+        is_valid &= ~options.mask.astype(np.bool_)
+    if (options.fov_deg, options.cube_order, options.mask_nadir_deg) != (None, None, 0.0):
+        raise InputError("panorama: fov_deg, cube_order and mask_nadir_deg go with pictures in files")
+    return Panorama(np.ascontiguousarray(panorama), is_valid)
+
+
+def stream_of_arrays(points: NDArray[np.floating[Any]], colors: NDArray[Any] | None) -> CloudStream:
+    """A cloud in memory: points (N, 3) [m], colours (N, 3) in uint8, uint16, or floats in [0, 1]."""
+    if points.ndim != 2 or points.shape[1:] != (3,) or colors is None or colors.shape != points.shape:
+        shapes = f"{points.shape} and {None if colors is None else colors.shape}"
+        raise InputError(f"points, colors: found shapes {shapes}, wanted two arrays of shape (N, 3)")
+    return stream_of(ARRAYS, RawCloud(points.astype(np.float64), to_bytes(colors)))
+
+
+def open_scan(
+    source: File | Sequence[File] | NDArray[np.floating[Any]],
+    colors: NDArray[Any] | None = None,
+    **options: Unpack[ScanOptions],
+) -> Scan:
+    """Read and prepare a coloured scan, in which photos can then be localized.
+
+    Parameters
+    ----------
+    source
+        Path of a scan in any format of the README, or of a map by tools/prepare_map.py; or several paths,
+        which are one scan; or points (N, 3) [m].
+    colors
+        With points: (N, 3) RGB, uint8, uint16, or floats in [0, 1].
+    **options
+        See ScanOptions.
+
+    Raises
+    ------
+    InputError
+        A file is missing or damaged, has no colours, or is of a format that is not read.
+
+    Examples
+    --------
+    >>> import piccolo
+    >>> scan = piccolo.open_scan("scan.e57", progress=print)  # doctest: +SKIP
+    >>> for result in scan.localize_many(["a.jpg", "b.jpg"]):  # doctest: +SKIP
+    ...     print(result.pano, result.status)
+    """
+    callback = options.get("progress")
+    show = progress_to(callback) if callback else unseen
+    workers = Workers(options.get("num_threads", num_cores()), show)
+    cache = options.get("cache", True)
+    policy = CachePolicy(cache is not False, None if isinstance(cache, bool) else Path(cache))
+    cloud_settings = CloudSettings(
+        METRES[options.get("units", "m")], options.get("up", "auto"), options.get("intensity_as_gray", False)
+    )
+    settings = options.get("settings", CoarseToFineSettings())
+    if isinstance(source, np.ndarray):
+        cloud, watch = stream_of_arrays(source, colors), Stopwatch()
+        return scan_of(cloud, str(ARRAYS), cloud_settings, settings, workers, watch)
+    if colors is not None:
+        raise InputError("colors: given beside files, wanted with an array of points only")
+    paths = [Path(source)] if isinstance(source, str | PathLike) else [Path(path) for path in source]
+    return open_files(paths, cloud_settings, settings, policy, workers)
+
+
+def open_files(
+    paths: Sequence[Path],
+    cloud_settings: CloudSettings,
+    settings: Settings,
+    cache: CachePolicy,
+    workers: Workers,
+) -> Scan:
+    """The same with all options as objects, for files."""
+    watch = Stopwatch()
+    name = str(paths[0]) if len(paths) == 1 else tuple(map(str, paths))
+    if isinstance(settings, CoarseToFineSettings):
+        scan_map = open_map(paths, cloud_settings, cache, workers, watch)
+        return Scan(scan_map, name, cloud_settings, settings, workers, watch.seconds)
+    if map_path := prepared_map_among(paths):
+        raise InputError(f"{map_path}: a prepared map; the preset paper needs the cloud itself")
+    with watch.stage("read"):
+        cloud = open_cloud(paths, cloud_settings, workers.show)
+    return scan_of(cloud, name, cloud_settings, settings, workers, watch)
+
+
+def scan_of(
+    cloud: CloudStream,
+    name: str | tuple[str, ...],
+    cloud_settings: CloudSettings,
+    settings: Settings,
+    workers: Workers,
+    watch: Stopwatch,
+) -> Scan:
+    """A scan prepared anew for the method of the settings."""
+    prepared: ScanMap | PaperMap
+    if isinstance(settings, CoarseToFineSettings):
+        prepared = prepare_map(cloud, workers, cloud_settings.up, watch)
+    else:
+        with watch.stage("read"):
+            points = cloud.read()
+        for warning in points.warnings:
+            workers.warn(warning)
+        with watch.stage("prepare"):
+            prepared = prepare_by_paper(points, settings)
+    return Scan(prepared, name, cloud_settings, settings, workers, watch.seconds)
