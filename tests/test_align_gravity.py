@@ -15,7 +15,7 @@ from scans import bare_room, points_of, scan, write_scan
 from piccolo.cli import align_gravity
 from piccolo.geometry.pose import exp_so3
 from piccolo.gravity import MIN_CONFIDENCE
-from piccolo.gravity.alignment import FORMAT, read_alignment
+from piccolo.gravity.alignment_file import FORMAT, read_alignment
 from piccolo.scenes.scene import Query, read_scene, write_queries
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -79,9 +79,9 @@ def test_planes_are_reported_with_their_kinds(run, tilted):
         assert np.dot(found["normal_scan"], up) > np.cos(np.radians(0.5))
         assert found["offset"] == pytest.approx(height, abs=0.05)
         assert found["rms"] < 0.02
-        assert 0.05 < found["share"] < 0.5
-        assert found["inliers"] > 100
-    assert sorted(report["planes"], key=lambda plane: -plane["inliers"]) == report["planes"]
+        assert 0.05 < found["fraction"] < 0.5
+        assert found["num_inliers"] > 100
+    assert sorted(report["planes"], key=lambda plane: -plane["num_inliers"]) == report["planes"]
 
 
 def test_other_properties_survive_and_normals_turn(run, tilted):
@@ -228,7 +228,7 @@ def test_no_wall_no_yaw(run, tmp_path):
     arguments = ("--cloud", tmp_path / "ground.npz", "--out", tmp_path / "out.ply", "--up", "z")
     code, report, err = run(*arguments, "--yaw-walls")
     assert (code, report["yaw_deg"]) == (1, None)
-    assert "--yaw-walls: found no wall" in err
+    assert "--yaw-walls: no wall" in err
 
 
 def test_true_poses_go_along(run, tilted, tmp_path):
@@ -255,14 +255,20 @@ def test_true_poses_go_along(run, tilted, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--inverse"], "--inverse: found no --apply"),
-        (["--apply", "T.json"], "--apply: found no --out"),
-        (["--apply", "T.json", "--out", "o.ply", "--yaw-walls"], "--yaw-walls: found with --apply"),
-        (["--apply", "T.json", "--out", "o.ply", "--up", "-y"], "--up: found with --apply"),
+        (["--inverse"], "--inverse needs --apply"),
+        (["--apply", "T.json"], "--apply needs --out"),
+        (
+            ["--apply", "T.json", "--out", "o.ply", "--yaw-walls"],
+            "--yaw-walls can't be combined with --apply",
+        ),
+        (["--apply", "T.json", "--out", "o.ply", "--up", "-y"], "--up can't be combined with --apply"),
         (["--min-confidence", "1.5"], "--min-confidence: found 1.5"),
         (["--scale", "-1"], "--scale: found -1"),
-        (["--out", "o.json"], "o.json: wanted a PLY file as --out"),
-        (["--out", "o.ply", "--transform", "T.txt"], "T.txt: wanted a PLY file as --out, and .json"),
+        (["--out", "o.json"], "o.json: --out must be a PLY file"),
+        (
+            ["--out", "o.ply", "--transform", "T.txt"],
+            "T.txt: --out must be a PLY file, and --transform end with .json",
+        ),
     ],
 )
 def test_wrong_usage(run, tilted, arguments, message):
@@ -279,7 +285,7 @@ def test_bad_input(run, tilted, tmp_path):
         (["--cloud", tmp_path / "none.ply", "--out", out], "none.ply: no such file"),
         (["--cloud", tilted, "--out", tilted], "found an input as the output"),
         (["--cloud", tilted, "--out", tmp_path / "no" / "o.ply"], "found no folder"),
-        (["--cloud", tilted, "--out", out, "--apply", tmp_path / "T.json"], "found no format"),
+        (["--cloud", tilted, "--out", out, "--apply", tmp_path / "T.json"], "the format is not"),
         (["--cloud", tilted, "--out", out, "--apply", tmp_path / "none.json"], "none.json"),
     ):
         code, report, err = run(*arguments)

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Try the search for up: clouds turned at random, how far the answers are off, and how sure they were."""
+"""Try the search for up on clouds turned at random: how far off its answers are, and how sure they were."""
 
 import argparse
 import sys
@@ -13,29 +13,29 @@ import _checkout  # noqa: F401
 import numpy as np
 from numpy.typing import NDArray
 
-from piccolo.cli.errors import EXIT_BAD_USAGE, complain, guarded
+from piccolo.cli.errors import guarded
 from piccolo.cli.progress import shown
-from piccolo.cloud import open_cloud, stream_of
+from piccolo.cloud import CloudStream, open_cloud, stream_of
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.confidence.confidence import check_confidence
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Array, rotation_from_quaternion_wxyz
+from piccolo.geometry.pose import Array
+from piccolo.geometry.rotations import random_rotation
 from piccolo.gravity import MIN_CONFIDENCE
 from piccolo.gravity.alignment import find_alignment
 from piccolo.runtime.threads import Workers, num_cores
 from piccolo.scenes.synthetic.buildings import BUILDINGS, make_building
 
-PROGRAM = "gravity_trials.py"
 RIGHT, ROUGH = 0.5, 5.0  # [deg]
-THINNED = 0.04  # spacing of a scene's points, from which the search thins further [m]
+THINNED = 0.04  # spacing of a scene's points, which the search thins further [m]
 EPILOG = """\
 examples:
-  python tools/evaluate_gravity.py --seeds 0 10 --kinds room --turns 50
-  python tools/evaluate_gravity.py --seeds 0 20 --turns 2
+  python tools/evaluate_gravity.py
+  python tools/evaluate_gravity.py --seeds 900 910 --kinds room --turns 50
   python tools/evaluate_gravity.py --scenes BENCH/house BENCH/hospital --turns 250
 
-Each cloud is turned by --turns seeded rotations, uniform over all, and goes the way of align_gravity.py.
+Each cloud is turned by --turns seeded rotations, uniform over all, and aligned as by align_gravity.py.
 Seeds make places of each kind; scenes are folders with a cloud.ply whose z is up, thinned to 4 cm once, but
 for the first --full turns. A Markdown table on stdout: right is within 0.5 degrees, rough within 5; accepted
 is a confidence of --min-confidence or more.
@@ -63,7 +63,13 @@ class Case:
 def rotations_of(seed: int, count: int) -> list[Array]:
     """Rotations (3, 3) uniform over SO(3)."""
     rng = np.random.default_rng([seed, 70])
-    return [rotation_from_quaternion_wxyz(rng.normal(size=4)) for _ in range(count)]
+    return [random_rotation(rng) for _ in range(count)]
+
+
+def rotated_cloud(points: NDArray[np.floating[Any]], R: Array) -> CloudStream:
+    """Points (N, 3) [m] rotated by R (3, 3), as a file of them would be read."""
+    rotated = np.einsum("ij,nj->ni", R, points.astype(np.float64))
+    return stream_of(Path("trial"), RawCloud(rotated, np.full(rotated.shape, 128, np.uint8)))
 
 
 def cases_of(arguments: argparse.Namespace) -> Iterator[Case]:
@@ -82,12 +88,10 @@ def cases_of(arguments: argparse.Namespace) -> Iterator[Case]:
 
 def try_turn(points: NDArray[np.floating[Any]], R: Array) -> Answer:
     """Turn the cloud by R (3, 3) and look for up."""
-    turned = np.einsum("ij,nj->ni", R, points.astype(np.float64))
-    cloud = stream_of(Path("trial"), RawCloud(turned, np.full(turned.shape, 128, np.uint8)))
-    finding, _ = find_alignment(cloud, "auto", along_walls=False)
-    up, true_up = finding.up_scan, R[:, 2]
+    report, _ = find_alignment(rotated_cloud(points, R), "auto", along_walls=False)
+    up, true_up = report.up_scan, R[:, 2]
     sine = float(np.linalg.norm(np.cross(up, true_up)))
-    return Answer(float(np.degrees(np.arctan2(sine, up @ true_up))), finding.alignment.confidence)
+    return Answer(float(np.degrees(np.arctan2(sine, up @ true_up))), report.alignment.confidence)
 
 
 def run(arguments: argparse.Namespace) -> dict[str, list[Answer]]:
@@ -124,35 +128,37 @@ def print_table(answers: dict[str, list[Answer]], min_confidence: float) -> int:
     return total
 
 
+def check_arguments(arguments: argparse.Namespace) -> None:
+    """Refuse values that no cloud could make right."""
+    check_confidence(arguments.min_confidence)
+    if min(arguments.seeds) < 0 or min(arguments.turns, arguments.threads) < 1 or arguments.full < 0:
+        raise InputError("--seeds and --full must be 0 or more, --turns and --threads at least 1")
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     parser = argparse.ArgumentParser(
-        PROGRAM, description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), default=[0, 0])
+    text = "of the made-up places (default 1100 1120, none where --scenes are given)"
+    parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), help=text)
     parser.add_argument(
         "--kinds", nargs="+", choices=BUILDINGS, default=list(BUILDINGS), help="(default all)"
     )
     parser.add_argument("--scenes", type=Path, nargs="*", default=[], metavar="FOLDER")
-    parser.add_argument("--turns", type=int, default=5, metavar="N", help="of each cloud (default 5)")
+    parser.add_argument("--turns", type=int, default=1, metavar="N", help="of each cloud (default 1)")
     parser.add_argument("--full", type=int, default=3, metavar="N", help="turns of whole scenes (default 3)")
     parser.add_argument("--min-confidence", type=float, default=MIN_CONFIDENCE, metavar="X")
     parser.add_argument("--threads", type=int, default=num_cores(), metavar="N")
     parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
     arguments = parser.parse_args(argv)
-    try:
-        check_confidence(arguments.min_confidence)
-        if min(arguments.seeds) < 0 or min(arguments.turns, arguments.threads) < 1 or arguments.full < 0:
-            raise InputError(
-                "--seeds, --turns, --full, --threads: found a negative number or no turn or thread"
-            )
-    except InputError as error:
-        return complain(PROGRAM, arguments.debug, str(error), EXIT_BAD_USAGE)
+    arguments.seeds = arguments.seeds or ([0, 0] if arguments.scenes else [1100, 1120])
     return guarded(
-        PROGRAM,
+        "evaluate_gravity.py",
         arguments.debug,
         lambda: int(print_table(run(arguments), arguments.min_confidence) > 0),
+        lambda: check_arguments(arguments),
     )
 
 
