@@ -141,7 +141,7 @@ def test_points_too_sparse_for_furniture_are_no_evidence():
 
 
 def test_a_front_with_a_strip_of_ground_is_uncertain():
-    up = find_up(turned(make_building("front", 1)[0], TURNS[2]), 0.0)
+    up = find_up(turned(make_building("front", 1), TURNS[2]), 0.0)
     assert up.confidence < 0.75
     assert "front" in up.reason
 

@@ -22,7 +22,7 @@ def rectangle(rng, corner, a, b, noise=0.003):
 
 @pytest.fixture(scope="module")
 def hut():
-    """PointNormals of a turned hut: floor, two walls, a table, a ceiling over one half, a roof over the other."""
+    """A turned hut: floor, two walls, a table, a ceiling over one half, a roof over the other."""
     rng = np.random.default_rng(1)
     parts = [
         rectangle(rng, [0, 0, 0], [6, 0, 0], [0, 4, 0]),

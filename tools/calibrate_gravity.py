@@ -47,7 +47,7 @@ def choice_of(case: tuple[str, int]) -> Choice:
     """The hypotheses for a place of a kind and a seed, turned at random."""
     kind, seed = case
     R = rotations_of(seed, 1)[0]
-    cloud = rotated_cloud(make_building(kind, seed)[0], R)
+    cloud = rotated_cloud(make_building(kind, seed), R)
     hypotheses = up_hypotheses(normals_of(cloud.voxels(np.eye(3))))
     cosines = np.array([hypothesis.axis @ R[:, 2] for hypothesis in hypotheses])
     return Choice(
@@ -63,8 +63,11 @@ def choices_of(seeds: Sequence[int], workers: Workers) -> list[Choice]:
 
 def log_likelihoods(parameters: Array, choices: Sequence[Choice]) -> Array:
     """Logarithm of the true up's part of the odds (C,), by weights (8) and sharing (1)."""
-    logits = [log_odds(choice.cues, parameters[:-1], float(parameters[-1])) for choice in choices]
-    return np.array([l[c.is_up].max() - np.logaddexp.reduce(l) for l, c in zip(logits, choices, strict=True)])
+    values = []
+    for choice in choices:
+        logits = log_odds(choice.cues, parameters[:-1], float(parameters[-1]))
+        values.append(logits[choice.is_up].max() - np.logaddexp.reduce(logits))
+    return np.array(values)
 
 
 def fit(choices: Sequence[Choice]) -> Array:

@@ -76,7 +76,7 @@ def cases_of(arguments: argparse.Namespace) -> Iterator[Case]:
     """Every cloud with its turns."""
     for kind in arguments.kinds:
         for seed in range(*arguments.seeds):
-            yield Case(kind, make_building(kind, seed)[0], rotations_of(seed, arguments.turns))
+            yield Case(kind, make_building(kind, seed), rotations_of(seed, arguments.turns))
     for number, folder in enumerate(arguments.scenes):
         rotations = rotations_of(number, arguments.turns)
         cloud = open_cloud([folder / "cloud.ply"])

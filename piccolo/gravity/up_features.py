@@ -13,7 +13,6 @@ SHARP_ANGLE = np.radians(2.0)  # the same of what is built, not grown or slumped
 
 BIN = 0.1  # of the histogram of heights, half a level's thickness [m]
 MAX_BINS = 10_000
-MAX_LEVELS = 6
 MIN_LEVEL = 0.1  # fraction of the largest level: of a floor, furniture may leave little to see
 MIN_INNER = 0.5  # of the weaker of the outermost levels, of one between them: a table is not a floor
 CLOSE = 4  # bins: levels closer than this are one that bends
@@ -140,7 +139,7 @@ def _find_levels(heights: Array, num_points: int) -> tuple[Array, Array]:
     counts = np.bincount(places.astype(np.int64) + 1, minlength=3)
     pairs = (counts[:-1] + counts[1:]).astype(np.float64)  # so that no border of a bin splits a level
     found: list[tuple[float, float]] = []
-    while len(found) < MAX_LEVELS and pairs.max() > 0:
+    while pairs.max() > 0:
         k = int(pairs.argmax())
         fraction = pairs[k] / num_points
         if found and fraction < MIN_LEVEL * found[0][1]:
