@@ -4,7 +4,6 @@
 import argparse
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -43,21 +42,7 @@ exit codes: 0 no wrong answer was accepted, 1 some were, 2 wrong usage, 3 bad in
 """
 
 
-@dataclass(frozen=True)
-class Answer:
-    """How one trial ended."""
-
-    error_deg: float  # between the up found and the true one
-    confidence: float
-
-
-@dataclass(frozen=True)
-class Case:
-    """A cloud with z up, to be turned."""
-
-    name: str
-    points: NDArray[np.floating[Any]]  # (N, 3) [m]
-    rotations: list[Array]  # (3, 3) each
+Points = NDArray[np.floating[Any]]
 
 
 def rotations_of(seed: int, count: int) -> list[Array]:
@@ -66,66 +51,58 @@ def rotations_of(seed: int, count: int) -> list[Array]:
     return [random_rotation(rng) for _ in range(count)]
 
 
-def rotated_cloud(points: NDArray[np.floating[Any]], R: Array) -> CloudStream:
+def rotated_cloud(points: Points, R: Array) -> CloudStream:
     """Points (N, 3) [m] rotated by R (3, 3), as a file of them would be read."""
     rotated = np.einsum("ij,nj->ni", R, points.astype(np.float64))
     return stream_of(Path("trial"), RawCloud(rotated, np.full(rotated.shape, 128, np.uint8)))
 
 
-def cases_of(arguments: argparse.Namespace) -> Iterator[Case]:
-    """Every cloud with its turns."""
+def cases_of(arguments: argparse.Namespace) -> Iterator[tuple[str, Points, list[Array]]]:
+    """Names of clouds with z up, their points (N, 3) [m] and the rotations (3, 3) to turn them by."""
     for kind in arguments.kinds:
         for seed in range(*arguments.seeds):
-            yield Case(kind, make_building(kind, seed), rotations_of(seed, arguments.turns))
+            yield kind, make_building(kind, seed), rotations_of(seed, arguments.turns)
     for number, folder in enumerate(arguments.scenes):
         rotations = rotations_of(number, arguments.turns)
         cloud = open_cloud([folder / "cloud.ply"])
         full = np.concatenate([points for points, _ in cloud.chunks([])])
-        yield Case(f"{folder.name}, whole", full, rotations[: arguments.full])
+        yield f"{folder.name}, whole", full, rotations[: arguments.full]
         thinned = build_octree(cloud.voxels(np.eye(3))).level(THINNED)[:, :3]
-        yield Case(folder.name, thinned, rotations[arguments.full :])
+        yield folder.name, thinned, rotations[arguments.full :]
 
 
-def try_turn(points: NDArray[np.floating[Any]], R: Array) -> Answer:
-    """Turn the cloud by R (3, 3) and look for up."""
+def try_turn(points: Points, R: Array) -> tuple[float, float]:
+    """Angle [deg] between found and true up of the cloud turned by R (3, 3), and the confidence."""
     report, _ = find_alignment(rotated_cloud(points, R), "auto", along_walls=False)
     up, true_up = report.up_scan, R[:, 2]
     sine = float(np.linalg.norm(np.cross(up, true_up)))
-    return Answer(float(np.degrees(np.arctan2(sine, up @ true_up))), report.alignment.confidence)
+    return float(np.degrees(np.arctan2(sine, up @ true_up))), report.alignment.confidence
 
 
-def run(arguments: argparse.Namespace) -> dict[str, list[Answer]]:
-    """All answers, case by case."""
+def print_table(arguments: argparse.Namespace) -> int:
+    """Try all clouds, print one line for each name; returns the exit code."""
     workers = Workers(arguments.threads, shown(arguments.quiet))
-    answers: dict[str, list[Answer]] = {}
-    for case in cases_of(arguments):
-        found = workers.each(partial(try_turn, case.points), case.rotations, case.name)
-        answers.setdefault(case.name, []).extend(found)
-    return answers
-
-
-def print_table(answers: dict[str, list[Answer]], min_confidence: float) -> int:
-    """One line a case; returns how many wrong answers were accepted."""
+    answers: dict[str, list[tuple[float, float]]] = {}
+    for name, points, rotations in cases_of(arguments):
+        answers.setdefault(name, []).extend(workers.each(partial(try_turn, points), rotations, name))
     print("| case | trials | right | rough | wrong | accepted | of these wrong | surest wrong |")
     print("|---|---:|---:|---:|---:|---:|---:|---:|")
-    total = 0
+    num_false = 0
     for name, rows in answers.items():
-        errors = np.array([row.error_deg for row in rows])
-        confidences = np.array([row.confidence for row in rows])
-        is_wrong, is_accepted = errors > ROUGH, confidences >= min_confidence
-        false = int(np.count_nonzero(is_wrong & is_accepted))
-        cells = [
-            len(rows),
-            np.count_nonzero(errors <= RIGHT),
-            np.count_nonzero((errors > RIGHT) & ~is_wrong),
-            np.count_nonzero(is_wrong),
-            np.count_nonzero(is_accepted),
-            false,
-            f"{confidences[is_wrong].max():.2f}" if is_wrong.any() else "",
+        errors, confidences = np.array(rows).reshape(-1, 2).T
+        is_wrong, is_accepted = errors > ROUGH, confidences >= arguments.min_confidence
+        counts = [
+            errors <= RIGHT,
+            (errors > RIGHT) & ~is_wrong,
+            is_wrong,
+            is_accepted,
+            is_wrong & is_accepted,
         ]
-        print(f"| {name} | {' | '.join(map(str, cells))} |")
-        total += false
-    return total
+        cells = [len(rows), *map(np.count_nonzero, counts)]
+        surest = f"{confidences[is_wrong].max():.2f}" if is_wrong.any() else ""
+        print(f"| {name} | {' | '.join(map(str, cells))} | {surest} |")
+        num_false += cells[-1]
+    return int(num_false > 0)
 
 
 def check_arguments(arguments: argparse.Namespace) -> None:
@@ -157,7 +134,7 @@ def main(argv: list[str] | None = None) -> int:
     return guarded(
         "evaluate_gravity.py",
         arguments.debug,
-        lambda: int(print_table(run(arguments), arguments.min_confidence) > 0),
+        lambda: print_table(arguments),
         lambda: check_arguments(arguments),
     )
 

@@ -15,7 +15,7 @@ from ..cloud.settings import UpAxis
 from ..geometry.pose import Array
 from .axes import MIN_POINTS, candidate_axes
 from .normals import PointNormals
-from .up_features import ALIGNED_ANGLE, SENSE_SHARING, SHARP_ANGLE, WEIGHTS, UpFeatures, log_odds, up_features
+from .up_features import ALIGNED_ANGLE, SENSE_SHARING, WEIGHTS, UpFeatures, log_odds, up_features
 
 Z_UP_LOG_ODDS = 1.5  # of the convention that scans have z up
 PRIOR_ANGLE = np.radians(10.0)  # of +z to a direction that the convention speaks for
@@ -26,18 +26,12 @@ MIN_CONFIDENCE = 0.8
 
 # Directions drawn at random: how many are within an angle of an axis or of the plane across it
 RANDOM_ALIGNED = 1.0 - np.cos(ALIGNED_ANGLE) + np.sin(ALIGNED_ANGLE)
-RANDOM_SHARP = (1.0 - np.cos(SHARP_ANGLE) + np.sin(SHARP_ANGLE)) / RANDOM_ALIGNED
 
 CLEAR_RADIUS, BLURRED_RADIUS = 1.0, 2.5  # of neighbourhoods from which on furniture fades, and is gone [m]
 OPEN_BALANCE, OPEN_ENERGY_RATIO = 0.3, 0.2
-WIDE_OPEN_BALANCE, WIDE_OPEN_ENERGY_RATIO = 0.8, 0.15  # where the winner itself has no open space before it
-OPEN_CONFIDENCE_FACTOR = 0.6
-SLAB_EXTENT = 2.0  # along up, below which nobody stands in the scan: a front, a table [m]
-SLAB_CONFIDENCE_FACTOR = 0.6
-ROOF_THRESHOLD = (
-    0.2  # fraction of walls at odd angles from which on they may be a gable roof, along its ridge
-)
-ROOF_CONFIDENCE_FACTOR = 0.6
+SLAB_EXTENT = 2.0
+ROOF_THRESHOLD = 0.2
+DOUBT_FACTOR = 0.6
 
 
 @dataclass(frozen=True)
@@ -134,30 +128,27 @@ def _doubts(
 ) -> tuple[float, list[str]]:
     """A factor [0, 1] on the confidence in the best hypothesis, and the reasons to doubt it."""
     factor = np.clip(best.aligned_fraction / RANDOM_ALIGNED - 1.0, 0.0, 1.0)
-    factor *= np.clip(best.sharp_fraction / RANDOM_SHARP - 1.0, 0.0, 1.0)
     factor *= np.clip((BLURRED_RADIUS - neighborhood_radius) / (BLURRED_RADIUS - CLEAR_RADIUS), 0.0, 1.0)
     doubts = []
     if neighborhood_radius > CLEAR_RADIUS:
         doubts.append(f"points so sparse that 24 neighbours reach {neighborhood_radius:.1f} m")
     if _may_be_front(best, hypotheses):
-        factor *= OPEN_CONFIDENCE_FACTOR
+        factor *= DOUBT_FACTOR
         doubts.append("ground and the front of a building look alike")
     if best.extent < SLAB_EXTENT:
-        factor *= SLAB_CONFIDENCE_FACTOR
+        factor *= DOUBT_FACTOR
         doubts.append(f"only {best.extent:.1f} m high, maybe a wall")
     if best.non_manhattan_fraction > ROOF_THRESHOLD:
-        factor *= ROOF_CONFIDENCE_FACTOR
+        factor *= DOUBT_FACTOR
         doubts.append("walls at odd angles, maybe a roof")
     return float(factor), doubts
 
 
 def _may_be_front(best: UpFeatures, hypotheses: list[UpFeatures]) -> bool:
     """True if a plane across the best one has open space before it, and so may be the ground."""
-    is_open = best.above_below_balance > OPEN_BALANCE
-    balance = OPEN_BALANCE if is_open else WIDE_OPEN_BALANCE
-    energy = (OPEN_ENERGY_RATIO if is_open else WIDE_OPEN_ENERGY_RATIO) * best.level_energy
     return any(
-        other.above_below_balance > balance and other.level_energy > energy
+        other.above_below_balance > OPEN_BALANCE
+        and other.level_energy > OPEN_ENERGY_RATIO * best.level_energy
         for other in hypotheses
         if abs(other.axis @ best.axis) < 0.3
     )

@@ -17,8 +17,6 @@ MIN_LEVEL = 0.1  # fraction of the largest level: of a floor, furniture may leav
 MIN_INNER = 0.5  # of the weaker of the outermost levels, of one between them: a table is not a floor
 CLOSE = 4  # bins: levels closer than this are one that bends
 MIN_STOREY, MAX_STOREY = 1.5, 5.0  # height [m]
-MAX_HALL = 15.0  # of a storey whose floor and ceiling are both there [m]
-MIN_WALLS = 0.05  # fraction of the flat points
 UNSEEN_END_FACTOR = 0.5  # on the balance above and below where a storey's floor or ceiling was not scanned
 FAR = 0.5  # beyond a level, further than it bends [m]
 FURNITURE = (0.3, 1.2)  # height of seats, beds, tables, boxes [m]
@@ -97,9 +95,7 @@ def up_features(cloud: PointNormals, axis: Array) -> UpFeatures:
     num_aligned, num_sharp = int(np.count_nonzero(is_level | is_wall)), int(np.count_nonzero(is_sharp))
     low, high = map(float, np.quantile(heights, [0.01, 0.99]))
     levels, fractions = _find_levels(heights[is_level], num_points)
-    # without walls there are no rooms: roofs and ground from above
-    has_walls = np.count_nonzero(is_wall) > MIN_WALLS * num_flat
-    storeys = _with_unseen_ends(levels, low, high) if has_walls else np.empty(0)
+    storeys = _with_unseen_ends(levels, low, high)
     balance = _above_below_balance(heights, levels)
     if len(storeys) > len(
         levels
@@ -162,7 +158,7 @@ def _clutter_log_ratio(heights: Array, levels: Array, softening: float) -> float
     is_between = (upper_level > 0) & (upper_level < len(levels))
     floors, ceilings = levels[upper_level[is_between] - 1], levels[upper_level[is_between]]
     parts = (heights[is_between] - floors) / (ceilings - floors)
-    parts = parts[(ceilings - floors > MIN_STOREY) & (ceilings - floors < MAX_HALL)]
+    parts = parts[ceilings - floors > MIN_STOREY]
     lower = np.count_nonzero((parts > MIDDLE[0]) & (parts < MIDDLE[1]))
     upper = np.count_nonzero((parts > MIDDLE[1]) & (parts < MIDDLE[2]))
     return float(np.log((lower + softening) / (upper + softening)))
