@@ -115,7 +115,7 @@ def test_from_above_roofs_are_no_furniture():
 def test_points_too_sparse_for_furniture_are_no_evidence():
     rng = np.random.default_rng(5)
     ground = plane(rng, 9000, np.array([400.0, 400.0, 0.02]))
-    things = plane(rng, 900, np.array([400.0, 400.0, 8.0])) + [0.0, 0.0, 8.0]
+    things = plane(rng, 900, np.array([400.0, 400.0, 8.0])) + np.array([0.0, 0.0, 8.0])
     sparse = find_up(np.concatenate([ground, things]).astype(np.float32))
     assert sparse.confidence == 0.0
     assert "so sparse" in sparse.reason

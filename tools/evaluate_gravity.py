@@ -91,17 +91,12 @@ def print_table(arguments: argparse.Namespace) -> int:
     for name, rows in answers.items():
         errors, confidences = np.array(rows).reshape(-1, 2).T
         is_wrong, is_accepted = errors > ROUGH, confidences >= arguments.min_confidence
-        counts = [
-            errors <= RIGHT,
-            (errors > RIGHT) & ~is_wrong,
-            is_wrong,
-            is_accepted,
-            is_wrong & is_accepted,
-        ]
-        cells = [len(rows), *map(np.count_nonzero, counts)]
+        is_rough = (errors > RIGHT) & ~is_wrong
+        masks = (errors <= RIGHT, is_rough, is_wrong, is_accepted, is_wrong & is_accepted)
+        counts = [len(rows), *(int(np.count_nonzero(mask)) for mask in masks)]
         surest = f"{confidences[is_wrong].max():.2f}" if is_wrong.any() else ""
-        print(f"| {name} | {' | '.join(map(str, cells))} | {surest} |")
-        num_false += cells[-1]
+        print(f"| {name} | {' | '.join(map(str, counts))} | {surest} |")
+        num_false += counts[-1]
     return int(num_false > 0)
 
 
