@@ -8,13 +8,14 @@ from scipy.spatial import cKDTree
 from ..geometry.pose import Array
 from .normals import PointNormals, dot
 
-MIN_POINTS = 300
+# Chosen by hand: the sphere in cells finer than the spread of a noisy plane's normals (3 to 8 deg)
+MIN_POINTS = 300  # of a cloud
 NUM_CELLS = 4000  # of the sphere of directions, about 3 deg wide
-CELLS_PER_MODE = 12  # neighbouring cells whose votes are one direction's, about 6 deg wide
-MAX_MODES = 6
+CELLS_PER_MODE = 12  # neighbouring cells whose votes are one direction's, 6 deg around it
+MAX_MODES = 6  # twice the three directions of a box
 MIN_MODE = 0.02  # fraction of the flat points
-DISTINCT_ANGLE = np.radians(15.0)  # between two candidates
-INLIER_ANGLES = np.radians([8.0, 4.0, 2.0, 2.0])  # of a normal to the axis, or of a wall to it, while refined
+DISTINCT_ANGLE = np.radians(15.0)  # between two candidates: twice the angle of the first refinement
+INLIER_ANGLES = np.radians([8.0, 4.0, 2.0, 2.0])  # of a normal to the axis or across it, step by step
 
 
 def _sphere_cells() -> Array:

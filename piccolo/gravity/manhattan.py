@@ -5,7 +5,7 @@ import numpy as np
 from ..geometry.pose import Array
 from .planes import Plane
 
-PEAK_ANGLE = np.radians(8.0)  # of a wall to those that it is averaged with, modulo a quarter turn
+PEAK_ANGLE = np.radians(8.0)  # of a wall to those averaged with it, modulo a quarter turn; as KIND_ANGLE
 
 
 def manhattan_yaw(planes: list[Plane], R_level_from_scan: Array) -> float | None:
