@@ -29,7 +29,7 @@ RANDOM_ALIGNED = 1.0 - np.cos(ALIGNED_ANGLE) + np.sin(ALIGNED_ANGLE)
 
 # What lowers the confidence, by hand. On 330 places of tools/evaluate_gravity.py a factor of 1 accepts a wrong
 # roof, and the surest wrong front has 0.72; a factor of 0.3 changes no answer.
-CLEAR_RADIUS, BLURRED_RADIUS = 1.0, 2.5  # of neighbourhoods from which on furniture fades, and is gone [m]
+CLEAR_RADIUS, BLURRED_RADIUS = 1.0, 2.5  # of neighbourhoods where furniture begins to fade, is gone [m]
 OPEN_BALANCE = 0.3  # above_below_balance of a plane with open space before it: ground or a front
 OPEN_ENERGY_RATIO = 0.2  # of its level energy to the winner's, from which on they are mixed up
 SLAB_EXTENT = 2.0  # along up, below which nobody stands in the scan: one wall, a table [m]
