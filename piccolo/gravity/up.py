@@ -29,7 +29,7 @@ RANDOM_ALIGNED = 1.0 - np.cos(ALIGNED_ANGLE) + np.sin(ALIGNED_ANGLE)
 
 # What lowers the confidence, by hand. On 330 places of tools/evaluate_gravity.py a factor of 1 accepts a wrong
 # roof, and the surest wrong front has 0.72; a factor of 0.3 changes no answer.
-CLEAR_RADIUS, BLURRED_RADIUS = 1.0, 2.5  # of neighbourhoods where furniture begins to fade, is gone [m]
+CLEAR_RADIUS, BLURRED_RADIUS = 1.0, 2.5  # of neighbourhoods where furniture fades, and is gone [m]
 OPEN_BALANCE = 0.3  # above_below_balance of a plane with open space before it: ground or a front
 OPEN_ENERGY_RATIO = 0.2  # of its level energy to the winner's, from which on they are mixed up
 SLAB_EXTENT = 2.0  # along up, below which nobody stands in the scan: one wall, a table [m]
@@ -117,9 +117,9 @@ def _choose(hypotheses: list[UpFeatures], z_up_log_odds: float, neighborhood_rad
     reason = (
         f"{best.aligned_fraction:.0%} of the points are floor or wall,"
         f" {best.sharp_fraction:.0%} of these within 2 deg;"
-        f" clutter below to above {np.exp(best.clutter_log_ratio):.1f} : 1,"
-        f" furniture {np.exp(best.furniture_log_ratio):.1f} : 1;"
-        f" next is {alternative}, {odds[rank[1]]:.0%}"
+        f" clutter in lower to upper halves of storeys {np.exp(best.clutter_log_ratio):.1f} : 1,"
+        f" furniture on floors to ceilings {np.exp(best.furniture_log_ratio):.1f} : 1;"
+        f" next best is {alternative}, {odds[rank[1]]:.0%}"
     )
     is_z = z_up_log_odds > 0.0 and best.axis[2] > np.cos(SNAP_ANGLE)
     direction = np.array([0.0, 0.0, 1.0]) if is_z else best.axis
