@@ -27,8 +27,8 @@ MIN_CONFIDENCE = 0.8
 # Fraction of directions drawn at random that are within ALIGNED_ANGLE of an axis or of the plane across it
 RANDOM_ALIGNED = 1.0 - np.cos(ALIGNED_ANGLE) + np.sin(ALIGNED_ANGLE)
 
-# What lowers the confidence, by hand. On 330 places of tools/evaluate_gravity.py a factor of 1 accepts a wrong
-# roof, and the surest wrong front has 0.72; a factor of 0.3 changes no answer.
+# What lowers the confidence, by hand. On 330 places of tools/evaluate_gravity.py a factor of 1 accepts a
+# wrong roof, and the surest wrong front has 0.72; a factor of 0.3 changes no answer.
 CLEAR_RADIUS, BLURRED_RADIUS = 1.0, 2.5  # of neighbourhoods where furniture fades, and is gone [m]
 OPEN_BALANCE = 0.3  # above_below_balance of a plane with open space before it: ground or a front
 OPEN_ENERGY_RATIO = 0.2  # of its level energy to the winner's, from which on they are mixed up
