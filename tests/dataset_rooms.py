@@ -21,7 +21,7 @@ from piccolo.panorama.texels import pack_texels
 from piccolo.render.zbuffer import visible_points
 from piccolo.runtime.threads import Workers
 from piccolo.scenes.scene import read_scene
-from piccolo.scenes.synthetic.raycast import cast
+from piccolo.scenes.synthetic.raycast import cast_rays
 
 SEED = 5
 WIDTH = 256
@@ -59,7 +59,7 @@ def cameras(count=2):
 def look(directions, center):
     """Colours (..., 3) and hit points (..., 3) along world directions from a position."""
     (room,) = rooms.room(SEED)[0].rooms
-    ranges, rgb = cast(room, np.asarray(center), directions.reshape(-1, 3), Workers(2), "look")
+    ranges, rgb, _ = cast_rays(room, np.asarray(center), directions.reshape(-1, 3), Workers(2), "look")
     points = center + ranges[:, None] * directions.reshape(-1, 3)
     return np.round(rgb * 255).astype(np.uint8).reshape(directions.shape), points.reshape(directions.shape)
 

@@ -21,7 +21,7 @@ WIDTH = 512
 def room(seed):
     """World of one room, and its cloud as a file would be read: shifted and in Morton order."""
     world = make_world(seed, np.array(SIZE))
-    points, colors = scan_world(world, NUM_POINTS, Workers(2))
+    points, colors, _ = scan_world(world, NUM_POINTS, Workers(2))
     origin_world = np.round((points.min(axis=0).astype(float) + points.max(axis=0)) / 2)
     points = (points - origin_world).astype(np.float32)
     order = canonical_order(points, colors)

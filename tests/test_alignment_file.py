@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from refusals import read_or_refused
 
-from piccolo.gravity.alignment import FORMAT, read_alignment
+from piccolo.gravity.alignment_file import FORMAT, read_alignment
 
 GOOD = {
     "format": FORMAT,
@@ -30,16 +30,19 @@ MIRROR = [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         {"T_aligned_from_scan": [[float("nan")] * 4] * 4},
         {"metres_per_unit": 0.0},
         {"metres_per_unit": "m"},
+        {"T_aligned_from_scan": [["1", "0", "0", "0"]] * 4},
         {"confidence": 2.0},
     ],
     ids=str,
 )
 def test_what_is_no_transform_is_refused(tmp_path, change):
-    path = tmp_path / "T.json"
-    path.write_text(json.dumps(GOOD))
-    np.testing.assert_array_equal(read_alignment(path).T_aligned_from_scan, np.eye(4))
-    path.write_text(json.dumps(GOOD | change))
-    assert read_or_refused(read_alignment, path)[1]
+    (tmp_path / "T.json").write_text(json.dumps(GOOD | change))
+    assert read_or_refused(read_alignment, tmp_path / "T.json")[1]
+
+
+def test_what_is_written_by_hand_is_read(tmp_path):
+    (tmp_path / "T.json").write_text(json.dumps(GOOD))
+    np.testing.assert_array_equal(read_alignment(tmp_path / "T.json").T_aligned_from_scan, np.eye(4))
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff\xfe", b"[" * 100_000, b"[1]", b" " * (2 << 20)], ids=len)

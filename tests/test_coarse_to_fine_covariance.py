@@ -27,7 +27,7 @@ from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.geometry.pose import Pose, exp_so3, log_so3, step
 from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers
-from piccolo.scenes.synthetic.repeated import KINDS, make_repeated
+from piccolo.scenes.synthetic.repeated import REPEATED_KINDS, make_repeated
 from piccolo.scenes.synthetic.world import World, make_query, scan_world
 
 SETTINGS = CoarseToFineSettings(gravity="known")
@@ -112,10 +112,10 @@ def test_halves_agree_at_the_right_pose_only(found):
     assert not has_bottom(look, wrong, 0.8)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", REPEATED_KINDS)
 def test_truth_is_among_the_poses_of_a_place_that_repeats(kind):
     world = World(1, make_repeated(kind, 1, np.array(rooms.SIZE)))
-    points, colors = scan_world(world, 80_000 * len(world.rooms), Workers(2))
+    points, colors, _ = scan_world(world, 80_000 * len(world.rooms), Workers(2))
     cloud = stream_of(Path("repeated"), RawCloud(points.astype(float), colors))
     taken = make_query(world, 0, "clean", rooms.WIDTH, Workers(2))
     result = localize(

@@ -3,17 +3,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rooms import room
+from scans import bare_room
 
+from piccolo import gravity
 from piccolo.cloud.octree import build_octree
 from piccolo.errors import InputError
 from piccolo.geometry.pose import angle_between, exp_so3
-from piccolo.gravity import find_up, rotation_to_z_up
+from piccolo.gravity import estimate_normals, rotation_to_z_up
 from piccolo.scenes.synthetic.buildings import make_building
 
 Z = np.array([0.0, 0.0, 1.0])
 TURNS = [np.array(w) for w in ([0.3, -0.2, 0.9], [1.4, 0.6, -0.3], [-0.7, 2.2, 1.0], [2.9, -0.5, 0.4])]
 Y_UP, Z_DOWN = np.array([-np.pi / 2, 0.0, 0.0]), np.array([np.pi, 0.0, 0.0])
 DIRECTIONS = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda d: np.linalg.norm(d) > 1e-3)
+
+
+def find_up(points, *log_odds):
+    return gravity.find_up(estimate_normals(points), *log_odds)
 
 
 def thinned(seed):
@@ -33,31 +39,14 @@ def plane(rng, num_points, spread):
     return rng.uniform(-1.0, 1.0, (num_points, 3)) * spread
 
 
-def bare_room(rng):
-    """A closed box of 5 x 4 x 2.6 m with nothing in it: points (N, 3) [m]."""
-    size, faces = np.array([5.0, 4.0, 2.6]), []
-    for axis, side in np.ndindex(3, 2):
-        face = rng.uniform(0.0, 1.0, (int(400 * np.delete(size, axis).prod()), 3)) * size
-        face[:, axis] = side * size[axis] + rng.normal(0.0, 0.003, len(face))
-        faces.append(face)
-    return np.concatenate(faces)
-
-
 @pytest.mark.parametrize("seed", [1, 2, 3])
-@pytest.mark.parametrize("w", TURNS, ids=str)
-def test_up_is_found_in_a_turned_room(seed, w):
+@pytest.mark.parametrize("w", [*TURNS, Y_UP, Z_DOWN], ids=str)
+def test_up_is_found_in_a_turned_room_though_the_convention_says_otherwise(seed, w):
     up = find_up(turned(thinned(seed), w))
     assert error_deg(up.direction_world, exp_so3(w) @ Z) < 0.5
     assert np.linalg.norm(up.direction_world) == pytest.approx(1.0)
     assert 0.5 < up.confidence <= 1.0
     assert "\n" not in up.reason
-
-
-@pytest.mark.parametrize("seed", [1, 2, 3])
-@pytest.mark.parametrize("w", [Y_UP, Z_DOWN], ids=["y up", "z down"])
-def test_planes_outvote_the_convention_where_it_is_wrong(seed, w):
-    up = find_up(turned(thinned(seed), w))
-    assert error_deg(up.direction_world, exp_so3(w) @ Z) < 0.5
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -77,7 +66,7 @@ def test_without_the_convention_the_answer_turns_with_the_cloud(w):
 
 
 def test_the_convention_counts_as_much_as_it_is_given():
-    points = bare_room(np.random.default_rng(7)).astype(np.float32)
+    points = bare_room().astype(np.float32)
     confidences = [find_up(points, log_odds).confidence for log_odds in (0.0, 1.5, 3.0)]
     assert confidences[0] < 0.4 < confidences[1] < confidences[2]
 
@@ -126,38 +115,32 @@ def test_from_above_roofs_are_no_furniture():
 def test_points_too_sparse_for_furniture_are_no_evidence():
     rng = np.random.default_rng(5)
     ground = plane(rng, 9000, np.array([400.0, 400.0, 0.02]))
-    sparse = find_up(
-        np.concatenate([ground, rng.uniform(-400, 400, (900, 3)) * [1, 1, 0.02] + [0, 0, 8.0]]).astype(
-            np.float32
-        )
-    )
+    things = plane(rng, 900, np.array([400.0, 400.0, 8.0])) + np.array([0.0, 0.0, 8.0])
+    sparse = find_up(np.concatenate([ground, things]).astype(np.float32))
     assert sparse.confidence == 0.0
     assert "so sparse" in sparse.reason
 
 
 def test_a_front_with_a_strip_of_ground_is_uncertain():
-    up = find_up(turned(make_building("front", 1)[0], TURNS[2]), 0.0)
+    up = find_up(turned(make_building("front", 1), TURNS[2]), 0.0)
     assert up.confidence < 0.75
     assert "front" in up.reason
 
 
 def test_a_few_points_on_a_face_are_no_sheet():
-    points = np.concatenate(
-        [plane(np.random.default_rng(1), 2000, np.array([0.002, 3.0, 3.0])), [[5.0, 0, 0]]]
-    )
-    assert find_up(points.astype(np.float32)).confidence < 0.5
+    points = plane(np.random.default_rng(1), 2000, np.array([0.002, 3.0, 3.0]))
+    assert find_up(np.append(points, [[5.0, 0, 0]], axis=0).astype(np.float32)).confidence < 0.5
 
 
 def test_a_bare_room_may_be_upside_down():
-    up = find_up(turned(bare_room(np.random.default_rng(7)), TURNS[0]))
+    up = find_up(turned(bare_room(), TURNS[0]))
     assert abs(up.direction_world @ exp_so3(TURNS[0]) @ Z) > np.cos(np.radians(0.5))
     assert up.confidence < 0.5
 
 
 def test_a_ceiling_is_not_the_ground_though_furniture_hides_the_floor():
-    rng = np.random.default_rng(9)
-    points = bare_room(rng)
-    furniture = rng.uniform([0.0, 0.0, 0.2], [4.0, 4.0, 1.1], (4000, 3))
+    points = bare_room()
+    furniture = np.random.default_rng(9).uniform([0.0, 0.0, 0.2], [4.0, 4.0, 1.1], (4000, 3))
     is_hidden = (points[:, 2] < 0.02) & (points[:, 0] < 4.2)
     up = find_up(turned(np.concatenate([points[~is_hidden], furniture]), TURNS[3]))
     assert error_deg(up.direction_world, exp_so3(TURNS[3]) @ Z) < 0.5
@@ -165,14 +148,12 @@ def test_a_ceiling_is_not_the_ground_though_furniture_hides_the_floor():
 
 
 def test_by_convention_a_bare_room_has_z_up():
-    points = bare_room(np.random.default_rng(7)).astype(np.float32)
+    points = bare_room().astype(np.float32)
     up = find_up(points)
     np.testing.assert_array_equal(up.direction_world, Z)
     assert up.confidence > 0.5
-    tilted = exp_so3(
-        np.array([0.1, 0.0, 0.0])
-    )  # 5.7 deg: the convention gives the sense, planes the direction
-    assert error_deg(find_up((points @ tilted.T).astype(np.float32)).direction_world, tilted @ Z) < 0.5
+    w = np.array([0.1, 0.0, 0.0])  # 5.7 deg: the convention gives the sense, planes the direction
+    assert error_deg(find_up(turned(points, w)).direction_world, exp_so3(w) @ Z) < 0.5
 
 
 def test_two_far_strays_change_little():
@@ -208,15 +189,10 @@ def test_same_points_same_bits():
 
 
 @pytest.mark.parametrize(
-    ("points", "message"),
-    [
-        (np.zeros((5, 2)), "found shape"),
-        (np.zeros(3), "found shape"),
-        (np.full((9, 3), np.nan), "not finite"),
-    ],
+    "points", [np.zeros((5, 2)), np.zeros(3), np.full((9, 3), np.nan)], ids=["(5, 2)", "(3,)", "NaN"]
 )
-def test_what_is_no_cloud_is_refused(points, message):
-    with pytest.raises(InputError, match=message):
+def test_what_is_no_cloud_is_refused(points):
+    with pytest.raises(InputError, match=r"the shape is|not finite"):
         find_up(points.astype(np.float32))
 
 

@@ -3,18 +3,11 @@
 import numpy as np
 import pytest
 
-from piccolo.geometry.pose import exp_so3
-from piccolo.gravity import (
-    Plane,
-    Surfaces,
-    find_planes,
-    name_planes,
-    refine_up,
-    rotation_to_z_up,
-    surfaces_of,
-    wall_yaw,
-    yaw_turn,
-)
+from piccolo.geometry.pose import exp_so3, yaw_rotation
+from piccolo.gravity.manhattan import manhattan_yaw
+from piccolo.gravity.normals import PointNormals, estimate_normals
+from piccolo.gravity.planes import Plane, classify_planes, ransac_planes, refine_up
+from piccolo.gravity.up import rotation_to_z_up
 
 TURN = exp_so3(np.array([0.7, -1.9, 0.5]))
 UP = TURN[:, 2]
@@ -29,7 +22,7 @@ def rectangle(rng, corner, a, b, noise=0.003):
 
 @pytest.fixture(scope="module")
 def hut():
-    """Surfaces of a turned hut: floor, two walls, a table, a ceiling over one half, a roof over the other."""
+    """A turned hut: floor, two walls, a table, a ceiling over one half, a roof over the other."""
     rng = np.random.default_rng(1)
     parts = [
         rectangle(rng, [0, 0, 0], [6, 0, 0], [0, 4, 0]),
@@ -39,31 +32,31 @@ def hut():
         rectangle(rng, [3, 0, 2.5], [3, 0, 1.5], [0, 4, 0]),
         rectangle(rng, [2, 1.5, 0.8], [2, 0, 0], [0, 1.5, 0]),
     ]
-    return surfaces_of((np.concatenate(parts) @ TURN.T + [7.0, -3.0, 2.0]).astype(np.float32))
+    return estimate_normals((np.concatenate(parts) @ TURN.T + [7.0, -3.0, 2.0]).astype(np.float32))
 
 
 def test_every_plane_is_found_and_called_by_its_name(hut):
-    planes = name_planes(find_planes(hut), hut, UP)
+    planes = classify_planes(ransac_planes(hut), hut, UP)
     assert [plane.num_inliers for plane in planes] == sorted((p.num_inliers for p in planes), reverse=True)
     kinds = [plane.kind for plane in planes]
-    assert sorted(kinds) == ["ceiling", "floor", "level", "slanted", "wall", "wall"]
+    assert sorted(kinds) == ["ceiling", "floor", "platform", "slanted", "wall", "wall"]
     height_of_origin = float(UP @ [7.0, -3.0, 2.0])
-    for kind, height in (("floor", 0.0), ("level", 0.8), ("ceiling", 2.5)):
+    for kind, height in (("floor", 0.0), ("platform", 0.8), ("ceiling", 2.5)):
         plane = planes[kinds.index(kind)]
         np.testing.assert_allclose(plane.normal_world, UP, atol=0.003)
         assert plane.offset == pytest.approx(height + height_of_origin, abs=0.02)
         assert 0.002 < plane.rms < 0.005
-    assert sum(plane.share for plane in planes) == pytest.approx(1.0, abs=0.1)
+    assert sum(plane.fraction for plane in planes) == pytest.approx(1.0, abs=0.1)
     assert planes[0].num_inliers == pytest.approx(24 * 400, rel=0.05)
 
 
 def test_the_names_turn_over_with_up(hut):
-    kinds = [plane.kind for plane in name_planes(find_planes(hut), hut, -UP)]
+    kinds = [plane.kind for plane in classify_planes(ransac_planes(hut), hut, -UP)]
     assert kinds[0] == "ceiling"
 
 
 def test_same_points_same_bits(hut):
-    a, b = find_planes(hut), find_planes(hut)
+    a, b = ransac_planes(hut), ransac_planes(hut)
     assert [(p.normal_world.tobytes(), p.offset, p.rms) for p in a] == [
         (p.normal_world.tobytes(), p.offset, p.rms) for p in b
     ]
@@ -71,17 +64,17 @@ def test_same_points_same_bits(hut):
 
 def test_noise_has_no_planes():
     points = np.random.default_rng(2).uniform(-3.0, 3.0, (9000, 3)).astype(np.float32)
-    assert find_planes(surfaces_of(points)) == []
-    assert find_planes(surfaces_of(points[:10])) == []
+    assert ransac_planes(estimate_normals(points)) == []
+    assert ransac_planes(estimate_normals(points[:10])) == []
 
 
-def plane(normal, share=0.2, rms=0.003, kind="wall"):
-    return Plane(np.asarray(normal, float) / np.linalg.norm(normal), 1.0, 1000, share, rms, kind)
+def plane(normal, fraction=0.2, rms=0.003, kind="wall"):
+    return Plane(np.asarray(normal, float) / np.linalg.norm(normal), 1.0, 1000, fraction, rms, kind)
 
 
 def test_planes_correct_up(hut):
     askew = exp_so3(np.array([0.004, 0.002, 0.0])) @ UP
-    refined, spread = refine_up(askew, find_planes(hut))
+    refined, spread = refine_up(askew, ransac_planes(hut))
     assert np.linalg.norm(refined - UP) < 0.001 < np.linalg.norm(askew - UP)
     assert 0.0 < spread < 0.002
 
@@ -115,21 +108,21 @@ def test_the_smallest_turn_puts_walls_along_the_axes(azimuth_deg):
     along = [plane([np.cos(a + k), np.sin(a + k), 0.0]) for k in (0.0, 0.5 * np.pi, 0.001)]
     odd = plane([np.cos(a + 0.6), np.sin(a + 0.6), 0.0], 0.3)
     R = rotation_to_z_up(UP)
-    scan = [Plane(R.T @ p.normal_world, 0.0, 10, p.share, 0.0, "wall") for p in [*along, odd]]
-    turn = wall_yaw(scan, R)
+    scan = [Plane(R.T @ p.normal_world, 0.0, 10, p.fraction, 0.0, "wall") for p in [*along, odd]]
+    turn = manhattan_yaw(scan, R)
     assert -np.pi / 4 < turn <= np.pi / 4
-    normal = yaw_turn(turn) @ along[0].normal_world
+    normal = yaw_rotation(-turn) @ along[0].normal_world
     assert np.abs(normal).max() == pytest.approx(1.0, abs=1e-5)
 
 
 def test_walls_at_45_degrees_turn_one_way_and_none_none():
-    assert wall_yaw([plane([1.0, 1.0, 0.0])], np.eye(3)) == pytest.approx(np.pi / 4)
-    assert wall_yaw([plane([1.0, -1.0, 0.0])], np.eye(3)) == pytest.approx(np.pi / 4)
-    assert wall_yaw([plane([0, 0, 1], kind="floor")], np.eye(3)) is None
+    assert manhattan_yaw([plane([1.0, 1.0, 0.0])], np.eye(3)) == pytest.approx(np.pi / 4)
+    assert manhattan_yaw([plane([1.0, -1.0, 0.0])], np.eye(3)) == pytest.approx(np.pi / 4)
+    assert manhattan_yaw([plane([0, 0, 1], kind="floor")], np.eye(3)) is None
 
 
-def test_surfaces_of_too_few_points_have_no_reach():
-    found = surfaces_of(np.zeros((5, 3), np.float32))
-    assert isinstance(found, Surfaces)
+def test_estimate_normals_too_few_points_have_no_reach():
+    found = estimate_normals(np.zeros((5, 3), np.float32))
+    assert isinstance(found, PointNormals)
     assert not found.is_flat.any()
-    assert found.reach == np.inf
+    assert found.neighborhood_radius == np.inf

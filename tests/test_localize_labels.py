@@ -19,7 +19,7 @@ from piccolo.pipeline import CachePolicy
 from piccolo.result import Result
 from piccolo.scenes.evaluation.runner import Failure, Job, Plan, run_job
 from piccolo.scenes.scene import read_scene
-from piccolo.scenes.synthetic.room import KINDS
+from piccolo.scenes.synthetic.room import LABEL_NAMES
 
 PAPER = ["--preset", "paper", "--translations", "30", "--iterations", "60", "--max-points", "30000"]
 
@@ -50,10 +50,10 @@ def test_room_maker_labels_points_and_pixels_alike(scene):
     row = (512 * (0.25 - np.arctan2(z, np.hypot(x, y)) / (2 * np.pi))).astype(int)
     assert (picture[row, column] == vertices["label"]).mean() > 0.7  # the rest is hidden
     assert picture.dtype == np.uint16
-    assert set(np.unique(picture)) <= set(range(1, len(KINDS)))
+    assert set(np.unique(picture)) <= set(range(1, len(LABEL_NAMES)))
     for kind, side in (("floor", points[:, 2] < 0.02), ("ceiling", points[:, 2] > 2.48)):
-        assert (vertices["label"][side] == KINDS.index(kind)).mean() > 0.3
-    assert (picture[[0, -1]] == [[KINDS.index("ceiling")], [picture[-1, 0]]]).all()
+        assert (vertices["label"][side] == LABEL_NAMES.index(kind)).mean() > 0.3
+    assert (picture[[0, -1]] == [[LABEL_NAMES.index("ceiling")], [picture[-1, 0]]]).all()
 
 
 @pytest.mark.parametrize("preset", [[], PAPER])
@@ -67,11 +67,12 @@ def test_camera_is_found_by_labels(scene, capsys, preset):
 
 
 def test_ignored_labels_stand_in_the_result_and_everything_ignored_is_refused(scene, capsys):
-    ceiling = str(KINDS.index("ceiling"))
+    ceiling = str(LABEL_NAMES.index("ceiling"))
     result, _, _ = _localized(scene, capsys, "--labels", "--ignore-labels", "99", ceiling)
     assert errors(result.pose, read_scene(scene).queries[0].pose)[0] < 0.05
     assert result.settings["cloud"]["labels"] == {"ignored": [int(ceiling), 99]}
-    _, code, err = _localized(scene, capsys, "--labels", "--ignore-labels", *map(str, range(len(KINDS))))
+    everything = map(str, range(len(LABEL_NAMES)))
+    _, code, err = _localized(scene, capsys, "--labels", "--ignore-labels", *everything)
     assert code == 3
     assert "cloud.ply: found 0 finite points" in err
 

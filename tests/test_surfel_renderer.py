@@ -21,7 +21,7 @@ from piccolo.render.splatting import BAND, BAND_OFFSET, MAX_SLOPE, MIN_RADIUS_PX
 from piccolo.render.surfel_renderer import Picture, closed, encoded, picture_at
 from piccolo.render.surfels import surfels_of
 from piccolo.runtime.threads import Workers
-from piccolo.scenes.synthetic.raycast import cast
+from piccolo.scenes.synthetic.raycast import cast_rays
 
 WORKERS = Workers(2)
 WIDTH = 256
@@ -38,7 +38,7 @@ def true_ranges():
     """Range (H, W) [m] at the tilted query, by casting rays at the room."""
     pose = rooms.query(SEED, "tilt").pose
     rays = pixel_rays(WIDTH).reshape(-1, 3) @ pose.R_cam_from_world
-    ranges, _ = cast(rooms.room(SEED)[0].rooms[0], pose.center_world, rays, WORKERS, "cast")
+    ranges, *_ = cast_rays(rooms.room(SEED)[0].rooms[0], pose.center_world, rays, WORKERS, "cast")
     return ranges.reshape(-1, WIDTH)
 
 

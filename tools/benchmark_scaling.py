@@ -82,7 +82,7 @@ def rooms_case(num_rooms: int) -> Case:
     """Seeded rooms side by side."""
     workers = Workers(num_cores())
     world = make_world(11, np.array([5.0, 4.0, 2.6]), num_rooms)
-    points, colors = scan_world(world, 50_000 * num_rooms, workers)
+    points, colors, _ = scan_world(world, 50_000 * num_rooms, workers)
     taken = [make_query(world, k, "clean", 1024, workers) for k in range(NUM_QUERIES)]
     queries = [(Panorama(q.rgb, np.ones(q.rgb.shape[:2], dtype=bool)), q.pose) for q in taken]
     return Case(ordered(points, colors, np.zeros(3)), queries)

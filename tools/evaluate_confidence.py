@@ -29,7 +29,7 @@ from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers, num_cores
 from piccolo.scenes.scene import Scene, read_scene
 from piccolo.scenes.synthetic.trials import (
-    SPARSE_SHARE,
+    SPARSE_FRACTION,
     Points,
     Trial,
     repeated_trials,
@@ -75,7 +75,7 @@ def scene_trials(scene: Scene, others: Sequence[Scene]) -> Iterator[tuple[CloudS
     ]
     points_world = cloud.points + cloud.origin_world
     yield cloud_of((points_world, cloud.colors)), [*own, *elsewhere, *spoilt, *map(upside_down, upright)]
-    sparse = np.sort(rng.choice(len(points_world), int(SPARSE_SHARE * len(points_world)), replace=False))
+    sparse = np.sort(rng.choice(len(points_world), int(SPARSE_FRACTION * len(points_world)), replace=False))
     thinned = cloud_of((points_world[sparse], cloud.colors[sparse]))
     yield thinned, [Trial("sparse", t.rgb, t.true_pose) for t in upright]
 

@@ -3,6 +3,7 @@
 import argparse
 import json
 import sys
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,7 +16,8 @@ from ..cloud.transform import MeasuredStream, measured, write_moved
 from ..confidence.confidence import check_confidence
 from ..errors import InputError
 from ..gravity import MIN_CONFIDENCE
-from ..gravity.alignment import Alignment, Finding, find_alignment, read_alignment
+from ..gravity.alignment import AlignmentReport, find_alignment
+from ..gravity.alignment_file import Alignment, read_alignment
 from ..runtime.atomic import check_output, write_atomically
 from ..scenes.scene import QUERIES_NAME, Scene, read_scene, write_queries
 from .errors import complain, guarded
@@ -40,7 +42,7 @@ cloud in whole metres, so map coordinates stay near theirs. One PLY file keeps i
 faces, its normals are turned; other formats and several files become x y z and red green blue.
 One JSON object on stdout: status, up, yaw, planes, transform. Without --out nothing else is written.
 Nothing is written either where the confidence is below --min-confidence (default {MIN_CONFIDENCE}): a room
-without furniture may be upside down, steep roofs and stairs mislead. --up says what you know.
+without furniture may be upside down, steep roofs and stairs mislead. If you know the axis, give it by --up.
 exit codes: 0 done, 1 not sure enough, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 
@@ -53,20 +55,20 @@ def build_parser() -> argparse.ArgumentParser:
     add_cloud_options(parser, "coloured scan, as for localize.py")
     files = parser.add_argument_group("files")
     files.add_argument("--out", type=Path, metavar="FILE", help="the turned cloud, a PLY file")
-    text = "of the transform (default --out's name with .json); .txt is written beside it"
+    text = "the transform (default --out's name with .json); a .txt is written beside it"
     files.add_argument("--transform", type=Path, metavar="FILE.json", help=text)
-    text = "true poses in the scan, which are turned with it and written beside --out"
+    text = "true poses in the scan, to be turned with it and written beside --out"
     files.add_argument("--queries", type=Path, metavar="queries.json", help=text)
-    text = "write no file, whatever else is given; report on stdout"
+    text = "write no file, only the report on stdout"
     files.add_argument("--transform-only", action="store_true", help=text)
     group = parser.add_argument_group("method")
-    text = "turn about z too, the least that puts the dominant walls along x and y"
+    text = "also turn about z, by the smallest angle that puts the dominant walls along x and y"
     group.add_argument("--yaw-walls", action="store_true", help=text)
-    text = f"below it nothing is written (default {MIN_CONFIDENCE})"
+    text = f"write nothing below this confidence (default {MIN_CONFIDENCE})"
     group.add_argument("--min-confidence", type=float, metavar="X", help=text)
-    text = "a transform to apply, in place of finding one"
+    text = "apply this transform instead of finding one"
     group.add_argument("--apply", type=Path, metavar="T.json", help=text)
-    group.add_argument("--inverse", action="store_true", help="of the one applied")
+    group.add_argument("--inverse", action="store_true", help="apply the inverse of --apply")
     run = parser.add_argument_group("run")
     run.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
     run.add_argument("--debug", action="store_true", help="show the traceback of an error")
@@ -79,17 +81,17 @@ def check_arguments(arguments: argparse.Namespace) -> None:
     if arguments.min_confidence is not None:
         check_confidence(arguments.min_confidence)
     if arguments.inverse and not arguments.apply:
-        raise InputError("--inverse: found no --apply, wanted a transform to apply")
-    finding = {"--yaw-walls": arguments.yaw_walls, "--min-confidence": arguments.min_confidence is not None,
-               "--up": arguments.up != "auto", "--transform-only": arguments.transform_only}  # fmt: skip
-    if arguments.apply and (wrong := [option for option, is_given in finding.items() if is_given]):
-        raise InputError(f"{wrong[0]}: found with --apply, which finds nothing, wanted one of them")
+        raise InputError("--inverse needs --apply")
+    searching = {"--yaw-walls": arguments.yaw_walls, "--min-confidence": arguments.min_confidence is not None,
+                 "--up": arguments.up != "auto", "--transform-only": arguments.transform_only}  # fmt: skip
+    if arguments.apply and (wrong := [option for option, is_given in searching.items() if is_given]):
+        raise InputError(f"{wrong[0]} can't be combined with --apply, which searches for nothing")
     for option in ("apply", "queries"):
         if getattr(arguments, option) and not arguments.out:
-            raise InputError(f"--{option}: found no --out, wanted a file to write")
+            raise InputError(f"--{option} needs --out")
     for path in filter(None, (arguments.out, arguments.transform)):
         if (path.suffix == ".json") != (path is arguments.transform):
-            raise InputError(f"{path}: wanted a PLY file as --out, and .json as --transform")
+            raise InputError(f"{path}: --out must be a PLY file, and --transform end with .json")
 
 
 @dataclass(frozen=True)
@@ -113,17 +115,17 @@ def outputs_of(arguments: argparse.Namespace) -> Outputs:
     for output in filter(None, outputs):
         check_output(output, inputs)
     if arguments.out in transforms:
-        raise InputError(f"{arguments.out}: found the same name for cloud and transform, wanted a .ply")
+        raise InputError(f"{arguments.out}: cloud and transform have the same name; use .ply for the cloud")
     scene = read_scene(arguments.queries) if arguments.queries else None
     return Outputs(arguments.out, transforms, scene)
 
 
 def open_measured(arguments: argparse.Namespace, settings: CloudSettings) -> MeasuredStream:
-    """The cloud, which shows how far its reading is."""
+    """The cloud, whose reading shows its progress."""
     return measured(open_cloud(arguments.cloud, settings, shown(arguments.quiet)))
 
 
-def write(cloud: MeasuredStream, alignment: Alignment, outputs: Outputs) -> list[str]:
+def write(cloud: MeasuredStream, alignment: Alignment, outputs: Outputs) -> tuple[str, ...]:
     """Write the cloud and what goes with it, the cloud's name last; returns warnings."""
     out = outputs.cloud
 
@@ -133,17 +135,19 @@ def write(cloud: MeasuredStream, alignment: Alignment, outputs: Outputs) -> list
             write_atomically(path, text.encode())
         if out and outputs.scene:
             in_metres = alignment.in_unit(1.0)
-            queries = [replace(query, pose=in_metres.moved(query.pose)) for query in outputs.scene.queries]
+            queries = [
+                replace(query, pose=in_metres.transform_pose(query.pose)) for query in outputs.scene.queries
+            ]
             write_queries(out.parent, queries, cloud=out.name)
 
     if out is None:
         write_others()
-        return []
-    return list(write_moved(cloud, alignment.T_aligned_from_scan, out, write_others))
+        return ()
+    return write_moved(cloud, alignment.T_aligned_from_scan, out, write_others)
 
 
 def report_of(arguments: argparse.Namespace, status: str, alignment: Alignment) -> dict[str, object]:
-    """What all reports say."""
+    """The part of the JSON report that finding and applying have in common."""
     return {
         "status": status,
         "cloud": [str(path) for path in arguments.cloud],
@@ -155,31 +159,32 @@ def report_of(arguments: argparse.Namespace, status: str, alignment: Alignment) 
     }
 
 
-def details_of(finding: Finding) -> dict[str, object]:
-    """The evidence: up, yaw and planes in the scan's frame."""
-    x, y, z = finding.up_scan
-    scale = finding.alignment.metres_per_unit
+def evidence_of(report: AlignmentReport) -> dict[str, object]:
+    """The evidence for the JSON report: up, yaw and planes in the scan's frame and unit."""
+    x, y, z = report.up_scan
+    scale = report.alignment.metres_per_unit
+    rms_angle = report.plane_rms_angle
     return {
-        "up_scan": finding.up_scan.tolist(),
+        "up_scan": report.up_scan.tolist(),
         "tilt_deg": float(np.degrees(np.arctan2(np.hypot(x, y), z))),
-        "spread_deg": None if finding.spread is None else float(np.degrees(finding.spread)),
-        "yaw_deg": None if finding.yaw is None else float(np.degrees(finding.yaw)),
+        "plane_rms_angle_deg": None if rms_angle is None else float(np.degrees(rms_angle)),
+        "yaw_deg": None if report.yaw is None else float(np.degrees(report.yaw)),
         "planes": [
             {
                 "kind": plane.kind,
                 "normal_scan": plane.normal_world.tolist(),
                 "offset": plane.offset / scale,
-                "inliers": plane.num_inliers,
-                "share": plane.share,
+                "num_inliers": plane.num_inliers,
+                "fraction": plane.fraction,
                 "rms": plane.rms / scale,
             }
-            for plane in finding.planes
+            for plane in report.planes
         ],
     }
 
 
-def say(arguments: argparse.Namespace, warnings: list[str]) -> None:
-    """Lines for the user."""
+def print_warnings(arguments: argparse.Namespace, warnings: Iterable[str]) -> None:
+    """A line on stderr for each warning, unless --quiet."""
     for warning in [] if arguments.quiet else warnings:
         tqdm.write(f"{PROGRAM}: warning: {warning}", file=sys.stderr)
 
@@ -188,19 +193,19 @@ def align(arguments: argparse.Namespace) -> int:
     """Find the alignment, write what is sure enough; returns the exit code."""
     outputs = outputs_of(arguments)
     cloud = open_measured(arguments, cloud_settings_from(arguments))
-    finding, warnings = find_alignment(cloud, arguments.up, arguments.yaw_walls)
-    say(arguments, list(warnings))
-    alignment = finding.alignment
+    found, warnings = find_alignment(cloud, arguments.up, arguments.yaw_walls)
+    print_warnings(arguments, warnings)
+    alignment = found.alignment
     least = MIN_CONFIDENCE if arguments.min_confidence is None else arguments.min_confidence
     doubt = ""
     if alignment.confidence < least:
         doubt = f"confidence {alignment.confidence:.2f} is below {least:g}: {alignment.explanation}"
-    elif arguments.yaw_walls and finding.yaw is None:
-        doubt = "--yaw-walls: found no wall among the dominant planes"
+    elif arguments.yaw_walls and found.yaw is None:
+        doubt = "--yaw-walls: no wall is among the dominant planes"
     if not doubt:
-        say(arguments, write(cloud, alignment, outputs))
+        print_warnings(arguments, write(cloud, alignment, outputs))
     report = report_of(arguments, "uncertain" if doubt else "aligned", alignment)
-    print(json.dumps({**report, **details_of(finding)}, allow_nan=False))
+    print(json.dumps({**report, **evidence_of(found)}, allow_nan=False))
     return complain(PROGRAM, False, doubt, EXIT_UNCERTAIN) if doubt else EXIT_ALIGNED
 
 
@@ -215,7 +220,7 @@ def apply(arguments: argparse.Namespace) -> int:
     cloud = open_measured(arguments, settings)
     for _ in cloud.chunks([]):  # for its box
         pass
-    say(arguments, write(cloud, alignment, outputs))
+    print_warnings(arguments, write(cloud, alignment, outputs))
     print(json.dumps(report_of(arguments, "applied", alignment), allow_nan=False))
     return EXIT_ALIGNED
 

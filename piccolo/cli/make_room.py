@@ -23,7 +23,7 @@ from ..scenes.synthetic.world import (
     make_labels,
     make_query,
     make_world,
-    scan_labelled,
+    scan_world,
 )
 from .errors import guarded
 from .progress import shown
@@ -91,7 +91,7 @@ def write_world(
     check_num_points(world, arguments.points)
     check_width(arguments.width)
     (folder / "images").mkdir(parents=True, exist_ok=True)
-    points, colors, labels = scan_labelled(world, arguments.points, workers)
+    points, colors, labels = scan_world(world, arguments.points, workers)
     rows = vertex_rows(points, colors, labels.astype(np.int32) if arguments.labels else None)
     write_ply(folder / scenes.CLOUD_NAME, rows)
     queries = []

@@ -13,7 +13,7 @@ from ..cloud.soa import PackedPoints, pack_points
 from ..cloud.voxels import Voxels
 from ..geometry.pose import Array, Pose
 from ..geometry.sphere_grid import SEARCH_RINGS, averaging, make_grid
-from ..gravity import MIN_CONFIDENCE, R_z_from_axis, find_up, rotation_to_z_up
+from ..gravity import MIN_CONFIDENCE, R_z_from_axis, estimate_normals, find_up, rotation_to_z_up
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from .camera_positions import BLOCK, COARSE_SPACING, candidate_centers
@@ -106,7 +106,7 @@ def widen(
 
 def align_to_gravity(octree: Octree) -> tuple[Array, tuple[str, ...]]:
     """Rotation (3, 3) that turns the cloud's up to +z, identity where it is there already or not known."""
-    up = find_up(octree.level(0.08)[:, :3])
+    up = find_up(estimate_normals(octree.level(0.08)[:, :3]))
     tilt = np.arccos(np.clip(up.direction_world[2], -1.0, 1.0))
     if up.confidence < MIN_CONFIDENCE or tilt < MIN_TILT:
         return np.eye(3), ()

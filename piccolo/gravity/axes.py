@@ -1,4 +1,4 @@
-"""Axes that many surfaces of a cloud face, and those that stand across two of these."""
+"""Axes that many flat points of a cloud face, and those perpendicular to two of these."""
 
 from collections.abc import Iterator
 
@@ -6,15 +6,16 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..geometry.pose import Array
-from .normals import Surfaces, cosines_to
+from .normals import PointNormals, dot
 
-MIN_POINTS = 300
+# Chosen by hand: the sphere in cells finer than the spread of a noisy plane's normals (3 to 8 deg)
+MIN_POINTS = 300  # of a cloud
 NUM_CELLS = 4000  # of the sphere of directions, about 3 deg wide
-CELLS_PER_MODE = 12  # neighbouring cells whose votes are one direction's, about 6 deg wide
-MAX_MODES = 6
-MIN_MODE = 0.02  # share of the flat points
-DISTINCT_ANGLE = np.radians(15.0)  # between two candidates
-INLIER_ANGLES = np.radians([8.0, 4.0, 2.0, 2.0])  # of a normal to the axis, or of a wall to it, while refined
+CELLS_PER_MODE = 12  # neighbouring cells whose votes are one direction's, 6 deg around it
+MAX_MODES = 6  # twice the three directions of a box
+MIN_MODE = 0.02  # fraction of the flat points
+DISTINCT_ANGLE = np.radians(15.0)  # between two candidates: twice the angle of the first refinement
+INLIER_ANGLES = np.radians([8.0, 4.0, 2.0, 2.0])  # of a normal to the axis or across it, step by step
 
 
 def _sphere_cells() -> Array:
@@ -26,9 +27,9 @@ def _sphere_cells() -> Array:
     return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)
 
 
-def candidate_axes(surfaces: Surfaces) -> list[Array]:
-    """Axes that many surfaces face, and those that stand across two such axes."""
-    normals = surfaces.normals[surfaces.is_flat]
+def candidate_axes(cloud: PointNormals) -> list[Array]:
+    """Unit vectors (3,) that many flat points face, and those perpendicular to two such axes; either sign."""
+    normals = cloud.normals[cloud.is_flat]
     cells = _sphere_cells()
     tree = cKDTree(cells)
     nearest = tree.query(np.concatenate([normals, -normals]))[1]
@@ -37,17 +38,17 @@ def candidate_axes(surfaces: Surfaces) -> list[Array]:
     modes: list[Array] = []
     while len(modes) < MAX_MODES and votes.max() > max(MIN_MODE * len(normals), MIN_POINTS // 10):
         axis = cells[votes.argmax()]
-        votes[np.abs(cosines_to(cells, axis)) > np.cos(DISTINCT_ANGLE)] = 0
+        votes[np.abs(dot(cells, axis)) > np.cos(DISTINCT_ANGLE)] = 0
         modes.append(axis)
     axes: list[Array] = []
-    for axis in [*modes, *_across(modes)]:
+    for axis in [*modes, *_perpendicular(modes)]:
         refined = _refine(normals, axis)
         if all(abs(refined @ other) < np.cos(DISTINCT_ANGLE) for other in axes):
             axes.append(refined)
     return axes
 
 
-def _across(axes: list[Array]) -> Iterator[Array]:
+def _perpendicular(axes: list[Array]) -> Iterator[Array]:
     """Unit vectors perpendicular to any two of `axes` that are not near parallel."""
     for i, a in enumerate(axes):
         for b in axes[:i]:
@@ -60,7 +61,7 @@ def _across(axes: list[Array]) -> Iterator[Array]:
 def _refine(normals: Array, axis: Array) -> Array:
     """`axis` by least squares: parallel to normals that face it, perpendicular to those of walls."""
     for angle in INLIER_ANGLES:
-        cosines = np.abs(cosines_to(normals, axis))
+        cosines = np.abs(dot(normals, axis))
         facing, along = normals[cosines > np.cos(angle)], normals[cosines < np.sin(angle)]
         spread = np.einsum("ni,nj->ij", along, along) - np.einsum("ni,nj->ij", facing, facing)
         axis = np.linalg.eigh(spread)[1][:, 0]

@@ -1,40 +1,40 @@
 """Which way is up in a cloud.
 
-Every axis that many surfaces face is a candidate, in both senses. For each of these hypotheses the evidence
-is added up as log-odds (evidence.py): how much of the cloud lies in a few sheets across it (floors,
+Every axis that many flat points face is a candidate, in both senses. What speaks for each of these hypotheses
+is added up as log-odds (up_features.py): how much of the cloud lies in a few levels across it (floors,
 ceilings), how little is aslant to it (floors and walls are not), how low the cloud is along it, whether
-clutter and level tops lie at the bottom of the storeys, whether one sheet carries everything, and the
+clutter and furniture are at the bottom of the storeys, whether one level carries everything, and the
 convention that scans have z up.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..cloud.settings import UpAxis
 from ..geometry.pose import Array
 from .axes import MIN_POINTS, candidate_axes
-from .normals import Surfaces, surfaces_of
-from .up_features import Evidence, evidence_for
+from .normals import PointNormals
+from .up_features import ALIGNED_ANGLE, SENSE_SHARING, WEIGHTS, UpFeatures, log_odds, up_features
 
+Z_UP_LOG_ODDS = 1.5  # of the convention that scans have z up, by hand: it decides a bare room
 PRIOR_ANGLE = np.radians(10.0)  # of +z to a direction that the convention speaks for
 SNAP_ANGLE = np.radians(0.2)  # of +z to a direction that is called +z itself
-CHANCE = 0.15  # share of directions in space that face an axis or stand along it, within FACING_ANGLE
-CHANCE_SHARP = 0.25  # share of these that do so within 2 deg
-CLEAR, BLURRED = 1.0, 2.5  # reach of neighbourhoods from which on furniture fades, and can't be seen [m]
-DOUBT = 0.05  # odds that it is none of the hypotheses
-OPEN = 0.3  # carried at least by a plane with open space on one side: ground, or the front of a house
-OPEN_RIVAL = 0.2  # size of such a plane across the winner's axis, to its own, from which on they are mixed up
-WIDE_OPEN, WIDE_RIVAL = 0.8, 0.15  # the same where the winner has no open space before it
-OPEN_DOUBT = 0.6  # factor on the confidence
-SLAB = 2.0  # extent along up [m] below which nobody stands in the scan: a front, a table
-SLAB_DOUBT = 0.6  # factor on the confidence
-ODD = 0.2  # share of walls at odd angles from which on they may be a gable roof, seen along its ridge
-ODD_DOUBT = 0.6  # factor on the confidence
-# Below it up is not relied on. Of places made from seeds the surest wrong answer was 0.69.
+NONE_ODDS = 0.05  # that it is none of the hypotheses, to those of the best one
+# Below it up is not relied on. The surest wrong answer of tools/evaluate_gravity.py has 0.69.
 MIN_CONFIDENCE = 0.8
-Z_UP = 1.5  # log-odds of the convention that scans have z up
+
+# Fraction of directions drawn at random that are within ALIGNED_ANGLE of an axis or of the plane across it
+RANDOM_ALIGNED = 1.0 - np.cos(ALIGNED_ANGLE) + np.sin(ALIGNED_ANGLE)
+
+# What lowers the confidence, by hand. On 330 places of tools/evaluate_gravity.py a factor of 1 accepts a
+# wrong roof, and the surest wrong front has 0.72; a factor of 0.3 changes no answer.
+CLEAR_RADIUS, BLURRED_RADIUS = 1.0, 2.5  # of neighbourhoods where furniture fades, and is gone [m]
+OPEN_BALANCE = 0.3  # above_below_balance of a plane with open space before it: ground or a front
+OPEN_ENERGY_RATIO = 0.2  # of its level energy to the winner's, from which on they are mixed up
+SLAB_EXTENT = 2.0  # along up, below which nobody stands in the scan: one wall, a table [m]
+ROOF_THRESHOLD = 0.2  # fraction of walls at odd angles, from which on they may be a roof along its ridge
+DOUBT_FACTOR = 0.6  # on the confidence, for each of these
 
 
 @dataclass(frozen=True)
@@ -42,39 +42,33 @@ class Up:
     """Which way is up in a cloud, and how far that can be relied on."""
 
     direction_world: Array  # (3,) unit vector that points up, in the cloud's frame
-    confidence: float  # [0, 1] share of the evidence for this direction; below 0.5 it is a mere guess
+    confidence: float  # [0, 1] part of the odds for this direction; below 0.5 it is a mere guess
     reason: str  # one line for a person
 
 
-def find_up(points: NDArray[np.float32], z_up_log_odds: float = Z_UP) -> Up:
-    """The direction that points up in a cloud (N, 3) [m], thinned evenly in space (5 to 20 cm).
+def find_up(cloud: PointNormals, z_up_log_odds: float = Z_UP_LOG_ODDS) -> Up:
+    """The direction that points up in a cloud, thinned evenly in space (5 to 20 cm).
 
     By convention scans have z up: `z_up_log_odds` count for a direction within 10 deg of +z, decide between
     close alternatives and often the sense; within 0.2 deg of it, +z itself is returned. In a frame turned at
     random the convention speaks for a wall or the ground below one time in 25, and sometimes misleads: with 0
     no direction is favoured, and none is rounded to +z.
 
-    The confidence is the winner's share of the odds of all directions, less where few surfaces are flat or
+    The confidence is the winner's part of the odds of all directions, less where few points are flat or
     they face about it, and where ground and a house front could be mixed up. A bare room turned at random
     stays below 0.5, for its floor may be its ceiling.
-
-    Raises
-    ------
-    InputError
-        The shape is not (N, 3), or a coordinate is not finite.
     """
-    return up_of(surfaces_of(points), z_up_log_odds)
+    if len(cloud.points) < MIN_POINTS:
+        return Up(np.array([0.0, 0.0, 1.0]), 0.0, f"only {len(cloud.points)} points: +z is assumed")
+    hypotheses = up_hypotheses(cloud)
+    if not hypotheses:
+        return Up(np.array([0.0, 0.0, 1.0]), 0.0, "no axis that flat points face: +z is assumed")
+    return _choose(hypotheses, z_up_log_odds, cloud.neighborhood_radius)
 
 
-def up_of(surfaces: Surfaces, z_up_log_odds: float = Z_UP) -> Up:
-    """As find_up, from surfaces that are known."""
-    if len(surfaces.points) < MIN_POINTS:
-        return Up(np.array([0.0, 0.0, 1.0]), 0.0, f"only {len(surfaces.points)} points: +z is assumed")
-    axes = candidate_axes(surfaces)
-    if not axes:
-        return Up(np.array([0.0, 0.0, 1.0]), 0.0, "no direction that flat surfaces share: +z is assumed")
-    hypotheses = [evidence_for(surfaces, sense * axis) for axis in axes for sense in (1.0, -1.0)]
-    return _verdict(hypotheses, z_up_log_odds, surfaces.reach)
+def up_hypotheses(cloud: PointNormals) -> list[UpFeatures]:
+    """The features of a cloud along every axis that may be upright, in both senses."""
+    return [up_features(cloud, sense * axis) for axis in candidate_axes(cloud) for sense in (1.0, -1.0)]
 
 
 def rotation_to_z_up(direction_world: Array) -> Array:
@@ -107,45 +101,57 @@ def R_z_from_axis(up: UpAxis) -> Array:
 
 def named_axis(up: UpAxis) -> Array:
     """The unit vector (3,) that a name other than auto stands for."""
-    return np.asarray((-1.0 if up.startswith("-") else 1.0) * np.eye(3)["xyz".index(up[-1])])
+    return np.asarray((-1.0 if up.startswith("-") else 1.0) * np.eye(3)["xyz".index(up[-1])] + 0.0)
 
 
-def _verdict(hypotheses: list[Evidence], z_up_log_odds: float, reach: float) -> Up:
-    """The hypothesis that the evidence favours, with its share of the odds."""
-    log_odds = np.array([h.log_odds + z_up_log_odds * (h.axis[2] > np.cos(PRIOR_ANGLE)) for h in hypotheses])
-    odds = np.exp(log_odds - log_odds.max())
-    odds /= odds.sum() + DOUBT
+def _choose(hypotheses: list[UpFeatures], z_up_log_odds: float, neighborhood_radius: float) -> Up:
+    """The hypothesis of the largest odds, its part of all odds less what makes it doubtful, and why."""
+    logits = log_odds(np.array([h.cues for h in hypotheses]), np.array(WEIGHTS), SENSE_SHARING)
+    logits += z_up_log_odds * np.array([h.axis[2] > np.cos(PRIOR_ANGLE) for h in hypotheses])
+    odds = np.exp(logits - logits.max())
+    odds /= odds.sum() + NONE_ODDS
     rank = np.argsort(-odds, kind="stable")
     best, second = hypotheses[rank[0]], hypotheses[rank[1]]
-    quality = np.clip((best.explained - CHANCE) / CHANCE, 0.0, 1.0)
-    quality *= np.clip((best.sharpness - CHANCE_SHARP) / CHANCE_SHARP, 0.0, 1.0)
-    quality *= np.clip((BLURRED - reach) / (BLURRED - CLEAR), 0.0, 1.0)
-    if is_open := _is_open(best, hypotheses):
-        quality *= OPEN_DOUBT
-    if is_slab := best.extent < SLAB:
-        quality *= SLAB_DOUBT
-    if is_odd := best.skewed > ODD:
-        quality *= ODD_DOUBT
-    rival = "upside down" if best.axis @ second.axis < -0.9 else "another axis"
+    factor, doubts = _doubts(best, hypotheses, neighborhood_radius)
+    alternative = "upside down" if best.axis @ second.axis < -0.9 else "another axis"
     reason = (
-        f"{best.explained:.0%} of the points are flat across or along it,"
-        f" {best.sharpness:.0%} of these sharply;"
-        f" clutter below to above {np.exp(best.clutter):.1f} : 1, level tops {np.exp(best.tops):.1f} : 1;"
-        f" next is {rival}, {odds[rank[1]]:.0%}"
+        f"{best.aligned_fraction:.0%} of the points are floor or wall,"
+        f" {best.sharp_fraction:.0%} of these within 2 deg;"
+        f" clutter in lower to upper halves of storeys {np.exp(best.clutter_log_ratio):.1f} : 1,"
+        f" furniture on floors to ceilings {np.exp(best.furniture_log_ratio):.1f} : 1;"
+        f" next best is {alternative}, {odds[rank[1]]:.0%}"
     )
-    reason += f"; points so sparse that 24 neighbours reach {reach:.1f} m" if reach > CLEAR else ""
-    reason += "; ground and the front of a building look alike" if is_open else ""
-    reason += f"; only {best.extent:.1f} m high, maybe a wall" if is_slab else ""
-    reason += "; walls at odd angles, maybe a roof" if is_odd else ""
     is_z = z_up_log_odds > 0.0 and best.axis[2] > np.cos(SNAP_ANGLE)
-    return Up(np.array([0.0, 0.0, 1.0]) if is_z else best.axis, float(odds[rank[0]] * quality), reason)
+    direction = np.array([0.0, 0.0, 1.0]) if is_z else best.axis
+    return Up(direction, float(odds[rank[0]] * factor), "; ".join([reason, *doubts]))
 
 
-def _is_open(best: Evidence, hypotheses: list[Evidence]) -> bool:
+def _doubts(
+    best: UpFeatures, hypotheses: list[UpFeatures], neighborhood_radius: float
+) -> tuple[float, list[str]]:
+    """A factor [0, 1] on the confidence in the best hypothesis, and the reasons to doubt it."""
+    factor = np.clip(best.aligned_fraction / RANDOM_ALIGNED - 1.0, 0.0, 1.0)
+    factor *= np.clip((BLURRED_RADIUS - neighborhood_radius) / (BLURRED_RADIUS - CLEAR_RADIUS), 0.0, 1.0)
+    doubts = []
+    if neighborhood_radius > CLEAR_RADIUS:
+        doubts.append(f"points so sparse that 24 neighbours reach {neighborhood_radius:.1f} m")
+    if _may_be_front(best, hypotheses):
+        factor *= DOUBT_FACTOR
+        doubts.append("ground and the front of a building look alike")
+    if best.extent < SLAB_EXTENT:
+        factor *= DOUBT_FACTOR
+        doubts.append(f"only {best.extent:.1f} m high, maybe a wall")
+    if best.non_manhattan_fraction > ROOF_THRESHOLD:
+        factor *= DOUBT_FACTOR
+        doubts.append("walls at odd angles, maybe a roof")
+    return float(factor), doubts
+
+
+def _may_be_front(best: UpFeatures, hypotheses: list[UpFeatures]) -> bool:
     """True if a plane across the best one has open space before it, and so may be the ground."""
-    least, rival = (OPEN, OPEN_RIVAL) if best.carried > OPEN else (WIDE_OPEN, WIDE_RIVAL)
     return any(
-        other.carried > least and other.sheets > rival * best.sheets
+        other.above_below_balance > OPEN_BALANCE
+        and other.level_energy > OPEN_ENERGY_RATIO * best.level_energy
         for other in hypotheses
         if abs(other.axis @ best.axis) < 0.3
     )

@@ -1,143 +1,159 @@
-"""What speaks for an axis of a cloud pointing up, as log-odds."""
+"""Features of a cloud along a direction, and the log-odds with which they say that it points up."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from ..geometry.pose import Array
-from .normals import Surfaces, cosines_to
+from .normals import PointNormals, dot
 
-FACING_ANGLE = np.radians(8.0)  # of a normal to the axis, or of a wall to it
+# Lengths and angles of buildings, by hand. On 138 clouds (twelve made-up places of each kind, two turns each
+# of the scenes house, hospital and hall) one of them halved or doubled changes at most 7 answers, but for
+# FURNITURE up to 2.4 m (11) and a MIDDLE without margins (10 of 69).
+ALIGNED_ANGLE = np.radians(8.0)  # of a normal to the axis (floors), or to the plane across it (walls)
 SHARP_ANGLE = np.radians(2.0)  # the same of what is built, not grown or slumped
+BIN = 0.1  # of the histogram of heights, half a level's thickness [m]
+MAX_BINS = 10_000  # for 1 km; coarser beyond
+MIN_LEVEL = 0.1  # fraction of the largest level: of a floor, furniture may leave little to see
+MIN_INNER = 0.5  # of the weaker of the outermost levels, of one between them: a table is not a floor
+CLOSE = 4  # bins: levels closer than this are one that bends
+MIN_STOREY = 1.5  # height, lower than any room [m]
+MAX_STOREY = 5.0  # height of one whose floor or ceiling was not scanned [m]
+UNSEEN_END_FACTOR = 0.5  # on the balance above and below for such a storey
+FAR = 0.5  # beyond a level, further than it bends [m]
+FURNITURE = (0.3, 1.2)  # height of seats, beds, tables, boxes [m]
+MIDDLE = (0.15, 0.5, 0.85)  # fractions of a storey: skirting below, clutter or air, lamps and beams above
+# fractions of the points added to both counts of a ratio, so that a handful of points says little
+CLUTTER_SOFTENING, FURNITURE_SOFTENING, BALANCE_SOFTENING = 0.003, 0.001, 0.1
 
-BIN = 0.1  # of the histogram of heights, half a sheet's thickness [m]
-MAX_BINS = 10_000
-MAX_SHEETS = 6
-MIN_SHEET = 0.1  # share of the largest sheet: of a floor, furniture may leave little to see
-MIN_INNER = 0.5  # of the weaker of the outermost sheets, of one between them: a table is not a floor
-CLOSE = 4  # bins: sheets closer than this are one that bends
-MIN_STOREY, MAX_STOREY = 1.5, 5.0  # height [m]
-MIN_WALLS = 0.05  # share of the flat surfaces
-MISSING_CARRY = 0.5  # of what such a room carries, the share that counts
-MAX_HALL = 15.0  # of a storey whose floor and ceiling are both there [m]
-FAR = 0.5  # beyond a sheet, further than it bends [m]
-TOPS = (0.3, 1.2)  # height of seats, beds, tables, boxes [m]
-MIDDLE = (0.15, 0.5, 0.85)  # of a storey: skirting below, clutter or air, lamps and beams above
 
-# Log-odds a unit of evidence: rounded from a fit to buildings made from seeds (synthetic/buildings.py), of
-# which each kind weighs the same
-SHEET_WEIGHT = 1.0  # of the logarithm of the share of the cloud in the sheets
-SLANT_WEIGHT = 0.5  # of the logarithm of the share of flat surfaces that are aslant to the axis, against
-LOOSE_WEIGHT = 2.0  # of the logarithm of the share that are more than 2 deg off, against
-SKEW_WEIGHT = 4.0  # of the share of walls at odd angles, against: along a gable roof, all surfaces are walls
-EXTENT_WEIGHT = 1.25  # of the logarithm of the extent, against
-CLUTTER_WEIGHT = 2.5  # of the logarithm of clutter below to clutter above the middle of the storeys
-MAX_CLUTTER = 1.2  # beyond which that logarithm says no more
-TOPS_WEIGHT = 2.5  # of the logarithm of level tops above a floor to those below a ceiling
-MAX_TOPS = 1.5
-SENSE_SHARE = 0.5  # 0: what tells the senses apart speaks for the axis in full; 1: not at all
-CARRY_WEIGHT = 2.5  # of what stands on all sheets less what hangs below all of them, as a share of both
+class Weights(NamedTuple):
+    """Log-odds a unit of each cue, in the order of UpFeatures.cues."""
+
+    level_energy: float
+    off_axis: float
+    misaligned: float
+    non_manhattan: float
+    extent: float
+    balance: float
+    clutter: float
+    furniture: float
+
+
+WEIGHTS = Weights(1.0, 0.5, 2.0, 4.0, 1.25, 2.5, 2.5, 2.5)
+SENSE_SHARING = 0.5  # 0: what tells the senses of an axis apart speaks for the axis in full; 1: not at all
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """What speaks for an axis in general, and for one of its senses."""
+class UpFeatures:
+    """What a cloud looks like along an axis, and along one of its senses."""
 
     axis: Array  # (3,) unit
-    sheets: float  # root of the sum of squares of the sheets' shares of all points
-    slanted: float  # share of the flat surfaces that neither face the axis nor stand along it
-    loose: float  # share of the flat surfaces that do neither within 2 deg
-    skewed: float  # share of the flat surfaces that stand along it at odd angles to the other walls
-    explained: float  # share of all points that face the axis or stand along it
-    sharpness: float  # share of these that do so within 2 deg
+    level_energy: float  # root of the sum of squares of the levels' fractions of all points
+    off_axis_fraction: float  # of the flat points: neither floor nor wall
+    misaligned_fraction: float  # of the flat points: neither floor nor wall within 2 deg
+    non_manhattan_fraction: float  # of the flat points: walls at odd angles to the other walls
+    aligned_fraction: float  # of all points: floor or wall
+    sharp_fraction: float  # of the aligned points: floor or wall within 2 deg
     extent: float  # of the cloud along the axis [m]
-    clutter: float  # logarithm of clutter below to clutter above the middle of the storeys
-    tops: float  # logarithm of level tops as high as furniture above a sheet to those as far below one
-    carried: float  # [-1, 1] what lies above the last sheet less what lies below the first, to both
+    clutter_log_ratio: float  # of clutter below to clutter above the middle of the storeys
+    furniture_log_ratio: float  # of level tops as high as furniture above a level to those as far below one
+    above_below_balance: float  # [-1, 1] points above the last level less those below the first, to both
 
     @property
-    def log_odds(self) -> float:
-        """Of the axis pointing up, before any convention.
-
-        Clutter and tops tell one sense of an axis from the other. What they say is shared out between the two
-        by SENSE_SHARE, so that shelves along a wall do not make it a floor.
-        """
-        sense = CLUTTER_WEIGHT * np.clip(self.clutter, -MAX_CLUTTER, MAX_CLUTTER)
-        sense += TOPS_WEIGHT * np.clip(self.tops, -MAX_TOPS, MAX_TOPS)
-        return float(
-            SHEET_WEIGHT * np.log(self.sheets + 0.03)
-            - SLANT_WEIGHT * np.log(self.slanted + 0.05)
-            - LOOSE_WEIGHT * np.log(self.loose + 0.02)
-            - SKEW_WEIGHT * self.skewed
-            - EXTENT_WEIGHT * np.log(self.extent + 0.1)
-            + sense
-            - SENSE_SHARE * np.log(2.0 * np.cosh(sense))
-            + CARRY_WEIGHT * self.carried
+    def cues(self) -> Array:
+        """Numbers (8,) of which the log-odds are a sum, in the order of Weights."""
+        return np.array(
+            [
+                np.log(self.level_energy + 0.03),
+                -np.log(self.off_axis_fraction + 0.05),
+                -np.log(self.misaligned_fraction + 0.02),
+                -self.non_manhattan_fraction,
+                -np.log(self.extent + 0.1),
+                self.above_below_balance,
+                np.clip(self.clutter_log_ratio, -1.2, 1.2),
+                np.clip(self.furniture_log_ratio, -1.5, 1.5),
+            ]
         )
 
 
-def evidence_for(surfaces: Surfaces, axis: Array) -> Evidence:
-    """What speaks for `axis` pointing up."""
-    cosines, is_flat = np.abs(cosines_to(surfaces.normals, axis)), surfaces.is_flat
-    faces = is_flat & (cosines > np.cos(FACING_ANGLE))
-    stands = is_flat & (cosines < np.sin(FACING_ANGLE))
-    sharp = is_flat & ((cosines > np.cos(SHARP_ANGLE)) | (cosines < np.sin(SHARP_ANGLE)))
-    heights = cosines_to(surfaces.points, axis)
+def log_odds(cues: Array, weights: Array, sense_sharing: float) -> Array:
+    """Log-odds (...) of directions with the cues (..., 8) pointing up, before any convention.
+
+    Clutter and furniture tell one sense of an axis from the other. What they say is shared out between the
+    two by `sense_sharing`, so that shelves along a wall do not make it a floor.
+    """
+    terms = cues * weights
+    sense = terms[..., 6:].sum(axis=-1)
+    return np.asarray(terms.sum(axis=-1) - sense_sharing * np.log(2.0 * np.cosh(sense)))
+
+
+def up_features(cloud: PointNormals, axis: Array) -> UpFeatures:
+    """Features of a cloud along a unit vector `axis` (3,)."""
+    cosines, is_flat = np.abs(dot(cloud.normals, axis)), cloud.is_flat
+    is_level = is_flat & (cosines > np.cos(ALIGNED_ANGLE))
+    is_wall = is_flat & (cosines < np.sin(ALIGNED_ANGLE))
+    is_sharp = is_flat & ((cosines > np.cos(SHARP_ANGLE)) | (cosines < np.sin(SHARP_ANGLE)))
+    heights = dot(cloud.points, axis)
     num_points, num_flat = len(heights), int(np.count_nonzero(is_flat))
-    num_explained, num_sharp = int(np.count_nonzero(faces | stands)), int(np.count_nonzero(sharp))
+    num_aligned, num_sharp = int(np.count_nonzero(is_level | is_wall)), int(np.count_nonzero(is_sharp))
     low, high = map(float, np.quantile(heights, [0.01, 0.99]))
-    levels, shares = _sheets(heights[faces], num_points)
-    # without walls there are no rooms: roofs and ground from above
-    has_walls = np.count_nonzero(stands) > MIN_WALLS * num_flat
-    storeys = _with_missing(levels, low, high) if has_walls else np.empty(0)
-    above = int(np.count_nonzero(heights > levels.max() + FAR)) if len(levels) else 0
-    below = int(np.count_nonzero(heights < levels.min() - FAR)) if len(levels) else 0
-    carried = (above - below) / (above + below + 0.1 * num_points)
-    if len(storeys) > len(
-        levels
-    ):  # a room of which floor or ceiling was not scanned: which one, its things say
-        carried *= MISSING_CARRY
-    return Evidence(
+    levels, fractions = _find_levels(heights[is_level], num_points)
+    storeys = _with_unseen_ends(levels, low, high)
+    balance = _above_below_balance(heights, levels)
+    if len(storeys) > len(levels):  # what was not scanned, floor or ceiling, clutter tells better
+        balance *= UNSEEN_END_FACTOR
+    return UpFeatures(
         axis=axis,
-        sheets=float(np.sqrt(np.sum(shares**2))),
-        slanted=1.0 - num_explained / num_flat,
-        loose=1.0 - num_sharp / num_flat,
-        skewed=_num_skewed(surfaces.normals[stands], axis) / num_flat,
-        explained=num_explained / num_points,
-        sharpness=num_sharp / max(num_explained, 1),
+        level_energy=float(np.sqrt(np.sum(fractions**2))),
+        off_axis_fraction=1.0 - num_aligned / num_flat,
+        misaligned_fraction=1.0 - num_sharp / num_flat,
+        non_manhattan_fraction=_num_non_manhattan(cloud.normals[is_wall], axis) / num_flat,
+        aligned_fraction=num_aligned / num_points,
+        sharp_fraction=num_sharp / max(num_aligned, 1),
         extent=high - low,
-        clutter=_clutter(heights[~stands], storeys, 0.003 * num_points),
-        tops=_tops(heights[faces], storeys, 0.001 * num_points),
-        carried=carried,
+        clutter_log_ratio=_clutter_log_ratio(heights[~is_wall], storeys, num_points),
+        furniture_log_ratio=_furniture_log_ratio(heights[is_level], storeys, num_points),
+        above_below_balance=balance,
     )
 
 
-def _sheets(heights: Array, num_points: int) -> tuple[Array, Array]:
-    """Levels (S,) [m], ascending, of the largest sheets among `heights`, and their shares of all points."""
+def _above_below_balance(heights: Array, levels: Array) -> float:
+    """[-1, 1] How many more heights lie above the last level than below the first, as a fraction of both."""
+    if len(levels) == 0:
+        return 0.0
+    above = int(np.count_nonzero(heights > levels.max() + FAR))
+    below = int(np.count_nonzero(heights < levels.min() - FAR))
+    return (above - below) / (above + below + BALANCE_SOFTENING * len(heights))
+
+
+def _find_levels(heights: Array, num_points: int) -> tuple[Array, Array]:
+    """Levels (L,) [m], ascending, at which most of the `heights` lie, and their fractions of all points."""
     if len(heights) == 0:
         return np.empty(0), np.empty(0)
     low, high = np.quantile(heights, [0.001, 0.999])  # strays, however far, cost neither memory nor fineness
     size = max(BIN, float(high - low) / MAX_BINS)
     places = (heights[(heights >= low) & (heights <= high)] - low) / size
     counts = np.bincount(places.astype(np.int64) + 1, minlength=3)
-    pairs = (counts[:-1] + counts[1:]).astype(np.float64)  # so that no border of a bin splits a sheet
+    pairs = (counts[:-1] + counts[1:]).astype(np.float64)  # so that no border of a bin splits a level
     found: list[tuple[float, float]] = []
-    while len(found) < MAX_SHEETS and pairs.max() > 0:
+    while pairs.max() > 0:
         k = int(pairs.argmax())
-        share = pairs[k] / num_points
-        if found and share < MIN_SHEET * found[0][1]:
+        fraction = pairs[k] / num_points
+        if found and fraction < MIN_LEVEL * found[0][1]:
             break
-        found.append((float(low) + k * size, share))
+        found.append((float(low) + k * size, fraction))
         pairs[max(k - CLOSE, 0) : k + CLOSE + 1] = 0
     if not found:  # a handful of heights, of which the quantiles left none
         return np.empty(0), np.empty(0)
-    found.sort()
-    least = MIN_INNER * min(found[0][1], found[-1][1])
-    found = [sheet for sheet in found if sheet in (found[0], found[-1]) or sheet[1] > least]
-    return np.array([level for level, _ in found]), np.array([share for _, share in found])
+    levels, fractions = np.array(sorted(found)).T
+    is_kept = fractions > MIN_INNER * min(fractions[0], fractions[-1])
+    is_kept[[0, -1]] = True
+    return levels[is_kept], fractions[is_kept]
 
 
-def _clutter(heights: Array, levels: Array, softening: float) -> float:
+def _clutter_log_ratio(heights: Array, levels: Array, num_points: int) -> float:
     """Logarithm of the number of `heights` below the middle of their storey to the number above it."""
     if len(levels) < 2:
         return 0.0
@@ -145,39 +161,42 @@ def _clutter(heights: Array, levels: Array, softening: float) -> float:
     is_between = (upper_level > 0) & (upper_level < len(levels))
     floors, ceilings = levels[upper_level[is_between] - 1], levels[upper_level[is_between]]
     parts = (heights[is_between] - floors) / (ceilings - floors)
-    parts = parts[(ceilings - floors > MIN_STOREY) & (ceilings - floors < MAX_HALL)]
+    parts = parts[ceilings - floors > MIN_STOREY]
     lower = np.count_nonzero((parts > MIDDLE[0]) & (parts < MIDDLE[1]))
     upper = np.count_nonzero((parts > MIDDLE[1]) & (parts < MIDDLE[2]))
+    softening = CLUTTER_SOFTENING * num_points
     return float(np.log((lower + softening) / (upper + softening)))
 
 
-def _tops(heights: Array, levels: Array, softening: float) -> float:
-    """Logarithm of `heights` of level surfaces at a piece of furniture's above a sheet to those below one."""
+def _furniture_log_ratio(heights: Array, levels: Array, num_points: int) -> float:
+    """Logarithm of the number of `heights` at a piece of furniture's above a level to those below one."""
     if len(levels) == 0:
         return 0.0
-    place = np.searchsorted(levels, heights)
-    above = np.where(place > 0, heights - levels[np.maximum(place - 1, 0)], np.inf)
-    below = np.where(place < len(levels), levels[np.minimum(place, len(levels) - 1)] - heights, np.inf)
-    lower = np.count_nonzero((above > TOPS[0]) & (above < TOPS[1]) & (below > TOPS[0]))
-    upper = np.count_nonzero((below > TOPS[0]) & (below < TOPS[1]) & (above > TOPS[0]))
+    low, high = FURNITURE
+    next_level = np.searchsorted(levels, heights)
+    above = heights - np.append(-np.inf, levels)[next_level]
+    below = np.append(levels, np.inf)[next_level] - heights
+    lower = np.count_nonzero((above > low) & (above < high) & (below > low))
+    upper = np.count_nonzero((below > low) & (below < high) & (above > low))
+    softening = FURNITURE_SOFTENING * num_points
     return float(np.log((lower + softening) / (upper + softening)))
 
 
-def _with_missing(levels: Array, low: float, high: float) -> Array:
+def _with_unseen_ends(levels: Array, low: float, high: float) -> Array:
     """The levels; where a storey's floor or ceiling was not scanned, the end of the cloud in its place."""
     if len(levels) == 0:
         return levels
-    ends = [low] if MIN_STOREY < levels[0] - low < MAX_STOREY else []
-    tops = [high] if MIN_STOREY < high - levels[-1] < MAX_STOREY else []
-    return np.array([*ends, *levels, *tops])
+    floor = [low] if MIN_STOREY < levels[0] - low < MAX_STOREY else []
+    ceiling = [high] if MIN_STOREY < high - levels[-1] < MAX_STOREY else []
+    return np.array([*floor, *levels, *ceiling])
 
 
-def _num_skewed(normals: Array, axis: Array) -> int:
+def _num_non_manhattan(normals: Array, axis: Array) -> int:
     """How many normals (N, 3) of walls are at odd angles to the main directions, two and perpendicular."""
     if len(normals) == 0:
         return 0
     a, b = np.linalg.svd(axis[None])[2][1:]
-    yaw = np.degrees(np.arctan2(cosines_to(normals, b), cosines_to(normals, a))) % 90.0
+    yaw = np.degrees(np.arctan2(dot(normals, b), dot(normals, a))) % 90.0
     counts = np.bincount((yaw / 2.0).astype(np.int64) % 45, minlength=45)
     wide = np.sum([np.roll(counts, k) for k in range(-4, 5)], axis=0)  # 18 deg
     return len(normals) - int(wide.max())

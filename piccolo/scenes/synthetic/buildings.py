@@ -7,32 +7,30 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ...geometry.pose import Array
 from ...runtime.threads import Workers
 from .repeated import make_repeated
 from .scan import RANGE_NOISE, scan_room
-from .world import make_world, scan_world
+from .world import make_world, random_size, scan_world
 
 DENSITY = 250.0  # points a m2
 ROOM_POINTS = 80_000
-CLUTTER_SHARE = 0.4
+CLUTTER_FRACTION = 0.4
 WALL_DISTANCE = np.array([0.5, 0.5, 0.0])  # of furniture [m]
-MARGIN = 0.05  # [m] of a floor or ceiling that is taken away
-Points = tuple[NDArray[np.float64], NDArray[np.uint8]]
+MARGIN = 0.05  # of a floor or ceiling that is taken away [m]
 
 
 @dataclass
-class Sampler:
+class SurfaceSampler:
     """Points on surfaces as they are added."""
 
     rng: np.random.Generator
-    points: list[Array] = field(default_factory=list)
-    colors: list[NDArray[np.uint8]] = field(default_factory=list)
+    parts: list[Array] = field(default_factory=list)
 
-    def patch(self, corner: ArrayLike, a: ArrayLike, b: ArrayLike) -> None:
-        """A parallelogram from `corner` along the edges `a` and `b` (3,) [m], in one colour."""
+    def parallelogram(self, corner: ArrayLike, a: ArrayLike, b: ArrayLike) -> None:
+        """Points from `corner` along the edges `a` and `b` (3,) [m]."""
         edge_a, edge_b = np.asarray(a, float), np.asarray(b, float)
         area = float(np.linalg.norm(np.cross(edge_a, edge_b)))
         s = self.rng.uniform(0.0, 1.0, (int(DENSITY * area) + 1, 2))
@@ -40,9 +38,7 @@ class Sampler:
 
     def add(self, points: Array) -> None:
         """Points (N, 3) [m], blurred by the scanner's noise."""
-        self.points.append(points + self.rng.normal(0.0, RANGE_NOISE, points.shape))
-        color = self.rng.integers(40, 220, 3) + self.rng.integers(-20, 20, (len(points), 3))
-        self.colors.append(color.astype(np.uint8))
+        self.parts.append(points + self.rng.normal(0.0, RANGE_NOISE, points.shape))
 
     def box(self, center: ArrayLike, size: ArrayLike, yaw: float = 0.0) -> None:
         """The sides and the top of a box of `size` (3,) whose bottom's centre is at `center` (3,) [m]."""
@@ -54,7 +50,15 @@ class Sampler:
             (corner, along, up), (corner + across, along, up),
             (corner, across, up), (corner + along, across, up), (corner + up, along, across),
         ):  # fmt: skip
-            self.patch(origin, a, b)
+            self.parallelogram(origin, a, b)
+
+    def shell(self, x: float, y: float, z: float) -> None:
+        """The inside of a box from the origin to (x, y, z): floor, ceiling and walls."""
+        for height in (0.0, z):
+            self.parallelogram([0, 0, height], [x, 0, 0], [0, y, 0])
+        for corner, a in (([0, 0, 0], [x, 0, 0]), ([0, y, 0], [x, 0, 0]), ([0, 0, 0], [0, y, 0]),
+                          ([x, 0, 0], [0, y, 0])):  # fmt: skip
+            self.parallelogram(corner, a, [0, 0, z])
 
     def furnish(self, low: Array, high: Array, num_pieces: int) -> None:
         """Boxes on the floor between two corners (3,)."""
@@ -63,68 +67,64 @@ class Sampler:
             size = self.rng.uniform([0.3, 0.3, 0.3], [1.6, 0.8, 1.2])
             self.box([at[0], at[1], low[2]], size, float(self.rng.normal(0.0, 0.3)))
 
-    def cloud(self) -> Points:
-        """All points and colours."""
-        return np.concatenate(self.points), np.concatenate(self.colors)
+    def points(self) -> Array:
+        """All points (N, 3)."""
+        return np.concatenate(self.parts)
 
 
-def _room(seed: int) -> Points:
+def _room(seed: int) -> Array:
     rng = np.random.default_rng([seed, 60])
     num_rooms = int(rng.integers(1, 3))
-    world = make_world(seed, rng.uniform([3.5, 3.0, 2.3], [9.0, 7.0, 3.4]), num_rooms)
-    points, colors = scan_world(world, ROOM_POINTS * num_rooms, Workers())
-    return points.astype(np.float64), colors
+    world = make_world(seed, random_size(rng), num_rooms)
+    return scan_world(world, ROOM_POINTS * num_rooms, Workers())[0].astype(np.float64)
 
 
-def _cluttered(seed: int) -> Points:
-    """A room of whose points 40 % lie on patches turned anyhow, heaped up on its floor."""
-    points, colors = _room(seed)
-    sampler = Sampler(np.random.default_rng([seed, 61]))
+def _cluttered(seed: int) -> Array:
+    """A room of whose points 40 % are on small pieces at random angles, heaped up on its floor."""
+    points = _room(seed)
+    s = SurfaceSampler(np.random.default_rng([seed, 61]))
     low, high = points.min(axis=0), points.max(axis=0)
-    wanted = len(points) * CLUTTER_SHARE / (1.0 - CLUTTER_SHARE)
-    while sum(map(len, sampler.points)) < wanted:
-        at = sampler.rng.uniform(low, high)
-        at[2] = low[2] + (high[2] - low[2]) * sampler.rng.beta(1.2, 2.0)
-        a, b = sampler.rng.normal(size=(2, 3)) * 0.3
-        sampler.patch(at, a, b)
-    more, more_colors = sampler.cloud()
-    return np.concatenate([points, more.clip(low, high)]), np.concatenate([colors, more_colors])
+    num_clutter = len(points) * CLUTTER_FRACTION / (1.0 - CLUTTER_FRACTION)
+    while sum(map(len, s.parts)) < num_clutter:
+        at = s.rng.uniform(low, high)
+        at[2] = low[2] + (high[2] - low[2]) * s.rng.beta(1.2, 2.0)
+        a, b = s.rng.normal(size=(2, 3)) * 0.3
+        s.parallelogram(at, a, b)
+    return np.concatenate([points, s.points().clip(low, high)])
 
 
-def _without_ceiling(seed: int) -> Points:
-    points, colors = _room(seed)
-    is_kept = points[:, 2] < points[:, 2].max() - MARGIN
-    return points[is_kept], colors[is_kept]
+def _without_ceiling(seed: int) -> Array:
+    points = _room(seed)
+    return np.compress(points[:, 2] < points[:, 2].max() - MARGIN, points, axis=0)
 
 
-def _without_floor(seed: int) -> Points:
-    points, colors = _room(seed)
-    is_kept = points[:, 2] > points[:, 2].min() + MARGIN
-    return points[is_kept], colors[is_kept]
+def _without_floor(seed: int) -> Array:
+    points = _room(seed)
+    return np.compress(points[:, 2] > points[:, 2].min() + MARGIN, points, axis=0)
 
 
-def _attic(seed: int) -> Points:
+def _attic(seed: int) -> Array:
     """Low walls, a slanted roof on both sides, furniture."""
-    s = Sampler(np.random.default_rng([seed, 62]))
+    s = SurfaceSampler(np.random.default_rng([seed, 62]))
     x, y, wall = s.rng.uniform([5.0, 4.0, 0.4], [10.0, 8.0, 1.4])
     ridge = wall + 0.5 * y * np.tan(s.rng.uniform(0.5, 0.9))
-    s.patch([0, 0, 0], [x, 0, 0], [0, y, 0])
-    s.patch([0, 0, 0], [x, 0, 0], [0, 0, wall])
-    s.patch([0, y, 0], [x, 0, 0], [0, 0, wall])
-    s.patch([0, 0, wall], [x, 0, 0], [0, y / 2, ridge - wall])
-    s.patch([0, y, wall], [x, 0, 0], [0, -y / 2, ridge - wall])
+    s.parallelogram([0, 0, 0], [x, 0, 0], [0, y, 0])
+    s.parallelogram([0, 0, 0], [x, 0, 0], [0, 0, wall])
+    s.parallelogram([0, y, 0], [x, 0, 0], [0, 0, wall])
+    s.parallelogram([0, 0, wall], [x, 0, 0], [0, y / 2, ridge - wall])
+    s.parallelogram([0, y, wall], [x, 0, 0], [0, -y / 2, ridge - wall])
     for end in (0.0, x):
         yz = s.rng.uniform([0, 0], [y, ridge], (int(DENSITY * y * ridge), 2))
         roof = wall + (ridge - wall) * (1.0 - np.abs(2.0 * yz[:, 0] / y - 1.0))
         yz = yz[yz[:, 1] < roof]
         s.add(np.column_stack([np.full(len(yz), end), yz]))
     s.furnish(np.zeros(3), np.array([x, y, 0.0]), int(x * y / 5))
-    return s.cloud()
+    return s.points()
 
 
-def _stairwell(seed: int) -> Points:
+def _stairwell(seed: int) -> Array:
     """Flights with steps, their undersides, landings and walls."""
-    s = Sampler(np.random.default_rng([seed, 63]))
+    s = SurfaceSampler(np.random.default_rng([seed, 63]))
     width, tread, rise = s.rng.uniform([0.9, 0.25, 0.16], [1.3, 0.30, 0.19])
     num_steps, num_flights = int(s.rng.integers(8, 12)), int(s.rng.integers(2, 5))
     length, height = num_steps * tread, num_steps * rise
@@ -134,23 +134,19 @@ def _stairwell(seed: int) -> Points:
         begin = width if flight % 2 == 0 else width + length
         for k in range(num_steps):
             foot = np.array([begin + sign * k * tread, at_y, flight * height + k * rise])
-            s.patch(foot, [0, width, 0], [0, 0, rise])
-            s.patch(foot + np.array([0, 0, rise]), [0, width, 0], [sign * tread, 0, 0])
+            s.parallelogram(foot, [0, width, 0], [0, 0, rise])
+            s.parallelogram(foot + np.array([0, 0, rise]), [0, width, 0], [sign * tread, 0, 0])
         if flight:
-            s.patch([begin, at_y, flight * height - 0.2], [0, width, 0], [sign * length, 0, height])
+            s.parallelogram([begin, at_y, flight * height - 0.2], [0, width, 0], [sign * length, 0, height])
         landing = 0.0 if flight % 2 else x - width
-        s.patch([landing, 0, (flight + 1) * height], [width, 0, 0], [0, y, 0])
-    s.patch([0, 0, 0], [x, 0, 0], [0, y, 0])
-    s.patch([0, 0, z + 2.3], [x, 0, 0], [0, y, 0])
-    for corner, a in (([0, 0, 0], [x, 0, 0]), ([0, y, 0], [x, 0, 0]), ([0, 0, 0], [0, y, 0]),
-                      ([x, 0, 0], [0, y, 0])):  # fmt: skip
-        s.patch(corner, a, [0, 0, z + 2.3])
-    return s.cloud()
+        s.parallelogram([landing, 0, (flight + 1) * height], [width, 0, 0], [0, y, 0])
+    s.shell(x, y, z + 2.3)
+    return s.points()
 
 
-def _outdoors(seed: int) -> Points:
+def _outdoors(seed: int) -> Array:
     """Sloping, uneven ground with trees, cars and perhaps a house front."""
-    s = Sampler(np.random.default_rng([seed, 64]))
+    s = SurfaceSampler(np.random.default_rng([seed, 64]))
     size = s.rng.uniform(20.0, 40.0)
     xy = s.rng.uniform(0.0, size, (int(40 * size * size), 2))
     slope = s.rng.normal(0.0, 0.015, 2)
@@ -170,13 +166,13 @@ def _outdoors(seed: int) -> Points:
     for at in s.rng.uniform(3.0, size - 3.0, (int(s.rng.integers(0, 6)), 2)):
         s.box([*at, float(ground(at[None])[0])], [4.2, 1.8, 1.4], float(s.rng.uniform(0, np.pi)))
     if s.rng.random() < 0.7:
-        s.patch([0, size, -0.5], [size, 0, 0], [0, 0, s.rng.uniform(4.0, 10.0)])
-    return s.cloud()
+        s.parallelogram([0, size, -0.5], [size, 0, 0], [0, 0, s.rng.uniform(4.0, 10.0)])
+    return s.points()
 
 
-def _aerial(seed: int) -> Points:
+def _aerial(seed: int) -> Array:
     """Houses and trees as a drone sees them: roofs, ground, no walls."""
-    s = Sampler(np.random.default_rng([seed, 68]))
+    s = SurfaceSampler(np.random.default_rng([seed, 68]))
     size = s.rng.uniform(40.0, 90.0)
     xy = s.rng.uniform(0.0, size, (int(8 * size * size), 2))
     slope = s.rng.normal(0.0, 0.01, 2)
@@ -194,43 +190,37 @@ def _aerial(seed: int) -> Points:
         crown = 2.0 * radius + np.sqrt(radius**2 - distance[is_crown] ** 2)
         level[is_crown] = at @ slope + crown + s.rng.normal(0.0, 0.3, len(crown))
     s.add(np.column_stack([xy, level]))
-    return s.cloud()
+    return s.points()
 
 
-def _front(seed: int) -> Points:
+def _front(seed: int) -> Array:
     """A house front and a strip of ground before it."""
-    s = Sampler(np.random.default_rng([seed, 65]))
+    s = SurfaceSampler(np.random.default_rng([seed, 65]))
     length, height, depth = s.rng.uniform([10.0, 5.0, 1.5], [20.0, 12.0, 6.0])
-    s.patch([0, 0, 0], [length, 0, 0], [0, 0, height])
-    s.patch([0, 0, 0], [length, 0, 0], [0, -depth, 0])
+    s.parallelogram([0, 0, 0], [length, 0, 0], [0, 0, height])
+    s.parallelogram([0, 0, 0], [length, 0, 0], [0, -depth, 0])
     for x in np.arange(1.5, length - 1.5, 2.5):
         for z in np.arange(1.0, height - 1.5, 3.0):
-            s.patch([x, 0.15, z], [1.0, 0, 0], [0, 0, 1.3])
-            s.patch([x, 0, z], [1.0, 0, 0], [0, 0.15, 0])
+            s.parallelogram([x, 0.15, z], [1.0, 0, 0], [0, 0, 1.3])
+            s.parallelogram([x, 0, z], [1.0, 0, 0], [0, 0.15, 0])
     s.furnish(np.array([0, -depth - 0.6, 0.0]), np.array([length, 0.6, 0.0]), int(s.rng.integers(0, 4)))
-    return s.cloud()
+    return s.points()
 
 
-def _bare(seed: int) -> Points:
+def _bare(seed: int) -> Array:
     """A closed box with nothing in it: no honest answer is sure."""
-    s = Sampler(np.random.default_rng([seed, 66]))
-    s_x, s_y, s_z = s.rng.uniform([3.0, 3.0, 2.2], [8.0, 7.0, 4.0])
-    s.patch([0, 0, s_z], [s_x, 0, 0], [0, s_y, 0])
-    s.patch([0, 0, 0], [s_x, 0, 0], [0, s_y, 0])
-    for corner, a in (([0, 0, 0], [s_x, 0, 0]), ([0, s_y, 0], [s_x, 0, 0]), ([0, 0, 0], [0, s_y, 0]),
-                      ([s_x, 0, 0], [0, s_y, 0])):  # fmt: skip
-        s.patch(corner, a, [0, 0, s_z])
-    return s.cloud()
+    s = SurfaceSampler(np.random.default_rng([seed, 66]))
+    s.shell(*s.rng.uniform([3.0, 3.0, 2.2], [8.0, 7.0, 4.0]))
+    return s.points()
 
 
-def _corridor(seed: int) -> Points:
+def _corridor(seed: int) -> Array:
     rng = np.random.default_rng([seed, 67])
-    (corridor,) = make_repeated("corridor", seed, rng.uniform([3.5, 3.0, 2.3], [9.0, 7.0, 3.4]))
-    points, colors, _ = scan_room(corridor, 2 * ROOM_POINTS, rng, Workers())
-    return points.astype(np.float64), colors
+    (corridor,) = make_repeated("corridor", seed, random_size(rng))
+    return scan_room(corridor, 2 * ROOM_POINTS, rng, Workers())[0].astype(np.float64)
 
 
-BUILDINGS: dict[str, Callable[[int], Points]] = {
+BUILDINGS: dict[str, Callable[[int], Array]] = {
     "room": _room,
     "clutter": _cluttered,
     "no ceiling": _without_ceiling,
@@ -245,6 +235,6 @@ BUILDINGS: dict[str, Callable[[int], Points]] = {
 }
 
 
-def make_building(kind: str, seed: int) -> Points:
-    """Points (N, 3) [m] and colours (N, 3) of one of BUILDINGS."""
+def make_building(kind: str, seed: int) -> Array:
+    """Points (N, 3) [m] of one of BUILDINGS."""
     return BUILDINGS[kind](seed)

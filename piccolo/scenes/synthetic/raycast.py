@@ -9,10 +9,10 @@ from ...geometry.pose import Array
 from ...runtime.jit import kernel
 from ...runtime.threads import Workers
 from .room import Room
-from .texture import pattern_share
+from .texture import second_color_fraction
 
-AMBIENT = 0.55
-CHUNK = 4_096
+AMBIENT, LAMP, LAMP_DECAY = 0.55, 0.9, 0.15  # of a surface's colour; the decay [1/m2]
+CHUNK = 4_096  # rays
 
 
 @kernel
@@ -58,26 +58,22 @@ def shade(origin, directions, ranges, hits, boxes, materials, light, rgb):
         px, py = c * ox + s * oy, c * oy - s * ox
         along, up = (py, oz) if axis == 0 else (px, oz) if axis == 1 else (px, py)
         m = materials[b]
-        share = pattern_share(np.int64(m[0]), along, up, m[1], np.int64(m[8]) + axis)
+        fraction = second_color_fraction(np.int64(m[0]), along, up, m[1], np.int64(m[8]) + axis)
         lx, ly, lz = light[0] - x, light[1] - y, light[2] - z
         distance2 = lx * lx + ly * ly + lz * lz
         towards = abs((c * lx + s * ly) if axis == 0 else (c * ly - s * lx) if axis == 1 else lz)
-        lit = AMBIENT + 0.9 * towards / math.sqrt(distance2) / (1.0 + 0.15 * distance2)
+        lit = AMBIENT + LAMP * towards / math.sqrt(distance2) / (1.0 + LAMP_DECAY * distance2)
         for k in range(3):
-            rgb[n, k] = min(1.0, lit * (m[2 + k] * (1.0 - share) + m[5 + k] * share))
+            rgb[n, k] = min(1.0, lit * (m[2 + k] * (1.0 - fraction) + m[5 + k] * fraction))
 
 
-def cast(
-    room: Room, origin: Array, directions: NDArray[np.float64], workers: Workers, label: str
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Ranges (N,) [m] and colours (N, 3) in [0, 1] along unit world `directions` (N, 3) from `origin`."""
-    return cast_labelled(room, origin, directions, workers, label)[:2]
-
-
-def cast_labelled(
+def cast_rays(
     room: Room, origin: Array, directions: NDArray[np.float64], workers: Workers, label: str
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Ranges (N,), colours (N, 3) and labels (N,) along `directions`; label 0 where nothing is hit."""
+    """Ranges (N,) [m], colours (N, 3) in [0, 1] and labels (N,) along unit world `directions` (N, 3).
+
+    Where nothing is hit the range is inf, the colour black and the label 0.
+    """
     ranges, rgb = np.empty(len(directions)), np.empty((len(directions), 3))
     labels = np.empty(len(directions), dtype=np.int64)
 

@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 
 from ...geometry.pose import Array
-from .room import PICTURE, PLAIN, PLANKS, TILES, WALL_THICKNESS, Builder, Room, make_room
+from .room import PICTURE, PLAIN, PLANKS, TILES, WALL_THICKNESS, Room, RoomBuilder, make_room
 
-KINDS = ("twins", "hall", "corridor")
+REPEATED_KINDS = ("twins", "hall", "corridor")
 GAP = 0.4  # between twins [m]
 NUM_DOORS, DOOR_DISTANCE, CORRIDOR_WIDTH = 6, 3.0, 2.2  # [m]
 
 
 def make_repeated(kind: str, seed: int, size: Array) -> tuple[Room, ...]:
-    """Rooms of one of KINDS; a corridor has a length and a width of its own."""
+    """Rooms of one of REPEATED_KINDS; a corridor has a length and a width of its own."""
     if kind == "twins":
         return twin_rooms(seed, size)
     return (symmetric_hall(seed, size) if kind == "hall" else corridor(seed, float(size[2])),)
@@ -45,7 +45,7 @@ def symmetric_hall(seed: int, size: Array) -> Room:
 
 def corridor(seed: int, height: float) -> Room:
     """A corridor whose doors and pictures repeat; both ends are alike."""
-    b = Builder(np.random.default_rng([seed, 3]), np.zeros(3))
+    b = RoomBuilder(np.random.default_rng([seed, 3]), np.zeros(3))
     length, width, d = DOOR_DISTANCE, CORRIDOR_WIDTH, WALL_THICKNESS
     floor, ceiling = b.paint((PLANKS, TILES), 0.3, 0.7), b.paint((PLAIN,), 0.75, 0.95)
     walls = [b.paint((PLAIN,), 0.5, 0.9) for _ in range(2)]

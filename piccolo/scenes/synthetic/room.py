@@ -9,19 +9,16 @@ from ...geometry.pose import Array
 
 PLAIN, PLANKS, TILES, STRIPES, CHECKS, PICTURE = range(6)
 WALL_THICKNESS = 0.1  # [m]
-KINDS = (  # of surfaces; a label is the place in this list, and 0 is nothing
+LABEL_NAMES = (  # kinds of surfaces; a label is the place in this list, and 0 is nothing
     *("nothing", "floor", "ceiling", "wall", "picture", "window", "door"),
     *("rug", "table", "shelf", "sofa", "crate"),
 )
+Pair = tuple[float, float]
 SATURATION = 0.5  # paints are paler than colours drawn at random
-
-# row of Room.boxes: center (3) [m], half size (3) [m], yaw [rad]
-# row of Room.materials: pattern, scale [m], color_a (3), color_b (3) in [0, 1], seed
-BOX_FIELDS, MATERIAL_FIELDS = 7, 9
 
 
 @dataclass
-class Builder:
+class RoomBuilder:
     """Boxes as they are put into a room whose floor's corner is at `corner` (3,)."""
 
     rng: np.random.Generator
@@ -29,7 +26,7 @@ class Builder:
     boxes: list[Array] = field(default_factory=list)
     materials: list[Array] = field(default_factory=list)
     labels: list[int] = field(default_factory=list)
-    kind: str = "nothing"  # of what is put next, one of KINDS
+    kind: str = "nothing"  # of what is put next, one of LABEL_NAMES
 
     def material(self, pattern: int, scale: float, colors: tuple[Array, Array]) -> Array:
         """A material row."""
@@ -43,12 +40,18 @@ class Builder:
         pattern, scale = int(self.rng.choice(patterns)), float(self.rng.uniform(0.12, 0.5))
         return self.material(pattern, scale, (base, other))
 
-    def put(self, center: ArrayLike, size: ArrayLike, material: Array, yaw: float = 0.0) -> None:
-        """Add a box of `size` (3,) [m] at `center` (3,), relative to the corner [m]."""
-        middle, half = np.asarray(center) + self.corner, np.asarray(size) / 2
-        self.boxes.append(np.array([*middle, *half, yaw]))
+    def put(
+        self, center: ArrayLike, size: ArrayLike, material: Array, yaw: float = 0.0, offset: Pair = (0.0, 0.0)
+    ) -> None:
+        """Add a box of `size` (3,) [m] turned by `yaw` at `center` (3,), relative to the corner [m].
+
+        The `offset` of the centre is along the box's own x and y [m].
+        """
+        along, across = np.array([np.cos(yaw), np.sin(yaw), 0.0]), np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+        middle = np.asarray(center) + offset[0] * along + offset[1] * across + self.corner
+        self.boxes.append(np.array([*middle, *(np.asarray(size) / 2), yaw]))
         self.materials.append(material)
-        self.labels.append(KINDS.index(self.kind))
+        self.labels.append(LABEL_NAMES.index(self.kind))
 
 
 @dataclass(frozen=True)
@@ -57,10 +60,10 @@ class Room:
 
     corner: Array  # (3,) least corner of the free space [m]
     size: Array  # (3,) [m]
-    boxes: NDArray[np.float64]  # (B, 7), see BOX_FIELDS
-    materials: NDArray[np.float64]  # (B, 9), see MATERIAL_FIELDS
+    boxes: NDArray[np.float64]  # (B, 7) center (3) [m], half size (3) [m], yaw [rad]
+    materials: NDArray[np.float64]  # (B, 9) pattern, scale [m], two colours (3) in [0, 1], seed
     light: Array  # (3,) position of the lamp [m]
-    labels: NDArray[np.int64]  # (B,) see KINDS
+    labels: NDArray[np.int64]  # (B,) see LABEL_NAMES
 
     def clearance(self, position: Array) -> float:
         """Distance [m] from `position` (3,) to the nearest surface; negative inside a box, unseen by rays."""
@@ -72,7 +75,7 @@ class Room:
         return float((outside + inside).min())
 
 
-def _shell(b: Builder, size: Array) -> None:
+def _shell(b: RoomBuilder, size: Array) -> None:
     """Floor, ceiling and four walls."""
     x, y, z = size
     d = WALL_THICKNESS
@@ -89,7 +92,7 @@ def _shell(b: Builder, size: Array) -> None:
             b.put(center, extent, b.paint((PLAIN, PLAIN, STRIPES, TILES), 0.5, 0.9))
 
 
-def _wall_hangings(b: Builder, size: Array) -> None:
+def _wall_hangings(b: RoomBuilder, size: Array) -> None:
     """Pictures, a door and windows: thin boxes on the walls."""
     for axis in (0, 1):
         along = 1 - axis
@@ -110,43 +113,40 @@ def _wall_hangings(b: Builder, size: Array) -> None:
                 b.put(center, extent, b.paint(patterns, low, high))
 
 
-def _table(b: Builder, at: Array, yaw: float) -> None:
+def _table(b: RoomBuilder, at: Array, yaw: float) -> None:
     length, width, height = b.rng.uniform([0.9, 0.6, 0.5], [1.6, 0.9, 0.8])
     wood = b.paint((PLANKS, PLAIN), 0.2, 0.7)
     b.put([*at, height], [length, width, 0.04], wood, yaw)
-    c, s = np.cos(yaw), np.sin(yaw)
-    for dx, dy in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
-        x, y = dx * (length / 2 - 0.05), dy * (width / 2 - 0.05)
-        b.put([at[0] + c * x - s * y, at[1] + s * x + c * y, height / 2], [0.06, 0.06, height], wood, yaw)
+    x, y = length / 2 - 0.05, width / 2 - 0.05
+    for offset in ((-x, -y), (-x, y), (x, -y), (x, y)):
+        b.put([*at, height / 2], [0.06, 0.06, height], wood, yaw, offset)
     b.put([*at, height + 0.12], b.rng.uniform(0.1, 0.25, 3), b.paint((CHECKS, PICTURE), 0.1, 1.0), yaw)
 
 
-def _shelf(b: Builder, at: Array, yaw: float) -> None:
+def _shelf(b: RoomBuilder, at: Array, yaw: float) -> None:
     height = b.rng.uniform(1.2, 2.0)
     frame = b.paint((PLANKS, PLAIN), 0.2, 0.8)
     b.put([*at, height / 2], [0.9, 0.02, height], frame, yaw)
-    c, s = np.cos(yaw), np.sin(yaw)
     for level in np.arange(0.05, height, 0.35):
         b.put([*at, level], [0.9, 0.35, 0.03], frame, yaw)
         x = b.rng.uniform(-0.2, 0.2)
         books = [b.rng.uniform(0.3, 0.5), 0.2, b.rng.uniform(0.15, 0.28)]
-        b.put([at[0] + c * x, at[1] + s * x, level + books[2] / 2], books, b.paint((STRIPES,), 0.1, 0.9), yaw)
+        b.put([*at, level + books[2] / 2], books, b.paint((STRIPES,), 0.1, 0.9), yaw, (x, 0.0))
 
 
-def _sofa(b: Builder, at: Array, yaw: float) -> None:
+def _sofa(b: RoomBuilder, at: Array, yaw: float) -> None:
     length = b.rng.uniform(1.2, 2.0)
     cloth = b.paint((PLAIN, STRIPES, CHECKS), 0.15, 0.8)
-    c, s = np.cos(yaw), np.sin(yaw)
     b.put([*at, 0.22], [length, 0.8, 0.44], cloth, yaw)
-    b.put([at[0] - s * 0.35, at[1] + c * 0.35, 0.5], [length, 0.15, 0.9], cloth, yaw)
+    b.put([*at, 0.5], [length, 0.15, 0.9], cloth, yaw, (0.0, 0.35))
 
 
-def _crate(b: Builder, at: Array, yaw: float) -> None:
+def _crate(b: RoomBuilder, at: Array, yaw: float) -> None:
     size = b.rng.uniform([0.3, 0.3, 0.3], [0.7, 0.7, 1.3])
     b.put([*at, size[2] / 2], size, b.paint((PLANKS, CHECKS, PICTURE, PLAIN), 0.15, 0.9), yaw)
 
 
-def _furniture(b: Builder, size: Array, moves: np.random.Generator | None) -> None:
+def _furniture(b: RoomBuilder, size: Array, moves: np.random.Generator | None) -> None:
     """A rug and about one piece in 3 m2; half of the pieces go elsewhere if there are `moves`."""
     num_pieces = max(3, round(size[0] * size[1] / 3.0))
     seeds = b.rng.integers(0, 1 << 30, num_pieces)
@@ -166,11 +166,11 @@ def _furniture(b: Builder, size: Array, moves: np.random.Generator | None) -> No
 
 def make_room(seed: int, size: Array, corner: Array, changed: int = 0) -> Room:
     """The room of `seed`; the same shell with other furniture and more crates for each `changed` above 0."""
-    fixed = Builder(np.random.default_rng([seed, 0]), np.asarray(corner, dtype=float))
+    fixed = RoomBuilder(np.random.default_rng([seed, 0]), np.asarray(corner, dtype=float))
     size = np.asarray(size, dtype=float)
     _shell(fixed, size)
     _wall_hangings(fixed, size)
-    loose = Builder(np.random.default_rng([seed, 1]), fixed.corner)
+    loose = RoomBuilder(np.random.default_rng([seed, 1]), fixed.corner)
     moves = np.random.default_rng([seed, 2, changed]) if changed else None
     _furniture(loose, size, moves)
     if moves is not None:

@@ -7,7 +7,7 @@ from ...errors import InputError
 from ...geometry.pose import Array, yaw_rotation
 from ...geometry.sphere import pixel_rays
 from ...runtime.threads import Workers
-from .raycast import cast_labelled
+from .raycast import cast_rays
 from .room import Room
 
 RANGE_NOISE = 0.003  # standard deviation [m]
@@ -28,7 +28,7 @@ def free_position(room: Room, rng: np.random.Generator, heights: tuple[float, fl
             return position
     size = room.size.tolist()
     raise InputError(
-        f"size: found no place {MIN_CLEARANCE} m from everything in a room of {size} m, wanted more"
+        f"size: a room of {size} m has no place {MIN_CLEARANCE} m from everything; use a larger one"
     )
 
 
@@ -42,7 +42,7 @@ def scan_room(
     for station in range(num_stations):
         position = free_position(room, rng, (1.2, 1.8))
         rays = pixel_rays(width).reshape(-1, 3) @ yaw_rotation(rng.uniform(0, 2 * np.pi))
-        ranges, rgb, kinds = cast_labelled(room, position, rays, workers, f"scan, station {station + 1}")
+        ranges, rgb, kinds = cast_rays(room, position, rays, workers, f"scan, station {station + 1}")
         ranges = ranges + rng.normal(0.0, RANGE_NOISE, len(ranges))
         points.append((position + ranges[:, None] * rays).astype(np.float32))
         colors.append(np.round(rgb * 255.0).astype(np.uint8))

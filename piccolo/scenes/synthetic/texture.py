@@ -36,8 +36,8 @@ def cloudy(s, t, seed):
 
 
 @inline_kernel
-def pattern_share(pattern, s, t, scale, seed):
-    """Share in [0, 1] of the second colour at (s, t) [m]; patterns as in room.py."""
+def second_color_fraction(pattern, s, t, scale, seed):
+    """Fraction in [0, 1] of the second colour at (s, t) [m]; patterns as in room.py."""
     i, j = np.int64(math.floor(s / scale)), np.int64(math.floor(t / scale))
     x, y = s / scale - math.floor(s / scale), t / scale - math.floor(t / scale)
     noise = cloudy(s, t, seed)

@@ -1,21 +1,21 @@
-"""Seeded trials of a verdict: queries that have an answer, queries that have none, and which is which."""
+"""Seeded trials of a result's status: queries with a true pose, and queries that have none."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from ...geometry.pose import Pose
 from ...geometry.rotations import Gravity
 from ...runtime.threads import Workers
-from .repeated import KINDS, make_repeated
-from .world import VARIANTS, World, make_query, make_world, scan_world
+from .photo import blur
+from .repeated import REPEATED_KINDS, make_repeated
+from .world import VARIANTS, World, make_query, make_world, random_size, scan_world
 
 WIDTH = 1024  # of the panoramas [px]
 POINTS_PER_ROOM = 120_000
-SPARSE_SHARE = 0.05
+SPARSE_FRACTION = 0.05
 WALL_DEPTH = 0.15  # [m]
 BLUR = 0.02  # of the width: blurred beyond recognition
 Image = NDArray[np.uint8]
@@ -32,34 +32,20 @@ class Trial:
     gravity: Gravity = "auto"
 
 
-def random_size(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Size (3,) of a room [m]."""
-    return rng.uniform([3.5, 3.0, 2.3], [9.0, 7.0, 3.4])
-
-
 def without_scene(rgb: Image, rng: np.random.Generator) -> Iterator[tuple[str, Image]]:
     """Images of the same size that show no place."""
     yield "black", np.zeros_like(rgb)
     yield "white", np.full_like(rgb, 255)
     yield "noise", rng.integers(0, 256, rgb.shape, dtype=np.uint8)
-    sigma = BLUR * rgb.shape[1]
-    yield "cloudy", noise_of_clouds(rgb.shape, rng)
-    yield "blurred", np.asarray(blurred(rgb.astype(float), sigma), np.uint8)
+    yield "cloudy", fractal_noise(rgb.shape, rng)
+    yield "blurred", np.asarray(blur(rgb.astype(float), BLUR * rgb.shape[1]), np.uint8)
 
 
-def blurred(image: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
-    """An equirectangular image (H, W, 3) under a Gaussian [px]."""
-    return np.asarray(gaussian_filter(image, (sigma, sigma, 0.0), mode=("nearest", "wrap", "nearest")))
-
-
-def noise_of_clouds(shape: tuple[int, ...], rng: np.random.Generator) -> Image:
-    """Smooth noise of several scales (H, W, 3), with the contrast of a picture."""
+def fractal_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Image:
+    """Smooth noise of several scales (H, W, 3), with the contrast of a photo."""
     total = np.zeros(shape)
-    for share in (0.004, 0.015, 0.06):
-        sigma = share * shape[1]
-        noise = gaussian_filter(
-            rng.normal(size=shape), (sigma, sigma, 0.0), mode=("nearest", "wrap", "nearest")
-        )
+    for scale in (0.004, 0.015, 0.06):
+        noise = blur(rng.normal(size=shape), scale * shape[1])
         total += noise / noise.std()
     return np.asarray((127.0 + 40.0 * total).clip(0, 255), np.uint8)
 
@@ -80,14 +66,15 @@ def room_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[Tria
     size = random_size(rng)
     world = make_world(seed, size, int(rng.integers(1, 4)))
     other = make_world(seed + 100_000, size, 1)  # of the same shape
-    cloud = scan_world(world, POINTS_PER_ROOM * len(world.rooms), workers)
+    cloud = scan_world(world, POINTS_PER_ROOM * len(world.rooms), workers)[:2]
     right = [_trial(world, variant, variant, workers) for variant in VARIANTS]
     trials = [*right, Trial("elsewhere", _trial(other, "", "clean", workers).rgb, None)]
     trials.append(Trial("elsewhere", _trial(other, "", "photo", workers).rgb, None))
-    trials += [Trial(name, rgb, _pose_if(name, right[0])) for name, rgb in without_scene(right[0].rgb, rng)]
+    for name, rgb in without_scene(right[0].rgb, rng):  # a blurred panorama keeps its true pose
+        trials.append(Trial(name, rgb, right[0].true_pose if name == "blurred" else None))
     trials.append(upside_down(right[0]))
     yield cloud, trials
-    sparse = np.sort(rng.choice(len(cloud[0]), int(SPARSE_SHARE * len(cloud[0])), replace=False))
+    sparse = np.sort(rng.choice(len(cloud[0]), int(SPARSE_FRACTION * len(cloud[0])), replace=False))
     yield (
         (cloud[0][sparse], cloud[1][sparse]),
         [Trial("sparse", right[0].rgb, right[0].true_pose), Trial("sparse, elsewhere", trials[4].rgb, None)],
@@ -99,17 +86,12 @@ def room_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[Tria
 def repeated_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[Trial]]]:
     """A place that looks the same from several positions, of each kind."""
     rng = np.random.default_rng([seed, 51])
-    for kind in KINDS:
+    for kind in REPEATED_KINDS:
         world = World(seed, make_repeated(kind, seed, random_size(rng)))
-        cloud = scan_world(world, POINTS_PER_ROOM * len(world.rooms), workers)
+        cloud = scan_world(world, POINTS_PER_ROOM * len(world.rooms), workers)[:2]
         yield cloud, [_trial(world, kind, "clean", workers, index) for index in range(2)]
 
 
 def _trial(world: World, case: str, variant: str, workers: Workers, index: int = 0) -> Trial:
     query = make_query(world, index, variant, WIDTH, workers)
     return Trial(case, query.rgb, query.pose)
-
-
-def _pose_if(name: str, trial: Trial) -> Pose | None:
-    """A blurred picture still was taken where it was taken."""
-    return trial.true_pose if name == "blurred" else None

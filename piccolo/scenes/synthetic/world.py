@@ -41,9 +41,9 @@ def make_world(seed: int, size: Array, num_rooms: int = 1) -> World:
     """`num_rooms` rooms of `size` (3,) [m], all different."""
     size = np.asarray(size, dtype=float)
     if not ((size >= MIN_SIZE) & (size <= MAX_SIZE)).all():  # so that NaN is refused too
-        raise InputError(f"size: found {size.tolist()}, wanted {MIN_SIZE} to {MAX_SIZE} m each way")
+        raise InputError(f"size: {size.tolist()} is not between {MIN_SIZE} and {MAX_SIZE} m each way")
     if not 1 <= num_rooms <= MAX_ROOMS:
-        raise InputError(f"rooms: found {num_rooms}, wanted 1 to {MAX_ROOMS}")
+        raise InputError(f"rooms: {num_rooms} is not between 1 and {MAX_ROOMS}")
     columns = int(np.ceil(np.sqrt(num_rooms)))
     rooms = []
     for k in range(num_rooms):
@@ -52,33 +52,31 @@ def make_world(seed: int, size: Array, num_rooms: int = 1) -> World:
     return World(seed, tuple(rooms))
 
 
+def random_size(rng: np.random.Generator) -> Array:
+    """Size (3,) of a room [m], from a box room to a hall."""
+    return rng.uniform([3.5, 3.0, 2.3], [9.0, 7.0, 3.4])
+
+
 def check_num_points(world: World, num_points: int) -> None:
     """Refuse, before any work is done, a scan too sparse to show the rooms."""
     if num_points < MIN_POINTS * len(world.rooms):
-        raise InputError(f"points: found {num_points}, wanted at least {MIN_POINTS} a room")
+        raise InputError(f"points: {num_points} are too few, use at least {MIN_POINTS} a room")
 
 
 def check_width(width: int) -> None:
     """Refuse, before any work is done, a panorama too small or of an odd width [px]."""
     if width < 128 or width % 2:
-        raise InputError(f"width: found {width}, wanted an even number of at least 128")
+        raise InputError(f"width: {width} is not an even number of at least 128")
 
 
 def scan_world(
     world: World, num_points: int, workers: Workers
-) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Points (num_points, 3) [m] and colours (num_points, 3) of all rooms."""
-    return scan_labelled(world, num_points, workers)[:2]
-
-
-def scan_labelled(
-    world: World, num_points: int, workers: Workers
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int64]]:
-    """The points and colours of scan_world, and the points' labels (num_points,)."""
+    """Points (num_points, 3) [m], colours (num_points, 3) and labels (num_points,) of all rooms."""
     check_num_points(world, num_points)
-    shares = np.diff(np.linspace(0, num_points, len(world.rooms) + 1).astype(int))
+    counts = np.diff(np.linspace(0, num_points, len(world.rooms) + 1).astype(int))
     rng = np.random.default_rng([world.seed, 10])
-    parts = [scan_room(room, int(n), rng, workers) for room, n in zip(world.rooms, shares, strict=True)]
+    parts = [scan_room(room, int(n), rng, workers) for room, n in zip(world.rooms, counts, strict=True)]
     points, colors, labels = zip(*parts, strict=True)
     return np.concatenate(points), np.concatenate(colors), np.concatenate(labels)
 
@@ -96,7 +94,7 @@ def room_of_query(world: World, index: int, variant: str) -> tuple[Room, np.rand
 def make_query(world: World, index: int, variant: str, width: int, workers: Workers) -> Query:
     """Query number `index` of a variant: upright but for `tilt`, in a room drawn at random."""
     if variant not in VARIANTS:
-        raise InputError(f"variant: found {variant!r}, wanted one of {', '.join(VARIANTS)}")
+        raise InputError(f"variant: {variant!r} is not one of {', '.join(VARIANTS)}")
     check_width(width)
     room, rng = room_of_query(world, index, variant)
     center_world = free_position(room, rng, (1.0, min(1.9, float(room.size[2]) - 0.4)))

@@ -1,0 +1,99 @@
+"""The transform that turns a scan's z up, and the JSON file that holds it."""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from ..geometry.pose import Array, Pose, orthonormal
+
+FORMAT = "piccolo-alignment/1"
+CONVENTION = "x_aligned = T_aligned_from_scan @ (x_scan, 1) in the unit given; z_aligned is up"
+MAX_FILE_SIZE = 1 << 20  # [byte]
+UNIT_RANGE = (1e-300, 1e300)  # [m] its inverse is a number too
+ROUNDING = 1e-6  # of a rotation's numbers in a file
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """A rigid transform of a scan, and how far it can be relied on."""
+
+    T_aligned_from_scan: Array  # (4, 4) in the unit of the files
+    metres_per_unit: float
+    confidence: float  # [0, 1] that up is up
+    explanation: str  # one line
+
+    def in_unit(self, metres_per_unit: float) -> "Alignment":
+        """The same transform for coordinates in another unit."""
+        T = self.T_aligned_from_scan.copy()
+        T[:3, 3] *= self.metres_per_unit / metres_per_unit
+        return replace(self, T_aligned_from_scan=T, metres_per_unit=metres_per_unit)
+
+    def inverse(self) -> "Alignment":
+        """The way back, from aligned coordinates to the scan's."""
+        T, R = np.eye(4), self.T_aligned_from_scan[:3, :3]
+        T[:3, :3] = R.T
+        T[:3, 3] = -np.einsum("ji,j->i", R, self.T_aligned_from_scan[:3, 3]) + 0.0
+        return replace(self, T_aligned_from_scan=T)
+
+    def transform_pose(self, pose: Pose) -> Pose:
+        """A pose of the scan in aligned coordinates, both in the unit of the transform."""
+        R, t = self.T_aligned_from_scan[:3, :3], self.T_aligned_from_scan[:3, 3]
+        return Pose(orthonormal(pose.R_cam_from_world @ R.T), R @ pose.center_world + t)
+
+    def to_json(self) -> str:
+        """One JSON object; every number reads back as the same float64."""
+        document = {
+            "format": FORMAT,
+            "convention": CONVENTION,
+            "T_aligned_from_scan": self.T_aligned_from_scan.tolist(),
+            "metres_per_unit": self.metres_per_unit,
+            "confidence": self.confidence,
+            "explanation": self.explanation,
+        }
+        return json.dumps(document, indent=1, allow_nan=False) + "\n"
+
+    def to_text(self) -> str:
+        """Four rows of four numbers, as CloudCompare reads and writes a transform."""
+        return "".join(" ".join(map(repr, row)) + "\n" for row in self.T_aligned_from_scan.tolist())
+
+
+def read_alignment(path: Path) -> Alignment:
+    """The alignment in a file by Alignment.to_json; InputError if it is not one."""
+    if path.is_file() and path.stat().st_size > MAX_FILE_SIZE:
+        raise InputError(f"{path}: too large for a transform by align_gravity.py")
+    try:
+        document = json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:  # broken JSON or UTF-8, or brackets without end
+        raise InputError(f"{path}: not a JSON file; use a transform by align_gravity.py") from error
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise InputError(f"{path}: the format is not {FORMAT!r}; use a transform by align_gravity.py")
+    T = _rigid(path, document.get("T_aligned_from_scan"))
+    metres_per_unit = _number(path, document, "metres_per_unit", UNIT_RANGE)
+    confidence = _number(path, document, "confidence", (0.0, 1.0))
+    return Alignment(T, metres_per_unit, confidence, str(document.get("explanation", "")))
+
+
+def _number(path: Path, document: dict[str, object], name: str, limits: tuple[float, float]) -> float:
+    """A field within limits."""
+    value, (low, high) = document.get(name), limits
+    if isinstance(value, int | float) and low <= value <= high:
+        return float(value)
+    raise InputError(f"{path}: {name} is {value!r:.40}, must be a number from {low:g} to {high:g}")
+
+
+def _rigid(path: Path, rows: object) -> Array:
+    """A transform (4, 4) of nested lists; refused if it is not a rotation and a translation."""
+    try:
+        T = np.array(rows)
+    except ValueError as error:  # rows of several lengths
+        raise InputError(f"{path}: T_aligned_from_scan is not four rows of four numbers") from error
+    if T.shape != (4, 4) or T.dtype.kind not in "if":
+        raise InputError(f"{path}: T_aligned_from_scan is not four rows of four numbers")
+    R = T[:3, :3]
+    is_rigid = np.isfinite(T).all() and np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]) and np.abs(R).max() <= 2.0
+    if not is_rigid or np.abs(R @ R.T - np.eye(3)).max() > ROUNDING or np.linalg.det(R) < 0.0:
+        raise InputError(f"{path}: T_aligned_from_scan is not a rotation and a translation")
+    return T.astype(np.float64)

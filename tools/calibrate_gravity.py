@@ -1,0 +1,146 @@
+#!/usr/bin/env python3
+"""Fit the weights of the features that tell up in a cloud, and try them on other seeds."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import _checkout  # noqa: F401
+import numpy as np
+from evaluate_gravity import ROUGH, rotated_cloud, rotations_of
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from piccolo.cli.errors import guarded
+from piccolo.cli.progress import shown
+from piccolo.errors import InputError
+from piccolo.geometry.pose import Array
+from piccolo.gravity.alignment import normals_of
+from piccolo.gravity.up import up_hypotheses
+from piccolo.gravity.up_features import SENSE_SHARING, WEIGHTS, Weights, log_odds
+from piccolo.runtime.threads import Workers, num_cores
+from piccolo.scenes.synthetic.buildings import BUILDINGS, make_building
+
+PENALTY = 0.01  # on the square of a weight times its cue's standard deviation; all kinds' losses add up to 1
+IN_USE = np.array([*WEIGHTS, SENSE_SHARING])
+EPILOG = """\
+examples:
+  python tools/calibrate_gravity.py
+  python tools/calibrate_gravity.py --fit 0 100 --check 1100 1120
+
+Every seed makes a place of each kind, turned at random. Each direction that flat points face is a hypothesis
+with its cues (piccolo/gravity/up_features.py), one of them is the true up. The weights are those of the
+conditional logit with the largest likelihood, in which each kind counts the same and large weights cost.
+Printed as up_features.py holds them; then a Markdown table of how often the true up has the largest odds, on
+the seeds to check, by the weights in use and by those fitted.
+exit codes: 0 done, 2 wrong usage, 130 interrupted.
+"""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The hypotheses of one cloud."""
+
+    kind: str
+    cues: Array  # (H, 8)
+    is_up: NDArray[np.bool_]  # (H,) one of them is true up, or none
+
+
+def choice_of(case: tuple[str, int]) -> Choice:
+    """The hypotheses for a place of a kind and a seed, turned at random."""
+    kind, seed = case
+    R = rotations_of(seed, 1)[0]
+    cloud = rotated_cloud(make_building(kind, seed), R)
+    hypotheses = up_hypotheses(normals_of(cloud.voxels(np.eye(3))))
+    is_up = [hypothesis.axis @ R[:, 2] > np.cos(np.radians(ROUGH)) for hypothesis in hypotheses]
+    return Choice(kind, np.array([hypothesis.cues for hypothesis in hypotheses]), np.array(is_up))
+
+
+def choices_of(seeds: Sequence[int], workers: Workers) -> list[Choice]:
+    """The clouds of all kinds with true up among their hypotheses."""
+    cases = list(product(BUILDINGS, range(*seeds)))
+    return [choice for choice in workers.each(choice_of, cases, "clouds") if choice.is_up.any()]
+
+
+def log_likelihoods(parameters: Array, choices: Sequence[Choice]) -> tuple[Array, NDArray[np.bool_]]:
+    """Logarithm of true up's part of the odds, and whether it is the largest, by weights and sharing (9,)."""
+    values = []
+    for choice in choices:
+        logits = log_odds(choice.cues, parameters[:-1], float(parameters[-1]))
+        true_logit = logits[choice.is_up].max()
+        values.append((true_logit - np.logaddexp.reduce(logits), true_logit == logits.max()))
+    likelihoods, is_right = np.array(values).T
+    return likelihoods, is_right > 0.0
+
+
+def fit(choices: Sequence[Choice]) -> Array:
+    """Weights and sharing (9,) of the largest likelihood, less what large weights cost."""
+    kinds = [choice.kind for choice in choices]
+    kind_weights = np.array([1.0 / kinds.count(kind) for kind in kinds]) / len(set(kinds))
+    deviations = np.concatenate([choice.cues - choice.cues.mean(axis=0) for choice in choices]).std(axis=0)
+
+    def loss(parameters: Array) -> float:
+        cost = PENALTY * float(np.sum((parameters[:-1] * deviations) ** 2))
+        return cost - float(kind_weights @ log_likelihoods(parameters, choices)[0])
+
+    bounds = [(0.0, None)] * len(WEIGHTS) + [(0.0, 1.0)]
+    return np.asarray(minimize(loss, IN_USE, method="L-BFGS-B", bounds=bounds).x)
+
+
+def print_table(choices: Sequence[Choice], fitted: Array) -> None:
+    """How often the true up has the largest odds, by kind, and the mean logarithm of its part of the odds."""
+    by_weights = [log_likelihoods(parameters, choices) for parameters in (IN_USE, fitted)]
+    print("| kind | clouds | right, in use | right, fitted | log-likelihood, in use | fitted |")
+    print("|---|---:|---:|---:|---:|---:|")
+    for kind in [*BUILDINGS, "all"]:
+        is_kind = np.array([kind in (choice.kind, "all") for choice in choices])
+        if is_kind.any():
+            right = [np.count_nonzero(is_right[is_kind]) for _, is_right in by_weights]
+            mean = [f"{likelihoods[is_kind].mean():.2f}" for likelihoods, _ in by_weights]
+            print(f"| {kind} | {np.count_nonzero(is_kind)} | {' | '.join(map(str, [*right, *mean]))} |")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Fit, print the weights and check them."""
+    workers = Workers(arguments.threads, shown(arguments.quiet))
+    fitted = np.round(fit(choices_of(arguments.fit, workers)), 2)
+    values = [f"{name}={value:g}" for name, value in zip(Weights._fields, fitted[:-1], strict=True)]
+    print(f"WEIGHTS = Weights({', '.join(values)})\nSENSE_SHARING = {fitted[-1]:g}\n")
+    print_table(choices_of(arguments.check, workers), fitted)
+    return 0
+
+
+def check_arguments(arguments: argparse.Namespace) -> None:
+    """Refuse seeds and threads that make no place."""
+    for name in ("fit", "check"):
+        first, end = getattr(arguments, name)
+        if not 0 <= first < end:
+            raise InputError(f"--{name}: {first} {end} is no range of seeds, such as 0 60")
+    if arguments.threads < 1:
+        raise InputError("--threads must be at least 1")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    text = "seeds to learn from (default 0 40)"
+    parser.add_argument("--fit", type=int, nargs=2, metavar=("FIRST", "END"), default=[0, 40], help=text)
+    text = "other seeds (default 1100 1120)"
+    parser.add_argument(
+        "--check", type=int, nargs=2, metavar=("FIRST", "END"), default=[1100, 1120], help=text
+    )
+    parser.add_argument("--threads", type=int, default=num_cores(), metavar="N")
+    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    arguments = parser.parse_args(argv)
+    return guarded(
+        "calibrate_gravity.py", arguments.debug, lambda: run(arguments), lambda: check_arguments(arguments)
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
