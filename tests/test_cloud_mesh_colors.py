@@ -131,10 +131,12 @@ def test_a_second_set_of_texture_coordinates(tmp_path):
     assert_quadrants(whole(open_mesh, gltf.glb(tmp_path / "a.glb")))
 
 
-def test_a_mesh_below_a_camera_is_read(tmp_path):
-    gltf = textured_gltf(camera=0)
+def test_a_camera_and_the_name_world_change_nothing(tmp_path):
+    gltf = textured_gltf(camera=0, name="world", translation=[0, 0, 1])
     gltf.tree["cameras"] = [{"perspective": {"znear": 0.1, "aspectRatio": 1.0, "yfov": 1.0}}]
-    assert_quadrants(whole(open_mesh, gltf.glb(tmp_path / "a.glb")))
+    raw = whole(open_mesh, gltf.glb(tmp_path / "a.glb"))
+    assert_quadrants(raw)
+    assert np.all(raw.points_world[:, 2] == 1)
 
 
 @pytest.mark.parametrize(

@@ -68,6 +68,7 @@ def sanitize_gltf(content: bytes, resolver: FolderResolver) -> tuple[bytes, list
         _keep_triangles(path, tree, materials, num_bytes)
         for node in tree.get("nodes", []):
             node.pop("camera", None)  # with which trimesh passes over the node's mesh
+            node.pop("name", None)  # trimesh before 5 mixes up nodes named "world"
         text = json.dumps(tree).encode()
     except InputError:
         raise
