@@ -22,7 +22,7 @@ from ..runtime.threads import Workers
 from .sampling_loss import sampling_loss
 
 POOL_PER_POINT = 8  # points that may be visible, for one that is used
-FREE_SPACE_WIDTH = 32  # cells of the view by which free space is told
+FREE_SPACE_WIDTH = 32  # [px] of the view that tests for free space
 MIN_CLEARANCE = 0.2  # [m] to the nearest point
 
 
@@ -53,7 +53,7 @@ class LossSurface:
     def lowest(self) -> tuple[int, int]:
         """Row and column of the least loss in free space; anywhere if none is free.
 
-        From outside a cloud few points are seen, and a plain wall before a plain picture has little loss.
+        From outside a cloud few points are seen, and a plain wall has little loss in a plain panorama.
         """
         is_free = self.is_free & np.isfinite(self.loss)
         loss = np.where(is_free, self.loss, np.inf) if is_free.any() else self.loss

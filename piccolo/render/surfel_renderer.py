@@ -142,11 +142,11 @@ def _filled(rgb: NDArray[np.uint8], is_seen: NDArray[np.bool_]) -> NDArray[np.ui
         masked = np.pad(masked, ((0, height % 2), (0, 0), (0, 0)))
         masked = np.pad(masked, ((0, 0), (0, width % 2), (0, 0)), mode="wrap")
     size = (counts.shape[1] // 2, counts.shape[0] // 2)
-    share = cv2.resize(counts, size, interpolation=cv2.INTER_AREA)
+    weights = cv2.resize(counts, size, interpolation=cv2.INTER_AREA)
     total = cv2.resize(masked, size, interpolation=cv2.INTER_AREA)
     del counts, masked
-    mean = cv2.divide(total, cv2.merge([share, share, share]), scale=255.0)
-    coarse = _filled(np.asarray(mean, np.uint8), share > 0)
+    mean = cv2.divide(total, cv2.merge([weights, weights, weights]), scale=255.0)
+    coarse = _filled(np.asarray(mean, np.uint8), weights > 0)
     around = np.concatenate([coarse[:, -1:], coarse, coarse[:, :1]], axis=1)
     double = (2 * around.shape[1], 2 * len(around))
     smooth = cv2.resize(around, double, interpolation=cv2.INTER_LINEAR)[:height, 2 : 2 + width]

@@ -20,7 +20,7 @@ from .reader import PLAIN, Format, PointSource, ReadOptions
 
 DENSITY = 10_000.0  # points on a square metre, 1 cm apart
 MAX_POINTS = 30_000_000
-MAX_TRIANGLES = 200_000_000  # counted anew wherever a scene places its mesh
+MAX_TRIANGLES = 200_000_000  # those of a mesh count again at each place where the scene puts it
 
 
 def open_mesh(path: Path, options: ReadOptions = PLAIN) -> PointSource:

@@ -102,7 +102,7 @@ def _scene(resolver: FolderResolver, content: bytes, kind: str, has_texture: boo
     trimesh = library(resolver.path, "trimesh")
     try:
         with own_limit(), _strict():
-            # a texture's corners are told apart only where there is a texture: colours go by vertices
+            # vertices are split by texture coordinates only if there is a texture: colours go by vertices
             options = {"fix_texture": has_texture} if kind == "ply" else {}
             load = trimesh.exchange.load.mesh_loaders[kind]
             parsed = load(BytesIO(content), resolver=resolver, **options)
