@@ -121,12 +121,12 @@ class Gltf:
         path.write_bytes(b"".join([*parts, struct.pack("<I4s", len(data), b"BIN\0"), data]))
         return path
 
-    def gltf(self, path, uri=None):
+    def gltf(self, path, uri=None, is_written=True):
         """Beside its buffer, or with it inside."""
         inside = "data:application/octet-stream;base64," + base64.b64encode(self.data).decode()
         tree = {**self.tree, "buffers": [{"byteLength": len(self.data), "uri": uri or inside}]}
         path.write_text(json.dumps(tree))
-        if uri:
+        if uri and is_written:
             (path.parent / uri).write_bytes(self.data)
         return path
 
@@ -152,6 +152,31 @@ def write_ply(path, vertices=SQUARE, colors=None, face_colors=None, uv=None, opt
         faces[name] = face_colors[:, i]
     elements = [PlyElement.describe(vertex, "vertex"), PlyElement.describe(faces, "face")]
     PlyData(elements, **(options or {})).write(str(path))
+    return path
+
+
+PLY_HEAD = """ply
+format ascii 1.0
+{comments}element vertex 4
+property float x
+property float y
+property float z
+{colors}element face 2
+property list uchar int vertex_indices
+property list uchar float texcoord
+end_header
+"""
+WEDGES = "3 0 1 2 6 0 0 1 0 1 1\n3 0 2 3 6 0 0.1 1 1 0 1\n"
+
+
+def write_wedges(path, textures=(), colors=None, kind="uchar"):
+    """A PLY file with texture coordinates a face corner."""
+    names = () if colors is None else ("red", "green", "blue")
+    properties = "".join(f"property {kind} {name}\n" for name in names)
+    comments = "".join(f"comment TextureFile {name}\n" for name in textures)
+    head = PLY_HEAD.format(comments=comments, colors=properties)
+    rows = SQUARE if colors is None else np.concatenate([SQUARE, colors], axis=1)
+    path.write_text(head + "".join(" ".join(f"{n:g}" for n in row) + "\n" for row in rows.tolist()) + WEDGES)
     return path
 
 

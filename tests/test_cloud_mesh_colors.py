@@ -1,26 +1,30 @@
-"""Meshes' colours: of vertices, faces, materials and factors."""
+"""Meshes' colours: of vertices, faces, materials and factors; and what trimesh would pass over in silence."""
 
 import numpy as np
 import pytest
 from meshes import (
     BLUE,
     CORNER_COLORS,
+    QUADRANTS,
     RED,
     SQUARE,
     TRIANGLES,
     UV_FROM_BELOW,
     Gltf,
     assert_quadrants,
+    obj_text,
     png,
     textured_gltf,
     write_obj,
     write_ply,
+    write_wedges,
 )
 from test_cloud_morton import whole
 
 from piccolo.cloud import read_cloud
+from piccolo.cloud.readers import mesh_texture
 from piccolo.cloud.readers.mesh import open_mesh
-from piccolo.cloud.readers.mesh_sampling import decoded, encoded
+from piccolo.cloud.readers.mesh_sampling import linear_to_srgb, srgb_to_linear
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.errors import InputError
 
@@ -76,7 +80,7 @@ def test_gltf_factors_multiply_in_linear_light(tmp_path):
 
 def test_srgb_there_and_back():
     levels = np.arange(256, dtype=np.uint8)
-    np.testing.assert_array_equal(np.rint(255 * encoded(decoded(levels))), levels)
+    np.testing.assert_array_equal(np.rint(255 * linear_to_srgb(srgb_to_linear(levels))), levels)
 
 
 def test_surfaces_without_colors_are_left_out_with_a_warning(tmp_path):
@@ -125,3 +129,73 @@ def test_a_second_set_of_texture_coordinates(tmp_path):
     attributes["TEXCOORD_0"] = gltf.accessor(np.zeros((4, 2), np.float32))
     gltf.tree["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]["texCoord"] = 1
     assert_quadrants(whole(open_mesh, gltf.glb(tmp_path / "a.glb")))
+
+
+def test_a_camera_and_the_name_world_change_nothing(tmp_path):
+    gltf = textured_gltf(camera=0, name="world", translation=[0, 0, 1])
+    gltf.tree["cameras"] = [{"perspective": {"znear": 0.1, "aspectRatio": 1.0, "yfov": 1.0}}]
+    raw = whole(open_mesh, gltf.glb(tmp_path / "a.glb"))
+    assert_quadrants(raw)
+    assert np.all(raw.points_world[:, 2] == 1)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("\nv ", "\n  v "),
+        ("\nf ", "\n\tf "),
+        ("\nf ", "\nf\t"),
+        ("f 1 2 3", "f 1 \\\n  2 3"),
+        ("\nf ", "\n  # f 9 9 9\nf "),
+    ],
+)
+def test_obj_lines_may_begin_in_other_ways(tmp_path, old, new):
+    path, colors = tmp_path / "a.obj", CORNER_COLORS / 255
+    path.write_text(obj_text(np.concatenate([SQUARE, colors], axis=1), None, library="", material=""))
+    expected = whole(open_mesh, path)
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    read = whole(open_mesh, path)
+    np.testing.assert_array_equal(read.points_world, expected.points_world)
+    np.testing.assert_array_equal(read.colors, expected.colors)
+
+
+def test_materials_in_comments_are_not_used(tmp_path):
+    path = write_obj(tmp_path, mtl="newmtl wall\nmap_Kd wall.png\nnewmtl door\nKd 1 0 0\n")
+    expected = whole(open_mesh, path)
+    path.write_text(path.read_text().replace("f 1/1 3/3", "# usemtl door\nf 1/1 3/3"))
+    np.testing.assert_array_equal(whole(open_mesh, path).colors, expected.colors)
+
+
+def test_ply_colors_stay_with_their_vertices_where_no_texture_is_named(tmp_path):
+    raw = whole(open_ply, write_wedges(tmp_path / "a.ply", colors=CORNER_COLORS))
+    np.testing.assert_allclose(raw.colors[:, 1], 255 * raw.points_world[:, 1], atol=0.51)
+
+
+def test_a_textured_material_without_uv_is_left_out_whatever_its_color(tmp_path):
+    mtl = "newmtl wall\nmap_Kd wall.png\nnewmtl bare\nKd 0.2 0.4 0.6\nmap_Kd wall.png\n"
+    path = write_obj(tmp_path, mtl=mtl)
+    path.write_text(path.read_text() + "usemtl bare\nf 1 2 3\n")
+    source = open_mesh(path)
+    assert source.num_points == 10_000
+    assert "1 surfaces without colours left out" in source.warnings[0]
+
+
+def test_textures_in_folders_below_are_found(tmp_path):
+    path = write_obj(tmp_path, mtl="newmtl wall\nmap_Kd maps\\wall 1.png\n")
+    (tmp_path / "maps").mkdir()
+    (tmp_path / "wall.png").rename(tmp_path / "maps" / "wall 1.png")
+    assert len(whole(open_mesh, path).colors) == 10_000
+
+
+def test_a_texture_of_many_surfaces_is_decoded_once(tmp_path, monkeypatch):
+    decode, calls = mesh_texture.Texture.texels, []
+    monkeypatch.setattr(mesh_texture.Texture, "texels", lambda self: calls.append(self) or decode(self))
+    gltf = Gltf()
+    first, other = (gltf.material(png(pixels)) for pixels in (QUADRANTS, QUADRANTS[::-1].copy()))
+    rows = [gltf.mesh(SQUARE + np.float32(i), material=other if i == 2 else first) for i in range(5)]
+    gltf.tree["meshes"] = [{"primitives": [gltf.tree["meshes"][i]["primitives"][0] for i in rows]}]
+    gltf.node(mesh=0)
+    raw = whole(open_mesh, gltf.glb(tmp_path / "a.glb"))
+    assert len(raw.colors) == 50_000
+    assert len(calls) == 2

@@ -4,7 +4,8 @@ import pytest
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import angle_between
 from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
-from piccolo.paper.starts import box_grid, free_grid, is_free, spread
+from piccolo.paper.starts import MIN_CLEARANCE, PROBE_WIDTH, box_grid, free_grid, spread
+from piccolo.render.free_space import is_free_space
 
 
 def _hollow_box(seed=0, count=40_000):
@@ -21,11 +22,15 @@ def _hollow_box(seed=0, count=40_000):
     )
 
 
+def _is_free(points, center):
+    return is_free_space(points, center, PROBE_WIDTH, MIN_CLEARANCE)
+
+
 def test_free_is_inside_and_clear_of_surfaces():
     points = _hollow_box()
-    assert is_free(points, np.array([8.5, 20.0, 1.5]))
-    assert not is_free(points, np.array([8.5, 21.9, 1.5]))  # 0.1 m from a wall
-    assert not is_free(points, np.array([20.0, 20.0, 1.5]))  # outside
+    assert _is_free(points, np.array([8.5, 20.0, 1.5]))
+    assert not _is_free(points, np.array([8.5, 21.9, 1.5]))  # 0.1 m from a wall
+    assert not _is_free(points, np.array([20.0, 20.0, 1.5]))  # outside
 
 
 @pytest.mark.parametrize("num_translations", [1, 5, 50])
@@ -33,7 +38,7 @@ def test_free_grid_gives_the_number_asked_for_all_free(num_translations):
     points = _hollow_box()
     grid = free_grid(points, num_translations, margin=0.0)
     assert len(grid) == num_translations
-    assert all(is_free(points, position) for position in grid)
+    assert all(_is_free(points, position) for position in grid)
     assert len(np.unique(grid, axis=0)) == num_translations
 
 

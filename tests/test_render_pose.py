@@ -54,7 +54,7 @@ def test_all_results_become_a_folder_of_pictures(run, scene, tmp_path):
     for name in ("clean_0", "tilt_0"):
         photo, drawn = cv2.imread(str(scene / "images" / f"{name}.jpg")), cv2.imread(str(out / f"{name}.png"))
         assert np.corrcoef(photo.ravel(), drawn.ravel())[0, 1] > 0.85
-    assert lines[0]["seen_share"] > 0.95
+    assert lines[0]["seen_fraction"] > 0.95
 
 
 def test_the_same_pose_from_each_source_gives_the_same_picture(run, scene, tmp_path):
@@ -102,7 +102,7 @@ def test_a_prepared_map_stands_in_place_of_the_cloud(run, scene, tmp_path):
 def test_a_descent_is_shown_with_where_it_ended(run, scene, tmp_path, monkeypatch):
     monkeypatch.setattr(animation, "MAX_FRAMES", 5)
     pano = ["--queries", scene / "queries.json", "--pano", "clean_0.jpg", "--animate"]
-    seeded = [*pano, tmp_path / "a.gif", "--shake", 0.1, 3, "--seed", 5, "--solver", "gauss-newton"]
+    seeded = [*pano, tmp_path / "a.gif", "--perturb", 0.1, 3, "--seed", 5, "--solver", "gauss-newton"]
     code, (line,), err = run(*seeded)
     assert (code, err) == (0, "")
     assert line["start_distance"] == pytest.approx(0.1)
@@ -120,15 +120,15 @@ def test_a_descent_is_shown_with_where_it_ended(run, scene, tmp_path, monkeypatc
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--at", 0, 0, 1], "--out, --animate: found none"),
-        (["--at", 0, 0, 1, "--out", "a.png", "--width", 101], "--width: found 101, wanted an even number"),
-        (["--at", 0, 0, 1, "--out", "a.bmp"], "--out: found a.bmp, wanted .png, .jpg"),
-        (["--at", 0, 0, 1, "--out", "a.png", "--depth", "a.exr"], "--depth: found a.exr"),
-        (["--at", 0, 0, 1, "--out", "a", "--depth", "a.png"], "found no single picture"),
-        (["--at", 0, 0, "nan", "--out", "a.png"], "found a number that is not finite"),
-        (["--at", 0, 0, 1, "--animate", "a.gif"], "--animate: found no panorama, wanted --photo"),
-        (["--pose", "T.txt", "--heading", 3, "--out", "a.png"], "found without --at"),
-        (["--at", 0, 0, 1, "--out", "a.png", "--seed", -1], "--seed: found -1"),
+        (["--at", 0, 0, 1], "give --out, --animate or both"),
+        (["--at", 0, 0, 1, "--out", "a.png", "--width", 101], "--width 101: wanted an even number"),
+        (["--at", 0, 0, 1, "--out", "a.bmp"], "--out a.bmp: wanted .png, .jpg"),
+        (["--at", 0, 0, 1, "--out", "a.png", "--depth", "a.exr"], "--depth a.exr: wanted"),
+        (["--at", 0, 0, 1, "--out", "a", "--depth", "a.png"], "work with a single picture only"),
+        (["--at", 0, 0, "nan", "--out", "a.png"], "must be finite"),
+        (["--at", 0, 0, 1, "--animate", "a.gif"], "--animate: no panorama"),
+        (["--pose", "T.txt", "--heading", 3, "--out", "a.png"], "only with --at"),
+        (["--at", 0, 0, 1, "--out", "a.png", "--seed", -1], "--seed -1"),
         (["--at", 0, 0, 1, "--out", "a.png", "--scale", 0], "--scale: found 0"),
     ],
 )
@@ -142,8 +142,8 @@ def test_bad_input_leaves_nothing(run, scene, tmp_path):
     (tmp_path / "T.txt").write_text("1 2 3\n")
     result = ["--result", scene / "poses.jsonl"]
     for arguments, message in (
-        ([*result, "--out", tmp_path / "a.png"], "found 2 poses, wanted one"),
-        ([*result, "--pano", "x.jpg", "--out", tmp_path / "a.png"], "found no pose, wanted that of x.jpg"),
+        ([*result, "--out", tmp_path / "a.png"], "2 poses; choose one"),
+        ([*result, "--pano", "x.jpg", "--out", tmp_path / "a.png"], "no pose of x.jpg"),
         ([*result, "--out", scene], "found a folder that is not empty"),
         ([*result, "--out", tmp_path / "no" / "a.png"], "found no folder"),
         (["--pose", tmp_path / "T.txt", "--out", tmp_path / "a.png"], "wanted the 4 x 4 numbers"),
@@ -165,7 +165,7 @@ def test_interrupts_and_surprises_have_codes_of_their_own(run, tmp_path, monkeyp
         def fail(*arguments, error=error):
             raise error
 
-        monkeypatch.setattr(render_pose, "picture_at", fail)
+        monkeypatch.setattr(render_pose, "render_points", fail)
         assert run("--at", 1, 1, 1, "--out", tmp_path / "a.png")[0] == code
     assert not list(tmp_path.iterdir())
 

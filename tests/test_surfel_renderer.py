@@ -1,4 +1,4 @@
-"""Pictures of the cloud from discs: kernel, closing, hiding; poses in files."""
+"""Pictures of the cloud from surfels: kernel, closing, hiding; poses in files."""
 
 import cv2
 import naive
@@ -18,7 +18,7 @@ from piccolo.geometry.pose import Pose, T_world_from_cam, angle_between, exp_so3
 from piccolo.geometry.pose_file import read_pose_matrix
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.render.splatting import BAND, BAND_OFFSET, MAX_SLOPE, MIN_RADIUS_PX, splat
-from piccolo.render.surfel_renderer import Picture, closed, encoded, picture_at
+from piccolo.render.surfel_renderer import RenderedView, encode_image, fill_holes, render_points
 from piccolo.render.surfels import surfels_of
 from piccolo.runtime.threads import Workers
 from piccolo.scenes.synthetic.raycast import cast_rays
@@ -44,7 +44,7 @@ def true_ranges():
 
 @pytest.fixture(scope="module")
 def tilted(points):
-    return picture_at(points, rooms.local(SEED, rooms.query(SEED, "tilt").pose), WIDTH, WORKERS)
+    return render_points(points, rooms.local(SEED, rooms.query(SEED, "tilt").pose), WIDTH, WORKERS)
 
 
 def test_splat_equals_its_twin_over_seam_and_poles():
@@ -56,7 +56,7 @@ def test_splat_equals_its_twin_over_seam_and_poles():
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     radius = np.minimum(rng.uniform(0.001, 0.4, 300), 0.3 * distance)
     along = (center * normal).sum(axis=1)
-    discs = np.column_stack([center, normal, along, radius**-2.0, distance]).astype(np.float32)
+    surfels = np.column_stack([center, normal, along, radius**-2.0, distance]).astype(np.float32)
     rgb = rng.integers(0, 256, (300, 3), dtype=np.uint8)
     angles = np.maximum(np.arcsin(radius / distance), MIN_RADIUS_PX * 2 * np.pi / 64)
     directions = np.stack(
@@ -66,10 +66,10 @@ def test_splat_equals_its_twin_over_seam_and_poles():
     packed = pack_points(center.astype(np.float32), rgb).rgbx
     for lo in (0, 11):  # two strips of rows
         part = slice(lo, 11 if lo == 0 else 32)
-        splat(discs, packed, directions, angles, lo, depth[part], sums[:0])
-        splat(discs, packed, directions, angles, lo, depth[part], sums[part])
+        splat(surfels, packed, directions, angles, lo, depth[part], sums[:0])
+        splat(surfels, packed, directions, angles, lo, depth[part], sums[part])
     expected_depth, expected_rgb = naive.splat(
-        discs.astype(float), rgb, 64, MIN_RADIUS_PX, MAX_SLOPE, BAND, BAND_OFFSET
+        surfels.astype(float), rgb, 64, MIN_RADIUS_PX, MAX_SLOPE, BAND, BAND_OFFSET
     )
     is_seen = sums[..., 4] > 0
     assert 0.3 < is_seen.mean() < 1.0
@@ -86,7 +86,7 @@ def test_the_picture_at_the_true_pose_is_the_photo(points, variant):
     photo = cv2.resize(query.rgb, (WIDTH, WIDTH // 2), interpolation=cv2.INTER_AREA).astype(float)
 
     def correlation(pose):
-        rgb = closed(picture_at(points, pose, WIDTH, WORKERS)).astype(float)
+        rgb = fill_holes(render_points(points, pose, WIDTH, WORKERS)).astype(float)
         return np.corrcoef(rgb.ravel(), photo.ravel())[0, 1]
 
     true_pose = rooms.local(SEED, query.pose)
@@ -108,9 +108,9 @@ def test_holes_are_marked_where_points_are_missing_and_nowhere_else(points, tilt
     rays = pixel_rays(WIDTH) @ pose.R_cam_from_world
     surface = pose.center_world + rays * true_ranges[..., None]
     low = points.z.max() - 0.1  # the ceiling: nothing is behind it
-    picture = picture_at(points.take(np.flatnonzero(points.z < low)), pose, WIDTH, WORKERS)
+    picture = render_points(points.take(np.flatnonzero(points.z < low)), pose, WIDTH, WORKERS)
     is_missing, is_there = surface[..., 2] > low, (surface[..., 2] < low) & tilted.is_seen
-    # discs at the upper end of the walls reach some pixels into it
+    # surfels at the upper end of the walls reach some pixels into it
     inner, other = (cv2.erode(m.astype(np.uint8), np.ones((9, 9))) > 0 for m in (is_missing, is_there))
     assert inner.mean() > 0.1
     assert not picture.is_seen[inner].any()
@@ -128,10 +128,10 @@ def test_a_sparse_wall_hides_what_is_behind_it():
     colors = np.repeat(np.array([[255, 0, 0], [0, 0, 255]], np.uint8), [4000, 40000], axis=0)
     cloud = pack_points(np.concatenate([near, far]).astype(np.float32), colors)
     pose = Pose(np.eye(3), np.zeros(3))
-    picture = picture_at(cloud, pose, 1024, WORKERS)
+    picture = render_points(cloud, pose, 1024, WORKERS)
     front = np.s_[200:312, 450:574]
     assert picture.is_seen[front].mean() > 0.97
-    rgb = closed(picture)[front]
+    rgb = fill_holes(picture)[front]
     assert (rgb[..., 2] < 40).mean() > 0.99
     assert abs(picture.depth[256, 512] - 2.0) < 0.01
 
@@ -143,7 +143,7 @@ def test_the_rim_beside_a_thing_in_front_is_seen():
     rod = np.column_stack([np.full(2000, 1.0), np.zeros(2000), np.linspace(-1, 1, 2000)])
     colors = np.repeat(np.array([[0, 0, 255], [255, 0, 0]], np.uint8), [len(wall), len(rod)], axis=0)
     cloud = pack_points(np.concatenate([wall, rod]).astype(np.float32), colors)
-    picture = picture_at(cloud, Pose(np.eye(3), np.zeros(3)), 720, WORKERS)
+    picture = render_points(cloud, Pose(np.eye(3), np.zeros(3)), 720, WORKERS)
     row = picture.rgb[180]
     assert (row[360] == [255, 0, 0]).all()
     assert (row[[356, 363], 2] > 200).all()  # two degrees are four pixels
@@ -151,12 +151,12 @@ def test_the_rim_beside_a_thing_in_front_is_seen():
 
 def test_turning_the_camera_rolls_the_picture_with_the_same_bits_on_any_number_of_threads(points):
     pose = rooms.local(SEED, rooms.query(SEED).pose)
-    straight = picture_at(points, pose, 128, Workers(1))
-    again = picture_at(points, pose, 128, Workers(2))
+    straight = render_points(points, pose, 128, Workers(1))
+    again = render_points(points, pose, 128, Workers(2))
     np.testing.assert_array_equal(straight.rgb, again.rgb)
     np.testing.assert_array_equal(straight.depth, again.depth)
     turned = Pose(exp_so3(np.array([0, 0, -2 * np.pi * 9 / 128])) @ pose.R_cam_from_world, pose.center_world)
-    rolled = picture_at(points, turned, 128, WORKERS)
+    rolled = render_points(points, turned, 128, WORKERS)
     is_same = np.isclose(rolled.depth, np.roll(straight.depth, 9, axis=1), rtol=1e-3, equal_nan=True)
     assert is_same.mean() > 0.99
 
@@ -167,13 +167,13 @@ def test_holes_take_the_colours_around_them_and_nothing_else_changes(size):
     rgb = rng.integers(100, 200, (*size, 3), dtype=np.uint8)
     depth = np.where(rng.random(size) < 0.3, np.inf, 1.0).astype(np.float32)
     depth[0, 0] = 1.0
-    picture = Picture(np.where(np.isfinite(depth)[..., None], rgb, 0).astype(np.uint8), depth)
-    filled = closed(picture)
+    picture = RenderedView(np.where(np.isfinite(depth)[..., None], rgb, 0).astype(np.uint8), depth)
+    filled = fill_holes(picture)
     np.testing.assert_array_equal(filled[picture.is_seen], rgb[picture.is_seen])
     assert filled.min() >= 98
     assert filled.max() <= 201
-    nothing = Picture(np.zeros((*size, 3), np.uint8), np.full(size, np.inf, np.float32))
-    assert not closed(nothing).any()
+    nothing = RenderedView(np.zeros((*size, 3), np.uint8), np.full(size, np.inf, np.float32))
+    assert not fill_holes(nothing).any()
 
 
 def test_a_hole_at_the_seam_is_closed_from_both_sides():
@@ -181,7 +181,7 @@ def test_a_hole_at_the_seam_is_closed_from_both_sides():
     rgb[:, 32:] = 200
     depth = np.ones((32, 64), np.float32)
     depth[:, :4] = depth[:, -4:] = np.inf
-    filled = closed(Picture(np.where(np.isfinite(depth)[..., None], rgb, 0).astype(np.uint8), depth))
+    filled = fill_holes(RenderedView(np.where(np.isfinite(depth)[..., None], rgb, 0).astype(np.uint8), depth))
     middle = filled[16, [60, 62, 0, 2], 0].astype(int)
     assert (np.diff(middle) < 0).all()
     assert 20 < middle[1:3].mean() < 180
@@ -207,7 +207,7 @@ def test_few_points_and_points_at_the_camera_are_drawn():
     for count in (1, 5, 11, 40):
         cloud = np.zeros((count + 1, 3), np.float32)
         cloud[1:] = [1.0, 0.0, 0.0]
-        picture = picture_at(
+        picture = render_points(
             pack_points(cloud, np.full((count + 1, 3), 9, np.uint8)),
             Pose(np.eye(3), np.zeros(3)),
             32,
@@ -219,7 +219,7 @@ def test_few_points_and_points_at_the_camera_are_drawn():
 
 def test_pictures_too_large_for_a_format_are_refused_by_name():
     with pytest.raises(OSError, match=r"could not be encoded as \.jpg"):
-        encoded(np.zeros((1, 70_000, 3), np.uint8), ".jpg")
+        encode_image(np.zeros((1, 70_000, 3), np.uint8), ".jpg")
 
 
 @given(st.floats(0, 359.9), st.floats(-89, 89), st.floats(-179, 179))

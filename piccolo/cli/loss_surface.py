@@ -13,10 +13,10 @@ from ..errors import InputError
 from ..geometry.pose import Array, Pose
 from ..geometry.rotations import uniform_rotations, uniform_yaws
 from ..optimize.loss_surface import LossSurface, PoseGrid, loss_surface
-from ..optimize.loss_surface_io import Known, plan_shift, surface_npz, surface_png
+from ..optimize.loss_surface_io import KnownPoses, plan_shift, surface_npz, surface_png
 from ..panorama import read_panorama
 from ..panorama.resize import shrink
-from ..panorama.texels import Texels, pack_texels
+from ..panorama.texels import pack_texels
 from ..pipeline import open_points
 from ..runtime.atomic import check_output, write_atomically
 from ..runtime.threads import Workers, num_cores
@@ -83,53 +83,53 @@ def check_usage(arguments: argparse.Namespace) -> None:
     """Refuse options that make no sense, whatever the files hold."""
     cloud_settings_from(arguments)
     if not (arguments.out or arguments.npz):
-        raise InputError("--out, --npz: found none, wanted one of them or both")
+        raise InputError("give --out, --npz or both")
     if not 0.0 < arguments.step < np.inf:
-        raise InputError(f"--step: found {arguments.step}, wanted metres above 0")
+        raise InputError(f"--step {arguments.step}: wanted metres above 0")
     least = {"rotations": 1, "width": 16, "max_points": 100, "threads": 1}
     for name, limit in least.items():
         value = getattr(arguments, name)
         if value is not None and value < limit:
-            raise InputError(f"--{name.replace('_', '-')}: found {value}, wanted at least {limit}")
+            raise InputError(f"--{name.replace('_', '-')} {value}: wanted at least {limit}")
     x0, y0, x1, y1 = arguments.box or (0.0, 0.0, 1.0, 1.0)
     if not (x0 < x1 and y0 < y1 and np.isfinite([x0, y0, x1, y1]).all()):
-        raise InputError(f"--box: found {arguments.box}, wanted X0 below X1 and Y0 below Y1")
+        raise InputError(f"--box {arguments.box}: wanted X0 below X1 and Y0 below Y1")
     low, high, num = arguments.heights or (0.0, 0.0, 1.0)
     if not (low <= high and np.isfinite([low, high]).all() and num in range(1, 1001)):
-        raise InputError(f"--heights: found {arguments.heights}, wanted MIN up to MAX and 1 to 1000 of them")
+        raise InputError(f"--heights {arguments.heights}: wanted MIN up to MAX and 1 to 1000 of them")
 
 
-def known_poses(arguments: argparse.Namespace, placed: LocalCloud) -> Known:
+def known_poses(arguments: argparse.Namespace, cloud: LocalCloud) -> KnownPoses:
     """The pose found and the true one of the panorama, as far as files are given."""
     name, found, true = arguments.pano.name, None, None
     if arguments.result:
         poses = [r.pose for r in read_results(arguments.result) if Path(r.pano).name == name and r.pose]
         if len(poses) != 1:
-            raise InputError(f"{arguments.result}: found {len(poses)} poses of {name}, wanted one")
-        found = placed.from_world(poses[0])
+            raise InputError(f"{arguments.result}: {len(poses)} poses of {name}, wanted one")
+        found = cloud.from_world(poses[0])
     if arguments.truth:
         queries = read_scene(arguments.truth).by_name
         if name not in queries:
-            raise InputError(f"{arguments.truth}: found no true pose of {name}, wanted one")
-        true = placed.from_world(queries[name].pose)
-    return Known(found, true)
+            raise InputError(f"{arguments.truth}: no true pose of {name}")
+        true = cloud.from_world(queries[name].pose)
+    return KnownPoses(found, true)
 
 
-def grid_from(arguments: argparse.Namespace, placed: LocalCloud, known: Known) -> PoseGrid:
+def grid_from(arguments: argparse.Namespace, cloud: LocalCloud, known: KnownPoses) -> PoseGrid:
     """The poses to try, in the frame of the points."""
-    shift = plan_shift(placed)
+    shift = plan_shift(cloud)
     if arguments.box:
         corners = np.array(arguments.box).reshape(2, 2) - shift[:2]
     else:
-        ends = [np.percentile(c, [0.5, 99.5]) for c in (placed.points.x, placed.points.y)]
+        ends = [np.percentile(c, [0.5, 99.5]) for c in (cloud.points.x, cloud.points.y)]
         places = np.array([*np.transpose(ends), *(pose.center_world[:2] for pose in known.all)], np.float64)
         corners = np.stack([places.min(axis=0), places.max(axis=0)])
     counts = np.floor((corners[1] - corners[0]) / arguments.step) + 1.0
     if counts.prod() > MAX_CELLS:
-        raise InputError(f"--step: found {counts.prod():.3g} places, wanted at most {MAX_CELLS}")
-    heights = heights_from(arguments, placed, known)
+        raise InputError(f"--step {arguments.step}: {counts.prod():.3g} places, wanted at most {MAX_CELLS}")
+    heights = heights_from(arguments, cloud, known)
     if not max(np.abs(corners).max(), np.abs(heights).max()) < FARTHEST:
-        raise InputError("--box, --heights: found places too far from the cloud, wanted them in it")
+        raise InputError("--box, --heights: places too far from the cloud")
     x, y = (corners[0, k] + arguments.step * np.arange(counts[k]) for k in range(2))
     is_known = arguments.gravity == "known"
     rotations = (uniform_yaws if is_known else uniform_rotations)(
@@ -140,23 +140,23 @@ def grid_from(arguments: argparse.Namespace, placed: LocalCloud, known: Known) -
     return PoseGrid(x, y, heights, start @ rotations @ rotations[0].T)
 
 
-def heights_from(arguments: argparse.Namespace, placed: LocalCloud, known: Known) -> Array:
+def heights_from(arguments: argparse.Namespace, cloud: LocalCloud, known: KnownPoses) -> Array:
     """The heights to try, in the frame of the points."""
     if arguments.heights:
         low, high, num = arguments.heights
-        return np.asarray(np.linspace(low, high, int(num)) - plan_shift(placed)[2])
+        return np.asarray(np.linspace(low, high, int(num)) - plan_shift(cloud)[2])
     if known.all:
         return np.asarray(known.all[0].center_world[2] + np.array(HEIGHTS_ABOUT))
-    floor, ceiling = np.percentile(placed.points.z, [1.0, 99.0])
+    floor, ceiling = np.percentile(cloud.points.z, [1.0, 99.0])
     return np.asarray(floor + (ceiling - floor) * np.linspace(0.25, 0.75, 5))
 
 
-def summary(surface: LossSurface, grid: PoseGrid, placed: LocalCloud, known: Known) -> dict[str, object]:
-    """What the JSON on stdout says of the surface."""
+def summary(surface: LossSurface, grid: PoseGrid, cloud: LocalCloud, known: KnownPoses) -> dict[str, object]:
+    """The surface's part of the JSON on stdout."""
     row, column = surface.lowest()
     lowest = np.array([grid.x[column], grid.y[row], surface.height[row, column]])
-    pose = placed.to_world(Pose(grid.R_cam_from_local[surface.rotation[row, column]], lowest))
-    told: dict[str, object] = {
+    pose = cloud.to_world(Pose(grid.R_cam_from_local[surface.rotation[row, column]], lowest))
+    line: dict[str, object] = {
         "places": [len(grid.y), len(grid.x)],
         "poses": grid.num_poses,
         "lowest_world": np.round(pose.center_world, 6).tolist(),
@@ -166,14 +166,8 @@ def summary(surface: LossSurface, grid: PoseGrid, placed: LocalCloud, known: Kno
     }
     for name, other in (("found", known.found), ("true", known.true)):
         if other is not None:
-            told[f"distance_to_{name}"] = round(float(np.linalg.norm(lowest - other.center_world)), 6)
-    return told
-
-
-def texels_of(path: Path, width: int) -> Texels:
-    """The panorama as the loss reads it."""
-    panorama = shrink(read_panorama(path), width)
-    return pack_texels(panorama.rgb, panorama.is_valid)
+            line[f"distance_to_{name}"] = round(float(np.linalg.norm(lowest - other.center_world)), 6)
+    return line
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -184,25 +178,26 @@ def run(arguments: argparse.Namespace) -> int:
         check_output(path, inputs)
 
     workers = Workers(arguments.threads, shown(arguments.quiet))
-    texels = texels_of(arguments.pano, arguments.width)
-    placed = open_points(arguments.cloud, cloud_settings_from(arguments), workers)
-    for warning in () if arguments.quiet else placed.warnings:
+    panorama = shrink(read_panorama(arguments.pano), arguments.width)
+    texels = pack_texels(panorama.rgb, panorama.is_valid)
+    cloud = open_points(arguments.cloud, cloud_settings_from(arguments), workers)
+    for warning in () if arguments.quiet else cloud.warnings:
         print(f"loss_surface.py: warning: {warning}", file=sys.stderr)
-    known = known_poses(arguments, placed)
-    grid = grid_from(arguments, placed, known)
+    known = known_poses(arguments, cloud)
+    grid = grid_from(arguments, cloud, known)
     begin = time.perf_counter()
     see = not arguments.no_visibility
-    surface = loss_surface(placed.points, texels, grid, arguments.max_points, see, workers)
+    surface = loss_surface(cloud.points, texels, grid, arguments.max_points, see, workers)
     seconds = time.perf_counter() - begin
     if not np.isfinite(surface.loss).any():
-        raise InputError(f"{arguments.pano}: found no pose with a loss, wanted a panorama less masked")
+        raise InputError(f"{arguments.pano}: the loss is infinite at all poses; mask less of the panorama")
     if arguments.npz:
-        write_atomically(arguments.npz, surface_npz(surface, grid, placed, known))
+        write_atomically(arguments.npz, surface_npz(surface, grid, cloud, known))
     if arguments.out:
-        write_atomically(arguments.out, surface_png(surface, grid, placed, known, arguments.pano.name))
-    told = {"seconds": round(seconds, 3), "poses_per_s": round(grid.num_poses / seconds)}
+        write_atomically(arguments.out, surface_png(surface, grid, cloud, known, arguments.pano.name))
+    line = {"seconds": round(seconds, 3), "poses_per_s": round(grid.num_poses / seconds)}
     files = {"out": arguments.out and str(arguments.out), "npz": arguments.npz and str(arguments.npz)}
-    print(json.dumps(files | summary(surface, grid, placed, known) | told))
+    print(json.dumps(files | summary(surface, grid, cloud, known) | line))
     return 0
 
 

@@ -1,8 +1,9 @@
-"""Draw the cloud as a camera at a pose would see it: colours, depth, or a descent towards the pose."""
+"""Render the cloud as a camera at a pose would see it: colours, depth, or a descent towards the pose."""
 
 import argparse
 import json
 import sys
+from contextlib import nullcontext
 from io import BytesIO
 from pathlib import Path
 
@@ -17,10 +18,9 @@ from ..geometry.pose_error import pose_errors
 from ..geometry.pose_file import read_pose_matrix
 from ..optimize.descent_animation import (
     FRAME_WIDTH,
-    check_animation,
     frames_of,
-    shaken,
-    watched_descent,
+    perturb_pose,
+    refine_with_history,
     write_animation,
 )
 from ..optimize.settings import DescentSettings
@@ -28,7 +28,7 @@ from ..panorama import read_panorama
 from ..panorama.resize import shrink
 from ..panorama.texels import pack_texels
 from ..pipeline import open_points
-from ..render.surfel_renderer import Picture, closed, encoded, picture_at
+from ..render.surfel_renderer import RenderedView, encode_image, fill_holes, render_points
 from ..runtime.atomic import check_output, check_output_folder, replacing_folder, write_atomically
 from ..runtime.threads import Workers, num_cores
 from ..scenes.export import read_results
@@ -43,11 +43,12 @@ examples:
   python tools/render_pose.py --cloud scan.ply --result poses.jsonl --out pictures
   python tools/render_pose.py --cloud scan.ply --queries queries.json --pano a.jpg --width 8192 --out true.jpg
   python tools/render_pose.py --cloud scan.ply --at 3 2 1.5 --heading 90 --holes mark --out east.png
-  python tools/render_pose.py --cloud scan.ply --result pose.json --animate descent.gif --shake 0.3 8
+  python tools/render_pose.py --cloud scan.ply --result pose.json --animate descent.gif --perturb 0.3 8
 
 Angles as in docs/CONVENTIONS.md, Exports: heading clockwise from the world's +y. Each point is a disc over
-its nearest neighbours; what no disc covers is a hole. --depth: range along the ray. PNG: 16 bit, millimetres,
-0 where nothing is seen, 65535 for 65.535 m and farther. NPY: float32, metres, inf where nothing is seen.
+its nearest neighbours; what no disc covers is a hole. --depth: range along the ray. PNG: 16 bit,
+millimetres, 0 where nothing is seen, 65535 for 65.535 m and farther. NPY: float32, metres, inf where nothing
+is seen.
 --mask-out: white where nothing is seen, as --mask of localize.py takes it.
 One JSON object a picture on stdout.
 exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
@@ -79,48 +80,53 @@ def build_parser() -> argparse.ArgumentParser:
     group.add_argument("--pano", metavar="NAME", help=text)
     for angle in ("heading", "pitch", "roll"):
         group.add_argument(f"--{angle}", type=float, metavar="DEG", help="with --at (default 0)")
+    _add_picture_options(parser)
+    _add_descent_options(parser)
+    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    return parser
+
+
+def _add_picture_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("picture")
     text = ".png or .jpg; of several poses a new folder of .png, named as the panoramas"
     group.add_argument("--out", type=Path, help=text)
-    group.add_argument(
-        "--width", type=int, default=2048, metavar="PX", help="twice the height (default 2048)"
-    )
+    text = "twice the height (default 2048)"
+    group.add_argument("--width", type=int, default=2048, metavar="PX", help=text)
     text = "fill them from around (default), mark them magenta, or leave them black"
     group.add_argument("--holes", choices=["close", "mark", "black"], default="close", help=text)
     group.add_argument("--depth", type=Path, metavar="FILE", help=".png or .npy, see below")
     group.add_argument("--mask-out", type=Path, metavar="PNG", help="where nothing is seen")
+
+
+def _add_descent_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("descent")
     text = ".gif, .mp4 or a new folder: the descent on the sampling loss, from a start near the pose"
     group.add_argument("--animate", type=Path, metavar="OUT", help=text)
     group.add_argument("--photo", type=Path, metavar="FILE", help="panorama (default: that of the result)")
-    text = "begin here, turned as the pose (default: the pose, shaken)"
+    text = "start at this position, turned as the pose (default: the pose, perturbed)"
     group.add_argument("--start", type=float, nargs=3, metavar=("X", "Y", "Z"), help=text)
-    text = "the start is so far from the pose (default 0.3 8)"
-    group.add_argument("--shake", type=float, nargs=2, metavar=("M", "DEG"), default=(0.3, 8.0), help=text)
-    group.add_argument("--seed", type=int, default=0, help="of the directions of --shake (default 0)")
+    text = "distance and angle of the start from the pose (default 0.3 8)"
+    group.add_argument("--perturb", type=float, nargs=2, metavar=("M", "DEG"), default=(0.3, 8.0), help=text)
+    group.add_argument("--seed", type=int, default=0, help="of the directions of --perturb (default 0)")
     solvers = ["adam", "lbfgs", "gauss-newton"]
     group.add_argument("--solver", choices=solvers, default=solvers[0], help="(default adam)")
-    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
-    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    return parser
 
 
 def check_usage(arguments: argparse.Namespace) -> None:
     """Refuse options that make no sense, whatever the files hold."""
     cloud_settings_from(arguments)
     if not (arguments.out or arguments.animate):
-        raise InputError("--out, --animate: found none, wanted one of them or both")
+        raise InputError("give --out, --animate or both")
     if (arguments.depth or arguments.mask_out) and not (arguments.out and arguments.out.suffix):
-        raise InputError("--depth, --mask-out: found no single picture, wanted them with --out FILE")
+        raise InputError("--depth, --mask-out: work with a single picture only, --out FILE")
     if not MIN_WIDTH <= arguments.width <= MAX_WIDTH or arguments.width % 2:
-        raise InputError(
-            f"--width: found {arguments.width}, wanted an even number, {MIN_WIDTH} to {MAX_WIDTH}"
-        )
+        raise InputError(f"--width {arguments.width}: wanted an even number, {MIN_WIDTH} to {MAX_WIDTH}")
     for name, allowed in SUFFIXES.items():
         path = getattr(arguments, name)
         if path and path.suffix.lower() not in allowed:
             wanted = ", ".join(suffix or "a folder's name" for suffix in allowed)
-            raise InputError(f"--{name.replace('_', '-')}: found {path.name}, wanted {wanted}")
+            raise InputError(f"--{name.replace('_', '-')} {path.name}: wanted {wanted}")
     check_pose_options(arguments)
 
 
@@ -128,14 +134,14 @@ def check_pose_options(arguments: argparse.Namespace) -> None:
     """The same of the options that say where the camera is."""
     angles = arguments.heading, arguments.pitch, arguments.roll
     if not arguments.at and any(angle is not None for angle in angles):
-        raise InputError("--heading, --pitch, --roll: found without --at, wanted with it")
+        raise InputError("--heading, --pitch, --roll: only with --at")
     if (arguments.at or arguments.pose) and arguments.animate and not arguments.photo:
-        raise InputError("--animate: found no panorama, wanted --photo")
+        raise InputError("--animate: no panorama; name it with --photo")
     numbers = [*(arguments.at or ()), *(arguments.start or ()), *(angle or 0.0 for angle in angles)]
-    if not np.isfinite([*numbers, *arguments.shake]).all():
-        raise InputError("--at, --start, --shake, angles: found a number that is not finite")
+    if not np.isfinite([*numbers, *arguments.perturb]).all():
+        raise InputError("--at, --start, --perturb and angles must be finite numbers")
     if arguments.seed < 0:
-        raise InputError(f"--seed: found {arguments.seed}, wanted 0 or more")
+        raise InputError(f"--seed {arguments.seed}: wanted 0 or more")
 
 
 def check_files(arguments: argparse.Namespace) -> None:
@@ -147,12 +153,10 @@ def check_files(arguments: argparse.Namespace) -> None:
             check_output(path, inputs)
         else:
             check_output_folder(path)
-    if arguments.animate:
-        check_animation(arguments.animate)
 
 
 def poses_from(arguments: argparse.Namespace) -> Named:
-    """The poses asked for, by the panorama's path, or by that of the file or the word that gave them."""
+    """The poses asked for, named by the panorama's path, the pose's file or "at"."""
     if arguments.at:
         angles = (arguments.heading or 0.0, arguments.pitch or 0.0, arguments.roll or 0.0)
         return [("at", Pose(R_cam_from_angles(*angles), np.array(arguments.at)))]
@@ -165,13 +169,10 @@ def poses_from(arguments: argparse.Namespace) -> Named:
         found = [(r.pano, r.pose) for r in read_results(file) if r.pose is not None]
     if arguments.pano:
         found = [(name, pose) for name, pose in found if Path(name).name == Path(arguments.pano).name]
-    wanted = f"that of {arguments.pano}" if arguments.pano else "one or more"
     if not found:
-        raise InputError(f"{file}: found no pose, wanted {wanted}")
+        raise InputError(f"{file}: no pose" + (f" of {arguments.pano}" if arguments.pano else ""))
     if len(found) > 1 and (arguments.animate or arguments.out.suffix):
-        raise InputError(
-            f"{file}: found {len(found)} poses, wanted one; --pano NAME chooses, or --out FOLDER"
-        )
+        raise InputError(f"{file}: {len(found)} poses; choose one with --pano NAME, or give --out FOLDER")
     return found
 
 
@@ -179,75 +180,69 @@ def depth_file(depth: NDArray[np.float32], suffix: str) -> bytes:
     """Depth (H, W) [m] as the file that the suffix names."""
     if suffix == ".png":
         millimetres = np.minimum(np.rint(depth * 1000.0), 65535.0)
-        return encoded(np.where(np.isfinite(depth), millimetres, 0.0).astype(np.uint16), suffix)
+        return encode_image(np.where(np.isfinite(depth), millimetres, 0.0).astype(np.uint16), suffix)
     file = BytesIO()
     np.save(file, depth)
     return file.getvalue()
 
 
-def colors_of(picture: Picture, holes: str) -> NDArray[np.uint8]:
-    """The picture's colours (H, W, 3), its holes as asked for."""
+def colors_of(view: RenderedView, holes: str) -> NDArray[np.uint8]:
+    """The view's colours (H, W, 3), its holes as asked for."""
     if holes == "close":
-        return closed(picture)
+        return fill_holes(view)
     if holes == "mark":
-        picture.rgb[~picture.is_seen] = MAGENTA
-    return picture.rgb
+        view.rgb[~view.is_seen] = MAGENTA
+    return view.rgb
 
 
-def draw_pictures(arguments: argparse.Namespace, placed: LocalCloud, poses: Named, workers: Workers) -> None:
+def draw_pictures(arguments: argparse.Namespace, cloud: LocalCloud, poses: Named, workers: Workers) -> None:
     """Write the pictures; one JSON line each."""
     is_folder = not arguments.out.suffix
     names = [f"{Path(pano).stem}.png" for pano, _ in poses] if is_folder else [arguments.out.name]
     if len(set(names)) < len(names):
-        raise InputError(
-            f"{arguments.out}: found panoramas of one name, wanted different ones; --pano chooses"
-        )
+        raise InputError(f"{arguments.out}: panoramas of the same name; choose one with --pano")
 
-    def write(folder: Path, name: str, pose: Pose) -> dict[str, object]:
-        picture = picture_at(placed.points, placed.from_world(pose), arguments.width, workers)
-        seen_share = float(picture.is_seen.mean())
+    def write(folder: Path, name: str, pano: str, pose: Pose) -> dict[str, object]:
+        view = render_points(cloud.points, cloud.from_world(pose), arguments.width, workers)
+        seen_fraction = round(float(view.is_seen.mean()), 6)
         if arguments.depth:
-            content = depth_file(picture.depth, arguments.depth.suffix.lower())
+            content = depth_file(view.depth, arguments.depth.suffix.lower())
             write_atomically(arguments.depth, content)
         if arguments.mask_out:
-            nothing = np.where(picture.is_seen, 0, 255).astype(np.uint8)
-            write_atomically(arguments.mask_out, encoded(nothing, ".png"))
+            nothing = np.where(view.is_seen, 0, 255).astype(np.uint8)
+            write_atomically(arguments.mask_out, encode_image(nothing, ".png"))
         suffix = Path(name).suffix.lower()
-        write_atomically(folder / name, encoded(colors_of(picture, arguments.holes), suffix))
-        return {"width": arguments.width, "seen_share": round(seen_share, 6)}
+        write_atomically(folder / name, encode_image(colors_of(view, arguments.holes), suffix))
+        out = arguments.out / name if is_folder else arguments.out
+        return {"out": str(out), "pano": pano, "width": arguments.width, "seen_fraction": seen_fraction}
 
-    if not is_folder:
-        ((pano, pose),) = poses
-        told = write(arguments.out.parent, names[0], pose)
-        print(json.dumps({"out": str(arguments.out), "pano": pano, **told}))
-        return
-    with replacing_folder(arguments.out) as folder:
-        lines = [write(folder, name, pose) for name, (_, pose) in zip(names, poses, strict=True)]
-    for name, (pano, _), told in zip(names, poses, lines, strict=True):
-        print(json.dumps({"out": str(arguments.out / name), "pano": pano, **told}))
+    with replacing_folder(arguments.out) if is_folder else nullcontext(arguments.out.parent) as folder:
+        lines = [write(folder, name, *named) for name, named in zip(names, poses, strict=True)]
+    for line in lines:
+        print(json.dumps(line))
 
 
-def animate(arguments: argparse.Namespace, placed: LocalCloud, poses: Named, workers: Workers) -> None:
+def animate(arguments: argparse.Namespace, cloud: LocalCloud, poses: Named, workers: Workers) -> None:
     """Write the descent towards the pose; one JSON line."""
     ((name, pose),) = poses
     folder = arguments.queries.parent / "images" if arguments.queries else Path()
     panorama = shrink(read_panorama(arguments.photo or folder / name), DESCENT_WIDTH)
-    goal = placed.from_world(pose)
+    goal = cloud.from_world(pose)
     if arguments.start:
-        start = placed.from_world(Pose(pose.R_cam_from_world, np.array(arguments.start)))
+        start = cloud.from_world(Pose(pose.R_cam_from_world, np.array(arguments.start)))
     else:
-        distance, angle_deg = arguments.shake
-        start = shaken(goal, distance, angle_deg, arguments.seed)
+        distance, angle_deg = arguments.perturb
+        start = perturb_pose(goal, distance, angle_deg, arguments.seed)
     texels = pack_texels(panorama.rgb, panorama.is_valid)
     settings = DescentSettings(solver=arguments.solver)
-    refined, passed = watched_descent(placed.points, texels, start, settings)
-    frames = frames_of(placed.points, panorama, passed, FRAME_WIDTH, workers)
+    refined, history = refine_with_history(cloud.points, texels, start, settings)
+    frames = frames_of(cloud.points, panorama, history, FRAME_WIDTH, workers)
     write_animation(arguments.animate, frames)
-    told: dict[str, object] = {"out": str(arguments.animate), "pano": name, "frames": len(frames)}
+    line: dict[str, object] = {"out": str(arguments.animate), "pano": name, "frames": len(frames)}
     for label, at in (("start", start), ("end", refined.pose)):
         distance, angle = pose_errors(at, goal)
-        told |= {f"{label}_distance": round(distance, 6), f"{label}_deg": round(float(np.degrees(angle)), 6)}
-    print(json.dumps(told | {"loss": refined.loss if np.isfinite(refined.loss) else None}))
+        line |= {f"{label}_distance": round(distance, 6), f"{label}_deg": round(float(np.degrees(angle)), 6)}
+    print(json.dumps(line | {"loss": refined.loss if np.isfinite(refined.loss) else None}))
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -256,13 +251,13 @@ def run(arguments: argparse.Namespace) -> int:
     poses = poses_from(arguments)
 
     workers = Workers(num_cores(), shown(arguments.quiet))
-    placed = open_points(arguments.cloud, cloud_settings_from(arguments), workers)
-    for warning in () if arguments.quiet else placed.warnings:
+    cloud = open_points(arguments.cloud, cloud_settings_from(arguments), workers)
+    for warning in () if arguments.quiet else cloud.warnings:
         print(f"render_pose.py: warning: {warning}", file=sys.stderr)
     if arguments.out:
-        draw_pictures(arguments, placed, poses, workers)
+        draw_pictures(arguments, cloud, poses, workers)
     if arguments.animate:
-        animate(arguments, placed, poses, workers)
+        animate(arguments, cloud, poses, workers)
     return 0
 
 

@@ -28,6 +28,12 @@ class PackedPoints:
         """The points at `indices`, in that order."""
         return PackedPoints(self.x[indices], self.y[indices], self.z[indices], self.rgbx[indices])
 
+    def subsample(self, count: int) -> "PackedPoints":
+        """At most `count` points, evenly in space as far as they are in Morton order."""
+        if len(self) <= count:
+            return self
+        return self.take(np.linspace(0, len(self) - 1, count).astype(np.int64))
+
 
 @dataclass(frozen=True)
 class LocalCloud:

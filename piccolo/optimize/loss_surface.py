@@ -7,7 +7,6 @@ Kim et al. (ICCV 2021) show such a surface to argue that their loss has a deep, 
 with L over the points that a camera at (x, y, z) sees. Rotations are the same at each place.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,16 +15,15 @@ from scipy.ndimage import minimum_filter
 
 from ..cloud.soa import PackedPoints
 from ..geometry.pose import Array, Pose
-from ..geometry.sphere import solid_angles
 from ..panorama.texels import Texels
-from ..render.zbuffer import nearest_depth, visible_points
+from ..render.free_space import is_free_space
+from ..render.zbuffer import visible_points
 from ..runtime.threads import Workers
 from .sampling_loss import sampling_loss
 
-POOL_PER_POINT = 8  # points among which the visible ones are looked for, for one that is asked
-CELLS_AROUND = 32  # of the view that tells free space
+POOL_PER_POINT = 8  # points that may be visible, for one that is used
+FREE_SPACE_WIDTH = 32  # [px] of the view that tests for free space
 MIN_CLEARANCE = 0.2  # [m] to the nearest point
-MIN_SEEN = 0.4  # share of the sphere on which there is anything
 
 
 @dataclass(frozen=True)
@@ -55,7 +53,7 @@ class LossSurface:
     def lowest(self) -> tuple[int, int]:
         """Row and column of the least loss in free space; anywhere if none is free.
 
-        From outside a cloud few points are seen, and a plain wall before a plain picture has little loss.
+        From outside a cloud few points are seen, and a plain wall has little loss in a plain panorama.
         """
         is_free = self.is_free & np.isfinite(self.loss)
         loss = np.where(is_free, self.loss, np.inf) if is_free.any() else self.loss
@@ -80,7 +78,7 @@ def loss_surface(
     workers: Workers,
 ) -> LossSurface:
     """The least loss over heights and rotations at each place, from at most `max_points` a position."""
-    pool = _thinned(points, POOL_PER_POINT * max_points if use_visibility else max_points)
+    pool = points.subsample(POOL_PER_POINT * max_points if use_visibility else max_points)
 
     def best(cell: int) -> tuple[float, float, int, bool]:
         row, column = divmod(cell, len(grid.x))
@@ -88,8 +86,8 @@ def loss_surface(
         for z in grid.heights:
             center = np.array([grid.x[column], grid.y[row], z])
             seen = visible_points(pool, center) if use_visibility else pool
-            is_free = _is_free(seen, center)
-            some = _thinned(seen, max_points)
+            is_free = is_free_space(seen, center, FREE_SPACE_WIDTH, MIN_CLEARANCE)
+            some = seen.subsample(max_points)
             losses = [sampling_loss(some, texels, Pose(R, center)) for R in grid.R_cam_from_local]
             k = int(np.argmin(losses))
             tried.append((losses[k], float(z), k, is_free))
@@ -102,17 +100,3 @@ def loss_surface(
     return LossSurface(
         loss.reshape(shape), height.reshape(shape), rotation.reshape(shape), is_free.reshape(shape)
     )
-
-
-def _thinned(points: PackedPoints, count: int) -> PackedPoints:
-    """At most `count` points, evenly in space as they are in Morton order."""
-    if len(points) <= count:
-        return points
-    return points.take(np.linspace(0, len(points) - 1, count).astype(np.int64))
-
-
-def _is_free(points: PackedPoints, center: Array) -> bool:
-    """True if a camera could be there: nothing too near, and something seen in many directions."""
-    depth = nearest_depth(points, Pose(np.eye(3), center), CELLS_AROUND).reshape(-1, CELLS_AROUND)
-    seen = float(solid_angles(CELLS_AROUND) @ np.isfinite(depth).sum(axis=1)) / (4.0 * math.pi)
-    return bool(depth.min() > MIN_CLEARANCE and seen > MIN_SEEN)

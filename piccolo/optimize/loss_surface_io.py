@@ -1,4 +1,4 @@
-"""A loss surface as a picture over the cloud's plan, and as a file of arrays."""
+"""A loss surface drawn over the cloud's plan, and as a file of arrays."""
 
 from dataclasses import dataclass
 from io import BytesIO
@@ -17,8 +17,8 @@ MARKS = {"true": ("*", "white", 260), "found": ("X", "red", 110), "lowest": ("o"
 
 
 @dataclass(frozen=True)
-class Known:
-    """Poses in the frame of the points; None where not known."""
+class KnownPoses:
+    """Poses in the frame of the points; None if not known."""
 
     found: Pose | None
     true: Pose | None
@@ -29,14 +29,14 @@ class Known:
         return [pose for pose in (self.true, self.found) if pose is not None]
 
 
-def plan_shift(placed: LocalCloud) -> Array:
-    """What is to be added to a position (3,) in the frame of the points to have it in the plan's."""
-    return np.asarray(placed.R_local_from_world @ placed.origin_world)
+def plan_shift(cloud: LocalCloud) -> Array:
+    """Offset (3,) [m] from the frame of the points to that of the plan, which has the world's origin."""
+    return np.asarray(cloud.R_local_from_world @ cloud.origin_world)
 
 
-def plan_of(placed: LocalCloud, grid: PoseGrid) -> tuple[NDArray[np.float32], tuple[float, ...]]:
+def plan_of(cloud: LocalCloud, grid: PoseGrid) -> tuple[NDArray[np.float32], tuple[float, ...]]:
     """Where walls and furniture are, (rows, columns) in [0, 1] from -y, and the edges x0, x1, y0, y1 [m]."""
-    p = placed.points
+    p = cloud.points
     floor, ceiling = np.percentile(p.z, [1.0, 99.0])
     inside = (p.z > floor + 0.15 * (ceiling - floor)) & (p.z < ceiling - 0.15 * (ceiling - floor))
     edges = (grid.x[0], grid.x[-1], grid.y[0], grid.y[-1])
@@ -48,10 +48,12 @@ def plan_of(placed: LocalCloud, grid: PoseGrid) -> tuple[NDArray[np.float32], tu
     return np.minimum(counts / many, 1.0).astype(np.float32), edges
 
 
-def surface_png(surface: LossSurface, grid: PoseGrid, placed: LocalCloud, known: Known, title: str) -> bytes:
-    """The surface over the plan, with the poses known."""
-    shift = plan_shift(placed)
-    plan, edges = plan_of(placed, grid)
+def surface_png(
+    surface: LossSurface, grid: PoseGrid, cloud: LocalCloud, known: KnownPoses, title: str
+) -> bytes:
+    """PNG of the surface over the plan, with the known poses marked."""
+    shift = plan_shift(cloud)
+    plan, edges = plan_of(cloud, grid)
     extent = np.array(edges) + shift[[0, 0, 1, 1]]
     aspect = (extent[3] - extent[2] + 1.0) / (extent[1] - extent[0] + 1.0)
     figure = Figure(figsize=(10.0, float(np.clip(8.5 * aspect + 1.0, 4.0, 16.0))), layout="constrained")
@@ -82,15 +84,15 @@ def surface_png(surface: LossSurface, grid: PoseGrid, placed: LocalCloud, known:
     return file.getvalue()
 
 
-def surface_npz(surface: LossSurface, grid: PoseGrid, placed: LocalCloud, known: Known) -> bytes:
-    """The surface and the poses known, as arrays."""
-    shift = plan_shift(placed)
+def surface_npz(surface: LossSurface, grid: PoseGrid, cloud: LocalCloud, known: KnownPoses) -> bytes:
+    """NPZ of the surface and the known poses."""
+    shift = plan_shift(cloud)
     nowhere = np.full(3, np.nan)
     positions = {
-        f"{name}_world": placed.to_world(pose).center_world if pose else nowhere
+        f"{name}_world": cloud.to_world(pose).center_world if pose else nowhere
         for name, pose in (("found", known.found), ("true", known.true))
     }
-    rotations = grid.R_cam_from_local @ placed.R_local_from_world
+    rotations = grid.R_cam_from_local @ cloud.R_local_from_world
     file = BytesIO()
     np.savez_compressed(
         file,
@@ -100,7 +102,7 @@ def surface_npz(surface: LossSurface, grid: PoseGrid, placed: LocalCloud, known:
         height=surface.height + shift[2],
         R_cam_from_world=rotations[surface.rotation],
         is_free=surface.is_free,
-        R_plan_from_world=placed.R_local_from_world,
+        R_plan_from_world=cloud.R_local_from_world,
         allow_pickle=False,
         **positions,
     )

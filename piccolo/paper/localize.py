@@ -45,11 +45,7 @@ class PaperMap:
 
 def prepare_by_paper(cloud: Cloud, settings: PaperSettings) -> PaperMap:
     """Everything that does not depend on the panorama."""
-    points = pack_points(cloud.points, cloud.colors)
-    if (
-        len(points) > settings.max_points
-    ):  # every so many of the Morton order: even in space, as dense as before
-        points = points.take(np.linspace(0, len(points) - 1, settings.max_points).astype(np.int64))
+    points = pack_points(cloud.points, cloud.colors).subsample(settings.max_points)
     return PaperMap(
         points=points,
         origin_world=cloud.origin_world,

@@ -1,26 +1,15 @@
 """Step 1 of the paper's Algorithm 1: camera positions on a grid, in free space."""
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cloud.soa import PackedPoints
-from ..geometry.pose import Array, Pose
-from ..geometry.sphere import solid_angles
-from ..render.zbuffer import nearest_depth
+from ..geometry.pose import Array
+from ..render.free_space import is_free_space
 
 MIN_CLEARANCE = 0.25  # a camera is not nearer to a surface than this [m]
-MIN_SEEN_FRACTION = 0.4  # and sees points over at least this share of the sphere: it is inside the scan
 PROBE_POINTS = 200_000  # about this many points are asked, evenly in space
 PROBE_WIDTH = 48  # cells of 7.5 degrees for the two tests
-
-
-def is_free(points: PackedPoints, center_world: Array) -> bool:
-    """True if a camera fits at `center_world` (3,) and finds itself inside the scan."""
-    depth = nearest_depth(points, Pose(np.eye(3), center_world), PROBE_WIDTH).reshape(-1, PROBE_WIDTH)
-    seen = np.isfinite(depth).sum(axis=1) @ solid_angles(PROBE_WIDTH) / (4.0 * math.pi)
-    return bool(depth.min() > MIN_CLEARANCE and seen > MIN_SEEN_FRACTION)
 
 
 def box_grid(low: Array, high: Array, num_cells: int) -> NDArray[np.float64]:
@@ -61,7 +50,7 @@ def free_grid(points: PackedPoints, num_translations: int, margin: float) -> NDA
     free = np.empty((0, 3))
     for growth in (1.0, 1.5, 2.25, 3.4, 5.0, 7.6, 11.4, 17.0, 26.0):
         grid = box_grid(low, high, round(num_translations * growth))
-        free = grid[[is_free(probed, center_world) for center_world in grid]]
+        free = grid[[is_free_space(probed, center, PROBE_WIDTH, MIN_CLEARANCE) for center in grid]]
         if len(free) >= num_translations:
             break
     return farthest_point_sampling(free, num_translations)

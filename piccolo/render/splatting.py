@@ -1,7 +1,7 @@
-"""Discs drawn into rows of an equirectangular picture: nearest range first, then weighted colours near it.
+"""Surfels drawn into rows of an equirectangular picture: nearest range first, then weighted colours near it.
 
-A pixel's ray sees a disc where it meets the disc's plane within the radius. A disc smaller than a pixel is
-seen by the ray nearest to it.
+A surfel is a disc around a point. A pixel's ray sees it where it meets the disc's plane within the radius; a
+surfel smaller than a pixel is seen by the ray nearest to it.
 """
 
 import math
@@ -11,26 +11,26 @@ import numpy as np
 from ..panorama.texels import channel
 from ..runtime.jit import F0, F1, inline_kernel, kernel
 
-MIN_RADIUS_PX = np.float32(0.75)  # every disc reaches the centre of a pixel
+MIN_RADIUS_PX = np.float32(0.75)  # every surfel reaches the centre of a pixel
 # Layers nearer to each other than this are one surface: noise of a scanner.
 BAND = np.float32(1.01)
 BAND_OFFSET = np.float32(0.02)  # [m]
 LEAST_WEIGHT = np.float32(1e-4)  # at the rim: whatever is seen has a colour
-MAX_SLOPE = np.float32(1.25)  # of the range within a disc or a pixel
+MAX_SLOPE = np.float32(1.25)  # of the range within a surfel or a pixel
 TWO = np.float32(2.0)
 
 
 @inline_kernel
-def hit(disc, dx, dy, dz, px_angle2):
-    """Squared distance of the unit ray (dx, dy, dz) from a disc's centre by its radius, and range [m]."""
-    x, y, z, nx, ny, nz, along, per_radius2, distance = disc
+def hit(surfel, dx, dy, dz, px_angle2):
+    """Squared distance of the unit ray (dx, dy, dz) from a surfel's centre by its radius, and range [m]."""
+    x, y, z, nx, ny, nz, along, per_radius2, distance = surfel
     facing = nx * dx + ny * dy + nz * dz
     t = along / facing
     ex, ey, ez = t * dx - x, t * dy - y, t * dz - z
     q = (ex * ex + ey * ey + ez * ez) * per_radius2
     if not facing * along > F0:  # a plane along the ray divides by zero: NaN is no hit
         q, t = TWO, distance
-    # What the ray meets beside the disc, in the same pixel: the surface goes on, but nobody knows how far.
+    # What the ray meets beside the surfel, in the same pixel: the surface goes on, but nobody knows how far.
     t = min(max(t, distance / MAX_SLOPE), distance * MAX_SLOPE)
     ex, ey, ez = dx - x / distance, dy - y / distance, dz - z / distance
     return min(q, (ex * ex + ey * ey + ez * ez) / px_angle2), t
@@ -42,15 +42,15 @@ def half_width(elevation, of_center, angle):
     over = math.sin(0.5 * angle) ** 2 - math.sin(0.5 * (elevation - of_center)) ** 2
     if over < 0.0:
         return -1.0
-    share = over / max(math.cos(elevation) * math.cos(of_center), 1e-12)
-    return math.pi if share >= 1.0 else 2.0 * math.asin(math.sqrt(share))
+    fraction = over / max(math.cos(elevation) * math.cos(of_center), 1e-12)
+    return math.pi if fraction >= 1.0 else 2.0 * math.asin(math.sqrt(fraction))
 
 
 @kernel
-def splat(discs, rgbx, directions, angles, first_row, depth, sums):
-    """Draw discs into the rows from `first_row` on: into `depth`, or into `sums` if that is not empty.
+def splat(surfels, rgbx, directions, angles, first_row, depth, sums):
+    """Draw surfels into the rows from `first_row` on: into `depth`, or into `sums` if that is not empty.
 
-    discs (N, 9): centre [m], normal, product of both, 1 / radius^2, range [m], in the camera's frame;
+    surfels (N, 9): centre [m], normal, product of both, 1 / radius^2, range [m], in the camera's frame;
     directions (N, 2): azimuth and elevation, angles (N,): radius as seen [rad].
     The nearest range [m] is written into depth (rows, W), which holds inf before; then sums (rows, W, 5) gets
     R, G, B [8-bit levels], range [m] and 1 of what is near that range, each times a weight, added.
@@ -61,9 +61,9 @@ def splat(discs, rgbx, directions, angles, first_row, depth, sums):
     cosines, sines = np.empty(width, np.float32), np.empty(width, np.float32)
     for j in range(width):
         cosines[j], sines[j] = math.cos(math.pi - (j + 0.5) * step), math.sin(math.pi - (j + 0.5) * step)
-    for n in range(len(discs)):
-        d, c = discs[n], rgbx[n]
-        disc = (d[0], d[1], d[2], d[3], d[4], d[5], d[6], d[7], d[8])
+    for n in range(len(surfels)):
+        d, c = surfels[n], rgbx[n]
+        surfel = (d[0], d[1], d[2], d[3], d[4], d[5], d[6], d[7], d[8])
         azimuth, elevation = directions[n, 0], directions[n, 1]
         top = math.ceil((0.5 * math.pi - elevation - angles[n]) / step - 0.5) - first_row
         bottom = math.floor((0.5 * math.pi - elevation + angles[n]) / step - 0.5) - first_row
@@ -75,7 +75,7 @@ def splat(discs, rgbx, directions, angles, first_row, depth, sums):
             cosine, sine = np.float32(math.cos(of_row)), np.float32(math.sin(of_row))
             for at in range(left, right + 1):
                 j = (at + width) % width
-                q, t = hit(disc, cosine * cosines[j], cosine * sines[j], sine, px_angle2)
+                q, t = hit(surfel, cosine * cosines[j], cosine * sines[j], sine, px_angle2)
                 if q >= F1:
                     continue
                 if len(sums) == 0:

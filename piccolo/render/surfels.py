@@ -1,4 +1,4 @@
-"""Points as discs that close the surface between them: size and attitude of each, from its neighbours."""
+"""Surfels: discs that close the surface between points, with a radius and a normal from the neighbours."""
 
 from dataclasses import dataclass
 
@@ -10,32 +10,30 @@ from ..runtime.threads import Workers
 
 NUM_NEIGHBORS = 10
 CHUNK = 65_536
-RADIUS_PER_REACH = 0.8  # disc radius by the distance of the farthest of these neighbours
+RADIUS_PER_REACH = 0.8  # surfel radius by the distance of the farthest of these neighbours
 # A ray that grazes an edge leaves points in the air behind it. Such a point is farther from its neighbours
 # than they are from theirs.
 MAX_REACH = 1.6  # by the median of the neighbours' own
 MIN_FLATNESS = 0.05  # second to largest eigenvalue; below, neighbours lie in a line and tell no plane
 MAX_THICKNESS = 0.12  # smallest eigenvalue by the sum of all; of a ball, such as leaves, it is 1/3
-THICK_RADIUS = 0.25  # so much smaller are discs that are no part of a surface
+THICK_RADIUS = 0.25  # so much smaller are surfels that are no part of a surface
 
 
 @dataclass(frozen=True)
 class Surfels:
-    """Coloured discs."""
+    """Coloured discs around points."""
 
     points: PackedPoints
-    normals: NDArray[
-        np.float32
-    ]  # (N, 3) unit, of either sign; 0 where there is no plane: they face the camera
-    radii: NDArray[np.float32]  # (N,) [m], 0 for a disc no larger than a pixel
+    normals: NDArray[np.float32]  # (N, 3) unit, of either sign; 0 without a plane: faces the camera
+    radii: NDArray[np.float32]  # (N,) [m], 0 for a surfel no larger than a pixel
 
     def take(self, indices: NDArray[np.integer]) -> "Surfels":
-        """The discs at `indices`, in that order."""
+        """The surfels at `indices`, in that order."""
         return Surfels(self.points.take(indices), self.normals[indices], self.radii[indices])
 
 
 def surfels_of(points: PackedPoints, workers: Workers) -> Surfels:
-    """Each point as a disc over its nearest neighbours; points in the air are left out."""
+    """Each point as a surfel over its nearest neighbours; points in the air are left out."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  # who draws no picture need not wait for it
 
     positions = np.stack([points.x, points.y, points.z], axis=1)

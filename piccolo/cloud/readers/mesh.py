@@ -11,15 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from .mesh_glb import has_glb_magic
+from ...geometry.pose import Array
+from .colors import BRIGHTEST
+from .mesh_gltf import NO_MATERIAL, has_glb_magic
 from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply
-from .mesh_sampling import Floats, Placed, Sampling, Surface
+from .mesh_sampling import Sampling, Surface, SurfaceInstance
 from .reader import PLAIN, Format, PointSource, ReadOptions
 
 DENSITY = 10_000.0  # points on a square metre, 1 cm apart
 MAX_POINTS = 30_000_000
-MAX_TRIANGLES = 200_000_000  # counted anew wherever a scene places its mesh
-BRIGHTEST = {"u1": 255.0, "u2": 65535.0}  # of whole numbers; fractions go to 1
+MAX_TRIANGLES = 200_000_000  # those of a mesh count again at each place where the scene puts it
 
 
 def open_mesh(path: Path, options: ReadOptions = PLAIN) -> PointSource:
@@ -44,13 +45,13 @@ def open_ply_mesh(path: Path, options: ReadOptions = PLAIN) -> PointSource:
 
 def _source(loaded: Loaded, scale: float) -> PointSource:
     path = loaded.path
-    parts, notes = _placed(loaded)
-    num_triangles = sum(len(part.surface.triangles) for part in parts)
+    instances, notes = _instances(loaded)
+    num_triangles = sum(len(instance.surface.triangles) for instance in instances)
     if num_triangles > MAX_TRIANGLES:
         raise InputError(f"{path}: {num_triangles} triangles, wanted at most {MAX_TRIANGLES}")
     sums, num_flat = [], 0
-    for part in parts:
-        areas = part.areas()
+    for instance in instances:
+        areas = instance.areas()
         sums.append(areas.sum())
         num_flat += int(np.count_nonzero(areas == 0.0))
     ends = np.cumsum(sums, dtype=np.float64)
@@ -68,16 +69,16 @@ def _source(loaded: Loaded, scale: float) -> PointSource:
             f"{path}: {area:.3g} square metres of surface, sampled with {num_points / area:.3g} points on "
             f"each instead of {DENSITY:.0f}"
         )
-    return PointSource(path, Sampling(parts, ends, num_points).read, num_points, tuple(notes))
+    return PointSource(path, Sampling(instances, ends, num_points).read, num_points, tuple(notes))
 
 
-def _placed(loaded: Loaded) -> tuple[list[Placed], list[str]]:
+def _instances(loaded: Loaded) -> tuple[list[SurfaceInstance], list[str]]:
     """The coloured surfaces where the scene puts them, and what the user should know."""
     scene, path = loaded.scene, loaded.path
     surfaces = {
         name: _surface(loaded, mesh) for name, mesh in scene.geometry.items() if hasattr(mesh, "faces")
     }
-    parts, num_bare = [], 0
+    instances, num_bare = [], 0
     nodes = [scene.graph.get(node) for node in scene.graph.nodes_geometry]
     # not by the nodes' names: trimesh makes some up by chance
     for matrix, name in sorted(nodes, key=lambda node: (node[1], node[0].tobytes())):
@@ -87,15 +88,15 @@ def _placed(loaded: Loaded) -> tuple[list[Placed], list[str]]:
         if surface.colors is None and surface.texture is None:
             num_bare += 1
             continue
-        parts.append(Placed(surface, np.array(matrix, dtype=np.float64)))
-    if not parts and not num_bare:
+        instances.append(SurfaceInstance(surface, np.array(matrix, dtype=np.float64)))
+    if not instances and not num_bare:
         raise InputError(f"{path}: no triangles, {WANTED}")
-    if not parts or _is_one_color([part.surface for part in parts]):
+    if not instances or _is_one_color([instance.surface for instance in instances]):
         raise InputError(f"{path}: no colours, {WANTED}")
     # surfaces of one texture next to each other: it is decoded once
-    first = {id(part.surface.texture): i for i, part in reversed(list(enumerate(parts)))}
-    parts.sort(key=lambda part: first[id(part.surface.texture)])
-    return parts, [f"{path}: {num_bare} surfaces without colours left out"] if num_bare else []
+    first = {id(instance.surface.texture): i for i, instance in reversed(list(enumerate(instances)))}
+    instances.sort(key=lambda instance: first[id(instance.surface.texture)])
+    return instances, [f"{path}: {num_bare} surfaces without colours left out"] if num_bare else []
 
 
 def _is_one_color(surfaces: list[Surface]) -> bool:
@@ -135,9 +136,9 @@ def _surface(loaded: Loaded, mesh: Any) -> Surface | None:
     return Surface(vertices, triangles, colors=colors, corners=corners)
 
 
-def _checked_uv(path: Path, raw: Any, vertices: Floats) -> Floats:
+def _checked_uv(path: Path, raw: Any, vertices: Array) -> Array:
     """Texture coordinates (V, 2); vertices without finite ones become NaN."""
-    uv: Floats = np.array(raw, dtype=np.float64)
+    uv: Array = np.array(raw, dtype=np.float64)
     if uv.shape != (len(vertices), 2):
         raise InputError(f"{path}: {len(uv)} texture coordinates, wanted {len(vertices)}")
     is_wrong: NDArray[np.bool_] = ~np.all(np.abs(uv) < 1e6, axis=1)
@@ -145,14 +146,14 @@ def _checked_uv(path: Path, raw: Any, vertices: Floats) -> Floats:
     return uv
 
 
-def _gltf_surface(loaded: Loaded, mesh: Any, vertices: Floats, triangles: NDArray[np.int64]) -> Surface:
+def _gltf_surface(loaded: Loaded, mesh: Any, vertices: Array, triangles: NDArray[np.int64]) -> Surface:
     visual, path, materials = mesh.visual, loaded.path, loaded.materials or []
     material = materials[int(visual.material.name)]
     texture = loaded.texture(visual.material.baseColorTexture)
-    if material.has_texture and (texture is None or visual.uv is None):
-        raise InputError(f"{path}: a texture or its coordinates are missing, {WANTED}")
+    if material.texture is not None and (texture is None or visual.uv is None):
+        raise InputError(f"{path}: a texture can't be read or its coordinates are missing, {WANTED}")
     raw = visual.vertex_attributes.get("color")
-    if raw is None and not material.is_given:
+    if raw is None and material is NO_MATERIAL:
         return Surface(vertices, triangles)
     uv = None if texture is None else _checked_uv(path, visual.uv, vertices)
     factor = np.array([material.factor])
@@ -167,7 +168,7 @@ def _gltf_surface(loaded: Loaded, mesh: Any, vertices: Floats, triangles: NDArra
 
 def _colors(
     path: Path, mesh: Any, triangles: NDArray[np.int64]
-) -> tuple[Floats, NDArray[np.int64]] | tuple[None, None]:
+) -> tuple[Array, NDArray[np.int64]] | tuple[None, None]:
     """Colours (C, 3) of vertices, faces or the material, and the corners' (T, 3) rows in them."""
     of_vertices = mesh.vertex_attributes.get("color")
     if of_vertices is not None:
@@ -183,12 +184,12 @@ def _colors(
     return None, None
 
 
-def _fractions(path: Path, raw: Any, count: int) -> Floats:
+def _fractions(path: Path, raw: Any, count: int) -> Array:
     """Colours (N, 3) in [0, 1] of a range that follows from their type."""
     colors = np.array(raw)
     if colors.ndim != 2 or len(colors) != count or colors.shape[1] < 3:
         raise InputError(f"{path}: colours of shape {colors.shape}, wanted {count} rows of red green blue")
-    fractions: Floats = colors[:, :3] / BRIGHTEST.get(colors.dtype.str[1:], 1.0)
+    fractions: Array = colors[:, :3] / BRIGHTEST.get(colors.dtype.str[1:], 1.0)
     if not np.all((fractions >= 0.0) & (fractions <= 1.0)):
         raise InputError(f"{path}: a colour of {np.abs(colors).max():g}, wanted 0 to 1 or bytes")
     return np.asarray(fractions, dtype=np.float64)

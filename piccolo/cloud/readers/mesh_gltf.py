@@ -1,19 +1,24 @@
-"""The JSON of glTF and GLB files, cut down to what is read here before trimesh sees it.
+"""Checks of glTF and GLB files before trimesh reads them, and their JSON without what is not read here.
 
-trimesh passes over what it doesn't know (compression, sparse accessors) and takes zeros; here it is refused.
+trimesh raises an error where data are cut off. But it takes zeros for compressed or sparse data, passes over
+what it doesn't know, and follows nodes and copies shared data without a limit: that is checked here.
 """
 
 import json
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 from ...errors import InputError
-from .mesh_files import Beside
-from .mesh_glb import WANTED, glb_parts, has_glb_magic
-from .mesh_texture import check_image, first_line
+from .mesh_files import FolderResolver
+from .mesh_texture import first_line
 
+GLB_MAGIC = b"glTF"
+WANTED = "wanted a whole glTF 2.0 mesh"
 KNOWN_EXTENSIONS = frozenset({"KHR_materials_unlit", "EXT_texture_webp"})  # of those a file may require
+UNREAD_EXTENSIONS = frozenset({"KHR_materials_pbrSpecularGlossiness", "KHR_texture_transform"})
 MAX_DEPTH = 200  # nodes below each other: a chain of n costs n^2
 MAX_ROWS = 20_000_000  # vertices and indices of all primitives; more only in a file of more bytes
 MAX_SHARING = 4  # times that a byte may be part of an accessor, on average
@@ -21,8 +26,13 @@ MAX_SHARING = 4  # times that a byte may be part of an accessor, on average
 BYTES_OF_TYPE = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 NUM_OF_SHAPE = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 FLOAT = 5126
-NORMALIZED = frozenset({5121, 5123, FLOAT})
 TRIANGLES, STRIP, FAN = 4, 5, 6
+COUNTS = {  # numbers that trimesh would count from the end if they were negative
+    "bufferViews": ("buffer", "byteOffset", "byteLength", "byteStride"),
+    "accessors": ("bufferView", "byteOffset", "count"),
+    "images": ("bufferView",),
+    "nodes": ("mesh",),
+}
 
 Json = dict[str, Any]
 
@@ -31,252 +41,171 @@ Json = dict[str, Any]
 class Material:
     """The base colour of a glTF material."""
 
-    factor: tuple[float, float, float]  # linear light
-    has_texture: bool
-    is_given: bool = True  # False: the primitive has no material
+    factor: tuple[float, float, float] = (1.0, 1.0, 1.0)  # linear light
+    texture: Json | None = None
 
 
-NO_MATERIAL = Material((1.0, 1.0, 1.0), False, False)
+NO_MATERIAL = Material()  # of primitives without one, the first of all
 
 
-@dataclass(frozen=True)
-class Narrowed:
-    """A glTF file with nothing in it but triangles, base colours and nodes."""
-
-    content: bytes  # JSON, without the buffers
-    materials: list[Material]  # named by their rows
+def has_glb_magic(head: bytes) -> bool:
+    """True if a file that begins with the bytes `head` says it is GLB."""
+    return head.startswith(GLB_MAGIC)
 
 
-def narrow(content: bytes, beside: Beside) -> Narrowed:
-    """Check a glTF or GLB file against its sizes; its buffers are then found `beside` it."""
-    path = beside.path
-    text, binary = glb_parts(path, content) if has_glb_magic(content) else (content, None)
+def sanitize_gltf(content: bytes, resolver: FolderResolver) -> tuple[bytes, list[Material]]:
+    """A checked glTF or GLB file with triangles, base colours and nodes only; materials, by rows as named."""
+    path = resolver.path
+    head, text, data = _glb_parts(path, content) if has_glb_magic(content) else (b"", content, b"")
     try:
         tree = json.loads(text)
-        return _Narrower(path, beside, tree, binary, len(content)).narrowed()
+        _check_version(path, tree)
+        num_bytes = len(content) + _num_bytes_of_files(tree, resolver)
+        _check_data(path, tree, num_bytes)
+        _check_nodes(path, tree)
+        materials = [NO_MATERIAL, *(_material(path, given) for given in tree.get("materials", []))]
+        _keep_base_colors(tree, materials)
+        _keep_triangles(path, tree, materials, num_bytes)
+        for node in tree.get("nodes", []):
+            node.pop("camera", None)  # with which trimesh passes over the node's mesh
+            node.pop("name", None)  # trimesh before 5 mixes up nodes named "world"
+        text = json.dumps(tree).encode()
     except InputError:
         raise
     except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
         raise InputError(f"{path}: broken JSON ({first_line(error)}), {WANTED}") from error
+    return head + (struct.pack("<I4s", len(text), b"JSON") if head else b"") + text + data, materials
 
 
-@dataclass
-class _Narrower:
-    path: Path
-    beside: Beside
-    tree: Json
-    binary: bytes | None
-    num_bytes: int
-    num_rows: int = 0  # of the primitives so far
+def _glb_parts(path: Path, content: bytes) -> tuple[bytes, bytes, bytes]:
+    """Head of a GLB file, its JSON, and the parts behind."""
+    version, size, json_size, kind = struct.unpack_from("<III4s", content.ljust(20, b"\0"), 4)
+    if size > len(content) or 20 + json_size > size:
+        raise InputError(f"{path}: {len(content)} bytes of {max(size, 20 + json_size)}, {WANTED}")
+    if version != 2 or kind != b"JSON":
+        raise InputError(f"{path}: GLB version {version}, first part {kind!r}, {WANTED}")
+    return content[:12], content[20 : 20 + json_size], content[20 + json_size : size]
 
-    def narrowed(self) -> Narrowed:
-        self._check_extensions()
-        buffers = self._buffers()
-        self._check_views(buffers)
-        self._check_accessors()
-        self._check_nodes()
-        images = self._images(buffers)
-        given = self.tree.get("materials", [])
-        materials = [self._material(material) for material in given]
-        kept = [self._kept_material(i, material) for i, material in enumerate(given)]
-        meshes = [
-            {"primitives": [p for p in map(self._primitive, mesh["primitives"]) if p]}
-            for mesh in self.tree.get("meshes", [])
-        ]
-        tree = {
-            "asset": {"version": str(self.tree["asset"]["version"])},
-            "buffers": [{"uri": name} for name in self._in_memory(buffers)],
-            "bufferViews": self.tree.get("bufferViews", []),
-            "accessors": self.tree.get("accessors", []),
-            "images": images,
-            "textures": [{"source": i} for i in range(len(images))],
-            "materials": [*kept, {"name": str(len(kept))}],
-            "meshes": meshes,
-            "nodes": [_kept_node(node) for node in self.tree.get("nodes", [])],
-            "scenes": [{"nodes": self._roots()}],
-        }
-        return Narrowed(json.dumps(tree).encode(), [*materials, NO_MATERIAL])
 
-    def _check_extensions(self) -> None:
-        unknown = set(self.tree.get("extensionsRequired", [])) - KNOWN_EXTENSIONS
-        if unknown:
-            names = ", ".join(sorted(map(str, unknown)))
-            raise InputError(
-                f"{self.path}: requires the extensions {names[:100]!a}, wanted a plain glTF mesh"
-            )
+def _check_version(path: Path, tree: Json) -> None:
+    if str(tree["asset"]["version"]).partition(".")[0] != "2":
+        raise InputError(f"{path}: glTF version {str(tree['asset']['version'])[:20]!a}, {WANTED}")
+    unknown = set(tree.get("extensionsRequired", [])) - KNOWN_EXTENSIONS
+    if unknown:
+        names = ", ".join(sorted(map(str, unknown)))
+        raise InputError(f"{path}: requires the extensions {names[:100]!a}, wanted a plain glTF mesh")
 
-    def _buffers(self) -> list[bytes]:
-        buffers = []
-        for i, buffer in enumerate(self.tree.get("buffers", [])):
-            if "uri" in buffer:
-                content = self.beside.uri_content(buffer["uri"])
-            elif i == 0 and self.binary is not None:
-                content = self.binary
-            else:
-                raise InputError(f"{self.path}: buffer {i} has no data, {WANTED}")
-            if _count(buffer["byteLength"]) > len(content):
-                raise InputError(
-                    f"{self.path}: buffer {i} promises {buffer['byteLength']} bytes, found {len(content)}"
-                )
-            buffers.append(content)
-        self.num_bytes += sum({id(content): len(content) for content in buffers}.values())
-        return buffers
 
-    def _in_memory(self, buffers: list[bytes]) -> list[str]:
-        """Names under which trimesh finds the buffers; no file has them, as ':' is refused there."""
-        names = [f":{i}" for i in range(len(buffers))]
-        self.beside.in_memory.update(zip(names, buffers, strict=True))
-        return names
-
-    def _check_views(self, buffers: list[bytes]) -> None:
-        total = 0
-        for i, view in enumerate(self.tree.get("bufferViews", [])):
-            size = _count(view["byteLength"])
-            if _count(view.get("byteOffset", 0)) + size > len(buffers[_count(view["buffer"])]):
-                raise InputError(f"{self.path}: buffer view {i} lies outside its buffer, {WANTED}")
-            total += size
-        self._check_total(total)
-
-    def _check_accessors(self) -> None:
-        total, views = 0, self.tree.get("bufferViews", [])
-        for i, accessor in enumerate(self.tree.get("accessors", [])):
-            if "sparse" in accessor or "bufferView" not in accessor:
-                raise InputError(f"{self.path}: accessor {i} is sparse or compressed, wanted plain data")
-            row = BYTES_OF_TYPE[accessor["componentType"]] * NUM_OF_SHAPE[accessor["type"]]
-            view = views[_count(accessor["bufferView"])]
-            count = _count(accessor["count"])
-            stride = _count(view.get("byteStride", row))
-            needed = _count(accessor.get("byteOffset", 0)) + max(count - 1, 0) * stride + row
-            if (count and needed > view["byteLength"]) or stride < row:
-                raise InputError(
-                    f"{self.path}: accessor {i} promises {count} rows of {row} bytes, its data have "
-                    f"{view['byteLength']}; the file is cut off or broken"
-                )
-            total += count * row
-        self._check_total(total)
-
-    def _check_total(self, total: int) -> None:
-        if total > MAX_SHARING * self.num_bytes:
-            raise InputError(f"{self.path}: {total} bytes of data promised in {self.num_bytes}, {WANTED}")
-
-    def _roots(self) -> list[int]:
-        scenes = self.tree.get("scenes", [])
-        if not scenes:
-            return []
-        return [_count(i) for i in scenes[_count(self.tree.get("scene", 0))].get("nodes", [])]
-
-    def _check_nodes(self) -> None:
-        """Refuse nodes that are no tree: they could stand for any number of meshes."""
-        nodes, level, seen, depth = self.tree.get("nodes", []), self._roots(), set[int](), 0
-        while level:
-            if len(set(level)) < len(level) or seen.intersection(level):
-                raise InputError(f"{self.path}: a node is named twice in its scene, {WANTED}")
-            depth += 1
-            if depth > MAX_DEPTH:
-                raise InputError(f"{self.path}: over {MAX_DEPTH} nodes below each other, {WANTED}")
-            seen.update(level)
-            level = [_count(child) for i in level for child in nodes[i].get("children", [])]
-
-    def _images(self, buffers: list[bytes]) -> list[Json]:
-        """The images of base colours, checked; empty ones instead of all others."""
-        textures = [_base(material).get("baseColorTexture") for material in self.tree.get("materials", [])]
-        wanted = {self._image_row(texture) for texture in textures if texture}
-        views = dict[int, bytes]()  # one copy, however many images share it
-        kept: list[Json] = []
-        for i, image in enumerate(self.tree.get("images", [])):
-            if i not in wanted:
-                kept.append({})
+def _num_bytes_of_files(tree: Json, resolver: FolderResolver) -> int:
+    """Size of the buffers that are files of their own; their names are decoded, which trimesh leaves out."""
+    for kind in ("buffers", "images"):
+        for entry in tree.get(kind, []):
+            if entry.get("uri", "data:").startswith("data:"):
                 continue
-            name = f":image {i}"
-            if "bufferView" in image:
-                row = _count(image["bufferView"])
-                view = self.tree["bufferViews"][row]
-                start = view.get("byteOffset", 0)
-                if row not in views:
-                    views[row] = buffers[view["buffer"]][start : start + view["byteLength"]]
-                content = views[row]
-            else:
-                content = self.beside.uri_content(image["uri"])
-            check_image(self.path, f"of image {i}", content)
-            self.beside.in_memory[name] = content
-            kept.append({"uri": name})
-        return kept
-
-    def _material(self, material: Json) -> Material:
-        base = _base(material)
-        extensions = {
-            *material.get("extensions", {}),
-            *(base.get("baseColorTexture") or {}).get("extensions", {}),
-        }
-        for name in ("KHR_materials_pbrSpecularGlossiness", "KHR_texture_transform"):
-            if name in extensions:
-                raise InputError(f"{self.path}: a material uses {name}, wanted plain base colours")
-        red, green, blue, _ = map(float, base.get("baseColorFactor", [1.0] * 4))
-        if not all(0.0 <= value <= 1.0 for value in (red, green, blue)):
-            raise InputError(f"{self.path}: a base colour of {red:g} {green:g} {blue:g}, wanted 0 to 1")
-        return Material((red, green, blue), "baseColorTexture" in base)
-
-    def _image_row(self, texture: Json) -> int:
-        """Which image a material's texture shows."""
-        given = self.tree["textures"][_count(texture["index"])]
-        webp = given.get("extensions", {}).get("EXT_texture_webp", {})
-        return _count(webp.get("source", given.get("source")))
-
-    def _kept_material(self, i: int, material: Json) -> Json:
-        texture = _base(material).get("baseColorTexture")
-        base = {"baseColorTexture": {"index": self._image_row(texture)}} if texture else {}
-        return {"name": str(i), "pbrMetallicRoughness": base}
-
-    def _primitive(self, primitive: Json) -> Json | None:
-        """A primitive with its positions, colours and the uv of its base colour; None for points, lines."""
-        mode = primitive.get("mode", TRIANGLES)
-        if mode == FAN:
-            raise InputError(f"{self.path}: has triangle fans, wanted triangles")
-        if mode not in (TRIANGLES, STRIP):
-            return None
-        given = primitive["attributes"]
-        materials = self.tree.get("materials", [])
-        row, material = len(materials), {}
-        if "material" in primitive:
-            row = _count(primitive["material"])
-            material = materials[row]
-        texture = _base(material).get("baseColorTexture") or {}
-        names = {
-            "POSITION": "POSITION",
-            "TEXCOORD_0": f"TEXCOORD_{_count(texture.get('texCoord', 0))}",
-            "COLOR_0": "COLOR_0",
-        }
-        attributes = {name: _count(given[source]) for name, source in names.items() if source in given}
-        if not texture:
-            attributes.pop("TEXCOORD_0", None)
-        self._check_types(attributes)
-        self._count_rows(attributes, primitive)
-        kept = {"mode": mode, "attributes": attributes, "material": row}
-        if "indices" in primitive:
-            kept["indices"] = _count(primitive["indices"])
-        return kept
-
-    def _count_rows(self, attributes: dict[str, int], primitive: Json) -> None:
-        """Refuse attributes of different lengths, and data that primitives share without end."""
-        accessors = self.tree["accessors"]
-        counts = {accessors[row]["count"] for row in attributes.values()}
-        if len(counts) > 1:
-            raise InputError(f"{self.path}: a primitive with {sorted(counts)} rows, wanted as many of each")
-        rows = [_count(primitive["indices"])] if "indices" in primitive else []
-        self.num_rows += sum(counts) + sum(accessors[row]["count"] for row in rows)
-        if self.num_rows > max(MAX_ROWS, self.num_bytes):
-            raise InputError(f"{self.path}: over {MAX_ROWS} vertices and indices in {self.num_bytes} bytes")
-
-    def _check_types(self, attributes: dict[str, int]) -> None:
-        wanted = {"POSITION": ({FLOAT}, {"VEC3"}), "TEXCOORD_0": ({FLOAT}, {"VEC2"})}
-        for name, row in attributes.items():
-            accessor = self.tree["accessors"][row]
-            types, shapes = wanted.get(name, (NORMALIZED, {"VEC3", "VEC4"}))
-            if accessor["componentType"] not in types or accessor["type"] not in shapes:
+            name = entry["uri"] = unquote(entry["uri"])
+            if kind == "buffers" and len(resolver[name]) < _count(entry["byteLength"]):
                 raise InputError(
-                    f"{self.path}: {name} of type {accessor['componentType']} {accessor['type']}, wanted "
-                    f"float {' or '.join(sorted(shapes))}"
+                    f"{resolver.path}: the buffer {name[:100]!a} has {len(resolver[name])} of "
+                    f"{entry['byteLength']} bytes, {WANTED}"
                 )
+    return resolver.num_bytes
+
+
+def _check_data(path: Path, tree: Json, num_bytes: int) -> None:
+    """Refuse data that trimesh would take for zeros, count from the end or copy without a limit."""
+    for kind, names in COUNTS.items():
+        for entry in tree.get(kind, []):
+            for name in entry.keys() & names:
+                _count(entry[name])
+    views, accessors, size = tree.get("bufferViews", []), tree.get("accessors", []), 0
+    for i, accessor in enumerate(accessors):
+        if "sparse" in accessor or "bufferView" not in accessor:
+            raise InputError(f"{path}: accessor {i} is sparse or compressed, wanted plain data")
+        row = BYTES_OF_TYPE[accessor["componentType"]] * NUM_OF_SHAPE[accessor["type"]]
+        stride = views[accessor["bufferView"]].get("byteStride", row)
+        if stride < row:
+            raise InputError(f"{path}: accessor {i} has rows of {row} bytes, {stride} bytes apart, {WANTED}")
+        size += accessor["count"] * row
+    size = max(size, sum(view["byteLength"] for view in views))
+    if size > MAX_SHARING * num_bytes:
+        raise InputError(f"{path}: {size} bytes of data promised in {num_bytes}, {WANTED}")
+
+
+def _check_nodes(path: Path, tree: Json) -> None:
+    """Refuse nodes that form no tree: they could place any number of meshes."""
+    scenes, nodes, seen = tree.get("scenes", []), tree.get("nodes", []), set[int]()
+    level = scenes[_count(tree.get("scene", 0))].get("nodes", []) if scenes else []
+    for _ in range(MAX_DEPTH):
+        num_seen = len(seen)
+        seen.update(level)
+        if len(seen) < num_seen + len(level):
+            raise InputError(f"{path}: a node is named twice in its scene, {WANTED}")
+        level = [child for i in level for child in nodes[_count(i)].get("children", [])]
+    if level:
+        raise InputError(f"{path}: over {MAX_DEPTH} nodes below each other, {WANTED}")
+
+
+def _material(path: Path, material: Json) -> Material:
+    """The base colour of a material."""
+    base = material.get("pbrMetallicRoughness", {})
+    texture = base.get("baseColorTexture")
+    for name in UNREAD_EXTENSIONS & {*material.get("extensions", {}), *(texture or {}).get("extensions", {})}:
+        raise InputError(f"{path}: a material uses {name}, wanted plain base colours")
+    red, green, blue, _ = map(float, base.get("baseColorFactor", [1.0] * 4))
+    if not all(0.0 <= value <= 1.0 for value in (red, green, blue)):
+        raise InputError(f"{path}: a base colour of {red:g} {green:g} {blue:g}, wanted 0 to 1")
+    return Material((red, green, blue), texture)
+
+
+def _image_row(tree: Json, texture: Json) -> int:
+    """Which image a texture shows."""
+    given = tree["textures"][_count(texture["index"])]
+    return _count(given.get("extensions", {}).get("EXT_texture_webp", given)["source"])
+
+
+def _keep_base_colors(tree: Json, materials: list[Material]) -> None:
+    """Leave the images of base colours only; materials take their rows as names."""
+    used = {_image_row(tree, material.texture) for material in materials if material.texture is not None}
+    tree["images"] = [image if i in used else {} for i, image in enumerate(tree.get("images", []))]
+    tree["materials"] = [
+        {"name": str(i), "pbrMetallicRoughness": {"baseColorTexture": material.texture}}
+        for i, material in enumerate(materials)
+    ]
+
+
+def _keep_triangles(path: Path, tree: Json, materials: list[Material], num_bytes: int) -> None:
+    """Leave primitives of triangles only; refuse data that too many of them share."""
+    accessors, num_rows = tree.get("accessors", []), 0
+    for mesh in tree.get("meshes", []):
+        triangles = [p for p in mesh["primitives"] if p.get("mode", TRIANGLES) in (TRIANGLES, STRIP, FAN)]
+        kept = [_primitive(path, accessors, materials, primitive) for primitive in triangles]
+        mesh.clear()
+        mesh["primitives"] = kept
+        rows = [p["attributes"]["POSITION"] for p in kept] + [p["indices"] for p in kept if "indices" in p]
+        num_rows += sum(accessors[row]["count"] for row in rows)
+    if num_rows > max(MAX_ROWS, num_bytes):
+        raise InputError(f"{path}: over {MAX_ROWS} vertices and indices in {num_bytes} bytes")
+
+
+def _primitive(path: Path, accessors: list[Json], materials: list[Material], primitive: Json) -> Json:
+    """A primitive with its positions, colours and the base colour's uv."""
+    if primitive.get("mode") == FAN:
+        raise InputError(f"{path}: has triangle fans, wanted triangles")
+    row = _count(primitive["material"]) + 1 if "material" in primitive else 0
+    texture = materials[row].texture
+    sources = {"POSITION": "POSITION", "COLOR_0": "COLOR_0"}
+    if texture is not None:
+        sources["TEXCOORD_0"] = f"TEXCOORD_{texture.get('texCoord', 0)}"  # the only one that trimesh reads
+    given = primitive["attributes"]
+    attributes = {name: _count(given[source]) for name, source in sources.items() if source in given}
+    counts = {accessors[i]["count"] for i in attributes.values()}
+    if len(counts) > 1:
+        raise InputError(f"{path}: a primitive with {sorted(counts)} rows, wanted as many of each")
+    for name in attributes.keys() - {"COLOR_0"}:
+        if accessors[attributes[name]]["componentType"] != FLOAT:
+            raise InputError(f"{path}: {name} of whole numbers, wanted floats")
+    kept = {name: _count(primitive[name]) for name in ("mode", "indices") if name in primitive}
+    return kept | {"attributes": attributes, "material": row}
 
 
 def _count(value: object) -> int:
@@ -284,16 +213,3 @@ def _count(value: object) -> int:
     if not isinstance(value, int) or value < 0:
         raise ValueError(f"{str(value)[:40]} where a count or an index is wanted")
     return value
-
-
-def _base(material: Json) -> Json:
-    base: Json = material.get("pbrMetallicRoughness", {})
-    return base
-
-
-def _kept_node(node: Json) -> Json:
-    return {
-        name: node[name]
-        for name in ("mesh", "children", "matrix", "translation", "rotation", "scale")
-        if name in node
-    }

@@ -6,15 +6,14 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from importlib import import_module
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
 from ...runtime.optional import library
-from .mesh_files import Beside
-from .mesh_gltf import Material, narrow
+from .mesh_files import FolderResolver
+from .mesh_gltf import Material, has_glb_magic, sanitize_gltf
 from .mesh_texture import Texture, check_image, first_line, own_limit, texture_of
 
 WANTED = "wanted a mesh with textures, vertex colours or materials"
@@ -50,15 +49,13 @@ class Loaded:
 
 def load_gltf(path: Path, content: bytes) -> Loaded:
     """A glTF or GLB file."""
-    library(path, "PIL.Image")
-    beside = Beside(path)
-    narrowed = narrow(content, beside)
-    return Loaded(path, _scene(beside, narrowed.content, "gltf"), narrowed.materials)
+    resolver = FolderResolver(path)
+    sanitized, materials = sanitize_gltf(content, resolver)
+    return Loaded(path, _scene(resolver, sanitized, "glb" if has_glb_magic(content) else "gltf"), materials)
 
 
 def load_obj(path: Path, content: bytes) -> Loaded:
     """An OBJ file with its materials."""
-    library(path, "PIL.Image")
     try:
         content.decode()
     except UnicodeDecodeError:
@@ -69,24 +66,24 @@ def load_obj(path: Path, content: bytes) -> Loaded:
     odd = ODD_FACE.search(content)
     if odd:
         raise InputError(f"{path}: a face {odd[0][:40].decode('latin-1')!a}, wanted indices from 1 upwards")
-    beside = Beside(path)
-    _check_libraries(beside, content)
-    return Loaded(path, _scene(beside, content, "obj"))
+    resolver = FolderResolver(path)
+    _check_libraries(resolver, content)
+    return Loaded(path, _scene(resolver, content, "obj"))
 
 
-def _check_libraries(beside: Beside, content: bytes) -> None:
+def _check_libraries(resolver: FolderResolver, content: bytes) -> None:
     """Refuse materials that trimesh would do without."""
     names = sorted(set(LIBRARY_LINE.findall(content)))
     if len(names) > 1:
-        raise InputError(f"{beside.path}: names {len(names)} files of materials, wanted one")
+        raise InputError(f"{resolver.path}: names {len(names)} files of materials, wanted one")
     for name in names:
-        text = beside.get(name.decode()).decode("utf-8", "replace")
-        _check_textures(beside, TEXTURE_LINE.findall(text))
+        text = resolver.get(name.decode()).decode("utf-8", "replace")
+        _check_textures(resolver, TEXTURE_LINE.findall(text))
 
 
-def _check_textures(beside: Beside, names: list[str]) -> None:
+def _check_textures(resolver: FolderResolver, names: list[str]) -> None:
     for name in sorted(set(names)):
-        check_image(beside.path, ascii(name[:100]), beside.get(name))
+        check_image(resolver.path, ascii(name[:100]), resolver.get(name))
 
 
 def _with_raw_colors(parsed: dict[str, Any]) -> dict[str, Any]:
@@ -101,23 +98,23 @@ def _with_raw_colors(parsed: dict[str, Any]) -> dict[str, Any]:
     return parsed
 
 
-def _scene(beside: Beside, content: bytes, kind: str, has_texture: bool = True) -> Any:
-    trimesh = library(beside.path, "trimesh")
+def _scene(resolver: FolderResolver, content: bytes, kind: str, has_texture: bool = True) -> Any:
+    trimesh = library(resolver.path, "trimesh")
     try:
-        with own_limit(beside.path), _strict():
-            # a texture's corners are told apart only where there is a texture: colours go by vertices
+        with own_limit(), _strict():
+            # vertices are split by texture coordinates only if there is a texture: colours go by vertices
             options = {"fix_texture": has_texture} if kind == "ply" else {}
-            load = getattr(import_module(f"trimesh.exchange.{kind}"), f"load_{kind}")
-            parsed = load(BytesIO(content), resolver=beside, **options)
+            load = trimesh.exchange.load.mesh_loaders[kind]
+            parsed = load(BytesIO(content), resolver=resolver, **options)
             scene = trimesh.load_scene(_with_raw_colors(parsed))
     except InputError:
         raise
     except Exception as error:  # whatever trimesh stumbles over
-        if beside.refusal is None:
-            text = f"{beside.path}: trimesh can't read it ({first_line(error)}), {WANTED}"
-            raise InputError(text) from error
-    if beside.refusal is not None:
-        raise beside.refusal
+        if resolver.refusal is None:
+            text = f"trimesh can't read it ({first_line(error)}); the file may be damaged or cut off"
+            raise InputError(f"{resolver.path}: {text}") from error
+    if resolver.refusal is not None:
+        raise resolver.refusal
     return scene
 
 
@@ -140,15 +137,14 @@ def _strict() -> Iterator[None]:
 
 def load_ply(path: Path) -> Loaded:
     """A PLY file with faces."""
-    library(path, "PIL.Image")
     content = path.read_bytes()
-    beside = Beside(path)
+    resolver = FolderResolver(path)
     header = content.partition(b"end_header")[0].decode("utf-8", "replace")
     textures = TEXTURE_COMMENT.findall(header)
     if len(textures) > 1:
         raise InputError(f"{path}: names {len(textures)} textures, wanted one")
-    _check_textures(beside, textures)
-    loaded = Loaded(path, _scene(beside, content, "ply", bool(textures)))
+    _check_textures(resolver, textures)
+    loaded = Loaded(path, _scene(resolver, content, "ply", bool(textures)))
     for mesh in loaded.scene.geometry.values():
         if "_ply_raw" in mesh.metadata:
             _check_ply(path, mesh.metadata["_ply_raw"])

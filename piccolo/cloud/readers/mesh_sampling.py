@@ -1,8 +1,9 @@
 """Points spread evenly over triangles, and their colours.
 
-Point k of N stands at the share (k + 1/2) / N of the area, triangles laid one after the other, so that every
-triangle gets its share within one point. Its place in the triangle is the k-th point of the R2 sequence
-(Roberts, 2018), which leaves no clumps and no gaps. All depends on k alone: not on chunks, not on chance.
+Point k of N stands at the fraction (k + 1/2) / N of the area, triangles laid one after the other, so that
+every triangle gets its part of the points within one. Its place in the triangle is the k-th point of the R2
+sequence (Roberts, 2018), which leaves no clumps and no gaps. All depends on k alone: not on chunks, not on
+chance.
 """
 
 from collections.abc import Iterator, Sequence
@@ -11,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...geometry.pose import Array
 from .mesh_texture import Texture
 from .reader import CHUNK, RawCloud
 
@@ -18,30 +20,28 @@ from .reader import CHUNK, RawCloud
 R2_STEPS = (0.7548776662466927, 0.5698402909980532)
 BLOCK = 1 << 18  # triangles whose corners are held at once
 
-Floats = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class Surface:
     """Triangles of one material, in a frame of their own."""
 
-    vertices: Floats  # (V, 3), NaN: the triangle is left out
+    vertices: Array  # (V, 3), NaN: the triangle is left out
     triangles: NDArray[np.int64]  # (T, 3) rows of vertices
-    uv: Floats | None = None  # (V, 2), v upwards from the lower edge
+    uv: Array | None = None  # (V, 2), v upwards from the lower edge
     texture: Texture | None = None
-    colors: Floats | None = None  # (C, 3) in [0, 1]; with a texture: factors
+    colors: Array | None = None  # (C, 3) in [0, 1]; with a texture: factors
     corners: NDArray[np.int64] | None = None  # (T, 3) rows of colors
     is_linear: bool = False  # colors are linear light, not sRGB
 
 
 @dataclass(frozen=True)
-class Placed:
-    """A surface in the world."""
+class SurfaceInstance:
+    """A surface where a node places it in the world."""
 
     surface: Surface
-    T_world_from_surface: Floats  # (4, 4)
+    T_world_from_surface: Array  # (4, 4)
 
-    def areas(self) -> Floats:
+    def areas(self) -> Array:
         """Areas (T,) of the triangles; 0 for those that aren't finite."""
         surface = self.surface
         areas = np.empty(len(surface.triangles))
@@ -60,46 +60,43 @@ class Placed:
 class Sampling:
     """How many points fall on which surface."""
 
-    parts: Sequence[Placed]
-    ends: Floats  # (P,) area up to the end of each part
+    instances: Sequence[SurfaceInstance]
+    ends: Array  # (P,) area up to the end of each instance
     num_points: int
 
     def read(self) -> Iterator[RawCloud]:
         """Yield the points of one surface after the other, at most CHUNK at once."""
-        area_a_point = float(self.ends[-1]) / self.num_points
-        # the first point at or behind each part's end
-        behind = np.ceil(self.ends / area_a_point - 0.5).astype(np.int64)
+        area_per_point = float(self.ends[-1]) / self.num_points
+        # the first point at or behind each instance's end
+        behind = np.ceil(self.ends / area_per_point - 0.5).astype(np.int64)
         behind[-1] = self.num_points
         last: Texture | None = None
         texels: NDArray[np.uint8] | None = None
-        for i, part in enumerate(self.parts):
+        for i, instance in enumerate(self.instances):
             first, end = (int(behind[i - 1]) if i else 0), int(behind[i])
             if first == end:
                 continue
-            texture = part.surface.texture
+            texture = instance.surface.texture
             if texture is not last:
                 texels = None  # before the next is decoded
                 texels = texture.texels() if texture else None
                 last = texture
-            within = np.add.accumulate(part.areas())
+            area_up_to = np.add.accumulate(instance.areas())
             area_before = float(self.ends[i - 1]) if i else 0.0
             for begin in range(first, end, CHUNK):
                 k = np.arange(begin, min(begin + CHUNK, end))
-                shares = np.asarray((k + 0.5) * area_a_point - area_before, dtype=np.float64)
-                yield _points(part, k, _triangles_at(within, shares), texels)
+                areas = np.asarray((k + 0.5) * area_per_point - area_before, dtype=np.float64)
+                yield _points(instance, k, _triangles_at(area_up_to, areas), texels)
 
 
-def _triangles_at(within: Floats, shares: Floats) -> NDArray[np.int64]:
-    """The triangle at each share of the area, `within` being the areas up to each one's end.
-
-    The first whose end lies behind the share: never one of area 0.
-    """
-    last = int(np.searchsorted(within, within[-1]))  # rounding may put a share behind all ends
-    found = np.searchsorted(within, shares, side="right")
+def _triangles_at(area_up_to: Array, areas: Array) -> NDArray[np.int64]:
+    """The triangles (N,) at `areas` (N,) of the running sum `area_up_to` (T,): never one of area 0."""
+    last = int(np.searchsorted(area_up_to, area_up_to[-1]))  # rounding may put an area behind all ends
+    found = np.searchsorted(area_up_to, areas, side="right")
     return np.minimum(found, last)
 
 
-def weights_of(k: NDArray[np.int64]) -> Floats:
+def weights_of(k: NDArray[np.int64]) -> Array:
     """Barycentric coordinates (N, 3) of the points k: the R2 sequence, its square folded to a triangle."""
     a, b = (np.modf(0.5 + k * step)[0] for step in R2_STEPS)
     is_beyond = a + b > 1.0
@@ -108,28 +105,28 @@ def weights_of(k: NDArray[np.int64]) -> Floats:
 
 
 def _points(
-    part: Placed, k: NDArray[np.int64], rows: NDArray[np.int64], texels: NDArray[np.uint8] | None
+    instance: SurfaceInstance, k: NDArray[np.int64], rows: NDArray[np.int64], texels: NDArray[np.uint8] | None
 ) -> RawCloud:
     """The points k in the triangles `rows`; those on texels of alpha 0 are left out."""
-    surface, weights = part.surface, weights_of(k)
-    matrix = part.T_world_from_surface
+    surface, weights = instance.surface, weights_of(k)
+    matrix = instance.T_world_from_surface
     triangles = surface.triangles[rows]
     points_world = _blend(surface.vertices, triangles, weights) @ matrix[:3, :3].T + matrix[:3, 3]
-    tints = None
+    factors = None
     if surface.colors is not None and surface.corners is not None:
-        tints = _blend(surface.colors, surface.corners[rows], weights)
+        factors = _blend(surface.colors, surface.corners[rows], weights)
     if texels is None or surface.uv is None:
-        if tints is None:
+        if factors is None:
             raise ValueError("a surface without colours")
-        return RawCloud(points_world, _bytes(encoded(tints) if surface.is_linear else tints))
+        return RawCloud(points_world, _bytes(linear_to_srgb(factors) if surface.is_linear else factors))
     found = look_up(texels, _blend(surface.uv, triangles, weights))
     colors, is_visible = found[:, :3], found[:, 3] > 0
-    if tints is not None:
-        colors = _bytes(encoded(decoded(colors) * tints))
+    if factors is not None:
+        colors = _bytes(linear_to_srgb(srgb_to_linear(colors) * factors))
     return RawCloud(points_world[is_visible], np.ascontiguousarray(colors[is_visible]))
 
 
-def _blend(values: Floats, corners: NDArray[np.int64], weights: Floats) -> Floats:
+def _blend(values: Array, corners: NDArray[np.int64], weights: Array) -> Array:
     """Values (N, D) between those at the corners (N, 3)."""
     blended = values[corners[:, 0]] * weights[:, :1]
     for i in (1, 2):
@@ -137,7 +134,7 @@ def _blend(values: Floats, corners: NDArray[np.int64], weights: Floats) -> Float
     return blended
 
 
-def look_up(texels: NDArray[np.uint8], uv: Floats) -> NDArray[np.uint8]:
+def look_up(texels: NDArray[np.uint8], uv: Array) -> NDArray[np.uint8]:
     """The texels (N, 4) under uv (N, 2): u to the right, v upwards from the lower edge, both repeating."""
     height, width = texels.shape[:2]
     turned = np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)
@@ -148,17 +145,17 @@ def look_up(texels: NDArray[np.uint8], uv: Floats) -> NDArray[np.uint8]:
     return found
 
 
-def decoded(colors: NDArray[np.uint8]) -> Floats:
+def srgb_to_linear(colors: NDArray[np.uint8]) -> Array:
     """Linear light in [0, 1] of sRGB bytes (IEC 61966-2-1)."""
     levels = np.arange(256) / 255.0
-    linear: Floats = np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
+    linear: Array = np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
     return linear[colors]
 
 
-def encoded(linear: Floats) -> Floats:
+def linear_to_srgb(linear: Array) -> Array:
     """Values of sRGB in [0, 1] of linear light in [0, 1]."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
 
 
-def _bytes(colors: Floats) -> NDArray[np.uint8]:
+def _bytes(colors: Array) -> NDArray[np.uint8]:
     return np.rint(np.clip(colors, 0.0, 1.0) * 255.0).astype(np.uint8)

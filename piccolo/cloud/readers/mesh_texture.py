@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from ...errors import InputError
-from ...runtime.optional import library
 
 MAX_TEXELS = 1 << 28  # 16,384 x 16,384: 1 GiB while it is looked up, three while it is decoded
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "TGA", "GIF")
@@ -27,16 +27,8 @@ class Texture:
 
     def texels(self) -> NDArray[np.uint8]:
         """Texels (H, W, 4) RGBA, the first row at the top."""
-        images = library(self.path, "PIL.Image")
-        with own_limit(self.path):
-            try:
-                with images.open(BytesIO(self.content), formats=FORMATS) as image:
-                    _check(self.path, image)
-                    return np.asarray(image.convert("RGBA"))
-            except InputError:
-                raise
-            except Exception as error:  # Pillow's decoders raise whatever their formats bring
-                raise InputError(f"{self.path}: a texture can't be read ({first_line(error)})") from error
+        with _image(self.path, "", self.content) as image:
+            return np.asarray(image.convert("RGBA"))
 
 
 def texture_of(path: Path, image: Any) -> Texture | None:
@@ -50,28 +42,34 @@ def texture_of(path: Path, image: Any) -> Texture | None:
 
 
 @contextmanager
-def own_limit(path: Path) -> Iterator[None]:
+def own_limit() -> Iterator[None]:
     """Lift Pillow's limit, which real textures exceed: MAX_TEXELS is held here before they are decoded."""
-    images: Any = library(path, "PIL.Image")
-    limit = images.MAX_IMAGE_PIXELS
-    images.MAX_IMAGE_PIXELS = None
+    limit = Image.MAX_IMAGE_PIXELS
+    Image.MAX_IMAGE_PIXELS = None
     try:
         yield
     finally:
-        images.MAX_IMAGE_PIXELS = limit
+        Image.MAX_IMAGE_PIXELS = limit
 
 
 def check_image(path: Path, name: str, content: bytes) -> None:
     """Refuse what is no image, before trimesh passes over it."""
-    images: Any = library(path, "PIL.Image")
-    with own_limit(path):
+    with _image(path, f" {name}", content):
+        pass
+
+
+@contextmanager
+def _image(path: Path, name: str, content: bytes) -> Iterator[Image.Image]:
+    """An image of a size that is allowed; InputError if it can't be opened, or decoded by who uses it."""
+    with own_limit():
         try:
-            with images.open(BytesIO(content), formats=FORMATS) as image:
+            with Image.open(BytesIO(content), formats=FORMATS) as image:
                 _check(path, image)
+                yield image
         except InputError:
             raise
-        except Exception as error:  # as above
-            raise InputError(f"{path}: the texture {name} can't be read ({first_line(error)})") from error
+        except Exception as error:  # Pillow's decoders raise whatever their formats bring
+            raise InputError(f"{path}: the texture{name} can't be read ({first_line(error)})") from error
 
 
 def _check(path: Path, image: Any) -> None:
