@@ -35,7 +35,7 @@ OPTIONS = ("size", "offset", "axes", "timestamps", "crs")  # those that only som
 
 def build_parser() -> argparse.ArgumentParser:
     """All options. One that is not given stays None, and keeps its default."""
-    formats = "\n".join(f"  {form.name:<11} {form.about}" for form in FORMATS.values())
+    formats = "\n".join(f"  {form.name:<11} {form.description}" for form in FORMATS.values())
     parser = argparse.ArgumentParser(
         "export_poses.py",
         description=__doc__,
@@ -79,7 +79,7 @@ def options_from(arguments: argparse.Namespace) -> Options:
     if foreign := [name for name in OPTIONS if name in given and name not in form.options]:
         raise InputError(f"--{foreign[0]}: not an option of the format {arguments.format}")
     if "crs" in form.options and "crs" not in given:
-        raise InputError("--crs: not given, wanted the cloud's coordinate system, such as EPSG:25832")
+        raise InputError("--crs: wanted, the cloud's coordinate system, such as EPSG:25832")
     return Options(
         images=arguments.images,
         size=tuple(arguments.size) if arguments.size else None,
