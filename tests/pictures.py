@@ -2,9 +2,11 @@
 
 import struct
 import zlib
+from io import BytesIO
 
 import cv2
 import numpy as np
+from PIL import Image
 
 XMP_NAMESPACE = "http://ns.google.com/photos/1.0/panorama/"
 PNG_HEADER_SIZE = 33  # [byte] magic and IHDR
@@ -20,6 +22,14 @@ def smooth_rgb(height=64, width=128):
 def encoded(rgb, suffix, options=()):
     bgr = rgb[:, :, [2, 1, 0, 3][: rgb.shape[2]]] if rgb.ndim == 3 else rgb
     return cv2.imencode(suffix, bgr, list(options))[1].tobytes()
+
+
+def animation(kind):
+    """An animated PNG or WebP of two pictures."""
+    first, second = Image.fromarray(smooth_rgb()), Image.fromarray(255 - smooth_rgb())
+    file = BytesIO()
+    first.save(file, kind, save_all=True, append_images=[second])
+    return file.getvalue()
 
 
 def write(path, content):

@@ -1,11 +1,9 @@
 import base64
-import struct
-import zlib
 
 import cv2
 import numpy as np
 import pytest
-from pictures import TURNS, encoded, smooth_rgb, tiff, with_metadata, write
+from pictures import TURNS, animation, encoded, smooth_rgb, tiff, with_metadata, write
 
 from piccolo.errors import InputError
 from piccolo.panorama import read_panorama
@@ -31,7 +29,7 @@ def test_tiff_comes_back_exactly(tmp_path, order, samples, dtype):
         RANDOM16[..., :samples] if dtype == np.uint16 else (RANDOM16[..., :samples] >> 8).astype(np.uint8)
     )
     panorama = read_panorama(write(tmp_path / "a.tif", tiff(pixels, order=order)))
-    is_valid = pixels[..., 3] > 0 if samples == 4 else np.ones((64, 128), bool)
+    is_valid = RANDOM16[..., 3] >> 8 > 0 if samples == 4 else np.ones((64, 128), bool)
     np.testing.assert_array_equal(panorama.rgb, RANDOM16[..., :3] >> 8)
     np.testing.assert_array_equal(panorama.is_valid, is_valid)
 
@@ -62,6 +60,9 @@ def test_tiff_is_turned_once(tmp_path, orientation, image):
     np.testing.assert_array_equal(read_panorama(write(tmp_path / "a.tif", content)).rgb, expected)
 
 
+RARE = "the TIFF is cut off, damaged or of a rare kind"
+
+
 def test_further_pages_are_left_with_a_warning(tmp_path):
     panorama = read_panorama(write(tmp_path / "a.tif", tiff(RGB, next_begin=8)))
     np.testing.assert_array_equal(panorama.rgb, RGB)
@@ -75,29 +76,22 @@ def test_further_pages_are_left_with_a_warning(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (tiff(RGB.astype(np.float32)), "found a TIFF of 32-bit float samples, wanted 8 or 16 bits"),
-        (tiff(RGB.astype(np.uint32)), "found a TIFF of 32-bit unsigned samples, wanted 8 or 16 bits"),
-        (tiff(RGB, {258: (3, [8, 8, 16])}), "found a TIFF of 8-bit unsigned samples, wanted 8 or 16 bits"),
-        (tiff(RGB, {339: (3, [2, 2, 2])}), "found a TIFF of 8-bit signed samples"),
-        (tiff(RANDOM16, {262: (3, [5])}), "found a TIFF of CMYK, wanted RGB or grey"),
-        (tiff(RANDOM16[..., 0], {262: (3, [0])}), "found a TIFF of 16-bit grey with 0 for white"),
-        (tiff(RANDOM16, {262: (3, [4711])}), "found a TIFF of photometric 4711, wanted RGB or grey"),
-        (tiff(RGB[..., :2]), "found a grey TIFF of 2 samples a pixel, wanted grey, RGB or RGB with alpha"),
-        (tiff(RGB, {257: (4, [2_000_000])}), "found a TIFF of 128 x 2000000"),
-        (tiff(RGB, {256: (4, [0])}), "found a TIFF of 0 x 64"),
-        (tiff(RGB, {257: (4, [65])}), "the TIFF's strips hold less than the picture"),
-        (tiff(RGB, {259: (3, [5]), 256: (4, [32768]), 257: (4, [16384])}), "in a file too small for it"),
-        (tiff(RGB, {279: (4, [999_999])}), "the TIFF's strips are not all in the file"),
-        (tiff(RGB, {273: (4, [999_999])}), "the TIFF's strips are not all in the file"),
-        (tiff(RGB, {279: (4, [99, 99])}), "the TIFF's strips are not all in the file"),
-        (tiff(RGB, {273: (4, [8] * 5), 279: (4, [24000] * 5)}), "the TIFF's strips lie over each other"),
-        (tiff(RGB, {322: (4, [1 << 30]), 323: (4, [1 << 30])}), "the TIFF's tiles or strips do not fit"),
-        (tiff(RGB, {278: (4, [0])}), "the TIFF's tiles or strips do not fit"),
-        (tiff(RGB, {259: (3, [8])}), "a strip of the TIFF is damaged or too long"),
-        (tiff(RGB, {259: (3, [4711])}), "the picture can't be decoded|the picture is damaged"),
-        (tiff(RGB)[:9000], r"the TIFF has a directory that leads out of the file \(cut off.\)"),
-        (tiff(RGB)[:-40], r"the TIFF has a directory that is cut off \(cut off.\)"),
-        (tiff(RGB, {700: (1, [0] * 9)})[:-8], "the TIFF has tag 700 leads out of the file"),
+        (tiff(RGB.astype(np.float32)), RARE),
+        (tiff(RGB[..., 0].astype(np.float32)), "the TIFF's numbers are signed, inverted or of 32 bits"),
+        (tiff(RGB[..., 0].astype(np.uint32)), "the TIFF's numbers are signed, inverted or of 32 bits"),
+        (tiff(RGB[..., 0], {339: (3, [2])}), "the TIFF's numbers are signed, inverted or of 32 bits"),
+        (tiff(RANDOM16[..., 0], {262: (3, [0])}), "the TIFF's numbers are signed, inverted or of 32 bits"),
+        (tiff(RGB, {258: (3, [8, 8, 16])}), RARE),
+        (tiff(RGB, {339: (3, [2, 2, 2])}), RARE),
+        (tiff(RANDOM16, {262: (3, [4711])}), RARE),
+        (tiff(RGB, {257: (4, [2_000_000])}), "found 128 x 2000000, wanted at most"),
+        (tiff(RGB, {256: (4, [0])}), RARE),
+        (tiff(RGB, {273: (4, [999_999])}), RARE),
+        (tiff(RGB, {278: (4, [0])}), RARE),
+        (tiff(RGB, {259: (3, [8])}), RARE),
+        (tiff(RGB, {259: (3, [4711])}), RARE),
+        (tiff(RGB)[:9000], RARE),
+        (tiff(RGB)[:-40], RARE),
     ],
 )
 def test_tiffs_are_refused_by_name(tmp_path, content, message, capfd):
@@ -113,23 +107,9 @@ def test_tiff_with_damaged_strips_is_refused(tmp_path, compression, capfd):
     noise = np.random.default_rng(1).integers(0, 256, (64, 128, 3), dtype=np.uint8)
     content = bytearray(encoded(noise, ".tif", [COMPRESSION, compression]))
     content[5000:15000] = bytes(10000)
-    with pytest.raises(InputError, match="is damaged"):
+    with pytest.raises(InputError, match=RARE):
         read_panorama(write(tmp_path / "a.tif", bytes(content)))
     assert capfd.readouterr().err == ""
-
-
-def test_a_strip_that_unpacks_to_too_much_is_refused(tmp_path):
-    content = tiff(np.frombuffer(zlib.compress(bytes(60_000_000)), np.uint8)[None])
-    values = {256: 128, 257: 64, 259: 8, 278: 64}
-    begin = struct.unpack_from("<I", content, 4)[0]
-    patched = bytearray(content)
-    for k in range(begin + 2, begin + 2 + 12 * 9, 12):
-        tag = struct.unpack_from("<H", content, k)[0]
-        if tag in values:
-            struct.pack_into("<HI", patched, k + 2, 4, 1)
-            struct.pack_into("<I", patched, k + 8, values[tag])
-    with pytest.raises(InputError, match="a strip of the TIFF is damaged or too long"):
-        read_panorama(write(tmp_path / "a.tif", bytes(patched)))
 
 
 @pytest.mark.parametrize(
@@ -164,14 +144,14 @@ WEBP = with_metadata(encoded(RGB, ".webp", LOSSLESS), orientation=1)
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (WEBP[:-9], r"the WebP ends before its last chunk does \(cut off.\)"),
-        (WEBP[:30], r"the WebP ends before its last chunk does \(cut off.\)"),
-        (WEBP[:12], r"the WebP ends before its last chunk does \(cut off.\)"),
-        (WEBP[:20] + b"\x02" + WEBP[21:], "found an animated WebP"),
-        (b"RIFF\x04\0\0\0WEBP", "the WebP holds no still picture"),
-        (b"RIFF\x16\0\0\0WEBPVP8X\x0a\0\0\0" + bytes(10), "the WebP holds no still picture"),
-        (WEBP[:24] + b"\x0f\x0f\0" + WEBP[27:], "the picture can't be decoded"),
-        (WEBP[:60] + bytes(40) + WEBP[100:], "the picture can't be decoded"),
+        (WEBP[:-9], "the WEBP is cut off, damaged"),
+        (WEBP[:30], "the WEBP is cut off, damaged"),
+        (WEBP[:12], "the WEBP is cut off, damaged"),
+        (animation("WEBP"), "the WEBP is animated, wanted a still picture"),
+        (b"RIFF\x04\0\0\0WEBP", "the WEBP is cut off, damaged"),
+        (b"RIFF\x16\0\0\0WEBPVP8X\x0a\0\0\0" + bytes(10), "the WEBP is cut off, damaged"),
+        (WEBP[:24] + b"\x0f\x0f\0" + WEBP[27:], "the WEBP is cut off, damaged"),
+        (WEBP[:60] + bytes(40) + WEBP[100:], "the WEBP is cut off, damaged"),
     ],
 )
 def test_webps_are_refused_by_name(tmp_path, content, message, capfd):

@@ -79,7 +79,7 @@ def options_from(arguments: argparse.Namespace) -> Options:
     if foreign := [name for name in OPTIONS if name in given and name not in form.options]:
         raise InputError(f"--{foreign[0]}: not an option of the format {arguments.format}")
     if "crs" in form.options and "crs" not in given:
-        raise InputError("--crs: wanted, the cloud's coordinate system, such as EPSG:25832")
+        raise InputError("--crs: not given, wanted the cloud's coordinate system, such as EPSG:25832")
     return Options(
         images=arguments.images,
         size=tuple(arguments.size) if arguments.size else None,

@@ -58,12 +58,11 @@ END_MARK = b"\xff\xd9"  # of a JPEG
 # libtiff writes what it finds damaged to stderr, which belongs to the whole process
 DECODE_TIFF = """\
 import io, sys
-from PIL import Image
+from PIL import Image, TiffImagePlugin
 Image.MAX_IMAGE_PIXELS = None
-image = Image.open(io.BytesIO(sys.stdin.buffer.read()), formats=["TIFF"])
+image = TiffImagePlugin.TiffImageFile(io.BytesIO(sys.stdin.buffer.read()))
 image.load()
-mode = sys.argv[1]
-sys.stdout.buffer.write((image if image.mode == mode else image.convert(mode)).tobytes())
+sys.stdout.buffer.write(image.convert(sys.argv[1]).tobytes())
 """
 
 _warnings_lock = threading.Lock()  # their filter is the whole process's
@@ -122,8 +121,8 @@ def read_labels(path: Path, labels: Labels) -> Picture:
         _check(path, image, len(data), (MIN_WIDTH, MIN_HEIGHT))
         if image.format != "PNG" or data[24:26] not in LABEL_KINDS or image.has_transparency_data:
             raise InputError(
-                f"{path}: this kind of picture holds no labels, wanted a PNG without alpha, grey of 8 or 16 bits "
-                "or RGB of 8"
+                f"{path}: this kind of picture holds no labels, wanted a PNG, grey of 8 or 16 bits or RGB of "
+                "8, without alpha"
             )
         pixels = np.array(_decoded(path, data, image, image.mode)).astype(np.int32)
         if pixels.ndim == 3:

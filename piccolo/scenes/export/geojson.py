@@ -20,7 +20,7 @@ def write(images: Sequence[PosedImage], out: Path, options: Options) -> None:
     """Write a FeatureCollection with a point a result."""
     pyproj = _pyproj()
     if options.crs is None:
-        raise InputError("--crs: wanted, the cloud's coordinate system, such as EPSG:25832")
+        raise InputError("--crs: not given, wanted the cloud's coordinate system, such as EPSG:25832")
     transformer = _transformer(pyproj, options.crs)
     features = [_feature(image, transformer, pyproj.Geod(ellps="WGS84"), options.crs) for image in images]
     document = {"type": "FeatureCollection", "features": features}
