@@ -24,12 +24,16 @@ def encoded(rgb, suffix, options=()):
     return cv2.imencode(suffix, bgr, list(options))[1].tobytes()
 
 
+def saved(pixels, kind, mode=None, **options):
+    """The file that Pillow makes of pixels."""
+    file = BytesIO()
+    Image.fromarray(pixels, mode).save(file, kind, **options)
+    return file.getvalue()
+
+
 def animation(kind):
     """An animated PNG or WebP of two pictures."""
-    first, second = Image.fromarray(smooth_rgb()), Image.fromarray(255 - smooth_rgb())
-    file = BytesIO()
-    first.save(file, kind, save_all=True, append_images=[second])
-    return file.getvalue()
+    return saved(smooth_rgb(), kind, save_all=True, append_images=[Image.fromarray(255 - smooth_rgb())])
 
 
 def write(path, content):

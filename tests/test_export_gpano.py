@@ -180,12 +180,7 @@ def test_the_size_of_cube_faces_is_the_spheres(tmp_path):
 
 def test_sizes_that_cannot_be_read_are_refused(tmp_path):
     results = [result(tmp_path / "b.jpg", tilted_poses(1)[0])]
-    for content in (
-        b"",
-        b"\xff\xd8" + b"\xff" * 100_000,
-        b"II*\0" + b"\0" * 100,
-        b"\xff\xd8\xff\xe1\xff\xff" * 9,
-    ):
+    for content in (b"", b"\xff\xd8" + b"\xff" * 9999, b"II*\0" + bytes(99), b"\xff\xd8\xff\xe1\xff\xff" * 9):
         write(tmp_path / "b.jpg", content)
         with pytest.raises(InputError, match=r"b\.jpg: .*with --size W H no picture is needed"):
             export(results, "nerfstudio", tmp_path / "t.json", Options())

@@ -111,7 +111,7 @@ def test_bad_input(run, tmp_path):
         (["--format", "csv", "--out", tmp_path / "1.jsonl"], "found an input as the output"),
         (["--format", "colmap", "--out", tmp_path / "x"], "p/a.jpg: cannot be read (No such file"),
         (["--format", "gpano", "--out", tmp_path / "x"], "p/a.jpg"),
-        (["--format", "csv", "--images", "q", "--out", tmp_path / "x"], "found outside of --images q"),
+        (["--format", "csv", "--images", "q", "--out", tmp_path / "x"], "is not in the folder --images q"),
     ):
         code, document, err = run(*arguments)
         assert (code, document) == (3, None), arguments
@@ -120,7 +120,7 @@ def test_bad_input(run, tmp_path):
     assert (code, "found no result, wanted JSON lines" in err) == (3, True)
     write_results(tmp_path / "none.jsonl", MIXED[3:4])
     code, _, err = run("--format", "csv", "--out", tmp_path / "x", results=("none.jsonl",))
-    assert (code, "found no pose to write" in err) == (3, True)
+    assert (code, "there is no pose to write" in err) == (3, True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["1.jsonl", "2.jsonl", "full", "none.jsonl"]
 
 

@@ -80,10 +80,11 @@ def test_transparent_color_is_not_valid(tmp_path):
 
 
 @pytest.mark.parametrize("orientation", TURNS)
-@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
 def test_exif_orientation_is_applied(tmp_path, suffix, orientation):
     stored = RGB if orientation < 5 else smooth_rgb(128, 64)
-    content = encoded(stored, suffix, [cv2.IMWRITE_JPEG_QUALITY, 98])
+    best = [cv2.IMWRITE_WEBP_QUALITY, 101] if suffix == ".webp" else [cv2.IMWRITE_JPEG_QUALITY, 98]
+    content = encoded(stored, suffix, best)
     rgb = read_panorama(write(tmp_path / "a", with_metadata(content, orientation))).rgb
     assert np.abs(rgb.astype(int) - TURNS[orientation](stored)).max() <= (8 if suffix == ".jpg" else 0)
 
