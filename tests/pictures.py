@@ -24,10 +24,10 @@ def encoded(rgb, suffix, options=()):
     return cv2.imencode(suffix, bgr, list(options))[1].tobytes()
 
 
-def saved(pixels, kind, mode=None, **options):
+def saved(pixels, kind, mode="RGB", **options):
     """The file that Pillow makes of pixels."""
     file = BytesIO()
-    Image.fromarray(pixels, mode).save(file, kind, **options)
+    Image.frombytes(mode, pixels.shape[1::-1], pixels.tobytes()).save(file, kind, **options)
     return file.getvalue()
 
 

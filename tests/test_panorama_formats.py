@@ -143,7 +143,7 @@ def test_cmyk_jpeg_becomes_rgb(tmp_path):
 
 @pytest.mark.parametrize("kind", ["PNG", "TIFF"])
 def test_palettes_become_rgb(tmp_path, kind):
-    image = Image.fromarray(RGB[..., 0] // 8, "P")
+    image = Image.frombytes("P", (128, 64), (RGB[..., 0] // 8).tobytes())
     image.putpalette((np.arange(256, dtype=np.uint8)[:, None] ^ TINT).tobytes())
     image.info["transparency"] = 3  # TIFF has none
     path = tmp_path / "a"
