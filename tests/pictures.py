@@ -2,9 +2,11 @@
 
 import struct
 import zlib
+from io import BytesIO
 
 import cv2
 import numpy as np
+from PIL import Image
 
 XMP_NAMESPACE = "http://ns.google.com/photos/1.0/panorama/"
 PNG_HEADER_SIZE = 33  # [byte] magic and IHDR
@@ -20,6 +22,18 @@ def smooth_rgb(height=64, width=128):
 def encoded(rgb, suffix, options=()):
     bgr = rgb[:, :, [2, 1, 0, 3][: rgb.shape[2]]] if rgb.ndim == 3 else rgb
     return cv2.imencode(suffix, bgr, list(options))[1].tobytes()
+
+
+def saved(pixels, kind, mode="RGB", **options):
+    """The file that Pillow makes of pixels."""
+    file = BytesIO()
+    Image.frombytes(mode, pixels.shape[1::-1], pixels.tobytes()).save(file, kind, **options)
+    return file.getvalue()
+
+
+def animation(kind):
+    """An animated PNG or WebP of two pictures."""
+    return saved(smooth_rgb(), kind, save_all=True, append_images=[Image.fromarray(255 - smooth_rgb())])
 
 
 def write(path, content):

@@ -101,7 +101,7 @@ def test_colmap_has_a_camera_a_size_and_refuses_blanks_in_names(tmp_path):
     export([result(f"my{narrow}ph\u00f6to.jpg", POSES[0])], "colmap", tmp_path / "narrow", SIZED)
     (image,) = pycolmap.Reconstruction(str(tmp_path / "narrow")).images.values()
     assert image.name == f"my{narrow}ph\u00f6to.jpg"
-    with pytest.raises(InputError, match="found ' ' in the name"):
+    with pytest.raises(InputError, match="can't read ' ' in a name"):
         export([result("my photo.jpg", POSES[0])], "colmap", tmp_path / "other", SIZED)
     assert not (tmp_path / "other").exists()
 
@@ -160,7 +160,7 @@ def test_potree_projects_to_our_pixels(tmp_path):
         assert row.split("\t")[:2] == [f"photos/{i}.jpg", str(i)]
         pixels, points = pixels_and_points(pose)
         _check_pixels(potree_pixels(row, points), pixels)
-    with pytest.raises(InputError, match="found '\"' in the name"):
+    with pytest.raises(InputError, match="can't read '\"' in a name"):
         export([result('a".jpg', POSES[0])], "potree", tmp_path / "c.txt", Options())
 
 

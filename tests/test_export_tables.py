@@ -62,7 +62,7 @@ def test_timestamps_by_name_are_exact_and_in_order(tmp_path, evo):
     assert [row.split()[0] for row in rows] == [names[i] for i in (2, 3, 1, 0)]
     positions = evo.read_tum_trajectory_file(str(tmp_path / "p.tum")).positions_xyz
     np.testing.assert_array_equal(positions[0], POSES[2].center_world - [1e5, 2e5, 0])
-    with pytest.raises(InputError, match="found the name 'a', wanted a number"):
+    with pytest.raises(InputError, match="its name 'a' is no number"):
         export(_results(), "tum", tmp_path / "q.tum", Options(timestamps="name"))
 
 

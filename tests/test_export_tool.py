@@ -109,9 +109,9 @@ def test_bad_input(run, tmp_path):
         (["--format", "colmap", "--out", tmp_path / "no" / "x"], "found no folder"),
         (["--format", "csv", "--out", tmp_path / "full"], "found a folder, wanted a file name"),
         (["--format", "csv", "--out", tmp_path / "1.jsonl"], "found an input as the output"),
-        (["--format", "colmap", "--out", tmp_path / "x"], "p/a.jpg: found no such file"),
+        (["--format", "colmap", "--out", tmp_path / "x"], "p/a.jpg: cannot be read (No such file"),
         (["--format", "gpano", "--out", tmp_path / "x"], "p/a.jpg"),
-        (["--format", "csv", "--images", "q", "--out", tmp_path / "x"], "found outside of --images q"),
+        (["--format", "csv", "--images", "q", "--out", tmp_path / "x"], "is not in the folder --images q"),
     ):
         code, document, err = run(*arguments)
         assert (code, document) == (3, None), arguments
@@ -120,7 +120,7 @@ def test_bad_input(run, tmp_path):
     assert (code, "found no result, wanted JSON lines" in err) == (3, True)
     write_results(tmp_path / "none.jsonl", MIXED[3:4])
     code, _, err = run("--format", "csv", "--out", tmp_path / "x", results=("none.jsonl",))
-    assert (code, "found no pose to write" in err) == (3, True)
+    assert (code, "there is no pose to write" in err) == (3, True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["1.jsonl", "2.jsonl", "full", "none.jsonl"]
 
 
@@ -129,7 +129,7 @@ def test_two_results_of_one_picture_are_refused_where_the_name_is_the_key(run, t
     out = tmp_path / "out"
     code, _, err = run("--format", "opensfm", "--size", "64", "32", "--out", out, results=["3.jsonl"])
     assert code == 3
-    assert "p/a.jpg: found two results of it (clouds a.ply, b.ply), wanted one; --cloud chooses" in err
+    assert "p/a.jpg: has two results (clouds a.ply, b.ply); --cloud chooses one" in err
     assert run("--format", "csv", "--out", out, results=["3.jsonl"])[1]["poses"] == 2
 
 

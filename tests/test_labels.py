@@ -165,15 +165,13 @@ def test_ignored_labels_and_masks_do_not_count_and_nothing_else_is_masked(tmp_pa
     expected = (labels != 0) & (labels != 5) & (np.arange(128) >= 20)
     expected[-7:] = False
     np.testing.assert_array_equal(panorama.is_valid, expected)
-    with pytest.raises(
-        InputError, match="found no pixel that counts, all are masked or black, or of ignored"
-    ):
+    with pytest.raises(InputError, match="no pixel is left: all are masked, black, or of ignored"):
         read_panorama(path, PanoramaOptions(labels=Labels(tuple(range(256)))))
 
 
 def test_pictures_that_do_not_keep_labels_are_refused(tmp_path):
     gray, rgba = IMAGE.astype(np.uint8), np.zeros((64, 128, 4), np.uint8)
-    wanted = "found another kind of picture, wanted labels in a PNG, grey of 8 or 16 bits or RGB of 8"
+    wanted = "this kind of picture holds no labels, wanted a PNG, grey of 8 or 16 bits or RGB of 8"
     deep_rgb = np.zeros((64, 128, 3), np.uint16)
     for path in (
         _png(tmp_path / "a.jpg", gray),

@@ -1,4 +1,3 @@
-import os
 import struct
 import zlib
 from pathlib import Path
@@ -8,7 +7,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pictures import PNG_HEADER_SIZE, TURNS, encoded, png_chunk, smooth_rgb, with_metadata, write
+from pictures import (
+    PNG_HEADER_SIZE,
+    TURNS,
+    animation,
+    encoded,
+    png_chunk,
+    smooth_rgb,
+    with_metadata,
+    write,
+)
 from refusals import mutated, read_or_refused
 
 from piccolo.errors import InputError
@@ -58,7 +66,7 @@ def test_sixteen_bits_become_eight(tmp_path):
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_alpha_zero_is_not_valid(tmp_path, dtype):
     alpha = np.full((64, 128), np.iinfo(dtype).max, dtype=dtype)
-    alpha[50:], alpha[0, 0] = 0, 1
+    alpha[50:], alpha[0, 0] = 0, alpha[0, 0] // 255  # of 16 bits the upper 8 count
     rgba = np.dstack([RGB.astype(dtype) * (np.iinfo(dtype).max // 255), alpha])
     panorama = read_panorama(write(tmp_path / "a.png", encoded(rgba, ".png")))
     np.testing.assert_array_equal(panorama.is_valid, alpha > 0)
@@ -72,10 +80,11 @@ def test_transparent_color_is_not_valid(tmp_path):
 
 
 @pytest.mark.parametrize("orientation", TURNS)
-@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
 def test_exif_orientation_is_applied(tmp_path, suffix, orientation):
     stored = RGB if orientation < 5 else smooth_rgb(128, 64)
-    content = encoded(stored, suffix, [cv2.IMWRITE_JPEG_QUALITY, 98])
+    best = [cv2.IMWRITE_WEBP_QUALITY, 101] if suffix == ".webp" else [cv2.IMWRITE_JPEG_QUALITY, 98]
+    content = encoded(stored, suffix, best)
     rgb = read_panorama(write(tmp_path / "a", with_metadata(content, orientation))).rgb
     assert np.abs(rgb.astype(int) - TURNS[orientation](stored)).max() <= (8 if suffix == ".jpg" else 0)
 
@@ -153,15 +162,15 @@ def test_cut_files_are_refused(tmp_path, suffix, part, capfd):
     assert capfd.readouterr().err == ""
 
 
-@pytest.mark.parametrize("progressive", [0, 1])
-@pytest.mark.parametrize("num_zeros", [0, 5000])
-def test_jpeg_cut_in_a_scan_and_mended_is_refused(tmp_path, progressive, num_zeros, capfd):
+def test_jpeg_cut_and_ended_is_refused_and_one_that_ends_in_grey_is_not(tmp_path):
     noise = np.random.default_rng(1).integers(0, 256, RGB.shape, dtype=np.uint8)
-    content = encoded(noise, ".jpg", [cv2.IMWRITE_JPEG_PROGRESSIVE, progressive])
-    path = write(tmp_path / "a.jpg", content[: len(content) // 2] + bytes(num_zeros) + b"\xff\xd9")
-    with pytest.raises(InputError, match=r"the picture is damaged \(Corrupt JPEG data"):
-        read_panorama(path)
-    assert capfd.readouterr().err == ""
+    noise[-20:] = 128
+    content = encoded(noise, ".jpg")
+    np.testing.assert_array_equal(read_panorama(write(tmp_path / "a.jpg", content)).rgb[-8:], 128)
+    for part in (0.2, 0.5, 0.8):
+        cut = content[: int(part * len(content))] + b"\xff\xd9"
+        with pytest.raises(InputError, match=r"the JPEG ends before its picture does \(cut off.\)"):
+            read_panorama(write(tmp_path / "a.jpg", cut))
 
 
 def test_jpeg_with_little_padding_and_things_behind_it_is_read(tmp_path, capfd):
@@ -173,12 +182,6 @@ def test_jpeg_with_little_padding_and_things_behind_it_is_read(tmp_path, capfd):
     ).rgb
     np.testing.assert_array_equal(whole, padded)
     assert capfd.readouterr().err == ""
-
-
-def test_stderr_is_given_back(tmp_path, capfd):
-    read_panorama(write(tmp_path / "a.png", encoded(RGB, ".png")))
-    os.write(2, b"heard")
-    assert capfd.readouterr().err == "heard"
 
 
 PNG = encoded(RGB, ".png")
@@ -194,12 +197,13 @@ def png_of(packed):
     [
         (b"", "the file is empty"),
         (b"GIF89a" + bytes(99), "begins with b'GIF89a.*', wanted a whole JPEG, PNG, TIFF or WebP panorama"),
-        (b"\xff\xd8", "the JPEG ends without its end mark"),
-        (b"\xff\xd8" + bytes(999), "the JPEG ends without its end mark"),
-        (PNG[:60] + b"\x01\x02\x03" + PNG[63:], "wrong checksum in the PNG's chunk b'IDAT'"),
-        (PNG[:8] + PNG[PNG_HEADER_SIZE:], "the PNG does not begin with its header"),
-        (png_of(zlib.compress(bytes(9000))), "the picture can't be decoded"),
-        (PNG[:PNG_HEADER_SIZE] + png_chunk(b"IEND", b""), "the picture can't be decoded"),
+        (b"\xff\xd8", "the JPEG is cut off"),
+        (b"\xff\xd8" + bytes(999), "the JPEG is cut off"),
+        (PNG[:60] + b"\x01\x02\x03" + PNG[63:], "the PNG is cut off, damaged .* .broken PNG file"),
+        (PNG[:8] + PNG[PNG_HEADER_SIZE:], "the PNG is cut off, damaged"),
+        (png_of(zlib.compress(bytes(9000))), "the PNG is cut off, damaged .*truncated"),
+        (PNG[:PNG_HEADER_SIZE] + png_chunk(b"IEND", b""), "the PNG is cut off, damaged"),
+        (animation("PNG"), "the PNG is animated, wanted a still picture"),
     ],
 )
 def test_other_content_is_refused(tmp_path, content, message, capfd):

@@ -44,7 +44,7 @@ def check(path):
 
 
 @pytest.mark.parametrize("content", FILES.values(), ids=FILES)
-@settings(deadline=None, max_examples=80)
+@settings(deadline=None, max_examples=40)
 @given(data=st.data())
 def test_mutated_files_are_read_or_refused(content, data, tmp_path_factory):
     begin = data.draw(st.integers(0, len(content) // 2))
@@ -53,7 +53,7 @@ def test_mutated_files_are_read_or_refused(content, data, tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", ["tiff", "tiff, 16 bits, big end", "tiff, packed by 5", "tiff, packed by 8"])
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=60)
 @given(data=st.data())
 def test_tiffs_with_mutated_tags_are_read_or_refused(name, data, tmp_path_factory):
     content = bytearray(FILES[name])

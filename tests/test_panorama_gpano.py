@@ -62,7 +62,7 @@ def test_packed_xmp_in_png_is_read_and_a_bomb_is_not(tmp_path):
             read_panorama, write(tmp_path / "a.png", crop[:33] + chunk + crop[33:])
         )
         assert (panorama is not None) == is_read
-        assert is_read or "found 240 x 140, wanted width = 2 x height" in message
+        assert is_read or "too large" in message
 
 
 def test_the_crop_of_a_picture_made_smaller_is_placed_by_ratio(tmp_path):
@@ -105,7 +105,7 @@ def test_a_crop_that_makes_no_sense_is_refused_or_left_aside(tmp_path, fields):
     panorama = read_panorama(write(tmp_path / "a", file_of(RGB, fields)))
     np.testing.assert_array_equal(panorama.rgb, RGB)
     assert panorama.is_valid.all()
-    assert "found a crop in the metadata that makes no sense" in panorama.warnings[0]
+    assert "the crop in the metadata makes no sense" in panorama.warnings[0]
     with pytest.raises(InputError, match="found 300 x 200 and a crop in the metadata that does not fit it"):
         read_panorama(write(tmp_path / "b", file_of(RGB[:, :300], fields)))
 
@@ -124,7 +124,7 @@ def test_a_crop_that_makes_no_sense_is_refused_or_left_aside(tmp_path, fields):
         (crop_fields(0, 0, 300, 200, (900, 200)), "of a sphere of 900 x 200, wanted that width = 2 x height"),
         (
             {"ProjectionType": "Cylin\ndrical"},
-            r"found the projection .cylin.+ndrical. in its metadata, wanted equirect",
+            "names the projection .cylin.+ndrical., wanted equirect",
         ),
     ],
 )
@@ -134,9 +134,9 @@ def test_crops_are_refused_by_name(tmp_path, fields, message):
 
 
 def test_the_attitude_is_read(tmp_path):
-    fields = {"PoseHeadingDegrees": "-75", "PosePitchDegrees": "+3.5", "PoseRollDegrees": -120.25}
-    assert read_panorama(write(tmp_path / "a", file_of(RGB, fields))).gpano == GPano(285.0, 3.5, -120.25)
-    fields = {"PoseHeadingDegrees": "nan", "PosePitchDegrees": 91, "PoseRollDegrees": "1e999"}
+    fields = {"PosePitchDegrees": "+3.5", "PoseRollDegrees": -120.25}
+    assert read_panorama(write(tmp_path / "a", file_of(RGB, fields))).gpano == GPano(3.5, -120.25)
+    fields = {"PosePitchDegrees": 91, "PoseRollDegrees": "1e999"}
     assert read_panorama(write(tmp_path / "a", file_of(RGB, fields))).gpano == GPano()
     assert read_panorama(write(tmp_path / "a", encoded(RGB, ".png"))).gpano is None
 
@@ -157,7 +157,7 @@ def test_pitch_raises_the_image_centre_and_roll_lowers_the_right_side():
     R_level_from_cam = rotation_to_level(GPano(roll_deg=20.0))
     np.testing.assert_allclose(R_level_from_cam @ [1, 0, 0], [1, 0, 0], atol=1e-12)
     assert (R_level_from_cam @ [0, -1, 0])[2] == pytest.approx(-np.sin(np.radians(20)))
-    assert rotation_to_level(GPano(heading_deg=90.0)) is None
+    assert rotation_to_level(GPano()) is None
 
 
 @pytest.mark.parametrize(("pitch", "roll"), [(25.0, -40.0), (-10.0, 170.0), (89.0, 5.0)])

@@ -24,7 +24,7 @@ SUFFIX = {"jpeg": ".jpg", "png": ".png"}
 
 
 def row_of(index: int, image: E57Image) -> dict[str, object]:
-    """What is said of an image."""
+    """The JSON object that describes an image."""
     placement = image.placement
     return {
         "index": index,
@@ -46,7 +46,7 @@ def row_of(index: int, image: E57Image) -> dict[str, object]:
 
 
 def extract(path: Path, index: int, image: E57Image, folder: Path) -> Path:
-    """Write an image as a file in a folder; returns its path."""
+    """Write an image as a file into a folder; returns the file's path."""
     stem = re.sub(r"[^\w.-]", "_", path.stem)
     file = folder / f"{stem}_{index}{SUFFIX[image.encoding]}"
     write_atomically(file, read_image(path, index))

@@ -34,8 +34,8 @@ OPTIONS = ("size", "offset", "axes", "timestamps", "crs")  # those that only som
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """All options. One that is not given stays None, and keeps its default."""
-    formats = "\n".join(f"  {form.name:<11} {form.about}" for form in FORMATS.values())
+    """The options; those not given are None, which stands for a default."""
+    formats = "\n".join(f"  {form.name:<11} {form.description}" for form in FORMATS.values())
     parser = argparse.ArgumentParser(
         "export_poses.py",
         description=__doc__,
@@ -91,7 +91,7 @@ def options_from(arguments: argparse.Namespace) -> Options:
 
 
 def report(selection: Selection) -> Iterable[str]:
-    """Lines for the user: what was left out, and what may be mixed up."""
+    """Notes on results left out, and on clouds that may have different coordinate systems."""
     if selection.left_out:
         num_left_out = sum(selection.left_out.values())
         reasons = ", ".join(f"{count} {reason}" for reason, count in selection.left_out.items())
@@ -102,7 +102,7 @@ def report(selection: Selection) -> Iterable[str]:
 
 
 def run(arguments: argparse.Namespace, options: Options) -> dict[str, object]:
-    """Read, choose, write; returns what was written."""
+    """Read the results, select and export them; returns the summary that is printed."""
     results = [result for path in arguments.results for result in read_results(path)]
     if arguments.scenes:
         results = [result for scene in find_scenes(arguments.scenes) for result in true_results(scene)]

@@ -1,6 +1,7 @@
-"""What is no picture of the scene, found by itself: black borders, and discs put over a pole.
+"""Automatic masks: black borders, and patches over the nadir or zenith.
 
-Each rule is narrow, as what is masked wrongly is lost: the lines below are far from what scenes show.
+Each rule is narrow, as what is masked wrongly is lost. The thresholds were set by hand, apart from both
+sides: tests/test_panorama_masks.py has the rooms that they must leave alone and the patches that they find.
 """
 
 import cv2
@@ -21,7 +22,7 @@ NUM_ROWS = round(45.0 * ROWS_PER_DEG)  # around a pole
 # numbers of rows inside a disc, largest first: half angles of 40 to 3 deg
 CANDIDATES = range(round(40.0 * ROWS_PER_DEG), round(3.0 * ROWS_PER_DEG) - 1, -1)
 MIN_STEP = 12.0  # levels between inside and outside of a disc's edge
-MIN_EDGE_SHARE, MAX_CALM_SHARE = 0.9, 0.5  # of columns with a step: at the edge, in the rows near it
+MIN_EDGE_FRACTION, MAX_CALM_FRACTION = 0.9, 0.5  # of columns with a step: at the edge, in the rows near it
 NUM_SECTORS = 16
 DETAIL_DEG = 0.5  # over which detail is measured
 MIN_DETAIL = 4.0  # levels, around a disc without detail
@@ -38,17 +39,17 @@ def black_borders(
     full sphere as a whole (a pole is one point, the seam one line), of a crop in part. 95 % of them, save
     for a rim of 8 pixels, must be black to two levels; shadows carry noise.
     """
-    min_share = MIN_FULL_EDGE if is_full else MIN_CROP_EDGE
+    min_fraction = MIN_FULL_EDGE if is_full else MIN_CROP_EDGE
     found = np.zeros(is_valid.shape, dtype=np.bool_)
     for axis in (0, 1):
         for step in (1, -1):
             inwards = rgb.swapaxes(0, axis)[::step]
             is_black = (inwards[0].max(axis=1) <= NEAR_BLACK) & is_valid.swapaxes(0, axis)[::step][0]
-            if is_black.mean() < min_share:
+            if is_black.mean() < min_fraction:
                 continue
             depth = _depth_of_black(inwards, is_black)
             core = np.maximum(minimum_filter1d(depth, 2 * RIM + 1) - RIM, 0)
-            if _pure_share(inwards, core if core.any() else depth) >= MIN_PURE:
+            if _black_fraction(inwards, core if core.any() else depth) >= MIN_PURE:
                 depth = np.where(depth > 0, depth + RIM, 0)
                 border = found.swapaxes(0, axis)[::step][: depth.max()]
                 border |= np.arange(len(border))[:, None] < maximum_filter1d(depth, 2 * RIM + 1)
@@ -69,8 +70,8 @@ def _depth_of_black(inwards: NDArray[np.uint8], is_black: NDArray[np.bool_]) -> 
     return depth
 
 
-def _pure_share(inwards: NDArray[np.uint8], depth: NDArray[np.int64]) -> float:
-    """Share of BLACK pixels among those within `depth` (columns,) of the edge."""
+def _black_fraction(inwards: NDArray[np.uint8], depth: NDArray[np.int64]) -> float:
+    """Fraction of BLACK pixels among those within `depth` (columns,) of the edge."""
     num_black = 0
     for begin in range(0, int(depth.max()), BAND):
         band = np.ascontiguousarray(inwards[begin : begin + BAND])
@@ -100,10 +101,10 @@ def _edge_circle(cap: NDArray[np.float32]) -> int:
     """Number of rows from the pole (row 0) to the outermost circle that is an edge, 0 if there is none."""
     pairs = (cap[1:] + cap[:-1]) / 2.0
     is_step = np.abs(pairs[2:] - pairs[:-2]).max(axis=2) > MIN_STEP
-    share = np.concatenate([[0.0, 0.0], is_step.mean(axis=1)])  # share[k]: k rows are inside
+    fraction = np.concatenate([[0.0, 0.0], is_step.mean(axis=1)])  # fraction[k]: k rows are inside
     for k in CANDIDATES:
-        near = np.concatenate([share[max(k - 8, 0) : k - 2], share[k + 3 : k + 9]])
-        if share[k] >= MIN_EDGE_SHARE and np.median(near) <= MAX_CALM_SHARE:
+        near = np.concatenate([fraction[max(k - 8, 0) : k - 2], fraction[k + 3 : k + 9]])
+        if fraction[k] >= MIN_EDGE_FRACTION and np.median(near) <= MAX_CALM_FRACTION:
             return k
     return 0
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .gpano import Region
+from .gpano import CropRegion
 from .picture import MAX_WIDTH
 
 ASPECT_TOLERANCE = 0.01
@@ -16,13 +16,13 @@ MIN_REGION = 0.02  # of the sphere's picture: less would take much memory to sho
 Pixels = tuple[NDArray[np.uint8], NDArray[np.bool_]]  # rgb (H, W, 3), is_valid (H, W)
 
 
-def region_of_fov(fov_deg: float, width: int, height: int) -> Region:
+def region_of_fov(fov_deg: float, width: int, height: int) -> CropRegion:
     """A picture with as many pixels a degree in both directions, centred on the horizon."""
-    share, share_high = fov_deg / 360.0, fov_deg / 180.0 * height / width
-    return Region((1.0 - share) / 2.0, (1.0 - share_high) / 2.0, share, share_high)
+    wide, high = fov_deg / 360.0, fov_deg / 180.0 * height / width  # fractions of the sphere's picture
+    return CropRegion((1.0 - wide) / 2.0, (1.0 - high) / 2.0, wide, high)
 
 
-def full_size(path: Path, region: Region, size: tuple[int, int]) -> tuple[int, int]:
+def full_size(path: Path, region: CropRegion, size: tuple[int, int]) -> tuple[int, int]:
     """Width and height [px], 2:1, of the sphere's picture in which one of `size` keeps its pixels.
 
     Within 1 % of 2:1 the direction that has more pixels a degree is shrunk.
@@ -41,13 +41,13 @@ def full_size(path: Path, region: Region, size: tuple[int, int]) -> tuple[int, i
     if width > MAX_WIDTH:
         raise InputError(f"{found} of a sphere {width:.0f} wide, wanted at most {MAX_WIDTH}")
     if region.width * region.height < MIN_REGION:
-        share = 100.0 * region.width * region.height
-        raise InputError(f"{found}, {share:.2g} % of the sphere, wanted at least {100.0 * MIN_REGION:g} %")
+        percent = 100.0 * region.width * region.height
+        raise InputError(f"{found}, {percent:.2g} % of the sphere, wanted at least {100.0 * MIN_REGION:g} %")
     full_height = int(min(height, width / 2.0) + 1e-6)  # a quotient may be a hair below a whole number
     return 2 * full_height, full_height
 
 
-def place(path: Path, rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], region: Region) -> Pixels:
+def embed_crop(path: Path, rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], region: CropRegion) -> Pixels:
     """The picture at its place in the full sphere, the rest not valid; itself if it is the full sphere.
 
     Its edges come to whole pixels: it is moved by half a pixel at most. Over the seam it is continued.

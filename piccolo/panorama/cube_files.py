@@ -38,13 +38,19 @@ def read_cube_folder(folder: Path) -> Picture:
     InputError
         The folder holds no complete cube or several, or the faces are not squares of one size.
     """
-    cubes = _cubes_in(folder)
-    if len(cubes) != 1:
-        raise InputError(f"{folder}: not a file but a folder with {len(cubes)} complete cubes, {WANTED}")
-    pictures = {letter: read_picture(path, (MIN_FACE, MIN_FACE)) for letter, path in cubes[0].items()}
+    paths = face_paths(folder).items()
+    pictures = {letter: read_picture(path, (MIN_FACE, MIN_FACE)) for letter, path in paths}
     faces = {letter: face_pixels(picture.rgb, picture.is_valid) for letter, picture in pictures.items()}
     warnings = dict.fromkeys(warning for picture in pictures.values() for warning in picture.warnings)
     return _from_faces(folder, faces, tuple(warnings))
+
+
+def face_paths(folder: Path) -> dict[str, Path]:
+    """The files of a folder's one complete cube, by the letters of their faces."""
+    cubes = _cubes_in(folder)
+    if len(cubes) != 1:
+        raise InputError(f"{folder}: not a file but a folder with {len(cubes)} complete cubes, {WANTED}")
+    return cubes[0]
 
 
 def _cubes_in(folder: Path) -> list[dict[str, Path]]:

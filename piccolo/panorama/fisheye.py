@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+# Set by hand, between the circles and the panoramas of tests/test_panorama_masks.py.
 SIZE = 128  # [px] of each half, for the test
 BLACK = 24  # levels: the dark around the circles carries some noise
 MIN_BLACK_OUTSIDE = 0.98

@@ -14,8 +14,8 @@ import numpy as np
 from ..geometry.pose import Array
 from .model import GPano
 
-NAMESPACE = rb"http://ns\.google\.com/photos/1\.0/panorama/"
-PREFIX = re.compile(rb"xmlns:([A-Za-z_][\w.-]{0,40})\s{0,9}=\s{0,9}[\"']" + NAMESPACE)
+NAMESPACE = b"http://ns.google.com/photos/1.0/panorama/"
+PREFIX = re.compile(rb"xmlns:([A-Za-z_][\w.-]{0,40})\s{0,9}=\s{0,9}[\"']" + re.escape(NAMESPACE))
 FIELD = rb"\b%s:(\w{1,60})(?:\s{0,9}=\s{0,9}[\"']([^\"'<>]{0,80})[\"']|\s{0,9}>([^<>]{0,80})</)"
 MAX_NUMBER = 1e9
 MAX_PREFIXES = 4  # of one namespace: each is a search of its own
@@ -30,8 +30,8 @@ CROP_FIELDS = (
 
 
 @dataclass(frozen=True)
-class Region:
-    """The part of the sphere that a picture shows, in shares of the full width and height."""
+class CropRegion:
+    """The part of the sphere that a picture shows, as fractions of the full width and height."""
 
     left: float = 0.0
     top: float = 0.0
@@ -41,7 +41,7 @@ class Region:
     @property
     def is_full(self) -> bool:
         """True for the whole sphere."""
-        return self == Region()
+        return self == CropRegion()
 
 
 def gpano_fields(xmp: bytes) -> dict[str, str]:
@@ -64,12 +64,10 @@ def _number(fields: dict[str, str], name: str) -> float | None:
 
 
 def attitude(fields: dict[str, str]) -> GPano:
-    """Heading, pitch and roll; what is out of range counts as not said."""
-    heading = _number(fields, "PoseHeadingDegrees")
+    """Pitch and roll; what is out of range counts as not said."""
     pitch = _number(fields, "PosePitchDegrees")
     roll = _number(fields, "PoseRollDegrees")
     return GPano(
-        heading % 360.0 if heading is not None else None,
         pitch if pitch is not None and abs(pitch) <= 90.0 else None,
         roll if roll is not None and abs(roll) <= 180.0 else None,
     )
@@ -80,7 +78,7 @@ def projection(fields: dict[str, str]) -> str:
     return fields.get("ProjectionType", "").lower()
 
 
-def crop_region(fields: dict[str, str], aspect: float) -> Region | None:
+def crop_region(fields: dict[str, str], aspect: float) -> CropRegion | None:
     """The part of the sphere that a picture of `aspect` (width by height) shows; full if nothing is said.
 
     The fields count pixels of the picture as it was made: only their ratios are used, so that a picture made
@@ -88,7 +86,7 @@ def crop_region(fields: dict[str, str], aspect: float) -> Region | None:
     """
     given = [_number(fields, name) for name in CROP_FIELDS]
     if not any(name in fields for name in CROP_FIELDS):
-        return Region()
+        return CropRegion()
     numbers = [number for number in given if number is not None]
     if len(numbers) < len(CROP_FIELDS):
         return None
@@ -100,7 +98,7 @@ def crop_region(fields: dict[str, str], aspect: float) -> Region | None:
     is_same_shape = abs(width / height / aspect - 1.0) <= max(0.01, 1.5 / width, 1.5 / height)
     if not (is_inside and is_same_shape):
         return None
-    return Region(left / full_width, top / full_height, width / full_width, height / full_height)
+    return CropRegion(left / full_width, top / full_height, width / full_width, height / full_height)
 
 
 def rotation_to_level(gpano: GPano) -> Array | None:

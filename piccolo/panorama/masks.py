@@ -1,4 +1,4 @@
-"""What the user says is to be ignored: a mask picture, or the cap around the camera's own stand."""
+"""Masks of the user: a picture, or the cap around a pole."""
 
 from pathlib import Path
 
@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from .crop import ASPECT_TOLERANCE
 from .cube_files import SUFFIXES
 from .picture import read_picture
 
-ASPECT_TOLERANCE = 0.01
 MIN_MASK = (16, 8)  # [px]
 WHITE = 128  # and above is to be ignored
 
@@ -46,8 +46,9 @@ def read_mask(path: Path, sizes: list[tuple[int, int]]) -> tuple[int, NDArray[np
     raise InputError(f"{path}: found a mask of {width} x {height}, wanted the shape of {wanted}")
 
 
-def mask_cap(is_valid: NDArray[np.bool_], half_angle_deg: float) -> NDArray[np.bool_]:
-    """Validity (H, W) without the rows whose centre is closer to straight down than `half_angle_deg`."""
+def mask_pole(is_valid: NDArray[np.bool_], pole: str, half_angle_deg: float) -> NDArray[np.bool_]:
+    """Validity (H, W) without the rows whose centre is nearer than that to the `pole`, zenith or nadir."""
     height = len(is_valid)
-    from_nadir = 180.0 - (np.arange(height) + 0.5) * 180.0 / height
-    return np.asarray(is_valid & (from_nadir >= half_angle_deg)[:, None])
+    from_zenith = (np.arange(height) + 0.5) * 180.0 / height
+    from_pole = from_zenith if pole == "zenith" else from_zenith[::-1]
+    return np.asarray(is_valid & (from_pole >= half_angle_deg)[:, None])

@@ -17,7 +17,6 @@ FACE_LETTERS = "rludfb"  # right, left, up, down, front, back
 class GPano:
     """How the camera was held, by the file's Photo Sphere XMP; None where the file does not say."""
 
-    heading_deg: float | None = None  # compass heading of the image centre, clockwise from north, [0, 360)
     pitch_deg: float | None = None  # of the image centre above the horizon, [-90, 90]
     roll_deg: float | None = None  # about the view axis, the camera's right side down, [-180, 180]
 

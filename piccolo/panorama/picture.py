@@ -1,50 +1,71 @@
-"""The pixels in a JPEG, PNG, TIFF or WebP file, 8 bits a channel, turned as EXIF says.
+"""The pixels in a JPEG, PNG, TIFF or WebP file, 8 bits a channel, turned as EXIF says; Pillow reads them.
 
-The bytes are checked before they are decoded: OpenCV makes a grey half of a JPEG that is cut off, takes
-memory for whatever size a header claims, and lets libjpeg, libpng and libtiff write to stderr.
+Sizes are checked before anything is decoded. Each format's class is called by itself, as the limit of
+Image.open, which large panoramas exceed, can be lifted for the whole process only.
 """
 
-import os
-import re
+import subprocess
 import sys
-import tempfile
 import threading
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
+from PIL.ExifTags import Base
+from PIL.Image import Transpose
+from PIL.ImageFile import ImageFile
+from PIL.JpegImagePlugin import JpegImageFile
+from PIL.PngImagePlugin import PngImageFile
+from PIL.TiffImagePlugin import TiffImageFile
+from PIL.WebPImagePlugin import WebPImageFile
 
 from ..cloud.label_colors import Labels, colors_of
 from ..errors import InputError
-from . import jpeg, png, tiff, webp
-from .header import WANTED, Header
 
+WANTED = "wanted a whole JPEG, PNG, TIFF or WebP panorama"
 MIN_WIDTH, MIN_HEIGHT = 128, 64
-# 2^29 pixels: half of what OpenCV decodes by default (CV_IO_MAX_IMAGE_PIXELS, 2^30)
 MAX_WIDTH, MAX_HEIGHT = 32768, 16384
-MAX_PADDING = 0.01  # of a JPEG; some cameras leave a few bytes behind the picture
-DAMAGE = re.compile(
-    r"(?:TIFF_Error |JPEGLib: )?(Corrupt JPEG data: (?:(\d+) extraneous bytes)?.*|Premature end.*)"
-)
-TIFF_DAMAGE = re.compile(r"TIFF_Error (.*)")
-
-# What a viewer does to the stored picture, by EXIF's number; 1 is as stored.
-TURNS: dict[int, Callable[[NDArray[Any]], NDArray[Any]]] = {
-    2: np.fliplr,
-    3: lambda image: np.rot90(image, 2),
-    4: np.flipud,
-    5: lambda image: np.swapaxes(image, 0, 1),
-    6: lambda image: np.rot90(image, -1),
-    7: lambda image: np.swapaxes(np.rot90(image, 2), 0, 1),
-    8: np.rot90,
+MAX_XMP_SIZE = 1 << 20  # [byte] what is longer is left aside
+FORMATS: dict[bytes, type[ImageFile]] = {
+    b"\x89PNG\r\n\x1a\n": PngImageFile,
+    b"\xff\xd8": JpegImageFile,
+    **dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), TiffImageFile),
+    b"RIFF": WebPImageFile,
 }
+# at best: a bit a block of 8 x 8; 1040 bytes of 8 pixels by zlib; 3840 by LZW; a plain WebP packs to nothing
+MAX_PIXELS_PER_BYTE = {"JPEG": 512, "PNG": 8 * 1040, "TIFF": 8 * 3840, "WEBP": 1 << 30}
+# what a viewer does to the stored picture, by EXIF's number
+TURNS: dict[object, Transpose] = {
+    2: Transpose.FLIP_LEFT_RIGHT,
+    3: Transpose.ROTATE_180,
+    4: Transpose.FLIP_TOP_BOTTOM,
+    5: Transpose.TRANSPOSE,
+    6: Transpose.ROTATE_270,
+    7: Transpose.TRANSVERSE,
+    8: Transpose.ROTATE_90,
+}
+PHOTOMETRIC, SAMPLE_FORMAT = 262, 339  # tags of TIFF
+WHITE_IS_ZERO, UNSIGNED = 0, 1
+LABEL_KINDS = (b"\x08\x00", b"\x10\x00", b"\x08\x02")  # in a PNG's header: grey of 8 and 16 bits, RGB of 8
+END_MARK = b"\xff\xd9"  # of a JPEG
+# libtiff writes what it finds damaged to stderr, which belongs to the whole process
+DECODE_TIFF = """\
+import io, sys
+from PIL import Image, TiffImagePlugin
+Image.MAX_IMAGE_PIXELS = None
+image = TiffImagePlugin.TiffImageFile(io.BytesIO(sys.stdin.buffer.read()))
+image.load()
+sys.stdout.buffer.write(image.convert(sys.argv[1]).tobytes())
+"""
 
-_stderr_lock = threading.Lock()
+_warnings_lock = threading.Lock()  # their filter is the whole process's
 
 
 @dataclass(frozen=True)
@@ -70,15 +91,21 @@ def read_picture(path: Path, min_size: tuple[int, int] = (MIN_WIDTH, MIN_HEIGHT)
     InputError
         The file is missing or damaged, of no format read here, or its size is out of range.
     """
-    data = _file_bytes(path)
-    header = _header(path, data)
-    _check_size(path, header, min_size)
-    pixels = _decoded(path, data, header)
-    rgb, is_valid = _split(pixels) if _keeps_all(header) else (pixels, np.ones(pixels.shape[:2], np.bool_))
-    if header.orientation in TURNS:
-        turn = TURNS[header.orientation]
-        rgb, is_valid = np.ascontiguousarray(turn(rgb)), np.ascontiguousarray(turn(is_valid))
-    return Picture(rgb, is_valid, header.xmp, header.warnings)
+    data = file_bytes(path)
+    with opened(path, data) as image:
+        _check(path, image, len(data), min_size)
+        mode = "RGBA" if image.has_transparency_data else "RGB"
+        is_16_bit_grey = image.mode.startswith("I;16")
+        pixels = np.array(_decoded(path, data, image, image.mode if is_16_bit_grey else mode))
+        if is_16_bit_grey:
+            is_valid = pixels != image.info.get("transparency", -1)
+            pixels = cv2.cvtColor((pixels >> 8).astype(np.uint8), cv2.COLOR_GRAY2RGB)
+        elif pixels.shape[2] == 4:
+            is_valid = pixels[..., 3] > 0
+            pixels = np.ascontiguousarray(pixels[..., :3])
+        else:
+            is_valid = np.ones(pixels.shape[:2], dtype=np.bool_)
+        return Picture(np.asarray(pixels, np.uint8), is_valid, _xmp(image), _warnings(image))
 
 
 def read_labels(path: Path, labels: Labels) -> Picture:
@@ -89,23 +116,28 @@ def read_labels(path: Path, labels: Labels) -> Picture:
     InputError
         The file is missing or damaged, its size is out of range, or it is of no kind that keeps labels.
     """
-    data = _file_bytes(path)
-    header = _header(path, data)
-    _check_size(path, header, (MIN_WIDTH, MIN_HEIGHT))
-    if not (data.startswith(png.MAGIC) and png.keeps_labels(data)) or header.has_alpha:
-        raise InputError(
-            f"{path}: found another kind of picture, wanted labels in a PNG, grey of 8 or 16 bits or RGB of "
-            "8, without alpha"
-        )
-    pixels = _decoded(path, data, replace(header, is_deep=True)).astype(np.int32)
-    if pixels.ndim == 3:
-        pixels = pixels[..., 2] << 16 | pixels[..., 1] << 8 | pixels[..., 0]
-    if header.orientation in TURNS:
-        pixels = np.ascontiguousarray(TURNS[header.orientation](pixels))
-    return Picture(colors_of(pixels), labels.are_kept(pixels), header.xmp, header.warnings)
+    data = file_bytes(path)
+    with opened(path, data) as image:
+        _check(path, image, len(data), (MIN_WIDTH, MIN_HEIGHT))
+        if image.format != "PNG" or data[24:26] not in LABEL_KINDS or image.has_transparency_data:
+            raise InputError(
+                f"{path}: this kind of picture holds no labels, wanted a PNG, grey of 8 or 16 bits or RGB of "
+                "8, without alpha"
+            )
+        pixels = np.array(_decoded(path, data, image, image.mode)).astype(np.int32)
+        if pixels.ndim == 3:
+            pixels = pixels[..., 0] << 16 | pixels[..., 1] << 8 | pixels[..., 2]
+        return Picture(colors_of(pixels), labels.are_kept(pixels), _xmp(image), _warnings(image))
 
 
-def _file_bytes(path: Path) -> bytes:
+def picture_size(path: Path) -> tuple[int, int]:
+    """Width and height [px] of the picture in a file, without decoding it."""
+    with opened(path, file_bytes(path)) as image:
+        return image.size
+
+
+def file_bytes(path: Path) -> bytes:
+    """The content of a picture's file, which must not be empty."""
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: not a file but a folder or a device, {WANTED}")
     try:
@@ -117,90 +149,98 @@ def _file_bytes(path: Path) -> bytes:
     return data
 
 
-def _header(path: Path, data: bytes) -> Header:
-    """What the bytes say of the picture, by the reader of the format that they begin with."""
-    if data.startswith(png.MAGIC):
-        return png.png_header(path, data)
-    if data.startswith(jpeg.MAGIC):
-        return jpeg.jpeg_header(path, data)
-    if data.startswith(tiff.MAGICS):
-        return tiff.tiff_header(path, data)
-    if webp.has_webp_magic(data):
-        return webp.webp_header(path, data)
-    raise InputError(f"{path}: begins with {data[:8]!r}, {WANTED}")
+@contextmanager
+def opened(path: Path, data: bytes) -> Iterator[ImageFile]:
+    """The picture in `data` as Pillow opens it, not decoded; what Pillow raises becomes an InputError."""
+    kind = next((kind for magic, kind in FORMATS.items() if data.startswith(magic)), None)
+    if kind is None:
+        raise InputError(f"{path}: begins with {data[:8]!r}, {WANTED}")
+    with _warnings_lock, warnings.catch_warnings(action="ignore"):
+        try:
+            yield kind(BytesIO(data))
+        except InputError:
+            raise
+        except Exception as error:  # Pillow's readers raise whatever their formats bring
+            words = " ".join(str(error).split())
+            why = f"the {kind.format} is cut off, damaged or of a rare kind ({words})"
+            raise InputError(f"{path}: {why}, {WANTED}") from error
 
 
-def _check_size(path: Path, header: Header, min_size: tuple[int, int]) -> None:
-    """Refuse sizes out of range, before memory is taken for them; the picture may yet be turned by 90 deg."""
-    longer, shorter = max(header.width, header.height), min(header.width, header.height)
-    found = f"{path}: found {header.width} x {header.height}"
+def _check(path: Path, image: ImageFile, num_bytes: int, min_size: tuple[int, int]) -> None:
+    """Refuse what would be read wrongly, and sizes out of range, before memory is taken for them."""
+    longer, shorter = max(image.size), min(image.size)
+    found = f"{path}: found {image.width} x {image.height}"
     if longer < min_size[0] or shorter < min_size[1]:
         raise InputError(f"{found}, wanted at least {min_size[0]} x {min_size[1]}")
     if longer > MAX_WIDTH or shorter > MAX_HEIGHT:
         raise InputError(f"{found}, wanted at most {MAX_WIDTH} x {MAX_HEIGHT}")
-    if longer * shorter > header.max_num_pixels:
+    if longer * shorter > num_bytes * MAX_PIXELS_PER_BYTE[str(image.format)]:
         raise InputError(f"{found} in a file too small for it, {WANTED}")
+    if image.format in ("PNG", "WEBP") and getattr(image, "is_animated", False):
+        raise InputError(f"{path}: the {image.format} is animated, wanted a still picture")
+    tags = image.tag_v2 if isinstance(image, TiffImageFile) else {}
+    is_inverted = image.mode.startswith("I;16") and tags.get(PHOTOMETRIC) == WHITE_IS_ZERO
+    if image.mode in ("I", "F") or is_inverted or set(tags.get(SAMPLE_FORMAT, ())) - {UNSIGNED}:
+        wanted = "wanted unsigned ones of 8 or 16 bits"
+        raise InputError(f"{path}: the {image.format}'s numbers are signed, inverted or of 32 bits, {wanted}")
 
 
-@contextmanager
-def _caught_stderr(messages: list[str]) -> Iterator[None]:
-    """Append what C code writes to stderr meanwhile to `messages` instead.
+def _decoded(path: Path, data: bytes, image: ImageFile, mode: str) -> Image.Image:
+    """The picture decoded, turned as EXIF says, and converted to Pillow's `mode`."""
+    if isinstance(image, TiffImageFile):  # which Pillow turns while it decodes
+        if image.use_load_libtiff:
+            return _decoded_apart(data, mode, image.size)
+        image.im = Image.new(image.mode, image._tile_size).im  # else Pillow does, with a limit of its own
+    if isinstance(image, PngImageFile):
+        PngImageFile(BytesIO(data)).verify()  # of checksums, which decoding leaves aside
+    if isinstance(image, JpegImageFile) and _is_cut(data, image):
+        raise InputError(f"{path}: the JPEG ends before its picture does (cut off?), {WANTED}")
+    image.load()  # here, as NumPy would pass over what it raises
+    converted = image if image.mode == mode else image.convert(mode)
+    turn = TURNS.get(_orientation(image))
+    return converted if turn is None else converted.transpose(turn)
 
-    libjpeg and libpng write to the file descriptor, libtiff through OpenCV's log; there is no other way to
-    hear that a picture was cut short.
+
+def _orientation(image: ImageFile) -> object:
+    """EXIF's number of how the picture is to be turned; None where EXIF says nothing or is damaged.
+
+    ImageOps.exif_transpose writes EXIF anew as well, and raises where it is odd.
     """
-    with _stderr_lock, tempfile.TemporaryFile() as file:
-        sys.stderr.flush()
-        saved, level = os.dup(2), cv2.utils.logging.getLogLevel()
-        try:
-            os.dup2(file.fileno(), 2)
-            cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_WARNING)
-            yield
-        finally:
-            cv2.utils.logging.setLogLevel(level)
-            os.dup2(saved, 2)
-            os.close(saved)
-            file.seek(0)
-            messages.append(file.read().decode("latin-1"))
+    try:
+        return image.getexif().get(Base.Orientation)
+    except Exception:  # as above
+        return None
 
 
-def _decoded(path: Path, data: bytes, header: Header) -> NDArray[Any]:
-    """The pixels as RGB (H, W, 3), uint8, or if `_keeps_all` as OpenCV leaves them, uint8 or uint16."""
-    flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
-    flags = cv2.IMREAD_UNCHANGED if _keeps_all(header) else flags
-    encoded = np.frombuffer(data, dtype=np.uint8)
-    encoded = encoded.copy() if header.patches else encoded
-    for place, patch in header.patches:
-        encoded[place : place + len(patch)] = np.frombuffer(patch, dtype=np.uint8)
-    messages: list[str] = []
-    pixels = None
-    with _caught_stderr(messages):
-        try:
-            pixels = cv2.imdecode(encoded, flags)
-        except cv2.error as error:
-            messages.append(str(error))
-    if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"{path}: the picture can't be decoded, {WANTED}")
-    for damage in DAMAGE.finditer(messages[0]):
-        if not damage.group(2) or int(damage.group(2)) > MAX_PADDING * len(data):
-            raise InputError(f"{path}: the picture is damaged ({damage.group(1).strip()}), {WANTED}")
-    for damage in TIFF_DAMAGE.finditer(messages[0]):
-        raise InputError(f"{path}: the picture is damaged ({damage.group(1).strip()}), {WANTED}")
-    return np.asarray(pixels)
+def _decoded_apart(data: bytes, mode: str, size: tuple[int, int]) -> Image.Image:
+    """The packed TIFF in `data`, decoded by a process of its own."""
+    command = [sys.executable, "-P", "-c", DECODE_TIFF, mode]
+    done = subprocess.run(command, input=data, capture_output=True, check=False)
+    if done.returncode:
+        raise OSError((done.stderr.decode(errors="replace").splitlines() or ["its decoder was killed"])[-1])
+    return Image.frombytes(mode, size, done.stdout)
 
 
-def _keeps_all(header: Header) -> bool:
-    """True if alpha or the lower of 16 bits are to be decoded too."""
-    return header.has_alpha or header.is_deep
+def _is_cut(data: bytes, image: JpegImageFile) -> bool:
+    """True for a JPEG just opened that has no end mark, or has it before the picture ends.
+
+    Then libjpeg takes grey for what is missing, but something else if more bytes come before the mark.
+    """
+    end = data.find(END_MARK, image.fp.tell() if image.fp else 0)
+    width, height = image.size
+    corner = image.crop((width - 8, height - 8, width, height)).convert("RGB")
+    if end < 0 or corner.getcolors(1) != [(64, (128, 128, 128))]:
+        return end < 0
+    longer = JpegImageFile(BytesIO(data[:end] + b"\x5a" * 64 + data[end:]))
+    return longer.tobytes() != image.tobytes()
 
 
-def _split(pixels: NDArray[Any]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """RGB (H, W, 3), 8 bits, and where alpha is above 0 (H, W), of grey (H, W), BGR or BGRA."""
-    has_alpha = pixels.ndim == 3 and pixels.shape[2] == 4
-    is_valid = pixels[..., 3] > 0 if has_alpha else np.ones(pixels.shape[:2], dtype=np.bool_)
-    if pixels.dtype == np.uint16:
-        pixels = (pixels >> 8).astype(np.uint8)
-    if pixels.ndim == 2 or pixels.shape[2] == 1:
-        return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB)), is_valid
-    code = cv2.COLOR_BGRA2RGB if has_alpha else cv2.COLOR_BGR2RGB
-    return np.asarray(cv2.cvtColor(pixels, code)), is_valid
+def _xmp(image: ImageFile) -> bytes:
+    """The picture's XMP packet; empty if it has none, or one that is damaged or long."""
+    xmp = image.info.get("xmp", b"")
+    return xmp if isinstance(xmp, bytes) and len(xmp) <= MAX_XMP_SIZE else b""
+
+
+def _warnings(image: ImageFile) -> tuple[str, ...]:
+    is_several = image.format == "TIFF" and getattr(image, "is_animated", False)
+    return ("found more than one picture in the TIFF, the first was read",) if is_several else ()

@@ -1,4 +1,4 @@
-"""Results as files of the tools that come next: one writer a format, then the same checks for all."""
+"""Results as files of other tools: a writer for each format, and the same checks for all."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,10 +12,8 @@ from .gpano import GPANO
 from .model import Format, Options
 from .nerfstudio import NERFSTUDIO
 from .opensfm import OPENSFM
-from .potree import POTREE
-from .shots import Selection, read_results, select, shots_of, true_results
-from .table import CSV
-from .trajectory import KITTI, TUM
+from .pose_lists import CSV, KITTI, POTREE, TUM
+from .posed_images import Selection, posed_images, read_results, select, true_results
 
 __all__ = ["FORMATS", "Format", "Options", "Selection", "export", "read_results", "select", "true_results"]
 
@@ -39,5 +37,5 @@ def export(results: Sequence[Result], name: str, out: Path, options: Options) ->
     else:
         check_output(out, [Path(result.pano) for result in results])
     if not results:
-        raise InputError(f"{out}: found no pose to write, wanted one or more")
-    form.write(shots_of(results, form, options), out, options)
+        raise InputError(f"{out}: there is no pose to write; --all also writes those that are not localized")
+    form.write(posed_images(results, form, options), out, options)

@@ -11,28 +11,28 @@ from pathlib import Path
 from ...geometry.camera_axes import OPTICAL_FROM_CAM, translation, turned
 from ...geometry.pose import quaternion_wxyz
 from ...runtime.atomic import replacing_folder
-from .model import Format, Options, Shot
-from .text import numbers, offset_comment, write_lines
+from .model import Format, Options, PosedImage
+from .pose_lists import numbers, offset_comment, write_lines
 
 
-def write(shots: Sequence[Shot], out: Path, options: Options) -> None:
-    """cameras.txt, images.txt and a points3D.txt without points, in a new folder."""
-    camera_ids = {size: i for i, size in enumerate(dict.fromkeys(shot.size for shot in shots), 1)}
+def write(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write cameras.txt, images.txt and a points3D.txt without points into a new folder."""
+    camera_ids = {size: i for i, size in enumerate(dict.fromkeys(image.size for image in images), 1)}
     with replacing_folder(out) as folder:
         comments = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", *offset_comment(options)]
         cameras = [f"{i} EQUIRECTANGULAR {w} {h} {w} {h}" for (w, h), i in camera_ids.items()]
         write_lines(folder / "cameras.txt", [*comments, *cameras])
         comments = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then a line of points"]
-        images = [_image_line(i, shot, camera_ids[shot.size]) for i, shot in enumerate(shots, 1)]
-        write_lines(folder / "images.txt", [*comments, *offset_comment(options), *images])
+        lines = [_image_line(i, image, camera_ids[image.size]) for i, image in enumerate(images, 1)]
+        write_lines(folder / "images.txt", [*comments, *offset_comment(options), *lines])
         write_lines(folder / "points3D.txt", ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"])
 
 
-def _image_line(image_id: int, shot: Shot, camera_id: int) -> str:
+def _image_line(image_id: int, image: PosedImage, camera_id: int) -> str:
     """The line of an image, and the empty one of its points."""
-    pose = turned(shot.pose, OPTICAL_FROM_CAM)
+    pose = turned(image.pose, OPTICAL_FROM_CAM)
     values = [*quaternion_wxyz(pose.R_cam_from_world), *translation(pose)]
-    return f"{image_id} {numbers(values)} {camera_id} {shot.name}\n"
+    return f"{image_id} {numbers(values)} {camera_id} {image.name}\n"
 
 
 # COLMAP reads a name up to the first blank

@@ -11,18 +11,18 @@ import numpy as np
 from ...errors import InputError
 from ...geometry.camera_axes import heading_pitch_roll_deg
 from ...runtime.atomic import write_atomically
-from .model import Format, Options, Shot
+from .model import Format, Options, PosedImage
 
 STEP = 10.0  # [m] ahead, to find true north
 
 
-def write(shots: Sequence[Shot], out: Path, options: Options) -> None:
-    """A FeatureCollection with a point a result."""
+def write(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write a FeatureCollection with a point a result."""
     pyproj = _pyproj()
     if options.crs is None:
         raise InputError("--crs: not given, wanted the cloud's coordinate system, such as EPSG:25832")
     transformer = _transformer(pyproj, options.crs)
-    features = [_feature(shot, transformer, pyproj.Geod(ellps="WGS84"), options.crs) for shot in shots]
+    features = [_feature(image, transformer, pyproj.Geod(ellps="WGS84"), options.crs) for image in images]
     document = {"type": "FeatureCollection", "features": features}
     write_atomically(out, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
 
@@ -48,22 +48,22 @@ def _transformer(pyproj: Any, crs: str) -> Any:
     return pyproj.Transformer.from_crs(system, "EPSG:4326", always_xy=True)
 
 
-def _feature(shot: Shot, transformer: Any, geod: Any, crs: str) -> dict[str, object]:
+def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[str, object]:
     """The point without a height, which would have to be above WGS84's ellipsoid: z is a property."""
-    result, (x, y, z) = shot.result, shot.pose.center_world.tolist()
-    heading, pitch, roll = heading_pitch_roll_deg(shot.pose)
+    result, (x, y, z) = image.result, image.pose.center_world.tolist()
+    heading, pitch, roll = heading_pitch_roll_deg(image.pose)
     ahead = np.radians(heading)
     longitudes, latitudes = transformer.transform(
         [x, x + STEP * np.sin(ahead)], [y, y + STEP * np.cos(ahead)]
     )
     if not np.isfinite([*longitudes, *latitudes]).all():
-        raise InputError(f"{shot.path}: found a camera at ({x}, {y}), wanted one where {crs} holds")
+        raise InputError(f"{image.path}: found a camera at ({x}, {y}), wanted one where {crs} holds")
     true_heading, _, _ = geod.inv(longitudes[0], latitudes[0], longitudes[1], latitudes[1])
     return {
         "type": "Feature",
         "geometry": {"type": "Point", "coordinates": [longitudes[0], latitudes[0]]},
         "properties": {
-            "image": shot.name,
+            "image": image.name,
             "cloud": result.cloud_name,
             "status": result.status,
             "confidence": result.confidence,

@@ -6,29 +6,23 @@ others wrote into it stays as they wrote it.
 
 import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from ...errors import InputError
 from ...geometry.camera_axes import DECIMALS, heading_pitch_roll_deg
+from ...panorama.gpano import CROP_FIELDS, NAMESPACE, PREFIX
+from ...panorama.picture import opened
 from ...runtime.atomic import replacing_folder, write_atomically
-from .model import Format, Options, Shot, check_size
-from .pictures import JPEG_MAGIC, SCAN, Segment, jpeg_segments, jpeg_size
+from .model import Format, Options, PosedImage, check_size
 
-NAMESPACE = b"http://ns.google.com/photos/1.0/panorama/"
-APP0, APP1 = 0xE0, 0xE1
+JPEG_MAGIC = b"\xff\xd8"
+APP0, APP1, SCAN = 0xE0, 0xE1, 0xDA
+MARKER = re.compile(rb"\xff+")
 EXIF_MARK, XMP_MARK = b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0"
 MAX_BODY_SIZE = 0xFFFF - 2
-PREFIX = re.compile(rb"xmlns:([A-Za-z_][\w.-]{0,40})\s{0,9}=\s{0,9}[\"']" + re.escape(NAMESPACE))
 POSE_NAMES = ("PoseHeadingDegrees", "PosePitchDegrees", "PoseRollDegrees")
-CROP_NAMES = (
-    "CroppedAreaLeftPixels",
-    "CroppedAreaTopPixels",
-    "CroppedAreaImageWidthPixels",
-    "CroppedAreaImageHeightPixels",
-    "FullPanoWidthPixels",
-    "FullPanoHeightPixels",
-)
 END = re.compile(rb"</([A-Za-z_][\w.-]{0,40}):RDF\s{0,9}>")
 ABOUT = re.compile(rb":about\s{0,9}=\s{0,9}(\"[^\"<]{0,999}\"|'[^'<]{0,999}')")
 # what is left of a description that had nothing but the pose
@@ -44,18 +38,24 @@ EMPTY_PACKET = (
 )
 
 
-def write(shots: Sequence[Shot], out: Path, options: Options) -> None:
-    """A copy of each picture in a new folder, under its name in --images or its file name."""
-    names = [shot.name if options.images else Path(shot.name).name for shot in shots]
+class Segment(NamedTuple):
+    """One segment of a JPEG: data[begin:end], marker and length included."""
+
+    marker: int
+    begin: int
+    end: int
+
+
+def write(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write a copy of each picture into a new folder, under its name in --images or its file name."""
+    names = [image.name if options.images else Path(image.name).name for image in images]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(
-            f"{twice}: found two pictures of that name, wanted --images FOLDER to tell them apart"
-        )
+        raise InputError(f"{twice}: two pictures have this name; --images FOLDER tells them apart")
     with replacing_folder(out) as folder:
-        for name, shot in zip(names, shots, strict=True):
-            angles = heading_pitch_roll_deg(shot.pose)
-            copy = with_pose(shot.path, shot.path.read_bytes(), angles)
+        for name, image in zip(names, images, strict=True):
+            angles = heading_pitch_roll_deg(image.pose)
+            copy = with_pose(image.path, image.path.read_bytes(), angles)
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             write_atomically(folder / name, copy)
 
@@ -66,9 +66,10 @@ def with_pose(path: Path, data: bytes, angles_deg: tuple[float, float, float]) -
     Fields of the pose that were there are replaced. Without a packet one is put behind JFIF's and EXIF's.
     """
     segments = list(jpeg_segments(data)) if data.startswith(JPEG_MAGIC) else []
-    size = jpeg_size(data) if segments and segments[-1].marker == SCAN else None
-    if size is None:
-        raise InputError(f"{path}: found no JPEG, or a damaged one, wanted a whole JPEG to write XMP into")
+    if not segments or segments[-1].marker != SCAN:
+        raise InputError(f"{path}: no JPEG, or a damaged one; XMP can be written into a whole JPEG only")
+    with opened(path, data) as image:
+        size = image.size
     bodies = [data[begin + 4 : end] if marker == APP1 else b"" for marker, begin, end in segments]
     packets = [i for i, body in enumerate(bodies) if body.startswith(XMP_MARK)]
     edits = []  # begin, end, what comes there
@@ -87,6 +88,23 @@ def with_pose(path: Path, data: bytes, angles_deg: tuple[float, float, float]) -
     return b"".join([*pieces, data[begin:]])
 
 
+def jpeg_segments(data: bytes) -> Iterator[Segment]:
+    """The segments of a JPEG up to the header of its first scan; fewer if it is damaged."""
+    begin = len(JPEG_MAGIC)
+    while found := MARKER.match(data, begin):
+        begin = found.end() - 1  # a marker may be filled up with FF
+        if begin + 4 > len(data):
+            return
+        marker, length = struct.unpack_from(">xBH", data, begin)
+        end = begin + 2 + length
+        if length < 2 or end > len(data):
+            return
+        yield Segment(marker, begin, end)
+        if marker == SCAN:
+            return
+        begin = end
+
+
 def _end_of_first_segments(segments: Sequence[Segment], bodies: Sequence[bytes]) -> int:
     """Behind JFIF's and EXIF's segments, which have to be the first."""
     place = len(JPEG_MAGIC)
@@ -100,7 +118,7 @@ def _end_of_first_segments(segments: Sequence[Segment], bodies: Sequence[bytes])
 def _segment(path: Path, packet: bytes) -> bytes:
     body = XMP_MARK + packet
     if len(body) > MAX_BODY_SIZE:
-        raise InputError(f"{path}: found XMP that leaves no room for the pose, wanted less than 64 KB of it")
+        raise InputError(f"{path}: its XMP leaves no room for the pose: with the pose it may have 64 KB")
     return struct.pack(">BBH", 0xFF, APP1, len(body) + 2) + body
 
 
@@ -132,9 +150,9 @@ def _with_fields(
         for name in re.findall(re.escape(prefix) + rb":(\w{1,60})", packet)
     }
     fields = {} if "ProjectionType" in known else {"ProjectionType": "equirectangular"}
-    if not known & set(CROP_NAMES):
+    if not known & set(CROP_FIELDS):
         check_size(f"{path}: without GPano's crop", size)
-        fields |= {name: str(value) for name, value in zip(CROP_NAMES, (0, 0, *size, *size), strict=True)}
+        fields |= {name: str(value) for name, value in zip(CROP_FIELDS, (0, 0, *size, *size), strict=True)}
     fields |= {n: f"{angle:.{DECIMALS}f}" for n, angle in zip(POSE_NAMES, angles_deg, strict=True)}
     attributes = "".join(f' GPano:{name}="{value}"' for name, value in fields.items()).encode()
     about = ABOUT.search(packet)  # has to be the same in all descriptions

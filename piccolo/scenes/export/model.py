@@ -1,4 +1,4 @@
-"""What a writer gets and says of itself."""
+"""What a format's writer is given, and what describes the format."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -7,13 +7,12 @@ from pathlib import Path
 
 from ...errors import InputError
 from ...geometry.pose import Pose
+from ...panorama.crop import ASPECT_TOLERANCE
 from ...result import Result
-
-ASPECT_TOLERANCE = 0.01  # of W = 2 H, as in reading
 
 
 @dataclass(frozen=True)
-class Shot:
+class PosedImage:
     """One picture with its pose, as it is to be written."""
 
     name: str  # of the picture, relative to the folder of images
@@ -48,8 +47,8 @@ class Format:
     """How the poses are written in one format."""
 
     name: str
-    about: str  # what reads it, and what `out` is
-    write: Callable[[Sequence[Shot], Path, Options], None]
+    description: str  # what reads it, and what `out` is
+    write: Callable[[Sequence[PosedImage], Path, Options], None]
     options: frozenset[str] = frozenset()  # names of the Options that it takes beside `images`
     is_folder: bool = False
     has_unique_names: bool = True  # the picture's name is the key

@@ -14,25 +14,25 @@ import numpy as np
 from ...geometry.camera_axes import OPENGL_FROM_CAM, turned
 from ...geometry.pose import T_world_from_cam
 from ...runtime.atomic import write_atomically
-from .model import Format, Options, Shot
+from .model import Format, Options, PosedImage
 
 
-def write(shots: Sequence[Shot], out: Path, options: Options) -> None:
-    """One JSON file; the offset is its applied_transform."""
-    sizes = {shot.size for shot in shots}
+def write(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write one JSON file; the offset is its applied_transform."""
+    sizes = {image.size for image in images}
     document: dict[str, object] = {"camera_model": "EQUIRECTANGULAR"}
     if len(sizes) == 1:
-        document |= _intrinsics(shots[0].size)
+        document |= _intrinsics(images[0].size)
     if options.offset is not None:
         moved = np.column_stack([np.eye(3), -np.array(options.offset)])
         document["applied_transform"] = moved.tolist()
     document["frames"] = [
         {
-            "file_path": shot.name,
-            **(_intrinsics(shot.size) if len(sizes) > 1 else {}),
-            "transform_matrix": T_world_from_cam(turned(shot.pose, OPENGL_FROM_CAM)).tolist(),
+            "file_path": image.name,
+            **(_intrinsics(image.size) if len(sizes) > 1 else {}),
+            "transform_matrix": T_world_from_cam(turned(image.pose, OPENGL_FROM_CAM)).tolist(),
         }
-        for shot in shots
+        for image in images
     ]
     write_atomically(out, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
 

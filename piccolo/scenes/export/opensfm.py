@@ -12,21 +12,21 @@ from ...errors import InputError
 from ...geometry.camera_axes import OPTICAL_FROM_CAM, translation, turned
 from ...geometry.pose import log_so3
 from ...runtime.atomic import write_atomically
-from .model import Format, Options, Shot
-from .text import write_offset_beside
+from .model import Format, Options, PosedImage
+from .pose_lists import write_offset_beside
 
 
-def write(shots: Sequence[Shot], out: Path, options: Options) -> None:
-    """One JSON file: a list of one reconstruction without points."""
+def write(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write one JSON file: a list of one reconstruction without points."""
     cameras, documents = {}, {}
-    for shot in shots:
-        width, height = shot.size
+    for image in images:
+        width, height = image.size
         if width != 2 * height:
-            raise InputError(f"{shot.path}: found {width} x {height}, wanted W = 2 H exactly for OpenSfM")
+            raise InputError(f"{image.path}: found {width} x {height}, wanted W = 2 H exactly for OpenSfM")
         camera = f"spherical {width} {height}"
         cameras[camera] = {"projection_type": "spherical", "width": width, "height": height}
-        pose = turned(shot.pose, OPTICAL_FROM_CAM)
-        documents[shot.name] = {
+        pose = turned(image.pose, OPTICAL_FROM_CAM)
+        documents[image.name] = {
             "rotation": log_so3(pose.R_cam_from_world).tolist(),
             "translation": translation(pose).tolist(),
             "camera": camera,

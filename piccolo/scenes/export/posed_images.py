@@ -1,4 +1,4 @@
-"""From lines of JSON to the pictures and poses that are to be written."""
+"""From lines of JSON to the pictures and poses to export."""
 
 import math
 import os
@@ -13,10 +13,10 @@ import numpy as np
 from ...confidence.confidence import LOCALIZED
 from ...errors import InputError
 from ...geometry.pose import Pose
+from ...panorama import panorama_size
 from ...result import Result
 from ..scene import Scene
-from .model import Format, Options, Shot, check_size
-from .pictures import picture_size
+from .model import Format, Options, PosedImage, check_size
 
 MAX_ROTATION_ERROR = 1e-6  # of R R^T from the identity
 TIMESTAMP = re.compile(r"\d+(\.\d+)?")
@@ -27,7 +27,7 @@ WANTED = "wanted JSON lines of localize.py"
 
 @dataclass(frozen=True)
 class Selection:
-    """The results to write, and why others are not."""
+    """The results to write, and how many others were left out for which reason."""
 
     results: tuple[Result, ...]
     left_out: dict[str, int]  # how many, by status or "without a pose"
@@ -73,20 +73,20 @@ def _check(result: Result) -> None:
     """Refuse names and numbers that can't be written, and a pose that is none."""
     for label, value in (("status", result.status), ("cloud", result.cloud_name), ("pano", result.pano)):
         if not isinstance(value, str) or UNWRITABLE.search(value):
-            raise InputError(f"result: found {label} {value!r}, wanted text on one line")
+            raise InputError(f"result: {label} is {value!r}, wanted text on one line")
     values = [result.confidence, *([result.evidence.score] if result.evidence else [])]
     if not all(isinstance(value, int | float) and math.isfinite(value) for value in values):
-        raise InputError(f"result: found confidence and score {values}, wanted finite numbers")
+        raise InputError(f"result: confidence and score are {values}, wanted finite numbers")
     if result.pose is None:
         return
     R, center = result.pose.R_cam_from_world, result.pose.center_world
     is_number = R.dtype.kind in "fiu" and center.dtype.kind in "fiu"
     if not is_number or R.shape != (3, 3) or center.shape != (3,) or not np.isfinite(center).all():
-        raise InputError("result: found no numbers of a pose, wanted R_cam_from_world 3 x 3 and center_world")
+        raise InputError("result: the pose needs numbers, R_cam_from_world 3 x 3 and center_world 3")
     # NaN is not below the limit either
     is_orthonormal = np.abs(R @ R.T - np.eye(3)).max() < MAX_ROTATION_ERROR
     if not (is_orthonormal and np.linalg.det(R) > 0.0):
-        raise InputError("result: found an R_cam_from_world that is no rotation, wanted one")
+        raise InputError("result: R_cam_from_world is no rotation")
 
 
 def select(results: Sequence[Result], clouds: Sequence[str] = (), use_all: bool = False) -> Selection:
@@ -109,32 +109,37 @@ def select(results: Sequence[Result], clouds: Sequence[str] = (), use_all: bool 
     return Selection(tuple(chosen), dict(left_out))
 
 
-def shots_of(results: Sequence[Result], form: Format, options: Options) -> list[Shot]:
+def posed_images(results: Sequence[Result], form: Format, options: Options) -> list[PosedImage]:
     """Pictures and poses by the names, times and offset that the options ask for."""
     offset = np.array(options.offset or (0.0, 0.0, 0.0))
-    shots: dict[str, Shot] = {}
+    posed: dict[str, PosedImage] = {}
     for index, result in enumerate(results):
         if result.pose is None:
-            raise InputError(f"{result.pano}: found a result without a pose, wanted one with")
+            raise InputError(f"{result.pano}: this result has no pose to write")
         name, path = _name(result.pano, options.images), Path(result.pano)
         if form.forbidden and (found := re.search(form.forbidden, name)):
             raise InputError(
-                f"{name}: found {found.group()!r} in the name, wanted one that {form.name} can read"
+                f"{name}: {form.name} can't read {found.group()!r} in a name: rename the picture"
             )
-        if form.has_unique_names and name in shots:
-            clouds = f"{shots[name].result.cloud_name}, {result.cloud_name}"
-            raise InputError(
-                f"{name}: found two results of it (clouds {clouds}), wanted one; --cloud chooses"
-            )
-        size = (0, 0)
-        if "size" in form.options:
-            size = options.size or picture_size(path)
-            check_size(str(path), size)
+        if form.has_unique_names and name in posed:
+            clouds = f"{posed[name].result.cloud_name}, {result.cloud_name}"
+            raise InputError(f"{name}: has two results (clouds {clouds}); --cloud chooses one")
+        size = _size(path, options) if "size" in form.options else (0, 0)
         time = str(index) if options.timestamps == "index" else _timestamp(path)
         pose = Pose(result.pose.R_cam_from_world, result.pose.center_world - offset)
         key = name if form.has_unique_names else str(index)
-        shots[key] = Shot(name, path, time, pose, size, result)
-    return list(shots.values())
+        posed[key] = PosedImage(name, path, time, pose, size, result)
+    return list(posed.values())
+
+
+def _size(path: Path, options: Options) -> tuple[int, int]:
+    """Width and height [px] of a full sphere: the option, or as the picture's file has it."""
+    try:
+        size = options.size or panorama_size(path)
+    except InputError as error:
+        raise InputError(f"{error}; with --size W H no picture is needed") from error
+    check_size(str(path), size)
+    return size
 
 
 def _name(pano: str, images: Path | None) -> str:
@@ -143,11 +148,11 @@ def _name(pano: str, images: Path | None) -> str:
         return Path(pano).as_posix()
     name = Path(os.path.relpath(pano, images))
     if ".." in name.parts:
-        raise InputError(f"{pano}: found outside of --images {images}, wanted a picture in that folder")
+        raise InputError(f"{pano}: is not in the folder --images {images}")
     return name.as_posix()
 
 
 def _timestamp(path: Path) -> str:
     if not TIMESTAMP.fullmatch(path.stem):
-        raise InputError(f"{path}: found the name {path.stem!r}, wanted a number for --timestamps name")
+        raise InputError(f"{path}: its name {path.stem!r} is no number, as --timestamps name needs")
     return path.stem

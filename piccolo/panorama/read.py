@@ -1,0 +1,161 @@
+"""A picture file or a folder of cube faces read as a panorama: a full sphere, and the pixels that count."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cloud.label_colors import Labels
+from ..errors import InputError
+from .auto_mask import black_borders, polar_disc
+from .crop import ASPECT_TOLERANCE, embed_crop, full_size, region_of_fov
+from .cube_files import cube_of_cells, face_paths, read_cube_folder
+from .fisheye import is_dual_fisheye
+from .gpano import CropRegion, attitude, crop_region, gpano_fields, projection
+from .masks import find_mask, mask_pole, read_mask
+from .model import GPano, Panorama, ReadOptions
+from .picture import Picture, picture_size, read_labels, read_picture
+
+AS_STORED = ReadOptions()
+MIN_REPORTED = 0.001  # of the sphere: borders below this are masked without a warning
+
+
+def read_panorama(path: Path, options: ReadOptions = AS_STORED) -> Panorama:
+    """The panorama in a JPEG, PNG, TIFF or WebP file or in a folder of six cube faces, as a full sphere.
+
+    Colours have 8 bits (of 16 the upper 8, v >> 8), grey becomes RGB, EXIF's orientation is applied. Not
+    valid are pixels of alpha 0, what a crop leaves open, masks, black borders and discs put over a pole.
+    Labels become colours, and only masks and ignored labels are not valid.
+
+    Raises
+    ------
+    InputError
+        The file is missing or damaged, of another format or projection, its size is out of range, or nothing
+        tells which part of the sphere it shows.
+    """
+    path = Path(path)
+    if options.labels:
+        return _read_labelled(path, options, options.labels)
+    is_folder = path.is_dir()
+    picture = read_cube_folder(path) if is_folder else read_picture(path)
+    cube = None if is_folder else cube_of_cells(path, picture, options.cube_order)
+    if is_folder or cube:
+        region, gpano, notes = CropRegion(), None, list[str]()
+    else:
+        region, gpano, notes = _region_and_attitude(path, picture, options)
+    return _embedded_and_masked(path, cube or picture, region, options, gpano, notes)
+
+
+def panorama_size(path: Path) -> tuple[int, int]:
+    """Width and height [px] of a panorama's file, or of the sphere of a folder of cube faces, not decoded."""
+    if not path.is_dir():
+        return picture_size(path)
+    size, _ = picture_size(face_paths(path)["f"])
+    return 4 * size, 2 * size
+
+
+def _read_labelled(path: Path, options: ReadOptions, labels: Labels) -> Panorama:
+    """The panorama in a PNG file of labels. No automatic masks: a black border is a label too."""
+    picture = read_labels(path, labels)
+    width, height = picture.size
+    if width != 2 * height:
+        raise InputError(f"{path}: found labels of {width} x {height}, wanted the full sphere, W = 2 H")
+    notes = list(picture.warnings)
+    counts = _user_masks(path, [picture.size], options, notes).get(0)
+    fields = gpano_fields(picture.xmp)
+    gpano = attitude(fields) if fields else None
+    return _masked(path, Panorama(picture.rgb, picture.is_valid, gpano, tuple(notes)), counts, options)
+
+
+def _region_and_attitude(
+    path: Path, picture: Picture, options: ReadOptions
+) -> tuple[CropRegion, GPano | None, list[str]]:
+    """Which part of the sphere a picture shows, how the camera was held, and warnings."""
+    fields = gpano_fields(picture.xmp)
+    gpano = attitude(fields) if fields else None
+    width, height = picture.size
+    if options.fov_deg is not None:
+        return region_of_fov(options.fov_deg, width, height), gpano, []
+    name = projection(fields)
+    if name not in ("", "equirectangular"):
+        raise InputError(f"{path}: its metadata names the projection {name!r}, wanted equirectangular")
+    notes: list[str] = []
+    region = crop_region(fields, width / height)
+    is_two_to_one = abs(width - 2 * height) <= ASPECT_TOLERANCE * 2 * height
+    if region is None and is_two_to_one:
+        region = CropRegion()
+        notes = ["the crop in the metadata makes no sense or has another shape: read as uncropped"]
+    if region is None or (region.is_full and not is_two_to_one):
+        wrong = " and a crop in the metadata that does not fit it" if region is None else ""
+        raise InputError(
+            f"{path}: found {width} x {height}{wrong}, wanted width = 2 x height (a full "
+            "equirectangular panorama), GPano metadata of a crop, a field of view (--fov), or the order of "
+            "cube faces (--cube-order)"
+        )
+    if region.is_full and is_dual_fisheye(picture.rgb):
+        raise InputError(
+            f"{path}: two fisheye pictures side by side: stitch them with the camera's program first, wanted "
+            "an equirectangular panorama"
+        )
+    return region, gpano, notes
+
+
+def _embedded_and_masked(
+    path: Path,
+    picture: Picture,
+    region: CropRegion,
+    options: ReadOptions,
+    gpano: GPano | None,
+    notes: list[str],
+) -> Panorama:
+    """The picture at its place in the sphere, with everything masked that is not to be counted."""
+    size = full_size(path, region, picture.size)
+    notes = [*picture.warnings, *notes]
+    masks = _user_masks(path, [size, picture.size], options, notes)
+    is_valid = picture.is_valid & masks[1] if 1 in masks else picture.is_valid
+    borders = black_borders(picture.rgb, is_valid, region.is_full)
+    if borders is not None:
+        is_valid = is_valid & ~borders
+        fraction = _sphere_fraction(borders, region)
+        if fraction >= MIN_REPORTED:
+            notes.append(f"masked black borders: {100 * fraction:.1f} % of the sphere")
+    rgb, is_valid = embed_crop(path, picture.rgb, is_valid, region)
+    for pole in ("zenith", "nadir"):
+        half_angle = polar_disc(rgb, is_valid, pole)
+        if half_angle:
+            notes.append(f"masked a {pole} patch of {half_angle:.1f} deg")
+            is_valid = mask_pole(is_valid, pole, half_angle)
+    return _masked(path, Panorama(rgb, is_valid, gpano, tuple(notes)), masks.get(0), options)
+
+
+def _masked(
+    path: Path, panorama: Panorama, counts: NDArray[np.bool_] | None, options: ReadOptions
+) -> Panorama:
+    """The panorama less what a mask of its size, or the option for the nadir, takes out."""
+    is_valid = panorama.is_valid if counts is None else panorama.is_valid & counts
+    is_valid = mask_pole(is_valid, "nadir", options.mask_nadir_deg)
+    if not is_valid.any():
+        raise InputError(f"{path}: no pixel is left: all are masked, black, or of ignored labels")
+    return replace(panorama, is_valid=np.ascontiguousarray(is_valid))
+
+
+def _user_masks(
+    path: Path, sizes: list[tuple[int, int]], options: ReadOptions, notes: list[str]
+) -> dict[int, NDArray[np.bool_]]:
+    """The user's mask, True where pixels count, by the index of the size that it has the shape of."""
+    if options.mask is None:
+        return {}
+    file = find_mask(options.mask, path)
+    if file is None:
+        notes.append(f"found no mask {path.stem} in {options.mask}")
+        return {}
+    index, counts = read_mask(file, sizes)
+    return {index: counts}
+
+
+def _sphere_fraction(is_there: NDArray[np.bool_], region: CropRegion) -> float:
+    """Fraction of the sphere's area that a part (H, W) of a picture of `region` has."""
+    rows = (np.arange(len(is_there)) + 0.5) / len(is_there) * region.height + region.top
+    per_row = is_there.mean(axis=1) * np.sin(np.clip(rows, 0.0, 1.0) * np.pi)
+    return float(per_row.mean() * region.width * region.height * np.pi / 2.0)
