@@ -10,19 +10,19 @@ from test_cloud_morton import seeded_cloud, whole
 
 from piccolo.cloud import open_cloud, read_cloud
 from piccolo.cloud.readers.e57 import open_e57
-from piccolo.cloud.readers.intensity import as_gray, in_gray
+from piccolo.cloud.readers.intensity import as_gray, intensity_reader
 from piccolo.cloud.readers.las import open_las
 from piccolo.cloud.readers.pcd import open_pcd
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.readers.ptx import open_ptx
-from piccolo.cloud.readers.reader import RawCloud, ReadOptions
+from piccolo.cloud.readers.reader import CloudReadOptions, RawCloud
 from piccolo.cloud.readers.text import open_text
 from piccolo.cloud.settings import CloudSettings
 from piccolo.errors import InputError
 from piccolo.geometry.pose import exp_so3
 
 POINTS = seeded_cloud(1, num_points=3000).points_world
-GRAY = ReadOptions(intensity_as_gray=True)
+GRAY = CloudReadOptions(intensity_as_gray=True)
 AS_GRAY = CloudSettings(intensity_as_gray=True)
 
 
@@ -41,7 +41,7 @@ def _in_gray(intensity, points=POINTS, chunk=701):
         for lo in range(0, len(points), chunk):
             yield points[lo : lo + chunk], intensity[lo : lo + chunk]
 
-    return np.concatenate([raw.colors for raw in in_gray("a", read)()])
+    return np.concatenate([raw.colors for raw in intensity_reader("a", read)()])
 
 
 @pytest.mark.parametrize("kind", ["bytes", "16 bits", "decibels", "mirrors"])

@@ -13,7 +13,7 @@ from piccolo.cloud.readers import reader as raw
 from piccolo.cloud.readers.lines import line_blocks
 from piccolo.cloud.readers.pts import open_pts
 from piccolo.cloud.readers.ptx import open_ptx
-from piccolo.cloud.readers.reader import ReadOptions
+from piccolo.cloud.readers.reader import CloudReadOptions
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)
@@ -250,7 +250,7 @@ def test_a_file_cut_while_it_is_read_is_refused(tmp_path, monkeypatch, name, gra
             for k, f in enumerate(map(str.split, lines))
         ]
     path = write(tmp_path / name, lines)
-    chunks = open_source(path, ReadOptions(intensity_as_gray=gray)).read_chunks()
+    chunks = open_source(path, CloudReadOptions(intensity_as_gray=gray)).read_chunks()
     next(chunks)
     content = path.read_bytes()
     with path.open("r+b") as file:

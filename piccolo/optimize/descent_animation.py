@@ -19,7 +19,7 @@ from ..render.overlay import compared, photo_of
 from ..render.surfel_renderer import closed, draw, encoded, evenly, not_hidden
 from ..render.surfels import surfels_of
 from ..runtime.atomic import replacing_folder, write_atomically
-from ..runtime.optional import library
+from ..runtime.optional import import_optional
 from ..runtime.threads import Workers
 from .refine import Refined, refine, sampling_loss_of
 from .settings import DescentSettings
@@ -91,7 +91,7 @@ def frames_of(
 def check_animation(path: Path) -> None:
     """Refuse, before any work is done, a kind that can't be written here."""
     if path.suffix.lower() == ".gif":
-        library(path, "PIL.Image")
+        import_optional(path, "PIL.Image")
 
 
 def write_animation(path: Path, frames: Frames) -> None:
@@ -107,7 +107,7 @@ def write_animation(path: Path, frames: Frames) -> None:
 
 
 def _gif(path: Path, frames: Frames) -> bytes:
-    pillow = library(path, "PIL.Image")
+    pillow = import_optional(path, "PIL.Image")
     first, *others = (pillow.fromarray(frame) for frame in frames)
     file = BytesIO()
     duration = 1000 // FRAMES_PER_S

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
-from ...runtime.optional import library
+from ...runtime.optional import import_optional
 from .mesh_files import Beside
 from .mesh_gltf import Material, narrow
 from .mesh_texture import Texture, check_image, first_line, own_limit, texture_of
@@ -50,7 +50,7 @@ class Loaded:
 
 def load_gltf(path: Path, content: bytes) -> Loaded:
     """A glTF or GLB file."""
-    library(path, "PIL.Image")
+    import_optional(path, "PIL.Image")
     beside = Beside(path)
     narrowed = narrow(content, beside)
     return Loaded(path, _scene(beside, narrowed.content, "gltf"), narrowed.materials)
@@ -58,7 +58,7 @@ def load_gltf(path: Path, content: bytes) -> Loaded:
 
 def load_obj(path: Path, content: bytes) -> Loaded:
     """An OBJ file with its materials."""
-    library(path, "PIL.Image")
+    import_optional(path, "PIL.Image")
     try:
         content.decode()
     except UnicodeDecodeError:
@@ -102,7 +102,7 @@ def _with_raw_colors(parsed: dict[str, Any]) -> dict[str, Any]:
 
 
 def _scene(beside: Beside, content: bytes, kind: str, has_texture: bool = True) -> Any:
-    trimesh = library(beside.path, "trimesh")
+    trimesh = import_optional(beside.path, "trimesh")
     try:
         with own_limit(beside.path), _strict():
             # a texture's corners are told apart only where there is a texture: colours go by vertices
@@ -140,7 +140,7 @@ def _strict() -> Iterator[None]:
 
 def load_ply(path: Path) -> Loaded:
     """A PLY file with faces."""
-    library(path, "PIL.Image")
+    import_optional(path, "PIL.Image")
     content = path.read_bytes()
     beside = Beside(path)
     header = content.partition(b"end_header")[0].decode("utf-8", "replace")

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...runtime.optional import library
+from ...runtime.optional import import_optional
 
 MAX_TEXELS = 1 << 28  # 16,384 x 16,384: 1 GiB while it is looked up, three while it is decoded
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "TGA", "GIF")
@@ -27,7 +27,7 @@ class Texture:
 
     def texels(self) -> NDArray[np.uint8]:
         """Texels (H, W, 4) RGBA, the first row at the top."""
-        images = library(self.path, "PIL.Image")
+        images = import_optional(self.path, "PIL.Image")
         with own_limit(self.path):
             try:
                 with images.open(BytesIO(self.content), formats=FORMATS) as image:
@@ -52,7 +52,7 @@ def texture_of(path: Path, image: Any) -> Texture | None:
 @contextmanager
 def own_limit(path: Path) -> Iterator[None]:
     """Lift Pillow's limit, which real textures exceed: MAX_TEXELS is held here before they are decoded."""
-    images: Any = library(path, "PIL.Image")
+    images: Any = import_optional(path, "PIL.Image")
     limit = images.MAX_IMAGE_PIXELS
     images.MAX_IMAGE_PIXELS = None
     try:
@@ -63,7 +63,7 @@ def own_limit(path: Path) -> Iterator[None]:
 
 def check_image(path: Path, name: str, content: bytes) -> None:
     """Refuse what is no image, before trimesh passes over it."""
-    images: Any = library(path, "PIL.Image")
+    images: Any = import_optional(path, "PIL.Image")
     with own_limit(path):
         try:
             with images.open(BytesIO(content), formats=FORMATS) as image:
