@@ -51,7 +51,7 @@ def colored_chunks(
         if wrong >= 0:
             color = " ".join(f"{value:g}" for value in values[wrong].tolist())
             place = locate(num_before + wrong)
-            raise InputError(f"{place} has the colour {color}, wanted three numbers from 0 to {brightest:g}")
+            raise InputError(f"{place} has the colour {color}, wanted 0 to {brightest:g}")
         num_before += len(colors)
         yield RawCloud(points_world, colors)
 

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain, islice
 from pathlib import Path
 
@@ -49,7 +50,8 @@ def line_blocks(path: Path, start: int) -> Iterator[list[bytes]]:
             yield data[:end].splitlines()
         if file.tell() < size:
             raise InputError(f"{path}: {CUT}")
-    yield rest.splitlines()
+    if rest:
+        yield rest.splitlines()
 
 
 class NumberLines:
@@ -58,15 +60,8 @@ class NumberLines:
     def __init__(self, path: Path, layout: LineLayout, wanted: str) -> None:
         self.path, self.layout, self.wanted = path, layout, wanted
         self.num_taken = 0
+        self._kept = partial(_kept, has_counts=layout.has_counts)
         self._lines = chain.from_iterable(map(self._kept, line_blocks(path, layout.start)))
-
-    def _kept(self, lines: list[bytes]) -> list[bytes]:
-        has_counts = self.layout.has_counts
-        return [
-            line
-            for line in filter(None, map(bytes.strip, lines))
-            if not line.startswith(COMMENT_MARKS) and not (has_counts and line.isdigit())
-        ]
 
     def peek(self) -> bytes | None:
         """The next line, which stays the next; None at the end."""
@@ -105,10 +100,10 @@ class NumberLines:
         except InputError:  # of line_blocks
             raise
         except ValueError as error:
-            raise InputError(self._complaint() or f"{self.path}: {error}, {self.wanted}") from error
+            raise InputError(self._complaint(str(error))) from error
         if num_columns is not None:
             if rows.shape[1] != num_columns:
-                raise InputError(self._complaint())
+                raise InputError(self._complaint("lines of another length"))
             rows = rows[:, columns]
         self.num_taken += len(rows)
         return rows
@@ -137,9 +132,10 @@ class NumberLines:
         return ((rows[:, :3], rows[:, 3]) for rows in self.read_rows(count))
 
     def locate(self, index: int) -> str:
-        """The file and the number in it of the line that was, or would be, taken as number `index`."""
-        number, _ = next(islice(self._numbered(), index, None))
-        return f"{self.path}: line {number}"
+        """The file and the number in it of the line that comes after `index` others."""
+        for number, _ in islice(self._numbered(), index, None):
+            return f"{self.path}: line {number}"
+        raise InputError(f"{self.path}: {CUT}")
 
     def _numbered(self) -> Iterator[tuple[int, bytes]]:
         """Number in the file and text of all lines of numbers, from the first on; the file is read again."""
@@ -151,22 +147,32 @@ class NumberLines:
                 for kept in self._kept([line]):
                     yield number, kept
 
-    def _complaint(self) -> str:
-        """What is wrong with the first broken line behind those taken; empty if none is found."""
+    def _complaint(self, otherwise: str) -> str:
+        """What is wrong with the first broken line behind those taken, or `otherwise` if all seem right."""
         for number, line in islice(self._numbered(), self.num_taken, None):
             if fault := self._fault(line):
                 return f"{self.path}: line {number}: {fault} ({quoted(line)}), {self.wanted}"
-        return ""
+        return f"{self.path}: {otherwise}, {self.wanted}"
 
     def _fault(self, line: bytes) -> str:
+        """What is wrong with a line; empty if nothing is."""
         fields = line.decode("latin-1").split(self.layout.delimiter)
         exact, columns = self.layout.num_columns, self.layout.columns
         num_wanted = max(columns) + 1 if exact is None else exact
         if len(fields) < num_wanted or (exact and len(fields) > exact):
-            return f"{len(fields)} columns instead of {num_wanted}"
+            return f"{len(fields)} instead of {num_wanted} columns"
         parsed = [fields[column] for column in columns] if exact is None else fields
         broken = next((field for field in parsed if not is_number(field)), None)
-        return "" if broken is None else f"{quoted(broken.encode())} is not a number"
+        return "" if broken is None else f"{quoted(broken.encode('latin-1'))} is not a number"
+
+
+def _kept(lines: list[bytes], has_counts: bool) -> list[bytes]:
+    """The lines of numbers among all, without blanks at their ends."""
+    return [
+        line
+        for line in filter(None, map(bytes.strip, lines))
+        if not line.startswith(COMMENT_MARKS) and not (has_counts and line.isdigit())
+    ]
 
 
 def is_number(field: str) -> bool:
