@@ -1,4 +1,4 @@
-"""The canonical order of points along Morton's curve."""
+"""The order of points along Morton's curve."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -40,7 +40,7 @@ def open_cloud(
 
 
 def read_cloud(path: Path, settings: CloudSettings = IN_METRES) -> Cloud:
-    """The coloured cloud in a file, checked, in metres, in canonical order.
+    """The coloured cloud in a file, checked, in metres, in Morton order.
 
     The file's coordinates are multiplied by the scale; the middle of their bounding box, rounded to whole
     metres, becomes `origin_world` and is subtracted in float64. This is done for every cloud, so that UTM

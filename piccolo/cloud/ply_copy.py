@@ -21,7 +21,7 @@ class PlyCopy:
     """The vertices' rows with all their properties, and what stands around them."""
 
     dtype: np.dtype[Any]  # little-endian
-    read_rows: Callable[[], Iterator[Rows]]  # each call anew
+    read_rows: Callable[[], Iterator[Rows]]  # each call from the start
     num_chunks: int
     comments: tuple[str, ...]
     more: tuple[str, ...]  # the header's lines about the elements that follow the vertices
@@ -77,7 +77,7 @@ def _comments(header: PlyHeader) -> tuple[str, ...]:
 
 
 def _lines(header: PlyHeader, k: int) -> list[str]:
-    """What the header says of an element; plyfile was told that it is empty."""
+    """The header's lines of an element, with its count, which plyfile was not given."""
     element = header.elements[k]
     return [f"element {element.name} {header.counts[k]}", *map(str, element.properties)]
 

@@ -25,7 +25,7 @@ def stream_of(path: Path, raw: RawCloud) -> "CloudStream":
 
 @dataclass(frozen=True)
 class CloudStream:
-    """One cloud in one or several files. Each reading begins anew, and ends with the same checks."""
+    """One cloud in one or several files. Each reading starts again, and ends with the same checks."""
 
     sources: Sequence[PointSource]  # in an order of their own: the user's changes nothing
     scale: float = 1.0  # metres per unit of the files
@@ -66,7 +66,7 @@ class CloudStream:
         return replace(voxels, warnings=(*self._warnings(validators), *of_all))
 
     def read(self) -> Cloud:
-        """All points, in canonical order."""
+        """All points, in Morton order."""
         validators: list[PointValidator] = []
         chunks = list(self.chunks(validators))
         points_world = np.concatenate([points_world for points_world, _ in chunks])

@@ -1,4 +1,4 @@
-"""Checks that every cloud passes, whatever file it came from, while its points stream by."""
+"""Checks applied to every chunk of points, whatever file it came from."""
 
 from dataclasses import dataclass
 from pathlib import Path

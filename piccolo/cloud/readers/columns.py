@@ -12,7 +12,7 @@ from .colors import colored_chunks
 from .reader import PointsWithScalar, RawCloud, point_label
 
 Columns = list[NDArray[Any]]
-ColumnReader = Callable[[], Iterator[Columns]]  # each call anew
+ColumnReader = Callable[[], Iterator[Columns]]  # each call from the start
 
 
 def points_of(columns: Columns) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
+from ...geometry.point_transforms import rotate_points
 from .e57_file import (
     NAMESPACE,
     E57File,
@@ -227,7 +228,8 @@ def _points(scan: E57Scan, columns: dict[str, Array]) -> tuple[Array, NDArray[np
         a, b, c = a * np.cos(c) * np.cos(b), a * np.cos(c) * np.sin(b), a * np.sin(c)
     points_world = np.stack([a, b, c], axis=1)
     if scan.placement is not None:
-        points_world = points_world @ scan.placement.R_world_from_local.T + scan.placement.center_world
+        R_world_from_local = scan.placement.R_world_from_local
+        points_world = rotate_points(points_world, R_world_from_local) + scan.placement.center_world
     return points_world, is_valid
 
 

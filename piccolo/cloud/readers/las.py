@@ -55,7 +55,10 @@ def open_las(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
             f"{num_samples} points looked at)"
         )
     return PointSource(
-        path, lambda: _read_chunks(header, compression, is_8_bit), header.num_points, tuple(warnings)
+        path,
+        lambda: (_cloud(header, records, is_8_bit) for records in _chunks(header, compression)),
+        header.num_points,
+        tuple(warnings),
     )
 
 
@@ -139,23 +142,21 @@ def _largest(header: LasHeader, compression: Compression | None, name: str) -> t
     return largest, num_samples
 
 
-def _read_chunks(header: LasHeader, compression: Compression | None, is_8_bit: bool) -> Iterator[RawCloud]:
+def _chunks(header: LasHeader, compression: Compression | None) -> Iterator[Records]:
+    """Yield all records, CHUNK or fewer at once."""
     with header.path.open("rb") as file:
         for run in _runs(header, compression):
             records = _load(file, header, compression, run)
             for first in range(0, len(records), CHUNK):
-                yield _cloud(header, records[first : first + CHUNK], is_8_bit)
+                yield records[first : first + CHUNK]
 
 
 def _read_scalar(header: LasHeader, compression: Compression | None, name: str) -> Iterator[PointsWithScalar]:
     """The points with their `intensity` or `class`."""
     bits = 0xFFFF if name == "intensity" else CLASS_OLD if header.point_format < 6 else CLASS
-    with header.path.open("rb") as file:
-        for run in _runs(header, compression):
-            records = _load(file, header, compression, run)
-            for first in range(0, len(records), CHUNK):
-                points_world, kept = _points(header, records[first : first + CHUNK])
-                yield points_world, (kept[name] & bits).astype(np.float64)
+    for records in _chunks(header, compression):
+        points_world, kept = _points(header, records)
+        yield points_world, (kept[name] & bits).astype(np.float64)
 
 
 def _points(header: LasHeader, records: Records) -> tuple[NDArray[np.float64], Records]:

@@ -1,7 +1,7 @@
 """The header of LAS and LAZ files, read and checked.
 
-laspy would loop and reserve as a damaged header tells it. A header that was checked has told all there is
-to know: what follows are records of a fixed length.
+laspy would loop and reserve as a damaged header says. Nothing more is needed than a checked header: what
+follows are records of a fixed length.
 """
 
 import struct
@@ -26,7 +26,7 @@ WANTED = "wanted LAS or LAZ with red green blue (point format 2, 3, 5, 7, 8 or 1
 
 @dataclass(frozen=True)
 class LasHeader:
-    """What a LAS file says of itself."""
+    """The header of a LAS file."""
 
     path: Path
     size: int  # [byte]

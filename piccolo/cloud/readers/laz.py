@@ -1,6 +1,6 @@
 """The compression of LAZ files: the chunk table, and decompression by lazrs.
 
-lazrs reserves whatever memory the chunk table and the sizes in the chunks promise, so these are held against
+lazrs reserves whatever memory the chunk table and the sizes in the chunks promise, so these are compared with
 the file first.
 """
 

@@ -185,7 +185,7 @@ def is_number(field: str) -> bool:
 
 
 def line_source(path: Path, layout: LineLayout, options: CloudReadOptions, wanted: str) -> PointSource:
-    """The points of lines x y z r g b, colours 0-255, or of x y z intensity where that is welcome."""
+    """The points of lines x y z r g b, colours 0-255, or of x y z intensity if the options allow it."""
     if len(layout.columns) > NUM_WITH_INTENSITY:
         return PointSource(path, lambda: NumberLines(path, layout, wanted).read_points())
     check_option(path, options, wanted)

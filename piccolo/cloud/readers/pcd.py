@@ -44,7 +44,7 @@ def open_pcd(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
 
     Colours are `rgb` or `rgba`, three bytes in one integer or, if the field is declared a float, in its bits,
     in ASCII too; or r g b (red green blue) of uint8 0-255, uint16 0-65535 or float 0-1. Alpha and all other
-    fields are left out. The options may welcome `intensity` or `label` in place of colours. The size of a
+    fields are left out. With the options for it, `intensity` or `label` stands in for colours. The size of a
     binary file is compared with the header before memory is reserved.
     """
     header = read_header(path)
@@ -69,7 +69,7 @@ def has_pcd_magic(head: bytes) -> bool:
 
 
 def _wanted_fields(header: PcdHeader, options: CloudReadOptions) -> tuple[PcdField, ...]:
-    """The fields x y z and the colour's one or three, or the intensity if that is welcome."""
+    """The fields x y z and the colour's one or three, or the intensity or label if the options say so."""
     found = {field.name: field for field in header.fields if field.count == 1}
     names = [field.name for field in header.fields]
     color = next(((name,) for name in PACKED_NAMES if name in found), color_names(found))

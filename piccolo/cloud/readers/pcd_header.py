@@ -31,7 +31,7 @@ class PcdField:
 
 @dataclass(frozen=True)
 class PcdHeader:
-    """What a PCD file says of itself."""
+    """The header of a PCD file."""
 
     path: Path
     fields: tuple[PcdField, ...]

@@ -33,7 +33,7 @@ MAX_COUNT_DIGITS = 15
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """What a PLY file says of itself."""
+    """The header of a PLY file."""
 
     path: Path
     elements: tuple[PlyElement, ...]
@@ -66,7 +66,7 @@ def open_ply(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     """The vertices of a PLY file, binary or ASCII; points on its faces if it has any.
 
     Colours are uchar 0-255, ushort 0-65535, or float and double 0-1. Other properties and elements are left
-    out. The file's size is held against the header's counts before memory is reserved.
+    out. The file's size is compared with the header's counts before memory is reserved.
     """
     header = read_header(path)
     index = vertex_index(header)
@@ -112,7 +112,7 @@ def read_columns(vertices: Vertices) -> Iterator[Columns]:
 
 
 def read_header(path: Path) -> PlyHeader:
-    """What a PLY file says of itself; InputError if that can't be made out."""
+    """The header of a PLY file; InputError if it is broken."""
     with path.open("rb") as file:
         head = file.read(MAX_HEADER_SIZE)
     if not has_ply_magic(head):

@@ -14,7 +14,7 @@ WANTED = "wanted lines x y z intensity r g b or x y z r g b, colours 0-255"
 def open_pts(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     """The points of all scans of a PTS file.
 
-    The first line of numbers tells the columns, and all others must have as many: x y z r g b if there are
+    All lines must have as many columns as the first one: x y z r g b if there are
     six, x y z intensity r g b and what else there is if there are more. The intensity may have any range. A
     lone count may stand before any line and is not compared with the lines, as many programs write a wrong
     one.

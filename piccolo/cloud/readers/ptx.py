@@ -116,7 +116,7 @@ def _numbers(line: bytes, num_wanted: int) -> list[float] | None:
 
 
 def _has_colors(lines: NumberLines, options: CloudReadOptions) -> bool:
-    """False if the next line is x y z intensity, and that is welcome."""
+    """False if the next line is x y z intensity, and the options allow that."""
     if len((lines.peek() or b"").split()) != NUM_WITH_INTENSITY:
         return True
     check_option(lines.path, options, WANTED)

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from ..label_colors import Labels
 
 HEAD_SIZE = 512  # [byte] by which a format is known
-CHUNK = 1 << 20  # points that a reader hands on at once, at most
+CHUNK = 1 << 20  # points of a chunk, at most
 CUT = "the file was cut while it was read, wanted a whole file"
 
 # points (N, 3) in the file's unit, and a number (N,) of each: intensity or label
 PointsWithScalar = tuple[NDArray[np.float64], NDArray[np.float64]]
-ScalarReader = Callable[[], Iterator[PointsWithScalar]]  # each call anew
+ScalarReader = Callable[[], Iterator[PointsWithScalar]]  # each call from the start
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class RawCloud:
     colors: NDArray[np.uint8]  # (N, 3) RGB
 
 
-ChunkReader = Callable[[], Iterator[RawCloud]]  # each call anew; InputError where the data break
+ChunkReader = Callable[[], Iterator[RawCloud]]  # each call from the start; InputError where the data break
 
 
 @dataclass(frozen=True)
