@@ -66,16 +66,6 @@ def voxels(points, colors, size, corner):
     return np.array([np.mean(rows, axis=0) for rows in members.values()])
 
 
-def parse_rows(text, separator, targets):
-    """Rows of numbers by Python's own float(), from text without broken lines."""
-    rows = []
-    for line in text.splitlines():
-        if line.strip() and not line.strip().startswith(("#", "//")):
-            fields = line.split(separator if separator != " " else None)
-            rows.append([float(fields[list(targets).index(column)]) for column in range(max(targets) + 1)])
-    return np.array(rows)
-
-
 def nearest_box(origin, directions, boxes):
     """Range (N,) of the first of the boxes (B, 7) along each direction (N, 3): by planes, not by slabs."""
     best = np.full(len(directions), np.inf)

@@ -5,7 +5,7 @@ import functools
 import numpy as np
 
 from piccolo.cloud.model import Cloud
-from piccolo.cloud.morton import canonical_order
+from piccolo.cloud.morton import morton_order
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import Pose, angle_between
 from piccolo.panorama import Panorama
@@ -24,7 +24,7 @@ def room(seed):
     points, colors, _ = scan_world(world, NUM_POINTS, Workers(2))
     origin_world = np.round((points.min(axis=0).astype(float) + points.max(axis=0)) / 2)
     points = (points - origin_world).astype(np.float32)
-    order = canonical_order(points, colors)
+    order = morton_order(points, colors)
     return world, Cloud(points[order], colors[order], origin_world)
 
 

@@ -209,7 +209,7 @@ def test_a_file_cut_while_it_is_read_is_refused(tmp_path):
     path = write(tmp_path, las_bytes(RAW))
     source = open_source(path)
     path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(InputError, match="the file ended while it was read"):
+    with pytest.raises(InputError, match="the file was cut while it was read"):
         list(source.read_chunks())
 
 

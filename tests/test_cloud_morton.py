@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from piccolo.cloud import Cloud, stream_of
-from piccolo.cloud.morton import canonical_order, morton_codes
+from piccolo.cloud.morton import morton_codes, morton_order
 from piccolo.cloud.readers.reader import PLAIN, RawCloud
 from piccolo.errors import InputError
 
@@ -75,7 +75,7 @@ def test_signed_zeros_do_not_tell_points_apart():
 def test_order_keeps_neighbours_together():
     raw = seeded_cloud(5, num_points=20_000)
     points = raw.points_world.astype(np.float32)
-    steps = np.linalg.norm(np.diff(points[canonical_order(points, raw.colors)], axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(points[morton_order(points, raw.colors)], axis=0), axis=1)
     spacing = (6.0 * 5.0 * 2.5 / 20_000) ** (1 / 3)
     assert np.median(steps) < 1.5 * spacing
 
@@ -83,7 +83,7 @@ def test_order_keeps_neighbours_together():
 def test_order_of_points_in_one_place():
     points = np.ones((1200, 3), dtype=np.float32)
     colors = seeded_cloud(6, num_points=1200).colors
-    ordered = colors[canonical_order(points, colors)]
+    ordered = colors[morton_order(points, colors)]
     assert ordered.tolist() == sorted(colors.tolist())
 
 

@@ -9,7 +9,7 @@ from test_cloud_lzf import compress
 from test_cloud_morton import seeded_cloud
 
 from piccolo.cloud import open_source, read_cloud
-from piccolo.cloud.readers import lines, records
+from piccolo.cloud.readers import fixed_records, number_lines
 from piccolo.cloud.readers import reader as raw
 from piccolo.errors import InputError
 
@@ -142,8 +142,16 @@ def test_nan_points_of_a_grid_need_no_color(tmp_path, encoding, kind):
         ([*XYZ[:2], ("rgb", "u4", 1, PACKED)], {}, "the fields are 'x y rgb'"),
         ([*XYZ, *XYZ[:1], ("rgb", "u4", 1, PACKED)], {}, "the fields are 'x y z x rgb'"),
         ([*XYZ, ("rgb", "f8", 1, PACKED)], {}, "'rgb' is of type f8, wanted uint32, int32 or float32"),
-        (separate("i4", 255), {}, "'r' is of type i4, wanted uint8 0-255, uint16 0-65535 or float 0-1"),
-        ([*separate("u1", 255)[:5], ("b", "u2", 1, PACKED)], {}, "of types u1 u1 u2, wanted one for all"),
+        (
+            separate("i4", 255),
+            {},
+            "of type i4 i4 i4, wanted uint8 0-255, uint16 0-65535 or float 0-1",
+        ),
+        (
+            [*separate("u1", 255)[:5], ("b", "u2", 1, PACKED)],
+            {},
+            "the colours are of type u1 u1 u2, wanted",
+        ),
         ([("x", "i2", 1, PACKED), *XYZ[1:], ("rgb", "u4", 1, PACKED)], {}, "'x' is of type i2, wanted float"),
         (None, {"SIZE": "4 4 4"}, "4 FIELDS, 3 of SIZE, 4 of TYPE"),
         (None, {"SIZE": "4 4 4 3"}, "'rgb 3 U 1', wanted SIZE 1 2 4 or 8"),
@@ -171,12 +179,12 @@ def test_broken_headers_are_refused(tmp_path, fields, lines, message):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (b"", b" 1", "line 12 has more than 4 columns"),
-        (b"", b" x", "line 12 has more than 4 columns"),
-        (b"4294967296", None, "line 12 has the colour 4.29497e.09, wanted 32 bits of the type u4"),
-        (b"1.5", None, "line 12 has the colour 1.5, wanted 32 bits"),
-        (b"nan", None, "line 12 has the colour nan, wanted 32 bits"),
-        (b"red", None, "line 12 is not all numbers"),
+        (b"", b" 1", "line 12: 5 instead of 4 columns"),
+        (b"", b" x", "line 12: 5 instead of 4 columns"),
+        (b"4294967296", None, "point 1 has the colour 4.29497e.09, wanted 32 bits of the type u4"),
+        (b"1.5", None, "point 1 has the colour 1.5, wanted 32 bits"),
+        (b"nan", None, "point 1 has the colour nan, wanted 32 bits"),
+        (b"red", None, "line 12: 'red' is not a number"),
     ],
 )
 def test_broken_lines_are_named(tmp_path, old, new, message):
@@ -191,7 +199,7 @@ def test_broken_lines_are_named(tmp_path, old, new, message):
 
 def test_a_colour_that_text_has_lost_is_refused(tmp_path):
     fields = [*XYZ, ("rgb", "f4", 1, (PACKED | np.uint32(0xFF800000)).view(np.float32))]
-    with pytest.raises(InputError, match="line 12 has the colour nan, wanted 32 bits of the type f4"):
+    with pytest.raises(InputError, match="point 1 has the colour nan, wanted 32 bits of the type f4"):
         read(write(tmp_path / "a.pcd", fields, "ascii"))
     _, colors = read(write(tmp_path / "b.pcd", fields))
     np.testing.assert_array_equal(colors, RAW.colors | [128, 0, 0])
@@ -201,15 +209,14 @@ def test_a_colour_that_text_has_lost_is_refused(tmp_path):
 def test_float_colors_out_of_range_are_refused(tmp_path, encoding):
     fields = separate("f4", 1)
     fields[4][3][7] = 1.5
-    place = "line 19" if encoding == "ascii" else "point 8"
-    with pytest.raises(InputError, match=f"{place} has the colour .* wanted 0 to 1 of the type f4"):
+    with pytest.raises(InputError, match=r"point 8 has the colour .* wanted 0 to 1"):
         read(write(tmp_path / "a.pcd", fields, encoding))
 
 
 def test_cut_text_is_refused(tmp_path):
     path = write(tmp_path / "a.pcd", [*XYZ, ("rgb", "u4", 1, PACKED)], "ascii")
     path.write_bytes(b"\n".join(path.read_bytes().split(b"\n")[:-3]))
-    with pytest.raises(InputError, match="promises 1200 points, found 1197; the file is cut off"):
+    with pytest.raises(InputError, match="found 1197 of 1200 points; the file is cut off"):
         read(path)
 
 
@@ -243,7 +250,7 @@ def test_mutated_files_raise_nothing_but_input_error(encoding, data, tmp_path_fa
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_a_file_cut_while_it_is_read_is_refused(tmp_path, monkeypatch, encoding):
     monkeypatch.setattr(raw, "CHUNK", 50)
-    monkeypatch.setattr(lines, "BLOCK", 2048)
+    monkeypatch.setattr(number_lines, "BLOCK", 2048)
     path = write(tmp_path / "a.pcd", COLORS["r g b"], encoding)
     source = open_source(path)
     chunks = source.read_chunks()
@@ -261,7 +268,7 @@ def test_a_file_cut_while_it_is_read_is_refused(tmp_path, monkeypatch, encoding)
 
 
 def test_long_records_come_in_smaller_chunks(tmp_path, monkeypatch):
-    monkeypatch.setattr(records, "MAX_BLOCK_SIZE", 1000)
+    monkeypatch.setattr(fixed_records, "MAX_BLOCK_SIZE", 1000)
     path = write(tmp_path / "a.pcd", separate("f4", 1))
     assert [len(chunk.colors) for chunk in open_source(path).read_chunks()] == [41] * 29 + [11]
     assert_read_as_written(path)

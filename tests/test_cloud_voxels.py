@@ -20,9 +20,9 @@ from piccolo.cloud.voxels import (
     VoxelTable,
     add_points,
     move_voxels,
-    turned,
 )
 from piccolo.errors import InputError
+from piccolo.geometry.point_transforms import rotate_points
 
 CORNER = -voxels.PHASE / voxels.QUANTA_PER_METRE
 
@@ -91,8 +91,8 @@ def test_the_most_points_of_a_voxel_fit_its_sums():
 
 def test_turning_gives_each_point_the_same_bits_alone_as_among_others():
     points = seeded_cloud(6).points_world
-    alone = np.concatenate([turned(p[None], TURN) for p in points])
-    assert alone.tobytes() == turned(points, TURN).tobytes()
+    alone = np.concatenate([rotate_points(p[None], TURN) for p in points])
+    assert alone.tobytes() == rotate_points(points, TURN).tobytes()
     np.testing.assert_allclose(alone, points @ TURN.T, atol=1e-12)
 
 

@@ -2,6 +2,7 @@ import naive
 import numpy as np
 import pytest
 import rooms
+from piccolo.optimize.descent import correlate, descend, descend_shaken, descend_starts, take_step
 
 from piccolo.cloud.octree import build_octree
 from piccolo.coarse_to_fine.query import FINE_VIEW, as_levels
@@ -10,7 +11,6 @@ from piccolo.coarse_to_fine.starts import shakes
 from piccolo.coarse_to_fine.view import render_view
 from piccolo.geometry.pose import Pose, exp_so3, step
 from piccolo.geometry.sphere_grid import make_grid
-from piccolo.optimize.descent import correlate, descend, descend_shaken, descend_starts, take_step
 from piccolo.optimize.normal_equations import normal_equations, solve_damped
 from piccolo.panorama.channels import LEVELS_PER_UNIT
 from piccolo.panorama.local_normalization import normalized_channels

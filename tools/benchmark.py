@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from piccolo.cloud import read_cloud
-from piccolo.cloud.morton import canonical_order
+from piccolo.cloud.morton import morton_order
 from piccolo.cloud.soa import PackedPoints, pack_points
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, yaw_rotation
@@ -52,7 +52,7 @@ def box_case(num_points: int, width: int) -> Case:
     points[np.arange(num_points), axis] = rng.integers(0, 2, num_points)
     points = ((points - 0.5) * size).astype(np.float32)
     colors = rng.integers(0, 256, (num_points, 3), dtype=np.uint8)
-    order = canonical_order(points, colors)
+    order = morton_order(points, colors)
     noise = rng.integers(0, 256, (width // 2, width, 3), dtype=np.uint8)
     rgb = np.asarray(cv2.GaussianBlur(noise, (0, 0), 2.0), dtype=np.uint8)
     pose = Pose(yaw_rotation(0.7), np.array([0.5, -0.3, 0.1]))

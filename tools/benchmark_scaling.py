@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from piccolo.cloud import read_cloud
 from piccolo.cloud.model import Cloud
-from piccolo.cloud.morton import canonical_order
+from piccolo.cloud.morton import morton_order
 from piccolo.coarse_to_fine.localize import localize
 from piccolo.coarse_to_fine.scan_map import prepare_map
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
@@ -58,7 +58,7 @@ def ordered(
     points: NDArray[np.float32], colors: NDArray[np.uint8], origin_world: NDArray[np.float64]
 ) -> Cloud:
     """A cloud as a file would be read."""
-    order = canonical_order(points, colors)
+    order = morton_order(points, colors)
     return Cloud(points[order], colors[order], origin_world)
 
 

@@ -13,7 +13,7 @@ import _checkout  # noqa: F401
 import numpy as np
 
 from piccolo.cloud import FORMATS
-from piccolo.cloud.readers.reader import PLAIN, Format
+from piccolo.cloud.readers.reader import PLAIN, CloudFormat
 from piccolo.coarse_to_fine.map_file import load_map
 from piccolo.errors import InputError
 from piccolo.panorama import read_panorama
@@ -33,7 +33,7 @@ exit codes: 0 nothing found, 1 something, 2 wrong usage, 3 bad input, 130 interr
 TIMEOUT_S, MEMORY_MB, MAX_SIZE = 20, 2048, 1 << 16
 
 
-def read_format(form: Format) -> Callable[[Path], object]:
+def read_format(form: CloudFormat) -> Callable[[Path], object]:
     """Reads all chunks of a file by one format's reader."""
 
     def read(path: Path) -> object:
@@ -42,7 +42,7 @@ def read_format(form: Format) -> Callable[[Path], object]:
     return read
 
 
-def named(form: Format) -> str:
+def named(form: CloudFormat) -> str:
     """A format's name on the command line."""
     return min(form.suffixes, key=lambda suffix: (len(suffix), suffix)).removeprefix(".")
 

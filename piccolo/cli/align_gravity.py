@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from ..cloud import open_cloud
 from ..cloud.settings import CloudSettings
-from ..cloud.transform import MeasuredStream, measured, write_moved
+from ..cloud.transform import BoundedStream, with_bounds, write_transformed
 from ..confidence.confidence import check_confidence
 from ..errors import InputError
 from ..gravity import MIN_CONFIDENCE
@@ -120,12 +120,12 @@ def outputs_of(arguments: argparse.Namespace) -> Outputs:
     return Outputs(arguments.out, transforms, scene)
 
 
-def open_measured(arguments: argparse.Namespace, settings: CloudSettings) -> MeasuredStream:
+def open_with_bounds(arguments: argparse.Namespace, settings: CloudSettings) -> BoundedStream:
     """The cloud, whose reading shows its progress."""
-    return measured(open_cloud(arguments.cloud, settings, shown(arguments.quiet)))
+    return with_bounds(open_cloud(arguments.cloud, settings, shown(arguments.quiet)))
 
 
-def write(cloud: MeasuredStream, alignment: Alignment, outputs: Outputs) -> tuple[str, ...]:
+def write(cloud: BoundedStream, alignment: Alignment, outputs: Outputs) -> tuple[str, ...]:
     """Write the cloud and what goes with it, the cloud's name last; returns warnings."""
     out = outputs.cloud
 
@@ -143,7 +143,7 @@ def write(cloud: MeasuredStream, alignment: Alignment, outputs: Outputs) -> tupl
     if out is None:
         write_others()
         return ()
-    return write_moved(cloud, alignment.T_aligned_from_scan, out, write_others)
+    return write_transformed(cloud, alignment.T_aligned_from_scan, out, write_others)
 
 
 def report_of(arguments: argparse.Namespace, status: str, alignment: Alignment) -> dict[str, object]:
@@ -192,7 +192,7 @@ def print_warnings(arguments: argparse.Namespace, warnings: Iterable[str]) -> No
 def align(arguments: argparse.Namespace) -> int:
     """Find the alignment, write what is sure enough; returns the exit code."""
     outputs = outputs_of(arguments)
-    cloud = open_measured(arguments, cloud_settings_from(arguments))
+    cloud = open_with_bounds(arguments, cloud_settings_from(arguments))
     found, warnings = find_alignment(cloud, arguments.up, arguments.yaw_walls)
     print_warnings(arguments, warnings)
     alignment = found.alignment
@@ -217,7 +217,7 @@ def apply(arguments: argparse.Namespace) -> int:
     if arguments.units is None and arguments.scale is None:
         settings = replace(settings, scale=given.metres_per_unit)
     alignment = (given.inverse() if arguments.inverse else given).in_unit(settings.scale)
-    cloud = open_measured(arguments, settings)
+    cloud = open_with_bounds(arguments, settings)
     for _ in cloud.chunks([]):  # for its box
         pass
     print_warnings(arguments, write(cloud, alignment, outputs))

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .voxels import Voxels, VoxelTable, turned
+from ..geometry.point_transforms import rotate_points
+from .voxels import Voxels, VoxelTable
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,6 @@ class Cloud:
     def voxels(self, R_map_from_world: NDArray[np.float64]) -> Voxels:
         """The points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
         table = VoxelTable("cloud")
-        table.add(turned(self.points + self.origin_world, R_map_from_world), self.colors)
+        table.add(rotate_points(self.points + self.origin_world, R_map_from_world), self.colors)
         voxels = table.finish()
         return Voxels(voxels.codes, voxels.nodes, voxels.origin, self.warnings + voxels.warnings)

@@ -1,4 +1,4 @@
-"""The canonical order of points along Morton's curve."""
+"""The order of points along Morton's curve."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,7 @@ def morton_codes(cells: NDArray[np.int64]) -> NDArray[np.int64]:
     return codes
 
 
-def canonical_order(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> NDArray[np.int64]:
+def morton_order(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> NDArray[np.int64]:
     """Indices (N,) that sort points (N, 3) [m] and colours (N, 3) along Morton's curve.
 
     The cells are cubes, 2^21 along the longest side of the bounding box. Within a cell coordinates and then

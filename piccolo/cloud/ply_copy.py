@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .ply_writer import Rows
-from .readers.ply import Header, Vertices, read_columns, read_header, vertex_index
+from .readers.ply import PlyHeader, Vertices, read_columns, read_header, vertex_index
 from .readers.reader import CHUNK, HEAD_SIZE
 
 BLOCK = 1 << 22  # [byte] copied at once
@@ -21,7 +21,7 @@ class PlyCopy:
     """The vertices' rows with all their properties, and what stands around them."""
 
     dtype: np.dtype[Any]  # little-endian
-    read_rows: Callable[[], Iterator[Rows]]  # each call anew
+    read_rows: Callable[[], Iterator[Rows]]  # each call from the start
     num_chunks: int
     comments: tuple[str, ...]
     more: tuple[str, ...]  # the header's lines about the elements that follow the vertices
@@ -70,19 +70,19 @@ def _rows(columns: list[NDArray[np.generic]], dtype: np.dtype[Any]) -> Rows:
     return rows
 
 
-def _comments(header: Header) -> tuple[str, ...]:
+def _comments(header: PlyHeader) -> tuple[str, ...]:
     with header.path.open("rb") as file:
         lines = file.read(header.size).decode("ascii", "replace").splitlines()
     return tuple(line.removeprefix("comment ") for line in lines if line.startswith("comment "))
 
 
-def _lines(header: Header, k: int) -> list[str]:
-    """What the header says of an element; plyfile was told that it is empty."""
+def _lines(header: PlyHeader, k: int) -> list[str]:
+    """The header's lines of an element, with its count, which plyfile was not given."""
     element = header.elements[k]
     return [f"element {element.name} {header.counts[k]}", *map(str, element.properties)]
 
 
-def _end_of_vertices(header: Header, index: int) -> int:
+def _end_of_vertices(header: PlyHeader, index: int) -> int:
     """Where the elements after the vertices begin [byte]."""
     elements = zip(header.elements[: index + 1], header.counts, strict=False)
     return header.size + sum(count * int(element.dtype().itemsize) for element, count in elements)

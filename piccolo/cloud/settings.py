@@ -22,7 +22,7 @@ class CloudSettings:
     labels: Labels | None = None  # the points' labels are taken for their colours
 
     def __post_init__(self) -> None:
-        """Refuse a scale that means nothing, and two things to make colours of."""
+        """Reject an invalid scale, and labels together with intensity."""
         if self.intensity_as_gray and self.labels:
             raise InputError("--labels, --intensity-as-gray: found both, wanted one of them")
         if not (math.isfinite(self.scale) and self.scale > 0.0):

@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..geometry.point_transforms import rotate_points
 from ..runtime.threads import Show, unseen
 from .model import Cloud
-from .morton import canonical_order
+from .morton import morton_order
 from .readers.reader import CHUNK, PointSource, RawCloud
-from .validation import Census, Chunk, unit_warnings
-from .voxels import Voxels, VoxelTable, turned
+from .validation import Chunk, PointValidator, unit_warnings
+from .voxels import Voxels, VoxelTable
 
 
 def stream_of(path: Path, raw: RawCloud) -> "CloudStream":
@@ -24,7 +25,7 @@ def stream_of(path: Path, raw: RawCloud) -> "CloudStream":
 
 @dataclass(frozen=True)
 class CloudStream:
-    """One cloud in one or several files. Each reading begins anew, and ends with the same checks."""
+    """One cloud in one or several files. Each reading starts again, and ends with the same checks."""
 
     sources: Sequence[PointSource]  # in an order of their own: the user's changes nothing
     scale: float = 1.0  # metres per unit of the files
@@ -36,38 +37,38 @@ class CloudStream:
         first, num_more = self.sources[0].path, len(self.sources) - 1
         return f"{first} and {num_more} more" if num_more else str(first)
 
-    def chunks(self, censuses: list[Census]) -> Iterator[Chunk]:
-        """Yield the finite points in metres; `censuses` gets what is then known of each file."""
+    def chunks(self, validators: list[PointValidator]) -> Iterator[Chunk]:
+        """Yield the finite points in metres; `validators` gets what is then known of each file."""
         for source in self.sources:
-            census = Census(source.path, self.scale)
+            validator = PointValidator(source.path, self.scale)
             total = None if source.num_points is None else math.ceil(source.num_points / CHUNK)
             try:
                 for raw in self.show(source.read_chunks(), total, f"read {source.path.name}"):
-                    yield census.pass_on(raw)
+                    yield validator.filter(raw)
             except OSError as error:
                 text = f"{source.path}: cannot be read ({error.strerror or error}), wanted a whole file"
                 raise InputError(text) from error
-            census.check()
-            censuses.append(census)
+            validator.check()
+            validators.append(validator)
 
-    def _warnings(self, censuses: list[Census]) -> list[str]:
-        pairs = zip(self.sources, censuses, strict=True)
-        return [line for source, census in pairs for line in (*source.warnings, *census.warnings())]
+    def _warnings(self, validators: list[PointValidator]) -> list[str]:
+        pairs = zip(self.sources, validators, strict=True)
+        return [line for source, validator in pairs for line in (*source.warnings, *validator.warnings())]
 
     def voxels(self, R_map_from_world: NDArray[np.float64]) -> Voxels:
         """The points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
-        censuses: list[Census] = []
+        validators: list[PointValidator] = []
         table = VoxelTable(self.label)
-        for points_world, colors in self.chunks(censuses):
-            table.add(turned(points_world, R_map_from_world), colors)
+        for points_world, colors in self.chunks(validators):
+            table.add(rotate_points(points_world, R_map_from_world), colors)
         voxels = table.finish()
         of_all = (*voxels.warnings, *unit_warnings(self.label, voxels.nodes[:, :3]))
-        return replace(voxels, warnings=(*self._warnings(censuses), *of_all))
+        return replace(voxels, warnings=(*self._warnings(validators), *of_all))
 
     def read(self) -> Cloud:
-        """All points, in canonical order."""
-        censuses: list[Census] = []
-        chunks = list(self.chunks(censuses))
+        """All points, in Morton order."""
+        validators: list[PointValidator] = []
+        chunks = list(self.chunks(validators))
         points_world = np.concatenate([points_world for points_world, _ in chunks])
         colors = np.concatenate([colors for _, colors in chunks])
         chunks.clear()
@@ -75,8 +76,8 @@ class CloudStream:
         # + 0.0 turns -0.0 into 0.0: equal points have equal bits.
         origin_world = np.round(0.5 * (points_world.min(axis=0) + points_world.max(axis=0))) + 0.0
         points = (points_world - origin_world + 0.0).astype(np.float32)
-        order = canonical_order(points, colors)
+        order = morton_order(points, colors)
         points, colors = points[order], colors[order]
-        warnings = (*self._warnings(censuses), *unit_warnings(self.label, points))
-        num_dropped = sum(census.num_dropped for census in censuses)
+        warnings = (*self._warnings(validators), *unit_warnings(self.label, points))
+        num_dropped = sum(validator.num_dropped for validator in validators)
         return Cloud(points, colors, origin_world, num_dropped, warnings)

@@ -7,19 +7,20 @@ from typing import Any
 
 import numpy as np
 
+from ..geometry.point_transforms import transform_points
 from ..geometry.pose import Array
 from .ply_copy import is_ply, open_copy
 from .ply_writer import Rows, vertex_rows, writing_ply
 from .stream import CloudStream
-from .validation import Census, Chunk
+from .validation import Chunk, PointValidator
 
 AXES, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
 MAX_LOSS = 1e-4  # of float32 coordinates by rounding [m]
 
 
 @dataclass
-class Box:
-    """What bounds the points seen so far."""
+class BoundingBox:
+    """The smallest box, along the axes, around the points seen so far."""
 
     low: Array = field(default_factory=lambda: np.full(3, np.inf))
     high: Array = field(default_factory=lambda: np.full(3, -np.inf))
@@ -36,37 +37,31 @@ class Box:
 
 
 @dataclass(frozen=True)
-class MeasuredStream(CloudStream):
-    """A cloud that knows its box once it has been read."""
+class BoundedStream(CloudStream):
+    """A cloud that knows its bounding box once it has been read."""
 
-    box: Box = field(default_factory=Box)  # [m]
+    box: BoundingBox = field(default_factory=BoundingBox)  # [m]
 
-    def chunks(self, censuses: list[Census]) -> Iterator[Chunk]:
+    def chunks(self, validators: list[PointValidator]) -> Iterator[Chunk]:
         """Yield the finite points in metres as CloudStream does."""
-        for points, colors in super().chunks(censuses):
+        for points, colors in super().chunks(validators):
             self.box.add(points)
             yield points, colors
 
 
-def measured(cloud: CloudStream) -> MeasuredStream:
-    """The same cloud, which measures its box while it is read."""
-    return MeasuredStream(cloud.sources, cloud.scale, cloud.show)
+def with_bounds(cloud: CloudStream) -> BoundedStream:
+    """The same cloud, which finds its bounding box while it is read."""
+    return BoundedStream(cloud.sources, cloud.scale, cloud.show)
 
 
-def moved(points: Array, T_target_from_source: Array) -> Array:
-    """Points (N, 3) under T (4, 4); not by BLAS, whose sums depend on how many points there are."""
-    x, y, z = points.T
-    return np.stack([a * x + b * y + c * z + d for a, b, c, d in T_target_from_source[:3]], axis=1)
-
-
-def needs_double(box: Box, T_target_from_source: Array, scale: float) -> bool:
+def needs_double(box: BoundingBox, T_target_from_source: Array, scale: float) -> bool:
     """True if float32 would lose more than MAX_LOSS of a moved box [m]; T is in units of `scale` metres."""
-    farthest = float(np.abs(moved(box.corners() / scale, T_target_from_source)).max())
+    farthest = float(np.abs(transform_points(box.corners() / scale, T_target_from_source)).max())
     return float(np.spacing(np.float32(farthest))) * scale > 2.0 * MAX_LOSS
 
 
-def write_moved(
-    cloud: MeasuredStream, T_target_from_source: Array, out: Path, finish: Callable[[], None]
+def write_transformed(
+    cloud: BoundedStream, T_target_from_source: Array, out: Path, finish: Callable[[], None]
 ) -> tuple[str, ...]:
     """Write a cloud, read once before, as binary PLY under a transform (4, 4) in the files' unit.
 
@@ -82,7 +77,7 @@ def write_moved(
             out, vertex_rows(np.empty((0, 3), dtype), np.empty((0, 3), np.uint8)).dtype
         ) as writer:
             for points, colors in cloud.chunks([]):
-                target = moved(points / cloud.scale, T_target_from_source)
+                target = transform_points(points / cloud.scale, T_target_from_source)
                 writer.add(vertex_rows(target.astype(dtype), colors))
             finish()
         return ()
@@ -90,7 +85,7 @@ def write_moved(
     dtype = _dtype_of(copy.dtype, is_double)
     with writing_ply(out, dtype, copy.comments, copy.more) as writer:
         for rows in cloud.show(copy.read_rows(), copy.num_chunks, "write"):
-            writer.add(_moved_rows(rows, dtype, T_target_from_source))
+            writer.add(_transformed_rows(rows, dtype, T_target_from_source))
         for block in copy.read_rest():
             writer.add_rest(block)
         finish()
@@ -104,14 +99,14 @@ def _dtype_of(dtype: np.dtype[Any], is_double: bool) -> np.dtype[Any]:
     return np.dtype([(name, np.dtype("<f8") if name in wide else kind) for name, kind in fields])
 
 
-def _moved_rows(rows: Rows, dtype: np.dtype[Any], T_target_from_source: Array) -> Rows:
+def _transformed_rows(rows: Rows, dtype: np.dtype[Any], T_target_from_source: Array) -> Rows:
     """Vertices with x y z moved and nx ny nz turned, all else as it is."""
     target = rows.astype(dtype)
     turn = T_target_from_source.copy()
     turn[:3, 3] = 0.0
     for names, T in ((AXES, T_target_from_source), (NORMALS, turn)):
         if set(names) <= set(dtype.names or ()):
-            points = moved(np.stack([rows[name] for name in names], axis=1, dtype=np.float64), T)
+            points = transform_points(np.stack([rows[name] for name in names], axis=1, dtype=np.float64), T)
             for name, column in zip(names, points.T, strict=True):
                 target[name] = column
     return target

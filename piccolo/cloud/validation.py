@@ -1,4 +1,4 @@
-"""Checks that every cloud passes, whatever file it came from, while its points stream by."""
+"""Checks applied to every chunk of points, whatever file it came from."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +20,7 @@ Chunk = tuple[NDArray[np.float64], NDArray[np.uint8]]  # finite points (N, 3) [m
 
 
 @dataclass
-class Census:
+class PointValidator:
     """What is known of a file's points so far."""
 
     path: Path
@@ -29,7 +29,7 @@ class Census:
     num_dropped: int = 0  # with NaN or infinite coordinates
     brightest: int = 0
 
-    def pass_on(self, raw: RawCloud) -> Chunk:
+    def filter(self, raw: RawCloud) -> Chunk:
         """The finite points of a chunk, after they have been counted."""
         points, colors = raw.points_world, raw.colors
         is_finite: NDArray[np.bool_] = np.all(np.isfinite(points), axis=1)

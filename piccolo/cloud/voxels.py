@@ -169,11 +169,3 @@ def _means(
         nodes[:, k] = corners + (rows[order, POSITION + k] / counts + 0.5 - PHASE) / QUANTA_PER_METRE
         nodes[:, 3 + k] = rows[order, COLOR + k] / counts / 255.0
     return nodes
-
-
-def turned(points: NDArray[np.float64], R_map_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points (N, 3) in the map's axes; not by BLAS, whose sums depend on how many points there are."""
-    if np.array_equal(R_map_from_world, np.eye(3)):
-        return points
-    x, y, z = points.T
-    return np.stack([a * x + b * y + c * z for a, b, c in R_map_from_world], axis=1)

@@ -7,7 +7,7 @@ from types import ModuleType
 from ..errors import InputError
 
 
-def library(path: Path, module_name: str) -> ModuleType:
+def import_optional(path: Path, module_name: str) -> ModuleType:
     """The module that reads `path`, or an InputError that says how to install it."""
     try:
         return import_module(module_name)

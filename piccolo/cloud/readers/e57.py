@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
+from ...geometry.point_transforms import rotate_points
 from .e57_file import (
     NAMESPACE,
     E57File,
@@ -27,8 +28,8 @@ from .e57_file import (
     scaled,
     text_of,
 )
-from .intensity import OPTION, in_gray
-from .reader import CHUNK, PLAIN, Format, Measured, PointSource, RawCloud, ReadOptions
+from .intensity import OPTION, intensity_reader
+from .reader import CHUNK, PLAIN, CloudFormat, CloudReadOptions, PointSource, PointsWithScalar, RawCloud
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
@@ -43,7 +44,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Scan:
+class E57Scan:
     """One scan of a file."""
 
     index: int
@@ -60,7 +61,7 @@ class _UnusableError(Exception):
     """A scan is whole, but not of use here."""
 
 
-def open_e57(path: Path, options: ReadOptions = PLAIN) -> PointSource:
+def open_e57(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     """The coloured points of all scans of an E57 file.
 
     Points with an invalid state (direction only, or nothing) or an invalid colour are left out. A colour's
@@ -76,16 +77,16 @@ def open_e57(path: Path, options: ReadOptions = PLAIN) -> PointSource:
         raise InputError(f"{path}: {found}, {WANTED}{more}")
     warnings = tuple(f"{path}: {what}; left out" for what in (left_out if scans else not_measured))
     num_points = sum(scan.num_points for scan in scans or measured)
-    read_chunks = in_gray(path, lambda: _read_measured(path, measured))
+    read_chunks = intensity_reader(path, lambda: _read_scalar(path, measured))
     if scans:
         read_chunks = partial(_read_chunks, path, scans)
     return PointSource(path, read_chunks, num_points, warnings)
 
 
-def _scans(file: E57File, channels: tuple[str, ...]) -> tuple[list[Scan], list[str]]:
+def _scans(file: E57File, channels: tuple[str, ...]) -> tuple[list[E57Scan], list[str]]:
     """The scans that have the channels, and why others have not."""
     elements = children(file.root, "data3D")
-    scans: list[Scan] = []
+    scans: list[E57Scan] = []
     left_out: list[str] = []
     for index, element in enumerate(elements):
         label = f"scan {index + 1} of {len(elements)} ({text_of(element, 'name')[:40]!r})"
@@ -96,7 +97,7 @@ def _scans(file: E57File, channels: tuple[str, ...]) -> tuple[list[Scan], list[s
     return scans, left_out
 
 
-def _scan(file: E57File, element: Element, channels: tuple[str, ...], index: int, label: str) -> Scan:
+def _scan(file: E57File, element: Element, channels: tuple[str, ...], index: int, label: str) -> E57Scan:
     """What is to be read of a scan; _UnusableError if nothing is."""
     points = child(element, "points")
     prototype = child(points, "prototype")
@@ -115,7 +116,7 @@ def _scan(file: E57File, element: Element, channels: tuple[str, ...], index: int
         raise _UnusableError("has colours, but without a range")
     invalid = (INVALID[coordinates], INVALID_COLOR if channels == COLORS else INVALID_INTENSITY)
     _check_size(file, label, num_points, prototype)
-    return Scan(
+    return E57Scan(
         index=index,
         label=label,
         num_points=num_points,
@@ -169,7 +170,7 @@ def _color_range(path: Path, element: Element, field: Element) -> tuple[float, f
     return first, last
 
 
-def _read_chunks(path: Path, scans: list[Scan]) -> Iterator[RawCloud]:
+def _read_chunks(path: Path, scans: list[E57Scan]) -> Iterator[RawCloud]:
     with opened(path) as file:
         for scan in scans:
             for columns in _read_scan(file, scan):
@@ -178,7 +179,7 @@ def _read_chunks(path: Path, scans: list[Scan]) -> Iterator[RawCloud]:
                 yield cloud
 
 
-def _read_measured(path: Path, scans: list[Scan]) -> Iterator[Measured]:
+def _read_scalar(path: Path, scans: list[E57Scan]) -> Iterator[PointsWithScalar]:
     with opened(path) as file:
         for scan in scans:
             for columns in _read_scan(file, scan):
@@ -187,7 +188,7 @@ def _read_measured(path: Path, scans: list[Scan]) -> Iterator[Measured]:
                 yield points_world, columns[INTENSITY][is_valid]
 
 
-def _read_scan(file: E57File, scan: Scan) -> Iterator[dict[str, Array]]:
+def _read_scan(file: E57File, scan: E57Scan) -> Iterator[dict[str, Array]]:
     """The columns of a scan, a chunk at a time, in room that is used again."""
     names = (*scan.coordinates, *scan.channels, *scan.invalid)
     columns = {name: np.empty(min(scan.num_points, CHUNK)) for name in names}
@@ -209,7 +210,7 @@ def _read_scan(file: E57File, scan: Scan) -> Iterator[dict[str, Array]]:
         )
 
 
-def _reader(file: E57File, scan: Scan, columns: dict[str, Array]) -> Any:
+def _reader(file: E57File, scan: E57Scan, columns: dict[str, Array]) -> Any:
     """libE57's reader, which fills the columns from their beginning at each call."""
     buffers = file.libe57.VectorSourceDestBuffer()
     for name, column in columns.items():
@@ -217,7 +218,7 @@ def _reader(file: E57File, scan: Scan, columns: dict[str, Array]) -> Any:
     return file.image_file.root()["data3D"][scan.index]["points"].reader(buffers)
 
 
-def _points(scan: Scan, columns: dict[str, Array]) -> tuple[Array, NDArray[np.bool_]]:
+def _points(scan: E57Scan, columns: dict[str, Array]) -> tuple[Array, NDArray[np.bool_]]:
     """The points that count (N, 3), in the world, from the columns of a chunk, and which these are."""
     is_valid = np.ones(len(columns[scan.coordinates[0]]), dtype=np.bool_)
     for name in scan.invalid:
@@ -227,11 +228,12 @@ def _points(scan: Scan, columns: dict[str, Array]) -> tuple[Array, NDArray[np.bo
         a, b, c = a * np.cos(c) * np.cos(b), a * np.cos(c) * np.sin(b), a * np.sin(c)
     points_world = np.stack([a, b, c], axis=1)
     if scan.placement is not None:
-        points_world = points_world @ scan.placement.R_world_from_local.T + scan.placement.center_world
+        R_world_from_local = scan.placement.R_world_from_local
+        points_world = rotate_points(points_world, R_world_from_local) + scan.placement.center_world
     return points_world, is_valid
 
 
-def _cloud(path: Path, scan: Scan, columns: dict[str, Array]) -> RawCloud:
+def _cloud(path: Path, scan: E57Scan, columns: dict[str, Array]) -> RawCloud:
     """The points that count, in the world, and their colours."""
     points_world, is_valid = _points(scan, columns)
     channels = [
@@ -241,7 +243,7 @@ def _cloud(path: Path, scan: Scan, columns: dict[str, Array]) -> RawCloud:
     return RawCloud(points_world, np.stack(channels, axis=1))
 
 
-def _channel(path: Path, scan: Scan, values: Array, low: float, high: float) -> NDArray[np.uint8]:
+def _channel(path: Path, scan: E57Scan, values: Array, low: float, high: float) -> NDArray[np.uint8]:
     """Channel (N,) 0-255 of values (N,) in the range from `low` to `high`."""
     brightness = (values - low) * (255.0 / (high - low))
     is_wrong = ~((brightness >= -TOLERANCE) & (brightness <= 255.0 + TOLERANCE))
@@ -253,4 +255,4 @@ def _channel(path: Path, scan: Scan, values: Array, low: float, high: float) -> 
     return np.rint(brightness).astype(np.uint8)
 
 
-E57 = Format("E57", frozenset({".e57"}), has_e57_magic, open_e57)
+E57 = CloudFormat("E57", frozenset({".e57"}), has_e57_magic, open_e57)

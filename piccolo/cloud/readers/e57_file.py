@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.pose import rotation_from_quaternion_wxyz
-from ...runtime.optional import library
-from .lines import quoted
+from ...runtime.optional import import_optional
+from .reader import quoted
 
 MAGIC = b"ASTM-E57"
 HEADER = struct.Struct("<8sIIQQQQ")  # magic, major, minor, file size, XML offset, XML size, page size
@@ -57,7 +57,7 @@ class E57File:
 def opened(path: Path) -> Iterator[E57File]:
     """An E57 file whose header and XML were checked, open to be read."""
     root = read_xml(path)
-    libe57 = library(path, "pye57.libe57")
+    libe57 = import_optional(path, "pye57.libe57")
     with refusing(path, libe57):
         image_file = libe57.ImageFile(str(path), "r", CHECK_ALL)
     try:

@@ -5,14 +5,14 @@ black and its 99th white: of all its points, in a reading of their own, whatever
 """
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from .reader import Measured, RawCloud
+from .reader import ChunkReader, CloudReadOptions, PointsWithScalar, RawCloud, ScalarReader
 
 INTENSITY_NAMES = frozenset({"intensity", "scalar_intensity", "reflectance", "scalar_reflectance"})
 OPTION = "--intensity-as-gray takes it for a gray"
@@ -21,16 +21,22 @@ LARGEST = float(np.finfo(np.float32).max)
 NUM_BINS = 1 << 16
 
 
-def in_gray(path: Path, read_measured: Callable[[], Iterator[Measured]]) -> Callable[[], Iterator[RawCloud]]:
+def intensity_reader(path: Path, read_scalar: ScalarReader) -> ChunkReader:
     """What a PointSource wants as `read_chunks`, of a reader of points and their intensity."""
-    limits = functools.cache(lambda: _limits(path, read_measured()))
+    limits = functools.cache(lambda: _limits(path, read_scalar()))
 
     def read_chunks() -> Iterator[RawCloud]:
         low, high = limits()
-        for points, intensity in read_measured():
+        for points, intensity in read_scalar():
             yield RawCloud(points, as_gray(intensity, low, high))
 
     return read_chunks
+
+
+def check_option(path: Path, options: CloudReadOptions, wanted: str) -> None:
+    """Refuse a file with intensity and no colours unless the user wants its intensity for a gray."""
+    if not options.intensity_as_gray:
+        raise InputError(f"{path}: has intensity and no colours, {wanted}; {OPTION}")
 
 
 def as_gray(intensity: NDArray[np.float64], low: float, high: float) -> NDArray[np.uint8]:
@@ -40,7 +46,7 @@ def as_gray(intensity: NDArray[np.float64], low: float, high: float) -> NDArray[
     return np.repeat(gray[:, None], 3, axis=1)
 
 
-def _limits(path: Path, chunks: Iterator[Measured]) -> tuple[float, float]:
+def _limits(path: Path, chunks: Iterator[PointsWithScalar]) -> tuple[float, float]:
     """Percentiles of the intensity of points that have a position, within 1 %, or exact up to 255."""
     histogram = np.zeros(NUM_BINS, np.int64)
     for points, intensity in chunks:

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from .intensity import OPTION, in_gray
-from .labels import in_palette
-from .las_header import WANTED, Header, has_las_magic, read_header
+from .intensity import OPTION, intensity_reader
+from .labels import label_reader
+from .las_header import WANTED, LasHeader, has_las_magic, read_header
 from .laz import MAX_CHUNK_SIZE, Compression, decompress, read_compression
-from .reader import CHUNK, PLAIN, Format, Measured, PointSource, RawCloud, ReadOptions
+from .reader import CHUNK, CUT, PLAIN, CloudFormat, CloudReadOptions, PointSource, PointsWithScalar, RawCloud
 
 WITHHELD_OLD, WITHHELD = 0x80, 0x04  # bits of the flags' byte, in the formats 0-5 and 6-10
 CLASS_OLD, CLASS = 0x1F, 0xFF  # bits of the class, in the same
@@ -24,7 +24,7 @@ Records = NDArray[np.void]
 
 
 @dataclass(frozen=True)
-class Run:
+class LasRun:
     """Records that follow each other in the file and are read at once."""
 
     num_points: int
@@ -33,7 +33,7 @@ class Run:
     chunks: tuple[tuple[int, int], ...] = ()  # of LAZ: the points and bytes of each
 
 
-def open_las(path: Path, options: ReadOptions = PLAIN) -> PointSource:
+def open_las(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     """The points of a LAS or LAZ file; withheld ones are left out.
 
     Colours are 16-bit, as the format says. They are taken for 8-bit if none of a million points, spread
@@ -43,7 +43,7 @@ def open_las(path: Path, options: ReadOptions = PLAIN) -> PointSource:
     header = read_header(path)
     compression = read_compression(header) if header.is_compressed else None
     if options.labels:
-        read_chunks = in_palette(path, lambda: _read_measured(header, compression, "class"), options.labels)
+        read_chunks = label_reader(path, lambda: _read_scalar(header, compression, "class"), options.labels)
         return PointSource(path, read_chunks, header.num_points)
     brightest, num_samples = _largest(header, compression, "rgb") if header.has_colors else (0, 0)
     if brightest == 0:
@@ -55,12 +55,15 @@ def open_las(path: Path, options: ReadOptions = PLAIN) -> PointSource:
             f"{num_samples} points looked at)"
         )
     return PointSource(
-        path, lambda: _read_chunks(header, compression, is_8_bit), header.num_points, tuple(warnings)
+        path,
+        lambda: (_cloud(header, records, is_8_bit) for records in _chunks(header, compression)),
+        header.num_points,
+        tuple(warnings),
     )
 
 
 def _gray_source(
-    header: Header, compression: Compression | None, options: ReadOptions, num_samples: int
+    header: LasHeader, compression: Compression | None, options: CloudReadOptions, num_samples: int
 ) -> PointSource:
     """The points with their intensity for a gray, if that is wanted, of a file without colours."""
     if not options.intensity_as_gray:
@@ -72,11 +75,11 @@ def _gray_source(
             why += f"; its intensity is 0 in all {num_samples} points looked at"
             raise InputError(f"{header.path}: has neither colours nor intensity: {why}, {WANTED}")
         raise InputError(f"{header.path}: has intensity and no colours: {why}, {WANTED}; {OPTION}")
-    read_chunks = in_gray(header.path, lambda: _read_measured(header, compression, "intensity"))
+    read_chunks = intensity_reader(header.path, lambda: _read_scalar(header, compression, "intensity"))
     return PointSource(header.path, read_chunks, header.num_points)
 
 
-def _runs(header: Header, compression: Compression | None) -> Iterator[Run]:
+def _runs(header: LasHeader, compression: Compression | None) -> Iterator[LasRun]:
     """All points in order, CHUNK or fewer at once unless one chunk of LAZ holds more."""
     most = max(1, min(CHUNK, MAX_CHUNK_SIZE // header.record_size))
     if compression is None:
@@ -87,20 +90,20 @@ def _runs(header: Header, compression: Compression | None) -> Iterator[Run]:
     waiting: list[tuple[int, int]] = []
     for chunk in compression.chunks:
         if waiting and num_points + chunk[0] > most:
-            yield Run(num_points, offset, size, tuple(waiting))
+            yield LasRun(num_points, offset, size, tuple(waiting))
             offset, size, num_points, waiting = offset + size, 0, 0, []
         waiting.append(chunk)
         num_points += chunk[0]
         size += chunk[1]
-    yield Run(num_points, offset, size, tuple(waiting))
+    yield LasRun(num_points, offset, size, tuple(waiting))
 
 
-def _plain_run(header: Header, first: int, count: int) -> Run:
+def _plain_run(header: LasHeader, first: int, count: int) -> LasRun:
     count = min(count, header.num_points - first)
-    return Run(count, header.points_offset + first * header.record_size, count * header.record_size)
+    return LasRun(count, header.points_offset + first * header.record_size, count * header.record_size)
 
 
-def _sample_runs(header: Header, compression: Compression | None) -> Iterator[Run]:
+def _sample_runs(header: LasHeader, compression: Compression | None) -> Iterator[LasRun]:
     """About MAX_SAMPLES points spread evenly over the file, or all if there are no more."""
     if header.num_points <= MAX_SAMPLES:
         yield from _runs(header, compression)
@@ -114,21 +117,21 @@ def _sample_runs(header: Header, compression: Compression | None) -> Iterator[Ru
     offsets = compression.offset + np.cumsum([0, *(size for _, size in chunks)])
     num_runs = min(max(2, MAX_SAMPLES // max(count for count, _ in chunks)), len(chunks))
     for k in np.linspace(0, len(chunks) - 1, num_runs).astype(np.int64).tolist():
-        yield Run(chunks[k][0], int(offsets[k]), chunks[k][1], (chunks[k],))
+        yield LasRun(chunks[k][0], int(offsets[k]), chunks[k][1], (chunks[k],))
 
 
-def _load(file: BinaryIO, header: Header, compression: Compression | None, run: Run) -> Records:
+def _load(file: BinaryIO, header: LasHeader, compression: Compression | None, run: LasRun) -> Records:
     """The records of a run."""
     file.seek(run.offset)
     data = file.read(run.size)
     if len(data) < run.size:
-        raise InputError(f"{header.path}: the file ended while it was read")
+        raise InputError(f"{header.path}: {CUT}")
     if compression is not None:
         return decompress(header.path, compression, data, run.chunks).view(header.dtype)
     return np.frombuffer(data, dtype=header.dtype)
 
 
-def _largest(header: Header, compression: Compression | None, name: str) -> tuple[int, int]:
+def _largest(header: LasHeader, compression: Compression | None, name: str) -> tuple[int, int]:
     """The largest `rgb` or `intensity` in a sample of the points, and the number of those."""
     largest = num_samples = 0
     with header.path.open("rb") as file:
@@ -139,26 +142,24 @@ def _largest(header: Header, compression: Compression | None, name: str) -> tupl
     return largest, num_samples
 
 
-def _read_chunks(header: Header, compression: Compression | None, is_8_bit: bool) -> Iterator[RawCloud]:
+def _chunks(header: LasHeader, compression: Compression | None) -> Iterator[Records]:
+    """Yield all records, CHUNK or fewer at once."""
     with header.path.open("rb") as file:
         for run in _runs(header, compression):
             records = _load(file, header, compression, run)
             for first in range(0, len(records), CHUNK):
-                yield _cloud(header, records[first : first + CHUNK], is_8_bit)
+                yield records[first : first + CHUNK]
 
 
-def _read_measured(header: Header, compression: Compression | None, name: str) -> Iterator[Measured]:
+def _read_scalar(header: LasHeader, compression: Compression | None, name: str) -> Iterator[PointsWithScalar]:
     """The points with their `intensity` or `class`."""
     bits = 0xFFFF if name == "intensity" else CLASS_OLD if header.point_format < 6 else CLASS
-    with header.path.open("rb") as file:
-        for run in _runs(header, compression):
-            records = _load(file, header, compression, run)
-            for first in range(0, len(records), CHUNK):
-                points_world, kept = _points(header, records[first : first + CHUNK])
-                yield points_world, (kept[name] & bits).astype(np.float64)
+    for records in _chunks(header, compression):
+        points_world, kept = _points(header, records)
+        yield points_world, (kept[name] & bits).astype(np.float64)
 
 
-def _points(header: Header, records: Records) -> tuple[NDArray[np.float64], Records]:
+def _points(header: LasHeader, records: Records) -> tuple[NDArray[np.float64], Records]:
     """Positions (N, 3) of the records that are not withheld, and these."""
     withheld = WITHHELD_OLD if header.point_format < 6 else WITHHELD
     is_withheld = (records["flags"] & withheld) != 0
@@ -168,7 +169,7 @@ def _points(header: Header, records: Records) -> tuple[NDArray[np.float64], Reco
         return records["xyz"] * header.scales + header.offsets, records
 
 
-def _cloud(header: Header, records: Records, is_8_bit: bool) -> RawCloud:
+def _cloud(header: LasHeader, records: Records, is_8_bit: bool) -> RawCloud:
     points_world, records = _points(header, records)
     rgb = records["rgb"]
     if not is_8_bit:
@@ -181,4 +182,4 @@ def _cloud(header: Header, records: Records, is_8_bit: bool) -> RawCloud:
     return RawCloud(points_world, rgb.astype(np.uint8))
 
 
-LAS = Format("LAS, LAZ", frozenset({".las", ".laz"}), has_las_magic, open_las, has_labels=True)
+LAS = CloudFormat("LAS, LAZ", frozenset({".las", ".laz"}), has_las_magic, open_las, has_labels=True)

@@ -1,7 +1,7 @@
 """The header of LAS and LAZ files, read and checked.
 
-laspy would loop and reserve as a damaged header tells it. A header that was checked has told all there is
-to know: what follows are records of a fixed length.
+laspy would loop and reserve as a damaged header says. Nothing more is needed than a checked header: what
+follows are records of a fixed length.
 """
 
 import struct
@@ -25,8 +25,8 @@ WANTED = "wanted LAS or LAZ with red green blue (point format 2, 3, 5, 7, 8 or 1
 
 
 @dataclass(frozen=True)
-class Header:
-    """What a LAS file says of itself."""
+class LasHeader:
+    """The header of a LAS file."""
 
     path: Path
     size: int  # [byte]
@@ -67,7 +67,7 @@ def has_las_magic(head: bytes) -> bool:
     return head.startswith(MAGIC)
 
 
-def read_header(path: Path) -> Header:
+def read_header(path: Path) -> LasHeader:
     """The header of a LAS or LAZ file; InputError if it is broken or promises too much."""
     with path.open("rb") as file:
         head = file.read(MIN_HEADER_SIZE_1_4)
@@ -82,7 +82,7 @@ def read_header(path: Path) -> Header:
     )
     if minor >= 4 and len(head) == MIN_HEADER_SIZE_1_4:
         num_points = struct.unpack_from("<Q", head, 247)[0] or num_points
-    header = Header(
+    header = LasHeader(
         path=path,
         size=path.stat().st_size,
         header_size=header_size,
@@ -107,7 +107,7 @@ def read_header(path: Path) -> Header:
     return header
 
 
-def _check_header(header: Header) -> None:
+def _check_header(header: LasHeader) -> None:
     """Refuse what no points could make right."""
     path = header.path
     if header.point_format not in RECORD_SIZES:

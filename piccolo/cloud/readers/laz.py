@@ -1,6 +1,6 @@
 """The compression of LAZ files: the chunk table, and decompression by lazrs.
 
-lazrs reserves whatever memory the chunk table and the sizes in the chunks promise, so these are held against
+lazrs reserves whatever memory the chunk table and the sizes in the chunks promise, so these are compared with
 the file first.
 """
 
@@ -17,41 +17,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...runtime.optional import library
-from .las_header import Header
+from ...runtime.optional import import_optional
+from .las_header import RECORD_SIZES, LasHeader
 
 OFFSET_SIZE = 8  # [byte] of the chunk table's offset, in front of the first chunk
 MAX_ENTRY_SIZE = 32  # [byte], more than an entry of the table can take
 MAX_VLRS = 1 << 16
 VLR_HEADER = struct.Struct("<2x16sHH32x")  # user, record id, length of what follows
 LASZIP_USER, LASZIP_RECORD_ID = b"laszip encoded", 22204
-LASZIP = struct.Struct("<H10xI16xH")  # compressor, points a chunk, number of items
-ITEM = struct.Struct("<HH2x")  # type, size
-POINTWISE_CHUNKED, LAYERED = 2, 3  # compressors
-VARIABLE = 0xFFFFFFFF  # points a chunk, if each says its own
-# The items of a record, (type, size [byte]), by point format; extra bytes may follow.
-ITEMS = {
-    0: ((6, 20),),
-    1: ((6, 20), (7, 8)),
-    2: ((6, 20), (8, 6)),
-    3: ((6, 20), (7, 8), (8, 6)),
-    4: ((6, 20), (7, 8), (9, 29)),
-    5: ((6, 20), (7, 8), (8, 6), (9, 29)),
-    6: ((10, 30),),
-    7: ((10, 30), (11, 6)),
-    8: ((10, 30), (12, 8)),
-    9: ((10, 30), (13, 29)),
-    10: ((10, 30), (12, 8), (13, 29)),
-}
-EXTRA_BYTES = frozenset({0, 14})  # item types
-NUM_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # by item type; extra bytes have one each
+ITEMS_AT, ITEM_SIZE, TYPE_AND_SIZE = 34, 6, 4  # [byte] in that record; an item ends with its version
+NUM_LAYERS = {6: 9, 7: 10, 8: 11, 9: 10, 10: 12}  # of a chunk, by point format; extra bytes have one each
 MAX_CHUNK_SIZE = 1 << 29  # [byte] of a chunk's records, for it is decompressed at once; 2 MB are usual
 # What is wanted of formats 6 to 10, where fields can be passed over.
 SELECTED = ("XY_RETURNS_CHANNEL", "Z", "INTENSITY", "FLAGS", "CLASSIFICATION", "RGB")
 
 BROKEN = "the file is cut off or broken"
 
-Chunk = tuple[int, int]  # points, bytes
+LazChunk = tuple[int, int]  # points, bytes
 
 
 @dataclass(frozen=True)
@@ -59,30 +41,31 @@ class Compression:
     """Where a file's chunks are and how to read them."""
 
     offset: int  # [byte] of the first chunk
-    chunks: tuple[Chunk, ...]
+    chunks: tuple[LazChunk, ...]
     laszip: bytes  # the record that describes the compression, as lazrs takes it
     record_size: int  # [byte]
     num_layers: int  # 0 if the points are not in layers
 
 
-def read_compression(header: Header) -> Compression:
+def read_compression(header: LasHeader) -> Compression:
     """The compression of a LAZ file; InputError if its parts don't fit together or in the file."""
-    lazrs = library(header.path, "lazrs")
+    lazrs = import_optional(header.path, "lazrs")
     with header.path.open("rb") as file:
         laszip = _laszip_record(header, file)
-        num_layers, chunk_size = _check_items(header, laszip)
+        num_layers = _check_items(header, laszip, lazrs)
         table_offset = _table_offset(header, file)
         table = _table(header, file, table_offset)
     with _refusing(header.path, lazrs):
-        entries = lazrs.read_chunk_table_only(io.BytesIO(table), lazrs.LazVlr(laszip))
-    if chunk_size != VARIABLE:
-        entries = [(chunk_size, size) for _, size in entries]
+        vlr = lazrs.LazVlr(laszip)
+        entries = lazrs.read_chunk_table_only(io.BytesIO(table), vlr)
+        if not vlr.uses_variable_size_chunks():
+            entries = [(vlr.chunk_size(), size) for _, size in entries]
     offset = header.points_offset + OFFSET_SIZE
     chunks = _checked_chunks(header, entries, table_offset - offset)
     return Compression(offset, chunks, laszip, header.record_size, num_layers)
 
 
-def _laszip_record(header: Header, file: BinaryIO) -> bytes:
+def _laszip_record(header: LasHeader, file: BinaryIO) -> bytes:
     """The content of the variable-length record that LASzip leaves behind the header."""
     position = header.header_size
     for _ in range(min(header.num_vlrs, MAX_VLRS)):
@@ -96,33 +79,25 @@ def _laszip_record(header: Header, file: BinaryIO) -> bytes:
     raise InputError(f"{header.path}: the points are compressed, but no record says how (LASzip's VLR)")
 
 
-def _check_items(header: Header, laszip: bytes) -> tuple[int, int]:
-    """The number of layers and the points a chunk, if the record describes this file's points."""
-    if len(laszip) < LASZIP.size:
-        raise InputError(f"{header.path}: LASzip's record has {len(laszip)} bytes, wanted {LASZIP.size}")
-    compressor, chunk_size, num_items = LASZIP.unpack_from(laszip)
-    expected = LAYERED if header.point_format >= 6 else POINTWISE_CHUNKED
-    if compressor != expected:
+def _check_items(header: LasHeader, laszip: bytes, lazrs: ModuleType) -> int:
+    """The number of layers of a chunk, if the record is one that lazrs would write for these points."""
+    num_extra = header.record_size - RECORD_SIZES[header.point_format]
+    expected = lazrs.LazVlr.new_for_compression(header.point_format, num_extra, False).record_data()
+    if _without_versions(laszip[: len(expected)]) != _without_versions(expected):
         raise InputError(
-            f"{header.path}: LASzip's compressor {compressor} in point format {header.point_format}, wanted "
-            f"{expected}, the chunked one that LASzip 2 and later write"
+            f"{header.path}: LASzip's record is not that of point format {header.point_format} in "
+            f"{header.record_size} bytes, as LASzip 2 and later write it; it is broken or too old"
         )
-    num_whole = min(num_items, (len(laszip) - LASZIP.size) // ITEM.size)
-    items = list(ITEM.iter_unpack(laszip[LASZIP.size : LASZIP.size + num_whole * ITEM.size]))
-    known = ITEMS[header.point_format]
-    extra = items[len(known) :]
-    is_known = tuple(items[: len(known)]) == known and all(type_ in EXTRA_BYTES for type_, _ in extra)
-    if not is_known or len(items) != num_items or sum(size for _, size in items) != header.record_size:
-        raise InputError(
-            f"{header.path}: LASzip's record lists items (type, size) {items[:6]}, wanted those of point "
-            f"format {header.point_format} in {header.record_size} bytes"
-        )
-    if compressor != LAYERED:
-        return 0, chunk_size
-    return sum(NUM_LAYERS.get(type_, size) for type_, size in items), chunk_size
+    return NUM_LAYERS[header.point_format] + num_extra if header.point_format >= 6 else 0
 
 
-def _table_offset(header: Header, file: BinaryIO) -> int:
+def _without_versions(laszip: bytes) -> list[bytes]:
+    """The compressor, the number of items, and the type and size of each."""
+    items = [laszip[k : k + TYPE_AND_SIZE] for k in range(ITEMS_AT, len(laszip), ITEM_SIZE)]
+    return [laszip[:2], laszip[ITEMS_AT - 2 : ITEMS_AT], *items]
+
+
+def _table_offset(header: LasHeader, file: BinaryIO) -> int:
     """Where the chunk table begins. A writer that could not go back says it in the file's last bytes."""
     for position in (header.points_offset, header.size - 8):
         file.seek(position)
@@ -135,7 +110,7 @@ def _table_offset(header: Header, file: BinaryIO) -> int:
     raise InputError(f"{header.path}: no chunk table within the file; it is cut off or broken")
 
 
-def _table(header: Header, file: BinaryIO, offset: int) -> bytes:
+def _table(header: LasHeader, file: BinaryIO, offset: int) -> bytes:
     """The compressed chunk table, if the file has room for as many chunks as it promises."""
     file.seek(offset)
     num_chunks = int.from_bytes(file.read(8)[4:], "little")
@@ -149,9 +124,9 @@ def _table(header: Header, file: BinaryIO, offset: int) -> bytes:
     return file.read(MAX_ENTRY_SIZE * (num_chunks + 32))
 
 
-def _checked_chunks(header: Header, entries: list[Chunk], num_bytes: int) -> tuple[Chunk, ...]:
+def _checked_chunks(header: LasHeader, entries: list[LazChunk], num_bytes: int) -> tuple[LazChunk, ...]:
     """The chunks that hold the promised points, the last no more than is left."""
-    chunks: list[Chunk] = []
+    chunks: list[LazChunk] = []
     num_left = header.num_points
     max_count = MAX_CHUNK_SIZE // header.record_size
     for full_count, size in entries:
@@ -175,10 +150,10 @@ def _checked_chunks(header: Header, entries: list[Chunk], num_bytes: int) -> tup
 
 
 def decompress(
-    path: Path, compression: Compression, data: bytes, chunks: Iterable[Chunk]
+    path: Path, compression: Compression, data: bytes, chunks: Iterable[LazChunk]
 ) -> NDArray[np.uint8]:
     """The records, one after the other, of the `chunks` whose compressed bytes are `data`."""
-    lazrs = library(path, "lazrs")
+    lazrs = import_optional(path, "lazrs")
     chunks = list(chunks)
     if compression.num_layers:
         _check_layers(path, compression, data, chunks)
@@ -193,7 +168,7 @@ def decompress(
     return records
 
 
-def _check_layers(path: Path, compression: Compression, data: bytes, chunks: Iterable[Chunk]) -> None:
+def _check_layers(path: Path, compression: Compression, data: bytes, chunks: Iterable[LazChunk]) -> None:
     """Refuse layers larger than the chunk they lie in, and another number of points than was promised.
 
     A chunk is a whole point, the number of points, the bytes of each layer, the layers.

@@ -16,14 +16,14 @@ from .colors import BRIGHTEST
 from .mesh_gltf import NO_MATERIAL, has_glb_magic
 from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply
 from .mesh_sampling import Sampling, Surface, SurfaceInstance
-from .reader import PLAIN, Format, PointSource, ReadOptions
+from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource
 
 DENSITY = 10_000.0  # points on a square metre, 1 cm apart
 MAX_POINTS = 30_000_000
 MAX_TRIANGLES = 200_000_000  # those of a mesh count again at each place where the scene puts it
 
 
-def open_mesh(path: Path, options: ReadOptions = PLAIN) -> PointSource:
+def open_mesh(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     """The points on the triangles of an OBJ, GLB or glTF file, 10,000 on a square metre.
 
     The options' scale tells what a metre is in the file. A file that would give more than 30 million is
@@ -38,7 +38,7 @@ def open_mesh(path: Path, options: ReadOptions = PLAIN) -> PointSource:
     return _source(load_obj(path, content), options.scale)
 
 
-def open_ply_mesh(path: Path, options: ReadOptions = PLAIN) -> PointSource:
+def open_ply_mesh(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     """The points on the faces of a PLY file, as by open_mesh; with a texture if a comment names one."""
     return _source(load_ply(path), options.scale)
 
@@ -195,4 +195,4 @@ def _fractions(path: Path, raw: Any, count: int) -> Array:
     return np.asarray(fractions, dtype=np.float64)
 
 
-MESH = Format("OBJ, GLB and glTF meshes", frozenset({".obj", ".glb", ".gltf"}), has_glb_magic, open_mesh)
+MESH = CloudFormat("OBJ, GLB and glTF meshes", frozenset({".obj", ".glb", ".gltf"}), has_glb_magic, open_mesh)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
-from ...runtime.optional import library
+from ...runtime.optional import import_optional
 from .mesh_files import FolderResolver
 from .mesh_gltf import Material, has_glb_magic, sanitize_gltf
 from .mesh_texture import Texture, check_image, first_line, own_limit, texture_of
@@ -99,7 +99,7 @@ def _with_raw_colors(parsed: dict[str, Any]) -> dict[str, Any]:
 
 
 def _scene(resolver: FolderResolver, content: bytes, kind: str, has_texture: bool = True) -> Any:
-    trimesh = library(resolver.path, "trimesh")
+    trimesh = import_optional(resolver.path, "trimesh")
     try:
         with own_limit(), _strict():
             # vertices are split by texture coordinates only if there is a texture: colours go by vertices

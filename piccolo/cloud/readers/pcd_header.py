@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ...errors import InputError
-from .lines import quoted
+from .reader import quoted
 
 MAX_HEADER_SIZE = 1 << 16  # [byte]
 MAX_COUNT_DIGITS = 10
@@ -14,7 +14,7 @@ WANTED = "wanted a PCD file with the fields x y z and rgb, rgba or r g b"
 
 
 @dataclass(frozen=True)
-class Field:
+class PcdField:
     """One of a point's fields."""
 
     name: str
@@ -30,15 +30,14 @@ class Field:
 
 
 @dataclass(frozen=True)
-class Header:
-    """What a PCD file says of itself."""
+class PcdHeader:
+    """The header of a PCD file."""
 
     path: Path
-    fields: tuple[Field, ...]
+    fields: tuple[PcdField, ...]
     num_points: int
     encoding: str  # one of ENCODINGS
     size: int  # [byte], the data begin here
-    num_lines: int
 
     @property
     def row_size(self) -> int:
@@ -51,15 +50,14 @@ class Header:
         return sum(field.count for field in self.fields)
 
 
-def read_header(path: Path) -> Header:
+def read_header(path: Path) -> PcdHeader:
     """The header of a PCD file; SIZE, TYPE and COUNT may be missing, as in old ones: 4, F and 1."""
     with path.open("rb") as file:
         head = file.read(MAX_HEADER_SIZE)
     entries: dict[str, list[str]] = {}
-    size = num_lines = 0
+    size = 0
     for line in head.split(b"\n"):
         size += len(line) + 1
-        num_lines += 1
         words = line.decode("latin-1").split()
         if words and not words[0].startswith("#"):
             entries["FIELDS" if words[0] == "COLUMNS" else words[0]] = words[1:]
@@ -71,10 +69,10 @@ def read_header(path: Path) -> Header:
     if encoding not in ENCODINGS:
         raise InputError(f"{path}: DATA is {quoted(encoding.encode())}, wanted {', '.join(ENCODINGS)}")
     fields = _fields(path, entries)
-    return Header(path, fields, _num_points(path, entries), encoding, min(size, len(head)), num_lines)
+    return PcdHeader(path, fields, _num_points(path, entries), encoding, min(size, len(head)))
 
 
-def _fields(path: Path, entries: dict[str, list[str]]) -> tuple[Field, ...]:
+def _fields(path: Path, entries: dict[str, list[str]]) -> tuple[PcdField, ...]:
     names = entries["FIELDS"]
     sizes, types, counts = (
         entries.get(key, [usual] * len(names))
@@ -85,7 +83,7 @@ def _fields(path: Path, entries: dict[str, list[str]]) -> tuple[Field, ...]:
             f"{path}: the header has {len(names)} FIELDS, {len(sizes)} of SIZE, {len(types)} of TYPE and "
             f"{len(counts)} of COUNT, wanted as many of each"
         )
-    fields: list[Field] = []
+    fields: list[PcdField] = []
     offset = column = 0
     for name, size, type_, text in zip(names, sizes, types, counts, strict=True):
         count = _count(text)
@@ -95,7 +93,7 @@ def _fields(path: Path, entries: dict[str, list[str]]) -> tuple[Field, ...]:
                 f"{path}: a field has the name, SIZE, TYPE and COUNT {found}, wanted SIZE 1 2 4 or 8, "
                 "TYPE I U or F, COUNT 1 or more"
             )
-        fields.append(Field(name, type_.lower() + size, count, offset, column))
+        fields.append(PcdField(name, type_.lower() + size, count, offset, column))
         offset += fields[-1].size
         column += count
     if offset > MAX_ROW_SIZE:

@@ -5,65 +5,70 @@ row vectors: [x y z 1]_world = [x y z 1] @ matrix. Then a line x y z intensity r
 """
 
 import math
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from . import reader as raw
-from .intensity import OPTION, in_gray
-from .lines import quoted
-from .point_lines import PointLines
-from .reader import CUT, PLAIN, Format, PointSource, RawCloud, ReadOptions
+from ...geometry.point_transforms import transform_points
+from .intensity import check_option, intensity_reader
+from .number_lines import NUM_WITH_INTENSITY, LineLayout, NumberLines
+from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, PointsWithScalar, RawCloud, quoted
 
 NUMBERS_A_LINE = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
 MAX_COUNT_DIGITS = 9
-TARGETS = np.array([0, 1, 2, -1, 3, 4, 5])  # x y z intensity r g b
+COLORED = LineLayout((0, 1, 2, 4, 5, 6))  # x y z r g b
+WITH_INTENSITY = LineLayout((0, 1, 2, 3), NUM_WITH_INTENSITY)
 AFFINE = (0.0, 0.0, 0.0, 1.0)  # the matrix' last column
-NUM_WITH_INTENSITY = 4  # columns: x y z intensity
 WANTED = "wanted a PTX file with lines x y z intensity r g b, colours 0-255"
 
 
 @dataclass(frozen=True)
-class Scan:
+class PtxScan:
     """How many points a scan has, and where they are in the world."""
 
     num_points: int  # lines that are there, whether the beam came back or not
-    matrix: NDArray[np.float64]  # (4, 4), world from scanner, for row vectors
+    T_world_from_scanner: NDArray[np.float64]  # (4, 4)
+
+    def place(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """The points in the world of those (N, 3) whose beam came back, and which these are (N,)."""
+        is_return: NDArray[np.bool_] = np.any(points != 0.0, axis=1)
+        with np.errstate(invalid="ignore", over="ignore"):  # infinite points are left out later, as elsewhere
+            return transform_points(points[is_return], self.T_world_from_scanner), is_return
 
 
-def open_ptx(path: Path, options: ReadOptions = PLAIN) -> PointSource:
+def open_ptx(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     """The points of all scans of a PTX file, in the world.
 
     0 0 0 stands where no beam came back and is left out. A last scan with fewer lines than its header
     promises is read as far as it goes, with a warning; a line without end is then taken for cut off.
     """
-    lines = PointLines(path, WANTED)
-    scans: list[Scan] = []
+    lines = NumberLines(path, COLORED, WANTED)
+    scans: list[PtxScan] = []
     warnings: list[str] = []
     has_colors = True
     while (header := _take_header(lines)) is not None:
-        count, matrix = header
-        end_of_header = lines.num_lines
+        count, T_world_from_scanner = header
+        last_of_header = lines.num_taken - 1
         if not scans:
             has_colors = _has_colors(lines, options)
         found = lines.skip(count)
         if found < count:
-            found -= bool(found) and not lines.has_line_end
+            found -= bool(found) and not _ends_with_a_line_end(path)
             warnings.append(
-                f"{path}: the header that ends at line {end_of_header} promises {count} points, found "
-                f"{found}; the file may be cut off"
+                f"{lines.locate(last_of_header)} ends a header that promises {count} points, found {found}; "
+                "the file may be cut off"
             )
-        scans.append(Scan(found, matrix))
+        scans.append(PtxScan(found, T_world_from_scanner))
     if not scans:
         raise InputError(f"{path}: no line of numbers, {WANTED}")
     num_points = sum(scan.num_points for scan in scans)
-    read_chunks = in_gray(path, partial(_read, path, scans, _take_measured))
+    read_chunks = intensity_reader(path, partial(_read_scalar, path, scans))
     if has_colors:
         read_chunks = partial(_read_colored, path, scans)
     return PointSource(path, read_chunks, num_points, tuple(warnings))
@@ -75,8 +80,8 @@ def has_ptx_magic(head: bytes) -> bool:
     return len(lines) == 3 and None not in map(_numbers, lines, NUMBERS_A_LINE)
 
 
-def _take_header(lines: PointLines) -> tuple[int, NDArray[np.float64]] | None:
-    """How many points the next scan's header promises, and its matrix; None at the file's end."""
+def _take_header(lines: NumberLines) -> tuple[int, NDArray[np.float64]] | None:
+    """How many points the next scan's header promises, T_world_from_scanner; None at the file's end."""
     numbers: list[list[float]] = []
     for num_wanted in NUMBERS_A_LINE:
         line = lines.take_line()
@@ -85,17 +90,17 @@ def _take_header(lines: PointLines) -> tuple[int, NDArray[np.float64]] | None:
         found = _numbers(line or b"", num_wanted)
         if found is None:
             raise InputError(
-                f"{lines.path}: line {lines.num_lines} is {quoted(line or b'')}, wanted "
+                f"{lines.locate(lines.num_taken - 1)} is {quoted(line or b'')}, wanted "
                 f"{'a count' if num_wanted == 1 else f'{num_wanted} numbers'} of a scan's header, {WANTED}"
             )
         numbers.append(found)
     matrix = np.array(numbers[-4:])
     if tuple(matrix[:, 3]) != AFFINE:
         raise InputError(
-            f"{lines.path}: the matrix that ends at line {lines.num_lines} has the last column "
+            f"{lines.locate(lines.num_taken - 1)} ends a matrix with the last column "
             f"{' '.join(f'{value:g}' for value in matrix[:, 3])}, wanted 0 0 0 1"
         )
-    return int(numbers[0][0]) * int(numbers[1][0]), matrix
+    return int(numbers[0][0]) * int(numbers[1][0]), matrix.T
 
 
 def _numbers(line: bytes, num_wanted: int) -> list[float] | None:
@@ -110,59 +115,36 @@ def _numbers(line: bytes, num_wanted: int) -> list[float] | None:
     return values if len(values) == num_wanted and all(map(math.isfinite, values)) else None
 
 
-def _has_colors(lines: PointLines, options: ReadOptions) -> bool:
-    """False if the next line is x y z intensity, and that is welcome."""
-    line = lines.next_line() or b""
-    if len(line.split()) == NUM_WITH_INTENSITY and not options.intensity_as_gray:
-        number = lines.line_number(0)
-        raise InputError(
-            f"{lines.path}: has intensity and no colours, line {number}: {quoted(line)}, {WANTED}; {OPTION}"
-        )
-    return len(line.split()) != NUM_WITH_INTENSITY
+def _has_colors(lines: NumberLines, options: CloudReadOptions) -> bool:
+    """False if the next line is x y z intensity, and the options allow that."""
+    if len((lines.peek() or b"").split()) != NUM_WITH_INTENSITY:
+        return True
+    check_option(lines.path, options, WANTED)
+    return False
 
 
-def _read_colored(path: Path, scans: list[Scan]) -> Iterator[RawCloud]:
-    for points_world, colors in _read(path, scans, _take_colored):
-        yield RawCloud(points_world, colors)
+def _ends_with_a_line_end(path: Path) -> bool:
+    with path.open("rb") as file:
+        file.seek(-1, os.SEEK_END)
+        return file.read() in (b"\r", b"\n")
 
 
-def _take_colored(lines: PointLines, count: int) -> tuple[NDArray[np.float64], NDArray[Any]]:
-    found = lines.take_points(TARGETS, False, np.empty((count, 6)))
-    return found.points_world, found.colors
-
-
-def _take_measured(lines: PointLines, count: int) -> tuple[NDArray[np.float64], NDArray[Any]]:
-    rows = np.empty((count, NUM_WITH_INTENSITY))
-    rows = rows[: lines.take_rows(np.arange(NUM_WITH_INTENSITY), True, rows)]
-    return rows[:, :3], rows[:, 3]
-
-
-def _read(
-    path: Path,
-    scans: list[Scan],
-    take: Callable[[PointLines, int], tuple[NDArray[np.float64], NDArray[Any]]],
-) -> Iterator[tuple[NDArray[np.float64], NDArray[Any]]]:
-    """Yield the points in the world that came back, and what else `take` finds in their lines."""
-    lines = PointLines(path, WANTED)
+def _read_colored(path: Path, scans: list[PtxScan]) -> Iterator[RawCloud]:
+    lines = NumberLines(path, COLORED, WANTED)
     for scan in scans:
         lines.skip(len(NUMBERS_A_LINE))
-        num_left = scan.num_points
-        while num_left:
-            points, values = take(lines, min(num_left, raw.CHUNK))
-            if not len(points):
-                raise InputError(f"{path}: {CUT}")
-            num_left -= len(points)
-            is_return: NDArray[np.bool_] = np.any(points != 0.0, axis=1)
-            yield _in_world(points[is_return], scan.matrix), values[is_return]
+        for chunk in lines.read_points(scan.num_points):
+            points_world, is_return = scan.place(chunk.points_world)
+            yield RawCloud(points_world, chunk.colors[is_return])
 
 
-def _in_world(points: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points (N, 3) in the world of points in the scanner's frame."""
-    # Column by column, not by BLAS: a point's bits must not depend on its neighbours.
-    x, y, z = points.T
-    with np.errstate(invalid="ignore", over="ignore"):  # infinite points are left out later, for all formats
-        columns = [x * a + y * b + z * c + d for a, b, c, d in matrix.T[:3]]
-    return np.stack(columns, axis=1)
+def _read_scalar(path: Path, scans: list[PtxScan]) -> Iterator[PointsWithScalar]:
+    lines = NumberLines(path, WITH_INTENSITY, WANTED)
+    for scan in scans:
+        lines.skip(len(NUMBERS_A_LINE))
+        for points, intensity in lines.read_scalars(scan.num_points):
+            points_world, is_return = scan.place(points)
+            yield points_world, intensity[is_return]
 
 
-PTX = Format("PTX", frozenset({".ptx"}), has_ptx_magic, open_ptx)
+PTX = CloudFormat("PTX", frozenset({".ptx"}), has_ptx_magic, open_ptx)

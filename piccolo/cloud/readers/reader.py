@@ -1,4 +1,4 @@
-"""What a reader hands on: a file's points as they stand there, a chunk at a time."""
+"""Types shared by the readers: chunks of points as they stand in a file."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -9,15 +9,17 @@ from numpy.typing import NDArray
 
 from ..label_colors import Labels
 
-CHUNK = 1 << 20  # points that a reader hands on at once, at most
+HEAD_SIZE = 512  # [byte] by which a format is known
+CHUNK = 1 << 20  # points of a chunk, at most
 CUT = "the file was cut while it was read, wanted a whole file"
 
 # points (N, 3) in the file's unit, and a number (N,) of each: intensity or label
-Measured = tuple[NDArray[np.float64], NDArray[np.float64]]
+PointsWithScalar = tuple[NDArray[np.float64], NDArray[np.float64]]
+ScalarReader = Callable[[], Iterator[PointsWithScalar]]  # each call from the start
 
 
 @dataclass(frozen=True)
-class ReadOptions:
+class CloudReadOptions:
     """What the user wants of a reader."""
 
     intensity_as_gray: bool = False  # take intensity for a gray where a file has no colours
@@ -25,7 +27,7 @@ class ReadOptions:
     scale: float = 1.0  # metres per unit of the file, for what counts by metres; points stay in its unit
 
 
-PLAIN = ReadOptions()
+PLAIN = CloudReadOptions()
 
 
 @dataclass(frozen=True)
@@ -36,25 +38,36 @@ class RawCloud:
     colors: NDArray[np.uint8]  # (N, 3) RGB
 
 
+ChunkReader = Callable[[], Iterator[RawCloud]]  # each call from the start; InputError where the data break
+
+
 @dataclass(frozen=True)
 class PointSource:
     """A file whose header has been checked, and the way to its points."""
 
     path: Path
-    read_chunks: Callable[[], Iterator[RawCloud]]  # each call anew; InputError where the data break
+    read_chunks: ChunkReader
     num_points: int | None = None  # for the progress; None if only reading can tell
     warnings: tuple[str, ...] = ()  # one line each, for the user: what was decided about this file
 
 
 @dataclass(frozen=True)
-class Format:
+class CloudFormat:
     """A format and its reader."""
 
     name: str
     suffixes: frozenset[str]  # lower case, with the dot
     has_magic: Callable[[bytes], bool]  # of a file's first HEAD_SIZE bytes; content goes before names
-    open_source: Callable[[Path, ReadOptions], PointSource]
+    open_source: Callable[[Path, CloudReadOptions], PointSource]
     has_labels: bool = False  # the reader knows them
 
 
-HEAD_SIZE = 512  # [byte]
+def quoted(line: bytes) -> str:
+    """The first line of `line`, short and printable, control characters as escapes."""
+    text = line.splitlines()[0] if line else b""
+    return ascii(text[:60].decode("latin-1")) + ("..." if len(text) > 60 else "")
+
+
+def point_label(path: Path, index: int) -> str:
+    """What messages call the point of that index in a file."""
+    return f"{path}: point {index + 1}"

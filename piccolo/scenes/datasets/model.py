@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...cloud.voxels import turned
+from ...geometry.point_transforms import rotate_points
 from ...geometry.pose import Array, Pose
 
 Labels = NDArray[np.uint16]  # (H, W) what each pixel shows, 0 where nobody says
@@ -57,7 +57,7 @@ class Motion:
 
     def of_points(self, points: Array) -> Array:
         """Points (N, 3) moved."""
-        return turned(points, self.R_written_from_dataset) + self.shift
+        return rotate_points(points, self.R_written_from_dataset) + self.shift
 
     def of_pose(self, pose: Pose) -> Pose:
         """The same camera, moved with the points."""

@@ -14,7 +14,7 @@ import numpy as np
 from ...cloud import open_source
 from ...cloud.ply_writer import vertex_rows, writing_ply
 from ...cloud.readers.reader import CHUNK
-from ...cloud.validation import Census, Chunk
+from ...cloud.validation import Chunk, PointValidator
 from ...errors import InputError
 from ...runtime.atomic import check_output_folder, replacing_folder
 from ...runtime.threads import Show, unseen
@@ -71,32 +71,34 @@ def _there_already(plan: Plan, folder: Path) -> Written:
 
 def _write_cloud(plan: Plan, path: Path, warnings: list[str], show: Show) -> int:
     """Stream the cloud's files into one PLY; returns how many points it has."""
-    census = Census(plan.cloud[0].path, 1.0)
+    validator = PointValidator(plan.cloud[0].path, 1.0)
     dtype = vertex_rows(*_no_points(), np.empty(0, np.int32) if plan.has_labels else None).dtype
     with writing_ply(path, dtype) as writer:
-        for (points, colors), label in _chunks(plan, census, warnings, show):
+        for (points, colors), label in _chunks(plan, validator, warnings, show):
             moved = points if plan.motion is None else plan.motion.of_points(points)
             labels = np.full(len(points), label, np.int32) if plan.has_labels else None
             writer.add(vertex_rows(moved, colors, labels))
-        census.check()
-    warnings += census.warnings()
-    return census.num_finite
+        validator.check()
+    warnings += validator.warnings()
+    return validator.num_finite
 
 
 def _no_points() -> Chunk:
     return np.empty((0, 3)), np.empty((0, 3), np.uint8)
 
 
-def _chunks(plan: Plan, census: Census, warnings: list[str], show: Show) -> Iterator[tuple[Chunk, int]]:
-    """Finite points of all files with their labels; one census counts them all, as an object may be small."""
+def _chunks(
+    plan: Plan, validator: PointValidator, warnings: list[str], show: Show
+) -> Iterator[tuple[Chunk, int]]:
+    """Finite points of all files with their labels; one validator for all, as an object may be small."""
     for part in plan.cloud:
         source = open_source(part.path)
         warnings += source.warnings
-        census.path = part.path
+        validator.path = part.path
         total = None if source.num_points is None else math.ceil(source.num_points / CHUNK)
         try:
             for raw in show(source.read_chunks(), total, f"{plan.name}: {part.path.name}"):
-                yield census.pass_on(raw), part.label
+                yield validator.filter(raw), part.label
         except OSError as error:
             text = f"{part.path}: cannot be read ({error.strerror or error}), wanted a whole file"
             raise InputError(text) from error

@@ -1,7 +1,4 @@
-"""Records of a fixed length, read as they are needed.
-
-Not by a map of the file, which a cut would turn deadly.
-"""
+"""Records of a fixed length, read as they are needed."""
 
 from collections.abc import Iterator
 from io import BufferedReader
@@ -33,3 +30,9 @@ def take_records(file: BufferedReader, path: Path, count: int, dtype: np.dtype[A
     if file.readinto(records.view(np.uint8).data) < records.nbytes:
         raise InputError(f"{path}: {CUT}")
     return records
+
+
+def in_chunks(columns: list[NDArray[Any]]) -> Iterator[list[NDArray[Any]]]:
+    """Yield arrays of the same length, raw.CHUNK or fewer rows at once."""
+    for begin in range(0, len(columns[0]), raw.CHUNK):
+        yield [column[begin : begin + raw.CHUNK] for column in columns]

@@ -1,0 +1,79 @@
+"""Files of point clouds opened: the format is chosen by a file's first bytes, then by its name."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from ..errors import InputError
+from ..runtime.threads import Show, unseen
+from .model import Cloud
+from .readers.e57 import E57
+from .readers.las import LAS
+from .readers.mesh import MESH
+from .readers.npz import NPY, NPZ
+from .readers.pcd import PCD
+from .readers.ply import PLY
+from .readers.pts import PTS
+from .readers.ptx import PTX
+from .readers.reader import HEAD_SIZE, PLAIN, CloudFormat, CloudReadOptions, PointSource
+from .readers.text import TEXT
+from .settings import IN_METRES, CloudSettings
+from .stream import CloudStream
+
+FORMATS = (PLY, LAS, E57, PCD, PTX, PTS, NPZ, NPY, MESH, TEXT)
+WANTED = f"wanted a coloured point cloud: {', '.join(f.name for f in FORMATS)}"
+
+
+def open_cloud(
+    paths: Sequence[Path], settings: CloudSettings = IN_METRES, show: Show = unseen
+) -> CloudStream:
+    """The coloured cloud in one or several files, before its points are read.
+
+    Raises
+    ------
+    InputError
+        A file is missing, has a damaged header, no colours, or is no format that is read here. Reading the
+        points raises it where the data break or fail the checks of `validation.PointValidator`.
+    """
+    options = CloudReadOptions(settings.intensity_as_gray, settings.labels, settings.scale)
+    sources = [open_source(path, options) for path in sorted(paths)]
+    return CloudStream(sources, settings.scale, show)
+
+
+def read_cloud(path: Path, settings: CloudSettings = IN_METRES) -> Cloud:
+    """The coloured cloud in a file, checked, in metres, in Morton order.
+
+    The file's coordinates are multiplied by the scale; the middle of their bounding box, rounded to whole
+    metres, becomes `origin_world` and is subtracted in float64. This is done for every cloud, so that UTM
+    coordinates and a room at the origin take the same path. InputError as by open_cloud.
+    """
+    return open_cloud([path], settings).read()
+
+
+def open_source(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+    """The points of a file in any format that is read here."""
+    try:
+        format_ = _format_of(path)
+        if options.labels and not format_.has_labels:
+            known = ", ".join(f.name for f in FORMATS if f.has_labels)
+            raise InputError(f"{path}: labels are not read from {format_.name}, wanted {known}")
+        return format_.open_source(path, options)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}), {WANTED}") from error
+
+
+def _format_of(path: Path) -> CloudFormat:
+    """The format of a file: by its first bytes, then by its name's end."""
+    if not path.exists():
+        raise InputError(f"{path}: no such file, {WANTED}")
+    if not path.is_file():
+        raise InputError(f"{path}: not a file but a folder or a device, {WANTED}")
+    with path.open("rb") as file:
+        head = file.read(HEAD_SIZE)
+    if not head:
+        raise InputError(f"{path}: the file is empty, {WANTED}")
+    suffix = path.suffix.lower()
+    by_content = [f for f in FORMATS if f.has_magic(head)]
+    by_name = [f for f in FORMATS if suffix in f.suffixes]
+    if not by_content and not by_name:
+        raise InputError(f"{path}: unknown format '{path.suffix}', {WANTED}")
+    return (by_content or by_name)[0]
