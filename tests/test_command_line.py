@@ -9,7 +9,8 @@ import pytest
 from rooms import errors, query, room
 
 from piccolo.cli import localize, prepare_map
-from piccolo.cli.options import build_parser, cloud_settings_from, parse
+from piccolo.cli.options import build_parser, cloud_settings_from
+from piccolo.cli.parser import parse
 from piccolo.cloud.settings import IN_METRES, CloudSettings
 from piccolo.coarse_to_fine.settings import EngineSettings
 from piccolo.panorama import AS_STORED

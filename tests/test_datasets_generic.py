@@ -136,7 +136,7 @@ def test_pictures_of_one_name_are_told_apart(folder, tmp_path, capsys):
         ({"axes": ""}, "found the axes None"),
         ({"direction": "up"}, "found the direction up"),
         ({"room": "../there"}, "wanted a name for a folder"),
-        ({"image": "images/none.png"}, "no such file that can be read"),
+        ({"image": "images/none.png"}, "no such panorama"),
     ],
 )
 def test_refused_rows(folder, tmp_path, capsys, change, message):

@@ -67,6 +67,6 @@ def test_refusals(dataset, tmp_path, capsys):
     (dataset / "coast" / "set 0.pts").write_text("1\n0 0 0 0 1 1 1\n")
     code, _, err = run(capsys, "mpo", dataset, tmp_path / "out2")
     assert code == 3
-    assert "wanted one cloud of this name" in err
+    assert "leave one cloud of this name" in err
     code, _, err = run(capsys, "mpo", tmp_path / "out", tmp_path / "out3")
     assert "with a picture of the same name" in err

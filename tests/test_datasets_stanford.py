@@ -144,7 +144,7 @@ def test_wrong_poses_fail_the_check_with_advice(dataset, tmp_path, capsys):
         path.write_text(json.dumps(pose))
     code, (line,), err = run(capsys, "stanford2d3ds", dataset, tmp_path / "out", "--check", 2)
     assert (code, line["fits"]) == (1, False)
-    assert "the poses don't fit the pictures" in err
+    assert "the poses don't fit the panoramas" in err
     assert "if the camera's x, y, z are z, y, -x" in err
 
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""What each part of the default engine brings: share found by variant with one part taken out at a time."""
+"""The gain of each part of the default method: recall by variant with one part removed at a time."""
 
 import argparse
 import sys
@@ -10,13 +10,14 @@ from pathlib import Path
 import _checkout  # noqa: F401
 import numpy as np
 
+from piccolo.cli.errors import run_command
+from piccolo.cli.parser import add_run_options, new_parser
 from piccolo.cloud import read_cloud
 from piccolo.cloud.model import Cloud
 from piccolo.coarse_to_fine import localize as method
 from piccolo.coarse_to_fine import query as look
 from piccolo.coarse_to_fine import scan_map
 from piccolo.coarse_to_fine.settings import EngineSettings
-from piccolo.errors import InputError
 from piccolo.geometry.pose_error import is_correct
 from piccolo.geometry.rotations import Gravity
 from piccolo.panorama import read_panorama
@@ -31,7 +32,7 @@ example:
 
 A folder has cloud.ply, queries.json and images. Gravity is unknown for the variant tilt, else known;
 correct is under 0.1 m and 5 degrees. Seconds are medians of a query.
-exit codes: 0 done, 2 wrong usage, 3 bad input.
+exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 VARIANTS = ("clean", "tilt", "photo", "change")
 VIEWS = ("MIDDLE_VIEW", "FINE_VIEW", "FINISH_VIEW")
@@ -79,36 +80,35 @@ def row(part: str, scenes: list[tuple[Scene, Cloud]]) -> str:
             if found.pose is not None and is_correct(found.pose, query.pose):
                 counts[query.variant] += 1
                 errors.append(float(np.linalg.norm(found.pose.center_world - query.pose.center_world)))
-    shares = " | ".join(f"{counts[v]}/{totals[v]}" for v in VARIANTS)
+    recall = " | ".join(f"{counts[v]}/{totals[v]}" for v in VARIANTS)
     median_mm = 1000.0 * float(np.median(errors)) if errors else float("nan")
-    return f"| {part} | {shares} | {median_mm:.1f} | {np.median(seconds):.2f} |"
+    return f"| {part} | {recall} | {median_mm:.1f} | {np.median(seconds):.2f} |"
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the table."""
+    scenes = [(scene, read_cloud(scene.cloud)) for scene in map(read_scene, arguments.scenes)]
+    print("| part | clean | tilt | photo | change | median mm | s |")
+    print("|---|---:|---:|---:|---:|---:|---:|")
+    row("all of it", scenes[:1])  # compiles
+    for part in SETTINGS:
+        print(row(part, scenes), flush=True)
+    kept = {name: getattr(look, name) for name in (*VIEWS, "SEARCH_VIEW", "SCALES")}
+    for part in ("no local normalisation", "no visibility"):
+        change_views(part)
+        print(row(part, scenes), flush=True)
+        for name, value in kept.items():
+            setattr(look, name, value)
+        scan_map.SEARCH_VIEW = kept["SEARCH_VIEW"]
+    return 0
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = new_parser("ablation", __doc__, EPILOG)
     parser.add_argument("scenes", type=Path, nargs="+", metavar="FOLDER", help="scenes with true poses")
-    arguments = parser.parse_args(argv)
-    try:
-        scenes = [(scene, read_cloud(scene.cloud)) for scene in map(read_scene, arguments.scenes)]
-        print("| part | clean | tilt | photo | change | median mm | s |")
-        print("|---|---:|---:|---:|---:|---:|---:|")
-        row("all of it", scenes[:1])  # compiles
-        for part in SETTINGS:
-            print(row(part, scenes), flush=True)
-        kept = {name: getattr(look, name) for name in (*VIEWS, "SEARCH_VIEW", "SCALES")}
-        for part in ("no local normalisation", "no visibility"):
-            change_views(part)
-            print(row(part, scenes), flush=True)
-            for name, value in kept.items():
-                setattr(look, name, value)
-            scan_map.SEARCH_VIEW = kept["SEARCH_VIEW"]
-    except (OSError, InputError) as error:
-        print(f"ablation.py: {error}", file=sys.stderr)
-        return 3
-    return 0
+    add_run_options(parser)
+    return run_command(parser, argv, run)
 
 
 if __name__ == "__main__":

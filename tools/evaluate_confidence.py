@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Try the verdict: seeded queries with and without an answer, and how often each was called localized."""
+"""Measure the status on seeded queries with and without an answer: how often each is called localized."""
 
 import argparse
 import json
@@ -11,12 +11,13 @@ from pathlib import Path
 import _checkout  # noqa: F401
 import numpy as np
 
+from piccolo.cli.errors import print_note, run_command
+from piccolo.cli.parser import add_run_options, new_parser
 from piccolo.cloud import CloudStream, read_cloud, stream_of
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.coarse_to_fine.scan_map import prepare_map
 from piccolo.coarse_to_fine.settings import EngineSettings
 from piccolo.confidence.confidence import AMBIGUOUS, LOCALIZED
-from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose
 from piccolo.geometry.pose_error import is_correct
 from piccolo.geometry.rotations import Gravity
@@ -46,12 +47,12 @@ examples:
 Seeds make rooms, and places that look the same from several positions; scenes are folders with cloud.ply,
 queries.json and images, each panorama tried in each cloud. A false answer is a pose called localized that is
 over 0.1 m or 5 degrees off. Each trial is a line {"case", "scene", "truth", "result"}; a table on stdout.
-exit codes: 0 no false answer, 1 some, 2 wrong usage, 3 bad input, 130 interrupted.
+exit codes: 0 no false answer, 1 some, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 
 
 def cloud_of(points: Points) -> CloudStream:
-    """Points as a file of them would be read."""
+    """Points as a stream, as if read from a file."""
     return stream_of(Path("trial"), RawCloud(points[0].astype(np.float64), points[1]))
 
 
@@ -95,7 +96,7 @@ def all_trials(
 
 
 def localizer_of(cloud: CloudStream, preset: str, workers: Workers) -> Callable[[Gravity], Localizer]:
-    """What prepares once and localizes with any gravity. The paper knows no `auto`: it is told `known`."""
+    """A factory of localizers that share one prepared map; for the paper `auto` becomes `known`."""
     if preset == "paper":
         paper_map = paper.prepare(cloud.read(), PaperSettings())
         return lambda gravity: PaperLocalizer(
@@ -105,7 +106,7 @@ def localizer_of(cloud: CloudStream, preset: str, workers: Workers) -> Callable[
     return lambda gravity: EngineLocalizer(scan_map, EngineSettings(gravity=gravity))
 
 
-def run(arguments: argparse.Namespace) -> Iterator[tuple[str, Trial, Result]]:
+def results_of(arguments: argparse.Namespace) -> Iterator[tuple[str, Trial, Result]]:
     """Localize every trial; the scene's name, the trial and its result."""
     workers = Workers(arguments.threads)
     for scene, cloud, trials in all_trials(arguments, workers):
@@ -143,35 +144,30 @@ def print_table(counts: dict[str, list[tuple[str, bool]]]) -> int:
     return total
 
 
+def run(arguments: argparse.Namespace) -> int:
+    """Localize every trial, write its line, print the table."""
+    counts: dict[str, list[tuple[str, bool]]] = {}
+    with arguments.out.open("w") as file:
+        for scene, trial, result in results_of(arguments):
+            ok = trial.true_pose is not None and is_correct(result.pose, trial.true_pose)
+            counts.setdefault(trial.case, []).append((result.status, ok))
+            file.write(as_line(scene, trial, result) + "\n")
+            file.flush()
+            outcome = "right" if ok else "wrong"
+            print_note(arguments, f"{scene}: {trial.case}: {result.status}, {outcome}")
+    return 1 if print_table(counts) else 0
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = new_parser("evaluate_confidence", __doc__, EPILOG)
     parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), required=True)
     parser.add_argument("--scenes", type=Path, nargs="*", default=[], metavar="FOLDER")
     parser.add_argument("--out", type=Path, required=True, help="JSON lines, written as they come")
     parser.add_argument("--preset", choices=["default", "paper"], default="default")
     parser.add_argument("--threads", type=int, default=num_cores(), metavar="N")
-    arguments = parser.parse_args(argv)
-    counts: dict[str, list[tuple[str, bool]]] = {}
-    try:
-        with arguments.out.open("w") as file:
-            for scene, trial, result in run(arguments):
-                ok = trial.true_pose is not None and is_correct(result.pose, trial.true_pose)
-                counts.setdefault(trial.case, []).append((result.status, ok))
-                file.write(as_line(scene, trial, result) + "\n")
-                file.flush()
-                print(
-                    f"{scene}: {trial.case}: {result.status}, {'right' if ok else 'wrong'}", file=sys.stderr
-                )
-    except (OSError, InputError) as error:
-        print(f"trials.py: {error}", file=sys.stderr)
-        return 3
-    except KeyboardInterrupt:
-        print("trials.py: interrupted", file=sys.stderr)
-        return 130
-    return 1 if print_table(counts) else 0
+    add_run_options(parser)
+    return run_command(parser, argv, run)
 
 
 if __name__ == "__main__":

@@ -13,20 +13,19 @@ import _checkout  # noqa: F401
 import numpy as np
 from numpy.typing import NDArray
 
-from piccolo.cli.errors import EXIT_BAD_USAGE, complain, guarded
-from piccolo.cli.progress import shown
+from piccolo.cli.errors import UsageError, checking_options, run_command
+from piccolo.cli.parser import add_run_options, new_parser
+from piccolo.cli.progress import progress_bar
 from piccolo.cloud import open_cloud, stream_of
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.confidence.confidence import check_confidence
-from piccolo.errors import InputError
 from piccolo.geometry.pose import Array, rotation_from_quaternion_wxyz
 from piccolo.gravity import MIN_CONFIDENCE
 from piccolo.gravity.alignment import find_alignment
 from piccolo.runtime.threads import Workers, num_cores
 from piccolo.scenes.synthetic.buildings import BUILDINGS, make_building
 
-PROGRAM = "gravity_trials.py"
 RIGHT, ROUGH = 0.5, 5.0  # [deg]
 THINNED = 0.04  # spacing of a scene's points, from which the search thins further [m]
 EPILOG = """\
@@ -90,9 +89,9 @@ def try_turn(points: NDArray[np.floating[Any]], R: Array) -> Answer:
     return Answer(float(np.degrees(np.arctan2(sine, up @ true_up))), finding.alignment.confidence)
 
 
-def run(arguments: argparse.Namespace) -> dict[str, list[Answer]]:
+def answers_of(arguments: argparse.Namespace) -> dict[str, list[Answer]]:
     """All answers, case by case."""
-    workers = Workers(arguments.threads, shown(arguments.quiet))
+    workers = Workers(arguments.threads, progress_bar(arguments.quiet))
     answers: dict[str, list[Answer]] = {}
     for case in cases_of(arguments):
         found = workers.each(partial(try_turn, case.points), case.rotations, case.name)
@@ -124,11 +123,18 @@ def print_table(answers: dict[str, list[Answer]], min_confidence: float) -> int:
     return total
 
 
+def run(arguments: argparse.Namespace) -> int:
+    """Try all clouds, print the table."""
+    with checking_options():
+        check_confidence(arguments.min_confidence)
+    if min(arguments.seeds) < 0 or min(arguments.turns, arguments.threads) < 1 or arguments.full < 0:
+        raise UsageError("--seeds, --turns, --full, --threads: found a negative number or no turn or thread")
+    return int(print_table(answers_of(arguments), arguments.min_confidence) > 0)
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    parser = argparse.ArgumentParser(
-        PROGRAM, description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = new_parser("evaluate_gravity", __doc__, EPILOG)
     parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), default=[0, 0])
     parser.add_argument(
         "--kinds", nargs="+", choices=BUILDINGS, default=list(BUILDINGS), help="(default all)"
@@ -138,22 +144,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--full", type=int, default=3, metavar="N", help="turns of whole scenes (default 3)")
     parser.add_argument("--min-confidence", type=float, default=MIN_CONFIDENCE, metavar="X")
     parser.add_argument("--threads", type=int, default=num_cores(), metavar="N")
-    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
-    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    arguments = parser.parse_args(argv)
-    try:
-        check_confidence(arguments.min_confidence)
-        if min(arguments.seeds) < 0 or min(arguments.turns, arguments.threads) < 1 or arguments.full < 0:
-            raise InputError(
-                "--seeds, --turns, --full, --threads: found a negative number or no turn or thread"
-            )
-    except InputError as error:
-        return complain(PROGRAM, arguments.debug, str(error), EXIT_BAD_USAGE)
-    return guarded(
-        PROGRAM,
-        arguments.debug,
-        lambda: int(print_table(run(arguments), arguments.min_confidence) > 0),
-    )
+    add_run_options(parser)
+    return run_command(parser, argv, run)
 
 
 if __name__ == "__main__":

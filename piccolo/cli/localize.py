@@ -20,18 +20,10 @@ from ..runtime.atomic import check_output, write_atomically
 from ..runtime.jit import KERNEL_FOLDER, is_first_use
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
-from .errors import EXIT_BAD_INPUT, complain, guarded, words_of
-from .options import (
-    build_parser,
-    check_arguments,
-    cloud_settings_from,
-    parse,
-    read_options_from,
-    settings_from,
-)
-from .progress import shown, warned
+from .errors import EXIT_BAD_INPUT, checking_options, format_error, print_error, run_command
+from .options import build_parser, check_arguments, cloud_settings_from, read_options_from, settings_from
+from .progress import progress_bar, warn_once
 
-PROGRAM = "localize.py"
 EXIT_ALL_LOCALIZED, EXIT_SOME_NOT = 0, 1
 
 
@@ -74,7 +66,7 @@ def open_session(
 
     watch = Stopwatch()
     cache = CachePolicy(not arguments.no_cache, arguments.cache)
-    workers = Workers(arguments.threads, shown(arguments.quiet), warned(arguments.quiet))
+    workers = Workers(arguments.threads, progress_bar(arguments.quiet), warn_once(arguments.quiet))
     inputs = Inputs(tuple(arguments.cloud), cloud_settings_from(arguments), read_options)
     localizer = open_localizer(inputs, settings, cache, workers, watch)
     for warning in localizer.warnings:  # those of a map prepared earlier; others have been written
@@ -90,16 +82,19 @@ def results_of(session: Session) -> Iterator[Result | None]:
         try:
             result = session.localize(pano)
         except (OSError, InputError) as error:
-            complain(PROGRAM, arguments.debug, words_of(error), EXIT_BAD_INPUT)
+            print_error(arguments, format_error(error), EXIT_BAD_INPUT)
             yield None
             continue
         session.say(result.summary())
         yield result
 
 
-def run(session: Session) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Localize every panorama, write the results, return the exit code."""
-    arguments, lines = session.arguments, list[str]()
+    with checking_options():
+        check_arguments(arguments)
+        settings, read_options = settings_from(arguments), read_options_from(arguments)
+    session, lines = open_session(arguments, settings, read_options), list[str]()
     is_bad = some_not = False
     for result in results_of(session):
         is_bad |= result is None
@@ -119,10 +114,4 @@ def run(session: Session) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    arguments = parse(build_parser(), argv)
-
-    def check() -> tuple[EngineSettings | PaperSettings, ReadOptions]:
-        check_arguments(arguments)
-        return settings_from(arguments), read_options_from(arguments)
-
-    return guarded(PROGRAM, arguments.debug, lambda: run(open_session(arguments, *check())), check)
+    return run_command(build_parser(), argv, run)

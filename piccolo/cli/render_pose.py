@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import sys
 from io import BytesIO
 from pathlib import Path
 
@@ -29,13 +28,14 @@ from ..panorama.resize import shrink
 from ..panorama.texels import pack_texels
 from ..pipeline import open_points
 from ..render.surfel_renderer import Picture, closed, encoded, picture_at
+from ..result import read_results
 from ..runtime.atomic import check_output, check_output_folder, replacing_folder, write_atomically
 from ..runtime.threads import Workers, num_cores
-from ..scenes.export import read_results
 from ..scenes.scene import read_scene
-from .errors import guarded
-from .options import add_cloud_options, cloud_settings_from, parse
-from .progress import shown
+from .errors import checking_options, print_note, run_command
+from .options import add_cloud_options, cloud_settings_from
+from .parser import add_run_options, new_parser
+from .progress import progress_bar
 
 EPILOG = """\
 examples:
@@ -62,12 +62,7 @@ Named = list[tuple[str, Pose]]  # poses in the world with the panorama's path
 
 def build_parser() -> argparse.ArgumentParser:
     """All options."""
-    parser = argparse.ArgumentParser(
-        "render_pose.py",
-        description=__doc__,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = new_parser("render_pose", __doc__, EPILOG)
     add_cloud_options(parser, "coloured scan, as for localize.py, or a map by tools/prepare_map.py")
     group = parser.add_argument_group("pose, one of")
     one = group.add_mutually_exclusive_group(required=True)
@@ -100,8 +95,7 @@ def build_parser() -> argparse.ArgumentParser:
     group.add_argument("--seed", type=int, default=0, help="of the directions of --shake (default 0)")
     solvers = ["adam", "lbfgs", "gauss-newton"]
     group.add_argument("--solver", choices=solvers, default=solvers[0], help="(default adam)")
-    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
-    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    add_run_options(parser)
     return parser
 
 
@@ -162,7 +156,7 @@ def poses_from(arguments: argparse.Namespace) -> Named:
     if arguments.queries:
         found = [(name, query.pose) for name, query in read_scene(file).by_name.items()]
     else:
-        found = [(r.pano, r.pose) for r in read_results(file) if r.pose is not None]
+        found = [(r.pano, r.pose) for r in read_results([file]) if r.pose is not None]
     if arguments.pano:
         found = [(name, pose) for name, pose in found if Path(name).name == Path(arguments.pano).name]
     wanted = f"that of {arguments.pano}" if arguments.pano else "one or more"
@@ -252,13 +246,15 @@ def animate(arguments: argparse.Namespace, placed: LocalCloud, poses: Named, wor
 
 def run(arguments: argparse.Namespace) -> int:
     """Read, draw, write."""
+    with checking_options():
+        check_usage(arguments)
     check_files(arguments)
     poses = poses_from(arguments)
 
-    workers = Workers(num_cores(), shown(arguments.quiet))
+    workers = Workers(num_cores(), progress_bar(arguments.quiet))
     placed = open_points(arguments.cloud, cloud_settings_from(arguments), workers)
-    for warning in () if arguments.quiet else placed.warnings:
-        print(f"render_pose.py: warning: {warning}", file=sys.stderr)
+    for warning in placed.warnings:
+        print_note(arguments, f"warning: {warning}")
     if arguments.out:
         draw_pictures(arguments, placed, poses, workers)
     if arguments.animate:
@@ -268,5 +264,4 @@ def run(arguments: argparse.Namespace) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    arguments = parse(build_parser(), argv)
-    return guarded("render_pose.py", arguments.debug, lambda: run(arguments), lambda: check_usage(arguments))
+    return run_command(build_parser(), argv, run)

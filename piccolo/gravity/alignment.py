@@ -11,7 +11,8 @@ from ..cloud import CloudStream
 from ..cloud.octree import build_octree
 from ..cloud.settings import UpAxis
 from ..errors import InputError
-from ..geometry.pose import Array, Pose, orthonormal
+from ..geometry.pose import Array, Pose, checked_rotation, orthonormal
+from ..runtime.json_file import read_json
 from . import (
     Plane,
     Up,
@@ -135,12 +136,7 @@ def _about(origin: Array, R: Array) -> Array:
 
 def read_alignment(path: Path) -> Alignment:
     """The alignment in a file by Alignment.to_json; InputError if it is not one."""
-    if path.is_file() and path.stat().st_size > MAX_FILE_SIZE:
-        raise InputError(f"{path}: found {path.stat().st_size} bytes, wanted a transform by align_gravity.py")
-    try:
-        document = json.loads(path.read_bytes())
-    except (ValueError, RecursionError) as error:  # broken JSON or UTF-8, or brackets without end
-        raise InputError(f"{path}: found no JSON, wanted a transform by align_gravity.py") from error
+    document = read_json(path, "wanted a transform by align_gravity.py", MAX_FILE_SIZE)
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise InputError(f"{path}: found no format {FORMAT!r}, wanted a transform by align_gravity.py")
     T = _rigid(path, document.get("T_aligned_from_scan"))
@@ -176,10 +172,7 @@ def _rigid(path: Path, rows: object) -> Array:
         T = np.array(rows, dtype=np.float64)
     except OverflowError as error:
         raise InputError(f"{path}: T_aligned_from_scan has a number beyond float64") from error
-    R = T[:3, :3]
-    is_rigid = np.isfinite(T).all() and np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]) and np.abs(R).max() <= 2.0
-    if not is_rigid or np.abs(R @ R.T - np.eye(3)).max() > ROUNDING or np.linalg.det(R) < 0.0:
-        raise InputError(
-            f"{path}: T_aligned_from_scan is no rotation and translation, wanted a rigid transform"
-        )
+    if not (np.isfinite(T).all() and np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0])):
+        raise InputError(f"{path}: T_aligned_from_scan is not finite, or its last row is not 0 0 0 1")
+    checked_rotation(T[:3, :3], ROUNDING, f"{path}: the matrix in T_aligned_from_scan")
     return T

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.pose import Array, Pose
+from ...runtime.json_file import read_json
 from .labels import labels_by_index
-from .model import CloudPart, Listing, Motion, Plan, Request, Shot
-from .poses import checked_pose, read_json
+from .model import CloudPart, ConvertOptions, PosedPanorama, RigidTransform, SceneList, SceneSpec
+from .poses import checked_pose
 
 NAME = "stanford2d3ds"
 # As most users of S3DIS number them, less one: theirs begin at 0. Other names, <UNK> among them, are 0.
@@ -39,7 +40,9 @@ AREA = re.compile(r"area_(\d)([ab]?)$")
 PICTURE = re.compile(r"camera_[0-9a-zA-Z]+_([A-Za-z]+_\d+)_frame_equirectangular_domain_rgb\.png$")
 # The poses of area 5b are in a frame of their own. Nobody gives the transform to the frame of the clouds but
 # DeepViewAgg (Robert et al., CVPR 2022), calibrated by hand: good to a centimetre or so.
-AREA_5B = Motion(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([-4.10, 6.25, 0.0]))
+AREA_5B = RigidTransform(
+    np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([-4.10, 6.25, 0.0])
+)
 WANTED_POSE = "wanted JSON with camera_location and final_camera_rotation"
 
 
@@ -53,26 +56,26 @@ class Picture:
     semantic: Path
 
 
-def listing(request: Request) -> Listing:
+def list_scenes(options: ConvertOptions) -> SceneList:
     """The rooms for which there are panoramas and a cloud."""
-    table = _read_table(request.folder) if request.labels else None
-    plans, missing = [], []
-    for (area, room), pictures in sorted(_pictures(request.folder).items()):
-        if request.areas and area not in request.areas:
+    table = _read_table(options.folder) if options.labels else None
+    specs, missing = [], []
+    for (area, room), pictures in sorted(_pictures(options.folder).items()):
+        if options.areas and area not in options.areas:
             continue
         name = f"area_{area}/{room}"
-        parts = _cloud_of(request.folder, area, room, request.labels)
+        parts = _cloud_of(options.folder, area, room, options.labels)
         if parts:
-            plans.append(_plan(name, parts, pictures, table))
+            specs.append(_scene_spec(name, parts, pictures, table))
         else:
             missing.append(name)
-    if not plans:
+    if not specs:
         raise InputError(
-            f"{request.folder}: found no room with panoramas ({PANORAMAS[0]}) and a cloud ({CLOUDS[0]}, for "
+            f"{options.folder}: found no room with panoramas ({PANORAMAS[0]}) and a cloud ({CLOUDS[0]}, for "
             "labels Annotations beside it), wanted the layout in docs/DATASETS.md"
         )
     notes = (f"{len(missing)} rooms without a cloud: {', '.join(missing)}",) if missing else ()
-    return Listing(tuple(plans), notes)
+    return SceneList(tuple(specs), notes)
 
 
 def _pictures(folder: Path) -> dict[tuple[str, str], list[Picture]]:
@@ -113,22 +116,25 @@ def _cloud_of(folder: Path, area: str, room: str, has_labels: bool) -> tuple[Clo
     return tuple(CloudPart(path, NUMBERS.get(path.name.split("_")[0], 0)) for path in objects)
 
 
-def _plan(
+def _scene_spec(
     name: str, parts: tuple[CloudPart, ...], pictures: list[Picture], table: NDArray[np.uint16] | None
-) -> Plan:
-    def read_shots() -> list[Shot]:
-        return [_shot(picture, table) for picture in pictures]
-
+) -> SceneSpec:
     source: dict[str, object] = {"dataset": NAME, "labels": table is not None}
     if table is not None:
         source["label_names"] = ["unknown", *CLASSES]
-    return Plan(name, parts, read_shots, has_labels=table is not None, source=source)
+    return SceneSpec(
+        name,
+        parts,
+        lambda: [_posed_panorama(picture, table) for picture in pictures],
+        has_labels=table is not None,
+        source=source,
+    )
 
 
-def _shot(picture: Picture, table: NDArray[np.uint16] | None) -> Shot:
+def _posed_panorama(picture: Picture, table: NDArray[np.uint16] | None) -> PosedPanorama:
     name = picture.path.name
     read_labels = None if table is None else partial(labels_by_index, picture.semantic, table)
-    return Shot(name, {name: picture.path}, f"area_{picture.part}", _read_pose(picture), read_labels)
+    return PosedPanorama(name, {name: picture.path}, f"area_{picture.part}", _read_pose(picture), read_labels)
 
 
 def _read_pose(picture: Picture) -> Pose:

@@ -13,11 +13,11 @@ from .model import Format, Options
 from .nerfstudio import NERFSTUDIO
 from .opensfm import OPENSFM
 from .potree import POTREE
-from .shots import Selection, read_results, select, shots_of, true_results
+from .shots import Selection, select, shots_of, true_results
 from .table import CSV
 from .trajectory import KITTI, TUM
 
-__all__ = ["FORMATS", "Format", "Options", "Selection", "export", "read_results", "select", "true_results"]
+__all__ = ["FORMATS", "Format", "Options", "Selection", "export", "select", "true_results"]
 
 FORMATS: dict[str, Format] = {
     f.name: f for f in (COLMAP, NERFSTUDIO, OPENSFM, TUM, KITTI, CSV, GEOJSON, POTREE, GPANO)
