@@ -76,7 +76,7 @@ def test_ignored_labels_stand_in_the_result_and_everything_ignored_is_refused(sc
 
 def test_wrong_use_of_labels_is_refused(scene, capsys):
     for options, expected, told in (
-        (["--ignore-labels", "3"], 2, "--ignore-labels: found without --labels, wanted both"),
+        (["--ignore-labels", "3"], 2, "--ignore-labels: only with --labels"),
         (["--labels", "--intensity-as-gray"], 2, "--labels, --intensity-as-gray: found both"),
         (["--labels", "--fov", "90"], 2, "--labels: found --fov or --cube-order too"),
     ):

@@ -2,7 +2,6 @@
 """The gain of each part of the default method: recall by variant with one part removed at a time."""
 
 import argparse
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +31,6 @@ example:
 
 A folder has cloud.ply, queries.json and images. Gravity is unknown for the variant tilt, else known;
 correct is under 0.1 m and 5 degrees. Seconds are medians of a query.
-exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 VARIANTS = ("clean", "tilt", "photo", "change")
 VIEWS = ("MIDDLE_VIEW", "FINE_VIEW", "FINISH_VIEW")
@@ -112,4 +110,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

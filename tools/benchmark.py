@@ -2,7 +2,6 @@
 """Kernel speed against named references, as ratios within one run."""
 
 import argparse
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,7 +31,6 @@ examples:
 
 Every kernel is timed once in each round, so that a disturbance hits all; ratios are of the medians.
 The reference is cv2.remap: 8-bit, 3 channels, bilinear, one thread, a coherent map, a pixel a point.
-exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 
 
@@ -148,4 +146,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

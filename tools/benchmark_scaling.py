@@ -4,7 +4,6 @@
 import argparse
 import multiprocessing
 import resource
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -40,7 +39,6 @@ examples:
 --scene: a folder with cloud.ply, queries.json and images; more points than it has are made by repeating it
 with 5 mm noise, fewer by leaving some out. --rooms: rooms of tools/make_room.py, 50,000 points each.
 Each row is measured in a process of its own; queries are the first six clean ones, gravity known and unknown.
-exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 NUM_QUERIES = 6
 GRAVITIES: tuple[Gravity, ...] = ("known", "unknown")
@@ -149,4 +147,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

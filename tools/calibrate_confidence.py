@@ -3,7 +3,6 @@
 
 import argparse
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -42,7 +41,6 @@ examples:
 Files are those of tools/evaluate_confidence.py. The weights printed go into
 piccolo/confidence/confidence.py; the tables show how reliable the
 confidence in use is on each set, and the fraction of true poses in the region of the covariance.
-exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 PENALTY = 0.05  # on squared weights of features of deviation 1: without, easy trials ask for ever larger ones
 LEVELS = (0.0, 0.5, 0.9, 0.99, 1.01)
@@ -174,4 +172,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

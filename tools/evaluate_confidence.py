@@ -3,7 +3,6 @@
 
 import argparse
 import json
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
@@ -47,7 +46,6 @@ examples:
 Seeds make rooms, and places that look the same from several positions; scenes are folders with cloud.ply,
 queries.json and images, each panorama tried in each cloud. A false answer is a pose called localized that is
 over 0.1 m or 5 degrees off. Each trial is a line {"case", "scene", "truth", "result"}; a table on stdout.
-exit codes: 0 no false answer, 1 some, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 
 
@@ -160,7 +158,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    parser = new_parser("evaluate_confidence", __doc__, EPILOG)
+    parser = new_parser("evaluate_confidence", __doc__, EPILOG, "0 no false answer, 1 some")
     parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), required=True)
     parser.add_argument("--scenes", type=Path, nargs="*", default=[], metavar="FOLDER")
     parser.add_argument("--out", type=Path, required=True, help="JSON lines, written as they come")
@@ -171,4 +169,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -2,7 +2,6 @@
 """Try the search for up: clouds turned at random, how far the answers are off, and how sure they were."""
 
 import argparse
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -38,7 +37,6 @@ Each cloud is turned by --turns seeded rotations, uniform over all, and goes the
 Seeds make places of each kind; scenes are folders with a cloud.ply whose z is up, thinned to 4 cm once, but
 for the first --full turns. A Markdown table on stdout: right is within 0.5 degrees, rough within 5; accepted
 is a confidence of --min-confidence or more.
-exit codes: 0 no wrong answer was accepted, 1 some were, 2 wrong usage, 3 bad input, 130 interrupted.
 """
 
 
@@ -134,7 +132,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    parser = new_parser("evaluate_gravity", __doc__, EPILOG)
+    parser = new_parser("evaluate_gravity", __doc__, EPILOG, "0 no wrong answer was accepted, 1 some were")
     parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), default=[0, 0])
     parser.add_argument(
         "--kinds", nargs="+", choices=BUILDINGS, default=list(BUILDINGS), help="(default all)"
@@ -149,4 +147,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

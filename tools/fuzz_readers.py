@@ -30,7 +30,6 @@ examples:
 Each reader gets the files of --corpus that end as its formats do, or one of a few bytes, and mutations of
 them. A good result or an InputError is right; anything else, over 20 s or over 2 GB is a finding: the file
 is kept in --crashes, named after its reader. atheris: pip install atheris.
-exit codes: 0 nothing found, 1 something, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 TIMEOUT_S, MEMORY_MB, MAX_SIZE = 20, 2048, 1 << 16
 
@@ -127,7 +126,7 @@ def main(argv: list[str] | None = None) -> int:
     words = sys.argv[1:] if argv is None else argv
     if words[:1] == ["--inside"]:
         fuzz(words[1], words[2:])
-    parser = new_parser("fuzz_readers", __doc__, EPILOG)
+    parser = new_parser("fuzz_readers", __doc__, EPILOG, "0 nothing found, 1 something")
     parser.add_argument("--reader", choices=list(READERS), nargs="+", default=list(READERS))
     parser.add_argument("--seconds", type=int, default=60, help="for each reader (default 60)")
     parser.add_argument("--seed", type=int, default=1, help="(default 1)")
@@ -138,4 +137,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

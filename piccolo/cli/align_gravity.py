@@ -39,13 +39,12 @@ faces, its normals are turned; other formats and several files become x y z and 
 One JSON object on stdout: status, up, yaw, planes, transform. Without --out nothing else is written.
 Nothing is written either where the confidence is below --min-confidence (default {MIN_CONFIDENCE}): a room
 without furniture may be upside down, steep roofs and stairs mislead. --up says what you know.
-exit codes: 0 done, 1 not sure enough, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 
 
 def build_parser() -> argparse.ArgumentParser:
     """All options."""
-    parser = new_parser("align_gravity", __doc__, EPILOG)
+    parser = new_parser("align_gravity", __doc__, EPILOG, "0 done, 1 not sure enough")
     add_cloud_options(parser, "coloured scan, as for localize.py")
     files = parser.add_argument_group("files")
     files.add_argument("--out", type=Path, metavar="FILE", help="the turned cloud, a PLY file")

@@ -32,15 +32,18 @@ Writes OUT/SCENE/cloud.ply, images/ (links to the dataset's own, or copies), lab
 they hold, and how each dataset's folders and poses are understood, is in docs/DATASETS.md. A scene that is
 there already is left as it is. A scene with a damaged file is left out and named on stderr, and the others go
 on. One JSON object a scene on stdout.
-exit codes: 0 done, 1 --check found poses that don't fit the panoramas, 2 wrong usage, 3 bad input, 4 internal
-error, 130 interrupted.
 """
 
 
 def build_parser() -> argparse.ArgumentParser:
     """All options; those that one dataset alone has are in its own subparser."""
     description = "\n".join(f"  {name:<14} {dataset.description}" for name, dataset in DATASETS.items())
-    parser = new_parser("convert_dataset", __doc__, EPILOG.format(datasets=description))
+    parser = new_parser(
+        "convert_dataset",
+        __doc__,
+        EPILOG.format(datasets=description),
+        "0 done, 1 --check found poses that don't fit the panoramas",
+    )
     subparsers = parser.add_subparsers(dest="dataset", required=True, metavar="DATASET")
     for name, dataset in DATASETS.items():
         subparser = subparsers.add_parser(

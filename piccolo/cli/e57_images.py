@@ -19,7 +19,6 @@ example:
 
 is_usable: the image is spherical, as localize.py needs it; fov_deg is 360 for a full sphere.
 pose: x_world = R_world_from_image @ x_image + center_world, as the file has it.
-exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 SUFFIX = {"jpeg": ".jpg", "png": ".png"}
 

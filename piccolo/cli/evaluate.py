@@ -42,7 +42,7 @@ Scenes are folders with a queries.json, a cloud and images, at any depth below -
 --out runs the queries that it does not have yet, and appends a line for each as it comes: give the same
 command again to take up a run that was stopped. --results are lines of localize.py instead; each belongs to
 the query of the same path, or else of the same file name. Tables are Markdown, on stdout.
-exit codes: 0 done, 2 wrong usage, 3 bad input (the rest of a run is done), 4 internal error, 130 interrupted.
+Queries that can't be read are named on stderr, and the rest is done before exit code 3.
 """
 
 

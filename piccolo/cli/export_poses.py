@@ -29,7 +29,6 @@ examples:
 
 Results that are not localized are left out and counted on stderr. docs/CONVENTIONS.md has axes and angles.
 A file at --out is replaced. One JSON object on stdout.
-exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 OPTIONS = ("size", "offset", "axes", "timestamps", "crs")  # those that only some formats take
 

@@ -39,7 +39,6 @@ cloud are computed too, and drawn pale; the lowest place and the minima are of t
 NPZ, in the world's axes turned so that z is up (R_plan_from_world, identity for clouds with z up): x (nx,)
 and y (ny,) [m]; loss, height, is_free (ny, nx); R_cam_from_world (ny, nx, 3, 3) of the best pose; found_world
 and true_world (3,), NaN where not known. One JSON object on stdout.
-exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 MAX_CELLS = 1_000_000
 HEIGHTS_ABOUT = (-0.15, 0.0, 0.15)  # [m] of the known one

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from ..cloud.ply_writer import vertex_rows, write_ply
 from ..runtime.atomic import write_atomically
 from ..runtime.threads import Workers, num_cores
 from ..scenes import scene as scenes
+from ..scenes.datasets.labels import write_labels
 from ..scenes.synthetic.world import (
     VARIANTS,
     Query,
@@ -38,7 +38,6 @@ Writes FOLDER/cloud.ply, FOLDER/images/VARIANT_K.jpg and FOLDER/queries.json wit
 clean: as scanned; tilt: the camera in any orientation; photo: other exposure, white balance, gamma, blur
 and noise; change: furniture moved and added. With --labels the points have a label too, and each panorama
 a picture of labels, FOLDER/labels/VARIANT_K.png. One JSON object a scene on stdout.
-exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 
 
@@ -72,15 +71,6 @@ def write_query(folder: Path, name: str, query: Query) -> scenes.Query:
     return scenes.Query(image, query.variant, query.pose)
 
 
-def write_labels(folder: Path, name: str, labels: NDArray[np.uint16]) -> Path:
-    """Write an image of labels (H, W) and return its path."""
-    image = folder / "labels" / f"{name}.png"
-    image.parent.mkdir(exist_ok=True)
-    _, encoded = cv2.imencode(".png", labels)
-    write_atomically(image, bytes(encoded))
-    return image
-
-
 def write_world(
     arguments: argparse.Namespace, world: World, folder: Path, workers: Workers
 ) -> dict[str, object]:
@@ -95,8 +85,10 @@ def write_world(
             query = make_query(world, k, v, arguments.width, workers)
             written = write_query(folder, f"{v}_{k}", query)
             if arguments.labels:
-                labels_path = write_labels(folder, f"{v}_{k}", make_labels(world, k, query, workers))
-                written = replace(written, labels=labels_path)
+                path = folder / "labels" / f"{v}_{k}.png"
+                path.parent.mkdir(exist_ok=True)
+                write_labels(path, make_labels(world, k, query, workers))
+                written = replace(written, labels=path)
             queries.append(written)
     scenes.write_queries(folder, queries)
     return {"folder": str(folder), "points": len(points), "queries": len(queries), "seed": world.seed}

@@ -25,7 +25,6 @@ examples:
 
 output: one JSON object a panorama, one a line, in the order given; messages and progress go to stderr.
 --help-paper shows the options of the preset paper.
-exit codes: 0 all localized, 1 some not, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 # Settings that only one preset has, each with an option of its name: option, metavar, type or choices, help.
 Option = tuple[str, str | None, type | tuple[str, ...], str]
@@ -57,7 +56,7 @@ PRIORS = ("near", "radius", "height", "heading", "heading_tolerance")
 
 def build_parser() -> argparse.ArgumentParser:
     """All options. A setting that is not given stays None, and keeps its preset's default."""
-    parser = new_parser("localize", DESCRIPTION, EPILOG)
+    parser = new_parser("localize", DESCRIPTION, EPILOG, "0 all localized, 1 some not")
     parser.add_argument("--version", action="version", version=f"piccolo {__version__}")
     text = "coloured scan in any format of the README, one file or several; or a map by tools/prepare_map.py"
     add_cloud_options(parser, text)

@@ -28,9 +28,15 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
         return as_started(super().format_help())
 
 
-def new_parser(name: str, description: str | None, epilog: str) -> argparse.ArgumentParser:
-    """A parser of the command `name` without options; run_command wants those of add_run_options too."""
+def new_parser(
+    name: str, description: str | None, epilog: str, exit_codes: str = "0 done"
+) -> argparse.ArgumentParser:
+    """A parser of the command `name` without options; run_command needs those of add_run_options too.
+
+    `exit_codes` are those of the command itself, below 2.
+    """
     program = as_started(f"{name}.py")
+    epilog += f"exit codes: {exit_codes}, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted."
     parser = argparse.ArgumentParser(
         program, description=description, epilog=epilog, formatter_class=HelpFormatter
     )

@@ -21,7 +21,6 @@ example:
 
 localize.py prepares and caches a map by itself; this tool is for maps that are copied, or made beforehand.
 One JSON object on stdout describes the map.
-exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 
 

@@ -50,7 +50,6 @@ its nearest neighbours; what no disc covers is a hole. --depth: range along the 
 0 where nothing is seen, 65535 for 65.535 m and farther. NPY: float32, metres, inf where nothing is seen.
 --mask-out: white where nothing is seen, as --mask of localize.py takes it.
 One JSON object a picture on stdout.
-exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 MAX_WIDTH, MIN_WIDTH = 32_768, 16
 MAGENTA = (255, 0, 255)  # a colour that scans do not have

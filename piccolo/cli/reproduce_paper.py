@@ -37,7 +37,6 @@ experiments:
 
 Writes OUT/NAME.md, OUT/NAME.png and OUT/NAME/CONDITION_PRESET.jsonl, runs that tools/evaluate.py compares.
 The same command resumes an experiment that was stopped. Changed clouds and images are temporary.
-exit codes: 0 done, 2 wrong usage, 3 bad input (the rest is done), 4 internal error, 130 interrupted.
 """
 PRESETS = ("paper", "default")
 

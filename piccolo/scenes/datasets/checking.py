@@ -1,11 +1,11 @@
 """Checks that the poses of a scene fit its panoramas, and finds the convention that fits better if not."""
 
-import itertools
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ...cloud import open_cloud
 from ...cloud.octree import build_octree
@@ -115,15 +115,9 @@ def convention_variants(pose: Pose, origin: Array) -> dict[str, Pose]:
     return poses
 
 
-def axis_rotations() -> list[Array]:
-    """The 24 rotations (3, 3) that take axes to axes, one of them the identity."""
-    turns = []
-    for order in itertools.permutations(range(3)):
-        for signs in itertools.product((1.0, -1.0), repeat=3):
-            turn = np.diag(signs) @ np.eye(3)[list(order)]
-            if np.linalg.det(turn) > 0.0:
-                turns.append(turn)
-    return turns
+def axis_rotations() -> Array:
+    """The 24 rotations (24, 3, 3) that take axes to axes, one of them the identity."""
+    return np.asarray(np.round(Rotation.create_group("O").as_matrix()))
 
 
 def describe_axes(turn: Array) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 from ...errors import InputError
 from ...runtime.json_file import read_json
 from .clouds import only_cloud_in
-from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec
+from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec, scene_list
 from .poses import WORLD_FROM_CAM, pose_of_transform
 
 NAME = "360loc"
@@ -21,14 +21,9 @@ def list_scenes(options: ConvertOptions) -> SceneList:
     folders = [path for path in below if (path / QUERIES).is_dir()]
     clouds = {folder: only_cloud_in(folder) for folder in folders}
     specs = [_scene_spec(folder, cloud) for folder, cloud in clouds.items() if cloud]
-    if not specs:
-        raise InputError(
-            f"{options.folder}: found no scene with {QUERIES}/SEQUENCE/{POSES} and a coloured cloud beside "
-            f"{QUERIES}, wanted the layout in docs/DATASETS.md"
-        )
     missing = [folder.name for folder, cloud in clouds.items() if not cloud]
-    notes = (f"{len(missing)} scenes without a cloud: {', '.join(missing)}",) if missing else ()
-    return SceneList(tuple(specs), notes)
+    layout = f"scene with {QUERIES}/SEQUENCE/{POSES} and a coloured cloud beside {QUERIES}"
+    return scene_list(options.folder, specs, missing, layout)
 
 
 def _scene_spec(folder: Path, cloud: Path) -> SceneSpec:

@@ -2,12 +2,12 @@
 
 import re
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from ...errors import InputError
-from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec
+from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec, scene_list
 from .poses import WORLD_FROM_CAM, pose_of_transform, read_matrix
 
 NAME = "matterport3d"
@@ -26,21 +26,19 @@ def list_scenes(options: ConvertOptions) -> SceneList:
     """The houses with skyboxes, poses and a mesh."""
     patterns = ["*/" * depth + SKYBOXES for depth in range(MAX_DEPTH)]
     folders = [path.parent for pattern in patterns for path in sorted(options.folder.glob(pattern))]
-    specs, notes = [], []
+    specs, notes, missing = [], [], []
     for folder in folders:
         meshes = next((found for pattern in MESHES if (found := sorted(folder.glob(pattern)))), [])
         if not meshes:
-            notes.append(f"{folder}: no mesh")
+            missing.append(str(folder))
             continue
         faces = _faces_in(folder / SKYBOXES)
         posed = {place: files for place, files in faces.items() if _is_whole(folder, place, files)}
         if len(posed) < len(faces):
             notes.append(f"{folder}: {len(faces) - len(posed)} skyboxes without a pose or without six faces")
         specs.append(_scene_spec(folder, meshes, posed))
-    if not specs:
-        wanted = "wanted the layout in docs/DATASETS.md"
-        raise InputError(f"{options.folder}: found no HOUSE/{SKYBOXES} with a mesh, {wanted}")
-    return SceneList(tuple(specs), tuple(notes))
+    listed = scene_list(options.folder, specs, missing, f"HOUSE/{SKYBOXES} with a mesh")
+    return replace(listed, notes=(*listed.notes, *notes))
 
 
 def _faces_in(folder: Path) -> dict[str, dict[str, Path]]:

@@ -1,6 +1,6 @@
 """The scenes that are found in a dataset, before they are written."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...cloud.voxels import turned
+from ...errors import InputError
 from ...geometry.pose import Array, Pose
 
 Labels = NDArray[np.uint16]  # (H, W) the class of each pixel, 0 where unknown
@@ -83,3 +84,11 @@ class SceneList:
 
     specs: tuple[SceneSpec, ...]
     notes: tuple[str, ...] = ()  # one line each, for the user: what is passed over
+
+
+def scene_list(folder: Path, specs: Sequence[SceneSpec], missing: Sequence[str], layout: str) -> SceneList:
+    """The scenes found in a folder, and a note on those that miss a cloud; InputError if none is found."""
+    if not specs:
+        raise InputError(f"{folder}: found no {layout}, wanted the layout in docs/DATASETS.md")
+    notes = (f"{len(missing)} scenes without a cloud: {', '.join(missing)}",) if missing else ()
+    return SceneList(tuple(specs), notes)

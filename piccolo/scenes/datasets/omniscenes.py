@@ -4,8 +4,7 @@ import re
 from collections import defaultdict
 from pathlib import Path
 
-from ...errors import InputError
-from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec
+from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec, scene_list
 from .poses import checked_pose, read_matrix
 
 NAME = "omniscenes"
@@ -23,20 +22,14 @@ def list_scenes(options: ConvertOptions) -> SceneList:
                 files = sorted(path for path in sequence.iterdir() if path.suffix.lower() in SUFFIXES)
                 pictures[split.parent / "pcd" / f"{match[1]}.txt", match[1]] += files
     specs = [_scene_spec(room, cloud, files) for (cloud, room), files in pictures.items() if cloud.exists()]
-    if not specs:
-        raise InputError(
-            f"{options.folder}: found no SPLIT_pano/HOW_ROOM_N_scene_K with a cloud pcd/ROOM_N.txt, wanted "
-            "the layout in docs/DATASETS.md"
-        )
     missing = sorted(str(cloud) for cloud, _ in pictures if not cloud.exists())
-    notes = (f"{len(missing)} rooms without a cloud: {', '.join(missing)}",) if missing else ()
-    return SceneList(tuple(sorted(specs, key=lambda spec: spec.name)), notes)
+    layout = "SPLIT_pano/HOW_ROOM_N_scene_K with a cloud pcd/ROOM_N.txt"
+    return scene_list(options.folder, sorted(specs, key=lambda spec: spec.name), missing, layout)
 
 
 def _scene_spec(room: str, cloud: Path, pictures: list[Path]) -> SceneSpec:
-    return SceneSpec(
-        room, (CloudPart(cloud),), lambda: list(map(_posed_panorama, pictures)), source={"dataset": NAME}
-    )
+    parts = (CloudPart(cloud),)
+    return SceneSpec(room, parts, lambda: list(map(_posed_panorama, pictures)), source={"dataset": NAME})
 
 
 def _posed_panorama(path: Path) -> PosedPanorama:

@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ...errors import InputError
 from ...geometry.pose import Array, Pose
 from ...runtime.json_file import read_json
 from .labels import labels_by_index
-from .model import CloudPart, ConvertOptions, PosedPanorama, RigidTransform, SceneList, SceneSpec
+from .model import CloudPart, ConvertOptions, PosedPanorama, RigidTransform, SceneList, SceneSpec, scene_list
 from .poses import checked_pose
 
 NAME = "stanford2d3ds"
@@ -69,13 +70,8 @@ def list_scenes(options: ConvertOptions) -> SceneList:
             specs.append(_scene_spec(name, parts, pictures, table))
         else:
             missing.append(name)
-    if not specs:
-        raise InputError(
-            f"{options.folder}: found no room with panoramas ({PANORAMAS[0]}) and a cloud ({CLOUDS[0]}, for "
-            "labels Annotations beside it), wanted the layout in docs/DATASETS.md"
-        )
-    notes = (f"{len(missing)} rooms without a cloud: {', '.join(missing)}",) if missing else ()
-    return SceneList(tuple(specs), notes)
+    layout = f"room with panoramas ({PANORAMAS[0]}) and a cloud ({CLOUDS[0]}, with --labels Annotations)"
+    return scene_list(options.folder, specs, missing, layout)
 
 
 def _pictures(folder: Path) -> dict[tuple[str, str], list[Picture]]:
@@ -145,7 +141,7 @@ def _read_pose(picture: Picture) -> Pose:
     document = read_json(picture.pose, WANTED_POSE)
     angles = _three(picture.pose, document, "final_camera_rotation")
     center_world = _three(picture.pose, document, "camera_location")
-    R_world_from_opengl = rotation_from_euler_xyz(angles)
+    R_world_from_opengl = Rotation.from_euler("xyz", angles).as_matrix()  # about fixed axes, x first
     pose = checked_pose(str(picture.pose), R_world_from_opengl.T, center_world, "opengl")
     return AREA_5B.of_pose(pose) if picture.part == "5b" else pose
 
@@ -158,15 +154,6 @@ def _three(path: Path, document: Any, name: str) -> Array:
     if values.shape != (3,):
         raise InputError(f"{path}: {name} has the shape {values.shape}, wanted three numbers")
     return values
-
-
-def rotation_from_euler_xyz(angles: Array) -> Array:
-    """R_z(c) R_y(b) R_x(a) (3, 3) of angles (a, b, c) [rad]: about x first, all about fixed axes."""
-    (ca, cb, cc), (sa, sb, sc) = np.cos(angles), np.sin(angles)
-    R_x = np.array([[1.0, 0.0, 0.0], [0.0, ca, -sa], [0.0, sa, ca]])
-    R_y = np.array([[cb, 0.0, sb], [0.0, 1.0, 0.0], [-sb, 0.0, cb]])
-    R_z = np.array([[cc, -sc, 0.0], [sc, cc, 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray(R_z @ R_y @ R_x)
 
 
 def _read_table(folder: Path) -> NDArray[np.uint16]:
