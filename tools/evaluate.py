@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Localize the panoramas of scenes with true poses, and tell how good the poses are."""
+"""Localize the panoramas of scenes with true poses, and measure how good the poses are."""
 
 import _checkout  # noqa: F401
 

@@ -1,4 +1,4 @@
-"""Localize the panoramas of scenes with true poses, and tell how good the poses are."""
+"""Localize the panoramas of scenes with true poses, and measure how good the poses are."""
 
 import argparse
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ examples:
 
 Scenes are folders with a queries.json, a cloud and images, at any depth below --scenes (docs/DATASETS.md).
 --out runs the queries that it does not have yet, and appends a line for each as it comes: give the same
-command again to take up a run that was stopped. --results are lines of localize.py instead; each belongs to
+command again to resume a run that was stopped. --results are lines of localize.py instead; each belongs to
 the query of the same path, or else of the same file name. Tables are Markdown, on stdout.
 Queries that can't be read are named on stderr, and the rest is done before exit code 3.
 """
@@ -171,7 +171,7 @@ def run(arguments: argparse.Namespace) -> int:
         rows = list(match_results(scenes, read_results([arguments.results])))
     else:
         found = open_run(arguments.out, config, scenes, arguments.variants)
-        rows, num_failed = found.finish(
+        rows, num_failed = found.resume(
             arguments.jobs,
             progress_bar(arguments.quiet),
             lambda text: print_error(arguments, text, EXIT_BAD_INPUT),

@@ -103,7 +103,7 @@ def run_condition(
         config = RunConfig(condition.settings, *reading, cache, max(1, num_cores() // arguments.jobs))
         variants = chosen_variants(condition, arguments.variants)
         run = open_run(out / file_name(condition), config, transformed, variants)
-        rows, num_failed_later = run.finish(arguments.jobs, progress_bar(arguments.quiet), report)
+        rows, num_failed_later = run.resume(arguments.jobs, progress_bar(arguments.quiet), report)
     return rows, num_failed + num_failed_later
 
 

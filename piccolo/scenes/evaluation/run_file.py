@@ -11,7 +11,7 @@ from ...errors import InputError
 from ...pipeline import Inputs, settings_json
 from ...runtime.atomic import check_output
 from ...runtime.json_file import parse_lines, read_bytes
-from ...runtime.threads import Show, unseen
+from ...runtime.threads import Show
 from ..scene import QUERIES_NAME, Query, Scene
 from .query_result import FORMAT, QueryResult, query_result_of
 from .runner import Failure, Job, RunConfig, jobs_of, run
@@ -48,38 +48,28 @@ class Run:
     jobs: tuple[Job, ...]  # that are left
     size: int  # of the file, up to its last whole line [byte]
 
-    @property
-    def num_left(self) -> int:
-        """Queries that are left."""
-        return sum(len(job.queries) for job in self.jobs)
-
-    def resume(self, num_processes: int, show: Show = unseen) -> Iterator[QueryResult | Failure]:
-        """The queries that were left, each written to the file before it is yielded.
+    def resume(
+        self, num_processes: int, show: Show, report: Callable[[str], object]
+    ) -> tuple[list[QueryResult], int]:
+        """All queries, old and new, and how many failed; `report` gets a line for each failure.
 
         Raises
         ------
         InputError
             Another process is writing the file.
         """
-        if not self.jobs:
-            return
-        with appending(self.path, self.size) as append:
-            for found in run(self.config, self.jobs, num_processes, show):
-                if isinstance(found, QueryResult):
-                    append(found)
-                yield found
-
-    def finish(
-        self, num_processes: int, show: Show, report: Callable[[str], object]
-    ) -> tuple[list[QueryResult], int]:
-        """All queries, old and new, and how many failed; `report` gets a line for each failure."""
         rows, num_failed = list(self.rows), 0
-        for found in show(self.resume(num_processes, show), self.num_left, "queries"):
-            if isinstance(found, Failure):
-                report(found.text)
-                num_failed += found.num_queries
-            else:
-                rows.append(found)
+        if not self.jobs:
+            return rows, num_failed
+        num_left = sum(len(job.queries) for job in self.jobs)
+        with appending(self.path, self.size) as append:
+            for found in show(run(self.config, self.jobs, num_processes, show), num_left, "queries"):
+                if isinstance(found, Failure):
+                    report(found.text)
+                    num_failed += found.num_queries
+                else:
+                    append(found)
+                    rows.append(found)
         return rows, num_failed
 
 

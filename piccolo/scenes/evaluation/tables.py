@@ -107,7 +107,7 @@ def csv_text(rows: Sequence[QueryResult]) -> str:
         has_pose = row.result.pose is not None
         errors = (row.position_error, float(np.degrees(row.rotation_error))) if has_pose else ("", "")
         box = "" if row.is_in_box is None else str(row.is_in_box).lower()
-        verdict = row.result.status, row.result.confidence
+        status = row.result.status, row.result.confidence
         words = row.scene, row.image, row.variant, box
-        writer.writerow((*words, *verdict, *errors, row.result.loss, round(row.seconds, 4)))
+        writer.writerow((*words, *status, *errors, row.result.loss, round(row.seconds, 4)))
     return file.getvalue()

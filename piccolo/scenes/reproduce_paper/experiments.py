@@ -14,6 +14,7 @@ from .transforms import SceneTransform, flipped, identity, with_count, with_frac
 
 Settings = EngineSettings | PaperSettings
 NO_FIGURE = "-"
+RUNTIMES = {10_000: "1.77 s + 0.01 s", 100_000: "1.90 s + 0.01 s", 1_000_000: "3.74 s + 0.02 s"}
 
 
 @dataclass(frozen=True)
@@ -55,52 +56,18 @@ def _paper_setting(setting: str, names: Mapping[Any, str]) -> ConditionsOf:
     return conditions_of
 
 
-def _gravity(presets: Sequence[Settings], variants: Sequence[str]) -> list[Condition]:
-    cases: tuple[tuple[str, bool, SceneTransform], ...] = (
-        ("gravity known", True, identity),
-        ("gravity unknown", False, identity),
-        ("images upside down", False, flipped),
-        ("clouds turned at random", False, with_random_rotation),
-    )
-    return [
-        Condition(name, replace(settings, gravity="known" if is_known else "unknown"), transform)
-        for name, is_known, transform in cases
-        for settings in presets
-    ]
+def _each_preset(cases: Mapping[str, dict[str, Any]]) -> ConditionsOf:
+    """A condition for each case and preset; a case has fields of Condition, and `gravity` of the settings."""
 
+    def conditions_of(presets: Sequence[Settings], variants: Sequence[str]) -> list[Condition]:
+        return [
+            Condition(name, replace(preset, gravity=case.get("gravity", preset.gravity)), **fields)
+            for name, case in cases.items()
+            for fields in [{field: value for field, value in case.items() if field != "gravity"}]
+            for preset in presets
+        ]
 
-def _density(presets: Sequence[Settings], variants: Sequence[str]) -> list[Condition]:
-    fractions = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
-    return [
-        Condition(f"{100 * fraction:g} % of the points", settings, with_fraction(fraction))
-        for fraction in fractions
-        for settings in presets
-    ]
-
-
-def _labels(presets: Sequence[Settings], variants: Sequence[str]) -> list[Condition]:
-    figures = {
-        False: "0.03 m, 0.66 deg (Stanford2D-3D-S, all areas)",
-        True: "0.01 m, 0.28 deg (Stanford2D-3D-S, all areas)",
-    }
-    return [
-        Condition("labels" if is_label else "RGB", settings, use_labels=is_label, paper=figures[is_label])
-        for is_label in (False, True)
-        for settings in presets
-    ]
-
-
-def _runtime(presets: Sequence[Settings], variants: Sequence[str]) -> list[Condition]:
-    figures = {
-        10_000: "1.77 s + 0.01 s (RTX 2080)",
-        100_000: "1.90 s + 0.01 s (RTX 2080)",
-        1_000_000: "3.74 s + 0.02 s (RTX 2080)",
-    }
-    return [
-        Condition(f"{count} points", settings, with_count(count), paper=figure)
-        for count, figure in figures.items()
-        for settings in presets
-    ]
+    return conditions_of
 
 
 def _variants(presets: Sequence[Settings], variants: Sequence[str]) -> list[Condition]:
@@ -144,12 +111,46 @@ EXPERIMENTS = {
         _paper_setting("loss", {"photometric": "photometric loss", "sampling": "sampling loss"}),
     ),
     "gravity": Experiment(
-        "gravity, images upside down, clouds turned", "what is known of the vertical is varied", _gravity
+        "gravity, images upside down, clouds turned",
+        "what is known of the vertical is varied",
+        _each_preset(
+            {
+                "gravity known": {"gravity": "known"},
+                "gravity unknown": {"gravity": "unknown"},
+                "images upside down": {"gravity": "unknown", "transform": flipped},
+                "clouds turned at random": {"gravity": "unknown", "transform": with_random_rotation},
+            }
+        ),
     ),
-    "density": Experiment("density of the cloud", "points are left out at random", _density),
-    "labels": Experiment("semantic labels as colours", "what is compared: colours or labels", _labels),
+    "density": Experiment(
+        "density of the cloud",
+        "points are left out at random",
+        _each_preset(
+            {
+                f"{100 * fraction:g} % of the points": {"transform": with_fraction(fraction)}
+                for fraction in (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
+            }
+        ),
+    ),
+    "labels": Experiment(
+        "semantic labels as colours",
+        "what is compared: colours or labels",
+        _each_preset(
+            {
+                "RGB": {"paper": "0.03 m, 0.66 deg (Stanford2D-3D-S, all areas)"},
+                "labels": {"use_labels": True, "paper": "0.01 m, 0.28 deg (Stanford2D-3D-S, all areas)"},
+            }
+        ),
+    ),
     "runtime": Experiment(
-        "seconds by the number of points", "points are left out at random; search + refinement", _runtime
+        "seconds by the number of points",
+        "points are left out at random; search + refinement",
+        _each_preset(
+            {
+                f"{count} points": {"transform": with_count(count), "paper": f"{seconds} (RTX 2080)"}
+                for count, seconds in RUNTIMES.items()
+            }
+        ),
     ),
     "variants": Experiment("splits of the data: changed scenes, light", "a line a split", _variants),
 }
