@@ -89,17 +89,12 @@ def test_skyboxes_without_a_pose_are_left_out(dataset, tmp_path, capsys):
 def test_damaged_files_are_refused(dataset, tmp_path, capsys):
     path = next(dataset.rglob("*_pose_1_2.txt"))
     path.write_text("1 0 0")
-    code, _, err = made.run(capsys, "matterport3d", dataset, tmp_path / "out")
-    assert code == 3
-    assert f"{path}: found 3 numbers, wanted 4 x 4 numbers" in err
+    message = f"{path}: found 3 numbers, wanted 4 x 4 numbers"
+    made.assert_refused(message, capsys, "matterport3d", dataset, tmp_path / "out")
     next(dataset.rglob("*.ply")).unlink()
-    code, _, err = made.run(capsys, "matterport3d", dataset, tmp_path / "out")
-    assert code == 3
-    assert "with a mesh" in err
+    made.assert_refused("with a mesh", capsys, "matterport3d", dataset, tmp_path / "out")
 
 
 def test_a_house_that_is_there_twice_is_refused(dataset, tmp_path, capsys):
     shutil.copytree(dataset / "v1" / "scans" / HOUSE / HOUSE, dataset / HOUSE)
-    code, lines, err = made.run(capsys, "matterport3d", dataset, tmp_path / "out")
-    assert (code, lines) == (3, [])
-    assert f"--from: found the scene {HOUSE} twice" in err
+    made.assert_refused(f"the scene {HOUSE} twice", capsys, "matterport3d", dataset, tmp_path / "out")

@@ -57,8 +57,6 @@ def test_refusals(dataset, tmp_path, capsys):
     assert code == 3
     assert '"seed": 4' in err
     (dataset / "coast" / "set 0.pts").write_text("1\n0 0 0 0 1 1 1\n")
-    code, _, err = made.run(capsys, "mpo", dataset, tmp_path / "out2")
-    assert code == 3
-    assert "leave one cloud of this name" in err
+    made.assert_refused("leave one cloud of this name", capsys, "mpo", dataset, tmp_path / "out2")
     code, _, err = made.run(capsys, "mpo", tmp_path / "out", tmp_path / "out3")
     assert "with a picture of the same name" in err

@@ -55,6 +55,4 @@ def test_damaged_poses_are_refused(dataset, tmp_path, capsys, text, message):
 
 def test_a_room_without_a_cloud_is_refused(dataset, tmp_path, capsys):
     (dataset / "pcd" / "weddingHall_1.txt").unlink()
-    code, _, err = made.run(capsys, "omniscenes", dataset, tmp_path / "out")
-    assert code == 3
-    assert "with a cloud pcd/ROOM_N.txt" in err
+    made.assert_refused("with a cloud pcd/ROOM_N.txt", capsys, "omniscenes", dataset, tmp_path / "out")

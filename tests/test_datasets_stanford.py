@@ -144,9 +144,7 @@ def test_a_scene_that_is_there_is_left_but_not_if_made_otherwise(dataset, tmp_pa
     code, (line,), _ = made.run(capsys, "stanford2d3ds", dataset, out)
     assert (code, line["status"], line["points"], line["queries"]) == (0, "there already", None, 2)
     assert (out / "area_1" / "office_1" / "queries.json").stat().st_mtime_ns == before
-    code, lines, err = made.run(capsys, "stanford2d3ds", dataset, out, "--labels")
-    assert (code, lines) == (3, [])
-    assert "remove it, or change --out" in err
+    made.assert_refused("remove it, or change --out", capsys, "stanford2d3ds", dataset, out, "--labels")
 
 
 def test_a_damaged_file_costs_its_room_only(dataset, tmp_path, capsys):
@@ -172,31 +170,22 @@ def test_a_damaged_file_costs_its_room_only(dataset, tmp_path, capsys):
 def test_damaged_poses_are_refused(dataset, tmp_path, capsys, text, message):
     for path in dataset.rglob("*_pose.json"):
         path.write_text(text)
-    code, lines, err = made.run(capsys, "stanford2d3ds", dataset, tmp_path / "out")
-    assert (code, lines) == (3, [])
-    assert message in err
+    made.assert_refused(message, capsys, "stanford2d3ds", dataset, tmp_path / "out")
 
 
 def test_a_damaged_line_of_a_cloud_is_named(dataset, tmp_path, capsys):
     (path,) = dataset.rglob("office_1.txt")
     path.write_text(path.read_text() + "1.0 2.0 3.0 185\x10187 4 5\n")
-    code, _, err = made.run(capsys, "stanford2d3ds", dataset, tmp_path / "out")
-    assert code == 3
-    assert f"{path}: line 20001" in err
+    made.assert_refused(f"{path}: line 20001", capsys, "stanford2d3ds", dataset, tmp_path / "out")
     assert not list((tmp_path / "out" / "area_1").iterdir())
 
 
 def test_refused_folders(dataset, tmp_path, capsys):
-    code, _, err = made.run(capsys, "stanford2d3ds", tmp_path, tmp_path / "out")
-    assert code == 3
-    assert "found no room with panoramas" in err
-    code, _, err = made.run(capsys, "stanford2d3ds", dataset, tmp_path / "out", "--rooms", "office_9")
-    assert code == 3
-    assert "found no office_9, wanted one of office_1" in err
+    where = capsys, "stanford2d3ds", dataset, tmp_path / "out"
+    made.assert_refused("found no room with panoramas", *where[:2], tmp_path, where[3])
+    made.assert_refused("found no office_9, wanted one of office_1", *where, "--rooms", "office_9")
     (dataset / "Stanford3dDataset_v1.2").rename(dataset / "Stanford3dDataset_v1.2_Aligned_Version")
-    code, _, err = made.run(capsys, "stanford2d3ds", dataset, tmp_path / "out")
-    assert code == 3
-    assert "turned one by one" in err
+    made.assert_refused("turned one by one", *where)
 
 
 def test_rooms_without_a_cloud_are_counted(dataset, tmp_path, capsys):
@@ -225,9 +214,7 @@ def test_a_folder_with_something_else_in_it_is_not_touched(dataset, tmp_path, ca
     folder = tmp_path / "out" / "area_1" / "office_1"
     folder.mkdir(parents=True)
     (folder / "notes.txt").write_text("mine")
-    code, lines, err = made.run(capsys, "stanford2d3ds", dataset, tmp_path / "out")
-    assert (code, lines) == (3, [])
-    assert "wanted a folder that is new or empty" in err
+    made.assert_refused("that is new or empty", capsys, "stanford2d3ds", dataset, tmp_path / "out")
     assert [path.name for path in folder.iterdir()] == ["notes.txt"]
 
 
