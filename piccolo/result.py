@@ -1,7 +1,11 @@
 """The result of one localization, and its JSON."""
 
 import json
+import math
+import re
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,10 +17,15 @@ from .confidence.covariance import PoseCovariance
 from .confidence.localization import Localization
 from .confidence.score import Evidence
 from .errors import InputError
-from .geometry.pose import Pose, T_world_from_cam, quaternion_wxyz
+from .geometry.pose import Pose, T_world_from_cam, checked_rotation, quaternion_wxyz
 from .geometry.sphere import CONVENTION
+from .runtime.json_file import parse_lines, read_bytes
 
 FORMAT = "piccolo-pose/3"
+MAX_ROTATION_ERROR = 1e-6  # of R R^T from the identity, in a file
+# control characters, line ends, halves of characters
+UNWRITABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+WANTED = "wanted JSON lines of localize.py"
 COVARIANCE_CONVENTION = (
     "of (w, d), rotation [rad] about the camera's axes, then translation [m] along the world's: "
     "R_true = exp([w]x) R_cam_from_world, center_true = center_world + d"
@@ -168,3 +177,38 @@ def _paths(value: object) -> tuple[str, ...]:
     if not isinstance(value, list) or not all(isinstance(path, str) for path in value):
         raise TypeError("a cloud that is neither a path nor a list of paths")
     return tuple(value)
+
+
+def read_results(paths: Sequence[Path]) -> list[Result]:
+    """The results in files of JSON lines, their poses checked.
+
+    Raises
+    ------
+    InputError
+        A line is no result, or a file has none.
+    """
+    results = []
+    for path in paths:
+        found = parse_lines(path, read_bytes(path, WANTED), _checked_result)
+        if not found:
+            raise InputError(f"{path}: found no result, {WANTED}")
+        results += found
+    return results
+
+
+def _checked_result(text: str) -> Result:
+    """A result of one line; refused are names and numbers that can't be written, and a pose that is none."""
+    result = Result.from_json(text)
+    for label, value in (("status", result.status), ("cloud", result.cloud_name), ("pano", result.pano)):
+        if not isinstance(value, str) or UNWRITABLE.search(value):
+            raise InputError(f"result: found {label} {value!r}, wanted text on one line")
+    values = [result.confidence, *([result.evidence.score] if result.evidence else [])]
+    if not all(isinstance(value, int | float) and math.isfinite(value) for value in values):
+        raise InputError(f"result: found confidence and score {values}, wanted finite numbers")
+    if result.pose is not None:
+        R, center = result.pose.R_cam_from_world, result.pose.center_world
+        is_number = R.dtype.kind in "fiu" and center.dtype.kind in "fiu"
+        if not (is_number and center.shape == (3,) and np.isfinite(center).all()):
+            raise InputError("result: found no numbers of a pose, wanted R_cam_from_world and center_world")
+        checked_rotation(R, MAX_ROTATION_ERROR, "result: R_cam_from_world")
+    return result

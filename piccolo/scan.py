@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cloud import open_cloud, stream_of
-from .cloud.readers.colors import to_bytes
-from .cloud.readers.reader import RawCloud
+from .cloud.readers.colors import brightest_of, colored_chunks
 from .cloud.settings import METRES, CloudSettings, UpAxis
-from .cloud.soa import PackedPoints
+from .cloud.soa import LocalCloud, PackedPoints, pack_points
 from .cloud.stream import CloudStream
 from .coarse_to_fine.localize import localize
 from .coarse_to_fine.open_map import CachePolicy, open_map, prepared_map_among
@@ -21,15 +20,17 @@ from .coarse_to_fine.scan_map import ScanMap, prepare_map
 from .coarse_to_fine.settings import CoarseToFineSettings, Prior
 from .confidence.localization import Localization
 from .errors import InputError
+from .geometry.point_transforms import rotate_points
 from .geometry.pose import Pose
 from .geometry.rotations import Gravity
+from .gravity import R_z_from_axis
 from .optimize.settings import Solver
 from .panorama import Panorama, ReadOptions, read_panorama
 from .paper.localize import PaperMap, localize_by_paper, prepare_by_paper
 from .paper.settings import PaperSettings
 from .result import Result, result_of
 from .runtime.stopwatch import Stopwatch
-from .runtime.threads import ProgressCallback, Workers, num_cores, progress_to
+from .runtime.threads import ProgressCallback, Workers, num_cores, progress_to, unseen
 
 File = str | PathLike[str]
 Settings = CoarseToFineSettings | PaperSettings
@@ -124,13 +125,16 @@ class Scan:
         ('localized', array([2.41, 1.07, 1.58]))
         """
         given: dict[str, Any] = dict(options)
+        if isinstance(given.get("mask"), np.ndarray):
+            given["mask_array"] = given.pop("mask")
         prior = {k: given.pop(k) for k in PRIOR_FIELDS & given.keys()}
         if prior:
             given["prior"] = Prior(**prior)
         read_options = ReadOptions(
             labels=self.cloud_settings.labels, **{k: given.pop(k) for k in READ_FIELDS & given.keys()}
         )
-        return self.localize_query(panorama, read_options, replace(self.settings, **given))
+        mask = given.pop("mask_array", None)
+        return self.localize_query(panorama, read_options, replace(self.settings, **given), mask)
 
     def localize_many(
         self, panoramas: Iterable[File | NDArray[np.uint8]], **options: Unpack[QueryOptions]
@@ -140,16 +144,19 @@ class Scan:
             yield self.localize(panorama, **options)
 
     def localize_query(
-        self, panorama: File | NDArray[np.uint8], read_options: ReadOptions, settings: Settings
+        self,
+        panorama: File | NDArray[np.uint8],
+        read_options: ReadOptions,
+        settings: Settings,
+        is_masked: NDArray[np.bool_] | None = None,
     ) -> Result:
-        """The same with all options as objects."""
+        """The same with all options as objects; the mask of an array apart."""
         watch = Stopwatch(dict(self.seconds))
         with watch.stage("read"):
-            picture = read_query(panorama, read_options)
+            picture = read_query(panorama, read_options, is_masked)
         found = self._method(picture, settings, watch)
         name = "array" if isinstance(panorama, np.ndarray) else str(panorama)
-        how = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(read_options).items()}
-        repeated = {**settings.to_json(), "cloud": asdict(self.cloud_settings), "panorama": how}
+        repeated = settings_json(settings, self.cloud_settings, read_options)
         warnings = self.warnings + picture.warnings + ((LABELS_WARNING,) if read_options.labels else ())
         return result_of(found, self.name, name, watch.seconds, repeated, warnings)
 
@@ -161,31 +168,43 @@ class Scan:
         raise InputError("settings: of another method than the one that the scan was prepared for")
 
 
-def read_query(panorama: File | NDArray[np.uint8], options: ReadOptions) -> Panorama:
-    """The panorama in a file, or the image in an array with what of it counts."""
+def settings_json(
+    settings: Settings, cloud_settings: CloudSettings, read_options: ReadOptions
+) -> dict[str, object]:
+    """What a result repeats of how it was made."""
+    how = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(read_options).items()}
+    return {**settings.to_json(), "cloud": asdict(cloud_settings), "panorama": how}
+
+
+def read_query(
+    panorama: File | NDArray[np.uint8], options: ReadOptions, is_masked: NDArray[np.bool_] | None = None
+) -> Panorama:
+    """The panorama in a file; or in an array (H, W, 3), with a mask (H, W) of what is to be ignored."""
     if not isinstance(panorama, np.ndarray):
-        if isinstance(options.mask, np.ndarray):
-            raise InputError("mask: an array goes with an image that is an array; give a picture's path")
+        if is_masked is not None:
+            raise InputError("mask: an array goes with a panorama that is an array; give a picture's path")
         return read_panorama(Path(panorama), options)
     if panorama.dtype != np.uint8 or panorama.ndim != 3 or panorama.shape[1:] != (2 * len(panorama), 3):
         found = f"{panorama.dtype} of shape {panorama.shape}"
         raise InputError(f"panorama: found {found}, wanted RGB in uint8 of shape (H, 2 H, 3)")
+    if replace(options, labels=None) != ReadOptions():
+        raise InputError("panorama: fov_deg, cube_order, mask_nadir_deg and a mask's path go with files")
     is_valid = np.ones(panorama.shape[:2], np.bool_)
-    if options.mask is not None:
-        if not isinstance(options.mask, np.ndarray) or options.mask.shape != is_valid.shape:
-            raise InputError(f"mask: wanted an array of shape {is_valid.shape}, as the image is one")
-        is_valid &= ~options.mask.astype(np.bool_)
-    if (options.fov_deg, options.cube_order, options.mask_nadir_deg) != (None, None, 0.0):
-        raise InputError("panorama: fov_deg, cube_order and mask_nadir_deg go with pictures in files")
+    if is_masked is not None:
+        if is_masked.shape != is_valid.shape or is_masked.dtype != np.bool_:
+            raise InputError(f"mask: wanted an array of bool of shape {is_valid.shape}, as the panorama's")
+        is_valid = ~is_masked
     return Panorama(np.ascontiguousarray(panorama), is_valid)
 
 
 def stream_of_arrays(points: NDArray[np.floating[Any]], colors: NDArray[Any] | None) -> CloudStream:
-    """A cloud in memory: points (N, 3) [m], colours (N, 3) in uint8, uint16, or floats in [0, 1]."""
+    """A cloud in memory: points (N, 3), colours (N, 3) in uint8, uint16, or floats in [0, 1]."""
     if points.ndim != 2 or points.shape[1:] != (3,) or colors is None or colors.shape != points.shape:
         shapes = f"{points.shape} and {None if colors is None else colors.shape}"
         raise InputError(f"points, colors: found shapes {shapes}, wanted two arrays of shape (N, 3)")
-    return stream_of(ARRAYS, RawCloud(points.astype(np.float64), to_bytes(colors)))
+    brightest = brightest_of(ARRAYS, [f"{colors.dtype.kind}{colors.dtype.itemsize}"])
+    chunks = colored_chunks([(points, colors)], brightest, lambda row: f"{ARRAYS}, row {row}")
+    return stream_of(ARRAYS, next(iter(chunks)))
 
 
 def open_scan(
@@ -275,3 +294,15 @@ def scan_of(
         with watch.stage("prepare"):
             prepared = prepare_by_paper(points, settings)
     return Scan(prepared, name, cloud_settings, settings, workers, watch.seconds)
+
+
+def open_points(paths: Sequence[Path], settings: CloudSettings, workers: Workers) -> LocalCloud:
+    """All points of a cloud's files, or the voxels of the prepared map that stands in place of them."""
+    if prepared_map_among(paths):
+        m = open_map(paths, settings, CachePolicy(is_used=False), workers, Stopwatch())
+        return LocalCloud(m.points, m.R_map_from_world, m.origin_world, m.warnings)
+    cloud = open_cloud(paths, settings, workers.show).read()
+    R_local_from_world = R_z_from_axis(settings.up)
+    points = rotate_points(cloud.points.astype(np.float64), R_local_from_world).astype(np.float32)
+    packed = pack_points(points, cloud.colors)
+    return LocalCloud(packed, R_local_from_world, cloud.origin_world, cloud.warnings)

@@ -87,6 +87,13 @@ def run(capsys, dataset, source, out, *options):
     return code, [json.loads(line) for line in stdout.splitlines()], stderr
 
 
+def assert_refused(message, capsys, dataset, source, out, *options):
+    """The tool writes no scene, and says why."""
+    code, lines, err = run(capsys, dataset, source, out, *options)
+    assert (code, lines) == (3, [])
+    assert message in err
+
+
 def vertices(path):
     """The vertices of a PLY."""
     return PlyData.read(path)["vertex"].data

@@ -4,6 +4,7 @@ import functools
 
 import numpy as np
 
+from piccolo.cli import make_room
 from piccolo.cloud.model import Cloud
 from piccolo.cloud.morton import morton_order
 from piccolo.cloud.soa import pack_points
@@ -60,3 +61,10 @@ def scene(seed):
     """A room's points as kernels read them, a panorama of it, and its true pose near the local origin."""
     taken = query(seed)
     return packed(seed), as_panorama(taken.rgb), local(seed, taken.pose)
+
+
+def write_room(folder, words):
+    """A room's files by tools/make_room.py with its options in one string; returns the folder."""
+    size = ["--size", *map(str, SIZE)]
+    assert make_room.main(["--out", str(folder), *size, "--quiet", *words.split()]) == 0
+    return folder

@@ -119,7 +119,11 @@ def test_truth_is_among_the_poses_of_a_place_that_repeats(kind):
     cloud = stream_of(Path("repeated"), RawCloud(points.astype(float), colors))
     taken = make_query(world, 0, "clean", rooms.WIDTH, Workers(2))
     result = localize(
-        prepare_map(cloud, Workers(2)), as_panorama(taken.rgb), CoarseToFineSettings(), Workers(2), Stopwatch()
+        prepare_map(cloud, Workers(2)),
+        as_panorama(taken.rgb),
+        CoarseToFineSettings(),
+        Workers(2),
+        Stopwatch(),
     )
     distances = [errors(pose, taken.pose)[0] for pose in (result.pose, *(r.pose for r in result.rivals))]
     assert min(distances) < 0.1

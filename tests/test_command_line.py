@@ -1,6 +1,7 @@
-"""The options that say what a cloud is."""
+"""The options that say what a cloud is, and what all commands share."""
 
 import json
+from importlib import import_module
 from types import SimpleNamespace
 
 import cv2
@@ -8,10 +9,13 @@ import numpy as np
 import pytest
 from rooms import errors, query, room
 
-from piccolo.cli import localize, prepare_map
-from piccolo.cli.options import build_parser, cloud_settings_from, parse
+from piccolo.cli import localize, make_room, prepare_map
+from piccolo.cli.errors import UsageError, checking_options, run_command
+from piccolo.cli.options import build_parser, cloud_settings_from
+from piccolo.cli.parser import COMMANDS, parse
 from piccolo.cloud.settings import IN_METRES, CloudSettings
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
+from piccolo.errors import InputError
 from piccolo.panorama import AS_STORED
 from piccolo.pipeline import Inputs
 from piccolo.result import Result
@@ -120,3 +124,44 @@ def test_a_warning_is_written_once_whenever_it_comes(monkeypatch, capsys, quiet)
     session = localize.open_session(arguments, CoarseToFineSettings(), AS_STORED)
     assert session.localizer.warnings == ("early", "late")
     assert capsys.readouterr().err == ("" if quiet else "warning: early\nwarning: late\n")
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "text"),
+    [
+        (UsageError("--a: wrong"), 2, "--a: wrong"),
+        (InputError("a: wanted a map by tools/prepare_map.py"), 3, "a: wanted a map by piccolo-prepare-map"),
+        (FileNotFoundError(2, "No such file", "b.ply"), 3, "b.ply: cannot be used (No such file)"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (ZeroDivisionError("c"), 4, "internal error: ZeroDivisionError('c'); --debug shows where"),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_errors_have_codes_and_name_the_command_as_it_was_started(monkeypatch, capsys, error, code, text):
+    def fail(arguments):
+        raise error
+
+    monkeypatch.setattr("sys.argv", ["/usr/bin/piccolo-make-room"])
+    assert run_command(make_room.build_parser(), ["--out", "x"], fail) == code
+    err = capsys.readouterr().err
+    assert err.startswith(f"piccolo-make-room: {text}")
+    assert err.count("\n") == 1
+    with pytest.raises(UsageError), checking_options():
+        raise InputError("in an option")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_names_commands_as_they_were_started(monkeypatch, capsys, name):
+    command = import_module(f"piccolo.cli.{name}")
+    for program, example in (
+        (f"piccolo-{name.replace('_', '-')}", "\n  piccolo-"),
+        (f"{name}.py", "  python "),
+    ):
+        monkeypatch.setattr("sys.argv", [f"bin/{program}"])
+        with pytest.raises(SystemExit):
+            command.main(["--help"])
+        text = capsys.readouterr().out
+        assert text.startswith(f"usage: {program} ")
+        assert example in text
+        assert ("piccolo-" in text) != (".py" in text)
+        assert "4 internal error" in text

@@ -4,24 +4,32 @@ import numpy as np
 import pytest
 from poses import tilted_poses
 
-from piccolo.scenes.datasets.checking import AS_GIVEN, Check, Fit, axes_named, axis_turns, readings, spread
+from piccolo.scenes.datasets.checking import (
+    AS_GIVEN,
+    Check,
+    ConventionCheck,
+    axis_rotations,
+    convention_variants,
+    describe_axes,
+    evenly_spaced,
+)
 from piccolo.scenes.datasets.poses import AXES, DIRECTIONS, pose_of_transform
 
 ORIGIN = np.array([10.0, -4.0, 2.0])
 
 
 def fit(score, best=AS_GIVEN, best_score=None):
-    return Fit("images/a.jpg", score, score if best_score is None else best_score, best)
+    return ConventionCheck("images/a.jpg", score, score if best_score is None else best_score, best)
 
 
 def test_turns_are_the_24_of_a_cube():
-    turns = axis_turns()
-    assert len({axes_named(turn) for turn in turns}) == 24
+    turns = axis_rotations()
+    assert len({describe_axes(turn) for turn in turns}) == 24
     for turn in turns:
         assert np.linalg.det(turn) == pytest.approx(1.0)
         np.testing.assert_array_equal(turn @ turn.T, np.eye(3))
     about_z = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    assert axes_named(about_z) == "-y, x, z"
+    assert describe_axes(about_z) == "-y, x, z"
 
 
 @pytest.mark.parametrize("axes", AXES)
@@ -34,7 +42,7 @@ def test_the_true_pose_is_among_the_readings_of_a_wrong_one(axes, direction, tak
     (other,) = set(DIRECTIONS) - {direction}
     for taken_direction in (direction, other):
         taken = pose_of_transform("T", T, taken_direction, taken_axes)
-        found = readings(type(taken)(taken.R_cam_from_world, taken.center_world - ORIGIN), ORIGIN)
+        found = convention_variants(type(taken)(taken.R_cam_from_world, taken.center_world - ORIGIN), ORIGIN)
         assert any(
             np.allclose(p.R_cam_from_world, true.R_cam_from_world)
             and np.allclose(p.center_world + ORIGIN, true.center_world)
@@ -56,6 +64,6 @@ def test_advice_names_the_way_that_fits_most():
 
 
 def test_spread_is_even():
-    assert spread(list(range(10)), 3) == [0, 4, 9]
-    assert spread(list(range(2)), 5) == [0, 1]
-    assert spread(list(range(9)), 1) == [0]
+    assert evenly_spaced(list(range(10)), 3) == [0, 4, 9]
+    assert evenly_spaced(list(range(2)), 5) == [0, 1]
+    assert evenly_spaced(list(range(9)), 1) == [0]

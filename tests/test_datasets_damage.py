@@ -10,7 +10,7 @@ from poses import jpeg
 from refusals import mutated, read_or_refused
 
 from piccolo.scenes.datasets import DATASETS
-from piccolo.scenes.datasets.model import Request
+from piccolo.scenes.datasets.model import ConvertOptions
 from piccolo.scenes.datasets.poses import MAX_MATRIX_SIZE
 
 T = np.eye(4)[[1, 2, 0, 3]]
@@ -51,9 +51,9 @@ FILES = {
 
 
 def read_poses(name, folder):
-    request = Request(folder, axes="optical" if name == "generic tum" else None)
-    listing = DATASETS[name.split()[0]].listing(request)
-    return [shot.pose for plan in listing.plans for shot in plan.read_shots()]
+    options = ConvertOptions(folder, axes="optical" if name == "generic tum" else None)
+    listed = DATASETS[name.split()[0]].list_scenes(options)
+    return [panorama.pose for spec in listed.specs for panorama in spec.read_panoramas()]
 
 
 @pytest.fixture(scope="module", params=FILES)

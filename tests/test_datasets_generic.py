@@ -2,26 +2,15 @@
 
 import json
 
+import dataset_rooms as made
 import numpy as np
 import pytest
-from dataset_rooms import (
-    FORWARD_LEFT_UP,
-    OPENGL,
-    OPTICAL,
-    assert_fits,
-    cameras,
-    picture,
-    points_and_colors,
-    run,
-    write_picture,
-    write_text_cloud,
-)
 from scipy.spatial.transform import Rotation
 
 from piccolo.cli import export_poses
 from piccolo.scenes.scene import read_scene
 
-AXES = {"optical": OPTICAL, "piccolo": FORWARD_LEFT_UP, "opengl": OPENGL}
+AXES = {"optical": made.OPTICAL, "piccolo": made.FORWARD_LEFT_UP, "opengl": made.OPENGL}
 COLUMNS = ("image", "tx", "ty", "tz", "qw", "qx", "qy", "qz", "direction", "axes", "variant", "room")
 
 
@@ -46,12 +35,12 @@ def write_csv(path, rows):
 def folder(tmp_path):
     """A cloud and pictures with each axes, by any direction; rows in rows.json."""
     root = tmp_path / "my photos"
-    write_text_cloud(root / "scan.xyz", *points_and_colors(), decimals=6)
+    made.write_text_cloud(root / "scan.xyz", *made.points_and_colors(), decimals=6)
     rows = []
     directions = ("world_from_cam", "cam_from_world")
     for k, (axes, direction) in enumerate((a, d) for a in AXES for d in directions):
-        camera = cameras(6)[k]
-        write_picture(root / "images" / f"{100 + k}.5.png", picture(*camera, AXES[axes])[0])
+        camera = made.cameras(6)[k]
+        made.write_picture(root / "images" / f"{100 + k}.5.png", made.picture(*camera, AXES[axes])[0])
         rows.append(entry(f"images/{100 + k}.5.png", camera, direction, axes))
     (root / "rows.json").write_text(json.dumps(rows))
     return root
@@ -64,10 +53,10 @@ def rows_of(folder):
 def test_csv_in_all_axes_and_directions(folder, tmp_path, capsys):
     rows = [{**row, "variant": "tripod"} for row in rows_of(folder)]
     write_csv(folder / "poses.csv", rows)
-    code, (line,), err = run(capsys, "generic", folder, tmp_path / "out", "--check", 6)
+    code, (line,), err = made.run(capsys, "generic", folder, tmp_path / "out", "--check", 6)
     assert (code, err) == (0, "")
     assert (line["scene"], line["queries"], line["fits"]) == ("my photos", 6, True)
-    scene = assert_fits(tmp_path / "out" / "my photos")
+    scene = made.assert_fits(tmp_path / "out" / "my photos")
     assert {query.variant for query in scene.queries} == {"tripod"}
 
 
@@ -78,39 +67,35 @@ def test_json_with_rooms_and_clouds(folder, tmp_path, capsys):
     for k, row in enumerate(rows):
         row |= {"room": f"room {k % 2}", "cloud": "clouds/a.xyz", "variant": None}
     (folder / "poses.json").write_text(json.dumps(rows))
-    code, lines, _ = run(capsys, "generic", folder, tmp_path / "out")
+    code, lines, _ = made.run(capsys, "generic", folder, tmp_path / "out")
     assert (code, [line["queries"] for line in lines]) == (0, [3, 3])
-    assert_fits(tmp_path / "out" / "room 1")
+    made.assert_fits(tmp_path / "out" / "room 1")
     rows[0]["cloud"] = "clouds/b.xyz"
     (folder / "poses.json").write_text(json.dumps(rows))
-    code, _, err = run(capsys, "generic", folder, tmp_path / "out2")
-    assert code == 3
-    assert "room room 0: found the clouds" in err
+    made.assert_refused("room room 0: found the clouds", capsys, "generic", folder, tmp_path / "out2")
 
 
 def test_trajectory_with_pictures_named_by_time(folder, tmp_path, capsys):
     row = rows_of(folder)[0]
     numbers = " ".join(str(row[name]) for name in ("tx", "ty", "tz", "qx", "qy", "qz", "qw"))
     (folder / "poses.txt").write_text(f"# time\n99.5 {numbers}\n\n100.5 {numbers}\n")
-    code, (line,), _ = run(capsys, "generic", folder, tmp_path / "out", "--axes", "optical")
+    code, (line,), _ = made.run(capsys, "generic", folder, tmp_path / "out", "--axes", "optical")
     assert (code, line["queries"]) == (0, 1)
-    assert_fits(tmp_path / "out" / "my photos")
-    code, _, err = run(capsys, "generic", folder, tmp_path / "out2")
-    assert code == 3
-    assert "in the list or by --axes" in err
+    made.assert_fits(tmp_path / "out" / "my photos")
+    made.assert_refused("in the list or by --axes", capsys, "generic", folder, tmp_path / "out2")
     (folder / "poses.txt").write_text("1 2 3\n")
-    assert "found '1 2 3', wanted timestamp tx" in run(capsys, "generic", folder, tmp_path / "out2")[2]
+    assert "found '1 2 3', wanted timestamp tx" in made.run(capsys, "generic", folder, tmp_path / "out2")[2]
     (folder / "images").rename(folder / "pictures")
-    assert "no such folder, wanted pictures" in run(capsys, "generic", folder, tmp_path / "out2")[2]
+    assert "no such folder, wanted pictures" in made.run(capsys, "generic", folder, tmp_path / "out2")[2]
 
 
 def test_wrong_axes_fail_the_check_with_advice(folder, tmp_path, capsys):
     rows = [{**row, "axes": "piccolo"} for row in rows_of(folder)[:2]]  # optical in truth
     write_csv(folder / "poses.csv", rows)
-    code, (line,), err = run(capsys, "generic", folder, tmp_path / "out", "--check", 2)
+    code, (line,), err = made.run(capsys, "generic", folder, tmp_path / "out", "--check", 2)
     assert (code, line["fits"]) == (1, False)
     assert "if the camera's x, y, z are z, -x, -y" in err
-    code, (line,), _ = run(capsys, "generic", folder, tmp_path / "out", "--check", 2)  # there already
+    code, (line,), _ = made.run(capsys, "generic", folder, tmp_path / "out", "--check", 2)  # there already
     assert (code, line["status"]) == (1, "there already")
 
 
@@ -120,8 +105,8 @@ def test_pictures_of_one_name_are_told_apart(folder, tmp_path, capsys):
     (folder / rows[1]["image"]).rename(folder / "more" / "100.5.png")
     rows[1]["image"] = "more/100.5.png"
     write_csv(folder / "poses.csv", rows)
-    assert run(capsys, "generic", folder, tmp_path / "out")[0] == 0
-    assert_fits(tmp_path / "out" / "my photos")
+    assert made.run(capsys, "generic", folder, tmp_path / "out")[0] == 0
+    made.assert_fits(tmp_path / "out" / "my photos")
 
 
 @pytest.mark.parametrize(
@@ -136,50 +121,48 @@ def test_pictures_of_one_name_are_told_apart(folder, tmp_path, capsys):
         ({"axes": ""}, "found the axes None"),
         ({"direction": "up"}, "found the direction up"),
         ({"room": "../there"}, "wanted a name for a folder"),
-        ({"image": "images/none.png"}, "no such file that can be read"),
+        ({"image": "images/none.png"}, "no such panorama"),
     ],
 )
 def test_refused_rows(folder, tmp_path, capsys, change, message):
     rows = rows_of(folder)
     rows[1] |= change
     write_csv(folder / "poses.csv", rows)
-    code, lines, err = run(capsys, "generic", folder, tmp_path / "out")
-    assert (code, lines) == (3, [])
-    assert message in err
+    made.assert_refused(message, capsys, "generic", folder, tmp_path / "out")
     assert not (tmp_path / "there").exists()
 
 
 def test_refused_lists_and_clouds(folder, tmp_path, capsys):
     out = tmp_path / "out"
-    assert "found 0 lists" in run(capsys, "generic", folder, out)[2]
+    assert "found 0 lists" in made.run(capsys, "generic", folder, out)[2]
     write_csv(folder / "poses.csv", rows_of(folder))
     (folder / "second.xyz").write_text("0 0 0 1 1 1\n")
-    assert "found the clouds scan.xyz, second.xyz" in run(capsys, "generic", folder, out)[2]
-    code, (line,), _ = run(capsys, "generic", folder, out, "--cloud", folder / "scan.xyz")
+    assert "found the clouds scan.xyz, second.xyz" in made.run(capsys, "generic", folder, out)[2]
+    code, (line,), _ = made.run(capsys, "generic", folder, out, "--cloud", folder / "scan.xyz")
     assert (code, line["queries"]) == (0, 6)
     (folder / "poses.csv").write_bytes(b"\xff\xfe")
-    assert "bytes that are no text" in run(capsys, "generic", folder, out)[2]
+    assert "bytes that are no text" in made.run(capsys, "generic", folder, out)[2]
     (folder / "poses.csv").write_text("image,tx\n")
-    assert "found no row with a picture" in run(capsys, "generic", folder, out)[2]
-    assert "cannot be read" in run(capsys, "generic", folder, out, "--poses", folder / "no.csv")[2]
+    assert "found no row with a picture" in made.run(capsys, "generic", folder, out)[2]
+    assert "cannot be read" in made.run(capsys, "generic", folder, out, "--poses", folder / "no.csv")[2]
     no_list = folder / "list.json"
     no_list.write_text("{}")
-    assert "found no list of objects" in run(capsys, "generic", folder, out, "--poses", no_list)[2]
+    assert "found no list of objects" in made.run(capsys, "generic", folder, out, "--poses", no_list)[2]
 
 
 def test_a_table_of_exported_poses_comes_back(folder, tmp_path, capsys):
     write_csv(folder / "poses.csv", rows_of(folder))
-    assert run(capsys, "generic", folder, tmp_path / "first")[0] == 0
+    assert made.run(capsys, "generic", folder, tmp_path / "first")[0] == 0
     first = tmp_path / "first" / "my photos"
     (folder / "poses.csv").unlink()
     table = folder / "exported.csv"
     words = ["--scenes", str(first), "--format", "csv", "--images", str(first), "--out", str(table)]
     assert export_poses.main(words) == 0
     capsys.readouterr()
-    code, _, err = run(capsys, "generic", folder, tmp_path / "second", "--poses", table)
+    code, _, err = made.run(capsys, "generic", folder, tmp_path / "second", "--poses", table)
     assert (code, err) == (0, "")
     pairs = zip(
-        read_scene(first).queries, assert_fits(tmp_path / "second" / "my photos").queries, strict=True
+        read_scene(first).queries, made.assert_fits(tmp_path / "second" / "my photos").queries, strict=True
     )
     for one, other in pairs:
         np.testing.assert_allclose(other.pose.R_cam_from_world, one.pose.R_cam_from_world, atol=1e-14)

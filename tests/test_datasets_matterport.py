@@ -2,9 +2,9 @@
 
 import shutil
 
+import dataset_rooms as made
 import numpy as np
 import pytest
-from dataset_rooms import assert_fits, cameras, look, points_and_colors, run, write_picture
 
 HOUSE = "17DRP5sb8fy"
 SIZE = 128  # of a face [px]
@@ -27,8 +27,8 @@ def write_skybox(folder, place, R_world_from_cam5, center):
         forward, right, up = np.array(axes, float)
         rays = forward + across[None, :, None] * right - across[:, None, None] * up
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        rgb, _ = look(rays @ R_world_from_cam5.T, center)
-        write_picture(folder / "matterport_skybox_images" / f"{place}_skybox{number}_sami.jpg", rgb)
+        rgb, _ = made.look(rays @ R_world_from_cam5.T, center)
+        made.write_picture(folder / "matterport_skybox_images" / f"{place}_skybox{number}_sami.jpg", rgb)
     for yaw in range(6):
         angle = np.radians(60.0) * (yaw - 5)  # clockwise from stop to stop: about y, which points down
         c, s = np.cos(angle), np.sin(angle)
@@ -42,7 +42,7 @@ def write_skybox(folder, place, R_world_from_cam5, center):
 
 def write_mesh(path):
     """The room's points as triangles 2 cm wide, in the points' colours."""
-    points, colors = points_and_colors()
+    points, colors = made.points_and_colors()
     corners = np.repeat(points, 3, axis=0)
     corners += np.tile([[0.01, 0.0, 0.0], [-0.01, 0.0, 0.0], [0.0, 0.012, 0.012]], (len(points), 1))
     vertices = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
@@ -64,42 +64,37 @@ def write_mesh(path):
 def dataset(tmp_path):
     root = tmp_path / "mp 3d"
     folder = root / "v1" / "scans" / HOUSE / HOUSE
-    for k, camera in enumerate(cameras()):
+    for k, camera in enumerate(made.cameras()):
         write_skybox(folder, f"{k:032x}", *camera)
     write_mesh(folder / "house_segmentations" / f"{HOUSE}.ply")
     return root
 
 
 def test_skyboxes_fit(dataset, tmp_path, capsys):
-    code, (line,), err = run(capsys, "matterport3d", dataset, tmp_path / "out", "--check", 2)
+    code, (line,), err = made.run(capsys, "matterport3d", dataset, tmp_path / "out", "--check", 2)
     assert (code, err) == (0, "")
     assert (line["scene"], line["queries"], line["fits"]) == (HOUSE, 2, True)
-    scene = assert_fits(tmp_path / "out" / HOUSE, max_loss=0.16)
-    for query, (_, center) in zip(scene.queries, cameras(), strict=True):
+    scene = made.assert_fits(tmp_path / "out" / HOUSE, max_loss=0.16)
+    for query, (_, center) in zip(scene.queries, made.cameras(), strict=True):
         assert query.image.is_dir()
         np.testing.assert_allclose(query.pose.center_world, center, atol=1e-6)
 
 
 def test_skyboxes_without_a_pose_are_left_out(dataset, tmp_path, capsys):
     next(dataset.rglob("*_pose_1_5.txt")).unlink()
-    code, (line,), _ = run(capsys, "matterport3d", dataset, tmp_path / "out")
+    code, (line,), _ = made.run(capsys, "matterport3d", dataset, tmp_path / "out")
     assert (code, line["queries"]) == (0, 1)
 
 
 def test_damaged_files_are_refused(dataset, tmp_path, capsys):
     path = next(dataset.rglob("*_pose_1_2.txt"))
     path.write_text("1 0 0")
-    code, _, err = run(capsys, "matterport3d", dataset, tmp_path / "out")
-    assert code == 3
-    assert f"{path}: found 3 numbers, wanted 4 x 4 numbers" in err
+    message = f"{path}: found 3 numbers, wanted 4 x 4 numbers"
+    made.assert_refused(message, capsys, "matterport3d", dataset, tmp_path / "out")
     next(dataset.rglob("*.ply")).unlink()
-    code, _, err = run(capsys, "matterport3d", dataset, tmp_path / "out")
-    assert code == 3
-    assert "with a mesh" in err
+    made.assert_refused("with a mesh", capsys, "matterport3d", dataset, tmp_path / "out")
 
 
 def test_a_house_that_is_there_twice_is_refused(dataset, tmp_path, capsys):
     shutil.copytree(dataset / "v1" / "scans" / HOUSE / HOUSE, dataset / HOUSE)
-    code, lines, err = run(capsys, "matterport3d", dataset, tmp_path / "out")
-    assert (code, lines) == (3, [])
-    assert f"--from: found the scene {HOUSE} twice" in err
+    made.assert_refused(f"the scene {HOUSE} twice", capsys, "matterport3d", dataset, tmp_path / "out")

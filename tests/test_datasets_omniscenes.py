@@ -1,17 +1,8 @@
 """OmniScenes: its folders, and poses by its authors' x_cam = R (x - t)."""
 
+import dataset_rooms as made
 import numpy as np
 import pytest
-from dataset_rooms import (
-    FORWARD_LEFT_UP,
-    assert_fits,
-    cameras,
-    picture,
-    points_and_colors,
-    run,
-    write_picture,
-    write_text_cloud,
-)
 
 PLACES = (
     ("turtlebot", "turtlebot_weddingHall_1_scene_1", "img_0001.jpg"),
@@ -22,10 +13,10 @@ PLACES = (
 @pytest.fixture
 def dataset(tmp_path):
     root = tmp_path / "omni scenes"
-    write_text_cloud(root / "pcd" / "weddingHall_1.txt", *points_and_colors())
-    for (split, sequence, name), (R_world_from_cam, center) in zip(PLACES, cameras(), strict=True):
-        rgb, _ = picture(R_world_from_cam, center, FORWARD_LEFT_UP)
-        write_picture(root / f"{split}_pano" / sequence / name, rgb)
+    made.write_text_cloud(root / "pcd" / "weddingHall_1.txt", *made.points_and_colors())
+    for (split, sequence, name), (R_world_from_cam, center) in zip(PLACES, made.cameras(), strict=True):
+        rgb, _ = made.picture(R_world_from_cam, center, made.FORWARD_LEFT_UP)
+        made.write_picture(root / f"{split}_pano" / sequence / name, rgb)
         pose = root / f"{split}_pose" / sequence / name.replace(".jpg", ".txt")
         pose.parent.mkdir(parents=True)
         np.savetxt(pose, np.column_stack([R_world_from_cam.T, center]))
@@ -33,10 +24,10 @@ def dataset(tmp_path):
 
 
 def test_poses_fit_and_splits_are_variants(dataset, tmp_path, capsys):
-    code, (line,), err = run(capsys, "omniscenes", dataset, tmp_path / "out", "--check", 5)
+    code, (line,), err = made.run(capsys, "omniscenes", dataset, tmp_path / "out", "--check", 5)
     assert (code, err) == (0, "")
     assert (line["scene"], line["queries"], line["fits"]) == ("weddingHall_1", 2, True)
-    scene = assert_fits(tmp_path / "out" / "weddingHall_1")
+    scene = made.assert_fits(tmp_path / "out" / "weddingHall_1")
     assert sorted(query.variant for query in scene.queries) == ["change_handheld", "turtlebot"]
     assert len({query.image.name for query in scene.queries}) == 2
 
@@ -54,16 +45,14 @@ def test_poses_fit_and_splits_are_variants(dataset, tmp_path, capsys):
 def test_damaged_poses_are_refused(dataset, tmp_path, capsys, text, message):
     path = dataset / "turtlebot_pose" / PLACES[0][1] / "img_0001.txt"
     path.write_text(text)
-    code, lines, err = run(capsys, "omniscenes", dataset, tmp_path / "out")
+    code, lines, err = made.run(capsys, "omniscenes", dataset, tmp_path / "out")
     assert (code, lines) == (3, [])
     assert str(path) in err
     assert message in err
     path.unlink()
-    assert "No such file" in run(capsys, "omniscenes", dataset, tmp_path / "out")[2]
+    assert "No such file" in made.run(capsys, "omniscenes", dataset, tmp_path / "out")[2]
 
 
 def test_a_room_without_a_cloud_is_refused(dataset, tmp_path, capsys):
     (dataset / "pcd" / "weddingHall_1.txt").unlink()
-    code, _, err = run(capsys, "omniscenes", dataset, tmp_path / "out")
-    assert code == 3
-    assert "with a cloud pcd/ROOM_N.txt" in err
+    made.assert_refused("with a cloud pcd/ROOM_N.txt", capsys, "omniscenes", dataset, tmp_path / "out")

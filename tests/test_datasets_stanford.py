@@ -3,20 +3,9 @@
 import json
 
 import cv2
+import dataset_rooms as made
 import numpy as np
 import pytest
-from dataset_rooms import (
-    OPENGL,
-    assert_fits,
-    cameras,
-    picture,
-    pixels_of,
-    points_and_colors,
-    run,
-    vertices,
-    write_picture,
-    write_text_cloud,
-)
 from scipy.spatial.transform import Rotation
 
 from piccolo.cli import convert_dataset
@@ -35,21 +24,21 @@ def is_low(points):
 
 def write_room(root, area="1", room="office_1"):
     """Points as in S3DIS: all, and by object."""
-    points, colors = points_and_colors()
+    points, colors = made.points_and_colors()
     folder = root / "Stanford3dDataset_v1.2" / f"Area_{area}" / room
-    write_text_cloud(folder / f"{room}.txt", points, colors)
+    made.write_text_cloud(folder / f"{room}.txt", points, colors)
     low = is_low(points)
-    write_text_cloud(folder / "Annotations" / "chair_1.txt", points[low], colors[low])
+    made.write_text_cloud(folder / "Annotations" / "chair_1.txt", points[low], colors[low])
     rest = np.flatnonzero(~low)
-    write_text_cloud(folder / "Annotations" / "wall_1.txt", points[rest[20:]], colors[rest[20:]])
-    write_text_cloud(folder / "Annotations" / "clutter_7.txt", points[rest[:10]], colors[rest[:10]])
-    write_text_cloud(folder / "Annotations" / "stairs_1.txt", points[rest[10:20]], colors[rest[10:20]])
+    made.write_text_cloud(folder / "Annotations" / "wall_1.txt", points[rest[20:]], colors[rest[20:]])
+    made.write_text_cloud(folder / "Annotations" / "clutter_7.txt", points[rest[:10]], colors[rest[:10]])
+    made.write_text_cloud(folder / "Annotations" / "stairs_1.txt", points[rest[10:20]], colors[rest[10:20]])
 
 
 def write_panorama(root, number, camera, part="1", room="office_1", is_authors=False):
     """Picture, pose and semantic picture; returns the pose's path."""
     R_world_from_cam, center = camera
-    rgb, hits = picture(R_world_from_cam, center, OPENGL)
+    rgb, hits = made.picture(R_world_from_cam, center, made.OPENGL)
     if part == "5b":
         R_world_from_cam, center = M_5B.T @ R_world_from_cam, M_5B.T @ (center - T_5B)
     stem = f"camera_{number:032x}_{room}_frame_equirectangular_domain"
@@ -59,11 +48,11 @@ def write_panorama(root, number, camera, part="1", room="office_1", is_authors=F
     }
     if is_authors:
         folders["rgb"] = root / "pano" / f"area_{part}"
-    write_picture(folders["rgb"] / f"{stem}_rgb.png", rgb)
+    made.write_picture(folders["rgb"] / f"{stem}_rgb.png", rgb)
     index = np.where(is_low(hits), 1, 2)
     semantic = np.stack([index >> 16, index >> 8, index], axis=-1).astype(np.uint8)
     semantic[0] = MISSING
-    write_picture(folders["semantic"] / f"{stem}_semantic.png", semantic)
+    made.write_picture(folders["semantic"] / f"{stem}_semantic.png", semantic)
     pose = folders["pose"] / f"{stem}_pose.json"
     pose.parent.mkdir(parents=True, exist_ok=True)
     angles = Rotation.from_matrix(R_world_from_cam).as_euler("xyz")  # R_z R_y R_x
@@ -75,7 +64,7 @@ def write_panorama(root, number, camera, part="1", room="office_1", is_authors=F
 def dataset(tmp_path):
     root = tmp_path / "my data"
     write_room(root)
-    for k, camera in enumerate(cameras()):
+    for k, camera in enumerate(made.cameras()):
         write_panorama(root, k, camera)
     (root / "assets").mkdir()
     (root / "assets" / "semantic_labels.json").write_text(json.dumps(LABELS))
@@ -83,23 +72,23 @@ def dataset(tmp_path):
 
 
 def test_poses_fit_the_panoramas(dataset, tmp_path, capsys):
-    code, (line,), err = run(capsys, "stanford2d3ds", dataset, tmp_path / "o ut", "--check", 2)
+    code, (line,), err = made.run(capsys, "stanford2d3ds", dataset, tmp_path / "o ut", "--check", 2)
     assert (code, err) == (0, "")
     assert (line["scene"], line["status"], line["points"], line["queries"]) == (
         "area_1/office_1", "written", 20_000, 2,
     )  # fmt: skip
     assert line["fits"]
-    scene = assert_fits(tmp_path / "o ut" / "area_1" / "office_1")
+    scene = made.assert_fits(tmp_path / "o ut" / "area_1" / "office_1")
     assert {query.variant for query in scene.queries} == {"area_1"}
     assert all(query.image.is_symlink() for query in scene.queries)
     assert [s.name for s in find_scenes([tmp_path / "o ut"])] == ["area_1/office_1"]
 
 
 def test_labels_of_cloud_and_panoramas_agree(dataset, tmp_path, capsys):
-    code, (line,), _ = run(capsys, "stanford2d3ds", dataset, tmp_path / "out", "--labels", "--copy")
+    code, (line,), _ = made.run(capsys, "stanford2d3ds", dataset, tmp_path / "out", "--labels", "--copy")
     assert (code, line["points"]) == (0, 20_000)
-    scene = assert_fits(tmp_path / "out" / "area_1" / "office_1")
-    data = vertices(scene.cloud)
+    scene = made.assert_fits(tmp_path / "out" / "area_1" / "office_1")
+    data = made.vertices(scene.cloud)
     labels = data["label"]
     assert sorted(set(labels)) == [0, WALL, CHAIR, CLUTTER]
     assert (np.sum(labels == 0), np.sum(labels == CLUTTER)) == (10, 10)
@@ -109,7 +98,7 @@ def test_labels_of_cloud_and_panoramas_agree(dataset, tmp_path, capsys):
         shown = cv2.imread(str(query.labels), cv2.IMREAD_UNCHANGED)
         assert (shown.dtype, shown.shape) == (np.uint16, (128, 256))
         assert (shown[0] == 0).all()
-        rows, columns = pixels_of(query, points, 256)
+        rows, columns = made.pixels_of(query, points, 256)
         there = shown[rows, columns]
         is_told = (there > 0) & np.isin(labels, [WALL, CHAIR])
         # not all: some points are behind furniture
@@ -118,21 +107,21 @@ def test_labels_of_cloud_and_panoramas_agree(dataset, tmp_path, capsys):
 
 def test_area_5b_is_brought_to_the_clouds_frame(dataset, tmp_path, capsys):
     write_room(dataset, "5", "hallway_2")
-    for k, (camera, part) in enumerate(zip(cameras(), ("5a", "5b"), strict=True)):
+    for k, (camera, part) in enumerate(zip(made.cameras(), ("5a", "5b"), strict=True)):
         write_panorama(dataset, 10 + k, camera, part, "hallway_2")
-    code, (line,), _ = run(capsys, "stanford2d3ds", dataset, tmp_path / "out", "--areas", 5)
+    code, (line,), _ = made.run(capsys, "stanford2d3ds", dataset, tmp_path / "out", "--areas", 5)
     assert (code, line["scene"]) == (0, "area_5/hallway_2")
-    scene = assert_fits(tmp_path / "out" / "area_5" / "hallway_2")
+    scene = made.assert_fits(tmp_path / "out" / "area_5" / "hallway_2")
     assert [query.variant for query in scene.queries] == ["area_5a", "area_5b"]
 
 
 def test_the_authors_folders(tmp_path, capsys):
     root = tmp_path / "data"
-    write_text_cloud(root / "pcd_not_aligned" / "area_3" / "WC_1.txt", *points_and_colors())
-    for k, camera in enumerate(cameras()):
+    made.write_text_cloud(root / "pcd_not_aligned" / "area_3" / "WC_1.txt", *made.points_and_colors())
+    for k, camera in enumerate(made.cameras()):
         write_panorama(root, k, camera, "3", "WC_1", is_authors=True)
-    assert run(capsys, "stanford2d3ds", root, tmp_path / "out")[0] == 0
-    assert_fits(tmp_path / "out" / "area_3" / "WC_1")
+    assert made.run(capsys, "stanford2d3ds", root, tmp_path / "out")[0] == 0
+    made.assert_fits(tmp_path / "out" / "area_3" / "WC_1")
 
 
 def test_wrong_poses_fail_the_check_with_advice(dataset, tmp_path, capsys):
@@ -142,29 +131,27 @@ def test_wrong_poses_fail_the_check_with_advice(dataset, tmp_path, capsys):
         R = Rotation.from_euler("xyz", pose["final_camera_rotation"]) * turn
         pose["final_camera_rotation"] = list(R.as_euler("xyz"))
         path.write_text(json.dumps(pose))
-    code, (line,), err = run(capsys, "stanford2d3ds", dataset, tmp_path / "out", "--check", 2)
+    code, (line,), err = made.run(capsys, "stanford2d3ds", dataset, tmp_path / "out", "--check", 2)
     assert (code, line["fits"]) == (1, False)
-    assert "the poses don't fit the pictures" in err
+    assert "the poses don't fit the panoramas" in err
     assert "if the camera's x, y, z are z, y, -x" in err
 
 
 def test_a_scene_that_is_there_is_left_but_not_if_made_otherwise(dataset, tmp_path, capsys):
     out = tmp_path / "out"
-    run(capsys, "stanford2d3ds", dataset, out)
+    made.run(capsys, "stanford2d3ds", dataset, out)
     before = (out / "area_1" / "office_1" / "queries.json").stat().st_mtime_ns
-    code, (line,), _ = run(capsys, "stanford2d3ds", dataset, out)
+    code, (line,), _ = made.run(capsys, "stanford2d3ds", dataset, out)
     assert (code, line["status"], line["points"], line["queries"]) == (0, "there already", None, 2)
     assert (out / "area_1" / "office_1" / "queries.json").stat().st_mtime_ns == before
-    code, lines, err = run(capsys, "stanford2d3ds", dataset, out, "--labels")
-    assert (code, lines) == (3, [])
-    assert "remove it, or change --out" in err
+    made.assert_refused("remove it, or change --out", capsys, "stanford2d3ds", dataset, out, "--labels")
 
 
 def test_a_damaged_file_costs_its_room_only(dataset, tmp_path, capsys):
     write_room(dataset, "1", "office_2")
-    path = write_panorama(dataset, 20, cameras(1)[0], "1", "office_2")
+    path = write_panorama(dataset, 20, made.cameras(1)[0], "1", "office_2")
     path.write_text('{"camera_location": [1, 2], "final_camera_rotation": [0, 0, 0]}')
-    code, (line,), err = run(capsys, "stanford2d3ds", dataset, tmp_path / "out")
+    code, (line,), err = made.run(capsys, "stanford2d3ds", dataset, tmp_path / "out")
     assert (code, line["scene"]) == (3, "area_1/office_1")
     assert str(path) in err
     assert "camera_location has the shape (2,)" in err
@@ -183,61 +170,51 @@ def test_a_damaged_file_costs_its_room_only(dataset, tmp_path, capsys):
 def test_damaged_poses_are_refused(dataset, tmp_path, capsys, text, message):
     for path in dataset.rglob("*_pose.json"):
         path.write_text(text)
-    code, lines, err = run(capsys, "stanford2d3ds", dataset, tmp_path / "out")
-    assert (code, lines) == (3, [])
-    assert message in err
+    made.assert_refused(message, capsys, "stanford2d3ds", dataset, tmp_path / "out")
 
 
 def test_a_damaged_line_of_a_cloud_is_named(dataset, tmp_path, capsys):
     (path,) = dataset.rglob("office_1.txt")
     path.write_text(path.read_text() + "1.0 2.0 3.0 185\x10187 4 5\n")
-    code, _, err = run(capsys, "stanford2d3ds", dataset, tmp_path / "out")
-    assert code == 3
-    assert f"{path}: line 20001" in err
+    made.assert_refused(f"{path}: line 20001", capsys, "stanford2d3ds", dataset, tmp_path / "out")
     assert not list((tmp_path / "out" / "area_1").iterdir())
 
 
 def test_refused_folders(dataset, tmp_path, capsys):
-    code, _, err = run(capsys, "stanford2d3ds", tmp_path, tmp_path / "out")
-    assert code == 3
-    assert "found no room with panoramas" in err
-    code, _, err = run(capsys, "stanford2d3ds", dataset, tmp_path / "out", "--rooms", "office_9")
-    assert code == 3
-    assert "found no office_9, wanted one of office_1" in err
+    where = capsys, "stanford2d3ds", dataset, tmp_path / "out"
+    made.assert_refused("found no room with panoramas", *where[:2], tmp_path, where[3])
+    made.assert_refused("found no office_9, wanted one of office_1", *where, "--rooms", "office_9")
     (dataset / "Stanford3dDataset_v1.2").rename(dataset / "Stanford3dDataset_v1.2_Aligned_Version")
-    code, _, err = run(capsys, "stanford2d3ds", dataset, tmp_path / "out")
-    assert code == 3
-    assert "turned one by one" in err
+    made.assert_refused("turned one by one", *where)
 
 
 def test_rooms_without_a_cloud_are_counted(dataset, tmp_path, capsys):
-    write_panorama(dataset, 30, cameras(1)[0], "1", "pantry_1")
+    write_panorama(dataset, 30, made.cameras(1)[0], "1", "pantry_1")
     arguments = ["stanford2d3ds", "--from", str(dataset), "--out", str(tmp_path / "out")]
     assert convert_dataset.main(arguments) == 0
-    assert "1 rooms without a cloud: area_1/pantry_1" in capsys.readouterr().err
+    assert "1 scenes without a cloud: area_1/pantry_1" in capsys.readouterr().err
 
 
 def test_rooms_without_objects_have_no_labels(dataset, tmp_path, capsys):
+    def refusal():
+        code, _, err = made.run(capsys, "stanford2d3ds", dataset, tmp_path / "out", "--labels")
+        return code, err
+
+    names = dataset / "assets" / "semantic_labels.json"
     for path in dataset.rglob("Annotations/*.txt"):
         path.unlink()
-    code, _, err = run(capsys, "stanford2d3ds", dataset, tmp_path / "out", "--labels")
-    assert code == 3
-    assert "for labels Annotations beside it" in err
-    (dataset / "assets" / "semantic_labels.json").write_text("{}")
-    assert "wanted a list of names" in run(capsys, "stanford2d3ds", dataset, tmp_path / "out", "--labels")[2]
-    (dataset / "assets" / "semantic_labels.json").unlink()
-    assert "found no assets/semantic_labels.json" in run(
-        capsys, "stanford2d3ds", dataset, tmp_path / "out", "--labels"
-    )[2]  # fmt: skip
+    assert (refusal()[0], "with --labels Annotations" in refusal()[1]) == (3, True)
+    names.write_text("{}")
+    assert "wanted a list of names" in refusal()[1]
+    names.unlink()
+    assert "found no assets/semantic_labels.json" in refusal()[1]
 
 
 def test_a_folder_with_something_else_in_it_is_not_touched(dataset, tmp_path, capsys):
     folder = tmp_path / "out" / "area_1" / "office_1"
     folder.mkdir(parents=True)
     (folder / "notes.txt").write_text("mine")
-    code, lines, err = run(capsys, "stanford2d3ds", dataset, tmp_path / "out")
-    assert (code, lines) == (3, [])
-    assert "wanted a folder that is new or empty" in err
+    made.assert_refused("that is new or empty", capsys, "stanford2d3ds", dataset, tmp_path / "out")
     assert [path.name for path in folder.iterdir()] == ["notes.txt"]
 
 
@@ -252,7 +229,7 @@ def test_points_that_are_left_out_are_told(dataset, tmp_path, capsys):
 
 
 def test_wrong_usage(dataset, tmp_path, capsys):
-    assert run(capsys, "stanford2d3ds", dataset, tmp_path / "out", "--check", -1)[0] == 2
+    assert made.run(capsys, "stanford2d3ds", dataset, tmp_path / "out", "--check", -1)[0] == 2
     with pytest.raises(SystemExit) as caught:
-        run(capsys, "stanford2d3ds", dataset, tmp_path / "out", "--link", "--copy")
+        made.run(capsys, "stanford2d3ds", dataset, tmp_path / "out", "--link", "--copy")
     assert caught.value.code == 2

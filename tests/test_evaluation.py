@@ -1,4 +1,4 @@
-"""Rows, statistics, tables, pictures and comparisons of an evaluation."""
+"""Errors, statistics, tables, plots and comparisons of an evaluation."""
 
 import csv
 import io
@@ -10,17 +10,19 @@ from poses import result
 
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3
-from piccolo.scenes.evaluation import pictures, tables
+from piccolo.geometry.pose_error import is_correct
+from piccolo.scenes.evaluation import tables
 from piccolo.scenes.evaluation.compare import changes, pair_up, side_by_side
-from piccolo.scenes.evaluation.row import Row, match_results, row_of
-from piccolo.scenes.evaluation.run_file import appending, read_rows
-from piccolo.scenes.evaluation.statistics import (
-    PAPER_LIMITS,
-    accuracies,
-    quartiles,
-    risk_and_coverage,
-    summarize,
+from piccolo.scenes.evaluation.plots import errors_figure, figure_png, risk_figure
+from piccolo.scenes.evaluation.query_result import (
+    PAPER_THRESHOLDS,
+    QueryResult,
+    Thresholds,
+    match_results,
+    query_result_of,
 )
+from piccolo.scenes.evaluation.run_file import appending, read_run
+from piccolo.scenes.evaluation.statistics import accuracies, quartiles, risk_and_coverage, summarize
 from piccolo.scenes.scene import Query, Scene
 
 TRUE_POSE = Pose(exp_so3(np.array([0.4, 0.1, -2.0])), np.array([10.0, -4.0, 1.5]))
@@ -44,7 +46,7 @@ def _row(image, distance, angle_deg, **more):
     status, confidence = kind.pop("status", "localized"), kind.pop("confidence", 0.95)
     has_pose = np.isfinite(distance)
     found = result(image, _pose(distance, angle_deg) if has_pose else None, status, confidence=confidence)
-    return Row(
+    return QueryResult(
         kind["scene"], image, kind["variant"], kind["is_in_box"], distance, np.radians(angle_deg), found
     )
 
@@ -57,20 +59,27 @@ ROWS = [
 ]
 
 
-def test_errors_of_a_row(tmp_path):
+def test_errors_of_a_query(tmp_path):
     scene = _scene(tmp_path)
-    row = row_of(scene, scene.queries[0], result("a.jpg", _pose(0.05, 3.0)), True)
+    row = query_result_of(scene, scene.queries[0], result("a.jpg", _pose(0.05, 3.0)), True)
     assert row.position_error == pytest.approx(0.05)
     assert np.degrees(row.rotation_error) == pytest.approx(3.0)
     assert (row.scene, row.image, row.variant) == ("room", "images/a.jpg", "clean")
-    assert row.is_correct(0.1, np.radians(5.0))
-    assert not row.is_correct(0.04, np.radians(5.0))
-    assert not row.is_correct(0.1, np.radians(2.0))
+    assert row.is_correct()
+    assert not row.is_correct(Thresholds(max_distance=0.04))
+    assert not row.is_correct(Thresholds(max_angle=np.radians(2.0)))
+
+
+def test_a_pose_is_correct_below_both_thresholds_of_the_paper():
+    assert is_correct(_pose(0.09, 4.9), TRUE_POSE)
+    assert not is_correct(_pose(0.11, 0.0), TRUE_POSE)
+    assert not is_correct(_pose(0.0, 5.1), TRUE_POSE)
+    assert not is_correct(None, TRUE_POSE)
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.image)
-def test_a_row_comes_back(row):
-    back = Row.from_json(row.to_json())
+def test_a_query_result_comes_back(row):
+    back = QueryResult.from_json(row.to_json())
     assert back.to_json() == row.to_json()
     assert (back.key, back.variant, back.is_in_box) == (row.key, row.variant, row.is_in_box)
     assert back.position_error == row.position_error
@@ -78,9 +87,9 @@ def test_a_row_comes_back(row):
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", '{"format": "piccolo-pose/2"}'])
-def test_what_is_no_row_is_refused(text):
+def test_what_is_no_query_result_is_refused(text):
     with pytest.raises(InputError, match="evaluation: found"):
-        Row.from_json(text)
+        QueryResult.from_json(text)
 
 
 def test_results_find_their_queries_by_path_then_by_name(tmp_path):
@@ -132,14 +141,14 @@ def test_risk_over_coverage():
 
 
 def test_tables_have_a_line_a_split_a_room_and_all():
-    text = tables.summary_table(ROWS, PAPER_LIMITS, "all 4 queries").markdown()
+    text = tables.summary_table(ROWS, PAPER_THRESHOLDS, "all 4 queries").markdown()
     assert text.startswith("all 4 queries; correct: under 0.1 m and 5 deg\n\n| queries | number |")
     names = [line.split(" | ")[0] for line in text.splitlines()[4:]]
     assert names == ["| clean", "| photo", "| hall", "| room", "| all"]
     assert text.splitlines()[7].startswith(
         "| room | 2 | 2 | 1.000 | 0.0150 | 0.0200 | 0.0250 | 0.250 | 0.300 "
     )
-    assert "| all | 0.250 | 0.500 | 0.500 |" in tables.threshold_table(ROWS, PAPER_LIMITS).markdown()
+    assert "| all | 0.250 | 0.500 | 0.500 |" in tables.threshold_table(ROWS, PAPER_THRESHOLDS).markdown()
     assert "| hall | d.jpg | not_localized | inf | inf | 0.000 |" in tables.per_query(ROWS).markdown()
 
 
@@ -151,42 +160,60 @@ def test_csv_has_base_units_and_blanks_where_there_is_no_pose():
     assert (lines[3]["position_error_m"], lines[3]["is_in_box"]) == ("", "false")
 
 
-def test_pictures_are_drawn():
-    for png in (
-        pictures.errors_png({"one": ROWS, "two": ROWS[:2]}, PAPER_LIMITS),
-        pictures.risk_png(risk_and_coverage(ROWS)),
-    ):
-        image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
-        assert min(image.shape[:2]) > 300
-        assert image.std() > 10.0
+def _curves(axes):
+    """Label, x and y of each curve, without the far ends; the vertical line of a threshold has x alone."""
+    curves = [(line.get_label(), *np.transpose(line.get_xydata()[1:-1])) for line in axes.get_lines()]
+    return [(label, *(np.round(v, 6).tolist() for v in xy)) for label, *xy in curves if len(xy) == 2]
+
+
+def test_plots_show_the_errors():
+    figure = errors_figure({"one": ROWS, "two": ROWS[:2]}, PAPER_THRESHOLDS)
+    position, rotation, recall = figure.axes
+    distances = [0.01, 0.03, 0.09], [25.0, 50.0, 75.0]  # the fourth has no pose
+    assert _curves(position)[:2] == [("one", *distances), ("two", distances[0][:2], [50.0, 100.0])]
+    assert _curves(rotation)[0] == ("one", [0.2, 0.4, 6.0], distances[1])
+    assert _curves(recall)[1] == ("one, under 5 deg", distances[0][:2], distances[1][:2])
+    assert [axes.get_lines()[-1].get_xdata()[0] for axes in figure.axes] == [0.1, 5.0, 0.1]
+    image = cv2.imdecode(np.frombuffer(figure_png(figure), np.uint8), cv2.IMREAD_COLOR)
+    assert image.shape == (504, 1680, 3)
+    assert (image != 255).any(axis=2).mean() > 0.02  # ink
+
+
+def test_plot_of_risk_shows_the_curve_and_the_usual_confidences():
+    (axes,) = risk_figure(risk_and_coverage(ROWS)).axes
+    curve, *marks = axes.get_lines()
+    expected = [[0.0, 50.0], [50.0, 50.0], [75.0, 100 / 3], [100.0, 50.0]]
+    np.testing.assert_allclose(curve.get_xydata(), expected)
+    assert [mark.get_label() for mark in marks] == ["confidence 0.9", "confidence 0.5"]
+    np.testing.assert_allclose([mark.get_xydata()[0] for mark in marks], expected[1:3])
 
 
 def test_two_runs_side_by_side():
     second = [_row("a.jpg", 0.01, 0.2), _row("b.jpg", 0.5, 0.4, variant="photo"), ROWS[2]]
     pairs = pair_up(ROWS, second)
     assert [pair.first.image for pair in pairs] == ["c.jpg", "a.jpg", "b.jpg"]
-    text = side_by_side(pairs, ("old", "new"), PAPER_LIMITS).markdown()
+    text = side_by_side(pairs, ("old", "new"), PAPER_THRESHOLDS).markdown()
     assert "| old | 3 | 2 | 0.667 | 2 | 1 |" in text
     assert "| new | 3 | 1 | 0.333 | 3 | 2 |" in text
-    changed = changes(pairs, PAPER_LIMITS).markdown().splitlines()[4:]
+    changed = changes(pairs, PAPER_THRESHOLDS).markdown().splitlines()[4:]
     assert changed == [
         "| room | b.jpg | worse | ambiguous 0.50: 0.030 m, 0.40 deg | localized 0.95: 0.500 m, 0.40 deg |"
     ]
 
 
-def test_a_run_is_taken_up_after_its_last_whole_line(tmp_path):
+def test_a_run_is_resumed_after_its_last_whole_line(tmp_path):
     path = tmp_path / "run.jsonl"
     path.write_text("".join(row.to_json() + "\n" for row in ROWS[:2]) + ROWS[2].to_json()[:50])
-    rows, size = read_rows(path)
+    rows, size = read_run(path)
     assert [row.image for row in rows] == ["a.jpg", "b.jpg"]
     with appending(path, size) as append:
         append(ROWS[3])
         with pytest.raises(InputError, match="another process is writing"), appending(path, size):
             pass
-    assert [row.image for row in read_rows(path)[0]] == ["a.jpg", "b.jpg", "d.jpg"]
+    assert [row.image for row in read_run(path)[0]] == ["a.jpg", "b.jpg", "d.jpg"]
     path.write_text('{"my": "notes"}')
-    with pytest.raises(InputError, match="found a last line that is no row"):
-        read_rows(path)
+    with pytest.raises(InputError, match="the last line is none of a run"):
+        read_run(path)
     path.write_text("{}\n")
-    with pytest.raises(InputError, match=r"run\.jsonl: line 1: evaluation: found"):
-        read_rows(path)
+    with pytest.raises(InputError, match=r"run\.jsonl, line 1: evaluation: found"):
+        read_run(path)

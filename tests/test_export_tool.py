@@ -16,8 +16,9 @@ from refusals import mutated, read_or_refused
 
 from piccolo.cli import export_poses
 from piccolo.errors import InputError
+from piccolo.result import read_results
 from piccolo.runtime.atomic import check_output_folder, replacing_folder
-from piccolo.scenes.export import FORMATS, read_results, select
+from piccolo.scenes.export import FORMATS, select
 from piccolo.scenes.scene import Query, write_queries
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -158,13 +159,13 @@ def test_damaged_results_are_refused_with_file_and_line(tmp_path, what):
     path = tmp_path / "r.jsonl"
     path.write_text(MIXED[0].to_json() + "\n\n" + DAMAGED[what] + "\n")
     with pytest.raises(InputError, match=r"r\.jsonl, line 3: ") as caught:
-        read_results(path)
+        read_results([path])
     assert "\n" not in str(caught.value)
     path.write_bytes(b"\xff\xfe")
     with pytest.raises(InputError, match=r"r\.jsonl, line 1: "):
-        read_results(path)
+        read_results([path])
     with pytest.raises(InputError, match="not a file but a folder"):
-        read_results(tmp_path)
+        read_results([tmp_path])
 
 
 @given(st.data())
@@ -173,7 +174,7 @@ def test_any_damage_of_results_is_refused_or_harmless(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("damaged") / "r.jsonl"
     content = (MIXED[0].to_json() + "\n").encode() * 2
     path.write_bytes(mutated(data.draw, st.integers, content))
-    results, _ = read_or_refused(read_results, path)
+    results, _ = read_or_refused(lambda p: read_results([p]), path)
     for r in results or []:
         np.testing.assert_allclose(r.pose.R_cam_from_world @ r.pose.R_cam_from_world.T, np.eye(3), atol=1e-5)
 

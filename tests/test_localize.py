@@ -11,35 +11,21 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from rooms import errors, query
+from rooms import errors, query, write_room
 
-from piccolo.cli import evaluate, localize, make_room, prepare_map
+from piccolo.cli import evaluate, localize, prepare_map
 from piccolo.geometry.pose import Pose
 from piccolo.result import Result
 
 ROOT = Path(__file__).resolve().parents[1]
 QUICK = ["--no-cache"]
-PAPER = ["--preset", "paper", "--translations", "30", "--iterations", "60", "--max-points", "30000"]
+PAPER = ["--preset", "paper", "--num-translations", "30", "--num-iterations", "60", "--max-points", "30000"]
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     """A folder, with a space in its name, of one room and two panoramas."""
-    folder = tmp_path_factory.mktemp("a scene")
-    arguments = [
-        "--out",
-        str(folder),
-        "--seed",
-        "7",
-        "--points",
-        "60000",
-        "--panoramas",
-        "2",
-        "--width",
-        "512",
-    ]
-    assert make_room.main([*arguments, "--size", "4.5", "3.5", "2.5", "--quiet"]) == 0
-    return folder
+    return write_room(tmp_path_factory.mktemp("a scene"), "--seed 7 --points 60000 --panoramas 2 --width 512")
 
 
 def _arguments(scene, *more):
@@ -161,15 +147,15 @@ def test_panorama_from_elsewhere_exits_with_one(scene, tmp_path, capsys):
     [
         (["--threads", "0"], 2, "--threads: found 0, wanted at least 1"),
         (["--scale", "-1"], 2, "--scale: found -1.0"),
-        (["--preset", "paper", "--translations", "0"], 2, "num_translations: found 0"),
-        (["--translations", "9"], 2, "--translations: not an option of the preset default"),
+        (["--preset", "paper", "--num-translations", "0"], 2, "num_translations: found 0"),
+        (["--num-translations", "9"], 2, "--num-translations: not an option of the preset default"),
         (["--preset", "paper", "--near", "0", "0", "0"], 2, "--near: not an option of the preset paper"),
         (["--preset", "paper", "--gravity", "auto"], 2, "gravity: found auto"),
         (["--near", "0", "0", "0"], 2, "--near, --radius: found one of them"),
         (["--height", "2", "1"], 2, "--height: found [2.0, 1.0]"),
         (["--heading-tolerance", "0"], 2, "--heading-tolerance: found 0.0"),
         (["--max-starts", "0"], 2, "max_starts: found 0"),
-        (["--cache", "x"], 2, "--cache, --no-cache: found both"),
+        (["--cache", "x"], 2, "--cache, --no-cache: only one of them"),
         (["--overlay", "x.png", "--pano", "a", "b"], 2, "--overlay: found 2 panoramas, wanted one"),
         (["--cloud", "no such.ply"], 3, "no such.ply"),
         (["--pano", "no such.jpg"], 3, "no such.jpg"),
@@ -214,7 +200,13 @@ def test_usage_and_version(capsys):
         with pytest.raises(SystemExit) as stop:
             localize.main(options)
         assert stop.value.code == code
-    assert "exit codes" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert "exit codes" in text
+    assert "--num-by-loss" not in text
+    with pytest.raises(SystemExit) as stop:
+        localize.main(["--help-paper"])
+    assert stop.value.code == 0
+    assert "--num-by-loss K1" in capsys.readouterr().out
 
 
 def _process(arguments, **options):
@@ -225,7 +217,7 @@ def _process(arguments, **options):
 def test_interrupt_leaves_nothing_half_written(scene, tmp_path):
     out = tmp_path / "pose.json"
     process = _process(
-        [*_arguments(scene, "--out", str(out)), *PAPER, "--translations", "5000"], cwd=tmp_path
+        [*_arguments(scene, "--out", str(out)), *PAPER, "--num-translations", "5000"], cwd=tmp_path
     )
     process.stderr.read(1)  # the bar of the search: imports are over
     process.send_signal(signal.SIGINT)

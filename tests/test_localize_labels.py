@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 from plyfile import PlyData
-from rooms import errors
+from rooms import errors, write_room
 
-from piccolo.cli import localize, make_room, prepare_map
+from piccolo.cli import localize, prepare_map
 from piccolo.cloud.label_colors import Labels
 from piccolo.cloud.settings import CloudSettings
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
@@ -17,20 +17,18 @@ from piccolo.panorama import ReadOptions
 from piccolo.paper.settings import PaperSettings
 from piccolo.pipeline import CachePolicy
 from piccolo.result import Result
-from piccolo.scenes.evaluation.runner import Failure, Job, Plan, run_job
+from piccolo.scenes.evaluation.runner import Failure, Job, RunConfig, run_job
 from piccolo.scenes.scene import read_scene
 from piccolo.scenes.synthetic.room import LABEL_NAMES
 
-PAPER = ["--preset", "paper", "--translations", "30", "--iterations", "60", "--max-points", "30000"]
+PAPER = ["--preset", "paper", "--num-translations", "30", "--num-iterations", "60", "--max-points", "30000"]
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     """A room with labels, and one panorama."""
-    folder = tmp_path_factory.mktemp("labels")
-    size = ["--size", "4.5", "3.5", "2.5", "--width", "512", "--points", "60000", "--panoramas", "1"]
-    assert make_room.main(["--out", str(folder), "--seed", "7", *size, "--labels", "--quiet"]) == 0
-    return folder
+    words = "--seed 7 --width 512 --points 60000 --panoramas 1 --labels"
+    return write_room(tmp_path_factory.mktemp("labels"), words)
 
 
 def _localized(scene, capsys, *options, pano="labels/clean_0.png"):
@@ -79,7 +77,7 @@ def test_ignored_labels_stand_in_the_result_and_everything_ignored_is_refused(sc
 
 def test_wrong_use_of_labels_is_refused(scene, capsys):
     for options, expected, told in (
-        (["--ignore-labels", "3"], 2, "--ignore-labels: found without --labels, wanted both"),
+        (["--ignore-labels", "3"], 2, "--ignore-labels: only with --labels"),
         (["--labels", "--intensity-as-gray"], 2, "--labels, --intensity-as-gray: found both"),
         (["--labels", "--fov", "90"], 2, "--labels: found --fov or --cube-order too"),
     ):
@@ -109,15 +107,16 @@ def test_prepared_map_of_labels_wants_labels(scene, tmp_path, capsys):
 def test_evaluation_takes_the_pictures_of_labels(scene):
     labels = Labels()
     settings = CoarseToFineSettings(min_starts=100, max_starts=100)
-    plan = Plan(settings, CloudSettings(labels=labels), ReadOptions(labels=labels), CachePolicy(False), 2)
+    reading = CloudSettings(labels=labels), ReadOptions(labels=labels)
+    config = RunConfig(settings, *reading, CachePolicy(False), 2)
     here = read_scene(scene)
-    (row,) = run_job(plan, Job(here, here.queries))
+    (row,) = run_job(config, Job(here, here.queries))
     assert row.result.pano == str(here.queries[0].labels)
     document = json.loads((scene / "queries.json").read_text())
     del document["queries"][0]["labels"]
     (scene / "unlabelled.json").write_text(json.dumps(document))
     here = read_scene(scene / "unlabelled.json")
-    (failure,) = run_job(plan, Job(here, here.queries))
+    (failure,) = run_job(config, Job(here, here.queries))
     assert isinstance(failure, Failure)
     assert "images/clean_0.jpg has no labels in queries.json" in failure.text
 

@@ -1,10 +1,12 @@
 import numpy as np
 import pytest
 
+from piccolo.errors import InputError
 from piccolo.geometry.pose import (
     Pose,
     T_world_from_cam,
     angle_between,
+    checked_rotation,
     exp_so3,
     left_jacobian,
     orthonormal,
@@ -85,3 +87,12 @@ def test_upright_camera_looks_along_its_yaw():
     yaw = 0.7
     forward = yaw_rotation(yaw).T @ [1.0, 0.0, 0.0]
     np.testing.assert_allclose(forward, [np.cos(yaw), np.sin(yaw), 0.0], atol=1e-12)
+
+
+def test_rotations_are_checked_to_a_tolerance():
+    R = exp_so3(VECTORS[2])
+    checked_rotation(R + 4e-4, 1e-2, "R")
+    assert checked_rotation(R, 1e-12, "R") is R
+    for wrong in (R + 4e-4, R[::-1], np.full((3, 3), np.nan), R * 1e300, R[0], np.eye(4)):
+        with pytest.raises(InputError, match="file: R is no rotation"):
+            checked_rotation(wrong, 1e-4, "file: R")

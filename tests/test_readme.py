@@ -35,10 +35,10 @@ def test_readme_room_runs_as_written(tmp_path):
 
 def test_readme_pipeline_runs_as_written(tmp_path):
     _, pipeline = _readme_commands()
-    told = _run_all(pipeline, tmp_path)
+    printed = _run_all(pipeline, tmp_path)
     assert len((tmp_path / "poses.jsonl").read_text().splitlines()) == 2
-    assert '"fits": true' in told
-    assert '"status": "aligned"' in told
-    assert "| default.jsonl | 2 | 2 | 1.000 |" in told
+    assert '"fits": true' in printed
+    assert '"status": "aligned"' in printed
+    assert "| default.jsonl | 2 | 2 | 1.000 |" in printed
     assert (tmp_path / "aligned" / "room.map").stat().st_size > 100_000
     assert len((tmp_path / "paper.jsonl").read_text().splitlines()) == 2

@@ -1,4 +1,4 @@
-"""The paper's experiments: what is changed of a scene, which arms there are, and the tool that runs them."""
+"""The paper's experiments: transforms of scenes, conditions, and the tool that runs them."""
 
 import json
 from dataclasses import replace
@@ -6,9 +6,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from rooms import write_room
 
-from piccolo.cli import make_room
-from piccolo.cli import reproduce_paper as experiments
+from piccolo.cli import reproduce_paper
 from piccolo.cloud import read_cloud
 from piccolo.cloud.soa import pack_points
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
@@ -19,9 +19,15 @@ from piccolo.panorama import read_panorama
 from piccolo.panorama.texels import pack_texels
 from piccolo.paper.settings import PaperSettings
 from piccolo.render.zbuffer import visible_points
-from piccolo.scenes.evaluation.run_file import read_rows
-from piccolo.scenes.experiments.arms import EXPERIMENTS
-from piccolo.scenes.experiments.changes import as_it_is, flipped, turned_at_random, with_count, with_share
+from piccolo.scenes.evaluation.run_file import read_run
+from piccolo.scenes.reproduce_paper.experiments import EXPERIMENTS
+from piccolo.scenes.reproduce_paper.transforms import (
+    flipped,
+    identity,
+    with_count,
+    with_fraction,
+    with_random_rotation,
+)
 from piccolo.scenes.scene import Query, read_scene, write_queries
 
 PRESETS = [PaperSettings(), CoarseToFineSettings()]
@@ -30,11 +36,8 @@ PRESETS = [PaperSettings(), CoarseToFineSettings()]
 @pytest.fixture(scope="module")
 def rooms(tmp_path_factory):
     """Two rooms with labels."""
-    folder = tmp_path_factory.mktemp("the rooms")
-    words = ["--scenes", "2", "--seed", "7", "--points", "40000", "--panoramas", "1", "--width", "256"]
-    words += ["--variants", "clean", "tilt", "--labels", "--size", "4.5", "3.5", "2.5", "--quiet"]
-    assert make_room.main(["--out", str(folder), *words]) == 0
-    return folder
+    words = "--scenes 2 --seed 7 --points 40000 --panoramas 1 --width 256 --variants clean tilt --labels"
+    return write_room(tmp_path_factory.mktemp("the rooms"), words)
 
 
 def _loss(scene, number):
@@ -45,39 +48,39 @@ def _loss(scene, number):
     return sampling_loss(points, pack_texels(read_panorama(query.image).rgb), pose)
 
 
-@pytest.mark.parametrize("change", [as_it_is, turned_at_random, flipped, with_share(0.5), with_count(9000)])
+@pytest.mark.parametrize(
+    "transform", [identity, with_random_rotation, flipped, with_fraction(0.5), with_count(9000)]
+)
 @pytest.mark.parametrize("number", [0, 1])
-def test_a_changed_scene_fits_its_true_poses(rooms, tmp_path, change, number):
-    scene = read_scene(rooms / "000")
-    changed = change(scene, tmp_path)
-    assert _loss(changed, number) < 0.09
-    wrong = replace(changed.queries[number].pose, R_cam_from_world=np.diag([-1.0, -1.0, 1.0]))
-    queries = [replace(query, pose=wrong) for query in changed.queries]
-    assert _loss(replace(changed, queries=tuple(queries)), number) > 0.2
+def test_a_transformed_scene_fits_its_true_poses(rooms, tmp_path, transform, number):
+    transformed = transform(read_scene(rooms / "000"), tmp_path)
+    assert _loss(transformed, number) < 0.09
+    wrong = replace(transformed.queries[number].pose, R_cam_from_world=np.diag([-1.0, -1.0, 1.0]))
+    queries = [replace(query, pose=wrong) for query in transformed.queries]
+    assert _loss(replace(transformed, queries=tuple(queries)), number) > 0.2
 
 
-def test_what_a_change_leaves_alone(rooms, tmp_path):
+def test_what_a_transform_leaves_alone(rooms, tmp_path):
     scene = read_scene(rooms / "000")
-    names = ("turned", "again", "flipped", "thinned")
-    folders = [tmp_path / name for name in names]
+    folders = [tmp_path / name for name in ("turned", "again", "flipped", "thinned")]
     for folder in folders:
         folder.mkdir()
-    turned = turned_at_random(scene, folders[0])
-    poses = [(a.pose, b.pose) for a, b in zip(scene.queries, turned.queries, strict=True)]
-    angles = {
-        round(float(np.degrees(angle_between(a.R_cam_from_world, b.R_cam_from_world))), 6) for a, b in poses
-    }
-    assert len(angles) == 1
-    assert angles.pop() > 1.0
+    turned = with_random_rotation(scene, folders[0])
+    angles = [
+        angle_between(old.pose.R_cam_from_world, new.pose.R_cam_from_world)
+        for old, new in zip(scene.queries, turned.queries, strict=True)
+    ]
+    assert angles == pytest.approx([angles[0]] * 2, abs=1e-7)
+    assert np.degrees(angles[0]) > 1.0
     assert turned.queries[0].image == scene.queries[0].image
-    turned_at_random(scene, folders[1])
+    with_random_rotation(scene, folders[1])
     assert (folders[0] / "cloud.ply").read_bytes() == (folders[1] / "cloud.ply").read_bytes()
-    upside_down = flipped(scene, folders[2])
-    assert upside_down.cloud == scene.cloud
-    assert [upside_down.name_of(q) for q in upside_down.queries] == [scene.name_of(q) for q in scene.queries]
-    up_in_camera = upside_down.queries[0].pose.R_cam_from_world @ [0.0, 0.0, 1.0]
+    changed = flipped(scene, folders[2])
+    assert changed.cloud == scene.cloud
+    assert [changed.name_of(q) for q in changed.queries] == [scene.name_of(q) for q in scene.queries]
+    up_in_camera = changed.queries[0].pose.R_cam_from_world @ [0.0, 0.0, 1.0]
     np.testing.assert_allclose(up_in_camera, [0.0, 0.0, -1.0], atol=1e-12)
-    assert len(read_cloud(with_share(0.1)(scene, folders[3]).cloud).points) == 4000
+    assert len(read_cloud(with_fraction(0.1)(scene, folders[3]).cloud).points) == 4000
 
 
 def test_pictures_beside_the_scene_and_masked_ones_are_flipped_too(rooms, tmp_path):
@@ -89,10 +92,10 @@ def test_pictures_beside_the_scene_and_masked_ones_are_flipped_too(rooms, tmp_pa
     (tmp_path / "room").mkdir()
     write_queries(tmp_path / "room", [Query(tmp_path / "raw" / "a.png", "clean", pose)])
     (tmp_path / "new").mkdir()
-    changed = flipped(read_scene(tmp_path / "room"), tmp_path / "new")
-    assert changed.name_of(changed.queries[0]) == "../raw/a.png"
-    assert changed.queries[0].image.resolve().is_relative_to(tmp_path / "new")
-    is_valid = read_panorama(changed.queries[0].image).is_valid
+    transformed = flipped(read_scene(tmp_path / "room"), tmp_path / "new")
+    assert transformed.name_of(transformed.queries[0]) == "../raw/a.png"
+    assert transformed.queries[0].image.resolve().is_relative_to(tmp_path / "new")
+    is_valid = read_panorama(transformed.queries[0].image).is_valid
     assert is_valid[:44].all()
     assert not is_valid[44:].any()
 
@@ -103,38 +106,40 @@ def test_too_few_points_are_told(rooms, tmp_path):
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_arms_differ_and_have_files_of_their_own(name):
-    arms = EXPERIMENTS[name].arms_of(PRESETS, ["change", "clean"])
-    assert len(arms) >= 2
-    assert len({experiments.file_name(arm) for arm in arms}) == len(arms)
-    tried = {(repr(arm.settings), repr(arm.change), arm.variants, arm.use_labels) for arm in arms}
-    assert len(tried) == len(arms)
+def test_conditions_differ_and_have_files_of_their_own(name):
+    conditions = EXPERIMENTS[name].conditions_of(PRESETS, ["change", "clean"])
+    assert len(conditions) >= 2
+    assert len({reproduce_paper.file_name(condition) for condition in conditions}) == len(conditions)
+    tried = {(repr(c.settings), repr(c.transform), c.variants, c.use_labels) for c in conditions}
+    assert len(tried) == len(conditions)
 
 
-def test_the_tool_writes_table_plot_and_rows_and_takes_them_up_again(rooms, tmp_path, monkeypatch, capsys):
-    quick = PaperSettings(num_translations=8, num_iterations=20)
-    monkeypatch.setitem(experiments.PRESETS, "paper", quick)
-    command = ["labels", "variants", "--scenes", str(rooms), "--out", str(tmp_path / "out"), "--quiet"]
-    command += ["--presets", "paper"]
-    assert experiments.main([*command, "--variants", "clean"]) == 0
-    out = capsys.readouterr().out
-    assert "| RGB | paper | 2 |" in out
-    assert "| labels | paper | 2 |" in out
-    assert "| clean | paper | 2 |" in out
-    assert "| tilt |" not in out
-    assert (tmp_path / "out" / "labels.png").read_bytes()[1:4] == b"PNG"
-    rows = read_rows(tmp_path / "out" / "labels" / "labels_paper.jsonl")[0]
+def _command(names, scenes, out, *more):
+    words = ["--presets", "paper", "--num-translations", "8", "--num-iterations", "20", "--quiet", *more]
+    return reproduce_paper.main([*names.split(), "--scenes", str(scenes), "--out", str(out), *words])
+
+
+def test_the_tool_writes_table_plot_and_runs_and_resumes_them(rooms, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert _command("labels variants", rooms, out, "--variants", "clean") == 0
+    text = capsys.readouterr().out
+    assert "| RGB | paper | 2 |" in text
+    assert "| labels | paper | 2 |" in text
+    assert "| clean | paper | 2 |" in text
+    assert "| tilt |" not in text
+    assert (out / "labels.png").read_bytes()[1:4] == b"PNG"
+    rows = read_run(out / "labels" / "labels_paper.jsonl")[0]
     assert [row.scene for row in rows] == ["000", "001"]
     assert rows[0].result.pano.endswith("labels/clean_0.png")
-    before = (tmp_path / "out" / "labels.md").read_text()
-    assert experiments.main([*command, "--variants", "clean"]) == 0
-    assert (tmp_path / "out" / "labels.md").read_text() == before
-    assert experiments.main(command) == 0
+    assert rows[0].result.settings["num_translations"] == 8
+    before = (out / "labels.md").read_text()
+    assert _command("labels variants", rooms, out, "--variants", "clean") == 0
+    assert (out / "labels.md").read_text() == before
+    assert _command("variants", rooms, out) == 0
     assert "| tilt | paper | 2 |" in capsys.readouterr().out
 
 
-def test_what_cannot_be_tried_is_told(rooms, tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(experiments.PRESETS, "paper", PaperSettings(num_translations=8, num_iterations=20))
+def test_what_cannot_be_localized_is_named(rooms, tmp_path, capsys):
     scene = tmp_path / "room"
     scene.mkdir()
     document = json.loads((rooms / "000" / "queries.json").read_text())
@@ -142,10 +147,11 @@ def test_what_cannot_be_tried_is_told(rooms, tmp_path, monkeypatch, capsys):
     for entry in document["queries"]:
         entry["image"] = str(rooms / "000" / entry["image"])
     (scene / "queries.json").write_text(json.dumps(document))
-    command = ["runtime", "--scenes", str(scene), "--out", str(tmp_path / "out"), "--presets", "paper"]
-    assert experiments.main([*command, "--quiet"]) == 3
-    told = capsys.readouterr()
-    assert "found 40000 points, wanted at least 100000" in told.err
-    assert "| 10000 points | paper | 2 |" in told.out
-    assert experiments.main(["variants", *command[1:], "--variants", "none"]) == 3
-    assert "variants: found no query that could be tried" in capsys.readouterr().err
+    assert _command("runtime", scene, tmp_path / "out") == 3
+    out, err = capsys.readouterr()
+    assert "found 40000 points, wanted at least 100000" in err
+    assert "| 10000 points | paper | 2 |" in out
+    assert _command("variants", scene, tmp_path / "out", "--variants", "none") == 3
+    assert "variants: no query could be localized" in capsys.readouterr().err
+    for wrong in (["--jobs", "0"], ["--num-by-loss", "0"]):
+        assert _command("variants", scene, tmp_path / "out", *wrong) == 2

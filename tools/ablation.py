@@ -1,8 +1,7 @@
 #!/usr/bin/env python3
-"""What each part of the default engine brings: share found by variant with one part taken out at a time."""
+"""The gain of each part of the default method: recall by variant with one part removed at a time."""
 
 import argparse
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,6 +10,8 @@ from pathlib import Path
 import _checkout  # noqa: F401
 import numpy as np
 
+from piccolo.cli.errors import run_command
+from piccolo.cli.parser import add_run_options, new_parser
 from piccolo.cloud import read_cloud
 from piccolo.cloud.model import Cloud
 from piccolo.coarse_to_fine.config import METHOD, Beam, ImageScales, MethodConfig
@@ -18,7 +19,6 @@ from piccolo.coarse_to_fine.localize import localize
 from piccolo.coarse_to_fine.scan_map import SEARCH_VIEW, prepare_map
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.coarse_to_fine.view import ViewConfig
-from piccolo.errors import InputError
 from piccolo.geometry.pose_error import is_correct
 from piccolo.geometry.rotations import Gravity
 from piccolo.panorama import read_panorama
@@ -32,7 +32,6 @@ example:
 
 A folder has cloud.ply, queries.json and images. Gravity is unknown for the variant tilt, else known;
 correct is under 0.1 m and 5 degrees. Seconds are medians of a query.
-exit codes: 0 done, 2 wrong usage, 3 bad input.
 """
 VARIANTS = ("clean", "tilt", "photo", "change")
 EVERYTHING = 120.0  # [deg] a neighbourhood that is the whole sphere: one mean and one deviation for all
@@ -81,30 +80,29 @@ def row(part: str, scenes: list[tuple[Scene, Cloud]]) -> str:
             if found.pose is not None and is_correct(found.pose, query.pose):
                 counts[query.variant] += 1
                 errors.append(float(np.linalg.norm(found.pose.center_world - query.pose.center_world)))
-    shares = " | ".join(f"{counts[v]}/{totals[v]}" for v in VARIANTS)
+    recall = " | ".join(f"{counts[v]}/{totals[v]}" for v in VARIANTS)
     median_mm = 1000.0 * float(np.median(errors)) if errors else float("nan")
-    return f"| {part} | {shares} | {median_mm:.1f} | {np.median(seconds):.2f} |"
+    return f"| {part} | {recall} | {median_mm:.1f} | {np.median(seconds):.2f} |"
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the table."""
+    scenes = [(scene, read_cloud(scene.cloud)) for scene in map(read_scene, arguments.scenes)]
+    print("| part | clean | tilt | photo | change | median mm | s |")
+    print("|---|---:|---:|---:|---:|---:|---:|")
+    row("all of it", scenes[:1])  # compiles
+    for part in PARTS:
+        print(row(part, scenes), flush=True)
+    return 0
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = new_parser("ablation", __doc__, EPILOG)
     parser.add_argument("scenes", type=Path, nargs="+", metavar="FOLDER", help="scenes with true poses")
-    arguments = parser.parse_args(argv)
-    try:
-        scenes = [(scene, read_cloud(scene.cloud)) for scene in map(read_scene, arguments.scenes)]
-        print("| part | clean | tilt | photo | change | median mm | s |")
-        print("|---|---:|---:|---:|---:|---:|---:|")
-        row("all of it", scenes[:1])  # compiles
-        for part in PARTS:
-            print(row(part, scenes), flush=True)
-    except (OSError, InputError) as error:
-        print(f"ablation.py: {error}", file=sys.stderr)
-        return 3
-    return 0
+    add_run_options(parser)
+    return run_command(parser, argv, run)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

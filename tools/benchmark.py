@@ -2,7 +2,6 @@
 """Kernel speed against named references, as ratios within one run."""
 
 import argparse
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,6 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from piccolo.cli.errors import UsageError, run_command
+from piccolo.cli.parser import add_run_options, new_parser
 from piccolo.cloud import read_cloud
 from piccolo.cloud.morton import morton_order
 from piccolo.cloud.soa import PackedPoints, pack_points
@@ -28,15 +29,14 @@ examples:
   python tools/benchmark.py
   python tools/benchmark.py --cloud scan.ply --pano query.jpg
 
-Every contender is timed once in each round, so that a disturbance hits all; ratios are of the medians.
+Every kernel is timed once in each round, so that a disturbance hits all; ratios are of the medians.
 The reference is cv2.remap: 8-bit, 3 channels, bilinear, one thread, a coherent map, a pixel a point.
-exit codes: 0 done, 2 wrong usage, 3 bad input.
 """
 
 
 @dataclass(frozen=True)
 class Case:
-    """What the kernels are timed on."""
+    """The data on which the kernels are timed."""
 
     points: PackedPoints
     rgb: NDArray[np.uint8]  # (H, W, 3)
@@ -78,7 +78,7 @@ def coherent_map(num_pixels: int, width: int) -> tuple[NDArray[np.float32], NDAr
 
 
 def medians(contenders: dict[str, Callable[[], object]], num_rounds: int) -> dict[str, float]:
-    """Median seconds of each contender over the rounds."""
+    """Median seconds of each kernel over the rounds."""
     seconds: dict[str, list[float]] = {name: [] for name in contenders}
     for run in contenders.values():
         run()  # compiles, and warms the caches
@@ -120,31 +120,30 @@ def run_kernels(case: Case, num_rounds: int) -> None:
     print(f"\nsame bits with 1 and 2 threads: {'yes' if same else 'NO'}")
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--cloud", type=Path, help="a scan (default: a box with seeded points)")
-    parser.add_argument("--pano", type=Path, help="a panorama, with --cloud")
-    parser.add_argument("--points", type=int, default=1_000_000, help="(default 1000000)")
-    parser.add_argument("--rounds", type=int, default=15, help="at least 7 (default 15)")
-    arguments = parser.parse_args(argv)
+def run(arguments: argparse.Namespace) -> int:
+    """Make the case, time the kernels."""
     if (arguments.cloud is None) != (arguments.pano is None):
-        parser.error("--cloud and --pano go together")
+        raise UsageError("--cloud and --pano go together")
     if arguments.rounds < 7 or arguments.points < 1000:
-        parser.error("wanted --rounds of at least 7 and --points of at least 1000")
-    try:
-        if arguments.cloud:
-            case = file_case(arguments.cloud, arguments.pano, arguments.points)
-        else:
-            case = box_case(arguments.points, 2048)
-    except (OSError, InputError) as error:
-        print(f"benchmark.py: {error}", file=sys.stderr)
-        return 3
+        raise UsageError("wanted --rounds of at least 7 and --points of at least 1000")
+    if arguments.cloud:
+        case = file_case(arguments.cloud, arguments.pano, arguments.points)
+    else:
+        case = box_case(arguments.points, 2048)
     run_kernels(case, arguments.rounds)
     return 0
 
 
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    parser = new_parser("benchmark", __doc__, EPILOG)
+    parser.add_argument("--cloud", type=Path, help="a scan (default: a box with seeded points)")
+    parser.add_argument("--pano", type=Path, help="a panorama, with --cloud")
+    parser.add_argument("--points", type=int, default=1_000_000, help="(default 1000000)")
+    parser.add_argument("--rounds", type=int, default=15, help="at least 7 (default 15)")
+    add_run_options(parser)
+    return run_command(parser, argv, run)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -1,10 +1,9 @@
 #!/usr/bin/env python3
-"""How the cost of the default engine grows with points and with rooms: time, memory, share found."""
+"""Time, memory and recall of the default method by the number of points and of rooms."""
 
 import argparse
 import multiprocessing
 import resource
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,13 +14,14 @@ import _checkout  # noqa: F401
 import numpy as np
 from numpy.typing import NDArray
 
+from piccolo.cli.errors import UsageError, run_command
+from piccolo.cli.parser import add_run_options, new_parser
 from piccolo.cloud import read_cloud
 from piccolo.cloud.model import Cloud
 from piccolo.cloud.morton import morton_order
 from piccolo.coarse_to_fine.localize import localize
 from piccolo.coarse_to_fine.scan_map import prepare_map
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
-from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose
 from piccolo.geometry.pose_error import is_correct
 from piccolo.geometry.rotations import Gravity
@@ -39,11 +39,13 @@ examples:
 --scene: a folder with cloud.ply, queries.json and images; more points than it has are made by repeating it
 with 5 mm noise, fewer by leaving some out. --rooms: rooms of tools/make_room.py, 50,000 points each.
 Each row is measured in a process of its own; queries are the first six clean ones, gravity known and unknown.
-exit codes: 0 done, 2 wrong usage, 3 bad input.
 """
 NUM_QUERIES = 6
 GRAVITIES: tuple[Gravity, ...] = ("known", "unknown")
-HEAD = "case | points | candidates | prepare s | known s | found | unknown s | found | peak MB | before"
+COLUMNS = (
+    "case", "points", "candidates", "prepare s", "known s", "found", "unknown s", "found",
+    "peak MB", "before",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -57,13 +59,13 @@ class Case:
 def ordered(
     points: NDArray[np.float32], colors: NDArray[np.uint8], origin_world: NDArray[np.float64]
 ) -> Cloud:
-    """A cloud as a file would be read."""
+    """A cloud in the order in which a file of it is read."""
     order = morton_order(points, colors)
     return Cloud(points[order], colors[order], origin_world)
 
 
 def scene_case(folder: Path, num_points: int) -> Case:
-    """A scene with as many points."""
+    """A scene resampled to `num_points` points."""
     scene = read_scene(folder)
     cloud = read_cloud(scene.cloud)
     rng = np.random.default_rng(0)
@@ -114,23 +116,14 @@ def measure(label: str, make: Callable[[], Case], results: "multiprocessing.Queu
     results.put(f"| {' | '.join([*columns, f'{peak_mb:.0f}', f'{before_mb:.0f}'])} |")
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--scene", type=Path, metavar="FOLDER", help="with --points")
-    parser.add_argument("--points", type=int, nargs="+", default=[], metavar="N", help="with --scene")
-    parser.add_argument("--rooms", type=int, nargs="+", default=[], metavar="N", help="1 to 64")
-    arguments = parser.parse_args(argv)
+def run(arguments: argparse.Namespace) -> int:
+    """Print the table, each row measured in a process of its own."""
     if bool(arguments.scene) != bool(arguments.points) or not (arguments.points or arguments.rooms):
-        parser.error("wanted --scene with --points, or --rooms")
+        raise UsageError("wanted --scene with --points, or --rooms")
     rows = [(f"{n} points", partial(scene_case, arguments.scene, n)) for n in arguments.points]
     rows += [(f"{n} rooms", partial(rooms_case, n)) for n in arguments.rooms]
-    print(
-        "| case | points | candidates | prepare s | known s | found | unknown s | found | peak MB | before |"
-    )
-    print("|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|")
+    print(f"| {' | '.join(COLUMNS)} |")
+    print("|---" + "|---:" * (len(COLUMNS) - 1) + "|")
     context = multiprocessing.get_context("spawn")
     for label, make in rows:
         results: multiprocessing.Queue[str] = context.Queue()
@@ -138,14 +131,20 @@ def main(argv: list[str] | None = None) -> int:
         process.start()
         process.join()
         if process.exitcode != 0:
-            print(f"growth.py: {label}: failed, see above", file=sys.stderr)
-            return 3
+            raise ChildProcessError(f"{label}: failed, see above")
         print(results.get(), flush=True)
     return 0
 
 
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    parser = new_parser("benchmark_scaling", __doc__, EPILOG)
+    parser.add_argument("--scene", type=Path, metavar="FOLDER", help="with --points")
+    parser.add_argument("--points", type=int, nargs="+", default=[], metavar="N", help="with --scene")
+    parser.add_argument("--rooms", type=int, nargs="+", default=[], metavar="N", help="1 to 64")
+    add_run_options(parser)
+    return run_command(parser, argv, run)
+
+
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except (OSError, InputError) as error:
-        sys.exit(f"growth.py: {error}")
+    raise SystemExit(main())

@@ -3,7 +3,6 @@
 
 import argparse
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -15,6 +14,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
+from piccolo.cli.errors import run_command
+from piccolo.cli.parser import add_run_options, new_parser
 from piccolo.confidence.confidence import (
     AMBIGUOUS,
     DIRECTIONS,
@@ -30,10 +31,10 @@ from piccolo.confidence.confidence import (
 )
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.confidence.score import Evidence
-from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, log_so3
 from piccolo.geometry.pose_error import is_correct
 from piccolo.result import Result
+from piccolo.runtime.json_file import parse_lines, read_bytes
 
 EPILOG = """\
 examples:
@@ -41,9 +42,8 @@ examples:
   python tools/calibrate_confidence.py --fit paper.jsonl --without twins hall corridor
 
 Files are those of tools/evaluate_confidence.py. The weights printed go into
-piccolo/confidence/confidence.py; the tables say how the
-confidence in use fares on each set, and what share of the true poses lies in the region of the covariance.
-exit codes: 0 done, 2 wrong usage, 3 bad input.
+piccolo/confidence/confidence.py; the tables show how reliable the
+confidence in use is on each set, and the fraction of true poses in the region of the covariance.
 """
 PENALTY = 0.05  # on squared weights of features of deviation 1: without, easy trials ask for ever larger ones
 LEVELS = (0.0, 0.5, 0.9, 0.99, 1.01)
@@ -65,16 +65,14 @@ class Outcome:
 
 def read_outcomes(paths: Sequence[Path]) -> list[Outcome]:
     """The trials of some files that came to a pose."""
-    return [
-        outcome
-        for path in paths
-        for line in path.read_text().splitlines()
-        if (outcome := outcome_of(json.loads(line))) is not None
-    ]
+    wanted = "wanted a file of tools/evaluate_confidence.py"
+    lines = [line for path in paths for line in parse_lines(path, read_bytes(path, wanted), outcome_of)]
+    return [outcome for outcome in lines if outcome is not None]
 
 
-def outcome_of(trial: dict[str, object]) -> Outcome | None:
+def outcome_of(line: str) -> Outcome | None:
     """One line of tools/evaluate_confidence.py; None if no pose was found."""
+    trial = json.loads(line)
     result, truth = Result.from_json(json.dumps(trial["result"])), trial["truth"]
     if result.pose is None or result.evidence is None:
         return None
@@ -125,7 +123,7 @@ def status_of(o: Outcome, min_confidence: float) -> str:
 
 
 def print_cases(name: str, outcomes: Sequence[Outcome], min_confidence: float) -> None:
-    """What each case is called by the confidence in use."""
+    """The statuses of each case with the confidence in use."""
     print(f"\n| case, {name} | poses | right | localized | ambiguous | false |")
     print("|---|---:|---:|---:|---:|---:|")
     for case in dict.fromkeys(o.case for o in outcomes):
@@ -137,7 +135,7 @@ def print_cases(name: str, outcomes: Sequence[Outcome], min_confidence: float) -
 
 
 def print_coverage(name: str, outcomes: Sequence[Outcome]) -> None:
-    """What share of right poses has its error in the covariance's 95 % region."""
+    """The fraction of right poses whose error lies in the covariance's 95 % region."""
     some = [o for o in outcomes if o.is_correct and o.covariance is not None]
     if not some:
         return
@@ -153,27 +151,14 @@ def print_coverage(name: str, outcomes: Sequence[Outcome]) -> None:
             for o in some
             if o.covariance is not None
         ]
-        shares = [np.mean(squares < chi2.ppf(p, len(range(6)[rows]))) for p in (0.95, 0.5)]
-        print(f"| {part} | {len(some)} | {shares[0]:.3f} | {shares[1]:.3f} |")
+        fractions = [np.mean(squares < chi2.ppf(p, len(range(6)[rows]))) for p in (0.95, 0.5)]
+        print(f"| {part} | {len(some)} | {fractions[0]:.3f} | {fractions[1]:.3f} |")
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--fit", type=Path, nargs="+", default=[], metavar="FILE", help="trials to learn from"
-    )
-    parser.add_argument("--check", type=Path, nargs="+", default=[], metavar="FILE", help="other trials")
-    parser.add_argument("--without", nargs="+", default=[], metavar="CASE", help="leave these cases out")
-    arguments = parser.parse_args(argv)
-    try:
-        sets = {"learnt from": read_outcomes(arguments.fit), "others": read_outcomes(arguments.check)}
-        sets = {k: [o for o in rows if o.case not in arguments.without] for k, rows in sets.items()}
-    except (OSError, InputError, json.JSONDecodeError, KeyError) as error:
-        print(f"calibrate.py: {error!r}", file=sys.stderr)
-        return 3
+def run(arguments: argparse.Namespace) -> int:
+    """Fit the weights, print the tables."""
+    sets = {"learnt from": read_outcomes(arguments.fit), "others": read_outcomes(arguments.check)}
+    sets = {k: [o for o in rows if o.case not in arguments.without] for k, rows in sets.items()}
     if arguments.fit:
         bias, weights = fit(sets["learnt from"])
         print(f"bias {bias:.2f}, weights " + ", ".join(f"{w:.2f}" for w in weights))
@@ -186,5 +171,16 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    parser = new_parser("calibrate_confidence", __doc__, EPILOG)
+    text = "trials to learn from"
+    parser.add_argument("--fit", type=Path, nargs="+", default=[], metavar="FILE", help=text)
+    parser.add_argument("--check", type=Path, nargs="+", default=[], metavar="FILE", help="other trials")
+    parser.add_argument("--without", nargs="+", default=[], metavar="CASE", help="leave these cases out")
+    add_run_options(parser)
+    return run_command(parser, argv, run)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

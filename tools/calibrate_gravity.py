@@ -2,7 +2,6 @@
 """Fit the weights of the features that tell up in a cloud, and try them on other seeds."""
 
 import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -13,8 +12,9 @@ from evaluate_gravity import ROUGH, rotated_cloud, rotations_of
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from piccolo.cli.errors import guarded
-from piccolo.cli.progress import shown
+from piccolo.cli.errors import checking_options, run_command
+from piccolo.cli.parser import add_run_options, new_parser
+from piccolo.cli.progress import progress_bar
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Array
 from piccolo.gravity.alignment import normals_of
@@ -35,7 +35,6 @@ with its cues (piccolo/gravity/up_features.py), one of them is the true up. The 
 conditional logit with the largest likelihood, in which each kind counts the same and large weights cost.
 Printed as up_features.py holds them; then a Markdown table of how often the true up has the largest odds, on
 the seeds to check, by the weights in use and by those fitted.
-exit codes: 0 done, 2 wrong usage, 130 interrupted.
 """
 
 
@@ -104,7 +103,9 @@ def print_table(choices: Sequence[Choice], fitted: Array) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Fit, print the weights and check them."""
-    workers = Workers(arguments.threads, shown(arguments.quiet))
+    with checking_options():
+        check_arguments(arguments)
+    workers = Workers(arguments.threads, progress_bar(arguments.quiet))
     fitted = np.round(fit(choices_of(arguments.fit, workers)), 2)
     values = [f"{name}={value:g}" for name, value in zip(Weights._fields, fitted[:-1], strict=True)]
     print(f"WEIGHTS = Weights({', '.join(values)})\nSENSE_SHARING = {fitted[-1]:g}\n")
@@ -124,9 +125,7 @@ def check_arguments(arguments: argparse.Namespace) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = new_parser("calibrate_gravity", __doc__, EPILOG)
     text = "seeds to learn from (default 0 40)"
     parser.add_argument("--fit", type=int, nargs=2, metavar=("FIRST", "END"), default=[0, 40], help=text)
     text = "other seeds (default 1100 1120)"
@@ -134,13 +133,9 @@ def main(argv: list[str] | None = None) -> int:
         "--check", type=int, nargs=2, metavar=("FIRST", "END"), default=[1100, 1120], help=text
     )
     parser.add_argument("--threads", type=int, default=num_cores(), metavar="N")
-    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
-    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    arguments = parser.parse_args(argv)
-    return guarded(
-        "calibrate_gravity.py", arguments.debug, lambda: run(arguments), lambda: check_arguments(arguments)
-    )
+    add_run_options(parser)
+    return run_command(parser, argv, run)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

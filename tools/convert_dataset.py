@@ -1,11 +1,9 @@
 #!/usr/bin/env python3
 """Write research datasets, or your own panoramas with known poses, as scenes that tools/evaluate.py reads."""
 
-import sys
-
 import _checkout  # noqa: F401
 
 from piccolo.cli.convert_dataset import main
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

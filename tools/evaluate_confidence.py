@@ -1,32 +1,31 @@
 #!/usr/bin/env python3
-"""Try the verdict: seeded queries with and without an answer, and how often each was called localized."""
+"""Measure the status on seeded queries with and without an answer: how often each is called localized."""
 
 import argparse
 import json
-import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
 import _checkout  # noqa: F401
 import numpy as np
 
+from piccolo.cli.errors import print_note, run_command
+from piccolo.cli.parser import add_run_options, new_parser
 from piccolo.cloud import CloudStream, read_cloud, stream_of
 from piccolo.cloud.readers.reader import RawCloud
-from piccolo.coarse_to_fine.scan_map import prepare_map
+from piccolo.cloud.settings import IN_METRES
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.confidence.confidence import AMBIGUOUS, LOCALIZED
-from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose
 from piccolo.geometry.pose_error import is_correct
 from piccolo.geometry.rotations import Gravity
-from piccolo.panorama import Panorama, read_panorama
-from piccolo.paper import localize as paper
+from piccolo.panorama import AS_STORED, read_panorama
 from piccolo.paper.settings import PaperSettings
-from piccolo.pipeline import DefaultLocalizer, Localizer, PaperLocalizer
-from piccolo.result import Result, result_of
+from piccolo.result import Result
 from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers, num_cores
+from piccolo.scan import Settings, scan_of
 from piccolo.scenes.scene import Scene, read_scene
 from piccolo.scenes.synthetic.trials import (
     SPARSE_FRACTION,
@@ -46,18 +45,12 @@ examples:
 Seeds make rooms, and places that look the same from several positions; scenes are folders with cloud.ply,
 queries.json and images, each panorama tried in each cloud. A false answer is a pose called localized that is
 over 0.1 m or 5 degrees off. Each trial is a line {"case", "scene", "truth", "result"}; a table on stdout.
-exit codes: 0 no false answer, 1 some, 2 wrong usage, 3 bad input, 130 interrupted.
 """
 
 
 def cloud_of(points: Points) -> CloudStream:
-    """Points as a file of them would be read."""
+    """Points as a stream, as if read from a file."""
     return stream_of(Path("trial"), RawCloud(points[0].astype(np.float64), points[1]))
-
-
-def as_panorama(rgb: np.ndarray[tuple[int, int, int], np.dtype[np.uint8]]) -> Panorama:
-    """An image (H, W, 3) of which every pixel counts."""
-    return Panorama(rgb, np.ones(rgb.shape[:2], np.bool_))
 
 
 def scene_trials(scene: Scene, others: Sequence[Scene]) -> Iterator[tuple[CloudStream, list[Trial]]]:
@@ -94,26 +87,22 @@ def all_trials(
             yield scene.name, cloud, trials
 
 
-def localizer_of(cloud: CloudStream, preset: str, workers: Workers) -> Callable[[Gravity], Localizer]:
-    """What prepares once and localizes with any gravity. The paper knows no `auto`: it is told `known`."""
+def settings_of(preset: str, gravity: Gravity) -> Settings:
+    """The settings of a trial; the paper's method takes `auto` as `known`."""
     if preset == "paper":
-        paper_map = paper.prepare(cloud.read(), PaperSettings())
-        return lambda gravity: PaperLocalizer(
-            paper_map, PaperSettings(gravity="known" if gravity == "auto" else gravity), ()
-        )
-    scan_map = prepare_map(cloud, workers)
-    return lambda gravity: DefaultLocalizer(scan_map, CoarseToFineSettings(gravity=gravity))
+        return PaperSettings(gravity="known" if gravity == "auto" else gravity)
+    return CoarseToFineSettings(gravity=gravity)
 
 
-def run(arguments: argparse.Namespace) -> Iterator[tuple[str, Trial, Result]]:
+def results_of(arguments: argparse.Namespace) -> Iterator[tuple[str, Trial, Result]]:
     """Localize every trial; the scene's name, the trial and its result."""
     workers = Workers(arguments.threads)
-    for scene, cloud, trials in all_trials(arguments, workers):
-        localizer = localizer_of(cloud, arguments.preset, workers)
+    for name, cloud, trials in all_trials(arguments, workers):
+        settings = settings_of(arguments.preset, "auto")
+        scan = scan_of(cloud, name, IN_METRES, settings, workers, Stopwatch())
         for trial in trials:
-            how, watch = localizer(trial.gravity), Stopwatch()
-            found = how.localize(as_panorama(trial.rgb), workers, watch)
-            yield scene, trial, result_of(found, scene, trial.case, watch.seconds, how.settings.to_json())
+            settings = settings_of(arguments.preset, trial.gravity)
+            yield name, trial, scan.localize_query(trial.rgb, AS_STORED, settings)
 
 
 def as_line(scene: str, trial: Trial, result: Result) -> str:
@@ -143,36 +132,31 @@ def print_table(counts: dict[str, list[tuple[str, bool]]]) -> int:
     return total
 
 
+def run(arguments: argparse.Namespace) -> int:
+    """Localize every trial, write its line, print the table."""
+    counts: dict[str, list[tuple[str, bool]]] = {}
+    with arguments.out.open("w") as file:
+        for scene, trial, result in results_of(arguments):
+            ok = trial.true_pose is not None and is_correct(result.pose, trial.true_pose)
+            counts.setdefault(trial.case, []).append((result.status, ok))
+            file.write(as_line(scene, trial, result) + "\n")
+            file.flush()
+            outcome = "right" if ok else "wrong"
+            print_note(arguments, f"{scene}: {trial.case}: {result.status}, {outcome}")
+    return 1 if print_table(counts) else 0
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = new_parser("evaluate_confidence", __doc__, EPILOG, "0 no false answer, 1 some")
     parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), required=True)
     parser.add_argument("--scenes", type=Path, nargs="*", default=[], metavar="FOLDER")
     parser.add_argument("--out", type=Path, required=True, help="JSON lines, written as they come")
     parser.add_argument("--preset", choices=["default", "paper"], default="default")
     parser.add_argument("--threads", type=int, default=num_cores(), metavar="N")
-    arguments = parser.parse_args(argv)
-    counts: dict[str, list[tuple[str, bool]]] = {}
-    try:
-        with arguments.out.open("w") as file:
-            for scene, trial, result in run(arguments):
-                ok = trial.true_pose is not None and is_correct(result.pose, trial.true_pose)
-                counts.setdefault(trial.case, []).append((result.status, ok))
-                file.write(as_line(scene, trial, result) + "\n")
-                file.flush()
-                print(
-                    f"{scene}: {trial.case}: {result.status}, {'right' if ok else 'wrong'}", file=sys.stderr
-                )
-    except (OSError, InputError) as error:
-        print(f"trials.py: {error}", file=sys.stderr)
-        return 3
-    except KeyboardInterrupt:
-        print("trials.py: interrupted", file=sys.stderr)
-        return 130
-    return 1 if print_table(counts) else 0
+    add_run_options(parser)
+    return run_command(parser, argv, run)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -2,7 +2,6 @@
 """Try the search for up on clouds turned at random: how far off its answers are, and how sure they were."""
 
 import argparse
-import sys
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -12,8 +11,9 @@ import _checkout  # noqa: F401
 import numpy as np
 from numpy.typing import NDArray
 
-from piccolo.cli.errors import guarded
-from piccolo.cli.progress import shown
+from piccolo.cli.errors import checking_options, run_command
+from piccolo.cli.parser import add_run_options, new_parser
+from piccolo.cli.progress import progress_bar
 from piccolo.cloud import CloudStream, open_cloud, stream_of
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.readers.reader import RawCloud
@@ -38,7 +38,6 @@ Each cloud is turned by --turns seeded rotations, uniform over all, and aligned 
 Seeds make places of each kind; scenes are folders with a cloud.ply whose z is up, thinned to 4 cm once, but
 for the first --full turns. A Markdown table on stdout: right is within 0.5 degrees, rough within 5; accepted
 is a confidence of --min-confidence or more.
-exit codes: 0 no wrong answer was accepted, 1 some were, 2 wrong usage, 3 bad input, 130 interrupted.
 """
 
 
@@ -79,9 +78,11 @@ def try_turn(points: Points, R: Array) -> tuple[float, float]:
     return float(np.degrees(np.arctan2(sine, up @ true_up))), report.alignment.confidence
 
 
-def print_table(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Try all clouds, print one line for each name; returns the exit code."""
-    workers = Workers(arguments.threads, shown(arguments.quiet))
+    with checking_options():
+        check_arguments(arguments)
+    workers = Workers(arguments.threads, progress_bar(arguments.quiet))
     answers: dict[str, list[tuple[float, float]]] = {}
     for name, points, rotations in cases_of(arguments):
         answers.setdefault(name, []).extend(workers.each(partial(try_turn, points), rotations, name))
@@ -101,7 +102,8 @@ def print_table(arguments: argparse.Namespace) -> int:
 
 
 def check_arguments(arguments: argparse.Namespace) -> None:
-    """Refuse values that no cloud could make right."""
+    """Fill in the default seeds; refuse values that no cloud could make right."""
+    arguments.seeds = arguments.seeds or ([0, 0] if arguments.scenes else [1100, 1120])
     check_confidence(arguments.min_confidence)
     if min(arguments.seeds) < 0 or min(arguments.turns, arguments.threads) < 1 or arguments.full < 0:
         raise InputError("--seeds and --full must be 0 or more, --turns and --threads at least 1")
@@ -109,9 +111,7 @@ def check_arguments(arguments: argparse.Namespace) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = new_parser("evaluate_gravity", __doc__, EPILOG, "0 no wrong answer was accepted, 1 some were")
     text = "of the made-up places (default 1100 1120, none where --scenes are given)"
     parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), help=text)
     parser.add_argument(
@@ -122,17 +122,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--full", type=int, default=3, metavar="N", help="turns of whole scenes (default 3)")
     parser.add_argument("--min-confidence", type=float, default=MIN_CONFIDENCE, metavar="X")
     parser.add_argument("--threads", type=int, default=num_cores(), metavar="N")
-    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
-    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    arguments = parser.parse_args(argv)
-    arguments.seeds = arguments.seeds or ([0, 0] if arguments.scenes else [1100, 1120])
-    return guarded(
-        "evaluate_gravity.py",
-        arguments.debug,
-        lambda: print_table(arguments),
-        lambda: check_arguments(arguments),
-    )
+    add_run_options(parser)
+    return run_command(parser, argv, run)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -12,6 +12,8 @@ from types import FunctionType
 import _checkout  # noqa: F401
 import numpy as np
 
+from piccolo.cli.errors import run_command
+from piccolo.cli.parser import add_run_options, new_parser
 from piccolo.cloud import FORMATS
 from piccolo.cloud.readers.reader import PLAIN, CloudFormat
 from piccolo.coarse_to_fine.map_file import load_map
@@ -28,7 +30,6 @@ examples:
 Each reader gets the files of --corpus that end as its formats do, or one of a few bytes, and mutations of
 them. A good result or an InputError is right; anything else, over 20 s or over 2 GB is a finding: the file
 is kept in --crashes, named after its reader. atheris: pip install atheris.
-exit codes: 0 nothing found, 1 something, 2 wrong usage, 3 bad input, 130 interrupted.
 """
 TIMEOUT_S, MEMORY_MB, MAX_SIZE = 20, 2048, 1 << 16
 
@@ -90,7 +91,7 @@ def fuzz(name: str, flags: list[str]) -> None:
         atheris.Fuzz()
 
 
-def run(name: str, arguments: argparse.Namespace) -> bool:
+def fuzz_apart(name: str, arguments: argparse.Namespace) -> bool:
     """Fuzz one reader in a process of its own; True if something was found."""
     suffixes = READERS[name][0]
     with tempfile.TemporaryDirectory() as corpus:
@@ -114,31 +115,26 @@ def run(name: str, arguments: argparse.Namespace) -> bool:
     return done.returncode != 0
 
 
+def run(arguments: argparse.Namespace) -> int:
+    """Fuzz the readers one by one."""
+    arguments.crashes.mkdir(parents=True, exist_ok=True)
+    return int(any([fuzz_apart(name, arguments) for name in arguments.reader]))
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     words = sys.argv[1:] if argv is None else argv
     if words[:1] == ["--inside"]:
         fuzz(words[1], words[2:])
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = new_parser("fuzz_readers", __doc__, EPILOG, "0 nothing found, 1 something")
     parser.add_argument("--reader", choices=list(READERS), nargs="+", default=list(READERS))
     parser.add_argument("--seconds", type=int, default=60, help="for each reader (default 60)")
     parser.add_argument("--seed", type=int, default=1, help="(default 1)")
     parser.add_argument("--corpus", type=Path, metavar="FOLDER", help="files to begin with")
     parser.add_argument("--crashes", type=Path, metavar="FOLDER", required=True, help="for what is found")
-    arguments = parser.parse_args(words)
-    try:
-        arguments.crashes.mkdir(parents=True, exist_ok=True)
-        found = [run(name, arguments) for name in arguments.reader]
-    except OSError as error:
-        print(f"fuzz_readers.py: {error}", file=sys.stderr)
-        return 3
-    except KeyboardInterrupt:
-        print("fuzz_readers.py: interrupted", file=sys.stderr)
-        return 130
-    return int(any(found))
+    add_run_options(parser)
+    return run_command(parser, words, run)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -1,11 +1,9 @@
 #!/usr/bin/env python3
 """Draw the sampling loss over a plan of the cloud: its least value over height and rotation at each place."""
 
-import sys
-
 import _checkout  # noqa: F401
 
 from piccolo.cli.loss_surface import main
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

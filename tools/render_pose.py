@@ -1,11 +1,9 @@
 #!/usr/bin/env python3
 """Draw the cloud as a camera at a pose would see it: colours, depth, or a descent towards the pose."""
 
-import sys
-
 import _checkout  # noqa: F401
 
 from piccolo.cli.render_pose import main
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

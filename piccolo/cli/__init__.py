@@ -1,1 +1,1 @@
-"""What the commands share, and the body of each."""
+"""The commands: a module each, and what they share."""

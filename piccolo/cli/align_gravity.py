@@ -2,13 +2,11 @@
 
 import argparse
 import json
-import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from ..cloud import open_cloud
 from ..cloud.settings import CloudSettings
@@ -20,11 +18,11 @@ from ..gravity.alignment import AlignmentReport, find_alignment
 from ..gravity.alignment_file import Alignment, read_alignment
 from ..runtime.atomic import check_output, write_atomically
 from ..scenes.scene import QUERIES_NAME, Scene, read_scene, write_queries
-from .errors import complain, guarded
-from .options import add_cloud_options, cloud_settings_from, parse
-from .progress import shown
+from .errors import checking_options, print_error, print_note, run_command
+from .options import add_cloud_options, cloud_settings_from
+from .parser import add_run_options, new_parser
+from .progress import progress_bar
 
-PROGRAM = "align_gravity.py"
 EXIT_ALIGNED, EXIT_UNCERTAIN = 0, 1
 EPILOG = f"""\
 examples:
@@ -43,15 +41,12 @@ faces, its normals are turned; other formats and several files become x y z and 
 One JSON object on stdout: status, up, yaw, planes, transform. Without --out nothing else is written.
 Nothing is written either where the confidence is below --min-confidence (default {MIN_CONFIDENCE}): a room
 without furniture may be upside down, steep roofs and stairs mislead. If you know the axis, give it by --up.
-exit codes: 0 done, 1 not sure enough, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 
 
 def build_parser() -> argparse.ArgumentParser:
     """All options."""
-    parser = argparse.ArgumentParser(
-        PROGRAM, description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = new_parser("align_gravity", __doc__, EPILOG, "0 done, 1 not sure enough")
     add_cloud_options(parser, "coloured scan, as for localize.py")
     files = parser.add_argument_group("files")
     files.add_argument("--out", type=Path, metavar="FILE", help="the turned cloud, a PLY file")
@@ -69,9 +64,7 @@ def build_parser() -> argparse.ArgumentParser:
     text = "apply this transform instead of finding one"
     group.add_argument("--apply", type=Path, metavar="T.json", help=text)
     group.add_argument("--inverse", action="store_true", help="apply the inverse of --apply")
-    run = parser.add_argument_group("run")
-    run.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
-    run.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    add_run_options(parser)
     return parser
 
 
@@ -122,7 +115,7 @@ def outputs_of(arguments: argparse.Namespace) -> Outputs:
 
 def open_with_bounds(arguments: argparse.Namespace, settings: CloudSettings) -> BoundedStream:
     """The cloud, whose reading shows its progress."""
-    return with_bounds(open_cloud(arguments.cloud, settings, shown(arguments.quiet)))
+    return with_bounds(open_cloud(arguments.cloud, settings, progress_bar(arguments.quiet)))
 
 
 def write(cloud: BoundedStream, alignment: Alignment, outputs: Outputs) -> tuple[str, ...]:
@@ -185,8 +178,8 @@ def evidence_of(report: AlignmentReport) -> dict[str, object]:
 
 def print_warnings(arguments: argparse.Namespace, warnings: Iterable[str]) -> None:
     """A line on stderr for each warning, unless --quiet."""
-    for warning in [] if arguments.quiet else warnings:
-        tqdm.write(f"{PROGRAM}: warning: {warning}", file=sys.stderr)
+    for warning in warnings:
+        print_note(arguments, f"warning: {warning}")
 
 
 def align(arguments: argparse.Namespace) -> int:
@@ -206,7 +199,7 @@ def align(arguments: argparse.Namespace) -> int:
         print_warnings(arguments, write(cloud, alignment, outputs))
     report = report_of(arguments, "uncertain" if doubt else "aligned", alignment)
     print(json.dumps({**report, **evidence_of(found)}, allow_nan=False))
-    return complain(PROGRAM, False, doubt, EXIT_UNCERTAIN) if doubt else EXIT_ALIGNED
+    return print_error(arguments, doubt, EXIT_UNCERTAIN) if doubt else EXIT_ALIGNED
 
 
 def apply(arguments: argparse.Namespace) -> int:
@@ -225,10 +218,15 @@ def apply(arguments: argparse.Namespace) -> int:
     return EXIT_ALIGNED
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    arguments = parse(build_parser(), argv)
+def run(arguments: argparse.Namespace) -> int:
+    """Find an alignment or apply one; returns the exit code."""
     if arguments.transform_only:
         arguments.out = arguments.transform = arguments.queries = None
-    work = apply if arguments.apply else align
-    return guarded(PROGRAM, arguments.debug, lambda: work(arguments), lambda: check_arguments(arguments))
+    with checking_options():
+        check_arguments(arguments)
+    return apply(arguments) if arguments.apply else align(arguments)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    return run_command(build_parser(), argv, run)

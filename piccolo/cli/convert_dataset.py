@@ -2,26 +2,22 @@
 
 import argparse
 import json
-import sys
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
-
-from tqdm import tqdm
 
 from ..errors import InputError
 from ..runtime.threads import Show, Workers, num_cores
 from ..scenes.datasets import DATASETS
 from ..scenes.datasets.checking import Check, check_scene
-from ..scenes.datasets.model import Plan, Request
+from ..scenes.datasets.model import ConvertOptions, SceneSpec
 from ..scenes.datasets.poses import AXES, DIRECTIONS
 from ..scenes.datasets.writing import Written, write_scene
 from ..scenes.scene import read_scene
-from .errors import EXIT_BAD_INPUT, EXIT_BAD_USAGE, complain, guarded
-from .progress import shown
+from .errors import EXIT_BAD_INPUT, UsageError, print_error, print_note, run_command
+from .parser import HelpFormatter, add_run_options, new_parser
+from .progress import progress_bar
 
-PROGRAM = "convert_dataset.py"
 EXIT_BAD_FIT = 1
 EPILOG = """\
 datasets:
@@ -36,21 +32,23 @@ Writes OUT/SCENE/cloud.ply, images/ (links to the dataset's own, or copies), lab
 they hold, and how each dataset's folders and poses are understood, is in docs/DATASETS.md. A scene that is
 there already is left as it is. A scene with a damaged file is left out and named on stderr, and the others go
 on. One JSON object a scene on stdout.
-exit codes: 0 done, 1 --check found poses that don't fit the pictures, 2 wrong usage, 3 bad input, 4 internal
-error, 130 interrupted.
 """
 
 
 def build_parser() -> argparse.ArgumentParser:
     """All options; those that one dataset alone has are in its own subparser."""
-    about = "\n".join(f"  {name:<14} {dataset.about}" for name, dataset in DATASETS.items())
-    how = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(
-        PROGRAM, description=__doc__, epilog=EPILOG.format(datasets=about), formatter_class=how
+    description = "\n".join(f"  {name:<14} {dataset.description}" for name, dataset in DATASETS.items())
+    parser = new_parser(
+        "convert_dataset",
+        __doc__,
+        EPILOG.format(datasets=description),
+        "0 done, 1 --check found poses that don't fit the panoramas",
     )
     subparsers = parser.add_subparsers(dest="dataset", required=True, metavar="DATASET")
     for name, dataset in DATASETS.items():
-        subparser = subparsers.add_parser(name, description=dataset.about, formatter_class=how)
+        subparser = subparsers.add_parser(
+            name, description=dataset.description, formatter_class=HelpFormatter
+        )
         add_common_options(subparser)
         if name in OWN_OPTIONS:
             OWN_OPTIONS[name](subparser)
@@ -65,7 +63,7 @@ def add_common_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="made if it is not there")
     text = "only these, by the last part of a scene's name: office_1, weddingHall_1, a house"
     parser.add_argument("--rooms", nargs="+", default=[], metavar="NAME", help=text)
-    text = "hold N panoramas of each scene against its cloud, also of those there already (default 0)"
+    text = "compare N panoramas of each scene with its cloud, also of those there already (default 0)"
     parser.add_argument("--check", type=int, default=0, metavar="N", help=text)
     images = parser.add_mutually_exclusive_group()
     text = "link to the panoramas where they are (default: a copy can take 100 GB)"
@@ -73,8 +71,7 @@ def add_common_options(parser: argparse.ArgumentParser) -> None:
     text = "copy the panoramas, so that the scenes can be moved and the dataset removed"
     images.add_argument("--copy", action="store_const", const="copy", dest="transfer", help=text)
     parser.set_defaults(transfer="symlink")
-    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
-    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    add_run_options(parser)
 
 
 def add_stanford_options(parser: argparse.ArgumentParser) -> None:
@@ -85,12 +82,12 @@ def add_stanford_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_mpo_options(parser: argparse.ArgumentParser) -> None:
-    """The motions."""
-    parser.add_argument("--seed", type=int, default=0, help="of the random motions (default 0)")
+    """The random transforms."""
+    parser.add_argument("--seed", type=int, default=0, help="of the random transforms (default 0)")
 
 
 def add_generic_options(parser: argparse.ArgumentParser) -> None:
-    """Where things are, and what the list does not say of its poses."""
+    """Where the files are, and the convention of the poses where the list has no column for it."""
     text = "the list (default poses.csv, .json, .txt or .tum of --from)"
     parser.add_argument("--poses", type=Path, metavar="FILE", help=text)
     parser.add_argument("--cloud", type=Path, metavar="FILE", help="(default the one cloud in --from)")
@@ -110,75 +107,69 @@ OWN_OPTIONS = {
 }
 
 
-def request_from(arguments: argparse.Namespace) -> Request:
-    """What the options ask for."""
+def convert_options_from(arguments: argparse.Namespace) -> ConvertOptions:
+    """The options of one dataset, as far as its subparser has them."""
     given = vars(arguments)
     names = ("labels", "seed", "poses", "cloud", "images", "axes", "direction")
     own = {name: given[name] for name in names if name in given}
-    return Request(arguments.folder, areas=frozenset(given.get("areas", ())), **own)
+    return ConvertOptions(arguments.folder, areas=frozenset(given.get("areas", ())), **own)
 
 
-def chosen(plans: tuple[Plan, ...], rooms: list[str]) -> list[Plan]:
-    """The plans of some rooms, or all."""
-    counts = Counter(plan.name for plan in plans)
+def chosen(specs: tuple[SceneSpec, ...], rooms: list[str]) -> list[SceneSpec]:
+    """The scenes of some rooms, or all."""
+    counts = Counter(spec.name for spec in specs)
     if twice := [name for name, count in counts.items() if count > 1]:
-        raise InputError(f"--from: found the scene {twice[0]} twice, wanted it once")
-    names = {plan.name.split("/")[-1] for plan in plans}
+        raise InputError(f"--from: found the scene {twice[0]} twice")
+    names = {spec.name.split("/")[-1] for spec in specs}
     if missing := [room for room in rooms if room not in names]:
         raise InputError(f"--rooms: found no {missing[0]}, wanted one of {', '.join(sorted(names))}")
-    return [plan for plan in plans if not rooms or plan.name.split("/")[-1] in rooms]
+    return [spec for spec in specs if not rooms or spec.name.split("/")[-1] in rooms]
 
 
-def tell(notes: Iterable[str], arguments: argparse.Namespace) -> None:
-    """Lines for the user, unless he wants quiet."""
-    for note in notes if not arguments.quiet else ():
-        tqdm.write(f"{PROGRAM}: {note}", file=sys.stderr)
-
-
-def report(plan: Plan, written: Written, check: Check | None) -> dict[str, object]:
-    """The line on stdout."""
+def report(spec: SceneSpec, written: Written, check: Check | None) -> dict[str, object]:
+    """The JSON object of a scene."""
     return {
-        "scene": plan.name,
+        "scene": spec.name,
         "folder": str(written.folder),
         "status": "there already" if written.num_points is None else "written",
         "points": written.num_points,
         "queries": written.num_queries,
-        **({"fits": check.is_passed, "check": [asdict(fit) for fit in check.fits]} if check else {}),
+        **({"fits": check.is_passed, "check": [asdict(c) for c in check.panoramas]} if check else {}),
     }
 
 
-def convert(arguments: argparse.Namespace, show: Show) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Write the scenes one by one; returns the exit code."""
-    listing = DATASETS[arguments.dataset].listing(request_from(arguments))
-    plans = chosen(listing.plans, arguments.rooms)
-    tell(listing.notes, arguments)
+    for name in ("check", "seed"):
+        if getattr(arguments, name, 0) < 0:
+            raise UsageError(f"--{name}: found {getattr(arguments, name)}, wanted 0 or more")
+    found = DATASETS[arguments.dataset].list_scenes(convert_options_from(arguments))
+    specs = chosen(found.specs, arguments.rooms)
+    for note in found.notes:
+        print_note(arguments, note)
+    show = progress_bar(arguments.quiet)
     # bad input goes before a bad fit
-    return max((convert_scene(plan, arguments, show) for plan in plans), default=0)
+    return max((convert_scene(spec, arguments, show) for spec in specs), default=0)
 
 
-def convert_scene(plan: Plan, arguments: argparse.Namespace, show: Show) -> int:
+def convert_scene(spec: SceneSpec, arguments: argparse.Namespace, show: Show) -> int:
     """Write a scene, check it, and print its line; returns the exit code."""
     try:
-        written = write_scene(plan, arguments.out, arguments.transfer, show)
+        written = write_scene(spec, arguments.out, arguments.transfer, show)
         check = None
         if arguments.check:
-            scene = read_scene(written.folder, plan.name)
+            scene = read_scene(written.folder, spec.name)
             check = check_scene(scene, arguments.check, Workers(num_cores(), show), show)
     except InputError as error:
-        return complain(PROGRAM, arguments.debug, f"{plan.name}: {error}", EXIT_BAD_INPUT)
-    tell(written.warnings, arguments)
-    print(json.dumps(report(plan, written, check)), flush=True)
+        return print_error(arguments, f"{spec.name}: {error}", EXIT_BAD_INPUT)
+    for warning in written.warnings:
+        print_note(arguments, warning)
+    print(json.dumps(report(spec, written, check)), flush=True)
     if check and not check.is_passed:
-        return complain(PROGRAM, False, f"{plan.name}: {check.advice}", EXIT_BAD_FIT)
+        return print_error(arguments, f"{spec.name}: {check.advice}", EXIT_BAD_FIT)
     return 0
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    arguments = build_parser().parse_args(argv)
-    for name in ("check", "seed"):
-        if getattr(arguments, name, 0) < 0:
-            text = f"--{name}: found {getattr(arguments, name)}, wanted 0 or more"
-            return complain(PROGRAM, arguments.debug, text, EXIT_BAD_USAGE)
-
-    return guarded(PROGRAM, arguments.debug, lambda: convert(arguments, shown(arguments.quiet)))
+    return run_command(build_parser(), argv, run)

@@ -9,22 +9,22 @@ from ..cloud.readers.e57_images import E57Image, list_images, read_image
 from ..errors import InputError
 from ..geometry.pose import quaternion_wxyz
 from ..runtime.atomic import write_atomically
-from .errors import EXIT_BAD_INPUT, complain, guarded
+from .errors import EXIT_BAD_INPUT, print_error, run_command
+from .parser import add_run_options, new_parser
 
 EPILOG = """\
 example:
   python tools/e57_images.py scan.e57 --extract photos
   python localize.py --cloud scan.e57 --pano photos/scan_0.jpg
 
-is_usable: the image is spherical, as localize.py wants it; fov_deg tells whether it is the full sphere.
+is_usable: the image is spherical, as localize.py needs it; fov_deg is 360 for a full sphere.
 pose: x_world = R_world_from_image @ x_image + center_world, as the file has it.
-exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 SUFFIX = {"jpeg": ".jpg", "png": ".png"}
 
 
-def row_of(index: int, image: E57Image) -> dict[str, object]:
-    """The JSON object that describes an image."""
+def image_json(index: int, image: E57Image) -> dict[str, object]:
+    """The JSON object of an image."""
     placement = image.placement
     return {
         "index": index,
@@ -60,23 +60,20 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.extract:
         arguments.extract.mkdir(exist_ok=True)
     for index, image in enumerate(images):
-        row = row_of(index, image)
+        row = image_json(index, image)
         if arguments.extract:
             try:
                 row["file"] = str(extract(arguments.e57, index, image, arguments.extract))
             except InputError as error:
-                exit_code = complain("e57_images.py", arguments.debug, str(error), EXIT_BAD_INPUT)
+                exit_code = print_error(arguments, str(error), EXIT_BAD_INPUT)
         print(json.dumps(row, allow_nan=False), flush=True)
     return exit_code
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = new_parser("e57_images", __doc__, EPILOG)
     parser.add_argument("e57", type=Path, metavar="FILE", help="an E57 file")
     parser.add_argument("--extract", type=Path, metavar="FOLDER", help="write the images here")
-    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    arguments = parser.parse_args(argv)
-    return guarded("e57_images.py", arguments.debug, lambda: run(arguments))
+    add_run_options(parser)
+    return run_command(parser, argv, run)

@@ -2,16 +2,17 @@
 
 import argparse
 import json
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 
 from ..errors import InputError
 from ..geometry.camera_axes import CAMERA_AXES
+from ..result import read_results
 from ..runtime.atomic import check_output
-from ..scenes.export import FORMATS, Options, Selection, export, read_results, select, true_results
+from ..scenes.export import FORMATS, Options, Selection, export, select, true_results
 from ..scenes.scene import find_scenes
-from .errors import guarded
+from .errors import checking_options, print_note, run_command
+from .parser import add_run_options, new_parser
 
 EPILOG = """\
 formats:
@@ -27,21 +28,15 @@ examples:
   python tools/export_poses.py --results *.jsonl --format gpano --images photos --out photos_with_pose
 
 Results that are not localized are left out and counted on stderr. docs/CONVENTIONS.md has axes and angles.
-A file at --out is replaced. One JSON object on stdout says what was written.
-exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
+A file at --out is replaced. One JSON object on stdout.
 """
 OPTIONS = ("size", "offset", "axes", "timestamps", "crs")  # those that only some formats take
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The options; those not given are None, which stands for a default."""
+    """All options. One that is not given stays None, and keeps its default."""
     formats = "\n".join(f"  {form.name:<11} {form.description}" for form in FORMATS.values())
-    parser = argparse.ArgumentParser(
-        "export_poses.py",
-        description=__doc__,
-        epilog=EPILOG.format(formats=formats),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = new_parser("export_poses", __doc__, EPILOG.format(formats=formats))
     source = parser.add_mutually_exclusive_group(required=True)
     text = "JSON lines of localize.py"
     source.add_argument("--results", type=Path, default=[], nargs="+", metavar="FILE", help=text)
@@ -64,7 +59,7 @@ def build_parser() -> argparse.ArgumentParser:
     group.add_argument("--timestamps", choices=["index", "name"], help=f"{text} ({_takers('timestamps')})")
     text = f"of the cloud's coordinates, such as EPSG:25832 ({_takers('crs')})"
     group.add_argument("--crs", help=text)
-    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    add_run_options(parser)
     return parser
 
 
@@ -90,8 +85,8 @@ def options_from(arguments: argparse.Namespace) -> Options:
     )
 
 
-def report(selection: Selection) -> Iterable[str]:
-    """Notes on results left out, and on clouds that may have different coordinate systems."""
+def notes_on(selection: Selection) -> Iterable[str]:
+    """Notes for the user: what was left out, and what may be mixed up."""
     if selection.left_out:
         num_left_out = sum(selection.left_out.values())
         reasons = ", ".join(f"{count} {reason}" for reason, count in selection.left_out.items())
@@ -101,31 +96,24 @@ def report(selection: Selection) -> Iterable[str]:
         yield f"poses in {num_clouds} clouds are taken as in one coordinate system; --cloud chooses"
 
 
-def run(arguments: argparse.Namespace, options: Options) -> dict[str, object]:
-    """Read the results, select and export them; returns the summary that is printed."""
-    results = [result for path in arguments.results for result in read_results(path)]
+def run(arguments: argparse.Namespace) -> int:
+    """Read, choose, write; returns the exit code."""
+    with checking_options():
+        options = options_from(arguments)
+    results = read_results(arguments.results)
     if arguments.scenes:
         results = [result for scene in find_scenes(arguments.scenes) for result in true_results(scene)]
     if not FORMATS[arguments.format].is_folder:
         check_output(arguments.out, arguments.results)
     selection = select(results, arguments.cloud, arguments.all)
-    for line in report(selection):
-        print(f"export_poses.py: {line}", file=sys.stderr)
+    for note in notes_on(selection):
+        print_note(arguments, note)
     export(selection.results, arguments.format, arguments.out, options)
-    return {
-        "out": str(arguments.out),
-        "format": arguments.format,
-        "poses": len(selection.results),
-        "left_out": selection.left_out,
-    }
+    report = {"out": str(arguments.out), "format": arguments.format, "poses": len(selection.results)}
+    print(json.dumps({**report, "left_out": selection.left_out}))
+    return 0
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    arguments = build_parser().parse_args(argv)
-
-    def export() -> int:
-        print(json.dumps(run(arguments, options_from(arguments))))
-        return 0
-
-    return guarded("export_poses.py", arguments.debug, export, lambda: options_from(arguments))
+    return run_command(build_parser(), argv, run)

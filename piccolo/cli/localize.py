@@ -3,105 +3,77 @@
 import argparse
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from tqdm import tqdm
 
-from ..coarse_to_fine.settings import CoarseToFineSettings
+from ..coarse_to_fine.open_map import CachePolicy
 from ..confidence.confidence import LOCALIZED
 from ..errors import InputError
-from ..panorama import ReadOptions
-from ..paper.settings import PaperSettings
-from ..pipeline import CachePolicy, Inputs, Localizer, localize_file, open_localizer
+from ..panorama import ReadOptions, read_panorama
 from ..render.overlay import overlay_png
 from ..result import Result
 from ..runtime.atomic import check_output, write_atomically
 from ..runtime.kernel_cache import is_first_use, kernel_folder
-from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
-from .errors import EXIT_BAD_INPUT, complain, guarded, words_of
-from .options import (
-    build_parser,
-    check_arguments,
-    cloud_settings_from,
-    parse,
-    read_options_from,
-    settings_from,
-)
-from .progress import shown, warned
+from ..scan import Scan, Settings, open_files
+from .errors import EXIT_BAD_INPUT, checking_options, format_error, print_error, run_command
+from .options import build_parser, check_arguments, cloud_settings_from, read_options_from, settings_from
+from .progress import progress_bar, warn_once
 
-PROGRAM = "localize.py"
 EXIT_ALL_LOCALIZED, EXIT_SOME_NOT = 0, 1
 
 
-@dataclass(frozen=True)
-class Session:
-    """One prepared cloud and how to treat the panoramas."""
-
-    arguments: argparse.Namespace
-    inputs: Inputs
-    localizer: Localizer
-    workers: Workers
-    seconds: dict[str, float]  # spent once, on the cloud
-
-    def say(self, text: str) -> None:
-        """A line for the user, on stderr."""
-        if not self.arguments.quiet:
-            tqdm.write(text, file=sys.stderr)
-
-    def localize(self, pano: Path) -> Result:
-        """Read one panorama, localize it, write its overlay if one is asked for."""
-        localizer = self.localizer
-        result, panorama = localize_file(localizer, self.inputs, pano, self.workers, self.seconds)
-        if self.arguments.overlay and result.pose is not None:
-            png = overlay_png(localizer.points, panorama, localizer.from_world(result.pose), self.workers)
-            write_atomically(self.arguments.overlay, png)
-        for warning in panorama.warnings:
-            self.say(f"warning: {warning}")
-        return result
-
-
-def open_session(
-    arguments: argparse.Namespace, settings: CoarseToFineSettings | PaperSettings, read_options: ReadOptions
-) -> Session:
-    """Read and prepare the cloud, after a look at what is to be written."""
+def open_scan(arguments: argparse.Namespace, settings: Settings) -> Scan:
+    """Read and prepare the scan, after a look at what is to be written."""
     for output in filter(None, (arguments.out, arguments.overlay)):
         check_output(output, [*arguments.cloud, *arguments.pano])
     if is_first_use() and not arguments.quiet:
         text = f"first use: compiling kernels, once (under half a minute), into {kernel_folder()}"
         print(text, file=sys.stderr, flush=True)
-
-    watch = Stopwatch()
     cache = CachePolicy(not arguments.no_cache, arguments.cache)
-    workers = Workers(arguments.threads, shown(arguments.quiet), warned(arguments.quiet))
-    inputs = Inputs(tuple(arguments.cloud), cloud_settings_from(arguments), read_options)
-    localizer = open_localizer(inputs, settings, cache, workers, watch)
-    for warning in localizer.warnings:  # those of a map prepared earlier; others have been written
+    workers = Workers(arguments.threads, progress_bar(arguments.quiet), warn_once(arguments.quiet))
+    scan = open_files(arguments.cloud, cloud_settings_from(arguments), settings, cache, workers)
+    for warning in scan.warnings:  # those of a map prepared earlier; others have been written
         workers.warn(warning)
-    return Session(arguments, inputs, localizer, workers, watch.seconds)
+    return scan
 
 
-def results_of(session: Session) -> Iterator[Result | None]:
+def report(arguments: argparse.Namespace, scan: Scan, result: Result, read_options: ReadOptions) -> None:
+    """Write the overlay if one is asked for, and say what was found."""
+    if arguments.overlay and result.pose is not None:
+        panorama = read_panorama(Path(result.pano), read_options)
+        png = overlay_png(scan.points, panorama, scan.from_world(result.pose), scan.workers)
+        write_atomically(arguments.overlay, png)
+    warnings = [f"warning: {warning}" for warning in result.warnings[len(scan.warnings) :]]
+    for line in () if arguments.quiet else (*warnings, result.summary()):
+        tqdm.write(line, file=sys.stderr)
+
+
+def results_of(
+    arguments: argparse.Namespace, scan: Scan, settings: Settings, read_options: ReadOptions
+) -> Iterator[Result | None]:
     """The result of each panorama in order; None for one that can't be read, after saying why."""
-    arguments = session.arguments
     hidden = arguments.quiet or len(arguments.pano) == 1
     for pano in tqdm(arguments.pano, desc="panoramas", unit="", disable=hidden, file=sys.stderr):
         try:
-            result = session.localize(pano)
+            result = scan.localize_query(pano, read_options, settings)
+            report(arguments, scan, result, read_options)
         except (OSError, InputError) as error:
-            complain(PROGRAM, arguments.debug, words_of(error), EXIT_BAD_INPUT)
+            print_error(arguments, format_error(error), EXIT_BAD_INPUT)
             yield None
-            continue
-        session.say(result.summary())
-        yield result
+        else:
+            yield result
 
 
-def run(session: Session) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Localize every panorama, write the results, return the exit code."""
-    arguments, lines = session.arguments, list[str]()
+    with checking_options():
+        check_arguments(arguments)
+        settings, read_options = settings_from(arguments), read_options_from(arguments)
+    scan, lines = open_scan(arguments, settings), list[str]()
     is_bad = some_not = False
-    for result in results_of(session):
+    for result in results_of(arguments, scan, settings, read_options):
         is_bad |= result is None
         if result is None:
             continue
@@ -119,10 +91,4 @@ def run(session: Session) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    arguments = parse(build_parser(), argv)
-
-    def check() -> tuple[CoarseToFineSettings | PaperSettings, ReadOptions]:
-        check_arguments(arguments)
-        return settings_from(arguments), read_options_from(arguments)
-
-    return guarded(PROGRAM, arguments.debug, lambda: run(open_session(arguments, *check())), check)
+    return run_command(build_parser(), argv, run)

@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import sys
 import time
 from pathlib import Path
 
@@ -17,14 +16,15 @@ from ..optimize.loss_surface_io import KnownPoses, plan_shift, surface_npz, surf
 from ..panorama import read_panorama
 from ..panorama.resize import shrink
 from ..panorama.texels import pack_texels
-from ..pipeline import open_points
+from ..result import read_results
 from ..runtime.atomic import check_output, write_atomically
 from ..runtime.threads import Workers, num_cores
-from ..scenes.export import read_results
+from ..scan import open_points
 from ..scenes.scene import read_scene
-from .errors import guarded
-from .options import add_cloud_options, cloud_settings_from, parse
-from .progress import shown
+from .errors import checking_options, print_note, run_command
+from .options import add_cloud_options, cloud_settings_from
+from .parser import add_run_options, new_parser
+from .progress import progress_bar
 
 EPILOG = """\
 examples:
@@ -39,7 +39,6 @@ cloud are computed too, and drawn pale; the lowest place and the minima are of t
 NPZ, in the world's axes turned so that z is up (R_plan_from_world, identity for clouds with z up): x (nx,)
 and y (ny,) [m]; loss, height, is_free (ny, nx); R_cam_from_world (ny, nx, 3, 3) of the best pose; found_world
 and true_world (3,), NaN where not known. One JSON object on stdout.
-exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 MAX_CELLS = 1_000_000
 HEIGHTS_ABOUT = (-0.15, 0.0, 0.15)  # [m] of the known one
@@ -47,12 +46,7 @@ HEIGHTS_ABOUT = (-0.15, 0.0, 0.15)  # [m] of the known one
 
 def build_parser() -> argparse.ArgumentParser:
     """All options."""
-    parser = argparse.ArgumentParser(
-        "loss_surface.py",
-        description=__doc__,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = new_parser("loss_surface", __doc__, EPILOG)
     add_cloud_options(parser, "coloured scan, as for localize.py, or a map by tools/prepare_map.py")
     parser.add_argument("--pano", type=Path, required=True, help="the panorama")
     parser.add_argument("--result", type=Path, metavar="FILE", help="JSON lines of localize.py: pose found")
@@ -74,8 +68,7 @@ def build_parser() -> argparse.ArgumentParser:
     group.add_argument("--max-points", type=int, default=30_000, metavar="N", help=text)
     group.add_argument("--no-visibility", action="store_true", help="see through walls")
     parser.add_argument("--threads", type=int, default=num_cores(), metavar="N", help="(default all cores)")
-    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
-    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    add_run_options(parser)
     return parser
 
 
@@ -103,7 +96,7 @@ def known_poses(arguments: argparse.Namespace, cloud: LocalCloud) -> KnownPoses:
     """The pose found and the true one of the panorama, as far as files are given."""
     name, found, true = arguments.pano.name, None, None
     if arguments.result:
-        poses = [r.pose for r in read_results(arguments.result) if Path(r.pano).name == name and r.pose]
+        poses = [r.pose for r in read_results([arguments.result]) if Path(r.pano).name == name and r.pose]
         if len(poses) != 1:
             raise InputError(f"{arguments.result}: {len(poses)} poses of {name}, wanted one")
         found = cloud.from_world(poses[0])
@@ -172,17 +165,19 @@ def summary(surface: LossSurface, grid: PoseGrid, cloud: LocalCloud, known: Know
 
 def run(arguments: argparse.Namespace) -> int:
     """Read, compute, write."""
+    with checking_options():
+        check_usage(arguments)
     outputs = [path for path in (arguments.out, arguments.npz) if path]
     inputs = [*arguments.cloud, arguments.pano, *filter(None, (arguments.result, arguments.truth))]
     for path in outputs:
         check_output(path, inputs)
 
-    workers = Workers(arguments.threads, shown(arguments.quiet))
+    workers = Workers(arguments.threads, progress_bar(arguments.quiet))
     panorama = shrink(read_panorama(arguments.pano), arguments.width)
     texels = pack_texels(panorama.rgb, panorama.is_valid)
     cloud = open_points(arguments.cloud, cloud_settings_from(arguments), workers)
-    for warning in () if arguments.quiet else cloud.warnings:
-        print(f"loss_surface.py: warning: {warning}", file=sys.stderr)
+    for warning in cloud.warnings:
+        print_note(arguments, f"warning: {warning}")
     known = known_poses(arguments, cloud)
     grid = grid_from(arguments, cloud, known)
     begin = time.perf_counter()
@@ -203,5 +198,4 @@ def run(arguments: argparse.Namespace) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    arguments = parse(build_parser(), argv)
-    return guarded("loss_surface.py", arguments.debug, lambda: run(arguments), lambda: check_usage(arguments))
+    return run_command(build_parser(), argv, run)

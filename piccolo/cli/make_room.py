@@ -7,13 +7,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from ..cloud.ply_writer import vertex_rows, write_ply
-from ..errors import InputError
 from ..runtime.atomic import write_atomically
 from ..runtime.threads import Workers, num_cores
 from ..scenes import scene as scenes
+from ..scenes.datasets.labels import write_labels
 from ..scenes.synthetic.world import (
     VARIANTS,
     Query,
@@ -25,8 +24,9 @@ from ..scenes.synthetic.world import (
     make_world,
     scan_world,
 )
-from .errors import guarded
-from .progress import shown
+from .errors import UsageError, checking_options, run_command
+from .parser import add_run_options, new_parser
+from .progress import progress_bar
 
 EPILOG = """\
 examples:
@@ -35,18 +35,15 @@ examples:
   python tools/make_room.py --out flats --rooms 16 --points 2000000 --panoramas 4 --variants clean photo
 
 Writes FOLDER/cloud.ply, FOLDER/images/VARIANT_K.jpg and FOLDER/queries.json with the true poses.
-clean: as scanned; tilt: the camera turned anyhow; photo: other exposure, white balance, gamma, blur, noise;
-change: furniture moved and added. With --labels the points have a label too, and each panorama a picture
-of labels, FOLDER/labels/VARIANT_K.png. One JSON object a scene on stdout says what was written.
-exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
+clean: as scanned; tilt: the camera in any orientation; photo: other exposure, white balance, gamma, blur
+and noise; change: furniture moved and added. With --labels the points have a label too, and each panorama
+a picture of labels, FOLDER/labels/VARIANT_K.png. One JSON object a scene on stdout.
 """
 
 
 def build_parser() -> argparse.ArgumentParser:
     """All options."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = new_parser("make_room", __doc__, EPILOG)
     parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="made if it is not there")
     parser.add_argument("--seed", type=int, default=0, help="equal seeds, equal bits (default 0)")
     parser.add_argument("--points", type=int, default=300_000, help="(default 300000)")
@@ -60,8 +57,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--labels", action="store_true", help=text)
     text = "a number of scenes, FOLDER/000 on, of the seeds from --seed on (default: one, in FOLDER itself)"
     parser.add_argument("--scenes", type=int, default=0, metavar="N", help=text)
-    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
-    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    add_run_options(parser)
     return parser
 
 
@@ -75,21 +71,10 @@ def write_query(folder: Path, name: str, query: Query) -> scenes.Query:
     return scenes.Query(image, query.variant, query.pose)
 
 
-def write_labels(folder: Path, name: str, labels: NDArray[np.uint16]) -> Path:
-    """Write an image of labels (H, W) and return its path."""
-    image = folder / "labels" / f"{name}.png"
-    image.parent.mkdir(exist_ok=True)
-    _, encoded = cv2.imencode(".png", labels)
-    write_atomically(image, bytes(encoded))
-    return image
-
-
 def write_world(
     arguments: argparse.Namespace, world: World, folder: Path, workers: Workers
 ) -> dict[str, object]:
     """Write one scene and return what was written."""
-    check_num_points(world, arguments.points)
-    check_width(arguments.width)
     (folder / "images").mkdir(parents=True, exist_ok=True)
     points, colors, labels = scan_world(world, arguments.points, workers)
     rows = vertex_rows(points, colors, labels.astype(np.int32) if arguments.labels else None)
@@ -100,25 +85,30 @@ def write_world(
             query = make_query(world, k, v, arguments.width, workers)
             written = write_query(folder, f"{v}_{k}", query)
             if arguments.labels:
-                labels_path = write_labels(folder, f"{v}_{k}", make_labels(world, k, query, workers))
-                written = replace(written, labels=labels_path)
+                path = folder / "labels" / f"{v}_{k}.png"
+                path.parent.mkdir(exist_ok=True)
+                write_labels(path, make_labels(world, k, query, workers))
+                written = replace(written, labels=path)
             queries.append(written)
     scenes.write_queries(folder, queries)
     return {"folder": str(folder), "points": len(points), "queries": len(queries), "seed": world.seed}
 
 
+def run(arguments: argparse.Namespace) -> int:
+    """Make and write all scenes."""
+    if min(arguments.panoramas, arguments.seed, arguments.scenes) < 0:
+        raise UsageError("--panoramas, --seed, --scenes: found a negative number, wanted 0 or more")
+    workers = Workers(num_cores(), progress_bar(arguments.quiet))
+    for number in range(max(1, arguments.scenes)):
+        with checking_options():
+            check_width(arguments.width)
+            world = make_world(arguments.seed + number, np.array(arguments.size), arguments.rooms)
+            check_num_points(world, arguments.points)
+        folder = arguments.out / f"{number:03}" if arguments.scenes else arguments.out
+        print(json.dumps(write_world(arguments, world, folder, workers)), flush=True)
+    return 0
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    arguments = build_parser().parse_args(argv)
-
-    def run() -> int:
-        if min(arguments.panoramas, arguments.seed, arguments.scenes) < 0:
-            raise InputError("--panoramas, --seed, --scenes: found a negative number, wanted 0 or more")
-        workers = Workers(num_cores(), shown(arguments.quiet))
-        for number in range(max(1, arguments.scenes)):
-            world = make_world(arguments.seed + number, np.array(arguments.size), arguments.rooms)
-            folder = arguments.out / f"{number:03}" if arguments.scenes else arguments.out
-            print(json.dumps(write_world(arguments, world, folder, workers)), flush=True)
-        return 0
-
-    return guarded("make_room.py", arguments.debug, run)
+    return run_command(build_parser(), argv, run)

@@ -1,7 +1,6 @@
 """The options of localize.py: what they are, and the settings that they ask for."""
 
 import argparse
-import sys
 from pathlib import Path
 from typing import Any, get_args
 
@@ -13,6 +12,7 @@ from ..errors import InputError
 from ..panorama import ReadOptions
 from ..paper.settings import Initialization, PaperSettings, PoseLoss
 from ..runtime.threads import num_cores
+from .parser import add_run_options, new_parser
 
 DESCRIPTION = "Find where in a coloured point cloud 360-degree panoramas were taken."
 EPILOG = """\
@@ -24,45 +24,39 @@ examples:
   python localize.py --cloud scan.ply --pano query.jpg --preset paper --solver lbfgs
 
 output: one JSON object a panorama, one a line, in the order given; messages and progress go to stderr.
-exit codes: 0 all localized, 1 some not, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
+--help-paper shows the options of the preset paper.
 """
-# option, metavar, type or choices, help: settings that only one preset has, named as the setting
+# Settings that only one preset has, each with an option of its name: option, metavar, type or choices, help.
 Option = tuple[str, str | None, type | tuple[str, ...], str]
+NUM_ROTATIONS: Option = (
+    "--num-rotations", "N", int,
+    "rotations of SO(3) searched where gravity is unknown; preset paper: N_r, 0 for 8 yaws or 32 of SO(3)",
+)  # fmt: skip
 ENGINE_OPTIONS: tuple[Option, ...] = (
     ("--num-yaws", "N", int, "rotations searched where gravity is known"),
-    ("--num-rotations", "N", int, "rotations of SO(3) searched where it is not"),
+    NUM_ROTATIONS,
     ("--max-starts", "N", int, "poses from which a descent begins, at most"),
 )
-PAPER_OPTIONS: tuple[Option, ...] = (
-    ("--translations", "N_t", int, "start positions in free space"),
-    ("--rotations", "N_r", int, "start rotations; 0: 8 yaws if gravity is known, 32 of SO(3) if not"),
+PAPER_ONLY: tuple[Option, ...] = (
+    ("--num-translations", "N_t", int, "start positions in free space"),
     ("--loss", None, get_args(PoseLoss), "photometric: pixels of the rendered cloud, the paper's comparison"),
     ("--photometric-width", "PX", int, "of rendered cloud and panorama with the photometric loss, at most"),
     ("--initialization", None, get_args(Initialization), "loss-only: K2 poses by the loss, no histograms"),
-    ("--keep-by-loss", "K1", int, "poses kept by the loss"),
-    ("--keep-by-histogram", "K2", int, "poses kept by colour histograms, and refined"),
-    ("--iterations", "N", int, "iterations of the solver"),
+    ("--num-by-loss", "K1", int, "poses kept by the loss"),
+    ("--num-by-histogram", "K2", int, "poses kept by colour histograms, and refined"),
+    ("--num-iterations", "N", int, "iterations of the solver"),
     ("--histogram-bins", "N", int, "bins a channel"),
-    ("--grid-margin", "SHARE", float, "share of the box left out on each side of the grid"),
+    ("--grid-margin", "FRACTION", float, "fraction of the box left out on each side of the grid"),
     ("--max-points", "N", int, "points used of a larger cloud"),
+    ("--no-visibility", None, bool, "see through walls"),
 )
-PAPER_SETTING = {
-    "translations": "num_translations",
-    "rotations": "num_rotations",
-    "keep_by_loss": "num_by_loss",
-    "keep_by_histogram": "num_by_histogram",
-    "iterations": "num_iterations",
-}
+PAPER_OPTIONS = (NUM_ROTATIONS, *PAPER_ONLY)
+PRIORS = ("near", "radius", "height", "heading", "heading_tolerance")
 
 
 def build_parser() -> argparse.ArgumentParser:
     """All options. A setting that is not given stays None, and keeps its preset's default."""
-    parser = argparse.ArgumentParser(
-        "localize.py",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = new_parser("localize", DESCRIPTION, EPILOG, "0 all localized, 1 some not")
     parser.add_argument("--version", action="version", version=f"piccolo {__version__}")
     text = "coloured scan in any format of the README, one file or several; or a map by tools/prepare_map.py"
     add_cloud_options(parser, text)
@@ -71,42 +65,41 @@ def build_parser() -> argparse.ArgumentParser:
     files.add_argument("--out", type=Path, help="write the JSON here, not to stdout")
     files.add_argument("--overlay", type=Path, help="PNG: panorama, cloud at the pose, checkerboard of both")
     files.add_argument("--cache", type=Path, metavar="FOLDER", help="of prepared maps (default the user's)")
-    files.add_argument("--no-cache", action="store_true", help="prepare the map anew and keep none")
+    files.add_argument("--no-cache", action="store_true", help="prepare the map again, and do not keep it")
     add_method_options(parser)
     add_prior_options(parser)
-    run = parser.add_argument_group("run")
-    run.add_argument("--threads", type=int, default=num_cores(), metavar="N", help="(default all cores)")
-    run.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
-    run.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    text = "(default all cores)"
+    parser.add_argument("--threads", type=int, default=num_cores(), metavar="N", help=text)
+    add_run_options(parser)
     return parser
 
 
 def add_cloud_options(parser: argparse.ArgumentParser, text: str) -> None:
-    """The cloud's files, described by `text`, and how to understand them."""
+    """The cloud's files, described by `text`, and how to read them."""
     group = parser.add_argument_group("cloud")
     group.add_argument("--cloud", type=Path, required=True, nargs="+", help=text)
     add_cloud_reading_options(group)
 
 
 def add_cloud_reading_options(group: argparse._ArgumentGroup) -> None:
-    """How to understand a cloud's files."""
+    """How to read a cloud's files."""
     unit = group.add_mutually_exclusive_group()
     unit.add_argument("--units", choices=list(METRES), help="of the cloud's coordinates (default m)")
     unit.add_argument("--scale", type=float, metavar="S", help="metres per unit of the cloud, in place of it")
-    text = "axis of the cloud that points up, not to be found out (default auto; preset default)"
+    text = "up axis of the cloud; auto estimates it (default auto; preset default)"
     group.add_argument("--up", choices=get_args(UpAxis), default="auto", help=text)
     text = "of clouds without colours"
     group.add_argument("--intensity-as-gray", action="store_true", help=text)
     text = (
-        "semantic labels in place of colours: of the points (PLY, LAS, LAZ, PCD), and PNG panoramas of such"
+        "semantic labels in place of colours: of the points (PLY, LAS, LAZ, PCD), and PNG panoramas of labels"
     )
     group.add_argument("--labels", action="store_true", help=text)
-    text = "labels that say nothing: left out of the cloud, masked in panoramas"
+    text = "labels to ignore: left out of the cloud, masked in panoramas"
     group.add_argument("--ignore-labels", type=int, nargs="+", metavar="N", help=text)
 
 
 def add_panorama_options(parser: argparse.ArgumentParser) -> None:
-    """The panoramas' files, and how to understand them."""
+    """The panoramas' files, and how to read them."""
     group = parser.add_argument_group("panorama")
     text = "JPEG, PNG, TIFF or WebP: 2:1, or a crop with Photo Sphere metadata; or a folder of six cube faces"
     group.add_argument("--pano", type=Path, required=True, nargs="+", help=text)
@@ -114,10 +107,12 @@ def add_panorama_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
-    """What the pictures do not say of themselves."""
+    """What the files of the panoramas do not tell."""
     text = "horizontal field of view of a part of the sphere, its middle row the horizon"
     group.add_argument("--fov", type=float, metavar="DEG", help=text)
-    text = "picture, white where the panorama is to be ignored, or a folder of such named as the panoramas"
+    text = (
+        "picture, white where the panorama is to be ignored; or a folder of masks with the panoramas' names"
+    )
     group.add_argument("--mask", type=Path, help=text)
     text = "ignore the cap of this half angle straight down: tripod, car roof"
     group.add_argument("--mask-nadir", type=float, default=0.0, metavar="DEG", help=text)
@@ -126,13 +121,13 @@ def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
 
 
 def read_options_from(arguments: argparse.Namespace) -> ReadOptions:
-    """What add_panorama_options asked for."""
+    """The options of add_panorama_options."""
     pictures = arguments.fov, arguments.mask, arguments.mask_nadir, arguments.cube_order
     return ReadOptions(*pictures, labels_from(arguments))
 
 
 def cloud_settings_from(arguments: argparse.Namespace) -> CloudSettings:
-    """What add_cloud_options asked for."""
+    """The options of add_cloud_options."""
     scale = METRES[arguments.units or "m"] if arguments.scale is None else arguments.scale
     return CloudSettings(scale, arguments.up, arguments.intensity_as_gray, labels_from(arguments))
 
@@ -140,23 +135,12 @@ def cloud_settings_from(arguments: argparse.Namespace) -> CloudSettings:
 def labels_from(arguments: argparse.Namespace) -> Labels | None:
     """How labels are to be read, None for colours."""
     if arguments.ignore_labels and not arguments.labels:
-        raise InputError("--ignore-labels: found without --labels, wanted both")
+        raise InputError("--ignore-labels: only with --labels")
     return Labels(tuple(sorted(set(arguments.ignore_labels or ())))) if arguments.labels else None
 
 
-def parse(parser: argparse.ArgumentParser, argv: list[str] | None) -> argparse.Namespace:
-    """The options given; argparse alone would take the value of `--up -y` for an option."""
-    words: list[str] = []
-    for word in sys.argv[1:] if argv is None else argv:
-        if words[-1:] == ["--up"]:
-            words[-1] = f"--up={word}"
-        else:
-            words.append(word)
-    return parser.parse_args(words)
-
-
 def add_method_options(parser: argparse.ArgumentParser) -> None:
-    """The preset and its settings."""
+    """The preset and its settings; those of the preset `paper` are shown by --help-paper only."""
     group = parser.add_argument_group("method")
     text = "default: prepared views, all positions searched; paper: Kim et al., ICCV 2021, Algorithm 1"
     group.add_argument("--preset", choices=["default", "paper"], default="default", help=text)
@@ -164,19 +148,48 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--gravity", choices=["auto", "known", "unknown"], help=text)
     text = "of the descent (default gauss-newton, with the preset paper adam)"
     group.add_argument("--solver", choices=["gauss-newton", "lbfgs", "adam"], help=text)
-    text = f"below it a pose is not called localized (default {CoarseToFineSettings().min_confidence})"
+    text = f"a pose with less is not called localized (default {CoarseToFineSettings().min_confidence})"
     group.add_argument("--min-confidence", type=float, metavar="X", help=text)
-    for title, options, settings in (
-        ("preset default", ENGINE_OPTIONS, CoarseToFineSettings()),
-        ("preset paper", PAPER_OPTIONS, PaperSettings()),
-    ):
-        group = parser.add_argument_group(title)
-        for option, metavar, kind, text in options:
-            name = option[2:].replace("-", "_")
-            default = getattr(settings, PAPER_SETTING.get(name, name))
-            checked: dict[str, Any] = {"choices": kind} if isinstance(kind, tuple) else {"type": kind}
-            group.add_argument(option, **checked, metavar=metavar, help=f"{text} (default {default})")
-    group.add_argument("--no-visibility", action="store_const", const=True, help="see through walls")
+    add_options(group, ENGINE_OPTIONS, CoarseToFineSettings())
+    add_options(group, PAPER_ONLY, PaperSettings(), is_hidden=True)
+    text = "show the options of the preset paper and exit"
+    group.add_argument("--help-paper", action=PaperHelp, nargs=0, help=text)
+
+
+def add_options(
+    group: argparse._ArgumentGroup,
+    options: tuple[Option, ...],
+    defaults: CoarseToFineSettings | PaperSettings,
+    is_hidden: bool = False,
+) -> None:
+    """Options that have the names of settings."""
+    for option, metavar, kind, text in options:
+        setting = setting_of(option)
+        default = "" if kind is bool else f" (default {getattr(defaults, setting)})"
+        shown = argparse.SUPPRESS if is_hidden else text + default
+        if kind is bool:
+            group.add_argument(option, action="store_const", const=False, dest=setting, help=shown)
+        elif isinstance(kind, tuple):
+            group.add_argument(option, choices=kind, help=shown)
+        else:
+            group.add_argument(option, type=kind, metavar=metavar, help=shown)
+
+
+def setting_of(option: str) -> str:
+    """The name of an option's setting."""
+    return option.removeprefix("--").replace("-", "_").replace("no_visibility", "use_visibility")
+
+
+class PaperHelp(argparse.Action):
+    """Print the options of the preset `paper`, and exit."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *values: object) -> None:
+        """See argparse.Action."""
+        usage = f"{parser.prog} --preset paper [option ...]"
+        paper = argparse.ArgumentParser(usage=usage, add_help=False)
+        add_options(paper.add_argument_group("options of the preset paper"), PAPER_OPTIONS, PaperSettings())
+        paper.print_help()
+        parser.exit()
 
 
 def add_prior_options(parser: argparse.ArgumentParser) -> None:
@@ -193,22 +206,17 @@ def add_prior_options(parser: argparse.ArgumentParser) -> None:
 def settings_from(arguments: argparse.Namespace) -> CoarseToFineSettings | PaperSettings:
     """The settings that the options ask for; an option of the other preset is refused."""
     given = {k: v for k, v in vars(arguments).items() if v is not None}
-    own, other = ENGINE_OPTIONS, PAPER_OPTIONS
+    shared = {name: given[name] for name in ("gravity", "solver", "min_confidence") if name in given}
     if arguments.preset == "paper":
-        own, other = other, own
-    foreign = [option for option, *_ in other if option[2:].replace("-", "_") in given]
-    priors = [n for n in ("near", "radius", "height", "heading", "heading_tolerance") if n in given]
-    if arguments.preset == "default":
-        foreign += ["--no-visibility"] if "no_visibility" in given else []
-    else:
-        foreign += ["--" + name.replace("_", "-") for name in priors]
+        foreign = [option for option, *_ in ENGINE_OPTIONS if option != NUM_ROTATIONS[0]]
+        foreign += ["--" + name.replace("_", "-") for name in PRIORS]
         foreign += ["--up"] if arguments.up != "auto" else []
-    if foreign:
-        raise InputError(f"{foreign[0]}: not an option of the preset {arguments.preset}")
-    names = ["gravity", "solver", "min_confidence", *(option[2:].replace("-", "_") for option, *_ in own)]
-    chosen = {PAPER_SETTING.get(n, n): given[n] for n in names if n in given}
+    else:
+        foreign = [option for option, *_ in PAPER_ONLY]
+    if wrong := [option for option in foreign if setting_of(option) in given]:
+        raise InputError(f"{wrong[0]}: not an option of the preset {arguments.preset}")
     if arguments.preset == "paper":
-        return PaperSettings(use_visibility="no_visibility" not in given, **chosen)
+        return paper_settings_from(arguments, **shared)
     prior = Prior(
         near_world=tuple(given["near"]) if "near" in given else None,
         radius=given.get("radius"),
@@ -216,15 +224,22 @@ def settings_from(arguments: argparse.Namespace) -> CoarseToFineSettings | Paper
         heading_deg=given.get("heading"),
         heading_tolerance_deg=given.get("heading_tolerance", Prior.heading_tolerance_deg),
     )
-    return CoarseToFineSettings(prior=prior, **chosen)
+    own = {name: given[name] for option, *_ in ENGINE_OPTIONS if (name := setting_of(option)) in given}
+    return CoarseToFineSettings(prior=prior, **shared, **own)
+
+
+def paper_settings_from(arguments: argparse.Namespace, **more: Any) -> PaperSettings:
+    """The settings of the preset `paper` by PAPER_OPTIONS, and `more`."""
+    given = {setting_of(option): getattr(arguments, setting_of(option)) for option, *_ in PAPER_OPTIONS}
+    return PaperSettings(**{name: value for name, value in given.items() if value is not None}, **more)
 
 
 def check_arguments(arguments: argparse.Namespace) -> None:
-    """Refuse values that no file could make right."""
+    """Refuse values that are wrong whatever the files hold."""
     if arguments.threads < 1:
         raise InputError(f"--threads: found {arguments.threads}, wanted at least 1")
     cloud_settings_from(arguments)
     if arguments.overlay and len(arguments.pano) > 1:
         raise InputError(f"--overlay: found {len(arguments.pano)} panoramas, wanted one")
     if arguments.cache and arguments.no_cache:
-        raise InputError("--cache, --no-cache: found both, wanted one of them or none")
+        raise InputError("--cache, --no-cache: only one of them")

@@ -1,4 +1,4 @@
-"""How the tools show on stderr how far they are, by bars that vanish when full, and warn."""
+"""Progress bars on stderr, which vanish when they are full, and warnings."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -11,8 +11,8 @@ from ..runtime.threads import Show
 DELAY = 0.5  # seconds: what takes less needs no bar
 
 
-def shown(is_quiet: bool) -> Show:
-    """What wraps values in a bar, or in nothing."""
+def progress_bar(is_quiet: bool) -> Show:
+    """A function that wraps values in a progress bar, or in nothing."""
 
     def show(values: Iterator[Any], total: int | None, label: str) -> Iterator[Any]:
         return iter(tqdm(values, label, total, leave=False, disable=is_quiet, file=sys.stderr, delay=DELAY))
@@ -20,13 +20,13 @@ def shown(is_quiet: bool) -> Show:
     return show
 
 
-def warned(is_quiet: bool) -> Callable[[str], None]:
-    """What writes a warning, once however often it comes, or nothing."""
-    said: set[str] = set()
+def warn_once(is_quiet: bool) -> Callable[[str], None]:
+    """A function that prints a warning, once however often it comes, or nothing."""
+    printed: set[str] = set()
 
     def warn(warning: str) -> None:
-        if not is_quiet and warning not in said:
-            said.add(warning)
+        if not is_quiet and warning not in printed:
+            printed.add(warning)
             tqdm.write(f"warning: {warning}", file=sys.stderr)
 
     return warn

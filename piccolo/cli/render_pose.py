@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import sys
 from contextlib import nullcontext
 from io import BytesIO
 from pathlib import Path
@@ -27,15 +26,16 @@ from ..optimize.settings import DescentSettings
 from ..panorama import read_panorama
 from ..panorama.resize import shrink
 from ..panorama.texels import pack_texels
-from ..pipeline import open_points
 from ..render.surfel_renderer import RenderedView, encode_image, fill_holes, render_points
+from ..result import read_results
 from ..runtime.atomic import check_output, check_output_folder, replacing_folder, write_atomically
 from ..runtime.threads import Workers, num_cores
-from ..scenes.export import read_results
+from ..scan import open_points
 from ..scenes.scene import read_scene
-from .errors import guarded
-from .options import add_cloud_options, cloud_settings_from, parse
-from .progress import shown
+from .errors import checking_options, print_note, run_command
+from .options import add_cloud_options, cloud_settings_from
+from .parser import add_run_options, new_parser
+from .progress import progress_bar
 
 EPILOG = """\
 examples:
@@ -51,7 +51,6 @@ millimetres, 0 where nothing is seen, 65535 for 65.535 m and farther. NPY: float
 is seen.
 --mask-out: white where nothing is seen, as --mask of localize.py takes it.
 One JSON object a picture on stdout.
-exit codes: 0 done, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted.
 """
 MAX_WIDTH, MIN_WIDTH = 32_768, 16
 MAGENTA = (255, 0, 255)  # a colour that scans do not have
@@ -63,12 +62,7 @@ Named = list[tuple[str, Pose]]  # poses in the world with the panorama's path
 
 def build_parser() -> argparse.ArgumentParser:
     """All options."""
-    parser = argparse.ArgumentParser(
-        "render_pose.py",
-        description=__doc__,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = new_parser("render_pose", __doc__, EPILOG)
     add_cloud_options(parser, "coloured scan, as for localize.py, or a map by tools/prepare_map.py")
     group = parser.add_argument_group("pose, one of")
     one = group.add_mutually_exclusive_group(required=True)
@@ -82,8 +76,7 @@ def build_parser() -> argparse.ArgumentParser:
         group.add_argument(f"--{angle}", type=float, metavar="DEG", help="with --at (default 0)")
     _add_picture_options(parser)
     _add_descent_options(parser)
-    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
-    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    add_run_options(parser)
     return parser
 
 
@@ -166,7 +159,7 @@ def poses_from(arguments: argparse.Namespace) -> Named:
     if arguments.queries:
         found = [(name, query.pose) for name, query in read_scene(file).by_name.items()]
     else:
-        found = [(r.pano, r.pose) for r in read_results(file) if r.pose is not None]
+        found = [(r.pano, r.pose) for r in read_results([file]) if r.pose is not None]
     if arguments.pano:
         found = [(name, pose) for name, pose in found if Path(name).name == Path(arguments.pano).name]
     if not found:
@@ -247,13 +240,15 @@ def animate(arguments: argparse.Namespace, cloud: LocalCloud, poses: Named, work
 
 def run(arguments: argparse.Namespace) -> int:
     """Read, draw, write."""
+    with checking_options():
+        check_usage(arguments)
     check_files(arguments)
     poses = poses_from(arguments)
 
-    workers = Workers(num_cores(), shown(arguments.quiet))
+    workers = Workers(num_cores(), progress_bar(arguments.quiet))
     cloud = open_points(arguments.cloud, cloud_settings_from(arguments), workers)
-    for warning in () if arguments.quiet else cloud.warnings:
-        print(f"render_pose.py: warning: {warning}", file=sys.stderr)
+    for warning in cloud.warnings:
+        print_note(arguments, f"warning: {warning}")
     if arguments.out:
         draw_pictures(arguments, cloud, poses, workers)
     if arguments.animate:
@@ -263,5 +258,4 @@ def run(arguments: argparse.Namespace) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    arguments = parse(build_parser(), argv)
-    return guarded("render_pose.py", arguments.debug, lambda: run(arguments), lambda: check_usage(arguments))
+    return run_command(build_parser(), argv, run)

@@ -2,126 +2,128 @@
 
 import argparse
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ..cloud.label_colors import Labels
 from ..cloud.settings import CloudSettings
+from ..coarse_to_fine.open_map import CachePolicy
 from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..errors import InputError
 from ..panorama import ReadOptions
 from ..paper.settings import PaperSettings
-from ..pipeline import CachePolicy
 from ..runtime.atomic import write_atomically
 from ..runtime.threads import num_cores
-from ..scenes.evaluation.row import Row
+from ..scenes.evaluation.query_result import QueryResult
 from ..scenes.evaluation.run_file import open_run
-from ..scenes.evaluation.runner import Plan
-from ..scenes.experiments.arms import EXPERIMENTS, Arm, Settings
-from ..scenes.experiments.report import plot_png, table
+from ..scenes.evaluation.runner import RunConfig
+from ..scenes.reproduce_paper.experiments import EXPERIMENTS, Condition, Settings
+from ..scenes.reproduce_paper.report import plot_png, table
 from ..scenes.scene import Scene, find_scenes
-from .errors import EXIT_BAD_INPUT, complain, guarded
-from .progress import shown
+from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error, run_command
+from .options import PAPER_OPTIONS, add_options, paper_settings_from
+from .parser import add_run_options, new_parser
+from .progress import progress_bar
 
 EPILOG = """\
 examples:
   python tools/make_room.py --out rooms --scenes 25 --panoramas 2 --labels
   python tools/reproduce_paper.py gravity density --scenes rooms --out results
   python tools/reproduce_paper.py labels --scenes datasets/stanford --out results --presets paper --jobs 4
+  python tools/reproduce_paper.py loss --scenes rooms --out results --num-translations 100 --num-by-loss 100
 
 experiments:
 {experiments}
 
-Writes OUT/NAME.md, OUT/NAME.png and OUT/NAME/ARM_PRESET.jsonl, whose lines tools/evaluate.py compares; the
-same command takes up an experiment that was stopped. Changed clouds and images are temporary.
-exit codes: 0 done, 2 wrong usage, 3 bad input (the rest is done), 4 internal error, 130 interrupted.
+Writes OUT/NAME.md, OUT/NAME.png and OUT/NAME/CONDITION_PRESET.jsonl, runs that tools/evaluate.py compares.
+The same command resumes an experiment that was stopped. Changed clouds and images are temporary.
 """
-PROGRAM = "experiments.py"
-PRESETS: dict[str, Settings] = {"paper": PaperSettings(), "default": CoarseToFineSettings(gravity="known")}
+PRESETS = ("paper", "default")
 
 
 def build_parser() -> argparse.ArgumentParser:
     """All options."""
     lines = [f"  {name:<15} {experiment.title}" for name, experiment in EXPERIMENTS.items()]
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog=EPILOG.format(experiments="\n".join(lines)),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = new_parser("reproduce_paper", __doc__, EPILOG.format(experiments="\n".join(lines)))
     parser.add_argument("names", nargs="+", choices=list(EXPERIMENTS), metavar="NAME", help="see below")
     parser.add_argument("--scenes", type=Path, nargs="+", required=True, metavar="FOLDER")
     parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="made if it is not there")
     parser.add_argument("--variants", nargs="+", metavar="NAME", default=[], help="only these splits")
     text = "where both are compared (default both)"
-    parser.add_argument("--presets", nargs="+", choices=list(PRESETS), default=list(PRESETS), help=text)
+    parser.add_argument("--presets", nargs="+", choices=PRESETS, default=PRESETS, help=text)
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default 1)")
-    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
-    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    add_run_options(parser)
+    group = parser.add_argument_group("preset paper, where the experiment does not vary it")
+    add_options(group, PAPER_OPTIONS, PaperSettings())
     return parser
 
 
-def file_name(arm: Arm) -> str:
-    """An arm's name without what a path must not have."""
-    words = f"{arm.name}_{arm.preset}".replace("%", "percent")
+def file_name(condition: Condition) -> str:
+    """The file of a condition: its name without characters that a path must not have."""
+    words = f"{condition.name}_{condition.preset}".replace("%", "percent")
     return "".join(c if c.isalnum() else "_" for c in words) + ".jsonl"
 
 
-def chosen_variants(arm: Arm, wanted: Sequence[str]) -> tuple[str, ...]:
-    """The splits that an arm is tried on, of those wanted; empty for all."""
-    if not arm.variants:
+def chosen_variants(condition: Condition, wanted: Sequence[str]) -> tuple[str, ...]:
+    """The splits of a condition, of those wanted; empty for all."""
+    if not condition.variants:
         return tuple(wanted)
-    return tuple(variant for variant in arm.variants if not wanted or variant in wanted)
+    return tuple(variant for variant in condition.variants if not wanted or variant in wanted)
 
 
-def changed_scenes(arm: Arm, scenes: Sequence[Scene], root: Path) -> tuple[list[Scene], int]:
-    """The scenes as an arm wants them, and the number of queries of those that can't be so."""
-    changed, num_failed = [], 0
+def transformed_scenes(
+    condition: Condition, scenes: Sequence[Scene], root: Path, report: Callable[[str], object]
+) -> tuple[list[Scene], int]:
+    """The scenes under a condition, and the number of queries of those that can't be so."""
+    transformed, num_failed = [], 0
     for number, scene in enumerate(scenes):
         folder = root / str(number)
         folder.mkdir()
         try:
-            changed.append(arm.change(scene, folder))
+            transformed.append(condition.transform(scene, folder))
         except InputError as error:
-            tell(str(error))
+            report(str(error))
             num_failed += len(scene.queries)
-    return changed, num_failed
+    return transformed, num_failed
 
 
-def run_arm(
-    arm: Arm, scenes: Sequence[Scene], out: Path, arguments: argparse.Namespace
-) -> tuple[list[Row], int]:
-    """The rows of one arm, and how many queries could not be tried."""
-    labels = Labels() if arm.use_labels else None
+def run_condition(
+    condition: Condition, scenes: Sequence[Scene], out: Path, arguments: argparse.Namespace
+) -> tuple[list[QueryResult], int]:
+    """The results under one condition, and how many queries could not be localized."""
+
+    def report(text: str) -> None:
+        print_error(arguments, text, EXIT_BAD_INPUT)
+
+    labels = Labels() if condition.use_labels else None
     reading = CloudSettings(labels=labels), ReadOptions(labels=labels)
     with tempfile.TemporaryDirectory(prefix="piccolo-") as temporary:
-        changed, num_failed = changed_scenes(arm, scenes, Path(temporary))
+        transformed, num_failed = transformed_scenes(condition, scenes, Path(temporary), report)
         cache = CachePolicy(True, Path(temporary))
-        plan = Plan(arm.settings, *reading, cache, max(1, num_cores() // arguments.jobs))
-        run = open_run(out / file_name(arm), plan, changed, chosen_variants(arm, arguments.variants))
-        rows, num_failed_later = run.finish(arguments.jobs, shown(arguments.quiet), tell)
+        config = RunConfig(condition.settings, *reading, cache, max(1, num_cores() // arguments.jobs))
+        variants = chosen_variants(condition, arguments.variants)
+        run = open_run(out / file_name(condition), config, transformed, variants)
+        rows, num_failed_later = run.resume(arguments.jobs, progress_bar(arguments.quiet), report)
     return rows, num_failed + num_failed_later
 
 
-def tell(text: str) -> None:
-    """Say what could not be tried."""
-    complain(PROGRAM, False, text, EXIT_BAD_INPUT)
-
-
-def run_experiment(name: str, scenes: Sequence[Scene], arguments: argparse.Namespace) -> int:
-    """All arms of one experiment, its table and plot; returns how many queries could not be tried."""
+def run_experiment(
+    name: str, scenes: Sequence[Scene], presets: Sequence[Settings], arguments: argparse.Namespace
+) -> int:
+    """All conditions of an experiment, its table and plot; returns how many queries were not localized."""
     experiment = EXPERIMENTS[name]
     folder: Path = arguments.out / name
     folder.mkdir(parents=True, exist_ok=True)
     variants = sorted({query.variant for scene in scenes for query in scene.queries})
     variants = [variant for variant in variants if not arguments.variants or variant in arguments.variants]
     num_failed, found = 0, []
-    for arm in experiment.arms_of([PRESETS[preset] for preset in arguments.presets], variants):
-        rows, num_failed_here = run_arm(arm, scenes, folder, arguments)
+    for condition in experiment.conditions_of(presets, variants):
+        rows, num_failed_here = run_condition(condition, scenes, folder, arguments)
         num_failed += num_failed_here
         if rows:
-            found.append((arm, sorted(rows, key=lambda row: row.key)))
+            found.append((condition, sorted(rows, key=lambda row: row.key)))
     if not found:
-        raise InputError(f"{name}: found no query that could be tried, wanted some")
+        raise InputError(f"{name}: no query could be localized; check --scenes and --variants")
     num_scenes = len({row.scene for _, rows in found for row in rows})
     title = f"{experiment.title}: {experiment.note}; {num_scenes} scenes"
     text = table(title, found).markdown()
@@ -131,16 +133,19 @@ def run_experiment(name: str, scenes: Sequence[Scene], arguments: argparse.Names
     return num_failed
 
 
+def run(arguments: argparse.Namespace) -> int:
+    """Run the experiments one by one; returns the exit code."""
+    if arguments.jobs < 1:
+        raise UsageError(f"--jobs: found {arguments.jobs}, wanted at least 1")
+    with checking_options():
+        paper = paper_settings_from(arguments)
+    settings: dict[str, Settings] = {"paper": paper, "default": CoarseToFineSettings(gravity="known")}
+    presets = [settings[name] for name in arguments.presets]
+    scenes = find_scenes(arguments.scenes)
+    failed = [run_experiment(name, scenes, presets, arguments) for name in arguments.names]
+    return EXIT_BAD_INPUT if any(failed) else 0
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    parser = build_parser()
-    arguments = parser.parse_args(argv)
-    if arguments.jobs < 1:
-        parser.error(f"--jobs: found {arguments.jobs}, wanted at least 1")
-
-    def run() -> int:
-        scenes = find_scenes(arguments.scenes)
-        num_failed = sum([run_experiment(name, scenes, arguments) for name in arguments.names])
-        return EXIT_BAD_INPUT if num_failed else 0
-
-    return guarded(PROGRAM, arguments.debug, run)
+    return run_command(build_parser(), argv, run)

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import InputError
+
 Array = NDArray[np.float64]
 
 
@@ -61,6 +63,15 @@ def orthonormal(R: Array) -> Array:
     """The rotation (3, 3) nearest to `R` (3, 3), for products that drift by rounding."""
     U, _, Vt = np.linalg.svd(R)
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+
+
+def checked_rotation(R: Array, tolerance: float, label: str) -> Array:
+    """`R` as it is; InputError, naming it `label`, if R R^T is off the identity (3, 3) or R is a mirror."""
+    # the bound on the entries keeps the product finite; NaN is not below it either
+    is_tame = R.shape == (3, 3) and np.abs(R).max() < 2.0
+    if not (is_tame and np.abs(R @ R.T - np.eye(3)).max() < tolerance and np.linalg.det(R) > 0.0):
+        raise InputError(f"{label} is no rotation")
+    return R
 
 
 def angle_between(R_a: Array, R_b: Array) -> float:

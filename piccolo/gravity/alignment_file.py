@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
-from ..geometry.pose import Array, Pose, orthonormal
+from ..geometry.pose import Array, Pose, checked_rotation, orthonormal
+from ..runtime.json_file import read_json
 
 FORMAT = "piccolo-alignment/1"
 CONVENTION = "x_aligned = T_aligned_from_scan @ (x_scan, 1) in the unit given; z_aligned is up"
@@ -62,12 +63,7 @@ class Alignment:
 
 def read_alignment(path: Path) -> Alignment:
     """The alignment in a file by Alignment.to_json; InputError if it is not one."""
-    if path.is_file() and path.stat().st_size > MAX_FILE_SIZE:
-        raise InputError(f"{path}: too large for a transform by align_gravity.py")
-    try:
-        document = json.loads(path.read_bytes())
-    except (ValueError, RecursionError) as error:  # broken JSON or UTF-8, or brackets without end
-        raise InputError(f"{path}: not a JSON file; use a transform by align_gravity.py") from error
+    document = read_json(path, "use a transform by align_gravity.py", MAX_FILE_SIZE)
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise InputError(f"{path}: the format is not {FORMAT!r}; use a transform by align_gravity.py")
     T = _rigid(path, document.get("T_aligned_from_scan"))
@@ -92,8 +88,7 @@ def _rigid(path: Path, rows: object) -> Array:
         raise InputError(f"{path}: T_aligned_from_scan is not four rows of four numbers") from error
     if T.shape != (4, 4) or T.dtype.kind not in "if":
         raise InputError(f"{path}: T_aligned_from_scan is not four rows of four numbers")
-    R = T[:3, :3]
-    is_rigid = np.isfinite(T).all() and np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]) and np.abs(R).max() <= 2.0
-    if not is_rigid or np.abs(R @ R.T - np.eye(3)).max() > ROUNDING or np.linalg.det(R) < 0.0:
+    if not np.isfinite(T).all() or not np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]):
         raise InputError(f"{path}: T_aligned_from_scan is not a rotation and a translation")
+    checked_rotation(T[:3, :3], ROUNDING, f"{path}: the matrix in T_aligned_from_scan")
     return T.astype(np.float64)

@@ -1,1 +1,1 @@
-"""How kernels are compiled and run, and how files are written whole."""
+"""How kernels are compiled and run, and how files are read and written."""

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..geometry.pose import Pose
+from ..geometry.pose import Pose, checked_rotation
 from ..geometry.sphere import CONVENTION
 from ..runtime.atomic import write_atomically
+from ..runtime.json_file import DAMAGE, describe, read_json
 
 QUERIES_NAME = "queries.json"
 CLOUD_NAME = "cloud.ply"
-# what damaged JSON, or JSON of another kind, raises
-DAMAGES = (AttributeError, KeyError, OverflowError, RecursionError, TypeError, ValueError)
-MAX_SKEW = 1e-4  # of what is called a rotation
+WANTED = "wanted a queries.json with true poses"
+MAX_SKEW = 1e-4  # of R R^T from the identity
 
 
 @dataclass(frozen=True)
@@ -59,16 +59,14 @@ def read_scene(folder: Path, name: str | None = None) -> Scene:
         There is no queries.json, or it is not as `write_queries` writes it.
     """
     path = folder if folder.suffix == ".json" else folder / QUERIES_NAME
+    document = read_json(path, WANTED)
     try:
-        document = json.loads(path.read_text())
         queries = tuple(_query(path.parent, k, entry) for k, entry in enumerate(document["queries"]))
         cloud = path.parent / str(document.get("cloud", CLOUD_NAME))
         if len({query.image for query in queries}) < len(queries):
             raise ValueError("an image twice")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}), wanted true poses") from error
-    except DAMAGES as error:
-        raise InputError(f"{path}: found {error!r}, wanted a queries.json with true poses") from error
+    except DAMAGE as error:
+        raise InputError(f"{path}: found {describe(error)}, {WANTED}") from error
     return Scene(name or path.parent.resolve().name, path.parent, cloud, queries)
 
 
@@ -105,16 +103,11 @@ def _query(folder: Path, number: int, entry: dict[str, Any]) -> Query:
         raise ValueError(f"queries[{number}] with an image, a variant or labels that are no plain text")
     R_cam_from_world = np.array(entry["R_cam_from_world"], float)
     center_world = np.array(entry["center_world"], float)
-    if R_cam_from_world.shape != (3, 3) or center_world.shape != (3,) or not np.isfinite(center_world).all():
-        raise ValueError(f"{entry['image']}: a pose of the wrong shape, or not finite")
-    skew = np.abs(R_cam_from_world @ R_cam_from_world.T - np.eye(3)).max()
-    if not skew < MAX_SKEW or np.linalg.det(R_cam_from_world) < 0.0:
-        raise ValueError(f"{entry['image']}: R_cam_from_world is no rotation")
-    labels = entry.get("labels")
-    pose = Pose(R_cam_from_world, center_world)
-    return Query(
-        folder / str(entry["image"]), str(entry["variant"]), pose, folder / str(labels) if labels else None
-    )
+    if center_world.shape != (3,) or not np.isfinite(center_world).all():
+        raise ValueError(f"{entry['image']}: a center_world that is not three finite numbers")
+    checked_rotation(R_cam_from_world, MAX_SKEW, f"{entry['image']}: an R_cam_from_world that")
+    labels = folder / entry["labels"] if entry.get("labels") else None
+    return Query(folder / entry["image"], entry["variant"], Pose(R_cam_from_world, center_world), labels)
 
 
 def _relative(path: Path, folder: Path) -> str:

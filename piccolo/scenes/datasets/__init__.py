@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from . import generic, loc360, matterport, mpo, omniscenes, stanford
-from .model import Listing, Request
+from .model import ConvertOptions, SceneList
 
 __all__ = ["DATASETS", "Dataset"]
 
@@ -13,15 +13,15 @@ __all__ = ["DATASETS", "Dataset"]
 class Dataset:
     """A dataset that can be converted."""
 
-    about: str  # in a line
-    listing: Callable[[Request], Listing]  # InputError if there is nothing of it in the folder
+    description: str  # in a line
+    list_scenes: Callable[[ConvertOptions], SceneList]  # InputError if there is nothing of it in the folder
 
 
 DATASETS = {
-    stanford.NAME: Dataset("Stanford2D-3D-S panoramas with S3DIS room clouds", stanford.listing),
-    omniscenes.NAME: Dataset("OmniScenes, all splits", omniscenes.listing),
-    mpo.NAME: Dataset("MPO scans with panoramas, moved at random as in the PICCOLO paper", mpo.listing),
-    matterport.NAME: Dataset("Matterport3D skyboxes and house meshes", matterport.listing),
-    loc360.NAME: Dataset("360Loc 360-degree queries, with a cloud of your own", loc360.listing),
-    generic.NAME: Dataset("any panoramas with poses in a CSV, JSON or TUM file", generic.listing),
+    stanford.NAME: Dataset("Stanford2D-3D-S panoramas with S3DIS room clouds", stanford.list_scenes),
+    omniscenes.NAME: Dataset("OmniScenes, all splits", omniscenes.list_scenes),
+    mpo.NAME: Dataset("MPO scans with panoramas, moved at random as in the PICCOLO paper", mpo.list_scenes),
+    matterport.NAME: Dataset("Matterport3D skyboxes and house meshes", matterport.list_scenes),
+    loc360.NAME: Dataset("360Loc 360-degree queries, with a cloud of your own", loc360.list_scenes),
+    generic.NAME: Dataset("any panoramas with poses in a CSV, JSON or TUM file", generic.list_scenes),
 }

@@ -1,4 +1,4 @@
-"""Which files are clouds."""
+"""The cloud files in a dataset's folders."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ SUFFIXES = frozenset().union(*(f.suffixes for f in FORMATS)) - {".csv"}  # as th
 
 
 def is_cloud(path: Path) -> bool:
-    """True for a file that by its name is a cloud in a format that is read here."""
+    """True for a file whose name ends as that of a cloud format."""
     return path.suffix.lower() in SUFFIXES and path.is_file()
 
 
@@ -19,5 +19,5 @@ def only_cloud_in(folder: Path) -> Path | None:
     found = named or sorted(path for path in folder.iterdir() if is_cloud(path) and path.suffix != ".txt")
     if len(found) > 1:
         names = ", ".join(path.name for path in found)
-        raise InputError(f"{folder}: found the clouds {names}, wanted one, or one named cloud")
+        raise InputError(f"{folder}: found the clouds {names}; leave one, or name one of them cloud.*")
     return found[0] if found else None

@@ -11,9 +11,10 @@ import numpy as np
 
 from ...errors import InputError
 from ...geometry.pose import Pose, rotation_from_quaternion_wxyz
+from ...runtime.json_file import read_json, read_text
 from .clouds import only_cloud_in
-from .model import CloudPart, Listing, Plan, Request, Shot
-from .poses import AXES, DIRECTIONS, WORLD_FROM_CAM, pose_of_transform, read_json, read_text
+from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec
+from .poses import AXES, DIRECTIONS, WORLD_FROM_CAM, pose_of_transform
 
 NAME = "generic"
 LISTS = ("poses.csv", "poses.json", "poses.txt", "poses.tum")
@@ -34,34 +35,36 @@ class Entry:
 
     room: str
     cloud: Path | None  # None: the one for all
-    shot: Shot
+    panorama: PosedPanorama
 
 
-def listing(request: Request) -> Listing:
+def list_scenes(options: ConvertOptions) -> SceneList:
     """The rooms that the list names, or one by the folder's name."""
-    path = _list_of(request)
+    path = _list_of(options)
     entries: dict[str, list[Entry]] = defaultdict(list)
     notes: list[str] = []
-    rows = _rows(path, request, notes)
+    rows = _rows(path, options, notes)
     for number, row in enumerate(rows, 1):
-        entry = _entry(f"{path}, row {number}", path, row, request)
+        entry = _entry(f"{path}, row {number}", path, row, options)
         entries[entry.room].append(entry)
     if not entries:
         raise InputError(f"{path}: found no row with a picture, {WANTED}")
-    return Listing(tuple(_plan(room, entries[room], request) for room in sorted(entries)), tuple(notes))
+    return SceneList(
+        tuple(_scene_spec(room, entries[room], options) for room in sorted(entries)), tuple(notes)
+    )
 
 
-def _list_of(request: Request) -> Path:
-    if request.poses:
-        return request.poses
-    found = [request.folder / name for name in LISTS if (request.folder / name).exists()]
+def _list_of(options: ConvertOptions) -> Path:
+    if options.poses:
+        return options.poses
+    found = [options.folder / name for name in LISTS if (options.folder / name).exists()]
     if len(found) != 1:
         wanted = f"wanted one of {', '.join(LISTS)}, or --poses"
-        raise InputError(f"{request.folder}: found {len(found)} lists, {wanted}")
+        raise InputError(f"{options.folder}: found {len(found)} lists, {wanted}")
     return found[0]
 
 
-def _rows(path: Path, request: Request, notes: list[str]) -> Iterator[Row]:
+def _rows(path: Path, options: ConvertOptions, notes: list[str]) -> Iterator[Row]:
     """The rows as text by column; a blank field is as good as none."""
     if path.suffix.lower() == ".json":
         document = read_json(path, WANTED)
@@ -71,7 +74,7 @@ def _rows(path: Path, request: Request, notes: list[str]) -> Iterator[Row]:
     elif path.suffix.lower() == ".csv":
         rows = _table(path)
     else:
-        rows = _trajectory(path, request, notes)
+        rows = _trajectory(path, options, notes)
     return ({key: value for key, value in row.items() if value} for row in rows)
 
 
@@ -99,9 +102,9 @@ def _negated(number: str) -> str:
     return number[1:] if number.startswith("-") else f"-{number}"
 
 
-def _trajectory(path: Path, request: Request, notes: list[str]) -> list[dict[str, str]]:
+def _trajectory(path: Path, options: ConvertOptions, notes: list[str]) -> list[dict[str, str]]:
     """The lines of a TUM trajectory that have a picture named by their time."""
-    folder = request.images or request.folder / "images"
+    folder = options.images or options.folder / "images"
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, wanted pictures named by the times in {path.name}")
     pictures = {file.stem: file for file in sorted(folder.iterdir()) if file.suffix.lower() in SUFFIXES}
@@ -124,21 +127,23 @@ def _is_comment(line: str) -> bool:
     return line.strip()[:1] in ("", "#")
 
 
-def _entry(where: str, path: Path, row: Row, request: Request) -> Entry:
+def _entry(where: str, path: Path, row: Row, options: ConvertOptions) -> Entry:
     if missing := [name for name in ("image", *NUMBERS) if name not in row]:
         raise InputError(f"{where}: found no {missing[0]}, {WANTED}")
     image = path.parent / row["image"]
-    room = row.get("room", request.folder.resolve().name)
+    room = row.get("room", options.folder.resolve().name)
     if room != Path(room).name or room.startswith(".") or not room.isprintable():
         raise InputError(f"{where}: found the room {room!r}, wanted a name for a folder")
-    shot = Shot(image.name, {image.name: image}, row.get("variant", VARIANT), _pose(where, row, request))
-    return Entry(room, path.parent / row["cloud"] if "cloud" in row else None, shot)
+    panorama = PosedPanorama(
+        image.name, {image.name: image}, row.get("variant", VARIANT), _pose(where, row, options)
+    )
+    return Entry(room, path.parent / row["cloud"] if "cloud" in row else None, panorama)
 
 
-def _pose(where: str, row: Row, request: Request) -> Pose:
+def _pose(where: str, row: Row, options: ConvertOptions) -> Pose:
     """The pose in a row, its direction and axes by the row or by the options, and never by guessing."""
-    axes = row.get("axes", request.axes)
-    direction = row.get("direction", request.direction)
+    axes = row.get("axes", options.axes)
+    direction = row.get("direction", options.direction)
     if axes not in AXES:
         wanted = f"wanted one of {', '.join(AXES)} in the list or by --axes"
         raise InputError(f"{where}: found the axes {axes}, {wanted}")
@@ -156,30 +161,30 @@ def _pose(where: str, row: Row, request: Request) -> Pose:
     return pose_of_transform(where, T, direction, axes)
 
 
-def _plan(room: str, entries: list[Entry], request: Request) -> Plan:
-    clouds = {entry.cloud or _cloud_of_all(request) for entry in entries}
+def _scene_spec(room: str, entries: list[Entry], options: ConvertOptions) -> SceneSpec:
+    clouds = {entry.cloud or _cloud_of_all(options) for entry in entries}
     if len(clouds) > 1:
         names = ", ".join(sorted(map(str, clouds))[:2])
         raise InputError(f"room {room}: found the clouds {names}, wanted one")
-    shots = _with_own_names([entry.shot for entry in entries])
-    return Plan(room, (CloudPart(clouds.pop()),), lambda: shots, source={"dataset": NAME})
+    panoramas = _with_unique_names([entry.panorama for entry in entries])
+    return SceneSpec(room, (CloudPart(clouds.pop()),), lambda: panoramas, source={"dataset": NAME})
 
 
-def _cloud_of_all(request: Request) -> Path:
-    cloud = request.cloud or only_cloud_in(request.folder)
+def _cloud_of_all(options: ConvertOptions) -> Path:
+    cloud = options.cloud or only_cloud_in(options.folder)
     if cloud is None:
-        raise InputError(f"{request.folder}: found no cloud, wanted one, or --cloud, or a column `cloud`")
+        raise InputError(f"{options.folder}: found no cloud, wanted one, or --cloud, or a column `cloud`")
     return cloud
 
 
-def _with_own_names(shots: list[Shot]) -> list[Shot]:
+def _with_unique_names(panoramas: list[PosedPanorama]) -> list[PosedPanorama]:
     """The same, where pictures of several folders have one name with their number before it."""
-    names = [shot.name for shot in shots]
+    names = [panorama.name for panorama in panoramas]
     if len(set(names)) == len(names):
-        return shots
+        return panoramas
     numbered = []
-    for number, shot in enumerate(shots):
-        (image,) = shot.files.values()
-        name = f"{number:05d}_{shot.name}"
-        numbered.append(Shot(name, {name: image}, shot.variant, shot.pose))
+    for number, panorama in enumerate(panoramas):
+        (image,) = panorama.files.values()
+        name = f"{number:05d}_{panorama.name}"
+        numbered.append(PosedPanorama(name, {name: image}, panorama.variant, panorama.pose))
     return numbered

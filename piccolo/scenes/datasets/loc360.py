@@ -5,44 +5,41 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import InputError
+from ...runtime.json_file import read_json
 from .clouds import only_cloud_in
-from .model import CloudPart, Listing, Plan, Request, Shot
-from .poses import WORLD_FROM_CAM, pose_of_transform, read_json
+from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec, scene_list
+from .poses import WORLD_FROM_CAM, pose_of_transform
 
 NAME = "360loc"
 QUERIES, POSES, PICTURES = "query_360", "camera_pose.json", "image"
 WANTED = 'wanted JSON {"NAME.jpg": a matrix of 4 x 4 numbers}'
 
 
-def listing(request: Request) -> Listing:
+def list_scenes(options: ConvertOptions) -> SceneList:
     """The scenes that have 360-degree queries, and a cloud that the user put there."""
-    below = (request.folder, *sorted(request.folder.glob("*")))
+    below = (options.folder, *sorted(options.folder.glob("*")))
     folders = [path for path in below if (path / QUERIES).is_dir()]
     clouds = {folder: only_cloud_in(folder) for folder in folders}
-    plans = [_plan(folder, cloud) for folder, cloud in clouds.items() if cloud]
-    if not plans:
-        raise InputError(
-            f"{request.folder}: found no scene with {QUERIES}/SEQUENCE/{POSES} and a coloured cloud beside "
-            f"{QUERIES}, wanted the layout in docs/DATASETS.md"
-        )
+    specs = [_scene_spec(folder, cloud) for folder, cloud in clouds.items() if cloud]
     missing = [folder.name for folder, cloud in clouds.items() if not cloud]
-    notes = (f"{len(missing)} scenes without a cloud: {', '.join(missing)}",) if missing else ()
-    return Listing(tuple(plans), notes)
+    layout = f"scene with {QUERIES}/SEQUENCE/{POSES} and a coloured cloud beside {QUERIES}"
+    return scene_list(options.folder, specs, missing, layout)
 
 
-def _plan(folder: Path, cloud: Path) -> Plan:
-    def read_shots() -> list[Shot]:
-        return [shot for path in sorted((folder / QUERIES).glob(f"*/{POSES}")) for shot in _shots(path)]
+def _scene_spec(folder: Path, cloud: Path) -> SceneSpec:
+    def read_panoramas() -> list[PosedPanorama]:
+        sequences = sorted((folder / QUERIES).glob(f"*/{POSES}"))
+        return [panorama for path in sequences for panorama in _panoramas(path)]
 
-    return Plan(folder.resolve().name, (CloudPart(cloud),), read_shots, source={"dataset": NAME})
+    return SceneSpec(folder.resolve().name, (CloudPart(cloud),), read_panoramas, source={"dataset": NAME})
 
 
-def _shots(path: Path) -> list[Shot]:
+def _panoramas(path: Path) -> list[PosedPanorama]:
     """The panoramas of a sequence: camera-to-world matrices, axes as of COLMAP."""
     document = read_json(path, WANTED)
     if not isinstance(document, dict):
         raise InputError(f"{path}: found no object, {WANTED}")
-    shots = []
+    panoramas = []
     for file, value in document.items():
         where = f"{path}, {file}"
         try:
@@ -54,5 +51,5 @@ def _shots(path: Path) -> list[Shot]:
         picture = path.parent / PICTURES / Path(file).name
         name = f"{path.parent.name}_{picture.name}"
         pose = pose_of_transform(where, matrix, WORLD_FROM_CAM, "optical")
-        shots.append(Shot(name, {name: picture}, path.parent.name, pose))
-    return shots
+        panoramas.append(PosedPanorama(name, {name: picture}, path.parent.name, pose))
+    return panoramas

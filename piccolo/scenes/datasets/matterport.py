@@ -2,12 +2,12 @@
 
 import re
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from ...errors import InputError
-from .model import CloudPart, Listing, Plan, Request, Shot
+from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec, scene_list
 from .poses import WORLD_FROM_CAM, pose_of_transform, read_matrix
 
 NAME = "matterport3d"
@@ -22,25 +22,23 @@ MESHES = ("house_segmentations/*.ply", "region_segmentations/region*.ply", "matt
 VARIANT = "skybox"
 
 
-def listing(request: Request) -> Listing:
+def list_scenes(options: ConvertOptions) -> SceneList:
     """The houses with skyboxes, poses and a mesh."""
     patterns = ["*/" * depth + SKYBOXES for depth in range(MAX_DEPTH)]
-    folders = [path.parent for pattern in patterns for path in sorted(request.folder.glob(pattern))]
-    plans, notes = [], []
+    folders = [path.parent for pattern in patterns for path in sorted(options.folder.glob(pattern))]
+    specs, notes, missing = [], [], []
     for folder in folders:
         meshes = next((found for pattern in MESHES if (found := sorted(folder.glob(pattern)))), [])
         if not meshes:
-            notes.append(f"{folder}: no mesh")
+            missing.append(str(folder))
             continue
         faces = _faces_in(folder / SKYBOXES)
         posed = {place: files for place, files in faces.items() if _is_whole(folder, place, files)}
         if len(posed) < len(faces):
             notes.append(f"{folder}: {len(faces) - len(posed)} skyboxes without a pose or without six faces")
-        plans.append(_plan(folder, meshes, posed))
-    if not plans:
-        wanted = "wanted the layout in docs/DATASETS.md"
-        raise InputError(f"{request.folder}: found no HOUSE/{SKYBOXES} with a mesh, {wanted}")
-    return Listing(tuple(plans), tuple(notes))
+        specs.append(_scene_spec(folder, meshes, posed))
+    listed = scene_list(options.folder, specs, missing, f"HOUSE/{SKYBOXES} with a mesh")
+    return replace(listed, notes=(*listed.notes, *notes))
 
 
 def _faces_in(folder: Path) -> dict[str, dict[str, Path]]:
@@ -60,15 +58,17 @@ def _pose_file(folder: Path, place: str, yaw: int) -> Path:
     return folder / POSES / f"{place}_pose_{LEVEL_CAMERA}_{yaw}.txt"
 
 
-def _plan(folder: Path, meshes: list[Path], faces: dict[str, dict[str, Path]]) -> Plan:
-    def read_shots() -> list[Shot]:
-        return [_shot(folder, place, files) for place, files in faces.items()]
-
+def _scene_spec(folder: Path, meshes: list[Path], faces: dict[str, dict[str, Path]]) -> SceneSpec:
     clouds = tuple(CloudPart(path) for path in meshes)
-    return Plan(folder.resolve().name, clouds, read_shots, source={"dataset": NAME})
+    return SceneSpec(
+        folder.resolve().name,
+        clouds,
+        lambda: [_posed_panorama(folder, place, files) for place, files in faces.items()],
+        source={"dataset": NAME},
+    )
 
 
-def _shot(folder: Path, place: str, files: dict[str, Path]) -> Shot:
+def _posed_panorama(folder: Path, place: str, files: dict[str, Path]) -> PosedPanorama:
     """The skybox of a place: turned as the level camera at one of its stops, in the middle of all of them.
 
     The camera's axes are right, down, forward; skybox 1 is what our cubes have in front.
@@ -78,4 +78,4 @@ def _shot(folder: Path, place: str, files: dict[str, Path]) -> Shot:
     T_world_from_skybox = matrices[paths[SKYBOX_YAW]].copy()
     T_world_from_skybox[:3, 3] = np.mean([matrix[:3, 3] for matrix in matrices.values()], axis=0)
     pose = pose_of_transform(str(paths[SKYBOX_YAW]), T_world_from_skybox, WORLD_FROM_CAM, "optical")
-    return Shot(place, files, VARIANT, pose)
+    return PosedPanorama(place, files, VARIANT, pose)

@@ -1,26 +1,27 @@
-"""What a reader of a dataset finds: the scenes that can be written, with their clouds and panoramas."""
+"""The scenes that are found in a dataset, before they are written."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...errors import InputError
 from ...geometry.point_transforms import rotate_points
 from ...geometry.pose import Array, Pose
 
-Labels = NDArray[np.uint16]  # (H, W) what each pixel shows, 0 where nobody says
+Labels = NDArray[np.uint16]  # (H, W) the class of each pixel, 0 where unknown
 
 
 @dataclass(frozen=True)
-class Request:
-    """What the user wants of a dataset."""
+class ConvertOptions:
+    """Which scenes of a dataset to convert, and how."""
 
     folder: Path
     areas: frozenset[str] = frozenset()  # of Stanford2D-3D-S, as in its folders' names; all if empty
     labels: bool = False
-    seed: int = 0  # of MPO's motions
+    seed: int = 0  # of MPO's random transforms
     # of `generic`
     poses: Path | None = None
     cloud: Path | None = None
@@ -31,14 +32,14 @@ class Request:
 
 @dataclass(frozen=True)
 class CloudPart:
-    """A file with points of a scene, in any format that is read here."""
+    """A file with points of a scene, in any format of piccolo.cloud."""
 
     path: Path
     label: int = 0  # of all its points
 
 
 @dataclass(frozen=True)
-class Shot:
+class PosedPanorama:
     """A panorama with its true pose in the dataset's cloud."""
 
     name: str  # below images/
@@ -49,37 +50,45 @@ class Shot:
 
 
 @dataclass(frozen=True)
-class Motion:
+class RigidTransform:
     """x_written = R_written_from_dataset @ x_dataset + shift."""
 
     R_written_from_dataset: Array  # (3, 3)
     shift: Array  # (3,) [m]
 
     def of_points(self, points: Array) -> Array:
-        """Points (N, 3) moved."""
+        """Points (N, 3) transformed."""
         return rotate_points(points, self.R_written_from_dataset) + self.shift
 
     def of_pose(self, pose: Pose) -> Pose:
-        """The same camera, moved with the points."""
+        """The same camera, transformed with the points."""
         center_world = self.R_written_from_dataset @ pose.center_world + self.shift
         return Pose(pose.R_cam_from_world @ self.R_written_from_dataset.T, center_world)
 
 
 @dataclass(frozen=True)
-class Plan:
-    """A scene that can be written. Its files are opened when it is."""
+class SceneSpec:
+    """A scene to be written; its files are opened only then."""
 
     name: str  # its folder below the output: a room, or area/room
     cloud: tuple[CloudPart, ...]
-    read_shots: Callable[[], list[Shot]]  # InputError naming the file where a pose is damaged
-    motion: Motion | None = None
+    read_panoramas: Callable[[], list[PosedPanorama]]  # InputError naming the file where a pose is damaged
+    transform: RigidTransform | None = None
     has_labels: bool = False
-    source: Mapping[str, object] = field(default_factory=dict)  # for queries.json: how it was made
+    source: dict[str, object] = field(default_factory=dict)  # for queries.json: how it was made
 
 
 @dataclass(frozen=True)
-class Listing:
+class SceneList:
     """The scenes of a dataset."""
 
-    plans: tuple[Plan, ...]
+    specs: tuple[SceneSpec, ...]
     notes: tuple[str, ...] = ()  # one line each, for the user: what is passed over
+
+
+def scene_list(folder: Path, specs: Sequence[SceneSpec], missing: Sequence[str], layout: str) -> SceneList:
+    """The scenes found in a folder, and a note on those that miss a cloud; InputError if none is found."""
+    if not specs:
+        raise InputError(f"{folder}: found no {layout}, wanted the layout in docs/DATASETS.md")
+    notes = (f"{len(missing)} scenes without a cloud: {', '.join(missing)}",) if missing else ()
+    return SceneList(tuple(specs), notes)

@@ -1,6 +1,6 @@
 """MPO, the Multi-modal Panoramic 3D Outdoor dataset (Jung et al., IROS 2016), as in the PICCOLO paper.
 
-All its true poses are the identity, so each scan is moved at random, and its camera with it.
+All its true poses are the identity, so each scan and its camera get a random rigid transform.
 """
 
 import math
@@ -13,7 +13,7 @@ import numpy as np
 from ...errors import InputError
 from ...geometry.pose import Pose, yaw_rotation
 from .clouds import is_cloud
-from .model import CloudPart, Listing, Motion, Plan, Request, Shot
+from .model import CloudPart, ConvertOptions, PosedPanorama, RigidTransform, SceneList, SceneSpec
 
 NAME = "mpo"
 PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
@@ -21,18 +21,20 @@ MAX_SHIFT = 3.0  # [m] along each axis
 VARIANT = "moved"
 
 
-def listing(request: Request) -> Listing:
+def list_scenes(options: ConvertOptions) -> SceneList:
     """Each scan with a picture of the same name beside it."""
     clouds: dict[Path, list[Path]] = defaultdict(list)
-    for path in sorted(request.folder.rglob("*")):
+    for path in sorted(options.folder.rglob("*")):
         if is_cloud(path):
             clouds[path.with_suffix("")].append(path)
     pictures = {stem: _picture_of(stem) for stem in clouds}
-    plans = [_plan(request, stem, clouds[stem], picture) for stem, picture in pictures.items() if picture]
-    if not plans:
-        raise InputError(f"{request.folder}: found no cloud with a picture of the same name, wanted some")
-    num_alone = len(clouds) - len(plans)
-    return Listing(tuple(plans), (f"{num_alone} clouds without a picture",) if num_alone else ())
+    specs = [
+        _scene_spec(options, stem, clouds[stem], picture) for stem, picture in pictures.items() if picture
+    ]
+    if not specs:
+        raise InputError(f"{options.folder}: found no cloud with a picture of the same name")
+    num_alone = len(clouds) - len(specs)
+    return SceneList(tuple(specs), (f"{num_alone} clouds without a picture",) if num_alone else ())
 
 
 def _picture_of(stem: Path) -> Path | None:
@@ -40,20 +42,19 @@ def _picture_of(stem: Path) -> Path | None:
     return found[0] if found else None
 
 
-def _plan(request: Request, stem: Path, clouds: list[Path], picture: Path) -> Plan:
+def _scene_spec(options: ConvertOptions, stem: Path, clouds: list[Path], picture: Path) -> SceneSpec:
     if len(clouds) > 1:
-        raise InputError(f"{clouds[0]}: found {clouds[1].name} beside it, wanted one cloud of this name")
-    name = stem.relative_to(request.folder).as_posix()
+        raise InputError(f"{clouds[0]}: found {clouds[1].name} beside it; leave one cloud of this name")
+    name = stem.relative_to(options.folder).as_posix()
 
-    def read_shots() -> list[Shot]:
-        # The camera is at the scanner's origin, its axes are the scanner's.
-        return [Shot(picture.name, {picture.name: picture}, VARIANT, Pose(np.eye(3), np.zeros(3)))]
+    pose = Pose(np.eye(3), np.zeros(3))  # the camera is at the scanner's origin, its axes are the scanner's
+    panorama = PosedPanorama(picture.name, {picture.name: picture}, VARIANT, pose)
+    transform = random_transform(options.seed, name)
+    source = {"dataset": NAME, "seed": options.seed}
+    return SceneSpec(name, (CloudPart(clouds[0]),), lambda: [panorama], transform, source=source)
 
-    source = {"dataset": NAME, "seed": request.seed}
-    return Plan(name, (CloudPart(clouds[0]),), read_shots, random_motion(request.seed, name), source=source)
 
-
-def random_motion(seed: int, name: str) -> Motion:
+def random_transform(seed: int, name: str) -> RigidTransform:
     """A turn about z by U(0, pi) and a shift by U(0, 3) m along each axis, by seed and name."""
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
-    return Motion(yaw_rotation(rng.uniform(0.0, math.pi)).T, rng.uniform(0.0, MAX_SHIFT, 3))
+    return RigidTransform(yaw_rotation(rng.uniform(0.0, math.pi)).T, rng.uniform(0.0, MAX_SHIFT, 3))

@@ -4,8 +4,7 @@ import re
 from collections import defaultdict
 from pathlib import Path
 
-from ...errors import InputError
-from .model import CloudPart, Listing, Plan, Request, Shot
+from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec, scene_list
 from .poses import checked_pose, read_matrix
 
 NAME = "omniscenes"
@@ -14,33 +13,26 @@ SEQUENCE = re.compile(r"[A-Za-z]+_([A-Za-z]+_\d+)_scene_\d+$")  # handheld_weddi
 SUFFIXES = (".jpg", ".jpeg", ".png")
 
 
-def listing(request: Request) -> Listing:
+def list_scenes(options: ConvertOptions) -> SceneList:
     """The rooms, each with the panoramas of all splits."""
     pictures: dict[tuple[Path, str], list[Path]] = defaultdict(list)
-    for split in [path for pattern in PANORAMAS for path in sorted(request.folder.glob(pattern))]:
+    for split in [path for pattern in PANORAMAS for path in sorted(options.folder.glob(pattern))]:
         for sequence in sorted(split.iterdir()):
             if match := SEQUENCE.match(sequence.name):
                 files = sorted(path for path in sequence.iterdir() if path.suffix.lower() in SUFFIXES)
                 pictures[split.parent / "pcd" / f"{match[1]}.txt", match[1]] += files
-    plans = [_plan(room, cloud, files) for (cloud, room), files in pictures.items() if cloud.exists()]
-    if not plans:
-        raise InputError(
-            f"{request.folder}: found no SPLIT_pano/HOW_ROOM_N_scene_K with a cloud pcd/ROOM_N.txt, wanted "
-            "the layout in docs/DATASETS.md"
-        )
+    specs = [_scene_spec(room, cloud, files) for (cloud, room), files in pictures.items() if cloud.exists()]
     missing = sorted(str(cloud) for cloud, _ in pictures if not cloud.exists())
-    notes = (f"{len(missing)} rooms without a cloud: {', '.join(missing)}",) if missing else ()
-    return Listing(tuple(sorted(plans, key=lambda plan: plan.name)), notes)
+    layout = "SPLIT_pano/HOW_ROOM_N_scene_K with a cloud pcd/ROOM_N.txt"
+    return scene_list(options.folder, sorted(specs, key=lambda spec: spec.name), missing, layout)
 
 
-def _plan(room: str, cloud: Path, pictures: list[Path]) -> Plan:
-    def read_shots() -> list[Shot]:
-        return [_shot(path) for path in pictures]
-
-    return Plan(room, (CloudPart(cloud),), read_shots, source={"dataset": NAME})
+def _scene_spec(room: str, cloud: Path, pictures: list[Path]) -> SceneSpec:
+    parts = (CloudPart(cloud),)
+    return SceneSpec(room, parts, lambda: list(map(_posed_panorama, pictures)), source={"dataset": NAME})
 
 
-def _shot(path: Path) -> Shot:
+def _posed_panorama(path: Path) -> PosedPanorama:
     """A panorama with the pose [R_cam_from_world | center_world] beside it, in our own axes."""
     split = path.parents[1]
     variant = split.name.removesuffix("_pano")
@@ -48,4 +40,4 @@ def _shot(path: Path) -> Shot:
     matrix = read_matrix(pose_file, 3)
     pose = checked_pose(str(pose_file), matrix[:, :3], matrix[:, 3], "piccolo")
     name = f"{variant}_{path.parent.name}_{path.name}"
-    return Shot(name, {name: path}, variant, pose)
+    return PosedPanorama(name, {name: path}, variant, pose)

@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ...errors import InputError
 from ...geometry.pose import Array, Pose
+from ...runtime.json_file import read_json
 from .labels import labels_by_index
-from .model import CloudPart, Listing, Motion, Plan, Request, Shot
-from .poses import checked_pose, read_json
+from .model import CloudPart, ConvertOptions, PosedPanorama, RigidTransform, SceneList, SceneSpec, scene_list
+from .poses import checked_pose
 
 NAME = "stanford2d3ds"
 # As most users of S3DIS number them, less one: theirs begin at 0. Other names, <UNK> among them, are 0.
@@ -39,7 +41,9 @@ AREA = re.compile(r"area_(\d)([ab]?)$")
 PICTURE = re.compile(r"camera_[0-9a-zA-Z]+_([A-Za-z]+_\d+)_frame_equirectangular_domain_rgb\.png$")
 # The poses of area 5b are in a frame of their own. Nobody gives the transform to the frame of the clouds but
 # DeepViewAgg (Robert et al., CVPR 2022), calibrated by hand: good to a centimetre or so.
-AREA_5B = Motion(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([-4.10, 6.25, 0.0]))
+AREA_5B = RigidTransform(
+    np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([-4.10, 6.25, 0.0])
+)
 WANTED_POSE = "wanted JSON with camera_location and final_camera_rotation"
 
 
@@ -53,26 +57,21 @@ class Picture:
     semantic: Path
 
 
-def listing(request: Request) -> Listing:
+def list_scenes(options: ConvertOptions) -> SceneList:
     """The rooms for which there are panoramas and a cloud."""
-    table = _read_table(request.folder) if request.labels else None
-    plans, missing = [], []
-    for (area, room), pictures in sorted(_pictures(request.folder).items()):
-        if request.areas and area not in request.areas:
+    table = _read_table(options.folder) if options.labels else None
+    specs, missing = [], []
+    for (area, room), pictures in sorted(_pictures(options.folder).items()):
+        if options.areas and area not in options.areas:
             continue
         name = f"area_{area}/{room}"
-        parts = _cloud_of(request.folder, area, room, request.labels)
+        parts = _cloud_of(options.folder, area, room, options.labels)
         if parts:
-            plans.append(_plan(name, parts, pictures, table))
+            specs.append(_scene_spec(name, parts, pictures, table))
         else:
             missing.append(name)
-    if not plans:
-        raise InputError(
-            f"{request.folder}: found no room with panoramas ({PANORAMAS[0]}) and a cloud ({CLOUDS[0]}, for "
-            "labels Annotations beside it), wanted the layout in docs/DATASETS.md"
-        )
-    notes = (f"{len(missing)} rooms without a cloud: {', '.join(missing)}",) if missing else ()
-    return Listing(tuple(plans), notes)
+    layout = f"room with panoramas ({PANORAMAS[0]}) and a cloud ({CLOUDS[0]}, with --labels Annotations)"
+    return scene_list(options.folder, specs, missing, layout)
 
 
 def _pictures(folder: Path) -> dict[tuple[str, str], list[Picture]]:
@@ -113,22 +112,25 @@ def _cloud_of(folder: Path, area: str, room: str, has_labels: bool) -> tuple[Clo
     return tuple(CloudPart(path, NUMBERS.get(path.name.split("_")[0], 0)) for path in objects)
 
 
-def _plan(
+def _scene_spec(
     name: str, parts: tuple[CloudPart, ...], pictures: list[Picture], table: NDArray[np.uint16] | None
-) -> Plan:
-    def read_shots() -> list[Shot]:
-        return [_shot(picture, table) for picture in pictures]
-
+) -> SceneSpec:
     source: dict[str, object] = {"dataset": NAME, "labels": table is not None}
     if table is not None:
         source["label_names"] = ["unknown", *CLASSES]
-    return Plan(name, parts, read_shots, has_labels=table is not None, source=source)
+    return SceneSpec(
+        name,
+        parts,
+        lambda: [_posed_panorama(picture, table) for picture in pictures],
+        has_labels=table is not None,
+        source=source,
+    )
 
 
-def _shot(picture: Picture, table: NDArray[np.uint16] | None) -> Shot:
+def _posed_panorama(picture: Picture, table: NDArray[np.uint16] | None) -> PosedPanorama:
     name = picture.path.name
     read_labels = None if table is None else partial(labels_by_index, picture.semantic, table)
-    return Shot(name, {name: picture.path}, f"area_{picture.part}", _read_pose(picture), read_labels)
+    return PosedPanorama(name, {name: picture.path}, f"area_{picture.part}", _read_pose(picture), read_labels)
 
 
 def _read_pose(picture: Picture) -> Pose:
@@ -139,7 +141,7 @@ def _read_pose(picture: Picture) -> Pose:
     document = read_json(picture.pose, WANTED_POSE)
     angles = _three(picture.pose, document, "final_camera_rotation")
     center_world = _three(picture.pose, document, "camera_location")
-    R_world_from_opengl = rotation_from_euler_xyz(angles)
+    R_world_from_opengl = Rotation.from_euler("xyz", angles).as_matrix()  # about fixed axes, x first
     pose = checked_pose(str(picture.pose), R_world_from_opengl.T, center_world, "opengl")
     return AREA_5B.of_pose(pose) if picture.part == "5b" else pose
 
@@ -152,15 +154,6 @@ def _three(path: Path, document: Any, name: str) -> Array:
     if values.shape != (3,):
         raise InputError(f"{path}: {name} has the shape {values.shape}, wanted three numbers")
     return values
-
-
-def rotation_from_euler_xyz(angles: Array) -> Array:
-    """R_z(c) R_y(b) R_x(a) (3, 3) of angles (a, b, c) [rad]: about x first, all about fixed axes."""
-    (ca, cb, cc), (sa, sb, sc) = np.cos(angles), np.sin(angles)
-    R_x = np.array([[1.0, 0.0, 0.0], [0.0, ca, -sa], [0.0, sa, ca]])
-    R_y = np.array([[cb, 0.0, sb], [0.0, 1.0, 0.0], [-sb, 0.0, cb]])
-    R_z = np.array([[cc, -sc, 0.0], [sc, cc, 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray(R_z @ R_y @ R_x)
 
 
 def _read_table(folder: Path) -> NDArray[np.uint16]:

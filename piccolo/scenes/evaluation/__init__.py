@@ -1,1 +1,1 @@
-"""How good results are: rows of errors, statistics, tables, pictures, and runs over whole datasets."""
+"""How good results are: errors of queries, statistics, tables, plots, and runs over whole datasets."""

@@ -10,23 +10,23 @@ from pathlib import Path
 from typing import Any
 
 from ...cloud.settings import CloudSettings
+from ...coarse_to_fine.open_map import CachePolicy
 from ...coarse_to_fine.settings import CoarseToFineSettings
 from ...errors import InputError
 from ...panorama import ReadOptions
 from ...paper.settings import PaperSettings
-from ...pipeline import CachePolicy, Inputs, localize_file, open_localizer
-from ...runtime.stopwatch import Stopwatch
 from ...runtime.threads import Show, Workers, unseen
+from ...scan import open_files
 from ..scene import Query, Scene
-from .row import Row, is_in_box, row_of
+from .query_result import QueryResult, is_in_box, query_result_of
 
 QUERIES_PER_JOB = 32  # so that several processes can share a scene with many
-PATIENCE = 1.0  # seconds between two looks at whether a process has died
+PATIENCE = 1.0  # seconds between checks that the other processes are alive
 
 
 @dataclass(frozen=True)
-class Plan:
-    """How queries are localized; goes to other processes as it is."""
+class RunConfig:
+    """How queries are localized; pickled for other processes."""
 
     settings: CoarseToFineSettings | PaperSettings
     cloud_settings: CloudSettings
@@ -52,7 +52,7 @@ class Failure:
 
 
 def jobs_of(scenes: Sequence[Scene], done: Collection[tuple[str, str]], variants: Sequence[str]) -> list[Job]:
-    """The queries that are left to do, `done` holding the keys of rows; no variants stands for all."""
+    """The queries that are left, without the keys in `done`; no variants stands for all."""
     jobs: list[Job] = []
     for scene in scenes:
         left = [query for query in scene.queries if (scene.name, scene.name_of(query)) not in done]
@@ -62,26 +62,25 @@ def jobs_of(scenes: Sequence[Scene], done: Collection[tuple[str, str]], variants
     return jobs
 
 
-def run_job(plan: Plan, job: Job, show: Show = unseen) -> Iterator[Row | Failure]:
-    """The rows of a job as they come; what can't be read is told and left out."""
-    scene, watch, workers = job.scene, Stopwatch(), Workers(plan.num_threads, show)
-    inputs = Inputs((scene.cloud,), plan.cloud_settings, plan.read_options)
+def run_job(config: RunConfig, job: Job, show: Show = unseen) -> Iterator[QueryResult | Failure]:
+    """The results of a job as they come; a Failure for what can't be read."""
+    scene, workers = job.scene, Workers(config.num_threads, show)
     try:
-        localizer = open_localizer(inputs, plan.settings, plan.cache, workers, watch)
+        scan = open_files([scene.cloud], config.cloud_settings, config.settings, config.cache, workers)
     except (OSError, InputError) as error:
         yield Failure(f"{scene.name}: {error}", len(job.queries))
         return
     for query in job.queries:
         try:
-            image = _image_of(scene, query, plan.read_options)
-            result, _ = localize_file(localizer, inputs, image, workers, watch.seconds)
-            yield row_of(scene, query, result, is_in_box(localizer, query.pose))
+            image = _image_of(scene, query, config.read_options)
+            result = scan.localize_query(image, config.read_options, config.settings)
+            yield query_result_of(scene, query, result, is_in_box(scan, query.pose))
         except (OSError, InputError) as error:
             yield Failure(str(error), 1)
 
 
 def _image_of(scene: Scene, query: Query, read_options: ReadOptions) -> Path:
-    """What is localized of a query: its picture of labels if labels are to be read."""
+    """The image of a query that is localized: that of its labels if labels are to be read."""
     if not read_options.labels:
         return query.image
     if query.labels is None:
@@ -89,25 +88,29 @@ def _image_of(scene: Scene, query: Query, read_options: ReadOptions) -> Path:
     return query.labels
 
 
-def run(plan: Plan, jobs: Sequence[Job], num_processes: int, show: Show = unseen) -> Iterator[Row | Failure]:
-    """The rows of all jobs as they come, out of order if there are several processes."""
+def run(
+    config: RunConfig, jobs: Sequence[Job], num_processes: int, show: Show = unseen
+) -> Iterator[QueryResult | Failure]:
+    """The results of all jobs as they come, out of order if there are several processes."""
     if num_processes == 1:
         for job in jobs:
-            yield from run_job(plan, job, show)
+            yield from run_job(config, job, show)
     else:
-        yield from _run_in_processes(plan, jobs, num_processes)
+        yield from _run_in_processes(config, jobs, num_processes)
 
 
-def _run_in_processes(plan: Plan, jobs: Sequence[Job], num_processes: int) -> Iterator[Row | Failure]:
+def _run_in_processes(
+    config: RunConfig, jobs: Sequence[Job], num_processes: int
+) -> Iterator[QueryResult | Failure]:
     context = multiprocessing.get_context("spawn")
     todo: Queue[Job | None] = context.Queue()
-    found: Queue[Row | Failure | None] = context.Queue()
+    found: Queue[QueryResult | Failure | None] = context.Queue()
     for job in jobs:
         todo.put(job)
     count = min(num_processes, len(jobs))
     for _ in range(count):
         todo.put(None)  # no more
-    processes = [context.Process(target=_work, args=(plan, todo, found), daemon=True) for _ in range(count)]
+    processes = [context.Process(target=_work, args=(config, todo, found), daemon=True) for _ in range(count)]
     # Ctrl-C reaches every process: the new ones inherit that it is ignored, and this one ends them.
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -121,8 +124,10 @@ def _run_in_processes(plan: Plan, jobs: Sequence[Job], num_processes: int) -> It
             process.join()
 
 
-def _collect(found: "Queue[Row | Failure | None]", processes: Sequence[Any]) -> Iterator[Row | Failure]:
-    """What the processes put, until each has put None."""
+def _collect(
+    found: "Queue[QueryResult | Failure | None]", processes: Sequence[Any]
+) -> Iterator[QueryResult | Failure]:
+    """Yield from the queue until each process has put None."""
     num_working = len(processes)
     while num_working:
         try:
@@ -138,8 +143,8 @@ def _collect(found: "Queue[Row | Failure | None]", processes: Sequence[Any]) -> 
             yield value
 
 
-def _work(plan: Plan, todo: "Queue[Job | None]", found: "Queue[Row | Failure | None]") -> None:
-    """One process: take jobs until there are none, or nobody is left to write what comes of them."""
+def _work(config: RunConfig, todo: "Queue[Job | None]", found: "Queue[QueryResult | Failure | None]") -> None:
+    """Worker loop: runs until the queue is empty or the parent process has died."""
     while _has_parent():
         try:
             job = todo.get(timeout=PATIENCE)
@@ -148,7 +153,7 @@ def _work(plan: Plan, todo: "Queue[Job | None]", found: "Queue[Row | Failure | N
         if job is None:
             found.put(None)
             return
-        for value in run_job(plan, job):
+        for value in run_job(config, job):
             if not _has_parent():
                 return
             found.put(value)

@@ -1,4 +1,4 @@
-"""Statistics over rows: errors, shares, and what a confidence is worth."""
+"""Statistics over the results of many queries: errors, accuracy, risk over coverage."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,27 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...confidence.confidence import LOCALIZED
-from ...geometry.pose_error import MAX_ANGLE, MAX_DISTANCE
-from .row import Row
+from .query_result import PAPER_THRESHOLDS, QueryResult, Thresholds
 
 HUGE = 1e30  # stands for an error without a pose while quartiles are interpolated
-THRESHOLDS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # [m] at which accuracy is told
-
-
-@dataclass(frozen=True)
-class Limits:
-    """From where on a pose is wrong."""
-
-    max_distance: float = MAX_DISTANCE  # [m]
-    max_angle: float = MAX_ANGLE  # [rad]
-
-
-PAPER_LIMITS = Limits()
+ACCURACY_DISTANCES = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # [m]
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What a table tells of some rows."""
+    """What a table says about some queries."""
 
     num_queries: int
     num_correct: int
@@ -39,19 +27,19 @@ class Summary:
 
     @property
     def accuracy(self) -> float:
-        """Share of correct poses, whatever their verdict."""
+        """Fraction of correct poses, whatever their status."""
         return self.num_correct / self.num_queries
 
 
 def quartiles(values: Sequence[float]) -> NDArray[np.float64]:
-    """The 25th, 50th and 75th percentiles (3,) of values of which some may be infinite."""
+    """The 25th, 50th and 75th percentiles (3,) of values, some of which may be infinite."""
     found = np.quantile(np.minimum(values, HUGE), [0.25, 0.5, 0.75])
     return np.where(found > 1e-6 * HUGE, np.inf, found)
 
 
-def summarize(rows: Sequence[Row], limits: Limits = PAPER_LIMITS) -> Summary:
-    """The statistics of at least one row."""
-    is_correct = [row.is_correct(limits.max_distance, limits.max_angle) for row in rows]
+def summarize(rows: Sequence[QueryResult], thresholds: Thresholds = PAPER_THRESHOLDS) -> Summary:
+    """The statistics of one or more queries."""
+    is_correct = [row.is_correct(thresholds) for row in rows]
     is_localized = [row.result.status == LOCALIZED for row in rows]
     return Summary(
         num_queries=len(rows),
@@ -64,9 +52,10 @@ def summarize(rows: Sequence[Row], limits: Limits = PAPER_LIMITS) -> Summary:
     )
 
 
-def accuracies(rows: Sequence[Row], max_angle: float) -> list[float]:
-    """The share of rows below each of THRESHOLDS [m] and below an angle [rad]."""
-    return [sum(row.is_correct(line, max_angle) for row in rows) / len(rows) for line in THRESHOLDS]
+def accuracies(rows: Sequence[QueryResult], max_angle: float) -> list[float]:
+    """The fraction of queries below each of ACCURACY_DISTANCES [m] and below an angle [rad]."""
+    levels = [Thresholds(distance, max_angle) for distance in ACCURACY_DISTANCES]
+    return [sum(row.is_correct(level) for row in rows) / len(rows) for level in levels]
 
 
 @dataclass(frozen=True)
@@ -74,18 +63,18 @@ class Point:
     """One point of the curve of risk over coverage."""
 
     confidence: float  # results from here on are accepted
-    coverage: float  # share that is accepted
-    risk: float  # share of these that is wrong
+    coverage: float  # fraction that is accepted
+    risk: float  # fraction of these that is wrong
     num_wrong: int
 
 
-def risk_and_coverage(rows: Sequence[Row], limits: Limits = PAPER_LIMITS) -> list[Point]:
-    """What is accepted and what is wrong of it, as the line moves down from one confidence to the next."""
+def risk_and_coverage(rows: Sequence[QueryResult], thresholds: Thresholds = PAPER_THRESHOLDS) -> list[Point]:
+    """The curve of risk over coverage, a point for each distinct confidence, from the highest down."""
     points: list[Point] = []
     by_confidence = sorted(rows, key=lambda row: -row.result.confidence)
     num_wrong = 0
     for k, row in enumerate(by_confidence, 1):
-        num_wrong += not row.is_correct(limits.max_distance, limits.max_angle)
+        num_wrong += not row.is_correct(thresholds)
         is_last = k == len(rows) or by_confidence[k].result.confidence < row.result.confidence
         if is_last:
             points.append(Point(row.result.confidence, k / len(rows), num_wrong / k, num_wrong))

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .row import Row
-from .statistics import THRESHOLDS, Limits, Point, Summary, accuracies, summarize
+from .query_result import QueryResult, Thresholds
+from .statistics import ACCURACY_DISTANCES, Point, Summary, accuracies, summarize
 
 CONFIDENCES = (0.999, 0.99, 0.95, 0.9, 0.7, 0.5, 0.2, 0.0)
 ALL = "all"
@@ -32,13 +32,13 @@ class Table:
         return "\n".join([*head, lines[0], f"|{'|'.join(marks)}|", *lines[1:], ""])
 
 
-def per_query(rows: Sequence[Row]) -> Table:
+def per_query(rows: Sequence[QueryResult]) -> Table:
     """One line a query."""
     columns = "scene", "panorama", "status", "error [m]", "error [deg]", "confidence", "score", "margin"
     return Table("", (*columns, "loss", "seconds"), tuple(_query_cells(row) for row in rows), 3)
 
 
-def _query_cells(row: Row) -> tuple[str, ...]:
+def _query_cells(row: QueryResult) -> tuple[str, ...]:
     result = row.result
     evidence = result.evidence
     score = (f"{evidence.score:.2f}", f"{evidence.margin:.2f}") if evidence else ("-", "-")
@@ -48,8 +48,8 @@ def _query_cells(row: Row) -> tuple[str, ...]:
     return (*words, *errors, f"{result.confidence:.3f}", *score, loss, f"{row.seconds:.2f}")
 
 
-def groups(rows: Sequence[Row]) -> Iterator[tuple[str, list[Row]]]:
-    """The rows of each split, of each room, and all; a grouping of one group is left out."""
+def groups(rows: Sequence[QueryResult]) -> Iterator[tuple[str, list[QueryResult]]]:
+    """The queries of each variant, of each scene, and all; a grouping of one group is left out."""
     for kind in ("variant", "scene"):
         names = sorted({getattr(row, kind) for row in rows})
         if len(names) > 1:
@@ -57,45 +57,47 @@ def groups(rows: Sequence[Row]) -> Iterator[tuple[str, list[Row]]]:
     yield ALL, list(rows)
 
 
-def summary_table(rows: Sequence[Row], limits: Limits, title: str) -> Table:
-    """Quartiles of the errors, accuracy and verdicts of every group."""
-    words = f"{title}; correct: under {limits.max_distance:g} m and {np.degrees(limits.max_angle):g} deg"
+def summary_table(rows: Sequence[QueryResult], thresholds: Thresholds, title: str) -> Table:
+    """Quartiles of the errors, accuracy and statuses of every group."""
+    words = (
+        f"{title}; correct: under {thresholds.max_distance:g} m and {np.degrees(thresholds.max_angle):g} deg"
+    )
     errors = "t 25 % [m]", "t 50 %", "t 75 %", "R 25 % [deg]", "R 50 %", "R 75 %"
     columns = "queries", "number", "correct", "accuracy", *errors, "localized", "wrong of these", "s"
-    cells = tuple((name, *_summary_cells(summarize(some, limits))) for name, some in groups(rows))
+    cells = tuple((name, *_summary_cells(summarize(some, thresholds))) for name, some in groups(rows))
     return Table(words, columns, cells)
 
 
 def _summary_cells(s: Summary) -> tuple[str, ...]:
     meters = [f"{value:.4f}" for value in s.position_quartiles]
     degrees = [f"{value:.3f}" for value in np.degrees(s.rotation_quartiles)]
-    shares = f"{s.num_queries}", f"{s.num_correct}", f"{s.accuracy:.3f}"
-    return (*shares, *meters, *degrees, f"{s.num_localized}", f"{s.num_wrong}", f"{s.seconds:.2f}")
+    counts = f"{s.num_queries}", f"{s.num_correct}", f"{s.accuracy:.3f}"
+    return (*counts, *meters, *degrees, f"{s.num_localized}", f"{s.num_wrong}", f"{s.seconds:.2f}")
 
 
-def threshold_table(rows: Sequence[Row], limits: Limits) -> Table:
+def threshold_table(rows: Sequence[QueryResult], thresholds: Thresholds) -> Table:
     """Accuracy at several distances."""
-    title = f"accuracy: share under the distance and {np.degrees(limits.max_angle):g} deg"
+    title = f"accuracy: fraction under the distance and {np.degrees(thresholds.max_angle):g} deg"
     cells = tuple(
-        (name, *(f"{share:.3f}" for share in accuracies(some, limits.max_angle)))
+        (name, *(f"{fraction:.3f}" for fraction in accuracies(some, thresholds.max_angle)))
         for name, some in groups(rows)
     )
-    return Table(title, ("queries", *(f"{line:g} m" for line in THRESHOLDS)), cells)
+    return Table(title, ("queries", *(f"{line:g} m" for line in ACCURACY_DISTANCES)), cells)
 
 
 def risk_table(points: Sequence[Point]) -> Table:
-    """What is wrong of what is accepted, at a few confidences."""
+    """The fraction accepted, and wrong of these, at a few minimum confidences."""
     cells = []
     for line in CONFIDENCES:
         inside = [point for point in points if point.confidence >= line]
         if inside:
             p = inside[-1]
             cells.append((f"{line}", f"{100 * p.coverage:.1f} %", f"{p.num_wrong}", f"{100 * p.risk:.2f} %"))
-    columns = "accepted from confidence", "accepted", "wrong of these", "wrong share"
+    columns = "min confidence", "accepted", "wrong of these", "wrong fraction"
     return Table("", columns, tuple(cells), 0)
 
 
-def csv_text(rows: Sequence[Row]) -> str:
+def csv_text(rows: Sequence[QueryResult]) -> str:
     """One line a query, in base units, every digit; empty where there is no pose."""
     file = io.StringIO()
     columns = ("scene", "image", "variant", "is_in_box", "status", "confidence", "position_error_m")
@@ -105,7 +107,7 @@ def csv_text(rows: Sequence[Row]) -> str:
         has_pose = row.result.pose is not None
         errors = (row.position_error, float(np.degrees(row.rotation_error))) if has_pose else ("", "")
         box = "" if row.is_in_box is None else str(row.is_in_box).lower()
-        verdict = row.result.status, row.result.confidence
+        status = row.result.status, row.result.confidence
         words = row.scene, row.image, row.variant, box
-        writer.writerow((*words, *verdict, *errors, row.result.loss, round(row.seconds, 4)))
+        writer.writerow((*words, *status, *errors, row.result.loss, round(row.seconds, 4)))
     return file.getvalue()

@@ -13,9 +13,9 @@ from .model import Format, Options
 from .nerfstudio import NERFSTUDIO
 from .opensfm import OPENSFM
 from .pose_lists import CSV, KITTI, POTREE, TUM
-from .posed_images import Selection, posed_images, read_results, select, true_results
+from .posed_images import Selection, posed_images, select, true_results
 
-__all__ = ["FORMATS", "Format", "Options", "Selection", "export", "read_results", "select", "true_results"]
+__all__ = ["FORMATS", "Format", "Options", "Selection", "export", "select", "true_results"]
 
 FORMATS: dict[str, Format] = {
     f.name: f for f in (COLMAP, NERFSTUDIO, OPENSFM, TUM, KITTI, CSV, GEOJSON, POTREE, GPANO)

@@ -1,6 +1,5 @@
 """From lines of JSON to the pictures and poses to export."""
 
-import math
 import os
 import re
 from collections import Counter
@@ -18,11 +17,7 @@ from ...result import Result
 from ..scene import Scene
 from .model import Format, Options, PosedImage, check_size
 
-MAX_ROTATION_ERROR = 1e-6  # of R R^T from the identity
 TIMESTAMP = re.compile(r"\d+(\.\d+)?")
-# control characters, line ends, halves of characters
-UNWRITABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
-WANTED = "wanted JSON lines of localize.py"
 
 
 @dataclass(frozen=True)
@@ -38,28 +33,6 @@ class Selection:
         return tuple(dict.fromkeys(result.cloud_name for result in self.results))
 
 
-def read_results(path: Path) -> list[Result]:
-    """The results in a file of JSON lines, their poses checked; any other file is an InputError."""
-    if path.exists() and not path.is_file():
-        raise InputError(f"{path}: not a file but a folder or a device, {WANTED}")
-    lines = path.read_bytes().splitlines()
-    results = []
-    for number, line in enumerate(lines, 1):
-        if not line.strip():
-            continue
-        try:
-            result = Result.from_json(line.decode())
-            _check(result)
-        except RecursionError as error:
-            raise InputError(f"{path}, line {number}: found too many brackets, {WANTED}") from error
-        except (ValueError, AttributeError) as error:  # InputError too, which does not know the file
-            raise InputError(f"{path}, line {number}: {error}") from error
-        results.append(result)
-    if not results:
-        raise InputError(f"{path}: found no result, {WANTED}")
-    return results
-
-
 def true_results(scene: Scene) -> list[Result]:
     """The true poses of a scene, as if they had been found beyond doubt: a reference for other tools."""
     cloud = str(scene.cloud)
@@ -67,26 +40,6 @@ def true_results(scene: Scene) -> list[Result]:
         Result(LOCALIZED, 1.0, cloud, str(query.image), query.pose, None, None, (), None, {}, {})
         for query in scene.queries
     ]
-
-
-def _check(result: Result) -> None:
-    """Refuse names and numbers that can't be written, and a pose that is none."""
-    for label, value in (("status", result.status), ("cloud", result.cloud_name), ("pano", result.pano)):
-        if not isinstance(value, str) or UNWRITABLE.search(value):
-            raise InputError(f"result: {label} is {value!r}, wanted text on one line")
-    values = [result.confidence, *([result.evidence.score] if result.evidence else [])]
-    if not all(isinstance(value, int | float) and math.isfinite(value) for value in values):
-        raise InputError(f"result: confidence and score are {values}, wanted finite numbers")
-    if result.pose is None:
-        return
-    R, center = result.pose.R_cam_from_world, result.pose.center_world
-    is_number = R.dtype.kind in "fiu" and center.dtype.kind in "fiu"
-    if not is_number or R.shape != (3, 3) or center.shape != (3,) or not np.isfinite(center).all():
-        raise InputError("result: the pose needs numbers, R_cam_from_world 3 x 3 and center_world 3")
-    # NaN is not below the limit either
-    is_orthonormal = np.abs(R @ R.T - np.eye(3)).max() < MAX_ROTATION_ERROR
-    if not (is_orthonormal and np.linalg.det(R) > 0.0):
-        raise InputError("result: R_cam_from_world is no rotation")
 
 
 def select(results: Sequence[Result], clouds: Sequence[str] = (), use_all: bool = False) -> Selection:

@@ -1,4 +1,4 @@
-"""One result against the truth."""
+"""The errors of one result against the true pose."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -9,17 +9,29 @@ import numpy as np
 
 from ...errors import InputError
 from ...geometry.pose import Array, Pose
-from ...geometry.pose_error import pose_errors
-from ...pipeline import Localizer
+from ...geometry.pose_error import MAX_ANGLE, MAX_DISTANCE, pose_errors
 from ...result import Result
-from ..scene import DAMAGES, Query, Scene
+from ...runtime.json_file import DAMAGE
+from ...scan import Scan
+from ..scene import Query, Scene
 
 FORMAT = "piccolo-evaluation/1"
 
 
 @dataclass(frozen=True)
-class Row:
-    """One query of one scene."""
+class Thresholds:
+    """Errors below which a pose is correct."""
+
+    max_distance: float = MAX_DISTANCE  # [m]
+    max_angle: float = MAX_ANGLE  # [rad]
+
+
+PAPER_THRESHOLDS = Thresholds()
+
+
+@dataclass(frozen=True)
+class QueryResult:
+    """The result of one query of one scene, and its errors."""
 
     scene: str
     image: str  # as the scene's queries.json names it
@@ -31,7 +43,7 @@ class Row:
 
     @property
     def key(self) -> tuple[str, str]:
-        """What makes it one query."""
+        """The query, unique in a run."""
         return self.scene, self.image
 
     @property
@@ -39,9 +51,9 @@ class Row:
         """Search and refinement, without reading and preparing."""
         return sum(self.result.seconds.get(stage, 0.0) for stage in ("search", "refine"))
 
-    def is_correct(self, max_distance: float, max_angle: float) -> bool:
-        """True if both errors are below the lines [m], [rad]."""
-        return self.position_error < max_distance and self.rotation_error < max_angle
+    def is_correct(self, thresholds: Thresholds = PAPER_THRESHOLDS) -> bool:
+        """True if both errors are below the thresholds."""
+        return self.position_error < thresholds.max_distance and self.rotation_error < thresholds.max_angle
 
     def to_json(self) -> str:
         """One line."""
@@ -61,8 +73,8 @@ class Row:
         )
 
     @classmethod
-    def from_json(cls, text: str) -> "Row":
-        """A row as `to_json` wrote it; InputError for anything else."""
+    def from_json(cls, text: str) -> "QueryResult":
+        """Read back what `to_json` wrote; any other text is an InputError."""
         try:
             row = json.loads(text)
             if row["format"] != FORMAT:
@@ -77,30 +89,30 @@ class Row:
                 rotation_error=np.inf if angle_deg is None else float(np.radians(angle_deg)),
                 result=Result.from_json(json.dumps(row["result"])),
             )
-        except DAMAGES as error:
+        except DAMAGE as error:
             if isinstance(error, InputError):
                 raise
             raise InputError(f"evaluation: found {error!r}, wanted a line of tools/evaluate.py") from error
 
 
-def row_of(scene: Scene, query: Query, result: Result, is_in_box: bool | None) -> Row:
-    """The errors of one result."""
+def query_result_of(scene: Scene, query: Query, result: Result, is_in_box: bool | None) -> QueryResult:
+    """A query's result with its errors."""
     errors = (np.inf, np.inf) if result.pose is None else pose_errors(result.pose, query.pose)
-    return Row(scene.name, scene.name_of(query), query.variant, is_in_box, *errors, result)
+    return QueryResult(scene.name, scene.name_of(query), query.variant, is_in_box, *errors, result)
 
 
-def is_in_box(localizer: Localizer, pose: Pose) -> bool:
+def is_in_box(scan: Scan, pose: Pose) -> bool:
     """True if a pose's position lies in the bounding box of a localizer's cloud (the paper's protocol)."""
-    points = localizer.points
-    center: Array = localizer.from_world(pose).center_world
+    points = scan.points
+    center: Array = scan.from_world(pose).center_world
     axes = zip(center, (points.x, points.y, points.z), strict=True)
     return all(bool(axis.min() <= value <= axis.max()) for value, axis in axes)
 
 
-def match_results(scenes: Sequence[Scene], results: Sequence[Result]) -> Iterator[Row]:
-    """The rows of results of localize.py: each belongs to the query whose image it names.
+def match_results(scenes: Sequence[Scene], results: Sequence[Result]) -> Iterator[QueryResult]:
+    """Results of localize.py with their errors; each belongs to the query whose image it names.
 
-    By its path, or else by its file's name if one query alone has that.
+    The image is found by its path, or else by its file name if only one query has that.
 
     Raises
     ------
@@ -123,7 +135,7 @@ def match_results(scenes: Sequence[Scene], results: Sequence[Result]) -> Iterato
             names = sorted(path.name for _, _, path in queries)[:3]
             text = f"{len(named)} queries of this name" if named else "a result without a true pose"
             raise InputError(f"{result.pano}: found {text}, wanted one of {names} ...")
-        row = row_of(*(found or named[0]), result, None)
+        row = query_result_of(*(found or named[0]), result, None)
         if row.key in done:
             raise InputError(f"{result.pano}: found a second result of this panorama, wanted one")
         done.add(row.key)

@@ -1,4 +1,4 @@
-"""Pictures of an evaluation, as PNG."""
+"""Plots of an evaluation, as PNG."""
 
 from collections.abc import Mapping, Sequence
 from io import BytesIO
@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .row import Row
-from .statistics import Limits, Point
+from .query_result import QueryResult, Thresholds
+from .statistics import Point
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,37 +18,38 @@ MIN_ROTATION_DEG, MAX_ROTATION_DEG = 1e-3, 180.0
 SHOWN_ANGLES_DEG = (1.0, 5.0, 10.0)  # at which recall over distance is drawn
 
 
-def _png(figure: "Figure") -> bytes:
+def figure_png(figure: "Figure") -> bytes:
+    """A figure as a PNG file."""
     file = BytesIO()
     figure.savefig(file, format="png", dpi=120)
     return file.getvalue()
 
 
-def _share_below(axes: "Axes", errors: Sequence[float], label: str) -> None:
-    """The share of the errors below each value; those without a pose are never reached."""
+def _fraction_below(axes: "Axes", errors: Sequence[float], label: str) -> None:
+    """Draw the fraction of the errors below each value; queries without a pose never count."""
     finite = np.sort([error for error in errors if np.isfinite(error)])
-    shares = 100.0 * np.arange(1, len(finite) + 1) / max(len(errors), 1)
-    last = shares[-1] if len(shares) else 0.0
-    axes.step([1e-9, *finite, 1e9], [0.0, *shares, last], where="post", label=label)
+    fractions = 100.0 * np.arange(1, len(finite) + 1) / max(len(errors), 1)
+    last = fractions[-1] if len(fractions) else 0.0
+    axes.step([1e-9, *finite, 1e9], [0.0, *fractions, last], where="post", label=label)
 
 
-def errors_png(runs: Mapping[str, Sequence[Row]], limits: Limits) -> bytes:
-    """Position and rotation error over the share of queries, and recall over thresholds, a line a run."""
+def errors_figure(runs: Mapping[str, Sequence[QueryResult]], thresholds: Thresholds) -> "Figure":
+    """Position and rotation error over the fraction of queries, and recall over thresholds, a line a run."""
     from matplotlib.figure import Figure  # noqa: PLC0415  # half a second that tables need not wait for
 
     figure = Figure(figsize=(14, 4.2), layout="constrained")
     position, rotation, recall = figure.subplots(1, 3)
     for name, rows in runs.items():
-        _share_below(position, [row.position_error for row in rows], name)
-        _share_below(rotation, [float(np.degrees(row.rotation_error)) for row in rows], name)
+        _fraction_below(position, [row.position_error for row in rows], name)
+        _fraction_below(rotation, [float(np.degrees(row.rotation_error)) for row in rows], name)
         for angle_deg in SHOWN_ANGLES_DEG:
             inside = [
                 row.position_error if np.degrees(row.rotation_error) < angle_deg else np.inf for row in rows
             ]
-            _share_below(recall, inside, f"{name}, under {angle_deg:g} deg")
-    position.axvline(limits.max_distance, color="gray", linestyle=":")
-    rotation.axvline(float(np.degrees(limits.max_angle)), color="gray", linestyle=":")
-    recall.axvline(limits.max_distance, color="gray", linestyle=":")
+            _fraction_below(recall, inside, f"{name}, under {angle_deg:g} deg")
+    position.axvline(thresholds.max_distance, color="gray", linestyle=":")
+    rotation.axvline(float(np.degrees(thresholds.max_angle)), color="gray", linestyle=":")
+    recall.axvline(thresholds.max_distance, color="gray", linestyle=":")
     position.set(xlabel="position error [m]", xlim=(MIN_POSITION, MAX_POSITION))
     rotation.set(xlabel="rotation error [deg]", xlim=(MIN_ROTATION_DEG, MAX_ROTATION_DEG))
     recall.set(xlabel="distance [m]", xlim=(MIN_POSITION, MAX_POSITION), title="recall")
@@ -56,11 +57,11 @@ def errors_png(runs: Mapping[str, Sequence[Row]], limits: Limits) -> bytes:
         axes.set(xscale="log", ylim=(0, 101), ylabel="queries [%]")
         axes.grid(alpha=0.3)
         axes.legend(loc="lower right", fontsize="small")
-    return _png(figure)
+    return figure
 
 
-def risk_png(points: Sequence[Point]) -> bytes:
-    """The share that is wrong over the share that is accepted."""
+def risk_figure(points: Sequence[Point]) -> "Figure":
+    """The fraction that is wrong over the fraction that is accepted."""
     from matplotlib.figure import Figure  # noqa: PLC0415  # see above
 
     figure = Figure(figsize=(6, 4), layout="constrained")
@@ -80,4 +81,4 @@ def risk_png(points: Sequence[Point]) -> bytes:
     axes.grid(alpha=0.3)
     if axes.get_legend_handles_labels()[0]:
         axes.legend()
-    return _png(figure)
+    return figure

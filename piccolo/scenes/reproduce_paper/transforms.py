@@ -1,6 +1,6 @@
 """Scenes with one thing changed: fewer points, the cloud turned, the camera upside down.
 
-Each writes what differs into a folder and leaves the scene itself alone.
+Each writes what differs into a folder and leaves the scene itself as it is.
 """
 
 from collections.abc import Callable
@@ -10,64 +10,66 @@ from zlib import crc32
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from ...cloud import read_cloud
-from ...cloud.model import Cloud
 from ...cloud.ply_writer import vertex_rows, write_ply
 from ...errors import InputError
 from ...geometry.pose import Array, Pose
 from ...geometry.rotations import random_rotation
 from ...panorama import read_panorama
 from ...runtime.atomic import write_atomically
-from ..scene import Query, Scene
+from ..scene import CLOUD_NAME, Query, Scene
 
-# A changed copy of a scene; the folder is there, and the copy's alone.
-Change = Callable[[Scene, Path], Scene]
+# A transformed copy of a scene; the folder, which is there, is for its files alone.
+SceneTransform = Callable[[Scene, Path], Scene]
 UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])  # half a turn about the view axis
 
 
-def as_it_is(scene: Scene, folder: Path) -> Scene:
+def identity(scene: Scene, folder: Path) -> Scene:
     """The scene itself."""
     return scene
 
 
-def with_share(share: float) -> Change:
-    """A change to a share of the points, drawn at random."""
-
-    def change(scene: Scene, folder: Path) -> Scene:
-        cloud = read_cloud(scene.cloud)
-        return _with_points(scene, folder, cloud, max(1, round(share * len(cloud.points))))
-
-    return change
+def with_fraction(fraction: float) -> SceneTransform:
+    """A transform that keeps a fraction of the points, drawn at random."""
+    return lambda scene, folder: _thinned(scene, folder, lambda count: max(1, round(fraction * count)))
 
 
-def with_count(num_points: int) -> Change:
-    """A change to a number of points, drawn at random; InputError where there are fewer."""
-
-    def change(scene: Scene, folder: Path) -> Scene:
-        cloud = read_cloud(scene.cloud)
-        if len(cloud.points) < num_points:
-            raise InputError(f"{scene.cloud}: found {len(cloud.points)} points, wanted at least {num_points}")
-        return _with_points(scene, folder, cloud, num_points)
-
-    return change
+def with_count(num_points: int) -> SceneTransform:
+    """A transform that keeps a number of points, drawn at random; InputError where there are fewer."""
+    return lambda scene, folder: _thinned(scene, folder, lambda _: num_points)
 
 
-def turned_at_random(scene: Scene, folder: Path) -> Scene:
+def _thinned(scene: Scene, folder: Path, num_kept: Callable[[int], int]) -> Scene:
+    cloud = read_cloud(scene.cloud)
+    count = num_kept(len(cloud.points))
+    if count > len(cloud.points):
+        raise InputError(f"{scene.cloud}: found {len(cloud.points)} points, wanted at least {count}")
+    chosen = np.sort(_rng(scene).choice(len(cloud.points), count, replace=False))
+    points = cloud.points[chosen].astype(np.float64) + cloud.origin_world
+    return replace(scene, cloud=_written(folder, points, cloud.colors[chosen]))
+
+
+def with_random_rotation(scene: Scene, folder: Path) -> Scene:
     """The cloud turned by a rotation drawn from all of SO(3), the true poses with it."""
     cloud = read_cloud(scene.cloud)
     R_new_from_old = random_rotation(_rng(scene))
     points = (cloud.points.astype(np.float64) + cloud.origin_world) @ R_new_from_old.T
-    path = folder / "cloud.ply"
-    write_ply(path, vertex_rows(points, cloud.colors))
     queries = tuple(replace(query, pose=_turned(query.pose, R_new_from_old)) for query in scene.queries)
-    return replace(scene, cloud=path, queries=queries)
+    return replace(scene, cloud=_written(folder, points, cloud.colors), queries=queries)
+
+
+def _written(folder: Path, points: Array, colors: NDArray[np.uint8]) -> Path:
+    path = folder / CLOUD_NAME
+    write_ply(path, vertex_rows(points, colors))
+    return path
 
 
 def flipped(scene: Scene, folder: Path) -> Scene:
     """Every picture taken with the camera upside down: turned by half a turn about the view axis.
 
-    They are PNG, under the names that the scene gives them: rows of both find each other.
+    They are PNG under the scene's own names, so that results of both can be compared by name.
     """
     names = [scene.name_of(query) for query in scene.queries]
     depth = max(Path(name).parts.count("..") for name in names) if names else 0
@@ -92,18 +94,10 @@ def _upside_down_png(image: Path) -> bytes:
     return bytes(png)
 
 
-def _with_points(scene: Scene, folder: Path, cloud: Cloud, num_points: int) -> Scene:
-    chosen = np.sort(_rng(scene).choice(len(cloud.points), num_points, replace=False))
-    path = folder / "cloud.ply"
-    points = cloud.points[chosen].astype(np.float64) + cloud.origin_world
-    write_ply(path, vertex_rows(points, cloud.colors[chosen]))
-    return replace(scene, cloud=path)
-
-
 def _turned(pose: Pose, R_new_from_old: Array) -> Pose:
     return Pose(pose.R_cam_from_world @ R_new_from_old.T, R_new_from_old @ pose.center_world)
 
 
 def _rng(scene: Scene) -> np.random.Generator:
-    """Of a scene's name: the same draw whatever else is tried."""
+    """A generator seeded by the scene's name: the same draw whatever else is run."""
     return np.random.default_rng([crc32(scene.name.encode()), len(scene.queries)])
