@@ -7,7 +7,7 @@
 ('localized', array([2.412, 1.068, 1.577]))
 """
 
-__version__ = "0.2.0"  # above the imports: a result repeats it
+__version__ = "0.1.0"  # above the imports: a result repeats it
 
 from .errors import InputError
 from .geometry.pose import Pose

@@ -13,13 +13,13 @@ from piccolo.result import Result
 WIDTH = 512
 SIZE = (WIDTH, WIDTH // 2)
 CENTER = np.array([500_123.456789, 5_400_987.654321, 312.25])
-EVIDENCE = Evidence(0.7, 0.5, 0.8, 0.9, 0.6, 0.95, 0.02)
+EVIDENCE = Evidence(0.7, 0.5, 0.8, 0.9, 0.95)
 WORDS = {
     "confidence": 0.9,
     "loss": 0.05,
     "evidence": EVIDENCE,
-    "rivals": (),
-    "certainty": None,
+    "alternatives": (),
+    "covariance": None,
     "seconds": {},
     "settings": {},
 }
@@ -48,7 +48,7 @@ def jpeg(path, size=SIZE, seed=0):
 
 
 def pixels_and_points(pose, seed=0, num_points=200):
-    """Pixels (N, 2) and world points (N, 3) seen there, by piccolo/sphere.py, up to 80 degrees of elevation.
+    """Pixels (N, 2) and world points (N, 3) seen there, by piccolo/geometry/sphere.py, up to 80 degrees of elevation.
 
     Nearer to a pole the rounding of UTM-size coordinates alone moves u by more than the tests allow.
     """

@@ -8,6 +8,7 @@ from piccolo.cli import make_room
 from piccolo.cloud.model import Cloud
 from piccolo.cloud.morton import morton_order
 from piccolo.cloud.soa import pack_points
+from piccolo.coarse_to_fine.scan_map import prepare_map
 from piccolo.geometry.pose import Pose, angle_between
 from piccolo.panorama import Panorama
 from piccolo.runtime.threads import Workers
@@ -27,6 +28,12 @@ def room(seed):
     points = (points - origin_world).astype(np.float32)
     order = morton_order(points, colors)
     return world, Cloud(points[order], colors[order], origin_world)
+
+
+@functools.lru_cache
+def scan_map(seed):
+    """The prepared map of a room."""
+    return prepare_map(room(seed)[1], Workers(2))
 
 
 @functools.lru_cache

@@ -4,7 +4,7 @@ import pytest
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import angle_between
 from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
-from piccolo.paper.starts import MIN_CLEARANCE, PROBE_WIDTH, box_grid, free_grid, spread
+from piccolo.paper.starts import MIN_CLEARANCE, PROBE_WIDTH, box_grid, farthest_point_sampling, free_grid
 from piccolo.render.free_space import is_free_space
 
 
@@ -56,10 +56,10 @@ def test_grid_is_even_and_inside_the_box():
     np.testing.assert_allclose(np.diff(np.unique(grid[:, 0])), np.diff(np.unique(grid[:, 0]))[0])
 
 
-def test_spread_keeps_far_ones():
+def test_sampling_keeps_far_ones():
     line = np.column_stack([np.arange(11.0), np.zeros(11), np.zeros(11)])
-    np.testing.assert_array_equal(spread(line, 3)[:, 0], [0, 5, 10])
-    assert spread(line, 20) is line
+    np.testing.assert_array_equal(farthest_point_sampling(line, 3)[:, 0], [0, 5, 10])
+    assert farthest_point_sampling(line, 20) is line
 
 
 def test_yaws_are_even():

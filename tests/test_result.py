@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 
 from piccolo.confidence.alternatives import Hypothesis
-from piccolo.confidence.covariance import Certainty
+from piccolo.confidence.covariance import PoseCovariance
 from piccolo.confidence.score import Evidence
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.result import Result
 
 POSE = Pose(exp_so3(np.array([0.3, -0.2, 0.9])), np.array([500_000.123, 4_000_000.456, 12.0]))
-EVIDENCE = Evidence(0.7, 0.5, 0.8, 0.6, 0.7, 0.9, 0.01, 0.002, 0.001)
-RIVAL = Hypothesis(Pose(exp_so3(np.array([0.1, 0.2, -2.0])), np.array([1.0, 2.0, 3.0])), 0.2)
+EVIDENCE = Evidence(0.7, 0.5, 0.8, 0.6, 0.9, 0.5)
+ALTERNATIVE = Hypothesis(Pose(exp_so3(np.array([0.1, 0.2, -2.0])), np.array([1.0, 2.0, 3.0])), 0.2)
 RESULT = Result(
     status="localized",
     confidence=0.99,
@@ -22,22 +22,24 @@ RESULT = Result(
     pose=POSE,
     loss=0.05,
     evidence=EVIDENCE,
-    rivals=(RIVAL,),
-    certainty=Certainty(np.diag([1e-6, 1e-6, 1e-6, 4e-6, 9e-6, 16e-6]), "up and down"),
+    alternatives=(ALTERNATIVE,),
+    covariance=PoseCovariance(np.diag([1e-6, 1e-6, 1e-6, 4e-6, 9e-6, 16e-6]), "up and down"),
     seconds={"read": 0.1, "search": 0.2},
     settings={"preset": "paper", "seed": 0},
     warnings=("odd",),
 )
-WITHOUT_ARRAYS = {"pose": None, "rivals": (), "certainty": None}
+WITHOUT_ARRAYS = {"pose": None, "alternatives": (), "covariance": None}
 
 
 def test_json_round_trip_keeps_every_bit_of_the_pose():
     back = Result.from_json(RESULT.to_json())
     np.testing.assert_array_equal(back.pose.R_cam_from_world, RESULT.pose.R_cam_from_world)
     np.testing.assert_array_equal(back.pose.center_world, RESULT.pose.center_world)
-    np.testing.assert_array_equal(back.rivals[0].pose.R_cam_from_world, RIVAL.pose.R_cam_from_world)
-    np.testing.assert_array_equal(back.certainty.covariance, RESULT.certainty.covariance)
-    assert (back.rivals[0].score, back.certainty.weakest_direction) == (0.2, "up and down")
+    np.testing.assert_array_equal(
+        back.alternatives[0].pose.R_cam_from_world, ALTERNATIVE.pose.R_cam_from_world
+    )
+    np.testing.assert_array_equal(back.covariance.matrix, RESULT.covariance.matrix)
+    assert (back.alternatives[0].score, back.covariance.least_constrained_direction) == (0.2, "up and down")
     plain = dataclasses.replace(RESULT, **WITHOUT_ARRAYS)
     assert dataclasses.replace(back, **WITHOUT_ARRAYS) == plain
 
@@ -60,7 +62,7 @@ def test_summary_says_what_a_person_asks_first():
 
 def test_json_names_what_the_next_tool_needs():
     document = json.loads(RESULT.to_json())
-    assert document["format"] == "piccolo-pose/2"
+    assert document["format"] == "piccolo-pose/3"
     T = np.array(document["T_world_from_cam"])
     np.testing.assert_allclose(T[:3, 3], RESULT.pose.center_world)
     np.testing.assert_allclose(T[:3, :3], np.array(document["R_cam_from_world"]).T)
@@ -89,8 +91,8 @@ def test_nan_is_never_written():
 
 
 @pytest.mark.parametrize(
-    "text", ["{", "[]", "{}", '{"format": "piccolo-pose/1"}', '{"format": "piccolo-pose/2"}']
+    "text", ["{", "[]", "{}", '{"format": "piccolo-pose/2"}', '{"format": "piccolo-pose/3"}']
 )
 def test_other_text_is_refused(text):
-    with pytest.raises(InputError, match="piccolo-pose/2"):
+    with pytest.raises(InputError, match="piccolo-pose/3"):
         Result.from_json(text)

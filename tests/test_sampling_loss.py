@@ -6,7 +6,7 @@ import pytest
 
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import Pose, exp_so3, step, yaw_rotation
-from piccolo.optimize.sampling_loss import BLOCK, normal_equations, sampling_loss
+from piccolo.optimize.sampling_loss import BLOCK, sampling_equations, sampling_loss
 from piccolo.panorama.texels import pack_texels
 
 WIDTH = 256
@@ -52,7 +52,7 @@ def test_loss_equals_its_twin(name):
     expected = naive.sampling_loss(points, colors, image, is_valid, pose.R_cam_from_world, pose.center_world)
     packed, texels = pack_points(points, colors), pack_texels(image)
     assert sampling_loss(packed, texels, pose) == pytest.approx(expected, rel=1e-5)
-    assert normal_equations(packed, texels, pose)[0] == pytest.approx(expected, rel=1e-5)
+    assert sampling_equations(packed, texels, pose)[0] == pytest.approx(expected, rel=1e-5)
 
 
 def test_masked_pixels_are_left_out_of_sum_and_count():
@@ -72,7 +72,7 @@ def test_pose_that_hides_half_of_the_cloud_behind_the_mask_has_no_loss():
     is_valid[: WIDTH // 4] = False
     texels = pack_texels(_smooth_image(), is_valid)
     assert sampling_loss(pack_points(points, colors), texels, POSES["tilted"]) == math.inf
-    assert normal_equations(pack_points(points, colors), texels, POSES["tilted"])[0] == math.inf
+    assert sampling_equations(pack_points(points, colors), texels, POSES["tilted"])[0] == math.inf
 
 
 def test_a_crop_has_a_loss_where_it_shows_a_quarter_of_the_points_that_a_full_panorama_must():
@@ -92,7 +92,7 @@ def test_gradient_against_central_differences(where):
     points, colors = _points(where)
     image, pose = _smooth_image(), POSES["tilted"]
     is_valid = np.ones(image.shape[:2], dtype=bool)
-    _, gradient, _ = normal_equations(pack_points(points, colors), pack_texels(image), pose)
+    _, gradient, _ = sampling_equations(pack_points(points, colors), pack_texels(image), pose)
 
     def loss(delta):
         at = step(pose, delta)
@@ -105,7 +105,7 @@ def test_gradient_against_central_differences(where):
 def test_normal_matrix_equals_jacobians_stacked():
     points, colors = _points("anywhere", 500)
     image, pose = _smooth_image(), POSES["tilted"]
-    _, _, matrix = normal_equations(pack_points(points, colors), pack_texels(image), pose)
+    _, _, matrix = sampling_equations(pack_points(points, colors), pack_texels(image), pose)
 
     def residuals(delta):
         at = step(pose, delta)
@@ -122,7 +122,7 @@ def test_same_bits_for_any_number_of_threads():
     points, colors = _points("anywhere", 5 * BLOCK + 3)
     packed, texels, pose = pack_points(points, colors), pack_texels(_smooth_image()), POSES["tilted"]
     assert len({sampling_loss(packed, texels, pose, n) for n in (1, 2, 3, 7)}) == 1
-    one, two = (normal_equations(packed, texels, pose, n) for n in (1, 2))
+    one, two = (sampling_equations(packed, texels, pose, n) for n in (1, 2))
     assert one[0] == two[0]
     np.testing.assert_array_equal(one[1], two[1])
     np.testing.assert_array_equal(one[2], two[2])
@@ -154,7 +154,9 @@ def test_point_at_the_camera_and_pose_out_of_range_are_harmless():
     points, colors = _points("anywhere")
     points[0] = CENTER.astype(np.float32)
     pose = Pose(np.eye(3), points[0].astype(np.float64))
-    loss, gradient, matrix = normal_equations(pack_points(points, colors), pack_texels(_smooth_image()), pose)
+    loss, gradient, matrix = sampling_equations(
+        pack_points(points, colors), pack_texels(_smooth_image()), pose
+    )
     assert np.isfinite(loss)
     assert np.isfinite(gradient).all()
     assert np.isfinite(matrix).all()

@@ -1,30 +1,47 @@
+import dataclasses
+import functools
+
+import naive
 import numpy as np
 import pytest
 import rooms
 
-from piccolo.coarse_to_fine.scan_map import SEARCH_VIEW, prepare_map
+from piccolo.coarse_to_fine.query import prepare_query
+from piccolo.coarse_to_fine.scan_map import SEARCH_VIEW
 from piccolo.coarse_to_fine.search import (
+    TurnedPanorama,
     best_poses,
     correlate_pairs,
-    pick_distinct,
+    masked_correlation,
     score_poses,
     score_poses_wide,
+    search_poses,
     turn_panorama,
+    turned,
 )
-from piccolo.geometry.pose import angle_between
+from piccolo.coarse_to_fine.settings import CoarseToFineSettings, Prior
+from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
-from piccolo.geometry.sphere_grid import make_grid
+from piccolo.geometry.sphere_grid import averaging, make_grid
 from piccolo.panorama import Panorama
-from piccolo.panorama.local_normalization import Scale, comparable, normalized_channels, sample_channels
+from piccolo.panorama.gpano import GPano
+from piccolo.panorama.local_normalization import (
+    ImageScale,
+    image_pyramid,
+    normalize_panorama,
+    sample_channels,
+)
 from piccolo.panorama.resize import resize
 from piccolo.runtime.threads import Workers
 
-SCALE = Scale(128, 7.5, SEARCH_VIEW.sigma_deg)
+SCALE = ImageScale(128, 7.5, SEARCH_VIEW.sigma_deg)
+AREA = make_grid(24).solid_angle
 
 
-@pytest.fixture(scope="module")
-def scan_map():
-    return prepare_map(rooms.room(1)[1], Workers(2))
+@functools.lru_cache
+def _query(gpano=None):
+    panorama = dataclasses.replace(rooms.scene(1)[1], gpano=gpano)
+    return prepare_query(panorama, rooms.scan_map(1), CoarseToFineSettings(num_yaws=12), Workers(2))
 
 
 def _levels(texels):
@@ -37,7 +54,7 @@ def _levels(texels):
 def test_channels_forget_exposure_and_white_balance():
     panorama = rooms.scene(1)[1]
     darker = Panorama((panorama.rgb * np.array([0.7, 0.6, 0.5])).astype(np.uint8), panorama.is_valid)
-    a, b = (_levels(normalized_channels(resize(p, 128), 7.5, 22.0))[0][..., 0] for p in (panorama, darker))
+    a, b = (_levels(normalize_panorama(resize(p, 128), 7.5, 22.0))[0][..., 0] for p in (panorama, darker))
     assert np.corrcoef(a.ravel(), b.ravel())[0, 1] > 0.95
 
 
@@ -47,55 +64,81 @@ def test_what_is_masked_does_not_bleed():
     is_valid[200:] = False
     black, white = panorama.rgb.copy(), panorama.rgb.copy()
     black[200:], white[200:] = 0, 255
-    (a, valid), (b, _) = (_levels(comparable(Panorama(rgb, is_valid), [SCALE])[0]) for rgb in (black, white))
+    (a, valid), (b, _) = (
+        _levels(image_pyramid(Panorama(rgb, is_valid), [SCALE])[0]) for rgb in (black, white)
+    )
     np.testing.assert_array_equal(a[valid], b[valid])
     assert valid.mean() == pytest.approx(200 / 256, abs=0.02)
 
 
 def test_images_of_every_scale_have_their_width():
-    images = comparable(rooms.scene(1)[1], [Scale(1024, 0.0, 10.0), Scale(256, 0.0, 10.0), SCALE])
-    assert [i.width for i in images] == [1024, 256, 128]
+    scales = [ImageScale(1024, 0.0, 10.0), ImageScale(256, 0.0, 10.0), SCALE]
+    assert [image.width for image in image_pyramid(rooms.scene(1)[1], scales)] == [1024, 256, 128]
 
 
-def test_samples_along_turned_directions_equal_the_pixels():
-    texels = normalized_channels(resize(rooms.scene(1)[1], 128), 7.5, 22.0)
-    channels, _ = _levels(texels)
-    direction = np.array([[np.cos(0.3), 0.0, np.sin(0.3)]], dtype=np.float32)
-    rotation = uniform_yaws(8)[3].astype(np.float32)
-    samples, validity = np.empty((1, 3, 1), np.float32), np.empty((1, 1), np.float32)
-    sample_channels(texels.rgbx, 128, direction, rotation[None], samples, validity)
-    x, y, z = rotation @ direction[0]
-    u, v = (0.5 - np.arctan2(y, x) / (2 * np.pi)) * 128, (0.5 - np.arcsin(z) / np.pi) * 64
-    near = channels[int(v) - 1 : int(v) + 2, int(u) - 1 : int(u) + 2].reshape(-1, 3)
-    assert validity[0, 0] == 1
-    assert (samples[0, :, 0] >= near.min(axis=0) - 1e-3).all()
-    assert (samples[0, :, 0] <= near.max(axis=0) + 1e-3).all()
+def test_samples_along_turned_directions_equal_their_twin():
+    texels, directions = (
+        normalize_panorama(resize(rooms.scene(1)[1], 128), 7.5, 22.0),
+        make_grid(24).directions,
+    )
+    channels, is_valid = _levels(texels)
+    rotations = uniform_rotations(5).astype(np.float32)
+    samples, validity = np.empty((5, 3, len(AREA)), np.float32), np.empty((5, len(AREA)), np.float32)
+    sample_channels(texels.rgbx, 128, directions, rotations, samples, validity)
+    assert is_valid.all()
+    assert (validity == 1).all()
+    for R, found in zip(rotations, samples, strict=True):
+        expected = naive.sample(channels, naive.project(directions, R, np.zeros(3), 128))
+        np.testing.assert_allclose(found.T, expected, atol=0.1)
 
 
-def test_scores_equal_correlations_one_by_one(scan_map):
-    rng = np.random.default_rng(0)
-    rotations = uniform_rotations(50)
-    samples, validity = turn_panorama(comparable(rooms.scene(1)[1], [SCALE])[0], rotations)
+def test_scores_equal_correlations_one_by_one():
+    rng, scan_map = np.random.default_rng(0), rooms.scan_map(1)
+    samples, validity = turn_panorama(_query().images.search, uniform_rotations(50))
     validity[:, rng.random(validity.shape[1]) < 0.2] = 0
     samples *= validity[:, None]
-    scores = score_poses(scan_map, samples, validity)
-    area = make_grid(24).solid_angle
+    scores, panorama = score_poses(scan_map, samples, validity), turned(samples, validity, AREA, 1)
     candidate, rotation = rng.integers(0, len(scores), 40), rng.integers(0, 50, 40)
-    pairs = np.empty(40, np.float32)
-    correlate_pairs(scan_map.features, scan_map.is_seen, area, samples, validity, candidate, rotation, pairs)
-    np.testing.assert_allclose(scores[candidate, rotation], pairs, atol=1e-4)
-    for c, r, score in zip(candidate[:5], rotation[:5], pairs[:5], strict=True):
-        w = area * scan_map.is_seen[c] * validity[r]
+    pairs, area = np.empty(40, np.float32), np.rint(1000 * AREA / AREA.max())
+    correlate_pairs(scan_map.features, scan_map.is_seen, area, panorama, candidate, rotation, pairs)
+    twin = []
+    for c, r in zip(candidate, rotation, strict=True):
+        w = AREA * scan_map.is_seen[c] * validity[r]
         f, s = scan_map.features[c].astype(float), samples[r].astype(float)
-        twin = (w * f * s).sum() / np.sqrt((w * f * f).sum() * (w * s * s).sum())
-        assert score == pytest.approx(twin, abs=1e-4)
+        twin.append((w * f * s).sum() / np.sqrt((w * f * f).sum() * (w * s * s).sum()))
+    for found in (scores[candidate, rotation], pairs):  # each up to a factor of its own
+        factor = (found @ twin) / (found @ found)
+        np.testing.assert_allclose(factor * found, twin, atol=3e-3)
+
+
+def test_sums_of_a_search_are_exact():
+    """No partial sum of what features and samples can be at most reaches 2^24, so no order changes a bit."""
+    for area, most_seen in ((AREA, 1), (averaging(12).sum(axis=0), 255)):
+        one = np.ones((1, 3, len(area)), np.float32)
+        panorama = turned(127.5 * one, one[:, 0], area, most_seen)
+        assert 127 * panorama.samples.sum(dtype=float) < 2**24
+        assert most_seen * panorama.energy.sum(dtype=float) < 2**24
+        assert 127 * panorama.samples.sum(dtype=float) > 2**22  # the room is used
+        for values in panorama:
+            np.testing.assert_array_equal(values, np.rint(values))
+    rng = np.random.default_rng(0)
+    samples = rng.uniform(-127.5, 127.5, (20, 3, len(AREA))).astype(np.float32)
+    validity = (rng.random((20, len(AREA))) < 0.8).astype(np.float32)
+    features = rng.choice(np.array([-127, 127, 126], np.int8), (50, 3, len(AREA)))
+    seen = rng.integers(0, 2, (50, len(AREA)), dtype=np.uint8)
+    panorama = turned(samples * validity[:, None], validity, AREA, 1)
+    expected = masked_correlation(features.reshape(50, -1), seen, AREA, panorama)
+    cells, views = rng.permutation(len(AREA)), rng.permutation(50)
+    shuffled = TurnedPanorama(*(values[..., cells] for values in panorama))
+    features, seen = features[views][..., cells].reshape(50, -1), seen[views][:, cells]
+    np.testing.assert_array_equal(masked_correlation(features, seen, AREA[cells], shuffled), expected[views])
 
 
 @pytest.mark.parametrize("is_wide", [False, True])
-def test_best_score_is_near_the_true_pose(scan_map, is_wide):
-    _, panorama, true_pose = rooms.scene(1)
+def test_best_score_is_near_the_true_pose(is_wide):
+    true_pose, scan_map = rooms.scene(1)[2], rooms.scan_map(1)
     rotations = uniform_rotations(2000) if is_wide else uniform_yaws(48)
-    samples, validity = turn_panorama(comparable(panorama, [SCALE])[0], rotations)
+    samples, validity = turn_panorama(_query().images.search, rotations)
     scores = (score_poses_wide if is_wide else score_poses)(scan_map, samples, validity)
     candidate, rotation, values = best_poses(scores, 200)
     centers = scan_map.centers[scan_map.sparse] if is_wide else scan_map.centers
@@ -115,8 +158,39 @@ def test_best_poses_are_the_largest_in_order():
     np.testing.assert_array_equal(scores[candidate, rotation], values)
 
 
-def test_distinct_poses_are_the_first_of_their_neighbourhood():
-    centers = np.array([[0.0, 0, 0], [0.1, 0, 0], [2, 0, 0], [0.1, 0, 0]])
-    rotations = np.stack([uniform_yaws(36)[k] for k in (0, 1, 0, 9)])
-    assert pick_distinct(rotations, centers, 9, 0.5, 20.0).tolist() == [0, 2, 3]
-    assert pick_distinct(rotations, centers, 2, 0.5, 20.0).tolist() == [0, 2]
+def test_tilt_in_the_metadata_is_that_of_every_start():
+    """Pitch raises the image centre, roll lowers the camera's right side."""
+    starts = search_poses(_query(GPano(pitch_deg=20.0, roll_deg=10.0)), "known")
+    forward, left, _ = starts.R_cam_from_map.transpose(1, 0, 2)
+    np.testing.assert_allclose(np.degrees(np.arcsin(forward[:, 2])), 20.0, atol=1e-6)
+    assert (left[:, 2] > 0.1).all()
+    assert len(np.unique(np.round(forward, 6), axis=0)) > 6
+
+
+@pytest.mark.parametrize("gravity", ["known", "unknown"])
+def test_heading_is_the_worlds_where_the_map_was_levelled(gravity):
+    query = _query()
+    tilted = dataclasses.replace(query.scan_map, R_map_from_world=exp_so3(np.array([0.4, 0.3, 1.0])))
+    settings = dataclasses.replace(query.settings, prior=Prior(heading_deg=70.0, heading_tolerance_deg=20.0))
+    starts = search_poses(dataclasses.replace(query, scan_map=tilted, settings=settings), gravity)
+    forward = (starts.R_cam_from_map @ tilted.R_map_from_world)[:, 0]
+    off = np.degrees(np.arctan2(forward[:, 0], forward[:, 1])) - 70.0
+    assert len(off) > 0
+    assert np.abs(off).max() < 20.0 + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("min_starts", "max_starts", "expected"), [(150, 4000, 150), (150, 20, 20), (1, 4000, None)]
+)
+def test_number_of_starts(min_starts, max_starts, expected):
+    """One for every four candidates, but not fewer and not more than asked for."""
+    query = _query()
+    method = query.method._replace(min_starts=min_starts)
+    settings = dataclasses.replace(query.settings, max_starts=max_starts)
+    few = dataclasses.replace(query, method=method, settings=settings)
+    for gravity in ("known", "unknown"):
+        starts = search_poses(few, gravity)
+        num_candidates = len(query.scan_map.centers)
+        assert len(starts.score) == (expected or num_candidates // 4)
+        assert (np.diff(starts.score) <= 0).all()
+        np.testing.assert_array_equal(starts.center_map, query.scan_map.centers[starts.candidate])

@@ -35,7 +35,9 @@ def test_neighbours_are_near_and_weighted_by_a_gaussian():
         np.testing.assert_allclose(near.weight[rows], gaussian, rtol=1e-3)
 
 
-def test_averaging_keeps_the_solid_angle():
-    matrix = averaging(12)
-    assert matrix.sum() == pytest.approx(1.0, abs=1e-5)
-    np.testing.assert_allclose(matrix.sum(axis=0), make_grid(12).solid_angle, rtol=0.5)
+def test_averaging_adds_up_the_solid_angle_in_whole_numbers():
+    matrix, area = averaging(12), make_grid(24).solid_angle
+    np.testing.assert_array_equal(matrix, np.rint(matrix))
+    np.testing.assert_array_equal(np.count_nonzero(matrix, axis=1), 1)
+    np.testing.assert_allclose(matrix.sum(axis=1), 1000 * area / area.max(), atol=0.51)
+    np.testing.assert_allclose(matrix.sum(axis=0) / matrix.sum(), make_grid(12).solid_angle, rtol=0.5)
