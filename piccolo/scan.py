@@ -26,7 +26,9 @@ from .geometry.rotations import Gravity
 from .gravity import R_z_from_axis
 from .optimize.settings import Solver
 from .panorama import Panorama, ReadOptions, read_panorama
-from .paper.localize import PaperMap, localize_by_paper, prepare_by_paper
+from .paper.localize import PaperMap
+from .paper.localize import localize as localize_by_paper
+from .paper.localize import prepare as prepare_by_paper
 from .paper.settings import PaperSettings
 from .result import Result, result_of
 from .runtime.stopwatch import Stopwatch

@@ -10,22 +10,21 @@ import pytest
 from rooms import as_panorama, errors, query, room
 from test_cloud_morton import seeded_cloud
 
-from piccolo import pipeline
 from piccolo.cloud import CloudStream
 from piccolo.cloud.readers.reader import PointSource, RawCloud
 from piccolo.cloud.settings import METRES, CloudSettings
 from piccolo.cloud.voxels import Voxels
 from piccolo.coarse_to_fine.localize import localize
-from piccolo.coarse_to_fine.map_file import content_key
+from piccolo.coarse_to_fine.open_map import CachePolicy, content_key, open_map
 from piccolo.coarse_to_fine.scan_map import prepare_map
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.gravity import rotation_to_z_up
 from piccolo.paper.settings import PaperSettings
-from piccolo.pipeline import CachePolicy, open_map
 from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers
+from piccolo.scan import open_files
 
 ROOT = Path(__file__).resolve().parents[1]
 TURN = exp_so3(np.array([0.3, -0.7, 1.9]))
@@ -218,7 +217,6 @@ MEASURE = """
 import resource
 from pathlib import Path
 import numpy as np
-from piccolo import pipeline
 from piccolo.cloud import CloudStream
 from piccolo.cloud.readers.reader import CHUNK, PointSource, RawCloud
 
@@ -251,18 +249,13 @@ def test_a_wrong_unit_is_told_before_the_long_work_begins(tmp_path, monkeypatch,
         raise InterruptedError
 
     monkeypatch.setattr("piccolo.coarse_to_fine.scan_map.candidate_centers", begin)
-    monkeypatch.setattr("piccolo.paper.localize.prepare", begin)
+    monkeypatch.setattr("piccolo.scan.prepare_by_paper", begin)
     path = tmp_path / "mm.xyz"
     raw = seeded_cloud(1, 1500, size=(6000.0, 5000.0, 2500.0))
     np.savetxt(path, np.hstack([raw.points_world, raw.colors]), fmt="%.3f")
     with pytest.raises(InterruptedError):
-        pipeline.open_localizer(
-            pipeline.Inputs((path,)),
-            preset,
-            CachePolicy(is_used=False),
-            Workers(1, warn=heard.append),
-            Stopwatch(),
-        )
+        no_cache, workers = CachePolicy(is_used=False), Workers(1, warn=heard.append)
+        open_files([path], CloudSettings(), preset, no_cache, workers)
     (warning,) = heard
     assert warning.startswith(f"{path}: the cloud spans")
     assert warning.endswith("set --units mm")

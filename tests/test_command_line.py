@@ -16,8 +16,6 @@ from piccolo.cli.parser import COMMANDS, parse
 from piccolo.cloud.settings import IN_METRES, CloudSettings
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.errors import InputError
-from piccolo.panorama import AS_STORED
-from piccolo.pipeline import Inputs
 from piccolo.result import Result
 
 ONE = ["--cloud", "a.ply", "--pano", "b.jpg"]
@@ -69,11 +67,6 @@ def test_preset_paper_has_no_up(capsys):
     assert "--up: not an option of the preset paper" in capsys.readouterr().err
 
 
-def test_one_file_is_named_by_a_string(tmp_path):
-    assert Inputs((tmp_path,)).cloud_name == str(tmp_path)
-    assert Inputs((tmp_path, tmp_path / "b")).cloud_name == (str(tmp_path), str(tmp_path / "b"))
-
-
 def test_several_files_in_feet_with_y_up(scene, tmp_path, capsys):
     pano = ["--pano", str(scene / "pano.png"), "--quiet"]
     cache = ["--cache", str(tmp_path)]
@@ -114,15 +107,14 @@ def test_no_file_of_a_cloud_is_overwritten(scene, capsys):
 
 @pytest.mark.parametrize("quiet", [False, True])
 def test_a_warning_is_written_once_whenever_it_comes(monkeypatch, capsys, quiet):
-    def opened(inputs, settings, cache, workers, watch):
+    def opened(paths, cloud_settings, settings, cache, workers):
         workers.warn("early")
         return SimpleNamespace(warnings=("early", "late"))
 
-    monkeypatch.setattr(localize, "open_localizer", opened)
+    monkeypatch.setattr(localize, "open_files", opened)
     monkeypatch.setattr(localize, "is_first_use", lambda: False)
     arguments = parse(build_parser(), [*ONE, *["--quiet"] * quiet])
-    session = localize.open_session(arguments, CoarseToFineSettings(), AS_STORED)
-    assert session.localizer.warnings == ("early", "late")
+    assert localize.open_scan(arguments, CoarseToFineSettings()).warnings == ("early", "late")
     assert capsys.readouterr().err == ("" if quiet else "warning: early\nwarning: late\n")
 
 

@@ -11,11 +11,11 @@ from rooms import errors, write_room
 from piccolo.cli import localize, prepare_map
 from piccolo.cloud.label_colors import Labels
 from piccolo.cloud.settings import CloudSettings
+from piccolo.coarse_to_fine.open_map import CachePolicy
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.errors import InputError
 from piccolo.panorama import ReadOptions
 from piccolo.paper.settings import PaperSettings
-from piccolo.pipeline import CachePolicy
 from piccolo.result import Result
 from piccolo.scenes.evaluation.runner import Failure, Job, RunConfig, run_job
 from piccolo.scenes.scene import read_scene
@@ -106,7 +106,7 @@ def test_prepared_map_of_labels_wants_labels(scene, tmp_path, capsys):
 
 def test_evaluation_takes_the_pictures_of_labels(scene):
     labels = Labels()
-    settings = CoarseToFineSettings(min_starts=100, max_starts=100)
+    settings = CoarseToFineSettings(max_starts=100)
     reading = CloudSettings(labels=labels), ReadOptions(labels=labels)
     config = RunConfig(settings, *reading, CachePolicy(False), 2)
     here = read_scene(scene)

@@ -43,7 +43,7 @@ class PaperMap:
         return replace(pose, center_world=pose.center_world + self.origin_world)
 
 
-def prepare_by_paper(cloud: Cloud, settings: PaperSettings) -> PaperMap:
+def prepare(cloud: Cloud, settings: PaperSettings) -> PaperMap:
     """Everything that does not depend on the panorama."""
     points = pack_points(cloud.points, cloud.colors).subsample(settings.max_points)
     return PaperMap(
@@ -61,7 +61,7 @@ def loss_of(panorama: Panorama, settings: PaperSettings) -> Loss:
     return sampling_loss_of(pack_texels(panorama.rgb, panorama.is_valid))
 
 
-def localize_by_paper(
+def localize(
     paper_map: PaperMap, panorama: Panorama, settings: PaperSettings, workers: Workers, watch: Stopwatch
 ) -> Localization:
     """Algorithm 1 of the paper: search, refine, select; then evaluate what was selected."""
