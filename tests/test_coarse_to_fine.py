@@ -1,37 +1,27 @@
 import dataclasses
-import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 import rooms
-from rooms import as_panorama, errors, query, room
+from golden_poses import check_golden_poses
+from rooms import as_panorama, errors, query, room, scan_map
 
 from piccolo.cloud.model import Cloud
+from piccolo.coarse_to_fine.camera_positions import heights_above_floor
 from piccolo.coarse_to_fine.localize import localize
-from piccolo.coarse_to_fine.map_file import load_map, save_map
-from piccolo.coarse_to_fine.prior import allowed_rotations, narrowed
+from piccolo.coarse_to_fine.prior import allowed_rotations, apply_prior
 from piccolo.coarse_to_fine.scan_map import prepare_map
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings, Prior
-from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.geometry.rotations import uniform_yaws
 from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers
 
-GOLDEN = Path(__file__).parent / "golden" / "engine.json"
-KNOWN, UNKNOWN = CoarseToFineSettings(gravity="known"), CoarseToFineSettings(gravity="unknown")
-MAPS = {}
-
-
-def _map(seed):
-    if seed not in MAPS:
-        MAPS[seed] = prepare_map(room(seed)[1], Workers(2))
-    return MAPS[seed]
+KNOWN = CoarseToFineSettings(gravity="known")
 
 
 def _localize(seed, rgb, settings, num_threads=2):
-    return localize(_map(seed), as_panorama(rgb), settings, Workers(num_threads), Stopwatch())
+    return localize(scan_map(seed), as_panorama(rgb), settings, Workers(num_threads), Stopwatch())
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -69,7 +59,7 @@ def test_panorama_from_elsewhere_is_not_localized(name):
 
 def test_panorama_of_which_nothing_counts_has_no_pose():
     panorama = dataclasses.replace(rooms.scene(1)[1], is_valid=np.zeros((256, 512), dtype=bool))
-    found = localize(_map(1), panorama, KNOWN, Workers(1), Stopwatch())
+    found = localize(scan_map(1), panorama, KNOWN, Workers(1), Stopwatch())
     assert found.status == "not_localized"
     assert found.pose is None
 
@@ -78,8 +68,8 @@ def test_cloud_without_a_place_for_a_camera_is_no_error():
     rng = np.random.default_rng(0)
     solid = rng.uniform(0.0, 1.0, (20_000, 3)).astype(np.float32)
     cloud = Cloud(solid, rng.integers(0, 256, (20_000, 3), dtype=np.uint8), np.zeros(3))
-    scan_map = prepare_map(cloud, Workers(1))
-    found = localize(scan_map, as_panorama(query(1).rgb), CoarseToFineSettings(), Workers(1), Stopwatch())
+    solid_map = prepare_map(cloud, Workers(1))
+    found = localize(solid_map, as_panorama(query(1).rgb), CoarseToFineSettings(), Workers(1), Stopwatch())
     assert found.status == "not_localized"
 
 
@@ -87,9 +77,9 @@ def test_cloud_that_lies_on_its_side_is_levelled():
     cloud, taken = room(1)[1], query(1)
     turn = exp_so3(np.array([np.pi / 2, 0.0, 0.0])) @ exp_so3(np.array([0.0, 0.3, 0.0]))
     lying = Cloud((cloud.points @ turn.T).astype(np.float32), cloud.colors, cloud.origin_world)
-    scan_map = prepare_map(lying, Workers(2))
-    assert any("levelled" in warning for warning in scan_map.warnings)
-    found = localize(scan_map, as_panorama(taken.rgb), KNOWN, Workers(2), Stopwatch())
+    lying_map = prepare_map(lying, Workers(2))
+    assert any("levelled" in warning for warning in lying_map.warnings)
+    found = localize(lying_map, as_panorama(taken.rgb), KNOWN, Workers(2), Stopwatch())
     center = turn @ (taken.pose.center_world - cloud.origin_world) + cloud.origin_world
     distance, angle_deg = errors(found.pose, Pose(taken.pose.R_cam_from_world @ turn.T, center))
     assert distance < 0.01
@@ -97,23 +87,35 @@ def test_cloud_that_lies_on_its_side_is_levelled():
 
 
 def test_world_and_map_frames_are_inverse():
-    scan_map = dataclasses.replace(_map(1), R_map_from_world=exp_so3(np.array([0.3, 1.0, -0.5])))
+    turned = dataclasses.replace(scan_map(1), R_map_from_world=exp_so3(np.array([0.3, 1.0, -0.5])))
     pose = Pose(exp_so3(np.array([0.1, 0.2, 0.3])), np.array([5.0, 6.0, 7.0]))
-    back = scan_map.from_world(scan_map.to_world(pose))
+    back = turned.from_world(turned.to_world(pose))
     np.testing.assert_allclose(back.R_cam_from_world, pose.R_cam_from_world, atol=1e-12)
     np.testing.assert_allclose(back.center_world, pose.center_world, atol=1e-12)
 
 
 def test_priors_leave_what_they_say():
-    scan_map, origin = _map(1), room(1)[1].origin_world
-    near = narrowed(scan_map, Prior(near_world=tuple(origin + np.array([0.5, 0, 0])), radius=1.0))
-    assert 0 < len(near.centers) < len(scan_map.centers)
-    assert np.linalg.norm(near.centers - [0.5, 0, 0], axis=1).max() <= 1.3
-    np.testing.assert_array_equal(np.sort(near.sparse), np.unique(near.sparse))
-    assert near.sparse.max() < len(near.centers)
-    low = narrowed(scan_map, Prior(height=(0.5, 1.0)))
-    assert 0 < len(low.centers) < len(scan_map.centers)
-    assert narrowed(scan_map, Prior()) is scan_map
+    whole, origin = scan_map(1), room(1)[1].origin_world
+    turn = exp_so3(np.array([0.0, 0.0, 2.0]))  # of a map that was levelled
+    turned = dataclasses.replace(whole, R_map_from_world=turn)
+    near = apply_prior(turned, Prior(near_world=tuple(origin + turn.T @ [0.5, 0, 0]), radius=1.0))
+    distance = np.linalg.norm(whole.centers - [0.5, 0, 0], axis=1)
+    is_near = distance <= 1.3  # half a spacing more
+    assert 0 < is_near.sum() < len(is_near)
+    low = apply_prior(whole, Prior(height=(0.5, 1.0)))
+    heights = heights_above_floor(whole.octree, whole.centers)
+    is_low = (heights >= 0.2) & (heights <= 1.3)
+    assert 0 < is_low.sum() < len(is_low)
+    for left, is_left in ((near, is_near), (low, is_low)):
+        for name in ("centers", "offsets", "offset_unit", "features", "is_seen"):
+            np.testing.assert_array_equal(getattr(left, name), getattr(whole, name)[is_left])
+        is_kept = is_left[whole.sparse]
+        np.testing.assert_array_equal(left.centers[left.sparse], whole.centers[whole.sparse[is_kept]])
+        np.testing.assert_array_equal(left.wide_features, whole.wide_features[is_kept])
+        np.testing.assert_array_equal(left.wide_seen, whole.wide_seen[is_kept])
+    both = apply_prior(turned, Prior(tuple(origin + turn.T @ [0.5, 0, 0]), 1.0, (0.5, 1.0)))
+    assert len(both.centers) == (is_near & is_low).sum()
+    assert apply_prior(whole, Prior()) is whole
 
 
 def test_heading_counts_clockwise_from_y():
@@ -134,22 +136,12 @@ def test_heading_of_the_truth_keeps_it_and_another_loses_it():
         assert (errors(found.pose, taken.pose)[1] < 1.0) == is_right
 
 
-def test_map_file_round_trip(tmp_path):
-    save_map(_map(1), tmp_path / "a.map")
-    back = load_map(tmp_path / "a.map")
-    for field in dataclasses.fields(back):
-        if field.name not in ("octree", "warnings"):
-            np.testing.assert_array_equal(getattr(back, field.name), getattr(_map(1), field.name))
-    np.testing.assert_array_equal(back.octree.nodes, _map(1).octree.nodes)
-    (tmp_path / "b.map").write_bytes((tmp_path / "a.map").read_bytes()[:-1000])
-    with pytest.raises(InputError, match=r"b\.map: found .*, wanted a whole map"):
-        load_map(tmp_path / "b.map")
-
-
 def test_golden_poses():
-    """A change that moves one says so in CHANGELOG.md under Numbers; the file is made anew from this loop."""
-    for entry in json.loads(GOLDEN.read_text()):
-        found = _localize(entry["seed"], query(entry["seed"], entry["variant"]).rgb, CoarseToFineSettings())
-        distance = np.linalg.norm(found.pose.center_world - entry["center_world"])
-        assert distance < 0.001, entry
-        assert np.abs(found.pose.R_cam_from_world - entry["R_cam_from_world"]).max() < np.radians(0.01), entry
+    def arrays(seed):
+        m = scan_map(seed)
+        return m.octree.nodes, m.centers, m.offsets, m.features, m.is_seen
+
+    def found(seed, variant):
+        return _localize(seed, query(seed, variant).rgb, CoarseToFineSettings())
+
+    check_golden_poses("coarse_to_fine.json", arrays, found)

@@ -8,20 +8,20 @@ from rooms import as_panorama, errors, query, room
 
 from piccolo.cloud import stream_of
 from piccolo.cloud.readers.reader import RawCloud
+from piccolo.coarse_to_fine import covariance
 from piccolo.coarse_to_fine.covariance import (
-    PROBES,
     SHARP_STD,
+    STEPS,
     block_gradients,
-    certainty_at,
     covariance_of,
-    disagreement_of_halves,
+    estimate_covariance,
     gradient_at,
-    has_bottom,
     hessian_at,
+    is_local_minimum,
     points_at,
 )
 from piccolo.coarse_to_fine.localize import localize
-from piccolo.coarse_to_fine.query import look_for
+from piccolo.coarse_to_fine.query import prepare_query
 from piccolo.coarse_to_fine.scan_map import prepare_map
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.geometry.pose import Pose, exp_so3, log_so3, step
@@ -35,32 +35,32 @@ SETTINGS = CoarseToFineSettings(gravity="known")
 
 @pytest.fixture(scope="module")
 def found():
-    """A look at a room, and the pose found in the map's frame."""
-    scan_map, panorama = prepare_map(room(2)[1], Workers(2)), as_panorama(query(2).rgb)
-    look = look_for(panorama, scan_map, SETTINGS, Workers(2))
+    """The query of a panorama in a room, and the pose found in the map's frame."""
+    scan_map, panorama = rooms.scan_map(2), as_panorama(query(2).rgb)
+    prepared = prepare_query(panorama, scan_map, SETTINGS, Workers(2))
     result = localize(scan_map, panorama, SETTINGS, Workers(2), Stopwatch())
-    return look, scan_map.from_world(result.pose), result
+    return prepared, scan_map.from_world(result.pose), result
 
 
 def test_gradients_of_blocks_add_up(found):
-    look, pose, _ = found
-    points = points_at(look, pose)
-    total = gradient_at(look.images[0], points, pose.R_cam_from_world, np.zeros(3))
-    parts = block_gradients(look.images[0], points, pose)
+    prepared, pose, _ = found
+    points = points_at(prepared, pose)
+    total = gradient_at(prepared.images.full, points, pose.R_cam_from_world, np.zeros(3))
+    parts = block_gradients(prepared.images.full, points, pose)
     assert len(parts) > 100
     tolerance = 1e-3 * np.abs(parts).sum(axis=0).max()
     np.testing.assert_allclose(parts.sum(axis=0), total, rtol=1e-3, atol=tolerance)
 
 
 def test_hessian_predicts_the_gradient_a_step_away(found):
-    look, pose, _ = found
-    points = points_at(look, pose)
-    hessian = hessian_at(look.images[0], points, pose, PROBES[0])
+    prepared, pose, _ = found
+    points = points_at(prepared, pose)
+    hessian = hessian_at(prepared.images.full, points, pose, STEPS[0])
     for delta in ([0.001, 0, 0, 0, 0.003, 0], [0, -0.0015, 0.001, 0.003, 0, -0.004]):
         moved = step(pose, np.array(delta))
-        before = gradient_at(look.images[0], points, pose.R_cam_from_world, np.zeros(3))
+        before = gradient_at(prepared.images.full, points, pose.R_cam_from_world, np.zeros(3))
         shift = moved.center_world - pose.center_world
-        after = gradient_at(look.images[0], points, moved.R_cam_from_world, shift)
+        after = gradient_at(prepared.images.full, points, moved.R_cam_from_world, shift)
         expected = hessian @ delta
         assert np.linalg.norm(after - before - expected) < 0.5 * np.linalg.norm(expected)
 
@@ -72,7 +72,7 @@ def test_sandwich_of_independent_blocks_is_the_textbook_covariance():
     np.testing.assert_allclose(covariance_of(hessian, gradients), np.linalg.inv(hessian), atol=0.05)
 
 
-def test_no_covariance_without_a_bottom_or_with_few_blocks():
+def test_no_covariance_without_a_minimum_or_with_few_blocks():
     gradients = np.random.default_rng(0).normal(size=(100, 6))
     assert covariance_of(np.diag([1.0, 1, 1, 1, 1, -0.1]), gradients) is None
     assert covariance_of(np.eye(6), gradients[:10]) is None
@@ -80,10 +80,10 @@ def test_no_covariance_without_a_bottom_or_with_few_blocks():
 
 def test_covariance_is_in_the_worlds_axes(found):
     """A map turned against the world: the same deviations, turned along."""
-    look, pose, result = found
-    points, R = points_at(look, pose), exp_so3(np.array([0.2, -0.5, 1.1]))
-    turned = replace(look, scan_map=replace(look.scan_map, R_map_from_world=R))
-    own, other = result.certainty.covariance, certainty_at(turned, points, pose).covariance
+    prepared, pose, result = found
+    R = exp_so3(np.array([0.2, -0.5, 1.1]))
+    turned = replace(prepared, scan_map=replace(prepared.scan_map, R_map_from_world=R))
+    own, other = result.covariance.matrix, estimate_covariance(turned, pose).matrix
     np.testing.assert_allclose(other[:3, :3], own[:3, :3], rtol=1e-6)
     np.testing.assert_allclose(R @ other[3:, 3:] @ R.T, own[3:, 3:], rtol=1e-6, atol=1e-12)
 
@@ -92,24 +92,52 @@ def test_deviations_are_of_the_size_of_the_errors():
     """Squared errors, weighed by their covariance: 5.3 in the median for six numbers if all is right."""
     squares = []
     for seed in (1, 2, 3):
-        scan_map = prepare_map(room(seed)[1], Workers(2))
+        scan_map = rooms.scan_map(seed)
         for variant in ("clean", "tilt", "change"):
             taken = query(seed, variant)
             how = CoarseToFineSettings(gravity="unknown" if variant == "tilt" else "known")
             result = localize(scan_map, as_panorama(taken.rgb), how, Workers(2), Stopwatch())
             turn = log_so3(taken.pose.R_cam_from_world @ result.pose.R_cam_from_world.T)
             error = np.concatenate([turn, taken.pose.center_world - result.pose.center_world])
-            squares.append(error @ np.linalg.solve(result.certainty.covariance, error))
+            squares.append(error @ np.linalg.solve(result.covariance.matrix, error))
     assert 1.0 < np.median(squares) < 15.0
 
 
-def test_halves_agree_at_the_right_pose_only(found):
-    look, pose, result = found
-    assert disagreement_of_halves(look, points_at(look, pose), pose)[0] < 0.02
-    assert has_bottom(look, pose, 0.8)
-    assert has_bottom(look, pose, 0.0) == (result.certainty.largest_std < SHARP_STD)  # where little is alike
+def test_the_right_pose_is_a_sharp_local_minimum_and_wrong_ones_are_not(found):
+    prepared, pose, result = found
+    assert result.covariance.largest_std < SHARP_STD
+    assert is_local_minimum(prepared, pose, 0.8)
+    assert is_local_minimum(prepared, pose, 0.0)
     wrong = Pose(exp_so3(np.array([0.0, 0.0, 2.0])) @ pose.R_cam_from_world, pose.center_world)
-    assert not has_bottom(look, wrong, 0.8)
+    assert not is_local_minimum(prepared, wrong, 0.8)
+
+
+@pytest.mark.parametrize(
+    ("std", "agreement", "expected"), [(0.014, 0.0, True), (0.016, 0.54, False), (0.016, 0.56, True), (0.051, 1, False)]
+)
+def test_a_minimum_may_be_blunt_where_much_agrees(found, monkeypatch, std, agreement, expected):
+    """The least constrained direction counts; a flat alternative, which fixes no pose, is none."""
+    matrix = np.diag([1e-4, 1e-4, 1e-4, 1e-8, std**2, 1e-8])
+    monkeypatch.setattr(covariance, "covariance_at", lambda *_: matrix)
+    assert is_local_minimum(found[0], found[1], agreement) == expected
+    monkeypatch.setattr(covariance, "covariance_at", lambda *_: None)
+    assert not is_local_minimum(found[0], found[1], agreement)
+
+
+def test_where_the_finest_image_has_no_minimum_the_next_one_tells(found, monkeypatch):
+    prepared, pose, _ = found
+    asked = []
+
+    def hessian(image, points, pose, steps):
+        asked.append((image, steps))
+        return np.diag([1.0] * 5 + [-1.0 if image is prepared.images.full else 1.0])
+
+    gradients = np.random.default_rng(0).normal(size=(100, 6))
+    monkeypatch.setattr(covariance, "hessian_at", hessian)
+    monkeypatch.setattr(covariance, "block_gradients", lambda *_: gradients)
+    matrix = covariance.covariance_at(prepared, points_at(prepared, pose), pose)
+    assert asked == [(prepared.images.full, STEPS[0]), (prepared.images.fine, STEPS[1])]
+    np.testing.assert_allclose(matrix, STEPS[1].inflation * gradients.T @ gradients * 100 / 94)
 
 
 @pytest.mark.parametrize("kind", REPEATED_KINDS)
@@ -125,7 +153,7 @@ def test_truth_is_among_the_poses_of_a_place_that_repeats(kind):
         Workers(2),
         Stopwatch(),
     )
-    distances = [errors(pose, taken.pose)[0] for pose in (result.pose, *(r.pose for r in result.rivals))]
+    distances = [errors(pose, taken.pose)[0] for pose in (result.pose, *(h.pose for h in result.alternatives))]
     assert min(distances) < 0.1
     assert result.status == "ambiguous" or distances[0] < 0.1
-    assert 1 <= len(result.rivals) <= 5
+    assert 1 <= len(result.alternatives) <= 5

@@ -7,7 +7,9 @@ from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.confidence.confidence import (
     AMBIGUOUS,
     LOCALIZED,
+    MODEL,
     NOT_LOCALIZED,
+    PAPER_MODEL,
     classify,
     confidence_of,
     features_of,
@@ -17,23 +19,46 @@ from piccolo.confidence.score import Evidence
 from piccolo.errors import InputError
 from piccolo.paper.settings import PaperSettings
 
-SURE = PoseCovariance(np.diag([1e-8] * 3 + [4e-6] * 3), "")
-RIGHT = Evidence(
-    score=0.8,
-    margin=0.6,
-    agreement=0.85,
-    explained_fraction=0.85,
-    seen_fraction=0.93,
-)
+
+def _covariance(std):
+    return PoseCovariance(np.diag([1e-8] * 3 + [std**2] * 3), "")
+
+
+SURE = _covariance(0.002)
+RIGHT = Evidence(score=0.8, margin=0.6, agreement=0.85, explained_fraction=0.85, seen_fraction=0.93)
 WRONG = dataclasses.replace(RIGHT, score=0.18, margin=0.02, agreement=0.25)
+MIDDLING = dataclasses.replace(RIGHT, score=0.35, margin=0.15, agreement=0.4)
 
 
 def test_right_and_wrong_evidence():
-    assert classify(RIGHT, SURE, True, 0.9) == (LOCALIZED, confidence_of(RIGHT, SURE))
+    assert classify(RIGHT, SURE, True, 0.9) == (LOCALIZED, confidence_of(RIGHT, SURE, MODEL))
     assert classify(WRONG, None, True, 0.9)[0] == NOT_LOCALIZED
-    assert confidence_of(RIGHT, SURE) > 0.99
-    assert confidence_of(WRONG, None) < 0.2
-    assert classify(OF_PAPER, None, True, 0.9)[0] == LOCALIZED
+    assert confidence_of(RIGHT, SURE, MODEL) > 0.99
+    assert confidence_of(WRONG, None, MODEL) < 0.2
+    assert classify(RIGHT, None, True, 0.9, PAPER_MODEL)[0] == LOCALIZED
+
+
+@pytest.mark.parametrize(
+    ("changes", "std", "model", "expected"),
+    [
+        ({}, 0.003, MODEL, 0.9707),
+        ({}, None, MODEL, 0.7858),
+        ({"margin": 0.45, "agreement": 0.8, "alternative_score_ratio": 0.5}, 0.003, MODEL, 0.7513),
+        ({}, None, PAPER_MODEL, 0.1759),
+        ({"margin": 0.35}, None, PAPER_MODEL, 0.4328),
+    ],
+)
+def test_confidence_is_what_was_learnt(changes, std, model, expected):
+    """From the models as they were fitted, by a pocket calculator; a new fit changes these numbers."""
+    evidence = dataclasses.replace(MIDDLING, **changes)
+    assert confidence_of(evidence, std and _covariance(std), model) == pytest.approx(expected, abs=0.001)
+
+
+@pytest.mark.parametrize(("std", "most"), [(0.05, 0.683), (0.1, 0.383), (0.3, 0.132)])
+def test_a_pose_that_may_be_a_decimetre_off_is_doubtful_whatever_the_evidence(std, most):
+    """The part of a normal distribution within 0.1 m, of twice the deviation."""
+    sure = dataclasses.replace(RIGHT, margin=3.0)
+    assert confidence_of(sure, _covariance(std), MODEL) == pytest.approx(most, abs=0.002)
 
 
 def test_an_alternative_as_good_makes_it_ambiguous():
@@ -41,36 +66,38 @@ def test_an_alternative_as_good_makes_it_ambiguous():
     status, confidence = classify(twin, SURE, True, 0.9)
     assert status == AMBIGUOUS
     assert confidence < 0.9
+    assert classify(twin, SURE, False, 0.9)[0] == NOT_LOCALIZED
 
 
 def test_without_an_alternative_nothing_is_ambiguous():
     weak = dataclasses.replace(WRONG, margin=0.18)
     assert classify(weak, None, False, 0.9)[0] == NOT_LOCALIZED
+    assert classify(WRONG, None, True, 0.9)[0] == NOT_LOCALIZED
 
 
 def test_the_line_moves():
-    confidence = confidence_of(RIGHT, SURE)
+    confidence = confidence_of(RIGHT, SURE, MODEL)
     assert classify(RIGHT, SURE, False, 0.5 * (1.0 + confidence))[0] != LOCALIZED
-    assert classify(WRONG, None, False, 0.5 * confidence_of(WRONG, None))[0] == LOCALIZED
+    assert classify(RIGHT, SURE, False, confidence)[0] == LOCALIZED
+    assert classify(WRONG, None, False, 0.5 * confidence_of(WRONG, None, MODEL))[0] == LOCALIZED
 
 
-@pytest.mark.parametrize("name", ["margin", "agreement"])
+@pytest.mark.parametrize("name", ["margin", "agreement", "score"])
 def test_more_evidence_is_more_confidence(name):
-    weaker = dataclasses.replace(RIGHT, **{name: 0.1}, score=0.3)
-    stronger = dataclasses.replace(weaker, **{name: 0.3})
-    assert confidence_of(weaker, SURE) < confidence_of(stronger, SURE)
+    stronger = dataclasses.replace(MIDDLING, **{name: getattr(MIDDLING, name) + 0.1})
+    assert confidence_of(MIDDLING, SURE, MODEL) < confidence_of(stronger, SURE, MODEL)
 
 
-def test_a_pose_that_is_no_bottom_and_a_credible_alternative_are_held_against_it():
-    middling = dataclasses.replace(RIGHT, score=0.35, margin=0.15, agreement=0.4)
-    assert confidence_of(middling, None) < confidence_of(middling, SURE)
-    challenged = dataclasses.replace(middling, alternative_score_ratio=0.9)
-    assert confidence_of(challenged, SURE) < confidence_of(middling, SURE)
+def test_a_pose_that_is_no_minimum_and_a_credible_alternative_are_held_against_it():
+    assert confidence_of(MIDDLING, None, MODEL) < confidence_of(MIDDLING, SURE, MODEL)
+    challenged = dataclasses.replace(MIDDLING, alternative_score_ratio=0.9)
+    assert confidence_of(challenged, SURE, MODEL) < confidence_of(MIDDLING, SURE, MODEL)
 
 
-def test_deviations_beyond_reason_change_nothing_more():
-    wide, wider = (PoseCovariance(np.diag([1e-8] * 3 + [std**2] * 3), "") for std in (1.0, 50.0))
-    np.testing.assert_array_equal(features_of(RIGHT, wide), features_of(RIGHT, wider))
+@pytest.mark.parametrize(("a", "b"), [(1.0, 50.0), (0.003, 0.001)])
+def test_deviations_beyond_reason_change_nothing_more(a, b):
+    np.testing.assert_array_equal(*(features_of(RIGHT, _covariance(std)) for std in (a, b)))
+    assert (features_of(RIGHT, None) == features_of(RIGHT, _covariance(0.3))).all()
 
 
 @pytest.mark.parametrize("settings", [CoarseToFineSettings, PaperSettings])

@@ -3,9 +3,10 @@ import pytest
 import rooms
 from rooms import as_panorama
 
-from piccolo.confidence.score import agreement_at
+from piccolo.confidence.score import Agreement, agreement_at
 from piccolo.geometry.pose import step
 from piccolo.panorama import Panorama
+from piccolo.panorama.local_normalization import normalize_locally
 
 
 @pytest.fixture(scope="module")
@@ -25,9 +26,8 @@ def test_right_pose_explains_most_of_the_panorama(scene):
     right = agreement_at(points, panorama, true_pose)
     wrong = agreement_at(points, panorama, step(true_pose, np.array([0, 0, 1.0, 0, 0, 0])))
     assert right.explained_fraction > 0.8 > wrong.explained_fraction
-    assert right.inlier_share > wrong.inlier_share
-    assert right.residual_p20 < 0.5 * wrong.residual_p20
-    assert right.explained_fraction <= right.inlier_share <= 1.0  # not all is seen
+    assert right.correlation > 0.5 > wrong.correlation
+    assert right.explained_fraction <= right.seen_fraction <= 1.0
 
 
 @pytest.mark.parametrize("level", [0, 128, 255])
@@ -52,12 +52,18 @@ def test_mostly_masked_panorama_is_charged(scene):
     is_valid[120:136] = True
     narrow = agreement_at(points, Panorama(panorama.rgb, is_valid), true_pose)
     assert narrow.seen_fraction < 0.15
-    assert narrow.score < 0.25
+    assert narrow.value < 0.25
 
 
-def test_local_contrast_forgets_gain_and_offset_but_not_pattern():
-    pattern = np.random.default_rng(0).normal(size=(1, 48, 96)).astype(np.float32)
+def test_normalisation_forgets_gain_and_offset_but_not_pattern():
+    rgb = np.random.default_rng(0).uniform(size=(48, 96, 3)).astype(np.float32)
     everywhere = np.ones((48, 96), dtype=bool)
-    a, b = local_contrast(pattern, everywhere), local_contrast(3.0 * pattern + 5.0, everywhere)
+    a, b = (normalize_locally(image, everywhere, 15.0) for image in (rgb, 3.0 * rgb + 5.0))
     np.testing.assert_allclose(a, b, atol=0.1)
     assert a.std() > 0.7
+
+
+def test_score_and_value_charge_a_view_of_which_little_is_seen():
+    for seen, value, score in ((0.25, 0.3, 0.3), (0.64, 0.6, 0.48), (1.0, 0.6, 0.6)):
+        agreement = Agreement(correlation=0.6, explained_fraction=0.5, seen_fraction=seen)
+        assert (agreement.value, agreement.score) == (pytest.approx(value), pytest.approx(score))

@@ -27,8 +27,8 @@ def test_an_error_drops_what_has_not_begun():
         begun.append(i)
         if i == 0:
             raise ValueError("first")
-        gate.wait(0.05)
+        gate.wait(0.5)
 
     with pytest.raises(ValueError, match="first"):
         list(Workers(2).each(work, range(1000), "work"))
-    assert len(begun) < 1000
+    assert len(begun) < 10  # what the two threads had begun

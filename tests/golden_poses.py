@@ -1,0 +1,50 @@
+"""Poses kept in golden/, each beside the hashes of what it was found in.
+
+A change that moves one says so in CHANGELOG.md under Numbers, and makes the files anew:
+REMAKE_GOLDEN=1 python -m pytest tests -k golden
+"""
+
+import hashlib
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+from rooms import query, room
+
+FOLDER = Path(__file__).parent / "golden"
+
+
+def _digest(*arrays):
+    content = hashlib.sha256()
+    for array in arrays:
+        content.update(np.ascontiguousarray(array).tobytes())
+    return content.hexdigest()[:16]
+
+
+def check_golden_poses(name, map_arrays, localize):
+    """Compare localize(seed, variant).pose with the file `name`; say which input differs where a pose does.
+
+    map_arrays(seed) are the arrays of the prepared map.
+    """
+    path, entries = FOLDER / name, []
+    for entry in json.loads(path.read_text()):
+        seed, variant = entry["seed"], entry["variant"]
+        cloud, rgb = room(seed)[1], query(seed, variant).rgb
+        now = {
+            "cloud": _digest(cloud.points, cloud.colors),
+            "panorama": _digest(rgb),
+            "map": _digest(*map_arrays(seed)),
+        }
+        changed = [word for word in now if entry.get("hashes", {}).get(word) != now[word]]
+        pose = localize(seed, variant).pose
+        R, center = pose.R_cam_from_world, pose.center_world
+        entries.append(
+            {"seed": seed, "variant": variant, "hashes": now, "R_cam_from_world": R.tolist(), "center_world": center.tolist()}
+        )
+        if "REMAKE_GOLDEN" not in os.environ:
+            told = f"{seed} {variant}: not found in the same {', '.join(changed)}" if changed else "the method moved it"
+            assert np.linalg.norm(center - entry["center_world"]) < 0.001, told
+            assert np.abs(R - entry["R_cam_from_world"]).max() < np.radians(0.01), told
+    if "REMAKE_GOLDEN" in os.environ:
+        path.write_text(json.dumps(entries, indent=1) + "\n")
