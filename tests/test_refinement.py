@@ -76,10 +76,14 @@ def test_halving_keeps_as_many_as_the_beam_says(monkeypatch):
         monkeypatch.setattr(refinement, name, gaining(name, gain))
     monkeypatch.setattr(refinement, "refine_by_perturbation", gaining("perturb", 0.5))
     centers = np.outer(np.arange(40.0), [1.0, 0, 0])
-    starts = Starts(np.repeat(np.eye(3)[None], 40, axis=0), centers, np.arange(40), 0.5 - 0.01 * np.arange(40))
+    starts = Starts(
+        np.repeat(np.eye(3)[None], 40, axis=0), centers, np.arange(40), 0.5 - 0.01 * np.arange(40)
+    )
     fine, middle = refinement.refine(QUERY, starts, Beam(30, 12, 5, 2))
     assert calls[:2] == [(5, 30), (12, 12)]
-    assert [calls.count(name) for name in ("descend_middle", "perturb_middle", "descend_fine", "perturb")] == [12, 5, 5, 2]
+    assert [
+        calls.count(name) for name in ("descend_middle", "perturb_middle", "descend_fine", "perturb")
+    ] == [12, 5, 5, 2]
     assert _places(fine) == [0, 1, 0, 1, 2, 3, 4]
     assert fine[0].score == pytest.approx(0.5 + 0.3 + 0.5)
     assert _places(middle) == list(range(12))
@@ -90,7 +94,12 @@ def test_halving_keeps_as_many_as_the_beam_says(monkeypatch):
 
 @pytest.mark.parametrize(
     ("gains", "rounds", "expected"),
-    [([0.2, 0.02, 0.005, 0.5], 3, 0.725), ([0.1] * 9, 5, 1.0), ([-0.3, 0.5], 1, 0.5), ([0.1, -0.1, 1.0], 2, 0.6)],
+    [
+        ([0.2, 0.02, 0.005, 0.5], 3, 0.725),
+        ([0.1] * 9, 5, 1.0),
+        ([-0.3, 0.5], 1, 0.5),
+        ([0.1, -0.1, 1.0], 2, 0.6),
+    ],
 )
 def test_poses_are_perturbed_for_as_long_as_that_helps(monkeypatch, gains, rounds, expected):
     left, sizes = list(gains), []
@@ -159,7 +168,9 @@ def test_alternatives_that_come_near_are_refined_and_the_better_wins(monkeypatch
         return Hypothesis(h.pose, h.score + gains[refined[-1]])
 
     monkeypatch.setattr(method, "refine_by_perturbation", perturbed)
-    monkeypatch.setattr(method, "refine_full_resolution", lambda query, h, num_rounds: h if num_rounds == 2 else None)
+    monkeypatch.setattr(
+        method, "refine_full_resolution", lambda query, h, num_rounds: h if num_rounds == 2 else None
+    )
     result = SearchResult(_at(0.0, 0.5), (_at(3.0, 0.4), _at(6.0, 0.3), _at(9.0, 0.19)))
     found = method.refine_alternatives(QUERY, result)
     assert refined == [3.0, 6.0]
@@ -169,7 +180,12 @@ def test_alternatives_that_come_near_are_refined_and_the_better_wins(monkeypatch
 
 
 def test_a_search_is_confident_by_score_and_margin():
-    for score, other, expected in ((0.25, 0.1, True), (0.24, 0.0, False), (0.5, 0.35, True), (0.5, 0.36, False)):
+    for score, other, expected in (
+        (0.25, 0.1, True),
+        (0.24, 0.0, False),
+        (0.5, 0.35, True),
+        (0.5, 0.36, False),
+    ):
         assert SearchResult(_at(0.0, score), (_at(3.0, other),)).is_confident == expected
 
 
