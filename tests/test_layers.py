@@ -18,7 +18,7 @@ LAYERS = [
     "scenes.synthetic",
     "scenes.export",
     "scenes",
-    "pipeline",
+    "scan",
     "result",
     "coarse_to_fine",
     "paper",

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from io import BytesIO
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ..cloud.soa import LocalCloud
@@ -56,7 +55,7 @@ def surface_png(
     plan, edges = plan_of(cloud, grid)
     extent = np.array(edges) + shift[[0, 0, 1, 1]]
     aspect = (extent[3] - extent[2] + 1.0) / (extent[1] - extent[0] + 1.0)
-    figure = Figure(figsize=(10.0, float(np.clip(8.5 * aspect + 1.0, 4.0, 16.0))), layout="constrained")
+    figure = new_figure(figsize=(10.0, float(np.clip(8.5 * aspect + 1.0, 4.0, 16.0))), layout="constrained")
     axes = figure.add_subplot()
     loss = np.where(np.isfinite(surface.loss), surface.loss, np.nan)
     x, y = grid.x + shift[0], grid.y + shift[1]

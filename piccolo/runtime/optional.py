@@ -1,4 +1,4 @@
-"""Libraries that only some formats need."""
+"""Libraries that only some formats and tools need."""
 
 from importlib import import_module
 from pathlib import Path
@@ -7,12 +7,12 @@ from types import ModuleType
 from ..errors import InputError
 
 
-def import_optional(path: Path, module_name: str) -> ModuleType:
-    """The module that reads `path`, or an InputError that says how to install it."""
+def import_optional(what: Path | str, module_name: str, extra: str = "formats") -> ModuleType:
+    """The module that `what` needs, or an InputError that says how to install it."""
     try:
         return import_module(module_name)
     except ImportError as error:
         raise InputError(
-            f"{path}: this format needs {module_name}, which can't be imported ({error}), "
-            "wanted: pip install -r requirements-formats.txt"
+            f"{what}: needs {module_name}, which can't be imported ({error}); "
+            f"pip install 'piccolo-localize[{extra}]', in a checkout: -r requirements-{extra}.txt"
         ) from error

@@ -35,9 +35,7 @@ def _fraction_below(axes: "Axes", errors: Sequence[float], label: str) -> None:
 
 def errors_figure(runs: Mapping[str, Sequence[QueryResult]], thresholds: Thresholds) -> "Figure":
     """Position and rotation error over the fraction of queries, and recall over thresholds, a line a run."""
-    from matplotlib.figure import Figure  # noqa: PLC0415  # half a second that tables need not wait for
-
-    figure = Figure(figsize=(14, 4.2), layout="constrained")
+    figure = new_figure(figsize=(14, 4.2), layout="constrained")
     position, rotation, recall = figure.subplots(1, 3)
     for name, rows in runs.items():
         _fraction_below(position, [row.position_error for row in rows], name)
@@ -62,9 +60,7 @@ def errors_figure(runs: Mapping[str, Sequence[QueryResult]], thresholds: Thresho
 
 def risk_figure(points: Sequence[Point]) -> "Figure":
     """The fraction that is wrong over the fraction that is accepted."""
-    from matplotlib.figure import Figure  # noqa: PLC0415  # see above
-
-    figure = Figure(figsize=(6, 4), layout="constrained")
+    figure = new_figure(figsize=(6, 4), layout="constrained")
     axes = figure.add_subplot()
     coverage, risk = [100 * p.coverage for p in points], [100 * p.risk for p in points]
     axes.step([0.0, *coverage], [risk[0], *risk], where="pre")

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from ...errors import InputError
 from ...geometry.camera_axes import heading_pitch_roll_deg
 from ...runtime.atomic import write_atomically
+from ...runtime.optional import import_optional
 from .model import Format, Options, PosedImage
 
 STEP = 10.0  # [m] ahead, to find true north
@@ -18,22 +18,13 @@ STEP = 10.0  # [m] ahead, to find true north
 
 def write(images: Sequence[PosedImage], out: Path, options: Options) -> None:
     """Write a FeatureCollection with a point a result."""
-    pyproj = _pyproj()
+    pyproj = import_optional("GeoJSON", "pyproj", "tools")
     if options.crs is None:
         raise InputError("--crs: not given, wanted the cloud's coordinate system, such as EPSG:25832")
     transformer = _transformer(pyproj, options.crs)
     features = [_feature(image, transformer, pyproj.Geod(ellps="WGS84"), options.crs) for image in images]
     document = {"type": "FeatureCollection", "features": features}
     write_atomically(out, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
-
-
-def _pyproj() -> Any:
-    try:
-        return import_module("pyproj")
-    except ImportError as error:
-        raise InputError(
-            "GeoJSON: the library pyproj is missing, wanted: python -m pip install pyproj"
-        ) from error
 
 
 def _transformer(pyproj: Any, crs: str) -> Any:

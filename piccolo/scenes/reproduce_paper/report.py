@@ -41,10 +41,8 @@ def _median_of_correct(rows: Sequence[QueryResult]) -> float:
 
 def plot_png(title: str, found: Sequence[tuple[Condition, Sequence[QueryResult]]]) -> bytes:
     """Accuracy, median error of the correct poses and seconds over the conditions, a line a preset."""
-    from matplotlib.figure import Figure  # noqa: PLC0415  # half a second that --help need not wait for
-
     names = list(dict.fromkeys(condition.name for condition, _ in found))
-    figure = Figure(figsize=(13, 4.4), layout="constrained")
+    figure = new_figure(figsize=(13, 4.4), layout="constrained")
     figure.suptitle(title)
     panels = figure.subplots(1, 3)
     for preset in dict.fromkeys(condition.preset for condition, _ in found):
