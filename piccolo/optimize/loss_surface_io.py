@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from ..cloud.soa import LocalCloud
 from ..geometry.pose import Array, Pose
+from ..runtime.figure import new_figure
 from .loss_surface import LossSurface, PoseGrid
 
 MAX_PIXELS = 1500  # of the plan, the longer way

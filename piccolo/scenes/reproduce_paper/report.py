@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ...runtime.figure import new_figure
 from ..evaluation.plots import figure_png
 from ..evaluation.query_result import QueryResult
 from ..evaluation.statistics import summarize
