@@ -18,6 +18,7 @@ from ..panorama.resize import shrink
 from ..panorama.texels import pack_texels
 from ..result import read_results
 from ..runtime.atomic import check_output, write_atomically
+from ..runtime.figure import new_figure
 from ..runtime.threads import Workers, num_cores
 from ..scan import open_points
 from ..scenes.scene import read_scene
@@ -171,6 +172,8 @@ def run(arguments: argparse.Namespace) -> int:
     inputs = [*arguments.cloud, arguments.pano, *filter(None, (arguments.result, arguments.truth))]
     for path in outputs:
         check_output(path, inputs)
+    if arguments.out:
+        new_figure()  # now: where matplotlib is missing, the work would be lost
 
     workers = Workers(arguments.threads, progress_bar(arguments.quiet))
     panorama = shrink(read_panorama(arguments.pano), arguments.width)
