@@ -253,8 +253,8 @@ def test_a_wrong_unit_is_told_before_the_long_work_begins(tmp_path, monkeypatch,
     path = tmp_path / "mm.xyz"
     raw = seeded_cloud(1, 1500, size=(6000.0, 5000.0, 2500.0))
     np.savetxt(path, np.hstack([raw.points_world, raw.colors]), fmt="%.3f")
+    no_cache, workers = CachePolicy(is_used=False), Workers(1, warn=heard.append)
     with pytest.raises(InterruptedError):
-        no_cache, workers = CachePolicy(is_used=False), Workers(1, warn=heard.append)
         open_files([path], CloudSettings(), preset, no_cache, workers)
     (warning,) = heard
     assert warning.startswith(f"{path}: the cloud spans")

@@ -7,8 +7,9 @@ import pytest
 from rooms import scan_map
 
 from piccolo.cloud.settings import CloudSettings
-from piccolo.coarse_to_fine import map_file
-from piccolo.coarse_to_fine.map_file import content_key, is_map_file, load_map, save_map
+from piccolo.coarse_to_fine import open_map
+from piccolo.coarse_to_fine.map_file import is_map_file, load_map, save_map
+from piccolo.coarse_to_fine.open_map import content_key
 from piccolo.errors import InputError
 
 
@@ -25,13 +26,13 @@ def test_round_trip_and_a_file_cut_short(tmp_path):
 
 
 def test_a_file_outlives_other_sources_but_the_cache_does_not(tmp_path, monkeypatch):
-    """Its format alone says whether a file can be read; the cache makes a map anew where its makers changed."""
+    """Its format alone says whether a file can be read; the cache makes maps anew where the makers changed."""
     cloud, built = tmp_path / "a.ply", tmp_path / "a.map"
     cloud.write_bytes(b"points")
     save_map(scan_map(1), built)
     key = content_key([cloud], CloudSettings())
     assert content_key([cloud], CloudSettings()) == key != content_key([cloud], CloudSettings(scale=0.1))
-    monkeypatch.setattr(map_file, "sources_digest", lambda: "of other sources")
+    monkeypatch.setattr(open_map, "sources_digest", lambda: "of other sources")
     assert content_key([cloud], CloudSettings()) != key
     assert len(load_map(built).centers) == len(scan_map(1).centers)
 

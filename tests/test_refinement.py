@@ -141,7 +141,7 @@ def test_full_resolution_is_taken_back_where_the_score_falls(monkeypatch, after,
 
 @pytest.mark.parametrize(("seed", "most"), [(1, 5e-4), (2, 5e-5), (3, 2e-4)])
 def test_the_end_hardly_depends_on_where_the_descent_begins(seed, most):
-    """Starts 5 mm apart end within 0.05 mm where the loss has one minimum; a noisy one has several near it."""
+    """Starts 5 mm apart end within 0.05 mm where the loss has one minimum; noise makes several."""
     query, true_pose = _query(seed), rooms.scene(seed)[2]
     ends = [
         refinement.settle(query, Hypothesis(step(true_pose, np.array([0, 0, 0, *d])), 0.0)).pose
@@ -159,7 +159,7 @@ def test_the_end_hardly_depends_on_where_the_descent_begins(seed, most):
 
 
 def test_alternatives_that_come_near_are_refined_and_the_better_wins(monkeypatch):
-    """The second gains by refinement and wins; the far one, with less than 0.4 of the score, stays as it is."""
+    """The second gains by refinement and wins; the far one, with under 0.4 of the score, stays as it is."""
     gains = {0.0: 9.0, 3.0: 0.25, 6.0: 0.01, 9.0: 9.0}
     refined = []
 
@@ -190,7 +190,7 @@ def test_a_search_is_confident_by_score_and_margin():
 
 
 def _run(monkeypatch, attempts, gravity="auto"):
-    """Localize with made-up attempts: lists of hypotheses on fine cells. Returns attempts made, and what is evaluated."""
+    """Localize with made-up attempts, lists of hypotheses; returns those made and what is evaluated."""
     made, left = [], list(attempts)
     scan_map = SimpleNamespace(centers=np.zeros((1, 3)))
 

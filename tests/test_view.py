@@ -95,7 +95,7 @@ def test_more_must_be_seen_around_a_candidate_than_on_open_land():
         np.column_stack([np.repeat(x, len(y)), np.full(len(x) * len(y), s), np.tile(y, len(x))])
         for s in (-6, 6)
     ]
-    hall = np.concatenate([ground, ground + [0, 0, 3], *walls, *(w[:, [1, 0, 2]] for w in walls)])
+    hall = np.concatenate([ground, ground + np.array([0, 0, 3]), *walls, *(w[:, [1, 0, 2]] for w in walls)])
     for points, least, most in ((ground, 0.3, 0.55), (hall, 0.55, 1.01)):
         cloud = Cloud(points.astype(np.float32), np.full(points.shape, 99, np.uint8), np.zeros(3))
         octree = build_octree(cloud.voxels(np.eye(3)))
