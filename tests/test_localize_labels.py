@@ -107,7 +107,7 @@ def test_prepared_map_of_labels_wants_labels(scene, tmp_path, capsys):
 
 def test_evaluation_takes_the_pictures_of_labels(scene):
     labels = Labels()
-    settings = CoarseToFineSettings(min_starts=100, max_starts=100)
+    settings = CoarseToFineSettings(max_starts=100)
     plan = Plan(settings, CloudSettings(labels=labels), ReadOptions(labels=labels), CachePolicy(False), 2)
     here = read_scene(scene)
     (row,) = run_job(plan, Job(here, here.queries))
