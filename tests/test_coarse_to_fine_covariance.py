@@ -100,7 +100,7 @@ def test_deviations_are_of_the_size_of_the_errors():
             turn = log_so3(taken.pose.R_cam_from_world @ result.pose.R_cam_from_world.T)
             error = np.concatenate([turn, taken.pose.center_world - result.pose.center_world])
             squares.append(error @ np.linalg.solve(result.covariance.matrix, error))
-    assert 1.0 < np.median(squares) < 15.0
+    assert 2.5 < np.median(squares) < 10.5  # deviations right to a factor of 1.4
 
 
 def test_the_right_pose_is_a_sharp_local_minimum_and_wrong_ones_are_not(found):

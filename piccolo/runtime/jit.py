@@ -21,8 +21,9 @@ F1 = np.float32(1.0)
 HALF = np.float32(0.5)
 
 
-# A function of scalars that kernels call: LLVM inlines it, and it is kept with its callers.
-inline_kernel = numba.njit(nogil=True, error_model="numpy", fastmath=FASTMATH)
+# A function of scalars that kernels call. Always inlined, as are kernels in kernels: a call would go to
+# whichever copy of the callee was loaded first, and a first run had other last bits than the runs after it.
+inline_kernel = numba.njit(nogil=True, error_model="numpy", fastmath=FASTMATH, forceinline=True)
 
 
 def kernel(function: Callable[..., Any]) -> Any:  # a Numba dispatcher, which has no type
