@@ -99,7 +99,7 @@ def test_limits_of_the_xml_section(tmp_path, monkeypatch):
 def test_a_missing_library_is_named(tmp_path, monkeypatch):
     path = write(tmp_path / "a.e57", [scan()])
     monkeypatch.setitem(sys.modules, "pye57.libe57", None)
-    with pytest.raises(InputError, match=r"needs pye57\.libe57, .*pip install -r requirements-formats\.txt"):
+    with pytest.raises(InputError, match=r"needs pye57\.libe57, .*-r requirements-formats\.txt"):
         open_source(path)
 
 

@@ -190,7 +190,7 @@ def test_internal_error_has_its_code(scene, capsys, monkeypatch):
     def fail(*_):
         raise ZeroDivisionError("made by the test")
 
-    monkeypatch.setattr(localize, "open_localizer", fail)
+    monkeypatch.setattr(localize, "open_files", fail)
     assert localize.main(_arguments(scene, "--quiet")) == 4
     assert "internal error: ZeroDivisionError" in capsys.readouterr().err
 

@@ -85,7 +85,7 @@ def test_wrong_use_of_labels_is_refused(scene, capsys):
         assert (code, told in err) == (expected, True)
     _, code, err = _localized(scene, capsys, "--labels", pano="images/clean_0.jpg")
     assert code == 3
-    assert "clean_0.jpg: found another kind of picture, wanted labels in a PNG" in err
+    assert "clean_0.jpg: this kind of picture holds no labels, wanted a PNG" in err
 
 
 def test_prepared_map_of_labels_wants_labels(scene, tmp_path, capsys):

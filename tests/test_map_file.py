@@ -7,7 +7,7 @@ import pytest
 from rooms import scan_map
 
 from piccolo.cloud.settings import CloudSettings
-from piccolo.coarse_to_fine import open_map
+from piccolo.coarse_to_fine import map_file, open_map
 from piccolo.coarse_to_fine.map_file import is_map_file, load_map, save_map
 from piccolo.coarse_to_fine.open_map import content_key
 from piccolo.errors import InputError
@@ -26,7 +26,7 @@ def test_round_trip_and_a_file_cut_short(tmp_path):
 
 
 def test_a_file_outlives_other_sources_but_the_cache_does_not(tmp_path, monkeypatch):
-    """Its format alone says whether a file can be read; the cache makes maps anew where the makers changed."""
+    """Its format alone says whether a file can be read; the cache makes maps anew when makers change."""
     cloud, built = tmp_path / "a.ply", tmp_path / "a.map"
     cloud.write_bytes(b"points")
     save_map(scan_map(1), built)

@@ -40,7 +40,7 @@ def test_ablation_has_a_row_a_part(scene, capsys):
     assert ablation.main([str(scene)]) == 0
     rows = capsys.readouterr().out.splitlines()[2:]
     assert [row.split(" | ")[0] for row in rows] == [
-        *(f"| {part}" for part in ablation.SETTINGS),
+        *(f"| {part}" for part in ablation.PARTS),
         "| no local normalisation",
         "| no visibility",
     ]
