@@ -37,7 +37,7 @@ class Result:
     """Where one panorama was taken, and what speaks for it."""
 
     status: str  # "localized", "ambiguous" or "not_localized"
-    confidence: float  # [0, 1] how likely the pose is right, as piccolo.verdict has it
+    confidence: float  # [0, 1] how likely the pose is right, see piccolo.confidence
     cloud: str | tuple[str, ...]  # path as given, or the paths of several files that are one cloud
     pano: str  # path as given
     pose: Pose | None  # the best pose found, in the file's own coordinates; None if there was no start

@@ -122,9 +122,10 @@ class Scan:
 
         Examples
         --------
-        >>> result = scan.localize("query.jpg", gravity="known")  # doctest: +SKIP
-        >>> result.status, result.pose.center_world.round(2)  # doctest: +SKIP
-        ('localized', array([2.41, 1.07, 1.58]))
+        >>> scan = open_scan("room/cloud.ply")
+        >>> result = scan.localize("room/images/clean_0.jpg", gravity="known")
+        >>> result.status, result.pose.center_world.round(2)
+        ('localized', array([2.6 , 3.17, 1.21]))
         """
         given: dict[str, Any] = dict(options)
         if isinstance(given.get("mask"), np.ndarray):
@@ -234,9 +235,11 @@ def open_scan(
     Examples
     --------
     >>> import piccolo
-    >>> scan = piccolo.open_scan("scan.e57", progress=print)  # doctest: +SKIP
-    >>> for result in scan.localize_many(["a.jpg", "b.jpg"]):  # doctest: +SKIP
+    >>> scan = piccolo.open_scan("room/cloud.ply", units="m", up="z")
+    >>> for result in scan.localize_many(["room/images/clean_0.jpg", "room/images/clean_1.jpg"]):
     ...     print(result.pano, result.status)
+    room/images/clean_0.jpg localized
+    room/images/clean_1.jpg localized
     """
     callback = options.get("progress")
     show = progress_to(callback) if callback else unseen

@@ -1,18 +1,20 @@
-"""The README's commands, run as they are written."""
+"""The README's commands and lines of Python, run as they are written."""
 
+import json
+import os
 import re
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text()
 
 
 def _readme_commands():
     """The blocks of commands that begin with a made room."""
-    blocks = re.findall(
-        r"(?:^    (?:python|mkdir) .*\n)+", (ROOT / "README.md").read_text(), flags=re.MULTILINE
-    )
+    blocks = re.findall(r"(?:^    (?:python|mkdir) .*\n)+", README, flags=re.MULTILINE)
     return [block.strip().splitlines() for block in blocks if "make_room" in block]
 
 
@@ -24,6 +26,19 @@ def _run_all(commands, folder):
         assert done.returncode == 0, done.stderr
         printed.append(done.stdout)
     return "".join(printed)
+
+
+def test_readme_python_prints_what_it_says_in_the_demo(tmp_path):
+    (demo,) = re.findall(r"tools/make_room.py .* > /dev/null", (ROOT / "Makefile").read_text())
+    _run_all([f"python {demo}"], tmp_path)
+    lines = re.search(r"^    import piccolo\n(?:    .*\n)+", README, flags=re.MULTILINE)[0]
+    command = [sys.executable, "-c", textwrap.dedent(lines)]
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    pose, document = done.stdout.splitlines()
+    assert f"prints `{pose}`" in README
+    assert all(f'"{key}": ' in README for key in json.loads(document))
 
 
 def test_readme_room_runs_as_written(tmp_path):
