@@ -25,11 +25,8 @@ FORMATS: dict[str, Format] = {
 def export(results: Sequence[Result], name: str, out: Path, options: Options) -> None:
     """Write the poses of `results`, which all have one, to `out` in the format `name`, whole or not at all.
 
-    Raises
-    ------
-    InputError
-        There is no pose, the format can't say what a result says, a picture can't be read, or `out` can't
-        be written.
+    Raises InputError if there is no pose, the format can't say what a result says, a picture can't be read,
+    or `out` can't be written.
     """
     form = FORMATS[name]
     if form.is_folder:
