@@ -9,8 +9,8 @@ from ..errors import InputError
 from ..runtime.threads import Show, Workers, num_cores
 from ..scenes.datasets import DATASETS
 from ..scenes.datasets.checking import Check, check_scene
+from ..scenes.datasets.files import AXES, DIRECTIONS
 from ..scenes.datasets.model import ConvertOptions, SceneSpec
-from ..scenes.datasets.poses import AXES, DIRECTIONS
 from ..scenes.datasets.writing import Written, write_scene
 from ..scenes.scene import read_scene
 from .command import option

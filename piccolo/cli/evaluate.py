@@ -12,7 +12,6 @@ from ..result import read_results
 from ..runtime.atomic import check_output, write_atomically
 from ..runtime.threads import num_cores
 from ..scenes.evaluation import tables
-from ..scenes.evaluation.compare import changes, pair_up, side_by_side
 from ..scenes.evaluation.plots import errors_figure, figure_png, risk_figure
 from ..scenes.evaluation.query_result import QueryResult, Thresholds, match_results
 from ..scenes.evaluation.run_file import input_files, open_run, read_run
@@ -122,14 +121,14 @@ def compare(arguments: argparse.Namespace, thresholds: Thresholds) -> int:
     runs = [read_run(path)[0] for path in arguments.compare]
     if arguments.variants:
         runs = [[row for row in rows if row.variant in arguments.variants] for rows in runs]
-    pairs = pair_up(*runs)
+    pairs = tables.pair_up(*runs)
     first, second = names = tuple(str(path) for path in arguments.compare)
     if not pairs:
         raise InputError(f"{first}, {second}: no query in common; compare runs of the same scenes")
-    text = side_by_side(pairs, (first, second), thresholds).markdown()
+    text = tables.side_by_side(pairs, (first, second), thresholds).markdown()
     for path, rows in zip(names, runs, strict=True):
         text += f"\nonly in {path}: {len(rows) - len(pairs)} queries"
-    text += f"\n\n{changes(pairs, thresholds).markdown()}"
+    text += f"\n\n{tables.changes(pairs, thresholds).markdown()}"
     if arguments.markdown:
         write_atomically(arguments.markdown, text.encode())
     if arguments.errors:

@@ -12,7 +12,7 @@ from ..cloud.ply_writer import vertex_rows, write_ply
 from ..runtime.atomic import write_atomically
 from ..runtime.threads import Workers, num_cores
 from ..scenes import scene as scenes
-from ..scenes.datasets.labels import write_labels
+from ..scenes.datasets.files import write_labels
 from ..scenes.synthetic.world import (
     VARIANTS,
     Query,

@@ -19,7 +19,7 @@ from ...errors import InputError, unreadable
 from ...runtime.atomic import check_output_folder, replacing_folder
 from ...runtime.threads import Show, unseen
 from ..scene import CLOUD_NAME, QUERIES_NAME, Query, read_scene, write_queries
-from .labels import write_labels
+from .files import write_labels
 from .model import PosedPanorama, SceneSpec
 
 IMAGES, LABELS = "images", "labels"  # folders of a scene

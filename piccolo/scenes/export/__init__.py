@@ -6,20 +6,16 @@ from pathlib import Path
 from ...errors import InputError
 from ...result import Result
 from ...runtime.atomic import check_output, check_output_folder
-from .colmap import COLMAP
 from .geojson import GEOJSON
 from .gpano import GPANO
-from .model import Format, Options
-from .nerfstudio import NERFSTUDIO
-from .opensfm import OPENSFM
 from .pose_lists import CSV, KITTI, POTREE, TUM
-from .posed_images import Selection, posed_images, select, true_results
+from .posed_images import Format, Options, Selection, posed_images, select, true_results
+from .reconstructions import COLMAP, NERFSTUDIO, OPENSFM
 
 __all__ = ["FORMATS", "Format", "Options", "Selection", "export", "select", "true_results"]
 
-FORMATS: dict[str, Format] = {
-    f.name: f for f in (COLMAP, NERFSTUDIO, OPENSFM, TUM, KITTI, CSV, GEOJSON, POTREE, GPANO)
-}
+_ALL = COLMAP, NERFSTUDIO, OPENSFM, TUM, KITTI, CSV, GEOJSON, POTREE, GPANO
+FORMATS: dict[str, Format] = {form.name: form for form in _ALL}
 
 
 def export(results: Sequence[Result], name: str, out: Path, options: Options) -> None:
