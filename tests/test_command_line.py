@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from rooms import errors, query, room
 
-from piccolo.cli import localize, make_room, prepare_map
-from piccolo.cli.errors import UsageError, checking_options, run_command
+from piccolo.cli import localize, prepare_map
+from piccolo.cli.command import command
+from piccolo.cli.errors import UsageError, checking_options
 from piccolo.cli.options import build_parser, cloud_settings_from
 from piccolo.cli.parser import COMMANDS, parse
 from piccolo.cloud.settings import IN_METRES, CloudSettings
@@ -134,7 +135,7 @@ def test_errors_have_codes_and_name_the_command_as_it_was_started(monkeypatch, c
         raise error
 
     monkeypatch.setattr("sys.argv", ["/usr/bin/piccolo-make-room"])
-    assert run_command(make_room.build_parser(), ["--out", "x"], fail) == code
+    assert command("make_room.py", "", "", lambda parser: None)(fail)([]) == code
     err = capsys.readouterr().err
     assert err.startswith(f"piccolo-make-room: {text}")
     assert err.count("\n") == 1
@@ -144,14 +145,14 @@ def test_errors_have_codes_and_name_the_command_as_it_was_started(monkeypatch, c
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_names_commands_as_they_were_started(monkeypatch, capsys, name):
-    command = import_module(f"piccolo.cli.{name}")
+    module = import_module(f"piccolo.cli.{name}")
     for program, example in (
         (f"piccolo-{name.replace('_', '-')}", "\n  piccolo-"),
         (f"{name}.py", "  python "),
     ):
         monkeypatch.setattr("sys.argv", [f"bin/{program}"])
         with pytest.raises(SystemExit):
-            command.main(["--help"])
+            module.main(["--help"])
         text = capsys.readouterr().out
         assert text.startswith(f"usage: {program} ")
         assert example in text

@@ -13,7 +13,7 @@ from piccolo.scenes.datasets.checking import (
     describe_axes,
     evenly_spaced,
 )
-from piccolo.scenes.datasets.poses import AXES, DIRECTIONS, pose_of_transform
+from piccolo.scenes.datasets.files import AXES, DIRECTIONS, pose_of_transform
 
 ORIGIN = np.array([10.0, -4.0, 2.0])
 

@@ -10,8 +10,8 @@ from poses import jpeg
 from refusals import mutated, read_or_refused
 
 from piccolo.scenes.datasets import DATASETS
+from piccolo.scenes.datasets.files import MAX_MATRIX_SIZE
 from piccolo.scenes.datasets.model import ConvertOptions
-from piccolo.scenes.datasets.poses import MAX_MATRIX_SIZE
 
 T = np.eye(4)[[1, 2, 0, 3]]
 STEM = "camera_00_office_1_frame_equirectangular_domain"

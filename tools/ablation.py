@@ -10,8 +10,7 @@ from pathlib import Path
 import _checkout  # noqa: F401
 import numpy as np
 
-from piccolo.cli.errors import run_command
-from piccolo.cli.parser import add_run_options, new_parser
+from piccolo.cli.command import command
 from piccolo.cloud import read_cloud
 from piccolo.cloud.model import Cloud
 from piccolo.coarse_to_fine.config import METHOD, Beam, ImageScales, MethodConfig
@@ -85,7 +84,13 @@ def row(part: str, scenes: list[tuple[Scene, Cloud]]) -> str:
     return f"| {part} | {recall} | {median_mm:.1f} | {np.median(seconds):.2f} |"
 
 
-def run(arguments: argparse.Namespace) -> int:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """All options."""
+    parser.add_argument("scenes", type=Path, nargs="+", metavar="FOLDER", help="scenes with true poses")
+
+
+@command(__file__, __doc__, EPILOG, add_arguments)
+def main(arguments: argparse.Namespace) -> int:
     """Print the table."""
     scenes = [(scene, read_cloud(scene.cloud)) for scene in map(read_scene, arguments.scenes)]
     print("| part | clean | tilt | photo | change | median mm | s |")
@@ -94,14 +99,6 @@ def run(arguments: argparse.Namespace) -> int:
     for part in PARTS:
         print(row(part, scenes), flush=True)
     return 0
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    parser = new_parser("ablation", __doc__, EPILOG)
-    parser.add_argument("scenes", type=Path, nargs="+", metavar="FOLDER", help="scenes with true poses")
-    add_run_options(parser)
-    return run_command(parser, argv, run)
 
 
 if __name__ == "__main__":

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from piccolo.cli.errors import UsageError, run_command
-from piccolo.cli.parser import add_run_options, new_parser
+from piccolo.cli.command import command, option
+from piccolo.cli.errors import UsageError
 from piccolo.cloud import read_cloud
 from piccolo.cloud.morton import morton_order
 from piccolo.cloud.soa import PackedPoints, pack_points
@@ -120,7 +120,16 @@ def run_kernels(case: Case, num_rounds: int) -> None:
     print(f"\nsame bits with 1 and 2 threads: {'yes' if same else 'NO'}")
 
 
-def run(arguments: argparse.Namespace) -> int:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """All options."""
+    option(parser, "--cloud FILE", "a scan (default: a box with seeded points)")
+    option(parser, "--pano FILE", "a panorama, with --cloud")
+    option(parser, "--points N", default=1_000_000)
+    option(parser, "--rounds N", "at least 7", default=15)
+
+
+@command(__file__, __doc__, EPILOG, add_arguments)
+def main(arguments: argparse.Namespace) -> int:
     """Make the case, time the kernels."""
     if (arguments.cloud is None) != (arguments.pano is None):
         raise UsageError("--cloud and --pano go together")
@@ -132,17 +141,6 @@ def run(arguments: argparse.Namespace) -> int:
         case = box_case(arguments.points, 2048)
     run_kernels(case, arguments.rounds)
     return 0
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    parser = new_parser("benchmark", __doc__, EPILOG)
-    parser.add_argument("--cloud", type=Path, help="a scan (default: a box with seeded points)")
-    parser.add_argument("--pano", type=Path, help="a panorama, with --cloud")
-    parser.add_argument("--points", type=int, default=1_000_000, help="(default 1000000)")
-    parser.add_argument("--rounds", type=int, default=15, help="at least 7 (default 15)")
-    add_run_options(parser)
-    return run_command(parser, argv, run)
 
 
 if __name__ == "__main__":

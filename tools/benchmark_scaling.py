@@ -14,8 +14,8 @@ import _checkout  # noqa: F401
 import numpy as np
 from numpy.typing import NDArray
 
-from piccolo.cli.errors import UsageError, run_command
-from piccolo.cli.parser import add_run_options, new_parser
+from piccolo.cli.command import command, option
+from piccolo.cli.errors import UsageError
 from piccolo.cloud import read_cloud
 from piccolo.cloud.model import Cloud
 from piccolo.cloud.morton import morton_order
@@ -116,7 +116,15 @@ def measure(label: str, make: Callable[[], Case], results: "multiprocessing.Queu
     results.put(f"| {' | '.join([*columns, f'{peak_mb:.0f}', f'{before_mb:.0f}'])} |")
 
 
-def run(arguments: argparse.Namespace) -> int:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """All options."""
+    option(parser, "--scene FOLDER", "with --points")
+    option(parser, "--points N ...", "with --scene", default=[])
+    option(parser, "--rooms N ...", "1 to 64", default=[])
+
+
+@command(__file__, __doc__, EPILOG, add_arguments)
+def main(arguments: argparse.Namespace) -> int:
     """Print the table, each row measured in a process of its own."""
     if bool(arguments.scene) != bool(arguments.points) or not (arguments.points or arguments.rooms):
         raise UsageError("wanted --scene with --points, or --rooms")
@@ -134,16 +142,6 @@ def run(arguments: argparse.Namespace) -> int:
             raise ChildProcessError(f"{label}: failed, see above")
         print(results.get(), flush=True)
     return 0
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    parser = new_parser("benchmark_scaling", __doc__, EPILOG)
-    parser.add_argument("--scene", type=Path, metavar="FOLDER", help="with --points")
-    parser.add_argument("--points", type=int, nargs="+", default=[], metavar="N", help="with --scene")
-    parser.add_argument("--rooms", type=int, nargs="+", default=[], metavar="N", help="1 to 64")
-    add_run_options(parser)
-    return run_command(parser, argv, run)
 
 
 if __name__ == "__main__":

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
-from piccolo.cli.errors import run_command
-from piccolo.cli.parser import add_run_options, new_parser
+from piccolo.cli.command import command, option
 from piccolo.confidence.confidence import (
     AMBIGUOUS,
     DIRECTIONS,
@@ -155,7 +154,15 @@ def print_coverage(name: str, outcomes: Sequence[Outcome]) -> None:
         print(f"| {part} | {len(some)} | {fractions[0]:.3f} | {fractions[1]:.3f} |")
 
 
-def run(arguments: argparse.Namespace) -> int:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """All options."""
+    option(parser, "--fit FILE ...", "trials to learn from", default=[])
+    option(parser, "--check FILE ...", "other trials", default=[])
+    option(parser, "--without CASE ...", "leave these cases out", default=[])
+
+
+@command(__file__, __doc__, EPILOG, add_arguments)
+def main(arguments: argparse.Namespace) -> int:
     """Fit the weights, print the tables."""
     sets = {"learnt from": read_outcomes(arguments.fit), "others": read_outcomes(arguments.check)}
     sets = {k: [o for o in rows if o.case not in arguments.without] for k, rows in sets.items()}
@@ -169,17 +176,6 @@ def run(arguments: argparse.Namespace) -> int:
             print_reliability(name, outcomes)
             print_coverage(name, outcomes)
     return 0
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    parser = new_parser("calibrate_confidence", __doc__, EPILOG)
-    text = "trials to learn from"
-    parser.add_argument("--fit", type=Path, nargs="+", default=[], metavar="FILE", help=text)
-    parser.add_argument("--check", type=Path, nargs="+", default=[], metavar="FILE", help="other trials")
-    parser.add_argument("--without", nargs="+", default=[], metavar="CASE", help="leave these cases out")
-    add_run_options(parser)
-    return run_command(parser, argv, run)
 
 
 if __name__ == "__main__":

@@ -12,8 +12,8 @@ from evaluate_gravity import ROUGH, rotated_cloud, rotations_of
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from piccolo.cli.errors import checking_options, run_command
-from piccolo.cli.parser import add_run_options, new_parser
+from piccolo.cli.command import command, option
+from piccolo.cli.errors import checking_options
 from piccolo.cli.progress import progress_bar
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Array
@@ -101,7 +101,15 @@ def print_table(choices: Sequence[Choice], fitted: Array) -> None:
             print(f"| {kind} | {np.count_nonzero(is_kind)} | {' | '.join(map(str, [*right, *mean]))} |")
 
 
-def run(arguments: argparse.Namespace) -> int:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """All options."""
+    option(parser, "--fit FIRST END", "seeds to learn from", default=[0, 40])
+    option(parser, "--check FIRST END", "other seeds", default=[1100, 1120])
+    option(parser, "--threads N", default=num_cores())
+
+
+@command(__file__, __doc__, EPILOG, add_arguments)
+def main(arguments: argparse.Namespace) -> int:
     """Fit, print the weights and check them."""
     with checking_options():
         check_arguments(arguments)
@@ -121,20 +129,6 @@ def check_arguments(arguments: argparse.Namespace) -> None:
             raise InputError(f"--{name}: {first} {end} is no range of seeds, such as 0 60")
     if arguments.threads < 1:
         raise InputError("--threads must be at least 1")
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    parser = new_parser("calibrate_gravity", __doc__, EPILOG)
-    text = "seeds to learn from (default 0 40)"
-    parser.add_argument("--fit", type=int, nargs=2, metavar=("FIRST", "END"), default=[0, 40], help=text)
-    text = "other seeds (default 1100 1120)"
-    parser.add_argument(
-        "--check", type=int, nargs=2, metavar=("FIRST", "END"), default=[1100, 1120], help=text
-    )
-    parser.add_argument("--threads", type=int, default=num_cores(), metavar="N")
-    add_run_options(parser)
-    return run_command(parser, argv, run)
 
 
 if __name__ == "__main__":

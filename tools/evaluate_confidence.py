@@ -10,8 +10,8 @@ from pathlib import Path
 import _checkout  # noqa: F401
 import numpy as np
 
-from piccolo.cli.errors import print_note, run_command
-from piccolo.cli.parser import add_run_options, new_parser
+from piccolo.cli.command import command, option
+from piccolo.cli.errors import print_note
 from piccolo.cloud import CloudStream, read_cloud, stream_of
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import IN_METRES
@@ -132,7 +132,17 @@ def print_table(counts: dict[str, list[tuple[str, bool]]]) -> int:
     return total
 
 
-def run(arguments: argparse.Namespace) -> int:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """All options."""
+    option(parser, "--seeds FIRST END", required=True)
+    option(parser, "--scenes FOLDER ...", default=[])
+    option(parser, "--out FILE", "JSON lines, written as they come", required=True)
+    option(parser, "--preset", choices=["default", "paper"], default="default")
+    option(parser, "--threads N", default=num_cores())
+
+
+@command(__file__, __doc__, EPILOG, add_arguments, "0 no false answer, 1 some")
+def main(arguments: argparse.Namespace) -> int:
     """Localize every trial, write its line, print the table."""
     counts: dict[str, list[tuple[str, bool]]] = {}
     with arguments.out.open("w") as file:
@@ -144,18 +154,6 @@ def run(arguments: argparse.Namespace) -> int:
             outcome = "right" if ok else "wrong"
             print_note(arguments, f"{scene}: {trial.case}: {result.status}, {outcome}")
     return 1 if print_table(counts) else 0
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    parser = new_parser("evaluate_confidence", __doc__, EPILOG, "0 no false answer, 1 some")
-    parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), required=True)
-    parser.add_argument("--scenes", type=Path, nargs="*", default=[], metavar="FOLDER")
-    parser.add_argument("--out", type=Path, required=True, help="JSON lines, written as they come")
-    parser.add_argument("--preset", choices=["default", "paper"], default="default")
-    parser.add_argument("--threads", type=int, default=num_cores(), metavar="N")
-    add_run_options(parser)
-    return run_command(parser, argv, run)
 
 
 if __name__ == "__main__":

@@ -11,8 +11,8 @@ import _checkout  # noqa: F401
 import numpy as np
 from numpy.typing import NDArray
 
-from piccolo.cli.errors import checking_options, run_command
-from piccolo.cli.parser import add_run_options, new_parser
+from piccolo.cli.command import command, option
+from piccolo.cli.errors import checking_options
 from piccolo.cli.progress import progress_bar
 from piccolo.cloud import CloudStream, open_cloud, stream_of
 from piccolo.cloud.octree import build_octree
@@ -78,7 +78,20 @@ def try_turn(points: Points, R: Array) -> tuple[float, float]:
     return float(np.degrees(np.arctan2(sine, up @ true_up))), report.alignment.confidence
 
 
-def run(arguments: argparse.Namespace) -> int:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """All options."""
+    text = "of the made-up places (default 1100 1120, none where --scenes are given)"
+    option(parser, "--seeds FIRST END", text)
+    option(parser, "--kinds", nargs="+", choices=BUILDINGS, default=list(BUILDINGS))
+    option(parser, "--scenes FOLDER ...", default=[])
+    option(parser, "--turns N", "of each cloud", default=1)
+    option(parser, "--full N", "turns of whole scenes", default=3)
+    option(parser, "--min-confidence X", default=MIN_CONFIDENCE)
+    option(parser, "--threads N", default=num_cores())
+
+
+@command(__file__, __doc__, EPILOG, add_arguments, "0 no wrong answer was accepted, 1 some were")
+def main(arguments: argparse.Namespace) -> int:
     """Try all clouds, print one line for each name; returns the exit code."""
     with checking_options():
         check_arguments(arguments)
@@ -107,23 +120,6 @@ def check_arguments(arguments: argparse.Namespace) -> None:
     check_confidence(arguments.min_confidence)
     if min(arguments.seeds) < 0 or min(arguments.turns, arguments.threads) < 1 or arguments.full < 0:
         raise InputError("--seeds and --full must be 0 or more, --turns and --threads at least 1")
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    parser = new_parser("evaluate_gravity", __doc__, EPILOG, "0 no wrong answer was accepted, 1 some were")
-    text = "of the made-up places (default 1100 1120, none where --scenes are given)"
-    parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), help=text)
-    parser.add_argument(
-        "--kinds", nargs="+", choices=BUILDINGS, default=list(BUILDINGS), help="(default all)"
-    )
-    parser.add_argument("--scenes", type=Path, nargs="*", default=[], metavar="FOLDER")
-    parser.add_argument("--turns", type=int, default=1, metavar="N", help="of each cloud (default 1)")
-    parser.add_argument("--full", type=int, default=3, metavar="N", help="turns of whole scenes (default 3)")
-    parser.add_argument("--min-confidence", type=float, default=MIN_CONFIDENCE, metavar="X")
-    parser.add_argument("--threads", type=int, default=num_cores(), metavar="N")
-    add_run_options(parser)
-    return run_command(parser, argv, run)
 
 
 if __name__ == "__main__":

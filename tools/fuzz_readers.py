@@ -12,8 +12,7 @@ from types import FunctionType
 import _checkout  # noqa: F401
 import numpy as np
 
-from piccolo.cli.errors import run_command
-from piccolo.cli.parser import add_run_options, new_parser
+from piccolo.cli.command import command, option
 from piccolo.cloud import FORMATS
 from piccolo.cloud.readers.reader import PLAIN, CloudFormat
 from piccolo.coarse_to_fine.map_file import load_map
@@ -115,26 +114,23 @@ def fuzz_apart(name: str, arguments: argparse.Namespace) -> bool:
     return done.returncode != 0
 
 
-def run(arguments: argparse.Namespace) -> int:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """All options."""
+    parser.add_argument("--reader", choices=list(READERS), nargs="+", default=list(READERS))
+    option(parser, "--seconds N", "for each reader", default=60)
+    option(parser, "--seed N", default=1)
+    option(parser, "--corpus FOLDER", "files to begin with")
+    option(parser, "--crashes FOLDER", "for what is found", required=True)
+
+
+@command(__file__, __doc__, EPILOG, add_arguments, "0 nothing found, 1 something")
+def main(arguments: argparse.Namespace) -> int:
     """Fuzz the readers one by one."""
     arguments.crashes.mkdir(parents=True, exist_ok=True)
     return int(any([fuzz_apart(name, arguments) for name in arguments.reader]))
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    words = sys.argv[1:] if argv is None else argv
-    if words[:1] == ["--inside"]:
-        fuzz(words[1], words[2:])
-    parser = new_parser("fuzz_readers", __doc__, EPILOG, "0 nothing found, 1 something")
-    parser.add_argument("--reader", choices=list(READERS), nargs="+", default=list(READERS))
-    parser.add_argument("--seconds", type=int, default=60, help="for each reader (default 60)")
-    parser.add_argument("--seed", type=int, default=1, help="(default 1)")
-    parser.add_argument("--corpus", type=Path, metavar="FOLDER", help="files to begin with")
-    parser.add_argument("--crashes", type=Path, metavar="FOLDER", required=True, help="for what is found")
-    add_run_options(parser)
-    return run_command(parser, words, run)
-
-
 if __name__ == "__main__":
+    if sys.argv[1:2] == ["--inside"]:
+        fuzz(sys.argv[2], sys.argv[3:])
     raise SystemExit(main())

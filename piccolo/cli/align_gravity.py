@@ -18,54 +18,40 @@ from ..gravity.alignment import AlignmentReport, find_alignment
 from ..gravity.alignment_file import Alignment, read_alignment
 from ..runtime.atomic import check_output, write_atomically
 from ..scenes.scene import QUERIES_NAME, Scene, read_scene, write_queries
-from .errors import checking_options, print_error, print_note, run_command
+from .command import command, option
+from .errors import checking_options, print_error, print_note
 from .options import add_cloud_options, cloud_settings_from
-from .parser import add_run_options, new_parser
 from .progress import progress_bar
 
 EXIT_ALIGNED, EXIT_UNCERTAIN = 0, 1
 EPILOG = f"""\
 examples:
-  python tools/align_gravity.py --cloud scan.ply --out aligned.ply
   python tools/align_gravity.py --cloud scan.e57 --out aligned.ply --yaw-walls
-  python tools/align_gravity.py --cloud a.las b.las --units us-ft --out aligned.ply --transform T.json
   python tools/align_gravity.py --cloud room/cloud.ply --queries room/queries.json --out aligned/cloud.ply
-  python tools/align_gravity.py --cloud scan.ply | jq .planes
-  python tools/align_gravity.py --cloud other.ply --apply aligned.json --out other_aligned.ply
   python tools/align_gravity.py --cloud aligned.ply --apply aligned.json --inverse --out as_scanned.ply
 
 Writes the cloud as binary PLY in the unit of the scan, and beside it the transform: aligned.json, and
-aligned.txt with four rows of four numbers, as CloudCompare reads them. The turn is about the middle of the
-cloud in whole metres, so map coordinates stay near theirs. One PLY file keeps its other properties and its
-faces, its normals are turned; other formats and several files become x y z and red green blue.
+aligned.txt with four rows of four numbers, as CloudCompare reads them (docs/CONVENTIONS.md). One PLY file
+keeps its other properties and faces, its normals are turned; all else becomes x y z and red green blue.
 One JSON object on stdout: status, up, yaw, planes, transform. Without --out nothing else is written.
 Nothing is written either where the confidence is below --min-confidence (default {MIN_CONFIDENCE}): a room
 without furniture may be upside down, steep roofs and stairs mislead. If you know the axis, give it by --up.
 """
 
 
-def build_parser() -> argparse.ArgumentParser:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
-    parser = new_parser("align_gravity", __doc__, EPILOG, "0 done, 1 not sure enough")
     add_cloud_options(parser, "coloured scan, as for localize.py")
-    files = parser.add_argument_group("files")
-    files.add_argument("--out", type=Path, metavar="FILE", help="the turned cloud, a PLY file")
-    text = "the transform (default --out's name with .json); a .txt is written beside it"
-    files.add_argument("--transform", type=Path, metavar="FILE.json", help=text)
-    text = "true poses in the scan, to be turned with it and written beside --out"
-    files.add_argument("--queries", type=Path, metavar="queries.json", help=text)
-    text = "write no file, only the report on stdout"
-    files.add_argument("--transform-only", action="store_true", help=text)
+    group = parser.add_argument_group("files")
+    option(group, "--out FILE", "the turned cloud, a PLY file")
+    option(group, "--transform FILE", "a .json (default --out's name), and a .txt written beside it")
+    option(group, "--queries FILE", "true poses in the scan, to be turned with it and written beside --out")
+    option(group, "--transform-only", "write no file, only the report on stdout")
     group = parser.add_argument_group("method")
-    text = "also turn about z, by the smallest angle that puts the dominant walls along x and y"
-    group.add_argument("--yaw-walls", action="store_true", help=text)
-    text = f"write nothing below this confidence (default {MIN_CONFIDENCE})"
-    group.add_argument("--min-confidence", type=float, metavar="X", help=text)
-    text = "apply this transform instead of finding one"
-    group.add_argument("--apply", type=Path, metavar="T.json", help=text)
-    group.add_argument("--inverse", action="store_true", help="apply the inverse of --apply")
-    add_run_options(parser)
-    return parser
+    option(group, "--yaw-walls", "also turn about z, least, so that the dominant walls are along x and y")
+    option(group, "--min-confidence X", f"write nothing below this confidence (default {MIN_CONFIDENCE})")
+    option(group, "--apply FILE", "apply this transform instead of finding one")
+    option(group, "--inverse", "apply the inverse of --apply")
 
 
 def check_arguments(arguments: argparse.Namespace) -> None:
@@ -77,11 +63,11 @@ def check_arguments(arguments: argparse.Namespace) -> None:
         raise InputError("--inverse needs --apply")
     searching = {"--yaw-walls": arguments.yaw_walls, "--min-confidence": arguments.min_confidence is not None,
                  "--up": arguments.up != "auto", "--transform-only": arguments.transform_only}  # fmt: skip
-    if arguments.apply and (wrong := [option for option, is_given in searching.items() if is_given]):
+    if arguments.apply and (wrong := [name for name, is_given in searching.items() if is_given]):
         raise InputError(f"{wrong[0]} can't be combined with --apply, which searches for nothing")
-    for option in ("apply", "queries"):
-        if getattr(arguments, option) and not arguments.out:
-            raise InputError(f"--{option} needs --out")
+    for name in ("apply", "queries"):
+        if getattr(arguments, name) and not arguments.out:
+            raise InputError(f"--{name} needs --out")
     for path in filter(None, (arguments.out, arguments.transform)):
         if (path.suffix == ".json") != (path is arguments.transform):
             raise InputError(f"{path}: --out must be a PLY file, and --transform end with .json")
@@ -218,15 +204,11 @@ def apply(arguments: argparse.Namespace) -> int:
     return EXIT_ALIGNED
 
 
-def run(arguments: argparse.Namespace) -> int:
+@command(__file__, __doc__, EPILOG, add_arguments, "0 done, 1 not sure enough")
+def main(arguments: argparse.Namespace) -> int:
     """Find an alignment or apply one; returns the exit code."""
     if arguments.transform_only:
         arguments.out = arguments.transform = arguments.queries = None
     with checking_options():
         check_arguments(arguments)
     return apply(arguments) if arguments.apply else align(arguments)
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    return run_command(build_parser(), argv, run)

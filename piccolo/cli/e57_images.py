@@ -9,8 +9,8 @@ from ..cloud.readers.e57_images import E57Image, list_images, read_image
 from ..errors import InputError
 from ..geometry.pose import quaternion_wxyz
 from ..runtime.atomic import write_atomically
-from .errors import EXIT_BAD_INPUT, print_error, run_command
-from .parser import add_run_options, new_parser
+from .command import command, option
+from .errors import EXIT_BAD_INPUT, print_error
 
 EPILOG = """\
 example:
@@ -53,7 +53,14 @@ def extract(path: Path, index: int, image: E57Image, folder: Path) -> Path:
     return file
 
 
-def run(arguments: argparse.Namespace) -> int:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """All options."""
+    parser.add_argument("e57", type=Path, metavar="FILE", help="an E57 file")
+    option(parser, "--extract FOLDER", "write the images here")
+
+
+@command(__file__, __doc__, EPILOG, add_arguments)
+def main(arguments: argparse.Namespace) -> int:
     """List and, if asked, write the images; returns the exit code. A broken one doesn't stop the others."""
     images = list_images(arguments.e57)
     exit_code = 0
@@ -68,12 +75,3 @@ def run(arguments: argparse.Namespace) -> int:
                 exit_code = print_error(arguments, str(error), EXIT_BAD_INPUT)
         print(json.dumps(row, allow_nan=False), flush=True)
     return exit_code
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    parser = new_parser("e57_images", __doc__, EPILOG)
-    parser.add_argument("e57", type=Path, metavar="FILE", help="an E57 file")
-    parser.add_argument("--extract", type=Path, metavar="FOLDER", help="write the images here")
-    add_run_options(parser)
-    return run_command(parser, argv, run)

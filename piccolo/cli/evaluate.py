@@ -12,14 +12,14 @@ from ..result import read_results
 from ..runtime.atomic import check_output, write_atomically
 from ..runtime.threads import num_cores
 from ..scenes.evaluation import tables
-from ..scenes.evaluation.compare import changes, pair_up, side_by_side
 from ..scenes.evaluation.plots import errors_figure, figure_png, risk_figure
 from ..scenes.evaluation.query_result import QueryResult, Thresholds, match_results
 from ..scenes.evaluation.run_file import input_files, open_run, read_run
 from ..scenes.evaluation.runner import RunConfig
 from ..scenes.evaluation.statistics import risk_and_coverage
 from ..scenes.scene import find_scenes
-from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error, run_command
+from .command import command, option
+from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error
 from .options import (
     add_cloud_reading_options,
     add_method_options,
@@ -28,13 +28,11 @@ from .options import (
     read_options_from,
     settings_from,
 )
-from .parser import add_run_options, new_parser
 from .progress import progress_bar
 
 EPILOG = """\
 examples:
   python tools/evaluate.py --scenes datasets/stanford --out run.jsonl --jobs 4
-  python tools/evaluate.py --scenes datasets/stanford --out paper.jsonl --preset paper --errors paper.png
   python tools/evaluate.py --scenes room --results poses.jsonl
   python tools/evaluate.py --compare paper.jsonl run.jsonl
 
@@ -46,33 +44,27 @@ Queries that can't be read are named on stderr, and the rest is done before exit
 """
 
 
-def build_parser() -> argparse.ArgumentParser:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
-    parser = new_parser("evaluate", __doc__, EPILOG)
-    source = parser.add_argument_group("what")
-    source.add_argument("--scenes", type=Path, nargs="+", metavar="FOLDER", help="scenes with true poses")
-    source.add_argument("--variants", nargs="+", metavar="NAME", default=[], help="only these splits")
-    kind = source.add_mutually_exclusive_group(required=True)
-    kind.add_argument("--out", type=Path, metavar="JSONL", help="begin this run, or resume it")
-    kind.add_argument("--results", type=Path, metavar="JSONL", help="results of localize.py")
-    kind.add_argument("--compare", type=Path, nargs=2, metavar="JSONL", help="two runs, side by side")
-    text = "processes, which divide the cores (default 1)"
-    source.add_argument("--jobs", type=int, default=1, metavar="N", help=text)
-    source.add_argument("--cache", type=Path, metavar="FOLDER", help="of prepared maps (default the user's)")
-    output = parser.add_argument_group("tables and plots")
-    output.add_argument("--max-distance", type=float, default=0.1, metavar="M", help="correct is under (0.1)")
-    output.add_argument("--max-angle", type=float, default=5.0, metavar="DEG", help="and under (5)")
-    output.add_argument("--csv", type=Path, metavar="FILE", help="a line a query")
-    output.add_argument("--markdown", type=Path, metavar="FILE", help="the tables, here too")
-    text = "plot: fraction of queries under each error, and recall over thresholds"
-    output.add_argument("--errors", type=Path, metavar="PNG", help=text)
-    text = "plot: fraction wrong over fraction accepted, as the minimum confidence falls"
-    output.add_argument("--risk", type=Path, metavar="PNG", help=text)
+    group = parser.add_argument_group("what")
+    option(group, "--scenes FOLDER ...", "scenes with true poses")
+    option(group, "--variants NAME ...", "only these splits", default=[])
+    kind = group.add_mutually_exclusive_group(required=True)
+    option(kind, "--out JSONL", "begin this run, or resume it")
+    option(kind, "--results JSONL", "results of localize.py")
+    option(kind, "--compare JSONL", "two runs, side by side", nargs=2)
+    option(group, "--jobs N", "processes, which divide the cores", default=1)
+    option(group, "--cache FOLDER", "of prepared maps (default the user's)")
+    group = parser.add_argument_group("tables and plots")
+    option(group, "--max-distance M", "correct is under", default=0.1)
+    option(group, "--max-angle DEG", "and under", default=5.0)
+    option(group, "--csv FILE", "a line a query")
+    option(group, "--markdown FILE", "the tables, here too")
+    option(group, "--errors PNG", "plot: fraction of queries under each error, and recall over thresholds")
+    option(group, "--risk PNG", "plot: fraction wrong over fraction accepted, as the min. confidence falls")
     add_cloud_reading_options(parser.add_argument_group("clouds"))
     add_panorama_reading_options(parser.add_argument_group("panoramas"))
     add_method_options(parser)
-    add_run_options(parser)
-    return parser
 
 
 def check_usage(arguments: argparse.Namespace) -> None:
@@ -129,14 +121,14 @@ def compare(arguments: argparse.Namespace, thresholds: Thresholds) -> int:
     runs = [read_run(path)[0] for path in arguments.compare]
     if arguments.variants:
         runs = [[row for row in rows if row.variant in arguments.variants] for rows in runs]
-    pairs = pair_up(*runs)
+    pairs = tables.pair_up(*runs)
     first, second = names = tuple(str(path) for path in arguments.compare)
     if not pairs:
         raise InputError(f"{first}, {second}: no query in common; compare runs of the same scenes")
-    text = side_by_side(pairs, (first, second), thresholds).markdown()
+    text = tables.side_by_side(pairs, (first, second), thresholds).markdown()
     for path, rows in zip(names, runs, strict=True):
         text += f"\nonly in {path}: {len(rows) - len(pairs)} queries"
-    text += f"\n\n{changes(pairs, thresholds).markdown()}"
+    text += f"\n\n{tables.changes(pairs, thresholds).markdown()}"
     if arguments.markdown:
         write_atomically(arguments.markdown, text.encode())
     if arguments.errors:
@@ -156,7 +148,8 @@ def check_files(arguments: argparse.Namespace, inputs: list[Path]) -> None:
             raise InputError(f"{output}: two outputs have this name, wanted one each")
 
 
-def run(arguments: argparse.Namespace) -> int:
+@command(__file__, __doc__, EPILOG, add_arguments)
+def main(arguments: argparse.Namespace) -> int:
     """Run or read the results, print the tables; returns the exit code."""
     check_usage(arguments)
     with checking_options():
@@ -182,8 +175,3 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError("no query could be localized; check --scenes and --variants")
     write_report(arguments, rows, thresholds)
     return EXIT_BAD_INPUT if num_failed else 0
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    return run_command(build_parser(), argv, run)

@@ -3,7 +3,6 @@
 import argparse
 import json
 from collections.abc import Iterable
-from pathlib import Path
 
 from ..errors import InputError
 from ..geometry.camera_axes import CAMERA_AXES
@@ -11,21 +10,17 @@ from ..result import read_results
 from ..runtime.atomic import check_output
 from ..scenes.export import FORMATS, Options, Selection, export, select, true_results
 from ..scenes.scene import find_scenes
-from .errors import checking_options, print_note, run_command
-from .parser import add_run_options, new_parser
+from .command import command, option
+from .errors import checking_options, print_note
 
-EPILOG = """\
+_FORMATS = "\n".join(f"  {form.name:<11} {form.description}" for form in FORMATS.values())
+EPILOG = f"""\
 formats:
-{formats}
+{_FORMATS}
 
 examples:
-  python localize.py --cloud scan.ply --pano photos/*.jpg --out poses.jsonl
   python tools/export_poses.py --results poses.jsonl --format colmap --images photos --out model
-  python tools/export_poses.py --results poses.jsonl --format nerfstudio --images . --out transforms.json
-  python tools/export_poses.py --results poses.jsonl --format tum --timestamps name --out poses.tum
   python tools/export_poses.py --results poses.jsonl --format geojson --crs EPSG:25832 --out poses.geojson
-  python tools/export_poses.py --scenes room --format tum --out reference.tum
-  python tools/export_poses.py --results *.jsonl --format gpano --images photos --out photos_with_pose
 
 Results that are not localized are left out and counted on stderr. docs/CONVENTIONS.md has axes and angles.
 A file at --out is replaced. One JSON object on stdout.
@@ -33,34 +28,24 @@ A file at --out is replaced. One JSON object on stdout.
 OPTIONS = ("size", "offset", "axes", "timestamps", "crs")  # those that only some formats take
 
 
-def build_parser() -> argparse.ArgumentParser:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options. One that is not given stays None, and keeps its default."""
-    formats = "\n".join(f"  {form.name:<11} {form.description}" for form in FORMATS.values())
-    parser = new_parser("export_poses", __doc__, EPILOG.format(formats=formats))
     source = parser.add_mutually_exclusive_group(required=True)
-    text = "JSON lines of localize.py"
-    source.add_argument("--results", type=Path, default=[], nargs="+", metavar="FILE", help=text)
-    text = "scenes whose true poses are written, as a reference for other tools (docs/DATASETS.md)"
-    source.add_argument("--scenes", type=Path, default=[], nargs="+", metavar="FOLDER", help=text)
-    parser.add_argument("--format", choices=FORMATS, required=True, help="see below")
-    parser.add_argument("--out", type=Path, required=True, help="file, or new folder for colmap and gpano")
-    text = "folder to which the pictures' names are written relative (default: as in the results)"
-    parser.add_argument("--images", type=Path, metavar="FOLDER", help=text)
-    parser.add_argument("--all", action="store_true", help="write ambiguous and not localized poses too")
-    parser.add_argument("--cloud", nargs="+", default=[], metavar="PATH", help="only results of these clouds")
+    option(source, "--results FILE ...", "JSON lines of localize.py", default=[])
+    option(source, "--scenes FOLDER ...", "scenes whose true poses are written, as a reference", default=[])
+    option(parser, "--format", "see below", choices=FORMATS, required=True)
+    option(parser, "--out FILE", "a new folder for colmap and gpano", required=True)
+    option(parser, "--images FOLDER", "pictures' names are relative to it (default: as in the results)")
+    option(parser, "--all", "write ambiguous and not localized poses too")
+    option(parser, "--cloud PATH ...", "only results of these clouds", default=[])
     group = parser.add_argument_group("of some formats")
-    text = f"width and height of all pictures, not read from each ({_takers('size')})"
-    group.add_argument("--size", type=int, nargs=2, metavar=("W", "H"), help=text)
-    text = f"subtract this from the positions, and write it beside them ({_takers('offset')})"
-    group.add_argument("--offset", type=float, nargs=3, metavar=("X", "Y", "Z"), help=text)
+    option(group, "--size W H", f"of all pictures, not read from each ({_takers('size')})")
+    option(group, "--offset X Y Z", f"subtracted from positions, written beside ({_takers('offset')})")
     text = "optical (default): right, down, forward; piccolo: forward, left, up"
-    group.add_argument("--axes", choices=CAMERA_AXES, help=f"{text} ({_takers('axes')})")
+    option(group, "--axes", f"{text} ({_takers('axes')})", choices=CAMERA_AXES)
     text = "index (default): 0, 1, ...; name: the number that is the picture's name"
-    group.add_argument("--timestamps", choices=["index", "name"], help=f"{text} ({_takers('timestamps')})")
-    text = f"of the cloud's coordinates, such as EPSG:25832 ({_takers('crs')})"
-    group.add_argument("--crs", help=text)
-    add_run_options(parser)
-    return parser
+    option(group, "--timestamps", f"{text} ({_takers('timestamps')})", choices=["index", "name"])
+    option(group, "--crs EPSG", f"of the cloud's coordinates, such as EPSG:25832 ({_takers('crs')})")
 
 
 def _takers(option: str) -> str:
@@ -96,7 +81,8 @@ def notes_on(selection: Selection) -> Iterable[str]:
         yield f"poses in {num_clouds} clouds are taken as in one coordinate system; --cloud chooses"
 
 
-def run(arguments: argparse.Namespace) -> int:
+@command(__file__, __doc__, EPILOG, add_arguments)
+def main(arguments: argparse.Namespace) -> int:
     """Read, choose, write; returns the exit code."""
     with checking_options():
         options = options_from(arguments)
@@ -112,8 +98,3 @@ def run(arguments: argparse.Namespace) -> int:
     report = {"out": str(arguments.out), "format": arguments.format, "poses": len(selection.results)}
     print(json.dumps({**report, "left_out": selection.left_out}))
     return 0
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    return run_command(build_parser(), argv, run)

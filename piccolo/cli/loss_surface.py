@@ -22,15 +22,14 @@ from ..runtime.figure import new_figure
 from ..runtime.threads import Workers, num_cores
 from ..scan import open_points
 from ..scenes.scene import read_scene
-from .errors import checking_options, print_note, run_command
+from .command import command, option
+from .errors import checking_options, print_note
 from .options import add_cloud_options, cloud_settings_from
-from .parser import add_run_options, new_parser
 from .progress import progress_bar
 
 EPILOG = """\
-examples:
+example:
   python tools/loss_surface.py --cloud scan.ply --pano a.jpg --truth queries.json --out surface.png
-  python tools/loss_surface.py --cloud scan.ply --pano a.jpg --result pose.json --step 0.1 --npz surface.npz
 
 At each place of a grid the least sampling loss (Eq. 2 of the paper) over --heights and --rotations is taken,
 over the points seen from there. If a pose is known, the rotations are its own, turned evenly, and the heights
@@ -45,32 +44,26 @@ MAX_CELLS = 1_000_000
 HEIGHTS_ABOUT = (-0.15, 0.0, 0.15)  # [m] of the known one
 
 
-def build_parser() -> argparse.ArgumentParser:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
-    parser = new_parser("loss_surface", __doc__, EPILOG)
     add_cloud_options(parser, "coloured scan, as for localize.py, or a map by tools/prepare_map.py")
-    parser.add_argument("--pano", type=Path, required=True, help="the panorama")
-    parser.add_argument("--result", type=Path, metavar="FILE", help="JSON lines of localize.py: pose found")
-    parser.add_argument("--truth", type=Path, metavar="FILE", help="queries.json: true pose")
-    parser.add_argument("--out", type=Path, metavar="PNG", help="the picture")
-    parser.add_argument("--npz", type=Path, metavar="FILE", help="the surface as arrays")
+    option(parser, "--pano FILE", "the panorama", required=True)
+    option(parser, "--result FILE", "JSON lines of localize.py: pose found")
+    option(parser, "--truth FILE", "queries.json: true pose")
+    option(parser, "--out PNG", "the picture")
+    option(parser, "--npz FILE", "the surface as arrays")
     group = parser.add_argument_group("poses tried")
-    group.add_argument("--step", type=float, default=0.2, metavar="M", help="of the grid (default 0.2)")
-    text = "corners of the grid (default: all of the cloud)"
-    group.add_argument("--box", type=float, nargs=4, metavar=("X0", "Y0", "X1", "Y1"), help=text)
+    option(group, "--step M", "of the grid", default=0.2)
+    option(group, "--box X0 Y0 X1 Y1", "corners of the grid (default: all of the cloud)")
     text = "least, greatest and how many (default: about the pose known, else 5 in the middle of the room)"
-    group.add_argument("--heights", type=float, nargs=3, metavar=("MIN", "MAX", "NUM"), help=text)
-    text = "known: yaws; unknown: all of SO(3) (default known)"
-    group.add_argument("--gravity", choices=["known", "unknown"], default="known", help=text)
-    group.add_argument("--rotations", type=int, metavar="N", help="(default 64, of SO(3) 1000)")
+    option(group, "--heights MIN MAX NUM", text)
+    option(group, "--gravity", "yaws, or all of SO(3)", choices=["known", "unknown"], default="known")
+    option(group, "--rotations N", "(default 64, of SO(3) 1000)")
     group = parser.add_argument_group("loss")
-    group.add_argument("--width", type=int, default=256, metavar="PX", help="of the panorama (default 256)")
-    text = "used at a position, of those seen from there (default 30000)"
-    group.add_argument("--max-points", type=int, default=30_000, metavar="N", help=text)
-    group.add_argument("--no-visibility", action="store_true", help="see through walls")
-    parser.add_argument("--threads", type=int, default=num_cores(), metavar="N", help="(default all cores)")
-    add_run_options(parser)
-    return parser
+    option(group, "--width PX", "of the panorama", default=256)
+    option(group, "--max-points N", "used at a position, of those seen from there", default=30_000)
+    option(group, "--no-visibility", "see through walls")
+    option(parser, "--threads N", default=num_cores())
 
 
 def check_usage(arguments: argparse.Namespace) -> None:
@@ -164,7 +157,8 @@ def summary(surface: LossSurface, grid: PoseGrid, cloud: LocalCloud, known: Know
     return line
 
 
-def run(arguments: argparse.Namespace) -> int:
+@command(__file__, __doc__, EPILOG, add_arguments)
+def main(arguments: argparse.Namespace) -> int:
     """Read, compute, write."""
     with checking_options():
         check_usage(arguments)
@@ -197,8 +191,3 @@ def run(arguments: argparse.Namespace) -> int:
     files = {"out": arguments.out and str(arguments.out), "npz": arguments.npz and str(arguments.npz)}
     print(json.dumps(files | summary(surface, grid, cloud, known) | line))
     return 0
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    return run_command(build_parser(), argv, run)

@@ -12,7 +12,7 @@ from ..cloud.ply_writer import vertex_rows, write_ply
 from ..runtime.atomic import write_atomically
 from ..runtime.threads import Workers, num_cores
 from ..scenes import scene as scenes
-from ..scenes.datasets.labels import write_labels
+from ..scenes.datasets.files import write_labels
 from ..scenes.synthetic.world import (
     VARIANTS,
     Query,
@@ -24,14 +24,13 @@ from ..scenes.synthetic.world import (
     make_world,
     scan_world,
 )
-from .errors import UsageError, checking_options, run_command
-from .parser import add_run_options, new_parser
+from .command import command, option
+from .errors import UsageError, checking_options
 from .progress import progress_bar
 
 EPILOG = """\
 examples:
   python tools/make_room.py --out room --seed 3
-  python tools/make_room.py --out rooms --scenes 25 --panoramas 2 --labels
   python tools/make_room.py --out flats --rooms 16 --points 2000000 --panoramas 4 --variants clean photo
 
 Writes FOLDER/cloud.ply, FOLDER/images/VARIANT_K.jpg and FOLDER/queries.json with the true poses.
@@ -41,24 +40,18 @@ a picture of labels, FOLDER/labels/VARIANT_K.png. One JSON object a scene on std
 """
 
 
-def build_parser() -> argparse.ArgumentParser:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
-    parser = new_parser("make_room", __doc__, EPILOG)
-    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="made if it is not there")
-    parser.add_argument("--seed", type=int, default=0, help="equal seeds, equal bits (default 0)")
-    parser.add_argument("--points", type=int, default=300_000, help="(default 300000)")
-    parser.add_argument("--panoramas", type=int, default=3, help="of each variant (default 3)")
-    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=["clean"], help="(default clean)")
-    parser.add_argument("--width", type=int, default=2048, help="of the panoramas [px] (default 2048)")
-    parser.add_argument("--size", type=float, nargs=3, default=[6.0, 5.0, 2.7], metavar=("X", "Y", "Z"),
-                        help="of a room [m] (default 6 5 2.7)")  # fmt: skip
-    parser.add_argument("--rooms", type=int, default=1, help="side by side, at most 64 (default 1)")
-    text = "label each point and pixel by its kind of surface, for localize.py --labels"
-    parser.add_argument("--labels", action="store_true", help=text)
-    text = "a number of scenes, FOLDER/000 on, of the seeds from --seed on (default: one, in FOLDER itself)"
-    parser.add_argument("--scenes", type=int, default=0, metavar="N", help=text)
-    add_run_options(parser)
-    return parser
+    option(parser, "--out FOLDER", "made if it is not there", required=True)
+    option(parser, "--seed N", "equal seeds, equal bits", default=0)
+    option(parser, "--points N", default=300_000)
+    option(parser, "--panoramas N", "of each variant", default=3)
+    option(parser, "--variants", nargs="+", choices=VARIANTS, default=["clean"])
+    option(parser, "--width PX", "of the panoramas", default=2048)
+    option(parser, "--size X Y Z", "of a room [m]", default=[6.0, 5.0, 2.7])
+    option(parser, "--rooms N", "side by side, at most 64", default=1)
+    option(parser, "--labels", "label points and pixels by their kind of surface, for localize.py --labels")
+    option(parser, "--scenes N", "write N scenes, FOLDER/000 on, of the seeds from --seed on", default=0)
 
 
 def write_query(folder: Path, name: str, query: Query) -> scenes.Query:
@@ -94,7 +87,8 @@ def write_world(
     return {"folder": str(folder), "points": len(points), "queries": len(queries), "seed": world.seed}
 
 
-def run(arguments: argparse.Namespace) -> int:
+@command(__file__, __doc__, EPILOG, add_arguments)
+def main(arguments: argparse.Namespace) -> int:
     """Make and write all scenes."""
     if min(arguments.panoramas, arguments.seed, arguments.scenes) < 0:
         raise UsageError("--panoramas, --seed, --scenes: found a negative number, wanted 0 or more")
@@ -107,8 +101,3 @@ def run(arguments: argparse.Namespace) -> int:
         folder = arguments.out / f"{number:03}" if arguments.scenes else arguments.out
         print(json.dumps(write_world(arguments, world, folder, workers)), flush=True)
     return 0
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    return run_command(build_parser(), argv, run)

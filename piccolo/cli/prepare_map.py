@@ -2,16 +2,15 @@
 
 import argparse
 import json
-from pathlib import Path
 
 from ..coarse_to_fine.map_file import save_map
 from ..coarse_to_fine.open_map import CachePolicy, open_map
 from ..runtime.atomic import check_output
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers, num_cores
-from .errors import checking_options, run_command
+from .command import command, option
+from .errors import checking_options
 from .options import add_cloud_options, cloud_settings_from
-from .parser import add_run_options, new_parser
 from .progress import progress_bar, warn_once
 
 EPILOG = """\
@@ -24,7 +23,14 @@ One JSON object on stdout describes the map.
 """
 
 
-def run(arguments: argparse.Namespace) -> int:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """All options."""
+    add_cloud_options(parser, "coloured scan, as for localize.py")
+    option(parser, "--out FILE", "the map", required=True)
+
+
+@command(__file__, __doc__, EPILOG, add_arguments)
+def main(arguments: argparse.Namespace) -> int:
     """Build and write the map; returns the exit code."""
     with checking_options():
         cloud_settings = cloud_settings_from(arguments)
@@ -42,12 +48,3 @@ def run(arguments: argparse.Namespace) -> int:
     }
     print(json.dumps(report))
     return 0
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    parser = new_parser("prepare_map", __doc__, EPILOG)
-    add_cloud_options(parser, "coloured scan, as for localize.py")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the map")
-    add_run_options(parser)
-    return run_command(parser, argv, run)

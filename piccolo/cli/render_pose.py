@@ -32,24 +32,21 @@ from ..runtime.atomic import check_output, check_output_folder, replacing_folder
 from ..runtime.threads import Workers, num_cores
 from ..scan import open_points
 from ..scenes.scene import read_scene
-from .errors import checking_options, print_note, run_command
+from .command import command, option
+from .errors import checking_options, print_note
 from .options import add_cloud_options, cloud_settings_from
-from .parser import add_run_options, new_parser
 from .progress import progress_bar
 
 EPILOG = """\
 examples:
   python tools/render_pose.py --cloud scan.ply --result pose.json --out seen.png --depth depth.png
-  python tools/render_pose.py --cloud scan.ply --result poses.jsonl --out pictures
-  python tools/render_pose.py --cloud scan.ply --queries queries.json --pano a.jpg --width 8192 --out true.jpg
   python tools/render_pose.py --cloud scan.ply --at 3 2 1.5 --heading 90 --holes mark --out east.png
   python tools/render_pose.py --cloud scan.ply --result pose.json --animate descent.gif --perturb 0.3 8
 
 Angles as in docs/CONVENTIONS.md, Exports: heading clockwise from the world's +y. Each point is a disc over
 its nearest neighbours; what no disc covers is a hole. --depth: range along the ray. PNG: 16 bit,
 millimetres, 0 where nothing is seen, 65535 for 65.535 m and farther. NPY: float32, metres, inf where nothing
-is seen.
---mask-out: white where nothing is seen, as --mask of localize.py takes it.
+is seen. --mask-out: white where nothing is seen, as --mask of localize.py takes it.
 One JSON object a picture on stdout.
 """
 MAX_WIDTH, MIN_WIDTH = 32_768, 16
@@ -60,50 +57,33 @@ SUFFIXES["animate"] = (".gif", ".mp4", "")
 Named = list[tuple[str, Pose]]  # poses in the world with the panorama's path
 
 
-def build_parser() -> argparse.ArgumentParser:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
-    parser = new_parser("render_pose", __doc__, EPILOG)
     add_cloud_options(parser, "coloured scan, as for localize.py, or a map by tools/prepare_map.py")
     group = parser.add_argument_group("pose, one of")
     one = group.add_mutually_exclusive_group(required=True)
-    one.add_argument("--result", type=Path, metavar="FILE", help="JSON lines of localize.py")
-    one.add_argument("--queries", type=Path, metavar="FILE", help="queries.json with true poses")
-    one.add_argument("--pose", type=Path, metavar="FILE", help="text file, 4 x 4 numbers of T_world_from_cam")
-    one.add_argument("--at", type=float, nargs=3, metavar=("X", "Y", "Z"), help="position in the world [m]")
-    text = "the pose of this panorama (file name); needed if --queries has several"
-    group.add_argument("--pano", metavar="NAME", help=text)
+    option(one, "--result FILE", "JSON lines of localize.py")
+    option(one, "--queries FILE", "queries.json with true poses")
+    option(one, "--pose FILE", "text file, 4 x 4 numbers of T_world_from_cam")
+    option(one, "--at X Y Z", "position in the world [m]")
+    option(group, "--pano NAME", "the pose of this panorama (file name); needed if --queries has several")
     for angle in ("heading", "pitch", "roll"):
-        group.add_argument(f"--{angle}", type=float, metavar="DEG", help="with --at (default 0)")
-    _add_picture_options(parser)
-    _add_descent_options(parser)
-    add_run_options(parser)
-    return parser
-
-
-def _add_picture_options(parser: argparse.ArgumentParser) -> None:
+        option(group, f"--{angle} DEG", "with --at (default 0)")
     group = parser.add_argument_group("picture")
-    text = ".png or .jpg; of several poses a new folder of .png, named as the panoramas"
-    group.add_argument("--out", type=Path, help=text)
-    text = "twice the height (default 2048)"
-    group.add_argument("--width", type=int, default=2048, metavar="PX", help=text)
-    text = "fill them from around (default), mark them magenta, or leave them black"
-    group.add_argument("--holes", choices=["close", "mark", "black"], default="close", help=text)
-    group.add_argument("--depth", type=Path, metavar="FILE", help=".png or .npy, see below")
-    group.add_argument("--mask-out", type=Path, metavar="PNG", help="where nothing is seen")
-
-
-def _add_descent_options(parser: argparse.ArgumentParser) -> None:
+    option(group, "--out FILE", ".png or .jpg; of several poses a new folder of .png, named as the panoramas")
+    option(group, "--width PX", "twice the height", default=2048)
+    text = "fill them from around, mark them magenta, or leave them black"
+    option(group, "--holes", text, choices=["close", "mark", "black"], default="close")
+    option(group, "--depth FILE", ".png or .npy, see below")
+    option(group, "--mask-out PNG", "where nothing is seen")
     group = parser.add_argument_group("descent")
     text = ".gif, .mp4 or a new folder: the descent on the sampling loss, from a start near the pose"
-    group.add_argument("--animate", type=Path, metavar="OUT", help=text)
-    group.add_argument("--photo", type=Path, metavar="FILE", help="panorama (default: that of the result)")
-    text = "start at this position, turned as the pose (default: the pose, perturbed)"
-    group.add_argument("--start", type=float, nargs=3, metavar=("X", "Y", "Z"), help=text)
-    text = "distance and angle of the start from the pose (default 0.3 8)"
-    group.add_argument("--perturb", type=float, nargs=2, metavar=("M", "DEG"), default=(0.3, 8.0), help=text)
-    group.add_argument("--seed", type=int, default=0, help="of the directions of --perturb (default 0)")
-    solvers = ["adam", "lbfgs", "gauss-newton"]
-    group.add_argument("--solver", choices=solvers, default=solvers[0], help="(default adam)")
+    option(group, "--animate FILE", text)
+    option(group, "--photo FILE", "panorama (default: that of the result)")
+    option(group, "--start X Y Z", "begin here, turned as the pose (default: at the pose, perturbed)")
+    option(group, "--perturb M DEG", "distance and angle of the start from the pose", default=(0.3, 8.0))
+    option(group, "--seed N", "of the directions of --perturb", default=0)
+    option(group, "--solver", choices=["adam", "lbfgs", "gauss-newton"], default="adam")
 
 
 def check_usage(arguments: argparse.Namespace) -> None:
@@ -238,7 +218,8 @@ def animate(arguments: argparse.Namespace, cloud: LocalCloud, poses: Named, work
     print(json.dumps(line | {"loss": refined.loss if np.isfinite(refined.loss) else None}))
 
 
-def run(arguments: argparse.Namespace) -> int:
+@command(__file__, __doc__, EPILOG, add_arguments)
+def main(arguments: argparse.Namespace) -> int:
     """Read, draw, write."""
     with checking_options():
         check_usage(arguments)
@@ -254,8 +235,3 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.animate:
         animate(arguments, cloud, poses, workers)
     return 0
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    return run_command(build_parser(), argv, run)

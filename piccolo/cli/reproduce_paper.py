@@ -20,20 +20,19 @@ from ..scenes.evaluation.runner import RunConfig
 from ..scenes.reproduce_paper.experiments import EXPERIMENTS, Condition, Settings
 from ..scenes.reproduce_paper.report import plot_png, table
 from ..scenes.scene import Scene, find_scenes
-from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error, run_command
+from .command import command, option
+from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error
 from .options import PAPER_OPTIONS, add_options, paper_settings_from
-from .parser import add_run_options, new_parser
 from .progress import progress_bar
 
-EPILOG = """\
+_EXPERIMENTS = "\n".join(f"  {name:<15} {experiment.title}" for name, experiment in EXPERIMENTS.items())
+EPILOG = f"""\
 examples:
-  python tools/make_room.py --out rooms --scenes 25 --panoramas 2 --labels
   python tools/reproduce_paper.py gravity density --scenes rooms --out results
   python tools/reproduce_paper.py labels --scenes datasets/stanford --out results --presets paper --jobs 4
-  python tools/reproduce_paper.py loss --scenes rooms --out results --num-translations 100 --num-by-loss 100
 
 experiments:
-{experiments}
+{_EXPERIMENTS}
 
 Writes OUT/NAME.md, OUT/NAME.png and OUT/NAME/CONDITION_PRESET.jsonl, runs that tools/evaluate.py compares.
 The same command resumes an experiment that was stopped. Changed clouds and images are temporary.
@@ -41,21 +40,16 @@ The same command resumes an experiment that was stopped. Changed clouds and imag
 PRESETS = ("paper", "default")
 
 
-def build_parser() -> argparse.ArgumentParser:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
-    lines = [f"  {name:<15} {experiment.title}" for name, experiment in EXPERIMENTS.items()]
-    parser = new_parser("reproduce_paper", __doc__, EPILOG.format(experiments="\n".join(lines)))
     parser.add_argument("names", nargs="+", choices=list(EXPERIMENTS), metavar="NAME", help="see below")
-    parser.add_argument("--scenes", type=Path, nargs="+", required=True, metavar="FOLDER")
-    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="made if it is not there")
-    parser.add_argument("--variants", nargs="+", metavar="NAME", default=[], help="only these splits")
-    text = "where both are compared (default both)"
-    parser.add_argument("--presets", nargs="+", choices=PRESETS, default=PRESETS, help=text)
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default 1)")
-    add_run_options(parser)
+    option(parser, "--scenes FOLDER ...", required=True)
+    option(parser, "--out FOLDER", "made if it is not there", required=True)
+    option(parser, "--variants NAME ...", "only these splits", default=[])
+    option(parser, "--presets", nargs="+", choices=PRESETS, default=PRESETS)
+    option(parser, "--jobs N", "processes", default=1)
     group = parser.add_argument_group("preset paper, where the experiment does not vary it")
     add_options(group, PAPER_OPTIONS, PaperSettings())
-    return parser
 
 
 def file_name(condition: Condition) -> str:
@@ -133,7 +127,8 @@ def run_experiment(
     return num_failed
 
 
-def run(arguments: argparse.Namespace) -> int:
+@command(__file__, __doc__, EPILOG, add_arguments)
+def main(arguments: argparse.Namespace) -> int:
     """Run the experiments one by one; returns the exit code."""
     if arguments.jobs < 1:
         raise UsageError(f"--jobs: found {arguments.jobs}, wanted at least 1")
@@ -144,8 +139,3 @@ def run(arguments: argparse.Namespace) -> int:
     scenes = find_scenes(arguments.scenes)
     failed = [run_experiment(name, scenes, presets, arguments) for name in arguments.names]
     return EXIT_BAD_INPUT if any(failed) else 0
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    return run_command(build_parser(), argv, run)

@@ -53,10 +53,7 @@ class Scene:
 def read_scene(folder: Path, name: str | None = None) -> Scene:
     """The scene of a folder, or of the queries.json in it.
 
-    Raises
-    ------
-    InputError
-        There is no queries.json, or it is not as `write_queries` writes it.
+    Raises InputError if there is no queries.json, or it is not as `write_queries` writes it.
     """
     path = folder if folder.suffix == ".json" else folder / QUERIES_NAME
     document = read_json(path, WANTED)
@@ -73,10 +70,7 @@ def read_scene(folder: Path, name: str | None = None) -> Scene:
 def find_scenes(roots: Sequence[Path]) -> list[Scene]:
     """The scenes in and below folders, by name; a queries.json may stand for its folder.
 
-    Raises
-    ------
-    InputError
-        There is none below one of the roots, or two have the same name.
+    Raises InputError if there is none below one of the roots, or two have the same name.
     """
     scenes: dict[str, Scene] = {}
     for root in roots:

@@ -16,7 +16,7 @@ from ...panorama import Panorama, read_panorama
 from ...panorama.resize import shrink
 from ...runtime.threads import Show, Workers, unseen
 from ..scene import Query, Scene
-from .poses import AXES
+from .files import AXES
 
 VOXEL_SIZE = 0.08  # [m] enough for views of a few degrees
 MIN_SCORE = 0.1  # other views of the same place may have as much, but seldom more than the right one

@@ -12,9 +12,8 @@ import numpy as np
 from ...errors import InputError
 from ...geometry.pose import Pose, rotation_from_quaternion_wxyz
 from ...runtime.json_file import read_json, read_text
-from .clouds import only_cloud_in
+from .files import AXES, DIRECTIONS, WORLD_FROM_CAM, only_cloud_in, pose_of_transform
 from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec
-from .poses import AXES, DIRECTIONS, WORLD_FROM_CAM, pose_of_transform
 
 NAME = "generic"
 LISTS = ("poses.csv", "poses.json", "poses.txt", "poses.tum")

@@ -6,9 +6,8 @@ import numpy as np
 
 from ...errors import InputError
 from ...runtime.json_file import read_json
-from .clouds import only_cloud_in
+from .files import WORLD_FROM_CAM, only_cloud_in, pose_of_transform
 from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec, scene_list
-from .poses import WORLD_FROM_CAM, pose_of_transform
 
 NAME = "360loc"
 QUERIES, POSES, PICTURES = "query_360", "camera_pose.json", "image"

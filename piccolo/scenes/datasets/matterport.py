@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from .files import WORLD_FROM_CAM, pose_of_transform, read_matrix
 from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec, scene_list
-from .poses import WORLD_FROM_CAM, pose_of_transform, read_matrix
 
 NAME = "matterport3d"
 SKYBOXES, POSES = "matterport_skybox_images", "matterport_camera_poses"

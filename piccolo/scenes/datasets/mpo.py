@@ -12,7 +12,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...geometry.pose import Pose, yaw_rotation
-from .clouds import is_cloud
+from .files import is_cloud
 from .model import CloudPart, ConvertOptions, PosedPanorama, RigidTransform, SceneList, SceneSpec
 
 NAME = "mpo"

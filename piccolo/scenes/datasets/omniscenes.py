@@ -4,8 +4,8 @@ import re
 from collections import defaultdict
 from pathlib import Path
 
+from .files import checked_pose, read_matrix
 from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec, scene_list
-from .poses import checked_pose, read_matrix
 
 NAME = "omniscenes"
 PANORAMAS = ("*_pano", "*/*_pano")  # change_handheld_pano, turtlebot_pano ...

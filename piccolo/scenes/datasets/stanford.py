@@ -16,9 +16,8 @@ from scipy.spatial.transform import Rotation
 from ...errors import InputError
 from ...geometry.pose import Array, Pose
 from ...runtime.json_file import read_json
-from .labels import labels_by_index
+from .files import checked_pose, labels_by_index
 from .model import CloudPart, ConvertOptions, PosedPanorama, RigidTransform, SceneList, SceneSpec, scene_list
-from .poses import checked_pose
 
 NAME = "stanford2d3ds"
 # As most users of S3DIS number them, less one: theirs begin at 0. Other names, <UNK> among them, are 0.

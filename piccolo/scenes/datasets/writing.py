@@ -19,7 +19,7 @@ from ...errors import InputError, unreadable
 from ...runtime.atomic import check_output_folder, replacing_folder
 from ...runtime.threads import Show, unseen
 from ..scene import CLOUD_NAME, QUERIES_NAME, Query, read_scene, write_queries
-from .labels import write_labels
+from .files import write_labels
 from .model import PosedPanorama, SceneSpec
 
 IMAGES, LABELS = "images", "labels"  # folders of a scene
@@ -39,10 +39,8 @@ class Written:
 def write_scene(spec: SceneSpec, out: Path, transfer: Transfer = "symlink", show: Show = unseen) -> Written:
     """Write a scene below `out`, or leave it as it is if it is there.
 
-    Raises
-    ------
-    InputError
-        A file of the scene is damaged or missing, there is no panorama, or what is there was made otherwise.
+    Raises InputError if a file of the scene is damaged or missing, there is no panorama, or what is there was
+    made otherwise.
     """
     folder = out / spec.name
     if (folder / QUERIES_NAME).exists():

@@ -114,10 +114,7 @@ def match_results(scenes: Sequence[Scene], results: Sequence[Result]) -> Iterato
 
     The image is found by its path, or else by its file name if only one query has that.
 
-    Raises
-    ------
-    InputError
-        A result belongs to no query, or its name to several.
+    Raises InputError if a result belongs to no query, or its name to several.
     """
     queries = [
         (scene, query, path)

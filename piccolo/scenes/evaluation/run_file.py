@@ -24,10 +24,7 @@ MAX_DIFFERENCE = 1e-6  # [m], [rad] between errors of the same poses
 def read_run(path: Path) -> tuple[list[QueryResult], int]:
     """The queries of a run, and the size [byte] of the file up to its last whole line.
 
-    Raises
-    ------
-    InputError
-        A line is none of a run; an unfinished last line was being written, and is left out.
+    Raises InputError if a line is none of a run; an unfinished last line was being written, and is left out.
     """
     content = read_bytes(path, WANTED)
     size = content.rfind(b"\n") + 1
@@ -53,10 +50,7 @@ class Run:
     ) -> tuple[list[QueryResult], int]:
         """All queries, old and new, and how many failed; `report` gets a line for each failure.
 
-        Raises
-        ------
-        InputError
-            Another process is writing the file.
+        Raises InputError if another process is writing the file.
         """
         rows, num_failed = list(self.rows), 0
         if not self.jobs:
@@ -76,10 +70,7 @@ class Run:
 def open_run(path: Path, config: RunConfig, scenes: Sequence[Scene], variants: Sequence[str]) -> Run:
     """Resume a run, or begin one; no variants stands for all.
 
-    Raises
-    ------
-    InputError
-        The file can't be written, holds something else, or rows made with other settings.
+    Raises InputError if the file can't be written, holds something else, or rows made with other settings.
     """
     rows, size = read_run(path) if path.exists() else ([], 0)
     repeated = settings_json(config.settings, config.cloud_settings, config.read_options)
@@ -130,10 +121,7 @@ def _check_settings(path: Path, rows: Sequence[QueryResult], settings: dict[str,
 def appending(path: Path, size: int) -> Iterator[Callable[[QueryResult], None]]:
     """A function that appends one query to a run at once; the run is first cut to `size` bytes.
 
-    Raises
-    ------
-    InputError
-        Another process is writing it.
+    Raises InputError if another process is writing it.
     """
     with path.open("ab") as file:
         try:

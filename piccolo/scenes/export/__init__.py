@@ -6,30 +6,23 @@ from pathlib import Path
 from ...errors import InputError
 from ...result import Result
 from ...runtime.atomic import check_output, check_output_folder
-from .colmap import COLMAP
 from .geojson import GEOJSON
 from .gpano import GPANO
-from .model import Format, Options
-from .nerfstudio import NERFSTUDIO
-from .opensfm import OPENSFM
 from .pose_lists import CSV, KITTI, POTREE, TUM
-from .posed_images import Selection, posed_images, select, true_results
+from .posed_images import Format, Options, Selection, posed_images, select, true_results
+from .reconstructions import COLMAP, NERFSTUDIO, OPENSFM
 
 __all__ = ["FORMATS", "Format", "Options", "Selection", "export", "select", "true_results"]
 
-FORMATS: dict[str, Format] = {
-    f.name: f for f in (COLMAP, NERFSTUDIO, OPENSFM, TUM, KITTI, CSV, GEOJSON, POTREE, GPANO)
-}
+_ALL = COLMAP, NERFSTUDIO, OPENSFM, TUM, KITTI, CSV, GEOJSON, POTREE, GPANO
+FORMATS: dict[str, Format] = {form.name: form for form in _ALL}
 
 
 def export(results: Sequence[Result], name: str, out: Path, options: Options) -> None:
     """Write the poses of `results`, which all have one, to `out` in the format `name`, whole or not at all.
 
-    Raises
-    ------
-    InputError
-        There is no pose, the format can't say what a result says, a picture can't be read, or `out` can't
-        be written.
+    Raises InputError if there is no pose, the format can't say what a result says, a picture can't be read,
+    or `out` can't be written.
     """
     form = FORMATS[name]
     if form.is_folder:

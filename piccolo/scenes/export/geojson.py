@@ -11,7 +11,7 @@ from ...errors import InputError
 from ...geometry.camera_axes import heading_pitch_roll_deg
 from ...runtime.atomic import write_atomically
 from ...runtime.optional import import_optional
-from .model import Format, Options, PosedImage
+from .posed_images import Format, Options, PosedImage
 
 STEP = 10.0  # [m] ahead, to find true north
 

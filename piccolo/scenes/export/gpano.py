@@ -15,7 +15,7 @@ from ...geometry.camera_axes import DECIMALS, heading_pitch_roll_deg
 from ...panorama.gpano import CROP_FIELDS, NAMESPACE, PREFIX
 from ...panorama.picture import opened
 from ...runtime.atomic import replacing_folder, write_atomically
-from .model import Format, Options, PosedImage, check_size
+from .posed_images import Format, Options, PosedImage, check_size
 
 JPEG_MAGIC = b"\xff\xd8"
 APP0, APP1, SCAN = 0xE0, 0xE1, 0xDA

@@ -13,7 +13,7 @@ from pathlib import Path
 from ...geometry.camera_axes import CAMERA_AXES, heading_pitch_roll_deg, turned
 from ...geometry.pose import T_world_from_cam, quaternion_wxyz
 from ...runtime.atomic import write_atomically
-from .model import Format, Options, PosedImage
+from .posed_images import Format, Options, PosedImage
 
 COLUMNS = (
     *("image", "cloud", "status", "confidence", "score", "x", "y", "z"),

@@ -1,19 +1,41 @@
-"""Poses in the datasets' files, checked, and in our axes."""
+"""What the readers share: the one cloud of a folder, matrices and poses, and pictures of labels."""
 
 from pathlib import Path
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from ...cloud import FORMATS
 from ...cloud.validation import MAX_COORDINATE
 from ...errors import InputError
 from ...geometry.camera_axes import CAMERA_AXES, OPENGL_FROM_CAM
 from ...geometry.pose import Array, Pose, checked_rotation, orthonormal
+from ...panorama.picture import read_picture
+from ...runtime.atomic import write_atomically
 from ...runtime.json_file import read_text
+from .model import Labels
 
+SUFFIXES = frozenset().union(*(f.suffixes for f in FORMATS)) - {".csv"}  # as these hold poses too
 AXES = {**CAMERA_AXES, "opengl": OPENGL_FROM_CAM}  # a pose file's camera axes from ours, by name
 MAX_MATRIX_SIZE = 1 << 16  # [byte] of a file
 MAX_SKEW = 1e-2  # of R R^T from the identity: some files have three decimals
 WORLD_FROM_CAM, CAM_FROM_WORLD = DIRECTIONS = ("world_from_cam", "cam_from_world")
+
+
+def is_cloud(path: Path) -> bool:
+    """True for a file whose name ends as that of a cloud format."""
+    return path.suffix.lower() in SUFFIXES and path.is_file()
+
+
+def only_cloud_in(folder: Path) -> Path | None:
+    """The one cloud in a folder, None if there is none. InputError if there are several."""
+    named = sorted(path for path in folder.glob("cloud.*") if is_cloud(path))
+    found = named or sorted(path for path in folder.iterdir() if is_cloud(path) and path.suffix != ".txt")
+    if len(found) > 1:
+        names = ", ".join(path.name for path in found)
+        raise InputError(f"{folder}: found the clouds {names}; leave one, or name one of them cloud.*")
+    return found[0] if found else None
 
 
 def read_matrix(path: Path, num_rows: int) -> Array:
@@ -49,3 +71,19 @@ def pose_of_transform(where: str, T: Array, direction: str, axes: str) -> Pose:
     if direction == CAM_FROM_WORLD:
         return checked_pose(where, R, -R.T @ t, axes)
     return checked_pose(where, R.T, t, axes)
+
+
+def labels_by_index(path: Path, table: NDArray[np.uint16]) -> Labels:
+    """The labels (H, W) of a picture whose colours are indices R 2^16 + G 2^8 + B into a table; 0 beyond."""
+    rgb = read_picture(path).rgb.astype(np.uint32)
+    index = rgb[..., 0] << 16 | rgb[..., 1] << 8 | rgb[..., 2]
+    beyond = len(table)
+    return np.asarray(np.append(table, np.uint16(0))[np.minimum(index, beyond)], dtype=np.uint16)
+
+
+def write_labels(path: Path, labels: Labels) -> None:
+    """Write labels (H, W) as a 16-bit PNG with one channel."""
+    is_done, png = cv2.imencode(".png", labels)
+    if not is_done:
+        raise InputError(f"{path}: {labels.shape} labels could not be encoded as PNG")
+    write_atomically(path, png.tobytes())
