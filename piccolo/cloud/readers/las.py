@@ -90,9 +90,10 @@ def _chunks(header: LasHeader, layout: LasLayout, is_sample: bool = False) -> It
             data = file.read(size)
             if len(data) < size:
                 raise InputError(f"{header.path}: {CUT}")
+            content: bytes | NDArray[np.uint8] = data
             if layout.laszip:
-                data = decompress(header, layout, data, layout.chunks[first:end])
-            records = np.frombuffer(data, dtype=header.dtype)
+                content = decompress(header, layout, data, layout.chunks[first:end])
+            records = np.frombuffer(content, dtype=header.dtype)
             for begin in range(0, len(records), CHUNK):
                 yield records[begin : begin + CHUNK]
 

@@ -84,8 +84,8 @@ def read_header(path: Path) -> LasHeader:
     if not least <= header_size <= points_offset <= size:
         found = f"a header of {header_size} bytes and points from byte {points_offset} on"
         raise InputError(f"{path}: {found}, wanted {least} or more and points within the file's {size} bytes")
-    least = RECORD_SIZES.get(point_format)
-    if least is None or record_size < least:
+    least = RECORD_SIZES.get(point_format, 0)
+    if least == 0 or record_size < least:
         wrong = f"records of {record_size} bytes, wanted {least} or more in point format {point_format}"
         raise InputError(f"{path}: {wrong if least else f'unknown point format {point_format}, {WANTED}'}")
     if not (np.isfinite([scales, offsets]).all() and scales.all()):
