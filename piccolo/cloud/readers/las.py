@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from .intensity import OPTION, intensity_reader
 from .labels import label_reader
-from .las_header import WANTED, LasHeader, has_las_magic, read_header
+from .las_header import MAGIC, WANTED, LasHeader, read_header
 from .laz import MAX_CHUNK_SIZE, LasLayout, decompress, read_laz_layout
 from .reader import CHUNK, CUT, PLAIN, CloudFormat, CloudReadOptions, PointSource, PointsWithScalar, RawCloud
 
@@ -132,4 +132,6 @@ def _cloud(header: LasHeader, records: Records, is_8_bit: bool) -> RawCloud:
     return RawCloud(points_world, rgb.astype(np.uint8))
 
 
-LAS = CloudFormat("LAS, LAZ", frozenset({".las", ".laz"}), has_las_magic, open_las, has_labels=True)
+LAS = CloudFormat(
+    "LAS, LAZ", frozenset({".las", ".laz"}), lambda head: head.startswith(MAGIC), open_las, has_labels=True
+)

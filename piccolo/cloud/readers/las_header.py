@@ -58,16 +58,11 @@ class LasHeader:
         return self.point_format in COLORS_BYTE
 
 
-def has_las_magic(head: bytes) -> bool:
-    """True if a file that begins with the bytes `head` says it is LAS or LAZ."""
-    return head.startswith(MAGIC)
-
-
 def read_header(path: Path) -> LasHeader:
     """The header of a LAS or LAZ file; InputError if it is broken or promises too much."""
     with path.open("rb") as file:
         head = file.read(MIN_HEADER_SIZE_1_4)
-    if not has_las_magic(head) or len(head) < MIN_HEADER_SIZE:
+    if not head.startswith(MAGIC) or len(head) < MIN_HEADER_SIZE:
         wanted = f"wanted 'LASF' and a header of {MIN_HEADER_SIZE} bytes or more"
         raise InputError(f"{path}: begins with {head[:4]!r} and {len(head)} bytes, {wanted}")
     major, minor = head[24], head[25]
