@@ -181,7 +181,7 @@ def test_broken_headers_are_refused(tmp_path, fields, lines, message):
     [
         (b"", b" 1", "line 12: 5 instead of 4 columns"),
         (b"", b" x", "line 12: 5 instead of 4 columns"),
-        (b"4294967296", None, "point 1 has the colour 4.29497e.09, wanted 32 bits of the type u4"),
+        (b"4294967296", None, "point 1 has the colour 4.29497e.09, wanted 32 bits of type u4"),
         (b"1.5", None, "point 1 has the colour 1.5, wanted 32 bits"),
         (b"nan", None, "point 1 has the colour nan, wanted 32 bits"),
         (b"red", None, "line 12: 'red' is not a number"),
@@ -199,7 +199,7 @@ def test_broken_lines_are_named(tmp_path, old, new, message):
 
 def test_a_colour_that_text_has_lost_is_refused(tmp_path):
     fields = [*XYZ, ("rgb", "f4", 1, (PACKED | np.uint32(0xFF800000)).view(np.float32))]
-    with pytest.raises(InputError, match="point 1 has the colour nan, wanted 32 bits of the type f4"):
+    with pytest.raises(InputError, match="point 1 has the colour nan, wanted 32 bits of type f4"):
         read(write(tmp_path / "a.pcd", fields, "ascii"))
     _, colors = read(write(tmp_path / "b.pcd", fields))
     np.testing.assert_array_equal(colors, RAW.colors | [128, 0, 0])

@@ -44,27 +44,19 @@ class Octree:
 def average_children(child_nodes, child_codes, nodes, codes, first_child):
     """Write the mean of the children of each parent voxel and where they begin. Returns how many parents."""
     count = 0
-    n = len(child_codes)
+    n, sums = len(child_codes), np.zeros(6)
     lo = 0
     while lo < n:
         hi = lo
         code = child_codes[lo] >> 3
-        s0 = s1 = s2 = s3 = s4 = s5 = 0.0
+        sums[:] = 0.0
         while hi < n and (child_codes[hi] >> 3) == code:
-            s0 += child_nodes[hi, 0]
-            s1 += child_nodes[hi, 1]
-            s2 += child_nodes[hi, 2]
-            s3 += child_nodes[hi, 3]
-            s4 += child_nodes[hi, 4]
-            s5 += child_nodes[hi, 5]
+            for k in range(6):
+                sums[k] += child_nodes[hi, k]
             hi += 1
         per = 1.0 / (hi - lo)
-        nodes[count, 0] = s0 * per
-        nodes[count, 1] = s1 * per
-        nodes[count, 2] = s2 * per
-        nodes[count, 3] = s3 * per
-        nodes[count, 4] = s4 * per
-        nodes[count, 5] = s5 * per
+        for k in range(6):
+            nodes[count, k] = sums[k] * per
         codes[count] = code
         first_child[count] = lo
         count += 1

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .ply_writer import Rows
-from .readers.ply import PlyHeader, Vertices, read_columns, read_header, vertex_index
+from .readers.ply import PLY, PlyHeader, place_of_vertices, read_columns, read_header
 from .readers.reader import CHUNK, HEAD_SIZE
 
 BLOCK = 1 << 22  # [byte] copied at once
@@ -36,19 +36,17 @@ def open_copy(path: Path) -> PlyCopy:
     are elements before the vertices.
     """
     header = read_header(path)
-    index = vertex_index(header)
-    element = header.elements[index]
-    vertices = Vertices(header, index, tuple(prop.name for prop in element.properties))
-    dtype = element.dtype("<")
-    full = [k for k, count in enumerate(header.counts) if count and k != index]
-    copied = [k for k in full if k > index and header.byte_order == "<"]
+    dtype = header.vertices.dtype("<")
+    names = dtype.names or ()
+    full = [k for k, count in enumerate(header.counts) if count and k != header.index]
+    copied = [k for k in full if k > header.index and header.byte_order == "<"]
     return PlyCopy(
         dtype=dtype,
-        read_rows=lambda: (_rows(columns, dtype) for columns in read_columns(vertices)),
-        num_chunks=math.ceil(header.counts[index] / CHUNK),
+        read_rows=lambda: (_rows(columns, dtype) for columns in read_columns(header, names)),
+        num_chunks=math.ceil(header.counts[header.index] / CHUNK),
         comments=_comments(header),
         more=tuple(line for k in copied for line in _lines(header, k)),
-        read_rest=lambda: _blocks(path, _end_of_vertices(header, index)) if copied else iter(()),
+        read_rest=lambda: _blocks(header) if copied else iter(()),
         left_out=tuple(header.elements[k].name for k in full if k not in copied),
     )
 
@@ -56,7 +54,7 @@ def open_copy(path: Path) -> PlyCopy:
 def is_ply(path: Path) -> bool:
     """True if a file's first bytes say that it is PLY."""
     with path.open("rb") as file:
-        return file.read(HEAD_SIZE).startswith((b"ply\n", b"ply\r"))
+        return PLY.has_magic(file.read(HEAD_SIZE))
 
 
 def _rows(columns: list[NDArray[np.generic]], dtype: np.dtype[Any]) -> Rows:
@@ -82,14 +80,10 @@ def _lines(header: PlyHeader, k: int) -> list[str]:
     return [f"element {element.name} {header.counts[k]}", *map(str, element.properties)]
 
 
-def _end_of_vertices(header: PlyHeader, index: int) -> int:
-    """Where the elements after the vertices begin [byte]."""
-    elements = zip(header.elements[: index + 1], header.counts, strict=False)
-    return header.size + sum(count * int(element.dtype().itemsize) for element, count in elements)
-
-
-def _blocks(path: Path, begin: int) -> Iterator[bytes]:
-    with path.open("rb") as file:
-        file.seek(begin)
+def _blocks(header: PlyHeader) -> Iterator[bytes]:
+    """Yield all that follows the vertices."""
+    offset, count, dtype = place_of_vertices(header)
+    with header.path.open("rb") as file:
+        file.seek(offset + count * dtype.itemsize)
         while block := file.read(BLOCK):
             yield block

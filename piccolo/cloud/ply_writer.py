@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -24,16 +25,12 @@ def vertex_rows(
     points: NDArray[np.floating[Any]], colors: NDArray[np.uint8], labels: NDArray[np.int32] | None = None
 ) -> Rows:
     """Vertices of points (N, 3), float32 or float64 as they are, colours (N, 3) RGB and labels (N,)."""
-    fields: list[tuple[str, np.dtype[Any]]] = [(name, points.dtype) for name in "xyz"]
-    fields += [(name, np.dtype("u1")) for name in COLOR_NAMES]
-    fields += [] if labels is None else [("label", np.dtype("i4"))]
-    rows = np.empty(len(points), dtype=fields)
-    for k, name in enumerate("xyz"):
-        rows[name] = points[:, k]
-    for k, name in enumerate(COLOR_NAMES):
-        rows[name] = colors[:, k]
+    columns = dict(zip(("x", "y", "z", *COLOR_NAMES), [*points.T, *colors.T], strict=True))
     if labels is not None:
-        rows["label"] = labels
+        columns["label"] = labels
+    rows = np.empty(len(points), dtype=[(name, column.dtype) for name, column in columns.items()])
+    for name, column in columns.items():
+        rows[name] = column
     return rows
 
 
@@ -52,40 +49,31 @@ def header(
     return "\n".join(lines).encode("ascii", "replace")
 
 
+@dataclass
 class PlyWriter:
-    """Writes vertices as they come; the number in the header is set at the end."""
+    """Writes vertices as they come."""
 
-    def __init__(
-        self, file: IO[bytes], dtype: np.dtype[Any], comments: Sequence[str] = (), more: Sequence[str] = ()
-    ) -> None:
-        self._file, self._dtype, self._comments, self._more = file, dtype.newbyteorder("<"), comments, more
-        self.num_vertices = 0
-        file.write(header(self._dtype, 0, comments, more))
+    file: IO[bytes]  # after the vertices the caller may write more elements, in little-endian order
+    dtype: np.dtype[Any]  # little-endian
+    num_vertices: int = 0
 
     def add(self, rows: Rows) -> None:
         """Write vertices of the dtype that the file was begun with."""
-        self._file.write(np.ascontiguousarray(rows.astype(self._dtype, copy=False)).data)
+        self.file.write(np.ascontiguousarray(rows.astype(self.dtype, copy=False)).data)
         self.num_vertices += len(rows)
-
-    def add_rest(self, content: bytes) -> None:
-        """Write some of the elements that follow the vertices, in little-endian order."""
-        self._file.write(content)
-
-    def finish(self) -> None:
-        """Set the number of vertices."""
-        self._file.seek(0)
-        self._file.write(header(self._dtype, self.num_vertices, self._comments, self._more))
 
 
 @contextmanager
 def writing_ply(
     path: Path, dtype: np.dtype[Any], comments: Sequence[str] = (), more: Sequence[str] = ()
 ) -> Iterator[PlyWriter]:
-    """A writer of `path`, which is there when all is written, and not after an error."""
+    """A writer of `path`, which is there when all is written and counted, and not after an error."""
     with replacing(path) as file:
-        writer = PlyWriter(file, dtype, comments, more)
+        writer = PlyWriter(file, dtype.newbyteorder("<"))
+        file.write(header(writer.dtype, 0, comments, more))
         yield writer
-        writer.finish()
+        file.seek(0)
+        file.write(header(writer.dtype, writer.num_vertices, comments, more))
 
 
 def write_ply(path: Path, rows: Rows) -> None:

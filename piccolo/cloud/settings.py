@@ -26,9 +26,7 @@ class CloudSettings:
         if self.intensity_as_gray and self.labels:
             raise InputError("--labels, --intensity-as-gray: found both, wanted one of them")
         if not (math.isfinite(self.scale) and self.scale > 0.0):
-            raise InputError(
-                f"--scale: found {self.scale}, wanted a number above 0 (metres a unit of the file)"
-            )
+            raise InputError(f"--scale: found {self.scale}, wanted a number above 0 (metres a unit)")
 
 
 IN_METRES = CloudSettings()

@@ -48,10 +48,8 @@ class LocalCloud:
         """A pose of the world in the frame of `points`; one too far for float32 is an InputError."""
         center_world = pose.center_world
         if not np.abs(center_world - self.origin_world).max() < FARTHEST:
-            text = (
-                f"found a camera at {center_world.tolist()}, wanted one within {FARTHEST:.0e} m of the cloud"
-            )
-            raise InputError(text)
+            found = f"found a camera at {center_world.tolist()}"
+            raise InputError(f"{found}, wanted one within {FARTHEST:.0e} m of the cloud")
         R = self.R_local_from_world
         return Pose(pose.R_cam_from_world @ R.T, R @ (center_world - self.origin_world))
 

@@ -87,7 +87,7 @@ def write_transformed(
         for rows in cloud.show(copy.read_rows(), copy.num_chunks, "write"):
             writer.add(_transformed_rows(rows, dtype, T_target_from_source))
         for block in copy.read_rest():
-            writer.add_rest(block)
+            writer.file.write(block)
         finish()
     return tuple(f"{path}: the element '{name}' is left out" for name in copy.left_out)
 

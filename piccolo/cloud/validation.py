@@ -47,23 +47,17 @@ class PointValidator:
     def _check_coordinates(self, points: NDArray[np.float64]) -> None:
         farthest = max(-float(points.min()), float(points.max()))
         if farthest > MAX_COORDINATE:
-            raise InputError(
-                f"{self.path}: a coordinate of {farthest:.3g} m, wanted all within {MAX_COORDINATE:.0e} m; "
-                "remove the broken points or set --units or --scale"
-            )
+            found = f"a coordinate of {farthest:.3g} m, wanted all within {MAX_COORDINATE:.0e} m"
+            raise InputError(f"{self.path}: {found}; remove broken points or set --units or --scale")
 
     def check(self) -> None:
         """Refuse points that are no coloured cloud, when all have passed."""
         if self.num_finite < MIN_POINTS:
-            raise InputError(
-                f"{self.path}: found {self.num_finite} finite points ({self.num_dropped} with NaN or "
-                f"infinite coordinates), wanted at least {MIN_POINTS}"
-            )
+            found = f"found {self.num_finite} finite points ({self.num_dropped} with NaN or infinity)"
+            raise InputError(f"{self.path}: {found}, wanted at least {MIN_POINTS}")
         if self.brightest < MIN_BRIGHTEST:
-            raise InputError(
-                f"{self.path}: all points are black (brightest value {self.brightest} of 255), wanted a "
-                "coloured cloud; numbers without a declared range are 0-255, not 0-1"
-            )
+            found = f"all points are black (brightest value {self.brightest} of 255)"
+            raise InputError(f"{self.path}: {found}; numbers without a declared range are 0-255, not 0-1")
 
     def warnings(self) -> tuple[str, ...]:
         """A line if points were left out."""
@@ -84,8 +78,6 @@ def unit_warnings(label: str, points: NDArray[np.float32]) -> tuple[str, ...]:
         return (f"{label}: the cloud spans {size} m; if its unit is the millimetre, set --units mm",)
     farthest = float(np.abs(points).max())
     if farthest > FAR:
-        step = np.spacing(np.float32(farthest))
-        return (
-            f"{label}: points {2 * farthest:.0f} m apart blur the rest to {step:.2g} m; remove the outliers",
-        )
+        blur = f"blur the rest to {np.spacing(np.float32(farthest)):.2g} m"
+        return (f"{label}: points {2 * farthest:.0f} m apart {blur}; remove the outliers",)
     return ()

@@ -113,24 +113,19 @@ class VoxelTable:
             self.base = np.floor(points[0] / LEAF_SIZE).astype(np.int64)
         while len(points):
             full = int(MAX_LOAD * len(self.table))
-            num_added, self.num_voxels = add_points(
-                points, colors, self.base, self.table, self.num_voxels, full
-            )
+            added = add_points(points, colors, self.base, self.table, self.num_voxels, full)
+            num_added, self.num_voxels = added
             points, colors = points[num_added:], colors[num_added:]
             if len(points) and self.num_voxels < full:
-                raise InputError(
-                    f"{self.label}: points more than {MAX_CELL * LEAF_SIZE / 1000:.0f} km apart, wanted one "
-                    "scene; remove the broken points or set --units or --scale"
-                )
+                far = f"points more than {MAX_CELL * LEAF_SIZE / 1000:.0f} km apart, wanted one scene"
+                raise InputError(f"{self.label}: {far}; remove broken points or set --units or --scale")
             if len(points):
                 self._grow()
 
     def _grow(self) -> None:
         if len(self.table) >= MAX_ROWS:
-            raise InputError(
-                f"{self.label}: more than {self.num_voxels} voxels of {LEAF_SIZE} m are filled, wanted a "
-                "smaller scene; is its unit the metre? --units or --scale convert"
-            )
+            found = f"more than {self.num_voxels} voxels of {LEAF_SIZE} m are filled"
+            raise InputError(f"{self.label}: {found}; if its unit is not the metre, set --units or --scale")
         larger = np.zeros((2 * len(self.table), NUM_COLUMNS), np.int32)
         move_voxels(self.table, larger)
         self.table = larger

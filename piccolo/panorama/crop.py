@@ -62,11 +62,8 @@ def embed_crop(path: Path, rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], 
         return rgb, is_valid
     full_rgb = np.zeros((full_height, full_width, 3), dtype=np.uint8)
     full_valid = np.zeros((full_height, full_width), dtype=np.bool_)
-    left %= full_width
-    num_before_seam = min(full_width - left, is_valid.shape[1])
-    for begin, end, to in ((0, num_before_seam, left), (num_before_seam, is_valid.shape[1], 0)):
-        full_rgb[top:bottom, to : to + end - begin] = rgb[:, begin:end]
-        full_valid[top:bottom, to : to + end - begin] = is_valid[:, begin:end]
+    columns = np.arange(left, right) % full_width
+    full_rgb[top:bottom, columns], full_valid[top:bottom, columns] = rgb, is_valid
     return full_rgb, full_valid
 
 

@@ -2,7 +2,6 @@
 
 import re
 from collections import defaultdict
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -46,15 +45,10 @@ def read_cube_folder(folder: Path) -> Picture:
 
 
 def face_paths(folder: Path) -> dict[str, Path]:
-    """The files of a folder's one complete cube, by the letters of their faces."""
-    cubes = _cubes_in(folder)
-    if len(cubes) != 1:
-        raise InputError(f"{folder}: not a file but a folder with {len(cubes)} complete cubes, {WANTED}")
-    return cubes[0]
+    """The files of a folder's one complete cube, by the letters of their faces.
 
-
-def _cubes_in(folder: Path) -> list[dict[str, Path]]:
-    """Paths by letter of every complete cube in a folder, each scheme's files told apart by the rest."""
+    Each scheme's files are told apart by the rest of their names.
+    """
     try:
         files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
     except OSError as error:
@@ -69,7 +63,9 @@ def _cubes_in(folder: Path) -> list[dict[str, Path]]:
                 if len(rest) == 2:
                     parts[rest][letter] = path
         cubes += [part for part in parts.values() if len(part) == len(names)]
-    return cubes
+    if len(cubes) != 1:
+        raise InputError(f"{folder}: not a file but a folder with {len(cubes)} complete cubes, {WANTED}")
+    return cubes[0]
 
 
 def cube_of_cells(path: Path, picture: Picture, order: str | None) -> Picture | None:
@@ -96,8 +92,8 @@ def _grid(path: Path, picture: Picture, order: str) -> Faces:
     width, height = picture.size
     for num_columns, num_rows in ((6, 1), (1, 6), (3, 2), (2, 3)):
         if width * num_rows == height * num_columns and width % num_columns == 0:
-            cell = _cells(picture, width // num_columns)
-            return {letter: cell(k // num_columns, k % num_columns) for k, letter in enumerate(order)}
+            size = width // num_columns
+            return {order[k]: _cell(picture, size, *divmod(k, num_columns)) for k in range(6)}
     raise InputError(f"{path}: found {width} x {height}, wanted six equal squares as --cube-order says")
 
 
@@ -107,11 +103,10 @@ def _cross(picture: Picture, layout: tuple[str, ...]) -> Faces | None:
     size = width // len(layout[0])
     if width != size * len(layout[0]) or height != size * len(layout):
         return None
-    cell = _cells(picture, size)
     faces: Faces = {}
     for i, letters in enumerate(layout):
         for j, letter in enumerate(letters):
-            pixels = cell(i, j)
+            pixels = _cell(picture, size, i, j)
             if letter == "-" and not _is_empty(pixels):
                 return None
             faces[letter.lower()] = np.ascontiguousarray(pixels[::-1, ::-1]) if letter == "B" else pixels
@@ -119,14 +114,10 @@ def _cross(picture: Picture, layout: tuple[str, ...]) -> Faces | None:
     return faces
 
 
-def _cells(picture: Picture, size: int) -> Callable[[int, int], NDArray[np.uint8]]:
-    """A function from row and column to the square there, (size, size, 4)."""
-
-    def cell(row: int, column: int) -> NDArray[np.uint8]:
-        place = slice(row * size, (row + 1) * size), slice(column * size, (column + 1) * size)
-        return face_pixels(picture.rgb[place], picture.is_valid[place])
-
-    return cell
+def _cell(picture: Picture, size: int, row: int, column: int) -> NDArray[np.uint8]:
+    """The square (size, size, 4) in a row and column of such."""
+    place = slice(row * size, (row + 1) * size), slice(column * size, (column + 1) * size)
+    return face_pixels(picture.rgb[place], picture.is_valid[place])
 
 
 def _is_empty(pixels: NDArray[np.uint8]) -> bool:

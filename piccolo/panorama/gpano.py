@@ -19,14 +19,8 @@ PREFIX = re.compile(rb"xmlns:([A-Za-z_][\w.-]{0,40})\s{0,9}=\s{0,9}[\"']" + re.e
 FIELD = rb"\b%s:(\w{1,60})(?:\s{0,9}=\s{0,9}[\"']([^\"'<>]{0,80})[\"']|\s{0,9}>([^<>]{0,80})</)"
 MAX_NUMBER = 1e9
 MAX_PREFIXES = 4  # of one namespace: each is a search of its own
-CROP_FIELDS = (
-    "CroppedAreaLeftPixels",
-    "CroppedAreaTopPixels",
-    "CroppedAreaImageWidthPixels",
-    "CroppedAreaImageHeightPixels",
-    "FullPanoWidthPixels",
-    "FullPanoHeightPixels",
-)
+CROP_NAMES = "CroppedAreaLeft CroppedAreaTop CroppedAreaImageWidth CroppedAreaImageHeight"
+CROP_FIELDS = tuple(f"{name}Pixels" for name in f"{CROP_NAMES} FullPanoWidth FullPanoHeight".split())
 
 
 @dataclass(frozen=True)
@@ -54,28 +48,18 @@ def gpano_fields(xmp: bytes) -> dict[str, str]:
     return fields
 
 
-def _number(fields: dict[str, str], name: str) -> float | None:
-    """The number in a field; None if it is missing, no number or not finite."""
+def _number(fields: dict[str, str], name: str, largest: float = MAX_NUMBER) -> float | None:
+    """The number in a field; None if it is missing, no number, not finite or out of range."""
     try:
         value = float(fields[name])
     except (KeyError, ValueError):
         return None
-    return value if abs(value) <= MAX_NUMBER else None  # NaN is not
+    return value if abs(value) <= largest else None  # NaN is not
 
 
 def attitude(fields: dict[str, str]) -> GPano:
     """Pitch and roll; what is out of range counts as not said."""
-    pitch = _number(fields, "PosePitchDegrees")
-    roll = _number(fields, "PoseRollDegrees")
-    return GPano(
-        pitch if pitch is not None and abs(pitch) <= 90.0 else None,
-        roll if roll is not None and abs(roll) <= 180.0 else None,
-    )
-
-
-def projection(fields: dict[str, str]) -> str:
-    """The projection's name, lower case; empty if not said."""
-    return fields.get("ProjectionType", "").lower()
+    return GPano(_number(fields, "PosePitchDegrees", 90.0), _number(fields, "PoseRollDegrees", 180.0))
 
 
 def crop_region(fields: dict[str, str], aspect: float) -> CropRegion | None:
@@ -84,15 +68,12 @@ def crop_region(fields: dict[str, str], aspect: float) -> CropRegion | None:
     The fields count pixels of the picture as it was made: only their ratios are used, so that a picture made
     smaller since is placed right. None if the fields make no sense or are of a picture of another shape.
     """
-    given = [_number(fields, name) for name in CROP_FIELDS]
-    if not any(name in fields for name in CROP_FIELDS):
+    if not fields.keys() & set(CROP_FIELDS):
         return CropRegion()
-    numbers = [number for number in given if number is not None]
-    if len(numbers) < len(CROP_FIELDS):
+    numbers = [number for name in CROP_FIELDS if (number := _number(fields, name)) is not None]
+    if len(numbers) < len(CROP_FIELDS) or min(numbers[2:]) < 1.0:
         return None
     left, top, width, height, full_width, full_height = numbers
-    if min(width, height, full_width, full_height) < 1.0:
-        return None
     is_inside = width <= full_width and -1.0 <= top <= full_height - height + 1.0 and abs(left) <= full_width
     # a pixel more or less by rounding, or one per cent
     is_same_shape = abs(width / height / aspect - 1.0) <= max(0.01, 1.5 / width, 1.5 / height)

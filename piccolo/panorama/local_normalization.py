@@ -48,9 +48,8 @@ def blur_sphere(image: NDArray[np.float32], sigma_deg: float) -> NDArray[np.floa
     spectrum = np.fft.rfft(image.astype(np.float64), axis=1).transpose(1, 0, 2)
     gains = sphere_gaussian(image.shape[1], sigma_deg)
     blurred = (gains @ spectrum.real) + 1j * (gains @ spectrum.imag)
-    return np.ascontiguousarray(
-        np.fft.irfft(blurred.transpose(1, 0, 2), n=image.shape[1], axis=1), np.float32
-    )
+    sums = np.fft.irfft(blurred.transpose(1, 0, 2), n=image.shape[1], axis=1)
+    return np.ascontiguousarray(sums, np.float32)
 
 
 @kernel

@@ -36,12 +36,10 @@ def read_mask(path: Path, sizes: list[tuple[int, int]]) -> tuple[int, NDArray[np
     height, width = rgb.shape[:2]
     for k, size in enumerate(sizes):
         if abs(width * size[1] - height * size[0]) <= ASPECT_TOLERANCE * height * size[0]:
-            is_white = (rgb.max(axis=2) >= WHITE).astype(np.uint8) * 255
-            is_larger = width > size[0]
+            is_white = (rgb.max(axis=2) >= WHITE).astype(np.float32)
             # averages of a larger mask are above 0 where any pixel is white
-            values = is_white.astype(np.float32) if is_larger else is_white
-            method = cv2.INTER_AREA if is_larger else cv2.INTER_NEAREST
-            return k, np.asarray(cv2.resize(values, size, interpolation=method) == 0)
+            method = cv2.INTER_AREA if width > size[0] else cv2.INTER_NEAREST
+            return k, np.asarray(cv2.resize(is_white, size, interpolation=method) == 0)
     wanted = " or ".join(f"{size[0]} x {size[1]}" for size in sizes)
     raise InputError(f"{path}: found a mask of {width} x {height}, wanted the shape of {wanted}")
 

@@ -50,7 +50,5 @@ class ReadOptions:
         if self.labels and (self.fov_deg is not None or self.cube_order is not None):
             raise InputError("--labels: found --fov or --cube-order too, wanted a picture of the full sphere")
         if self.cube_order is not None and sorted(self.cube_order) != sorted(FACE_LETTERS):
-            raise InputError(
-                f"--cube-order: found {self.cube_order}, wanted each of the letters {FACE_LETTERS} once "
-                "(right, left, up, down, front, back)"
-            )
+            wanted = f"wanted each of the letters {FACE_LETTERS} once (right, left, up, down, front, back)"
+            raise InputError(f"--cube-order: found {self.cube_order}, {wanted}")

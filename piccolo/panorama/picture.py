@@ -120,10 +120,8 @@ def read_labels(path: Path, labels: Labels) -> Picture:
     with opened(path, data) as image:
         _check(path, image, len(data), (MIN_WIDTH, MIN_HEIGHT))
         if image.format != "PNG" or data[24:26] not in LABEL_KINDS or image.has_transparency_data:
-            raise InputError(
-                f"{path}: this kind of picture holds no labels, wanted a PNG, grey of 8 or 16 bits or RGB of "
-                "8, without alpha"
-            )
+            wanted = "wanted a PNG, grey of 8 or 16 bits or RGB of 8, without alpha"
+            raise InputError(f"{path}: this kind of picture holds no labels, {wanted}")
         pixels = np.array(_decoded(path, data, image, image.mode)).astype(np.int32)
         if pixels.ndim == 3:
             pixels = pixels[..., 0] << 16 | pixels[..., 1] << 8 | pixels[..., 2]

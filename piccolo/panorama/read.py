@@ -12,12 +12,16 @@ from .auto_mask import black_borders, polar_disc
 from .crop import ASPECT_TOLERANCE, embed_crop, full_size, region_of_fov
 from .cube_files import cube_of_cells, face_paths, read_cube_folder
 from .fisheye import is_dual_fisheye
-from .gpano import CropRegion, attitude, crop_region, gpano_fields, projection
+from .gpano import CropRegion, attitude, crop_region, gpano_fields
 from .masks import find_mask, mask_pole, read_mask
 from .model import GPano, Panorama, ReadOptions
 from .picture import Picture, picture_size, read_labels, read_picture
 
 AS_STORED = ReadOptions()
+WANTED = (
+    "wanted width = 2 x height (a full equirectangular panorama), GPano metadata of a crop, a field of view "
+    "(--fov), or the order of cube faces (--cube-order)"
+)
 MIN_REPORTED = 0.001  # of the sphere: borders below this are masked without a warning
 
 
@@ -37,14 +41,15 @@ def read_panorama(path: Path, options: ReadOptions = AS_STORED) -> Panorama:
     path = Path(path)
     if options.labels:
         return _read_labelled(path, options, options.labels)
-    is_folder = path.is_dir()
-    picture = read_cube_folder(path) if is_folder else read_picture(path)
-    cube = None if is_folder else cube_of_cells(path, picture, options.cube_order)
-    if is_folder or cube:
-        region, gpano, notes = CropRegion(), None, list[str]()
-    else:
-        region, gpano, notes = _region_and_attitude(path, picture, options)
-    return _embedded_and_masked(path, cube or picture, region, options, gpano, notes)
+    if path.is_dir():
+        return _embedded_and_masked(path, read_cube_folder(path), CropRegion(), options)
+    picture = read_picture(path)
+    if cube := cube_of_cells(path, picture, options.cube_order):
+        return _embedded_and_masked(path, cube, CropRegion(), options)
+    fields = gpano_fields(picture.xmp)
+    region, notes = _region_of(path, picture, fields, options.fov_deg)
+    picture = replace(picture, warnings=(*picture.warnings, *notes))
+    return _embedded_and_masked(path, picture, region, options, attitude(fields) if fields else None)
 
 
 def panorama_size(path: Path) -> tuple[int, int]:
@@ -68,16 +73,14 @@ def _read_labelled(path: Path, options: ReadOptions, labels: Labels) -> Panorama
     return _masked(path, Panorama(picture.rgb, picture.is_valid, gpano, tuple(notes)), counts, options)
 
 
-def _region_and_attitude(
-    path: Path, picture: Picture, options: ReadOptions
-) -> tuple[CropRegion, GPano | None, list[str]]:
-    """Which part of the sphere a picture shows, how the camera was held, and warnings."""
-    fields = gpano_fields(picture.xmp)
-    gpano = attitude(fields) if fields else None
+def _region_of(
+    path: Path, picture: Picture, fields: dict[str, str], fov_deg: float | None
+) -> tuple[CropRegion, list[str]]:
+    """Which part of the sphere a picture shows, by the user or its metadata, and warnings."""
     width, height = picture.size
-    if options.fov_deg is not None:
-        return region_of_fov(options.fov_deg, width, height), gpano, []
-    name = projection(fields)
+    if fov_deg is not None:
+        return region_of_fov(fov_deg, width, height), []
+    name = fields.get("ProjectionType", "").lower()
     if name not in ("", "equirectangular"):
         raise InputError(f"{path}: its metadata names the projection {name!r}, wanted equirectangular")
     notes: list[str] = []
@@ -88,30 +91,18 @@ def _region_and_attitude(
         notes = ["the crop in the metadata makes no sense or has another shape: read as uncropped"]
     if region is None or (region.is_full and not is_two_to_one):
         wrong = " and a crop in the metadata that does not fit it" if region is None else ""
-        raise InputError(
-            f"{path}: found {width} x {height}{wrong}, wanted width = 2 x height (a full "
-            "equirectangular panorama), GPano metadata of a crop, a field of view (--fov), or the order of "
-            "cube faces (--cube-order)"
-        )
+        raise InputError(f"{path}: found {width} x {height}{wrong}, {WANTED}")
     if region.is_full and is_dual_fisheye(picture.rgb):
-        raise InputError(
-            f"{path}: two fisheye pictures side by side: stitch them with the camera's program first, wanted "
-            "an equirectangular panorama"
-        )
-    return region, gpano, notes
+        found = "two fisheye pictures side by side: stitch them with the camera's program first"
+        raise InputError(f"{path}: {found}")
+    return region, notes
 
 
 def _embedded_and_masked(
-    path: Path,
-    picture: Picture,
-    region: CropRegion,
-    options: ReadOptions,
-    gpano: GPano | None,
-    notes: list[str],
+    path: Path, picture: Picture, region: CropRegion, options: ReadOptions, gpano: GPano | None = None
 ) -> Panorama:
     """The picture at its place in the sphere, with everything masked that is not to be counted."""
-    size = full_size(path, region, picture.size)
-    notes = [*picture.warnings, *notes]
+    size, notes = full_size(path, region, picture.size), [*picture.warnings]
     masks = _user_masks(path, [size, picture.size], options, notes)
     is_valid = picture.is_valid & masks[1] if 1 in masks else picture.is_valid
     borders = black_borders(picture.rgb, is_valid, region.is_full)

@@ -1,6 +1,6 @@
 """Points from columns: chunks of arrays (N,) of x, y, z and red, green, blue, or of x, y, z and a scalar."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -8,8 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .colors import colored_chunks
-from .reader import PointsWithScalar, RawCloud, point_label
+from ..label_colors import Labels
+from .colors import brightest_of, colored_chunks
+from .intensity import intensity_reader
+from .labels import label_reader
+from .reader import ChunkReader, PointSource, PointsWithScalar, RawCloud, point_label
 
 Columns = list[NDArray[Any]]
 ColumnReader = Callable[[], Iterator[Columns]]  # each call from the start
@@ -21,13 +24,23 @@ def points_of(columns: Columns) -> NDArray[np.float64]:
         return np.stack(columns[:3], axis=1, dtype=np.float64)
 
 
-def read_colored(path: Path, read_columns: ColumnReader, brightest: float) -> Iterator[RawCloud]:
-    """Yield points with colours from 0 to `brightest`; InputError where one is out of range."""
+def column_source(
+    path: Path, read_columns: ColumnReader, types: Sequence[str], num_points: int, labels: Labels | None
+) -> PointSource:
+    """Points with three colours of these types, as "u1", or with one scalar: a label, else the intensity."""
+    if len(types) == 3:
+        read_chunks: ChunkReader = partial(_colored, path, read_columns, brightest_of(path, types))
+    elif labels:
+        read_chunks = label_reader(path, partial(_with_scalar, read_columns), labels)
+    else:
+        read_chunks = intensity_reader(path, partial(_with_scalar, read_columns))
+    return PointSource(path, read_chunks, num_points)
+
+
+def _colored(path: Path, read_columns: ColumnReader, brightest: float) -> Iterator[RawCloud]:
     parts = ((np.stack(c[:3], axis=1), np.stack(c[3:], axis=1)) for c in read_columns())
     return colored_chunks(parts, brightest, partial(point_label, path))
 
 
-def read_scalar(read_columns: ColumnReader) -> Iterator[PointsWithScalar]:
-    """Yield points with the scalar."""
-    for columns in read_columns():
-        yield points_of(columns), columns[3].astype(np.float64)
+def _with_scalar(read_columns: ColumnReader) -> Iterator[PointsWithScalar]:
+    return ((points_of(columns), columns[3].astype(np.float64)) for columns in read_columns())

@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -13,23 +12,22 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...geometry.point_transforms import rotate_points
 from .e57_file import (
+    MAGIC,
     NAMESPACE,
     E57File,
     Placement,
     child,
     children,
-    has_e57_magic,
     number_of,
     opened,
     parsed_integer,
-    parsed_number,
     placement_of,
     refusing,
     scaled,
     text_of,
 )
 from .intensity import OPTION, intensity_reader
-from .reader import CHUNK, PLAIN, CloudFormat, CloudReadOptions, PointSource, PointsWithScalar, RawCloud
+from .reader import CHUNK, PLAIN, CloudFormat, CloudReadOptions, PointSource, RawCloud
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
@@ -77,9 +75,9 @@ def open_e57(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
         raise InputError(f"{path}: {found}, {WANTED}{more}")
     warnings = tuple(f"{path}: {what}; left out" for what in (left_out if scans else not_measured))
     num_points = sum(scan.num_points for scan in scans or measured)
-    read_chunks = intensity_reader(path, lambda: _read_scalar(path, measured))
+    read_chunks = intensity_reader(path, lambda: ((p, v[:, 0]) for _, p, v in _read(path, measured)))
     if scans:
-        read_chunks = partial(_read_chunks, path, scans)
+        read_chunks = partial(_read_colored, path, scans)
     return PointSource(path, read_chunks, num_points, warnings)
 
 
@@ -115,29 +113,14 @@ def _scan(file: E57File, element: Element, channels: tuple[str, ...], index: int
     if channels != COLORS and fields.keys() >= set(COLORS):
         raise _UnusableError("has colours, but without a range")
     invalid = (INVALID[coordinates], INVALID_COLOR if channels == COLORS else INVALID_INTENSITY)
-    _check_size(file, label, num_points, prototype)
-    return E57Scan(
-        index=index,
-        label=label,
-        num_points=num_points,
-        coordinates=coordinates,
-        channels=channels,
-        invalid=tuple(name for name in invalid if name in fields),
-        color_ranges=tuple(
-            _color_range(file.path, element, fields[name]) for name in channels if name != INTENSITY
-        ),
-        placement=placement_of(file.path, element),
-    )
-
-
-def _check_size(file: E57File, label: str, num_points: int, prototype: Element) -> None:
-    """Refuse more points than the bits of the file could hold."""
     num_bits = sum(_num_bits(file.path, field) for field in prototype.iter())
     if num_bits == 0 or num_points * num_bits > 8 * file.size:
-        raise InputError(
-            f"{file.path}: {label} promises {num_points} points of {num_bits} bits, found a file of "
-            f"{file.size} bytes; it is broken"
-        )
+        found = f"promises {num_points} points of {num_bits} bits, found a file of {file.size} bytes"
+        raise InputError(f"{file.path}: {label} {found}; it is broken")
+    names = tuple(name for name in invalid if name in fields)
+    ranges = (_color_range(file.path, element, fields[name]) for name in channels if name != INTENSITY)
+    placement = placement_of(file.path, element)
+    return E57Scan(index, label, num_points, coordinates, channels, names, tuple(ranges), placement)
 
 
 def _num_bits(path: Path, field: Element) -> int:
@@ -162,97 +145,67 @@ def _color_range(path: Path, element: Element, field: Element) -> tuple[float, f
     declared = [field.get(end) for end in ("minimum", "maximum")]
     if None in declared:
         raise _UnusableError(f"has colours without a range: neither colorLimits nor a declared {name}")
-    first, last = (parsed_number(path, text or "") for text in declared)
-    if field.get("type") == "ScaledInteger":
-        first, last = scaled(path, field, first), scaled(path, field, last)
+    first, last = (scaled(path, field, text or "") for text in declared)
     if not first < last:
         raise _UnusableError(f"has colours without a range: {name} is declared {first:g} to {last:g}")
     return first, last
 
 
-def _read_chunks(path: Path, scans: list[E57Scan]) -> Iterator[RawCloud]:
+def _read_colored(path: Path, scans: list[E57Scan]) -> Iterator[RawCloud]:
+    """Yield the points with channels scaled from the file's range to 0-255."""
+    for scan, points_world, values in _read(path, scans):
+        low, high = np.array(scan.color_ranges).T
+        with np.errstate(over="ignore", invalid="ignore"):
+            brightness = (values - low) * (255.0 / (high - low))
+        is_wrong = ~((brightness >= -TOLERANCE) & (brightness <= 255.0 + TOLERANCE))
+        if is_wrong.any():
+            i, k = np.argwhere(is_wrong)[0]
+            wanted = f"wanted {low[k]:g} to {high[k]:g} as the file declares"
+            raise InputError(f"{path}: {scan.label} has a colour of {values[i, k]:g}, {wanted}")
+        yield RawCloud(points_world, np.rint(brightness).astype(np.uint8))
+
+
+def _read(path: Path, scans: list[E57Scan]) -> Iterator[tuple[E57Scan, Array, Array]]:
+    """Yield the points that count (N, 3), in the world, of each scan, and its channels (N, C)."""
     with opened(path) as file:
         for scan in scans:
             for columns in _read_scan(file, scan):
-                with np.errstate(over="ignore", invalid="ignore"):  # broken points may be infinite
-                    cloud = _cloud(path, scan, columns)
-                yield cloud
+                is_valid = np.ones(len(columns[scan.channels[0]]), dtype=np.bool_)
+                for name in scan.invalid:
+                    is_valid &= columns[name] == 0
+                coordinates = [columns[name][is_valid] for name in scan.coordinates]
+                channels = np.stack([columns[name][is_valid] for name in scan.channels], axis=1)
+                yield scan, _in_world(scan, *coordinates), channels
 
 
-def _read_scalar(path: Path, scans: list[E57Scan]) -> Iterator[PointsWithScalar]:
-    with opened(path) as file:
-        for scan in scans:
-            for columns in _read_scan(file, scan):
-                with np.errstate(over="ignore", invalid="ignore"):
-                    points_world, is_valid = _points(scan, columns)
-                yield points_world, columns[INTENSITY][is_valid]
+def _in_world(scan: E57Scan, a: Array, b: Array, c: Array) -> Array:
+    """Points (N, 3) in the world of coordinates (N,): x y z, or range, azimuth, elevation."""
+    with np.errstate(over="ignore", invalid="ignore"):  # broken points may be infinite
+        if scan.coordinates == SPHERICAL:
+            a, b, c = a * np.cos(c) * np.cos(b), a * np.cos(c) * np.sin(b), a * np.sin(c)
+        points = np.stack([a, b, c], axis=1)
+        if placement := scan.placement:
+            return rotate_points(points, placement.R_world_from_local) + placement.center_world
+        return points
 
 
 def _read_scan(file: E57File, scan: E57Scan) -> Iterator[dict[str, Array]]:
     """The columns of a scan, a chunk at a time, in room that is used again."""
     names = (*scan.coordinates, *scan.channels, *scan.invalid)
     columns = {name: np.empty(min(scan.num_points, CHUNK)) for name in names}
-    num_read = 0
+    buffers, num_read, count = file.libe57.VectorSourceDestBuffer(), 0, 1
     with refusing(file.path, file.libe57):
-        reader = _reader(file, scan, columns)
-    while num_read < scan.num_points:
-        with refusing(file.path, file.libe57):
+        for name, room in columns.items():
+            buffers.append(file.libe57.SourceDestBuffer(file.image_file, name, room, len(room), True, True))
+        reader = file.image_file.root()["data3D"][scan.index]["points"].reader(buffers)
+        while num_read < scan.num_points and count > 0:
             count = reader.read()
-        if count == 0:
-            break
-        num_read += count
-        yield {name: column[:count] for name, column in columns.items()}
+            num_read += count
+            yield {name: column[:count] for name, column in columns.items()}
     reader.close()
     if num_read != scan.num_points:
-        raise InputError(
-            f"{file.path}: {scan.label} promises {scan.num_points} points, found {num_read}; "
-            "the file is broken"
-        )
+        counts = f"promises {scan.num_points} points, found {num_read}"
+        raise InputError(f"{file.path}: {scan.label} {counts}; the file is broken")
 
 
-def _reader(file: E57File, scan: E57Scan, columns: dict[str, Array]) -> Any:
-    """libE57's reader, which fills the columns from their beginning at each call."""
-    buffers = file.libe57.VectorSourceDestBuffer()
-    for name, column in columns.items():
-        buffers.append(file.libe57.SourceDestBuffer(file.image_file, name, column, len(column), True, True))
-    return file.image_file.root()["data3D"][scan.index]["points"].reader(buffers)
-
-
-def _points(scan: E57Scan, columns: dict[str, Array]) -> tuple[Array, NDArray[np.bool_]]:
-    """The points that count (N, 3), in the world, from the columns of a chunk, and which these are."""
-    is_valid = np.ones(len(columns[scan.coordinates[0]]), dtype=np.bool_)
-    for name in scan.invalid:
-        is_valid &= columns[name] == 0
-    a, b, c = (columns[name][is_valid] for name in scan.coordinates)
-    if scan.coordinates == SPHERICAL:
-        a, b, c = a * np.cos(c) * np.cos(b), a * np.cos(c) * np.sin(b), a * np.sin(c)
-    points_world = np.stack([a, b, c], axis=1)
-    if scan.placement is not None:
-        R_world_from_local = scan.placement.R_world_from_local
-        points_world = rotate_points(points_world, R_world_from_local) + scan.placement.center_world
-    return points_world, is_valid
-
-
-def _cloud(path: Path, scan: E57Scan, columns: dict[str, Array]) -> RawCloud:
-    """The points that count, in the world, and their colours."""
-    points_world, is_valid = _points(scan, columns)
-    channels = [
-        _channel(path, scan, columns[name][is_valid], *range_)
-        for name, range_ in zip(COLORS, scan.color_ranges, strict=True)
-    ]
-    return RawCloud(points_world, np.stack(channels, axis=1))
-
-
-def _channel(path: Path, scan: E57Scan, values: Array, low: float, high: float) -> NDArray[np.uint8]:
-    """Channel (N,) 0-255 of values (N,) in the range from `low` to `high`."""
-    brightness = (values - low) * (255.0 / (high - low))
-    is_wrong = ~((brightness >= -TOLERANCE) & (brightness <= 255.0 + TOLERANCE))
-    if is_wrong.any():
-        raise InputError(
-            f"{path}: {scan.label} has a colour of {values[np.argmax(is_wrong)]:g}, wanted {low:g} to "
-            f"{high:g} as the file declares"
-        )
-    return np.rint(brightness).astype(np.uint8)
-
-
-E57 = CloudFormat("E57", frozenset({".e57"}), has_e57_magic, open_e57)
+E57 = CloudFormat("E57", frozenset({".e57"}), lambda head: head.startswith(MAGIC), open_e57)

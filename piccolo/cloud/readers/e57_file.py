@@ -79,34 +79,22 @@ def read_xml(path: Path) -> Element:
     """The root of a file's XML section."""
     with path.open("rb") as file:
         head = file.read(HEADER.size)
-        if len(head) < HEADER.size or not has_e57_magic(head):
+        if len(head) < HEADER.size or not head.startswith(MAGIC):
             raise InputError(f"{path}: begins with {head[:8]!r} and {len(head)} bytes, wanted 'ASTM-E57'")
         _, major, _, size, offset, length, page_size = HEADER.unpack(head)
-        found = path.stat().st_size
+        found, text = path.stat().st_size, f"{path}: the header promises"
         if major != 1 or page_size != PAGE_SIZE:
-            raise InputError(
-                f"{path}: E57 version {major} in pages of {page_size} bytes, wanted 1 and {PAGE_SIZE}"
-            )
+            raise InputError(f"{path}: E57 {major} in pages of {page_size} bytes, wanted 1 and {PAGE_SIZE}")
         if size != found or found % PAGE_SIZE:
-            raise InputError(
-                f"{path}: the header promises {size} bytes in pages of {PAGE_SIZE}, found {found}; "
-                "the file is cut off or broken"
-            )
+            raise InputError(f"{text} {size} bytes, found {found}; the file is cut off or broken")
         num_bytes = (offset % PAGE_SIZE + length) // PAGE_CONTENT * PAGE_SIZE + PAGE_SIZE
         if length > MAX_XML_SIZE or offset + length > found:
-            raise InputError(
-                f"{path}: the header promises {length} bytes of XML from byte {offset} on, wanted "
-                f"{MAX_XML_SIZE} at most and within the file's {found} bytes"
-            )
+            most = f"wanted {MAX_XML_SIZE} at most and within the file's {found} bytes"
+            raise InputError(f"{text} {length} bytes of XML from byte {offset} on, {most}")
         file.seek(offset - offset % PAGE_SIZE)
         pages = file.read(num_bytes)
     content = b"".join(pages[k : k + PAGE_CONTENT] for k in range(0, len(pages), PAGE_SIZE))
     return _parsed(path, content[offset % PAGE_SIZE :][:length])
-
-
-def has_e57_magic(head: bytes) -> bool:
-    """True if a file that begins with the bytes `head` says it is E57."""
-    return head.startswith(MAGIC)
 
 
 class _Limited(TreeBuilder):
@@ -171,19 +159,16 @@ def text_of(element: Element | None, name: str) -> str:
 
 def number_of(path: Path, element: Element | None) -> float | None:
     """The value of a number's element, None without one; an empty one is 0, a scaled integer is scaled."""
-    if element is None:
-        return None
-    value = parsed_number(path, (element.text or "").strip() or "0")
-    if element.get("type") == "ScaledInteger":
-        return scaled(path, element, value)
-    return value
+    return None if element is None else scaled(path, element, (element.text or "").strip() or "0")
 
 
-def scaled(path: Path, element: Element, raw: float) -> float:
-    """The value of a scaled integer's raw value."""
-    return raw * parsed_number(path, element.get("scale", "1")) + parsed_number(
-        path, element.get("offset", "0")
-    )
+def scaled(path: Path, element: Element, text: str) -> float:
+    """The number that a text means in an element, which may be a scaled integer's."""
+    value = parsed_number(path, text)
+    if element.get("type") != "ScaledInteger":
+        return value
+    scale, offset = (parsed_number(path, element.get(*part)) for part in (("scale", "1"), ("offset", "0")))
+    return value * scale + offset
 
 
 def parsed_number(path: Path, text: str) -> float:
@@ -209,19 +194,13 @@ def placement_of(path: Path, element: Element) -> Placement | None:
     pose = child(element, "pose")
     if pose is None:
         return None
-    R_world_from_local = np.eye(3)
     rotation = child(pose, "rotation")
-    if rotation is not None:
-        quaternion_wxyz = _numbers(path, rotation, "wxyz")
-        if not 0.0 < np.linalg.norm(quaternion_wxyz) < math.inf:
-            raise InputError(
-                f"{path}: a pose's rotation is {quaternion_wxyz.tolist()}, wanted a quaternion w x y z"
-            )
-        R_world_from_local = rotation_from_quaternion_wxyz(quaternion_wxyz)
-    translation = child(pose, "translation")
-    center_world = np.zeros(3) if translation is None else _numbers(path, translation, "xyz")
-    return Placement(R_world_from_local, center_world)
+    q = _numbers(path, rotation, "wxyz") if rotation is not None else np.eye(4)[0]
+    if not 0.0 < np.linalg.norm(q) < math.inf:
+        raise InputError(f"{path}: a pose's rotation is {q.tolist()}, wanted a quaternion w x y z")
+    center_world = _numbers(path, child(pose, "translation"), "xyz")
+    return Placement(rotation_from_quaternion_wxyz(q), center_world)
 
 
-def _numbers(path: Path, element: Element, names: str) -> NDArray[np.float64]:
+def _numbers(path: Path, element: Element | None, names: str) -> NDArray[np.float64]:
     return np.array([number_of(path, child(element, name)) or 0.0 for name in names])

@@ -96,10 +96,8 @@ def _blob_size(file: E57File, number: int, blob: Element) -> int:
     """The length [byte] of a blob, if the file has room for it: libE57 reserves it."""
     size = parsed_integer(file.path, blob.get("length", ""))
     if not 0 < size <= file.size:
-        raise InputError(
-            f"{file.path}: image {number} promises {size} bytes, found a file of {file.size} bytes; "
-            "it is broken"
-        )
+        found = f"promises {size} bytes, found a file of {file.size} bytes"
+        raise InputError(f"{file.path}: image {number} {found}; it is broken")
     return size
 
 

@@ -47,13 +47,9 @@ class LasHeader:
         fields["class"] = ("u1", CLASS_BYTE_OLD if self.point_format < 6 else CLASS_BYTE)
         if self.has_colors:
             fields["rgb"] = ("3<u2", COLORS_BYTE[self.point_format])
+        kinds, begins = zip(*fields.values(), strict=True)
         return np.dtype(
-            {
-                "names": list(fields),
-                "formats": [kind for kind, _ in fields.values()],
-                "offsets": [begin for _, begin in fields.values()],
-                "itemsize": self.record_size,
-            }
+            {"names": [*fields], "formats": kinds, "offsets": begins, "itemsize": self.record_size}
         )
 
     @property
@@ -62,75 +58,40 @@ class LasHeader:
         return self.point_format in COLORS_BYTE
 
 
-def has_las_magic(head: bytes) -> bool:
-    """True if a file that begins with the bytes `head` says it is LAS or LAZ."""
-    return head.startswith(MAGIC)
-
-
 def read_header(path: Path) -> LasHeader:
     """The header of a LAS or LAZ file; InputError if it is broken or promises too much."""
     with path.open("rb") as file:
         head = file.read(MIN_HEADER_SIZE_1_4)
-    if not has_las_magic(head) or len(head) < MIN_HEADER_SIZE:
-        raise InputError(
-            f"{path}: begins with {head[:4]!r} and {len(head)} bytes, wanted 'LASF' and a header of "
-            f"{MIN_HEADER_SIZE} bytes or more"
-        )
+    if not head.startswith(MAGIC) or len(head) < MIN_HEADER_SIZE:
+        wanted = f"wanted 'LASF' and a header of {MIN_HEADER_SIZE} bytes or more"
+        raise InputError(f"{path}: begins with {head[:4]!r} and {len(head)} bytes, {wanted}")
     major, minor = head[24], head[25]
     header_size, points_offset, num_vlrs, format_id, record_size, num_points = struct.unpack_from(
         "<HIIBHI", head, 94
     )
-    if minor >= 4 and len(head) == MIN_HEADER_SIZE_1_4:
-        num_points = struct.unpack_from("<Q", head, 247)[0] or num_points
-    header = LasHeader(
-        path=path,
-        size=path.stat().st_size,
-        header_size=header_size,
-        points_offset=points_offset,
-        num_vlrs=num_vlrs,
-        point_format=format_id & ~COMPRESSED_BIT,
-        record_size=record_size,
-        num_points=num_points,
-        scales=np.frombuffer(head, "<f8", 3, 131),
-        offsets=np.frombuffer(head, "<f8", 3, 155),
-        is_compressed=bool(format_id & COMPRESSED_BIT),
-    )
+    if minor >= 4:
+        num_points = int.from_bytes(head[247:255], "little") or num_points
+    scales, offsets = np.frombuffer(head, "<f8", 6, 131).reshape(2, 3)
+    size, point_format, is_compressed = path.stat().st_size, format_id & ~COMPRESSED_BIT, format_id >= 0x80
     if major != 1 or minor > 5:
         raise InputError(f"{path}: found LAS {major}.{minor}, wanted LAS 1.0 to 1.5")
     least = MIN_HEADER_SIZE_1_4 if minor >= 4 else MIN_HEADER_SIZE
-    if not least <= header_size <= points_offset <= header.size:
-        raise InputError(
-            f"{path}: a header of {header_size} bytes and points from byte {points_offset} on, wanted a "
-            f"header of {least} or more and points behind it, within the file's {header.size} bytes"
-        )
-    _check_header(header)
-    return header
-
-
-def _check_header(header: LasHeader) -> None:
-    """Refuse what no points could make right."""
-    path = header.path
-    if header.point_format not in RECORD_SIZES:
-        raise InputError(f"{path}: unknown point format {header.point_format}, {WANTED}")
-    least = RECORD_SIZES[header.point_format]
-    if header.record_size < least:
-        raise InputError(
-            f"{path}: records of {header.record_size} bytes, wanted {least} or more in point format "
-            f"{header.point_format}"
-        )
-    if not (np.isfinite(header.scales).all() and np.isfinite(header.offsets).all() and header.scales.all()):
-        raise InputError(
-            f"{path}: scales {_listed(header.scales)} and offsets {_listed(header.offsets)}, wanted finite "
-            "ones and no scale of 0"
-        )
-    if header.num_points == 0:
-        raise InputError(f"{path}: the header promises 0 points, wanted a coloured cloud")
-    room = (header.size - header.points_offset) // header.record_size
-    if not header.is_compressed and header.num_points > room:
-        raise InputError(
-            f"{path}: the header promises {header.num_points} points of {header.record_size} bytes, found "
-            f"room for {room}; the file is cut off or broken"
-        )
+    if not least <= header_size <= points_offset <= size:
+        found = f"a header of {header_size} bytes and points from byte {points_offset} on"
+        raise InputError(f"{path}: {found}, wanted {least} or more and points within the file's {size} bytes")
+    least = RECORD_SIZES.get(point_format, 0)
+    if least == 0 or record_size < least:
+        wrong = f"records of {record_size} bytes, wanted {least} or more in point format {point_format}"
+        raise InputError(f"{path}: {wrong if least else f'unknown point format {point_format}, {WANTED}'}")
+    if not (np.isfinite([scales, offsets]).all() and scales.all()):
+        found = f"scales {_listed(scales)} and offsets {_listed(offsets)}"
+        raise InputError(f"{path}: {found}, wanted finite ones and no scale of 0")
+    room = (size - points_offset) // record_size
+    if num_points == 0 or (num_points > room and not is_compressed):
+        promised = f"promises {num_points} points of {record_size} bytes, found room for {room}"
+        raise InputError(f"{path}: the header {promised}; the file is cut off or broken")
+    sizes = size, header_size, points_offset, num_vlrs, point_format, record_size, num_points
+    return LasHeader(path, *sizes, scales, offsets, is_compressed)
 
 
 def _listed(values: NDArray[np.float64]) -> str:

@@ -6,7 +6,7 @@ the file first.
 
 import io
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...runtime.optional import import_optional
 from .las_header import RECORD_SIZES, LasHeader
+from .reader import quoted
 
 OFFSET_SIZE = 8  # [byte] of the chunk table's offset, in front of the first chunk
 MAX_ENTRY_SIZE = 32  # [byte], more than an entry of the table can take
@@ -37,17 +38,16 @@ LazChunk = tuple[int, int]  # points, bytes
 
 
 @dataclass(frozen=True)
-class Compression:
+class LasLayout:
     """Where a file's chunks are and how to read them."""
 
     offset: int  # [byte] of the first chunk
     chunks: tuple[LazChunk, ...]
-    laszip: bytes  # the record that describes the compression, as lazrs takes it
-    record_size: int  # [byte]
-    num_layers: int  # 0 if the points are not in layers
+    laszip: bytes = b""  # the record that describes the compression, as lazrs takes it; empty without
+    num_layers: int = 0  # 0 if the points are not in layers
 
 
-def read_compression(header: LasHeader) -> Compression:
+def read_laz_layout(header: LasHeader) -> LasLayout:
     """The compression of a LAZ file; InputError if its parts don't fit together or in the file."""
     lazrs = import_optional(header.path, "lazrs")
     with header.path.open("rb") as file:
@@ -61,8 +61,7 @@ def read_compression(header: LasHeader) -> Compression:
         if not vlr.uses_variable_size_chunks():
             entries = [(vlr.chunk_size(), size) for _, size in entries]
     offset = header.points_offset + OFFSET_SIZE
-    chunks = _checked_chunks(header, entries, table_offset - offset)
-    return Compression(offset, chunks, laszip, header.record_size, num_layers)
+    return LasLayout(offset, _checked_chunks(header, entries, table_offset - offset), laszip, num_layers)
 
 
 def _laszip_record(header: LasHeader, file: BinaryIO) -> bytes:
@@ -84,10 +83,8 @@ def _check_items(header: LasHeader, laszip: bytes, lazrs: ModuleType) -> int:
     num_extra = header.record_size - RECORD_SIZES[header.point_format]
     expected = lazrs.LazVlr.new_for_compression(header.point_format, num_extra, False).record_data()
     if _without_versions(laszip[: len(expected)]) != _without_versions(expected):
-        raise InputError(
-            f"{header.path}: LASzip's record is not that of point format {header.point_format} in "
-            f"{header.record_size} bytes, as LASzip 2 and later write it; it is broken or too old"
-        )
+        what = f"point format {header.point_format} in {header.record_size} bytes"
+        raise InputError(f"{header.path}: LASzip's record is not that of {what}: it is broken or too old")
     return NUM_LAYERS[header.point_format] + num_extra if header.point_format >= 6 else 0
 
 
@@ -101,11 +98,10 @@ def _table_offset(header: LasHeader, file: BinaryIO) -> int:
     """Where the chunk table begins. A writer that could not go back says it in the file's last bytes."""
     for position in (header.points_offset, header.size - 8):
         file.seek(position)
-        number = file.read(8)
-        offset = int.from_bytes(number, "little", signed=True)
-        if len(number) == 8 and header.points_offset + OFFSET_SIZE <= offset <= header.size - 8:
+        offset = int.from_bytes(file.read(8), "little", signed=True)
+        if header.points_offset + OFFSET_SIZE <= offset <= header.size - 8:
             return offset
-        if len(number) == 8 and offset > header.points_offset:
+        if offset > header.points_offset:
             break
     raise InputError(f"{header.path}: no chunk table within the file; it is cut off or broken")
 
@@ -117,9 +113,8 @@ def _table(header: LasHeader, file: BinaryIO, offset: int) -> bytes:
     # each chunk begins with a whole point
     max_chunks = (offset - header.points_offset - OFFSET_SIZE) // header.record_size
     if not 0 < num_chunks <= max_chunks:
-        raise InputError(
-            f"{header.path}: the chunk table promises {num_chunks} chunks, wanted 1 to {max_chunks}; {BROKEN}"
-        )
+        counts = f"promises {num_chunks} chunks, wanted 1 to {max_chunks}"
+        raise InputError(f"{header.path}: the chunk table {counts}; {BROKEN}")
     file.seek(offset)
     return file.read(MAX_ENTRY_SIZE * (num_chunks + 32))
 
@@ -127,64 +122,52 @@ def _table(header: LasHeader, file: BinaryIO, offset: int) -> bytes:
 def _checked_chunks(header: LasHeader, entries: list[LazChunk], num_bytes: int) -> tuple[LazChunk, ...]:
     """The chunks that hold the promised points, the last no more than is left."""
     chunks: list[LazChunk] = []
-    num_left = header.num_points
-    max_count = MAX_CHUNK_SIZE // header.record_size
+    num_left, most = header.num_points, MAX_CHUNK_SIZE // header.record_size
     for full_count, size in entries:
         if num_left == 0:
             break
         count = min(full_count, num_left)
-        if not (0 < count <= max_count and header.record_size <= size <= num_bytes):
-            raise InputError(
-                f"{header.path}: chunk {len(chunks) + 1} of {count} points in {size} bytes, wanted 1 to "
-                f"{max_count} points and within the file; the chunk table is broken"
-            )
+        if not (0 < count <= most and header.record_size <= size <= num_bytes):
+            where = f"{header.path}: chunk {len(chunks) + 1} of {count} points in {size} bytes"
+            raise InputError(f"{where}, wanted 1 to {most} points, in the file; the chunk table is broken")
         chunks.append((count, size))
-        num_left -= count
-        num_bytes -= size
+        num_left, num_bytes = num_left - count, num_bytes - size
     if num_left:
-        raise InputError(
-            f"{header.path}: the header promises {header.num_points} points, the chunk table has "
-            f"{header.num_points - num_left}"
-        )
+        counts = f"promises {header.num_points} points, the chunk table has {header.num_points - num_left}"
+        raise InputError(f"{header.path}: the header {counts}")
     return tuple(chunks)
 
 
 def decompress(
-    path: Path, compression: Compression, data: bytes, chunks: Iterable[LazChunk]
+    header: LasHeader, layout: LasLayout, data: bytes, chunks: Sequence[LazChunk]
 ) -> NDArray[np.uint8]:
     """The records, one after the other, of the `chunks` whose compressed bytes are `data`."""
-    lazrs = import_optional(path, "lazrs")
-    chunks = list(chunks)
-    if compression.num_layers:
-        _check_layers(path, compression, data, chunks)
-    records = np.empty(sum(count for count, _ in chunks) * compression.record_size, dtype=np.uint8)
-    selected = 0
-    for name in SELECTED:
-        selected |= getattr(lazrs, f"SELECTIVE_DECOMPRESS_{name}")
-    with _refusing(path, lazrs):
+    lazrs = import_optional(header.path, "lazrs")
+    if layout.num_layers:
+        _check_layers(header, layout.num_layers, data, chunks)
+    records = np.empty(sum(count for count, _ in chunks) * header.record_size, dtype=np.uint8)
+    selected = sum(getattr(lazrs, f"SELECTIVE_DECOMPRESS_{name}") for name in SELECTED)
+    with _refusing(header.path, lazrs):
         lazrs.decompress_points_with_chunk_table(
-            data, compression.laszip, records, chunks, lazrs.DecompressionSelection(selected)
+            data, layout.laszip, records, list(chunks), lazrs.DecompressionSelection(selected)
         )
     return records
 
 
-def _check_layers(path: Path, compression: Compression, data: bytes, chunks: Iterable[LazChunk]) -> None:
+def _check_layers(header: LasHeader, num_layers: int, data: bytes, chunks: Sequence[LazChunk]) -> None:
     """Refuse layers larger than the chunk they lie in, and another number of points than was promised.
 
     A chunk is a whole point, the number of points, the bytes of each layer, the layers.
     """
-    begin = 0
-    head_size = compression.record_size + 4 * (1 + compression.num_layers)
+    begin, head_size = 0, header.record_size + 4 * (1 + num_layers)
     for num_points, size in chunks:
         if size < head_size:
-            raise InputError(f"{path}: a chunk of {size} bytes, wanted {head_size} or more; {BROKEN}")
-        head = data[begin + compression.record_size : begin + head_size]
-        found, *layers = np.frombuffer(head, dtype="<u4").tolist()
+            raise InputError(f"{header.path}: a chunk of {size} bytes, wanted {head_size} or more; {BROKEN}")
+        found, *layers = np.frombuffer(data, "<u4", 1 + num_layers, begin + header.record_size).tolist()
         if sum(layers) > size - head_size or found != num_points:
-            raise InputError(
-                f"{path}: a chunk of {found} points with layers of {sum(layers)} bytes, wanted "
-                f"{num_points} points and {size - head_size} bytes at most; {BROKEN}"
-            )
+            what = f"a chunk of {found} points with layers of {sum(layers)} bytes"
+            most = f"wanted {num_points} points and {size - head_size} bytes at most"
+            raise InputError(f"{header.path}: {what}, {most}; {BROKEN}")
         begin += size
 
 
@@ -193,9 +176,9 @@ def _refusing(path: Path, lazrs: ModuleType) -> Iterator[None]:
     """Turn what lazrs says of broken data into an InputError."""
     try:
         yield
-    except lazrs.LazrsError as error:
-        raise InputError(f"{path}: the compressed points are broken ({error})") from error
     except BaseException as error:  # a panic in Rust: no Exception, and of a class that can't be imported
-        if type(error).__name__ != "PanicException":
+        if not isinstance(error, lazrs.LazrsError) and type(error).__name__ != "PanicException":
             raise
-        raise InputError(f"{path}: the compressed points are broken") from error
+        raise InputError(
+            f"{path}: the compressed points are broken ({quoted(str(error).encode())})"
+        ) from error

@@ -4,6 +4,7 @@ Coordinates are taken as they stand in the file, after its own scene graph: a gl
 unit. trimesh reads the files; what it would pass over in silence is checked before and after.
 """
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,9 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...geometry.pose import Array
 from .colors import BRIGHTEST
-from .mesh_gltf import NO_MATERIAL, has_glb_magic
+from .mesh_gltf import GLB_MAGIC, NO_MATERIAL
 from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply
-from .mesh_sampling import Sampling, Surface, SurfaceInstance
+from .mesh_sampling import Surface, SurfaceInstance, sample_points
 from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource
 
 DENSITY = 10_000.0  # points on a square metre, 1 cm apart
@@ -33,9 +34,8 @@ def open_mesh(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     colours are left out, with a warning.
     """
     content = path.read_bytes()
-    if has_glb_magic(content) or path.suffix.lower() in (".glb", ".gltf"):
-        return _source(load_gltf(path, content), options.scale)
-    return _source(load_obj(path, content), options.scale)
+    is_gltf = content.startswith(GLB_MAGIC) or path.suffix.lower() in (".glb", ".gltf")
+    return _source((load_gltf if is_gltf else load_obj)(path, content), options.scale)
 
 
 def open_ply_mesh(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
@@ -65,11 +65,10 @@ def _source(loaded: Loaded, scale: float) -> PointSource:
     if num_points == 0:
         raise InputError(f"{path}: an area of {area:.2g} square metres, too small for points; set --units")
     if area * DENSITY > MAX_POINTS:
-        notes.append(
-            f"{path}: {area:.3g} square metres of surface, sampled with {num_points / area:.3g} points on "
-            f"each instead of {DENSITY:.0f}"
-        )
-    return PointSource(path, Sampling(instances, ends, num_points).read, num_points, tuple(notes))
+        density = f"{num_points / area:.3g} points on each instead of {DENSITY:.0f}"
+        notes.append(f"{path}: {area:.3g} square metres of surface, sampled with {density}")
+    read_chunks = partial(sample_points, instances, ends, num_points)
+    return PointSource(path, read_chunks, num_points, tuple(notes))
 
 
 def _instances(loaded: Loaded) -> tuple[list[SurfaceInstance], list[str]]:
@@ -114,15 +113,11 @@ def _surface(loaded: Loaded, mesh: Any) -> Surface | None:
     if not len(triangles):
         return None
     if (vertices.shape[1:], triangles.shape[1:]) != ((3,), (3,)):
-        raise InputError(
-            f"{loaded.path}: vertices of shape {vertices.shape} and triangles of shape {triangles.shape}, "
-            "wanted three numbers each"
-        )
+        found = f"vertices of shape {vertices.shape} and triangles of shape {triangles.shape}"
+        raise InputError(f"{loaded.path}: {found}, wanted three numbers each")
     if triangles.min() < 0 or triangles.max() >= len(vertices):
-        raise InputError(
-            f"{loaded.path}: a face names vertex {triangles.max()} (from {triangles.min()}), found "
-            f"{len(vertices)} vertices"
-        )
+        named = f"a face names vertex {triangles.max()} (from {triangles.min()})"
+        raise InputError(f"{loaded.path}: {named}, found {len(vertices)} vertices")
     if loaded.materials is not None:
         return _gltf_surface(loaded, mesh, vertices, triangles)
     material = getattr(mesh.visual, "material", None)
@@ -195,4 +190,9 @@ def _fractions(path: Path, raw: Any, count: int) -> Array:
     return np.asarray(fractions, dtype=np.float64)
 
 
-MESH = CloudFormat("OBJ, GLB and glTF meshes", frozenset({".obj", ".glb", ".gltf"}), has_glb_magic, open_mesh)
+MESH = CloudFormat(
+    "OBJ, GLB and glTF meshes",
+    frozenset({".obj", ".glb", ".gltf"}),
+    lambda head: head.startswith(GLB_MAGIC),
+    open_mesh,
+)

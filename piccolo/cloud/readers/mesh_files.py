@@ -24,28 +24,21 @@ class FolderResolver:
 
     def get(self, name: str) -> bytes:
         """The content of a file, by the name that the mesh gives it."""
-        try:
-            return self._content(name)
-        except InputError as refusal:
-            self.refusal = self.refusal or refusal
-            raise
-
-    __getitem__ = get
-
-    def _content(self, name: str) -> bytes:
-        folder, short = self.path.parent.resolve(), ascii(name[:100])
+        folder, problem = self.path.parent.resolve(), ""
         try:
             file = (folder / name.strip().replace("\\", "/")).resolve()  # names may be written on Windows
             if ":" in name or not file.is_relative_to(folder):  # ':' of a drive or a URL
-                raise InputError(
-                    f"{self.path}: names the file {short}, wanted names in the mesh's own folder or below"
-                )
-            if not file.is_file():
-                raise InputError(f"{self.path}: names the file {short}, which is not in its folder")
-            if file not in self._contents:
+                problem = ", wanted names in the mesh's own folder or below"
+            elif not file.is_file():
+                problem = ", which is not in its folder"
+            elif file not in self._contents:
                 self._contents[file] = file.read_bytes()
-        except InputError:
-            raise
         except (OSError, ValueError, RuntimeError) as error:
-            raise InputError(f"{self.path}: names the file {short} ({error})") from error
+            problem = f" ({error})"
+        if problem:
+            refusal = InputError(f"{self.path}: names the file {name[:100]!a}{problem}")
+            self.refusal = self.refusal or refusal
+            raise refusal
         return self._contents[file]
+
+    __getitem__ = get

@@ -48,15 +48,11 @@ class Material:
 NO_MATERIAL = Material()  # of primitives without one, the first of all
 
 
-def has_glb_magic(head: bytes) -> bool:
-    """True if a file that begins with the bytes `head` says it is GLB."""
-    return head.startswith(GLB_MAGIC)
-
-
 def sanitize_gltf(content: bytes, resolver: FolderResolver) -> tuple[bytes, list[Material]]:
     """A checked glTF or GLB file with triangles, base colours and nodes only; materials, by rows as named."""
     path = resolver.path
-    head, text, data = _glb_parts(path, content) if has_glb_magic(content) else (b"", content, b"")
+    is_glb = content.startswith(GLB_MAGIC)
+    head, text, data = _glb_parts(path, content) if is_glb else (b"", content, b"")
     try:
         tree = json.loads(text)
         _check_version(path, tree)
@@ -104,10 +100,8 @@ def _num_bytes_of_files(tree: Json, resolver: FolderResolver) -> int:
                 continue
             name = entry["uri"] = unquote(entry["uri"])
             if kind == "buffers" and len(resolver[name]) < _count(entry["byteLength"]):
-                raise InputError(
-                    f"{resolver.path}: the buffer {name[:100]!a} has {len(resolver[name])} of "
-                    f"{entry['byteLength']} bytes, {WANTED}"
-                )
+                counts = f"has {len(resolver[name])} of {entry['byteLength']} bytes"
+                raise InputError(f"{resolver.path}: the buffer {name[:100]!a} {counts}, {WANTED}")
     return resolver.num_bytes
 
 

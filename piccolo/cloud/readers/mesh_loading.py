@@ -13,7 +13,7 @@ from typing import Any
 from ...errors import InputError
 from ...runtime.optional import import_optional
 from .mesh_files import FolderResolver
-from .mesh_gltf import Material, has_glb_magic, sanitize_gltf
+from .mesh_gltf import GLB_MAGIC, Material, sanitize_gltf
 from .mesh_texture import Texture, check_image, first_line, own_limit, texture_of
 
 WANTED = "wanted a mesh with textures, vertex colours or materials"
@@ -51,7 +51,8 @@ def load_gltf(path: Path, content: bytes) -> Loaded:
     """A glTF or GLB file."""
     resolver = FolderResolver(path)
     sanitized, materials = sanitize_gltf(content, resolver)
-    return Loaded(path, _scene(resolver, sanitized, "glb" if has_glb_magic(content) else "gltf"), materials)
+    kind = "glb" if content.startswith(GLB_MAGIC) else "gltf"
+    return Loaded(path, _scene(resolver, sanitized, kind), materials)
 
 
 def load_obj(path: Path, content: bytes) -> Loaded:
@@ -67,18 +68,13 @@ def load_obj(path: Path, content: bytes) -> Loaded:
     if odd:
         raise InputError(f"{path}: a face {odd[0][:40].decode('latin-1')!a}, wanted indices from 1 upwards")
     resolver = FolderResolver(path)
-    _check_libraries(resolver, content)
-    return Loaded(path, _scene(resolver, content, "obj"))
-
-
-def _check_libraries(resolver: FolderResolver, content: bytes) -> None:
-    """Refuse materials that trimesh would do without."""
-    names = sorted(set(LIBRARY_LINE.findall(content)))
+    names = set(LIBRARY_LINE.findall(content))
     if len(names) > 1:
-        raise InputError(f"{resolver.path}: names {len(names)} files of materials, wanted one")
-    for name in names:
+        raise InputError(f"{path}: names {len(names)} files of materials, wanted one")
+    for name in names:  # trimesh would do without
         text = resolver.get(name.decode()).decode("utf-8", "replace")
         _check_textures(resolver, TEXTURE_LINE.findall(text))
+    return Loaded(path, _scene(resolver, content, "obj"))
 
 
 def _check_textures(resolver: FolderResolver, names: list[str]) -> None:
@@ -126,9 +122,7 @@ def _strict() -> Iterator[None]:
     logger.setLevel(logging.CRITICAL + 1)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        warnings.filterwarnings(
-            "error", message="string or file could not be read", category=DeprecationWarning
-        )
+        warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
         try:
             yield
         finally:

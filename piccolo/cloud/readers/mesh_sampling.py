@@ -56,44 +56,32 @@ class SurfaceInstance:
         return areas
 
 
-@dataclass(frozen=True)
-class Sampling:
-    """How many points fall on which surface."""
-
-    instances: Sequence[SurfaceInstance]
-    ends: Array  # (P,) area up to the end of each instance
-    num_points: int
-
-    def read(self) -> Iterator[RawCloud]:
-        """Yield the points of one surface after the other, at most CHUNK at once."""
-        area_per_point = float(self.ends[-1]) / self.num_points
-        # the first point at or behind each instance's end
-        behind = np.ceil(self.ends / area_per_point - 0.5).astype(np.int64)
-        behind[-1] = self.num_points
-        last: Texture | None = None
-        texels: NDArray[np.uint8] | None = None
-        for i, instance in enumerate(self.instances):
-            first, end = (int(behind[i - 1]) if i else 0), int(behind[i])
-            if first == end:
-                continue
-            texture = instance.surface.texture
-            if texture is not last:
-                texels = None  # before the next is decoded
-                texels = texture.texels() if texture else None
-                last = texture
-            area_up_to = np.add.accumulate(instance.areas())
-            area_before = float(self.ends[i - 1]) if i else 0.0
-            for begin in range(first, end, CHUNK):
-                k = np.arange(begin, min(begin + CHUNK, end))
-                areas = np.asarray((k + 0.5) * area_per_point - area_before, dtype=np.float64)
-                yield _points(instance, k, _triangles_at(area_up_to, areas), texels)
-
-
-def _triangles_at(area_up_to: Array, areas: Array) -> NDArray[np.int64]:
-    """The triangles (N,) at `areas` (N,) of the running sum `area_up_to` (T,): never one of area 0."""
-    last = int(np.searchsorted(area_up_to, area_up_to[-1]))  # rounding may put an area behind all ends
-    found = np.searchsorted(area_up_to, areas, side="right")
-    return np.minimum(found, last)
+def sample_points(instances: Sequence[SurfaceInstance], ends: Array, num_points: int) -> Iterator[RawCloud]:
+    """Yield points of one surface after the other, at most CHUNK at once; `ends` (P,) are sums of areas."""
+    area_per_point = float(ends[-1]) / num_points
+    # the first point at or behind each instance's end
+    behind = np.ceil(ends / area_per_point - 0.5).astype(np.int64)
+    behind[-1] = num_points
+    last: Texture | None = None
+    texels: NDArray[np.uint8] | None = None
+    for i, instance in enumerate(instances):
+        first, end = (int(behind[i - 1]) if i else 0), int(behind[i])
+        if first == end:
+            continue
+        texture = instance.surface.texture
+        if texture is not last:
+            texels = None  # before the next is decoded
+            texels = texture.texels() if texture else None
+            last = texture
+        area_up_to = np.add.accumulate(instance.areas())
+        # rounding may put an area behind all ends; never a triangle of area 0
+        last_row = int(np.searchsorted(area_up_to, area_up_to[-1]))
+        area_before = float(ends[i - 1]) if i else 0.0
+        for begin in range(first, end, CHUNK):
+            k = np.arange(begin, min(begin + CHUNK, end))
+            areas = (k + 0.5) * area_per_point - area_before
+            rows = np.minimum(np.searchsorted(area_up_to, areas, side="right"), last_row)
+            yield _points(instance, k, rows, texels)
 
 
 def weights_of(k: NDArray[np.int64]) -> Array:
@@ -128,10 +116,8 @@ def _points(
 
 def _blend(values: Array, corners: NDArray[np.int64], weights: Array) -> Array:
     """Values (N, D) between those at the corners (N, 3)."""
-    blended = values[corners[:, 0]] * weights[:, :1]
-    for i in (1, 2):
-        blended += values[corners[:, i]] * weights[:, i : i + 1]
-    return blended
+    a, b, c = (values[corners[:, i]] * weights[:, i : i + 1] for i in range(3))
+    return np.asarray(a + b + c)
 
 
 def look_up(texels: NDArray[np.uint8], uv: Array) -> NDArray[np.uint8]:
@@ -141,15 +127,13 @@ def look_up(texels: NDArray[np.uint8], uv: Array) -> NDArray[np.uint8]:
     turned -= np.floor(turned)
     columns = np.minimum((turned[:, 0] * width).astype(np.int64), width - 1)  # 1 - 1e-17 is 1
     rows = np.minimum((turned[:, 1] * height).astype(np.int64), height - 1)
-    found: NDArray[np.uint8] = texels[rows, columns]
-    return found
+    return np.asarray(texels[rows, columns])
 
 
 def srgb_to_linear(colors: NDArray[np.uint8]) -> Array:
     """Linear light in [0, 1] of sRGB bytes (IEC 61966-2-1)."""
     levels = np.arange(256) / 255.0
-    linear: Array = np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
-    return linear[colors]
+    return np.asarray(np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)[colors])
 
 
 def linear_to_srgb(linear: Array) -> Array:

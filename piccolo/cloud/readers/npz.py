@@ -8,12 +8,12 @@ import errno
 import math
 import warnings
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Literal
 
 import numpy as np
 from numpy.lib import format as npy
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from .colors import BRIGHTEST, brightest_of, colored_chunks
 from .fixed_records import in_chunks, read_records
-from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, RawCloud, point_label, quoted
+from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, point_label, quoted
 
 NPY_MAGIC, ZIP_MAGIC = b"\x93NUMPY", b"PK\x03\x04"
 ZIP_NAME_AT = 30  # [byte] in an archive: the name of its first member
@@ -30,6 +30,7 @@ MAX_HEADER_SIZE = 4096  # [byte] of an array's header
 MAX_RATIO = 200  # unpacked to packed; real scans stay below 10, deflate could reach 1032
 MAX_UNPACKED = 1 << 34  # [byte] of an archive's arrays, which are read whole
 POINTS_NAMES, COLORS_NAMES = ("points", "xyz"), ("colors", "rgb")
+Parts = Iterable[tuple[NDArray[Any], NDArray[Any]]]
 WANTED = "wanted .npy of x y z r g b (N, 6) with colours 0-255, or .npz with points (N, 3) and colors (N, 3)"
 
 
@@ -56,9 +57,8 @@ class ArrayInFile:
         with _damage_named(self.path), _open(self.path, self.member) as file:
             file.read(self.offset)  # not seek, so that the checksum covers all
             content = file.read(math.prod(self.shape) * self.dtype.itemsize)
-            array = np.frombuffer(content, self.dtype).reshape(
-                self.shape, order="F" if self.is_fortran else "C"
-            )
+            order: Literal["F", "C"] = "F" if self.is_fortran else "C"
+            array = np.frombuffer(content, self.dtype).reshape(self.shape, order=order)
         for (rows,) in in_chunks([array]):
             yield rows
 
@@ -68,12 +68,8 @@ def open_npy(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     array = _open_array(path, None, path.stat().st_size)
     if len(array.shape) != 2 or array.shape[1] != 6 or array.dtype.kind not in "fiu":
         raise InputError(f"{path}: {array}, {WANTED}")
-
-    def read_chunks() -> Iterator[RawCloud]:
-        parts = ((rows[:, :3], rows[:, 3:]) for rows in array.read_rows())
-        return colored_chunks(parts, BRIGHTEST["u1"], partial(point_label, path))
-
-    return PointSource(path, read_chunks, array.shape[0])
+    brightest = BRIGHTEST["u1"]
+    return _source(path, lambda: ((rows[:, :3], rows[:, 3:]) for rows in array.read_rows()), brightest, array)
 
 
 def open_npz(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
@@ -86,17 +82,13 @@ def open_npz(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     if points.shape != colors.shape or points.shape[1:] != (3,) or points.dtype.kind not in "fiu":
         raise InputError(f"{path}: {points} and {colors}, {WANTED}")
     brightest = brightest_of(path, [colors.dtype.str[1:]])
-
-    def read_chunks() -> Iterator[RawCloud]:
-        parts = zip(points.read_rows(), colors.read_rows(), strict=True)
-        return colored_chunks(parts, brightest, partial(point_label, path))
-
-    return PointSource(path, read_chunks, points.shape[0])
+    return _source(path, lambda: zip(points.read_rows(), colors.read_rows(), strict=True), brightest, points)
 
 
-def has_npy_magic(head: bytes) -> bool:
-    """True if a file that begins with the bytes `head` is an array."""
-    return head.startswith(NPY_MAGIC)
+def _source(path: Path, read_parts: Callable[[], Parts], brightest: float, rows: ArrayInFile) -> PointSource:
+    """The points of chunks of positions and colours, as many as there are `rows`."""
+    locate = partial(point_label, path)
+    return PointSource(path, lambda: colored_chunks(read_parts(), brightest, locate), rows.shape[0])
 
 
 def has_npz_magic(head: bytes) -> bool:
@@ -137,15 +129,11 @@ def _members(path: Path) -> list[zipfile.ZipInfo]:
     infos = [members[name] for name in names]
     for info in infos:
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or info.flag_bits & 1:
-            raise InputError(
-                f"{path}: {quoted(info.filename.encode())} is encrypted or compressed in another way than "
-                "np.savez_compressed does"
-            )
+            name = quoted(info.filename.encode())
+            raise InputError(f"{path}: {name} is encrypted or compressed in another way than by NumPy")
     size, most = sum(info.file_size for info in infos), min(MAX_RATIO * path.stat().st_size, MAX_UNPACKED)
     if size > most:
-        raise InputError(
-            f"{path}: the archive promises {size} bytes, {most} at most are read; use .npy files"
-        )
+        raise InputError(f"{path}: the arrays promise {size} bytes, {most} at most are read; use .npy files")
     return infos
 
 
@@ -162,14 +150,13 @@ def _open_array(path: Path, member: str | None, size: int) -> ArrayInFile:
     array = ArrayInFile(path, member, shape, is_fortran, dtype, offset)
     if dtype.hasobject or dtype.itemsize == 0 or any(count < 0 for count in shape):
         raise InputError(f"{path}: {array}, {WANTED}")
-    promised = math.prod(shape) * dtype.itemsize
-    if promised != size - offset:
+    promised, found = math.prod(shape) * dtype.itemsize, size - offset
+    if promised != found:
         raise InputError(
-            f"{path}: an array's header promises {promised} bytes, found {size - offset}; "
-            "the file is cut off or broken"
+            f"{path}: an array promises {promised} bytes, found {found}; it is cut off or broken"
         )
     return array
 
 
-NPY = CloudFormat("NumPy .npy", frozenset({".npy"}), has_npy_magic, open_npy)
+NPY = CloudFormat("NumPy .npy", frozenset({".npy"}), lambda head: head.startswith(NPY_MAGIC), open_npy)
 NPZ = CloudFormat("NumPy .npz", frozenset({".npz"}), has_npz_magic, open_npz)

@@ -12,31 +12,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from .colors import brightest_of, color_names
-from .columns import ColumnReader, Columns, points_of, read_colored, read_scalar
+from .colors import color_names
+from .columns import ColumnReader, Columns, column_source, points_of
 from .fixed_records import in_chunks, read_records, take_records
-from .intensity import OPTION, intensity_reader
-from .labels import label_reader
+from .intensity import check_option
 from .lzf import MAX_RATIO, decompress_lzf
 from .number_lines import LineLayout, NumberLines
 from .pcd_header import WANTED, PcdField, PcdHeader, read_header
-from .reader import (
-    PLAIN,
-    ChunkReader,
-    CloudFormat,
-    CloudReadOptions,
-    PointSource,
-    RawCloud,
-    point_label,
-    quoted,
-)
+from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, RawCloud, point_label, quoted
 
 FIRST_LINES = re.compile(rb"(?:#[^\n]*\n|[ \t\r\n])*(?:# \.PCD|VERSION[ \t]+0?\.\d)")
 PADDING = "_"
+BROKEN = "the file is cut off or broken"
 PACKED_NAMES = ("rgb", "rgba")  # 0xAARRGGBB in one number
-PACKED_TYPES = ("f4", "u4", "i4")
 INTENSITY, LABEL = "intensity", "label"
 SCALAR_TYPES = ("f4", "f8", "u1", "u2", "u4", "i1", "i2", "i4")
+TYPES = {  # of fields that are not colours on their own
+    **dict.fromkeys("xyz", (("f4", "f8"), "float32 or float64")),
+    **dict.fromkeys(PACKED_NAMES, (("f4", "u4", "i4"), "uint32, int32 or float32")),
+    **dict.fromkeys((INTENSITY, LABEL), (SCALAR_TYPES, "numbers of 32 bits or float64")),
+}
 
 
 def open_pcd(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
@@ -52,48 +47,34 @@ def open_pcd(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     _check_size(header)
     read = {"ascii": _read_ascii, "binary": _read_binary, "binary_compressed": _read_compressed}
     read_columns = partial(read[header.encoding], header, fields)
-    read_chunks: ChunkReader = partial(_read_packed, header, fields[3].type, read_columns)
-    if options.labels:
-        read_chunks = label_reader(path, partial(read_scalar, read_columns), options.labels)
-    elif fields[3].name == INTENSITY:
-        read_chunks = intensity_reader(path, partial(read_scalar, read_columns))
-    elif len(fields) == 6:
-        brightest = brightest_of(path, [field.type for field in fields[3:]])
-        read_chunks = partial(read_colored, path, read_columns, brightest)
-    return PointSource(path, read_chunks, header.num_points)
-
-
-def has_pcd_magic(head: bytes) -> bool:
-    """True if a file that begins with the bytes `head` says it is PCD."""
-    return FIRST_LINES.match(head) is not None
+    if fields[3].name in PACKED_NAMES:
+        return PointSource(
+            path, partial(_read_packed, header, fields[3].type, read_columns), header.num_points
+        )
+    types = [field.type for field in fields[3:]]
+    return column_source(path, read_columns, types, header.num_points, options.labels)
 
 
 def _wanted_fields(header: PcdHeader, options: CloudReadOptions) -> tuple[PcdField, ...]:
     """The fields x y z and the colour's one or three, or the intensity or label if the options say so."""
     found = {field.name: field for field in header.fields if field.count == 1}
     names = [field.name for field in header.fields]
-    color = next(((name,) for name in PACKED_NAMES if name in found), color_names(found))
     if options.labels:
-        color = (LABEL,) if LABEL in found else ()
-    has_intensity = not color and INTENSITY in found and not options.labels
-    if has_intensity and options.intensity_as_gray:
-        color = (INTENSITY,)
-    if not all(names.count(axis) == 1 and axis in found for axis in "xyz") or not color:
-        wanted_fields = "wanted x y z and label" if options.labels else WANTED
+        more, wanted = (LABEL,) * (LABEL in found), "wanted x y z and label"
+    else:
+        color = next(((name,) for name in PACKED_NAMES if name in found), color_names(found))
+        more, wanted = color or (INTENSITY,) * (INTENSITY in found), WANTED
+    if not more or not all(names.count(axis) == 1 and axis in found for axis in "xyz"):
         listed = " ".join(names[:12]) or "none"
-        more = f"; has intensity and no colours, {OPTION}" if has_intensity else ""
-        raise InputError(f"{header.path}: the fields are {quoted(listed.encode())}, {wanted_fields}{more}")
-    wanted = tuple(found[name] for name in (*"xyz", *color))
-    for field in wanted[:4] if len(color) == 1 else wanted[:3]:
-        types: tuple[str, ...] = ("f4", "f8")
-        kinds = "float32 or float64"
-        if field.name in PACKED_NAMES:
-            types, kinds = PACKED_TYPES, "uint32, int32 or float32"
-        elif field.name in (INTENSITY, LABEL):
-            types, kinds = SCALAR_TYPES, "numbers of 32 bits or float64"
+        raise InputError(f"{header.path}: the fields are {quoted(listed.encode())}, {wanted}")
+    if more == (INTENSITY,):
+        check_option(header.path, options, WANTED)
+    fields = tuple(found[name] for name in (*"xyz", *more))
+    for field in fields:
+        types, kinds = TYPES.get(field.name, ((field.type,), ""))
         if field.type not in types:
             raise InputError(f"{header.path}: '{field.name}' is of type {field.type}, wanted {kinds}")
-    return wanted
+    return fields
 
 
 def _check_size(header: PcdHeader) -> None:
@@ -101,10 +82,8 @@ def _check_size(header: PcdHeader) -> None:
     found = header.path.stat().st_size - header.size
     promised = {"ascii": 0, "binary": header.row_size * header.num_points}.get(header.encoding, 8)
     if promised > found:
-        raise InputError(
-            f"{header.path}: the header promises {header.num_points} points in {promised} bytes or more, "
-            f"found {found} bytes; the file is cut off or broken"
-        )
+        counts = f"{header.num_points} points in {promised} bytes or more, found {found} bytes"
+        raise InputError(f"{header.path}: the header promises {counts}; {BROKEN}")
 
 
 def _read_ascii(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterator[Columns]:
@@ -114,16 +93,10 @@ def _read_ascii(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterator[Col
 
 
 def _read_binary(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterator[Columns]:
-    dtype = np.dtype(
-        {
-            "names": [field.name for field in fields],
-            "formats": ["<" + field.type for field in fields],
-            "offsets": [field.offset for field in fields],
-            "itemsize": header.row_size,
-        }
-    )
-    for records in read_records(header.path, header.size, header.num_points, dtype):
-        yield [records[field.name] for field in fields]
+    places = [("<" + field.type, field.offset) for field in fields]
+    row = np.dtype((np.void, header.row_size))
+    for records in read_records(header.path, header.size, header.num_points, row):
+        yield [records.getfield(*place) for place in places]
 
 
 def _read_compressed(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterator[Columns]:
@@ -134,22 +107,16 @@ def _read_compressed(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterato
         file.seek(header.size)
         packed_size, size = take_records(file, header.path, 2, np.dtype("<u4")).tolist()
         if packed_size > found or size > MAX_RATIO * packed_size or size != promised:
-            raise InputError(
-                f"{header.path}: {size} bytes packed into {packed_size}, found {found}, wanted "
-                f"{promised} for {header.num_points} points; the file is cut off or broken"
-            )
+            counts = f"found {found}, wanted {promised} for {header.num_points} points"
+            raise InputError(f"{header.path}: {size} bytes packed into {packed_size}, {counts}; {BROKEN}")
         packed = take_records(file, header.path, packed_size, np.dtype(np.uint8))
     table = np.empty(size, dtype=np.uint8)
     if decompress_lzf(packed, table) != size:
         raise InputError(f"{header.path}: the compressed data are broken, {WANTED}")
-    columns = {}
-    begin = 0
-    for field in kept:  # all points' values of a field, then those of the next
-        end = begin + field.size * header.num_points
-        if field in fields:
-            columns[field.name] = table[begin:end].view("<" + field.type)
-        begin = end
-    yield from in_chunks([columns[field.name] for field in fields])
+    # all points' values of a field, then those of the next
+    ends = np.cumsum([field.size * header.num_points for field in kept])
+    parts = dict(zip(kept, np.split(table, ends[:-1]), strict=True))
+    yield from in_chunks([parts[field].view("<" + field.type) for field in fields])
 
 
 def _read_packed(header: PcdHeader, type_: str, read_columns: ColumnReader) -> Iterator[RawCloud]:
@@ -158,15 +125,12 @@ def _read_packed(header: PcdHeader, type_: str, read_columns: ColumnReader) -> I
     for columns in read_columns():
         points_world, values = points_of(columns), columns[3]
         if header.encoding == "ascii":
-            bits, is_right = _bits_of_text(
-                np.where(np.isfinite(points_world).all(axis=1), values, 0.0), type_
-            )
+            has_position = np.isfinite(points_world).all(axis=1)
+            bits, is_right = _bits_of_text(np.where(has_position, values, 0.0), type_)
             if not is_right.all():
                 wrong = int(np.argmin(is_right))
-                raise InputError(
-                    f"{point_label(header.path, num_before + wrong)} has the colour {values[wrong]:g}, "
-                    f"wanted 32 bits of the type {type_}"
-                )
+                place = point_label(header.path, num_before + wrong)
+                raise InputError(f"{place} has the colour {values[wrong]:g}, wanted 32 bits of type {type_}")
         else:
             bits = np.ascontiguousarray(values).view(np.uint32)
         num_before += len(bits)
@@ -183,4 +147,6 @@ def _bits_of_text(values: NDArray[np.float64], type_: str) -> tuple[NDArray[np.u
     return np.where(is_right, values, 0.0).astype(np.int64).astype(np.uint32), is_right
 
 
-PCD = CloudFormat("PCD", frozenset({".pcd"}), has_pcd_magic, open_pcd, has_labels=True)
+PCD = CloudFormat(
+    "PCD", frozenset({".pcd"}), lambda head: bool(FIRST_LINES.match(head)), open_pcd, has_labels=True
+)

@@ -74,25 +74,19 @@ def read_header(path: Path) -> PcdHeader:
 
 def _fields(path: Path, entries: dict[str, list[str]]) -> tuple[PcdField, ...]:
     names = entries["FIELDS"]
-    sizes, types, counts = (
-        entries.get(key, [usual] * len(names))
-        for key, usual in (("SIZE", "4"), ("TYPE", "F"), ("COUNT", "1"))
-    )
+    usual = {"SIZE": "4", "TYPE": "F", "COUNT": "1"}
+    sizes, types, counts = (entries.get(key, [value] * len(names)) for key, value in usual.items())
     if not len(names) == len(sizes) == len(types) == len(counts):
-        raise InputError(
-            f"{path}: the header has {len(names)} FIELDS, {len(sizes)} of SIZE, {len(types)} of TYPE and "
-            f"{len(counts)} of COUNT, wanted as many of each"
-        )
+        found = f"{len(names)} FIELDS, {len(sizes)} of SIZE, {len(types)} of TYPE and {len(counts)} of COUNT"
+        raise InputError(f"{path}: the header has {found}, wanted as many of each")
     fields: list[PcdField] = []
     offset = column = 0
     for name, size, type_, text in zip(names, sizes, types, counts, strict=True):
         count = _count(text)
         if size not in ("1", "2", "4", "8") or type_ not in ("I", "U", "F") or not count:
             found = quoted(f"{name} {size} {type_} {text}".encode())
-            raise InputError(
-                f"{path}: a field has the name, SIZE, TYPE and COUNT {found}, wanted SIZE 1 2 4 or 8, "
-                "TYPE I U or F, COUNT 1 or more"
-            )
+            wanted = "wanted SIZE 1 2 4 or 8, TYPE I U or F, COUNT 1 or more"
+            raise InputError(f"{path}: a field has the name, SIZE, TYPE and COUNT {found}, {wanted}")
         fields.append(PcdField(name, type_.lower() + size, count, offset, column))
         offset += fields[-1].size
         column += count
@@ -104,17 +98,14 @@ def _fields(path: Path, entries: dict[str, list[str]]) -> tuple[PcdField, ...]:
 def _num_points(path: Path, entries: dict[str, list[str]]) -> int:
     """POINTS, or WIDTH x HEIGHT; both must be the same if both are there."""
     found = {key: entries[key] for key in ("WIDTH", "HEIGHT", "POINTS") if key in entries}
-    counts = {key: _count(words[0]) if len(words) == 1 else None for key, words in found.items()}
-    num_cells = (counts.get("WIDTH") or 0) * (counts.get("HEIGHT", 1) or 0)
-    num_points = counts.get("POINTS", num_cells)
-    is_complete = "POINTS" in counts or "WIDTH" in counts
-    if None in counts.values() or not is_complete or num_points is None:
+    counts = {key: _count(" ".join(words)) for key, words in found.items()}
+    if None in counts.values() or not counts.keys() & {"POINTS", "WIDTH"}:
         words = " ".join(f"{key} {' '.join(words)}" for key, words in found.items())
         raise InputError(f"{path}: the header counts the points by {quoted(words.encode())}, {WANTED}")
+    num_cells = (counts.get("WIDTH") or 0) * (counts.get("HEIGHT", 1) or 0)
+    num_points = counts.get("POINTS", num_cells) or 0
     if "WIDTH" in counts and num_cells != num_points:
-        raise InputError(
-            f"{path}: the header promises {num_points} points in a grid of {num_cells}, wanted as many"
-        )
+        raise InputError(f"{path}: the header promises {num_points} points in a grid of {num_cells}")
     return num_points
 
 

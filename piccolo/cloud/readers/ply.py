@@ -5,7 +5,7 @@ promises, and read ASCII and lists line by line in Python, so the numbers are re
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from io import BytesIO
@@ -15,19 +15,21 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from ...errors import InputError
-from .colors import COLOR_NAMES, brightest_of, color_names
-from .columns import Columns, read_colored, read_scalar
+from .colors import COLOR_NAMES, color_names
+from .columns import Columns, column_source
 from .fixed_records import read_records
-from .intensity import INTENSITY_NAMES, check_option, intensity_reader
-from .labels import LABEL_NAMES, label_reader
+from .intensity import INTENSITY_NAMES, check_option
+from .labels import LABEL_NAMES
 from .mesh import open_ply_mesh
 from .number_lines import LineLayout, NumberLines
 from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, quoted
 
+MAGIC = (b"ply\n", b"ply\r")
 MAX_HEADER_SIZE = 1 << 20  # [byte]
 LINE_ENDS = (b"\r\n", b"\n", b"\r")
 ELEMENT_LINE = re.compile(rb"^(\s*element[ \t]+\S+[ \t]+)(\S+)[ \t]*$", re.MULTILINE)
 WANTED = "wanted a PLY file whose vertices have x y z and red green blue"
+LABELS_WANTED = "wanted x y z and a label (label, class or classification, or these after scalar_)"
 MAX_COUNT_DIGITS = 15
 
 
@@ -41,25 +43,12 @@ class PlyHeader:
     byte_order: str  # '<' or '>', '=' in ASCII
     is_ascii: bool
     size: int  # [byte], the data begin here
-
-
-@dataclass(frozen=True)
-class Vertices:
-    """The vertices of a PLY file, and the properties that are wanted of them."""
-
-    header: PlyHeader
-    index: int  # of the element
-    names: tuple[str, ...]  # x y z and three colours, or x y z and intensity or label
+    index: int  # which element the vertices are
 
     @property
-    def element(self) -> PlyElement:
-        """The element in the header."""
-        return self.header.elements[self.index]
-
-    @property
-    def types(self) -> list[str]:
-        """The properties' types."""
-        return [self.element.ply_property(name).val_dtype for name in self.names]
+    def vertices(self) -> PlyElement:
+        """The element of the vertices."""
+        return self.elements[self.index]
 
 
 def open_ply(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
@@ -69,21 +58,16 @@ def open_ply(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     out. The file's size is compared with the header's counts before memory is reserved.
     """
     header = read_header(path)
-    index = vertex_index(header)
     if _has_faces(header):
         if options.labels:
             raise InputError(f"{path}: found a mesh, wanted points with labels")
         return open_ply_mesh(path, options)
-    vertices = Vertices(header, index, _property_names(header, index, options))
+    names = _property_names(header, options)
     if not header.is_ascii:
-        _rows_of(vertices)
-    columns = partial(read_columns, vertices)
-    read_chunks = intensity_reader(path, partial(read_scalar, columns))
-    if options.labels:
-        read_chunks = label_reader(path, partial(read_scalar, columns), options.labels)
-    elif len(vertices.names) > 4:
-        read_chunks = partial(read_colored, path, columns, brightest_of(path, vertices.types[3:]))
-    return PointSource(path, read_chunks, header.counts[index])
+        place_of_vertices(header)
+    types = [header.vertices.ply_property(name).val_dtype for name in names[3:]]
+    num_points = header.counts[header.index]
+    return column_source(path, partial(read_columns, header, names), types, num_points, options.labels)
 
 
 def _has_faces(header: PlyHeader) -> bool:
@@ -94,28 +78,30 @@ def _has_faces(header: PlyHeader) -> bool:
     for element in header.elements:
         for prop in element.properties:
             if prop.name in COLOR_NAMES[0] and prop.val_dtype not in ("u1", "f4", "f8"):
-                raise InputError(
-                    f"{header.path}: '{prop.name}' is of type {prop.val_dtype}, wanted uchar 0-255 or "
-                    "float 0-1 in a mesh"
-                )
+                wrong = f"'{prop.name}' is of type {prop.val_dtype}"
+                raise InputError(f"{header.path}: {wrong}, wanted uchar 0-255 or float 0-1 in a mesh")
     return True
 
 
-def has_ply_magic(head: bytes) -> bool:
-    """True if a file that begins with the bytes `head` says it is PLY."""
-    return head.startswith((b"ply\n", b"ply\r"))
-
-
-def read_columns(vertices: Vertices) -> Iterator[Columns]:
-    """Yield the columns of up to CHUNK vertices; those of an ASCII file are float64, whatever their type."""
-    return (_read_ascii if vertices.header.is_ascii else _read_binary)(vertices)
+def read_columns(header: PlyHeader, names: Sequence[str]) -> Iterator[Columns]:
+    """Yield the named columns of up to raw.CHUNK vertices, of an ASCII file float64 whatever their type."""
+    if not header.is_ascii:
+        for rows in read_records(header.path, *place_of_vertices(header)):
+            yield [rows[name] for name in names]
+        return
+    properties = [prop.name for prop in header.vertices.properties]
+    columns = tuple(properties.index(name) for name in names)
+    lines = NumberLines(header.path, LineLayout(columns, len(properties), header.size), WANTED)
+    lines.skip(sum(header.counts[: header.index]))
+    for rows in lines.read_rows(header.counts[header.index]):
+        yield list(rows.T)
 
 
 def read_header(path: Path) -> PlyHeader:
     """The header of a PLY file; InputError if it is broken."""
     with path.open("rb") as file:
         head = file.read(MAX_HEADER_SIZE)
-    if not has_ply_magic(head):
+    if not head.startswith(MAGIC):
         raise InputError(f"{path}: begins with {head[:4]!r}, wanted 'ply' and a line end")
     line_end = next(end for end in LINE_ENDS if head.startswith(b"ply" + end))
     size = head.find(line_end + b"end_header" + line_end)
@@ -134,86 +120,50 @@ def read_header(path: Path) -> PlyHeader:
         raise InputError(f"{path}: broken header ({quoted(str(error).encode())}), {WANTED}") from error
     if len(ply.elements) != len(counts):
         raise InputError(f"{path}: broken header (an element's line), {WANTED}")
-    return PlyHeader(
-        path, ply.elements, tuple(int(count) for count in counts), ply.byte_order, ply.text, size
-    )
+    index = _vertex_index(path, ply.elements)
+    return PlyHeader(path, ply.elements, tuple(map(int, counts)), ply.byte_order, ply.text, size, index)
 
 
-def vertex_index(header: PlyHeader) -> int:
+def _vertex_index(path: Path, elements: Sequence[PlyElement]) -> int:
     """Which element the vertices are; it and all before it have rows of a fixed length."""
-    names = [element.name for element in header.elements]
-    if "vertex" not in names:
-        raise InputError(f"{header.path}: the header has no element 'vertex', {WANTED}")
-    index = names.index("vertex")
-    for element in header.elements[: index + 1]:
+    for index, element in enumerate(elements):
         lists = [prop.name for prop in element.properties if isinstance(prop, PlyListProperty)]
         if lists:
-            raise InputError(
-                f"{header.path}: the element '{element.name}' has the list property '{lists[0]}', wanted "
-                "vertices without lists, before the elements that have them"
-            )
-    return index
+            found = f"the element '{element.name}' has the list property '{lists[0]}'"
+            raise InputError(f"{path}: {found}, wanted vertices without lists, before those that have them")
+        if element.name == "vertex":
+            return index
+    raise InputError(f"{path}: the header has no element 'vertex', {WANTED}")
 
 
-def _property_names(header: PlyHeader, index: int, options: CloudReadOptions) -> tuple[str, ...]:
-    """The vertices' properties for x, y, z, red, green, blue, or for x, y, z, intensity."""
-    found = {prop.name: prop.val_dtype for prop in header.elements[index].properties}
-    names = color_names(found)
+def _property_names(header: PlyHeader, options: CloudReadOptions) -> tuple[str, ...]:
+    """The vertices' properties for x, y, z and red, green, blue, or intensity, or label."""
+    found = [prop.name for prop in header.vertices.properties]
+    colors = () if options.labels else color_names(found)
+    scalars = [name for name in found if name.lower() in INTENSITY_NAMES]
     if options.labels:
-        return _labelled_names(header, found)
-    intensity = next((name for name in found if name.lower() in INTENSITY_NAMES), None)
-    if not all(axis in found for axis in "xyz") or not (names or intensity):
+        by_lower = {name.lower(): name for name in found}
+        scalars = [by_lower[name] for name in LABEL_NAMES if name in by_lower]
+    if not {*"xyz"} <= {*found} or not (colors or scalars):
         kind = "Gaussian splats without red green blue, " if "f_dc_0" in found else ""
-        raise InputError(
-            f"{header.path}: {kind}the vertices have {' '.join(list(found)[:9]) or 'no properties'}, {WANTED}"
-        )
-    if not names:
+        listed, wanted = " ".join(found[:9]) or "no properties", LABELS_WANTED if options.labels else WANTED
+        raise InputError(f"{header.path}: {kind}the vertices have {listed}, {wanted}")
+    if not colors and not options.labels:
         check_option(header.path, options, WANTED)
-    return (*"xyz", *(names or (str(intensity),)))
+    return (*"xyz", *(colors or scalars[:1]))
 
 
-def _labelled_names(header: PlyHeader, found: dict[str, str]) -> tuple[str, ...]:
-    """The vertices' properties for x, y, z, label."""
-    by_lower = {name.lower(): name for name in found}
-    label = next((by_lower[name] for name in LABEL_NAMES if name in by_lower), None)
-    if not all(axis in found for axis in "xyz") or label is None:
-        raise InputError(
-            f"{header.path}: the vertices have {' '.join(list(found)[:9]) or 'no properties'}, wanted x y z "
-            "and a label (label, class or classification, or these after scalar_)"
-        )
-    return (*"xyz", label)
-
-
-def _rows_of(vertices: Vertices) -> tuple[int, int, np.dtype[np.void]]:
+def place_of_vertices(header: PlyHeader) -> tuple[int, int, np.dtype[np.void]]:
     """Where the rows of a binary file begin [byte], how many there are, and what is in one."""
-    header, count = vertices.header, vertices.header.counts[vertices.index]
-    before = zip(header.elements[: vertices.index], header.counts, strict=False)
+    count = header.counts[header.index]
+    before = zip(header.elements[: header.index], header.counts, strict=False)
     offset = header.size + sum(count * element.dtype().itemsize for element, count in before)
-    dtype = vertices.element.dtype(header.byte_order)
+    dtype = header.vertices.dtype(header.byte_order)
     room = max(header.path.stat().st_size - offset, 0)
     if dtype.itemsize * count > room:
-        raise InputError(
-            f"{header.path}: the header promises {count} vertices of {dtype.itemsize} bytes, found {room} "
-            "bytes; the file is cut off or broken"
-        )
+        promised = f"promises {count} vertices of {dtype.itemsize} bytes, found {room} bytes"
+        raise InputError(f"{header.path}: the header {promised}; the file is cut off or broken")
     return offset, count, dtype
 
 
-def _read_binary(vertices: Vertices) -> Iterator[Columns]:
-    """Yield the columns of up to raw.CHUNK vertices."""
-    for rows in read_records(vertices.header.path, *_rows_of(vertices)):
-        yield [rows[name] for name in vertices.names]
-
-
-def _read_ascii(vertices: Vertices) -> Iterator[Columns]:
-    """Yield the columns of up to raw.CHUNK vertices."""
-    header = vertices.header
-    properties = [prop.name for prop in vertices.element.properties]
-    columns = tuple(properties.index(name) for name in vertices.names)
-    lines = NumberLines(header.path, LineLayout(columns, len(properties), header.size), WANTED)
-    lines.skip(sum(header.counts[: vertices.index]))
-    for rows in lines.read_rows(header.counts[vertices.index]):
-        yield list(rows.T)
-
-
-PLY = CloudFormat("PLY", frozenset({".ply"}), has_ply_magic, open_ply, has_labels=True)
+PLY = CloudFormat("PLY", frozenset({".ply"}), lambda head: head.startswith(MAGIC), open_ply, has_labels=True)

@@ -60,10 +60,8 @@ def open_ptx(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
         found = lines.skip(count)
         if found < count:
             found -= bool(found) and not _ends_with_a_line_end(path)
-            warnings.append(
-                f"{lines.locate(last_of_header)} ends a header that promises {count} points, found {found}; "
-                "the file may be cut off"
-            )
+            promised = f"ends a header that promises {count} points, found {found}"
+            warnings.append(f"{lines.locate(last_of_header)} {promised}; the file may be cut off")
         scans.append(PtxScan(found, T_world_from_scanner))
     if not scans:
         raise InputError(f"{path}: no line of numbers, {WANTED}")
@@ -89,17 +87,15 @@ def _take_header(lines: NumberLines) -> tuple[int, NDArray[np.float64]] | None:
             return None
         found = _numbers(line or b"", num_wanted)
         if found is None:
-            raise InputError(
-                f"{lines.locate(lines.num_taken - 1)} is {quoted(line or b'')}, wanted "
-                f"{'a count' if num_wanted == 1 else f'{num_wanted} numbers'} of a scan's header, {WANTED}"
-            )
+            wanted = "a count" if num_wanted == 1 else f"{num_wanted} numbers"
+            place = f"{lines.locate(lines.num_taken - 1)} is {quoted(line or b'')}"
+            raise InputError(f"{place}, wanted {wanted} of a scan's header, {WANTED}")
         numbers.append(found)
     matrix = np.array(numbers[-4:])
     if tuple(matrix[:, 3]) != AFFINE:
-        raise InputError(
-            f"{lines.locate(lines.num_taken - 1)} ends a matrix with the last column "
-            f"{' '.join(f'{value:g}' for value in matrix[:, 3])}, wanted 0 0 0 1"
-        )
+        column = " ".join(f"{value:g}" for value in matrix[:, 3])
+        place = f"{lines.locate(lines.num_taken - 1)} ends a matrix with the last column"
+        raise InputError(f"{place} {column}, wanted 0 0 0 1")
     return int(numbers[0][0]) * int(numbers[1][0]), matrix.T
 
 

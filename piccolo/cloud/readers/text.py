@@ -9,7 +9,6 @@ from .number_lines import COMMENT_MARKS, NUM_WITH_INTENSITY, LineLayout, is_numb
 from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, quoted
 
 TEXT_SUFFIXES = frozenset({".txt", ".xyz", ".asc", ".csv", ".xyzrgb"})
-USUAL_COLUMNS = (0, 1, 2, 3, 4, 5)
 HEAD_SIZE = 1 << 16  # bytes in which the header is looked for
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 WANTED = "wanted lines of numbers x y z r g b, with decimal points, colours 0-255"
@@ -49,17 +48,12 @@ def _layout(path: Path, head: bytes) -> LineLayout:
         raise InputError(f"{path}: no line of numbers at its beginning, {WANTED}")
     if not named and len(_names(header)) == len(fields):
         raise InputError(f"{path}: the columns are {quoted(header.encode())}, {WANTED}")
-    columns = named or _usual_columns(fields)
-    if len(fields) <= max(columns):
-        raise InputError(
-            f"{path}: line {num_lines + 1} has {len(fields)} columns (no colours?): {quoted(line)}, {WANTED}"
-        )
-    return LineLayout(columns, start=start, delimiter=_delimiter(text))
-
-
-def _usual_columns(fields: list[str]) -> tuple[int, ...]:
     has_intensity = len(fields) == NUM_WITH_INTENSITY and all(map(is_number, fields))
-    return USUAL_COLUMNS[:NUM_WITH_INTENSITY] if has_intensity else USUAL_COLUMNS
+    columns = named or tuple(range(NUM_WITH_INTENSITY if has_intensity else 6))
+    if len(fields) <= max(columns):
+        found = f"line {num_lines + 1} has {len(fields)} columns (no colours?): {quoted(line)}"
+        raise InputError(f"{path}: {found}, {WANTED}")
+    return LineLayout(columns, start=start, delimiter=_delimiter(text))
 
 
 def _delimiter(line: str) -> str | None:
