@@ -48,7 +48,7 @@ def jpeg(path, size=SIZE, seed=0):
 
 
 def pixels_and_points(pose, seed=0, num_points=200):
-    """Pixels (N, 2) and world points (N, 3) seen there, by piccolo/geometry/sphere.py, up to 80 degrees of elevation.
+    """Pixels (N, 2) and world points (N, 3) seen there, by sphere.py, up to 80 degrees of elevation.
 
     Nearer to a pole the rounding of UTM-size coordinates alone moves u by more than the tests allow.
     """

@@ -68,7 +68,10 @@ def test_a_folder_that_others_may_have_filled_is_not_trusted(folders, monkeypatc
 
 
 def test_files_unused_for_a_month_go_and_others_stay(tmp_path):
-    old, used, foreign, fresh = (tmp_path / name for name in ("0" * 32 + ".kernel", "1" * 32 + ".kernel", "a.txt", "2" * 32 + ".kernel"))
+    old, used, foreign, fresh = (
+        tmp_path / name
+        for name in ("0" * 32 + ".kernel", "1" * 32 + ".kernel", "a.txt", "2" * 32 + ".kernel")
+    )
     for path in (old, used, foreign):
         path.touch()
         os.utime(path, (0, 0))
@@ -76,7 +79,9 @@ def test_files_unused_for_a_month_go_and_others_stay(tmp_path):
     os.utime(fresh, (fresh.stat().st_mtime - 29 * 24 * 3600,) * 2)
     cache.mark_used(used)
     cache.remove_stale(tmp_path, kernel_cache.NAME)
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in (used, foreign, fresh))
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
+        path.name for path in (used, foreign, fresh)
+    )
 
 
 def test_a_flipped_byte_in_compiled_code_is_noticed(tmp_path, monkeypatch, caplog):
@@ -112,7 +117,12 @@ def test_a_flipped_byte_in_compiled_code_is_noticed(tmp_path, monkeypatch, caplo
 
 
 def test_importing_writes_nothing(tmp_path):
-    environment = {**os.environ, "HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
+    environment = {
+        **os.environ,
+        "HOME": str(tmp_path),
+        "XDG_CACHE_HOME": str(tmp_path / "cache"),
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
     command = [sys.executable, "-c", "import piccolo.cli.localize, piccolo.cli.evaluate"]
     subprocess.run(command, cwd=ROOT, env=environment, check=True)
     assert list(tmp_path.iterdir()) == []

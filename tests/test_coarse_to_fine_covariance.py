@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rooms
-from rooms import as_panorama, errors, query, room
+from rooms import as_panorama, errors, query
 
 from piccolo.cloud import stream_of
 from piccolo.cloud.readers.reader import RawCloud
@@ -113,7 +113,8 @@ def test_the_right_pose_is_a_sharp_local_minimum_and_wrong_ones_are_not(found):
 
 
 @pytest.mark.parametrize(
-    ("std", "agreement", "expected"), [(0.014, 0.0, True), (0.016, 0.54, False), (0.016, 0.56, True), (0.051, 1, False)]
+    ("std", "agreement", "expected"),
+    [(0.014, 0.0, True), (0.016, 0.54, False), (0.016, 0.56, True), (0.051, 1, False)],
 )
 def test_a_minimum_may_be_blunt_where_much_agrees(found, monkeypatch, std, agreement, expected):
     """The least constrained direction counts; a flat alternative, which fixes no pose, is none."""
@@ -147,9 +148,15 @@ def test_truth_is_among_the_poses_of_a_place_that_repeats(kind):
     cloud = stream_of(Path("repeated"), RawCloud(points.astype(float), colors))
     taken = make_query(world, 0, "clean", rooms.WIDTH, Workers(2))
     result = localize(
-        prepare_map(cloud, Workers(2)), as_panorama(taken.rgb), CoarseToFineSettings(), Workers(2), Stopwatch()
+        prepare_map(cloud, Workers(2)),
+        as_panorama(taken.rgb),
+        CoarseToFineSettings(),
+        Workers(2),
+        Stopwatch(),
     )
-    distances = [errors(pose, taken.pose)[0] for pose in (result.pose, *(h.pose for h in result.alternatives))]
+    distances = [
+        errors(pose, taken.pose)[0] for pose in (result.pose, *(h.pose for h in result.alternatives))
+    ]
     assert min(distances) < 0.1
     assert result.status == "ambiguous" or distances[0] < 0.1
     assert 1 <= len(result.alternatives) <= 5

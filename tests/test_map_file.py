@@ -25,7 +25,7 @@ def test_round_trip_and_a_file_cut_short(tmp_path):
 
 
 def test_a_file_outlives_other_sources_but_the_cache_does_not(tmp_path, monkeypatch):
-    """Its format alone says whether a file can be read; the cache makes a map anew where its makers changed."""
+    """Its format alone says whether a file can be read; the cache also goes by what made it."""
     cloud, built = tmp_path / "a.ply", tmp_path / "a.map"
     cloud.write_bytes(b"points")
     save_map(scan_map(1), built)

@@ -15,7 +15,8 @@ AT = np.array([1.0, 2.0, 1.5])
 
 def test_poses_are_close_only_if_near_and_turned_alike():
     a, b, c = (
-        Pose(yaw_rotation(np.radians(yaw)), np.array([x, 0.0, 0.0])) for x, yaw in ((0, 0), (0.2, 10), (0.2, 20))
+        Pose(yaw_rotation(np.radians(yaw)), np.array([x, 0.0, 0.0]))
+        for x, yaw in ((0, 0), (0.2, 10), (0.2, 20))
     )
     assert is_close(a, b, 0.3, np.radians(15))
     assert not is_close(a, c, 0.3, np.radians(15))
@@ -23,7 +24,10 @@ def test_poses_are_close_only_if_near_and_turned_alike():
 
 
 def test_rotation_without_a_loss_is_no_hypothesis():
-    loss = Loss(lambda points, pose: pose.R_cam_from_world[0, 0] if pose.R_cam_from_world[0, 0] > 0 else math.inf, None)
+    loss = Loss(
+        lambda points, pose: pose.R_cam_from_world[0, 0] if pose.R_cam_from_world[0, 0] > 0 else math.inf,
+        None,
+    )
     turns = np.stack([yaw_rotation(a) for a in np.radians([60, 0, 180])])
     np.testing.assert_allclose([h.score for h in losses_at(None, loss, AT, turns)], [-0.5, -1.0])
 

@@ -4,7 +4,7 @@ import pytest
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import angle_between
 from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
-from piccolo.paper.starts import box_grid, free_grid, is_free, farthest_point_sampling
+from piccolo.paper.starts import box_grid, farthest_point_sampling, free_grid, is_free
 
 
 def _hollow_box(seed=0, count=40_000):

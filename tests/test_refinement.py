@@ -1,7 +1,7 @@
 """Decisions of the default method, each in a made-up case where one rule changes the outcome."""
 
-import dataclasses
 import functools
+import types
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +12,7 @@ from piccolo.coarse_to_fine import evaluation, refinement
 from piccolo.coarse_to_fine import localize as method
 from piccolo.coarse_to_fine.config import METHOD, Beam
 from piccolo.coarse_to_fine.query import prepare_query
-from piccolo.coarse_to_fine.search_result import NOTHING, SearchResult
+from piccolo.coarse_to_fine.search_result import SearchResult
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.coarse_to_fine.starts import Starts, best_and_alternatives, narrow
 from piccolo.confidence.alternatives import Hypothesis
@@ -76,10 +76,14 @@ def test_halving_keeps_as_many_as_the_beam_says(monkeypatch):
         monkeypatch.setattr(refinement, name, gaining(name, gain))
     monkeypatch.setattr(refinement, "refine_by_perturbation", gaining("perturb", 0.5))
     centers = np.outer(np.arange(40.0), [1.0, 0, 0])
-    starts = Starts(np.repeat(np.eye(3)[None], 40, axis=0), centers, np.arange(40), 0.5 - 0.01 * np.arange(40))
+    starts = Starts(
+        np.repeat(np.eye(3)[None], 40, axis=0), centers, np.arange(40), 0.5 - 0.01 * np.arange(40)
+    )
     fine, middle = refinement.refine(QUERY, starts, Beam(30, 12, 5, 2))
     assert calls[:2] == [(5, 30), (12, 12)]
-    assert [calls.count(name) for name in ("descend_middle", "perturb_middle", "descend_fine", "perturb")] == [12, 5, 5, 2]
+    assert [
+        calls.count(name) for name in ("descend_middle", "perturb_middle", "descend_fine", "perturb")
+    ] == [12, 5, 5, 2]
     assert _places(fine) == [0, 1, 0, 1, 2, 3, 4]
     assert fine[0].score == pytest.approx(0.5 + 0.3 + 0.5)
     assert _places(middle) == list(range(12))
@@ -90,7 +94,12 @@ def test_halving_keeps_as_many_as_the_beam_says(monkeypatch):
 
 @pytest.mark.parametrize(
     ("gains", "rounds", "expected"),
-    [([0.2, 0.02, 0.005, 0.5], 3, 0.725), ([0.1] * 9, 5, 1.0), ([-0.3, 0.5], 1, 0.5), ([0.1, -0.1, 1.0], 2, 0.6)],
+    [
+        ([0.2, 0.02, 0.005, 0.5], 3, 0.725),
+        ([0.1] * 9, 5, 1.0),
+        ([-0.3, 0.5], 1, 0.5),
+        ([0.1, -0.1, 1.0], 2, 0.6),
+    ],
 )
 def test_poses_are_perturbed_for_as_long_as_that_helps(monkeypatch, gains, rounds, expected):
     left, sizes = list(gains), []
@@ -132,7 +141,7 @@ def test_full_resolution_is_taken_back_where_the_score_falls(monkeypatch, after,
 
 @pytest.mark.parametrize(("seed", "most"), [(1, 5e-4), (2, 5e-5), (3, 2e-4)])
 def test_the_end_hardly_depends_on_where_the_descent_begins(seed, most):
-    """Starts 5 mm apart end within 0.05 mm where the loss has one minimum; a noisy one has several near it."""
+    """Starts 5 mm apart end within 0.05 mm where the loss has one minimum; in noise it has several."""
     query, true_pose = _query(seed), rooms.scene(seed)[2]
     ends = [
         refinement.settle(query, Hypothesis(step(true_pose, np.array([0, 0, 0, *d])), 0.0)).pose
@@ -150,7 +159,7 @@ def test_the_end_hardly_depends_on_where_the_descent_begins(seed, most):
 
 
 def test_alternatives_that_come_near_are_refined_and_the_better_wins(monkeypatch):
-    """The second gains by refinement and wins; the far one, with less than 0.4 of the score, stays as it is."""
+    """The second gains by refinement and wins; one with less than 0.4 of the best score stays."""
     gains = {0.0: 9.0, 3.0: 0.25, 6.0: 0.01, 9.0: 9.0}
     refined = []
 
@@ -159,7 +168,9 @@ def test_alternatives_that_come_near_are_refined_and_the_better_wins(monkeypatch
         return Hypothesis(h.pose, h.score + gains[refined[-1]])
 
     monkeypatch.setattr(method, "refine_by_perturbation", perturbed)
-    monkeypatch.setattr(method, "refine_full_resolution", lambda query, h, num_rounds: h if num_rounds == 2 else None)
+    monkeypatch.setattr(
+        method, "refine_full_resolution", lambda query, h, num_rounds: h if num_rounds == 2 else None
+    )
     result = SearchResult(_at(0.0, 0.5), (_at(3.0, 0.4), _at(6.0, 0.3), _at(9.0, 0.19)))
     found = method.refine_alternatives(QUERY, result)
     assert refined == [3.0, 6.0]
@@ -169,12 +180,17 @@ def test_alternatives_that_come_near_are_refined_and_the_better_wins(monkeypatch
 
 
 def test_a_search_is_confident_by_score_and_margin():
-    for score, other, expected in ((0.25, 0.1, True), (0.24, 0.0, False), (0.5, 0.35, True), (0.5, 0.36, False)):
+    for score, other, expected in (
+        (0.25, 0.1, True),
+        (0.24, 0.0, False),
+        (0.5, 0.35, True),
+        (0.5, 0.36, False),
+    ):
         assert SearchResult(_at(0.0, score), (_at(3.0, other),)).is_confident == expected
 
 
-def _run(monkeypatch, attempts, gravity="auto"):
-    """Localize with made-up attempts: lists of hypotheses on fine cells. Returns attempts made, and what is evaluated."""
+def _run(monkeypatch, attempts, gravity="auto", refined=types.MappingProxyType({})):
+    """Localize with made-up attempts, lists of hypotheses; the attempts made, and what is evaluated."""
     made, left = [], list(attempts)
     scan_map = SimpleNamespace(centers=np.zeros((1, 3)))
 
@@ -182,11 +198,14 @@ def _run(monkeypatch, attempts, gravity="auto"):
         made.append((starts, "wide" if beam is METHOD.wide_beam else "narrow"))
         return left.pop(0), []
 
+    def perturbed(query, h):
+        return Hypothesis(h.pose, refined.get(h.pose.center_world[0], h.score))
+
     monkeypatch.setattr(method, "apply_prior", lambda *_: scan_map)
     monkeypatch.setattr(method, "prepare_query", lambda *_: QUERY)
     monkeypatch.setattr(method, "search_poses", lambda query, gravity: gravity)
     monkeypatch.setattr(method, "refine", refine)
-    monkeypatch.setattr(method, "refine_by_perturbation", lambda query, h: h)
+    monkeypatch.setattr(method, "refine_by_perturbation", perturbed)
     monkeypatch.setattr(method, "refine_full_resolution", lambda query, h, num_rounds: h)
     monkeypatch.setattr(method, "settle", lambda query, h: Hypothesis(h.pose, h.score + 0.001))
     monkeypatch.setattr(method, "evaluate", lambda query, panorama, found: found)
@@ -217,15 +236,7 @@ def test_attempts_are_made_until_one_is_confident(monkeypatch, attempts, gravity
 
 def test_a_confident_attempt_whose_alternative_gains_by_refinement_is_not_the_last(monkeypatch):
     attempts = [[_at(1, 0.6), _at(5, 0.3)], [_at(7, 0.9)]]
-    scores = {5: 0.55}
-    perturbed = lambda query, h: Hypothesis(h.pose, scores.get(h.pose.center_world[0], h.score))  # noqa: E731
-    original = monkeypatch.setattr
-
-    def keep(target, name, value):
-        original(target, name, perturbed if name == "refine_by_perturbation" else value)
-
-    monkeypatch.setattr = keep
-    made, found = _run(monkeypatch, attempts)
+    made, found = _run(monkeypatch, attempts, refined={5.0: 0.55})
     assert len(made) == 2
     assert _places([found.best]) == [7]
 
@@ -269,9 +280,3 @@ def test_evidence_counts_alternatives_that_are_local_minima(monkeypatch):
     assert len(found.alternatives) == 5
     monkeypatch.setattr(evaluation, "sampling_loss", lambda *_: np.inf)
     assert evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(_at(0.0, 0.6), ())).pose is None
-
-
-def test_nothing_is_worse_than_any_attempt():
-    assert NOTHING.best.score == -1.0
-    assert not NOTHING.is_confident
-    assert dataclasses.replace(NOTHING, best=_at(0, 0.5)).margin == 0.5

@@ -35,7 +35,9 @@ def test_json_round_trip_keeps_every_bit_of_the_pose():
     back = Result.from_json(RESULT.to_json())
     np.testing.assert_array_equal(back.pose.R_cam_from_world, RESULT.pose.R_cam_from_world)
     np.testing.assert_array_equal(back.pose.center_world, RESULT.pose.center_world)
-    np.testing.assert_array_equal(back.alternatives[0].pose.R_cam_from_world, ALTERNATIVE.pose.R_cam_from_world)
+    np.testing.assert_array_equal(
+        back.alternatives[0].pose.R_cam_from_world, ALTERNATIVE.pose.R_cam_from_world
+    )
     np.testing.assert_array_equal(back.covariance.matrix, RESULT.covariance.matrix)
     assert (back.alternatives[0].score, back.covariance.least_constrained_direction) == (0.2, "up and down")
     plain = dataclasses.replace(RESULT, **WITHOUT_ARRAYS)

@@ -154,7 +154,9 @@ def test_point_at_the_camera_and_pose_out_of_range_are_harmless():
     points, colors = _points("anywhere")
     points[0] = CENTER.astype(np.float32)
     pose = Pose(np.eye(3), points[0].astype(np.float64))
-    loss, gradient, matrix = sampling_equations(pack_points(points, colors), pack_texels(_smooth_image()), pose)
+    loss, gradient, matrix = sampling_equations(
+        pack_points(points, colors), pack_texels(_smooth_image()), pose
+    )
     assert np.isfinite(loss)
     assert np.isfinite(gradient).all()
     assert np.isfinite(matrix).all()

@@ -64,7 +64,9 @@ def test_what_is_masked_does_not_bleed():
     is_valid[200:] = False
     black, white = panorama.rgb.copy(), panorama.rgb.copy()
     black[200:], white[200:] = 0, 255
-    (a, valid), (b, _) = (_levels(image_pyramid(Panorama(rgb, is_valid), [SCALE])[0]) for rgb in (black, white))
+    (a, valid), (b, _) = (
+        _levels(image_pyramid(Panorama(rgb, is_valid), [SCALE])[0]) for rgb in (black, white)
+    )
     np.testing.assert_array_equal(a[valid], b[valid])
     assert valid.mean() == pytest.approx(200 / 256, abs=0.02)
 
@@ -75,7 +77,10 @@ def test_images_of_every_scale_have_their_width():
 
 
 def test_samples_along_turned_directions_equal_their_twin():
-    texels, directions = normalize_panorama(resize(rooms.scene(1)[1], 128), 7.5, 22.0), make_grid(24).directions
+    texels, directions = (
+        normalize_panorama(resize(rooms.scene(1)[1], 128), 7.5, 22.0),
+        make_grid(24).directions,
+    )
     channels, is_valid = _levels(texels)
     rotations = uniform_rotations(5).astype(np.float32)
     samples, validity = np.empty((5, 3, len(AREA)), np.float32), np.empty((5, len(AREA)), np.float32)
@@ -174,7 +179,9 @@ def test_heading_is_the_worlds_where_the_map_was_levelled(gravity):
     assert np.abs(off).max() < 20.0 + 1e-6
 
 
-@pytest.mark.parametrize(("min_starts", "max_starts", "expected"), [(150, 4000, 150), (150, 20, 20), (1, 4000, None)])
+@pytest.mark.parametrize(
+    ("min_starts", "max_starts", "expected"), [(150, 4000, 150), (150, 20, 20), (1, 4000, None)]
+)
 def test_number_of_starts(min_starts, max_starts, expected):
     """One for every four candidates, but not fewer and not more than asked for."""
     query = _query()

@@ -18,7 +18,9 @@ RAYS = sphere.pixel_rays(WIDTH)
 def _pixels(points, R_cam_from_world=TILTED, center_world=CENTER, width=WIDTH):
     x_cam = ((points - center_world) @ R_cam_from_world.T).astype(np.float32)
     rho = np.hypot(x_cam[:, 0], x_cam[:, 1])
-    return np.array([sphere.direction_to_pixel(*p, r, np.float32(width)) for p, r in zip(x_cam, rho, strict=True)])
+    return np.array(
+        [sphere.direction_to_pixel(*p, r, np.float32(width)) for p, r in zip(x_cam, rho, strict=True)]
+    )
 
 
 def test_pixel_of_a_direction_equals_its_twin():

@@ -19,7 +19,9 @@ from piccolo.geometry.sphere_grid import cell_of, make_grid
 from piccolo.panorama.channels import LEVELS_PER_UNIT
 from piccolo.runtime.threads import Workers
 
-LEAVES = ViewConfig(num_rings=24, stats_rings=16, sigma_deg=22.0, voxel_per_range=1e-6)  # the leaves themselves
+LEAVES = ViewConfig(
+    num_rings=24, stats_rings=16, sigma_deg=22.0, voxel_per_range=1e-6
+)  # the leaves themselves
 
 
 @pytest.fixture(scope="module")
@@ -89,8 +91,11 @@ def test_more_must_be_seen_around_a_candidate_than_on_open_land():
     """Flat ground fills about half of the sphere: enough only where no place is closed in."""
     x, y = np.arange(-6.0, 6.0, 0.05), np.arange(0.0, 3.0, 0.05)
     ground = np.stack([*np.meshgrid(x, x), np.zeros((len(x), len(x)))], axis=-1).reshape(-1, 3)
-    walls = [np.column_stack([np.repeat(x, len(y)), np.full(len(x) * len(y), s), np.tile(y, len(x))]) for s in (-6, 6)]
-    hall = np.concatenate([ground, ground + [0, 0, 3], *walls, *(w[:, [1, 0, 2]] for w in walls)])
+    walls = [
+        np.column_stack([np.repeat(x, len(y)), np.full(len(x) * len(y), s), np.tile(y, len(x))])
+        for s in (-6, 6)
+    ]
+    hall = np.concatenate([ground, ground + np.array([0, 0, 3]), *walls, *(w[:, [1, 0, 2]] for w in walls)])
     for points, least, most in ((ground, 0.3, 0.55), (hall, 0.55, 1.01)):
         cloud = Cloud(points.astype(np.float32), np.full(points.shape, 99, np.uint8), np.zeros(3))
         octree = build_octree(cloud.voxels(np.eye(3)))

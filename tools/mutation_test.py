@@ -15,32 +15,33 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 COPIED = ("piccolo", "tests", "tools", "pyproject.toml", "localize.py")
-SEARCH = ("refinement", "search", "coarse_to_fine", "coarse_to_fine_covariance")
-JUDGED = ("alternatives", "confidence", "covariance", "score", "refinement", "coarse_to_fine_covariance")
+WHOLE = ("refinement", "coarse_to_fine")
 TESTS = {  # those that matter for a module, the quickest first
-    "coarse_to_fine/search.py": SEARCH,
-    "coarse_to_fine/descent.py": ("descent", *SEARCH),
-    "coarse_to_fine/refinement.py": SEARCH,
-    "coarse_to_fine/localize.py": SEARCH,
-    "coarse_to_fine/evaluation.py": SEARCH,
-    "coarse_to_fine/prior.py": SEARCH,
-    "confidence/alternatives.py": JUDGED,
-    "confidence/confidence.py": JUDGED,
-    "confidence/covariance.py": JUDGED,
-    "confidence/score.py": JUDGED,
-    "render/zbuffer.py": ("zbuffer", "score", "paper_search", "paper_starts"),
+    "coarse_to_fine/search.py": ("search", *WHOLE),
+    "coarse_to_fine/descent.py": ("descent", *WHOLE),
+    "coarse_to_fine/refinement.py": WHOLE,
+    "coarse_to_fine/localize.py": WHOLE,
+    "coarse_to_fine/evaluation.py": WHOLE,
+    "coarse_to_fine/prior.py": WHOLE,
+    "confidence/alternatives.py": ("alternatives", "refinement"),
+    "confidence/confidence.py": ("confidence",),
+    "confidence/covariance.py": ("covariance",),
+    "confidence/score.py": ("score",),
+    "render/zbuffer.py": ("zbuffer", "score", "paper_starts"),
 }
 OPPOSITE: dict[type[ast.AST], type[ast.AST]] = {
     ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
-    ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In, ast.And: ast.Or, ast.Or: ast.And,
+    ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
+    ast.And: ast.Or, ast.Or: ast.And,
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult,
 }  # fmt: skip
 REMOVABLE = (ast.AugAssign, ast.Expr, ast.If, ast.Break, ast.Continue)
@@ -69,11 +70,13 @@ def _changed(node: ast.AST) -> Iterator[ast.AST]:
         yield other
     elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not | ast.USub):
         yield node.operand
-    elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
-        yield from (ast.Constant(value) for value in {2 * node.value, 0, 1} - {node.value})
     elif isinstance(node, ast.Constant) and isinstance(node.value, bool):
         yield ast.Constant(not node.value)
-    elif isinstance(node, REMOVABLE) and not (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)):
+    elif isinstance(node, ast.Constant) and isinstance(node.value, int | float):
+        yield from (ast.Constant(value) for value in {2 * node.value, 0, 1} - {node.value})
+    elif isinstance(node, REMOVABLE) and not (
+        isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+    ):
         yield ast.Pass()
 
 
@@ -97,10 +100,10 @@ def mutants(module: str) -> Iterator[Mutant]:
     for line in source.encode().splitlines(keepends=True):
         starts.append(starts[-1] + len(line))
     for node, is_kernel in _nodes(ast.parse(source)):
-        if not hasattr(node, "lineno"):
+        if not isinstance(node, ast.stmt | ast.expr):
             continue
         lo = starts[node.lineno - 1] + node.col_offset
-        hi = starts[node.end_lineno - 1] + node.end_col_offset  # type: ignore[attr-defined]
+        hi = starts[(node.end_lineno or 0) - 1] + (node.end_col_offset or 0)
         for other in _changed(node):
             text = ast.unparse(other)
             text = text if isinstance(node, ast.stmt | ast.Constant) else f"({text})"
@@ -118,8 +121,9 @@ def is_caught(mutant: Mutant, folder: Path) -> bool:
     plugin = [] if mutant.is_kernel else ["-p", "kept_kernels"]
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *plugin, *tests]
     environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
+    limits: dict[str, Any] = {"cwd": folder, "env": environment, "timeout": TIMEOUT_S}
     try:
-        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, timeout=TIMEOUT_S)
+        done = subprocess.run(command, check=False, capture_output=True, **limits)
         return done.returncode != 0
     except subprocess.TimeoutExpired:
         return True
@@ -127,30 +131,22 @@ def is_caught(mutant: Mutant, folder: Path) -> bool:
         path.write_text(original)
 
 
-def main() -> int:
-    """Try a sample of mutants; print the survivors and the share that was caught."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=60, help="mutants tried")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--jobs", type=int, default=1, help="at a time")
-    parser.add_argument("--modules", nargs="+", default=list(TESTS), choices=list(TESTS), metavar="MODULE")
-    parser.add_argument("--no-kernels", action="store_true", help="leave out changes within kernels")
-    arguments = parser.parse_args()
-    every = [m for module in arguments.modules for m in mutants(module)]
-    every = [m for m in every if not (arguments.no_kernels and m.is_kernel)]
-    chosen = random.Random(arguments.seed).sample(every, min(arguments.count, len(every)))
-    with tempfile.TemporaryDirectory() as temporary:
+def checkout_copy(folder: Path) -> Path:
+    """A copy of the checkout in which kernels can be told to stay as they were compiled."""
+    folder.mkdir()
+    for name in COPIED:
+        (shutil.copytree if (ROOT / name).is_dir() else shutil.copy)(ROOT / name, folder / name)
+    plugin = "from piccolo.runtime import kernel_cache\nkernel_cache.sources_digest = lambda: 'kept'\n"
+    (folder / "kept_kernels.py").write_text(plugin)
+    return folder
+
+
+def try_all(chosen: Sequence[Mutant], num_jobs: int) -> int:
+    """Print what becomes of each mutant; returns how many were caught."""
+    with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(num_jobs) as pool:
         folders: SimpleQueue[Path] = SimpleQueue()
-        for k in range(arguments.jobs):
-            folder = Path(temporary) / str(k)
-            for name in COPIED:
-                copied = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
-                folder.mkdir(exist_ok=True)
-                copied(ROOT / name, folder / name)
-            (folder / "kept_kernels.py").write_text(
-                "from piccolo.runtime import kernel_cache\nkernel_cache.sources_digest = lambda: 'kept'\n"
-            )
-            folders.put(folder)
+        for k in range(num_jobs):
+            folders.put(checkout_copy(Path(temporary) / str(k)))
 
         def tried(mutant: Mutant) -> bool:
             folder = folders.get()
@@ -160,9 +156,25 @@ def main() -> int:
             print(f"{word}  {mutant.module}:{mutant.line}  {mutant.change}", flush=True)
             return caught
 
-        with ThreadPoolExecutor(arguments.jobs) as pool:
-            num_caught = sum(pool.map(tried, chosen))
-    print(f"caught {num_caught} of {len(chosen)} ({100 * num_caught / len(chosen):.0f} %), of {len(every)} mutants")
+        return sum(pool.map(tried, chosen))
+
+
+def main() -> int:
+    """Try a sample of mutants; print the survivors and the share that was caught."""
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
+    parser.add_argument("--count", type=int, default=60, help="mutants tried")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=1, help="at a time")
+    parser.add_argument("--modules", nargs="+", default=list(TESTS), choices=list(TESTS), metavar="MODULE")
+    parser.add_argument("--no-kernels", action="store_true", help="leave out changes within kernels")
+    arguments = parser.parse_args()
+    every = [m for module in arguments.modules for m in mutants(module)]
+    every = [m for m in every if not (arguments.no_kernels and m.is_kernel)]
+    chosen = random.Random(arguments.seed).sample(every, min(arguments.count, len(every)))
+    num_caught = try_all(chosen, arguments.jobs)
+    share = 100 * num_caught / len(chosen)
+    print(f"caught {num_caught} of {len(chosen)} ({share:.0f} %), of {len(every)} mutants")
     return 0
 
 
