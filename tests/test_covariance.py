@@ -14,6 +14,8 @@ def test_direction_in_words():
     assert least_constrained_direction(np.eye(3), np.eye(3), LONG) == "much the same in all directions"
     assert least_constrained_direction(ALONG_X, ALONG_X, LONG) == "along the corridor, heading 90 or 270 deg"
     assert least_constrained_direction(ALONG_X, ALONG_X, WIDE) == "heading 90 or 270 deg"
+    above = np.array([[0.1], [0.1], [3.0]], np.float32)  # no walls
+    assert least_constrained_direction(ALONG_X, ALONG_X, above) == "heading 90 or 270 deg"
 
 
 def test_heading_is_the_worlds_not_the_maps():
