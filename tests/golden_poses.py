@@ -36,28 +36,10 @@ def check_golden_poses(name, map_arrays, localize):
         changed = [word for word in hashes if entry["hashes"][word] != hashes[word]]
         pose = localize(seed, variant).pose
         R, center = pose.R_cam_from_world, pose.center_world
-<<<<<<< HEAD
-        entries.append(
-            {
-                "seed": seed,
-                "variant": variant,
-                "hashes": now,
-                "R_cam_from_world": R.tolist(),
-                "center_world": center.tolist(),
-            }
-        )
-        if "REMAKE_GOLDEN" not in os.environ:
-            told = (
-                f"{seed} {variant}: not found in the same {', '.join(changed)}"
-                if changed
-                else "the method moved it"
-            )
-=======
         if is_remade:
             entry |= {"hashes": hashes, "R_cam_from_world": R.tolist(), "center_world": center.tolist()}
         else:
             told = f"{seed} {variant}: " + (f"another {', '.join(changed)}" if changed else "the same input")
->>>>>>> coretests
             assert np.linalg.norm(center - entry["center_world"]) < 0.001, told
             assert np.abs(R - entry["R_cam_from_world"]).max() < np.radians(0.01), told
     if is_remade:

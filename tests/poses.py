@@ -48,11 +48,7 @@ def jpeg(path, size=SIZE, seed=0):
 
 
 def pixels_and_points(pose, seed=0, num_points=200):
-<<<<<<< HEAD
     """Pixels (N, 2) and world points (N, 3) seen there, by geometry/sphere.py, up to 80 degrees of elevation.
-=======
-    """Pixels (N, 2) and world points (N, 3) seen there, by sphere.py, up to 80 degrees of elevation.
->>>>>>> coretests
 
     Nearer to a pole the rounding of UTM-size coordinates alone moves u by more than the tests allow.
     """

@@ -26,11 +26,7 @@ def test_round_trip_and_a_file_cut_short(tmp_path):
 
 
 def test_a_file_outlives_other_sources_but_the_cache_does_not(tmp_path, monkeypatch):
-<<<<<<< HEAD
-    """Its format alone says whether a file can be read; the cache makes maps anew when makers change."""
-=======
     """Its format alone says whether a file can be read; the cache also goes by what made it."""
->>>>>>> coretests
     cloud, built = tmp_path / "a.ply", tmp_path / "a.map"
     cloud.write_bytes(b"points")
     save_map(scan_map(1), built)

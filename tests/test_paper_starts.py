@@ -4,12 +4,8 @@ import pytest
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import angle_between
 from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
-<<<<<<< HEAD
 from piccolo.paper.starts import MIN_CLEARANCE, PROBE_WIDTH, box_grid, farthest_point_sampling, free_grid
 from piccolo.render.free_space import is_free_space
-=======
-from piccolo.paper.starts import box_grid, farthest_point_sampling, free_grid, is_free
->>>>>>> coretests
 
 
 def _hollow_box(seed=0, count=40_000):

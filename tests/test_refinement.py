@@ -141,11 +141,7 @@ def test_full_resolution_is_taken_back_where_the_score_falls(monkeypatch, after,
 
 @pytest.mark.parametrize(("seed", "most"), [(1, 5e-4), (2, 5e-5), (3, 2e-4)])
 def test_the_end_hardly_depends_on_where_the_descent_begins(seed, most):
-<<<<<<< HEAD
-    """Starts 5 mm apart end within 0.05 mm where the loss has one minimum; noise makes several."""
-=======
     """Starts 5 mm apart end within 0.05 mm where the loss has one minimum; in noise it has several."""
->>>>>>> coretests
     query, true_pose = _query(seed), rooms.scene(seed)[2]
     ends = [
         refinement.settle(query, Hypothesis(step(true_pose, np.array([0, 0, 0, *d])), 0.0)).pose
@@ -163,11 +159,7 @@ def test_the_end_hardly_depends_on_where_the_descent_begins(seed, most):
 
 
 def test_alternatives_that_come_near_are_refined_and_the_better_wins(monkeypatch):
-<<<<<<< HEAD
-    """The second gains by refinement and wins; the far one, with under 0.4 of the score, stays as it is."""
-=======
     """The second gains by refinement and wins; one with less than 0.4 of the best score stays."""
->>>>>>> coretests
     gains = {0.0: 9.0, 3.0: 0.25, 6.0: 0.01, 9.0: 9.0}
     refined = []
 
@@ -197,13 +189,8 @@ def test_a_search_is_confident_by_score_and_margin():
         assert SearchResult(_at(0.0, score), (_at(3.0, other),)).is_confident == expected
 
 
-<<<<<<< HEAD
-def _run(monkeypatch, attempts, gravity="auto"):
-    """Localize with made-up attempts, lists of hypotheses; returns those made and what is evaluated."""
-=======
 def _run(monkeypatch, attempts, gravity="auto", refined=types.MappingProxyType({})):
     """Localize with made-up attempts, lists of hypotheses; the attempts made, and what is evaluated."""
->>>>>>> coretests
     made, left = [], list(attempts)
     scan_map = SimpleNamespace(centers=np.zeros((1, 3)))
 
