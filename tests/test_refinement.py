@@ -92,6 +92,26 @@ def test_halving_keeps_as_many_as_the_beam_says(monkeypatch):
 # Perturbations and the last millimetres
 
 
+def test_each_stage_has_its_view_its_image_and_its_limits(monkeypatch):
+    asked = []
+    monkeypatch.setattr(refinement, "render_view", lambda octree, center, view: view)
+    monkeypatch.setattr(refinement, "visible_points", lambda octree, center, view, count: (view, count))
+    monkeypatch.setattr(refinement, "descend", lambda *arguments: asked.append(arguments) or arguments[3])
+    monkeypatch.setattr(refinement, "score_on", lambda cells, center, image, pose: 0.5)
+    query = SimpleNamespace(**vars(QUERY), images=SimpleNamespace(full="full", fine="fine", middle="middle"))
+    h, full = _at(1.0, 0.2), (METHOD.full_view, 30_000)
+    refinement.descend_middle(query, h)
+    assert refinement.descend_fine(query, h).score == 0.5
+    refinement.refine_full_resolution(query, h, 1)
+    refinement.settle(query, h)
+    assert [(cells, image, *limits) for cells, _, image, _, limits in asked] == [
+        (METHOD.middle_view, "middle", 1.2, 12, 1e-3),
+        (METHOD.fine_view, "fine", 1.0, 12, 1e-4),
+        (full, "full", 0.7, 10, 1e-4),
+        (full, "full", 0.7, 30, 1e-7),
+    ]
+
+
 @pytest.mark.parametrize(
     ("gains", "rounds", "expected"),
     [

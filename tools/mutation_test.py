@@ -99,7 +99,10 @@ def mutants(module: str) -> Iterator[Mutant]:
     starts = [0]
     for line in source.encode().splitlines(keepends=True):
         starts.append(starts[-1] + len(line))
-    for node, is_kernel in _nodes(ast.parse(source)):
+    tree, has_kernels = ast.parse(source), "runtime.jit import" in source
+    assigned = [statement for statement in tree.body if isinstance(statement, ast.Assign)]
+    global_nodes = {id(node) for statement in assigned for node in ast.walk(statement)}  # kernels hold them
+    for node, is_kernel in _nodes(tree):
         if not isinstance(node, ast.stmt | ast.expr):
             continue
         lo = starts[node.lineno - 1] + node.col_offset
@@ -109,7 +112,8 @@ def mutants(module: str) -> Iterator[Mutant]:
             text = text if isinstance(node, ast.stmt | ast.Constant) else f"({text})"
             changed = source.encode()[:lo] + text.encode() + source.encode()[hi:]
             told = f"{ast.unparse(node).splitlines()[0]}  ->  {text}"
-            yield Mutant(module, node.lineno, told, changed.decode(), is_kernel)
+            is_compiled = is_kernel or (has_kernels and id(node) in global_nodes)
+            yield Mutant(module, node.lineno, told, changed.decode(), is_compiled)
 
 
 def is_caught(mutant: Mutant, folder: Path) -> bool:
