@@ -88,18 +88,18 @@ def check_usage(arguments: argparse.Namespace) -> None:
 
 def known_poses(arguments: argparse.Namespace, cloud: LocalCloud) -> KnownPoses:
     """The pose found and the true one of the panorama, as far as files are given."""
-    name, found, true = arguments.pano.name, None, None
-    if arguments.result:
-        poses = [r.pose for r in read_results([arguments.result]) if Path(r.pano).name == name and r.pose]
-        if len(poses) != 1:
-            raise InputError(f"{arguments.result}: {len(poses)} poses of {name}, wanted one")
-        found = cloud.from_world(poses[0])
+    name, known = arguments.pano.name, KnownPoses()
     if arguments.truth:
         queries = read_scene(arguments.truth).by_name
         if name not in queries:
             raise InputError(f"{arguments.truth}: no true pose of {name}")
-        true = cloud.from_world(queries[name].pose)
-    return KnownPoses(found, true)
+        known["true"] = cloud.from_world(queries[name].pose)
+    if arguments.result:
+        poses = [r.pose for r in read_results([arguments.result]) if Path(r.pano).name == name and r.pose]
+        if len(poses) != 1:
+            raise InputError(f"{arguments.result}: {len(poses)} poses of {name}, wanted one")
+        known["found"] = cloud.from_world(poses[0])
+    return known
 
 
 def grid_from(arguments: argparse.Namespace, cloud: LocalCloud, known: KnownPoses) -> PoseGrid:
@@ -109,7 +109,9 @@ def grid_from(arguments: argparse.Namespace, cloud: LocalCloud, known: KnownPose
         corners = np.array(arguments.box).reshape(2, 2) - shift[:2]
     else:
         ends = [np.percentile(c, [0.5, 99.5]) for c in (cloud.points.x, cloud.points.y)]
-        places = np.array([*np.transpose(ends), *(pose.center_world[:2] for pose in known.all)], np.float64)
+        places = np.array(
+            [*np.transpose(ends), *(pose.center_world[:2] for pose in known.values())], np.float64
+        )
         corners = np.stack([places.min(axis=0), places.max(axis=0)])
     counts = np.floor((corners[1] - corners[0]) / arguments.step) + 1.0
     if counts.prod() > MAX_CELLS:
@@ -123,7 +125,7 @@ def grid_from(arguments: argparse.Namespace, cloud: LocalCloud, known: KnownPose
         arguments.rotations or (64 if is_known else 1000)
     )
     # Turned from a pose that is known, so that it is among them.
-    start = known.all[0].R_cam_from_world if known.all else np.eye(3)
+    start = next(iter(known.values())).R_cam_from_world if known else np.eye(3)
     return PoseGrid(x, y, heights, start @ rotations @ rotations[0].T)
 
 
@@ -132,8 +134,8 @@ def heights_from(arguments: argparse.Namespace, cloud: LocalCloud, known: KnownP
     if arguments.heights:
         low, high, num = arguments.heights
         return np.asarray(np.linspace(low, high, int(num)) - plan_shift(cloud)[2])
-    if known.all:
-        return np.asarray(known.all[0].center_world[2] + np.array(HEIGHTS_ABOUT))
+    if known:
+        return np.asarray(next(iter(known.values())).center_world[2] + np.array(HEIGHTS_ABOUT))
     floor, ceiling = np.percentile(cloud.points.z, [1.0, 99.0])
     return np.asarray(floor + (ceiling - floor) * np.linspace(0.25, 0.75, 5))
 
@@ -151,9 +153,8 @@ def summary(surface: LossSurface, grid: PoseGrid, cloud: LocalCloud, known: Know
         "median_loss": float(np.median(surface.loss[np.isfinite(surface.loss)])),
         "num_minima": surface.num_minima(),
     }
-    for name, other in (("found", known.found), ("true", known.true)):
-        if other is not None:
-            line[f"distance_to_{name}"] = round(float(np.linalg.norm(lowest - other.center_world)), 6)
+    for name, other in sorted(known.items()):
+        line[f"distance_to_{name}"] = round(float(np.linalg.norm(lowest - other.center_world)), 6)
     return line
 
 

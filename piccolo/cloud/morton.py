@@ -23,9 +23,8 @@ def spread_bits(cell):
 def interleave(cells, codes):
     """Write the 63-bit Morton code (N,) of each cell (N, 3), int64 in [0, 2^21); x has the lowest bit."""
     for i in range(len(cells)):
-        codes[i] = (
-            spread_bits(cells[i, 0]) | (spread_bits(cells[i, 1]) << 1) | (spread_bits(cells[i, 2]) << 2)
-        )
+        x, y, z = spread_bits(cells[i, 0]), spread_bits(cells[i, 1]), spread_bits(cells[i, 2])
+        codes[i] = x | (y << 1) | (z << 2)
 
 
 def morton_codes(cells: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -53,10 +52,7 @@ def morton_order(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> NDAr
 
 
 def _settle_ties(
-    codes: NDArray[np.int64],
-    order: NDArray[np.int64],
-    points: NDArray[np.float32],
-    colors: NDArray[np.uint8],
+    codes: NDArray[np.int64], order: NDArray[np.int64], points: NDArray[np.float32], colors: NDArray[np.uint8]
 ) -> None:
     """Sort `order` (N,) in place within each run of equal, ascending `codes` (N,)."""
     is_equal = codes[1:] == codes[:-1]

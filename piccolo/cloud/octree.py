@@ -1,6 +1,5 @@
 """The cloud as a pyramid of voxels: mean position and mean colour of each, children next to each other."""
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -12,27 +11,13 @@ from .voxels import COARSEST, LEAF_SIZE, Voxels
 NUM_LEVELS = COARSEST.bit_length()  # from 128 leaves wide (2.56 m) down to one
 
 
-class OctreeArrays(NamedTuple):
-    """An octree as kernels read it; fields as in Octree."""
-
-    nodes: NDArray[np.float32]
-    first_child: NDArray[np.int32]
-    level_start: NDArray[np.int32]
-    leaf_size: float
-
-
-@dataclass(frozen=True)
-class Octree:
-    """Nodes of all levels, coarsest first, in Morton order within a level."""
+class Octree(NamedTuple):
+    """Nodes of all levels, coarsest first, in Morton order within a level; kernels read it as it is."""
 
     nodes: NDArray[np.float32]  # (nodes, 6) mean x, y, z [m], r, g, b in [0, 1]
     first_child: NDArray[np.int32]  # (nodes + 1,) children of i are first_child[i]:first_child[i + 1]
     level_start: NDArray[np.int32]  # (levels + 1,)
     leaf_size: float  # [m]
-
-    def arrays(self) -> OctreeArrays:
-        """What the kernels read."""
-        return OctreeArrays(self.nodes, self.first_child, self.level_start, self.leaf_size)
 
     def level(self, size: float) -> NDArray[np.float32]:
         """The nodes of the level whose voxels are nearest to `size` [m]."""

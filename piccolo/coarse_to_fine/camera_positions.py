@@ -58,7 +58,7 @@ def coverage(octree: Octree, centers: NDArray[np.floating[Any]], workers: Worker
     def glance(lo: int) -> None:
         part = slice(lo, lo + BLOCK)
         voxels = FREE_SPACE_VIEW.voxel_per_range
-        filled_fractions(octree.arrays(), centers[part], voxels, view, thread_scratch(), fraction[part])
+        filled_fractions(octree, centers[part], voxels, view, thread_scratch(), fraction[part])
 
     list(workers.each(glance, range(0, len(centers), BLOCK), "find free space"))
     return fraction

@@ -6,7 +6,7 @@ by which a map was made, and makes it anew when they have changed.
 """
 
 import zipfile
-from dataclasses import asdict, fields
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +27,7 @@ FIRST_VALUE, FIRST_VALUE_WITHIN = FORMAT.partition("/")[0].encode("utf-32-le"), 
 def save_map(scan_map: ScanMap, path: Path) -> None:
     """Write a map to `path`, whole or not at all."""
     members = {name: getattr(scan_map, name) for name in ARRAYS}
-    members.update({f"octree_{name}": value for name, value in asdict(scan_map.octree).items()})
+    members.update({f"octree_{name}": value for name, value in scan_map.octree._asdict().items()})
     with replacing(path) as file:
         np.savez(
             file,

@@ -81,7 +81,7 @@ def render_candidates(
         part = slice(lo, lo + BLOCK)
         out = offsets[part], unit[part], levels[part], is_seen[part]
         voxels = config.voxel_per_range
-        render_block(octree.arrays(), centers[part], voxels, view, thread_scratch(), *out)
+        render_block(octree, centers[part], voxels, view, thread_scratch(), *out)
 
     list(workers.each(run, range(0, len(centers), BLOCK), "render views"))
     return offsets, unit, levels, is_seen

@@ -235,7 +235,7 @@ def render_view(octree: Octree, center_map: NDArray[np.float64], config: ViewCon
     """What is seen around a centre (3,) [m], on the cells of `config`."""
     cells = _empty_cells(len(make_grid(config.num_rings)))
     center = np.asarray(center_map, np.float64)
-    render(octree.arrays(), center, config.voxel_per_range, config.arrays, thread_scratch(), *cells)
+    render(octree, center, config.voxel_per_range, config.arrays, thread_scratch(), *cells)
     return cells
 
 
@@ -243,5 +243,5 @@ def visible_points(octree: Octree, center_map: NDArray[np.float64], config: View
     """The same of at most `count` visible points instead of cells, with equal weights."""
     cells = _empty_cells(count)
     center, view = np.asarray(center_map, np.float64), config.arrays
-    n = render_points(octree.arrays(), center, config.voxel_per_range, view, thread_scratch(), *cells)
+    n = render_points(octree, center, config.voxel_per_range, view, thread_scratch(), *cells)
     return Cells(cells.offsets[:, :n].copy(), cells.channels[:, :n].copy(), cells.weights[:n].copy())

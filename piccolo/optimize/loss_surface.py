@@ -7,6 +7,7 @@ Kim et al. (ICCV 2021) show such a surface to argue that their loss has a deep, 
 with L over the points that a camera at (x, y, z) sees. Rotations are the same at each place.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,11 +63,9 @@ class LossSurface:
 
     def num_minima(self) -> int:
         """Places in free space that are lower than their eight neighbours."""
-        loss = np.where(np.isfinite(self.loss), self.loss, np.inf)
-        others = np.ones((3, 3), np.bool_)
-        others[1, 1] = False
-        lowest_around = minimum_filter(loss, footprint=others, mode="constant", cval=np.inf)
-        return int(((loss < lowest_around) & self.is_free).sum())
+        others = np.arange(9).reshape(3, 3) != 4
+        lowest_around = minimum_filter(self.loss, footprint=others, mode="constant", cval=np.inf)
+        return int(((self.loss < lowest_around) & self.is_free).sum())
 
 
 def loss_surface(
@@ -93,10 +92,6 @@ def loss_surface(
             tried.append((losses[k], float(z), k, is_free))
         return min(tried)
 
-    num_cells = len(grid.x) * len(grid.y)
-    cells = list(workers.each(best, range(num_cells), "loss surface"))
-    loss, height, rotation, is_free = (np.array(column) for column in zip(*cells, strict=True))
     shape = (len(grid.y), len(grid.x))
-    return LossSurface(
-        loss.reshape(shape), height.reshape(shape), rotation.reshape(shape), is_free.reshape(shape)
-    )
+    cells = workers.each(best, range(math.prod(shape)), "loss surface")
+    return LossSurface(*(np.array(column).reshape(shape) for column in zip(*cells, strict=True)))

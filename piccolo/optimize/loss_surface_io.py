@@ -1,6 +1,5 @@
 """A loss surface drawn over the cloud's plan, and as a file of arrays."""
 
-from dataclasses import dataclass
 from io import BytesIO
 
 import numpy as np
@@ -16,17 +15,7 @@ MIN_PIXEL = 0.03  # [m]
 MARKS = {"true": ("*", "white", 260), "found": ("X", "red", 110), "lowest": ("o", "none", 130)}
 
 
-@dataclass(frozen=True)
-class KnownPoses:
-    """Poses in the frame of the points; None if not known."""
-
-    found: Pose | None
-    true: Pose | None
-
-    @property
-    def all(self) -> list[Pose]:
-        """Those that are known, the true one first."""
-        return [pose for pose in (self.true, self.found) if pose is not None]
+KnownPoses = dict[str, Pose]  # in the frame of the points, by "true" and "found", as far as they are known
 
 
 def plan_shift(cloud: LocalCloud) -> Array:
@@ -69,9 +58,9 @@ def surface_png(
     axes.imshow(walls, extent=extent.tolist(), origin="lower", interpolation="nearest", zorder=2)
     row, column = surface.lowest()
     marks = {"lowest": (x[column], y[row])}
-    for name, pose in (("found", known.found), ("true", known.true)):
-        if pose is not None:
-            marks[name] = (pose.center_world[0] + shift[0], pose.center_world[1] + shift[1])
+    for name in ("found", "true"):
+        if name in known:
+            marks[name] = tuple(known[name].center_world[:2] + shift[:2])
     for name, place in marks.items():
         symbol, color, size = MARKS[name]
         edge = "red" if color == "none" else "black"
@@ -87,11 +76,8 @@ def surface_png(
 def surface_npz(surface: LossSurface, grid: PoseGrid, cloud: LocalCloud, known: KnownPoses) -> bytes:
     """NPZ of the surface and the known poses."""
     shift = plan_shift(cloud)
-    nowhere = np.full(3, np.nan)
-    positions = {
-        f"{name}_world": cloud.to_world(pose).center_world if pose else nowhere
-        for name, pose in (("found", known.found), ("true", known.true))
-    }
+    positions = {f"{name}_world": np.full(3, np.nan) for name in ("found", "true")}
+    positions |= {f"{name}_world": cloud.to_world(pose).center_world for name, pose in known.items()}
     rotations = grid.R_cam_from_local @ cloud.R_local_from_world
     file = BytesIO()
     np.savez_compressed(

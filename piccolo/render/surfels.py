@@ -57,9 +57,7 @@ def surfels_of(points: PackedPoints, workers: Workers) -> Surfels:
     return Surfels(points, normals, radii).take(np.flatnonzero(is_surface))
 
 
-def planes(
-    neighborhoods: NDArray[np.float32],
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def planes(neighborhoods: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Unit normals (N, 3) of neighbourhoods (N, K, 3), 0 without a plane; and which fill a volume (N,)."""
     offsets = neighborhoods - neighborhoods.mean(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))

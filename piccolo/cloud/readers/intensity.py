@@ -57,9 +57,7 @@ def _limits(path: Path, chunks: Iterator[PointsWithScalar]) -> tuple[float, floa
         return 0.0, 1.0
     low, high = (_lower_edge(int(np.searchsorted(total, share * total[-1]))) for share in (BLACK, WHITE))
     if not low < high:
-        raise InputError(
-            f"{path}: the intensity is {low:g} nearly everywhere, wanted colours, or one that varies"
-        )
+        raise InputError(f"{path}: the intensity is {low:g} nearly everywhere, wanted colours")
     return low, high
 
 

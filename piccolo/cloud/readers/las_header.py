@@ -66,9 +66,8 @@ def read_header(path: Path) -> LasHeader:
         wanted = f"wanted 'LASF' and a header of {MIN_HEADER_SIZE} bytes or more"
         raise InputError(f"{path}: begins with {head[:4]!r} and {len(head)} bytes, {wanted}")
     major, minor = head[24], head[25]
-    header_size, points_offset, num_vlrs, format_id, record_size, num_points = struct.unpack_from(
-        "<HIIBHI", head, 94
-    )
+    sizes = struct.unpack_from("<HIIBHI", head, 94)
+    header_size, points_offset, num_vlrs, format_id, record_size, num_points = sizes
     if minor >= 4:
         num_points = int.from_bytes(head[247:255], "little") or num_points
     scales, offsets = np.frombuffer(head, "<f8", 6, 131).reshape(2, 3)

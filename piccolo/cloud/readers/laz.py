@@ -179,6 +179,5 @@ def _refusing(path: Path, lazrs: ModuleType) -> Iterator[None]:
     except BaseException as error:  # a panic in Rust: no Exception, and of a class that can't be imported
         if not isinstance(error, lazrs.LazrsError) and type(error).__name__ != "PanicException":
             raise
-        raise InputError(
-            f"{path}: the compressed points are broken ({quoted(str(error).encode())})"
-        ) from error
+        why = quoted(str(error).encode())
+        raise InputError(f"{path}: the compressed points are broken ({why})") from error

@@ -152,9 +152,7 @@ def _open_array(path: Path, member: str | None, size: int) -> ArrayInFile:
         raise InputError(f"{path}: {array}, {WANTED}")
     promised, found = math.prod(shape) * dtype.itemsize, size - offset
     if promised != found:
-        raise InputError(
-            f"{path}: an array promises {promised} bytes, found {found}; it is cut off or broken"
-        )
+        raise InputError(f"{path}: an array promises {promised} bytes, found {found}; it is cut off")
     return array
 
 

@@ -48,9 +48,8 @@ def open_pcd(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     read = {"ascii": _read_ascii, "binary": _read_binary, "binary_compressed": _read_compressed}
     read_columns = partial(read[header.encoding], header, fields)
     if fields[3].name in PACKED_NAMES:
-        return PointSource(
-            path, partial(_read_packed, header, fields[3].type, read_columns), header.num_points
-        )
+        read_chunks = partial(_read_packed, header, fields[3].type, read_columns)
+        return PointSource(path, read_chunks, header.num_points)
     types = [field.type for field in fields[3:]]
     return column_source(path, read_columns, types, header.num_points, options.labels)
 
