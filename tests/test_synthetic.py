@@ -163,6 +163,6 @@ def test_command_line_writes_a_world_that_reads_back(tmp_path, capsys):
     ],
 )
 def test_command_line_refuses_in_one_line_before_anything_is_written(options, message, tmp_path, capsys):
-    assert tool.main(["--out", str(tmp_path / "r"), *options]) == 2
+    assert tool.main(["--out", str(tmp_path / "r"), *options.split()]) == 2
     assert capsys.readouterr() == ("", f"make_room.py: {message}\n")
     assert not (tmp_path / "r").exists()
