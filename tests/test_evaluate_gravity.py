@@ -47,7 +47,8 @@ def test_the_fit_finds_the_cue_that_tells():
 
 
 def test_weights_are_printed_as_the_module_holds_them(monkeypatch, capsys):
-    monkeypatch.setattr(calibrate_gravity, "BUILDINGS", ["attic"])
+    attic = {"attic": calibrate_gravity.BUILDINGS["attic"]}
+    monkeypatch.setattr(calibrate_gravity, "BUILDINGS", attic)
     assert calibrate_gravity.main(["--fit", "1", "2", "--check", "2", "3", "--quiet"]) == 0
     weights, sharing, _, *table = capsys.readouterr().out.splitlines()
     assert tuple(re.findall(r"(\w+)=", weights)) == Weights._fields

@@ -10,7 +10,7 @@ from piccolo.cloud.octree import build_octree
 from piccolo.errors import InputError
 from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.gravity import estimate_normals, rotation_to_z_up
-from piccolo.scenes.synthetic.buildings import make_building
+from piccolo.scenes.synthetic.buildings import BUILDINGS
 
 Z = np.array([0.0, 0.0, 1.0])
 TURNS = [np.array(w) for w in ([0.3, -0.2, 0.9], [1.4, 0.6, -0.3], [-0.7, 2.2, 1.0], [2.9, -0.5, 0.4])]
@@ -122,7 +122,7 @@ def test_points_too_sparse_for_furniture_are_no_evidence():
 
 
 def test_a_front_with_a_strip_of_ground_is_uncertain():
-    up = find_up(turned(make_building("front", 1), TURNS[2]), 0.0)
+    up = find_up(turned(BUILDINGS["front"](1), TURNS[2]), 0.0)
     assert up.confidence < 0.75
     assert "front" in up.reason
 

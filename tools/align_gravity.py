@@ -1,9 +1,6 @@
 #!/usr/bin/env python3
 """Turn a coloured scan so that z is up: find up from its planes, write the cloud and the 4 x 4 transform."""
 
-import _checkout  # noqa: F401
+from _checkout import run
 
-from piccolo.cli.align_gravity import main
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+run(__name__, __file__)

@@ -4,7 +4,6 @@
 import argparse
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import _checkout  # noqa: F401
@@ -25,8 +24,7 @@ from piccolo.panorama.texels import pack_texels
 from piccolo.runtime.threads import num_cores
 
 EPILOG = """\
-examples:
-  python tools/benchmark.py
+example:
   python tools/benchmark.py --cloud scan.ply --pano query.jpg
 
 Every kernel is timed once in each round, so that a disturbance hits all; ratios are of the medians.
@@ -34,13 +32,7 @@ The reference is cv2.remap: 8-bit, 3 channels, bilinear, one thread, a coherent 
 """
 
 
-@dataclass(frozen=True)
-class Case:
-    """The data on which the kernels are timed."""
-
-    points: PackedPoints
-    rgb: NDArray[np.uint8]  # (H, W, 3)
-    pose: Pose
+Case = tuple[PackedPoints, NDArray[np.uint8], Pose]  # what is timed: points, image (H, W, 3), pose
 
 
 def box_case(num_points: int, width: int) -> Case:
@@ -56,7 +48,7 @@ def box_case(num_points: int, width: int) -> Case:
     noise = rng.integers(0, 256, (width // 2, width, 3), dtype=np.uint8)
     rgb = np.asarray(cv2.GaussianBlur(noise, (0, 0), 2.0), dtype=np.uint8)
     pose = Pose(yaw_rotation(0.7), np.array([0.5, -0.3, 0.1]))
-    return Case(pack_points(points[order], colors[order]), rgb, pose)
+    return pack_points(points[order], colors[order]), rgb, pose
 
 
 def file_case(cloud_path: Path, pano_path: Path, num_points: int) -> Case:
@@ -67,7 +59,7 @@ def file_case(cloud_path: Path, pano_path: Path, num_points: int) -> Case:
     chosen = np.linspace(0, len(cloud.points) - 1, num_points).astype(np.int64)
     pose = Pose(yaw_rotation(0.7), np.median(cloud.points, axis=0).astype(np.float64))
     points = pack_points(cloud.points[chosen], cloud.colors[chosen])
-    return Case(points, read_panorama(pano_path).rgb, pose)
+    return points, read_panorama(pano_path).rgb, pose
 
 
 def coherent_map(num_pixels: int, width: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -93,12 +85,12 @@ def medians(contenders: dict[str, Callable[[], object]], num_rounds: int) -> dic
 def run_kernels(case: Case, num_rounds: int) -> None:
     """Print the table of the kernels."""
     cv2.setNumThreads(1)
-    texels = pack_texels(case.rgb)
-    map_u, map_v = coherent_map(len(case.points), case.rgb.shape[1])
-    points, pose = case.points, case.pose
+    points, rgb, pose = case
+    texels = pack_texels(rgb)
+    map_u, map_v = coherent_map(len(points), rgb.shape[1])
     seconds = medians(
         {
-            "cv2.remap, 1 thread": lambda: cv2.remap(case.rgb, map_u, map_v, cv2.INTER_LINEAR),
+            "cv2.remap, 1 thread": lambda: cv2.remap(rgb, map_u, map_v, cv2.INTER_LINEAR),
             "loss, 1 thread": lambda: sampling_loss(points, texels, pose, 1),
             "loss, 2 threads": lambda: sampling_loss(points, texels, pose, 2),
             "loss + gradient + normal matrix, 1 thread": lambda: sampling_equations(points, texels, pose, 1),
@@ -108,15 +100,14 @@ def run_kernels(case: Case, num_rounds: int) -> None:
     )
     reference = map_u.size / seconds["cv2.remap, 1 thread"]
     same = sampling_loss(points, texels, pose, 1) == sampling_loss(points, texels, pose, 2)
-    print(f"{len(points)} points, {case.rgb.shape[1]} x {case.rgb.shape[0]} image, {num_cores()} cores\n")
+    print(f"{len(points)} points, {rgb.shape[1]} x {rgb.shape[0]} image, {num_cores()} cores\n")
     print("| kernel | Mpoint/s | of cv2.remap | of its one thread |")
     print("|---|---:|---:|---:|")
     for name, value in seconds.items():
         count = map_u.size if name.startswith("cv2") else len(points)
         alone = seconds[name.replace("2 threads", "1 thread")]
-        print(
-            f"| {name} | {count / value / 1e6:.0f} | {count / value / reference:.2f} | {alone / value:.2f} |"
-        )
+        speed = count / value
+        print(f"| {name} | {speed / 1e6:.0f} | {speed / reference:.2f} | {alone / value:.2f} |")
     print(f"\nsame bits with 1 and 2 threads: {'yes' if same else 'NO'}")
 
 

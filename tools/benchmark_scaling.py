@@ -6,7 +6,6 @@ import multiprocessing
 import resource
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -48,12 +47,7 @@ COLUMNS = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Case:
-    """A cloud and panoramas in it."""
-
-    cloud: Cloud
-    queries: list[tuple[Panorama, Pose]]
+Case = tuple[Cloud, list[tuple[Panorama, Pose]]]  # a cloud, and panoramas in it with their true poses
 
 
 def ordered(
@@ -77,7 +71,7 @@ def scene_case(folder: Path, num_points: int) -> Case:
         points = points + rng.normal(0.0, 0.005, points.shape).astype(np.float32)
     taken = [query for query in scene.queries if query.variant == "clean"][:NUM_QUERIES]
     queries = [(read_panorama(query.image), query.pose) for query in taken]
-    return Case(ordered(points, cloud.colors[index], cloud.origin_world), queries)
+    return ordered(points, cloud.colors[index], cloud.origin_world), queries
 
 
 def rooms_case(num_rooms: int) -> Case:
@@ -87,31 +81,31 @@ def rooms_case(num_rooms: int) -> Case:
     points, colors, _ = scan_world(world, 50_000 * num_rooms, workers)
     taken = [make_query(world, k, "clean", 1024, workers) for k in range(NUM_QUERIES)]
     queries = [(Panorama(q.rgb, np.ones(q.rgb.shape[:2], dtype=bool)), q.pose) for q in taken]
-    return Case(ordered(points, colors, np.zeros(3)), queries)
+    return ordered(points, colors, np.zeros(3)), queries
 
 
 def measure(label: str, make: Callable[[], Case], results: "multiprocessing.Queue[str]") -> None:
     """Put one row of the table."""
-    case, workers = make(), Workers(num_cores())
-    every = max(1, len(case.cloud.points) // 20_000)
-    small = Cloud(case.cloud.points[::every], case.cloud.colors[::every], case.cloud.origin_world)
+    (cloud, queries), workers = make(), Workers(num_cores())
+    every = max(1, len(cloud.points) // 20_000)
+    small = Cloud(cloud.points[::every], cloud.colors[::every], cloud.origin_world)
     for gravity in GRAVITIES:  # compiles
         settings = CoarseToFineSettings(gravity=gravity)
-        localize(prepare_map(small, workers), case.queries[0][0], settings, workers, Stopwatch())
+        localize(prepare_map(small, workers), queries[0][0], settings, workers, Stopwatch())
     before_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     begin = time.perf_counter()
-    scan_map = prepare_map(case.cloud, workers)
+    scan_map = prepare_map(cloud, workers)
     seconds = time.perf_counter() - begin
-    columns = [label, str(len(case.cloud.points)), str(len(scan_map.centers)), f"{seconds:.1f}"]
+    columns = [label, str(len(cloud.points)), str(len(scan_map.centers)), f"{seconds:.1f}"]
     for gravity in GRAVITIES:
         settings = CoarseToFineSettings(gravity=gravity)
         times, correct = [], 0
-        for panorama, truth in case.queries:
+        for panorama, truth in queries:
             begin = time.perf_counter()
             found = localize(scan_map, panorama, settings, workers, Stopwatch())
             times.append(time.perf_counter() - begin)
             correct += is_correct(found.pose, truth)
-        columns += [f"{np.median(times):.2f}", f"{correct}/{len(case.queries)}"]
+        columns += [f"{np.median(times):.2f}", f"{correct}/{len(queries)}"]
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     results.put(f"| {' | '.join([*columns, f'{peak_mb:.0f}', f'{before_mb:.0f}'])} |")
 

@@ -36,13 +36,12 @@ from piccolo.result import Result
 from piccolo.runtime.json_file import parse_lines, read_bytes
 
 EPILOG = """\
-examples:
+example:
   python tools/calibrate_confidence.py --fit trials.jsonl --check others.jsonl bench.jsonl
-  python tools/calibrate_confidence.py --fit paper.jsonl --without twins hall corridor
 
 Files are those of tools/evaluate_confidence.py. The weights printed go into
-piccolo/confidence/confidence.py; the tables show how reliable the
-confidence in use is on each set, and the fraction of true poses in the region of the covariance.
+piccolo/confidence/confidence.py; the tables show how reliable the confidence in use is on each set, and the
+fraction of true poses in the region of the covariance.
 """
 PENALTY = 0.05  # on squared weights of features of deviation 1: without, easy trials ask for ever larger ones
 LEVELS = (0.0, 0.5, 0.9, 0.99, 1.01)
@@ -116,18 +115,14 @@ def print_reliability(name: str, outcomes: Sequence[Outcome]) -> None:
         print(f"| {low} to {min(high, 1.0)} | {len(some)} | {right} | {len(some) - right} |")
 
 
-def status_of(o: Outcome, min_confidence: float) -> str:
-    """What the pose is called by the model in use."""
-    return classify(o.evidence, o.covariance, o.has_alternatives, min_confidence, o.model)[0]
-
-
-def print_cases(name: str, outcomes: Sequence[Outcome], min_confidence: float) -> None:
+def print_cases(name: str, outcomes: Sequence[Outcome]) -> None:
     """The statuses of each case with the confidence in use."""
     print(f"\n| case, {name} | poses | right | localized | ambiguous | false |")
     print("|---|---:|---:|---:|---:|---:|")
     for case in dict.fromkeys(o.case for o in outcomes):
         some = [o for o in outcomes if o.case == case]
-        called = [status_of(o, min_confidence) for o in some]
+        evidence = [(o.evidence, o.covariance, o.has_alternatives, MIN_CONFIDENCE, o.model) for o in some]
+        called = [classify(*one)[0] for one in evidence]
         false = sum(s == LOCALIZED and not o.is_correct for s, o in zip(called, some, strict=True))
         counts = sum(o.is_correct for o in some), called.count(LOCALIZED), called.count(AMBIGUOUS), false
         print(f"| {case} | {len(some)} | {' | '.join(map(str, counts))} |")
@@ -140,17 +135,13 @@ def print_coverage(name: str, outcomes: Sequence[Outcome]) -> None:
         return
     print(f"\n| covariance, {name} | right poses | in the 95 % region | in the 50 % region |")
     print("|---|---:|---:|---:|")
-    for part, rows in (
-        ("rotation and position", slice(6)),
-        ("rotation", slice(3)),
-        ("position", slice(3, 6)),
-    ):
-        squares = [
-            o.error[rows] @ np.linalg.solve(o.covariance.matrix[rows, rows], o.error[rows])
-            for o in some
-            if o.covariance is not None
-        ]
-        fractions = [np.mean(squares < chi2.ppf(p, len(range(6)[rows]))) for p in (0.95, 0.5)]
+    errors = np.array([o.error for o in some])
+    matrices = np.array([o.covariance.matrix for o in some if o.covariance is not None])
+    parts = {"rotation and position": slice(6), "rotation": slice(3), "position": slice(3, 6)}
+    for part, rows in parts.items():
+        e = errors[:, rows, None]
+        squares = np.sum(e * np.linalg.solve(matrices[:, rows, rows], e), axis=(1, 2))
+        fractions = [np.mean(squares < chi2.ppf(p, e.shape[1])) for p in (0.95, 0.5)]
         print(f"| {part} | {len(some)} | {fractions[0]:.3f} | {fractions[1]:.3f} |")
 
 
@@ -172,7 +163,7 @@ def main(arguments: argparse.Namespace) -> int:
         print(f"of {', '.join(FEATURES[: len(weights)])}")
     for name, outcomes in sets.items():
         if outcomes:
-            print_cases(name, outcomes, MIN_CONFIDENCE)
+            print_cases(name, outcomes)
             print_reliability(name, outcomes)
             print_coverage(name, outcomes)
     return 0

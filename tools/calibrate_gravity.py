@@ -21,13 +21,12 @@ from piccolo.gravity.alignment import normals_of
 from piccolo.gravity.up import up_hypotheses
 from piccolo.gravity.up_features import SENSE_SHARING, WEIGHTS, Weights, log_odds
 from piccolo.runtime.threads import Workers, num_cores
-from piccolo.scenes.synthetic.buildings import BUILDINGS, make_building
+from piccolo.scenes.synthetic.buildings import BUILDINGS
 
 PENALTY = 0.01  # on the square of a weight times its cue's standard deviation; all kinds' losses add up to 1
 IN_USE = np.array([*WEIGHTS, SENSE_SHARING])
 EPILOG = """\
-examples:
-  python tools/calibrate_gravity.py
+example:
   python tools/calibrate_gravity.py --fit 0 100 --check 1100 1120
 
 Every seed makes a place of each kind, turned at random. Each direction that flat points face is a hypothesis
@@ -51,7 +50,7 @@ def choice_of(case: tuple[str, int]) -> Choice:
     """The hypotheses for a place of a kind and a seed, turned at random."""
     kind, seed = case
     R = rotations_of(seed, 1)[0]
-    cloud = rotated_cloud(make_building(kind, seed), R)
+    cloud = rotated_cloud(BUILDINGS[kind](seed), R)
     hypotheses = up_hypotheses(normals_of(cloud.voxels(np.eye(3))))
     is_up = [hypothesis.axis @ R[:, 2] > np.cos(np.radians(ROUGH)) for hypothesis in hypotheses]
     return Choice(kind, np.array([hypothesis.cues for hypothesis in hypotheses]), np.array(is_up))

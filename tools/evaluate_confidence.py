@@ -17,7 +17,6 @@ from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import IN_METRES
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.confidence.confidence import AMBIGUOUS, LOCALIZED
-from piccolo.geometry.pose import Pose
 from piccolo.geometry.pose_error import is_correct
 from piccolo.geometry.rotations import Gravity
 from piccolo.panorama import AS_STORED, read_panorama
@@ -38,8 +37,7 @@ from piccolo.scenes.synthetic.trials import (
 )
 
 EPILOG = """\
-examples:
-  python tools/evaluate_confidence.py --seeds 0 40 --out trials.jsonl
+example:
   python tools/evaluate_confidence.py --seeds 0 0 --scenes BENCH/house BENCH/hospital --out bench.jsonl
 
 Seeds make rooms, and places that look the same from several positions; scenes are folders with cloud.ply,
@@ -61,11 +59,8 @@ def scene_trials(scene: Scene, others: Sequence[Scene]) -> Iterator[tuple[CloudS
     upright = [trial for trial in own if trial.case == "clean"]
     spoilt = [Trial(name, rgb, t.true_pose if name == "blurred" else None)
               for t in upright[:2] for name, rgb in without_scene(t.rgb, rng)]  # fmt: skip
-    elsewhere = [
-        Trial("elsewhere", read_panorama(query.image).rgb, None)
-        for other in others
-        for query in other.queries
-    ]
+    foreign = [query.image for other in others for query in other.queries]
+    elsewhere = [Trial("elsewhere", read_panorama(image).rgb, None) for image in foreign]
     points_world = cloud.points + cloud.origin_world
     yield cloud_of((points_world, cloud.colors)), [*own, *elsewhere, *spoilt, *map(upside_down, upright)]
     sparse = np.sort(rng.choice(len(points_world), int(SPARSE_FRACTION * len(points_world)), replace=False))
@@ -105,31 +100,15 @@ def results_of(arguments: argparse.Namespace) -> Iterator[tuple[str, Trial, Resu
             yield name, trial, scan.localize_query(trial.rgb, AS_STORED, settings)
 
 
-def as_line(scene: str, trial: Trial, result: Result) -> str:
-    """One JSON object."""
-    pose: Pose | None = trial.true_pose
-    truth = pose and {
-        "R_cam_from_world": pose.R_cam_from_world.tolist(),
-        "center_world": pose.center_world.tolist(),
-    }
-    return json.dumps(
-        {"case": trial.case, "scene": scene, "truth": truth, "result": json.loads(result.to_json())}
-    )
-
-
 def print_table(counts: dict[str, list[tuple[str, bool]]]) -> int:
     """One line a case; returns the number of false answers."""
     print("| case | trials | correct | localized | ambiguous | false |")
     print("|---|---:|---:|---:|---:|---:|")
-    total = 0
     for case, rows in counts.items():
-        localized = [ok for status, ok in rows if status == LOCALIZED]
-        false = localized.count(False)
-        ambiguous = sum(status == AMBIGUOUS for status, _ in rows)
-        correct = sum(ok for _, ok in rows)
-        print(f"| {case} | {len(rows)} | {correct} | {len(localized)} | {ambiguous} | {false} |")
-        total += false
-    return total
+        statuses, is_right = zip(*rows, strict=True)
+        numbers = len(rows), sum(is_right), statuses.count(LOCALIZED), statuses.count(AMBIGUOUS)
+        print(f"| {case} | {' | '.join(map(str, numbers))} | {rows.count((LOCALIZED, False))} |")
+    return sum(rows.count((LOCALIZED, False)) for rows in counts.values())
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -147,12 +126,14 @@ def main(arguments: argparse.Namespace) -> int:
     counts: dict[str, list[tuple[str, bool]]] = {}
     with arguments.out.open("w") as file:
         for scene, trial, result in results_of(arguments):
-            ok = trial.true_pose is not None and is_correct(result.pose, trial.true_pose)
+            pose, names = trial.true_pose, ("R_cam_from_world", "center_world")
+            ok = pose is not None and is_correct(result.pose, pose)
             counts.setdefault(trial.case, []).append((result.status, ok))
-            file.write(as_line(scene, trial, result) + "\n")
+            truth = pose and {name: getattr(pose, name).tolist() for name in names}
+            line = {"case": trial.case, "scene": scene, "truth": truth}
+            file.write(json.dumps(line | {"result": json.loads(result.to_json())}) + "\n")
             file.flush()
-            outcome = "right" if ok else "wrong"
-            print_note(arguments, f"{scene}: {trial.case}: {result.status}, {outcome}")
+            print_note(arguments, f"{scene}: {trial.case}: {result.status}, {'right' if ok else 'wrong'}")
     return 1 if print_table(counts) else 0
 
 

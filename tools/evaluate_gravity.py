@@ -24,14 +24,12 @@ from piccolo.geometry.rotations import random_rotation
 from piccolo.gravity import MIN_CONFIDENCE
 from piccolo.gravity.alignment import find_alignment
 from piccolo.runtime.threads import Workers, num_cores
-from piccolo.scenes.synthetic.buildings import BUILDINGS, make_building
+from piccolo.scenes.synthetic.buildings import BUILDINGS
 
 RIGHT, ROUGH = 0.5, 5.0  # [deg]
 THINNED = 0.04  # spacing of a scene's points, which the search thins further [m]
 EPILOG = """\
-examples:
-  python tools/evaluate_gravity.py
-  python tools/evaluate_gravity.py --seeds 900 910 --kinds room --turns 50
+example:
   python tools/evaluate_gravity.py --scenes BENCH/house BENCH/hospital --turns 250
 
 Each cloud is turned by --turns seeded rotations, uniform over all, and aligned as by align_gravity.py.
@@ -39,8 +37,6 @@ Seeds make places of each kind; scenes are folders with a cloud.ply whose z is u
 for the first --full turns. A Markdown table on stdout: right is within 0.5 degrees, rough within 5; accepted
 is a confidence of --min-confidence or more.
 """
-
-
 Points = NDArray[np.floating[Any]]
 
 
@@ -60,7 +56,7 @@ def cases_of(arguments: argparse.Namespace) -> Iterator[tuple[str, Points, list[
     """Names of clouds with z up, their points (N, 3) [m] and the rotations (3, 3) to turn them by."""
     for kind in arguments.kinds:
         for seed in range(*arguments.seeds):
-            yield kind, make_building(kind, seed), rotations_of(seed, arguments.turns)
+            yield kind, BUILDINGS[kind](seed), rotations_of(seed, arguments.turns)
     for number, folder in enumerate(arguments.scenes):
         rotations = rotations_of(number, arguments.turns)
         cloud = open_cloud([folder / "cloud.ply"])

@@ -22,8 +22,7 @@ from piccolo.result import Result
 from piccolo.scenes.scene import read_scene
 
 EPILOG = """\
-examples:
-  python tools/fuzz_readers.py --seconds 60 --crashes found
+example:
   python tools/fuzz_readers.py --reader las --seconds 3600 --corpus samples --crashes found
 
 Each reader gets the files of --corpus that end as its formats do, or one of a few bytes, and mutations of
@@ -42,13 +41,11 @@ def read_format(form: CloudFormat) -> Callable[[Path], object]:
     return read
 
 
-def named(form: CloudFormat) -> str:
-    """A format's name on the command line."""
-    return min(form.suffixes, key=lambda suffix: (len(suffix), suffix)).removeprefix(".")
-
-
 READERS: dict[str, tuple[tuple[str, ...], Callable[[Path], object]]] = {
-    **{named(form): (tuple(sorted(form.suffixes)), read_format(form)) for form in FORMATS},
+    **{
+        min(form.suffixes, key=lambda s: (len(s), s))[1:]: (tuple(sorted(form.suffixes)), read_format(form))
+        for form in FORMATS
+    },
     "panorama": ((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp"), read_panorama),
     "result": ((".jsonl",), lambda path: Result.from_json(path.read_text())),
     "scene": ((".json",), read_scene),
@@ -100,12 +97,9 @@ def fuzz_apart(name: str, arguments: argparse.Namespace) -> bool:
                 (Path(corpus) / path.name).write_bytes(path.read_bytes())
         prefix = arguments.crashes / f"{name}-"
         command = [sys.executable, __file__, "--inside", name, corpus, f"-artifact_prefix={prefix}"]
-        command += [
-            f"-max_total_time={arguments.seconds}",
-            f"-timeout={TIMEOUT_S}",
-            f"-seed={arguments.seed}",
-        ]
-        command += [f"-rss_limit_mb={MEMORY_MB}", f"-max_len={MAX_SIZE}", "-print_final_stats=1"]
+        flags = {"max_total_time": arguments.seconds, "timeout": TIMEOUT_S, "seed": arguments.seed}
+        flags |= {"rss_limit_mb": MEMORY_MB, "max_len": MAX_SIZE, "print_final_stats": 1}
+        command += [f"-{name}={value}" for name, value in flags.items()]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     stats = [line for line in done.stderr.splitlines() if "number_of_executed_units" in line]
     print(f"{name}: {stats[0].split()[-1] if stats else '?'} inputs, {'FOUND' if done.returncode else 'ok'}")

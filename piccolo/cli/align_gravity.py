@@ -3,13 +3,12 @@
 import argparse
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ..cloud import open_cloud
-from ..cloud.settings import CloudSettings
 from ..cloud.transform import BoundedStream, with_bounds, write_transformed
 from ..confidence.confidence import check_confidence
 from ..errors import InputError
@@ -17,13 +16,14 @@ from ..gravity import MIN_CONFIDENCE
 from ..gravity.alignment import AlignmentReport, find_alignment
 from ..gravity.alignment_file import Alignment, read_alignment
 from ..runtime.atomic import check_output, write_atomically
-from ..scenes.scene import QUERIES_NAME, Scene, read_scene, write_queries
+from ..scenes.scene import QUERIES_NAME, Query, read_scene, write_queries
 from .command import command, option
 from .errors import checking_options, print_error, print_note
 from .options import add_cloud_options, cloud_settings_from
 from .progress import progress_bar
 
 EXIT_ALIGNED, EXIT_UNCERTAIN = 0, 1
+Outputs = tuple[list[Path], tuple[Query, ...]]  # files of the transform, JSON and text; poses to be turned
 EPILOG = f"""\
 examples:
   python tools/align_gravity.py --cloud scan.e57 --out aligned.ply --yaw-walls
@@ -73,17 +73,8 @@ def check_arguments(arguments: argparse.Namespace) -> None:
             raise InputError(f"{path}: --out must be a PLY file, and --transform end with .json")
 
 
-@dataclass(frozen=True)
-class Outputs:
-    """What is to be written."""
-
-    cloud: Path | None
-    transforms: list[Path]  # JSON and text, or none
-    scene: Scene | None  # whose poses go along
-
-
 def outputs_of(arguments: argparse.Namespace) -> Outputs:
-    """What is to be written; refused if it can't be."""
+    """What is to be written beside the cloud; refused if it can't be."""
     path = arguments.transform
     if arguments.out and not arguments.apply:
         path = path or arguments.out.with_suffix(".json")
@@ -95,34 +86,26 @@ def outputs_of(arguments: argparse.Namespace) -> Outputs:
         check_output(output, inputs)
     if arguments.out in transforms:
         raise InputError(f"{arguments.out}: cloud and transform have the same name; use .ply for the cloud")
-    scene = read_scene(arguments.queries) if arguments.queries else None
-    return Outputs(arguments.out, transforms, scene)
+    return transforms, read_scene(arguments.queries).queries if arguments.queries else ()
 
 
-def open_with_bounds(arguments: argparse.Namespace, settings: CloudSettings) -> BoundedStream:
-    """The cloud, whose reading shows its progress."""
-    return with_bounds(open_cloud(arguments.cloud, settings, progress_bar(arguments.quiet)))
-
-
-def write(cloud: BoundedStream, alignment: Alignment, outputs: Outputs) -> tuple[str, ...]:
-    """Write the cloud and what goes with it, the cloud's name last; returns warnings."""
-    out = outputs.cloud
+def write(args: argparse.Namespace, outputs: Outputs, cloud: BoundedStream, alignment: Alignment) -> None:
+    """Write the cloud and what goes with it, the cloud's name last."""
+    (transforms, queries), out = outputs, args.out
 
     def write_others() -> None:
-        texts = alignment.to_json(), alignment.to_text()
-        for path, text in zip(outputs.transforms, texts, strict=False):
+        for path, text in zip(transforms, (alignment.to_json(), alignment.to_text()), strict=False):
             write_atomically(path, text.encode())
-        if out and outputs.scene:
-            in_metres = alignment.in_unit(1.0)
-            queries = [
-                replace(query, pose=in_metres.transform_pose(query.pose)) for query in outputs.scene.queries
-            ]
-            write_queries(out.parent, queries, cloud=out.name)
+        if out and queries:
+            move = alignment.in_unit(1.0).transform_pose
+            moved = [replace(query, pose=move(query.pose)) for query in queries]
+            write_queries(out.parent, moved, cloud=out.name)
 
     if out is None:
         write_others()
-        return ()
-    return write_transformed(cloud, alignment.T_aligned_from_scan, out, write_others)
+    else:
+        T_aligned_from_scan = alignment.T_aligned_from_scan
+        print_warnings(args, write_transformed(cloud, T_aligned_from_scan, out, write_others))
 
 
 def report_of(arguments: argparse.Namespace, status: str, alignment: Alignment) -> dict[str, object]:
@@ -143,22 +126,17 @@ def evidence_of(report: AlignmentReport) -> dict[str, object]:
     x, y, z = report.up_scan
     scale = report.alignment.metres_per_unit
     rms_angle = report.plane_rms_angle
+    planes = []
+    for plane in report.planes:
+        numbers = {"num_inliers": plane.num_inliers, "fraction": plane.fraction, "rms": plane.rms / scale}
+        place = {"normal_scan": plane.normal_world.tolist(), "offset": plane.offset / scale}
+        planes.append({"kind": plane.kind, **place, **numbers})
     return {
         "up_scan": report.up_scan.tolist(),
         "tilt_deg": float(np.degrees(np.arctan2(np.hypot(x, y), z))),
         "plane_rms_angle_deg": None if rms_angle is None else float(np.degrees(rms_angle)),
         "yaw_deg": None if report.yaw is None else float(np.degrees(report.yaw)),
-        "planes": [
-            {
-                "kind": plane.kind,
-                "normal_scan": plane.normal_world.tolist(),
-                "offset": plane.offset / scale,
-                "num_inliers": plane.num_inliers,
-                "fraction": plane.fraction,
-                "rms": plane.rms / scale,
-            }
-            for plane in report.planes
-        ],
+        "planes": planes,
     }
 
 
@@ -171,7 +149,8 @@ def print_warnings(arguments: argparse.Namespace, warnings: Iterable[str]) -> No
 def align(arguments: argparse.Namespace) -> int:
     """Find the alignment, write what is sure enough; returns the exit code."""
     outputs = outputs_of(arguments)
-    cloud = open_with_bounds(arguments, cloud_settings_from(arguments))
+    show = progress_bar(arguments.quiet)
+    cloud = with_bounds(open_cloud(arguments.cloud, cloud_settings_from(arguments), show))
     found, warnings = find_alignment(cloud, arguments.up, arguments.yaw_walls)
     print_warnings(arguments, warnings)
     alignment = found.alignment
@@ -182,7 +161,7 @@ def align(arguments: argparse.Namespace) -> int:
     elif arguments.yaw_walls and found.yaw is None:
         doubt = "--yaw-walls: no wall is among the dominant planes"
     if not doubt:
-        print_warnings(arguments, write(cloud, alignment, outputs))
+        write(arguments, outputs, cloud, alignment)
     report = report_of(arguments, "uncertain" if doubt else "aligned", alignment)
     print(json.dumps({**report, **evidence_of(found)}, allow_nan=False))
     return print_error(arguments, doubt, EXIT_UNCERTAIN) if doubt else EXIT_ALIGNED
@@ -196,10 +175,10 @@ def apply(arguments: argparse.Namespace) -> int:
     if arguments.units is None and arguments.scale is None:
         settings = replace(settings, scale=given.metres_per_unit)
     alignment = (given.inverse() if arguments.inverse else given).in_unit(settings.scale)
-    cloud = open_with_bounds(arguments, settings)
+    cloud = with_bounds(open_cloud(arguments.cloud, settings, progress_bar(arguments.quiet)))
     for _ in cloud.chunks([]):  # for its box
         pass
-    print_warnings(arguments, write(cloud, alignment, outputs))
+    write(arguments, outputs, cloud, alignment)
     print(json.dumps(report_of(arguments, "applied", alignment), allow_nan=False))
     return EXIT_ALIGNED
 

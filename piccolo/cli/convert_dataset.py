@@ -8,10 +8,10 @@ from dataclasses import asdict, fields
 from ..errors import InputError
 from ..runtime.threads import Show, Workers, num_cores
 from ..scenes.datasets import DATASETS
-from ..scenes.datasets.checking import Check, check_scene
+from ..scenes.datasets.checking import check_scene
 from ..scenes.datasets.files import AXES, DIRECTIONS
 from ..scenes.datasets.model import ConvertOptions, SceneSpec
-from ..scenes.datasets.writing import Written, write_scene
+from ..scenes.datasets.writing import write_scene
 from ..scenes.scene import read_scene
 from .command import option
 from .errors import EXIT_BAD_INPUT, UsageError, print_error, print_note, run_command
@@ -97,18 +97,6 @@ def chosen(specs: tuple[SceneSpec, ...], rooms: list[str]) -> list[SceneSpec]:
     return [spec for spec in specs if not rooms or spec.name.split("/")[-1] in rooms]
 
 
-def report(spec: SceneSpec, written: Written, check: Check | None) -> dict[str, object]:
-    """The JSON object of a scene."""
-    return {
-        "scene": spec.name,
-        "folder": str(written.folder),
-        "status": "there already" if written.num_points is None else "written",
-        "points": written.num_points,
-        "queries": written.num_queries,
-        **({"fits": check.is_passed, "check": [asdict(c) for c in check.panoramas]} if check else {}),
-    }
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Write the scenes one by one; returns the exit code."""
     for name in ("check", "seed"):
@@ -135,7 +123,12 @@ def convert_scene(spec: SceneSpec, arguments: argparse.Namespace, show: Show) ->
         return print_error(arguments, f"{spec.name}: {error}", EXIT_BAD_INPUT)
     for warning in written.warnings:
         print_note(arguments, warning)
-    print(json.dumps(report(spec, written, check)), flush=True)
+    status = "there already" if written.num_points is None else "written"
+    line: dict[str, object] = {"scene": spec.name, "folder": str(written.folder), "status": status}
+    line |= {"points": written.num_points, "queries": written.num_queries}
+    if check:
+        line |= {"fits": check.is_passed, "check": [asdict(panorama) for panorama in check.panoramas]}
+    print(json.dumps(line), flush=True)
     if check and not check.is_passed:
         return print_error(arguments, f"{spec.name}: {check.advice}", EXIT_BAD_FIT)
     return 0

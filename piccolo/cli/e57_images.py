@@ -25,32 +25,15 @@ SUFFIX = {"jpeg": ".jpg", "png": ".png"}
 
 def image_json(index: int, image: E57Image) -> dict[str, object]:
     """The JSON object of an image."""
-    placement = image.placement
-    return {
-        "index": index,
-        "name": image.name,
-        "kind": image.kind,
-        "is_usable": image.kind == "spherical",
-        "width": image.width,
-        "height": image.height,
-        "fov_deg": image.fov_deg,
-        "encoding": image.encoding,
-        "bytes": image.size,
-        "pose": placement
-        and {
-            "quaternion_wxyz_world_from_image": quaternion_wxyz(placement.R_world_from_local).tolist(),
-            "center_world": placement.center_world.tolist(),
-        },
-        "scan_guid": image.scan_guid or None,
-    }
-
-
-def extract(path: Path, index: int, image: E57Image, folder: Path) -> Path:
-    """Write an image as a file into a folder; returns the file's path."""
-    stem = re.sub(r"[^\w.-]", "_", path.stem)
-    file = folder / f"{stem}_{index}{SUFFIX[image.encoding]}"
-    write_atomically(file, read_image(path, index))
-    return file
+    pose = None
+    if placement := image.placement:
+        wxyz = quaternion_wxyz(placement.R_world_from_local).tolist()
+        center_world = placement.center_world.tolist()
+        pose = {"quaternion_wxyz_world_from_image": wxyz, "center_world": center_world}
+    names = "name", "kind", "width", "height", "fov_deg", "encoding"
+    row = {"index": index, **{name: getattr(image, name) for name in names}, "bytes": image.size}
+    is_usable = image.kind == "spherical"
+    return {**row, "is_usable": is_usable, "pose": pose, "scan_guid": image.scan_guid or None}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -70,7 +53,10 @@ def main(arguments: argparse.Namespace) -> int:
         row = image_json(index, image)
         if arguments.extract:
             try:
-                row["file"] = str(extract(arguments.e57, index, image, arguments.extract))
+                stem = re.sub(r"[^\w.-]", "_", arguments.e57.stem)
+                file = arguments.extract / f"{stem}_{index}{SUFFIX[image.encoding]}"
+                write_atomically(file, read_image(arguments.e57, index))
+                row["file"] = str(file)
             except InputError as error:
                 exit_code = print_error(arguments, str(error), EXIT_BAD_INPUT)
         print(json.dumps(row, allow_nan=False), flush=True)

@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -79,25 +80,16 @@ def check_usage(arguments: argparse.Namespace) -> None:
         raise UsageError(f"--jobs: found {arguments.jobs}, wanted at least 1")
 
 
-def run_config_from(arguments: argparse.Namespace) -> RunConfig:
-    """How queries are localized, by the options."""
-    num_threads = max(1, num_cores() // arguments.jobs)
-    reading = cloud_settings_from(arguments), read_options_from(arguments)
-    return RunConfig(settings_from(arguments), *reading, CachePolicy(True, arguments.cache), num_threads)
-
-
 def tables_of(rows: Sequence[QueryResult], thresholds: Thresholds) -> list[tables.Table]:
     """All tables of one run."""
     inside = [row for row in rows if row.is_in_box]
-    boxes = [row for row in rows if row.is_in_box is not None]
+    num_outside = sum(row.is_in_box is False for row in rows)
     found = [tables.per_query(rows), tables.summary_table(rows, thresholds, f"all {len(rows)} queries")]
-    if boxes:
-        num_outside = len(boxes) - len(inside)
+    if num_outside and inside:
         title = f"without the {num_outside} queries taken outside the cloud's bounding box"
-        found += [tables.summary_table(inside, thresholds, title)] if num_outside and inside else []
-    found.append(tables.threshold_table(rows, thresholds))
-    found.append(tables.risk_table(risk_and_coverage(rows, thresholds)))
-    return found
+        found.append(tables.summary_table(inside, thresholds, title))
+    risk = tables.risk_table(risk_and_coverage(rows, thresholds))
+    return [*found, tables.threshold_table(rows, thresholds), risk]
 
 
 def write_report(arguments: argparse.Namespace, rows: Sequence[QueryResult], thresholds: Thresholds) -> None:
@@ -153,7 +145,9 @@ def main(arguments: argparse.Namespace) -> int:
     """Run or read the results, print the tables; returns the exit code."""
     check_usage(arguments)
     with checking_options():
-        config = run_config_from(arguments)
+        reading = cloud_settings_from(arguments), read_options_from(arguments)
+        cache, num_threads = CachePolicy(True, arguments.cache), max(1, num_cores() // arguments.jobs)
+        config = RunConfig(settings_from(arguments), *reading, cache, num_threads)
     thresholds = Thresholds(arguments.max_distance, float(np.radians(arguments.max_angle)))
     scenes = find_scenes(arguments.scenes or [])
     check_files(arguments, input_files(scenes))
@@ -164,11 +158,8 @@ def main(arguments: argparse.Namespace) -> int:
         rows = list(match_results(scenes, read_results([arguments.results])))
     else:
         found = open_run(arguments.out, config, scenes, arguments.variants)
-        rows, num_failed = found.resume(
-            arguments.jobs,
-            progress_bar(arguments.quiet),
-            lambda text: print_error(arguments, text, EXIT_BAD_INPUT),
-        )
+        report = partial(print_error, arguments, exit_code=EXIT_BAD_INPUT)
+        rows, num_failed = found.resume(arguments.jobs, progress_bar(arguments.quiet), report)
     if arguments.variants:
         rows = [row for row in rows if row.variant in arguments.variants]
     if not rows:

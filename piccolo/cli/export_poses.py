@@ -3,6 +3,7 @@
 import argparse
 import json
 from collections.abc import Iterable
+from typing import Any
 
 from ..errors import InputError
 from ..geometry.camera_axes import CAMERA_AXES
@@ -60,14 +61,9 @@ def options_from(arguments: argparse.Namespace) -> Options:
         raise InputError(f"--{foreign[0]}: not an option of the format {arguments.format}")
     if "crs" in form.options and "crs" not in given:
         raise InputError("--crs: not given, wanted the cloud's coordinate system, such as EPSG:25832")
-    return Options(
-        images=arguments.images,
-        size=tuple(arguments.size) if arguments.size else None,
-        offset=tuple(arguments.offset) if arguments.offset else None,
-        axes=given.get("axes", Options.axes),
-        timestamps=given.get("timestamps", Options.timestamps),
-        crs=arguments.crs,
-    )
+    own: dict[str, Any] = {name: given[name] for name in ("images", *OPTIONS) if name in given}
+    own |= {name: tuple(own[name]) for name in ("size", "offset") if name in own}
+    return Options(**own)
 
 
 def notes_on(selection: Selection) -> Iterable[str]:

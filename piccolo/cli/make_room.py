@@ -2,7 +2,6 @@
 
 import argparse
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,7 +14,6 @@ from ..scenes import scene as scenes
 from ..scenes.datasets.files import write_labels
 from ..scenes.synthetic.world import (
     VARIANTS,
-    Query,
     World,
     check_num_points,
     check_width,
@@ -54,16 +52,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--scenes N", "write N scenes, FOLDER/000 on, of the seeds from --seed on", default=0)
 
 
-def write_query(folder: Path, name: str, query: Query) -> scenes.Query:
-    """Write the image of a query and return what queries.json has of it."""
-    image = folder / "images" / f"{name}.jpg"
-    bgr = cv2.cvtColor(query.rgb, cv2.COLOR_RGB2BGR)
-    quality = 70 if query.variant == "photo" else 95
-    _, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    write_atomically(image, bytes(encoded))
-    return scenes.Query(image, query.variant, query.pose)
-
-
 def write_world(
     arguments: argparse.Namespace, world: World, folder: Path, workers: Workers
 ) -> dict[str, object]:
@@ -76,13 +64,14 @@ def write_world(
     for v in dict.fromkeys(arguments.variants):
         for k in range(arguments.panoramas):
             query = make_query(world, k, v, arguments.width, workers)
-            written = write_query(folder, f"{v}_{k}", query)
+            bgr = cv2.cvtColor(query.rgb, cv2.COLOR_RGB2BGR)
+            quality = [cv2.IMWRITE_JPEG_QUALITY, 70 if v == "photo" else 95]
+            image, path = folder / "images" / f"{v}_{k}.jpg", folder / "labels" / f"{v}_{k}.png"
+            write_atomically(image, bytes(cv2.imencode(".jpg", bgr, quality)[1]))
             if arguments.labels:
-                path = folder / "labels" / f"{v}_{k}.png"
                 path.parent.mkdir(exist_ok=True)
                 write_labels(path, make_labels(world, k, query, workers))
-                written = replace(written, labels=path)
-            queries.append(written)
+            queries.append(scenes.Query(image, v, query.pose, path if arguments.labels else None))
     scenes.write_queries(folder, queries)
     return {"folder": str(folder), "points": len(points), "queries": len(queries), "seed": world.seed}
 

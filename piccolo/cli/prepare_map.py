@@ -39,12 +39,8 @@ def main(arguments: argparse.Namespace) -> int:
     workers = Workers(num_cores(), progress_bar(arguments.quiet), warn_once(arguments.quiet))
     scan_map = open_map(arguments.cloud, cloud_settings, CachePolicy(is_used=False), workers, watch)
     save_map(scan_map, arguments.out)
-    report = {
-        "map": str(arguments.out),
-        "points": len(scan_map.points),
-        "candidates": len(scan_map.centers),
-        "seconds": {stage: round(seconds, 3) for stage, seconds in watch.seconds.items()},
-        "warnings": list(scan_map.warnings),
-    }
-    print(json.dumps(report))
+    seconds = {stage: round(seconds, 3) for stage, seconds in watch.seconds.items()}
+    counts = {"points": len(scan_map.points), "candidates": len(scan_map.centers)}
+    warnings = list(scan_map.warnings)
+    print(json.dumps({"map": str(arguments.out), **counts, "seconds": seconds, "warnings": warnings}))
     return 0

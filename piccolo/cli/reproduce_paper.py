@@ -3,6 +3,7 @@
 import argparse
 import tempfile
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from ..cloud.label_colors import Labels
@@ -58,13 +59,6 @@ def file_name(condition: Condition) -> str:
     return "".join(c if c.isalnum() else "_" for c in words) + ".jsonl"
 
 
-def chosen_variants(condition: Condition, wanted: Sequence[str]) -> tuple[str, ...]:
-    """The splits of a condition, of those wanted; empty for all."""
-    if not condition.variants:
-        return tuple(wanted)
-    return tuple(variant for variant in condition.variants if not wanted or variant in wanted)
-
-
 def transformed_scenes(
     condition: Condition, scenes: Sequence[Scene], root: Path, report: Callable[[str], object]
 ) -> tuple[list[Scene], int]:
@@ -85,17 +79,14 @@ def run_condition(
     condition: Condition, scenes: Sequence[Scene], out: Path, arguments: argparse.Namespace
 ) -> tuple[list[QueryResult], int]:
     """The results under one condition, and how many queries could not be localized."""
-
-    def report(text: str) -> None:
-        print_error(arguments, text, EXIT_BAD_INPUT)
-
+    report = partial(print_error, arguments, exit_code=EXIT_BAD_INPUT)
     labels = Labels() if condition.use_labels else None
     reading = CloudSettings(labels=labels), ReadOptions(labels=labels)
     with tempfile.TemporaryDirectory(prefix="piccolo-") as temporary:
         transformed, num_failed = transformed_scenes(condition, scenes, Path(temporary), report)
         cache = CachePolicy(True, Path(temporary))
         config = RunConfig(condition.settings, *reading, cache, max(1, num_cores() // arguments.jobs))
-        variants = chosen_variants(condition, arguments.variants)
+        variants = condition.variants or arguments.variants  # those of a condition are of the wanted
         run = open_run(out / file_name(condition), config, transformed, variants)
         rows, num_failed_later = run.resume(arguments.jobs, progress_bar(arguments.quiet), report)
     return rows, num_failed + num_failed_later

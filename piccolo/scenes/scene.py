@@ -111,12 +111,8 @@ def _relative(path: Path, folder: Path) -> str:
 
 def write_queries(folder: Path, queries: Iterable[Query], **more: object) -> None:
     """Write the queries.json of a folder that holds the cloud and the images; `more` goes in beside them."""
-    document = {
-        "cloud": CLOUD_NAME,
-        "convention": CONVENTION,
-        **more,
-        "queries": [_entry(folder, query) for query in queries],
-    }
+    entries = [_entry(folder, query) for query in queries]
+    document = {"cloud": CLOUD_NAME, "convention": CONVENTION, **more, "queries": entries}
     write_atomically(folder / QUERIES_NAME, json.dumps(document, indent=1).encode())
 
 

@@ -1,7 +1,7 @@
 """Research datasets, read from their own folders and written as scenes with true poses."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from . import generic, loc360, matterport, mpo, omniscenes, stanford
 from .model import ConvertOptions, SceneList
@@ -9,8 +9,7 @@ from .model import ConvertOptions, SceneList
 __all__ = ["DATASETS", "Dataset"]
 
 
-@dataclass(frozen=True)
-class Dataset:
+class Dataset(NamedTuple):
     """A dataset that can be converted."""
 
     description: str  # in a line

@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from ...cloud import open_cloud
 from ...cloud.octree import build_octree
-from ...cloud.soa import PackedPoints, pack_points
+from ...cloud.soa import pack_points
 from ...confidence.score import VIEW_WIDTH, agreement_at
 from ...geometry.pose import Array, Pose
-from ...panorama import Panorama, read_panorama
+from ...panorama import read_panorama
 from ...panorama.resize import shrink
 from ...runtime.threads import Show, Workers, unseen
 from ..scene import Query, Scene
@@ -70,7 +70,10 @@ def check_scene(scene: Scene, num_queries: int, workers: Workers, show: Show = u
     def check(query: Query) -> ConventionCheck:
         pose = Pose(query.pose.R_cam_from_world, query.pose.center_world - voxels.origin)
         panorama = shrink(read_panorama(query.image), VIEW_WIDTH)  # once for all variants
-        return _check_pose(scene.name_of(query), points, panorama, pose, voxels.origin)
+        variants = convention_variants(pose, voxels.origin)
+        scores = {words: agreement_at(points, panorama, variant).score for words, variant in variants.items()}
+        best = max(scores, key=lambda words: scores[words])
+        return ConventionCheck(scene.name_of(query), scores[AS_GIVEN], scores[best], best)
 
     chosen = evenly_spaced(scene.queries, num_queries)
     return Check(tuple(workers.each(check, chosen, f"{scene.name}: check")))
@@ -80,15 +83,6 @@ def evenly_spaced(queries: Sequence[Query], count: int) -> list[Query]:
     """Up to `count` of the queries, evenly spaced."""
     indices = np.linspace(0, len(queries) - 1, min(count, len(queries))).round().astype(int)
     return [queries[k] for k in indices]
-
-
-def _check_pose(
-    image: str, points: PackedPoints, panorama: Panorama, pose: Pose, origin: Array
-) -> ConventionCheck:
-    variants = convention_variants(pose, origin)
-    scores = {words: agreement_at(points, panorama, variant).score for words, variant in variants.items()}
-    best = max(scores, key=lambda words: scores[words])
-    return ConventionCheck(image, scores[AS_GIVEN], scores[best], best)
 
 
 def convention_variants(pose: Pose, origin: Array) -> dict[str, Pose]:
@@ -107,10 +101,9 @@ def convention_variants(pose: Pose, origin: Array) -> dict[str, Pose]:
     poses = {}
     for words, variant in inverted.items():
         for turn in axis_rotations():
-            named = (
-                "" if np.array_equal(turn, np.eye(3)) else f"the camera's x, y, z are {describe_axes(turn)}"
-            )
-            text = " and ".join(part for part in (words, named) if part) or AS_GIVEN
+            is_same = np.array_equal(turn, np.eye(3))
+            named = "" if is_same else f"the camera's x, y, z are {describe_axes(turn)}"
+            text = " and ".join(filter(None, (words, named))) or AS_GIVEN
             poses[text] = Pose(turn @ variant.R_cam_from_world, variant.center_world)
     return poses
 

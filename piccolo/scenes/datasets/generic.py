@@ -4,7 +4,7 @@ import csv
 import io
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,15 +26,7 @@ VARIANT = "generic"
 WANTED = f"wanted rows with image, {', '.join(NUMBERS)}, direction, axes"
 
 Row = Mapping[str, str]
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A row of the list."""
-
-    room: str
-    cloud: Path | None  # None: the one for all
-    panorama: PosedPanorama
+Entry = tuple[Path | None, PosedPanorama]  # a row of the list: its cloud, None for the one of all
 
 
 def list_scenes(options: ConvertOptions) -> SceneList:
@@ -44,13 +36,12 @@ def list_scenes(options: ConvertOptions) -> SceneList:
     notes: list[str] = []
     rows = _rows(path, options, notes)
     for number, row in enumerate(rows, 1):
-        entry = _entry(f"{path}, row {number}", path, row, options)
-        entries[entry.room].append(entry)
+        room, entry = _entry(f"{path}, row {number}", path, row, options)
+        entries[room].append(entry)
     if not entries:
         raise InputError(f"{path}: found no row with a picture, {WANTED}")
-    return SceneList(
-        tuple(_scene_spec(room, entries[room], options) for room in sorted(entries)), tuple(notes)
-    )
+    specs = tuple(_scene_spec(room, entries[room], options) for room in sorted(entries))
+    return SceneList(specs, tuple(notes))
 
 
 def _list_of(options: ConvertOptions) -> Path:
@@ -91,14 +82,11 @@ def _table(path: Path) -> list[dict[str, str]]:
 
 def _renamed(row: dict[str, str]) -> dict[str, str]:
     """A row of tools/export_poses.py as one of a list, its rotation inverted to go with the position."""
-    w, x, y, z = (row[f"quaternion_{letter}"] for letter in "wxyz")
-    inverse = {"qw": w, "qx": _negated(x), "qy": _negated(y), "qz": _negated(z)}
+    inverse = {f"q{letter}": row[f"quaternion_{letter}"] for letter in "wxyz"}
+    w = inverse["qw"]
+    inverse["qw"] = w[1:] if w.startswith("-") else f"-{w}"
     position = {f"t{letter}": row.get(letter, "") for letter in "xyz"}
     return {**row, **inverse, **position, "direction": WORLD_FROM_CAM, "axes": "piccolo", "cloud": ""}
-
-
-def _negated(number: str) -> str:
-    return number[1:] if number.startswith("-") else f"-{number}"
 
 
 def _trajectory(path: Path, options: ConvertOptions, notes: list[str]) -> list[dict[str, str]]:
@@ -107,8 +95,8 @@ def _trajectory(path: Path, options: ConvertOptions, notes: list[str]) -> list[d
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, wanted pictures named by the times in {path.name}")
     pictures = {file.stem: file for file in sorted(folder.iterdir()) if file.suffix.lower() in SUFFIXES}
-    lines = [line.split() for line in read_text(path, WANTED).splitlines() if not _is_comment(line)]
-    rows = []
+    lines = [line.split() for line in read_text(path, WANTED).splitlines()]
+    lines, rows = [fields for fields in lines if fields and not fields[0].startswith("#")], []
     for fields in lines:
         if len(fields) != len(TUM_COLUMNS):
             found = " ".join(fields)[:60]
@@ -122,33 +110,26 @@ def _trajectory(path: Path, options: ConvertOptions, notes: list[str]) -> list[d
     return rows
 
 
-def _is_comment(line: str) -> bool:
-    return line.strip()[:1] in ("", "#")
-
-
-def _entry(where: str, path: Path, row: Row, options: ConvertOptions) -> Entry:
+def _entry(where: str, path: Path, row: Row, options: ConvertOptions) -> tuple[str, Entry]:
+    """A row's room, and the row itself."""
     if missing := [name for name in ("image", *NUMBERS) if name not in row]:
         raise InputError(f"{where}: found no {missing[0]}, {WANTED}")
     image = path.parent / row["image"]
     room = row.get("room", options.folder.resolve().name)
     if room != Path(room).name or room.startswith(".") or not room.isprintable():
         raise InputError(f"{where}: found the room {room!r}, wanted a name for a folder")
-    panorama = PosedPanorama(
-        image.name, {image.name: image}, row.get("variant", VARIANT), _pose(where, row, options)
-    )
-    return Entry(room, path.parent / row["cloud"] if "cloud" in row else None, panorama)
+    variant, pose = row.get("variant", VARIANT), _pose(where, row, options)
+    cloud = path.parent / row["cloud"] if "cloud" in row else None
+    return room, (cloud, PosedPanorama(image.name, {image.name: image}, variant, pose))
 
 
 def _pose(where: str, row: Row, options: ConvertOptions) -> Pose:
     """The pose in a row, its direction and axes by the row or by the options, and never by guessing."""
-    axes = row.get("axes", options.axes)
-    direction = row.get("direction", options.direction)
-    if axes not in AXES:
-        wanted = f"wanted one of {', '.join(AXES)} in the list or by --axes"
-        raise InputError(f"{where}: found the axes {axes}, {wanted}")
-    if direction not in DIRECTIONS:
-        wanted = f"wanted one of {', '.join(DIRECTIONS)} in the list or by --direction"
-        raise InputError(f"{where}: found the direction {direction}, {wanted}")
+    axes, direction = row.get("axes", options.axes), row.get("direction", options.direction)
+    for name, value, known in (("axes", axes, AXES), ("direction", direction, DIRECTIONS)):
+        if value not in known:
+            wanted = f"wanted one of {', '.join(known)} in the list or by --{name}"
+            raise InputError(f"{where}: found the {name} {value}, {wanted}")
     try:
         numbers = np.array([float(row[name]) for name in NUMBERS])
     except ValueError as error:
@@ -157,15 +138,15 @@ def _pose(where: str, row: Row, options: ConvertOptions) -> Pose:
     if not abs(length - 1.0) < MAX_LENGTH_ERROR:
         raise InputError(f"{where}: found a quaternion of length {length:.3g}, wanted 1")
     T = np.column_stack([rotation_from_quaternion_wxyz(numbers[3:]), numbers[:3]])
-    return pose_of_transform(where, T, direction, axes)
+    return pose_of_transform(where, T, str(direction), str(axes))
 
 
 def _scene_spec(room: str, entries: list[Entry], options: ConvertOptions) -> SceneSpec:
-    clouds = {entry.cloud or _cloud_of_all(options) for entry in entries}
+    clouds = {cloud or _cloud_of_all(options) for cloud, _ in entries}
     if len(clouds) > 1:
         names = ", ".join(sorted(map(str, clouds))[:2])
         raise InputError(f"room {room}: found the clouds {names}, wanted one")
-    panoramas = _with_unique_names([entry.panorama for entry in entries])
+    panoramas = _with_unique_names([panorama for _, panorama in entries])
     return SceneSpec(room, (CloudPart(clouds.pop()),), lambda: panoramas, source={"dataset": NAME})
 
 
@@ -178,12 +159,10 @@ def _cloud_of_all(options: ConvertOptions) -> Path:
 
 def _with_unique_names(panoramas: list[PosedPanorama]) -> list[PosedPanorama]:
     """The same, where pictures of several folders have one name with their number before it."""
-    names = [panorama.name for panorama in panoramas]
-    if len(set(names)) == len(names):
+    if len({panorama.name for panorama in panoramas}) == len(panoramas):
         return panoramas
-    numbered = []
-    for number, panorama in enumerate(panoramas):
-        (image,) = panorama.files.values()
-        name = f"{number:05d}_{panorama.name}"
-        numbered.append(PosedPanorama(name, {name: image}, panorama.variant, panorama.pose))
-    return numbered
+    return [
+        replace(panorama, name=f"{number:05d}_{name}", files={f"{number:05d}_{name}": image})
+        for number, panorama in enumerate(panoramas)
+        for name, image in panorama.files.items()
+    ]

@@ -1,5 +1,7 @@
 """360Loc (Huang et al., CVPR 2024): halls with 360-degree queries by day and by night."""
 
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,26 +21,27 @@ def list_scenes(options: ConvertOptions) -> SceneList:
     below = (options.folder, *sorted(options.folder.glob("*")))
     folders = [path for path in below if (path / QUERIES).is_dir()]
     clouds = {folder: only_cloud_in(folder) for folder in folders}
-    specs = [_scene_spec(folder, cloud) for folder, cloud in clouds.items() if cloud]
+    specs = [
+        SceneSpec(
+            folder.resolve().name, (CloudPart(cloud),), partial(_panoramas, folder), source={"dataset": NAME}
+        )
+        for folder, cloud in clouds.items()
+        if cloud
+    ]
     missing = [folder.name for folder, cloud in clouds.items() if not cloud]
     layout = f"scene with {QUERIES}/SEQUENCE/{POSES} and a coloured cloud beside {QUERIES}"
     return scene_list(options.folder, specs, missing, layout)
 
 
-def _scene_spec(folder: Path, cloud: Path) -> SceneSpec:
-    def read_panoramas() -> list[PosedPanorama]:
-        sequences = sorted((folder / QUERIES).glob(f"*/{POSES}"))
-        return [panorama for path in sequences for panorama in _panoramas(path)]
-
-    return SceneSpec(folder.resolve().name, (CloudPart(cloud),), read_panoramas, source={"dataset": NAME})
+def _panoramas(folder: Path) -> list[PosedPanorama]:
+    return [each for path in sorted((folder / QUERIES).glob(f"*/{POSES}")) for each in _sequence(path)]
 
 
-def _panoramas(path: Path) -> list[PosedPanorama]:
+def _sequence(path: Path) -> Iterator[PosedPanorama]:
     """The panoramas of a sequence: camera-to-world matrices, axes as of COLMAP."""
     document = read_json(path, WANTED)
     if not isinstance(document, dict):
         raise InputError(f"{path}: found no object, {WANTED}")
-    panoramas = []
     for file, value in document.items():
         where = f"{path}, {file}"
         try:
@@ -50,5 +53,4 @@ def _panoramas(path: Path) -> list[PosedPanorama]:
         picture = path.parent / PICTURES / Path(file).name
         name = f"{path.parent.name}_{picture.name}"
         pose = pose_of_transform(where, matrix, WORLD_FROM_CAM, "optical")
-        panoramas.append(PosedPanorama(name, {name: picture}, path.parent.name, pose))
-    return panoramas
+        yield PosedPanorama(name, {name: picture}, path.parent.name, pose)

@@ -3,6 +3,7 @@
 import re
 from collections import defaultdict
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,9 @@ def list_scenes(options: ConvertOptions) -> SceneList:
         posed = {place: files for place, files in faces.items() if _is_whole(folder, place, files)}
         if len(posed) < len(faces):
             notes.append(f"{folder}: {len(faces) - len(posed)} skyboxes without a pose or without six faces")
-        specs.append(_scene_spec(folder, meshes, posed))
+        read_panoramas = partial(_posed_panoramas, folder, posed)
+        parts = tuple(map(CloudPart, meshes))
+        specs.append(SceneSpec(folder.resolve().name, parts, read_panoramas, source={"dataset": NAME}))
     listed = scene_list(options.folder, specs, missing, f"HOUSE/{SKYBOXES} with a mesh")
     return replace(listed, notes=(*listed.notes, *notes))
 
@@ -58,14 +61,8 @@ def _pose_file(folder: Path, place: str, yaw: int) -> Path:
     return folder / POSES / f"{place}_pose_{LEVEL_CAMERA}_{yaw}.txt"
 
 
-def _scene_spec(folder: Path, meshes: list[Path], faces: dict[str, dict[str, Path]]) -> SceneSpec:
-    clouds = tuple(CloudPart(path) for path in meshes)
-    return SceneSpec(
-        folder.resolve().name,
-        clouds,
-        lambda: [_posed_panorama(folder, place, files) for place, files in faces.items()],
-        source={"dataset": NAME},
-    )
+def _posed_panoramas(folder: Path, faces: dict[str, dict[str, Path]]) -> list[PosedPanorama]:
+    return [_posed_panorama(folder, place, files) for place, files in faces.items()]
 
 
 def _posed_panorama(folder: Path, place: str, files: dict[str, Path]) -> PosedPanorama:

@@ -27,26 +27,20 @@ def list_scenes(options: ConvertOptions) -> SceneList:
     for path in sorted(options.folder.rglob("*")):
         if is_cloud(path):
             clouds[path.with_suffix("")].append(path)
-    pictures = {stem: _picture_of(stem) for stem in clouds}
-    specs = [
-        _scene_spec(options, stem, clouds[stem], picture) for stem, picture in pictures.items() if picture
-    ]
+    specs = []
+    for stem, found in clouds.items():
+        pictures = [path for suffix in PICTURES if (path := stem.with_name(stem.name + suffix)).exists()]
+        specs += [_scene_spec(options, stem, found, picture) for picture in pictures[:1]]
     if not specs:
         raise InputError(f"{options.folder}: found no cloud with a picture of the same name")
     num_alone = len(clouds) - len(specs)
     return SceneList(tuple(specs), (f"{num_alone} clouds without a picture",) if num_alone else ())
 
 
-def _picture_of(stem: Path) -> Path | None:
-    found = [path for suffix in PICTURES if (path := stem.with_name(stem.name + suffix)).exists()]
-    return found[0] if found else None
-
-
 def _scene_spec(options: ConvertOptions, stem: Path, clouds: list[Path], picture: Path) -> SceneSpec:
     if len(clouds) > 1:
         raise InputError(f"{clouds[0]}: found {clouds[1].name} beside it; leave one cloud of this name")
     name = stem.relative_to(options.folder).as_posix()
-
     pose = Pose(np.eye(3), np.zeros(3))  # the camera is at the scanner's origin, its axes are the scanner's
     panorama = PosedPanorama(picture.name, {picture.name: picture}, VARIANT, pose)
     transform = random_transform(options.seed, name)

@@ -64,8 +64,7 @@ def list_scenes(options: ConvertOptions) -> SceneList:
         if options.areas and area not in options.areas:
             continue
         name = f"area_{area}/{room}"
-        parts = _cloud_of(options.folder, area, room, options.labels)
-        if parts:
+        if parts := _cloud_of(options.folder, area, room, options.labels):
             specs.append(_scene_spec(name, parts, pictures, table))
         else:
             missing.append(name)
@@ -101,10 +100,8 @@ def _cloud_of(folder: Path, area: str, room: str, has_labels: bool) -> tuple[Clo
     found = _globbed(folder, [pattern.format(area=area, room=room) for pattern in CLOUDS])
     usable = [path for path in found if not any(ALIGNED in part for part in path.parts)]
     if found and not usable:
-        raise InputError(
-            f"{found[0]}: found a cloud of the {ALIGNED}, whose rooms are turned one by one, wanted those of "
-            "Stanford3dDataset_v1.2"
-        )
+        text = f"found a cloud of the {ALIGNED}, whose rooms are turned one by one"
+        raise InputError(f"{found[0]}: {text}, wanted those of Stanford3dDataset_v1.2")
     if not has_labels:
         return tuple(CloudPart(path) for path in usable[:1])
     objects = [path for cloud in usable[:1] for path in sorted(cloud.parent.glob("Annotations/*.txt"))]
@@ -117,19 +114,17 @@ def _scene_spec(
     source: dict[str, object] = {"dataset": NAME, "labels": table is not None}
     if table is not None:
         source["label_names"] = ["unknown", *CLASSES]
-    return SceneSpec(
-        name,
-        parts,
-        lambda: [_posed_panorama(picture, table) for picture in pictures],
-        has_labels=table is not None,
-        source=source,
-    )
+    read_panoramas = partial(_posed_panoramas, pictures, table)
+    return SceneSpec(name, parts, read_panoramas, has_labels=table is not None, source=source)
 
 
-def _posed_panorama(picture: Picture, table: NDArray[np.uint16] | None) -> PosedPanorama:
-    name = picture.path.name
-    read_labels = None if table is None else partial(labels_by_index, picture.semantic, table)
-    return PosedPanorama(name, {name: picture.path}, f"area_{picture.part}", _read_pose(picture), read_labels)
+def _posed_panoramas(pictures: list[Picture], table: NDArray[np.uint16] | None) -> list[PosedPanorama]:
+    panoramas = []
+    for picture in pictures:
+        read_labels = None if table is None else partial(labels_by_index, picture.semantic, table)
+        files, variant = {picture.path.name: picture.path}, f"area_{picture.part}"
+        panoramas.append(PosedPanorama(picture.path.name, files, variant, _read_pose(picture), read_labels))
+    return panoramas
 
 
 def _read_pose(picture: Picture) -> Pose:

@@ -70,7 +70,8 @@ def _there_already(spec: SceneSpec, folder: Path) -> Written:
 def _write_cloud(spec: SceneSpec, path: Path, warnings: list[str], show: Show) -> int:
     """Stream the cloud's files into one PLY; returns how many points it has."""
     validator = PointValidator(spec.cloud[0].path, 1.0)
-    dtype = vertex_rows(*_no_points(), np.empty(0, np.int32) if spec.has_labels else None).dtype
+    nothing = np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty(0, np.int32) if spec.has_labels else None
+    dtype = vertex_rows(*nothing).dtype
     with writing_ply(path, dtype) as writer:
         for (points, colors), label in _chunks(spec, validator, warnings, show):
             moved = points if spec.transform is None else spec.transform.of_points(points)
@@ -79,10 +80,6 @@ def _write_cloud(spec: SceneSpec, path: Path, warnings: list[str], show: Show) -
         validator.check()
     warnings += validator.warnings()
     return validator.num_finite
-
-
-def _no_points() -> Chunk:
-    return np.empty((0, 3)), np.empty((0, 3), np.uint8)
 
 
 def _chunks(
@@ -103,7 +100,14 @@ def _chunks(
 
 def _write_panorama(spec: SceneSpec, panorama: PosedPanorama, folder: Path, transfer: Transfer) -> Query:
     for name, file in panorama.files.items():
-        _link_or_copy(file, folder / IMAGES / name, transfer)
+        if not (file.is_file() and os.access(file, os.R_OK)):
+            raise InputError(f"{file}: no such panorama, or no permission to read it")
+        target = folder / IMAGES / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if transfer == "symlink":
+            target.symlink_to(file.resolve())
+        else:
+            shutil.copyfile(file, target)
     labels = None
     if panorama.read_labels is not None:
         labels = (folder / LABELS / panorama.name).with_suffix(".png")
@@ -111,14 +115,3 @@ def _write_panorama(spec: SceneSpec, panorama: PosedPanorama, folder: Path, tran
         write_labels(labels, panorama.read_labels())
     pose = panorama.pose if spec.transform is None else spec.transform.of_pose(panorama.pose)
     return Query(folder / IMAGES / panorama.name, panorama.variant, pose, labels)
-
-
-def _link_or_copy(file: Path, target: Path, transfer: Transfer) -> None:
-    """Make the picture appear at `target`, as a link or a copy."""
-    if not (file.is_file() and os.access(file, os.R_OK)):
-        raise InputError(f"{file}: no such panorama, or no permission to read it")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if transfer == "symlink":
-        target.symlink_to(file.resolve())
-    else:
-        shutil.copyfile(file, target)

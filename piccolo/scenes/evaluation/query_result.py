@@ -57,20 +57,13 @@ class QueryResult:
 
     def to_json(self) -> str:
         """One line."""
+        names = "scene", "image", "variant", "is_in_box"
+        line: dict[str, object] = {"format": FORMAT, **{name: getattr(self, name) for name in names}}
         has_pose = self.result.pose is not None
-        return json.dumps(
-            {
-                "format": FORMAT,
-                "scene": self.scene,
-                "image": self.image,
-                "variant": self.variant,
-                "is_in_box": self.is_in_box,
-                "position_error": self.position_error if has_pose else None,
-                "rotation_error_deg": float(np.degrees(self.rotation_error)) if has_pose else None,
-                "result": json.loads(self.result.to_json()),
-            },
-            allow_nan=False,
-        )
+        line["position_error"] = self.position_error if has_pose else None
+        line["rotation_error_deg"] = float(np.degrees(self.rotation_error)) if has_pose else None
+        line["result"] = json.loads(self.result.to_json())
+        return json.dumps(line, allow_nan=False)
 
     @classmethod
     def from_json(cls, text: str) -> "QueryResult":
@@ -80,15 +73,11 @@ class QueryResult:
             if row["format"] != FORMAT:
                 raise InputError(f"evaluation: found format {row['format']!r}, wanted {FORMAT!r}")
             distance, angle_deg = row["position_error"], row["rotation_error_deg"]
-            return cls(
-                scene=str(row["scene"]),
-                image=str(row["image"]),
-                variant=str(row["variant"]),
-                is_in_box=row["is_in_box"],
-                position_error=np.inf if distance is None else float(distance),
-                rotation_error=np.inf if angle_deg is None else float(np.radians(angle_deg)),
-                result=Result.from_json(json.dumps(row["result"])),
-            )
+            words = str(row["scene"]), str(row["image"]), str(row["variant"])
+            position_error = np.inf if distance is None else float(distance)
+            rotation_error = np.inf if angle_deg is None else float(np.radians(angle_deg))
+            result = Result.from_json(json.dumps(row["result"]))
+            return cls(*words, row["is_in_box"], position_error, rotation_error, result)
         except DAMAGE as error:
             if isinstance(error, InputError):
                 raise
@@ -116,13 +105,8 @@ def match_results(scenes: Sequence[Scene], results: Sequence[Result]) -> Iterato
 
     Raises InputError if a result belongs to no query, or its name to several.
     """
-    queries = [
-        (scene, query, path)
-        for scene in scenes
-        for query in scene.queries
-        for path in (query.image, query.labels)
-        if path is not None
-    ]
+    pairs = [(scene, query) for scene in scenes for query in scene.queries]
+    queries = [(*pair, path) for pair in pairs for path in (pair[1].image, pair[1].labels) if path]
     by_path = {path.resolve(): (scene, query) for scene, query, path in queries}
     done: set[tuple[str, str]] = set()
     for result in results:

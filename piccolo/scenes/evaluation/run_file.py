@@ -108,13 +108,11 @@ def _is_of(row: QueryResult, scene: Scene, query: Query) -> bool:
 def _check_settings(path: Path, rows: Sequence[QueryResult], settings: dict[str, object]) -> None:
     for row in rows:
         made_with = row.result.settings
-        names = sorted({*made_with, *settings})
-        differing = [name for name in names if made_with.get(name) != settings.get(name)]
-        if differing:
-            name = differing[0]
+        for name in sorted({*made_with, *settings}):
             found, wanted = made_with.get(name), settings.get(name)
-            text = f"its results were made with {name} {found!r}, not {wanted!r}; choose another file"
-            raise InputError(f"{path}: {text}")
+            if found != wanted:
+                text = f"its results were made with {name} {found!r}, not {wanted!r}"
+                raise InputError(f"{path}: {text}; choose another file")
 
 
 @contextmanager

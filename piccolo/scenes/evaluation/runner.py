@@ -6,7 +6,6 @@ import signal
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.queues import Queue
-from pathlib import Path
 from typing import Any
 
 from ...cloud.settings import CloudSettings
@@ -72,20 +71,13 @@ def run_job(config: RunConfig, job: Job, show: Show = unseen) -> Iterator[QueryR
         return
     for query in job.queries:
         try:
-            image = _image_of(scene, query, config.read_options)
+            image = query.labels if config.read_options.labels else query.image
+            if image is None:
+                raise InputError(f"{scene.folder}: {scene.name_of(query)} has no labels in queries.json")
             result = scan.localize_query(image, config.read_options, config.settings)
             yield query_result_of(scene, query, result, is_in_box(scan, query.pose))
         except (OSError, InputError) as error:
             yield Failure(str(error), 1)
-
-
-def _image_of(scene: Scene, query: Query, read_options: ReadOptions) -> Path:
-    """The image of a query that is localized: that of its labels if labels are to be read."""
-    if not read_options.labels:
-        return query.image
-    if query.labels is None:
-        raise InputError(f"{scene.folder}: {scene.name_of(query)} has no labels in queries.json")
-    return query.labels
 
 
 def run(

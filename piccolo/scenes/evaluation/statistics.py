@@ -70,12 +70,10 @@ class Point:
 
 def risk_and_coverage(rows: Sequence[QueryResult], thresholds: Thresholds = PAPER_THRESHOLDS) -> list[Point]:
     """The curve of risk over coverage, a point for each distinct confidence, from the highest down."""
-    points: list[Point] = []
-    by_confidence = sorted(rows, key=lambda row: -row.result.confidence)
+    points: dict[float, Point] = {}
     num_wrong = 0
-    for k, row in enumerate(by_confidence, 1):
+    for k, row in enumerate(sorted(rows, key=lambda row: -row.result.confidence), 1):
         num_wrong += not row.is_correct(thresholds)
-        is_last = k == len(rows) or by_confidence[k].result.confidence < row.result.confidence
-        if is_last:
-            points.append(Point(row.result.confidence, k / len(rows), num_wrong / k, num_wrong))
-    return points
+        confidence = row.result.confidence
+        points[confidence] = Point(confidence, k / len(rows), num_wrong / k, num_wrong)
+    return list(points.values())

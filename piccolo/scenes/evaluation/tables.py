@@ -59,9 +59,8 @@ def groups(rows: Sequence[QueryResult]) -> Iterator[tuple[str, list[QueryResult]
 
 def summary_table(rows: Sequence[QueryResult], thresholds: Thresholds, title: str) -> Table:
     """Quartiles of the errors, accuracy and statuses of every group."""
-    words = (
-        f"{title}; correct: under {thresholds.max_distance:g} m and {np.degrees(thresholds.max_angle):g} deg"
-    )
+    distance, angle_deg = thresholds.max_distance, np.degrees(thresholds.max_angle)
+    words = f"{title}; correct: under {distance:g} m and {angle_deg:g} deg"
     errors = "t 25 % [m]", "t 50 %", "t 75 %", "R 25 % [deg]", "R 50 %", "R 75 %"
     columns = "queries", "number", "correct", "accuracy", *errors, "localized", "wrong of these", "s"
     cells = tuple((name, *_summary_cells(summarize(some, thresholds))) for name, some in groups(rows))
@@ -78,10 +77,8 @@ def _summary_cells(s: Summary) -> tuple[str, ...]:
 def threshold_table(rows: Sequence[QueryResult], thresholds: Thresholds) -> Table:
     """Accuracy at several distances."""
     title = f"accuracy: fraction under the distance and {np.degrees(thresholds.max_angle):g} deg"
-    cells = tuple(
-        (name, *(f"{fraction:.3f}" for fraction in accuracies(some, thresholds.max_angle)))
-        for name, some in groups(rows)
-    )
+    fractions = [(name, accuracies(some, thresholds.max_angle)) for name, some in groups(rows)]
+    cells = tuple((name, *(f"{value:.3f}" for value in values)) for name, values in fractions)
     return Table(title, ("queries", *(f"{line:g} m" for line in ACCURACY_DISTANCES)), cells)
 
 
@@ -89,8 +86,7 @@ def risk_table(points: Sequence[Point]) -> Table:
     """The fraction accepted, and wrong of these, at a few minimum confidences."""
     cells = []
     for line in CONFIDENCES:
-        inside = [point for point in points if point.confidence >= line]
-        if inside:
+        if inside := [point for point in points if point.confidence >= line]:
             p = inside[-1]
             cells.append((f"{line}", f"{100 * p.coverage:.1f} %", f"{p.num_wrong}", f"{100 * p.risk:.2f} %"))
     columns = "min confidence", "accepted", "wrong of these", "wrong fraction"

@@ -139,16 +139,11 @@ def _with_fields(
 
     A packet without an end of its RDF is damaged and gives way to a new one.
     """
-    found = list(END.finditer(packet))
-    if not found:
+    if not END.search(packet):
         packet = EMPTY_PACKET
-        found = list(END.finditer(packet))
-    prefixes = dict.fromkeys(PREFIX.findall(packet))
-    known = {
-        name.decode()
-        for prefix in prefixes
-        for name in re.findall(re.escape(prefix) + rb":(\w{1,60})", packet)
-    }
+    *_, end = END.finditer(packet)
+    names = [re.findall(re.escape(p) + rb":(\w{1,60})", packet) for p in set(PREFIX.findall(packet))]
+    known = {name.decode() for some in names for name in some}
     fields = {} if "ProjectionType" in known else {"ProjectionType": "equirectangular"}
     if not known & set(CROP_FIELDS):
         check_size(f"{path}: without GPano's crop", size)
@@ -156,16 +151,11 @@ def _with_fields(
     fields |= {n: f"{angle:.{DECIMALS}f}" for n, angle in zip(POSE_NAMES, angles_deg, strict=True)}
     attributes = "".join(f' GPano:{name}="{value}"' for name, value in fields.items()).encode()
     about = ABOUT.search(packet)  # has to be the same in all descriptions
-    rdf = found[-1].group(1)
+    rdf, place = end[1], end.start()
     description = b"<%s:Description %s:about=%s" % (rdf, rdf, about.group(1) if about else b'""')
     description += b' xmlns:GPano="%s"%s/>' % (NAMESPACE, attributes)
-    place = found[-1].start()
     return packet[:place] + description + packet[place:]
 
 
-GPANO = Format(
-    "gpano",
-    "copies of the JPEGs with heading, pitch and roll as Photo Sphere XMP; --out is a new folder",
-    write,
-    is_folder=True,
-)
+TEXT = "copies of the JPEGs with heading, pitch and roll as Photo Sphere XMP; --out is a new folder"
+GPANO = Format("gpano", TEXT, write, is_folder=True)

@@ -54,14 +54,9 @@ def write_csv(images: Sequence[PosedImage], out: Path, options: Options) -> None
     for image in images:
         result, pose = image.result, image.pose
         score = result.evidence.score if result.evidence else None
-        table.writerow(
-            [
-                *(image.name, result.cloud_name, result.status, result.confidence, score),
-                *pose.center_world.tolist(),
-                *quaternion_wxyz(pose.R_cam_from_world).tolist(),
-                *heading_pitch_roll_deg(pose),
-            ]
-        )
+        words = image.name, result.cloud_name, result.status, result.confidence, score
+        wxyz = quaternion_wxyz(pose.R_cam_from_world).tolist()
+        table.writerow([*words, *pose.center_world.tolist(), *wxyz, *heading_pitch_roll_deg(pose)])
     write_offset_beside(out, options)
     write_atomically(out, text.getvalue().encode())
 
@@ -102,10 +97,5 @@ def write_potree(images: Sequence[PosedImage], out: Path, options: Options) -> N
 CSV = Format("csv", "table with a header", write_csv, frozenset({"offset"}), has_unique_names=False)
 TUM = Format("tum", "trajectory for evo and others", write_tum, frozenset({"offset", "axes", "timestamps"}))
 KITTI = Format("kitti", "trajectory for evo and others", write_kitti, frozenset({"offset", "axes"}))
-POTREE = Format(
-    "potree",
-    "coordinates.txt of Potree's 360 images, in the folder that --images names",
-    write_potree,
-    frozenset({"offset", "timestamps"}),
-    forbidden='"',
-)
+TEXT = "coordinates.txt of Potree's 360 images, in the folder that --images names"
+POTREE = Format("potree", TEXT, write_potree, frozenset({"offset", "timestamps"}), forbidden='"')

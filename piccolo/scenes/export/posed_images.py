@@ -98,9 +98,8 @@ def select(results: Sequence[Result], clouds: Sequence[str] = (), use_all: bool 
     """The results with a pose that are localized, or all with a pose; those of `clouds` only, if given."""
     known = {result.cloud_name for result in results}
     if missing := [cloud for cloud in clouds if cloud not in known]:
-        raise InputError(
-            f"--cloud: found no result for {missing[0]}, wanted one of {', '.join(sorted(known))}"
-        )
+        wanted = ", ".join(sorted(known))
+        raise InputError(f"--cloud: found no result for {missing[0]}, wanted one of {wanted}")
     chosen, left_out = [], Counter[str]()
     for result in results:
         if clouds and result.cloud_name not in clouds:
@@ -123,9 +122,7 @@ def posed_images(results: Sequence[Result], form: Format, options: Options) -> l
             raise InputError(f"{result.pano}: this result has no pose to write")
         name, path = _name(result.pano, options.images), Path(result.pano)
         if form.forbidden and (found := re.search(form.forbidden, name)):
-            raise InputError(
-                f"{name}: {form.name} can't read {found.group()!r} in a name: rename the picture"
-            )
+            raise InputError(f"{name}: {form.name} can't read {found[0]!r} in a name: rename the picture")
         if form.has_unique_names and name in posed:
             clouds = f"{posed[name].result.cloud_name}, {result.cloud_name}"
             raise InputError(f"{name}: has two results (clouds {clouds}); --cloud chooses one")

@@ -71,13 +71,9 @@ def _each_preset(cases: Mapping[str, dict[str, Any]]) -> ConditionsOf:
 
 
 def _variants(presets: Sequence[Settings], variants: Sequence[str]) -> list[Condition]:
-    figures = {
-        "handheld": "accuracy 0.71 (OmniScenes)",
-        "turtlebot": "accuracy 0.77 (OmniScenes)",
-        "change_handheld": "accuracy 0.43 (OmniScenes)",
-        "change_turtlebot": "accuracy 0.55 (OmniScenes)",
-        "mpo": "accuracy 0.45 (MPO)",
-    }
+    found = {"handheld": 0.71, "turtlebot": 0.77, "change_handheld": 0.43, "change_turtlebot": 0.55}
+    figures = {variant: f"accuracy {value} (OmniScenes)" for variant, value in found.items()}
+    figures["mpo"] = "accuracy 0.45 (MPO)"
     # Splits may be tilted. The paper's preset needs one of known and unknown; the default tries both.
     tried = [replace(s, gravity="auto") if isinstance(s, CoarseToFineSettings) else s for s in presets]
     return [
@@ -87,6 +83,21 @@ def _variants(presets: Sequence[Settings], variants: Sequence[str]) -> list[Cond
     ]
 
 
+GRAVITY_CASES: dict[str, dict[str, Any]] = {
+    "gravity known": {"gravity": "known"},
+    "gravity unknown": {"gravity": "unknown"},
+    "images upside down": {"gravity": "unknown", "transform": flipped},
+    "clouds turned at random": {"gravity": "unknown", "transform": with_random_rotation},
+}
+PERCENTS = (100, 50, 20, 10, 5, 2, 1)
+LABEL_CASES: dict[str, dict[str, Any]] = {
+    "RGB": {"paper": "0.03 m, 0.66 deg (Stanford2D-3D-S, all areas)"},
+    "labels": {"use_labels": True, "paper": "0.01 m, 0.28 deg (Stanford2D-3D-S, all areas)"},
+}
+RUNTIME_CASES = {
+    f"{count} points": {"transform": with_count(count), "paper": f"{seconds} (RTX 2080)"}
+    for count, seconds in RUNTIMES.items()
+}
 EXPERIMENTS = {
     "translations": Experiment(
         "number of start positions",
@@ -101,9 +112,7 @@ EXPERIMENTS = {
     "initialization": Experiment(
         "how starts are chosen",
         "K2 by the loss alone, or by the loss and then histograms",
-        _paper_setting(
-            "initialization", {"loss-only": "by the loss alone", "two-stage": "loss, then histograms"}
-        ),
+        _paper_setting("initialization", {"loss-only": "loss alone", "two-stage": "loss, then histograms"}),
     ),
     "loss": Experiment(
         "sampling against photometric loss",
@@ -113,44 +122,22 @@ EXPERIMENTS = {
     "gravity": Experiment(
         "gravity, images upside down, clouds turned",
         "what is known of the vertical is varied",
-        _each_preset(
-            {
-                "gravity known": {"gravity": "known"},
-                "gravity unknown": {"gravity": "unknown"},
-                "images upside down": {"gravity": "unknown", "transform": flipped},
-                "clouds turned at random": {"gravity": "unknown", "transform": with_random_rotation},
-            }
-        ),
+        _each_preset(GRAVITY_CASES),
     ),
     "density": Experiment(
         "density of the cloud",
         "points are left out at random",
-        _each_preset(
-            {
-                f"{100 * fraction:g} % of the points": {"transform": with_fraction(fraction)}
-                for fraction in (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
-            }
-        ),
+        _each_preset({f"{p:g} % of the points": {"transform": with_fraction(p / 100)} for p in PERCENTS}),
     ),
     "labels": Experiment(
         "semantic labels as colours",
         "what is compared: colours or labels",
-        _each_preset(
-            {
-                "RGB": {"paper": "0.03 m, 0.66 deg (Stanford2D-3D-S, all areas)"},
-                "labels": {"use_labels": True, "paper": "0.01 m, 0.28 deg (Stanford2D-3D-S, all areas)"},
-            }
-        ),
+        _each_preset(LABEL_CASES),
     ),
     "runtime": Experiment(
         "seconds by the number of points",
         "points are left out at random; search + refinement",
-        _each_preset(
-            {
-                f"{count} points": {"transform": with_count(count), "paper": f"{seconds} (RTX 2080)"}
-                for count, seconds in RUNTIMES.items()
-            }
-        ),
+        _each_preset(RUNTIME_CASES),
     ),
     "variants": Experiment("splits of the data: changed scenes, light", "a line a split", _variants),
 }

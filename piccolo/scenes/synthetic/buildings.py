@@ -5,6 +5,7 @@ Surfaces are sampled evenly, without a scanner's shadows but with its noise. z i
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -54,11 +55,12 @@ class SurfaceSampler:
 
     def shell(self, x: float, y: float, z: float) -> None:
         """The inside of a box from the origin to (x, y, z): floor, ceiling and walls."""
-        for height in (0.0, z):
-            self.parallelogram([0, 0, height], [x, 0, 0], [0, y, 0])
-        for corner, a in (([0, 0, 0], [x, 0, 0]), ([0, y, 0], [x, 0, 0]), ([0, 0, 0], [0, y, 0]),
-                          ([x, 0, 0], [0, y, 0])):  # fmt: skip
-            self.parallelogram(corner, a, [0, 0, z])
+        along, across, up = [x, 0, 0], [0, y, 0], [0, 0, z]
+        for corner, a, b in (
+            ([0, 0, 0], along, across), (up, along, across), ([0, 0, 0], along, up),
+            (across, along, up), ([0, 0, 0], across, up), (along, across, up),
+        ):  # fmt: skip
+            self.parallelogram(corner, a, b)
 
     def furnish(self, low: Array, high: Array, num_pieces: int) -> None:
         """Boxes on the floor between two corners (3,)."""
@@ -93,14 +95,11 @@ def _cluttered(seed: int) -> Array:
     return np.concatenate([points, s.points().clip(low, high)])
 
 
-def _without_ceiling(seed: int) -> Array:
+def _open_room(seed: int, is_open_above: bool) -> Array:
+    """A room without its ceiling, or without its floor."""
     points = _room(seed)
-    return np.compress(points[:, 2] < points[:, 2].max() - MARGIN, points, axis=0)
-
-
-def _without_floor(seed: int) -> Array:
-    points = _room(seed)
-    return np.compress(points[:, 2] > points[:, 2].min() + MARGIN, points, axis=0)
+    z = points[:, 2]
+    return np.compress(z < z.max() - MARGIN if is_open_above else z > z.min() + MARGIN, points, axis=0)
 
 
 def _attic(seed: int) -> Array:
@@ -220,11 +219,11 @@ def _corridor(seed: int) -> Array:
     return scan_room(corridor, 2 * ROOM_POINTS, rng, Workers())[0].astype(np.float64)
 
 
-BUILDINGS: dict[str, Callable[[int], Array]] = {
+BUILDINGS: dict[str, Callable[[int], Array]] = {  # points (N, 3) [m] by a seed
     "room": _room,
     "clutter": _cluttered,
-    "no ceiling": _without_ceiling,
-    "no floor": _without_floor,
+    "no ceiling": partial(_open_room, is_open_above=True),
+    "no floor": partial(_open_room, is_open_above=False),
     "attic": _attic,
     "stairs": _stairwell,
     "outdoors": _outdoors,
@@ -233,8 +232,3 @@ BUILDINGS: dict[str, Callable[[int], Array]] = {
     "corridor": _corridor,
     "bare": _bare,
 }
-
-
-def make_building(kind: str, seed: int) -> Array:
-    """Points (N, 3) [m] of one of BUILDINGS."""
-    return BUILDINGS[kind](seed)

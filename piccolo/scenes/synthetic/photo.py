@@ -17,31 +17,25 @@ BAND = 8  # rows cast at once: all rays of a large image would take a gigabyte
 def photograph(room: Room, pose: Pose, width: int, workers: Workers) -> NDArray[np.uint8]:
     """Equirectangular image (width / 2, width, 3) of a room at `pose`."""
     rays_cam = pixel_rays(SUPERSAMPLING * width)
-    image = np.empty((width // 2, width, 3), dtype=np.uint8)
 
-    def run(top: int) -> None:
-        band = image[top : top + BAND]
+    def run(top: int) -> NDArray[np.uint8]:
         rows = rays_cam[SUPERSAMPLING * top : SUPERSAMPLING * (top + BAND)].reshape(-1, 3)
-        rays = rows @ pose.R_cam_from_world
-        rgb = cast_rays(room, pose.center_world, rays, Workers(), "band")[1]
-        blocks = rgb.reshape(len(band), SUPERSAMPLING, width, SUPERSAMPLING, 3)
-        band[:] = np.round(blocks.mean(axis=(1, 3)) * 255.0)
+        rgb = cast_rays(room, pose.center_world, rows @ pose.R_cam_from_world, Workers(), "band")[1]
+        blocks = rgb.reshape(-1, SUPERSAMPLING, width, SUPERSAMPLING, 3)
+        return np.asarray(np.round(blocks.mean(axis=(1, 3)) * 255.0), dtype=np.uint8)
 
-    list(workers.each(run, range(0, width // 2, BAND), "panorama"))
-    return image
+    return np.concatenate(list(workers.each(run, range(0, width // 2, BAND), "panorama")))
 
 
 def label_image(room: Room, pose: Pose, width: int, workers: Workers) -> NDArray[np.uint16]:
     """Equirectangular image (width / 2, width) of a room's labels at `pose`, of pixels' centres."""
-    image = np.empty((width // 2, width), dtype=np.uint16)
 
-    def run(top: int) -> None:
+    def run(top: int) -> NDArray[np.uint16]:
         rays = pixel_rays(width, slice(top, top + BAND)).reshape(-1, 3) @ pose.R_cam_from_world
         labels = cast_rays(room, pose.center_world, rays, Workers(), "band")[2]
-        image[top : top + BAND] = labels.reshape(-1, width)
+        return labels.reshape(-1, width).astype(np.uint16)
 
-    list(workers.each(run, range(0, width // 2, BAND), "labels"))
-    return image
+    return np.concatenate(list(workers.each(run, range(0, width // 2, BAND), "labels")))
 
 
 def blur(image: Array, sigma: float) -> Array:

@@ -26,10 +26,8 @@ def free_position(room: Room, rng: np.random.Generator, heights: tuple[float, fl
         position = room.corner + rng.uniform(low, high)
         if room.clearance(position) >= MIN_CLEARANCE:
             return position
-    size = room.size.tolist()
-    raise InputError(
-        f"size: a room of {size} m has no place {MIN_CLEARANCE} m from everything; use a larger one"
-    )
+    text = f"has no place {MIN_CLEARANCE} m from everything; use a larger one"
+    raise InputError(f"size: a room of {room.size.tolist()} m {text}")
 
 
 def scan_room(

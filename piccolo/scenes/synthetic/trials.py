@@ -75,10 +75,8 @@ def room_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[Tria
     trials.append(upside_down(right[0]))
     yield cloud, trials
     sparse = np.sort(rng.choice(len(cloud[0]), int(SPARSE_FRACTION * len(cloud[0])), replace=False))
-    yield (
-        (cloud[0][sparse], cloud[1][sparse]),
-        [Trial("sparse", right[0].rgb, right[0].true_pose), Trial("sparse, elsewhere", trials[4].rgb, None)],
-    )
+    thin = Trial("sparse", right[0].rgb, right[0].true_pose), Trial("sparse, elsewhere", trials[4].rgb, None)
+    yield (cloud[0][sparse], cloud[1][sparse]), list(thin)
     wall = np.flatnonzero(cloud[0][:, 0] < cloud[0][:, 0].min() + WALL_DEPTH)
     yield (cloud[0][wall], cloud[1][wall]), [Trial("one wall", r.rgb, r.true_pose) for r in right[:2]]
 
