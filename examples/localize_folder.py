@@ -3,7 +3,6 @@
 The CSV has the columns name,x,y,z,radius: the camera of photos/NAME was within `radius` [m] of (x, y, z) [m].
 A photo without a row is searched everywhere.
 """
-# ruff: noqa: T201
 
 import csv
 import sys

@@ -1,5 +1,4 @@
 """Localize one photo: python examples/localize_one.py scan.ply query.jpg."""
-# ruff: noqa: T201
 
 import sys
 

@@ -1,5 +1,4 @@
 """Own arrays, cell by cell: python examples/own_arrays.py scan.ply query.jpg."""
-# ruff: noqa: T201
 
 # %% Paths
 import sys

@@ -1,7 +1,7 @@
 """A scan that photos are localized in: what `import piccolo` gives."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, TypedDict, Unpack
@@ -77,7 +77,7 @@ PRIOR_FIELDS = {f.name for f in fields(Prior)}
 class Scan:
     """A prepared scan. `open_scan` makes one; it may be used from several threads at once."""
 
-    prepared: ScanMap | PaperMap
+    prepared: ScanMap | PaperMap = field(repr=False)
     name: str | tuple[str, ...]  # path as given, or the paths of several files that are one scan
     cloud_settings: CloudSettings
     settings: Settings  # of photos that say nothing else

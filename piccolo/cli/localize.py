@@ -29,7 +29,7 @@ def open_scan(arguments: argparse.Namespace, settings: Settings) -> Scan:
     for output in filter(None, (arguments.out, arguments.overlay)):
         check_output(output, [*arguments.cloud, *arguments.pano])
     if is_first_use() and not arguments.quiet:
-        text = f"first use: compiling kernels, once (under half a minute), into {kernel_folder()}"
+        text = f"first use: compiling kernels, once (about a minute), into {kernel_folder()}"
         print(text, file=sys.stderr, flush=True)
     cache = CachePolicy(not arguments.no_cache, arguments.cache)
     workers = Workers(arguments.threads, progress_bar(arguments.quiet), warn_once(arguments.quiet))

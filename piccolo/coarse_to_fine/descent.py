@@ -57,11 +57,12 @@ def descend_perturbed(points, levels, weights, wide, narrow, scale, steps, R_cam
     R, t = R_cam_from_map, center
     for k in range(len(steps)):
         retract(R[k].copy(), t[k].copy(), steps[k], R[k], t[k])
-        if k > 0:
-            problem = points, levels, weights, wide[0], wide[1], scale
-            descend_channels(problem, WIDE_ITERATIONS, PERTURBED_TOLERANCE, R[k], t[k])
-        problem = points, levels, weights, narrow[0], narrow[1], scale
-        descend_channels(problem, NARROW_ITERATIONS, PERTURBED_TOLERANCE, R[k], t[k])
+        for image in range(0 if k > 0 else 1, 2):
+            texels, width, num_iterations = narrow[0], narrow[1], NARROW_ITERATIONS
+            if image == 0:
+                texels, width, num_iterations = wide[0], wide[1], WIDE_ITERATIONS
+            problem = points, levels, weights, texels, width, scale
+            descend_channels(problem, num_iterations, PERTURBED_TOLERANCE, R[k], t[k])
         scores[k] = score(points, levels, weights, narrow[0], narrow[1], R[k], t[k])
 
 

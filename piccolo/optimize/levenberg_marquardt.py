@@ -87,12 +87,10 @@ def levenberg_marquardt(equations: Any) -> Callable[..., float]:
         R, t = R_cam_from_world, center_world
         sums, new_sums, step = np.empty(NUM_SUMS), np.empty(NUM_SUMS), np.empty(6)
         R_new, t_new = np.empty((3, 3)), np.empty(3)
-        damping = FIRST_DAMPING
-        equations(problem, R, t, sums)
-        for _ in range(num_iterations):
-            if not solve_damped(sums, damping, step):
-                break
-            length = retract(R, t, step, R_new, t_new)
+        R_new[:], t_new[:] = R, t
+        sums[LOSS], damping, length = np.inf, FIRST_DAMPING / FALL, np.inf
+        # The equations stand in one place, as they are compiled into it: first at the start, which is accepted.
+        for left in range(num_iterations, -1, -1):
             equations(problem, R_new, t_new, new_sums)
             if new_sums[LOSS] <= sums[LOSS] * (1.0 + ROUNDING):
                 R[:], t[:] = R_new, t_new
@@ -100,8 +98,11 @@ def levenberg_marquardt(equations: Any) -> Callable[..., float]:
                 damping = max(damping * FALL, LEAST_DAMPING)
             else:
                 damping *= RISE
-            if length < tolerance or damping > MOST_DAMPING:
+            if length < tolerance or damping > MOST_DAMPING or left == 0:
                 break
+            if not solve_damped(sums, damping, step):
+                break
+            length = retract(R, t, step, R_new, t_new)
         return sums[LOSS]
 
     return descend
