@@ -1,6 +1,6 @@
 """A scan that photos are localized in: what `import piccolo` gives."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from os import PathLike
 from pathlib import Path
@@ -69,6 +69,12 @@ class QueryOptions(TypedDict, total=False):
     min_confidence: float  # below it a pose is not called localized
 
 
+def refuse_unknown(options: Mapping[str, object], known: type, function: str) -> None:
+    """TypeError for an option that is none, as Python has it for keywords."""
+    for name in options.keys() - known.__annotations__.keys():
+        raise TypeError(f"{function}() has no option {name!r}; it has {', '.join(known.__annotations__)}")
+
+
 READ_FIELDS = {f.name for f in fields(ReadOptions)}
 PRIOR_FIELDS = {f.name for f in fields(Prior)}
 
@@ -127,6 +133,7 @@ class Scan:
         >>> result.status, result.pose.center_world.round(2)
         ('localized', array([2.6 , 3.17, 1.21]))
         """
+        refuse_unknown(options, QueryOptions, "localize")
         given: dict[str, Any] = dict(options)
         if isinstance(given.get("mask"), np.ndarray):
             given["mask_array"] = given.pop("mask")
@@ -241,13 +248,16 @@ def open_scan(
     room/images/clean_0.jpg localized
     room/images/clean_1.jpg localized
     """
+    refuse_unknown(options, ScanOptions, "open_scan")
+    if (units := options.get("units", "m")) not in METRES:
+        raise InputError(f"units: found {units!r}, wanted one of {', '.join(METRES)}")
     callback = options.get("progress")
     show = progress_to(callback) if callback else unseen
     workers = Workers(options.get("num_threads", num_cores()), show)
     cache = options.get("cache", True)
     policy = CachePolicy(cache is not False, None if isinstance(cache, bool) else Path(cache))
     cloud_settings = CloudSettings(
-        METRES[options.get("units", "m")], options.get("up", "auto"), options.get("intensity_as_gray", False)
+        METRES[units], options.get("up", "auto"), options.get("intensity_as_gray", False)
     )
     settings = options.get("settings", CoarseToFineSettings())
     if isinstance(source, np.ndarray):
@@ -256,6 +266,8 @@ def open_scan(
     if colors is not None:
         raise InputError("colors: given beside files, wanted with an array of points only")
     paths = [Path(source)] if isinstance(source, str | PathLike) else [Path(path) for path in source]
+    if not paths:
+        raise InputError("open_scan: found no file, wanted a scan's path")
     return open_files(paths, cloud_settings, settings, policy, workers)
 
 

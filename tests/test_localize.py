@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from rooms import errors, query
+from rooms import errors, query, write_room
 
 from piccolo.cli import evaluate, localize, prepare_map
 from piccolo.geometry.pose import Pose
@@ -25,10 +25,8 @@ PAPER = ["--preset", "paper", "--num-translations", "30", "--num-iterations", "6
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     """A folder, with a space in its name, of one room and two panoramas."""
-    folder = tmp_path_factory.mktemp("a scene")
-    size = ["--size", "4.5", "3.5", "2.5", "--width", "512", "--points", "60000", "--panoramas", "2"]
-    assert make_room.main(["--out", str(folder), "--seed", "7", *size, "--quiet"]) == 0
-    return folder
+    words = "--seed 7 --size 4.5 3.5 2.5 --points 60000 --panoramas 2 --width 512"
+    return write_room(tmp_path_factory.mktemp("a scene"), words)
 
 
 def _arguments(scene, *more):

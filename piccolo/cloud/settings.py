@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from ..errors import InputError
 from .label_colors import Labels
@@ -25,6 +25,8 @@ class CloudSettings:
         """Reject an invalid scale, and labels together with intensity."""
         if self.intensity_as_gray and self.labels:
             raise InputError("--labels, --intensity-as-gray: found both, wanted one of them")
+        if self.up not in get_args(UpAxis):
+            raise InputError(f"up: found {self.up!r}, wanted one of {', '.join(get_args(UpAxis))}")
         if not (math.isfinite(self.scale) and self.scale > 0.0):
             raise InputError(f"--scale: found {self.scale}, wanted a number above 0 (metres a unit)")
 

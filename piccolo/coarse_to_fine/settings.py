@@ -1,6 +1,7 @@
 """Settings of the default method, and what is known of a camera beforehand."""
 
 from dataclasses import asdict, dataclass
+from typing import get_args
 
 from ..confidence.confidence import MIN_CONFIDENCE, check_confidence
 from ..errors import InputError
@@ -44,6 +45,10 @@ class CoarseToFineSettings:
 
     def __post_init__(self) -> None:
         """Refuse counts that mean nothing, naming the setting."""
+        for name, kind in (("gravity", Gravity), ("solver", Solver)):
+            if getattr(self, name) not in get_args(kind):
+                found, known = getattr(self, name), ", ".join(get_args(kind))
+                raise InputError(f"{name}: found {found!r}, wanted one of {known}")
         for name in ("num_yaws", "num_rotations", "max_starts"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name}: found {getattr(self, name)}, wanted at least 1")

@@ -89,7 +89,7 @@ def levenberg_marquardt(equations: Any) -> Callable[..., float]:
         R_new, t_new = np.empty((3, 3)), np.empty(3)
         R_new[:], t_new[:] = R, t
         sums[LOSS], damping, length = np.inf, FIRST_DAMPING / FALL, np.inf
-        # The equations stand in one place, as they are compiled into it: first at the start, which is accepted.
+        # The equations stand in one place, as they are compiled into it; the start is accepted first.
         for left in range(num_iterations, -1, -1):
             equations(problem, R_new, t_new, new_sums)
             if new_sums[LOSS] <= sums[LOSS] * (1.0 + ROUNDING):

@@ -6,6 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from ..errors import InputError
+
 Item = TypeVar("Item")
 Value = TypeVar("Value")
 
@@ -50,6 +52,11 @@ class Workers:
     num_threads: int = 1
     show: Show = unseen  # progress
     warn: Callable[[str], None] = unheard  # of what should be known before the work is done
+
+    def __post_init__(self) -> None:
+        """Refuse a count that means nothing."""
+        if self.num_threads < 1:
+            raise InputError(f"num_threads: found {self.num_threads}, wanted at least 1")
 
     def each(self, function: Callable[[Item], Value], items: Sequence[Item], label: str) -> Iterator[Value]:
         """Yield function(item) for each item, in order.
