@@ -50,34 +50,27 @@ def build_parser() -> argparse.ArgumentParser:
         text = "link to the panoramas where they are (default: a copy can take 100 GB)"
         option(images, "--link", text, const="symlink", default="symlink", **const)
         option(images, "--copy", "copy them, so that the dataset can be removed", const="copy", **const)
-        if name in OWN_OPTIONS:
-            OWN_OPTIONS[name](one)
+        add_own_options(one, name)
         add_run_options(one)
     return parser
 
 
-def add_stanford_options(parser: argparse.ArgumentParser) -> None:
-    """Areas and labels."""
-    option(parser, "--areas 1-6 ...", "only these", default=[])
-    option(parser, "--labels", "clouds from Annotations with a label a point, and labels/ of the panoramas")
-
-
-def add_mpo_options(parser: argparse.ArgumentParser) -> None:
-    """The random transforms."""
-    option(parser, "--seed N", "of the random transforms", default=0)
-
-
-def add_generic_options(parser: argparse.ArgumentParser) -> None:
-    """Where the files are, and the convention of the poses where the list has no column for it."""
-    option(parser, "--poses FILE", "the list (default poses.csv, .json, .txt or .tum of --from)")
-    option(parser, "--cloud FILE", "(default the one cloud in --from)")
-    option(parser, "--images FOLDER", "pictures named by times (default images of --from)")
-    text = "of the camera; piccolo: forward, left, up; optical: right, down, forward; opengl: right, up, back"
-    option(parser, "--axes", text, choices=AXES)
-    option(parser, "--direction", "what a row's [R | t] takes to which", choices=DIRECTIONS)
-
-
-OWN_OPTIONS = {"stanford2d3ds": add_stanford_options, "mpo": add_mpo_options, "generic": add_generic_options}
+def add_own_options(parser: argparse.ArgumentParser, dataset: str) -> None:
+    """What one dataset alone has; of `generic` the poses' convention, where the list has no column for it."""
+    if dataset == "stanford2d3ds":
+        option(parser, "--areas 1-6 ...", "only these", default=[])
+        text = "clouds from Annotations with a label a point, and labels/ of the panoramas"
+        option(parser, "--labels", text)
+    elif dataset == "mpo":
+        option(parser, "--seed N", "of the random transforms", default=0)
+    elif dataset == "generic":
+        option(parser, "--poses FILE", "the list (default poses.csv, .json, .txt or .tum of --from)")
+        option(parser, "--cloud FILE", "(default the one cloud in --from)")
+        option(parser, "--images FOLDER", "pictures named by times (default images of --from)")
+        text = "piccolo: forward, left, up; optical: right, down, forward; opengl: right, up, back"
+        option(parser, "--axes", f"of the camera; {text}", choices=AXES)
+        text = "what a row's [R | t] takes camera coordinates to, or from"
+        option(parser, "--direction", text, choices=DIRECTIONS)
 
 
 def convert_options_from(arguments: argparse.Namespace) -> ConvertOptions:

@@ -26,7 +26,7 @@ from ..optimize.settings import DescentSettings
 from ..panorama import read_panorama
 from ..panorama.resize import shrink
 from ..panorama.texels import pack_texels
-from ..render.surfel_renderer import RenderedView, encode_image, fill_holes, render_points
+from ..render.surfel_renderer import encode_image, fill_holes, render_points
 from ..result import read_results
 from ..runtime.atomic import check_output, check_output_folder, replacing_folder, write_atomically
 from ..runtime.threads import Workers, num_cores
@@ -159,15 +159,6 @@ def depth_file(depth: NDArray[np.float32], suffix: str) -> bytes:
     return file.getvalue()
 
 
-def colors_of(view: RenderedView, holes: str) -> NDArray[np.uint8]:
-    """The view's colours (H, W, 3), its holes as asked for."""
-    if holes == "close":
-        return fill_holes(view)
-    if holes == "mark":
-        view.rgb[~view.is_seen] = MAGENTA
-    return view.rgb
-
-
 def draw_pictures(arguments: argparse.Namespace, cloud: LocalCloud, poses: Named, workers: Workers) -> None:
     """Write the pictures; one JSON line each."""
     is_folder = not arguments.out.suffix
@@ -184,8 +175,10 @@ def draw_pictures(arguments: argparse.Namespace, cloud: LocalCloud, poses: Named
         if arguments.mask_out:
             nothing = np.where(view.is_seen, 0, 255).astype(np.uint8)
             write_atomically(arguments.mask_out, encode_image(nothing, ".png"))
-        suffix = Path(name).suffix.lower()
-        write_atomically(folder / name, encode_image(colors_of(view, arguments.holes), suffix))
+        if arguments.holes == "mark":
+            view.rgb[~view.is_seen] = MAGENTA
+        rgb = fill_holes(view) if arguments.holes == "close" else view.rgb
+        write_atomically(folder / name, encode_image(rgb, Path(name).suffix.lower()))
         out = arguments.out / name if is_folder else arguments.out
         return {"out": str(out), "pano": pano, "width": arguments.width, "seen_fraction": seen_fraction}
 

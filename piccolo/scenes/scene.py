@@ -111,18 +111,11 @@ def _relative(path: Path, folder: Path) -> str:
 
 def write_queries(folder: Path, queries: Iterable[Query], **more: object) -> None:
     """Write the queries.json of a folder that holds the cloud and the images; `more` goes in beside them."""
-    entries = [_entry(folder, query) for query in queries]
+    entries = []
+    for query in queries:
+        pose = {name: getattr(query.pose, name).tolist() for name in ("R_cam_from_world", "center_world")}
+        labels = {"labels": _relative(query.labels, folder)} if query.labels else {}
+        image = _relative(query.image, folder)
+        entries.append({"image": image, "variant": query.variant, **pose, **labels})
     document = {"cloud": CLOUD_NAME, "convention": CONVENTION, **more, "queries": entries}
     write_atomically(folder / QUERIES_NAME, json.dumps(document, indent=1).encode())
-
-
-def _entry(folder: Path, query: Query) -> dict[str, object]:
-    entry: dict[str, object] = {
-        "image": _relative(query.image, folder),
-        "variant": query.variant,
-        "R_cam_from_world": query.pose.R_cam_from_world.tolist(),
-        "center_world": query.pose.center_world.tolist(),
-    }
-    if query.labels:
-        entry["labels"] = _relative(query.labels, folder)
-    return entry

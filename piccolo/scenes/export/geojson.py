@@ -41,6 +41,7 @@ def _transformer(pyproj: Any, crs: str) -> Any:
 
 def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[str, object]:
     """The point without a height, which would have to be above WGS84's ellipsoid: z is a property."""
+    properties: dict[str, object]
     result, (x, y, z) = image.result, image.pose.center_world.tolist()
     heading, pitch, roll = heading_pitch_roll_deg(image.pose)
     ahead = np.radians(heading)
@@ -50,22 +51,12 @@ def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[s
     if not np.isfinite([*longitudes, *latitudes]).all():
         raise InputError(f"{image.path}: found a camera at ({x}, {y}), wanted one where {crs} holds")
     true_heading, _, _ = geod.inv(longitudes[0], latitudes[0], longitudes[1], latitudes[1])
-    return {
-        "type": "Feature",
-        "geometry": {"type": "Point", "coordinates": [longitudes[0], latitudes[0]]},
-        "properties": {
-            "image": image.name,
-            "cloud": result.cloud_name,
-            "status": result.status,
-            "confidence": result.confidence,
-            "score": result.evidence.score if result.evidence else None,
-            **{"crs": crs, "x": x, "y": y, "z": z},
-            "heading_deg": heading,
-            "heading_true_deg": true_heading % 360.0,
-            "pitch_deg": pitch,
-            "roll_deg": roll,
-        },
-    }
+    properties = {"image": image.name, "cloud": result.cloud_name, "status": result.status}
+    properties |= {"confidence": result.confidence, "score": result.evidence and result.evidence.score}
+    properties |= {"crs": crs, "x": x, "y": y, "z": z, "heading_deg": heading}
+    properties |= {"heading_true_deg": true_heading % 360.0, "pitch_deg": pitch, "roll_deg": roll}
+    point = {"type": "Point", "coordinates": [longitudes[0], latitudes[0]]}
+    return {"type": "Feature", "geometry": point, "properties": properties}
 
 
 GEOJSON = Format(

@@ -7,6 +7,7 @@ others wrote into it stays as they wrote it.
 import re
 import struct
 from collections.abc import Iterator, Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -79,7 +80,9 @@ def with_pose(path: Path, data: bytes, angles_deg: tuple[float, float, float]) -
             packet = _with_fields(path, packet, angles_deg, size)
         edits.append((segments[i].begin, segments[i].end, _segment(path, packet)))
     if not packets:
-        place = _end_of_first_segments(segments, bodies)
+        pairs = zip(segments, bodies, strict=True)  # JFIF's and EXIF's segments have to be the first
+        first = takewhile(lambda pair: pair[0].marker == APP0 or pair[1].startswith(EXIF_MARK), pairs)
+        place = max((segment.end for segment, _ in first), default=len(JPEG_MAGIC))
         edits = [(place, place, _segment(path, _with_fields(path, EMPTY_PACKET, angles_deg, size)))]
     pieces, begin = [], 0
     for edit_begin, edit_end, new in edits:
@@ -103,16 +106,6 @@ def jpeg_segments(data: bytes) -> Iterator[Segment]:
         if marker == SCAN:
             return
         begin = end
-
-
-def _end_of_first_segments(segments: Sequence[Segment], bodies: Sequence[bytes]) -> int:
-    """Behind JFIF's and EXIF's segments, which have to be the first."""
-    place = len(JPEG_MAGIC)
-    for segment, body in zip(segments, bodies, strict=True):
-        if segment.marker != APP0 and not body.startswith(EXIF_MARK):
-            break
-        place = segment.end
-    return place
 
 
 def _segment(path: Path, packet: bytes) -> bytes:

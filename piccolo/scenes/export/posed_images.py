@@ -127,7 +127,9 @@ def posed_images(results: Sequence[Result], form: Format, options: Options) -> l
             clouds = f"{posed[name].result.cloud_name}, {result.cloud_name}"
             raise InputError(f"{name}: has two results (clouds {clouds}); --cloud chooses one")
         size = _size(path, options) if "size" in form.options else (0, 0)
-        time = str(index) if options.timestamps == "index" else _timestamp(path)
+        if options.timestamps == "name" and not TIMESTAMP.fullmatch(path.stem):
+            raise InputError(f"{path}: its name {path.stem!r} is no number, as --timestamps name needs")
+        time = str(index) if options.timestamps == "index" else path.stem
         pose = Pose(result.pose.R_cam_from_world, result.pose.center_world - offset)
         key = name if form.has_unique_names else str(index)
         posed[key] = PosedImage(name, path, time, pose, size, result)
@@ -152,9 +154,3 @@ def _name(pano: str, images: Path | None) -> str:
     if ".." in name.parts:
         raise InputError(f"{pano}: is not in the folder --images {images}")
     return name.as_posix()
-
-
-def _timestamp(path: Path) -> str:
-    if not TIMESTAMP.fullmatch(path.stem):
-        raise InputError(f"{path}: its name {path.stem!r} is no number, as --timestamps name needs")
-    return path.stem

@@ -79,19 +79,13 @@ def flipped(scene: Scene, folder: Path) -> Scene:
     for name, query in zip(names, scene.queries, strict=True):
         image = inner / name
         image.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(image, _upside_down_png(query.image))
+        panorama = read_panorama(query.image)
+        bgra = cv2.cvtColor(panorama.rgb, cv2.COLOR_RGB2BGRA)
+        bgra[..., 3] = np.where(panorama.is_valid, 255, 0)  # transparent where it shows nothing
+        write_atomically(image, bytes(cv2.imencode(".png", bgra[::-1, ::-1])[1]))
         pose = Pose(UPSIDE_DOWN @ query.pose.R_cam_from_world, query.pose.center_world)
         queries.append(Query(image, query.variant, pose))
     return Scene(scene.name, inner, scene.cloud, tuple(queries))
-
-
-def _upside_down_png(image: Path) -> bytes:
-    """A panorama turned by half a turn, transparent where it shows nothing."""
-    panorama = read_panorama(image)
-    bgra = cv2.cvtColor(panorama.rgb, cv2.COLOR_RGB2BGRA)
-    bgra[..., 3] = np.where(panorama.is_valid, 255, 0)
-    _, png = cv2.imencode(".png", bgra[::-1, ::-1])
-    return bytes(png)
 
 
 def _turned(pose: Pose, R_new_from_old: Array) -> Pose:

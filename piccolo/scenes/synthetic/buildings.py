@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from ...geometry.pose import Array
 from ...runtime.threads import Workers
 from .repeated import make_repeated
-from .scan import RANGE_NOISE, scan_room
+from .sensors import RANGE_NOISE, scan_room
 from .world import make_world, random_size, scan_world
 
 DENSITY = 250.0  # points a m2

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from ...geometry.pose import Pose
 from ...geometry.rotations import Gravity
 from ...runtime.threads import Workers
-from .photo import blur
 from .repeated import REPEATED_KINDS, make_repeated
+from .sensors import blur
 from .world import VARIANTS, World, make_query, make_world, random_size, scan_world
 
 WIDTH = 1024  # of the panoramas [px]

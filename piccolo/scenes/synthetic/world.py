@@ -9,9 +9,8 @@ from ...errors import InputError
 from ...geometry.pose import Array, Pose, exp_so3, yaw_rotation
 from ...geometry.rotations import uniform_rotations
 from ...runtime.threads import Workers
-from .photo import label_image, other_light, photograph
 from .room import Room, make_room
-from .scan import free_position, scan_room
+from .sensors import free_position, label_image, other_light, photograph, scan_room
 
 VARIANTS = ("clean", "tilt", "photo", "change")
 GAP = 0.4  # between rooms [m]
