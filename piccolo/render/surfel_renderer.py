@@ -12,7 +12,7 @@ from ..geometry.pose import Array, Pose
 from ..runtime.threads import Workers
 from .splatting import MIN_RADIUS_PX, splat
 from .surfels import Surfels, surfels_of
-from .zbuffer import cells_of, near_front
+from .zbuffer import nearest_depth, select_visible
 
 STRIP = 1 << 21  # pixels that one thread draws at a time
 MAX_SURFELS = 8_000_000  # of more points that may be seen, this many are drawn, evenly in space
@@ -51,14 +51,16 @@ def visible_indices(points: PackedPoints, center_world: Array) -> NDArray[np.int
     each thing would be missing in a picture. Here nine cells must agree, of one or the other size.
     """
     pose = Pose(np.eye(3), center_world)
+    R, t = pose.R_cam_from_world, pose.center_world
     kept = np.arange(len(points))
     for width in HIDING_WIDTHS:
-        cells, ranges, depth = cells_of(points, pose, width)
-        around = np.pad(depth.reshape(-1, width), ((1, 1), (1, 1)), mode="wrap")
+        depth = nearest_depth(points, pose, width).reshape(-1, width)
+        around = np.pad(depth, ((1, 1), (1, 1)), mode="wrap")
         around[[0, -1]] = -np.inf  # no row beyond a pole
         farthest = cv2.dilate(around, np.ones((3, 3), np.uint8))[1:-1, 1:-1].reshape(-1)
-        indices = near_front(cells, ranges, np.asarray(farthest, np.float32))
-        points, kept = points.take(indices), kept[indices]
+        indices = np.empty(len(points), np.int64)
+        count = select_visible(points.x, points.y, points.z, R, t, width, farthest, indices)
+        points, kept = points.take(indices[:count]), kept[indices[:count]]
     return kept
 
 

@@ -9,7 +9,11 @@ from numpy.typing import NDArray
 from ..cloud.soa import PackedPoints
 from ..geometry.pose import Array, Pose
 from ..geometry.sphere import direction_to_pixel
+from ..panorama.texels import channel
 from ..runtime.jit import kernel
+
+CHUNK = 4096
+EMPTY = np.float32(np.inf)
 
 # A point is visible if it is not farther than the nearest in its cell by this much. The factor lets grazing
 # floors and walls through, whose ranges vary within a cell; the offset [m] covers range noise nearby.
@@ -54,48 +58,77 @@ def cells_and_ranges(x, y, z, R_cam_from_world, center_world, width, cells, rang
 
 
 @kernel
-def scatter_nearest(cells, ranges, depth):
-    """Write the nearest range [m] of each cell into `depth` (H * W,), which holds inf before."""
-    for i in range(len(cells)):
-        depth[cells[i]] = min(depth[cells[i]], ranges[i])
+def nearest_ranges(x, y, z, R_cam_from_world, center_world, width, depth):
+    """Write the range [m] of the nearest point of each cell into `depth` (H * W,), which holds inf before."""
+    R, t = R_cam_from_world, center_world
+    cells = np.empty(CHUNK, np.int32)
+    ranges = np.empty(CHUNK, np.float32)
+    for lo in range(0, len(x), CHUNK):
+        hi = min(len(x), lo + CHUNK)
+        # The arithmetic is vectorised chunk by chunk; the scatter that follows can't be.
+        cells_and_ranges(x[lo:hi], y[lo:hi], z[lo:hi], R, t, width, cells, ranges)
+        for i in range(hi - lo):
+            depth[cells[i]] = min(depth[cells[i]], ranges[i])
 
 
-def cells_of(
-    points: PackedPoints, pose: Pose, width: int
-) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
-    """Cell (N,) and range (N,) [m] of each point, and the nearest range (width / 2 * width,) of each cell."""
-    cells, ranges = np.empty(len(points), np.int32), np.empty(len(points), np.float32)
-    R, t = pose.R_cam_from_world, pose.center_world
-    cells_and_ranges(points.x, points.y, points.z, R, t, width, cells, ranges)
-    depth = np.full(width // 2 * width, np.inf, dtype=np.float32)
-    scatter_nearest(cells, ranges, depth)
-    return cells, ranges, depth
+@kernel
+def mean_colors(x, y, z, rgbx, R_cam_from_world, center_world, width, band, depth, sums):
+    """Add up (H * W, 4): R, G, B [8-bit levels] and count of the points within (1 + band) of the nearest."""
+    R, t = R_cam_from_world, center_world
+    cells = np.empty(CHUNK, np.int32)
+    ranges = np.empty(CHUNK, np.float32)
+    for lo in range(0, len(x), CHUNK):
+        hi = min(len(x), lo + CHUNK)
+        cells_and_ranges(x[lo:hi], y[lo:hi], z[lo:hi], R, t, width, cells, ranges)
+        for i in range(hi - lo):
+            cell = cells[i]
+            if ranges[i] <= depth[cell] * band:
+                c = rgbx[lo + i]
+                sums[cell, 0] += channel(c, 0)
+                sums[cell, 1] += channel(c, 8)
+                sums[cell, 2] += channel(c, 16)
+                sums[cell, 3] += 1
+
+
+@kernel
+def select_visible(x, y, z, R_cam_from_world, center_world, width, depth, indices):
+    """Write the indices of the points near the front of their cells; returns how many."""
+    R, t = R_cam_from_world, center_world
+    cells = np.empty(CHUNK, np.int32)
+    ranges = np.empty(CHUNK, np.float32)
+    count = 0
+    for lo in range(0, len(x), CHUNK):
+        hi = min(len(x), lo + CHUNK)
+        cells_and_ranges(x[lo:hi], y[lo:hi], z[lo:hi], R, t, width, cells, ranges)
+        for i in range(hi - lo):
+            if ranges[i] <= depth[cells[i]] * VISIBLE_FACTOR + VISIBLE_OFFSET:
+                indices[count] = lo + i
+                count += 1
+    return count
 
 
 def nearest_depth(points: PackedPoints, pose: Pose, width: int) -> NDArray[np.float32]:
     """Range (width / 2 * width,) [m] of the nearest point in each cell, inf where there is none."""
-    return cells_of(points, pose, width)[2]
+    depth = np.full(width // 2 * width, EMPTY, dtype=np.float32)
+    nearest_ranges(points.x, points.y, points.z, pose.R_cam_from_world, pose.center_world, width, depth)
+    return depth
 
 
 def render_view(points: PackedPoints, pose: Pose, width: int, band: float = 0.15) -> View:
     """The cloud at `pose`, `width` cells around; colours are of the points within 1 + band of the nearest."""
-    cells, ranges, depth = cells_of(points, pose, width)
-    is_near = ranges <= depth[cells] * np.float32(1.0 + band)
-    cells, rgbx = cells[is_near], points.rgbx[is_near]
-    sums = [np.bincount(cells, (rgbx >> shift) & 255, len(depth)) for shift in (0, 8, 16)]
-    counts = np.bincount(cells, minlength=len(depth))
-    rgb = (np.stack(sums, axis=1) / np.maximum(counts, 1)[:, None] / 255.0).astype(np.float32)
+    depth = nearest_depth(points, pose, width)
+    sums = np.zeros((len(depth), 4))
+    R, t = pose.R_cam_from_world, pose.center_world
+    mean_colors(points.x, points.y, points.z, points.rgbx, R, t, width, np.float32(1.0 + band), depth, sums)
+    rgb = (sums[:, :3] / np.maximum(sums[:, 3:], 1.0) / 255.0).astype(np.float32)
     return View(depth.reshape(width // 2, width), rgb.reshape(width // 2, width, 3))
 
 
 def visible_points(points: PackedPoints, center_world: Array) -> PackedPoints:
     """The points that a camera at `center_world` (3,) sees, whichever way it is turned."""
-    cells, ranges, depth = cells_of(points, Pose(np.eye(3), center_world), VISIBLE_WIDTH)
-    return points.take(near_front(cells, ranges, depth))
-
-
-def near_front(
-    cells: NDArray[np.int32], ranges: NDArray[np.float32], depth: NDArray[np.float32]
-) -> NDArray[np.int64]:
-    """Indices of the points that are hardly farther than the `depth` of their cells."""
-    return np.flatnonzero(ranges <= depth[cells] * VISIBLE_FACTOR + VISIBLE_OFFSET)
+    pose = Pose(np.eye(3), center_world)
+    depth = nearest_depth(points, pose, VISIBLE_WIDTH)
+    indices = np.empty(len(points), dtype=np.int64)
+    R, t = pose.R_cam_from_world, pose.center_world
+    count = select_visible(points.x, points.y, points.z, R, t, VISIBLE_WIDTH, depth, indices)
+    return points.take(indices[:count])
