@@ -32,7 +32,7 @@ from .paper.localize import prepare as prepare_by_paper
 from .paper.settings import PaperSettings
 from .result import Result, result_of
 from .runtime.stopwatch import Stopwatch
-from .runtime.threads import ProgressCallback, Workers, num_cores, progress_to, unseen
+from .runtime.threads import ProgressCallback, Workers, no_progress, num_cores, progress_to
 
 File = str | PathLike[str]
 Settings = CoarseToFineSettings | PaperSettings
@@ -252,7 +252,7 @@ def open_scan(
     if (units := options.get("units", "m")) not in METRES:
         raise InputError(f"units: found {units!r}, wanted one of {', '.join(METRES)}")
     callback = options.get("progress")
-    show = progress_to(callback) if callback else unseen
+    show = progress_to(callback) if callback else no_progress
     workers = Workers(options.get("num_threads", num_cores()), show)
     cache = options.get("cache", True)
     policy = CachePolicy(cache is not False, None if isinstance(cache, bool) else Path(cache))

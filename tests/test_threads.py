@@ -13,7 +13,7 @@ def test_results_come_in_order_and_pass_the_display(num_threads):
         seen.append((total, label))
         return values
 
-    assert list(Workers(num_threads, show).each(lambda i: i * i, range(20), "squares")) == [
+    assert list(Workers(num_threads, show).map(lambda i: i * i, range(20), "squares")) == [
         i * i for i in range(20)
     ]
     assert seen == [(20, "squares")]
@@ -30,5 +30,5 @@ def test_an_error_drops_what_has_not_begun():
         gate.wait(0.5)
 
     with pytest.raises(ValueError, match="first"):
-        list(Workers(2).each(work, range(1000), "work"))
+        list(Workers(2).map(work, range(1000), "work"))
     assert len(begun) < 10  # what the two threads had begun

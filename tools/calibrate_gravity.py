@@ -59,7 +59,7 @@ def choice_of(case: tuple[str, int]) -> Choice:
 def choices_of(seeds: Sequence[int], workers: Workers) -> list[Choice]:
     """The clouds of all kinds with true up among their hypotheses."""
     cases = list(product(BUILDINGS, range(*seeds)))
-    return [choice for choice in workers.each(choice_of, cases, "clouds") if choice.is_up.any()]
+    return [choice for choice in workers.map(choice_of, cases, "clouds") if choice.is_up.any()]
 
 
 def log_likelihoods(parameters: Array, choices: Sequence[Choice]) -> tuple[Array, NDArray[np.bool_]]:

@@ -94,7 +94,7 @@ def main(arguments: argparse.Namespace) -> int:
     workers = Workers(arguments.threads, progress_bar(arguments.quiet))
     answers: dict[str, list[tuple[float, float]]] = {}
     for name, points, rotations in cases_of(arguments):
-        answers.setdefault(name, []).extend(workers.each(partial(try_turn, points), rotations, name))
+        answers.setdefault(name, []).extend(workers.map(partial(try_turn, points), rotations, name))
     print("| case | trials | right | rough | wrong | accepted | of these wrong | surest wrong |")
     print("|---|---:|---:|---:|---:|---:|---:|---:|")
     num_false = 0

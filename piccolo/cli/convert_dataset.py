@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import asdict, fields
 
 from ..errors import InputError
-from ..runtime.threads import Show, Workers, num_cores
+from ..runtime.threads import Progress, Workers, num_cores
 from ..scenes.datasets import DATASETS
 from ..scenes.datasets.checking import check_scene
 from ..scenes.datasets.files import AXES, DIRECTIONS
@@ -104,7 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
     return max((convert_scene(spec, arguments, show) for spec in specs), default=0)
 
 
-def convert_scene(spec: SceneSpec, arguments: argparse.Namespace, show: Show) -> int:
+def convert_scene(spec: SceneSpec, arguments: argparse.Namespace, show: Progress) -> int:
     """Write a scene, check it, and print its line; returns the exit code."""
     try:
         written = write_scene(spec, arguments.out, arguments.transfer, show)

@@ -32,7 +32,7 @@ NUM_ROTATIONS: Option = (
     "--num-rotations", "N", int,
     "rotations of SO(3) searched where gravity is unknown; preset paper: N_r, 0 for 8 yaws or 32 of SO(3)",
 )  # fmt: skip
-ENGINE_OPTIONS: tuple[Option, ...] = (
+DEFAULT_OPTIONS: tuple[Option, ...] = (
     ("--num-yaws", "N", int, "rotations searched where gravity is known"),
     NUM_ROTATIONS,
     ("--max-starts", "N", int, "poses from which a descent begins, at most"),
@@ -150,7 +150,7 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--solver", choices=["gauss-newton", "lbfgs", "adam"], help=text)
     text = f"a pose with less is not called localized (default {CoarseToFineSettings().min_confidence})"
     group.add_argument("--min-confidence", type=float, metavar="X", help=text)
-    add_options(group, ENGINE_OPTIONS, CoarseToFineSettings())
+    add_options(group, DEFAULT_OPTIONS, CoarseToFineSettings())
     add_options(group, PAPER_ONLY, PaperSettings(), is_hidden=True)
     text = "show the options of the preset paper and exit"
     group.add_argument("--help-paper", action=PaperHelp, nargs=0, help=text)
@@ -208,7 +208,7 @@ def settings_from(arguments: argparse.Namespace) -> CoarseToFineSettings | Paper
     given = {k: v for k, v in vars(arguments).items() if v is not None}
     shared = {name: given[name] for name in ("gravity", "solver", "min_confidence") if name in given}
     if arguments.preset == "paper":
-        foreign = [option for option, *_ in ENGINE_OPTIONS if option != NUM_ROTATIONS[0]]
+        foreign = [option for option, *_ in DEFAULT_OPTIONS if option != NUM_ROTATIONS[0]]
         foreign += ["--" + name.replace("_", "-") for name in PRIORS]
         foreign += ["--up"] if arguments.up != "auto" else []
     else:
@@ -224,7 +224,7 @@ def settings_from(arguments: argparse.Namespace) -> CoarseToFineSettings | Paper
         heading_deg=given.get("heading"),
         heading_tolerance_deg=given.get("heading_tolerance", Prior.heading_tolerance_deg),
     )
-    own = {name: given[name] for option, *_ in ENGINE_OPTIONS if (name := setting_of(option)) in given}
+    own = {name: given[name] for option, *_ in DEFAULT_OPTIONS if (name := setting_of(option)) in given}
     return CoarseToFineSettings(prior=prior, **shared, **own)
 
 

@@ -6,12 +6,12 @@ from typing import Any
 
 from tqdm import tqdm
 
-from ..runtime.threads import Show
+from ..runtime.threads import Progress
 
 DELAY = 0.5  # seconds: what takes less needs no bar
 
 
-def progress_bar(is_quiet: bool) -> Show:
+def progress_bar(is_quiet: bool) -> Progress:
     """A function that wraps values in a progress bar, or in nothing."""
 
     def show(values: Iterator[Any], total: int | None, label: str) -> Iterator[Any]:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import InputError
-from ..runtime.threads import Show, unseen
+from ..runtime.threads import Progress, no_progress
 from .model import Cloud
 from .readers.e57 import E57
 from .readers.las import LAS
@@ -24,7 +24,7 @@ WANTED = f"wanted a coloured point cloud: {', '.join(f.name for f in FORMATS)}"
 
 
 def open_cloud(
-    paths: Sequence[Path], settings: CloudSettings = IN_METRES, show: Show = unseen
+    paths: Sequence[Path], settings: CloudSettings = IN_METRES, show: Progress = no_progress
 ) -> CloudStream:
     """The coloured cloud in one or several files, before its points are read.
 

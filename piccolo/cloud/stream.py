@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry.point_transforms import rotate_points
-from ..runtime.threads import Show, unseen
+from ..runtime.threads import Progress, no_progress
 from .model import Cloud
 from .morton import morton_order
 from .readers.reader import CHUNK, PointSource, RawCloud
@@ -29,7 +29,7 @@ class CloudStream:
 
     sources: Sequence[PointSource]  # in an order of their own: the user's changes nothing
     scale: float = 1.0  # metres per unit of the files
-    show: Show = unseen  # progress
+    show: Progress = no_progress  # progress
 
     @property
     def label(self) -> str:

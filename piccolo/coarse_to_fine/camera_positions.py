@@ -51,7 +51,7 @@ def supported_cells(surfaces: NDArray[np.float32]) -> NDArray[np.int64]:
 
 
 def coverage(octree: Octree, centers: NDArray[np.floating[Any]], workers: Workers) -> NDArray[np.float32]:
-    """Share of the sphere (N,) around each centre (N, 3) that is not empty, seen at a low resolution."""
+    """Fraction of the sphere (N,) around each centre (N, 3) that is not empty, seen at a low resolution."""
     fraction = np.empty(len(centers), np.float32)
     view = FREE_SPACE_VIEW.arrays
 
@@ -60,7 +60,7 @@ def coverage(octree: Octree, centers: NDArray[np.floating[Any]], workers: Worker
         voxels = FREE_SPACE_VIEW.voxel_per_range
         filled_fractions(octree, centers[part], voxels, view, thread_scratch(), fraction[part])
 
-    list(workers.each(glance, range(0, len(centers), BLOCK), "find free space"))
+    list(workers.map(glance, range(0, len(centers), BLOCK), "find free space"))
     return fraction
 
 

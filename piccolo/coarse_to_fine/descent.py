@@ -94,7 +94,7 @@ def descend_all(
         some = starts.candidate[part], R[part], t[part], scores[part]
         descend_starts(views, (image.rgbx, image.width), scale, num_iterations, *some)
 
-    list(workers.each(run, range(0, len(t), BATCH), "descend"))
+    list(workers.map(run, range(0, len(t), BATCH), "descend"))
     return Starts(R, t, starts.candidate, scores).take(np.argsort(-scores, kind="stable"))
 
 

@@ -73,6 +73,6 @@ def refine_alternatives(query: Query, found: SearchResult) -> SearchResult:
         return refine_full_resolution(query, refine_by_perturbation(query, h), 2)
 
     near, far = found.near, found.alternatives[len(found.near) :]
-    finished = list(query.workers.each(refined, near, "descend"))
+    finished = list(query.workers.map(refined, near, "descend"))
     best, *others = by_score([found.best, *finished, *far])
     return SearchResult(best, tuple(alternative_poses(best.pose, others, count=ALTERNATIVES_REFINED)))

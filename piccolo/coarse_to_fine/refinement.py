@@ -102,7 +102,7 @@ def refine(query: Query, starts: Starts, beam: Beam) -> tuple[list[Hypothesis], 
     """
 
     def each(function: Callable[[Query, Hypothesis], Hypothesis], some: list[Hypothesis]) -> list[Hypothesis]:
-        return list(query.workers.each(lambda h: function(query, h), some, "descend"))
+        return list(query.workers.map(lambda h: function(query, h), some, "descend"))
 
     coarse = descend_prepared(query, starts, FIRST_ITERATIONS, beam.num_coarse)
     coarse = descend_prepared(query, coarse, SECOND_ITERATIONS, beam.num_middle)

@@ -83,7 +83,7 @@ def render_candidates(
         voxels = config.voxel_per_range
         render_block(octree, centers[part], voxels, view, thread_scratch(), *out)
 
-    list(workers.each(run, range(0, len(centers), BLOCK), "render views"))
+    list(workers.map(run, range(0, len(centers), BLOCK), "render views"))
     return offsets, unit, levels, is_seen
 
 

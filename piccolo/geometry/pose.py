@@ -53,7 +53,7 @@ def left_jacobian(w: Array) -> Array:
 def step(pose: Pose, delta: Array) -> Pose:
     """`pose` moved by `delta` (6,), rotation [rad] then translation [m], both in the camera's frame.
 
-    R <- exp([w]x) R, center <- center + R^T d (ENGINE.md's left perturbation, R before the turn).
+    R <- exp([w]x) R, center <- center + R^T d, with R before the turn.
     """
     center_world = pose.center_world + pose.R_cam_from_world.T @ delta[3:]
     return Pose(orthonormal(exp_so3(delta[:3]) @ pose.R_cam_from_world), center_world)

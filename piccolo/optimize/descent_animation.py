@@ -85,7 +85,7 @@ def frames_of(
         cv2.putText(bar, text, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
         return np.concatenate([bar, checkerboard(photo, cloud)])
 
-    return list(workers.each(frame, chosen.tolist(), "frames"))
+    return list(workers.map(frame, chosen.tolist(), "frames"))
 
 
 def write_animation(path: Path, frames: Frames) -> None:

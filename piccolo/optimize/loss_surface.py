@@ -93,5 +93,5 @@ def loss_surface(
         return min(tried)
 
     shape = (len(grid.y), len(grid.x))
-    cells = workers.each(best, range(math.prod(shape)), "loss surface")
+    cells = workers.map(best, range(math.prod(shape)), "loss surface")
     return LossSurface(*(np.array(column).reshape(shape) for column in zip(*cells, strict=True)))

@@ -110,7 +110,7 @@ def _sum_blocks(
         p, R, t = points, pose.R_cam_from_world, pose.center_world
         blocks(p.x, p.y, p.z, p.rgbx, R, t, texels.rgbx, texels.width, lo, sums[lo:hi])
 
-    list(Workers(num_threads).each(run, range(num_threads), "blocks"))
+    list(Workers(num_threads).map(run, range(num_threads), "blocks"))
     return np.asarray(sums.sum(axis=0))
 
 

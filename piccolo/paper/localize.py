@@ -72,7 +72,7 @@ def localize(
     with watch.stage("search"):
         starts = search(points, panorama, loss, (paper_map.positions, rotations), settings, workers)
     with watch.stage("refine"):
-        refined = list(workers.each(lambda s: refine(points, loss, s.pose, settings), starts, "refine"))
+        refined = list(workers.map(lambda s: refine(points, loss, s.pose, settings), starts, "refine"))
         best = min(refined, key=lambda r: r.loss, default=None)
     if best is None or not np.isfinite(best.loss):
         return Localization()

@@ -49,7 +49,7 @@ def search(
         seen = visible_points(points, center_world) if settings.use_visibility else points
         return losses_at(seen, loss, center_world, rotations)
 
-    scored = [h for batch in workers.each(losses, list(positions), "search") for h in batch]
+    scored = [h for batch in workers.map(losses, list(positions), "search") for h in batch]
     if settings.initialization == "loss-only":
         return best_distinct(scored, settings.num_by_histogram, distance, angle)
     by_loss = best_distinct(scored, settings.num_by_loss, distance, angle)
@@ -58,5 +58,5 @@ def search(
     def rescored(h: Hypothesis) -> Hypothesis:
         return Hypothesis(h.pose, histogram_similarity(points, small, h.pose, settings.histogram_bins))
 
-    by_histogram = list(workers.each(rescored, by_loss, "compare colours"))
+    by_histogram = list(workers.map(rescored, by_loss, "compare colours"))
     return best_distinct(by_histogram, settings.num_by_histogram, distance, angle)

@@ -87,7 +87,7 @@ def render_surfels(surfels: Surfels, pose: Pose, width: int, workers: Workers) -
         rgb[rows] = np.rint(means[..., :3])
         depth[rows] = np.where(is_seen, means[..., 3], np.float32(np.inf))
 
-    list(workers.each(run, range(0, width // 2, num_rows), "draw"))
+    list(workers.map(run, range(0, width // 2, num_rows), "draw"))
     return RenderedView(rgb, depth)
 
 

@@ -49,7 +49,7 @@ def surfels_of(points: PackedPoints, workers: Workers) -> Surfels:
         normals[part], is_thick = planes(positions[neighbors[part]])
         radii[part] = RADIUS_PER_REACH * distances[:, -1] * np.where(is_thick, THICK_RADIUS, 1.0)
 
-    list(workers.each(run, range(0, len(positions), CHUNK), "surface"))
+    list(workers.map(run, range(0, len(positions), CHUNK), "surface"))
     is_surface = np.empty(len(positions), np.bool_)
     for lo in range(0, len(positions), CHUNK):
         part = slice(lo, lo + CHUNK)

@@ -18,11 +18,11 @@ def num_cores() -> int:
 
 
 # wraps values as tqdm does: how many there will be, None if unknown, and what they are
-Show = Callable[[Iterator[Any], int | None, str], Iterator[Any]]
+Progress = Callable[[Iterator[Any], int | None, str], Iterator[Any]]
 
 
-def unseen(values: Iterator[Value], total: int | None, label: str) -> Iterator[Value]:
-    """Progress that nobody watches."""
+def no_progress(values: Iterator[Value], total: int | None, label: str) -> Iterator[Value]:
+    """No progress: the values as they are."""
     return values
 
 
@@ -30,7 +30,7 @@ def unseen(values: Iterator[Value], total: int | None, label: str) -> Iterator[V
 ProgressCallback = Callable[[str, int, int | None], None]
 
 
-def progress_to(callback: ProgressCallback) -> Show:
+def progress_to(callback: ProgressCallback) -> Progress:
     """Progress that a callback is told of."""
 
     def watched(values: Iterator[Value], total: int | None, label: str) -> Iterator[Value]:
@@ -41,24 +41,24 @@ def progress_to(callback: ProgressCallback) -> Show:
     return watched
 
 
-def unheard(warning: str) -> None:
-    """A warning that the result alone repeats."""
+def ignore_warning(warning: str) -> None:
+    """Default warning handler: does nothing (warnings are also stored in the result)."""
 
 
 @dataclass(frozen=True)
 class Workers:
-    """How many threads do the work, and who is told how far it is."""
+    """Thread count, progress and warning callbacks."""
 
     num_threads: int = 1
-    show: Show = unseen  # progress
-    warn: Callable[[str], None] = unheard  # of what should be known before the work is done
+    show: Progress = no_progress  # progress
+    warn: Callable[[str], None] = ignore_warning  # of what should be known before the work is done
 
     def __post_init__(self) -> None:
         """Refuse a count that means nothing."""
         if self.num_threads < 1:
             raise InputError(f"num_threads: found {self.num_threads}, wanted at least 1")
 
-    def each(self, function: Callable[[Item], Value], items: Sequence[Item], label: str) -> Iterator[Value]:
+    def map(self, function: Callable[[Item], Value], items: Sequence[Item], label: str) -> Iterator[Value]:
         """Yield function(item) for each item, in order.
 
         Nothing is summed across items here, so results have the same bits for any number of threads. An error

@@ -14,7 +14,7 @@ from ...confidence.score import VIEW_WIDTH, agreement_at
 from ...geometry.pose import Array, Pose
 from ...panorama import read_panorama
 from ...panorama.resize import shrink
-from ...runtime.threads import Show, Workers, unseen
+from ...runtime.threads import Progress, Workers, no_progress
 from ..scene import Query, Scene
 from .files import AXES
 
@@ -61,7 +61,7 @@ class Check:
         return f"{text}; no other axes fit better"
 
 
-def check_scene(scene: Scene, num_queries: int, workers: Workers, show: Show = unseen) -> Check:
+def check_scene(scene: Scene, num_queries: int, workers: Workers, show: Progress = no_progress) -> Check:
     """Score some panoramas of a scene, evenly spaced over the list, against its cloud at their poses."""
     voxels = open_cloud([scene.cloud], show=show).voxels(np.eye(3))
     nodes = build_octree(voxels).level(VOXEL_SIZE)
@@ -76,7 +76,7 @@ def check_scene(scene: Scene, num_queries: int, workers: Workers, show: Show = u
         return ConventionCheck(scene.name_of(query), scores[AS_GIVEN], scores[best], best)
 
     chosen = evenly_spaced(scene.queries, num_queries)
-    return Check(tuple(workers.each(check, chosen, f"{scene.name}: check")))
+    return Check(tuple(workers.map(check, chosen, f"{scene.name}: check")))
 
 
 def evenly_spaced(queries: Sequence[Query], count: int) -> list[Query]:

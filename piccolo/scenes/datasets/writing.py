@@ -17,7 +17,7 @@ from ...cloud.readers.reader import CHUNK
 from ...cloud.validation import Chunk, PointValidator
 from ...errors import InputError, unreadable
 from ...runtime.atomic import check_output_folder, replacing_folder
-from ...runtime.threads import Show, unseen
+from ...runtime.threads import Progress, no_progress
 from ..scene import CLOUD_NAME, QUERIES_NAME, Query, read_scene, write_queries
 from .files import write_labels
 from .model import PosedPanorama, SceneSpec
@@ -36,7 +36,9 @@ class Written:
     warnings: tuple[str, ...] = ()  # one line each, for the user
 
 
-def write_scene(spec: SceneSpec, out: Path, transfer: Transfer = "symlink", show: Show = unseen) -> Written:
+def write_scene(
+    spec: SceneSpec, out: Path, transfer: Transfer = "symlink", show: Progress = no_progress
+) -> Written:
     """Write a scene below `out`, or leave it as it is if it is there.
 
     Raises InputError if a file of the scene is damaged or missing, there is no panorama, or what is there was
@@ -67,7 +69,7 @@ def _there_already(spec: SceneSpec, folder: Path) -> Written:
     return Written(folder, None, len(scene.queries))
 
 
-def _write_cloud(spec: SceneSpec, path: Path, warnings: list[str], show: Show) -> int:
+def _write_cloud(spec: SceneSpec, path: Path, warnings: list[str], show: Progress) -> int:
     """Stream the cloud's files into one PLY; returns how many points it has."""
     validator = PointValidator(spec.cloud[0].path, 1.0)
     nothing = np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty(0, np.int32) if spec.has_labels else None
@@ -83,7 +85,7 @@ def _write_cloud(spec: SceneSpec, path: Path, warnings: list[str], show: Show) -
 
 
 def _chunks(
-    spec: SceneSpec, validator: PointValidator, warnings: list[str], show: Show
+    spec: SceneSpec, validator: PointValidator, warnings: list[str], show: Progress
 ) -> Iterator[tuple[Chunk, int]]:
     """Finite points of all files with their labels; one validator for all, as an object may be small."""
     for part in spec.cloud:

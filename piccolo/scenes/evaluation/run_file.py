@@ -10,7 +10,7 @@ from pathlib import Path
 from ...errors import InputError
 from ...runtime.atomic import check_output
 from ...runtime.json_file import parse_lines, read_bytes
-from ...runtime.threads import Show
+from ...runtime.threads import Progress
 from ...scan import settings_json
 from ..scene import QUERIES_NAME, Query, Scene
 from .query_result import FORMAT, QueryResult, query_result_of
@@ -46,7 +46,7 @@ class Run:
     size: int  # of the file, up to its last whole line [byte]
 
     def resume(
-        self, num_processes: int, show: Show, report: Callable[[str], object]
+        self, num_processes: int, show: Progress, report: Callable[[str], object]
     ) -> tuple[list[QueryResult], int]:
         """All queries, old and new, and how many failed; `report` gets a line for each failure.
 

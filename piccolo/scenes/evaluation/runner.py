@@ -14,7 +14,7 @@ from ...coarse_to_fine.settings import CoarseToFineSettings
 from ...errors import InputError
 from ...panorama import ReadOptions
 from ...paper.settings import PaperSettings
-from ...runtime.threads import Show, Workers, unseen
+from ...runtime.threads import Progress, Workers, no_progress
 from ...scan import open_files
 from ..scene import Query, Scene
 from .query_result import QueryResult, is_in_box, query_result_of
@@ -61,7 +61,7 @@ def jobs_of(scenes: Sequence[Scene], done: Collection[tuple[str, str]], variants
     return jobs
 
 
-def run_job(config: RunConfig, job: Job, show: Show = unseen) -> Iterator[QueryResult | Failure]:
+def run_job(config: RunConfig, job: Job, show: Progress = no_progress) -> Iterator[QueryResult | Failure]:
     """The results of a job as they come; a Failure for what can't be read."""
     scene, workers = job.scene, Workers(config.num_threads, show)
     try:
@@ -81,7 +81,7 @@ def run_job(config: RunConfig, job: Job, show: Show = unseen) -> Iterator[QueryR
 
 
 def run(
-    config: RunConfig, jobs: Sequence[Job], num_processes: int, show: Show = unseen
+    config: RunConfig, jobs: Sequence[Job], num_processes: int, show: Progress = no_progress
 ) -> Iterator[QueryResult | Failure]:
     """The results of all jobs as they come, out of order if there are several processes."""
     if num_processes == 1:

@@ -133,5 +133,5 @@ def cast_rays(
         shade(origin, directions[part], ranges[part], hits, room.boxes, room.materials, room.light, rgb[part])
         labels[part] = np.where(hits < 0, 0, room.labels[hits // 3])
 
-    list(workers.each(run, range(0, len(directions), CHUNK), label))
+    list(workers.map(run, range(0, len(directions), CHUNK), label))
     return ranges, rgb, labels

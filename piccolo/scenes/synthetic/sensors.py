@@ -68,7 +68,7 @@ def photograph(room: Room, pose: Pose, width: int, workers: Workers) -> NDArray[
         blocks = rgb.reshape(-1, SUPERSAMPLING, width, SUPERSAMPLING, 3)
         return np.asarray(np.round(blocks.mean(axis=(1, 3)) * 255.0), dtype=np.uint8)
 
-    return np.concatenate(list(workers.each(run, range(0, width // 2, BAND), "panorama")))
+    return np.concatenate(list(workers.map(run, range(0, width // 2, BAND), "panorama")))
 
 
 def label_image(room: Room, pose: Pose, width: int, workers: Workers) -> NDArray[np.uint16]:
@@ -79,7 +79,7 @@ def label_image(room: Room, pose: Pose, width: int, workers: Workers) -> NDArray
         labels = cast_rays(room, pose.center_world, rays, Workers(), "band")[2]
         return labels.reshape(-1, width).astype(np.uint16)
 
-    return np.concatenate(list(workers.each(run, range(0, width // 2, BAND), "labels")))
+    return np.concatenate(list(workers.map(run, range(0, width // 2, BAND), "labels")))
 
 
 def blur(image: Array, sigma: float) -> Array:
