@@ -21,7 +21,7 @@ demo: $(VENV)/ready
 	$(BIN)/python tools/evaluate.py --scenes demo --results demo/pose.json
 
 test: $(VENV)/ready
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 check: $(VENV)/ready
 	$(BIN)/ruff check .

@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import mutated, read_or_refused
 
-from piccolo.cli import render_pose
 from piccolo.cloud.soa import LocalCloud, pack_points
 from piccolo.errors import InputError
 from piccolo.geometry.camera_axes import R_cam_from_angles, heading_pitch_roll_deg
@@ -116,9 +115,6 @@ def test_holes_are_marked_where_points_are_missing_and_nowhere_else(points, tilt
     assert not picture.is_seen[inner].any()
     assert other.mean() > 0.4
     assert picture.is_seen[other].all()
-    is_seen = picture.is_seen.copy()
-    marked = render_pose.colors_of(picture, "mark")
-    np.testing.assert_array_equal((marked == render_pose.MAGENTA).all(axis=-1), ~is_seen)
 
 
 def test_a_sparse_wall_hides_what_is_behind_it():
