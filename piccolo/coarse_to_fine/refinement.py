@@ -17,7 +17,7 @@ FULL_LIMITS, LAST_LIMITS = (FULL_LOSS, 10, 1e-4), (FULL_LOSS, 30, 1e-7)
 PERTURBATION = 0.4  # of that on middle cells, on fine ones
 MAX_PERTURBATIONS, MIN_GAIN = 5, 0.01  # rounds; of the score in one, else it was the last
 NUM_POINTS = 30_000  # for the last millimetres
-MAX_LAST_ROUNDS, SETTLED = 6, 2e-5  # [m] a camera that moves by less in a round has arrived
+MAX_LAST_ROUNDS, SETTLED = 6, 1e-4  # [m] a camera that moves by less in a round has arrived
 MAX_SCORE_LOSS = 0.01  # in exchange for millimetres
 
 
