@@ -11,9 +11,22 @@ In the folder in which `make_room.py --out room --seed 4 --points 100000 --panor
 
 __version__ = "0.1.0"  # above the imports: a result repeats it
 
+from importlib import import_module
+from typing import TYPE_CHECKING
+
 from .errors import InputError
-from .geometry.pose import Pose
-from .result import Result
-from .scan import Scan, open_scan
+
+if TYPE_CHECKING:
+    from .geometry.pose import Pose
+    from .result import Result
+    from .scan import Scan, open_scan
 
 __all__ = ["InputError", "Pose", "Result", "Scan", "__version__", "open_scan"]
+MODULES = {"Pose": ".geometry.pose", "Result": ".result", "Scan": ".scan", "open_scan": ".scan"}
+
+
+def __getattr__(name: str) -> object:
+    """Import what is asked for when it is (PEP 562): Numba, SciPy and OpenCV take most of a second."""
+    if name not in MODULES:
+        raise AttributeError(f"module 'piccolo' has no attribute {name!r}")
+    return getattr(import_module(MODULES[name], __name__), name)
