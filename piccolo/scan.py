@@ -9,21 +9,18 @@ from typing import Any, Literal, TypedDict, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from .cloud import open_cloud, stream_of
-from .cloud.readers.colors import brightest_of, colored_chunks
+from .cloud import open_cloud
 from .cloud.settings import METRES, CloudSettings, UpAxis
-from .cloud.soa import LocalCloud, PackedPoints, pack_points
-from .cloud.stream import CloudStream
+from .cloud.soa import PackedPoints
+from .cloud.stream import ARRAYS, CloudStream, stream_of_arrays
 from .coarse_to_fine.localize import localize
 from .coarse_to_fine.open_map import CachePolicy, open_map, prepared_map_among
 from .coarse_to_fine.scan_map import ScanMap, prepare_map
 from .coarse_to_fine.settings import CoarseToFineSettings, Prior
 from .confidence.localization import Localization
 from .errors import InputError
-from .geometry.point_transforms import rotate_points
 from .geometry.pose import Pose
 from .geometry.rotations import Gravity
-from .gravity import R_z_from_axis
 from .optimize.settings import Solver
 from .panorama import Panorama, ReadOptions, read_panorama
 from .paper.localize import PaperMap
@@ -36,7 +33,6 @@ from .runtime.threads import ProgressCallback, Workers, no_progress, num_cores, 
 
 File = str | PathLike[str]
 Settings = CoarseToFineSettings | PaperSettings
-ARRAYS = Path("arrays")  # how messages and results name a scan that is no file
 LABELS_WARNING = "labels: the confidence was learnt on colours, and is a rough guide only"
 
 
@@ -207,16 +203,6 @@ def read_query(
     return Panorama(np.ascontiguousarray(panorama), is_valid)
 
 
-def stream_of_arrays(points: NDArray[np.floating[Any]], colors: NDArray[Any] | None) -> CloudStream:
-    """A cloud in memory: points (N, 3), colours (N, 3) in uint8, uint16, or floats in [0, 1]."""
-    if points.ndim != 2 or points.shape[1:] != (3,) or colors is None or colors.shape != points.shape:
-        shapes = f"{points.shape} and {None if colors is None else colors.shape}"
-        raise InputError(f"points, colors: found shapes {shapes}, wanted two arrays of shape (N, 3)")
-    brightest = brightest_of(ARRAYS, [f"{colors.dtype.kind}{colors.dtype.itemsize}"])
-    chunks = colored_chunks([(points, colors)], brightest, lambda row: f"{ARRAYS}, row {row}")
-    return stream_of(ARRAYS, next(iter(chunks)))
-
-
 def open_scan(
     source: File | Sequence[File] | NDArray[np.floating[Any]],
     colors: NDArray[Any] | None = None,
@@ -311,15 +297,3 @@ def scan_of(
         with watch.stage("prepare"):
             prepared = prepare_by_paper(points, settings)
     return Scan(prepared, name, cloud_settings, settings, workers, watch.seconds)
-
-
-def open_points(paths: Sequence[Path], settings: CloudSettings, workers: Workers) -> LocalCloud:
-    """All points of a cloud's files, or the voxels of the prepared map that stands in place of them."""
-    if prepared_map_among(paths):
-        m = open_map(paths, settings, CachePolicy(is_used=False), workers, Stopwatch())
-        return LocalCloud(m.points, m.R_map_from_world, m.origin_world, m.warnings)
-    cloud = open_cloud(paths, settings, workers.show).read()
-    R_local_from_world = R_z_from_axis(settings.up)
-    points = rotate_points(cloud.points.astype(np.float64), R_local_from_world).astype(np.float32)
-    packed = pack_points(points, cloud.colors)
-    return LocalCloud(packed, R_local_from_world, cloud.origin_world, cloud.warnings)

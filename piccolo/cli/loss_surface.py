@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..cloud.soa import FARTHEST, LocalCloud
+from ..coarse_to_fine.open_map import open_points
 from ..errors import InputError
 from ..geometry.pose import Array, Pose
 from ..geometry.rotations import uniform_rotations, uniform_yaws
@@ -20,7 +21,6 @@ from ..result import read_results
 from ..runtime.atomic import check_output, write_atomically
 from ..runtime.figure import new_figure
 from ..runtime.threads import Workers, num_cores
-from ..scan import open_points
 from ..scenes.scene import read_scene
 from .command import command, option
 from .errors import checking_options, print_note

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cloud.soa import LocalCloud
+from ..coarse_to_fine.open_map import open_points
 from ..errors import InputError
 from ..geometry.camera_axes import R_cam_from_angles
 from ..geometry.pose import Pose
@@ -30,7 +31,6 @@ from ..render.surfel_renderer import encode_image, fill_holes, render_points
 from ..result import read_results
 from ..runtime.atomic import check_output, check_output_folder, replacing_folder, write_atomically
 from ..runtime.threads import Workers, num_cores
-from ..scan import open_points
 from ..scenes.scene import read_scene
 from .command import command, option
 from .errors import checking_options, print_note

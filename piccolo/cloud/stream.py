@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +14,12 @@ from ..geometry.point_transforms import rotate_points
 from ..runtime.threads import Progress, no_progress
 from .model import Cloud
 from .morton import morton_order
+from .readers.colors import brightest_of, colored_chunks
 from .readers.reader import CHUNK, PointSource, RawCloud
 from .validation import Chunk, PointValidator, unit_warnings
 from .voxels import Voxels, VoxelTable
+
+ARRAYS = Path("arrays")  # how messages and results name a scan that is no file
 
 
 def stream_of(path: Path, raw: RawCloud) -> "CloudStream":
@@ -81,3 +85,13 @@ class CloudStream:
         warnings = (*self._warnings(validators), *unit_warnings(self.label, points))
         num_dropped = sum(validator.num_dropped for validator in validators)
         return Cloud(points, colors, origin_world, num_dropped, warnings)
+
+
+def stream_of_arrays(points: NDArray[np.floating[Any]], colors: NDArray[Any] | None) -> CloudStream:
+    """A cloud in memory: points (N, 3), colours (N, 3) in uint8, uint16, or floats in [0, 1]."""
+    if points.ndim != 2 or points.shape[1:] != (3,) or colors is None or colors.shape != points.shape:
+        shapes = f"{points.shape} and {None if colors is None else colors.shape}"
+        raise InputError(f"points, colors: found shapes {shapes}, wanted two arrays of shape (N, 3)")
+    brightest = brightest_of(ARRAYS, [f"{colors.dtype.kind}{colors.dtype.itemsize}"])
+    chunks = colored_chunks([(points, colors)], brightest, lambda row: f"{ARRAYS}, row {row}")
+    return stream_of(ARRAYS, next(iter(chunks)))

@@ -7,9 +7,14 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
+import numpy as np
+
 from ..cloud import open_cloud
 from ..cloud.settings import IN_METRES, CloudSettings
+from ..cloud.soa import LocalCloud, pack_points
 from ..errors import InputError
+from ..geometry.point_transforms import rotate_points
+from ..gravity import R_z_from_axis
 from ..runtime.cache import cache_root, mark_used, remove_stale
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
@@ -113,3 +118,15 @@ def cached_map(folder: Path | None, key: str, build: Callable[[], ScanMap], watc
         remove_stale(folder, NAME)
         save_map(scan_map, path)
     return scan_map
+
+
+def open_points(paths: Sequence[Path], settings: CloudSettings, workers: Workers) -> LocalCloud:
+    """All points of a cloud's files, or the voxels of the prepared map that stands in place of them."""
+    if prepared_map_among(paths):
+        m = open_map(paths, settings, CachePolicy(is_used=False), workers, Stopwatch())
+        return LocalCloud(m.points, m.R_map_from_world, m.origin_world, m.warnings)
+    cloud = open_cloud(paths, settings, workers.show).read()
+    R_local_from_world = R_z_from_axis(settings.up)
+    points = rotate_points(cloud.points.astype(np.float64), R_local_from_world).astype(np.float32)
+    packed = pack_points(points, cloud.colors)
+    return LocalCloud(packed, R_local_from_world, cloud.origin_world, cloud.warnings)
