@@ -17,7 +17,6 @@ from .coarse_to_fine.localize import localize
 from .coarse_to_fine.open_map import CachePolicy, open_map, prepared_map_among
 from .coarse_to_fine.scan_map import ScanMap, prepare_map
 from .coarse_to_fine.settings import CoarseToFineSettings, Prior
-from .confidence.localization import Localization
 from .errors import InputError
 from .geometry.pose import Pose
 from .geometry.rotations import Gravity
@@ -160,18 +159,16 @@ class Scan:
         watch = Stopwatch(dict(self.seconds))
         with watch.stage("read"):
             picture = read_query(panorama, read_options, is_masked)
-        found = self._method(picture, settings, watch)
+        if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
+            found = localize(self.prepared, picture, settings, self.workers, watch)
+        elif isinstance(self.prepared, PaperMap) and isinstance(settings, PaperSettings):
+            found = localize_by_paper(self.prepared, picture, settings, self.workers, watch)
+        else:
+            raise InputError("settings: of another method than the one that the scan was prepared for")
         name = "array" if isinstance(panorama, np.ndarray) else str(panorama)
         repeated = settings_json(settings, self.cloud_settings, read_options)
         warnings = self.warnings + picture.warnings + ((LABELS_WARNING,) if read_options.labels else ())
         return result_of(found, self.name, name, watch.seconds, repeated, warnings)
-
-    def _method(self, panorama: Panorama, settings: Settings, watch: Stopwatch) -> Localization:
-        if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
-            return localize(self.prepared, panorama, settings, self.workers, watch)
-        if isinstance(self.prepared, PaperMap) and isinstance(settings, PaperSettings):
-            return localize_by_paper(self.prepared, panorama, settings, self.workers, watch)
-        raise InputError("settings: of another method than the one that the scan was prepared for")
 
 
 def settings_json(

@@ -2,7 +2,6 @@
 
 import argparse
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 from tqdm import tqdm
@@ -50,22 +49,6 @@ def report(arguments: argparse.Namespace, scan: Scan, result: Result, read_optio
         tqdm.write(line, file=sys.stderr)
 
 
-def results_of(
-    arguments: argparse.Namespace, scan: Scan, settings: Settings, read_options: ReadOptions
-) -> Iterator[Result | None]:
-    """The result of each panorama in order; None for one that can't be read, after saying why."""
-    hidden = arguments.quiet or len(arguments.pano) == 1
-    for pano in tqdm(arguments.pano, desc="panoramas", unit="", disable=hidden, file=sys.stderr):
-        try:
-            result = scan.localize_query(pano, read_options, settings)
-            report(arguments, scan, result, read_options)
-        except (OSError, InputError) as error:
-            print_error(arguments, format_error(error), EXIT_BAD_INPUT)
-            yield None
-        else:
-            yield result
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Localize every panorama, write the results, return the exit code."""
     with checking_options():
@@ -73,9 +56,14 @@ def run(arguments: argparse.Namespace) -> int:
         settings, read_options = settings_from(arguments), read_options_from(arguments)
     scan, lines = open_scan(arguments, settings), list[str]()
     is_bad = some_not = False
-    for result in results_of(arguments, scan, settings, read_options):
-        is_bad |= result is None
-        if result is None:
+    hidden = arguments.quiet or len(arguments.pano) == 1
+    for pano in tqdm(arguments.pano, desc="panoramas", unit="", disable=hidden, file=sys.stderr):
+        try:
+            result = scan.localize_query(pano, read_options, settings)
+            report(arguments, scan, result, read_options)
+        except (OSError, InputError) as error:
+            print_error(arguments, format_error(error), EXIT_BAD_INPUT)
+            is_bad = True
             continue
         some_not |= result.status != LOCALIZED
         if arguments.out:
