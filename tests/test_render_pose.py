@@ -79,6 +79,10 @@ def test_the_same_pose_from_each_source_gives_the_same_picture(run, scene, tmp_p
         assert range_m.dtype == np.float32
         mask = cv2.imread(str(tmp_path / f"{name}_mask.png"), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(mask == 255, ~np.isfinite(range_m))
+    marked = tmp_path / "marked.png"
+    assert run(*sources["pose"], "--out", marked, "--width", 128, "--holes", "mark")[0] == 0
+    is_marked = (cv2.imread(str(marked))[..., ::-1] == render_pose.MAGENTA).all(axis=-1)
+    np.testing.assert_array_equal(is_marked, mask == 255)
 
 
 def test_depth_in_millimetres_says_nothing_and_too_far():
