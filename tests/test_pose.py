@@ -81,6 +81,9 @@ def test_matrix_takes_camera_to_world():
 def test_orthonormal_repairs_drift():
     R = exp_so3(np.array([0.4, -1.1, 0.7]))
     np.testing.assert_allclose(orthonormal(R * 1.001), R, atol=1e-12)
+    rough = R + np.random.default_rng(1).normal(0.0, 0.02, (3, 3))
+    U, _, Vt = np.linalg.svd(rough)
+    np.testing.assert_allclose(orthonormal(rough), U @ Vt, atol=1e-12)
 
 
 def test_upright_camera_looks_along_its_yaw():

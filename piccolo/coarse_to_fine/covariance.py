@@ -76,12 +76,9 @@ def block_gradients(image: Texels, points: Cells, pose: Pose) -> Array:
     """Gradients (B, 6), in the camera's frame, of the points in each block of the sphere."""
     offsets, levels, weights = points
     block = cell_of(offsets.T / np.linalg.norm(offsets, axis=0)[:, None], BLOCK_RINGS)
-    gradients = []
-    for b in np.unique(block):
-        chosen = np.flatnonzero(block == b)
-        part = Cells(offsets[:, chosen], levels[:, chosen], weights[chosen])
-        gradients.append(gradient_at(image, part, pose.R_cam_from_world, np.zeros(3)))
-    return np.array(gradients)
+    parts = np.split(np.argsort(block, kind="stable"), np.cumsum(np.bincount(block))[:-1])
+    chosen = (Cells(offsets[:, part], levels[:, part], weights[part]) for part in parts if len(part))
+    return np.array([gradient_at(image, part, pose.R_cam_from_world, np.zeros(3)) for part in chosen])
 
 
 def covariance_of(hessian: Array, gradients: Array) -> Array | None:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 
 Array = NDArray[np.float64]
+NEWTON_STEPS = 4  # from an error of 5 % to rounding
 
 
 @dataclass(frozen=True)
@@ -60,9 +61,14 @@ def step(pose: Pose, delta: Array) -> Pose:
 
 
 def orthonormal(R: Array) -> Array:
-    """The rotation (3, 3) nearest to `R` (3, 3), for products that drift by rounding."""
-    U, _, Vt = np.linalg.svd(R)
-    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+    """The rotation (3, 3) nearest to `R` (3, 3), which is one but for rounding or a few per cent.
+
+    The polar factor by Newton and Schulz's iteration (Higham, "Functions of Matrices", 2008, eq. 8.20): each
+    step squares the error.
+    """
+    for _ in range(NEWTON_STEPS):
+        R = R @ (1.5 * np.eye(3) - 0.5 * R.T @ R)
+    return R
 
 
 def checked_rotation(R: Array, tolerance: float, label: str) -> Array:

@@ -114,14 +114,16 @@ def _detail_circle(cap: NDArray[np.float32]) -> int:
     grey = cap.mean(axis=2)
     around = np.sin(np.radians((np.arange(NUM_ROWS) + 0.5) / ROWS_PER_DEG))
     spacing = np.clip(np.round(DETAIL_DEG * ROWS_PER_DEG / around), 1, DISC_WIDTH // 8).astype(int)
-    second = [np.roll(row, k) + np.roll(row, -k) - 2.0 * row for row, k in zip(grey, spacing, strict=True)]
-    detail = np.abs(np.stack(second)).reshape(NUM_ROWS, NUM_SECTORS, -1).mean(axis=2)
+    rows, columns = np.arange(NUM_ROWS)[:, None], np.arange(DISC_WIDTH)
+    east, west = ((columns + sign * spacing[:, None]) % DISC_WIDTH for sign in (1, -1))
+    second = grey[rows, east] + grey[rows, west] - 2.0 * grey
+    detail = np.abs(second).reshape(NUM_ROWS, NUM_SECTORS, -1).mean(axis=2)
+    ends = np.cumsum(np.concatenate([np.zeros((1, NUM_SECTORS)), detail]), axis=0)
+    within = (ends[NEAR_ROWS:] - ends[:-NEAR_ROWS]) / NEAR_ROWS  # mean of the NEAR_ROWS from each row on
     for k in CANDIDATES:
-        # row k - 1 is half a step: left out
-        inside = np.maximum(
-            np.median(detail[: k - 1], axis=0), detail[k - 1 - NEAR_ROWS : k - 1].mean(axis=0)
-        )
-        outside = detail[k + 1 : k + 1 + NEAR_ROWS].mean(axis=0)
-        if (outside >= np.maximum(MIN_DETAIL_RATIO * inside, MIN_DETAIL)).all():
+        inside, outside = within[k - 1 - NEAR_ROWS], within[k + 1]  # row k - 1 is half a step: left out
+        if (outside < np.maximum(MIN_DETAIL_RATIO * inside, MIN_DETAIL)).any():
+            continue
+        if (outside >= MIN_DETAIL_RATIO * np.median(detail[: k - 1], axis=0)).all():
             return k
     return 0
