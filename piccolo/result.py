@@ -4,7 +4,7 @@ import json
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from . import __version__
 from .confidence.alternatives import Hypothesis
-from .confidence.confidence import AMBIGUOUS
+from .confidence.confidence import AMBIGUOUS, LOCALIZED
 from .confidence.covariance import PoseCovariance
 from .confidence.localization import Localization
 from .confidence.score import Evidence
@@ -21,7 +21,9 @@ from .geometry.pose import Pose, T_world_from_cam, checked_rotation, quaternion_
 from .geometry.sphere import CONVENTION
 from .runtime.json_file import parse_lines, read_bytes
 
-FORMAT = "piccolo-pose/3"
+FORMAT = "piccolo-pose/4"
+UNREADABLE = "unreadable"
+POSE_FIELDS = ("R_cam_from_world", "center_world", "quaternion_wxyz", "T_world_from_cam")
 MAX_ROTATION_ERROR = 1e-6  # of R R^T from the identity, in a file
 # control characters, line ends, halves of characters
 UNWRITABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
@@ -33,21 +35,43 @@ COVARIANCE_CONVENTION = (
 
 
 @dataclass(frozen=True)
+class Source:
+    """Which scan and which photo a result is of; None where that is not known."""
+
+    cloud_sha256: str | None = None  # of the scan's file; of several, of their sorted digests, one a line
+    pano_sha256: str | None = None  # of the photo's file; of cube faces, of their digests in order
+    image_size: tuple[int, int] | None = None  # width and height of the picture as it is stored [px]
+    capture_time: str | None = None  # by EXIF, ISO 8601, with the offset from UTC if EXIF has it
+
+
+@dataclass(frozen=True)
 class Result:
     """Where one panorama was taken, and what speaks for it."""
 
-    status: str  # "localized", "ambiguous" or "not_localized"
+    status: str  # "localized", "ambiguous", "not_localized" or "unreadable"
     confidence: float  # [0, 1] how likely the pose is right, see piccolo.confidence
     cloud: str | tuple[str, ...]  # path as given, or the paths of several files that are one cloud
     pano: str  # path as given
-    pose: Pose | None  # the best pose found, in the file's own coordinates; None if there was no start
+    best_pose: Pose | None  # found, in the scan's own coordinates; None if there was no start
     loss: float | None  # sampling loss [0, sqrt(3)] over the points seen from the pose
     evidence: Evidence | None
     alternatives: tuple[Hypothesis, ...]  # poses elsewhere, best first, at most 5
     covariance: PoseCovariance | None  # None with the preset paper, and where the points do not fix the pose
-    seconds: dict[str, float]  # read, prepare, search, refine
+    seconds: dict[str, float]  # of this photo: read, search, refine
     settings: dict[str, object]  # effective settings, seed included
-    warnings: tuple[str, ...] = field(default=())
+    warnings: tuple[str, ...] = ()
+    source: Source = Source()
+    error: str | None = None  # why a photo is "unreadable"
+
+    @property
+    def pose(self) -> Pose | None:
+        """Where the photo was taken, if it is localized."""
+        return self.best_pose if self.status == LOCALIZED else None
+
+    @property
+    def best_guess(self) -> Pose | None:
+        """The best pose found where it is not sure enough to be called localized."""
+        return None if self.status == LOCALIZED else self.best_pose
 
     @property
     def cloud_name(self) -> str:
@@ -56,11 +80,13 @@ class Result:
 
     def summary(self) -> str:
         """Two lines for a person."""
-        if self.pose is None:
-            return f"{self.pano}: {self.status}\n  no place for a camera, or nothing of the panorama counts"
-        x, y, z = self.pose.center_world
+        if self.best_pose is None:
+            why = self.error or "no place for a camera, or nothing of the panorama counts"
+            return f"{self.pano}: {self.status}\n  {why}"
+        x, y, z = self.best_pose.center_world
         total = sum(self.seconds.values())
-        lines = [f"{self.pano}: {self.status} at ({x:.3f}, {y:.3f}, {z:.3f}) m in {total:.1f} s"]
+        where = "at" if self.pose else "best guess"
+        lines = [f"{self.pano}: {self.status}, {where} ({x:.3f}, {y:.3f}, {z:.3f}) m in {total:.1f} s"]
         if self.evidence is not None:
             e = self.evidence
             lines.append(
@@ -78,19 +104,19 @@ class Result:
 
     def to_json(self) -> str:
         """One JSON object on one line. Numbers only: NaN and infinity raise ValueError."""
-        pose = self.pose
         document = {
             "format": FORMAT,
             "status": self.status,
             "confidence": self.confidence,
+            "error": self.error,
             "cloud": self.cloud,
             "pano": self.pano,
-            **_pose_json(pose),
-            "quaternion_wxyz": pose and quaternion_wxyz(pose.R_cam_from_world).tolist(),
-            "T_world_from_cam": pose and T_world_from_cam(pose).tolist(),
+            **asdict(self.source),
+            **(_pose_json(self.pose) or dict.fromkeys(POSE_FIELDS)),
+            "best_guess": _pose_json(self.best_guess),
             "loss": self.loss,
             "evidence": self.evidence and asdict(self.evidence),
-            "alternatives": [_pose_json(h.pose) | {"score": h.score} for h in self.alternatives],
+            "alternatives": [{**_rotation_and_center(h.pose), "score": h.score} for h in self.alternatives],
             "covariance": self.covariance and self.covariance.matrix.tolist(),
             "covariance_convention": COVARIANCE_CONVENTION,
             "std_mm": self.covariance and self.covariance.std_mm.tolist(),
@@ -114,7 +140,8 @@ class Result:
             cloud = document.pop("cloud")
             return cls(
                 cloud=cloud if isinstance(cloud, str) else _paths(cloud),
-                pose=_pose_from_json(document),
+                best_pose=_best_pose_from_json(document),
+                source=Source(**{f.name: document[f.name] for f in fields(Source)}),
                 evidence=document["evidence"] and Evidence(**document["evidence"]),
                 alternatives=tuple(map(_alternative_from_json, document["alternatives"])),
                 covariance=_covariance_from_json(document),
@@ -127,32 +154,36 @@ class Result:
             ) from error
 
 
-def result_of(
-    found: Localization,
-    cloud: str | tuple[str, ...],
-    pano: str,
-    seconds: dict[str, float],
-    settings: dict[str, object],
-    warnings: tuple[str, ...] = (),
-) -> Result:
-    """The result of a localization, with the names of the files and what it took."""
-    values = {f.name: getattr(found, f.name) for f in fields(found)}
-    return Result(cloud=cloud, pano=pano, seconds=seconds, settings=settings, warnings=warnings, **values)
+def result_of(found: Localization, **about: Any) -> Result:
+    """The result of a localization; `about` are the fields of Result that say what it is of, and how it was made."""
+    values = {f.name: getattr(found, f.name) for f in fields(found) if f.name != "pose"}
+    return Result(best_pose=found.pose, **values, **about)
 
 
-_PLAIN_FIELDS = ("status", "confidence", "pano", "loss", "seconds", "settings")
+def unreadable_result(error: str, cloud: str | tuple[str, ...], pano: str, **more: Any) -> Result:
+    """The result of a photo that can't be read; `more` as in Result."""
+    return Result(UNREADABLE, 0.0, cloud, pano, None, None, None, (), None, {}, error=error, **more)
 
 
-def _pose_json(pose: Pose | None) -> dict[str, object]:
-    return {
-        "R_cam_from_world": pose and pose.R_cam_from_world.tolist(),
-        "center_world": pose and pose.center_world.tolist(),
-    }
+_PLAIN_FIELDS = ("status", "confidence", "pano", "loss", "seconds", "settings", "error")
 
 
-def _pose_from_json(document: dict[str, Any]) -> Pose | None:
-    R, center = document["R_cam_from_world"], document["center_world"]
-    return None if R is None else Pose(np.array(R), np.array(center))
+def _rotation_and_center(pose: Pose) -> dict[str, object]:
+    return {"R_cam_from_world": pose.R_cam_from_world.tolist(), "center_world": pose.center_world.tolist()}
+
+
+def _pose_json(pose: Pose | None) -> dict[str, object] | None:
+    """A pose in all its forms, POSE_FIELDS."""
+    if pose is None:
+        return None
+    quaternion, T = quaternion_wxyz(pose.R_cam_from_world), T_world_from_cam(pose)
+    other = {"quaternion_wxyz": quaternion.tolist(), "T_world_from_cam": T.tolist()}
+    return {**_rotation_and_center(pose), **other}
+
+
+def _best_pose_from_json(document: dict[str, Any]) -> Pose | None:
+    own = document if document["status"] == LOCALIZED else document["best_guess"]
+    return None if own is None else Pose(np.array(own["R_cam_from_world"]), np.array(own["center_world"]))
 
 
 def _covariance_from_json(document: dict[str, Any]) -> PoseCovariance | None:
@@ -205,8 +236,8 @@ def _checked_result(text: str) -> Result:
     values = [result.confidence, *([result.evidence.score] if result.evidence else [])]
     if not all(isinstance(value, int | float) and math.isfinite(value) for value in values):
         raise InputError(f"result: found confidence and score {values}, wanted finite numbers")
-    if result.pose is not None:
-        R, center = result.pose.R_cam_from_world, result.pose.center_world
+    if result.best_pose is not None:
+        R, center = result.best_pose.R_cam_from_world, result.best_pose.center_world
         is_number = R.dtype.kind in "fiu" and center.dtype.kind in "fiu"
         if not (is_number and center.shape == (3,) and np.isfinite(center).all()):
             raise InputError("result: found no numbers of a pose, wanted R_cam_from_world and center_world")

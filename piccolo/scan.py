@@ -22,11 +22,12 @@ from .geometry.pose import Pose
 from .geometry.rotations import Gravity
 from .optimize.settings import Solver
 from .panorama import Panorama, ReadOptions, read_panorama
+from .panorama.photo import photo_of, photo_of_array
 from .paper.localize import PaperMap
 from .paper.localize import localize as localize_by_paper
 from .paper.localize import prepare as prepare_by_paper
 from .paper.settings import PaperSettings
-from .result import Result, result_of
+from .result import Result, Source, result_of
 from .runtime.stopwatch import Stopwatch
 from .runtime.threads import ProgressCallback, Workers, no_progress, num_cores, progress_to
 
@@ -156,19 +157,25 @@ class Scan:
         is_masked: NDArray[np.bool_] | None = None,
     ) -> Result:
         """The same with all options as objects; the mask of an array apart."""
-        watch = Stopwatch(dict(self.seconds))
+        watch = Stopwatch()
         with watch.stage("read"):
             picture = read_query(panorama, read_options, is_masked)
+            photo = photo_of_array(panorama) if isinstance(panorama, np.ndarray) else photo_of(Path(panorama))
         if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
             found = localize(self.prepared, picture, settings, self.workers, watch)
         elif isinstance(self.prepared, PaperMap) and isinstance(settings, PaperSettings):
             found = localize_by_paper(self.prepared, picture, settings, self.workers, watch)
         else:
             raise InputError("settings: of another method than the one that the scan was prepared for")
-        name = "array" if isinstance(panorama, np.ndarray) else str(panorama)
-        repeated = settings_json(settings, self.cloud_settings, read_options)
-        warnings = self.warnings + picture.warnings + ((LABELS_WARNING,) if read_options.labels else ())
-        return result_of(found, self.name, name, watch.seconds, repeated, warnings)
+        return result_of(
+            found,
+            cloud=self.name,
+            pano="array" if isinstance(panorama, np.ndarray) else str(panorama),
+            seconds=watch.seconds,
+            settings=settings_json(settings, self.cloud_settings, read_options),
+            warnings=self.warnings + picture.warnings + ((LABELS_WARNING,) if read_options.labels else ()),
+            source=Source(self.prepared.scan_sha256, photo.sha256, photo.image_size, photo.capture_time),
+        )
 
 
 def settings_json(

@@ -72,14 +72,14 @@ def outcome_of(line: str) -> Outcome | None:
     """One line of tools/evaluate_confidence.py; None if no pose was found."""
     trial = json.loads(line)
     result, truth = Result.from_json(json.dumps(trial["result"])), trial["truth"]
-    if result.pose is None or result.evidence is None:
+    if result.best_pose is None or result.evidence is None:
         return None
     error, ok = np.full(6, np.nan), False
     if isinstance(truth, dict):
         true_pose = Pose(np.array(truth["R_cam_from_world"]), np.array(truth["center_world"]))
-        turn = log_so3(true_pose.R_cam_from_world @ result.pose.R_cam_from_world.T)
-        error = np.concatenate([turn, true_pose.center_world - result.pose.center_world])
-        ok = is_correct(result.pose, true_pose)
+        turn = log_so3(true_pose.R_cam_from_world @ result.best_pose.R_cam_from_world.T)
+        error = np.concatenate([turn, true_pose.center_world - result.best_pose.center_world])
+        ok = is_correct(result.best_pose, true_pose)
     model = PAPER_MODEL if result.settings["preset"] == "paper" else MODEL
     has_alternatives = len(result.alternatives) > 0
     return Outcome(str(trial["case"]), result.evidence, result.covariance, has_alternatives, model, ok, error)

@@ -127,7 +127,7 @@ def main(arguments: argparse.Namespace) -> int:
     with arguments.out.open("w") as file:
         for scene, trial, result in results_of(arguments):
             pose, names = trial.true_pose, ("R_cam_from_world", "center_world")
-            ok = pose is not None and is_correct(result.pose, pose)
+            ok = pose is not None and is_correct(result.best_pose, pose)
             counts.setdefault(trial.case, []).append((result.status, ok))
             truth = pose and {name: getattr(pose, name).tolist() for name in names}
             line = {"case": trial.case, "scene": scene, "truth": truth}

@@ -1,80 +1,176 @@
 """Command line: a coloured scan and 360-degree photos in, camera poses out."""
 
 import argparse
+import itertools
 import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from tqdm import tqdm
 
-from ..coarse_to_fine.open_map import CachePolicy
-from ..confidence.confidence import LOCALIZED
-from ..errors import InputError
-from ..panorama import ReadOptions, read_panorama
+from ..batch.batch import Batch
+from ..batch.inputs import is_stream, panoramas_of
+from ..batch.priors import read_priors
+from ..coarse_to_fine.open_map import CachePolicy, scan_digest
+from ..coarse_to_fine.settings import CoarseToFineSettings
+from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
+from ..panorama import read_panorama
 from ..render.overlay import overlay_png
-from ..result import Result
+from ..result import UNREADABLE, Result
 from ..runtime.atomic import check_output, write_atomically
 from ..runtime.kernel_cache import is_first_use, kernel_folder
+from ..runtime.line_file import appending
+from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
-from ..scan import Scan, Settings, open_files
-from .errors import EXIT_BAD_INPUT, checking_options, format_error, print_error, run_command
+from ..scan import Scan, open_files
+from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error, print_note, run_command
+from .interruption import SIGNALS, Interruption, Stopped, interruptible
 from .options import build_parser, check_arguments, cloud_settings_from, read_options_from, settings_from
 from .progress import progress_bar, warn_once
 
 EXIT_ALL_LOCALIZED, EXIT_SOME_NOT = 0, 1
+STATUSES = (LOCALIZED, AMBIGUOUS, NOT_LOCALIZED, UNREADABLE)
+Write = Callable[[str], object]
 
 
-def open_scan(arguments: argparse.Namespace, settings: Settings) -> Scan:
-    """Read and prepare the scan, after a look at what is to be written."""
+@dataclass
+class Run:
+    """A command's batch, and what it has done so far."""
+
+    arguments: argparse.Namespace
+    batch: Batch
+    panoramas: Iterator[Path]
+    total: int | None  # of the panoramas; None if they come on standard input
+    counts: Counter[str]  # results by status, those of an earlier run too
+    size: int  # of the lines that an earlier run has left [byte]
+
+    @property
+    def num_finished(self) -> int:
+        """Results written, by this run or an earlier one."""
+        return self.counts.total()
+
+
+def prepare_run(arguments: argparse.Namespace) -> Run:
+    """What is to be done: the options, the panoramas, and how many of them are finished."""
+    with checking_options():
+        check_arguments(arguments)
+        settings, read_options = settings_from(arguments), read_options_from(arguments)
+        cloud_settings = cloud_settings_from(arguments)
+    priors = None
+    if arguments.priors:
+        if not isinstance(settings, CoarseToFineSettings):
+            raise UsageError("--priors: not an option of the preset paper")
+        priors = read_priors(arguments.priors, settings.prior)
+    batch = Batch(settings, cloud_settings, read_options, priors)
+    panoramas, total = panoramas_of(arguments.pano, sys.stdin), None
+    if not is_stream(arguments.pano):
+        known = list(panoramas)
+        panoramas, total = iter(known), len(known)
+        if arguments.overlay and total > 1 and not arguments.overlay.is_dir():
+            raise UsageError(f"--overlay: found {total} panoramas, wanted one or a folder that exists")
+    inputs = [*arguments.cloud, *(Path(word) for word in arguments.pano), *filter(None, [arguments.priors])]
     for output in filter(None, (arguments.out, arguments.overlay)):
-        check_output(output, [*arguments.cloud, *arguments.pano])
-    if is_first_use() and not arguments.quiet:
-        text = f"first use: compiling kernels, once (about a minute), into {kernel_folder()}"
-        print(text, file=sys.stderr, flush=True)
+        if not output.is_dir():
+            check_output(output, inputs)
+    counts, size = Counter[str](), 0
+    if arguments.out and arguments.out.exists() and not arguments.overwrite:
+        show = progress_bar(arguments.quiet)
+        paths = arguments.cloud
+        name = str(paths[0]) if len(paths) == 1 else tuple(map(str, paths))
+        checked = show(panoramas, total, "check what is finished")
+        counts, size = batch.pass_finished(arguments.out, checked, name, scan_digest(paths))
+    return Run(arguments, batch, panoramas, total, counts, size)
+
+
+def open_scan(run: Run) -> Scan:
+    """Read and prepare the scan."""
+    arguments, batch = run.arguments, run.batch
+    if is_first_use():
+        print_note(arguments, f"first use: compiling kernels, once (about a minute), into {kernel_folder()}")
     cache = CachePolicy(not arguments.no_cache, arguments.cache)
     workers = Workers(arguments.threads, progress_bar(arguments.quiet), warn_once(arguments.quiet))
-    scan = open_files(arguments.cloud, cloud_settings_from(arguments), settings, cache, workers)
+    scan = open_files(arguments.cloud, batch.cloud_settings, batch.settings, cache, workers)
     for warning in scan.warnings:  # those of a map prepared earlier; others have been written
         workers.warn(warning)
     return scan
 
 
-def report(arguments: argparse.Namespace, scan: Scan, result: Result, read_options: ReadOptions) -> None:
+@contextmanager
+def output(run: Run) -> Iterator[Write]:
+    """A function that writes one line, to stdout or behind the finished lines of a file."""
+    if run.arguments.out is None:
+        yield lambda line: print(line, flush=True)
+    else:
+        with appending(run.arguments.out, run.size) as append:
+            yield append
+
+
+def report(run: Run, scan: Scan, result: Result) -> None:
     """Write the overlay if one is asked for, and say what was found."""
-    if arguments.overlay and result.pose is not None:
-        panorama = read_panorama(Path(result.pano), read_options)
-        png = overlay_png(scan.points, panorama, scan.from_world(result.pose), scan.workers)
-        write_atomically(arguments.overlay, png)
+    arguments = run.arguments
+    if result.error is not None:
+        print_error(arguments, result.error, EXIT_BAD_INPUT)
+        return
+    if arguments.overlay and result.best_pose is not None:
+        panorama = read_panorama(Path(result.pano), run.batch.read_options)
+        png = overlay_png(scan.points, panorama, scan.from_world(result.best_pose), scan.workers)
+        is_folder = arguments.overlay.is_dir()
+        file = arguments.overlay / f"{Path(result.pano).stem}.png" if is_folder else arguments.overlay
+        write_atomically(file, png)
     warnings = [f"warning: {warning}" for warning in result.warnings[len(scan.warnings) :]]
     for line in () if arguments.quiet else (*warnings, result.summary()):
         tqdm.write(line, file=sys.stderr)
 
 
+def localize_all(run: Run, scan: Scan, write: Write, interruption: Interruption) -> None:
+    """Localize the panoramas that are left, write each result as it comes, until a signal ends it."""
+    hidden = run.arguments.quiet or run.total == 1
+    bar = {"total": run.total, "initial": run.num_finished, "disable": hidden, "file": sys.stderr}
+    for pano in tqdm(run.panoramas, "panoramas", unit="", **bar):
+        with interruption.postponed():
+            result = run.batch.localize(scan, pano)
+            report(run, scan, result)
+            write(result.to_json())
+            run.counts[result.status] += 1
+        if interruption.number:
+            return
+
+
+def finish(run: Run, interruption: Interruption, seconds: float) -> int:
+    """Say what was done, and how to go on; the exit code."""
+    arguments, counts = run.arguments, run.counts
+    if run.total != 1:
+        words = ", ".join(f"{counts[status]} {status.replace('_', ' ')}" for status in STATUSES)
+        print_note(arguments, f"{run.num_finished} panoramas in {seconds:.0f} s: {words}")
+    if run.batch.priors and (unused := run.batch.priors.unused) and not interruption.number:
+        note = f"{run.batch.priors.path}: {len(unused)} names of no panorama here, such as {unused[0]}"
+        print_note(arguments, f"warning: {note}")
+    if interruption.number:
+        how = "the same command goes on from here" if arguments.out else "--out FILE lets a command go on"
+        text = f"ended by {SIGNALS[interruption.number]} after {run.num_finished} results; {how}"
+        return print_error(arguments, text, interruption.exit_code)
+    if counts[UNREADABLE]:
+        return EXIT_BAD_INPUT
+    return EXIT_ALL_LOCALIZED if counts[LOCALIZED] == run.num_finished else EXIT_SOME_NOT
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Localize every panorama, write the results, return the exit code."""
-    with checking_options():
-        check_arguments(arguments)
-        settings, read_options = settings_from(arguments), read_options_from(arguments)
-    scan, lines = open_scan(arguments, settings), list[str]()
-    is_bad = some_not = False
-    hidden = arguments.quiet or len(arguments.pano) == 1
-    for pano in tqdm(arguments.pano, desc="panoramas", unit="", disable=hidden, file=sys.stderr):
-        try:
-            result = scan.localize_query(pano, read_options, settings)
-            report(arguments, scan, result, read_options)
-        except (OSError, InputError) as error:
-            print_error(arguments, format_error(error), EXIT_BAD_INPUT)
-            is_bad = True
-            continue
-        some_not |= result.status != LOCALIZED
-        if arguments.out:
-            lines.append(result.to_json() + "\n")
-        else:
-            print(result.to_json(), flush=True)
-    if arguments.out and lines:
-        write_atomically(arguments.out, "".join(lines).encode())
-    if is_bad:
-        return EXIT_BAD_INPUT
-    return EXIT_SOME_NOT if some_not else EXIT_ALL_LOCALIZED
+    watch = Stopwatch()
+    run = prepare_run(arguments)
+    first = next(run.panoramas, None)
+    if first is None:
+        print_note(arguments, f"{arguments.out or 'nothing'}: nothing is left to do")
+        return finish(run, Interruption(), 0.0)
+    scan = open_scan(run)
+    with watch.stage("all"), output(run) as write, interruptible() as interruption:
+        run.panoramas = itertools.chain([first], run.panoramas)
+        with suppress(Stopped):
+            localize_all(run, scan, write, interruption)
+    return finish(run, interruption, watch.seconds["all"])
 
 
 def main(argv: list[str] | None = None) -> int:

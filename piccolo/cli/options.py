@@ -19,11 +19,13 @@ EPILOG = """\
 examples:
   python localize.py --cloud scan.ply --pano query.jpg
   python localize.py --cloud scan.ply --pano query.jpg --out pose.json --overlay overlay.png
-  python localize.py --cloud scan.ply --pano photos/*.jpg --out poses.jsonl
+  python localize.py --cloud scan.ply --pano photos --out poses.jsonl --priors priors.csv
+  ls photos/*.jpg | python localize.py --cloud scan.ply --pano - > poses.jsonl
   python localize.py --cloud scan.ply --pano query.jpg --near 12 3 1.5 --radius 4
   python localize.py --cloud scan.ply --pano query.jpg --preset paper --solver lbfgs
 
-output: one JSON object a panorama, one a line, in the order given; messages and progress go to stderr.
+output: one JSON object a panorama, one a line, in the order given (docs/RESULT.md); messages and progress go
+to stderr. Ctrl-C ends a batch after the photo at work, a second one at once.
 --help-paper shows the options of the preset paper.
 """
 # Settings that only one preset has, each with an option of its name: option, metavar, type or choices, help.
@@ -62,8 +64,11 @@ def build_parser() -> argparse.ArgumentParser:
     add_cloud_options(parser, text)
     files = parser.add_argument_group("files")
     add_panorama_options(parser)
-    files.add_argument("--out", type=Path, help="write the JSON here, not to stdout")
-    files.add_argument("--overlay", type=Path, help="PNG: panorama, cloud at the pose, checkerboard of both")
+    text = "append each JSON line here as it comes; the same command again goes on where it stopped"
+    files.add_argument("--out", type=Path, metavar="FILE", help=text)
+    files.add_argument("--overwrite", action="store_true", help="begin --out anew, whatever is in it")
+    text = "PNG: panorama, cloud at the pose, checkerboard of both; of several panoramas a folder of PNGs"
+    files.add_argument("--overlay", type=Path, metavar="PNG", help=text)
     files.add_argument("--cache", type=Path, metavar="FOLDER", help="of prepared maps (default the user's)")
     files.add_argument("--no-cache", action="store_true", help="prepare the map again, and do not keep it")
     add_method_options(parser)
@@ -101,8 +106,11 @@ def add_cloud_reading_options(group: argparse._ArgumentGroup) -> None:
 def add_panorama_options(parser: argparse.ArgumentParser) -> None:
     """The panoramas' files, and how to read them."""
     group = parser.add_argument_group("panorama")
-    text = "JPEG, PNG, TIFF or WebP: 2:1, or a crop with Photo Sphere metadata; or a folder of six cube faces"
-    group.add_argument("--pano", type=Path, required=True, nargs="+", help=text)
+    text = (
+        "JPEG, PNG, TIFF or WebP: 2:1, or a crop with Photo Sphere metadata; or a folder of six cube faces; "
+        "or a folder of pictures, @FILE with a path a line, or - for paths on stdin, answered as they come"
+    )
+    group.add_argument("--pano", required=True, nargs="+", help=text)
     add_panorama_reading_options(group)
 
 
@@ -195,6 +203,8 @@ class PaperHelp(argparse.Action):
 def add_prior_options(parser: argparse.ArgumentParser) -> None:
     """What the user knows beforehand."""
     group = parser.add_argument_group("prior knowledge (preset default); each narrows the search")
+    text = "CSV: name and any of x, y, z, radius, heading, tolerance, height; goes before the options here"
+    group.add_argument("--priors", type=Path, metavar="FILE", help=text)
     group.add_argument("--near", type=float, nargs=3, metavar=("X", "Y", "Z"), help="rough position [m]")
     group.add_argument("--radius", type=float, metavar="M", help="the camera is within M metres of --near")
     group.add_argument("--height", type=float, nargs=2, metavar=("MIN", "MAX"), help="above the floor [m]")
@@ -239,7 +249,7 @@ def check_arguments(arguments: argparse.Namespace) -> None:
     if arguments.threads < 1:
         raise InputError(f"--threads: found {arguments.threads}, wanted at least 1")
     cloud_settings_from(arguments)
-    if arguments.overlay and len(arguments.pano) > 1:
-        raise InputError(f"--overlay: found {len(arguments.pano)} panoramas, wanted one")
+    if arguments.overwrite and not arguments.out:
+        raise InputError("--overwrite: only with --out")
     if arguments.cache and arguments.no_cache:
         raise InputError("--cache, --no-cache: only one of them")

@@ -139,7 +139,7 @@ def poses_from(arguments: argparse.Namespace) -> Named:
     if arguments.queries:
         found = [(name, query.pose) for name, query in read_scene(file).by_name.items()]
     else:
-        found = [(r.pano, r.pose) for r in read_results([file]) if r.pose is not None]
+        found = [(r.pano, r.best_pose) for r in read_results([file]) if r.best_pose is not None]
     if arguments.pano:
         found = [(name, pose) for name, pose in found if Path(name).name == Path(arguments.pano).name]
     if not found:

@@ -14,9 +14,10 @@ def apply_prior(scan_map: ScanMap, prior: Prior) -> ScanMap:
     """The map with only the candidates that the prior allows, by half a grid spacing more than it says."""
     is_allowed = np.ones(len(scan_map.centers), dtype=bool)
     if prior.near_world is not None and prior.radius is not None:
-        near = scan_map.R_map_from_world @ (np.array(prior.near_world) - scan_map.origin_world)
-        distance = np.linalg.norm(scan_map.centers - near, axis=1)
-        is_allowed &= distance <= prior.radius + COARSE_SPACING / 2
+        x, y, z = prior.near_world
+        centers_world = scan_map.centers @ scan_map.R_map_from_world + scan_map.origin_world
+        offsets = centers_world[:, :2] - (x, y) if z is None else centers_world - (x, y, z)
+        is_allowed &= np.linalg.norm(offsets, axis=1) <= prior.radius + COARSE_SPACING / 2
     if prior.height is not None:
         heights = heights_above_floor(scan_map.octree, scan_map.centers)
         low, high = prior.height[0] - COARSE_SPACING / 2, prior.height[1] + COARSE_SPACING / 2

@@ -13,7 +13,9 @@ from ..optimize.settings import Solver
 class Prior:
     """What the user knows beforehand; each narrows the search."""
 
-    near_world: tuple[float, float, float] | None = None  # [m] the camera is within `radius` of this
+    near_world: tuple[float, float, float | None] | None = (
+        None  # [m] within `radius` of this; None: any height
+    )
     radius: float | None = None  # [m]
     height: tuple[float, float] | None = None  # [m] least and most above the floor
     heading_deg: float | None = None  # of the image centre, clockwise from the cloud's +y, as GPano counts

@@ -9,11 +9,13 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .cube import Faces, equirectangular, face_pixels
+from .model import FACE_LETTERS
 from .picture import MAX_WIDTH, Picture, read_picture
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
 MIN_FACE = 32  # [px]
 MAX_FACE = MAX_WIDTH // 4
+MAX_CUBE_FILES = 64  # a folder with more pictures is a folder of panoramas
 MAX_EMPTY_RANGE = 8  # levels within an empty cell of a cross: JPEG leaves a few
 # names that programs give to the faces r, l, u, d, f, b
 SCHEMES = (
@@ -42,6 +44,16 @@ def read_cube_folder(folder: Path) -> Picture:
     faces = {letter: face_pixels(picture.rgb, picture.is_valid) for letter, picture in pictures.items()}
     warnings = dict.fromkeys(warning for picture in pictures.values() for warning in picture.warnings)
     return _from_faces(folder, faces, tuple(warnings))
+
+
+def is_cube(folder: Path) -> bool:
+    """True for a folder of few pictures among which are the six faces of one cube."""
+    if sum(path.suffix.lower() in SUFFIXES for path in folder.iterdir()) > MAX_CUBE_FILES:
+        return False
+    try:
+        return len(face_paths(folder)) == len(FACE_LETTERS)
+    except InputError:
+        return False
 
 
 def face_paths(folder: Path) -> dict[str, Path]:

@@ -59,7 +59,7 @@ class QueryResult:
         """One line."""
         names = "scene", "image", "variant", "is_in_box"
         line: dict[str, object] = {"format": FORMAT, **{name: getattr(self, name) for name in names}}
-        has_pose = self.result.pose is not None
+        has_pose = self.result.best_pose is not None
         line["position_error"] = self.position_error if has_pose else None
         line["rotation_error_deg"] = float(np.degrees(self.rotation_error)) if has_pose else None
         line["result"] = json.loads(self.result.to_json())
@@ -86,7 +86,8 @@ class QueryResult:
 
 def query_result_of(scene: Scene, query: Query, result: Result, is_in_box: bool | None) -> QueryResult:
     """A query's result with its errors."""
-    errors = (np.inf, np.inf) if result.pose is None else pose_errors(result.pose, query.pose)
+    pose = result.best_pose
+    errors = (np.inf, np.inf) if pose is None else pose_errors(pose, query.pose)
     return QueryResult(scene.name, scene.name_of(query), query.variant, is_in_box, *errors, result)
 
 

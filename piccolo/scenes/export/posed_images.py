@@ -5,7 +5,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -104,7 +104,7 @@ def select(results: Sequence[Result], clouds: Sequence[str] = (), use_all: bool 
     for result in results:
         if clouds and result.cloud_name not in clouds:
             left_out["other clouds"] += 1
-        elif result.pose is None:
+        elif result.best_pose is None:
             left_out["without a pose"] += 1
         elif result.status != LOCALIZED and not use_all:
             left_out[result.status] += 1
@@ -118,7 +118,7 @@ def posed_images(results: Sequence[Result], form: Format, options: Options) -> l
     offset = np.array(options.offset or (0.0, 0.0, 0.0))
     posed: dict[str, PosedImage] = {}
     for index, result in enumerate(results):
-        if result.pose is None:
+        if result.best_pose is None:
             raise InputError(f"{result.pano}: this result has no pose to write")
         name, path = _name(result.pano, options.images), Path(result.pano)
         if form.forbidden and (found := re.search(form.forbidden, name)):
@@ -130,7 +130,7 @@ def posed_images(results: Sequence[Result], form: Format, options: Options) -> l
         if options.timestamps == "name" and not TIMESTAMP.fullmatch(path.stem):
             raise InputError(f"{path}: its name {path.stem!r} is no number, as --timestamps name needs")
         time = str(index) if options.timestamps == "index" else path.stem
-        pose = Pose(result.pose.R_cam_from_world, result.pose.center_world - offset)
+        pose = replace(result.best_pose, center_world=result.best_pose.center_world - offset)
         key = name if form.has_unique_names else str(index)
         posed[key] = PosedImage(name, path, time, pose, size, result)
     return list(posed.values())

@@ -1,0 +1,51 @@
+"""The panoramas of a batch: pictures, folders of pictures, lists, and names that come on standard input."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TextIO
+
+from ..errors import InputError
+from ..panorama.cube_files import SUFFIXES, is_cube
+from ..runtime.json_file import read_text
+
+STDIN = "-"
+WANTED_LIST = "wanted a text file, a panorama's path on each line"
+
+
+def is_stream(words: Sequence[str]) -> bool:
+    """True if names come on standard input, so that nobody knows how many."""
+    return STDIN in words
+
+
+def panoramas_of(words: Iterable[str], stdin: TextIO) -> Iterator[Path]:
+    """The panoramas that words name, in order: a picture, a folder, `@list.txt`, or `-` for lines of `stdin`.
+
+    A folder is one panorama if it holds the six faces of a cube, else all pictures in it and in its folders,
+    sorted by path.
+
+    Raises
+    ------
+    InputError
+        A list can't be read, or a folder holds no picture.
+    """
+    for word in words:
+        if word == STDIN:
+            yield from (Path(line.rstrip("\r\n")) for line in stdin if line.strip())
+        elif word.startswith("@"):
+            lines = read_text(Path(word[1:]), WANTED_LIST).splitlines()
+            yield from (Path(line) for line in lines if line.strip())
+        else:
+            yield from _at(Path(word))
+
+
+def _at(path: Path) -> Iterator[Path]:
+    if not path.is_dir() or is_cube(path):
+        yield path
+        return
+    folders = [path, *(folder for folder in path.rglob("*") if folder.is_dir())]
+    cubes = [folder for folder in folders if is_cube(folder)]
+    files = (file for folder in folders if folder not in cubes for file in folder.iterdir())
+    pictures = [file for file in files if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")]
+    if not pictures and not cubes:
+        raise InputError(f"{path}: a folder without a JPEG, PNG, TIFF or WebP picture")
+    yield from sorted([*pictures, *cubes])

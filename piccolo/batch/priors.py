@@ -1,0 +1,113 @@
+"""What is known of each camera beforehand, from a table."""
+
+import csv
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from ..coarse_to_fine.settings import Prior
+from ..errors import InputError
+from ..runtime.json_file import read_text
+
+COLUMNS = ("x", "y", "z", "radius", "heading", "tolerance", "height")
+WANTED = f"wanted a CSV file whose first line names its columns: name and any of {', '.join(COLUMNS)}"
+DEFAULT_RADIUS = 5.0  # [m]
+HEIGHT_TOLERANCE = 0.3  # [m] either side of a height
+
+
+@dataclass(frozen=True)
+class PriorTable:
+    """A prior for each panorama named, in place of what it says of the one that all have."""
+
+    path: Path
+    by_name: Mapping[str, Mapping[str, float]]
+    used: set[str] = field(default_factory=set)
+
+    def prior_of(self, pano: Path, general: Prior) -> Prior:
+        """The prior of a panorama, found by its path as given, or else by its file name."""
+        name = next((name for name in (str(pano), pano.name) if name in self.by_name), None)
+        if name is None:
+            return general
+        self.used.add(name)
+        return _prior_from(self.by_name[name], general)
+
+    @property
+    def unused(self) -> list[str]:
+        """Names that no panorama has had."""
+        return [name for name in self.by_name if name not in self.used]
+
+
+def _prior_from(row: Mapping[str, float], general: Prior) -> Prior:
+    prior = general
+    if "x" in row:
+        radius = row.get("radius", general.radius or DEFAULT_RADIUS)
+        prior = replace(prior, near_world=(row["x"], row["y"], row.get("z")), radius=radius)
+    if "height" in row:
+        low, high = row["height"] - HEIGHT_TOLERANCE, row["height"] + HEIGHT_TOLERANCE
+        prior = replace(prior, height=(low, high))
+    if "heading" in row:
+        tolerance = row.get("tolerance", general.heading_tolerance_deg)
+        prior = replace(prior, heading_deg=row["heading"], heading_tolerance_deg=tolerance)
+    return prior
+
+
+def read_priors(path: Path, general: Prior) -> PriorTable:
+    """The priors in a CSV file; cells may be empty, `general` fills what they leave open.
+
+    Columns: name (the panorama's path as given, or its file name), x, y, z [m] in the scan's frame (without z
+    in any height), radius [m] about them, heading [deg] of the image centre clockwise from +y, its tolerance
+    [deg], height [m] above the floor.
+
+    Raises
+    ------
+    InputError
+        The file can't be read, a cell is no number, or a row contradicts itself.
+    """
+    rows = csv.DictReader(read_text(path, WANTED).splitlines(), restkey="more")
+    names = [name.strip() for name in rows.fieldnames or ()]
+    rows.fieldnames = names
+    if (
+        "name" not in names
+        or (odd := sorted(set(names) - {"name", *COLUMNS}))
+        or len(set(names)) < len(names)
+    ):
+        found = f"found a column {odd[0]!r}" if "name" in names and odd else f"found the columns {names}"
+        raise InputError(f"{path}: {found}, {WANTED}")
+    by_name: dict[str, Mapping[str, float]] = {}
+    for row in rows:
+        where = f"{path}, line {rows.line_num}"
+        name = (row.pop("name") or "").strip()
+        if not name or name in by_name or "more" in row:
+            wrong = (
+                "more cells than columns"
+                if "more" in row
+                else f"the name {name!r} twice"
+                if name
+                else "no name"
+            )
+            raise InputError(f"{where}: found {wrong}")
+        by_name[name] = _numbers(where, row)
+        try:
+            _prior_from(by_name[name], general)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from error
+    return PriorTable(path, by_name)
+
+
+def _numbers(where: str, row: Mapping[str, str | None]) -> dict[str, float]:
+    """The cells that are not empty, as finite numbers."""
+    numbers = {}
+    for column, text in row.items():
+        if text is None or not text.strip():
+            continue
+        try:
+            numbers[column] = float(text)
+        except ValueError as error:
+            raise InputError(f"{where}: found {column} {text.strip()!r}, wanted a number") from error
+        if not math.isfinite(numbers[column]):
+            raise InputError(f"{where}: found {column} {text.strip()}, wanted a finite number")
+    for column, other in (("x", "y"), ("y", "x"), ("z", "x"), ("radius", "x"), ("tolerance", "heading")):
+        if column in numbers and other not in numbers:
+            raise InputError(f"{where}: found {column} without {other}")
+    return numbers

@@ -1,0 +1,95 @@
+"""What a photo's file says of itself beside its pixels: a digest, its size, when and where it was taken."""
+
+import hashlib
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL.ExifTags import GPS, IFD, Base
+
+from .cube_files import face_paths
+from .picture import file_bytes, opened
+
+TIME = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)")
+OFFSET = re.compile(r"[+-]\d\d:\d\d")
+DEGREE_PARTS = 1.0, 60.0, 3600.0  # degrees, minutes, seconds
+
+
+class GpsPosition(NamedTuple):
+    """Where a receiver in the camera was, on the WGS 84 ellipsoid."""
+
+    latitude_deg: float
+    longitude_deg: float
+    accuracy: float | None  # [m] horizontal, None if the file does not say
+
+
+class Photo(NamedTuple):
+    """A photo's file without its pixels."""
+
+    sha256: str  # of the file; of cube faces, of their digests in the order of FACE_LETTERS, one a line
+    image_size: tuple[int, int]  # width and height [px], as stored; of a cube one face
+    capture_time: str | None  # ISO 8601, with the offset from UTC if the file has it
+    gps: GpsPosition | None
+
+
+def photo_of(path: Path) -> Photo:
+    """What a photo's file, or the first of a folder of cube faces, says of itself.
+
+    Raises
+    ------
+    InputError
+        The file is missing or no picture. Metadata that are damaged count as missing.
+    """
+    files = list(face_paths(path).values()) if path.is_dir() else [path]
+    contents = [file_bytes(file) for file in files]
+    digests = [hashlib.sha256(content).hexdigest() for content in contents]
+    sha256 = digests[0] if len(files) == 1 else hashlib.sha256("\n".join(digests).encode()).hexdigest()
+    with opened(files[0], contents[0]) as image:
+        exif: Mapping[int, Any]
+        try:
+            own = image.getexif()
+            exif, gps = own.get_ifd(IFD.Exif), own.get_ifd(IFD.GPSInfo)
+        except Exception:  # Pillow raises whatever damaged metadata bring
+            exif, gps = {}, {}
+        return Photo(sha256, image.size, _capture_time(exif), _gps_position(gps))
+
+
+def photo_of_array(rgb: NDArray[np.uint8]) -> Photo:
+    """The same of pixels (H, W, 3): their digest and size."""
+    height, width = rgb.shape[:2]
+    return Photo(hashlib.sha256(np.ascontiguousarray(rgb)).hexdigest(), (width, height), None, None)
+
+
+def _capture_time(exif: Mapping[int, Any]) -> str | None:
+    """When the picture was taken, by the camera's clock."""
+    found = TIME.fullmatch(str(exif.get(Base.DateTimeOriginal, "")).strip("\0 "))
+    if not found:
+        return None
+    year, month, day, clock = found.groups()
+    digits = re.sub(r"\D", "", str(exif.get(Base.SubsecTimeOriginal, "")))[:6]
+    offset = OFFSET.fullmatch(str(exif.get(Base.OffsetTimeOriginal, "")).strip("\0 "))
+    return f"{year}-{month}-{day}T{clock}" + (f".{digits}" if digits else "") + (offset[0] if offset else "")
+
+
+def _gps_position(gps: Mapping[int, Any]) -> GpsPosition | None:
+    """Where the picture was taken; None if the file does not say, or says what can't be."""
+    try:
+        latitude = _degrees(gps[GPS.GPSLatitude], gps[GPS.GPSLatitudeRef], "NS")
+        longitude = _degrees(gps[GPS.GPSLongitude], gps[GPS.GPSLongitudeRef], "EW")
+        accuracy = float(gps.get(GPS.GPSHPositioningError, math.nan))
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        return None
+    is_possible = abs(latitude) <= 90.0 and abs(longitude) <= 180.0 and (latitude, longitude) != (0.0, 0.0)
+    if not is_possible:
+        return None
+    return GpsPosition(latitude, longitude, accuracy if 0.0 < accuracy < math.inf else None)
+
+
+def _degrees(parts: Any, reference: str, letters: str) -> float:
+    """Degrees from degrees, minutes and seconds, positive for the first letter."""
+    sign = {letters[0]: 1.0, letters[1]: -1.0}[str(reference).strip("\0 ").upper()]
+    return sign * sum(float(part) / unit for part, unit in zip(parts, DEGREE_PARTS, strict=False))

@@ -1,0 +1,28 @@
+"""Every result that a test makes is checked by the schema that users have."""
+
+import json
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+from piccolo.result import Result
+
+SCHEMA = json.loads((Path(__file__).resolve().parents[1] / "docs" / "result.schema.json").read_text())
+VALIDATOR = jsonschema.Draft202012Validator(SCHEMA)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _checked_results():
+    """Result.to_json as ever, but for a text that the schema does not know."""
+    to_json = Result.to_json
+
+    def checked(result):
+        text = to_json(result)
+        VALIDATOR.validate(json.loads(text))
+        return text
+
+    patch = pytest.MonkeyPatch()
+    patch.setattr(Result, "to_json", checked)
+    yield
+    patch.undo()
