@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cloud import open_cloud
+from .cloud.digest import sha256_of_files
 from .cloud.settings import METRES, CloudSettings, UpAxis
 from .cloud.soa import PackedPoints
 from .cloud.stream import ARRAYS, CloudStream, stream_of_arrays
@@ -278,6 +279,7 @@ def open_files(
         raise InputError(f"{map_path}: a prepared map; the preset paper needs the cloud itself")
     with watch.stage("read"):
         cloud = open_cloud(paths, cloud_settings, workers.show)
+        cloud = replace(cloud, sha256=sha256_of_files(paths))
     return scan_of(cloud, name, cloud_settings, settings, workers, watch)
 
 
@@ -300,4 +302,5 @@ def scan_of(
             workers.warn(warning)
         with watch.stage("prepare"):
             prepared = prepare_by_paper(points, settings)
+    prepared = replace(prepared, scan_sha256=cloud.sha256)
     return Scan(prepared, name, cloud_settings, settings, workers, watch.seconds)

@@ -157,3 +157,14 @@ def splat(discs, rgb, width, min_radius_px, max_slope, band, band_offset):
     total = np.maximum(weight.sum(axis=-1), 1e-12)
     depth = np.where(weight.sum(axis=-1) > 0, (weight * t).sum(axis=-1) / total, np.inf)
     return depth, weight @ rgb / total[..., None]
+
+
+def misplaced(nodes, first_child, level_start, origin, leaf_size):
+    """Whether each node of an octree lies in another voxel of the grid than its parent, by whole numbers."""
+    parent = np.repeat(np.arange(len(nodes)), np.diff(first_child))
+    children = np.arange(level_start[1], len(nodes))
+    level = np.searchsorted(level_start, parent, side="right") - 1
+    size = leaf_size * 2.0 ** (len(level_start) - 2 - level)[:, None]
+    places = (np.array([nodes[children, :3], nodes[parent, :3]]) + origin) / size
+    is_near_border = np.abs(places - np.rint(places)).max(axis=0) < 1e-3
+    return ((np.floor(places[0]) != np.floor(places[1])) & ~is_near_border).any(axis=1)

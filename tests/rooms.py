@@ -1,6 +1,7 @@
 """Seeded synthetic rooms, small and quick, kept for all tests of a run."""
 
 import functools
+from dataclasses import replace
 
 import numpy as np
 
@@ -33,7 +34,7 @@ def room(seed):
 @functools.lru_cache
 def scan_map(seed):
     """The prepared map of a room."""
-    return prepare_map(room(seed)[1], Workers(2))
+    return replace(prepare_map(room(seed)[1], Workers(2)), scan_sha256=64 * "0")
 
 
 @functools.lru_cache

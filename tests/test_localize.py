@@ -72,7 +72,7 @@ def test_map_is_cached_prepared_and_read_back_to_the_same_bits(scene, tmp_path, 
     assert "prepare" in poses[0].seconds
     assert "prepare" not in poses[1].seconds
     assert len({json.dumps(p.pose.center_world.tolist()) for p in poses}) == 1
-    (cached,) = cache.iterdir()
+    (cached,) = cache.glob("piccolo-maps/*.piccolo-map")
     damaged = bytearray(cached.read_bytes())
     damaged[len(damaged) // 2] ^= 1
     cached.write_bytes(damaged)

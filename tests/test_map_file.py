@@ -1,50 +1,198 @@
-"""Prepared maps on disk."""
+"""Prepared maps on disk: read back to the same bits, and nothing believed that a map can't be."""
 
 import dataclasses
+import struct
+import zipfile
 
+import naive
 import numpy as np
 import pytest
+from refusals import read_or_refused
 from rooms import scan_map
 
 from piccolo.cloud.settings import CloudSettings
+from piccolo.cloud.voxels import LEAF_SIZE, PHASE, QUANTA_PER_METRE
 from piccolo.coarse_to_fine import map_file, open_map
 from piccolo.coarse_to_fine.map_file import is_map_file, load_map, save_map
+from piccolo.coarse_to_fine.map_validation import first_misplaced
 from piccolo.coarse_to_fine.open_map import content_key
 from piccolo.errors import InputError
 
 
-def test_round_trip_and_a_file_cut_short(tmp_path):
-    save_map(scan_map(1), tmp_path / "a.map")
-    back = load_map(tmp_path / "a.map")
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    path = tmp_path_factory.mktemp("map") / "a.map"
+    save_map(scan_map(1), path)
+    return path
+
+
+@pytest.fixture
+def arrays(built):
+    with np.load(built) as archive:
+        return dict(archive)
+
+
+def _save(path, arrays, save=np.savez):
+    """Write arrays as they are, with right checksums."""
+    with path.open("wb") as file:
+        save(file, **arrays)
+
+
+def test_round_trip_and_a_file_cut_short(built, tmp_path):
+    back = load_map(built)
     for field in dataclasses.fields(back):
-        if field.name not in ("octree", "warnings"):
+        if field.name != "octree":
             np.testing.assert_array_equal(getattr(back, field.name), getattr(scan_map(1), field.name))
+    assert isinstance(back.scan_sha256, str)
+    assert back.has_labels is False
     np.testing.assert_array_equal(back.octree.nodes, scan_map(1).octree.nodes)
-    (tmp_path / "b.map").write_bytes((tmp_path / "a.map").read_bytes()[:-1000])
+    (tmp_path / "b.map").write_bytes(built.read_bytes()[:-1000])
     with pytest.raises(InputError, match=r"b\.map: "):
         load_map(tmp_path / "b.map")
 
 
-def test_a_file_outlives_other_sources_but_the_cache_does_not(tmp_path, monkeypatch):
+def test_a_file_outlives_other_sources_but_the_cache_does_not(built, monkeypatch):
     """Its format alone says whether a file can be read; the cache also goes by what made it."""
-    cloud, built = tmp_path / "a.ply", tmp_path / "a.map"
-    cloud.write_bytes(b"points")
-    save_map(scan_map(1), built)
-    key = content_key([cloud], CloudSettings())
-    assert content_key([cloud], CloudSettings()) == key != content_key([cloud], CloudSettings(scale=0.1))
+    key = content_key("00", CloudSettings())
+    assert content_key("00", CloudSettings()) == key != content_key("00", CloudSettings(scale=0.1))
     monkeypatch.setattr(open_map, "sources_digest", lambda: "of other sources")
-    assert content_key([cloud], CloudSettings()) != key
+    assert content_key("00", CloudSettings()) != key
     assert len(load_map(built).centers) == len(scan_map(1).centers)
 
 
 def test_another_format_is_refused_in_one_clear_line(tmp_path, monkeypatch):
-    built = tmp_path / "a.map"
+    path = tmp_path / "a.map"
     with monkeypatch.context() as patched:
         patched.setattr(map_file, "FORMAT", "piccolo-map/1")
-        save_map(scan_map(1), built)
-    assert is_map_file(built)
+        save_map(scan_map(1), path)
+    assert is_map_file(path)
     with pytest.raises(InputError) as refused:
-        load_map(built)
+        load_map(path)
     assert str(refused.value) == (
-        f"{built}: a map of format piccolo-map/1, but this version reads {map_file.FORMAT}; prepare it again"
+        f"{path}: a map of format 'piccolo-map/1', but this version reads {map_file.FORMAT}; prepare it again"
     )
+
+
+def _changed(index, value):
+    """A function that puts a value into an array."""
+
+    def change(array):
+        array[index] = value
+        return array
+
+    return change
+
+
+TILT = np.array([[1.0, 0.0, 0.0], [0.0, 0.8, -0.6], [0.0, 0.6, 0.8]])
+DAMAGE = {  # member, what is done to it, the words of the refusal
+    "no rotation": ("R_map_from_world", lambda a: a * 1.001, "R_map_from_world of the map is no rotation"),
+    "another": ("R_map_from_world", lambda a: TILT, "octree whose node|origin_world"),
+    "mirror": ("R_map_from_world", lambda a: a * [[1.0], [1.0], [-1.0]], "is no rotation"),
+    "no number": ("R_map_from_world", _changed((1, 1), np.nan), "is no rotation"),
+    "nowhere": ("origin_world", _changed(0, np.inf), "an origin_world of"),
+    "off metres": ("origin_world", lambda a: a + 0.25, "an origin_world of"),
+    "a metre off": ("origin_world", lambda a: a + np.eye(3)[0], "an octree whose node"),
+    "float32": ("centers", lambda a: a.astype(np.float32), "centers of type float32 and shape"),
+    "a candidate less": ("offsets", lambda a: a[1:], "offsets of type int16 and shape"),
+    "a cell less": ("is_seen", lambda a: a[:, 1:], "is_seen of type bool and shape"),
+    "flat": ("features", lambda a: a.reshape(len(a), -1), "features of type int8 and shape"),
+    "nodes of five": ("octree_nodes", lambda a: a[:, :5].copy(), "octree_nodes of type float32 and shape"),
+    "a node more": ("octree_nodes", lambda a: np.concatenate([a, a[-1:]]), "levels that begin at"),
+    "a link less": ("octree_first_child", lambda a: a[:-1], "links of an octree"),
+    "cycle": ("octree_first_child", _changed(3, 0), "links of an octree"),
+    "behind the end": ("octree_first_child", _changed(-1, 2**31 - 1), "links of an octree"),
+    "before the start": ("octree_first_child", _changed(0, -(2**31)), "links of an octree"),
+    "empty level": ("octree_level_start", lambda a: np.sort(a[[0, 1, 1, *range(3, len(a))]]), "levels that"),
+    "level far away": ("octree_level_start", _changed(-2, 2**31 - 1), "levels that begin at"),
+    "no leaf": ("octree_leaf_size", lambda a: np.array(0.0), "leaves of 0.0 m"),
+    "other leaves": ("octree_leaf_size", lambda a: a * 2.0, "an octree whose node"),
+    "leaf of no number": ("octree_leaf_size", lambda a: np.array(np.nan), "leaves of nan m"),
+    "no place": ("octree_nodes", _changed((-1, 0), np.nan), "an octree whose node"),
+    "moved leaf": ("octree_nodes", _changed((-1, 2), 9.5), "an octree whose node"),
+    "far root": ("octree_nodes", _changed((0, 1), 1e30), "an octree whose node 0 is"),
+    "too bright": ("octree_nodes", _changed((7, 3), 1.1), "an octree whose node 7 is"),
+    "larger room": ("octree_nodes", lambda a: a * np.float32([1.1, 1.1, 1.1, 1, 1, 1]), "octree whose node"),
+    "candidate nowhere": ("centers", _changed((0, 1), np.nan), "a candidate at no finite place"),
+    "candidate far away": ("centers", _changed((0, 1), -1e6), "a candidate at no finite place"),
+    "no unit": ("offset_unit", _changed(0, 0.0), "an offset_unit of 0.0 to"),
+    "unit of no number": ("offset_unit", _changed(-1, np.nan), "an offset_unit of"),
+    "large unit": ("offset_unit", _changed(-1, 1e3), "an offset_unit of"),
+    "neither": ("is_seen", lambda a: (a * np.uint8(2)).view(np.bool_), "neither true nor false"),
+    "too low": ("features", _changed((0, 0, 0), -128), "features below -127"),
+    "too low on wide cells": ("wide_features", _changed((0, 0), -128), "wide_features below -127"),
+    "index too large": ("sparse", _changed(0, 10**9), "sparse candidates that are not"),
+    "index below zero": ("sparse", _changed(0, -1), "sparse candidates that are not"),
+    "twice": ("sparse", _changed(0, 1), "sparse candidates that are not"),
+    "no digest": ("scan_sha256", lambda a: np.array("G" * 64), "a scan_sha256 that is no digest"),
+    "short digest": ("scan_sha256", lambda a: np.array("0"), "scan_sha256 of type <U1"),
+    "numbers": ("warnings", lambda a: np.arange(3), "warnings of type int64"),
+    "objects": ("warnings", lambda a: np.array([{}], dtype=object), "wanted a whole map"),
+    "columns": ("octree_nodes", np.asfortranarray, "octree_nodes.npy of .* which promises"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_what_no_map_can_be_is_refused(arrays, tmp_path, damage):
+    member, change, words = DAMAGE[damage]
+    arrays[member] = change(arrays[member].copy())
+    path = tmp_path / "a.map"
+    _save(path, arrays)
+    with pytest.raises(InputError, match=words) as refused:
+        load_map(path)
+    assert str(refused.value).startswith(f"{path}: ")
+    assert "\n" not in str(refused.value)
+
+
+def test_members_are_those_of_a_map_and_not_compressed(arrays, tmp_path):
+    path = tmp_path / "a.map"
+    _save(path, arrays, np.savez_compressed)
+    with pytest.raises(InputError, match=r"damaged .'arrays of \d+ bytes'"):
+        load_map(path)
+    path.write_bytes(bytes(10**7) + path.read_bytes())  # what comes before an archive is no part of it
+    with pytest.raises(InputError, match=r"format.npy in another way than NumPy's savez has it"):
+        load_map(path)
+    _save(path, {**arrays, "more": np.zeros(3)})
+    with pytest.raises(InputError, match=r"damaged .*'more'"):
+        load_map(path)
+    del arrays["sparse"]
+    _save(path, arrays)
+    with pytest.raises(InputError, match=r"damaged .*sparse"):
+        load_map(path)
+
+
+def test_no_more_is_read_than_the_file_holds(built, tmp_path):
+    """An array's header, or the archive's directory, promises more."""
+    path, content = tmp_path / "a.map", built.read_bytes()
+    shape = str(scan_map(1).offsets.shape).encode()
+    path.write_bytes(content.replace(shape, shape.replace(b"3", b"9")))
+    assert "which promises" in read_or_refused(load_map, path)[1]
+    with zipfile.ZipFile(built) as archive:
+        info = archive.getinfo("offsets.npy")
+    sizes = struct.pack("<II", info.file_size, info.file_size)
+    path.write_bytes(content.replace(sizes, struct.pack("<II", 2**32 - 2, 2**32 - 2)))
+    assert "damaged" in read_or_refused(load_map, path)[1]
+
+
+def test_warnings_are_lines_that_can_be_printed(arrays, tmp_path):
+    arrays["warnings"] = np.array(["two\nlines \x1b[31m", "x" * 9000] * 600)
+    _save(tmp_path / "a.map", arrays)
+    warnings = load_map(tmp_path / "a.map").warnings
+    assert warnings[0] == "two?lines ?[31m"
+    assert (len(warnings), max(map(len, warnings))) == (1000, 5000)
+
+
+def test_nodes_are_in_their_parents_voxels():
+    octree, rng = scan_map(1).octree, np.random.default_rng(3)
+    origin = scan_map(1).R_map_from_world @ scan_map(1).origin_world + PHASE / QUANTA_PER_METRE
+    args = octree.first_child, octree.level_start, origin, LEAF_SIZE
+    assert first_misplaced(octree.nodes, *args, 100.0) == -1
+    assert first_misplaced(octree.nodes, *args, 0.5) == 0
+    assert not naive.misplaced(octree.nodes, *args).any()
+    num_found = 0
+    for _ in range(40):
+        nodes, node = octree.nodes.copy(), rng.integers(octree.level_start[1], len(octree.nodes))
+        nodes[node, rng.integers(3)] += rng.choice([0.003, -0.03, 0.2])
+        misplaced = naive.misplaced(nodes, *args)
+        assert (first_misplaced(nodes, *args, 100.0) >= 0) == misplaced.any()
+        num_found += misplaced.any()
+    assert 10 < num_found < 40

@@ -1,10 +1,14 @@
 """The API: what options mean, and what is refused. docs/API.md and examples/ are run by test_examples.py."""
 
+import hashlib
+
 import numpy as np
 import pytest
 import rooms
 
 import piccolo
+from piccolo.cloud.digest import sha256_of_arrays
+from piccolo.paper.settings import PaperSettings
 
 
 @pytest.fixture(scope="module")
@@ -47,3 +51,17 @@ def test_a_mask_is_left_out_and_settings_are_repeated(scan):
     assert result.settings["gravity"] == "known"
     assert result.settings["prior"]["heading_tolerance_deg"] == 30.0
     assert len(repr(scan)) < 1000
+
+
+def test_a_scan_is_known_by_its_bytes(tmp_path, scan):
+    """A file's digest is that of sha256sum; of arrays it changes with type and shape."""
+    cloud, path = rooms.room(1)[1], tmp_path / "a.txt"
+    np.savetxt(path, np.hstack([cloud.points[::50], cloud.colors[::50]]), fmt="%.3f")
+    expected = hashlib.sha256(path.read_bytes()).hexdigest()
+    paper = piccolo.open_scan(path, settings=PaperSettings())
+    assert [piccolo.open_scan(path, cache=False).prepared.scan_sha256, paper.prepared.scan_sha256] == [
+        expected
+    ] * 2
+    digest = scan.prepared.scan_sha256
+    assert digest == sha256_of_arrays(cloud.points + cloud.origin_world, cloud.colors)
+    assert len({digest, sha256_of_arrays(cloud.points), sha256_of_arrays(cloud.points.T.copy())}) == 3

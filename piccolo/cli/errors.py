@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from ..errors import InputError
 from .parser import as_started, parse
+from .progress import log_shown
 
 EXIT_BAD_USAGE, EXIT_BAD_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_BROKEN_PIPE = 2, 3, 4, 130, 141
 
@@ -34,7 +35,8 @@ def run_command(
     """The exit code of `run` with the options given, or of the error that ended it, which is printed."""
     arguments = parse(parser, argv)
     try:
-        code = run(arguments)
+        with log_shown(arguments.quiet):
+            code = run(arguments)
         sys.stdout.flush()  # here, where a closed pipe is caught
         return code
     except BrokenPipeError:  # the reader of stdout has gone: say nothing, not even at the flush at exit

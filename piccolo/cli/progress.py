@@ -1,7 +1,9 @@
 """Progress bars on stderr, which vanish when they are full, and warnings."""
 
+import logging
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from tqdm import tqdm
@@ -30,3 +32,26 @@ def warn_once(is_quiet: bool) -> Callable[[str], None]:
             tqdm.write(f"warning: {warning}", file=sys.stderr)
 
     return warn
+
+
+class WarningHandler(logging.Handler):
+    """Hands the text of what is logged to a function."""
+
+    def __init__(self, warn: Callable[[str], None]) -> None:
+        super().__init__(logging.WARNING)
+        self.warn = warn
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Hand one over."""
+        self.warn(record.getMessage())
+
+
+@contextmanager
+def log_shown(is_quiet: bool) -> Iterator[None]:
+    """Within this, what the package logs is printed as warnings, each once, or not at all."""
+    log, handler = logging.getLogger("piccolo"), WarningHandler(warn_once(is_quiet))
+    log.addHandler(handler)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)

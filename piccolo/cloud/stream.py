@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..geometry.point_transforms import rotate_points
 from ..runtime.threads import Progress, no_progress
+from .digest import sha256_of_arrays
 from .model import Cloud
 from .morton import morton_order
 from .readers.colors import brightest_of, colored_chunks
@@ -34,6 +35,7 @@ class CloudStream:
     sources: Sequence[PointSource]  # in an order of their own: the user's changes nothing
     scale: float = 1.0  # metres per unit of the files
     show: Progress = no_progress  # progress
+    sha256: str = ""  # of what is read, if that is known
 
     @property
     def label(self) -> str:
@@ -94,4 +96,4 @@ def stream_of_arrays(points: NDArray[np.floating[Any]], colors: NDArray[Any] | N
         raise InputError(f"points, colors: found shapes {shapes}, wanted two arrays of shape (N, 3)")
     brightest = brightest_of(ARRAYS, [f"{colors.dtype.kind}{colors.dtype.itemsize}"])
     chunks = colored_chunks([(points, colors)], brightest, lambda row: f"{ARRAYS}, row {row}")
-    return stream_of(ARRAYS, next(iter(chunks)))
+    return replace(stream_of(ARRAYS, next(iter(chunks))), sha256=sha256_of_arrays(points, colors))

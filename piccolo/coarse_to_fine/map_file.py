@@ -1,23 +1,33 @@
 """A prepared map on disk: a NumPy archive, and the cache of such files.
 
-A file of another format, or damaged in any byte (each member of an archive has a checksum), is never trusted.
+A file of another format, or damaged in any byte (each member of an archive has a checksum), is never trusted;
+`map_validation.py` checks what is whole.
 FORMAT changes with what the arrays mean, so that a file outlives an update; the cache also knows the sources
 by which a map was made, and makes it anew when they have changed.
 """
 
+import math
 import zipfile
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
+from warnings import catch_warnings, simplefilter
 
 import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
 
 from ..cloud.octree import Octree
+from ..cloud.readers.npz import damage_named
 from ..errors import InputError
 from ..runtime.atomic import replacing
+from .map_validation import LAYOUT, check_arrays, clean_warnings
 from .scan_map import ScanMap
 
-FORMAT = "piccolo-map/2"
+FORMAT = "piccolo-map/3"
 ARRAYS = [f.name for f in fields(ScanMap) if f.name not in ("octree", "warnings")]
+MEMBERS = {*LAYOUT, "format", "warnings"}
+WANTED = "wanted a whole map by tools/prepare_map.py"
 ZIP_MAGIC = b"PK\x03\x04"
 # The first member of a map: its name and where that stands, and the beginning of its value somewhere behind.
 FIRST_NAME, FIRST_NAME_AT = b"format.npy", 30
@@ -50,24 +60,43 @@ def is_map_file(path: Path) -> bool:
 
 
 def load_map(path: Path) -> ScanMap:
-    """Read what `save_map` wrote; InputError for anything else."""
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            members = {name: archive[name] for name in archive.files}
-        if str(members["format"]) != FORMAT:
-            found = members["format"]
-            raise InputError(
-                f"{path}: a map of format {found}, but this version reads {FORMAT}; prepare it again"
-            )
-        octree = Octree(
-            nodes=members["octree_nodes"],
-            first_child=members["octree_first_child"],
-            level_start=members["octree_level_start"],
-            leaf_size=float(members["octree_leaf_size"]),
-        )
-        warnings = tuple(str(line) for line in members["warnings"])
-        return ScanMap(octree=octree, warnings=warnings, **{name: members[name] for name in ARRAYS})
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: found {error}, wanted a whole map by tools/prepare_map.py") from error
+    """Read what `save_map` wrote; InputError for anything else, before more is read than the file holds."""
+    with damage_named(path, WANTED), path.open("rb") as file, zipfile.ZipFile(file) as archive:
+        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+        size = sum(info.file_size for info in archive.infolist())
+        if size > path.stat().st_size:
+            raise ValueError(f"arrays of {size} bytes")
+        if "format" in members and (found := str(_read(archive, members["format"]))) != FORMAT:
+            text = f"a map of format {found[:40]!r}, but this version reads {FORMAT}; prepare it again"
+            raise InputError(f"{path}: {text}")
+        if set(members) != MEMBERS or len(archive.infolist()) != len(MEMBERS):
+            raise ValueError(f"not the arrays of a map: {sorted(MEMBERS ^ set(members))}")
+        arrays = {name: _read(archive, info) for name, info in members.items()}
+        warnings = clean_warnings(path, arrays["warnings"])
+    check_arrays(path, arrays)
+    return ScanMap(
+        octree=Octree(
+            nodes=arrays["octree_nodes"],
+            first_child=arrays["octree_first_child"],
+            level_start=arrays["octree_level_start"],
+            leaf_size=float(arrays["octree_leaf_size"]),
+        ),
+        has_labels=bool(arrays["has_labels"]),
+        warnings=warnings,
+        scan_sha256=str(arrays["scan_sha256"]),
+        **{name: arrays[name] for name in ARRAYS if name not in ("has_labels", "scan_sha256")},
+    )
+
+
+def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
+    """The array in a member as `np.savez` writes it: not compressed, and as long as its header says."""
+    with archive.open(info) as member, catch_warnings():
+        simplefilter("error")  # NumPy warns of headers that it had to mend
+        if info.compress_type != zipfile.ZIP_STORED or npy.read_magic(member) != (1, 0):
+            raise ValueError(f"{info.filename} in another way than NumPy's savez has it")
+        shape, is_fortran, dtype = npy.read_array_header_1_0(member)
+        promised, found = math.prod(shape) * dtype.itemsize, info.file_size - member.tell()
+        if is_fortran or dtype.hasobject or promised != found:
+            raise ValueError(f"{info.filename} of {found} bytes, which promises {dtype} of shape {shape}")
+        member.seek(0)
+        return np.asarray(npy.read_array(member, allow_pickle=False))

@@ -10,18 +10,21 @@ from pathlib import Path
 import numpy as np
 
 from ..cloud import open_cloud
+from ..cloud.digest import sha256_of_files
 from ..cloud.settings import IN_METRES, CloudSettings
 from ..cloud.soa import LocalCloud, pack_points
 from ..errors import InputError
 from ..geometry.point_transforms import rotate_points
 from ..gravity import R_z_from_axis
-from ..runtime.cache import cache_root, mark_used, remove_stale
+from ..runtime.cache import cache_root, in_words, mark_used, own_folder
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from .map_file import FORMAT, is_map_file, load_map, save_map
 from .scan_map import ScanMap, prepare_map
 
-NAME = re.compile(r"[0-9a-f]{32}\.piccolo-map")  # of a file in the cache
+# of a file in the cache, and of one that was being written when its process was killed
+NAME = re.compile(r"[0-9a-f]{32}\.piccolo-map|\.[0-9a-f]{32}\.piccolo-map\.\w{8}")
+FOLDER = "piccolo-maps"  # within the folder that the user names
 # What makes a map: folders of the package. The cache makes maps anew when one of their files has changed.
 MAKERS = ("cloud", "coarse_to_fine", "geometry", "gravity", "panorama")
 
@@ -56,17 +59,25 @@ def open_map(
             raise InputError(f"{map_path}: found a prepared map of {kind}")
         return scan_map
 
+    digest = ""
+    if all(path.is_file() for path in paths):  # what is none is refused when it is opened
+        with watch.stage("read"):
+            digest = sha256_of_files(paths)
+
     def build() -> ScanMap:
         with watch.stage("read"):
             cloud = open_cloud(paths, cloud_settings, workers.show)
         scan_map = prepare_map(cloud, workers, cloud_settings.up, watch)
-        return replace(scan_map, has_labels=cloud_settings.labels is not None)
+        return replace(scan_map, has_labels=cloud_settings.labels is not None, scan_sha256=digest)
 
-    if not (cache.is_used and all(path.is_file() for path in paths)):
+    if not (cache.is_used and digest):
         return build()
-    with watch.stage("read"):
-        key = content_key(paths, cloud_settings)
-    return cached_map(cache.folder, key, build, watch)
+    key = content_key(digest, cloud_settings)
+    scan_map, warning = cached_map(cache.folder, key, digest, build, watch)
+    if not warning:
+        return scan_map
+    workers.warn(warning)
+    return replace(scan_map, warnings=(*scan_map.warnings, warning))
 
 
 def prepared_map_among(paths: Sequence[Path]) -> Path | None:
@@ -74,10 +85,9 @@ def prepared_map_among(paths: Sequence[Path]) -> Path | None:
     return next((path for path in paths if path.is_file() and is_map_file(path)), None)
 
 
-def content_key(paths: Sequence[Path], settings: CloudSettings) -> str:
+def content_key(scan_sha256: str, settings: CloudSettings) -> str:
     """Name for the map of a cloud's files: by what is in them and the settings, wherever they lie."""
-    digests = sorted(_file_digest(path) for path in paths)
-    digest = hashlib.sha256(" ".join([FORMAT, sources_digest(), repr(settings), *digests]).encode())
+    digest = hashlib.sha256(" ".join([FORMAT, sources_digest(), repr(settings), scan_sha256]).encode())
     return digest.hexdigest()[:32]
 
 
@@ -91,33 +101,36 @@ def sources_digest() -> str:
     return digest.hexdigest()
 
 
-def _file_digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def cached_map(
+    folder: Path | None, key: str, scan_sha256: str, build: Callable[[], ScanMap], watch: Stopwatch
+) -> tuple[ScanMap, str]:
+    """The map named `key` of a cache within a folder, or built and put there; the user's cache if None.
 
-
-def cached_map(folder: Path | None, key: str, build: Callable[[], ScanMap], watch: Stopwatch) -> ScanMap:
-    """The map named `key` of a cache folder, or built and put there; the user's cache if `folder` is None.
-
-    Two processes may build one map at once: each writes its own file whole, the last stays, both are equal.
+    Second what went wrong with the cache, in one line: the map is then as good, only not kept. Two processes
+    may build one map at once: each writes its own file whole, the last stays, both are equal.
     """
-    folder = folder or cache_root() / "maps"
-    path = folder / f"{key}.piccolo-map"
-    if path.exists():
-        try:
+    warning = ""
+    try:
+        kept_in = own_folder(folder / FOLDER if folder else cache_root() / "maps", NAME)
+        path = kept_in / f"{key}.piccolo-map"
+        if path.exists():
             with watch.stage("read"):
                 scan_map = load_map(path)
-        except InputError:
-            path.unlink(missing_ok=True)
-        else:
-            mark_used(path)
-            return scan_map
+            if scan_map.scan_sha256 == scan_sha256:
+                mark_used(path)
+                return scan_map, ""
+            warning = f"{path}: found the map of another scan; it is made anew"
+    except InputError as error:
+        warning = f"{error}; it is made anew"
+    except OSError as error:
+        return build(), f"{in_words(error)}; the prepared map is not kept"
     scan_map = build()
-    with watch.stage("prepare"):
-        folder.mkdir(parents=True, exist_ok=True)
-        remove_stale(folder, NAME)
-        save_map(scan_map, path)
-    return scan_map
+    try:
+        with watch.stage("prepare"):
+            save_map(scan_map, path)
+    except OSError as error:
+        warning = f"{kept_in}: {error.strerror or error}; the prepared map is not kept"
+    return scan_map, warning
 
 
 def open_points(paths: Sequence[Path], settings: CloudSettings, workers: Workers) -> LocalCloud:

@@ -41,6 +41,7 @@ class ScanMap:
     wide_seen: NDArray[np.uint8]  # (sparse, wide cells) fraction seen of each, 255 for all
     has_labels: bool = False  # colours are those of labels
     warnings: tuple[str, ...] = ()
+    scan_sha256: str = ""  # of the files or arrays that it was made from, in hexadecimal digits
 
     @cached_property
     def points(self) -> PackedPoints:
@@ -85,6 +86,11 @@ def render_candidates(
 
     list(workers.map(run, range(0, len(centers), BLOCK), "render views"))
     return offsets, unit, levels, is_seen
+
+
+def sparse_candidates(centers: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Indices of the candidates (N, 3) [m] that come first in their cells of the coarse grid."""
+    return np.unique(np.floor(centers / COARSE_SPACING), axis=0, return_index=True)[1]
 
 
 def widen(
@@ -164,7 +170,7 @@ def prepare_map(
         octree = aligned.octree
         centers = candidate_centers(octree, workers)
         offsets, unit, levels, is_seen = render_candidates(octree, centers, view, workers)
-        _, sparse = np.unique(np.floor(centers / COARSE_SPACING), axis=0, return_index=True)
+        sparse = sparse_candidates(centers)
         wide_features, wide_seen = widen(levels, is_seen, sparse)
     return ScanMap(
         octree=octree,

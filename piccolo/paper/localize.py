@@ -33,6 +33,7 @@ class PaperMap:
     origin_world: NDArray[np.float64]  # (3,) [m]
     positions: NDArray[np.float64]  # (M, 3) starts in free space, relative to origin_world [m]
     warnings: tuple[str, ...] = ()
+    scan_sha256: str = ""  # of the files or arrays that it was made from, in hexadecimal digits
 
     def from_world(self, pose: Pose) -> Pose:
         """A pose of the world in the frame of the points."""

@@ -1,5 +1,10 @@
-"""The folder for what is kept between runs: compiled kernels and prepared maps."""
+"""The folders for what is kept between runs: compiled kernels and prepared maps.
 
+Nothing is deleted but files that have a name of ours, in a folder that this program has made and marked.
+"""
+
+import errno
+import logging
 import os
 import re
 import stat
@@ -9,47 +14,72 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
+from .atomic import write_atomically
+
 STALE_AFTER_S = 30 * 24 * 3600.0
-PRIVATE = 0o700
+PRIVATE, ALL = 0o700, 0o777
+WRITABLE, OPEN = 0o022, 0o077  # by others; in any way
+TAG = "CACHEDIR.TAG"  # https://bford.info/cachedir/: backups leave such folders out
+TAG_CONTENT = (
+    b"Signature: 8a477f597d28d172789f06886806bc55\n# Made by PICCOLO, which deletes its own old files.\n"
+)
+log = logging.getLogger("piccolo")
 
 
 @cache
 def cache_root() -> Path:
     """The folder for everything this program keeps between runs (XDG base directory specification), made now.
 
-    Where it can't be written, a folder of the user's own among the temporary files takes its place; what lies
-    there may hold code, so it belongs to nobody else and nobody else may write to it.
+    Where it can't be written, or others may write to it, a folder of the user's own among the temporary files
+    takes its place; what lies there may hold code. OSError where that can't be trusted either.
     """
-    home = os.environ.get("XDG_CACHE_HOME") or str(Path("~/.cache").expanduser())
-    root = Path(home) / "piccolo"
-    if _is_writable_folder(root):
-        return root
-    fallback = Path(tempfile.gettempdir()) / f"piccolo-{os.getuid()}"
-    return fallback if _is_private_folder(fallback) else Path(tempfile.mkdtemp(prefix="piccolo-"))
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111  # never raises
+    root, temporary = Path(home) / "piccolo", Path(tempfile.gettempdir())
+    with suppress(OSError):
+        if not root.is_absolute():
+            raise FileNotFoundError
+        if is_own(make_writable(root).stat(), WRITABLE):
+            return root
+        log.warning("%s: others may write to it, and nothing there is trusted; chmod go-w it", root)
+    fallback = temporary / f"piccolo-{os.getuid()}"
+    fallback.mkdir(PRIVATE, exist_ok=True)
+    # One look, at the entry itself: where only its owner may rename it, what is found stays true.
+    if not is_own(fallback.lstat(), OPEN) or temporary.stat().st_mode & (WRITABLE | stat.S_ISVTX) == WRITABLE:
+        raise PermissionError(errno.EACCES, "others may write to it", str(fallback))
+    return make_writable(fallback)
 
 
-def _is_writable_folder(folder: Path) -> bool:
-    """True if the folder is there, made if need be, and a file can be written into it."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return True
-    except OSError:
-        return False
+def make_writable(folder: Path) -> Path:
+    """The folder, made if need be, private then; OSError if no file can be written into it."""
+    folder.mkdir(PRIVATE, parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=folder):
+        return folder
 
 
-def _is_private_folder(folder: Path) -> bool:
-    """True if the folder, made if need be, is the user's own and closed to others; no link is followed."""
-    try:
-        folder.mkdir(mode=PRIVATE, exist_ok=True)
-        status = folder.lstat()
-    except OSError:
-        return False
-    return (
-        stat.S_ISDIR(status.st_mode)
-        and status.st_uid == os.getuid()
-        and stat.S_IMODE(status.st_mode) == PRIVATE
-    )
+def is_own(status: os.stat_result, forbidden: int) -> bool:
+    """True for the user's own folder without the `forbidden` permissions."""
+    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & forbidden
+
+
+def own_folder(folder: Path, name: re.Pattern[str], mode: int = ALL) -> Path:
+    """A folder for files of ours, made and marked if it is new; stale files of a marked one are deleted."""
+    folder.mkdir(mode, parents=True, exist_ok=True)
+    tag = folder / TAG
+    if not any(folder.iterdir()):
+        write_atomically(tag, TAG_CONTENT)
+    elif tag.is_file() and tag.read_bytes() == TAG_CONTENT:
+        remove_stale(folder, name)
+    return folder
+
+
+def remove_stale(folder: Path, name: re.Pattern[str]) -> None:
+    """Delete the files of a folder that have a name of ours and have not been used for a month."""
+    for entry in folder.iterdir():
+        with suppress(OSError):  # another process was faster, or the file is not ours to delete
+            status = entry.lstat()
+            is_old = time.time() - status.st_mtime > STALE_AFTER_S
+            if is_old and name.fullmatch(entry.name) and stat.S_ISREG(status.st_mode):
+                entry.unlink()
 
 
 def mark_used(path: Path) -> None:
@@ -58,12 +88,7 @@ def mark_used(path: Path) -> None:
         os.utime(path)
 
 
-def remove_stale(folder: Path, name: re.Pattern[str]) -> None:
-    """Delete the files of a folder that have a name of ours and have not been used for a month."""
-    for entry in folder.iterdir():
-        try:
-            is_old = time.time() - entry.stat().st_mtime > STALE_AFTER_S
-            if is_old and name.fullmatch(entry.name) and entry.is_file():
-                entry.unlink()
-        except FileNotFoundError:  # another process was faster
-            continue
+def in_words(error: OSError) -> str:
+    """Why a cache can't be used: the file, if it is known, and what the system says."""
+    place = f"{error.filename}: " if error.filename else ""
+    return f"{place}{error.strerror or error}"

@@ -17,20 +17,34 @@ import numba
 from numba.core import compiler, serialize
 
 from .atomic import write_atomically
-from .cache import cache_root, mark_used, remove_stale
+from .cache import PRIVATE, WRITABLE, cache_root, in_words, is_own, mark_used, own_folder
 
-NAME = re.compile(r"[0-9a-f]{32}\.kernel")
+NAME = re.compile(r"[0-9a-f]{32}\.kernel|\.[0-9a-f]{32}\.kernel\.\w{8}")  # and one that was being written
 DIGEST_SIZE = hashlib.sha256().digest_size
 log = logging.getLogger("piccolo")
 
 
 @cache
-def kernel_folder() -> Path:
-    """The folder of compiled kernels, made now; those of a month ago are deleted."""
-    folder = cache_root() / "kernels"
-    folder.mkdir(exist_ok=True)
-    remove_stale(folder, NAME)
-    return folder
+def kernel_folder() -> Path | None:
+    """The folder of compiled kernels, made now; None, after a warning, where there can be none.
+
+    Kernels are pickles, which run code: others must not be able to write there.
+    """
+    try:
+        folder = own_folder(cache_root() / "kernels", NAME, PRIVATE)
+        if is_own(folder.stat(), WRITABLE):
+            return folder
+        reason = f"{folder}: others may write to it; delete it"
+    except OSError as error:
+        reason = in_words(error)
+    warn_not_kept(reason)
+    return None
+
+
+@cache
+def warn_not_kept(reason: str) -> None:
+    """Warn once that the next run has to compile again."""
+    log.warning("%s; compiled code is not kept, and each run takes a minute more", reason)
 
 
 @cache
@@ -45,8 +59,28 @@ def sources_digest() -> str:
 
 
 def is_first_use() -> bool:
-    """True while no kernel has been compiled on this machine."""
-    return not any(NAME.fullmatch(entry.name) for entry in kernel_folder().iterdir())
+    """True while no kernel has been compiled on this machine, where any can be kept."""
+    folder = kernel_folder()
+    return folder is not None and not any(NAME.fullmatch(entry.name) for entry in folder.iterdir())
+
+
+def digest_of(name: str, payload: bytes) -> bytes:
+    """What stands before a payload in the file of this name: it tells damage, not malice."""
+    return hashlib.sha256(name.encode() + payload).digest()
+
+
+def read_whole(path: Path) -> bytes | None:
+    """The compiled code in a file, as written; None if there is none or (with a warning) if it is damaged."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    payload = content[DIGEST_SIZE:]
+    if digest_of(path.name, payload) != content[:DIGEST_SIZE]:
+        log.warning("%s: damaged compiled code; it is compiled anew", path)
+        return None
+    mark_used(path)
+    return payload
 
 
 class KernelCache:
@@ -58,35 +92,28 @@ class KernelCache:
         self.name = " ".join(f"{f.__module__}.{f.__qualname__}" for f in (function, *captured))
         self.cache_path = None  # Numba's `stats` shows it
 
-    def _file(self, signature: object, codegen: Any) -> Path:
+    def _file(self, signature: object, codegen: Any) -> Path | None:
         """The file for a signature on this machine's processor."""
         versions = numba.__version__, sys.version_info[:2], sys.byteorder, codegen.magic_tuple()
         key = repr((self.name, str(signature), versions, sources_digest()))
-        return kernel_folder() / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.kernel"
+        folder = kernel_folder()
+        return folder and folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.kernel"
 
     def load_overload(self, signature: object, target_context: Any) -> Any:
         """Read compiled code; None if there is none that can be trusted."""
         target_context.refresh()
         path = self._file(signature, target_context.codegen())
-        try:
-            content = path.read_bytes()
-        except OSError:
-            return None
-        payload = content[DIGEST_SIZE:]
-        if hashlib.sha256(payload).digest() != content[:DIGEST_SIZE]:
-            log.warning("%s: damaged compiled code; it is compiled anew", path)
-            return None
-        mark_used(path)
-        return compiler.CompileResult._rebuild(target_context, *pickle.loads(payload))
+        payload = path and read_whole(path)
+        return payload and compiler.CompileResult._rebuild(target_context, *pickle.loads(payload))
 
     def save_overload(self, signature: object, compiled: Any) -> None:
         """Write compiled code whole; where that can't be done it is compiled again by the next run."""
-        payload = serialize.dumps(compiled._reduce())
-        path = self._file(signature, compiled.codegen)
-        try:
-            write_atomically(path, hashlib.sha256(payload).digest() + payload)
-        except OSError as error:
-            log.warning("%s: compiled code can't be kept: %s", path.parent, error.strerror)
+        if path := self._file(signature, compiled.codegen):
+            payload = serialize.dumps(compiled._reduce())
+            try:
+                write_atomically(path, digest_of(path.name, payload) + payload)
+            except OSError as error:
+                warn_not_kept(f"{path.parent}: {error.strerror or error}")
 
     def flush(self) -> None:
         """Nothing is held in memory."""

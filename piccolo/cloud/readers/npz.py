@@ -54,7 +54,7 @@ class ArrayInFile:
             row = np.dtype((self.dtype, self.shape[1:]))
             yield from read_records(self.path, self.offset, self.shape[0], row)
             return
-        with _damage_named(self.path), _open(self.path, self.member) as file:
+        with damage_named(self.path), _open(self.path, self.member) as file:
             file.read(self.offset)  # not seek, so that the checksum covers all
             content = file.read(math.prod(self.shape) * self.dtype.itemsize)
             order: Literal["F", "C"] = "F" if self.is_fortran else "C"
@@ -98,7 +98,7 @@ def has_npz_magic(head: bytes) -> bool:
 
 
 @contextmanager
-def _damage_named(path: Path) -> Iterator[None]:
+def damage_named(path: Path, wanted: str = WANTED) -> Iterator[None]:
     """Turn what zipfile, zlib and NumPy's header parser raise on damaged files, 14 types, into one line."""
     try:
         yield
@@ -107,7 +107,7 @@ def _damage_named(path: Path) -> Iterator[None]:
     except Exception as error:
         if isinstance(error, OSError) and error.errno != errno.EINVAL:
             raise  # the disk's or the user's trouble; EINVAL is zipfile going to a place before the beginning
-        raise InputError(f"{path}: damaged ({quoted(str(error).encode())}), {WANTED}") from error
+        raise InputError(f"{path}: damaged ({quoted(str(error).encode())}), {wanted}") from error
 
 
 def _open(path: Path, member: str | None) -> IO[bytes]:
@@ -120,7 +120,7 @@ def _open(path: Path, member: str | None) -> IO[bytes]:
 
 def _members(path: Path) -> list[zipfile.ZipInfo]:
     """An archive's arrays of points and of colours."""
-    with _damage_named(path), zipfile.ZipFile(path) as archive:
+    with damage_named(path), zipfile.ZipFile(path) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
     names = [name for names in (POINTS_NAMES, COLORS_NAMES) for name in names if name in members]
     if [name in COLORS_NAMES for name in names] != [False, True]:
@@ -139,7 +139,7 @@ def _members(path: Path) -> list[zipfile.ZipInfo]:
 
 def _open_array(path: Path, member: str | None, size: int) -> ArrayInFile:
     """The array in a file or member of `size` bytes, by its header."""
-    with _damage_named(path), _open(path, member) as file, warnings.catch_warnings():
+    with damage_named(path), _open(path, member) as file, warnings.catch_warnings():
         warnings.simplefilter("error")  # NumPy warns of headers that it had to mend
         version = npy.read_magic(file)
         readers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}

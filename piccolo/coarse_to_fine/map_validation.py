@@ -1,0 +1,158 @@
+"""Whether the arrays of a map file are what `save_map` writes, before a search takes them.
+
+A map may come from anybody, and checksums are easily mended: every index that a kernel takes from a map is
+checked, every number bounded, and the octree compared with the grid that its voxels come from.
+"""
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cloud.octree import NUM_LEVELS
+from ..cloud.voxels import PHASE, QUANTUM_BITS, WINDOW
+from ..errors import InputError
+from ..geometry.pose import Array, checked_rotation
+from ..geometry.sphere_grid import make_grid
+from ..runtime.jit import F0, inline_kernel, kernel
+from .scan_map import SEARCH_VIEW, WIDE_RINGS, sparse_candidates
+
+Arrays = dict[str, NDArray[Any]]
+CELLS, WIDE_CELLS = len(make_grid(SEARCH_VIEW.num_rings)), len(make_grid(WIDE_RINGS))
+# Type and shape; an axis that has a name is as long as the others of that name.
+LAYOUT: dict[str, tuple[str, tuple[int | str, ...]]] = {
+    "octree_nodes": ("<f4", ("nodes", 6)),
+    "octree_first_child": ("<i4", ("links",)),
+    "octree_level_start": ("<i4", (NUM_LEVELS + 1,)),
+    "octree_leaf_size": ("<f8", ()),
+    "R_map_from_world": ("<f8", (3, 3)),
+    "origin_world": ("<f8", (3,)),
+    "centers": ("<f8", ("candidates", 3)),
+    "offsets": ("<i2", ("candidates", 3, CELLS)),
+    "offset_unit": ("<f4", ("candidates",)),
+    "features": ("|i1", ("candidates", 3, CELLS)),
+    "is_seen": ("|b1", ("candidates", CELLS)),
+    "sparse": ("<i8", ("sparse",)),
+    "wide_features": ("|i1", ("sparse", 3 * WIDE_CELLS)),
+    "wide_seen": ("|u1", ("sparse", WIDE_CELLS)),
+    "has_labels": ("|b1", ()),
+    "scan_sha256": ("<U64", ()),
+}
+SHA256 = re.compile("[0-9a-f]{64}")
+ROUNDING = 1e-9  # of a rotation
+LEAF_SIZES = 1e-3, 10.0  # [m] least and most
+FARTHEST_ORIGIN = 1e12  # [m]
+BRIGHTEST = np.float32(1.0 + 1e-6)
+LEAST_UNIT, MOST_OFFSET = 3e-8, 1e6  # [m] of the offsets; how far they reach
+MAX_WARNINGS, MAX_WARNING = 1000, 5000  # lines, and characters of a line
+
+
+@inline_kernel
+def is_in_range(node, reach):
+    """True if a node (6,) is not farther than `reach` from zero along any axis and its colour is one."""
+    x, y, z, r, g, b = node[0], node[1], node[2], node[3], node[4], node[5]
+    is_near = abs(x) <= reach and abs(y) <= reach and abs(z) <= reach
+    return is_near and F0 <= r <= BRIGHTEST and F0 <= g <= BRIGHTEST and F0 <= b <= BRIGHTEST
+
+
+@kernel
+def first_misplaced(nodes, first_child, level_start, origin, leaf_size, reach):
+    """The first node outside its parent's voxel, farther than `reach` [m], or of no colour; -1 if none is.
+
+    The links must be right. `origin` (3,) leads from a corner of all levels' grids to zero [m].
+    """
+    num_levels = len(level_start) - 1
+    for node in range(len(nodes)):
+        if not is_in_range(nodes[node], reach):
+            return node
+    for level in range(num_levels - 1):
+        size = leaf_size * 2.0 ** (num_levels - 1 - level)
+        for parent in range(level_start[level], level_start[level + 1]):
+            for k in range(3):
+                x = np.float64(nodes[parent, k])
+                low = math.floor((x + origin[k]) / size) * size - origin[k]
+                rounding = 1e-5 + 4e-7 * abs(x)  # float32
+                for child in range(first_child[parent], first_child[parent + 1]):
+                    if not (low - rounding <= nodes[child, k] <= low + size + rounding):
+                        return child
+    return -1
+
+
+def check_arrays(path: Path, arrays: Arrays) -> None:
+    """Refuse the arrays of a map file that `save_map` can't have written, all but its warnings."""
+    sizes: dict[str, int] = {}
+    for name, (dtype, shape) in LAYOUT.items():
+        found = arrays[name]
+        wanted = len(shape) == found.ndim and tuple(
+            sizes.setdefault(axis, length) if isinstance(axis, str) else axis
+            for axis, length in zip(shape, found.shape, strict=True)
+        )
+        if found.dtype.str != dtype or found.shape != wanted:
+            _refuse(path, f"{name} of type {found.dtype} and shape {found.shape}")
+    _check_frame(path, arrays)
+    _check_octree(path, arrays)
+    _check_views(path, arrays)
+    if not SHA256.fullmatch(str(arrays["scan_sha256"])):
+        _refuse(path, "a scan_sha256 that is no digest")
+
+
+def _refuse(path: Path, found: str) -> None:
+    raise InputError(f"{path}: found {found}, wanted a map by tools/prepare_map.py; prepare it again")
+
+
+def _check_frame(path: Path, arrays: Arrays) -> None:
+    """The rotation is one, and the origin lies at whole metres of the map's axes."""
+    R = checked_rotation(arrays["R_map_from_world"], ROUNDING, f"{path}: R_map_from_world of the map")
+    origin: Array = arrays["origin_world"]
+    if not (np.abs(origin).max() < FARTHEST_ORIGIN and np.abs(R @ origin - np.rint(R @ origin)).max() < 1e-3):
+        _refuse(path, f"an origin_world of {origin.tolist()}")
+
+
+def _check_octree(path: Path, arrays: Arrays) -> None:
+    """Each level's children are the next level, one to eight a node, within its voxel of the grid."""
+    nodes, first_child = arrays["octree_nodes"], arrays["octree_first_child"]
+    start, leaf_size = arrays["octree_level_start"], float(arrays["octree_leaf_size"])
+    if not LEAF_SIZES[0] <= leaf_size <= LEAF_SIZES[1]:
+        _refuse(path, f"leaves of {leaf_size} m")
+    if start[0] != 0 or start[-1] != len(nodes) or not (start[:-1] < start[1:]).all():
+        _refuse(path, f"levels that begin at {start.tolist()} of {len(nodes)} nodes")
+    num_inner = start[-2]
+    num_children = np.diff(first_child)
+    is_tree = len(first_child) == len(nodes) + 1 and (first_child[start[:-1]] == start[1:]).all()
+    inner, leaves = num_children[:num_inner], num_children[num_inner:]
+    if not (is_tree and inner.min() >= 1 and inner.max() <= 8 and not leaves.any()):
+        _refuse(path, "links of an octree that are none")
+    origin_map = np.rint(arrays["R_map_from_world"] @ arrays["origin_world"])
+    origin = origin_map + PHASE / (1 << QUANTUM_BITS) * leaf_size
+    reach = (WINDOW + 1) * leaf_size
+    misplaced = first_misplaced(nodes, first_child, start, origin, leaf_size, reach)
+    if misplaced >= 0:
+        _refuse(path, f"an octree whose node {misplaced} is {nodes[misplaced].tolist()}")
+
+
+def _check_views(path: Path, arrays: Arrays) -> None:
+    """Candidates and what they see are in range, and the sparse ones are those of the coarse grid."""
+    centers, unit = arrays["centers"], arrays["offset_unit"]
+    reach = (WINDOW + 1) * float(arrays["octree_leaf_size"])
+    if not np.abs(centers).max(initial=0.0) <= reach:
+        _refuse(path, "a candidate at no finite place or too far away")
+    if not (unit.min(initial=1.0) >= LEAST_UNIT and 32767.0 * unit.max(initial=0.0) <= MOST_OFFSET):
+        _refuse(path, f"an offset_unit of {unit.min()} to {unit.max()} m")
+    if arrays["is_seen"].view(np.uint8).max(initial=0) > 1:
+        _refuse(path, "an is_seen that is neither true nor false")
+    for name in ("features", "wide_features"):
+        if arrays[name].min(initial=0) < -127:
+            _refuse(path, f"{name} below -127")
+    if not np.array_equal(arrays["sparse"], sparse_candidates(centers)):
+        _refuse(path, "sparse candidates that are not those of the coarse grid")
+
+
+def clean_warnings(path: Path, warnings: NDArray[Any]) -> tuple[str, ...]:
+    """Lines that can be printed: no control characters, not too many, not too long."""
+    if warnings.dtype.kind != "U" or warnings.ndim != 1:
+        _refuse(path, f"warnings of type {warnings.dtype} and shape {warnings.shape}")
+    lines = (str(line)[:MAX_WARNING] for line in warnings[:MAX_WARNINGS])
+    return tuple("".join(c if c.isprintable() else "?" for c in line) for line in lines)
