@@ -85,8 +85,8 @@ class Result:
             return f"{self.pano}: {self.status}\n  {why}"
         x, y, z = self.best_pose.center_world
         total = sum(self.seconds.values())
-        where = "at" if self.pose else "best guess"
-        lines = [f"{self.pano}: {self.status}, {where} ({x:.3f}, {y:.3f}, {z:.3f}) m in {total:.1f} s"]
+        where = "at" if self.pose else "with the best guess"
+        lines = [f"{self.pano}: {self.status} {where} ({x:.3f}, {y:.3f}, {z:.3f}) m in {total:.1f} s"]
         if self.evidence is not None:
             e = self.evidence
             lines.append(
@@ -141,7 +141,7 @@ class Result:
             return cls(
                 cloud=cloud if isinstance(cloud, str) else _paths(cloud),
                 best_pose=_best_pose_from_json(document),
-                source=Source(**{f.name: document[f.name] for f in fields(Source)}),
+                source=_source_from_json(document),
                 evidence=document["evidence"] and Evidence(**document["evidence"]),
                 alternatives=tuple(map(_alternative_from_json, document["alternatives"])),
                 covariance=_covariance_from_json(document),
@@ -155,7 +155,7 @@ class Result:
 
 
 def result_of(found: Localization, **about: Any) -> Result:
-    """The result of a localization; `about` are the fields of Result that say what it is of, and how it was made."""
+    """The result of a localization; `about` are the fields of Result that say what it is of and how made."""
     values = {f.name: getattr(found, f.name) for f in fields(found) if f.name != "pose"}
     return Result(best_pose=found.pose, **values, **about)
 
@@ -179,6 +179,11 @@ def _pose_json(pose: Pose | None) -> dict[str, object] | None:
     quaternion, T = quaternion_wxyz(pose.R_cam_from_world), T_world_from_cam(pose)
     other = {"quaternion_wxyz": quaternion.tolist(), "T_world_from_cam": T.tolist()}
     return {**_rotation_and_center(pose), **other}
+
+
+def _source_from_json(document: dict[str, Any]) -> Source:
+    values = {f.name: document[f.name] for f in fields(Source)}
+    return Source(**values | {"image_size": values["image_size"] and tuple(values["image_size"])})
 
 
 def _best_pose_from_json(document: dict[str, Any]) -> Pose | None:

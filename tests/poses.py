@@ -32,7 +32,7 @@ def tilted_poses(num_poses, center=CENTER):
 
 
 def result(pano, pose, status="localized", cloud="a.ply", **changes):
-    return Result(status=status, cloud=cloud, pano=str(pano), pose=pose, **(WORDS | changes))
+    return Result(status=status, cloud=cloud, pano=str(pano), best_pose=pose, **(WORDS | changes))
 
 
 def write_results(path, results):

@@ -9,7 +9,7 @@ from piccolo.confidence.covariance import PoseCovariance
 from piccolo.confidence.score import Evidence
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3
-from piccolo.result import Result
+from piccolo.result import Result, Source, unreadable_result
 
 POSE = Pose(exp_so3(np.array([0.3, -0.2, 0.9])), np.array([500_000.123, 4_000_000.456, 12.0]))
 EVIDENCE = Evidence(0.7, 0.5, 0.8, 0.6, 0.9, 0.5)
@@ -19,7 +19,7 @@ RESULT = Result(
     confidence=0.99,
     cloud="a scan.ply",
     pano="b.jpg",
-    pose=POSE,
+    best_pose=POSE,
     loss=0.05,
     evidence=EVIDENCE,
     alternatives=(ALTERNATIVE,),
@@ -28,7 +28,7 @@ RESULT = Result(
     settings={"preset": "paper", "seed": 0},
     warnings=("odd",),
 )
-WITHOUT_ARRAYS = {"pose": None, "alternatives": (), "covariance": None}
+WITHOUT_ARRAYS = {"status": "not_localized", "best_pose": None, "alternatives": (), "covariance": None}
 
 
 def test_json_round_trip_keeps_every_bit_of_the_pose():
@@ -53,7 +53,7 @@ def test_deviations_are_in_millimetres_and_degrees():
 
 def test_summary_says_what_a_person_asks_first():
     text = dataclasses.replace(RESULT, status="ambiguous").summary()
-    assert "ambiguous at (500000.123, 4000000.456, 12.000) m" in text
+    assert "ambiguous with the best guess (500000.123, 4000000.456, 12.000) m" in text
     assert "confidence 0.990" in text
     assert "one sigma 4.0 mm (up and down)" in text
     assert "or (1.000, 2.000, 3.000) m, score 0.20" in text
@@ -62,15 +62,38 @@ def test_summary_says_what_a_person_asks_first():
 
 def test_json_names_what_the_next_tool_needs():
     document = json.loads(RESULT.to_json())
-    assert document["format"] == "piccolo-pose/3"
+    assert document["format"] == "piccolo-pose/4"
     T = np.array(document["T_world_from_cam"])
     np.testing.assert_allclose(T[:3, 3], RESULT.pose.center_world)
     np.testing.assert_allclose(T[:3, :3], np.array(document["R_cam_from_world"]).T)
     assert "R_cam_from_world @ (x_world - center_world)" in document["convention"]
 
 
+@pytest.mark.parametrize("status", ["ambiguous", "not_localized"])
+def test_a_pose_that_is_not_sure_is_a_best_guess_only(status):
+    unsure = dataclasses.replace(RESULT, status=status)
+    document = json.loads(unsure.to_json())
+    assert all(document[name] is None for name in document["best_guess"])
+    np.testing.assert_array_equal(document["best_guess"]["center_world"], POSE.center_world)
+    back = Result.from_json(unsure.to_json())
+    assert back.pose is None
+    assert (back.best_guess.center_world == POSE.center_world).all()
+    assert (RESULT.pose, RESULT.best_guess) == (POSE, None)
+
+
+def test_unreadable_photo_has_a_reason_and_nothing_else():
+    result = unreadable_result("b.jpg: is empty", "a.ply", "b.jpg", settings={}, source=Source("0" * 64))
+    assert Result.from_json(result.to_json()) == result
+    assert result.summary() == "b.jpg: unreadable\n  b.jpg: is empty"
+
+
+def test_source_comes_back():
+    source = Source("0" * 64, "1" * 64, (2048, 1024), "2026-11-22T10:00:00+01:00")
+    assert Result.from_json(dataclasses.replace(RESULT, source=source).to_json()).source == source
+
+
 def test_result_without_a_pose():
-    none = dataclasses.replace(RESULT, status="not_localized", loss=None, evidence=None, **WITHOUT_ARRAYS)
+    none = dataclasses.replace(RESULT, loss=None, evidence=None, **WITHOUT_ARRAYS)
     assert json.loads(none.to_json())["T_world_from_cam"] is None
     assert Result.from_json(none.to_json()).pose is None
 
@@ -91,8 +114,8 @@ def test_nan_is_never_written():
 
 
 @pytest.mark.parametrize(
-    "text", ["{", "[]", "{}", '{"format": "piccolo-pose/2"}', '{"format": "piccolo-pose/3"}']
+    "text", ["{", "[]", "{}", '{"format": "piccolo-pose/3"}', '{"format": "piccolo-pose/4"}']
 )
 def test_other_text_is_refused(text):
-    with pytest.raises(InputError, match="piccolo-pose/3"):
+    with pytest.raises(InputError, match="piccolo-pose/4"):
         Result.from_json(text)

@@ -60,7 +60,7 @@ class Batch:
     def pass_finished(
         self, path: Path, panoramas: Iterator[Path], cloud: str | tuple[str, ...], cloud_sha256: str
     ) -> tuple[Counter[str], int]:
-        """Take from `panoramas` those that an earlier run has finished: counts by status, size of their lines.
+        """Take from `panoramas` what an earlier run has finished: counts by status, size of their lines.
 
         Raises
         ------

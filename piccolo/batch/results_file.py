@@ -40,7 +40,7 @@ def finished_lines(path: Path) -> tuple[Iterator[dict[str, Any]], int]:
 
 
 def check_finished(fields: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
-    """InputError for a finished line that is not of the panorama, scan and settings `expected` in its place."""
+    """InputError for a finished line that is not of the panorama, scan and settings `expected` there."""
     different = next((key for key in KEYS if fields.get(key) != expected[key]), None)
     if different is None:
         return

@@ -1,5 +1,6 @@
 """Ctrl-C and SIGTERM in a batch: the photo at work is finished first."""
 
+import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -31,7 +32,7 @@ class Interruption:
             self.is_at_work = False
 
 
-class Stopped(Exception):
+class Stopped(Exception):  # noqa: N818  it is no error
     """A signal came while nothing was at work, or for the second time."""
 
 
@@ -45,6 +46,7 @@ def interruptible() -> Iterator[Interruption]:
         interruption.number = number
         if is_second or not interruption.is_at_work:
             raise Stopped
+        os.write(2, f"\n{SIGNALS[number]}: the photo at work is finished; again to stop now\n".encode())
 
     before = {number: signal.signal(number, handle) for number in SIGNALS}
     try:

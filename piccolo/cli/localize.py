@@ -5,7 +5,7 @@ import itertools
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from tqdm import tqdm
 from ..batch.batch import Batch
 from ..batch.inputs import is_stream, panoramas_of
 from ..batch.priors import read_priors
-from ..coarse_to_fine.open_map import CachePolicy, scan_digest
+from ..coarse_to_fine.open_map import CachePolicy, scan_sha256_of
 from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..panorama import read_panorama
@@ -45,7 +45,7 @@ class Run:
     panoramas: Iterator[Path]
     total: int | None  # of the panoramas; None if they come on standard input
     counts: Counter[str]  # results by status, those of an earlier run too
-    size: int  # of the lines that an earlier run has left [byte]
+    size: int | None  # of the lines that an earlier run has left [byte]; None: they are overwritten
 
     @property
     def num_finished(self) -> int:
@@ -75,13 +75,13 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
     for output in filter(None, (arguments.out, arguments.overlay)):
         if not output.is_dir():
             check_output(output, inputs)
-    counts, size = Counter[str](), 0
+    counts, size = Counter[str](), None if arguments.overwrite else 0
     if arguments.out and arguments.out.exists() and not arguments.overwrite:
         show = progress_bar(arguments.quiet)
         paths = arguments.cloud
         name = str(paths[0]) if len(paths) == 1 else tuple(map(str, paths))
         checked = show(panoramas, total, "check what is finished")
-        counts, size = batch.pass_finished(arguments.out, checked, name, scan_digest(paths))
+        counts, size = batch.pass_finished(arguments.out, checked, name, scan_sha256_of(paths))
     return Run(arguments, batch, panoramas, total, counts, size)
 
 
@@ -130,7 +130,7 @@ def localize_all(run: Run, scan: Scan, write: Write, interruption: Interruption)
     hidden = run.arguments.quiet or run.total == 1
     bar = {"total": run.total, "initial": run.num_finished, "disable": hidden, "file": sys.stderr}
     for pano in tqdm(run.panoramas, "panoramas", unit="", **bar):
-        with interruption.postponed():
+        with interruption.postponed() if run.total != 1 else nullcontext():
             result = run.batch.localize(scan, pano)
             report(run, scan, result)
             write(result.to_json())

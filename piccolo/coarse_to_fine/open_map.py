@@ -85,6 +85,12 @@ def prepared_map_among(paths: Sequence[Path]) -> Path | None:
     return next((path for path in paths if path.is_file() and is_map_file(path)), None)
 
 
+def scan_sha256_of(paths: Sequence[Path]) -> str:
+    """The digest of a scan's files, or the one of what the prepared map in place of them was made from."""
+    map_path = prepared_map_among(paths)
+    return load_map(map_path).scan_sha256 if map_path else sha256_of_files(paths)
+
+
 def content_key(scan_sha256: str, settings: CloudSettings) -> str:
     """Name for the map of a cloud's files: by what is in them and the settings, wherever they lie."""
     digest = hashlib.sha256(" ".join([FORMAT, sources_digest(), repr(settings), scan_sha256]).encode())

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL.ExifTags import GPS, IFD, Base
 
+from ..cloud.digest import sha256_of_arrays
 from .cube_files import face_paths
 from .picture import file_bytes, opened
 
@@ -61,7 +62,7 @@ def photo_of(path: Path) -> Photo:
 def photo_of_array(rgb: NDArray[np.uint8]) -> Photo:
     """The same of pixels (H, W, 3): their digest and size."""
     height, width = rgb.shape[:2]
-    return Photo(hashlib.sha256(np.ascontiguousarray(rgb)).hexdigest(), (width, height), None, None)
+    return Photo(sha256_of_arrays(rgb), (width, height), None, None)
 
 
 def _capture_time(exif: Mapping[int, Any]) -> str | None:

@@ -45,8 +45,10 @@ def whole_lines(path: Path, size: int) -> Iterator[bytes]:
 
 
 @contextmanager
-def appending(path: Path, size: int) -> Iterator[Callable[[str], None]]:
-    """A function that appends one line at once, to a file that is first cut to `size` bytes, or made.
+def appending(path: Path, size: int | None) -> Iterator[Callable[[str], None]]:
+    """A function that appends one line at once, to a file that is made or first cut to `size` bytes.
+
+    It should have its whole lines within `size`; None begins it anew, whatever is in it.
 
     A line that does not fit on the disk is taken back: the lines before stay whole.
 
@@ -57,15 +59,16 @@ def appending(path: Path, size: int) -> Iterator[Callable[[str], None]]:
     OSError
         The file can't be written.
     """
+    is_new = not path.exists()
     handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise InputError(f"{path}: another process is writing it; wait for its end") from error
-        if b"\n" in os.pread(handle, os.fstat(handle).st_size, size):
+        if size is not None and b"\n" in os.pread(handle, os.fstat(handle).st_size, size):
             raise InputError(f"{path}: another process has written it since; start again")
-        os.ftruncate(handle, size)
+        os.ftruncate(handle, size or 0)
 
         def append(line: str) -> None:
             begin, rest = os.fstat(handle).st_size, memoryview(line.encode() + b"\n")
@@ -78,5 +81,7 @@ def appending(path: Path, size: int) -> Iterator[Callable[[str], None]]:
                 raise OSError(error.errno, os.strerror(error.errno or 0), str(path)) from error
 
         yield append
+        if is_new and os.fstat(handle).st_size == 0:
+            path.resolve().unlink()
     finally:
         os.close(handle)
