@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import pytest
@@ -185,15 +184,13 @@ def test_a_signal_ends_a_batch_after_the_photo_at_work(scene, tmp_path, number, 
 
 def test_names_on_standard_input_are_answered_as_they_come(scene):
     name = str(scene / "images" / "clean_1.jpg")
-    process = _process(scene, None, ["-"], stdout=subprocess.PIPE, bufsize=1)
-    reader = threading.Thread(target=process.stderr.read, daemon=True)
-    reader.start()
-    for word, status in ((name, "localized"), ("missing.jpg", "unreadable"), (name, "localized")):
-        process.stdin.write(word + "\n")
-        process.stdin.flush()
-        assert Result.from_json(process.stdout.readline()).status == status
-    process.stdin.close()
-    assert process.wait(timeout=60) == 3
+    with _process(scene, None, ["-", "--quiet"], stdout=subprocess.PIPE, bufsize=1) as process:
+        for word, status in ((name, "localized"), ("missing.jpg", "unreadable"), (name, "localized")):
+            process.stdin.write(word + "\n")
+            process.stdin.flush()
+            assert Result.from_json(process.stdout.readline()).status == status
+        process.stdin.close()
+        assert process.wait(timeout=60) == 3
 
 
 def test_two_processes_do_not_write_one_file(tmp_path):
