@@ -43,7 +43,7 @@ LAYOUT: dict[str, tuple[str, tuple[int | str, ...]]] = {
 }
 SHA256 = re.compile("[0-9a-f]{64}")
 ROUNDING = 1e-9  # of a rotation
-LEAF_SIZES = 1e-3, 10.0  # [m] least and most
+LEAF_SIZES = 1e-3, 0.1  # [m] least and most
 FARTHEST_ORIGIN = 1e12  # [m]
 BRIGHTEST = np.float32(1.0 + 1e-6)
 LEAST_UNIT, MOST_OFFSET = 3e-8, 1e6  # [m] of the offsets; how far they reach
