@@ -1,11 +1,13 @@
 """Mutations by hand, in a process of their own: maps with right checksums, and files of both caches.
 
-Started by fuzz_readers.py with a group, a seed, the first mutation and how many; each is drawn by its number.
+Started by fuzz_readers.py with a group, a seed, the first mutation, how many, and a file that names the one under
+way, and stays where the process is killed. Each is drawn by its number.
 """
 
 import faulthandler
 import logging
 import resource
+import signal
 import sys
 import tempfile
 import warnings
@@ -38,7 +40,7 @@ from piccolo.scenes.synthetic.world import make_query, make_world, scan_world
 ROOM_SIZE, SHIFT, NEAR = np.array([2.4, 2.2, 2.2]), np.array([320.0, -150.0, 7.0]), 0.3  # [m]
 QUICK = METHOD._replace(beam=Beam(32, 8, 3, 1), wide_beam=Beam(48, 12, 4, 1), min_starts=48)
 SETTINGS, WORKERS, SHA256 = CoarseToFineSettings(gravity="known", num_yaws=24), Workers(1), 64 * "0"
-HANG_S, MEMORY_KB = 10.0, 2 << 20  # most a mutation may take, and all
+HANG_S, MEMORY_KB = 10.0, 2 << 20  # of processor time, at most, for one; of memory for all
 LOCALIZED_FRACTION = 0.1  # of the maps that are read
 Trial = Callable[[np.random.Generator], str]
 
@@ -121,9 +123,19 @@ def mutated_array(rng: np.random.Generator, array: NDArray[Any]) -> NDArray[Any]
     return changed
 
 
+def status_in(scan_map: ScanMap, panorama: Panorama, pose: Pose) -> str:
+    """What the panorama's pose in a map is called; never "localized" if it is not the true one."""
+    result = localize(scan_map, panorama, SETTINGS, WORKERS, Stopwatch(), QUICK)
+    if result.status == "localized" and result.pose and not is_close(result.pose, pose, 0.1, np.radians(5)):
+        raise RuntimeError(f"a wrong pose is called localized: {result.pose}")
+    return result.status
+
+
 def trial_of_maps(folder: Path) -> Trial:
     """Mutates arrays of a map, writes it with right checksums, reads it, and localizes in what is read."""
     scan_map, panorama, pose = small_map()
+    if status_in(scan_map, panorama, pose) != "localized":  # this also loads the kernels
+        raise RuntimeError("the map itself is no good")
     path = folder / "a.map"
     save_map(scan_map, path)
     with np.load(path) as archive:
@@ -146,14 +158,7 @@ def trial_of_maps(folder: Path) -> Trial:
             return "refused"
         if rng.random() > LOCALIZED_FRACTION:
             return "read"
-        result = localize(found, panorama, SETTINGS, WORKERS, Stopwatch(), QUICK)
-        if (
-            result.status == "localized"
-            and result.pose
-            and not is_close(result.pose, pose, 0.1, np.radians(5))
-        ):
-            raise RuntimeError(f"a wrong pose is called localized: {result.pose}")
-        return f"read and {result.status}"
+        return f"read and {status_in(found, panorama, pose)}"
 
     return run
 
@@ -187,25 +192,24 @@ def trial_of_caches(folder: Path) -> Trial:
     return run
 
 
-def trials(group: str, folder: Path, seed: int, numbers: range) -> Iterator[str]:
+def trials(group: str, folder: Path, seed: int, numbers: range, at: Path) -> Iterator[str]:
     """Run mutations; what became of each."""
     trial = {"maps": trial_of_maps, "caches": trial_of_caches}[group](folder)
+    faulthandler.register(signal.SIGPROF, chain=True)  # and the process ends
     for k in numbers:
-        faulthandler.dump_traceback_later(HANG_S, exit=True)
-        try:
-            yield trial(np.random.default_rng([seed, k]))
-        except BaseException:
-            print(f"{group}: mutation {k} of seed {seed}", file=sys.stderr)
-            raise
-        faulthandler.cancel_dump_traceback_later()
+        at.write_text(f"{group}: mutation {k} of seed {seed}\n")
+        signal.setitimer(signal.ITIMER_PROF, HANG_S)
+        yield trial(np.random.default_rng([seed, k]))
+    signal.setitimer(signal.ITIMER_PROF, 0.0)
+    at.unlink(missing_ok=True)
 
 
 if __name__ == "__main__":
-    group, seed, first, count = sys.argv[1], *map(int, sys.argv[2:])
+    group, at, (seed, first, count) = sys.argv[1], Path(sys.argv[5]), map(int, sys.argv[2:5])
     faulthandler.enable()
     warnings.simplefilter("error")
     with tempfile.TemporaryDirectory() as temporary:
-        counts = Counter(trials(group, Path(temporary), seed, range(first, first + count)))
+        counts = Counter(trials(group, Path(temporary), seed, range(first, first + count), at))
     memory_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     print(
         f"{group}: {count} mutations of seed {seed}, {memory_kb >> 10} MB:",

@@ -115,7 +115,8 @@ def fuzz_apart(name: str, arguments: argparse.Namespace) -> bool:
 
 def fuzz_by_hand(group: str, arguments: argparse.Namespace) -> bool:
     """Fuzz maps or caches in a process of their own; True if something was found."""
-    numbers = map(str, (arguments.seed, arguments.first, arguments.count))
+    at = arguments.crashes / f"{group}-{arguments.seed}"
+    numbers = map(str, (arguments.seed, arguments.first, arguments.count, at))
     done = subprocess.run(
         [sys.executable, Path(__file__).with_name("_fuzz_maps.py"), group, *numbers], check=False
     )
