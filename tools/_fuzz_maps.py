@@ -1,7 +1,7 @@
 """Mutations by hand, in a process of their own: maps with right checksums, and files of both caches.
 
-Started by fuzz_readers.py with a group, a seed, the first mutation, how many, and a file that names the one under
-way, and stays where the process is killed. Each is drawn by its number.
+Started by fuzz_readers.py with a group, a seed, the first mutation, how many, and a file that names the one
+under way, and stays where the process is killed. Each is drawn by its number.
 """
 
 import faulthandler
