@@ -10,13 +10,15 @@ import pytest
 from refusals import read_or_refused
 from rooms import scan_map
 
+from piccolo.cloud.octree import build_octree
 from piccolo.cloud.settings import CloudSettings
-from piccolo.cloud.voxels import LEAF_SIZE, PHASE, QUANTA_PER_METRE
+from piccolo.cloud.voxels import LEAF_SIZE, PHASE, QUANTA_PER_METRE, VoxelTable
 from piccolo.coarse_to_fine import map_file, open_map
 from piccolo.coarse_to_fine.map_file import is_map_file, load_map, save_map
 from piccolo.coarse_to_fine.map_validation import first_misplaced
 from piccolo.coarse_to_fine.open_map import content_key
 from piccolo.errors import InputError
+from piccolo.geometry.pose import exp_so3
 
 
 @pytest.fixture(scope="module")
@@ -179,6 +181,24 @@ def test_warnings_are_lines_that_can_be_printed(arrays, tmp_path):
     warnings = load_map(tmp_path / "a.map").warnings
     assert warnings[0] == "two?lines ?[31m"
     assert (len(warnings), max(map(len, warnings))) == (1000, 5000)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_no_octree_of_a_cloud_is_refused(arrays, tmp_path, seed):
+    """Turned, far from zero, wide, of one point, and with points on the borders of voxels."""
+    rng = np.random.default_rng(seed)
+    R = exp_so3(rng.normal(size=3)) if seed % 3 else np.eye(3)
+    table, count = VoxelTable("cloud"), [1, 60, 4000][seed // 4]
+    points = rng.random((count, 3)) * [0.01, 5.0, 300.0, 41_000.0][seed % 4]
+    if seed % 2:
+        points = np.round(points / LEAF_SIZE) * LEAF_SIZE
+    table.add(points + rng.normal(size=3) * [0.0, 50.0, 5e6][seed % 3], np.full((count, 3), 200, np.uint8))
+    voxels = table.finish()
+    octree = build_octree(voxels)
+    changed = {f"octree_{name}": value for name, value in octree._asdict().items()}
+    changed |= {"R_map_from_world": R, "origin_world": R.T @ voxels.origin}
+    _save(tmp_path / "a.map", arrays | changed)
+    np.testing.assert_array_equal(load_map(tmp_path / "a.map").octree.nodes, octree.nodes)
 
 
 def test_nodes_are_in_their_parents_voxels():

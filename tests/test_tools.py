@@ -83,6 +83,18 @@ def test_fuzzing_finds_nothing_in_a_second_and_knows_every_format(tmp_path, caps
         fuzz_readers.main(["--reader", "doc", "--crashes", str(found)])
 
 
+def test_maps_and_caches_are_fuzzed_by_hand(tmp_path, capfd):
+    how = ["--reader", "maps", "caches", "--seed", "5", "--count", "40", "--crashes", str(tmp_path)]
+    assert fuzz_readers.main(how) == 0
+    maps, caches = capfd.readouterr().out.splitlines()
+    assert re.fullmatch(
+        r"maps: 40 mutations of seed 5, \d+ MB:( \d+ (refused|read|read and localized);)+", maps
+    )
+    assert re.fullmatch(
+        r"caches: 40 mutations of seed 5, \d+ MB:( \d+ (compiled code|map made anew);)+", caches
+    )
+
+
 def test_a_reader_that_breaks_is_found(tmp_path, monkeypatch):
     (tmp_path / "a").write_bytes(b"")
     monkeypatch.setitem(fuzz_readers.READERS, "scene", ((".json",), lambda path: 1 // 0))

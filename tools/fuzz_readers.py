@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Fuzz the readers for a given time: coverage-guided mutations of small files, by atheris."""
+"""Fuzz the readers: coverage-guided mutations of small files by atheris for a given time; maps by hand."""
 
 import argparse
 import subprocess
@@ -28,7 +28,12 @@ example:
 Each reader gets the files of --corpus that end as its formats do, or one of a few bytes, and mutations of
 them. A good result or an InputError is right; anything else, over 20 s or over 2 GB is a finding: the file
 is kept in --crashes, named after its reader. atheris: pip install atheris.
+
+The readers `maps` and `caches` need no atheris and no corpus: --count mutations of a small map's arrays with
+right checksums, some of which a photo is then localized in, and of the bytes of a map and of compiled code in
+their caches. A map that is refused, or a right or no pose, is right; the number of what is found is printed.
 """
+BY_HAND = ("maps", "caches")
 TIMEOUT_S, MEMORY_MB, MAX_SIZE = 20, 2048, 1 << 16
 
 
@@ -108,11 +113,23 @@ def fuzz_apart(name: str, arguments: argparse.Namespace) -> bool:
     return done.returncode != 0
 
 
+def fuzz_by_hand(group: str, arguments: argparse.Namespace) -> bool:
+    """Fuzz maps or caches in a process of their own; True if something was found."""
+    at = arguments.crashes / f"{group}-{arguments.seed}"
+    numbers = map(str, (arguments.seed, arguments.first, arguments.count, at))
+    done = subprocess.run(
+        [sys.executable, Path(__file__).with_name("_fuzz_maps.py"), group, *numbers], check=False
+    )
+    return done.returncode != 0
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
-    parser.add_argument("--reader", choices=list(READERS), nargs="+", default=list(READERS))
+    parser.add_argument("--reader", choices=[*READERS, *BY_HAND], nargs="+", default=[*READERS, *BY_HAND])
     option(parser, "--seconds N", "for each reader", default=60)
     option(parser, "--seed N", default=1)
+    option(parser, "--count N", "mutations of maps, and of caches", default=1000)
+    option(parser, "--first N", "number of the first of them", default=0)
     option(parser, "--corpus FOLDER", "files to begin with")
     option(parser, "--crashes FOLDER", "for what is found", required=True)
 
@@ -121,7 +138,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(arguments: argparse.Namespace) -> int:
     """Fuzz the readers one by one."""
     arguments.crashes.mkdir(parents=True, exist_ok=True)
-    return int(any([fuzz_apart(name, arguments) for name in arguments.reader]))
+    runs = [(fuzz_by_hand if name in BY_HAND else fuzz_apart, name) for name in arguments.reader]
+    return int(any([run(name, arguments) for run, name in runs]))
 
 
 if __name__ == "__main__":

@@ -43,8 +43,8 @@ LAYOUT: dict[str, tuple[str, tuple[int | str, ...]]] = {
 }
 SHA256 = re.compile("[0-9a-f]{64}")
 ROUNDING = 1e-9  # of a rotation
-LEAF_SIZES = 1e-3, 10.0  # [m] least and most
-FARTHEST_ORIGIN = 1e12  # [m]
+LEAF_SIZES = 1e-3, 0.1  # [m] least and most
+FARTHEST_ORIGIN, MARGIN = 1e12, 10.0  # [m] of the world; around the voxels that are kept
 BRIGHTEST = np.float32(1.0 + 1e-6)
 LEAST_UNIT, MOST_OFFSET = 3e-8, 1e6  # [m] of the offsets; how far they reach
 MAX_WARNINGS, MAX_WARNING = 1000, 5000  # lines, and characters of a line
@@ -127,7 +127,7 @@ def _check_octree(path: Path, arrays: Arrays) -> None:
         _refuse(path, "links of an octree that are none")
     origin_map = np.rint(arrays["R_map_from_world"] @ arrays["origin_world"])
     origin = origin_map + PHASE / (1 << QUANTUM_BITS) * leaf_size
-    reach = (WINDOW + 1) * leaf_size
+    reach = WINDOW * leaf_size + MARGIN
     misplaced = first_misplaced(nodes, first_child, start, origin, leaf_size, reach)
     if misplaced >= 0:
         _refuse(path, f"an octree whose node {misplaced} is {nodes[misplaced].tolist()}")
@@ -136,10 +136,10 @@ def _check_octree(path: Path, arrays: Arrays) -> None:
 def _check_views(path: Path, arrays: Arrays) -> None:
     """Candidates and what they see are in range, and the sparse ones are those of the coarse grid."""
     centers, unit = arrays["centers"], arrays["offset_unit"]
-    reach = (WINDOW + 1) * float(arrays["octree_leaf_size"])
+    reach = WINDOW * float(arrays["octree_leaf_size"]) + MARGIN
     if not np.abs(centers).max(initial=0.0) <= reach:
         _refuse(path, "a candidate at no finite place or too far away")
-    if not (unit.min(initial=1.0) >= LEAST_UNIT and 32767.0 * unit.max(initial=0.0) <= MOST_OFFSET):
+    if not (unit.min(initial=1.0) >= LEAST_UNIT and unit.max(initial=0.0) <= MOST_OFFSET / 32767):
         _refuse(path, f"an offset_unit of {unit.min()} to {unit.max()} m")
     if arrays["is_seen"].view(np.uint8).max(initial=0) > 1:
         _refuse(path, "an is_seen that is neither true nor false")

@@ -90,7 +90,10 @@ def render_candidates(
 
 def sparse_candidates(centers: NDArray[np.float64]) -> NDArray[np.int64]:
     """Indices of the candidates (N, 3) [m] that come first in their cells of the coarse grid."""
-    return np.unique(np.floor(centers / COARSE_SPACING), axis=0, return_index=True)[1]
+    cells = np.floor(centers / COARSE_SPACING).astype(np.int64)
+    cells -= cells.min(axis=0, initial=0)
+    codes = np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0, initial=0) + 1))
+    return np.unique(codes, return_index=True)[1]
 
 
 def widen(
