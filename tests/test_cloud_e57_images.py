@@ -32,9 +32,9 @@ def test_images_are_listed_and_read(tmp_path):
         len(JPEG),
     )
     assert images[0].fov_deg == pytest.approx((360.0, 180.0))
-    assert (images[0].scan_guid, images[0].placement, images[1].fov_deg) == ("{scan}", None, None)
-    np.testing.assert_allclose(images[1].placement.R_world_from_local, R_WORLD, atol=1e-12)
-    np.testing.assert_array_equal(images[1].placement.center_world, CENTER)
+    assert (images[0].scan_guid, images[0].pose, images[1].fov_deg) == ("{scan}", None, None)
+    np.testing.assert_allclose(images[1].pose.R_cam_from_world.T, R_WORLD, atol=1e-12)
+    np.testing.assert_array_equal(images[1].pose.center_world, CENTER)
     assert [read_image(path, k) for k in range(4)] == [JPEG, PNG, PNG, JPEG]
     assert list_images(write(tmp_path / "b.e57", [scan()])) == []
 

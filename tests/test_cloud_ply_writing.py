@@ -6,7 +6,8 @@ from plyfile import PlyData
 
 from piccolo.cloud import open_cloud
 from piccolo.cloud.ply_writer import vertex_rows, write_ply, writing_ply
-from piccolo.cloud.transform import BoundingBox, needs_double
+from piccolo.cloud.stream import BoundingBox
+from piccolo.cloud.transform import needs_double
 
 
 def _cloud(num_points, dtype):

@@ -6,7 +6,7 @@ import rooms
 
 from piccolo.geometry.pose import Pose, is_close, yaw_rotation
 from piccolo.optimize.refine import Loss, sampling_loss_of
-from piccolo.panorama.resize import shrink
+from piccolo.panorama.model import shrink
 from piccolo.panorama.texels import pack_texels
 from piccolo.paper.search import histogram_similarity, losses_at
 

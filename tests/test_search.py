@@ -31,7 +31,7 @@ from piccolo.panorama.local_normalization import (
     normalize_panorama,
     sample_channels,
 )
-from piccolo.panorama.resize import resize
+from piccolo.panorama.model import resize
 from piccolo.runtime.threads import Workers
 
 SCALE = ImageScale(128, 7.5, SEARCH_VIEW.sigma_deg)

@@ -16,9 +16,8 @@ from piccolo.geometry.camera_axes import R_cam_from_angles, heading_pitch_roll_d
 from piccolo.geometry.pose import Pose, T_world_from_cam, angle_between, exp_so3, step
 from piccolo.geometry.pose_file import read_pose_matrix
 from piccolo.geometry.sphere import pixel_rays
-from piccolo.render.splatting import BAND, BAND_OFFSET, MAX_SLOPE, MIN_RADIUS_PX, splat
 from piccolo.render.surfel_renderer import RenderedView, encode_image, fill_holes, render_points
-from piccolo.render.surfels import surfels_of
+from piccolo.render.surfels import BAND, BAND_OFFSET, MAX_SLOPE, MIN_RADIUS_PX, splat, surfels_of
 from piccolo.runtime.threads import Workers
 from piccolo.scenes.synthetic.raycast import cast_rays
 

@@ -14,8 +14,15 @@ from piccolo.geometry.sphere import pixel_rays
 from piccolo.runtime.threads import Workers
 from piccolo.scenes.synthetic.raycast import cast_rays
 from piccolo.scenes.synthetic.room import make_room
-from piccolo.scenes.synthetic.sensors import MIN_CLEARANCE, RANGE_NOISE, free_position
-from piccolo.scenes.synthetic.world import VARIANTS, make_query, make_world, scan_world
+from piccolo.scenes.synthetic.world import (
+    MIN_CLEARANCE,
+    RANGE_NOISE,
+    VARIANTS,
+    free_position,
+    make_query,
+    make_world,
+    scan_world,
+)
 
 SMALL = np.array([3.0, 3.0, 2.4])
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from piccolo.cli.command import command
 from piccolo.cloud import read_cloud
-from piccolo.cloud.model import Cloud
+from piccolo.cloud.stream import Cloud
 from piccolo.coarse_to_fine.config import METHOD, Beam, ImageScales, MethodConfig
 from piccolo.coarse_to_fine.localize import localize
 from piccolo.coarse_to_fine.scan_map import SEARCH_VIEW, prepare_map

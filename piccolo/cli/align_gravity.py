@@ -8,13 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ..cloud import open_cloud
-from ..cloud.transform import BoundedStream, with_bounds, write_transformed
+from ..cloud import CloudStream, open_cloud
+from ..cloud.transform import write_transformed
 from ..confidence.confidence import check_confidence
 from ..errors import InputError
 from ..gravity import MIN_CONFIDENCE
-from ..gravity.alignment import AlignmentReport, find_alignment
-from ..gravity.alignment_file import Alignment, read_alignment
+from ..gravity.alignment import Alignment, AlignmentReport, find_alignment, read_alignment
 from ..runtime.atomic import check_output, write_atomically
 from ..scenes.scene import QUERIES_NAME, Query, read_scene, write_queries
 from .command import command, option
@@ -89,7 +88,7 @@ def outputs_of(arguments: argparse.Namespace) -> Outputs:
     return transforms, read_scene(arguments.queries).queries if arguments.queries else ()
 
 
-def write(args: argparse.Namespace, outputs: Outputs, cloud: BoundedStream, alignment: Alignment) -> None:
+def write(args: argparse.Namespace, outputs: Outputs, cloud: CloudStream, alignment: Alignment) -> None:
     """Write the cloud and what goes with it, the cloud's name last."""
     (transforms, queries), out = outputs, args.out
 
@@ -150,7 +149,7 @@ def align(arguments: argparse.Namespace) -> int:
     """Find the alignment, write what is sure enough; returns the exit code."""
     outputs = outputs_of(arguments)
     show = progress_bar(arguments.quiet)
-    cloud = with_bounds(open_cloud(arguments.cloud, cloud_settings_from(arguments), show))
+    cloud = open_cloud(arguments.cloud, cloud_settings_from(arguments), show)
     found, warnings = find_alignment(cloud, arguments.up, arguments.yaw_walls)
     print_warnings(arguments, warnings)
     alignment = found.alignment
@@ -175,7 +174,7 @@ def apply(arguments: argparse.Namespace) -> int:
     if arguments.units is None and arguments.scale is None:
         settings = replace(settings, scale=given.metres_per_unit)
     alignment = (given.inverse() if arguments.inverse else given).in_unit(settings.scale)
-    cloud = with_bounds(open_cloud(arguments.cloud, settings, progress_bar(arguments.quiet)))
+    cloud = open_cloud(arguments.cloud, settings, progress_bar(arguments.quiet))
     for _ in cloud.chunks([]):  # for its box
         pass
     write(arguments, outputs, cloud, alignment)

@@ -15,9 +15,8 @@ from ..runtime.threads import num_cores
 from ..scenes.evaluation import tables
 from ..scenes.evaluation.plots import errors_figure, figure_png, risk_figure
 from ..scenes.evaluation.query_result import QueryResult, Thresholds, match_results
-from ..scenes.evaluation.run_file import input_files, open_run, read_run
-from ..scenes.evaluation.runner import RunConfig
-from ..scenes.evaluation.statistics import risk_and_coverage
+from ..scenes.evaluation.runner import RunConfig, input_files, open_run, read_run
+from ..scenes.evaluation.tables import risk_and_coverage
 from ..scenes.scene import find_scenes
 from .command import command, option
 from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error

@@ -10,7 +10,7 @@ from ..coarse_to_fine.open_map import CachePolicy
 from ..confidence.confidence import LOCALIZED
 from ..errors import InputError
 from ..panorama import ReadOptions, read_panorama
-from ..render.overlay import overlay_png
+from ..render.surfel_renderer import overlay_png
 from ..result import Result
 from ..runtime.atomic import check_output, write_atomically
 from ..runtime.kernel_cache import is_first_use, kernel_folder

@@ -12,10 +12,17 @@ from ..coarse_to_fine.open_map import open_points
 from ..errors import InputError
 from ..geometry.pose import Array, Pose
 from ..geometry.rotations import uniform_rotations, uniform_yaws
-from ..optimize.loss_surface import LossSurface, PoseGrid, loss_surface
-from ..optimize.loss_surface_io import KnownPoses, plan_shift, surface_npz, surface_png
+from ..optimize.loss_surface import (
+    KnownPoses,
+    LossSurface,
+    PoseGrid,
+    loss_surface,
+    plan_shift,
+    surface_npz,
+    surface_png,
+)
 from ..panorama import read_panorama
-from ..panorama.resize import shrink
+from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
 from ..result import read_results
 from ..runtime.atomic import check_output, write_atomically

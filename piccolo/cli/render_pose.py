@@ -25,7 +25,7 @@ from ..optimize.descent_animation import (
 )
 from ..optimize.settings import DescentSettings
 from ..panorama import read_panorama
-from ..panorama.resize import shrink
+from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
 from ..render.surfel_renderer import encode_image, fill_holes, render_points
 from ..result import read_results

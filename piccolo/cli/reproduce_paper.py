@@ -16,8 +16,7 @@ from ..paper.settings import PaperSettings
 from ..runtime.atomic import write_atomically
 from ..runtime.threads import num_cores
 from ..scenes.evaluation.query_result import QueryResult
-from ..scenes.evaluation.run_file import open_run
-from ..scenes.evaluation.runner import RunConfig
+from ..scenes.evaluation.runner import RunConfig, open_run
 from ..scenes.reproduce_paper.experiments import EXPERIMENTS, Condition, Settings
 from ..scenes.reproduce_paper.report import plot_png, table
 from ..scenes.scene import Scene, find_scenes

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry.point_transforms import rotate_points
+from ..geometry.pose import Array
 from ..runtime.threads import Progress, no_progress
-from .model import Cloud
 from .morton import morton_order
 from .readers.colors import brightest_of, colored_chunks
 from .readers.reader import CHUNK, PointSource, RawCloud
@@ -22,9 +22,45 @@ from .voxels import Voxels, VoxelTable
 ARRAYS = Path("arrays")  # how messages and results name a scan that is no file
 
 
+@dataclass(frozen=True)
+class Cloud:
+    """Coloured points near a local origin, in an order that does not depend on the file's."""
+
+    points: NDArray[np.float32]  # (N, 3) world minus origin_world [m], all finite, Morton order
+    colors: NDArray[np.uint8]  # (N, 3) RGB
+    origin_world: NDArray[np.float64]  # (3,) what was subtracted from the file's coordinates [m]
+    num_dropped: int = 0  # points with NaN or infinite coordinates, left out
+    warnings: tuple[str, ...] = ()  # one line each, for the user
+
+    def voxels(self, R_map_from_world: NDArray[np.float64]) -> Voxels:
+        """The points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
+        table = VoxelTable("cloud")
+        table.add(rotate_points(self.points + self.origin_world, R_map_from_world), self.colors)
+        voxels = table.finish()
+        return Voxels(voxels.codes, voxels.nodes, voxels.origin, self.warnings + voxels.warnings)
+
+
 def stream_of(path: Path, raw: RawCloud) -> "CloudStream":
     """Points in memory as if they stood in a file named `path`."""
     return CloudStream([PointSource(path, lambda: iter([raw]), len(raw.colors))])
+
+
+@dataclass
+class BoundingBox:
+    """The smallest box, along the axes, around the points seen so far."""
+
+    low: Array = field(default_factory=lambda: np.full(3, np.inf))
+    high: Array = field(default_factory=lambda: np.full(3, -np.inf))
+
+    def add(self, points: Array) -> None:
+        """Widen to points (N, 3)."""
+        for k in range(3 if len(points) else 0):
+            self.low[k] = min(self.low[k], float(points[:, k].min()))
+            self.high[k] = max(self.high[k], float(points[:, k].max()))
+
+    def corners(self) -> Array:
+        """The eight corners (8, 3)."""
+        return np.array([np.where(bits, self.high, self.low) for bits in np.ndindex(2, 2, 2)])
 
 
 @dataclass(frozen=True)
@@ -34,6 +70,7 @@ class CloudStream:
     sources: Sequence[PointSource]  # in an order of their own: the user's changes nothing
     scale: float = 1.0  # metres per unit of the files
     show: Progress = no_progress  # progress
+    box: BoundingBox = field(default_factory=BoundingBox)  # of the points read so far [m]
 
     @property
     def label(self) -> str:
@@ -48,7 +85,9 @@ class CloudStream:
             total = None if source.num_points is None else math.ceil(source.num_points / CHUNK)
             try:
                 for raw in self.show(source.read_chunks(), total, f"read {source.path.name}"):
-                    yield validator.filter(raw)
+                    points_world, colors = validator.filter(raw)
+                    self.box.add(points_world)
+                    yield points_world, colors
             except OSError as error:
                 text = f"{source.path}: cannot be read ({error.strerror or error}), wanted a whole file"
                 raise InputError(text) from error

@@ -1,57 +1,23 @@
 """Clouds written again under a rigid transform, a chunk at a time."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+import math
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..geometry.point_transforms import transform_points
 from ..geometry.pose import Array
-from .ply_copy import is_ply, open_copy
 from .ply_writer import Rows, vertex_rows, writing_ply
-from .stream import CloudStream
-from .validation import Chunk, PointValidator
+from .readers.ply import PLY, PlyHeader, place_of_vertices, read_columns, read_header
+from .readers.reader import CHUNK, HEAD_SIZE
+from .stream import BoundingBox, CloudStream
 
 AXES, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
 MAX_LOSS = 1e-4  # of float32 coordinates by rounding [m]
-
-
-@dataclass
-class BoundingBox:
-    """The smallest box, along the axes, around the points seen so far."""
-
-    low: Array = field(default_factory=lambda: np.full(3, np.inf))
-    high: Array = field(default_factory=lambda: np.full(3, -np.inf))
-
-    def add(self, points: Array) -> None:
-        """Widen to points (N, 3)."""
-        for k in range(3 if len(points) else 0):
-            self.low[k] = min(self.low[k], float(points[:, k].min()))
-            self.high[k] = max(self.high[k], float(points[:, k].max()))
-
-    def corners(self) -> Array:
-        """The eight corners (8, 3)."""
-        return np.array([np.where(bits, self.high, self.low) for bits in np.ndindex(2, 2, 2)])
-
-
-@dataclass(frozen=True)
-class BoundedStream(CloudStream):
-    """A cloud that knows its bounding box once it has been read."""
-
-    box: BoundingBox = field(default_factory=BoundingBox)  # [m]
-
-    def chunks(self, validators: list[PointValidator]) -> Iterator[Chunk]:
-        """Yield the finite points in metres as CloudStream does."""
-        for points, colors in super().chunks(validators):
-            self.box.add(points)
-            yield points, colors
-
-
-def with_bounds(cloud: CloudStream) -> BoundedStream:
-    """The same cloud, which finds its bounding box while it is read."""
-    return BoundedStream(cloud.sources, cloud.scale, cloud.show)
 
 
 def needs_double(box: BoundingBox, T_target_from_source: Array, scale: float) -> bool:
@@ -61,7 +27,7 @@ def needs_double(box: BoundingBox, T_target_from_source: Array, scale: float) ->
 
 
 def write_transformed(
-    cloud: BoundedStream, T_target_from_source: Array, out: Path, finish: Callable[[], None]
+    cloud: CloudStream, T_target_from_source: Array, out: Path, finish: Callable[[], None]
 ) -> tuple[str, ...]:
     """Write a cloud, read once before, as binary PLY under a transform (4, 4) in the files' unit.
 
@@ -69,27 +35,67 @@ def write_transformed(
     other cloud is written with x y z and red green blue. `finish` runs when all is written, just before `out`
     appears. Returns a line for each element that was left out.
     """
-    is_double = needs_double(cloud.box, T_target_from_source, cloud.scale)
     path = cloud.sources[0].path
-    if len(cloud.sources) > 1 or not is_ply(path):
-        dtype = np.dtype(np.float64 if is_double else np.float32)
-        with writing_ply(
-            out, vertex_rows(np.empty((0, 3), dtype), np.empty((0, 3), np.uint8)).dtype
-        ) as writer:
-            for points, colors in cloud.chunks([]):
-                target = transform_points(points / cloud.scale, T_target_from_source)
-                writer.add(vertex_rows(target.astype(dtype), colors))
-            finish()
-        return ()
-    copy = open_copy(path)
-    dtype = _dtype_of(copy.dtype, is_double)
-    with writing_ply(out, dtype, copy.comments, copy.more) as writer:
-        for rows in cloud.show(copy.read_rows(), copy.num_chunks, "write"):
-            writer.add(_transformed_rows(rows, dtype, T_target_from_source))
-        for block in copy.read_rest():
-            writer.file.write(block)
+    with path.open("rb") as file:
+        is_ply = PLY.has_magic(file.read(HEAD_SIZE))
+    if is_ply and len(cloud.sources) == 1:
+        return _write_copy(cloud, read_header(path), T_target_from_source, out, finish)
+    dtype = np.float64 if needs_double(cloud.box, T_target_from_source, cloud.scale) else np.float32
+    fields = vertex_rows(np.empty((0, 3), dtype), np.empty((0, 3), np.uint8)).dtype
+    with writing_ply(out, fields) as writer:
+        for points, colors in cloud.chunks([]):
+            target = transform_points(points / cloud.scale, T_target_from_source)
+            writer.add(vertex_rows(target.astype(dtype), colors))
         finish()
-    return tuple(f"{path}: the element '{name}' is left out" for name in copy.left_out)
+    return ()
+
+
+def _write_copy(
+    cloud: CloudStream, header: PlyHeader, T_target_from_source: Array, out: Path, finish: Callable[[], None]
+) -> tuple[str, ...]:
+    """Write one PLY file with all that it holds, but for the elements in the lines returned.
+
+    Elements after the vertices are copied as bytes, so those of ASCII and big-endian files are left out, as
+    are elements before the vertices.
+    """
+    full = [k for k, count in enumerate(header.counts) if count and k != header.index]
+    copied = [k for k in full if k > header.index and header.byte_order == "<"]
+    more: list[str] = []
+    for k in copied:  # with its count, which plyfile was not given
+        element = header.elements[k]
+        more += [f"element {element.name} {header.counts[k]}", *map(str, element.properties)]
+    found = header.vertices.dtype("<")
+    dtype = _dtype_of(found, needs_double(cloud.box, T_target_from_source, cloud.scale))
+    columns = read_columns(header, found.names or ())
+    num_chunks = math.ceil(header.counts[header.index] / CHUNK)
+    with writing_ply(out, dtype, _comments(header), more) as writer:
+        for some in cloud.show(columns, num_chunks, "write"):
+            writer.add(_transformed_rows(_rows(some, found), dtype, T_target_from_source))
+        if copied:
+            offset, count, row = place_of_vertices(header)
+            with header.path.open("rb") as file:
+                file.seek(offset + count * row.itemsize)
+                shutil.copyfileobj(file, writer.file)
+        finish()
+    left_out = [header.elements[k].name for k in full if k not in copied]
+    return tuple(f"{header.path}: the element '{name}' is left out" for name in left_out)
+
+
+def _rows(columns: list[NDArray[np.generic]], dtype: np.dtype[Any]) -> Rows:
+    rows = np.empty(len(columns[0]), dtype)
+    for name, column in zip(dtype.names or (), columns, strict=True):
+        if dtype[name].kind in "iu" and column.dtype.kind == "f":  # of an ASCII file
+            limits = np.iinfo(dtype[name])
+            rows[name] = np.clip(np.nan_to_num(np.rint(column)), limits.min, limits.max)
+        else:
+            rows[name] = column
+    return rows
+
+
+def _comments(header: PlyHeader) -> tuple[str, ...]:
+    with header.path.open("rb") as file:
+        lines = file.read(header.size).decode("ascii", "replace").splitlines()
+    return tuple(line.removeprefix("comment ") for line in lines if line.startswith("comment "))
 
 
 def _dtype_of(dtype: np.dtype[Any], is_double: bool) -> np.dtype[Any]:

@@ -26,6 +26,7 @@ NEAR = 1.0  # height of furniture: what is so close above or below tells a floor
 AGREE_ANGLE = np.radians(3.0)  # of a plane to level or upright, that counts for up
 EVEN = 0.01  # rms distance from which on a plane counts less: ground is uneven, and not level [m]
 MAX_CHANGE = np.radians(1.0)  # of up by the planes
+PEAK_ANGLE = np.radians(8.0)  # of a wall to those averaged with it, modulo a quarter turn; as KIND_ANGLE
 
 
 @dataclass(frozen=True)
@@ -152,3 +153,22 @@ def _is_ceiling(things: Array, height: float) -> bool:
     """True if more of the things, at ascending heights (N,), are just below `height` than just above."""
     ends = np.searchsorted(things, height + np.array([-NEAR, -2.0 * TOLERANCE, 2.0 * TOLERANCE, NEAR]))
     return bool(ends[1] - ends[0] > ends[3] - ends[2])
+
+
+def manhattan_yaw(planes: list[Plane], R_level_from_scan: Array) -> float | None:
+    """The smallest turn about z [rad], in (-45, 45] deg, that puts the dominant walls along x and y.
+
+    None without walls. Walls a quarter turn apart count as one direction, the larger ones for more.
+    """
+    walls = [plane for plane in planes if plane.kind == "wall"]
+    if not walls:
+        return None
+    normals = np.array([R_level_from_scan @ wall.normal_world for wall in walls])
+    weights = np.array([wall.fraction for wall in walls])
+    # four times the azimuth is the same for all four directions of a rectangle
+    phases = np.exp(4j * np.arctan2(normals[:, 1], normals[:, 0]))
+    is_near = np.abs(np.angle(phases[:, None] / phases)) < 4.0 * PEAK_ANGLE
+    peak = int((is_near * weights).sum(axis=1).argmax())
+    mean = np.sum(weights[is_near[peak]] * phases[is_near[peak]])
+    turn = -0.25 * float(np.angle(mean))
+    return turn + 0.5 * np.pi if turn <= -0.25 * np.pi else turn

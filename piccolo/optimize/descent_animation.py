@@ -16,8 +16,14 @@ from ..errors import InputError
 from ..geometry.pose import Pose, step
 from ..panorama import Panorama
 from ..panorama.texels import Texels
-from ..render.overlay import checkerboard, resized_rgb
-from ..render.surfel_renderer import encode_image, fill_holes, render_surfels, visible_indices
+from ..render.surfel_renderer import (
+    checkerboard,
+    encode_image,
+    fill_holes,
+    render_surfels,
+    resized_rgb,
+    visible_indices,
+)
 from ..render.surfels import surfels_of
 from ..runtime.atomic import replacing_folder, write_atomically
 from ..runtime.threads import Workers

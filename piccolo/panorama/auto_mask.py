@@ -1,4 +1,4 @@
-"""Automatic masks: black borders, and patches over the nadir or zenith.
+"""What a picture tells by itself: black borders, patches over the nadir or zenith, two fisheye circles.
 
 Each rule is narrow, as what is masked wrongly is lost. The thresholds were set by hand, apart from both
 sides: tests/test_panorama_masks.py has the rooms that they must leave alone and the patches that they find.
@@ -28,6 +28,12 @@ DETAIL_DEG = 0.5  # over which detail is measured
 MIN_DETAIL = 4.0  # levels, around a disc without detail
 MIN_DETAIL_RATIO = 5.0  # of detail outside by detail inside
 NEAR_ROWS = round(2.0 * ROWS_PER_DEG)  # on each side, in which it is
+# Set by hand, between the circles and the panoramas of tests/test_panorama_masks.py.
+FISHEYE_SIZE = 128  # [px] of each half, for the test
+FISHEYE_BLACK = 24  # levels: the dark around the circles carries some noise
+MIN_BLACK_OUTSIDE = 0.98
+MIN_BRIGHT_INSIDE = 0.7  # of each sector of a ring within the circle
+FISHEYE_SECTORS = 8
 
 
 def black_borders(
@@ -125,3 +131,23 @@ def _detail_circle(cap: NDArray[np.float32]) -> int:
         if (outside >= np.maximum(MIN_DETAIL_RATIO * inside, MIN_DETAIL)).all():
             return k
     return 0
+
+
+def is_dual_fisheye(rgb: NDArray[np.uint8]) -> bool:
+    """True if all is black outside of the two circles inscribed in the halves, but not within them.
+
+    A panorama with black poles is black within the circles' upper and lower parts too; a dark one is dark all
+    around. Circles down to 0.9 of the halves' height are found.
+    """
+    small = cv2.resize(rgb, (2 * FISHEYE_SIZE, FISHEYE_SIZE), interpolation=cv2.INTER_AREA).max(axis=2)
+    v, u = np.mgrid[:FISHEYE_SIZE, :FISHEYE_SIZE] + 0.5 - FISHEYE_SIZE / 2
+    radius = np.hypot(u, v) / (FISHEYE_SIZE / 2)
+    sector = np.floor(np.arctan2(v, u) / (2.0 * np.pi) * FISHEYE_SECTORS).astype(int) % FISHEYE_SECTORS
+    is_ring = (radius > 0.7) & (radius < 0.85)
+    for half in (small[:, :FISHEYE_SIZE], small[:, FISHEYE_SIZE:]):
+        if (half[radius > 1.03] < FISHEYE_BLACK).mean() < MIN_BLACK_OUTSIDE:
+            return False
+        is_bright = half >= FISHEYE_BLACK
+        if min(is_bright[is_ring & (sector == k)].mean() for k in range(FISHEYE_SECTORS)) < MIN_BRIGHT_INSIDE:
+            return False
+    return True

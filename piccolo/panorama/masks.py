@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .crop import ASPECT_TOLERANCE
-from .cube_files import SUFFIXES
+from .cube import SUFFIXES
 from .picture import read_picture
 
 MIN_MASK = (16, 8)  # [px]

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cloud.model import Cloud
 from ..cloud.soa import PackedPoints, pack_points
+from ..cloud.stream import Cloud
 from ..confidence.alternatives import Hypothesis, alternative_poses, score_margin
 from ..confidence.confidence import PAPER_MODEL, classify
 from ..confidence.localization import Localization
@@ -15,14 +15,13 @@ from ..geometry.pose import Pose
 from ..geometry.rotations import uniform_rotations, uniform_yaws
 from ..optimize.refine import Loss, Refined, refine, sampling_loss_of
 from ..panorama import Panorama
-from ..panorama.resize import shrink
+from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from .photometric import photometric_loss_of
-from .search import search
+from .search import free_grid, search
 from .settings import PaperSettings
-from .starts import free_grid
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from ..cloud.soa import PackedPoints
 from ..geometry.pose import Array, Pose
+from ..panorama import Panorama
+from ..panorama.model import shrink
 from ..runtime.threads import Workers
-from .splatting import MIN_RADIUS_PX, splat
-from .surfels import Surfels, surfels_of
+from .surfels import MIN_RADIUS_PX, Surfels, splat, surfels_of
 from .zbuffer import nearest_depth, select_visible
 
 STRIP = 1 << 21  # pixels that one thread draws at a time
@@ -23,6 +24,8 @@ MAX_RADIUS = 1.5  # by the radius that 95 % of the surfels stay below
 MIN_RANGE = 1e-3  # [m] nearer to the camera nothing is drawn
 HIDING_WIDTHS = (360, 720)  # cells of 1 and 1/2 degrees; wider ones hide what is seen through a door ajar
 FAR_ANGLE = 0.02  # [rad] as which a far surfel's radius is seen
+OVERLAY_WIDTH = 1024
+NUM_TILES = 16  # columns of the checkerboard
 
 
 @dataclass(frozen=True)
@@ -162,3 +165,22 @@ def encode_image(image: NDArray[np.uint8] | NDArray[np.uint16], suffix: str) -> 
     if not is_encoded:
         raise OSError(f"an image of {image.shape[1]} x {image.shape[0]} could not be encoded as {suffix}")
     return content.tobytes()
+
+
+def resized_rgb(panorama: Panorama, width: int) -> NDArray[np.uint8]:
+    """The panorama's colours, resized to (width / 2, width, 3)."""
+    rgb = shrink(panorama, width).rgb
+    return np.asarray(cv2.resize(rgb, (width, width // 2), interpolation=cv2.INTER_LINEAR), np.uint8)
+
+
+def checkerboard(photo: NDArray[np.uint8], cloud: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Two images (H, W, 3) and a checkerboard of both, one above the other (3 H, W, 3)."""
+    row, column = np.indices(photo.shape[:2]) // (photo.shape[1] // NUM_TILES)
+    mixed = np.where(((row + column) % 2 == 0)[..., None], photo, cloud)
+    return np.concatenate([photo, cloud, mixed])
+
+
+def overlay_png(points: PackedPoints, panorama: Panorama, pose: Pose, workers: Workers) -> bytes:
+    """PNG file of three images, one above the other: panorama, cloud from the pose, checkerboard of both."""
+    cloud = fill_holes(render_points(points, pose, OVERLAY_WIDTH, workers))
+    return encode_image(checkerboard(resized_rgb(panorama, OVERLAY_WIDTH), cloud), ".png")

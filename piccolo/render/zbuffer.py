@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..cloud.soa import PackedPoints
 from ..geometry.pose import Array, Pose
-from ..geometry.sphere import direction_to_pixel
+from ..geometry.sphere import direction_to_pixel, solid_angles
 from ..panorama.texels import channel
 from ..runtime.jit import kernel
 
@@ -21,6 +21,7 @@ VISIBLE_FACTOR = np.float32(1.08)
 VISIBLE_OFFSET = np.float32(0.1)
 MIN_VIEW_WIDTH, MAX_VIEW_WIDTH = 32, 4096  # [px] of a rendered view
 VISIBLE_WIDTH = 180  # cells of 2 degrees
+MIN_SEEN_FRACTION = 0.4  # of the sphere; less is seen from outside a scan
 
 
 @dataclass(frozen=True)
@@ -132,3 +133,13 @@ def visible_points(points: PackedPoints, center_world: Array) -> PackedPoints:
     R, t = pose.R_cam_from_world, pose.center_world
     count = select_visible(points.x, points.y, points.z, R, t, VISIBLE_WIDTH, depth, indices)
     return points.take(indices[:count])
+
+
+def is_free_space(points: PackedPoints, center: Array, width: int, min_clearance: float) -> bool:
+    """True if no point is within `min_clearance` [m] of `center` (3,), and points are seen all around.
+
+    Both follow from the nearest range in each cell of an equirectangular view `width` cells wide.
+    """
+    depth = nearest_depth(points, Pose(np.eye(3), center), width).reshape(-1, width)
+    seen = np.isfinite(depth).sum(axis=1) @ solid_angles(width) / (4.0 * math.pi)
+    return bool(depth.min() > min_clearance and seen > MIN_SEEN_FRACTION)

@@ -7,27 +7,26 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.point_transforms import rotate_points
+from ...geometry.pose import Array, Pose
 from .e57_file import (
     MAGIC,
     NAMESPACE,
     E57File,
-    Placement,
     child,
     children,
     number_of,
     opened,
     parsed_integer,
-    placement_of,
+    pose_of,
     refusing,
     scaled,
     text_of,
 )
-from .intensity import OPTION, intensity_reader
 from .reader import CHUNK, PLAIN, CloudFormat, CloudReadOptions, PointSource, RawCloud
+from .scalars import OPTION, intensity_reader
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
@@ -37,8 +36,6 @@ INTENSITY = "intensity"
 INVALID_COLOR, INVALID_INTENSITY = "isColorInvalid", "isIntensityInvalid"
 TOLERANCE = 0.01  # of 255, what a float colour may lie outside of its range
 WANTED = "wanted scans with colorRed colorGreen colorBlue"
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -52,7 +49,7 @@ class E57Scan:
     channels: tuple[str, ...]  # COLORS or INTENSITY alone
     invalid: tuple[str, ...]  # fields that are 0 in points that count
     color_ranges: tuple[tuple[float, float], ...]  # of each channel; none: the intensity is read
-    placement: Placement | None
+    pose: Pose | None  # the scanner is the camera
 
 
 class _UnusableError(Exception):
@@ -119,8 +116,8 @@ def _scan(file: E57File, element: Element, channels: tuple[str, ...], index: int
         raise InputError(f"{file.path}: {label} {found}; it is broken")
     names = tuple(name for name in invalid if name in fields)
     ranges = (_color_range(file.path, element, fields[name]) for name in channels if name != INTENSITY)
-    placement = placement_of(file.path, element)
-    return E57Scan(index, label, num_points, coordinates, channels, names, tuple(ranges), placement)
+    pose = pose_of(file.path, element)
+    return E57Scan(index, label, num_points, coordinates, channels, names, tuple(ranges), pose)
 
 
 def _num_bits(path: Path, field: Element) -> int:
@@ -184,9 +181,9 @@ def _in_world(scan: E57Scan, a: Array, b: Array, c: Array) -> Array:
         if scan.coordinates == SPHERICAL:
             a, b, c = a * np.cos(c) * np.cos(b), a * np.cos(c) * np.sin(b), a * np.sin(c)
         points = np.stack([a, b, c], axis=1)
-        if placement := scan.placement:
-            return rotate_points(points, placement.R_world_from_local) + placement.center_world
-        return points
+        if scan.pose is None:
+            return points
+        return rotate_points(points, scan.pose.R_cam_from_world.T) + scan.pose.center_world
 
 
 def _read_scan(file: E57File, scan: E57Scan) -> Iterator[dict[str, Array]]:

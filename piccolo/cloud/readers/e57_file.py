@@ -16,10 +16,9 @@ from typing import Any
 from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...geometry.pose import rotation_from_quaternion_wxyz
+from ...geometry.pose import Array, Pose, rotation_from_quaternion_wxyz
 from ...runtime.optional import import_optional
 from .reader import quoted
 
@@ -32,14 +31,6 @@ MAX_XML_SIZE = 1 << 26  # [byte]
 MAX_ELEMENTS, MAX_PARTS, MAX_IN_VECTOR, MAX_DEPTH = 500_000, 500, 20_000, 32
 INTEGER = re.compile(r"[+-]?[0-9]{1,19}")
 CHECK_ALL = 100  # [%] of the pages have their checksum verified
-
-
-@dataclass(frozen=True)
-class Placement:
-    """Where a scan or an image stands: `x_world = R_world_from_local @ x_local + center_world`."""
-
-    R_world_from_local: NDArray[np.float64]  # (3, 3)
-    center_world: NDArray[np.float64]  # (3,)
 
 
 @dataclass(frozen=True)
@@ -189,7 +180,7 @@ def parsed_integer(path: Path, text: str) -> int:
     return int(text)
 
 
-def placement_of(path: Path, element: Element) -> Placement | None:
+def pose_of(path: Path, element: Element) -> Pose | None:
     """The pose of a scan or an image; None if it has none. A part that is missing is the identity's."""
     pose = child(element, "pose")
     if pose is None:
@@ -199,8 +190,8 @@ def placement_of(path: Path, element: Element) -> Placement | None:
     if not 0.0 < np.linalg.norm(q) < math.inf:
         raise InputError(f"{path}: a pose's rotation is {q.tolist()}, wanted a quaternion w x y z")
     center_world = _numbers(path, child(pose, "translation"), "xyz")
-    return Placement(rotation_from_quaternion_wxyz(q), center_world)
+    return Pose(rotation_from_quaternion_wxyz(q).T, center_world)
 
 
-def _numbers(path: Path, element: Element | None, names: str) -> NDArray[np.float64]:
+def _numbers(path: Path, element: Element | None, names: str) -> Array:
     return np.array([number_of(path, child(element, name)) or 0.0 for name in names])

@@ -7,15 +7,15 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from ...errors import InputError
+from ...geometry.pose import Pose
 from .e57_file import (
     E57File,
-    Placement,
     child,
     children,
     number_of,
     opened,
     parsed_integer,
-    placement_of,
+    pose_of,
     refusing,
     text_of,
 )
@@ -42,7 +42,7 @@ class E57Image:
     width: int  # [px]
     height: int  # [px]
     fov_deg: tuple[float, float] | None  # of a spherical image, across and down
-    placement: Placement | None
+    pose: Pose | None
     scan_guid: str  # of the scan it belongs to, or empty
     node: tuple[int, str, str]  # index in images2D, names of the representation and the blob
 
@@ -86,7 +86,7 @@ def _images(file: E57File, number: int, element: Element) -> Iterator[E57Image]:
                 width=_side(file.path, representation, "imageWidth"),
                 height=_side(file.path, representation, "imageHeight"),
                 fov_deg=_fov_deg(file.path, representation) if kind == "spherical" else None,
-                placement=placement_of(file.path, element),
+                pose=pose_of(file.path, element),
                 scan_guid=text_of(element, "associatedData3DGuid"),
                 node=(number, representation_name, blob_name),
             )

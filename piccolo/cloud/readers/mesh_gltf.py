@@ -12,8 +12,7 @@ from typing import Any
 from urllib.parse import unquote
 
 from ...errors import InputError
-from .mesh_files import FolderResolver
-from .mesh_texture import first_line
+from .mesh_files import FolderResolver, first_line
 
 GLB_MAGIC = b"glTF"
 WANTED = "wanted a whole glTF 2.0 mesh"

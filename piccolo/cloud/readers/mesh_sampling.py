@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry.pose import Array
-from .mesh_texture import Texture
+from .mesh_files import Texture
 from .reader import CHUNK, RawCloud
 
 # 1 / p and 1 / p^2 of the plastic number p, the root of p^3 = p + 1

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from .colors import BRIGHTEST, brightest_of, colored_chunks
-from .fixed_records import in_chunks, read_records
+from .columns import in_chunks, read_records
 from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, point_label, quoted
 
 NPY_MAGIC, ZIP_MAGIC = b"\x93NUMPY", b"PK\x03\x04"

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from . import fixed_records
 from . import reader as raw
 from .colors import BRIGHTEST, colored_chunks
-from .intensity import check_option, intensity_reader
 from .reader import CUT, CloudReadOptions, PointSource, PointsWithScalar, RawCloud, quoted
+from .scalars import check_option, intensity_reader
 
 BLOCK = 1 << 20  # [byte] read at once; no line is longer
 COMMENT_MARKS = (b"#", b"//")
@@ -85,7 +84,7 @@ class NumberLines:
     def take_rows(self, count: int) -> NDArray[np.float64]:
         """The wanted columns (R, C) of the next lines, R <= `count`; R = 0 at the end."""
         columns, num_columns = list(self.layout.columns), self.layout.num_columns
-        most = fixed_records.MAX_BLOCK_SIZE // (8 * (num_columns or len(columns)))
+        most = raw.MAX_BLOCK_SIZE // (8 * (num_columns or len(columns)))
         first = next(self._lines, None)
         if first is None:
             return np.empty((0, len(columns)))

@@ -1,6 +1,7 @@
 """PCD files of the Point Cloud Library, 0.5 to 0.7: ascii, binary and binary_compressed.
 
-VIEWPOINT is where the sensor was; the points are already in the cloud's frame, so it is not applied.
+VIEWPOINT is where the sensor was; the points are already in the cloud's frame, so it is not applied. The
+compression is LZF: runs of bytes as they are, and copies of what came before.
 """
 
 import re
@@ -12,15 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
+from ...runtime.jit import inline_kernel, kernel
 from .colors import color_names
-from .columns import ColumnReader, Columns, column_source, points_of
-from .fixed_records import in_chunks, read_records, take_records
-from .intensity import check_option
-from .lzf import MAX_RATIO, decompress_lzf
+from .columns import ColumnReader, Columns, column_source, in_chunks, points_of, read_records, take_records
 from .number_lines import LineLayout, NumberLines
 from .pcd_header import WANTED, PcdField, PcdHeader, read_header
 from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, RawCloud, point_label, quoted
+from .scalars import check_option
 
+LZF_BROKEN = -1
+MAX_RATIO = 88  # three bytes can stand for a copy of 264
+MAX_LITERALS = 32  # a control byte below it is a run of one more bytes than it says
+LONG_COPY = 7  # the length in the control byte's upper three bits that has a byte of its own behind it
 FIRST_LINES = re.compile(rb"(?:#[^\n]*\n|[ \t\r\n])*(?:# \.PCD|VERSION[ \t]+0?\.\d)")
 PADDING = "_"
 BROKEN = "the file is cut off or broken"
@@ -32,6 +36,43 @@ TYPES = {  # of fields that are not colours on their own
     **dict.fromkeys(PACKED_NAMES, (("f4", "u4", "i4"), "uint32, int32 or float32")),
     **dict.fromkeys((INTENSITY, LABEL), (SCALAR_TYPES, "numbers of 32 bits or float64")),
 }
+
+
+@inline_kernel
+def append(source, begin, length, out, filled):
+    """How much of `out` is filled when `length` bytes of `source` come after `filled`, or LZF_BROKEN."""
+    if begin < 0 or begin + length > len(source) or filled + length > len(out):
+        return LZF_BROKEN
+    for k in range(length):  # one by one: a copy that reaches into itself repeats a pattern
+        out[filled + k] = source[begin + k]
+    return filled + length
+
+
+@kernel
+def decompress_lzf(data, out):
+    """Fill `out` (uint8) from compressed `data` (uint8); the number of bytes filled, or LZF_BROKEN.
+
+    Broken is what would read before the beginning of `out`, or go beyond the end of either.
+    """
+    i, filled = 0, 0
+    while filled >= 0 and i < len(data):
+        control = int(data[i])
+        i += 1
+        if control < MAX_LITERALS:
+            filled = append(data, i, control + 1, out, filled)
+            i += control + 1
+        else:
+            length = control >> 5
+            is_long = length == LONG_COPY
+            if i + is_long >= len(data):
+                return LZF_BROKEN
+            if is_long:
+                length += int(data[i])
+                i += 1
+            distance = ((control & 31) << 8) + int(data[i]) + 1
+            filled = append(out, filled - distance, length + 2, out, filled)
+            i += 1
+    return filled
 
 
 def open_pcd(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:

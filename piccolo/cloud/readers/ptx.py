@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.point_transforms import transform_points
-from .intensity import check_option, intensity_reader
 from .number_lines import NUM_WITH_INTENSITY, LineLayout, NumberLines
 from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, PointsWithScalar, RawCloud, quoted
+from .scalars import check_option, intensity_reader
 
 NUMBERS_A_LINE = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
 MAX_COUNT_DIGITS = 9

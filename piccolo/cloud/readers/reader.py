@@ -11,6 +11,7 @@ from ..label_colors import Labels
 
 HEAD_SIZE = 512  # [byte] by which a format is known
 CHUNK = 1 << 20  # points of a chunk, at most
+MAX_BLOCK_SIZE = 1 << 28  # [byte] read at once, in which CHUNK records of 256 bytes have room
 CUT = "the file was cut while it was read, wanted a whole file"
 
 # points (N, 3) in the file's unit, and a number (N,) of each: intensity or label

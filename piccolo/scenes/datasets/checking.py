@@ -13,7 +13,7 @@ from ...cloud.soa import pack_points
 from ...confidence.score import VIEW_WIDTH, agreement_at
 from ...geometry.pose import Array, Pose
 from ...panorama import read_panorama
-from ...panorama.resize import shrink
+from ...panorama.model import shrink
 from ...runtime.threads import Progress, Workers, no_progress
 from ..scene import Query, Scene
 from .files import AXES

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...runtime.figure import new_figure
 from .query_result import QueryResult, Thresholds
-from .statistics import Point
+from .tables import Point
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,9 +8,8 @@ from ...result import Result
 from ...runtime.atomic import check_output, check_output_folder
 from .geojson import GEOJSON
 from .gpano import GPANO
-from .pose_lists import CSV, KITTI, POTREE, TUM
+from .pose_lists import COLMAP, CSV, KITTI, NERFSTUDIO, OPENSFM, POTREE, TUM
 from .posed_images import Format, Options, Selection, posed_images, select, true_results
-from .reconstructions import COLMAP, NERFSTUDIO, OPENSFM
 
 __all__ = ["FORMATS", "Format", "Options", "Selection", "export", "select", "true_results"]
 

@@ -1,4 +1,4 @@
-"""Lists of poses as text: CSV for spreadsheets, trajectories for evo and others, Potree's 360 images.
+"""Poses as text: CSV, trajectories for evo and others, Potree's images, COLMAP, nerfstudio and OpenSfM.
 
 Numbers are written so that the same float64 is read back. Where a format has no place for the offset, it is
 written beside it: <name>.offset.txt.
@@ -6,13 +6,24 @@ written beside it: <name>.offset.txt.
 
 import csv
 import io
+import json
 from collections.abc import Iterable, Sequence
 from decimal import Decimal
 from pathlib import Path
 
-from ...geometry.camera_axes import CAMERA_AXES, heading_pitch_roll_deg, turned
-from ...geometry.pose import T_world_from_cam, quaternion_wxyz
-from ...runtime.atomic import write_atomically
+import numpy as np
+
+from ...errors import InputError
+from ...geometry.camera_axes import (
+    CAMERA_AXES,
+    OPENGL_FROM_CAM,
+    OPTICAL_FROM_CAM,
+    heading_pitch_roll_deg,
+    translation,
+    turned,
+)
+from ...geometry.pose import T_world_from_cam, log_so3, quaternion_wxyz
+from ...runtime.atomic import replacing_folder, write_atomically
 from .posed_images import Format, Options, PosedImage
 
 COLUMNS = (
@@ -94,8 +105,89 @@ def write_potree(images: Sequence[PosedImage], out: Path, options: Options) -> N
     write_lines(out, lines)
 
 
-CSV = Format("csv", "table with a header", write_csv, frozenset({"offset"}), has_unique_names=False)
-TUM = Format("tum", "trajectory for evo and others", write_tum, frozenset({"offset", "axes", "timestamps"}))
-KITTI = Format("kitti", "trajectory for evo and others", write_kitti, frozenset({"offset", "axes"}))
-TEXT = "coordinates.txt of Potree's 360 images, in the folder that --images names"
-POTREE = Format("potree", TEXT, write_potree, frozenset({"offset", "timestamps"}), forbidden='"')
+def write_colmap(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write cameras.txt, images.txt and a points3D.txt without points into a new folder.
+
+    https://colmap.github.io/format.html: T_cam_from_world, camera axes right, down, forward. The camera model
+    EQUIRECTANGULAR came with COLMAP 4; its parameters are the width and height. Its pixels are ours.
+    """
+    camera_ids = {size: i for i, size in enumerate(dict.fromkeys(image.size for image in images), 1)}
+    cameras = [f"{i} EQUIRECTANGULAR {w} {h} {w} {h}" for (w, h), i in camera_ids.items()]
+    lines = []
+    for i, image in enumerate(images, 1):
+        pose = turned(image.pose, OPTICAL_FROM_CAM)
+        values = numbers([*quaternion_wxyz(pose.R_cam_from_world), *translation(pose)])
+        lines += [f"{i} {values} {camera_ids[image.size]} {image.name}", ""]  # a line of points follows
+    offset = offset_comment(options)
+    with replacing_folder(out) as folder:
+        comment = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"
+        write_lines(folder / "cameras.txt", [comment, *offset, *cameras])
+        comment = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then a line of points"
+        write_lines(folder / "images.txt", [comment, *offset, *lines])
+        write_lines(folder / "points3D.txt", ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"])
+
+
+def write_nerfstudio(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write transforms.json: T_world_from_cam, camera axes right, up, back; the offset is applied_transform.
+
+    Rays of EQUIRECTANGULAR in nerfstudio/cameras/cameras.py: theta = -pi (x - cx) / fl_x,
+    phi = pi (1/2 + (y - cy) / fl_y), direction (-sin theta sin phi, cos phi, -cos theta sin phi): the image
+    centre looks along -z.
+    """
+    is_one_size = len({image.size for image in images}) == 1
+    document: dict[str, object] = {"camera_model": "EQUIRECTANGULAR"}
+    if is_one_size:
+        document |= _intrinsics(images[0].size)
+    if options.offset is not None:
+        moved = np.column_stack([np.eye(3), -np.array(options.offset)])
+        document["applied_transform"] = moved.tolist()
+    frames = []
+    for image in images:
+        own = {} if is_one_size else _intrinsics(image.size)
+        matrix = T_world_from_cam(turned(image.pose, OPENGL_FROM_CAM)).tolist()
+        frames.append({"file_path": image.name, **own, "transform_matrix": matrix})
+    write_json(out, document | {"frames": frames})
+
+
+def _intrinsics(size: tuple[int, int]) -> dict[str, float]:
+    """The sphere as a focal length: x - cx reaches +-fl_x at the seam, y - cy +-fl_y / 2 at the poles."""
+    w, h = size
+    return {"w": w, "h": h, "fl_x": w / 2, "fl_y": float(h), "cx": w / 2, "cy": h / 2}
+
+
+def write_opensfm(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write a list of one reconstruction without points. Camera axes right, down, forward.
+
+    https://opensfm.org/docs/geometry.html: rotation is an angle-axis vector and translation t of
+    x_cam = R x_world + t. Its spherical camera takes the sphere to be W = 2 H exactly.
+    """
+    cameras, shots = {}, {}
+    for image in images:
+        width, height = image.size
+        if width != 2 * height:
+            raise InputError(f"{image.path}: found {width} x {height}, wanted W = 2 H exactly for OpenSfM")
+        camera = f"spherical {width} {height}"
+        cameras[camera] = {"projection_type": "spherical", "width": width, "height": height}
+        pose = turned(image.pose, OPTICAL_FROM_CAM)
+        rotation, t = log_so3(pose.R_cam_from_world).tolist(), translation(pose).tolist()
+        shots[image.name] = {"rotation": rotation, "translation": t, "camera": camera}
+    write_offset_beside(out, options)
+    write_json(out, [{"cameras": cameras, "shots": shots, "points": {}}])
+
+
+def write_json(out: Path, document: object) -> None:
+    """Write a JSON file."""
+    write_atomically(out, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
+
+
+OFFSET, MODEL = frozenset({"offset"}), frozenset({"size", "offset"})
+COLMAP_TEXT = "text model of COLMAP 4 and pycolmap; --out is a new folder"
+NERFSTUDIO_TEXT = "transforms.json of nerfstudio, in the folder that --images names"
+POTREE_TEXT = "coordinates.txt of Potree's 360 images, in the folder that --images names"
+COLMAP = Format("colmap", COLMAP_TEXT, write_colmap, MODEL, is_folder=True, forbidden=" ")  # ends a name
+NERFSTUDIO = Format("nerfstudio", NERFSTUDIO_TEXT, write_nerfstudio, MODEL)
+OPENSFM = Format("opensfm", "reconstruction.json of OpenSfM", write_opensfm, MODEL)
+CSV = Format("csv", "table with a header", write_csv, OFFSET, has_unique_names=False)
+TUM = Format("tum", "trajectory for evo and others", write_tum, OFFSET | {"axes", "timestamps"})
+KITTI = Format("kitti", "trajectory for evo and others", write_kitti, OFFSET | {"axes"})
+POTREE = Format("potree", POTREE_TEXT, write_potree, OFFSET | {"timestamps"}, forbidden='"')

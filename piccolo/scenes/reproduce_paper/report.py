@@ -7,8 +7,7 @@ import numpy as np
 from ...runtime.figure import new_figure
 from ..evaluation.plots import figure_png
 from ..evaluation.query_result import QueryResult
-from ..evaluation.statistics import summarize
-from ..evaluation.tables import Table
+from ..evaluation.tables import Table, summarize
 from .experiments import Condition
 
 COLUMNS = ("", "preset", "queries", "accuracy", "t 50 % [m]", "t of correct [m]", "R 50 % [deg]")

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from ...geometry.pose import Pose
 from ...geometry.rotations import Gravity
 from ...runtime.threads import Workers
-from .repeated import REPEATED_KINDS, make_repeated
-from .sensors import blur
-from .world import VARIANTS, World, make_query, make_world, random_size, scan_world
+from .room import REPEATED_KINDS, make_repeated
+from .world import VARIANTS, World, blur, make_query, make_world, random_size, scan_world
 
 WIDTH = 1024  # of the panoramas [px]
 POINTS_PER_ROOM = 120_000
