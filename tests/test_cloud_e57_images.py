@@ -6,7 +6,7 @@ from e57_files import ImageToWrite, with_xml, write
 from test_cloud_e57 import CENTER, QUATERNION, R_WORLD, scan
 
 from piccolo.cli import e57_images
-from piccolo.cloud.readers.e57_images import list_images, read_image
+from piccolo.cloud.readers.e57 import list_images, read_image
 from piccolo.errors import InputError
 from piccolo.geometry.pose import quaternion_wxyz
 

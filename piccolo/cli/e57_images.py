@@ -5,7 +5,7 @@ import json
 import re
 from pathlib import Path
 
-from ..cloud.readers.e57_images import E57Image, list_images, read_image
+from ..cloud.readers.e57 import E57Image, list_images, read_image
 from ..errors import InputError
 from ..geometry.pose import quaternion_wxyz
 from ..runtime.atomic import write_atomically

@@ -47,7 +47,7 @@ def colored_chunks(
     for points, values in chunks:
         with np.errstate(invalid="ignore"):  # a NaN of the kind that signals
             points_world = points.astype(np.float64)
-        colors, wrong = to_uint8(values, points_world, brightest)
+        colors, wrong = _to_uint8(values, points_world, brightest)
         if wrong >= 0:
             color = " ".join(f"{value:g}" for value in values[wrong].tolist())
             place = locate(num_before + wrong)
@@ -56,7 +56,7 @@ def colored_chunks(
         yield RawCloud(points_world, colors)
 
 
-def to_uint8(
+def _to_uint8(
     colors: NDArray[np.generic], points_world: NDArray[np.float64], brightest: float
 ) -> tuple[NDArray[np.uint8], int]:
     """Colours (N, 3) uint8 of values 0 to `brightest`, and the first row that is out of range, or -1.

@@ -1,8 +1,10 @@
-"""E57 files: the coloured points of all scans, each at its pose; decoded by libE57."""
+"""E57 files, decoded by libE57: the coloured points of all scans, each at its pose, and the images."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -36,6 +38,14 @@ INTENSITY = "intensity"
 INVALID_COLOR, INVALID_INTENSITY = "isColorInvalid", "isIntensityInvalid"
 TOLERANCE = 0.01  # of 255, what a float colour may lie outside of its range
 WANTED = "wanted scans with colorRed colorGreen colorBlue"
+KINDS = {
+    "spherical": "sphericalRepresentation",
+    "pinhole": "pinholeRepresentation",
+    "cylindrical": "cylindricalRepresentation",
+    "visual-reference": "visualReferenceRepresentation",
+}
+ENCODINGS = {"jpeg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n"}
+MAX_SIDE = 1 << 20  # [px]
 
 
 @dataclass(frozen=True)
@@ -206,3 +216,82 @@ def _read_scan(file: E57File, scan: E57Scan) -> Iterator[dict[str, Array]]:
 
 
 E57 = CloudFormat("E57", frozenset({".e57"}), lambda head: head.startswith(MAGIC), open_e57)
+
+
+@dataclass(frozen=True)
+class E57Image:
+    """One representation of one image of a file."""
+
+    name: str
+    kind: str  # of KINDS
+    encoding: str  # of ENCODINGS
+    size: int  # [byte]
+    width: int  # [px]
+    height: int  # [px]
+    fov_deg: tuple[float, float] | None  # of a spherical image, across and down
+    pose: Pose | None
+    scan_guid: str  # of the scan it belongs to, or empty
+    node: tuple[int, str, str]  # index in images2D, names of the representation and the blob
+
+
+def list_images(path: Path) -> list[E57Image]:
+    """The images of an E57 file, in its order."""
+    with opened(path) as file:
+        return list(_images(file))
+
+
+def read_image(path: Path, index: int) -> bytes:
+    """The JPEG or PNG file that is the image of that index in list_images."""
+    with opened(path) as file:
+        image = list(_images(file))[index]
+        number, representation, blob = image.node
+        with refusing(path, file.libe57):
+            content = file.image_file.root()["images2D"][number][representation][blob].read_buffer().tobytes()
+    if not content.startswith(ENCODINGS[image.encoding]):
+        raise InputError(f"{path}: image {index} begins with {content[:8]!r}, wanted a {image.encoding} file")
+    return bytes(content)
+
+
+def _images(file: E57File) -> Iterator[E57Image]:
+    """The representations of the elements of images2D that hold an image."""
+    for (number, element), (kind, representation_name) in product(
+        enumerate(children(file.root, "images2D")), KINDS.items()
+    ):
+        representation = child(element, representation_name)
+        for encoding in ENCODINGS:
+            blob = child(representation, f"{encoding}Image")
+            if representation is None or blob is None or blob.get("type") != "Blob":
+                continue
+            size = parsed_integer(file.path, blob.get("length", ""))
+            if not 0 < size <= file.size:  # libE57 reserves it
+                found = f"promises {size} bytes, found a file of {file.size} bytes"
+                raise InputError(f"{file.path}: image {number} {found}; it is broken")
+            yield E57Image(
+                name=text_of(element, "name"),
+                kind=kind,
+                encoding=encoding,
+                size=size,
+                width=_side(file.path, representation, "imageWidth"),
+                height=_side(file.path, representation, "imageHeight"),
+                fov_deg=_fov_deg(file.path, representation) if kind == "spherical" else None,
+                pose=pose_of(file.path, element),
+                scan_guid=text_of(element, "associatedData3DGuid"),
+                node=(number, representation_name, f"{encoding}Image"),
+            )
+
+
+def _side(path: Path, representation: Element, name: str) -> int:
+    value = number_of(path, child(representation, name)) or 0.0
+    if not 0 < value <= MAX_SIDE:
+        raise InputError(f"{path}: an image's {name} is {value:g}, wanted 1 to {MAX_SIDE}")
+    return int(value)
+
+
+def _fov_deg(path: Path, representation: Element) -> tuple[float, float] | None:
+    """What a spherical image covers [deg], across and down, if the file says how large its pixels are."""
+    width, height = (number_of(path, child(representation, name)) for name in ("pixelWidth", "pixelHeight"))
+    if width is None or height is None:
+        return None
+    across = width * _side(path, representation, "imageWidth")
+    down = height * _side(path, representation, "imageHeight")
+    return math.degrees(across), math.degrees(down)
