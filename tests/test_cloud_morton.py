@@ -1,5 +1,5 @@
 import math
-from dataclasses import astuple, replace
+from dataclasses import replace
 from pathlib import Path
 
 import naive
@@ -33,7 +33,7 @@ def clean(path, raw, scale):
 def whole(open_source, path, options=PLAIN):
     """All points that a reader finds in a file."""
     chunks = list(open_source(path, options).read_chunks())
-    return RawCloud(*(np.concatenate(arrays) for arrays in zip(*map(astuple, chunks), strict=True)))
+    return RawCloud(*(np.concatenate(arrays) for arrays in zip(*chunks, strict=True)))
 
 
 def same_bits(a: Cloud, b: Cloud):

@@ -9,8 +9,7 @@ import pytest
 from poses import result
 
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose, exp_so3
-from piccolo.geometry.pose_error import is_correct
+from piccolo.geometry.pose import Pose, exp_so3, is_correct
 from piccolo.scenes.evaluation import tables
 from piccolo.scenes.evaluation.plots import errors_figure, figure_png, risk_figure
 from piccolo.scenes.evaluation.query_result import (

@@ -4,8 +4,8 @@ import pytest
 import rooms
 from scipy.spatial import cKDTree
 
-from piccolo.cloud.octree import build_octree
 from piccolo.cloud.stream import Cloud
+from piccolo.cloud.voxels import build_octree
 from piccolo.coarse_to_fine.camera_positions import (
     candidate_centers,
     coverage,

@@ -21,8 +21,7 @@ from piccolo.cloud.stream import Cloud
 from piccolo.coarse_to_fine.localize import localize
 from piccolo.coarse_to_fine.scan_map import prepare_map
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
-from piccolo.geometry.pose import Pose
-from piccolo.geometry.pose_error import is_correct
+from piccolo.geometry.pose import Pose, is_correct
 from piccolo.geometry.rotations import Gravity
 from piccolo.panorama import Panorama, read_panorama
 from piccolo.runtime.stopwatch import Stopwatch

@@ -3,8 +3,8 @@
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import product
+from typing import NamedTuple
 
 import _checkout  # noqa: F401
 import numpy as np
@@ -37,8 +37,7 @@ the seeds to check, by the weights in use and by those fitted.
 """
 
 
-@dataclass(frozen=True)
-class Choice:
+class Choice(NamedTuple):
     """The hypotheses of one cloud."""
 
     kind: str

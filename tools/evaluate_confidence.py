@@ -17,7 +17,7 @@ from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import IN_METRES
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.confidence.confidence import AMBIGUOUS, LOCALIZED
-from piccolo.geometry.pose_error import is_correct
+from piccolo.geometry.pose import is_correct
 from piccolo.geometry.rotations import Gravity
 from piccolo.panorama import AS_STORED, read_panorama
 from piccolo.paper.settings import PaperSettings

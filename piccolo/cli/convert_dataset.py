@@ -3,7 +3,7 @@
 import argparse
 import json
 from collections import Counter
-from dataclasses import asdict, fields
+from dataclasses import fields
 
 from ..errors import InputError
 from ..runtime.threads import Progress, Workers, num_cores
@@ -120,7 +120,7 @@ def convert_scene(spec: SceneSpec, arguments: argparse.Namespace, show: Progress
     line: dict[str, object] = {"scene": spec.name, "folder": str(written.folder), "status": status}
     line |= {"points": written.num_points, "queries": written.num_queries}
     if check:
-        line |= {"fits": check.is_passed, "check": [asdict(panorama) for panorama in check.panoramas]}
+        line |= {"fits": check.is_passed, "check": [panorama._asdict() for panorama in check.panoramas]}
     print(json.dumps(line), flush=True)
     if check and not check.is_passed:
         return print_error(arguments, f"{spec.name}: {check.advice}", EXIT_BAD_FIT)

@@ -13,9 +13,7 @@ from ..cloud.soa import LocalCloud
 from ..coarse_to_fine.open_map import open_points
 from ..errors import InputError
 from ..geometry.camera_axes import R_cam_from_angles
-from ..geometry.pose import Pose
-from ..geometry.pose_error import pose_errors
-from ..geometry.pose_file import read_pose_matrix
+from ..geometry.pose import Pose, pose_errors, read_pose_matrix
 from ..optimize.descent_animation import (
     FRAME_WIDTH,
     frames_of,

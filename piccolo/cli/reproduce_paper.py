@@ -17,8 +17,7 @@ from ..runtime.atomic import write_atomically
 from ..runtime.threads import num_cores
 from ..scenes.evaluation.query_result import QueryResult
 from ..scenes.evaluation.runner import RunConfig, open_run
-from ..scenes.reproduce_paper.experiments import EXPERIMENTS, Condition, Settings
-from ..scenes.reproduce_paper.report import plot_png, table
+from ..scenes.reproduce_paper.experiments import EXPERIMENTS, Condition, Settings, plot_png, table
 from ..scenes.scene import Scene, find_scenes
 from .command import command, option
 from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.point_transforms import transform_points
-from ..geometry.pose import Array
+from ..geometry.pose import Array, transform_points
 from .ply_writer import Rows, vertex_rows, writing_ply
 from .readers.ply import PLY, PlyHeader, place_of_vertices, read_columns, read_header
 from .readers.reader import CHUNK, HEAD_SIZE

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..cloud.octree import Octree
+from ..cloud.voxels import Octree
 from ..errors import InputError
 from ..runtime.atomic import replacing
 from .scan_map import ScanMap

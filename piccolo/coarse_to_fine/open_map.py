@@ -13,7 +13,7 @@ from ..cloud import open_cloud
 from ..cloud.settings import IN_METRES, CloudSettings
 from ..cloud.soa import LocalCloud, pack_points
 from ..errors import InputError
-from ..geometry.point_transforms import rotate_points
+from ..geometry.pose import rotate_points
 from ..gravity import R_z_from_axis
 from ..runtime.cache import cache_root, mark_used, remove_stale
 from ..runtime.stopwatch import Stopwatch

@@ -1,20 +1,26 @@
 """The transform that turns a cloud's z up, and what it is based on."""
 
 import json
-from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from ..cloud import CloudStream
-from ..cloud.octree import build_octree
 from ..cloud.settings import UpAxis
-from ..cloud.voxels import Voxels
+from ..cloud.voxels import Voxels, build_octree
 from ..errors import InputError
 from ..geometry.pose import Array, Pose, checked_rotation, orthonormal, yaw_rotation
 from ..runtime.json_file import read_json
-from .normals import PointNormals, estimate_normals
-from .planes import Plane, classify_planes, manhattan_yaw, ransac_planes, refine_up
+from .planes import (
+    Plane,
+    PointNormals,
+    classify_planes,
+    estimate_normals,
+    manhattan_yaw,
+    ransac_planes,
+    refine_up,
+)
 from .up import Up, find_up, named_axis, rotation_to_z_up
 
 FORMAT = "piccolo-alignment/1"
@@ -26,8 +32,7 @@ SPACING = 0.08  # of the points used [m]
 NO_CONVENTION = 0.0  # log-odds of z up: a scan that is to be aligned may lie anyhow
 
 
-@dataclass(frozen=True)
-class Alignment:
+class Alignment(NamedTuple):
     """A rigid transform of a scan, and how far it can be relied on."""
 
     T_aligned_from_scan: Array  # (4, 4) in the unit of the files
@@ -39,14 +44,14 @@ class Alignment:
         """The same transform for coordinates in another unit."""
         T = self.T_aligned_from_scan.copy()
         T[:3, 3] *= self.metres_per_unit / metres_per_unit
-        return replace(self, T_aligned_from_scan=T, metres_per_unit=metres_per_unit)
+        return self._replace(T_aligned_from_scan=T, metres_per_unit=metres_per_unit)
 
     def inverse(self) -> "Alignment":
         """The way back, from aligned coordinates to the scan's."""
         T, R = np.eye(4), self.T_aligned_from_scan[:3, :3]
         T[:3, :3] = R.T
         T[:3, 3] = -np.einsum("ji,j->i", R, self.T_aligned_from_scan[:3, 3]) + 0.0
-        return replace(self, T_aligned_from_scan=T)
+        return self._replace(T_aligned_from_scan=T)
 
     def transform_pose(self, pose: Pose) -> Pose:
         """A pose of the scan in aligned coordinates, both in the unit of the transform."""
@@ -103,8 +108,7 @@ def _rigid(path: Path, rows: object) -> Array:
     return T.astype(np.float64)
 
 
-@dataclass(frozen=True)
-class AlignmentReport:
+class AlignmentReport(NamedTuple):
     """An alignment with the evidence for it."""
 
     alignment: Alignment
@@ -139,7 +143,7 @@ def find_alignment(
     T = _rotation_about(voxels.origin, orthonormal(R))
     alignment = Alignment(T, 1.0, found.confidence, found.reason).in_unit(cloud.scale)
     in_scan = [
-        replace(plane, offset=plane.offset + float(np.einsum("i,i->", plane.normal_world, voxels.origin)))
+        plane._replace(offset=plane.offset + float(np.einsum("i,i->", plane.normal_world, voxels.origin)))
         for plane in planes
     ]
     return AlignmentReport(alignment, direction, rms_angle, yaw, in_scan), voxels.warnings

@@ -8,14 +8,14 @@ convention that scans have z up.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from ..cloud.settings import UpAxis
 from ..geometry.pose import Array
-from .normals import PointNormals, dot
+from .planes import PointNormals, dot
 from .up_features import ALIGNED_ANGLE, SENSE_SHARING, WEIGHTS, UpFeatures, log_odds, up_features
 
 # Chosen by hand: the sphere in cells finer than the spread of a noisy plane's normals (3 to 8 deg)
@@ -96,8 +96,7 @@ def _refine(normals: Array, axis: Array) -> Array:
     return np.asarray(axis)
 
 
-@dataclass(frozen=True)
-class Up:
+class Up(NamedTuple):
     """Which way is up in a cloud, and how far that can be relied on."""
 
     direction_world: Array  # (3,) unit vector that points up, in the cloud's frame

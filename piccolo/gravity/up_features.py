@@ -1,12 +1,11 @@
 """Features of a cloud along a direction, and the log-odds with which they say that it points up."""
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from ..geometry.pose import Array
-from .normals import PointNormals, dot
+from .planes import PointNormals, dot
 
 # Lengths and angles of buildings, by hand. On 138 clouds (twelve made-up places of each kind, two turns each
 # of the scenes house, hospital and hall) one of them halved or doubled changes at most 7 answers, but for
@@ -45,8 +44,7 @@ WEIGHTS = Weights(1.0, 0.5, 2.0, 4.0, 1.25, 2.5, 2.5, 2.5)
 SENSE_SHARING = 0.5  # 0: what tells the senses of an axis apart speaks for the axis in full; 1: not at all
 
 
-@dataclass(frozen=True)
-class UpFeatures:
+class UpFeatures(NamedTuple):
     """What a cloud looks like along an axis, and along one of its senses."""
 
     axis: Array  # (3,) unit

@@ -2,9 +2,9 @@
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -40,8 +40,7 @@ NUM_LAST = 12  # times that the last frame is repeated
 Frames = Sequence[NDArray[np.uint8]]  # (H, W, 3) RGB each, all of one size
 
 
-@dataclass(frozen=True)
-class Iterate:
+class Iterate(NamedTuple):
     """A pose on the way of a descent."""
 
     iteration: int

@@ -8,8 +8,8 @@ with L over the points that a camera at (x, y, z) sees. Rotations are the same a
 """
 
 import math
-from dataclasses import dataclass
 from io import BytesIO
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +34,7 @@ MARKS = {"true": ("*", "white", 260), "found": ("X", "red", 110), "lowest": ("o"
 KnownPoses = dict[str, Pose]  # in the frame of the points, by "true" and "found", as far as they are known
 
 
-@dataclass(frozen=True)
-class PoseGrid:
+class PoseGrid(NamedTuple):
     """All poses that are tried, in the frame of the points, z up."""
 
     x: Array  # (nx,) [m]
@@ -49,8 +48,7 @@ class PoseGrid:
         return len(self.x) * len(self.y) * len(self.heights) * len(self.R_cam_from_local)
 
 
-@dataclass(frozen=True)
-class LossSurface:
+class LossSurface(NamedTuple):
     """The best pose at each place of the plan."""
 
     loss: Array  # (ny, nx) [0, sqrt(3)], inf where masked pixels hide too much at every pose

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry.sphere import pixel_rays
-from .crop import Pixels
+from .gpano import Pixels
 from .picture import MAX_WIDTH, Picture, read_picture
 
 BAND = 64  # rows at a time

@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -45,8 +45,7 @@ def inverse_std(mean, mean_square):
     return F1 / math.sqrt(max(mean_square - mean * mean, F0) + _MIN_VARIANCE)
 
 
-@dataclass(frozen=True)
-class ImageScale:
+class ImageScale(NamedTuple):
     """One size of the panorama."""
 
     width: int  # [px] a multiple of STATS_WIDTH

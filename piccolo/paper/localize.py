@@ -1,6 +1,7 @@
 """The paper's method in order, one line a step."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +25,7 @@ from .search import free_grid, search
 from .settings import PaperSettings
 
 
-@dataclass(frozen=True)
-class PaperMap:
+class PaperMap(NamedTuple):
     """What the paper's method prepares once per cloud."""
 
     points: PackedPoints

@@ -1,7 +1,7 @@
 """The cloud rendered at a pose, of any size: surfaces closed, what nobody scanned filled or left open."""
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -28,8 +28,7 @@ OVERLAY_WIDTH = 1024
 NUM_TILES = 16  # columns of the checkerboard
 
 
-@dataclass(frozen=True)
-class RenderedView:
+class RenderedView(NamedTuple):
     """What the camera sees of the cloud."""
 
     rgb: NDArray[np.uint8]  # (H, W, 3), black where nothing is seen

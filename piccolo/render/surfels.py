@@ -1,7 +1,7 @@
 """Surfels: discs that close the surface between points, with a radius and a normal from the neighbours."""
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,7 @@ MAX_SLOPE = np.float32(1.25)  # of the range within a surfel or a pixel
 TWO = np.float32(2.0)
 
 
-@dataclass(frozen=True)
-class Surfels:
+class Surfels(NamedTuple):
     """Coloured discs around points."""
 
     points: PackedPoints

@@ -1,7 +1,7 @@
 """The cloud seen from a pose: z-buffered equirectangular views, and which points the camera sees."""
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +24,7 @@ VISIBLE_WIDTH = 180  # cells of 2 degrees
 MIN_SEEN_FRACTION = 0.4  # of the sphere; less is seen from outside a scan
 
 
-@dataclass(frozen=True)
-class View:
+class View(NamedTuple):
     """What the camera sees of the cloud, on an equirectangular grid."""
 
     depth: NDArray[np.float32]  # (H, W) range of the nearest point [m], inf where there is none

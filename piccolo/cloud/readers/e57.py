@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from ...errors import InputError
-from ...geometry.point_transforms import rotate_points
-from ...geometry.pose import Array, Pose
+from ...geometry.pose import Array, Pose, rotate_points
 from .e57_file import (
     MAGIC,
     NAMESPACE,
@@ -218,8 +218,7 @@ def _read_scan(file: E57File, scan: E57Scan) -> Iterator[dict[str, Array]]:
 E57 = CloudFormat("E57", frozenset({".e57"}), lambda head: head.startswith(MAGIC), open_e57)
 
 
-@dataclass(frozen=True)
-class E57Image:
+class E57Image(NamedTuple):
     """One representation of one image of a file."""
 
     name: str

@@ -9,10 +9,9 @@ import re
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
 
 import numpy as np
@@ -33,8 +32,7 @@ INTEGER = re.compile(r"[+-]?[0-9]{1,19}")
 CHECK_ALL = 100  # [%] of the pages have their checksum verified
 
 
-@dataclass(frozen=True)
-class E57File:
+class E57File(NamedTuple):
     """An E57 file opened by libE57, and its XML."""
 
     path: Path

@@ -5,8 +5,8 @@ follows are records of a fixed length.
 """
 
 import struct
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +24,7 @@ CLASS_BYTE_OLD, CLASS_BYTE = 15, 16  # in the formats 0-5, whose upper three bit
 WANTED = "wanted LAS or LAZ with red green blue (point format 2, 3, 5, 7, 8 or 10)"
 
 
-@dataclass(frozen=True)
-class LasHeader:
+class LasHeader(NamedTuple):
     """The header of a LAS file."""
 
     path: Path

@@ -8,10 +8,9 @@ import io
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,8 +36,7 @@ BROKEN = "the file is cut off or broken"
 LazChunk = tuple[int, int]  # points, bytes
 
 
-@dataclass(frozen=True)
-class LasLayout:
+class LasLayout(NamedTuple):
     """Where a file's chunks are and how to read them."""
 
     offset: int  # [byte] of the first chunk

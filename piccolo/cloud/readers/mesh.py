@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.pose import Array
-from .colors import BRIGHTEST
+from .columns import BRIGHTEST
 from .mesh_gltf import GLB_MAGIC, NO_MATERIAL
 from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply
 from .mesh_sampling import Surface, SurfaceInstance, sample_points

@@ -6,9 +6,8 @@ what it doesn't know, and follows nodes and copies shared data without a limit: 
 
 import json
 import struct
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import unquote
 
 from ...errors import InputError
@@ -36,8 +35,7 @@ COUNTS = {  # numbers that trimesh would count from the end if they were negativ
 Json = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Material:
+class Material(NamedTuple):
     """The base colour of a glTF material."""
 
     factor: tuple[float, float, float] = (1.0, 1.0, 1.0)  # linear light

@@ -2,18 +2,17 @@
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
 from itertools import chain, islice, starmap
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
 from . import reader as raw
-from .colors import BRIGHTEST, colored_chunks
+from .columns import BRIGHTEST, colored_chunks
 from .reader import CUT, CloudReadOptions, PointSource, RawCloud, quoted
 from .scalars import check_option, intensity_reader
 
@@ -22,8 +21,7 @@ COMMENT_MARKS = (b"#", b"//")
 NUM_WITH_INTENSITY = 4  # columns of a line without colours: x y z intensity
 
 
-@dataclass(frozen=True)
-class LineLayout:
+class LineLayout(NamedTuple):
     """Where the lines of numbers begin, and what is in one."""
 
     columns: tuple[int, ...] = ()  # that are read

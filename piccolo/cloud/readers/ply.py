@@ -15,8 +15,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from ...errors import InputError
-from .colors import COLOR_NAMES, color_names
-from .columns import Columns, column_source, read_records
+from .columns import COLOR_NAMES, Columns, color_names, column_source, read_records
 from .mesh import open_ply_mesh
 from .number_lines import LineLayout, NumberLines
 from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, quoted

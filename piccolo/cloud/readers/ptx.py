@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...geometry.point_transforms import transform_points
+from ...geometry.pose import transform_points
 from .number_lines import NUM_WITH_INTENSITY, LineLayout, NumberLines
 from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, RawCloud, quoted
 from .scalars import check_option, intensity_reader

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from ...errors import InputError
-from .colors import color_names
+from .columns import color_names
 from .number_lines import COMMENT_MARKS, NUM_WITH_INTENSITY, LineLayout, NumberLines, is_number, line_source
 from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, quoted
 from .scalars import INTENSITY_NAMES

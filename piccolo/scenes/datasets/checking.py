@@ -2,14 +2,14 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ...cloud import open_cloud
-from ...cloud.octree import build_octree
 from ...cloud.soa import pack_points
+from ...cloud.voxels import build_octree
 from ...confidence.score import VIEW_WIDTH, agreement_at
 from ...geometry.pose import Array, Pose
 from ...panorama import read_panorama
@@ -23,8 +23,7 @@ MIN_SCORE = 0.1  # other views of the same place may have as much, but seldom mo
 AS_GIVEN = "as given"
 
 
-@dataclass(frozen=True)
-class ConventionCheck:
+class ConventionCheck(NamedTuple):
     """How well a panorama fits the cloud at its pose, by this convention and by others."""
 
     image: str  # as queries.json has it
@@ -38,8 +37,7 @@ class ConventionCheck:
         return self.best == AS_GIVEN and self.score >= MIN_SCORE
 
 
-@dataclass(frozen=True)
-class Check:
+class Check(NamedTuple):
     """The checks of some panoramas of a scene."""
 
     panoramas: tuple[ConventionCheck, ...]

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...cloud import FORMATS
-from ...cloud.validation import MAX_COORDINATE
+from ...cloud.stream import MAX_COORDINATE
 from ...errors import InputError
 from ...geometry.camera_axes import CAMERA_AXES, OPENGL_FROM_CAM
 from ...geometry.pose import Array, Pose, checked_rotation, orthonormal

@@ -4,7 +4,6 @@ import csv
 import io
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -162,7 +161,7 @@ def _with_unique_names(panoramas: list[PosedPanorama]) -> list[PosedPanorama]:
     if len({panorama.name for panorama in panoramas}) == len(panoramas):
         return panoramas
     return [
-        replace(panorama, name=f"{number:05d}_{name}", files={f"{number:05d}_{name}": image})
+        panorama._replace(name=f"{number:05d}_{name}", files={f"{number:05d}_{name}": image})
         for number, panorama in enumerate(panoramas)
         for name, image in panorama.files.items()
     ]

@@ -2,7 +2,6 @@
 
 import re
 from collections import defaultdict
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -41,7 +40,7 @@ def list_scenes(options: ConvertOptions) -> SceneList:
         parts = tuple(map(CloudPart, meshes))
         specs.append(SceneSpec(folder.resolve().name, parts, read_panoramas, source={"dataset": NAME}))
     listed = scene_list(options.folder, specs, missing, f"HOUSE/{SKYBOXES} with a mesh")
-    return replace(listed, notes=(*listed.notes, *notes))
+    return listed._replace(notes=(*listed.notes, *notes))
 
 
 def _faces_in(folder: Path) -> dict[str, dict[str, Path]]:

@@ -5,16 +5,15 @@ import math
 import os
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from ...cloud import open_source
 from ...cloud.ply_writer import vertex_rows, writing_ply
 from ...cloud.readers.reader import CHUNK
-from ...cloud.validation import Chunk, PointValidator
+from ...cloud.stream import Chunk, PointValidator
 from ...errors import InputError, unreadable
 from ...runtime.atomic import check_output_folder, replacing_folder
 from ...runtime.threads import Progress, no_progress
@@ -26,8 +25,7 @@ IMAGES, LABELS = "images", "labels"  # folders of a scene
 Transfer = Literal["symlink", "copy"]
 
 
-@dataclass(frozen=True)
-class Written:
+class Written(NamedTuple):
     """The scene that was written, or was there already."""
 
     folder: Path

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.queues import Queue
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ...cloud.settings import CloudSettings
 from ...coarse_to_fine.open_map import CachePolicy
@@ -43,16 +43,14 @@ class RunConfig:
     num_threads: int  # of each process
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """Queries of one scene, whose cloud is prepared once for them."""
 
     scene: Scene
     queries: tuple[Query, ...]
 
 
-@dataclass(frozen=True)
-class Failure:
+class Failure(NamedTuple):
     """Queries that could not be tried."""
 
     text: str  # one line, which file and why
@@ -179,8 +177,7 @@ def read_run(path: Path) -> tuple[list[QueryResult], int]:
     return list({row.key: row for row in rows}.values()), size
 
 
-@dataclass(frozen=True)
-class Run:
+class Run(NamedTuple):
     """A run over scenes: the queries that are done, and those that are left."""
 
     path: Path

@@ -3,7 +3,7 @@
 import csv
 import io
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,7 @@ CONFIDENCES = (0.999, 0.99, 0.95, 0.9, 0.7, 0.5, 0.2, 0.0)
 ALL = "all"
 
 
-@dataclass(frozen=True)
-class Summary:
+class Summary(NamedTuple):
     """What a table says about some queries."""
 
     num_queries: int
@@ -62,8 +61,7 @@ def accuracies(rows: Sequence[QueryResult], max_angle: float) -> list[float]:
     return [sum(row.is_correct(level) for row in rows) / len(rows) for level in levels]
 
 
-@dataclass(frozen=True)
-class Point:
+class Point(NamedTuple):
     """One point of the curve of risk over coverage."""
 
     confidence: float  # results from here on are accepted
@@ -83,8 +81,7 @@ def risk_and_coverage(rows: Sequence[QueryResult], thresholds: Thresholds = PAPE
     return list(points.values())
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(NamedTuple):
     """A table of text; the first `num_left` columns are words."""
 
     title: str
@@ -178,8 +175,7 @@ def csv_text(rows: Sequence[QueryResult]) -> str:
     return file.getvalue()
 
 
-@dataclass(frozen=True)
-class Pair:
+class Pair(NamedTuple):
     """The same query in two runs."""
 
     first: QueryResult

@@ -10,6 +10,7 @@ import json
 from collections.abc import Iterable, Sequence
 from decimal import Decimal
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from ...geometry.camera_axes import (
 )
 from ...geometry.pose import T_world_from_cam, log_so3, quaternion_wxyz
 from ...runtime.atomic import replacing_folder, write_atomically
+from ...runtime.optional import import_optional
 from .posed_images import Format, Options, PosedImage
 
 COLUMNS = (
@@ -31,6 +33,7 @@ COLUMNS = (
     *("quaternion_w", "quaternion_x", "quaternion_y", "quaternion_z"),  # of R_cam_from_world
     *("heading_deg", "pitch_deg", "roll_deg"),
 )
+STEP = 10.0  # [m] ahead, to find true north
 
 
 def numbers(values: Iterable[float], separator: str = " ") -> str:
@@ -191,3 +194,55 @@ CSV = Format("csv", "table with a header", write_csv, OFFSET, has_unique_names=F
 TUM = Format("tum", "trajectory for evo and others", write_tum, OFFSET | {"axes", "timestamps"})
 KITTI = Format("kitti", "trajectory for evo and others", write_kitti, OFFSET | {"axes"})
 POTREE = Format("potree", POTREE_TEXT, write_potree, OFFSET | {"timestamps"}, forbidden='"')
+
+
+def write(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write a FeatureCollection with a point a result."""
+    pyproj = import_optional("GeoJSON", "pyproj", "tools")
+    if options.crs is None:
+        raise InputError("--crs: not given, wanted the cloud's coordinate system, such as EPSG:25832")
+    transformer = _transformer(pyproj, options.crs)
+    features = [_feature(image, transformer, pyproj.Geod(ellps="WGS84"), options.crs) for image in images]
+    document = {"type": "FeatureCollection", "features": features}
+    write_atomically(out, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
+
+
+def _transformer(pyproj: Any, crs: str) -> Any:
+    """From the cloud's coordinates to longitude and latitude."""
+    try:
+        system = pyproj.CRS.from_user_input(crs)
+    except pyproj.exceptions.CRSError as error:
+        raise InputError(f"--crs: found {crs!r}, wanted a coordinate system such as EPSG:25832") from error
+    units = {axis.unit_name for axis in system.axis_info[:2]}
+    if not system.is_projected or units != {"metre"}:
+        raise InputError(f"--crs: found {crs} ({system.name}), wanted a projected system in metres")
+    return pyproj.Transformer.from_crs(system, "EPSG:4326", always_xy=True)
+
+
+def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[str, object]:
+    """The point without a height, which would have to be above WGS84's ellipsoid: z is a property."""
+    properties: dict[str, object]
+    result, (x, y, z) = image.result, image.pose.center_world.tolist()
+    heading, pitch, roll = heading_pitch_roll_deg(image.pose)
+    ahead = np.radians(heading)
+    longitudes, latitudes = transformer.transform(
+        [x, x + STEP * np.sin(ahead)], [y, y + STEP * np.cos(ahead)]
+    )
+    if not np.isfinite([*longitudes, *latitudes]).all():
+        raise InputError(f"{image.path}: found a camera at ({x}, {y}), wanted one where {crs} holds")
+    true_heading, _, _ = geod.inv(longitudes[0], latitudes[0], longitudes[1], latitudes[1])
+    properties = {"image": image.name, "cloud": result.cloud_name, "status": result.status}
+    properties |= {"confidence": result.confidence, "score": result.evidence and result.evidence.score}
+    properties |= {"crs": crs, "x": x, "y": y, "z": z, "heading_deg": heading}
+    properties |= {"heading_true_deg": true_heading % 360.0, "pitch_deg": pitch, "roll_deg": roll}
+    point = {"type": "Point", "coordinates": [longitudes[0], latitudes[0]]}
+    return {"type": "Feature", "geometry": point, "properties": properties}
+
+
+GEOJSON = Format(
+    "geojson",
+    "points for maps, in WGS84; needs --crs and the library pyproj",
+    write,
+    frozenset({"crs"}),
+    has_unique_names=False,
+)

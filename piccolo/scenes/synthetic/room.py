@@ -1,6 +1,7 @@
 """The seeded layout of a room: boxes, each with a material."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -57,8 +58,7 @@ class RoomBuilder:
         self.labels.append(LABEL_NAMES.index(self.kind))
 
 
-@dataclass(frozen=True)
-class Room:
+class Room(NamedTuple):
     """A closed room full of boxes, z up."""
 
     corner: Array  # (3,) least corner of the free space [m]
@@ -197,7 +197,7 @@ def twin_rooms(seed: int, size: Array) -> tuple[Room, Room]:
     room = make_room(seed, size, np.zeros(3))
     shift = np.array([room.size[0] + GAP, 0.0, 0.0])
     boxes = room.boxes + np.array([*shift, 0.0, 0.0, 0.0, 0.0])
-    return room, replace(room, corner=room.corner + shift, boxes=boxes, light=room.light + shift)
+    return room, room._replace(corner=room.corner + shift, boxes=boxes, light=room.light + shift)
 
 
 def symmetric_hall(seed: int, size: Array) -> Room:

@@ -1,7 +1,7 @@
 """Seeded trials of a result's status: queries with a true pose, and queries that have none."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,7 @@ Image = NDArray[np.uint8]
 Points = tuple[NDArray[np.floating], NDArray[np.uint8]]
 
 
-@dataclass(frozen=True)
-class Trial:
+class Trial(NamedTuple):
     """One panorama to be localized in a cloud."""
 
     case: str

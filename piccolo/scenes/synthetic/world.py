@@ -1,6 +1,7 @@
 """Rooms side by side with their scan, and queries with true poses."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,8 +101,7 @@ def other_light(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.
     return np.asarray(np.round(noisy.clip(0.0, 1.0) * 255.0).astype(np.uint8))
 
 
-@dataclass(frozen=True)
-class World:
+class World(NamedTuple):
     """Seeded rooms in a square grid."""
 
     seed: int
