@@ -132,7 +132,7 @@ def test_a_descent_is_shown_with_where_it_ended(run, scene, tmp_path, monkeypatc
         (["--at", 0, 0, "nan", "--out", "a.png"], "must be finite"),
         (["--at", 0, 0, 1, "--animate", "a.gif"], "--animate: no panorama"),
         (["--pose", "T.txt", "--heading", 3, "--out", "a.png"], "only with --at"),
-        (["--at", 0, 0, 1, "--out", "a.png", "--seed", -1], "--seed -1"),
+        (["--at", 0, 0, 1, "--out", "a.png", "--seed", -1], "--seed: found -1"),
         (["--at", 0, 0, 1, "--out", "a.png", "--scale", 0], "--scale: found 0"),
     ],
 )

@@ -166,7 +166,7 @@ def test_command_line_writes_a_world_that_reads_back(tmp_path, capsys):
         ("--width 127", "width: 127 is not an even number of at least 128"),
         ("--size nan 3 2.4", "size: [nan, 3.0, 2.4] is not between 2.0 and 50.0 m each way"),
         ("--rooms 65", "rooms: 65 is not between 1 and 64"),
-        ("--seed -1", "--panoramas, --seed, --scenes: found a negative number, wanted 0 or more"),
+        ("--seed -1", "--seed: found -1, wanted at least 0"),
     ],
 )
 def test_command_line_refuses_in_one_line_before_anything_is_written(options, message, tmp_path, capsys):

@@ -22,8 +22,8 @@ from ..scenes.synthetic.world import (
     make_world,
     scan_world,
 )
-from .command import command, option
-from .errors import UsageError, checking_options
+from .command import check_least, command, option
+from .errors import checking_options
 from .progress import progress_bar
 
 EPILOG = """\
@@ -79,8 +79,7 @@ def write_world(
 @command(__file__, __doc__, EPILOG, add_arguments)
 def main(arguments: argparse.Namespace) -> int:
     """Make and write all scenes."""
-    if min(arguments.panoramas, arguments.seed, arguments.scenes) < 0:
-        raise UsageError("--panoramas, --seed, --scenes: found a negative number, wanted 0 or more")
+    check_least(arguments, panoramas=0, seed=0, scenes=0)
     workers = Workers(num_cores(), progress_bar(arguments.quiet))
     for number in range(max(1, arguments.scenes)):
         with checking_options():

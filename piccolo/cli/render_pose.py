@@ -30,8 +30,8 @@ from ..result import read_results
 from ..runtime.atomic import check_output, check_output_folder, replacing_folder, write_atomically
 from ..runtime.threads import Workers, num_cores
 from ..scenes.scene import read_scene
-from .command import command, option
-from .errors import checking_options, print_note
+from .command import check_least, command, option, print_warnings
+from .errors import checking_options
 from .options import add_cloud_options, cloud_settings_from
 from .progress import progress_bar
 
@@ -111,14 +111,13 @@ def check_pose_options(arguments: argparse.Namespace) -> None:
     numbers = [*(arguments.at or ()), *(arguments.start or ()), *(angle or 0.0 for angle in angles)]
     if not np.isfinite([*numbers, *arguments.perturb]).all():
         raise InputError("--at, --start, --perturb and angles must be finite numbers")
-    if arguments.seed < 0:
-        raise InputError(f"--seed {arguments.seed}: wanted 0 or more")
+    check_least(arguments, seed=0)
 
 
 def check_files(arguments: argparse.Namespace) -> None:
     """Refuse, before any work, what could not be written."""
-    inputs = [*arguments.cloud, *filter(None, (arguments.result, arguments.queries, arguments.pose))]
-    inputs += [arguments.photo] if arguments.photo else []
+    named = arguments.result, arguments.queries, arguments.pose, arguments.photo
+    inputs = [*arguments.cloud, *filter(None, named)]
     for path in filter(None, (arguments.out, arguments.depth, arguments.mask_out, arguments.animate)):
         if path.suffix:
             check_output(path, inputs)
@@ -129,7 +128,7 @@ def check_files(arguments: argparse.Namespace) -> None:
 def poses_from(arguments: argparse.Namespace) -> Named:
     """The poses asked for, named by the panorama's path, the pose's file or "at"."""
     if arguments.at:
-        angles = (arguments.heading or 0.0, arguments.pitch or 0.0, arguments.roll or 0.0)
+        angles = [angle or 0.0 for angle in (arguments.heading, arguments.pitch, arguments.roll)]
         return [("at", Pose(R_cam_from_angles(*angles), np.array(arguments.at)))]
     if arguments.pose:
         return [(str(arguments.pose), read_pose_matrix(arguments.pose))]
@@ -168,8 +167,7 @@ def draw_pictures(arguments: argparse.Namespace, cloud: LocalCloud, poses: Named
         view = render_points(cloud.points, cloud.from_world(pose), arguments.width, workers)
         seen_fraction = round(float(view.is_seen.mean()), 6)
         if arguments.depth:
-            content = depth_file(view.depth, arguments.depth.suffix.lower())
-            write_atomically(arguments.depth, content)
+            write_atomically(arguments.depth, depth_file(view.depth, arguments.depth.suffix.lower()))
         if arguments.mask_out:
             nothing = np.where(view.is_seen, 0, 255).astype(np.uint8)
             write_atomically(arguments.mask_out, encode_image(nothing, ".png"))
@@ -219,8 +217,7 @@ def main(arguments: argparse.Namespace) -> int:
 
     workers = Workers(num_cores(), progress_bar(arguments.quiet))
     cloud = open_points(arguments.cloud, cloud_settings_from(arguments), workers)
-    for warning in cloud.warnings:
-        print_note(arguments, f"warning: {warning}")
+    print_warnings(arguments, cloud.warnings)
     if arguments.out:
         draw_pictures(arguments, cloud, poses, workers)
     if arguments.animate:

@@ -50,14 +50,11 @@ class PointValidator:
         if num_finite:
             points = points * self.scale
             self.brightest = max(self.brightest, int(colors.max()))
-            self._check_coordinates(points)
+            farthest = max(-float(points.min()), float(points.max()))
+            if farthest > MAX_COORDINATE:
+                found = f"a coordinate of {farthest:.3g} m, wanted all within {MAX_COORDINATE:.0e} m"
+                raise InputError(f"{self.path}: {found}; remove broken points or set --units or --scale")
         return points, colors
-
-    def _check_coordinates(self, points: NDArray[np.float64]) -> None:
-        farthest = max(-float(points.min()), float(points.max()))
-        if farthest > MAX_COORDINATE:
-            found = f"a coordinate of {farthest:.3g} m, wanted all within {MAX_COORDINATE:.0e} m"
-            raise InputError(f"{self.path}: {found}; remove broken points or set --units or --scale")
 
     def check(self) -> None:
         """Refuse points that are no coloured cloud, when all have passed."""

@@ -64,10 +64,15 @@ def _write_copy(
         element = header.elements[k]
         more += [f"element {element.name} {header.counts[k]}", *map(str, element.properties)]
     found = header.vertices.dtype("<")
-    dtype = _dtype_of(found, needs_double(cloud.box, T_target_from_source, cloud.scale))
+    is_double = needs_double(cloud.box, T_target_from_source, cloud.scale)
+    wide = [name for name in AXES if is_double or found[name].kind != "f"]  # integers are not enough either
+    dtype = np.dtype([(name, "<f8" if name in wide else found[name]) for name in found.names or ()])
     columns = read_columns(header, found.names or ())
+    with header.path.open("rb") as file:
+        lines = file.read(header.size).decode("ascii", "replace").splitlines()
+    comments = [line.removeprefix("comment ") for line in lines if line.startswith("comment ")]
     num_chunks = math.ceil(header.counts[header.index] / CHUNK)
-    with writing_ply(out, dtype, _comments(header), more) as writer:
+    with writing_ply(out, dtype, comments, more) as writer:
         for some in cloud.show(columns, num_chunks, "write"):
             writer.add(_transformed_rows(_rows(some, found), dtype, T_target_from_source))
         if copied:
@@ -89,19 +94,6 @@ def _rows(columns: list[NDArray[np.generic]], dtype: np.dtype[Any]) -> Rows:
         else:
             rows[name] = column
     return rows
-
-
-def _comments(header: PlyHeader) -> tuple[str, ...]:
-    with header.path.open("rb") as file:
-        lines = file.read(header.size).decode("ascii", "replace").splitlines()
-    return tuple(line.removeprefix("comment ") for line in lines if line.startswith("comment "))
-
-
-def _dtype_of(dtype: np.dtype[Any], is_double: bool) -> np.dtype[Any]:
-    """A PLY file's dtype with x y z of float64 where it `is_double` or they are integers."""
-    fields = [(name, dtype[name]) for name in dtype.names or ()]
-    wide = [name for name, kind in fields if name in AXES and (is_double or kind.kind != "f")]
-    return np.dtype([(name, np.dtype("<f8") if name in wide else kind) for name, kind in fields])
 
 
 def _transformed_rows(rows: Rows, dtype: np.dtype[Any], T_target_from_source: Array) -> Rows:

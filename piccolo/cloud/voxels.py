@@ -150,20 +150,13 @@ class VoxelTable:
         order = np.argsort(codes)
         # + 0.0 turns -0.0 into 0.0
         origin = np.round(0.5 * LEAF_SIZE * (low + high) - PHASE / QUANTA_PER_METRE) + 0.0
-        return Voxels(codes[order], _means(rows, cells, order, origin), origin, warnings)
-
-
-def _means(
-    rows: NDArray[np.int32], cells: NDArray[np.int64], order: NDArray[np.int64], origin: NDArray[np.float64]
-) -> NDArray[np.float32]:
-    """Mean positions less `origin` and mean colours (M, 6) of the table's rows, taken in `order`."""
-    nodes = np.empty((len(rows), 6), np.float32)
-    counts = rows[order, COUNT].astype(np.float64)
-    for k in range(3):  # one at a time, for the memory's sake
-        corners = cells[order, k] * LEAF_SIZE - origin[k]
-        nodes[:, k] = corners + (rows[order, POSITION + k] / counts + 0.5 - PHASE) / QUANTA_PER_METRE
-        nodes[:, 3 + k] = rows[order, COLOR + k] / counts / 255.0
-    return nodes
+        nodes = np.empty((len(rows), 6), np.float32)
+        counts = rows[order, COUNT].astype(np.float64)
+        for k in range(3):  # one at a time, for the memory's sake
+            corners = cells[order, k] * LEAF_SIZE - origin[k]
+            nodes[:, k] = corners + (rows[order, POSITION + k] / counts + 0.5 - PHASE) / QUANTA_PER_METRE
+            nodes[:, 3 + k] = rows[order, COLOR + k] / counts / 255.0
+        return Voxels(codes[order], nodes, origin, warnings)
 
 
 class Octree(NamedTuple):

@@ -58,16 +58,13 @@ class Alignment(NamedTuple):
         R, t = self.T_aligned_from_scan[:3, :3], self.T_aligned_from_scan[:3, 3]
         return Pose(orthonormal(pose.R_cam_from_world @ R.T), R @ pose.center_world + t)
 
+    def numbers(self) -> dict[str, object]:
+        """The fields by their names, as JSON takes them."""
+        return {**self._asdict(), "T_aligned_from_scan": self.T_aligned_from_scan.tolist()}
+
     def to_json(self) -> str:
         """One JSON object; every number reads back as the same float64."""
-        document = {
-            "format": FORMAT,
-            "convention": CONVENTION,
-            "T_aligned_from_scan": self.T_aligned_from_scan.tolist(),
-            "metres_per_unit": self.metres_per_unit,
-            "confidence": self.confidence,
-            "explanation": self.explanation,
-        }
+        document = {"format": FORMAT, "convention": CONVENTION, **self.numbers()}
         return json.dumps(document, indent=1, allow_nan=False) + "\n"
 
     def to_text(self) -> str:
@@ -140,7 +137,9 @@ def find_alignment(
     yaw = manhattan_yaw(planes, R) if along_walls else None
     if yaw is not None:
         R = np.einsum("ij,jk->ik", yaw_rotation(-yaw), R)
-    T = _rotation_about(voxels.origin, orthonormal(R))
+    R = orthonormal(R)
+    T = np.eye(4)  # turns about the middle
+    T[:3, :3], T[:3, 3] = R + 0.0, voxels.origin - np.einsum("ij,j->i", R, voxels.origin) + 0.0
     alignment = Alignment(T, 1.0, found.confidence, found.reason).in_unit(cloud.scale)
     in_scan = [
         plane._replace(offset=plane.offset + float(np.einsum("i,i->", plane.normal_world, voxels.origin)))
@@ -152,11 +151,3 @@ def find_alignment(
 def normals_of(voxels: Voxels) -> PointNormals:
     """Normals of a cloud thinned to SPACING."""
     return estimate_normals(build_octree(voxels).level(SPACING)[:, :3])
-
-
-def _rotation_about(origin: Array, R: Array) -> Array:
-    """The transform (4, 4) that turns by R (3, 3) about a point (3,)."""
-    T = np.eye(4)
-    T[:3, :3] = R + 0.0
-    T[:3, 3] = origin - np.einsum("ij,j->i", R, origin) + 0.0
-    return T

@@ -46,39 +46,26 @@ def colored_chunks(
 ) -> Iterator[RawCloud]:
     """Yield chunks of positions and colours (N, 3), each of any type, colours from 0 to `brightest`.
 
-    Raises
-    ------
-    InputError
-        A colour is out of range: `locate` turns the index of its point into the file and a place in it.
+    Raises InputError if a colour is out of range: `locate` turns a point's index into the file and a place.
     """
     num_before = 0
     for points, values in chunks:
         with np.errstate(invalid="ignore"):  # a NaN of the kind that signals
             points_world = points.astype(np.float64)
-        colors, wrong = _to_uint8(values, points_world, brightest)
-        if wrong >= 0:
-            color = " ".join(f"{value:g}" for value in values[wrong].tolist())
-            place = locate(num_before + wrong)
-            raise InputError(f"{place} has the colour {color}, wanted 0 to {brightest:g}")
+        if values.dtype == np.uint8 and brightest == BRIGHTEST["u1"]:
+            colors = np.array(values, dtype=np.uint8)
+        else:  # a point without a finite position needs no colour: it becomes black
+            is_finite: NDArray[np.bool_] = np.all(np.isfinite(points_world), axis=1)
+            numbers = np.where(is_finite[:, None], values, 0).astype(np.float64)
+            is_wrong = ~((numbers >= 0.0) & (numbers <= brightest)).all(axis=1)
+            if is_wrong.any():
+                wrong = int(np.argmax(is_wrong))
+                color = " ".join(f"{value:g}" for value in values[wrong].tolist())
+                place = locate(num_before + wrong)
+                raise InputError(f"{place} has the colour {color}, wanted 0 to {brightest:g}")
+            colors = np.rint(numbers * (255.0 / brightest)).astype(np.uint8)
         num_before += len(colors)
         yield RawCloud(points_world, colors)
-
-
-def _to_uint8(
-    colors: NDArray[np.generic], points_world: NDArray[np.float64], brightest: float
-) -> tuple[NDArray[np.uint8], int]:
-    """Colours (N, 3) uint8 of values 0 to `brightest`, and the first row that is out of range, or -1.
-
-    A point without a finite position needs no colour: it becomes black.
-    """
-    if colors.dtype == np.uint8 and brightest == BRIGHTEST["u1"]:
-        return np.array(colors, dtype=np.uint8), -1
-    is_finite: NDArray[np.bool_] = np.all(np.isfinite(points_world), axis=1)
-    values = np.where(is_finite[:, None], colors, 0).astype(np.float64)
-    is_wrong = ~np.all((values >= 0.0) & (values <= brightest), axis=1)
-    if is_wrong.any():
-        return np.zeros((len(values), 3), np.uint8), int(np.argmax(is_wrong))
-    return np.rint(values * (255.0 / brightest)).astype(np.uint8), -1
 
 
 def read_records(path: Path, offset: int, count: int, dtype: np.dtype[Any]) -> Iterator[NDArray[Any]]:

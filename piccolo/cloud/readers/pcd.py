@@ -198,7 +198,11 @@ def open_pcd(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     """
     header = read_header(path)
     fields = _wanted_fields(header, options)
-    _check_size(header)
+    found = path.stat().st_size - header.size
+    promised = {"ascii": 0, "binary": header.row_size * header.num_points}.get(header.encoding, 8)
+    if promised > found:  # of ASCII and compressed data this is known when they are read
+        counts = f"{header.num_points} points in {promised} bytes or more, found {found} bytes"
+        raise InputError(f"{path}: the header promises {counts}; {BROKEN}")
     read = {"ascii": _read_ascii, "binary": _read_binary, "binary_compressed": _read_compressed}
     read_columns = partial(read[header.encoding], header, fields)
     if fields[3].name in PACKED_NAMES:
@@ -230,19 +234,10 @@ def _wanted_fields(header: PcdHeader, options: CloudReadOptions) -> tuple[PcdFie
     return fields
 
 
-def _check_size(header: PcdHeader) -> None:
-    """Refuse a binary file that is shorter than its header promises; others are checked as they are read."""
-    found = header.path.stat().st_size - header.size
-    promised = {"ascii": 0, "binary": header.row_size * header.num_points}.get(header.encoding, 8)
-    if promised > found:
-        counts = f"{header.num_points} points in {promised} bytes or more, found {found} bytes"
-        raise InputError(f"{header.path}: the header promises {counts}; {BROKEN}")
-
-
 def _read_ascii(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterator[Columns]:
     layout = LineLayout(tuple(field.column for field in fields), header.num_columns, header.size)
-    for rows in NumberLines(header.path, layout, WANTED).read_rows(header.num_points):
-        yield list(rows.T)
+    rows = NumberLines(header.path, layout, WANTED).read_rows(header.num_points)
+    return (list(some.T) for some in rows)
 
 
 def _read_binary(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterator[Columns]:

@@ -85,18 +85,14 @@ def label_reader(path: Path, read_scalar: ScalarReader, labels: Labels) -> Chunk
     """What a PointSource wants as `read_chunks`, of a reader of points and their labels."""
 
     def read_chunks() -> Iterator[RawCloud]:
-        for points, values in read_scalar():
-            numbers = as_integers(path, points, values)
+        for points, raw in read_scalar():
+            values = np.where(np.isfinite(points).all(axis=1), raw, 0.0)  # the others are left out later
+            is_whole = (np.abs(values) < MOST) & (values == np.floor(values))
+            if not is_whole.all():
+                wrong = f"found the label {values[np.argmin(is_whole)]:g}"
+                raise InputError(f"{path}: {wrong}, wanted whole numbers")
+            numbers = values.astype(np.int64)
             is_kept = labels.are_kept(numbers)
             yield RawCloud(points[is_kept], colors_of(numbers[is_kept]))
 
     return read_chunks
-
-
-def as_integers(path: Path, points: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Labels (N,) of points (N, 3), as integers; 0 for points without a position, left out later."""
-    values = np.where(np.isfinite(points).all(axis=1), values, 0.0)
-    is_whole = (np.abs(values) < MOST) & (values == np.floor(values))
-    if not is_whole.all():
-        raise InputError(f"{path}: found the label {values[np.argmin(is_whole)]:g}, wanted whole numbers")
-    return values.astype(np.int64)

@@ -44,7 +44,14 @@ def write_scene(
     """
     folder = out / spec.name
     if (folder / QUERIES_NAME).exists():
-        return _there_already(spec, folder)
+        scene = read_scene(folder)
+        source = json.loads((folder / QUERIES_NAME).read_text()).get("source")
+        if source != spec.source:
+            found, wanted = json.dumps(source), json.dumps(spec.source)
+            raise InputError(
+                f"{folder}: found a scene of {found}, wanted {wanted}: remove it, or change --out"
+            )
+        return Written(folder, None, len(scene.queries))
     folder.parent.mkdir(parents=True, exist_ok=True)
     check_output_folder(folder)
     panoramas = spec.read_panoramas()
@@ -56,15 +63,6 @@ def write_scene(
         queries = [_write_panorama(spec, panorama, unfinished, transfer) for panorama in panoramas]
         write_queries(unfinished, queries, source=spec.source)
     return Written(folder, num_points, len(queries), tuple(warnings))
-
-
-def _there_already(spec: SceneSpec, folder: Path) -> Written:
-    scene = read_scene(folder)
-    source = json.loads((folder / QUERIES_NAME).read_text()).get("source")
-    if source != spec.source:
-        found, wanted = json.dumps(source), json.dumps(spec.source)
-        raise InputError(f"{folder}: found a scene of {found}, wanted {wanted}: remove it, or change --out")
-    return Written(folder, None, len(scene.queries))
 
 
 def _write_cloud(spec: SceneSpec, path: Path, warnings: list[str], show: Progress) -> int:

@@ -216,9 +216,8 @@ def open_run(path: Path, config: RunConfig, scenes: Sequence[Scene], variants: S
     rows, size = read_run(path) if path.exists() else ([], 0)
     repeated = settings_json(config.settings, config.cloud_settings, config.read_options)
     _check_settings(path, rows, json.loads(json.dumps(repeated)))
-    queries = {
-        (scene.name, scene.name_of(query)): (scene, query) for scene in scenes for query in scene.queries
-    }
+    pairs = [(scene, query) for scene in scenes for query in scene.queries]
+    queries = {(scene.name, scene.name_of(query)): (scene, query) for scene, query in pairs}
     known = {query.variant for _, query in queries.values()}
     if missing := [variant for variant in variants if variant not in known]:
         raise InputError(f"--variants: found no {missing[0]}, wanted some of {', '.join(sorted(known))}")

@@ -81,6 +81,9 @@ def risk_and_coverage(rows: Sequence[QueryResult], thresholds: Thresholds = PAPE
     return list(points.values())
 
 
+Pair = tuple[QueryResult, QueryResult]  # the same query in two runs
+
+
 class Table(NamedTuple):
     """A table of text; the first `num_left` columns are words."""
 
@@ -175,28 +178,16 @@ def csv_text(rows: Sequence[QueryResult]) -> str:
     return file.getvalue()
 
 
-class Pair(NamedTuple):
-    """The same query in two runs."""
-
-    first: QueryResult
-    second: QueryResult
-
-    def has_changed(self, thresholds: Thresholds) -> bool:
-        """True if one run is correct where the other is wrong, or their statuses differ."""
-        is_other_status = self.first.result.status != self.second.result.status
-        return is_other_status or self.first.is_correct(thresholds) != self.second.is_correct(thresholds)
-
-
 def pair_up(first: Sequence[QueryResult], second: Sequence[QueryResult]) -> list[Pair]:
     """The queries that both runs have, in the order of their names."""
     others = {row.key: row for row in second}
-    pairs = [Pair(row, others[row.key]) for row in first if row.key in others]
-    return sorted(pairs, key=lambda pair: pair.first.key)
+    pairs = [(row, others[row.key]) for row in first if row.key in others]
+    return sorted(pairs, key=lambda pair: pair[0].key)
 
 
 def side_by_side(pairs: Sequence[Pair], names: tuple[str, str], thresholds: Thresholds) -> Table:
     """The statistics of two runs over the queries that both have."""
-    runs = [summarize([p.first for p in pairs], thresholds), summarize([p.second for p in pairs], thresholds)]
+    runs = [summarize([pair[k] for pair in pairs], thresholds) for k in (0, 1)]
     columns = "run", "queries", "correct", "accuracy", "localized", "wrong of these"
     rows = tuple((name, *_cells(run)) for name, run in zip(names, runs, strict=True))
     return Table("", (*columns, "t 50 % [m]", "R 50 % [deg]", "s"), rows)
@@ -211,12 +202,11 @@ def _cells(s: Summary) -> tuple[str, ...]:
 def changes(pairs: Sequence[Pair], thresholds: Thresholds) -> Table:
     """The queries that one run alone gets right, or whose statuses differ."""
     rows = []
-    for pair in pairs:
-        if pair.has_changed(thresholds):
-            was, is_now = pair.first.is_correct(thresholds), pair.second.is_correct(thresholds)
+    for first, second in pairs:
+        was, is_now = first.is_correct(thresholds), second.is_correct(thresholds)
+        if was != is_now or first.result.status != second.result.status:
             kind = "same error" if was == is_now else "better" if is_now else "worse"
-            cells = _outcome(pair.first), _outcome(pair.second)
-            rows.append((pair.first.scene, pair.first.image, kind, *cells))
+            rows.append((first.scene, first.image, kind, _outcome(first), _outcome(second)))
     columns = "scene", "panorama", "second is", "first", "second"
     return Table("queries that changed", columns, tuple(rows), 5)
 

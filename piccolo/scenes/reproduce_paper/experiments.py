@@ -158,14 +158,11 @@ def _cells(condition: Condition, rows: Sequence[QueryResult]) -> tuple[str, ...]
     summary = summarize(rows)
     errors = f"{summary.position_quartiles[1]:.4f}", f"{_median_of_correct(rows):.4f}"
     angle = f"{np.degrees(summary.rotation_quartiles[1]):.3f}"
-    seconds = tuple(f"{_median_seconds(rows, stage):.2f}" for stage in ("search", "refine"))
+    stages = [[row.result.seconds.get(stage, 0.0) for row in rows] for stage in ("search", "refine")]
+    seconds = [f"{np.median(stage):.2f}" for stage in stages]
     counts = f"{summary.num_queries}", f"{summary.accuracy:.3f}"
     verdicts = f"{summary.num_localized}", f"{summary.num_wrong}"
     return (condition.name, condition.preset, *counts, *errors, angle, *seconds, *verdicts, condition.paper)
-
-
-def _median_seconds(rows: Sequence[QueryResult], stage: str) -> float:
-    return float(np.median([row.result.seconds.get(stage, 0.0) for row in rows]))
 
 
 def _median_of_correct(rows: Sequence[QueryResult]) -> float:
