@@ -83,7 +83,8 @@ def test_the_picture_at_the_true_pose_is_the_photo(points, variant):
     photo = cv2.resize(query.rgb, (WIDTH, WIDTH // 2), interpolation=cv2.INTER_AREA).astype(float)
 
     def correlation(pose):
-        rgb = fill_holes(render_points(points, pose, WIDTH, WORKERS)).astype(float)
+        view = render_points(points, pose, WIDTH, WORKERS)
+        rgb = fill_holes(view.rgb, view.is_seen).astype(float)
         return np.corrcoef(rgb.ravel(), photo.ravel())[0, 1]
 
     true_pose = rooms.local(SEED, query.pose)
@@ -125,7 +126,7 @@ def test_a_sparse_wall_hides_what_is_behind_it():
     picture = render_points(cloud, pose, 1024, WORKERS)
     front = np.s_[200:312, 450:574]
     assert picture.is_seen[front].mean() > 0.97
-    rgb = fill_holes(picture)[front]
+    rgb = fill_holes(picture.rgb, picture.is_seen)[front]
     assert (rgb[..., 2] < 40).mean() > 0.99
     assert abs(picture.depth[256, 512] - 2.0) < 0.01
 
@@ -162,12 +163,12 @@ def test_holes_take_the_colours_around_them_and_nothing_else_changes(size):
     depth = np.where(rng.random(size) < 0.3, np.inf, 1.0).astype(np.float32)
     depth[0, 0] = 1.0
     picture = RenderedView(np.where(np.isfinite(depth)[..., None], rgb, 0).astype(np.uint8), depth)
-    filled = fill_holes(picture)
+    filled = fill_holes(picture.rgb, picture.is_seen)
     np.testing.assert_array_equal(filled[picture.is_seen], rgb[picture.is_seen])
     assert filled.min() >= 98
     assert filled.max() <= 201
     nothing = RenderedView(np.zeros((*size, 3), np.uint8), np.full(size, np.inf, np.float32))
-    assert not fill_holes(nothing).any()
+    assert not fill_holes(nothing.rgb, nothing.is_seen).any()
 
 
 def test_a_hole_at_the_seam_is_closed_from_both_sides():
@@ -175,7 +176,8 @@ def test_a_hole_at_the_seam_is_closed_from_both_sides():
     rgb[:, 32:] = 200
     depth = np.ones((32, 64), np.float32)
     depth[:, :4] = depth[:, -4:] = np.inf
-    filled = fill_holes(RenderedView(np.where(np.isfinite(depth)[..., None], rgb, 0).astype(np.uint8), depth))
+    is_seen = np.isfinite(depth)
+    filled = fill_holes(np.where(is_seen[..., None], rgb, 0).astype(np.uint8), is_seen)
     middle = filled[16, [60, 62, 0, 2], 0].astype(int)
     assert (np.diff(middle) < 0).all()
     assert 20 < middle[1:3].mean() < 180

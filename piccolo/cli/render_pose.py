@@ -173,7 +173,7 @@ def draw_pictures(arguments: argparse.Namespace, cloud: LocalCloud, poses: Named
             write_atomically(arguments.mask_out, encode_image(nothing, ".png"))
         if arguments.holes == "mark":
             view.rgb[~view.is_seen] = MAGENTA
-        rgb = fill_holes(view) if arguments.holes == "close" else view.rgb
+        rgb = fill_holes(view.rgb, view.is_seen) if arguments.holes == "close" else view.rgb
         write_atomically(folder / name, encode_image(rgb, Path(name).suffix.lower()))
         out = arguments.out / name if is_folder else arguments.out
         return {"out": str(out), "pano": pano, "width": arguments.width, "seen_fraction": seen_fraction}

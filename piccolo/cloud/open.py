@@ -26,11 +26,8 @@ def open_cloud(
 ) -> CloudStream:
     """The coloured cloud in one or several files, before its points are read.
 
-    Raises
-    ------
-    InputError
-        A file is missing, has a damaged header, no colours, or is no format that is read here. Reading the
-        points raises it where the data break or fail the checks of `validation.PointValidator`.
+    Raises InputError if a file is missing, has a damaged header, no colours, or is no format that is read
+    here. Reading the points raises it where the data break or fail the checks of `PointValidator`.
     """
     options = CloudReadOptions(settings.intensity_as_gray, settings.labels, settings.scale)
     sources = [open_source(path, options) for path in sorted(paths)]

@@ -119,16 +119,14 @@ class VoxelTable:
             if len(points) and self.num_voxels < full:
                 far = f"points more than {MAX_CELL * LEAF_SIZE / 1000:.0f} km apart, wanted one scene"
                 raise InputError(f"{self.label}: {far}; remove broken points or set --units or --scale")
+            if len(points) and len(self.table) >= MAX_ROWS:
+                found = f"more than {self.num_voxels} voxels of {LEAF_SIZE} m are filled"
+                wanted = "if its unit is not the metre, set --units or --scale"
+                raise InputError(f"{self.label}: {found}; {wanted}")
             if len(points):
-                self._grow()
-
-    def _grow(self) -> None:
-        if len(self.table) >= MAX_ROWS:
-            found = f"more than {self.num_voxels} voxels of {LEAF_SIZE} m are filled"
-            raise InputError(f"{self.label}: {found}; if its unit is not the metre, set --units or --scale")
-        larger = np.zeros((2 * len(self.table), NUM_COLUMNS), np.int32)
-        move_voxels(self.table, larger)
-        self.table = larger
+                larger = np.zeros((2 * len(self.table), NUM_COLUMNS), np.int32)
+                move_voxels(self.table, larger)
+                self.table = larger
 
     def finish(self) -> Voxels:
         """The means; those too far from the rest for a Morton code are left out. The table is spent."""
@@ -173,41 +171,17 @@ class Octree(NamedTuple):
         return self.nodes[self.level_start[level] : self.level_start[level + 1]]
 
 
-@kernel
-def average_children(child_nodes, child_codes, nodes, codes, first_child):
-    """Write the mean of the children of each parent voxel and where they begin. Returns how many parents."""
-    count = 0
-    n, sums = len(child_codes), np.zeros(6)
-    lo = 0
-    while lo < n:
-        hi = lo
-        code = child_codes[lo] >> 3
-        sums[:] = 0.0
-        while hi < n and (child_codes[hi] >> 3) == code:
-            for k in range(6):
-                sums[k] += child_nodes[hi, k]
-            hi += 1
-        per = 1.0 / (hi - lo)
-        for k in range(6):
-            nodes[count, k] = sums[k] * per
-        codes[count] = code
-        first_child[count] = lo
-        count += 1
-        lo = hi
-    return count
-
-
 def build_octree(voxels: Voxels) -> Octree:
     """The octree whose leaves are the voxels."""
     nodes, node_codes = voxels.nodes, voxels.codes
     levels, children = [nodes], [np.zeros(len(nodes), np.int32)]
     for _ in range(NUM_LEVELS - 1):
-        parents, parent_codes = np.empty_like(nodes), np.empty_like(node_codes)
-        first = np.empty(len(nodes), np.int32)
-        count = average_children(nodes, node_codes, parents, parent_codes, first)
-        nodes, node_codes = parents[:count].copy(), parent_codes[:count].copy()
+        first = np.flatnonzero(np.diff(node_codes >> 3, prepend=-1))  # children of a parent follow each other
+        counts = np.diff(first, append=len(nodes))
+        columns = [np.add.reduceat(column, first, dtype=np.float64) / counts for column in nodes.T]
+        nodes, node_codes = np.stack(columns, axis=1, dtype=np.float32), node_codes[first] >> 3
         levels.insert(0, nodes)
-        children.insert(0, first[:count].copy())
+        children.insert(0, first.astype(np.int32))
     start = np.concatenate([[0], np.cumsum([len(level) for level in levels])]).astype(np.int32)
     first_child = np.concatenate([c + s for c, s in zip(children[:-1], start[1:-1], strict=True)])
     leaves = np.full(len(levels[-1]) + 1, start[-1], np.int32)

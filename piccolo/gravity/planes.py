@@ -46,10 +46,7 @@ class PointNormals(NamedTuple):
 def estimate_normals(points: NDArray[np.float32]) -> PointNormals:
     """Normals of an evenly strided sample of a cloud (N, 3) [m], by PCA of the nearest of all its points.
 
-    Raises
-    ------
-    InputError
-        The shape is not (N, 3), or a coordinate is not finite.
+    Raises InputError if the shape is not (N, 3), or a coordinate is not finite.
     """
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"points: the shape is {points.shape}, must be (N, 3)")
@@ -186,7 +183,9 @@ def classify_planes(planes: list[Plane], cloud: PointNormals, up: Array) -> list
             continue
         distances = dot(cloud.points, plane.normal_world) - plane.offset
         height, sign = float(np.median(heights[np.abs(distances) < TOLERANCE])), float(np.sign(sine))
-        kind: Kind = "ceiling" if height - lowest > MIN_STOREY and _is_ceiling(things, height) else "floor"
+        ends = np.searchsorted(things, height + np.array([-NEAR, -2.0 * TOLERANCE, 2.0 * TOLERANCE, NEAR]))
+        is_more_below = ends[1] - ends[0] > ends[3] - ends[2]
+        kind: Kind = "ceiling" if height - lowest > MIN_STOREY and is_more_below else "floor"
         near = (other for level, other in storeys if abs(level - height) < MIN_STOREY)
         if any(other.num_inliers > 2 * plane.num_inliers for other in near):
             kind = "platform"
@@ -195,12 +194,6 @@ def classify_planes(planes: list[Plane], cloud: PointNormals, up: Array) -> list
         if kind != "platform":
             storeys.append((height, classified[-1]))
     return classified
-
-
-def _is_ceiling(things: Array, height: float) -> bool:
-    """True if more of the things, at ascending heights (N,), are just below `height` than just above."""
-    ends = np.searchsorted(things, height + np.array([-NEAR, -2.0 * TOLERANCE, 2.0 * TOLERANCE, NEAR]))
-    return bool(ends[1] - ends[0] > ends[3] - ends[2])
 
 
 def manhattan_yaw(planes: list[Plane], R_level_from_scan: Array) -> float | None:

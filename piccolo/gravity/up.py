@@ -46,19 +46,13 @@ ROOF_THRESHOLD = 0.2  # fraction of walls at odd angles, from which on they may 
 DOUBT_FACTOR = 0.6  # on the confidence, for each of these
 
 
-def _sphere_cells() -> Array:
-    """Directions (NUM_CELLS, 3) evenly over the sphere, a Fibonacci spiral."""
-    k = np.arange(NUM_CELLS) + 0.5
-    z = 1.0 - 2.0 * k / NUM_CELLS
-    azimuth = k * np.pi * (3.0 - np.sqrt(5.0))
-    radius = np.sqrt(1.0 - z * z)
-    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)
-
-
 def candidate_axes(cloud: PointNormals) -> list[Array]:
     """Unit vectors (3,) that many flat points face, and those perpendicular to two such axes; either sign."""
     normals = cloud.normals[cloud.is_flat]
-    cells = _sphere_cells()
+    k = np.arange(NUM_CELLS) + 0.5  # directions (NUM_CELLS, 3) evenly over the sphere, a Fibonacci spiral
+    azimuth, z = k * np.pi * (3.0 - np.sqrt(5.0)), 1.0 - 2.0 * k / NUM_CELLS
+    radius = np.sqrt(1.0 - z * z)
+    cells = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)
     tree = cKDTree(cells)
     nearest = tree.query(np.concatenate([normals, -normals]))[1]
     counts = np.bincount(nearest, minlength=NUM_CELLS)
@@ -193,7 +187,9 @@ def _doubts(
     doubts = []
     if neighborhood_radius > CLEAR_RADIUS:
         doubts.append(f"points so sparse that 24 neighbours reach {neighborhood_radius:.1f} m")
-    if _may_be_front(best, hypotheses):
+    across = [other for other in hypotheses if abs(other.axis @ best.axis) < 0.3]
+    energy = OPEN_ENERGY_RATIO * best.level_energy
+    if any(h.above_below_balance > OPEN_BALANCE and h.level_energy > energy for h in across):
         factor *= DOUBT_FACTOR
         doubts.append("ground and the front of a building look alike")
     if best.extent < SLAB_EXTENT:
@@ -203,13 +199,3 @@ def _doubts(
         factor *= DOUBT_FACTOR
         doubts.append("walls at odd angles, maybe a roof")
     return float(factor), doubts
-
-
-def _may_be_front(best: UpFeatures, hypotheses: list[UpFeatures]) -> bool:
-    """True if a plane across the best one has open space before it, and so may be the ground."""
-    return any(
-        other.above_below_balance > OPEN_BALANCE
-        and other.level_energy > OPEN_ENERGY_RATIO * best.level_energy
-        for other in hypotheses
-        if abs(other.axis @ best.axis) < 0.3
-    )

@@ -84,11 +84,11 @@ def frames_of(
     chosen = np.unique(np.linspace(0, len(history) - 1, min(MAX_FRAMES, len(history))).astype(int))
 
     def frame(k: int) -> NDArray[np.uint8]:
-        cloud = fill_holes(render_surfels(surfels, history[k].pose, width, Workers(1)))
+        view = render_surfels(surfels, history[k].pose, width, Workers(1))
         bar = np.zeros((TEXT_HEIGHT, width, 3), np.uint8)
         text = f"iteration {history[k].iteration}   loss {history[k].loss:.4f}"
         cv2.putText(bar, text, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
-        return np.concatenate([bar, checkerboard(photo, cloud)])
+        return np.concatenate([bar, checkerboard(photo, fill_holes(view.rgb, view.is_seen))])
 
     return list(workers.map(frame, chosen.tolist(), "frames"))
 

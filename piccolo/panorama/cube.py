@@ -107,10 +107,8 @@ def _sampled(faces: Faces, directions: NDArray[np.float32], rim: int) -> NDArray
 def read_cube_folder(folder: Path) -> Picture:
     """The panorama of the six square pictures in a folder, one cube's faces.
 
-    Raises
-    ------
-    InputError
-        The folder holds no complete cube or several, or the faces are not squares of one size.
+    Raises InputError if the folder holds no complete cube or several, or the faces are not squares of one
+    size.
     """
     paths = face_paths(folder).items()
     pictures = {letter: read_picture(path, (MIN_FACE, MIN_FACE)) for letter, path in paths}
@@ -149,10 +147,7 @@ def cube_of_cells(path: Path, picture: Picture, order: str | None) -> Picture | 
     A cross, 4:3 or 3:4, is known by its empty cells. A grid, 6:1, 1:6, 3:2 or 2:3, is known by `order` alone,
     the letters of its faces from left to right, then downwards.
 
-    Raises
-    ------
-    InputError
-        An order is given, and the picture is no grid of six squares.
+    Raises InputError if an order is given, and the picture is no grid of six squares.
     """
     if order is not None:
         return _from_faces(path, _grid(path, picture, order), picture.warnings)

@@ -120,10 +120,7 @@ def full_size(path: Path, region: CropRegion, size: tuple[int, int]) -> tuple[in
 
     Within 1 % of 2:1 the direction that has more pixels a degree is shrunk.
 
-    Raises
-    ------
-    InputError
-        The region does not fit the picture, or the sphere's picture would be too large.
+    Raises InputError if the region does not fit the picture, or the sphere's picture would be too large.
     """
     width, height = size[0] / region.width, size[1] / region.height
     found = f"{path}: found {size[0]} x {size[1]}"
@@ -150,7 +147,11 @@ def embed_crop(path: Path, rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], 
     left, top = round(region.left * full_width), max(round(region.top * full_height), 0)
     right = left + max(round(region.width * full_width), 1)
     bottom = min(top + max(round(region.height * full_height), 1), full_height)
-    rgb, is_valid = _resized(rgb, is_valid, (right - left, bottom - top))
+    size = right - left, bottom - top
+    if is_valid.shape != size[::-1]:  # area-averaged; a pixel is valid if all that went into it is
+        mask = cv2.resize(is_valid.astype(np.uint8) * 255, size, interpolation=cv2.INTER_AREA)
+        small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+        rgb, is_valid = np.asarray(small, dtype=np.uint8), np.asarray(mask == 255)
     if is_valid.shape == (full_height, full_width) and left % full_width == 0:
         return rgb, is_valid
     full_rgb = np.zeros((full_height, full_width, 3), dtype=np.uint8)
@@ -158,12 +159,3 @@ def embed_crop(path: Path, rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], 
     columns = np.arange(left, right) % full_width
     full_rgb[top:bottom, columns], full_valid[top:bottom, columns] = rgb, is_valid
     return full_rgb, full_valid
-
-
-def _resized(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], size: tuple[int, int]) -> Pixels:
-    """Both area-averaged to `size`; a pixel is valid if all that went into it is."""
-    if is_valid.shape == (size[1], size[0]):
-        return rgb, is_valid
-    small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
-    mask = cv2.resize(is_valid.astype(np.uint8) * 255, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(small, dtype=np.uint8), np.asarray(mask == 255)

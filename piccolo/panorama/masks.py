@@ -170,10 +170,7 @@ def read_mask(path: Path, sizes: list[tuple[int, int]]) -> tuple[int, NDArray[np
 
     A larger mask masks a pixel if any of its own pixels there is white, a smaller one is enlarged.
 
-    Raises
-    ------
-    InputError
-        The mask can't be read, or has the shape of none of the sizes, within 1 %.
+    Raises InputError if the mask can't be read, or has the shape of none of the sizes, within 1 %.
     """
     rgb = read_picture(path, MIN_MASK).rgb
     height, width = rgb.shape[:2]

@@ -86,10 +86,7 @@ class Picture:
 def read_picture(path: Path, min_size: tuple[int, int] = (MIN_WIDTH, MIN_HEIGHT)) -> Picture:
     """The picture in a file; grey becomes RGB, of 16 bits the upper 8 are kept (v >> 8).
 
-    Raises
-    ------
-    InputError
-        The file is missing or damaged, of no format read here, or its size is out of range.
+    Raises InputError if the file is missing or damaged, of no format read here, or its size is out of range.
     """
     data = file_bytes(path)
     with opened(path, data) as image:
@@ -111,10 +108,8 @@ def read_picture(path: Path, min_size: tuple[int, int] = (MIN_WIDTH, MIN_HEIGHT)
 def read_labels(path: Path, labels: Labels) -> Picture:
     """The picture in a PNG file of labels, in their colours; of RGB, a label is R 65536 + G 256 + B.
 
-    Raises
-    ------
-    InputError
-        The file is missing or damaged, its size is out of range, or it is of no kind that keeps labels.
+    Raises InputError if the file is missing or damaged, its size is out of range, or it is of no kind that
+    keeps labels.
     """
     data = file_bytes(path)
     with opened(path, data) as image:

@@ -68,7 +68,10 @@ def visible_indices(points: PackedPoints, center_world: Array) -> NDArray[np.int
 
 def render_surfels(surfels: Surfels, pose: Pose, width: int, workers: Workers) -> RenderedView:
     """The surfels seen from `pose`."""
-    surfels = _without_lone(surfels, pose.center_world)
+    p = surfels.points
+    ranges = np.linalg.norm(np.stack([p.x, p.y, p.z], axis=1) - pose.center_world, axis=1)
+    largest = np.maximum(MAX_RADIUS * np.percentile(surfels.radii, 95.0), FAR_ANGLE * ranges)  # not lone
+    surfels = surfels.take(np.flatnonzero((surfels.radii <= largest) & (ranges > MIN_RANGE)))
     packed, directions, angles = _in_camera(surfels, pose, width)
     rgb = np.zeros((width // 2, width, 3), np.uint8)
     depth = np.full((width // 2, width), np.inf, np.float32)
@@ -93,18 +96,10 @@ def render_surfels(surfels: Surfels, pose: Pose, width: int, workers: Workers) -
     return RenderedView(rgb, depth)
 
 
-def _without_lone(surfels: Surfels, center_world: Array) -> Surfels:
-    """The surfels without lone ones and those at the camera itself."""
-    p = surfels.points
-    ranges = np.linalg.norm(np.stack([p.x, p.y, p.z], axis=1) - center_world, axis=1)
-    largest = np.maximum(MAX_RADIUS * np.percentile(surfels.radii, 95.0), FAR_ANGLE * ranges)
-    return surfels.take(np.flatnonzero((surfels.radii <= largest) & (ranges > MIN_RANGE)))
-
-
 def _in_camera(
     surfels: Surfels, pose: Pose, width: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
-    """Surfels (N, 9), directions (N, 2) and angles (N,) as `splatting.splat` reads them."""
+    """Surfels (N, 9), directions (N, 2) and angles (N,) as `surfels.splat` reads them."""
     p, R = surfels.points, pose.R_cam_from_world
     x_cam = (np.stack([p.x, p.y, p.z], axis=1) - pose.center_world) @ R.T
     ranges = np.linalg.norm(x_cam, axis=1)
@@ -124,15 +119,11 @@ def _in_camera(
     return packed, np.stack([azimuth, elevation], axis=1), angles
 
 
-def fill_holes(view: RenderedView) -> NDArray[np.uint8]:
-    """The view's colours; what is not seen takes those around it, the farther away the smoother."""
-    return _filled(view.rgb, view.is_seen)
+def fill_holes(rgb: NDArray[np.uint8], is_seen: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """A picture (H, W, 3); what is not seen (H, W) takes colours around it, the farther away the smoother.
 
-
-def _filled(rgb: NDArray[np.uint8], is_seen: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Holes filled from the same at half the size; black if nothing is seen at all.
-
-    In bytes, as floating-point copies of a large picture would take gigabytes.
+    From the same at half the size, in bytes, as floating-point copies of a large picture would take
+    gigabytes. Black if nothing is seen at all.
     """
     height, width = is_seen.shape
     if is_seen.all() or width == 1:
@@ -148,7 +139,7 @@ def _filled(rgb: NDArray[np.uint8], is_seen: NDArray[np.bool_]) -> NDArray[np.ui
     total = cv2.resize(masked, size, interpolation=cv2.INTER_AREA)
     del counts, masked
     mean = cv2.divide(total, cv2.merge([weights, weights, weights]), scale=255.0)
-    coarse = _filled(np.asarray(mean, np.uint8), weights > 0)
+    coarse = fill_holes(np.asarray(mean, np.uint8), weights > 0)
     around = np.concatenate([coarse[:, -1:], coarse, coarse[:, :1]], axis=1)
     double = (2 * around.shape[1], 2 * len(around))
     smooth = cv2.resize(around, double, interpolation=cv2.INTER_LINEAR)[:height, 2 : 2 + width]
@@ -181,5 +172,6 @@ def checkerboard(photo: NDArray[np.uint8], cloud: NDArray[np.uint8]) -> NDArray[
 
 def overlay_png(points: PackedPoints, panorama: Panorama, pose: Pose, workers: Workers) -> bytes:
     """PNG file of three images, one above the other: panorama, cloud from the pose, checkerboard of both."""
-    cloud = fill_holes(render_points(points, pose, OVERLAY_WIDTH, workers))
+    view = render_points(points, pose, OVERLAY_WIDTH, workers)
+    cloud = fill_holes(view.rgb, view.is_seen)
     return encode_image(checkerboard(resized_rgb(panorama, OVERLAY_WIDTH), cloud), ".png")

@@ -180,20 +180,16 @@ def _read(path: Path, scans: list[E57Scan]) -> Iterator[tuple[E57Scan, Array, Ar
                 is_valid = np.ones(len(columns[scan.channels[0]]), dtype=np.bool_)
                 for name in scan.invalid:
                     is_valid &= columns[name] == 0
-                coordinates = [columns[name][is_valid] for name in scan.coordinates]
+                a, b, c = (columns[name][is_valid] for name in scan.coordinates)
                 channels = np.stack([columns[name][is_valid] for name in scan.channels], axis=1)
-                yield scan, _in_world(scan, *coordinates), channels
-
-
-def _in_world(scan: E57Scan, a: Array, b: Array, c: Array) -> Array:
-    """Points (N, 3) in the world of coordinates (N,): x y z, or range, azimuth, elevation."""
-    with np.errstate(over="ignore", invalid="ignore"):  # broken points may be infinite
-        if scan.coordinates == SPHERICAL:
-            a, b, c = a * np.cos(c) * np.cos(b), a * np.cos(c) * np.sin(b), a * np.sin(c)
-        points = np.stack([a, b, c], axis=1)
-        if scan.pose is None:
-            return points
-        return rotate_points(points, scan.pose.R_cam_from_world.T) + scan.pose.center_world
+                with np.errstate(over="ignore", invalid="ignore"):  # broken points may be infinite
+                    if scan.coordinates == SPHERICAL:
+                        a, b, c = a * np.cos(c) * np.cos(b), a * np.cos(c) * np.sin(b), a * np.sin(c)
+                    points = np.stack([a, b, c], axis=1)
+                    if scan.pose is not None:
+                        R_world_from_scan = scan.pose.R_cam_from_world.T
+                        points = rotate_points(points, R_world_from_scan) + scan.pose.center_world
+                yield scan, points, channels
 
 
 def _read_scan(file: E57File, scan: E57Scan) -> Iterator[dict[str, Array]]:

@@ -7,8 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from .las_header import MAGIC, WANTED, LasHeader, read_header
-from .laz import MAX_CHUNK_SIZE, LasLayout, decompress, read_laz_layout
+from .las_file import (
+    MAGIC,
+    MAX_CHUNK_SIZE,
+    WANTED,
+    LasHeader,
+    LasLayout,
+    decompress,
+    read_header,
+    read_laz_layout,
+)
 from .reader import CHUNK, CUT, PLAIN, CloudFormat, CloudReadOptions, PointSource, PointsWithScalar, RawCloud
 from .scalars import OPTION, intensity_reader, label_reader
 

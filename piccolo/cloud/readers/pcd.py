@@ -30,9 +30,8 @@ from .number_lines import LineLayout, NumberLines
 from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, RawCloud, point_label, quoted
 from .scalars import check_option
 
-MAX_HEADER_SIZE = 1 << 16  # [byte]
+MAX_HEADER_SIZE = MAX_ROW_SIZE = 1 << 16  # [byte]; a row is a point
 MAX_COUNT_DIGITS = 10
-MAX_ROW_SIZE = 1 << 16  # [byte] of a point
 ENCODINGS = ("ascii", "binary", "binary_compressed")
 WANTED = "wanted a PCD file with the fields x y z and rgb, rgba or r g b"
 LZF_BROKEN = -1

@@ -141,19 +141,16 @@ def _pose(where: str, row: Row, options: ConvertOptions) -> Pose:
 
 
 def _scene_spec(room: str, entries: list[Entry], options: ConvertOptions) -> SceneSpec:
-    clouds = {cloud or _cloud_of_all(options) for cloud, _ in entries}
+    found = {cloud for cloud, _ in entries}
+    clouds = {cloud or options.cloud or only_cloud_in(options.folder) for cloud in found}
+    if None in clouds:
+        raise InputError(f"{options.folder}: found no cloud, wanted one, or --cloud, or a column `cloud`")
     if len(clouds) > 1:
         names = ", ".join(sorted(map(str, clouds))[:2])
         raise InputError(f"room {room}: found the clouds {names}, wanted one")
     panoramas = _with_unique_names([panorama for _, panorama in entries])
-    return SceneSpec(room, (CloudPart(clouds.pop()),), lambda: panoramas, source={"dataset": NAME})
-
-
-def _cloud_of_all(options: ConvertOptions) -> Path:
-    cloud = options.cloud or only_cloud_in(options.folder)
-    if cloud is None:
-        raise InputError(f"{options.folder}: found no cloud, wanted one, or --cloud, or a column `cloud`")
-    return cloud
+    parts = tuple(CloudPart(cloud) for cloud in clouds if cloud)
+    return SceneSpec(room, parts, lambda: panoramas, source={"dataset": NAME})
 
 
 def _with_unique_names(panoramas: list[PosedPanorama]) -> list[PosedPanorama]:

@@ -1,4 +1,4 @@
-"""Poses as text: CSV, trajectories for evo and others, Potree's images, COLMAP, nerfstudio and OpenSfM.
+"""Poses as text: tables, trajectories, Potree's images, COLMAP, nerfstudio, OpenSfM, and points on maps.
 
 Numbers are written so that the same float64 is read back. Where a format has no place for the offset, it is
 written beside it: <name>.offset.txt.
@@ -183,6 +183,41 @@ def write_json(out: Path, document: object) -> None:
     write_atomically(out, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
 
 
+def write_geojson(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write a FeatureCollection (RFC 7946) with a point a result: longitude and latitude in WGS84."""
+    pyproj, crs = import_optional("GeoJSON", "pyproj", "tools"), options.crs
+    if crs is None:
+        raise InputError("--crs: not given, wanted the cloud's coordinate system, such as EPSG:25832")
+    try:
+        system = pyproj.CRS.from_user_input(crs)
+    except pyproj.exceptions.CRSError as error:
+        raise InputError(f"--crs: found {crs!r}, wanted a coordinate system such as EPSG:25832") from error
+    units = {axis.unit_name for axis in system.axis_info[:2]}
+    if not system.is_projected or units != {"metre"}:
+        raise InputError(f"--crs: found {crs} ({system.name}), wanted a projected system in metres")
+    transformer = pyproj.Transformer.from_crs(system, "EPSG:4326", always_xy=True)
+    features = [_feature(image, transformer, pyproj.Geod(ellps="WGS84"), crs) for image in images]
+    write_json(out, {"type": "FeatureCollection", "features": features})
+
+
+def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[str, object]:
+    """The point without a height, which would have to be above WGS84's ellipsoid: z is a property."""
+    result, (x, y, z) = image.result, image.pose.center_world.tolist()
+    heading, pitch, roll = heading_pitch_roll_deg(image.pose)
+    ahead = np.radians(heading)
+    eastings, northings = [x, x + STEP * np.sin(ahead)], [y, y + STEP * np.cos(ahead)]
+    longitudes, latitudes = transformer.transform(eastings, northings)
+    if not np.isfinite([*longitudes, *latitudes]).all():
+        raise InputError(f"{image.path}: found a camera at ({x}, {y}), wanted one where {crs} holds")
+    true_heading, _, _ = geod.inv(longitudes[0], latitudes[0], longitudes[1], latitudes[1])
+    properties: dict[str, object] = {"image": image.name, "cloud": result.cloud_name, "status": result.status}
+    properties |= {"confidence": result.confidence, "score": result.evidence and result.evidence.score}
+    properties |= {"crs": crs, "x": x, "y": y, "z": z, "heading_deg": heading}
+    properties |= {"heading_true_deg": true_heading % 360.0, "pitch_deg": pitch, "roll_deg": roll}
+    point = {"type": "Point", "coordinates": [longitudes[0], latitudes[0]]}
+    return {"type": "Feature", "geometry": point, "properties": properties}
+
+
 OFFSET, MODEL = frozenset({"offset"}), frozenset({"size", "offset"})
 COLMAP_TEXT = "text model of COLMAP 4 and pycolmap; --out is a new folder"
 NERFSTUDIO_TEXT = "transforms.json of nerfstudio, in the folder that --images names"
@@ -194,55 +229,5 @@ CSV = Format("csv", "table with a header", write_csv, OFFSET, has_unique_names=F
 TUM = Format("tum", "trajectory for evo and others", write_tum, OFFSET | {"axes", "timestamps"})
 KITTI = Format("kitti", "trajectory for evo and others", write_kitti, OFFSET | {"axes"})
 POTREE = Format("potree", POTREE_TEXT, write_potree, OFFSET | {"timestamps"}, forbidden='"')
-
-
-def write(images: Sequence[PosedImage], out: Path, options: Options) -> None:
-    """Write a FeatureCollection with a point a result."""
-    pyproj = import_optional("GeoJSON", "pyproj", "tools")
-    if options.crs is None:
-        raise InputError("--crs: not given, wanted the cloud's coordinate system, such as EPSG:25832")
-    transformer = _transformer(pyproj, options.crs)
-    features = [_feature(image, transformer, pyproj.Geod(ellps="WGS84"), options.crs) for image in images]
-    document = {"type": "FeatureCollection", "features": features}
-    write_atomically(out, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
-
-
-def _transformer(pyproj: Any, crs: str) -> Any:
-    """From the cloud's coordinates to longitude and latitude."""
-    try:
-        system = pyproj.CRS.from_user_input(crs)
-    except pyproj.exceptions.CRSError as error:
-        raise InputError(f"--crs: found {crs!r}, wanted a coordinate system such as EPSG:25832") from error
-    units = {axis.unit_name for axis in system.axis_info[:2]}
-    if not system.is_projected or units != {"metre"}:
-        raise InputError(f"--crs: found {crs} ({system.name}), wanted a projected system in metres")
-    return pyproj.Transformer.from_crs(system, "EPSG:4326", always_xy=True)
-
-
-def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[str, object]:
-    """The point without a height, which would have to be above WGS84's ellipsoid: z is a property."""
-    properties: dict[str, object]
-    result, (x, y, z) = image.result, image.pose.center_world.tolist()
-    heading, pitch, roll = heading_pitch_roll_deg(image.pose)
-    ahead = np.radians(heading)
-    longitudes, latitudes = transformer.transform(
-        [x, x + STEP * np.sin(ahead)], [y, y + STEP * np.cos(ahead)]
-    )
-    if not np.isfinite([*longitudes, *latitudes]).all():
-        raise InputError(f"{image.path}: found a camera at ({x}, {y}), wanted one where {crs} holds")
-    true_heading, _, _ = geod.inv(longitudes[0], latitudes[0], longitudes[1], latitudes[1])
-    properties = {"image": image.name, "cloud": result.cloud_name, "status": result.status}
-    properties |= {"confidence": result.confidence, "score": result.evidence and result.evidence.score}
-    properties |= {"crs": crs, "x": x, "y": y, "z": z, "heading_deg": heading}
-    properties |= {"heading_true_deg": true_heading % 360.0, "pitch_deg": pitch, "roll_deg": roll}
-    point = {"type": "Point", "coordinates": [longitudes[0], latitudes[0]]}
-    return {"type": "Feature", "geometry": point, "properties": properties}
-
-
-GEOJSON = Format(
-    "geojson",
-    "points for maps, in WGS84; needs --crs and the library pyproj",
-    write,
-    frozenset({"crs"}),
-    has_unique_names=False,
-)
+GEOJSON_TEXT = "points for maps, in WGS84; needs --crs and the library pyproj"
+GEOJSON = Format("geojson", GEOJSON_TEXT, write_geojson, frozenset({"crs"}), has_unique_names=False)
