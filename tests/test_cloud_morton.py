@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from piccolo.cloud import Cloud, stream_of
-from piccolo.cloud.morton import morton_codes, morton_order
 from piccolo.cloud.readers.reader import PLAIN, RawCloud
+from piccolo.cloud.voxels import morton_codes, morton_order
 from piccolo.errors import InputError
 
 A = Path("a")

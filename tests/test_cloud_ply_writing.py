@@ -5,9 +5,8 @@ import pytest
 from plyfile import PlyData
 
 from piccolo.cloud import open_cloud
-from piccolo.cloud.ply_writer import vertex_rows, write_ply, writing_ply
+from piccolo.cloud.ply_writer import needs_double, vertex_rows, write_ply, writing_ply
 from piccolo.cloud.stream import BoundingBox
-from piccolo.cloud.transform import needs_double
 
 
 def _cloud(num_points, dtype):

@@ -11,8 +11,8 @@ import poses
 import pytest
 
 from piccolo.cli import make_room, prepare_map, render_pose
-from piccolo.geometry.camera_axes import heading_pitch_roll_deg
 from piccolo.geometry.pose import T_world_from_cam
+from piccolo.geometry.rotations import heading_pitch_roll_deg
 from piccolo.optimize import descent_animation as animation
 from piccolo.scenes.scene import read_scene
 

@@ -12,8 +12,8 @@ from refusals import mutated, read_or_refused
 
 from piccolo.cloud.soa import LocalCloud, pack_points
 from piccolo.errors import InputError
-from piccolo.geometry.camera_axes import R_cam_from_angles, heading_pitch_roll_deg
 from piccolo.geometry.pose import Pose, T_world_from_cam, angle_between, exp_so3, read_pose_matrix, step
+from piccolo.geometry.rotations import R_cam_from_angles, heading_pitch_roll_deg
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.render.surfel_renderer import RenderedView, encode_image, fill_holes, render_points
 from piccolo.render.surfels import BAND, BAND_OFFSET, MAX_SLOPE, MIN_RADIUS_PX, splat, surfels_of

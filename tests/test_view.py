@@ -15,7 +15,7 @@ from piccolo.coarse_to_fine.camera_positions import (
 )
 from piccolo.coarse_to_fine.scan_map import SEARCH_VIEW, render_candidates
 from piccolo.coarse_to_fine.view import ViewConfig, render_view, visible_points
-from piccolo.geometry.sphere_grid import cell_of, make_grid
+from piccolo.geometry.sphere import cell_of, make_grid
 from piccolo.panorama.local_normalization import LEVELS_PER_UNIT
 from piccolo.runtime.threads import Workers
 

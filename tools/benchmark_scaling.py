@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from piccolo.cli.command import command, option
 from piccolo.cli.errors import UsageError
 from piccolo.cloud import read_cloud
-from piccolo.cloud.morton import morton_order
 from piccolo.cloud.stream import Cloud
+from piccolo.cloud.voxels import morton_order
 from piccolo.coarse_to_fine.localize import localize
 from piccolo.coarse_to_fine.scan_map import prepare_map
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings

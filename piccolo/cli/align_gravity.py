@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..cloud import CloudStream, open_cloud
-from ..cloud.transform import write_transformed
+from ..cloud.ply_writer import write_transformed
 from ..confidence.confidence import check_confidence
 from ..errors import InputError
 from ..gravity import MIN_CONFIDENCE

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from ..cloud.soa import LocalCloud
 from ..coarse_to_fine.open_map import open_points
 from ..errors import InputError
-from ..geometry.camera_axes import R_cam_from_angles
 from ..geometry.pose import Pose, pose_errors, read_pose_matrix
+from ..geometry.rotations import R_cam_from_angles
 from ..optimize.descent_animation import (
     FRAME_WIDTH,
     frames_of,

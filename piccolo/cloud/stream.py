@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..geometry.pose import Array, rotate_points
 from ..runtime.threads import Progress, no_progress
-from .morton import morton_order
 from .readers.columns import brightest_of, colored_chunks
 from .readers.reader import CHUNK, PointSource, RawCloud
-from .voxels import Voxels, VoxelTable
+from .voxels import Voxels, VoxelTable, morton_order
 
 MIN_POINTS = 1000
 MAX_COORDINATE = 1e8  # [m], ten times the Earth: beyond it lie only broken numbers, and float32 gives way

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from ...cloud import FORMATS
 from ...cloud.stream import MAX_COORDINATE
 from ...errors import InputError
-from ...geometry.camera_axes import CAMERA_AXES, OPENGL_FROM_CAM
 from ...geometry.pose import Array, Pose, checked_rotation, orthonormal
+from ...geometry.rotations import CAMERA_AXES, OPENGL_FROM_CAM
 from ...panorama.picture import read_picture
 from ...runtime.atomic import write_atomically
 from ...runtime.json_file import read_text

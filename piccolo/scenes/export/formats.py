@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from ...errors import InputError
-from ...geometry.camera_axes import (
+from ...geometry.pose import T_world_from_cam, log_so3, quaternion_wxyz
+from ...geometry.rotations import (
     CAMERA_AXES,
     OPENGL_FROM_CAM,
     OPTICAL_FROM_CAM,
@@ -23,7 +24,6 @@ from ...geometry.camera_axes import (
     translation,
     turned,
 )
-from ...geometry.pose import T_world_from_cam, log_so3, quaternion_wxyz
 from ...runtime.atomic import replacing_folder, write_atomically
 from ...runtime.optional import import_optional
 from .posed_images import Format, Options, PosedImage
