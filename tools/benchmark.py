@@ -31,7 +31,6 @@ Every kernel is timed once in each round, so that a disturbance hits all; ratios
 The reference is cv2.remap: 8-bit, 3 channels, bilinear, one thread, a coherent map, a pixel a point.
 """
 
-
 Case = tuple[PackedPoints, NDArray[np.uint8], Pose]  # what is timed: points, image (H, W, 3), pose
 
 

@@ -45,7 +45,6 @@ COLUMNS = (
     "peak MB", "before",
 )  # fmt: skip
 
-
 Case = tuple[Cloud, list[tuple[Panorama, Pose]]]  # a cloud, and panoramas in it with their true poses
 
 

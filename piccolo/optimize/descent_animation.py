@@ -98,19 +98,16 @@ def write_animation(path: Path, frames: Frames) -> None:
     kind = path.suffix.lower()
     if kind in (".gif", ".mp4"):
         held = [*frames, *[frames[-1]] * NUM_LAST]
-        write_atomically(path, _gif(held) if kind == ".gif" else _mp4(path, held))
+        file = BytesIO()
+        if kind == ".gif":
+            first, *others = map(Image.fromarray, held)
+            duration = 1000 // FRAMES_PER_S
+            first.save(file, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
+        write_atomically(path, file.getvalue() or _mp4(path, held))
         return
     with replacing_folder(path) as folder:
         for k, frame in enumerate(frames):
             (folder / f"{k:04d}.png").write_bytes(encode_image(frame, ".png"))
-
-
-def _gif(frames: Frames) -> bytes:
-    first, *others = (Image.fromarray(frame) for frame in frames)
-    file = BytesIO()
-    duration = 1000 // FRAMES_PER_S
-    first.save(file, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
-    return file.getvalue()
 
 
 def _mp4(path: Path, frames: Frames) -> bytes:

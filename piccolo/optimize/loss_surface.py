@@ -30,7 +30,6 @@ MAX_PIXELS = 1500  # of the plan, the longer way
 MIN_PIXEL = 0.03  # [m]
 MARKS = {"true": ("*", "white", 260), "found": ("X", "red", 110), "lowest": ("o", "none", 130)}
 
-
 KnownPoses = dict[str, Pose]  # in the frame of the points, by "true" and "found", as far as they are known
 
 

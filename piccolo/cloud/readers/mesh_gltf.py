@@ -148,15 +148,10 @@ def _material(path: Path, material: Json) -> Material:
     return Material((red, green, blue), texture)
 
 
-def _image_row(tree: Json, texture: Json) -> int:
-    """Which image a texture shows."""
-    given = tree["textures"][_count(texture["index"])]
-    return _count(given.get("extensions", {}).get("EXT_texture_webp", given)["source"])
-
-
 def _keep_base_colors(tree: Json, materials: list[Material]) -> None:
     """Leave the images of base colours only; materials take their rows as names."""
-    used = {_image_row(tree, material.texture) for material in materials if material.texture is not None}
+    shown = [tree["textures"][_count(m.texture["index"])] for m in materials if m.texture is not None]
+    used = {_count(t.get("extensions", {}).get("EXT_texture_webp", t)["source"]) for t in shown}
     tree["images"] = [image if i in used else {} for i, image in enumerate(tree.get("images", []))]
     tree["materials"] = [
         {"name": str(i), "pbrMetallicRoughness": {"baseColorTexture": material.texture}}

@@ -30,7 +30,11 @@ Entry = tuple[Path | None, PosedPanorama]  # a row of the list: its cloud, None 
 
 def list_scenes(options: ConvertOptions) -> SceneList:
     """The rooms that the list names, or one by the folder's name."""
-    path = _list_of(options)
+    found = [path for name in LISTS if (path := options.folder / name).exists()]
+    if not options.poses and len(found) != 1:
+        wanted = f"wanted one of {', '.join(LISTS)}, or --poses"
+        raise InputError(f"{options.folder}: found {len(found)} lists, {wanted}")
+    path = options.poses or found[0]
     entries: dict[str, list[Entry]] = defaultdict(list)
     notes: list[str] = []
     rows = _rows(path, options, notes)
@@ -41,16 +45,6 @@ def list_scenes(options: ConvertOptions) -> SceneList:
         raise InputError(f"{path}: found no row with a picture, {WANTED}")
     specs = tuple(_scene_spec(room, entries[room], options) for room in sorted(entries))
     return SceneList(specs, tuple(notes))
-
-
-def _list_of(options: ConvertOptions) -> Path:
-    if options.poses:
-        return options.poses
-    found = [options.folder / name for name in LISTS if (options.folder / name).exists()]
-    if len(found) != 1:
-        wanted = f"wanted one of {', '.join(LISTS)}, or --poses"
-        raise InputError(f"{options.folder}: found {len(found)} lists, {wanted}")
-    return found[0]
 
 
 def _rows(path: Path, options: ConvertOptions, notes: list[str]) -> Iterator[Row]:

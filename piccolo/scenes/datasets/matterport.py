@@ -33,7 +33,8 @@ def list_scenes(options: ConvertOptions) -> SceneList:
             missing.append(str(folder))
             continue
         faces = _faces_in(folder / SKYBOXES)
-        posed = {place: files for place, files in faces.items() if _is_whole(folder, place, files)}
+        whole = [place for place, files in faces.items() if len(files) == NUM_FACES]
+        posed = {place: faces[place] for place in whole if _pose_file(folder, place, SKYBOX_YAW).exists()}
         if len(posed) < len(faces):
             notes.append(f"{folder}: {len(faces) - len(posed)} skyboxes without a pose or without six faces")
         read_panoramas = partial(_posed_panoramas, folder, posed)
@@ -50,10 +51,6 @@ def _faces_in(folder: Path) -> dict[str, dict[str, Path]]:
         if match := FACE.match(path.name):
             faces[match[1]][f"{match[1]}/{path.name}"] = path
     return faces
-
-
-def _is_whole(folder: Path, place: str, files: dict[str, Path]) -> bool:
-    return len(files) == NUM_FACES and _pose_file(folder, place, SKYBOX_YAW).exists()
 
 
 def _pose_file(folder: Path, place: str, yaw: int) -> Path:

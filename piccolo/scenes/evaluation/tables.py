@@ -104,17 +104,15 @@ class Table(NamedTuple):
 def per_query(rows: Sequence[QueryResult]) -> Table:
     """One line a query."""
     columns = "scene", "panorama", "status", "error [m]", "error [deg]", "confidence", "score", "margin"
-    return Table("", (*columns, "loss", "seconds"), tuple(_query_cells(row) for row in rows), 3)
-
-
-def _query_cells(row: QueryResult) -> tuple[str, ...]:
-    result = row.result
-    evidence = result.evidence
-    score = (f"{evidence.score:.2f}", f"{evidence.margin:.2f}") if evidence else ("-", "-")
-    errors = f"{row.position_error:.4f}", f"{np.degrees(row.rotation_error):.3f}"
-    loss = "-" if result.loss is None else f"{result.loss:.3f}"
-    words = row.scene, row.image, result.status
-    return (*words, *errors, f"{result.confidence:.3f}", *score, loss, f"{row.seconds:.2f}")
+    cells = []
+    for row in rows:
+        result, evidence = row.result, row.result.evidence
+        score = (f"{evidence.score:.2f}", f"{evidence.margin:.2f}") if evidence else ("-", "-")
+        errors = f"{row.position_error:.4f}", f"{np.degrees(row.rotation_error):.3f}"
+        loss = "-" if result.loss is None else f"{result.loss:.3f}"
+        words = row.scene, row.image, result.status
+        cells.append((*words, *errors, f"{result.confidence:.3f}", *score, loss, f"{row.seconds:.2f}"))
+    return Table("", (*columns, "loss", "seconds"), tuple(cells), 3)
 
 
 def groups(rows: Sequence[QueryResult]) -> Iterator[tuple[str, list[QueryResult]]]:
@@ -132,15 +130,15 @@ def summary_table(rows: Sequence[QueryResult], thresholds: Thresholds, title: st
     words = f"{title}; correct: under {distance:g} m and {angle_deg:g} deg"
     errors = "t 25 % [m]", "t 50 %", "t 75 %", "R 25 % [deg]", "R 50 %", "R 75 %"
     columns = "queries", "number", "correct", "accuracy", *errors, "localized", "wrong of these", "s"
-    cells = tuple((name, *_summary_cells(summarize(some, thresholds))) for name, some in groups(rows))
-    return Table(words, columns, cells)
-
-
-def _summary_cells(s: Summary) -> tuple[str, ...]:
-    meters = [f"{value:.4f}" for value in s.position_quartiles]
-    degrees = [f"{value:.3f}" for value in np.degrees(s.rotation_quartiles)]
-    counts = f"{s.num_queries}", f"{s.num_correct}", f"{s.accuracy:.3f}"
-    return (*counts, *meters, *degrees, f"{s.num_localized}", f"{s.num_wrong}", f"{s.seconds:.2f}")
+    cells = []
+    for name, some in groups(rows):
+        s = summarize(some, thresholds)
+        meters = [f"{value:.4f}" for value in s.position_quartiles]
+        degrees = [f"{value:.3f}" for value in np.degrees(s.rotation_quartiles)]
+        counts = f"{s.num_queries}", f"{s.num_correct}", f"{s.accuracy:.3f}"
+        ends = f"{s.num_localized}", f"{s.num_wrong}", f"{s.seconds:.2f}"
+        cells.append((name, *counts, *meters, *degrees, *ends))
+    return Table(words, columns, tuple(cells))
 
 
 def threshold_table(rows: Sequence[QueryResult], thresholds: Thresholds) -> Table:
@@ -187,16 +185,14 @@ def pair_up(first: Sequence[QueryResult], second: Sequence[QueryResult]) -> list
 
 def side_by_side(pairs: Sequence[Pair], names: tuple[str, str], thresholds: Thresholds) -> Table:
     """The statistics of two runs over the queries that both have."""
-    runs = [summarize([pair[k] for pair in pairs], thresholds) for k in (0, 1)]
     columns = "run", "queries", "correct", "accuracy", "localized", "wrong of these"
-    rows = tuple((name, *_cells(run)) for name, run in zip(names, runs, strict=True))
-    return Table("", (*columns, "t 50 % [m]", "R 50 % [deg]", "s"), rows)
-
-
-def _cells(s: Summary) -> tuple[str, ...]:
-    medians = f"{s.position_quartiles[1]:.4f}", f"{np.degrees(s.rotation_quartiles[1]):.3f}"
-    counts = f"{s.num_queries}", f"{s.num_correct}", f"{s.accuracy:.3f}", f"{s.num_localized}"
-    return (*counts, f"{s.num_wrong}", *medians, f"{s.seconds:.2f}")
+    rows = []
+    for k, name in enumerate(names):
+        s = summarize([pair[k] for pair in pairs], thresholds)
+        counts = f"{s.num_queries}", f"{s.num_correct}", f"{s.accuracy:.3f}", f"{s.num_localized}"
+        medians = f"{s.position_quartiles[1]:.4f}", f"{np.degrees(s.rotation_quartiles[1]):.3f}"
+        rows.append((name, *counts, f"{s.num_wrong}", *medians, f"{s.seconds:.2f}"))
+    return Table("", (*columns, "t 50 % [m]", "R 50 % [deg]", "s"), tuple(rows))
 
 
 def changes(pairs: Sequence[Pair], thresholds: Thresholds) -> Table:

@@ -18,7 +18,6 @@ from .room import Room, make_room
 SUPERSAMPLING = 2  # rays a pixel, each way
 BAND = 8  # rows cast at once: all rays of a large image would take a gigabyte
 
-
 RANGE_NOISE = 0.003  # of the scanner, standard deviation [m]
 MIN_CLEARANCE = 0.35  # of a station or camera [m]
 NUM_TRIES = 2000
