@@ -15,8 +15,9 @@ from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, T_world_from_cam, angle_between, exp_so3, read_pose_matrix, step
 from piccolo.geometry.rotations import R_cam_from_angles, heading_pitch_roll_deg
 from piccolo.geometry.sphere import pixel_rays
-from piccolo.render.surfel_renderer import RenderedView, encode_image, fill_holes, render_points
+from piccolo.render.surfel_renderer import encode_image, fill_holes, render_points
 from piccolo.render.surfels import BAND, BAND_OFFSET, MAX_SLOPE, MIN_RADIUS_PX, splat, surfels_of
+from piccolo.render.zbuffer import View
 from piccolo.runtime.threads import Workers
 from piccolo.scenes.synthetic.raycast import cast_rays
 
@@ -162,12 +163,12 @@ def test_holes_take_the_colours_around_them_and_nothing_else_changes(size):
     rgb = rng.integers(100, 200, (*size, 3), dtype=np.uint8)
     depth = np.where(rng.random(size) < 0.3, np.inf, 1.0).astype(np.float32)
     depth[0, 0] = 1.0
-    picture = RenderedView(np.where(np.isfinite(depth)[..., None], rgb, 0).astype(np.uint8), depth)
+    picture = View(depth, np.where(np.isfinite(depth)[..., None], rgb, 0).astype(np.uint8))
     filled = fill_holes(picture.rgb, picture.is_seen)
     np.testing.assert_array_equal(filled[picture.is_seen], rgb[picture.is_seen])
     assert filled.min() >= 98
     assert filled.max() <= 201
-    nothing = RenderedView(np.zeros((*size, 3), np.uint8), np.full(size, np.inf, np.float32))
+    nothing = View(np.full(size, np.inf, np.float32), np.zeros((*size, 3), np.uint8))
     assert not fill_holes(nothing.rgb, nothing.is_seen).any()
 
 

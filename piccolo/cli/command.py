@@ -3,7 +3,7 @@
 import argparse
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from .errors import UsageError, print_note, run_command
 from .parser import add_run_options, new_parser
@@ -13,13 +13,7 @@ KINDS: dict[str, type] = {  # of the values, by the first metavar; of others tex
     **dict.fromkeys(("N", "PX", "FIRST", "W"), int),
     **dict.fromkeys(("X", "M", "DEG", "X0", "MIN"), float),
 }
-
-
-class Main(Protocol):
-    """Runs a command line, by default this program's, and returns its exit code."""
-
-    def __call__(self, argv: list[str] | None = None) -> int:
-        """See the class."""
+Main = Callable[..., int]  # runs a command line, by default this program's, and returns its exit code
 
 
 def option(group: argparse._ActionsContainer, usage: str, text: str = "", **more: Any) -> None:

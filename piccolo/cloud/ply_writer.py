@@ -15,7 +15,7 @@ from ..geometry.pose import Array, transform_points
 from ..runtime.atomic import replacing
 from .readers.ply import PLY, PlyHeader, place_of_vertices, read_columns, read_header
 from .readers.reader import CHUNK, HEAD_SIZE
-from .stream import BoundingBox, CloudStream
+from .stream import CloudStream
 
 TYPE_NAMES = {
     "i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float",
@@ -90,9 +90,10 @@ def write_ply(path: Path, rows: Rows) -> None:
         writer.add(rows)
 
 
-def needs_double(box: BoundingBox, T_target_from_source: Array, scale: float) -> bool:
-    """True if float32 would lose more than MAX_LOSS of a moved box [m]; T is in units of `scale` metres."""
-    farthest = float(np.abs(transform_points(box.corners() / scale, T_target_from_source)).max())
+def needs_double(box: Array, T_target_from_source: Array, scale: float) -> bool:
+    """True if float32 would lose over MAX_LOSS of a moved box (2, 3) [m]; T is in units of `scale` metres."""
+    corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(8, 3)
+    farthest = float(np.abs(transform_points(corners / scale, T_target_from_source)).max())
     return float(np.spacing(np.float32(farthest))) * scale > 2.0 * MAX_LOSS
 
 

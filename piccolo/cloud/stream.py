@@ -111,22 +111,8 @@ def stream_of(path: Path, raw: RawCloud) -> "CloudStream":
     return CloudStream([PointSource(path, lambda: iter([raw]), len(raw.colors))])
 
 
-@dataclass
-class BoundingBox:
-    """The smallest box, along the axes, around the points seen so far."""
-
-    low: Array = field(default_factory=lambda: np.full(3, np.inf))
-    high: Array = field(default_factory=lambda: np.full(3, -np.inf))
-
-    def add(self, points: Array) -> None:
-        """Widen to points (N, 3)."""
-        for k in range(3 if len(points) else 0):
-            self.low[k] = min(self.low[k], float(points[:, k].min()))
-            self.high[k] = max(self.high[k], float(points[:, k].max()))
-
-    def corners(self) -> Array:
-        """The eight corners (8, 3)."""
-        return np.array([np.where(bits, self.high, self.low) for bits in np.ndindex(2, 2, 2)])
+def _no_box() -> Array:
+    return np.repeat([[np.inf], [-np.inf]], 3, axis=1)
 
 
 @dataclass(frozen=True)
@@ -136,7 +122,7 @@ class CloudStream:
     sources: Sequence[PointSource]  # in an order of their own: the user's changes nothing
     scale: float = 1.0  # metres per unit of the files
     show: Progress = no_progress  # progress
-    box: BoundingBox = field(default_factory=BoundingBox)  # of the points read so far [m]
+    box: Array = field(default_factory=_no_box)  # (2, 3) least and greatest of all points read so far [m]
 
     @property
     def label(self) -> str:
@@ -152,7 +138,9 @@ class CloudStream:
             try:
                 for raw in self.show(source.read_chunks(), total, f"read {source.path.name}"):
                     points_world, colors = validator.filter(raw)
-                    self.box.add(points_world)
+                    for k in range(3 if len(points_world) else 0):
+                        column = points_world[:, k]
+                        self.box[:, k] = min(self.box[0, k], column.min()), max(self.box[1, k], column.max())
                     yield points_world, colors
             except OSError as error:
                 text = f"{source.path}: cannot be read ({error.strerror or error}), wanted a whole file"

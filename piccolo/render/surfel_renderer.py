@@ -1,7 +1,6 @@
 """The cloud rendered at a pose, of any size: surfaces closed, what nobody scanned filled or left open."""
 
 import math
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -13,7 +12,7 @@ from ..panorama import Panorama
 from ..panorama.model import shrink
 from ..runtime.threads import Workers
 from .surfels import MIN_RADIUS_PX, Surfels, splat, surfels_of
-from .zbuffer import nearest_depth, select_visible
+from .zbuffer import View, nearest_depth, select_visible
 
 STRIP = 1 << 21  # pixels that one thread draws at a time
 MAX_SURFELS = 8_000_000  # of more points that may be seen, this many are drawn, evenly in space
@@ -28,20 +27,8 @@ OVERLAY_WIDTH = 1024
 NUM_TILES = 16  # columns of the checkerboard
 
 
-class RenderedView(NamedTuple):
-    """What the camera sees of the cloud."""
-
-    rgb: NDArray[np.uint8]  # (H, W, 3), black where nothing is seen
-    depth: NDArray[np.float32]  # (H, W) range [m] along the ray, inf where nothing is seen
-
-    @property
-    def is_seen(self) -> NDArray[np.bool_]:
-        """(H, W), true where there is a surface."""
-        return np.isfinite(self.depth)
-
-
-def render_points(points: PackedPoints, pose: Pose, width: int, workers: Workers) -> RenderedView:
-    """The cloud at `pose`, `width` x width / 2 pixels."""
+def render_points(points: PackedPoints, pose: Pose, width: int, workers: Workers) -> View:
+    """The cloud at `pose`, `width` x width / 2 pixels; colours in uint8."""
     visible = points.take(visible_indices(points, pose.center_world)).subsample(MAX_SURFELS)
     return render_surfels(surfels_of(visible, workers), pose, width, workers)
 
@@ -66,8 +53,8 @@ def visible_indices(points: PackedPoints, center_world: Array) -> NDArray[np.int
     return kept
 
 
-def render_surfels(surfels: Surfels, pose: Pose, width: int, workers: Workers) -> RenderedView:
-    """The surfels seen from `pose`."""
+def render_surfels(surfels: Surfels, pose: Pose, width: int, workers: Workers) -> View:
+    """The surfels seen from `pose`; colours in uint8."""
     p = surfels.points
     ranges = np.linalg.norm(np.stack([p.x, p.y, p.z], axis=1) - pose.center_world, axis=1)
     largest = np.maximum(MAX_RADIUS * np.percentile(surfels.radii, 95.0), FAR_ANGLE * ranges)  # not lone
@@ -93,7 +80,7 @@ def render_surfels(surfels: Surfels, pose: Pose, width: int, workers: Workers) -
         depth[rows] = np.where(is_seen, means[..., 3], np.float32(np.inf))
 
     list(workers.map(run, range(0, width // 2, num_rows), "draw"))
-    return RenderedView(rgb, depth)
+    return View(depth, rgb)
 
 
 def _in_camera(

@@ -1,7 +1,7 @@
 """The cloud seen from a pose: z-buffered equirectangular views, and which points the camera sees."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,12 +27,12 @@ MIN_SEEN_FRACTION = 0.4  # of the sphere; less is seen from outside a scan
 class View(NamedTuple):
     """What the camera sees of the cloud, on an equirectangular grid."""
 
-    depth: NDArray[np.float32]  # (H, W) range of the nearest point [m], inf where there is none
-    rgb: NDArray[np.float32]  # (H, W, 3) mean colour in [0, 1] of the points near that range, 0 where empty
+    depth: NDArray[np.float32]  # (H, W) range of what is nearest [m], inf where there is nothing
+    rgb: NDArray[Any]  # (H, W, 3) mean colour of what is near that range, 0 where there is nothing
 
     @property
     def is_seen(self) -> NDArray[np.bool_]:
-        """(H, W), true where a point was seen."""
+        """(H, W), true where something was seen."""
         return np.isfinite(self.depth)
 
 
@@ -115,7 +115,7 @@ def nearest_depth(points: PackedPoints, pose: Pose, width: int) -> NDArray[np.fl
 
 
 def render_view(points: PackedPoints, pose: Pose, width: int, band: float = 0.15) -> View:
-    """The cloud at `pose`, `width` cells around; colours are of the points within 1 + band of the nearest."""
+    """The cloud at `pose`, `width` cells around; colours, float32 in [0, 1], within 1 + band of the nearest."""
     depth = nearest_depth(points, pose, width)
     sums = np.zeros((len(depth), 4))
     R, t = pose.R_cam_from_world, pose.center_world

@@ -1,4 +1,4 @@
-"""Textures of meshes: images held to a size, and their texels."""
+"""The files that a mesh names: materials, buffers, and textures, which are images held to a size."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
