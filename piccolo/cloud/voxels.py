@@ -242,8 +242,6 @@ def build_octree(voxels: Voxels) -> Octree:
         levels.insert(0, nodes)
         children.insert(0, first.astype(np.int32))
     start = np.concatenate([[0], np.cumsum([len(level) for level in levels])]).astype(np.int32)
-    first_child = np.concatenate([c + s for c, s in zip(children[:-1], start[1:-1], strict=True)])
-    leaves = np.full(len(levels[-1]) + 1, start[-1], np.int32)
-    return Octree(
-        np.concatenate(levels), np.concatenate([first_child, leaves]).astype(np.int32), start, LEAF_SIZE
-    )
+    first_child = [c + s for c, s in zip(children[:-1], start[1:-1], strict=True)]
+    first_child.append(np.full(len(levels[-1]) + 1, start[-1], np.int32))  # leaves have none
+    return Octree(np.concatenate(levels), np.concatenate(first_child).astype(np.int32), start, LEAF_SIZE)

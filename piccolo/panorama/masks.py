@@ -129,9 +129,8 @@ def _detail_circle(cap: NDArray[np.float32]) -> int:
     detail = np.abs(np.stack(second)).reshape(NUM_ROWS, NUM_SECTORS, -1).mean(axis=2)
     for k in CANDIDATES:
         # row k - 1 is half a step: left out
-        inside = np.maximum(
-            np.median(detail[: k - 1], axis=0), detail[k - 1 - NEAR_ROWS : k - 1].mean(axis=0)
-        )
+        near = detail[k - 1 - NEAR_ROWS : k - 1].mean(axis=0)
+        inside = np.maximum(np.median(detail[: k - 1], axis=0), near)
         outside = detail[k + 1 : k + 1 + NEAR_ROWS].mean(axis=0)
         if (outside >= np.maximum(MIN_DETAIL_RATIO * inside, MIN_DETAIL)).all():
             return k

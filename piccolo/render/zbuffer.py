@@ -115,7 +115,7 @@ def nearest_depth(points: PackedPoints, pose: Pose, width: int) -> NDArray[np.fl
 
 
 def render_view(points: PackedPoints, pose: Pose, width: int, band: float = 0.15) -> View:
-    """The cloud at `pose`, `width` cells around; colours, float32 in [0, 1], within 1 + band of the nearest."""
+    """The cloud at `pose`, `width` cells around; colours (float32, 0 to 1) within 1 + band of the nearest."""
     depth = nearest_depth(points, pose, width)
     sums = np.zeros((len(depth), 4))
     R, t = pose.R_cam_from_world, pose.center_world

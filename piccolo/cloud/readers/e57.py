@@ -249,9 +249,8 @@ def read_image(path: Path, index: int) -> bytes:
 
 def _images(file: E57File) -> Iterator[E57Image]:
     """The representations of the elements of images2D that hold an image."""
-    for (number, element), (kind, representation_name) in product(
-        enumerate(children(file.root, "images2D")), KINDS.items()
-    ):
+    elements = enumerate(children(file.root, "images2D"))
+    for (number, element), (kind, representation_name) in product(elements, KINDS.items()):
         representation = child(element, representation_name)
         for encoding in ENCODINGS:
             blob = child(representation, f"{encoding}Image")

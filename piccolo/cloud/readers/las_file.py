@@ -67,9 +67,8 @@ class LasHeader(NamedTuple):
         if self.has_colors:
             fields["rgb"] = ("3<u2", COLORS_BYTE[self.point_format])
         kinds, begins = zip(*fields.values(), strict=True)
-        return np.dtype(
-            {"names": [*fields], "formats": kinds, "offsets": begins, "itemsize": self.record_size}
-        )
+        named = {"names": [*fields], "formats": kinds, "offsets": begins, "itemsize": self.record_size}
+        return np.dtype(named)
 
     @property
     def has_colors(self) -> bool:
@@ -224,11 +223,10 @@ def decompress(
     if layout.num_layers:
         _check_layers(header, layout.num_layers, data, chunks)
     records = np.empty(sum(count for count, _ in chunks) * header.record_size, dtype=np.uint8)
-    selected = sum(getattr(lazrs, f"SELECTIVE_DECOMPRESS_{name}") for name in SELECTED)
+    fields = sum(getattr(lazrs, f"SELECTIVE_DECOMPRESS_{name}") for name in SELECTED)
+    selected = lazrs.DecompressionSelection(fields)
     with _refusing(header.path, lazrs):
-        lazrs.decompress_points_with_chunk_table(
-            data, layout.laszip, records, list(chunks), lazrs.DecompressionSelection(selected)
-        )
+        lazrs.decompress_points_with_chunk_table(data, layout.laszip, records, list(chunks), selected)
     return records
 
 

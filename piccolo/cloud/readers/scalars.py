@@ -21,9 +21,7 @@ BLACK, WHITE = 0.01, 0.99  # share of the points that are darker
 LARGEST = float(np.finfo(np.float32).max)
 NUM_BINS = 1 << 16
 # as they stand in PLY files, in lower case; the first that is there counts. CloudCompare prefixes `scalar_`
-LABEL_NAMES = tuple(
-    f"{prefix}{name}" for name in ("label", "class", "classification") for prefix in ("", "scalar_")
-)
+LABEL_NAMES = ("label", "scalar_label", "class", "scalar_class", "classification", "scalar_classification")
 MOST = 2.0**32  # labels are below it, and above its negative
 
 

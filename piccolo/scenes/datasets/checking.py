@@ -31,11 +31,6 @@ class ConventionCheck(NamedTuple):
     best_score: float  # the highest score by any convention
     best: str  # that convention in words
 
-    @property
-    def is_good(self) -> bool:
-        """True if the pose fits, and no other convention fits better."""
-        return self.best == AS_GIVEN and self.score >= MIN_SCORE
-
 
 class Check(NamedTuple):
     """The checks of some panoramas of a scene."""
@@ -44,8 +39,9 @@ class Check(NamedTuple):
 
     @property
     def is_passed(self) -> bool:
-        """True if more than half of them fit."""
-        return 2 * sum(check.is_good for check in self.panoramas) > len(self.panoramas)
+        """True if more than half of them fit, and no other convention fits better."""
+        num_good = sum(check.best == AS_GIVEN and check.score >= MIN_SCORE for check in self.panoramas)
+        return 2 * num_good > len(self.panoramas)
 
     @property
     def advice(self) -> str:

@@ -47,10 +47,8 @@ def write_scene(
         scene = read_scene(folder)
         source = json.loads((folder / QUERIES_NAME).read_text()).get("source")
         if source != spec.source:
-            found, wanted = json.dumps(source), json.dumps(spec.source)
-            raise InputError(
-                f"{folder}: found a scene of {found}, wanted {wanted}: remove it, or change --out"
-            )
+            found = f"found a scene of {json.dumps(source)}, wanted {json.dumps(spec.source)}"
+            raise InputError(f"{folder}: {found}: remove it, or change --out")
         return Written(folder, None, len(scene.queries))
     folder.parent.mkdir(parents=True, exist_ok=True)
     check_output_folder(folder)
