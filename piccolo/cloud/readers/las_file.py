@@ -67,8 +67,9 @@ class LasHeader(NamedTuple):
         if self.has_colors:
             fields["rgb"] = ("3<u2", COLORS_BYTE[self.point_format])
         kinds, begins = zip(*fields.values(), strict=True)
-        named = {"names": [*fields], "formats": kinds, "offsets": begins, "itemsize": self.record_size}
-        return np.dtype(named)
+        return np.dtype(
+            {"names": [*fields], "formats": kinds, "offsets": begins, "itemsize": self.record_size}
+        )
 
     @property
     def has_colors(self) -> bool:
