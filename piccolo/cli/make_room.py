@@ -4,10 +4,10 @@ import argparse
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from ..cloud.ply_writer import vertex_rows, write_ply
+from ..render.surfel_renderer import encode_image
 from ..runtime.atomic import write_atomically
 from ..runtime.threads import Workers, num_cores
 from ..scenes import scene as scenes
@@ -64,10 +64,8 @@ def write_world(
     for v in dict.fromkeys(arguments.variants):
         for k in range(arguments.panoramas):
             query = make_query(world, k, v, arguments.width, workers)
-            bgr = cv2.cvtColor(query.rgb, cv2.COLOR_RGB2BGR)
-            quality = [cv2.IMWRITE_JPEG_QUALITY, 70 if v == "photo" else 95]
             image, path = folder / "images" / f"{v}_{k}.jpg", folder / "labels" / f"{v}_{k}.png"
-            write_atomically(image, bytes(cv2.imencode(".jpg", bgr, quality)[1]))
+            write_atomically(image, encode_image(query.rgb, ".jpg", 70 if v == "photo" else 95))
             if arguments.labels:
                 path.parent.mkdir(exist_ok=True)
                 write_labels(path, make_labels(world, k, query, workers))

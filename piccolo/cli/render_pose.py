@@ -50,8 +50,8 @@ One JSON object a picture on stdout.
 MAX_WIDTH, MIN_WIDTH = 32_768, 16
 MAGENTA = (255, 0, 255)  # a colour that scans do not have
 DESCENT_WIDTH = 1024  # of the panorama
-SUFFIXES = {"out": (".png", ".jpg", ".jpeg", ""), "depth": (".png", ".npy"), "mask_out": (".png",)}
-SUFFIXES["animate"] = (".gif", ".mp4", "")
+SUFFIXES = {"out": (".png", ".jpg", ".jpeg", ""), "depth": (".png", ".npy"), "mask_out": (".png",),
+            "animate": (".gif", ".mp4", "")}  # fmt: skip
 Named = list[tuple[str, Pose]]  # poses in the world with the panorama's path
 
 

@@ -134,10 +134,13 @@ def fill_holes(rgb: NDArray[np.uint8], is_seen: NDArray[np.bool_]) -> NDArray[np
     return np.asarray(smooth, np.uint8)
 
 
-def encode_image(image: NDArray[np.uint8] | NDArray[np.uint16], suffix: str) -> bytes:
-    """Bytes of a file with an image (H, W, 3) RGB or (H, W) gray, of the kind that the suffix names."""
+def encode_image(image: NDArray[np.uint8] | NDArray[np.uint16], suffix: str, quality: int = 95) -> bytes:
+    """Bytes of a file with an image (H, W, 3) RGB or (H, W) gray, of the kind that the suffix names.
+
+    The quality, up to 100, is that of a JPEG.
+    """
     bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
-    options = [cv2.IMWRITE_JPEG_QUALITY, 95] if suffix in (".jpg", ".jpeg") else []
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if suffix in (".jpg", ".jpeg") else []
     is_encoded, content = cv2.imencode(suffix, bgr, options)
     if not is_encoded:
         raise OSError(f"an image of {image.shape[1]} x {image.shape[0]} could not be encoded as {suffix}")
