@@ -1,4 +1,4 @@
-"""Writing PLY: binary vertices, a chunk at a time."""
+"""Writing PLY: binary vertices, a chunk at a time; and clouds written again under a rigid transform."""
 
 import math
 import shutil

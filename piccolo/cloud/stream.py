@@ -1,4 +1,4 @@
-"""Clouds in files, read as often as they are needed: into voxels, or into memory."""
+"""Clouds in files, checked chunk by chunk, read as often as they are needed: into voxels, or into memory."""
 
 import math
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,7 @@
 """Points averaged voxel by voxel as they stream by: the memory grows with the scene, not with the points.
 
 The grid is fixed in the map's axes, and all sums are integers: neither the order of the points nor how they
-are cut into chunks changes a bit.
+are cut into chunks changes a bit. The octree is a pyramid of these voxels, in Morton order.
 """
 
 from typing import NamedTuple
@@ -71,24 +71,17 @@ def morton_order(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> NDAr
     cells = np.minimum(((points - low) * cells_per_metre).astype(np.int64), NUM_CELLS - 1)
     codes = morton_codes(cells)
     order = np.argsort(codes)
-    _settle_ties(codes[order], order, points, colors)
-    return order
-
-
-def _settle_ties(
-    codes: NDArray[np.int64], order: NDArray[np.int64], points: NDArray[np.float32], colors: NDArray[np.uint8]
-) -> None:
-    """Sort `order` (N,) in place within each run of equal, ascending `codes` (N,)."""
-    is_equal = codes[1:] == codes[:-1]
-    is_tied = np.zeros(len(codes), dtype=np.bool_)
-    is_tied[1:] |= is_equal
-    is_tied[:-1] |= is_equal
+    ascending = codes[order]
+    is_tied = np.zeros(len(order), dtype=np.bool_)
+    is_tied[1:] = ascending[1:] == ascending[:-1]
+    is_tied[:-1] |= is_tied[1:]
     places = np.flatnonzero(is_tied)
-    if len(places) == 0:
-        return
-    tied = order[places]
-    keys = [*colors[tied].T[::-1], *points[tied].T[::-1], codes[places]]  # lexsort's last key counts first
-    order[places] = tied[np.lexsort(keys)]
+    if len(places):
+        tied = order[places]
+        # lexsort's last key counts first
+        keys = [*colors[tied].T[::-1], *points[tied].T[::-1], ascending[places]]
+        order[places] = tied[np.lexsort(keys)]
+    return order
 
 
 @inline_kernel

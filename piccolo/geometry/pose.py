@@ -1,4 +1,7 @@
-"""SE(3) in NumPy, float64: `x_cam = R_cam_from_world @ (x_world - center_world)`."""
+"""SE(3) in NumPy, float64: `x_cam = R_cam_from_world @ (x_world - center_world)`.
+
+Points are turned term by term: BLAS sums in an order that depends on how many points there are.
+"""
 
 import math
 from dataclasses import dataclass

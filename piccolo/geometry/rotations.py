@@ -1,4 +1,8 @@
-"""Rotations to try: upright at even yaws, spread evenly over SO(3), or drawn from it."""
+"""Rotations to try, and other tools' camera axes and angles. Ours: +x the image centre, +y left, +z up.
+
+A matrix other_from_cam takes our camera coordinates to theirs: R_other_from_world = other_from_cam @
+R_cam_from_world, and the camera's position stays as it is.
+"""
 
 import math
 from typing import Literal

@@ -1,4 +1,4 @@
-"""The transform that turns a cloud's z up, and what it is based on."""
+"""The transform that turns a cloud's z up, what it is based on, and the JSON file that holds it."""
 
 import json
 from pathlib import Path

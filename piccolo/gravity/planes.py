@@ -1,4 +1,4 @@
-"""The dominant planes of a cloud by RANSAC, what they are, and up as they agree on it."""
+"""Normals of a cloud by PCA, its dominant planes by RANSAC, what they are, up and yaw as they agree on it."""
 
 from typing import Literal, NamedTuple
 

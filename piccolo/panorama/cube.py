@@ -1,4 +1,4 @@
-"""Six faces of a cube resampled to an equirectangular picture.
+"""Six faces of a cube, files of a folder or cells of one picture, resampled to an equirectangular picture.
 
 Every face is a pinhole picture of 90 x 90 degrees seen from inside. Up hangs over front: its lower edge is
 front's upper edge. Down's upper edge is front's lower edge. This is OpenGL's cube (px right, nx left, py up,

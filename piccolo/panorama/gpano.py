@@ -2,7 +2,7 @@
 
 https://developers.google.com/streetview/spherical-metadata. The few fields are searched in the text, once as
 attributes and once as elements, without an XML parser: there are no entities that could be expanded, and
-damaged XML costs nothing but its damaged fields.
+damaged XML costs nothing but its damaged fields. A crop is embedded in the full sphere here.
 """
 
 import math

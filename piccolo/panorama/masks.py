@@ -1,4 +1,9 @@
-"""Masks of the user: a picture, or the cap around a pole."""
+"""Masks: a picture, the cap around a pole; and what a picture tells by itself, that it is two fisheyes too.
+
+Black borders and patches over the nadir or zenith are found. Each rule is narrow: what is masked wrongly is
+lost. The thresholds were set by hand, apart from both sides: tests/test_panorama_masks.py has the rooms that
+they must leave alone and the patches that they find.
+"""
 
 from pathlib import Path
 

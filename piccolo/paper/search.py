@@ -1,4 +1,4 @@
-"""Steps 1 to 3 of the paper's Algorithm 1: score poses on a grid, keep the diverse best."""
+"""Steps 1 to 3 of the paper's Algorithm 1: score poses on a grid in free space, keep the diverse best."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""The cloud rendered at a pose, of any size: surfaces closed, what nobody scanned filled or left open."""
+"""The cloud rendered at a pose: surfaces closed, what nobody scanned filled or left open; and overlays."""
 
 import math
 

@@ -1,4 +1,9 @@
-"""Surfels: discs that close the surface between points, with a radius and a normal from the neighbours."""
+"""Surfels: discs that close the surface between points, with a radius and a normal from the neighbours.
+
+They are drawn into rows of an equirectangular picture: nearest range first, then weighted colours near it. A
+pixel's ray sees a surfel where it meets the disc's plane within the radius; a surfel smaller than a pixel is
+seen by the ray nearest to it.
+"""
 
 import math
 from typing import NamedTuple

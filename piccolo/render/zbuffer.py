@@ -1,4 +1,4 @@
-"""The cloud seen from a pose: z-buffered equirectangular views, and which points the camera sees."""
+"""The cloud seen from a pose: z-buffered views, which points the camera sees, whether it can stand there."""
 
 import math
 from typing import Any, NamedTuple

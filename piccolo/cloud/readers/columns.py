@@ -1,4 +1,7 @@
-"""Points from columns: chunks of arrays (N,) of x, y, z and red, green, blue, or of x, y, z and a scalar."""
+"""Points from columns: chunks of arrays (N,) of x, y, z and red, green, blue, or of x, y, z and a scalar.
+
+Colours of any type become 8 bits; their range follows from the declared type and is never guessed.
+"""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import partial

@@ -1,7 +1,7 @@
-"""Intensity as a gray, for files that have no colours.
+"""Intensity as a gray, for files that have no colours; labels as colours, in place of the file's own.
 
-Its unit is each scanner's own, and a few mirrors outshine everything. So a file's 1st percentile becomes
-black and its 99th white: of all its points, in a reading of their own, whatever their order.
+The unit of intensity is each scanner's own, and a few mirrors outshine everything. So a file's 1st percentile
+becomes black and its 99th white: of all its points, in a reading of their own, whatever their order.
 """
 
 import functools

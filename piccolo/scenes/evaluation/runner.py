@@ -1,4 +1,7 @@
-"""Localize the queries of many scenes, in this process or in several."""
+"""Localize the queries of many scenes, in this process or in several.
+
+A run on disk is one JSON line a query, flushed as it comes, so that a stopped run can be resumed.
+"""
 
 import fcntl
 import json

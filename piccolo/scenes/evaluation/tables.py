@@ -1,4 +1,4 @@
-"""Tables of an evaluation, of one run or of two side by side, as Markdown and CSV."""
+"""Statistics and tables of an evaluation, of one run or of two side by side, as Markdown and CSV."""
 
 import csv
 import io

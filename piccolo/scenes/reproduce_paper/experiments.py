@@ -1,4 +1,4 @@
-"""The experiments: the conditions that each compares, and what the paper found there.
+"""The experiments: the conditions that each compares, what the paper found there, table and picture.
 
 The paper's figures are of its own data (Stanford2D-3D-S, OmniScenes, MPO) on an RTX 2080 (Kim et al., ICCV
 2021): they say what to expect of a trend, and compare in full only on the same data.

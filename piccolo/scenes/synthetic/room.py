@@ -1,4 +1,4 @@
-"""The seeded layout of a room: boxes, each with a material."""
+"""The seeded layout of a room: boxes, each with a material; places that look the same from several poses."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple

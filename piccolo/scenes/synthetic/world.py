@@ -1,4 +1,7 @@
-"""Rooms side by side with their scan, and queries with true poses."""
+"""Rooms side by side with their scan, and queries with true poses.
+
+The scanner has noise, shadows and uneven density; light, lens and file change the panoramas.
+"""
 
 from dataclasses import dataclass
 from typing import NamedTuple
