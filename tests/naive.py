@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from piccolo.geometry.sphere_grid import cell_of, make_grid
+from piccolo.geometry.sphere import cell_of, make_grid
 
 
 def project(points, R_cam_from_world, center_world, width):

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 
 from piccolo.cli import make_room
-from piccolo.cloud.model import Cloud
-from piccolo.cloud.morton import morton_order
 from piccolo.cloud.soa import pack_points
+from piccolo.cloud.stream import Cloud
+from piccolo.cloud.voxels import morton_order
 from piccolo.coarse_to_fine.scan_map import prepare_map
 from piccolo.geometry.pose import Pose, angle_between
 from piccolo.panorama import Panorama

@@ -15,7 +15,7 @@ from scans import bare_room, points_of, scan, write_scan
 from piccolo.cli import align_gravity
 from piccolo.geometry.pose import exp_so3
 from piccolo.gravity import MIN_CONFIDENCE
-from piccolo.gravity.alignment_file import FORMAT, read_alignment
+from piccolo.gravity.alignment import FORMAT, read_alignment
 from piccolo.scenes.scene import Query, read_scene, write_queries
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from refusals import read_or_refused
 
-from piccolo.gravity.alignment_file import FORMAT, read_alignment
+from piccolo.gravity.alignment import FORMAT, read_alignment
 
 GOOD = {
     "format": FORMAT,

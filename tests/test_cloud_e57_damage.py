@@ -10,7 +10,7 @@ from test_cloud_e57 import BYTES, cartesian, colored, read, scan
 
 from piccolo.cloud import open_source
 from piccolo.cloud.readers import e57_file
-from piccolo.cloud.readers.e57_images import list_images, read_image
+from piccolo.cloud.readers.e57 import list_images, read_image
 from piccolo.errors import InputError
 
 

@@ -6,7 +6,7 @@ from e57_files import ImageToWrite, with_xml, write
 from test_cloud_e57 import CENTER, QUATERNION, R_WORLD, scan
 
 from piccolo.cli import e57_images
-from piccolo.cloud.readers.e57_images import list_images, read_image
+from piccolo.cloud.readers.e57 import list_images, read_image
 from piccolo.errors import InputError
 from piccolo.geometry.pose import quaternion_wxyz
 
@@ -32,9 +32,9 @@ def test_images_are_listed_and_read(tmp_path):
         len(JPEG),
     )
     assert images[0].fov_deg == pytest.approx((360.0, 180.0))
-    assert (images[0].scan_guid, images[0].placement, images[1].fov_deg) == ("{scan}", None, None)
-    np.testing.assert_allclose(images[1].placement.R_world_from_local, R_WORLD, atol=1e-12)
-    np.testing.assert_array_equal(images[1].placement.center_world, CENTER)
+    assert (images[0].scan_guid, images[0].pose, images[1].fov_deg) == ("{scan}", None, None)
+    np.testing.assert_allclose(images[1].pose.R_cam_from_world.T, R_WORLD, atol=1e-12)
+    np.testing.assert_array_equal(images[1].pose.center_world, CENTER)
     assert [read_image(path, k) for k in range(4)] == [JPEG, PNG, PNG, JPEG]
     assert list_images(write(tmp_path / "b.e57", [scan()])) == []
 

@@ -5,7 +5,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from piccolo.cloud.readers.lzf import BROKEN, MAX_RATIO, decompress_lzf
+from piccolo.cloud.readers.pcd import LZF_BROKEN, MAX_RATIO, decompress_lzf
 
 
 def compress(data):
@@ -40,7 +40,7 @@ def compress(data):
 def unpacked(data, size):
     out = np.full(size, 77, dtype=np.uint8)
     filled = decompress_lzf(np.frombuffer(data, np.uint8), out)
-    return None if filled == BROKEN else out[:filled].tobytes()
+    return None if filled == LZF_BROKEN else out[:filled].tobytes()
 
 
 @settings(deadline=None, max_examples=60)

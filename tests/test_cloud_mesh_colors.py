@@ -22,7 +22,7 @@ from meshes import (
 from test_cloud_morton import whole
 
 from piccolo.cloud import read_cloud
-from piccolo.cloud.readers import mesh_texture
+from piccolo.cloud.readers import mesh_files
 from piccolo.cloud.readers.mesh import open_mesh
 from piccolo.cloud.readers.mesh_sampling import linear_to_srgb, srgb_to_linear
 from piccolo.cloud.readers.ply import open_ply
@@ -189,8 +189,8 @@ def test_textures_in_folders_below_are_found(tmp_path):
 
 
 def test_a_texture_of_many_surfaces_is_decoded_once(tmp_path, monkeypatch):
-    decode, calls = mesh_texture.Texture.texels, []
-    monkeypatch.setattr(mesh_texture.Texture, "texels", lambda self: calls.append(self) or decode(self))
+    decode, calls = mesh_files.Texture.texels, []
+    monkeypatch.setattr(mesh_files.Texture, "texels", lambda self: calls.append(self) or decode(self))
     gltf = Gltf()
     first, other = (gltf.material(png(pixels)) for pixels in (QUADRANTS, QUADRANTS[::-1].copy()))
     rows = [gltf.mesh(SQUARE + np.float32(i), material=other if i == 2 else first) for i in range(5)]

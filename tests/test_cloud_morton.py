@@ -1,5 +1,5 @@
 import math
-from dataclasses import astuple, replace
+from dataclasses import replace
 from pathlib import Path
 
 import naive
@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from piccolo.cloud import Cloud, stream_of
-from piccolo.cloud.morton import morton_codes, morton_order
 from piccolo.cloud.readers.reader import PLAIN, RawCloud
+from piccolo.cloud.voxels import morton_codes, morton_order
 from piccolo.errors import InputError
 
 A = Path("a")
@@ -33,7 +33,7 @@ def clean(path, raw, scale):
 def whole(open_source, path, options=PLAIN):
     """All points that a reader finds in a file."""
     chunks = list(open_source(path, options).read_chunks())
-    return RawCloud(*(np.concatenate(arrays) for arrays in zip(*map(astuple, chunks), strict=True)))
+    return RawCloud(*(np.concatenate(arrays) for arrays in zip(*chunks, strict=True)))
 
 
 def same_bits(a: Cloud, b: Cloud):

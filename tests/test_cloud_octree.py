@@ -4,8 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from piccolo.cloud import Cloud
-from piccolo.cloud.octree import NUM_LEVELS, build_octree
-from piccolo.cloud.voxels import LEAF_SIZE
+from piccolo.cloud.voxels import LEAF_SIZE, NUM_LEVELS, build_octree
 
 
 def _cloud(count=5000, seed=0):

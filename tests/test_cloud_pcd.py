@@ -9,7 +9,7 @@ from test_cloud_lzf import compress
 from test_cloud_morton import seeded_cloud
 
 from piccolo.cloud import open_source, read_cloud
-from piccolo.cloud.readers import fixed_records, number_lines
+from piccolo.cloud.readers import number_lines
 from piccolo.cloud.readers import reader as raw
 from piccolo.errors import InputError
 
@@ -268,7 +268,7 @@ def test_a_file_cut_while_it_is_read_is_refused(tmp_path, monkeypatch, encoding)
 
 
 def test_long_records_come_in_smaller_chunks(tmp_path, monkeypatch):
-    monkeypatch.setattr(fixed_records, "MAX_BLOCK_SIZE", 1000)
+    monkeypatch.setattr(raw, "MAX_BLOCK_SIZE", 1000)
     path = write(tmp_path / "a.pcd", separate("f4", 1))
     assert [len(chunk.colors) for chunk in open_source(path).read_chunks()] == [41] * 29 + [11]
     assert_read_as_written(path)

@@ -5,8 +5,7 @@ import pytest
 from plyfile import PlyData
 
 from piccolo.cloud import open_cloud
-from piccolo.cloud.ply_writer import vertex_rows, write_ply, writing_ply
-from piccolo.cloud.transform import BoundingBox, needs_double
+from piccolo.cloud.ply_writer import needs_double, vertex_rows, write_ply, writing_ply
 
 
 def _cloud(num_points, dtype):
@@ -53,5 +52,5 @@ def test_an_error_leaves_nothing(tmp_path):
 
 def test_float32_is_kept_where_it_holds_a_tenth_of_a_millimetre():
     for size, is_double in ((500.0, False), (5000.0, True)):
-        assert needs_double(BoundingBox(np.zeros(3), np.full(3, size)), np.eye(4), 1.0) == is_double
-    assert not needs_double(BoundingBox(np.zeros(3), np.full(3, 500.0)), np.eye(4), 0.001)
+        assert needs_double(np.array([np.zeros(3), np.full(3, size)]), np.eye(4), 1.0) == is_double
+    assert not needs_double(np.array([np.zeros(3), np.full(3, 500.0)]), np.eye(4), 0.001)

@@ -11,9 +11,9 @@ from piccolo.cloud import open_source, read_cloud
 from piccolo.cloud.readers import number_lines
 from piccolo.cloud.readers import reader as raw
 from piccolo.cloud.readers.number_lines import line_blocks
-from piccolo.cloud.readers.pts import open_pts
 from piccolo.cloud.readers.ptx import open_ptx
 from piccolo.cloud.readers.reader import CloudReadOptions
+from piccolo.cloud.readers.text import open_pts
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)

@@ -10,7 +10,6 @@ from test_cloud_morton import seeded_cloud
 from test_cloud_stream import LEVEL, TURN, stream
 
 from piccolo.cloud import voxels
-from piccolo.cloud.octree import build_octree
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.voxels import (
     COUNT,
@@ -19,10 +18,11 @@ from piccolo.cloud.voxels import (
     POSITION,
     VoxelTable,
     add_points,
+    build_octree,
     move_voxels,
 )
 from piccolo.errors import InputError
-from piccolo.geometry.point_transforms import rotate_points
+from piccolo.geometry.pose import rotate_points
 
 CORNER = -voxels.PHASE / voxels.QUANTA_PER_METRE
 

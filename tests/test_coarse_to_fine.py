@@ -6,7 +6,7 @@ import rooms
 from golden_poses import check_golden_poses
 from rooms import as_panorama, errors, query, room, scan_map
 
-from piccolo.cloud.model import Cloud
+from piccolo.cloud.stream import Cloud
 from piccolo.coarse_to_fine.camera_positions import heights_above_floor
 from piccolo.coarse_to_fine.localize import localize
 from piccolo.coarse_to_fine.prior import allowed_rotations, apply_prior

@@ -18,7 +18,7 @@ from piccolo.coarse_to_fine.query import QueryImages
 from piccolo.coarse_to_fine.starts import Starts
 from piccolo.coarse_to_fine.view import Cells, render_view
 from piccolo.geometry.pose import Pose, step
-from piccolo.geometry.sphere_grid import make_grid
+from piccolo.geometry.sphere import make_grid
 from piccolo.panorama.local_normalization import image_pyramid
 from piccolo.runtime.threads import Workers
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import rooms
 
-from piccolo.geometry.pose_error import pose_errors
+from piccolo.geometry.pose import pose_errors
 from piccolo.optimize.descent_animation import perturb_pose, refine_with_history, write_animation
 from piccolo.optimize.refine import refine, sampling_loss_of
 from piccolo.optimize.settings import DescentSettings

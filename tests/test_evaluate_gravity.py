@@ -22,8 +22,8 @@ def test_a_table_of_kinds(capsys):
 @pytest.mark.parametrize(
     ("tool", "arguments", "message"),
     [
-        (evaluate_gravity, ["--turns", "0"], "--turns and --threads at least 1"),
-        (evaluate_gravity, ["--seeds", "-1", "2"], "--seeds and --full must be 0 or more"),
+        (evaluate_gravity, ["--turns", "0"], "--turns: found 0, wanted at least 1"),
+        (evaluate_gravity, ["--seeds", "-1", "2"], "--seeds: found [-1, 2], wanted 0 or more"),
         (evaluate_gravity, ["--min-confidence", "2"], "--min-confidence"),
         (calibrate_gravity, ["--fit", "3", "3"], "--fit: 3 3 is no range"),
         (calibrate_gravity, ["--threads", "0"], "--threads"),

@@ -15,7 +15,7 @@ import pytest
 from rooms import write_room
 
 from piccolo.cli import evaluate
-from piccolo.scenes.evaluation.run_file import read_run
+from piccolo.scenes.evaluation.runner import read_run
 from piccolo.scenes.scene import Query, read_scene, write_queries
 
 ROOT = Path(__file__).resolve().parents[1]

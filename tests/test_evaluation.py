@@ -9,8 +9,7 @@ import pytest
 from poses import result
 
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose, exp_so3
-from piccolo.geometry.pose_error import is_correct
+from piccolo.geometry.pose import Pose, exp_so3, is_correct
 from piccolo.scenes.evaluation import tables
 from piccolo.scenes.evaluation.plots import errors_figure, figure_png, risk_figure
 from piccolo.scenes.evaluation.query_result import (
@@ -20,9 +19,16 @@ from piccolo.scenes.evaluation.query_result import (
     match_results,
     query_result_of,
 )
-from piccolo.scenes.evaluation.run_file import appending, read_run
-from piccolo.scenes.evaluation.statistics import accuracies, quartiles, risk_and_coverage, summarize
-from piccolo.scenes.evaluation.tables import changes, pair_up, side_by_side
+from piccolo.scenes.evaluation.runner import appending, read_run
+from piccolo.scenes.evaluation.tables import (
+    accuracies,
+    changes,
+    pair_up,
+    quartiles,
+    risk_and_coverage,
+    side_by_side,
+    summarize,
+)
 from piccolo.scenes.scene import Query, Scene
 
 TRUE_POSE = Pose(exp_so3(np.array([0.4, 0.1, -2.0])), np.array([10.0, -4.0, 1.5]))

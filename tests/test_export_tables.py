@@ -9,8 +9,8 @@ import pytest
 from poses import json_of, lines_of, result, tilted_poses
 
 from piccolo.errors import InputError
-from piccolo.geometry.camera_axes import heading_pitch_roll_deg
 from piccolo.geometry.pose import Pose, exp_so3, rotation_from_quaternion_wxyz
+from piccolo.geometry.rotations import heading_pitch_roll_deg
 from piccolo.scenes.export import Options, export
 
 POSES = tilted_poses(4)

@@ -4,9 +4,15 @@ import numpy as np
 import pytest
 
 from piccolo.geometry.pose import exp_so3, yaw_rotation
-from piccolo.gravity.manhattan import manhattan_yaw
-from piccolo.gravity.normals import PointNormals, estimate_normals
-from piccolo.gravity.planes import Plane, classify_planes, ransac_planes, refine_up
+from piccolo.gravity.planes import (
+    Plane,
+    PointNormals,
+    classify_planes,
+    estimate_normals,
+    manhattan_yaw,
+    ransac_planes,
+    refine_up,
+)
 from piccolo.gravity.up import rotation_to_z_up
 
 TURN = exp_so3(np.array([0.7, -1.9, 0.5]))

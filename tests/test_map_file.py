@@ -7,10 +7,10 @@ import zipfile
 import naive
 import numpy as np
 import pytest
+from piccolo.cloud.octree import build_octree
 from refusals import read_or_refused
 from rooms import scan_map
 
-from piccolo.cloud.octree import build_octree
 from piccolo.cloud.settings import CloudSettings
 from piccolo.cloud.voxels import LEAF_SIZE, PHASE, QUANTA_PER_METRE, VoxelTable
 from piccolo.coarse_to_fine import map_file, open_map

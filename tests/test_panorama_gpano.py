@@ -21,8 +21,8 @@ from refusals import read_or_refused
 
 from piccolo.errors import InputError
 from piccolo.geometry.sphere import pixel_rays
-from piccolo.panorama import GPano, ReadOptions, read_panorama, rotation_to_level
-from piccolo.panorama.gpano import gpano_fields
+from piccolo.panorama import GPano, ReadOptions, read_panorama
+from piccolo.panorama.gpano import gpano_fields, rotation_to_level
 
 RGB = smooth_rgb(200, 400)
 LOSSLESS = [cv2.IMWRITE_WEBP_QUALITY, 101]

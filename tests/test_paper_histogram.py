@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from piccolo.paper.histogram import color_histogram, histogram_intersection
+from piccolo.paper.search import color_histogram, histogram_intersection
 
 
 def test_histogram_counts_solid_angle_not_pixels():

@@ -14,7 +14,7 @@ from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, step
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.optimize.refine import refine
-from piccolo.panorama.resize import shrink
+from piccolo.panorama.model import shrink
 from piccolo.paper.localize import localize, loss_of, prepare
 from piccolo.paper.photometric import photometric_equations, photometric_loss, pixel_motion, view_gradient
 from piccolo.paper.settings import PaperSettings

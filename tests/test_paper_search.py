@@ -4,23 +4,13 @@ import numpy as np
 import pytest
 import rooms
 
-from piccolo.geometry.pose import Pose, is_close, yaw_rotation
+from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.optimize.refine import Loss, sampling_loss_of
-from piccolo.panorama.resize import shrink
+from piccolo.panorama.model import shrink
 from piccolo.panorama.texels import pack_texels
 from piccolo.paper.search import histogram_similarity, losses_at
 
 AT = np.array([1.0, 2.0, 1.5])
-
-
-def test_poses_are_close_only_if_near_and_turned_alike():
-    a, b, c = (
-        Pose(yaw_rotation(np.radians(yaw)), np.array([x, 0.0, 0.0]))
-        for x, yaw in ((0, 0), (0.2, 10), (0.2, 20))
-    )
-    assert is_close(a, b, 0.3, np.radians(15))
-    assert not is_close(a, c, 0.3, np.radians(15))
-    assert not is_close(a, b, 0.1, np.radians(15))
 
 
 def test_rotation_without_a_loss_is_no_hypothesis():

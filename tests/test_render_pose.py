@@ -11,8 +11,8 @@ import poses
 import pytest
 
 from piccolo.cli import make_room, prepare_map, render_pose
-from piccolo.geometry.camera_axes import heading_pitch_roll_deg
 from piccolo.geometry.pose import T_world_from_cam
+from piccolo.geometry.rotations import heading_pitch_roll_deg
 from piccolo.optimize import descent_animation as animation
 from piccolo.scenes.scene import read_scene
 
@@ -132,7 +132,7 @@ def test_a_descent_is_shown_with_where_it_ended(run, scene, tmp_path, monkeypatc
         (["--at", 0, 0, "nan", "--out", "a.png"], "must be finite"),
         (["--at", 0, 0, 1, "--animate", "a.gif"], "--animate: no panorama"),
         (["--pose", "T.txt", "--heading", 3, "--out", "a.png"], "only with --at"),
-        (["--at", 0, 0, 1, "--out", "a.png", "--seed", -1], "--seed -1"),
+        (["--at", 0, 0, 1, "--out", "a.png", "--seed", -1], "--seed: found -1"),
         (["--at", 0, 0, 1, "--out", "a.png", "--scale", 0], "--scale: found 0"),
     ],
 )

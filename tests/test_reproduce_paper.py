@@ -19,7 +19,7 @@ from piccolo.panorama import read_panorama
 from piccolo.panorama.texels import pack_texels
 from piccolo.paper.settings import PaperSettings
 from piccolo.render.zbuffer import visible_points
-from piccolo.scenes.evaluation.run_file import read_run
+from piccolo.scenes.evaluation.runner import read_run
 from piccolo.scenes.reproduce_paper.experiments import EXPERIMENTS
 from piccolo.scenes.reproduce_paper.transforms import (
     flipped,

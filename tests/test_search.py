@@ -22,7 +22,7 @@ from piccolo.coarse_to_fine.search import (
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings, Prior
 from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
-from piccolo.geometry.sphere_grid import averaging, make_grid
+from piccolo.geometry.sphere import averaging, make_grid
 from piccolo.panorama import Panorama
 from piccolo.panorama.gpano import GPano
 from piccolo.panorama.local_normalization import (
@@ -31,7 +31,7 @@ from piccolo.panorama.local_normalization import (
     normalize_panorama,
     sample_channels,
 )
-from piccolo.panorama.resize import resize
+from piccolo.panorama.model import resize
 from piccolo.runtime.threads import Workers
 
 SCALE = ImageScale(128, 7.5, SEARCH_VIEW.sigma_deg)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from piccolo.geometry.sphere_grid import averaging, cell_of, make_grid, make_neighbors
+from piccolo.geometry.sphere import averaging, cell_of, make_grid, make_neighbors
 
 
 @pytest.mark.parametrize("num_rings", [12, 24, 96])

@@ -12,13 +12,12 @@ from refusals import mutated, read_or_refused
 
 from piccolo.cloud.soa import LocalCloud, pack_points
 from piccolo.errors import InputError
-from piccolo.geometry.camera_axes import R_cam_from_angles, heading_pitch_roll_deg
-from piccolo.geometry.pose import Pose, T_world_from_cam, angle_between, exp_so3, step
-from piccolo.geometry.pose_file import read_pose_matrix
+from piccolo.geometry.pose import Pose, T_world_from_cam, angle_between, exp_so3, read_pose_matrix, step
+from piccolo.geometry.rotations import R_cam_from_angles, heading_pitch_roll_deg
 from piccolo.geometry.sphere import pixel_rays
-from piccolo.render.splatting import BAND, BAND_OFFSET, MAX_SLOPE, MIN_RADIUS_PX, splat
-from piccolo.render.surfel_renderer import RenderedView, encode_image, fill_holes, render_points
-from piccolo.render.surfels import surfels_of
+from piccolo.render.surfel_renderer import encode_image, fill_holes, render_points
+from piccolo.render.surfels import BAND, BAND_OFFSET, MAX_SLOPE, MIN_RADIUS_PX, splat, surfels_of
+from piccolo.render.zbuffer import View
 from piccolo.runtime.threads import Workers
 from piccolo.scenes.synthetic.raycast import cast_rays
 
@@ -85,7 +84,8 @@ def test_the_picture_at_the_true_pose_is_the_photo(points, variant):
     photo = cv2.resize(query.rgb, (WIDTH, WIDTH // 2), interpolation=cv2.INTER_AREA).astype(float)
 
     def correlation(pose):
-        rgb = fill_holes(render_points(points, pose, WIDTH, WORKERS)).astype(float)
+        view = render_points(points, pose, WIDTH, WORKERS)
+        rgb = fill_holes(view.rgb, view.is_seen).astype(float)
         return np.corrcoef(rgb.ravel(), photo.ravel())[0, 1]
 
     true_pose = rooms.local(SEED, query.pose)
@@ -127,7 +127,7 @@ def test_a_sparse_wall_hides_what_is_behind_it():
     picture = render_points(cloud, pose, 1024, WORKERS)
     front = np.s_[200:312, 450:574]
     assert picture.is_seen[front].mean() > 0.97
-    rgb = fill_holes(picture)[front]
+    rgb = fill_holes(picture.rgb, picture.is_seen)[front]
     assert (rgb[..., 2] < 40).mean() > 0.99
     assert abs(picture.depth[256, 512] - 2.0) < 0.01
 
@@ -163,13 +163,13 @@ def test_holes_take_the_colours_around_them_and_nothing_else_changes(size):
     rgb = rng.integers(100, 200, (*size, 3), dtype=np.uint8)
     depth = np.where(rng.random(size) < 0.3, np.inf, 1.0).astype(np.float32)
     depth[0, 0] = 1.0
-    picture = RenderedView(np.where(np.isfinite(depth)[..., None], rgb, 0).astype(np.uint8), depth)
-    filled = fill_holes(picture)
+    picture = View(depth, np.where(np.isfinite(depth)[..., None], rgb, 0).astype(np.uint8))
+    filled = fill_holes(picture.rgb, picture.is_seen)
     np.testing.assert_array_equal(filled[picture.is_seen], rgb[picture.is_seen])
     assert filled.min() >= 98
     assert filled.max() <= 201
-    nothing = RenderedView(np.zeros((*size, 3), np.uint8), np.full(size, np.inf, np.float32))
-    assert not fill_holes(nothing).any()
+    nothing = View(np.full(size, np.inf, np.float32), np.zeros((*size, 3), np.uint8))
+    assert not fill_holes(nothing.rgb, nothing.is_seen).any()
 
 
 def test_a_hole_at_the_seam_is_closed_from_both_sides():
@@ -177,7 +177,8 @@ def test_a_hole_at_the_seam_is_closed_from_both_sides():
     rgb[:, 32:] = 200
     depth = np.ones((32, 64), np.float32)
     depth[:, :4] = depth[:, -4:] = np.inf
-    filled = fill_holes(RenderedView(np.where(np.isfinite(depth)[..., None], rgb, 0).astype(np.uint8), depth))
+    is_seen = np.isfinite(depth)
+    filled = fill_holes(np.where(is_seen[..., None], rgb, 0).astype(np.uint8), is_seen)
     middle = filled[16, [60, 62, 0, 2], 0].astype(int)
     assert (np.diff(middle) < 0).all()
     assert 20 < middle[1:3].mean() < 180

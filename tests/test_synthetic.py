@@ -14,8 +14,15 @@ from piccolo.geometry.sphere import pixel_rays
 from piccolo.runtime.threads import Workers
 from piccolo.scenes.synthetic.raycast import cast_rays
 from piccolo.scenes.synthetic.room import make_room
-from piccolo.scenes.synthetic.sensors import MIN_CLEARANCE, RANGE_NOISE, free_position
-from piccolo.scenes.synthetic.world import VARIANTS, make_query, make_world, scan_world
+from piccolo.scenes.synthetic.world import (
+    MIN_CLEARANCE,
+    RANGE_NOISE,
+    VARIANTS,
+    free_position,
+    make_query,
+    make_world,
+    scan_world,
+)
 
 SMALL = np.array([3.0, 3.0, 2.4])
 
@@ -159,7 +166,7 @@ def test_command_line_writes_a_world_that_reads_back(tmp_path, capsys):
         ("--width 127", "width: 127 is not an even number of at least 128"),
         ("--size nan 3 2.4", "size: [nan, 3.0, 2.4] is not between 2.0 and 50.0 m each way"),
         ("--rooms 65", "rooms: 65 is not between 1 and 64"),
-        ("--seed -1", "--panoramas, --seed, --scenes: found a negative number, wanted 0 or more"),
+        ("--seed -1", "--seed: found -1, wanted at least 0"),
     ],
 )
 def test_command_line_refuses_in_one_line_before_anything_is_written(options, message, tmp_path, capsys):

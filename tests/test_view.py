@@ -4,8 +4,8 @@ import pytest
 import rooms
 from scipy.spatial import cKDTree
 
-from piccolo.cloud.model import Cloud
-from piccolo.cloud.octree import build_octree
+from piccolo.cloud.stream import Cloud
+from piccolo.cloud.voxels import build_octree
 from piccolo.coarse_to_fine.camera_positions import (
     candidate_centers,
     coverage,
@@ -15,8 +15,8 @@ from piccolo.coarse_to_fine.camera_positions import (
 )
 from piccolo.coarse_to_fine.scan_map import SEARCH_VIEW, render_candidates
 from piccolo.coarse_to_fine.view import ViewConfig, render_view, visible_points
-from piccolo.geometry.sphere_grid import cell_of, make_grid
-from piccolo.panorama.channels import LEVELS_PER_UNIT
+from piccolo.geometry.sphere import cell_of, make_grid
+from piccolo.panorama.local_normalization import LEVELS_PER_UNIT
 from piccolo.runtime.threads import Workers
 
 LEAVES = ViewConfig(

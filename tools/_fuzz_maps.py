@@ -30,7 +30,7 @@ from piccolo.coarse_to_fine.prior import apply_prior
 from piccolo.coarse_to_fine.scan_map import ScanMap, prepare_map, sparse_candidates, widen
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings, Prior
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose, is_close
+from piccolo.geometry.pose import Pose, is_correct
 from piccolo.panorama import Panorama
 from piccolo.runtime.kernel_cache import digest_of, read_whole
 from piccolo.runtime.stopwatch import Stopwatch
@@ -126,7 +126,7 @@ def mutated_array(rng: np.random.Generator, array: NDArray[Any]) -> NDArray[Any]
 def status_in(scan_map: ScanMap, panorama: Panorama, pose: Pose) -> str:
     """What the panorama's pose in a map is called; never "localized" if it is not the true one."""
     result = localize(scan_map, panorama, SETTINGS, WORKERS, Stopwatch(), QUICK)
-    if result.status == "localized" and result.pose and not is_close(result.pose, pose, 0.1, np.radians(5)):
+    if result.status == "localized" and not is_correct(result.pose, pose):
         raise RuntimeError(f"a wrong pose is called localized: {result.pose}")
     return result.status
 

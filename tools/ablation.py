@@ -12,13 +12,13 @@ import numpy as np
 
 from piccolo.cli.command import command
 from piccolo.cloud import read_cloud
-from piccolo.cloud.model import Cloud
+from piccolo.cloud.stream import Cloud
 from piccolo.coarse_to_fine.config import METHOD, Beam, ImageScales, MethodConfig
 from piccolo.coarse_to_fine.localize import localize
 from piccolo.coarse_to_fine.scan_map import SEARCH_VIEW, prepare_map
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.coarse_to_fine.view import ViewConfig
-from piccolo.geometry.pose_error import is_correct
+from piccolo.geometry.pose import is_correct
 from piccolo.geometry.rotations import Gravity
 from piccolo.panorama import read_panorama
 from piccolo.runtime.stopwatch import Stopwatch
@@ -47,7 +47,7 @@ def with_views(change: Callable[[ViewConfig], ViewConfig], scales: ImageScales =
     return method._replace(scales=scales), change(SEARCH_VIEW), 4000
 
 
-GLOBAL_SCALES = ImageScales(*(replace(scale, sigma_deg=EVERYTHING) for scale in METHOD.scales))
+GLOBAL_SCALES = ImageScales(*(scale._replace(sigma_deg=EVERYTHING) for scale in METHOD.scales))
 PARTS: dict[str, Parts] = {
     "all of it": (METHOD, SEARCH_VIEW, 4000),
     "12 starts": (METHOD._replace(min_starts=12), SEARCH_VIEW, 12),

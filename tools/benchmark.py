@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from piccolo.cli.command import command, option
 from piccolo.cli.errors import UsageError
 from piccolo.cloud import read_cloud
-from piccolo.cloud.morton import morton_order
 from piccolo.cloud.soa import PackedPoints, pack_points
+from piccolo.cloud.voxels import morton_order
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.optimize.sampling_loss import sampling_equations, sampling_loss
@@ -30,7 +30,6 @@ example:
 Every kernel is timed once in each round, so that a disturbance hits all; ratios are of the medians.
 The reference is cv2.remap: 8-bit, 3 channels, bilinear, one thread, a coherent map, a pixel a point.
 """
-
 
 Case = tuple[PackedPoints, NDArray[np.uint8], Pose]  # what is timed: points, image (H, W, 3), pose
 

@@ -11,18 +11,15 @@ from pathlib import Path
 
 import _checkout  # noqa: F401
 import numpy as np
-from numpy.typing import NDArray
 
 from piccolo.cli.command import command, option
 from piccolo.cli.errors import UsageError
-from piccolo.cloud import read_cloud
-from piccolo.cloud.model import Cloud
-from piccolo.cloud.morton import morton_order
+from piccolo.cloud import Cloud, read_cloud, stream_of
+from piccolo.cloud.readers.reader import RawCloud
 from piccolo.coarse_to_fine.localize import localize
 from piccolo.coarse_to_fine.scan_map import prepare_map
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
-from piccolo.geometry.pose import Pose
-from piccolo.geometry.pose_error import is_correct
+from piccolo.geometry.pose import Pose, is_correct
 from piccolo.geometry.rotations import Gravity
 from piccolo.panorama import Panorama, read_panorama
 from piccolo.runtime.stopwatch import Stopwatch
@@ -46,16 +43,7 @@ COLUMNS = (
     "peak MB", "before",
 )  # fmt: skip
 
-
 Case = tuple[Cloud, list[tuple[Panorama, Pose]]]  # a cloud, and panoramas in it with their true poses
-
-
-def ordered(
-    points: NDArray[np.float32], colors: NDArray[np.uint8], origin_world: NDArray[np.float64]
-) -> Cloud:
-    """A cloud in the order in which a file of it is read."""
-    order = morton_order(points, colors)
-    return Cloud(points[order], colors[order], origin_world)
 
 
 def scene_case(folder: Path, num_points: int) -> Case:
@@ -71,7 +59,8 @@ def scene_case(folder: Path, num_points: int) -> Case:
         points = points + rng.normal(0.0, 0.005, points.shape).astype(np.float32)
     taken = [query for query in scene.queries if query.variant == "clean"][:NUM_QUERIES]
     queries = [(read_panorama(query.image), query.pose) for query in taken]
-    return ordered(points, cloud.colors[index], cloud.origin_world), queries
+    raw = RawCloud(points + cloud.origin_world, cloud.colors[index])
+    return stream_of(folder, raw).read(), queries
 
 
 def rooms_case(num_rooms: int) -> Case:
@@ -81,7 +70,7 @@ def rooms_case(num_rooms: int) -> Case:
     points, colors, _ = scan_world(world, 50_000 * num_rooms, workers)
     taken = [make_query(world, k, "clean", 1024, workers) for k in range(NUM_QUERIES)]
     queries = [(Panorama(q.rgb, np.ones(q.rgb.shape[:2], dtype=bool)), q.pose) for q in taken]
-    return ordered(points, colors, np.zeros(3)), queries
+    return stream_of(Path("rooms"), RawCloud(points.astype(np.float64), colors)).read(), queries
 
 
 def measure(label: str, make: Callable[[], Case], results: "multiprocessing.Queue[str]") -> None:

@@ -4,9 +4,9 @@
 import argparse
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import _checkout  # noqa: F401
 import numpy as np
@@ -30,8 +30,7 @@ from piccolo.confidence.confidence import (
 )
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.confidence.score import Evidence
-from piccolo.geometry.pose import Pose, log_so3
-from piccolo.geometry.pose_error import is_correct
+from piccolo.geometry.pose import Pose, is_correct, log_so3
 from piccolo.result import Result
 from piccolo.runtime.json_file import parse_lines, read_bytes
 
@@ -48,8 +47,7 @@ LEVELS = (0.0, 0.5, 0.9, 0.99, 1.01)
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(NamedTuple):
     """One trial's evidence, and whether its pose was right."""
 
     case: str

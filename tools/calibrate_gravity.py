@@ -3,8 +3,8 @@
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import product
+from typing import NamedTuple
 
 import _checkout  # noqa: F401
 import numpy as np
@@ -12,10 +12,9 @@ from evaluate_gravity import ROUGH, rotated_cloud, rotations_of
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from piccolo.cli.command import command, option
-from piccolo.cli.errors import checking_options
+from piccolo.cli.command import check_least, command, option
+from piccolo.cli.errors import UsageError
 from piccolo.cli.progress import progress_bar
-from piccolo.errors import InputError
 from piccolo.geometry.pose import Array
 from piccolo.gravity.alignment import normals_of
 from piccolo.gravity.up import up_hypotheses
@@ -37,8 +36,7 @@ the seeds to check, by the weights in use and by those fitted.
 """
 
 
-@dataclass(frozen=True)
-class Choice:
+class Choice(NamedTuple):
     """The hypotheses of one cloud."""
 
     kind: str
@@ -110,24 +108,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 @command(__file__, __doc__, EPILOG, add_arguments)
 def main(arguments: argparse.Namespace) -> int:
     """Fit, print the weights and check them."""
-    with checking_options():
-        check_arguments(arguments)
+    for name in ("fit", "check"):
+        first, end = getattr(arguments, name)
+        if not 0 <= first < end:
+            raise UsageError(f"--{name}: {first} {end} is no range of seeds, such as 0 60")
+    check_least(arguments, threads=1)
     workers = Workers(arguments.threads, progress_bar(arguments.quiet))
     fitted = np.round(fit(choices_of(arguments.fit, workers)), 2)
     values = [f"{name}={value:g}" for name, value in zip(Weights._fields, fitted[:-1], strict=True)]
     print(f"WEIGHTS = Weights({', '.join(values)})\nSENSE_SHARING = {fitted[-1]:g}\n")
     print_table(choices_of(arguments.check, workers), fitted)
     return 0
-
-
-def check_arguments(arguments: argparse.Namespace) -> None:
-    """Refuse seeds and threads that make no place."""
-    for name in ("fit", "check"):
-        first, end = getattr(arguments, name)
-        if not 0 <= first < end:
-            raise InputError(f"--{name}: {first} {end} is no range of seeds, such as 0 60")
-    if arguments.threads < 1:
-        raise InputError("--threads must be at least 1")
 
 
 if __name__ == "__main__":

@@ -11,14 +11,13 @@ import _checkout  # noqa: F401
 import numpy as np
 from numpy.typing import NDArray
 
-from piccolo.cli.command import command, option
-from piccolo.cli.errors import checking_options
+from piccolo.cli.command import check_least, command, option
+from piccolo.cli.errors import UsageError, checking_options
 from piccolo.cli.progress import progress_bar
 from piccolo.cloud import CloudStream, open_cloud, stream_of
-from piccolo.cloud.octree import build_octree
 from piccolo.cloud.readers.reader import RawCloud
+from piccolo.cloud.voxels import build_octree
 from piccolo.confidence.confidence import check_confidence
-from piccolo.errors import InputError
 from piccolo.geometry.pose import Array
 from piccolo.geometry.rotations import random_rotation
 from piccolo.gravity import MIN_CONFIDENCE
@@ -89,8 +88,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 @command(__file__, __doc__, EPILOG, add_arguments, "0 no wrong answer was accepted, 1 some were")
 def main(arguments: argparse.Namespace) -> int:
     """Try all clouds, print one line for each name; returns the exit code."""
+    arguments.seeds = arguments.seeds or ([0, 0] if arguments.scenes else [1100, 1120])
     with checking_options():
-        check_arguments(arguments)
+        check_confidence(arguments.min_confidence)
+    if min(arguments.seeds) < 0:
+        raise UsageError(f"--seeds: found {arguments.seeds}, wanted 0 or more")
+    check_least(arguments, turns=1, threads=1, full=0)
     workers = Workers(arguments.threads, progress_bar(arguments.quiet))
     answers: dict[str, list[tuple[float, float]]] = {}
     for name, points, rotations in cases_of(arguments):
@@ -108,14 +111,6 @@ def main(arguments: argparse.Namespace) -> int:
         print(f"| {name} | {' | '.join(map(str, counts))} | {surest} |")
         num_false += counts[-1]
     return int(num_false > 0)
-
-
-def check_arguments(arguments: argparse.Namespace) -> None:
-    """Fill in the default seeds; refuse values that no cloud could make right."""
-    arguments.seeds = arguments.seeds or ([0, 0] if arguments.scenes else [1100, 1120])
-    check_confidence(arguments.min_confidence)
-    if min(arguments.seeds) < 0 or min(arguments.turns, arguments.threads) < 1 or arguments.full < 0:
-        raise InputError("--seeds and --full must be 0 or more, --turns and --threads at least 1")
 
 
 if __name__ == "__main__":

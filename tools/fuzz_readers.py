@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import FunctionType
 
@@ -37,19 +38,15 @@ BY_HAND = ("maps", "caches")
 TIMEOUT_S, MEMORY_MB, MAX_SIZE = 20, 2048, 1 << 16
 
 
-def read_format(form: CloudFormat) -> Callable[[Path], object]:
-    """Reads all chunks of a file by one format's reader."""
-
-    def read(path: Path) -> object:
-        return [len(chunk.colors) for chunk in form.open_source(path, PLAIN).read_chunks()]
-
-    return read
+def read_format(form: CloudFormat, path: Path) -> object:
+    """The sizes of all chunks of a file, by one format's reader."""
+    return [len(chunk.colors) for chunk in form.open_source(path, PLAIN).read_chunks()]
 
 
 READERS: dict[str, tuple[tuple[str, ...], Callable[[Path], object]]] = {
     **{
-        min(form.suffixes, key=lambda s: (len(s), s))[1:]: (tuple(sorted(form.suffixes)), read_format(form))
-        for form in FORMATS
+        min(f.suffixes, key=lambda s: (len(s), s))[1:]: (tuple(sorted(f.suffixes)), partial(read_format, f))
+        for f in FORMATS
     },
     "panorama": ((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp"), read_panorama),
     "result": ((".jsonl",), lambda path: Result.from_json(path.read_text())),

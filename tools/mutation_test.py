@@ -17,10 +17,9 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 COPIED = ("piccolo", "tests", "tools", "pyproject.toml", "localize.py")
@@ -48,8 +47,7 @@ REMOVABLE = (ast.AugAssign, ast.Expr, ast.If, ast.Break, ast.Continue)
 TIMEOUT_S = 400.0  # a test that runs on for ever has noticed, too
 
 
-@dataclass(frozen=True)
-class Mutant:
+class Mutant(NamedTuple):
     """A module with one change."""
 
     module: str

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TextIO
 
 from ..errors import InputError
-from ..panorama.cube_files import SUFFIXES, is_cube
+from ..panorama.cube import SUFFIXES, is_cube
 from ..runtime.json_file import read_text
 
 STDIN = "-"

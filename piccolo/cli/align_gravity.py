@@ -2,23 +2,21 @@
 
 import argparse
 import json
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from ..cloud import open_cloud
-from ..cloud.transform import BoundedStream, with_bounds, write_transformed
+from ..cloud import CloudStream, open_cloud
+from ..cloud.ply_writer import write_transformed
 from ..confidence.confidence import check_confidence
 from ..errors import InputError
 from ..gravity import MIN_CONFIDENCE
-from ..gravity.alignment import AlignmentReport, find_alignment
-from ..gravity.alignment_file import Alignment, read_alignment
+from ..gravity.alignment import Alignment, AlignmentReport, find_alignment, read_alignment
 from ..runtime.atomic import check_output, write_atomically
 from ..scenes.scene import QUERIES_NAME, Query, read_scene, write_queries
-from .command import command, option
-from .errors import checking_options, print_error, print_note
+from .command import command, option, print_warnings
+from .errors import checking_options, print_error
 from .options import add_cloud_options, cloud_settings_from
 from .progress import progress_bar
 
@@ -89,7 +87,7 @@ def outputs_of(arguments: argparse.Namespace) -> Outputs:
     return transforms, read_scene(arguments.queries).queries if arguments.queries else ()
 
 
-def write(args: argparse.Namespace, outputs: Outputs, cloud: BoundedStream, alignment: Alignment) -> None:
+def write(args: argparse.Namespace, outputs: Outputs, cloud: CloudStream, alignment: Alignment) -> None:
     """Write the cloud and what goes with it, the cloud's name last."""
     (transforms, queries), out = outputs, args.out
 
@@ -104,8 +102,7 @@ def write(args: argparse.Namespace, outputs: Outputs, cloud: BoundedStream, alig
     if out is None:
         write_others()
     else:
-        T_aligned_from_scan = alignment.T_aligned_from_scan
-        print_warnings(args, write_transformed(cloud, T_aligned_from_scan, out, write_others))
+        print_warnings(args, write_transformed(cloud, alignment.T_aligned_from_scan, out, write_others))
 
 
 def report_of(arguments: argparse.Namespace, status: str, alignment: Alignment) -> dict[str, object]:
@@ -114,10 +111,7 @@ def report_of(arguments: argparse.Namespace, status: str, alignment: Alignment) 
         "status": status,
         "cloud": [str(path) for path in arguments.cloud],
         "out": str(arguments.out) if arguments.out and status != "uncertain" else None,
-        "confidence": alignment.confidence,
-        "explanation": alignment.explanation,
-        "metres_per_unit": alignment.metres_per_unit,
-        "T_aligned_from_scan": alignment.T_aligned_from_scan.tolist(),
+        **alignment.numbers(),
     }
 
 
@@ -127,10 +121,9 @@ def evidence_of(report: AlignmentReport) -> dict[str, object]:
     scale = report.alignment.metres_per_unit
     rms_angle = report.plane_rms_angle
     planes = []
-    for plane in report.planes:
-        numbers = {"num_inliers": plane.num_inliers, "fraction": plane.fraction, "rms": plane.rms / scale}
-        place = {"normal_scan": plane.normal_world.tolist(), "offset": plane.offset / scale}
-        planes.append({"kind": plane.kind, **place, **numbers})
+    for normal, offset, num_inliers, fraction, rms, kind in report.planes:
+        place = {"kind": kind, "normal_scan": normal.tolist(), "offset": offset / scale}
+        planes.append({**place, "num_inliers": num_inliers, "fraction": fraction, "rms": rms / scale})
     return {
         "up_scan": report.up_scan.tolist(),
         "tilt_deg": float(np.degrees(np.arctan2(np.hypot(x, y), z))),
@@ -140,17 +133,11 @@ def evidence_of(report: AlignmentReport) -> dict[str, object]:
     }
 
 
-def print_warnings(arguments: argparse.Namespace, warnings: Iterable[str]) -> None:
-    """A line on stderr for each warning, unless --quiet."""
-    for warning in warnings:
-        print_note(arguments, f"warning: {warning}")
-
-
 def align(arguments: argparse.Namespace) -> int:
     """Find the alignment, write what is sure enough; returns the exit code."""
     outputs = outputs_of(arguments)
     show = progress_bar(arguments.quiet)
-    cloud = with_bounds(open_cloud(arguments.cloud, cloud_settings_from(arguments), show))
+    cloud = open_cloud(arguments.cloud, cloud_settings_from(arguments), show)
     found, warnings = find_alignment(cloud, arguments.up, arguments.yaw_walls)
     print_warnings(arguments, warnings)
     alignment = found.alignment
@@ -175,7 +162,7 @@ def apply(arguments: argparse.Namespace) -> int:
     if arguments.units is None and arguments.scale is None:
         settings = replace(settings, scale=given.metres_per_unit)
     alignment = (given.inverse() if arguments.inverse else given).in_unit(settings.scale)
-    cloud = with_bounds(open_cloud(arguments.cloud, settings, progress_bar(arguments.quiet)))
+    cloud = open_cloud(arguments.cloud, settings, progress_bar(arguments.quiet))
     for _ in cloud.chunks([]):  # for its box
         pass
     write(arguments, outputs, cloud, alignment)

@@ -1,11 +1,11 @@
 """What makes a module a command: options written as a help text shows them, and the `main` that runs it."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-from .errors import run_command
+from .errors import UsageError, print_note, run_command
 from .parser import add_run_options, new_parser
 
 KINDS: dict[str, type] = {  # of the values, by the first metavar; of others text
@@ -13,13 +13,7 @@ KINDS: dict[str, type] = {  # of the values, by the first metavar; of others tex
     **dict.fromkeys(("N", "PX", "FIRST", "W"), int),
     **dict.fromkeys(("X", "M", "DEG", "X0", "MIN"), float),
 }
-
-
-class Main(Protocol):
-    """Runs a command line, by default this program's, and returns its exit code."""
-
-    def __call__(self, argv: list[str] | None = None) -> int:
-        """See the class."""
+Main = Callable[..., int]  # runs a command line, by default this program's, and returns its exit code
 
 
 def option(group: argparse._ActionsContainer, usage: str, text: str = "", **more: Any) -> None:
@@ -41,6 +35,20 @@ def option(group: argparse._ActionsContainer, usage: str, text: str = "", **more
         shown = " ".join(map(str, default)) if isinstance(default, list | tuple) else default
         text = f"{text} (default {shown})".lstrip()
     group.add_argument(name, help=text, **more)
+
+
+def check_least(arguments: argparse.Namespace, **limits: int) -> None:
+    """Refuse an option below its limit, by its name in `arguments`; one that is not there may be anything."""
+    for name, limit in limits.items():
+        value = getattr(arguments, name, None)
+        if value is not None and value < limit:
+            raise UsageError(f"--{name.replace('_', '-')}: found {value}, wanted at least {limit}")
+
+
+def print_warnings(arguments: argparse.Namespace, warnings: Iterable[str]) -> None:
+    """A line on stderr for each warning, unless --quiet."""
+    for warning in warnings:
+        print_note(arguments, f"warning: {warning}")
 
 
 def command(

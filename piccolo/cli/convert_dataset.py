@@ -3,7 +3,7 @@
 import argparse
 import json
 from collections import Counter
-from dataclasses import asdict, fields
+from dataclasses import fields
 
 from ..errors import InputError
 from ..runtime.threads import Progress, Workers, num_cores
@@ -13,8 +13,8 @@ from ..scenes.datasets.files import AXES, DIRECTIONS
 from ..scenes.datasets.model import ConvertOptions, SceneSpec
 from ..scenes.datasets.writing import write_scene
 from ..scenes.scene import read_scene
-from .command import option
-from .errors import EXIT_BAD_INPUT, UsageError, print_error, print_note, run_command
+from .command import check_least, option
+from .errors import EXIT_BAD_INPUT, print_error, print_note, run_command
 from .parser import HelpFormatter, add_run_options, new_parser
 from .progress import progress_bar
 
@@ -73,12 +73,6 @@ def add_own_options(parser: argparse.ArgumentParser, dataset: str) -> None:
         option(parser, "--direction", text, choices=DIRECTIONS)
 
 
-def convert_options_from(arguments: argparse.Namespace) -> ConvertOptions:
-    """The options of one dataset, as far as its subparser has them."""
-    own = {field.name: getattr(arguments, field.name, field.default) for field in fields(ConvertOptions)}
-    return ConvertOptions(**own | {"areas": frozenset(getattr(arguments, "areas", ()))})
-
-
 def chosen(specs: tuple[SceneSpec, ...], rooms: list[str]) -> list[SceneSpec]:
     """The scenes of some rooms, or all."""
     counts = Counter(spec.name for spec in specs)
@@ -92,10 +86,11 @@ def chosen(specs: tuple[SceneSpec, ...], rooms: list[str]) -> list[SceneSpec]:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the scenes one by one; returns the exit code."""
-    for name in ("check", "seed"):
-        if getattr(arguments, name, 0) < 0:
-            raise UsageError(f"--{name}: found {getattr(arguments, name)}, wanted 0 or more")
-    found = DATASETS[arguments.dataset].list_scenes(convert_options_from(arguments))
+    check_least(arguments, check=0, seed=0)
+    # a dataset's subparser has only some of the options
+    own = {field.name: getattr(arguments, field.name, field.default) for field in fields(ConvertOptions)}
+    options = ConvertOptions(**own | {"areas": frozenset(getattr(arguments, "areas", ()))})
+    found = DATASETS[arguments.dataset].list_scenes(options)
     specs = chosen(found.specs, arguments.rooms)
     for note in found.notes:
         print_note(arguments, note)
@@ -120,7 +115,7 @@ def convert_scene(spec: SceneSpec, arguments: argparse.Namespace, show: Progress
     line: dict[str, object] = {"scene": spec.name, "folder": str(written.folder), "status": status}
     line |= {"points": written.num_points, "queries": written.num_queries}
     if check:
-        line |= {"fits": check.is_passed, "check": [asdict(panorama) for panorama in check.panoramas]}
+        line |= {"fits": check.is_passed, "check": [panorama._asdict() for panorama in check.panoramas]}
     print(json.dumps(line), flush=True)
     if check and not check.is_passed:
         return print_error(arguments, f"{spec.name}: {check.advice}", EXIT_BAD_FIT)

@@ -5,7 +5,7 @@ import json
 import re
 from pathlib import Path
 
-from ..cloud.readers.e57_images import E57Image, list_images, read_image
+from ..cloud.readers.e57 import E57Image, list_images, read_image
 from ..errors import InputError
 from ..geometry.pose import quaternion_wxyz
 from ..runtime.atomic import write_atomically
@@ -25,15 +25,13 @@ SUFFIX = {"jpeg": ".jpg", "png": ".png"}
 
 def image_json(index: int, image: E57Image) -> dict[str, object]:
     """The JSON object of an image."""
-    pose = None
-    if placement := image.placement:
-        wxyz = quaternion_wxyz(placement.R_world_from_local).tolist()
-        center_world = placement.center_world.tolist()
-        pose = {"quaternion_wxyz_world_from_image": wxyz, "center_world": center_world}
+    pose = image.pose and {
+        "quaternion_wxyz_world_from_image": quaternion_wxyz(image.pose.R_cam_from_world.T).tolist(),
+        "center_world": image.pose.center_world.tolist(),
+    }
     names = "name", "kind", "width", "height", "fov_deg", "encoding"
     row = {"index": index, **{name: getattr(image, name) for name in names}, "bytes": image.size}
-    is_usable = image.kind == "spherical"
-    return {**row, "is_usable": is_usable, "pose": pose, "scan_guid": image.scan_guid or None}
+    return {**row, "is_usable": image.kind == "spherical", "pose": pose, "scan_guid": image.scan_guid or None}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

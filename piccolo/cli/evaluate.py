@@ -15,11 +15,9 @@ from ..runtime.threads import num_cores
 from ..scenes.evaluation import tables
 from ..scenes.evaluation.plots import errors_figure, figure_png, risk_figure
 from ..scenes.evaluation.query_result import QueryResult, Thresholds, match_results
-from ..scenes.evaluation.run_file import input_files, open_run, read_run
-from ..scenes.evaluation.runner import RunConfig
-from ..scenes.evaluation.statistics import risk_and_coverage
+from ..scenes.evaluation.runner import RunConfig, input_files, open_run, read_run
 from ..scenes.scene import find_scenes
-from .command import command, option
+from .command import check_least, command, option
 from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error
 from .options import (
     add_cloud_reading_options,
@@ -76,35 +74,30 @@ def check_usage(arguments: argparse.Namespace) -> None:
         raise UsageError("--csv, --risk: not with --compare, they show one run")
     if not (0.0 < arguments.max_distance < np.inf and 0.0 < arguments.max_angle < np.inf):
         raise UsageError("--max-distance, --max-angle: wanted numbers above 0")
-    if arguments.jobs < 1:
-        raise UsageError(f"--jobs: found {arguments.jobs}, wanted at least 1")
+    check_least(arguments, jobs=1)
 
 
-def tables_of(rows: Sequence[QueryResult], thresholds: Thresholds) -> list[tables.Table]:
-    """All tables of one run."""
+def report_of(rows: Sequence[QueryResult], thresholds: Thresholds) -> str:
+    """All tables of one run as Markdown."""
     inside = [row for row in rows if row.is_in_box]
     num_outside = sum(row.is_in_box is False for row in rows)
     found = [tables.per_query(rows), tables.summary_table(rows, thresholds, f"all {len(rows)} queries")]
     if num_outside and inside:
         title = f"without the {num_outside} queries taken outside the cloud's bounding box"
         found.append(tables.summary_table(inside, thresholds, title))
-    risk = tables.risk_table(risk_and_coverage(rows, thresholds))
-    return [*found, tables.threshold_table(rows, thresholds), risk]
+    found.append(tables.threshold_table(rows, thresholds))
+    found.append(tables.risk_table(tables.risk_and_coverage(rows, thresholds)))
+    return "\n".join(table.markdown() for table in found)
 
 
-def write_report(arguments: argparse.Namespace, rows: Sequence[QueryResult], thresholds: Thresholds) -> None:
-    """Print the tables of one run, and write the files asked for."""
-    rows = sorted(rows, key=lambda row: row.key)
-    text = "\n".join(table.markdown() for table in tables_of(rows, thresholds))
-    name = (arguments.out or arguments.results).stem
-    if arguments.csv:
-        write_atomically(arguments.csv, tables.csv_text(rows).encode())
+def write_report(
+    arguments: argparse.Namespace, text: str, runs: dict[str, list[QueryResult]], thresholds: Thresholds
+) -> None:
+    """Print the tables of one run or two, and write them and the plot of their errors if asked for."""
     if arguments.markdown:
         write_atomically(arguments.markdown, text.encode())
     if arguments.errors:
-        write_atomically(arguments.errors, figure_png(errors_figure({name: rows}, thresholds)))
-    if arguments.risk:
-        write_atomically(arguments.risk, figure_png(risk_figure(risk_and_coverage(rows, thresholds))))
+        write_atomically(arguments.errors, figure_png(errors_figure(runs, thresholds)))
     print(text, end="")
 
 
@@ -121,12 +114,8 @@ def compare(arguments: argparse.Namespace, thresholds: Thresholds) -> int:
     for path, rows in zip(names, runs, strict=True):
         text += f"\nonly in {path}: {len(rows) - len(pairs)} queries"
     text += f"\n\n{tables.changes(pairs, thresholds).markdown()}"
-    if arguments.markdown:
-        write_atomically(arguments.markdown, text.encode())
-    if arguments.errors:
-        both = {first: [p.first for p in pairs], second: [p.second for p in pairs]}
-        write_atomically(arguments.errors, figure_png(errors_figure(both, thresholds)))
-    print(text, end="")
+    both = {first: [pair[0] for pair in pairs], second: [pair[1] for pair in pairs]}
+    write_report(arguments, text, both, thresholds)
     return 0
 
 
@@ -164,5 +153,12 @@ def main(arguments: argparse.Namespace) -> int:
         rows = [row for row in rows if row.variant in arguments.variants]
     if not rows:
         raise InputError("no query could be localized; check --scenes and --variants")
-    write_report(arguments, rows, thresholds)
+    rows = sorted(rows, key=lambda row: row.key)
+    if arguments.csv:
+        write_atomically(arguments.csv, tables.csv_text(rows).encode())
+    if arguments.risk:
+        points = tables.risk_and_coverage(rows, thresholds)
+        write_atomically(arguments.risk, figure_png(risk_figure(points)))
+    name = (arguments.out or arguments.results).stem
+    write_report(arguments, report_of(rows, thresholds), {name: rows}, thresholds)
     return EXIT_BAD_INPUT if num_failed else 0

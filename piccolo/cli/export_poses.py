@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from ..errors import InputError
-from ..geometry.camera_axes import CAMERA_AXES
+from ..geometry.rotations import CAMERA_AXES
 from ..result import read_results
 from ..runtime.atomic import check_output
 from ..scenes.export import FORMATS, Options, Selection, export, select, true_results

@@ -18,7 +18,7 @@ from ..coarse_to_fine.open_map import CachePolicy, scan_sha256_of
 from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..panorama import read_panorama
-from ..render.overlay import overlay_png
+from ..render.surfel_renderer import overlay_png
 from ..result import UNREADABLE, Result
 from ..runtime.atomic import check_output, write_atomically
 from ..runtime.kernel_cache import is_first_use, kernel_folder

@@ -12,18 +12,25 @@ from ..coarse_to_fine.open_map import open_points
 from ..errors import InputError
 from ..geometry.pose import Array, Pose
 from ..geometry.rotations import uniform_rotations, uniform_yaws
-from ..optimize.loss_surface import LossSurface, PoseGrid, loss_surface
-from ..optimize.loss_surface_io import KnownPoses, plan_shift, surface_npz, surface_png
+from ..optimize.loss_surface import (
+    KnownPoses,
+    LossSurface,
+    PoseGrid,
+    loss_surface,
+    plan_shift,
+    surface_npz,
+    surface_png,
+)
 from ..panorama import read_panorama
-from ..panorama.resize import shrink
+from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
 from ..result import read_results
 from ..runtime.atomic import check_output, write_atomically
 from ..runtime.figure import new_figure
 from ..runtime.threads import Workers, num_cores
 from ..scenes.scene import read_scene
-from .command import command, option
-from .errors import checking_options, print_note
+from .command import check_least, command, option, print_warnings
+from .errors import checking_options
 from .options import add_cloud_options, cloud_settings_from
 from .progress import progress_bar
 
@@ -73,11 +80,7 @@ def check_usage(arguments: argparse.Namespace) -> None:
         raise InputError("give --out, --npz or both")
     if not 0.0 < arguments.step < np.inf:
         raise InputError(f"--step {arguments.step}: wanted metres above 0")
-    least = {"rotations": 1, "width": 16, "max_points": 100, "threads": 1}
-    for name, limit in least.items():
-        value = getattr(arguments, name)
-        if value is not None and value < limit:
-            raise InputError(f"--{name.replace('_', '-')} {value}: wanted at least {limit}")
+    check_least(arguments, rotations=1, width=16, max_points=100, threads=1)
     x0, y0, x1, y1 = arguments.box or (0.0, 0.0, 1.0, 1.0)
     if not (x0 < x1 and y0 < y1 and np.isfinite([x0, y0, x1, y1]).all()):
         raise InputError(f"--box {arguments.box}: wanted X0 below X1 and Y0 below Y1")
@@ -109,9 +112,8 @@ def grid_from(arguments: argparse.Namespace, cloud: LocalCloud, known: KnownPose
         corners = np.array(arguments.box).reshape(2, 2) - shift[:2]
     else:
         ends = [np.percentile(c, [0.5, 99.5]) for c in (cloud.points.x, cloud.points.y)]
-        places = np.array(
-            [*np.transpose(ends), *(pose.center_world[:2] for pose in known.values())], np.float64
-        )
+        known_places = [pose.center_world[:2] for pose in known.values()]
+        places = np.array([*np.transpose(ends), *known_places], np.float64)
         corners = np.stack([places.min(axis=0), places.max(axis=0)])
     counts = np.floor((corners[1] - corners[0]) / arguments.step) + 1.0
     if counts.prod() > MAX_CELLS:
@@ -121,9 +123,8 @@ def grid_from(arguments: argparse.Namespace, cloud: LocalCloud, known: KnownPose
         raise InputError("--box, --heights: places too far from the cloud")
     x, y = (corners[0, k] + arguments.step * np.arange(counts[k]) for k in range(2))
     is_known = arguments.gravity == "known"
-    rotations = (uniform_yaws if is_known else uniform_rotations)(
-        arguments.rotations or (64 if is_known else 1000)
-    )
+    spread, usual = (uniform_yaws, 64) if is_known else (uniform_rotations, 1000)
+    rotations = spread(arguments.rotations or usual)
     # Turned from a pose that is known, so that it is among them.
     start = next(iter(known.values())).R_cam_from_world if known else np.eye(3)
     return PoseGrid(x, y, heights, start @ rotations @ rotations[0].T)
@@ -174,8 +175,7 @@ def main(arguments: argparse.Namespace) -> int:
     panorama = shrink(read_panorama(arguments.pano), arguments.width)
     texels = pack_texels(panorama.rgb, panorama.is_valid)
     cloud = open_points(arguments.cloud, cloud_settings_from(arguments), workers)
-    for warning in cloud.warnings:
-        print_note(arguments, f"warning: {warning}")
+    print_warnings(arguments, cloud.warnings)
     known = known_poses(arguments, cloud)
     grid = grid_from(arguments, cloud, known)
     begin = time.perf_counter()

@@ -4,10 +4,10 @@ import argparse
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from ..cloud.ply_writer import vertex_rows, write_ply
+from ..render.surfel_renderer import encode_image
 from ..runtime.atomic import write_atomically
 from ..runtime.threads import Workers, num_cores
 from ..scenes import scene as scenes
@@ -22,8 +22,8 @@ from ..scenes.synthetic.world import (
     make_world,
     scan_world,
 )
-from .command import command, option
-from .errors import UsageError, checking_options
+from .command import check_least, command, option
+from .errors import checking_options
 from .progress import progress_bar
 
 EPILOG = """\
@@ -64,10 +64,8 @@ def write_world(
     for v in dict.fromkeys(arguments.variants):
         for k in range(arguments.panoramas):
             query = make_query(world, k, v, arguments.width, workers)
-            bgr = cv2.cvtColor(query.rgb, cv2.COLOR_RGB2BGR)
-            quality = [cv2.IMWRITE_JPEG_QUALITY, 70 if v == "photo" else 95]
             image, path = folder / "images" / f"{v}_{k}.jpg", folder / "labels" / f"{v}_{k}.png"
-            write_atomically(image, bytes(cv2.imencode(".jpg", bgr, quality)[1]))
+            write_atomically(image, encode_image(query.rgb, ".jpg", 70 if v == "photo" else 95))
             if arguments.labels:
                 path.parent.mkdir(exist_ok=True)
                 write_labels(path, make_labels(world, k, query, workers))
@@ -79,8 +77,7 @@ def write_world(
 @command(__file__, __doc__, EPILOG, add_arguments)
 def main(arguments: argparse.Namespace) -> int:
     """Make and write all scenes."""
-    if min(arguments.panoramas, arguments.seed, arguments.scenes) < 0:
-        raise UsageError("--panoramas, --seed, --scenes: found a negative number, wanted 0 or more")
+    check_least(arguments, panoramas=0, seed=0, scenes=0)
     workers = Workers(num_cores(), progress_bar(arguments.quiet))
     for number in range(max(1, arguments.scenes)):
         with checking_options():

@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from ..cloud.soa import LocalCloud
 from ..coarse_to_fine.open_map import open_points
 from ..errors import InputError
-from ..geometry.camera_axes import R_cam_from_angles
-from ..geometry.pose import Pose
-from ..geometry.pose_error import pose_errors
-from ..geometry.pose_file import read_pose_matrix
+from ..geometry.pose import Pose, pose_errors, read_pose_matrix
+from ..geometry.rotations import R_cam_from_angles
 from ..optimize.descent_animation import (
     FRAME_WIDTH,
     frames_of,
@@ -25,15 +23,15 @@ from ..optimize.descent_animation import (
 )
 from ..optimize.settings import DescentSettings
 from ..panorama import read_panorama
-from ..panorama.resize import shrink
+from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
 from ..render.surfel_renderer import encode_image, fill_holes, render_points
 from ..result import read_results
 from ..runtime.atomic import check_output, check_output_folder, replacing_folder, write_atomically
 from ..runtime.threads import Workers, num_cores
 from ..scenes.scene import read_scene
-from .command import command, option
-from .errors import checking_options, print_note
+from .command import check_least, command, option, print_warnings
+from .errors import checking_options
 from .options import add_cloud_options, cloud_settings_from
 from .progress import progress_bar
 
@@ -52,8 +50,8 @@ One JSON object a picture on stdout.
 MAX_WIDTH, MIN_WIDTH = 32_768, 16
 MAGENTA = (255, 0, 255)  # a colour that scans do not have
 DESCENT_WIDTH = 1024  # of the panorama
-SUFFIXES = {"out": (".png", ".jpg", ".jpeg", ""), "depth": (".png", ".npy"), "mask_out": (".png",)}
-SUFFIXES["animate"] = (".gif", ".mp4", "")
+SUFFIXES = {"out": (".png", ".jpg", ".jpeg", ""), "depth": (".png", ".npy"), "mask_out": (".png",),
+            "animate": (".gif", ".mp4", "")}  # fmt: skip
 Named = list[tuple[str, Pose]]  # poses in the world with the panorama's path
 
 
@@ -113,14 +111,13 @@ def check_pose_options(arguments: argparse.Namespace) -> None:
     numbers = [*(arguments.at or ()), *(arguments.start or ()), *(angle or 0.0 for angle in angles)]
     if not np.isfinite([*numbers, *arguments.perturb]).all():
         raise InputError("--at, --start, --perturb and angles must be finite numbers")
-    if arguments.seed < 0:
-        raise InputError(f"--seed {arguments.seed}: wanted 0 or more")
+    check_least(arguments, seed=0)
 
 
 def check_files(arguments: argparse.Namespace) -> None:
     """Refuse, before any work, what could not be written."""
-    inputs = [*arguments.cloud, *filter(None, (arguments.result, arguments.queries, arguments.pose))]
-    inputs += [arguments.photo] if arguments.photo else []
+    named = arguments.result, arguments.queries, arguments.pose, arguments.photo
+    inputs = [*arguments.cloud, *filter(None, named)]
     for path in filter(None, (arguments.out, arguments.depth, arguments.mask_out, arguments.animate)):
         if path.suffix:
             check_output(path, inputs)
@@ -131,7 +128,7 @@ def check_files(arguments: argparse.Namespace) -> None:
 def poses_from(arguments: argparse.Namespace) -> Named:
     """The poses asked for, named by the panorama's path, the pose's file or "at"."""
     if arguments.at:
-        angles = (arguments.heading or 0.0, arguments.pitch or 0.0, arguments.roll or 0.0)
+        angles = [angle or 0.0 for angle in (arguments.heading, arguments.pitch, arguments.roll)]
         return [("at", Pose(R_cam_from_angles(*angles), np.array(arguments.at)))]
     if arguments.pose:
         return [(str(arguments.pose), read_pose_matrix(arguments.pose))]
@@ -170,14 +167,13 @@ def draw_pictures(arguments: argparse.Namespace, cloud: LocalCloud, poses: Named
         view = render_points(cloud.points, cloud.from_world(pose), arguments.width, workers)
         seen_fraction = round(float(view.is_seen.mean()), 6)
         if arguments.depth:
-            content = depth_file(view.depth, arguments.depth.suffix.lower())
-            write_atomically(arguments.depth, content)
+            write_atomically(arguments.depth, depth_file(view.depth, arguments.depth.suffix.lower()))
         if arguments.mask_out:
             nothing = np.where(view.is_seen, 0, 255).astype(np.uint8)
             write_atomically(arguments.mask_out, encode_image(nothing, ".png"))
         if arguments.holes == "mark":
             view.rgb[~view.is_seen] = MAGENTA
-        rgb = fill_holes(view) if arguments.holes == "close" else view.rgb
+        rgb = fill_holes(view.rgb, view.is_seen) if arguments.holes == "close" else view.rgb
         write_atomically(folder / name, encode_image(rgb, Path(name).suffix.lower()))
         out = arguments.out / name if is_folder else arguments.out
         return {"out": str(out), "pano": pano, "width": arguments.width, "seen_fraction": seen_fraction}
@@ -221,8 +217,7 @@ def main(arguments: argparse.Namespace) -> int:
 
     workers = Workers(num_cores(), progress_bar(arguments.quiet))
     cloud = open_points(arguments.cloud, cloud_settings_from(arguments), workers)
-    for warning in cloud.warnings:
-        print_note(arguments, f"warning: {warning}")
+    print_warnings(arguments, cloud.warnings)
     if arguments.out:
         draw_pictures(arguments, cloud, poses, workers)
     if arguments.animate:

@@ -16,13 +16,11 @@ from ..paper.settings import PaperSettings
 from ..runtime.atomic import write_atomically
 from ..runtime.threads import num_cores
 from ..scenes.evaluation.query_result import QueryResult
-from ..scenes.evaluation.run_file import open_run
-from ..scenes.evaluation.runner import RunConfig
-from ..scenes.reproduce_paper.experiments import EXPERIMENTS, Condition, Settings
-from ..scenes.reproduce_paper.report import plot_png, table
+from ..scenes.evaluation.runner import RunConfig, open_run
+from ..scenes.reproduce_paper.experiments import EXPERIMENTS, Condition, Settings, plot_png, table
 from ..scenes.scene import Scene, find_scenes
-from .command import command, option
-from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error
+from .command import check_least, command, option
+from .errors import EXIT_BAD_INPUT, checking_options, print_error
 from .options import PAPER_OPTIONS, add_options, paper_settings_from
 from .progress import progress_bar
 
@@ -121,8 +119,7 @@ def run_experiment(
 @command(__file__, __doc__, EPILOG, add_arguments)
 def main(arguments: argparse.Namespace) -> int:
     """Run the experiments one by one; returns the exit code."""
-    if arguments.jobs < 1:
-        raise UsageError(f"--jobs: found {arguments.jobs}, wanted at least 1")
+    check_least(arguments, jobs=1)
     with checking_options():
         paper = paper_settings_from(arguments)
     settings: dict[str, Settings] = {"paper": paper, "default": CoarseToFineSettings(gravity="known")}

@@ -5,19 +5,17 @@ from pathlib import Path
 
 from ..errors import InputError
 from ..runtime.threads import Progress, no_progress
-from .model import Cloud
 from .readers.e57 import E57
 from .readers.las import LAS
 from .readers.mesh import MESH
 from .readers.npz import NPY, NPZ
 from .readers.pcd import PCD
 from .readers.ply import PLY
-from .readers.pts import PTS
 from .readers.ptx import PTX
 from .readers.reader import HEAD_SIZE, PLAIN, CloudFormat, CloudReadOptions, PointSource
-from .readers.text import TEXT
+from .readers.text import PTS, TEXT
 from .settings import IN_METRES, CloudSettings
-from .stream import CloudStream
+from .stream import Cloud, CloudStream
 
 FORMATS = (PLY, LAS, E57, PCD, PTX, PTS, NPZ, NPY, MESH, TEXT)
 WANTED = f"wanted a coloured point cloud: {', '.join(f.name for f in FORMATS)}"
@@ -28,11 +26,8 @@ def open_cloud(
 ) -> CloudStream:
     """The coloured cloud in one or several files, before its points are read.
 
-    Raises
-    ------
-    InputError
-        A file is missing, has a damaged header, no colours, or is no format that is read here. Reading the
-        points raises it where the data break or fail the checks of `validation.PointValidator`.
+    Raises InputError if a file is missing, has a damaged header, no colours, or is no format that is read
+    here. Reading the points raises it where the data break or fail the checks of `PointValidator`.
     """
     options = CloudReadOptions(settings.intensity_as_gray, settings.labels, settings.scale)
     sources = [open_source(path, options) for path in sorted(paths)]

@@ -1,6 +1,8 @@
-"""Writing PLY: binary vertices, a chunk at a time."""
+"""Writing PLY: binary vertices, a chunk at a time; and clouds written again under a rigid transform."""
 
-from collections.abc import Iterator, Sequence
+import math
+import shutil
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +11,11 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.pose import Array, transform_points
 from ..runtime.atomic import replacing
+from .readers.ply import PLY, PlyHeader, place_of_vertices, read_columns, read_header
+from .readers.reader import CHUNK, HEAD_SIZE
+from .stream import CloudStream
 
 TYPE_NAMES = {
     "i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float",
@@ -19,6 +25,8 @@ COLOR_NAMES = ("red", "green", "blue")
 MAX_DIGITS = 20  # of the number of vertices, for which the header keeps room
 
 Rows = NDArray[np.void]  # structured, a field a property
+AXES, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
+MAX_LOSS = 1e-4  # of float32 coordinates by rounding [m]
 
 
 def vertex_rows(
@@ -80,3 +88,94 @@ def write_ply(path: Path, rows: Rows) -> None:
     """Write vertices, whole or not at all."""
     with writing_ply(path, rows.dtype) as writer:
         writer.add(rows)
+
+
+def needs_double(box: Array, T_target_from_source: Array, scale: float) -> bool:
+    """True if float32 would lose over MAX_LOSS of a moved box (2, 3) [m]; T is in units of `scale` metres."""
+    corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(8, 3)
+    farthest = float(np.abs(transform_points(corners / scale, T_target_from_source)).max())
+    return float(np.spacing(np.float32(farthest))) * scale > 2.0 * MAX_LOSS
+
+
+def write_transformed(
+    cloud: CloudStream, T_target_from_source: Array, out: Path, finish: Callable[[], None]
+) -> tuple[str, ...]:
+    """Write a cloud, read once before, as binary PLY under a transform (4, 4) in the files' unit.
+
+    One PLY file keeps its other properties and elements, its normals are turned and points with NaN stay; any
+    other cloud is written with x y z and red green blue. `finish` runs when all is written, just before `out`
+    appears. Returns a line for each element that was left out.
+    """
+    path = cloud.sources[0].path
+    with path.open("rb") as file:
+        is_ply = PLY.has_magic(file.read(HEAD_SIZE))
+    if is_ply and len(cloud.sources) == 1:
+        return _write_copy(cloud, read_header(path), T_target_from_source, out, finish)
+    dtype = np.float64 if needs_double(cloud.box, T_target_from_source, cloud.scale) else np.float32
+    fields = vertex_rows(np.empty((0, 3), dtype), np.empty((0, 3), np.uint8)).dtype
+    with writing_ply(out, fields) as writer:
+        for points, colors in cloud.chunks([]):
+            target = transform_points(points / cloud.scale, T_target_from_source)
+            writer.add(vertex_rows(target.astype(dtype), colors))
+        finish()
+    return ()
+
+
+def _write_copy(
+    cloud: CloudStream, header: PlyHeader, T_target_from_source: Array, out: Path, finish: Callable[[], None]
+) -> tuple[str, ...]:
+    """Write one PLY file with all that it holds, but for the elements in the lines returned.
+
+    Elements after the vertices are copied as bytes, so those of ASCII and big-endian files are left out, as
+    are elements before the vertices.
+    """
+    full = [k for k, count in enumerate(header.counts) if count and k != header.index]
+    copied = [k for k in full if k > header.index and header.byte_order == "<"]
+    more: list[str] = []
+    for k in copied:  # with its count, which plyfile was not given
+        element = header.elements[k]
+        more += [f"element {element.name} {header.counts[k]}", *map(str, element.properties)]
+    found = header.vertices.dtype("<")
+    is_double = needs_double(cloud.box, T_target_from_source, cloud.scale)
+    wide = [name for name in AXES if is_double or found[name].kind != "f"]  # integers are not enough either
+    dtype = np.dtype([(name, "<f8" if name in wide else found[name]) for name in found.names or ()])
+    columns = read_columns(header, found.names or ())
+    with header.path.open("rb") as file:
+        lines = file.read(header.size).decode("ascii", "replace").splitlines()
+    comments = [line.removeprefix("comment ") for line in lines if line.startswith("comment ")]
+    num_chunks = math.ceil(header.counts[header.index] / CHUNK)
+    with writing_ply(out, dtype, comments, more) as writer:
+        for some in cloud.show(columns, num_chunks, "write"):
+            writer.add(_transformed_rows(_rows(some, found), dtype, T_target_from_source))
+        if copied:
+            offset, count, row = place_of_vertices(header)
+            with header.path.open("rb") as file:
+                file.seek(offset + count * row.itemsize)
+                shutil.copyfileobj(file, writer.file)
+        finish()
+    left_out = [header.elements[k].name for k in full if k not in copied]
+    return tuple(f"{header.path}: the element '{name}' is left out" for name in left_out)
+
+
+def _rows(columns: list[NDArray[np.generic]], dtype: np.dtype[Any]) -> Rows:
+    rows = np.empty(len(columns[0]), dtype)
+    for name, column in zip(dtype.names or (), columns, strict=True):
+        if dtype[name].kind in "iu" and column.dtype.kind == "f":  # of an ASCII file
+            limits = np.iinfo(dtype[name])
+            rows[name] = np.clip(np.nan_to_num(np.rint(column)), limits.min, limits.max)
+        else:
+            rows[name] = column
+    return rows
+
+
+def _transformed_rows(rows: Rows, dtype: np.dtype[Any], T_target_from_source: Array) -> Rows:
+    """Vertices with x y z moved and nx ny nz turned, all else as it is."""
+    target = rows.astype(dtype)
+    turn = T_target_from_source.copy()
+    turn[:3, 3] = 0.0
+    for names, T in ((AXES, T_target_from_source), (NORMALS, turn)):
+        if set(names) <= set(dtype.names or ()):
+            points = transform_points(np.stack([rows[name] for name in names], axis=1, dtype=np.float64), T)
+            for name, column in zip(names, points.T, strict=True):
+                target[name] = column
+    return target

@@ -18,7 +18,7 @@ class PackedPoints:
     x: NDArray[np.float32]  # (N,) [m]
     y: NDArray[np.float32]  # (N,) [m]
     z: NDArray[np.float32]  # (N,) [m]
-    rgbx: NDArray[np.int32]  # (N,) as piccolo.sampling.pack_rgbx
+    rgbx: NDArray[np.int32]  # (N,) as pack_rgbx
 
     def __len__(self) -> int:
         """How many points there are."""
@@ -59,9 +59,16 @@ class LocalCloud:
         return Pose(pose.R_cam_from_world @ R, R.T @ pose.center_world + self.origin_world)
 
 
+def pack_rgbx(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = None) -> NDArray[np.int32]:
+    """One int32 (...) for each colour (..., 3): R, G, B from the lowest byte up and 1 where valid on top."""
+    rgbx = np.ones((*rgb.shape[:-1], 4), dtype=np.uint8)
+    rgbx[..., :3] = rgb
+    if is_valid is not None:
+        rgbx[..., 3] = is_valid
+    return rgbx.view("<i4")[..., 0].astype(np.int32, copy=False)
+
+
 def pack_points(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> PackedPoints:
     """Points (N, 3) [m] with colours (N, 3) as PackedPoints."""
     x, y, z = np.ascontiguousarray(points.T, dtype=np.float32)
-    rgbx = np.ones((len(points), 4), dtype=np.uint8)
-    rgbx[:, :3] = colors
-    return PackedPoints(x, y, z, rgbx.view("<i4")[:, 0].astype(np.int32, copy=False))
+    return PackedPoints(x, y, z, pack_rgbx(colors))

@@ -1,8 +1,8 @@
-"""Clouds in files, read as often as they are needed: into voxels, or into memory."""
+"""Clouds in files, checked chunk by chunk, read as often as they are needed: into voxels, or into memory."""
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,22 +10,110 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..geometry.point_transforms import rotate_points
+from ..geometry.pose import Array, rotate_points
 from ..runtime.threads import Progress, no_progress
 from .digest import sha256_of_arrays
-from .model import Cloud
-from .morton import morton_order
-from .readers.colors import brightest_of, colored_chunks
+from .readers.columns import brightest_of, colored_chunks
 from .readers.reader import CHUNK, PointSource, RawCloud
-from .validation import Chunk, PointValidator, unit_warnings
-from .voxels import Voxels, VoxelTable
+from .voxels import Voxels, VoxelTable, morton_order
 
+MIN_POINTS = 1000
+MAX_COORDINATE = 1e8  # [m], ten times the Earth: beyond it lie only broken numbers, and float32 gives way
+MIN_BRIGHTEST = 2  # of 255; 16-bit fields that hold 8-bit values come out at 1
+METRES_LIMIT = 2000.0  # [m], a scan wider than this along two axes is more likely in millimetres
+FAR = 16_384.0  # [m] from the origin, where float32 steps by 2 mm
+MAX_SAMPLES = 100_000  # points that the estimate of the extent looks at
+
+Chunk = tuple[NDArray[np.float64], NDArray[np.uint8]]  # finite points (N, 3) [m], colours (N, 3)
 ARRAYS = Path("arrays")  # how messages and results name a scan that is no file
+
+
+@dataclass
+class PointValidator:
+    """What is known of a file's points so far."""
+
+    path: Path
+    scale: float  # metres per unit of the file
+    num_finite: int = 0
+    num_dropped: int = 0  # with NaN or infinite coordinates
+    brightest: int = 0
+
+    def filter(self, raw: RawCloud) -> Chunk:
+        """The finite points of a chunk, after they have been counted."""
+        points, colors = raw.points_world, raw.colors
+        is_finite: NDArray[np.bool_] = np.all(np.isfinite(points), axis=1)
+        num_finite = int(np.count_nonzero(is_finite))
+        if num_finite < len(points):
+            points, colors = points[is_finite], colors[is_finite]
+        self.num_finite += num_finite
+        self.num_dropped += len(is_finite) - num_finite
+        if num_finite:
+            points = points * self.scale
+            self.brightest = max(self.brightest, int(colors.max()))
+            farthest = max(-float(points.min()), float(points.max()))
+            if farthest > MAX_COORDINATE:
+                found = f"a coordinate of {farthest:.3g} m, wanted all within {MAX_COORDINATE:.0e} m"
+                raise InputError(f"{self.path}: {found}; remove broken points or set --units or --scale")
+        return points, colors
+
+    def check(self) -> None:
+        """Refuse points that are no coloured cloud, when all have passed."""
+        if self.num_finite < MIN_POINTS:
+            found = f"found {self.num_finite} finite points ({self.num_dropped} with NaN or infinity)"
+            raise InputError(f"{self.path}: {found}, wanted at least {MIN_POINTS}")
+        if self.brightest < MIN_BRIGHTEST:
+            found = f"all points are black (brightest value {self.brightest} of 255)"
+            raise InputError(f"{self.path}: {found}; numbers without a declared range are 0-255, not 0-1")
+
+    def warnings(self) -> tuple[str, ...]:
+        """A line if points were left out."""
+        if self.num_dropped:
+            return (f"{self.path}: {self.num_dropped} points with NaN or infinite coordinates left out",)
+        return ()
+
+
+def unit_warnings(label: str, points: NDArray[np.float32]) -> tuple[str, ...]:
+    """A line if points (N, 3), in Morton order, look like millimetres or are too far apart for float32.
+
+    Millimetres: 98 % of the points span more than 2,000 along at least two axes.
+    """
+    samples = points[:: 1 + len(points) // MAX_SAMPLES]
+    low, high = np.percentile(samples, [1.0, 99.0], axis=0)
+    if np.count_nonzero(high - low > METRES_LIMIT) >= 2:
+        size = " x ".join(f"{extent:.0f}" for extent in high - low)
+        return (f"{label}: the cloud spans {size} m; if its unit is the millimetre, set --units mm",)
+    farthest = float(np.abs(points).max())
+    if farthest > FAR:
+        blur = f"blur the rest to {np.spacing(np.float32(farthest)):.2g} m"
+        return (f"{label}: points {2 * farthest:.0f} m apart {blur}; remove the outliers",)
+    return ()
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Coloured points near a local origin, in an order that does not depend on the file's."""
+
+    points: NDArray[np.float32]  # (N, 3) world minus origin_world [m], all finite, Morton order
+    colors: NDArray[np.uint8]  # (N, 3) RGB
+    origin_world: NDArray[np.float64]  # (3,) what was subtracted from the file's coordinates [m]
+    num_dropped: int = 0  # points with NaN or infinite coordinates, left out
+    warnings: tuple[str, ...] = ()  # one line each, for the user
+
+    def voxels(self, R_map_from_world: NDArray[np.float64]) -> Voxels:
+        """The points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
+        table = VoxelTable("cloud")
+        table.add(rotate_points(self.points + self.origin_world, R_map_from_world), self.colors)
+        voxels = table.finish()
+        return Voxels(voxels.codes, voxels.nodes, voxels.origin, self.warnings + voxels.warnings)
 
 
 def stream_of(path: Path, raw: RawCloud) -> "CloudStream":
     """Points in memory as if they stood in a file named `path`."""
     return CloudStream([PointSource(path, lambda: iter([raw]), len(raw.colors))])
+
+
+def _no_box() -> Array:
+    return np.repeat([[np.inf], [-np.inf]], 3, axis=1)
 
 
 @dataclass(frozen=True)
@@ -36,6 +124,7 @@ class CloudStream:
     scale: float = 1.0  # metres per unit of the files
     show: Progress = no_progress  # progress
     sha256: str = ""  # of what is read, if that is known
+    box: Array = field(default_factory=_no_box)  # (2, 3) least and greatest of all points read so far [m]
 
     @property
     def label(self) -> str:
@@ -50,7 +139,11 @@ class CloudStream:
             total = None if source.num_points is None else math.ceil(source.num_points / CHUNK)
             try:
                 for raw in self.show(source.read_chunks(), total, f"read {source.path.name}"):
-                    yield validator.filter(raw)
+                    points_world, colors = validator.filter(raw)
+                    for k in range(3 if len(points_world) else 0):
+                        column = points_world[:, k]
+                        self.box[:, k] = min(self.box[0, k], column.min()), max(self.box[1, k], column.max())
+                    yield points_world, colors
             except OSError as error:
                 text = f"{source.path}: cannot be read ({error.strerror or error}), wanted a whole file"
                 raise InputError(text) from error
@@ -69,7 +162,7 @@ class CloudStream:
             table.add(rotate_points(points_world, R_map_from_world), colors)
         voxels = table.finish()
         of_all = (*voxels.warnings, *unit_warnings(self.label, voxels.nodes[:, :3]))
-        return replace(voxels, warnings=(*self._warnings(validators), *of_all))
+        return voxels._replace(warnings=(*self._warnings(validators), *of_all))
 
     def read(self) -> Cloud:
         """All points, in Morton order."""

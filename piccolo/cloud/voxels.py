@@ -1,18 +1,18 @@
 """Points averaged voxel by voxel as they stream by: the memory grows with the scene, not with the points.
 
 The grid is fixed in the map's axes, and all sums are integers: neither the order of the points nor how they
-are cut into chunks changes a bit.
+are cut into chunks changes a bit. The octree is a pyramid of these voxels, in Morton order.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..runtime.jit import inline_kernel, kernel
-from .morton import NUM_CELLS, morton_codes
 
+NUM_CELLS = 1 << 21  # along an axis; three axes fill 63 bits
 LEAF_SIZE = 0.02  # [m]
 QUANTUM_BITS = 8  # a voxel is 256 quanta wide: positions are summed in steps of 78 um
 QUANTUM_MASK = (1 << QUANTUM_BITS) - 1
@@ -29,6 +29,59 @@ PHASE = (COARSEST << QUANTUM_BITS) // 3 + 1
 CELL, COUNT, POSITION, COLOR, NUM_COLUMNS = 0, 3, 4, 7, 10
 FIRST_ROWS, MAX_ROWS = 1 << 16, 1 << 27  # 40 bytes a row; the most are 80 million voxels, 20,000 m^2 or more
 MAX_LOAD = 0.6  # share of the rows in use
+NUM_LEVELS = COARSEST.bit_length()  # from 128 leaves wide (2.56 m) down to one
+
+
+@inline_kernel
+def spread_bits(cell):
+    """The lowest 21 bits of an int64, each followed by two zeros."""
+    bits = cell & 0x1FFFFF
+    bits = (bits | (bits << 32)) & 0x1F00000000FFFF
+    bits = (bits | (bits << 16)) & 0x1F0000FF0000FF
+    bits = (bits | (bits << 8)) & 0x100F00F00F00F00F
+    bits = (bits | (bits << 4)) & 0x10C30C30C30C30C3
+    return (bits | (bits << 2)) & 0x1249249249249249
+
+
+@kernel
+def interleave(cells, codes):
+    """Write the 63-bit Morton code (N,) of each cell (N, 3), int64 in [0, 2^21); x has the lowest bit."""
+    for i in range(len(cells)):
+        x, y, z = spread_bits(cells[i, 0]), spread_bits(cells[i, 1]), spread_bits(cells[i, 2])
+        codes[i] = x | (y << 1) | (z << 2)
+
+
+def morton_codes(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Morton code (N,) of each cell (N, 3) in [0, 2^21)."""
+    codes = np.empty(len(cells), dtype=np.int64)
+    interleave(cells, codes)
+    return codes
+
+
+def morton_order(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Indices (N,) that sort points (N, 3) [m] and colours (N, 3) along Morton's curve.
+
+    The cells are cubes, 2^21 along the longest side of the bounding box. Within a cell coordinates and then
+    colours decide, so only points that are alike in every bit are left in the order of the input.
+    """
+    low = points.min(axis=0)
+    extent = float((points.max(axis=0) - low).max())
+    # Rounded here, not in the kernel: fastmath may round the last, odd points of an array differently.
+    cells_per_metre = np.float32((NUM_CELLS - 1) / max(extent, 1e-6))
+    cells = np.minimum(((points - low) * cells_per_metre).astype(np.int64), NUM_CELLS - 1)
+    codes = morton_codes(cells)
+    order = np.argsort(codes)
+    ascending = codes[order]
+    is_tied = np.zeros(len(order), dtype=np.bool_)
+    is_tied[1:] = ascending[1:] == ascending[:-1]
+    is_tied[:-1] |= is_tied[1:]
+    places = np.flatnonzero(is_tied)
+    if len(places):
+        tied = order[places]
+        # lexsort's last key counts first
+        keys = [*colors[tied].T[::-1], *points[tied].T[::-1], ascending[places]]
+        order[places] = tied[np.lexsort(keys)]
+    return order
 
 
 @inline_kernel
@@ -87,8 +140,7 @@ def move_voxels(table, larger):
             larger[find_row(larger, x, y, z)] = table[k]
 
 
-@dataclass(frozen=True)
-class Voxels:
+class Voxels(NamedTuple):
     """The voxels in which there are points, in Morton order."""
 
     codes: NDArray[np.int64]  # (M,) Morton codes; the three lowest bits choose among a parent's children
@@ -119,16 +171,14 @@ class VoxelTable:
             if len(points) and self.num_voxels < full:
                 far = f"points more than {MAX_CELL * LEAF_SIZE / 1000:.0f} km apart, wanted one scene"
                 raise InputError(f"{self.label}: {far}; remove broken points or set --units or --scale")
+            if len(points) and len(self.table) >= MAX_ROWS:
+                found = f"more than {self.num_voxels} voxels of {LEAF_SIZE} m are filled"
+                wanted = "if its unit is not the metre, set --units or --scale"
+                raise InputError(f"{self.label}: {found}; {wanted}")
             if len(points):
-                self._grow()
-
-    def _grow(self) -> None:
-        if len(self.table) >= MAX_ROWS:
-            found = f"more than {self.num_voxels} voxels of {LEAF_SIZE} m are filled"
-            raise InputError(f"{self.label}: {found}; if its unit is not the metre, set --units or --scale")
-        larger = np.zeros((2 * len(self.table), NUM_COLUMNS), np.int32)
-        move_voxels(self.table, larger)
-        self.table = larger
+                larger = np.zeros((2 * len(self.table), NUM_COLUMNS), np.int32)
+                move_voxels(self.table, larger)
+                self.table = larger
 
     def finish(self) -> Voxels:
         """The means; those too far from the rest for a Morton code are left out. The table is spent."""
@@ -150,17 +200,41 @@ class VoxelTable:
         order = np.argsort(codes)
         # + 0.0 turns -0.0 into 0.0
         origin = np.round(0.5 * LEAF_SIZE * (low + high) - PHASE / QUANTA_PER_METRE) + 0.0
-        return Voxels(codes[order], _means(rows, cells, order, origin), origin, warnings)
+        nodes = np.empty((len(rows), 6), np.float32)
+        counts = rows[order, COUNT].astype(np.float64)
+        for k in range(3):  # one at a time, for the memory's sake
+            corners = cells[order, k] * LEAF_SIZE - origin[k]
+            nodes[:, k] = corners + (rows[order, POSITION + k] / counts + 0.5 - PHASE) / QUANTA_PER_METRE
+            nodes[:, 3 + k] = rows[order, COLOR + k] / counts / 255.0
+        return Voxels(codes[order], nodes, origin, warnings)
 
 
-def _means(
-    rows: NDArray[np.int32], cells: NDArray[np.int64], order: NDArray[np.int64], origin: NDArray[np.float64]
-) -> NDArray[np.float32]:
-    """Mean positions less `origin` and mean colours (M, 6) of the table's rows, taken in `order`."""
-    nodes = np.empty((len(rows), 6), np.float32)
-    counts = rows[order, COUNT].astype(np.float64)
-    for k in range(3):  # one at a time, for the memory's sake
-        corners = cells[order, k] * LEAF_SIZE - origin[k]
-        nodes[:, k] = corners + (rows[order, POSITION + k] / counts + 0.5 - PHASE) / QUANTA_PER_METRE
-        nodes[:, 3 + k] = rows[order, COLOR + k] / counts / 255.0
-    return nodes
+class Octree(NamedTuple):
+    """Nodes of all levels, coarsest first, in Morton order within a level; kernels read it as it is."""
+
+    nodes: NDArray[np.float32]  # (nodes, 6) mean x, y, z [m], r, g, b in [0, 1]
+    first_child: NDArray[np.int32]  # (nodes + 1,) children of i are first_child[i]:first_child[i + 1]
+    level_start: NDArray[np.int32]  # (levels + 1,)
+    leaf_size: float  # [m]
+
+    def level(self, size: float) -> NDArray[np.float32]:
+        """The nodes of the level whose voxels are nearest to `size` [m]."""
+        level = NUM_LEVELS - 1 - int(np.clip(np.rint(np.log2(size / self.leaf_size)), 0, NUM_LEVELS - 1))
+        return self.nodes[self.level_start[level] : self.level_start[level + 1]]
+
+
+def build_octree(voxels: Voxels) -> Octree:
+    """The octree whose leaves are the voxels."""
+    nodes, node_codes = voxels.nodes, voxels.codes
+    levels, children = [nodes], [np.zeros(len(nodes), np.int32)]
+    for _ in range(NUM_LEVELS - 1):
+        first = np.flatnonzero(np.diff(node_codes >> 3, prepend=-1))  # children of a parent follow each other
+        counts = np.diff(first, append=len(nodes))
+        columns = [np.add.reduceat(column, first, dtype=np.float64) / counts for column in nodes.T]
+        nodes, node_codes = np.stack(columns, axis=1, dtype=np.float32), node_codes[first] >> 3
+        levels.insert(0, nodes)
+        children.insert(0, first.astype(np.int32))
+    start = np.concatenate([[0], np.cumsum([len(level) for level in levels])]).astype(np.int32)
+    first_child = [c + s for c, s in zip(children[:-1], start[1:-1], strict=True)]
+    first_child.append(np.full(len(levels[-1]) + 1, start[-1], np.int32))  # leaves have none
+    return Octree(np.concatenate(levels), np.concatenate(first_child).astype(np.int32), start, LEAF_SIZE)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..cloud.octree import Octree
+from ..cloud.voxels import Octree
 from ..runtime.threads import Workers
 from .view import ViewConfig, filled_fractions, thread_scratch
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from ..geometry.sphere import atan2
-from ..panorama.channels import inverse_std, opponent
+from ..panorama.local_normalization import inverse_std, opponent
 from ..runtime.jit import F0, F1, HALF, kernel
 
 PI = np.float32(math.pi)

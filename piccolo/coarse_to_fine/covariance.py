@@ -8,10 +8,10 @@ import numpy as np
 
 from ..confidence.covariance import PoseCovariance, least_constrained_direction
 from ..geometry.pose import Array, Pose, exp_so3
-from ..geometry.sphere_grid import cell_of
+from ..geometry.sphere import cell_of
 from ..optimize.channel_loss import channel_equations
 from ..optimize.normal_equations import GRADIENT, MATRIX, NUM_SUMS
-from ..panorama.channels import LEVELS_PER_UNIT
+from ..panorama.local_normalization import LEVELS_PER_UNIT
 from ..panorama.texels import Texels
 from .descent import FULL_LOSS, as_levels
 from .query import Query

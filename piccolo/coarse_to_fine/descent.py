@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from ..confidence.alternatives import Hypothesis
 from ..geometry.pose import Array, Pose, orthonormal
-from ..geometry.sphere_grid import make_grid
+from ..geometry.sphere import make_grid
 from ..optimize.channel_loss import descend_channels, score
 from ..optimize.levenberg_marquardt import retract
-from ..panorama.channels import LEVELS_PER_UNIT, ZERO_LEVEL
+from ..panorama.local_normalization import LEVELS_PER_UNIT, ZERO_LEVEL
 from ..panorama.texels import Texels
 from ..runtime.jit import F0, kernel
 from ..runtime.threads import Workers

@@ -10,7 +10,7 @@ from ..optimize.refine import refine, sampling_loss_of
 from ..optimize.sampling_loss import sampling_loss
 from ..optimize.settings import DescentSettings
 from ..panorama import Panorama
-from ..panorama.resize import shrink
+from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
 from ..render.zbuffer import visible_points
 from .covariance import estimate_covariance, is_local_minimum

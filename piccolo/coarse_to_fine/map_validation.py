@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cloud.octree import NUM_LEVELS
-from ..cloud.voxels import PHASE, QUANTUM_BITS, WINDOW
+from ..cloud.voxels import NUM_LEVELS, PHASE, QUANTUM_BITS, WINDOW
 from ..errors import InputError
 from ..geometry.pose import Array, checked_rotation
-from ..geometry.sphere_grid import make_grid
+from ..geometry.sphere import make_grid
 from ..runtime.jit import F0, inline_kernel, kernel
 from .scan_map import SEARCH_VIEW, WIDE_RINGS, sparse_candidates
 

@@ -14,7 +14,7 @@ from ..cloud.digest import sha256_of_files
 from ..cloud.settings import IN_METRES, CloudSettings
 from ..cloud.soa import LocalCloud, pack_points
 from ..errors import InputError
-from ..geometry.point_transforms import rotate_points
+from ..geometry.pose import rotate_points
 from ..gravity import R_z_from_axis
 from ..runtime.cache import cache_root, in_words, mark_used, own_folder
 from ..runtime.stopwatch import Stopwatch

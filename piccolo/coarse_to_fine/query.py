@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..geometry.pose import Array
-from ..panorama import Panorama, rotation_to_level
+from ..panorama import Panorama
+from ..panorama.gpano import rotation_to_level
 from ..panorama.local_normalization import image_pyramid
 from ..panorama.texels import Texels
 from ..runtime.threads import Workers

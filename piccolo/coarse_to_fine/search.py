@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.rotations import Gravity, uniform_rotations, uniform_yaws
-from ..geometry.sphere_grid import AREA_UNITS, SEARCH_RINGS, averaging, make_grid
+from ..geometry.sphere import AREA_UNITS, SEARCH_RINGS, averaging, make_grid
 from ..geometry.suppression import non_maximum_suppression
 from ..panorama.local_normalization import sample_channels
 from ..panorama.texels import Texels

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cloud.octree import Octree
-from ..geometry.sphere_grid import cell_of, make_grid, make_neighbors
-from ..panorama.channels import LEVELS_PER_UNIT, opponent, zscore
+from ..cloud.voxels import Octree
+from ..geometry.sphere import cell_of, make_grid, make_neighbors
+from ..panorama.local_normalization import LEVELS_PER_UNIT, opponent, zscore
 from ..runtime.jit import F0, F1, HALF, inline_kernel, kernel
 from .cells import average_cells, average_colors, collect, local_statistics, locate
 

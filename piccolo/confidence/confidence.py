@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..geometry.pose_error import MAX_DISTANCE
+from ..geometry.pose import MAX_DISTANCE
 from .covariance import PoseCovariance
 from .score import Evidence
 

@@ -11,7 +11,7 @@ from ..geometry.pose import Pose
 from ..geometry.sphere import solid_angles
 from ..panorama import Panorama
 from ..panorama.local_normalization import normalize_locally
-from ..panorama.resize import shrink
+from ..panorama.model import shrink
 from ..render.zbuffer import render_view
 
 VIEW_WIDTH = 96  # cells of 3.75 degrees

@@ -1,14 +1,24 @@
-"""SE(3) in NumPy, float64: `x_cam = R_cam_from_world @ (x_world - center_world)`."""
+"""SE(3) in NumPy, float64: `x_cam = R_cam_from_world @ (x_world - center_world)`.
 
+Points are turned term by term: BLAS sums in an order that depends on how many points there are.
+"""
+
+import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..runtime.json_file import read_text
 
 Array = NDArray[np.float64]
 NEWTON_STEPS = 4  # from an error of 5 % to rounding
+MAX_DISTANCE, MAX_ANGLE = 0.1, math.radians(5.0)  # the paper's line between correct and wrong [m], [rad]
+MAX_FILE_SIZE = 65_536  # [byte] sixteen numbers and some comments
+MAX_SKEW = 1e-3  # off a rotation, for matrices written with few digits
+WANTED = "wanted the 4 x 4 numbers of T_world_from_cam"
 
 
 @dataclass(frozen=True)
@@ -87,12 +97,6 @@ def angle_between(R_a: Array, R_b: Array) -> float:
     return float(np.arctan2(sine, 0.5 * (np.trace(relative) - 1.0)))
 
 
-def is_close(a: Pose, b: Pose, min_distance: float, min_angle: float) -> bool:
-    """True for poses closer than `min_distance` [m] and turned by less than `min_angle` [rad]."""
-    distance = float(np.linalg.norm(a.center_world - b.center_world))
-    return distance < min_distance and angle_between(a.R_cam_from_world, b.R_cam_from_world) < min_angle
-
-
 def yaw_rotation(yaw: float) -> Array:
     """R_cam_from_world (3, 3) of an upright camera whose image centre looks along azimuth `yaw` [rad]."""
     c, s = np.cos(yaw), np.sin(yaw)
@@ -132,3 +136,48 @@ def T_world_from_cam(pose: Pose) -> Array:
     T[:3, :3] = pose.R_cam_from_world.T
     T[:3, 3] = pose.center_world
     return T
+
+
+def pose_errors(pose: Pose, true_pose: Pose) -> tuple[float, float]:
+    """Position error [m] and rotation error [rad]."""
+    distance = float(np.linalg.norm(pose.center_world - true_pose.center_world))
+    return distance, angle_between(pose.R_cam_from_world, true_pose.R_cam_from_world)
+
+
+def is_correct(pose: Pose | None, true_pose: Pose) -> bool:
+    """True for a pose that counts as correct in the paper."""
+    if pose is None:
+        return False
+    distance, angle = pose_errors(pose, true_pose)
+    return distance < MAX_DISTANCE and angle < MAX_ANGLE
+
+
+def read_pose_matrix(path: Path) -> Pose:
+    """The pose in a text file of T_world_from_cam, 4 x 4 numbers; lines that begin with # are comments."""
+    lines = read_text(path, WANTED, MAX_FILE_SIZE).splitlines()
+    rows = [line.replace(",", " ").split() for line in lines if line.split("#")[0].strip()]
+    try:
+        T_world_from_cam = np.array(rows, dtype=np.float64)
+    except ValueError as error:  # words, lines of several lengths
+        raise InputError(f"{path}: found {error}, {WANTED}") from error
+    if T_world_from_cam.shape != (4, 4) or not np.isfinite(T_world_from_cam).all():
+        shape = " x ".join(map(str, T_world_from_cam.shape))
+        raise InputError(f"{path}: found {shape} numbers, not all finite or not as many, {WANTED}")
+    if not np.allclose(T_world_from_cam[3], [0.0, 0.0, 0.0, 1.0]):
+        raise InputError(f"{path}: the last row is not 0 0 0 1, {WANTED}")
+    R = checked_rotation(T_world_from_cam[:3, :3], MAX_SKEW, f"{path}: the matrix on the left")
+    return Pose(orthonormal(R).T, T_world_from_cam[:3, 3])
+
+
+def rotate_points(points: Array, R_target_from_source: Array) -> Array:
+    """Points (N, 3) under a rotation (3, 3); the same array under the identity."""
+    if np.array_equal(R_target_from_source, np.eye(3)):
+        return points
+    x, y, z = points.T
+    return np.stack([a * x + b * y + c * z for a, b, c in R_target_from_source], axis=1)
+
+
+def transform_points(points: Array, T_target_from_source: Array) -> Array:
+    """Points (N, 3) under an affine transform (4, 4) for column vectors."""
+    x, y, z = points.T
+    return np.stack([a * x + b * y + c * z + d for a, b, c, d in T_target_from_source[:3]], axis=1)

@@ -1,4 +1,8 @@
-"""Rotations to try: upright at even yaws, spread evenly over SO(3), or drawn from it."""
+"""Rotations to try, and other tools' camera axes and angles. Ours: +x the image centre, +y left, +z up.
+
+A matrix other_from_cam takes our camera coordinates to theirs: R_other_from_world = other_from_cam @
+R_cam_from_world, and the camera's position stays as it is.
+"""
 
 import math
 from functools import lru_cache
@@ -7,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from .pose import rotation_from_quaternion_wxyz, yaw_rotation
+from .pose import Array, Pose, exp_so3, rotation_from_quaternion_wxyz, yaw_rotation
 
 # of a query: known: the camera is upright, up to yaw; unknown: any rotation; auto: both are tried
 Gravity = Literal["auto", "known", "unknown"]
@@ -15,6 +19,10 @@ Gravity = Literal["auto", "known", "unknown"]
 # Psi, the real root of x^4 = x + 4 (Alexa, "Super-Fibonacci Spirals: Fast,
 # Low-Discrepancy Sampling of SO(3)", CVPR 2022).
 SUPER_FIBONACCI_PSI = 1.533751168755204288118041
+OPTICAL_FROM_CAM = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # right, down, forward
+OPENGL_FROM_CAM = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])  # right, up, back
+CAMERA_AXES = {"optical": OPTICAL_FROM_CAM, "piccolo": np.eye(3)}  # by the name in the options
+DECIMALS = 9  # of degrees
 
 
 def uniform_yaws(num_rotations: int) -> NDArray[np.float64]:
@@ -38,3 +46,38 @@ def random_rotation(rng: np.random.Generator) -> NDArray[np.float64]:
     """A rotation (3, 3) drawn evenly from SO(3) (Shoemake, 1992: a normalised Gaussian quaternion)."""
     quaternion = rng.normal(size=4)
     return rotation_from_quaternion_wxyz(quaternion / np.linalg.norm(quaternion))
+
+
+def turned(pose: Pose, other_from_cam: Array) -> Pose:
+    """The same camera, its rotation to other axes."""
+    return Pose(other_from_cam @ pose.R_cam_from_world, pose.center_world)
+
+
+def translation(pose: Pose) -> Array:
+    """The t (3,) of x_cam = R x_world + t."""
+    return np.asarray(-pose.R_cam_from_world @ pose.center_world)
+
+
+def R_cam_from_angles(heading_deg: float, pitch_deg: float, roll_deg: float) -> Array:
+    """R_cam_from_world (3, 3) of the angles [deg] that `heading_pitch_roll_deg` gives."""
+    yaw = exp_so3(np.radians([0.0, 0.0, 90.0 - heading_deg]))
+    pitch, roll = exp_so3(np.radians([0.0, -pitch_deg, 0.0])), exp_so3(np.radians([roll_deg, 0.0, 0.0]))
+    return np.asarray((yaw @ pitch @ roll).T)
+
+
+def heading_pitch_roll_deg(pose: Pose) -> tuple[float, float, float]:
+    """Heading in [0, 360), pitch in [-90, 90], roll in (-180, 180], by Photo Sphere XMP's definitions [deg].
+
+    Heading is of the image centre, clockwise from the world's +y; pitch its elevation above the horizon; as
+    roll grows the camera's right side goes down, so the horizon turns counterclockwise in the image:
+    R_world_from_cam = R_z(90 deg - heading) R_y(-pitch) R_x(roll).
+    https://developers.google.com/streetview/spherical-metadata
+    """
+    forward, left, up = pose.R_cam_from_world  # the camera's axes in the world
+    heading = np.arctan2(forward[0], forward[1])
+    pitch = np.arctan2(forward[2], np.hypot(forward[0], forward[1]))
+    # Against the level left of this very heading: right at the zenith too, where any heading would do.
+    level_left = np.array([-np.cos(heading), np.sin(heading), 0.0])
+    roll = np.arctan2(-up @ level_left, left @ level_left)
+    rounded = [round(float(np.degrees(angle)), DECIMALS) for angle in (heading, pitch, roll)]
+    return rounded[0] % 360.0, rounded[1], 180.0 if rounded[2] == -180.0 else rounded[2]

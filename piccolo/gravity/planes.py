@@ -1,14 +1,19 @@
-"""The dominant planes of a cloud by RANSAC, what they are, and up as they agree on it."""
+"""Normals of a cloud by PCA, its dominant planes by RANSAC, what they are, up and yaw as they agree on it."""
 
-from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+from ..errors import InputError
 from ..geometry.pose import Array
-from .normals import PointNormals, dot
 
+# Chosen by hand; the noise of scanners (2 to 5 mm) is far below the spacing of the points (8 cm)
+MAX_POINTS = 40_000  # that get a normal: a plane of 1 % of the cloud still has 400
+NUM_NEIGHBORS = 24  # with the point itself: at 8 cm a disc of radius 0.22 m
+MAX_THICKNESS = 0.05  # of a flat neighbourhood: variance across it to the lesser variance along it
+MIN_WIDTH = 0.1  # of a flat neighbourhood: lesser to larger variance along it; below, it is a line
 Kind = Literal["floor", "ceiling", "platform", "wall", "slanted"]
 
 SEED = 20  # of the draws
@@ -26,10 +31,51 @@ NEAR = 1.0  # height of furniture: what is so close above or below tells a floor
 AGREE_ANGLE = np.radians(3.0)  # of a plane to level or upright, that counts for up
 EVEN = 0.01  # rms distance from which on a plane counts less: ground is uneven, and not level [m]
 MAX_CHANGE = np.radians(1.0)  # of up by the planes
+PEAK_ANGLE = np.radians(8.0)  # of a wall to those averaged with it, modulo a quarter turn; as KIND_ANGLE
 
 
-@dataclass(frozen=True)
-class Plane:
+class PointNormals(NamedTuple):
+    """A sample of a cloud with the normals there."""
+
+    points: Array  # (M, 3) [m]
+    normals: Array  # (M, 3) unit, of either sign
+    is_flat: NDArray[np.bool_]  # (M,) the neighbourhood is a plane
+    neighborhood_radius: float  # median distance of the farthest neighbour [m]
+
+
+def estimate_normals(points: NDArray[np.float32]) -> PointNormals:
+    """Normals of an evenly strided sample of a cloud (N, 3) [m], by PCA of the nearest of all its points.
+
+    Raises InputError if the shape is not (N, 3), or a coordinate is not finite.
+    """
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"points: the shape is {points.shape}, must be (N, 3)")
+    if not np.isfinite(points).all():
+        raise InputError("points: a coordinate is not finite")
+    if len(points) < NUM_NEIGHBORS:
+        blank = np.zeros((len(points), 3))
+        return PointNormals(points.astype(np.float64), blank, np.zeros(len(points), np.bool_), np.inf)
+    stride = -(-len(points) // MAX_POINTS)
+    all_points = points.astype(np.float64)
+    sample = all_points[::stride]
+    distances, indices = cKDTree(all_points).query(sample, NUM_NEIGHBORS)
+    neighbors = all_points[indices]
+    neighbors -= neighbors.mean(axis=1, keepdims=True)
+    variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", neighbors, neighbors))
+    across, narrow, wide = variances.T
+    is_flat = (across < MAX_THICKNESS * narrow) & (narrow > MIN_WIDTH * wide)
+    return PointNormals(sample, axes[:, :, 0], is_flat, float(np.median(distances[:, -1])))
+
+
+def dot(vectors: Array, axis: Array) -> Array:
+    """Dot products (M,) of vectors (M, 3) and one axis (3,), the same for any number of threads.
+
+    By einsum, since a BLAS may sum in an order that depends on its threads.
+    """
+    return np.asarray(np.einsum("ni,i->n", vectors, axis))
+
+
+class Plane(NamedTuple):
     """Points x with `normal_world @ x = offset`, and how many there are."""
 
     normal_world: Array  # (3,) unit; of level planes up, else away from the origin
@@ -133,22 +179,37 @@ def classify_planes(planes: list[Plane], cloud: PointNormals, up: Array) -> list
     for plane in planes:
         sine = float(plane.normal_world @ up)
         if abs(sine) < np.cos(KIND_ANGLE):
-            classified.append(replace(plane, kind="wall" if abs(sine) < np.sin(KIND_ANGLE) else "slanted"))
+            classified.append(plane._replace(kind="wall" if abs(sine) < np.sin(KIND_ANGLE) else "slanted"))
             continue
         distances = dot(cloud.points, plane.normal_world) - plane.offset
         height, sign = float(np.median(heights[np.abs(distances) < TOLERANCE])), float(np.sign(sine))
-        kind: Kind = "ceiling" if height - lowest > MIN_STOREY and _is_ceiling(things, height) else "floor"
+        ends = np.searchsorted(things, height + np.array([-NEAR, -2.0 * TOLERANCE, 2.0 * TOLERANCE, NEAR]))
+        is_more_below = ends[1] - ends[0] > ends[3] - ends[2]
+        kind: Kind = "ceiling" if height - lowest > MIN_STOREY and is_more_below else "floor"
         near = (other for level, other in storeys if abs(level - height) < MIN_STOREY)
         if any(other.num_inliers > 2 * plane.num_inliers for other in near):
             kind = "platform"
         normal_world, offset = sign * plane.normal_world, sign * plane.offset
-        classified.append(replace(plane, normal_world=normal_world, offset=offset, kind=kind))
+        classified.append(plane._replace(normal_world=normal_world, offset=offset, kind=kind))
         if kind != "platform":
             storeys.append((height, classified[-1]))
     return classified
 
 
-def _is_ceiling(things: Array, height: float) -> bool:
-    """True if more of the things, at ascending heights (N,), are just below `height` than just above."""
-    ends = np.searchsorted(things, height + np.array([-NEAR, -2.0 * TOLERANCE, 2.0 * TOLERANCE, NEAR]))
-    return bool(ends[1] - ends[0] > ends[3] - ends[2])
+def manhattan_yaw(planes: list[Plane], R_level_from_scan: Array) -> float | None:
+    """The smallest turn about z [rad], in (-45, 45] deg, that puts the dominant walls along x and y.
+
+    None without walls. Walls a quarter turn apart count as one direction, the larger ones for more.
+    """
+    walls = [plane for plane in planes if plane.kind == "wall"]
+    if not walls:
+        return None
+    normals = np.array([R_level_from_scan @ wall.normal_world for wall in walls])
+    weights = np.array([wall.fraction for wall in walls])
+    # four times the azimuth is the same for all four directions of a rectangle
+    phases = np.exp(4j * np.arctan2(normals[:, 1], normals[:, 0]))
+    is_near = np.abs(np.angle(phases[:, None] / phases)) < 4.0 * PEAK_ANGLE
+    peak = int((is_near * weights).sum(axis=1).argmax())
+    mean = np.sum(weights[is_near[peak]] * phases[is_near[peak]])
+    turn = -0.25 * float(np.angle(mean))
+    return turn + 0.5 * np.pi if turn <= -0.25 * np.pi else turn

@@ -7,16 +7,25 @@ clutter and furniture are at the bottom of the storeys, whether one level carrie
 convention that scans have z up.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ..cloud.settings import UpAxis
 from ..geometry.pose import Array
-from .axes import MIN_POINTS, candidate_axes
-from .normals import PointNormals
+from .planes import PointNormals, dot
 from .up_features import ALIGNED_ANGLE, SENSE_SHARING, WEIGHTS, UpFeatures, log_odds, up_features
 
+# Chosen by hand: the sphere in cells finer than the spread of a noisy plane's normals (3 to 8 deg)
+MIN_POINTS = 300  # of a cloud
+NUM_CELLS = 4000  # of the sphere of directions, about 3 deg wide
+CELLS_PER_MODE = 12  # neighbouring cells whose votes are one direction's, 6 deg around it
+MAX_MODES = 6  # twice the three directions of a box
+MIN_MODE = 0.02  # fraction of the flat points
+DISTINCT_ANGLE = np.radians(15.0)  # between two candidates: twice the angle of the first refinement
+INLIER_ANGLES = np.radians([8.0, 4.0, 2.0, 2.0])  # of a normal to the axis or across it, step by step
 Z_UP_LOG_ODDS = 1.5  # of the convention that scans have z up, by hand: it decides a bare room
 PRIOR_ANGLE = np.radians(10.0)  # of +z to a direction that the convention speaks for
 SNAP_ANGLE = np.radians(0.2)  # of +z to a direction that is called +z itself
@@ -37,8 +46,51 @@ ROOF_THRESHOLD = 0.2  # fraction of walls at odd angles, from which on they may 
 DOUBT_FACTOR = 0.6  # on the confidence, for each of these
 
 
-@dataclass(frozen=True)
-class Up:
+def candidate_axes(cloud: PointNormals) -> list[Array]:
+    """Unit vectors (3,) that many flat points face, and those perpendicular to two such axes; either sign."""
+    normals = cloud.normals[cloud.is_flat]
+    k = np.arange(NUM_CELLS) + 0.5  # directions (NUM_CELLS, 3) evenly over the sphere, a Fibonacci spiral
+    azimuth, z = k * np.pi * (3.0 - np.sqrt(5.0)), 1.0 - 2.0 * k / NUM_CELLS
+    radius = np.sqrt(1.0 - z * z)
+    cells = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)
+    tree = cKDTree(cells)
+    nearest = tree.query(np.concatenate([normals, -normals]))[1]
+    counts = np.bincount(nearest, minlength=NUM_CELLS)
+    votes = counts[tree.query(cells, CELLS_PER_MODE)[1]].sum(axis=1)
+    modes: list[Array] = []
+    while len(modes) < MAX_MODES and votes.max() > max(MIN_MODE * len(normals), MIN_POINTS // 10):
+        axis = cells[votes.argmax()]
+        votes[np.abs(dot(cells, axis)) > np.cos(DISTINCT_ANGLE)] = 0
+        modes.append(axis)
+    axes: list[Array] = []
+    for axis in [*modes, *_perpendicular(modes)]:
+        refined = _refine(normals, axis)
+        if all(abs(refined @ other) < np.cos(DISTINCT_ANGLE) for other in axes):
+            axes.append(refined)
+    return axes
+
+
+def _perpendicular(axes: list[Array]) -> Iterator[Array]:
+    """Unit vectors perpendicular to any two of `axes` that are not near parallel."""
+    for i, a in enumerate(axes):
+        for b in axes[:i]:
+            normal = np.cross(a, b)
+            length = np.linalg.norm(normal)
+            if length > 0.5:
+                yield normal / length
+
+
+def _refine(normals: Array, axis: Array) -> Array:
+    """`axis` by least squares: parallel to normals that face it, perpendicular to those of walls."""
+    for angle in INLIER_ANGLES:
+        cosines = np.abs(dot(normals, axis))
+        facing, along = normals[cosines > np.cos(angle)], normals[cosines < np.sin(angle)]
+        spread = np.einsum("ni,nj->ij", along, along) - np.einsum("ni,nj->ij", facing, facing)
+        axis = np.linalg.eigh(spread)[1][:, 0]
+    return np.asarray(axis)
+
+
+class Up(NamedTuple):
     """Which way is up in a cloud, and how far that can be relied on."""
 
     direction_world: Array  # (3,) unit vector that points up, in the cloud's frame
@@ -135,7 +187,9 @@ def _doubts(
     doubts = []
     if neighborhood_radius > CLEAR_RADIUS:
         doubts.append(f"points so sparse that 24 neighbours reach {neighborhood_radius:.1f} m")
-    if _may_be_front(best, hypotheses):
+    across = [other for other in hypotheses if abs(other.axis @ best.axis) < 0.3]
+    energy = OPEN_ENERGY_RATIO * best.level_energy
+    if any(h.above_below_balance > OPEN_BALANCE and h.level_energy > energy for h in across):
         factor *= DOUBT_FACTOR
         doubts.append("ground and the front of a building look alike")
     if best.extent < SLAB_EXTENT:
@@ -145,13 +199,3 @@ def _doubts(
         factor *= DOUBT_FACTOR
         doubts.append("walls at odd angles, maybe a roof")
     return float(factor), doubts
-
-
-def _may_be_front(best: UpFeatures, hypotheses: list[UpFeatures]) -> bool:
-    """True if a plane across the best one has open space before it, and so may be the ground."""
-    return any(
-        other.above_below_balance > OPEN_BALANCE
-        and other.level_energy > OPEN_ENERGY_RATIO * best.level_energy
-        for other in hypotheses
-        if abs(other.axis @ best.axis) < 0.3
-    )

@@ -1,12 +1,11 @@
 """Features of a cloud along a direction, and the log-odds with which they say that it points up."""
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from ..geometry.pose import Array
-from .normals import PointNormals, dot
+from .planes import PointNormals, dot
 
 # Lengths and angles of buildings, by hand. On 138 clouds (twelve made-up places of each kind, two turns each
 # of the scenes house, hospital and hall) one of them halved or doubled changes at most 7 answers, but for
@@ -45,8 +44,7 @@ WEIGHTS = Weights(1.0, 0.5, 2.0, 4.0, 1.25, 2.5, 2.5, 2.5)
 SENSE_SHARING = 0.5  # 0: what tells the senses of an axis apart speaks for the axis in full; 1: not at all
 
 
-@dataclass(frozen=True)
-class UpFeatures:
+class UpFeatures(NamedTuple):
     """What a cloud looks like along an axis, and along one of its senses."""
 
     axis: Array  # (3,) unit
@@ -100,8 +98,15 @@ def up_features(cloud: PointNormals, axis: Array) -> UpFeatures:
     num_aligned, num_sharp = int(np.count_nonzero(is_level | is_wall)), int(np.count_nonzero(is_sharp))
     low, high = map(float, np.quantile(heights, [0.01, 0.99]))
     levels, fractions = _find_levels(heights[is_level], num_points)
-    storeys = _with_unseen_ends(levels, low, high)
-    balance = _above_below_balance(heights, levels)
+    storeys, balance = levels, 0.0
+    if len(levels):
+        above = int(np.count_nonzero(heights > levels[-1] + FAR))
+        below = int(np.count_nonzero(heights < levels[0] - FAR))
+        balance = (above - below) / (above + below + BALANCE_SOFTENING * num_points)
+        # where a storey's floor or ceiling was not scanned, the end of the cloud stands in its place
+        floor = [low] if MIN_STOREY < levels[0] - low < MAX_STOREY else []
+        ceiling = [high] if MIN_STOREY < high - levels[-1] < MAX_STOREY else []
+        storeys = np.array([*floor, *levels, *ceiling])
     if len(storeys) > len(levels):  # what was not scanned, floor or ceiling, clutter tells better
         balance *= UNSEEN_END_FACTOR
     return UpFeatures(
@@ -117,15 +122,6 @@ def up_features(cloud: PointNormals, axis: Array) -> UpFeatures:
         furniture_log_ratio=_furniture_log_ratio(heights[is_level], storeys, num_points),
         above_below_balance=balance,
     )
-
-
-def _above_below_balance(heights: Array, levels: Array) -> float:
-    """[-1, 1] How many more heights lie above the last level than below the first, as a fraction of both."""
-    if len(levels) == 0:
-        return 0.0
-    above = int(np.count_nonzero(heights > levels.max() + FAR))
-    below = int(np.count_nonzero(heights < levels.min() - FAR))
-    return (above - below) / (above + below + BALANCE_SOFTENING * len(heights))
 
 
 def _find_levels(heights: Array, num_points: int) -> tuple[Array, Array]:
@@ -180,15 +176,6 @@ def _furniture_log_ratio(heights: Array, levels: Array, num_points: int) -> floa
     upper = np.count_nonzero((below > low) & (below < high) & (above > low))
     softening = FURNITURE_SOFTENING * num_points
     return float(np.log((lower + softening) / (upper + softening)))
-
-
-def _with_unseen_ends(levels: Array, low: float, high: float) -> Array:
-    """The levels; where a storey's floor or ceiling was not scanned, the end of the cloud in its place."""
-    if len(levels) == 0:
-        return levels
-    floor = [low] if MIN_STOREY < levels[0] - low < MAX_STOREY else []
-    ceiling = [high] if MIN_STOREY < high - levels[-1] < MAX_STOREY else []
-    return np.array([*floor, *levels, *ceiling])
 
 
 def _num_non_manhattan(normals: Array, axis: Array) -> int:

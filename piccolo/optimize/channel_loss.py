@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from ..panorama.channels import ZERO_LEVEL
+from ..panorama.local_normalization import ZERO_LEVEL
 from ..panorama.texels import bilinear_weights, blend, is_valid, texel_at
 from ..runtime.jit import F1, HALF, inline_kernel, kernel
 from .levenberg_marquardt import levenberg_marquardt

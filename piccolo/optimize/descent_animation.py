@@ -2,9 +2,9 @@
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -16,8 +16,14 @@ from ..errors import InputError
 from ..geometry.pose import Pose, step
 from ..panorama import Panorama
 from ..panorama.texels import Texels
-from ..render.overlay import checkerboard, resized_rgb
-from ..render.surfel_renderer import encode_image, fill_holes, render_surfels, visible_indices
+from ..render.surfel_renderer import (
+    checkerboard,
+    encode_image,
+    fill_holes,
+    render_surfels,
+    resized_rgb,
+    visible_indices,
+)
 from ..render.surfels import surfels_of
 from ..runtime.atomic import replacing_folder, write_atomically
 from ..runtime.threads import Workers
@@ -34,8 +40,7 @@ NUM_LAST = 12  # times that the last frame is repeated
 Frames = Sequence[NDArray[np.uint8]]  # (H, W, 3) RGB each, all of one size
 
 
-@dataclass(frozen=True)
-class Iterate:
+class Iterate(NamedTuple):
     """A pose on the way of a descent."""
 
     iteration: int
@@ -79,11 +84,11 @@ def frames_of(
     chosen = np.unique(np.linspace(0, len(history) - 1, min(MAX_FRAMES, len(history))).astype(int))
 
     def frame(k: int) -> NDArray[np.uint8]:
-        cloud = fill_holes(render_surfels(surfels, history[k].pose, width, Workers(1)))
+        view = render_surfels(surfels, history[k].pose, width, Workers(1))
         bar = np.zeros((TEXT_HEIGHT, width, 3), np.uint8)
         text = f"iteration {history[k].iteration}   loss {history[k].loss:.4f}"
         cv2.putText(bar, text, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
-        return np.concatenate([bar, checkerboard(photo, cloud)])
+        return np.concatenate([bar, checkerboard(photo, fill_holes(view.rgb, view.is_seen))])
 
     return list(workers.map(frame, chosen.tolist(), "frames"))
 
@@ -93,19 +98,16 @@ def write_animation(path: Path, frames: Frames) -> None:
     kind = path.suffix.lower()
     if kind in (".gif", ".mp4"):
         held = [*frames, *[frames[-1]] * NUM_LAST]
-        write_atomically(path, _gif(held) if kind == ".gif" else _mp4(path, held))
+        file = BytesIO()
+        if kind == ".gif":
+            first, *others = map(Image.fromarray, held)
+            duration = 1000 // FRAMES_PER_S
+            first.save(file, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
+        write_atomically(path, file.getvalue() or _mp4(path, held))
         return
     with replacing_folder(path) as folder:
         for k, frame in enumerate(frames):
             (folder / f"{k:04d}.png").write_bytes(encode_image(frame, ".png"))
-
-
-def _gif(frames: Frames) -> bytes:
-    first, *others = (Image.fromarray(frame) for frame in frames)
-    file = BytesIO()
-    duration = 1000 // FRAMES_PER_S
-    first.save(file, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
-    return file.getvalue()
 
 
 def _mp4(path: Path, frames: Frames) -> bytes:

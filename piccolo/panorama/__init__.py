@@ -1,15 +1,6 @@
 """Panoramas read from files of any format and shape, always as full spheres; masks and sizes."""
 
-from .gpano import rotation_to_level
 from .model import GPano, Panorama, ReadOptions
 from .read import AS_STORED, panorama_size, read_panorama
 
-__all__ = [
-    "AS_STORED",
-    "GPano",
-    "Panorama",
-    "ReadOptions",
-    "panorama_size",
-    "read_panorama",
-    "rotation_to_level",
-]
+__all__ = ["AS_STORED", "GPano", "Panorama", "ReadOptions", "panorama_size", "read_panorama"]

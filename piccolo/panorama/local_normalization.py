@@ -2,26 +2,50 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.sphere import pixel_rays, solid_angles
-from ..runtime.jit import F0, F1, HALF, kernel
+from ..runtime.jit import F0, F1, HALF, inline_kernel, kernel
 from . import Panorama
-from .channels import CLIP, LEVELS_PER_UNIT, OPPONENT, ZERO_LEVEL, inverse_std, zscore
-from .resize import resize
+from .model import resize
 from .texels import Texels, bilinear_weights, blend, is_valid, texel_at
 
+CLIP = 2.0  # deviations; what differs more from its surroundings counts no more
+MIN_DEVIATION = 0.03  # of a channel in [0, 1]: flatter surroundings are not amplified further
+ZERO_LEVEL = 127.5  # the level of 0
+LEVELS_PER_UNIT = 127.5 / CLIP
+OPPONENT = np.array([[1 / 3, 1 / 3, 1 / 3], [1 / 2, 0, -1 / 2], [-1 / 4, 1 / 2, -1 / 4]], np.float32)
+
+_CLIP = np.float32(CLIP)
+_MIN_VARIANCE = np.float32(MIN_DEVIATION * MIN_DEVIATION)
 STATS_WIDTH = 128  # [px] local means vary over 10 degrees and more
 LEAST_WEIGHT = np.float32(1e-9)  # of neighbours that count, where hardly any does
 
 
-@dataclass(frozen=True)
-class ImageScale:
+@inline_kernel
+def opponent(r, g, b):
+    """Luminance, (R - B) / 2 and (2 G - R - B) / 4: OPPONENT times the colour."""
+    return (r + g + b) / np.float32(3.0), HALF * (r - b), HALF * g - np.float32(0.25) * (r + b)
+
+
+@inline_kernel
+def zscore(value, mean, inverse_std):
+    """(value - mean) / standard deviation, clipped."""
+    return min(max((value - mean) * inverse_std, -_CLIP), _CLIP)
+
+
+@inline_kernel
+def inverse_std(mean, mean_square):
+    """1 / standard deviation, bounded where nothing varies."""
+    return F1 / math.sqrt(max(mean_square - mean * mean, F0) + _MIN_VARIANCE)
+
+
+class ImageScale(NamedTuple):
     """One size of the panorama."""
 
     width: int  # [px] a multiple of STATS_WIDTH

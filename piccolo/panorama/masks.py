@@ -1,18 +1,168 @@
-"""Masks of the user: a picture, or the cap around a pole."""
+"""Masks: a picture, the cap around a pole; and what a picture tells by itself, that it is two fisheyes too.
+
+Black borders and patches over the nadir or zenith are found. Each rule is narrow: what is masked wrongly is
+lost. The thresholds were set by hand, apart from both sides: tests/test_panorama_masks.py has the rooms that
+they must leave alone and the patches that they find.
+"""
 
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from ..errors import InputError
-from .crop import ASPECT_TOLERANCE
-from .cube_files import SUFFIXES
+from .cube import SUFFIXES
+from .gpano import ASPECT_TOLERANCE
 from .picture import read_picture
 
+NEAR_BLACK, BLACK = 8, 2  # levels: where a border goes on, and what most of it has
+MIN_FULL_EDGE = 0.99  # of a full sphere's edge: its rows at the poles and its seam are black as a whole
+MIN_CROP_EDGE = 1.0 / 64.0  # of a crop's edge, which may be ragged
+MIN_PURE = 0.95  # of a border's pixels that are BLACK
+RIM = 8  # [px] that JPEG smears a border's edge: a block
+BAND = 64  # rows at a time
+
+DISC_WIDTH = 720  # [px] discs are looked for at this size, rows of half a degree; not in smaller pictures
+ROWS_PER_DEG = DISC_WIDTH / 360.0
+NUM_ROWS = round(45.0 * ROWS_PER_DEG)  # around a pole
+# numbers of rows inside a disc, largest first: half angles of 40 to 3 deg
+CANDIDATES = range(round(40.0 * ROWS_PER_DEG), round(3.0 * ROWS_PER_DEG) - 1, -1)
+MIN_STEP = 12.0  # levels between inside and outside of a disc's edge
+MIN_EDGE_FRACTION, MAX_CALM_FRACTION = 0.9, 0.5  # of columns with a step: at the edge, in the rows near it
+NUM_SECTORS = 16
+DETAIL_DEG = 0.5  # over which detail is measured
+MIN_DETAIL = 4.0  # levels, around a disc without detail
+MIN_DETAIL_RATIO = 5.0  # of detail outside by detail inside
+NEAR_ROWS = round(2.0 * ROWS_PER_DEG)  # on each side, in which it is
+# Set by hand, between the circles and the panoramas of tests/test_panorama_masks.py.
+FISHEYE_SIZE = 128  # [px] of each half, for the test
+FISHEYE_BLACK = 24  # levels: the dark around the circles carries some noise
+MIN_BLACK_OUTSIDE = 0.98
+MIN_BRIGHT_INSIDE = 0.7  # of each sector of a ring within the circle
+FISHEYE_SECTORS = 8
 MIN_MASK = (16, 8)  # [px]
 WHITE = 128  # and above is to be ignored
+
+
+def black_borders(
+    rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], is_full: bool
+) -> NDArray[np.bool_] | None:
+    """Where (H, W) the picture is unfilled but valid so far, None if nowhere.
+
+    From each edge inwards, pixels up to the first that is not near black, if the edge is near black: of a
+    full sphere as a whole (a pole is one point, the seam one line), of a crop in part. 95 % of them, save
+    for a rim of 8 pixels, must be black to two levels; shadows carry noise.
+    """
+    min_fraction = MIN_FULL_EDGE if is_full else MIN_CROP_EDGE
+    found = np.zeros(is_valid.shape, dtype=np.bool_)
+    for axis in (0, 1):
+        for step in (1, -1):
+            inwards = rgb.swapaxes(0, axis)[::step]
+            is_black = (inwards[0].max(axis=1) <= NEAR_BLACK) & is_valid.swapaxes(0, axis)[::step][0]
+            if is_black.mean() < min_fraction:
+                continue
+            depth = _depth_of_black(inwards, is_black)
+            core = np.maximum(minimum_filter1d(depth, 2 * RIM + 1) - RIM, 0)
+            if _black_fraction(inwards, core if core.any() else depth) >= MIN_PURE:
+                depth = np.where(depth > 0, depth + RIM, 0)
+                border = found.swapaxes(0, axis)[::step][: depth.max()]
+                border |= np.arange(len(border))[:, None] < maximum_filter1d(depth, 2 * RIM + 1)
+    return found if found.any() else None
+
+
+def _depth_of_black(inwards: NDArray[np.uint8], is_black: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Number of near black pixels from the edge (row 0) inwards, of the columns that are black there."""
+    depth = np.zeros(len(is_black), dtype=np.int64)
+    for begin in range(0, len(inwards), BAND):
+        band = np.ascontiguousarray(inwards[begin : begin + BAND])
+        is_near_black = cv2.inRange(band, (0, 0, 0), (NEAR_BLACK,) * 3) > 0
+        run = np.where(is_near_black.all(axis=0), len(band), is_near_black.argmin(axis=0))
+        depth += run * is_black
+        is_black = is_black & (run == len(band))
+        if not is_black.any():
+            break
+    return depth
+
+
+def _black_fraction(inwards: NDArray[np.uint8], depth: NDArray[np.int64]) -> float:
+    """Fraction of BLACK pixels among those within `depth` (columns,) of the edge."""
+    num_black = 0
+    for begin in range(0, int(depth.max()), BAND):
+        band = np.ascontiguousarray(inwards[begin : begin + BAND])
+        is_within = np.arange(begin, begin + len(band))[:, None] < depth
+        num_black += int(((cv2.inRange(band, (0, 0, 0), (BLACK,) * 3) > 0) & is_within).sum())
+    return num_black / float(depth.sum())
+
+
+def polar_disc(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], pole: str) -> float:
+    """Half angle [deg] of a disc put over the `pole`, zenith or nadir, of a full sphere; 0 if there is none.
+
+    It is bounded by a circle of latitude, which is an edge in 90 % of all directions while the rows near it
+    are not (a logo, a plain colour), or at which all detail ends in every direction (a blur). Scenes have no
+    such circles, save for round things right over or under the camera, such as its own stand.
+    """
+    num_rows = round(NUM_ROWS / DISC_WIDTH * rgb.shape[1])
+    rows = slice(num_rows) if pole == "zenith" else slice(-num_rows, None)
+    if rgb.shape[1] < DISC_WIDTH or not is_valid[rows].all():
+        return 0.0
+    cap = cv2.resize(rgb[rows], (DISC_WIDTH, NUM_ROWS), interpolation=cv2.INTER_AREA).astype(np.float32)
+    cap = cap if pole == "zenith" else cap[::-1]
+    num_inside = max(_edge_circle(cap), _detail_circle(cap))
+    return (num_inside + 1) / ROWS_PER_DEG if num_inside else 0.0
+
+
+def _edge_circle(cap: NDArray[np.float32]) -> int:
+    """Number of rows from the pole (row 0) to the outermost circle that is an edge, 0 if there is none."""
+    pairs = (cap[1:] + cap[:-1]) / 2.0
+    is_step = np.abs(pairs[2:] - pairs[:-2]).max(axis=2) > MIN_STEP
+    fraction = np.concatenate([[0.0, 0.0], is_step.mean(axis=1)])  # fraction[k]: k rows are inside
+    for k in CANDIDATES:
+        near = np.concatenate([fraction[max(k - 8, 0) : k - 2], fraction[k + 3 : k + 9]])
+        if fraction[k] >= MIN_EDGE_FRACTION and np.median(near) <= MAX_CALM_FRACTION:
+            return k
+    return 0
+
+
+def _detail_circle(cap: NDArray[np.float32]) -> int:
+    """Number of rows from the pole (row 0) to the outermost circle at which all detail ends, 0 if none."""
+    grey = cap.mean(axis=2)
+    around = np.sin(np.radians((np.arange(NUM_ROWS) + 0.5) / ROWS_PER_DEG))
+    spacing = np.clip(np.round(DETAIL_DEG * ROWS_PER_DEG / around), 1, DISC_WIDTH // 8).astype(int)
+    rows, columns = np.arange(NUM_ROWS)[:, None], np.arange(DISC_WIDTH)
+    east, west = ((columns + sign * spacing[:, None]) % DISC_WIDTH for sign in (1, -1))
+    second = grey[rows, east] + grey[rows, west] - 2.0 * grey
+    detail = np.abs(second).reshape(NUM_ROWS, NUM_SECTORS, -1).mean(axis=2)
+    ends = np.cumsum(np.concatenate([np.zeros((1, NUM_SECTORS)), detail]), axis=0)
+    within = (ends[NEAR_ROWS:] - ends[:-NEAR_ROWS]) / NEAR_ROWS  # mean of the NEAR_ROWS from each row on
+    for k in CANDIDATES:
+        inside, outside = within[k - 1 - NEAR_ROWS], within[k + 1]  # row k - 1 is half a step: left out
+        if (outside < np.maximum(MIN_DETAIL_RATIO * inside, MIN_DETAIL)).any():
+            continue
+        if (outside >= MIN_DETAIL_RATIO * np.median(detail[: k - 1], axis=0)).all():
+            return k
+    return 0
+
+
+def is_dual_fisheye(rgb: NDArray[np.uint8]) -> bool:
+    """True if all is black outside of the two circles inscribed in the halves, but not within them.
+
+    A panorama with black poles is black within the circles' upper and lower parts too; a dark one is dark all
+    around. Circles down to 0.9 of the halves' height are found.
+    """
+    small = cv2.resize(rgb, (2 * FISHEYE_SIZE, FISHEYE_SIZE), interpolation=cv2.INTER_AREA).max(axis=2)
+    v, u = np.mgrid[:FISHEYE_SIZE, :FISHEYE_SIZE] + 0.5 - FISHEYE_SIZE / 2
+    radius = np.hypot(u, v) / (FISHEYE_SIZE / 2)
+    sector = np.floor(np.arctan2(v, u) / (2.0 * np.pi) * FISHEYE_SECTORS).astype(int) % FISHEYE_SECTORS
+    is_ring = (radius > 0.7) & (radius < 0.85)
+    for half in (small[:, :FISHEYE_SIZE], small[:, FISHEYE_SIZE:]):
+        if (half[radius > 1.03] < FISHEYE_BLACK).mean() < MIN_BLACK_OUTSIDE:
+            return False
+        is_bright = half >= FISHEYE_BLACK
+        if min(is_bright[is_ring & (sector == k)].mean() for k in range(FISHEYE_SECTORS)) < MIN_BRIGHT_INSIDE:
+            return False
+    return True
 
 
 def find_mask(mask: Path, pano: Path) -> Path | None:
@@ -27,10 +177,7 @@ def read_mask(path: Path, sizes: list[tuple[int, int]]) -> tuple[int, NDArray[np
 
     A larger mask masks a pixel if any of its own pixels there is white, a smaller one is enlarged.
 
-    Raises
-    ------
-    InputError
-        The mask can't be read, or has the shape of none of the sizes, within 1 %.
+    Raises InputError if the mask can't be read, or has the shape of none of the sizes, within 1 %.
     """
     rgb = read_picture(path, MIN_MASK).rgb
     height, width = rgb.shape[:2]

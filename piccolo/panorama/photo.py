@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from PIL.ExifTags import GPS, IFD, Base
 
 from ..cloud.digest import sha256_of_arrays
-from .cube_files import face_paths
-from .picture import file_bytes, opened
+from ..runtime.json_file import read_bytes
+from .cube import face_paths
+from .picture import WANTED, opened
 
 TIME = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)")
 OFFSET = re.compile(r"[+-]\d\d:\d\d")
@@ -46,7 +47,7 @@ def photo_of(path: Path) -> Photo:
         The file is missing or no picture. Metadata that are damaged count as missing.
     """
     files = list(face_paths(path).values()) if path.is_dir() else [path]
-    contents = [file_bytes(file) for file in files]
+    contents = [read_bytes(file, WANTED) for file in files]
     digests = [hashlib.sha256(content).hexdigest() for content in contents]
     sha256 = digests[0] if len(files) == 1 else hashlib.sha256("\n".join(digests).encode()).hexdigest()
     with opened(files[0], contents[0]) as image:

@@ -28,6 +28,7 @@ from PIL.WebPImagePlugin import WebPImageFile
 
 from ..cloud.label_colors import Labels, colors_of
 from ..errors import InputError
+from ..runtime.json_file import read_bytes
 
 WANTED = "wanted a whole JPEG, PNG, TIFF or WebP panorama"
 MIN_WIDTH, MIN_HEIGHT = 128, 64
@@ -86,12 +87,9 @@ class Picture:
 def read_picture(path: Path, min_size: tuple[int, int] = (MIN_WIDTH, MIN_HEIGHT)) -> Picture:
     """The picture in a file; grey becomes RGB, of 16 bits the upper 8 are kept (v >> 8).
 
-    Raises
-    ------
-    InputError
-        The file is missing or damaged, of no format read here, or its size is out of range.
+    Raises InputError if the file is missing or damaged, of no format read here, or its size is out of range.
     """
-    data = file_bytes(path)
+    data = read_bytes(path, WANTED)
     with opened(path, data) as image:
         _check(path, image, len(data), min_size)
         mode = "RGBA" if image.has_transparency_data else "RGB"
@@ -111,12 +109,10 @@ def read_picture(path: Path, min_size: tuple[int, int] = (MIN_WIDTH, MIN_HEIGHT)
 def read_labels(path: Path, labels: Labels) -> Picture:
     """The picture in a PNG file of labels, in their colours; of RGB, a label is R 65536 + G 256 + B.
 
-    Raises
-    ------
-    InputError
-        The file is missing or damaged, its size is out of range, or it is of no kind that keeps labels.
+    Raises InputError if the file is missing or damaged, its size is out of range, or it is of no kind that
+    keeps labels.
     """
-    data = file_bytes(path)
+    data = read_bytes(path, WANTED)
     with opened(path, data) as image:
         _check(path, image, len(data), (MIN_WIDTH, MIN_HEIGHT))
         if image.format != "PNG" or data[24:26] not in LABEL_KINDS or image.has_transparency_data:
@@ -130,26 +126,15 @@ def read_labels(path: Path, labels: Labels) -> Picture:
 
 def picture_size(path: Path) -> tuple[int, int]:
     """Width and height [px] of the picture in a file, without decoding it."""
-    with opened(path, file_bytes(path)) as image:
+    with opened(path, read_bytes(path, WANTED)) as image:
         return image.size
-
-
-def file_bytes(path: Path) -> bytes:
-    """The content of a picture's file, which must not be empty."""
-    if path.exists() and not path.is_file():
-        raise InputError(f"{path}: not a file but a folder or a device, {WANTED}")
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}), {WANTED}") from error
-    if not data:
-        raise InputError(f"{path}: the file is empty, {WANTED}")
-    return data
 
 
 @contextmanager
 def opened(path: Path, data: bytes) -> Iterator[ImageFile]:
     """The picture in `data` as Pillow opens it, not decoded; what Pillow raises becomes an InputError."""
+    if not data:
+        raise InputError(f"{path}: the file is empty, {WANTED}")
     kind = next((kind for magic, kind in FORMATS.items() if data.startswith(magic)), None)
     if kind is None:
         raise InputError(f"{path}: begins with {data[:8]!r}, {WANTED}")

@@ -8,12 +8,18 @@ from numpy.typing import NDArray
 
 from ..cloud.label_colors import Labels
 from ..errors import InputError
-from .auto_mask import black_borders, polar_disc
-from .crop import ASPECT_TOLERANCE, embed_crop, full_size, region_of_fov
-from .cube_files import cube_of_cells, face_paths, read_cube_folder
-from .fisheye import is_dual_fisheye
-from .gpano import CropRegion, attitude, crop_region, gpano_fields
-from .masks import find_mask, mask_pole, read_mask
+from .cube import cube_of_cells, face_paths, read_cube_folder
+from .gpano import (
+    ASPECT_TOLERANCE,
+    CropRegion,
+    attitude,
+    crop_region,
+    embed_crop,
+    full_size,
+    gpano_fields,
+    region_of_fov,
+)
+from .masks import black_borders, find_mask, is_dual_fisheye, mask_pole, polar_disc, read_mask
 from .model import GPano, Panorama, ReadOptions
 from .picture import Picture, picture_size, read_labels, read_picture
 

@@ -1,37 +1,23 @@
 """The panorama as texels: one int32 a pixel, and the bilinear value and gradient at a continuous pixel."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cloud.soa import pack_rgbx
 from ..geometry.sphere import direction_to_pixel, solid_angles
 from ..runtime.jit import F1, HALF, inline_kernel
 
 BYTE = np.int32(255)
 
 
-@dataclass(frozen=True)
-class Texels:
+class Texels(NamedTuple):
     """An equirectangular image for gathering: a column is wrapped and a row clamped on each side."""
 
     rgbx: NDArray[np.int32]  # ((H + 2) * (W + 2),) R, G, B from the lowest byte up, X = 1 where valid
     width: int  # W [px], H = W / 2
     valid_share: float = 1.0  # of the sphere
-
-    @property
-    def stride(self) -> int:
-        """Texels from one row to the next."""
-        return self.width + 2
-
-
-def pack_rgbx(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = None) -> NDArray[np.int32]:
-    """One int32 (...) for each colour (..., 3): R, G, B from the lowest byte up and 1 where valid on top."""
-    rgbx = np.ones((*rgb.shape[:-1], 4), dtype=np.uint8)
-    rgbx[..., :3] = rgb
-    if is_valid is not None:
-        rgbx[..., 3] = is_valid
-    return rgbx.view("<i4")[..., 0].astype(np.int32, copy=False)
 
 
 def pack_texels(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = None) -> Texels:

@@ -5,54 +5,37 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cloud.model import Cloud
-from ..cloud.soa import PackedPoints, pack_points
+from ..cloud.soa import LocalCloud, PackedPoints, pack_points
+from ..cloud.stream import Cloud
 from ..confidence.alternatives import Hypothesis, alternative_poses, score_margin
 from ..confidence.confidence import PAPER_MODEL, classify
 from ..confidence.localization import Localization
 from ..confidence.score import Evidence, agreement_at
-from ..geometry.pose import Pose
 from ..geometry.rotations import uniform_rotations, uniform_yaws
 from ..optimize.refine import Loss, Refined, refine, sampling_loss_of
 from ..panorama import Panorama
-from ..panorama.resize import shrink
+from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from .photometric import photometric_loss_of
-from .search import search
+from .search import free_grid, search
 from .settings import PaperSettings
-from .starts import free_grid
 
 
 @dataclass(frozen=True)
-class PaperMap:
+class PaperMap(LocalCloud):
     """What the paper's method prepares once per cloud."""
 
-    points: PackedPoints
-    origin_world: NDArray[np.float64]  # (3,) [m]
     positions: NDArray[np.float64]  # (M, 3) starts in free space, relative to origin_world [m]
-    warnings: tuple[str, ...] = ()
     scan_sha256: str = ""  # of the files or arrays that it was made from, in hexadecimal digits
-
-    def from_world(self, pose: Pose) -> Pose:
-        """A pose of the world in the frame of the points."""
-        return replace(pose, center_world=pose.center_world - self.origin_world)
-
-    def to_world(self, pose: Pose) -> Pose:
-        """A pose relative to the local origin in the world."""
-        return replace(pose, center_world=pose.center_world + self.origin_world)
 
 
 def prepare(cloud: Cloud, settings: PaperSettings) -> PaperMap:
     """Everything that does not depend on the panorama."""
     points = pack_points(cloud.points, cloud.colors).subsample(settings.max_points)
-    return PaperMap(
-        points=points,
-        origin_world=cloud.origin_world,
-        positions=free_grid(points, settings.num_translations, settings.grid_margin),
-        warnings=cloud.warnings,
-    )
+    positions = free_grid(points, settings.num_translations, settings.grid_margin)
+    return PaperMap(points, np.eye(3), cloud.origin_world, cloud.warnings, positions)
 
 
 def loss_of(panorama: Panorama, settings: PaperSettings) -> Loss:

@@ -30,11 +30,8 @@ LEAST_NORM = 0.5 / 255.0  # a residual below half an 8-bit level has the weight 
 
 def photometric_loss(points: PackedPoints, panorama: Panorama, pose: Pose) -> float:
     """The loss at `pose`, in [0, sqrt(3)], over the panorama's own pixels; inf where too little is shown."""
-    view = render_view(points, pose, panorama.rgb.shape[1])
-    residuals, counts = _compared(view, panorama)
-    if not _shows_enough(view, panorama, counts, len(points)):
-        return math.inf
-    return float(np.linalg.norm(residuals[counts], axis=-1).mean(dtype=np.float64))
+    found = _compared(points, panorama, pose)
+    return math.inf if found is None else float(np.linalg.norm(found[1], axis=-1).mean(dtype=np.float64))
 
 
 def photometric_loss_of(panorama: Panorama) -> Loss:
@@ -47,11 +44,10 @@ def photometric_loss_of(panorama: Panorama) -> Loss:
 
 def photometric_equations(points: PackedPoints, panorama: Panorama, pose: Pose) -> Equations:
     """Loss, its gradient (6,) and the matrix (6, 6) of iteratively reweighted least squares at `pose`."""
-    view = render_view(points, pose, panorama.rgb.shape[1])
-    residuals, counts = _compared(view, panorama)
-    if not _shows_enough(view, panorama, counts, len(points)):
+    found = _compared(points, panorama, pose)
+    if found is None:
         return math.inf, np.zeros(6), np.eye(6)
-    residuals = residuals[counts]
+    view, residuals, counts = found
     norms = np.linalg.norm(residuals, axis=-1)
     by_u, by_v = (gradient[counts] for gradient in view_gradient(view))
     rows_u, rows_v = pixel_motion(view.depth, counts)
@@ -65,17 +61,21 @@ def photometric_equations(points: PackedPoints, panorama: Panorama, pose: Pose) 
     return float(norms.mean(dtype=np.float64)), gradient / count, matrix / count
 
 
-def _compared(view: View, panorama: Panorama) -> tuple[Image, NDArray[np.bool_]]:
-    """Differences (H, W, 3) of view and panorama in [-1, 1], and where both show something."""
-    return view.rgb - panorama.rgb.astype(np.float32) / np.float32(255.0), view.is_seen & panorama.is_valid
+def _compared(
+    points: PackedPoints, panorama: Panorama, pose: Pose
+) -> tuple[View, Image, NDArray[np.bool_]] | None:
+    """View at `pose`, its differences (N, 3) in [-1, 1] from the panorama where both count, and where (H, W).
 
-
-def _shows_enough(view: View, panorama: Panorama, counts: NDArray[np.bool_], num_points: int) -> bool:
-    """False where masked pixels hide too much of the view, or it is nearly empty, as from outside a scan."""
+    None where masked pixels hide too much of the view, or it is nearly empty, as from outside a scan.
+    """
+    view = render_view(points, pose, panorama.rgb.shape[1])
+    counts = view.is_seen & panorama.is_valid
     num_seen = int(view.is_seen.sum())
     least_shown = MIN_SHOWN_SHARE * float(panorama.is_valid.mean()) ** 2 * num_seen
-    least_seen = MIN_FILLED_SHARE * min(view.is_seen.size, num_points)
-    return num_seen > least_seen and int(counts.sum()) > least_shown
+    least_seen = MIN_FILLED_SHARE * min(view.is_seen.size, len(points))
+    if num_seen <= least_seen or int(counts.sum()) <= least_shown:
+        return None
+    return view, view.rgb[counts] - panorama.rgb[counts].astype(np.float32) / np.float32(255.0), counts
 
 
 def view_gradient(view: View) -> tuple[Image, Image]:

@@ -1,4 +1,4 @@
-"""Steps 1 to 3 of the paper's Algorithm 1: score poses on a grid, keep the diverse best."""
+"""Steps 1 to 3 of the paper's Algorithm 1: score poses on a grid in free space, keep the diverse best."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,13 +6,78 @@ from numpy.typing import NDArray
 from ..cloud.soa import PackedPoints
 from ..confidence.alternatives import Hypothesis, best_distinct
 from ..geometry.pose import Array, Pose
+from ..geometry.sphere import solid_angles
 from ..optimize.refine import Loss
 from ..panorama import Panorama
-from ..panorama.resize import shrink
-from ..render.zbuffer import render_view, visible_points
+from ..panorama.model import shrink
+from ..render.zbuffer import is_free_space, render_view, visible_points
 from ..runtime.threads import Workers
-from .histogram import color_histogram, histogram_intersection
 from .settings import PaperSettings
+
+MIN_CLEARANCE = 0.25  # a camera is not nearer to a surface than this [m]
+PROBE_POINTS = 200_000  # about this many points are asked, evenly in space
+PROBE_WIDTH = 48  # cells of 7.5 degrees for the two tests
+
+
+def box_grid(low: Array, high: Array, num_cells: int) -> NDArray[np.float64]:
+    """Centres (M, 3) of near-cubic cells that fill a box, M near `num_cells`, at least one an axis."""
+    size = np.maximum(high - low, 1e-3)
+    edge = (size.prod() / num_cells) ** (1.0 / 3.0)
+    for _ in range(3):  # an axis shorter than the edge gets one cell: the others share the number
+        is_long = size > edge
+        if is_long.any():
+            edge = (size[is_long].prod() / num_cells) ** (1.0 / is_long.sum())
+    counts = np.maximum(np.round(size / edge), 1).astype(int)
+    axes = [low[k] + size[k] * (np.arange(counts[k]) + 0.5) / counts[k] for k in range(3)]
+    return np.column_stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")])
+
+
+def farthest_point_sampling(positions: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """At most `count` of the positions (N, 3), each the farthest from those before it, in their old order."""
+    if len(positions) <= count:
+        return positions
+    chosen = [0]
+    distance = np.linalg.norm(positions - positions[0], axis=1)
+    while len(chosen) < count:
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(positions - positions[chosen[-1]], axis=1))
+    return np.asarray(positions[np.sort(chosen)])
+
+
+def free_grid(points: PackedPoints, num_translations: int, margin: float) -> NDArray[np.float64]:
+    """Camera positions (M, 3), M <= num_translations, of a uniform grid over the box that lie in free space.
+
+    The box is that of the points, made smaller by `margin` of its size on every side. The grid is refined
+    until enough of its positions are free; what is over is thinned out evenly. Empty if nothing is free.
+    """
+    low = np.array([points.x.min(), points.y.min(), points.z.min()], dtype=np.float64)
+    high = np.array([points.x.max(), points.y.max(), points.z.max()], dtype=np.float64)
+    low, high = low + margin * (high - low), high - margin * (high - low)
+    probed = points.take(slice(None, None, max(1, len(points) // PROBE_POINTS)))
+    free = np.empty((0, 3))
+    for growth in (1.0, 1.5, 2.25, 3.4, 5.0, 7.6, 11.4, 17.0, 26.0):
+        grid = box_grid(low, high, round(num_translations * growth))
+        free = grid[[is_free_space(probed, center, PROBE_WIDTH, MIN_CLEARANCE) for center in grid]]
+        if len(free) >= num_translations:
+            break
+    return farthest_point_sampling(free, num_translations)
+
+
+def color_histogram(rgb: NDArray[np.float32], counts: NDArray[np.bool_], bins: int) -> NDArray[np.float64]:
+    """Share (bins ** 3,) of the solid angle in each colour, of an image (H, W, 3) in [0, 1].
+
+    Only pixels of `counts` (H, W) are counted; all zero if none is.
+    """
+    level = np.minimum((rgb * bins).astype(np.int64), bins - 1)
+    index = (level[..., 0] * bins + level[..., 1]) * bins + level[..., 2]
+    weights = counts * solid_angles(rgb.shape[1])[:, None]
+    histogram = np.bincount(index.ravel(), weights.ravel(), minlength=bins**3)
+    return np.asarray(histogram / max(histogram.sum(), 1e-12))
+
+
+def histogram_intersection(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """Overlap in [0, 1] of two histograms that each sum to 1 (Swain and Ballard, 1991)."""
+    return float(np.minimum(a, b).sum())
 
 
 def losses_at(

@@ -19,9 +19,7 @@ class PaperSettings(DescentSettings):
 
     gravity: Gravity = "known"  # known: the camera is upright, only its yaw is searched
     num_translations: int = 50  # [N_t] positions on a uniform grid over the cloud's box, all in free space
-    num_rotations: int = (
-        0  # [N_r] 0 for the paper's: 8 yaws where gravity is known, 32 rotations of SO(3) if not
-    )
+    num_rotations: int = 0  # [N_r] 0 for the paper's: 8 yaws if gravity is known, else 32 rotations of SO(3)
     loss: PoseLoss = "sampling"  # photometric: of the rendered cloud, pixel by pixel
     initialization: Initialization = "two-stage"  # loss-only: K2 poses by the loss, without histograms
     num_by_loss: int = 50  # [K1] poses kept by the loss
@@ -30,9 +28,7 @@ class PaperSettings(DescentSettings):
     histogram_bins: int = 8  # a channel
     photometric_width: int = 256  # [px] at most, of the views and of the panorama for the photometric loss
     histogram_width: int = 256  # [px] of the views and of the panorama that are compared
-    min_distance: float = (
-        0.3  # poses closer than this [m] and than `min_angle_deg` are one: the better is kept
-    )
+    min_distance: float = 0.3  # poses closer than this [m] and `min_angle_deg` are one: the better is kept
     min_angle_deg: float = 15.0
     max_points: int = 1_000_000  # of a larger cloud, this many are taken, evenly in space
     min_confidence: float = MIN_CONFIDENCE  # below it a pose is not called localized
@@ -45,9 +41,8 @@ class PaperSettings(DescentSettings):
             if getattr(self, name) < 1:
                 raise InputError(f"{name}: found {getattr(self, name)}, wanted at least 1")
         if self.num_rotations < 0:
-            raise InputError(
-                f"num_rotations: found {self.num_rotations}, wanted 1 or more, or 0 for the paper's"
-            )
+            found = f"found {self.num_rotations}"
+            raise InputError(f"num_rotations: {found}, wanted 1 or more, or 0 for the paper's")
         if self.gravity == "auto":
             raise InputError("gravity: found auto, wanted known or unknown with the preset paper")
         if not 0.0 <= self.grid_margin < 0.5:
@@ -56,10 +51,8 @@ class PaperSettings(DescentSettings):
         if not 2 <= self.histogram_bins <= 64:
             raise InputError(f"histogram_bins: found {self.histogram_bins}, wanted 2 to 64")
         if not MIN_VIEW_WIDTH <= self.photometric_width <= MAX_VIEW_WIDTH or self.photometric_width % 2:
-            raise InputError(
-                f"photometric_width: found {self.photometric_width}, wanted an even number of "
-                f"{MIN_VIEW_WIDTH} to {MAX_VIEW_WIDTH}"
-            )
+            wanted = f"wanted an even number of {MIN_VIEW_WIDTH} to {MAX_VIEW_WIDTH}"
+            raise InputError(f"photometric_width: found {self.photometric_width}, {wanted}")
 
     @property
     def effective_num_rotations(self) -> int:

@@ -1,7 +1,6 @@
-"""The cloud rendered at a pose, of any size: surfaces closed, what nobody scanned filled or left open."""
+"""The cloud rendered at a pose: surfaces closed, what nobody scanned filled or left open; and overlays."""
 
 import math
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -9,10 +8,11 @@ from numpy.typing import NDArray
 
 from ..cloud.soa import PackedPoints
 from ..geometry.pose import Array, Pose
+from ..panorama import Panorama
+from ..panorama.model import shrink
 from ..runtime.threads import Workers
-from .splatting import MIN_RADIUS_PX, splat
-from .surfels import Surfels, surfels_of
-from .zbuffer import nearest_depth, select_visible
+from .surfels import MIN_RADIUS_PX, Surfels, splat, surfels_of
+from .zbuffer import View, nearest_depth, select_visible
 
 STRIP = 1 << 21  # pixels that one thread draws at a time
 MAX_SURFELS = 8_000_000  # of more points that may be seen, this many are drawn, evenly in space
@@ -23,23 +23,12 @@ MAX_RADIUS = 1.5  # by the radius that 95 % of the surfels stay below
 MIN_RANGE = 1e-3  # [m] nearer to the camera nothing is drawn
 HIDING_WIDTHS = (360, 720)  # cells of 1 and 1/2 degrees; wider ones hide what is seen through a door ajar
 FAR_ANGLE = 0.02  # [rad] as which a far surfel's radius is seen
+OVERLAY_WIDTH = 1024
+NUM_TILES = 16  # columns of the checkerboard
 
 
-@dataclass(frozen=True)
-class RenderedView:
-    """What the camera sees of the cloud."""
-
-    rgb: NDArray[np.uint8]  # (H, W, 3), black where nothing is seen
-    depth: NDArray[np.float32]  # (H, W) range [m] along the ray, inf where nothing is seen
-
-    @property
-    def is_seen(self) -> NDArray[np.bool_]:
-        """(H, W), true where there is a surface."""
-        return np.isfinite(self.depth)
-
-
-def render_points(points: PackedPoints, pose: Pose, width: int, workers: Workers) -> RenderedView:
-    """The cloud at `pose`, `width` x width / 2 pixels."""
+def render_points(points: PackedPoints, pose: Pose, width: int, workers: Workers) -> View:
+    """The cloud at `pose`, `width` x width / 2 pixels; colours in uint8."""
     visible = points.take(visible_indices(points, pose.center_world)).subsample(MAX_SURFELS)
     return render_surfels(surfels_of(visible, workers), pose, width, workers)
 
@@ -64,9 +53,12 @@ def visible_indices(points: PackedPoints, center_world: Array) -> NDArray[np.int
     return kept
 
 
-def render_surfels(surfels: Surfels, pose: Pose, width: int, workers: Workers) -> RenderedView:
-    """The surfels seen from `pose`."""
-    surfels = _without_lone(surfels, pose.center_world)
+def render_surfels(surfels: Surfels, pose: Pose, width: int, workers: Workers) -> View:
+    """The surfels seen from `pose`; colours in uint8."""
+    p = surfels.points
+    ranges = np.linalg.norm(np.stack([p.x, p.y, p.z], axis=1) - pose.center_world, axis=1)
+    largest = np.maximum(MAX_RADIUS * np.percentile(surfels.radii, 95.0), FAR_ANGLE * ranges)  # not lone
+    surfels = surfels.take(np.flatnonzero((surfels.radii <= largest) & (ranges > MIN_RANGE)))
     packed, directions, angles = _in_camera(surfels, pose, width)
     rgb = np.zeros((width // 2, width, 3), np.uint8)
     depth = np.full((width // 2, width), np.inf, np.float32)
@@ -88,21 +80,13 @@ def render_surfels(surfels: Surfels, pose: Pose, width: int, workers: Workers) -
         depth[rows] = np.where(is_seen, means[..., 3], np.float32(np.inf))
 
     list(workers.map(run, range(0, width // 2, num_rows), "draw"))
-    return RenderedView(rgb, depth)
-
-
-def _without_lone(surfels: Surfels, center_world: Array) -> Surfels:
-    """The surfels without lone ones and those at the camera itself."""
-    p = surfels.points
-    ranges = np.linalg.norm(np.stack([p.x, p.y, p.z], axis=1) - center_world, axis=1)
-    largest = np.maximum(MAX_RADIUS * np.percentile(surfels.radii, 95.0), FAR_ANGLE * ranges)
-    return surfels.take(np.flatnonzero((surfels.radii <= largest) & (ranges > MIN_RANGE)))
+    return View(depth, rgb)
 
 
 def _in_camera(
     surfels: Surfels, pose: Pose, width: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
-    """Surfels (N, 9), directions (N, 2) and angles (N,) as `splatting.splat` reads them."""
+    """Surfels (N, 9), directions (N, 2) and angles (N,) as `surfels.splat` reads them."""
     p, R = surfels.points, pose.R_cam_from_world
     x_cam = (np.stack([p.x, p.y, p.z], axis=1) - pose.center_world) @ R.T
     ranges = np.linalg.norm(x_cam, axis=1)
@@ -122,15 +106,11 @@ def _in_camera(
     return packed, np.stack([azimuth, elevation], axis=1), angles
 
 
-def fill_holes(view: RenderedView) -> NDArray[np.uint8]:
-    """The view's colours; what is not seen takes those around it, the farther away the smoother."""
-    return _filled(view.rgb, view.is_seen)
+def fill_holes(rgb: NDArray[np.uint8], is_seen: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """A picture (H, W, 3); what is not seen (H, W) takes colours around it, the farther away the smoother.
 
-
-def _filled(rgb: NDArray[np.uint8], is_seen: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Holes filled from the same at half the size; black if nothing is seen at all.
-
-    In bytes, as floating-point copies of a large picture would take gigabytes.
+    From the same at half the size, in bytes, as floating-point copies of a large picture would take
+    gigabytes. Black if nothing is seen at all.
     """
     height, width = is_seen.shape
     if is_seen.all() or width == 1:
@@ -146,7 +126,7 @@ def _filled(rgb: NDArray[np.uint8], is_seen: NDArray[np.bool_]) -> NDArray[np.ui
     total = cv2.resize(masked, size, interpolation=cv2.INTER_AREA)
     del counts, masked
     mean = cv2.divide(total, cv2.merge([weights, weights, weights]), scale=255.0)
-    coarse = _filled(np.asarray(mean, np.uint8), weights > 0)
+    coarse = fill_holes(np.asarray(mean, np.uint8), weights > 0)
     around = np.concatenate([coarse[:, -1:], coarse, coarse[:, :1]], axis=1)
     double = (2 * around.shape[1], 2 * len(around))
     smooth = cv2.resize(around, double, interpolation=cv2.INTER_LINEAR)[:height, 2 : 2 + width]
@@ -154,11 +134,34 @@ def _filled(rgb: NDArray[np.uint8], is_seen: NDArray[np.bool_]) -> NDArray[np.ui
     return np.asarray(smooth, np.uint8)
 
 
-def encode_image(image: NDArray[np.uint8] | NDArray[np.uint16], suffix: str) -> bytes:
-    """Bytes of a file with an image (H, W, 3) RGB or (H, W) gray, of the kind that the suffix names."""
+def encode_image(image: NDArray[np.uint8] | NDArray[np.uint16], suffix: str, quality: int = 95) -> bytes:
+    """Bytes of a file with an image (H, W, 3) RGB or (H, W) gray, of the kind that the suffix names.
+
+    The quality, up to 100, is that of a JPEG.
+    """
     bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
-    options = [cv2.IMWRITE_JPEG_QUALITY, 95] if suffix in (".jpg", ".jpeg") else []
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if suffix in (".jpg", ".jpeg") else []
     is_encoded, content = cv2.imencode(suffix, bgr, options)
     if not is_encoded:
         raise OSError(f"an image of {image.shape[1]} x {image.shape[0]} could not be encoded as {suffix}")
     return content.tobytes()
+
+
+def resized_rgb(panorama: Panorama, width: int) -> NDArray[np.uint8]:
+    """The panorama's colours, resized to (width / 2, width, 3)."""
+    rgb = shrink(panorama, width).rgb
+    return np.asarray(cv2.resize(rgb, (width, width // 2), interpolation=cv2.INTER_LINEAR), np.uint8)
+
+
+def checkerboard(photo: NDArray[np.uint8], cloud: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Two images (H, W, 3) and a checkerboard of both, one above the other (3 H, W, 3)."""
+    row, column = np.indices(photo.shape[:2]) // (photo.shape[1] // NUM_TILES)
+    mixed = np.where(((row + column) % 2 == 0)[..., None], photo, cloud)
+    return np.concatenate([photo, cloud, mixed])
+
+
+def overlay_png(points: PackedPoints, panorama: Panorama, pose: Pose, workers: Workers) -> bytes:
+    """PNG file of three images, one above the other: panorama, cloud from the pose, checkerboard of both."""
+    view = render_points(points, pose, OVERLAY_WIDTH, workers)
+    cloud = fill_holes(view.rgb, view.is_seen)
+    return encode_image(checkerboard(resized_rgb(panorama, OVERLAY_WIDTH), cloud), ".png")

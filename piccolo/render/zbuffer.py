@@ -1,14 +1,14 @@
-"""The cloud seen from a pose: z-buffered equirectangular views, and which points the camera sees."""
+"""The cloud seen from a pose: z-buffered views, which points the camera sees, whether it can stand there."""
 
 import math
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cloud.soa import PackedPoints
 from ..geometry.pose import Array, Pose
-from ..geometry.sphere import direction_to_pixel
+from ..geometry.sphere import direction_to_pixel, solid_angles
 from ..panorama.texels import channel
 from ..runtime.jit import kernel
 
@@ -21,18 +21,18 @@ VISIBLE_FACTOR = np.float32(1.08)
 VISIBLE_OFFSET = np.float32(0.1)
 MIN_VIEW_WIDTH, MAX_VIEW_WIDTH = 32, 4096  # [px] of a rendered view
 VISIBLE_WIDTH = 180  # cells of 2 degrees
+MIN_SEEN_FRACTION = 0.4  # of the sphere; less is seen from outside a scan
 
 
-@dataclass(frozen=True)
-class View:
+class View(NamedTuple):
     """What the camera sees of the cloud, on an equirectangular grid."""
 
-    depth: NDArray[np.float32]  # (H, W) range of the nearest point [m], inf where there is none
-    rgb: NDArray[np.float32]  # (H, W, 3) mean colour in [0, 1] of the points near that range, 0 where empty
+    depth: NDArray[np.float32]  # (H, W) range of what is nearest [m], inf where there is nothing
+    rgb: NDArray[Any]  # (H, W, 3) mean colour of what is near that range, 0 where there is nothing
 
     @property
     def is_seen(self) -> NDArray[np.bool_]:
-        """(H, W), true where a point was seen."""
+        """(H, W), true where something was seen."""
         return np.isfinite(self.depth)
 
 
@@ -115,7 +115,7 @@ def nearest_depth(points: PackedPoints, pose: Pose, width: int) -> NDArray[np.fl
 
 
 def render_view(points: PackedPoints, pose: Pose, width: int, band: float = 0.15) -> View:
-    """The cloud at `pose`, `width` cells around; colours are of the points within 1 + band of the nearest."""
+    """The cloud at `pose`, `width` cells around; colours (float32, 0 to 1) within 1 + band of the nearest."""
     depth = nearest_depth(points, pose, width)
     sums = np.zeros((len(depth), 4))
     R, t = pose.R_cam_from_world, pose.center_world
@@ -132,3 +132,13 @@ def visible_points(points: PackedPoints, center_world: Array) -> PackedPoints:
     R, t = pose.R_cam_from_world, pose.center_world
     count = select_visible(points.x, points.y, points.z, R, t, VISIBLE_WIDTH, depth, indices)
     return points.take(indices[:count])
+
+
+def is_free_space(points: PackedPoints, center: Array, width: int, min_clearance: float) -> bool:
+    """True if no point is within `min_clearance` [m] of `center` (3,), and points are seen all around.
+
+    Both follow from the nearest range in each cell of an equirectangular view `width` cells wide.
+    """
+    depth = nearest_depth(points, Pose(np.eye(3), center), width).reshape(-1, width)
+    seen = np.isfinite(depth).sum(axis=1) @ solid_angles(width) / (4.0 * math.pi)
+    return bool(depth.min() > min_clearance and seen > MIN_SEEN_FRACTION)

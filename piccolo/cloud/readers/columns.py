@@ -1,21 +1,97 @@
-"""Points from columns: chunks of arrays (N,) of x, y, z and red, green, blue, or of x, y, z and a scalar."""
+"""Points from columns: chunks of arrays (N,) of x, y, z and red, green, blue, or of x, y, z and a scalar.
 
-from collections.abc import Callable, Iterator, Sequence
+Colours of any type become 8 bits; their range follows from the declared type and is never guessed.
+"""
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import partial
+from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...errors import InputError
 from ..label_colors import Labels
-from .colors import brightest_of, colored_chunks
-from .intensity import intensity_reader
-from .labels import label_reader
-from .reader import ChunkReader, PointSource, PointsWithScalar, RawCloud, point_label
+from . import reader as raw
+from .reader import CUT, ChunkReader, PointSource, PointsWithScalar, RawCloud, point_label
+from .scalars import intensity_reader, label_reader
 
+# The value that means full brightness, by the type of a field without its byte order.
+BRIGHTEST = {"u1": 255.0, "u2": 65535.0, "f4": 1.0, "f8": 1.0}
+TYPES_WANTED = "uint8 0-255, uint16 0-65535 or float 0-1, one for all three"
+COLOR_NAMES = (
+    ("red", "green", "blue"),
+    ("r", "g", "b"),
+    ("diffuse_red", "diffuse_green", "diffuse_blue"),
+)
 Columns = list[NDArray[Any]]
 ColumnReader = Callable[[], Iterator[Columns]]  # each call from the start
+
+
+def color_names(names: Collection[str]) -> tuple[str, ...]:
+    """Which of a file's names are the three colours'; empty if none are."""
+    return next((three for three in COLOR_NAMES if all(name in names for name in three)), ())
+
+
+def brightest_of(path: Path, types: Sequence[str]) -> float:
+    """The value of full brightness in colours of these types, as "u1"."""
+    if len(set(types)) > 1 or types[0] not in BRIGHTEST:
+        raise InputError(f"{path}: the colours are of type {' '.join(types)}, wanted {TYPES_WANTED}")
+    return BRIGHTEST[types[0]]
+
+
+def colored_chunks(
+    chunks: Iterable[tuple[NDArray[np.generic], NDArray[np.generic]]],
+    brightest: float,
+    locate: Callable[[int], str],
+) -> Iterator[RawCloud]:
+    """Yield chunks of positions and colours (N, 3), each of any type, colours from 0 to `brightest`.
+
+    Raises InputError if a colour is out of range: `locate` turns a point's index into the file and a place.
+    """
+    num_before = 0
+    for points, values in chunks:
+        with np.errstate(invalid="ignore"):  # a NaN of the kind that signals
+            points_world = points.astype(np.float64)
+        if values.dtype == np.uint8 and brightest == BRIGHTEST["u1"]:
+            colors = np.array(values, dtype=np.uint8)
+        else:  # a point without a finite position needs no colour: it becomes black
+            is_finite: NDArray[np.bool_] = np.all(np.isfinite(points_world), axis=1)
+            numbers = np.where(is_finite[:, None], values, 0).astype(np.float64)
+            is_wrong = ~((numbers >= 0.0) & (numbers <= brightest)).all(axis=1)
+            if is_wrong.any():
+                wrong = int(np.argmax(is_wrong))
+                color = " ".join(f"{value:g}" for value in values[wrong].tolist())
+                place = locate(num_before + wrong)
+                raise InputError(f"{place} has the colour {color}, wanted 0 to {brightest:g}")
+            colors = np.rint(numbers * (255.0 / brightest)).astype(np.uint8)
+        num_before += len(colors)
+        yield RawCloud(points_world, colors)
+
+
+def read_records(path: Path, offset: int, count: int, dtype: np.dtype[Any]) -> Iterator[NDArray[Any]]:
+    """Yield `count` records from byte `offset` on, raw.CHUNK or fewer at once."""
+    most = max(1, min(raw.CHUNK, raw.MAX_BLOCK_SIZE // dtype.itemsize))
+    with path.open("rb") as file:
+        file.seek(offset)
+        for begin in range(0, count, most):
+            yield take_records(file, path, min(most, count - begin), dtype)
+
+
+def take_records(file: BufferedReader, path: Path, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """The next `count` records of a file; InputError if there are fewer."""
+    records = np.empty(count, dtype)
+    if file.readinto(records.view(np.uint8).data) < records.nbytes:
+        raise InputError(f"{path}: {CUT}")
+    return records
+
+
+def in_chunks(columns: list[NDArray[Any]]) -> Iterator[list[NDArray[Any]]]:
+    """Yield arrays of the same length, raw.CHUNK or fewer rows at once."""
+    for begin in range(0, len(columns[0]), raw.CHUNK):
+        yield [column[begin : begin + raw.CHUNK] for column in columns]
 
 
 def points_of(columns: Columns) -> NDArray[np.float64]:

@@ -1,33 +1,34 @@
-"""E57 files: the coloured points of all scans, each at its pose; decoded by libE57."""
+"""E57 files, decoded by libE57: the coloured points of all scans, each at its pose, and the images."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...geometry.point_transforms import rotate_points
+from ...geometry.pose import Array, Pose, rotate_points
 from .e57_file import (
     MAGIC,
     NAMESPACE,
     E57File,
-    Placement,
     child,
     children,
     number_of,
     opened,
     parsed_integer,
-    placement_of,
+    pose_of,
     refusing,
     scaled,
     text_of,
 )
-from .intensity import OPTION, intensity_reader
 from .reader import CHUNK, PLAIN, CloudFormat, CloudReadOptions, PointSource, RawCloud
+from .scalars import OPTION, intensity_reader
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
@@ -37,8 +38,14 @@ INTENSITY = "intensity"
 INVALID_COLOR, INVALID_INTENSITY = "isColorInvalid", "isIntensityInvalid"
 TOLERANCE = 0.01  # of 255, what a float colour may lie outside of its range
 WANTED = "wanted scans with colorRed colorGreen colorBlue"
-
-Array = NDArray[np.float64]
+KINDS = {
+    "spherical": "sphericalRepresentation",
+    "pinhole": "pinholeRepresentation",
+    "cylindrical": "cylindricalRepresentation",
+    "visual-reference": "visualReferenceRepresentation",
+}
+ENCODINGS = {"jpeg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n"}
+MAX_SIDE = 1 << 20  # [px]
 
 
 @dataclass(frozen=True)
@@ -52,7 +59,7 @@ class E57Scan:
     channels: tuple[str, ...]  # COLORS or INTENSITY alone
     invalid: tuple[str, ...]  # fields that are 0 in points that count
     color_ranges: tuple[tuple[float, float], ...]  # of each channel; none: the intensity is read
-    placement: Placement | None
+    pose: Pose | None  # the scanner is the camera
 
 
 class _UnusableError(Exception):
@@ -119,8 +126,8 @@ def _scan(file: E57File, element: Element, channels: tuple[str, ...], index: int
         raise InputError(f"{file.path}: {label} {found}; it is broken")
     names = tuple(name for name in invalid if name in fields)
     ranges = (_color_range(file.path, element, fields[name]) for name in channels if name != INTENSITY)
-    placement = placement_of(file.path, element)
-    return E57Scan(index, label, num_points, coordinates, channels, names, tuple(ranges), placement)
+    pose = pose_of(file.path, element)
+    return E57Scan(index, label, num_points, coordinates, channels, names, tuple(ranges), pose)
 
 
 def _num_bits(path: Path, field: Element) -> int:
@@ -173,20 +180,16 @@ def _read(path: Path, scans: list[E57Scan]) -> Iterator[tuple[E57Scan, Array, Ar
                 is_valid = np.ones(len(columns[scan.channels[0]]), dtype=np.bool_)
                 for name in scan.invalid:
                     is_valid &= columns[name] == 0
-                coordinates = [columns[name][is_valid] for name in scan.coordinates]
+                a, b, c = (columns[name][is_valid] for name in scan.coordinates)
                 channels = np.stack([columns[name][is_valid] for name in scan.channels], axis=1)
-                yield scan, _in_world(scan, *coordinates), channels
-
-
-def _in_world(scan: E57Scan, a: Array, b: Array, c: Array) -> Array:
-    """Points (N, 3) in the world of coordinates (N,): x y z, or range, azimuth, elevation."""
-    with np.errstate(over="ignore", invalid="ignore"):  # broken points may be infinite
-        if scan.coordinates == SPHERICAL:
-            a, b, c = a * np.cos(c) * np.cos(b), a * np.cos(c) * np.sin(b), a * np.sin(c)
-        points = np.stack([a, b, c], axis=1)
-        if placement := scan.placement:
-            return rotate_points(points, placement.R_world_from_local) + placement.center_world
-        return points
+                with np.errstate(over="ignore", invalid="ignore"):  # broken points may be infinite
+                    if scan.coordinates == SPHERICAL:
+                        a, b, c = a * np.cos(c) * np.cos(b), a * np.cos(c) * np.sin(b), a * np.sin(c)
+                    points = np.stack([a, b, c], axis=1)
+                    if scan.pose is not None:
+                        R_world_from_scan = scan.pose.R_cam_from_world.T
+                        points = rotate_points(points, R_world_from_scan) + scan.pose.center_world
+                yield scan, points, channels
 
 
 def _read_scan(file: E57File, scan: E57Scan) -> Iterator[dict[str, Array]]:
@@ -209,3 +212,80 @@ def _read_scan(file: E57File, scan: E57Scan) -> Iterator[dict[str, Array]]:
 
 
 E57 = CloudFormat("E57", frozenset({".e57"}), lambda head: head.startswith(MAGIC), open_e57)
+
+
+class E57Image(NamedTuple):
+    """One representation of one image of a file."""
+
+    name: str
+    kind: str  # of KINDS
+    encoding: str  # of ENCODINGS
+    size: int  # [byte]
+    width: int  # [px]
+    height: int  # [px]
+    fov_deg: tuple[float, float] | None  # of a spherical image, across and down
+    pose: Pose | None
+    scan_guid: str  # of the scan it belongs to, or empty
+    node: tuple[int, str, str]  # index in images2D, names of the representation and the blob
+
+
+def list_images(path: Path) -> list[E57Image]:
+    """The images of an E57 file, in its order."""
+    with opened(path) as file:
+        return list(_images(file))
+
+
+def read_image(path: Path, index: int) -> bytes:
+    """The JPEG or PNG file that is the image of that index in list_images."""
+    with opened(path) as file:
+        image = list(_images(file))[index]
+        number, representation, blob = image.node
+        with refusing(path, file.libe57):
+            content = file.image_file.root()["images2D"][number][representation][blob].read_buffer().tobytes()
+    if not content.startswith(ENCODINGS[image.encoding]):
+        raise InputError(f"{path}: image {index} begins with {content[:8]!r}, wanted a {image.encoding} file")
+    return bytes(content)
+
+
+def _images(file: E57File) -> Iterator[E57Image]:
+    """The representations of the elements of images2D that hold an image."""
+    elements = enumerate(children(file.root, "images2D"))
+    for (number, element), (kind, representation_name) in product(elements, KINDS.items()):
+        representation = child(element, representation_name)
+        for encoding in ENCODINGS:
+            blob = child(representation, f"{encoding}Image")
+            if representation is None or blob is None or blob.get("type") != "Blob":
+                continue
+            size = parsed_integer(file.path, blob.get("length", ""))
+            if not 0 < size <= file.size:  # libE57 reserves it
+                found = f"promises {size} bytes, found a file of {file.size} bytes"
+                raise InputError(f"{file.path}: image {number} {found}; it is broken")
+            yield E57Image(
+                name=text_of(element, "name"),
+                kind=kind,
+                encoding=encoding,
+                size=size,
+                width=_side(file.path, representation, "imageWidth"),
+                height=_side(file.path, representation, "imageHeight"),
+                fov_deg=_fov_deg(file.path, representation) if kind == "spherical" else None,
+                pose=pose_of(file.path, element),
+                scan_guid=text_of(element, "associatedData3DGuid"),
+                node=(number, representation_name, f"{encoding}Image"),
+            )
+
+
+def _side(path: Path, representation: Element, name: str) -> int:
+    value = number_of(path, child(representation, name)) or 0.0
+    if not 0 < value <= MAX_SIDE:
+        raise InputError(f"{path}: an image's {name} is {value:g}, wanted 1 to {MAX_SIDE}")
+    return int(value)
+
+
+def _fov_deg(path: Path, representation: Element) -> tuple[float, float] | None:
+    """What a spherical image covers [deg], across and down, if the file says how large its pixels are."""
+    width, height = (number_of(path, child(representation, name)) for name in ("pixelWidth", "pixelHeight"))
+    if width is None or height is None:
+        return None
+    across = width * _side(path, representation, "imageWidth")
+    down = height * _side(path, representation, "imageHeight")
+    return math.degrees(across), math.degrees(down)

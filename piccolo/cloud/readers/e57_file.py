@@ -9,17 +9,15 @@ import re
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...geometry.pose import rotation_from_quaternion_wxyz
+from ...geometry.pose import Array, Pose, rotation_from_quaternion_wxyz
 from ...runtime.optional import import_optional
 from .reader import quoted
 
@@ -34,16 +32,7 @@ INTEGER = re.compile(r"[+-]?[0-9]{1,19}")
 CHECK_ALL = 100  # [%] of the pages have their checksum verified
 
 
-@dataclass(frozen=True)
-class Placement:
-    """Where a scan or an image stands: `x_world = R_world_from_local @ x_local + center_world`."""
-
-    R_world_from_local: NDArray[np.float64]  # (3, 3)
-    center_world: NDArray[np.float64]  # (3,)
-
-
-@dataclass(frozen=True)
-class E57File:
+class E57File(NamedTuple):
     """An E57 file opened by libE57, and its XML."""
 
     path: Path
@@ -189,7 +178,7 @@ def parsed_integer(path: Path, text: str) -> int:
     return int(text)
 
 
-def placement_of(path: Path, element: Element) -> Placement | None:
+def pose_of(path: Path, element: Element) -> Pose | None:
     """The pose of a scan or an image; None if it has none. A part that is missing is the identity's."""
     pose = child(element, "pose")
     if pose is None:
@@ -199,8 +188,8 @@ def placement_of(path: Path, element: Element) -> Placement | None:
     if not 0.0 < np.linalg.norm(q) < math.inf:
         raise InputError(f"{path}: a pose's rotation is {q.tolist()}, wanted a quaternion w x y z")
     center_world = _numbers(path, child(pose, "translation"), "xyz")
-    return Placement(rotation_from_quaternion_wxyz(q), center_world)
+    return Pose(rotation_from_quaternion_wxyz(q).T, center_world)
 
 
-def _numbers(path: Path, element: Element | None, names: str) -> NDArray[np.float64]:
+def _numbers(path: Path, element: Element | None, names: str) -> Array:
     return np.array([number_of(path, child(element, name)) or 0.0 for name in names])

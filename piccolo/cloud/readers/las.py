@@ -7,11 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from .intensity import OPTION, intensity_reader
-from .labels import label_reader
-from .las_header import MAGIC, WANTED, LasHeader, read_header
-from .laz import MAX_CHUNK_SIZE, LasLayout, decompress, read_laz_layout
+from .las_file import (
+    MAGIC,
+    MAX_CHUNK_SIZE,
+    WANTED,
+    LasHeader,
+    LasLayout,
+    decompress,
+    read_header,
+    read_laz_layout,
+)
 from .reader import CHUNK, CUT, PLAIN, CloudFormat, CloudReadOptions, PointSource, PointsWithScalar, RawCloud
+from .scalars import OPTION, intensity_reader, label_reader
 
 WITHHELD_OLD, WITHHELD = 0x80, 0x04  # bits of the flags' byte, in the formats 0-5 and 6-10
 CLASS_OLD, CLASS = 0x1F, 0xFF  # bits of the class, in the same

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.pose import Array
-from .colors import BRIGHTEST
+from .columns import BRIGHTEST
 from .mesh_gltf import GLB_MAGIC, NO_MATERIAL
 from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply
 from .mesh_sampling import Surface, SurfaceInstance, sample_points
@@ -74,9 +74,8 @@ def _source(loaded: Loaded, scale: float) -> PointSource:
 def _instances(loaded: Loaded) -> tuple[list[SurfaceInstance], list[str]]:
     """The coloured surfaces where the scene puts them, and what the user should know."""
     scene, path = loaded.scene, loaded.path
-    surfaces = {
-        name: _surface(loaded, mesh) for name, mesh in scene.geometry.items() if hasattr(mesh, "faces")
-    }
+    meshes = {name: mesh for name, mesh in scene.geometry.items() if hasattr(mesh, "faces")}
+    surfaces = {name: _surface(loaded, mesh) for name, mesh in meshes.items()}
     instances, num_bare = [], 0
     nodes = [scene.graph.get(node) for node in scene.graph.nodes_geometry]
     # not by the nodes' names: trimesh makes some up by chance

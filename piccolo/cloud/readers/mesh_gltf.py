@@ -6,14 +6,12 @@ what it doesn't know, and follows nodes and copies shared data without a limit: 
 
 import json
 import struct
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import unquote
 
 from ...errors import InputError
-from .mesh_files import FolderResolver
-from .mesh_texture import first_line
+from .mesh_files import FolderResolver, first_line
 
 GLB_MAGIC = b"glTF"
 WANTED = "wanted a whole glTF 2.0 mesh"
@@ -37,8 +35,7 @@ COUNTS = {  # numbers that trimesh would count from the end if they were negativ
 Json = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Material:
+class Material(NamedTuple):
     """The base colour of a glTF material."""
 
     factor: tuple[float, float, float] = (1.0, 1.0, 1.0)  # linear light
@@ -151,15 +148,10 @@ def _material(path: Path, material: Json) -> Material:
     return Material((red, green, blue), texture)
 
 
-def _image_row(tree: Json, texture: Json) -> int:
-    """Which image a texture shows."""
-    given = tree["textures"][_count(texture["index"])]
-    return _count(given.get("extensions", {}).get("EXT_texture_webp", given)["source"])
-
-
 def _keep_base_colors(tree: Json, materials: list[Material]) -> None:
     """Leave the images of base colours only; materials take their rows as names."""
-    used = {_image_row(tree, material.texture) for material in materials if material.texture is not None}
+    shown = [tree["textures"][_count(m.texture["index"])] for m in materials if m.texture is not None]
+    used = {_count(t.get("extensions", {}).get("EXT_texture_webp", t)["source"]) for t in shown}
     tree["images"] = [image if i in used else {} for i, image in enumerate(tree.get("images", []))]
     tree["materials"] = [
         {"name": str(i), "pbrMetallicRoughness": {"baseColorTexture": material.texture}}

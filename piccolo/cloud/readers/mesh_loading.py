@@ -7,14 +7,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from io import BytesIO
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
 from ...runtime.optional import import_optional
-from .mesh_files import FolderResolver
+from .mesh_files import FolderResolver, Texture, check_image, first_line, own_limit, texture_of
 from .mesh_gltf import GLB_MAGIC, Material, sanitize_gltf
-from .mesh_texture import Texture, check_image, first_line, own_limit, texture_of
 
 WANTED = "wanted a mesh with textures, vertex colours or materials"
 # faces whose indices count back from the last vertex, or are 0; trimesh would take wrong vertices
@@ -139,17 +139,11 @@ def load_ply(path: Path) -> Loaded:
         raise InputError(f"{path}: names {len(textures)} textures, wanted one")
     _check_textures(resolver, textures)
     loaded = Loaded(path, _scene(resolver, content, "ply", bool(textures)))
-    for mesh in loaded.scene.geometry.values():
-        if "_ply_raw" in mesh.metadata:
-            _check_ply(path, mesh.metadata["_ply_raw"])
-    return loaded
-
-
-def _check_ply(path: Path, elements: dict[str, Any]) -> None:
-    """Refuse a file with fewer rows than promised."""
-    for name in ("vertex", "face"):
+    raw = [m.metadata["_ply_raw"] for m in loaded.scene.geometry.values() if "_ply_raw" in m.metadata]
+    for elements, name in product(raw, ("vertex", "face")):
         data, count = elements[name].get("data"), elements[name]["length"]
         columns = data.values() if isinstance(data, dict) else [data]
         found = min((len(column) for column in columns if column is not None), default=0)
         if found != count:
             raise InputError(f"{path}: the header promises {count} rows of '{name}', found {found}")
+    return loaded

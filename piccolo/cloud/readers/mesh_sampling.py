@@ -7,13 +7,13 @@ chance.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry.pose import Array
-from .mesh_texture import Texture
+from .mesh_files import Texture
 from .reader import CHUNK, RawCloud
 
 # 1 / p and 1 / p^2 of the plastic number p, the root of p^3 = p + 1
@@ -21,8 +21,7 @@ R2_STEPS = (0.7548776662466927, 0.5698402909980532)
 BLOCK = 1 << 18  # triangles whose corners are held at once
 
 
-@dataclass(frozen=True)
-class Surface:
+class Surface(NamedTuple):
     """Triangles of one material, in a frame of their own."""
 
     vertices: Array  # (V, 3), NaN: the triangle is left out
@@ -34,8 +33,7 @@ class Surface:
     is_linear: bool = False  # colors are linear light, not sRGB
 
 
-@dataclass(frozen=True)
-class SurfaceInstance:
+class SurfaceInstance(NamedTuple):
     """A surface where a node places it in the world."""
 
     surface: Surface

@@ -10,18 +10,16 @@ import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import IO, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from .colors import BRIGHTEST, brightest_of, colored_chunks
-from .fixed_records import in_chunks, read_records
+from .columns import BRIGHTEST, brightest_of, colored_chunks, in_chunks, read_records
 from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, point_label, quoted
 
 NPY_MAGIC, ZIP_MAGIC = b"\x93NUMPY", b"PK\x03\x04"
@@ -34,8 +32,7 @@ Parts = Iterable[tuple[NDArray[Any], NDArray[Any]]]
 WANTED = "wanted .npy of x y z r g b (N, 6) with colours 0-255, or .npz with points (N, 3) and colors (N, 3)"
 
 
-@dataclass(frozen=True)
-class ArrayInFile:
+class ArrayInFile(NamedTuple):
     """An array in a .npy file or in a member of an archive, not yet read."""
 
     path: Path

@@ -2,28 +2,26 @@
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
-from itertools import chain, islice
+from itertools import chain, islice, starmap
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from . import fixed_records
 from . import reader as raw
-from .colors import BRIGHTEST, colored_chunks
-from .intensity import check_option, intensity_reader
-from .reader import CUT, CloudReadOptions, PointSource, PointsWithScalar, RawCloud, quoted
+from .columns import BRIGHTEST, colored_chunks
+from .reader import CUT, CloudReadOptions, PointSource, RawCloud, quoted
+from .scalars import check_option, intensity_reader
 
 BLOCK = 1 << 20  # [byte] read at once; no line is longer
 COMMENT_MARKS = (b"#", b"//")
 NUM_WITH_INTENSITY = 4  # columns of a line without colours: x y z intensity
 
 
-@dataclass(frozen=True)
-class LineLayout:
+class LineLayout(NamedTuple):
     """Where the lines of numbers begin, and what is in one."""
 
     columns: tuple[int, ...] = ()  # that are read
@@ -82,21 +80,16 @@ class NumberLines:
         self.num_taken += num_skipped
         return num_skipped
 
-    def take_rows(self, count: int) -> NDArray[np.float64]:
+    def _take_rows(self, count: int) -> NDArray[np.float64]:
         """The wanted columns (R, C) of the next lines, R <= `count`; R = 0 at the end."""
         columns, num_columns = list(self.layout.columns), self.layout.num_columns
-        most = fixed_records.MAX_BLOCK_SIZE // (8 * (num_columns or len(columns)))
-        first = next(self._lines, None)
-        if first is None:
+        most = max(1, raw.MAX_BLOCK_SIZE // (8 * (num_columns or len(columns))))
+        if self.peek() is None:
             return np.empty((0, len(columns)))
+        lines = islice(self._lines, min(count, raw.CHUNK, most))
+        usecols = columns if num_columns is None else None
         try:
-            rows = np.loadtxt(
-                chain([first], islice(self._lines, min(count, raw.CHUNK, max(1, most)) - 1)),
-                comments=None,
-                delimiter=self.layout.delimiter,
-                usecols=columns if num_columns is None else None,
-                ndmin=2,
-            )
+            rows = np.loadtxt(lines, comments=None, delimiter=self.layout.delimiter, usecols=usecols, ndmin=2)
         except InputError:  # of line_blocks
             raise
         except ValueError as error:
@@ -112,7 +105,7 @@ class NumberLines:
         """Yield the wanted columns of `count` lines, or of all that are left, CHUNK or fewer at once."""
         num_rows = 0
         while num_rows != count:
-            rows = self.take_rows(raw.CHUNK if count is None else count - num_rows)
+            rows = self._take_rows(raw.CHUNK if count is None else count - num_rows)
             num_rows += len(rows)
             if len(rows):
                 yield rows
@@ -121,15 +114,17 @@ class NumberLines:
             else:
                 raise InputError(f"{self.path}: found {num_rows} of {count} points; the file is cut off")
 
-    def read_points(self, count: int | None = None) -> Iterator[RawCloud]:
-        """The points of as many lines as read_rows would read, columns x y z r g b, colours 0-255."""
-        first = self.num_taken
-        parts = ((rows[:, :3], rows[:, 3:]) for rows in self.read_rows(count))
-        return colored_chunks(parts, BRIGHTEST["u1"], lambda index: self.locate(first + index))
+    def read_points(self, count: int | None = None) -> Iterator[tuple[NDArray[np.float64], NDArray[Any]]]:
+        """Points (N, 3) of as many lines as read_rows would read, and what else is in the columns.
 
-    def read_scalars(self, count: int | None = None) -> Iterator[PointsWithScalar]:
-        """Points and what the fourth column says of them, of as many lines as read_rows would read."""
-        return ((rows[:, :3], rows[:, 3]) for rows in self.read_rows(count))
+        Colours (N, 3) of six columns x y z r g b, checked to be 0-255; the fourth (N,) of four.
+        """
+        first, rows = self.num_taken, self.read_rows(count)
+        if len(self.layout.columns) == NUM_WITH_INTENSITY:
+            return ((some[:, :3], some[:, 3]) for some in rows)
+        parts = ((some[:, :3], some[:, 3:]) for some in rows)
+        chunks = colored_chunks(parts, BRIGHTEST["u1"], lambda index: self.locate(first + index))
+        return ((chunk.points_world, chunk.colors) for chunk in chunks)
 
     def locate(self, index: int) -> str:
         """The file and the number in it of the line that comes after `index` others."""
@@ -186,7 +181,11 @@ def is_number(field: str) -> bool:
 
 def line_source(path: Path, layout: LineLayout, options: CloudReadOptions, wanted: str) -> PointSource:
     """The points of lines x y z r g b, colours 0-255, or of x y z intensity if the options allow it."""
+
+    def read() -> Iterator[tuple[NDArray[np.float64], NDArray[Any]]]:
+        return NumberLines(path, layout, wanted).read_points()
+
     if len(layout.columns) > NUM_WITH_INTENSITY:
-        return PointSource(path, lambda: NumberLines(path, layout, wanted).read_points())
+        return PointSource(path, lambda: starmap(RawCloud, read()))
     check_option(path, options, wanted)
-    return PointSource(path, intensity_reader(path, lambda: NumberLines(path, layout, wanted).read_scalars()))
+    return PointSource(path, intensity_reader(path, read))

@@ -1,26 +1,43 @@
 """PCD files of the Point Cloud Library, 0.5 to 0.7: ascii, binary and binary_compressed.
 
-VIEWPOINT is where the sensor was; the points are already in the cloud's frame, so it is not applied.
+VIEWPOINT is where the sensor was; the points are already in the cloud's frame, so it is not applied. The
+compression is LZF: runs of bytes as they are, and copies of what came before.
 """
 
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from .colors import color_names
-from .columns import ColumnReader, Columns, column_source, points_of
-from .fixed_records import in_chunks, read_records, take_records
-from .intensity import check_option
-from .lzf import MAX_RATIO, decompress_lzf
+from ...runtime.jit import inline_kernel, kernel
+from .columns import (
+    ColumnReader,
+    Columns,
+    color_names,
+    column_source,
+    in_chunks,
+    points_of,
+    read_records,
+    take_records,
+)
 from .number_lines import LineLayout, NumberLines
-from .pcd_header import WANTED, PcdField, PcdHeader, read_header
 from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, RawCloud, point_label, quoted
+from .scalars import check_option
 
+MAX_HEADER_SIZE = MAX_ROW_SIZE = 1 << 16  # [byte]; a row is a point
+MAX_COUNT_DIGITS = 10
+ENCODINGS = ("ascii", "binary", "binary_compressed")
+WANTED = "wanted a PCD file with the fields x y z and rgb, rgba or r g b"
+LZF_BROKEN = -1
+MAX_RATIO = 88  # three bytes can stand for a copy of 264
+MAX_LITERALS = 32  # a control byte below it is a run of one more bytes than it says
+LONG_COPY = 7  # the length in the control byte's upper three bits that has a byte of its own behind it
 FIRST_LINES = re.compile(rb"(?:#[^\n]*\n|[ \t\r\n])*(?:# \.PCD|VERSION[ \t]+0?\.\d)")
 PADDING = "_"
 BROKEN = "the file is cut off or broken"
@@ -34,6 +51,142 @@ TYPES = {  # of fields that are not colours on their own
 }
 
 
+@dataclass(frozen=True)
+class PcdField:
+    """One of a point's fields."""
+
+    name: str
+    type: str  # NumPy's, without byte order: all numbers are little-endian
+    count: int  # numbers
+    offset: int  # [byte] in a point
+    column: int  # of its first number among those of a point
+
+    @property
+    def size(self) -> int:
+        """Bytes of all its numbers."""
+        return int(self.type[1:]) * self.count
+
+
+class PcdHeader(NamedTuple):
+    """The header of a PCD file."""
+
+    path: Path
+    fields: tuple[PcdField, ...]
+    num_points: int
+    encoding: str  # one of ENCODINGS
+    size: int  # [byte], the data begin here
+
+    @property
+    def row_size(self) -> int:
+        """Bytes of a point in binary."""
+        return sum(field.size for field in self.fields)
+
+    @property
+    def num_columns(self) -> int:
+        """Numbers of a point."""
+        return sum(field.count for field in self.fields)
+
+
+def read_header(path: Path) -> PcdHeader:
+    """The header of a PCD file; SIZE, TYPE and COUNT may be missing, as in old ones: 4, F and 1."""
+    with path.open("rb") as file:
+        head = file.read(MAX_HEADER_SIZE)
+    entries: dict[str, list[str]] = {}
+    size = 0
+    for line in head.split(b"\n"):
+        size += len(line) + 1
+        words = line.decode("latin-1").split()
+        if words and not words[0].startswith("#"):
+            entries["FIELDS" if words[0] == "COLUMNS" else words[0]] = words[1:]
+        if "DATA" in entries:
+            break
+    if not {"FIELDS", "DATA"} <= entries.keys():
+        raise InputError(f"{path}: the header has no lines FIELDS and DATA, {WANTED}")
+    encoding = " ".join(entries["DATA"])
+    if encoding not in ENCODINGS:
+        raise InputError(f"{path}: DATA is {quoted(encoding.encode())}, wanted {', '.join(ENCODINGS)}")
+    fields = _fields(path, entries)
+    return PcdHeader(path, fields, _num_points(path, entries), encoding, min(size, len(head)))
+
+
+def _fields(path: Path, entries: dict[str, list[str]]) -> tuple[PcdField, ...]:
+    names = entries["FIELDS"]
+    usual = {"SIZE": "4", "TYPE": "F", "COUNT": "1"}
+    sizes, types, counts = (entries.get(key, [value] * len(names)) for key, value in usual.items())
+    if not len(names) == len(sizes) == len(types) == len(counts):
+        found = f"{len(names)} FIELDS, {len(sizes)} of SIZE, {len(types)} of TYPE and {len(counts)} of COUNT"
+        raise InputError(f"{path}: the header has {found}, wanted as many of each")
+    fields: list[PcdField] = []
+    offset = column = 0
+    for name, size, type_, text in zip(names, sizes, types, counts, strict=True):
+        count = _count(text)
+        if size not in ("1", "2", "4", "8") or type_ not in ("I", "U", "F") or not count:
+            found = quoted(f"{name} {size} {type_} {text}".encode())
+            wanted = "wanted SIZE 1 2 4 or 8, TYPE I U or F, COUNT 1 or more"
+            raise InputError(f"{path}: a field has the name, SIZE, TYPE and COUNT {found}, {wanted}")
+        fields.append(PcdField(name, type_.lower() + size, count, offset, column))
+        offset += fields[-1].size
+        column += count
+    if offset > MAX_ROW_SIZE:
+        raise InputError(f"{path}: the header promises {offset} bytes a point, wanted {MAX_ROW_SIZE} at most")
+    return tuple(fields)
+
+
+def _num_points(path: Path, entries: dict[str, list[str]]) -> int:
+    """POINTS, or WIDTH x HEIGHT; both must be the same if both are there."""
+    found = {key: entries[key] for key in ("WIDTH", "HEIGHT", "POINTS") if key in entries}
+    counts = {key: _count(" ".join(words)) for key, words in found.items()}
+    if None in counts.values() or not counts.keys() & {"POINTS", "WIDTH"}:
+        words = " ".join(f"{key} {' '.join(words)}" for key, words in found.items())
+        raise InputError(f"{path}: the header counts the points by {quoted(words.encode())}, {WANTED}")
+    num_cells = (counts.get("WIDTH") or 0) * (counts.get("HEIGHT", 1) or 0)
+    num_points = counts.get("POINTS", num_cells) or 0
+    if "WIDTH" in counts and num_cells != num_points:
+        raise InputError(f"{path}: the header promises {num_points} points in a grid of {num_cells}")
+    return num_points
+
+
+def _count(text: str) -> int | None:
+    return int(text) if text.isdecimal() and len(text) <= MAX_COUNT_DIGITS else None
+
+
+@inline_kernel
+def append(source, begin, length, out, filled):
+    """How much of `out` is filled when `length` bytes of `source` come after `filled`, or LZF_BROKEN."""
+    if begin < 0 or begin + length > len(source) or filled + length > len(out):
+        return LZF_BROKEN
+    for k in range(length):  # one by one: a copy that reaches into itself repeats a pattern
+        out[filled + k] = source[begin + k]
+    return filled + length
+
+
+@kernel
+def decompress_lzf(data, out):
+    """Fill `out` (uint8) from compressed `data` (uint8); the number of bytes filled, or LZF_BROKEN.
+
+    Broken is what would read before the beginning of `out`, or go beyond the end of either.
+    """
+    i, filled = 0, 0
+    while filled >= 0 and i < len(data):
+        control = int(data[i])
+        i += 1
+        if control < MAX_LITERALS:
+            filled = append(data, i, control + 1, out, filled)
+            i += control + 1
+        else:
+            length = control >> 5
+            is_long = length == LONG_COPY
+            if i + is_long >= len(data):
+                return LZF_BROKEN
+            if is_long:
+                length += int(data[i])
+                i += 1
+            distance = ((control & 31) << 8) + int(data[i]) + 1
+            filled = append(out, filled - distance, length + 2, out, filled)
+            i += 1
+    return filled
+
+
 def open_pcd(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     """The points of a PCD file.
 
@@ -44,7 +197,11 @@ def open_pcd(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     """
     header = read_header(path)
     fields = _wanted_fields(header, options)
-    _check_size(header)
+    found = path.stat().st_size - header.size
+    promised = {"ascii": 0, "binary": header.row_size * header.num_points}.get(header.encoding, 8)
+    if promised > found:  # of ASCII and compressed data this is known when they are read
+        counts = f"{header.num_points} points in {promised} bytes or more, found {found} bytes"
+        raise InputError(f"{path}: the header promises {counts}; {BROKEN}")
     read = {"ascii": _read_ascii, "binary": _read_binary, "binary_compressed": _read_compressed}
     read_columns = partial(read[header.encoding], header, fields)
     if fields[3].name in PACKED_NAMES:
@@ -76,19 +233,10 @@ def _wanted_fields(header: PcdHeader, options: CloudReadOptions) -> tuple[PcdFie
     return fields
 
 
-def _check_size(header: PcdHeader) -> None:
-    """Refuse a binary file that is shorter than its header promises; others are checked as they are read."""
-    found = header.path.stat().st_size - header.size
-    promised = {"ascii": 0, "binary": header.row_size * header.num_points}.get(header.encoding, 8)
-    if promised > found:
-        counts = f"{header.num_points} points in {promised} bytes or more, found {found} bytes"
-        raise InputError(f"{header.path}: the header promises {counts}; {BROKEN}")
-
-
 def _read_ascii(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterator[Columns]:
     layout = LineLayout(tuple(field.column for field in fields), header.num_columns, header.size)
-    for rows in NumberLines(header.path, layout, WANTED).read_rows(header.num_points):
-        yield list(rows.T)
+    rows = NumberLines(header.path, layout, WANTED).read_rows(header.num_points)
+    return (list(some.T) for some in rows)
 
 
 def _read_binary(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterator[Columns]:

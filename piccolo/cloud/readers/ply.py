@@ -15,14 +15,11 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from ...errors import InputError
-from .colors import COLOR_NAMES, color_names
-from .columns import Columns, column_source
-from .fixed_records import read_records
-from .intensity import INTENSITY_NAMES, check_option
-from .labels import LABEL_NAMES
+from .columns import COLOR_NAMES, Columns, color_names, column_source, read_records
 from .mesh import open_ply_mesh
 from .number_lines import LineLayout, NumberLines
 from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, quoted
+from .scalars import INTENSITY_NAMES, LABEL_NAMES, check_option
 
 MAGIC = (b"ply\n", b"ply\r")
 MAX_HEADER_SIZE = 1 << 20  # [byte]

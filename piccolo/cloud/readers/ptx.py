@@ -7,18 +7,19 @@ row vectors: [x y z 1]_world = [x y z 1] @ matrix. Then a line x y z intensity r
 import math
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
+from itertools import starmap
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...geometry.point_transforms import transform_points
-from .intensity import check_option, intensity_reader
+from ...geometry.pose import transform_points
 from .number_lines import NUM_WITH_INTENSITY, LineLayout, NumberLines
-from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, PointsWithScalar, RawCloud, quoted
+from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, RawCloud, quoted
+from .scalars import check_option, intensity_reader
 
 NUMBERS_A_LINE = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
 MAX_COUNT_DIGITS = 9
@@ -28,18 +29,11 @@ AFFINE = (0.0, 0.0, 0.0, 1.0)  # the matrix' last column
 WANTED = "wanted a PTX file with lines x y z intensity r g b, colours 0-255"
 
 
-@dataclass(frozen=True)
-class PtxScan:
+class PtxScan(NamedTuple):
     """How many points a scan has, and where they are in the world."""
 
     num_points: int  # lines that are there, whether the beam came back or not
     T_world_from_scanner: NDArray[np.float64]  # (4, 4)
-
-    def place(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """The points in the world of those (N, 3) whose beam came back, and which these are (N,)."""
-        is_return: NDArray[np.bool_] = np.any(points != 0.0, axis=1)
-        with np.errstate(invalid="ignore", over="ignore"):  # infinite points are left out later, as elsewhere
-            return transform_points(points[is_return], self.T_world_from_scanner), is_return
 
 
 def open_ptx(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
@@ -55,8 +49,9 @@ def open_ptx(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     while (header := _take_header(lines)) is not None:
         count, T_world_from_scanner = header
         last_of_header = lines.num_taken - 1
-        if not scans:
-            has_colors = _has_colors(lines, options)
+        if not scans and len((lines.peek() or b"").split()) == NUM_WITH_INTENSITY:
+            check_option(path, options, WANTED)
+            has_colors = False
         found = lines.skip(count)
         if found < count:
             found -= bool(found) and not _ends_with_a_line_end(path)
@@ -65,11 +60,9 @@ def open_ptx(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
         scans.append(PtxScan(found, T_world_from_scanner))
     if not scans:
         raise InputError(f"{path}: no line of numbers, {WANTED}")
-    num_points = sum(scan.num_points for scan in scans)
-    read_chunks = intensity_reader(path, partial(_read_scalar, path, scans))
-    if has_colors:
-        read_chunks = partial(_read_colored, path, scans)
-    return PointSource(path, read_chunks, num_points, tuple(warnings))
+    read = partial(_read, path, COLORED if has_colors else WITH_INTENSITY, scans)
+    read_chunks = (lambda: starmap(RawCloud, read())) if has_colors else intensity_reader(path, read)
+    return PointSource(path, read_chunks, sum(scan.num_points for scan in scans), tuple(warnings))
 
 
 def has_ptx_magic(head: bytes) -> bool:
@@ -111,36 +104,23 @@ def _numbers(line: bytes, num_wanted: int) -> list[float] | None:
     return values if len(values) == num_wanted and all(map(math.isfinite, values)) else None
 
 
-def _has_colors(lines: NumberLines, options: CloudReadOptions) -> bool:
-    """False if the next line is x y z intensity, and the options allow that."""
-    if len((lines.peek() or b"").split()) != NUM_WITH_INTENSITY:
-        return True
-    check_option(lines.path, options, WANTED)
-    return False
-
-
 def _ends_with_a_line_end(path: Path) -> bool:
     with path.open("rb") as file:
         file.seek(-1, os.SEEK_END)
         return file.read() in (b"\r", b"\n")
 
 
-def _read_colored(path: Path, scans: list[PtxScan]) -> Iterator[RawCloud]:
-    lines = NumberLines(path, COLORED, WANTED)
+def _read(
+    path: Path, layout: LineLayout, scans: list[PtxScan]
+) -> Iterator[tuple[NDArray[np.float64], NDArray[Any]]]:
+    """Yield points (N, 3) whose beam came back, in the world, and their colours (N, 3) or intensity (N,)."""
+    lines = NumberLines(path, layout, WANTED)
     for scan in scans:
         lines.skip(len(NUMBERS_A_LINE))
-        for chunk in lines.read_points(scan.num_points):
-            points_world, is_return = scan.place(chunk.points_world)
-            yield RawCloud(points_world, chunk.colors[is_return])
-
-
-def _read_scalar(path: Path, scans: list[PtxScan]) -> Iterator[PointsWithScalar]:
-    lines = NumberLines(path, WITH_INTENSITY, WANTED)
-    for scan in scans:
-        lines.skip(len(NUMBERS_A_LINE))
-        for points, intensity in lines.read_scalars(scan.num_points):
-            points_world, is_return = scan.place(points)
-            yield points_world, intensity[is_return]
+        for points, values in lines.read_points(scan.num_points):
+            is_return: NDArray[np.bool_] = np.any(points != 0.0, axis=1)
+            with np.errstate(invalid="ignore", over="ignore"):  # infinite points are left out later
+                yield transform_points(points[is_return], scan.T_world_from_scanner), values[is_return]
 
 
 PTX = CloudFormat("PTX", frozenset({".ptx"}), has_ptx_magic, open_ptx)

@@ -1,8 +1,8 @@
 """Types shared by the readers: chunks of points as they stand in a file."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from ..label_colors import Labels
 
 HEAD_SIZE = 512  # [byte] by which a format is known
 CHUNK = 1 << 20  # points of a chunk, at most
+MAX_BLOCK_SIZE = 1 << 28  # [byte] read at once, in which CHUNK records of 256 bytes have room
 CUT = "the file was cut while it was read, wanted a whole file"
 
 # points (N, 3) in the file's unit, and a number (N,) of each: intensity or label
@@ -18,8 +19,7 @@ PointsWithScalar = tuple[NDArray[np.float64], NDArray[np.float64]]
 ScalarReader = Callable[[], Iterator[PointsWithScalar]]  # each call from the start
 
 
-@dataclass(frozen=True)
-class CloudReadOptions:
+class CloudReadOptions(NamedTuple):
     """What the user wants of a reader."""
 
     intensity_as_gray: bool = False  # take intensity for a gray where a file has no colours
@@ -30,8 +30,7 @@ class CloudReadOptions:
 PLAIN = CloudReadOptions()
 
 
-@dataclass(frozen=True)
-class RawCloud:
+class RawCloud(NamedTuple):
     """Points in the file's order and unit, not yet checked."""
 
     points_world: NDArray[np.float64]  # (N, 3) in the file's unit, maybe NaN or infinite
@@ -41,8 +40,7 @@ class RawCloud:
 ChunkReader = Callable[[], Iterator[RawCloud]]  # each call from the start; InputError where the data break
 
 
-@dataclass(frozen=True)
-class PointSource:
+class PointSource(NamedTuple):
     """A file whose header has been checked, and the way to its points."""
 
     path: Path
@@ -51,8 +49,7 @@ class PointSource:
     warnings: tuple[str, ...] = ()  # one line each, for the user: what was decided about this file
 
 
-@dataclass(frozen=True)
-class CloudFormat:
+class CloudFormat(NamedTuple):
     """A format and its reader."""
 
     name: str

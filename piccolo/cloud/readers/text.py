@@ -1,17 +1,20 @@
-"""Text files of lines x y z r g b."""
+"""Text files of lines x y z r g b, and PTS files: x y z intensity r g b after a count of points."""
 
 from pathlib import Path
 
 from ...errors import InputError
-from .colors import color_names
-from .intensity import INTENSITY_NAMES
-from .number_lines import COMMENT_MARKS, NUM_WITH_INTENSITY, LineLayout, is_number, line_source
+from .columns import color_names
+from .number_lines import COMMENT_MARKS, NUM_WITH_INTENSITY, LineLayout, NumberLines, is_number, line_source
 from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, quoted
+from .scalars import INTENSITY_NAMES
 
 TEXT_SUFFIXES = frozenset({".txt", ".xyz", ".asc", ".csv", ".xyzrgb"})
 HEAD_SIZE = 1 << 16  # bytes in which the header is looked for
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 WANTED = "wanted lines of numbers x y z r g b, with decimal points, colours 0-255"
+# What is read of a line, by the number of its columns; those behind the seventh are left out.
+COLUMNS = {NUM_WITH_INTENSITY: (0, 1, 2, 3), 6: (0, 1, 2, 3, 4, 5), 7: (0, 1, 2, 4, 5, 6)}
+PTS_WANTED = "wanted lines x y z intensity r g b or x y z r g b, colours 0-255"
 
 
 def open_text(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
@@ -82,3 +85,26 @@ def _named_columns(header: str) -> tuple[int, ...]:
 
 
 TEXT = CloudFormat("text x y z r g b", TEXT_SUFFIXES, lambda head: False, open_text)
+
+
+def open_pts(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+    """The points of all scans of a PTS file.
+
+    All lines must have as many columns as the first one: x y z r g b if there are
+    six, x y z intensity r g b and what else there is if there are more. The intensity may have any range. A
+    lone count may stand before any line and is not compared with the lines, as many programs write a wrong
+    one.
+    """
+    lines = NumberLines(path, LineLayout(has_counts=True), PTS_WANTED)
+    line = lines.peek()
+    if line is None:
+        raise InputError(f"{path}: no line of numbers, {PTS_WANTED}")
+    num_columns = len(line.split())
+    if min(num_columns, 7) not in COLUMNS:
+        found = f"{num_columns} columns, no colours: {quoted(line)}"
+        raise InputError(f"{lines.locate(0)} has {found}, {PTS_WANTED}")
+    layout = LineLayout(COLUMNS[min(num_columns, 7)], num_columns, has_counts=True)
+    return line_source(path, layout, options, PTS_WANTED)
+
+
+PTS = CloudFormat("PTS", frozenset({".pts"}), lambda head: False, open_pts)

@@ -2,18 +2,18 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ...cloud import open_cloud
-from ...cloud.octree import build_octree
 from ...cloud.soa import pack_points
+from ...cloud.voxels import build_octree
 from ...confidence.score import VIEW_WIDTH, agreement_at
 from ...geometry.pose import Array, Pose
 from ...panorama import read_panorama
-from ...panorama.resize import shrink
+from ...panorama.model import shrink
 from ...runtime.threads import Progress, Workers, no_progress
 from ..scene import Query, Scene
 from .files import AXES
@@ -23,8 +23,7 @@ MIN_SCORE = 0.1  # other views of the same place may have as much, but seldom mo
 AS_GIVEN = "as given"
 
 
-@dataclass(frozen=True)
-class ConventionCheck:
+class ConventionCheck(NamedTuple):
     """How well a panorama fits the cloud at its pose, by this convention and by others."""
 
     image: str  # as queries.json has it
@@ -32,22 +31,17 @@ class ConventionCheck:
     best_score: float  # the highest score by any convention
     best: str  # that convention in words
 
-    @property
-    def is_good(self) -> bool:
-        """True if the pose fits, and no other convention fits better."""
-        return self.best == AS_GIVEN and self.score >= MIN_SCORE
 
-
-@dataclass(frozen=True)
-class Check:
+class Check(NamedTuple):
     """The checks of some panoramas of a scene."""
 
     panoramas: tuple[ConventionCheck, ...]
 
     @property
     def is_passed(self) -> bool:
-        """True if more than half of them fit."""
-        return 2 * sum(check.is_good for check in self.panoramas) > len(self.panoramas)
+        """True if more than half of them fit, and no other convention fits better."""
+        num_good = sum(check.best == AS_GIVEN and check.score >= MIN_SCORE for check in self.panoramas)
+        return 2 * num_good > len(self.panoramas)
 
     @property
     def advice(self) -> str:

@@ -2,16 +2,16 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ...cloud import FORMATS
-from ...cloud.validation import MAX_COORDINATE
+from ...cloud.stream import MAX_COORDINATE
 from ...errors import InputError
-from ...geometry.camera_axes import CAMERA_AXES, OPENGL_FROM_CAM
 from ...geometry.pose import Array, Pose, checked_rotation, orthonormal
+from ...geometry.rotations import CAMERA_AXES, OPENGL_FROM_CAM
 from ...panorama.picture import read_picture
+from ...render.surfel_renderer import encode_image
 from ...runtime.atomic import write_atomically
 from ...runtime.json_file import read_text
 from .model import Labels
@@ -83,7 +83,4 @@ def labels_by_index(path: Path, table: NDArray[np.uint16]) -> Labels:
 
 def write_labels(path: Path, labels: Labels) -> None:
     """Write labels (H, W) as a 16-bit PNG with one channel."""
-    is_done, png = cv2.imencode(".png", labels)
-    if not is_done:
-        raise InputError(f"{path}: {labels.shape} labels could not be encoded as PNG")
-    write_atomically(path, png.tobytes())
+    write_atomically(path, encode_image(labels, ".png"))

@@ -4,7 +4,6 @@ import csv
 import io
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +30,11 @@ Entry = tuple[Path | None, PosedPanorama]  # a row of the list: its cloud, None 
 
 def list_scenes(options: ConvertOptions) -> SceneList:
     """The rooms that the list names, or one by the folder's name."""
-    path = _list_of(options)
+    found = [path for name in LISTS if (path := options.folder / name).exists()]
+    if not options.poses and len(found) != 1:
+        wanted = f"wanted one of {', '.join(LISTS)}, or --poses"
+        raise InputError(f"{options.folder}: found {len(found)} lists, {wanted}")
+    path = options.poses or found[0]
     entries: dict[str, list[Entry]] = defaultdict(list)
     notes: list[str] = []
     rows = _rows(path, options, notes)
@@ -42,16 +45,6 @@ def list_scenes(options: ConvertOptions) -> SceneList:
         raise InputError(f"{path}: found no row with a picture, {WANTED}")
     specs = tuple(_scene_spec(room, entries[room], options) for room in sorted(entries))
     return SceneList(specs, tuple(notes))
-
-
-def _list_of(options: ConvertOptions) -> Path:
-    if options.poses:
-        return options.poses
-    found = [options.folder / name for name in LISTS if (options.folder / name).exists()]
-    if len(found) != 1:
-        wanted = f"wanted one of {', '.join(LISTS)}, or --poses"
-        raise InputError(f"{options.folder}: found {len(found)} lists, {wanted}")
-    return found[0]
 
 
 def _rows(path: Path, options: ConvertOptions, notes: list[str]) -> Iterator[Row]:
@@ -142,19 +135,16 @@ def _pose(where: str, row: Row, options: ConvertOptions) -> Pose:
 
 
 def _scene_spec(room: str, entries: list[Entry], options: ConvertOptions) -> SceneSpec:
-    clouds = {cloud or _cloud_of_all(options) for cloud, _ in entries}
+    found = {cloud for cloud, _ in entries}
+    clouds = {cloud or options.cloud or only_cloud_in(options.folder) for cloud in found}
+    if None in clouds:
+        raise InputError(f"{options.folder}: found no cloud, wanted one, or --cloud, or a column `cloud`")
     if len(clouds) > 1:
         names = ", ".join(sorted(map(str, clouds))[:2])
         raise InputError(f"room {room}: found the clouds {names}, wanted one")
     panoramas = _with_unique_names([panorama for _, panorama in entries])
-    return SceneSpec(room, (CloudPart(clouds.pop()),), lambda: panoramas, source={"dataset": NAME})
-
-
-def _cloud_of_all(options: ConvertOptions) -> Path:
-    cloud = options.cloud or only_cloud_in(options.folder)
-    if cloud is None:
-        raise InputError(f"{options.folder}: found no cloud, wanted one, or --cloud, or a column `cloud`")
-    return cloud
+    parts = tuple(CloudPart(cloud) for cloud in clouds if cloud)
+    return SceneSpec(room, parts, lambda: panoramas, source={"dataset": NAME})
 
 
 def _with_unique_names(panoramas: list[PosedPanorama]) -> list[PosedPanorama]:
@@ -162,7 +152,7 @@ def _with_unique_names(panoramas: list[PosedPanorama]) -> list[PosedPanorama]:
     if len({panorama.name for panorama in panoramas}) == len(panoramas):
         return panoramas
     return [
-        replace(panorama, name=f"{number:05d}_{name}", files={f"{number:05d}_{name}": image})
+        panorama._replace(name=f"{number:05d}_{name}", files={f"{number:05d}_{name}": image})
         for number, panorama in enumerate(panoramas)
         for name, image in panorama.files.items()
     ]

@@ -2,7 +2,6 @@
 
 import re
 from collections import defaultdict
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -34,14 +33,15 @@ def list_scenes(options: ConvertOptions) -> SceneList:
             missing.append(str(folder))
             continue
         faces = _faces_in(folder / SKYBOXES)
-        posed = {place: files for place, files in faces.items() if _is_whole(folder, place, files)}
+        whole = [place for place, files in faces.items() if len(files) == NUM_FACES]
+        posed = {place: faces[place] for place in whole if _pose_file(folder, place, SKYBOX_YAW).exists()}
         if len(posed) < len(faces):
             notes.append(f"{folder}: {len(faces) - len(posed)} skyboxes without a pose or without six faces")
         read_panoramas = partial(_posed_panoramas, folder, posed)
         parts = tuple(map(CloudPart, meshes))
         specs.append(SceneSpec(folder.resolve().name, parts, read_panoramas, source={"dataset": NAME}))
     listed = scene_list(options.folder, specs, missing, f"HOUSE/{SKYBOXES} with a mesh")
-    return replace(listed, notes=(*listed.notes, *notes))
+    return listed._replace(notes=(*listed.notes, *notes))
 
 
 def _faces_in(folder: Path) -> dict[str, dict[str, Path]]:
@@ -51,10 +51,6 @@ def _faces_in(folder: Path) -> dict[str, dict[str, Path]]:
         if match := FACE.match(path.name):
             faces[match[1]][f"{match[1]}/{path.name}"] = path
     return faces
-
-
-def _is_whole(folder: Path, place: str, files: dict[str, Path]) -> bool:
-    return len(files) == NUM_FACES and _pose_file(folder, place, SKYBOX_YAW).exists()
 
 
 def _pose_file(folder: Path, place: str, yaw: int) -> Path:

@@ -3,13 +3,13 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...geometry.point_transforms import rotate_points
-from ...geometry.pose import Array, Pose
+from ...geometry.pose import Array, Pose, rotate_points
 
 Labels = NDArray[np.uint16]  # (H, W) the class of each pixel, 0 where unknown
 
@@ -30,16 +30,14 @@ class ConvertOptions:
     direction: str | None = None
 
 
-@dataclass(frozen=True)
-class CloudPart:
+class CloudPart(NamedTuple):
     """A file with points of a scene, in any format of piccolo.cloud."""
 
     path: Path
     label: int = 0  # of all its points
 
 
-@dataclass(frozen=True)
-class PosedPanorama:
+class PosedPanorama(NamedTuple):
     """A panorama with its true pose in the dataset's cloud."""
 
     name: str  # below images/
@@ -49,8 +47,7 @@ class PosedPanorama:
     read_labels: Callable[[], Labels] | None = None
 
 
-@dataclass(frozen=True)
-class RigidTransform:
+class RigidTransform(NamedTuple):
     """x_written = R_written_from_dataset @ x_dataset + shift."""
 
     R_written_from_dataset: Array  # (3, 3)
@@ -78,8 +75,7 @@ class SceneSpec:
     source: dict[str, object] = field(default_factory=dict)  # for queries.json: how it was made
 
 
-@dataclass(frozen=True)
-class SceneList:
+class SceneList(NamedTuple):
     """The scenes of a dataset."""
 
     specs: tuple[SceneSpec, ...]

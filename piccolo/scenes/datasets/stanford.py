@@ -4,10 +4,9 @@ import json
 import re
 from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,8 +45,7 @@ AREA_5B = RigidTransform(
 WANTED_POSE = "wanted JSON with camera_location and final_camera_rotation"
 
 
-@dataclass(frozen=True)
-class Picture:
+class Picture(NamedTuple):
     """A panorama and the files that belong to it."""
 
     path: Path

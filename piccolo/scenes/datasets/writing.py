@@ -5,16 +5,15 @@ import math
 import os
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from ...cloud import open_source
 from ...cloud.ply_writer import vertex_rows, writing_ply
 from ...cloud.readers.reader import CHUNK
-from ...cloud.validation import Chunk, PointValidator
+from ...cloud.stream import Chunk, PointValidator
 from ...errors import InputError, unreadable
 from ...runtime.atomic import check_output_folder, replacing_folder
 from ...runtime.threads import Progress, no_progress
@@ -26,8 +25,7 @@ IMAGES, LABELS = "images", "labels"  # folders of a scene
 Transfer = Literal["symlink", "copy"]
 
 
-@dataclass(frozen=True)
-class Written:
+class Written(NamedTuple):
     """The scene that was written, or was there already."""
 
     folder: Path
@@ -46,7 +44,12 @@ def write_scene(
     """
     folder = out / spec.name
     if (folder / QUERIES_NAME).exists():
-        return _there_already(spec, folder)
+        scene = read_scene(folder)
+        source = json.loads((folder / QUERIES_NAME).read_text()).get("source")
+        if source != spec.source:
+            found = f"found a scene of {json.dumps(source)}, wanted {json.dumps(spec.source)}"
+            raise InputError(f"{folder}: {found}: remove it, or change --out")
+        return Written(folder, None, len(scene.queries))
     folder.parent.mkdir(parents=True, exist_ok=True)
     check_output_folder(folder)
     panoramas = spec.read_panoramas()
@@ -58,15 +61,6 @@ def write_scene(
         queries = [_write_panorama(spec, panorama, unfinished, transfer) for panorama in panoramas]
         write_queries(unfinished, queries, source=spec.source)
     return Written(folder, num_points, len(queries), tuple(warnings))
-
-
-def _there_already(spec: SceneSpec, folder: Path) -> Written:
-    scene = read_scene(folder)
-    source = json.loads((folder / QUERIES_NAME).read_text()).get("source")
-    if source != spec.source:
-        found, wanted = json.dumps(source), json.dumps(spec.source)
-        raise InputError(f"{folder}: found a scene of {found}, wanted {wanted}: remove it, or change --out")
-    return Written(folder, None, len(scene.queries))
 
 
 def _write_cloud(spec: SceneSpec, path: Path, warnings: list[str], show: Progress) -> int:

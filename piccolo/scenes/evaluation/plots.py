@@ -8,7 +8,7 @@ import numpy as np
 
 from ...runtime.figure import new_figure
 from .query_result import QueryResult, Thresholds
-from .statistics import Point
+from .tables import Point
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,9 +42,8 @@ def errors_figure(runs: Mapping[str, Sequence[QueryResult]], thresholds: Thresho
         _fraction_below(position, [row.position_error for row in rows], name)
         _fraction_below(rotation, [float(np.degrees(row.rotation_error)) for row in rows], name)
         for angle_deg in SHOWN_ANGLES_DEG:
-            inside = [
-                row.position_error if np.degrees(row.rotation_error) < angle_deg else np.inf for row in rows
-            ]
+            pairs = [(row.position_error, np.degrees(row.rotation_error)) for row in rows]
+            inside = [distance if angle < angle_deg else np.inf for distance, angle in pairs]
             _fraction_below(recall, inside, f"{name}, under {angle_deg:g} deg")
     position.axvline(thresholds.max_distance, color="gray", linestyle=":")
     rotation.axvline(float(np.degrees(thresholds.max_angle)), color="gray", linestyle=":")
@@ -69,12 +68,8 @@ def risk_figure(points: Sequence[Point]) -> "Figure":
         inside = [p for p in points if p.confidence >= line]
         if inside:
             axes.plot(100 * inside[-1].coverage, 100 * inside[-1].risk, "o", label=f"confidence {line}")
-    axes.set(
-        xlabel="accepted [%]",
-        ylabel="wrong of the accepted [%]",
-        xlim=(0, 100),
-        ylim=(0, max(5.0, 1.1 * max(risk))),
-    )
+    axes.set(xlabel="accepted [%]", ylabel="wrong of the accepted [%]")
+    axes.set(xlim=(0, 100), ylim=(0, max(5.0, 1.1 * max(risk))))
     axes.grid(alpha=0.3)
     if axes.get_legend_handles_labels()[0]:
         axes.legend()

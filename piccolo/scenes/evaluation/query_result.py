@@ -4,12 +4,12 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from ...errors import InputError
-from ...geometry.pose import Array, Pose
-from ...geometry.pose_error import MAX_ANGLE, MAX_DISTANCE, pose_errors
+from ...geometry.pose import MAX_ANGLE, MAX_DISTANCE, Array, Pose, pose_errors
 from ...result import Result
 from ...runtime.json_file import DAMAGE
 from ...scan import Scan
@@ -18,8 +18,7 @@ from ..scene import Query, Scene
 FORMAT = "piccolo-evaluation/1"
 
 
-@dataclass(frozen=True)
-class Thresholds:
+class Thresholds(NamedTuple):
     """Errors below which a pose is correct."""
 
     max_distance: float = MAX_DISTANCE  # [m]

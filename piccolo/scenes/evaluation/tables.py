@@ -1,21 +1,90 @@
-"""Tables of an evaluation, of one run or of two side by side, as Markdown and CSV."""
+"""Statistics and tables of an evaluation, of one run or of two side by side, as Markdown and CSV."""
 
 import csv
 import io
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .query_result import QueryResult, Thresholds
-from .statistics import ACCURACY_DISTANCES, Point, Summary, accuracies, summarize
+from ...confidence.confidence import LOCALIZED
+from .query_result import PAPER_THRESHOLDS, QueryResult, Thresholds
 
+HUGE = 1e30  # stands for an error without a pose while quartiles are interpolated
+ACCURACY_DISTANCES = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # [m]
 CONFIDENCES = (0.999, 0.99, 0.95, 0.9, 0.7, 0.5, 0.2, 0.0)
 ALL = "all"
 
 
-@dataclass(frozen=True)
-class Table:
+class Summary(NamedTuple):
+    """What a table says about some queries."""
+
+    num_queries: int
+    num_correct: int
+    num_localized: int
+    num_wrong: int  # of the localized
+    position_quartiles: NDArray[np.float64]  # (3,) [m] over all queries, inf where there is no pose
+    rotation_quartiles: NDArray[np.float64]  # (3,) [rad]
+    seconds: float  # median
+
+    @property
+    def accuracy(self) -> float:
+        """Fraction of correct poses, whatever their status."""
+        return self.num_correct / self.num_queries
+
+
+def quartiles(values: Sequence[float]) -> NDArray[np.float64]:
+    """The 25th, 50th and 75th percentiles (3,) of values, some of which may be infinite."""
+    found = np.quantile(np.minimum(values, HUGE), [0.25, 0.5, 0.75])
+    return np.where(found > 1e-6 * HUGE, np.inf, found)
+
+
+def summarize(rows: Sequence[QueryResult], thresholds: Thresholds = PAPER_THRESHOLDS) -> Summary:
+    """The statistics of one or more queries."""
+    is_correct = [row.is_correct(thresholds) for row in rows]
+    is_localized = [row.result.status == LOCALIZED for row in rows]
+    return Summary(
+        num_queries=len(rows),
+        num_correct=sum(is_correct),
+        num_localized=sum(is_localized),
+        num_wrong=sum(a and not b for a, b in zip(is_localized, is_correct, strict=True)),
+        position_quartiles=quartiles([row.position_error for row in rows]),
+        rotation_quartiles=quartiles([row.rotation_error for row in rows]),
+        seconds=float(np.median([row.seconds for row in rows])),
+    )
+
+
+def accuracies(rows: Sequence[QueryResult], max_angle: float) -> list[float]:
+    """The fraction of queries below each of ACCURACY_DISTANCES [m] and below an angle [rad]."""
+    levels = [Thresholds(distance, max_angle) for distance in ACCURACY_DISTANCES]
+    return [sum(row.is_correct(level) for row in rows) / len(rows) for level in levels]
+
+
+class Point(NamedTuple):
+    """One point of the curve of risk over coverage."""
+
+    confidence: float  # results from here on are accepted
+    coverage: float  # fraction that is accepted
+    risk: float  # fraction of these that is wrong
+    num_wrong: int
+
+
+def risk_and_coverage(rows: Sequence[QueryResult], thresholds: Thresholds = PAPER_THRESHOLDS) -> list[Point]:
+    """The curve of risk over coverage, a point for each distinct confidence, from the highest down."""
+    points: dict[float, Point] = {}
+    num_wrong = 0
+    for k, row in enumerate(sorted(rows, key=lambda row: -row.result.confidence), 1):
+        num_wrong += not row.is_correct(thresholds)
+        confidence = row.result.confidence
+        points[confidence] = Point(confidence, k / len(rows), num_wrong / k, num_wrong)
+    return list(points.values())
+
+
+Pair = tuple[QueryResult, QueryResult]  # the same query in two runs
+
+
+class Table(NamedTuple):
     """A table of text; the first `num_left` columns are words."""
 
     title: str
@@ -35,17 +104,15 @@ class Table:
 def per_query(rows: Sequence[QueryResult]) -> Table:
     """One line a query."""
     columns = "scene", "panorama", "status", "error [m]", "error [deg]", "confidence", "score", "margin"
-    return Table("", (*columns, "loss", "seconds"), tuple(_query_cells(row) for row in rows), 3)
-
-
-def _query_cells(row: QueryResult) -> tuple[str, ...]:
-    result = row.result
-    evidence = result.evidence
-    score = (f"{evidence.score:.2f}", f"{evidence.margin:.2f}") if evidence else ("-", "-")
-    errors = f"{row.position_error:.4f}", f"{np.degrees(row.rotation_error):.3f}"
-    loss = "-" if result.loss is None else f"{result.loss:.3f}"
-    words = row.scene, row.image, result.status
-    return (*words, *errors, f"{result.confidence:.3f}", *score, loss, f"{row.seconds:.2f}")
+    cells = []
+    for row in rows:
+        result, evidence = row.result, row.result.evidence
+        score = (f"{evidence.score:.2f}", f"{evidence.margin:.2f}") if evidence else ("-", "-")
+        errors = f"{row.position_error:.4f}", f"{np.degrees(row.rotation_error):.3f}"
+        loss = "-" if result.loss is None else f"{result.loss:.3f}"
+        words = row.scene, row.image, result.status
+        cells.append((*words, *errors, f"{result.confidence:.3f}", *score, loss, f"{row.seconds:.2f}"))
+    return Table("", (*columns, "loss", "seconds"), tuple(cells), 3)
 
 
 def groups(rows: Sequence[QueryResult]) -> Iterator[tuple[str, list[QueryResult]]]:
@@ -63,15 +130,15 @@ def summary_table(rows: Sequence[QueryResult], thresholds: Thresholds, title: st
     words = f"{title}; correct: under {distance:g} m and {angle_deg:g} deg"
     errors = "t 25 % [m]", "t 50 %", "t 75 %", "R 25 % [deg]", "R 50 %", "R 75 %"
     columns = "queries", "number", "correct", "accuracy", *errors, "localized", "wrong of these", "s"
-    cells = tuple((name, *_summary_cells(summarize(some, thresholds))) for name, some in groups(rows))
-    return Table(words, columns, cells)
-
-
-def _summary_cells(s: Summary) -> tuple[str, ...]:
-    meters = [f"{value:.4f}" for value in s.position_quartiles]
-    degrees = [f"{value:.3f}" for value in np.degrees(s.rotation_quartiles)]
-    counts = f"{s.num_queries}", f"{s.num_correct}", f"{s.accuracy:.3f}"
-    return (*counts, *meters, *degrees, f"{s.num_localized}", f"{s.num_wrong}", f"{s.seconds:.2f}")
+    cells = []
+    for name, some in groups(rows):
+        s = summarize(some, thresholds)
+        meters = [f"{value:.4f}" for value in s.position_quartiles]
+        degrees = [f"{value:.3f}" for value in np.degrees(s.rotation_quartiles)]
+        counts = f"{s.num_queries}", f"{s.num_correct}", f"{s.accuracy:.3f}"
+        ends = f"{s.num_localized}", f"{s.num_wrong}", f"{s.seconds:.2f}"
+        cells.append((name, *counts, *meters, *degrees, *ends))
+    return Table(words, columns, tuple(cells))
 
 
 def threshold_table(rows: Sequence[QueryResult], thresholds: Thresholds) -> Table:
@@ -109,49 +176,33 @@ def csv_text(rows: Sequence[QueryResult]) -> str:
     return file.getvalue()
 
 
-@dataclass(frozen=True)
-class Pair:
-    """The same query in two runs."""
-
-    first: QueryResult
-    second: QueryResult
-
-    def has_changed(self, thresholds: Thresholds) -> bool:
-        """True if one run is correct where the other is wrong, or their statuses differ."""
-        is_other_status = self.first.result.status != self.second.result.status
-        return is_other_status or self.first.is_correct(thresholds) != self.second.is_correct(thresholds)
-
-
 def pair_up(first: Sequence[QueryResult], second: Sequence[QueryResult]) -> list[Pair]:
     """The queries that both runs have, in the order of their names."""
     others = {row.key: row for row in second}
-    pairs = [Pair(row, others[row.key]) for row in first if row.key in others]
-    return sorted(pairs, key=lambda pair: pair.first.key)
+    pairs = [(row, others[row.key]) for row in first if row.key in others]
+    return sorted(pairs, key=lambda pair: pair[0].key)
 
 
 def side_by_side(pairs: Sequence[Pair], names: tuple[str, str], thresholds: Thresholds) -> Table:
     """The statistics of two runs over the queries that both have."""
-    runs = [summarize([p.first for p in pairs], thresholds), summarize([p.second for p in pairs], thresholds)]
     columns = "run", "queries", "correct", "accuracy", "localized", "wrong of these"
-    rows = tuple((name, *_cells(run)) for name, run in zip(names, runs, strict=True))
-    return Table("", (*columns, "t 50 % [m]", "R 50 % [deg]", "s"), rows)
-
-
-def _cells(s: Summary) -> tuple[str, ...]:
-    medians = f"{s.position_quartiles[1]:.4f}", f"{np.degrees(s.rotation_quartiles[1]):.3f}"
-    counts = f"{s.num_queries}", f"{s.num_correct}", f"{s.accuracy:.3f}", f"{s.num_localized}"
-    return (*counts, f"{s.num_wrong}", *medians, f"{s.seconds:.2f}")
+    rows = []
+    for k, name in enumerate(names):
+        s = summarize([pair[k] for pair in pairs], thresholds)
+        counts = f"{s.num_queries}", f"{s.num_correct}", f"{s.accuracy:.3f}", f"{s.num_localized}"
+        medians = f"{s.position_quartiles[1]:.4f}", f"{np.degrees(s.rotation_quartiles[1]):.3f}"
+        rows.append((name, *counts, f"{s.num_wrong}", *medians, f"{s.seconds:.2f}"))
+    return Table("", (*columns, "t 50 % [m]", "R 50 % [deg]", "s"), tuple(rows))
 
 
 def changes(pairs: Sequence[Pair], thresholds: Thresholds) -> Table:
     """The queries that one run alone gets right, or whose statuses differ."""
     rows = []
-    for pair in pairs:
-        if pair.has_changed(thresholds):
-            was, is_now = pair.first.is_correct(thresholds), pair.second.is_correct(thresholds)
+    for first, second in pairs:
+        was, is_now = first.is_correct(thresholds), second.is_correct(thresholds)
+        if was != is_now or first.result.status != second.result.status:
             kind = "same error" if was == is_now else "better" if is_now else "worse"
-            cells = _outcome(pair.first), _outcome(pair.second)
-            rows.append((pair.first.scene, pair.first.image, kind, *cells))
+            rows.append((first.scene, first.image, kind, _outcome(first), _outcome(second)))
     columns = "scene", "panorama", "second is", "first", "second"
     return Table("queries that changed", columns, tuple(rows), 5)
 

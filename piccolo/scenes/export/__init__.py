@@ -6,11 +6,9 @@ from pathlib import Path
 from ...errors import InputError
 from ...result import Result
 from ...runtime.atomic import check_output, check_output_folder
-from .geojson import GEOJSON
+from .formats import COLMAP, CSV, GEOJSON, KITTI, NERFSTUDIO, OPENSFM, POTREE, TUM
 from .gpano import GPANO
-from .pose_lists import CSV, KITTI, POTREE, TUM
 from .posed_images import Format, Options, Selection, posed_images, select, true_results
-from .reconstructions import COLMAP, NERFSTUDIO, OPENSFM
 
 __all__ = ["FORMATS", "Format", "Options", "Selection", "export", "select", "true_results"]
 

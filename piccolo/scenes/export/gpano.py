@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ...errors import InputError
-from ...geometry.camera_axes import DECIMALS, heading_pitch_roll_deg
+from ...geometry.rotations import DECIMALS, heading_pitch_roll_deg
 from ...panorama.gpano import CROP_FIELDS, NAMESPACE, PREFIX
 from ...panorama.picture import opened
 from ...runtime.atomic import replacing_folder, write_atomically

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,15 +15,14 @@ from ...confidence.confidence import LOCALIZED
 from ...errors import InputError
 from ...geometry.pose import Pose
 from ...panorama import panorama_size
-from ...panorama.crop import ASPECT_TOLERANCE
+from ...panorama.gpano import ASPECT_TOLERANCE
 from ...result import Result
 from ..scene import Scene
 
 TIMESTAMP = re.compile(r"\d+(\.\d+)?")
 
 
-@dataclass(frozen=True)
-class PosedImage:
+class PosedImage(NamedTuple):
     """One picture with its pose, as it is to be written."""
 
     name: str  # of the picture, relative to the folder of images
@@ -52,8 +52,7 @@ class Options:
             raise InputError(f"--offset: found {self.offset}, wanted three finite numbers")
 
 
-@dataclass(frozen=True)
-class Format:
+class Format(NamedTuple):
     """How the poses are written in one format."""
 
     name: str
@@ -72,8 +71,7 @@ def check_size(label: str, size: tuple[int, int]) -> None:
         raise InputError(f"{label}: found {width} x {height}, wanted width = 2 x height (a full sphere)")
 
 
-@dataclass(frozen=True)
-class Selection:
+class Selection(NamedTuple):
     """The results to write, and how many others were left out for which reason."""
 
     results: tuple[Result, ...]

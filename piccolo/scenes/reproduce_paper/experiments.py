@@ -1,24 +1,30 @@
-"""The experiments: the conditions that each compares, and what the paper found there.
+"""The experiments: the conditions that each compares, what the paper found there, table and picture.
 
 The paper's figures are of its own data (Stanford2D-3D-S, OmniScenes, MPO) on an RTX 2080 (Kim et al., ICCV
 2021): they say what to expect of a trend, and compare in full only on the same data.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from ...coarse_to_fine.settings import CoarseToFineSettings
 from ...paper.settings import PaperSettings
+from ...runtime.figure import new_figure
+from ..evaluation.plots import figure_png
+from ..evaluation.query_result import QueryResult
+from ..evaluation.tables import Table, summarize
 from .transforms import SceneTransform, flipped, identity, with_count, with_fraction, with_random_rotation
 
 Settings = CoarseToFineSettings | PaperSettings
 NO_FIGURE = "-"
 RUNTIMES = {10_000: "1.77 s + 0.01 s", 100_000: "1.90 s + 0.01 s", 1_000_000: "3.74 s + 0.02 s"}
+COLUMNS = ("", "preset", "queries", "accuracy", "t 50 % [m]", "t of correct [m]", "R 50 % [deg]")
 
 
-@dataclass(frozen=True)
-class Condition:
+class Condition(NamedTuple):
     """One line of an experiment's table."""
 
     name: str
@@ -37,8 +43,7 @@ class Condition:
 ConditionsOf = Callable[[Sequence[Settings], Sequence[str]], list[Condition]]
 
 
-@dataclass(frozen=True)
-class Experiment:
+class Experiment(NamedTuple):
     """A question, and the conditions that answer it."""
 
     title: str
@@ -141,3 +146,52 @@ EXPERIMENTS = {
     ),
     "variants": Experiment("splits of the data: changed scenes, light", "a line a split", _variants),
 }
+
+
+def table(title: str, found: Sequence[tuple[Condition, Sequence[QueryResult]]]) -> Table:
+    """A line a condition, the paper's figure at its end."""
+    columns = (*COLUMNS, "search s", "refine s", "localized", "wrong of these", "the paper")
+    return Table(title, columns, tuple(_cells(condition, rows) for condition, rows in found), 2)
+
+
+def _cells(condition: Condition, rows: Sequence[QueryResult]) -> tuple[str, ...]:
+    summary = summarize(rows)
+    errors = f"{summary.position_quartiles[1]:.4f}", f"{_median_of_correct(rows):.4f}"
+    angle = f"{np.degrees(summary.rotation_quartiles[1]):.3f}"
+    stages = [[row.result.seconds.get(stage, 0.0) for row in rows] for stage in ("search", "refine")]
+    seconds = [f"{np.median(stage):.2f}" for stage in stages]
+    counts = f"{summary.num_queries}", f"{summary.accuracy:.3f}"
+    verdicts = f"{summary.num_localized}", f"{summary.num_wrong}"
+    return (condition.name, condition.preset, *counts, *errors, angle, *seconds, *verdicts, condition.paper)
+
+
+def _median_of_correct(rows: Sequence[QueryResult]) -> float:
+    """Median position error [m] of the correct poses, NaN if there are none."""
+    errors = [row.position_error for row in rows if row.is_correct()]
+    return float(np.median(errors)) if errors else float("nan")
+
+
+def plot_png(title: str, found: Sequence[tuple[Condition, Sequence[QueryResult]]]) -> bytes:
+    """Accuracy, median error of the correct poses and seconds over the conditions, a line a preset."""
+    names = list(dict.fromkeys(condition.name for condition, _ in found))
+    figure = new_figure(figsize=(13, 4.4), layout="constrained")
+    figure.suptitle(title)
+    panels = figure.subplots(1, 3)
+    for preset in dict.fromkeys(condition.preset for condition, _ in found):
+        own = [(names.index(condition.name), rows) for condition, rows in found if condition.preset == preset]
+        summaries = [summarize(rows) for _, rows in own]
+        values = (
+            [100.0 * summary.accuracy for summary in summaries],
+            [1000.0 * _median_of_correct(rows) for _, rows in own],
+            [summary.seconds for summary in summaries],
+        )
+        for axes, some in zip(panels, values, strict=True):
+            axes.plot([place for place, _ in own], some, "o-", label=preset)
+    for axes, label in zip(panels, ("correct [%]", "median error of correct [mm]", "seconds"), strict=True):
+        axes.set_xticks(range(len(names)), names, rotation=30, ha="right")
+        axes.set_ylabel(label)
+        axes.grid(alpha=0.3)
+        axes.legend()
+    panels[0].set_ylim(0, 103)
+    panels[2].set_ylim(bottom=0)
+    return figure_png(figure)

@@ -19,6 +19,7 @@ from ...geometry.pose import Array, Pose
 from ...geometry.rotations import random_rotation
 from ...panorama import read_panorama
 from ...runtime.atomic import write_atomically
+from ..datasets.model import RigidTransform
 from ..scene import CLOUD_NAME, Query, Scene
 
 # A transformed copy of a scene; the folder, which is there, is for its files alone.
@@ -54,9 +55,9 @@ def _thinned(scene: Scene, folder: Path, num_kept: Callable[[int], int]) -> Scen
 def with_random_rotation(scene: Scene, folder: Path) -> Scene:
     """The cloud turned by a rotation drawn from all of SO(3), the true poses with it."""
     cloud = read_cloud(scene.cloud)
-    R_new_from_old = random_rotation(_rng(scene))
-    points = (cloud.points.astype(np.float64) + cloud.origin_world) @ R_new_from_old.T
-    queries = tuple(replace(query, pose=_turned(query.pose, R_new_from_old)) for query in scene.queries)
+    turn = RigidTransform(random_rotation(_rng(scene)), np.zeros(3))
+    points = turn.of_points(cloud.points.astype(np.float64) + cloud.origin_world)
+    queries = tuple(replace(query, pose=turn.of_pose(query.pose)) for query in scene.queries)
     return replace(scene, cloud=_written(folder, points, cloud.colors), queries=queries)
 
 
@@ -86,10 +87,6 @@ def flipped(scene: Scene, folder: Path) -> Scene:
         pose = Pose(UPSIDE_DOWN @ query.pose.R_cam_from_world, query.pose.center_world)
         queries.append(Query(image, query.variant, pose))
     return Scene(scene.name, inner, scene.cloud, tuple(queries))
-
-
-def _turned(pose: Pose, R_new_from_old: Array) -> Pose:
-    return Pose(pose.R_cam_from_world @ R_new_from_old.T, R_new_from_old @ pose.center_world)
 
 
 def _rng(scene: Scene) -> np.random.Generator:

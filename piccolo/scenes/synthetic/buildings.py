@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike
 
 from ...geometry.pose import Array
 from ...runtime.threads import Workers
-from .repeated import make_repeated
-from .sensors import RANGE_NOISE, scan_room
-from .world import make_world, random_size, scan_world
+from .room import make_repeated
+from .world import RANGE_NOISE, make_world, random_size, scan_room, scan_world
 
 DENSITY = 250.0  # points a m2
 ROOM_POINTS = 80_000

@@ -1,7 +1,7 @@
-"""Intensity as a gray, for files that have no colours.
+"""Intensity as a gray, for files that have no colours; labels as colours, in place of the file's own.
 
-Its unit is each scanner's own, and a few mirrors outshine everything. So a file's 1st percentile becomes
-black and its 99th white: of all its points, in a reading of their own, whatever their order.
+The unit of intensity is each scanner's own, and a few mirrors outshine everything. So a file's 1st percentile
+becomes black and its 99th white: of all its points, in a reading of their own, whatever their order.
 """
 
 import functools
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
+from ..label_colors import Labels, colors_of
 from .reader import ChunkReader, CloudReadOptions, PointsWithScalar, RawCloud, ScalarReader
 
 INTENSITY_NAMES = frozenset({"intensity", "scalar_intensity", "reflectance", "scalar_reflectance"})
@@ -19,6 +20,9 @@ OPTION = "--intensity-as-gray takes it for a gray"
 BLACK, WHITE = 0.01, 0.99  # share of the points that are darker
 LARGEST = float(np.finfo(np.float32).max)
 NUM_BINS = 1 << 16
+# as they stand in PLY files, in lower case; the first that is there counts. CloudCompare prefixes `scalar_`
+LABEL_NAMES = ("label", "scalar_label", "class", "scalar_class", "classification", "scalar_classification")
+MOST = 2.0**32  # labels are below it, and above its negative
 
 
 def intensity_reader(path: Path, read_scalar: ScalarReader) -> ChunkReader:
@@ -73,3 +77,20 @@ def _lower_edge(index: int) -> float:
     """The value nearest to 0 in a bin."""
     bits = (index << 16) ^ (1 << 31) if index >= NUM_BINS // 2 else ~(index << 16 | 0xFFFF) & 0xFFFFFFFF
     return float(np.array(bits, np.uint32).view(np.float32))
+
+
+def label_reader(path: Path, read_scalar: ScalarReader, labels: Labels) -> ChunkReader:
+    """What a PointSource wants as `read_chunks`, of a reader of points and their labels."""
+
+    def read_chunks() -> Iterator[RawCloud]:
+        for points, raw in read_scalar():
+            values = np.where(np.isfinite(points).all(axis=1), raw, 0.0)  # the others are left out later
+            is_whole = (np.abs(values) < MOST) & (values == np.floor(values))
+            if not is_whole.all():
+                wrong = f"found the label {values[np.argmin(is_whole)]:g}"
+                raise InputError(f"{path}: {wrong}, wanted whole numbers")
+            numbers = values.astype(np.int64)
+            is_kept = labels.are_kept(numbers)
+            yield RawCloud(points[is_kept], colors_of(numbers[is_kept]))
+
+    return read_chunks

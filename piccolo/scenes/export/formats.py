@@ -1,0 +1,233 @@
+"""Poses as text: tables, trajectories, Potree's images, COLMAP, nerfstudio, OpenSfM, and points on maps.
+
+Numbers are written so that the same float64 is read back. Where a format has no place for the offset, it is
+written beside it: <name>.offset.txt.
+"""
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Sequence
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import InputError
+from ...geometry.pose import T_world_from_cam, log_so3, quaternion_wxyz
+from ...geometry.rotations import (
+    CAMERA_AXES,
+    OPENGL_FROM_CAM,
+    OPTICAL_FROM_CAM,
+    heading_pitch_roll_deg,
+    translation,
+    turned,
+)
+from ...runtime.atomic import replacing_folder, write_atomically
+from ...runtime.optional import import_optional
+from .posed_images import Format, Options, PosedImage
+
+COLUMNS = (
+    *("image", "cloud", "status", "confidence", "score", "x", "y", "z"),
+    *("quaternion_w", "quaternion_x", "quaternion_y", "quaternion_z"),  # of R_cam_from_world
+    *("heading_deg", "pitch_deg", "roll_deg"),
+)
+STEP = 10.0  # [m] ahead, to find true north
+
+
+def numbers(values: Iterable[float], separator: str = " ") -> str:
+    """The shortest text of each number that reads back as the same float64."""
+    return separator.join(repr(float(value)) for value in values)
+
+
+def offset_comment(options: Options) -> list[str]:
+    """A comment line that gives the offset; none without."""
+    if options.offset is None:
+        return []
+    return [f"# world position = position here + {numbers(options.offset)}"]
+
+
+def write_lines(out: Path, lines: Sequence[str]) -> None:
+    """Write a text file, UTF-8."""
+    write_atomically(out, "".join(f"{line}\n" for line in lines).encode())
+
+
+def write_offset_beside(out: Path, options: Options) -> None:
+    """Write <name>.offset.txt with the offset's three numbers, if there is an offset."""
+    if options.offset is not None:
+        lines = [*offset_comment(options), numbers(options.offset)]
+        write_lines(out.with_name(f"{out.name}.offset.txt"), lines)
+
+
+def write_csv(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write a header and a row a result, in our own axes; what is not known is empty."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(COLUMNS)
+    for image in images:
+        result, pose = image.result, image.pose
+        score = result.evidence.score if result.evidence else None
+        words = image.name, result.cloud_name, result.status, result.confidence, score
+        wxyz = quaternion_wxyz(pose.R_cam_from_world).tolist()
+        table.writerow([*words, *pose.center_world.tolist(), *wxyz, *heading_pitch_roll_deg(pose)])
+    write_offset_beside(out, options)
+    write_atomically(out, text.getvalue().encode())
+
+
+def write_tum(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write rows "timestamp tx ty tz qx qy qz qw", world from camera, by time, below a comment."""
+    lines = [f"# timestamp tx ty tz qx qy qz qw, camera axes {options.axes}", *offset_comment(options)]
+    for image in sorted(images, key=lambda image: Decimal(image.time)):
+        T = T_world_from_cam(turned(image.pose, CAMERA_AXES[options.axes]))
+        w, x, y, z = quaternion_wxyz(T[:3, :3])
+        lines.append(f"{image.time} {numbers([*T[:3, 3], x, y, z, w])}")
+    write_lines(out, lines)
+
+
+def write_kitti(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write the twelve numbers of a 3 x 4 matrix, world from camera, a row; the format has no comments."""
+    matrices = [T_world_from_cam(turned(image.pose, CAMERA_AXES[options.axes])) for image in images]
+    write_offset_beside(out, options)
+    write_lines(out, [numbers(T[:3].ravel()) for T in matrices])
+
+
+def write_potree(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write coordinates.txt of Potree's 360 images (src/modules/Images360/Images360.js).
+
+    Columns, by tabs: file, time, x, y, z in the cloud's coordinates, course, pitch, roll [deg]. Potree turns
+    the sphere by R_z(90 - course) R_y(-pitch) R_x(90 + roll); with the picture as three.js lays it on the
+    sphere these are heading, pitch and roll of Photo Sphere XMP. The first line is empty: by its version
+    Potree skips the first line or reads it.
+    """
+    lines = [""]
+    for image in images:
+        values = [*image.pose.center_world, *heading_pitch_roll_deg(image.pose)]
+        lines.append("\t".join([image.name, image.time, numbers(values, "\t")]))
+    write_offset_beside(out, options)
+    write_lines(out, lines)
+
+
+def write_colmap(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write cameras.txt, images.txt and a points3D.txt without points into a new folder.
+
+    https://colmap.github.io/format.html: T_cam_from_world, camera axes right, down, forward. The camera model
+    EQUIRECTANGULAR came with COLMAP 4; its parameters are the width and height. Its pixels are ours.
+    """
+    camera_ids = {size: i for i, size in enumerate(dict.fromkeys(image.size for image in images), 1)}
+    cameras = [f"{i} EQUIRECTANGULAR {w} {h} {w} {h}" for (w, h), i in camera_ids.items()]
+    lines = []
+    for i, image in enumerate(images, 1):
+        pose = turned(image.pose, OPTICAL_FROM_CAM)
+        values = numbers([*quaternion_wxyz(pose.R_cam_from_world), *translation(pose)])
+        lines += [f"{i} {values} {camera_ids[image.size]} {image.name}", ""]  # a line of points follows
+    offset = offset_comment(options)
+    with replacing_folder(out) as folder:
+        comment = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"
+        write_lines(folder / "cameras.txt", [comment, *offset, *cameras])
+        comment = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then a line of points"
+        write_lines(folder / "images.txt", [comment, *offset, *lines])
+        write_lines(folder / "points3D.txt", ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"])
+
+
+def write_nerfstudio(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write transforms.json: T_world_from_cam, camera axes right, up, back; the offset is applied_transform.
+
+    Rays of EQUIRECTANGULAR in nerfstudio/cameras/cameras.py: theta = -pi (x - cx) / fl_x,
+    phi = pi (1/2 + (y - cy) / fl_y), direction (-sin theta sin phi, cos phi, -cos theta sin phi): the image
+    centre looks along -z.
+    """
+    is_one_size = len({image.size for image in images}) == 1
+    document: dict[str, object] = {"camera_model": "EQUIRECTANGULAR"}
+    if is_one_size:
+        document |= _intrinsics(images[0].size)
+    if options.offset is not None:
+        moved = np.column_stack([np.eye(3), -np.array(options.offset)])
+        document["applied_transform"] = moved.tolist()
+    frames = []
+    for image in images:
+        own = {} if is_one_size else _intrinsics(image.size)
+        matrix = T_world_from_cam(turned(image.pose, OPENGL_FROM_CAM)).tolist()
+        frames.append({"file_path": image.name, **own, "transform_matrix": matrix})
+    write_json(out, document | {"frames": frames})
+
+
+def _intrinsics(size: tuple[int, int]) -> dict[str, float]:
+    """The sphere as a focal length: x - cx reaches +-fl_x at the seam, y - cy +-fl_y / 2 at the poles."""
+    w, h = size
+    return {"w": w, "h": h, "fl_x": w / 2, "fl_y": float(h), "cx": w / 2, "cy": h / 2}
+
+
+def write_opensfm(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write a list of one reconstruction without points. Camera axes right, down, forward.
+
+    https://opensfm.org/docs/geometry.html: rotation is an angle-axis vector and translation t of
+    x_cam = R x_world + t. Its spherical camera takes the sphere to be W = 2 H exactly.
+    """
+    cameras, shots = {}, {}
+    for image in images:
+        width, height = image.size
+        if width != 2 * height:
+            raise InputError(f"{image.path}: found {width} x {height}, wanted W = 2 H exactly for OpenSfM")
+        camera = f"spherical {width} {height}"
+        cameras[camera] = {"projection_type": "spherical", "width": width, "height": height}
+        pose = turned(image.pose, OPTICAL_FROM_CAM)
+        rotation, t = log_so3(pose.R_cam_from_world).tolist(), translation(pose).tolist()
+        shots[image.name] = {"rotation": rotation, "translation": t, "camera": camera}
+    write_offset_beside(out, options)
+    write_json(out, [{"cameras": cameras, "shots": shots, "points": {}}])
+
+
+def write_json(out: Path, document: object) -> None:
+    """Write a JSON file."""
+    write_atomically(out, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
+
+
+def write_geojson(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write a FeatureCollection (RFC 7946) with a point a result: longitude and latitude in WGS84."""
+    pyproj, crs = import_optional("GeoJSON", "pyproj", "tools"), options.crs
+    if crs is None:
+        raise InputError("--crs: not given, wanted the cloud's coordinate system, such as EPSG:25832")
+    try:
+        system = pyproj.CRS.from_user_input(crs)
+    except pyproj.exceptions.CRSError as error:
+        raise InputError(f"--crs: found {crs!r}, wanted a coordinate system such as EPSG:25832") from error
+    units = {axis.unit_name for axis in system.axis_info[:2]}
+    if not system.is_projected or units != {"metre"}:
+        raise InputError(f"--crs: found {crs} ({system.name}), wanted a projected system in metres")
+    transformer = pyproj.Transformer.from_crs(system, "EPSG:4326", always_xy=True)
+    features = [_feature(image, transformer, pyproj.Geod(ellps="WGS84"), crs) for image in images]
+    write_json(out, {"type": "FeatureCollection", "features": features})
+
+
+def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[str, object]:
+    """The point without a height, which would have to be above WGS84's ellipsoid: z is a property."""
+    result, (x, y, z) = image.result, image.pose.center_world.tolist()
+    heading, pitch, roll = heading_pitch_roll_deg(image.pose)
+    ahead = np.radians(heading)
+    eastings, northings = [x, x + STEP * np.sin(ahead)], [y, y + STEP * np.cos(ahead)]
+    longitudes, latitudes = transformer.transform(eastings, northings)
+    if not np.isfinite([*longitudes, *latitudes]).all():
+        raise InputError(f"{image.path}: found a camera at ({x}, {y}), wanted one where {crs} holds")
+    true_heading, _, _ = geod.inv(longitudes[0], latitudes[0], longitudes[1], latitudes[1])
+    properties: dict[str, object] = {"image": image.name, "cloud": result.cloud_name, "status": result.status}
+    properties |= {"confidence": result.confidence, "score": result.evidence and result.evidence.score}
+    properties |= {"crs": crs, "x": x, "y": y, "z": z, "heading_deg": heading}
+    properties |= {"heading_true_deg": true_heading % 360.0, "pitch_deg": pitch, "roll_deg": roll}
+    point = {"type": "Point", "coordinates": [longitudes[0], latitudes[0]]}
+    return {"type": "Feature", "geometry": point, "properties": properties}
+
+
+OFFSET, MODEL = frozenset({"offset"}), frozenset({"size", "offset"})
+COLMAP_TEXT = "text model of COLMAP 4 and pycolmap; --out is a new folder"
+NERFSTUDIO_TEXT = "transforms.json of nerfstudio, in the folder that --images names"
+POTREE_TEXT = "coordinates.txt of Potree's 360 images, in the folder that --images names"
+COLMAP = Format("colmap", COLMAP_TEXT, write_colmap, MODEL, is_folder=True, forbidden=" ")  # ends a name
+NERFSTUDIO = Format("nerfstudio", NERFSTUDIO_TEXT, write_nerfstudio, MODEL)
+OPENSFM = Format("opensfm", "reconstruction.json of OpenSfM", write_opensfm, MODEL)
+CSV = Format("csv", "table with a header", write_csv, OFFSET, has_unique_names=False)
+TUM = Format("tum", "trajectory for evo and others", write_tum, OFFSET | {"axes", "timestamps"})
+KITTI = Format("kitti", "trajectory for evo and others", write_kitti, OFFSET | {"axes"})
+POTREE = Format("potree", POTREE_TEXT, write_potree, OFFSET | {"timestamps"}, forbidden='"')
+GEOJSON_TEXT = "points for maps, in WGS84; needs --crs and the library pyproj"
+GEOJSON = Format("geojson", GEOJSON_TEXT, write_geojson, frozenset({"crs"}), has_unique_names=False)
