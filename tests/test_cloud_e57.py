@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 from e57_files import ScanToWrite, write
-from test_cloud_morton import seeded_cloud
+from refusals import assert_refused
+from test_cloud_morton import read, seeded_cloud
 
 from piccolo.cloud import open_source, read_cloud
 from piccolo.cloud.readers import e57
@@ -37,11 +38,6 @@ def scan(extra=(), declared=(), **options):
 
 def placed(**options):
     return scan(rotation_wxyz=QUATERNION, center_world=tuple(CENTER), **options)
-
-
-def read(path):
-    chunks = list(open_source(path).read_chunks())
-    return np.concatenate([c.points_world for c in chunks]), np.concatenate([c.colors for c in chunks])
 
 
 def test_scans_stand_at_their_poses(tmp_path):
@@ -151,8 +147,7 @@ def test_color_ranges_are_those_that_the_file_declares(tmp_path, dtype, low, hig
 
 def test_colors_outside_of_their_range_are_refused(tmp_path):
     path = write(tmp_path / "a.e57", [scan(limits=color_limits(0, 100))])
-    with pytest.raises(InputError, match=r"scan 1 of 1 \('a scan'\) has a colour of \d+, wanted 0 to 100"):
-        read(path)
+    assert_refused(r"scan 1 of 1 \('a scan'\) has a colour of \d+, wanted 0 to 100", read, path)
 
 
 def test_colors_without_a_range_are_refused(tmp_path):
@@ -177,10 +172,8 @@ def test_scans_without_colors_are_left_out_beside_others(tmp_path):
 
 def test_files_without_points_are_refused(tmp_path):
     empty = ScanToWrite({name: column[:0] for name, column in (cartesian() | colored()).items()}, BYTES)
-    with pytest.raises(InputError, match=r"scan 1 of 1 \('a scan'\) has 0 points"):
-        open_source(write(tmp_path / "a.e57", [empty]))
-    with pytest.raises(InputError, match="no scans, wanted scans with"):
-        open_source(write(tmp_path / "b.e57"))
+    assert_refused(r"scan 1 of 1 \('a scan'\) has 0 points", open_source, write(tmp_path / "a.e57", [empty]))
+    assert_refused("no scans, wanted scans with", open_source, write(tmp_path / "b.e57"))
 
 
 def test_points_that_are_not_finite_are_handed_on(tmp_path):

@@ -3,11 +3,11 @@ import json
 import numpy as np
 import pytest
 from e57_files import ImageToWrite, with_xml, write
+from refusals import assert_refused
 from test_cloud_e57 import CENTER, QUATERNION, R_WORLD, scan
 
 from piccolo.cli import e57_images
 from piccolo.cloud.readers.e57_images import list_images, read_image
-from piccolo.errors import InputError
 from piccolo.geometry.pose import quaternion_wxyz
 
 SPHERE = {"imageWidth": 400, "imageHeight": 200, "pixelWidth": np.pi / 200, "pixelHeight": np.pi / 200}
@@ -84,5 +84,4 @@ def test_the_tool_names_its_errors_by_exit_codes(tmp_path, capsys):
 def test_damaged_images_are_refused(tmp_path, old, new, message):
     path = write(tmp_path / "a.e57", [], [ImageToWrite(JPEG[:25], numbers=SMALL)])
     path.write_bytes(with_xml(path.read_bytes(), old, new))
-    with pytest.raises(InputError, match=message):
-        list_images(path)
+    assert_refused(message, list_images, path)

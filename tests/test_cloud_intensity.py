@@ -6,6 +6,7 @@ from e57_files import ScanToWrite
 from e57_files import write as write_e57
 from las_files import OFFSETS, las_bytes, laz_bytes
 from plyfile import PlyData, PlyElement
+from refusals import assert_refused
 from test_cloud_morton import seeded_cloud, whole
 
 from piccolo.cloud import open_cloud, read_cloud
@@ -95,8 +96,7 @@ def _ply(path, name, kind="f4", text=False, values=None):
 def test_ply(tmp_path, name, kind, text):
     path = _ply(tmp_path / "a.ply", name, kind, text)
     np.testing.assert_array_equal(whole(open_ply, path, GRAY).colors, _in_gray(_measured(5, "16 bits")))
-    with pytest.raises(InputError, match=r"has intensity and no colours.*--intensity-as-gray"):
-        read_cloud(path)
+    assert_refused(r"has intensity and no colours.*--intensity-as-gray", read_cloud, path)
 
 
 LAYOUTS = {
@@ -117,8 +117,7 @@ def test_text(tmp_path, name):
     read = whole(open_text, path, GRAY)
     np.testing.assert_allclose(read.points_world, POINTS, rtol=1e-14)
     np.testing.assert_array_equal(read.colors, _in_gray(intensity))
-    with pytest.raises(InputError, match=r"has intensity and no colours.*--intensity-as-gray"):
-        read_cloud(path)
+    assert_refused(r"has intensity and no colours.*--intensity-as-gray", read_cloud, path)
 
 
 def test_colours_come_first_and_the_map_is_gray(tmp_path):
@@ -147,8 +146,7 @@ def test_las(tmp_path, point_format, is_compressed):
     read = whole(open_las, path, GRAY)
     np.testing.assert_array_equal(read.colors, _in_gray(intensity))
     np.testing.assert_allclose(read.points_world, raw.points_world, atol=0.002)
-    with pytest.raises(InputError, match=r"has intensity and no colours.*--intensity-as-gray"):
-        read_cloud(path)
+    assert_refused(r"has intensity and no colours.*--intensity-as-gray", read_cloud, path)
 
 
 def test_ptx_at_its_pose_without_beams_that_did_not_return(tmp_path):
@@ -163,8 +161,7 @@ def test_ptx_at_its_pose_without_beams_that_did_not_return(tmp_path):
     read = whole(open_ptx, path, GRAY)
     np.testing.assert_array_equal(read.colors, _in_gray(intensity))
     np.testing.assert_allclose(read.points_world, POINTS @ R.T + [5.0, 6.0, 7.0], atol=1e-9)
-    with pytest.raises(InputError, match=r"has intensity and no colours.*--intensity-as-gray"):
-        read_cloud(path)
+    assert_refused(r"has intensity and no colours.*--intensity-as-gray", read_cloud, path)
 
 
 def _e57_scan(points, **more):
@@ -179,19 +176,16 @@ def test_e57_scans_have_one_gray_for_all(tmp_path):
     read = whole(open_e57, path, GRAY)
     np.testing.assert_array_equal(read.colors, _in_gray(intensity))
     np.testing.assert_allclose(read.points_world, POINTS * [-1, -1, 1] + [1.0, 2.0, 3.0], atol=1e-9)
-    with pytest.raises(InputError, match=r"has intensity and no colours.*--intensity-as-gray"):
-        read_cloud(path)
+    assert_refused(r"has intensity and no colours.*--intensity-as-gray", read_cloud, path)
     bare = write_e57(tmp_path / "b.e57", [_e57_scan(POINTS)])
-    with pytest.raises(InputError, match="has no colours, wanted scans with"):
-        open_e57(bare, GRAY)
+    assert_refused("has no colours, wanted scans with", open_e57, bare, GRAY)
 
 
 def test_e57_scans_without_intensity_are_named(tmp_path):
     intensity = _measured(9, "decibels")
     scans = [_e57_scan(POINTS[:1000]), _e57_scan(POINTS[1000:], intensity=intensity[1000:])]
     path = write_e57(tmp_path / "a.e57", scans)
-    with pytest.raises(InputError, match=r"scan 2 of 2 .* has intensity and no colours"):
-        open_e57(path)
+    assert_refused(r"scan 2 of 2 .* has intensity and no colours", open_e57, path)
     source = open_e57(path, GRAY)
     assert len(source.warnings) == 1
     assert "scan 1 of 2 ('a scan') has no intensity; left out" in source.warnings[0]
@@ -218,5 +212,4 @@ def test_pcd(tmp_path, encoding):
     read = whole(open_pcd, path, GRAY)
     np.testing.assert_array_equal(read.colors, _in_gray(intensity.astype(float)))
     np.testing.assert_allclose(read.points_world, table[:, :3], rtol=1e-6)
-    with pytest.raises(InputError, match=r"has intensity and no colours.*--intensity-as-gray"):
-        open_pcd(path)
+    assert_refused(r"has intensity and no colours.*--intensity-as-gray", open_pcd, path)

@@ -19,6 +19,7 @@ from meshes import (
     write_ply,
     write_wedges,
 )
+from refusals import assert_refused
 from test_cloud_morton import whole
 
 from piccolo.cloud import read_cloud
@@ -26,7 +27,6 @@ from piccolo.cloud.readers import mesh_texture
 from piccolo.cloud.readers.mesh import open_mesh
 from piccolo.cloud.readers.mesh_sampling import linear_to_srgb, srgb_to_linear
 from piccolo.cloud.readers.ply import open_ply
-from piccolo.errors import InputError
 
 
 @pytest.mark.parametrize("text", [False, True])
@@ -109,8 +109,7 @@ def test_flat_triangles_and_nan_vertices_are_left_out_with_a_warning(tmp_path):
     ],
 )
 def test_meshes_without_colors_are_refused(tmp_path, options):
-    with pytest.raises(InputError, match=r"room\.obj: no colours"):
-        open_mesh(write_obj(tmp_path, **options))
+    assert_refused(r"room\.obj: no colours", open_mesh, write_obj(tmp_path, **options))
 
 
 def test_gltf_images_that_give_no_color_are_passed_over(tmp_path):

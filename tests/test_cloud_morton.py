@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from piccolo.cloud import Cloud, stream_of
+from piccolo.cloud import Cloud, open_source, stream_of
 from piccolo.cloud.morton import morton_codes, morton_order
 from piccolo.cloud.readers.reader import PLAIN, RawCloud
 from piccolo.errors import InputError
@@ -30,10 +30,16 @@ def clean(path, raw, scale):
     return replace(stream_of(path, raw), scale=scale).read()
 
 
-def whole(open_source, path, options=PLAIN):
+def whole(open_file, path, options=PLAIN):
     """All points that a reader finds in a file."""
-    chunks = list(open_source(path, options).read_chunks())
+    chunks = list(open_file(path, options).read_chunks())
     return RawCloud(*(np.concatenate(arrays) for arrays in zip(*map(astuple, chunks), strict=True)))
+
+
+def read(path):
+    """Points (N, 3) and colours (N, 3) of a file, by the reader that its content asks for."""
+    raw = whole(open_source, path)
+    return raw.points_world, raw.colors
 
 
 def same_bits(a: Cloud, b: Cloud):

@@ -12,15 +12,7 @@ from test_cloud_stream import LEVEL, TURN, stream
 from piccolo.cloud import voxels
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.readers.reader import RawCloud
-from piccolo.cloud.voxels import (
-    COUNT,
-    LEAF_SIZE,
-    NUM_COLUMNS,
-    POSITION,
-    VoxelTable,
-    add_points,
-    move_voxels,
-)
+from piccolo.cloud.voxels import COUNT, LEAF_SIZE, NUM_COLUMNS, POSITION, VoxelTable, add_points, move_voxels
 from piccolo.errors import InputError
 from piccolo.geometry.point_transforms import rotate_points
 

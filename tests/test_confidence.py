@@ -6,6 +6,7 @@ import pytest
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.confidence.confidence import (
     AMBIGUOUS,
+    DIRECTIONS,
     LOCALIZED,
     MODEL,
     NOT_LOCALIZED,
@@ -50,6 +51,7 @@ def test_right_and_wrong_evidence():
 )
 def test_confidence_is_what_was_learnt(changes, std, model, expected):
     """From the models as they were fitted, by a pocket calculator; a new fit changes these numbers."""
+    assert tuple(np.sign(model.weights)) == DIRECTIONS[: len(model.weights)]
     evidence = dataclasses.replace(MIDDLING, **changes)
     assert confidence_of(evidence, std and _covariance(std), model) == pytest.approx(expected, abs=0.001)
 
@@ -105,3 +107,4 @@ def test_deviations_beyond_reason_change_nothing_more(a, b):
 def test_lines_that_mean_nothing_are_refused(settings, value):
     with pytest.raises(InputError, match=f"--min-confidence: found {value}, wanted above 0 and below 1"):
         settings(min_confidence=value)
+    assert settings(min_confidence=0.01).min_confidence == 0.01

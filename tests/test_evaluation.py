@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from poses import result
+from refusals import assert_refused
 
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3
@@ -212,8 +213,6 @@ def test_a_run_is_resumed_after_its_last_whole_line(tmp_path):
             pass
     assert [row.image for row in read_run(path)[0]] == ["a.jpg", "b.jpg", "d.jpg"]
     path.write_text('{"my": "notes"}')
-    with pytest.raises(InputError, match="the last line is none of a run"):
-        read_run(path)
+    assert_refused("the last line is none of a run", read_run, path)
     path.write_text("{}\n")
-    with pytest.raises(InputError, match=r"run\.jsonl, line 1: evaluation: found"):
-        read_run(path)
+    assert_refused(r"run\.jsonl, line 1: evaluation: found", read_run, path)

@@ -17,7 +17,7 @@ from pictures import (
     write,
     xmp_packet,
 )
-from refusals import read_or_refused
+from refusals import assert_refused, read_or_refused
 
 from piccolo.errors import InputError
 from piccolo.geometry.sphere import pixel_rays
@@ -122,15 +122,11 @@ def test_a_crop_that_makes_no_sense_is_refused_or_left_aside(tmp_path, fields):
             "found 300 x 200, 0.15 % of the sphere, wanted at least 2 %",
         ),
         (crop_fields(0, 0, 300, 200, (900, 200)), "of a sphere of 900 x 200, wanted that width = 2 x height"),
-        (
-            {"ProjectionType": "Cylin\ndrical"},
-            "names the projection .cylin.+ndrical., wanted equirect",
-        ),
+        ({"ProjectionType": "Cylin\ndrical"}, "names the projection .cylin.+ndrical., wanted equirect"),
     ],
 )
 def test_crops_are_refused_by_name(tmp_path, fields, message):
-    with pytest.raises(InputError, match=message):
-        read_panorama(write(tmp_path / "a", file_of(RGB[:, :300], fields)))
+    assert_refused(message, read_panorama, write(tmp_path / "a", file_of(RGB[:, :300], fields)))
 
 
 def test_the_attitude_is_read(tmp_path):
@@ -182,8 +178,7 @@ def test_the_horizon_turns_counterclockwise_in_the_image_as_roll_grows():
 
 def test_a_field_of_view_is_centred_on_the_horizon(tmp_path):
     path = write(tmp_path / "a.png", encoded(RGB[60:140, 100:300], ".png"))
-    with pytest.raises(InputError, match=r"found 200 x 80, wanted width = 2 x height .* field of view"):
-        read_panorama(path)
+    assert_refused(r"found 200 x 80, wanted width = 2 x height .* field of view", read_panorama, path)
     panorama = read_panorama(path, ReadOptions(fov_deg=180.0))
     rgb, is_valid = expected_crop(100, 60, 200, 80)
     np.testing.assert_array_equal(panorama.is_valid, is_valid)

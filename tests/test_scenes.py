@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3
@@ -71,12 +72,10 @@ def test_what_lacks_a_field_or_comes_twice_is_named(tmp_path):
     document = json.loads((_written(tmp_path, ("images/a.jpg", "images/b.jpg")) / "queries.json").read_text())
     del document["queries"][1]["variant"]
     (tmp_path / "queries.json").write_text(json.dumps(document))
-    with pytest.raises(InputError, match=r"queries\[1\] without one of image, variant"):
-        read_scene(tmp_path)
+    assert_refused(r"queries\[1\] without one of image, variant", read_scene, tmp_path)
     document["queries"][1] = document["queries"][0]
     (tmp_path / "queries.json").write_text(json.dumps(document))
-    with pytest.raises(InputError, match="an image twice"):
-        read_scene(tmp_path)
+    assert_refused("an image twice", read_scene, tmp_path)
     with pytest.raises(InputError, match="found a file, wanted a folder with scenes"):
         find_scenes([Path(__file__)])
 
@@ -84,8 +83,7 @@ def test_what_lacks_a_field_or_comes_twice_is_named(tmp_path):
 def test_no_scene_is_told(tmp_path):
     with pytest.raises(InputError, match=r"found no queries\.json in or below it"):
         find_scenes([tmp_path])
-    with pytest.raises(InputError, match=r"queries\.json: cannot be read \(No such file"):
-        read_scene(tmp_path)
+    assert_refused(r"queries\.json: cannot be read \(No such file", read_scene, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -108,12 +106,10 @@ def test_what_is_no_pose_is_refused(tmp_path, change, message):
     document = json.loads((_written(tmp_path) / "queries.json").read_text())
     document["queries"][0].update(change)
     (tmp_path / "queries.json").write_text(json.dumps(document))
-    with pytest.raises(InputError, match=message):
-        read_scene(tmp_path)
+    assert_refused(message, read_scene, tmp_path)
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"queries": 1}', '{"queries": [1]}', "\xff", "[" * 2000])
 def test_what_is_no_document_is_refused(tmp_path, text):
     (tmp_path / "queries.json").write_bytes(text.encode("latin-1"))
-    with pytest.raises(InputError, match=r"queries\.json: found .*wanted a queries\.json with true poses"):
-        read_scene(tmp_path)
+    assert_refused(r"queries\.json: found .*wanted a queries\.json with true poses", read_scene, tmp_path)
