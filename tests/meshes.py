@@ -71,10 +71,10 @@ class Gltf:
         kind = {"f": 5126, "I": 5125, "B": 5121, "H": 5123}[array.dtype.char]
         shape = {1: "SCALAR"}.get(array.ndim) or f"VEC{array.shape[1]}"
         row = {
-            "bufferView": self.view(array.tobytes()),
             "componentType": kind,
             "type": shape,
             "count": len(array),
+            "bufferView": self.view(array.tobytes()),
         }
         if kind in (5121, 5123) and array.ndim > 1:
             row["normalized"] = True

@@ -79,9 +79,8 @@ def test_files_unused_for_a_month_go_and_others_stay(tmp_path):
     os.utime(fresh, (fresh.stat().st_mtime - 29 * 24 * 3600,) * 2)
     cache.mark_used(used)
     cache.remove_stale(tmp_path, kernel_cache.NAME)
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
-        path.name for path in (used, foreign, fresh)
-    )
+    kept = sorted(path.name for path in (used, foreign, fresh))
+    assert sorted(path.name for path in tmp_path.iterdir()) == kept
 
 
 def test_a_flipped_byte_in_compiled_code_is_noticed(tmp_path, monkeypatch, caplog):

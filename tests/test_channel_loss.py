@@ -87,15 +87,8 @@ def test_correlation_is_over_what_both_show():
     a, b = naive.sample(rgb, pixels) - 127.5, levels.T - 127.5
     expected = (w @ (a * b)).sum() / np.sqrt((w @ a**2).sum() * (w @ b**2).sum())
     texels = pack_texels(rgb, is_valid)
-    arguments = (
-        points,
-        levels,
-        weights,
-        texels.rgbx,
-        texels.width,
-        TILTED.R_cam_from_world,
-        TILTED.center_world,
-    )
+    R, center = TILTED.R_cam_from_world, TILTED.center_world
+    arguments = points, levels, weights, texels.rgbx, texels.width, R, center
     correlation, shared = correlate(*arguments)
     assert 0.5 < shared / weights.sum() < 0.9
     assert correlation == pytest.approx(expected, abs=1e-4)

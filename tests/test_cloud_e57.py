@@ -19,9 +19,7 @@ BYTES = dict.fromkeys(RGB, (0, 255))
 
 
 def cartesian(raw=RAW, dtype=np.float64):
-    return dict(
-        zip(("cartesianX", "cartesianY", "cartesianZ"), raw.points_world.T.astype(dtype), strict=True)
-    )
+    return dict(zip(XYZ, raw.points_world.T.astype(dtype), strict=True))
 
 
 def colored(colors=RAW.colors):
@@ -133,16 +131,13 @@ def test_color_ranges_are_those_that_the_file_declares(tmp_path, dtype, low, hig
     values = (RAW.colors * ((last - first) / 255) + first).astype(np.float64)
     values = values.astype(dtype) if np.issubdtype(dtype, np.floating) else np.rint(values).astype(dtype)
     declared = dict.fromkeys(RGB, () if low is None else (low, high))
-    named = limits and {
-        f"{n}{end}": v for n in RGB for end, v in zip(("Minimum", "Maximum"), limits, strict=True)
-    }
+    named = limits and color_limits(*limits)
     written = ScanToWrite(cartesian() | colored(values), declared, named)
     _, colors = read(write(tmp_path / "a.e57", [written]))
     expected = np.rint((values - first) / (last - first) * 255)
     assert abs(colors - expected).max() <= (1 if dtype == np.float32 else 0)
-    assert abs(colors - RAW.colors.astype(np.float64)).max() <= (
-        0 if last - first >= 255 or dtype != np.int64 else 1
-    )
+    tolerance = 0 if last - first >= 255 or dtype != np.int64 else 1
+    assert abs(colors - RAW.colors.astype(float)).max() <= tolerance
 
 
 def test_colors_outside_of_their_range_are_refused(tmp_path):

@@ -25,12 +25,12 @@ def test_images_are_listed_and_read(tmp_path):
     path = write(tmp_path / "a.e57", [scan()], IMAGES)
     images = list_images(path)
     assert [image.kind for image in images] == ["spherical", "pinhole", "cylindrical", "visual-reference"]
-    assert (images[0].name, images[0].width, images[0].height, images[0].size) == (
+    assert [images[0].name, images[0].width, images[0].height, images[0].size] == [
         "pano",
         400,
         200,
         len(JPEG),
-    )
+    ]
     assert images[0].fov_deg == pytest.approx((360.0, 180.0))
     assert (images[0].scan_guid, images[0].placement, images[1].fov_deg) == ("{scan}", None, None)
     np.testing.assert_allclose(images[1].placement.R_world_from_local, R_WORLD, atol=1e-12)
@@ -51,12 +51,8 @@ def test_images_are_written_as_files(tmp_path, capsys):
     captured = capsys.readouterr()
     rows = [json.loads(line) for line in captured.out.splitlines()]
     assert "image 4 begins with b'GIF', wanted a jpeg file" in captured.err
-    assert sorted(p.name for p in folder.iterdir()) == [
-        "a_scan_0.jpg",
-        "a_scan_1.png",
-        "a_scan_2.png",
-        "a_scan_3.jpg",
-    ]
+    names = sorted(p.name for p in folder.iterdir())
+    assert names == ["a_scan_0.jpg", "a_scan_1.png", "a_scan_2.png", "a_scan_3.jpg"]
     assert (folder / "a_scan_0.jpg").read_bytes() == JPEG
     assert rows[0]["file"] == str(folder / "a_scan_0.jpg")
 

@@ -1,3 +1,4 @@
+import re
 import struct
 import sys
 
@@ -118,9 +119,7 @@ def test_the_sample_is_spread_over_the_file(tmp_path, monkeypatch, is_compressed
     path = written(25 if is_compressed else 20, 255)
     assert "8-bit values in 16-bit fields" in open_source(path).warnings[0]
     path = written(100, 40_000)  # outside of the sample
-    assert (
-        "in 120 points" in open_source(path).warnings[0] or "in 128 points" in open_source(path).warnings[0]
-    )
+    assert re.search("in 12[08] points", open_source(path).warnings[0])
     assert_refused("a colour of 40000 in a file whose other colours are 8-bit", read, path)
 
 
@@ -211,9 +210,7 @@ def test_counts_of_las_1_4_are_refused_before_memory_is_taken(tmp_path, count):
     content = las_bytes(RAW, 7)
     with pytest.raises(InputError, match=f"promises {count} points of 36 bytes, found room for 1200"):
         open_source(write(tmp_path, patched(content, COUNT_1_4, "<Q", count)))
-    message = (
-        f"promises {count} points, the chunk table has 1500" if count > 1500 else "a chunk of 200 points"
-    )
+    message = f"promises {count} points, the chunk table has 1500" if count > 1500 else "chunk of 200 points"
     with pytest.raises(InputError, match=message):
         open_source(write(tmp_path, patched(laz_bytes(content, 500), COUNT_1_4, "<Q", count)))
 

@@ -190,9 +190,8 @@ def test_too_many_points_lower_the_density(tmp_path, monkeypatch):
 def test_density_counts_by_square_metres(tmp_path, unit, scale):
     """A square metre in any unit, as OBJ and as PLY, gives the same 10,000 points."""
     path = made.write_obj(tmp_path, vertices=made.SQUARE / scale)
-    ply = made.write_ply(
-        tmp_path / "a.ply", made.SQUARE / scale, colors=np.array(made.CORNER_COLORS[:, :3] * 255, "u1")
-    )
+    colors = np.array(made.CORNER_COLORS[:, :3] * 255, "u1")
+    ply = made.write_ply(tmp_path / "a.ply", made.SQUARE / scale, colors=colors)
     for source in (path, ply):
         (opened,) = open_cloud([source], CloudSettings(scale=scale)).sources
         assert abs(opened.num_points - 10_000) <= 1
@@ -205,8 +204,7 @@ def test_density_counts_by_square_metres(tmp_path, unit, scale):
 def test_texels_of_alpha_0_leave_their_points_out(tmp_path):
     alpha = np.full((8, 8, 1), 255, np.uint8)
     alpha[:4, 4:] = 0  # the green ones
-    raw = whole(
-        open_mesh, made.write_obj(tmp_path, texture=made.png(np.concatenate([made.QUADRANTS, alpha], axis=2)))
-    )
+    texture = made.png(np.concatenate([made.QUADRANTS, alpha], axis=2))
+    raw = whole(open_mesh, made.write_obj(tmp_path, texture=texture))
     assert len(raw.colors) == pytest.approx(7500, rel=0.02)
     assert not np.any(np.all(raw.points_world[:, :2] > 0.5, axis=1))

@@ -134,9 +134,8 @@ def test_a_camera_and_the_name_world_change_nothing(tmp_path):
 )
 def test_obj_lines_may_begin_in_other_ways(tmp_path, old, new):
     path, colors = tmp_path / "a.obj", made.CORNER_COLORS / 255
-    path.write_text(
-        made.obj_text(np.concatenate([made.SQUARE, colors], axis=1), None, library="", material="")
-    )
+    vertices = np.concatenate([made.SQUARE, colors], axis=1)
+    path.write_text(made.obj_text(vertices, None, library="", material=""))
     expected = whole(open_mesh, path)
     assert old in path.read_text()
     path.write_text(path.read_text().replace(old, new))
@@ -177,9 +176,8 @@ def test_a_texture_of_many_surfaces_is_decoded_once(tmp_path, monkeypatch):
     decode, calls = mesh_texture.Texture.texels, []
     monkeypatch.setattr(mesh_texture.Texture, "texels", lambda self: calls.append(self) or decode(self))
     gltf = made.Gltf()
-    first, other = (
-        gltf.material(made.png(pixels)) for pixels in (made.QUADRANTS, made.QUADRANTS[::-1].copy())
-    )
+    pictures = made.QUADRANTS, made.QUADRANTS[::-1].copy()
+    first, other = (gltf.material(made.png(pixels)) for pixels in pictures)
     rows = [gltf.mesh(made.SQUARE + np.float32(i), material=other if i == 2 else first) for i in range(5)]
     gltf.tree["meshes"] = [{"primitives": [gltf.tree["meshes"][i]["primitives"][0] for i in rows]}]
     gltf.node(mesh=0)

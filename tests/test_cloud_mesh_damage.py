@@ -64,9 +64,7 @@ def test_a_link_out_of_the_folder_is_refused(tmp_path):
 
 
 def test_missing_materials_are_named(tmp_path):
-    assert "names the file 'room.mtl', which is not in its folder" in refusal(
-        made.write_obj(tmp_path, mtl="")
-    )
+    assert "names the file 'room.mtl', which is not in its" in refusal(made.write_obj(tmp_path, mtl=""))
 
 
 def test_a_texture_that_says_it_is_huge_is_refused(tmp_path):
@@ -85,10 +83,8 @@ def test_a_texture_that_says_it_is_huge_is_refused(tmp_path):
 def test_broken_textures_are_refused(tmp_path, cut):
     noise = np.random.default_rng(1).integers(0, 256, (64, 64, 3), np.uint8)
     texture = made.png(noise)[:cut]
-    for path in (
-        made.write_obj(tmp_path, texture=texture),
-        made.textured_gltf(texture).glb(tmp_path / "a.glb"),
-    ):
+    glb = made.textured_gltf(texture).glb(tmp_path / "a.glb")
+    for path in (made.write_obj(tmp_path, texture=texture), glb):
         assert "can't be read" in refusal(path)
 
 
@@ -100,7 +96,7 @@ def test_a_missing_library_is_named(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "face", ["1/1 2/2 9/3", "-1/1 -2/2 -3/3", "0/1 1/1 2/2", "1/1 2/0 3/3", "1/1 2/2 99999999999/3"]
+    "face", ["1/1 2/2 9/3", "-1/1 -2/2 -3/3", "0/1 1/1 2/2", "1/1 2/0 3/3", f"1/1 2/2 {10**11}/3"]
 )
 def test_wrong_indices_in_obj_are_refused(tmp_path, face):
     path = made.write_obj(tmp_path)
@@ -120,9 +116,8 @@ def test_empty_meshes_are_refused(tmp_path, text):
 def test_float_colors_beyond_1_are_refused_not_cut_off(tmp_path):
     colors = made.CORNER_COLORS.astype(float)
     obj = tmp_path / "a.obj"
-    obj.write_text(
-        made.obj_text(np.concatenate([made.SQUARE, colors], axis=1), None, library="", material="")
-    )
+    vertices = np.concatenate([made.SQUARE, colors], axis=1)
+    obj.write_text(made.obj_text(vertices, None, library="", material=""))
     ply = made.write_wedges(tmp_path / "a.ply", colors=colors, kind="float")
     assert "a colour of 255, wanted 0 to 1 or bytes" in refusal(obj)
     assert "a colour of 255, wanted 0 to 1 or bytes" in refusal(ply)
@@ -131,9 +126,8 @@ def test_float_colors_beyond_1_are_refused_not_cut_off(tmp_path):
 def test_several_textures_of_a_ply_are_refused(tmp_path):
     for name in ("a.png", "b.png"):
         (tmp_path / name).write_bytes(made.png())
-    assert "names 2 textures, wanted one" in refusal(
-        made.write_wedges(tmp_path / "a.ply", textures=("a.png", "b.png"))
-    )
+    path = made.write_wedges(tmp_path / "a.ply", textures=("a.png", "b.png"))
+    assert "names 2 textures, wanted one" in refusal(path)
 
 
 PRIMITIVE = ("meshes", 0, "primitives", 0)

@@ -183,9 +183,8 @@ def test_further_columns_of_pts_are_passed_over(tmp_path):
 def test_counts_stand_between_scans_of_pts(tmp_path, monkeypatch, chunk):
     monkeypatch.setattr(raw, "CHUNK", chunk)
     lines = pts()
-    assert_read_as_written(
-        write(tmp_path / "a.pts", ["", "400", *lines[:400], "0", "800", *lines[400:], "", "0"])
-    )
+    lines = ["", "400", *lines[:400], "0", "800", *lines[400:], "", "0"]
+    assert_read_as_written(write(tmp_path / "a.pts", lines))
 
 
 @pytest.mark.parametrize(
@@ -231,8 +230,7 @@ def test_a_file_cut_while_it_is_read_is_refused(tmp_path, monkeypatch, name, gra
     lines = TWO_SCANS if name == "a.ptx" else ["1200", *pts()]
     if gray:
         lines = [
-            " ".join([*f[:3], str(k)]) if len(f) == 7 else " ".join(f)
-            for k, f in enumerate(map(str.split, lines))
+            " ".join([*f[:3], str(k)] if len(f) == 7 else f) for k, f in enumerate(map(str.split, lines))
         ]
     path = write(tmp_path / name, lines)
     chunks = open_source(path, CloudReadOptions(intensity_as_gray=gray)).read_chunks()

@@ -39,10 +39,8 @@ def stream(*raws, chunk=10**9, scale=1.0):
     """A cloud of as many files, each handed on in chunks."""
 
     def source(k, raw):
-        begins = range(0, len(raw.colors), chunk)
-        return PointSource(
-            Path(f"{k}.ply"), lambda: (part(raw, slice(lo, lo + chunk)) for lo in begins), len(raw.colors)
-        )
+        chunks = [part(raw, slice(lo, lo + chunk)) for lo in range(0, len(raw.colors), chunk)]
+        return PointSource(Path(f"{k}.ply"), lambda: iter(chunks), len(raw.colors))
 
     return CloudStream([source(k, raw) for k, raw in enumerate(raws)], scale)
 
@@ -142,9 +140,8 @@ def _lying(turn):
     cloud, taken = room(1)[1], query(1)
     points = (cloud.points @ turn.T).astype(np.float64) + cloud.origin_world
     center = turn @ (taken.pose.center_world - cloud.origin_world) + cloud.origin_world
-    return stream(RawCloud(points, cloud.colors), chunk=9999), Pose(
-        taken.pose.R_cam_from_world @ turn.T, center
-    )
+    pose = Pose(taken.pose.R_cam_from_world @ turn.T, center)
+    return stream(RawCloud(points, cloud.colors), chunk=9999), pose
 
 
 @pytest.mark.parametrize("up", ["y", "-x"])

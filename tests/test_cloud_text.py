@@ -92,9 +92,8 @@ def test_float_colors_and_last_line_without_end(tmp_path):
 
 
 def test_nan_points_need_no_color(tmp_path):
-    cloud = read_cloud(
-        write(tmp_path / "a.txt", ["nan nan nan nan nan nan", *lines_of(RAW), "inf 0 0 0 0 -1"])
-    )
+    lines = ["nan nan nan nan nan nan", *lines_of(RAW), "inf 0 0 0 0 -1"]
+    cloud = read_cloud(write(tmp_path / "a.txt", lines))
     assert cloud.num_dropped == 2
     assert len(cloud.points) == 1500
 

@@ -58,9 +58,8 @@ def test_sandwich_of_independent_blocks_is_the_textbook_covariance():
     rng = np.random.default_rng(0)
     hessian = np.diag([4.0, 5.0, 6.0, 1.0, 2.0, 3.0])
     gradients = rng.normal(size=(5000, 6)) * np.sqrt(np.diag(hessian) / 5000)
-    np.testing.assert_allclose(
-        covariance.covariance_of(hessian, gradients), np.linalg.inv(hessian), atol=0.05
-    )
+    found = covariance.covariance_of(hessian, gradients)
+    np.testing.assert_allclose(found, np.linalg.inv(hessian), atol=0.05)
 
 
 def test_no_covariance_without_a_minimum_or_with_few_blocks():
@@ -145,9 +144,8 @@ def test_truth_is_among_the_poses_of_a_place_that_repeats(kind):
         Workers(2),
         Stopwatch(),
     )
-    distances = [
-        errors(pose, taken.pose)[0] for pose in (result.pose, *(h.pose for h in result.alternatives))
-    ]
+    poses = [result.pose, *(h.pose for h in result.alternatives)]
+    distances = [errors(pose, taken.pose)[0] for pose in poses]
     assert min(distances) < 0.1
     assert result.status == "ambiguous" or distances[0] < 0.1
     assert 1 <= len(result.alternatives) <= 5

@@ -146,10 +146,8 @@ def test_errors_have_codes_and_name_the_command_as_it_was_started(monkeypatch, c
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_names_commands_as_they_were_started(monkeypatch, capsys, name):
     module = import_module(f"piccolo.cli.{name}")
-    for program, example in (
-        (f"piccolo-{name.replace('_', '-')}", "\n  piccolo-"),
-        (f"{name}.py", "  python "),
-    ):
+    installed = f"piccolo-{name.replace('_', '-')}"
+    for program, example in ((installed, "\n  piccolo-"), (f"{name}.py", "  python ")):
         monkeypatch.setattr("sys.argv", [f"bin/{program}"])
         with pytest.raises(SystemExit):
             module.main(["--help"])

@@ -22,10 +22,7 @@ MIDDLING = dataclasses.replace(RIGHT, score=0.35, margin=0.15, agreement=0.4)
 
 
 def test_right_and_wrong_evidence():
-    assert rule.classify(RIGHT, SURE, True, 0.9) == (
-        rule.LOCALIZED,
-        rule.confidence_of(RIGHT, SURE, rule.MODEL),
-    )
+    assert rule.classify(RIGHT, SURE, True, 0.9) == ("localized", rule.confidence_of(RIGHT, SURE, rule.MODEL))
     assert rule.classify(WRONG, None, True, 0.9)[0] == rule.NOT_LOCALIZED
     assert rule.confidence_of(RIGHT, SURE, rule.MODEL) > 0.99
     assert rule.confidence_of(WRONG, None, rule.MODEL) < 0.2
@@ -74,10 +71,8 @@ def test_the_line_moves():
     confidence = rule.confidence_of(RIGHT, SURE, rule.MODEL)
     assert rule.classify(RIGHT, SURE, False, 0.5 * (1.0 + confidence))[0] != rule.LOCALIZED
     assert rule.classify(RIGHT, SURE, False, confidence)[0] == rule.LOCALIZED
-    assert (
-        rule.classify(WRONG, None, False, 0.5 * rule.confidence_of(WRONG, None, rule.MODEL))[0]
-        == rule.LOCALIZED
-    )
+    half = 0.5 * rule.confidence_of(WRONG, None, rule.MODEL)
+    assert rule.classify(WRONG, None, False, half)[0] == rule.LOCALIZED
 
 
 @pytest.mark.parametrize("name", ["margin", "agreement", "score"])

@@ -34,9 +34,8 @@ def test_the_true_pose_is_among_the_readings_of_a_wrong_one(axes, direction, tak
     (other,) = set(DIRECTIONS) - {direction}
     for taken_direction in (direction, other):
         taken = pose_of_transform("T", T, taken_direction, taken_axes)
-        found = checking.convention_variants(
-            type(taken)(taken.R_cam_from_world, taken.center_world - ORIGIN), ORIGIN
-        )
+        local = type(taken)(taken.R_cam_from_world, taken.center_world - ORIGIN)
+        found = checking.convention_variants(local, ORIGIN)
         assert any(
             np.allclose(p.R_cam_from_world, true.R_cam_from_world)
             and np.allclose(p.center_world + ORIGIN, true.center_world)
@@ -54,9 +53,8 @@ def test_advice_names_the_way_that_fits_most():
     wrong = fit(0.02, "the camera's x, y, z are z, x, y", 0.6)
     advice = checking.Check((wrong, wrong, fit(0.1))).advice
     assert "scores 0.02, 0.02, 0.10, wanted 0.1 and more; 0.60 if the camera's x, y, z are z, x, y" in advice
-    assert checking.Check((wrong, fit(0.02), fit(0.05, "others", 0.06))).advice.endswith(
-        "no other axes fit better"
-    )
+    fits = wrong, fit(0.02), fit(0.05, "others", 0.06)
+    assert checking.Check(fits).advice.endswith("no other axes fit better")
 
 
 def test_spread_is_even():

@@ -37,9 +37,8 @@ def test_descent_finds_the_true_pose_again():
     center, off = true_pose.center_world, step(true_pose, np.array([0.03, -0.02, 0.04, 0.06, -0.05, 0.04]))
     pose = descent.descend(cells, center, image, off, (1.0, 30, 1e-5))
     assert rooms.errors(pose, true_pose)[0] < 0.01
-    assert descent.score_on(cells, center, image, pose) > max(
-        0.6, descent.score_on(cells, center, image, off)
-    )
+    before, after = (descent.score_on(cells, center, image, p) for p in (off, pose))
+    assert after > max(0.6, before)
     assert rooms.errors(descent.descend(cells, center, image, off, (1.0, 1, 1e-5)), true_pose)[0] > 0.01
 
 

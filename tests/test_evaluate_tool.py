@@ -32,9 +32,8 @@ def scenes(tmp_path_factory):
     scene = read_scene(root / "hall 2")
     shutil.copy(root / "room" / "images" / "clean_0.jpg", root / "hall 2" / "images" / "far.jpg")
     pose = scene.queries[0].pose
-    far = Query(
-        scene.folder / "images" / "far.jpg", "far", type(pose)(pose.R_cam_from_world, np.full(3, 99.0))
-    )
+    far_pose = type(pose)(pose.R_cam_from_world, np.full(3, 99.0))
+    far = Query(scene.folder / "images" / "far.jpg", "far", far_pose)
     write_queries(scene.folder, [*scene.queries, far])
     return root
 

@@ -189,7 +189,7 @@ def test_same_points_same_bits():
 
 
 @pytest.mark.parametrize(
-    "points", [np.zeros((5, 2)), np.zeros(3), np.full((9, 3), np.nan)], ids=["(5, 2)", "(3,)", "NaN"]
+    "points", [np.zeros((5, 2)), np.zeros(3), np.full((9, 3), np.nan)], ids=["wide", "flat", "NaN"]
 )
 def test_what_is_no_cloud_is_refused(points):
     with pytest.raises(InputError, match=r"the shape is|not finite"):

@@ -100,9 +100,7 @@ def test_what_has_no_say_changes_nothing():
     np.testing.assert_array_equal(far, up)
 
 
-@pytest.mark.parametrize(
-    "azimuth_deg", [-170.0, -100.0, -46.0, -44.0, -1.0, 0.0, 30.0, 44.0, 46.0, 91.0, 179.0]
-)
+@pytest.mark.parametrize("azimuth_deg", [-170, -100, -46, -44, -1, 0, 30, 44, 46, 91, 179])
 def test_the_smallest_turn_puts_walls_along_the_axes(azimuth_deg):
     a = np.radians(azimuth_deg)
     along = [plane([np.cos(a + k), np.sin(a + k), 0.0]) for k in (0.0, 0.5 * np.pi, 0.001)]

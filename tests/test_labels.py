@@ -111,9 +111,8 @@ def test_pcd(tmp_path, encoding):
     header = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z label\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\n"
     header += f"WIDTH 3000\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3000\nDATA {encoding}\n"
     rows = "\n".join(" ".join(map(str, row)) for row in table.tolist()) + "\n"
-    path = write(
-        tmp_path / "a.pcd", header.encode() + (rows.encode() if encoding == "ascii" else table.tobytes())
-    )
+    body = rows.encode() if encoding == "ascii" else table.tobytes()
+    path = write(tmp_path / "a.pcd", header.encode() + body)
     np.testing.assert_array_equal(whole(open_source, path, READ).colors, colors_of(LABELS))
     write(path, path.read_bytes().replace(b"label", b"ring_"))
     assert_refused("the fields are 'x y z ring_', wanted x y z and label", open_source, path, READ)
@@ -142,11 +141,7 @@ def test_pictures_of_labels_in_8_16_and_24_bits(tmp_path):
     deep = IMAGE * 300
     of_24_bits = deep * 256 + 9
     bgr = np.stack([of_24_bits & 255, of_24_bits >> 8 & 255, of_24_bits >> 16], axis=-1)
-    for labels, pixels in (
-        (IMAGE, IMAGE.astype(np.uint8)),
-        (deep, deep.astype(np.uint16)),
-        (of_24_bits, bgr),
-    ):
+    for labels, pixels in ((IMAGE, np.uint8(IMAGE)), (deep, np.uint16(deep)), (of_24_bits, np.uint8(bgr))):
         panorama = read_panorama(_png(tmp_path / "a.png", pixels), READ_IMAGE)
         np.testing.assert_array_equal(panorama.rgb, colors_of(labels))
         assert panorama.is_valid.all()

@@ -209,9 +209,8 @@ def _process(arguments, **options):
 
 def test_interrupt_leaves_nothing_half_written(scene, tmp_path):
     out = tmp_path / "pose.json"
-    process = _process(
-        [*_arguments(scene, "--out", str(out)), *PAPER, "--num-translations", "5000"], cwd=tmp_path
-    )
+    arguments = _arguments(scene, "--out", str(out))
+    process = _process([*arguments, *PAPER, "--num-translations", "5000"], cwd=tmp_path)
     process.stderr.read(1)  # the bar of the search: imports are over
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
@@ -243,9 +242,8 @@ def test_first_use_is_announced_and_two_processes_may_share_it(scene, tmp_path):
 def test_results_are_evaluated_against_the_truth(scene, tmp_path, capsys):
     panos = [str(scene / "images" / f"clean_{k}.jpg") for k in (0, 1)]
     results = tmp_path / "poses.jsonl"
-    localize.main(
-        ["--cloud", str(scene / "cloud.ply"), "--pano", *panos, *QUICK, "--quiet", "--out", str(results)]
-    )
+    quiet = [*QUICK, "--quiet", "--out", str(results)]
+    localize.main(["--cloud", str(scene / "cloud.ply"), "--pano", *panos, *quiet])
     truth = str(scene)
     assert evaluate.main(["--scenes", truth, "--results", str(results)]) == 0
     table = capsys.readouterr().out

@@ -17,9 +17,8 @@ RGB = smooth_rgb()
 
 
 def png_header(width, height, depth=8, color_type=2):
-    return b"\x89PNG\r\n\x1a\n" + png_chunk(
-        b"IHDR", struct.pack(">IIBBBBB", width, height, depth, color_type, 0, 0, 0)
-    )
+    fields = struct.pack(">IIBBBBB", width, height, depth, color_type, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", fields)
 
 
 def test_png_comes_back_exactly(tmp_path):
@@ -164,9 +163,8 @@ def test_jpeg_with_little_padding_and_things_behind_it_is_read(tmp_path, capfd):
     noise = np.random.default_rng(2).integers(0, 256, RGB.shape, dtype=np.uint8)
     content = encoded(noise, ".jpg")
     whole = read_panorama(write(tmp_path / "a.jpg", content)).rgb
-    padded = read_panorama(
-        write(tmp_path / "b.jpg", content[:-2] + bytes(20) + b"\xff\xd9" + b"film" * 99)
-    ).rgb
+    path = write(tmp_path / "b.jpg", content[:-2] + bytes(20) + b"\xff\xd9" + b"film" * 99)
+    padded = read_panorama(path).rgb
     np.testing.assert_array_equal(whole, padded)
     assert capfd.readouterr().err == ""
 

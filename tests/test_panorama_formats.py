@@ -17,9 +17,7 @@ TINT = np.uint8([0, 85, 170])
 @pytest.mark.parametrize("order", "<>")
 @pytest.mark.parametrize(("samples", "dtype"), [(3, np.uint8), (4, np.uint8), (3, np.uint16), (4, np.uint16)])
 def test_tiff_comes_back_exactly(tmp_path, order, samples, dtype):
-    pixels = (
-        RANDOM16[..., :samples] if dtype == np.uint16 else (RANDOM16[..., :samples] >> 8).astype(np.uint8)
-    )
+    pixels = RANDOM16[..., :samples] if dtype == np.uint16 else np.uint8(RANDOM16[..., :samples] >> 8)
     panorama = read_panorama(write(tmp_path / "a.tif", tiff(pixels, order=order)))
     is_valid = RANDOM16[..., 3] >> 8 > 0 if samples == 4 else np.ones((64, 128), bool)
     np.testing.assert_array_equal(panorama.rgb, RANDOM16[..., :3] >> 8)
@@ -129,9 +127,7 @@ def test_lossy_webp_comes_back_nearly(tmp_path):
 
 
 def test_cmyk_jpeg_becomes_rgb(tmp_path):
-    inks = np.repeat(np.array([[[0, 200, 200, 30], [200, 100, 0, 0]]], np.uint8), 64, axis=1).repeat(
-        64, axis=0
-    )
+    inks = np.uint8([[[0, 200, 200, 30], [200, 100, 0, 0]]]).repeat(64, axis=1).repeat(64, axis=0)
     content = saved(inks, "JPEG", "CMYK")
     rgb = read_panorama(write(tmp_path / "a.jpg", content)).rgb
     expected = (255 - inks[..., :3].astype(int)) * (255 - inks[..., 3:].astype(int)) / 255

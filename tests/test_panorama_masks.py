@@ -143,10 +143,8 @@ def fisheyes(radius=0.49, floor=0.0):
     v, u = np.mgrid[:HEIGHT, :HEIGHT] + 0.5 - HEIGHT / 2
     distance = np.hypot(u, v) / (radius * HEIGHT)
     fall = np.clip(1.2 - 0.6 * distance, 0, 1) * (distance < 1)
-    return (
-        np.concatenate([room(0)[:, :HEIGHT], room(1)[:, :HEIGHT]], axis=1) * np.tile(fall, 2)[..., None]
-        + floor
-    )
+    both = np.concatenate([room(0)[:, :HEIGHT], room(1)[:, :HEIGHT]], axis=1)
+    return both * np.tile(fall, 2)[..., None] + floor
 
 
 @pytest.mark.parametrize(("radius", "floor"), [(0.5, 0.0), (0.46, 6.0)])
@@ -197,9 +195,7 @@ def test_a_mask_of_a_crop_may_have_its_shape_or_the_spheres(tmp_path):
     is_valid = read(tmp_path / "a.jpg", image, options=ReadOptions(mask=file, **options)).is_valid
     assert is_valid[top:].sum() == 200 * 600
     file = write(tmp_path / "wrong.png", encoded(np.zeros((100, 100), np.uint8), ".png"))
-    with pytest.raises(
-        InputError, match=r"wrong.png: found a mask of 100 x 100, wanted the shape of 1024 x 512 or 600"
-    ):
+    with pytest.raises(InputError, match=r"wrong.png: found a mask of 100 x 100, wanted the shape of 1024 x"):
         read(tmp_path / "a.jpg", image, options=ReadOptions(mask=file, **options))
 
 

@@ -5,6 +5,7 @@ import pytest
 import rooms
 
 from piccolo.geometry.pose import Pose, is_close, yaw_rotation
+from piccolo.geometry.rotations import uniform_yaws
 from piccolo.optimize.refine import Loss, sampling_loss_of
 from piccolo.panorama.resize import shrink
 from piccolo.panorama.texels import pack_texels
@@ -14,10 +15,10 @@ AT = np.array([1.0, 2.0, 1.5])
 
 
 def test_poses_are_close_only_if_near_and_turned_alike():
-    a, b, c = (
-        Pose(yaw_rotation(np.radians(yaw)), np.array([x, 0.0, 0.0]))
-        for x, yaw in ((0, 0), (0.2, 10), (0.2, 20))
+    poses = (
+        Pose(yaw_rotation(np.radians(yaw)), np.array([x, 0, 0])) for x, yaw in ((0, 0), (0.2, 10), (0.2, 20))
     )
+    a, b, c = poses
     assert is_close(a, b, 0.3, np.radians(15))
     assert not is_close(a, c, 0.3, np.radians(15))
     assert not is_close(a, b, 0.1, np.radians(15))
@@ -39,9 +40,7 @@ def scene():
 
 def test_true_rotation_has_the_smallest_loss(scene):
     points, panorama, true_pose = scene
-    turns = np.stack(
-        [yaw_rotation(a) @ true_pose.R_cam_from_world for a in np.radians([0, 45, 90, 180, 270])]
-    )
+    turns = uniform_yaws(8) @ true_pose.R_cam_from_world
     scored = losses_at(points, sampling_loss_of(pack_texels(panorama.rgb)), true_pose.center_world, turns)
     assert np.argmax([h.score for h in scored]) == 0
 

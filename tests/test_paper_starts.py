@@ -71,9 +71,8 @@ def test_yaws_are_even():
 @pytest.mark.parametrize("count", [32, 500])
 def test_rotations_cover_so3_evenly(count):
     rotations = uniform_rotations(count)
-    np.testing.assert_allclose(
-        rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (count, 1, 1)), atol=1e-12
-    )
+    products = rotations @ rotations.transpose(0, 2, 1)
+    np.testing.assert_allclose(products, np.tile(np.eye(3), (count, 1, 1)), atol=1e-12)
     traces = np.einsum("aij,bij->ab", rotations, rotations)
     np.fill_diagonal(traces, -1.0)
     nearest = np.arccos(np.clip((traces.max(axis=1) - 1.0) / 2.0, -1.0, 1.0))

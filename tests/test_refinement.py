@@ -76,9 +76,8 @@ def test_halving_keeps_as_many_as_the_beam_says(monkeypatch):
         monkeypatch.setattr(refinement, name, gaining(name, gain))
     monkeypatch.setattr(refinement, "refine_by_perturbation", gaining("perturb", 0.5))
     centers = np.outer(np.arange(40.0), [1.0, 0, 0])
-    starts = Starts(
-        np.repeat(np.eye(3)[None], 40, axis=0), centers, np.arange(40), 0.5 - 0.01 * np.arange(40)
-    )
+    R, index = np.repeat(np.eye(3)[None], 40, axis=0), np.arange(40)
+    starts = Starts(R, centers, index, 0.5 - 0.01 * index)
     fine, middle = refinement.refine(QUERY, starts, Beam(30, 12, 5, 2))
     assert calls[:2] == [(5, 30), (12, 12)]
     assert [
@@ -202,7 +201,7 @@ def test_alternatives_that_come_near_are_refined_and_the_better_wins(monkeypatch
 def test_a_search_is_confident_by_score_and_margin():
     for score, other, expected in (
         (0.25, 0.1, True),
-        (0.24, 0.0, False),
+        (0.24, 0, False),
         (0.5, 0.35, True),
         (0.5, 0.36, False),
     ):

@@ -24,12 +24,8 @@ def scene(tmp_path_factory):
     """A made room with a result for each of two panoramas, in a folder with a blank in its name."""
     folder = tmp_path_factory.mktemp("my room")
     arguments = ["--seed", "7", "--points", "30000", "--panoramas", "1", "--width", "256", "--quiet"]
-    assert (
-        make_room.main(
-            ["--out", str(folder), *arguments, "--size", "4", "3", "2.5", "--variants", "clean", "tilt"]
-        )
-        == 0
-    )
+    room = ["--size", "4", "3", "2.5", "--variants", "clean", "tilt"]
+    assert make_room.main(["--out", str(folder), *arguments, *room]) == 0
     truth = read_scene(folder).by_name
     some = [poses.result(folder / "images" / n, truth[n].pose) for n in ("clean_0.jpg", "tilt_0.jpg")]
     poses.write_results(folder / "poses.jsonl", [*some, poses.result("c.jpg", None, "not_localized")])

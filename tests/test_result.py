@@ -35,9 +35,8 @@ def test_json_round_trip_keeps_every_bit_of_the_pose():
     back = Result.from_json(RESULT.to_json())
     np.testing.assert_array_equal(back.pose.R_cam_from_world, RESULT.pose.R_cam_from_world)
     np.testing.assert_array_equal(back.pose.center_world, RESULT.pose.center_world)
-    np.testing.assert_array_equal(
-        back.alternatives[0].pose.R_cam_from_world, ALTERNATIVE.pose.R_cam_from_world
-    )
+    found, kept = (a.pose.R_cam_from_world for a in (back.alternatives[0], ALTERNATIVE))
+    np.testing.assert_array_equal(found, kept)
     np.testing.assert_array_equal(back.covariance.matrix, RESULT.covariance.matrix)
     assert (back.alternatives[0].score, back.covariance.least_constrained_direction) == (0.2, "up and down")
     plain = dataclasses.replace(RESULT, **WITHOUT_ARRAYS)
@@ -90,9 +89,7 @@ def test_nan_is_never_written():
         dataclasses.replace(RESULT, loss=float("nan")).to_json()
 
 
-@pytest.mark.parametrize(
-    "text", ["{", "[]", "{}", '{"format": "piccolo-pose/2"}', '{"format": "piccolo-pose/3"}']
-)
+@pytest.mark.parametrize("text", ["{", "[]", "{}", *(f'{{"format": "piccolo-pose/{k}"}}' for k in (2, 3))])
 def test_other_text_is_refused(text):
     with pytest.raises(InputError, match="piccolo-pose/3"):
         Result.from_json(text)

@@ -46,11 +46,8 @@ def test_images_may_stand_elsewhere(tmp_path):
 def test_scenes_are_found_at_any_depth_and_named_by_it(tmp_path):
     for name in ("area_1/office 1", "area_1/hall", "area_2/hall"):
         _written(tmp_path / name)
-    assert [scene.name for scene in find_scenes([tmp_path])] == [
-        "area_1/hall",
-        "area_1/office 1",
-        "area_2/hall",
-    ]
+    names = [scene.name for scene in find_scenes([tmp_path])]
+    assert names == ["area_1/hall", "area_1/office 1", "area_2/hall"]
     alone = find_scenes([tmp_path / "area_1" / "hall" / "queries.json"])
     assert [(scene.name, scene.cloud.parent.name) for scene in alone] == [("hall", "hall")]
     with pytest.raises(InputError, match="found a second scene named hall"):

@@ -40,9 +40,7 @@ def test_a_blank_wall_can_not_win(scene, level):
 def test_exposure_and_white_balance_change_little(scene):
     points, panorama, true_pose = scene
     darker = as_panorama((panorama.rgb * np.array([0.6, 0.5, 0.4])).astype(np.uint8))
-    difference = (
-        agreement_at(points, darker, true_pose).score - agreement_at(points, panorama, true_pose).score
-    )
+    difference = np.diff([agreement_at(points, p, true_pose).score for p in (panorama, darker)])
     assert abs(difference) < 0.12
 
 

@@ -54,9 +54,8 @@ def test_what_is_masked_does_not_bleed():
     is_valid[200:] = False
     black, white = panorama.rgb.copy(), panorama.rgb.copy()
     black[200:], white[200:] = 0, 255
-    (a, valid), (b, _) = (
-        _levels(image_pyramid(Panorama(rgb, is_valid), [SCALE])[0]) for rgb in (black, white)
-    )
+    black_and_white = (image_pyramid(Panorama(rgb, is_valid), [SCALE])[0] for rgb in (black, white))
+    (a, valid), (b, _) = map(_levels, black_and_white)
     np.testing.assert_array_equal(a[valid], b[valid])
     assert valid.mean() == pytest.approx(200 / 256, abs=0.02)
 
@@ -67,10 +66,8 @@ def test_images_of_every_scale_have_their_width():
 
 
 def test_samples_along_turned_directions_equal_their_twin():
-    texels, directions = (
-        normalize_panorama(resize(rooms.scene(1)[1], 128), 7.5, 22.0),
-        make_grid(24).directions,
-    )
+    texels = normalize_panorama(resize(rooms.scene(1)[1], 128), 7.5, 22.0)
+    directions = make_grid(24).directions
     channels, is_valid = _levels(texels)
     rotations = uniform_rotations(5).astype(np.float32)
     samples, validity = np.empty((5, 3, len(AREA)), np.float32), np.empty((5, len(AREA)), np.float32)
@@ -87,10 +84,8 @@ def test_scores_equal_correlations_one_by_one():
     samples, validity = search.turn_panorama(_query().images.search, uniform_rotations(50))
     validity[:, rng.random(validity.shape[1]) < 0.2] = 0
     samples *= validity[:, None]
-    scores, panorama = (
-        search.score_poses(scan_map, samples, validity),
-        search.turned(samples, validity, AREA, 1),
-    )
+    panorama = search.turned(samples, validity, AREA, 1)
+    scores = search.score_poses(scan_map, samples, validity)
     candidate, rotation = rng.integers(0, len(scores), 40), rng.integers(0, 50, 40)
     pairs, area = np.empty(40, np.float32), np.rint(1000 * AREA / AREA.max())
     search.correlate_pairs(scan_map.features, scan_map.is_seen, area, panorama, candidate, rotation, pairs)
@@ -124,9 +119,8 @@ def test_sums_of_a_search_are_exact():
     cells, views = rng.permutation(len(AREA)), rng.permutation(50)
     shuffled = search.TurnedPanorama(*(values[..., cells] for values in panorama))
     features, seen = features[views][..., cells].reshape(50, -1), seen[views][:, cells]
-    np.testing.assert_array_equal(
-        search.masked_correlation(features, seen, AREA[cells], shuffled), expected[views]
-    )
+    found = search.masked_correlation(features, seen, AREA[cells], shuffled)
+    np.testing.assert_array_equal(found, expected[views])
 
 
 @pytest.mark.parametrize("is_wide", [False, True])
@@ -174,14 +168,12 @@ def test_heading_is_the_worlds_where_the_map_was_levelled(gravity):
     assert np.abs(off).max() < 20.0 + 1e-6
 
 
-@pytest.mark.parametrize(
-    ("min_starts", "max_starts", "expected"), [(150, 4000, 150), (150, 20, 20), (1, 4000, None)]
-)
-def test_number_of_starts(min_starts, max_starts, expected):
+@pytest.mark.parametrize(("fewest", "most", "expected"), [(150, 4000, 150), (150, 20, 20), (1, 4000, None)])
+def test_number_of_starts(fewest, most, expected):
     """One for every four candidates, but not fewer and not more than asked for."""
     query = _query()
-    method = query.method._replace(min_starts=min_starts)
-    settings = dataclasses.replace(query.settings, max_starts=max_starts)
+    method = query.method._replace(min_starts=fewest)
+    settings = dataclasses.replace(query.settings, max_starts=most)
     few = dataclasses.replace(query, method=method, settings=settings)
     for gravity in ("known", "unknown"):
         starts = search.search_poses(few, gravity)

@@ -18,9 +18,8 @@ RAYS = sphere.pixel_rays(WIDTH)
 def _pixels(points, R_cam_from_world=TILTED, center_world=CENTER, width=WIDTH):
     x_cam = ((points - center_world) @ R_cam_from_world.T).astype(np.float32)
     rho = np.hypot(x_cam[:, 0], x_cam[:, 1])
-    return np.array(
-        [sphere.direction_to_pixel(*p, r, np.float32(width)) for p, r in zip(x_cam, rho, strict=True)]
-    )
+    pixel = sphere.direction_to_pixel
+    return np.array([pixel(*p, r, np.float32(width)) for p, r in zip(x_cam, rho, strict=True)])
 
 
 def test_pixel_of_a_direction_equals_its_twin():
@@ -91,9 +90,7 @@ def test_pixel_jacobian_against_central_differences(where):
         numbers = np.empty((2, 3))
         for axis in range(3):
             h = 1e-6 * np.eye(3)[axis]
-            ahead, behind = (
-                naive.project((p + s * h)[None], np.eye(3), np.zeros(3), WIDTH)[0] for s in (1, -1)
-            )
+            ahead, behind = (naive.project((p + s)[None], np.eye(3), np.zeros(3), WIDTH)[0] for s in (h, -h))
             difference = ahead - behind
             difference[0] -= WIDTH * np.round(difference[0] / WIDTH)
             numbers[:, axis] = difference / 2e-6

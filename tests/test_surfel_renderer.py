@@ -58,9 +58,8 @@ def test_splat_equals_its_twin_over_seam_and_poles():
     surfels = np.column_stack([center, normal, along, radius**-2.0, distance]).astype(np.float32)
     rgb = rng.integers(0, 256, (300, 3), dtype=np.uint8)
     angles = np.maximum(np.arcsin(radius / distance), MIN_RADIUS_PX * 2 * np.pi / 64)
-    directions = np.stack(
-        [np.arctan2(center[:, 1], center[:, 0]), np.arcsin(center[:, 2] / distance)], axis=1
-    )
+    azimuth, elevation = np.arctan2(center[:, 1], center[:, 0]), np.arcsin(center[:, 2] / distance)
+    directions = np.stack([azimuth, elevation], axis=1)
     depth, sums = np.full((32, 64), np.inf, np.float32), np.zeros((32, 64, 5), np.float32)
     packed = pack_points(center.astype(np.float32), rgb).rgbx
     for lo in (0, 11):  # two strips of rows

@@ -85,7 +85,7 @@ def test_scan_stays_inside_the_walls_and_keeps_rooms_apart():
     world = make_world(2, SMALL, num_rooms=2)
     points, *_ = scan_world(world, 8000, Workers(2))
     inside = [
-        ((points > r.corner - 0.03) & (points < r.corner + r.size + 0.03)).all(axis=1) for r in world.rooms
+        np.all((points > r.corner - 0.03) & (points < r.corner + r.size + 0.03), 1) for r in world.rooms
     ]
     assert (inside[0] | inside[1]).all()
     assert inside[0].sum() == inside[1].sum() == 4000

@@ -93,9 +93,8 @@ def test_more_must_be_seen_around_a_candidate_than_on_open_land():
     for points, least, most in ((ground, 0.3, 0.55), (hall, 0.55, 1.01)):
         cloud = Cloud(points.astype(np.float32), np.full(points.shape, 99, np.uint8), np.zeros(3))
         octree = build_octree(cloud.voxels(np.eye(3)))
-        fractions = camera_positions.coverage(
-            octree, camera_positions.candidate_centers(octree, Workers(2)), Workers(2)
-        )
+        centers = camera_positions.candidate_centers(octree, Workers(2))
+        fractions = camera_positions.coverage(octree, centers, Workers(2))
         assert len(fractions) > 50
         assert least < fractions.min() < most
 

@@ -44,13 +44,12 @@ def test_range_noise_and_grazing_surfaces_hide_nothing():
     for distance, gap, is_seen in (
         (0.5, 0.13, True),
         (0.5, 0.15, False),
-        (10.0, 0.89, True),
-        (10.0, 0.91, False),
+        (10, 0.89, True),
+        (10, 0.91, False),
     ):
         points = np.array([[distance, 0.01, 0.01], [distance + gap, 0.01, 0.01]], np.float32)
-        assert (
-            len(visible_points(pack_points(points, np.zeros((2, 3), np.uint8)), np.zeros(3))) == 2
-        ) == is_seen
+        visible = visible_points(pack_points(points, np.zeros((2, 3), np.uint8)), np.zeros(3))
+        assert (len(visible) == 2) == is_seen
 
 
 def test_view_shows_the_nearer_wall_in_its_colour():

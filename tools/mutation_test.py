@@ -126,8 +126,8 @@ def fails(names: Sequence[str], folder: Path, *options: str) -> bool:
     """True if one of these tests fails in a copy of the checkout."""
     tests = [f"tests/test_{name}.py" for name in names]
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *options, *tests]
-    environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
-    limits: dict[str, Any] = {"cwd": folder, "env": environment, "timeout": TIMEOUT_S}
+    own = {"PYTHONPATH": str(folder), "XDG_CACHE_HOME": str(folder.parent), "PYTHONDONTWRITEBYTECODE": "1"}
+    limits: dict[str, Any] = {"cwd": folder, "env": os.environ | own, "timeout": TIMEOUT_S}
     try:
         return subprocess.run(command, check=False, capture_output=True, **limits).returncode != 0
     except subprocess.TimeoutExpired:
