@@ -54,9 +54,8 @@ def xmp_packet(fields, form="attributes", prefix="GPano"):
     """XMP with Photo Sphere fields, by either of its two forms."""
     names = {name: str(value) for name, value in fields.items()}
     attributes = "".join(f' {prefix}:{k}="{v}"' for k, v in names.items()) if form == "attributes" else ""
-    elements = (
-        "" if attributes else "".join(f"<{prefix}:{k}> {v} </{prefix}:{k}>\n" for k, v in names.items())
-    )
+    elements = "".join(f"<{prefix}:{k}> {v} </{prefix}:{k}>\n" for k, v in names.items())
+    elements = "" if attributes else elements
     return (
         '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
         f'<rdf:Description rdf:about="" xmlns:{prefix}="{XMP_NAMESPACE}"{attributes}>{elements}'

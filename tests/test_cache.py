@@ -68,10 +68,8 @@ def test_a_folder_that_others_may_have_filled_is_not_trusted(folders, monkeypatc
 
 
 def test_files_unused_for_a_month_go_and_others_stay(tmp_path):
-    old, used, foreign, fresh = (
-        tmp_path / name
-        for name in ("0" * 32 + ".kernel", "1" * 32 + ".kernel", "a.txt", "2" * 32 + ".kernel")
-    )
+    names = (f"{'0' * 32}.kernel", f"{'1' * 32}.kernel", "a.txt", f"{'2' * 32}.kernel")
+    old, used, foreign, fresh = (tmp_path / name for name in names)
     for path in (old, used, foreign):
         path.touch()
         os.utime(path, (0, 0))
@@ -108,20 +106,15 @@ def test_a_flipped_byte_in_compiled_code_is_noticed(tmp_path, monkeypatch, caplo
         anew = kernel(total)
         assert anew(values) == 10.0
         assert sum(anew.stats.cache_misses.values()) == 1
-        assert [record.getMessage() for record in caplog.records] == [
-            f"{path}: damaged compiled code; it is compiled anew"
-        ]
+        message = f"{path}: damaged compiled code; it is compiled anew"
+        assert [record.getMessage() for record in caplog.records] == [message]
         assert kernel(total)(values) == 10.0
         assert len(caplog.records) == 1  # it was written anew
 
 
 def test_importing_writes_nothing(tmp_path):
-    environment = {
-        **os.environ,
-        "HOME": str(tmp_path),
-        "XDG_CACHE_HOME": str(tmp_path / "cache"),
-        "PYTHONDONTWRITEBYTECODE": "1",
-    }
+    folders = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    environment = {**os.environ, **folders, "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, "-c", "import piccolo.cli.localize, piccolo.cli.evaluate"]
     subprocess.run(command, cwd=ROOT, env=environment, check=True)
     assert list(tmp_path.iterdir()) == []

@@ -59,11 +59,8 @@ def test_a_quaternion_of_any_length_is_a_rotation(tmp_path):
 def test_spherical_coordinates(tmp_path):
     distance = np.linalg.norm(RAW.points_world, axis=1)
     x, y, z = RAW.points_world.T
-    spherical = {
-        "sphericalRange": distance,
-        "sphericalAzimuth": np.arctan2(y, x),
-        "sphericalElevation": np.arcsin(z / distance),
-    }
+    azimuth, elevation = np.arctan2(y, x), np.arcsin(z / distance)
+    spherical = {"sphericalRange": distance, "sphericalAzimuth": azimuth, "sphericalElevation": elevation}
     written = ScanToWrite(spherical | colored(), BYTES, None, QUATERNION)
     points, _ = read(write(tmp_path / "a.e57", [written]))
     np.testing.assert_allclose(points, RAW.points_world @ R_WORLD.T, atol=1e-12)
@@ -97,9 +94,8 @@ def test_invalid_points_and_colors_are_left_out(tmp_path):
     state = np.arange(1200) % 3  # 0 whole, 1 direction only, 2 nothing
     is_gray = np.arange(1200) % 5 == 0
     extra = {"cartesianInvalidState": state, "isColorInvalid": is_gray.astype(np.int64)}
-    points, colors = read(
-        write(tmp_path / "a.e57", [scan(extra, {"cartesianInvalidState": (0, 2), "isColorInvalid": (0, 1)})])
-    )
+    declared = {"cartesianInvalidState": (0, 2), "isColorInvalid": (0, 1)}
+    points, colors = read(write(tmp_path / "a.e57", [scan(extra, declared)]))
     is_whole = (state == 0) & ~is_gray
     np.testing.assert_array_equal(points, RAW.points_world[is_whole])
     np.testing.assert_array_equal(colors, RAW.colors[is_whole])

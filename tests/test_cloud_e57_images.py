@@ -25,12 +25,8 @@ def test_images_are_listed_and_read(tmp_path):
     path = write(tmp_path / "a.e57", [scan()], IMAGES)
     images = list_images(path)
     assert [image.kind for image in images] == ["spherical", "pinhole", "cylindrical", "visual-reference"]
-    assert [images[0].name, images[0].width, images[0].height, images[0].size] == [
-        "pano",
-        400,
-        200,
-        len(JPEG),
-    ]
+    first = images[0]
+    assert (first.name, first.width, first.height, first.size) == ("pano", 400, 200, len(JPEG))
     assert images[0].fov_deg == pytest.approx((360.0, 180.0))
     assert (images[0].scan_guid, images[0].placement, images[1].fov_deg) == ("{scan}", None, None)
     np.testing.assert_allclose(images[1].placement.R_world_from_local, R_WORLD, atol=1e-12)

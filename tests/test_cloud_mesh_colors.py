@@ -86,11 +86,7 @@ def test_flat_triangles_and_nan_vertices_are_left_out_with_a_warning(tmp_path):
 
 @pytest.mark.parametrize(
     "options",
-    [
-        {"library": "", "material": "", "mtl": ""},
-        {"mtl": "newmtl wall\nKd 0.2 0.3 0.4\n"},
-        {"material": "unknown"},
-    ],
+    [{"library": "", "material": "", "mtl": ""}, {"mtl": "newmtl wall\nKd 1 1 1\n"}, {"material": "other"}],
 )
 def test_meshes_without_colors_are_refused(tmp_path, options):
     assert_refused(r"room\.obj: no colours", open_mesh, made.write_obj(tmp_path, **options))

@@ -33,12 +33,8 @@ def assert_read_as_written(path, points_world=XYZ):
     np.testing.assert_array_equal(colors, RGB)
 
 
-ARRAYS = {
-    "float": WHOLE,
-    "fortran": np.asfortranarray(WHOLE),
-    "big-endian": WHOLE.astype(">f8"),
-    "float32": WHOLE.astype("f4"),
-}
+ARRAYS = {"float": WHOLE, "fortran": np.asfortranarray(WHOLE)}
+ARRAYS |= {"big-endian": WHOLE.astype(">f8"), "float32": WHOLE.astype("f4")}
 
 
 @pytest.mark.parametrize("kind", ARRAYS)

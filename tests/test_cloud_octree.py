@@ -54,6 +54,5 @@ def test_shuffling_points_changes_no_bit(seed):
 @pytest.mark.parametrize(("size", "level"), [(0.02, 7), (0.04, 6), (0.16, 4), (100.0, 0), (0.001, 7)])
 def test_level_is_the_nearest_in_size(size, level):
     octree = _octree(*_cloud())
-    np.testing.assert_array_equal(
-        octree.level(size), octree.nodes[octree.level_start[level] : octree.level_start[level + 1]]
-    )
+    begin, end = octree.level_start[level : level + 2]
+    np.testing.assert_array_equal(octree.level(size), octree.nodes[begin:end])

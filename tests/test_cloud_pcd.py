@@ -42,9 +42,8 @@ def content_of(fields, encoding, num_points=1200, **lines):
     if encoding == "ascii":
         types = [type_ for _, type_, *_ in fields]
         rows = zip(*columns, strict=True)
-        body = "\n".join(
-            " ".join(number(v, t) for part, t in zip(row, types, strict=True) for v in part) for row in rows
-        ).encode()
+        fields = (zip(row, types, strict=True) for row in rows)
+        body = "\n".join(" ".join(number(v, t) for part, t in row for v in part) for row in fields).encode()
     elif encoding == "binary":
         body = np.hstack([column.view(np.uint8) for column in columns]).tobytes()
     else:

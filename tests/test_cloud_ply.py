@@ -15,9 +15,8 @@ from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)
 RGB = ("red", "green", "blue")
-TRIANGLES = PlyElement.describe(
-    np.array([([0, 1, 2],), ([2, 3, 4],)], dtype=[("vertex_indices", "i4", (3,))]), "strip"
-)
+FACES = np.array([([0, 1, 2],), ([2, 3, 4],)], dtype=[("vertex_indices", "i4", (3,))])
+TRIANGLES = PlyElement.describe(FACES, "strip")
 
 
 def vertices(raw=RAW, coordinate="f4", color="u1", names=RGB, brightest=255, extra=()):

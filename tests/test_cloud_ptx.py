@@ -35,10 +35,8 @@ THERE = placed(-2.1, -0.8, [637_012.25, 5_849_028.5, 431.125])
 
 
 def points_of(points_world, colors, intensity="0.5 "):
-    return [
-        " ".join(map(repr, point.tolist())) + f" {intensity}{r} {g} {b}"
-        for point, (r, g, b) in zip(points_world, colors.tolist(), strict=True)
-    ]
+    rows = zip(points_world.tolist(), colors.tolist(), strict=True)
+    return [f"{x!r} {y!r} {z!r} {intensity}{r} {g} {b}" for (x, y, z), (r, g, b) in rows]
 
 
 def in_scanner(points_world, matrix):
@@ -229,9 +227,8 @@ def test_a_file_cut_while_it_is_read_is_refused(tmp_path, monkeypatch, name, gra
     monkeypatch.setattr(number_lines, "BLOCK", 4096)
     lines = TWO_SCANS if name == "a.ptx" else ["1200", *pts()]
     if gray:
-        lines = [
-            " ".join([*f[:3], str(k)] if len(f) == 7 else f) for k, f in enumerate(map(str.split, lines))
-        ]
+        fields = [line.split() for line in lines]
+        lines = [" ".join([*f[:3], str(k)] if len(f) == 7 else f) for k, f in enumerate(fields)]
     path = write(tmp_path / name, lines)
     chunks = open_source(path, CloudReadOptions(intensity_as_gray=gray)).read_chunks()
     next(chunks)

@@ -14,9 +14,7 @@ RAW = seeded_cloud(1)
 
 def lines_of(raw, separator=" ", color_format="d"):
     return [
-        separator.join(
-            [*(f"{value:.6f}" for value in point), *(f"{value:{color_format}}" for value in color)]
-        )
+        separator.join([*map("{:.6f}".format, point), *(f"{value:{color_format}}" for value in color)])
         for point, color in zip(raw.points_world, raw.colors, strict=True)
     ]
 

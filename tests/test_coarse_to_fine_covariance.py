@@ -137,13 +137,8 @@ def test_truth_is_among_the_poses_of_a_place_that_repeats(kind):
     points, colors, _ = scan_world(world, 80_000 * len(world.rooms), Workers(2))
     cloud = stream_of(Path("repeated"), RawCloud(points.astype(float), colors))
     taken = make_query(world, 0, "clean", rooms.WIDTH, Workers(2))
-    result = localize(
-        prepare_map(cloud, Workers(2)),
-        as_panorama(taken.rgb),
-        CoarseToFineSettings(),
-        Workers(2),
-        Stopwatch(),
-    )
+    built, panorama = prepare_map(cloud, Workers(2)), as_panorama(taken.rgb)
+    result = localize(built, panorama, CoarseToFineSettings(), Workers(2), Stopwatch())
     poses = [result.pose, *(h.pose for h in result.alternatives)]
     distances = [errors(pose, taken.pose)[0] for pose in poses]
     assert min(distances) < 0.1

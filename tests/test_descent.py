@@ -59,9 +59,8 @@ def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off():
     cells = render_view(rooms.scan_map(1).octree, off.center_world, METHOD.fine_view)
     found = descent.descend_around(cells, (images.search, images.middle), off, 1.0)
     assert rooms.errors(found.pose, true_pose)[0] < 0.06
-    np.testing.assert_allclose(
-        found.score, descent.score_on(cells, off.center_world, images.middle, found.pose), atol=1e-5
-    )
+    score = descent.score_on(cells, off.center_world, images.middle, found.pose)
+    np.testing.assert_allclose(found.score, score, atol=1e-5)
 
 
 def test_starts_descend_on_their_candidates_views_as_one_does_alone():

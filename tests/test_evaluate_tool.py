@@ -49,9 +49,8 @@ def test_a_run_its_tables_and_files(scenes, tmp_path, capsys):
     assert _run(scenes, out, *options) == 0
     text = capsys.readouterr().out
     rows = read_run(out)[0]
-    assert [(row.scene, row.is_in_box) for row in rows] == [
-        *[("hall 2", True), ("hall 2", True), ("hall 2", False), ("room", True), ("room", True)]
-    ]
+    hall, room = [("hall 2", True)] * 2 + [("hall 2", False)], [("room", True)] * 2
+    assert [(row.scene, row.is_in_box) for row in rows] == hall + room
     assert rows[2].position_error > 50.0
     assert "all 5 queries; correct" in text
     assert "without the 1 queries taken outside the cloud's bounding box; correct" in text

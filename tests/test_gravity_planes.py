@@ -57,9 +57,8 @@ def test_the_names_turn_over_with_up(hut):
 
 def test_same_points_same_bits(hut):
     a, b = ransac_planes(hut), ransac_planes(hut)
-    assert [(p.normal_world.tobytes(), p.offset, p.rms) for p in a] == [
-        (p.normal_world.tobytes(), p.offset, p.rms) for p in b
-    ]
+    bits = [[(p.normal_world.tobytes(), p.offset, p.rms) for p in planes] for planes in (a, b)]
+    assert bits[0] == bits[1]
 
 
 def test_noise_has_no_planes():

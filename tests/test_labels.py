@@ -76,9 +76,8 @@ def test_ignored_labels_are_left_out(tmp_path):
 @pytest.mark.parametrize("wrong", [3.5, np.nan, -np.inf, 1e12])
 def test_labels_that_are_no_whole_numbers_are_refused(tmp_path, wrong):
     path = _ply(tmp_path / "a.ply", kind="f8", values=np.where(np.arange(3000) == 1700, wrong, LABELS))
-    with pytest.raises(
-        InputError, match=re.escape(f"a.ply: found the label {wrong:g}, wanted whole numbers")
-    ):
+    message = f"a.ply: found the label {wrong:g}, wanted whole numbers"
+    with pytest.raises(InputError, match=re.escape(message)):
         whole(open_source, path, READ)
 
 
@@ -152,10 +151,8 @@ def test_ignored_labels_and_masks_do_not_count_and_nothing_else_is_masked(tmp_pa
     labels[:9], labels[-9:] = 0, 1  # as a black border and a disc over the nadir look in colours
     path = _png(tmp_path / "a.png", labels.astype(np.uint8))
     assert read_panorama(path, READ_IMAGE).is_valid.all()
-    mask = _png(
-        tmp_path / "mask.png",
-        np.where(np.arange(128) < 20, 255, 0).astype(np.uint8) * np.ones((64, 1), np.uint8),
-    )
+    is_left = np.broadcast_to(np.arange(128) < 20, (64, 128))
+    mask = _png(tmp_path / "mask.png", np.uint8(255 * is_left))
     panorama = read_panorama(path, PanoramaOptions(mask=mask, mask_nadir_deg=20.0, labels=Labels((0, 5))))
     expected = (labels != 0) & (labels != 5) & (np.arange(128) >= 20)
     expected[-7:] = False

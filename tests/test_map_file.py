@@ -45,6 +45,5 @@ def test_another_format_is_refused_in_one_clear_line(tmp_path, monkeypatch):
     assert is_map_file(built)
     with pytest.raises(InputError) as refused:
         load_map(built)
-    assert str(refused.value) == (
-        f"{built}: a map of format piccolo-map/1, but this version reads {map_file.FORMAT}; prepare it again"
-    )
+    message = f"a map of format piccolo-map/1, but this version reads {map_file.FORMAT}; prepare it again"
+    assert str(refused.value) == f"{built}: {message}"

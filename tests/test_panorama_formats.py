@@ -109,9 +109,7 @@ def test_tiff_with_damaged_strips_is_refused(tmp_path, compression, capfd):
     assert capfd.readouterr().err == ""
 
 
-@pytest.mark.parametrize(
-    "image", [RGB, np.dstack([RGB, np.where(RGB[..., 1] < 99, 0, 255).astype(np.uint8)])]
-)
+@pytest.mark.parametrize("image", [RGB, np.dstack([RGB, np.uint8(np.where(RGB[..., 1] < 99, 0, 255))])])
 def test_webp_comes_back_exactly(tmp_path, image):
     content = encoded(image, ".webp", LOSSLESS)
     for stored in (content, with_metadata(content, orientation=1)):

@@ -131,9 +131,8 @@ def test_the_attitude_is_read(tmp_path):
 
 
 def test_an_entity_bomb_is_not_expanded(tmp_path):
-    bomb = b'<!DOCTYPE a [<!ENTITY a "aaaaaaaa">' + b"".join(
-        f'<!ENTITY {chr(98 + k)} "{f"&{chr(97 + k)};" * 10}">'.encode() for k in range(20)
-    )
+    steps = (f'<!ENTITY {chr(98 + k)} "{f"&{chr(97 + k)};" * 10}">'.encode() for k in range(20))
+    bomb = b'<!DOCTYPE a [<!ENTITY a "aaaaaaaa">' + b"".join(steps)
     xmp = bomb + b"]>" + xmp_packet({"PosePitchDegrees": "&u;"})
     panorama = read_panorama(write(tmp_path / "a.jpg", with_metadata(encoded(RGB, ".jpg"), xmp=xmp)))
     assert panorama.gpano == GPano()
@@ -189,8 +188,8 @@ def test_other_fields_of_view_are_refused(fov_deg):
         ReadOptions(fov_deg=fov_deg)
 
 
-NUMBERS = st.one_of(
-    st.integers(-10, 2_000_000_000), st.floats(), st.text(max_size=9), st.sampled_from([200, 400, 800, 32768])
+NUMBERS = (
+    st.integers(-10, 2**31) | st.floats() | st.text(max_size=9) | st.sampled_from([200, 400, 800, 32768])
 )
 
 

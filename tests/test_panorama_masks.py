@@ -204,9 +204,8 @@ def test_a_folder_of_masks_is_looked_up_by_name(tmp_path):
     folder.mkdir()
     write(folder / "a.png", encoded(checker_mask(64, 32), ".png"))
     options = ReadOptions(mask=folder)
-    np.testing.assert_array_equal(
-        read(tmp_path / "a.jpg", room(), options=options).is_valid, checker_mask(WIDTH, HEIGHT) == 0
-    )
+    is_valid = read(tmp_path / "a.jpg", room(), options=options).is_valid
+    np.testing.assert_array_equal(is_valid, checker_mask(WIDTH, HEIGHT) == 0)
     panorama = read(tmp_path / "b.jpg", room(), options=options)
     assert panorama.is_valid.all()
     assert panorama.warnings == (f"found no mask b in {folder}",)

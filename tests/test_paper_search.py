@@ -15,9 +15,8 @@ AT = np.array([1.0, 2.0, 1.5])
 
 
 def test_poses_are_close_only_if_near_and_turned_alike():
-    poses = (
-        Pose(yaw_rotation(np.radians(yaw)), np.array([x, 0, 0])) for x, yaw in ((0, 0), (0.2, 10), (0.2, 20))
-    )
+    places = (0.0, 0), (0.2, 10), (0.2, 20)
+    poses = (Pose(yaw_rotation(np.radians(yaw)), np.array([x, 0, 0])) for x, yaw in places)
     a, b, c = poses
     assert is_close(a, b, 0.3, np.radians(15))
     assert not is_close(a, c, 0.3, np.radians(15))

@@ -80,9 +80,8 @@ def test_halving_keeps_as_many_as_the_beam_says(monkeypatch):
     starts = Starts(R, centers, index, 0.5 - 0.01 * index)
     fine, middle = refinement.refine(QUERY, starts, Beam(30, 12, 5, 2))
     assert calls[:2] == [(5, 30), (12, 12)]
-    assert [
-        calls.count(name) for name in ("descend_middle", "perturb_middle", "descend_fine", "perturb")
-    ] == [12, 5, 5, 2]
+    stages = ("descend_middle", "perturb_middle", "descend_fine", "perturb")
+    assert [calls.count(name) for name in stages] == [12, 5, 5, 2]
     assert _places(fine) == [0, 1, 0, 1, 2, 3, 4]
     assert fine[0].score == pytest.approx(0.5 + 0.3 + 0.5)
     assert _places(middle) == list(range(12))
@@ -113,12 +112,7 @@ def test_each_stage_has_its_view_its_image_and_its_limits(monkeypatch):
 
 @pytest.mark.parametrize(
     ("gains", "rounds", "expected"),
-    [
-        ([0.2, 0.02, 0.005, 0.5], 3, 0.725),
-        ([0.1] * 9, 5, 1.0),
-        ([-0.3, 0.5], 1, 0.5),
-        ([0.1, -0.1, 1.0], 2, 0.6),
-    ],
+    [([0.2, 0.02, 0.005, 1], 3, 0.725), ([0.1] * 9, 5, 1.0), ([-0.3, 0.5], 1, 0.5), ([0.1, -0.1, 1], 2, 0.6)],
 )
 def test_poses_are_perturbed_for_as_long_as_that_helps(monkeypatch, gains, rounds, expected):
     left, sizes = list(gains), []
@@ -199,13 +193,8 @@ def test_alternatives_that_come_near_are_refined_and_the_better_wins(monkeypatch
 
 
 def test_a_search_is_confident_by_score_and_margin():
-    for score, other, expected in (
-        (0.25, 0.1, True),
-        (0.24, 0, False),
-        (0.5, 0.35, True),
-        (0.5, 0.36, False),
-    ):
-        assert SearchResult(_at(0.0, score), (_at(3.0, other),)).is_confident == expected
+    for score, other, is_sure in ((0.25, 0.1, True), (0.24, 0, False), (0.5, 0.35, True), (0.5, 0.36, False)):
+        assert SearchResult(_at(0.0, score), (_at(3.0, other),)).is_confident == is_sure
 
 
 def _run(monkeypatch, attempts, gravity="auto", refined=types.MappingProxyType({})):

@@ -66,9 +66,8 @@ def test_splat_equals_its_twin_over_seam_and_poles():
         part = slice(lo, 11 if lo == 0 else 32)
         splat(surfels, packed, directions, angles, lo, depth[part], sums[:0])
         splat(surfels, packed, directions, angles, lo, depth[part], sums[part])
-    expected_depth, expected_rgb = naive.splat(
-        surfels.astype(float), rgb, 64, MIN_RADIUS_PX, MAX_SLOPE, BAND, BAND_OFFSET
-    )
+    limits = MIN_RADIUS_PX, MAX_SLOPE, BAND, BAND_OFFSET
+    expected_depth, expected_rgb = naive.splat(surfels.astype(float), rgb, 64, *limits)
     is_seen = sums[..., 4] > 0
     assert 0.3 < is_seen.mean() < 1.0
     # a ray along a disc's rim may hit by one rounding and miss by the other
@@ -202,12 +201,8 @@ def test_few_points_and_points_at_the_camera_are_drawn():
     for count in (1, 5, 11, 40):
         cloud = np.zeros((count + 1, 3), np.float32)
         cloud[1:] = [1.0, 0.0, 0.0]
-        picture = render_points(
-            pack_points(cloud, np.full((count + 1, 3), 9, np.uint8)),
-            Pose(np.eye(3), np.zeros(3)),
-            32,
-            WORKERS,
-        )
+        packed = pack_points(cloud, np.full((count + 1, 3), 9, np.uint8))
+        picture = render_points(packed, Pose(np.eye(3), np.zeros(3)), 32, WORKERS)
         assert picture.is_seen.any()
         assert (picture.rgb[picture.is_seen] == 9).all()
 

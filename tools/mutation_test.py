@@ -22,6 +22,10 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
+import _checkout  # noqa: F401
+
+from piccolo.runtime.kernel_cache import kernel_folder, sources_digest
+
 ROOT = Path(__file__).resolve().parents[1]
 COPIED = ("piccolo", "tests", "tools", "pyproject.toml", "localize.py")
 WHOLE = ("refinement", "coarse_to_fine")
@@ -146,12 +150,12 @@ def is_caught(mutant: Mutant, folder: Path) -> bool:
 
 
 def checkout_copy(folder: Path) -> Path:
-    """A copy of the checkout in which kernels can be told to stay as they were compiled."""
+    """A copy of the checkout in which kernels can be told to stay as they were compiled for the checkout."""
     folder.mkdir()
     for name in COPIED:
         (shutil.copytree if (ROOT / name).is_dir() else shutil.copy)(ROOT / name, folder / name)
-    plugin = "from piccolo.runtime import kernel_cache\nkernel_cache.sources_digest = lambda: 'kept'\n"
-    (folder / "kept_kernels.py").write_text(plugin)
+    digest = f"kernel_cache.sources_digest = lambda: {sources_digest()!r}\n"
+    (folder / "kept_kernels.py").write_text(f"from piccolo.runtime import kernel_cache\n{digest}")
     return folder
 
 
@@ -161,6 +165,7 @@ def try_all(chosen: Sequence[Mutant], num_jobs: int) -> int:
         folders: SimpleQueue[Path] = SimpleQueue()
         for k in range(num_jobs):
             folders.put(checkout_copy(Path(temporary) / str(k)))
+        shutil.copytree(kernel_folder(), Path(temporary) / "piccolo" / "kernels")
         names = sorted({name for mutant in chosen for name in TESTS[mutant.module]})
         if fails(names, Path(temporary) / "0", *KEPT_KERNELS):
             sys.exit(f"the tests fail without a mutant: {' '.join(names)}")
