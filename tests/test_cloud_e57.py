@@ -38,7 +38,7 @@ def placed(**options):
     return scan(rotation_wxyz=QUATERNION, center_world=tuple(CENTER), **options)
 
 
-def test_scans_stand_at_their_poses(tmp_path):
+def test_scans_stand_at_their_poses_by_quaternions_of_any_length(tmp_path):
     path = write(tmp_path / "a.e57", [placed(), scan(center_world=(1.0, 2.0, 3.0)), scan()])
     source = open_source(path)
     points, colors = read(path)
@@ -48,9 +48,6 @@ def test_scans_stand_at_their_poses(tmp_path):
     np.testing.assert_array_equal(points[2400:], RAW.points_world)
     np.testing.assert_array_equal(colors, np.tile(RAW.colors, (3, 1)))
     assert len(read_cloud(path).points) == 3600
-
-
-def test_a_quaternion_of_any_length_is_a_rotation(tmp_path):
     longer = scan(rotation_wxyz=tuple(-3.0 * quaternion_wxyz(R_WORLD)))
     points, _ = read(write(tmp_path / "a.e57", [longer]))
     np.testing.assert_allclose(points, RAW.points_world @ R_WORLD.T, atol=1e-12)
@@ -90,7 +87,7 @@ def test_chunks_hold_no_more_points_than_asked(tmp_path, monkeypatch, chunk):
         np.testing.assert_array_equal(points, np.tile(raw.points_world, (2, 1)))
 
 
-def test_invalid_points_and_colors_are_left_out(tmp_path):
+def test_invalid_points_of_any_color_and_invalid_colors_are_left_out(tmp_path):
     state = np.arange(1200) % 3  # 0 whole, 1 direction only, 2 nothing
     is_gray = np.arange(1200) % 5 == 0
     extra = {"cartesianInvalidState": state, "isColorInvalid": is_gray.astype(np.int64)}
@@ -99,9 +96,6 @@ def test_invalid_points_and_colors_are_left_out(tmp_path):
     is_whole = (state == 0) & ~is_gray
     np.testing.assert_array_equal(points, RAW.points_world[is_whole])
     np.testing.assert_array_equal(colors, RAW.colors[is_whole])
-
-
-def test_an_invalid_point_may_have_any_color(tmp_path):
     red = np.where(np.arange(1200) < 5, 999, RAW.colors[:, 0])
     extra = {"colorRed": red, "cartesianInvalidState": (np.arange(1200) < 5).astype(np.int64)}
     declared = {"colorRed": (0, 999), "cartesianInvalidState": (0, 1)}
@@ -136,15 +130,15 @@ def test_color_ranges_are_those_that_the_file_declares(tmp_path, dtype, low, hig
     assert abs(colors - RAW.colors.astype(float)).max() <= tolerance
 
 
-def test_colors_outside_of_their_range_are_refused(tmp_path):
+def test_colors_without_or_outside_of_their_range_and_files_without_points_are_refused(tmp_path):
     path = write(tmp_path / "a.e57", [scan(limits=color_limits(0, 100))])
     assert_refused(r"scan 1 of 1 \('a scan'\) has a colour of \d+, wanted 0 to 100", read, path)
-
-
-def test_colors_without_a_range_are_refused(tmp_path):
     written = ScanToWrite(cartesian() | colored(RAW.colors / 255.0))
     with pytest.raises(InputError, match="colours without a range: neither colorLimits nor a declared"):
         open_source(write(tmp_path / "a.e57", [written]))
+    empty = ScanToWrite({name: column[:0] for name, column in (cartesian() | colored()).items()}, BYTES)
+    assert_refused(r"scan 1 of 1 \('a scan'\) has 0 points", open_source, write(tmp_path / "a.e57", [empty]))
+    assert_refused("no scans, wanted scans with", open_source, write(tmp_path / "b.e57"))
 
 
 def test_scans_without_colors_are_left_out_beside_others(tmp_path):
@@ -159,12 +153,6 @@ def test_scans_without_colors_are_left_out_beside_others(tmp_path):
     np.testing.assert_allclose(read(path)[0], RAW.points_world @ R_WORLD.T + CENTER, atol=1e-12)
     with pytest.raises(InputError, match=r"scan 1 of 1 \('gray'\) has no colours, wanted scans"):
         open_source(write(tmp_path / "b.e57", [plain]))
-
-
-def test_files_without_points_are_refused(tmp_path):
-    empty = ScanToWrite({name: column[:0] for name, column in (cartesian() | colored()).items()}, BYTES)
-    assert_refused(r"scan 1 of 1 \('a scan'\) has 0 points", open_source, write(tmp_path / "a.e57", [empty]))
-    assert_refused("no scans, wanted scans with", open_source, write(tmp_path / "b.e57"))
 
 
 def test_points_that_are_not_finite_are_handed_on(tmp_path):

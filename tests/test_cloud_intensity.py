@@ -71,12 +71,9 @@ def test_what_has_no_position_or_no_intensity_does_not_count():
     np.testing.assert_array_equal(_in_gray(intensity, points)[:2000], expected)
 
 
-def test_gray_of_what_is_not_finite():
+def test_one_intensity_for_all_is_refused_and_what_is_not_finite_is_black():
     gray = as_gray(np.array([np.nan, -np.inf, np.inf, 0.5]), 0.0, 1.0)
     assert gray[:, 0].tolist() == [0, 0, 255, 128]
-
-
-def test_one_intensity_for_all_is_refused():
     with pytest.raises(InputError, match="a: the intensity is 7 nearly everywhere, wanted colours"):
         _in_gray(np.full(3000, 7.0))
 

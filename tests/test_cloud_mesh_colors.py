@@ -60,22 +60,16 @@ def test_gltf_factors_multiply_in_linear_light(tmp_path):
     expected = round(255 * (1.055 * linear ** (1 / 2.4) - 0.055))
     assert np.unique(red[:, 0]).tolist() == [expected]
     assert np.unique(red[:, 1]).tolist() == [10]
-
-
-def test_srgb_there_and_back():
     levels = np.arange(256, dtype=np.uint8)
     np.testing.assert_array_equal(np.rint(255 * linear_to_srgb(srgb_to_linear(levels))), levels)
 
 
-def test_surfaces_without_colors_are_left_out_with_a_warning(tmp_path):
+def test_surfaces_without_colors_or_area_are_left_out_with_a_warning(tmp_path):
     gltf = made.textured_gltf()
     gltf.node(mesh=gltf.mesh(uv=None), translation=[0, 0, 2.0])
     source = open_mesh(gltf.glb(tmp_path / "a.glb"))
     assert "1 surfaces without colours left out" in source.warnings[0]
     assert source.num_points == 10_000
-
-
-def test_flat_triangles_and_nan_vertices_are_left_out_with_a_warning(tmp_path):
     vertices = np.concatenate([made.SQUARE, [[np.nan, 0, 0], [0.5, 0, 0]]])
     triangles = np.concatenate([[[0, 1, 4], [0, 1, 5]], made.TRIANGLES])
     uv = np.concatenate([made.UV_FROM_BELOW, [[0, 0], [0, 0]]])

@@ -54,16 +54,13 @@ def test_references_are_held_to_the_folder(tmp_path, name):
         assert f"names the file {name[:100]!a}" in refusal(path)
 
 
-def test_a_link_out_of_the_folder_is_refused(tmp_path):
+def test_a_link_out_of_the_folder_is_refused_and_missing_materials_are_named(tmp_path):
     folder = tmp_path / "mesh"
     folder.mkdir()
     path = made.write_obj(folder)
     (folder / "wall.png").rename(tmp_path / "wall.png")
     (folder / "wall.png").symlink_to(tmp_path / "wall.png")
     assert "names the file 'wall.png', wanted names in the mesh's own folder or below" in refusal(path)
-
-
-def test_missing_materials_are_named(tmp_path):
     assert "names the file 'room.mtl', which is not in its" in refusal(made.write_obj(tmp_path, mtl=""))
 
 
@@ -123,11 +120,14 @@ def test_float_colors_beyond_1_are_refused_not_cut_off(tmp_path):
     assert "a colour of 255, wanted 0 to 1 or bytes" in refusal(ply)
 
 
-def test_several_textures_of_a_ply_are_refused(tmp_path):
+def test_several_textures_and_colors_of_other_types_of_a_ply_are_refused(tmp_path):
     for name in ("a.png", "b.png"):
         (tmp_path / name).write_bytes(made.png())
     path = made.write_wedges(tmp_path / "a.ply", textures=("a.png", "b.png"))
     assert "names 2 textures, wanted one" in refusal(path)
+    path = made.write_ply(tmp_path / "a.ply", colors=made.CORNER_COLORS, options={"text": True})
+    path.write_text(path.read_text().replace("uchar green", "ushort green"))
+    assert "'green' is of type u2" in refusal(path)
 
 
 PRIMITIVE = ("meshes", 0, "primitives", 0)
@@ -179,20 +179,14 @@ def test_broken_gltf_is_refused(tmp_path, path, value):
     refusal(gltf.glb(tmp_path / "a.glb"), open_mesh)
 
 
-def test_a_compressed_gltf_says_what_it_requires(tmp_path):
+def test_gltf_with_extensions_or_with_wrong_indices_or_colors_says_so(tmp_path):
     gltf = made.textured_gltf()
     gltf.tree["extensionsRequired"] = ["KHR_draco_mesh_compression"]
     message = refusal(gltf.glb(tmp_path / "a.glb"))
     assert message.endswith("requires the extensions 'KHR_draco_mesh_compression', wanted a plain glTF mesh")
-
-
-def test_gltf_indices_out_of_range_are_refused(tmp_path):
     gltf = made.Gltf()
     gltf.node(mesh=gltf.mesh(triangles=made.TRIANGLES + 2, colors=made.CORNER_COLORS, uv=None))
     assert "a face names vertex 5 " in refusal(gltf.glb(tmp_path / "a.glb"))
-
-
-def test_gltf_colors_of_another_length_are_refused(tmp_path):
     gltf = made.Gltf()
     gltf.node(mesh=gltf.mesh(uv=None, colors=np.eye(3, dtype=np.float32)))
     assert "a primitive with [3, 4] rows" in refusal(gltf.glb(tmp_path / "a.glb"))
@@ -254,9 +248,3 @@ def test_cut_ply_meshes_are_refused(tmp_path, text):
     for size in (len(content) - 9, content.index(b"end_header") + 30):
         path.write_bytes(content[:size])
         refusal(path, open_ply)
-
-
-def test_ply_colors_of_other_types_are_refused_in_meshes(tmp_path):
-    path = made.write_ply(tmp_path / "a.ply", colors=made.CORNER_COLORS, options={"text": True})
-    path.write_text(path.read_text().replace("uchar green", "ushort green"))
-    assert "'green' is of type u2" in refusal(path)

@@ -91,15 +91,11 @@ def test_encodings_and_colors(tmp_path, encoding, kind, monkeypatch):
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_padding_counts_and_other_fields_are_passed_over(tmp_path, encoding):
+def test_padding_counts_and_other_fields_are_passed_over_and_doubles_stay(tmp_path, encoding):
     noise = np.random.default_rng(2).integers(0, 256, (1200, 3))
     fields = [("_", "u1", 3, noise), ("label", "u4", 1, noise[:, 0]), ("fpfh", "f4", 3, noise), *XYZ]
     fields += [("_", "u1", 3, noise), ("rgb", "u4", 1, PACKED), ("rgbs", "i2", 3, noise)]
     assert_read_as_written(write(tmp_path / "a.pcd", fields, encoding))
-
-
-@pytest.mark.parametrize("encoding", ENCODINGS)
-def test_doubles_stay_doubles(tmp_path, encoding):
     xyz = [(name, "f8", 1, values) for name, _, _, values in XYZ]
     assert_read_as_written(write(tmp_path / "a.pcd", [*xyz, ("rgb", "u4", 1, PACKED)], encoding), "f8")
 
@@ -180,12 +176,15 @@ def test_broken_lines_are_named(tmp_path, old, new, message):
     assert_refused(message, read, path)
 
 
-def test_a_colour_that_text_has_lost_is_refused(tmp_path):
+def test_cut_text_and_a_colour_that_it_has_lost_are_refused(tmp_path):
     fields = [*XYZ, ("rgb", "f4", 1, (PACKED | np.uint32(0xFF800000)).view(np.float32))]
     with pytest.raises(InputError, match="point 1 has the colour nan, wanted 32 bits of type f4"):
         read(write(tmp_path / "a.pcd", fields, "ascii"))
     _, colors = read(write(tmp_path / "b.pcd", fields))
     np.testing.assert_array_equal(colors, RAW.colors | [128, 0, 0])
+    path = write(tmp_path / "a.pcd", [*XYZ, ("rgb", "u4", 1, PACKED)], "ascii")
+    path.write_bytes(b"\n".join(path.read_bytes().split(b"\n")[:-3]))
+    assert_refused("found 1197 of 1200 points; the file is cut off", read, path)
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -194,12 +193,6 @@ def test_float_colors_out_of_range_are_refused(tmp_path, encoding):
     fields[4][3][7] = 1.5
     with pytest.raises(InputError, match=r"point 8 has the colour .* wanted 0 to 1"):
         read(write(tmp_path / "a.pcd", fields, encoding))
-
-
-def test_cut_text_is_refused(tmp_path):
-    path = write(tmp_path / "a.pcd", [*XYZ, ("rgb", "u4", 1, PACKED)], "ascii")
-    path.write_bytes(b"\n".join(path.read_bytes().split(b"\n")[:-3]))
-    assert_refused("found 1197 of 1200 points; the file is cut off", read, path)
 
 
 @pytest.mark.parametrize(

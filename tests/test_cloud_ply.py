@@ -165,13 +165,10 @@ def test_broken_files_are_refused(tmp_path, old, new, message):
     assert len(str(error.value)) < 500 + len(str(path))
 
 
-def test_gaussian_splats_are_refused(tmp_path):
+def test_gaussian_splats_and_lists_before_the_vertices_are_refused(tmp_path):
     names = ("f_dc_0", "f_dc_1", "f_dc_2")
     with pytest.raises(InputError, match="Gaussian splats without red green blue, the vertices have x y z"):
         read_cloud(write(tmp_path / "a.ply", vertices(color="f4", names=names)))
-
-
-def test_lists_before_the_vertices_are_refused(tmp_path):
     with pytest.raises(InputError, match="'strip' has the list property 'vertex_indices', wanted vertices"):
         read_cloud(write(tmp_path / "a.ply", TRIANGLES, vertices()))
 

@@ -103,13 +103,10 @@ def _with_a_word(cloud):
     return [dataclasses.replace(source, warnings=("a word",)) for source in cloud.sources]
 
 
-def test_several_files_are_named_together():
+def test_several_files_are_named_together_and_progress_knows_each():
     raw = seeded_cloud(12, size=(6000.0, 5000.0, 2500.0))
     (warning,) = stream(raw, raw, raw).voxels(LEVEL).warnings
     assert warning.startswith("0.ply and 2 more: the cloud spans")
-
-
-def test_progress_knows_how_many_chunks_come():
     seen = []
 
     def show(values, total, label):

@@ -51,26 +51,18 @@ def test_headers_are_passed_over(tmp_path, header):
     assert_read_as_written(write(tmp_path / "a.asc", header + lines_of(RAW)))
 
 
-def test_comments_and_blank_lines_between_points(tmp_path):
+def test_comments_are_passed_over_and_headers_name_columns(tmp_path):
     lines = lines_of(RAW)
     assert_read_as_written(write(tmp_path / "a.xyz", [*lines[:700], "# half", "", "  ", "//", *lines[700:]]))
-
-
-def test_header_names_columns(tmp_path):
     lines = [f"{k},wall,{line}" for k, line in enumerate(lines_of(RAW, ","))]
     assert_read_as_written(write(tmp_path / "a.csv", ['index,"class",x,y,z,R,G,B', *lines]))
-
-
-def test_further_columns_are_left_out(tmp_path):
     assert_read_as_written(write(tmp_path / "a.txt", [line + " 0.5 label" for line in lines_of(RAW)]))
-
-
-def test_header_names_columns_in_any_case(tmp_path):
     lines = [" ".join([*f[:3], "0.25", *f[3:]]) for f in map(str.split, lines_of(RAW))]
     for k, header in enumerate(
         ["//X Y Z Intensity R G B", "x y z i Red Green Blue", '"X" "Y" "Z" "I" r g b']
     ):
         assert_read_as_written(write(tmp_path / f"{k}.asc", [header, "1500", *lines]))
+    assert_read_as_written(write(tmp_path / "a.txt", ["# x y z are metres", *lines_of(RAW)]))
 
 
 @pytest.mark.parametrize("header", ["//X Y Z Classification Row Column", "x y z Rf Gf Bf"])
@@ -79,17 +71,10 @@ def test_columns_without_colors_are_refused(tmp_path, header):
         whole(open_text, write(tmp_path / "a.txt", [header, *lines_of(RAW)]))
 
 
-def test_a_remark_about_x_y_z_is_no_header(tmp_path):
-    assert_read_as_written(write(tmp_path / "a.txt", ["# x y z are metres", *lines_of(RAW)]))
-
-
-def test_float_colors_and_last_line_without_end(tmp_path):
+def test_float_colors_and_nan_points_without_a_color_are_read(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("\n".join(lines_of(RAW, color_format=".2f")))
     assert_read_as_written(path)
-
-
-def test_nan_points_need_no_color(tmp_path):
     lines = ["nan nan nan nan nan nan", *lines_of(RAW), "inf 0 0 0 0 -1"]
     cloud = read_cloud(write(tmp_path / "a.txt", lines))
     assert cloud.num_dropped == 2

@@ -66,7 +66,7 @@ def test_a_larger_table_holds_the_same_rows():
     assert add_points(raw.points_world, raw.colors, np.zeros(3, np.int64), larger, 40, 99) == (40, 40)
 
 
-def test_a_full_voxel_takes_no_more(monkeypatch):
+def test_a_full_voxel_takes_no_more_and_fits_its_sums(monkeypatch):
     monkeypatch.setattr(voxels, "MAX_COUNT", 3)
     table = np.zeros((8, NUM_COLUMNS), np.int32)
     points, colors = np.full((5, 3), 0.01), np.full((5, 3), 200, np.uint8)
@@ -75,9 +75,6 @@ def test_a_full_voxel_takes_no_more(monkeypatch):
     (row,) = table[table[:, COUNT] > 0]
     assert row[COUNT] == 3
     assert row[POSITION] == 3 * ((128 + voxels.PHASE) % 256)
-
-
-def test_the_most_points_of_a_voxel_fit_its_sums():
     assert voxels.MAX_COUNT * max(255, voxels.QUANTUM_MASK) <= np.iinfo(np.int32).max
 
 
@@ -88,7 +85,7 @@ def test_turning_gives_each_point_the_same_bits_alone_as_among_others():
     np.testing.assert_allclose(alone, points @ TURN.T, atol=1e-12)
 
 
-def test_points_too_far_away_are_left_out_and_counted():
+def test_points_too_far_away_are_left_out_and_two_scenes_are_no_map():
     raw = seeded_cloud(7)
     raw.points_world[5:8] += [0.0, 30_000.0, 0.0]
     found = stream(raw).voxels(LEVEL)
@@ -97,9 +94,6 @@ def test_points_too_far_away_are_left_out_and_counted():
     raw.points_world[5] = [0.0, 0.0, -9e7]
     with pytest.raises(InputError, match=r"0\.ply: points more than 42950 km apart, wanted one scene"):
         stream(raw).voxels(LEVEL)
-
-
-def test_two_scenes_far_from_each_other_are_no_map():
     raw = seeded_cloud(8, 2000)
     raw.points_world[:1000, 0] += 50_000.0
     assert len(stream(raw).voxels(LEVEL).nodes) >= 900  # one of them

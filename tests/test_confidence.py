@@ -53,15 +53,12 @@ def test_a_pose_that_may_be_a_decimetre_off_is_doubtful_whatever_the_evidence(st
     assert rule.confidence_of(sure, _covariance(std), rule.MODEL) == pytest.approx(most, abs=0.002)
 
 
-def test_an_alternative_as_good_makes_it_ambiguous():
+def test_an_alternative_as_good_makes_it_ambiguous_and_nothing_else_does():
     twin = dataclasses.replace(RIGHT, margin=0.01, alternative_score_ratio=0.98)
     status, confidence = rule.classify(twin, SURE, True, 0.9)
     assert status == rule.AMBIGUOUS
     assert confidence < 0.9
     assert rule.classify(twin, SURE, False, 0.9)[0] == rule.NOT_LOCALIZED
-
-
-def test_without_an_alternative_nothing_is_ambiguous():
     weak = dataclasses.replace(WRONG, margin=0.18)
     assert rule.classify(weak, None, False, 0.9)[0] == rule.NOT_LOCALIZED
     assert rule.classify(WRONG, None, True, 0.9)[0] == rule.NOT_LOCALIZED

@@ -50,18 +50,12 @@ def test_every_plane_is_found_and_called_by_its_name(hut):
     assert planes[0].num_inliers == pytest.approx(24 * 400, rel=0.05)
 
 
-def test_the_names_turn_over_with_up(hut):
+def test_names_turn_over_with_up_and_noise_has_no_planes(hut):
     kinds = [plane.kind for plane in classify_planes(ransac_planes(hut), hut, -UP)]
     assert kinds[0] == "ceiling"
-
-
-def test_same_points_same_bits(hut):
     a, b = ransac_planes(hut), ransac_planes(hut)
     bits = [[(p.normal_world.tobytes(), p.offset, p.rms) for p in planes] for planes in (a, b)]
     assert bits[0] == bits[1]
-
-
-def test_noise_has_no_planes():
     points = np.random.default_rng(2).uniform(-3.0, 3.0, (9000, 3)).astype(np.float32)
     assert ransac_planes(estimate_normals(points)) == []
     assert ransac_planes(estimate_normals(points[:10])) == []

@@ -37,9 +37,6 @@ def test_no_color_is_black_and_a_label_alone_decides():
     shuffled = np.array([[5, 70_000], [-1, 5]])
     np.testing.assert_array_equal(colors_of(shuffled)[0, 0], colors_of(shuffled)[1, 1])
     np.testing.assert_array_equal(colors_of(shuffled)[1, 0], palette()[NUM_COLORS - 1])
-
-
-def test_labels_in_the_upper_bytes_keep_colors_of_their_own():
     for step in (256, 65_536):
         assert len(np.unique(colors_of(step * np.arange(256)), axis=0)) == 256
 

@@ -172,14 +172,12 @@ def test_input_is_never_overwritten(scene, capsys):
     assert cloud.stat().st_mtime_ns == before
 
 
-def test_traceback_only_with_debug(scene, capsys):
+def test_traceback_only_with_debug_and_internal_errors_have_a_code(scene, capsys, monkeypatch):
     localize.main(_arguments(scene, "--cloud", "no.ply"))
     assert "Traceback" not in capsys.readouterr().err
     localize.main(_arguments(scene, "--cloud", "no.ply", "--debug"))
     assert "Traceback" in capsys.readouterr().err
 
-
-def test_internal_error_has_its_code(scene, capsys, monkeypatch):
     def fail(*_):
         raise ZeroDivisionError("made by the test")
 

@@ -133,9 +133,13 @@ def test_a_ragged_corner_of_a_crop_is_found(tmp_path):
     assert not is_valid[:100].any()
 
 
-def test_a_black_picture_is_refused(tmp_path):
+def test_a_black_picture_is_refused_and_black_poles_are_no_fisheyes(tmp_path):
     with pytest.raises(InputError, match="no pixel is left: all are masked, black"):
         read(tmp_path / "a.png", np.zeros((HEIGHT, WIDTH, 3)), ".png")
+    for half_angle in (20, 40, 60):
+        image = capped(capped(room(), half_angle, 0), half_angle, 0, "zenith")
+        panorama = read(tmp_path / "a.jpg", image)
+        assert panorama.is_valid[HEIGHT // 2 - 30 : HEIGHT // 2 + 30].all()
 
 
 def fisheyes(radius=0.49, floor=0.0):
@@ -151,13 +155,6 @@ def fisheyes(radius=0.49, floor=0.0):
 def test_two_fisheyes_are_refused(tmp_path, radius, floor):
     with pytest.raises(InputError, match="two fisheye pictures side by side: stitch them"):
         read(tmp_path / "a.insp", fisheyes(radius, floor))
-
-
-def test_panoramas_with_black_poles_are_no_fisheyes(tmp_path):
-    for half_angle in (20, 40, 60):
-        image = capped(capped(room(), half_angle, 0), half_angle, 0, "zenith")
-        panorama = read(tmp_path / "a.jpg", image)
-        assert panorama.is_valid[HEIGHT // 2 - 30 : HEIGHT // 2 + 30].all()
 
 
 def checker_mask(width, height):

@@ -16,8 +16,21 @@ def test_exponential_is_a_rotation_by_the_norm(w):
     np.testing.assert_allclose(R @ w, w, atol=1e-12)
 
 
-def test_exponential_turns_counterclockwise():
+def test_conventions_of_turns_steps_quaternions_and_matrices():
     np.testing.assert_allclose(poses.exp_so3(np.array([0, 0, np.pi / 2])) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+    start = poses.Pose(poses.yaw_rotation(np.pi / 2), np.array([1.0, 2.0, 3.0]))
+    moved = poses.step(start, np.array([0, 0, 0.1, 0.5, 0, 0]))
+    np.testing.assert_allclose(moved.center_world, [1.0, 2.5, 3.0], atol=1e-12)  # forward is +y in the world
+    assert poses.angle_between(moved.R_cam_from_world, start.R_cam_from_world) == pytest.approx(0.1)
+    q = poses.quaternion_wxyz(poses.exp_so3(np.array([0.0, 0.0, np.pi / 2])))
+    np.testing.assert_allclose(q, [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], atol=1e-12)
+    pose = poses.Pose(poses.exp_so3(np.array([0.4, -1.1, 0.7])), np.array([0.3, -0.2, 1.5]))
+    x_world = np.array([2.0, 1.0, 0.5])
+    x_cam = pose.R_cam_from_world @ (x_world - pose.center_world)
+    np.testing.assert_allclose((poses.T_world_from_cam(pose) @ [*x_cam, 1.0])[:3], x_world, atol=1e-12)
+    yaw = 0.7
+    forward = poses.yaw_rotation(yaw).T @ [1.0, 0.0, 0.0]
+    np.testing.assert_allclose(forward, [np.cos(yaw), np.sin(yaw), 0.0], atol=1e-12)
 
 
 @pytest.mark.parametrize("w", VECTORS)
@@ -27,13 +40,6 @@ def test_left_jacobian_against_central_differences(w):
         turn = poses.exp_so3(w + dw) @ poses.exp_so3(w - dw).T
         vee = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
         np.testing.assert_allclose(vee / 2e-6, poses.left_jacobian(w)[:, axis], atol=2e-5)
-
-
-def test_step_moves_along_the_camera_axes():
-    start = poses.Pose(poses.yaw_rotation(np.pi / 2), np.array([1.0, 2.0, 3.0]))
-    moved = poses.step(start, np.array([0, 0, 0.1, 0.5, 0, 0]))
-    np.testing.assert_allclose(moved.center_world, [1.0, 2.5, 3.0], atol=1e-12)  # forward is +y in the world
-    assert poses.angle_between(moved.R_cam_from_world, start.R_cam_from_world) == pytest.approx(0.1)
 
 
 def test_step_is_the_derivative_that_the_kernels_use():
@@ -54,27 +60,9 @@ def test_quaternion_round_trip(w):
     np.testing.assert_allclose(poses.rotation_from_quaternion_wxyz(q), R, atol=1e-9)
 
 
-def test_quaternion_order_is_scalar_first():
-    q = poses.quaternion_wxyz(poses.exp_so3(np.array([0.0, 0.0, np.pi / 2])))
-    np.testing.assert_allclose(q, [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], atol=1e-12)
-
-
-def test_matrix_takes_camera_to_world():
-    pose = poses.Pose(poses.exp_so3(np.array([0.4, -1.1, 0.7])), np.array([0.3, -0.2, 1.5]))
-    x_world = np.array([2.0, 1.0, 0.5])
-    x_cam = pose.R_cam_from_world @ (x_world - pose.center_world)
-    np.testing.assert_allclose((poses.T_world_from_cam(pose) @ [*x_cam, 1.0])[:3], x_world, atol=1e-12)
-
-
 def test_orthonormal_repairs_drift():
     R = poses.exp_so3(np.array([0.4, -1.1, 0.7]))
     np.testing.assert_allclose(poses.orthonormal(R * 1.001), R, atol=1e-12)
-
-
-def test_upright_camera_looks_along_its_yaw():
-    yaw = 0.7
-    forward = poses.yaw_rotation(yaw).T @ [1.0, 0.0, 0.0]
-    np.testing.assert_allclose(forward, [np.cos(yaw), np.sin(yaw), 0.0], atol=1e-12)
 
 
 def test_rotations_are_checked_to_a_tolerance():

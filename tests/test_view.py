@@ -61,7 +61,7 @@ def test_points_that_are_seen_lie_at_the_front_and_are_bounded(octree):
     assert (ranges <= nearest[_cells(offsets.T)] * 1.09 + 0.11).mean() > 0.99
 
 
-def test_every_free_place_at_a_cameras_height_has_a_candidate_near(octree):
+def test_candidates_are_near_every_free_place_and_keep_their_distance(octree):
     room, origin = rooms.room(1)[0].rooms[0], rooms.room(1)[1].origin_world
     centers = camera_positions.candidate_centers(octree, Workers(2)) + origin
     rng = np.random.default_rng(0)
@@ -73,9 +73,6 @@ def test_every_free_place_at_a_cameras_height_has_a_candidate_near(octree):
     heights = camera_positions.heights_above_floor(octree, centers - origin)
     assert heights.min() > 0.2
     assert np.median(heights) < 2.0
-
-
-def test_candidates_keep_their_distance_from_points(octree):
     tree = cKDTree(octree.level(octree.leaf_size)[:, :3])
     clearance, _ = tree.query(camera_positions.candidate_centers(octree, Workers(2)))
     assert clearance.min() > 0.25 - 0.08  # the width of the voxels that are asked
