@@ -116,13 +116,7 @@ def test_files_that_shrink_while_they_are_read_are_refused(tmp_path, small, enco
 
 
 def test_each_reading_begins_anew(tmp_path, small):
-    source = open_text(_text(tmp_path))
-    first = next(source.read_chunks())
-    again = next(source.read_chunks())
+    (tmp_path / "a.txt").write_text("\n".join(lines_of(RAW)))
+    source = open_text(tmp_path / "a.txt")
+    first, again = (next(source.read_chunks()) for _ in range(2))
     np.testing.assert_array_equal(first.points_world, again.points_world)
-
-
-def _text(folder):
-    path = folder / "a.txt"
-    path.write_text("\n".join(lines_of(RAW)))
-    return path

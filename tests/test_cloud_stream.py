@@ -92,15 +92,12 @@ def test_both_ways_refuse_the_same(what, message):
 def test_both_ways_warn_of_the_same(scale):
     raw = seeded_cloud(11, size=(6000.0, 5000.0, 2500.0))
     raw.points_world[:4] = np.inf
-    cloud = dataclasses.replace(stream(raw, scale=scale), sources=_with_a_word(stream(raw)))
+    (source,) = stream(raw).sources
+    cloud = CloudStream([dataclasses.replace(source, warnings=("a word",))], scale)
     warnings = cloud.read().warnings
     assert cloud.voxels(LEVEL).warnings == warnings
     assert warnings[:2] == ("a word", "0.ply: 4 points with NaN or infinite coordinates left out")
     assert [("--units mm" in line) for line in warnings[2:]] == ([True] if scale == 1.0 else [])
-
-
-def _with_a_word(cloud):
-    return [dataclasses.replace(source, warnings=("a word",)) for source in cloud.sources]
 
 
 def test_several_files_are_named_together_and_progress_knows_each():

@@ -1,9 +1,6 @@
 """The loss over a plan, and the command line of tools/loss_surface.py."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -24,7 +21,6 @@ from piccolo.render.zbuffer import visible_points
 from piccolo.runtime.threads import Workers
 from piccolo.scenes.scene import read_scene
 
-ROOT = Path(__file__).resolve().parents[1]
 STEP = 0.3
 COARSE = ["--step", STEP, "--rotations", 24, "--max-points", 3000, "--width", 128]
 
@@ -230,9 +226,3 @@ def test_bad_input_leaves_nothing(run, scene, tmp_path):
         assert err.count("\n") == 1
     assert run(*out, pano="no.jpg")[0] == 3
     assert not list(tmp_path.iterdir())
-
-
-def test_help_runs():
-    command = [sys.executable, ROOT / "tools" / "loss_surface.py", "--help"]
-    text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    assert "--no-visibility" in text

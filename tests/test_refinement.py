@@ -51,10 +51,17 @@ def test_a_quarter_of_the_beam_is_for_the_best_that_lie_far_apart():
     assert best_and_alternatives(rotations, centers, 8, 0.3).tolist() == [0, 2, 3, 4, 6, 8, 9, 10]
 
 
-def test_narrow_ranks_hypotheses_first():
+def test_narrow_ranks_hypotheses_first(monkeypatch):
     close = [_at(0.0, 0.5), _at(0.05, 0.9), _at(3.0, 0.1), _at(5.0, 0.7)]
     assert _places(narrow(close, 4)) == [0.05, 5.0, 3.0]
     assert _places(narrow(close, 1)) == [0.05]
+    turned = [_at(0.0, 0.9), _at(0.09, 0.8), _at(0.11, 0.7), _at(0.0, 0.6, 4.9), _at(0.0, 0.5, 5.1)]
+    assert [h.score for h in narrow(turned, 8)] == [0.9, 0.7, 0.5]
+    R, centers = np.repeat(np.eye(3)[None], 3, axis=0), np.outer([0.0, 0.14, 0.16], [1.0, 0, 0])
+    starts = Starts(R, centers, np.arange(3), np.array([0.3, 0.2, 0.1]))
+    monkeypatch.setattr(refinement, "descend_all", lambda scan_map, image, starts, *_: starts)
+    query = SimpleNamespace(**vars(QUERY), images=SimpleNamespace(search=None))
+    assert refinement.descend_prepared(query, starts, 5, 8).candidate.tolist() == [0, 2]
 
 
 def test_halving_keeps_as_many_as_the_beam_says(monkeypatch):
@@ -150,6 +157,9 @@ def test_full_resolution_is_taken_back_where_the_score_falls(monkeypatch, after,
     assert asked == [0.0, 0.004]  # the points are taken anew from where the pose is
     assert refinement.settle(query, start) == expected
     assert len(asked) == len(descents) == 4  # the second round of settling moves nothing
+    monkeypatch.setattr(refinement, "descend", lambda *arguments: _at(len(asked), 0.0).pose)
+    refinement.settle(query, start)
+    assert len(asked) == 10  # six rounds at most
 
 
 @pytest.mark.parametrize(("seed", "most"), [(1, 5e-4), (2, 5e-5), (3, 2e-4)])

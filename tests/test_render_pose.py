@@ -1,8 +1,6 @@
 """Pictures of the cloud at a pose, and the command line of tools/render_pose.py."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -15,8 +13,6 @@ from piccolo.geometry.camera_axes import heading_pitch_roll_deg
 from piccolo.geometry.pose import T_world_from_cam
 from piccolo.optimize import descent_animation as animation
 from piccolo.scenes.scene import read_scene
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -168,9 +164,3 @@ def test_interrupts_and_surprises_have_codes_of_their_own(run, tmp_path, monkeyp
         monkeypatch.setattr(render_pose, "render_points", fail)
         assert run("--at", 1, 1, 1, "--out", tmp_path / "a.png")[0] == code
     assert not list(tmp_path.iterdir())
-
-
-def test_help_runs():
-    command = [sys.executable, ROOT / "tools" / "render_pose.py", "--help"]
-    text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    assert "--mask-out" in text
