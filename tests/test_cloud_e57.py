@@ -53,7 +53,7 @@ def test_scans_stand_at_their_poses_by_quaternions_of_any_length(tmp_path):
     np.testing.assert_allclose(points, RAW.points_world @ R_WORLD.T, atol=1e-12)
 
 
-def test_spherical_coordinates(tmp_path):
+def test_spherical_coordinates_single_precision_and_scaled_integers(tmp_path):
     distance = np.linalg.norm(RAW.points_world, axis=1)
     x, y, z = RAW.points_world.T
     azimuth, elevation = np.arctan2(y, x), np.arcsin(z / distance)
@@ -61,9 +61,6 @@ def test_spherical_coordinates(tmp_path):
     written = ScanToWrite(spherical | colored(), BYTES, None, QUATERNION)
     points, _ = read(write(tmp_path / "a.e57", [written]))
     np.testing.assert_allclose(points, RAW.points_world @ R_WORLD.T, atol=1e-12)
-
-
-def test_single_precision_and_scaled_integers(tmp_path):
     single = ScanToWrite(cartesian(dtype=np.float32) | colored(), BYTES)
     millimetres = np.rint(RAW.points_world * 1000).astype(np.int64)
     columns = dict(zip(XYZ, millimetres.T, strict=True))
@@ -163,14 +160,11 @@ def test_points_that_are_not_finite_are_handed_on(tmp_path):
     assert (read_cloud(path).num_dropped, len(read_cloud(path).points)) == (3, 1197)
 
 
-def test_a_reader_may_stop_early(tmp_path, monkeypatch):
+def test_a_reader_may_stop_early_and_foreign_fields_change_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(e57, "CHUNK", 100)
     chunks = open_source(write(tmp_path / "a.e57", [scan(), scan()])).read_chunks()
     np.testing.assert_array_equal(next(chunks).points_world, RAW.points_world[:100])
     chunks.close()
-
-
-def test_foreign_fields_change_nothing(tmp_path):
     normals = dict.fromkeys(("nor:normalX", "nor:normalY", "nor:normalZ"), np.full(1200, 0.5, np.float32))
     extra = normals | {"intensity": np.linspace(0.0, 1.0, 1200), "rowIndex": np.arange(1200)}
     points, colors = read(write(tmp_path / "a.e57", [scan(extra, {"rowIndex": (0, 1199)})]))

@@ -84,11 +84,14 @@ def test_withheld_points_are_left_out(tmp_path, point_format):
     assert_read_as_written(write(tmp_path, laz_bytes(content, 500)), ~is_withheld)
 
 
-def test_16_bit_colors_are_rounded_to_the_nearest(tmp_path):
+def test_16_bit_colors_are_rounded_and_coordinates_that_overflow_are_infinite(tmp_path):
     colors = np.random.default_rng(5).integers(0, 1 << 16, (1200, 3)).astype(np.uint16)
     colors[0] = (0, 1, 65535)
     _, found = read(write(tmp_path, las_bytes(RAW, colors=colors)))
     np.testing.assert_array_equal(found, np.floor(colors / 257.0 + 0.5))
+    points, _ = read(write(tmp_path, patched(las_bytes(RAW), SCALE_X, "<d", 1e308)))
+    assert np.isinf(points[:, 0]).any()
+    assert np.isfinite(points[:, 1:]).all()
 
 
 @pytest.mark.parametrize("is_compressed", [False, True])
@@ -222,12 +225,6 @@ def test_a_wrong_number_of_vlrs_does_no_harm(tmp_path):
     assert_read_as_written(write(tmp_path, patched(compressed, NUM_VLRS, "<I", 0xFFFFFFFF)))
     with pytest.raises(InputError, match="compressed, but no record says how"):
         open_source(write(tmp_path, patched(compressed, NUM_VLRS, "<I", 0)))
-
-
-def test_coordinates_that_overflow_are_infinite(tmp_path):
-    points, _ = read(write(tmp_path, patched(las_bytes(RAW), SCALE_X, "<d", 1e308)))
-    assert np.isinf(points[:, 0]).any()
-    assert np.isfinite(points[:, 1:]).all()
 
 
 def test_a_missing_library_is_named(tmp_path, monkeypatch):

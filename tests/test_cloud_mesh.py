@@ -103,12 +103,18 @@ def test_gltf_nodes_turn_shift_and_scale(tmp_path):
         assert np.unique(raw.colors[is_here], axis=0).tolist() == [list(color)]
 
 
-def test_a_mesh_placed_twice(tmp_path):
+def test_a_mesh_placed_twice_and_texels_of_alpha_0(tmp_path):
     gltf = made.textured_gltf(translation=[0, 0, 5.0])
     gltf.node(mesh=0, scale=[1, 2, 1])
     raw = whole(open_mesh, gltf.glb(tmp_path / "a.glb"))
     near = raw.points_world[:, 2] < 1
     assert (np.count_nonzero(near), np.count_nonzero(~near)) == (20_000, 10_000)
+    alpha = np.full((8, 8, 1), 255, np.uint8)
+    alpha[:4, 4:] = 0  # the green ones
+    texture = made.png(np.concatenate([made.QUADRANTS, alpha], axis=2))
+    raw = whole(open_mesh, made.write_obj(tmp_path, texture=texture))
+    assert len(raw.colors) == pytest.approx(7500, rel=0.02)
+    assert not np.any(np.all(raw.points_world[:, :2] > 0.5, axis=1))
 
 
 def test_the_order_of_surfaces_is_no_chance(tmp_path):
@@ -193,12 +199,3 @@ def test_density_counts_by_square_metres(tmp_path, unit, scale):
     cloud = read_cloud(path, CloudSettings(scale=scale))
     extent = np.ptp(cloud.points, axis=0)
     np.testing.assert_allclose(extent, [1, 1, 0], atol=0.01)
-
-
-def test_texels_of_alpha_0_leave_their_points_out(tmp_path):
-    alpha = np.full((8, 8, 1), 255, np.uint8)
-    alpha[:4, 4:] = 0  # the green ones
-    texture = made.png(np.concatenate([made.QUADRANTS, alpha], axis=2))
-    raw = whole(open_mesh, made.write_obj(tmp_path, texture=texture))
-    assert len(raw.colors) == pytest.approx(7500, rel=0.02)
-    assert not np.any(np.all(raw.points_world[:, :2] > 0.5, axis=1))

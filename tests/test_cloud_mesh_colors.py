@@ -29,12 +29,14 @@ def test_obj_vertex_colors_come_before_the_material(tmp_path):
         np.testing.assert_allclose(raw.colors[:, :2], 255 * raw.points_world[:, :2], atol=1.01)
 
 
-def test_ply_face_colors(tmp_path):
+def test_ply_face_colors_and_vertex_colors_where_no_texture_is_named(tmp_path):
     path = made.write_ply(tmp_path / "a.ply", face_colors=np.array([made.RED, made.BLUE], np.uint8))
     raw = whole(open_ply, path)
     is_first = raw.points_world[:, 0] > raw.points_world[:, 1]
     assert np.unique(raw.colors[is_first], axis=0).tolist() == [list(made.RED)]
     assert np.unique(raw.colors[~is_first], axis=0).tolist() == [list(made.BLUE)]
+    raw = whole(open_ply, made.write_wedges(tmp_path / "a.ply", colors=made.CORNER_COLORS))
+    np.testing.assert_allclose(raw.colors[:, 1], 255 * raw.points_world[:, 1], atol=0.51)
 
 
 @pytest.mark.parametrize("type_", [np.float32, np.uint8, np.uint16])
@@ -86,13 +88,18 @@ def test_meshes_without_colors_are_refused(tmp_path, options):
     assert_refused(r"room\.obj: no colours", open_mesh, made.write_obj(tmp_path, **options))
 
 
-def test_gltf_images_that_give_no_color_are_passed_over(tmp_path):
+def test_gltf_images_that_give_no_color_cameras_and_the_name_world_change_nothing(tmp_path):
     gltf = made.textured_gltf()
     gltf.tree["images"] += [{"uri": "gone.png"}, {"mimeType": "image/ktx2", "uri": "normals.ktx2"}]
     gltf.tree["textures"] += [{"source": 1}, {"extensions": {"KHR_texture_basisu": {"source": 2}}}]
     gltf.tree["materials"][0]["normalTexture"] = {"index": 1}
     gltf.tree["materials"][0]["emissiveTexture"] = {"index": 2}
     made.assert_quadrants(whole(open_mesh, gltf.glb(tmp_path / "a.glb")))
+    gltf = made.textured_gltf(camera=0, name="world", translation=[0, 0, 1])
+    gltf.tree["cameras"] = [{"perspective": {"znear": 0.1, "aspectRatio": 1.0, "yfov": 1.0}}]
+    raw = whole(open_mesh, gltf.glb(tmp_path / "a.glb"))
+    made.assert_quadrants(raw)
+    assert np.all(raw.points_world[:, 2] == 1)
 
 
 def test_a_second_set_of_texture_coordinates(tmp_path):
@@ -102,14 +109,6 @@ def test_a_second_set_of_texture_coordinates(tmp_path):
     attributes["TEXCOORD_0"] = gltf.accessor(np.zeros((4, 2), np.float32))
     gltf.tree["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]["texCoord"] = 1
     made.assert_quadrants(whole(open_mesh, gltf.glb(tmp_path / "a.glb")))
-
-
-def test_a_camera_and_the_name_world_change_nothing(tmp_path):
-    gltf = made.textured_gltf(camera=0, name="world", translation=[0, 0, 1])
-    gltf.tree["cameras"] = [{"perspective": {"znear": 0.1, "aspectRatio": 1.0, "yfov": 1.0}}]
-    raw = whole(open_mesh, gltf.glb(tmp_path / "a.glb"))
-    made.assert_quadrants(raw)
-    assert np.all(raw.points_world[:, 2] == 1)
 
 
 @pytest.mark.parametrize(
@@ -134,16 +133,15 @@ def test_obj_lines_may_begin_in_other_ways(tmp_path, old, new):
     np.testing.assert_array_equal(read.colors, expected.colors)
 
 
-def test_materials_in_comments_are_not_used(tmp_path):
+def test_materials_in_comments_are_not_used_and_textures_in_folders_below_are_found(tmp_path):
     path = made.write_obj(tmp_path, mtl="newmtl wall\nmap_Kd wall.png\nnewmtl door\nKd 1 0 0\n")
     expected = whole(open_mesh, path)
     path.write_text(path.read_text().replace("f 1/1 3/3", "# usemtl door\nf 1/1 3/3"))
     np.testing.assert_array_equal(whole(open_mesh, path).colors, expected.colors)
-
-
-def test_ply_colors_stay_with_their_vertices_where_no_texture_is_named(tmp_path):
-    raw = whole(open_ply, made.write_wedges(tmp_path / "a.ply", colors=made.CORNER_COLORS))
-    np.testing.assert_allclose(raw.colors[:, 1], 255 * raw.points_world[:, 1], atol=0.51)
+    path = made.write_obj(tmp_path, mtl="newmtl wall\nmap_Kd maps\\wall 1.png\n")
+    (tmp_path / "maps").mkdir()
+    (tmp_path / "wall.png").rename(tmp_path / "maps" / "wall 1.png")
+    assert len(whole(open_mesh, path).colors) == 10_000
 
 
 def test_a_textured_material_without_uv_is_left_out_whatever_its_color(tmp_path):
@@ -153,13 +151,6 @@ def test_a_textured_material_without_uv_is_left_out_whatever_its_color(tmp_path)
     source = open_mesh(path)
     assert source.num_points == 10_000
     assert "1 surfaces without colours left out" in source.warnings[0]
-
-
-def test_textures_in_folders_below_are_found(tmp_path):
-    path = made.write_obj(tmp_path, mtl="newmtl wall\nmap_Kd maps\\wall 1.png\n")
-    (tmp_path / "maps").mkdir()
-    (tmp_path / "wall.png").rename(tmp_path / "maps" / "wall 1.png")
-    assert len(whole(open_mesh, path).colors) == 10_000
 
 
 def test_a_texture_of_many_surfaces_is_decoded_once(tmp_path, monkeypatch):

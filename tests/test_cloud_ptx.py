@@ -204,10 +204,15 @@ def test_mutated_pts_raise_nothing_but_input_error(data, tmp_path_factory):
     assert cloud is None or 1000 <= len(cloud.points) <= 1202
 
 
-def test_empty_files_are_refused_by_the_readers_themselves(tmp_path):
+def test_empty_files_and_scans_that_have_gone_between_two_readings_are_refused(tmp_path):
     (tmp_path / "a").touch()
     for reader in (open_ptx, open_pts):
         assert_refused("no line of numbers, wanted", reader, tmp_path / "a")
+    path = write(tmp_path / "a.ptx", TWO_SCANS)
+    source = open_source(path)
+    write(path, TWO_SCANS[:300])
+    with pytest.raises(InputError, match="found 290 of 500 points; the file is cut off"):
+        list(source.read_chunks())
 
 
 @pytest.mark.parametrize("name", ["a.ptx", "a.pts"])
@@ -229,14 +234,6 @@ def test_a_file_cut_while_it_is_read_is_refused(tmp_path, monkeypatch, name, gra
     with pytest.raises(InputError, match="the file was cut while it was read, wanted a whole file") as error:
         list(chunks)
     assert str(error.value).startswith(f"{path}: ")
-
-
-def test_a_scan_that_has_gone_between_two_readings_is_refused(tmp_path):
-    path = write(tmp_path / "a.ptx", TWO_SCANS)
-    source = open_source(path)
-    write(path, TWO_SCANS[:300])
-    with pytest.raises(InputError, match="found 290 of 500 points; the file is cut off"):
-        list(source.read_chunks())
 
 
 def test_many_small_scans_are_read_once(tmp_path, monkeypatch):

@@ -28,8 +28,15 @@ def _fine():
     return render_view(rooms.scan_map(1).octree, true_pose.center_world, METHOD.fine_view), true_pose
 
 
-def test_channels_in_levels():
+def test_channels_in_levels_and_perturbations_to_the_corners_of_a_cube():
     np.testing.assert_allclose(descent.as_levels(np.array([-2, 0, 2], np.float32)), [0, 127.5, 255])
+    steps = descent.perturbations(0.5)
+    assert steps.shape == (9, 6)
+    assert (steps[0] == 0).all()
+    np.testing.assert_allclose(np.degrees(np.linalg.norm(steps[1:, :3], axis=1)), 4.0)
+    np.testing.assert_allclose(np.linalg.norm(steps[1:, 3:], axis=1), 0.125)
+    assert len(np.unique(np.sign(steps[1:, 3:]), axis=0)) == 8
+    assert (np.sign(steps[1:, 3:]) == np.sign(steps[1:, 2::-1])).all()
 
 
 def test_descent_finds_the_true_pose_again():
@@ -40,16 +47,6 @@ def test_descent_finds_the_true_pose_again():
     before, after = (descent.score_on(cells, center, image, p) for p in (off, pose))
     assert after > max(0.6, before)
     assert rooms.errors(descent.descend(cells, center, image, off, (1.0, 1, 1e-5)), true_pose)[0] > 0.01
-
-
-def test_perturbations_are_none_and_the_corners_of_a_cube():
-    steps = descent.perturbations(0.5)
-    assert steps.shape == (9, 6)
-    assert (steps[0] == 0).all()
-    np.testing.assert_allclose(np.degrees(np.linalg.norm(steps[1:, :3], axis=1)), 4.0)
-    np.testing.assert_allclose(np.linalg.norm(steps[1:, 3:], axis=1), 0.125)
-    assert len(np.unique(np.sign(steps[1:, 3:]), axis=0)) == 8
-    assert (np.sign(steps[1:, 3:]) == np.sign(steps[1:, 2::-1])).all()
 
 
 def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off():

@@ -115,10 +115,14 @@ def test_no_output_replaces_an_input_or_another_output(scenes, tmp_path, capsys,
     assert not out.exists()
 
 
-def test_an_unknown_variant_is_refused(scenes, tmp_path, capsys):
+def test_an_unknown_variant_is_refused_and_runs_of_other_scenes_do_not_compare(scenes, tmp_path, capsys):
     assert _run(scenes, tmp_path / "run.jsonl", "--variants", "nope") == 3
     assert "--variants: found no nope, wanted some of clean, far" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+    (tmp_path / "a").write_text("")
+    (tmp_path / "b").write_text("")
+    assert evaluate.main(["--compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 3
+    assert "no query in common" in capsys.readouterr().err
 
 
 def test_a_closed_pipe_is_no_message(scenes, tmp_path):
@@ -204,10 +208,3 @@ def test_interrupt_ends_all_processes_without_a_traceback(scenes, tmp_path):
 def test_wrong_usage(words, message, capsys):
     assert evaluate.main(words.split()) == 2
     assert message in capsys.readouterr().err
-
-
-def test_runs_of_other_scenes_do_not_compare(scenes, tmp_path, capsys):
-    (tmp_path / "a").write_text("")
-    (tmp_path / "b").write_text("")
-    assert evaluate.main(["--compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 3
-    assert "no query in common" in capsys.readouterr().err

@@ -58,7 +58,7 @@ ROWS = [
 ]
 
 
-def test_errors_of_a_query(tmp_path):
+def test_errors_of_a_query_and_the_thresholds_of_the_paper(tmp_path):
     scene = _scene(tmp_path)
     row = query_result_of(scene, scene.queries[0], result("a.jpg", _pose(0.05, 3.0)), True)
     assert row.position_error == pytest.approx(0.05)
@@ -67,9 +67,6 @@ def test_errors_of_a_query(tmp_path):
     assert row.is_correct()
     assert not row.is_correct(Thresholds(max_distance=0.04))
     assert not row.is_correct(Thresholds(max_angle=np.radians(2.0)))
-
-
-def test_a_pose_is_correct_below_both_thresholds_of_the_paper():
     assert is_correct(_pose(0.09, 4.9), TRUE_POSE)
     assert not is_correct(_pose(0.11, 0.0), TRUE_POSE)
     assert not is_correct(_pose(0.0, 5.1), TRUE_POSE)
@@ -106,14 +103,11 @@ def test_results_find_their_queries_by_path_then_by_name(tmp_path):
         list(match_results(scenes, [result("z.jpg", None)]))
 
 
-def test_quartiles_of_errors_some_of_which_are_infinite():
+def test_summary_accuracies_and_quartiles_of_errors_some_of_which_are_infinite():
     assert quartiles([1.0, 2.0, 3.0, 4.0, 5.0]).tolist() == [2.0, 3.0, 4.0]
     assert quartiles([1.0, 2.0, 3.0, 4.0, np.inf]).tolist() == [2.0, 3.0, 4.0]
     assert quartiles([1.0, np.inf]).tolist() == [np.inf] * 3
     assert quartiles([1.0, 1.0, 1.0, np.inf]).tolist() == [1.0, 1.0, np.inf]
-
-
-def test_summary_and_accuracies():
     summary = summarize(ROWS)
     assert (summary.num_queries, summary.num_correct, summary.num_localized) == (4, 2, 2)
     assert (summary.num_wrong, summary.accuracy) == (1, 0.5)
@@ -160,7 +154,7 @@ def _curves(axes):
     return [(label, *(np.round(v, 6).tolist() for v in xy)) for label, *xy in curves if len(xy) == 2]
 
 
-def test_plots_show_the_errors():
+def test_plots_show_the_errors_and_risk_over_coverage():
     figure = errors_figure({"one": ROWS, "two": ROWS[:2]}, PAPER_THRESHOLDS)
     position, rotation, recall = figure.axes
     distances = [0.01, 0.03, 0.09], [25.0, 50.0, 75.0]  # the fourth has no pose
@@ -171,9 +165,6 @@ def test_plots_show_the_errors():
     image = cv2.imdecode(np.frombuffer(figure_png(figure), np.uint8), cv2.IMREAD_COLOR)
     assert image.shape == (504, 1680, 3)
     assert (image != 255).any(axis=2).mean() > 0.02  # ink
-
-
-def test_plot_of_risk_shows_the_curve_and_the_usual_confidences():
     (axes,) = risk_figure(risk_and_coverage(ROWS)).axes
     curve, *marks = axes.get_lines()
     expected = [[0.0, 50.0], [50.0, 50.0], [75.0, 100 / 3], [100.0, 50.0]]

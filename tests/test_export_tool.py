@@ -55,7 +55,7 @@ def test_only_localized_poses_are_written_and_the_others_counted(run, tmp_path):
     assert [line.split(",")[0] for line in lines_of(tmp_path / "p.csv")[1:]] == ["p/a.jpg", "p/e.jpg"]
 
 
-def test_all_and_clouds(run, tmp_path):
+def test_all_and_clouds_are_selected_in_order(run, tmp_path):
     code, document, _ = run("--format", "csv", "--out", tmp_path / "p.csv", "--all")
     assert (code, document["poses"]) == (0, 4)
     code, document, err = run("--format", "csv", "--out", tmp_path / "p.csv", "--all", "--cloud", "b.ply")
@@ -63,6 +63,7 @@ def test_all_and_clouds(run, tmp_path):
     assert "coordinate system" not in err
     code, _, err = run("--format", "csv", "--out", tmp_path / "p.csv", "--cloud", "c.ply")
     assert (code, "found no result for c.ply, wanted one of a.ply, b.ply" in err) == (3, True)
+    assert [r.pano for r in select(MIXED, use_all=True).results] == [MIXED[i].pano for i in (0, 1, 2, 4)]
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -174,10 +175,6 @@ def test_any_damage_of_results_is_refused_or_harmless(tmp_path_factory, data):
     results, _ = read_or_refused(lambda p: read_results([p]), path)
     for r in results or []:
         np.testing.assert_allclose(r.pose.R_cam_from_world @ r.pose.R_cam_from_world.T, np.eye(3), atol=1e-5)
-
-
-def test_selection_keeps_the_order():
-    assert [r.pano for r in select(MIXED, use_all=True).results] == [MIXED[i].pano for i in (0, 1, 2, 4)]
 
 
 def test_folder_is_whole_or_not_there(tmp_path):

@@ -65,14 +65,11 @@ def plane(normal, fraction=0.2, rms=0.003, kind="wall"):
     return Plane(np.asarray(normal, float) / np.linalg.norm(normal), 1.0, 1000, fraction, rms, kind)
 
 
-def test_planes_correct_up(hut):
+def test_planes_correct_up_and_plumb_walls_count_more_than_uneven_ground(hut):
     askew = exp_so3(np.array([0.004, 0.002, 0.0])) @ UP
     refined, spread = refine_up(askew, ransac_planes(hut))
     assert np.linalg.norm(refined - UP) < 0.001 < np.linalg.norm(askew - UP)
     assert 0.0 < spread < 0.002
-
-
-def test_plumb_walls_count_more_than_uneven_ground():
     up = np.array([0.0, 0.01, 1.0]) / np.hypot(1.0, 0.01)
     walls = [plane([1, 0, 0], 0.1), plane([0, 1, 0], 0.1)]
     refined, spread = refine_up(up, [plane([0.0, 0.02, 1.0], 0.4, rms=0.1), *walls])

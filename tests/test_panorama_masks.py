@@ -171,12 +171,17 @@ def test_a_mask_of_any_size_is_applied(tmp_path, factor):
     np.testing.assert_array_equal(is_valid, checker_mask(WIDTH, HEIGHT) == 0)
 
 
-def test_any_white_pixel_of_a_larger_mask_counts(tmp_path):
+def test_any_white_pixel_of_a_larger_mask_counts_and_the_nadir_is_masked(tmp_path):
     mask = np.zeros((2 * HEIGHT, 2 * WIDTH), np.uint8)
     mask[301, 401], mask[700, 800] = 128, 127
     file = write(tmp_path / "mask.png", encoded(mask, ".png"))
     is_valid = read(tmp_path / "a.jpg", room(), options=ReadOptions(mask=file)).is_valid
     assert np.argwhere(~is_valid).tolist() == [[150, 200]]
+    is_valid = read(tmp_path / "a.jpg", room(), options=ReadOptions(mask_nadir_deg=20.0)).is_valid
+    np.testing.assert_array_equal(is_valid, np.repeat((FROM_NADIR >= 20)[:, None], WIDTH, axis=1))
+    for degrees in (-1.0, 91.0, float("nan")):
+        with pytest.raises(InputError, match=r"--mask-nadir: found .*, wanted 0 to 90"):
+            ReadOptions(mask_nadir_deg=degrees)
 
 
 def test_a_mask_of_a_crop_may_have_its_shape_or_the_spheres(tmp_path):
@@ -208,11 +213,3 @@ def test_a_folder_of_masks_is_looked_up_by_name(tmp_path):
     assert panorama.warnings == (f"found no mask b in {folder}",)
     with pytest.raises(InputError, match=r"none.png: cannot be read"):
         read(tmp_path / "a.jpg", room(), options=ReadOptions(mask=tmp_path / "none.png"))
-
-
-def test_the_nadir_is_masked(tmp_path):
-    is_valid = read(tmp_path / "a.jpg", room(), options=ReadOptions(mask_nadir_deg=20.0)).is_valid
-    np.testing.assert_array_equal(is_valid, np.repeat((FROM_NADIR >= 20)[:, None], WIDTH, axis=1))
-    for degrees in (-1.0, 91.0, float("nan")):
-        with pytest.raises(InputError, match=r"--mask-nadir: found .*, wanted 0 to 90"):
-            ReadOptions(mask_nadir_deg=degrees)

@@ -77,15 +77,12 @@ def test_the_same_pose_from_each_source_gives_the_same_picture(run, scene, tmp_p
     np.testing.assert_array_equal(is_marked, mask == 255)
 
 
-def test_depth_in_millimetres_says_nothing_and_too_far():
+def test_depth_in_millimetres_and_a_prepared_map_in_place_of_the_cloud(run, scene, tmp_path):
     depth = np.array([[1.2345, np.inf], [65.6, 1e6]], np.float32)
     png = render_pose.depth_file(depth, ".png")
     read = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
     assert read.dtype == np.uint16
     assert read.tolist() == [[1234, 0], [65535, 65535]]
-
-
-def test_a_prepared_map_stands_in_place_of_the_cloud(run, scene, tmp_path):
     arguments = ["--cloud", str(scene / "cloud.ply"), "--out", str(scene / "cloud.map"), "--quiet"]
     assert prepare_map.main(arguments) == 0
     pano = ["--queries", scene / "queries.json", "--pano", "tilt_0.jpg", "--width", 128]

@@ -128,7 +128,7 @@ def test_same_bits_for_any_number_of_threads():
     np.testing.assert_array_equal(one[2], two[2])
 
 
-def test_turning_the_camera_by_whole_pixels_rolls_the_image():
+def test_turning_rolls_the_image_and_moving_world_and_camera_together_changes_nothing():
     points, colors = _points("anywhere")
     packed, image = pack_points(points, colors), _smooth_image()
     k = 37
@@ -136,9 +136,6 @@ def test_turning_the_camera_by_whole_pixels_rolls_the_image():
     rolled = pack_texels(np.roll(image, k, axis=1))
     expected = sampling_loss(packed, pack_texels(image), POSES["tilted"])
     assert sampling_loss(packed, rolled, turned) == pytest.approx(expected, rel=1e-5)
-
-
-def test_moving_world_and_camera_together_changes_nothing():
     points, colors = _points("anywhere")
     texels, pose = pack_texels(_smooth_image()), POSES["tilted"]
     turn, shift = exp_so3(np.array([0.5, 0.2, -0.9])), np.array([3.0, -2.0, 1.0])

@@ -34,13 +34,21 @@ def test_a_scene_comes_back_as_it_was_written(tmp_path):
     assert json.loads((tmp_path / "queries.json").read_text())["source"] == "made up"
 
 
-def test_images_may_stand_elsewhere(tmp_path):
+def test_images_may_stand_elsewhere_and_beside_a_linked_folder(tmp_path):
     far = tmp_path / "elsewhere" / "a.jpg"
     (tmp_path / "room").mkdir()
     write_queries(tmp_path / "room", [Query(far, "robot", POSE)])
     scene = read_scene(tmp_path / "room")
     assert scene.name_of(scene.queries[0]) == "../elsewhere/a.jpg"
     assert scene.queries[0].image.resolve() == far.resolve()
+    far = tmp_path / "deep" / "er"
+    far.mkdir(parents=True)
+    (tmp_path / "link").symlink_to(far)
+    image = tmp_path / "raw" / "a.jpg"
+    image.parent.mkdir()
+    image.touch()
+    write_queries(tmp_path / "link", [Query(image, "robot", POSE)])
+    assert read_scene(tmp_path / "link").queries[0].image.samefile(image)
 
 
 def test_scenes_are_found_at_any_depth_and_named_by_it(tmp_path):
@@ -54,18 +62,10 @@ def test_scenes_are_found_at_any_depth_and_named_by_it(tmp_path):
         find_scenes([tmp_path / "area_1", tmp_path / "area_2"])
 
 
-def test_images_beside_a_linked_folder_are_found(tmp_path):
-    far = tmp_path / "deep" / "er"
-    far.mkdir(parents=True)
-    (tmp_path / "link").symlink_to(far)
-    image = tmp_path / "raw" / "a.jpg"
-    image.parent.mkdir()
-    image.touch()
-    write_queries(tmp_path / "link", [Query(image, "robot", POSE)])
-    assert read_scene(tmp_path / "link").queries[0].image.samefile(image)
-
-
-def test_what_lacks_a_field_or_comes_twice_is_named(tmp_path):
+def test_what_lacks_a_field_or_comes_twice_or_is_not_there_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"found no queries\.json in or below it"):
+        find_scenes([tmp_path])
+    assert_refused(r"queries\.json: cannot be read \(No such file", read_scene, tmp_path)
     document = json.loads((_written(tmp_path, ("images/a.jpg", "images/b.jpg")) / "queries.json").read_text())
     del document["queries"][1]["variant"]
     (tmp_path / "queries.json").write_text(json.dumps(document))
@@ -75,12 +75,6 @@ def test_what_lacks_a_field_or_comes_twice_is_named(tmp_path):
     assert_refused("an image twice", read_scene, tmp_path)
     with pytest.raises(InputError, match="found a file, wanted a folder with scenes"):
         find_scenes([Path(__file__)])
-
-
-def test_no_scene_is_told(tmp_path):
-    with pytest.raises(InputError, match=r"found no queries\.json in or below it"):
-        find_scenes([tmp_path])
-    assert_refused(r"queries\.json: cannot be read \(No such file", read_scene, tmp_path)
 
 
 @pytest.mark.parametrize(

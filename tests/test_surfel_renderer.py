@@ -197,7 +197,7 @@ def test_points_in_the_air_and_lines_are_no_surface():
     assert (abs(surfels.normals[of_wall, 2]) > 0.999).mean() > 0.99
 
 
-def test_few_points_and_points_at_the_camera_are_drawn():
+def test_few_points_are_drawn_and_pictures_too_large_refused():
     for count in (1, 5, 11, 40):
         cloud = np.zeros((count + 1, 3), np.float32)
         cloud[1:] = [1.0, 0.0, 0.0]
@@ -205,9 +205,6 @@ def test_few_points_and_points_at_the_camera_are_drawn():
         picture = render_points(packed, Pose(np.eye(3), np.zeros(3)), 32, WORKERS)
         assert picture.is_seen.any()
         assert (picture.rgb[picture.is_seen] == 9).all()
-
-
-def test_pictures_too_large_for_a_format_are_refused_by_name():
     with pytest.raises(OSError, match=r"could not be encoded as \.jpg"):
         encode_image(np.zeros((1, 70_000, 3), np.uint8), ".jpg")
 
