@@ -152,15 +152,12 @@ def test_scans_without_colors_are_left_out_beside_others(tmp_path):
         open_source(write(tmp_path / "b.e57", [plain]))
 
 
-def test_points_that_are_not_finite_are_handed_on(tmp_path):
+def test_points_that_are_not_finite_are_handed_on_and_foreign_fields_change_nothing(tmp_path, monkeypatch):
     raw = type(RAW)(RAW.points_world.copy(), RAW.colors)
     raw.points_world[:3] = [[np.inf, 0.0, 0.0], [np.nan, 1.0, 1.0], [1.7e308, 1.7e308, 1.7e308]]
     written = ScanToWrite(cartesian(raw) | colored(), BYTES, rotation_wxyz=QUATERNION)
     path = write(tmp_path / "a.e57", [written])
     assert (read_cloud(path).num_dropped, len(read_cloud(path).points)) == (3, 1197)
-
-
-def test_a_reader_may_stop_early_and_foreign_fields_change_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(e57, "CHUNK", 100)
     chunks = open_source(write(tmp_path / "a.e57", [scan(), scan()])).read_chunks()
     np.testing.assert_array_equal(next(chunks).points_world, RAW.points_world[:100])

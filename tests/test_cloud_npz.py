@@ -51,12 +51,10 @@ def test_single_arrays(tmp_path, monkeypatch, kind, chunk):
 
 @pytest.mark.parametrize("saver", SAVERS)
 @pytest.mark.parametrize("names", [("points", "colors"), ("xyz", "rgb"), ("points", "rgb")])
-@pytest.mark.parametrize(
-    ("type_", "most"), [("u1", 255), ("<u2", 65535), (">u2", 65535), ("f4", 1), ("f8", 1)]
-)
-def test_pairs_of_arrays(tmp_path, monkeypatch, saver, names, type_, most):
+@pytest.mark.parametrize(("kind", "top"), [("u1", 255), ("<u2", 65535), (">u2", 65535), ("f4", 1), ("f8", 1)])
+def test_pairs_of_arrays(tmp_path, monkeypatch, saver, names, kind, top):
     monkeypatch.setattr(raw, "CHUNK", 500)
-    colors = (RGB * (most / 255.0)).astype(type_)
+    colors = (RGB * (top / 255.0)).astype(kind)
     path = tmp_path / "a.npz"
     saver(path, other=np.arange(5), **{names[1]: colors, names[0]: np.asfortranarray(XYZ.astype("f4"))})
     assert_read_as_written(path, XYZ.astype("f4"))

@@ -58,10 +58,8 @@ def test_comments_are_passed_over_and_headers_name_columns(tmp_path):
     assert_read_as_written(write(tmp_path / "a.csv", ['index,"class",x,y,z,R,G,B', *lines]))
     assert_read_as_written(write(tmp_path / "a.txt", [line + " 0.5 label" for line in lines_of(RAW)]))
     lines = [" ".join([*f[:3], "0.25", *f[3:]]) for f in map(str.split, lines_of(RAW))]
-    for k, header in enumerate(
-        ["//X Y Z Intensity R G B", "x y z i Red Green Blue", '"X" "Y" "Z" "I" r g b']
-    ):
-        assert_read_as_written(write(tmp_path / f"{k}.asc", [header, "1500", *lines]))
+    for header in ("//X Y Z Intensity R G B", "x y z i Red Green Blue", '"X" "Y" "Z" "I" r g b'):
+        assert_read_as_written(write(tmp_path / "a.asc", [header, "1500", *lines]))
     assert_read_as_written(write(tmp_path / "a.txt", ["# x y z are metres", *lines_of(RAW)]))
 
 

@@ -55,7 +55,7 @@ def test_a_floor_at_a_round_height_is_one_layer_at_every_level(z):
         assert len(np.unique(columns, axis=0)) == end - begin
 
 
-def test_a_larger_table_holds_the_same_rows():
+def test_a_larger_table_holds_the_same_rows_and_may_be_fed_with_nothing():
     table, larger = np.zeros((64, NUM_COLUMNS), np.int32), np.zeros((256, NUM_COLUMNS), np.int32)
     raw = seeded_cloud(16, 40)
     assert add_points(raw.points_world, raw.colors, np.zeros(3, np.int64), table, 0, 40) == (40, 40)
@@ -64,6 +64,12 @@ def test_a_larger_table_holds_the_same_rows():
     assert kept[0] == kept[1]
     assert len(kept[0]) == 40
     assert add_points(raw.points_world, raw.colors, np.zeros(3, np.int64), larger, 40, 99) == (40, 40)
+    table = VoxelTable("a")
+    table.add(np.empty((0, 3)), np.empty((0, 3), np.uint8))
+    table.add(np.full((2, 3), 7.5), np.full((2, 3), 51, np.uint8))
+    found = table.finish()
+    np.testing.assert_allclose(found.nodes[0, 3:], 0.2)
+    np.testing.assert_allclose(found.nodes[0, :3] + found.origin, 7.5, atol=4e-5)
 
 
 def test_a_full_voxel_takes_no_more_and_fits_its_sums(monkeypatch):
@@ -106,12 +112,3 @@ def test_too_many_voxels_are_refused(monkeypatch):
     monkeypatch.setattr(voxels, "MAX_ROWS", voxels.FIRST_ROWS)
     with pytest.raises(InputError, match=r"more than 39321 voxels of 0\.02 m are filled.*--units"):
         stream(seeded_cloud(9, 50_000, size=(900.0, 900.0, 900.0))).voxels(LEVEL)
-
-
-def test_voxel_table_may_be_fed_with_nothing():
-    table = VoxelTable("a")
-    table.add(np.empty((0, 3)), np.empty((0, 3), np.uint8))
-    table.add(np.full((2, 3), 7.5), np.full((2, 3), 51, np.uint8))
-    found = table.finish()
-    np.testing.assert_allclose(found.nodes[0, 3:], 0.2)
-    np.testing.assert_allclose(found.nodes[0, :3] + found.origin, 7.5, atol=4e-5)

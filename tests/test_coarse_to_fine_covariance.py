@@ -65,7 +65,9 @@ def test_sandwich_of_independent_blocks_is_the_textbook_covariance():
 def test_no_covariance_without_a_minimum_or_with_few_blocks():
     gradients = np.random.default_rng(0).normal(size=(100, 6))
     assert covariance.covariance_of(np.diag([1.0, 1, 1, 1, 1, -0.1]), gradients) is None
-    assert covariance.covariance_of(np.eye(6), gradients[:10]) is None
+    for least, count, is_known in ((1, 12, False), (1, 13, True), (1e-10, 100, False), (1e-8, 100, True)):
+        found = covariance.covariance_of(np.diag([1.0, 1, 1, 1, 1, least]), gradients[:count])
+        assert (found is not None) == is_known
 
 
 def test_covariance_is_in_the_worlds_axes(found):

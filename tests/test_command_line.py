@@ -150,10 +150,8 @@ def test_errors_have_codes_and_name_the_command_as_it_was_started(monkeypatch, c
 def test_help_names_commands_as_they_were_started(monkeypatch, capsys, name):
     script = ROOT / ("" if name == "localize" else "tools") / f"{name}.py"
     installed = f"piccolo-{name.replace('_', '-')}", import_module(f"piccolo.cli.{name}").main, "\n  piccolo-"
-    for program, start, example in (
-        installed,
-        (script.name, lambda: runpy.run_path(str(script), run_name="__main__"), "  python "),
-    ):
+    scripted = script.name, lambda: runpy.run_path(str(script), run_name="__main__"), "  python "
+    for program, start, example in (installed, scripted):
         monkeypatch.setattr("sys.argv", [f"bin/{program}", "--help"])
         with pytest.raises(SystemExit):
             start()

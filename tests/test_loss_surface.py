@@ -9,7 +9,6 @@ import pytest
 import rooms
 
 from piccolo.cli import loss_surface as tool
-from piccolo.cli import make_room
 from piccolo.cloud import read_cloud
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import Pose, angle_between
@@ -100,10 +99,8 @@ def test_minima_are_counted_in_free_space():
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     """A made room and a result for one panorama, in a folder with a blank in its name."""
-    folder = tmp_path_factory.mktemp("my room")
-    arguments = ["--seed", "5", "--points", "30000", "--panoramas", "1", "--width", "256", "--quiet"]
-    variants = ["--size", "4", "3", "2.5", "--variants", "clean", "tilt"]
-    assert make_room.main(["--out", str(folder), *arguments, *variants]) == 0
+    words = "--seed 5 --size 4 3 2.5 --points 30000 --panoramas 1 --width 256 --variants clean tilt"
+    folder = rooms.write_room(tmp_path_factory.mktemp("my room"), words)
     pose = read_scene(folder).by_name["tilt_0.jpg"].pose
     found = Pose(pose.R_cam_from_world, pose.center_world + 0.05)
     poses.write_results(folder / "pose.json", [poses.result("x/tilt_0.jpg", found)])

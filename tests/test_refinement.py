@@ -191,9 +191,7 @@ def test_alternatives_that_come_near_are_refined_and_the_better_wins(monkeypatch
         return Hypothesis(h.pose, h.score + gains[refined[-1]])
 
     monkeypatch.setattr(method, "refine_by_perturbation", perturbed)
-    monkeypatch.setattr(
-        method, "refine_full_resolution", lambda query, h, num_rounds: h if num_rounds == 2 else None
-    )
+    monkeypatch.setattr(method, "refine_full_resolution", lambda query, h, n: h if n == 2 else None)
     result = SearchResult(_at(0.0, 0.5), (_at(3.0, 0.4), _at(6.0, 0.3), _at(9.0, 0.19)))
     found = method.refine_alternatives(QUERY, result)
     assert refined == [3.0, 6.0]

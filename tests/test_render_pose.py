@@ -7,8 +7,9 @@ import cv2
 import numpy as np
 import poses
 import pytest
+import rooms
 
-from piccolo.cli import make_room, prepare_map, render_pose
+from piccolo.cli import prepare_map, render_pose
 from piccolo.geometry.camera_axes import heading_pitch_roll_deg
 from piccolo.geometry.pose import T_world_from_cam
 from piccolo.optimize import descent_animation as animation
@@ -18,10 +19,8 @@ from piccolo.scenes.scene import read_scene
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     """A made room with a result for each of two panoramas, in a folder with a blank in its name."""
-    folder = tmp_path_factory.mktemp("my room")
-    arguments = ["--seed", "7", "--points", "30000", "--panoramas", "1", "--width", "256", "--quiet"]
-    room = ["--size", "4", "3", "2.5", "--variants", "clean", "tilt"]
-    assert make_room.main(["--out", str(folder), *arguments, *room]) == 0
+    words = "--seed 7 --size 4 3 2.5 --points 30000 --panoramas 1 --width 256 --variants clean tilt"
+    folder = rooms.write_room(tmp_path_factory.mktemp("my room"), words)
     truth = read_scene(folder).by_name
     some = [poses.result(folder / "images" / n, truth[n].pose) for n in ("clean_0.jpg", "tilt_0.jpg")]
     poses.write_results(folder / "poses.jsonl", [*some, poses.result("c.jpg", None, "not_localized")])

@@ -43,11 +43,16 @@ def test_json_round_trip_keeps_every_bit_of_the_pose():
     assert dataclasses.replace(back, **WITHOUT_ARRAYS) == plain
 
 
-def test_deviations_are_in_millimetres_and_degrees():
+def test_json_names_what_the_next_tool_needs_in_its_units():
     document = json.loads(RESULT.to_json())
     assert document["std_mm"] == pytest.approx([2.0, 3.0, 4.0])
     assert document["std_deg"] == pytest.approx([np.degrees(1e-3)] * 3)
     assert "R_true = exp([w]x) R_cam_from_world" in document["covariance_convention"]
+    assert document["format"] == "piccolo-pose/3"
+    T = np.array(document["T_world_from_cam"])
+    np.testing.assert_allclose(T[:3, 3], RESULT.pose.center_world)
+    np.testing.assert_allclose(T[:3, :3], np.array(document["R_cam_from_world"]).T)
+    assert "R_cam_from_world @ (x_world - center_world)" in document["convention"]
 
 
 def test_summary_says_what_a_person_asks_first():
@@ -57,15 +62,6 @@ def test_summary_says_what_a_person_asks_first():
     assert "one sigma 4.0 mm (up and down)" in text
     assert "or (1.000, 2.000, 3.000) m, score 0.20" in text
     assert "or (" not in RESULT.summary()
-
-
-def test_json_names_what_the_next_tool_needs():
-    document = json.loads(RESULT.to_json())
-    assert document["format"] == "piccolo-pose/3"
-    T = np.array(document["T_world_from_cam"])
-    np.testing.assert_allclose(T[:3, 3], RESULT.pose.center_world)
-    np.testing.assert_allclose(T[:3, :3], np.array(document["R_cam_from_world"]).T)
-    assert "R_cam_from_world @ (x_world - center_world)" in document["convention"]
 
 
 def test_a_result_without_a_pose_is_written_and_nan_never():

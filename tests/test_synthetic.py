@@ -63,11 +63,17 @@ def test_room_without_a_free_place_and_an_unknown_variant_are_refused():
         make_query(make_world(0, SMALL), 0, "odd", 128, Workers())
 
 
-def test_points_lie_on_surfaces():
+def test_scan_lies_on_surfaces_inside_the_walls_and_keeps_rooms_apart():
     world = make_world(3, SMALL)
     points, *_ = scan_world(world, 2000, Workers(2))
     distances = [abs(world.rooms[0].clearance(point)) for point in points.astype(float)]
     assert max(distances) < 5 * RANGE_NOISE
+    world = make_world(2, SMALL, num_rooms=2)
+    points, *_ = scan_world(world, 8000, Workers(2))
+    walls = [(r.corner - 0.03, r.corner + r.size + 0.03) for r in world.rooms]
+    inside = [((points > low) & (points < high)).all(axis=1) for low, high in walls]
+    assert (inside[0] | inside[1]).all()
+    assert inside[0].sum() == inside[1].sum() == 4000
 
 
 def test_same_seed_same_bits_at_any_number_of_threads():
@@ -86,17 +92,6 @@ def test_rooms_of_equal_size_do_not_look_alike():
     rooms = [make_room(s, SMALL, np.zeros(3)) for s in range(4)]
     views = [cast_rays(this, SMALL / 2, rays, Workers(), "")[1] for this in rooms]
     assert all(np.abs(a - b).mean() > 0.05 for a, b in combinations(views, 2))
-
-
-def test_scan_stays_inside_the_walls_and_keeps_rooms_apart():
-    world = make_world(2, SMALL, num_rooms=2)
-    points, *_ = scan_world(world, 8000, Workers(2))
-    near = 0.03  # of noise
-    inside = [
-        np.all((points > r.corner - near) & (points < r.corner + r.size + near), 1) for r in world.rooms
-    ]
-    assert (inside[0] | inside[1]).all()
-    assert inside[0].sum() == inside[1].sum() == 4000
 
 
 @pytest.mark.parametrize("variant", ["clean", "tilt"])
