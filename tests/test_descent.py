@@ -64,11 +64,11 @@ def test_starts_descend_on_their_candidates_views_as_one_does_alone():
     scan_map, (_, true_pose), image = rooms.scan_map(1), _fine(), _images().search
     distance = np.linalg.norm(scan_map.centers - true_pose.center_world, axis=1)
     k, far = int(np.argmin(distance)), int(np.argmax(distance))
-    candidate, R = np.array([far, k]), true_pose.R_cam_from_world
-    starts = Starts(np.stack([R, R]), scan_map.centers[candidate], candidate, np.zeros(2))
+    candidate, R = np.array([k, far, k]), true_pose.R_cam_from_world
+    starts = Starts(np.stack([R] * 3), scan_map.centers[candidate], candidate, np.zeros(3))
     ends = descent.descend_all(scan_map, image, starts, 12, Workers(2))
-    assert ends.candidate[0] == k  # the best first
-    assert ends.score[0] > max(0.4, ends.score[1])
+    assert ends.candidate.tolist() == [k, k, far]  # the best first
+    assert ends.score[0] == ends.score[1] > max(0.4, ends.score[2])
     offsets = (scan_map.offsets[k] * scan_map.offset_unit[k]).astype(np.float32)
     channels = scan_map.features[k].astype(np.float32) / np.float32(63.75)
     weights = (scan_map.is_seen[k] * make_grid(24).solid_angle).astype(np.float32)
