@@ -62,13 +62,11 @@ def _set_pose(file, node, thing):
         return
     pose = libe57.StructureNode(file)
     if thing.rotation_wxyz is not None:
-        pose.set(
-            "rotation", _structure(file, dict(zip("wxyz", map(float, thing.rotation_wxyz), strict=True)))
-        )
+        rotation = dict(zip("wxyz", map(float, thing.rotation_wxyz), strict=True))
+        pose.set("rotation", _structure(file, rotation))
     if thing.center_world is not None:
-        pose.set(
-            "translation", _structure(file, dict(zip("xyz", map(float, thing.center_world), strict=True)))
-        )
+        center = dict(zip("xyz", map(float, thing.center_world), strict=True))
+        pose.set("translation", _structure(file, center))
     node.set("pose", pose)
 
 

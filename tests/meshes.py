@@ -70,12 +70,8 @@ class Gltf:
     def accessor(self, array):
         kind = {"f": 5126, "I": 5125, "B": 5121, "H": 5123}[array.dtype.char]
         shape = {1: "SCALAR"}.get(array.ndim) or f"VEC{array.shape[1]}"
-        row = {
-            "bufferView": self.view(array.tobytes()),
-            "componentType": kind,
-            "type": shape,
-            "count": len(array),
-        }
+        row = {"bufferView": self.view(array.tobytes()), "componentType": kind}
+        row |= {"type": shape, "count": len(array)}
         if kind in (5121, 5123) and array.ndim > 1:
             row["normalized"] = True
         self.tree["accessors"].append(row)

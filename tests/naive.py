@@ -60,9 +60,8 @@ def voxels(points, colors, size, corner):
     """Mean position and colour (M, 6) of each voxel of a grid with that corner, by a dictionary."""
     members = {}
     for point, color in zip(points, colors.astype(int), strict=True):
-        members.setdefault(tuple(int(k) for k in np.floor((point - corner) / size)), []).append(
-            (*point, *color)
-        )
+        voxel = tuple(int(k) for k in np.floor((point - corner) / size))
+        members.setdefault(voxel, []).append((*point, *color))
     return np.array([np.mean(rows, axis=0) for rows in members.values()])
 
 

@@ -54,9 +54,8 @@ def xmp_packet(fields, form="attributes", prefix="GPano"):
     """XMP with Photo Sphere fields, by either of its two forms."""
     names = {name: str(value) for name, value in fields.items()}
     attributes = "".join(f' {prefix}:{k}="{v}"' for k, v in names.items()) if form == "attributes" else ""
-    elements = (
-        "".join(f"<{prefix}:{k}> {v} </{prefix}:{k}>\n" for k, v in names.items()) if not attributes else ""
-    )
+    elements = "".join(f"<{prefix}:{k}> {v} </{prefix}:{k}>\n" for k, v in names.items())
+    elements = "" if attributes else elements
     return (
         '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
         f'<rdf:Description rdf:about="" xmlns:{prefix}="{XMP_NAMESPACE}"{attributes}>{elements}'
@@ -88,9 +87,8 @@ def with_metadata(content, orientation=None, xmp=None):
         chunks = [png_chunk(b"eXIf", exif(orientation))] if orientation else []
         chunks += [png_chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + xmp)] if xmp else []
         return content[:PNG_HEADER_SIZE] + b"".join(chunks) + content[PNG_HEADER_SIZE:]
-    return with_webp_chunks(
-        content, {b"EXIF": exif(orientation) if orientation else b"", b"XMP ": xmp or b""}
-    )
+    metadata = {b"EXIF": exif(orientation) if orientation else b"", b"XMP ": xmp or b""}
+    return with_webp_chunks(content, metadata)
 
 
 def with_webp_chunks(content, extra):

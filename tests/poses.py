@@ -14,15 +14,8 @@ WIDTH = 512
 SIZE = (WIDTH, WIDTH // 2)
 CENTER = np.array([500_123.456789, 5_400_987.654321, 312.25])
 EVIDENCE = Evidence(0.7, 0.5, 0.8, 0.9, 0.95)
-WORDS = {
-    "confidence": 0.9,
-    "loss": 0.05,
-    "evidence": EVIDENCE,
-    "alternatives": (),
-    "covariance": None,
-    "seconds": {},
-    "settings": {},
-}
+WORDS = {"confidence": 0.9, "loss": 0.05, "evidence": EVIDENCE, "alternatives": (), "covariance": None}
+WORDS |= {"seconds": {}, "settings": {}}
 
 
 def tilted_poses(num_poses, center=CENTER):

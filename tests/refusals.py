@@ -1,6 +1,17 @@
 """What tests of damaged files share."""
 
+import pytest
+
 from piccolo.errors import InputError
+
+
+def assert_refused(message, read, path, *arguments, **options):
+    """`read` refuses a file in one line that begins with its name and holds `message`, an expression."""
+    with pytest.raises(InputError, match=message) as error:
+        read(path, *arguments, **options)
+    text = str(error.value)
+    assert text.startswith(str(path))
+    assert "\n" not in text
 
 
 def read_or_refused(read, path):

@@ -8,12 +8,7 @@ from refusals import read_or_refused
 
 from piccolo.gravity.alignment import FORMAT, read_alignment
 
-GOOD = {
-    "format": FORMAT,
-    "T_aligned_from_scan": np.eye(4).tolist(),
-    "metres_per_unit": 1.0,
-    "confidence": 1.0,
-}
+GOOD = {"format": FORMAT, "T_aligned_from_scan": np.eye(4).tolist(), "metres_per_unit": 1.0, "confidence": 1}
 SKEWED = [[1, 0.1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 MIRROR = [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 

@@ -283,12 +283,8 @@ def test_a_cache_that_can_not_be_used_is_a_warning(cloud, tmp_path, monkeypatch,
 
 
 def test_importing_writes_nothing(tmp_path):
-    environment = {
-        **os.environ,
-        "HOME": str(tmp_path),
-        "XDG_CACHE_HOME": str(tmp_path / "cache"),
-        "PYTHONDONTWRITEBYTECODE": "1",
-    }
+    folders = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    environment = {**os.environ, **folders, "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, "-c", "import piccolo.cli.localize, piccolo.cli.evaluate"]
     subprocess.run(command, cwd=ROOT, env=environment, check=True)
     assert list(tmp_path.iterdir()) == []

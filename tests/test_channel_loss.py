@@ -48,10 +48,8 @@ def test_loss_equals_its_twin():
 def test_gradient_against_central_differences():
     problem = _problem()
     gradient = _sums(problem, TILTED)[GRADIENT:MATRIX]
-    numbers = [
-        (_loss(problem, step(TILTED, 1e-6 * e)) - _loss(problem, step(TILTED, -1e-6 * e))) / 2e-6
-        for e in np.eye(6)
-    ]
+    losses = [[_loss(problem, step(TILTED, h * e)) for h in (1e-6, -1e-6)] for e in np.eye(6)]
+    numbers = [(ahead - behind) / 2e-6 for ahead, behind in losses]
     np.testing.assert_allclose(gradient, numbers, atol=0.02 * np.abs(numbers).max())
 
 
@@ -87,15 +85,8 @@ def test_correlation_is_over_what_both_show():
     a, b = naive.sample(rgb, pixels) - 127.5, levels.T - 127.5
     expected = (w @ (a * b)).sum() / np.sqrt((w @ a**2).sum() * (w @ b**2).sum())
     texels = pack_texels(rgb, is_valid)
-    arguments = (
-        points,
-        levels,
-        weights,
-        texels.rgbx,
-        texels.width,
-        TILTED.R_cam_from_world,
-        TILTED.center_world,
-    )
+    R, center = TILTED.R_cam_from_world, TILTED.center_world
+    arguments = points, levels, weights, texels.rgbx, texels.width, R, center
     correlation, shared = correlate(*arguments)
     assert 0.5 < shared / weights.sum() < 0.9
     assert correlation == pytest.approx(expected, abs=1e-4)

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 from e57_files import ScanToWrite, write
-from test_cloud_morton import seeded_cloud
+from refusals import assert_refused
+from test_cloud_morton import read, seeded_cloud
 
 from piccolo.cloud import open_source, read_cloud
 from piccolo.cloud.readers import e57
@@ -18,9 +19,7 @@ BYTES = dict.fromkeys(RGB, (0, 255))
 
 
 def cartesian(raw=RAW, dtype=np.float64):
-    return dict(
-        zip(("cartesianX", "cartesianY", "cartesianZ"), raw.points_world.T.astype(dtype), strict=True)
-    )
+    return dict(zip(XYZ, raw.points_world.T.astype(dtype), strict=True))
 
 
 def colored(colors=RAW.colors):
@@ -39,12 +38,7 @@ def placed(**options):
     return scan(rotation_wxyz=QUATERNION, center_world=tuple(CENTER), **options)
 
 
-def read(path):
-    chunks = list(open_source(path).read_chunks())
-    return np.concatenate([c.points_world for c in chunks]), np.concatenate([c.colors for c in chunks])
-
-
-def test_scans_stand_at_their_poses(tmp_path):
+def test_scans_stand_at_their_poses_by_quaternions_of_any_length(tmp_path):
     path = write(tmp_path / "a.e57", [placed(), scan(center_world=(1.0, 2.0, 3.0)), scan()])
     source = open_source(path)
     points, colors = read(path)
@@ -54,28 +48,19 @@ def test_scans_stand_at_their_poses(tmp_path):
     np.testing.assert_array_equal(points[2400:], RAW.points_world)
     np.testing.assert_array_equal(colors, np.tile(RAW.colors, (3, 1)))
     assert len(read_cloud(path).points) == 3600
-
-
-def test_a_quaternion_of_any_length_is_a_rotation(tmp_path):
     longer = scan(rotation_wxyz=tuple(-3.0 * quaternion_wxyz(R_WORLD)))
     points, _ = read(write(tmp_path / "a.e57", [longer]))
     np.testing.assert_allclose(points, RAW.points_world @ R_WORLD.T, atol=1e-12)
 
 
-def test_spherical_coordinates(tmp_path):
+def test_spherical_coordinates_single_precision_and_scaled_integers(tmp_path):
     distance = np.linalg.norm(RAW.points_world, axis=1)
     x, y, z = RAW.points_world.T
-    spherical = {
-        "sphericalRange": distance,
-        "sphericalAzimuth": np.arctan2(y, x),
-        "sphericalElevation": np.arcsin(z / distance),
-    }
+    azimuth, elevation = np.arctan2(y, x), np.arcsin(z / distance)
+    spherical = {"sphericalRange": distance, "sphericalAzimuth": azimuth, "sphericalElevation": elevation}
     written = ScanToWrite(spherical | colored(), BYTES, None, QUATERNION)
     points, _ = read(write(tmp_path / "a.e57", [written]))
     np.testing.assert_allclose(points, RAW.points_world @ R_WORLD.T, atol=1e-12)
-
-
-def test_single_precision_and_scaled_integers(tmp_path):
     single = ScanToWrite(cartesian(dtype=np.float32) | colored(), BYTES)
     millimetres = np.rint(RAW.points_world * 1000).astype(np.int64)
     columns = dict(zip(XYZ, millimetres.T, strict=True))
@@ -99,19 +84,15 @@ def test_chunks_hold_no_more_points_than_asked(tmp_path, monkeypatch, chunk):
         np.testing.assert_array_equal(points, np.tile(raw.points_world, (2, 1)))
 
 
-def test_invalid_points_and_colors_are_left_out(tmp_path):
+def test_invalid_points_of_any_color_and_invalid_colors_are_left_out(tmp_path):
     state = np.arange(1200) % 3  # 0 whole, 1 direction only, 2 nothing
     is_gray = np.arange(1200) % 5 == 0
     extra = {"cartesianInvalidState": state, "isColorInvalid": is_gray.astype(np.int64)}
-    points, colors = read(
-        write(tmp_path / "a.e57", [scan(extra, {"cartesianInvalidState": (0, 2), "isColorInvalid": (0, 1)})])
-    )
+    declared = {"cartesianInvalidState": (0, 2), "isColorInvalid": (0, 1)}
+    points, colors = read(write(tmp_path / "a.e57", [scan(extra, declared)]))
     is_whole = (state == 0) & ~is_gray
     np.testing.assert_array_equal(points, RAW.points_world[is_whole])
     np.testing.assert_array_equal(colors, RAW.colors[is_whole])
-
-
-def test_an_invalid_point_may_have_any_color(tmp_path):
     red = np.where(np.arange(1200) < 5, 999, RAW.colors[:, 0])
     extra = {"colorRed": red, "cartesianInvalidState": (np.arange(1200) < 5).astype(np.int64)}
     declared = {"colorRed": (0, 999), "cartesianInvalidState": (0, 1)}
@@ -137,28 +118,24 @@ def test_color_ranges_are_those_that_the_file_declares(tmp_path, dtype, low, hig
     values = (RAW.colors * ((last - first) / 255) + first).astype(np.float64)
     values = values.astype(dtype) if np.issubdtype(dtype, np.floating) else np.rint(values).astype(dtype)
     declared = dict.fromkeys(RGB, () if low is None else (low, high))
-    named = limits and {
-        f"{n}{end}": v for n in RGB for end, v in zip(("Minimum", "Maximum"), limits, strict=True)
-    }
+    named = limits and color_limits(*limits)
     written = ScanToWrite(cartesian() | colored(values), declared, named)
     _, colors = read(write(tmp_path / "a.e57", [written]))
     expected = np.rint((values - first) / (last - first) * 255)
     assert abs(colors - expected).max() <= (1 if dtype == np.float32 else 0)
-    assert abs(colors - RAW.colors.astype(np.float64)).max() <= (
-        0 if last - first >= 255 or dtype != np.int64 else 1
-    )
+    tolerance = 0 if last - first >= 255 or dtype != np.int64 else 1
+    assert abs(colors - RAW.colors.astype(float)).max() <= tolerance
 
 
-def test_colors_outside_of_their_range_are_refused(tmp_path):
+def test_colors_without_or_outside_of_their_range_and_files_without_points_are_refused(tmp_path):
     path = write(tmp_path / "a.e57", [scan(limits=color_limits(0, 100))])
-    with pytest.raises(InputError, match=r"scan 1 of 1 \('a scan'\) has a colour of \d+, wanted 0 to 100"):
-        read(path)
-
-
-def test_colors_without_a_range_are_refused(tmp_path):
+    assert_refused(r"scan 1 of 1 \('a scan'\) has a colour of \d+, wanted 0 to 100", read, path)
     written = ScanToWrite(cartesian() | colored(RAW.colors / 255.0))
     with pytest.raises(InputError, match="colours without a range: neither colorLimits nor a declared"):
         open_source(write(tmp_path / "a.e57", [written]))
+    empty = ScanToWrite({name: column[:0] for name, column in (cartesian() | colored()).items()}, BYTES)
+    assert_refused(r"scan 1 of 1 \('a scan'\) has 0 points", open_source, write(tmp_path / "a.e57", [empty]))
+    assert_refused("no scans, wanted scans with", open_source, write(tmp_path / "b.e57"))
 
 
 def test_scans_without_colors_are_left_out_beside_others(tmp_path):
@@ -175,30 +152,16 @@ def test_scans_without_colors_are_left_out_beside_others(tmp_path):
         open_source(write(tmp_path / "b.e57", [plain]))
 
 
-def test_files_without_points_are_refused(tmp_path):
-    empty = ScanToWrite({name: column[:0] for name, column in (cartesian() | colored()).items()}, BYTES)
-    with pytest.raises(InputError, match=r"scan 1 of 1 \('a scan'\) has 0 points"):
-        open_source(write(tmp_path / "a.e57", [empty]))
-    with pytest.raises(InputError, match="no scans, wanted scans with"):
-        open_source(write(tmp_path / "b.e57"))
-
-
-def test_points_that_are_not_finite_are_handed_on(tmp_path):
+def test_points_that_are_not_finite_are_handed_on_and_foreign_fields_change_nothing(tmp_path, monkeypatch):
     raw = type(RAW)(RAW.points_world.copy(), RAW.colors)
     raw.points_world[:3] = [[np.inf, 0.0, 0.0], [np.nan, 1.0, 1.0], [1.7e308, 1.7e308, 1.7e308]]
     written = ScanToWrite(cartesian(raw) | colored(), BYTES, rotation_wxyz=QUATERNION)
     path = write(tmp_path / "a.e57", [written])
     assert (read_cloud(path).num_dropped, len(read_cloud(path).points)) == (3, 1197)
-
-
-def test_a_reader_may_stop_early(tmp_path, monkeypatch):
     monkeypatch.setattr(e57, "CHUNK", 100)
     chunks = open_source(write(tmp_path / "a.e57", [scan(), scan()])).read_chunks()
     np.testing.assert_array_equal(next(chunks).points_world, RAW.points_world[:100])
     chunks.close()
-
-
-def test_foreign_fields_change_nothing(tmp_path):
     normals = dict.fromkeys(("nor:normalX", "nor:normalY", "nor:normalZ"), np.full(1200, 0.5, np.float32))
     extra = normals | {"intensity": np.linspace(0.0, 1.0, 1200), "rowIndex": np.arange(1200)}
     points, colors = read(write(tmp_path / "a.e57", [scan(extra, {"rowIndex": (0, 1199)})]))

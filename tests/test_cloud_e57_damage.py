@@ -5,7 +5,7 @@ import pytest
 from e57_files import ImageToWrite, ScanToWrite, sealed, with_xml, write
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from refusals import mutated, read_or_refused
+from refusals import assert_refused, mutated, read_or_refused
 from test_cloud_e57 import BYTES, cartesian, colored, read, scan
 
 from piccolo.cloud import open_source
@@ -37,9 +37,7 @@ CUT, LONG = "the file is cut off or broken", 1 << 40
 def test_damaged_files_are_refused(tmp_path, change, message):
     path = write(tmp_path / "a.e57", [scan()])
     path.write_bytes(change(path.read_bytes()))
-    with pytest.raises(InputError, match=message) as error:
-        read(path)
-    assert str(path) in str(error.value)
+    assert_refused(message, read, path)
 
 
 BOMB = b'<?xml version="1.0"?><!DOCTYPE e [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;">]><e57Root'
@@ -49,11 +47,7 @@ BOMB = b'<?xml version="1.0"?><!DOCTYPE e [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&
     ("old", "new", "message"),
     [
         (b'recordCount="1200"', b'recordCount="1201"', "promises 1201 points, found 1200|broken E57 file"),
-        (
-            b'recordCount="1200"',
-            b'recordCount="99999999999999"',
-            "promises 99999999999999 points of 216 bits",
-        ),
+        (b'recordCount="1200"', b'recordCount="9999999999999"', "promises 9999999999999 points of 216 bits"),
         (b'recordCount="1200"', b'recordCount="' + b"9" * 5000 + b'"', "wanted an integer"),
         (b'recordCount="1200"', b'recordCount="many"', "found 'many' in the XML section, wanted an integer"),
         (b'recordCount="1200"', b'recordCount="+-5"', "wanted an integer"),
@@ -89,18 +83,15 @@ def test_damaged_xml_is_refused(tmp_path, old, new, message):
 def test_limits_of_the_xml_section(tmp_path, monkeypatch):
     path = write(tmp_path / "a.e57", [scan()])
     monkeypatch.setattr(e57_file, "MAX_ELEMENTS", 10)
-    with pytest.raises(InputError, match="more than 10 elements"):
-        read(path)
+    assert_refused("more than 10 elements", read, path)
     monkeypatch.setattr(e57_file, "MAX_XML_SIZE", 500)
-    with pytest.raises(InputError, match=r"promises \d+ bytes of XML from byte \d+ on, wanted 500 at most"):
-        read(path)
+    assert_refused(r"promises \d+ bytes of XML from byte \d+ on, wanted 500 at most", read, path)
 
 
 def test_a_missing_library_is_named(tmp_path, monkeypatch):
     path = write(tmp_path / "a.e57", [scan()])
     monkeypatch.setitem(sys.modules, "pye57.libe57", None)
-    with pytest.raises(InputError, match=r"needs pye57\.libe57, .*-r requirements-formats\.txt"):
-        open_source(path)
+    assert_refused(r"needs pye57\.libe57, .*-r requirements-formats\.txt", open_source, path)
 
 
 def read_all(path):

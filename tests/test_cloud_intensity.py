@@ -6,6 +6,7 @@ from e57_files import ScanToWrite
 from e57_files import write as write_e57
 from las_files import OFFSETS, las_bytes, laz_bytes
 from plyfile import PlyData, PlyElement
+from refusals import assert_refused
 from test_cloud_morton import seeded_cloud, whole
 
 from piccolo.cloud import open_cloud, read_cloud
@@ -58,9 +59,8 @@ def test_percentiles_become_black_and_white(kind):
 def test_order_and_chunks_change_no_bit():
     intensity = _measured(2, "decibels")
     shuffle = np.random.default_rng(3).permutation(3000)
-    np.testing.assert_array_equal(
-        _in_gray(intensity)[shuffle], _in_gray(intensity[shuffle], POINTS[shuffle], 47)
-    )
+    shuffled = _in_gray(intensity[shuffle], POINTS[shuffle], 47)
+    np.testing.assert_array_equal(_in_gray(intensity)[shuffle], shuffled)
 
 
 def test_what_has_no_position_or_no_intensity_does_not_count():
@@ -71,12 +71,9 @@ def test_what_has_no_position_or_no_intensity_does_not_count():
     np.testing.assert_array_equal(_in_gray(intensity, points)[:2000], expected)
 
 
-def test_gray_of_what_is_not_finite():
+def test_one_intensity_for_all_is_refused_and_what_is_not_finite_is_black():
     gray = as_gray(np.array([np.nan, -np.inf, np.inf, 0.5]), 0.0, 1.0)
     assert gray[:, 0].tolist() == [0, 0, 255, 128]
-
-
-def test_one_intensity_for_all_is_refused():
     with pytest.raises(InputError, match="a: the intensity is 7 nearly everywhere, wanted colours"):
         _in_gray(np.full(3000, 7.0))
 
@@ -95,17 +92,13 @@ def _ply(path, name, kind="f4", text=False, values=None):
 def test_ply(tmp_path, name, kind, text):
     path = _ply(tmp_path / "a.ply", name, kind, text)
     np.testing.assert_array_equal(whole(open_ply, path, GRAY).colors, _in_gray(_measured(5, "16 bits")))
-    with pytest.raises(InputError, match=r"has intensity and no colours.*--intensity-as-gray"):
-        read_cloud(path)
+    assert_refused(r"has intensity and no colours.*--intensity-as-gray", read_cloud, path)
 
 
 LAYOUTS = {
     "a.xyz": lambda rows: [f"{x} {y} {z} {i}" for x, y, z, i in rows],
     "a.pts": lambda rows: ["3000", *(f"{x} {y} {z} {i}" for x, y, z, i in rows)],
-    "a.csv": lambda rows: [
-        "id,Intensity,x,y,z,ring,a,b",
-        *(f"9,{i},{x},{y},{z},3,1,2" for x, y, z, i in rows),
-    ],
+    "a.csv": lambda rows: ["id,Intensity,x,y,z,ring,a", *(f"9,{i},{x},{y},{z},3,1" for x, y, z, i in rows)],
 }
 
 
@@ -117,8 +110,7 @@ def test_text(tmp_path, name):
     read = whole(open_text, path, GRAY)
     np.testing.assert_allclose(read.points_world, POINTS, rtol=1e-14)
     np.testing.assert_array_equal(read.colors, _in_gray(intensity))
-    with pytest.raises(InputError, match=r"has intensity and no colours.*--intensity-as-gray"):
-        read_cloud(path)
+    assert_refused(r"has intensity and no colours.*--intensity-as-gray", read_cloud, path)
 
 
 def test_colours_come_first_and_the_map_is_gray(tmp_path):
@@ -147,8 +139,7 @@ def test_las(tmp_path, point_format, is_compressed):
     read = whole(open_las, path, GRAY)
     np.testing.assert_array_equal(read.colors, _in_gray(intensity))
     np.testing.assert_allclose(read.points_world, raw.points_world, atol=0.002)
-    with pytest.raises(InputError, match=r"has intensity and no colours.*--intensity-as-gray"):
-        read_cloud(path)
+    assert_refused(r"has intensity and no colours.*--intensity-as-gray", read_cloud, path)
 
 
 def test_ptx_at_its_pose_without_beams_that_did_not_return(tmp_path):
@@ -163,8 +154,7 @@ def test_ptx_at_its_pose_without_beams_that_did_not_return(tmp_path):
     read = whole(open_ptx, path, GRAY)
     np.testing.assert_array_equal(read.colors, _in_gray(intensity))
     np.testing.assert_allclose(read.points_world, POINTS @ R.T + [5.0, 6.0, 7.0], atol=1e-9)
-    with pytest.raises(InputError, match=r"has intensity and no colours.*--intensity-as-gray"):
-        read_cloud(path)
+    assert_refused(r"has intensity and no colours.*--intensity-as-gray", read_cloud, path)
 
 
 def _e57_scan(points, **more):
@@ -179,19 +169,16 @@ def test_e57_scans_have_one_gray_for_all(tmp_path):
     read = whole(open_e57, path, GRAY)
     np.testing.assert_array_equal(read.colors, _in_gray(intensity))
     np.testing.assert_allclose(read.points_world, POINTS * [-1, -1, 1] + [1.0, 2.0, 3.0], atol=1e-9)
-    with pytest.raises(InputError, match=r"has intensity and no colours.*--intensity-as-gray"):
-        read_cloud(path)
+    assert_refused(r"has intensity and no colours.*--intensity-as-gray", read_cloud, path)
     bare = write_e57(tmp_path / "b.e57", [_e57_scan(POINTS)])
-    with pytest.raises(InputError, match="has no colours, wanted scans with"):
-        open_e57(bare, GRAY)
+    assert_refused("has no colours, wanted scans with", open_e57, bare, GRAY)
 
 
 def test_e57_scans_without_intensity_are_named(tmp_path):
     intensity = _measured(9, "decibels")
     scans = [_e57_scan(POINTS[:1000]), _e57_scan(POINTS[1000:], intensity=intensity[1000:])]
     path = write_e57(tmp_path / "a.e57", scans)
-    with pytest.raises(InputError, match=r"scan 2 of 2 .* has intensity and no colours"):
-        open_e57(path)
+    assert_refused(r"scan 2 of 2 .* has intensity and no colours", open_e57, path)
     source = open_e57(path, GRAY)
     assert len(source.warnings) == 1
     assert "scan 1 of 2 ('a scan') has no intensity; left out" in source.warnings[0]
@@ -218,5 +205,4 @@ def test_pcd(tmp_path, encoding):
     read = whole(open_pcd, path, GRAY)
     np.testing.assert_array_equal(read.colors, _in_gray(intensity.astype(float)))
     np.testing.assert_allclose(read.points_world, table[:, :3], rtol=1e-6)
-    with pytest.raises(InputError, match=r"has intensity and no colours.*--intensity-as-gray"):
-        open_pcd(path)
+    assert_refused(r"has intensity and no colours.*--intensity-as-gray", open_pcd, path)

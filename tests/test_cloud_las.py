@@ -1,3 +1,4 @@
+import re
 import struct
 import sys
 
@@ -6,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from las_files import OFFSETS, SCALES, las_bytes, laz_bytes
-from refusals import mutated, read_or_refused
-from test_cloud_morton import seeded_cloud
+from refusals import assert_refused, mutated, read_or_refused
+from test_cloud_morton import read, seeded_cloud
 
 from piccolo.cloud import open_source, read_cloud
 from piccolo.cloud.readers import las
@@ -27,11 +28,6 @@ def write(tmp_path, content, name="a.las"):
     path = tmp_path / name
     path.write_bytes(content)
     return path
-
-
-def read(path):
-    chunks = list(open_source(path).read_chunks())
-    return np.concatenate([c.points_world for c in chunks]), np.concatenate([c.colors for c in chunks])
 
 
 def assert_read_as_written(path, is_kept=slice(None)):
@@ -88,11 +84,14 @@ def test_withheld_points_are_left_out(tmp_path, point_format):
     assert_read_as_written(write(tmp_path, laz_bytes(content, 500)), ~is_withheld)
 
 
-def test_16_bit_colors_are_rounded_to_the_nearest(tmp_path):
+def test_16_bit_colors_are_rounded_and_coordinates_that_overflow_are_infinite(tmp_path):
     colors = np.random.default_rng(5).integers(0, 1 << 16, (1200, 3)).astype(np.uint16)
     colors[0] = (0, 1, 65535)
     _, found = read(write(tmp_path, las_bytes(RAW, colors=colors)))
     np.testing.assert_array_equal(found, np.floor(colors / 257.0 + 0.5))
+    points, _ = read(write(tmp_path, patched(las_bytes(RAW), SCALE_X, "<d", 1e308)))
+    assert np.isinf(points[:, 0]).any()
+    assert np.isfinite(points[:, 1:]).all()
 
 
 @pytest.mark.parametrize("is_compressed", [False, True])
@@ -123,11 +122,8 @@ def test_the_sample_is_spread_over_the_file(tmp_path, monkeypatch, is_compressed
     path = written(25 if is_compressed else 20, 255)
     assert "8-bit values in 16-bit fields" in open_source(path).warnings[0]
     path = written(100, 40_000)  # outside of the sample
-    assert (
-        "in 120 points" in open_source(path).warnings[0] or "in 128 points" in open_source(path).warnings[0]
-    )
-    with pytest.raises(InputError, match="a colour of 40000 in a file whose other colours are 8-bit"):
-        read(path)
+    assert re.search("in 12[08] points", open_source(path).warnings[0])
+    assert_refused("a colour of 40000 in a file whose other colours are 8-bit", read, path)
 
 
 def test_files_without_colors_are_refused(tmp_path, monkeypatch):
@@ -137,8 +133,7 @@ def test_files_without_colors_are_refused(tmp_path, monkeypatch):
             open_source(write(tmp_path, content))
     black = las_bytes(RAW, colors=np.zeros((1200, 3), np.uint16), intensity=INTENSITY + 1)
     monkeypatch.setattr(las, "MAX_SAMPLES", 64)  # a larger file is not read to its end
-    with pytest.raises(InputError, match="are 0 in all 64 points looked at"):
-        open_source(write(tmp_path, black))
+    assert_refused("are 0 in all 64 points looked at", open_source, write(tmp_path, black))
 
 
 @pytest.mark.parametrize("point_format", [0, 1, 4, 6, 9])
@@ -218,9 +213,7 @@ def test_counts_of_las_1_4_are_refused_before_memory_is_taken(tmp_path, count):
     content = las_bytes(RAW, 7)
     with pytest.raises(InputError, match=f"promises {count} points of 36 bytes, found room for 1200"):
         open_source(write(tmp_path, patched(content, COUNT_1_4, "<Q", count)))
-    message = (
-        f"promises {count} points, the chunk table has 1500" if count > 1500 else "a chunk of 200 points"
-    )
+    message = f"promises {count} points, the chunk table has 1500" if count > 1500 else "chunk of 200 points"
     with pytest.raises(InputError, match=message):
         open_source(write(tmp_path, patched(laz_bytes(content, 500), COUNT_1_4, "<Q", count)))
 
@@ -232,12 +225,6 @@ def test_a_wrong_number_of_vlrs_does_no_harm(tmp_path):
     assert_read_as_written(write(tmp_path, patched(compressed, NUM_VLRS, "<I", 0xFFFFFFFF)))
     with pytest.raises(InputError, match="compressed, but no record says how"):
         open_source(write(tmp_path, patched(compressed, NUM_VLRS, "<I", 0)))
-
-
-def test_coordinates_that_overflow_are_infinite(tmp_path):
-    points, _ = read(write(tmp_path, patched(las_bytes(RAW), SCALE_X, "<d", 1e308)))
-    assert np.isinf(points[:, 0]).any()
-    assert np.isfinite(points[:, 1:]).all()
 
 
 def test_a_missing_library_is_named(tmp_path, monkeypatch):

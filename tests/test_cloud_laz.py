@@ -3,7 +3,7 @@ import sys
 
 import pytest
 from las_files import las_bytes, laz_bytes
-from refusals import read_or_refused
+from refusals import assert_refused, read_or_refused
 from test_cloud_las import POINTS_OFFSET, RAW, RECORD_SIZE, assert_read_as_written, patched, read, write
 
 from piccolo.cloud import open_source
@@ -28,8 +28,7 @@ from piccolo.errors import InputError
 def test_damaged_laszip_records_are_refused(tmp_path, position, form, value, message):
     content = laz_bytes(las_bytes(RAW), 600)
     begin = content.index(b"laszip encoded") + 52
-    with pytest.raises(InputError, match=message):
-        open_source(write(tmp_path, patched(content, begin + position, form, value)))
+    assert_refused(message, open_source, write(tmp_path, patched(content, begin + position, form, value)))
 
 
 def test_damaged_chunk_tables_are_refused(tmp_path):
@@ -45,15 +44,17 @@ def test_damaged_chunk_tables_are_refused(tmp_path):
         (content[: table + 9], "the compressed points are broken"),
         (patched(content, table + 8, "4s", b"\xff" * 4), "the chunk table is broken"),
     ]:
-        with pytest.raises(InputError, match=message):
-            open_source(write(tmp_path, changed))
+        assert_refused(message, open_source, write(tmp_path, changed))
 
 
-def test_a_chunk_table_may_be_named_at_the_end(tmp_path):
+def test_a_chunk_table_may_be_named_at_the_end_and_fill_no_memory(tmp_path, monkeypatch):
     """As writers do that can't go back."""
     content = laz_bytes(las_bytes(RAW), 600)
     (begin,) = struct.unpack_from("<I", content, POINTS_OFFSET)
     assert_read_as_written(write(tmp_path, patched(content, begin, "<q", -1) + content[begin : begin + 8]))
+    path = write(tmp_path, laz_bytes(las_bytes(RAW), 600))
+    monkeypatch.setattr(las_file, "MAX_CHUNK_SIZE", 34 * 600 - 1)
+    assert_refused(r"chunk 1 of 600 points in \d+ bytes, wanted 1 to 599 points", open_source, path)
 
 
 @pytest.mark.parametrize("point_format", [7, 8, 10])
@@ -92,8 +93,7 @@ def test_panics_of_lazrs_are_refused(tmp_path, monkeypatch):
 
     path = write(tmp_path, laz_bytes(las_bytes(RAW), 600))
     monkeypatch.setattr("lazrs.decompress_points_with_chunk_table", panic)
-    with pytest.raises(InputError, match="the compressed points are broken"):
-        open_source(path)
+    assert_refused("the compressed points are broken", open_source, path)
     monkeypatch.setattr("lazrs.decompress_points_with_chunk_table", lambda *_: sys.exit(7))
     with pytest.raises(SystemExit):
         open_source(path)

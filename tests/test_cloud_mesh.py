@@ -1,21 +1,6 @@
+import meshes as made
 import numpy as np
 import pytest
-from meshes import (
-    CORNER_COLORS,
-    CORNERS,
-    QUADRANTS,
-    SQUARE,
-    TRIANGLES,
-    UV_FROM_ABOVE,
-    UV_FROM_BELOW,
-    Gltf,
-    assert_quadrants,
-    obj_text,
-    png,
-    textured_gltf,
-    write_obj,
-    write_ply,
-)
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from test_cloud_morton import whole
@@ -29,52 +14,49 @@ from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.settings import CloudSettings
 
 
-def test_an_obj_texture_stands_upright(tmp_path):
-    assert_quadrants(whole(open_mesh, write_obj(tmp_path)))
+def test_an_obj_texture_stands_upright_in_any_encoding(tmp_path):
+    made.assert_quadrants(whole(open_mesh, made.write_obj(tmp_path)))
+    path = made.write_obj(tmp_path, texture=made.png(format="JPEG", quality=100, subsampling=0))
+    made.assert_quadrants(whole(open_mesh, path), tolerance=12)
+    image = Image.open(tmp_path / "wall.png")
+    image.quantize(8).save(tmp_path / "wall.png", "PNG")
+    made.assert_quadrants(whole(open_mesh, path), tolerance=12)
 
 
 @pytest.mark.parametrize("kind", ["glb", "gltf", "buffer beside"])
 def test_a_gltf_texture_stands_upright(tmp_path, kind):
-    gltf = textured_gltf()
+    gltf = made.textured_gltf()
     if kind == "glb":
         path = gltf.glb(tmp_path / "a.glb")
     else:
         path = gltf.gltf(tmp_path / "a.gltf", "a b.bin" if kind == "buffer beside" else None)
-    assert_quadrants(whole(open_mesh, path))
+    made.assert_quadrants(whole(open_mesh, path))
 
 
 def test_a_glb_by_trimesh_stands_upright(tmp_path):
     trimesh = pytest.importorskip("trimesh")
-    image = Image.fromarray(QUADRANTS)
+    image = Image.fromarray(made.QUADRANTS)
     material = trimesh.visual.material.PBRMaterial(baseColorTexture=image)
-    visual = trimesh.visual.TextureVisuals(uv=UV_FROM_BELOW, material=material)
-    trimesh.Trimesh(SQUARE, TRIANGLES, visual=visual, process=False).export(tmp_path / "a.glb")
-    assert_quadrants(whole(open_mesh, tmp_path / "a.glb"))
+    visual = trimesh.visual.TextureVisuals(uv=made.UV_FROM_BELOW, material=material)
+    trimesh.Trimesh(made.SQUARE, made.TRIANGLES, visual=visual, process=False).export(tmp_path / "a.glb")
+    made.assert_quadrants(whole(open_mesh, tmp_path / "a.glb"))
 
 
 @pytest.mark.parametrize("text", [False, True])
 def test_a_ply_texture_stands_upright(tmp_path, text):
-    (tmp_path / "wall.png").write_bytes(png())
+    (tmp_path / "wall.png").write_bytes(made.png())
     options = {"text": text, "comments": ["TextureFile wall.png"]}
-    path = write_ply(tmp_path / "a.ply", uv=UV_FROM_BELOW, options=options)
-    assert_quadrants(whole(open_ply, path))
-
-
-def test_images_in_other_encodings(tmp_path):
-    path = write_obj(tmp_path, texture=png(format="JPEG", quality=100, subsampling=0))
-    assert_quadrants(whole(open_mesh, path), tolerance=12)
-    image = Image.open(tmp_path / "wall.png")
-    image.quantize(8).save(tmp_path / "wall.png", "PNG")
-    assert_quadrants(whole(open_mesh, path), tolerance=12)
+    path = made.write_ply(tmp_path / "a.ply", uv=made.UV_FROM_BELOW, options=options)
+    made.assert_quadrants(whole(open_ply, path))
 
 
 @pytest.mark.parametrize("shift", [(1, 0), (-3, 2), (0, -1)])
 def test_textures_repeat(tmp_path, shift):
-    uv = UV_FROM_BELOW + np.array(shift)
-    assert_quadrants(whole(open_mesh, write_obj(tmp_path, uv=uv)))
-    gltf = Gltf()
-    gltf.node(mesh=gltf.mesh(uv=UV_FROM_ABOVE + np.array(shift), material=gltf.material(png())))
-    assert_quadrants(whole(open_mesh, gltf.glb(tmp_path / "a.glb")))
+    uv = made.UV_FROM_BELOW + np.array(shift)
+    made.assert_quadrants(whole(open_mesh, made.write_obj(tmp_path, uv=uv)))
+    gltf = made.Gltf()
+    gltf.node(mesh=gltf.mesh(uv=made.UV_FROM_ABOVE + np.array(shift), material=gltf.material(made.png())))
+    made.assert_quadrants(whole(open_mesh, gltf.glb(tmp_path / "a.glb")))
 
 
 def test_look_up_against_texels_named_by_their_place():
@@ -88,14 +70,14 @@ def test_look_up_against_texels_named_by_their_place():
 
 def test_several_materials_and_quads(tmp_path):
     mtl = "newmtl wall\nmap_Kd wall.png\nnewmtl door\nKd 0.2 0.4 0.6\n"
-    path = write_obj(tmp_path, mtl=mtl, triangles=np.array([[0, 1, 2, 3]]))
-    text = path.read_text() + "".join(f"v {x} {y} 1\n" for x, y, _ in SQUARE.tolist())
+    path = made.write_obj(tmp_path, mtl=mtl, triangles=np.array([[0, 1, 2, 3]]))
+    text = path.read_text() + "".join(f"v {x} {y} 1\n" for x, y, _ in made.SQUARE.tolist())
     path.write_text(text + "usemtl door\nf 5 6 7 8\n")
     raw = whole(open_mesh, path)
     is_door = raw.points_world[:, 2] > 0.5
     assert np.unique(raw.colors[is_door], axis=0).tolist() == [[51, 102, 153]]
     assert np.count_nonzero(is_door) == 10_000
-    assert_quadrants(type(raw)(raw.points_world[~is_door], raw.colors[~is_door]))
+    made.assert_quadrants(type(raw)(raw.points_world[~is_door], raw.colors[~is_door]))
 
 
 def test_gltf_nodes_turn_shift_and_scale(tmp_path):
@@ -103,8 +85,8 @@ def test_gltf_nodes_turn_shift_and_scale(tmp_path):
     inner = np.eye(4)
     inner[:3, :3] = 0.5 * Rotation.from_rotvec([0.3, 0.9, -0.2]).as_matrix()
     inner[:3, 3] = [1, -2, 3]
-    gltf = Gltf()
-    mesh = gltf.mesh(material=gltf.material(png()))
+    gltf = made.Gltf()
+    mesh = gltf.mesh(material=gltf.material(made.png()))
     child = gltf.node(is_root=False, mesh=mesh, matrix=inner.T.reshape(-1).tolist())
     translation, scale = [4.0, 5.0, -6.0], [2.0, 3.0, 0.5]
     gltf.node(children=[child], translation=translation, scale=scale, rotation=rotation.as_quat().tolist())
@@ -113,28 +95,34 @@ def test_gltf_nodes_turn_shift_and_scale(tmp_path):
     in_square = (in_inner - inner[:3, 3]) @ np.linalg.inv(inner[:3, :3]).T
     is_clear = np.all(np.abs(in_square[:, :2] - 0.5) > 1e-6, axis=1)
     np.testing.assert_allclose(in_square[:, 2], 0, atol=1e-12)
-    edges = rotation.apply((SQUARE[[1, 3]] @ inner[:3, :3].T) * scale)
+    edges = rotation.apply((made.SQUARE[[1, 3]] @ inner[:3, :3].T) * scale)
     area = np.linalg.norm(np.cross(*edges))
     assert len(raw.colors) == pytest.approx(10_000 * area, rel=0.001)
-    for color, corner in CORNERS.items():
+    for color, corner in made.CORNERS.items():
         is_here = is_clear & np.all((in_square[:, :2] > 0.5) == corner, axis=1)
         assert np.unique(raw.colors[is_here], axis=0).tolist() == [list(color)]
 
 
-def test_a_mesh_placed_twice(tmp_path):
-    gltf = textured_gltf(translation=[0, 0, 5.0])
+def test_a_mesh_placed_twice_and_texels_of_alpha_0(tmp_path):
+    gltf = made.textured_gltf(translation=[0, 0, 5.0])
     gltf.node(mesh=0, scale=[1, 2, 1])
     raw = whole(open_mesh, gltf.glb(tmp_path / "a.glb"))
     near = raw.points_world[:, 2] < 1
     assert (np.count_nonzero(near), np.count_nonzero(~near)) == (20_000, 10_000)
+    alpha = np.full((8, 8, 1), 255, np.uint8)
+    alpha[:4, 4:] = 0  # the green ones
+    texture = made.png(np.concatenate([made.QUADRANTS, alpha], axis=2))
+    raw = whole(open_mesh, made.write_obj(tmp_path, texture=texture))
+    assert len(raw.colors) == pytest.approx(7500, rel=0.02)
+    assert not np.any(np.all(raw.points_world[:, :2] > 0.5, axis=1))
 
 
 def test_the_order_of_surfaces_is_no_chance(tmp_path):
     """trimesh gives the nodes of a mesh of several parts random names."""
-    gltf = textured_gltf()
+    gltf = made.textured_gltf()
     primitives = gltf.tree["meshes"][0]["primitives"]
     for i in range(1, 9):
-        part = gltf.mesh(SQUARE * i / 8, colors=CORNER_COLORS)
+        part = gltf.mesh(made.SQUARE * i / 8, colors=made.CORNER_COLORS)
         primitives += gltf.tree["meshes"][part]["primitives"]
     gltf.node(mesh=0, translation=[0, 0, 3])
     path = gltf.glb(tmp_path / "a.glb")
@@ -152,7 +140,7 @@ def test_density_is_the_same_on_large_and_small_triangles(tmp_path):
     vertices = np.concatenate([corners.reshape(-1, 3), rng.uniform(size=(12_000, 3))], axis=1)
     path = tmp_path / "a.obj"
     triangles = np.arange(12_000).reshape(-1, 3)
-    path.write_text(obj_text(vertices, None, triangles, library="", material=""))
+    path.write_text(made.obj_text(vertices, None, triangles, library="", material=""))
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = 0.5 * np.linalg.norm(normals, axis=1)
     source = open_mesh(path)
@@ -171,12 +159,9 @@ def test_density_is_the_same_on_large_and_small_triangles(tmp_path):
 
 
 def test_points_leave_no_gaps_and_no_clumps(tmp_path):
-    points = whole(open_mesh, write_obj(tmp_path)).points_world
+    points = whole(open_mesh, made.write_obj(tmp_path)).points_world
     counts = np.histogram2d(points[:, 0], points[:, 1], bins=20)[0]
     assert abs(counts - 25).max() <= 7  # chance would give +-18
-
-
-def test_weights_are_barycentric_and_uniform():
     weights = weights_of(np.arange(30_000_000 - 9000, 30_000_000))
     assert weights.min() >= 0
     np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-15)
@@ -184,7 +169,7 @@ def test_weights_are_barycentric_and_uniform():
 
 
 def test_chunks_and_readings_change_no_bit(tmp_path, monkeypatch):
-    path = write_obj(tmp_path)
+    path = made.write_obj(tmp_path)
     source = open_mesh(path)
     first = [raw.points_world for raw in source.read_chunks()]
     monkeypatch.setattr(mesh_sampling, "CHUNK", 777)
@@ -195,7 +180,7 @@ def test_chunks_and_readings_change_no_bit(tmp_path, monkeypatch):
 
 def test_too_many_points_lower_the_density(tmp_path, monkeypatch):
     monkeypatch.setattr(mesh_module, "MAX_POINTS", 2000)
-    source = open_mesh(write_obj(tmp_path))
+    source = open_mesh(made.write_obj(tmp_path))
     assert source.num_points == 2000
     assert "1 square metres of surface, sampled with 2e+03 points" in source.warnings[0]
     assert sum(len(raw.colors) for raw in source.read_chunks()) == 2000
@@ -204,8 +189,9 @@ def test_too_many_points_lower_the_density(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("unit", "scale"), [("mm", 0.001), ("km", 1000.0), ("ft", 0.3048)])
 def test_density_counts_by_square_metres(tmp_path, unit, scale):
     """A square metre in any unit, as OBJ and as PLY, gives the same 10,000 points."""
-    path = write_obj(tmp_path, vertices=SQUARE / scale)
-    ply = write_ply(tmp_path / "a.ply", SQUARE / scale, colors=np.array(CORNER_COLORS[:, :3] * 255, "u1"))
+    path = made.write_obj(tmp_path, vertices=made.SQUARE / scale)
+    colors = np.array(made.CORNER_COLORS[:, :3] * 255, "u1")
+    ply = made.write_ply(tmp_path / "a.ply", made.SQUARE / scale, colors=colors)
     for source in (path, ply):
         (opened,) = open_cloud([source], CloudSettings(scale=scale)).sources
         assert abs(opened.num_points - 10_000) <= 1
@@ -213,11 +199,3 @@ def test_density_counts_by_square_metres(tmp_path, unit, scale):
     cloud = read_cloud(path, CloudSettings(scale=scale))
     extent = np.ptp(cloud.points, axis=0)
     np.testing.assert_allclose(extent, [1, 1, 0], atol=0.01)
-
-
-def test_texels_of_alpha_0_leave_their_points_out(tmp_path):
-    alpha = np.full((8, 8, 1), 255, np.uint8)
-    alpha[:4, 4:] = 0  # the green ones
-    raw = whole(open_mesh, write_obj(tmp_path, texture=png(np.concatenate([QUADRANTS, alpha], axis=2))))
-    assert len(raw.colors) == pytest.approx(7500, rel=0.02)
-    assert not np.any(np.all(raw.points_world[:, :2] > 0.5, axis=1))

@@ -1,24 +1,9 @@
 """Meshes' colours: of vertices, faces, materials and factors; and what trimesh would pass over in silence."""
 
+import meshes as made
 import numpy as np
 import pytest
-from meshes import (
-    BLUE,
-    CORNER_COLORS,
-    QUADRANTS,
-    RED,
-    SQUARE,
-    TRIANGLES,
-    UV_FROM_BELOW,
-    Gltf,
-    assert_quadrants,
-    obj_text,
-    png,
-    textured_gltf,
-    write_obj,
-    write_ply,
-    write_wedges,
-)
+from refusals import assert_refused
 from test_cloud_morton import whole
 
 from piccolo.cloud import read_cloud
@@ -26,12 +11,11 @@ from piccolo.cloud.readers import mesh_files
 from piccolo.cloud.readers.mesh import open_mesh
 from piccolo.cloud.readers.mesh_sampling import linear_to_srgb, srgb_to_linear
 from piccolo.cloud.readers.ply import open_ply
-from piccolo.errors import InputError
 
 
 @pytest.mark.parametrize("text", [False, True])
 def test_ply_vertex_colors_are_interpolated(tmp_path, text):
-    path = write_ply(tmp_path / "a.ply", colors=CORNER_COLORS, options={"text": text})
+    path = made.write_ply(tmp_path / "a.ply", colors=made.CORNER_COLORS, options={"text": text})
     raw = whole(open_ply, path)
     np.testing.assert_allclose(raw.colors[:, :2], 255 * raw.points_world[:, :2], atol=0.51)
     assert np.unique(raw.colors[:, 2]).tolist() == [40]
@@ -39,26 +23,28 @@ def test_ply_vertex_colors_are_interpolated(tmp_path, text):
 
 
 def test_obj_vertex_colors_come_before_the_material(tmp_path):
-    vertices = np.concatenate([SQUARE, CORNER_COLORS / 255], axis=1)
+    vertices = np.concatenate([made.SQUARE, made.CORNER_COLORS / 255], axis=1)
     for options in ({"library": "", "material": ""}, {"mtl": "newmtl wall\nKd 1 1 1\n"}):
-        raw = whole(open_mesh, write_obj(tmp_path, vertices=vertices, uv=None, **options))
+        raw = whole(open_mesh, made.write_obj(tmp_path, vertices=vertices, uv=None, **options))
         np.testing.assert_allclose(raw.colors[:, :2], 255 * raw.points_world[:, :2], atol=1.01)
 
 
-def test_ply_face_colors(tmp_path):
-    path = write_ply(tmp_path / "a.ply", face_colors=np.array([RED, BLUE], np.uint8))
+def test_ply_face_colors_and_vertex_colors_where_no_texture_is_named(tmp_path):
+    path = made.write_ply(tmp_path / "a.ply", face_colors=np.array([made.RED, made.BLUE], np.uint8))
     raw = whole(open_ply, path)
     is_first = raw.points_world[:, 0] > raw.points_world[:, 1]
-    assert np.unique(raw.colors[is_first], axis=0).tolist() == [list(RED)]
-    assert np.unique(raw.colors[~is_first], axis=0).tolist() == [list(BLUE)]
+    assert np.unique(raw.colors[is_first], axis=0).tolist() == [list(made.RED)]
+    assert np.unique(raw.colors[~is_first], axis=0).tolist() == [list(made.BLUE)]
+    raw = whole(open_ply, made.write_wedges(tmp_path / "a.ply", colors=made.CORNER_COLORS))
+    np.testing.assert_allclose(raw.colors[:, 1], 255 * raw.points_world[:, 1], atol=0.51)
 
 
 @pytest.mark.parametrize("type_", [np.float32, np.uint8, np.uint16])
 @pytest.mark.parametrize("has_material", [False, True])
 def test_gltf_vertex_colors_are_linear_light(tmp_path, type_, has_material):
     brightest = 1 if type_ == np.float32 else np.iinfo(type_).max
-    gltf = Gltf()
-    colors = np.round(CORNER_COLORS / 255.0, 2) * brightest
+    gltf = made.Gltf()
+    colors = np.round(made.CORNER_COLORS / 255.0, 2) * brightest
     material = gltf.material() if has_material else None
     gltf.node(mesh=gltf.mesh(uv=None, colors=colors.astype(type_), material=material))
     raw = whole(open_mesh, gltf.glb(tmp_path / "a.glb"))
@@ -68,75 +54,61 @@ def test_gltf_vertex_colors_are_linear_light(tmp_path, type_, has_material):
 
 
 def test_gltf_factors_multiply_in_linear_light(tmp_path):
-    gltf = Gltf()
-    gltf.node(mesh=gltf.mesh(material=gltf.material(png(), (0.5, 1.0, 0.25))))
+    gltf = made.Gltf()
+    gltf.node(mesh=gltf.mesh(material=gltf.material(made.png(), (0.5, 1.0, 0.25))))
     raw = whole(open_mesh, gltf.glb(tmp_path / "a.glb"))
     red = raw.colors[np.all((raw.points_world[:, :2] > 0.5) == (0, 1), axis=1)]
     linear = ((250 / 255 + 0.055) / 1.055) ** 2.4 / 2
     expected = round(255 * (1.055 * linear ** (1 / 2.4) - 0.055))
     assert np.unique(red[:, 0]).tolist() == [expected]
     assert np.unique(red[:, 1]).tolist() == [10]
-
-
-def test_srgb_there_and_back():
     levels = np.arange(256, dtype=np.uint8)
     np.testing.assert_array_equal(np.rint(255 * linear_to_srgb(srgb_to_linear(levels))), levels)
 
 
-def test_surfaces_without_colors_are_left_out_with_a_warning(tmp_path):
-    gltf = textured_gltf()
+def test_surfaces_without_colors_or_area_are_left_out_with_a_warning(tmp_path):
+    gltf = made.textured_gltf()
     gltf.node(mesh=gltf.mesh(uv=None), translation=[0, 0, 2.0])
     source = open_mesh(gltf.glb(tmp_path / "a.glb"))
     assert "1 surfaces without colours left out" in source.warnings[0]
     assert source.num_points == 10_000
-
-
-def test_flat_triangles_and_nan_vertices_are_left_out_with_a_warning(tmp_path):
-    vertices = np.concatenate([SQUARE, [[np.nan, 0, 0], [0.5, 0, 0]]])
-    triangles = np.concatenate([[[0, 1, 4], [0, 1, 5]], TRIANGLES])
-    uv = np.concatenate([UV_FROM_BELOW, [[0, 0], [0, 0]]])
-    path = write_obj(tmp_path, vertices=vertices, uv=uv, triangles=triangles)
+    vertices = np.concatenate([made.SQUARE, [[np.nan, 0, 0], [0.5, 0, 0]]])
+    triangles = np.concatenate([[[0, 1, 4], [0, 1, 5]], made.TRIANGLES])
+    uv = np.concatenate([made.UV_FROM_BELOW, [[0, 0], [0, 0]]])
+    path = made.write_obj(tmp_path, vertices=vertices, uv=uv, triangles=triangles)
     assert "2 triangles without an area or with NaN" in open_mesh(path).warnings[0]
-    assert_quadrants(whole(open_mesh, path))
+    made.assert_quadrants(whole(open_mesh, path))
 
 
 @pytest.mark.parametrize(
     "options",
-    [
-        {"library": "", "material": "", "mtl": ""},
-        {"mtl": "newmtl wall\nKd 0.2 0.3 0.4\n"},
-        {"material": "unknown"},
-    ],
+    [{"library": "", "material": "", "mtl": ""}, {"mtl": "newmtl wall\nKd 1 1 1\n"}, {"material": "other"}],
 )
 def test_meshes_without_colors_are_refused(tmp_path, options):
-    with pytest.raises(InputError, match=r"room\.obj: no colours"):
-        open_mesh(write_obj(tmp_path, **options))
+    assert_refused(r"room\.obj: no colours", open_mesh, made.write_obj(tmp_path, **options))
 
 
-def test_gltf_images_that_give_no_color_are_passed_over(tmp_path):
-    gltf = textured_gltf()
+def test_gltf_images_that_give_no_color_cameras_and_the_name_world_change_nothing(tmp_path):
+    gltf = made.textured_gltf()
     gltf.tree["images"] += [{"uri": "gone.png"}, {"mimeType": "image/ktx2", "uri": "normals.ktx2"}]
     gltf.tree["textures"] += [{"source": 1}, {"extensions": {"KHR_texture_basisu": {"source": 2}}}]
     gltf.tree["materials"][0]["normalTexture"] = {"index": 1}
     gltf.tree["materials"][0]["emissiveTexture"] = {"index": 2}
-    assert_quadrants(whole(open_mesh, gltf.glb(tmp_path / "a.glb")))
+    made.assert_quadrants(whole(open_mesh, gltf.glb(tmp_path / "a.glb")))
+    gltf = made.textured_gltf(camera=0, name="world", translation=[0, 0, 1])
+    gltf.tree["cameras"] = [{"perspective": {"znear": 0.1, "aspectRatio": 1.0, "yfov": 1.0}}]
+    raw = whole(open_mesh, gltf.glb(tmp_path / "a.glb"))
+    made.assert_quadrants(raw)
+    assert np.all(raw.points_world[:, 2] == 1)
 
 
 def test_a_second_set_of_texture_coordinates(tmp_path):
-    gltf = textured_gltf()
+    gltf = made.textured_gltf()
     attributes = gltf.tree["meshes"][0]["primitives"][0]["attributes"]
     attributes["TEXCOORD_1"] = attributes["TEXCOORD_0"]
     attributes["TEXCOORD_0"] = gltf.accessor(np.zeros((4, 2), np.float32))
     gltf.tree["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]["texCoord"] = 1
-    assert_quadrants(whole(open_mesh, gltf.glb(tmp_path / "a.glb")))
-
-
-def test_a_camera_and_the_name_world_change_nothing(tmp_path):
-    gltf = textured_gltf(camera=0, name="world", translation=[0, 0, 1])
-    gltf.tree["cameras"] = [{"perspective": {"znear": 0.1, "aspectRatio": 1.0, "yfov": 1.0}}]
-    raw = whole(open_mesh, gltf.glb(tmp_path / "a.glb"))
-    assert_quadrants(raw)
-    assert np.all(raw.points_world[:, 2] == 1)
+    made.assert_quadrants(whole(open_mesh, gltf.glb(tmp_path / "a.glb")))
 
 
 @pytest.mark.parametrize(
@@ -150,8 +122,9 @@ def test_a_camera_and_the_name_world_change_nothing(tmp_path):
     ],
 )
 def test_obj_lines_may_begin_in_other_ways(tmp_path, old, new):
-    path, colors = tmp_path / "a.obj", CORNER_COLORS / 255
-    path.write_text(obj_text(np.concatenate([SQUARE, colors], axis=1), None, library="", material=""))
+    path, colors = tmp_path / "a.obj", made.CORNER_COLORS / 255
+    vertices = np.concatenate([made.SQUARE, colors], axis=1)
+    path.write_text(made.obj_text(vertices, None, library="", material=""))
     expected = whole(open_mesh, path)
     assert old in path.read_text()
     path.write_text(path.read_text().replace(old, new))
@@ -160,40 +133,34 @@ def test_obj_lines_may_begin_in_other_ways(tmp_path, old, new):
     np.testing.assert_array_equal(read.colors, expected.colors)
 
 
-def test_materials_in_comments_are_not_used(tmp_path):
-    path = write_obj(tmp_path, mtl="newmtl wall\nmap_Kd wall.png\nnewmtl door\nKd 1 0 0\n")
+def test_materials_in_comments_are_not_used_and_textures_in_folders_below_are_found(tmp_path):
+    path = made.write_obj(tmp_path, mtl="newmtl wall\nmap_Kd wall.png\nnewmtl door\nKd 1 0 0\n")
     expected = whole(open_mesh, path)
     path.write_text(path.read_text().replace("f 1/1 3/3", "# usemtl door\nf 1/1 3/3"))
     np.testing.assert_array_equal(whole(open_mesh, path).colors, expected.colors)
-
-
-def test_ply_colors_stay_with_their_vertices_where_no_texture_is_named(tmp_path):
-    raw = whole(open_ply, write_wedges(tmp_path / "a.ply", colors=CORNER_COLORS))
-    np.testing.assert_allclose(raw.colors[:, 1], 255 * raw.points_world[:, 1], atol=0.51)
+    path = made.write_obj(tmp_path, mtl="newmtl wall\nmap_Kd maps\\wall 1.png\n")
+    (tmp_path / "maps").mkdir()
+    (tmp_path / "wall.png").rename(tmp_path / "maps" / "wall 1.png")
+    assert len(whole(open_mesh, path).colors) == 10_000
 
 
 def test_a_textured_material_without_uv_is_left_out_whatever_its_color(tmp_path):
     mtl = "newmtl wall\nmap_Kd wall.png\nnewmtl bare\nKd 0.2 0.4 0.6\nmap_Kd wall.png\n"
-    path = write_obj(tmp_path, mtl=mtl)
+    path = made.write_obj(tmp_path, mtl=mtl)
     path.write_text(path.read_text() + "usemtl bare\nf 1 2 3\n")
     source = open_mesh(path)
     assert source.num_points == 10_000
     assert "1 surfaces without colours left out" in source.warnings[0]
 
 
-def test_textures_in_folders_below_are_found(tmp_path):
-    path = write_obj(tmp_path, mtl="newmtl wall\nmap_Kd maps\\wall 1.png\n")
-    (tmp_path / "maps").mkdir()
-    (tmp_path / "wall.png").rename(tmp_path / "maps" / "wall 1.png")
-    assert len(whole(open_mesh, path).colors) == 10_000
-
-
 def test_a_texture_of_many_surfaces_is_decoded_once(tmp_path, monkeypatch):
     decode, calls = mesh_files.Texture.texels, []
     monkeypatch.setattr(mesh_files.Texture, "texels", lambda self: calls.append(self) or decode(self))
-    gltf = Gltf()
-    first, other = (gltf.material(png(pixels)) for pixels in (QUADRANTS, QUADRANTS[::-1].copy()))
-    rows = [gltf.mesh(SQUARE + np.float32(i), material=other if i == 2 else first) for i in range(5)]
+    gltf = made.Gltf()
+    first, other = (
+        gltf.material(made.png(pixels)) for pixels in (made.QUADRANTS, made.QUADRANTS[::-1].copy())
+    )
+    rows = [gltf.mesh(made.SQUARE + np.float32(i), material=other if i == 2 else first) for i in range(5)]
     gltf.tree["meshes"] = [{"primitives": [gltf.tree["meshes"][i]["primitives"][0] for i in rows]}]
     gltf.node(mesh=0)
     raw = whole(open_mesh, gltf.glb(tmp_path / "a.glb"))

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from piccolo.cloud import Cloud, stream_of
+from piccolo.cloud import Cloud, open_source, stream_of
 from piccolo.cloud.readers.reader import PLAIN, RawCloud
 from piccolo.cloud.voxels import morton_codes, morton_order
 from piccolo.errors import InputError
@@ -30,10 +30,16 @@ def clean(path, raw, scale):
     return replace(stream_of(path, raw), scale=scale).read()
 
 
-def whole(open_source, path, options=PLAIN):
+def whole(open_file, path, options=PLAIN):
     """All points that a reader finds in a file."""
-    chunks = list(open_source(path, options).read_chunks())
+    chunks = list(open_file(path, options).read_chunks())
     return RawCloud(*(np.concatenate(arrays) for arrays in zip(*chunks, strict=True)))
+
+
+def read(path):
+    """Points (N, 3) and colours (N, 3) of a file, by the reader that its content asks for."""
+    raw = whole(open_source, path)
+    return raw.points_world, raw.colors
 
 
 def same_bits(a: Cloud, b: Cloud):
@@ -72,22 +78,19 @@ def test_signed_zeros_do_not_tell_points_apart():
     assert same_bits(clean(A, raw, 1.0), clean(A, flipped, 1.0))
 
 
-def test_order_keeps_neighbours_together():
+def test_order_keeps_neighbours_together_and_sorts_colors_in_one_place():
     raw = seeded_cloud(5, num_points=20_000)
     points = raw.points_world.astype(np.float32)
     steps = np.linalg.norm(np.diff(points[morton_order(points, raw.colors)], axis=0), axis=1)
     spacing = (6.0 * 5.0 * 2.5 / 20_000) ** (1 / 3)
     assert np.median(steps) < 1.5 * spacing
-
-
-def test_order_of_points_in_one_place():
     points = np.ones((1200, 3), dtype=np.float32)
     colors = seeded_cloud(6, num_points=1200).colors
     ordered = colors[morton_order(points, colors)]
     assert ordered.tolist() == sorted(colors.tolist())
 
 
-def test_utm_coordinates_keep_their_millimetres():
+def test_utm_coordinates_keep_their_millimetres_around_the_middle_of_the_box():
     raw = seeded_cloud(7)
     origin = np.array([637_012.25, 5_849_028.75, 431.5])
     far = clean(A, RawCloud(raw.points_world + origin, raw.colors), 1.0)
@@ -97,15 +100,12 @@ def test_utm_coordinates_keep_their_millimetres():
     restored = far.points + far.origin_world
     gaps = np.linalg.norm(restored[:50, None] - (raw.points_world + origin)[None], axis=2).min(axis=1)
     assert gaps.max() < 1e-6
-
-
-def test_origin_is_the_middle_of_the_box_in_whole_metres():
     raw = seeded_cloud(8)
     raw.points_world[:2] = [[0, 0, 0], [20.9, 10, 3.2]]
     assert clean(A, RawCloud(np.abs(raw.points_world), raw.colors), 1.0).origin_world.tolist() == [10, 5, 2]
 
 
-def test_scale_turns_millimetres_to_metres():
+def test_millimetres_and_far_outliers_are_warned_of():
     raw = seeded_cloud(9)
     millimetres = RawCloud(raw.points_world * 1000, raw.colors)
     (warning,) = clean(Path("room.ply"), millimetres, 1.0).warnings
@@ -114,17 +114,11 @@ def test_scale_turns_millimetres_to_metres():
     metres = clean(Path("room.ply"), millimetres, 0.001)
     assert metres.warnings == ()
     np.testing.assert_allclose(np.ptp(metres.points, axis=0), np.ptp(raw.points_world, axis=0), rtol=1e-5)
-
-
-def test_one_long_axis_or_few_outliers_are_no_millimetres():
     raw = seeded_cloud(10, size=(5000.0, 30.0, 10.0))
     assert clean(A, raw, 1.0).warnings == ()
     raw = seeded_cloud(11)
     raw.points_world[:5] = 9000.0
     assert clean(A, raw, 1.0).warnings == ()
-
-
-def test_far_outliers_are_warned_of():
     raw = seeded_cloud(16)
     raw.points_world[0] = 5e6
     (warning,) = clean(A, raw, 1.0).warnings
@@ -140,9 +134,6 @@ def test_points_that_are_not_finite_are_dropped_and_counted():
     assert cloud.num_dropped == 3
     assert len(cloud.points) == len(cloud.colors) == 1497
     assert np.isfinite(cloud.points).all()
-
-
-def test_too_few_finite_points_are_refused():
     raw = seeded_cloud(13)
     raw.points_world[999:] = np.nan
     with pytest.raises(InputError, match=r"found 999 finite points \(501 with NaN.*wanted at least 1000"):

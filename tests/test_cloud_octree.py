@@ -17,12 +17,9 @@ def _octree(points, colors):
     return build_octree(Cloud(points, colors, np.zeros(3)).voxels(np.eye(3)))
 
 
-def test_leaves_are_the_voxels():
+def test_leaves_are_the_voxels_and_parents_the_means_of_their_children():
     voxels = Cloud(*_cloud(), np.zeros(3)).voxels(np.eye(3))
     np.testing.assert_array_equal(build_octree(voxels).level(LEAF_SIZE), voxels.nodes)
-
-
-def test_parents_are_the_means_of_their_children():
     octree = _octree(*_cloud())
     for level in range(NUM_LEVELS - 1):
         lo, hi = octree.level_start[level : level + 2]
@@ -30,9 +27,6 @@ def test_parents_are_the_means_of_their_children():
             children = octree.nodes[octree.first_child[node] : octree.first_child[node + 1]]
             assert 1 <= len(children) <= 8
             np.testing.assert_allclose(octree.nodes[node], children.mean(axis=0), rtol=1e-5, atol=1e-5)
-
-
-def test_every_node_but_a_root_has_one_parent():
     octree = _octree(*_cloud())
     last = octree.level_start[-2]
     assert octree.first_child[0] == octree.level_start[1]
@@ -53,6 +47,5 @@ def test_shuffling_points_changes_no_bit(seed):
 @pytest.mark.parametrize(("size", "level"), [(0.02, 7), (0.04, 6), (0.16, 4), (100.0, 0), (0.001, 7)])
 def test_level_is_the_nearest_in_size(size, level):
     octree = _octree(*_cloud())
-    np.testing.assert_array_equal(
-        octree.level(size), octree.nodes[octree.level_start[level] : octree.level_start[level + 1]]
-    )
+    begin, end = octree.level_start[level : level + 2]
+    np.testing.assert_array_equal(octree.level(size), octree.nodes[begin:end])

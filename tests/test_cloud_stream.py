@@ -40,10 +40,8 @@ def stream(*raws, chunk=10**9, scale=1.0):
     """A cloud of as many files, each handed on in chunks."""
 
     def source(k, raw):
-        begins = range(0, len(raw.colors), chunk)
-        return PointSource(
-            Path(f"{k}.ply"), lambda: (part(raw, slice(lo, lo + chunk)) for lo in begins), len(raw.colors)
-        )
+        chunks = [part(raw, slice(lo, lo + chunk)) for lo in range(0, len(raw.colors), chunk)]
+        return PointSource(Path(f"{k}.ply"), lambda: iter(chunks), len(raw.colors))
 
     return CloudStream([source(k, raw) for k, raw in enumerate(raws)], scale)
 
@@ -62,20 +60,20 @@ def test_same_bits_for_any_order_chunks_and_files(turn):
     whole = stream(raw).voxels(turn)
     shuffle = np.random.default_rng(3).permutation(60_000)
     first, second = part(raw, slice(0, 20_000)), part(raw, slice(20_000, None))
-    for other in (
-        stream(part(raw, shuffle)),
-        stream(raw, chunk=997),
-        stream(first, second),
-        stream(second, first, chunk=5000),
-    ):
+    again = stream(part(raw, shuffle)), stream(raw, chunk=997)
+    for other in (*again, stream(first, second), stream(second, first, chunk=5000)):
         assert same_voxels(other.voxels(turn), whole)
 
 
-def test_in_memory_and_in_a_file_are_one():
+def test_in_memory_and_in_a_file_are_one_in_any_unit():
     raw = seeded_cloud(5)
     cloud = stream(raw).read()
     same = RawCloud(cloud.points + cloud.origin_world, cloud.colors)
     assert same_voxels(cloud.voxels(TURN), stream(same).voxels(TURN))
+    assert METRES["ft"] == 0.3048
+    assert METRES["us-ft"] == pytest.approx(0.3048006096, abs=1e-10)
+    feet = stream(seeded_cloud(15), scale=METRES["ft"]).voxels(LEVEL)
+    assert np.ptp(feet.nodes[:, 0]) == pytest.approx(6.0 * 0.3048, abs=0.02)
 
 
 BROKEN = {
@@ -99,24 +97,18 @@ def test_both_ways_refuse_the_same(what, message):
 def test_both_ways_warn_of_the_same(scale):
     raw = seeded_cloud(11, size=(6000.0, 5000.0, 2500.0))
     raw.points_world[:4] = np.inf
-    cloud = dataclasses.replace(stream(raw, scale=scale), sources=_with_a_word(stream(raw)))
+    (source,) = stream(raw).sources
+    cloud = CloudStream([dataclasses.replace(source, warnings=("a word",))], scale)
     warnings = cloud.read().warnings
     assert cloud.voxels(LEVEL).warnings == warnings
     assert warnings[:2] == ("a word", "0.ply: 4 points with NaN or infinite coordinates left out")
     assert [("--units mm" in line) for line in warnings[2:]] == ([True] if scale == 1.0 else [])
 
 
-def _with_a_word(cloud):
-    return [dataclasses.replace(source, warnings=("a word",)) for source in cloud.sources]
-
-
-def test_several_files_are_named_together():
+def test_several_files_are_named_together_and_progress_knows_each():
     raw = seeded_cloud(12, size=(6000.0, 5000.0, 2500.0))
     (warning,) = stream(raw, raw, raw).voxels(LEVEL).warnings
     assert warning.startswith("0.ply and 2 more: the cloud spans")
-
-
-def test_progress_knows_how_many_chunks_come():
     seen = []
 
     def show(values, total, label):
@@ -143,9 +135,8 @@ def _lying(turn):
     cloud, taken = room(1)[1], query(1)
     points = (cloud.points @ turn.T).astype(np.float64) + cloud.origin_world
     center = turn @ (taken.pose.center_world - cloud.origin_world) + cloud.origin_world
-    return stream(RawCloud(points, cloud.colors), chunk=9999), Pose(
-        taken.pose.R_cam_from_world @ turn.T, center
-    )
+    pose = Pose(taken.pose.R_cam_from_world @ turn.T, center)
+    return stream(RawCloud(points, cloud.colors), chunk=9999), pose
 
 
 @pytest.mark.parametrize("up", ["y", "-x"])
@@ -207,13 +198,6 @@ def test_order_of_files_changes_no_bit_of_a_map(tmp_path):
     digests = sorted(hashlib.sha256(path.read_bytes()).hexdigest() for path in (a, b))
     of_both = hashlib.sha256("\n".join(digests).encode()).hexdigest()
     assert [m.scan_sha256 for m in maps] == [of_both, of_both]
-
-
-def test_units_are_what_surveyors_mean():
-    assert METRES["ft"] == 0.3048
-    assert METRES["us-ft"] == pytest.approx(0.3048006096, abs=1e-10)
-    feet = stream(seeded_cloud(15), scale=METRES["ft"]).voxels(LEVEL)
-    assert np.ptp(feet.nodes[:, 0]) == pytest.approx(6.0 * 0.3048, abs=0.02)
 
 
 MEASURE = """

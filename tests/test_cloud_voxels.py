@@ -63,7 +63,7 @@ def test_a_floor_at_a_round_height_is_one_layer_at_every_level(z):
         assert len(np.unique(columns, axis=0)) == end - begin
 
 
-def test_a_larger_table_holds_the_same_rows():
+def test_a_larger_table_holds_the_same_rows_and_may_be_fed_with_nothing():
     table, larger = np.zeros((64, NUM_COLUMNS), np.int32), np.zeros((256, NUM_COLUMNS), np.int32)
     raw = seeded_cloud(16, 40)
     assert add_points(raw.points_world, raw.colors, np.zeros(3, np.int64), table, 0, 40) == (40, 40)
@@ -72,9 +72,15 @@ def test_a_larger_table_holds_the_same_rows():
     assert kept[0] == kept[1]
     assert len(kept[0]) == 40
     assert add_points(raw.points_world, raw.colors, np.zeros(3, np.int64), larger, 40, 99) == (40, 40)
+    table = VoxelTable("a")
+    table.add(np.empty((0, 3)), np.empty((0, 3), np.uint8))
+    table.add(np.full((2, 3), 7.5), np.full((2, 3), 51, np.uint8))
+    found = table.finish()
+    np.testing.assert_allclose(found.nodes[0, 3:], 0.2)
+    np.testing.assert_allclose(found.nodes[0, :3] + found.origin, 7.5, atol=4e-5)
 
 
-def test_a_full_voxel_takes_no_more(monkeypatch):
+def test_a_full_voxel_takes_no_more_and_fits_its_sums(monkeypatch):
     monkeypatch.setattr(voxels, "MAX_COUNT", 3)
     table = np.zeros((8, NUM_COLUMNS), np.int32)
     points, colors = np.full((5, 3), 0.01), np.full((5, 3), 200, np.uint8)
@@ -83,9 +89,6 @@ def test_a_full_voxel_takes_no_more(monkeypatch):
     (row,) = table[table[:, COUNT] > 0]
     assert row[COUNT] == 3
     assert row[POSITION] == 3 * ((128 + voxels.PHASE) % 256)
-
-
-def test_the_most_points_of_a_voxel_fit_its_sums():
     assert voxels.MAX_COUNT * max(255, voxels.QUANTUM_MASK) <= np.iinfo(np.int32).max
 
 
@@ -96,7 +99,7 @@ def test_turning_gives_each_point_the_same_bits_alone_as_among_others():
     np.testing.assert_allclose(alone, points @ TURN.T, atol=1e-12)
 
 
-def test_points_too_far_away_are_left_out_and_counted():
+def test_points_too_far_away_are_left_out_and_two_scenes_are_no_map():
     raw = seeded_cloud(7)
     raw.points_world[5:8] += [0.0, 30_000.0, 0.0]
     found = stream(raw).voxels(LEVEL)
@@ -105,9 +108,6 @@ def test_points_too_far_away_are_left_out_and_counted():
     raw.points_world[5] = [0.0, 0.0, -9e7]
     with pytest.raises(InputError, match=r"0\.ply: points more than 42950 km apart, wanted one scene"):
         stream(raw).voxels(LEVEL)
-
-
-def test_two_scenes_far_from_each_other_are_no_map():
     raw = seeded_cloud(8, 2000)
     raw.points_world[:1000, 0] += 50_000.0
     assert len(stream(raw).voxels(LEVEL).nodes) >= 900  # one of them
@@ -120,12 +120,3 @@ def test_too_many_voxels_are_refused(monkeypatch):
     monkeypatch.setattr(voxels, "MAX_ROWS", voxels.FIRST_ROWS)
     with pytest.raises(InputError, match=r"more than 39321 voxels of 0\.02 m are filled.*--units"):
         stream(seeded_cloud(9, 50_000, size=(900.0, 900.0, 900.0))).voxels(LEVEL)
-
-
-def test_voxel_table_may_be_fed_with_nothing():
-    table = VoxelTable("a")
-    table.add(np.empty((0, 3)), np.empty((0, 3), np.uint8))
-    table.add(np.full((2, 3), 7.5), np.full((2, 3), 51, np.uint8))
-    found = table.finish()
-    np.testing.assert_allclose(found.nodes[0, 3:], 0.2)
-    np.testing.assert_allclose(found.nodes[0, :3] + found.origin, 7.5, atol=4e-5)

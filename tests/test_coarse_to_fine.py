@@ -57,14 +57,11 @@ def test_panorama_from_elsewhere_is_not_localized(name):
     assert _localize(2, rgb, CoarseToFineSettings()).status == "not_localized"
 
 
-def test_panorama_of_which_nothing_counts_has_no_pose():
+def test_nothing_that_counts_or_no_place_for_a_camera_is_no_error():
     panorama = dataclasses.replace(rooms.scene(1)[1], is_valid=np.zeros((256, 512), dtype=bool))
     found = localize(scan_map(1), panorama, KNOWN, Workers(1), Stopwatch())
     assert found.status == "not_localized"
     assert found.pose is None
-
-
-def test_cloud_without_a_place_for_a_camera_is_no_error():
     rng = np.random.default_rng(0)
     solid = rng.uniform(0.0, 1.0, (20_000, 3)).astype(np.float32)
     cloud = Cloud(solid, rng.integers(0, 256, (20_000, 3), dtype=np.uint8), np.zeros(3))

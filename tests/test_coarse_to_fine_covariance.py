@@ -9,17 +9,6 @@ from rooms import as_panorama, errors, query
 from piccolo.cloud import stream_of
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.coarse_to_fine import covariance
-from piccolo.coarse_to_fine.covariance import (
-    SHARP_STD,
-    STEPS,
-    block_gradients,
-    covariance_of,
-    estimate_covariance,
-    gradient_at,
-    hessian_at,
-    is_local_minimum,
-    points_at,
-)
 from piccolo.coarse_to_fine.localize import localize
 from piccolo.coarse_to_fine.query import prepare_query
 from piccolo.coarse_to_fine.scan_map import prepare_map
@@ -44,9 +33,9 @@ def found():
 
 def test_gradients_of_blocks_add_up(found):
     prepared, pose, _ = found
-    points = points_at(prepared, pose)
-    total = gradient_at(prepared.images.full, points, pose.R_cam_from_world, np.zeros(3))
-    parts = block_gradients(prepared.images.full, points, pose)
+    points = covariance.points_at(prepared, pose)
+    total = covariance.gradient_at(prepared.images.full, points, pose.R_cam_from_world, np.zeros(3))
+    parts = covariance.block_gradients(prepared.images.full, points, pose)
     assert len(parts) > 100
     tolerance = 1e-3 * np.abs(parts).sum(axis=0).max()
     np.testing.assert_allclose(parts.sum(axis=0), total, rtol=1e-3, atol=tolerance)
@@ -54,13 +43,13 @@ def test_gradients_of_blocks_add_up(found):
 
 def test_hessian_predicts_the_gradient_a_step_away(found):
     prepared, pose, _ = found
-    points = points_at(prepared, pose)
-    hessian = hessian_at(prepared.images.full, points, pose, STEPS[0])
+    points = covariance.points_at(prepared, pose)
+    hessian = covariance.hessian_at(prepared.images.full, points, pose, covariance.STEPS[0])
     for delta in ([0.001, 0, 0, 0, 0.003, 0], [0, -0.0015, 0.001, 0.003, 0, -0.004]):
         moved = step(pose, np.array(delta))
-        before = gradient_at(prepared.images.full, points, pose.R_cam_from_world, np.zeros(3))
+        before = covariance.gradient_at(prepared.images.full, points, pose.R_cam_from_world, np.zeros(3))
         shift = moved.center_world - pose.center_world
-        after = gradient_at(prepared.images.full, points, moved.R_cam_from_world, shift)
+        after = covariance.gradient_at(prepared.images.full, points, moved.R_cam_from_world, shift)
         expected = hessian @ delta
         assert np.linalg.norm(after - before - expected) < 0.5 * np.linalg.norm(expected)
 
@@ -69,13 +58,16 @@ def test_sandwich_of_independent_blocks_is_the_textbook_covariance():
     rng = np.random.default_rng(0)
     hessian = np.diag([4.0, 5.0, 6.0, 1.0, 2.0, 3.0])
     gradients = rng.normal(size=(5000, 6)) * np.sqrt(np.diag(hessian) / 5000)
-    np.testing.assert_allclose(covariance_of(hessian, gradients), np.linalg.inv(hessian), atol=0.05)
+    found = covariance.covariance_of(hessian, gradients)
+    np.testing.assert_allclose(found, np.linalg.inv(hessian), atol=0.05)
 
 
 def test_no_covariance_without_a_minimum_or_with_few_blocks():
     gradients = np.random.default_rng(0).normal(size=(100, 6))
-    assert covariance_of(np.diag([1.0, 1, 1, 1, 1, -0.1]), gradients) is None
-    assert covariance_of(np.eye(6), gradients[:10]) is None
+    assert covariance.covariance_of(np.diag([1.0, 1, 1, 1, 1, -0.1]), gradients) is None
+    for least, count, is_known in ((1, 12, False), (1, 13, True), (1e-10, 100, False), (1e-8, 100, True)):
+        found = covariance.covariance_of(np.diag([1.0, 1, 1, 1, 1, least]), gradients[:count])
+        assert (found is not None) == is_known
 
 
 def test_covariance_is_in_the_worlds_axes(found):
@@ -83,7 +75,7 @@ def test_covariance_is_in_the_worlds_axes(found):
     prepared, pose, result = found
     R = exp_so3(np.array([0.2, -0.5, 1.1]))
     turned = replace(prepared, scan_map=replace(prepared.scan_map, R_map_from_world=R))
-    own, other = result.covariance.matrix, estimate_covariance(turned, pose).matrix
+    own, other = result.covariance.matrix, covariance.estimate_covariance(turned, pose).matrix
     np.testing.assert_allclose(other[:3, :3], own[:3, :3], rtol=1e-6)
     np.testing.assert_allclose(R @ other[3:, 3:] @ R.T, own[3:, 3:], rtol=1e-6, atol=1e-12)
 
@@ -105,11 +97,11 @@ def test_deviations_are_of_the_size_of_the_errors():
 
 def test_the_right_pose_is_a_sharp_local_minimum_and_wrong_ones_are_not(found):
     prepared, pose, result = found
-    assert result.covariance.largest_std < SHARP_STD
-    assert is_local_minimum(prepared, pose, 0.8)
-    assert is_local_minimum(prepared, pose, 0.0)
+    assert result.covariance.largest_std < covariance.SHARP_STD
+    assert covariance.is_local_minimum(prepared, pose, 0.8)
+    assert covariance.is_local_minimum(prepared, pose, 0.0)
     wrong = Pose(exp_so3(np.array([0.0, 0.0, 2.0])) @ pose.R_cam_from_world, pose.center_world)
-    assert not is_local_minimum(prepared, wrong, 0.8)
+    assert not covariance.is_local_minimum(prepared, wrong, 0.8)
 
 
 @pytest.mark.parametrize(
@@ -120,9 +112,9 @@ def test_a_minimum_may_be_blunt_where_much_agrees(found, monkeypatch, std, agree
     """The least constrained direction counts; a flat alternative, which fixes no pose, is none."""
     matrix = np.diag([1e-4, 1e-4, 1e-4, 1e-8, std**2, 1e-8])
     monkeypatch.setattr(covariance, "covariance_at", lambda *_: matrix)
-    assert is_local_minimum(found[0], found[1], agreement) == expected
+    assert covariance.is_local_minimum(found[0], found[1], agreement) == expected
     monkeypatch.setattr(covariance, "covariance_at", lambda *_: None)
-    assert not is_local_minimum(found[0], found[1], agreement)
+    assert not covariance.is_local_minimum(found[0], found[1], agreement)
 
 
 def test_where_the_finest_image_has_no_minimum_the_next_one_tells(found, monkeypatch):
@@ -136,9 +128,9 @@ def test_where_the_finest_image_has_no_minimum_the_next_one_tells(found, monkeyp
     gradients = np.random.default_rng(0).normal(size=(100, 6))
     monkeypatch.setattr(covariance, "hessian_at", hessian)
     monkeypatch.setattr(covariance, "block_gradients", lambda *_: gradients)
-    matrix = covariance.covariance_at(prepared, points_at(prepared, pose), pose)
-    assert asked == [(prepared.images.full, STEPS[0]), (prepared.images.fine, STEPS[1])]
-    np.testing.assert_allclose(matrix, STEPS[1].inflation * gradients.T @ gradients * 100 / 94)
+    matrix = covariance.covariance_at(prepared, covariance.points_at(prepared, pose), pose)
+    assert asked == [(prepared.images.full, covariance.STEPS[0]), (prepared.images.fine, covariance.STEPS[1])]
+    np.testing.assert_allclose(matrix, covariance.STEPS[1].inflation * gradients.T @ gradients * 100 / 94)
 
 
 @pytest.mark.parametrize("kind", REPEATED_KINDS)
@@ -147,16 +139,10 @@ def test_truth_is_among_the_poses_of_a_place_that_repeats(kind):
     points, colors, _ = scan_world(world, 80_000 * len(world.rooms), Workers(2))
     cloud = stream_of(Path("repeated"), RawCloud(points.astype(float), colors))
     taken = make_query(world, 0, "clean", rooms.WIDTH, Workers(2))
-    result = localize(
-        prepare_map(cloud, Workers(2)),
-        as_panorama(taken.rgb),
-        CoarseToFineSettings(),
-        Workers(2),
-        Stopwatch(),
-    )
-    distances = [
-        errors(pose, taken.pose)[0] for pose in (result.pose, *(h.pose for h in result.alternatives))
-    ]
+    built, panorama = prepare_map(cloud, Workers(2)), as_panorama(taken.rgb)
+    result = localize(built, panorama, CoarseToFineSettings(), Workers(2), Stopwatch())
+    poses = [result.pose, *(h.pose for h in result.alternatives)]
+    distances = [errors(pose, taken.pose)[0] for pose in poses]
     assert min(distances) < 0.1
     assert result.status == "ambiguous" or distances[0] < 0.1
     assert 1 <= len(result.alternatives) <= 5

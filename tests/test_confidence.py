@@ -4,16 +4,7 @@ import numpy as np
 import pytest
 
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
-from piccolo.confidence.confidence import (
-    AMBIGUOUS,
-    LOCALIZED,
-    MODEL,
-    NOT_LOCALIZED,
-    PAPER_MODEL,
-    classify,
-    confidence_of,
-    features_of,
-)
+from piccolo.confidence import confidence as rule
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.confidence.score import Evidence
 from piccolo.errors import InputError
@@ -31,73 +22,72 @@ MIDDLING = dataclasses.replace(RIGHT, score=0.35, margin=0.15, agreement=0.4)
 
 
 def test_right_and_wrong_evidence():
-    assert classify(RIGHT, SURE, True, 0.9) == (LOCALIZED, confidence_of(RIGHT, SURE, MODEL))
-    assert classify(WRONG, None, True, 0.9)[0] == NOT_LOCALIZED
-    assert confidence_of(RIGHT, SURE, MODEL) > 0.99
-    assert confidence_of(WRONG, None, MODEL) < 0.2
-    assert classify(RIGHT, None, True, 0.9, PAPER_MODEL)[0] == LOCALIZED
+    assert rule.classify(RIGHT, SURE, True, 0.9) == ("localized", rule.confidence_of(RIGHT, SURE, rule.MODEL))
+    assert rule.classify(WRONG, None, True, 0.9)[0] == rule.NOT_LOCALIZED
+    assert rule.confidence_of(RIGHT, SURE, rule.MODEL) > 0.99
+    assert rule.confidence_of(WRONG, None, rule.MODEL) < 0.2
+    assert rule.classify(RIGHT, None, True, 0.9, rule.PAPER_MODEL)[0] == rule.LOCALIZED
 
 
 @pytest.mark.parametrize(
     ("changes", "std", "model", "expected"),
     [
-        ({}, 0.003, MODEL, 0.9707),
-        ({}, None, MODEL, 0.7858),
-        ({"margin": 0.45, "agreement": 0.8, "alternative_score_ratio": 0.5}, 0.003, MODEL, 0.7513),
-        ({}, None, PAPER_MODEL, 0.1759),
-        ({"margin": 0.35}, None, PAPER_MODEL, 0.4328),
+        ({}, 0.003, rule.MODEL, 0.9707),
+        ({}, None, rule.MODEL, 0.7858),
+        ({"margin": 0.45, "agreement": 0.8, "alternative_score_ratio": 0.5}, 0.003, rule.MODEL, 0.7513),
+        ({}, None, rule.PAPER_MODEL, 0.1759),
+        ({"margin": 0.35}, None, rule.PAPER_MODEL, 0.4328),
     ],
 )
 def test_confidence_is_what_was_learnt(changes, std, model, expected):
     """From the models as they were fitted, by a pocket calculator; a new fit changes these numbers."""
+    assert tuple(np.sign(model.weights)) == rule.DIRECTIONS[: len(model.weights)]
     evidence = dataclasses.replace(MIDDLING, **changes)
-    assert confidence_of(evidence, std and _covariance(std), model) == pytest.approx(expected, abs=0.001)
+    assert rule.confidence_of(evidence, std and _covariance(std), model) == pytest.approx(expected, abs=0.001)
 
 
 @pytest.mark.parametrize(("std", "most"), [(0.05, 0.683), (0.1, 0.383), (0.3, 0.132)])
 def test_a_pose_that_may_be_a_decimetre_off_is_doubtful_whatever_the_evidence(std, most):
     """The part of a normal distribution within 0.1 m, of twice the deviation."""
     sure = dataclasses.replace(RIGHT, margin=3.0)
-    assert confidence_of(sure, _covariance(std), MODEL) == pytest.approx(most, abs=0.002)
+    assert rule.confidence_of(sure, _covariance(std), rule.MODEL) == pytest.approx(most, abs=0.002)
 
 
-def test_an_alternative_as_good_makes_it_ambiguous():
+def test_an_alternative_as_good_makes_it_ambiguous_and_nothing_else_does():
     twin = dataclasses.replace(RIGHT, margin=0.01, alternative_score_ratio=0.98)
-    status, confidence = classify(twin, SURE, True, 0.9)
-    assert status == AMBIGUOUS
+    status, confidence = rule.classify(twin, SURE, True, 0.9)
+    assert status == rule.AMBIGUOUS
     assert confidence < 0.9
-    assert classify(twin, SURE, False, 0.9)[0] == NOT_LOCALIZED
-
-
-def test_without_an_alternative_nothing_is_ambiguous():
+    assert rule.classify(twin, SURE, False, 0.9)[0] == rule.NOT_LOCALIZED
     weak = dataclasses.replace(WRONG, margin=0.18)
-    assert classify(weak, None, False, 0.9)[0] == NOT_LOCALIZED
-    assert classify(WRONG, None, True, 0.9)[0] == NOT_LOCALIZED
+    assert rule.classify(weak, None, False, 0.9)[0] == rule.NOT_LOCALIZED
+    assert rule.classify(WRONG, None, True, 0.9)[0] == rule.NOT_LOCALIZED
 
 
 def test_the_line_moves():
-    confidence = confidence_of(RIGHT, SURE, MODEL)
-    assert classify(RIGHT, SURE, False, 0.5 * (1.0 + confidence))[0] != LOCALIZED
-    assert classify(RIGHT, SURE, False, confidence)[0] == LOCALIZED
-    assert classify(WRONG, None, False, 0.5 * confidence_of(WRONG, None, MODEL))[0] == LOCALIZED
+    confidence = rule.confidence_of(RIGHT, SURE, rule.MODEL)
+    assert rule.classify(RIGHT, SURE, False, 0.5 * (1.0 + confidence))[0] != rule.LOCALIZED
+    assert rule.classify(RIGHT, SURE, False, confidence)[0] == rule.LOCALIZED
+    half = 0.5 * rule.confidence_of(WRONG, None, rule.MODEL)
+    assert rule.classify(WRONG, None, False, half)[0] == rule.LOCALIZED
 
 
 @pytest.mark.parametrize("name", ["margin", "agreement", "score"])
 def test_more_evidence_is_more_confidence(name):
     stronger = dataclasses.replace(MIDDLING, **{name: getattr(MIDDLING, name) + 0.1})
-    assert confidence_of(MIDDLING, SURE, MODEL) < confidence_of(stronger, SURE, MODEL)
+    assert rule.confidence_of(MIDDLING, SURE, rule.MODEL) < rule.confidence_of(stronger, SURE, rule.MODEL)
 
 
 def test_a_pose_that_is_no_minimum_and_a_credible_alternative_are_held_against_it():
-    assert confidence_of(MIDDLING, None, MODEL) < confidence_of(MIDDLING, SURE, MODEL)
+    assert rule.confidence_of(MIDDLING, None, rule.MODEL) < rule.confidence_of(MIDDLING, SURE, rule.MODEL)
     challenged = dataclasses.replace(MIDDLING, alternative_score_ratio=0.9)
-    assert confidence_of(challenged, SURE, MODEL) < confidence_of(MIDDLING, SURE, MODEL)
+    assert rule.confidence_of(challenged, SURE, rule.MODEL) < rule.confidence_of(MIDDLING, SURE, rule.MODEL)
 
 
 @pytest.mark.parametrize(("a", "b"), [(1.0, 50.0), (0.003, 0.001)])
 def test_deviations_beyond_reason_change_nothing_more(a, b):
-    np.testing.assert_array_equal(*(features_of(RIGHT, _covariance(std)) for std in (a, b)))
-    assert (features_of(RIGHT, None) == features_of(RIGHT, _covariance(0.3))).all()
+    np.testing.assert_array_equal(*(rule.features_of(RIGHT, _covariance(std)) for std in (a, b)))
+    assert (rule.features_of(RIGHT, None) == rule.features_of(RIGHT, _covariance(0.3))).all()
 
 
 @pytest.mark.parametrize("settings", [CoarseToFineSettings, PaperSettings])
@@ -105,3 +95,4 @@ def test_deviations_beyond_reason_change_nothing_more(a, b):
 def test_lines_that_mean_nothing_are_refused(settings, value):
     with pytest.raises(InputError, match=f"--min-confidence: found {value}, wanted above 0 and below 1"):
         settings(min_confidence=value)
+    assert settings(min_confidence=0.01).min_confidence == 0.01

@@ -1,28 +1,43 @@
 import numpy as np
+import pytest
 
 from piccolo.confidence.covariance import PoseCovariance, least_constrained_direction
 from piccolo.geometry.pose import exp_so3
 
-RNG = np.random.default_rng(3)
-LONG = (RNG.uniform(-1, 1, (3, 4000)) * np.array([[12.0], [1.1], [1.3]])).astype(np.float32)  # along x
-WIDE = (RNG.uniform(-1, 1, (3, 4000)) * np.array([[5.0], [5.0], [1.3]])).astype(np.float32)
-ALONG_X, UP = np.diag([9e-6, 1e-6, 1e-6]), np.diag([1e-6, 1e-6, 9e-6])
+BOX = np.random.default_rng(3).uniform(-1, 1, (2, 4000))
 
 
-def test_direction_in_words():
-    assert least_constrained_direction(UP, UP, LONG) == "up and down"
-    assert least_constrained_direction(np.eye(3), np.eye(3), LONG) == "much the same in all directions"
-    assert least_constrained_direction(ALONG_X, ALONG_X, LONG) == "along the corridor, heading 90 or 270 deg"
-    assert least_constrained_direction(ALONG_X, ALONG_X, WIDE) == "heading 90 or 270 deg"
-    above = np.array([[0.1], [0.1], [3.0]], np.float32)  # no walls
-    assert least_constrained_direction(ALONG_X, ALONG_X, above) == "heading 90 or 270 deg"
+def _words(std_ratio=3.0, tilt_deg=0.0, reach=12.0, elevation_deg=0.0, turn=0.0):
+    """Words for a camera least sure along heading 50 deg, in a cloud `reach` times as long that way."""
+    R = exp_so3(np.array([0.0, 0.0, np.radians(40.0)]))
+    direction = R @ exp_so3(np.array([0.0, -np.radians(tilt_deg), 0.0]))[:, 0]
+    covariance = 1e-6 * (np.eye(3) + (std_ratio**2 - 1.0) * np.outer(direction, direction))
+    x, y = BOX * [[reach], [1.0]]
+    seen = R @ np.stack([x, y, np.tan(np.radians(elevation_deg)) * np.hypot(x, y)])
+    R_world_from_map = exp_so3(np.array([0.0, 0.0, turn]))
+    in_world = R_world_from_map @ covariance @ R_world_from_map.T
+    return least_constrained_direction(covariance, in_world, seen.astype(np.float32))
 
 
-def test_heading_is_the_worlds_not_the_maps():
-    R_world_from_map = exp_so3(np.array([0.0, 0.0, np.radians(90.0)]))  # the map's x is the world's y
-    in_world = R_world_from_map @ ALONG_X @ R_world_from_map.T
-    words = least_constrained_direction(ALONG_X, in_world, LONG)
-    assert words in ("along the corridor, heading 0 or 180 deg", "along the corridor, heading 180 or 360 deg")
+@pytest.mark.parametrize(
+    ("case", "expected"),
+    [
+        ({"std_ratio": 1.45}, "much the same in all directions"),
+        ({"std_ratio": 1.55}, "along the corridor, heading 50 or 230 deg"),
+        ({"tilt_deg": 61.0}, "up and down"),
+        ({"tilt_deg": 59.0}, "along the corridor, heading 50 or 230 deg"),
+        ({"reach": 2.4}, "heading 50 or 230 deg"),
+        ({"reach": 2.6}, "along the corridor, heading 50 or 230 deg"),
+        ({"elevation_deg": 31.0}, "heading 50 or 230 deg"),  # no walls
+        ({"elevation_deg": 29.0}, "along the corridor, heading 50 or 230 deg"),
+        (
+            {"turn": np.radians(-90.0)},
+            "along the corridor, heading 140 or 320 deg",
+        ),  # the world's, not the map's
+    ],
+)
+def test_direction_in_words(case, expected):
+    assert _words(**case) == expected
 
 
 def test_deviations():

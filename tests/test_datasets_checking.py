@@ -4,32 +4,24 @@ import numpy as np
 import pytest
 from poses import tilted_poses
 
-from piccolo.scenes.datasets.checking import (
-    AS_GIVEN,
-    Check,
-    ConventionCheck,
-    axis_rotations,
-    convention_variants,
-    describe_axes,
-    evenly_spaced,
-)
+from piccolo.scenes.datasets import checking
 from piccolo.scenes.datasets.files import AXES, DIRECTIONS, pose_of_transform
 
 ORIGIN = np.array([10.0, -4.0, 2.0])
 
 
-def fit(score, best=AS_GIVEN, best_score=None):
-    return ConventionCheck("images/a.jpg", score, score if best_score is None else best_score, best)
+def fit(score, best=checking.AS_GIVEN, best_score=None):
+    return checking.ConventionCheck("images/a.jpg", score, score if best_score is None else best_score, best)
 
 
 def test_turns_are_the_24_of_a_cube():
-    turns = axis_rotations()
-    assert len({describe_axes(turn) for turn in turns}) == 24
+    turns = checking.axis_rotations()
+    assert len({checking.describe_axes(turn) for turn in turns}) == 24
     for turn in turns:
         assert np.linalg.det(turn) == pytest.approx(1.0)
         np.testing.assert_array_equal(turn @ turn.T, np.eye(3))
     about_z = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    assert describe_axes(about_z) == "-y, x, z"
+    assert checking.describe_axes(about_z) == "-y, x, z"
 
 
 @pytest.mark.parametrize("axes", AXES)
@@ -42,7 +34,8 @@ def test_the_true_pose_is_among_the_readings_of_a_wrong_one(axes, direction, tak
     (other,) = set(DIRECTIONS) - {direction}
     for taken_direction in (direction, other):
         taken = pose_of_transform("T", T, taken_direction, taken_axes)
-        found = convention_variants(type(taken)(taken.R_cam_from_world, taken.center_world - ORIGIN), ORIGIN)
+        local = type(taken)(taken.R_cam_from_world, taken.center_world - ORIGIN)
+        found = checking.convention_variants(local, ORIGIN)
         assert any(
             np.allclose(p.R_cam_from_world, true.R_cam_from_world)
             and np.allclose(p.center_world + ORIGIN, true.center_world)
@@ -51,19 +44,20 @@ def test_the_true_pose_is_among_the_readings_of_a_wrong_one(axes, direction, tak
 
 
 def test_more_than_half_must_fit():
-    assert Check((fit(0.5), fit(0.4), fit(0.02))).is_passed
-    assert not Check((fit(0.5), fit(0.02))).is_passed
-    assert not Check((fit(0.3, "axes are x", 0.4),)).is_passed
+    assert checking.Check((fit(0.5), fit(0.4), fit(0.02))).is_passed
+    assert not checking.Check((fit(0.5), fit(0.02))).is_passed
+    assert not checking.Check((fit(0.3, "axes are x", 0.4),)).is_passed
 
 
 def test_advice_names_the_way_that_fits_most():
     wrong = fit(0.02, "the camera's x, y, z are z, x, y", 0.6)
-    advice = Check((wrong, wrong, fit(0.1))).advice
+    advice = checking.Check((wrong, wrong, fit(0.1))).advice
     assert "scores 0.02, 0.02, 0.10, wanted 0.1 and more; 0.60 if the camera's x, y, z are z, x, y" in advice
-    assert Check((wrong, fit(0.02), fit(0.05, "others", 0.06))).advice.endswith("no other axes fit better")
+    fits = wrong, fit(0.02), fit(0.05, "others", 0.06)
+    assert checking.Check(fits).advice.endswith("no other axes fit better")
 
 
 def test_spread_is_even():
-    assert evenly_spaced(list(range(10)), 3) == [0, 4, 9]
-    assert evenly_spaced(list(range(2)), 5) == [0, 1]
-    assert evenly_spaced(list(range(9)), 1) == [0]
+    assert checking.evenly_spaced(list(range(10)), 3) == [0, 4, 9]
+    assert checking.evenly_spaced(list(range(2)), 5) == [0, 1]
+    assert checking.evenly_spaced(list(range(9)), 1) == [0]

@@ -37,7 +37,7 @@ FILES = {
     "360loc": (
         "hall/query_360/s/camera_pose.json",
         json.dumps({"a.jpg": T.tolist()}),
-        ("hall/cloud.xyz",),
+        ["hall/cloud.xyz"],
     ),
     "matterport3d": (
         "house/matterport_camera_poses/ab_pose_1_5.txt",

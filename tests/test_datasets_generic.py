@@ -161,9 +161,8 @@ def test_a_table_of_exported_poses_comes_back(folder, tmp_path, capsys):
     capsys.readouterr()
     code, _, err = made.run(capsys, "generic", folder, tmp_path / "second", "--poses", table)
     assert (code, err) == (0, "")
-    pairs = zip(
-        read_scene(first).queries, made.assert_fits(tmp_path / "second" / "my photos").queries, strict=True
-    )
+    second = made.assert_fits(tmp_path / "second" / "my photos").queries
+    pairs = zip(read_scene(first).queries, second, strict=True)
     for one, other in pairs:
         np.testing.assert_allclose(other.pose.R_cam_from_world, one.pose.R_cam_from_world, atol=1e-14)
         assert np.array_equal(other.pose.center_world, one.pose.center_world)

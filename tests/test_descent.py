@@ -5,15 +5,8 @@ import functools
 import numpy as np
 import rooms
 
+from piccolo.coarse_to_fine import descent
 from piccolo.coarse_to_fine.config import METHOD
-from piccolo.coarse_to_fine.descent import (
-    as_levels,
-    descend,
-    descend_all,
-    descend_around,
-    perturbations,
-    score_on,
-)
 from piccolo.coarse_to_fine.query import QueryImages
 from piccolo.coarse_to_fine.starts import Starts
 from piccolo.coarse_to_fine.view import Cells, render_view
@@ -35,21 +28,9 @@ def _fine():
     return render_view(rooms.scan_map(1).octree, true_pose.center_world, METHOD.fine_view), true_pose
 
 
-def test_channels_in_levels():
-    np.testing.assert_allclose(as_levels(np.array([-2, 0, 2], np.float32)), [0, 127.5, 255])
-
-
-def test_descent_finds_the_true_pose_again():
-    (cells, true_pose), image = _fine(), _images().fine
-    center, off = true_pose.center_world, step(true_pose, np.array([0.03, -0.02, 0.04, 0.06, -0.05, 0.04]))
-    pose = descend(cells, center, image, off, (1.0, 30, 1e-5))
-    assert rooms.errors(pose, true_pose)[0] < 0.01
-    assert score_on(cells, center, image, pose) > max(0.6, score_on(cells, center, image, off))
-    assert rooms.errors(descend(cells, center, image, off, (1.0, 1, 1e-5)), true_pose)[0] > 0.01
-
-
-def test_perturbations_are_none_and_the_corners_of_a_cube():
-    steps = perturbations(0.5)
+def test_channels_in_levels_and_perturbations_to_the_corners_of_a_cube():
+    np.testing.assert_allclose(descent.as_levels(np.array([-2, 0, 2], np.float32)), [0, 127.5, 255])
+    steps = descent.perturbations(0.5)
     assert steps.shape == (9, 6)
     assert (steps[0] == 0).all()
     np.testing.assert_allclose(np.degrees(np.linalg.norm(steps[1:, :3], axis=1)), 4.0)
@@ -58,32 +39,41 @@ def test_perturbations_are_none_and_the_corners_of_a_cube():
     assert (np.sign(steps[1:, 3:]) == np.sign(steps[1:, 2::-1])).all()
 
 
+def test_descent_finds_the_true_pose_again():
+    (cells, true_pose), image = _fine(), _images().fine
+    center, off = true_pose.center_world, step(true_pose, np.array([0.03, -0.02, 0.04, 0.06, -0.05, 0.04]))
+    pose = descent.descend(cells, center, image, off, (1.0, 30, 1e-5))
+    assert rooms.errors(pose, true_pose)[0] < 0.01
+    before, after = (descent.score_on(cells, center, image, p) for p in (off, pose))
+    assert after > max(0.6, before)
+    assert rooms.errors(descent.descend(cells, center, image, off, (1.0, 1, 1e-5)), true_pose)[0] > 0.01
+
+
 def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off():
     (_, true_pose), images = _fine(), _images()
-    off = step(true_pose, perturbations(1.0)[1])
+    off = step(true_pose, descent.perturbations(1.0)[1])
     assert rooms.errors(off, true_pose)[0] > 0.2
     cells = render_view(rooms.scan_map(1).octree, off.center_world, METHOD.fine_view)
-    found = descend_around(cells, (images.search, images.middle), off, 1.0)
+    found = descent.descend_around(cells, (images.search, images.middle), off, 1.0)
     assert rooms.errors(found.pose, true_pose)[0] < 0.06
-    np.testing.assert_allclose(
-        found.score, score_on(cells, off.center_world, images.middle, found.pose), atol=1e-5
-    )
+    score = descent.score_on(cells, off.center_world, images.middle, found.pose)
+    np.testing.assert_allclose(found.score, score, atol=1e-5)
 
 
 def test_starts_descend_on_their_candidates_views_as_one_does_alone():
     scan_map, (_, true_pose), image = rooms.scan_map(1), _fine(), _images().search
     distance = np.linalg.norm(scan_map.centers - true_pose.center_world, axis=1)
     k, far = int(np.argmin(distance)), int(np.argmax(distance))
-    candidate, R = np.array([far, k]), true_pose.R_cam_from_world
-    starts = Starts(np.stack([R, R]), scan_map.centers[candidate], candidate, np.zeros(2))
-    ends = descend_all(scan_map, image, starts, 12, Workers(2))
-    assert ends.candidate[0] == k  # the best first
-    assert ends.score[0] > max(0.4, ends.score[1])
+    candidate, R = np.array([k, far, k]), true_pose.R_cam_from_world
+    starts = Starts(np.stack([R] * 3), scan_map.centers[candidate], candidate, np.zeros(3))
+    ends = descent.descend_all(scan_map, image, starts, 12, Workers(2))
+    assert ends.candidate.tolist() == [k, k, far]  # the best first
+    assert ends.score[0] == ends.score[1] > max(0.4, ends.score[2])
     offsets = (scan_map.offsets[k] * scan_map.offset_unit[k]).astype(np.float32)
     channels = scan_map.features[k].astype(np.float32) / np.float32(63.75)
     weights = (scan_map.is_seen[k] * make_grid(24).solid_angle).astype(np.float32)
     cells, center = Cells(offsets, channels, weights), scan_map.centers[k]
-    alone = descend(cells, center, image, Pose(R, center), (1.2, 12, 2e-3))
+    alone = descent.descend(cells, center, image, Pose(R, center), (1.2, 12, 2e-3))
     np.testing.assert_allclose(ends.center_map[0], alone.center_world, atol=1e-4)
     np.testing.assert_allclose(ends.R_cam_from_map[0], alone.R_cam_from_world, atol=1e-4)
     assert rooms.errors(alone, true_pose)[0] < 0.1

@@ -32,9 +32,8 @@ def scenes(tmp_path_factory):
     scene = read_scene(root / "hall 2")
     shutil.copy(root / "room" / "images" / "clean_0.jpg", root / "hall 2" / "images" / "far.jpg")
     pose = scene.queries[0].pose
-    far = Query(
-        scene.folder / "images" / "far.jpg", "far", type(pose)(pose.R_cam_from_world, np.full(3, 99.0))
-    )
+    far_pose = type(pose)(pose.R_cam_from_world, np.full(3, 99.0))
+    far = Query(scene.folder / "images" / "far.jpg", "far", far_pose)
     write_queries(scene.folder, [*scene.queries, far])
     return root
 
@@ -50,9 +49,8 @@ def test_a_run_its_tables_and_files(scenes, tmp_path, capsys):
     assert _run(scenes, out, *options) == 0
     text = capsys.readouterr().out
     rows = read_run(out)[0]
-    assert [(row.scene, row.is_in_box) for row in rows] == [
-        *[("hall 2", True), ("hall 2", True), ("hall 2", False), ("room", True), ("room", True)]
-    ]
+    hall, room = [("hall 2", True)] * 2 + [("hall 2", False)], [("room", True)] * 2
+    assert [(row.scene, row.is_in_box) for row in rows] == hall + room
     assert rows[2].position_error > 50.0
     assert "all 5 queries; correct" in text
     assert "without the 1 queries taken outside the cloud's bounding box; correct" in text
@@ -117,10 +115,14 @@ def test_no_output_replaces_an_input_or_another_output(scenes, tmp_path, capsys,
     assert not out.exists()
 
 
-def test_an_unknown_variant_is_refused(scenes, tmp_path, capsys):
+def test_an_unknown_variant_is_refused_and_runs_of_other_scenes_do_not_compare(scenes, tmp_path, capsys):
     assert _run(scenes, tmp_path / "run.jsonl", "--variants", "nope") == 3
     assert "--variants: found no nope, wanted some of clean, far" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+    (tmp_path / "a").write_text("")
+    (tmp_path / "b").write_text("")
+    assert evaluate.main(["--compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 3
+    assert "no query in common" in capsys.readouterr().err
 
 
 def test_a_closed_pipe_is_no_message(scenes, tmp_path):
@@ -206,10 +208,3 @@ def test_interrupt_ends_all_processes_without_a_traceback(scenes, tmp_path):
 def test_wrong_usage(words, message, capsys):
     assert evaluate.main(words.split()) == 2
     assert message in capsys.readouterr().err
-
-
-def test_runs_of_other_scenes_do_not_compare(scenes, tmp_path, capsys):
-    (tmp_path / "a").write_text("")
-    (tmp_path / "b").write_text("")
-    assert evaluate.main(["--compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 3
-    assert "no query in common" in capsys.readouterr().err

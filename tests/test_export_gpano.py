@@ -124,14 +124,11 @@ def test_fields_of_others_stay_and_the_old_pose_goes(tmp_path):
     assert with_pose(tmp_path / "a.jpg", copy, ANGLES) == copy  # once more changes nothing
 
 
-def test_only_the_pose_is_taken_out_of_a_packet():
+def test_only_the_pose_is_taken_out_of_a_packet_and_a_damaged_one_gives_way(tmp_path):
     assert without_pose(EMPTY_PACKET) == EMPTY_PACKET
     stranger = CAMERA_PACKET.replace(b"http://ns.google.com/photos/1.0/panorama/", b"http://other/")
     assert without_pose(stranger) == stranger
     assert len(without_pose(b" " * 65_000 + CAMERA_PACKET)) > 65_000  # in no time
-
-
-def test_damaged_packet_gives_way_to_a_new_one(tmp_path):
     data = _with_segments(jpeg(tmp_path / "a.jpg"), _segment(XMP_MARK + CAMERA_PACKET[:-30]))
     (packet,) = _packets(with_pose(tmp_path / "a.jpg", data, ANGLES))
     assert _fields(packet)["PosePitchDegrees"] == "-10.500000000"
@@ -169,16 +166,13 @@ def test_sizes_are_read_without_decoding(tmp_path, suffix):
         assert panorama_size(write(tmp_path / "a", picture)) == (128, 64)
 
 
-def test_the_size_of_cube_faces_is_the_spheres(tmp_path):
+def test_the_size_of_cube_faces_is_the_spheres_and_what_has_none_is_refused(tmp_path):
     for name in ("px", "nx", "py", "ny", "pz", "nz"):
         write(tmp_path / f"{name}.png", encoded(smooth_rgb(64, 64), ".png"))
     assert panorama_size(tmp_path) == (256, 128)
     pose = tilted_poses(1)[0]
     export([result(tmp_path, pose)], "opensfm", tmp_path / "r.json", Options())
     assert json_of(tmp_path / "r.json")[0]["cameras"].keys() == {"spherical 256 128"}
-
-
-def test_sizes_that_cannot_be_read_are_refused(tmp_path):
     results = [result(tmp_path / "b.jpg", tilted_poses(1)[0])]
     for content in (b"", b"\xff\xd8" + b"\xff" * 9999, b"II*\0" + bytes(99), b"\xff\xd8\xff\xe1\xff\xff" * 9):
         write(tmp_path / "b.jpg", content)

@@ -56,19 +56,12 @@ def test_every_plane_is_found_and_called_by_its_name(hut):
     assert planes[0].num_inliers == pytest.approx(24 * 400, rel=0.05)
 
 
-def test_the_names_turn_over_with_up(hut):
+def test_names_turn_over_with_up_and_noise_has_no_planes(hut):
     kinds = [plane.kind for plane in classify_planes(ransac_planes(hut), hut, -UP)]
     assert kinds[0] == "ceiling"
-
-
-def test_same_points_same_bits(hut):
     a, b = ransac_planes(hut), ransac_planes(hut)
-    assert [(p.normal_world.tobytes(), p.offset, p.rms) for p in a] == [
-        (p.normal_world.tobytes(), p.offset, p.rms) for p in b
-    ]
-
-
-def test_noise_has_no_planes():
+    bits = [[(p.normal_world.tobytes(), p.offset, p.rms) for p in planes] for planes in (a, b)]
+    assert bits[0] == bits[1]
     points = np.random.default_rng(2).uniform(-3.0, 3.0, (9000, 3)).astype(np.float32)
     assert ransac_planes(estimate_normals(points)) == []
     assert ransac_planes(estimate_normals(points[:10])) == []
@@ -78,14 +71,11 @@ def plane(normal, fraction=0.2, rms=0.003, kind="wall"):
     return Plane(np.asarray(normal, float) / np.linalg.norm(normal), 1.0, 1000, fraction, rms, kind)
 
 
-def test_planes_correct_up(hut):
+def test_planes_correct_up_and_plumb_walls_count_more_than_uneven_ground(hut):
     askew = exp_so3(np.array([0.004, 0.002, 0.0])) @ UP
     refined, spread = refine_up(askew, ransac_planes(hut))
     assert np.linalg.norm(refined - UP) < 0.001 < np.linalg.norm(askew - UP)
     assert 0.0 < spread < 0.002
-
-
-def test_plumb_walls_count_more_than_uneven_ground():
     up = np.array([0.0, 0.01, 1.0]) / np.hypot(1.0, 0.01)
     walls = [plane([1, 0, 0], 0.1), plane([0, 1, 0], 0.1)]
     refined, spread = refine_up(up, [plane([0.0, 0.02, 1.0], 0.4, rms=0.1), *walls])
@@ -106,9 +96,7 @@ def test_what_has_no_say_changes_nothing():
     np.testing.assert_array_equal(far, up)
 
 
-@pytest.mark.parametrize(
-    "azimuth_deg", [-170.0, -100.0, -46.0, -44.0, -1.0, 0.0, 30.0, 44.0, 46.0, 91.0, 179.0]
-)
+@pytest.mark.parametrize("azimuth_deg", [-170, -100, -46, -44, -1, 0, 30, 44, 46, 91, 179])
 def test_the_smallest_turn_puts_walls_along_the_axes(azimuth_deg):
     a = np.radians(azimuth_deg)
     along = [plane([np.cos(a + k), np.sin(a + k), 0.0]) for k in (0.0, 0.5 * np.pi, 0.001)]

@@ -8,6 +8,7 @@ import pytest
 from las_files import OFFSETS, las_bytes, laz_bytes
 from pictures import write
 from plyfile import PlyData, PlyElement
+from refusals import assert_refused
 from scipy.spatial.distance import pdist
 from test_cloud_morton import seeded_cloud, whole
 
@@ -36,9 +37,6 @@ def test_no_color_is_black_and_a_label_alone_decides():
     shuffled = np.array([[5, 70_000], [-1, 5]])
     np.testing.assert_array_equal(colors_of(shuffled)[0, 0], colors_of(shuffled)[1, 1])
     np.testing.assert_array_equal(colors_of(shuffled)[1, 0], palette()[NUM_COLORS - 1])
-
-
-def test_labels_in_the_upper_bytes_keep_colors_of_their_own():
     for step in (256, 65_536):
         assert len(np.unique(colors_of(step * np.arange(256)), axis=0)) == 256
 
@@ -75,9 +73,8 @@ def test_ignored_labels_are_left_out(tmp_path):
 @pytest.mark.parametrize("wrong", [3.5, np.nan, -np.inf, 1e12])
 def test_labels_that_are_no_whole_numbers_are_refused(tmp_path, wrong):
     path = _ply(tmp_path / "a.ply", kind="f8", values=np.where(np.arange(3000) == 1700, wrong, LABELS))
-    with pytest.raises(
-        InputError, match=re.escape(f"a.ply: found the label {wrong:g}, wanted whole numbers")
-    ):
+    message = f"a.ply: found the label {wrong:g}, wanted whole numbers"
+    with pytest.raises(InputError, match=re.escape(message)):
         whole(open_source, path, READ)
 
 
@@ -110,13 +107,11 @@ def test_pcd(tmp_path, encoding):
     header = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z label\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\n"
     header += f"WIDTH 3000\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3000\nDATA {encoding}\n"
     rows = "\n".join(" ".join(map(str, row)) for row in table.tolist()) + "\n"
-    path = write(
-        tmp_path / "a.pcd", header.encode() + (rows.encode() if encoding == "ascii" else table.tobytes())
-    )
+    body = rows.encode() if encoding == "ascii" else table.tobytes()
+    path = write(tmp_path / "a.pcd", header.encode() + body)
     np.testing.assert_array_equal(whole(open_source, path, READ).colors, colors_of(LABELS))
     write(path, path.read_bytes().replace(b"label", b"ring_"))
-    with pytest.raises(InputError, match="the fields are 'x y z ring_', wanted x y z and label"):
-        open_source(path, READ)
+    assert_refused("the fields are 'x y z ring_', wanted x y z and label", open_source, path, READ)
 
 
 def test_clouds_without_labels_are_refused(tmp_path):
@@ -142,11 +137,7 @@ def test_pictures_of_labels_in_8_16_and_24_bits(tmp_path):
     deep = IMAGE * 300
     of_24_bits = deep * 256 + 9
     bgr = np.stack([of_24_bits & 255, of_24_bits >> 8 & 255, of_24_bits >> 16], axis=-1)
-    for labels, pixels in (
-        (IMAGE, IMAGE.astype(np.uint8)),
-        (deep, deep.astype(np.uint16)),
-        (of_24_bits, bgr),
-    ):
+    for labels, pixels in ((IMAGE, np.uint8(IMAGE)), (deep, np.uint16(deep)), (of_24_bits, np.uint8(bgr))):
         panorama = read_panorama(_png(tmp_path / "a.png", pixels), READ_IMAGE)
         np.testing.assert_array_equal(panorama.rgb, colors_of(labels))
         assert panorama.is_valid.all()
@@ -157,10 +148,8 @@ def test_ignored_labels_and_masks_do_not_count_and_nothing_else_is_masked(tmp_pa
     labels[:9], labels[-9:] = 0, 1  # as a black border and a disc over the nadir look in colours
     path = _png(tmp_path / "a.png", labels.astype(np.uint8))
     assert read_panorama(path, READ_IMAGE).is_valid.all()
-    mask = _png(
-        tmp_path / "mask.png",
-        np.where(np.arange(128) < 20, 255, 0).astype(np.uint8) * np.ones((64, 1), np.uint8),
-    )
+    is_left = np.broadcast_to(np.arange(128) < 20, (64, 128))
+    mask = _png(tmp_path / "mask.png", np.uint8(255 * is_left))
     panorama = read_panorama(path, PanoramaOptions(mask=mask, mask_nadir_deg=20.0, labels=Labels((0, 5))))
     expected = (labels != 0) & (labels != 5) & (np.arange(128) >= 20)
     expected[-7:] = False
@@ -179,11 +168,9 @@ def test_pictures_that_do_not_keep_labels_are_refused(tmp_path):
         _png(tmp_path / "rgba.png", rgba),
         _png(tmp_path / "deep.png", deep_rgb),
     ):
-        with pytest.raises(InputError, match=f"{path.name}: {wanted}"):
-            read_panorama(path, READ_IMAGE)
+        assert_refused(f"{path.name}: {wanted}", read_panorama, path, READ_IMAGE)
     _, bits = cv2.imencode(".png", gray, [cv2.IMWRITE_PNG_BILEVEL, 1])
-    with pytest.raises(InputError, match=wanted):
-        read_panorama(write(tmp_path / "b.png", bytes(bits)), READ_IMAGE)
+    assert_refused(wanted, read_panorama, write(tmp_path / "b.png", bytes(bits)), READ_IMAGE)
     with pytest.raises(InputError, match=r"found labels of 128 x 65, wanted the full sphere, W = 2 H"):
         read_panorama(_png(tmp_path / "c.png", np.zeros((65, 128), np.uint8)), READ_IMAGE)
     with pytest.raises(InputError, match="--labels: found --fov or --cube-order too"):

@@ -92,10 +92,6 @@ def test_every_function_but_a_kernel_is_annotated():
 
 def test_only_commands_know_argparse():
     for module, path in MODULES.items():
-        imports = {
-            a.name
-            for n in ast.walk(ast.parse(path.read_text()))
-            if isinstance(n, ast.Import)
-            for a in n.names
-        }
+        imports = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Import)]
+        imports = {a.name for n in imports for a in n.names}
         assert "argparse" not in imports or _folder(module) == "cli", module

@@ -1,9 +1,6 @@
 """The loss over a plan, and the command line of tools/loss_surface.py."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,7 +9,6 @@ import pytest
 import rooms
 
 from piccolo.cli import loss_surface as tool
-from piccolo.cli import make_room
 from piccolo.cloud import read_cloud
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import Pose, angle_between
@@ -24,7 +20,6 @@ from piccolo.render.zbuffer import visible_points
 from piccolo.runtime.threads import Workers
 from piccolo.scenes.scene import read_scene
 
-ROOT = Path(__file__).resolve().parents[1]
 STEP = 0.3
 COARSE = ["--step", STEP, "--rotations", 24, "--max-points", 3000, "--width", 128]
 
@@ -104,10 +99,8 @@ def test_minima_are_counted_in_free_space():
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     """A made room and a result for one panorama, in a folder with a blank in its name."""
-    folder = tmp_path_factory.mktemp("my room")
-    arguments = ["--seed", "5", "--points", "30000", "--panoramas", "1", "--width", "256", "--quiet"]
-    variants = ["--size", "4", "3", "2.5", "--variants", "clean", "tilt"]
-    assert make_room.main(["--out", str(folder), *arguments, *variants]) == 0
+    words = "--seed 5 --size 4 3 2.5 --points 30000 --panoramas 1 --width 256 --variants clean tilt"
+    folder = rooms.write_room(tmp_path_factory.mktemp("my room"), words)
     pose = read_scene(folder).by_name["tilt_0.jpg"].pose
     found = Pose(pose.R_cam_from_world, pose.center_world + 0.05)
     poses.write_results(folder / "pose.json", [poses.result("x/tilt_0.jpg", found)])
@@ -230,9 +223,3 @@ def test_bad_input_leaves_nothing(run, scene, tmp_path):
         assert err.count("\n") == 1
     assert run(*out, pano="no.jpg")[0] == 3
     assert not list(tmp_path.iterdir())
-
-
-def test_help_runs():
-    command = [sys.executable, ROOT / "tools" / "loss_surface.py", "--help"]
-    text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    assert "--no-visibility" in text

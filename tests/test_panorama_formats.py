@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 from pictures import TURNS, animation, encoded, saved, smooth_rgb, tiff, with_metadata, write
 from PIL import Image
+from refusals import assert_refused
 
-from piccolo.errors import InputError
 from piccolo.panorama import read_panorama
 
 RGB = smooth_rgb()
@@ -17,9 +17,7 @@ TINT = np.uint8([0, 85, 170])
 @pytest.mark.parametrize("order", "<>")
 @pytest.mark.parametrize(("samples", "dtype"), [(3, np.uint8), (4, np.uint8), (3, np.uint16), (4, np.uint16)])
 def test_tiff_comes_back_exactly(tmp_path, order, samples, dtype):
-    pixels = (
-        RANDOM16[..., :samples] if dtype == np.uint16 else (RANDOM16[..., :samples] >> 8).astype(np.uint8)
-    )
+    pixels = RANDOM16[..., :samples] if dtype == np.uint16 else np.uint8(RANDOM16[..., :samples] >> 8)
     panorama = read_panorama(write(tmp_path / "a.tif", tiff(pixels, order=order)))
     is_valid = RANDOM16[..., 3] >> 8 > 0 if samples == 4 else np.ones((64, 128), bool)
     np.testing.assert_array_equal(panorama.rgb, RANDOM16[..., :3] >> 8)
@@ -98,9 +96,7 @@ def test_further_pages_are_left_with_a_warning(tmp_path):
 )
 def test_other_files_are_refused_by_name(tmp_path, content, message, capfd):
     path = write(tmp_path / "a", content)
-    with pytest.raises(InputError, match=message) as error:
-        read_panorama(path)
-    assert str(path) in str(error.value)
+    assert_refused(message, read_panorama, path)
     assert capfd.readouterr().err == ""
 
 
@@ -109,14 +105,11 @@ def test_tiff_with_damaged_strips_is_refused(tmp_path, compression, capfd):
     noise = np.random.default_rng(1).integers(0, 256, (64, 128, 3), dtype=np.uint8)
     content = bytearray(encoded(noise, ".tif", [COMPRESSION, compression]))
     content[5000:15000] = bytes(10000)
-    with pytest.raises(InputError, match=RARE):
-        read_panorama(write(tmp_path / "a.tif", bytes(content)))
+    assert_refused(RARE, read_panorama, write(tmp_path / "a.tif", bytes(content)))
     assert capfd.readouterr().err == ""
 
 
-@pytest.mark.parametrize(
-    "image", [RGB, np.dstack([RGB, np.where(RGB[..., 1] < 99, 0, 255).astype(np.uint8)])]
-)
+@pytest.mark.parametrize("image", [RGB, np.dstack([RGB, np.uint8(np.where(RGB[..., 1] < 99, 0, 255))])])
 def test_webp_comes_back_exactly(tmp_path, image):
     content = encoded(image, ".webp", LOSSLESS)
     for stored in (content, with_metadata(content, orientation=1)):
@@ -132,9 +125,7 @@ def test_lossy_webp_comes_back_nearly(tmp_path):
 
 
 def test_cmyk_jpeg_becomes_rgb(tmp_path):
-    inks = np.repeat(np.array([[[0, 200, 200, 30], [200, 100, 0, 0]]], np.uint8), 64, axis=1).repeat(
-        64, axis=0
-    )
+    inks = np.uint8([[[0, 200, 200, 30], [200, 100, 0, 0]]]).repeat(64, axis=1).repeat(64, axis=0)
     content = saved(inks, "JPEG", "CMYK")
     rgb = read_panorama(write(tmp_path / "a.jpg", content)).rgb
     expected = (255 - inks[..., :3].astype(int)) * (255 - inks[..., 3:].astype(int)) / 255

@@ -17,7 +17,7 @@ from pictures import (
     write,
     xmp_packet,
 )
-from refusals import read_or_refused
+from refusals import assert_refused, read_or_refused
 
 from piccolo.errors import InputError
 from piccolo.geometry.sphere import pixel_rays
@@ -58,9 +58,8 @@ def test_packed_xmp_in_png_is_read_and_a_bomb_is_not(tmp_path):
     crop = encoded(RGB[30:170, 50:290], ".png")
     for xmp, is_read in ((xmp_packet(crop_fields(50, 30, 240, 140)), True), (bytes(50_000_000), False)):
         chunk = png_chunk(b"iTXt", b"XML:com.adobe.xmp\0\1\0\0\0" + zlib.compress(xmp))
-        panorama, message = read_or_refused(
-            read_panorama, write(tmp_path / "a.png", crop[:33] + chunk + crop[33:])
-        )
+        path = write(tmp_path / "a.png", crop[:33] + chunk + crop[33:])
+        panorama, message = read_or_refused(read_panorama, path)
         assert (panorama is not None) == is_read
         assert is_read or "too large" in message
 
@@ -113,38 +112,24 @@ def test_a_crop_that_makes_no_sense_is_refused_or_left_aside(tmp_path, fields):
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        (
-            crop_fields(0, 0, 300, 200, (70_000, 35_000)),
-            "found 300 x 200 of a sphere 70000 wide, wanted at most",
-        ),
-        (
-            crop_fields(0, 0, 300, 200, (9000, 4500)),
-            "found 300 x 200, 0.15 % of the sphere, wanted at least 2 %",
-        ),
+        (crop_fields(0, 0, 300, 200, (70_000, 35_000)), "found 300 x 200 of a sphere 70000 wide, wanted"),
+        (crop_fields(0, 0, 300, 200, (9000, 4500)), "found 300 x 200, 0.15 % of the sphere, wanted at least"),
         (crop_fields(0, 0, 300, 200, (900, 200)), "of a sphere of 900 x 200, wanted that width = 2 x height"),
-        (
-            {"ProjectionType": "Cylin\ndrical"},
-            "names the projection .cylin.+ndrical., wanted equirect",
-        ),
+        ({"ProjectionType": "Cylin\ndrical"}, "names the projection .cylin.+ndrical., wanted equirect"),
     ],
 )
 def test_crops_are_refused_by_name(tmp_path, fields, message):
-    with pytest.raises(InputError, match=message):
-        read_panorama(write(tmp_path / "a", file_of(RGB[:, :300], fields)))
+    assert_refused(message, read_panorama, write(tmp_path / "a", file_of(RGB[:, :300], fields)))
 
 
-def test_the_attitude_is_read(tmp_path):
+def test_the_attitude_is_read_and_an_entity_bomb_is_not_expanded(tmp_path):
     fields = {"PosePitchDegrees": "+3.5", "PoseRollDegrees": -120.25}
     assert read_panorama(write(tmp_path / "a", file_of(RGB, fields))).gpano == GPano(3.5, -120.25)
     fields = {"PosePitchDegrees": 91, "PoseRollDegrees": "1e999"}
     assert read_panorama(write(tmp_path / "a", file_of(RGB, fields))).gpano == GPano()
     assert read_panorama(write(tmp_path / "a", encoded(RGB, ".png"))).gpano is None
-
-
-def test_an_entity_bomb_is_not_expanded(tmp_path):
-    bomb = b'<!DOCTYPE a [<!ENTITY a "aaaaaaaa">' + b"".join(
-        f'<!ENTITY {chr(98 + k)} "{f"&{chr(97 + k)};" * 10}">'.encode() for k in range(20)
-    )
+    steps = (f'<!ENTITY {chr(98 + k)} "{f"&{chr(97 + k)};" * 10}">'.encode() for k in range(20))
+    bomb = b'<!DOCTYPE a [<!ENTITY a "aaaaaaaa">' + b"".join(steps)
     xmp = bomb + b"]>" + xmp_packet({"PosePitchDegrees": "&u;"})
     panorama = read_panorama(write(tmp_path / "a.jpg", with_metadata(encoded(RGB, ".jpg"), xmp=xmp)))
     assert panorama.gpano == GPano()
@@ -182,8 +167,7 @@ def test_the_horizon_turns_counterclockwise_in_the_image_as_roll_grows():
 
 def test_a_field_of_view_is_centred_on_the_horizon(tmp_path):
     path = write(tmp_path / "a.png", encoded(RGB[60:140, 100:300], ".png"))
-    with pytest.raises(InputError, match=r"found 200 x 80, wanted width = 2 x height .* field of view"):
-        read_panorama(path)
+    assert_refused(r"found 200 x 80, wanted width = 2 x height .* field of view", read_panorama, path)
     panorama = read_panorama(path, ReadOptions(fov_deg=180.0))
     rgb, is_valid = expected_crop(100, 60, 200, 80)
     np.testing.assert_array_equal(panorama.is_valid, is_valid)
@@ -191,9 +175,7 @@ def test_a_field_of_view_is_centred_on_the_horizon(tmp_path):
     around = read_panorama(path, ReadOptions(fov_deg=360.0))
     assert around.rgb.shape == (100, 200, 3)
     assert around.is_valid[10:90].all()
-    with pytest.raises(
-        InputError, match=r"found 200 x 200, higher than the sphere .* wanted a smaller --fov"
-    ):
+    with pytest.raises(InputError, match=r"found 200 x 200, higher than the sphere .* a smaller --fov"):
         read_panorama(write(path, encoded(RGB[:, :200], ".png")), ReadOptions(fov_deg=270.0))
 
 
@@ -203,9 +185,7 @@ def test_other_fields_of_view_are_refused(fov_deg):
         ReadOptions(fov_deg=fov_deg)
 
 
-NUMBERS = st.one_of(
-    st.integers(-10, 2_000_000_000), st.floats(), st.text(max_size=9), st.sampled_from([200, 400, 800, 32768])
-)
+NUMBERS = st.integers(-10, 2**31) | st.floats() | st.text(max_size=9) | st.sampled_from([200, 400, 32768])
 
 
 @settings(deadline=None, max_examples=150)
@@ -219,9 +199,8 @@ def test_any_numbers_in_a_crop_are_read_or_refused(values, width, tmp_path_facto
 
 
 def test_many_prefixes_of_the_namespace_cost_no_time():
-    xmp = b"".join(
-        f'xmlns:p{k}="{XMP_NAMESPACE}" p{k}:PosePitchDegrees="{k}" '.encode() for k in range(12_000)
-    )
+    space = f'xmlns:p{{}}="{XMP_NAMESPACE}" p{{}}:PosePitchDegrees="{{}}" '
+    xmp = b"".join(space.format(k, k, k).encode() for k in range(12_000))
     begin = time.perf_counter()
     assert gpano_fields(xmp) == {"PosePitchDegrees": "0"}
     assert time.perf_counter() - begin < 2.0

@@ -133,9 +133,13 @@ def test_a_ragged_corner_of_a_crop_is_found(tmp_path):
     assert not is_valid[:100].any()
 
 
-def test_a_black_picture_is_refused(tmp_path):
+def test_a_black_picture_is_refused_and_black_poles_are_no_fisheyes(tmp_path):
     with pytest.raises(InputError, match="no pixel is left: all are masked, black"):
         read(tmp_path / "a.png", np.zeros((HEIGHT, WIDTH, 3)), ".png")
+    for half_angle in (20, 40, 60):
+        image = capped(capped(room(), half_angle, 0), half_angle, 0, "zenith")
+        panorama = read(tmp_path / "a.jpg", image)
+        assert panorama.is_valid[HEIGHT // 2 - 30 : HEIGHT // 2 + 30].all()
 
 
 def fisheyes(radius=0.49, floor=0.0):
@@ -143,23 +147,14 @@ def fisheyes(radius=0.49, floor=0.0):
     v, u = np.mgrid[:HEIGHT, :HEIGHT] + 0.5 - HEIGHT / 2
     distance = np.hypot(u, v) / (radius * HEIGHT)
     fall = np.clip(1.2 - 0.6 * distance, 0, 1) * (distance < 1)
-    return (
-        np.concatenate([room(0)[:, :HEIGHT], room(1)[:, :HEIGHT]], axis=1) * np.tile(fall, 2)[..., None]
-        + floor
-    )
+    both = np.concatenate([room(0)[:, :HEIGHT], room(1)[:, :HEIGHT]], axis=1)
+    return both * np.tile(fall, 2)[..., None] + floor
 
 
 @pytest.mark.parametrize(("radius", "floor"), [(0.5, 0.0), (0.46, 6.0)])
 def test_two_fisheyes_are_refused(tmp_path, radius, floor):
     with pytest.raises(InputError, match="two fisheye pictures side by side: stitch them"):
         read(tmp_path / "a.insp", fisheyes(radius, floor))
-
-
-def test_panoramas_with_black_poles_are_no_fisheyes(tmp_path):
-    for half_angle in (20, 40, 60):
-        image = capped(capped(room(), half_angle, 0), half_angle, 0, "zenith")
-        panorama = read(tmp_path / "a.jpg", image)
-        assert panorama.is_valid[HEIGHT // 2 - 30 : HEIGHT // 2 + 30].all()
 
 
 def checker_mask(width, height):
@@ -176,12 +171,17 @@ def test_a_mask_of_any_size_is_applied(tmp_path, factor):
     np.testing.assert_array_equal(is_valid, checker_mask(WIDTH, HEIGHT) == 0)
 
 
-def test_any_white_pixel_of_a_larger_mask_counts(tmp_path):
+def test_any_white_pixel_of_a_larger_mask_counts_and_the_nadir_is_masked(tmp_path):
     mask = np.zeros((2 * HEIGHT, 2 * WIDTH), np.uint8)
     mask[301, 401], mask[700, 800] = 128, 127
     file = write(tmp_path / "mask.png", encoded(mask, ".png"))
     is_valid = read(tmp_path / "a.jpg", room(), options=ReadOptions(mask=file)).is_valid
     assert np.argwhere(~is_valid).tolist() == [[150, 200]]
+    is_valid = read(tmp_path / "a.jpg", room(), options=ReadOptions(mask_nadir_deg=20.0)).is_valid
+    np.testing.assert_array_equal(is_valid, np.repeat((FROM_NADIR >= 20)[:, None], WIDTH, axis=1))
+    for degrees in (-1.0, 91.0, float("nan")):
+        with pytest.raises(InputError, match=r"--mask-nadir: found .*, wanted 0 to 90"):
+            ReadOptions(mask_nadir_deg=degrees)
 
 
 def test_a_mask_of_a_crop_may_have_its_shape_or_the_spheres(tmp_path):
@@ -197,9 +197,7 @@ def test_a_mask_of_a_crop_may_have_its_shape_or_the_spheres(tmp_path):
     is_valid = read(tmp_path / "a.jpg", image, options=ReadOptions(mask=file, **options)).is_valid
     assert is_valid[top:].sum() == 200 * 600
     file = write(tmp_path / "wrong.png", encoded(np.zeros((100, 100), np.uint8), ".png"))
-    with pytest.raises(
-        InputError, match=r"wrong.png: found a mask of 100 x 100, wanted the shape of 1024 x 512 or 600"
-    ):
+    with pytest.raises(InputError, match=r"wrong.png: found a mask of 100 x 100, wanted the shape of 1024 x"):
         read(tmp_path / "a.jpg", image, options=ReadOptions(mask=file, **options))
 
 
@@ -208,19 +206,10 @@ def test_a_folder_of_masks_is_looked_up_by_name(tmp_path):
     folder.mkdir()
     write(folder / "a.png", encoded(checker_mask(64, 32), ".png"))
     options = ReadOptions(mask=folder)
-    np.testing.assert_array_equal(
-        read(tmp_path / "a.jpg", room(), options=options).is_valid, checker_mask(WIDTH, HEIGHT) == 0
-    )
+    is_valid = read(tmp_path / "a.jpg", room(), options=options).is_valid
+    np.testing.assert_array_equal(is_valid, checker_mask(WIDTH, HEIGHT) == 0)
     panorama = read(tmp_path / "b.jpg", room(), options=options)
     assert panorama.is_valid.all()
     assert panorama.warnings == (f"found no mask b in {folder}",)
     with pytest.raises(InputError, match=r"none.png: cannot be read"):
         read(tmp_path / "a.jpg", room(), options=ReadOptions(mask=tmp_path / "none.png"))
-
-
-def test_the_nadir_is_masked(tmp_path):
-    is_valid = read(tmp_path / "a.jpg", room(), options=ReadOptions(mask_nadir_deg=20.0)).is_valid
-    np.testing.assert_array_equal(is_valid, np.repeat((FROM_NADIR >= 20)[:, None], WIDTH, axis=1))
-    for degrees in (-1.0, 91.0, float("nan")):
-        with pytest.raises(InputError, match=r"--mask-nadir: found .*, wanted 0 to 90"):
-            ReadOptions(mask_nadir_deg=degrees)

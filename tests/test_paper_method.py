@@ -33,14 +33,11 @@ def test_upright_camera_is_found(seed, variant):
     assert set(watch.seconds) == {"search", "refine"}
 
 
-def test_tilted_camera_is_found_with_unknown_gravity():
+def test_tilted_camera_is_found_with_unknown_gravity_and_by_lbfgs():
     found, _ = _localize(5, "tilt", dataclasses.replace(QUICK, gravity="unknown", num_rotations=96))
     distance, angle_deg = errors(found.pose, query(5, "tilt").pose)
     assert distance < 0.05
     assert angle_deg < 1.0
-
-
-def test_lbfgs_finds_the_same_place():
     found, _ = _localize(1, "clean", dataclasses.replace(QUICK, solver="lbfgs"))
     distance, _ = errors(found.pose, query(1).pose)
     assert distance < 0.02

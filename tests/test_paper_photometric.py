@@ -163,7 +163,5 @@ def test_masked_or_empty_views_have_no_loss():
 
 def test_width_that_means_nothing_is_refused():
     for width in (0, 31, 129, 8192):
-        with pytest.raises(
-            InputError, match=f"photometric_width: found {width}, wanted an even number of 32"
-        ):
+        with pytest.raises(InputError, match=f"photometric_width: found {width}, wanted an even number of"):
             PaperSettings(photometric_width=width)

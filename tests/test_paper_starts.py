@@ -31,6 +31,9 @@ def test_free_is_inside_and_clear_of_surfaces():
     assert _is_free(points, np.array([8.5, 20.0, 1.5]))
     assert not _is_free(points, np.array([8.5, 21.9, 1.5]))  # 0.1 m from a wall
     assert not _is_free(points, np.array([20.0, 20.0, 1.5]))  # outside
+    rng = np.random.default_rng(0)
+    solid = pack_points(rng.uniform(0, 1, (20_000, 3)).astype(np.float32), np.zeros((20_000, 3), np.uint8))
+    assert len(free_grid(solid, 5, 0.0)) == 0
 
 
 @pytest.mark.parametrize("num_translations", [1, 5, 50])
@@ -42,27 +45,15 @@ def test_free_grid_gives_the_number_asked_for_all_free(num_translations):
     assert len(np.unique(grid, axis=0)) == num_translations
 
 
-def test_nothing_is_free_in_a_solid():
-    rng = np.random.default_rng(0)
-    solid = pack_points(rng.uniform(0, 1, (20_000, 3)).astype(np.float32), np.zeros((20_000, 3), np.uint8))
-    assert len(free_grid(solid, 5, 0.0)) == 0
-
-
-def test_grid_is_even_and_inside_the_box():
+def test_grid_and_yaws_are_even_and_sampling_keeps_far_ones():
     grid = box_grid(np.zeros(3), np.array([20.0, 10.0, 2.5]), 50)
     assert 35 <= len(grid) <= 70
     assert (grid > 0).all()
     assert (grid < [20.0, 10.0, 2.5]).all()
     np.testing.assert_allclose(np.diff(np.unique(grid[:, 0])), np.diff(np.unique(grid[:, 0]))[0])
-
-
-def test_sampling_keeps_far_ones():
     line = np.column_stack([np.arange(11.0), np.zeros(11), np.zeros(11)])
     np.testing.assert_array_equal(farthest_point_sampling(line, 3)[:, 0], [0, 5, 10])
     assert farthest_point_sampling(line, 20) is line
-
-
-def test_yaws_are_even():
     yaws = uniform_yaws(8)
     assert angle_between(yaws[0], yaws[1]) == pytest.approx(np.pi / 4)
     assert angle_between(yaws[7], yaws[0]) == pytest.approx(np.pi / 4)
@@ -71,9 +62,8 @@ def test_yaws_are_even():
 @pytest.mark.parametrize("count", [32, 500])
 def test_rotations_cover_so3_evenly(count):
     rotations = uniform_rotations(count)
-    np.testing.assert_allclose(
-        rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (count, 1, 1)), atol=1e-12
-    )
+    products = rotations @ rotations.transpose(0, 2, 1)
+    np.testing.assert_allclose(products, np.tile(np.eye(3), (count, 1, 1)), atol=1e-12)
     traces = np.einsum("aij,bij->ab", rotations, rotations)
     np.fill_diagonal(traces, -1.0)
     nearest = np.arccos(np.clip((traces.max(axis=1) - 1.0) / 2.0, -1.0, 1.0))

@@ -2,100 +2,82 @@ import numpy as np
 import pytest
 
 from piccolo.errors import InputError
-from piccolo.geometry.pose import (
-    Pose,
-    T_world_from_cam,
-    angle_between,
-    checked_rotation,
-    exp_so3,
-    left_jacobian,
-    orthonormal,
-    quaternion_wxyz,
-    rotation_from_quaternion_wxyz,
-    step,
-    yaw_rotation,
-)
+from piccolo.geometry import pose as poses
 
 VECTORS = [np.zeros(3), np.array([1e-9, 0, 0]), np.array([0.3, -0.2, 0.9]), np.array([0.0, 3.14159, 0.0])]
 
 
 @pytest.mark.parametrize("w", VECTORS)
 def test_exponential_is_a_rotation_by_the_norm(w):
-    R = exp_so3(w)
+    R = poses.exp_so3(w)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(R) == pytest.approx(1.0)
-    assert angle_between(R, np.eye(3)) == pytest.approx(np.linalg.norm(w), abs=1e-12)
+    assert poses.angle_between(R, np.eye(3)) == pytest.approx(np.linalg.norm(w), abs=1e-12)
     np.testing.assert_allclose(R @ w, w, atol=1e-12)
 
 
-def test_exponential_turns_counterclockwise():
-    np.testing.assert_allclose(exp_so3(np.array([0, 0, np.pi / 2])) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+def test_conventions_of_turns_steps_quaternions_and_matrices():
+    np.testing.assert_allclose(poses.exp_so3(np.array([0, 0, np.pi / 2])) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+    start = poses.Pose(poses.yaw_rotation(np.pi / 2), np.array([1.0, 2.0, 3.0]))
+    moved = poses.step(start, np.array([0, 0, 0.1, 0.5, 0, 0]))
+    np.testing.assert_allclose(moved.center_world, [1.0, 2.5, 3.0], atol=1e-12)  # forward is +y in the world
+    assert poses.angle_between(moved.R_cam_from_world, start.R_cam_from_world) == pytest.approx(0.1)
+    q = poses.quaternion_wxyz(poses.exp_so3(np.array([0.0, 0.0, np.pi / 2])))
+    np.testing.assert_allclose(q, [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], atol=1e-12)
+    pose = poses.Pose(poses.exp_so3(np.array([0.4, -1.1, 0.7])), np.array([0.3, -0.2, 1.5]))
+    x_world = np.array([2.0, 1.0, 0.5])
+    x_cam = pose.R_cam_from_world @ (x_world - pose.center_world)
+    np.testing.assert_allclose((poses.T_world_from_cam(pose) @ [*x_cam, 1.0])[:3], x_world, atol=1e-12)
+    yaw = 0.7
+    forward = poses.yaw_rotation(yaw).T @ [1.0, 0.0, 0.0]
+    np.testing.assert_allclose(forward, [np.cos(yaw), np.sin(yaw), 0.0], atol=1e-12)
 
 
 @pytest.mark.parametrize("w", VECTORS)
 def test_left_jacobian_against_central_differences(w):
     for axis in range(3):
         dw = 1e-6 * np.eye(3)[axis]
-        turn = exp_so3(w + dw) @ exp_so3(w - dw).T
+        turn = poses.exp_so3(w + dw) @ poses.exp_so3(w - dw).T
         vee = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-        np.testing.assert_allclose(vee / 2e-6, left_jacobian(w)[:, axis], atol=2e-5)
-
-
-def test_step_moves_along_the_camera_axes():
-    start = Pose(yaw_rotation(np.pi / 2), np.array([1.0, 2.0, 3.0]))
-    moved = step(start, np.array([0, 0, 0.1, 0.5, 0, 0]))
-    np.testing.assert_allclose(moved.center_world, [1.0, 2.5, 3.0], atol=1e-12)  # forward is +y in the world
-    assert angle_between(moved.R_cam_from_world, start.R_cam_from_world) == pytest.approx(0.1)
+        np.testing.assert_allclose(vee / 2e-6, poses.left_jacobian(w)[:, axis], atol=2e-5)
 
 
 def test_step_is_the_derivative_that_the_kernels_use():
-    start = Pose(exp_so3(np.array([0.4, -1.1, 0.7])), np.array([0.3, -0.2, 1.5]))
+    start = poses.Pose(poses.exp_so3(np.array([0.4, -1.1, 0.7])), np.array([0.3, -0.2, 1.5]))
     x_world = np.array([2.0, 1.0, 0.5])
     p = start.R_cam_from_world @ (x_world - start.center_world)
     delta = np.array([1e-7, -2e-7, 3e-7, 2e-7, 1e-7, -1e-7])
-    moved = step(start, delta)
+    moved = poses.step(start, delta)
     dp = moved.R_cam_from_world @ (x_world - moved.center_world) - p
     np.testing.assert_allclose(dp, np.cross(delta[:3], p) - delta[3:], atol=1e-12)
 
 
 @pytest.mark.parametrize("w", VECTORS)
 def test_quaternion_round_trip(w):
-    R = exp_so3(w)
-    q = quaternion_wxyz(R)
+    R = poses.exp_so3(w)
+    q = poses.quaternion_wxyz(R)
     assert q[0] >= 0
-    np.testing.assert_allclose(rotation_from_quaternion_wxyz(q), R, atol=1e-9)
-
-
-def test_quaternion_order_is_scalar_first():
-    q = quaternion_wxyz(exp_so3(np.array([0.0, 0.0, np.pi / 2])))
-    np.testing.assert_allclose(q, [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], atol=1e-12)
-
-
-def test_matrix_takes_camera_to_world():
-    pose = Pose(exp_so3(np.array([0.4, -1.1, 0.7])), np.array([0.3, -0.2, 1.5]))
-    x_world = np.array([2.0, 1.0, 0.5])
-    x_cam = pose.R_cam_from_world @ (x_world - pose.center_world)
-    np.testing.assert_allclose((T_world_from_cam(pose) @ [*x_cam, 1.0])[:3], x_world, atol=1e-12)
+    np.testing.assert_allclose(poses.rotation_from_quaternion_wxyz(q), R, atol=1e-9)
 
 
 def test_orthonormal_repairs_drift():
-    R = exp_so3(np.array([0.4, -1.1, 0.7]))
-    np.testing.assert_allclose(orthonormal(R * 1.001), R, atol=1e-12)
+    R = poses.exp_so3(np.array([0.4, -1.1, 0.7]))
+    np.testing.assert_allclose(poses.orthonormal(R * 1.001), R, atol=1e-12)
     rough = R + np.random.default_rng(1).normal(0.0, 0.02, (3, 3))
     U, _, Vt = np.linalg.svd(rough)
-    np.testing.assert_allclose(orthonormal(rough), U @ Vt, atol=1e-12)
+    np.testing.assert_allclose(poses.orthonormal(rough), U @ Vt, atol=1e-12)
 
 
 def test_upright_camera_looks_along_its_yaw():
     yaw = 0.7
-    forward = yaw_rotation(yaw).T @ [1.0, 0.0, 0.0]
+    forward = poses.yaw_rotation(yaw).T @ [1.0, 0.0, 0.0]
     np.testing.assert_allclose(forward, [np.cos(yaw), np.sin(yaw), 0.0], atol=1e-12)
 
 
 def test_rotations_are_checked_to_a_tolerance():
-    R = exp_so3(VECTORS[2])
-    checked_rotation(R + 4e-4, 1e-2, "R")
-    assert checked_rotation(R, 1e-12, "R") is R
+    R = poses.exp_so3(VECTORS[2])
+    poses.checked_rotation(R + 4e-4, 1e-2, "R")
+    assert poses.checked_rotation(R, 1e-12, "R") is R
     for wrong in (R + 4e-4, R[::-1], np.full((3, 3), np.nan), R * 1e300, R[0], np.eye(4)):
         with pytest.raises(InputError, match="file: R is no rotation"):
-            checked_rotation(wrong, 1e-4, "file: R")
+            poses.checked_rotation(wrong, 1e-4, "file: R")

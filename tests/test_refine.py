@@ -54,9 +54,8 @@ def test_best_iterate_is_kept_not_the_last():
 
 def test_lbfgs_follows_a_gradient_in_steps_of_the_camera():
     """A bowl about a known pose, its gradient by steps: a wrong chain rule would not arrive."""
-    goal = step(
-        Pose(yaw_rotation(0.5), np.array([1.0, 2.0, 3.0])), np.array([0.3, -0.2, 0.4, 0.5, 0.4, -0.3])
-    )
+    start = Pose(yaw_rotation(0.5), np.array([1.0, 2.0, 3.0]))
+    goal = step(start, np.array([0.3, -0.2, 0.4, 0.5, 0.4, -0.3]))
     x_world = np.random.default_rng(0).normal(size=(20, 3))
 
     def objective(pose):

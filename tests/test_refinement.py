@@ -51,10 +51,17 @@ def test_a_quarter_of_the_beam_is_for_the_best_that_lie_far_apart():
     assert best_and_alternatives(rotations, centers, 8, 0.3).tolist() == [0, 2, 3, 4, 6, 8, 9, 10]
 
 
-def test_narrow_ranks_hypotheses_first():
+def test_narrow_ranks_hypotheses_first(monkeypatch):
     close = [_at(0.0, 0.5), _at(0.05, 0.9), _at(3.0, 0.1), _at(5.0, 0.7)]
     assert _places(narrow(close, 4)) == [0.05, 5.0, 3.0]
     assert _places(narrow(close, 1)) == [0.05]
+    turned = [_at(0.0, 0.9), _at(0.09, 0.8), _at(0.11, 0.7), _at(0.0, 0.6, 4.9), _at(0.0, 0.5, 5.1)]
+    assert [h.score for h in narrow(turned, 8)] == [0.9, 0.7, 0.5]
+    R, centers = np.repeat(np.eye(3)[None], 3, axis=0), np.outer([0.0, 0.14, 0.16], [1.0, 0, 0])
+    starts = Starts(R, centers, np.arange(3), np.array([0.3, 0.2, 0.1]))
+    monkeypatch.setattr(refinement, "descend_all", lambda scan_map, image, starts, *_: starts)
+    query = SimpleNamespace(**vars(QUERY), images=SimpleNamespace(search=None))
+    assert refinement.descend_prepared(query, starts, 5, 8).candidate.tolist() == [0, 2]
 
 
 def test_halving_keeps_as_many_as_the_beam_says(monkeypatch):
@@ -76,14 +83,12 @@ def test_halving_keeps_as_many_as_the_beam_says(monkeypatch):
         monkeypatch.setattr(refinement, name, gaining(name, gain))
     monkeypatch.setattr(refinement, "refine_by_perturbation", gaining("perturb", 0.5))
     centers = np.outer(np.arange(40.0), [1.0, 0, 0])
-    starts = Starts(
-        np.repeat(np.eye(3)[None], 40, axis=0), centers, np.arange(40), 0.5 - 0.01 * np.arange(40)
-    )
+    R, index = np.repeat(np.eye(3)[None], 40, axis=0), np.arange(40)
+    starts = Starts(R, centers, index, 0.5 - 0.01 * index)
     fine, middle = refinement.refine(QUERY, starts, Beam(30, 12, 5, 2))
     assert calls[:2] == [(5, 30), (12, 12)]
-    assert [
-        calls.count(name) for name in ("descend_middle", "perturb_middle", "descend_fine", "perturb")
-    ] == [12, 5, 5, 2]
+    stages = ("descend_middle", "perturb_middle", "descend_fine", "perturb")
+    assert [calls.count(name) for name in stages] == [12, 5, 5, 2]
     assert _places(fine) == [0, 1, 0, 1, 2, 3, 4]
     assert fine[0].score == pytest.approx(0.5 + 0.3 + 0.5)
     assert _places(middle) == list(range(12))
@@ -114,12 +119,7 @@ def test_each_stage_has_its_view_its_image_and_its_limits(monkeypatch):
 
 @pytest.mark.parametrize(
     ("gains", "rounds", "expected"),
-    [
-        ([0.2, 0.02, 0.005, 0.5], 3, 0.725),
-        ([0.1] * 9, 5, 1.0),
-        ([-0.3, 0.5], 1, 0.5),
-        ([0.1, -0.1, 1.0], 2, 0.6),
-    ],
+    [([0.2, 0.02, 0.005, 1], 3, 0.725), ([0.1] * 9, 5, 1.0), ([-0.3, 0.5], 1, 0.5), ([0.1, -0.1, 1], 2, 0.6)],
 )
 def test_poses_are_perturbed_for_as_long_as_that_helps(monkeypatch, gains, rounds, expected):
     left, sizes = list(gains), []
@@ -157,6 +157,9 @@ def test_full_resolution_is_taken_back_where_the_score_falls(monkeypatch, after,
     assert asked == [0.0, 0.004]  # the points are taken anew from where the pose is
     assert refinement.settle(query, start) == expected
     assert len(asked) == len(descents) == 4  # the second round of settling moves nothing
+    monkeypatch.setattr(refinement, "descend", lambda *arguments: _at(len(asked), 0.0).pose)
+    refinement.settle(query, start)
+    assert len(asked) == 10  # six rounds at most
 
 
 @pytest.mark.parametrize(("seed", "most"), [(1, 5e-4), (2, 5e-5), (3, 2e-4)])
@@ -188,9 +191,7 @@ def test_alternatives_that_come_near_are_refined_and_the_better_wins(monkeypatch
         return Hypothesis(h.pose, h.score + gains[refined[-1]])
 
     monkeypatch.setattr(method, "refine_by_perturbation", perturbed)
-    monkeypatch.setattr(
-        method, "refine_full_resolution", lambda query, h, num_rounds: h if num_rounds == 2 else None
-    )
+    monkeypatch.setattr(method, "refine_full_resolution", lambda query, h, n: h if n == 2 else None)
     result = SearchResult(_at(0.0, 0.5), (_at(3.0, 0.4), _at(6.0, 0.3), _at(9.0, 0.19)))
     found = method.refine_alternatives(QUERY, result)
     assert refined == [3.0, 6.0]
@@ -200,13 +201,8 @@ def test_alternatives_that_come_near_are_refined_and_the_better_wins(monkeypatch
 
 
 def test_a_search_is_confident_by_score_and_margin():
-    for score, other, expected in (
-        (0.25, 0.1, True),
-        (0.24, 0.0, False),
-        (0.5, 0.35, True),
-        (0.5, 0.36, False),
-    ):
-        assert SearchResult(_at(0.0, score), (_at(3.0, other),)).is_confident == expected
+    for score, other, is_sure in ((0.25, 0.1, True), (0.24, 0, False), (0.5, 0.35, True), (0.5, 0.36, False)):
+        assert SearchResult(_at(0.0, score), (_at(3.0, other),)).is_confident == is_sure
 
 
 def _run(monkeypatch, attempts, gravity="auto", refined=types.MappingProxyType({})):

@@ -1,35 +1,26 @@
 """Pictures of the cloud at a pose, and the command line of tools/render_pose.py."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import poses
 import pytest
+import rooms
 
-from piccolo.cli import make_room, prepare_map, render_pose
+from piccolo.cli import prepare_map, render_pose
 from piccolo.geometry.pose import T_world_from_cam
 from piccolo.geometry.rotations import heading_pitch_roll_deg
 from piccolo.optimize import descent_animation as animation
 from piccolo.scenes.scene import read_scene
 
-ROOT = Path(__file__).resolve().parents[1]
-
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     """A made room with a result for each of two panoramas, in a folder with a blank in its name."""
-    folder = tmp_path_factory.mktemp("my room")
-    arguments = ["--seed", "7", "--points", "30000", "--panoramas", "1", "--width", "256", "--quiet"]
-    assert (
-        make_room.main(
-            ["--out", str(folder), *arguments, "--size", "4", "3", "2.5", "--variants", "clean", "tilt"]
-        )
-        == 0
-    )
+    words = "--seed 7 --size 4 3 2.5 --points 30000 --panoramas 1 --width 256 --variants clean tilt"
+    folder = rooms.write_room(tmp_path_factory.mktemp("my room"), words)
     truth = read_scene(folder).by_name
     some = [poses.result(folder / "images" / n, truth[n].pose) for n in ("clean_0.jpg", "tilt_0.jpg")]
     poses.write_results(folder / "poses.jsonl", [*some, poses.result("c.jpg", None, "not_localized")])
@@ -85,15 +76,12 @@ def test_the_same_pose_from_each_source_gives_the_same_picture(run, scene, tmp_p
     np.testing.assert_array_equal(is_marked, mask == 255)
 
 
-def test_depth_in_millimetres_says_nothing_and_too_far():
+def test_depth_in_millimetres_and_a_prepared_map_in_place_of_the_cloud(run, scene, tmp_path):
     depth = np.array([[1.2345, np.inf], [65.6, 1e6]], np.float32)
     png = render_pose.depth_file(depth, ".png")
     read = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
     assert read.dtype == np.uint16
     assert read.tolist() == [[1234, 0], [65535, 65535]]
-
-
-def test_a_prepared_map_stands_in_place_of_the_cloud(run, scene, tmp_path):
     arguments = ["--cloud", str(scene / "cloud.ply"), "--out", str(scene / "cloud.map"), "--quiet"]
     assert prepare_map.main(arguments) == 0
     pano = ["--queries", scene / "queries.json", "--pano", "tilt_0.jpg", "--width", 128]
@@ -172,9 +160,3 @@ def test_interrupts_and_surprises_have_codes_of_their_own(run, tmp_path, monkeyp
         monkeypatch.setattr(render_pose, "render_points", fail)
         assert run("--at", 1, 1, 1, "--out", tmp_path / "a.png")[0] == code
     assert not list(tmp_path.iterdir())
-
-
-def test_help_runs():
-    command = [sys.executable, ROOT / "tools" / "render_pose.py", "--help"]
-    text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    assert "--mask-out" in text

@@ -66,10 +66,8 @@ def test_what_a_transform_leaves_alone(rooms, tmp_path):
     for folder in folders:
         folder.mkdir()
     turned = with_random_rotation(scene, folders[0])
-    angles = [
-        angle_between(old.pose.R_cam_from_world, new.pose.R_cam_from_world)
-        for old, new in zip(scene.queries, turned.queries, strict=True)
-    ]
+    rotations = [[q.pose.R_cam_from_world for q in s.queries] for s in (scene, turned)]
+    angles = list(map(angle_between, *rotations))
     assert angles == pytest.approx([angles[0]] * 2, abs=1e-7)
     assert np.degrees(angles[0]) > 1.0
     assert turned.queries[0].image == scene.queries[0].image

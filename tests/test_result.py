@@ -35,20 +35,24 @@ def test_json_round_trip_keeps_every_bit_of_the_pose():
     back = Result.from_json(RESULT.to_json())
     np.testing.assert_array_equal(back.pose.R_cam_from_world, RESULT.pose.R_cam_from_world)
     np.testing.assert_array_equal(back.pose.center_world, RESULT.pose.center_world)
-    np.testing.assert_array_equal(
-        back.alternatives[0].pose.R_cam_from_world, ALTERNATIVE.pose.R_cam_from_world
-    )
+    found, kept = (a.pose.R_cam_from_world for a in (back.alternatives[0], ALTERNATIVE))
+    np.testing.assert_array_equal(found, kept)
     np.testing.assert_array_equal(back.covariance.matrix, RESULT.covariance.matrix)
     assert (back.alternatives[0].score, back.covariance.least_constrained_direction) == (0.2, "up and down")
     plain = dataclasses.replace(RESULT, **WITHOUT_ARRAYS)
     assert dataclasses.replace(back, **WITHOUT_ARRAYS) == plain
 
 
-def test_deviations_are_in_millimetres_and_degrees():
+def test_json_names_what_the_next_tool_needs_in_its_units():
     document = json.loads(RESULT.to_json())
     assert document["std_mm"] == pytest.approx([2.0, 3.0, 4.0])
     assert document["std_deg"] == pytest.approx([np.degrees(1e-3)] * 3)
     assert "R_true = exp([w]x) R_cam_from_world" in document["covariance_convention"]
+    assert document["format"] == "piccolo-pose/3"
+    T = np.array(document["T_world_from_cam"])
+    np.testing.assert_allclose(T[:3, 3], RESULT.pose.center_world)
+    np.testing.assert_allclose(T[:3, :3], np.array(document["R_cam_from_world"]).T)
+    assert "R_cam_from_world @ (x_world - center_world)" in document["convention"]
 
 
 def test_summary_says_what_a_person_asks_first():
@@ -96,6 +100,8 @@ def test_result_without_a_pose():
     none = dataclasses.replace(RESULT, loss=None, evidence=None, **WITHOUT_ARRAYS)
     assert json.loads(none.to_json())["T_world_from_cam"] is None
     assert Result.from_json(none.to_json()).pose is None
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        dataclasses.replace(RESULT, loss=float("nan")).to_json()
 
 
 def test_several_files_of_a_cloud_are_a_list():

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3
@@ -33,30 +34,13 @@ def test_a_scene_comes_back_as_it_was_written(tmp_path):
     assert json.loads((tmp_path / "queries.json").read_text())["source"] == "made up"
 
 
-def test_images_may_stand_elsewhere(tmp_path):
+def test_images_may_stand_elsewhere_and_beside_a_linked_folder(tmp_path):
     far = tmp_path / "elsewhere" / "a.jpg"
     (tmp_path / "room").mkdir()
     write_queries(tmp_path / "room", [Query(far, "robot", POSE)])
     scene = read_scene(tmp_path / "room")
     assert scene.name_of(scene.queries[0]) == "../elsewhere/a.jpg"
     assert scene.queries[0].image.resolve() == far.resolve()
-
-
-def test_scenes_are_found_at_any_depth_and_named_by_it(tmp_path):
-    for name in ("area_1/office 1", "area_1/hall", "area_2/hall"):
-        _written(tmp_path / name)
-    assert [scene.name for scene in find_scenes([tmp_path])] == [
-        "area_1/hall",
-        "area_1/office 1",
-        "area_2/hall",
-    ]
-    alone = find_scenes([tmp_path / "area_1" / "hall" / "queries.json"])
-    assert [(scene.name, scene.cloud.parent.name) for scene in alone] == [("hall", "hall")]
-    with pytest.raises(InputError, match="found a second scene named hall"):
-        find_scenes([tmp_path / "area_1", tmp_path / "area_2"])
-
-
-def test_images_beside_a_linked_folder_are_found(tmp_path):
     far = tmp_path / "deep" / "er"
     far.mkdir(parents=True)
     (tmp_path / "link").symlink_to(far)
@@ -67,25 +51,30 @@ def test_images_beside_a_linked_folder_are_found(tmp_path):
     assert read_scene(tmp_path / "link").queries[0].image.samefile(image)
 
 
-def test_what_lacks_a_field_or_comes_twice_is_named(tmp_path):
+def test_scenes_are_found_at_any_depth_and_named_by_it(tmp_path):
+    for name in ("area_1/office 1", "area_1/hall", "area_2/hall"):
+        _written(tmp_path / name)
+    names = [scene.name for scene in find_scenes([tmp_path])]
+    assert names == ["area_1/hall", "area_1/office 1", "area_2/hall"]
+    alone = find_scenes([tmp_path / "area_1" / "hall" / "queries.json"])
+    assert [(scene.name, scene.cloud.parent.name) for scene in alone] == [("hall", "hall")]
+    with pytest.raises(InputError, match="found a second scene named hall"):
+        find_scenes([tmp_path / "area_1", tmp_path / "area_2"])
+
+
+def test_what_lacks_a_field_or_comes_twice_or_is_not_there_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"found no queries\.json in or below it"):
+        find_scenes([tmp_path])
+    assert_refused(r"queries\.json: cannot be read \(No such file", read_scene, tmp_path)
     document = json.loads((_written(tmp_path, ("images/a.jpg", "images/b.jpg")) / "queries.json").read_text())
     del document["queries"][1]["variant"]
     (tmp_path / "queries.json").write_text(json.dumps(document))
-    with pytest.raises(InputError, match=r"queries\[1\] without one of image, variant"):
-        read_scene(tmp_path)
+    assert_refused(r"queries\[1\] without one of image, variant", read_scene, tmp_path)
     document["queries"][1] = document["queries"][0]
     (tmp_path / "queries.json").write_text(json.dumps(document))
-    with pytest.raises(InputError, match="an image twice"):
-        read_scene(tmp_path)
+    assert_refused("an image twice", read_scene, tmp_path)
     with pytest.raises(InputError, match="found a file, wanted a folder with scenes"):
         find_scenes([Path(__file__)])
-
-
-def test_no_scene_is_told(tmp_path):
-    with pytest.raises(InputError, match=r"found no queries\.json in or below it"):
-        find_scenes([tmp_path])
-    with pytest.raises(InputError, match=r"queries\.json: cannot be read \(No such file"):
-        read_scene(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -108,12 +97,10 @@ def test_what_is_no_pose_is_refused(tmp_path, change, message):
     document = json.loads((_written(tmp_path) / "queries.json").read_text())
     document["queries"][0].update(change)
     (tmp_path / "queries.json").write_text(json.dumps(document))
-    with pytest.raises(InputError, match=message):
-        read_scene(tmp_path)
+    assert_refused(message, read_scene, tmp_path)
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"queries": 1}', '{"queries": [1]}', "\xff", "[" * 2000])
 def test_what_is_no_document_is_refused(tmp_path, text):
     (tmp_path / "queries.json").write_bytes(text.encode("latin-1"))
-    with pytest.raises(InputError, match=r"queries\.json: found .*wanted a queries\.json with true poses"):
-        read_scene(tmp_path)
+    assert_refused(r"queries\.json: found .*wanted a queries\.json with true poses", read_scene, tmp_path)

@@ -6,19 +6,9 @@ import numpy as np
 import pytest
 import rooms
 
+from piccolo.coarse_to_fine import search
 from piccolo.coarse_to_fine.query import prepare_query
 from piccolo.coarse_to_fine.scan_map import SEARCH_VIEW
-from piccolo.coarse_to_fine.search import (
-    TurnedPanorama,
-    best_poses,
-    correlate_pairs,
-    masked_correlation,
-    score_poses,
-    score_poses_wide,
-    search_poses,
-    turn_panorama,
-    turned,
-)
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings, Prior
 from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
@@ -64,9 +54,8 @@ def test_what_is_masked_does_not_bleed():
     is_valid[200:] = False
     black, white = panorama.rgb.copy(), panorama.rgb.copy()
     black[200:], white[200:] = 0, 255
-    (a, valid), (b, _) = (
-        _levels(image_pyramid(Panorama(rgb, is_valid), [SCALE])[0]) for rgb in (black, white)
-    )
+    black_and_white = (image_pyramid(Panorama(rgb, is_valid), [SCALE])[0] for rgb in (black, white))
+    (a, valid), (b, _) = map(_levels, black_and_white)
     np.testing.assert_array_equal(a[valid], b[valid])
     assert valid.mean() == pytest.approx(200 / 256, abs=0.02)
 
@@ -77,10 +66,8 @@ def test_images_of_every_scale_have_their_width():
 
 
 def test_samples_along_turned_directions_equal_their_twin():
-    texels, directions = (
-        normalize_panorama(resize(rooms.scene(1)[1], 128), 7.5, 22.0),
-        make_grid(24).directions,
-    )
+    texels = normalize_panorama(resize(rooms.scene(1)[1], 128), 7.5, 22.0)
+    directions = make_grid(24).directions
     channels, is_valid = _levels(texels)
     rotations = uniform_rotations(5).astype(np.float32)
     samples, validity = np.empty((5, 3, len(AREA)), np.float32), np.empty((5, len(AREA)), np.float32)
@@ -94,13 +81,14 @@ def test_samples_along_turned_directions_equal_their_twin():
 
 def test_scores_equal_correlations_one_by_one():
     rng, scan_map = np.random.default_rng(0), rooms.scan_map(1)
-    samples, validity = turn_panorama(_query().images.search, uniform_rotations(50))
+    samples, validity = search.turn_panorama(_query().images.search, uniform_rotations(50))
     validity[:, rng.random(validity.shape[1]) < 0.2] = 0
     samples *= validity[:, None]
-    scores, panorama = score_poses(scan_map, samples, validity), turned(samples, validity, AREA, 1)
+    panorama = search.turned(samples, validity, AREA, 1)
+    scores = search.score_poses(scan_map, samples, validity)
     candidate, rotation = rng.integers(0, len(scores), 40), rng.integers(0, 50, 40)
     pairs, area = np.empty(40, np.float32), np.rint(1000 * AREA / AREA.max())
-    correlate_pairs(scan_map.features, scan_map.is_seen, area, panorama, candidate, rotation, pairs)
+    search.correlate_pairs(scan_map.features, scan_map.is_seen, area, panorama, candidate, rotation, pairs)
     twin = []
     for c, r in zip(candidate, rotation, strict=True):
         w = AREA * scan_map.is_seen[c] * validity[r]
@@ -115,7 +103,7 @@ def test_sums_of_a_search_are_exact():
     """No partial sum of what features and samples can be at most reaches 2^24, so no order changes a bit."""
     for area, most_seen in ((AREA, 1), (averaging(12).sum(axis=0), 255)):
         one = np.ones((1, 3, len(area)), np.float32)
-        panorama = turned(127.5 * one, one[:, 0], area, most_seen)
+        panorama = search.turned(127.5 * one, one[:, 0], area, most_seen)
         assert 127 * panorama.samples.sum(dtype=float) < 2**24
         assert most_seen * panorama.energy.sum(dtype=float) < 2**24
         assert 127 * panorama.samples.sum(dtype=float) > 2**22  # the room is used
@@ -126,21 +114,22 @@ def test_sums_of_a_search_are_exact():
     validity = (rng.random((20, len(AREA))) < 0.8).astype(np.float32)
     features = rng.choice(np.array([-127, 127, 126], np.int8), (50, 3, len(AREA)))
     seen = rng.integers(0, 2, (50, len(AREA)), dtype=np.uint8)
-    panorama = turned(samples * validity[:, None], validity, AREA, 1)
-    expected = masked_correlation(features.reshape(50, -1), seen, AREA, panorama)
+    panorama = search.turned(samples * validity[:, None], validity, AREA, 1)
+    expected = search.masked_correlation(features.reshape(50, -1), seen, AREA, panorama)
     cells, views = rng.permutation(len(AREA)), rng.permutation(50)
-    shuffled = TurnedPanorama(*(values[..., cells] for values in panorama))
+    shuffled = search.TurnedPanorama(*(values[..., cells] for values in panorama))
     features, seen = features[views][..., cells].reshape(50, -1), seen[views][:, cells]
-    np.testing.assert_array_equal(masked_correlation(features, seen, AREA[cells], shuffled), expected[views])
+    found = search.masked_correlation(features, seen, AREA[cells], shuffled)
+    np.testing.assert_array_equal(found, expected[views])
 
 
 @pytest.mark.parametrize("is_wide", [False, True])
 def test_best_score_is_near_the_true_pose(is_wide):
     true_pose, scan_map = rooms.scene(1)[2], rooms.scan_map(1)
     rotations = uniform_rotations(2000) if is_wide else uniform_yaws(48)
-    samples, validity = turn_panorama(_query().images.search, rotations)
-    scores = (score_poses_wide if is_wide else score_poses)(scan_map, samples, validity)
-    candidate, rotation, values = best_poses(scores, 200)
+    samples, validity = search.turn_panorama(_query().images.search, rotations)
+    scores = (search.score_poses_wide if is_wide else search.score_poses)(scan_map, samples, validity)
+    candidate, rotation, values = search.best_poses(scores, 200)
     centers = scan_map.centers[scan_map.sparse] if is_wide else scan_map.centers
     assert (np.diff(values) <= 0).all()
     near = [
@@ -153,14 +142,14 @@ def test_best_score_is_near_the_true_pose(is_wide):
 
 def test_best_poses_are_the_largest_in_order():
     scores = np.random.default_rng(1).normal(size=(400, 600)).astype(np.float32)
-    candidate, rotation, values = best_poses(scores, 100)
+    candidate, rotation, values = search.best_poses(scores, 100)
     np.testing.assert_array_equal(values, np.sort(scores.ravel())[::-1][:100])
     np.testing.assert_array_equal(scores[candidate, rotation], values)
 
 
 def test_tilt_in_the_metadata_is_that_of_every_start():
     """Pitch raises the image centre, roll lowers the camera's right side."""
-    starts = search_poses(_query(GPano(pitch_deg=20.0, roll_deg=10.0)), "known")
+    starts = search.search_poses(_query(GPano(pitch_deg=20.0, roll_deg=10.0)), "known")
     forward, left, _ = starts.R_cam_from_map.transpose(1, 0, 2)
     np.testing.assert_allclose(np.degrees(np.arcsin(forward[:, 2])), 20.0, atol=1e-6)
     assert (left[:, 2] > 0.1).all()
@@ -172,24 +161,22 @@ def test_heading_is_the_worlds_where_the_map_was_levelled(gravity):
     query = _query()
     tilted = dataclasses.replace(query.scan_map, R_map_from_world=exp_so3(np.array([0.4, 0.3, 1.0])))
     settings = dataclasses.replace(query.settings, prior=Prior(heading_deg=70.0, heading_tolerance_deg=20.0))
-    starts = search_poses(dataclasses.replace(query, scan_map=tilted, settings=settings), gravity)
+    starts = search.search_poses(dataclasses.replace(query, scan_map=tilted, settings=settings), gravity)
     forward = (starts.R_cam_from_map @ tilted.R_map_from_world)[:, 0]
     off = np.degrees(np.arctan2(forward[:, 0], forward[:, 1])) - 70.0
     assert len(off) > 0
     assert np.abs(off).max() < 20.0 + 1e-6
 
 
-@pytest.mark.parametrize(
-    ("min_starts", "max_starts", "expected"), [(150, 4000, 150), (150, 20, 20), (1, 4000, None)]
-)
-def test_number_of_starts(min_starts, max_starts, expected):
+@pytest.mark.parametrize(("fewest", "most", "expected"), [(150, 4000, 150), (150, 20, 20), (1, 4000, None)])
+def test_number_of_starts(fewest, most, expected):
     """One for every four candidates, but not fewer and not more than asked for."""
     query = _query()
-    method = query.method._replace(min_starts=min_starts)
-    settings = dataclasses.replace(query.settings, max_starts=max_starts)
+    method = query.method._replace(min_starts=fewest)
+    settings = dataclasses.replace(query.settings, max_starts=most)
     few = dataclasses.replace(query, method=method, settings=settings)
     for gravity in ("known", "unknown"):
-        starts = search_poses(few, gravity)
+        starts = search.search_poses(few, gravity)
         num_candidates = len(query.scan_map.centers)
         assert len(starts.score) == (expected or num_candidates // 4)
         assert (np.diff(starts.score) <= 0).all()

@@ -57,18 +57,16 @@ def test_splat_equals_its_twin_over_seam_and_poles():
     surfels = np.column_stack([center, normal, along, radius**-2.0, distance]).astype(np.float32)
     rgb = rng.integers(0, 256, (300, 3), dtype=np.uint8)
     angles = np.maximum(np.arcsin(radius / distance), MIN_RADIUS_PX * 2 * np.pi / 64)
-    directions = np.stack(
-        [np.arctan2(center[:, 1], center[:, 0]), np.arcsin(center[:, 2] / distance)], axis=1
-    )
+    azimuth, elevation = np.arctan2(center[:, 1], center[:, 0]), np.arcsin(center[:, 2] / distance)
+    directions = np.stack([azimuth, elevation], axis=1)
     depth, sums = np.full((32, 64), np.inf, np.float32), np.zeros((32, 64, 5), np.float32)
     packed = pack_points(center.astype(np.float32), rgb).rgbx
     for lo in (0, 11):  # two strips of rows
         part = slice(lo, 11 if lo == 0 else 32)
         splat(surfels, packed, directions, angles, lo, depth[part], sums[:0])
         splat(surfels, packed, directions, angles, lo, depth[part], sums[part])
-    expected_depth, expected_rgb = naive.splat(
-        surfels.astype(float), rgb, 64, MIN_RADIUS_PX, MAX_SLOPE, BAND, BAND_OFFSET
-    )
+    limits = MIN_RADIUS_PX, MAX_SLOPE, BAND, BAND_OFFSET
+    expected_depth, expected_rgb = naive.splat(surfels.astype(float), rgb, 64, *limits)
     is_seen = sums[..., 4] > 0
     assert 0.3 < is_seen.mean() < 1.0
     # a ray along a disc's rim may hit by one rounding and miss by the other
@@ -200,21 +198,14 @@ def test_points_in_the_air_and_lines_are_no_surface():
     assert (abs(surfels.normals[of_wall, 2]) > 0.999).mean() > 0.99
 
 
-def test_few_points_and_points_at_the_camera_are_drawn():
+def test_few_points_are_drawn_and_pictures_too_large_refused():
     for count in (1, 5, 11, 40):
         cloud = np.zeros((count + 1, 3), np.float32)
         cloud[1:] = [1.0, 0.0, 0.0]
-        picture = render_points(
-            pack_points(cloud, np.full((count + 1, 3), 9, np.uint8)),
-            Pose(np.eye(3), np.zeros(3)),
-            32,
-            WORKERS,
-        )
+        packed = pack_points(cloud, np.full((count + 1, 3), 9, np.uint8))
+        picture = render_points(packed, Pose(np.eye(3), np.zeros(3)), 32, WORKERS)
         assert picture.is_seen.any()
         assert (picture.rgb[picture.is_seen] == 9).all()
-
-
-def test_pictures_too_large_for_a_format_are_refused_by_name():
     with pytest.raises(OSError, match=r"could not be encoded as \.jpg"):
         encode_image(np.zeros((1, 70_000, 3), np.uint8), ".jpg")
 

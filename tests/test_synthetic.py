@@ -61,24 +61,37 @@ def test_cameras_stand_clear_of_everything_in_full_rooms():
             assert (position < 2.0).all()
 
 
-def test_room_without_a_free_place_is_refused():
+def test_room_without_a_free_place_and_an_unknown_variant_are_refused():
     this = make_room(5, SMALL, np.zeros(3))
     full = dataclasses.replace(this, boxes=np.array([[*(SMALL / 2), *(SMALL / 2), 0.0]]))
     with pytest.raises(InputError, match=r"size: .* no place 0\.35 m from everything"):
         free_position(full, np.random.default_rng(0), (1.0, 1.9))
+    with pytest.raises(InputError, match="variant: 'odd' is not one of"):
+        make_query(make_world(0, SMALL), 0, "odd", 128, Workers())
 
 
-def test_points_lie_on_surfaces():
+def test_scan_lies_on_surfaces_inside_the_walls_and_keeps_rooms_apart():
     world = make_world(3, SMALL)
     points, *_ = scan_world(world, 2000, Workers(2))
     distances = [abs(world.rooms[0].clearance(point)) for point in points.astype(float)]
     assert max(distances) < 5 * RANGE_NOISE
+    world = make_world(2, SMALL, num_rooms=2)
+    points, *_ = scan_world(world, 8000, Workers(2))
+    walls = [(r.corner - 0.03, r.corner + r.size + 0.03) for r in world.rooms]
+    inside = [((points > low) & (points < high)).all(axis=1) for low, high in walls]
+    assert (inside[0] | inside[1]).all()
+    assert inside[0].sum() == inside[1].sum() == 4000
 
 
 def test_same_seed_same_bits_at_any_number_of_threads():
     a, b = (scan_world(make_world(1, SMALL), 5000, Workers(n)) for n in (1, 2))
     np.testing.assert_array_equal(a[0], b[0])
     np.testing.assert_array_equal(a[1], b[1])
+    world = make_world(1, SMALL)
+    for variant in VARIANTS:
+        a, b = (make_query(world, 0, variant, 128, Workers(n)) for n in (1, 2))
+        np.testing.assert_array_equal(a.rgb, b.rgb)
+        np.testing.assert_array_equal(a.pose.center_world, b.pose.center_world)
 
 
 def test_rooms_of_equal_size_do_not_look_alike():
@@ -86,16 +99,6 @@ def test_rooms_of_equal_size_do_not_look_alike():
     rooms = [make_room(s, SMALL, np.zeros(3)) for s in range(4)]
     views = [cast_rays(this, SMALL / 2, rays, Workers(), "")[1] for this in rooms]
     assert all(np.abs(a - b).mean() > 0.05 for a, b in combinations(views, 2))
-
-
-def test_scan_stays_inside_the_walls_and_keeps_rooms_apart():
-    world = make_world(2, SMALL, num_rooms=2)
-    points, *_ = scan_world(world, 8000, Workers(2))
-    inside = [
-        ((points > r.corner - 0.03) & (points < r.corner + r.size + 0.03)).all(axis=1) for r in world.rooms
-    ]
-    assert (inside[0] | inside[1]).all()
-    assert inside[0].sum() == inside[1].sum() == 4000
 
 
 @pytest.mark.parametrize("variant", ["clean", "tilt"])
@@ -125,23 +128,10 @@ def test_change_alters_a_part_of_the_sphere_and_photo_all_of_it():
     assert clean.shape == photo.shape == (64, 128, 3)
 
 
-def test_same_query_same_bits_at_any_number_of_threads():
-    world = make_world(1, SMALL)
-    for variant in VARIANTS:
-        a, b = (make_query(world, 0, variant, 128, Workers(n)) for n in (1, 2))
-        np.testing.assert_array_equal(a.rgb, b.rgb)
-        np.testing.assert_array_equal(a.pose.center_world, b.pose.center_world)
-
-
 @pytest.mark.parametrize("size", [1.0, np.inf])
 def test_a_room_of_an_odd_size_is_refused(size):
     with pytest.raises(InputError, match=r"size: \[.*\] is not between"):
         make_world(0, np.array([size, 3.0, 2.4]))
-
-
-def test_an_unknown_variant_is_refused():
-    with pytest.raises(InputError, match="variant: 'odd' is not one of"):
-        make_query(make_world(0, SMALL), 0, "odd", 128, Workers())
 
 
 def test_command_line_writes_a_world_that_reads_back(tmp_path, capsys):
@@ -153,9 +143,8 @@ def test_command_line_writes_a_world_that_reads_back(tmp_path, capsys):
     assert err == ""
     assert len(read_cloud(folder / "cloud.ply").points) == 3000
     document = json.loads((folder / "queries.json").read_text())
-    assert [e["image"] for e in document["queries"]] == [
-        f"images/{v}_{k}.jpg" for v in ("clean", "photo") for k in (0, 1)
-    ]
+    names = [f"images/{v}_{k}.jpg" for v in ("clean", "photo") for k in (0, 1)]
+    assert [e["image"] for e in document["queries"]] == names
     assert all((folder / e["image"]).is_file() for e in document["queries"])
 
 

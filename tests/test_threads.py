@@ -13,9 +13,8 @@ def test_results_come_in_order_and_pass_the_display(num_threads):
         seen.append((total, label))
         return values
 
-    assert list(Workers(num_threads, show).map(lambda i: i * i, range(20), "squares")) == [
-        i * i for i in range(20)
-    ]
+    squares = Workers(num_threads, show).map(lambda i: i * i, range(20), "squares")
+    assert list(squares) == [i * i for i in range(20)]
     assert seen == [(20, "squares")]
 
 

@@ -6,13 +6,7 @@ from scipy.spatial import cKDTree
 
 from piccolo.cloud.stream import Cloud
 from piccolo.cloud.voxels import build_octree
-from piccolo.coarse_to_fine.camera_positions import (
-    candidate_centers,
-    coverage,
-    heights_above_floor,
-    supported_cells,
-    top_surfaces,
-)
+from piccolo.coarse_to_fine import camera_positions
 from piccolo.coarse_to_fine.scan_map import SEARCH_VIEW, render_candidates
 from piccolo.coarse_to_fine.view import ViewConfig, render_view, visible_points
 from piccolo.geometry.sphere import cell_of, make_grid
@@ -67,23 +61,20 @@ def test_points_that_are_seen_lie_at_the_front_and_are_bounded(octree):
     assert (ranges <= nearest[_cells(offsets.T)] * 1.09 + 0.11).mean() > 0.99
 
 
-def test_every_free_place_at_a_cameras_height_has_a_candidate_near(octree):
+def test_candidates_are_near_every_free_place_and_keep_their_distance(octree):
     room, origin = rooms.room(1)[0].rooms[0], rooms.room(1)[1].origin_world
-    centers = candidate_centers(octree, Workers(2)) + origin
+    centers = camera_positions.candidate_centers(octree, Workers(2)) + origin
     rng = np.random.default_rng(0)
     places = room.corner + rng.uniform([0.4, 0.4, 0.8], [*(room.size[:2] - 0.4), 2.0], (300, 3))
     places = [p for p in places if room.clearance(p) > 0.4]
     assert len(places) > 50
     gaps = np.array([np.linalg.norm(centers - p, axis=1).min() for p in places])
     assert gaps.max() < 0.7
-    heights = heights_above_floor(octree, centers - origin)
+    heights = camera_positions.heights_above_floor(octree, centers - origin)
     assert heights.min() > 0.2
     assert np.median(heights) < 2.0
-
-
-def test_candidates_keep_their_distance_from_points(octree):
     tree = cKDTree(octree.level(octree.leaf_size)[:, :3])
-    clearance, _ = tree.query(candidate_centers(octree, Workers(2)))
+    clearance, _ = tree.query(camera_positions.candidate_centers(octree, Workers(2)))
     assert clearance.min() > 0.25 - 0.08  # the width of the voxels that are asked
 
 
@@ -99,20 +90,21 @@ def test_more_must_be_seen_around_a_candidate_than_on_open_land():
     for points, least, most in ((ground, 0.3, 0.55), (hall, 0.55, 1.01)):
         cloud = Cloud(points.astype(np.float32), np.full(points.shape, 99, np.uint8), np.zeros(3))
         octree = build_octree(cloud.voxels(np.eye(3)))
-        fractions = coverage(octree, candidate_centers(octree, Workers(2)), Workers(2))
+        centers = camera_positions.candidate_centers(octree, Workers(2))
+        fractions = camera_positions.coverage(octree, centers, Workers(2))
         assert len(fractions) > 50
         assert least < fractions.min() < most
 
 
 def test_top_surfaces_have_nothing_right_above(octree):
-    surfaces = top_surfaces(octree)
-    cells = supported_cells(surfaces)
+    surfaces = camera_positions.top_surfaces(octree)
+    cells = camera_positions.supported_cells(surfaces)
     assert len(np.unique(cells, axis=0)) == len(cells)
     assert surfaces[:, 2].min() < -1.0  # the floor is among them
 
 
 def test_coverage_is_all_inside_and_little_outside(octree):
-    share = coverage(octree, np.array([[0.3, 0.2, 0.3], [30.0, 0.0, 0.0]]), Workers(1))
+    share = camera_positions.coverage(octree, np.array([[0.3, 0.2, 0.3], [30.0, 0.0, 0.0]]), Workers(1))
     assert share[0] > 0.9
     assert share[1] < 0.2
 

@@ -41,16 +41,10 @@ def test_nearer_wall_hides_the_farther():
 
 def test_range_noise_and_grazing_surfaces_hide_nothing():
     """Behind a point at 0.5 m or at 10 m, as far as a tenth of a metre and 8 % more, and beyond."""
-    for distance, gap, is_seen in (
-        (0.5, 0.13, True),
-        (0.5, 0.15, False),
-        (10.0, 0.89, True),
-        (10.0, 0.91, False),
-    ):
+    for distance, gap, is_seen in ((0.5, 0.13, 1), (0.5, 0.15, 0), (10.0, 0.89, 1), (10.0, 0.91, 0)):
         points = np.array([[distance, 0.01, 0.01], [distance + gap, 0.01, 0.01]], np.float32)
-        assert (
-            len(visible_points(pack_points(points, np.zeros((2, 3), np.uint8)), np.zeros(3))) == 2
-        ) == is_seen
+        visible = visible_points(pack_points(points, np.zeros((2, 3), np.uint8)), np.zeros(3))
+        assert (len(visible) == 2) == is_seen
 
 
 def test_view_shows_the_nearer_wall_in_its_colour():

@@ -21,21 +21,30 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, NamedTuple
 
+import _checkout  # noqa: F401
+
+from piccolo.runtime.kernel_cache import kernel_folder, sources_digest
+
 ROOT = Path(__file__).resolve().parents[1]
 COPIED = ("piccolo", "tests", "tools", "pyproject.toml", "localize.py")
 WHOLE = ("refinement", "coarse_to_fine")
 TESTS = {  # those that matter for a module, the quickest first
     "coarse_to_fine/search.py": ("search", *WHOLE),
     "coarse_to_fine/descent.py": ("descent", *WHOLE),
+    "coarse_to_fine/starts.py": WHOLE,
     "coarse_to_fine/refinement.py": WHOLE,
+    "coarse_to_fine/search_result.py": WHOLE,
     "coarse_to_fine/localize.py": WHOLE,
     "coarse_to_fine/evaluation.py": WHOLE,
     "coarse_to_fine/prior.py": WHOLE,
+    "coarse_to_fine/covariance.py": ("coarse_to_fine_covariance",),
     "confidence/alternatives.py": ("alternatives", "refinement"),
     "confidence/confidence.py": ("confidence",),
     "confidence/covariance.py": ("covariance",),
     "confidence/score.py": ("score",),
+    "geometry/suppression.py": ("suppression", "alternatives", "refinement"),
     "render/zbuffer.py": ("zbuffer", "score", "paper_starts"),
+    "render/free_space.py": ("paper_starts",),
 }
 OPPOSITE: dict[type[ast.AST], type[ast.AST]] = {
     ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
@@ -44,6 +53,7 @@ OPPOSITE: dict[type[ast.AST], type[ast.AST]] = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult,
 }  # fmt: skip
 REMOVABLE = (ast.AugAssign, ast.Expr, ast.If, ast.Break, ast.Continue)
+KEPT_KERNELS = ("-p", "kept_kernels")
 TIMEOUT_S = 400.0  # a test that runs on for ever has noticed, too
 
 
@@ -114,32 +124,36 @@ def mutants(module: str) -> Iterator[Mutant]:
             yield Mutant(module, node.lineno, told, changed.decode(), is_compiled)
 
 
+def fails(names: Sequence[str], folder: Path, *options: str) -> bool:
+    """True if one of these tests fails in a copy of the checkout."""
+    tests = [f"tests/test_{name}.py" for name in names]
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *options, *tests]
+    own = {"PYTHONPATH": str(folder), "XDG_CACHE_HOME": str(folder.parent), "PYTHONDONTWRITEBYTECODE": "1"}
+    limits: dict[str, Any] = {"cwd": folder, "env": os.environ | own, "timeout": TIMEOUT_S}
+    try:
+        return subprocess.run(command, check=False, capture_output=True, **limits).returncode != 0
+    except subprocess.TimeoutExpired:
+        return True
+
+
 def is_caught(mutant: Mutant, folder: Path) -> bool:
     """True if a test fails on the mutant in a copy of the checkout."""
     path = folder / "piccolo" / mutant.module
     original = path.read_text()
     path.write_text(mutant.source)
-    tests = [f"tests/test_{name}.py" for name in TESTS[mutant.module]]
-    plugin = [] if mutant.is_kernel else ["-p", "kept_kernels"]
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *plugin, *tests]
-    environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
-    limits: dict[str, Any] = {"cwd": folder, "env": environment, "timeout": TIMEOUT_S}
     try:
-        done = subprocess.run(command, check=False, capture_output=True, **limits)
-        return done.returncode != 0
-    except subprocess.TimeoutExpired:
-        return True
+        return fails(TESTS[mutant.module], folder, *([] if mutant.is_kernel else KEPT_KERNELS))
     finally:
         path.write_text(original)
 
 
 def checkout_copy(folder: Path) -> Path:
-    """A copy of the checkout in which kernels can be told to stay as they were compiled."""
+    """A copy of the checkout in which kernels can be told to stay as they were compiled for the checkout."""
     folder.mkdir()
     for name in COPIED:
         (shutil.copytree if (ROOT / name).is_dir() else shutil.copy)(ROOT / name, folder / name)
-    plugin = "from piccolo.runtime import kernel_cache\nkernel_cache.sources_digest = lambda: 'kept'\n"
-    (folder / "kept_kernels.py").write_text(plugin)
+    digest = f"kernel_cache.sources_digest = lambda: {sources_digest()!r}\n"
+    (folder / "kept_kernels.py").write_text(f"from piccolo.runtime import kernel_cache\n{digest}")
     return folder
 
 
@@ -149,6 +163,12 @@ def try_all(chosen: Sequence[Mutant], num_jobs: int) -> int:
         folders: SimpleQueue[Path] = SimpleQueue()
         for k in range(num_jobs):
             folders.put(checkout_copy(Path(temporary) / str(k)))
+        shutil.copytree(
+            kernel_folder() or sys.exit("no folder for kernels"), Path(temporary) / "piccolo" / "kernels"
+        )
+        names = sorted({name for mutant in chosen for name in TESTS[mutant.module]})
+        if fails(names, Path(temporary) / "0", *KEPT_KERNELS):
+            sys.exit(f"the tests fail without a mutant: {' '.join(names)}")
 
         def tried(mutant: Mutant) -> bool:
             folder = folders.get()

@@ -60,7 +60,7 @@ def least_constrained_direction(covariance_up: Array, covariance: Array, offsets
 
 def _is_corridor(direction: Array, offsets: NDArray[np.float32]) -> bool:
     """True if what is seen (3, N), z up, lies much farther away along a direction (3,) than across it."""
-    along = direction[:2] / max(float(np.linalg.norm(direction[:2])), 1e-12)
+    along = direction[:2]  # not of length 1, which scales reach and width alike
     walls = offsets[:2, np.abs(offsets[2]) < BAND * np.linalg.norm(offsets, axis=0)]
     if walls.shape[1] == 0:
         return False
