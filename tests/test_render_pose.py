@@ -126,7 +126,7 @@ def test_a_descent_is_shown_with_where_it_ended(run, scene, tmp_path, monkeypatc
     [
         (["--at", 0, 0, 1], "give --out, --animate or both"),
         (["--at", 0, 0, 1, "--out", "a.png", "--width", 101], "--width 101: wanted an even number"),
-        (["--at", 0, 0, 1, "--out", "a.bmp"], "--out a.bmp: wanted .png, .jpg"),
+        (["--at", 0, 0, 1, "--out", "a.bmp"], "--out a.bmp: wanted a name that ends with .png, .jpg"),
         (["--at", 0, 0, 1, "--out", "a.png", "--depth", "a.exr"], "--depth a.exr: wanted"),
         (["--at", 0, 0, 1, "--out", "a", "--depth", "a.png"], "work with a single picture only"),
         (["--at", 0, 0, "nan", "--out", "a.png"], "must be finite"),
@@ -149,7 +149,7 @@ def test_bad_input_leaves_nothing(run, scene, tmp_path):
         ([*result, "--out", tmp_path / "a.png"], "2 poses; choose one"),
         ([*result, "--pano", "x.jpg", "--out", tmp_path / "a.png"], "no pose of x.jpg"),
         ([*result, "--out", scene], "found a folder that is not empty"),
-        ([*result, "--out", tmp_path / "no" / "a.png"], "found no folder"),
+        (["--at", 0, 0, 1, "--out", tmp_path / "no" / "a.png"], "found no folder"),
         (["--pose", tmp_path / "T.txt", "--out", tmp_path / "a.png"], "wanted the 4 x 4 numbers"),
         (["--pose", tmp_path / "no.txt", "--out", tmp_path / "a.png"], "no.txt"),
         (["--at", 0, 0, 1e30, "--out", tmp_path / "a.png"], "found a camera at [0.0, 0.0, 1e+30]"),

@@ -15,6 +15,7 @@ from ..scenes.datasets.writing import write_scene
 from ..scenes.scene import read_scene
 from .command import option
 from .errors import EXIT_BAD_INPUT, UsageError, print_error, print_note, run_command
+from .outputs import check_folder_name
 from .parser import HelpFormatter, add_run_options, new_parser
 from .progress import progress_bar
 
@@ -95,6 +96,7 @@ def run(arguments: argparse.Namespace) -> int:
     for name in ("check", "seed"):
         if getattr(arguments, name, 0) < 0:
             raise UsageError(f"--{name}: found {getattr(arguments, name)}, wanted 0 or more")
+    check_folder_name("--out", arguments.out)
     found = DATASETS[arguments.dataset].list_scenes(convert_options_from(arguments))
     specs = chosen(found.specs, arguments.rooms)
     for note in found.notes:

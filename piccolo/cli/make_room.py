@@ -24,6 +24,7 @@ from ..scenes.synthetic.world import (
 )
 from .command import command, option
 from .errors import UsageError, checking_options
+from .outputs import check_folder_name
 from .progress import progress_bar
 
 EPILOG = """\
@@ -81,6 +82,7 @@ def main(arguments: argparse.Namespace) -> int:
     """Make and write all scenes."""
     if min(arguments.panoramas, arguments.seed, arguments.scenes) < 0:
         raise UsageError("--panoramas, --seed, --scenes: found a negative number, wanted 0 or more")
+    check_folder_name("--out", arguments.out)
     workers = Workers(num_cores(), progress_bar(arguments.quiet))
     for number in range(max(1, arguments.scenes)):
         with checking_options():

@@ -10,9 +10,10 @@ from collections.abc import Iterable, Sequence
 from decimal import Decimal
 from pathlib import Path
 
+from ...errors import InputError
 from ...geometry.camera_axes import CAMERA_AXES, heading_pitch_roll_deg, turned
 from ...geometry.pose import T_world_from_cam, quaternion_wxyz
-from ...runtime.atomic import write_atomically
+from ...runtime.atomic import is_stream, write_atomically
 from .posed_images import Format, Options, PosedImage
 
 COLUMNS = (
@@ -39,11 +40,17 @@ def write_lines(out: Path, lines: Sequence[str]) -> None:
     write_atomically(out, "".join(f"{line}\n" for line in lines).encode())
 
 
+def offset_file(out: Path) -> Path:
+    """The file of the offset beside one that has no place for it."""
+    return out.with_name(f"{out.name}.offset.txt")
+
+
 def write_offset_beside(out: Path, options: Options) -> None:
     """Write <name>.offset.txt with the offset's three numbers, if there is an offset."""
     if options.offset is not None:
-        lines = [*offset_comment(options), numbers(options.offset)]
-        write_lines(out.with_name(f"{out.name}.offset.txt"), lines)
+        if is_stream(out):
+            raise InputError(f"--offset: nothing can be written beside {out}, wanted a file as --out")
+        write_lines(offset_file(out), [*offset_comment(options), numbers(options.offset)])
 
 
 def write_csv(images: Sequence[PosedImage], out: Path, options: Options) -> None:
