@@ -70,8 +70,7 @@ def run_command(
     except UsageError as error:
         return print_error(arguments, str(error), EXIT_BAD_USAGE)
     except (OSError, InputError) as error:
-        if isinstance(error, OSError) and not error.filename:  # it may be of stdout: no second try at exit
-            discard_stdout()
+        discard_stdout()
         if isinstance(error, BrokenPipeError) and not error.filename:  # stdout's reader has gone: say nothing
             return EXIT_BROKEN_PIPE
         return print_error(arguments, format_error(error), EXIT_BAD_INPUT)
@@ -80,7 +79,7 @@ def run_command(
 
 
 def discard_stdout() -> None:
-    """Drop what could not be written to stdout."""
+    """Drop what can't be written to stdout, so that it is not tried again at exit."""
     try:
         if sys.stdout:
             sys.stdout.flush()

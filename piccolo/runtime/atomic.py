@@ -94,7 +94,7 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
     the new one; its other hard links keep the old content. What is_stream gets the whole content at the end.
     """
     if is_stream(path):
-        with tempfile.TemporaryFile() as file:
+        with _naming(path), tempfile.TemporaryFile() as file:
             yield file
             file.seek(0)
             _write_stream(path, file)
@@ -130,11 +130,11 @@ def _keep_owner(handle: int, old: os.stat_result) -> None:
 def _write_stream(path: Path, file: IO[bytes]) -> None:
     """Copy a file to stdout, a FIFO (which waits for a reader) or a device."""
     if not is_stdout(path):
-        with _naming(path), path.open("wb") as stream:
+        with path.open("wb") as stream:
             shutil.copyfileobj(file, stream)
         return
     if sys.stdout is None:
-        raise OSError(errno.EBADF, os.strerror(errno.EBADF), str(path))
+        raise InputError(f"{path}: found a closed stdout, wanted an open one or a file")
     sys.stdout.flush()
     shutil.copyfileobj(file, sys.stdout.buffer)
     sys.stdout.buffer.flush()
@@ -142,12 +142,16 @@ def _write_stream(path: Path, file: IO[bytes]) -> None:
 
 @contextmanager
 def _naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
-    """Within this, the system's error while `path` is written names it, and nothing temporary."""
+    """Within this, the system's error while `path` is written names it, and nothing temporary.
+
+    That stdout's reader has gone stays an error without a name, as where `print` finds it out.
+    """
     try:
         yield
     except OSError as error:
         named = [Path(str(name)) for name in (error.filename, error.filename2) if name is not None]
-        is_bare = not named and error.errno in WRITE_ERRORS
+        is_closed = error.errno == errno.EPIPE and is_stdout(path)
+        is_bare = not named and not is_closed and error.errno in WRITE_ERRORS
         if is_bare or (temporary and any(name.is_relative_to(temporary) for name in named)):
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
