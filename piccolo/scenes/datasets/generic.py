@@ -51,7 +51,7 @@ def _list_of(options: ConvertOptions) -> Path:
     if len(found) != 1:
         wanted = f"wanted one of {', '.join(LISTS)}, or --poses"
         raise InputError(f"{options.folder}: found {len(found)} lists, {wanted}")
-    return found[0]
+    return options.inside(found[0])
 
 
 def _rows(path: Path, options: ConvertOptions, notes: list[str]) -> Iterator[Row]:
@@ -103,7 +103,7 @@ def _trajectory(path: Path, options: ConvertOptions, notes: list[str]) -> list[d
             raise InputError(f"{path}: found {found!r}, wanted {' '.join(TUM_COLUMNS)} a line")
         row = dict(zip(TUM_COLUMNS, fields, strict=True))
         if row["timestamp"] in pictures:
-            image = str(pictures[row["timestamp"]].resolve())
+            image = str(pictures[row["timestamp"]].absolute())
             rows.append({**row, "image": image, "direction": WORLD_FROM_CAM})
     if len(rows) < len(lines):
         notes.append(f"{path}: {len(lines) - len(rows)} of {len(lines)} times without a picture")

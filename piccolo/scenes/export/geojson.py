@@ -14,6 +14,8 @@ from ...runtime.optional import import_optional
 from .posed_images import Format, Options, PosedImage
 
 STEP = 10.0  # [m] ahead, to find true north
+MARGIN_DEG = 3.0  # around a system's area: a country that spans two zones often uses one for both
+LOCAL = 10_000.0  # [m] from (0, 0): without a margin, as scans with coordinates of their own lie there
 
 
 def write(images: Sequence[PosedImage], out: Path, options: Options) -> None:
@@ -21,14 +23,17 @@ def write(images: Sequence[PosedImage], out: Path, options: Options) -> None:
     pyproj = import_optional("GeoJSON", "pyproj", "tools")
     if options.crs is None:
         raise InputError("--crs: not given, wanted the cloud's coordinate system, such as EPSG:25832")
-    transformer = _transformer(pyproj, options.crs)
+    system = _system(pyproj, options.crs)
+    transformer = pyproj.Transformer.from_crs(system, "EPSG:4326", always_xy=True)
+    for image in images:
+        _check_place(image, system, transformer, options.crs)
     features = [_feature(image, transformer, pyproj.Geod(ellps="WGS84"), options.crs) for image in images]
     document = {"type": "FeatureCollection", "features": features}
     write_atomically(out, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
 
 
-def _transformer(pyproj: Any, crs: str) -> Any:
-    """From the cloud's coordinates to longitude and latitude."""
+def _system(pyproj: Any, crs: str) -> Any:
+    """The cloud's coordinate system, with axes in metres."""
     try:
         system = pyproj.CRS.from_user_input(crs)
     except pyproj.exceptions.CRSError as error:
@@ -36,7 +41,32 @@ def _transformer(pyproj: Any, crs: str) -> Any:
     units = {axis.unit_name for axis in system.axis_info[:2]}
     if not system.is_projected or units != {"metre"}:
         raise InputError(f"--crs: found {crs} ({system.name}), wanted a projected system in metres")
-    return pyproj.Transformer.from_crs(system, "EPSG:4326", always_xy=True)
+    return system
+
+
+def _check_place(image: PosedImage, system: Any, transformer: Any, crs: str) -> None:
+    """Refuse a camera outside of the area where the system is used, as far as the system says it."""
+    x, y = image.pose.center_world[:2].tolist()
+    longitude, latitude = transformer.transform(x, y)
+    parts = [system, *system.sub_crs_list]  # a system with a height says it of its parts
+    area = next((part.area_of_use for part in parts if part.area_of_use), None)
+    if not np.isfinite([longitude, latitude]).all() or (area and not _is_in(area, longitude, latitude, x, y)):
+        name = (
+            f"{system.name}, {area.west:g} to {area.east:g} E, {area.south:g} to {area.north:g} N"
+            if area
+            else system.name
+        )
+        raise InputError(
+            f"{image.path}: found a camera at ({x:g}, {y:g}), wanted one where {crs} holds ({name})"
+        )
+
+
+def _is_in(area: Any, longitude: float, latitude: float, x: float, y: float) -> bool:
+    """True if a place [deg], (x, y) [m] in the system, is in its area with a margin; some cross 180 E."""
+    margin = 0.0 if np.hypot(x, y) < LOCAL else MARGIN_DEG
+    width = 360.0 if area.east - area.west >= 360.0 else (area.east - area.west) % 360.0
+    is_between = (longitude - area.west + margin) % 360.0 <= width + 2.0 * margin
+    return bool(is_between and area.south - margin <= latitude <= area.north + margin)
 
 
 def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[str, object]:
@@ -48,8 +78,6 @@ def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[s
     longitudes, latitudes = transformer.transform(
         [x, x + STEP * np.sin(ahead)], [y, y + STEP * np.cos(ahead)]
     )
-    if not np.isfinite([*longitudes, *latitudes]).all():
-        raise InputError(f"{image.path}: found a camera at ({x}, {y}), wanted one where {crs} holds")
     true_heading, _, _ = geod.inv(longitudes[0], latitudes[0], longitudes[1], latitudes[1])
     properties = {"image": image.name, "cloud": result.cloud_name, "status": result.status}
     properties |= {"confidence": result.confidence, "score": result.evidence and result.evidence.score}
