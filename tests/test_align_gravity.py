@@ -276,3 +276,14 @@ def test_bad_input(run, tilted, tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may write everywhere
     refuse(out, "--cloud", tilted, "--out", out)
     assert not out.exists()
+
+
+def test_a_cloud_on_stdout_and_nothing_beside_it(tilted, tmp_path, capfdbinary):
+    out = tmp_path / "out.ply"
+    assert align_gravity.main(["--cloud", str(tilted), "--up", "z", "--out", str(out)]) == 0
+    capfdbinary.readouterr()
+    assert align_gravity.main(["--cloud", str(tilted), "--up", "z", "--out", "-", "--quiet"]) == 0
+    assert capfdbinary.readouterr() == (out.read_bytes(), b"")
+    assert align_gravity.main(["--cloud", str(tilted), "--out", "-", "--queries", "q.json"]) == 2
+    assert b"--queries: nothing can be written beside --out -" in capfdbinary.readouterr().err
+    assert not Path("-.json").exists()

@@ -178,3 +178,26 @@ def test_help_runs():
     command = [sys.executable, ROOT / "tools" / "render_pose.py", "--help"]
     text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     assert "--mask-out" in text
+
+
+def test_pictures_on_stdout_are_those_of_files(scene, tmp_path, capfdbinary):
+    arguments = ["--cloud", str(scene / "cloud.ply"), "--at", "3", "2", "1", "--width", "64", "--out"]
+    depth = ["--depth", str(tmp_path / "depth.png")]
+    assert render_pose.main([*arguments, str(tmp_path / "a.png"), *depth, "--quiet"]) == 0
+    capfdbinary.readouterr()
+    before = (tmp_path / "depth.png").read_bytes()
+    assert render_pose.main([*arguments, "-", *depth, "--quiet"]) == 0
+    assert capfdbinary.readouterr() == ((tmp_path / "a.png").read_bytes(), b"")
+    assert render_pose.main([*arguments, str(tmp_path / "b.png"), "--depth", "-", "--quiet"]) == 0
+    assert capfdbinary.readouterr() == (before, b"")
+    assert render_pose.main([*arguments, "-", "--depth", "/dev/stdout", "--quiet"]) == 2
+    pano = [
+        "--cloud",
+        str(scene / "cloud.ply"),
+        "--queries",
+        str(scene / "queries.json"),
+        "--pano",
+        "clean_0.jpg",
+    ]
+    assert render_pose.main([*pano, "--out", str(scene / "images" / "clean_0.jpg")]) == 2
+    assert b"found an input as the output" in capfdbinary.readouterr().err
