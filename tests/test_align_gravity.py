@@ -249,8 +249,8 @@ def test_true_poses_go_along(run, tilted, tmp_path):
         ("--apply T.json --out o.ply --up -y", "--up can't be combined with --apply"),
         ("--min-confidence 1.5", "--min-confidence"),
         ("--scale -1", "--scale"),
-        ("--out o.json", "o.json: --out must be a PLY file"),
-        ("--out o.ply --transform T.txt", "--transform end with .json"),
+        ("--out o.json", "--out o.json: wanted a name that ends with .ply"),
+        ("--out o.ply --transform T.txt", "--transform T.txt: wanted a name that ends with .json"),
     ],
 )
 def test_wrong_usage(run, tilted, arguments, message):
@@ -263,16 +263,27 @@ def test_bad_input(run, tilted, tmp_path, monkeypatch):
     (tmp_path / "T.json").write_text("{}")
     out, missing = tmp_path / "o.ply", tmp_path / "none.json"
 
-    def refuse(named, *arguments):
-        code, report, err = run(*arguments)
-        assert (code, report, err.count("\n")) == (3, None, 1), arguments
+    def refuse(named, *arguments, code=3):
+        found, report, err = run(*arguments)
+        assert (found, report, err.count("\n")) == (code, None, 1), arguments
         assert str(named) in err
 
     refuse(tmp_path / "none.ply", "--cloud", tmp_path / "none.ply", "--out", out)
-    refuse(tilted, "--cloud", tilted, "--out", tilted)
+    refuse(tilted, "--cloud", tilted, "--out", tilted, code=2)
     refuse(tmp_path / "no", "--cloud", tilted, "--out", tmp_path / "no" / "o.ply")
     refuse(tmp_path / "T.json", "--cloud", tilted, "--out", out, "--apply", tmp_path / "T.json")
     refuse(missing, "--cloud", tilted, "--out", out, "--apply", missing)
     monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may write everywhere
     refuse(out, "--cloud", tilted, "--out", out)
     assert not out.exists()
+
+
+def test_a_cloud_on_stdout_and_nothing_beside_it(tilted, tmp_path, capfdbinary):
+    out = tmp_path / "out.ply"
+    assert align_gravity.main(["--cloud", str(tilted), "--up", "z", "--out", str(out)]) == 0
+    capfdbinary.readouterr()
+    assert align_gravity.main(["--cloud", str(tilted), "--up", "z", "--out", "-", "--quiet"]) == 0
+    assert capfdbinary.readouterr() == (out.read_bytes(), b"")
+    assert align_gravity.main(["--cloud", str(tilted), "--out", "-", "--queries", "q.json"]) == 2
+    assert b"--queries: nothing can be written beside --out -" in capfdbinary.readouterr().err
+    assert not Path("-.json").exists()

@@ -1,18 +1,41 @@
 import os
+import signal
+import subprocess
+import sys
+import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from piccolo.cli.errors import UsageError, run_command
+from piccolo.cli.outputs import check_distinct, check_outputs, check_suffix
+from piccolo.cli.parser import add_run_options, new_parser
 from piccolo.errors import InputError
-from piccolo.runtime.atomic import check_output, write_atomically
+from piccolo.geometry.pose import Pose
+from piccolo.runtime import atomic
+from piccolo.runtime.atomic import (
+    check_output,
+    check_output_folder,
+    replacing,
+    replacing_folder,
+    write_atomically,
+)
+from piccolo.scenes.scene import Query, write_queries
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
 
 
 def test_content_replaces_and_nothing_else_is_left(tmp_path):
-    path = tmp_path / "with space.json"
+    path = tmp_path / ("with space " + "ä" * 110)  # 231 of the 255 bytes that a name may have
     path.write_bytes(b"old")
     write_atomically(path, b"new")
     assert path.read_bytes() == b"new"
-    assert [p.name for p in tmp_path.iterdir()] == ["with space.json"]
+    assert names(tmp_path) == [path.name]
 
 
 def test_failure_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
@@ -26,26 +49,184 @@ def test_failure_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="disk"):
         write_atomically(path, b"new")
     assert path.read_bytes() == b"old"
-    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
+    assert names(tmp_path) == ["a.json"]
 
 
-def test_permissions_follow_the_umask(tmp_path):
+def test_permissions_follow_the_umask_or_the_file_that_is_replaced(tmp_path):
+    private, shared = tmp_path / "private", tmp_path / "shared"
+    for path, mode in ((private, 0o600), (shared, 0o664)):
+        path.touch()
+        path.chmod(mode)
     before = os.umask(0o027)
     try:
-        write_atomically(tmp_path / "a", b"")
+        for path, mode in ((tmp_path / "new", 0o640), (private, 0o600), (shared, 0o664)):
+            write_atomically(path, b"x")
+            assert path.stat().st_mode & 0o777 == mode
     finally:
         os.umask(before)
-    assert (tmp_path / "a").stat().st_mode & 0o777 == 0o640
 
 
-def test_outputs_that_can_not_be_are_refused(tmp_path):
-    source = tmp_path / "in.jpg"
+@pytest.mark.skipif(os.getuid() != 0, reason="only root may give files away")
+def test_the_owner_stays(tmp_path):
+    path = tmp_path / "a"
+    path.touch()
+    os.chown(path, 1234, 1235)
+    write_atomically(path, b"x")
+    assert (path.stat().st_uid, path.stat().st_gid) == (1234, 1235)
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_link_stays_and_its_target_is_replaced(tmp_path, is_there):
+    for name in ("links", "files"):
+        (tmp_path / name).mkdir()
+    link, second, target = tmp_path / "links" / "a", tmp_path / "links" / "b", tmp_path / "files" / "a"
+    link.symlink_to("b")
+    second.symlink_to("../files/a")
+    if is_there:
+        target.write_bytes(b"old")
+    check_output(link)
+    write_atomically(link, b"new")
+    assert (str(link.readlink()), str(second.readlink())) == ("b", "../files/a")
+    assert target.read_bytes() == b"new"
+    assert not target.is_symlink()
+    assert (names(tmp_path / "links"), names(tmp_path / "files")) == (["a", "b"], ["a"])
+    folder = tmp_path / "links" / "folder"
+    folder.symlink_to(tmp_path / "files" / "made")
+    check_output_folder(folder)
+    with replacing_folder(folder) as unfinished:
+        (unfinished / "x").touch()
+    assert folder.is_symlink()
+    assert names(tmp_path / "files" / "made") == ["x"]
+
+
+def test_a_fifo_is_written_to_and_stays(tmp_path):
+    fifo, read = tmp_path / "fifo.json", []
+    os.mkfifo(fifo)
+    reader = threading.Thread(target=lambda: read.append(fifo.read_bytes()))
+    reader.start()
+    check_output(fifo)
+    write_atomically(fifo, b"new" * 100_000)
+    reader.join()
+    assert read == [b"new" * 100_000]
+    assert fifo.is_fifo()
+    assert names(tmp_path) == ["fifo.json"]
+
+
+@pytest.mark.parametrize("name", ["-", "/dev/stdout"])
+def test_stdout_gets_bytes(name, capfdbinary):
+    check_output(Path(name))
+    sys.stdout.write("before\n")
+    write_atomically(Path(name), b"\0\xff")
+    assert capfdbinary.readouterr().out == b"before\n\0\xff"
+    assert not Path("-").exists()
+
+
+@pytest.mark.parametrize(("redirection", "found"), [("> out", "1\n2\n3\n"), (">&-", "found a closed stdout")])
+def test_stdout_redirected_keeps_what_is_printed_around_it(tmp_path, redirection, found):
+    code = "from piccolo.runtime.atomic import *; print(1); write_atomically(Path('-'), b'2\\n'); print(3)"
+    command = f'cd "{tmp_path}" && PYTHONPATH="{ROOT}" "{sys.executable}" -c "{code}" {redirection}'
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    assert found in ((tmp_path / "out").read_text() if "out" in redirection else done.stderr)
+
+
+def test_devices_are_written_to_and_a_full_one_is_named():
+    before = Path("/dev/null").stat().st_rdev
+    write_atomically(Path("/dev/null"), b"x")
+    assert Path("/dev/null").stat().st_rdev == before
+    with pytest.raises(OSError, match=r"No space left on device: '/dev/full'"):
+        write_atomically(Path("/dev/full"), b"x")
+    assert Path("/dev/full").is_char_device()
+
+
+@pytest.mark.parametrize(
+    ("out", "reason"), [("link.csv", "File too large"), ("-", "No space left on device")]
+)
+def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, out, reason):
+    """A limit to the size of files stands for the disk, /dev/full for stdout."""
+    (tmp_path / "p.csv").write_bytes(b"old")
+    (tmp_path / "link.csv").symlink_to("p.csv")
+    (tmp_path / "r").mkdir()
+    write_queries(tmp_path / "r", [Query(tmp_path / "r" / "a.jpg", "v", Pose(np.eye(3), np.zeros(3)))])
+    tool = f'"{sys.executable}" "{ROOT}/tools/export_poses.py" --scenes r --format csv'
+    command = f"(ulimit -f {1 if out == '-' else 0}; {tool} --out {out} > /dev/full)"
+    done = subprocess.run(["bash", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False)
+    line = f"export_poses.py: {out}: cannot be used ({reason})\n"
+    assert (done.returncode, done.stderr) == (3, line)
+    assert (tmp_path / "p.csv").read_bytes() == b"old"
+    assert names(tmp_path) == ["link.csv", "p.csv", "r"]
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_leaves_nothing(tmp_path, number, code):
+    def run(arguments):
+        with replacing_folder(tmp_path / "folder") as folder, replacing(folder / "a") as file:
+            file.write(b"half")
+            signal.raise_signal(number)
+        return 0
+
+    parser = new_parser("prepare_map", None, "")
+    add_run_options(parser)
+    before = [signal.signal(signal.SIGINT, signal.default_int_handler), signal.getsignal(signal.SIGTERM)]
+    try:
+        assert run_command(parser, [], run) == code
+        assert signal.getsignal(signal.SIGTERM) is before[1]
+    finally:
+        signal.signal(signal.SIGINT, before[0])
+    assert not names(tmp_path)
+
+
+def test_outputs_that_can_not_be_are_refused(tmp_path, monkeypatch):
+    source, loop = tmp_path / "in.jpg", tmp_path / "loop"
     source.write_bytes(b"x")
-    with pytest.raises(InputError, match="found no folder"):
-        check_output(tmp_path / "no" / "a.json", [])
-    with pytest.raises(InputError, match="found a folder"):
-        check_output(tmp_path, [])
-    with pytest.raises(InputError, match="an input as the output"):
-        check_output(tmp_path / "." / "in.jpg", [source])
-    check_output(tmp_path / "new.json", [source])
-    assert not (tmp_path / "new.json").exists()
+    loop.symlink_to("loop")
+    (tmp_path / "dangling").symlink_to("no/a")
+    for path, message in (
+        (tmp_path / "no" / "a.json", "found no folder"),
+        (tmp_path / "dangling", "found no folder"),
+        (tmp_path, "found a folder"),
+        (loop, "found a link that leads to itself"),
+    ):
+        with pytest.raises(InputError, match=message):
+            check_output(path)
+    with pytest.raises(InputError, match="found stdout or a device, wanted a folder"):
+        check_output_folder(Path("/dev/null"))
+    with pytest.raises(InputError, match="that leads to itself"):
+        write_atomically(loop, b"")
+    check_output(tmp_path / "new.json")
+    monkeypatch.setattr(atomic.os, "access", lambda path, mode: path not in (source, Path("/dev/full")))
+    for path in (source, Path("/dev/full")):
+        with pytest.raises(InputError, match="write permission"):
+            check_output(path)
+    assert names(tmp_path) == ["dangling", "in.jpg", "loop"]
+
+
+def test_two_outputs_that_are_one_and_inputs_are_refused(tmp_path):
+    new, there, folder = tmp_path / "new.png", tmp_path / "there.png", tmp_path / "photos"
+    folder.mkdir()
+    for path in (there, folder / "mask.png", folder / "poses.jsonl"):
+        path.touch()
+    (tmp_path / "hard.png").hardlink_to(there)
+    (tmp_path / "soft.png").symlink_to(new)
+    for first, second in (
+        (new, tmp_path / "photos" / ".." / "new.png"),
+        (new, tmp_path / "soft.png"),
+        (there, tmp_path / "hard.png"),
+        (Path("-"), Path("-")),
+        (Path("-"), Path("/dev/stdout")),
+        (tmp_path / "frames", tmp_path / "frames" / "a.png"),
+    ):
+        for pair in ((first, second), (second, first)):
+            with pytest.raises(UsageError, match="found the same output as --out for --depth, wanted two"):
+                check_distinct(dict(zip(("--out", "--depth"), pair, strict=True)))
+    for output, source in ((there, tmp_path / "hard.png"), (folder / "mask.png", folder)):
+        with pytest.raises(UsageError, match="found an input as the output, wanted another name"):
+            check_outputs({"--out": new, "--depth": output}, [tmp_path / "none", source])
+    nothing = Path("/dev/null")
+    check_outputs(
+        {"a": new, "b": folder / "poses.jsonl", "c": nothing, "d": nothing, "e": None}, [folder, there]
+    )
+    check_suffix("--overlay", nothing, (".png",))
+    check_suffix("--overlay", Path("A.PNG"), (".png",))
+    for name in ("x.jpg", "x", ".png"):
+        with pytest.raises(UsageError, match=rf"--overlay {name}: wanted a name that ends with \.png"):
+            check_suffix("--overlay", Path(name), (".png",))

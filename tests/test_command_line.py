@@ -105,7 +105,7 @@ def test_no_file_of_a_cloud_is_overwritten(scene, capsys):
     before = second.read_bytes()
     assert localize.main([*_cloud(scene, 0, 1), "--pano", "b.jpg", "--out", str(second)]) == 3
     assert "an input as the output" in capsys.readouterr().err
-    assert prepare_map.main([*_cloud(scene, 0, 1), "--out", str(second)]) == 3
+    assert prepare_map.main([*_cloud(scene, 0, 1), "--out", str(second)]) == 2
     assert second.read_bytes() == before
 
 

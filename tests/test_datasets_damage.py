@@ -87,6 +87,32 @@ def test_damaged_files_are_read_or_refused(dataset, data):
         assert np.linalg.det(pose.R_cam_from_world) == pytest.approx(1.0)
 
 
+def test_a_link_out_of_the_folder_is_refused_and_one_within_followed(dataset, tmp_path):
+    name, folder, path, content = dataset
+    path.write_bytes(content)
+    root, outside = tmp_path / "root", tmp_path / "outside"
+    root.symlink_to(folder)  # may be a link itself
+    for file in sorted(file for file in folder.rglob("*") if file.is_file()):
+        for target, is_within in ((folder / "kept", True), (outside, False)):
+            file.rename(target)
+            file.symlink_to(target)
+            try:
+                poses, message = read_or_refused(lambda _: read_poses(name, root), file.name)
+            finally:
+                target.rename(file)
+            assert bool(poses) == is_within, file
+            assert is_within or f"leads to {outside}, out of" in message
+    top = folder / path.relative_to(folder).parts[0]
+    if top.is_dir():
+        top.rename(outside)
+        top.symlink_to(outside)
+        try:
+            assert f"leads to {outside}/" in read_or_refused(lambda _: read_poses(name, root), "")[1]
+        finally:
+            top.unlink()
+            outside.rename(top)
+
+
 ODD = ("1e999", "-1e300", "1" + "0" * 400, "9" * 5000, "NaN", "[[[[]]]]", "null", '"x"')
 
 

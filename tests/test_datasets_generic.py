@@ -150,6 +150,19 @@ def test_refused_lists_and_clouds(folder, tmp_path, capsys):
     assert "found no list of objects" in made.run(capsys, "generic", folder, out, "--poses", no_list)[2]
 
 
+def test_files_elsewhere_are_read_only_where_an_option_names_them(folder, tmp_path, capsys):
+    row = {**rows_of(folder)[0], "image": str(folder / "images" / "100.5.png")}
+    (tmp_path / "lists").mkdir()
+    write_csv(tmp_path / "lists" / "poses.csv", [row])
+    lists, out = tmp_path / "lists", tmp_path / "out"
+    scan = folder / "scan.xyz"
+    message = f"leads to {row['image']}, out of {lists}; move or copy"
+    made.assert_refused(message, capsys, "generic", lists, out, "--cloud", scan)
+    options = ("--cloud", scan, "--images", folder / "images")
+    assert made.run(capsys, "generic", lists, out, *options)[0] == 0
+    assert made.run(capsys, "generic", folder, out, "--poses", lists / "poses.csv")[0] == 0
+
+
 def test_a_table_of_exported_poses_comes_back(folder, tmp_path, capsys):
     write_csv(folder / "poses.csv", rows_of(folder))
     assert made.run(capsys, "generic", folder, tmp_path / "first")[0] == 0

@@ -1,5 +1,7 @@
 """Descents with their history, and the animations of them."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -42,13 +44,13 @@ FRAMES = [np.full((26, 30, 3), (40 * k, 255 - 40 * k, 90), np.uint8) for k in ra
 
 def test_animations_read_back(tmp_path):
     for name in ("a.gif", "a.mp4"):
-        write_animation(tmp_path / name, FRAMES)
+        write_animation(tmp_path / name, FRAMES, Path(name).suffix)
         video = cv2.VideoCapture(str(tmp_path / name))
         read = [frame for is_read, frame in iter(video.read, (False, None)) if is_read]
         assert len(read) >= len(FRAMES)
         assert abs(read[0][13, 15, ::-1].astype(int) - FRAMES[0][13, 15]).max() < 12
         assert abs(read[-1][13, 15, ::-1].astype(int) - FRAMES[-1][13, 15]).max() < 12
-    write_animation(tmp_path / "frames", FRAMES)
+    write_animation(tmp_path / "frames", FRAMES, "")
     names = [f"{k:04d}.png" for k in range(4)]
     assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == names
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.gif", "a.mp4", "frames"]

@@ -44,7 +44,7 @@ def _run(scenes, out, *more):
 
 def test_a_run_its_tables_and_files(scenes, tmp_path, capsys):
     out = tmp_path / "run.jsonl"
-    files = {name: tmp_path / f"a {name}" for name in ("csv", "markdown", "errors", "risk")}
+    files = {name: tmp_path / f"a {name}.png" for name in ("csv", "markdown", "errors", "risk")}
     options = [word for name, path in files.items() for word in (f"--{name}", str(path))]
     assert _run(scenes, out, *options) == 0
     text = capsys.readouterr().out
@@ -106,12 +106,15 @@ def test_another_scene_of_the_same_name_does_not_go_into_the_same_file(scenes, t
 def test_no_output_replaces_an_input_or_another_output(scenes, tmp_path, capsys, option):
     truth = scenes / "room" / "queries.json"
     before = truth.read_bytes()
-    assert _run(scenes / "room", tmp_path / "run.jsonl", option, str(truth)) == 3
+    link, out = tmp_path / "link.png", tmp_path / "run.png"
+    link.hardlink_to(truth)
+    assert _run(scenes / "room", out, option, str(link)) == 2
     assert "found an input as the output" in capsys.readouterr().err
     assert truth.read_bytes() == before
-    out = tmp_path / "run.jsonl"
-    assert _run(scenes / "room", out, option, str(out)) == 3
-    assert "two outputs have this name" in capsys.readouterr().err
+    assert _run(scenes / "room", out, option, f"{tmp_path}/../{tmp_path.name}/run.png") == 2
+    assert f"found the same output as --out for {option}" in capsys.readouterr().err
+    assert _run(scenes / "room", "-", option, str(out)) == 2
+    assert "a run is read again to be resumed" in capsys.readouterr().err
     assert not out.exists()
 
 

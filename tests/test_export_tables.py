@@ -146,6 +146,11 @@ def test_geojson_is_in_wgs84(tmp_path):
         ("EPSG:4326", (0, 0, 0), "wanted a projected system in metres"),
         ("EPSG:2263", (0, 0, 0), "wanted a projected system in metres"),  # feet
         ("EPSG:32632", (1e12, 0, 0), "wanted one where EPSG:32632 holds"),
+        ("EPSG:32632", (3.5, -2.0, 1.0), r"a\.jpg: found a camera at \(3\.5, -2\), .* 6 to 12 E, 0 to 84 N"),
+        ("EPSG:25832+5783", (3.5, 2.0, 1.0), "wanted one where EPSG:25832"),
+        ("EPSG:25832", (690_000.0, 3_500_000.0, 0), "6 to 12.01 E, 36.53 to 84.01 N"),  # 31.6 N
+        ("EPSG:25832", (1_100_000.0, 5_600_000.0, 0), "wanted one where EPSG:25832"),  # 17.5 E
+        ("EPSG:2193", (1_500_000.0, 900_000.0, 0), "wanted one where EPSG:2193"),
     ],
 )
 def test_geojson_refuses_systems_and_places_that_do_not_fit(tmp_path, crs, center, message):
@@ -153,6 +158,22 @@ def test_geojson_refuses_systems_and_places_that_do_not_fit(tmp_path, crs, cente
     with pytest.raises(InputError, match=message):
         export([one], "geojson", tmp_path / "p.geojson", Options(crs=crs))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("crs", "x", "y"),
+    [
+        ("EPSG:25832", 915_000.0, 5_680_000.0),  # in Saxony, which is in the next zone
+        ("EPSG:3832", 3_400_000.0, -1_900_000.0),  # about the Pacific, across 180 E
+        ("EPSG:3857", 0.0, 0.0),
+        ("+proj=utm +zone=32 +datum=WGS84", 0.0, 0.0),  # says no area
+    ],
+)
+def test_geojson_takes_what_is_near_the_area_of_a_system(tmp_path, crs, x, y):
+    one = result("a.jpg", Pose(POSES[0].R_cam_from_world, np.array([x, y, 0.0])))
+    export([one], "geojson", tmp_path / "p.geojson", Options(crs=crs))
+    (longitude, _) = json_of(tmp_path / "p.geojson")["features"][0]["geometry"]["coordinates"]
+    assert -180.0 <= longitude <= 180.0
 
 
 def test_geojson_without_the_library_says_how_to_get_it(tmp_path, monkeypatch):

@@ -104,10 +104,9 @@ def test_bad_input(run, tmp_path):
     (tmp_path / "full" / "x").touch()
     for arguments, message in (
         (["--format", "colmap", "--out", tmp_path / "full"], "found a folder that is not empty"),
-        (["--format", "colmap", "--out", tmp_path / "1.jsonl"], "found a file, wanted a folder"),
+        (["--format", "colmap", "--out", tmp_path / "full" / "x"], "found a file, wanted a folder"),
         (["--format", "colmap", "--out", tmp_path / "no" / "x"], "found no folder"),
         (["--format", "csv", "--out", tmp_path / "full"], "found a folder, wanted a file name"),
-        (["--format", "csv", "--out", tmp_path / "1.jsonl"], "found an input as the output"),
         (["--format", "colmap", "--out", tmp_path / "x"], "p/a.jpg: cannot be read (No such file"),
         (["--format", "gpano", "--out", tmp_path / "x"], "p/a.jpg"),
         (["--format", "csv", "--images", "q", "--out", tmp_path / "x"], "is not in the folder --images q"),
@@ -178,9 +177,9 @@ def test_any_damage_of_results_is_refused_or_harmless(tmp_path_factory, data):
 
 
 def test_folder_is_whole_or_not_there(tmp_path):
-    (tmp_path / "empty").mkdir()
     before = os.umask(0o027)
     try:
+        (tmp_path / "empty").mkdir()
         for name in ("empty", "new"):
             check_output_folder(tmp_path / name)
             with replacing_folder(tmp_path / name) as folder:
@@ -216,3 +215,32 @@ def test_true_poses_are_written_as_a_reference(tmp_path, capsys):
     assert [row[0] for row in rows] == [str(query.image) for query in queries]
     for row, pose in zip(rows, POSES, strict=True):
         assert [float(value) for value in row[5:8]] == pose.center_world.tolist()
+
+
+@pytest.mark.parametrize("name", [name for name, form in FORMATS.items() if not form.is_folder])
+def test_poses_on_stdout_are_those_of_a_file_and_the_report_goes_to_stderr(tmp_path, capsys, name):
+    write_results(tmp_path / "r.jsonl", MIXED)
+    arguments = ["--results", str(tmp_path / "r.jsonl"), "--format", name, "--out"]
+    sizes = ["--size", "64", "32"] if "size" in FORMATS[name].options else []
+    extra = ["--crs", "EPSG:32632"] if name == "geojson" else sizes
+    assert export_poses.main([*arguments, str(tmp_path / "file"), *extra]) == 0
+    capsys.readouterr()
+    assert export_poses.main([*arguments, "-", *extra]) == 0
+    out, err = capsys.readouterr()
+    assert out == (tmp_path / "file").read_text()
+    assert json.loads(err.splitlines()[-1])["poses"] == 2
+    assert export_poses.main([*arguments, "-", *extra, "--quiet"]) == 0
+    assert capsys.readouterr() == (out, "")
+    if "offset" in FORMATS[name].options and name not in ("nerfstudio", "tum"):
+        assert export_poses.main([*arguments, "-", *extra, "--offset", "1", "2", "3"]) == 3
+        assert "--offset: nothing can be written beside -" in capsys.readouterr().err
+
+
+def test_no_picture_of_the_results_is_replaced(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("p").mkdir()
+    jpeg(Path("p", "d.jpg"))
+    Path("link.csv").symlink_to("p/d.jpg")
+    for out in ("p/d.jpg", "link.csv", tmp_path / "1.jsonl"):
+        code, _, err = run("--format", "csv", "--out", out)
+        assert (code, "found an input as the output, wanted another name" in err) == (2, True)

@@ -191,6 +191,8 @@ def test_a_cloud_with_another_axis_up(run, scene, tmp_path):
     ("arguments", "message"),
     [
         ([], "give --out, --npz or both"),
+        (["--out", "a.jpg"], "--out a.jpg: wanted a name that ends with .png"),
+        (["--out", "a.png", "--npz", "./a.png"], "found the same output as --out for --npz"),
         (["--out", "a.png", "--step", 0], "--step 0.0: wanted metres above 0"),
         (["--out", "a.png", "--step", "nan"], "--step nan"),
         (["--out", "a.png", "--rotations", 0], "--rotations: found 0, wanted at least 1"),
@@ -215,11 +217,12 @@ def test_bad_input_leaves_nothing(run, scene, tmp_path):
         ([*out, "--result", scene / "pose.json"], "0 poses of clean_0.jpg, wanted one"),
         ([*out, "--truth", scene / "pose.json"], "wanted a queries.json with true poses"),
         (["--out", tmp_path / "no" / "a.png"], "found no folder"),
-        (["--npz", scene / "cloud.ply"], "found an input as the output"),
     ):
         code, told, err = run(*arguments)
         assert (code, told) == (3, None)
         assert message in err
         assert err.count("\n") == 1
     assert run(*out, pano="no.jpg")[0] == 3
+    code, _, err = run("--npz", scene / "images" / ".." / "cloud.ply")
+    assert (code, "found an input as the output" in err) == (2, True)
     assert not list(tmp_path.iterdir())

@@ -114,7 +114,7 @@ def test_a_descent_is_shown_with_where_it_ended(run, scene, tmp_path, monkeypatc
     [
         (["--at", 0, 0, 1], "give --out, --animate or both"),
         (["--at", 0, 0, 1, "--out", "a.png", "--width", 101], "--width 101: wanted an even number"),
-        (["--at", 0, 0, 1, "--out", "a.bmp"], "--out a.bmp: wanted .png, .jpg"),
+        (["--at", 0, 0, 1, "--out", "a.bmp"], "--out a.bmp: wanted a name that ends with .png, .jpg"),
         (["--at", 0, 0, 1, "--out", "a.png", "--depth", "a.exr"], "--depth a.exr: wanted"),
         (["--at", 0, 0, 1, "--out", "a", "--depth", "a.png"], "work with a single picture only"),
         (["--at", 0, 0, "nan", "--out", "a.png"], "must be finite"),
@@ -137,7 +137,7 @@ def test_bad_input_leaves_nothing(run, scene, tmp_path):
         ([*result, "--out", tmp_path / "a.png"], "2 poses; choose one"),
         ([*result, "--pano", "x.jpg", "--out", tmp_path / "a.png"], "no pose of x.jpg"),
         ([*result, "--out", scene], "found a folder that is not empty"),
-        ([*result, "--out", tmp_path / "no" / "a.png"], "found no folder"),
+        (["--at", 0, 0, 1, "--out", tmp_path / "no" / "a.png"], "found no folder"),
         (["--pose", tmp_path / "T.txt", "--out", tmp_path / "a.png"], "wanted the 4 x 4 numbers"),
         (["--pose", tmp_path / "no.txt", "--out", tmp_path / "a.png"], "no.txt"),
         (["--at", 0, 0, 1e30, "--out", tmp_path / "a.png"], "found a camera at [0.0, 0.0, 1e+30]"),
@@ -160,3 +160,20 @@ def test_interrupts_and_surprises_have_codes_of_their_own(run, tmp_path, monkeyp
         monkeypatch.setattr(render_pose, "render_points", fail)
         assert run("--at", 1, 1, 1, "--out", tmp_path / "a.png")[0] == code
     assert not list(tmp_path.iterdir())
+
+
+def test_pictures_on_stdout_are_those_of_files(scene, tmp_path, capfdbinary):
+    arguments = ["--cloud", str(scene / "cloud.ply"), "--at", "3", "2", "1", "--width", "64", "--out"]
+    depth = ["--depth", str(tmp_path / "depth.png")]
+    assert render_pose.main([*arguments, str(tmp_path / "a.png"), *depth, "--quiet"]) == 0
+    capfdbinary.readouterr()
+    before = (tmp_path / "depth.png").read_bytes()
+    assert render_pose.main([*arguments, "-", *depth, "--quiet"]) == 0
+    assert capfdbinary.readouterr() == ((tmp_path / "a.png").read_bytes(), b"")
+    assert render_pose.main([*arguments, str(tmp_path / "b.png"), "--depth", "-", "--quiet"]) == 0
+    assert capfdbinary.readouterr() == (before, b"")
+    assert render_pose.main([*arguments, "-", "--depth", "/dev/stdout", "--quiet"]) == 2
+    pano = ["--cloud", str(scene / "cloud.ply"), "--queries", str(scene / "queries.json")]
+    pano += ["--pano", "clean_0.jpg", "--out", str(scene / "images" / "clean_0.jpg")]
+    assert render_pose.main(pano) == 2
+    assert b"found an input as the output" in capfdbinary.readouterr().err

@@ -13,11 +13,12 @@ from ..confidence.confidence import check_confidence
 from ..errors import InputError
 from ..gravity import MIN_CONFIDENCE
 from ..gravity.alignment import Alignment, AlignmentReport, find_alignment, read_alignment
-from ..runtime.atomic import check_output, write_atomically
+from ..runtime.atomic import is_stream, write_atomically
 from ..scenes.scene import QUERIES_NAME, Query, read_scene, write_queries
 from .command import command, option, print_warnings
 from .errors import checking_options, print_error
 from .options import add_cloud_options, cloud_settings_from
+from .outputs import check_outputs, check_suffix, print_report
 from .progress import progress_bar
 
 EXIT_ALIGNED, EXIT_UNCERTAIN = 0, 1
@@ -41,8 +42,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
     add_cloud_options(parser, "coloured scan, as for localize.py")
     group = parser.add_argument_group("files")
-    option(group, "--out FILE", "the turned cloud, a PLY file")
-    option(group, "--transform FILE", "a .json (default --out's name), and a .txt written beside it")
+    option(group, "--out FILE", "the turned cloud, a PLY file; - is stdout")
+    text = "a .json (default --out's name, where it has one), and a .txt written beside it"
+    option(group, "--transform FILE", text)
     option(group, "--queries FILE", "true poses in the scan, to be turned with it and written beside --out")
     option(group, "--transform-only", "write no file, only the report on stdout")
     group = parser.add_argument_group("method")
@@ -66,24 +68,25 @@ def check_arguments(arguments: argparse.Namespace) -> None:
     for name in ("apply", "queries"):
         if getattr(arguments, name) and not arguments.out:
             raise InputError(f"--{name} needs --out")
-    for path in filter(None, (arguments.out, arguments.transform)):
-        if (path.suffix == ".json") != (path is arguments.transform):
-            raise InputError(f"{path}: --out must be a PLY file, and --transform end with .json")
+    check_suffix("--out", arguments.out, (".ply",))
+    if arguments.transform and arguments.transform.suffix != ".json":
+        raise InputError(f"--transform {arguments.transform}: wanted a name that ends with .json")
+    if arguments.queries and is_stream(arguments.out):
+        raise InputError(f"--queries: nothing can be written beside --out {arguments.out}, wanted a file")
 
 
 def outputs_of(arguments: argparse.Namespace) -> Outputs:
     """What is to be written beside the cloud; refused if it can't be."""
     path = arguments.transform
-    if arguments.out and not arguments.apply:
+    if arguments.out and not arguments.apply and not is_stream(arguments.out):
         path = path or arguments.out.with_suffix(".json")
-    transforms = [path, path.with_suffix(".txt")] if path else []
-    outputs = [arguments.out, *transforms]
-    outputs += [arguments.out.with_name(QUERIES_NAME)] if arguments.queries else []
+    text = path and path.with_suffix(".txt")
+    queries = arguments.out.with_name(QUERIES_NAME) if arguments.queries else None
+    outputs = {"--out": arguments.out, "--transform": path, "its .txt": text, "the poses": queries}
     inputs = [*arguments.cloud, *filter(None, (arguments.apply, arguments.queries))]
-    for output in filter(None, outputs):
-        check_output(output, inputs)
-    if arguments.out in transforms:
-        raise InputError(f"{arguments.out}: cloud and transform have the same name; use .ply for the cloud")
+    inputs += [arguments.queries / QUERIES_NAME] if arguments.queries else []
+    check_outputs(outputs, inputs)
+    transforms = [path, text] if path and text else []
     return transforms, read_scene(arguments.queries).queries if arguments.queries else ()
 
 
@@ -150,7 +153,8 @@ def align(arguments: argparse.Namespace) -> int:
     if not doubt:
         write(arguments, outputs, cloud, alignment)
     report = report_of(arguments, "uncertain" if doubt else "aligned", alignment)
-    print(json.dumps({**report, **evidence_of(found)}, allow_nan=False))
+    text = json.dumps({**report, **evidence_of(found)}, allow_nan=False)
+    print_report(arguments, {"--out": arguments.out}, text)
     return print_error(arguments, doubt, EXIT_UNCERTAIN) if doubt else EXIT_ALIGNED
 
 
@@ -166,7 +170,8 @@ def apply(arguments: argparse.Namespace) -> int:
     for _ in cloud.chunks([]):  # for its box
         pass
     write(arguments, outputs, cloud, alignment)
-    print(json.dumps(report_of(arguments, "applied", alignment), allow_nan=False))
+    text = json.dumps(report_of(arguments, "applied", alignment), allow_nan=False)
+    print_report(arguments, {"--out": arguments.out}, text)
     return EXIT_ALIGNED
 
 

@@ -15,6 +15,7 @@ from ..scenes.datasets.writing import write_scene
 from ..scenes.scene import read_scene
 from .command import check_least, option
 from .errors import EXIT_BAD_INPUT, print_error, print_note, run_command
+from .outputs import check_folder_name
 from .parser import HelpFormatter, add_run_options, new_parser
 from .progress import progress_bar
 
@@ -87,6 +88,7 @@ def chosen(specs: tuple[SceneSpec, ...], rooms: list[str]) -> list[SceneSpec]:
 def run(arguments: argparse.Namespace) -> int:
     """Write the scenes one by one; returns the exit code."""
     check_least(arguments, check=0, seed=0)
+    check_folder_name("--out", arguments.out)
     # a dataset's subparser has only some of the options
     own = {field.name: getattr(arguments, field.name, field.default) for field in fields(ConvertOptions)}
     options = ConvertOptions(**own | {"areas": frozenset(getattr(arguments, "areas", ()))})

@@ -11,6 +11,7 @@ from ..geometry.pose import quaternion_wxyz
 from ..runtime.atomic import write_atomically
 from .command import command, option
 from .errors import EXIT_BAD_INPUT, print_error
+from .outputs import check_distinct, check_folder_name
 
 EPILOG = """\
 example:
@@ -43,16 +44,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 @command(__file__, __doc__, EPILOG, add_arguments)
 def main(arguments: argparse.Namespace) -> int:
     """List and, if asked, write the images; returns the exit code. A broken one doesn't stop the others."""
+    check_folder_name("--extract", arguments.extract)
     images = list_images(arguments.e57)
     exit_code = 0
+    stem = re.sub(r"[^\w.-]", "_", arguments.e57.stem)
+    names = [f"{stem}_{index}{SUFFIX[image.encoding]}" for index, image in enumerate(images)]
     if arguments.extract:
+        check_distinct({name: arguments.extract / name for name in names}, [arguments.e57])
         arguments.extract.mkdir(exist_ok=True)
     for index, image in enumerate(images):
         row = image_json(index, image)
         if arguments.extract:
             try:
-                stem = re.sub(r"[^\w.-]", "_", arguments.e57.stem)
-                file = arguments.extract / f"{stem}_{index}{SUFFIX[image.encoding]}"
+                file = arguments.extract / names[index]
                 write_atomically(file, read_image(arguments.e57, index))
                 row["file"] = str(file)
             except InputError as error:

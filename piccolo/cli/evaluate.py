@@ -10,7 +10,7 @@ import numpy as np
 from ..coarse_to_fine.open_map import CachePolicy
 from ..errors import InputError
 from ..result import read_results
-from ..runtime.atomic import check_output, write_atomically
+from ..runtime.atomic import is_stream, write_atomically
 from ..runtime.threads import num_cores
 from ..scenes.evaluation import tables
 from ..scenes.evaluation.plots import errors_figure, figure_png, risk_figure
@@ -27,6 +27,7 @@ from .options import (
     read_options_from,
     settings_from,
 )
+from .outputs import check_distinct, check_outputs, check_suffix, print_report
 from .progress import progress_bar
 
 EPILOG = """\
@@ -38,7 +39,8 @@ examples:
 Scenes are folders with a queries.json, a cloud and images, at any depth below --scenes (docs/DATASETS.md).
 --out runs the queries that it does not have yet, and appends a line for each as it comes: give the same
 command again to resume a run that was stopped. --results are lines of localize.py instead; each belongs to
-the query of the same path, or else of the same file name. Tables are Markdown, on stdout.
+the query of the same path, or else of the same file name. Tables are Markdown, on stdout (on stderr where
+one of the files is stdout).
 Queries that can't be read are named on stderr, and the rest is done before exit code 3.
 """
 
@@ -57,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("tables and plots")
     option(group, "--max-distance M", "correct is under", default=0.1)
     option(group, "--max-angle DEG", "and under", default=5.0)
-    option(group, "--csv FILE", "a line a query")
+    option(group, "--csv FILE", "a line a query; - is stdout, as for the others")
     option(group, "--markdown FILE", "the tables, here too")
     option(group, "--errors PNG", "plot: fraction of queries under each error, and recall over thresholds")
     option(group, "--risk PNG", "plot: fraction wrong over fraction accepted, as the min. confidence falls")
@@ -75,6 +77,10 @@ def check_usage(arguments: argparse.Namespace) -> None:
     if not (0.0 < arguments.max_distance < np.inf and 0.0 < arguments.max_angle < np.inf):
         raise UsageError("--max-distance, --max-angle: wanted numbers above 0")
     check_least(arguments, jobs=1)
+    for option_ in ("errors", "risk"):
+        check_suffix(f"--{option_}", getattr(arguments, option_), (".png",))
+    if arguments.out and is_stream(arguments.out):
+        raise UsageError(f"--out {arguments.out}: a run is read again to be resumed, wanted a file")
 
 
 def report_of(rows: Sequence[QueryResult], thresholds: Thresholds) -> str:
@@ -98,7 +104,7 @@ def write_report(
         write_atomically(arguments.markdown, text.encode())
     if arguments.errors:
         write_atomically(arguments.errors, figure_png(errors_figure(runs, thresholds)))
-    print(text, end="")
+    print_report(arguments, outputs_of(arguments), text, end="")
 
 
 def compare(arguments: argparse.Namespace, thresholds: Thresholds) -> int:
@@ -119,14 +125,16 @@ def compare(arguments: argparse.Namespace, thresholds: Thresholds) -> int:
     return 0
 
 
+def outputs_of(arguments: argparse.Namespace) -> dict[str, Path | None]:
+    """The files beside a run, by option."""
+    return {f"--{name}": getattr(arguments, name) for name in ("csv", "markdown", "errors", "risk")}
+
+
 def check_files(arguments: argparse.Namespace, inputs: list[Path]) -> None:
     """Refuse outputs that would replace an input, a run or each other."""
-    outputs = [p for p in (arguments.csv, arguments.markdown, arguments.errors, arguments.risk) if p]
-    runs = [path for path in (arguments.out, arguments.results, *(arguments.compare or ())) if path]
-    for output in outputs:
-        check_output(output, [*inputs, *runs])
-        if outputs.count(output) > 1 or output == arguments.out:
-            raise InputError(f"{output}: two outputs have this name, wanted one each")
+    more = filter(None, (arguments.results, arguments.mask, *(arguments.compare or ())))
+    check_distinct({"--out": arguments.out, **outputs_of(arguments)}, [*inputs, *more])
+    check_outputs(outputs_of(arguments))
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)

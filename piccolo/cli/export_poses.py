@@ -3,16 +3,19 @@
 import argparse
 import json
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
 from ..geometry.rotations import CAMERA_AXES
 from ..result import read_results
-from ..runtime.atomic import check_output
+from ..scenes.evaluation.runner import input_files
 from ..scenes.export import FORMATS, Options, Selection, export, select, true_results
+from ..scenes.export.formats import offset_file
 from ..scenes.scene import find_scenes
 from .command import command, option
 from .errors import checking_options, print_note
+from .outputs import check_distinct, print_report
 
 _FORMATS = "\n".join(f"  {form.name:<11} {form.description}" for form in FORMATS.values())
 EPILOG = f"""\
@@ -24,7 +27,7 @@ examples:
   python tools/export_poses.py --results poses.jsonl --format geojson --crs EPSG:25832 --out poses.geojson
 
 Results that are not localized are left out and counted on stderr. docs/CONVENTIONS.md has axes and angles.
-A file at --out is replaced. One JSON object on stdout.
+A file at --out is replaced; - is stdout. One JSON object on stdout, on stderr if the poses are there.
 """
 OPTIONS = ("size", "offset", "axes", "timestamps", "crs")  # those that only some formats take
 
@@ -83,14 +86,16 @@ def main(arguments: argparse.Namespace) -> int:
     with checking_options():
         options = options_from(arguments)
     results = read_results(arguments.results)
-    if arguments.scenes:
-        results = [result for scene in find_scenes(arguments.scenes) for result in true_results(scene)]
-    if not FORMATS[arguments.format].is_folder:
-        check_output(arguments.out, arguments.results)
+    scenes = find_scenes(arguments.scenes) if arguments.scenes else []
+    results += [result for scene in scenes for result in true_results(scene)]
+    beside = offset_file(arguments.out) if options.offset else None
+    outputs = {"--out": arguments.out, "the offset": beside}
+    files = {Path(name) for result in results for name in (result.pano, result.cloud_name)}
+    check_distinct(outputs, [*arguments.results, *input_files(scenes), *files])
     selection = select(results, arguments.cloud, arguments.all)
     for note in notes_on(selection):
         print_note(arguments, note)
     export(selection.results, arguments.format, arguments.out, options)
     report = {"out": str(arguments.out), "format": arguments.format, "poses": len(selection.results)}
-    print(json.dumps({**report, "left_out": selection.left_out}))
+    print_report(arguments, outputs, json.dumps({**report, "left_out": selection.left_out}))
     return 0

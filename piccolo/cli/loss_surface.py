@@ -25,13 +25,14 @@ from ..panorama import read_panorama
 from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
 from ..result import read_results
-from ..runtime.atomic import check_output, write_atomically
+from ..runtime.atomic import write_atomically
 from ..runtime.figure import new_figure
 from ..runtime.threads import Workers, num_cores
 from ..scenes.scene import read_scene
 from .command import check_least, command, option, print_warnings
 from .errors import checking_options
 from .options import add_cloud_options, cloud_settings_from
+from .outputs import check_outputs, check_suffix, print_report
 from .progress import progress_bar
 
 EPILOG = """\
@@ -57,8 +58,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--pano FILE", "the panorama", required=True)
     option(parser, "--result FILE", "JSON lines of localize.py: pose found")
     option(parser, "--truth FILE", "queries.json: true pose")
-    option(parser, "--out PNG", "the picture")
-    option(parser, "--npz FILE", "the surface as arrays")
+    option(parser, "--out PNG", "the picture; - is stdout")
+    option(parser, "--npz FILE", "the surface as arrays; - is stdout")
     group = parser.add_argument_group("poses tried")
     option(group, "--step M", "of the grid", default=0.2)
     option(group, "--box X0 Y0 X1 Y1", "corners of the grid (default: all of the cloud)")
@@ -78,6 +79,7 @@ def check_usage(arguments: argparse.Namespace) -> None:
     cloud_settings_from(arguments)
     if not (arguments.out or arguments.npz):
         raise InputError("give --out, --npz or both")
+    check_suffix("--out", arguments.out, (".png",))
     if not 0.0 < arguments.step < np.inf:
         raise InputError(f"--step {arguments.step}: wanted metres above 0")
     check_least(arguments, rotations=1, width=16, max_points=100, threads=1)
@@ -164,10 +166,9 @@ def main(arguments: argparse.Namespace) -> int:
     """Read, compute, write."""
     with checking_options():
         check_usage(arguments)
-    outputs = [path for path in (arguments.out, arguments.npz) if path]
+    outputs = {"--out": arguments.out, "--npz": arguments.npz}
     inputs = [*arguments.cloud, arguments.pano, *filter(None, (arguments.result, arguments.truth))]
-    for path in outputs:
-        check_output(path, inputs)
+    check_outputs(outputs, inputs)
     if arguments.out:
         new_figure()  # now: where matplotlib is missing, the work would be lost
 
@@ -190,5 +191,5 @@ def main(arguments: argparse.Namespace) -> int:
         write_atomically(arguments.out, surface_png(surface, grid, cloud, known, arguments.pano.name))
     line = {"seconds": round(seconds, 3), "poses_per_s": round(grid.num_poses / seconds)}
     files = {"out": arguments.out and str(arguments.out), "npz": arguments.npz and str(arguments.npz)}
-    print(json.dumps(files | summary(surface, grid, cloud, known) | line))
+    print_report(arguments, outputs, json.dumps(files | summary(surface, grid, cloud, known) | line))
     return 0

@@ -24,6 +24,7 @@ from ..scenes.synthetic.world import (
 )
 from .command import check_least, command, option
 from .errors import checking_options
+from .outputs import check_folder_name
 from .progress import progress_bar
 
 EPILOG = """\
@@ -78,6 +79,7 @@ def write_world(
 def main(arguments: argparse.Namespace) -> int:
     """Make and write all scenes."""
     check_least(arguments, panoramas=0, seed=0, scenes=0)
+    check_folder_name("--out", arguments.out)
     workers = Workers(num_cores(), progress_bar(arguments.quiet))
     for number in range(max(1, arguments.scenes)):
         with checking_options():

@@ -5,12 +5,12 @@ import json
 
 from ..coarse_to_fine.map_file import save_map
 from ..coarse_to_fine.open_map import CachePolicy, open_map
-from ..runtime.atomic import check_output
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers, num_cores
 from .command import command, option
 from .errors import checking_options
 from .options import add_cloud_options, cloud_settings_from
+from .outputs import check_outputs, print_report
 from .progress import progress_bar, warn_once
 
 EPILOG = """\
@@ -26,7 +26,7 @@ One JSON object on stdout describes the map.
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
     add_cloud_options(parser, "coloured scan, as for localize.py")
-    option(parser, "--out FILE", "the map", required=True)
+    option(parser, "--out FILE", "the map; - is stdout", required=True)
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
@@ -34,7 +34,8 @@ def main(arguments: argparse.Namespace) -> int:
     """Build and write the map; returns the exit code."""
     with checking_options():
         cloud_settings = cloud_settings_from(arguments)
-    check_output(arguments.out, arguments.cloud)
+    outputs = {"--out": arguments.out}
+    check_outputs(outputs, arguments.cloud)
     watch = Stopwatch()
     workers = Workers(num_cores(), progress_bar(arguments.quiet), warn_once(arguments.quiet))
     scan_map = open_map(arguments.cloud, cloud_settings, CachePolicy(is_used=False), workers, watch)
@@ -42,5 +43,6 @@ def main(arguments: argparse.Namespace) -> int:
     seconds = {stage: round(seconds, 3) for stage, seconds in watch.seconds.items()}
     counts = {"points": len(scan_map.points), "candidates": len(scan_map.centers)}
     warnings = list(scan_map.warnings)
-    print(json.dumps({"map": str(arguments.out), **counts, "seconds": seconds, "warnings": warnings}))
+    report = {"map": str(arguments.out), **counts, "seconds": seconds, "warnings": warnings}
+    print_report(arguments, outputs, json.dumps(report))
     return 0

@@ -27,12 +27,13 @@ from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
 from ..render.surfel_renderer import encode_image, fill_holes, render_points
 from ..result import read_results
-from ..runtime.atomic import check_output, check_output_folder, replacing_folder, write_atomically
+from ..runtime.atomic import check_output, check_output_folder, is_stream, replacing_folder, write_atomically
 from ..runtime.threads import Workers, num_cores
 from ..scenes.scene import read_scene
 from .command import check_least, command, option, print_warnings
 from .errors import checking_options
 from .options import add_cloud_options, cloud_settings_from
+from .outputs import check_distinct, check_suffix, print_report
 from .progress import progress_bar
 
 EPILOG = """\
@@ -45,13 +46,17 @@ Angles as in docs/CONVENTIONS.md, Exports: heading clockwise from the world's +y
 its nearest neighbours; what no disc covers is a hole. --depth: range along the ray. PNG: 16 bit,
 millimetres, 0 where nothing is seen, 65535 for 65.535 m and farther. NPY: float32, metres, inf where nothing
 is seen. --mask-out: white where nothing is seen, as --mask of localize.py takes it.
-One JSON object a picture on stdout.
+An output - is stdout: PNG, of --animate GIF. One JSON object a picture on stdout, or stderr if that is taken.
 """
 MAX_WIDTH, MIN_WIDTH = 32_768, 16
 MAGENTA = (255, 0, 255)  # a colour that scans do not have
 DESCENT_WIDTH = 1024  # of the panorama
-SUFFIXES = {"out": (".png", ".jpg", ".jpeg", ""), "depth": (".png", ".npy"), "mask_out": (".png",),
-            "animate": (".gif", ".mp4", "")}  # fmt: skip
+SUFFIXES = {  # of outputs, those of stdout and devices first; "" is a folder
+    "out": (".png", ".jpg", ".jpeg", ""),
+    "depth": (".png", ".npy"),
+    "mask_out": (".png",),
+    "animate": (".gif", ".mp4", ""),
+}
 Named = list[tuple[str, Pose]]  # poses in the world with the panorama's path
 
 
@@ -89,15 +94,12 @@ def check_usage(arguments: argparse.Namespace) -> None:
     cloud_settings_from(arguments)
     if not (arguments.out or arguments.animate):
         raise InputError("give --out, --animate or both")
-    if (arguments.depth or arguments.mask_out) and not (arguments.out and arguments.out.suffix):
+    if (arguments.depth or arguments.mask_out) and (not arguments.out or is_folder(arguments.out)):
         raise InputError("--depth, --mask-out: work with a single picture only, --out FILE")
     if not MIN_WIDTH <= arguments.width <= MAX_WIDTH or arguments.width % 2:
         raise InputError(f"--width {arguments.width}: wanted an even number, {MIN_WIDTH} to {MAX_WIDTH}")
-    for name, allowed in SUFFIXES.items():
-        path = getattr(arguments, name)
-        if path and path.suffix.lower() not in allowed:
-            wanted = ", ".join(suffix or "a folder's name" for suffix in allowed)
-            raise InputError(f"--{name.replace('_', '-')} {path.name}: wanted {wanted}")
+    for name, path in outputs_of(arguments).items():
+        check_suffix(name, path, SUFFIXES[name.removeprefix("--").replace("-", "_")])
     check_pose_options(arguments)
 
 
@@ -114,15 +116,35 @@ def check_pose_options(arguments: argparse.Namespace) -> None:
     check_least(arguments, seed=0)
 
 
-def check_files(arguments: argparse.Namespace) -> None:
-    """Refuse, before any work, what could not be written."""
-    named = arguments.result, arguments.queries, arguments.pose, arguments.photo
-    inputs = [*arguments.cloud, *filter(None, named)]
-    for path in filter(None, (arguments.out, arguments.depth, arguments.mask_out, arguments.animate)):
-        if path.suffix:
-            check_output(path, inputs)
-        else:
-            check_output_folder(path)
+def outputs_of(arguments: argparse.Namespace) -> dict[str, Path | None]:
+    """The outputs by option."""
+    return {f"--{name.replace('_', '-')}": getattr(arguments, name) for name in SUFFIXES}
+
+
+def is_folder(path: Path) -> bool:
+    """True for an output that is to be a folder of pictures."""
+    return not path.suffix and not is_stream(path)
+
+
+def suffix_of(arguments: argparse.Namespace, name: str) -> str:
+    """The suffix that says in which format an output is written."""
+    path: Path = getattr(arguments, name)
+    return SUFFIXES[name][0] if is_stream(path) else path.suffix.lower()
+
+
+def check_files(arguments: argparse.Namespace, poses: Named) -> None:
+    """Refuse, before any work, what could not be written, or would replace an input."""
+    given = arguments.result, arguments.queries, arguments.pose, arguments.photo
+    photos = [photo_of(arguments, name) for name, _ in poses]
+    check_distinct(outputs_of(arguments), [*arguments.cloud, *filter(None, given), *photos])
+    for path in filter(None, outputs_of(arguments).values()):
+        (check_output_folder if is_folder(path) else check_output)(path)
+
+
+def photo_of(arguments: argparse.Namespace, name: str) -> Path:
+    """The panorama of a pose: the one given, or the one that the pose's file names."""
+    folder = arguments.queries.parent / "images" if arguments.queries else Path()
+    return arguments.photo or folder / name
 
 
 def poses_from(arguments: argparse.Namespace) -> Named:
@@ -141,7 +163,7 @@ def poses_from(arguments: argparse.Namespace) -> Named:
         found = [(name, pose) for name, pose in found if Path(name).name == Path(arguments.pano).name]
     if not found:
         raise InputError(f"{file}: no pose" + (f" of {arguments.pano}" if arguments.pano else ""))
-    if len(found) > 1 and (arguments.animate or arguments.out.suffix):
+    if len(found) > 1 and (arguments.animate or not is_folder(arguments.out)):
         raise InputError(f"{file}: {len(found)} poses; choose one with --pano NAME, or give --out FOLDER")
     return found
 
@@ -158,8 +180,9 @@ def depth_file(depth: NDArray[np.float32], suffix: str) -> bytes:
 
 def draw_pictures(arguments: argparse.Namespace, cloud: LocalCloud, poses: Named, workers: Workers) -> None:
     """Write the pictures; one JSON line each."""
-    is_folder = not arguments.out.suffix
-    names = [f"{Path(pano).stem}.png" for pano, _ in poses] if is_folder else [arguments.out.name]
+    is_many = is_folder(arguments.out)
+    names = [f"{Path(pano).stem}.png" for pano, _ in poses] if is_many else [arguments.out.name]
+    suffix = ".png" if is_many else suffix_of(arguments, "out")
     if len(set(names)) < len(names):
         raise InputError(f"{arguments.out}: panoramas of the same name; choose one with --pano")
 
@@ -167,28 +190,27 @@ def draw_pictures(arguments: argparse.Namespace, cloud: LocalCloud, poses: Named
         view = render_points(cloud.points, cloud.from_world(pose), arguments.width, workers)
         seen_fraction = round(float(view.is_seen.mean()), 6)
         if arguments.depth:
-            write_atomically(arguments.depth, depth_file(view.depth, arguments.depth.suffix.lower()))
+            write_atomically(arguments.depth, depth_file(view.depth, suffix_of(arguments, "depth")))
         if arguments.mask_out:
             nothing = np.where(view.is_seen, 0, 255).astype(np.uint8)
             write_atomically(arguments.mask_out, encode_image(nothing, ".png"))
         if arguments.holes == "mark":
             view.rgb[~view.is_seen] = MAGENTA
         rgb = fill_holes(view.rgb, view.is_seen) if arguments.holes == "close" else view.rgb
-        write_atomically(folder / name, encode_image(rgb, Path(name).suffix.lower()))
-        out = arguments.out / name if is_folder else arguments.out
+        write_atomically(folder / name, encode_image(rgb, suffix))
+        out = arguments.out / name if is_many else arguments.out
         return {"out": str(out), "pano": pano, "width": arguments.width, "seen_fraction": seen_fraction}
 
-    with replacing_folder(arguments.out) if is_folder else nullcontext(arguments.out.parent) as folder:
+    with replacing_folder(arguments.out) if is_many else nullcontext(arguments.out.parent) as folder:
         lines = [write(folder, name, *named) for name, named in zip(names, poses, strict=True)]
     for line in lines:
-        print(json.dumps(line))
+        print_report(arguments, outputs_of(arguments), json.dumps(line))
 
 
 def animate(arguments: argparse.Namespace, cloud: LocalCloud, poses: Named, workers: Workers) -> None:
     """Write the descent towards the pose; one JSON line."""
     ((name, pose),) = poses
-    folder = arguments.queries.parent / "images" if arguments.queries else Path()
-    panorama = shrink(read_panorama(arguments.photo or folder / name), DESCENT_WIDTH)
+    panorama = shrink(read_panorama(photo_of(arguments, name)), DESCENT_WIDTH)
     goal = cloud.from_world(pose)
     if arguments.start:
         start = cloud.from_world(Pose(pose.R_cam_from_world, np.array(arguments.start)))
@@ -199,12 +221,13 @@ def animate(arguments: argparse.Namespace, cloud: LocalCloud, poses: Named, work
     settings = DescentSettings(solver=arguments.solver)
     refined, history = refine_with_history(cloud.points, texels, start, settings)
     frames = frames_of(cloud.points, panorama, history, FRAME_WIDTH, workers)
-    write_animation(arguments.animate, frames)
+    write_animation(arguments.animate, frames, suffix_of(arguments, "animate"))
     line: dict[str, object] = {"out": str(arguments.animate), "pano": name, "frames": len(frames)}
     for label, at in (("start", start), ("end", refined.pose)):
         distance, angle = pose_errors(at, goal)
         line |= {f"{label}_distance": round(distance, 6), f"{label}_deg": round(float(np.degrees(angle)), 6)}
-    print(json.dumps(line | {"loss": refined.loss if np.isfinite(refined.loss) else None}))
+    line["loss"] = refined.loss if np.isfinite(refined.loss) else None
+    print_report(arguments, outputs_of(arguments), json.dumps(line))
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
@@ -212,8 +235,8 @@ def main(arguments: argparse.Namespace) -> int:
     """Read, draw, write."""
     with checking_options():
         check_usage(arguments)
-    check_files(arguments)
     poses = poses_from(arguments)
+    check_files(arguments, poses)
 
     workers = Workers(num_cores(), progress_bar(arguments.quiet))
     cloud = open_points(arguments.cloud, cloud_settings_from(arguments), workers)

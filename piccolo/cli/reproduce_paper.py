@@ -16,12 +16,13 @@ from ..paper.settings import PaperSettings
 from ..runtime.atomic import write_atomically
 from ..runtime.threads import num_cores
 from ..scenes.evaluation.query_result import QueryResult
-from ..scenes.evaluation.runner import RunConfig, open_run
+from ..scenes.evaluation.runner import RunConfig, input_files, open_run
 from ..scenes.reproduce_paper.experiments import EXPERIMENTS, Condition, Settings, plot_png, table
 from ..scenes.scene import Scene, find_scenes
 from .command import check_least, command, option
 from .errors import EXIT_BAD_INPUT, checking_options, print_error
 from .options import PAPER_OPTIONS, add_options, paper_settings_from
+from .outputs import check_distinct, check_folder_name
 from .progress import progress_bar
 
 _EXPERIMENTS = "\n".join(f"  {name:<15} {experiment.title}" for name, experiment in EXPERIMENTS.items())
@@ -96,11 +97,15 @@ def run_experiment(
     """All conditions of an experiment, its table and plot; returns how many queries were not localized."""
     experiment = EXPERIMENTS[name]
     folder: Path = arguments.out / name
-    folder.mkdir(parents=True, exist_ok=True)
     variants = sorted({query.variant for scene in scenes for query in scene.queries})
     variants = [variant for variant in variants if not arguments.variants or variant in arguments.variants]
     num_failed, found = 0, []
-    for condition in experiment.conditions_of(presets, variants):
+    conditions = experiment.conditions_of(presets, variants)
+    files = [folder / file_name(condition) for condition in conditions]
+    files += [folder.with_name(f"{name}{suffix}") for suffix in (".md", ".png")]
+    check_distinct({file.name: file for file in files}, input_files(scenes))
+    folder.mkdir(parents=True, exist_ok=True)
+    for condition in conditions:
         rows, num_failed_here = run_condition(condition, scenes, folder, arguments)
         num_failed += num_failed_here
         if rows:
@@ -120,6 +125,7 @@ def run_experiment(
 def main(arguments: argparse.Namespace) -> int:
     """Run the experiments one by one; returns the exit code."""
     check_least(arguments, jobs=1)
+    check_folder_name("--out", arguments.out)
     with checking_options():
         paper = paper_settings_from(arguments)
     settings: dict[str, Settings] = {"paper": paper, "default": CoarseToFineSettings(gravity="known")}

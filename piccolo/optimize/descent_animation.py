@@ -93,9 +93,8 @@ def frames_of(
     return list(workers.map(frame, chosen.tolist(), "frames"))
 
 
-def write_animation(path: Path, frames: Frames) -> None:
-    """Write a GIF or an MP4, as the suffix says, or PNG files into a new folder; whole or not at all."""
-    kind = path.suffix.lower()
+def write_animation(path: Path, frames: Frames, kind: str) -> None:
+    """Write a GIF or an MP4, by its suffix, or else PNG files into a new folder; whole or not at all."""
     if kind in (".gif", ".mp4"):
         held = [*frames, *[frames[-1]] * NUM_LAST]
         file = BytesIO()
@@ -112,7 +111,7 @@ def write_animation(path: Path, frames: Frames) -> None:
 
 def _mp4(path: Path, frames: Frames) -> bytes:
     height, width = (size // 2 * 2 for size in frames[0].shape[:2])  # the codec takes even sizes only
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+    with tempfile.TemporaryDirectory() as folder:
         part = Path(folder) / "part.mp4"
         writer = cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*"mp4v"), FRAMES_PER_S, (width, height))
         for frame in frames:

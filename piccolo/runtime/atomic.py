@@ -1,58 +1,159 @@
-"""Files that are either whole or not there."""
+"""Files that are either whole or not there, and what else a path of the user's may lead to."""
 
+import errno
 import os
+import secrets
 import shutil
+import stat
+import sys
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
 from ..errors import InputError
 
+STDOUT = Path("-")
+WRITE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EPIPE}  # that name no file
+NEW_FILE, NEW_FOLDER = 0o666, 0o777  # modes, less the umask
 
-def check_output(path: Path, inputs: list[Path]) -> None:
+
+def is_stdout(path: Path) -> bool:
+    """True for -, /dev/stdout, and any other name of what stdout is; not for /dev/null."""
+    try:
+        is_same = sys.stdout is not None and os.path.samestat(path.stat(), os.fstat(1))
+    except OSError:  # there is no such file, or no stdout
+        is_same = False
+    return path == STDOUT or (is_same and os.path.realpath(path) != os.devnull)
+
+
+def is_stream(path: Path) -> bool:
+    """True for what is written to as it is: stdout, a FIFO or a character device."""
+    return is_stdout(path) or path.is_fifo() or path.is_char_device()
+
+
+def check_output(path: Path, inputs: Iterable[Path] = ()) -> None:
     """Refuse, before any work is done, a file that could not be written or that is one of the inputs."""
-    folder = path.parent
-    if not folder.is_dir():
-        raise InputError(f"{path}: found no folder {folder}, wanted one that exists")
+    if is_stream(path):
+        if path.exists() and not os.access(path, os.W_OK):
+            raise InputError(f"{path}: found no write permission, wanted a device that can be written")
+        return
+    _check_folder_of(path)
     if path.is_dir():
         raise InputError(f"{path}: found a folder, wanted a file name")
-    if not os.access(folder, os.W_OK):
-        raise InputError(f"{path}: found a folder without write permission, wanted one that can be written")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: found a socket or a disk, wanted a file name")
+    if path.exists() and not os.access(path, os.W_OK):
+        raise InputError(f"{path}: found a file without write permission, wanted another name")
     if path.exists() and any(other.exists() and path.samefile(other) for other in inputs):
         raise InputError(f"{path}: found an input as the output, wanted another name")
 
 
 def check_output_folder(path: Path) -> None:
     """Refuse, before any work is done, a folder that could not be made or that has something in it."""
-    if path.is_dir() and not any(path.iterdir()):
-        return
-    if path.exists():
+    if is_stream(path):
+        raise InputError(f"{path}: found stdout or a device, wanted a folder that is new or empty")
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
         kind = "a folder that is not empty" if path.is_dir() else "a file"
         raise InputError(f"{path}: found {kind}, wanted a folder that is new or empty")
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: found no folder {path.parent}, wanted one that exists")
-    if not os.access(path.parent, os.W_OK):
-        raise InputError(
-            f"{path}: found {path.parent} without write permission, wanted one that can be written"
-        )
+    _check_folder_of(path)
+
+
+def _check_folder_of(path: Path) -> None:
+    """Refuse a path where nothing can be made: the folder that counts is that of a link's target."""
+    folder = _target_of(path).parent
+    if not folder.is_dir():
+        raise InputError(f"{path}: found no folder {folder}, wanted one that exists")
+    if not os.access(folder, os.W_OK):
+        raise InputError(f"{path}: found {folder} without write permission, wanted one that can be written")
+
+
+def _target_of(path: Path) -> Path:
+    """The file that a path stands for, there or not: of links their target, which is replaced, not they."""
+    if not path.is_symlink():
+        return path
+    try:
+        return Path(os.path.realpath(path, strict=True))
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise InputError(f"{path}: found a link that leads to itself, wanted another name") from error
+        return Path(os.path.realpath(path))
+
+
+def _temporary_beside(target: Path) -> Path:
+    """A name in the target's folder that nobody else has."""
+    return target.with_name(f".{target.name[:40]}.{secrets.token_hex(8)}")
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[IO[bytes]]:
-    """A file to write under a temporary name in the same folder, renamed to `path` at the end.
+    """A file to write and to seek in, under a temporary name in the same folder, renamed at the end.
 
-    Nobody sees half a file, and after an error nothing is left.
+    Nobody sees half a file, and after an error nothing is left. An existing file gives its mode and owner to
+    the new one; its other hard links keep the old content. What is_stream gets the whole content at the end.
     """
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "w+b") as file:
+    if is_stream(path):
+        with _naming(path), tempfile.TemporaryFile() as file:
             yield file
-        _open_to_umask(Path(temporary), 0o666)
-        Path(temporary).replace(path)
+            file.seek(0)
+            _write_stream(path, file)
+        return
+    target = _target_of(path)
+    temporary = _temporary_beside(target)
+    try:
+        with _naming(path, temporary):
+            old = target.stat() if target.exists() else None
+            mode = stat.S_IMODE(old.st_mode) if old else NEW_FILE
+            handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, mode)
+            with os.fdopen(handle, "w+b") as file:
+                yield file
+                file.flush()
+                if old:
+                    _keep_owner(handle, old)
+                # It takes milliseconds. File systems that write late (NFS, quotas) say only now that there is
+                # no room, and after a power cut the new name might stand for an empty file.
+                os.fsync(handle)
+            temporary.replace(target)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def _keep_owner(handle: int, old: os.stat_result) -> None:
+    """Give an open file the owner, where that is allowed, and the mode of the one that it replaces."""
+    with suppress(PermissionError):
+        os.fchown(handle, old.st_uid, old.st_gid)
+    os.fchmod(handle, stat.S_IMODE(old.st_mode))
+
+
+def _write_stream(path: Path, file: IO[bytes]) -> None:
+    """Copy a file to stdout, a FIFO (which waits for a reader) or a device."""
+    if not is_stdout(path):
+        with path.open("wb") as stream:
+            shutil.copyfileobj(file, stream)
+        return
+    if sys.stdout is None:
+        raise InputError(f"{path}: found a closed stdout, wanted an open one or a file")
+    sys.stdout.flush()
+    shutil.copyfileobj(file, sys.stdout.buffer)
+    sys.stdout.buffer.flush()
+
+
+@contextmanager
+def _naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
+    """Within this, the system's error while `path` is written names it, and nothing temporary.
+
+    That stdout's reader has gone stays an error without a name, as where `print` finds it out.
+    """
+    try:
+        yield
+    except OSError as error:
+        named = [Path(str(name)) for name in (error.filename, error.filename2) if name is not None]
+        is_closed = error.errno == errno.EPIPE and is_stdout(path)
+        is_bare = not named and not is_closed and error.errno in WRITE_ERRORS
+        if is_bare or (temporary and any(name.is_relative_to(temporary) for name in named)):
+            raise OSError(error.errno, error.strerror, str(path)) from error
         raise
 
 
@@ -62,21 +163,19 @@ def replacing_folder(path: Path) -> Iterator[Path]:
 
     Nobody sees it half full, and after an error nothing is left.
     """
-    temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    target = _target_of(path)
+    temporary = _temporary_beside(target)
     try:
-        yield temporary
-        _open_to_umask(temporary, 0o777)
-        temporary.replace(path)
+        with _naming(path, temporary):
+            temporary.mkdir(NEW_FOLDER)
+            yield temporary
+            if target.exists():
+                temporary.chmod(stat.S_IMODE(target.stat().st_mode))
+            temporary.replace(target)
     except BaseException:
-        shutil.rmtree(temporary)
+        if temporary.exists():
+            shutil.rmtree(temporary)
         raise
-
-
-def _open_to_umask(path: Path, mode: int) -> None:
-    """Temporary files and folders are private; what they become is not."""
-    umask = os.umask(0)
-    os.umask(umask)
-    path.chmod(mode & ~umask)
 
 
 def write_atomically(path: Path, content: bytes) -> None:

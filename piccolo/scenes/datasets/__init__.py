@@ -1,10 +1,12 @@
 """Research datasets, read from their own folders and written as scenes with true poses."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 from . import generic, loc360, matterport, mpo, omniscenes, stanford
-from .model import ConvertOptions, SceneList
+from .model import ConvertOptions, PosedPanorama, SceneList, SceneSpec
 
 __all__ = ["DATASETS", "Dataset"]
 
@@ -13,7 +15,24 @@ class Dataset(NamedTuple):
     """A dataset that can be converted."""
 
     description: str  # in a line
-    list_scenes: Callable[[ConvertOptions], SceneList]  # InputError if there is nothing of it in the folder
+    find: Callable[[ConvertOptions], SceneList]
+
+    def list_scenes(self, options: ConvertOptions) -> SceneList:
+        """The scenes in a folder; InputError if there are none. None is read from files outside of it."""
+        found = self.find(options)
+        specs = [replace(spec, read_panoramas=partial(_read_inside, options, spec)) for spec in found.specs]
+        return found._replace(specs=tuple(specs))
+
+
+def _read_inside(options: ConvertOptions, spec: SceneSpec) -> list[PosedPanorama]:
+    """The panoramas of a scene; InputError if its cloud or one of their files lies outside."""
+    for part in spec.cloud:
+        options.inside(part.path)
+    panoramas = spec.read_panoramas()
+    for panorama in panoramas:
+        for file in panorama.files.values():
+            options.inside(file)
+    return panoramas
 
 
 DATASETS = {

@@ -34,7 +34,7 @@ def list_scenes(options: ConvertOptions) -> SceneList:
     if not options.poses and len(found) != 1:
         wanted = f"wanted one of {', '.join(LISTS)}, or --poses"
         raise InputError(f"{options.folder}: found {len(found)} lists, {wanted}")
-    path = options.poses or found[0]
+    path = options.poses or options.inside(found[0])
     entries: dict[str, list[Entry]] = defaultdict(list)
     notes: list[str] = []
     rows = _rows(path, options, notes)
@@ -96,7 +96,7 @@ def _trajectory(path: Path, options: ConvertOptions, notes: list[str]) -> list[d
             raise InputError(f"{path}: found {found!r}, wanted {' '.join(TUM_COLUMNS)} a line")
         row = dict(zip(TUM_COLUMNS, fields, strict=True))
         if row["timestamp"] in pictures:
-            image = str(pictures[row["timestamp"]].resolve())
+            image = str(pictures[row["timestamp"]].absolute())
             rows.append({**row, "image": image, "direction": WORLD_FROM_CAM})
     if len(rows) < len(lines):
         notes.append(f"{path}: {len(lines) - len(rows)} of {len(lines)} times without a picture")

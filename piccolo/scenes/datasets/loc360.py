@@ -23,7 +23,10 @@ def list_scenes(options: ConvertOptions) -> SceneList:
     clouds = {folder: only_cloud_in(folder) for folder in folders}
     specs = [
         SceneSpec(
-            folder.resolve().name, (CloudPart(cloud),), partial(_panoramas, folder), source={"dataset": NAME}
+            folder.resolve().name,
+            (CloudPart(cloud),),
+            partial(_panoramas, options, folder),
+            source={"dataset": NAME},
         )
         for folder, cloud in clouds.items()
         if cloud
@@ -33,8 +36,9 @@ def list_scenes(options: ConvertOptions) -> SceneList:
     return scene_list(options.folder, specs, missing, layout)
 
 
-def _panoramas(folder: Path) -> list[PosedPanorama]:
-    return [each for path in sorted((folder / QUERIES).glob(f"*/{POSES}")) for each in _sequence(path)]
+def _panoramas(options: ConvertOptions, folder: Path) -> list[PosedPanorama]:
+    paths = map(options.inside, sorted((folder / QUERIES).glob(f"*/{POSES}")))
+    return [each for path in paths for each in _sequence(path)]
 
 
 def _sequence(path: Path) -> Iterator[PosedPanorama]:

@@ -37,7 +37,7 @@ def list_scenes(options: ConvertOptions) -> SceneList:
         posed = {place: faces[place] for place in whole if _pose_file(folder, place, SKYBOX_YAW).exists()}
         if len(posed) < len(faces):
             notes.append(f"{folder}: {len(faces) - len(posed)} skyboxes without a pose or without six faces")
-        read_panoramas = partial(_posed_panoramas, folder, posed)
+        read_panoramas = partial(_posed_panoramas, options, folder, posed)
         parts = tuple(map(CloudPart, meshes))
         specs.append(SceneSpec(folder.resolve().name, parts, read_panoramas, source={"dataset": NAME}))
     listed = scene_list(options.folder, specs, missing, f"HOUSE/{SKYBOXES} with a mesh")
@@ -57,17 +57,21 @@ def _pose_file(folder: Path, place: str, yaw: int) -> Path:
     return folder / POSES / f"{place}_pose_{LEVEL_CAMERA}_{yaw}.txt"
 
 
-def _posed_panoramas(folder: Path, faces: dict[str, dict[str, Path]]) -> list[PosedPanorama]:
-    return [_posed_panorama(folder, place, files) for place, files in faces.items()]
+def _posed_panoramas(
+    options: ConvertOptions, folder: Path, faces: dict[str, dict[str, Path]]
+) -> list[PosedPanorama]:
+    return [_posed_panorama(options, folder, place, files) for place, files in faces.items()]
 
 
-def _posed_panorama(folder: Path, place: str, files: dict[str, Path]) -> PosedPanorama:
+def _posed_panorama(
+    options: ConvertOptions, folder: Path, place: str, files: dict[str, Path]
+) -> PosedPanorama:
     """The skybox of a place: turned as the level camera at one of its stops, in the middle of all of them.
 
     The camera's axes are right, down, forward; skybox 1 is what our cubes have in front.
     """
     paths = [_pose_file(folder, place, yaw) for yaw in range(NUM_YAWS)]
-    matrices = {path: read_matrix(path, 4) for path in paths if path.exists()}
+    matrices = {path: read_matrix(options.inside(path), 4) for path in paths if path.exists()}
     T_world_from_skybox = matrices[paths[SKYBOX_YAW]].copy()
     T_world_from_skybox[:3, 3] = np.mean([matrix[:3, 3] for matrix in matrices.values()], axis=0)
     pose = pose_of_transform(str(paths[SKYBOX_YAW]), T_world_from_skybox, WORLD_FROM_CAM, "optical")

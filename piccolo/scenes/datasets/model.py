@@ -1,7 +1,9 @@
 """The scenes that are found in a dataset, before they are written."""
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,6 +30,19 @@ class ConvertOptions:
     images: Path | None = None
     axes: str | None = None
     direction: str | None = None
+
+    @cached_property
+    def _roots(self) -> list[str]:
+        """What the user named, which may be links themselves, without links."""
+        named = self.folder, self.poses and self.poses.parent, self.cloud, self.images
+        return [os.path.realpath(path) for path in named if path]
+
+    def inside(self, path: Path) -> Path:
+        """A file of the dataset, which is refused if it lies elsewhere, by a link or by ".."."""
+        real = Path(os.path.realpath(path))
+        if not any(real.is_relative_to(root) for root in self._roots):
+            raise InputError(f"{path}: leads to {real}, out of {self.folder}; move or copy the file into it")
+        return path
 
 
 class CloudPart(NamedTuple):

@@ -21,23 +21,29 @@ def list_scenes(options: ConvertOptions) -> SceneList:
             if match := SEQUENCE.match(sequence.name):
                 files = sorted(path for path in sequence.iterdir() if path.suffix.lower() in SUFFIXES)
                 pictures[split.parent / "pcd" / f"{match[1]}.txt", match[1]] += files
-    specs = [_scene_spec(room, cloud, files) for (cloud, room), files in pictures.items() if cloud.exists()]
+    specs = [
+        _scene_spec(options, room, cloud, files)
+        for (cloud, room), files in pictures.items()
+        if cloud.exists()
+    ]
     missing = sorted(str(cloud) for cloud, _ in pictures if not cloud.exists())
     layout = "SPLIT_pano/HOW_ROOM_N_scene_K with a cloud pcd/ROOM_N.txt"
     return scene_list(options.folder, sorted(specs, key=lambda spec: spec.name), missing, layout)
 
 
-def _scene_spec(room: str, cloud: Path, pictures: list[Path]) -> SceneSpec:
-    parts = (CloudPart(cloud),)
-    return SceneSpec(room, parts, lambda: list(map(_posed_panorama, pictures)), source={"dataset": NAME})
+def _scene_spec(options: ConvertOptions, room: str, cloud: Path, pictures: list[Path]) -> SceneSpec:
+    def read_panoramas() -> list[PosedPanorama]:
+        return [_posed_panorama(options, path) for path in pictures]
+
+    return SceneSpec(room, (CloudPart(cloud),), read_panoramas, source={"dataset": NAME})
 
 
-def _posed_panorama(path: Path) -> PosedPanorama:
+def _posed_panorama(options: ConvertOptions, path: Path) -> PosedPanorama:
     """A panorama with the pose [R_cam_from_world | center_world] beside it, in our own axes."""
     split = path.parents[1]
     variant = split.name.removesuffix("_pano")
     pose_file = split.parent / f"{variant}_pose" / path.parent.name / f"{path.stem}.txt"
-    matrix = read_matrix(pose_file, 3)
+    matrix = read_matrix(options.inside(pose_file), 3)
     pose = checked_pose(str(pose_file), matrix[:, :3], matrix[:, 3], "piccolo")
     name = f"{variant}_{path.parent.name}_{path.name}"
     return PosedPanorama(name, {name: path}, variant, pose)

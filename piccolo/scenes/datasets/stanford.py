@@ -3,7 +3,7 @@
 import json
 import re
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -56,14 +56,15 @@ class Picture(NamedTuple):
 
 def list_scenes(options: ConvertOptions) -> SceneList:
     """The rooms for which there are panoramas and a cloud."""
-    table = _read_table(options.folder) if options.labels else None
+    table = _read_table(options) if options.labels else None
     specs, missing = [], []
     for (area, room), pictures in sorted(_pictures(options.folder).items()):
         if options.areas and area not in options.areas:
             continue
         name = f"area_{area}/{room}"
         if parts := _cloud_of(options.folder, area, room, options.labels):
-            specs.append(_scene_spec(name, parts, pictures, table))
+            read_panoramas = partial(_posed_panoramas, options, pictures, table)
+            specs.append(_scene_spec(name, parts, read_panoramas, table is not None))
         else:
             missing.append(name)
     layout = f"room with panoramas ({PANORAMAS[0]}) and a cloud ({CLOUDS[0]}, with --labels Annotations)"
@@ -107,19 +108,25 @@ def _cloud_of(folder: Path, area: str, room: str, has_labels: bool) -> tuple[Clo
 
 
 def _scene_spec(
-    name: str, parts: tuple[CloudPart, ...], pictures: list[Picture], table: NDArray[np.uint16] | None
+    name: str,
+    parts: tuple[CloudPart, ...],
+    read_panoramas: Callable[[], list[PosedPanorama]],
+    has_labels: bool,
 ) -> SceneSpec:
-    source: dict[str, object] = {"dataset": NAME, "labels": table is not None}
-    if table is not None:
+    source: dict[str, object] = {"dataset": NAME, "labels": has_labels}
+    if has_labels:
         source["label_names"] = ["unknown", *CLASSES]
-    read_panoramas = partial(_posed_panoramas, pictures, table)
-    return SceneSpec(name, parts, read_panoramas, has_labels=table is not None, source=source)
+    return SceneSpec(name, parts, read_panoramas, has_labels=has_labels, source=source)
 
 
-def _posed_panoramas(pictures: list[Picture], table: NDArray[np.uint16] | None) -> list[PosedPanorama]:
+def _posed_panoramas(
+    options: ConvertOptions, pictures: list[Picture], table: NDArray[np.uint16] | None
+) -> list[PosedPanorama]:
     panoramas = []
     for picture in pictures:
-        read_labels = None if table is None else partial(labels_by_index, picture.semantic, table)
+        options.inside(picture.pose)
+        semantic = options.inside(picture.semantic)
+        read_labels = None if table is None else partial(labels_by_index, semantic, table)
         files, variant = {picture.path.name: picture.path}, f"area_{picture.part}"
         panoramas.append(PosedPanorama(picture.path.name, files, variant, _read_pose(picture), read_labels))
     return panoramas
@@ -148,12 +155,14 @@ def _three(path: Path, document: Any, name: str) -> Array:
     return values
 
 
-def _read_table(folder: Path) -> NDArray[np.uint16]:
+def _read_table(options: ConvertOptions) -> NDArray[np.uint16]:
     """The class of each index in the semantic pictures."""
-    found = _globbed(folder, LABEL_FILES)
+    found = _globbed(options.folder, LABEL_FILES)
     if not found:
-        raise InputError(f"{folder}: found no {LABEL_FILES[1]}, wanted the names of the semantic indices")
-    names = read_json(found[0], "wanted a list of names")
+        raise InputError(
+            f"{options.folder}: found no {LABEL_FILES[1]}, wanted the names of the semantic indices"
+        )
+    names = read_json(options.inside(found[0]), "wanted a list of names")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise InputError(f"{found[0]}: found {json.dumps(names)[:60]}, wanted a list of names")
     return np.array([NUMBERS.get(name.split("_")[0], 0) for name in names], dtype=np.uint16)

@@ -231,14 +231,15 @@ def open_run(path: Path, config: RunConfig, scenes: Sequence[Scene], variants: S
     own = tuple(row for row in rows if row.key in queries and (not variants or row.variant in variants))
     jobs = jobs_of(scenes, {row.key for row in rows}, variants)
     if jobs:
-        check_output(path, input_files(scenes))
+        check_output(path)
     return Run(path, config, own, tuple(jobs), size)
 
 
 def input_files(scenes: Sequence[Scene]) -> list[Path]:
     """The files of scenes, which no output may replace."""
     of_all = [path for scene in scenes for path in (scene.folder / QUERIES_NAME, scene.cloud)]
-    return of_all + [query.image for scene in scenes for query in scene.queries]
+    queries = [query for scene in scenes for query in scene.queries]
+    return of_all + [path for query in queries for path in (query.image, query.labels) if path]
 
 
 def _is_of(row: QueryResult, scene: Scene, query: Query) -> bool:

@@ -26,7 +26,7 @@ def export(results: Sequence[Result], name: str, out: Path, options: Options) ->
     if form.is_folder:
         check_output_folder(out)
     else:
-        check_output(out, [Path(result.pano) for result in results])
+        check_output(out)
     if not results:
         raise InputError(f"{out}: there is no pose to write; --all also writes those that are not localized")
     form.write(posed_images(results, form, options), out, options)

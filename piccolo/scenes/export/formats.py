@@ -24,7 +24,7 @@ from ...geometry.rotations import (
     translation,
     turned,
 )
-from ...runtime.atomic import replacing_folder, write_atomically
+from ...runtime.atomic import is_stream, replacing_folder, write_atomically
 from ...runtime.optional import import_optional
 from .posed_images import Format, Options, PosedImage
 
@@ -34,6 +34,8 @@ COLUMNS = (
     *("heading_deg", "pitch_deg", "roll_deg"),
 )
 STEP = 10.0  # [m] ahead, to find true north
+MARGIN_DEG = 3.0  # around a system's area: a country that spans two zones often uses one for both
+LOCAL = 10_000.0  # [m] from (0, 0): without a margin, as scans with coordinates of their own lie there
 
 
 def numbers(values: Iterable[float], separator: str = " ") -> str:
@@ -53,11 +55,17 @@ def write_lines(out: Path, lines: Sequence[str]) -> None:
     write_atomically(out, "".join(f"{line}\n" for line in lines).encode())
 
 
+def offset_file(out: Path) -> Path:
+    """The file of the offset beside one that has no place for it."""
+    return out.with_name(f"{out.name}.offset.txt")
+
+
 def write_offset_beside(out: Path, options: Options) -> None:
     """Write <name>.offset.txt with the offset's three numbers, if there is an offset."""
     if options.offset is not None:
-        lines = [*offset_comment(options), numbers(options.offset)]
-        write_lines(out.with_name(f"{out.name}.offset.txt"), lines)
+        if is_stream(out):
+            raise InputError(f"--offset: nothing can be written beside {out}, wanted a file as --out")
+        write_lines(offset_file(out), [*offset_comment(options), numbers(options.offset)])
 
 
 def write_csv(images: Sequence[PosedImage], out: Path, options: Options) -> None:
@@ -196,8 +204,32 @@ def write_geojson(images: Sequence[PosedImage], out: Path, options: Options) -> 
     if not system.is_projected or units != {"metre"}:
         raise InputError(f"--crs: found {crs} ({system.name}), wanted a projected system in metres")
     transformer = pyproj.Transformer.from_crs(system, "EPSG:4326", always_xy=True)
+    for image in images:
+        _check_place(image, system, transformer, crs)
     features = [_feature(image, transformer, pyproj.Geod(ellps="WGS84"), crs) for image in images]
     write_json(out, {"type": "FeatureCollection", "features": features})
+
+
+def _check_place(image: PosedImage, system: Any, transformer: Any, crs: str) -> None:
+    """Refuse a camera outside of the area where the system is used, as far as the system says it."""
+    x, y = image.pose.center_world[:2].tolist()
+    longitude, latitude = transformer.transform(x, y)
+    parts = [system, *system.sub_crs_list]  # a system with a height says it of its parts
+    area = next((part.area_of_use for part in parts if part.area_of_use), None)
+    if not np.isfinite([longitude, latitude]).all() or (area and not _is_in(area, longitude, latitude, x, y)):
+        name = str(system.name)
+        if area:
+            name += f", {area.west:g} to {area.east:g} E, {area.south:g} to {area.north:g} N"
+        found = f"found a camera at ({x:g}, {y:g})"
+        raise InputError(f"{image.path}: {found}, wanted one where {crs} holds ({name})")
+
+
+def _is_in(area: Any, longitude: float, latitude: float, x: float, y: float) -> bool:
+    """True if a place [deg], (x, y) [m] in the system, is in its area with a margin; some cross 180 E."""
+    margin = 0.0 if np.hypot(x, y) < LOCAL else MARGIN_DEG
+    width = 360.0 if area.east - area.west >= 360.0 else (area.east - area.west) % 360.0
+    is_between = (longitude - area.west + margin) % 360.0 <= width + 2.0 * margin
+    return bool(is_between and area.south - margin <= latitude <= area.north + margin)
 
 
 def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[str, object]:
@@ -207,8 +239,6 @@ def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[s
     ahead = np.radians(heading)
     eastings, northings = [x, x + STEP * np.sin(ahead)], [y, y + STEP * np.cos(ahead)]
     longitudes, latitudes = transformer.transform(eastings, northings)
-    if not np.isfinite([*longitudes, *latitudes]).all():
-        raise InputError(f"{image.path}: found a camera at ({x}, {y}), wanted one where {crs} holds")
     true_heading, _, _ = geod.inv(longitudes[0], latitudes[0], longitudes[1], latitudes[1])
     properties: dict[str, object] = {"image": image.name, "cloud": result.cloud_name, "status": result.status}
     properties |= {"confidence": result.confidence, "score": result.evidence and result.evidence.score}
