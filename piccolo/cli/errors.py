@@ -2,21 +2,35 @@
 
 import argparse
 import os
+import signal
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FrameType
 
 from tqdm import tqdm
 
 from ..errors import InputError
+from ..runtime.memory import is_shortage
 from .parser import as_started, parse
+from .start import EXIT_INTERRUPTED
 
-EXIT_BAD_USAGE, EXIT_BAD_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_BROKEN_PIPE = 2, 3, 4, 130, 141
+EXIT_BAD_USAGE, EXIT_BAD_INPUT, EXIT_INTERNAL, EXIT_BROKEN_PIPE, EXIT_TERMINATED = 2, 3, 4, 141, 143
+
+
+RETRY = 0.1  # [s] after which a signal is sent again
+INTERRUPTED = "interrupted", EXIT_INTERRUPTED
+SHORTAGE = "not enough memory: {}; set --max-memory or fewer --threads, or thin the scan"
 
 
 class UsageError(InputError):
     """The options are wrong, whatever the files hold."""
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM has come: as with Ctrl-C, what has been begun is cleaned up on the way out."""
 
 
 @contextmanager
@@ -34,20 +48,63 @@ def run_command(
     """The exit code of `run` with the options given, or of the error that ended it, which is printed."""
     arguments = parse(parser, argv)
     try:
-        code = run(arguments)
+        with raising_signals():
+            code = run(arguments)
         sys.stdout.flush()  # here, where a closed pipe is caught
         return code
-    except BrokenPipeError:  # the reader of stdout has gone: say nothing, not even at the flush at exit
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:  # the reader of stdout has gone: say nothing
+        _drop_stdout()
         return EXIT_BROKEN_PIPE
-    except KeyboardInterrupt:
-        return print_error(arguments, "interrupted", EXIT_INTERRUPTED)
-    except UsageError as error:
-        return print_error(arguments, str(error), EXIT_BAD_USAGE)
+    except KeyboardInterrupt as stop:
+        text, code = ("terminated", EXIT_TERMINATED) if isinstance(stop, Terminated) else INTERRUPTED
+        return print_error(arguments, text, code)
     except (OSError, InputError) as error:
-        return print_error(arguments, format_error(error), EXIT_BAD_INPUT)
+        _drop_stdout()
+        code = EXIT_BAD_USAGE if isinstance(error, UsageError) else EXIT_BAD_INPUT
+        return print_error(arguments, format_error(error), code)
     except Exception as error:  # the last line of defence: a code and one line for the shell
+        if is_shortage(error):
+            return print_error(arguments, SHORTAGE.format(" ".join(str(error).split())), EXIT_BAD_INPUT)
         return print_error(arguments, f"internal error: {error!r}; --debug shows where", EXIT_INTERNAL)
+
+
+@contextmanager
+def raising_signals() -> Iterator[None]:
+    """Within this, SIGTERM raises Terminated in the main thread, as SIGINT raises KeyboardInterrupt.
+
+    Code that is called back from C, as by LLVM while a kernel is compiled, can't pass an exception on: then
+    the signal is sent again a moment later.
+    """
+    if threading.current_thread() is not threading.main_thread():  # where no handler can be set
+        yield
+        return
+    before, hook = signal.signal(signal.SIGTERM, _terminate), sys.unraisablehook
+    sys.unraisablehook = _send_again
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+        sys.unraisablehook = hook
+
+
+def _terminate(signum: int, frame: FrameType | None) -> None:
+    raise Terminated
+
+
+def _send_again(lost: "sys.UnraisableHookArgs") -> None:
+    if issubclass(lost.exc_type, KeyboardInterrupt):
+        number = signal.SIGTERM if issubclass(lost.exc_type, Terminated) else signal.SIGINT
+        threading.Timer(RETRY, os.kill, (os.getpid(), number)).start()
+    else:
+        sys.__unraisablehook__(lost)
+
+
+def _drop_stdout() -> None:
+    """Let what stdout still holds go nowhere if it can't be written, as Python tries again at its exit."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def print_error(arguments: argparse.Namespace, text: str, exit_code: int) -> int:
@@ -68,4 +125,6 @@ def format_error(error: OSError | InputError) -> str:
     """An error in one line: of the system's, the file and what went wrong."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: cannot be used ({error.strerror})"
+    if isinstance(error, OSError) and error.strerror:  # of a stream or pipe, which have no name
+        return f"writing or reading failed ({error.strerror})"
     return str(error)

@@ -36,7 +36,8 @@ def new_parser(
     `exit_codes` are those of the command itself, below 2.
     """
     program = as_started(f"{name}.py")
-    epilog += f"exit codes: {exit_codes}, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted."
+    epilog += f"exit codes: {exit_codes}, 2 wrong usage, 3 bad input, 4 internal error, 130 interrupted, 143 "
+    epilog += "terminated."
     parser = argparse.ArgumentParser(
         program, description=description, epilog=epilog, formatter_class=HelpFormatter
     )

@@ -17,7 +17,7 @@ from ..runtime.atomic import replacing
 from .scan_map import ScanMap
 
 FORMAT = "piccolo-map/2"
-ARRAYS = [f.name for f in fields(ScanMap) if f.name not in ("octree", "warnings")]
+ARRAYS = [f.name for f in fields(ScanMap) if f.name not in ("octree", "warnings", "is_partial")]
 ZIP_MAGIC = b"PK\x03\x04"
 # The first member of a map: its name and where that stands, and the beginning of its value somewhere behind.
 FIRST_NAME, FIRST_NAME_AT = b"format.npy", 30

@@ -20,6 +20,7 @@ from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from .map_file import FORMAT, is_map_file, load_map, save_map
 from .scan_map import ScanMap, prepare_map
+from .settings import NOTHING_KNOWN, Prior
 
 NAME = re.compile(r"[0-9a-f]{32}\.piccolo-map")  # of a file in the cache
 # What makes a map: folders of the package. The cache makes maps anew when one of their files has changed.
@@ -40,10 +41,11 @@ def open_map(
     cache: CachePolicy,
     workers: Workers,
     watch: Stopwatch,
+    prior: Prior = NOTHING_KNOWN,
 ) -> ScanMap:
     """The map of a cloud's files: prepared already, from the cache, or built now.
 
-    A prepared map may stand in place of the files.
+    A prepared map may stand in place of the files. The prior is asked where the scan is too large as a whole.
     """
     map_path = prepared_map_among(paths)
     if map_path:
@@ -59,7 +61,7 @@ def open_map(
     def build() -> ScanMap:
         with watch.stage("read"):
             cloud = open_cloud(paths, cloud_settings, workers.show)
-        scan_map = prepare_map(cloud, workers, cloud_settings.up, watch)
+        scan_map = prepare_map(cloud, workers, cloud_settings.up, watch, prior=prior)
         return replace(scan_map, has_labels=cloud_settings.labels is not None)
 
     if not (cache.is_used and all(path.is_file() for path in paths)):
@@ -113,6 +115,8 @@ def cached_map(folder: Path | None, key: str, build: Callable[[], ScanMap], watc
             mark_used(path)
             return scan_map
     scan_map = build()
+    if scan_map.is_partial:
+        return scan_map
     with watch.stage("prepare"):
         folder.mkdir(parents=True, exist_ok=True)
         remove_stale(folder, NAME)

@@ -147,6 +147,8 @@ def best_poses(scores: Samples, pool: int) -> tuple[NDArray[np.int64], NDArray[n
     rank = len(sample) - 1 - int(min(2 * pool / step + 20, len(sample) - 1))
     threshold = sample[rank] if step > 1 else -np.inf
     top = indices[: min(count_above(flat, threshold, indices), len(indices))]
+    if len(top) == 0:  # all fit alike: a scan of one colour
+        top = np.flatnonzero(flat == threshold)
     top = top[np.lexsort((top, -flat[top]))][:pool]
     return *np.divmod(top, scores.shape[1]), flat[top]
 
