@@ -30,6 +30,7 @@ ADVICE = (
     "the most that are searched; if its unit is not the metre, set --units, else say where the camera was "
     "(--near X Y Z --radius M) or cut out a part"
 )
+BASES = 1 << 14  # cells on surfaces, around which others are supported, at a time
 LONG = 60.0  # [s] a warning tells how long the views take, if more
 COST_OF_VIEW = 4.0  # looking and rendering at a position, in the time of looking
 
@@ -77,15 +78,18 @@ def supported_cells(
     low = base.min(axis=0) - reach
     shape = base.max(axis=0) - low + reach + len(layers)
     weights = np.array([shape[1] * shape[2], shape[2], 1])  # one number a cell sorts as its three do
-    codes = np.unique((base - low) @ weights)
-    if len(codes) <= MAX_POSITIONS:  # else there are at least as many, and the memory for them may not be
-        codes = np.unique(codes[:, None] + steps @ weights)
-        cells = np.asarray(np.stack(np.unravel_index(codes, shape), axis=1) + low)
+    codes, found = np.unique((base - low) @ weights), np.empty(0, np.int64)
+    for begin in range(0, len(codes), BASES):
+        around_some = np.unique(codes[begin : begin + BASES, None] + steps @ weights)
+        cells = np.stack(np.unravel_index(around_some, shape), axis=1) + low
         if within is not None:
-            cells = cells[np.linalg.norm((cells + 0.5) * s - within[0], axis=1) <= within[1] + s]
-        if len(cells) <= MAX_POSITIONS:
-            return cells
-    raise TooManyPositionsError("surfaces of {:.0f} x {:.0f} x {:.0f} m".format(*np.ptp(surfaces, axis=0)))
+            distance = np.linalg.norm((cells + 0.5) * s - within[0], axis=1)
+            around_some = around_some[distance <= within[1] + s]
+        found = np.union1d(found, around_some)
+        if len(found) > MAX_POSITIONS:
+            size = "{:.0f} x {:.0f} x {:.0f} m".format(*np.ptp(surfaces, axis=0))
+            raise TooManyPositionsError(f"surfaces of {size}")
+    return np.asarray(np.stack(np.unravel_index(found, shape), axis=1) + low)
 
 
 def coverage(octree: Octree, centers: NDArray[np.floating[Any]], workers: Workers) -> NDArray[np.float32]:
