@@ -137,7 +137,8 @@ def result_of(
 ) -> Result:
     """The result of a localization, with the names of the files and what it took."""
     values = {f.name: getattr(found, f.name) for f in fields(found)}
-    return Result(cloud=cloud, pano=pano, seconds=seconds, settings=settings, warnings=warnings, **values)
+    values["warnings"] = warnings + found.warnings
+    return Result(cloud=cloud, pano=pano, seconds=seconds, settings=settings, **values)
 
 
 _PLAIN_FIELDS = ("status", "confidence", "pano", "loss", "seconds", "settings")

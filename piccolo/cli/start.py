@@ -4,6 +4,7 @@
 """
 
 import os
+import resource
 import signal
 import sys
 from collections.abc import Callable
@@ -11,6 +12,8 @@ from functools import partial
 from importlib import import_module
 from types import FrameType
 
+# [byte] below it LLVM and OpenBLAS crash or wait for ever, where NumPy raises; each core has a thread
+LEAST_ADDRESS_SPACE = 1_000_000_000 + 250_000_000 * (os.cpu_count() or 1)
 EXIT_CANNOT_START, EXIT_INTERRUPTED = 3, 130
 
 
@@ -24,6 +27,12 @@ def __getattr__(name: str) -> Callable[[], int]:
 def run(name: str) -> int:
     """Import the command `name` of piccolo.cli and run it; returns its exit code."""
     open_closed_streams()
+    space, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if 0 <= space < LEAST_ADDRESS_SPACE:
+        print_line(
+            f"found ulimit -v {space >> 10}, wanted {LEAST_ADDRESS_SPACE >> 10} or more on this machine"
+        )
+        return EXIT_CANNOT_START
     handler = signal.getsignal(signal.SIGINT)
     is_ignored = handler is not signal.default_int_handler  # by nohup, or a shell's &
     signal.signal(signal.SIGINT, handler if is_ignored else _quit)

@@ -6,8 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..runtime.jit import kernel
-from .voxels import COARSEST, LEAF_SIZE, Voxels
+from ..runtime.memory import check_memory
+from .voxels import COARSEST, LEAF_SIZE, THIN, Voxels
 
+NODE_BYTES = 6 * 4 + 8 + 4  # mean, code, first child
 NUM_LEVELS = COARSEST.bit_length()  # from 128 leaves wide (2.56 m) down to one
 
 
@@ -54,12 +56,15 @@ def build_octree(voxels: Voxels) -> Octree:
     nodes, node_codes = voxels.nodes, voxels.codes
     levels, children = [nodes], [np.zeros(len(nodes), np.int32)]
     for _ in range(NUM_LEVELS - 1):
+        check_memory(2 * len(nodes) * NODE_BYTES, f"the scan: a level of {len(nodes)} voxels", THIN)
         parents, parent_codes = np.empty_like(nodes), np.empty_like(node_codes)
         first = np.empty(len(nodes), np.int32)
         count = average_children(nodes, node_codes, parents, parent_codes, first)
         nodes, node_codes = parents[:count].copy(), parent_codes[:count].copy()
         levels.insert(0, nodes)
         children.insert(0, first[:count].copy())
+    num_nodes = sum(map(len, levels))
+    check_memory(num_nodes * NODE_BYTES, f"the scan: a tree of {num_nodes} voxels", THIN)
     start = np.concatenate([[0], np.cumsum([len(level) for level in levels])]).astype(np.int32)
     first_child = np.concatenate([c + s for c, s in zip(children[:-1], start[1:-1], strict=True)])
     leaves = np.full(len(levels[-1]) + 1, start[-1], np.int32)

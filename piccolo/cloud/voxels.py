@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..runtime.jit import inline_kernel, kernel
+from ..runtime.memory import check_memory
 from .morton import NUM_CELLS, morton_codes
 
 LEAF_SIZE = 0.02  # [m]
@@ -28,6 +29,9 @@ PHASE = (COARSEST << QUANTUM_BITS) // 3 + 1
 # columns of the table: cell, number of points (0: the row is free), sums of quanta, sums of colours
 CELL, COUNT, POSITION, COLOR, NUM_COLUMNS = 0, 3, 4, 7, 10
 FIRST_ROWS, MAX_ROWS = 1 << 16, 1 << 27  # 40 bytes a row; the most are 80 million voxels, 20,000 m^2 or more
+ROW_BYTES = 4 * NUM_COLUMNS
+VOXEL_BYTES = ROW_BYTES + 3 * 8 + 3 * 8 + 3 * 8 + 6 * 4  # rows, cells, a copy of them, codes and order, nodes
+THIN = "set --units if its unit is not the metre, or cut out a part"
 MAX_LOAD = 0.6  # share of the rows in use
 
 
@@ -126,12 +130,16 @@ class VoxelTable:
         if len(self.table) >= MAX_ROWS:
             found = f"more than {self.num_voxels} voxels of {LEAF_SIZE} m are filled"
             raise InputError(f"{self.label}: {found}; if its unit is not the metre, set --units or --scale")
-        larger = np.zeros((2 * len(self.table), NUM_COLUMNS), np.int32)
+        num_rows = 2 * len(self.table)
+        check_memory(num_rows * ROW_BYTES, f"{self.label}: a table of {num_rows} voxels of 2 cm", THIN)
+        larger = np.zeros((num_rows, NUM_COLUMNS), np.int32)
         move_voxels(self.table, larger)
         self.table = larger
 
     def finish(self) -> Voxels:
         """The means; those too far from the rest for a Morton code are left out. The table is spent."""
+        num = self.num_voxels
+        check_memory(num * VOXEL_BYTES, f"{self.label}: sorting {num} voxels of 2 cm", THIN)
         rows = self.table[self.table[:, COUNT] > 0]
         self.table = self.table[:0]
         cells = rows[:, :COUNT] + (np.zeros(3, np.int64) if self.base is None else self.base)

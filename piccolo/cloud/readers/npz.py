@@ -102,7 +102,7 @@ def _damage_named(path: Path) -> Iterator[None]:
     """Turn what zipfile, zlib and NumPy's header parser raise on damaged files, 14 types, into one line."""
     try:
         yield
-    except InputError:
+    except (InputError, MemoryError):
         raise
     except Exception as error:
         if isinstance(error, OSError) and error.errno != errno.EINVAL:
