@@ -45,16 +45,22 @@ def test_console_commands_begin_before_their_libraries():
         _ = start.__wrapped__
 
 
-@pytest.mark.parametrize("script", ["localize.py", "tools/prepare_map.py"])
-def test_interrupt_while_libraries_are_imported(script, tmp_path):
+@pytest.mark.parametrize(
+    ("script", "number", "code", "word"),
+    [
+        ("localize.py", signal.SIGINT, 130, "interrupted"),
+        ("tools/prepare_map.py", signal.SIGTERM, 143, "terminated"),
+    ],
+)
+def test_signals_while_libraries_are_imported(script, number, code, word, tmp_path):
     (tmp_path / "numpy.py").write_text("import time\nprint('importing', flush=True)\ntime.sleep(60)\n")
     with subprocess.Popen(
         _command(script), env={"PYTHONPATH": str(tmp_path)}, stdout=-1, stderr=-1, text=True
     ) as process:
         assert process.stdout.readline() == "importing\n"
-        process.send_signal(signal.SIGINT)
-        assert process.stderr.read() == f"{Path(script).name}: interrupted\n"
-    assert process.returncode == 130
+        process.send_signal(number)
+        assert process.stderr.read() == f"{Path(script).name}: {word}\n"
+    assert process.returncode == code
 
 
 def test_a_library_that_cannot_be_loaded_is_one_line(tmp_path):

@@ -15,14 +15,14 @@ from tqdm import tqdm
 from ..errors import InputError
 from ..runtime.memory import is_shortage
 from .parser import as_started, parse
-from .start import EXIT_INTERRUPTED
+from .start import EXIT_INTERRUPTED, EXIT_TERMINATED
 
-EXIT_BAD_USAGE, EXIT_BAD_INPUT, EXIT_INTERNAL, EXIT_BROKEN_PIPE, EXIT_TERMINATED = 2, 3, 4, 141, 143
+EXIT_BAD_USAGE, EXIT_BAD_INPUT, EXIT_INTERNAL, EXIT_BROKEN_PIPE = 2, 3, 4, 141
 
 
 RETRY = 0.1  # [s] after which a signal is sent again
-INTERRUPTED = "interrupted", EXIT_INTERRUPTED
-SHORTAGE = "not enough memory: {}; set --max-memory or fewer --threads, or thin the scan"
+INTERRUPTED, TERMINATED = ("interrupted", EXIT_INTERRUPTED), ("terminated", EXIT_TERMINATED)
+SHORTAGE = "not enough memory ({}); set --max-memory or fewer --threads, or thin the scan"
 
 
 class UsageError(InputError):
@@ -46,9 +46,9 @@ def run_command(
     parser: argparse.ArgumentParser, argv: list[str] | None, run: Callable[[argparse.Namespace], int]
 ) -> int:
     """The exit code of `run` with the options given, or of the error that ended it, which is printed."""
-    arguments = parse(parser, argv)
+    arguments, lost = parse(parser, argv), list[KeyboardInterrupt]()
     try:
-        with raising_signals():
+        with raising_signals(lost):
             code = run(arguments)
         sys.stdout.flush()  # here, where a closed pipe is caught
         return code
@@ -56,33 +56,52 @@ def run_command(
         _drop_stdout()
         return EXIT_BROKEN_PIPE
     except KeyboardInterrupt as stop:
-        text, code = ("terminated", EXIT_TERMINATED) if isinstance(stop, Terminated) else INTERRUPTED
-        return print_error(arguments, text, code)
+        return _stopped(arguments, stop)
     except (OSError, InputError) as error:
         _drop_stdout()
         code = EXIT_BAD_USAGE if isinstance(error, UsageError) else EXIT_BAD_INPUT
         return print_error(arguments, format_error(error), code)
     except Exception as error:  # the last line of defence: a code and one line for the shell
-        if is_shortage(error):
-            return print_error(arguments, SHORTAGE.format(" ".join(str(error).split())), EXIT_BAD_INPUT)
-        return print_error(arguments, f"internal error: {error!r}; --debug shows where", EXIT_INTERNAL)
+        return _unforeseen(arguments, error, lost)
+
+
+def _unforeseen(arguments: argparse.Namespace, error: Exception, lost: list[KeyboardInterrupt]) -> int:
+    if lost:  # what was called back by C has failed for it
+        return _stopped(arguments, lost[0])
+    if is_shortage(error):
+        text = " ".join(str(error).split()) or "none is left"
+        return print_error(arguments, SHORTAGE.format(text), EXIT_BAD_INPUT)
+    return print_error(arguments, f"internal error: {error!r}; --debug shows where", EXIT_INTERNAL)
 
 
 @contextmanager
-def raising_signals() -> Iterator[None]:
+def raising_signals(lost: list[KeyboardInterrupt]) -> Iterator[None]:
     """Within this, SIGTERM raises Terminated in the main thread, as SIGINT raises KeyboardInterrupt.
 
-    Code that is called back from C, as by LLVM while a kernel is compiled, can't pass an exception on: then
-    the signal is sent again a moment later.
+    Code that is called back from C, as by LLVM while a kernel is compiled, can't pass an exception on: it is
+    added to `lost`, and the signal is sent again a moment later.
     """
     if threading.current_thread() is not threading.main_thread():  # where no handler can be set
         yield
         return
+    timers: list[threading.Timer] = []
+
+    def send_again(unraisable: "sys.UnraisableHookArgs") -> None:
+        if isinstance(unraisable.exc_value, KeyboardInterrupt):
+            lost.append(unraisable.exc_value)
+            number = signal.SIGTERM if isinstance(unraisable.exc_value, Terminated) else signal.SIGINT
+            timers.append(threading.Timer(RETRY, os.kill, (os.getpid(), number)))
+            timers[-1].start()
+        else:
+            sys.__unraisablehook__(unraisable)
+
     before, hook = signal.signal(signal.SIGTERM, _terminate), sys.unraisablehook
-    sys.unraisablehook = _send_again
+    sys.unraisablehook = send_again
     try:
         yield
     finally:
+        for timer in timers:
+            timer.cancel()
         signal.signal(signal.SIGTERM, before)
         sys.unraisablehook = hook
 
@@ -91,12 +110,9 @@ def _terminate(signum: int, frame: FrameType | None) -> None:
     raise Terminated
 
 
-def _send_again(lost: "sys.UnraisableHookArgs") -> None:
-    if issubclass(lost.exc_type, KeyboardInterrupt):
-        number = signal.SIGTERM if issubclass(lost.exc_type, Terminated) else signal.SIGINT
-        threading.Timer(RETRY, os.kill, (os.getpid(), number)).start()
-    else:
-        sys.__unraisablehook__(lost)
+def _stopped(arguments: argparse.Namespace, stop: KeyboardInterrupt) -> int:
+    text, code = TERMINATED if isinstance(stop, Terminated) else INTERRUPTED
+    return print_error(arguments, text, code)
 
 
 def _drop_stdout() -> None:

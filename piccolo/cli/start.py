@@ -14,7 +14,7 @@ from types import FrameType
 
 # [byte] below it LLVM and OpenBLAS crash or wait for ever, where NumPy raises; each core has a thread
 LEAST_ADDRESS_SPACE = 1_000_000_000 + 250_000_000 * (os.cpu_count() or 1)
-EXIT_CANNOT_START, EXIT_INTERRUPTED = 3, 130
+EXIT_CANNOT_START, EXIT_INTERRUPTED, EXIT_TERMINATED = 3, 130, 143
 
 
 def __getattr__(name: str) -> Callable[[], int]:
@@ -36,6 +36,7 @@ def run(name: str) -> int:
     handler = signal.getsignal(signal.SIGINT)
     is_ignored = handler is not signal.default_int_handler  # by nohup, or a shell's &
     signal.signal(signal.SIGINT, handler if is_ignored else _quit)
+    signal.signal(signal.SIGTERM, _quit)
     try:
         main = import_module(f"piccolo.cli.{name}").main
     except (ImportError, MemoryError, OSError) as error:  # a library is missing, or memory for it
@@ -45,7 +46,7 @@ def run(name: str) -> int:
         signal.signal(signal.SIGINT, handler)
         return int(main())
     except KeyboardInterrupt:  # before or after the work
-        _quit()
+        print_line("interrupted")
     finally:
         signal.signal(signal.SIGINT, handler if is_ignored else _quit)
     return EXIT_INTERRUPTED
@@ -73,7 +74,8 @@ def print_line(text: str) -> None:
     os.write(2, f"{os.path.basename(sys.argv[0])}: {text}\n".encode(errors="backslashreplace"))  # noqa: PTH119
 
 
-def _quit(signum: int = signal.SIGINT, frame: FrameType | None = None) -> None:
+def _quit(signum: int, frame: FrameType | None) -> None:
     """End at once: there is nothing to clean up, and an exception would pass through half-made modules."""
-    print_line("interrupted")
-    os._exit(EXIT_INTERRUPTED)
+    is_interrupt = signum == signal.SIGINT
+    print_line("interrupted" if is_interrupt else "terminated")
+    os._exit(EXIT_INTERRUPTED if is_interrupt else EXIT_TERMINATED)
