@@ -3,7 +3,7 @@
 
 import sys
 
-from piccolo.cli.localize import main
+from piccolo.cli.start import run
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run("localize"))

@@ -154,10 +154,10 @@ class Result:
             ) from error
 
 
-def result_of(found: Localization, **about: Any) -> Result:
+def result_of(found: Localization, warnings: tuple[str, ...] = (), **about: Any) -> Result:
     """The result of a localization; `about` are the fields of Result that say what it is of and how made."""
-    values = {f.name: getattr(found, f.name) for f in fields(found) if f.name != "pose"}
-    return Result(best_pose=found.pose, **values, **about)
+    values = {f.name: getattr(found, f.name) for f in fields(found) if f.name not in ("pose", "warnings")}
+    return Result(best_pose=found.pose, warnings=warnings + found.warnings, **values, **about)
 
 
 def unreadable_result(error: str, cloud: str | tuple[str, ...], pano: str, **more: Any) -> Result:

@@ -273,7 +273,7 @@ def open_files(
     watch = Stopwatch()
     name = str(paths[0]) if len(paths) == 1 else tuple(map(str, paths))
     if isinstance(settings, CoarseToFineSettings):
-        scan_map = open_map(paths, cloud_settings, cache, workers, watch)
+        scan_map = open_map(paths, cloud_settings, cache, workers, watch, settings.prior)
         return Scan(scan_map, name, cloud_settings, settings, workers, watch.seconds)
     if map_path := prepared_map_among(paths):
         raise InputError(f"{map_path}: a prepared map; the preset paper needs the cloud itself")

@@ -1,4 +1,5 @@
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -7,11 +8,13 @@ from golden_poses import check_golden_poses
 from rooms import as_panorama, errors, query, room, scan_map
 
 from piccolo.cloud.stream import Cloud
-from piccolo.coarse_to_fine.camera_positions import heights_above_floor
+from piccolo.coarse_to_fine import camera_positions
+from piccolo.coarse_to_fine.camera_positions import heights_above_floor, supported_cells, top_surfaces
 from piccolo.coarse_to_fine.localize import localize
 from piccolo.coarse_to_fine.prior import allowed_rotations, apply_prior
 from piccolo.coarse_to_fine.scan_map import prepare_map
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings, Prior
+from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.geometry.rotations import uniform_yaws
 from piccolo.runtime.stopwatch import Stopwatch
@@ -113,6 +116,53 @@ def test_priors_leave_what_they_say():
     both = apply_prior(turned, Prior(tuple(origin + turn.T @ [0.5, 0, 0]), 1.0, (0.5, 1.0)))
     assert len(both.centers) == (is_near & is_low).sum()
     assert apply_prior(whole, Prior()) is whole
+
+
+def test_a_prior_that_allows_nothing_says_what_was_left_out():
+    whole, origin = scan_map(1), room(1)[1].origin_world
+    num, heights = len(whole.centers), heights_above_floor(whole.octree, whole.centers)
+    prior = Prior(tuple(whole.centers[0] + origin - [50.0, 0.0, 0.0]), 1.0, (0.5, 1.0))
+    settings = dataclasses.replace(KNOWN, prior=prior)
+    (text,) = _localize(1, query(1).rgb, settings).warnings
+    num_low = ((heights >= 0.2) & (heights <= 1.3)).sum()
+    start = (
+        f"no position is left of the scan's {num}: --near allows 0, --height allows {num_low}; the nearest"
+    )
+    assert text.startswith(start)
+    x, y, z, distance = map(float, re.search(r"is (\S+) (\S+) (\S+), (\S+) m away", text).groups())
+    to_near = np.linalg.norm(whole.centers + origin - prior.near_world, axis=1)
+    np.testing.assert_allclose((x, y, z), whole.centers[to_near.argmin()] + origin, atol=0.005)
+    assert distance == pytest.approx(to_near.min(), abs=0.005)
+
+
+def test_a_scan_too_large_is_refused_or_prepared_where_the_prior_says(monkeypatch):
+    cloud, whole = room(1)[1], scan_map(1)
+    center = whole.centers[0]
+    is_near = np.linalg.norm(whole.centers - center, axis=1) <= 1.0
+    num = len(supported_cells(top_surfaces(whole.octree)))
+    for most in (num - 1, 10):  # known when all have been counted, or from the surfaces alone
+        monkeypatch.setattr(camera_positions, "MAX_POSITIONS", most)
+        with pytest.raises(InputError, match=rf"more than {most} camera positions, .*--units, else .*--near"):
+            prepare_map(cloud, Workers(1))
+    monkeypatch.setattr(camera_positions, "MAX_POSITIONS", num - 1)
+    prior = Prior(tuple(center + cloud.origin_world), 1.0)
+    said = []
+    part = prepare_map(cloud, Workers(1, warn=said.append), prior=prior)
+    assert part.is_partial
+    assert said == list(part.warnings)
+    assert "prepared within 1 m of --near" in said[0]
+    assert 0 < len(part.centers) < len(whole.centers)
+    left = {tuple(c) for c in apply_prior(part, prior).centers}
+    assert {tuple(c) for c in whole.centers[is_near]} <= left
+    far = Prior((900.0, 0.0, 0.0), 1.0)
+    assert len(prepare_map(cloud, Workers(1), prior=far).centers) == 0
+
+
+def test_a_long_preparation_is_announced(monkeypatch):
+    monkeypatch.setattr(camera_positions, "LONG", 0.0)
+    said = []
+    camera_positions.candidate_centers(scan_map(1).octree, Workers(1, warn=said.append))
+    assert re.fullmatch(r"the scan: \d+ camera positions, about \d+ min to prepare, once", said[0])
 
 
 def test_heading_counts_clockwise_from_y():

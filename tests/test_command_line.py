@@ -1,7 +1,10 @@
 """The options that say what a cloud is, and what all commands share."""
 
+import ctypes
 import json
 import runpy
+import signal
+import time
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -144,6 +147,23 @@ def test_errors_have_codes_and_name_the_command_as_it_was_started(monkeypatch, c
     assert err.count("\n") == 1
     with pytest.raises(UsageError), checking_options():
         raise InputError("in an option")
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "text"), [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")]
+)
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_signal_during_a_callback_from_c_is_not_lost(capsys, number, code, text, fails):
+    callback = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(number))  # its exception goes nowhere
+
+    def compiled(arguments):
+        callback()
+        if fails:
+            raise RuntimeError("no compiled object yet")
+        time.sleep(20.0)
+
+    assert command("make_room.py", "", "", lambda parser: None)(compiled)([]) == code
+    assert capsys.readouterr().err == f"make_room.py: {text}\n"
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -92,7 +92,9 @@ def test_prior_narrows_the_search_and_stands_in_the_result(scene, capsys):
     assert errors(result.pose, _truth(scene, 0))[0] < 0.03
     assert result.settings["prior"]["radius"] == 1.0
     assert localize.main(_arguments(scene, "--quiet", "--near", "900", "0", "0", "--radius", "1")) == 1
-    assert json.loads(capsys.readouterr().out)["center_world"] is None
+    nothing = json.loads(capsys.readouterr().out)
+    assert nothing["center_world"] is None
+    assert "--near allows 0; the nearest to --near is" in nothing["warnings"][-1]
 
 
 def test_files_are_written_and_look_right(scene, tmp_path, capsys):
@@ -145,6 +147,8 @@ def test_panorama_from_elsewhere_exits_with_one(scene, tmp_path, capsys):
         (["--height", "2", "1"], 2, "--height: found [2.0, 1.0]"),
         (["--heading-tolerance", "0"], 2, "--heading-tolerance: found 0.0"),
         (["--max-starts", "0"], 2, "max_starts: found 0"),
+        (["--num-yaws", "1000000"], 2, "num_yaws: found 1000000, wanted 1 to 3600"),
+        (["--near", "nan", "0", "0", "--radius", "1"], 2, "found nan or inf, wanted finite numbers"),
         (["--cache", "x"], 2, "--cache, --no-cache: only one of them"),
         (
             ["--overlay", "x.png", "--pano", "a", "b"],
@@ -208,15 +212,19 @@ def _process(arguments, **options):
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
 
 
-def test_interrupt_leaves_nothing_half_written(scene, tmp_path):
+@pytest.mark.parametrize(
+    ("number", "code", "word"), [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")]
+)
+def test_a_signal_leaves_nothing_half_written(scene, tmp_path, number, code, word):
     out = tmp_path / "pose.json"
     arguments = _arguments(scene, "--out", str(out))
     process = _process([*arguments, *PAPER, "--num-translations", "5000"], cwd=tmp_path)
     process.stderr.read(1)  # the bar of the search: imports are over
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, err = process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.returncode == code
     assert "Traceback" not in err
+    assert err.endswith(f"localize.py: {word}\n")
     assert list(tmp_path.iterdir()) == []
 
 

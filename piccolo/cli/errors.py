@@ -8,15 +8,20 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FrameType
 
 from tqdm import tqdm
 
 from ..errors import InputError
+from ..runtime.memory import is_shortage
 from .parser import as_started, parse
 from .progress import log_shown
+from .start import EXIT_INTERRUPTED, EXIT_TERMINATED
 
-EXIT_BAD_USAGE, EXIT_BAD_INPUT, EXIT_INTERNAL = 2, 3, 4
-EXIT_INTERRUPTED, EXIT_BROKEN_PIPE, EXIT_TERMINATED = 130, 141, 143
+EXIT_BAD_USAGE, EXIT_BAD_INPUT, EXIT_INTERNAL, EXIT_BROKEN_PIPE = 2, 3, 4, 141
+RETRY = 0.1  # [s] after which a signal is sent again
+INTERRUPTED, TERMINATED = ("interrupted", EXIT_INTERRUPTED), ("terminated", EXIT_TERMINATED)
+SHORTAGE = "not enough memory ({}); set --max-memory or fewer --threads, or thin the scan"
 
 
 class UsageError(InputError):
@@ -25,24 +30,6 @@ class UsageError(InputError):
 
 class Terminated(KeyboardInterrupt):
     """SIGTERM: a command ends as after Ctrl-C, so that no temporary file is left."""
-
-
-def _terminate(*_: object) -> None:
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # once is enough: what cleans up is not to be stopped
-    raise Terminated
-
-
-@contextmanager
-def terminating() -> Iterator[None]:
-    """Within this, SIGTERM raises Terminated."""
-    if threading.current_thread() is not threading.main_thread():  # which alone gets signals
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, _terminate)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager
@@ -58,25 +45,73 @@ def run_command(
     parser: argparse.ArgumentParser, argv: list[str] | None, run: Callable[[argparse.Namespace], int]
 ) -> int:
     """The exit code of `run` with the options given, or of the error that ended it, which is printed."""
-    arguments = parse(parser, argv)
+    arguments, lost = parse(parser, argv), list[KeyboardInterrupt]()
     try:
-        with log_shown(arguments.quiet), terminating():
+        with log_shown(arguments.quiet), raising_signals(lost):
             code = run(arguments)
             sys.stdout.flush()  # here, where a closed pipe is caught
         return code
-    except KeyboardInterrupt as error:
-        is_term = isinstance(error, Terminated)
-        code = EXIT_TERMINATED if is_term else EXIT_INTERRUPTED
-        return print_error(arguments, "terminated" if is_term else "interrupted", code)
-    except UsageError as error:
-        return print_error(arguments, str(error), EXIT_BAD_USAGE)
+    except KeyboardInterrupt as stop:
+        return _stopped(arguments, stop)
     except (OSError, InputError) as error:
         discard_stdout()
         if isinstance(error, BrokenPipeError) and not error.filename:  # stdout's reader has gone: say nothing
             return EXIT_BROKEN_PIPE
-        return print_error(arguments, format_error(error), EXIT_BAD_INPUT)
+        code = EXIT_BAD_USAGE if isinstance(error, UsageError) else EXIT_BAD_INPUT
+        return print_error(arguments, format_error(error), code)
     except Exception as error:  # the last line of defence: a code and one line for the shell
-        return print_error(arguments, f"internal error: {error!r}; --debug shows where", EXIT_INTERNAL)
+        return _unforeseen(arguments, error, lost)
+
+
+def _unforeseen(arguments: argparse.Namespace, error: Exception, lost: list[KeyboardInterrupt]) -> int:
+    if lost:  # what was called back by C has failed for it
+        return _stopped(arguments, lost[0])
+    if is_shortage(error):
+        text = " ".join(str(error).split()) or "none is left"
+        return print_error(arguments, SHORTAGE.format(text), EXIT_BAD_INPUT)
+    return print_error(arguments, f"internal error: {error!r}; --debug shows where", EXIT_INTERNAL)
+
+
+@contextmanager
+def raising_signals(lost: list[KeyboardInterrupt]) -> Iterator[None]:
+    """Within this, SIGTERM raises Terminated in the main thread, as SIGINT raises KeyboardInterrupt.
+
+    Code that is called back from C, as by LLVM while a kernel is compiled, can't pass an exception on: it is
+    added to `lost`, and the signal is sent again a moment later.
+    """
+    if threading.current_thread() is not threading.main_thread():  # where no handler can be set
+        yield
+        return
+    timers: list[threading.Timer] = []
+
+    def send_again(unraisable: "sys.UnraisableHookArgs") -> None:
+        if isinstance(unraisable.exc_value, KeyboardInterrupt):
+            lost.append(unraisable.exc_value)
+            number = signal.SIGTERM if isinstance(unraisable.exc_value, Terminated) else signal.SIGINT
+            timers.append(threading.Timer(RETRY, os.kill, (os.getpid(), number)))
+            timers[-1].start()
+        else:
+            sys.__unraisablehook__(unraisable)
+
+    before, hook = signal.signal(signal.SIGTERM, _terminate), sys.unraisablehook
+    sys.unraisablehook = send_again
+    try:
+        yield
+    finally:
+        for timer in timers:
+            timer.cancel()
+        signal.signal(signal.SIGTERM, before)
+        sys.unraisablehook = hook
+
+
+def _terminate(signum: int, frame: FrameType | None) -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # once is enough: what cleans up is not to be stopped
+    raise Terminated
+
+
+def _stopped(arguments: argparse.Namespace, stop: KeyboardInterrupt) -> int:
+    text, code = TERMINATED if isinstance(stop, Terminated) else INTERRUPTED
+    return print_error(arguments, text, code)
 
 
 def discard_stdout() -> None:
@@ -106,4 +141,6 @@ def format_error(error: OSError | InputError) -> str:
     """An error in one line: of the system's, the file and what went wrong."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: cannot be used ({error.strerror})"
+    if isinstance(error, OSError) and error.strerror:  # of a stream or pipe, which have no name
+        return f"writing or reading failed ({error.strerror})"
     return str(error)

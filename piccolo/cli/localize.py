@@ -23,6 +23,7 @@ from ..result import UNREADABLE, Result
 from ..runtime.atomic import check_output, write_atomically
 from ..runtime.kernel_cache import is_first_use, kernel_folder
 from ..runtime.line_file import appending
+from ..runtime.memory import limit_memory
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from ..scan import Scan, open_files
@@ -57,6 +58,7 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
     """What is to be done: the options, the panoramas, and how many of them are finished."""
     with checking_options():
         check_arguments(arguments)
+        limit_memory(arguments.max_memory)
         settings, read_options = settings_from(arguments), read_options_from(arguments)
         cloud_settings = cloud_settings_from(arguments)
     priors = None

@@ -11,6 +11,7 @@ from tqdm import tqdm
 from ..runtime.threads import Progress
 
 DELAY = 0.5  # seconds: what takes less needs no bar
+tqdm.monitor_interval = 0  # no thread of tqdm's own, which might not start, for bars that stand still
 
 
 def progress_bar(is_quiet: bool) -> Progress:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..runtime.jit import inline_kernel, kernel
+from ..runtime.memory import check_memory
 
 NUM_CELLS = 1 << 21  # along an axis; three axes fill 63 bits
 LEAF_SIZE = 0.02  # [m]
@@ -28,6 +29,10 @@ PHASE = (COARSEST << QUANTUM_BITS) // 3 + 1
 # columns of the table: cell, number of points (0: the row is free), sums of quanta, sums of colours
 CELL, COUNT, POSITION, COLOR, NUM_COLUMNS = 0, 3, 4, 7, 10
 FIRST_ROWS, MAX_ROWS = 1 << 16, 1 << 27  # 40 bytes a row; the most are 80 million voxels, 20,000 m^2 or more
+ROW_BYTES = 4 * NUM_COLUMNS
+VOXEL_BYTES = ROW_BYTES + 3 * 8 + 3 * 8 + 3 * 8 + 6 * 4  # rows, cells, a copy of them, codes and order, nodes
+NODE_BYTES = 6 * 4 + 8 + 4  # mean, code, first child
+THIN = "set --units if its unit is not the metre, or cut out a part"
 MAX_LOAD = 0.6  # share of the rows in use
 NUM_LEVELS = COARSEST.bit_length()  # from 128 leaves wide (2.56 m) down to one
 
@@ -171,17 +176,23 @@ class VoxelTable:
             if len(points) and self.num_voxels < full:
                 far = f"points more than {MAX_CELL * LEAF_SIZE / 1000:.0f} km apart, wanted one scene"
                 raise InputError(f"{self.label}: {far}; remove broken points or set --units or --scale")
-            if len(points) and len(self.table) >= MAX_ROWS:
-                found = f"more than {self.num_voxels} voxels of {LEAF_SIZE} m are filled"
-                wanted = "if its unit is not the metre, set --units or --scale"
-                raise InputError(f"{self.label}: {found}; {wanted}")
             if len(points):
-                larger = np.zeros((2 * len(self.table), NUM_COLUMNS), np.int32)
-                move_voxels(self.table, larger)
-                self.table = larger
+                self._grow()
+
+    def _grow(self) -> None:
+        if len(self.table) >= MAX_ROWS:
+            found = f"more than {self.num_voxels} voxels of {LEAF_SIZE} m are filled"
+            raise InputError(f"{self.label}: {found}; if its unit is not the metre, set --units or --scale")
+        num_rows = 2 * len(self.table)
+        check_memory(num_rows * ROW_BYTES, f"{self.label}: a table of {num_rows} voxels of 2 cm", THIN)
+        larger = np.zeros((num_rows, NUM_COLUMNS), np.int32)
+        move_voxels(self.table, larger)
+        self.table = larger
 
     def finish(self) -> Voxels:
         """The means; those too far from the rest for a Morton code are left out. The table is spent."""
+        num = self.num_voxels
+        check_memory(num * VOXEL_BYTES, f"{self.label}: sorting {num} voxels of 2 cm", THIN)
         rows = self.table[self.table[:, COUNT] > 0]
         self.table = self.table[:0]
         cells = rows[:, :COUNT] + (np.zeros(3, np.int64) if self.base is None else self.base)
@@ -228,12 +239,15 @@ def build_octree(voxels: Voxels) -> Octree:
     nodes, node_codes = voxels.nodes, voxels.codes
     levels, children = [nodes], [np.zeros(len(nodes), np.int32)]
     for _ in range(NUM_LEVELS - 1):
+        check_memory(2 * len(nodes) * NODE_BYTES, f"the scan: a level of {len(nodes)} voxels", THIN)
         first = np.flatnonzero(np.diff(node_codes >> 3, prepend=-1))  # children of a parent follow each other
         counts = np.diff(first, append=len(nodes))
         columns = [np.add.reduceat(column, first, dtype=np.float64) / counts for column in nodes.T]
         nodes, node_codes = np.stack(columns, axis=1, dtype=np.float32), node_codes[first] >> 3
         levels.insert(0, nodes)
         children.insert(0, first.astype(np.int32))
+    num_nodes = sum(map(len, levels))
+    check_memory(num_nodes * NODE_BYTES, f"the scan: a tree of {num_nodes} voxels", THIN)
     start = np.concatenate([[0], np.cumsum([len(level) for level in levels])]).astype(np.int32)
     first_child = [c + s for c, s in zip(children[:-1], start[1:-1], strict=True)]
     first_child.append(np.full(len(levels[-1]) + 1, start[-1], np.int32))  # leaves have none

@@ -1,5 +1,6 @@
 """Where a camera can be: free space at a camera's height above something that carries it."""
 
+import time
 from typing import Any
 
 import numpy as np
@@ -7,6 +8,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..cloud.voxels import Octree
+from ..errors import InputError
+from ..geometry.pose import Array
 from ..runtime.threads import Workers
 from .view import ViewConfig, filled_fractions, thread_scratch
 
@@ -22,6 +25,14 @@ SURFACE_VOXEL = 0.16  # [m]
 COARSE_SPACING = 0.6  # [m] of the grid; the half of it where surfaces are near
 NEAR = 0.3  # [m] clearance below which the grid is refined
 BLOCK = 64  # views a thread makes at a time
+MAX_POSITIONS = 250_000  # looked at, and views rendered: some ten minutes on two cores, 1.9 GB
+ADVICE = (
+    "the most that are searched; if its unit is not the metre, set --units, else say where the camera was "
+    "(--near X Y Z --radius M) or cut out a part"
+)
+BASES = 1 << 14  # cells on surfaces, around which others are supported, at a time
+LONG = 60.0  # [s] a warning tells how long the views take, if more
+COST_OF_VIEW = 4.0  # looking and rendering at a position, in the time of looking
 
 
 def top_surfaces(octree: Octree) -> NDArray[np.float32]:
@@ -35,19 +46,50 @@ def top_surfaces(octree: Octree) -> NDArray[np.float32]:
     return np.asarray(xyz[~is_covered])
 
 
-def supported_cells(surfaces: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Cells (N, 3) of the coarse grid whose centres are at a camera's height above a surface (M, 3)."""
+class TooManyPositionsError(InputError):
+    """A scan of land, or in another unit: a camera could be at more places than are searched."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__(f"the scan: {what} leave more than {MAX_POSITIONS} camera positions, {ADVICE}")
+
+
+def supported_cells(
+    surfaces: NDArray[np.float32], within: tuple[Array, float] | None = None
+) -> NDArray[np.int64]:
+    """Cells (N, 3) of the coarse grid whose centres are at a camera's height above a surface (M, 3).
+
+    Those `within` a radius [m] of a place (3,), by a spacing more than it says. TooManyPositionsError if they
+    are more than MAX_POSITIONS; no more memory than for these is taken.
+    """
     s = COARSE_SPACING
     reach = int(np.ceil(SUPPORT_RADIUS / s))
+    if within is not None:
+        distance = np.linalg.norm(surfaces[:, :2] - within[0][:2], axis=1)
+        surfaces = surfaces[distance <= within[1] + SUPPORT_RADIUS + 2 * s]
+    if len(surfaces) == 0:
+        return np.empty((0, 3), np.int64)
     base = np.floor(surfaces / s).astype(np.int64)
     base[:, 2] = np.ceil((surfaces[:, 2] + MIN_HEIGHT) / s - 0.5)
-    base = np.unique(base, axis=0)
     around = np.arange(-reach, reach + 1)
     layers = np.arange(int(np.ceil((MAX_HEIGHT - MIN_HEIGHT) / s)))
     steps = np.stack(np.meshgrid(around, around, layers, indexing="ij"), axis=-1).reshape(-1, 3)
     gap = np.maximum(np.abs(steps[:, :2]) - 0.5, 0.0) * s
     steps = steps[np.hypot(gap[:, 0], gap[:, 1]) < SUPPORT_RADIUS]
-    return np.asarray(np.unique((base[:, None] + steps).reshape(-1, 3), axis=0))
+    low = base.min(axis=0) - reach
+    shape = base.max(axis=0) - low + reach + len(layers)
+    weights = np.array([shape[1] * shape[2], shape[2], 1])  # one number a cell sorts as its three do
+    codes, found = np.unique((base - low) @ weights), np.empty(0, np.int64)
+    for begin in range(0, len(codes), BASES):
+        around_some = np.unique(codes[begin : begin + BASES, None] + steps @ weights)
+        cells = np.stack(np.unravel_index(around_some, shape), axis=1) + low
+        if within is not None:
+            distance = np.linalg.norm((cells + 0.5) * s - within[0], axis=1)
+            around_some = around_some[distance <= within[1] + s]
+        found = np.union1d(found, around_some)
+        if len(found) > MAX_POSITIONS:
+            size = "{:.0f} x {:.0f} x {:.0f} m".format(*np.ptp(surfaces, axis=0))
+            raise TooManyPositionsError(f"surfaces of {size}")
+    return np.asarray(np.stack(np.unravel_index(found, shape), axis=1) + low)
 
 
 def coverage(octree: Octree, centers: NDArray[np.floating[Any]], workers: Workers) -> NDArray[np.float32]:
@@ -64,11 +106,29 @@ def coverage(octree: Octree, centers: NDArray[np.floating[Any]], workers: Worker
     return fraction
 
 
-def candidate_centers(octree: Octree, workers: Workers) -> NDArray[np.float64]:
-    """Positions (N, 3) [m] in free space, 0.6 m apart, or 0.3 m where surfaces are near."""
+def warn_if_long(octree: Octree, centers: NDArray[np.floating[Any]], workers: Workers) -> None:
+    """Say about how many minutes the views from the centres (N, 3) take, by a sample of them."""
+    sample, alone = centers[:: 1 + len(centers) // BLOCK], Workers()
+    coverage(octree, sample[:1], alone)  # compiled
+    begin = time.perf_counter()
+    coverage(octree, sample, alone)
+    seconds = (time.perf_counter() - begin) / max(len(sample), 1) * len(centers) * COST_OF_VIEW
+    if seconds > LONG * workers.num_threads:
+        minutes = seconds / workers.num_threads / 60.0
+        workers.warn(f"the scan: {len(centers)} camera positions, about {minutes:.0f} min to prepare, once")
+
+
+def candidate_centers(
+    octree: Octree, workers: Workers, within: tuple[Array, float] | None = None
+) -> NDArray[np.float64]:
+    """Positions (N, 3) [m] in free space, 0.6 m apart, or 0.3 m where surfaces are near.
+
+    `within` and the error as of supported_cells.
+    """
+    cells = supported_cells(top_surfaces(octree), within)
     tree = cKDTree(octree.level(0.08)[:, :3], balanced_tree=False, compact_nodes=False)
-    cells = supported_cells(top_surfaces(octree))
     middle = (cells + 0.5) * COARSE_SPACING
+    warn_if_long(octree, middle, workers)
     clearance, _ = tree.query(middle, workers=workers.num_threads)
     fraction = coverage(octree, middle, workers)
     is_free = clearance > MIN_CLEARANCE
@@ -86,6 +146,8 @@ def candidate_centers(octree: Octree, workers: Workers) -> NDArray[np.float64]:
     middle = (finer + 0.5) * half
     clearance, _ = tree.query(middle, workers=workers.num_threads)
     middle = middle[clearance > MIN_CLEARANCE]
+    if len(middle) > MAX_POSITIONS:
+        raise TooManyPositionsError("narrow places")
     return np.concatenate([kept, middle[coverage(octree, middle, workers) > min_coverage]])
 
 

@@ -11,7 +11,7 @@ from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from .config import METHOD, MethodConfig
 from .evaluation import evaluate
-from .prior import apply_prior
+from .prior import apply_prior, nothing_allowed
 from .query import Query, prepare_query
 from .refinement import MAX_SCORE_LOSS, refine, refine_by_perturbation, refine_full_resolution, settle
 from .scan_map import ScanMap
@@ -21,6 +21,7 @@ from .settings import CoarseToFineSettings
 
 HOPELESS_SCORE = 0.05  # of black, white and noisy pictures; views of other places have 0.1 and more
 ALTERNATIVES_REFINED = 10  # at most
+NO_PIXEL = "the panorama: no pixel counts, all are masked"
 
 
 def localize(
@@ -38,7 +39,9 @@ def localize(
     """
     candidates = apply_prior(scan_map, settings.prior)
     if len(candidates.centers) == 0 or not panorama.is_valid.any():
-        return Localization()
+        is_masked = len(candidates.centers) > 0
+        why = NO_PIXEL if is_masked else nothing_allowed(scan_map, settings.prior)
+        return Localization(warnings=(why,))
     with watch.stage("search"):
         query = prepare_query(panorama, candidates, settings, workers, method)
     found = NOTHING

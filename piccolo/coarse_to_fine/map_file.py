@@ -25,7 +25,7 @@ from .map_validation import LAYOUT, check_arrays, clean_warnings
 from .scan_map import ScanMap
 
 FORMAT = "piccolo-map/3"
-ARRAYS = [f.name for f in fields(ScanMap) if f.name not in ("octree", "warnings")]
+ARRAYS = [f.name for f in fields(ScanMap) if f.name not in ("octree", "warnings", "is_partial")]
 MEMBERS = {*LAYOUT, "format", "warnings"}
 WANTED = "wanted a whole map by tools/prepare_map.py"
 ZIP_MAGIC = b"PK\x03\x04"
@@ -74,6 +74,7 @@ def load_map(path: Path) -> ScanMap:
         arrays = {name: _read(archive, info) for name, info in members.items()}
         warnings = clean_warnings(path, arrays["warnings"])
     check_arrays(path, arrays)
+    own: dict[str, Any] = {name: arrays[name] for name in ARRAYS if name not in ("has_labels", "scan_sha256")}
     return ScanMap(
         octree=Octree(
             nodes=arrays["octree_nodes"],
@@ -84,7 +85,7 @@ def load_map(path: Path) -> ScanMap:
         has_labels=bool(arrays["has_labels"]),
         warnings=warnings,
         scan_sha256=str(arrays["scan_sha256"]),
-        **{name: arrays[name] for name in ARRAYS if name not in ("has_labels", "scan_sha256")},
+        **own,
     )
 
 

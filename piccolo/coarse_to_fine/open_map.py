@@ -21,6 +21,7 @@ from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from .map_file import FORMAT, is_map_file, load_map, save_map
 from .scan_map import ScanMap, prepare_map
+from .settings import NOTHING_KNOWN, Prior
 
 # of a file in the cache, and of one that was being written when its process was killed
 NAME = re.compile(r"[0-9a-f]{32}\.piccolo-map|\.[0-9a-f]{32}\.piccolo-map\.\w{8}")
@@ -43,10 +44,11 @@ def open_map(
     cache: CachePolicy,
     workers: Workers,
     watch: Stopwatch,
+    prior: Prior = NOTHING_KNOWN,
 ) -> ScanMap:
     """The map of a cloud's files: prepared already, from the cache, or built now.
 
-    A prepared map may stand in place of the files.
+    A prepared map may stand in place of the files. The prior is asked where the scan is too large as a whole.
     """
     map_path = prepared_map_among(paths)
     if map_path:
@@ -67,7 +69,7 @@ def open_map(
     def build() -> ScanMap:
         with watch.stage("read"):
             cloud = open_cloud(paths, cloud_settings, workers.show)
-        scan_map = prepare_map(cloud, workers, cloud_settings.up, watch)
+        scan_map = prepare_map(cloud, workers, cloud_settings.up, watch, prior=prior)
         return replace(scan_map, has_labels=cloud_settings.labels is not None, scan_sha256=digest)
 
     if not (cache.is_used and digest):
@@ -131,6 +133,8 @@ def cached_map(
     except OSError as error:
         return build(), f"{in_words(error)}; the prepared map is not kept"
     scan_map = build()
+    if scan_map.is_partial:
+        return scan_map, ""
     try:
         with watch.stage("prepare"):
             save_map(scan_map, path)

@@ -10,18 +10,46 @@ from .scan_map import ScanMap
 from .settings import Prior
 
 
-def apply_prior(scan_map: ScanMap, prior: Prior) -> ScanMap:
-    """The map with only the candidates that the prior allows, by half a grid spacing more than it says."""
-    is_allowed = np.ones(len(scan_map.centers), dtype=bool)
+def allowed_by_option(scan_map: ScanMap, prior: Prior) -> dict[str, NDArray[np.bool_]]:
+    """Which candidates (N,) each option allows, by half a grid spacing more than it says."""
+    allowed: dict[str, NDArray[np.bool_]] = {}
     if prior.near_world is not None and prior.radius is not None:
-        x, y, z = prior.near_world
-        centers_world = scan_map.centers @ scan_map.R_map_from_world + scan_map.origin_world
-        offsets = centers_world[:, :2] - (x, y) if z is None else centers_world - (x, y, z)
-        is_allowed &= np.linalg.norm(offsets, axis=1) <= prior.radius + COARSE_SPACING / 2
+        allowed["--near"] = distances_to(scan_map, prior.near_world) <= prior.radius + COARSE_SPACING / 2
     if prior.height is not None:
         heights = heights_above_floor(scan_map.octree, scan_map.centers)
         low, high = prior.height[0] - COARSE_SPACING / 2, prior.height[1] + COARSE_SPACING / 2
-        is_allowed &= (heights >= low) & (heights <= high)
+        allowed["--height"] = (heights >= low) & (heights <= high)
+    return allowed
+
+
+def distances_to(scan_map: ScanMap, near_world: tuple[float, float, float | None]) -> NDArray[np.float64]:
+    """Distance (N,) [m] of each candidate from a place; without its z, along the ground."""
+    x, y, z = near_world
+    centers_world = scan_map.centers @ scan_map.R_map_from_world + scan_map.origin_world
+    offsets = centers_world[:, :2] - (x, y) if z is None else centers_world - (x, y, z)
+    return np.asarray(np.linalg.norm(offsets, axis=1))
+
+
+def nothing_allowed(scan_map: ScanMap, prior: Prior) -> str:
+    """Why no candidate is left, as a warning: how many each option allows, and the nearest to --near."""
+    num = len(scan_map.centers)
+    if num == 0:
+        return "the scan: found no place for a camera (free space 0.3 to 2.4 m above a surface, closed in)"
+    counts = [f"{name} allows {mask.sum()}" for name, mask in allowed_by_option(scan_map, prior).items()]
+    text = f"no position is left of the scan's {num}: {', '.join(counts)}"
+    if prior.near_world is None:
+        return text
+    distances = distances_to(scan_map, prior.near_world)
+    k = int(distances.argmin())
+    x, y, z = scan_map.R_map_from_world.T @ scan_map.centers[k] + scan_map.origin_world
+    return f"{text}; the nearest to --near is {x:.2f} {y:.2f} {z:.2f}, {distances[k]:.2f} m away"
+
+
+def apply_prior(scan_map: ScanMap, prior: Prior) -> ScanMap:
+    """The map with only the candidates that the prior allows."""
+    is_allowed = np.ones(len(scan_map.centers), dtype=bool)
+    for mask in allowed_by_option(scan_map, prior).values():
+        is_allowed &= mask
     if is_allowed.all():
         return scan_map
     index = np.cumsum(is_allowed) - 1

@@ -13,13 +13,16 @@ from ..cloud.voxels import Octree, Voxels, build_octree
 from ..geometry.pose import Array, Pose
 from ..geometry.sphere import SEARCH_RINGS, averaging, make_grid
 from ..gravity import MIN_CONFIDENCE, R_z_from_axis, estimate_normals, find_up, rotation_to_z_up
+from ..runtime.memory import check_memory
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
-from .camera_positions import BLOCK, COARSE_SPACING, candidate_centers
+from .camera_positions import BLOCK, COARSE_SPACING, TooManyPositionsError, candidate_centers
+from .settings import NOTHING_KNOWN, Prior
 from .view import ViewConfig, render_block, thread_scratch
 
 WIDE_RINGS = 12
 SEARCH_VIEW = ViewConfig(num_rings=SEARCH_RINGS, stats_rings=16, sigma_deg=22.0, voxel_per_range=1 / 15)
+BYTES_PER_CELL = 6 + 3 + 1 + 4  # of a view: offsets, channels, seen; and what is made of them for a search
 MIN_TILT = np.radians(5.0)  # a cloud whose up is nearer to its z is taken as it is
 
 
@@ -41,6 +44,7 @@ class ScanMap:
     has_labels: bool = False  # colours are those of labels
     warnings: tuple[str, ...] = ()
     scan_sha256: str = ""  # of the files or arrays that it was made from, in hexadecimal digits
+    is_partial: bool = False  # of a scan too large as a whole: candidates where a prior asks; not in files
 
     @cached_property
     def points(self) -> PackedPoints:
@@ -73,6 +77,8 @@ def render_candidates(
 ) -> tuple[NDArray[np.int16], NDArray[np.float32], NDArray[np.int8], NDArray[np.bool_]]:
     """Offsets, their units, channels and seen cells of the view from each centre, as ScanMap holds them."""
     cells = len(make_grid(config.num_rings))
+    num_bytes = len(centers) * cells * BYTES_PER_CELL
+    check_memory(num_bytes, f"the scan: {len(centers)} prepared views", "cut out a part of it")
     offsets, unit = np.empty((len(centers), 3, cells), np.int16), np.empty(len(centers), np.float32)
     levels, is_seen = np.empty((len(centers), 3, cells), np.int8), np.empty((len(centers), cells), np.bool_)
     view = config.arrays
@@ -155,14 +161,36 @@ def read_aligned(cloud: Voxelized, up: UpAxis) -> AlignedCloud:
     return AlignedCloud(octree, R_map_from_world, origin_world, voxels.warnings + more)
 
 
+def candidates_of(
+    aligned: AlignedCloud, prior: Prior, workers: Workers
+) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+    """Candidates (N, 3) [m]; of a scan too large as a whole those near the prior's place, and a warning."""
+    try:
+        return candidate_centers(aligned.octree, workers), ()
+    except TooManyPositionsError:
+        if prior.near_world is None or prior.radius is None:
+            raise
+    near = aligned.R_map_from_world @ (np.array(prior.near_world) - aligned.origin_world)
+    centers = candidate_centers(aligned.octree, workers, (near, prior.radius))
+    text = (
+        f"the scan is too large as a whole: prepared within {prior.radius:g} m of --near, for this run only"
+    )
+    workers.warn(text)
+    return centers, (text,)
+
+
 def prepare_map(
     cloud: Voxelized,
     workers: Workers,
     up: UpAxis = "auto",
     watch: Stopwatch | None = None,
     view: ViewConfig = SEARCH_VIEW,
+    prior: Prior = NOTHING_KNOWN,
 ) -> ScanMap:
-    """Everything about a cloud that does not depend on the panorama."""
+    """Everything about a cloud that does not depend on the panorama.
+
+    Of a scan too large as a whole, what the prior allows; TooManyPositionsError if it names no place.
+    """
     watch = watch or Stopwatch()
     with watch.stage("read"):
         aligned = read_aligned(cloud, up)
@@ -170,7 +198,7 @@ def prepare_map(
         workers.warn(warning)
     with watch.stage("prepare"):
         octree = aligned.octree
-        centers = candidate_centers(octree, workers)
+        centers, notes = candidates_of(aligned, prior, workers)
         offsets, unit, levels, is_seen = render_candidates(octree, centers, view, workers)
         sparse = sparse_candidates(centers)
         wide_features, wide_seen = widen(levels, is_seen, sparse)
@@ -186,5 +214,6 @@ def prepare_map(
         sparse=sparse,
         wide_features=wide_features,
         wide_seen=wide_seen,
-        warnings=aligned.warnings,
+        warnings=aligned.warnings + notes,
+        is_partial=bool(notes),
     )

@@ -16,12 +16,14 @@ from ..geometry.suppression import non_maximum_suppression
 from ..panorama.local_normalization import sample_channels
 from ..panorama.texels import Texels
 from ..runtime.jit import kernel
+from ..runtime.memory import check_memory
 from .prior import allowed_rotations
 from .query import Query
 from .scan_map import WIDE_RINGS, ScanMap
 from .starts import START_ANGLE, START_DISTANCE, Starts
 
 BLOCK = 2048  # views a matrix product
+TURNED_BYTES = 4 * 16  # of a rotation, a cell: channels, validity, energy, and what they are made from
 EXACT = (1 << 24) - 1  # whole numbers up to this are exact in float32
 MOST_LEVEL = 127.5  # of a channel
 MOST_ENERGY = 3.0 * MOST_LEVEL**2  # of a cell
@@ -147,6 +149,8 @@ def best_poses(scores: Samples, pool: int) -> tuple[NDArray[np.int64], NDArray[n
     rank = len(sample) - 1 - int(min(2 * pool / step + 20, len(sample) - 1))
     threshold = sample[rank] if step > 1 else -np.inf
     top = indices[: min(count_above(flat, threshold, indices), len(indices))]
+    if len(top) == 0:  # all fit alike: a scan of one colour
+        top = np.flatnonzero(flat == threshold)
     top = top[np.lexsort((top, -flat[top]))][:pool]
     return *np.divmod(top, scores.shape[1]), flat[top]
 
@@ -163,6 +167,10 @@ def search_poses(query: Query, gravity: Gravity) -> Starts:
     else:
         rotations = uniform_rotations(settings.num_rotations)
     rotations = allowed_rotations(rotations @ m.R_map_from_world, settings.prior) @ m.R_map_from_world.T
+    num_views = len(m.centers) if gravity == "known" else len(m.sparse)
+    num_bytes = len(rotations) * (len(make_grid(SEARCH_RINGS)) * TURNED_BYTES + 4 * num_views)
+    what = f"a search of {num_views} positions in {len(rotations)} rotations"
+    check_memory(num_bytes, what, "set fewer --num-yaws or --num-rotations")
     samples, validity = turn_panorama(query.images.search, rotations)
     if gravity == "known":
         candidate, rotation, scores = best_poses(score_poses(m, samples, validity), num_pool)

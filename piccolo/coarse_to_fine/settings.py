@@ -1,5 +1,6 @@
 """Settings of the default method, and what is known of a camera beforehand."""
 
+import math
 from dataclasses import asdict, dataclass
 from typing import get_args
 
@@ -23,6 +24,14 @@ class Prior:
 
     def __post_init__(self) -> None:
         """Refuse what contradicts itself, naming the option."""
+        numbers = (
+            *(self.near_world or ()),
+            *(self.height or ()),
+            self.radius or 0.0,
+            self.heading_deg or 0.0,
+        )
+        if not all(map(math.isfinite, numbers)):
+            raise InputError("--near, --radius, --height, --heading: found nan or inf, wanted finite numbers")
         if (self.near_world is None) != (self.radius is None):
             raise InputError("--near, --radius: found one of them, wanted both or none")
         if self.radius is not None and self.radius <= 0.0:
@@ -33,13 +42,18 @@ class Prior:
             raise InputError(f"--heading-tolerance: found {self.heading_tolerance_deg}, wanted 0 to 180")
 
 
+NOTHING_KNOWN = Prior()
+# at most: a minute and a gigabyte for a flat, far beyond what finds more
+MOST = {"num_yaws": 3600, "num_rotations": 50_000, "max_starts": 100_000}
+
+
 @dataclass(frozen=True)
 class CoarseToFineSettings:
     """The default method."""
 
     gravity: Gravity = "auto"  # auto: as known first, and as unknown if that does not convince
     solver: Solver = "gauss-newton"  # of the last descent
-    prior: Prior = Prior()
+    prior: Prior = NOTHING_KNOWN
     num_yaws: int = 48  # gravity known
     num_rotations: int = 2000  # of SO(3), gravity unknown
     max_starts: int = 4000  # poses from which a descent begins
@@ -51,9 +65,9 @@ class CoarseToFineSettings:
             if getattr(self, name) not in get_args(kind):
                 found, known = getattr(self, name), ", ".join(get_args(kind))
                 raise InputError(f"{name}: found {found!r}, wanted one of {known}")
-        for name in ("num_yaws", "num_rotations", "max_starts"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: found {getattr(self, name)}, wanted at least 1")
+        for name, most in MOST.items():
+            if not 1 <= getattr(self, name) <= most:
+                raise InputError(f"{name}: found {getattr(self, name)}, wanted 1 to {most}")
         check_confidence(self.min_confidence)
 
     def to_json(self) -> dict[str, object]:

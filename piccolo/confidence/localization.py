@@ -20,3 +20,4 @@ class Localization:
     evidence: Evidence | None = None
     alternatives: tuple[Hypothesis, ...] = ()  # poses elsewhere, best first
     covariance: PoseCovariance | None = None
+    warnings: tuple[str, ...] = ()  # one line each: why there is no pose

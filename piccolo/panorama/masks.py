@@ -55,6 +55,8 @@ def black_borders(
     full sphere as a whole (a pole is one point, the seam one line), of a crop in part. 95 % of them, save
     for a rim of 8 pixels, must be black to two levels; shadows carry noise.
     """
+    if rgb[0].max() <= BLACK and rgb.max() <= BLACK:
+        return np.ones(is_valid.shape, dtype=np.bool_)
     min_fraction = MIN_FULL_EDGE if is_full else MIN_CROP_EDGE
     found = np.zeros(is_valid.shape, dtype=np.bool_)
     for axis in (0, 1):

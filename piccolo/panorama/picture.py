@@ -29,10 +29,12 @@ from PIL.WebPImagePlugin import WebPImageFile
 from ..cloud.label_colors import Labels, colors_of
 from ..errors import InputError
 from ..runtime.json_file import read_bytes
+from ..runtime.memory import check_memory
 
 WANTED = "wanted a whole JPEG, PNG, TIFF or WebP panorama"
 MIN_WIDTH, MIN_HEIGHT = 128, 64
 MAX_WIDTH, MAX_HEIGHT = 32768, 16384
+BYTES_PER_PIXEL = 12  # while a picture is decoded, turned and masked; 10 were measured, more with alpha
 MAX_XMP_SIZE = 1 << 20  # [byte] what is longer is left aside
 FORMATS: dict[bytes, type[ImageFile]] = {
     b"\x89PNG\r\n\x1a\n": PngImageFile,
@@ -141,7 +143,7 @@ def opened(path: Path, data: bytes) -> Iterator[ImageFile]:
     with _warnings_lock, warnings.catch_warnings(action="ignore"):
         try:
             yield kind(BytesIO(data))
-        except InputError:
+        except (InputError, MemoryError):
             raise
         except Exception as error:  # Pillow's readers raise whatever their formats bring
             words = " ".join(str(error).split())
@@ -159,6 +161,7 @@ def _check(path: Path, image: ImageFile, num_bytes: int, min_size: tuple[int, in
         raise InputError(f"{found}, wanted at most {MAX_WIDTH} x {MAX_HEIGHT}")
     if longer * shorter > num_bytes * MAX_PIXELS_PER_BYTE[str(image.format)]:
         raise InputError(f"{found} in a file too small for it, {WANTED}")
+    check_memory(longer * shorter * BYTES_PER_PIXEL, f"{found}, which", "make the picture smaller")
     if image.format in ("PNG", "WEBP") and getattr(image, "is_animated", False):
         raise InputError(f"{path}: the {image.format} is animated, wanted a still picture")
     tags = image.tag_v2 if isinstance(image, TiffImageFile) else {}

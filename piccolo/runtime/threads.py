@@ -10,11 +10,12 @@ from ..errors import InputError
 
 Item = TypeVar("Item")
 Value = TypeVar("Value")
+MAX_THREADS = 512  # each has arrays of 0.1 GB for views
 
 
 def num_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0))
+    """Cores that this process may use, at most as many as threads are allowed."""
+    return min(len(os.sched_getaffinity(0)), MAX_THREADS)
 
 
 # wraps values as tqdm does: how many there will be, None if unknown, and what they are
@@ -55,8 +56,8 @@ class Workers:
 
     def __post_init__(self) -> None:
         """Refuse a count that means nothing."""
-        if self.num_threads < 1:
-            raise InputError(f"num_threads: found {self.num_threads}, wanted at least 1")
+        if not 1 <= self.num_threads <= MAX_THREADS:
+            raise InputError(f"num_threads: found {self.num_threads}, wanted 1 to {MAX_THREADS}")
 
     def map(self, function: Callable[[Item], Value], items: Sequence[Item], label: str) -> Iterator[Value]:
         """Yield function(item) for each item, in order.

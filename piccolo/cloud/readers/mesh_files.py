@@ -65,7 +65,7 @@ def _image(path: Path, name: str, content: bytes) -> Iterator[Image.Image]:
             with Image.open(BytesIO(content), formats=FORMATS) as image:
                 _check(path, image)
                 yield image
-        except InputError:
+        except (InputError, MemoryError):
             raise
         except Exception as error:  # Pillow's decoders raise whatever their formats bring
             raise InputError(f"{path}: the texture{name} can't be read ({first_line(error)})") from error

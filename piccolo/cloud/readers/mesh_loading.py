@@ -103,7 +103,7 @@ def _scene(resolver: FolderResolver, content: bytes, kind: str, has_texture: boo
             load = trimesh.exchange.load.mesh_loaders[kind]
             parsed = load(BytesIO(content), resolver=resolver, **options)
             scene = trimesh.load_scene(_with_raw_colors(parsed))
-    except InputError:
+    except (InputError, MemoryError):
         raise
     except Exception as error:  # whatever trimesh stumbles over
         if resolver.refusal is None:

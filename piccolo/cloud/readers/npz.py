@@ -99,7 +99,7 @@ def damage_named(path: Path, wanted: str = WANTED) -> Iterator[None]:
     """Turn what zipfile, zlib and NumPy's header parser raise on damaged files, 14 types, into one line."""
     try:
         yield
-    except InputError:
+    except (InputError, MemoryError):
         raise
     except Exception as error:
         if isinstance(error, OSError) and error.errno != errno.EINVAL:

@@ -1,0 +1,81 @@
+"""Where a command begins: signals and streams are in order before the libraries are imported, for a second.
+
+`piccolo.cli.start.NAME` is a function without arguments that runs the command NAME, for console commands.
+"""
+
+import os
+import resource
+import signal
+import sys
+from collections.abc import Callable
+from functools import partial
+from importlib import import_module
+from types import FrameType
+
+# [byte] below it LLVM and OpenBLAS crash or wait for ever, where NumPy raises; each core has a thread
+LEAST_ADDRESS_SPACE = 1_000_000_000 + 250_000_000 * (os.cpu_count() or 1)
+EXIT_CANNOT_START, EXIT_INTERRUPTED, EXIT_TERMINATED = 3, 130, 143
+
+
+def __getattr__(name: str) -> Callable[[], int]:
+    """What runs the command `name`."""
+    if name.startswith("_"):
+        raise AttributeError(name)
+    return partial(run, name)
+
+
+def run(name: str) -> int:
+    """Import the command `name` of piccolo.cli and run it; returns its exit code."""
+    open_closed_streams()
+    space, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if 0 <= space < LEAST_ADDRESS_SPACE:
+        print_line(
+            f"found ulimit -v {space >> 10}, wanted {LEAST_ADDRESS_SPACE >> 10} or more on this machine"
+        )
+        return EXIT_CANNOT_START
+    handler = signal.getsignal(signal.SIGINT)
+    is_ignored = handler is not signal.default_int_handler  # by nohup, or a shell's &
+    signal.signal(signal.SIGINT, handler if is_ignored else _quit)
+    signal.signal(signal.SIGTERM, _quit)
+    try:
+        main = import_module(f"piccolo.cli.{name}").main
+    except (ImportError, MemoryError, OSError) as error:  # a library is missing, or memory for it
+        print_line(f"the libraries cannot be loaded ({' '.join(str(error).split()) or 'not enough memory'})")
+        return EXIT_CANNOT_START
+    try:
+        signal.signal(signal.SIGINT, handler)
+        return int(main())
+    except KeyboardInterrupt:  # before or after the work
+        print_line("interrupted")
+    finally:
+        signal.signal(signal.SIGINT, handler if is_ignored else _quit)
+    return EXIT_INTERRUPTED
+
+
+def open_closed_streams() -> None:
+    """Put /dev/null in place of stdin, stdout and stderr if closed, so that no other file gets their number.
+
+    Reading finds the end; what is written to stderr is dropped; writing to stdout fails, so that no result is
+    lost unseen. Names of files that can't be encoded are escaped.
+    """
+    for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_WRONLY if name == "stderr" else os.O_RDONLY)  # takes the lowest number
+            setattr(sys, name, open(number, mode, errors="backslashreplace", closefd=False))  # noqa: SIM115
+        else:
+            if name != "stdin":
+                getattr(sys, name).reconfigure(errors="backslashreplace")
+
+
+def print_line(text: str) -> None:
+    """One line on stderr, past Python's streams, after the name that the program was started by."""
+    os.write(2, f"{os.path.basename(sys.argv[0])}: {text}\n".encode(errors="backslashreplace"))  # noqa: PTH119
+
+
+def _quit(signum: int, frame: FrameType | None) -> None:
+    """End at once: there is nothing to clean up, and an exception would pass through half-made modules."""
+    is_interrupt = signum == signal.SIGINT
+    print_line("interrupted" if is_interrupt else "terminated")
+    os._exit(EXIT_INTERRUPTED if is_interrupt else EXIT_TERMINATED)

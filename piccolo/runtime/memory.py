@@ -1,0 +1,108 @@
+"""How much memory may still be taken, asked before much is: a refusal in one line, not the kernel's kill."""
+
+import os
+import resource
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import InputError
+
+GB = 1e9
+DEFAULT_FRACTION = 0.8  # of what is free, where the user sets no limit
+PROC, CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
+V2 = ("", "memory.max", "memory.current", "inactive_file")
+V1 = ("memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+OPENCV_NO_MEMORY = -4  # `code` of a cv2.error
+
+
+@dataclass
+class Limit:
+    """The user's limit, of this process."""
+
+    num_bytes: float | None = None
+
+
+LIMIT = Limit()
+
+
+def limit_memory(gigabytes: float | None) -> None:
+    """Set the memory [10^9 byte] that this process may take in all; None for a part of what is free."""
+    if gigabytes is not None and not gigabytes > 0.0:
+        raise InputError(f"--max-memory: found {gigabytes:g}, wanted gigabytes above 0")
+    LIMIT.num_bytes = None if gigabytes is None else gigabytes * GB
+
+
+def check_memory(num_bytes: float, purpose: str, advice: str) -> None:
+    """Refuse what needs more bytes than may still be taken; `purpose` begins the line, `advice` ends it."""
+    room = memory_left()
+    if num_bytes > room:
+        left = f"{max(room, 0.0) / GB:.2g} GB may be taken"
+        raise InputError(
+            f"{purpose} needs {num_bytes / GB:.2g} GB of memory, {left}; {advice}, or raise --max-memory"
+        )
+
+
+def memory_left() -> float:
+    """Bytes that this process may still take: of the user's limit, or a part of what is free."""
+    free = min(free_of_machine(), free_of_cgroup(), free_of_process())
+    if LIMIT.num_bytes is None:
+        return DEFAULT_FRACTION * free
+    return min(LIMIT.num_bytes - _of_process(1), free)
+
+
+def free_of_machine() -> float:
+    """Bytes free, or held by caches that can be dropped; infinite where the system does not tell."""
+    return _number_after(PROC / "meminfo", "MemAvailable:") * 1024.0 or float("inf")
+
+
+def free_of_process() -> float:
+    """Bytes of address space that `ulimit -v` leaves; infinite without."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return float("inf") if soft == resource.RLIM_INFINITY else soft - _of_process(0)
+
+
+def free_of_cgroup() -> float:
+    """Bytes that the limits of this process's containers leave, caches not counted; infinite without."""
+    return min(_free_of_cgroups(), default=float("inf"))
+
+
+def _free_of_cgroups() -> Iterator[float]:
+    """Bytes that each limited cgroup leaves, of version 2 and 1, from this process's own up to the root."""
+    for line in _text(PROC / "self/cgroup").splitlines():
+        _, controllers, path = line.split(":", 2)
+        if controllers and "memory" not in controllers.split(","):
+            continue
+        root, limit, usage, cache = V1 if controllers else V2
+        folder = CGROUPS / root / path.lstrip("/")
+        while folder.is_relative_to(CGROUPS / root):
+            most, used = _text(folder / limit).strip(), _text(folder / usage).strip()
+            if most.isdigit() and used.isdigit():
+                yield int(most) - int(used) + _number_after(folder / "memory.stat", cache)
+            folder = folder.parent
+
+
+def is_shortage(error: BaseException) -> bool:
+    """True for what NumPy, OpenCV or Python raise where memory, or room for a thread, has run out."""
+    if isinstance(error, MemoryError) or getattr(error, "code", None) == OPENCV_NO_MEMORY:
+        return True
+    return isinstance(error, RuntimeError) and "can't start new thread" in str(error)
+
+
+def _of_process(column: int) -> float:
+    """Bytes of address space (0) or of memory (1) that this process has."""
+    return float((_text(PROC / "self/statm") or "0 0").split()[column]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def _number_after(path: Path, name: str) -> float:
+    """The number in the line of a file that begins with `name`; 0 without."""
+    lines = (line.split() for line in _text(path).splitlines())
+    return next((float(words[1]) for words in lines if words[:1] == [name]), 0.0)
+
+
+def _text(path: Path) -> str:
+    """A file's text, empty where there is none."""
+    try:
+        return path.read_text()
+    except OSError:
+        return ""

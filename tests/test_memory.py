@@ -1,0 +1,106 @@
+"""What may be taken of the memory, and that it is asked before much is."""
+
+import resource
+
+import cv2
+import numpy as np
+import pytest
+from rooms import as_panorama, query, room, scan_map
+
+from piccolo.cloud import voxels
+from piccolo.coarse_to_fine.localize import localize
+from piccolo.coarse_to_fine.scan_map import SEARCH_VIEW, prepare_map, render_candidates
+from piccolo.coarse_to_fine.settings import CoarseToFineSettings
+from piccolo.errors import InputError
+from piccolo.panorama import read_panorama
+from piccolo.runtime import memory
+from piccolo.runtime.stopwatch import Stopwatch
+from piccolo.runtime.threads import Workers
+
+
+@pytest.fixture
+def system(tmp_path, monkeypatch):
+    """A made-up /proc and cgroup folder: 8 GB free, 1 GB taken."""
+    (tmp_path / "self").mkdir()
+    (tmp_path / "meminfo").write_text("MemTotal: 16000000 kB\nMemAvailable: 7812500 kB\n")
+    (tmp_path / "self/statm").write_text(f"500000 {10**9 // resource.getpagesize()} 9\n")
+    monkeypatch.setattr(memory, "PROC", tmp_path)
+    monkeypatch.setattr(memory, "CGROUPS", tmp_path / "cgroup")
+    monkeypatch.setattr(memory, "LIMIT", memory.Limit())
+    return tmp_path
+
+
+def test_default_is_a_part_of_what_is_free_and_a_limit_counts_what_is_taken(system):
+    assert memory.memory_left() == pytest.approx(6.4e9)
+    memory.limit_memory(3.0)
+    assert memory.memory_left() == pytest.approx(2e9, rel=1e-4)
+    memory.check_memory(1.9e9, "a", "b")
+    with pytest.raises(
+        InputError, match=r"^the grid needs 2.1 GB of memory, 2 GB may be taken; cut it, or raise"
+    ):
+        memory.check_memory(2.1e9, "the grid", "cut it")
+    memory.limit_memory(500.0)
+    assert memory.memory_left() == pytest.approx(8e9)
+    for wrong in (0.0, -1.0, float("nan")):
+        with pytest.raises(InputError, match="--max-memory: found"):
+            memory.limit_memory(wrong)
+
+
+@pytest.mark.parametrize(
+    ("line", "names"),
+    [
+        ("0::/a/b", ("a/memory.max", "a/memory.current", "a/memory.stat", "inactive_file")),
+        (
+            "4:cpu,memory:/a",
+            (
+                "memory/a/memory.limit_in_bytes",
+                "memory/a/memory.usage_in_bytes",
+                "memory/a/memory.stat",
+                "total_inactive_file",
+            ),
+        ),
+    ],
+)
+def test_a_container_leaves_its_limit_less_what_is_used_but_for_caches(system, line, names):
+    (system / "self/cgroup").write_text(f"7:cpu:/a\n{line}\n")
+    assert memory.free_of_cgroup() == float("inf")
+    limit, usage, stat = (system / "cgroup" / name for name in names[:3])
+    limit.parent.mkdir(parents=True)
+    limit.write_text("3000000000\n")
+    usage.write_text("1500000000\n")
+    stat.write_text(f"anon 5\n{names[3]} 500000000\n")
+    assert memory.free_of_cgroup() == 2e9
+    limit.write_text("max\n")
+    assert memory.free_of_cgroup() == float("inf")
+
+
+def test_address_space_is_a_limit_too(monkeypatch):
+    monkeypatch.setattr(resource, "getrlimit", lambda what: (10**12, -1))
+    assert 0.0 < memory.free_of_process() < 1e12
+
+
+def test_what_libraries_raise_when_memory_is_short():
+    opencv = type("error", (Exception,), {"code": -4})
+    for error in (MemoryError(), RuntimeError("can't start new thread"), opencv()):
+        assert memory.is_shortage(error)
+    assert not memory.is_shortage(RuntimeError("other"))
+
+
+def test_all_that_grows_asks_first(monkeypatch, tmp_path):
+    picture = tmp_path / "a.png"
+    whole, taken = scan_map(1), as_panorama(query(1).rgb)
+    cv2.imwrite(str(picture), taken.rgb)
+    rng = np.random.default_rng(0)
+    table = voxels.VoxelTable("a.ply")
+    settings, workers = CoarseToFineSettings(), Workers(1)
+    monkeypatch.setattr(memory, "memory_left", lambda: 1e5)
+    spread, colors = rng.uniform(0, 90, (50_000, 3)), np.full((50_000, 3), 9, np.uint8)
+    for text, ask in (
+        ("a.png: found 512 x 256, which needs 0.0016 GB", lambda: read_panorama(picture)),
+        ("a.ply: a table of 131072 voxels", lambda: table.add(spread, colors)),
+        ("voxels of 2 cm needs", lambda: prepare_map(room(1)[1], workers)),
+        ("prepared views", lambda: render_candidates(whole.octree, whole.centers, SEARCH_VIEW, workers)),
+        ("rotations needs .*--num-yaws", lambda: localize(whole, taken, settings, workers, Stopwatch())),
+    ):
+        with pytest.raises(InputError, match=text):
+            ask()

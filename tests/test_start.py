@@ -1,0 +1,151 @@
+"""Where a command begins and how it ends: signals, streams, locale and memory, in processes of their own."""
+
+import json
+import resource
+import signal
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from rooms import write_room
+
+from piccolo.cli import start
+from piccolo.cli.parser import COMMANDS
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A room in a folder whose name is not ASCII."""
+    return write_room(tmp_path_factory.mktemp("зал"), "--seed 7 --points 20000 --panoramas 1 --width 256")
+
+
+def _command(script, *arguments):
+    return [sys.executable, str(ROOT / script), *map(str, arguments)]
+
+
+def _shell(redirection, *words):
+    """Exit code, stdout and stderr of a command of which a shell closes or turns some streams."""
+    line = ["sh", "-c", f'"$@" {redirection}', "sh", *words]
+    done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=300)
+    return done.returncode, done.stdout, done.stderr
+
+
+def test_console_commands_begin_before_their_libraries():
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    assert scripts == {f"piccolo-{n.replace('_', '-')}": f"piccolo.cli.start:{n}" for n in COMMANDS}
+    code = "import sys; from piccolo.cli.start import localize; sys.exit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
+    with pytest.raises(AttributeError):
+        _ = start.__wrapped__
+
+
+@pytest.mark.parametrize(
+    ("script", "number", "code", "word"),
+    [
+        ("localize.py", signal.SIGINT, 130, "interrupted"),
+        ("tools/prepare_map.py", signal.SIGTERM, 143, "terminated"),
+    ],
+)
+def test_signals_while_libraries_are_imported(script, number, code, word, tmp_path):
+    (tmp_path / "numpy.py").write_text("import time\nprint('importing', flush=True)\ntime.sleep(60)\n")
+    with subprocess.Popen(
+        _command(script), env={"PYTHONPATH": str(tmp_path)}, stdout=-1, stderr=-1, text=True
+    ) as process:
+        assert process.stdout.readline() == "importing\n"
+        process.send_signal(number)
+        assert process.stderr.read() == f"{Path(script).name}: {word}\n"
+    assert process.returncode == code
+
+
+def test_a_library_that_cannot_be_loaded_is_one_line(tmp_path):
+    (tmp_path / "numpy.py").write_text("raise MemoryError\n")
+    done = subprocess.run(
+        _command("localize.py"),
+        env={"PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 3
+    assert done.stderr == "localize.py: the libraries cannot be loaded (not enough memory)\n"
+
+
+@pytest.mark.parametrize("redirection", [">&-", ">/dev/full"])
+def test_a_result_that_cannot_be_written_is_an_error(scene, tmp_path, redirection):
+    prepare = _command("tools/prepare_map.py", "--cloud", scene / "cloud.ply", "--out", tmp_path / "a.map")
+    code, out, err = _shell(redirection, *prepare, "--quiet")
+    assert (code, out) == (3, "")
+    assert err.startswith("prepare_map.py: writing or reading failed (")
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("locale", ["C", "C PYTHONUTF8=0 PYTHONCOERCECLOCALE=0"])
+def test_stderr_closed_and_names_that_the_locale_does_not_know(scene, tmp_path, locale):
+    files = "--cloud", scene / "cloud.ply", "--out", tmp_path / "ж.map"
+    environment = ["env", *f"LC_ALL={locale}".split()]
+    code, out, err = _shell("2>&- <&-", *environment, *_command("tools/prepare_map.py", *files))
+    assert (code, err) == (0, "")
+    assert json.loads(out)["candidates"] > 0
+    code, out, err = _shell("", *environment, *_command("localize.py", "--cloud", "ж.ply", "--pano", "ж.jpg"))
+    assert (code, out) == (3, "")
+    assert err.count("\n") == 1
+    assert err.startswith("localize.py: ")
+
+
+@pytest.mark.parametrize(
+    ("gigabytes", "text"), [(0.5, "found ulimit -v 488281, wanted"), (None, "not enough memory")]
+)
+def test_little_address_space_is_one_line(scene, tmp_path, gigabytes, text):
+    files = "--cloud", scene / "cloud.ply", "--out", tmp_path / "a.map", "--quiet"
+    words = _command("tools/prepare_map.py", *files)
+    if gigabytes is None:  # as little as is allowed, and most of it taken
+        gigabytes = start.LEAST_ADDRESS_SPACE / 1e9
+        held = round(gigabytes * 0.45e9)
+        code = f"import numpy, runpy, sys; held = numpy.empty({held}, 'u1'); sys.argv = sys.argv[1:]; "
+        code += "sys.path.insert(0, 'tools'); runpy.run_path(sys.argv[0], run_name='__main__')"
+        words = [sys.executable, "-c", code, *words[1:]]
+
+    def limit():
+        resource.setrlimit(resource.RLIMIT_AS, (round(gigabytes * 1e9), -1))
+
+    done = subprocess.run(
+        words, cwd=ROOT, preexec_fn=limit, capture_output=True, text=True, check=False, timeout=300
+    )
+    assert (done.returncode, done.stderr.count("\n")) == (3, 1), done.stderr
+    assert text in done.stderr
+
+
+@pytest.mark.parametrize("name", ["one colour", "one point", "one wall"])
+def test_scans_of_nearly_nothing_are_no_error(tmp_path, scene, name):
+    rng = np.random.default_rng(0)
+    points, colors = rng.uniform(0.0, 4.0, (20_000, 3)), rng.integers(0, 256, (20_000, 3))
+    points[np.arange(20_000), rng.integers(0, 3, 20_000)] = 4.0 * rng.integers(0, 2, 20_000)
+    if name == "one colour":
+        colors[:] = 120
+    elif name == "one point":
+        points[:] = 1.5
+    else:
+        points[:, 1] = 0.0
+    np.savez(tmp_path / "scan.npz", points=points, colors=colors.astype(np.uint8))
+    pano = scene / "images/clean_0.jpg"
+    files = "--cloud", tmp_path / "scan.npz", "--pano", pano, "--no-cache", "--quiet"
+    code, out, err = _shell("", *_command("localize.py", *files))
+    result = json.loads(out)
+    assert (code, err, result["status"]) == (1, "", "not_localized")
+    if name != "one colour":
+        assert result["warnings"][-1].startswith("the scan: found no place for a camera")
+
+
+def test_a_mask_that_hides_all_is_refused(scene, tmp_path):
+    cv2.imwrite(str(tmp_path / "mask.png"), np.full((128, 256), 255, np.uint8))
+    pano = scene / "images/clean_0.jpg"
+    files = "--cloud", scene / "cloud.ply", "--pano", pano, "--mask", tmp_path / "mask.png", "--quiet"
+    code, out, err = _shell("", *_command("localize.py", *files, "--no-cache"))
+    assert (code, out) == (3, "")
+    assert "no pixel is left: all are masked" in err
