@@ -12,7 +12,7 @@ STDIN = "-"
 WANTED_LIST = "wanted a text file, a panorama's path on each line"
 
 
-def is_stream(words: Sequence[str]) -> bool:
+def is_from_stdin(words: Sequence[str]) -> bool:
     """True if names come on standard input, so that nobody knows how many."""
     return STDIN in words
 

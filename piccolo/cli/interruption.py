@@ -32,7 +32,7 @@ class Interruption:
             self.is_at_work = False
 
 
-class Stopped(Exception):  # noqa: N818  it is no error
+class Stopped(KeyboardInterrupt):
     """A signal came while nothing was at work, or for the second time."""
 
 
@@ -43,7 +43,7 @@ def interruptible() -> Iterator[Interruption]:
 
     def handle(number: int, _frame: FrameType | None) -> None:
         is_second = interruption.number != 0
-        interruption.number = number
+        interruption.number = interruption.number or number
         if is_second or not interruption.is_at_work:
             raise Stopped
         os.write(2, f"\n{SIGNALS[number]}: the photo at work is finished; again to stop now\n".encode())

@@ -12,7 +12,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from ..batch.batch import Batch
-from ..batch.inputs import is_stream, panoramas_of
+from ..batch.inputs import is_from_stdin, panoramas_of
 from ..batch.priors import read_priors
 from ..coarse_to_fine.open_map import CachePolicy, scan_sha256_of
 from ..coarse_to_fine.settings import CoarseToFineSettings
@@ -20,7 +20,7 @@ from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..panorama import read_panorama
 from ..render.surfel_renderer import overlay_png
 from ..result import UNREADABLE, Result
-from ..runtime.atomic import check_output, write_atomically
+from ..runtime.atomic import STDOUT, check_output, is_stdout, is_stream, write_atomically
 from ..runtime.kernel_cache import is_first_use, kernel_folder
 from ..runtime.line_file import appending
 from ..runtime.memory import limit_memory
@@ -30,6 +30,7 @@ from ..scan import Scan, open_files
 from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error, print_note, run_command
 from .interruption import SIGNALS, Interruption, Stopped, interruptible
 from .options import build_parser, check_arguments, cloud_settings_from, read_options_from, settings_from
+from .outputs import check_distinct, check_suffix
 from .progress import progress_bar, warn_once
 
 EXIT_ALL_LOCALIZED, EXIT_SOME_NOT = 0, 1
@@ -54,6 +55,29 @@ class Run:
         return self.counts.total()
 
 
+def is_resumable(out: Path | None) -> bool:
+    """True for an output that can be read again: a file, no stream."""
+    return out is not None and not is_stream(out)
+
+
+def check_files(arguments: argparse.Namespace, panoramas: list[Path], total: int | None) -> None:
+    """Refuse, before any work, what could not be written, or would replace an input or another output."""
+    overlay: Path | None = arguments.overlay
+    given = filter(None, (arguments.mask, arguments.priors))
+    lists = [Path(word[1:]) for word in arguments.pano if word.startswith("@")]
+    outputs = {"--out": arguments.out or STDOUT, "--overlay": overlay}
+    check_distinct(outputs, [*arguments.cloud, *panoramas, *lists, *given])
+    check_output(arguments.out or STDOUT)
+    if overlay and overlay.is_dir():
+        return
+    if overlay and total != 1:
+        found = "names on stdin" if total is None else f"{total} panoramas"
+        raise UsageError(f"--overlay: found {found}, wanted one panorama or a folder that exists")
+    check_suffix("--overlay", overlay, (".png",))
+    if overlay:
+        check_output(overlay)
+
+
 def prepare_run(arguments: argparse.Namespace) -> Run:
     """What is to be done: the options, the panoramas, and how many of them are finished."""
     with checking_options():
@@ -68,17 +92,13 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
         priors = read_priors(arguments.priors, settings.prior)
     batch = Batch(settings, cloud_settings, read_options, priors)
     panoramas, total = panoramas_of(arguments.pano, sys.stdin), None
-    if not is_stream(arguments.pano):
+    known: list[Path] = []
+    if not is_from_stdin(arguments.pano):
         known = list(panoramas)
         panoramas, total = iter(known), len(known)
-        if arguments.overlay and total > 1 and not arguments.overlay.is_dir():
-            raise UsageError(f"--overlay: found {total} panoramas, wanted one or a folder that exists")
-    inputs = [*arguments.cloud, *(Path(word) for word in arguments.pano), *filter(None, [arguments.priors])]
-    for output in filter(None, (arguments.out, arguments.overlay)):
-        if not output.is_dir():
-            check_output(output, inputs)
+    check_files(arguments, known, total)
     counts, size = Counter[str](), None if arguments.overwrite else 0
-    if arguments.out and arguments.out.exists() and not arguments.overwrite:
+    if is_resumable(arguments.out) and arguments.out.exists() and not arguments.overwrite:
         show = progress_bar(arguments.quiet)
         paths = arguments.cloud
         name = str(paths[0]) if len(paths) == 1 else tuple(map(str, paths))
@@ -102,12 +122,16 @@ def open_scan(run: Run) -> Scan:
 
 @contextmanager
 def output(run: Run) -> Iterator[Write]:
-    """A function that writes one line, to stdout or behind the finished lines of a file."""
-    if run.arguments.out is None:
+    """A function that writes one line: to stdout, a FIFO, or behind the finished lines of a file."""
+    out = run.arguments.out or STDOUT
+    if is_resumable(out):
+        with appending(out, run.size) as append:
+            yield append
+    elif is_stdout(out):
         yield lambda line: print(line, flush=True)
     else:
-        with appending(run.arguments.out, run.size) as append:
-            yield append
+        with out.open("w") as stream:
+            yield lambda line: print(line, file=stream, flush=True)
 
 
 def report(run: Run, scan: Scan, result: Result) -> None:
@@ -151,7 +175,8 @@ def finish(run: Run, interruption: Interruption, seconds: float) -> int:
         note = f"{run.batch.priors.path}: {len(unused)} names of no panorama here, such as {unused[0]}"
         print_note(arguments, f"warning: {note}")
     if interruption.number:
-        how = "the same command goes on from here" if arguments.out else "--out FILE lets a command go on"
+        is_kept = is_resumable(arguments.out)
+        how = "the same command goes on from here" if is_kept else "with --out FILE the same command goes on"
         text = f"ended by {SIGNALS[interruption.number]} after {run.num_finished} results; {how}"
         return print_error(arguments, text, interruption.exit_code)
     if counts[UNREADABLE]:

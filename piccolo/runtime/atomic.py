@@ -7,7 +7,7 @@ import shutil
 import stat
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
@@ -33,8 +33,8 @@ def is_stream(path: Path) -> bool:
     return is_stdout(path) or path.is_fifo() or path.is_char_device()
 
 
-def check_output(path: Path, inputs: Iterable[Path] = ()) -> None:
-    """Refuse, before any work is done, a file that could not be written or that is one of the inputs."""
+def check_output(path: Path) -> None:
+    """Refuse, before any work is done, a file that could not be written."""
     if is_stream(path):
         if path.exists() and not os.access(path, os.W_OK):
             raise InputError(f"{path}: found no write permission, wanted a device that can be written")
@@ -46,8 +46,6 @@ def check_output(path: Path, inputs: Iterable[Path] = ()) -> None:
         raise InputError(f"{path}: found a socket or a disk, wanted a file name")
     if path.exists() and not os.access(path, os.W_OK):
         raise InputError(f"{path}: found a file without write permission, wanted another name")
-    if path.exists() and any(other.exists() and path.samefile(other) for other in inputs):
-        raise InputError(f"{path}: found an input as the output, wanted another name")
 
 
 def check_output_folder(path: Path) -> None:
