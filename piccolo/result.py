@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from . import __version__
+from .coarse_to_fine.gps import GpsPrior
 from .confidence.alternatives import Hypothesis
 from .confidence.confidence import AMBIGUOUS, LOCALIZED
 from .confidence.covariance import PoseCovariance
@@ -62,6 +63,7 @@ class Result:
     warnings: tuple[str, ...] = ()
     source: Source = Source()
     error: str | None = None  # why a photo is "unreadable"
+    gps_prior: GpsPrior | None = None  # where the photo's GPS position lies in the scan, if both are known
 
     @property
     def pose(self) -> Pose | None:
@@ -124,6 +126,7 @@ class Result:
             "least_constrained_direction": self.covariance and self.covariance.least_constrained_direction,
             "convention": CONVENTION,
             "seconds": {stage: round(seconds, 4) for stage, seconds in self.seconds.items()},
+            "gps_prior": self.gps_prior and asdict(self.gps_prior),
             "settings": self.settings,
             "warnings": list(self.warnings),
             "version": __version__,
@@ -142,6 +145,7 @@ class Result:
                 cloud=cloud if isinstance(cloud, str) else _paths(cloud),
                 best_pose=_best_pose_from_json(document),
                 source=_source_from_json(document),
+                gps_prior=_gps_prior_from_json(document["gps_prior"]),
                 evidence=document["evidence"] and Evidence(**document["evidence"]),
                 alternatives=tuple(map(_alternative_from_json, document["alternatives"])),
                 covariance=_covariance_from_json(document),
@@ -184,6 +188,12 @@ def _pose_json(pose: Pose | None) -> dict[str, object] | None:
 def _source_from_json(document: dict[str, Any]) -> Source:
     values = {f.name: document[f.name] for f in fields(Source)}
     return Source(**values | {"image_size": values["image_size"] and tuple(values["image_size"])})
+
+
+def _gps_prior_from_json(value: dict[str, Any] | None) -> GpsPrior | None:
+    return (
+        None if value is None else GpsPrior(tuple(value["center_world"]), value["radius"], value["is_used"])
+    )
 
 
 def _best_pose_from_json(document: dict[str, Any]) -> Pose | None:

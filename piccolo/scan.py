@@ -14,16 +14,19 @@ from .cloud.digest import sha256_of_files
 from .cloud.settings import METRES, CloudSettings, UpAxis
 from .cloud.soa import PackedPoints
 from .cloud.stream import ARRAYS, CloudStream, stream_of_arrays
+from .coarse_to_fine.gps import GpsPrior, gps_prior
 from .coarse_to_fine.localize import localize
 from .coarse_to_fine.open_map import CachePolicy, open_map, prepared_map_among
 from .coarse_to_fine.scan_map import ScanMap, prepare_map
 from .coarse_to_fine.settings import CoarseToFineSettings, Prior
+from .confidence.confidence import LOCALIZED
+from .confidence.localization import Localization
 from .errors import InputError
 from .geometry.pose import Pose
 from .geometry.rotations import Gravity
 from .optimize.settings import Solver
 from .panorama import Panorama, ReadOptions, read_panorama
-from .panorama.photo import photo_of, photo_of_array
+from .panorama.photo import Photo, photo_of, photo_of_array
 from .paper.localize import PaperMap
 from .paper.localize import localize as localize_by_paper
 from .paper.localize import prepare as prepare_by_paper
@@ -43,6 +46,7 @@ class ScanOptions(TypedDict, total=False):
     units: Literal["mm", "cm", "m", "ft", "us-ft"]  # of the coordinates; metres if not given
     up: UpAxis  # the axis that points up; "auto" (default): z, or what the cloud's own planes say
     intensity_as_gray: bool  # for files without colours
+    crs: str  # coordinate system, such as EPSG:25832, for photos with GPS; else what the file names
     cache: bool | File  # keep the prepared map in the user's cache (default), nowhere, or in a folder
     num_threads: int  # all cores if not given
     progress: ProgressCallback  # is told (what is done, how many are done, of how many or None)
@@ -56,6 +60,7 @@ class QueryOptions(TypedDict, total=False):
     mask_nadir_deg: float  # the cap of this half angle about the camera's down axis is ignored
     fov_deg: float  # horizontal field of view of a picture that is a part of the sphere
     cube_order: str  # the picture is six cube faces in this order, such as "rludfb"
+    use_gps: bool  # a GPS position in the file narrows the search (default), or not
     gravity: Gravity  # "known": upright camera, "unknown": any rotation, "auto": both are tried
     solver: Solver  # of the last descent
     near_world: tuple[float, float, float]  # [m] the camera is within `radius` of this
@@ -162,8 +167,10 @@ class Scan:
         with watch.stage("read"):
             picture = read_query(panorama, read_options, is_masked)
             photo = photo_of_array(panorama) if isinstance(panorama, np.ndarray) else photo_of(Path(panorama))
+        gps = None
         if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
-            found = localize(self.prepared, picture, settings, self.workers, watch)
+            gps = self.gps_prior_of(photo, settings) if read_options.use_gps else None
+            found, gps = self._localized(self.prepared, picture, settings, gps, watch)
         elif isinstance(self.prepared, PaperMap) and isinstance(settings, PaperSettings):
             found = localize_by_paper(self.prepared, picture, settings, self.workers, watch)
         else:
@@ -176,7 +183,32 @@ class Scan:
             settings=settings_json(settings, self.cloud_settings, read_options),
             warnings=self.warnings + picture.warnings + ((LABELS_WARNING,) if read_options.labels else ()),
             source=Source(self.prepared.scan_sha256, photo.sha256, photo.image_size, photo.capture_time),
+            gps_prior=gps,
         )
+
+    def gps_prior_of(self, photo: Photo, settings: CoarseToFineSettings) -> GpsPrior | None:
+        """The photo's GPS position in the scan; None if it has none, or a position is given anyway."""
+        crs = self.cloud_settings.crs or getattr(self.prepared, "crs", "")
+        if photo.gps is None or not crs or settings.prior.near_world is not None:
+            return None
+        return gps_prior(photo.gps, crs, self.cloud_settings.scale)
+
+    def _localized(
+        self,
+        scan_map: ScanMap,
+        picture: Panorama,
+        settings: CoarseToFineSettings,
+        gps: GpsPrior | None,
+        watch: Stopwatch,
+    ) -> tuple[Localization, GpsPrior | None]:
+        """What is found near the GPS position, or else anywhere, if that is as good."""
+        if gps is not None:
+            near = replace(settings, prior=gps.applied_to(settings.prior))
+            found = localize(scan_map, picture, near, self.workers, watch)
+            if found.status == LOCALIZED:
+                return found, gps
+            gps = replace(gps, is_used=False)
+        return localize(scan_map, picture, settings, self.workers, watch), gps
 
 
 def settings_json(
@@ -198,7 +230,7 @@ def read_query(
     if panorama.dtype != np.uint8 or panorama.ndim != 3 or panorama.shape[1:] != (2 * len(panorama), 3):
         found = f"{panorama.dtype} of shape {panorama.shape}"
         raise InputError(f"panorama: found {found}, wanted RGB in uint8 of shape (H, 2 H, 3)")
-    if replace(options, labels=None) != ReadOptions():
+    if replace(options, labels=None, use_gps=True) != ReadOptions():
         raise InputError("panorama: fov_deg, cube_order, mask_nadir_deg and a mask's path go with files")
     is_valid = np.ones(panorama.shape[:2], np.bool_)
     if is_masked is not None:
@@ -248,7 +280,10 @@ def open_scan(
     cache = options.get("cache", True)
     policy = CachePolicy(cache is not False, None if isinstance(cache, bool) else Path(cache))
     cloud_settings = CloudSettings(
-        METRES[units], options.get("up", "auto"), options.get("intensity_as_gray", False)
+        METRES[units],
+        options.get("up", "auto"),
+        options.get("intensity_as_gray", False),
+        crs=options.get("crs"),
     )
     settings = options.get("settings", CoarseToFineSettings())
     if isinstance(source, np.ndarray):

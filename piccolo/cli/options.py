@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from .. import __version__
+from ..cloud.crs import check_crs
 from ..cloud.label_colors import Labels
 from ..cloud.settings import METRES, CloudSettings, UpAxis
 from ..coarse_to_fine.settings import CoarseToFineSettings, Prior
@@ -128,18 +129,25 @@ def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--mask-nadir", type=float, default=0.0, metavar="DEG", help=text)
     text = "the picture is a strip or grid of cube faces in this order, such as rludfb"
     group.add_argument("--cube-order", metavar="LETTERS", help=text)
+    text = "the cloud's system, such as EPSG:25832, for photos with GPS (default: what LAS, LAZ or E57 say)"
+    group.add_argument("--crs", metavar="CRS", help=text)
+    text = "leave GPS positions in the pictures aside (default: each is searched about first)"
+    group.add_argument("--no-gps", action="store_true", help=text)
 
 
 def read_options_from(arguments: argparse.Namespace) -> ReadOptions:
     """The options of add_panorama_options."""
     pictures = arguments.fov, arguments.mask, arguments.mask_nadir, arguments.cube_order
-    return ReadOptions(*pictures, labels_from(arguments))
+    return ReadOptions(*pictures, labels_from(arguments), not arguments.no_gps)
 
 
 def cloud_settings_from(arguments: argparse.Namespace) -> CloudSettings:
     """The options of add_cloud_options."""
     scale = METRES[arguments.units or "m"] if arguments.scale is None else arguments.scale
-    return CloudSettings(scale, arguments.up, arguments.intensity_as_gray, labels_from(arguments))
+    crs = vars(arguments).get("crs")  # not of commands without photos
+    if crs:
+        check_crs(crs)
+    return CloudSettings(scale, arguments.up, arguments.intensity_as_gray, labels_from(arguments), crs)
 
 
 def labels_from(arguments: argparse.Namespace) -> Labels | None:

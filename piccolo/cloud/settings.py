@@ -20,6 +20,7 @@ class CloudSettings:
     up: UpAxis = "auto"  # the axis that points up; auto: z, or what the cloud's own planes say
     intensity_as_gray: bool = False  # where a file has no colours
     labels: Labels | None = None  # the points' labels are taken for their colours
+    crs: str | None = None  # coordinate system, such as EPSG:25832; None: what the file names
 
     def __post_init__(self) -> None:
         """Reject an invalid scale, and labels together with intensity."""

@@ -25,7 +25,7 @@ from .map_validation import LAYOUT, check_arrays, clean_warnings
 from .scan_map import ScanMap
 
 FORMAT = "piccolo-map/3"
-ARRAYS = [f.name for f in fields(ScanMap) if f.name not in ("octree", "warnings", "is_partial")]
+ARRAYS = [f.name for f in fields(ScanMap) if f.name not in ("octree", "warnings", "crs", "is_partial")]
 MEMBERS = {*LAYOUT, "format", "warnings"}
 WANTED = "wanted a whole map by tools/prepare_map.py"
 ZIP_MAGIC = b"PK\x03\x04"
@@ -43,6 +43,7 @@ def save_map(scan_map: ScanMap, path: Path) -> None:
             file,
             format=np.array(FORMAT),
             warnings=np.array(scan_map.warnings, dtype=np.str_),
+            crs=np.frombuffer(scan_map.crs.encode(), np.uint8),
             allow_pickle=False,
             **members,
         )
@@ -85,6 +86,7 @@ def load_map(path: Path) -> ScanMap:
         has_labels=bool(arrays["has_labels"]),
         warnings=warnings,
         scan_sha256=str(arrays["scan_sha256"]),
+        crs=arrays["crs"].tobytes().decode(),
         **own,
     )
 

@@ -39,6 +39,7 @@ LAYOUT: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "wide_seen": ("|u1", ("sparse", WIDE_CELLS)),
     "has_labels": ("|b1", ()),
     "scan_sha256": ("<U64", ()),
+    "crs": ("|u1", ("characters",)),  # UTF-8
 }
 SHA256 = re.compile("[0-9a-f]{64}")
 ROUNDING = 1e-9  # of a rotation
@@ -46,6 +47,7 @@ LEAF_SIZES = 1e-3, 0.1  # [m] least and most
 FARTHEST_ORIGIN, MARGIN = 1e12, 10.0  # [m] of the world; around the voxels that are kept
 BRIGHTEST = np.float32(1.0 + 1e-6)
 LEAST_UNIT, MOST_OFFSET = 3e-8, 1e6  # [m] of the offsets; how far they reach
+MAX_CRS = 4 * 20_000  # [byte]
 MAX_WARNINGS, MAX_WARNING = 1000, 5000  # lines, and characters of a line
 
 
@@ -96,6 +98,9 @@ def check_arrays(path: Path, arrays: Arrays) -> None:
     _check_views(path, arrays)
     if not SHA256.fullmatch(str(arrays["scan_sha256"])):
         _refuse(path, "a scan_sha256 that is no digest")
+    text = arrays["crs"].tobytes()
+    if len(text) > MAX_CRS or not text.decode(errors="\0").isprintable():
+        _refuse(path, "a crs that is no text")
 
 
 def _refuse(path: Path, found: str) -> None:

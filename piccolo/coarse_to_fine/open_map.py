@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..cloud import open_cloud
+from ..cloud.crs import crs_of
 from ..cloud.digest import sha256_of_files
 from ..cloud.settings import IN_METRES, CloudSettings
 from ..cloud.soa import LocalCloud, pack_points
@@ -52,7 +53,7 @@ def open_map(
     """
     map_path = prepared_map_among(paths)
     if map_path:
-        if len(paths) > 1 or replace(cloud_settings, labels=None) != IN_METRES:
+        if len(paths) > 1 or replace(cloud_settings, labels=None, crs=None) != IN_METRES:
             raise InputError(f"{map_path}: found a prepared map, wanted it alone, without options for clouds")
         with watch.stage("read"):
             scan_map = load_map(map_path)
@@ -70,7 +71,8 @@ def open_map(
         with watch.stage("read"):
             cloud = open_cloud(paths, cloud_settings, workers.show)
         scan_map = prepare_map(cloud, workers, cloud_settings.up, watch, prior=prior)
-        return replace(scan_map, has_labels=cloud_settings.labels is not None, scan_sha256=digest)
+        has_labels = cloud_settings.labels is not None
+        return replace(scan_map, has_labels=has_labels, scan_sha256=digest, crs=crs_of(paths))
 
     if not (cache.is_used and digest):
         return build()
@@ -95,7 +97,9 @@ def scan_sha256_of(paths: Sequence[Path]) -> str:
 
 def content_key(scan_sha256: str, settings: CloudSettings) -> str:
     """Name for the map of a cloud's files: by what is in them and the settings, wherever they lie."""
-    digest = hashlib.sha256(" ".join([FORMAT, sources_digest(), repr(settings), scan_sha256]).encode())
+    digest = hashlib.sha256(
+        " ".join([FORMAT, sources_digest(), repr(replace(settings, crs=None)), scan_sha256]).encode()
+    )
     return digest.hexdigest()[:32]
 
 

@@ -44,6 +44,7 @@ class ScanMap:
     has_labels: bool = False  # colours are those of labels
     warnings: tuple[str, ...] = ()
     scan_sha256: str = ""  # of the files or arrays that it was made from, in hexadecimal digits
+    crs: str = ""  # coordinate system that the scan's file names, as WKT or EPSG:code; empty if none
     is_partial: bool = False  # of a scan too large as a whole: candidates where a prior asks; not in files
 
     @cached_property

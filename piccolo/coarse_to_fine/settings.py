@@ -14,9 +14,7 @@ from ..optimize.settings import Solver
 class Prior:
     """What the user knows beforehand; each narrows the search."""
 
-    near_world: tuple[float, float, float | None] | None = (
-        None  # [m] within `radius` of this; None: any height
-    )
+    near_world: tuple[float, float, float | None] | None = None  # [m] within `radius`; None: any height
     radius: float | None = None  # [m]
     height: tuple[float, float] | None = None  # [m] least and most above the floor
     heading_deg: float | None = None  # of the image centre, clockwise from the cloud's +y, as GPano counts
@@ -24,13 +22,8 @@ class Prior:
 
     def __post_init__(self) -> None:
         """Refuse what contradicts itself, naming the option."""
-        numbers = (
-            *(self.near_world or ()),
-            *(self.height or ()),
-            self.radius or 0.0,
-            self.heading_deg or 0.0,
-        )
-        if not all(map(math.isfinite, numbers)):
+        numbers = *(self.near_world or ()), *(self.height or ()), self.radius, self.heading_deg
+        if not all(math.isfinite(number) for number in numbers if number is not None):
             raise InputError("--near, --radius, --height, --heading: found nan or inf, wanted finite numbers")
         if (self.near_world is None) != (self.radius is None):
             raise InputError("--near, --radius: found one of them, wanted both or none")

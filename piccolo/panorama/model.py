@@ -41,6 +41,7 @@ class ReadOptions:
     mask_nadir_deg: float = 0.0  # the cap of this half angle about the camera's down axis is ignored
     cube_order: str | None = None  # the picture is six cube faces in this order, such as rludfb
     labels: Labels | None = None  # the picture holds labels, not colours
+    use_gps: bool = True  # a GPS position in the file narrows the search, where the scan's system is known
 
     def __post_init__(self) -> None:
         """Refuse values that mean nothing, naming the option."""

@@ -143,7 +143,16 @@ def read_laz_layout(header: LasHeader) -> LasLayout:
 
 
 def _laszip_record(header: LasHeader, file: BinaryIO) -> bytes:
-    """The content of the variable-length record that LASzip leaves behind the header."""
+    """The content of the record that LASzip leaves behind the header."""
+    content = record_content(header, file, LASZIP_USER, LASZIP_RECORD_ID)
+    if content is None:
+        text = "the points are compressed, but no record says how (LASzip's VLR)"
+        raise InputError(f"{header.path}: {text}")
+    return content
+
+
+def record_content(header: LasHeader, file: BinaryIO, wanted_user: bytes, wanted_id: int) -> bytes | None:
+    """The content of the variable-length record of this user and id; None if there is none."""
     position = header.header_size
     for _ in range(min(header.num_vlrs, MAX_VLRS)):
         if position + VLR_HEADER.size > header.points_offset:
@@ -151,9 +160,9 @@ def _laszip_record(header: LasHeader, file: BinaryIO) -> bytes:
         file.seek(position)
         user, record_id, length = VLR_HEADER.unpack(file.read(VLR_HEADER.size))
         position += VLR_HEADER.size + length
-        if user.rstrip(b"\0") == LASZIP_USER and record_id == LASZIP_RECORD_ID:
+        if user.rstrip(b"\0") == wanted_user and record_id == wanted_id:
             return file.read(length)
-    raise InputError(f"{header.path}: the points are compressed, but no record says how (LASzip's VLR)")
+    return None
 
 
 def _check_items(header: LasHeader, laszip: bytes, lazrs: ModuleType) -> int:

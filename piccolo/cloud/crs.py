@@ -1,0 +1,67 @@
+"""The coordinate system that a scan's file names, and where a GPS position lies in it."""
+
+import math
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from ..runtime.optional import import_optional
+from .readers import e57_file, las_file
+
+PROJECTION_USER, WKT_ID, GEO_KEYS_ID = b"LASF_Projection", 2112, 34735  # of LAS's records
+PROJECTED_KEY, GEOGRAPHIC_KEY = 3072, 2048  # GeoTIFF keys whose value is a code of EPSG
+USER_DEFINED = 32767
+MAX_LENGTH = 20_000  # characters of a system's description; what is longer is left aside
+
+
+def crs_of(paths: Sequence[Path]) -> str:
+    """The system that the first of a scan's files names, as WKT or EPSG:code; empty if it names none.
+
+    LAS and LAZ: the OGC WKT record, or the GeoTIFF keys. E57: coordinateMetadata.
+    """
+    with paths[0].open("rb") as file:
+        head = file.read(8)
+    text = ""
+    if head.startswith(las_file.MAGIC):
+        text = _of_las(paths[0])
+    elif head.startswith(e57_file.MAGIC):
+        text = e57_file.read_xml(paths[0]).findtext("{*}coordinateMetadata") or ""
+    return text.strip() if len(text) <= MAX_LENGTH else ""
+
+
+def _of_las(path: Path) -> str:
+    header = las_file.read_header(path)
+    with path.open("rb") as file:
+        wkt = las_file.record_content(header, file, PROJECTION_USER, WKT_ID)
+        keys = las_file.record_content(header, file, PROJECTION_USER, GEO_KEYS_ID) or b""
+    if wkt:
+        return wkt.rstrip(b"\0").decode(errors="replace")
+    entries = list(struct.iter_unpack("<4H", keys[: len(keys) // 8 * 8]))[1:]
+    codes = {key: value for key, place, _, value in entries if place == 0}
+    code = codes.get(PROJECTED_KEY, codes.get(GEOGRAPHIC_KEY, 0))
+    return f"EPSG:{code}" if 0 < code < USER_DEFINED else ""
+
+
+def check_crs(crs: str) -> Any:
+    """The system that a text names, by pyproj, its heights left aside; InputError if there is none."""
+    pyproj = import_optional("GPS in photos", "pyproj", "tools")
+    try:
+        return pyproj.CRS.from_user_input(crs).to_2d()
+    except pyproj.exceptions.CRSError as error:
+        raise InputError(
+            f"--crs: found {crs[:80]!r}, wanted a coordinate system such as EPSG:25832"
+        ) from error
+
+
+def from_wgs84(crs: str, latitude_deg: float, longitude_deg: float) -> tuple[float, float] | None:
+    """X and y of a place in a projected system, in its own unit; None where it does not hold there."""
+    system = check_crs(crs)
+    pyproj = import_optional("GPS in photos", "pyproj", "tools")
+    if not system.is_projected:
+        return None
+    x, y = pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True).transform(
+        longitude_deg, latitude_deg
+    )
+    return (float(x), float(y)) if math.isfinite(x) and math.isfinite(y) else None
