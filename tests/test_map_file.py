@@ -126,6 +126,7 @@ DAMAGE = {  # member, what is done to it, the words of the refusal
     "index below zero": ("sparse", _changed(0, -1), "sparse candidates that are not"),
     "twice": ("sparse", _changed(0, 1), "sparse candidates that are not"),
     "no digest": ("scan_sha256", lambda a: np.array("G" * 64), "a scan_sha256 that is no digest"),
+    "no text": ("scan_sha256", lambda a: np.full(64, 2**32 - 1, "u4").view("<U64")[0], "that is no digest"),
     "short digest": ("scan_sha256", lambda a: np.array("0"), "scan_sha256 of type <U1"),
     "numbers": ("warnings", lambda a: np.arange(3), "warnings of type int64"),
     "objects": ("warnings", lambda a: np.array([{}], dtype=object), "wanted a whole map"),

@@ -72,8 +72,8 @@ def load_map(path: Path) -> ScanMap:
         if set(members) != MEMBERS or len(archive.infolist()) != len(MEMBERS):
             raise ValueError(f"not the arrays of a map: {sorted(MEMBERS ^ set(members))}")
         arrays = {name: _read(archive, info) for name, info in members.items()}
+        check_arrays(path, arrays)
         warnings = clean_warnings(path, arrays["warnings"])
-    check_arrays(path, arrays)
     return ScanMap(
         octree=Octree(
             nodes=arrays["octree_nodes"],
