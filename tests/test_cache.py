@@ -170,7 +170,7 @@ def test_damaged_compiled_code_is_noticed_and_made_anew(tmp_path, monkeypatch, c
     assert sum(anew.stats.cache_misses.values()) == 1
     assert kernel(total)(values) == 10.0  # it was written anew
     text = "damaged compiled code; it is compiled anew"
-    assert [record.getMessage() for record in caplog.records] == [f"{path}: {text}"]
+    assert [record.getMessage() for record in caplog.records] == [f"{tmp_path}: {text}"]
     other = path.with_name(32 * "0" + ".kernel")
     damaged = [b"", whole[: kernel_cache.DIGEST_SIZE], whole[:-1], whole + b"0"]
     for bit in np.random.default_rng(0).integers(8 * len(whole), size=300):
@@ -178,10 +178,9 @@ def test_damaged_compiled_code_is_noticed_and_made_anew(tmp_path, monkeypatch, c
         flipped[bit // 8] ^= 1 << bit % 8
         damaged.append(bytes(flipped))
     for place, content in [*((path, content) for content in damaged), (other, whole)]:
-        caplog.clear()
         place.write_bytes(content)
         assert kernel_cache.read_whole(place) is None
-        assert [record.getMessage() for record in caplog.records] == [f"{place}: {text}"]
+    assert len(caplog.records) == 1  # however many are damaged
     assert kernel_cache.read_whole(tmp_path / "none") is None
 
 
@@ -204,7 +203,7 @@ def _open(cloud, folder, monkeypatch, num_made=1):
     """The map by `open_map`, and the warnings; `prepare_map` is called so many times."""
     made, heard = [], []
 
-    def prepare(*_):
+    def prepare(*_, prior):
         made.append(1)
         return scan_map(1)
 

@@ -182,7 +182,7 @@ def test_plots_show_the_errors_and_risk_over_coverage():
 def test_two_runs_side_by_side():
     second = [_row("a.jpg", 0.01, 0.2), _row("b.jpg", 0.5, 0.4, variant="photo"), ROWS[2]]
     pairs = pair_up(ROWS, second)
-    assert [pair.first.image for pair in pairs] == ["c.jpg", "a.jpg", "b.jpg"]
+    assert [first.image for first, _ in pairs] == ["c.jpg", "a.jpg", "b.jpg"]
     text = side_by_side(pairs, ("old", "new"), PAPER_THRESHOLDS).markdown()
     assert "| old | 3 | 2 | 0.667 | 2 | 1 |" in text
     assert "| new | 3 | 1 | 0.333 | 3 | 2 |" in text

@@ -196,7 +196,7 @@ def test_a_cloud_with_another_axis_up(run, scene, tmp_path):
         (["--out", "a.png", "--step", 0], "--step 0.0: wanted metres above 0"),
         (["--out", "a.png", "--step", "nan"], "--step nan"),
         (["--out", "a.png", "--rotations", 0], "--rotations: found 0, wanted at least 1"),
-        (["--out", "a.png", "--max-points", 3], "--max-points 3"),
+        (["--out", "a.png", "--max-points", 3], "--max-points: found 3"),
         (["--out", "a.png", "--box", 0, 0, 0, 1], "--box ["),
         (["--out", "a.png", "--heights", 2, 1, 3], "--heights ["),
         (["--out", "a.png", "--heights", 1, 2, 1.5], "--heights ["),

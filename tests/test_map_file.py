@@ -7,12 +7,11 @@ import zipfile
 import naive
 import numpy as np
 import pytest
-from piccolo.cloud.octree import build_octree
 from refusals import read_or_refused
 from rooms import scan_map
 
 from piccolo.cloud.settings import CloudSettings
-from piccolo.cloud.voxels import LEAF_SIZE, PHASE, QUANTA_PER_METRE, VoxelTable
+from piccolo.cloud.voxels import LEAF_SIZE, PHASE, QUANTA_PER_METRE, VoxelTable, build_octree
 from piccolo.coarse_to_fine import map_file, open_map
 from piccolo.coarse_to_fine.map_file import is_map_file, load_map, save_map
 from piccolo.coarse_to_fine.map_validation import first_misplaced
@@ -126,6 +125,7 @@ DAMAGE = {  # member, what is done to it, the words of the refusal
     "index below zero": ("sparse", _changed(0, -1), "sparse candidates that are not"),
     "twice": ("sparse", _changed(0, 1), "sparse candidates that are not"),
     "no digest": ("scan_sha256", lambda a: np.array("G" * 64), "a scan_sha256 that is no digest"),
+    "no text": ("scan_sha256", lambda a: np.full(64, 2**32 - 1, "u4").view("<U64")[0], "that is no digest"),
     "short digest": ("scan_sha256", lambda a: np.array("0"), "scan_sha256 of type <U1"),
     "numbers": ("warnings", lambda a: np.arange(3), "warnings of type int64"),
     "objects": ("warnings", lambda a: np.array([{}], dtype=object), "wanted a whole map"),

@@ -21,7 +21,7 @@ def test_rotation_without_a_loss_is_no_hypothesis():
     )
     turns = np.stack([yaw_rotation(a) for a in np.radians([60, 0, 180])])
     np.testing.assert_allclose([h.score for h in losses_at(None, loss, AT, turns)], [-0.5, -1.0])
-    points, panorama, true_pose = scene
+    points, panorama, true_pose = rooms.scene(1)
     turns = uniform_yaws(8) @ true_pose.R_cam_from_world
     scored = losses_at(points, sampling_loss_of(pack_texels(panorama.rgb)), true_pose.center_world, turns)
     assert np.argmax([h.score for h in scored]) == 0

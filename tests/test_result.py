@@ -48,7 +48,7 @@ def test_json_names_what_the_next_tool_needs_in_its_units():
     assert document["std_mm"] == pytest.approx([2.0, 3.0, 4.0])
     assert document["std_deg"] == pytest.approx([np.degrees(1e-3)] * 3)
     assert "R_true = exp([w]x) R_cam_from_world" in document["covariance_convention"]
-    assert document["format"] == "piccolo-pose/3"
+    assert document["format"] == "piccolo-pose/4"
     T = np.array(document["T_world_from_cam"])
     np.testing.assert_allclose(T[:3, 3], RESULT.pose.center_world)
     np.testing.assert_allclose(T[:3, :3], np.array(document["R_cam_from_world"]).T)

@@ -1,4 +1,3 @@
-import dataclasses
 import json
 from itertools import combinations
 
@@ -63,7 +62,7 @@ def test_cameras_stand_clear_of_everything_in_full_rooms():
 
 def test_room_without_a_free_place_and_an_unknown_variant_are_refused():
     this = make_room(5, SMALL, np.zeros(3))
-    full = dataclasses.replace(this, boxes=np.array([[*(SMALL / 2), *(SMALL / 2), 0.0]]))
+    full = this._replace(boxes=np.array([[*(SMALL / 2), *(SMALL / 2), 0.0]]))
     with pytest.raises(InputError, match=r"size: .* no place 0\.35 m from everything"):
         free_position(full, np.random.default_rng(0), (1.0, 1.9))
     with pytest.raises(InputError, match="variant: 'odd' is not one of"):

@@ -105,7 +105,6 @@ def raising_signals(lost: list[KeyboardInterrupt]) -> Iterator[None]:
 
 
 def _terminate(signum: int, frame: FrameType | None) -> None:
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # once is enough: what cleans up is not to be stopped
     raise Terminated
 
 

@@ -74,7 +74,7 @@ def build_parser() -> argparse.ArgumentParser:
     files.add_argument("--no-cache", action="store_true", help="prepare the map again, and do not keep it")
     add_method_options(parser)
     add_prior_options(parser)
-    text = "that may be taken (default 80 % of what is free)"
+    text = "that may be taken (default 80 %% of what is free)"
     parser.add_argument("--max-memory", type=float, metavar="GB", help=text)
     text = "(default all cores)"
     parser.add_argument("--threads", type=int, default=num_cores(), metavar="N", help=text)

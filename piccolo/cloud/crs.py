@@ -28,7 +28,7 @@ def crs_of(paths: Sequence[Path]) -> str:
         text = _of_las(paths[0])
     elif head.startswith(e57_file.MAGIC):
         text = e57_file.read_xml(paths[0]).findtext("{*}coordinateMetadata") or ""
-    return text.strip() if len(text) <= MAX_LENGTH else ""
+    return " ".join(text.split()) if len(text) <= MAX_LENGTH else ""
 
 
 def _of_las(path: Path) -> str:

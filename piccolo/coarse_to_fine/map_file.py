@@ -73,8 +73,8 @@ def load_map(path: Path) -> ScanMap:
         if set(members) != MEMBERS or len(archive.infolist()) != len(MEMBERS):
             raise ValueError(f"not the arrays of a map: {sorted(MEMBERS ^ set(members))}")
         arrays = {name: _read(archive, info) for name, info in members.items()}
+        check_arrays(path, arrays)
         warnings = clean_warnings(path, arrays["warnings"])
-    check_arrays(path, arrays)
     own: dict[str, Any] = {name: arrays[name] for name in ARRAYS if name not in ("has_labels", "scan_sha256")}
     return ScanMap(
         octree=Octree(

@@ -99,7 +99,7 @@ def check_arrays(path: Path, arrays: Arrays) -> None:
     if not SHA256.fullmatch(str(arrays["scan_sha256"])):
         _refuse(path, "a scan_sha256 that is no digest")
     text = arrays["crs"].tobytes()
-    if len(text) > MAX_CRS or not text.decode(errors="\0").isprintable():
+    if len(text) > MAX_CRS or not text.decode().isprintable():
         _refuse(path, "a crs that is no text")
 
 

@@ -48,6 +48,12 @@ def warn_not_kept(reason: str) -> None:
 
 
 @cache
+def warn_damaged(folder: Path) -> None:
+    """Warn once, however many files are damaged."""
+    log.warning("%s: damaged compiled code; it is compiled anew", folder)
+
+
+@cache
 def sources_digest() -> str:
     """Digest of the sources that hold kernels, as one kernel is compiled into another."""
     digest = hashlib.sha256()
@@ -77,7 +83,7 @@ def read_whole(path: Path) -> bytes | None:
         return None
     payload = content[DIGEST_SIZE:]
     if digest_of(path.name, payload) != content[:DIGEST_SIZE]:
-        log.warning("%s: damaged compiled code; it is compiled anew", path)
+        warn_damaged(path.parent)
         return None
     mark_used(path)
     return payload
