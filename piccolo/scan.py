@@ -329,7 +329,7 @@ def scan_of(
     """A scan prepared anew for the method of the settings."""
     prepared: ScanMap | PaperMap
     if isinstance(settings, CoarseToFineSettings):
-        prepared = prepare_map(cloud, workers, cloud_settings.up, watch)
+        prepared = prepare_map(cloud, workers, cloud_settings.up, watch, prior=settings.prior)
     else:
         with watch.stage("read"):
             points = cloud.read()

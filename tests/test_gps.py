@@ -1,0 +1,123 @@
+"""Photos with GPS in scans whose coordinate system is known, and what else a photo's file says of itself."""
+
+import dataclasses
+import hashlib
+import struct
+
+import numpy as np
+import pytest
+import rooms
+from las_files import las_bytes
+from PIL import Image
+from PIL.ExifTags import GPS, IFD, Base
+from pyproj import Transformer
+from test_cloud_las import RAW
+
+import piccolo
+from piccolo.cloud.crs import crs_of, from_wgs84
+from piccolo.coarse_to_fine.gps import gps_prior
+from piccolo.coarse_to_fine.settings import Prior
+from piccolo.panorama.photo import GpsPosition, photo_of
+
+UTM = "EPSG:25832"
+OFFSET = np.array([500_000.0, 5_400_000.0, 300.0])  # of a room in UTM
+
+
+def write_photo(path, rgb, position=None, accuracy=None, time=None):
+    """A JPEG with GPS (latitude, longitude) [deg] and a time of EXIF."""
+    exif = Image.Exif()
+    if position is not None:
+        gps = exif.get_ifd(IFD.GPSInfo)
+        for value, names, tags in zip(
+            position, ("NS", "EW"), ((GPS.GPSLatitude, GPS.GPSLatitudeRef), (GPS.GPSLongitude, GPS.GPSLongitudeRef)),
+            strict=True,
+        ):  # fmt: skip
+            degrees, rest = divmod(abs(value), 1.0)
+            minutes, rest = divmod(rest * 60.0, 1.0)
+            gps[tags[0]] = (degrees, minutes, rest * 60.0)
+            gps[tags[1]] = names[value < 0]
+        if accuracy is not None:
+            gps[GPS.GPSHPositioningError] = accuracy
+    if time is not None:
+        own = exif.get_ifd(IFD.Exif)
+        own[Base.DateTimeOriginal], own[Base.SubsecTimeOriginal], own[Base.OffsetTimeOriginal] = time
+    Image.fromarray(rgb).save(path, quality=95, exif=exif)
+    return path
+
+
+def test_a_photo_says_what_it_is_and_when_and_where_it_was_taken(tmp_path):
+    rgb = rooms.query(1).rgb
+    time = "2026:11:22 10:02:03", "25", "+01:00"
+    path = write_photo(tmp_path / "a.jpg", rgb, (-48.5, 9.75), 4.0, time)
+    photo = photo_of(path)
+    assert photo.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert photo.image_size == (rooms.WIDTH, rooms.WIDTH // 2)
+    assert photo.capture_time == "2026-11-22T10:02:03.25+01:00"
+    assert photo.gps == GpsPosition(pytest.approx(-48.5), pytest.approx(9.75), 4.0)
+    bare = photo_of(write_photo(tmp_path / "b.jpg", rgb, time=("soon", "", "")))
+    assert (bare.capture_time, bare.gps) == (None, None)
+    assert photo_of(write_photo(tmp_path / "c.jpg", rgb, (0.0, 0.0))).gps is None
+
+
+def las_with_record(record_id, content):
+    """A LAS file with one record of a coordinate system behind its header."""
+    plain = las_bytes(RAW)
+    (header_size,) = struct.unpack_from("<H", plain, 94)
+    (points,) = struct.unpack_from("<I", plain, 96)
+    record = struct.pack("<H16sHH32s", 0, b"LASF_Projection", record_id, len(content), b"") + content
+    head = bytearray(plain[:header_size])
+    struct.pack_into("<II", head, 96, header_size + len(record), 1)
+    return bytes(head) + record + plain[points:]
+
+
+def test_las_names_its_system(tmp_path):
+    path = tmp_path / "a.las"
+    for record_id, content, expected in (
+        (2112, b'PROJCS["a",\n GEOGCS["b"]]\0', 'PROJCS["a", GEOGCS["b"]]'),
+        (34735, struct.pack("<8H", 1, 1, 0, 1, 3072, 0, 1, 25832), UTM),
+        (34735, struct.pack("<8H", 1, 1, 0, 1, 3072, 0, 1, 32767), ""),
+        (34735, b"\1", ""),
+        (7, b"else", ""),
+    ):
+        path.write_bytes(las_with_record(record_id, content))
+        assert crs_of([path]) == expected
+    other = tmp_path / "a.xyz"
+    other.write_text("0 0 0 1 2 3\n")
+    assert crs_of([other]) == ""
+
+
+def test_a_position_becomes_a_prior_of_any_height():
+    x, y = 512_345.0, 5_403_210.0
+    longitude, latitude = Transformer.from_crs(UTM, "EPSG:4326", always_xy=True).transform(x, y)
+    prior = gps_prior(GpsPosition(latitude, longitude, 4.0), UTM, 1.0)
+    assert prior.center_world == pytest.approx((x, y), abs=1e-3)
+    assert (prior.radius, prior.is_used) == (15.0, True)
+    assert gps_prior(GpsPosition(latitude, longitude, None), UTM, 1.0).radius == 30.0
+    near = prior.applied_to(Prior(height=(1.0, 2.0)))
+    assert near.near_world == (*prior.center_world, None)
+    assert near.height == (1.0, 2.0)
+    assert from_wgs84("EPSG:4326", latitude, longitude) is None
+    with pytest.raises(piccolo.InputError, match="--crs: found 'EPSG:0'"):
+        from_wgs84("EPSG:0", latitude, longitude)
+
+
+def test_a_photo_is_searched_about_its_position_and_then_anywhere(tmp_path):
+    cloud, taken = rooms.room(1)[1], rooms.query(1)
+    points = cloud.points + cloud.origin_world + OFFSET
+    scan = piccolo.open_scan(points, cloud.colors, crs=UTM)
+    here = taken.pose.center_world + OFFSET
+    to_degrees = Transformer.from_crs(UTM, "EPSG:4326", always_xy=True)
+    for shift, is_used in ((3.0, True), (2000.0, False)):
+        longitude, latitude = to_degrees.transform(here[0] + shift, here[1])
+        path = write_photo(tmp_path / "a.jpg", taken.rgb, (latitude, longitude), 2.0)
+        result = scan.localize(path)
+        assert result.status == "localized"
+        assert np.linalg.norm(result.pose.center_world - here) < 0.03
+        assert result.gps_prior.is_used == is_used
+        assert result.gps_prior.center_world == pytest.approx((here[0] + shift, here[1]), abs=0.01)
+        assert piccolo.Result.from_json(result.to_json()).gps_prior == result.gps_prior
+    assert scan.localize(path, use_gps=False).gps_prior is None
+    near = tuple(here.tolist())
+    assert scan.localize(path, near_world=near, radius=2.0).gps_prior is None
+    unknown = dataclasses.replace(scan, cloud_settings=dataclasses.replace(scan.cloud_settings, crs=None))
+    assert unknown.localize(path).gps_prior is None
