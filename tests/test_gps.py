@@ -28,14 +28,11 @@ def write_photo(path, rgb, position=None, accuracy=None, time=None):
     exif = Image.Exif()
     if position is not None:
         gps = exif.get_ifd(IFD.GPSInfo)
-        for value, names, tags in zip(
-            position, ("NS", "EW"), ((GPS.GPSLatitude, GPS.GPSLatitudeRef), (GPS.GPSLongitude, GPS.GPSLongitudeRef)),
-            strict=True,
-        ):  # fmt: skip
+        tags = (GPS.GPSLatitude, GPS.GPSLatitudeRef, "NS"), (GPS.GPSLongitude, GPS.GPSLongitudeRef, "EW")
+        for value, (number, reference, letters) in zip(position, tags, strict=True):
             degrees, rest = divmod(abs(value), 1.0)
             minutes, rest = divmod(rest * 60.0, 1.0)
-            gps[tags[0]] = (degrees, minutes, rest * 60.0)
-            gps[tags[1]] = names[value < 0]
+            gps[number], gps[reference] = (degrees, minutes, rest * 60.0), letters[value < 0]
         if accuracy is not None:
             gps[GPS.GPSHPositioningError] = accuracy
     if time is not None:
