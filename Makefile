@@ -17,7 +17,7 @@ $(VENV)/ready: requirements.lock requirements-formats.lock requirements-tools.lo
 
 demo: $(VENV)/ready
 	$(BIN)/python tools/make_room.py --out demo --seed 7 --points 200000 --panoramas 1 > /dev/null
-	$(BIN)/python localize.py --cloud demo/cloud.ply --pano demo/images/clean_0.jpg --out demo/pose.json --overlay demo/overlay.png
+	$(BIN)/python localize.py --cloud demo/cloud.ply --pano demo/images/clean_0.jpg --out demo/pose.json --overwrite --overlay demo/overlay.png
 	$(BIN)/python tools/evaluate.py --scenes demo --results demo/pose.json
 
 test: $(VENV)/ready
