@@ -13,12 +13,15 @@ from types import FunctionType
 import _checkout  # noqa: F401
 import numpy as np
 
+from piccolo.batch.priors import read_priors
 from piccolo.cli.command import command, option
 from piccolo.cloud import FORMATS
 from piccolo.cloud.readers.reader import PLAIN, CloudFormat
 from piccolo.coarse_to_fine.map_file import load_map
+from piccolo.coarse_to_fine.settings import Prior
 from piccolo.errors import InputError
 from piccolo.panorama import read_panorama
+from piccolo.panorama.photo import photo_of
 from piccolo.result import Result
 from piccolo.scenes.scene import read_scene
 
@@ -49,6 +52,8 @@ READERS: dict[str, tuple[tuple[str, ...], Callable[[Path], object]]] = {
         for f in FORMATS
     },
     "panorama": ((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp"), read_panorama),
+    "metadata": ((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp"), photo_of),
+    "priors": ((".csv",), lambda path: read_priors(path, Prior())),
     "result": ((".jsonl",), lambda path: Result.from_json(path.read_text())),
     "scene": ((".json",), read_scene),
     "map": ((".map", ".npz"), load_map),
@@ -65,7 +70,7 @@ def try_file(name: str, path: Path) -> None:
 
 def readers_functions() -> list[FunctionType]:
     """The plain functions of the readers' modules; compiled kernels can't be instrumented."""
-    names = [name for name in sorted(sys.modules) if name.startswith(("piccolo.cloud", "piccolo.panorama"))]
+    names = [name for name in sorted(sys.modules) if name.startswith(("piccolo.batch", "piccolo.cloud", "piccolo.panorama"))]
     values = [value for name in names for value in vars(sys.modules[name]).values()]
     unique = {id(v): v for v in values if isinstance(v, FunctionType) and v.__module__.startswith("piccolo")}
     return list(unique.values())
