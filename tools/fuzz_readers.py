@@ -70,7 +70,8 @@ def try_file(name: str, path: Path) -> None:
 
 def readers_functions() -> list[FunctionType]:
     """The plain functions of the readers' modules; compiled kernels can't be instrumented."""
-    names = [name for name in sorted(sys.modules) if name.startswith(("piccolo.batch", "piccolo.cloud", "piccolo.panorama"))]
+    packages = "piccolo.batch", "piccolo.cloud", "piccolo.panorama"
+    names = [name for name in sorted(sys.modules) if name.startswith(packages)]
     values = [value for name in names for value in vars(sys.modules[name]).values()]
     unique = {id(v): v for v in values if isinstance(v, FunctionType) and v.__module__.startswith("piccolo")}
     return list(unique.values())
