@@ -182,7 +182,9 @@ class Scan:
             seconds=watch.seconds,
             settings=settings_json(settings, self.cloud_settings, read_options),
             warnings=self.warnings + picture.warnings + ((LABELS_WARNING,) if read_options.labels else ()),
-            source=Source(self.prepared.scan_sha256, photo.sha256, photo.image_size, photo.capture_time),
+            source=Source(
+                self.prepared.scan_sha256 or None, photo.sha256, photo.image_size, photo.capture_time
+            ),
             gps_prior=gps,
         )
 

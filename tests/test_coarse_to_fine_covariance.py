@@ -115,6 +115,7 @@ def test_a_minimum_may_be_blunt_where_much_agrees(found, monkeypatch, std, agree
     assert covariance.is_local_minimum(found[0], found[1], agreement) == expected
     monkeypatch.setattr(covariance, "covariance_at", lambda *_: None)
     assert not covariance.is_local_minimum(found[0], found[1], agreement)
+    assert covariance.estimate_covariance(found[0], found[1]) is None
 
 
 def test_where_the_finest_image_has_no_minimum_the_next_one_tells(found, monkeypatch):

@@ -1,5 +1,6 @@
 import dataclasses
 import functools
+import itertools
 
 import naive
 import numpy as np
@@ -181,3 +182,8 @@ def test_number_of_starts(fewest, most, expected):
         assert len(starts.score) == (expected or num_candidates // 4)
         assert (np.diff(starts.score) <= 0).all()
         np.testing.assert_array_equal(starts.center_map, query.scan_map.centers[starts.candidate])
+        pairs = list(itertools.combinations(starts.hypotheses(), 2))
+        apart = np.array([rooms.errors(a.pose, b.pose) for a, b in pairs])
+        assert 0.5 <= apart[apart[:, 1] < 20.0, 0].min(initial=0.9) < 1.0
+        if gravity == "known":  # turned by twelfths of a turn
+            assert 20.0 <= apart[apart[:, 0] < 0.5, 1].min() < 40.0

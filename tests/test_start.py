@@ -147,5 +147,5 @@ def test_a_mask_that_hides_all_is_refused(scene, tmp_path):
     pano = scene / "images/clean_0.jpg"
     files = "--cloud", scene / "cloud.ply", "--pano", pano, "--mask", tmp_path / "mask.png", "--quiet"
     code, out, err = _shell("", *_command("localize.py", *files, "--no-cache"))
-    assert (code, out) == (3, "")
+    assert (code, json.loads(out)["status"]) == (3, "unreadable")
     assert "no pixel is left: all are masked" in err

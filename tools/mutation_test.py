@@ -124,12 +124,12 @@ def mutants(module: str) -> Iterator[Mutant]:
             yield Mutant(module, node.lineno, told, changed.decode(), is_compiled)
 
 
-def fails(names: Sequence[str], folder: Path, *options: str) -> bool:
+def fails(names: Sequence[str], folder: Path, *options: str, timeout_s: float | None = TIMEOUT_S) -> bool:
     """True if one of these tests fails in a copy of the checkout."""
     tests = [f"tests/test_{name}.py" for name in names]
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *options, *tests]
     own = {"PYTHONPATH": str(folder), "XDG_CACHE_HOME": str(folder.parent), "PYTHONDONTWRITEBYTECODE": "1"}
-    limits: dict[str, Any] = {"cwd": folder, "env": os.environ | own, "timeout": TIMEOUT_S}
+    limits: dict[str, Any] = {"cwd": folder, "env": os.environ | own, "timeout": timeout_s}
     try:
         return subprocess.run(command, check=False, capture_output=True, **limits).returncode != 0
     except subprocess.TimeoutExpired:
@@ -167,7 +167,7 @@ def try_all(chosen: Sequence[Mutant], num_jobs: int) -> int:
             kernel_folder() or sys.exit("no folder for kernels"), Path(temporary) / "piccolo" / "kernels"
         )
         names = sorted({name for mutant in chosen for name in TESTS[mutant.module]})
-        if fails(names, Path(temporary) / "0", *KEPT_KERNELS):
+        if fails(names, Path(temporary) / "0", *KEPT_KERNELS, timeout_s=None):
             sys.exit(f"the tests fail without a mutant: {' '.join(names)}")
 
         def tried(mutant: Mutant) -> bool:

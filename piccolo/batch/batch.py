@@ -40,7 +40,7 @@ class Batch:
         try:
             return scan.localize_query(pano, self.read_options, settings)
         except (OSError, InputError) as error:
-            source = Source(scan.prepared.scan_sha256, pano_sha256(pano))
+            source = Source(scan.prepared.scan_sha256 or None, pano_sha256(pano))
             repeated = settings_json(settings, self.cloud_settings, self.read_options)
             return unreadable_result(str(error), scan.name, str(pano), settings=repeated, source=source)
 
