@@ -72,6 +72,8 @@ def run_killed(arguments: Sequence[str], num_kills: int, seconds: float, rng: ra
 def interrupted(folder: Path, preset: str, num_kills: int, rng: random.Random) -> dict[str, object]:
     """Batches killed until they are done: how often, and how many files differ from the whole run's."""
     whole, out = folder / "whole.jsonl", folder / "poses.jsonl"
+    first = command(folder, folder / "first.jsonl", str(folder / "photos"), preset)
+    subprocess.run([sys.executable, *first], cwd=ROOT, check=False)  # which may compile kernels
     begin = time.monotonic()
     subprocess.run(
         [sys.executable, *command(folder, whole, str(folder / "photos"), preset)], cwd=ROOT, check=False
