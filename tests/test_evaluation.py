@@ -11,6 +11,7 @@ from refusals import assert_refused
 
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, is_correct
+from piccolo.runtime.line_file import appending
 from piccolo.scenes.evaluation import tables
 from piccolo.scenes.evaluation.plots import errors_figure, figure_png, risk_figure
 from piccolo.scenes.evaluation.query_result import (
@@ -20,7 +21,7 @@ from piccolo.scenes.evaluation.query_result import (
     match_results,
     query_result_of,
 )
-from piccolo.scenes.evaluation.runner import appending, read_run
+from piccolo.scenes.evaluation.runner import read_run
 from piccolo.scenes.evaluation.tables import (
     accuracies,
     changes,
@@ -197,11 +198,11 @@ def test_a_run_is_resumed_after_its_last_whole_line(tmp_path):
     rows, size = read_run(path)
     assert [row.image for row in rows] == ["a.jpg", "b.jpg"]
     with appending(path, size) as append:
-        append(ROWS[3])
+        append(ROWS[3].to_json())
         with pytest.raises(InputError, match="another process is writing"), appending(path, size):
             pass
     assert [row.image for row in read_run(path)[0]] == ["a.jpg", "b.jpg", "d.jpg"]
     path.write_text('{"my": "notes"}')
-    assert_refused("the last line is none of a run", read_run, path)
+    assert_refused("its end is no line of a run of tools/evaluate.py", read_run, path)
     path.write_text("{}\n")
     assert_refused(r"run\.jsonl, line 1: evaluation: found", read_run, path)

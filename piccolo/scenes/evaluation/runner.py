@@ -3,13 +3,11 @@
 A run on disk is one JSON line a query, flushed as it comes, so that a stopped run can be resumed.
 """
 
-import fcntl
 import json
 import multiprocessing
 import queue
 import signal
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.queues import Queue
 from pathlib import Path
@@ -23,6 +21,7 @@ from ...panorama import ReadOptions
 from ...paper.settings import PaperSettings
 from ...runtime.atomic import check_output
 from ...runtime.json_file import parse_lines, read_bytes
+from ...runtime.line_file import appending, whole_size
 from ...runtime.threads import Progress, Workers, no_progress
 from ...scan import open_files, settings_json
 from ..scene import QUERIES_NAME, Query, Scene
@@ -172,10 +171,7 @@ def read_run(path: Path) -> tuple[list[QueryResult], int]:
     Raises InputError if a line is none of a run; an unfinished last line was being written, and is left out.
     """
     content = read_bytes(path, WANTED)
-    size = content.rfind(b"\n") + 1
-    rest = content[size : size + len(LINE_BEGINS)]
-    if rest != LINE_BEGINS[: len(rest)]:
-        raise InputError(f"{path}: the last line is none of a run, {WANTED}")
+    size = whole_size(path, LINE_BEGINS, "a run of tools/evaluate.py")
     rows = parse_lines(path, content[:size], QueryResult.from_json)
     return list({row.key: row for row in rows}.values()), size
 
@@ -206,7 +202,7 @@ class Run(NamedTuple):
                     report(found.text)
                     num_failed += found.num_queries
                 else:
-                    append(found)
+                    append(found.to_json())
                     rows.append(found)
         return rows, num_failed
 
@@ -257,23 +253,3 @@ def _check_settings(path: Path, rows: Sequence[QueryResult], settings: dict[str,
             if found != wanted:
                 text = f"its results were made with {name} {found!r}, not {wanted!r}"
                 raise InputError(f"{path}: {text}; choose another file")
-
-
-@contextmanager
-def appending(path: Path, size: int) -> Iterator[Callable[[QueryResult], None]]:
-    """A function that appends one query to a run at once; the run is first cut to `size` bytes.
-
-    Raises InputError if another process is writing it.
-    """
-    with path.open("ab") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise InputError(f"{path}: another process is writing this run; wait for its end") from error
-        file.truncate(size)
-
-        def append(row: QueryResult) -> None:
-            file.write(row.to_json().encode() + b"\n")
-            file.flush()
-
-        yield append
