@@ -18,11 +18,12 @@ from .errors import InputError
 
 if TYPE_CHECKING:
     from .geometry.pose import Pose
+    from .opening import open_scan
     from .result import Result
-    from .scan import Scan, open_scan
+    from .scan import Scan
 
 __all__ = ["InputError", "Pose", "Result", "Scan", "__version__", "open_scan"]
-MODULES = {"Pose": ".geometry.pose", "Result": ".result", "Scan": ".scan", "open_scan": ".scan"}
+MODULES = {"Pose": ".geometry.pose", "Result": ".result", "Scan": ".scan", "open_scan": ".opening"}
 
 
 def __getattr__(name: str) -> object:

@@ -22,10 +22,10 @@ from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.gravity import rotation_to_z_up
+from piccolo.opening import open_files
 from piccolo.paper.settings import PaperSettings
 from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers
-from piccolo.scan import open_files
 
 ROOT = Path(__file__).resolve().parents[1]
 TURN = exp_so3(np.array([0.3, -0.7, 1.9]))
@@ -236,7 +236,7 @@ def test_a_wrong_unit_is_told_before_the_long_work_begins(tmp_path, monkeypatch,
         raise InterruptedError
 
     monkeypatch.setattr("piccolo.coarse_to_fine.scan_map.candidate_centers", begin)
-    monkeypatch.setattr("piccolo.scan.prepare_by_paper", begin)
+    monkeypatch.setattr("piccolo.opening.prepare_by_paper", begin)
     path = tmp_path / "mm.xyz"
     raw = seeded_cloud(1, 1500, size=(6000.0, 5000.0, 2500.0))
     np.savetxt(path, np.hstack([raw.points_world, raw.colors]), fmt="%.3f")

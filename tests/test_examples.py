@@ -5,6 +5,7 @@ import doctest
 import json
 import runpy
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -76,9 +77,10 @@ def test_api_page(folder, monkeypatch):
     assert tried > 20
 
 
-@pytest.mark.parametrize("module", [piccolo, sys.modules["piccolo.scan"]], ids=lambda m: m.__name__)
-def test_docstrings(module, folder, monkeypatch):
+@pytest.mark.parametrize("name", ["piccolo", "piccolo.opening", "piccolo.scan"])
+def test_docstrings(name, folder, monkeypatch):
     monkeypatch.chdir(folder)
-    failures, tried = doctest.testmod(module, extraglobs={"piccolo": piccolo}, optionflags=FLAGS)
+    known = {"piccolo": piccolo, "open_scan": piccolo.open_scan}
+    failures, tried = doctest.testmod(import_module(name), extraglobs=known, optionflags=FLAGS)
     assert failures == 0
     assert tried > 0

@@ -19,6 +19,7 @@ LAYERS = [
     "scenes.synthetic",
     "scenes.export",
     "scenes",
+    "opening",
     "scan",
     "result",
     "coarse_to_fine",

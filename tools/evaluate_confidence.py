@@ -21,12 +21,13 @@ from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.confidence.confidence import AMBIGUOUS, LOCALIZED
 from piccolo.geometry.pose import Pose, is_correct
 from piccolo.geometry.rotations import Gravity
+from piccolo.opening import scan_of
 from piccolo.panorama import AS_STORED, read_panorama
 from piccolo.paper.settings import PaperSettings
 from piccolo.result import Result
 from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers, num_cores
-from piccolo.scan import Settings, scan_of
+from piccolo.scan import Settings
 from piccolo.scenes.scene import Scene, read_scene
 from piccolo.scenes.synthetic.room import REPEATED_KINDS, make_repeated
 from piccolo.scenes.synthetic.world import (

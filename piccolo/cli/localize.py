@@ -17,6 +17,7 @@ from ..batch.priors import read_priors
 from ..coarse_to_fine.open_map import CachePolicy, scan_sha256_of
 from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
+from ..opening import open_files
 from ..panorama import read_panorama
 from ..render.surfel_renderer import overlay_png
 from ..result import UNREADABLE, Result
@@ -26,7 +27,7 @@ from ..runtime.line_file import appending
 from ..runtime.memory import limit_memory
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
-from ..scan import Scan, open_files
+from ..scan import Scan
 from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error, print_note, run_command
 from .interruption import SIGNALS, Interruption, Stopped, interruptible
 from .options import build_parser, check_arguments, cloud_settings_from, read_options_from, settings_from

@@ -17,13 +17,14 @@ from ...cloud.settings import CloudSettings
 from ...coarse_to_fine.open_map import CachePolicy
 from ...coarse_to_fine.settings import CoarseToFineSettings
 from ...errors import InputError
+from ...opening import open_files
 from ...panorama import ReadOptions
 from ...paper.settings import PaperSettings
 from ...runtime.atomic import check_output
 from ...runtime.json_file import parse_lines, read_bytes
 from ...runtime.line_file import appending, whole_size
 from ...runtime.threads import Progress, Workers, no_progress
-from ...scan import open_files, settings_json
+from ...scan import settings_json
 from ..scene import QUERIES_NAME, Query, Scene
 from .query_result import FORMAT, QueryResult, is_in_box, query_result_of
 
