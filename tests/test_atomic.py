@@ -66,13 +66,25 @@ def test_permissions_follow_the_umask_or_the_file_that_is_replaced(tmp_path):
         os.umask(before)
 
 
-@pytest.mark.skipif(os.getuid() != 0, reason="only root may give files away")
-def test_the_owner_stays(tmp_path):
-    path = tmp_path / "a"
+@pytest.mark.parametrize("is_allowed", [True, False])
+def test_the_owner_stays_where_that_is_allowed(tmp_path, monkeypatch, is_allowed):
+    path, given = tmp_path / "a", []
     path.touch()
-    os.chown(path, 1234, 1235)
+    if os.getuid() == 0:  # who alone may give files away
+        os.chown(path, 1234, 1235)
+    owner, fchown = (path.stat().st_uid, path.stat().st_gid), os.fchown
+
+    def give(handle, uid, gid):
+        given.append((uid, gid))
+        if not is_allowed:
+            raise PermissionError
+        fchown(handle, uid, gid)
+
+    monkeypatch.setattr(os, "fchown", give)
     write_atomically(path, b"x")
-    assert (path.stat().st_uid, path.stat().st_gid) == (1234, 1235)
+    assert given == [owner]
+    assert path.read_bytes() == b"x"
+    assert ((path.stat().st_uid, path.stat().st_gid) == owner) == (is_allowed or os.getuid() != 0)
 
 
 @pytest.mark.parametrize("is_there", [True, False])
