@@ -20,7 +20,7 @@ from .confidence.score import Evidence
 from .errors import InputError
 from .geometry.pose import Pose, T_world_from_cam, checked_rotation, quaternion_wxyz
 from .geometry.sphere import CONVENTION
-from .runtime.json_file import parse_lines, read_bytes
+from .runtime.json_file import document_of, parse_lines, read_bytes
 
 FORMAT = "piccolo-pose/4"
 UNREADABLE = "unreadable"
@@ -136,10 +136,7 @@ class Result:
     @classmethod
     def from_json(cls, text: str) -> "Result":
         """Read back what `to_json` wrote; any other text is an InputError."""
-        try:
-            document = json.loads(text)
-            if document["format"] != FORMAT:
-                raise InputError(f"result: found format {document['format']!r}, wanted {FORMAT!r}")
+        with document_of(text, FORMAT, "result") as document:
             cloud = document.pop("cloud")
             return cls(
                 cloud=cloud if isinstance(cloud, str) else _paths(cloud),
@@ -152,10 +149,6 @@ class Result:
                 warnings=tuple(document["warnings"]),
                 **{name: document[name] for name in _PLAIN_FIELDS},
             )
-        except (json.JSONDecodeError, KeyError, RecursionError, TypeError) as error:
-            raise InputError(
-                f"result: found {error!r}, wanted one JSON object of format {FORMAT!r}"
-            ) from error
 
 
 def result_of(found: Localization, warnings: tuple[str, ...] = (), **about: Any) -> Result:

@@ -2,7 +2,8 @@
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -41,6 +42,23 @@ def read_json(path: Path, wanted: str, max_size: int = MAX_SIZE) -> Any:
         return json.loads(text)
     except (ValueError, RecursionError) as error:  # bad JSON, and numbers of thousands of digits
         raise InputError(f"{path}: found damaged JSON ({error}), {wanted}") from error
+
+
+@contextmanager
+def document_of(text: str, form: str, label: str) -> Iterator[Any]:
+    """The JSON object in `text`, which says that it is of the format `form`; `label` begins an error.
+
+    Within this, what damaged fields raise is an InputError too.
+    """
+    try:
+        document = json.loads(text)
+        if document["format"] != form:
+            raise InputError(f"{label}: found format {document['format']!r}, wanted {form!r}")
+        yield document
+    except InputError:
+        raise
+    except DAMAGE as error:
+        raise InputError(f"{label}: found {error!r}, wanted one JSON object of format {form!r}") from error
 
 
 def parse_lines(path: Path, content: bytes, parse: Callable[[str], Value]) -> list[Value]:

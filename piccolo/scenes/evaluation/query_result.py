@@ -11,7 +11,7 @@ import numpy as np
 from ...errors import InputError
 from ...geometry.pose import MAX_ANGLE, MAX_DISTANCE, Array, Pose, pose_errors
 from ...result import Result
-from ...runtime.json_file import DAMAGE
+from ...runtime.json_file import document_of
 from ...scan import Scan
 from ..scene import Query, Scene
 
@@ -67,20 +67,13 @@ class QueryResult:
     @classmethod
     def from_json(cls, text: str) -> "QueryResult":
         """Read back what `to_json` wrote; any other text is an InputError."""
-        try:
-            row = json.loads(text)
-            if row["format"] != FORMAT:
-                raise InputError(f"evaluation: found format {row['format']!r}, wanted {FORMAT!r}")
+        with document_of(text, FORMAT, "evaluation") as row:
             distance, angle_deg = row["position_error"], row["rotation_error_deg"]
             words = str(row["scene"]), str(row["image"]), str(row["variant"])
             position_error = np.inf if distance is None else float(distance)
             rotation_error = np.inf if angle_deg is None else float(np.radians(angle_deg))
             result = Result.from_json(json.dumps(row["result"]))
             return cls(*words, row["is_in_box"], position_error, rotation_error, result)
-        except DAMAGE as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError(f"evaluation: found {error!r}, wanted a line of tools/evaluate.py") from error
 
 
 def query_result_of(scene: Scene, query: Query, result: Result, is_in_box: bool | None) -> QueryResult:
