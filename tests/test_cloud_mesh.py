@@ -1,6 +1,7 @@
 import meshes as made
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from test_cloud_morton import whole
@@ -34,7 +35,6 @@ def test_a_gltf_texture_stands_upright(tmp_path, kind):
 
 
 def test_a_glb_by_trimesh_stands_upright(tmp_path):
-    trimesh = pytest.importorskip("trimesh")
     image = Image.fromarray(made.QUADRANTS)
     material = trimesh.visual.material.PBRMaterial(baseColorTexture=image)
     visual = trimesh.visual.TextureVisuals(uv=made.UV_FROM_BELOW, material=material)
