@@ -228,6 +228,11 @@ def test_a_full_disk_keeps_the_lines_before(tmp_path):
     assert out.read_text() == "".join(f"{str(k) * 300}\n" for k in range(3))
 
 
+def test_a_full_device_is_named(scene, capsys):
+    assert _run(scene, Path("/dev/full"), "--quiet", pano=[str(scene / "images" / "clean_0.jpg")]) == 3
+    assert capsys.readouterr().err == "localize.py: /dev/full: cannot be used (No space left on device)\n"
+
+
 def test_several_overlays_go_into_a_folder(scene, tmp_path):
     folder = tmp_path / "overlays"
     folder.mkdir()

@@ -2,11 +2,13 @@
 
 import argparse
 import itertools
+import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from io import FileIO
 from pathlib import Path
 
 from tqdm import tqdm
@@ -131,8 +133,18 @@ def output(run: Run) -> Iterator[Write]:
     elif is_stdout(out):
         yield lambda line: print(line, flush=True)
     else:
-        with out.open("w") as stream:
-            yield lambda line: print(line, file=stream, flush=True)
+        with out.open("wb", buffering=0) as stream:
+            yield lambda line: write_to(stream, line, out)
+
+
+def write_to(stream: FileIO, line: str, out: Path) -> None:
+    """Write one line to a FIFO or a device; an OSError names it."""
+    rest = memoryview(line.encode() + b"\n")
+    try:
+        while rest:
+            rest = rest[stream.write(rest) or 0 :]
+    except OSError as error:
+        raise OSError(error.errno, os.strerror(error.errno or 0), str(out)) from error
 
 
 def report(run: Run, scan: Scan, result: Result) -> None:
