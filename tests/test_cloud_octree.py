@@ -4,7 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from piccolo.cloud import Cloud
-from piccolo.cloud.voxels import LEAF_SIZE, NUM_LEVELS, build_octree
+from piccolo.cloud.octree import build_octree
+from piccolo.cloud.voxels import LEAF_SIZE, NUM_LEVELS
 
 
 def _cloud(count=5000, seed=0):

@@ -10,17 +10,9 @@ from test_cloud_morton import seeded_cloud
 from test_cloud_stream import LEVEL, TURN, stream
 
 from piccolo.cloud import voxels
+from piccolo.cloud.octree import build_octree
 from piccolo.cloud.readers.reader import RawCloud
-from piccolo.cloud.voxels import (
-    COUNT,
-    LEAF_SIZE,
-    NUM_COLUMNS,
-    POSITION,
-    VoxelTable,
-    add_points,
-    build_octree,
-    move_voxels,
-)
+from piccolo.cloud.voxels import COUNT, LEAF_SIZE, NUM_COLUMNS, POSITION, VoxelTable, add_points, move_voxels
 from piccolo.errors import InputError
 from piccolo.geometry.pose import rotate_points
 

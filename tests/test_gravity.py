@@ -6,7 +6,7 @@ from rooms import room
 from scans import bare_room
 
 from piccolo import gravity
-from piccolo.cloud.voxels import build_octree
+from piccolo.cloud.octree import build_octree
 from piccolo.errors import InputError
 from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.gravity import estimate_normals, rotation_to_z_up

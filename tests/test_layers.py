@@ -23,6 +23,7 @@ LAYERS = [
     "scan",
     "result",
     "coarse_to_fine",
+    "local_features",
     "paper",
     "optimize",
     "gravity",

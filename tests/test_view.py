@@ -4,8 +4,8 @@ import pytest
 import rooms
 from scipy.spatial import cKDTree
 
+from piccolo.cloud.octree import build_octree
 from piccolo.cloud.stream import Cloud
-from piccolo.cloud.voxels import build_octree
 from piccolo.coarse_to_fine import camera_positions
 from piccolo.coarse_to_fine.scan_map import SEARCH_VIEW, render_candidates
 from piccolo.coarse_to_fine.view import ViewConfig, render_view, visible_points

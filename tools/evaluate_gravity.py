@@ -15,8 +15,8 @@ from piccolo.cli.command import check_least, command, option
 from piccolo.cli.errors import UsageError, checking_options
 from piccolo.cli.progress import progress_bar
 from piccolo.cloud import CloudStream, open_cloud, stream_of
+from piccolo.cloud.octree import build_octree
 from piccolo.cloud.readers.reader import RawCloud
-from piccolo.cloud.voxels import build_octree
 from piccolo.confidence.confidence import check_confidence
 from piccolo.geometry.pose import Array
 from piccolo.geometry.rotations import random_rotation

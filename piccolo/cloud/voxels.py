@@ -1,7 +1,7 @@
 """Points averaged voxel by voxel as they stream by: the memory grows with the scene, not with the points.
 
 The grid is fixed in the map's axes, and all sums are integers: neither the order of the points nor how they
-are cut into chunks changes a bit. The octree is a pyramid of these voxels, in Morton order.
+are cut into chunks changes a bit.
 """
 
 from typing import NamedTuple
@@ -31,7 +31,6 @@ CELL, COUNT, POSITION, COLOR, NUM_COLUMNS = 0, 3, 4, 7, 10
 FIRST_ROWS, MAX_ROWS = 1 << 16, 1 << 27  # 40 bytes a row; the most are 80 million voxels, 20,000 m^2 or more
 ROW_BYTES = 4 * NUM_COLUMNS
 VOXEL_BYTES = ROW_BYTES + 3 * 8 + 3 * 8 + 3 * 8 + 6 * 4  # rows, cells, a copy of them, codes and order, nodes
-NODE_BYTES = 6 * 4 + 8 + 4  # mean, code, first child
 THIN = "set --units if its unit is not the metre, or cut out a part"
 MAX_LOAD = 0.6  # share of the rows in use
 NUM_LEVELS = COARSEST.bit_length()  # from 128 leaves wide (2.56 m) down to one
@@ -218,37 +217,3 @@ class VoxelTable:
             nodes[:, k] = corners + (rows[order, POSITION + k] / counts + 0.5 - PHASE) / QUANTA_PER_METRE
             nodes[:, 3 + k] = rows[order, COLOR + k] / counts / 255.0
         return Voxels(codes[order], nodes, origin, warnings)
-
-
-class Octree(NamedTuple):
-    """Nodes of all levels, coarsest first, in Morton order within a level; kernels read it as it is."""
-
-    nodes: NDArray[np.float32]  # (nodes, 6) mean x, y, z [m], r, g, b in [0, 1]
-    first_child: NDArray[np.int32]  # (nodes + 1,) children of i are first_child[i]:first_child[i + 1]
-    level_start: NDArray[np.int32]  # (levels + 1,)
-    leaf_size: float  # [m]
-
-    def level(self, size: float) -> NDArray[np.float32]:
-        """The nodes of the level whose voxels are nearest to `size` [m]."""
-        level = NUM_LEVELS - 1 - int(np.clip(np.rint(np.log2(size / self.leaf_size)), 0, NUM_LEVELS - 1))
-        return self.nodes[self.level_start[level] : self.level_start[level + 1]]
-
-
-def build_octree(voxels: Voxels) -> Octree:
-    """The octree whose leaves are the voxels."""
-    nodes, node_codes = voxels.nodes, voxels.codes
-    levels, children = [nodes], [np.zeros(len(nodes), np.int32)]
-    for _ in range(NUM_LEVELS - 1):
-        check_memory(2 * len(nodes) * NODE_BYTES, f"the scan: a level of {len(nodes)} voxels", THIN)
-        first = np.flatnonzero(np.diff(node_codes >> 3, prepend=-1))  # children of a parent follow each other
-        counts = np.diff(first, append=len(nodes))
-        columns = [np.add.reduceat(column, first, dtype=np.float64) / counts for column in nodes.T]
-        nodes, node_codes = np.stack(columns, axis=1, dtype=np.float32), node_codes[first] >> 3
-        levels.insert(0, nodes)
-        children.insert(0, first.astype(np.int32))
-    num_nodes = sum(map(len, levels))
-    check_memory(num_nodes * NODE_BYTES, f"the scan: a tree of {num_nodes} voxels", THIN)
-    start = np.concatenate([[0], np.cumsum([len(level) for level in levels])]).astype(np.int32)
-    first_child = [c + s for c, s in zip(children[:-1], start[1:-1], strict=True)]
-    first_child.append(np.full(len(levels[-1]) + 1, start[-1], np.int32))  # leaves have none
-    return Octree(np.concatenate(levels), np.concatenate(first_child).astype(np.int32), start, LEAF_SIZE)

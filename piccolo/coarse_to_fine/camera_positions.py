@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..cloud.voxels import Octree
+from ..cloud.octree import Octree
 from ..errors import InputError
 from ..geometry.pose import Array
 from ..runtime.threads import Workers

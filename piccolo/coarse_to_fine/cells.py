@@ -13,46 +13,6 @@ FAR = np.float32(1e30)
 
 
 @kernel
-def collect(tree, center, voxel_per_range, found, directions):
-    """Write the nodes that, seen from `center`, are as small as asked, or leaves; returns how many.
-
-    `directions` (3, N) get the positions relative to the centre [m].
-    """
-    nodes, first_child = tree.nodes, tree.first_child
-    num_levels = len(tree.level_start) - 1
-    stack = np.empty(8 * num_levels, np.int32)
-    levels = np.empty(8 * num_levels, np.int32)
-    cx, cy, cz = np.float32(center[0]), np.float32(center[1]), np.float32(center[2])
-    per2 = np.float32(1.0 / (voxel_per_range * voxel_per_range))
-    min_d2 = np.empty(num_levels, np.float32)
-    for level in range(num_levels):
-        size = np.float32(tree.leaf_size * 2.0 ** (num_levels - 1 - level))
-        min_d2[level] = size * size * per2
-    min_d2[num_levels - 1] = F0
-    count = 0
-    for root in range(tree.level_start[1]):
-        stack[0] = root
-        levels[0] = 0
-        top = 1
-        while top > 0:
-            top -= 1
-            node = stack[top]
-            level = levels[top]
-            dx, dy, dz = nodes[node, 0] - cx, nodes[node, 1] - cy, nodes[node, 2] - cz
-            if dx * dx + dy * dy + dz * dz >= min_d2[level]:
-                if count < len(found):
-                    found[count] = node
-                    directions[0, count], directions[1, count], directions[2, count] = dx, dy, dz
-                    count += 1
-            else:
-                for child in range(first_child[node], first_child[node + 1]):
-                    stack[top] = child
-                    levels[top] = level + 1
-                    top += 1
-    return count
-
-
-@kernel
 def locate(X, Y, Z, num_columns, first, cells, ranges, turns):
     """Write the cell and the range [m] of each position relative to the centre; `turns` is scratch."""
     num_rings = np.float32(len(num_columns))

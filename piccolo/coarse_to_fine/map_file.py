@@ -17,8 +17,8 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from ..cloud.octree import Octree
 from ..cloud.readers.npz import damage_named
-from ..cloud.voxels import Octree
 from ..errors import InputError
 from ..runtime.atomic import replacing
 from .map_validation import LAYOUT, check_arrays, clean_warnings

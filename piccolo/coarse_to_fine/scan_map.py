@@ -7,9 +7,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cloud.octree import Octree, build_octree
 from ..cloud.settings import UpAxis
 from ..cloud.soa import PackedPoints, pack_points
-from ..cloud.voxels import Octree, Voxels, build_octree
+from ..cloud.voxels import Voxels
 from ..geometry.pose import Array, Pose
 from ..geometry.sphere import SEARCH_RINGS, averaging, make_grid
 from ..gravity import MIN_CONFIDENCE, R_z_from_axis, estimate_normals, find_up, rotation_to_z_up

@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cloud.voxels import Octree
+from ..cloud.octree import MAX_NODES, Octree, collect
 from ..geometry.sphere import cell_of, make_grid, make_neighbors
 from ..panorama.local_normalization import LEVELS_PER_UNIT, opponent, zscore
 from ..runtime.jit import F0, F1, HALF, inline_kernel, kernel
-from .cells import average_cells, average_colors, collect, local_statistics, locate
+from .cells import average_cells, average_colors, local_statistics, locate
 
 VISIBLE_OFFSET = np.float32(0.1)  # [m] of range noise
 U15, U16, LOW_32 = np.uint64(15), np.uint64(16), np.uint64(0xFFFFFFFF)
@@ -198,9 +198,6 @@ def filled_fractions(tree, centers, voxel_per_range, view, scratch, fraction):
         for c in range(len(is_filled)):
             if is_filled[c]:
                 fraction[k] += view.solid_angle[c]
-
-
-MAX_NODES = 1 << 22  # of a view; reserved, but used only as far as a dense cloud fills it
 
 
 def make_scratch() -> Scratch:

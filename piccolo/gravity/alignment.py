@@ -7,8 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ..cloud import CloudStream
+from ..cloud.octree import build_octree
 from ..cloud.settings import UpAxis
-from ..cloud.voxels import Voxels, build_octree
+from ..cloud.voxels import Voxels
 from ..errors import InputError
 from ..geometry.pose import Array, Pose, checked_rotation, orthonormal, yaw_rotation
 from ..runtime.json_file import read_json

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ...cloud import open_cloud
+from ...cloud.octree import build_octree
 from ...cloud.soa import pack_points
-from ...cloud.voxels import build_octree
 from ...confidence.score import VIEW_WIDTH, agreement_at
 from ...geometry.pose import Array, Pose
 from ...panorama import read_panorama

@@ -1,0 +1,131 @@
+"""The scan's local features: where views are taken, what they show, and an index of descriptors."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cloud.octree import Octree
+from ..runtime.jit import kernel
+from ..runtime.threads import Workers
+from .keypoints import find_keypoints
+from .view_image import render_gray
+
+VIEW_WIDTH = 640  # [px] of the views
+NUM_COMPONENTS = 64
+MAX_RANGE = 30.0  # [m] farther away the scan is too thin, and a match tells little of the position
+SAMPLE = 20_000  # descriptors from which the components and the lists' middles are learnt
+LIST_SIZE = 128  # features of a list, on average
+MAX_LISTS = 4096
+KMEANS_ROUNDS = 5
+
+
+class FeatureMap(NamedTuple):
+    """Local features in the map's frame, sorted by the list that each is in."""
+
+    points: NDArray[np.float32]  # (F, 3) [m]
+    directions: NDArray[np.int8]  # (F, 3) from the camera to the point, by 127
+    tangents: NDArray[np.int8]  # (F, 3) in which the keypoint points, across the direction, by 127
+    sizes: NDArray[np.float32]  # (F,) diameter [m]
+    descriptors: NDArray[np.int8]  # (F, NUM_COMPONENTS)
+    mean: NDArray[np.int16]  # (128,) of the descriptors, and
+    components: NDArray[np.int8]  # (128, NUM_COMPONENTS) their principal components, by 127
+    middles: NDArray[np.int8]  # (L, NUM_COMPONENTS) of the lists
+    list_start: NDArray[np.int32]  # (L + 1,) where each begins
+
+
+class _View(NamedTuple):
+    """The features of one view."""
+
+    points: NDArray[np.float32]
+    directions: NDArray[np.int8]
+    tangents: NDArray[np.int8]
+    sizes: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+
+
+def features_of_view(octree: Octree, center_map: NDArray[np.float64], width: int = VIEW_WIDTH) -> _View:
+    """The features seen from a centre (3,) [m] that have a point of the scan."""
+    image = render_gray(octree, center_map, width)
+    found = find_keypoints(image.gray, image.is_filled)
+    u = (0.5 - np.arctan2(found.rays[:, 1], found.rays[:, 0]) / (2.0 * math.pi)) * width
+    v = (0.5 - np.arcsin(np.clip(found.rays[:, 2], -1.0, 1.0)) / math.pi) * width / 2.0
+    ranges = image.ranges[np.minimum(v.astype(int), width // 2 - 1), u.astype(int) % width]
+    found, ranges = (
+        found.take(np.flatnonzero((ranges > 0.0) & (ranges < MAX_RANGE))),
+        ranges[(ranges > 0.0) & (ranges < MAX_RANGE)],
+    )
+    return _View(
+        np.asarray(center_map + found.rays * ranges[:, None], np.float32),
+        np.rint(found.rays * 127.0).astype(np.int8),
+        np.rint(found.tangents * 127.0).astype(np.int8),
+        np.asarray(found.sizes * ranges, np.float32),
+        found.descriptors,
+    )
+
+
+def principal_components(
+    descriptors: NDArray[np.uint8],
+) -> tuple[NDArray[np.int16], NDArray[np.int8]]:
+    """Mean (128,) and the strongest components (128, NUM_COMPONENTS) of descriptors (N, 128), whole numbers."""
+    values = descriptors.astype(np.float64)
+    mean = np.rint(values.mean(axis=0))
+    values -= mean
+    axes = np.linalg.eigh(values.T @ values)[1][:, : -NUM_COMPONENTS - 1 : -1]
+    axes *= np.sign(axes[np.abs(axes).argmax(axis=0), np.arange(NUM_COMPONENTS)])
+    return mean.astype(np.int16), np.rint(axes * 127.0).astype(np.int8)
+
+
+def project(
+    descriptors: NDArray[np.uint8], mean: NDArray[np.int16], components: NDArray[np.int8]
+) -> NDArray[np.int8]:
+    """Components (N, NUM_COMPONENTS) of descriptors (N, 128); sums of whole numbers below 2^24 are exact."""
+    values = descriptors.astype(np.float32) - mean.astype(np.float32)
+    projected = values @ components.astype(np.float32)
+    return np.clip(np.rint(projected / np.float32(127.0)), -127, 127).astype(np.int8)
+
+
+@kernel
+def nearest_middle(descriptors, middles, nearest):
+    """Write the index of the nearest middle (L, D) of each descriptor (N, D)."""
+    for i in range(len(descriptors)):
+        best = np.int32(2147483647)
+        for k in range(len(middles)):
+            total = np.int32(0)
+            for d in range(descriptors.shape[1]):
+                gap = np.int32(descriptors[i, d]) - np.int32(middles[k, d])
+                total += gap * gap
+            if total < best:
+                best = total
+                nearest[i] = k
+
+
+def list_middles(descriptors: NDArray[np.int8], num_lists: int) -> NDArray[np.int8]:
+    """Middles (num_lists, D) of clusters of descriptors (N, D), by Lloyd's k-means from an even sample."""
+    sample = descriptors[:: 1 + len(descriptors) // SAMPLE]
+    middles = sample[np.linspace(0, len(sample) - 1, num_lists).astype(int)].copy()
+    nearest = np.empty(len(sample), np.int32)
+    for _ in range(KMEANS_ROUNDS):
+        nearest_middle(sample, middles, nearest)
+        order = np.argsort(nearest, kind="stable")
+        lists, first, counts = np.unique(nearest[order], return_index=True, return_counts=True)
+        sums = np.add.reduceat(sample[order].astype(np.int64), first, axis=0)
+        middles[lists] = np.rint(sums / counts[:, None]).astype(np.int8)
+    return middles
+
+
+def make_feature_map(octree: Octree, centers: NDArray[np.float64], workers: Workers) -> FeatureMap:
+    """The features of the views from some centres (N, 3) [m]."""
+    views = list(workers.map(lambda c: features_of_view(octree, c), list(centers), "find features"))
+    merged = _View(*(np.concatenate(values) for values in zip(*views, strict=True)))
+    mean, components = principal_components(merged.descriptors[:: 1 + len(merged.points) // SAMPLE])
+    descriptors = project(merged.descriptors, mean, components)
+    num_lists = int(np.clip(len(descriptors) // LIST_SIZE, 1, MAX_LISTS))
+    middles = list_middles(descriptors, num_lists)
+    nearest = np.empty(len(descriptors), np.int32)
+    nearest_middle(descriptors, middles, nearest)
+    order = np.argsort(nearest, kind="stable")
+    start = np.searchsorted(nearest[order], np.arange(num_lists + 1)).astype(np.int32)
+    points, directions, tangents, sizes, _ = (values[order] for values in merged)
+    return FeatureMap(points, directions, tangents, sizes, descriptors[order], mean, components, middles, start)

@@ -1,0 +1,213 @@
+"""Poses that matches vote for.
+
+One match gives a pose by itself, roughly: its keypoint's size tells how far the point is, its direction and
+tangent how the camera is turned, if the camera is near where the map knows the feature from. The poses that
+most other matches agree with, in place, size and turn, are made exact by P3P within RANSAC (Fischler and
+Bolles, 1981) among those matches.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.pose import Array, Pose
+from ..geometry.suppression import non_maximum_suppression
+from ..runtime.jit import F0, F1, inline_kernel, kernel
+from ..runtime.threads import Workers
+from .matching import Matches
+from .p3p import p3p
+from .pose_refinement import refine_pose
+
+COS_ROUGH, COS_EXACT = math.cos(math.radians(20.0)), math.cos(math.radians(1.0))  # a match off by less agrees
+COS_TANGENT = math.cos(math.radians(40.0))
+SIZE_RATIO = 1.7  # of a keypoint's size as predicted and as found, at most
+COS_TILT = math.cos(math.radians(12.0))  # by which a pose may be off the known vertical
+MAX_VOTERS = 3000  # single matches whose poses are tried
+CLUSTER_DISTANCE, CLUSTER_ANGLE = 1.0, math.radians(30.0)  # [m], [rad] rough poses nearer than both are one
+NUM_CLUSTERS = 48
+NUM_SAMPLES = 200  # of three matches, a cluster
+LEAST_MATCHES = 4  # that agree with a pose
+REFINEMENTS, REFINE_SCALE = 8, math.radians(0.5)  # steps, scale of the loss [rad]
+
+
+class MatchedPose(NamedTuple):
+    """A pose, and how many features of the photo it puts where the map has them."""
+
+    pose: Pose
+    num_matches: int
+
+
+@inline_kernel
+def agreement(m, j, R, t, cos_rough):
+    """Cosine between a match's ray and its point as the pose (3, 3), (3,) sees it; -1 if anything else differs.
+
+    Size and tangent must agree too.
+    """
+    dx, dy, dz = m.points[j, 0] - t[0], m.points[j, 1] - t[1], m.points[j, 2] - t[2]
+    x = R[0, 0] * dx + R[0, 1] * dy + R[0, 2] * dz
+    y = R[1, 0] * dx + R[1, 1] * dy + R[1, 2] * dz
+    z = R[2, 0] * dx + R[2, 1] * dy + R[2, 2] * dz
+    length = math.sqrt(x * x + y * y + z * z)
+    cosine = (x * m.rays[j, 0] + y * m.rays[j, 1] + z * m.rays[j, 2]) / max(length, 1e-9)
+    if cosine < cos_rough:
+        return -1.0
+    ratio = m.sizes[j] / (length * m.angles[j])
+    if not 1.0 / SIZE_RATIO < ratio < SIZE_RATIO:
+        return -1.0
+    a, b, c = m.tangents[j, 0], m.tangents[j, 1], m.tangents[j, 2]
+    turn = m.ray_tangents[j, 0] * (R[0, 0] * a + R[0, 1] * b + R[0, 2] * c)
+    turn += m.ray_tangents[j, 1] * (R[1, 0] * a + R[1, 1] * b + R[1, 2] * c)
+    turn += m.ray_tangents[j, 2] * (R[2, 0] * a + R[2, 1] * b + R[2, 2] * c)
+    return cosine if turn > COS_TANGENT else -1.0
+
+
+@kernel
+def rough_poses(matches, voters, R_cam_from_level, is_upright, rotations, centers, votes):
+    """Write the pose (n, 3, 3), (n, 3) of each single match, and the weight (n,) of all that agree with it."""
+    m = matches
+    for k in range(len(voters)):
+        j, R, t = voters[k], rotations[k], centers[k]
+        distance = m.sizes[j] / max(m.angles[j], F0 + np.float32(1e-6))
+        b, d = m.rays[j], m.directions[j]
+        for i in range(3):
+            t[i] = m.points[j, i] - distance * d[i]
+        if is_upright:
+            # the yaw that takes the azimuth of the direction to that of the ray in the level frame
+            x = R_cam_from_level[0, 0] * b[0] + R_cam_from_level[1, 0] * b[1] + R_cam_from_level[2, 0] * b[2]
+            y = R_cam_from_level[0, 1] * b[0] + R_cam_from_level[1, 1] * b[1] + R_cam_from_level[2, 1] * b[2]
+            per = 1.0 / max(math.sqrt((x * x + y * y) * (d[0] * d[0] + d[1] * d[1])), 1e-9)
+            c, s = (x * d[0] + y * d[1]) * per, (y * d[0] - x * d[1]) * per
+            for i in range(3):
+                R[i, 0] = R_cam_from_level[i, 0] * c + R_cam_from_level[i, 1] * s
+                R[i, 1] = R_cam_from_level[i, 1] * c - R_cam_from_level[i, 0] * s
+                R[i, 2] = R_cam_from_level[i, 2]
+        else:
+            u, v = m.ray_tangents[j], m.tangents[j]
+            for i in range(3):
+                n_i = b[(i + 1) % 3] * u[(i + 2) % 3] - b[(i + 2) % 3] * u[(i + 1) % 3]
+                for h in range(3):
+                    n_h = d[(h + 1) % 3] * v[(h + 2) % 3] - d[(h + 2) % 3] * v[(h + 1) % 3]
+                    R[i, h] = b[i] * d[h] + u[i] * v[h] + n_i * n_h
+        votes[k] = 0.0
+        last, best = -1, F0
+        for i in range(len(m.query)):
+            if m.query[i] != last:
+                votes[k] += best
+                last, best = m.query[i], F0
+            if agreement(m, i, R, t, COS_ROUGH) > 0.0:
+                best = max(best, m.weights[i])
+        votes[k] += best
+
+
+@inline_kernel
+def count_exact(m, members, R, t):
+    """How many features of the photo, of the matches `members`, agree with a pose to a degree."""
+    count, last = 0, -1
+    for k in range(len(members)):
+        j = members[k]
+        if m.query[j] != last and agreement(m, j, R, t, COS_EXACT) > 0.0:
+            count += 1
+            last = m.query[j]
+    return count
+
+
+@kernel
+def sample_poses(matches, members, up_cam, cos_tilt, R_best, t_best):
+    """Write the pose, (3, 3) and (3,), of three members that most members agree with; returns how many do.
+
+    Poses whose vertical is off `up_cam` (3,) by more than the cosine says are left out. The samples are always
+    the same ones.
+    """
+    m, best = matches, 0
+    bearings, points = np.empty((3, 3)), np.empty((3, 3))
+    rotations, centers = np.empty((4, 3, 3)), np.empty((4, 3))
+    state = np.uint32(12345)
+    for _ in range(NUM_SAMPLES):
+        for i in range(3):
+            state = np.uint32(state * np.uint32(1664525) + np.uint32(1013904223))
+            j = members[np.int64(state >> np.uint32(8)) % len(members)]
+            for c in range(3):
+                bearings[i, c], points[i, c] = m.rays[j, c], m.points[j, c]
+        for k in range(p3p(bearings, points, rotations, centers)):
+            R = rotations[k]
+            if R[0, 2] * up_cam[0] + R[1, 2] * up_cam[1] + R[2, 2] * up_cam[2] < cos_tilt:
+                continue
+            count = count_exact(m, members, R, centers[k])
+            if count > best:
+                best = count
+                R_best[:], t_best[:] = R, centers[k]
+    return best
+
+
+@kernel
+def list_members(matches, R_cam_from_map, center_map, cos_rough, members):
+    """Write the indices of the matches that agree with a pose; returns how many."""
+    count = 0
+    for j in range(len(matches.query)):
+        if agreement(matches, j, R_cam_from_map, center_map, cos_rough) > 0.0:
+            members[count] = j
+            count += 1
+    return count
+
+
+def members_of(matches: Matches, pose: Pose, cos_rough: float) -> NDArray[np.int64]:
+    """Indices of the matches that agree with a pose."""
+    members = np.empty(len(matches.query), np.int64)
+    count = list_members(matches, pose.R_cam_from_world, pose.center_world, cos_rough, members)
+    return members[:count]
+
+
+def count_matches(matches: Matches, pose: Pose) -> int:
+    """How many features of the photo a pose puts where the map has them."""
+    return len(np.unique(matches.query[members_of(matches, pose, COS_EXACT)]))
+
+
+def poses_of(
+    matches: Matches, R_cam_from_level: Array | None, count: int, workers: Workers
+) -> list[MatchedPose]:
+    """At most `count` poses that most matches agree with, best first, in the map's frame.
+
+    R_cam_from_level (3, 3) says how the camera was tilted, None if nobody knows.
+    """
+    voters = np.flatnonzero(matches.weights == F1)
+    others = np.flatnonzero(matches.weights < F1)
+    voters = np.concatenate([voters, others])[:MAX_VOTERS]
+    rotations, centers = np.empty((len(voters), 3, 3)), np.empty((len(voters), 3))
+    votes = np.empty(len(voters))
+    level = np.eye(3) if R_cam_from_level is None else np.ascontiguousarray(R_cam_from_level, np.float64)
+
+    def vote(lo: int) -> None:
+        part = slice(lo, lo + 64)
+        how = level, R_cam_from_level is not None
+        rough_poses(matches, voters[part], *how, rotations[part], centers[part], votes[part])
+
+    list(workers.map(vote, range(0, len(voters), 64), "vote"))
+    order = np.argsort(-votes, kind="stable")
+    kept = order[
+        non_maximum_suppression(
+            rotations[order], centers[order], NUM_CLUSTERS, CLUSTER_DISTANCE, CLUSTER_ANGLE
+        )
+    ]
+    up_cam, cos_tilt = level[:, 2].copy(), -2.0 if R_cam_from_level is None else COS_TILT
+
+    def exact(k: int) -> MatchedPose | None:
+        rough = Pose(rotations[k], centers[k])
+        members = members_of(matches, rough, COS_ROUGH)
+        R, t = np.empty((3, 3)), np.empty(3)
+        if len(members) < LEAST_MATCHES or sample_poses(matches, members, up_cam, cos_tilt, R, t) < LEAST_MATCHES:
+            return None
+        for _ in range(2):
+            members = members_of(matches, Pose(R, t), COS_EXACT)
+            some = matches.rays[members].astype(np.float64), matches.points[members].astype(np.float64)
+            refine_pose(*some, np.ones(len(members)), R, t, REFINEMENTS, REFINE_SCALE)
+        pose = Pose(R, t)
+        return MatchedPose(pose, count_matches(matches, pose))
+
+    found = [f for f in workers.map(exact, list(kept), "sample") if f and f.num_matches >= LEAST_MATCHES]
+    found.sort(key=lambda f: -f.num_matches)
+    if not found:
+        return []
+    R, t = np.array([f.pose.R_cam_from_world for f in found]), np.array([f.pose.center_world for f in found])
+    return [found[k] for k in non_maximum_suppression(R, t, count, 0.1, math.radians(5.0))]

@@ -1,0 +1,113 @@
+"""Keypoints of a sphere: SIFT (Lowe, IJCV 2004) on overlapping perspective views, as rays and sizes."""
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+FIELD_DEG = 65.0  # of a view, across
+CONTRAST = 0.02  # least of a keypoint, as OpenCV counts it
+MARGIN = 8  # [px] of the sphere's picture around it, so that views may cross the seam
+DESCRIPTOR_SIZE = 128
+# azimuth and elevation of the views' middles [deg]; at the poles pictures show floor and ceiling, or nothing
+VIEWS_DEG = [(45.0 * k, 0.0) for k in range(8)]
+VIEWS_DEG += [(60.0 * k + 30.0, elevation) for elevation in (45.0, -45.0) for k in range(6)]
+
+
+class Keypoints(NamedTuple):
+    """Keypoints of one sphere, in the axes of its picture."""
+
+    rays: NDArray[np.float32]  # (N, 3) unit directions
+    tangents: NDArray[np.float32]  # (N, 3) unit directions across the ray in which the keypoint points
+    sizes: NDArray[np.float32]  # (N,) diameter [rad]
+    descriptors: NDArray[np.uint8]  # (N, 128) square roots of SIFT's shares (Arandjelovic, Zisserman 2012)
+
+    def take(self, indices: NDArray[np.int64]) -> "Keypoints":
+        """The keypoints at `indices`."""
+        return Keypoints(*(values[indices] for values in self))
+
+
+class PerspectiveView(NamedTuple):
+    """A perspective view of a sphere's picture."""
+
+    R_sphere_from_view: NDArray[np.float64]  # (3, 3), +x the view's middle, +y left, +z up
+    columns: NDArray[np.float32]  # (s, s) of each pixel in the sphere's picture with its margin
+    rows: NDArray[np.float32]
+
+
+@lru_cache(maxsize=4)
+def perspective_views(width: int) -> list[PerspectiveView]:
+    """Views of a sphere's picture of `width`, of its resolution in their middles."""
+    reach = math.tan(math.radians(FIELD_DEG / 2.0))
+    side = round(2.0 * reach * width / (2.0 * math.pi))
+    across = reach * (1.0 - (2.0 * np.arange(side) + 1.0) / side)
+    left, up = np.meshgrid(across, across)
+    views = []
+    for azimuth, elevation in np.radians(VIEWS_DEG):
+        c, s, ce, se = math.cos(azimuth), math.sin(azimuth), math.cos(elevation), math.sin(elevation)
+        R = np.array([[c * ce, -s, -c * se], [s * ce, c, -s * se], [se, 0.0, ce]])
+        x, y, z = np.moveaxis(np.stack([np.ones_like(left), left, up], axis=-1) @ R.T, -1, 0)
+        u = (0.5 - np.arctan2(y, x) / (2.0 * np.pi)) * width
+        v = (0.5 - np.arctan2(z, np.hypot(x, y)) / np.pi) * width / 2.0
+        columns, rows = (np.asarray(a - 0.5 + MARGIN, np.float32) for a in (u, v))
+        views.append(PerspectiveView(R, columns, rows))
+    return views
+
+
+def find_keypoints(gray: NDArray[np.uint8], is_valid: NDArray[np.bool_]) -> Keypoints:
+    """The keypoints of an equirectangular picture (H, W), W = 2 H, where it is valid."""
+    sift = cv2.SIFT_create(contrastThreshold=CONTRAST)
+    views = perspective_views(gray.shape[1])
+    middles = np.stack([view.R_sphere_from_view[:, 0] for view in views])
+    picture, mask = _with_margin(gray), _with_margin(is_valid.view(np.uint8) * np.uint8(255))
+    found = []
+    for k, view in enumerate(views):
+        shown = cv2.remap(mask, view.columns, view.rows, cv2.INTER_NEAREST)
+        if not shown.any():
+            continue
+        shown = cv2.erode(shown, np.ones((3, 3), np.uint8))
+        image = cv2.remap(picture, view.columns, view.rows, cv2.INTER_LINEAR)
+        keypoints = _on_sphere(*sift.detectAndCompute(image, shown), view)
+        is_own = np.argmax(keypoints.rays @ middles.T, axis=1) == k  # what views share counts once
+        found.append(keypoints.take(np.flatnonzero(is_own)))
+    return Keypoints(*(np.concatenate(values) for values in zip(_nothing(), *found, strict=True)))
+
+
+def _with_margin(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The picture with its other end beyond the seam, and its first and last rows repeated."""
+    return np.pad(np.pad(image, ((0, 0), (MARGIN, MARGIN)), mode="wrap"), ((MARGIN, MARGIN), (0, 0)), "edge")
+
+
+def _nothing() -> Keypoints:
+    three = np.empty((0, 3), np.float32)
+    return Keypoints(three, three, np.empty(0, np.float32), np.empty((0, DESCRIPTOR_SIZE), np.uint8))
+
+
+def _on_sphere(
+    found: "tuple[cv2.KeyPoint, ...]", shares: NDArray[np.float32] | None, view: PerspectiveView
+) -> Keypoints:
+    """A view's keypoints as rays; descriptors (N, 128) of SIFT become square roots of their shares."""
+    if shares is None:
+        return _nothing()
+    side = len(view.rows)
+    per_px = 2.0 * math.tan(math.radians(FIELD_DEG / 2.0)) / side
+    points = np.array([(*k.pt, k.size, k.angle) for k in found])
+    angle = np.radians(points[:, 3])
+    left, up = (per_px * (0.5 * side - 0.5 - points[:, axis]) for axis in (0, 1))
+    rays = np.stack([np.ones_like(left), left, up], axis=1)
+    tangents = np.stack([np.zeros_like(left), -np.cos(angle), -np.sin(angle)], axis=1)
+    length = np.linalg.norm(rays, axis=1, keepdims=True)
+    rays /= length
+    tangents -= rays * np.sum(rays * tangents, axis=1, keepdims=True)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    sizes = points[:, 2] * per_px / length[:, 0] ** 1.5  # of the area that it covers
+    roots = np.sqrt(shares / np.maximum(shares.sum(axis=1, keepdims=True), 1.0))
+    return Keypoints(
+        np.asarray(rays @ view.R_sphere_from_view.T, np.float32),
+        np.asarray(tangents @ view.R_sphere_from_view.T, np.float32),
+        np.asarray(sizes, np.float32),
+        np.rint(roots * 255.0).astype(np.uint8),
+    )

@@ -1,0 +1,143 @@
+"""The scan as a grey picture from a position, to find keypoints in: surfaces closed, small gaps filled."""
+
+import math
+import threading
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cloud.octree import MAX_NODES, Octree, collect, level_of
+from ..geometry.pose import Array
+from ..geometry.sphere import direction_to_pixel
+from ..runtime.jit import F0, F1, HALF, kernel
+
+VOXEL_PER_RANGE = 1.0 / 120.0  # largest voxel by its distance
+REACH = np.float32(0.7)  # half width of what is drawn for a voxel, by the voxel's
+LEAST_REACH, MOST_REACH = np.float32(0.75), np.float32(12.0)  # [px]
+FRONT, FRONT_OFFSET = np.float32(1.05), np.float32(0.05)  # a pixel's grey is the mean up to this range, [m]
+BEHIND = np.float32(0.8)  # by its range: a pixel most of whose surroundings are nearer is seen through a gap
+WINDOW = 3  # [px] on each side of it
+FILL_LEVELS = 4  # gaps up to 16 px are filled
+LEAST_FILLED = 0.25  # of a wider pixel that fills finer ones
+NOTHING = np.float32(1e30)
+
+
+class ViewImage(NamedTuple):
+    """The scan seen from a position, equirectangular, in the map's axes."""
+
+    gray: NDArray[np.uint8]  # (H, W)
+    is_filled: NDArray[np.bool_]  # (H, W) where the grey means something
+    ranges: NDArray[np.float32]  # (H, W) [m], 0 where nothing is seen
+
+
+@kernel
+def draw_voxels(tree, center, found, directions, ranges, sums):
+    """Write the nearest range (H, W) and weighted sums (H, W, 2) of grey and of weights near that range."""
+    height, width = ranges.shape
+    count = collect(tree, center, VOXEL_PER_RANGE, found, directions)
+    ranges[:] = NOTHING
+    sums[:] = F0
+    W = np.float32(width)
+    px_per_rad = np.float32(width / (2.0 * math.pi))
+    for is_second in range(2):
+        for k in range(count):
+            x, y, z = directions[0, k], directions[1, k], directions[2, k]
+            rho = math.sqrt(x * x + y * y)
+            r = math.sqrt(x * x + y * y + z * z)
+            node = tree.nodes[found[k]]
+            size = np.float32(tree.leaf_size * 2.0 ** (len(tree.level_start) - 2 - level_of(tree, found[k])))
+            reach = REACH * size / max(r, np.float32(0.05)) * px_per_rad
+            reach = min(max(reach, LEAST_REACH), MOST_REACH)
+            across = min(reach * r / max(rho, np.float32(1e-3)), np.float32(0.25) * W)
+            u, v = direction_to_pixel(x, y, z, rho, W)
+            gray = np.float32(0.299) * node[3] + np.float32(0.587) * node[4] + np.float32(0.114) * node[5]
+            top, bottom = np.int32(math.ceil(v - reach - HALF)), np.int32(math.floor(v + reach - HALF))
+            left, right = np.int32(math.ceil(u - across - HALF)), np.int32(math.floor(u + across - HALF))
+            for i in range(max(top, 0), min(bottom, height - 1) + 1):
+                dv = (np.float32(i) + HALF - v) / reach
+                for at in range(left, right + 1):
+                    j = at + width if at < 0 else at
+                    j = j - width if j >= width else j
+                    if is_second == 0:
+                        ranges[i, j] = min(ranges[i, j], r)
+                    elif r <= ranges[i, j] * FRONT + FRONT_OFFSET:
+                        du = (np.float32(at) + HALF - u) / across
+                        weight = max(F1 - HALF * (du * du + dv * dv), np.float32(0.02))
+                        weight = weight * weight * weight
+                        sums[i, j, 0] += weight * gray
+                        sums[i, j, 1] += weight
+
+
+@kernel
+def drop_hidden(ranges, sums, gray, weight):
+    """Write grey and weight 1 of the pixels that are seen, 0 of those seen through gaps of what is nearer."""
+    height, width = ranges.shape
+    for i in range(height):
+        for j in range(width):
+            gray[i, j] = weight[i, j] = F0
+            if sums[i, j, 1] <= F0:
+                continue
+            num_nearer = num_around = 0
+            for row in range(max(i - WINDOW, 0), min(i + WINDOW, height - 1) + 1):
+                for at in range(j - WINDOW, j + WINDOW + 1):
+                    r = ranges[row, at % width]
+                    num_around += r < NOTHING
+                    num_nearer += r < ranges[i, j] * BEHIND
+            if 2 * num_nearer <= num_around:
+                gray[i, j], weight[i, j] = sums[i, j, 0] / sums[i, j, 1], F1
+
+
+def fill_gaps(
+    gray: NDArray[np.float32], weight: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Grey (H, W) whose gaps take the colour around them, and where it means something.
+
+    Pull and push over a pyramid of means (Gortler et al., "The Lumigraph", SIGGRAPH 1996, section 3.4.2).
+    """
+    pyramid = [(gray, weight)]
+    for _ in range(FILL_LEVELS):
+        size = pyramid[-1][0].shape[1] // 2, pyramid[-1][0].shape[0] // 2
+        pyramid.append(tuple(cv2.resize(a, size, interpolation=cv2.INTER_AREA) for a in pyramid[-1]))
+    total, known = pyramid.pop()
+    filled, counts = total / np.maximum(known, 1e-6), np.float32(known > LEAST_FILLED)
+    for total, known in reversed(pyramid):
+        size = total.shape[1], total.shape[0]
+        wider = cv2.resize(filled * counts, size, interpolation=cv2.INTER_LINEAR)
+        counts = known + (1.0 - known) * cv2.resize(counts, size, interpolation=cv2.INTER_LINEAR)
+        filled = (total + (1.0 - known) * wider) / np.maximum(counts, 1e-6)
+        counts = np.float32(counts > LEAST_FILLED)
+    return filled, counts > 0.0
+
+
+class _Scratch(NamedTuple):
+    """Arrays that one thread needs."""
+
+    nodes: NDArray[np.int32]
+    directions: NDArray[np.float32]  # (3, N)
+    sums: NDArray[np.float32]  # (H, W, 2)
+
+
+_local = threading.local()
+
+
+def _thread_scratch(width: int) -> _Scratch:
+    """The calling thread's own arrays, for views of one width."""
+    if not hasattr(_local, "scratch") or _local.scratch.sums.shape[1] != width:
+        sums = np.empty((width // 2, width, 2), np.float32)
+        _local.scratch = _Scratch(np.empty(MAX_NODES, np.int32), np.empty((3, MAX_NODES), np.float32), sums)
+    scratch: _Scratch = _local.scratch
+    return scratch
+
+
+def render_gray(octree: Octree, center_map: Array, width: int) -> ViewImage:
+    """What is seen around a centre (3,) [m], `width` x width / 2 pixels."""
+    nodes, directions, sums = _thread_scratch(width)
+    ranges = np.empty((width // 2, width), np.float32)
+    draw_voxels(octree, np.asarray(center_map, np.float64), nodes, directions, ranges, sums)
+    gray, weight = np.empty_like(ranges), np.empty_like(ranges)
+    drop_hidden(ranges, sums, gray, weight)
+    filled, is_filled = fill_gaps(gray, weight)
+    levels = np.rint(np.clip(filled, 0.0, 1.0) * np.float32(255.0)).astype(np.uint8)
+    return ViewImage(levels, is_filled, ranges * weight)
