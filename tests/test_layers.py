@@ -24,6 +24,7 @@ LAYERS = [
     "result",
     "coarse_to_fine",
     "paper",
+    "local_features",
     "optimize",
     "gravity",
     "confidence",

@@ -1,0 +1,1 @@
+"""Poses of a camera from single matches: rays of the photo and points of the scan."""
