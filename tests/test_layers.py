@@ -25,6 +25,7 @@ LAYERS = [
     "coarse_to_fine",
     "local_features",
     "paper",
+    "local_features",
     "optimize",
     "gravity",
     "confidence",
