@@ -20,12 +20,14 @@ from numpy.typing import NDArray
 from ..cloud.octree import Octree
 from ..cloud.readers.npz import damage_named
 from ..errors import InputError
+from ..local_features.feature_map import FeatureMap
 from ..runtime.atomic import replacing
 from .map_validation import LAYOUT, check_arrays, clean_warnings
 from .scan_map import ScanMap
 
-FORMAT = "piccolo-map/3"
-ARRAYS = [f.name for f in fields(ScanMap) if f.name not in ("octree", "warnings", "crs", "is_partial")]
+FORMAT = "piccolo-map/4"
+OTHERS = ("octree", "local_features", "warnings", "crs", "is_partial")
+ARRAYS = [f.name for f in fields(ScanMap) if f.name not in OTHERS]
 MEMBERS = {*LAYOUT, "format", "warnings"}
 WANTED = "wanted a whole map by tools/prepare_map.py"
 ZIP_MAGIC = b"PK\x03\x04"
@@ -37,7 +39,8 @@ FIRST_VALUE, FIRST_VALUE_WITHIN = FORMAT.partition("/")[0].encode("utf-32-le"), 
 def save_map(scan_map: ScanMap, path: Path) -> None:
     """Write a map to `path`, whole or not at all."""
     members = {name: getattr(scan_map, name) for name in ARRAYS}
-    members.update({f"octree_{name}": value for name, value in scan_map.octree._asdict().items()})
+    for label, part in (("octree", scan_map.octree), ("local", scan_map.local_features)):
+        members.update({f"{label}_{name}": value for name, value in part._asdict().items()})
     with replacing(path) as file:
         np.savez(
             file,
@@ -83,6 +86,7 @@ def load_map(path: Path) -> ScanMap:
             level_start=arrays["octree_level_start"],
             leaf_size=float(arrays["octree_leaf_size"]),
         ),
+        local_features=FeatureMap(*(arrays[f"local_{name}"] for name in FeatureMap._fields)),
         has_labels=bool(arrays["has_labels"]),
         warnings=warnings,
         scan_sha256=str(arrays["scan_sha256"]),

@@ -16,7 +16,9 @@ from ..cloud.voxels import NUM_LEVELS, PHASE, QUANTUM_BITS, WINDOW
 from ..errors import InputError
 from ..geometry.pose import Array, checked_rotation
 from ..geometry.sphere import make_grid
-from ..runtime.jit import F0, inline_kernel, kernel
+from ..local_features.feature_map import MAX_LISTS, MAX_RANGE, NUM_COMPONENTS
+from ..local_features.keypoints import DESCRIPTOR_SIZE
+from ..runtime.jit import F0, F1, inline_kernel, kernel
 from .scan_map import SEARCH_VIEW, WIDE_RINGS, sparse_candidates
 
 Arrays = dict[str, NDArray[Any]]
@@ -37,6 +39,15 @@ LAYOUT: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "sparse": ("<i8", ("sparse",)),
     "wide_features": ("|i1", ("sparse", 3 * WIDE_CELLS)),
     "wide_seen": ("|u1", ("sparse", WIDE_CELLS)),
+    "local_points": ("<f4", ("local", 3)),
+    "local_directions": ("|i1", ("local", 3)),
+    "local_tangents": ("|i1", ("local", 3)),
+    "local_sizes": ("<f4", ("local",)),
+    "local_descriptors": ("|i1", ("local", NUM_COMPONENTS)),
+    "local_mean": ("<i2", (DESCRIPTOR_SIZE,)),
+    "local_components": ("|i1", (DESCRIPTOR_SIZE, NUM_COMPONENTS)),
+    "local_middles": ("|i1", ("lists", NUM_COMPONENTS)),
+    "local_list_start": ("<i4", ("list_starts",)),
     "has_labels": ("|b1", ()),
     "scan_sha256": ("<U64", ()),
     "crs": ("|u1", ("characters",)),  # UTF-8
@@ -96,6 +107,7 @@ def check_arrays(path: Path, arrays: Arrays) -> None:
     _check_frame(path, arrays)
     _check_octree(path, arrays)
     _check_views(path, arrays)
+    _check_features(path, arrays)
     if not SHA256.fullmatch(str(arrays["scan_sha256"])):
         _refuse(path, "a scan_sha256 that is no digest")
     text = arrays["crs"].tobytes()
@@ -152,6 +164,29 @@ def _check_views(path: Path, arrays: Arrays) -> None:
             _refuse(path, f"{name} below -127")
     if not np.array_equal(arrays["sparse"], sparse_candidates(centers)):
         _refuse(path, "sparse candidates that are not those of the coarse grid")
+
+
+def _check_features(path: Path, arrays: Arrays) -> None:
+    """Features lie where the scan is, and the lists hold each of them once."""
+    points, sizes, start = arrays["local_points"], arrays["local_sizes"], arrays["local_list_start"]
+    reach = WINDOW * float(arrays["octree_leaf_size"]) + 2.0 * MARGIN + MAX_RANGE
+    if not np.abs(points).max(initial=F0) <= reach:
+        _refuse(path, "a feature at no finite place or too far away")
+    if not (sizes.min(initial=F1) > F0 and sizes.max(initial=F0) <= MAX_RANGE):
+        _refuse(path, f"features of {sizes.min()} to {sizes.max()} m")
+    for name in (
+        "local_directions",
+        "local_tangents",
+        "local_descriptors",
+        "local_components",
+        "local_middles",
+    ):
+        if arrays[name].min(initial=0) < -127:
+            _refuse(path, f"{name} below -127")
+    if not 1 <= len(arrays["local_middles"]) == len(start) - 1 <= MAX_LISTS:
+        _refuse(path, f"{len(arrays['local_middles'])} lists of features with {len(start)} beginnings")
+    if start[0] != 0 or start[-1] != len(points) or (np.diff(start) < 0).any():
+        _refuse(path, "lists of features that do not follow each other")
 
 
 def clean_warnings(path: Path, warnings: NDArray[Any]) -> tuple[str, ...]:

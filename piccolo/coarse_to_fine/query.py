@@ -1,19 +1,26 @@
 """A query: a panorama at several scales, and the map in which it is searched."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from ..geometry.pose import Array
+from ..local_features.keypoints import find_keypoints
+from ..local_features.matching import Matches, match
 from ..panorama import Panorama
 from ..panorama.gpano import rotation_to_level
 from ..panorama.local_normalization import image_pyramid
-from ..panorama.texels import Texels
+from ..panorama.model import resize
+from ..panorama.texels import Texels, pack_texels
 from ..runtime.threads import Workers
 from .config import METHOD, MethodConfig
 from .scan_map import ScanMap
 from .settings import CoarseToFineSettings
+
+COMPARED_WIDTH = 256  # [px]
 
 
 class QueryImages(NamedTuple):
@@ -35,6 +42,20 @@ class Query:
     settings: CoarseToFineSettings
     workers: Workers
     method: MethodConfig
+    panorama: Panorama  # at the width of its features
+
+    @cached_property
+    def matches(self) -> Matches:
+        """The photo's keypoints and the features of the map that look alike."""
+        gray = cv2.cvtColor(self.panorama.rgb, cv2.COLOR_RGB2GRAY)
+        keypoints = find_keypoints(gray, self.panorama.is_valid, self.workers)
+        return match(keypoints, self.scan_map.local_features, self.workers)
+
+    @cached_property
+    def photo(self) -> Texels:
+        """The photo's colours at the size at which poses are compared."""
+        small = resize(self.panorama, COMPARED_WIDTH)
+        return pack_texels(small.rgb, small.is_valid)
 
 
 def prepare_query(
@@ -47,5 +68,6 @@ def prepare_query(
     """The query of a panorama among a map's candidates; its metadata say how the camera was tilted."""
     R_level_from_cam = rotation_to_level(panorama.gpano) if panorama.gpano else None
     R_cam_from_level = np.eye(3) if R_level_from_cam is None else R_level_from_cam.T
+    panorama = resize(panorama, method.scales.full.width)
     images = QueryImages(*image_pyramid(panorama, method.scales))
-    return Query(scan_map, images, R_cam_from_level, settings, workers, method)
+    return Query(scan_map, images, R_cam_from_level, settings, workers, method, panorama)

@@ -14,6 +14,8 @@ from ..cloud.voxels import Voxels
 from ..geometry.pose import Array, Pose
 from ..geometry.sphere import SEARCH_RINGS, averaging, make_grid
 from ..gravity import MIN_CONFIDENCE, R_z_from_axis, estimate_normals, find_up, rotation_to_z_up
+from ..local_features.feature_map import FeatureMap, make_feature_map
+from ..local_features.view_positions import view_positions
 from ..runtime.memory import check_memory
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
@@ -42,6 +44,7 @@ class ScanMap:
     sparse: NDArray[np.int64]  # candidates of which no two share a cell of the coarse grid
     wide_features: NDArray[np.int8]  # (sparse, 3 * wide cells) means over wider cells, for SO(3)
     wide_seen: NDArray[np.uint8]  # (sparse, wide cells) fraction seen of each, 255 for all
+    local_features: FeatureMap
     has_labels: bool = False  # colours are those of labels
     warnings: tuple[str, ...] = ()
     scan_sha256: str = ""  # of the files or arrays that it was made from, in hexadecimal digits
@@ -204,6 +207,9 @@ def prepare_map(
         offsets, unit, levels, is_seen = render_candidates(octree, centers, view, workers)
         sparse = sparse_candidates(centers)
         wide_features, wide_seen = widen(levels, is_seen, sparse)
+        ranges = np.linalg.norm(offsets.astype(np.float32), axis=1) * unit[:, None] * is_seen
+        chosen = view_positions(centers, ranges, view.num_rings)
+        local_features = make_feature_map(octree, centers[chosen], workers)
     return ScanMap(
         octree=octree,
         R_map_from_world=aligned.R_map_from_world,
@@ -216,6 +222,7 @@ def prepare_map(
         sparse=sparse,
         wide_features=wide_features,
         wide_seen=wide_seen,
+        local_features=local_features,
         warnings=aligned.warnings + notes,
         is_partial=bool(notes),
     )

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ..cloud.octree import Octree
 from ..runtime.jit import kernel
 from ..runtime.threads import Workers
-from .keypoints import find_keypoints
+from .keypoints import DESCRIPTOR_SIZE, find_keypoints
 from .view_image import render_gray
 
 VIEW_WIDTH = 640  # [px] of the views
@@ -19,6 +19,7 @@ SAMPLE = 20_000  # descriptors from which the components and the lists' middles 
 LIST_SIZE = 128  # features of a list, on average
 MAX_LISTS = 4096
 KMEANS_ROUNDS = 5
+BLOCK = 4096  # descriptors a thread sorts into lists at a time
 
 
 class FeatureMap(NamedTuple):
@@ -35,7 +36,7 @@ class FeatureMap(NamedTuple):
     list_start: NDArray[np.int32]  # (L + 1,) where each begins
 
 
-class _View(NamedTuple):
+class FeaturesOfView(NamedTuple):
     """The features of one view."""
 
     points: NDArray[np.float32]
@@ -45,18 +46,27 @@ class _View(NamedTuple):
     descriptors: NDArray[np.uint8]
 
 
-def features_of_view(octree: Octree, center_map: NDArray[np.float64], width: int = VIEW_WIDTH) -> _View:
+NO_FEATURES = FeaturesOfView(
+    np.empty((0, 3), np.float32),
+    np.empty((0, 3), np.int8),
+    np.empty((0, 3), np.int8),
+    np.empty(0, np.float32),
+    np.empty((0, DESCRIPTOR_SIZE), np.uint8),
+)
+
+
+def features_of_view(
+    octree: Octree, center_map: NDArray[np.float64], width: int = VIEW_WIDTH
+) -> FeaturesOfView:
     """The features seen from a centre (3,) [m] that have a point of the scan."""
     image = render_gray(octree, center_map, width)
     found = find_keypoints(image.gray, image.is_filled)
     u = (0.5 - np.arctan2(found.rays[:, 1], found.rays[:, 0]) / (2.0 * math.pi)) * width
     v = (0.5 - np.arcsin(np.clip(found.rays[:, 2], -1.0, 1.0)) / math.pi) * width / 2.0
     ranges = image.ranges[np.minimum(v.astype(int), width // 2 - 1), u.astype(int) % width]
-    found, ranges = (
-        found.take(np.flatnonzero((ranges > 0.0) & (ranges < MAX_RANGE))),
-        ranges[(ranges > 0.0) & (ranges < MAX_RANGE)],
-    )
-    return _View(
+    kept = np.flatnonzero((ranges > 0.0) & (ranges < MAX_RANGE))
+    found, ranges = found.take(kept), ranges[kept]
+    return FeaturesOfView(
         np.asarray(center_map + found.rays * ranges[:, None], np.float32),
         np.rint(found.rays * 127.0).astype(np.int8),
         np.rint(found.tangents * 127.0).astype(np.int8),
@@ -70,7 +80,7 @@ def principal_components(
 ) -> tuple[NDArray[np.int16], NDArray[np.int8]]:
     """Mean (128,) and the strongest components (128, NUM_COMPONENTS) of descriptors (N, 128), whole numbers."""
     values = descriptors.astype(np.float64)
-    mean = np.rint(values.mean(axis=0))
+    mean = np.rint(values.sum(axis=0) / max(len(values), 1))
     values -= mean
     axes = np.linalg.eigh(values.T @ values)[1][:, : -NUM_COMPONENTS - 1 : -1]
     axes *= np.sign(axes[np.abs(axes).argmax(axis=0), np.arange(NUM_COMPONENTS)])
@@ -104,6 +114,8 @@ def nearest_middle(descriptors, middles, nearest):
 def list_middles(descriptors: NDArray[np.int8], num_lists: int) -> NDArray[np.int8]:
     """Middles (num_lists, D) of clusters of descriptors (N, D), by Lloyd's k-means from an even sample."""
     sample = descriptors[:: 1 + len(descriptors) // SAMPLE]
+    if len(sample) == 0:
+        return np.zeros((num_lists, NUM_COMPONENTS), np.int8)
     middles = sample[np.linspace(0, len(sample) - 1, num_lists).astype(int)].copy()
     nearest = np.empty(len(sample), np.int32)
     for _ in range(KMEANS_ROUNDS):
@@ -118,14 +130,20 @@ def list_middles(descriptors: NDArray[np.int8], num_lists: int) -> NDArray[np.in
 def make_feature_map(octree: Octree, centers: NDArray[np.float64], workers: Workers) -> FeatureMap:
     """The features of the views from some centres (N, 3) [m]."""
     views = list(workers.map(lambda c: features_of_view(octree, c), list(centers), "find features"))
-    merged = _View(*(np.concatenate(values) for values in zip(*views, strict=True)))
-    mean, components = principal_components(merged.descriptors[:: 1 + len(merged.points) // SAMPLE])
-    descriptors = project(merged.descriptors, mean, components)
-    num_lists = int(np.clip(len(descriptors) // LIST_SIZE, 1, MAX_LISTS))
-    middles = list_middles(descriptors, num_lists)
+    found = FeaturesOfView(*(np.concatenate(values) for values in zip(NO_FEATURES, *views, strict=True)))
+    sample = found.descriptors[:: 1 + len(found.points) // SAMPLE]
+    mean, components = principal_components(sample)
+    descriptors = project(found.descriptors, mean, components)
+    middles = list_middles(descriptors, int(np.clip(len(descriptors) // LIST_SIZE, 1, MAX_LISTS)))
     nearest = np.empty(len(descriptors), np.int32)
-    nearest_middle(descriptors, middles, nearest)
+
+    def assign(lo: int) -> None:
+        nearest_middle(descriptors[lo : lo + BLOCK], middles, nearest[lo : lo + BLOCK])
+
+    list(workers.map(assign, range(0, len(descriptors), BLOCK), "sort features"))
     order = np.argsort(nearest, kind="stable")
-    start = np.searchsorted(nearest[order], np.arange(num_lists + 1)).astype(np.int32)
-    points, directions, tangents, sizes, _ = (values[order] for values in merged)
-    return FeatureMap(points, directions, tangents, sizes, descriptors[order], mean, components, middles, start)
+    start = np.searchsorted(nearest[order], np.arange(len(middles) + 1)).astype(np.int32)
+    points, directions, tangents, sizes, _ = (values[order] for values in found)
+    return FeatureMap(
+        points, directions, tangents, sizes, descriptors[order], mean, components, middles, start
+    )

@@ -196,7 +196,10 @@ def poses_of(
         rough = Pose(rotations[k], centers[k])
         members = members_of(matches, rough, COS_ROUGH)
         R, t = np.empty((3, 3)), np.empty(3)
-        if len(members) < LEAST_MATCHES or sample_poses(matches, members, up_cam, cos_tilt, R, t) < LEAST_MATCHES:
+        if (
+            len(members) < LEAST_MATCHES
+            or sample_poses(matches, members, up_cam, cos_tilt, R, t) < LEAST_MATCHES
+        ):
             return None
         for _ in range(2):
             members = members_of(matches, Pose(R, t), COS_EXACT)

@@ -8,10 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..runtime.threads import Workers
+
 FIELD_DEG = 65.0  # of a view, across
 CONTRAST = 0.02  # least of a keypoint, as OpenCV counts it
 MARGIN = 8  # [px] of the sphere's picture around it, so that views may cross the seam
 DESCRIPTOR_SIZE = 128
+ALONE = Workers()
 # azimuth and elevation of the views' middles [deg]; at the poles pictures show floor and ceiling, or nothing
 VIEWS_DEG = [(45.0 * k, 0.0) for k in range(8)]
 VIEWS_DEG += [(60.0 * k + 30.0, elevation) for elevation in (45.0, -45.0) for k in range(6)]
@@ -57,23 +60,28 @@ def perspective_views(width: int) -> list[PerspectiveView]:
     return views
 
 
-def find_keypoints(gray: NDArray[np.uint8], is_valid: NDArray[np.bool_]) -> Keypoints:
+def find_keypoints(
+    gray: NDArray[np.uint8], is_valid: NDArray[np.bool_], workers: Workers = ALONE
+) -> Keypoints:
     """The keypoints of an equirectangular picture (H, W), W = 2 H, where it is valid."""
-    sift = cv2.SIFT_create(contrastThreshold=CONTRAST)
     views = perspective_views(gray.shape[1])
     middles = np.stack([view.R_sphere_from_view[:, 0] for view in views])
     picture, mask = _with_margin(gray), _with_margin(is_valid.view(np.uint8) * np.uint8(255))
-    found = []
-    for k, view in enumerate(views):
+
+    def find(k: int) -> Keypoints:
+        view = views[k]
         shown = cv2.remap(mask, view.columns, view.rows, cv2.INTER_NEAREST)
         if not shown.any():
-            continue
+            return _nothing()
         shown = cv2.erode(shown, np.ones((3, 3), np.uint8))
         image = cv2.remap(picture, view.columns, view.rows, cv2.INTER_LINEAR)
+        sift = cv2.SIFT_create(contrastThreshold=CONTRAST)
         keypoints = _on_sphere(*sift.detectAndCompute(image, shown), view)
         is_own = np.argmax(keypoints.rays @ middles.T, axis=1) == k  # what views share counts once
-        found.append(keypoints.take(np.flatnonzero(is_own)))
-    return Keypoints(*(np.concatenate(values) for values in zip(_nothing(), *found, strict=True)))
+        return keypoints.take(np.flatnonzero(is_own))
+
+    found = workers.map(find, range(len(views)), "find keypoints")
+    return Keypoints(*(np.concatenate(values) for values in zip(*found, strict=True)))
 
 
 def _with_margin(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

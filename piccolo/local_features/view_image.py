@@ -13,12 +13,12 @@ from ..geometry.pose import Array
 from ..geometry.sphere import direction_to_pixel
 from ..runtime.jit import F0, F1, HALF, kernel
 
-VOXEL_PER_RANGE = 1.0 / 120.0  # largest voxel by its distance
+VOXEL_PER_RANGE = 1.0 / 80.0  # largest voxel by its distance
 REACH = np.float32(0.7)  # half width of what is drawn for a voxel, by the voxel's
 LEAST_REACH, MOST_REACH = np.float32(0.75), np.float32(12.0)  # [px]
 FRONT, FRONT_OFFSET = np.float32(1.05), np.float32(0.05)  # a pixel's grey is the mean up to this range, [m]
-BEHIND = np.float32(0.8)  # by its range: a pixel most of whose surroundings are nearer is seen through a gap
-WINDOW = 3  # [px] on each side of it
+BEHIND = np.float32(1.2)  # by its range: a pixel all of whose surroundings are that much nearer is hidden
+WIDER = 4  # [px] of a wider pixel
 FILL_LEVELS = 4  # gaps up to 16 px are filled
 LEAST_FILLED = 0.25  # of a wider pixel that fills finer ones
 NOTHING = np.float32(1e30)
@@ -70,23 +70,18 @@ def draw_voxels(tree, center, found, directions, ranges, sums):
                         sums[i, j, 1] += weight
 
 
-@kernel
-def drop_hidden(ranges, sums, gray, weight):
-    """Write grey and weight 1 of the pixels that are seen, 0 of those seen through gaps of what is nearer."""
+def is_in_front(ranges: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Where (H, W) of nearest ranges, NOTHING where there is none, a pixel is no gap in what is nearer.
+
+    A pixel is seen through a gap if in all wider pixels around it there is something much nearer.
+    """
     height, width = ranges.shape
-    for i in range(height):
-        for j in range(width):
-            gray[i, j] = weight[i, j] = F0
-            if sums[i, j, 1] <= F0:
-                continue
-            num_nearer = num_around = 0
-            for row in range(max(i - WINDOW, 0), min(i + WINDOW, height - 1) + 1):
-                for at in range(j - WINDOW, j + WINDOW + 1):
-                    r = ranges[row, at % width]
-                    num_around += r < NOTHING
-                    num_nearer += r < ranges[i, j] * BEHIND
-            if 2 * num_nearer <= num_around:
-                gray[i, j], weight[i, j] = sums[i, j, 0] / sums[i, j, 1], F1
+    rows, columns = height // WIDER, width // WIDER
+    nearest = ranges.reshape(rows, WIDER, columns, WIDER).min(axis=(1, 3))
+    around = np.pad(np.pad(nearest, ((0, 0), (1, 1)), mode="wrap"), ((1, 1), (0, 0)), mode="edge")
+    farthest = cv2.dilate(around, np.ones((3, 3), np.uint8))[1:-1, 1:-1]
+    limit = np.repeat(np.repeat(farthest, WIDER, axis=0), WIDER, axis=1)
+    return np.asarray((ranges < NOTHING) & (ranges <= limit * BEHIND))
 
 
 def fill_gaps(
@@ -136,8 +131,8 @@ def render_gray(octree: Octree, center_map: Array, width: int) -> ViewImage:
     nodes, directions, sums = _thread_scratch(width)
     ranges = np.empty((width // 2, width), np.float32)
     draw_voxels(octree, np.asarray(center_map, np.float64), nodes, directions, ranges, sums)
-    gray, weight = np.empty_like(ranges), np.empty_like(ranges)
-    drop_hidden(ranges, sums, gray, weight)
+    weight = is_in_front(ranges).astype(np.float32)
+    gray = weight * sums[..., 0] / np.maximum(sums[..., 1], np.float32(1e-6))
     filled, is_filled = fill_gaps(gray, weight)
     levels = np.rint(np.clip(filled, 0.0, 1.0) * np.float32(255.0)).astype(np.uint8)
     return ViewImage(levels, is_filled, ranges * weight)

@@ -1,0 +1,136 @@
+"""The scan at a pose and the photo compared block by block of the sphere, over what both show.
+
+An occluder costs what it hides and no more: a right pose explains some blocks well and the rest not at all, a
+wrong one explains all of them a little.
+"""
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.pose import Pose
+from ..geometry.sphere import cell_of, make_grid
+from ..panorama.local_normalization import opponent, zscore
+from ..panorama.texels import bilinear_weights, blend, is_valid, texel_at
+from ..runtime.jit import F0, kernel
+from .cells import local_statistics
+from .query import Query
+from .view import render_cells, thread_scratch
+
+BLOCK_RINGS = 6  # blocks of 30 degrees
+CHANCE = 0.35  # a block's correlation that wrong poses reach
+CONTRADICTS = 0.1  # a block of less is left out of the local means and deviations
+PER_LEVEL = np.float32(1.0 / 255.0)
+
+
+class Comparison(NamedTuple):
+    """What speaks for a pose, block by block."""
+
+    correlation: NDArray[np.float64]  # (blocks,) of locally normalised colours, 0 where nothing is shared
+    area: NDArray[np.float64]  # (blocks,) fractions of the sphere that both show
+    valid_area: float  # of the sphere that the photo shows
+
+    @property
+    def score(self) -> float:
+        """What blocks explain beyond chance, by what the photo shows, in [0, 1]."""
+        beyond = np.maximum(self.correlation - CHANCE, 0.0) / (1.0 - CHANCE)
+        return float(beyond @ self.area) / max(self.valid_area, 1e-9)
+
+
+@kernel
+def sample_photo(offsets, weights, texels, width, R_cam_from_map, colors, shared):
+    """Write the photo's opponent channels (3, N) where cells (3, N) are seen, and the weights that are shared."""
+    R, stride = R_cam_from_map, np.int32(width + 2)
+    for n in range(len(weights)):
+        dx, dy, dz = offsets[0, n], offsets[1, n], offsets[2, n]
+        x = np.float32(R[0, 0] * dx + R[0, 1] * dy + R[0, 2] * dz)
+        y = np.float32(R[1, 0] * dx + R[1, 1] * dy + R[1, 2] * dz)
+        z = np.float32(R[2, 0] * dx + R[2, 1] * dy + R[2, 2] * dz)
+        k, fu, fv = texel_at(x, y, z, math.sqrt(x * x + y * y), width)
+        bilinear = bilinear_weights(fu, fv)
+        t00, t10, t01, t11 = texels[k], texels[k + 1], texels[k + stride], texels[k + stride + 1]
+        shared[n] = weights[n] * is_valid(t00, t10, t01, t11)
+        r, g, b = (
+            blend(t00, t10, t01, t11, bilinear, 0) * PER_LEVEL,
+            blend(t00, t10, t01, t11, bilinear, 8) * PER_LEVEL,
+            blend(t00, t10, t01, t11, bilinear, 16) * PER_LEVEL,
+        )
+        colors[0, n], colors[1, n], colors[2, n] = opponent(r, g, b)
+
+
+@kernel
+def normalize(colors, shared, view, normalized):
+    """Write channels (3, N) less their local mean, by their local deviation, over the shared cells."""
+    moments, stats = np.zeros((view.num_stats, 8), np.float32), np.empty((6, len(shared)), np.float32)
+    for n in range(len(shared)):
+        m, w = moments[view.stats_cell[n]], shared[n]
+        m[0] += w
+        for k in range(3):
+            m[1 + k] += w * colors[k, n]
+            m[4 + k] += w * colors[k, n] * colors[k, n]
+    local_statistics(moments, view, shared, stats)
+    for k in range(3):
+        for n in range(len(shared)):
+            normalized[k, n] = zscore(colors[k, n], stats[k, n], stats[3 + k, n]) if shared[n] > F0 else F0
+
+
+@kernel
+def correlate_blocks(first, second, shared, blocks, correlation, area):
+    """Write the correlation and the area (blocks,) of two sets of channels (3, N) over the shared cells."""
+    energy = np.zeros((len(area), 2))
+    correlation[:] = 0.0
+    area[:] = 0.0
+    for n in range(len(shared)):
+        b, w = blocks[n], shared[n]
+        area[b] += w
+        for k in range(3):
+            correlation[b] += w * first[k, n] * second[k, n]
+            energy[b, 0] += w * first[k, n] * first[k, n]
+            energy[b, 1] += w * second[k, n] * second[k, n]
+    for b in range(len(area)):
+        correlation[b] /= math.sqrt(max(energy[b, 0] * energy[b, 1], 1e-12))
+
+
+@kernel
+def compare_cells(offsets, colors, weights, photo, R_cam_from_map, view, blocks, correlation, area):
+    """Write the correlation and the shared area (blocks,) of cells (3, N) around a camera with its photo.
+
+    Blocks that contradict are then left out of the local means and deviations, and all is taken anew.
+    """
+    texels, width = photo
+    of_photo, shared = np.empty_like(colors), np.empty_like(weights)
+    sample_photo(offsets, weights, texels, width, R_cam_from_map, of_photo, shared)
+    first, second, kept = np.empty_like(colors), np.empty_like(colors), shared.copy()
+    for k in range(2):
+        normalize(colors, kept, view, first)
+        normalize(of_photo, kept, view, second)
+        correlate_blocks(first, second, kept, blocks, correlation, area)
+        if k == 0:
+            for n in range(len(kept)):
+                if correlation[blocks[n]] < CONTRADICTS:
+                    kept[n] = F0
+
+
+def compare(query: Query, pose: Pose) -> Comparison:
+    """The scan as seen from a pose and the photo, by blocks."""
+    config, photo = query.method.fine_view, query.photo
+    n = len(make_grid(config.num_rings))
+    offsets, colors = np.empty((3, n), np.float32), np.empty((3, n), np.float32)
+    weights, sums, stats = np.empty(n, np.float32), np.empty((n, 8), np.float32), np.empty((6, n), np.float32)
+    how = config.voxel_per_range, config.arrays, thread_scratch()
+    render_cells(query.scan_map.octree, pose.center_world, *how, offsets, colors, weights, sums, stats)
+    blocks = blocks_of(config.num_rings)
+    correlation, area = np.empty(len(make_grid(BLOCK_RINGS))), np.empty(len(make_grid(BLOCK_RINGS)))
+    texels = photo.rgbx, photo.width
+    args = texels, pose.R_cam_from_world, config.arrays, blocks, correlation, area
+    compare_cells(offsets, colors, weights, *args)
+    return Comparison(correlation, area, photo.valid_share)
+
+
+@lru_cache(maxsize=4)
+def blocks_of(num_rings: int) -> NDArray[np.int32]:
+    """The block (N,) in which each cell of a grid lies."""
+    return cell_of(make_grid(num_rings).directions, BLOCK_RINGS)

@@ -1,0 +1,76 @@
+"""From where the scan's features are taken: few positions that see all that a camera can see."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.pose import Array
+from ..geometry.sphere import cell_of
+from ..runtime.jit import kernel
+
+SPACING, LAYER = (
+    2.5,
+    2.4,
+)  # [m] across and in height: what is nearer to a position and seen from it needs none
+ABOVE_LOWEST, HEIGHT_STEP = (
+    1.0,
+    0.3,
+)  # [m] taken first are positions so high above the lowest around, by steps
+CELL = np.array([2.5, 2.5, 3.0])  # [m] around: a part of a storey
+TABLE_HEIGHT = 48  # directions, by 3.75 degrees
+SLACK = 1.0  # [m] a wall is so much nearer than what is behind it
+
+
+@kernel
+def choose(order, centers, ranges, cells, kept):
+    """Write the indices of the positions kept, in order: each that is near none kept or seen from none of them.
+
+    Ranges (N, cells) [m] are those of the view from each centre (N, 3), 0 where nothing is seen; `cells` is a
+    table (h, 2 h) of the cell in each direction.
+    """
+    height, width = cells.shape
+    count = 0
+    for i in order:
+        is_covered = False
+        for k in range(count):
+            j = kept[k]
+            dx, dy = centers[i, 0] - centers[j, 0], centers[i, 1] - centers[j, 1]
+            dz = centers[i, 2] - centers[j, 2]
+            across = dx * dx + dy * dy
+            if across >= SPACING * SPACING or abs(dz) >= LAYER:
+                continue
+            row = min(int((0.5 - np.arctan2(dz, np.sqrt(across)) / np.pi) * height), height - 1)
+            column = min(int((0.5 + np.arctan2(dy, dx) / (2.0 * np.pi)) * width), width - 1)
+            limit = ranges[j, cells[row, column]]
+            if limit == 0.0 or np.sqrt(across + dz * dz) < limit + SLACK:
+                is_covered = True
+                break
+        if not is_covered:
+            kept[count] = i
+            count += 1
+    return count
+
+
+def cell_table(num_rings: int) -> NDArray[np.int32]:
+    """The cell (h, 2 h) of a grid in each direction, from the zenith down, azimuth from -pi."""
+    h = TABLE_HEIGHT
+    azimuth = ((np.arange(2 * h) + 0.5) / (2 * h) - 0.5) * 2.0 * np.pi
+    elevation = (0.5 - (np.arange(h) + 0.5) / h)[:, None] * np.pi
+    z = np.broadcast_to(np.sin(elevation), (h, 2 * h))
+    rays = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), z], axis=-1)
+    return cell_of(rays.reshape(-1, 3).astype(np.float32), num_rings).reshape(h, 2 * h)
+
+
+def view_positions(centers: Array, ranges: NDArray[np.float32], num_rings: int) -> NDArray[np.int64]:
+    """Indices of the candidates (N, 3) [m] from which features are taken.
+
+    Ranges (N, cells) [m] are those of the candidates' views, 0 where nothing is seen.
+    """
+    if len(centers) == 0:
+        return np.empty(0, np.int64)
+    _, group = np.unique(np.floor(centers / CELL), axis=0, return_inverse=True)
+    lowest = np.full(group.max() + 1, np.inf)
+    np.minimum.at(lowest, group.ravel(), centers[:, 2])
+    off = np.abs(centers[:, 2] - lowest[group.ravel()] - ABOVE_LOWEST)
+    order = np.argsort(np.rint(off / HEIGHT_STEP), kind="stable")
+    kept = np.empty(len(centers), np.int64)
+    return kept[: choose(order, centers, ranges, cell_table(num_rings), kept)]
