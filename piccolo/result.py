@@ -93,7 +93,8 @@ class Result:
             e = self.evidence
             lines.append(
                 f"  confidence {self.confidence:.3f}, score {e.score:.2f}, margin {e.margin:.2f}, "
-                f"{100.0 * e.explained_fraction:.0f} % of the panorama explained"
+                f"{100.0 * e.explained_fraction:.0f} % of the panorama explained, "
+                f"{100.0 * e.contradicted_fraction:.0f} % contradicted"
             )
         if self.covariance is not None:
             mm, deg = 1000.0 * self.covariance.largest_std, self.covariance.std_deg.max()

@@ -17,6 +17,7 @@ from .coarse_to_fine.scan_map import ScanMap
 from .coarse_to_fine.settings import CoarseToFineSettings, Prior
 from .confidence.confidence import LOCALIZED
 from .confidence.localization import Localization
+from .confidence.occlusion import occlusion_mask
 from .errors import InputError
 from .geometry.pose import Pose
 from .geometry.rotations import Gravity
@@ -136,6 +137,16 @@ class Scan:
         """The result of each panorama in order, as it comes; options as in `localize`."""
         for panorama in panoramas:
             yield self.localize(panorama, **options)
+
+    def occlusion_mask(
+        self, panorama: File | NDArray[np.uint8], pose: Pose, read_options: ReadOptions | None = None
+    ) -> NDArray[np.uint8]:
+        """What of a photo contradicts the scan at a pose of the world: (H, W), of the full sphere's size.
+
+        255 where it contradicts, 0 where the scan explains it, 128 where one of them shows nothing.
+        """
+        picture = read_query(panorama, read_options or ReadOptions(labels=self.cloud_settings.labels))
+        return occlusion_mask(self.points, picture, self.from_world(pose))
 
     def localize_query(
         self,

@@ -233,11 +233,14 @@ def test_a_full_device_is_named(scene, capsys):
     assert capsys.readouterr().err == "localize.py: /dev/full: cannot be used (No space left on device)\n"
 
 
-def test_several_overlays_go_into_a_folder(scene, tmp_path):
-    folder = tmp_path / "overlays"
-    folder.mkdir()
-    assert _run(scene, tmp_path / "poses.jsonl", "--quiet", "--overlay", str(folder)) == 0
-    assert sorted(path.name for path in folder.iterdir()) == ["clean_0.png", "clean_1.png", "clean_2.png"]
+def test_several_pictures_go_into_folders(scene, tmp_path):
+    folders = tmp_path / "overlays", tmp_path / "changes"
+    for folder in folders:
+        folder.mkdir()
+    options = ["--overlay", str(folders[0]), "--occlusion-mask", str(folders[1])]
+    assert _run(scene, tmp_path / "poses.jsonl", "--quiet", *options) == 0
+    for folder in folders:
+        assert sorted(path.name for path in folder.iterdir()) == ["clean_0.png", "clean_1.png", "clean_2.png"]
 
 
 def test_priors_of_a_table_go_before_the_general_one(scene, tmp_path, capsys):

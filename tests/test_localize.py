@@ -98,10 +98,14 @@ def test_prior_narrows_the_search_and_stands_in_the_result(scene, capsys):
 
 
 def test_files_are_written_and_look_right(scene, tmp_path, capsys):
-    out, overlay = tmp_path / "pose.json", tmp_path / "overlay.png"
-    assert localize.main(_arguments(scene, "--out", str(out), "--overlay", str(overlay), "--quiet")) == 0
+    out, overlay, occlusion = (tmp_path / name for name in ("pose.json", "overlay.png", "occlusion.png"))
+    pictures = ["--overlay", str(overlay), "--occlusion-mask", str(occlusion)]
+    assert localize.main(_arguments(scene, "--out", str(out), *pictures, "--quiet")) == 0
     assert capsys.readouterr() == ("", "")
     assert Result.from_json(out.read_text()).status == "localized"
+    mask = cv2.imread(str(occlusion), cv2.IMREAD_UNCHANGED)
+    assert mask.shape == cv2.imread(str(scene / "images" / "clean_0.jpg")).shape[:2]
+    assert np.mean(mask == 255) < 0.05
     photo, cloud, checkerboard = np.split(cv2.imread(str(overlay)).astype(float), 3)
     assert photo.shape == (512, 1024, 3)
     assert np.abs(photo - cloud).mean() < 20
@@ -155,6 +159,8 @@ def test_panorama_from_elsewhere_exits_with_one(scene, tmp_path, capsys):
             2,
             "--overlay: found 2 panoramas, wanted one panorama or a folder",
         ),
+        (["--occlusion-mask", "x.jpg"], 2, "--occlusion-mask x.jpg: wanted a name that ends with .png"),
+        (["--occlusion-mask", "x.png", "--overlay", "x.png"], 2, "the same output as --overlay"),
         (["--pano", "@no such.txt"], 3, "no such.txt"),
         (["--priors", "no such.csv"], 3, "no such.csv"),
         (["--overwrite"], 2, "--overwrite: only with --out"),

@@ -274,7 +274,8 @@ def test_evidence_counts_alternatives_that_are_local_minima(monkeypatch):
     for name, value in {
         "visible_points": lambda *_: None,
         "sampling_loss": lambda *_: 0.07,
-        "agreement_at": lambda points, panorama, pose: Agreement(values[pose.center_world[0]], 0.6, 1.0),
+        "agreement_at": lambda points, panorama, pose: Agreement(values[pose.center_world[0]], 1.0),
+        "occlusion_at": lambda *_: SimpleNamespace(fractions=lambda: (0.6, 0.3)),
         "is_local_minimum": is_local_minimum,
         "estimate_covariance": lambda *_: None,
     }.items():
@@ -283,7 +284,8 @@ def test_evidence_counts_alternatives_that_are_local_minima(monkeypatch):
     found = evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(_at(0.0, 0.6), alternatives))
     assert asked == [(1.0, 0.3), (2.0, 0.75)]
     e = found.evidence
-    assert (e.score, e.agreement, e.explained_fraction, e.seen_fraction) == (0.6, 0.8, 0.6, 1.0)
+    assert (e.score, e.agreement, e.seen_fraction) == (0.6, 0.8, 1.0)
+    assert (e.explained_fraction, e.contradicted_fraction) == (0.6, 0.3)
     assert e.margin == pytest.approx(0.05)  # by the agreements, where that is less than 0.1 by the scores
     assert e.alternative_score_ratio == pytest.approx(0.75)
     assert _places(found.alternatives) == [2.0, 1.0, 3.0]

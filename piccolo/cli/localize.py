@@ -21,7 +21,7 @@ from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..opening import open_files
 from ..panorama import read_panorama
-from ..render.surfel_renderer import overlay_png
+from ..render.surfel_renderer import encode_image, overlay_png
 from ..result import UNREADABLE, Result
 from ..runtime.atomic import STDOUT, check_output, is_stdout, is_stream, write_atomically
 from ..runtime.kernel_cache import is_first_use, kernel_folder
@@ -65,20 +65,20 @@ def is_resumable(out: Path | None) -> bool:
 
 def check_files(arguments: argparse.Namespace, panoramas: list[Path], total: int | None) -> None:
     """Refuse, before any work, what could not be written, or would replace an input or another output."""
-    overlay: Path | None = arguments.overlay
     given = filter(None, (arguments.mask, arguments.priors))
     lists = [Path(word[1:]) for word in arguments.pano if word.startswith("@")]
-    outputs = {"--out": arguments.out or STDOUT, "--overlay": overlay}
+    pictures = {"--overlay": arguments.overlay, "--occlusion-mask": arguments.occlusion_mask}
+    outputs = {"--out": arguments.out or STDOUT, **pictures}
     check_distinct(outputs, [*arguments.cloud, *panoramas, *lists, *given])
     check_output(arguments.out or STDOUT)
-    if overlay and overlay.is_dir():
-        return
-    if overlay and total != 1:
-        found = "names on stdin" if total is None else f"{total} panoramas"
-        raise UsageError(f"--overlay: found {found}, wanted one panorama or a folder that exists")
-    check_suffix("--overlay", overlay, (".png",))
-    if overlay:
-        check_output(overlay)
+    for option, path in pictures.items():
+        if path is None or path.is_dir():
+            continue
+        if total != 1:
+            found = "names on stdin" if total is None else f"{total} panoramas"
+            raise UsageError(f"{option}: found {found}, wanted one panorama or a folder that exists")
+        check_suffix(option, path, (".png",))
+        check_output(path)
 
 
 def prepare_run(arguments: argparse.Namespace) -> Run:
@@ -147,18 +147,25 @@ def write_to(stream: FileIO, line: str, out: Path) -> None:
         raise OSError(error.errno, os.strerror(error.errno or 0), str(out)) from error
 
 
+def write_picture(path: Path, pano: Path, png: bytes) -> None:
+    """Write a PNG of a panorama to a file, or into a folder under the panorama's name."""
+    write_atomically(path / f"{pano.stem}.png" if path.is_dir() else path, png)
+
+
 def report(run: Run, scan: Scan, result: Result) -> None:
-    """Write the overlay if one is asked for, and say what was found."""
+    """Write the pictures that are asked for, and say what was found."""
     arguments = run.arguments
     if result.error is not None:
         print_error(arguments, result.error, EXIT_BAD_INPUT)
         return
-    if arguments.overlay and result.best_pose is not None:
-        panorama = read_panorama(Path(result.pano), run.batch.read_options)
-        png = overlay_png(scan.points, panorama, scan.from_world(result.best_pose), scan.workers)
-        is_folder = arguments.overlay.is_dir()
-        file = arguments.overlay / f"{Path(result.pano).stem}.png" if is_folder else arguments.overlay
-        write_atomically(file, png)
+    pano, pose, read_options = Path(result.pano), result.best_pose, run.batch.read_options
+    if arguments.overlay and pose is not None:
+        panorama = read_panorama(pano, read_options)
+        png = overlay_png(scan.points, panorama, scan.from_world(pose), scan.workers)
+        write_picture(arguments.overlay, pano, png)
+    if arguments.occlusion_mask and pose is not None:
+        mask = scan.occlusion_mask(pano, pose, read_options)
+        write_picture(arguments.occlusion_mask, pano, encode_image(mask, ".png"))
     warnings = [f"warning: {warning}" for warning in result.warnings[len(scan.warnings) :]]
     for line in () if arguments.quiet else (*warnings, result.summary()):
         tqdm.write(line, file=sys.stderr)

@@ -70,6 +70,8 @@ def build_parser() -> argparse.ArgumentParser:
     files.add_argument("--overwrite", action="store_true", help="begin --out anew, whatever is in it")
     text = "PNG: panorama, cloud at the pose, checkerboard of both; of several panoramas a folder of PNGs"
     files.add_argument("--overlay", type=Path, metavar="PNG", help=text)
+    text = "PNG of the photo's size: white what contradicts the scan, grey what was not scanned, else black"
+    files.add_argument("--occlusion-mask", type=Path, metavar="PNG", help=f"{text}; of several a folder")
     files.add_argument("--cache", type=Path, metavar="FOLDER", help="of prepared maps (default the user's)")
     files.add_argument("--no-cache", action="store_true", help="prepare the map again, and do not keep it")
     add_method_options(parser)

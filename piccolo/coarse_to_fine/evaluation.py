@@ -5,6 +5,7 @@ import math
 from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
 from ..confidence.confidence import classify
 from ..confidence.localization import Localization
+from ..confidence.occlusion import occlusion_at
 from ..confidence.score import Evidence, agreement_at
 from ..optimize.refine import refine, sampling_loss_of
 from ..optimize.sampling_loss import sampling_loss
@@ -36,11 +37,13 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
     agreements = [agreement_at(scan_map.coarse_points, panorama, h.pose).value for h in found.near]
     is_credible = [is_local_minimum(query, h.pose, a) for h, a in zip(found.near, agreements, strict=True)]
     credible = [h for h, yes in zip(found.near, is_credible, strict=True) if yes]
+    explained, contradicted = occlusion_at(scan_map.points, panorama, pose).fractions()
     evidence = Evidence(
         score=found.best.score,
         margin=min([found.margin, *(at_pose.value - a for a in agreements)]),
         agreement=at_pose.value,
-        explained_fraction=at_pose.explained_fraction,
+        explained_fraction=explained,
+        contradicted_fraction=contradicted,
         seen_fraction=at_pose.seen_fraction,
         alternative_score_ratio=max([0.0, *(h.score for h in credible)]) / max(found.best.score, 1e-9),
     )

@@ -16,7 +16,6 @@ from ..render.zbuffer import render_view
 
 VIEW_WIDTH = 96  # cells of 3.75 degrees
 SIGMA_DEG = 15.0  # of the Gaussian in which contrast is judged
-AGREEING = 1.0  # standard deviations of local contrast by which two colours that agree may differ
 
 
 @dataclass(frozen=True)
@@ -26,10 +25,11 @@ class Evidence:
     score: float  # correlation of locally normalised views times the root of the fraction both show, [-1, 1]
     margin: float  # score less that of the best pose elsewhere, or less 0 if there is none above
     agreement: float  # correlation over what both show, charged where that is under half of the sphere
-    explained_fraction: float  # of what the panorama shows, by solid angle
+    explained_fraction: float  # of what the panorama shows, by solid angle, see occlusion.py
     seen_fraction: float  # of the sphere, on which both show anything
     # score of the best alternative that is a local minimum of the loss too, by the pose's own; 0 if none is
     alternative_score_ratio: float = 0.0
+    contradicted_fraction: float = 0.0  # of what the panorama shows; what is left was not scanned
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,6 @@ class Agreement:
     """Cloud and panorama compared at a pose, by cells of the sphere."""
 
     correlation: float  # of locally normalised colours over what both show
-    explained_fraction: float  # of what the panorama shows, by solid angle, what agrees
     seen_fraction: float  # of the sphere, what both show
 
     @property
@@ -56,8 +55,7 @@ def agreement_at(points: PackedPoints, panorama: Panorama, pose: Pose) -> Agreem
     small = shrink(panorama, VIEW_WIDTH)
     view = render_view(points, pose, VIEW_WIDTH)
     is_shared = view.is_seen & small.is_valid
-    areas = solid_angles(VIEW_WIDTH)[:, None] / (4.0 * math.pi)
-    weights = is_shared * areas
+    weights = is_shared * (solid_angles(VIEW_WIDTH)[:, None] / (4.0 * math.pi))
     of_view = normalize_locally(view.rgb, is_shared, SIGMA_DEG)
     of_panorama = normalize_locally(small.rgb.astype(np.float32) / np.float32(255.0), is_shared, SIGMA_DEG)
 
@@ -65,9 +63,7 @@ def agreement_at(points: PackedPoints, panorama: Panorama, pose: Pose) -> Agreem
         return float((weights[..., None] * values).sum(dtype=np.float64))
 
     energy = math.sqrt(total(of_view**2) * total(of_panorama**2))
-    is_agreeing = np.linalg.norm(of_view - of_panorama, axis=2) < AGREEING
     return Agreement(
         correlation=total(of_view * of_panorama) / max(energy, 1e-9),
-        explained_fraction=float((weights * is_agreeing).sum() / max((small.is_valid * areas).sum(), 1e-9)),
         seen_fraction=float(weights.sum()),
     )

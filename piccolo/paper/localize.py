@@ -10,6 +10,7 @@ from ..cloud.stream import Cloud
 from ..confidence.alternatives import Hypothesis, alternative_poses, score_margin
 from ..confidence.confidence import PAPER_MODEL, classify
 from ..confidence.localization import Localization
+from ..confidence.occlusion import occlusion_at
 from ..confidence.score import Evidence, agreement_at
 from ..geometry.rotations import uniform_rotations, uniform_yaws
 from ..optimize.refine import Loss, Refined, refine, sampling_loss_of
@@ -74,11 +75,13 @@ def evaluate(
     at_pose = agreement_at(points, panorama, best.pose)
     others = [Hypothesis(r.pose, agreement_at(points, panorama, r.pose).score) for r in refined]
     others = alternative_poses(best.pose, others)
+    explained, contradicted = occlusion_at(points, panorama, best.pose).fractions()
     evidence = Evidence(
         score=at_pose.score,
         margin=score_margin(at_pose.score, others),
         agreement=at_pose.value,
-        explained_fraction=at_pose.explained_fraction,
+        explained_fraction=explained,
+        contradicted_fraction=contradicted,
         seen_fraction=at_pose.seen_fraction,
     )
     return evidence, others

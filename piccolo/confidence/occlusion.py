@@ -1,0 +1,164 @@
+"""What of a photo the scan at its pose explains, what contradicts it, and what was not scanned.
+
+Photo and scan are compared by local contrast, as the exposure differs. An occluder pollutes mean and
+deviation around it: they are taken again over what agrees, the whole photo's at first, then more local ones.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cloud.soa import PackedPoints
+from ..geometry.pose import Pose
+from ..geometry.sphere import solid_angles
+from ..panorama import Panorama
+from ..panorama.local_normalization import block_moments, blur_sphere, finish_statistics, opponent_channels
+from ..panorama.model import resize
+from ..render.zbuffer import View, render_view
+
+WIDTHS = (256, 128, 64)  # [px] of the comparison, cells of 1.4 degrees and more: where the scan is sparse
+LEAST_FILLED = 0.75  # of the cells twice as wide in which anything is seen: less is sparse
+STATS_WIDTH = 64  # [px] of local means
+SIGMA_DEG, SMOOTHING = 15.0, 0.9  # of the Gaussians for contrast, and [cells] for the difference
+GLOBAL_WEIGHTS = (10.0, 1.0, 0.3)  # round by round, of the whole photo beside a full neighbourhood
+FLAT_DEVIATION = 0.08  # of a channel in [0, 1]: flatter surroundings make a difference count less
+MOST_DIFFERENCE = 2.0  # deviations; what differs more counts no more
+CONTRADICTING = 0.5  # squared deviations, summed over channels
+WEIGHT_SCALE = 1.0  # the same, of Geman and McClure's weights
+LEAST_COVERED = 0.3  # of the neighbourhood that both show: less was not scanned
+EXPLAINED, NOT_SCANNED, CONTRADICTED = 0, 128, 255  # levels of the mask
+LEVEL = 100  # 8-bit level of the thresholds in maps that are enlarged
+
+
+@dataclass(frozen=True)
+class Occlusion:
+    """Photo and scan compared at a pose, on a small equirectangular grid."""
+
+    difference: NDArray[np.float32]  # (H, W) squared deviations of local contrast, smoothed
+    coverage: NDArray[np.float32]  # (H, W) fraction of the neighbourhood that both show
+    is_valid: NDArray[np.bool_]  # (H, W) where the photo shows anything
+
+    def fractions(self) -> tuple[float, float]:
+        """What is explained and what contradicts, of what the photo shows, by solid angle."""
+        areas = solid_angles(self.is_valid.shape[1])[:, None] * self.is_valid
+        is_compared = areas * (self.coverage > LEAST_COVERED)
+        contradicted = float((is_compared * (self.difference > CONTRADICTING)).sum())
+        total = max(float(areas.sum()), 1e-9)
+        return (float(is_compared.sum()) - contradicted) / total, contradicted / total
+
+
+def occlusion_at(points: PackedPoints, panorama: Panorama, pose: Pose) -> Occlusion:
+    """Photo and scan compared at a pose."""
+    view = _filled_view(points, pose)
+    small = resize(panorama, view.depth.shape[1])
+    is_shared = view.is_seen & small.is_valid
+    of_photo = opponent_channels(small.rgb.astype(np.float32) / np.float32(255.0))
+    of_scan = opponent_channels(view.rgb)
+    shared = weight = is_shared.astype(np.float32)
+    coverage = _smoothed(shared)
+    for global_weight in GLOBAL_WEIGHTS:
+        square = _squared_difference(of_photo, of_scan, is_shared, weight, global_weight)
+        difference = _smoothed(square * shared)
+        difference /= np.maximum(coverage, np.float32(1e-6))
+        weight = np.asarray(shared / (1.0 + difference / WEIGHT_SCALE) ** 2, np.float32)
+    return Occlusion(difference, coverage, small.is_valid)
+
+
+def _filled_view(points: PackedPoints, pose: Pose) -> View:
+    """The scan at a pose, on the smallest cells that its points fill."""
+    view = render_view(points, pose, WIDTHS[0])
+    for width in WIDTHS[1:]:
+        wider = view.is_seen.reshape(width // 2, 2, width, 2).any(axis=(1, 3))
+        if view.is_seen.mean() >= LEAST_FILLED * wider.mean():
+            break
+        view = render_view(points, pose, width)
+    return view
+
+
+def occlusion_mask(points: PackedPoints, panorama: Panorama, pose: Pose) -> NDArray[np.uint8]:
+    """The comparison as a picture (H, W) of the panorama's size: EXPLAINED, NOT_SCANNED or CONTRADICTED.
+
+    What the photo does not show has the level of what was not scanned.
+    """
+    small, shape = occlusion_at(points, panorama, pose), panorama.is_valid.shape
+
+    def exceeds(values: NDArray[np.float32], threshold: float) -> NDArray[np.bool_]:
+        levels = np.clip(values * np.float32(LEVEL / threshold), 0.0, 255.0).astype(np.uint8)
+        return _enlarged(levels, shape) > LEVEL
+
+    mask = np.full(shape, NOT_SCANNED, np.uint8)
+    is_compared = exceeds(small.coverage, LEAST_COVERED) & panorama.is_valid
+    is_contradicted = exceeds(small.difference, CONTRADICTING)
+    mask[is_compared & is_contradicted] = CONTRADICTED
+    mask[is_compared & ~is_contradicted] = EXPLAINED
+    return mask
+
+
+def _squared_difference(
+    of_photo: NDArray[np.float32],
+    of_scan: NDArray[np.float32],
+    is_shared: NDArray[np.bool_],
+    weight: NDArray[np.float32],
+    global_weight: float,
+) -> NDArray[np.float32]:
+    """Squared difference (H, W) of the channels' contrasts, from what the scan has within a cell around.
+
+    An edge that is off by less than a cell, or blurred, differs by nothing.
+    """
+    photo, scan = (_statistics(c, weight, global_weight) for c in (of_photo, of_scan))
+    value = (of_photo - photo[..., :3]) * photo[..., 3:]
+    contrast = (of_scan - scan[..., :3]) * scan[..., 3:]
+    low, high = _extreme(contrast, is_shared, cv2.erode, 9.0), _extreme(contrast, is_shared, cv2.dilate, -9.0)
+    outside = np.maximum(np.maximum(low - value, value - high), np.float32(0.0))
+    variance = np.float32(1.0) / np.minimum(photo[..., 3:], scan[..., 3:]) ** 2
+    outside *= np.sqrt(variance / (variance + np.float32(FLAT_DEVIATION**2)))
+    return np.asarray((np.minimum(outside, np.float32(MOST_DIFFERENCE)) ** 2).sum(axis=2))
+
+
+def _statistics(
+    channels: NDArray[np.float32], weight: NDArray[np.float32], global_weight: float
+) -> NDArray[np.float32]:
+    """Local means and 1 / deviations (H, W, 6) of channels (H, W, 3), mixed with those of all that counts."""
+    moments = np.empty((STATS_WIDTH // 2, STATS_WIDTH, 7), np.float32)
+    block_moments(channels, weight, moments)
+    total = (moments * solid_angles(STATS_WIDTH)[:, None, None]).sum(axis=(0, 1))
+    # what blur_sphere makes of full blocks: the integral of exp((cosine - 1) / sigma^2)
+    full = global_weight * math.tau * math.radians(SIGMA_DEG) ** 2 * weight.size / moments[..., 0].size
+    sums = blur_sphere(moments, SIGMA_DEG)
+    sums += (full * total / max(total[0], 1e-9)).astype(np.float32)
+    finish_statistics(sums)
+    return _enlarged(sums[..., 1:], weight.shape)
+
+
+def _smoothed(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A map (H, W) under a narrow Gaussian on the sphere: along rows, wider at the poles, then columns."""
+    height, width = values.shape
+    cosine = np.cos((0.5 - (np.arange(height) + 0.5) / height) * math.pi)
+    frequency = np.arange(width // 2 + 1) * math.tau / width
+    gains = np.exp(-0.5 * (frequency * SMOOTHING / cosine[:, None]) ** 2)
+    rows = np.fft.irfft(np.fft.rfft(values.astype(np.float64), axis=1) * gains, n=width, axis=1)
+    kernel = cv2.getGaussianKernel(2 * math.ceil(3.0 * SMOOTHING) + 1, SMOOTHING)
+    columns = cv2.sepFilter2D(rows, cv2.CV_64F, np.ones(1), kernel, borderType=cv2.BORDER_REFLECT)
+    return np.maximum(columns, 0.0).astype(np.float32)
+
+
+def _extreme(
+    channels: NDArray[np.float32], is_shared: NDArray[np.bool_], of: Any, unseen: float
+) -> NDArray[np.float32]:
+    """The least or the most (H, W, 3), by cv2.erode or cv2.dilate, among a cell and its eight neighbours."""
+    seen = np.where(is_shared[..., None], channels, np.float32(unseen))
+    padded = np.concatenate([seen[:, -1:], seen, seen[:, :1]], axis=1)
+    return np.asarray(of(padded, np.ones((3, 3), np.uint8))[:, 1:-1])
+
+
+def _enlarged(small: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """A map (h, w, ...) at another shape (H, W), bilinear; columns wrap."""
+    border = math.ceil(shape[1] / small.shape[1])
+    padded = np.concatenate([small[:, -1:], small, small[:, :1]], axis=1)
+    size = (shape[1] + 2 * border, shape[0])
+    enlarged = cv2.resize(padded, size, interpolation=cv2.INTER_LINEAR)
+    return np.ascontiguousarray(enlarged[:, border : border + shape[1]])
