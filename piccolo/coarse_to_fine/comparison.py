@@ -5,14 +5,14 @@ wrong one explains all of them a little.
 """
 
 import math
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.pose import Pose
-from ..geometry.sphere import cell_of, make_grid
+from ..geometry.sphere import make_grid
+from ..optimize.channel_loss import CHANCE, NUM_BLOCKS
 from ..panorama.local_normalization import opponent, zscore
 from ..panorama.texels import bilinear_weights, blend, is_valid, texel_at
 from ..runtime.jit import F0, kernel
@@ -20,8 +20,6 @@ from .cells import local_statistics
 from .query import Query
 from .view import render_cells, thread_scratch
 
-BLOCK_RINGS = 6  # blocks of 30 degrees
-CHANCE = 0.35  # a block's correlation that wrong poses reach
 CONTRADICTS = 0.1  # a block of less is left out of the local means and deviations
 PER_LEVEL = np.float32(1.0 / 255.0)
 
@@ -95,7 +93,7 @@ def correlate_blocks(first, second, shared, blocks, correlation, area):
 
 
 @kernel
-def compare_cells(offsets, colors, weights, photo, R_cam_from_map, view, blocks, correlation, area):
+def compare_cells(offsets, colors, weights, photo, R_cam_from_map, view, correlation, area):
     """Write the correlation and the shared area (blocks,) of cells (3, N) around a camera with its photo.
 
     Blocks that contradict are then left out of the local means and deviations, and all is taken anew.
@@ -107,10 +105,10 @@ def compare_cells(offsets, colors, weights, photo, R_cam_from_map, view, blocks,
     for k in range(2):
         normalize(colors, kept, view, first)
         normalize(of_photo, kept, view, second)
-        correlate_blocks(first, second, kept, blocks, correlation, area)
+        correlate_blocks(first, second, kept, view.blocks, correlation, area)
         if k == 0:
             for n in range(len(kept)):
-                if correlation[blocks[n]] < CONTRADICTS:
+                if correlation[view.blocks[n]] < CONTRADICTS:
                     kept[n] = F0
 
 
@@ -122,15 +120,7 @@ def compare(query: Query, pose: Pose) -> Comparison:
     weights, sums, stats = np.empty(n, np.float32), np.empty((n, 8), np.float32), np.empty((6, n), np.float32)
     how = config.voxel_per_range, config.arrays, thread_scratch()
     render_cells(query.scan_map.octree, pose.center_world, *how, offsets, colors, weights, sums, stats)
-    blocks = blocks_of(config.num_rings)
-    correlation, area = np.empty(len(make_grid(BLOCK_RINGS))), np.empty(len(make_grid(BLOCK_RINGS)))
-    texels = photo.rgbx, photo.width
-    args = texels, pose.R_cam_from_world, config.arrays, blocks, correlation, area
-    compare_cells(offsets, colors, weights, *args)
+    correlation, area = np.empty(NUM_BLOCKS), np.empty(NUM_BLOCKS)
+    image = photo.rgbx, photo.width
+    compare_cells(offsets, colors, weights, image, pose.R_cam_from_world, config.arrays, correlation, area)
     return Comparison(correlation, area, photo.valid_share)
-
-
-@lru_cache(maxsize=4)
-def blocks_of(num_rings: int) -> NDArray[np.int32]:
-    """The block (N,) in which each cell of a grid lies."""
-    return cell_of(make_grid(num_rings).directions, BLOCK_RINGS)

@@ -33,7 +33,8 @@ class MethodConfig(NamedTuple):
     full_view: ViewConfig = ViewConfig(num_rings=96, stats_rings=24, sigma_deg=10.0, voxel_per_range=1 / 150)
     scales: ImageScales = ImageScales()
     beam: Beam = Beam(400, 48, 8, 2)
-    wide_beam: Beam = Beam(800, 192, 24, 4)  # of the attempts after the first
+    uses_features: bool = True
+    uses_search: bool = True  # where features alone are not sure
     min_starts: int = 1000
 
 

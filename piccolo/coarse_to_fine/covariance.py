@@ -1,4 +1,4 @@
-"""Covariance of a pose from blocks of the sphere, and whether it is a sharp minimum of the loss."""
+"""Covariance of a pose from blocks of the sphere."""
 
 import math
 from dataclasses import dataclass
@@ -18,9 +18,6 @@ from .query import Query
 from .refinement import NUM_POINTS
 from .view import Cells, visible_points
 
-# [m] A minimum wider than this is none; it may be blunt where most of what both show agrees. Wrong poses in
-# a hospital of equal wards had 0.022 and more, at agreements up to 0.47.
-SHARP_STD, BLUNT_STD, LIKENESS = 0.015, 0.05, 0.55
 BLOCK_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
 SCALE = FULL_LOSS * LEVELS_PER_UNIT
 
@@ -104,15 +101,6 @@ def covariance_at(query: Query, points: Cells, pose: Pose) -> Array | None:
         if covariance is not None:
             return steps.inflation * covariance
     return None
-
-
-def is_local_minimum(query: Query, pose: Pose, agreement: float) -> bool:
-    """True if the pose is a sharp local minimum of the loss. Wrong poses rarely are."""
-    covariance = covariance_at(query, points_at(query, pose), pose)
-    if covariance is None:
-        return False
-    std = math.sqrt(float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
-    return std < (BLUNT_STD if agreement >= LIKENESS else SHARP_STD)
 
 
 def estimate_covariance(query: Query, pose: Pose) -> PoseCovariance | None:

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from ..confidence.alternatives import Hypothesis
 from ..geometry.pose import Array, Pose, orthonormal
-from ..geometry.sphere import make_grid
 from ..optimize.channel_loss import descend_channels, score
 from ..optimize.levenberg_marquardt import retract
 from ..panorama.local_normalization import LEVELS_PER_UNIT, ZERO_LEVEL
@@ -28,7 +27,7 @@ BATCH = 16  # starts a thread takes at a time
 @kernel
 def descend_starts(views, image, scale, num_iterations, candidate, R_cam_from_map, center_map, scores):
     """Descend from each start, (n, 3, 3) and (n, 3) in place, on the cells of its candidate's view."""
-    offsets, unit, features, is_seen, solid_angle, centers = views
+    offsets, unit, features, is_seen, solid_angle, blocks, centers = views
     texels, width = image
     R, t = R_cam_from_map, center_map
     n = len(solid_angle)
@@ -46,13 +45,15 @@ def descend_starts(views, image, scale, num_iterations, candidate, R_cam_from_ma
             t[k, i] -= centers[c, i]
         problem = points, levels, weights, texels, width, scale
         descend_channels(problem, num_iterations, START_TOLERANCE, R[k], t[k])
-        scores[k] = score(points, levels, weights, texels, width, R[k], t[k])
+        scores[k] = score(points, levels, weights, blocks, texels, width, R[k], t[k])
         for i in range(3):
             t[k, i] += centers[c, i]
 
 
 @kernel
-def descend_perturbed(points, levels, weights, wide, narrow, scale, steps, R_cam_from_map, center, scores):
+def descend_perturbed(
+    points, levels, weights, blocks, wide, narrow, scale, steps, R_cam_from_map, center, scores
+):
     """Descend from each step (n, 6) away from (n, 3, 3), (n, 3): on the wide image, then on the other."""
     R, t = R_cam_from_map, center
     for k in range(len(steps)):
@@ -63,7 +64,7 @@ def descend_perturbed(points, levels, weights, wide, narrow, scale, steps, R_cam
                 texels, width, num_iterations = wide[0], wide[1], WIDE_ITERATIONS
             problem = points, levels, weights, texels, width, scale
             descend_channels(problem, num_iterations, PERTURBED_TOLERANCE, R[k], t[k])
-        scores[k] = score(points, levels, weights, narrow[0], narrow[1], R[k], t[k])
+        scores[k] = score(points, levels, weights, blocks, narrow[0], narrow[1], R[k], t[k])
 
 
 def as_levels(channels: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -85,8 +86,8 @@ def descend_all(
     m = scan_map
     R, t = starts.R_cam_from_map.copy(), starts.center_map.copy()
     scores = np.empty(len(t))
-    solid_angle = make_grid(SEARCH_VIEW.num_rings).solid_angle
-    views = m.offsets, m.offset_unit, m.features, m.is_seen, solid_angle, m.centers
+    view = SEARCH_VIEW.arrays
+    views = m.offsets, m.offset_unit, m.features, m.is_seen, view.solid_angle, view.blocks, m.centers
     scale = COARSE_LOSS * LEVELS_PER_UNIT
 
     def run(lo: int) -> None:
@@ -112,13 +113,15 @@ def descend(cells: Cells, center: Array, image: Texels, pose: Pose, limits: tupl
     return Pose(orthonormal(R), t + center)
 
 
-def score_on(cells: Cells, center: Array, image: Texels, pose: Pose) -> float:
-    """The score of a pose on cells around `center` (3,)."""
+def score_on(cells: Cells, blocks: NDArray[np.int32], center: Array, image: Texels, pose: Pose) -> float:
+    """The score of a pose on cells around `center` (3,), each in its block of the sphere."""
     levels, R, t = as_levels(cells.channels), pose.R_cam_from_world, pose.center_world - center
-    return float(score(cells.offsets, levels, cells.weights, image.rgbx, image.width, R, t))
+    return float(score(cells.offsets, levels, cells.weights, blocks, image.rgbx, image.width, R, t))
 
 
-def descend_around(cells: Cells, images: tuple[Texels, Texels], pose: Pose, size: float) -> Hypothesis:
+def descend_around(
+    cells: Cells, blocks: NDArray[np.int32], images: tuple[Texels, Texels], pose: Pose, size: float
+) -> Hypothesis:
     """The best end of descents from around a pose, the wider image first, and from the pose itself.
 
     The cells are those around the pose.
@@ -128,6 +131,6 @@ def descend_around(cells: Cells, images: tuple[Texels, Texels], pose: Pose, size
     scores = np.empty(len(steps))
     both = (wide.rgbx, wide.width), (narrow.rgbx, narrow.width)
     levels, scale = as_levels(cells.channels), COARSE_LOSS * LEVELS_PER_UNIT
-    descend_perturbed(cells.offsets, levels, cells.weights, *both, scale, steps, R, t, scores)
+    descend_perturbed(cells.offsets, levels, cells.weights, blocks, *both, scale, steps, R, t, scores)
     best = int(np.argmax(scores))
     return Hypothesis(Pose(orthonormal(R[best]), t[best] + pose.center_world), float(scores[best]))

@@ -7,6 +7,7 @@ from ..confidence.confidence import classify
 from ..confidence.localization import Localization
 from ..confidence.occlusion import occlusion_at
 from ..confidence.score import Evidence, agreement_at
+from ..local_features.hypotheses import count_matches
 from ..optimize.refine import refine, sampling_loss_of
 from ..optimize.sampling_loss import sampling_loss
 from ..optimize.settings import DescentSettings
@@ -14,7 +15,7 @@ from ..panorama import Panorama
 from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
 from ..render.zbuffer import visible_points
-from .covariance import estimate_covariance, is_local_minimum
+from .covariance import estimate_covariance
 from .query import Query
 from .search_result import SearchResult
 
@@ -34,22 +35,19 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
     if not math.isfinite(loss):
         return Localization()
     at_pose = agreement_at(scan_map.coarse_points, panorama, pose)
-    agreements = [agreement_at(scan_map.coarse_points, panorama, h.pose).value for h in found.near]
-    is_credible = [is_local_minimum(query, h.pose, a) for h, a in zip(found.near, agreements, strict=True)]
-    credible = [h for h, yes in zip(found.near, is_credible, strict=True) if yes]
     explained, contradicted = occlusion_at(scan_map.points, panorama, pose).fractions()
     evidence = Evidence(
         score=found.best.score,
-        margin=min([found.margin, *(at_pose.value - a for a in agreements)]),
+        margin=found.margin,
         agreement=at_pose.value,
         explained_fraction=explained,
         contradicted_fraction=contradicted,
         seen_fraction=at_pose.seen_fraction,
-        alternative_score_ratio=max([0.0, *(h.score for h in credible)]) / max(found.best.score, 1e-9),
+        num_matches=count_matches(query.matches, found.best.pose),
+        alternative_matches=max([0, *(count_matches(query.matches, h.pose) for h in found.alternatives)]),
     )
     covariance = estimate_covariance(query, pose)
     status, confidence = classify(evidence, covariance, len(found.alternatives) > 0, settings.min_confidence)
-    others = [h for h in found.alternatives if not any(h is c for c in credible)]
-    reported = [*credible, *others][:MAX_ALTERNATIVES]
+    reported = found.alternatives[:MAX_ALTERNATIVES]
     alternatives = tuple(Hypothesis(scan_map.to_world(h.pose), h.score) for h in reported)
     return Localization(status, confidence, scan_map.to_world(pose), loss, evidence, alternatives, covariance)

@@ -1,25 +1,33 @@
 """The default method in order, one line a step: one panorama in a prepared map."""
 
-import itertools
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
-from ..confidence.alternatives import Hypothesis, alternative_poses, by_score
+from ..confidence.alternatives import Hypothesis
 from ..confidence.localization import Localization
+from ..geometry.pose import Pose
+from ..local_features.hypotheses import count_matches, poses_of
 from ..panorama import Panorama
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from .config import METHOD, MethodConfig
 from .evaluation import evaluate
-from .prior import apply_prior, nothing_allowed
+from .prior import apply_prior, is_allowed, nothing_allowed
 from .query import Query, prepare_query
-from .refinement import MAX_SCORE_LOSS, refine, refine_by_perturbation, refine_full_resolution, settle
+from .refinement import (
+    refine,
+    refine_by_perturbation,
+    refine_full_resolution,
+    refine_matched,
+    settle,
+)
 from .scan_map import ScanMap
 from .search import search_poses
-from .search_result import NOTHING, SearchResult
+from .search_result import NOTHING, SearchResult, found_among
 from .settings import CoarseToFineSettings
 
-HOPELESS_SCORE = 0.05  # of black, white and noisy pictures; views of other places have 0.1 and more
+NUM_MATCHED = 6  # poses from matches that are refined
 ALTERNATIVES_REFINED = 10  # at most
 NO_PIXEL = "the panorama: no pixel counts, all are masked"
 
@@ -32,10 +40,10 @@ def localize(
     watch: Stopwatch,
     method: MethodConfig = METHOD,
 ) -> Localization:
-    """Where the panorama was taken: search, refine, compare with the alternatives, evaluate.
+    """Where the panorama was taken: match features, search, refine, compare with the alternatives, evaluate.
 
-    Where the gravity is `auto`, as known first, then as unknown; then both again with a wider beam. The first
-    attempt whose result is confident ends the search.
+    The poses that matches vote for come first. Where they leave doubt, whole views are searched too: with the
+    gravity `auto` as known, then as unknown, until one is sure.
     """
     candidates = apply_prior(scan_map, settings.prior)
     if len(candidates.centers) == 0 or not panorama.is_valid.any():
@@ -44,38 +52,42 @@ def localize(
         return Localization(warnings=(why,))
     with watch.stage("search"):
         query = prepare_query(panorama, candidates, settings, workers, method)
-    found = NOTHING
+    hypotheses, found = [], NOTHING
+    if method.uses_features:
+        with watch.stage("match"):
+            poses = matched_poses(query)
+        with watch.stage("refine"):
+            hypotheses = refine_matched(query, poses)
+            found = finished(query, hypotheses)
     gravities: list[Literal["known", "unknown"]]
     gravities = ["known", "unknown"] if settings.gravity == "auto" else [settings.gravity]
-    for beam, gravity in itertools.product((method.beam, method.wide_beam), gravities):
-        if beam is method.wide_beam and found.best.score < HOPELESS_SCORE:
+    for gravity in gravities if method.uses_search else []:
+        if found.is_sure(count_matches(query.matches, found.best.pose)):
             break
         with watch.stage("search"):
             starts = search_poses(query, gravity)
         with watch.stage("refine"):
-            fine, middle = refine(query, starts, beam)
-            best = refine_full_resolution(query, fine[0], 1)
-            # A wider beam knows more alternatives: of the same pose, its margin is the one to believe.
-            if best.score > found.best.score - MAX_SCORE_LOSS:
-                others = alternative_poses(best.pose, fine, middle, ALTERNATIVES_REFINED)
-                found = SearchResult(best, tuple(others))
-            if found.is_confident:
-                found = refine_alternatives(query, found)
-        if found.is_confident:
-            break
+            hypotheses = [*hypotheses, *refine(query, starts, method.beam)]
+            found = finished(query, hypotheses)
     with watch.stage("refine"):
-        if not found.is_confident:
-            found = refine_alternatives(query, found)
         return evaluate(query, panorama, replace(found, best=settle(query, found.best)))
 
 
-def refine_alternatives(query: Query, found: SearchResult) -> SearchResult:
-    """The same, with the alternatives that come near refined as carefully as the best; the better wins."""
+def matched_poses(query: Query) -> list[Pose]:
+    """The poses that matches vote for and the prior allows, best first."""
+    is_known = query.settings.gravity == "known"
+    level = query.R_cam_from_level if is_known else None
+    found = poses_of(query.matches, level, NUM_MATCHED, query.workers)
+    return [f.pose for f in found if is_allowed(query.scan_map, f.pose, query.settings.prior)]
+
+
+def finished(query: Query, hypotheses: Sequence[Hypothesis]) -> SearchResult:
+    """The best of some hypotheses, and the best elsewhere, those near it refined to the same end."""
 
     def refined(h: Hypothesis) -> Hypothesis:
         return refine_full_resolution(query, refine_by_perturbation(query, h), 2)
 
+    found = found_among(hypotheses, ALTERNATIVES_REFINED)
     near, far = found.near, found.alternatives[len(found.near) :]
-    finished = list(query.workers.map(refined, near, "descend"))
-    best, *others = by_score([found.best, *finished, *far])
-    return SearchResult(best, tuple(alternative_poses(best.pose, others, count=ALTERNATIVES_REFINED)))
+    ends = list(query.workers.map(refined, [found.best, *near] if hypotheses else [], "descend"))
+    return found_among([*ends, *far], ALTERNATIVES_REFINED)

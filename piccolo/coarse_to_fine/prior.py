@@ -1,10 +1,12 @@
 """What the user knows beforehand, as fewer positions and fewer rotations."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.pose import Pose
 from .camera_positions import COARSE_SPACING, heights_above_floor
 from .scan_map import ScanMap
 from .settings import Prior
@@ -67,12 +69,33 @@ def apply_prior(scan_map: ScanMap, prior: Prior) -> ScanMap:
     )
 
 
-def allowed_rotations(R_cam_from_world: NDArray[np.float64], prior: Prior) -> NDArray[np.float64]:
-    """The rotations (N, 3, 3) whose image centre looks where the prior says; the nearest if none does."""
+def allowed_rotations(
+    R_cam_from_world: NDArray[np.float64], prior: Prior, is_strict: bool = False
+) -> NDArray[np.float64]:
+    """The rotations (N, 3, 3) whose image centre looks where the prior says; else the nearest, or none."""
     if prior.heading_deg is None:
         return R_cam_from_world
     forward = R_cam_from_world[:, 0]  # of the camera's +x, in the world
     heading = np.arctan2(forward[:, 0], forward[:, 1])
     off = np.abs((heading - np.radians(prior.heading_deg) + np.pi) % (2.0 * np.pi) - np.pi)
-    is_allowed = off <= max(np.radians(prior.heading_tolerance_deg), float(off.min()))
-    return np.asarray(R_cam_from_world[is_allowed])
+    least = 0.0 if is_strict else float(off.min())
+    return np.asarray(R_cam_from_world[off <= max(np.radians(prior.heading_tolerance_deg), least)])
+
+
+def is_allowed(scan_map: ScanMap, pose: Pose, prior: Prior) -> bool:
+    """True for a pose of the map's frame within what the prior says, by a grid spacing more."""
+    world = scan_map.to_world(pose)
+    if prior.near_world is not None and prior.radius is not None:
+        x, y, z = prior.near_world
+        gap = (
+            math.dist(world.center_world[:2], (x, y))
+            if z is None
+            else math.dist(world.center_world, (x, y, z))
+        )
+        if gap > prior.radius + COARSE_SPACING:
+            return False
+    if prior.height is not None:
+        height = float(heights_above_floor(scan_map.octree, pose.center_world[None])[0])
+        if not prior.height[0] - COARSE_SPACING <= height <= prior.height[1] + COARSE_SPACING:
+            return False
+    return len(allowed_rotations(world.R_cam_from_world[None], prior, is_strict=True)) > 0

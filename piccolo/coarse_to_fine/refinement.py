@@ -1,10 +1,11 @@
 """From starts to poses: successive halving on ever finer views, perturbations, the last millimetres."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
-from ..confidence.alternatives import Hypothesis, best_distinct, by_score
+from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE, Hypothesis, best_distinct, by_score, suppressed
 from ..geometry.pose import Pose
+from .comparison import compare
 from .config import Beam
 from .descent import COARSE_LOSS, FINE_LOSS, FULL_LOSS, descend, descend_all, descend_around, score_on
 from .query import Query
@@ -15,10 +16,11 @@ FIRST_ITERATIONS, SECOND_ITERATIONS = 5, 12  # of the descents on prepared views
 MIDDLE_LIMITS, FINE_LIMITS = (COARSE_LOSS, 12, 1e-3), (FINE_LOSS, 12, 1e-4)
 FULL_LIMITS, LAST_LIMITS = (FULL_LOSS, 10, 1e-4), (FULL_LOSS, 30, 1e-7)
 PERTURBATION = 0.4  # of that on middle cells, on fine ones
-MAX_PERTURBATIONS, MIN_GAIN = 5, 0.01  # rounds; of the score in one, else it was the last
+MAX_PERTURBATIONS, MIN_GAIN = 5, 0.02  # rounds; by the score in one, else it was the last
+MOST_OTHERS = 6  # poses on middle cells that are alternatives
 NUM_POINTS = 30_000  # for the last millimetres
 MAX_LAST_ROUNDS, SETTLED = 6, 1e-4  # [m] a camera that moves by less in a round has arrived
-MAX_SCORE_LOSS = 0.01  # in exchange for millimetres
+MIN_SCORE_LEFT = 0.97  # of the score, in exchange for millimetres
 
 
 def descend_prepared(query: Query, starts: Starts, num_iterations: int, count: int) -> Starts:
@@ -30,56 +32,59 @@ def descend_prepared(query: Query, starts: Starts, num_iterations: int, count: i
 def descend_middle(query: Query, h: Hypothesis) -> Hypothesis:
     """Descend on middle cells, seen from where the pose is now."""
     center, image = h.pose.center_world, query.images.middle
-    cells = render_view(query.scan_map.octree, center, query.method.middle_view)
+    config = query.method.middle_view
+    cells = render_view(query.scan_map.octree, center, config)
     pose = descend(cells, center, image, h.pose, MIDDLE_LIMITS)
-    return Hypothesis(pose, score_on(cells, center, image, pose))
+    return Hypothesis(pose, score_on(cells, config.arrays.blocks, center, image, pose))
 
 
 def perturb_middle(query: Query, h: Hypothesis) -> Hypothesis:
     """Descend again from around a pose on middle cells."""
-    cells = render_view(query.scan_map.octree, h.pose.center_world, query.method.middle_view)
-    return descend_around(cells, (query.images.search, query.images.middle), h.pose, 1.0)
+    config, images = query.method.middle_view, (query.images.search, query.images.middle)
+    cells = render_view(query.scan_map.octree, h.pose.center_world, config)
+    return descend_around(cells, config.arrays.blocks, images, h.pose, 1.0)
 
 
 def descend_fine(query: Query, h: Hypothesis) -> Hypothesis:
     """Descend on fine cells, seen from where the pose is now."""
     center, image = h.pose.center_world, query.images.fine
-    cells = render_view(query.scan_map.octree, center, query.method.fine_view)
+    config = query.method.fine_view
+    cells = render_view(query.scan_map.octree, center, config)
     pose = descend(cells, center, image, h.pose, FINE_LIMITS)
-    return Hypothesis(pose, score_on(cells, center, image, pose))
+    return Hypothesis(pose, score_on(cells, config.arrays.blocks, center, image, pose))
 
 
 def refine_by_perturbation(query: Query, h: Hypothesis) -> Hypothesis:
     """Perturb and refine for as long as the score rises: a pose that stopped short creeps on."""
+    config, images = query.method.fine_view, (query.images.middle, query.images.fine)
     for _ in range(MAX_PERTURBATIONS):
-        cells = render_view(query.scan_map.octree, h.pose.center_world, query.method.fine_view)
-        images = query.images.middle, query.images.fine
-        refined = descend_fine(query, descend_around(cells, images, h.pose, PERTURBATION))
+        cells = render_view(query.scan_map.octree, h.pose.center_world, config)
+        around = descend_around(cells, config.arrays.blocks, images, h.pose, PERTURBATION)
+        refined = descend_fine(query, around)
         gain = refined.score - h.score
         h = refined if gain > 0.0 else h
-        if gain < MIN_GAIN:
+        if gain < MIN_GAIN * refined.score:
             break
     return h
 
 
-def score_at(query: Query, pose: Pose) -> float:
-    """Score of a pose on fine cells, seen from just there."""
-    cells = render_view(query.scan_map.octree, pose.center_world, query.method.fine_view)
-    return score_on(cells, pose.center_world, query.images.fine, pose)
+def compared(query: Query, h: Hypothesis) -> Hypothesis:
+    """The same pose with the score by which poses are selected."""
+    return Hypothesis(h.pose, compare(query, h.pose).score)
 
 
 def refine_full_resolution(query: Query, h: Hypothesis, num_rounds: int) -> Hypothesis:
     """The last millimetres: the visible points themselves in the finest image, unless the score falls.
 
-    In each round the points are taken anew, from where the pose is then.
+    In each round the points are taken anew, from where the pose is then. The score is that of `compared`.
     """
-    before, pose = score_at(query, h.pose), h.pose
+    before, pose = compared(query, h), h.pose
     for _ in range(num_rounds):
         center = pose.center_world
         points = visible_points(query.scan_map.octree, center, query.method.full_view, NUM_POINTS)
         pose = descend(points, center, query.images.full, pose, FULL_LIMITS)
-    score = score_at(query, pose)
-    return Hypothesis(pose, score) if score > before - MAX_SCORE_LOSS else Hypothesis(h.pose, before)
+    after = compared(query, Hypothesis(pose, 0.0))
+    return after if after.score > MIN_SCORE_LEFT * before.score else before
 
 
 def settle(query: Query, h: Hypothesis) -> Hypothesis:
@@ -91,14 +96,25 @@ def settle(query: Query, h: Hypothesis) -> Hypothesis:
         pose = descend(points, center, query.images.full, pose, LAST_LIMITS)
         if math.dist(pose.center_world, center) < SETTLED:
             break
-    score = score_at(query, pose)
-    return Hypothesis(pose, score) if score > h.score - MAX_SCORE_LOSS else h
+    settled = compared(query, Hypothesis(pose, 0.0))
+    return settled if settled.score > MIN_SCORE_LEFT * h.score else h
 
 
-def refine(query: Query, starts: Starts, beam: Beam) -> tuple[list[Hypothesis], list[Hypothesis]]:
-    """Successive halving from the starts to a few poses on fine cells, best first.
+def refine_matched(query: Query, poses: Sequence[Pose]) -> list[Hypothesis]:
+    """Poses that matches gave, refined on fine cells; the best first, by the score of `compared`."""
 
-    Then the many on middle cells, for the alternatives among them.
+    def refined(pose: Pose) -> Hypothesis:
+        as_found = Hypothesis(pose, 0.0)
+        ends = as_found, descend_fine(query, as_found), descend_fine(query, perturb_middle(query, as_found))
+        return max((compared(query, end) for end in ends), key=lambda h: h.score)
+
+    return by_score(list(query.workers.map(refined, poses, "descend")))
+
+
+def refine(query: Query, starts: Starts, beam: Beam) -> list[Hypothesis]:
+    """Successive halving from the starts to a few poses on fine cells, and the best elsewhere; best first.
+
+    The score is that of `compared`.
     """
 
     def each(function: Callable[[Query, Hypothesis], Hypothesis], some: list[Hypothesis]) -> list[Hypothesis]:
@@ -110,4 +126,11 @@ def refine(query: Query, starts: Starts, beam: Beam) -> tuple[list[Hypothesis], 
     perturbed = each(perturb_middle, narrow(middle, beam.num_fine))
     fine = each(descend_fine, narrow(perturbed, beam.num_fine))
     best = best_distinct(fine, beam.num_perturbed, CLOSE_DISTANCE, SAME_ANGLE)
-    return by_score([*each(refine_by_perturbation, best), *fine]), middle
+    found = alternative_candidates([*each(refine_by_perturbation, best), *fine], middle)
+    return by_score(each(compared, found))
+
+
+def alternative_candidates(fine: Sequence[Hypothesis], middle: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """The best on fine cells, and the best of those on middle cells that are near none of them."""
+    near = suppressed([*by_score(fine), *by_score(middle)], len(fine) + MOST_OTHERS, MIN_DISTANCE, MIN_ANGLE)
+    return [*fine, *(h for h in near if not any(h is f for f in fine))]

@@ -1,14 +1,16 @@
 """What a search has come to."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..confidence.alternatives import Hypothesis, score_margin
+from ..confidence.alternatives import Hypothesis, alternative_poses, by_score, score_margin
 from ..geometry.pose import Pose
 
-CONFIDENT_SCORE, CONFIDENT_MARGIN = 0.25, 0.15  # with less, another attempt is made
-NEAR_RATIO = 0.4  # an alternative with this part of the best score is refined as carefully as the best
+SURE_SCORE, SURE_RATIO = 0.15, 0.5  # least of the best; at most of the best elsewhere, by the best
+SURE_MATCHES = 12  # wrong poses have 5, in alike places more, but then not the only ones
+NEAR_RATIO = 0.6  # an alternative with this part of the best score is refined as carefully as the best
 
 
 @dataclass(frozen=True)
@@ -23,10 +25,10 @@ class SearchResult:
         """Lead of the best score over the best elsewhere, or over 0."""
         return score_margin(self.best.score, self.alternatives)
 
-    @property
-    def is_confident(self) -> bool:
-        """True if no other attempt need be made."""
-        return self.best.score >= CONFIDENT_SCORE and self.margin >= CONFIDENT_MARGIN
+    def is_sure(self, num_matches: int) -> bool:
+        """True if no other search need be made, with this many matches that agree with the best pose."""
+        is_alone = self.margin >= (1.0 - SURE_RATIO) * self.best.score
+        return is_alone and self.best.score >= SURE_SCORE and num_matches >= SURE_MATCHES
 
     @property
     def near(self) -> list[Hypothesis]:
@@ -35,3 +37,11 @@ class SearchResult:
 
 
 NOTHING = SearchResult(Hypothesis(Pose(np.eye(3), np.zeros(3)), -1.0), ())
+
+
+def found_among(hypotheses: Sequence[Hypothesis], count: int) -> SearchResult:
+    """The best of some hypotheses, and at most `count` elsewhere; NOTHING if there are none."""
+    if not hypotheses:
+        return NOTHING
+    best = by_score(hypotheses)[0]
+    return SearchResult(best, tuple(alternative_poses(best.pose, hypotheses, count=count)))

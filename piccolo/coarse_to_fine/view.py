@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..cloud.octree import MAX_NODES, Octree, collect
 from ..geometry.sphere import cell_of, make_grid, make_neighbors
+from ..optimize.channel_loss import BLOCK_RINGS
 from ..panorama.local_normalization import LEVELS_PER_UNIT, opponent, zscore
 from ..runtime.jit import F0, F1, HALF, inline_kernel, kernel
 from .cells import average_cells, average_colors, local_statistics, locate
@@ -42,6 +43,7 @@ class ViewArrays(NamedTuple):
     neighbor_weight: NDArray[np.float32]
     front: np.float32
     visible: np.float32
+    blocks: NDArray[np.int32]  # (cells,) the block of the sphere that each lies in, for scores
 
 
 class Scratch(NamedTuple):
@@ -81,6 +83,7 @@ class ViewConfig:
             neighbors.weight,
             np.float32(self.front),
             np.float32(self.visible),
+            cell_of(grid.directions, BLOCK_RINGS),
         )
 
 

@@ -26,36 +26,43 @@ NOT_LOCALIZED = "not_localized"
 MIN_CONFIDENCE = 0.9
 
 LEAST_STD, MOST_STD = 0.003, 0.3  # [m] smaller or larger tells nothing more
-LEAST_SCORE = 0.02
+LEAST_SCORE, LEAST_SEEN = 0.02, 0.01
 SAFETY = 2.0  # errors that the whole sphere shares, as by blur, are not in the deviations
-# Logistic regression by tools/calibrate_confidence.py on tools/evaluate_confidence.py --seeds 0 14 and the
-# scene house. Each feature counts in one direction only: for the pose, or (the last two) against it.
+# Logistic regression by tools/calibrate_confidence.py. Each feature counts in one direction only.
 FEATURES = (
-    "margin",
-    "log of the agreement",
+    "margin by score",
     "log of the score",
+    "log of 1 + matches",
+    "matches elsewhere by matches",
+    "log of the fraction of the sphere seen",
     "log10 of the largest deviation [m]",
-    "has a credible alternative",
 )
-DIRECTIONS = (1, 1, 1, -1, -1)
-MODEL = LogisticModel(4.94, (6.29, 4.37, 1.10, -1.10, -7.31))
+DIRECTIONS = (1, 1, 1, -1, 1, -1)
+MODEL = LogisticModel(-4.0, (6.0, 1.0, 1.5, -2.0, 0.5, -0.5))
 # The preset paper knows no covariance, and too few alternatives to tell places that repeat: learnt without
 # those, on tools/evaluate_confidence.py --preset paper --seeds 0 6 and --seeds 100 104.
 PAPER_MODEL = LogisticModel(-0.20, (6.37, 2.51))
 
 
 def features_of(evidence: Evidence, covariance: PoseCovariance | None) -> NDArray[np.float64]:
-    """What the confidence goes by, (5,), as FEATURES names them."""
+    """What the confidence goes by, (6,), as FEATURES names them."""
+    e = evidence
     std = MOST_STD if covariance is None else min(max(covariance.largest_std, LEAST_STD), MOST_STD)
     return np.array(
         [
-            evidence.margin,
-            math.log(max(evidence.agreement, LEAST_SCORE)),
-            math.log(max(evidence.score, LEAST_SCORE)),
+            e.margin / max(e.score, LEAST_SCORE),
+            math.log(max(e.score, LEAST_SCORE)),
+            math.log1p(e.num_matches),
+            min(e.alternative_matches / max(e.num_matches, 1), 1.0),
+            math.log(max(e.seen_fraction, LEAST_SEEN)),
             math.log10(std),
-            float(evidence.alternative_score_ratio > 0.0),
         ]
     )
+
+
+def paper_features_of(evidence: Evidence) -> NDArray[np.float64]:
+    """What the confidence of preset paper goes by, (2,): margin and log of the agreement."""
+    return np.array([evidence.margin, math.log(max(evidence.agreement, LEAST_SCORE))])
 
 
 def confidence_of(evidence: Evidence, covariance: PoseCovariance | None, model: LogisticModel) -> float:
@@ -64,7 +71,8 @@ def confidence_of(evidence: Evidence, covariance: PoseCovariance | None, model: 
     It holds where half of all queries have an answer, as in the trials from which it was learnt. A pose whose
     own deviation makes 0.1 m doubtful has less.
     """
-    features = features_of(evidence, covariance)[: len(model.weights)]
+    is_paper = model is PAPER_MODEL
+    features = paper_features_of(evidence) if is_paper else features_of(evidence, covariance)
     logit = model.bias + float(features @ np.array(model.weights))
     exactness = 1.0
     if covariance is not None:
@@ -83,7 +91,7 @@ def classify(
     confidence = confidence_of(evidence, covariance, model)
     if confidence >= min_confidence:
         return LOCALIZED, confidence
-    alone = replace(evidence, margin=max(evidence.score, evidence.margin), alternative_score_ratio=0.0)
+    alone = replace(evidence, margin=max(evidence.score, evidence.margin), alternative_matches=0)
     if has_alternatives and confidence_of(alone, covariance, model) >= min_confidence:
         return AMBIGUOUS, confidence
     return NOT_LOCALIZED, confidence

@@ -22,14 +22,16 @@ SIGMA_DEG = 15.0  # of the Gaussian in which contrast is judged
 class Evidence:
     """What a confidence rests on."""
 
-    score: float  # correlation of locally normalised views times the root of the fraction both show, [-1, 1]
+    score: (
+        float  # [0, 1] what blocks of the photo explain beyond chance; of preset paper, see Agreement.score
+    )
     margin: float  # score less that of the best pose elsewhere, or less 0 if there is none above
     agreement: float  # correlation over what both show, charged where that is under half of the sphere
     explained_fraction: float  # of what the panorama shows, by solid angle, see occlusion.py
     seen_fraction: float  # of the sphere, on which both show anything
-    # score of the best alternative that is a local minimum of the loss too, by the pose's own; 0 if none is
-    alternative_score_ratio: float = 0.0
     contradicted_fraction: float = 0.0  # of what the panorama shows; what is left was not scanned
+    num_matches: int = 0  # local features of the photo that agree with the pose
+    alternative_matches: int = 0  # the most that agree with a pose elsewhere
 
 
 @dataclass(frozen=True)

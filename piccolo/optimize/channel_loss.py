@@ -8,12 +8,16 @@ import math
 
 import numpy as np
 
+from ..geometry.sphere import make_grid
 from ..panorama.local_normalization import ZERO_LEVEL
 from ..panorama.texels import bilinear_weights, blend, is_valid, texel_at
 from ..runtime.jit import F1, HALF, inline_kernel, kernel
 from .levenberg_marquardt import levenberg_marquardt
 from .normal_equations import COUNT, LOSS, block_adder
 
+BLOCK_RINGS = 6  # blocks of the sphere of 30 degrees, in which a score is taken
+NUM_BLOCKS = len(make_grid(BLOCK_RINGS))
+CHANCE = 0.35  # a block's correlation that wrong poses reach
 BLOCK = 512  # points: float32 sums within, float64 over blocks
 
 
@@ -28,6 +32,12 @@ def geman_mcclure(square, inverse_scale2):
     """Loss of a residual of this squared length, and its weight."""
     s = F1 / (F1 + square * inverse_scale2)
     return HALF * square * s, s * s
+
+
+@inline_kernel
+def beyond_chance(correlation):
+    """What a block's correlation has beyond what those of wrong poses reach, in [0, 1]."""
+    return max(correlation - CHANCE, 0.0) / (1.0 - CHANCE)
 
 
 add_channels = block_adder(read_channels, geman_mcclure)
@@ -59,11 +69,11 @@ descend_channels = kernel(levenberg_marquardt(channel_equations))
 
 
 @kernel
-def correlate(points, channels, weights, texels, width, R_cam_from_world, center_world):
-    """Correlation of the points' channels with the image's at the pose, and the weight of what both show."""
+def correlate(points, channels, weights, blocks, texels, width, R_cam_from_world, center_world, sums):
+    """Write, block by block (B, 4), product, energies and shared weight of points' and image's channels."""
     R, t = R_cam_from_world, center_world
     stride = np.int32(width + 2)
-    product = points_energy = image_energy = shared = 0.0
+    sums[:] = 0.0
     for n in range(len(weights)):
         dx, dy, dz = points[0, n] - t[0], points[1, n] - t[1], points[2, n] - t[2]
         x = np.float32(R[0, 0] * dx + R[0, 1] * dy + R[0, 2] * dz)
@@ -73,22 +83,27 @@ def correlate(points, channels, weights, texels, width, R_cam_from_world, center
         bilinear = bilinear_weights(fu, fv)
         t00, t10, t01, t11 = texels[k], texels[k + 1], texels[k + stride], texels[k + stride + 1]
         w = weights[n] * is_valid(t00, t10, t01, t11)
-        shared += w
+        s = sums[blocks[n]]
+        s[3] += w
         for c in range(3):
             value = blend(t00, t10, t01, t11, bilinear, 8 * c) - np.float32(ZERO_LEVEL)
             feature = channels[c, n] - np.float32(ZERO_LEVEL)
-            product += w * value * feature
-            points_energy += w * feature * feature
-            image_energy += w * value * value
-    return product / math.sqrt(max(points_energy * image_energy, 1e-12)), shared
+            s[0] += w * value * feature
+            s[1] += w * feature * feature
+            s[2] += w * value * value
 
 
 @kernel
-def score(points, channels, weights, texels, width, R_cam_from_world, center_world):
-    """The score of a pose: correlation over what both show, times the root of the fraction of the sphere.
+def score(points, channels, weights, blocks, texels, width, R_cam_from_world, center_world):
+    """The score of a pose: what blocks of the sphere correlate beyond chance, times what both show of them.
 
-    The weights are solid angles as fractions of the sphere.
+    The weights are solid angles as fractions of the sphere, `blocks` (N,) the block of each point. An occluder
+    costs what it hides and no more.
     """
-    R, t = R_cam_from_world, center_world
-    correlation, shared = correlate(points, channels, weights, texels, width, R, t)
-    return correlation * math.sqrt(shared)
+    sums = np.empty((NUM_BLOCKS, 4))
+    correlate(points, channels, weights, blocks, texels, width, R_cam_from_world, center_world, sums)
+    total = 0.0
+    for b in range(NUM_BLOCKS):
+        product, points_energy, image_energy, shared = sums[b, 0], sums[b, 1], sums[b, 2], sums[b, 3]
+        total += beyond_chance(product / math.sqrt(max(points_energy * image_energy, 1e-12))) * shared
+    return total
