@@ -1,12 +1,20 @@
 """Refinement of a pose by the bearings of its matches."""
 
+import hashlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from piccolo.geometry.pose import Pose, angle_between, exp_so3, pose_errors, step
 from piccolo.geometry.rotations import random_rotation
+from piccolo.local_features.p3p import p3p
 from piccolo.local_features.pose_refinement import angular_equations, refine_pose
 from piccolo.optimize.normal_equations import COUNT, GRADIENT, LOSS, MATRIX, NUM_SUMS
+from piccolo.runtime.threads import Workers
 
 TILTED = Pose(exp_so3(np.array([0.4, -1.1, 0.7])), np.array([0.2, -0.3, 0.1]))
 
@@ -100,6 +108,46 @@ def test_weight_zero_is_no_match():
     found, _ = _refined((bearings, points, weights), _away(rng, TILTED), 0.3)
     assert np.linalg.norm(found.center_world - TILTED.center_world) < 1e-6
     assert angle_between(found.R_cam_from_world, TILTED.R_cam_from_world) < 1e-6
+
+
+def _pose_of(seed):
+    """A pose by the first three of noisy matches, refined on all: its bits."""
+    rng = np.random.default_rng(seed)
+    pose = Pose(random_rotation(rng), rng.normal(size=3) * 5.0)
+    bearings, points, weights = _matches(rng, pose, 30, noise=1e-3)
+    rotations, centers = np.empty((4, 3, 3)), np.empty((4, 3))
+    count = p3p(bearings[:3], points[:3], rotations, centers)
+    for R, center in zip(rotations[:count], centers[:count], strict=True):
+        refine_pose(bearings, points, weights, R, center, 30, 0.1)
+    return rotations[:count].tobytes() + centers[:count].tobytes()
+
+
+def test_threads_change_no_bit():
+    alone, together = ([*Workers(n).map(_pose_of, range(200), "poses")] for n in (1, 4))
+    assert alone == together
+    assert len(set(alone)) > 190  # each has poses of its own
+
+
+BITS = """
+import hashlib
+from test_pose_refinement import _pose_of
+print(hashlib.sha256(b"".join(map(_pose_of, range(100)))).hexdigest())
+"""
+
+
+def test_processes_have_the_same_bits():
+    """Whether threads of libraries are allowed or not, and whatever ran before."""
+    tests = str(Path(__file__).parent)
+    digests = set()
+    for num_threads in ("1", "4"):
+        counts = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), num_threads)
+        env = {**os.environ, **counts, "PYTHONPATH": os.pathsep.join([tests, str(Path(tests).parent)])}
+        done = subprocess.run(
+            [sys.executable, "-c", BITS], env=env, capture_output=True, text=True, check=True
+        )
+        digests.add(done.stdout)
+    digests.add(hashlib.sha256(b"".join(map(_pose_of, range(100)))).hexdigest() + "\n")
+    assert len(digests) == 1
 
 
 def test_a_point_at_the_camera_and_too_few_matches_leave_a_finite_pose():
