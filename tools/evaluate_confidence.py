@@ -29,6 +29,7 @@ from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers, num_cores
 from piccolo.scan import Settings
 from piccolo.scenes.scene import Scene, read_scene
+from piccolo.scenes.synthetic.damage import occluded, outside_field, unevenly_lit, without_texture
 from piccolo.scenes.synthetic.room import REPEATED_KINDS, make_repeated
 from piccolo.scenes.synthetic.world import (
     VARIANTS,
@@ -64,6 +65,26 @@ class Trial(NamedTuple):
     rgb: Image  # (H, W, 3)
     true_pose: Pose | None  # None where the panorama was not taken in this cloud
     gravity: Gravity = "auto"
+    is_masked: NDArray[np.bool_] | None = None  # (H, W) what the photo does not show
+
+
+OCCLUSIONS, FIELDS = (0.2, 0.4, 0.6), (120.0, 90.0, 65.0)  # of the sphere; of narrow photos [deg]
+
+
+def damaged(trial: Trial, other: Image, rng: np.random.Generator) -> Iterator[Trial]:
+    """The same photo half hidden, in uneven light, narrow, and mirrored."""
+    for fraction in OCCLUSIONS:
+        hidden = occluded(trial.rgb, other, fraction, rng)
+        yield trial._replace(case=f"{trial.case}, hidden {fraction:.0%}", rgb=hidden)
+    lit = occluded(unevenly_lit(trial.rgb, 2.0, rng), other, 0.3, rng)
+    yield trial._replace(case=f"{trial.case}, uneven light, hidden 30%", rgb=lit)
+    for fov_deg in FIELDS:
+        outside = outside_field(trial.rgb.shape[1], fov_deg, float(rng.uniform(0.0, 2.0 * np.pi)))
+        for gravity in ("known", "unknown"):
+            case = f"{trial.case}, {fov_deg:.0f} deg, gravity {gravity}"
+            yield Trial(case, trial.rgb, trial.true_pose, gravity, outside)
+    mirrored = np.ascontiguousarray(trial.rgb[:, ::-1])
+    yield Trial(f"{trial.case}, mirrored", mirrored, None, "unknown")
 
 
 def without_scene(rgb: Image, rng: np.random.Generator) -> Iterator[tuple[str, Image]]:
@@ -100,6 +121,8 @@ def room_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[Tria
     size = random_size(rng)
     world = make_world(seed, size, int(rng.integers(1, 4)))
     other = make_world(seed + 100_000, size, 1)  # of the same shape
+    if seed % 3 == 2:  # a third of the rooms
+        world, other = without_texture(world), without_texture(other)
     cloud = scan_world(world, POINTS_PER_ROOM * len(world.rooms), workers)[:2]
     right = [_trial(world, variant, variant, workers) for variant in VARIANTS]
     trials = [*right, Trial("elsewhere", _trial(other, "", "clean", workers).rgb, None)]
@@ -107,6 +130,9 @@ def room_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[Tria
     for name, rgb in without_scene(right[0].rgb, rng):  # a blurred panorama keeps its true pose
         trials.append(Trial(name, rgb, right[0].true_pose if name == "blurred" else None))
     trials.append(upside_down(right[0]))
+    another = _trial(other, "another place", "clean", workers, 1)._replace(true_pose=None)
+    for trial in (right[0], another):
+        trials += damaged(trial, _trial(other, "", "clean", workers, 2).rgb, rng)
     yield cloud, trials
     sparse = np.sort(rng.choice(len(cloud[0]), int(SPARSE_FRACTION * len(cloud[0])), replace=False))
     thin = Trial("sparse", right[0].rgb, right[0].true_pose), Trial("sparse, elsewhere", trials[4].rgb, None)
@@ -180,7 +206,7 @@ def results_of(arguments: argparse.Namespace) -> Iterator[tuple[str, Trial, Resu
         scan = scan_of(cloud, name, IN_METRES, settings, workers, Stopwatch())
         for trial in trials:
             settings = settings_of(arguments.preset, trial.gravity)
-            yield name, trial, scan.localize_query(trial.rgb, AS_STORED, settings)
+            yield name, trial, scan.localize_query(trial.rgb, AS_STORED, settings, trial.is_masked)
 
 
 def print_table(counts: dict[str, list[tuple[str, bool]]]) -> int:

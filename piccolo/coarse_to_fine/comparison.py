@@ -11,24 +11,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.pose import Pose
-from ..geometry.sphere import make_grid
-from ..optimize.channel_loss import CHANCE, NUM_BLOCKS
+from ..geometry.sphere import PI, atan2, cell_of, make_grid, pixel_rays
+from ..optimize.channel_loss import BLOCK_RINGS, CHANCE, NUM_BLOCKS
 from ..panorama.local_normalization import opponent, zscore
 from ..panorama.texels import bilinear_weights, blend, is_valid, texel_at
-from ..runtime.jit import F0, kernel
+from ..runtime.jit import F0, HALF, kernel
 from .cells import local_statistics
 from .query import Query
 from .view import render_cells, thread_scratch
 
 CONTRADICTS = 0.1  # a block of less is left out of the local means and deviations
+LEAST_SHARED = 0.3  # of what the poorer view shows
+MASK_WIDTH = 256  # [px] of the mask of blocks that contradict
 PER_LEVEL = np.float32(1.0 / 255.0)
 
 
 class Comparison(NamedTuple):
-    """What speaks for a pose, block by block."""
+    """What speaks for a pose, by blocks of the photo."""
 
     correlation: NDArray[np.float64]  # (blocks,) of locally normalised colours, 0 where nothing is shared
-    area: NDArray[np.float64]  # (blocks,) fractions of the sphere that both show
+    area: NDArray[
+        np.float64
+    ]  # (blocks,) fractions of the sphere that both show, where they do not contradict
+    visible_area: NDArray[np.float64]  # (blocks,) that both show
     valid_area: float  # of the sphere that the photo shows
 
     @property
@@ -37,10 +42,27 @@ class Comparison(NamedTuple):
         beyond = np.maximum(self.correlation - CHANCE, 0.0) / (1.0 - CHANCE)
         return float(beyond @ self.area) / max(self.valid_area, 1e-9)
 
+    def ratio_to(self, other: "Comparison") -> float:
+        """What this pose explains by what another does, over the blocks that both views show.
+
+        Over all blocks, a pose from which more was scanned would gain by that alone. 0 where hardly any is shared.
+        """
+        shared = np.minimum(self.visible_area, other.visible_area)
+        if shared.sum() < LEAST_SHARED * min(self.visible_area.sum(), other.visible_area.sum()):
+            return 0.0
+        mine, others = (np.maximum(c.correlation - CHANCE, 0.0) @ shared for c in (self, other))
+        return float(mine / max(others, 1e-9))
+
 
 @kernel
-def sample_photo(offsets, weights, texels, width, R_cam_from_map, colors, shared):
-    """Write the photo's opponent channels (3, N) where cells (3, N) are seen, and the weights that are shared."""
+def sample_photo(offsets, weights, photo, R_cam_from_map, grid, colors, shared, blocks):
+    """Write the photo's opponent channels (3, N) where cells (3, N) are seen, weights shared, and blocks (N,).
+
+    Blocks are those of the photo: cells of a grid of `num_columns`, `first` in the camera's frame.
+    """
+    texels, width = photo
+    num_columns, first = grid
+    num_rings = np.float32(len(num_columns))
     R, stride = R_cam_from_map, np.int32(width + 2)
     for n in range(len(weights)):
         dx, dy, dz = offsets[0, n], offsets[1, n], offsets[2, n]
@@ -57,6 +79,10 @@ def sample_photo(offsets, weights, texels, width, R_cam_from_map, colors, shared
             blend(t00, t10, t01, t11, bilinear, 16) * PER_LEVEL,
         )
         colors[0, n], colors[1, n], colors[2, n] = opponent(r, g, b)
+        ring = np.int32((HALF - atan2(z, math.sqrt(x * x + y * y)) / PI) * num_rings)
+        ring = min(max(ring, np.int32(0)), np.int32(len(num_columns) - 1))
+        column = np.int32((HALF + atan2(y, x) / (PI + PI)) * np.float32(num_columns[ring]))
+        blocks[n] = first[ring] + min(column, num_columns[ring] - np.int32(1))
 
 
 @kernel
@@ -93,22 +119,25 @@ def correlate_blocks(first, second, shared, blocks, correlation, area):
 
 
 @kernel
-def compare_cells(offsets, colors, weights, photo, R_cam_from_map, view, correlation, area):
+def compare_cells(
+    offsets, colors, weights, photo, R_cam_from_map, view, grid, correlation, area, visible_area
+):
     """Write the correlation and the shared area (blocks,) of cells (3, N) around a camera with its photo.
 
     Blocks that contradict are then left out of the local means and deviations, and all is taken anew.
     """
-    texels, width = photo
     of_photo, shared = np.empty_like(colors), np.empty_like(weights)
-    sample_photo(offsets, weights, texels, width, R_cam_from_map, of_photo, shared)
+    blocks = np.empty(len(weights), np.int32)
+    sample_photo(offsets, weights, photo, R_cam_from_map, grid, of_photo, shared, blocks)
     first, second, kept = np.empty_like(colors), np.empty_like(colors), shared.copy()
     for k in range(2):
         normalize(colors, kept, view, first)
         normalize(of_photo, kept, view, second)
-        correlate_blocks(first, second, kept, view.blocks, correlation, area)
+        correlate_blocks(first, second, kept, blocks, correlation, area)
         if k == 0:
+            visible_area[:] = area
             for n in range(len(kept)):
-                if correlation[view.blocks[n]] < CONTRADICTS:
+                if correlation[blocks[n]] < CONTRADICTS:
                     kept[n] = F0
 
 
@@ -120,7 +149,19 @@ def compare(query: Query, pose: Pose) -> Comparison:
     weights, sums, stats = np.empty(n, np.float32), np.empty((n, 8), np.float32), np.empty((6, n), np.float32)
     how = config.voxel_per_range, config.arrays, thread_scratch()
     render_cells(query.scan_map.octree, pose.center_world, *how, offsets, colors, weights, sums, stats)
-    correlation, area = np.empty(NUM_BLOCKS), np.empty(NUM_BLOCKS)
+    by_block = np.empty(NUM_BLOCKS), np.empty(NUM_BLOCKS), np.empty(NUM_BLOCKS)
     image = photo.rgbx, photo.width
-    compare_cells(offsets, colors, weights, image, pose.R_cam_from_world, config.arrays, correlation, area)
-    return Comparison(correlation, area, photo.valid_share)
+    blocks = make_grid(BLOCK_RINGS)
+    grid = blocks.num_columns, blocks.first
+    compare_cells(offsets, colors, weights, image, pose.R_cam_from_world, config.arrays, grid, *by_block)
+    return Comparison(*by_block, photo.valid_share)
+
+
+def without_occluders(query: Query, pose: Pose) -> Query:
+    """The query without the blocks of the photo that contradict the scan at a pose; itself if there are none."""
+    seen = compare(query, pose)
+    contradicts = (seen.correlation < CONTRADICTS) & (seen.visible_area > 0.0)
+    if not contradicts.any():
+        return query
+    is_hidden = contradicts[cell_of(pixel_rays(MASK_WIDTH).reshape(-1, 3).astype(np.float32), BLOCK_RINGS)]
+    return query.without(is_hidden.reshape(MASK_WIDTH // 2, MASK_WIDTH))

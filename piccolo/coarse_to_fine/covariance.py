@@ -13,10 +13,11 @@ from ..optimize.channel_loss import channel_equations
 from ..optimize.normal_equations import GRADIENT, MATRIX, NUM_SUMS
 from ..panorama.local_normalization import LEVELS_PER_UNIT
 from ..panorama.texels import Texels
+from .comparison import without_occluders
 from .descent import FULL_LOSS, as_levels
 from .query import Query
-from .refinement import NUM_POINTS
-from .view import Cells, visible_points
+from .refinement import points_at
+from .view import Cells
 
 BLOCK_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
 SCALE = FULL_LOSS * LEVELS_PER_UNIT
@@ -37,13 +38,6 @@ STEPS = (
     DifferenceSteps("full", math.radians(0.1), 0.005, 2.5),
     DifferenceSteps("fine", math.radians(0.3), 0.015, 0.8),
 )
-
-
-def points_at(query: Query, pose: Pose) -> Cells:
-    """The points that the last descent goes by, channels in levels."""
-    octree, center = query.scan_map.octree, pose.center_world
-    points = visible_points(octree, center, query.method.full_view, NUM_POINTS)
-    return points._replace(channels=as_levels(points.channels))
 
 
 def gradient_at(image: Texels, points: Cells, R_cam_from_map: Array, shift: Array) -> Array:
@@ -105,7 +99,9 @@ def covariance_at(query: Query, points: Cells, pose: Pose) -> Array | None:
 
 def estimate_covariance(query: Query, pose: Pose) -> PoseCovariance | None:
     """The covariance of a pose, in world axes; None where the points do not fix it."""
+    query = without_occluders(query, pose)
     points = points_at(query, pose)
+    points = points._replace(channels=as_levels(points.channels))
     covariance = covariance_at(query, points, pose)
     if covariance is None:
         return None

@@ -11,13 +11,13 @@ from ..local_features.hypotheses import count_matches, poses_of
 from ..panorama import Panorama
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
+from .comparison import compare
 from .config import METHOD, MethodConfig
 from .evaluation import evaluate
 from .prior import apply_prior, is_allowed, nothing_allowed
 from .query import Query, prepare_query
 from .refinement import (
     refine,
-    refine_by_perturbation,
     refine_full_resolution,
     refine_matched,
     settle,
@@ -29,6 +29,7 @@ from .settings import CoarseToFineSettings
 
 NUM_MATCHED = 6  # poses from matches that are refined
 ALTERNATIVES_REFINED = 10  # at most
+FAIRLY_BETTER = 1.05  # what an alternative explains of what both show, by the best, to take its place
 NO_PIXEL = "the panorama: no pixel counts, all are masked"
 
 
@@ -85,9 +86,24 @@ def finished(query: Query, hypotheses: Sequence[Hypothesis]) -> SearchResult:
     """The best of some hypotheses, and the best elsewhere, those near it refined to the same end."""
 
     def refined(h: Hypothesis) -> Hypothesis:
-        return refine_full_resolution(query, refine_by_perturbation(query, h), 2)
+        return refine_full_resolution(query, h, 2)
 
     found = found_among(hypotheses, ALTERNATIVES_REFINED)
     near, far = found.near, found.alternatives[len(found.near) :]
     ends = list(query.workers.map(refined, [found.best, *near] if hypotheses else [], "descend"))
-    return found_among([*ends, *far], ALTERNATIVES_REFINED)
+    return fairly_selected(query, found_among([*ends, *far], ALTERNATIVES_REFINED))
+
+
+def fairly_selected(query: Query, found: SearchResult) -> SearchResult:
+    """The same with the margin over what both views show; one that explains more of that becomes the best."""
+    if not found.alternatives:
+        return found
+    ranked = [found.best, *found.alternatives]
+    seen = list(query.workers.map(lambda h: compare(query, h.pose), ranked, "compare"))
+    best = 0
+    for k in range(1, len(ranked)):
+        if seen[k].ratio_to(seen[best]) > FAIRLY_BETTER:
+            best = k
+    others = [k for k in range(len(ranked)) if k != best]
+    rival_ratio = max(seen[k].ratio_to(seen[best]) for k in others)
+    return SearchResult(ranked[best], tuple(ranked[k] for k in others), rival_ratio)

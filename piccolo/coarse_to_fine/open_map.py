@@ -28,7 +28,7 @@ from .settings import NOTHING_KNOWN, Prior
 NAME = re.compile(r"[0-9a-f]{32}\.piccolo-map|\.[0-9a-f]{32}\.piccolo-map\.\w{8}")
 FOLDER = "piccolo-maps"  # within the folder that the user names
 # What makes a map: folders of the package. The cache makes maps anew when one of their files has changed.
-MAKERS = ("cloud", "coarse_to_fine", "geometry", "gravity", "panorama")
+MAKERS = ("cloud", "coarse_to_fine", "geometry", "gravity", "local_features", "optimize", "panorama")
 
 
 @dataclass(frozen=True)

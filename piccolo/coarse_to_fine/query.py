@@ -1,11 +1,12 @@
 """A query: a panorama at several scales, and the map in which it is searched."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from ..geometry.pose import Array
 from ..local_features.keypoints import find_keypoints
@@ -56,6 +57,21 @@ class Query:
         """The photo's colours at the size at which poses are compared."""
         small = resize(self.panorama, COMPARED_WIDTH)
         return pack_texels(small.rgb, small.is_valid)
+
+    def shows(self, directions: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
+        """True for each of some directions (N, 3) in the camera's frame in which the photo shows something."""
+        x, y, z = directions.T
+        height, width = self.panorama.is_valid.shape
+        column = ((0.5 - np.arctan2(y, x) / (2.0 * np.pi)) * width).astype(np.int64) % width
+        row = ((0.5 - np.arctan2(z, np.hypot(x, y)) / np.pi) * height).astype(np.int64)
+        return self.panorama.is_valid[np.minimum(row, height - 1), column]
+
+    def without(self, is_hidden: NDArray[np.bool_]) -> "Query":
+        """The same of what is left of the photo without some pixels (h, 2 h), its contrast taken anew."""
+        height, width = self.panorama.is_valid.shape
+        enlarged = cv2.resize(is_hidden.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+        rest = replace(self.panorama, is_valid=self.panorama.is_valid & (enlarged == 0))
+        return replace(self, images=QueryImages(*image_pyramid(rest, self.method.scales)), panorama=rest)
 
 
 def prepare_query(

@@ -5,20 +5,25 @@ from collections.abc import Callable, Sequence
 
 from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE, Hypothesis, best_distinct, by_score, suppressed
 from ..geometry.pose import Pose
-from .comparison import compare
+from .comparison import compare, without_occluders
 from .config import Beam
 from .descent import COARSE_LOSS, FINE_LOSS, FULL_LOSS, descend, descend_all, descend_around, score_on
 from .query import Query
 from .starts import CLOSE_DISTANCE, SAME_ANGLE, SAME_DISTANCE, Starts, best_and_alternatives, narrow
-from .view import render_view, visible_points
+from .view import Cells, render_view, visible_points
 
 FIRST_ITERATIONS, SECOND_ITERATIONS = 5, 12  # of the descents on prepared views
 MIDDLE_LIMITS, FINE_LIMITS = (COARSE_LOSS, 12, 1e-3), (FINE_LOSS, 12, 1e-4)
 FULL_LIMITS, LAST_LIMITS = (FULL_LOSS, 10, 1e-4), (FULL_LOSS, 30, 1e-7)
 PERTURBATION = 0.4  # of that on middle cells, on fine ones
+MAX_UNOCCLUDED = 2  # times that occluders are looked for
 MAX_PERTURBATIONS, MIN_GAIN = 5, 0.02  # rounds; by the score in one, else it was the last
 MOST_OTHERS = 6  # poses on middle cells that are alternatives
-NUM_POINTS = 30_000  # for the last millimetres
+NUM_POINTS = 30_000  # for the last millimetres, in what the photo shows
+LEAST_SHARE, MOST_SHARE = (
+    0.03,
+    0.9,
+)  # of the sphere that a photo shows: for less, points are as many; for more, not chosen
 MAX_LAST_ROUNDS, SETTLED = 6, 1e-4  # [m] a camera that moves by less in a round has arrived
 MIN_SCORE_LEFT = 0.97  # of the score, in exchange for millimetres
 
@@ -73,27 +78,54 @@ def compared(query: Query, h: Hypothesis) -> Hypothesis:
     return Hypothesis(h.pose, compare(query, h.pose).score)
 
 
+def points_at(query: Query, pose: Pose) -> Cells:
+    """The points that the last descent goes by: those seen from a pose that the photo shows too."""
+    share = max(query.photo.valid_share, LEAST_SHARE)
+    points = visible_points(
+        query.scan_map.octree, pose.center_world, query.method.full_view, round(NUM_POINTS / share)
+    )
+    if query.photo.valid_share > MOST_SHARE:
+        return points
+    is_shown = query.shows(points.offsets.T @ pose.R_cam_from_world.T)
+    return Cells(points.offsets[:, is_shown], points.channels[:, is_shown], points.weights[is_shown])
+
+
+def refine_unoccluded(query: Query, h: Hypothesis) -> tuple[Query, Hypothesis]:
+    """A pose refined by what of the photo does not contradict it; the query of just that, and the pose.
+
+    The score is that of `compared`, of the whole photo.
+    """
+    h, shown = compared(query, h), query
+    for _ in range(MAX_UNOCCLUDED):
+        shown = without_occluders(query, h.pose)
+        start = h if shown is query else descend_fine(shown, perturb_middle(shown, h))
+        refined = compared(query, refine_by_perturbation(shown, start))
+        gain = refined.score - h.score
+        h = refined if gain > 0.0 else h
+        if shown is query or gain < MIN_GAIN * refined.score:
+            break
+    return shown, h
+
+
 def refine_full_resolution(query: Query, h: Hypothesis, num_rounds: int) -> Hypothesis:
     """The last millimetres: the visible points themselves in the finest image, unless the score falls.
 
     In each round the points are taken anew, from where the pose is then. The score is that of `compared`.
     """
-    before, pose = compared(query, h), h.pose
+    shown, before = refine_unoccluded(query, h)
+    pose = before.pose
     for _ in range(num_rounds):
-        center = pose.center_world
-        points = visible_points(query.scan_map.octree, center, query.method.full_view, NUM_POINTS)
-        pose = descend(points, center, query.images.full, pose, FULL_LIMITS)
+        pose = descend(points_at(shown, pose), pose.center_world, shown.images.full, pose, FULL_LIMITS)
     after = compared(query, Hypothesis(pose, 0.0))
     return after if after.score > MIN_SCORE_LEFT * before.score else before
 
 
 def settle(query: Query, h: Hypothesis) -> Hypothesis:
     """The same until the pose moves no more, so that it does not depend on where the search began."""
-    pose = h.pose
+    pose, shown = h.pose, without_occluders(query, h.pose)
     for _ in range(MAX_LAST_ROUNDS):
         center = pose.center_world
-        points = visible_points(query.scan_map.octree, center, query.method.full_view, NUM_POINTS)
-        pose = descend(points, center, query.images.full, pose, LAST_LIMITS)
+        pose = descend(points_at(shown, pose), center, shown.images.full, pose, LAST_LIMITS)
         if math.dist(pose.center_world, center) < SETTLED:
             break
     settled = compared(query, Hypothesis(pose, 0.0))

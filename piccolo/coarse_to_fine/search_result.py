@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..confidence.alternatives import Hypothesis, alternative_poses, by_score, score_margin
+from ..confidence.alternatives import Hypothesis, alternative_poses, by_score
 from ..geometry.pose import Pose
 
-SURE_SCORE, SURE_RATIO = 0.15, 0.5  # least of the best; at most of the best elsewhere, by the best
+SURE_SCORE, SURE_RATIO = 0.05, 0.5  # least of the best; at most of the best elsewhere, by the best
 SURE_MATCHES = 12  # wrong poses have 5, in alike places more, but then not the only ones
 NEAR_RATIO = 0.6  # an alternative with this part of the best score is refined as carefully as the best
 
@@ -19,15 +19,17 @@ class SearchResult:
 
     best: Hypothesis
     alternatives: tuple[Hypothesis, ...]
+    rival_ratio: float = 0.0  # the most that one of these explains of what both views show, by the best
 
     @property
     def margin(self) -> float:
-        """Lead of the best score over the best elsewhere, or over 0."""
-        return score_margin(self.best.score, self.alternatives)
+        """Lead of the best in what both views show, by what it explains, in [-1, 1]; by score if that is less."""
+        of_scores = max([0.0, *(h.score for h in self.alternatives)]) / max(self.best.score, 1e-9)
+        return 1.0 - min(max(self.rival_ratio, of_scores), 2.0)
 
     def is_sure(self, num_matches: int) -> bool:
         """True if no other search need be made, with this many matches that agree with the best pose."""
-        is_alone = self.margin >= (1.0 - SURE_RATIO) * self.best.score
+        is_alone = self.margin >= 1.0 - SURE_RATIO
         return is_alone and self.best.score >= SURE_SCORE and num_matches >= SURE_MATCHES
 
     @property

@@ -30,7 +30,7 @@ LEAST_SCORE, LEAST_SEEN = 0.02, 0.01
 SAFETY = 2.0  # errors that the whole sphere shares, as by blur, are not in the deviations
 # Logistic regression by tools/calibrate_confidence.py. Each feature counts in one direction only.
 FEATURES = (
-    "margin by score",
+    "margin",
     "log of the score",
     "log of 1 + matches",
     "matches elsewhere by matches",
@@ -50,7 +50,7 @@ def features_of(evidence: Evidence, covariance: PoseCovariance | None) -> NDArra
     std = MOST_STD if covariance is None else min(max(covariance.largest_std, LEAST_STD), MOST_STD)
     return np.array(
         [
-            e.margin / max(e.score, LEAST_SCORE),
+            e.margin,
             math.log(max(e.score, LEAST_SCORE)),
             math.log1p(e.num_matches),
             min(e.alternative_matches / max(e.num_matches, 1), 1.0),
@@ -91,7 +91,7 @@ def classify(
     confidence = confidence_of(evidence, covariance, model)
     if confidence >= min_confidence:
         return LOCALIZED, confidence
-    alone = replace(evidence, margin=max(evidence.score, evidence.margin), alternative_matches=0)
+    alone = replace(evidence, margin=1.0, alternative_matches=0)
     if has_alternatives and confidence_of(alone, covariance, model) >= min_confidence:
         return AMBIGUOUS, confidence
     return NOT_LOCALIZED, confidence

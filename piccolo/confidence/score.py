@@ -25,7 +25,9 @@ class Evidence:
     score: (
         float  # [0, 1] what blocks of the photo explain beyond chance; of preset paper, see Agreement.score
     )
-    margin: float  # score less that of the best pose elsewhere, or less 0 if there is none above
+    # lead over the best pose elsewhere in what both views show, by what the pose explains: 1 if there is none;
+    # of preset paper, score less that of the best pose elsewhere
+    margin: float
     agreement: float  # correlation over what both show, charged where that is under half of the sphere
     explained_fraction: float  # of what the panorama shows, by solid angle, see occlusion.py
     seen_fraction: float  # of the sphere, on which both show anything

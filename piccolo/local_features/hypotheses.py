@@ -24,8 +24,9 @@ COS_ROUGH, COS_EXACT = math.cos(math.radians(20.0)), math.cos(math.radians(1.0))
 COS_TANGENT = math.cos(math.radians(40.0))
 SIZE_RATIO = 1.7  # of a keypoint's size as predicted and as found, at most
 COS_TILT = math.cos(math.radians(12.0))  # by which a pose may be off the known vertical
-MAX_VOTERS = 3000  # single matches whose poses are tried
+MAX_VOTERS = 1200  # single matches whose poses are tried
 CLUSTER_DISTANCE, CLUSTER_ANGLE = 1.0, math.radians(30.0)  # [m], [rad] rough poses nearer than both are one
+SAME_DISTANCE, SAME_ANGLE = 0.3, math.radians(10.0)  # exact poses nearer than both are one
 NUM_CLUSTERS = 48
 NUM_SAMPLES = 200  # of three matches, a cluster
 LEAST_MATCHES = 4  # that agree with a pose
@@ -213,4 +214,4 @@ def poses_of(
     if not found:
         return []
     R, t = np.array([f.pose.R_cam_from_world for f in found]), np.array([f.pose.center_world for f in found])
-    return [found[k] for k in non_maximum_suppression(R, t, count, 0.1, math.radians(5.0))]
+    return [found[k] for k in non_maximum_suppression(R, t, count, SAME_DISTANCE, SAME_ANGLE)]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..runtime.threads import Workers
 
 FIELD_DEG = 65.0  # of a view, across
-CONTRAST = 0.02  # least of a keypoint, as OpenCV counts it
+CONTRAST = 0.006  # least of a keypoint, as OpenCV counts it: plain walls have faint ones, and they hold
 MARGIN = 8  # [px] of the sphere's picture around it, so that views may cross the seam
 DESCRIPTOR_SIZE = 128
 ALONE = Workers()

@@ -10,8 +10,8 @@ from ..runtime.threads import Workers
 from .feature_map import FeatureMap, project
 from .keypoints import Keypoints
 
-NUM_NEIGHBORS = 3  # features of the map that a feature of the photo is matched to, at most
-NUM_LISTS = 12  # that are looked through
+NUM_NEIGHBORS = 4  # features of the map that a feature of the photo is matched to, at most
+NUM_LISTS = 16  # that are looked through
 APART = np.float32(0.3)  # [m] features of the map nearer to each other are one
 BATCH = 64  # features a thread takes at a time
 DISTINCT_RATIO = 0.8  # of squared distances, best by second best elsewhere (Lowe)
