@@ -29,6 +29,7 @@ LAYERS = [
     "confidence",
     "render",
     "panorama",
+    "camera",
     "cloud",
     "geometry",
     "runtime",

@@ -75,11 +75,11 @@ def pixel_jacobian(x, y, z, rho2, width):
     return y * per_rho2, -x * per_rho2, x * z * per_rho_r2, y * z * per_rho_r2, -rho2 * per_rho_r2
 
 
-def pixel_rays(width: int, rows: slice = slice(None)) -> NDArray[np.float64]:
-    """Unit camera directions (width / 2, width, 3) of pixel centres of a `width` image, or of its `rows`."""
-    azimuth = (0.5 - (np.arange(width) + 0.5) / width) * 2.0 * np.pi
+def pixel_rays(width: int, rows: slice = slice(None), columns: slice = slice(None)) -> NDArray[np.float64]:
+    """Unit camera directions (width / 2, width, 3) of pixel centres of a `width` image, or a part of it."""
+    azimuth = (0.5 - (np.arange(width)[columns] + 0.5) / width) * 2.0 * np.pi
     elevation = (0.5 - (np.arange(width // 2)[rows] + 0.5) / (width // 2)) * np.pi
-    rays = np.empty((len(elevation), width, 3))
+    rays = np.empty((len(elevation), len(azimuth), 3))
     rays[..., 0] = np.cos(elevation)[:, None] * np.cos(azimuth)
     rays[..., 1] = np.cos(elevation)[:, None] * np.sin(azimuth)
     rays[..., 2] = np.sin(elevation)[:, None]
