@@ -75,10 +75,15 @@ def pixel_jacobian(x, y, z, rho2, width):
     return y * per_rho2, -x * per_rho2, x * z * per_rho_r2, y * z * per_rho_r2, -rho2 * per_rho_r2
 
 
-def pixel_rays(width: int, rows: slice = slice(None), columns: slice = slice(None)) -> NDArray[np.float64]:
-    """Unit camera directions (width / 2, width, 3) of pixel centres of a `width` image, or a part of it."""
-    azimuth = (0.5 - (np.arange(width)[columns] + 0.5) / width) * 2.0 * np.pi
-    elevation = (0.5 - (np.arange(width // 2)[rows] + 0.5) / (width // 2)) * np.pi
+def pixel_rays(width: int, rows: slice = slice(None)) -> NDArray[np.float64]:
+    """Unit camera directions (width / 2, width, 3) of pixel centres of a `width` image, or of its `rows`."""
+    return rays_at(width, np.arange(width) + 0.5, np.arange(width // 2)[rows] + 0.5)
+
+
+def rays_at(width: int, u: NDArray[np.floating], v: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Unit camera directions (len(v), len(u), 3) of columns and rows, continuous, of a `width` image."""
+    azimuth = (0.5 - u / width) * 2.0 * np.pi
+    elevation = (0.5 - v / (width // 2)) * np.pi
     rays = np.empty((len(elevation), len(azimuth), 3))
     rays[..., 0] = np.cos(elevation)[:, None] * np.cos(azimuth)
     rays[..., 1] = np.cos(elevation)[:, None] * np.sin(azimuth)
