@@ -9,6 +9,7 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from .camera import Calibration
 from .camera.files import read_calibration, read_rig
 from .cloud.settings import CloudSettings
 from .cloud.soa import PackedPoints
@@ -156,9 +157,13 @@ class Scan:
         read_options: ReadOptions,
         settings: Settings,
         is_masked: NDArray[np.bool_] | None = None,
+        calibration: Calibration | None = None,
     ) -> Result:
-        """The same with all options as objects; the mask of an array apart."""
+        """The same with all options as objects; apart the mask of an array, and the camera of this photo."""
         watch = Stopwatch()
+        repeated = settings_json(settings, self.cloud_settings, read_options)
+        if calibration is not None and read_options.calibration is None:
+            read_options = replace(read_options, calibration=calibration)
         with watch.stage("read"):
             picture = read_query(panorama, read_options, is_masked)
             if isinstance(panorama, np.ndarray):
@@ -178,7 +183,7 @@ class Scan:
             cloud=self.name,
             pano="array" if isinstance(panorama, np.ndarray) else str(panorama),
             seconds=watch.seconds,
-            settings=settings_json(settings, self.cloud_settings, read_options),
+            settings=repeated,
             warnings=self.warnings + picture.warnings + ((LABELS_WARNING,) if read_options.labels else ()),
             source=Source(
                 self.prepared.scan_sha256 or None, photo.sha256, photo.image_size, photo.capture_time

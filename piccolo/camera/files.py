@@ -36,6 +36,14 @@ OPENSFM: dict[str, tuple[str, str]] = {
 
 
 def read_calibration(path: Path) -> Calibration:
+    """The cameras in a file that take one picture, as `read_cameras`; InputError if they are a rig."""
+    calibration = read_cameras(path)
+    if calibration.is_rig:
+        raise InputError(f"{path}: found a rig, each camera with an image of its own: give it as --rig")
+    return calibration
+
+
+def read_cameras(path: Path) -> Calibration:
     """The cameras in a file, told by its content.
 
     Raises InputError if it can't be read, is of no format known, or holds what is no camera.
@@ -44,13 +52,10 @@ def read_calibration(path: Path) -> Calibration:
     is_json = text.lstrip()[:1] in ("{", "[")
     try:
         document = json.loads(text) if is_json else None
-        calibration = _of_document(path, document) if is_json else _of_colmap(path, text)
+        return _of_document(path, document) if is_json else _of_colmap(path, text)
     except DAMAGE as error:
         text = str(error) if isinstance(error, InputError) else f"found {describe(error)}"
         raise InputError(text if text.startswith(str(path)) else f"{path}: {text}; {WANTED}") from error
-    if calibration.is_rig:
-        raise InputError(f"{path}: found a rig, each camera with an image of its own: give it as --rig")
-    return calibration
 
 
 def read_rig(path: Path) -> Calibration:

@@ -127,6 +127,10 @@ class Camera:
         params = tuple(value * factors.get(name, 1.0) for name, value in self._named.items())
         return replace(self, width=width, height=height, params=params)
 
+    def scaled_to_width(self, width: int) -> "Camera":
+        """The same camera with its picture at another width [px]."""
+        return self.scaled(width, max(1, round(width * self.height / self.width)))
+
     def pixels(self, rays: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Pixels (..., 2) that rays (..., 3) of any length come to, and which are in the picture (...).
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
-from ..geometry.pose import Array, checked_rotation
+from ..geometry.pose import Array, Pose, checked_rotation
 from .model import Camera
 
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -46,6 +46,11 @@ class Mount:
     def rotation(self) -> Array:
         """R_lens_from_cam as an array (3, 3)."""
         return np.array(self.R_lens_from_cam, dtype=np.float64)
+
+    def pose(self, pose: Pose) -> Pose:
+        """The camera's own pose, of the whole's."""
+        center_world = pose.center_world + pose.R_cam_from_world.T @ np.array(self.center_cam)
+        return Pose(self.rotation @ pose.R_cam_from_world, center_world)
 
     def with_camera(self, camera: Camera) -> "Mount":
         """Another camera at the same place."""
