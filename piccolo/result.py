@@ -11,6 +11,9 @@ from typing import Any
 import numpy as np
 
 from . import __version__
+from .camera import Mount
+from .camera.files import document_of as camera_document
+from .camera.files import mounts_of
 from .coarse_to_fine.gps import GpsPrior
 from .confidence.alternatives import Hypothesis
 from .confidence.confidence import AMBIGUOUS, LOCALIZED
@@ -22,7 +25,7 @@ from .geometry.pose import Pose, T_world_from_cam, checked_rotation, quaternion_
 from .geometry.sphere import CONVENTION
 from .runtime.json_file import document_of, parse_lines, read_bytes
 
-FORMAT = "piccolo-pose/4"
+FORMAT = "piccolo-pose/5"
 UNREADABLE = "unreadable"
 POSE_FIELDS = ("R_cam_from_world", "center_world", "quaternion_wxyz", "T_world_from_cam")
 MAX_ROTATION_ERROR = 1e-6  # of R R^T from the identity, in a file
@@ -64,6 +67,7 @@ class Result:
     source: Source = Source()
     error: str | None = None  # why a photo is "unreadable"
     gps_prior: GpsPrior | None = None  # where the photo's GPS position lies in the scan, if both are known
+    cameras: tuple[Mount, ...] = ()  # that took it; none if it came as a sphere or a part of one
 
     @property
     def pose(self) -> Pose | None:
@@ -114,6 +118,7 @@ class Result:
             "error": self.error,
             "cloud": self.cloud,
             "pano": self.pano,
+            "camera": camera_document(self.cameras) if self.cameras else None,
             **asdict(self.source),
             **(_pose_json(self.pose) or dict.fromkeys(POSE_FIELDS)),
             "best_guess": _pose_json(self.best_guess),
@@ -143,6 +148,7 @@ class Result:
                 cloud=cloud if isinstance(cloud, str) else _paths(cloud),
                 best_pose=_best_pose_from_json(document),
                 source=_source_from_json(document),
+                cameras=mounts_of(document["camera"]) if document.get("camera") else (),
                 gps_prior=_gps_prior_from_json(document["gps_prior"]),
                 evidence=document["evidence"] and Evidence(**document["evidence"]),
                 alternatives=tuple(map(_alternative_from_json, document["alternatives"])),

@@ -9,6 +9,8 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from .camera import Calibration
+from .camera.files import read_calibration, read_rig
 from .cloud.settings import CloudSettings
 from .cloud.soa import PackedPoints
 from .coarse_to_fine.gps import GpsPrior, gps_prior
@@ -22,7 +24,8 @@ from .errors import InputError
 from .geometry.pose import Pose
 from .geometry.rotations import Gravity
 from .optimize.settings import Solver
-from .panorama import Panorama, ReadOptions, read_panorama
+from .panorama import Panorama, ReadOptions, panorama_of_array, read_panorama
+from .panorama.model import Projection
 from .panorama.photo import Photo, photo_of, photo_of_array
 from .paper.localize import PaperMap
 from .paper.localize import localize as localize_by_paper
@@ -42,6 +45,11 @@ class QueryOptions(TypedDict, total=False):
     mask: File | NDArray[np.bool_]  # what is to be ignored: white pixels of a picture, True of an array
     mask_nadir_deg: float  # the cap of this half angle about the camera's down axis is ignored
     fov_deg: float  # horizontal field of view of a picture that is a part of the sphere
+    projection: Projection  # of the picture: "equirectangular", "pinhole" or "fisheye"
+    focal_px: float  # focal length of a pinhole photo [px]
+    camera: File  # calibration of the camera, see docs/CAMERAS.md
+    rig: File  # the same of several cameras; the panorama is the folder of one instant's pictures
+    gravity_vector: tuple[float, float, float]  # down, in the camera's axes
     cube_order: str  # the picture is six cube faces in this order, such as "rludfb"
     use_gps: bool  # a GPS position in the file narrows the search (default), or not
     gravity: Gravity  # "known": upright camera, "unknown": any rotation, "auto": both are tried
@@ -125,6 +133,12 @@ class Scan:
         prior = {k: given.pop(k) for k in PRIOR_FIELDS & given.keys()}
         if prior:
             given["prior"] = Prior(**prior)
+        if "camera" in given and "rig" in given:
+            raise InputError("camera, rig: wanted only one of them")
+        if "camera" in given:
+            given["calibration"] = read_calibration(Path(given.pop("camera")))
+        if "rig" in given:
+            given["calibration"] = read_rig(Path(given.pop("rig")))
         read_options = ReadOptions(
             labels=self.cloud_settings.labels, **{k: given.pop(k) for k in READ_FIELDS & given.keys()}
         )
@@ -154,12 +168,19 @@ class Scan:
         read_options: ReadOptions,
         settings: Settings,
         is_masked: NDArray[np.bool_] | None = None,
+        calibration: Calibration | None = None,
     ) -> Result:
-        """The same with all options as objects; the mask of an array apart."""
+        """The same with all options as objects; apart the mask of an array, and the camera of this photo."""
         watch = Stopwatch()
+        repeated = settings_json(settings, self.cloud_settings, read_options)
+        if calibration is not None and read_options.calibration is None:
+            read_options = replace(read_options, calibration=calibration)
         with watch.stage("read"):
             picture = read_query(panorama, read_options, is_masked)
-            photo = photo_of_array(panorama) if isinstance(panorama, np.ndarray) else photo_of(Path(panorama))
+            if isinstance(panorama, np.ndarray):
+                photo = photo_of_array(panorama)
+            else:
+                photo = photo_of(Path(panorama), read_options.rig)
         gps = None
         if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
             gps = self.gps_prior_of(photo, settings) if read_options.use_gps else None
@@ -173,12 +194,13 @@ class Scan:
             cloud=self.name,
             pano="array" if isinstance(panorama, np.ndarray) else str(panorama),
             seconds=watch.seconds,
-            settings=settings_json(settings, self.cloud_settings, read_options),
+            settings=repeated,
             warnings=self.warnings + picture.warnings + ((LABELS_WARNING,) if read_options.labels else ()),
             source=Source(
                 self.prepared.scan_sha256 or None, photo.sha256, photo.image_size, photo.capture_time
             ),
             gps_prior=gps,
+            cameras=picture.cameras,
         )
 
     def gps_prior_of(self, photo: Photo, settings: CoarseToFineSettings) -> GpsPrior | None:
@@ -217,19 +239,23 @@ def settings_json(
 def read_query(
     panorama: File | NDArray[np.uint8], options: ReadOptions, is_masked: NDArray[np.bool_] | None = None
 ) -> Panorama:
-    """The panorama in a file; or in an array (H, W, 3), with a mask (H, W) of what is to be ignored."""
+    """The panorama in a file; or in an array (H, W, 3), with a mask (H, W) of what is to be ignored.
+
+    An array that no camera is given for is a full sphere.
+    """
     if not isinstance(panorama, np.ndarray):
         if is_masked is not None:
             raise InputError("mask: an array goes with a panorama that is an array; give a picture's path")
         return read_panorama(Path(panorama), options)
-    if panorama.dtype != np.uint8 or panorama.ndim != 3 or panorama.shape[1:] != (2 * len(panorama), 3):
+    if panorama.dtype != np.uint8 or panorama.ndim != 3 or panorama.shape[2] != 3 or not panorama.size:
         found = f"{panorama.dtype} of shape {panorama.shape}"
-        raise InputError(f"panorama: found {found}, wanted RGB in uint8 of shape (H, 2 H, 3)")
-    if replace(options, labels=None, use_gps=True) != ReadOptions():
-        raise InputError("panorama: fov_deg, cube_order, mask_nadir_deg and a mask's path go with files")
+        raise InputError(f"panorama: found {found}, wanted RGB in uint8 of shape (H, W, 3)")
+    is_crop = options.fov_deg is not None and options.projection not in ("pinhole", "fisheye")
+    if options.mask or options.mask_nadir_deg or options.cube_order or options.rig or is_crop:
+        raise InputError("panorama: fov_deg, cube_order, mask_nadir_deg, rig and a mask's path go with files")
     is_valid = np.ones(panorama.shape[:2], np.bool_)
     if is_masked is not None:
         if is_masked.shape != is_valid.shape or is_masked.dtype != np.bool_:
             raise InputError(f"mask: wanted an array of bool of shape {is_valid.shape}, as the panorama's")
         is_valid = ~is_masked
-    return Panorama(np.ascontiguousarray(panorama), is_valid)
+    return panorama_of_array(np.ascontiguousarray(panorama), is_valid, options)

@@ -5,6 +5,8 @@ import pycolmap
 import pytest
 from poses import CENTER, SIZE, WIDTH, jpeg, json_of, lines_of, pixels_and_points, result, tilted_poses
 
+from piccolo.camera import Camera, Mount
+from piccolo.camera.model import pinhole
 from piccolo.errors import InputError
 from piccolo.geometry.pose import exp_so3, log_so3
 from piccolo.scenes.export import Options, export
@@ -86,6 +88,57 @@ def test_colmap_is_read_by_pycolmap_and_projects_to_our_pixels(tmp_path):
         pixels, points = pixels_and_points(pose)
         _check_pixels(np.array([image.project_point(point) for point in points]), pixels)
         np.testing.assert_allclose(image.projection_center(), pose.center_world, rtol=0, atol=1e-8)
+
+
+CAMERA = Camera("OPENCV", 640, 480, (500.0, 505.0, 322.5, 241.0, -0.1, 0.02, 1e-3, -2e-3))
+TILTED = tuple(map(tuple, exp_so3(np.array([0.1, 0.7, -1.2])).tolist()))
+
+
+def test_colmap_has_the_camera_of_a_photo_and_of_each_picture_of_a_rig(tmp_path):
+    """A world point, by our camera, and by COLMAP's of the model that we wrote."""
+    (tmp_path / "rig").mkdir()
+    for name in ("left.jpg", "right.jpg"):
+        jpeg(tmp_path / "rig" / name)
+    rig = (
+        Mount(CAMERA, image="left.*"),
+        Mount(pinhole(640, 480, 400.0), TILTED, (0.1, 0.2, 0.3), image="r*"),
+    )
+    results = [
+        result(tmp_path / "a.jpg", POSES[0], cameras=(Mount(CAMERA),)),
+        result(tmp_path / "rig", POSES[1], cameras=rig),
+    ]
+    export(results, "colmap", tmp_path / "model", Options(images=tmp_path))
+    model = pycolmap.Reconstruction(str(tmp_path / "model"))
+    images = {image.name: image for image in model.images.values()}
+    assert model.num_cameras() == 2
+    wanted = {
+        "a.jpg": (POSES[0], Mount(CAMERA)),
+        "rig/left.jpg": (POSES[1], rig[0]),
+        "rig/right.jpg": (POSES[1], rig[1]),
+    }
+    assert images.keys() == wanted.keys()
+    for name, (pose, mount) in wanted.items():
+        pixels = np.random.default_rng(1).uniform(0.0, 1.0, (50, 2)) * (640, 480)
+        x_lens = 5.0 * mount.camera.rays(pixels)[0]
+        x_cam = x_lens @ np.array(mount.R_lens_from_cam) + np.array(mount.center_cam)
+        points = x_cam @ pose.R_cam_from_world + pose.center_world
+        found = np.array([images[name].project_point(point) for point in points])
+        assert np.abs(found - pixels).max() < TOLERANCE
+
+
+@pytest.mark.parametrize("name", ["nerfstudio", "opensfm", "potree", "gpano"])
+def test_photos_are_refused_by_formats_of_spheres(tmp_path, name):
+    photo = result(tmp_path / "a.jpg", POSES[0], cameras=(Mount(CAMERA),))
+    with pytest.raises(InputError, match=r"a.jpg: found a photo by the model OPENCV, wanted a sphere for"):
+        export([photo], name, tmp_path / "out", Options())
+    export([photo], "csv", tmp_path / "poses.csv", Options())
+    assert len(lines_of(tmp_path / "poses.csv")) == 2
+
+
+def test_two_cameras_in_one_picture_are_refused_by_colmap(tmp_path):
+    two = (Mount(CAMERA), Mount(CAMERA, TILTED, offset=(640, 0)))
+    with pytest.raises(InputError, match="found 2 cameras in one picture, wanted one for colmap"):
+        export([result(tmp_path / "a.jpg", POSES[0], cameras=two)], "colmap", tmp_path / "out", Options())
 
 
 def test_colmap_has_a_camera_a_size_and_refuses_blanks_in_names(tmp_path):

@@ -173,5 +173,5 @@ def test_pictures_that_do_not_keep_labels_are_refused(tmp_path):
     assert_refused(wanted, read_panorama, write(tmp_path / "b.png", bytes(bits)), READ_IMAGE)
     with pytest.raises(InputError, match=r"found labels of 128 x 65, wanted the full sphere, W = 2 H"):
         read_panorama(_png(tmp_path / "c.png", np.zeros((65, 128), np.uint8)), READ_IMAGE)
-    with pytest.raises(InputError, match="--labels: found --fov or --cube-order too"):
+    with pytest.raises(InputError, match="--labels: found --fov or --projection too"):
         PanoramaOptions(fov_deg=90.0, labels=Labels())

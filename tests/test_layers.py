@@ -31,6 +31,7 @@ LAYERS = [
     "confidence",
     "render",
     "panorama",
+    "camera",
     "cloud",
     "geometry",
     "runtime",

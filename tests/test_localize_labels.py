@@ -79,7 +79,7 @@ def test_wrong_use_of_labels_is_refused(scene, capsys):
     for options, expected, told in (
         (["--ignore-labels", "3"], 2, "--ignore-labels: only with --labels"),
         (["--labels", "--intensity-as-gray"], 2, "--labels, --intensity-as-gray: found both"),
-        (["--labels", "--fov", "90"], 2, "--labels: found --fov or --cube-order too"),
+        (["--labels", "--fov", "90"], 2, "--labels: found --fov or --projection too"),
     ):
         _, code, err = _localized(scene, capsys, *options)
         assert (code, told in err) == (expected, True)

@@ -153,7 +153,7 @@ def fisheyes(radius=0.49, floor=0.0):
 
 @pytest.mark.parametrize(("radius", "floor"), [(0.5, 0.0), (0.46, 6.0)])
 def test_two_fisheyes_are_refused(tmp_path, radius, floor):
-    with pytest.raises(InputError, match="two fisheye pictures side by side: stitch them"):
+    with pytest.raises(InputError, match="two fisheye pictures side by side, wanted their calibration"):
         read(tmp_path / "a.insp", fisheyes(radius, floor))
 
 

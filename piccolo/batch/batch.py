@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__
+from ..camera import Calibration
 from ..cloud.settings import CloudSettings
 from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..errors import InputError
@@ -40,7 +41,7 @@ class Batch:
         try:
             return scan.localize_query(pano, self.read_options, settings)
         except (OSError, InputError) as error:
-            source = Source(scan.prepared.scan_sha256 or None, pano_sha256(pano))
+            source = Source(scan.prepared.scan_sha256 or None, pano_sha256(pano, self.read_options.rig))
             repeated = settings_json(settings, self.cloud_settings, self.read_options)
             return unreadable_result(str(error), scan.name, str(pano), settings=repeated, source=source)
 
@@ -49,7 +50,7 @@ class Batch:
         repeated = settings_json(self.settings_of(pano), self.cloud_settings, self.read_options)
         expected = {
             "pano": str(pano),
-            "pano_sha256": pano_sha256(pano),
+            "pano_sha256": pano_sha256(pano, self.read_options.rig),
             "cloud": cloud,
             "cloud_sha256": cloud_sha256,
             "settings": repeated,
@@ -78,9 +79,9 @@ class Batch:
         return counts, size
 
 
-def pano_sha256(pano: Path) -> str | None:
+def pano_sha256(pano: Path, rig: Calibration | None) -> str | None:
     """Digest of a panorama's file; None for one that is missing or no picture."""
     try:
-        return photo_of(pano).sha256
+        return photo_of(pano, rig).sha256
     except (OSError, InputError):
         return None

@@ -1,6 +1,6 @@
 """The panoramas of a batch: pictures, folders of pictures, lists, and names that come on standard input."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TextIO
 
@@ -17,11 +17,13 @@ def is_from_stdin(words: Sequence[str]) -> bool:
     return STDIN in words
 
 
-def panoramas_of(words: Iterable[str], stdin: TextIO) -> Iterator[Path]:
+def panoramas_of(
+    words: Iterable[str], stdin: TextIO, is_panorama: Callable[[Path], bool] = is_cube
+) -> Iterator[Path]:
     """The panoramas that words name, in order: a picture, a folder, `@list.txt`, or `-` for lines of `stdin`.
 
-    A folder is one panorama if it holds the six faces of a cube, else all pictures in it and in its folders,
-    sorted by path.
+    A folder is one panorama if it holds the six faces of a cube, or what else `is_panorama` tells, else all
+    pictures in it and in its folders, sorted by path.
 
     Raises
     ------
@@ -35,17 +37,22 @@ def panoramas_of(words: Iterable[str], stdin: TextIO) -> Iterator[Path]:
             lines = read_text(Path(word[1:]), WANTED_LIST).splitlines()
             yield from (Path(line) for line in lines if line.strip())
         else:
-            yield from _at(Path(word))
+            yield from _at(Path(word), is_panorama)
 
 
-def _at(path: Path) -> Iterator[Path]:
-    if not path.is_dir() or is_cube(path):
+def _at(path: Path, is_panorama: Callable[[Path], bool]) -> Iterator[Path]:
+    if not path.is_dir() or is_panorama(path):
         yield path
         return
     folders = [path, *(folder for folder in path.rglob("*") if folder.is_dir())]
-    cubes = [folder for folder in folders if is_cube(folder)]
-    files = (file for folder in folders if folder not in cubes for file in folder.iterdir())
+    whole = [folder for folder in folders if is_panorama(folder)]
+    files = (
+        file
+        for folder in folders
+        if not any(folder.is_relative_to(other) for other in whole)
+        for file in folder.iterdir()
+    )
     pictures = [file for file in files if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")]
-    if not pictures and not cubes:
+    if not pictures and not whole:
         raise InputError(f"{path}: a folder without a JPEG, PNG, TIFF or WebP picture")
-    yield from sorted([*pictures, *cubes])
+    yield from sorted([*pictures, *whole])

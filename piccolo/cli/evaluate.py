@@ -132,7 +132,8 @@ def outputs_of(arguments: argparse.Namespace) -> dict[str, Path | None]:
 
 def check_files(arguments: argparse.Namespace, inputs: list[Path]) -> None:
     """Refuse outputs that would replace an input, a run or each other."""
-    more = filter(None, (arguments.results, arguments.mask, *(arguments.compare or ())))
+    given = arguments.results, arguments.mask, arguments.camera, arguments.rig
+    more = filter(None, (*given, *(arguments.compare or ())))
     check_distinct({"--out": arguments.out, **outputs_of(arguments)}, [*inputs, *more])
     check_outputs(outputs_of(arguments))
 

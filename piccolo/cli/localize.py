@@ -21,6 +21,7 @@ from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..opening import open_files
 from ..panorama import read_panorama
+from ..panorama.cube import is_cube
 from ..render.surfel_renderer import encode_image, overlay_png
 from ..result import UNREADABLE, Result
 from ..runtime.atomic import STDOUT, check_output, is_stdout, is_stream, write_atomically
@@ -65,7 +66,7 @@ def is_resumable(out: Path | None) -> bool:
 
 def check_files(arguments: argparse.Namespace, panoramas: list[Path], total: int | None) -> None:
     """Refuse, before any work, what could not be written, or would replace an input or another output."""
-    given = filter(None, (arguments.mask, arguments.priors))
+    given = filter(None, (arguments.mask, arguments.priors, arguments.camera, arguments.rig))
     lists = [Path(word[1:]) for word in arguments.pano if word.startswith("@")]
     pictures = {"--overlay": arguments.overlay, "--occlusion-mask": arguments.occlusion_mask}
     outputs = {"--out": arguments.out or STDOUT, **pictures}
@@ -94,7 +95,8 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
             raise UsageError("--priors: not an option of the preset paper")
         priors = read_priors(arguments.priors, settings.prior)
     batch = Batch(settings, cloud_settings, read_options, priors)
-    panoramas, total = panoramas_of(arguments.pano, sys.stdin), None
+    is_one = read_options.rig.is_instant if read_options.rig else is_cube
+    panoramas, total = panoramas_of(arguments.pano, sys.stdin, is_one), None
     known: list[Path] = []
     if not is_from_stdin(arguments.pano):
         known = list(panoramas)

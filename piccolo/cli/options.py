@@ -5,12 +5,14 @@ from pathlib import Path
 from typing import Any, get_args
 
 from .. import __version__
+from ..camera.files import read_calibration, read_rig
 from ..cloud.crs import check_crs
 from ..cloud.label_colors import Labels
 from ..cloud.settings import METRES, CloudSettings, UpAxis
 from ..coarse_to_fine.settings import CoarseToFineSettings, Prior
 from ..errors import InputError
 from ..panorama import ReadOptions
+from ..panorama.model import Projection
 from ..paper.settings import Initialization, PaperSettings, PoseLoss
 from ..runtime.threads import num_cores
 from .parser import add_run_options, new_parser
@@ -112,7 +114,8 @@ def add_panorama_options(parser: argparse.ArgumentParser) -> None:
     """The panoramas' files, and how to read them."""
     group = parser.add_argument_group("panorama")
     text = (
-        "JPEG, PNG, TIFF or WebP: 2:1, or a crop with Photo Sphere metadata; or a folder of six cube faces; "
+        "JPEG, PNG, TIFF or WebP: 2:1, a crop with Photo Sphere metadata, or a photo with a focal length; "
+        "a folder of six cube faces, or with --rig of the pictures of one instant; "
         "or a folder of pictures, @FILE with a path a line, or - for paths on stdin, answered as they come"
     )
     group.add_argument("--pano", required=True, nargs="+", help=text)
@@ -121,8 +124,18 @@ def add_panorama_options(parser: argparse.ArgumentParser) -> None:
 
 def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
     """What the files of the panoramas do not tell."""
-    text = "horizontal field of view of a part of the sphere, its middle row the horizon"
+    text = "horizontal field of view, of a part of the sphere about the horizon or as --projection says"
     group.add_argument("--fov", type=float, metavar="DEG", help=text)
+    text = "of the picture (default equirectangular; of a photo with EXIF's focal length pinhole)"
+    group.add_argument("--projection", choices=get_args(Projection), help=text)
+    text = "focal length of a pinhole photo, in its own pixels"
+    group.add_argument("--focal", type=float, metavar="PX", help=text)
+    text = "calibration: COLMAP's cameras.txt, OpenSfM's camera_models.json, or JSON of docs/CAMERAS.md"
+    group.add_argument("--camera", type=Path, metavar="FILE", help=text)
+    text = "cameras whose pictures, a folder, are one query: COLMAP's rig_config.json, or our JSON"
+    group.add_argument("--rig", type=Path, metavar="FILE", help=text)
+    text = "down, in the camera's axes (+x image centre, +y left, +z up), of any length: 0 0 -1 is upright"
+    group.add_argument("--gravity-vector", type=float, nargs=3, metavar=("X", "Y", "Z"), help=text)
     text = (
         "picture, white where the panorama is to be ignored; or a folder of masks with the panoramas' names"
     )
@@ -140,7 +153,18 @@ def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
 def read_options_from(arguments: argparse.Namespace) -> ReadOptions:
     """The options of add_panorama_options."""
     pictures = arguments.fov, arguments.mask, arguments.mask_nadir, arguments.cube_order
-    return ReadOptions(*pictures, labels_from(arguments), not arguments.no_gps)
+    if arguments.camera and arguments.rig:
+        raise InputError("--camera, --rig: wanted only one of them")
+    calibration = read_calibration(arguments.camera) if arguments.camera else None
+    return ReadOptions(
+        *pictures,
+        labels_from(arguments),
+        not arguments.no_gps,
+        arguments.projection,
+        arguments.focal,
+        read_rig(arguments.rig) if arguments.rig else calibration,
+        tuple(arguments.gravity_vector) if arguments.gravity_vector else None,
+    )
 
 
 def cloud_settings_from(arguments: argparse.Namespace) -> CloudSettings:

@@ -5,10 +5,13 @@ import json
 from contextlib import nullcontext
 from io import BytesIO
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera import Camera, Mount
+from ..camera.files import read_calibration
 from ..cloud.soa import LocalCloud
 from ..coarse_to_fine.open_map import open_points
 from ..errors import InputError
@@ -25,6 +28,7 @@ from ..optimize.settings import DescentSettings
 from ..panorama import read_panorama
 from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
+from ..render.field import cut_view, sphere_width_for
 from ..render.surfel_renderer import encode_image, fill_holes, render_points
 from ..result import read_results
 from ..runtime.atomic import check_output, check_output_folder, is_stream, replacing_folder, write_atomically
@@ -57,7 +61,14 @@ SUFFIXES = {  # of outputs, those of stdout and devices first; "" is a folder
     "mask_out": (".png",),
     "animate": (".gif", ".mp4", ""),
 }
-Named = list[tuple[str, Pose]]  # poses in the world with the panorama's path
+
+
+class Shot(NamedTuple):
+    """A picture to draw."""
+
+    pano: str  # the panorama's path
+    pose: Pose  # of the camera, in the world
+    camera: Camera | None  # None for a sphere
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -74,7 +85,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         option(group, f"--{angle} DEG", "with --at (default 0)")
     group = parser.add_argument_group("picture")
     option(group, "--out FILE", ".png or .jpg; of several poses a new folder of .png, named as the panoramas")
-    option(group, "--width PX", "twice the height", default=2048)
+    option(group, "--width PX", "of a sphere twice the height", default=2048)
+    text = "draw what this camera sees (docs/CAMERAS.md; default: that of --result, or else the sphere)"
+    option(group, "--camera FILE", text)
     text = "fill them from around, mark them magenta, or leave them black"
     option(group, "--holes", text, choices=["close", "mark", "black"], default="close")
     option(group, "--depth FILE", ".png or .npy, see below")
@@ -132,10 +145,10 @@ def suffix_of(arguments: argparse.Namespace, name: str) -> str:
     return SUFFIXES[name][0] if is_stream(path) else path.suffix.lower()
 
 
-def check_files(arguments: argparse.Namespace, poses: Named) -> None:
+def check_files(arguments: argparse.Namespace, poses: list[Shot]) -> None:
     """Refuse, before any work, what could not be written, or would replace an input."""
-    given = arguments.result, arguments.queries, arguments.pose, arguments.photo
-    photos = [photo_of(arguments, name) for name, _ in poses]
+    given = arguments.result, arguments.queries, arguments.pose, arguments.photo, arguments.camera
+    photos = [photo_of(arguments, shot.pano) for shot in poses]
     check_distinct(outputs_of(arguments), [*arguments.cloud, *filter(None, given), *photos])
     for path in filter(None, outputs_of(arguments).values()):
         (check_output_folder if is_folder(path) else check_output)(path)
@@ -147,25 +160,35 @@ def photo_of(arguments: argparse.Namespace, name: str) -> Path:
     return arguments.photo or folder / name
 
 
-def poses_from(arguments: argparse.Namespace) -> Named:
-    """The poses asked for, named by the panorama's path, the pose's file or "at"."""
+def poses_from(arguments: argparse.Namespace) -> list[Shot]:
+    """The poses asked for, named by the panorama's path, the pose's file or "at", with their cameras."""
+    given = read_calibration(arguments.camera).mounts if arguments.camera else ()
+    if len(given) > 1:
+        raise InputError(f"{arguments.camera}: found {len(given)} cameras, wanted one")
     if arguments.at:
         angles = [angle or 0.0 for angle in (arguments.heading, arguments.pitch, arguments.roll)]
-        return [("at", Pose(R_cam_from_angles(*angles), np.array(arguments.at)))]
+        return [shot_of("at", Pose(R_cam_from_angles(*angles), np.array(arguments.at)), given)]
     if arguments.pose:
-        return [(str(arguments.pose), read_pose_matrix(arguments.pose))]
+        return [shot_of(str(arguments.pose), read_pose_matrix(arguments.pose), given)]
     file = arguments.queries or arguments.result
     if arguments.queries:
-        found = [(name, query.pose) for name, query in read_scene(file).by_name.items()]
+        queries = read_scene(file).by_name.items()
+        found = [shot_of(name, query.pose, given or query.cameras) for name, query in queries]
     else:
-        found = [(r.pano, r.best_pose) for r in read_results([file]) if r.best_pose is not None]
+        results = [r for r in read_results([file]) if r.best_pose is not None]
+        found = [shot_of(r.pano, r.best_pose, given or r.cameras) for r in results if r.best_pose]
     if arguments.pano:
-        found = [(name, pose) for name, pose in found if Path(name).name == Path(arguments.pano).name]
+        found = [shot for shot in found if Path(shot.pano).name == Path(arguments.pano).name]
     if not found:
         raise InputError(f"{file}: no pose" + (f" of {arguments.pano}" if arguments.pano else ""))
     if len(found) > 1 and (arguments.animate or not is_folder(arguments.out)):
         raise InputError(f"{file}: {len(found)} poses; choose one with --pano NAME, or give --out FOLDER")
     return found
+
+
+def shot_of(pano: str, pose: Pose, mounts: tuple[Mount, ...]) -> Shot:
+    """The picture of a pose by its one camera, if it has one; a rig's is the sphere."""
+    return Shot(pano, mounts[0].pose(pose), mounts[0].camera) if len(mounts) == 1 else Shot(pano, pose, None)
 
 
 def depth_file(depth: NDArray[np.float32], suffix: str) -> bytes:
@@ -178,38 +201,46 @@ def depth_file(depth: NDArray[np.float32], suffix: str) -> bytes:
     return file.getvalue()
 
 
-def draw_pictures(arguments: argparse.Namespace, cloud: LocalCloud, poses: Named, workers: Workers) -> None:
+def draw_pictures(
+    arguments: argparse.Namespace, cloud: LocalCloud, poses: list[Shot], workers: Workers
+) -> None:
     """Write the pictures; one JSON line each."""
     is_many = is_folder(arguments.out)
-    names = [f"{Path(pano).stem}.png" for pano, _ in poses] if is_many else [arguments.out.name]
+    names = [f"{Path(shot.pano).stem}.png" for shot in poses] if is_many else [arguments.out.name]
     suffix = ".png" if is_many else suffix_of(arguments, "out")
     if len(set(names)) < len(names):
         raise InputError(f"{arguments.out}: panoramas of the same name; choose one with --pano")
 
-    def write(folder: Path, name: str, pano: str, pose: Pose) -> dict[str, object]:
-        view = render_points(cloud.points, cloud.from_world(pose), arguments.width, workers)
+    def write(folder: Path, name: str, shot: Shot) -> dict[str, object]:
+        camera = shot.camera and shot.camera.scaled_to_width(arguments.width)
+        width = sphere_width_for(camera) if camera else arguments.width
+        view = render_points(cloud.points, cloud.from_world(shot.pose), width, workers)
+        if arguments.holes == "mark":
+            view.rgb[~view.is_seen] = MAGENTA
+        elif arguments.holes == "close":
+            view = view._replace(rgb=fill_holes(view.rgb, view.is_seen))
+        view = cut_view(view, camera) if camera else view
         seen_fraction = round(float(view.is_seen.mean()), 6)
         if arguments.depth:
             write_atomically(arguments.depth, depth_file(view.depth, suffix_of(arguments, "depth")))
         if arguments.mask_out:
             nothing = np.where(view.is_seen, 0, 255).astype(np.uint8)
             write_atomically(arguments.mask_out, encode_image(nothing, ".png"))
-        if arguments.holes == "mark":
-            view.rgb[~view.is_seen] = MAGENTA
-        rgb = fill_holes(view.rgb, view.is_seen) if arguments.holes == "close" else view.rgb
-        write_atomically(folder / name, encode_image(rgb, suffix))
+        write_atomically(folder / name, encode_image(view.rgb, suffix))
         out = arguments.out / name if is_many else arguments.out
-        return {"out": str(out), "pano": pano, "width": arguments.width, "seen_fraction": seen_fraction}
+        return {"out": str(out), "pano": shot.pano, "width": arguments.width, "seen_fraction": seen_fraction}
 
     with replacing_folder(arguments.out) if is_many else nullcontext(arguments.out.parent) as folder:
-        lines = [write(folder, name, *named) for name, named in zip(names, poses, strict=True)]
+        lines = [write(folder, name, shot) for name, shot in zip(names, poses, strict=True)]
     for line in lines:
         print_report(arguments, outputs_of(arguments), json.dumps(line))
 
 
-def animate(arguments: argparse.Namespace, cloud: LocalCloud, poses: Named, workers: Workers) -> None:
+def animate(arguments: argparse.Namespace, cloud: LocalCloud, poses: list[Shot], workers: Workers) -> None:
     """Write the descent towards the pose; one JSON line."""
-    ((name, pose),) = poses
+    ((name, pose, camera),) = poses
+    if camera is not None:
+        raise InputError(f"{name}: found a photo by the model {camera.model}, --animate wanted a sphere")
     panorama = shrink(read_panorama(photo_of(arguments, name)), DESCENT_WIDTH)
     goal = cloud.from_world(pose)
     if arguments.start:

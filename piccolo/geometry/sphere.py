@@ -77,9 +77,14 @@ def pixel_jacobian(x, y, z, rho2, width):
 
 def pixel_rays(width: int, rows: slice = slice(None)) -> NDArray[np.float64]:
     """Unit camera directions (width / 2, width, 3) of pixel centres of a `width` image, or of its `rows`."""
-    azimuth = (0.5 - (np.arange(width) + 0.5) / width) * 2.0 * np.pi
-    elevation = (0.5 - (np.arange(width // 2)[rows] + 0.5) / (width // 2)) * np.pi
-    rays = np.empty((len(elevation), width, 3))
+    return rays_at(width, np.arange(width) + 0.5, np.arange(width // 2)[rows] + 0.5)
+
+
+def rays_at(width: int, u: NDArray[np.floating], v: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Unit camera directions (len(v), len(u), 3) of columns and rows, continuous, of a `width` image."""
+    azimuth = (0.5 - u / width) * 2.0 * np.pi
+    elevation = (0.5 - v / (width // 2)) * np.pi
+    rays = np.empty((len(elevation), len(azimuth), 3))
     rays[..., 0] = np.cos(elevation)[:, None] * np.cos(azimuth)
     rays[..., 1] = np.cos(elevation)[:, None] * np.sin(azimuth)
     rays[..., 2] = np.sin(elevation)[:, None]

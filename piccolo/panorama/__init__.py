@@ -1,6 +1,14 @@
 """Panoramas read from files of any format and shape, always as full spheres; masks and sizes."""
 
 from .model import GPano, Panorama, ReadOptions
-from .read import AS_STORED, panorama_size, read_panorama
+from .read import AS_STORED, panorama_of_array, panorama_size, read_panorama
 
-__all__ = ["AS_STORED", "GPano", "Panorama", "ReadOptions", "panorama_size", "read_panorama"]
+__all__ = [
+    "AS_STORED",
+    "GPano",
+    "Panorama",
+    "ReadOptions",
+    "panorama_of_array",
+    "panorama_size",
+    "read_panorama",
+]

@@ -109,6 +109,17 @@ def rotation_to_level(gpano: GPano) -> Array | None:
     return np.asarray(R_pitch @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]))
 
 
+def attitude_of_gravity(down_cam: tuple[float, float, float]) -> GPano:
+    """Pitch and roll of a camera in whose axes, +x image centre, +y left, +z up, gravity is `down_cam` (3,).
+
+    Up is the third row of R_level_from_cam: (sin pitch, cos pitch sin roll, cos pitch cos roll).
+    """
+    x, y, z = (-value for value in down_cam)
+    across = math.hypot(y, z)
+    roll = math.degrees(math.atan2(y, z)) if across > 0.0 else 0.0
+    return GPano(math.degrees(math.atan2(x, across)), roll)
+
+
 def region_of_fov(fov_deg: float, width: int, height: int) -> CropRegion:
     """A picture with as many pixels a degree in both directions, centred on the horizon."""
     wide, high = fov_deg / 360.0, fov_deg / 180.0 * height / width  # fractions of the sphere's picture

@@ -3,15 +3,18 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, get_args
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera import Calibration, Mount
 from ..cloud.label_colors import Labels
 from ..errors import InputError
 
 FACE_LETTERS = "rludfb"  # right, left, up, down, front, back
+Projection = Literal["equirectangular", "pinhole", "fisheye"]
 
 
 @dataclass(frozen=True)
@@ -30,30 +33,69 @@ class Panorama:
     is_valid: NDArray[np.bool_]  # (H, W), False where the picture shows nothing
     gpano: GPano | None = None  # None for a file without such metadata
     warnings: tuple[str, ...] = ()  # what the user should know of the reading
+    cameras: tuple[Mount, ...] = ()  # that took it; none if it came as a sphere or a part of one
 
 
 @dataclass(frozen=True)
 class ReadOptions:
     """What a picture can't say of itself."""
 
-    fov_deg: float | None = None  # horizontal, of a picture centred on the horizon; goes before metadata
+    fov_deg: float | None = None  # horizontal; goes before metadata
     mask: Path | None = None  # picture, white where the panorama is to be ignored, or a folder of such
     mask_nadir_deg: float = 0.0  # the cap of this half angle about the camera's down axis is ignored
     cube_order: str | None = None  # the picture is six cube faces in this order, such as rludfb
     labels: Labels | None = None  # the picture holds labels, not colours
     use_gps: bool = True  # a GPS position in the file narrows the search, where the scan's system is known
+    projection: Projection | None = None  # of a picture; None: of a sphere, if nothing speaks for a photo
+    focal_px: float | None = None  # of a pinhole [px], at the picture's own size
+    calibration: Calibration | None = None  # of the camera, or of a rig whose pictures are in a folder
+    gravity_vector: tuple[float, float, float] | None = None  # down, in the camera's axes, of any length
 
     def __post_init__(self) -> None:
         """Refuse values that mean nothing, naming the option."""
-        if self.fov_deg is not None and not (math.isfinite(self.fov_deg) and 0.0 < self.fov_deg <= 360.0):
-            raise InputError(f"--fov: found {self.fov_deg}, wanted above 0 and at most 360")
+        _check_number("--fov", self.fov_deg, 360.0)
+        _check_number("--focal", self.focal_px, 1e6)
         if not (math.isfinite(self.mask_nadir_deg) and 0.0 <= self.mask_nadir_deg <= 90.0):
             raise InputError(f"--mask-nadir: found {self.mask_nadir_deg}, wanted 0 to 90")
-        if self.labels and (self.fov_deg is not None or self.cube_order is not None):
-            raise InputError("--labels: found --fov or --cube-order too, wanted a picture of the full sphere")
         if self.cube_order is not None and sorted(self.cube_order) != sorted(FACE_LETTERS):
             wanted = f"wanted each of the letters {FACE_LETTERS} once (right, left, up, down, front, back)"
             raise InputError(f"--cube-order: found {self.cube_order}, {wanted}")
+        if self.projection is not None and self.projection not in get_args(Projection):
+            wanted = f"wanted one of {', '.join(get_args(Projection))}"
+            raise InputError(f"--projection: found {self.projection!r}, {wanted}")
+        vector = self.gravity_vector
+        if vector is not None and not (all(map(math.isfinite, vector)) and math.hypot(*vector) > 0.0):
+            raise InputError(f"--gravity-vector: found {vector}, wanted three finite numbers, not all 0")
+        self._check_together()
+
+    @property
+    def rig(self) -> Calibration | None:
+        """The rig whose pictures a panorama is made of; None for pictures that stand alone."""
+        return self.calibration if self.calibration is not None and self.calibration.is_rig else None
+
+    def _check_together(self) -> None:
+        """Refuse options that say the same thing twice, or of different pictures."""
+        given = {
+            "--camera or --rig": self.calibration is not None,
+            "--focal": self.focal_px is not None,
+            "--cube-order": self.cube_order is not None,
+            "--fov or --projection": self.fov_deg is not None or self.projection is not None,
+        }
+        if self.focal_px is not None and self.fov_deg is None and self.projection == "pinhole":
+            given["--fov or --projection"] = False
+        names = [name for name, is_given in given.items() if is_given]
+        if self.labels and names:
+            raise InputError(f"--labels: found {names[0]} too, wanted a picture of the full sphere")
+        if len(names) > 1:
+            raise InputError(f"{', '.join(names)}: wanted only one of them")
+        if self.projection == "fisheye" and self.fov_deg is None:
+            raise InputError("--projection fisheye: found no --fov, wanted the angle that the width shows")
+
+
+def _check_number(option: str, value: float | None, largest: float) -> None:
+    """Refuse a number that is not above 0 and at most the largest."""
+    if value is not None and not (math.isfinite(value) and 0.0 < value <= largest):
+        raise InputError(f"{option}: found {value}, wanted above 0 and at most {largest:g}")
 
 
 def shrink(panorama: Panorama, width: int) -> Panorama:

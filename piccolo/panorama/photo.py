@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL.ExifTags import GPS, IFD, Base
 
+from ..camera import Calibration
 from ..cloud.digest import sha256_of_arrays
 from ..runtime.json_file import read_bytes
 from .cube import face_paths
@@ -32,21 +33,24 @@ class GpsPosition(NamedTuple):
 class Photo(NamedTuple):
     """A photo's file without its pixels."""
 
-    sha256: str  # of the file; of cube faces, of their digests in the order of FACE_LETTERS, one a line
-    image_size: tuple[int, int]  # width and height [px], as stored; of a cube one face
+    sha256: str  # of the file; of several, of their digests in the order of FACE_LETTERS or rig, one a line
+    image_size: tuple[int, int]  # width and height [px], as stored; of several the first
     capture_time: str | None  # ISO 8601, with the offset from UTC if the file has it
     gps: GpsPosition | None
 
 
-def photo_of(path: Path) -> Photo:
-    """What a photo's file, or the first of a folder of cube faces, says of itself.
+def photo_of(path: Path, rig: Calibration | None = None) -> Photo:
+    """What a photo's file, or the first of a folder of cube faces or of a rig's pictures, says of itself.
 
     Raises
     ------
     InputError
         The file is missing or no picture. Metadata that are damaged count as missing.
     """
-    files = list(face_paths(path).values()) if path.is_dir() else [path]
+    if rig is not None:
+        files = rig.images_in(path)
+    else:
+        files = list(face_paths(path).values()) if path.is_dir() else [path]
     contents = [read_bytes(file, WANTED) for file in files]
     digests = [hashlib.sha256(content).hexdigest() for content in contents]
     sha256 = digests[0] if len(files) == 1 else hashlib.sha256("\n".join(digests).encode()).hexdigest()

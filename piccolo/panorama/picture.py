@@ -8,9 +8,9 @@ import subprocess
 import sys
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 
@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from PIL.ExifTags import Base
+from PIL.ExifTags import IFD, Base
 from PIL.Image import Transpose
 from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
@@ -79,6 +79,8 @@ class Picture:
     is_valid: NDArray[np.bool_]  # (H, W), False where alpha is 0
     xmp: bytes = b""
     warnings: tuple[str, ...] = ()
+    exif: Mapping[int, object] = field(default_factory=dict)  # of the camera, by tag; empty if damaged
+    orientation: object = None  # EXIF's number of how the stored picture was turned to become this one
 
     @property
     def size(self) -> tuple[int, int]:
@@ -105,7 +107,8 @@ def read_picture(path: Path, min_size: tuple[int, int] = (MIN_WIDTH, MIN_HEIGHT)
             pixels = np.ascontiguousarray(pixels[..., :3])
         else:
             is_valid = np.ones(pixels.shape[:2], dtype=np.bool_)
-        return Picture(np.asarray(pixels, np.uint8), is_valid, _xmp(image), _warnings(image))
+        more = _xmp(image), _warnings(image), exif_of(image), _orientation(image)
+        return Picture(np.asarray(pixels, np.uint8), is_valid, *more)
 
 
 def read_labels(path: Path, labels: Labels) -> Picture:
@@ -196,6 +199,14 @@ def _orientation(image: ImageFile) -> object:
         return image.getexif().get(Base.Orientation)
     except Exception:  # as above
         return None
+
+
+def exif_of(image: ImageFile) -> dict[int, object]:
+    """What EXIF says of camera and exposure, by tag; empty where it is missing or damaged."""
+    try:
+        return dict(image.getexif().get_ifd(IFD.Exif))
+    except Exception:  # Pillow raises whatever damaged metadata bring
+        return {}
 
 
 def _decoded_apart(data: bytes, mode: str, size: tuple[int, int]) -> Image.Image:

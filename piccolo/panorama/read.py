@@ -6,13 +6,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera import Calibration, Mount
+from ..camera.resampling import View, sphere_of, sphere_width
+from ..camera.rig import MAX_OFFSET
 from ..cloud.label_colors import Labels
 from ..errors import InputError
+from ..runtime.memory import check_memory
+from .cameras import cameras_of, rig_cameras, views_of
 from .cube import cube_of_cells, face_paths, read_cube_folder
+from .exif import elevation_deg
 from .gpano import (
     ASPECT_TOLERANCE,
     CropRegion,
     attitude,
+    attitude_of_gravity,
     crop_region,
     embed_crop,
     full_size,
@@ -21,12 +28,13 @@ from .gpano import (
 )
 from .masks import black_borders, find_mask, is_dual_fisheye, mask_pole, polar_disc, read_mask
 from .model import GPano, Panorama, ReadOptions
-from .picture import Picture, picture_size, read_labels, read_picture
+from .picture import BYTES_PER_PIXEL, Picture, picture_size, read_labels, read_picture
 
+Shot = tuple[Path, Picture, tuple[Mount, ...]]  # a file with the cameras that took it
 AS_STORED = ReadOptions()
 WANTED = (
     "wanted width = 2 x height (a full equirectangular panorama), GPano metadata of a crop, a field of view "
-    "(--fov), or the order of cube faces (--cube-order)"
+    "(--fov), a photo's focal length (EXIF, --focal, --camera), or the order of cube faces (--cube-order)"
 )
 MIN_REPORTED = 0.001  # of the sphere: borders below this are masked without a warning
 
@@ -47,15 +55,74 @@ def read_panorama(path: Path, options: ReadOptions = AS_STORED) -> Panorama:
     path = Path(path)
     if options.labels:
         return _read_labelled(path, options, options.labels)
+    if options.rig is not None:
+        return _read_rig(path, options.rig, options)
     if path.is_dir():
-        return _embedded_and_masked(path, read_cube_folder(path), CropRegion(), options)
-    picture = read_picture(path)
+        return _embedded_and_masked(path, read_cube_folder(path), CropRegion(), options, None)
+    return panorama_of(path, read_picture(path), options)
+
+
+def panorama_of(path: Path, picture: Picture, options: ReadOptions) -> Panorama:
+    """The panorama of a picture; `path` names it in errors and warnings."""
     if cube := cube_of_cells(path, picture, options.cube_order):
-        return _embedded_and_masked(path, cube, CropRegion(), options)
+        return _embedded_and_masked(path, cube, CropRegion(), options, None)
     fields = gpano_fields(picture.xmp)
-    region, notes = _region_of(path, picture, fields, options.fov_deg)
-    picture = replace(picture, warnings=(*picture.warnings, *notes))
-    return _embedded_and_masked(path, picture, region, options, attitude(fields) if fields else None)
+    cameras, notes = cameras_of(path, picture, options, bool(fields))
+    gpano = attitude(fields) if fields else None
+    if cameras:
+        if gpano is None and (elevation := elevation_deg(picture.exif)) is not None:
+            gpano = GPano(elevation)
+        picture = replace(picture, warnings=(*picture.warnings, *notes))
+        return _on_sphere(path, [(path, picture, cameras)], options, gpano)
+    region, more = _region_of(path, picture, fields, options)
+    picture = replace(picture, warnings=(*picture.warnings, *more))
+    return _embedded_and_masked(path, picture, region, options, gpano)
+
+
+def panorama_of_array(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], options: ReadOptions) -> Panorama:
+    """The panorama of an image (H, W, 3) of a camera that the options name, or else of a full sphere."""
+    path, picture = Path("array"), Picture(rgb, is_valid)
+    cameras, _ = cameras_of(path, picture, options, has_gpano=True)
+    if cameras:
+        return _on_sphere(path, [(path, picture, cameras)], options, None)
+    if rgb.shape[1] != 2 * len(rgb):
+        found = f"{rgb.dtype} of shape {rgb.shape}"
+        raise InputError(f"panorama: found {found}, wanted RGB in uint8 of shape (H, 2 H, 3), or a camera")
+    down = options.gravity_vector
+    return Panorama(rgb, is_valid, None if down is None else attitude_of_gravity(down))
+
+
+def _read_rig(folder: Path, rig: Calibration, options: ReadOptions) -> Panorama:
+    """The panorama of the pictures of one instant."""
+    files = rig.images_in(folder)
+    pictures = [read_picture(file) for file in files]
+    shots = list(zip(files, pictures, rig_cameras(folder, pictures, rig), strict=True))
+    panorama = _on_sphere(folder, shots, options, None)
+    if rig.extent <= MAX_OFFSET:
+        return panorama
+    note = f"the rig's cameras are up to {rig.extent:.2f} m from its origin: near things come out displaced"
+    return replace(panorama, warnings=(*panorama.warnings, note))
+
+
+def _on_sphere(path: Path, shots: list[Shot], options: ReadOptions, gpano: GPano | None) -> Panorama:
+    """The pictures of one instant on one sphere, each with its file and cameras, masks taken out."""
+    cameras = tuple(mount for *_, mounts in shots for mount in mounts)
+    width = sphere_width(cameras)
+    num_bytes = width * width // 2 * BYTES_PER_PIXEL
+    check_memory(num_bytes, f"{path}: the sphere of {width} x {width // 2}", "make the picture smaller")
+    views: list[View] = []
+    notes: list[str] = []
+    counts = None
+    for file, picture, mounts in shots:
+        masks = _user_masks(file, [picture.size, (width, width // 2)], options, notes)
+        counts = masks.get(1, counts)
+        is_valid = picture.is_valid & masks[0] if 0 in masks else picture.is_valid
+        found, more = views_of(file, picture, mounts, is_valid)
+        views += found
+        notes += [*picture.warnings, *more]
+    rgb, is_valid = sphere_of(views, width)
+    panorama = Panorama(rgb, is_valid, gpano, tuple(dict.fromkeys(notes)), cameras)
+    return _masked(path, panorama, counts, options)
 
 
 def panorama_size(path: Path) -> tuple[int, int]:
@@ -80,12 +147,12 @@ def _read_labelled(path: Path, options: ReadOptions, labels: Labels) -> Panorama
 
 
 def _region_of(
-    path: Path, picture: Picture, fields: dict[str, str], fov_deg: float | None
+    path: Path, picture: Picture, fields: dict[str, str], options: ReadOptions
 ) -> tuple[CropRegion, list[str]]:
     """Which part of the sphere a picture shows, by the user or its metadata, and warnings."""
     width, height = picture.size
-    if fov_deg is not None:
-        return region_of_fov(fov_deg, width, height), []
+    if options.fov_deg is not None:
+        return region_of_fov(options.fov_deg, width, height), []
     name = fields.get("ProjectionType", "").lower()
     if name not in ("", "equirectangular"):
         raise InputError(f"{path}: its metadata names the projection {name!r}, wanted equirectangular")
@@ -99,13 +166,13 @@ def _region_of(
         wrong = " and a crop in the metadata that does not fit it" if region is None else ""
         raise InputError(f"{path}: found {width} x {height}{wrong}, {WANTED}")
     if region.is_full and is_dual_fisheye(picture.rgb):
-        found = "two fisheye pictures side by side: stitch them with the camera's program first"
-        raise InputError(f"{path}: {found}")
+        found = "two fisheye pictures side by side, wanted their calibration as --camera (docs/CAMERAS.md)"
+        raise InputError(f"{path}: {found}, or that the camera's program stitches them first")
     return region, notes
 
 
 def _embedded_and_masked(
-    path: Path, picture: Picture, region: CropRegion, options: ReadOptions, gpano: GPano | None = None
+    path: Path, picture: Picture, region: CropRegion, options: ReadOptions, gpano: GPano | None
 ) -> Panorama:
     """The picture at its place in the sphere, with everything masked that is not to be counted."""
     size, notes = full_size(path, region, picture.size), [*picture.warnings]
@@ -134,7 +201,9 @@ def _masked(
     is_valid = mask_pole(is_valid, "nadir", options.mask_nadir_deg)
     if not is_valid.any():
         raise InputError(f"{path}: no pixel is left: all are masked, black, or of ignored labels")
-    return replace(panorama, is_valid=np.ascontiguousarray(is_valid))
+    down = options.gravity_vector
+    gpano = panorama.gpano if down is None else attitude_of_gravity(down)
+    return replace(panorama, is_valid=np.ascontiguousarray(is_valid), gpano=gpano)
 
 
 def _user_masks(

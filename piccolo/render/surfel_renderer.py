@@ -11,6 +11,7 @@ from ..geometry.pose import Array, Pose
 from ..panorama import Panorama
 from ..panorama.model import shrink
 from ..runtime.threads import Workers
+from .field import cut, sphere_width_for
 from .surfels import MIN_RADIUS_PX, Surfels, splat, surfels_of
 from .zbuffer import View, nearest_depth, select_visible
 
@@ -161,7 +162,17 @@ def checkerboard(photo: NDArray[np.uint8], cloud: NDArray[np.uint8]) -> NDArray[
 
 
 def overlay_png(points: PackedPoints, panorama: Panorama, pose: Pose, workers: Workers) -> bytes:
-    """PNG file of three images, one above the other: panorama, cloud from the pose, checkerboard of both."""
-    view = render_points(points, pose, OVERLAY_WIDTH, workers)
-    cloud = fill_holes(view.rgb, view.is_seen)
-    return encode_image(checkerboard(resized_rgb(panorama, OVERLAY_WIDTH), cloud), ".png")
+    """PNG file of three images, one above the other: panorama, cloud from the pose, checkerboard of both.
+
+    A photo by one camera is shown in its own field, others as spheres.
+    """
+    if len(panorama.cameras) != 1:
+        view = render_points(points, pose, OVERLAY_WIDTH, workers)
+        cloud = fill_holes(view.rgb, view.is_seen)
+        return encode_image(checkerboard(resized_rgb(panorama, OVERLAY_WIDTH), cloud), ".png")
+    (mount,) = panorama.cameras
+    camera = mount.camera.scaled_to_width(OVERLAY_WIDTH)
+    view = render_points(points, mount.pose(pose), sphere_width_for(camera), workers)
+    cloud = cut(fill_holes(view.rgb, view.is_seen), camera)
+    photo = cut(panorama.rgb, camera, mount.rotation)
+    return encode_image(checkerboard(photo, cloud), ".png")

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from ..camera import Calibration, Mount
+from ..camera.files import document_of, mounts_of
 from ..errors import InputError
 from ..geometry.pose import Pose, checked_rotation
 from ..geometry.sphere import CONVENTION
@@ -25,10 +27,16 @@ MAX_SKEW = 1e-4  # of R R^T from the identity
 class Query:
     """A panorama with its true pose."""
 
-    image: Path  # a file, or a folder of cube faces
+    image: Path  # a file, or a folder of cube faces or of a rig's pictures
     variant: str  # what sets it apart: how it was taken, or the split of its dataset
     pose: Pose  # in the cloud's coordinates
     labels: Path | None = None  # a picture of what each pixel shows, as numbers
+    cameras: tuple[Mount, ...] = ()  # that took it; none for a sphere
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """The cameras as a file would tell them; None for a sphere."""
+        return Calibration(QUERIES_NAME, self.cameras) if self.cameras else None
 
 
 @dataclass(frozen=True)
@@ -101,7 +109,9 @@ def _query(folder: Path, number: int, entry: dict[str, Any]) -> Query:
         raise ValueError(f"{entry['image']}: a center_world that is not three finite numbers")
     checked_rotation(R_cam_from_world, MAX_SKEW, f"{entry['image']}: an R_cam_from_world that")
     labels = folder / entry["labels"] if entry.get("labels") else None
-    return Query(folder / entry["image"], entry["variant"], Pose(R_cam_from_world, center_world), labels)
+    cameras = mounts_of(entry["camera"]) if entry.get("camera") else ()
+    pose = Pose(R_cam_from_world, center_world)
+    return Query(folder / entry["image"], entry["variant"], pose, labels, cameras)
 
 
 def _relative(path: Path, folder: Path) -> str:
@@ -116,6 +126,7 @@ def write_queries(folder: Path, queries: Iterable[Query], **more: object) -> Non
         pose = {name: getattr(query.pose, name).tolist() for name in ("R_cam_from_world", "center_world")}
         labels = {"labels": _relative(query.labels, folder)} if query.labels else {}
         image = _relative(query.image, folder)
-        entries.append({"image": image, "variant": query.variant, **pose, **labels})
+        camera = {"camera": document_of(query.cameras)} if query.cameras else {}
+        entries.append({"image": image, "variant": query.variant, **pose, **labels, **camera})
     document = {"cloud": CLOUD_NAME, "convention": CONVENTION, **more, "queries": entries}
     write_atomically(folder / QUERIES_NAME, json.dumps(document, indent=1).encode())

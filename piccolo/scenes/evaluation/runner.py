@@ -84,7 +84,8 @@ def run_job(config: RunConfig, job: Job, show: Progress = no_progress) -> Iterat
             image = query.labels if config.read_options.labels else query.image
             if image is None:
                 raise InputError(f"{scene.folder}: {scene.name_of(query)} has no labels in queries.json")
-            result = scan.localize_query(image, config.read_options, config.settings)
+            options, camera = config.read_options, query.calibration
+            result = scan.localize_query(image, options, config.settings, calibration=camera)
             yield query_result_of(scene, query, result, is_in_box(scan, query.pose))
         except (OSError, InputError) as error:
             yield Failure(str(error), 1)

@@ -120,15 +120,20 @@ def write_colmap(images: Sequence[PosedImage], out: Path, options: Options) -> N
     """Write cameras.txt, images.txt and a points3D.txt without points into a new folder.
 
     https://colmap.github.io/format.html: T_cam_from_world, camera axes right, down, forward. The camera model
-    EQUIRECTANGULAR came with COLMAP 4; its parameters are the width and height. Its pixels are ours.
+    EQUIRECTANGULAR came with COLMAP 4; its parameters are the width and height. Its pixels are ours. Photos
+    have their own models, which are COLMAP's; of a rig each picture is an image.
     """
-    camera_ids = {size: i for i, size in enumerate(dict.fromkeys(image.size for image in images), 1)}
-    cameras = [f"{i} EQUIRECTANGULAR {w} {h} {w} {h}" for (w, h), i in camera_ids.items()]
+    texts = [_colmap_camera(image) for image in images]
+    camera_ids = {text: i for i, text in enumerate(dict.fromkeys(texts), 1)}
+    cameras = [f"{i} {text}" for text, i in camera_ids.items()]
     lines = []
-    for i, image in enumerate(images, 1):
+    for i, (image, text) in enumerate(zip(images, texts, strict=True), 1):
         pose = turned(image.pose, OPTICAL_FROM_CAM)
         values = numbers([*quaternion_wxyz(pose.R_cam_from_world), *translation(pose)])
-        lines += [f"{i} {values} {camera_ids[image.size]} {image.name}", ""]  # a line of points follows
+        lines += [
+            f"{i} {values} {camera_ids[text]} {image.name}",
+            "",
+        ]  # a line of points follows
     offset = offset_comment(options)
     with replacing_folder(out) as folder:
         comment = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"
@@ -136,6 +141,15 @@ def write_colmap(images: Sequence[PosedImage], out: Path, options: Options) -> N
         comment = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then a line of points"
         write_lines(folder / "images.txt", [comment, *offset, *lines])
         write_lines(folder / "points3D.txt", ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"])
+
+
+def _colmap_camera(image: PosedImage) -> str:
+    """Model, size and parameters."""
+    if image.camera is None:
+        w, h = image.size
+        return f"EQUIRECTANGULAR {w} {h} {w} {h}"
+    camera = image.camera
+    return f"{camera.model} {camera.width} {camera.height} {numbers(camera.params)}"
 
 
 def write_nerfstudio(images: Sequence[PosedImage], out: Path, options: Options) -> None:
@@ -252,12 +266,14 @@ OFFSET, MODEL = frozenset({"offset"}), frozenset({"size", "offset"})
 COLMAP_TEXT = "text model of COLMAP 4 and pycolmap; --out is a new folder"
 NERFSTUDIO_TEXT = "transforms.json of nerfstudio, in the folder that --images names"
 POTREE_TEXT = "coordinates.txt of Potree's 360 images, in the folder that --images names"
-COLMAP = Format("colmap", COLMAP_TEXT, write_colmap, MODEL, is_folder=True, forbidden=" ")  # ends a name
-NERFSTUDIO = Format("nerfstudio", NERFSTUDIO_TEXT, write_nerfstudio, MODEL)
-OPENSFM = Format("opensfm", "reconstruction.json of OpenSfM", write_opensfm, MODEL)
+COLMAP = Format("colmap", COLMAP_TEXT, write_colmap, MODEL, True, forbidden=" ", cameras="own")  # ends a name
+NERFSTUDIO = Format("nerfstudio", NERFSTUDIO_TEXT, write_nerfstudio, MODEL, cameras="spheres")
+OPENSFM = Format("opensfm", "reconstruction.json of OpenSfM", write_opensfm, MODEL, cameras="spheres")
 CSV = Format("csv", "table with a header", write_csv, OFFSET, has_unique_names=False)
 TUM = Format("tum", "trajectory for evo and others", write_tum, OFFSET | {"axes", "timestamps"})
 KITTI = Format("kitti", "trajectory for evo and others", write_kitti, OFFSET | {"axes"})
-POTREE = Format("potree", POTREE_TEXT, write_potree, OFFSET | {"timestamps"}, forbidden='"')
+POTREE = Format(
+    "potree", POTREE_TEXT, write_potree, OFFSET | {"timestamps"}, forbidden='"', cameras="spheres"
+)
 GEOJSON_TEXT = "points for maps, in WGS84; needs --crs and the library pyproj"
 GEOJSON = Format("geojson", GEOJSON_TEXT, write_geojson, frozenset({"crs"}), has_unique_names=False)

@@ -151,4 +151,4 @@ def _with_fields(
 
 
 TEXT = "copies of the JPEGs with heading, pitch and roll as Photo Sphere XMP; --out is a new folder"
-GPANO = Format("gpano", TEXT, write, is_folder=True)
+GPANO = Format("gpano", TEXT, write, is_folder=True, cameras="spheres")

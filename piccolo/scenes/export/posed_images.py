@@ -7,10 +7,11 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
+from ...camera import Calibration, Camera, Mount
 from ...confidence.confidence import LOCALIZED
 from ...errors import InputError
 from ...geometry.pose import Pose
@@ -31,6 +32,7 @@ class PosedImage(NamedTuple):
     pose: Pose  # less the offset
     size: tuple[int, int]  # W, H [px]; (0, 0) for a format that takes none
     result: Result
+    camera: Camera | None = None  # None for a sphere
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,7 @@ class Format(NamedTuple):
     is_folder: bool = False
     has_unique_names: bool = True  # the picture's name is the key
     forbidden: str = ""  # regular expression of what a name can't have in it
+    cameras: Literal["any", "own", "spheres"] = "any"  # of photos: no matter, an image each, or not at all
 
 
 def check_size(label: str, size: tuple[int, int]) -> None:
@@ -113,25 +116,53 @@ def select(results: Sequence[Result], clouds: Sequence[str] = (), use_all: bool 
 
 def posed_images(results: Sequence[Result], form: Format, options: Options) -> list[PosedImage]:
     """Pictures and poses by the names, times and offset that the options ask for."""
-    offset = np.array(options.offset or (0.0, 0.0, 0.0))
     posed: dict[str, PosedImage] = {}
     for index, result in enumerate(results):
-        if result.best_pose is None:
-            raise InputError(f"{result.pano}: this result has no pose to write")
-        name, path = _name(result.pano, options.images), Path(result.pano)
-        if form.forbidden and (found := re.search(form.forbidden, name)):
-            raise InputError(f"{name}: {form.name} can't read {found[0]!r} in a name: rename the picture")
-        if form.has_unique_names and name in posed:
-            clouds = f"{posed[name].result.cloud_name}, {result.cloud_name}"
-            raise InputError(f"{name}: has two results (clouds {clouds}); --cloud chooses one")
-        size = _size(path, options) if "size" in form.options else (0, 0)
-        if options.timestamps == "name" and not TIMESTAMP.fullmatch(path.stem):
-            raise InputError(f"{path}: its name {path.stem!r} is no number, as --timestamps name needs")
-        time = str(index) if options.timestamps == "index" else path.stem
-        pose = replace(result.best_pose, center_world=result.best_pose.center_world - offset)
-        key = name if form.has_unique_names else str(index)
-        posed[key] = PosedImage(name, path, time, pose, size, result)
+        for path, mount in _pictures(result, form):
+            image = _posed_image(result, path, mount, form, options)
+            if options.timestamps == "index":
+                image = image._replace(time=str(index))
+            elif not TIMESTAMP.fullmatch(image.time):
+                raise InputError(f"{path}: its name {path.stem!r} is no number, as --timestamps name needs")
+            key = image.name if form.has_unique_names else str(index)
+            if key in posed:
+                clouds = f"{posed[key].result.cloud_name}, {result.cloud_name}"
+                raise InputError(f"{key}: has two results (clouds {clouds}); --cloud chooses one")
+            posed[key] = image
     return list(posed.values())
+
+
+def _pictures(result: Result, form: Format) -> list[tuple[Path, Mount | None]]:
+    """The files of a result that a format writes, with the camera of those that are no sphere."""
+    path, mounts = Path(result.pano), result.cameras
+    if not mounts or form.cameras == "any":
+        return [(path, None)]
+    if form.cameras == "spheres":
+        found = f"found a photo by the model {mounts[0].camera.model}"
+        raise InputError(f"{path}: {found}, wanted a sphere for {form.name}; the format colmap has cameras")
+    if mounts[0].image is not None:
+        return list(zip(Calibration(str(path), mounts).images_in(path), mounts, strict=True))
+    if len(mounts) > 1:
+        raise InputError(f"{path}: found {len(mounts)} cameras in one picture, wanted one for {form.name}")
+    return [(path, mounts[0])]
+
+
+def _posed_image(
+    result: Result, path: Path, mount: Mount | None, form: Format, options: Options
+) -> PosedImage:
+    """One picture; its time is its name."""
+    pose = result.best_pose
+    if pose is None:
+        raise InputError(f"{path}: this result has no pose to write")
+    name = _name(path, options.images)
+    if form.forbidden and (found := re.search(form.forbidden, name)):
+        raise InputError(f"{name}: {form.name} can't read {found[0]!r} in a name: rename the picture")
+    pose = replace(pose, center_world=pose.center_world - np.array(options.offset or (0.0, 0.0, 0.0)))
+    if mount is not None:
+        size = mount.camera.width, mount.camera.height
+        return PosedImage(name, path, path.stem, mount.pose(pose), size, result, mount.camera)
+    size = _size(path, options) if "size" in form.options else (0, 0)
+    return PosedImage(name, path, path.stem, pose, size, result)
 
 
 def _size(path: Path, options: Options) -> tuple[int, int]:
@@ -144,10 +175,10 @@ def _size(path: Path, options: Options) -> tuple[int, int]:
     return size
 
 
-def _name(pano: str, images: Path | None) -> str:
+def _name(pano: Path, images: Path | None) -> str:
     """The picture's name in the folder of images, with slashes; as given if there is no such folder."""
     if images is None:
-        return Path(pano).as_posix()
+        return pano.as_posix()
     name = Path(os.path.relpath(pano, images))
     if ".." in name.parts:
         raise InputError(f"{pano}: is not in the folder --images {images}")

@@ -175,17 +175,22 @@ def room_of_query(world: World, index: int, variant: str) -> tuple[Room, np.rand
 
 def make_query(world: World, index: int, variant: str, width: int, workers: Workers) -> Query:
     """Query number `index` of a variant: upright but for `tilt`, in a room drawn at random."""
+    check_width(width)
+    room, pose, rng = pose_of_query(world, index, variant)
+    rgb = photograph(room, pose, width, workers)
+    return Query(other_light(rgb, rng) if variant == "photo" else rgb, pose, variant)
+
+
+def pose_of_query(world: World, index: int, variant: str) -> tuple[Room, Pose, np.random.Generator]:
+    """The room, the camera in it, and what else is drawn from, of query number `index` of a variant."""
     if variant not in VARIANTS:
         raise InputError(f"variant: {variant!r} is not one of {', '.join(VARIANTS)}")
-    check_width(width)
     room, rng = room_of_query(world, index, variant)
     center_world = free_position(room, rng, (1.0, min(1.9, float(room.size[2]) - 0.4)))
     R_cam_from_world = yaw_rotation(rng.uniform(0, 2 * np.pi))
     if variant == "tilt":
         R_cam_from_world = exp_so3(rng.uniform(-1, 1, 3)) @ uniform_rotations(64)[rng.integers(64)]
-    pose = Pose(R_cam_from_world, center_world)
-    rgb = photograph(room, pose, width, workers)
-    return Query(other_light(rgb, rng) if variant == "photo" else rgb, pose, variant)
+    return room, Pose(R_cam_from_world, center_world), rng
 
 
 def make_labels(world: World, index: int, query: Query, workers: Workers) -> NDArray[np.uint16]:

@@ -1,0 +1,216 @@
+"""A camera: its pixels to rays and back, for every projection that pictures come in.
+
+Models, their parameters and pixels are COLMAP's (sensor/models.h, https://colmap.github.io/cameras.html):
+the centre of the upper left pixel is (0.5, 0.5), as everywhere here. OpenCV's is (0, 0): its principal point
+is half a pixel less. Rays are in our camera axes, +x the image centre, +y left, +z up.
+
+A ray at the angle theta from the axis comes to the radius r in the plane in front of the lens:
+    perspective r = tan theta;  equidistant r = theta (Kannala and Brandt, 2006);
+    FOV r = atan(2 tan(omega / 2) tan theta) / omega (Devernay and Faugeras, 2001);
+then it is distorted (distortion.py), and u = fx x' + cx, v = fy y' + cy.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..geometry.pose import Array
+from .distortion import Distortion
+
+PERSPECTIVE, EQUIDISTANT, FOV, SPHERE = "perspective", "equidistant", "fov", "sphere"
+# lens, and names of the parameters as the formulas here have them
+MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
+    model: (lens, tuple(names.split()))
+    for model, lens, names in (
+        ("SIMPLE_PINHOLE", PERSPECTIVE, "f cx cy"),
+        ("PINHOLE", PERSPECTIVE, "fx fy cx cy"),
+        ("SIMPLE_RADIAL", PERSPECTIVE, "f cx cy k1"),
+        ("RADIAL", PERSPECTIVE, "f cx cy k1 k2"),
+        ("OPENCV", PERSPECTIVE, "fx fy cx cy k1 k2 p1 p2"),
+        ("FULL_OPENCV", PERSPECTIVE, "fx fy cx cy k1 k2 p1 p2 k3 d1 d2 d3"),
+        ("FOV", FOV, "fx fy cx cy omega"),
+        ("SIMPLE_FISHEYE", EQUIDISTANT, "f cx cy"),
+        ("FISHEYE", EQUIDISTANT, "fx fy cx cy"),
+        ("SIMPLE_RADIAL_FISHEYE", EQUIDISTANT, "f cx cy k1"),
+        ("RADIAL_FISHEYE", EQUIDISTANT, "f cx cy k1 k2"),
+        ("OPENCV_FISHEYE", EQUIDISTANT, "fx fy cx cy k1 k2 k3 k4"),
+        ("THIN_PRISM_FISHEYE", EQUIDISTANT, "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1"),
+        ("EQUIRECTANGULAR", SPHERE, "w h"),
+    )
+}
+MAX_PERSPECTIVE = math.radians(89.9)  # half angle: no plane shows more
+MAX_ASPECT_ERROR = 0.01  # of a calibration of another size
+MAX_NUMBER = 1e6
+TABLE_SIZE = 4096  # angles at which the radial part is tabulated, for Newton's first guess
+SMALL = 1e-4  # [rad] from the axis, at which the resolution is taken
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A calibrated camera; two with equal fields are the same."""
+
+    model: str  # one of MODELS
+    width: int  # [px]
+    height: int  # [px]
+    params: tuple[float, ...]  # in COLMAP's order
+    max_angle_deg: float | None = None  # from the axis; beyond, nothing is shown (a fisheye's circle)
+
+    def __post_init__(self) -> None:
+        """Refuse what is no camera."""
+        if self.model not in MODELS:
+            raise InputError(f"found the camera model {self.model!r}, wanted one of {', '.join(MODELS)}")
+        names = MODELS[self.model][1]
+        if len(self.params) != len(names) or not all(abs(p) <= MAX_NUMBER for p in self.params):
+            wanted = f"wanted {len(names)} finite numbers ({' '.join(names)})"
+            raise InputError(f"found {list(self.params)} as parameters of {self.model}, {wanted}")
+        if not (0 < self.width <= MAX_NUMBER and 0 < self.height <= MAX_NUMBER):
+            raise InputError(f"found a camera of {self.width} x {self.height}, wanted its size in pixels")
+        if min(self.focal) <= 0.0:
+            raise InputError(f"found a focal length of {min(self.focal):g} px, wanted one above 0")
+        if not 1e-4 <= self._named.get("omega", 1.0) < math.pi:
+            raise InputError(f"found omega {self._named['omega']:g} of the model FOV, wanted 0.0001 to 3.14")
+        if self.max_angle_deg is not None and not 0.0 < self.max_angle_deg <= 180.0:
+            raise InputError(f"found max_angle_deg {self.max_angle_deg:g}, wanted above 0 and at most 180")
+
+    @property
+    def lens(self) -> str:
+        """How the angle from the axis becomes a radius."""
+        return MODELS[self.model][0]
+
+    @cached_property
+    def _named(self) -> dict[str, float]:
+        return dict(zip(MODELS[self.model][1], self.params, strict=True))
+
+    @property
+    def focal(self) -> tuple[float, float]:
+        """Pixels a unit of the plane, across and down; of a sphere pixels a radian."""
+        if self.lens == SPHERE:
+            return self.width / (2.0 * math.pi), self.height / math.pi
+        f = self._named.get("f", 0.0)
+        return self._named.get("fx", f), self._named.get("fy", f)
+
+    @cached_property
+    def distortion(self) -> Distortion:
+        """The coefficients that this model has."""
+        return Distortion(**{k: v for k, v in self._named.items() if k in Distortion._fields})
+
+    @cached_property
+    def max_angle(self) -> float:
+        """Angle [rad] from the axis up to which there is one pixel for each ray."""
+        limits = {PERSPECTIVE: MAX_PERSPECTIVE, FOV: MAX_PERSPECTIVE}.get(self.lens, math.pi)
+        radius = self.distortion.max_radius()
+        if math.isfinite(radius):
+            limits = min(limits, math.atan(radius) if self.lens == PERSPECTIVE else radius)
+        return limits if self.max_angle_deg is None else min(limits, math.radians(self.max_angle_deg))
+
+    @property
+    def resolution(self) -> float:
+        """Pixels a radian at the axis."""
+        off = np.array([[math.cos(SMALL), -math.sin(SMALL), 0.0], [math.cos(SMALL), 0.0, -math.sin(SMALL)]])
+        pixels, _ = self.pixels(np.array([[1.0, 0.0, 0.0], *off]))
+        return float(np.sqrt(np.prod(np.linalg.norm(pixels[1:] - pixels[0], axis=1))) / SMALL)
+
+    def scaled(self, width: int, height: int) -> "Camera":
+        """The same camera with its picture at another size; InputError if that has another shape."""
+        if (width, height) == (self.width, self.height):
+            return self
+        across, down = width / self.width, height / self.height
+        if abs(across / down - 1.0) > max(MAX_ASPECT_ERROR, 1.5 / min(width, height)):
+            found = f"found a picture of {width} x {height}"
+            raise InputError(f"{found} and a calibration for {self.width} x {self.height}, wanted one shape")
+        factors = {"f": math.sqrt(across * down), "fx": across, "cx": across, "fy": down, "cy": down}
+        factors |= {"w": across, "h": down}
+        params = tuple(value * factors.get(name, 1.0) for name, value in self._named.items())
+        return replace(self, width=width, height=height, params=params)
+
+    def scaled_to_width(self, width: int) -> "Camera":
+        """The same camera with its picture at another width [px]."""
+        return self.scaled(width, max(1, round(width * self.height / self.width)))
+
+    def pixels(self, rays: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Pixels (..., 2) that rays (..., 3) of any length come to, and which are in the picture (...).
+
+        Pixels of rays that are not in the picture mean nothing.
+        """
+        forward, right, down = rays[..., 0], -rays[..., 1], -rays[..., 2]
+        across = np.sqrt(right * right + down * down)
+        if self.lens == SPHERE:
+            u = self.width * (0.5 + np.arctan2(right, forward) / (2.0 * math.pi))
+            v = self.height * (0.5 + np.arctan2(down, np.hypot(right, forward)) / math.pi)
+            return np.stack([u, v], axis=-1), np.ones(u.shape, np.bool_)
+        if self.lens == PERSPECTIVE:
+            is_in = (forward > 0.0) & (across <= math.tan(self.max_angle) * forward)
+            per = 1.0 / np.where(is_in, forward, np.inf)
+        else:
+            angle = np.arctan2(across, forward)
+            is_in = angle <= self.max_angle
+            per = np.where(is_in, self._radius(np.where(is_in, angle, 0.0)), 0.0) / np.maximum(across, 1e-300)
+        x, y = right * per, down * per
+        if self.distortion != Distortion():
+            is_in = is_in & self.distortion.keeps_sides(x, y)
+            x, y = self.distortion.apply(x, y)
+        u, v = self.focal[0] * x + self._named["cx"], self.focal[1] * y + self._named["cy"]
+        is_in = is_in & (u >= 0.0) & (u <= self.width) & (v >= 0.0) & (v <= self.height)
+        return np.stack([u, v], axis=-1), is_in
+
+    def rays(self, pixels: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Unit rays (..., 3) of pixels (..., 2), and which of them there are (...)."""
+        u, v = np.moveaxis(np.asarray(pixels, np.float64), -1, 0)
+        if self.lens == SPHERE:
+            azimuth, elevation = (u / self.width - 0.5) * 2.0 * math.pi, (v / self.height - 0.5) * math.pi
+            c = np.cos(elevation)
+            ray = np.stack([c * np.cos(azimuth), -c * np.sin(azimuth), -np.sin(elevation)], axis=-1)
+            return ray, np.ones(u.shape, np.bool_)
+        x, y = (u - self._named["cx"]) / self.focal[0], (v - self._named["cy"]) / self.focal[1]
+        x, y, is_found = self.distortion.invert(x, y, self._radii)
+        radius = np.hypot(x, y)
+        angle = self._angle(radius)
+        per = np.sin(angle) / np.maximum(radius, 1e-300)
+        is_found &= (angle <= self.max_angle) & (u >= 0.0) & (u <= self.width)
+        is_found &= (v >= 0.0) & (v <= self.height)
+        return np.stack([np.cos(angle), -x * per, -y * per], axis=-1), is_found
+
+    @cached_property
+    def _radii(self) -> Array:
+        return self._radius(np.linspace(0.0, self.max_angle, TABLE_SIZE))
+
+    def _radius(self, angle: Array) -> Array:
+        """Radius before the distortion of an angle [rad] from the axis."""
+        if self.lens == EQUIDISTANT:
+            return angle
+        if self.lens == PERSPECTIVE:
+            return np.tan(angle)
+        omega = self._named["omega"]
+        return np.asarray(np.arctan(2.0 * math.tan(omega / 2.0) * np.tan(angle)) / omega)
+
+    def _angle(self, radius: Array) -> Array:
+        """The inverse of `_radius`."""
+        if self.lens == EQUIDISTANT:
+            return radius
+        if self.lens == PERSPECTIVE:
+            return np.arctan(radius)
+        omega = self._named["omega"]
+        inner = np.minimum(radius * omega, 0.5 * math.pi)
+        return np.arctan2(np.sin(inner), 2.0 * math.tan(omega / 2.0) * np.cos(inner))
+
+
+def pinhole(width: int, height: int, focal: float) -> Camera:
+    """An ideal photo of this size and focal length [px], its axis in the middle."""
+    return Camera("SIMPLE_PINHOLE", width, height, (focal, width / 2.0, height / 2.0))
+
+
+def camera_of_fov(lens: str, fov_deg: float, width: int, height: int) -> Camera:
+    """An ideal photo of this size, `lens` pinhole or fisheye, whose `width` shows a field of view [deg].
+
+    Raises InputError for a field that the lens can't have.
+    """
+    if lens == "fisheye":
+        focal = width / math.radians(fov_deg)
+        return Camera("SIMPLE_FISHEYE", width, height, (focal, width / 2.0, height / 2.0))
+    if fov_deg >= 2.0 * math.degrees(MAX_PERSPECTIVE) - 1.0:
+        raise InputError(f"--fov: found {fov_deg:g} of a pinhole, wanted less than 178")
+    return pinhole(width, height, width / 2.0 / math.tan(math.radians(fov_deg) / 2.0))

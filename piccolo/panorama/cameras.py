@@ -1,0 +1,122 @@
+"""Which camera took a picture: by the options, or of a plain photo by EXIF; and the part that each shows."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera import Calibration, Mount
+from ..camera.model import MODELS, SPHERE, Camera, camera_of_fov, pinhole
+from ..camera.resampling import View, shrunk
+from ..camera.rig import extent_of
+from ..errors import InputError
+from .cube import face_pixels
+from .exif import focal_of
+from .gpano import ASPECT_TOLERANCE
+from .masks import black_borders
+from .model import ReadOptions
+from .picture import Picture
+
+# By EXIF's orientation: the stored picture's axes from those of the picture as it is shown; and how many
+# quarter turns to the left take it back to the stored one.
+TURNED: dict[object, tuple[NDArray[np.float64], int]] = {
+    6: (np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), 1),
+    8: (np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), -1),
+}
+HOW = "; --camera, --focal, or --fov with --projection pinhole say it exactly"
+MIN_REPORTED = 0.01  # of a picture: black borders below this are masked without a warning
+
+
+def cameras_of(
+    path: Path, picture: Picture, options: ReadOptions, has_gpano: bool
+) -> tuple[tuple[Mount, ...], tuple[str, ...]]:
+    """The cameras of a picture, none if it is a sphere or a part of one, and what the user should know.
+
+    Raises InputError if a calibration does not fit, or a pinhole is asked for and nothing tells its field.
+    """
+    width, height = picture.size
+    if options.calibration is not None:
+        mounts = _calibrated(path, picture, options.calibration)
+        return (() if _is_sphere(mounts) else mounts), ()
+    if options.focal_px is not None:
+        return (Mount(pinhole(width, height, options.focal_px)),), ()
+    lens = options.projection
+    if lens in ("pinhole", "fisheye") and options.fov_deg is not None:
+        return (Mount(camera_of_fov(lens, options.fov_deg, width, height)),), ()
+    is_two_to_one = abs(width - 2 * height) <= ASPECT_TOLERANCE * 2 * height
+    is_photo = lens is None and options.fov_deg is None and not has_gpano and not is_two_to_one
+    if not (is_photo or lens == "pinhole"):
+        return (), ()
+    found = focal_of(picture.exif, picture.size)
+    if found is None:
+        if lens == "pinhole":
+            raise InputError(f"{path}: found no focal length in EXIF, wanted --focal, --fov or --camera")
+        return (), ()
+    fov = 2.0 * math.degrees(math.atan(width / 2.0 / found.focal))
+    note = f"read as a pinhole photo {fov:.1f} deg wide, focal length {found.focal:.0f} px by {found.source}"
+    return (Mount(pinhole(width, height, found.focal)),), (note + HOW,)
+
+
+def _is_sphere(mounts: tuple[Mount, ...]) -> bool:
+    """True for one camera that takes the whole sphere as it is stored here."""
+    return mounts == (Mount(mounts[0].camera),) and MODELS[mounts[0].camera.model][0] == SPHERE
+
+
+def _calibrated(path: Path, picture: Picture, calibration: Calibration) -> tuple[Mount, ...]:
+    """The calibration at the picture's size; of the stored picture, if only that has its shape."""
+    try:
+        return calibration.for_picture(*picture.size)
+    except InputError as error:
+        if picture.orientation not in TURNED:
+            raise InputError(f"{path}: {error}") from error
+    try:
+        mounts = calibration.for_picture(*picture.size[::-1])
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    R_stored_from_shown, _ = TURNED[picture.orientation]
+    return tuple(mount.turned(R_stored_from_shown) for mount in mounts)
+
+
+def views_of(
+    path: Path, picture: Picture, mounts: tuple[Mount, ...], is_valid: NDArray[np.bool_]
+) -> tuple[list[View], tuple[str, ...]]:
+    """Each camera with its part of a picture, black borders masked, and what the user should know.
+
+    `is_valid` (H, W) tells the pixels that count so far.
+    """
+    pixels = face_pixels(picture.rgb, is_valid)
+    whole = extent_of(mounts)
+    if picture.size[0] != picture.size[1] and picture.orientation in TURNED and whole == picture.size[::-1]:
+        pixels = np.rot90(pixels, TURNED[picture.orientation][1])
+    views, notes = [], []
+    for mount in mounts:
+        (left, top), camera = mount.offset, mount.camera
+        own = np.ascontiguousarray(pixels[top : top + camera.height, left : left + camera.width])
+        is_bounded = camera.max_angle_deg is not None  # what is black within the circle is no border
+        borders = None if is_bounded else black_borders(own[..., :3], own[..., 3] > 0, is_full=False)
+        if borders is not None:
+            own[borders] = 0
+            if borders.mean() >= MIN_REPORTED:
+                notes.append(f"masked black borders: {100 * borders.mean():.0f} % of the picture")
+        views.append(shrunk(View(mount, own)))
+    return views, tuple(notes)
+
+
+def rig_cameras(path: Path, pictures: list[Picture], rig: Calibration) -> list[tuple[Mount, ...]]:
+    """The camera of each picture of a rig, at the picture's size.
+
+    Raises InputError if a picture has another shape than its camera.
+    """
+    found = []
+    for picture, mount in zip(pictures, rig.mounts, strict=True):
+        width, height = picture.size
+        if rig.has_sizes:
+            one = Calibration(rig.path, (replace(mount, image=None),))
+            mounts = tuple(replace(m, image=mount.image) for m in _calibrated(path, picture, one))
+        else:
+            camera = mount.camera
+            mounts = (mount.with_camera(Camera(camera.model, width, height, camera.params)),)
+        found.append(mounts)
+    return found

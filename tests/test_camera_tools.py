@@ -1,0 +1,138 @@
+"""The tools around photos of other cameras: made rooms, evaluation, exports, renderings, overlays."""
+
+import json
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from pictures import write
+from rooms import write_room
+
+from piccolo.camera import Camera, Mount
+from piccolo.camera.files import document_of
+from piccolo.camera.model import pinhole
+from piccolo.cli import evaluate, export_poses, localize, make_room, render_pose
+from piccolo.geometry.pose import exp_so3
+from piccolo.render.field import cut, sphere_width_for
+from piccolo.result import read_results
+from piccolo.runtime.threads import Workers
+from piccolo.scenes.scene import read_scene
+from piccolo.scenes.synthetic.photographs import picture_by
+from piccolo.scenes.synthetic.world import make_world, photograph, pose_of_query
+
+WIDE = Camera("OPENCV", 480, 400, (150.0, 152.0, 245.0, 198.0, -0.02, 0.001, 1e-3, -1e-3))
+TURN = tuple(map(tuple, exp_so3(np.radians([0.0, 0.0, 90.0])).tolist()))
+RIG = (Mount(pinhole(240, 240, 110.0), image="a.jpg"), Mount(pinhole(240, 240, 110.0), TURN, image="b.png"))
+
+
+def calibration(path, mounts):
+    return write(path, json.dumps(document_of(mounts)).encode())
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    """A room with two photos by one wide camera, and the calibration."""
+    folder = tmp_path_factory.mktemp("photos")
+    camera = calibration(folder / "camera.json", (Mount(WIDE),))
+    return write_room(folder, f"--seed 7 --points 60000 --panoramas 2 --camera {camera}")
+
+
+def test_the_same_pose_is_photographed_as_a_sphere_and_by_a_camera():
+    world = make_world(3, np.array([4.0, 4.0, 2.5]))
+    room, pose, _ = pose_of_query(world, 0, "tilt")
+    full = photograph(room, pose, 2048, Workers(2))
+    mount = Mount(WIDE, TURN)
+    difference = np.abs(
+        cut(full, WIDE, mount.rotation).astype(int) - picture_by(mount, room, pose, Workers(2))
+    )
+    assert np.median(difference) <= 2
+    assert difference.mean() < 4
+
+
+def test_evaluate_takes_the_cameras_of_queries_json_and_resumes(photos, tmp_path, capsys):
+    scene = read_scene(photos)
+    assert [query.cameras for query in scene.queries] == [(Mount(WIDE),)] * 2
+    run = tmp_path / "run.jsonl"
+    options = ["--scenes", str(photos), "--out", str(run), "--gravity", "known", "--cache", str(tmp_path)]
+    assert evaluate.main(options) == 0
+    lines = run.read_bytes()
+    rows = [json.loads(line) for line in lines.splitlines()]
+    assert all(row["result"]["camera"]["model"] == "OPENCV" for row in rows)
+    assert max(row["position_error"] for row in rows) < 0.02
+    assert evaluate.main(options) == 0
+    assert run.read_bytes() == lines
+
+
+def test_localize_overlay_export_and_render_show_the_photo_s_own_field(photos, tmp_path, capsys):
+    image, camera = photos / "images/clean_0.jpg", photos / "camera.json"
+    out, overlay = tmp_path / "pose.jsonl", tmp_path / "overlay.png"
+    cloud = ["--cloud", str(photos / "cloud.ply")]
+    command = [*cloud, "--pano", str(image), "--camera", str(camera), "--gravity", "known", "--no-cache"]
+    localize.main([*command, "--out", str(out), "--overlay", str(overlay)])
+    (result,) = read_results([out])
+    assert result.cameras == (Mount(WIDE),)
+    photo = cv2.imread(str(image)).astype(float)
+
+    shown, seen, _ = np.split(cv2.imread(str(overlay)).astype(float), 3)
+    assert shown.shape == (853, 1024, 3)
+    large = cv2.resize(photo, (1024, 853), interpolation=cv2.INTER_LINEAR)
+    assert np.abs(shown - large)[10:-10, 10:-10].mean() < 8
+    assert np.corrcoef(seen.ravel(), large.ravel())[0, 1] > 0.9
+
+    drawn, depth = tmp_path / "seen.png", tmp_path / "depth.npy"
+    words = ["--result", str(out), "--out", str(drawn), "--depth", str(depth), "--width", "480"]
+    assert render_pose.main([*cloud, *words]) == 0
+    picture = cv2.imread(str(drawn)).astype(float)
+    assert picture.shape == photo.shape
+    assert np.corrcoef(picture.ravel(), photo.ravel())[0, 1] > 0.9
+    ranges = np.load(depth)
+    assert ranges.shape == photo.shape[:2]
+    assert 0.3 < np.median(ranges) < 6.0
+
+    model = tmp_path / "model"
+    assert export_poses.main(["--results", str(out), "--format", "colmap", "--out", str(model), "--all"]) == 0
+    (theirs,) = pycolmap.Reconstruction(str(model)).images.values()
+    rays, _ = WIDE.rays(np.array([[100.0, 300.0]]))
+    point = result.best_pose.center_world + 3.0 * rays[0] @ result.best_pose.R_cam_from_world
+    np.testing.assert_allclose(theirs.project_point(point), [100.0, 300.0], atol=1e-6)
+
+
+def test_a_camera_s_picture_of_any_pose_is_drawn(photos, tmp_path):
+    words = ["--cloud", str(photos / "cloud.ply"), "--at", "2", "2", "1.5", "--width", "320"]
+    camera = calibration(tmp_path / "small.json", (Mount(pinhole(64, 48, 40.0)),))
+    out = tmp_path / "east.png"
+    assert render_pose.main([*words, "--camera", str(camera), "--out", str(out)]) == 0
+    assert cv2.imread(str(out)).shape == (240, 320, 3)
+    two = calibration(tmp_path / "two.json", (Mount(WIDE), Mount(WIDE, offset=(480, 0))))
+    assert render_pose.main([*words, "--camera", str(two), "--out", str(out)]) == 3
+
+
+def test_the_sphere_is_as_fine_as_the_picture_cut_from_it():
+    assert sphere_width_for(pinhole(640, 480, 100.0)) == 630
+    assert sphere_width_for(pinhole(640, 480, 9000.0)) == 8192
+
+
+def test_a_made_rig_is_a_folder_an_instant(tmp_path):
+    camera = calibration(tmp_path / "rig.json", RIG)
+    folder = write_room(tmp_path / "room", f"--seed 3 --points 20000 --panoramas 1 --camera {camera}")
+    (query,) = read_scene(folder).queries
+    assert query.cameras == RIG
+    assert sorted(path.name for path in query.image.iterdir()) == ["a.jpg", "b.png"]
+    assert query.calibration.is_instant(query.image)
+
+
+@pytest.mark.parametrize(
+    ("mounts", "more", "message"),
+    [
+        (RIG, ["--labels"], "--labels: not with --camera"),
+        ((Mount(pinhole(9000, 100, 50.0)),), [], "--camera: found pictures of no size in .* or over 4096 px"),
+        ((Mount(WIDE, image="*.jpg"),), [], "--camera: found images"),
+        ((Mount(WIDE, image="../a.jpg"),), [], "--camera: found images"),
+    ],
+)
+def test_cameras_that_can_not_be_made_are_refused(tmp_path, capsys, mounts, more, message):
+    camera = calibration(tmp_path / "camera.json", mounts)
+    assert make_room.main(["--out", str(tmp_path / "room"), "--camera", str(camera), *more]) == 2
+    assert message.split(" .* ")[0] in capsys.readouterr().err
+    assert not (tmp_path / "room").exists()

@@ -1,0 +1,148 @@
+"""Photos of other cameras than spheres, from the file to the pose."""
+
+import functools
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pictures import encoded, write
+from PIL import Image
+from PIL.ExifTags import IFD, Base
+from rooms import room, scan_map, write_room
+from test_panorama_cameras import four_sides
+
+import piccolo
+from piccolo.camera import Mount
+from piccolo.camera.files import document_of
+from piccolo.camera.model import Camera, pinhole
+from piccolo.cli.localize import main
+from piccolo.cloud.settings import CloudSettings
+from piccolo.coarse_to_fine.settings import CoarseToFineSettings
+from piccolo.geometry.pose import Pose, exp_so3, pose_errors
+from piccolo.result import Result, read_results
+from piccolo.runtime.threads import Workers
+from piccolo.scan import Scan
+from piccolo.scenes.synthetic.photographs import picture_by, picture_of_all
+from piccolo.scenes.synthetic.world import make_query, photograph, room_of_query
+
+BACK = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
+FISHEYE = Camera("OPENCV_FISHEYE", 512, 512, (150.0, 150.0, 256.0, 256.0, 0.01, -0.003, 0.0, 0.0), 95.0)
+DUAL = (Mount(FISHEYE), Mount(FISHEYE, BACK, offset=(512, 0)))
+SEED = 5
+
+
+@functools.lru_cache
+def scan():
+    return Scan(scan_map(SEED), "room", CloudSettings(), CoarseToFineSettings(), Workers(2), {})
+
+
+@functools.lru_cache
+def place(index=0):
+    """The room as a query finds it, and the query's pose in the world."""
+    world = room(SEED)[0]
+    this, _ = room_of_query(world, index, "clean")
+    return this, make_query(world, index, "clean", 128, Workers(2)).pose
+
+
+def cut(full, mount):
+    """The picture of a camera (H, W, 3), cut from a panorama of the same place."""
+    camera, width = mount.camera, full.shape[1]
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    rays = camera.rays(np.stack([u, v], axis=-1))[0] @ mount.rotation
+    x = width * (0.5 - np.arctan2(rays[..., 1], rays[..., 0]) / (2 * np.pi))
+    y = width * (0.25 - np.arcsin(rays[..., 2]) / (2 * np.pi))
+    around = np.concatenate([full[:, -4:], full, full[:, :4]], axis=1)
+    return cv2.remap(around, np.float32(x + 3.5), np.float32(y - 0.5), cv2.INTER_LINEAR)
+
+
+def test_a_rig_of_four_photos_equals_the_sphere_that_they_were_cut_from(tmp_path):
+    this, pose = place()
+    full = photograph(this, pose, 2048, Workers(2))
+    folder = tmp_path / "instant"
+    folder.mkdir()
+    camera = pinhole(640, 640, 320.0)
+    mounts = tuple(m.with_camera(camera) for m in four_sides())
+    for mount in mounts:
+        write(folder / mount.image, encoded(cut(full, mount), ".png"))
+    rig = write(tmp_path / "rig.json", json.dumps(document_of(mounts)).encode())
+    sphere = scan().localize(write(tmp_path / "full.png", encoded(full, ".png")), gravity="known")
+    result = scan().localize(folder, rig=rig, gravity="known")
+    distance, angle = pose_errors(result.best_pose, sphere.best_pose)
+    assert distance < 0.002
+    assert np.degrees(angle) < 0.1
+    assert result.cameras == mounts
+    assert Result.from_json(result.to_json()).cameras == mounts
+    assert sphere.cameras == ()
+    assert json.loads(sphere.to_json())["camera"] is None
+
+
+@pytest.mark.parametrize("gravity", ["known", "unknown"])
+def test_a_dual_fisheye_is_localized(tmp_path, gravity):
+    this, pose = place()
+    rgb = picture_of_all(DUAL, this, pose, Workers(2))
+    calibration = write(tmp_path / "dual.json", json.dumps(document_of(DUAL)).encode())
+    result = scan().localize(
+        write(tmp_path / "a.png", encoded(rgb, ".png")), camera=calibration, gravity=gravity
+    )
+    distance, angle = pose_errors(result.best_pose, pose)
+    assert distance < 0.01
+    assert np.degrees(angle) < 0.2
+    assert json.loads(result.to_json())["camera"]["cameras"][1]["offset"] == [512, 0]
+
+
+def test_a_tilted_wide_photo_is_found_by_its_gravity(tmp_path):
+    """Pitched up by 20 and rolled by 15 degrees: its own axes say where down is."""
+    this, upright = place()
+    R_tilt = exp_so3(np.radians([15.0, 0.0, 0.0])) @ exp_so3(np.radians([0.0, 20.0, 0.0]))
+    pose = Pose(R_tilt @ upright.R_cam_from_world, upright.center_world)
+    camera = Camera("SIMPLE_FISHEYE", 800, 600, (230.0, 400.0, 300.0))
+    rgb = picture_by(Mount(camera), this, pose, Workers(2))
+    down = tuple((pose.R_cam_from_world @ [0.0, 0.0, -9.81]).tolist())
+    fov_deg = float(np.degrees(800 / 230.0))
+    result = scan().localize(rgb, fov_deg=fov_deg, projection="fisheye", gravity_vector=down, gravity="known")
+    distance, angle = pose_errors(result.best_pose, pose)
+    assert distance < 0.02
+    assert np.degrees(angle) < 0.5
+    (mount,) = result.cameras
+    assert mount.camera.params == pytest.approx(camera.params)
+
+
+def test_arrays_of_photos_need_a_camera():
+    rgb = np.zeros((300, 400, 3), np.uint8)
+    with pytest.raises(piccolo.InputError, match=r"found uint8 of shape .300, 400, 3., wanted RGB"):
+        scan().localize(rgb)
+    with pytest.raises(piccolo.InputError, match="camera, rig: wanted only one of them"):
+        scan().localize(rgb, camera="a.json", rig="b.json")
+
+
+def test_rigs_and_phone_photos_on_the_command_line(tmp_path, capsys):
+    """A folder of instants, and a photo with nothing but EXIF; each line names its camera."""
+    folder = write_room(tmp_path, "--seed 5 --points 60000 --panoramas 0")
+    this, pose = place()
+    mounts = tuple(m.with_camera(pinhole(200, 200, 100.0)) for m in four_sides())
+    rig = write(tmp_path / "rig.json", json.dumps(document_of(mounts)).encode())
+    for name in ("1", "2"):
+        instant = tmp_path / "walk" / name
+        instant.mkdir(parents=True)
+        for mount in mounts:
+            write(instant / mount.image, encoded(picture_by(mount, this, pose, Workers(2)), ".png"))
+    cloud = ["--cloud", str(folder / "cloud.ply"), "--no-cache", "--gravity", "known"]
+    main([*cloud, "--pano", str(tmp_path / "walk"), "--rig", str(rig), "--out", str(tmp_path / "out.jsonl")])
+    results = read_results([tmp_path / "out.jsonl"])
+    assert [Path(result.pano).name for result in results] == ["1", "2"]
+    assert all(result.cameras == mounts for result in results)
+    assert all(pose_errors(result.best_pose, pose)[0] < 0.02 for result in results)
+    assert results[0].source.pano_sha256 == results[1].source.pano_sha256
+    capsys.readouterr()
+    wide = picture_by(Mount(pinhole(480, 360, 150.0)), this, pose, Workers(2))
+    exif = Image.Exif()
+    exif.get_ifd(IFD.Exif)[Base.FocalLengthIn35mmFilm] = 11  # 600 px diagonal: 152.5 px
+    Image.fromarray(wide).save(tmp_path / "phone.jpg", exif=exif, quality=95)
+    main([*cloud, "--pano", str(tmp_path / "phone.jpg")])
+    out, err = capsys.readouterr()
+    assert json.loads(out)["camera"]["model"] == "SIMPLE_PINHOLE"
+    assert "read as a pinhole photo 115.1 deg wide, focal length 153 px by EXIF's 35 mm equivalent" in err
+    assert main([*cloud, "--pano", str(tmp_path / "phone.jpg"), "--camera", str(rig)]) == 2
+    assert "give it as --rig" in capsys.readouterr().err
