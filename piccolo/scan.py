@@ -130,6 +130,8 @@ class Scan:
         given: dict[str, Any] = dict(options)
         if isinstance(given.get("mask"), np.ndarray):
             given["mask_array"] = given.pop("mask")
+        elif "mask" in given:
+            given["mask"] = Path(given["mask"])
         prior = {k: given.pop(k) for k in PRIOR_FIELDS & given.keys()}
         if prior:
             given["prior"] = Prior(**prior)

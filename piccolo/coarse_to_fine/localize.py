@@ -24,11 +24,12 @@ from .refinement import (
 )
 from .scan_map import ScanMap
 from .search import search_poses
-from .search_result import NOTHING, SearchResult, found_among
+from .search_result import SearchResult, found_among
 from .settings import CoarseToFineSettings
 
 NUM_MATCHED = 6  # poses from matches that are refined
-ALTERNATIVES_REFINED = 10  # at most
+ALTERNATIVES_COMPARED, ALTERNATIVES_REFINED = 8, 4  # at most
+HOPELESS_SCORE = 0.02  # of black, white and noisy pictures, and of most views of other places
 FAIRLY_BETTER = 1.05  # what an alternative explains of what both show, by the best, to take its place
 NO_PIXEL = "the panorama: no pixel counts, all are masked"
 
@@ -53,25 +54,27 @@ def localize(
         return Localization(warnings=(why,))
     with watch.stage("search"):
         query = prepare_query(panorama, candidates, settings, workers, method)
-    hypotheses, found = [], NOTHING
+    hypotheses: list[Hypothesis] = []
     if method.uses_features:
         with watch.stage("match"):
-            poses = matched_poses(query)
-        with watch.stage("refine"):
-            hypotheses = refine_matched(query, poses)
-            found = finished(query, hypotheses)
+            hypotheses = refine_matched(query, matched_poses(query))
     gravities: list[Literal["known", "unknown"]]
     gravities = ["known", "unknown"] if settings.gravity == "auto" else [settings.gravity]
     for gravity in gravities if method.uses_search else []:
-        if found.is_sure(count_matches(query.matches, found.best.pose)):
+        if is_sure(query, hypotheses):
             break
         with watch.stage("search"):
             starts = search_poses(query, gravity)
         with watch.stage("refine"):
-            hypotheses = [*hypotheses, *refine(query, starts, method.beam)]
-            found = finished(query, hypotheses)
+            hypotheses += refine(query, starts, method.beam)
     with watch.stage("refine"):
-        return evaluate(query, panorama, replace(found, best=settle(query, found.best)))
+        return evaluate(query, panorama, finished(query, hypotheses))
+
+
+def is_sure(query: Query, hypotheses: Sequence[Hypothesis]) -> bool:
+    """True if the best of some hypotheses leaves no doubt."""
+    found = fairly_selected(query, found_among(hypotheses, ALTERNATIVES_COMPARED))
+    return found.is_sure(count_matches(query.matches, found.best.pose))
 
 
 def matched_poses(query: Query) -> list[Pose]:
@@ -88,10 +91,14 @@ def finished(query: Query, hypotheses: Sequence[Hypothesis]) -> SearchResult:
     def refined(h: Hypothesis) -> Hypothesis:
         return refine_full_resolution(query, h, 2)
 
-    found = found_among(hypotheses, ALTERNATIVES_REFINED)
-    near, far = found.near, found.alternatives[len(found.near) :]
-    ends = list(query.workers.map(refined, [found.best, *near] if hypotheses else [], "descend"))
-    return fairly_selected(query, found_among([*ends, *far], ALTERNATIVES_REFINED))
+    found = found_among(hypotheses, ALTERNATIVES_COMPARED)
+    if found.best.score < HOPELESS_SCORE:
+        return found
+    near = found.near[:ALTERNATIVES_REFINED]
+    ends = list(query.workers.map(refined, [found.best, *near], "descend"))
+    far = found.alternatives[len(near) :]
+    found = fairly_selected(query, found_among([*ends, *far], ALTERNATIVES_COMPARED))
+    return replace(found, best=settle(query, found.best))
 
 
 def fairly_selected(query: Query, found: SearchResult) -> SearchResult:

@@ -137,7 +137,7 @@ def refine_matched(query: Query, poses: Sequence[Pose]) -> list[Hypothesis]:
 
     def refined(pose: Pose) -> Hypothesis:
         as_found = Hypothesis(pose, 0.0)
-        ends = as_found, descend_fine(query, as_found), descend_fine(query, perturb_middle(query, as_found))
+        ends = as_found, descend_fine(query, as_found)
         return max((compared(query, end) for end in ends), key=lambda h: h.score)
 
     return by_score(list(query.workers.map(refined, poses, "descend")))
