@@ -178,7 +178,7 @@ def test_resolution_is_the_focal_length():
         (("KODAK", 10, 10, ()), "found the camera model 'KODAK', wanted one of SIMPLE_PINHOLE"),
         (("PINHOLE", 10, 10, (1.0, 2.0)), r"wanted 4 finite numbers \(fx fy cx cy\)"),
         (("SIMPLE_PINHOLE", 10, 10, (float("nan"), 2.0, 3.0)), "wanted 3 finite numbers"),
-        (("SIMPLE_PINHOLE", 10, 10, (-5.0, 2.0, 3.0)), "found a focal length of -5 px, wanted one above 0"),
+        (("SIMPLE_PINHOLE", 10, 10, (-5.0, 2.0, 3.0)), "found a focal length of -5 px, wanted at least 1"),
         (("SIMPLE_PINHOLE", 0, 10, (5.0, 2.0, 3.0)), "found a camera of 0 x 10"),
         (("FOV", 10, 10, (5.0, 5.0, 2.0, 3.0, 0.0)), "found omega 0 of the model FOV"),
         (("SIMPLE_PINHOLE", 10, 10, (5.0, 2.0, 3.0), 190.0), "found max_angle_deg 190, wanted above 0"),

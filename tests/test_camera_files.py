@@ -3,10 +3,13 @@ import json
 import numpy as np
 import pycolmap
 import pytest
-from refusals import assert_refused
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from refusals import assert_refused, mutated, read_or_refused
 
 from piccolo.camera.files import document_of, mounts_of, read_calibration, read_rig
-from piccolo.camera.model import Camera
+from piccolo.camera.model import MODELS, Camera
+from piccolo.camera.resampling import View, sphere_of, sphere_width
 from piccolo.camera.rig import Mount
 from piccolo.errors import InputError
 from piccolo.geometry.pose import exp_so3, quaternion_wxyz
@@ -214,3 +217,46 @@ def test_damaged_files_are_refused(tmp_path, content, message):
 )
 def test_damaged_rigs_are_refused(tmp_path, content, message):
     assert_refused(message, read_rig, write(tmp_path / "a.json", content))
+
+
+@settings(deadline=None, max_examples=150)
+@given(data=st.data())
+@pytest.mark.parametrize("name", ["cameras.txt", "ours.json", "opensfm.json", "rig.json"])
+def test_mutated_files_are_read_or_refused(name, data, tmp_path_factory):
+    lens = {"camera_model_name": "PINHOLE", "camera_params": [400, 400, 32, 24]}
+    content = {
+        "cameras.txt": "# c\n1 OPENCV 64 48 60 60 32 24 0.1 -0.02 0.001 0.002\n",
+        "ours.json": json.dumps({**GOOD, "offset": [0, 0], "center_cam": [0, 0, 0.1], "max_angle_deg": 80}),
+        "opensfm.json": json.dumps({"a": {"projection_type": "brown", **OPENSFM["brown"][0], **SIZE}}),
+        "rig.json": json.dumps(
+            [{"cameras": [{"image_prefix": "a/", **lens}, {"image_prefix": "b/", **lens}]}]
+        ),
+    }[name]
+    path = tmp_path_factory.getbasetemp() / name
+    path.write_bytes(mutated(data.draw, st.integers, content.encode(), 3))
+    found, message = read_or_refused(read_rig if name == "rig.json" else read_calibration, path)
+    assert (found is None) == bool(message)
+
+
+SIZE = {"width": 64, "height": 48}
+ANY = st.one_of(st.floats(-3.0, 3.0), st.floats(-1e6, 1e6), st.just(0.0))
+
+
+@settings(deadline=None, max_examples=300)
+@given(data=st.data())
+def test_any_camera_that_is_taken_can_be_resampled(data):
+    """Whatever the numbers: what they can't show is not valid, and what is has a pixel."""
+    model = data.draw(st.sampled_from(sorted(MODELS)))
+    params = tuple(data.draw(ANY) for _ in MODELS[model][1])
+    try:
+        camera = Camera(model, 64, 48, params)
+    except InputError:
+        return
+    views = [View(Mount(camera), np.full((48, 64, 4), 255, np.uint8))]
+    rgb, is_valid = sphere_of(views, sphere_width([view.mount for view in views]) if params[0] < 99 else 512)
+    assert rgb[is_valid].min(initial=255) == 255
+    pixels = np.random.default_rng(0).uniform(0.0, 1.0, (200, 2)) * (64, 48)
+    rays, is_seen = camera.rays(pixels)
+    back, is_in = camera.pixels(rays)
+    assert np.isfinite(rays).all()
+    assert np.abs(back - pixels)[is_seen & is_in].max(initial=0.0) < 1e-3

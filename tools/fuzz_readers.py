@@ -14,6 +14,7 @@ import _checkout  # noqa: F401
 import numpy as np
 
 from piccolo.batch.priors import read_priors
+from piccolo.camera.files import read_cameras, read_rig
 from piccolo.cli.command import command, option
 from piccolo.cloud import FORMATS
 from piccolo.cloud.readers.reader import PLAIN, CloudFormat
@@ -56,6 +57,8 @@ READERS: dict[str, tuple[tuple[str, ...], Callable[[Path], object]]] = {
     "priors": ((".csv",), lambda path: read_priors(path, Prior())),
     "result": ((".jsonl",), lambda path: Result.from_json(path.read_text())),
     "scene": ((".json",), read_scene),
+    "cameras": ((".txt", ".json"), read_cameras),
+    "rigs": ((".json",), read_rig),
     "map": ((".map", ".npz"), load_map),
 }
 
@@ -70,7 +73,7 @@ def try_file(name: str, path: Path) -> None:
 
 def readers_functions() -> list[FunctionType]:
     """The plain functions of the readers' modules; compiled kernels can't be instrumented."""
-    packages = "piccolo.batch", "piccolo.cloud", "piccolo.panorama"
+    packages = "piccolo.batch", "piccolo.camera", "piccolo.cloud", "piccolo.panorama"
     names = [name for name in sorted(sys.modules) if name.startswith(packages)]
     values = [value for name in names for value in vars(sys.modules[name]).values()]
     unique = {id(v): v for v in values if isinstance(v, FunctionType) and v.__module__.startswith("piccolo")}

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from ..geometry.pose import Array
 
 MAX_STEPS = 25  # of Newton; five are usual
+LEAST = 1e-12  # of the denominator
+NO_MORE = 1e-30  # of a coefficient: less does nothing at any radius, but overflows
 CONVERGED = 1e-12  # of x' and y': a thousandth of a millionth of a pixel
 
 
@@ -48,14 +50,16 @@ class Distortion(NamedTuple):
     def radial(self, r2: Array) -> tuple[Array, Array]:
         """Values g and dg/dr2 at r2, of any shape."""
         n, d = self.numerator, self.denominator
-        value = n(r2) / d(r2)
-        return value, (n.deriv()(r2) - value * d.deriv()(r2)) / d(r2)
+        below = d(r2)
+        below = np.where(np.abs(below) < LEAST, LEAST, below)  # 0 at the limit itself
+        value = n(r2) / below
+        return value, (n.deriv()(r2) - value * d.deriv()(r2)) / below
 
     def max_radius(self) -> float:
         """Radius up to which r g(r^2) grows, infinite if it always does: beyond, a pixel is two rays."""
         n, d, r2 = self.numerator, self.denominator, Polynomial([0.0, 1.0])
         slope = n * d + 2.0 * r2 * (n.deriv() * d - n * d.deriv())
-        roots = np.concatenate([slope.trim().roots(), d.trim().roots()])
+        roots = np.concatenate([slope.trim(NO_MORE).roots(), d.trim(NO_MORE).roots()])
         real = roots[np.abs(roots.imag) < 1e-9 * (1.0 + np.abs(roots))].real
         return math.sqrt(min(real[real > 0.0], default=math.inf))
 

@@ -45,6 +45,7 @@ MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
 MAX_PERSPECTIVE = math.radians(89.9)  # half angle: no plane shows more
 MAX_ASPECT_ERROR = 0.01  # of a calibration of another size
 MAX_NUMBER = 1e6
+MIN_FOCAL = 1.0  # [px]
 TABLE_SIZE = 4096  # angles at which the radial part is tabulated, for Newton's first guess
 SMALL = 1e-4  # [rad] from the axis, at which the resolution is taken
 
@@ -69,8 +70,8 @@ class Camera:
             raise InputError(f"found {list(self.params)} as parameters of {self.model}, {wanted}")
         if not (0 < self.width <= MAX_NUMBER and 0 < self.height <= MAX_NUMBER):
             raise InputError(f"found a camera of {self.width} x {self.height}, wanted its size in pixels")
-        if min(self.focal) <= 0.0:
-            raise InputError(f"found a focal length of {min(self.focal):g} px, wanted one above 0")
+        if min(self.focal) < MIN_FOCAL:
+            raise InputError(f"found a focal length of {min(self.focal):g} px, wanted at least {MIN_FOCAL:g}")
         if not 1e-4 <= self._named.get("omega", 1.0) < math.pi:
             raise InputError(f"found omega {self._named['omega']:g} of the model FOV, wanted 0.0001 to 3.14")
         if self.max_angle_deg is not None and not 0.0 < self.max_angle_deg <= 180.0:
@@ -109,10 +110,11 @@ class Camera:
 
     @property
     def resolution(self) -> float:
-        """Pixels a radian at the axis."""
+        """Pixels a radian at the axis, at least MIN_FOCAL."""
         off = np.array([[math.cos(SMALL), -math.sin(SMALL), 0.0], [math.cos(SMALL), 0.0, -math.sin(SMALL)]])
         pixels, _ = self.pixels(np.array([[1.0, 0.0, 0.0], *off]))
-        return float(np.sqrt(np.prod(np.linalg.norm(pixels[1:] - pixels[0], axis=1))) / SMALL)
+        steps = np.linalg.norm(pixels[1:] - pixels[0], axis=1) / SMALL
+        return max(float(np.sqrt(steps[0] * steps[1])), MIN_FOCAL)
 
     def scaled(self, width: int, height: int) -> "Camera":
         """The same camera with its picture at another size; InputError if that has another shape."""
