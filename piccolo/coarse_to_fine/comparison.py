@@ -147,7 +147,7 @@ def compare(query: Query, pose: Pose) -> Comparison:
     n = len(make_grid(config.num_rings))
     offsets, colors = np.empty((3, n), np.float32), np.empty((3, n), np.float32)
     weights, sums, stats = np.empty(n, np.float32), np.empty((n, 8), np.float32), np.empty((6, n), np.float32)
-    how = config.voxel_per_range, config.arrays, thread_scratch()
+    how = config.voxel_per_range, config.arrays, thread_scratch(), np.ones(n, np.bool_)
     render_cells(query.scan_map.octree, pose.center_world, *how, offsets, colors, weights, sums, stats)
     by_block = np.empty(NUM_BLOCKS), np.empty(NUM_BLOCKS), np.empty(NUM_BLOCKS)
     image = photo.rgbx, photo.width

@@ -33,7 +33,6 @@ class DifferenceSteps:
     inflation: float  # so that 95 % of true poses lie in the 95 % region (tools/calibrate_confidence.py)
 
 
-# Noise roughens the loss in the finest image; where it has no minimum there, the next image tells.
 STEPS = (
     DifferenceSteps("full", math.radians(0.1), 0.005, 2.5),
     DifferenceSteps("fine", math.radians(0.3), 0.015, 0.8),
@@ -69,7 +68,8 @@ def block_gradients(image: Texels, points: Cells, pose: Pose) -> Array:
     block = cell_of(offsets.T / np.linalg.norm(offsets, axis=0)[:, None], BLOCK_RINGS)
     parts = np.split(np.argsort(block, kind="stable"), np.cumsum(np.bincount(block))[:-1])
     chosen = (Cells(offsets[:, part], levels[:, part], weights[part]) for part in parts if len(part))
-    return np.array([gradient_at(image, part, pose.R_cam_from_world, np.zeros(3)) for part in chosen])
+    found = np.array([gradient_at(image, part, pose.R_cam_from_world, np.zeros(3)) for part in chosen])
+    return np.asarray(found[found.any(axis=1)])  # blocks that the photo does not show have none
 
 
 def covariance_of(hessian: Array, gradients: Array) -> Array | None:
@@ -87,14 +87,18 @@ def covariance_of(hessian: Array, gradients: Array) -> Array | None:
 
 
 def covariance_at(query: Query, points: Cells, pose: Pose) -> Array | None:
-    """Covariance (6, 6) [rad, m] in the camera's frame, by the finest image where the pose is a minimum."""
+    """Covariance (6, 6) [rad, m] in the camera's frame, by the image in which the pose is best determined.
+
+    Noise and stitching roughen the loss in the finest image; the next one is smoother.
+    """
+    found = []
     for steps in STEPS:
         image: Texels = getattr(query.images, steps.image)
         hessian = hessian_at(image, points, pose, steps)
         covariance = covariance_of(hessian, block_gradients(image, points, pose))
         if covariance is not None:
-            return steps.inflation * covariance
-    return None
+            found.append(steps.inflation * covariance)
+    return min(found, key=lambda c: float(np.linalg.eigvalsh(c[3:, 3:])[-1]), default=None)
 
 
 def estimate_covariance(query: Query, pose: Pose) -> PoseCovariance | None:

@@ -1,13 +1,14 @@
 """What speaks for the pose that was found and against it, and the status that follows."""
 
 import math
+from dataclasses import replace
 
 from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
-from ..confidence.confidence import classify
+from ..confidence.confidence import NOT_LOCALIZED, classify
 from ..confidence.localization import Localization
 from ..confidence.occlusion import occlusion_at
 from ..confidence.score import Evidence, agreement_at
-from ..local_features.hypotheses import count_matches
+from ..local_features.hypotheses import count_matches, poses_of
 from ..optimize.refine import refine, sampling_loss_of
 from ..optimize.sampling_loss import sampling_loss
 from ..optimize.settings import DescentSettings
@@ -17,14 +18,19 @@ from ..panorama.texels import pack_texels
 from ..render.zbuffer import visible_points
 from .covariance import estimate_covariance
 from .query import Query
-from .search_result import SearchResult
+from .search_result import SURE_MATCHES, SearchResult
 
+ENOUGH_EXPLAINED = 0.7  # score from which a photo is not mirrored
+MIRROR_RATIO = 1.2  # of matches, mirrored by not
+MIRRORED = "the photo fits the scan better mirrored, left for right: turn it over and try again"
 MAX_WIDTH = 4096  # [px] of the panorama that the loss is taken from: more costs seconds and tells nothing
 LAST_STEP = 0.01  # [rad, m] of Adam and the first of L-BFGS, where they take the last descent
 
 
 def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localization:
     """The pose found in world coordinates, after the descent that the solver asks for, with its evidence."""
+    if found.best.score < 0.0:
+        return Localization()
     scan_map, settings, pose = query.scan_map, query.settings, found.best.pose
     panorama = shrink(panorama, MAX_WIDTH)
     texels = pack_texels(panorama.rgb, panorama.is_valid)
@@ -48,6 +54,23 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
     )
     covariance = estimate_covariance(query, pose)
     status, confidence = classify(evidence, covariance, len(found.alternatives) > 0, settings.min_confidence)
+    warnings: tuple[str, ...] = ()
+    if status != NOT_LOCALIZED and is_mirrored(query, evidence):
+        status, confidence, warnings = NOT_LOCALIZED, 0.0, (MIRRORED,)
     reported = found.alternatives[:MAX_ALTERNATIVES]
     alternatives = tuple(Hypothesis(scan_map.to_world(h.pose), h.score) for h in reported)
-    return Localization(status, confidence, scan_map.to_world(pose), loss, evidence, alternatives, covariance)
+    in_world = scan_map.to_world(pose)
+    return Localization(status, confidence, in_world, loss, evidence, alternatives, covariance, warnings)
+
+
+def is_mirrored(query: Query, evidence: Evidence) -> bool:
+    """True if more features of the mirrored photo agree with one pose than of the photo.
+
+    Symmetric things match in a mirror too, but never more of them. A pose that explains nearly all is not asked.
+    """
+    if evidence.score >= ENOUGH_EXPLAINED:
+        return False
+    shown = query.panorama
+    flipped = replace(shown, rgb=shown.rgb[:, ::-1].copy(), is_valid=shown.is_valid[:, ::-1].copy())
+    found = poses_of(replace(query, panorama=flipped).matches, None, 1, query.workers)
+    return len(found) > 0 and found[0].num_matches > max(MIRROR_RATIO * evidence.num_matches, SURE_MATCHES)

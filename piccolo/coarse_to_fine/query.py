@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.pose import Array
+from ..geometry.pose import Array, Pose
+from ..geometry.sphere import make_grid
 from ..local_features.keypoints import find_keypoints
 from ..local_features.matching import Matches, match
 from ..panorama import Panorama
@@ -22,6 +23,7 @@ from .scan_map import ScanMap
 from .settings import CoarseToFineSettings
 
 COMPARED_WIDTH = 256  # [px]
+MOST_SHARE = 0.98  # of the sphere: of a photo that shows more, all cells are shown
 
 
 class QueryImages(NamedTuple):
@@ -58,13 +60,16 @@ class Query:
         small = resize(self.panorama, COMPARED_WIDTH)
         return pack_texels(small.rgb, small.is_valid)
 
-    def shows(self, directions: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
-        """True for each of some directions (N, 3) in the camera's frame in which the photo shows something."""
-        x, y, z = directions.T
+    def shown_cells(self, num_rings: int, pose: Pose) -> NDArray[np.bool_]:
+        """Which cells (N,) of a grid around a pose in the map the photo shows; all, of a photo of a sphere."""
+        grid = make_grid(num_rings)
+        if self.photo.valid_share > MOST_SHARE:
+            return np.ones(len(grid), np.bool_)
+        x, y, z = pose.R_cam_from_world.astype(np.float32) @ grid.directions.T
         height, width = self.panorama.is_valid.shape
         column = ((0.5 - np.arctan2(y, x) / (2.0 * np.pi)) * width).astype(np.int64) % width
-        row = ((0.5 - np.arctan2(z, np.hypot(x, y)) / np.pi) * height).astype(np.int64)
-        return self.panorama.is_valid[np.minimum(row, height - 1), column]
+        row = ((0.5 - np.arcsin(np.clip(z, -1.0, 1.0)) / np.pi) * height).astype(np.int64)
+        return np.asarray(self.panorama.is_valid[np.minimum(row, height - 1), column])
 
     def without(self, is_hidden: NDArray[np.bool_]) -> "Query":
         """The same of what is left of the photo without some pixels (h, 2 h), its contrast taken anew."""

@@ -10,7 +10,7 @@ from .config import Beam
 from .descent import COARSE_LOSS, FINE_LOSS, FULL_LOSS, descend, descend_all, descend_around, score_on
 from .query import Query
 from .starts import CLOSE_DISTANCE, SAME_ANGLE, SAME_DISTANCE, Starts, best_and_alternatives, narrow
-from .view import Cells, render_view, visible_points
+from .view import Cells, ViewConfig, render_view, visible_points
 
 FIRST_ITERATIONS, SECOND_ITERATIONS = 5, 12  # of the descents on prepared views
 MIDDLE_LIMITS, FINE_LIMITS = (COARSE_LOSS, 12, 1e-3), (FINE_LOSS, 12, 1e-4)
@@ -20,10 +20,6 @@ MAX_UNOCCLUDED = 2  # times that occluders are looked for
 MAX_PERTURBATIONS, MIN_GAIN = 5, 0.02  # rounds; by the score in one, else it was the last
 MOST_OTHERS = 6  # poses on middle cells that are alternatives
 NUM_POINTS = 30_000  # for the last millimetres, in what the photo shows
-LEAST_SHARE, MOST_SHARE = (
-    0.03,
-    0.9,
-)  # of the sphere that a photo shows: for less, points are as many; for more, not chosen
 MAX_LAST_ROUNDS, SETTLED = 6, 1e-4  # [m] a camera that moves by less in a round has arrived
 MIN_SCORE_LEFT = 0.97  # of the score, in exchange for millimetres
 
@@ -38,7 +34,7 @@ def descend_middle(query: Query, h: Hypothesis) -> Hypothesis:
     """Descend on middle cells, seen from where the pose is now."""
     center, image = h.pose.center_world, query.images.middle
     config = query.method.middle_view
-    cells = render_view(query.scan_map.octree, center, config)
+    cells = view_at(query, h.pose, config)
     pose = descend(cells, center, image, h.pose, MIDDLE_LIMITS)
     return Hypothesis(pose, score_on(cells, config.arrays.blocks, center, image, pose))
 
@@ -46,7 +42,7 @@ def descend_middle(query: Query, h: Hypothesis) -> Hypothesis:
 def perturb_middle(query: Query, h: Hypothesis) -> Hypothesis:
     """Descend again from around a pose on middle cells."""
     config, images = query.method.middle_view, (query.images.search, query.images.middle)
-    cells = render_view(query.scan_map.octree, h.pose.center_world, config)
+    cells = view_at(query, h.pose, config)
     return descend_around(cells, config.arrays.blocks, images, h.pose, 1.0)
 
 
@@ -54,7 +50,7 @@ def descend_fine(query: Query, h: Hypothesis) -> Hypothesis:
     """Descend on fine cells, seen from where the pose is now."""
     center, image = h.pose.center_world, query.images.fine
     config = query.method.fine_view
-    cells = render_view(query.scan_map.octree, center, config)
+    cells = view_at(query, h.pose, config)
     pose = descend(cells, center, image, h.pose, FINE_LIMITS)
     return Hypothesis(pose, score_on(cells, config.arrays.blocks, center, image, pose))
 
@@ -63,7 +59,7 @@ def refine_by_perturbation(query: Query, h: Hypothesis) -> Hypothesis:
     """Perturb and refine for as long as the score rises: a pose that stopped short creeps on."""
     config, images = query.method.fine_view, (query.images.middle, query.images.fine)
     for _ in range(MAX_PERTURBATIONS):
-        cells = render_view(query.scan_map.octree, h.pose.center_world, config)
+        cells = view_at(query, h.pose, config)
         around = descend_around(cells, config.arrays.blocks, images, h.pose, PERTURBATION)
         refined = descend_fine(query, around)
         gain = refined.score - h.score
@@ -78,16 +74,17 @@ def compared(query: Query, h: Hypothesis) -> Hypothesis:
     return Hypothesis(h.pose, compare(query, h.pose).score)
 
 
+def view_at(query: Query, pose: Pose, config: ViewConfig) -> Cells:
+    """The cells seen from a pose that the photo shows."""
+    shown = query.shown_cells(config.num_rings, pose)
+    return render_view(query.scan_map.octree, pose.center_world, config, shown)
+
+
 def points_at(query: Query, pose: Pose) -> Cells:
     """The points that the last descent goes by: those seen from a pose that the photo shows too."""
-    share = max(query.photo.valid_share, LEAST_SHARE)
-    points = visible_points(
-        query.scan_map.octree, pose.center_world, query.method.full_view, round(NUM_POINTS / share)
-    )
-    if query.photo.valid_share > MOST_SHARE:
-        return points
-    is_shown = query.shows(points.offsets.T @ pose.R_cam_from_world.T)
-    return Cells(points.offsets[:, is_shown], points.channels[:, is_shown], points.weights[is_shown])
+    config = query.method.full_view
+    shown = query.shown_cells(config.num_rings, pose)
+    return visible_points(query.scan_map.octree, pose.center_world, config, shown, NUM_POINTS)
 
 
 def refine_unoccluded(query: Query, h: Hypothesis) -> tuple[Query, Hypothesis]:

@@ -98,11 +98,16 @@ def locate_nodes(tree, center, voxel_per_range, view, scratch):
 
 
 @kernel
-def render_cells(tree, center, voxel_per_range, view, scratch, offsets, channels, weights, sums, stats):
-    """One view: relative position, opponent channels, their local statistics and weight of each cell."""
+def render_cells(
+    tree, center, voxel_per_range, view, scratch, shown, offsets, channels, weights, sums, stats
+):
+    """One view: relative position, opponent channels, their local statistics and weight of each cell shown."""
     n = locate_nodes(tree, center, voxel_per_range, view, scratch)
     s = scratch
     average_cells(tree.nodes, s.nodes, s.directions, s.cells[:n], s.ranges, view.front, sums)
+    for c in range(len(shown)):
+        if not shown[c]:
+            sums[c, 6] = F0
     moments = np.empty((view.num_stats, 8), np.float32)
     average_colors(sums, view, offsets, channels, weights, moments)
     local_statistics(moments, view, weights, stats)
@@ -110,11 +115,11 @@ def render_cells(tree, center, voxel_per_range, view, scratch, offsets, channels
 
 
 @kernel
-def render(tree, center, voxel_per_range, view, scratch, offsets, channels, weights):
-    """One view: position relative to the centre, normalised channels and weight of each cell."""
+def render(tree, center, voxel_per_range, view, scratch, shown, offsets, channels, weights):
+    """One view: position relative to the centre, normalised channels and weight of each cell that is shown."""
     sums = np.empty((len(weights), 8), np.float32)
     stats = np.empty((6, len(weights)), np.float32)
-    render_cells(tree, center, voxel_per_range, view, scratch, offsets, channels, weights, sums, stats)
+    render_cells(tree, center, voxel_per_range, view, scratch, shown, offsets, channels, weights, sums, stats)
     for k in range(3):
         for c in range(len(weights)):
             if weights[c] > F0:
@@ -126,9 +131,9 @@ def render_block(tree, centers, voxel_per_range, view, scratch, offsets, unit, l
     """Views from several centres in few bits: offsets in units of their own, channels in levels."""
     n = len(view.solid_angle)
     points, channels = np.empty((3, n), np.float32), np.empty((3, n), np.float32)
-    weights = np.empty(n, np.float32)
+    weights, shown = np.empty(n, np.float32), np.ones(n, np.bool_)
     for k in range(len(centers)):
-        render(tree, centers[k], voxel_per_range, view, scratch, points, channels, weights)
+        render(tree, centers[k], voxel_per_range, view, scratch, shown, points, channels, weights)
         largest = np.float32(1e-3)
         for i in range(3):
             for c in range(n):
@@ -155,8 +160,8 @@ def node_fraction(node):
 
 
 @kernel
-def render_points(tree, center, voxel_per_range, view, scratch, offsets, channels, weights):
-    """The visible points, thinned to what fits: relative position, normalised channels, weight 1.
+def render_points(tree, center, voxel_per_range, view, scratch, shown, offsets, channels, weights):
+    """The visible points in cells that are shown, thinned to what fits: as `render`, with weight 1.
 
     Each node is kept or left out by its own number, so that a camera a little farther on sees nearly the same
     points: a descent that is begun again from where it ended then ends there. Returns how many.
@@ -165,18 +170,19 @@ def render_points(tree, center, voxel_per_range, view, scratch, offsets, channel
     sums, stats = np.empty((num_cells, 8), np.float32), np.empty((6, num_cells), np.float32)
     cell_offsets, cell_channels = np.empty((3, num_cells), np.float32), np.empty((3, num_cells), np.float32)
     cell_weights = np.empty(num_cells, np.float32)
-    n = render_cells(
-        tree, center, voxel_per_range, view, scratch, cell_offsets, cell_channels, cell_weights, sums, stats
-    )
+    cells = cell_offsets, cell_channels, cell_weights, sums, stats
+    n = render_cells(tree, center, voxel_per_range, view, scratch, shown, *cells)
     s = scratch
+    for c in range(num_cells):  # how far what is seen reaches; nothing of cells that are not shown
+        sums[c, 7] = sums[c, 7] * view.visible + VISIBLE_OFFSET if cell_weights[c] > F0 else F0
     num_visible = 0
     for i in range(n):
-        if s.ranges[i] <= sums[s.cells[i], 7] * view.visible + VISIBLE_OFFSET:
+        if s.ranges[i] <= sums[s.cells[i], 7]:
             num_visible += 1
     kept = np.float32(FILLED * len(weights) / max(num_visible, 1))
     count = 0
     for i in range(n):
-        is_visible = s.ranges[i] <= sums[s.cells[i], 7] * view.visible + VISIBLE_OFFSET
+        is_visible = s.ranges[i] <= sums[s.cells[i], 7]
         if is_visible and node_fraction(s.nodes[i]) < kept and count < len(weights):
             node, c = s.nodes[i], s.cells[i]
             colors = opponent(tree.nodes[node, 3], tree.nodes[node, 4], tree.nodes[node, 5])
@@ -231,17 +237,21 @@ def _empty_cells(n: int) -> Cells:
     return Cells(np.empty((3, n), np.float32), np.empty((3, n), np.float32), np.empty(n, np.float32))
 
 
-def render_view(octree: Octree, center_map: NDArray[np.float64], config: ViewConfig) -> Cells:
-    """What is seen around a centre (3,) [m], on the cells of `config`."""
+def render_view(
+    octree: Octree, center_map: NDArray[np.float64], config: ViewConfig, shown: NDArray[np.bool_]
+) -> Cells:
+    """What is seen around a centre (3,) [m], on those cells (N,) of `config` that are shown."""
     cells = _empty_cells(len(make_grid(config.num_rings)))
     center = np.asarray(center_map, np.float64)
-    render(octree, center, config.voxel_per_range, config.arrays, thread_scratch(), *cells)
+    render(octree, center, config.voxel_per_range, config.arrays, thread_scratch(), shown, *cells)
     return cells
 
 
-def visible_points(octree: Octree, center_map: NDArray[np.float64], config: ViewConfig, count: int) -> Cells:
+def visible_points(
+    octree: Octree, center_map: NDArray[np.float64], config: ViewConfig, shown: NDArray[np.bool_], count: int
+) -> Cells:
     """The same of at most `count` visible points instead of cells, with equal weights."""
     cells = _empty_cells(count)
     center, view = np.asarray(center_map, np.float64), config.arrays
-    n = render_points(octree, center, config.voxel_per_range, view, thread_scratch(), *cells)
+    n = render_points(octree, center, config.voxel_per_range, view, thread_scratch(), shown, *cells)
     return Cells(cells.offsets[:, :n].copy(), cells.channels[:, :n].copy(), cells.weights[:n].copy())
