@@ -105,7 +105,8 @@ def open_files(
     watch = Stopwatch()
     name = str(paths[0]) if len(paths) == 1 else tuple(map(str, paths))
     if isinstance(settings, CoarseToFineSettings):
-        scan_map = open_map(paths, cloud_settings, cache, workers, watch, settings.prior)
+        up = cloud_settings.up if prepared_map_among(paths) else up_axis(cloud_settings, settings)
+        scan_map = open_map(paths, replace(cloud_settings, up=up), cache, workers, watch, settings.prior)
         return Scan(scan_map, name, cloud_settings, settings, workers, watch.seconds)
     if map_path := prepared_map_among(paths):
         raise InputError(f"{map_path}: a prepared map; the preset paper needs the cloud itself")
@@ -126,7 +127,8 @@ def scan_of(
     """A scan prepared anew for the method of the settings."""
     prepared: ScanMap | PaperMap
     if isinstance(settings, CoarseToFineSettings):
-        prepared = prepare_map(cloud, workers, cloud_settings.up, watch, prior=settings.prior)
+        up = up_axis(cloud_settings, settings)
+        prepared = prepare_map(cloud, workers, up, watch, prior=settings.prior)
     else:
         with watch.stage("read"):
             points = cloud.read()
@@ -136,3 +138,9 @@ def scan_of(
             prepared = prepare_by_paper(points, settings)
     prepared = replace(prepared, scan_sha256=cloud.sha256)
     return Scan(prepared, name, cloud_settings, settings, workers, watch.seconds)
+
+
+def up_axis(cloud_settings: CloudSettings, settings: CoarseToFineSettings) -> UpAxis:
+    """The axis that points up: z where the user says that gravity is known, so that nothing turns the scan."""
+    is_known = settings.gravity == "known" and cloud_settings.up == "auto"
+    return "z" if is_known else cloud_settings.up
