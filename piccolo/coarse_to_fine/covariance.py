@@ -68,8 +68,9 @@ def block_gradients(image: Texels, points: Cells, pose: Pose) -> Array:
     block = cell_of(offsets.T / np.linalg.norm(offsets, axis=0)[:, None], BLOCK_RINGS)
     parts = np.split(np.argsort(block, kind="stable"), np.cumsum(np.bincount(block))[:-1])
     chosen = (Cells(offsets[:, part], levels[:, part], weights[part]) for part in parts if len(part))
-    found = np.array([gradient_at(image, part, pose.R_cam_from_world, np.zeros(3)) for part in chosen])
-    return np.asarray(found[found.any(axis=1)])  # blocks that the photo does not show have none
+    found = [gradient_at(image, part, pose.R_cam_from_world, np.zeros(3)) for part in chosen]
+    gradients = np.reshape(found, (-1, 6))
+    return np.asarray(gradients[gradients.any(axis=1)])  # blocks that the photo does not show have none
 
 
 def covariance_of(hessian: Array, gradients: Array) -> Array | None:
