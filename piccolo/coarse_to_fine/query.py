@@ -48,7 +48,7 @@ class Query:
     @cached_property
     def matches(self) -> Matches:
         """The photo's keypoints and the features of the map that look alike."""
-        gray = cv2.cvtColor(self.panorama.rgb, cv2.COLOR_RGB2GRAY)
+        gray = np.asarray(cv2.cvtColor(self.panorama.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
         keypoints = find_keypoints(gray, self.panorama.is_valid, self.workers)
         return match(keypoints, self.scan_map.local_features, self.workers)
 
@@ -59,12 +59,12 @@ class Query:
         return pack_texels(small.rgb, small.is_valid)
 
     def shows(self, directions: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
-        """True for each of some directions (N, 3) in the camera's frame in which the photo shows something."""
+        """Whether the photo shows something in directions (N, 3) of the camera's frame."""
         x, y, z = directions.T
         height, width = self.panorama.is_valid.shape
         column = ((0.5 - np.arctan2(y, x) / (2.0 * np.pi)) * width).astype(np.int64) % width
         row = ((0.5 - np.arctan2(z, np.hypot(x, y)) / np.pi) * height).astype(np.int64)
-        return self.panorama.is_valid[np.minimum(row, height - 1), column]
+        return np.asarray(self.panorama.is_valid[np.minimum(row, height - 1), column])
 
     def without(self, is_hidden: NDArray[np.bool_]) -> "Query":
         """The same of what is left of the photo without some pixels (h, 2 h), its contrast taken anew."""
