@@ -213,7 +213,7 @@ def block_correlation(first, second, shared, blocks, num_blocks):
 
 
 def votes(matches, R_cam_from_map, center_map):
-    """Sum over features of the largest weight of a match off by 20 deg, 1.7 in size, 40 deg in turn at most."""
+    """Sum over features of the largest weight of a match within 20 deg, 1.7 in size, 40 deg in turn."""
     best = {}
     for k in range(len(matches.query)):
         seen = R_cam_from_map @ (matches.points[k].astype(float) - center_map)

@@ -56,14 +56,14 @@ def test_ranges_and_greys_are_those_of_the_room():
 
 
 def test_what_is_seen_through_a_thin_scan_is_dropped():
-    """Before a wall at 4 m a sheet at 1 m of which one pixel in ten was scanned."""
-    sheet = _sphere(1.0, 80)
+    """Before a wall at 4 m a sheet at 1 m of which one pixel in seven was scanned."""
+    sheet = _sphere(1.0, 96)
     sheet = sheet[(sheet[:, 0] > 0.5)]
     view = render_gray(_octree((_sphere(4.0, 512), 40), (sheet, 220)), np.zeros(3), WIDTH)
     behind_sheet = pixel_rays(WIDTH)[..., 0] > 0.7
     assert (view.ranges[behind_sheet] < 1.5).all()
-    assert view.is_filled[behind_sheet].mean() > 0.97
-    assert (view.gray[behind_sheet] > 200).mean() > 0.98
+    assert view.is_filled[behind_sheet].mean() > 0.9  # all but where hardly a quarter is left
+    assert (view.gray[behind_sheet & view.is_filled] > 200).all()
     aside = pixel_rays(WIDTH)[..., 0] < 0.3
     np.testing.assert_allclose(view.ranges[aside & (view.ranges > 0)], 4.0, rtol=0.02)
 
