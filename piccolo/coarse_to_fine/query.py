@@ -59,12 +59,12 @@ class Query:
         return pack_texels(small.rgb, small.is_valid)
 
     def shows(self, directions: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
-        """Whether the photo shows something in directions (N, 3) of the camera's frame."""
+        """True for each of some directions (N, 3) in the camera's frame in which the photo shows something."""
         x, y, z = directions.T
         height, width = self.panorama.is_valid.shape
         column = ((0.5 - np.arctan2(y, x) / (2.0 * np.pi)) * width).astype(np.int64) % width
         row = ((0.5 - np.arctan2(z, np.hypot(x, y)) / np.pi) * height).astype(np.int64)
-        return np.asarray(self.panorama.is_valid[np.minimum(row, height - 1), column])
+        return self.panorama.is_valid[np.minimum(row, height - 1), column]
 
     def without(self, is_hidden: NDArray[np.bool_]) -> "Query":
         """The same of what is left of the photo without some pixels (h, 2 h), its contrast taken anew."""
