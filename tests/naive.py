@@ -167,3 +167,60 @@ def misplaced(nodes, first_child, level_start, origin, leaf_size):
     places = (np.array([nodes[children, :3], nodes[parent, :3]]) + origin) / size
     is_near_border = np.abs(places - np.rint(places)).max(axis=0) < 1e-3
     return ((np.floor(places[0]) != np.floor(places[1])) & ~is_near_border).any(axis=1)
+
+
+def view_positions(centers, ranges, num_rings):
+    """Indices of the positions kept, one after another by lists; 2.5 m, 2.4 m, 1 m as in the module."""
+    cells = [tuple(np.floor(c / [2.5, 2.5, 3.0])) for c in centers]
+    lowest = {cell: min(c[2] for c, own in zip(centers, cells, strict=True) if own == cell) for cell in cells}
+    off = [abs(c[2] - lowest[cell] - 1.0) for c, cell in zip(centers, cells, strict=True)]
+    kept = []
+    for i in sorted(range(len(centers)), key=lambda i: round(off[i] / 0.3)):
+        for j in kept:
+            gap = centers[i] - centers[j]
+            row = int((90.0 - math.degrees(math.atan2(gap[2], math.hypot(*gap[:2])))) / 3.75)
+            column = int((180.0 + math.degrees(math.atan2(gap[1], gap[0]))) / 3.75)
+            middle = np.radians([(column + 0.5) * 3.75 - 180.0, 90.0 - (row + 0.5) * 3.75])
+            level = math.cos(middle[1])
+            ray = np.array([[level * math.cos(middle[0]), level * math.sin(middle[0]), math.sin(middle[1])]])
+            limit = ranges[j, cell_of(ray.astype(np.float32), num_rings)[0]]
+            is_near = math.hypot(*gap[:2]) < 2.5 and abs(gap[2]) < 2.4
+            if is_near and (limit == 0 or np.linalg.norm(gap) < limit + 1.0):
+                break
+        else:
+            kept.append(i)
+    return kept
+
+
+def nearest_places(descriptors, map_descriptors, places, count):
+    """Squared distances (N, count) to the nearest features of the nearest places, and these places."""
+    gaps = descriptors[:, None].astype(int) - map_descriptors[None].astype(int)
+    squares = (gaps**2).sum(axis=2)
+    best = np.stack([squares[:, places == place].min(axis=1) for place in np.unique(places)], axis=1)
+    order = np.argsort(best, axis=1, kind="stable")[:, :count]
+    return np.take_along_axis(best, order, axis=1), np.unique(places)[order]
+
+
+def block_correlation(first, second, shared, blocks, num_blocks):
+    """Correlation and area (blocks,) of channels (3, N) over weights (N,)."""
+    correlation, area = np.zeros(num_blocks), np.zeros(num_blocks)
+    for b in range(num_blocks):
+        w, x, y = shared[blocks == b], first[:, blocks == b], second[:, blocks == b]
+        area[b] = w.sum()
+        energy = (w * x**2).sum() * (w * y**2).sum()
+        correlation[b] = (w * x * y).sum() / math.sqrt(energy) if energy > 1e-12 else 0.0
+    return correlation, area
+
+
+def votes(matches, R_cam_from_map, center_map):
+    """Sum over features of the largest weight of a match within 20 deg, 1.7 in size, 40 deg in turn."""
+    best = {}
+    for k in range(len(matches.query)):
+        seen = R_cam_from_map @ (matches.points[k].astype(float) - center_map)
+        distance = np.linalg.norm(seen)
+        off = math.acos(min(seen @ matches.rays[k] / distance, 1.0))
+        ratio = math.log(matches.sizes[k] / (distance * matches.angles[k]))
+        turn = math.acos(np.clip(R_cam_from_map @ matches.tangents[k] @ matches.ray_tangents[k], -1.0, 1.0))
+        if off < math.radians(20.0) and abs(ratio) < math.log(1.7) and turn < math.radians(40.0):
+            best[matches.query[k]] = max(best.get(matches.query[k], 0.0), float(matches.weights[k]))
+    return sum(best.values())

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from piccolo.geometry.pose import Pose, exp_so3, step
-from piccolo.optimize.channel_loss import channel_equations, correlate, score
+from piccolo.optimize.channel_loss import CHANCE, NUM_BLOCKS, channel_equations, correlate, score
 from piccolo.optimize.normal_equations import COUNT, GRADIENT, LOSS, MATRIX, NUM_SUMS
 from piccolo.panorama.texels import pack_texels
 
@@ -76,19 +76,29 @@ def test_a_point_on_masked_pixels_costs_half_of_the_most_it_could():
     assert (sums[GRADIENT:] == 0).all()
 
 
-def test_correlation_is_over_what_both_show():
+def test_each_block_correlates_over_what_both_show_and_counts_beyond_chance():
     points, levels, weights, rgb = _problem()
     is_valid = np.ones(rgb.shape[:2], dtype=bool)
     is_valid[:20] = False
     pixels = naive.project(points.T, TILTED.R_cam_from_world, TILTED.center_world, rgb.shape[1])
-    w = weights * (naive.sample(is_valid[..., None], pixels)[:, 0] > 1 - 1e-9)
-    a, b = naive.sample(rgb, pixels) - 127.5, levels.T - 127.5
-    expected = (w @ (a * b)).sum() / np.sqrt((w @ a**2).sum() * (w @ b**2).sum())
+    shown = naive.sample(rgb, pixels).T
+    noise = np.linspace(0, 200, points.shape[1]).astype(np.float32)  # so that blocks correlate more or less
+    levels = np.clip(shown + noise * (levels - 130) / 70, 0, 255).astype(np.float32)
+    w = weights * (naive.sample(is_valid[..., None], pixels)[:, 0] > 1 - 1e-9) / weights.sum()
+    blocks = (np.arange(points.shape[1]) * NUM_BLOCKS // points.shape[1]).astype(np.int32)
+    expected, total = [], 0.0
+    for block in range(NUM_BLOCKS):
+        a, b, of_block = *((x[:, blocks == block] - 127.5) for x in (shown, levels)), w[blocks == block]
+        expected.append([a * b @ of_block, b * b @ of_block, a * a @ of_block, [of_block.sum()] * 3])
+        product, own, other = (channel.sum() for channel in expected[-1][:3])
+        total += max(product / np.sqrt(own * other) - CHANCE, 0) / (1 - CHANCE) * of_block.sum()
     texels = pack_texels(rgb, is_valid)
-    R, center = TILTED.R_cam_from_world, TILTED.center_world
-    arguments = points, levels, weights, texels.rgbx, texels.width, R, center
-    correlation, shared = correlate(*arguments)
-    assert 0.5 < shared / weights.sum() < 0.9
-    assert correlation == pytest.approx(expected, abs=1e-4)
-    assert shared == pytest.approx(w.sum(), rel=1e-5)
-    assert score(*arguments) == pytest.approx(correlation * np.sqrt(shared))
+    how = texels.rgbx, texels.width, TILTED.R_cam_from_world, TILTED.center_world
+    arguments = points, levels, (weights / weights.sum()).astype(np.float32), blocks, *how
+    sums = np.empty((NUM_BLOCKS, 4))
+    correlate(*arguments, sums)
+    np.testing.assert_allclose(sums[:, :3], np.sum(expected, axis=2)[:, :3], rtol=1e-3, atol=0.5)
+    np.testing.assert_allclose(sums[:, 3], np.array(expected)[:, 3, 0], rtol=1e-5)
+    assert 0.5 < sums[:, 3].sum() < 0.9
+    assert score(*arguments) == pytest.approx(total, abs=1e-4)
+    assert 0.2 < total < 0.7

@@ -15,6 +15,8 @@ from piccolo.geometry.sphere import make_grid
 from piccolo.panorama.local_normalization import image_pyramid
 from piccolo.runtime.threads import Workers
 
+FINE_BLOCKS = METHOD.fine_view.arrays.blocks
+
 
 @functools.lru_cache
 def _images():
@@ -44,7 +46,7 @@ def test_descent_finds_the_true_pose_again():
     center, off = true_pose.center_world, step(true_pose, np.array([0.03, -0.02, 0.04, 0.06, -0.05, 0.04]))
     pose = descent.descend(cells, center, image, off, (1.0, 30, 1e-5))
     assert rooms.errors(pose, true_pose)[0] < 0.01
-    before, after = (descent.score_on(cells, center, image, p) for p in (off, pose))
+    before, after = (descent.score_on(cells, FINE_BLOCKS, center, image, p) for p in (off, pose))
     assert after > max(0.6, before)
     assert rooms.errors(descent.descend(cells, center, image, off, (1.0, 1, 1e-5)), true_pose)[0] > 0.01
 
@@ -54,9 +56,9 @@ def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off():
     off = step(true_pose, descent.perturbations(1.0)[1])
     assert rooms.errors(off, true_pose)[0] > 0.2
     cells = render_view(rooms.scan_map(1).octree, off.center_world, METHOD.fine_view)
-    found = descent.descend_around(cells, (images.search, images.middle), off, 1.0)
+    found = descent.descend_around(cells, FINE_BLOCKS, (images.search, images.middle), off, 1.0)
     assert rooms.errors(found.pose, true_pose)[0] < 0.06
-    score = descent.score_on(cells, off.center_world, images.middle, found.pose)
+    score = descent.score_on(cells, FINE_BLOCKS, off.center_world, images.middle, found.pose)
     np.testing.assert_allclose(found.score, score, atol=1e-5)
 
 

@@ -43,8 +43,12 @@ def _save(path, arrays, save=np.savez):
 def test_round_trip_and_a_file_cut_short(built, tmp_path):
     back = load_map(built)
     for field in dataclasses.fields(back):
-        if field.name != "octree":
+        if field.name not in ("octree", "local_features"):
             np.testing.assert_array_equal(getattr(back, field.name), getattr(scan_map(1), field.name))
+    for own, other in zip(back.local_features, scan_map(1).local_features, strict=True):
+        assert own.dtype == other.dtype
+        np.testing.assert_array_equal(own, other)
+    assert len(back.local_features.points) > 1000
     assert isinstance(back.scan_sha256, str)
     assert back.has_labels is False
     np.testing.assert_array_equal(back.octree.nodes, scan_map(1).octree.nodes)
@@ -125,6 +129,24 @@ DAMAGE = {  # member, what is done to it, the words of the refusal
     "index too large": ("sparse", _changed(0, 10**9), "sparse candidates that are not"),
     "index below zero": ("sparse", _changed(0, -1), "sparse candidates that are not"),
     "twice": ("sparse", _changed(0, 1), "sparse candidates that are not"),
+    "a feature nowhere": ("local_points", _changed((5, 2), np.nan), "a feature at no finite place"),
+    "a feature far away": ("local_points", _changed((-1, 0), 1e6), "a feature at no finite place"),
+    "a feature less": ("local_sizes", lambda a: a[1:], "local_sizes of type float32 and shape"),
+    "no size": ("local_sizes", _changed(3, 0.0), "features of 0.0 to"),
+    "size of no number": ("local_sizes", _changed(3, np.nan), "features of nan to nan m"),
+    "large size": ("local_sizes", _changed(3, 31.0), "features of .* to 31.0 m"),
+    "too low direction": ("local_directions", _changed((1, 2), -128), "local_directions below -127"),
+    "too low tangent": ("local_tangents", _changed((1, 2), -128), "local_tangents below -127"),
+    "too low descriptor": ("local_descriptors", _changed((9, 9), -128), "local_descriptors below -127"),
+    "too low component": ("local_components", _changed((9, 9), -128), "local_components below -127"),
+    "too low middle": ("local_middles", _changed((0, 9), -128), "local_middles below -127"),
+    "a component less": ("local_components", lambda a: a[:, 1:].copy(), "local_components of type int8"),
+    "wide mean": ("local_mean", lambda a: a.astype(np.int64), "local_mean of type int64"),
+    "no list": ("local_middles", lambda a: a[:0], "0 lists of features with"),
+    "a list more": ("local_middles", lambda a: np.concatenate([a, a[:1]]), "lists of features with"),
+    "a list after the end": ("local_list_start", _changed(-1, 2**31 - 1), "lists of features that do not"),
+    "a list before the start": ("local_list_start", _changed(0, -1), "lists of features that do not"),
+    "lists that overlap": ("local_list_start", _changed(2, 2**30), "lists of features that do not"),
     "no digest": ("scan_sha256", lambda a: np.array("G" * 64), "a scan_sha256 that is no digest"),
     "no text": ("scan_sha256", lambda a: np.full(64, 2**32 - 1, "u4").view("<U64")[0], "that is no digest"),
     "short digest": ("scan_sha256", lambda a: np.array("0"), "scan_sha256 of type <U1"),

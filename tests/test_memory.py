@@ -8,13 +8,13 @@ import pytest
 from rooms import as_panorama, query, room, scan_map
 
 from piccolo.cloud import voxels
-from piccolo.coarse_to_fine.localize import localize
+from piccolo.coarse_to_fine.query import prepare_query
 from piccolo.coarse_to_fine.scan_map import SEARCH_VIEW, prepare_map, render_candidates
+from piccolo.coarse_to_fine.search import search_poses
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.errors import InputError
 from piccolo.panorama import read_panorama
 from piccolo.runtime import memory
-from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers
 
 
@@ -92,7 +92,8 @@ def test_all_that_grows_asks_first(monkeypatch, tmp_path):
     cv2.imwrite(str(picture), taken.rgb)
     rng = np.random.default_rng(0)
     table = voxels.VoxelTable("a.ply")
-    settings, workers = CoarseToFineSettings(), Workers(1)
+    workers = Workers(1)
+    asked = prepare_query(taken, whole, CoarseToFineSettings(), workers)
     monkeypatch.setattr(memory, "memory_left", lambda: 1e5)
     spread, colors = rng.uniform(0, 90, (50_000, 3)), np.full((50_000, 3), 9, np.uint8)
     for text, ask in (
@@ -100,7 +101,7 @@ def test_all_that_grows_asks_first(monkeypatch, tmp_path):
         ("a.ply: a table of 131072 voxels", lambda: table.add(spread, colors)),
         ("voxels of 2 cm needs", lambda: prepare_map(room(1)[1], workers)),
         ("prepared views", lambda: render_candidates(whole.octree, whole.centers, SEARCH_VIEW, workers)),
-        ("rotations needs .*--num-yaws", lambda: localize(whole, taken, settings, workers, Stopwatch())),
+        ("rotations needs .*--num-yaws", lambda: search_poses(asked, "known")),
     ):
         with pytest.raises(InputError, match=text):
             ask()

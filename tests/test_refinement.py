@@ -1,7 +1,6 @@
 """Decisions of the default method, each in a made-up case where one rule changes the outcome."""
 
 import functools
-import types
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,14 +9,17 @@ import rooms
 
 from piccolo.coarse_to_fine import evaluation, refinement
 from piccolo.coarse_to_fine import localize as method
+from piccolo.coarse_to_fine.comparison import Comparison
 from piccolo.coarse_to_fine.config import METHOD, Beam
 from piccolo.coarse_to_fine.query import prepare_query
 from piccolo.coarse_to_fine.search_result import SearchResult
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.coarse_to_fine.starts import Starts, best_and_alternatives, narrow
+from piccolo.coarse_to_fine.view import Cells
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.confidence.score import Agreement
 from piccolo.geometry.pose import Pose, step, yaw_rotation
+from piccolo.optimize.channel_loss import CHANCE
 from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers
 
@@ -82,16 +84,16 @@ def test_halving_keeps_as_many_as_the_beam_says(monkeypatch):
     for name, gain in (("descend_middle", 0.1), ("perturb_middle", 0.1), ("descend_fine", 0.1)):
         monkeypatch.setattr(refinement, name, gaining(name, gain))
     monkeypatch.setattr(refinement, "refine_by_perturbation", gaining("perturb", 0.5))
+    monkeypatch.setattr(refinement, "compared", gaining("compared", 1.0))
     centers = np.outer(np.arange(40.0), [1.0, 0, 0])
     R, index = np.repeat(np.eye(3)[None], 40, axis=0), np.arange(40)
     starts = Starts(R, centers, index, 0.5 - 0.01 * index)
-    fine, middle = refinement.refine(QUERY, starts, Beam(30, 12, 5, 2))
-    assert calls[:2] == [(5, 30), (12, 12)]
-    stages = ("descend_middle", "perturb_middle", "descend_fine", "perturb")
-    assert [calls.count(name) for name in stages] == [12, 5, 5, 2]
-    assert _places(fine) == [0, 1, 0, 1, 2, 3, 4]
-    assert fine[0].score == pytest.approx(0.5 + 0.3 + 0.5)
-    assert _places(middle) == list(range(12))
+    found = refinement.refine(QUERY, starts, Beam(30, 20, 5, 2))
+    assert calls[:2] == [(5, 30), (12, 20)]
+    stages = ("descend_middle", "perturb_middle", "descend_fine", "perturb", "compared")
+    assert [calls.count(name) for name in stages] == [20, 5, 5, 2, 15]
+    assert _places(found) == [0, 1, 0, 1, 2, 3, 4, *range(5, 13)]  # the last from middle cells
+    assert [found[k].score for k in (0, 2, 7)] == pytest.approx([2.3, 1.8, 1.55])
 
 
 # Perturbations and the last millimetres
@@ -102,11 +104,18 @@ def test_each_stage_has_its_view_its_image_and_its_limits(monkeypatch):
     monkeypatch.setattr(refinement, "render_view", lambda octree, center, view: view)
     monkeypatch.setattr(refinement, "visible_points", lambda octree, center, view, count: (view, count))
     monkeypatch.setattr(refinement, "descend", lambda *arguments: asked.append(arguments) or arguments[3])
-    monkeypatch.setattr(refinement, "score_on", lambda cells, center, image, pose: 0.5)
-    query = SimpleNamespace(**vars(QUERY), images=SimpleNamespace(full="full", fine="fine", middle="middle"))
+    monkeypatch.setattr(refinement, "score_on", lambda cells, blocks, center, image, pose: len(blocks))
+    monkeypatch.setattr(refinement, "refine_unoccluded", lambda query, h: (query, h))
+    monkeypatch.setattr(refinement, "without_occluders", lambda query, pose: query)
+    monkeypatch.setattr(refinement, "compared", lambda query, h: h)
+    images = SimpleNamespace(full="full", fine="fine", middle="middle")
+    query = SimpleNamespace(**vars(QUERY), images=images, photo=SimpleNamespace(valid_share=1.0))
     h, full = _at(1.0, 0.2), (METHOD.full_view, 30_000)
-    refinement.descend_middle(query, h)
-    assert refinement.descend_fine(query, h).score == 0.5
+    for at, view in (
+        (refinement.descend_middle, METHOD.middle_view),
+        (refinement.descend_fine, METHOD.fine_view),
+    ):
+        assert at(query, h).score == len(view.arrays.blocks)
     refinement.refine_full_resolution(query, h, 1)
     refinement.settle(query, h)
     assert [(cells, image, *limits) for cells, _, image, _, limits in asked] == [
@@ -124,7 +133,7 @@ def test_each_stage_has_its_view_its_image_and_its_limits(monkeypatch):
 def test_poses_are_perturbed_for_as_long_as_that_helps(monkeypatch, gains, rounds, expected):
     left, sizes = list(gains), []
 
-    def around(cells, images, pose, size):
+    def around(cells, blocks, images, pose, size):
         sizes.append(size)
         assert images == ("middle", "fine")
         return Hypothesis(pose, score[0])
@@ -143,14 +152,16 @@ def test_poses_are_perturbed_for_as_long_as_that_helps(monkeypatch, gains, round
     assert sizes == [0.4] * rounds
 
 
-@pytest.mark.parametrize(("after", "is_taken"), [(0.60, True), (0.515, True), (0.505, False), (0.1, False)])
+@pytest.mark.parametrize(("after", "is_taken"), [(0.60, True), (0.515, True), (0.503, False), (0.1, False)])
 def test_full_resolution_is_taken_back_where_the_score_falls(monkeypatch, after, is_taken):
-    """By a hundredth at most may it fall, in exchange for millimetres."""
+    """By three parts in a hundred at most may it fall, in exchange for millimetres."""
     moved, start = _at(0.004, 0.0).pose, _at(0.0, 0.52)
     query = SimpleNamespace(**vars(QUERY), images=SimpleNamespace(full="full"))
     asked, descents = [], []
-    monkeypatch.setattr(refinement, "score_at", lambda _, pose: 0.52 if pose is start.pose else after)
-    monkeypatch.setattr(refinement, "visible_points", lambda octree, center, *_: asked.append(center[0]))
+    monkeypatch.setattr(refinement, "refine_unoccluded", lambda query, h: (query, h))
+    monkeypatch.setattr(refinement, "without_occluders", lambda query, pose: query)
+    monkeypatch.setattr(refinement, "compared", lambda query, h: Hypothesis(h.pose, after))
+    monkeypatch.setattr(refinement, "points_at", lambda query, pose: asked.append(pose.center_world[0]))
     monkeypatch.setattr(refinement, "descend", lambda *arguments: descents.append(arguments[-1]) or moved)
     expected = Hypothesis(moved, after) if is_taken else start
     assert refinement.refine_full_resolution(query, start, 2) == expected
@@ -160,6 +171,59 @@ def test_full_resolution_is_taken_back_where_the_score_falls(monkeypatch, after,
     monkeypatch.setattr(refinement, "descend", lambda *arguments: _at(len(asked), 0.0).pose)
     refinement.settle(query, start)
     assert len(asked) == 10  # six rounds at most
+
+
+@pytest.mark.parametrize(
+    ("hidden", "gains", "expected"),
+    [
+        ([None], [0.1], (0.6, None, 1)),
+        (["a", "b"], [0.1, 0.1], (0.7, "b", 2)),
+        (["a"], [0.01], (0.51, "a", 1)),
+        (["a"], [-0.2], (0.5, "a", 1)),
+        (["a", None], [0.1, 0.1], (0.7, None, 2)),
+    ],
+)
+def test_occluders_are_masked_twice_at_most_and_while_that_helps(monkeypatch, hidden, gains, expected):
+    """What is hidden at each look, what is gained; the score, what is hidden at last, the looks."""
+    score, looks, left = [0.5], [], list(hidden)
+    query = SimpleNamespace(**vars(QUERY), hidden=None)
+
+    def without_occluders(asked, pose):
+        assert asked is query  # always of the whole photo
+        looks.append(left.pop(0))
+        return query if looks[-1] is None else SimpleNamespace(**{**vars(QUERY), "hidden": looks[-1]})
+
+    def perturbed(shown, h):
+        assert shown.hidden == looks[-1]
+        score[0] = max(score[0], h.score) + gains[len(looks) - 1]
+        return h
+
+    def compared(asked, h):
+        assert asked is query
+        return Hypothesis(h.pose, score[0])
+
+    monkeypatch.setattr(refinement, "without_occluders", without_occluders)
+    monkeypatch.setattr(refinement, "refine_by_perturbation", perturbed)
+    monkeypatch.setattr(refinement, "compared", compared)
+    monkeypatch.setattr(refinement, "perturb_middle", lambda shown, h: h)
+    monkeypatch.setattr(refinement, "descend_fine", lambda shown, h: h)
+    shown, h = refinement.refine_unoccluded(query, _at(0.0, 0.0))
+    assert (pytest.approx(h.score), shown.hidden, len(looks)) == expected
+
+
+def test_points_are_those_that_the_photo_shows(monkeypatch):
+    """A fifth of the sphere is asked for five times as many; those outside the photo are left out."""
+    asked, turned = [], Pose(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
+    offsets = np.array([[1.0, -1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]], np.float32)
+    cells = Cells(offsets, np.arange(9.0).reshape(3, 3), np.arange(3.0))
+    monkeypatch.setattr(refinement, "visible_points", lambda *arguments: asked.append(arguments[3]) or cells)
+    query = SimpleNamespace(**vars(QUERY), shows=lambda rays: rays[:, 1] > 0.5)
+    for share, num_points, kept in ((1.0, 30_000, [0, 1, 2]), (0.2, 150_000, [1]), (0.001, 1_000_000, [1])):
+        query.photo = SimpleNamespace(valid_share=share)
+        points = refinement.points_at(query, turned)
+        assert asked.pop() == num_points
+        assert points.weights.tolist() == kept
+        assert points.offsets.shape == points.channels.shape == (3, len(kept))
 
 
 @pytest.mark.parametrize(("seed", "most"), [(1, 5e-4), (2, 5e-5), (3, 2e-4)])
@@ -178,123 +242,157 @@ def test_the_end_hardly_depends_on_where_the_descent_begins(seed, most):
     assert rooms.errors(ends[0], true_pose)[0] < 0.01
 
 
-# Attempts and alternatives
+# Matches, searches and alternatives
 
 
-def test_alternatives_that_come_near_are_refined_and_the_better_wins(monkeypatch):
-    """The second gains by refinement and wins; one with less than 0.4 of the best score stays."""
-    gains = {0.0: 9.0, 3.0: 0.25, 6.0: 0.01, 9.0: 9.0}
+def _seen(explains, num_blocks=4):
+    """A comparison that explains a part of each of some blocks of a hundredth of the sphere."""
+    beyond = CHANCE + (1.0 - CHANCE) * explains
+    return Comparison(np.full(num_blocks, beyond), *[np.full(num_blocks, 0.01)] * 2, 0.04)
+
+
+def test_of_poses_that_matches_gave_the_better_end_is_taken(monkeypatch):
+    """As found, or after a descent on fine cells, whichever explains more."""
+    scores = {0.0: 0.3, 1.0: 0.5, 5.0: 0.6, 6.0: 0.2}
+    down = lambda query, h: _at(h.pose.center_world[0] + 1.0, 0.9)  # noqa: E731
+    monkeypatch.setattr(refinement, "descend_fine", down)
+    monkeypatch.setattr(refinement, "perturb_middle", lambda query, h: _at(-1.0, 0.9))
+    to_score = lambda query, h: Hypothesis(h.pose, scores[h.pose.center_world[0]])  # noqa: E731
+    monkeypatch.setattr(refinement, "compared", to_score)
+    found = refinement.refine_matched(QUERY, [_at(0.0, 0).pose, _at(5.0, 0).pose])
+    assert [(h.pose.center_world[0], h.score) for h in found] == [(5.0, 0.6), (1.0, 0.5)]
+
+
+def test_alternatives_that_come_near_are_refined_and_what_explains_more_wins(monkeypatch):
+    """The third explains more of what both show, though its score is less; the far one stays as it is."""
+    explains = {0.0: 0.5, 3.0: 0.4, 6.0: 0.6, 9.0: 0.1}
     refined = []
 
-    def perturbed(query, h):
-        refined.append(h.pose.center_world[0])
-        return Hypothesis(h.pose, h.score + gains[refined[-1]])
+    def full(query, h, num_rounds):
+        refined.append((h.pose.center_world[0], num_rounds))
+        return Hypothesis(h.pose, h.score + 0.01)
 
-    monkeypatch.setattr(method, "refine_by_perturbation", perturbed)
-    monkeypatch.setattr(method, "refine_full_resolution", lambda query, h, n: h if n == 2 else None)
-    result = SearchResult(_at(0.0, 0.5), (_at(3.0, 0.4), _at(6.0, 0.3), _at(9.0, 0.19)))
-    found = method.refine_alternatives(QUERY, result)
-    assert refined == [3.0, 6.0]
-    assert (found.best.pose.center_world[0], found.best.score) == (3.0, pytest.approx(0.65))
-    assert _places(found.alternatives) == [0.0, 6.0, 9.0]
-    assert [h.score for h in found.alternatives] == pytest.approx([0.5, 0.31, 0.19])
-
-
-def test_a_search_is_confident_by_score_and_margin():
-    for score, other, is_sure in ((0.25, 0.1, True), (0.24, 0, False), (0.5, 0.35, True), (0.5, 0.36, False)):
-        assert SearchResult(_at(0.0, score), (_at(3.0, other),)).is_confident == is_sure
+    monkeypatch.setattr(method, "refine_full_resolution", full)
+    monkeypatch.setattr(method, "compare", lambda query, pose: _seen(explains[pose.center_world[0]]))
+    monkeypatch.setattr(method, "settle", lambda query, h: h)
+    found = method.finished(QUERY, [_at(9.0, 0.1), _at(0.0, 0.5), _at(6.0, 0.31), _at(3.0, 0.4)])
+    assert refined == [(0.0, 2), (3.0, 2), (6.0, 2)]
+    assert found.best == Hypothesis(found.best.pose, 0.32)
+    assert _places([found.best, *found.alternatives]) == [6.0, 0.0, 3.0, 9.0]
+    assert found.rival_ratio == pytest.approx(0.5 / 0.6)
 
 
-def _run(monkeypatch, attempts, gravity="auto", refined=types.MappingProxyType({})):
-    """Localize with made-up attempts, lists of hypotheses; the attempts made, and what is evaluated."""
-    made, left = [], list(attempts)
+def test_an_alternative_must_explain_five_hundredths_more_to_win(monkeypatch):
+    for other, best in ((0.52, 0.0), (0.53, 3.0)):
+        explains = {0.0: 0.5, 3.0: other}
+        monkeypatch.setattr(
+            method, "compare", lambda query, pose, of=explains: _seen(of[pose.center_world[0]])
+        )
+        found = method.fairly_selected(QUERY, SearchResult(_at(0.0, 0.5), (_at(3.0, 0.4),)))
+        assert _places([found.best]) == [best]
+    alone = SearchResult(_at(0.0, 0.5), ())
+    assert method.fairly_selected(QUERY, alone) is alone
+
+
+def test_margin_is_the_lesser_of_two_leads_and_a_result_is_sure_by_three_things():
+    for score, other, rival, margin in ((0.5, 0.1, 0.3, 0.7), (0.5, 0.4, 0.3, 0.2), (0.1, 0.4, 0.0, -1.0)):
+        found = SearchResult(_at(0.0, score), (_at(3.0, other),), rival)
+        assert found.margin == pytest.approx(margin)
+    assert SearchResult(_at(0.0, 0.3), ()).margin == 1.0
+    for score, other, matches, is_sure in (
+        (0.05, 0.02, 12, True),
+        (0.04, 0.01, 12, False),
+        (0.5, 0.24, 11, False),
+        (0.5, 0.26, 99, False),
+    ):
+        assert SearchResult(_at(0.0, score), (_at(3.0, other),)).is_sure(matches) == is_sure
+
+
+def _run(monkeypatch, matched, searches, gravity="auto", config=METHOD):
+    """Localize with made-up poses from matches and from searches; the searches made, what is evaluated.
+
+    A score in hundredths is also how many features agree, and what a pose explains.
+    """
+    made, left = [], list(searches)
     scan_map = SimpleNamespace(centers=np.zeros((1, 3)))
+    scores = {h.pose.center_world[0]: h.score for some in (matched, *searches) for h in some}
 
-    def refine(query, starts, beam):
-        made.append((starts, "wide" if beam is METHOD.wide_beam else "narrow"))
-        return left.pop(0), []
-
-    def perturbed(query, h):
-        return Hypothesis(h.pose, refined.get(h.pose.center_world[0], h.score))
+    def search_poses(query, gravity):
+        made.append(gravity)
+        return gravity
 
     monkeypatch.setattr(method, "apply_prior", lambda *_: scan_map)
-    monkeypatch.setattr(method, "prepare_query", lambda *_: QUERY)
-    monkeypatch.setattr(method, "search_poses", lambda query, gravity: gravity)
-    monkeypatch.setattr(method, "refine", refine)
-    monkeypatch.setattr(method, "refine_by_perturbation", perturbed)
+    monkeypatch.setattr(method, "prepare_query", lambda *_: SimpleNamespace(**vars(QUERY), matches=None))
+    monkeypatch.setattr(method, "matched_poses", lambda query: "matched")
+    monkeypatch.setattr(method, "refine_matched", lambda query, poses: list(matched))
+    monkeypatch.setattr(method, "count_matches", lambda _, pose: 100 * scores.get(pose.center_world[0], 0))
+    monkeypatch.setattr(method, "compare", lambda query, pose: _seen(scores[pose.center_world[0]]))
+    monkeypatch.setattr(method, "search_poses", search_poses)
+    monkeypatch.setattr(method, "refine", lambda query, starts, beam: left.pop(0))
     monkeypatch.setattr(method, "refine_full_resolution", lambda query, h, num_rounds: h)
     monkeypatch.setattr(method, "settle", lambda query, h: Hypothesis(h.pose, h.score + 0.001))
     monkeypatch.setattr(method, "evaluate", lambda query, panorama, found: found)
     settings = CoarseToFineSettings(gravity=gravity)
-    found = method.localize(None, rooms.scene(1)[1], settings, Workers(1), Stopwatch())
+    found = method.localize(None, rooms.scene(1)[1], settings, Workers(1), Stopwatch(), config)
     return made, found
 
 
 @pytest.mark.parametrize(
-    ("attempts", "gravity", "num_made", "best"),
+    ("matched", "searches", "gravity", "num_made", "best"),
     [
-        ([[_at(1, 0.6)]], "auto", 1, 1),
-        ([[_at(1, 0.2)], [_at(2, 0.6)]], "auto", 2, 2),
-        ([[_at(1, 0.2)], [_at(2, 0.1)], [_at(3, 0.15)], [_at(4, 0.12)]], "auto", 4, 1),
-        ([[_at(1, 0.02)], [_at(2, 0.04)]], "auto", 2, 2),  # hopeless: no wider beam
-        ([[_at(1, 0.2)], [_at(2, 0.5)]], "known", 2, 2),
-        ([[_at(1, 0.5), _at(9, 0.45)], [_at(1.1, 0.495)]], "unknown", 2, 1.1),  # a later one may lose 0.01
-        ([[_at(1, 0.5), _at(9, 0.45)], [_at(1.1, 0.489)]], "unknown", 2, 1),
+        ([_at(1, 0.6)], [], "auto", 0, 1),
+        ([], [[_at(1, 0.6)]], "auto", 1, 1),
+        ([_at(1, 0.1)], [[_at(2, 0.6)]], "auto", 1, 2),  # too few matches
+        ([_at(1, 0.6), _at(5, 0.4)], [[_at(7, 0.1)], [_at(7, 0.1)]], "auto", 2, 1),  # two that are alike
+        ([_at(1, 0.1)], [[_at(2, 0.11)], [_at(3, 0.09)]], "auto", 2, 2),
+        ([], [[_at(2, 0.1)]], "known", 1, 2),
+        ([_at(1, 0.08)], [[_at(2, 0.05)]], "unknown", 1, 1),
     ],
 )
-def test_attempts_are_made_until_one_is_confident(monkeypatch, attempts, gravity, num_made, best):
-    made, found = _run(monkeypatch, attempts, gravity)
-    order = [("known", "narrow"), ("unknown", "narrow"), ("known", "wide"), ("unknown", "wide")]
-    assert made == [way for way in order if gravity in ("auto", way[0])][:num_made]
+def test_searches_are_made_where_matches_leave_doubt(monkeypatch, matched, searches, gravity, num_made, best):
+    made, found = _run(monkeypatch, matched, searches, gravity)
+    assert made == [way for way in ("known", "unknown") if gravity in ("auto", way)][:num_made]
     assert found.best.pose.center_world[0] == best
-    assert found.best.score in {h.score + 0.001 for some in attempts for h in some}  # settled
+    assert found.best.score in {h.score + 0.001 for some in (matched, *searches) for h in some}  # settled
 
 
-def test_a_confident_attempt_whose_alternative_gains_by_refinement_is_not_the_last(monkeypatch):
-    attempts = [[_at(1, 0.6), _at(5, 0.3)], [_at(7, 0.9)]]
-    made, found = _run(monkeypatch, attempts, refined={5.0: 0.55})
-    assert len(made) == 2
-    assert _places([found.best]) == [7]
+def test_matches_or_searches_can_be_taken_out(monkeypatch):
+    alone = METHOD._replace(uses_features=False)
+    made, found = _run(monkeypatch, [_at(1, 0.6)], [[_at(2, 0.1)], [_at(2, 0.1)]], config=alone)
+    assert (made, _places([found.best])) == (["known", "unknown"], [2])
+    made, found = _run(monkeypatch, [_at(1, 0.1)], [], config=METHOD._replace(uses_search=False))
+    assert (made, _places([found.best])) == ([], [1])
 
 
 # Evaluation
 
 
-def test_evidence_counts_alternatives_that_are_local_minima(monkeypatch):
-    """Of three alternatives the second is a minimum: it is told first, and its score counts."""
+def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
     scan_map = SimpleNamespace(points=None, coarse_points=None, to_world=lambda pose: pose)
-    query = SimpleNamespace(scan_map=scan_map, settings=CoarseToFineSettings())
-    values = {0.0: 0.8, 1.0: 0.3, 2.0: 0.75, 3.0: 0.1}
-    asked = []
-
-    def is_local_minimum(query, pose, agreement):
-        asked.append((pose.center_world[0], agreement))
-        return pose.center_world[0] == 2.0
-
+    query = SimpleNamespace(scan_map=scan_map, settings=CoarseToFineSettings(), matches=None)
+    counts = {0.0: 30, 1.0: 4, 2.0: 6}
     for name, value in {
         "visible_points": lambda *_: None,
         "sampling_loss": lambda *_: 0.07,
-        "agreement_at": lambda points, panorama, pose: Agreement(values[pose.center_world[0]], 1.0),
+        "agreement_at": lambda points, panorama, pose: Agreement(0.8, 1.0),
         "occlusion_at": lambda *_: SimpleNamespace(fractions=lambda: (0.6, 0.3)),
-        "is_local_minimum": is_local_minimum,
+        "count_matches": lambda matches, pose: counts.get(pose.center_world[0], 0),
         "estimate_covariance": lambda *_: None,
     }.items():
         monkeypatch.setattr(evaluation, name, value)
-    alternatives = _at(1.0, 0.5), _at(2.0, 0.45), _at(3.0, 0.1)
-    found = evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(_at(0.0, 0.6), alternatives))
-    assert asked == [(1.0, 0.3), (2.0, 0.75)]
+    alternatives = _at(1.0, 0.3), _at(2.0, 0.2)
+    found = evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(_at(0.0, 0.6), alternatives, 0.7))
     e = found.evidence
     assert (e.score, e.agreement, e.seen_fraction) == (0.6, 0.8, 1.0)
     assert (e.explained_fraction, e.contradicted_fraction) == (0.6, 0.3)
-    assert e.margin == pytest.approx(0.05)  # by the agreements, where that is less than 0.1 by the scores
-    assert e.alternative_score_ratio == pytest.approx(0.75)
-    assert _places(found.alternatives) == [2.0, 1.0, 3.0]
-    assert (found.loss, found.status) == (0.07, "ambiguous")
+    assert (e.num_matches, e.alternative_matches) == (30, 6)
+    assert e.margin == pytest.approx(0.3)
+    assert _places(found.alternatives) == [1.0, 2.0]
+    assert found.loss == 0.07
     many = tuple(_at(1.0 + 0.001 * k, 0.1) for k in range(9))
-    values.update({h.pose.center_world[0]: 0.1 for h in many})
     found = evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(_at(0.0, 0.6), many))
-    assert found.evidence.margin == pytest.approx(0.5)
-    assert found.evidence.alternative_score_ratio == 0
     assert len(found.alternatives) == 5
+    alone = evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(_at(0.0, 0.6), ()))
+    assert (alone.evidence.margin, alone.evidence.alternative_matches) == (1.0, 0)
     monkeypatch.setattr(evaluation, "sampling_loss", lambda *_: np.inf)
     assert evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(_at(0.0, 0.6), ())).pose is None

@@ -38,7 +38,7 @@ from piccolo.runtime.threads import Workers
 from piccolo.scenes.synthetic.world import make_query, make_world, scan_world
 
 ROOM_SIZE, SHIFT, NEAR = np.array([2.4, 2.2, 2.2]), np.array([320.0, -150.0, 7.0]), 0.3  # [m]
-QUICK = METHOD._replace(beam=Beam(32, 8, 3, 1), wide_beam=Beam(48, 12, 4, 1), min_starts=48)
+QUICK = METHOD._replace(beam=Beam(32, 8, 3, 1), min_starts=48)
 SETTINGS, WORKERS, SHA256 = CoarseToFineSettings(gravity="known", num_yaws=24), Workers(1), 64 * "0"
 HANG_S, MEMORY_KB = 10.0, 2 << 20  # of processor time, at most, for one; of memory for all
 LOCALIZED_FRACTION = 0.1  # of the maps that are read

@@ -30,9 +30,7 @@ class Comparison(NamedTuple):
     """What speaks for a pose, by blocks of the photo."""
 
     correlation: NDArray[np.float64]  # (blocks,) of locally normalised colours, 0 where nothing is shared
-    area: NDArray[
-        np.float64
-    ]  # (blocks,) fractions of the sphere that both show, where they do not contradict
+    area: NDArray[np.float64]  # (blocks,) fractions of the sphere that both show and do not contradict
     visible_area: NDArray[np.float64]  # (blocks,) that both show
     valid_area: float  # of the sphere that the photo shows
 
@@ -45,7 +43,8 @@ class Comparison(NamedTuple):
     def ratio_to(self, other: "Comparison") -> float:
         """What this pose explains by what another does, over the blocks that both views show.
 
-        Over all blocks, a pose from which more was scanned would gain by that alone. 0 where hardly any is shared.
+        Over all blocks, a pose from which more was scanned would gain by that alone. 0 where hardly any is
+        shared.
         """
         shared = np.minimum(self.visible_area, other.visible_area)
         if shared.sum() < LEAST_SHARED * min(self.visible_area.sum(), other.visible_area.sum()):
@@ -56,7 +55,7 @@ class Comparison(NamedTuple):
 
 @kernel
 def sample_photo(offsets, weights, photo, R_cam_from_map, grid, colors, shared, blocks):
-    """Write the photo's opponent channels (3, N) where cells (3, N) are seen, weights shared, and blocks (N,).
+    """Write the photo's opponent channels (3, N) at cells (3, N), the weights both show, and blocks (N,).
 
     Blocks are those of the photo: cells of a grid of `num_columns`, `first` in the camera's frame.
     """
@@ -73,11 +72,9 @@ def sample_photo(offsets, weights, photo, R_cam_from_map, grid, colors, shared, 
         bilinear = bilinear_weights(fu, fv)
         t00, t10, t01, t11 = texels[k], texels[k + 1], texels[k + stride], texels[k + stride + 1]
         shared[n] = weights[n] * is_valid(t00, t10, t01, t11)
-        r, g, b = (
-            blend(t00, t10, t01, t11, bilinear, 0) * PER_LEVEL,
-            blend(t00, t10, t01, t11, bilinear, 8) * PER_LEVEL,
-            blend(t00, t10, t01, t11, bilinear, 16) * PER_LEVEL,
-        )
+        r = blend(t00, t10, t01, t11, bilinear, 0) * PER_LEVEL
+        g = blend(t00, t10, t01, t11, bilinear, 8) * PER_LEVEL
+        b = blend(t00, t10, t01, t11, bilinear, 16) * PER_LEVEL
         colors[0, n], colors[1, n], colors[2, n] = opponent(r, g, b)
         ring = np.int32((HALF - atan2(z, math.sqrt(x * x + y * y)) / PI) * num_rings)
         ring = min(max(ring, np.int32(0)), np.int32(len(num_columns) - 1))
@@ -158,7 +155,7 @@ def compare(query: Query, pose: Pose) -> Comparison:
 
 
 def without_occluders(query: Query, pose: Pose) -> Query:
-    """The query without the blocks of the photo that contradict the scan at a pose; itself if there are none."""
+    """The query without the photo's blocks that contradict the scan at a pose; itself if there are none."""
     seen = compare(query, pose)
     contradicts = (seen.correlation < CONTRADICTS) & (seen.visible_area > 0.0)
     if not contradicts.any():

@@ -50,7 +50,7 @@ class Query:
     @cached_property
     def matches(self) -> Matches:
         """The photo's keypoints and the features of the map that look alike."""
-        gray = cv2.cvtColor(self.panorama.rgb, cv2.COLOR_RGB2GRAY)
+        gray = np.asarray(cv2.cvtColor(self.panorama.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
         keypoints = find_keypoints(gray, self.panorama.is_valid, self.workers)
         return match(keypoints, self.scan_map.local_features, self.workers)
 

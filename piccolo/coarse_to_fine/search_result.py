@@ -23,7 +23,7 @@ class SearchResult:
 
     @property
     def margin(self) -> float:
-        """Lead of the best in what both views show, by what it explains, in [-1, 1]; by score if that is less."""
+        """Lead of the best in what both views show, by what it explains, in [-1, 1]; by score if less."""
         of_scores = max([0.0, *(h.score for h in self.alternatives)]) / max(self.best.score, 1e-9)
         return 1.0 - min(max(self.rival_ratio, of_scores), 2.0)
 

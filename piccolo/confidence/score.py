@@ -22,10 +22,8 @@ SIGMA_DEG = 15.0  # of the Gaussian in which contrast is judged
 class Evidence:
     """What a confidence rests on."""
 
-    score: (
-        float  # [0, 1] what blocks of the photo explain beyond chance; of preset paper, see Agreement.score
-    )
-    # lead over the best pose elsewhere in what both views show, by what the pose explains: 1 if there is none;
+    score: float  # [0, 1] what the photo's blocks explain beyond chance; of preset paper, Agreement.score
+    # lead over the best pose elsewhere in what both views show, by what it explains; 1 if there is none;
     # of preset paper, score less that of the best pose elsewhere
     margin: float
     agreement: float  # correlation over what both show, charged where that is under half of the sphere

@@ -1,13 +1,13 @@
 """The scan's local features: where views are taken, what they show, and an index of descriptors."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cloud.octree import Octree
-from ..runtime.jit import kernel
+from ..runtime.jit import inline_kernel, kernel
 from ..runtime.threads import Workers
 from .keypoints import DESCRIPTOR_SIZE, find_keypoints
 from .view_image import render_gray
@@ -78,7 +78,7 @@ def features_of_view(
 def principal_components(
     descriptors: NDArray[np.uint8],
 ) -> tuple[NDArray[np.int16], NDArray[np.int8]]:
-    """Mean (128,) and the strongest components (128, NUM_COMPONENTS) of descriptors (N, 128), whole numbers."""
+    """Mean (128,) and strongest components (128, NUM_COMPONENTS) by 127 of descriptors (N, 128)."""
     values = descriptors.astype(np.float64)
     mean = np.rint(values.sum(axis=0) / max(len(values), 1))
     values -= mean
@@ -93,7 +93,17 @@ def project(
     """Components (N, NUM_COMPONENTS) of descriptors (N, 128); sums of whole numbers below 2^24 are exact."""
     values = descriptors.astype(np.float32) - mean.astype(np.float32)
     projected = values @ components.astype(np.float32)
-    return np.clip(np.rint(projected / np.float32(127.0)), -127, 127).astype(np.int8)
+    return np.asarray(np.clip(np.rint(projected / np.float32(127.0)), -127, 127), np.int8)
+
+
+@inline_kernel
+def squared_gap(first, second):
+    """Squared distance of two descriptors (D,) of 8 bits."""
+    total = np.int32(0)
+    for d in range(len(first)):
+        gap = np.int32(first[d]) - np.int32(second[d])
+        total += gap * gap
+    return total
 
 
 @kernel
@@ -102,10 +112,7 @@ def nearest_middle(descriptors, middles, nearest):
     for i in range(len(descriptors)):
         best = np.int32(2147483647)
         for k in range(len(middles)):
-            total = np.int32(0)
-            for d in range(descriptors.shape[1]):
-                gap = np.int32(descriptors[i, d]) - np.int32(middles[k, d])
-                total += gap * gap
+            total = squared_gap(descriptors[i], middles[k])
             if total < best:
                 best = total
                 nearest[i] = k
@@ -124,13 +131,14 @@ def list_middles(descriptors: NDArray[np.int8], num_lists: int) -> NDArray[np.in
         lists, first, counts = np.unique(nearest[order], return_index=True, return_counts=True)
         sums = np.add.reduceat(sample[order].astype(np.int64), first, axis=0)
         middles[lists] = np.rint(sums / counts[:, None]).astype(np.int8)
-    return middles
+    return np.asarray(middles)
 
 
 def make_feature_map(octree: Octree, centers: NDArray[np.float64], workers: Workers) -> FeatureMap:
     """The features of the views from some centres (N, 3) [m]."""
     views = list(workers.map(lambda c: features_of_view(octree, c), list(centers), "find features"))
-    found = FeaturesOfView(*(np.concatenate(values) for values in zip(NO_FEATURES, *views, strict=True)))
+    joined: list[Any] = [np.concatenate(values) for values in zip(NO_FEATURES, *views, strict=True)]
+    found = FeaturesOfView(*joined)
     sample = found.descriptors[:: 1 + len(found.points) // SAMPLE]
     mean, components = principal_components(sample)
     descriptors = project(found.descriptors, mean, components)
@@ -143,7 +151,6 @@ def make_feature_map(octree: Octree, centers: NDArray[np.float64], workers: Work
     list(workers.map(assign, range(0, len(descriptors), BLOCK), "sort features"))
     order = np.argsort(nearest, kind="stable")
     start = np.searchsorted(nearest[order], np.arange(len(middles) + 1)).astype(np.int32)
-    points, directions, tangents, sizes, _ = (values[order] for values in found)
-    return FeatureMap(
-        points, directions, tangents, sizes, descriptors[order], mean, components, middles, start
-    )
+    of_points: list[Any] = [values[order] for values in (*found[:-1], descriptors)]
+    of_lists: list[Any] = [mean, components, middles, start]
+    return FeatureMap(*of_points, *of_lists)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..geometry.pose import Array, Pose
 from ..geometry.suppression import non_maximum_suppression
-from ..runtime.jit import F0, F1, inline_kernel, kernel
+from ..runtime.jit import F0, inline_kernel, kernel
 from ..runtime.threads import Workers
 from .matching import Matches
 from .p3p import p3p
@@ -25,6 +25,7 @@ COS_TANGENT = math.cos(math.radians(40.0))
 SIZE_RATIO = 1.7  # of a keypoint's size as predicted and as found, at most
 COS_TILT = math.cos(math.radians(12.0))  # by which a pose may be off the known vertical
 MAX_VOTERS = 1200  # single matches whose poses are tried
+BATCH = 64  # of them a thread tries at a time
 CLUSTER_DISTANCE, CLUSTER_ANGLE = 1.0, math.radians(30.0)  # [m], [rad] rough poses nearer than both are one
 SAME_DISTANCE, SAME_ANGLE = 0.3, math.radians(10.0)  # exact poses nearer than both are one
 NUM_CLUSTERS = 48
@@ -42,10 +43,7 @@ class MatchedPose(NamedTuple):
 
 @inline_kernel
 def agreement(m, j, R, t, cos_rough):
-    """Cosine between a match's ray and its point as the pose (3, 3), (3,) sees it; -1 if anything else differs.
-
-    Size and tangent must agree too.
-    """
+    """Cosine of a match's ray and its point as seen from a pose; -1 if that, size or tangent differ."""
     dx, dy, dz = m.points[j, 0] - t[0], m.points[j, 1] - t[1], m.points[j, 2] - t[2]
     x = R[0, 0] * dx + R[0, 1] * dy + R[0, 2] * dz
     y = R[1, 0] * dx + R[1, 1] * dy + R[1, 2] * dz
@@ -64,42 +62,58 @@ def agreement(m, j, R, t, cos_rough):
     return cosine if turn > COS_TANGENT else -1.0
 
 
+@inline_kernel
+def write_upright(m, j, R_cam_from_level, R):
+    """Write the rotation (3, 3) whose yaw takes the azimuth of a match's direction to that of its ray."""
+    L, b, d = R_cam_from_level, m.rays[j], m.directions[j]
+    x = L[0, 0] * b[0] + L[1, 0] * b[1] + L[2, 0] * b[2]
+    y = L[0, 1] * b[0] + L[1, 1] * b[1] + L[2, 1] * b[2]
+    per = 1.0 / max(math.sqrt((x * x + y * y) * (d[0] * d[0] + d[1] * d[1])), 1e-9)
+    c, s = (x * d[0] + y * d[1]) * per, (y * d[0] - x * d[1]) * per
+    for i in range(3):
+        R[i, 0] = L[i, 0] * c + L[i, 1] * s
+        R[i, 1] = L[i, 1] * c - L[i, 0] * s
+        R[i, 2] = L[i, 2]
+
+
+@inline_kernel
+def write_turned(m, j, R):
+    """Write the rotation (3, 3) that takes a match's direction and tangent to its ray and ray's tangent."""
+    b, u, d, v = m.rays[j], m.ray_tangents[j], m.directions[j], m.tangents[j]
+    for i in range(3):
+        n_i = b[(i + 1) % 3] * u[(i + 2) % 3] - b[(i + 2) % 3] * u[(i + 1) % 3]
+        for h in range(3):
+            n_h = d[(h + 1) % 3] * v[(h + 2) % 3] - d[(h + 2) % 3] * v[(h + 1) % 3]
+            R[i, h] = b[i] * d[h] + u[i] * v[h] + n_i * n_h
+
+
+@inline_kernel
+def agreeing_weight(m, R, t):
+    """Sum over the photo's features of the largest weight of a match that roughly agrees with a pose."""
+    total, last, best = 0.0, -1, F0
+    for i in range(len(m.query)):
+        if m.query[i] != last:
+            total += best
+            last, best = m.query[i], F0
+        if agreement(m, i, R, t, COS_ROUGH) > 0.0:
+            best = max(best, m.weights[i])
+    return total + best
+
+
 @kernel
 def rough_poses(matches, voters, R_cam_from_level, is_upright, rotations, centers, votes):
-    """Write the pose (n, 3, 3), (n, 3) of each single match, and the weight (n,) of all that agree with it."""
+    """Write the pose (n, 3, 3), (n, 3) of each single match, and the weight (n,) of all that agree."""
     m = matches
     for k in range(len(voters)):
         j, R, t = voters[k], rotations[k], centers[k]
         distance = m.sizes[j] / max(m.angles[j], F0 + np.float32(1e-6))
-        b, d = m.rays[j], m.directions[j]
         for i in range(3):
-            t[i] = m.points[j, i] - distance * d[i]
+            t[i] = m.points[j, i] - distance * m.directions[j, i]
         if is_upright:
-            # the yaw that takes the azimuth of the direction to that of the ray in the level frame
-            x = R_cam_from_level[0, 0] * b[0] + R_cam_from_level[1, 0] * b[1] + R_cam_from_level[2, 0] * b[2]
-            y = R_cam_from_level[0, 1] * b[0] + R_cam_from_level[1, 1] * b[1] + R_cam_from_level[2, 1] * b[2]
-            per = 1.0 / max(math.sqrt((x * x + y * y) * (d[0] * d[0] + d[1] * d[1])), 1e-9)
-            c, s = (x * d[0] + y * d[1]) * per, (y * d[0] - x * d[1]) * per
-            for i in range(3):
-                R[i, 0] = R_cam_from_level[i, 0] * c + R_cam_from_level[i, 1] * s
-                R[i, 1] = R_cam_from_level[i, 1] * c - R_cam_from_level[i, 0] * s
-                R[i, 2] = R_cam_from_level[i, 2]
+            write_upright(m, j, R_cam_from_level, R)
         else:
-            u, v = m.ray_tangents[j], m.tangents[j]
-            for i in range(3):
-                n_i = b[(i + 1) % 3] * u[(i + 2) % 3] - b[(i + 2) % 3] * u[(i + 1) % 3]
-                for h in range(3):
-                    n_h = d[(h + 1) % 3] * v[(h + 2) % 3] - d[(h + 2) % 3] * v[(h + 1) % 3]
-                    R[i, h] = b[i] * d[h] + u[i] * v[h] + n_i * n_h
-        votes[k] = 0.0
-        last, best = -1, F0
-        for i in range(len(m.query)):
-            if m.query[i] != last:
-                votes[k] += best
-                last, best = m.query[i], F0
-            if agreement(m, i, R, t, COS_ROUGH) > 0.0:
-                best = max(best, m.weights[i])
-        votes[k] += best
+            write_turned(m, j, R)
+        votes[k] = agreeing_weight(m, R, t)
 
 
 @inline_kernel
@@ -118,8 +132,8 @@ def count_exact(m, members, R, t):
 def sample_poses(matches, members, up_cam, cos_tilt, R_best, t_best):
     """Write the pose, (3, 3) and (3,), of three members that most members agree with; returns how many do.
 
-    Poses whose vertical is off `up_cam` (3,) by more than the cosine says are left out. The samples are always
-    the same ones.
+    Poses whose vertical is off `up_cam` (3,) by more than the cosine says are left out. The samples are the
+    same in every run.
     """
     m, best = matches, 0
     bearings, points = np.empty((3, 3)), np.empty((3, 3))
@@ -165,6 +179,22 @@ def count_matches(matches: Matches, pose: Pose) -> int:
     return len(np.unique(matches.query[members_of(matches, pose, COS_EXACT)]))
 
 
+def exact_pose(matches: Matches, rough: Pose, R_cam_from_level: Array | None) -> MatchedPose | None:
+    """The pose that most matches near a rough one agree with, refined; None if they are too few."""
+    up_cam = np.array([0.0, 0.0, 1.0]) if R_cam_from_level is None else R_cam_from_level[:, 2].copy()
+    cos_tilt = -2.0 if R_cam_from_level is None else COS_TILT
+    members, R, t = members_of(matches, rough, COS_ROUGH), np.empty((3, 3)), np.empty(3)
+    is_enough = len(members) >= LEAST_MATCHES
+    if not is_enough or sample_poses(matches, members, up_cam, cos_tilt, R, t) < LEAST_MATCHES:
+        return None
+    for _ in range(2):
+        members = members_of(matches, Pose(R, t), COS_EXACT)
+        some = matches.rays[members].astype(np.float64), matches.points[members].astype(np.float64)
+        refine_pose(*some, np.ones(len(members)), R, t, REFINEMENTS, REFINE_SCALE)
+    pose = Pose(R, t)
+    return MatchedPose(pose, count_matches(matches, pose))
+
+
 def poses_of(
     matches: Matches, R_cam_from_level: Array | None, count: int, workers: Workers
 ) -> list[MatchedPose]:
@@ -172,42 +202,23 @@ def poses_of(
 
     R_cam_from_level (3, 3) says how the camera was tilted, None if nobody knows.
     """
-    voters = np.flatnonzero(matches.weights == F1)
-    others = np.flatnonzero(matches.weights < F1)
-    voters = np.concatenate([voters, others])[:MAX_VOTERS]
+    voters = np.argsort(-matches.weights, kind="stable")[:MAX_VOTERS]
     rotations, centers = np.empty((len(voters), 3, 3)), np.empty((len(voters), 3))
     votes = np.empty(len(voters))
     level = np.eye(3) if R_cam_from_level is None else np.ascontiguousarray(R_cam_from_level, np.float64)
 
     def vote(lo: int) -> None:
-        part = slice(lo, lo + 64)
+        part = slice(lo, lo + BATCH)
         how = level, R_cam_from_level is not None
         rough_poses(matches, voters[part], *how, rotations[part], centers[part], votes[part])
 
-    list(workers.map(vote, range(0, len(voters), 64), "vote"))
+    list(workers.map(vote, range(0, len(voters), BATCH), "vote"))
     order = np.argsort(-votes, kind="stable")
-    kept = order[
-        non_maximum_suppression(
-            rotations[order], centers[order], NUM_CLUSTERS, CLUSTER_DISTANCE, CLUSTER_ANGLE
-        )
-    ]
-    up_cam, cos_tilt = level[:, 2].copy(), -2.0 if R_cam_from_level is None else COS_TILT
+    R, t = rotations[order], centers[order]
+    kept = order[non_maximum_suppression(R, t, NUM_CLUSTERS, CLUSTER_DISTANCE, CLUSTER_ANGLE)]
 
     def exact(k: int) -> MatchedPose | None:
-        rough = Pose(rotations[k], centers[k])
-        members = members_of(matches, rough, COS_ROUGH)
-        R, t = np.empty((3, 3)), np.empty(3)
-        if (
-            len(members) < LEAST_MATCHES
-            or sample_poses(matches, members, up_cam, cos_tilt, R, t) < LEAST_MATCHES
-        ):
-            return None
-        for _ in range(2):
-            members = members_of(matches, Pose(R, t), COS_EXACT)
-            some = matches.rays[members].astype(np.float64), matches.points[members].astype(np.float64)
-            refine_pose(*some, np.ones(len(members)), R, t, REFINEMENTS, REFINE_SCALE)
-        pose = Pose(R, t)
-        return MatchedPose(pose, count_matches(matches, pose))
+        return exact_pose(matches, Pose(rotations[k], centers[k]), R_cam_from_level)
 
     found = [f for f in workers.map(exact, list(kept), "sample") if f and f.num_matches >= LEAST_MATCHES]
     found.sort(key=lambda f: -f.num_matches)

@@ -1,8 +1,9 @@
 """Keypoints of a sphere: SIFT (Lowe, IJCV 2004) on overlapping perspective views, as rays and sizes."""
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -30,7 +31,8 @@ class Keypoints(NamedTuple):
 
     def take(self, indices: NDArray[np.int64]) -> "Keypoints":
         """The keypoints at `indices`."""
-        return Keypoints(*(values[indices] for values in self))
+        taken: list[Any] = [values[indices] for values in self]
+        return Keypoints(*taken)
 
 
 class PerspectiveView(NamedTuple):
@@ -75,8 +77,9 @@ def find_keypoints(
             return _nothing()
         shown = cv2.erode(shown, np.ones((3, 3), np.uint8))
         image = cv2.remap(picture, view.columns, view.rows, cv2.INTER_LINEAR)
-        sift = cv2.SIFT_create(contrastThreshold=CONTRAST)
-        keypoints = _on_sphere(*sift.detectAndCompute(image, shown), view)
+        sift = cv2.SIFT.create(contrastThreshold=CONTRAST)
+        found, shares = sift.detectAndCompute(image, shown)
+        keypoints = _on_sphere(found, np.asarray(shares, np.float32), view) if found else _nothing()
         is_own = np.argmax(keypoints.rays @ middles.T, axis=1) == k  # what views share counts once
         return keypoints.take(np.flatnonzero(is_own))
 
@@ -95,11 +98,9 @@ def _nothing() -> Keypoints:
 
 
 def _on_sphere(
-    found: "tuple[cv2.KeyPoint, ...]", shares: NDArray[np.float32] | None, view: PerspectiveView
+    found: Sequence[cv2.KeyPoint], shares: NDArray[np.float32], view: PerspectiveView
 ) -> Keypoints:
     """A view's keypoints as rays; descriptors (N, 128) of SIFT become square roots of their shares."""
-    if shares is None:
-        return _nothing()
     side = len(view.rows)
     per_px = 2.0 * math.tan(math.radians(FIELD_DEG / 2.0)) / side
     points = np.array([(*k.pt, k.size, k.angle) for k in found])

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..runtime.jit import kernel
+from ..runtime.jit import inline_kernel, kernel
 from ..runtime.threads import Workers
-from .feature_map import FeatureMap, project
+from .feature_map import FeatureMap, project, squared_gap
 from .keypoints import Keypoints
 
 NUM_NEIGHBORS = 4  # features of the map that a feature of the photo is matched to, at most
@@ -32,64 +32,64 @@ class Matches(NamedTuple):
     weights: NDArray[np.float32]  # (M,) how much it tells: 1 of a distinct one
 
 
+@inline_kernel
+def is_one_place(points, f, g):
+    """True if two features of the map are nearer to each other than APART."""
+    dx, dy, dz = points[f, 0] - points[g, 0], points[f, 1] - points[g, 1], points[f, 2] - points[g, 2]
+    return dx * dx + dy * dy + dz * dz < APART * APART
+
+
+@inline_kernel
+def place_taken(points, f, total, found, distances):
+    """Which of the features kept (K,) gives way to another: a worse one of the same place, or the last.
+
+    -1 if one of the same place is no worse.
+    """
+    for k in range(len(found)):
+        if found[k] < 0:
+            break
+        if is_one_place(points, f, found[k]):
+            return k if total < distances[k] else -1
+    return len(found) - 1
+
+
+@inline_kernel
+def put_in_order(at, value, total, values, totals):
+    """Write a value in place of that `at`, moved forward before all (K,) with a larger total."""
+    while at > 0 and totals[at - 1] > total:
+        values[at], totals[at] = values[at - 1], totals[at - 1]
+        at -= 1
+    values[at], totals[at] = value, total
+
+
 @kernel
 def search_lists(descriptors, probes, map_descriptors, list_start, points, found, distances):
     """Write the nearest features (N, K) of the map, no two of which are one place, and squared distances.
 
     `probes` (N, P) are the lists to look through; -1 and FAR where there is no other.
     """
-    num_kept = found.shape[1]
+    found[:], distances[:] = -1, FAR
     for i in range(len(descriptors)):
-        for k in range(num_kept):
-            found[i, k], distances[i, k] = -1, FAR
         for p in range(probes.shape[1]):
             for f in range(list_start[probes[i, p]], list_start[probes[i, p] + 1]):
-                total = np.int32(0)
-                for d in range(descriptors.shape[1]):
-                    gap = np.int32(descriptors[i, d]) - np.int32(map_descriptors[f, d])
-                    total += gap * gap
-                if total >= distances[i, num_kept - 1]:
+                total = squared_gap(descriptors[i], map_descriptors[f])
+                if total >= distances[i, -1]:
                     continue
-                # the place that it takes: that of a worse one of the same point, or the last
-                at, is_new = num_kept - 1, True
-                for k in range(num_kept):
-                    if found[i, k] < 0:
-                        break
-                    g = found[i, k]
-                    dx, dy, dz = (
-                        points[f, 0] - points[g, 0],
-                        points[f, 1] - points[g, 1],
-                        points[f, 2] - points[g, 2],
-                    )
-                    if dx * dx + dy * dy + dz * dz < APART * APART:
-                        at, is_new = k, total < distances[i, k]
-                        break
-                if not is_new:
-                    continue
-                while at > 0 and distances[i, at - 1] > total:
-                    found[i, at], distances[i, at] = found[i, at - 1], distances[i, at - 1]
-                    at -= 1
-                found[i, at], distances[i, at] = f, total
+                at = place_taken(points, f, total, found[i], distances[i])
+                if at >= 0:
+                    put_in_order(at, f, total, found[i], distances[i])
 
 
 @kernel
 def nearest_lists(descriptors, middles, probes):
     """Write the indices (N, P) of the nearest middles of each descriptor, nearest first."""
-    num_probes = probes.shape[1]
-    best = np.empty(num_probes, np.int32)
+    best = np.empty(probes.shape[1], np.int32)
     for i in range(len(descriptors)):
         best[:] = FAR
         for m in range(len(middles)):
-            total = np.int32(0)
-            for d in range(descriptors.shape[1]):
-                gap = np.int32(descriptors[i, d]) - np.int32(middles[m, d])
-                total += gap * gap
-            if total < best[num_probes - 1]:
-                at = num_probes - 1
-                while at > 0 and best[at - 1] > total:
-                    best[at], probes[i, at] = best[at - 1], probes[i, at - 1]
-                    at -= 1
-                best[at], probes[i, at] = total, m
+            total = squared_gap(descriptors[i], middles[m])
+            if total < best[-1]:
+                put_in_order(len(best) - 1, m, total, probes[i], best)
 
 
 def match(keypoints: Keypoints, feature_map: FeatureMap, workers: Workers) -> Matches:

@@ -2,7 +2,7 @@
 
 import math
 import threading
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -22,6 +22,7 @@ WIDER = 4  # [px] of a wider pixel
 FILL_LEVELS = 4  # gaps up to 16 px are filled
 LEAST_FILLED = 0.25  # of a wider pixel that fills finer ones
 NOTHING = np.float32(1e30)
+Floats = NDArray[np.floating[Any]]
 
 
 class ViewImage(NamedTuple):
@@ -84,26 +85,31 @@ def is_in_front(ranges: NDArray[np.float32]) -> NDArray[np.bool_]:
     return np.asarray((ranges < NOTHING) & (ranges <= limit * BEHIND))
 
 
-def fill_gaps(
-    gray: NDArray[np.float32], weight: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def fill_gaps(gray: Floats, weight: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Grey (H, W) whose gaps take the colour around them, and where it means something.
 
     Pull and push over a pyramid of means (Gortler et al., "The Lumigraph", SIGGRAPH 1996, section 3.4.2).
     """
     pyramid = [(gray, weight)]
     for _ in range(FILL_LEVELS):
-        size = pyramid[-1][0].shape[1] // 2, pyramid[-1][0].shape[0] // 2
-        pyramid.append(tuple(cv2.resize(a, size, interpolation=cv2.INTER_AREA) for a in pyramid[-1]))
+        size = gray.shape[1] >> len(pyramid), gray.shape[0] >> len(pyramid)
+        pyramid.append((_resized(pyramid[-1][0], size), _resized(pyramid[-1][1], size)))
     total, known = pyramid.pop()
-    filled, counts = total / np.maximum(known, 1e-6), np.float32(known > LEAST_FILLED)
+    filled: Floats = total / np.maximum(known, 1e-6)
+    counts: Floats = (known > LEAST_FILLED).astype(np.float32)
     for total, known in reversed(pyramid):
         size = total.shape[1], total.shape[0]
-        wider = cv2.resize(filled * counts, size, interpolation=cv2.INTER_LINEAR)
-        counts = known + (1.0 - known) * cv2.resize(counts, size, interpolation=cv2.INTER_LINEAR)
+        wider = _resized(filled * counts, size)
+        counts = known + (1.0 - known) * _resized(counts, size)
         filled = (total + (1.0 - known) * wider) / np.maximum(counts, 1e-6)
-        counts = np.float32(counts > LEAST_FILLED)
+        counts = (counts > LEAST_FILLED).astype(np.float32)
     return filled, counts > 0.0
+
+
+def _resized(image: Floats, size: tuple[int, int]) -> Floats:
+    """An image at another (width, height): means where that is smaller, else bilinear."""
+    how = cv2.INTER_AREA if size[0] < image.shape[1] else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(image, size, interpolation=how))
 
 
 class _Scratch(NamedTuple):

@@ -7,14 +7,8 @@ from ..geometry.pose import Array
 from ..geometry.sphere import cell_of
 from ..runtime.jit import kernel
 
-SPACING, LAYER = (
-    2.5,
-    2.4,
-)  # [m] across and in height: what is nearer to a position and seen from it needs none
-ABOVE_LOWEST, HEIGHT_STEP = (
-    1.0,
-    0.3,
-)  # [m] taken first are positions so high above the lowest around, by steps
+SPACING, LAYER = 2.5, 2.4  # [m] across and in height: what is nearer and seen from a position needs none
+ABOVE_LOWEST, HEIGHT_STEP = 1.0, 0.3  # [m] first are positions so high above the lowest around, by steps
 CELL = np.array([2.5, 2.5, 3.0])  # [m] around: a part of a storey
 TABLE_HEIGHT = 48  # directions, by 3.75 degrees
 SLACK = 1.0  # [m] a wall is so much nearer than what is behind it
@@ -22,7 +16,7 @@ SLACK = 1.0  # [m] a wall is so much nearer than what is behind it
 
 @kernel
 def choose(order, centers, ranges, cells, kept):
-    """Write the indices of the positions kept, in order: each that is near none kept or seen from none of them.
+    """Write the indices of the positions kept, in order: each that no kept one is near and sees.
 
     Ranges (N, cells) [m] are those of the view from each centre (N, 3), 0 where nothing is seen; `cells` is a
     table (h, 2 h) of the cell in each direction.

@@ -97,8 +97,8 @@ def correlate(points, channels, weights, blocks, texels, width, R_cam_from_world
 def score(points, channels, weights, blocks, texels, width, R_cam_from_world, center_world):
     """The score of a pose: what blocks of the sphere correlate beyond chance, times what both show of them.
 
-    The weights are solid angles as fractions of the sphere, `blocks` (N,) the block of each point. An occluder
-    costs what it hides and no more.
+    The weights are solid angles as fractions of the sphere, `blocks` (N,) the block of each point. An
+    occluder costs what it hides and no more.
     """
     sums = np.empty((NUM_BLOCKS, 4))
     correlate(points, channels, weights, blocks, texels, width, R_cam_from_world, center_world, sums)

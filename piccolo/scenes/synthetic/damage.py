@@ -1,4 +1,4 @@
-"""Seeded damage to a photo: occluders before it, uneven light, a narrow field of view; rooms without texture."""
+"""Seeded damage to a photo: occluders, uneven light, a narrow field of view; rooms without texture."""
 
 import math
 
@@ -41,7 +41,7 @@ def unevenly_lit(rgb: Image, stops: float, rng: np.random.Generator) -> Image:
 
 
 def outside_field(width: int, fov_deg: float, yaw: float) -> NDArray[np.bool_]:
-    """Where (H, W) a sphere lies outside a pinhole photo of this width, level, that looks along azimuth `yaw`."""
+    """Where (H, W) a sphere lies outside a level pinhole photo this wide that looks along azimuth `yaw`."""
     x, y, z = np.moveaxis(pixel_rays(width), -1, 0)
     forward, left = math.cos(yaw) * x + math.sin(yaw) * y, math.cos(yaw) * y - math.sin(yaw) * x
     reach = math.tan(math.radians(fov_deg / 2.0)) * forward

@@ -1,0 +1,198 @@
+"""Poses compared by blocks: an occluder costs what it hides, and what is not shown costs nothing."""
+
+import functools
+from dataclasses import replace
+
+import naive
+import numpy as np
+import pytest
+import rooms
+
+from piccolo.coarse_to_fine.comparison import (
+    CONTRADICTS,
+    Comparison,
+    compare,
+    correlate_blocks,
+    sample_photo,
+    without_occluders,
+)
+from piccolo.coarse_to_fine.query import prepare_query
+from piccolo.coarse_to_fine.settings import CoarseToFineSettings
+from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
+from piccolo.geometry.sphere import cell_of, make_grid, pixel_rays, solid_angles
+from piccolo.optimize.channel_loss import BLOCK_RINGS, CHANCE, NUM_BLOCKS
+from piccolo.panorama import Panorama
+from piccolo.panorama.texels import pack_texels
+from piccolo.runtime.threads import Workers
+from piccolo.scenes.synthetic.damage import occluded, outside_field
+
+WIDTH = rooms.WIDTH
+TILTED = exp_so3(np.array([0.4, -1.1, 0.7]))
+AREAS = solid_angles(WIDTH)[:, None] / (4 * np.pi) * np.ones(WIDTH)
+
+
+def _query(rgb, is_hidden=None):
+    is_valid = np.ones(rgb.shape[:2], bool) if is_hidden is None else ~is_hidden
+    return prepare_query(Panorama(rgb, is_valid), rooms.scan_map(1), CoarseToFineSettings(), Workers(2))
+
+
+@functools.lru_cache
+def _clean():
+    """The comparison at the true pose of a room's photo, with that pose."""
+    true_pose = rooms.scene(1)[2]
+    return compare(_query(rooms.query(1).rgb), true_pose), true_pose
+
+
+@functools.lru_cache
+def _hidden(fraction):
+    """A photo behind pieces of another room, and where (H, W) it is hidden."""
+    rgb, other = rooms.query(1).rgb, rooms.query(2).rgb
+    shown = occluded(rgb, other, fraction, np.random.default_rng(1))
+    return shown, (shown != rgb).any(axis=2)
+
+
+def _blocks_of(is_chosen):
+    """Fraction (blocks,) of each block that is chosen (H, W)."""
+    block = cell_of(pixel_rays(WIDTH).reshape(-1, 3).astype(np.float32), BLOCK_RINGS)
+    total = np.bincount(block, AREAS.ravel(), NUM_BLOCKS)
+    return np.bincount(block, (AREAS * is_chosen).ravel(), NUM_BLOCKS) / total
+
+
+def test_a_photo_is_sampled_as_its_twin():
+    rng = np.random.default_rng(2)
+    is_valid = np.ones((128, 256), bool)
+    is_valid[:30] = False
+    v, u = np.mgrid[0:128, 0:256] / 256 * 2 * np.pi
+    rgb = np.stack([127 + 100 * np.sin((k + 1) * u + v) for k in range(3)], axis=-1).astype(np.uint8)
+    offsets, texels = rng.normal(size=(3, 900)).astype(np.float32), pack_texels(rgb, is_valid)
+    weights, grid = rng.uniform(0.5, 1.5, 900).astype(np.float32), make_grid(BLOCK_RINGS)
+    colors, shared, blocks = (
+        np.empty((3, 900), np.float32),
+        np.empty(900, np.float32),
+        np.empty(900, np.int32),
+    )
+    photo = texels.rgbx, texels.width
+    sample_photo(offsets, weights, photo, TILTED, (grid.num_columns, grid.first), colors, shared, blocks)
+    pixels = naive.project(offsets.T, TILTED, np.zeros(3), 256)
+    r, g, b = naive.sample(rgb, pixels).T / 255
+    np.testing.assert_allclose(colors, [(r + g + b) / 3, (r - b) / 2, (2 * g - r - b) / 4], atol=2e-3)
+    shows = naive.sample(is_valid[..., None], pixels)[:, 0] > 1 - 1e-9
+    assert (shared == weights * shows).mean() > 0.995
+    rays = (offsets / np.linalg.norm(offsets, axis=0)).T @ TILTED.T
+    assert (blocks == cell_of(rays.astype(np.float32), BLOCK_RINGS)).mean() > 0.995
+
+
+def test_blocks_correlate_as_their_twin():
+    rng = np.random.default_rng(3)
+    first = rng.normal(size=(3, 2000)).astype(np.float32)
+    second = (0.6 * first + 0.8 * rng.normal(size=(3, 2000))).astype(np.float32)
+    blocks = rng.integers(NUM_BLOCKS - 2, size=2000).astype(np.int32)  # the last two show nothing
+    shared = (rng.uniform(size=2000) * (rng.uniform(size=2000) < 0.8)).astype(np.float32)
+    correlation, area = np.empty(NUM_BLOCKS), np.empty(NUM_BLOCKS)
+    correlate_blocks(first, second, shared, blocks, correlation, area)
+    expected = naive.block_correlation(first, second, shared, blocks, NUM_BLOCKS)
+    np.testing.assert_allclose(correlation, expected[0], atol=1e-5)
+    np.testing.assert_allclose(area, expected[1], rtol=1e-5)
+    assert correlation[-1] == area[-1] == 0
+
+
+def test_score_and_ratio_by_hand():
+    """Blocks below chance give nothing; only what both poses show is compared."""
+    half = CHANCE + 0.5 * (1 - CHANCE)
+    area = np.array([0.2, 0.1, 0.1])
+    a = Comparison(np.array([half, 0.1, -0.9]), area, area, 0.5)
+    assert a.score == pytest.approx(0.5 * 0.2 / 0.5)
+    b = Comparison(np.array([1.0, 1.0, half]), area, np.array([0.1, 0.0, 0.1]), 0.5)
+    assert a.ratio_to(b) == pytest.approx((0.5 * 0.1) / (1.0 * 0.1 + 0.5 * 0.1))
+    assert b.ratio_to(a) == pytest.approx(1 / a.ratio_to(b))
+    assert a.ratio_to(a) == 1.0
+    elsewhere = Comparison(np.ones(3), area, np.array([0.01, 0.0, 0.3]), 0.5)
+    other = Comparison(np.ones(3), area, np.array([0.3, 0.0, 0.02]), 0.5)
+    assert elsewhere.ratio_to(other) == 0.0
+
+
+def test_the_true_pose_explains_more_than_others():
+    seen, true_pose = _clean()
+    assert 0.6 < seen.score < 1.0
+    assert seen.ratio_to(seen) == 1.0
+    assert seen.valid_area == pytest.approx(1.0, abs=1e-3)
+    query = _query(rooms.query(1).rgb)
+    turned = compare(query, Pose(yaw_rotation(1.0) @ true_pose.R_cam_from_world, true_pose.center_world))
+    moved = compare(
+        query, Pose(true_pose.R_cam_from_world, true_pose.center_world + np.array([0.3, 0.0, 0.0]))
+    )
+    for wrong in (turned, moved):
+        assert wrong.score < 0.5 * seen.score
+        assert wrong.ratio_to(seen) < 0.5
+
+
+@pytest.mark.parametrize("fraction", [0.2, 0.5])
+def test_an_occluder_costs_what_it_hides(fraction):
+    seen, true_pose = _clean()
+    rgb, is_hidden = _hidden(fraction)
+    behind = compare(_query(rgb), true_pose)
+    touched = _blocks_of(is_hidden)
+    lost = ((touched > 0.02) * seen.area * np.maximum(seen.correlation - CHANCE, 0) / (1 - CHANCE)).sum()
+    assert behind.score >= seen.score - lost - 0.02
+    assert behind.score < seen.score - 0.3 * fraction * seen.score
+    untouched = (touched == 0.0) & (seen.area > 0.0)
+    assert untouched.sum() >= 5
+    # the occluder's edges in the neighbour's mean and deviation cost little
+    assert np.median((behind.correlation - seen.correlation)[untouched]) > -0.05
+
+
+def test_blocks_outside_a_narrow_photo_count_nothing():
+    seen, true_pose = _clean()
+    outside = outside_field(WIDTH, 90.0, 0.5)
+    narrow = compare(_query(rooms.query(1).rgb, outside), true_pose)
+    shown = _blocks_of(~outside)
+    assert (narrow.visible_area[shown == 0.0] == 0.0).all()
+    assert (narrow.area[shown == 0.0] == 0.0).all()
+    assert narrow.valid_area == pytest.approx((AREAS * ~outside).sum(), abs=0.01)
+    assert narrow.visible_area.sum() <= narrow.valid_area + 0.01
+    assert narrow.score > 0.7 * seen.score
+    black = np.where(outside[..., None], 0, rooms.query(1).rgb).astype(np.uint8)
+    again = compare(_query(black, outside), true_pose)
+    np.testing.assert_array_equal(again.correlation, narrow.correlation)
+
+
+def test_what_contradicts_is_masked_and_the_rest_stays():
+    true_pose = rooms.scene(1)[2]
+    rgb, is_hidden = _hidden(0.4)
+    query = _query(rgb)
+    shown = without_occluders(query, true_pose)
+    masked = _blocks_of(~shown.panorama.is_valid[::2, ::2])
+    covered = _blocks_of(is_hidden)
+    assert masked[covered > 0.9].mean() > 0.8
+    assert masked[covered == 0.0].mean() < 0.15
+    assert shown.settings is query.settings
+    assert query.panorama.is_valid.all()  # as it was
+    after = compare(shown, true_pose)
+    seen = compare(query, true_pose)
+    assert after.score > seen.score
+    assert after.valid_area == pytest.approx(
+        1.0 - (AREAS * ~shown.panorama.is_valid[::2, ::2]).sum(), abs=0.02
+    )
+    clean = _query(rooms.query(1).rgb)
+    fits = (compare(clean, true_pose).correlation >= CONTRADICTS).all()
+    assert (without_occluders(clean, true_pose) is clean) == fits
+
+
+def test_a_mask_is_enlarged_to_the_photo():
+    query = _query(rooms.query(1).rgb)
+    is_hidden = np.zeros((8, 16), bool)
+    is_hidden[2, 5] = True
+    rest = query.without(is_hidden)
+    height = rest.panorama.is_valid.shape[0]
+    side = height // 8
+    assert not rest.panorama.is_valid[2 * side : 3 * side, 5 * side : 6 * side].any()
+    assert (~rest.panorama.is_valid).sum() == side * side
+    ray = np.array([[np.cos(0.6), 0.0, np.sin(0.6)], [0.0, 1.0, 0.0]])
+    up = replace(
+        query,
+        panorama=replace(
+            query.panorama, is_valid=np.arange(height)[:, None] < height // 2 + np.zeros((1, 2 * height))
+        ),
+    )
+    assert up.shows(ray @ np.diag([1.0, 1.0, -1.0])).tolist() == [False, False]
+    assert up.shows(ray)[0]

@@ -1,0 +1,153 @@
+"""Poses that matches vote for: exact from exact matches, right in a room, obedient to what is known."""
+
+import functools
+from dataclasses import replace
+
+import naive
+import numpy as np
+import pytest
+import rooms
+
+from piccolo.coarse_to_fine.localize import localize, matched_poses
+from piccolo.coarse_to_fine.prior import is_allowed
+from piccolo.coarse_to_fine.query import prepare_query
+from piccolo.coarse_to_fine.settings import CoarseToFineSettings, Prior
+from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
+from piccolo.local_features.feature_map import make_feature_map
+from piccolo.local_features.hypotheses import count_matches, exact_pose, poses_of, rough_poses
+from piccolo.local_features.matching import Matches
+from piccolo.runtime.stopwatch import Stopwatch
+from piccolo.runtime.threads import Workers
+
+
+@functools.lru_cache
+def _query(seed, variant="clean"):
+    panorama = rooms.as_panorama(rooms.query(seed, variant).rgb)
+    return prepare_query(panorama, rooms.scan_map(seed), CoarseToFineSettings(), Workers(2))
+
+
+def _true_pose(seed, variant="clean"):
+    return rooms.scan_map(seed).from_world(rooms.query(seed, variant).pose)
+
+
+def _exact_matches(pose, count, num_wrong=0, seed=0):
+    """Matches that a camera at the pose would have, seen from right there; the last ones of any points."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-3, 3, (count, 3))
+    directions = points - pose.center_world
+    ranges = np.linalg.norm(directions, axis=1)
+    directions /= ranges[:, None]
+    tangents = np.cross(directions, rng.normal(size=(count, 3)))
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    angles = rng.uniform(0.02, 0.2, count)
+    rays, ray_tangents = directions @ pose.R_cam_from_world.T, tangents @ pose.R_cam_from_world.T
+    wrong = slice(count - num_wrong, count)
+    points[wrong] = rng.uniform(-3, 3, (num_wrong, 3))
+    values = rays, ray_tangents, angles, points, directions, tangents, angles * ranges
+    some = [np.asarray(a, np.float32) for a in values]
+    weights = rng.choice(np.float32([0.5, 1.0]), count)
+    return Matches(np.arange(count, dtype=np.int32), *some, weights)
+
+
+POSE = Pose(exp_so3(np.array([0.3, -0.8, 1.9])), np.array([0.4, -0.2, 0.3]))
+LEVEL = exp_so3(np.array([0.2, -0.4, 0.0]))  # R_cam_from_level
+TILTED = Pose(LEVEL @ yaw_rotation(2.2), np.array([0.4, -0.2, 0.3]))
+
+
+@pytest.mark.parametrize(("pose", "is_upright"), [(POSE, False), (TILTED, True)])
+def test_one_exact_match_gives_the_pose_and_its_votes_equal_their_twin(pose, is_upright):
+    matches = _exact_matches(pose, 40, num_wrong=10)
+    matches = matches._replace(query=np.repeat(np.arange(20, dtype=np.int32), 2))
+    voters = np.arange(40)
+    rotations, centers, votes = np.empty((40, 3, 3)), np.empty((40, 3)), np.empty(40)
+    rough_poses(matches, voters, LEVEL if is_upright else np.eye(3), is_upright, rotations, centers, votes)
+    np.testing.assert_allclose(centers[:30], np.tile(pose.center_world, (30, 1)), atol=1e-4)
+    np.testing.assert_allclose(rotations[:30], np.tile(pose.R_cam_from_world, (30, 1, 1)), atol=2e-3)
+    np.testing.assert_allclose(
+        votes, [naive.votes(matches, *rough) for rough in zip(rotations, centers, strict=True)]
+    )
+    assert votes[:30].min() > votes[30:].max()
+
+
+@pytest.mark.parametrize("R_cam_from_level", [None, LEVEL])
+def test_the_pose_is_found_among_wrong_matches(R_cam_from_level):
+    matches = _exact_matches(TILTED, 60, num_wrong=40)
+    found = poses_of(matches, R_cam_from_level, 6, Workers())
+    assert found[0].num_matches >= 20
+    assert rooms.errors(found[0].pose, TILTED)[0] < 1e-4
+    assert all(one.num_matches <= 6 for one in found[1:])
+    assert count_matches(matches, TILTED) == found[0].num_matches
+    elsewhere = Pose(TILTED.R_cam_from_world, TILTED.center_world + np.array([2.0, 0.0, 0.0]))
+    assert count_matches(matches, elsewhere) < 4
+
+
+def test_a_pose_off_the_known_vertical_is_none():
+    matches = _exact_matches(POSE, 30)
+    assert exact_pose(matches, POSE, None).num_matches == 30
+    near = exp_so3(np.array([0.1, 0.1, 0.0])) @ POSE.R_cam_from_world
+    off = exp_so3(np.array([0.5, 0.5, 0.0])) @ POSE.R_cam_from_world
+    assert exact_pose(matches, POSE, near).num_matches == 30
+    assert exact_pose(matches, POSE, off) is None
+    assert exact_pose(_exact_matches(POSE, 3), POSE, None) is None
+
+
+@pytest.mark.parametrize(
+    ("variant", "is_known"), [("clean", True), ("clean", False), ("tilt", False), ("photo", True)]
+)
+def test_a_photo_is_found_in_its_room_with_the_same_bits_for_any_threads(variant, is_known):
+    query = _query(1, variant)
+    level = query.R_cam_from_level if is_known else None
+    found = poses_of(query.matches, level, 6, Workers(2))
+    distance, angle_deg = rooms.errors(found[0].pose, _true_pose(1, variant))
+    assert distance < 0.05
+    assert angle_deg < 1.0
+    assert found[0].num_matches >= 12
+    assert [one.num_matches for one in found] == sorted((one.num_matches for one in found), reverse=True)
+    alone = poses_of(query.matches, level, 6, Workers(1))
+    for one, other in zip(found, alone, strict=True):
+        np.testing.assert_array_equal(one.pose.R_cam_from_world, other.pose.R_cam_from_world)
+        np.testing.assert_array_equal(one.pose.center_world, other.pose.center_world)
+        assert one.num_matches == other.num_matches
+
+
+def test_noise_has_no_pose_that_many_matches_agree_with():
+    rgb = np.random.default_rng(9).integers(0, 256, (256, 512, 3)).astype(np.uint8)
+    panorama, scan_map = rooms.as_panorama(rgb), rooms.scan_map(1)
+    query = prepare_query(panorama, scan_map, CoarseToFineSettings(), Workers(2))
+    for level in (None, np.eye(3)):
+        found = poses_of(query.matches, level, 6, Workers(2))
+        assert max([0, *(one.num_matches for one in found)]) < 8
+    flat = prepare_query(
+        rooms.as_panorama(np.full_like(rgb, 90)), scan_map, CoarseToFineSettings(), Workers(2)
+    )
+    assert poses_of(flat.matches, None, 6, Workers(2)) == []
+
+
+def test_only_poses_that_the_prior_allows_are_refined():
+    query, world = _query(1), rooms.query(1).pose
+    x, y, z = world.center_world
+    heading = np.degrees(np.arctan2(*world.R_cam_from_world[0, :2]))
+    for prior, holds in (
+        (Prior(), True),
+        (Prior(near_world=(x, y, z), radius=0.5), True),
+        (Prior(near_world=(x + 1.4, y, None), radius=0.5), False),
+        (Prior(height=(z - 0.3, z + 0.3)), True),
+        (Prior(height=(z + 1.0, z + 1.2)), False),
+        (Prior(heading_deg=heading + 15.0), True),
+        (Prior(heading_deg=heading + 25.0), False),
+    ):
+        asked = replace(query, settings=CoarseToFineSettings(gravity="known", prior=prior))
+        poses = matched_poses(asked)
+        assert all(is_allowed(query.scan_map, pose, prior) for pose in poses)
+        assert any(rooms.errors(pose, _true_pose(1))[0] < 0.1 for pose in poses) == holds
+
+
+def test_without_features_the_search_finds_the_pose():
+    scan_map = rooms.scan_map(1)
+    featureless = replace(
+        scan_map, local_features=make_feature_map(scan_map.octree, np.empty((0, 3)), Workers())
+    )
+    settings = CoarseToFineSettings(gravity="known")
+    result = localize(featureless, rooms.scene(1)[1], settings, Workers(2), Stopwatch())
+    assert rooms.errors(result.pose, rooms.query(1).pose)[0] < 0.02
+    assert (result.evidence.num_matches, result.evidence.alternative_matches) == (0, 0)

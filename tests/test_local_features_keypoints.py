@@ -1,0 +1,114 @@
+"""Keypoints of a sphere: they turn with it, come once, and lie where the picture is valid."""
+
+import functools
+
+import cv2
+import numpy as np
+import rooms
+from scipy.spatial import cKDTree
+
+from piccolo.geometry.pose import yaw_rotation
+from piccolo.geometry.sphere import pixel_rays
+from piccolo.local_features.keypoints import DESCRIPTOR_SIZE, VIEWS_DEG, find_keypoints, perspective_views
+from piccolo.runtime.threads import Workers
+
+WIDTH = rooms.WIDTH
+PIXEL = 2.0 * np.pi / WIDTH  # [rad]
+
+
+@functools.lru_cache
+def _gray():
+    return cv2.cvtColor(rooms.query(1).rgb, cv2.COLOR_RGB2GRAY)
+
+
+@functools.lru_cache
+def _found(shift=0):
+    """The keypoints of a room's photo turned by some pixels."""
+    gray = np.ascontiguousarray(np.roll(_gray(), shift, axis=1))
+    return find_keypoints(gray, np.ones(gray.shape, bool), Workers(2))
+
+
+def test_rays_and_tangents_are_unit_and_orthogonal():
+    found = _found()
+    assert len(found.rays) > 300
+    for directions in (found.rays, found.tangents):
+        np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(np.sum(found.rays * found.tangents, axis=1), 0.0, atol=1e-5)
+    assert found.descriptors.shape == (len(found.rays), DESCRIPTOR_SIZE)
+    # square roots of shares that add up to one, but for SIFT's own rounding
+    np.testing.assert_allclose((found.descriptors / 255.0).__pow__(2).sum(axis=1), 1.0, atol=0.05)
+    assert PIXEL < found.sizes.min() < found.sizes.max() < 1.0
+
+
+def test_turning_the_sphere_turns_the_keypoints():
+    """By half a turn the views fall on each other; by other angles most keypoints are found again."""
+    for shift, least, most_off in ((WIDTH // 2, 0.97, 0.1), (37, 0.6, 0.7)):
+        own, turned = _found(), _found(shift)
+        R = yaw_rotation(shift * PIXEL)
+        back, tangents = turned.rays @ R, turned.tangents @ R
+        forward = own.rays @ R.T
+        assert (cKDTree(turned.rays).query(forward)[0] < most_off * PIXEL).mean() > least
+        wrong_way = own.rays @ R
+        distance, nearest = cKDTree(own.rays).query(back)
+        is_same = distance < most_off * PIXEL
+        assert is_same.mean() > least
+        if shift == 37:
+            assert (cKDTree(turned.rays).query(wrong_way)[0] < most_off * PIXEL).mean() < 0.3
+        cosines = np.sum(tangents[is_same] * own.tangents[nearest[is_same]], axis=1)
+        assert np.median(cosines) > np.cos(np.radians(8.0))
+        np.testing.assert_allclose(
+            np.median(turned.sizes[is_same] / own.sizes[nearest[is_same]]), 1, atol=0.05
+        )
+
+
+def test_what_views_share_counts_once():
+    """No two keypoints of the same place, size and tangent."""
+    found = _found()
+    values = np.concatenate([found.rays / PIXEL, 3.0 * found.tangents], axis=1)
+    pairs = cKDTree(values).query_pairs(0.7, output_type="ndarray")
+    ratio = found.sizes[pairs[:, 0]] / found.sizes[pairs[:, 1]]
+    assert (np.abs(np.log(ratio)) < 0.1).sum() <= 0.005 * len(found.rays)
+    views = perspective_views(WIDTH)
+    middles = np.stack([view.R_sphere_from_view[:, 0] for view in views])
+    assert len(middles) == len(VIEWS_DEG) == 20
+    assert len(np.unique(np.argmax(found.rays @ middles.T, axis=1))) > 10
+
+
+def test_views_are_perspective_and_of_the_pictures_resolution():
+    """A picture of the rays themselves, remapped, shows those of a pinhole."""
+    for k in (0, 9, 16):
+        view = perspective_views(256)[k]
+        middle = len(view.rows) // 2
+        step = np.hypot(*np.diff(np.stack([view.columns, view.rows])[:, middle, middle : middle + 2], axis=1))
+        assert abs(step[0] * np.cos(np.radians(VIEWS_DEG[k][1])) - 1.0) < 0.1
+        u, v = view.columns - 8 + 0.5, view.rows - 8 + 0.5
+        azimuth, elevation = (0.5 - u / 256) * 2 * np.pi, (0.5 - v / 128) * np.pi
+        rays = np.stack(
+            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+        )
+        x, y, z = np.tensordot(view.R_sphere_from_view.T, rays, axes=1)
+        np.testing.assert_allclose(np.diff(y / x, axis=1), np.diff(y / x, axis=1).mean(), atol=1e-4)
+        np.testing.assert_allclose(np.diff(z / x, axis=0), np.diff(z / x, axis=0).mean(), atol=1e-4)
+        assert y[0, 0] > 0 > y[0, -1]
+        assert z[0, 0] > 0 > z[-1, 0]
+
+
+def test_masked_areas_have_none():
+    is_valid = np.ones((WIDTH // 2, WIDTH), bool)
+    is_valid[:, 100:300] = False
+    is_valid[150:] = False
+    found = find_keypoints(_gray(), is_valid)
+    _, nearest = cKDTree(pixel_rays(WIDTH).reshape(-1, 3)).query(found.rays)
+    assert len(found.rays) > 50
+    assert is_valid.ravel()[nearest].all()
+    nothing = find_keypoints(_gray(), np.zeros_like(is_valid))
+    assert [len(values) for values in nothing] == [0, 0, 0, 0]
+    flat = find_keypoints(np.full_like(_gray(), 128), np.ones_like(is_valid))
+    assert flat.descriptors.shape == (0, DESCRIPTOR_SIZE)
+    assert flat.descriptors.dtype == np.uint8
+
+
+def test_same_bits_for_any_number_of_threads():
+    alone = find_keypoints(_gray(), np.ones(_gray().shape, bool), Workers(1))
+    for own, other in zip(_found(), alone, strict=True):
+        np.testing.assert_array_equal(own, other)

@@ -1,0 +1,199 @@
+"""The map's features and matches with them: lists against all, and places that count once."""
+
+import naive
+import numpy as np
+import pytest
+import rooms
+from scipy.spatial import cKDTree
+
+from piccolo.coarse_to_fine.query import prepare_query
+from piccolo.coarse_to_fine.settings import CoarseToFineSettings
+from piccolo.local_features.feature_map import (
+    LIST_SIZE,
+    NUM_COMPONENTS,
+    features_of_view,
+    list_middles,
+    make_feature_map,
+    nearest_middle,
+    principal_components,
+    project,
+)
+from piccolo.local_features.keypoints import Keypoints, find_keypoints
+from piccolo.local_features.matching import APART, FAR, NUM_NEIGHBORS, match, nearest_lists, search_lists
+from piccolo.local_features.view_image import render_gray
+from piccolo.runtime.threads import Workers
+
+
+def _descriptors(rng, count):
+    return rng.integers(-127, 128, (count, NUM_COMPONENTS)).astype(np.int8)
+
+
+def _centers():
+    """Two places in a room, with what is seen from them."""
+    centers = rooms.scan_map(1).centers
+    return centers[[len(centers) // 3, 2 * len(centers) // 3]]
+
+
+def test_lists_equal_a_search_of_all_where_all_are_looked_through():
+    rng = np.random.default_rng(6)
+    places = rng.integers(40, size=300)  # 40 places a metre apart, each seen about 7 times
+    points = np.stack([places, 0 * places, 0 * places], axis=1) + rng.uniform(-0.08, 0.08, (300, 3))
+    in_map, descriptors = _descriptors(rng, 300), _descriptors(rng, 25)
+    in_map[::3] = np.clip(
+        descriptors[rng.integers(25, size=100)].astype(int) + rng.integers(-9, 10, (100, NUM_COMPONENTS)),
+        -127,
+        127,
+    )
+    start = np.array([0, 100, 100, 180, 300], np.int32)
+    probes = np.stack([rng.permutation(4) for _ in range(25)]).astype(np.int32)
+    found, distances = np.empty((25, 5), np.int32), np.empty((25, 5), np.int32)
+    search_lists(descriptors, probes, in_map, start, points.astype(np.float32), found, distances)
+    expected, nearest = naive.nearest_places(descriptors, in_map, places, 5)
+    np.testing.assert_array_equal(distances, expected)
+    np.testing.assert_array_equal(places[found], nearest)
+    squares = ((in_map[found].astype(int) - descriptors[:, None].astype(int)) ** 2).sum(axis=2)
+    np.testing.assert_array_equal(distances, squares)
+    search_lists(descriptors, probes[:, :1], in_map, start, points.astype(np.float32), found, distances)
+    of_list = probes[:, :1] == 1  # that is empty
+    assert (found[of_list[:, 0]] == -1).all()
+    assert (distances[of_list[:, 0]] == FAR).all()
+    lists = np.searchsorted(start, found, side="right") - 1
+    assert ((lists == probes[:, :1]) | (found < 0)).all()
+
+
+def test_two_places_nearer_than_apart_count_once():
+    descriptors = np.zeros((1, NUM_COMPONENTS), np.int8)
+    in_map = np.zeros((4, NUM_COMPONENTS), np.int8)
+    in_map[:, 0] = [5, 4, 6, 9]
+    for gap, order in ((0.9 * APART, [1, 2, 3]), (1.1 * APART, [1, 0, 3])):
+        x = np.array([0.0, gap, -gap / 3, 50.0], np.float32)
+        points = np.stack([x, 0 * x, 0 * x], axis=1)
+        found, distances = np.empty((1, 5), np.int32), np.empty((1, 5), np.int32)
+        start = np.array([0, 4], np.int32)
+        search_lists(descriptors, np.zeros((1, 1), np.int32), in_map, start, points, found, distances)
+        kept = found[found >= 0].tolist()
+        assert kept == order
+        assert distances[0, : len(kept)].tolist() == [int(in_map[k, 0]) ** 2 for k in kept]
+        assert (distances[0, len(kept) :] == FAR).all()
+
+
+def test_nearest_lists_and_middles_by_brute_force():
+    rng = np.random.default_rng(7)
+    descriptors, middles = _descriptors(rng, 90), _descriptors(rng, 30)
+    squares = ((descriptors[:, None].astype(int) - middles[None].astype(int)) ** 2).sum(axis=2)
+    probes, nearest = np.empty((90, 6), np.int32), np.empty(90, np.int32)
+    nearest_lists(descriptors, middles, probes)
+    np.testing.assert_array_equal(probes, np.argsort(squares, axis=1, kind="stable")[:, :6])
+    nearest_middle(descriptors, middles, nearest)
+    np.testing.assert_array_equal(nearest, squares.argmin(axis=1))
+
+
+def test_components_keep_distances_and_middles_are_of_clusters():
+    rng = np.random.default_rng(8)
+    axes = rng.normal(size=(10, 128))
+    values = np.clip(np.rint(120 + 4 * rng.normal(size=(500, 10)) @ axes), 0, 255).astype(np.uint8)
+    mean, components = principal_components(values)
+    np.testing.assert_allclose(mean, values.mean(axis=0), atol=0.5)
+    gram = components[:, :8].T.astype(float) @ components[:, :8] / 127**2
+    np.testing.assert_allclose(gram, np.eye(8), atol=0.03)
+    projected = project(values, mean, components).astype(float)
+    gaps = np.linalg.norm(values[:-1].astype(float) - values[1:], axis=1)
+    is_unclipped = np.abs(projected).max(axis=1) < 127
+    both = is_unclipped[:-1] & is_unclipped[1:]
+    assert both.sum() > 200
+    np.testing.assert_allclose(
+        np.linalg.norm(projected[:-1] - projected[1:], axis=1)[both], gaps[both], rtol=0.05
+    )
+    clusters = np.repeat(_descriptors(rng, 3) // 2, 50, axis=0)
+    noisy = (clusters + rng.integers(-2, 3, clusters.shape)).astype(np.int8)
+    middles = list_middles(noisy, 3)
+    distance = np.abs(middles[:, None].astype(int) - clusters[::50].astype(int)).max(axis=2)
+    assert (np.sort(distance.min(axis=1)) <= 2).all()
+
+
+def test_the_maps_features_lie_on_its_surfaces_and_in_one_list_each():
+    found, octree = rooms.scan_map(1).local_features, rooms.scan_map(1).octree
+    leaves = octree.level(octree.leaf_size)[:, :3]
+    distance = cKDTree(leaves).query(found.points)[0]
+    assert len(found.points) > 1000
+    assert np.median(distance) < 0.02
+    assert (distance < 0.06).mean() > 0.95
+    start = found.list_start
+    assert start[0] == 0
+    assert start[-1] == len(found.points) == len(found.descriptors)
+    assert (np.diff(start) >= 0).all()
+    assert abs(len(found.middles) * LIST_SIZE - len(found.points)) < LIST_SIZE
+    nearest = np.empty(len(found.points), np.int32)
+    nearest_middle(found.descriptors, found.middles, nearest)
+    np.testing.assert_array_equal(nearest, np.repeat(np.arange(len(found.middles)), np.diff(start)))
+    for directions in (found.directions, found.tangents):
+        np.testing.assert_allclose(np.linalg.norm(directions / 127.0, axis=1), 1.0, atol=0.01)
+    across = np.sum(found.directions.astype(float) * found.tangents, axis=1) / 127**2
+    assert np.abs(across).max() < 0.02
+
+
+def test_a_view_knows_from_where_it_saw_its_features():
+    center = _centers()[0]
+    view = features_of_view(rooms.scan_map(1).octree, center)
+    rays = (view.points - center) / np.linalg.norm(view.points - center, axis=1, keepdims=True)
+    np.testing.assert_allclose(view.directions / 127.0, rays, atol=0.005)
+    angle = view.sizes / np.linalg.norm(view.points - center, axis=1)
+    assert 0.005 < angle.min() < angle.max() < 1.0
+
+
+def test_same_bits_for_any_number_of_threads_and_none_where_nothing_is():
+    octree = rooms.scan_map(1).octree
+    one, two = (make_feature_map(octree, _centers(), Workers(k)) for k in (1, 2))
+    for own, other in zip(one, two, strict=True):
+        assert own.dtype == other.dtype
+        np.testing.assert_array_equal(own, other)
+    assert len(one.points) > 300
+    nothing = make_feature_map(octree, np.empty((0, 3)), Workers())
+    assert [len(values) for values in nothing] == [0, 0, 0, 0, 0, 128, 128, 1, 2]
+    gray = octree._replace(nodes=np.where(np.arange(6) < 3, octree.nodes, np.float32(128 / 255)))
+    flat = make_feature_map(gray, _centers(), Workers())
+    assert len(flat.points) < 5  # at the edges of what was scanned
+    found = rooms.scan_map(1).local_features
+    some = Keypoints(
+        *(np.ones((5, n), t) for n, t in ((3, "f4"), (3, "f4"))), np.ones(5, "f4"), np.ones((5, 128), "u1")
+    )
+    assert len(match(some, nothing, Workers()).query) == 0
+    assert len(match(some.take(np.arange(0)), found, Workers()).query) == 0
+
+
+@pytest.fixture(scope="module")
+def matches():
+    query = prepare_query(rooms.scene(1)[1], rooms.scan_map(1), CoarseToFineSettings(), Workers(2))
+    return query.matches
+
+
+def test_matches_come_in_the_photos_order_the_distinct_ones_weigh_most(matches):
+    assert (np.diff(matches.query) >= 0).all()
+    counts = np.bincount(matches.query)
+    assert counts.max() == NUM_NEIGHBORS
+    is_distinct = matches.weights == 1.0
+    assert set(np.unique(matches.weights)) == {0.5, 1.0}
+    assert (np.bincount(matches.query[is_distinct]) <= 1).all()
+    true_pose = rooms.scene(1)[2]
+    rays = (matches.points - true_pose.center_world) @ true_pose.R_cam_from_world.T
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    is_right = np.sum(rays * matches.rays, axis=1) > np.cos(np.radians(2.0))
+    assert is_right[is_distinct].mean() > 3 * is_right[~is_distinct].mean()
+    assert is_right.sum() > 30
+    tangents = matches.tangents @ true_pose.R_cam_from_world.T
+    assert np.median(np.sum(tangents * matches.ray_tangents, axis=1)[is_right]) > 0.9
+    ranges = np.linalg.norm(matches.points - true_pose.center_world, axis=1)
+    assert abs(np.log(np.median((matches.sizes / (matches.angles * ranges))[is_right]))) < 0.2
+
+
+def test_a_map_is_matched_with_itself():
+    """The features of a view that is in the map find themselves."""
+    center = _centers()[0]
+    octree = rooms.scan_map(1).octree
+    own = make_feature_map(octree, center[None], Workers())
+    view = render_gray(octree, center, 640)
+    keypoints = find_keypoints(view.gray, view.is_filled)
+    found = match(keypoints, own, Workers(2))
+    first = np.flatnonzero(np.diff(found.query, prepend=-1))
+    gaps = np.linalg.norm(np.cross(found.rays[first], found.directions[first]), axis=1)
+    assert (gaps < 0.02).mean() > 0.8  # some are seen where the scan has no point, and left out of the map

@@ -1,0 +1,97 @@
+"""The scan as a grey picture: the nearest is shown, gaps are closed, what shines through them is dropped."""
+
+import numpy as np
+import pytest
+import rooms
+
+from piccolo.cloud.octree import build_octree
+from piccolo.cloud.stream import Cloud
+from piccolo.geometry.sphere import pixel_rays
+from piccolo.local_features.view_image import NOTHING, fill_gaps, is_in_front, render_gray
+from piccolo.runtime.threads import Workers
+from piccolo.scenes.synthetic.raycast import cast_rays
+
+WIDTH = 256
+
+
+def _octree(*shells):
+    """An octree of points (N, 3) [m] of one grey each."""
+    points = np.concatenate([points for points, _ in shells]).astype(np.float32)
+    colors = np.concatenate([np.full((len(points), 3), gray, np.uint8) for points, gray in shells])
+    return build_octree(Cloud(points, colors, np.zeros(3)).voxels(np.eye(3)))
+
+
+def _sphere(radius, width=WIDTH):
+    return radius * pixel_rays(width).reshape(-1, 3)
+
+
+def test_the_nearest_surface_wins_with_its_grey_and_range():
+    near = _sphere(1.5)
+    near = near[np.abs(near[:, 1]) < 0.7]
+    near = near[(near[:, 0] > 0) & (np.abs(near[:, 2]) < 0.7)]
+    view = render_gray(_octree((_sphere(3.0, 512), 60), (near, 200)), np.zeros(3), WIDTH)
+    rays = pixel_rays(WIDTH)
+    is_near = (rays[..., 0] > 0) & (np.abs(rays[..., 1:]).max(axis=-1) < 0.42)
+    is_far = (rays[..., 0] < 0) | (np.abs(rays[..., 1:]).max(axis=-1) > 0.52)
+    assert view.is_filled.all()
+    for where, gray, distance in ((is_near, 200, 1.5), (is_far, 60, 3.0)):
+        np.testing.assert_allclose(view.gray[where], gray, atol=1)
+        shown = view.ranges[where & (view.ranges > 0)]
+        assert len(shown) > 0.95 * where.sum()
+        np.testing.assert_allclose(shown, distance, rtol=0.02)
+
+
+def test_ranges_and_greys_are_those_of_the_room():
+    _, true_pose, room = rooms.scene(1)[1], rooms.scene(1)[2], rooms.room(1)[0].rooms[0]
+    view = render_gray(rooms.scan_map(1).octree, true_pose.center_world, WIDTH)
+    rays = pixel_rays(WIDTH).reshape(-1, 3)
+    center_world = rooms.query(1).pose.center_world
+    ranges, rgb, _ = cast_rays(room, center_world, rays, Workers(2), "room")
+    is_shown = view.ranges.ravel() > 0
+    assert is_shown.mean() > 0.8
+    assert np.median(np.abs(view.ranges.ravel() - ranges)[is_shown]) < 0.02
+    assert (np.abs(view.ranges.ravel() - ranges)[is_shown] < 0.1).mean() > 0.93
+    gray = 255.0 * rgb @ [0.299, 0.587, 0.114]
+    assert np.corrcoef(view.gray.ravel()[is_shown], gray[is_shown])[0, 1] > 0.85
+
+
+def test_what_is_seen_through_a_thin_scan_is_dropped():
+    """Before a wall at 4 m a sheet at 1 m of which one pixel in seven was scanned."""
+    sheet = _sphere(1.0, 96)
+    sheet = sheet[(sheet[:, 0] > 0.5)]
+    view = render_gray(_octree((_sphere(4.0, 512), 40), (sheet, 220)), np.zeros(3), WIDTH)
+    behind_sheet = pixel_rays(WIDTH)[..., 0] > 0.7
+    assert (view.ranges[behind_sheet] < 1.5).all()
+    assert view.is_filled[behind_sheet].mean() > 0.9  # all but where hardly a quarter is left
+    is_inner = pixel_rays(WIDTH)[..., 0] > 0.9  # what is filled takes up some of the wall next to the sheet
+    assert (view.gray[is_inner & view.is_filled] > 200).all()
+    aside = pixel_rays(WIDTH)[..., 0] < 0.3
+    np.testing.assert_allclose(view.ranges[aside & (view.ranges > 0)], 4.0, rtol=0.02)
+
+
+def test_a_pixel_is_in_front_if_anything_around_it_is_as_far():
+    ranges = np.full((32, 64), 5.0, np.float32)
+    ranges[::4, ::4] = 1.0  # in each of the wider pixels
+    assert (is_in_front(ranges) == (ranges == 1.0)).all()
+    ranges[8:12, 0:4] = 5.0  # but for one at the seam: so nothing around it is hidden either
+    shown = is_in_front(ranges)
+    assert shown[4:16, 0:8].all()
+    assert shown[4:16, -4:].all()
+    assert (shown[20:] == (ranges[20:] == 1.0)).all()
+    ranges[0, 0] = NOTHING
+    assert not is_in_front(ranges)[0, 0]
+    assert is_in_front(np.full((16, 32), 1.19, np.float32) * np.float32([[1.0, 1 / 1.19] * 16])).all()
+
+
+@pytest.mark.parametrize(("gap", "is_closed"), [(3, True), (6, True), (100, False)])
+def test_gaps_are_filled_with_what_is_around_them(gap, is_closed):
+    gray, weight = np.full((128, 256), 0.25, np.float32), np.ones((128, 256), np.float32)
+    gray[:, 128:] = 0.75
+    weight[14 : 14 + gap, 30 : 30 + gap] = 0.0
+    filled, is_filled = fill_gaps(gray * weight, weight)
+    assert is_filled[14 + gap // 2, 30 + gap // 2] == is_closed
+    np.testing.assert_array_equal(filled[weight > 0], gray[weight > 0])
+    if is_closed:
+        assert is_filled.all()
+        np.testing.assert_allclose(filled, gray, atol=1e-3)
+    assert not fill_gaps(0 * gray, 0 * weight)[1].any()
