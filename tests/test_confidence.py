@@ -16,9 +16,15 @@ def _covariance(std):
 
 
 SURE = _covariance(0.002)
-RIGHT = Evidence(score=0.8, margin=0.6, agreement=0.85, explained_fraction=0.85, seen_fraction=0.93)
-WRONG = dataclasses.replace(RIGHT, score=0.18, margin=0.02, agreement=0.25)
-MIDDLING = dataclasses.replace(RIGHT, score=0.35, margin=0.15, agreement=0.4)
+RIGHT = Evidence(
+    score=0.8, margin=0.9, agreement=0.85, explained_fraction=0.85, seen_fraction=0.93, num_matches=60
+)
+WRONG = dataclasses.replace(
+    RIGHT, score=0.03, margin=0.1, agreement=0.25, num_matches=3, alternative_matches=4
+)
+MIDDLING = dataclasses.replace(RIGHT, score=0.15, margin=0.35, agreement=0.4, num_matches=8)
+PAPER_RIGHT = dataclasses.replace(RIGHT, margin=0.6)
+PAPER_MIDDLING = dataclasses.replace(RIGHT, margin=0.15, agreement=0.4)
 
 
 def test_right_and_wrong_evidence():
@@ -26,7 +32,7 @@ def test_right_and_wrong_evidence():
     assert rule.classify(WRONG, None, True, 0.9)[0] == rule.NOT_LOCALIZED
     assert rule.confidence_of(RIGHT, SURE, rule.MODEL) > 0.99
     assert rule.confidence_of(WRONG, None, rule.MODEL) < 0.2
-    assert rule.classify(RIGHT, None, True, 0.9, rule.PAPER_MODEL)[0] == rule.LOCALIZED
+    assert rule.classify(PAPER_RIGHT, None, True, 0.9, rule.PAPER_MODEL)[0] == rule.LOCALIZED
 
 
 @pytest.mark.parametrize(
@@ -34,9 +40,9 @@ def test_right_and_wrong_evidence():
     [
         ({}, 0.003, rule.MODEL, 0.9707),
         ({}, None, rule.MODEL, 0.7858),
-        ({"margin": 0.45, "agreement": 0.8, "alternative_score_ratio": 0.5}, 0.003, rule.MODEL, 0.7513),
-        ({}, None, rule.PAPER_MODEL, 0.1759),
-        ({"margin": 0.35}, None, rule.PAPER_MODEL, 0.4328),
+        ({"margin": 0.6, "alternative_matches": 4}, 0.003, rule.MODEL, 0.7513),
+        ({"margin": 0.15}, None, rule.PAPER_MODEL, 0.1759),
+        ({}, None, rule.PAPER_MODEL, 0.4328),
     ],
 )
 def test_confidence_is_what_was_learnt(changes, std, model, expected):
@@ -49,17 +55,17 @@ def test_confidence_is_what_was_learnt(changes, std, model, expected):
 @pytest.mark.parametrize(("std", "most"), [(0.05, 0.683), (0.1, 0.383), (0.3, 0.132)])
 def test_a_pose_that_may_be_a_decimetre_off_is_doubtful_whatever_the_evidence(std, most):
     """The part of a normal distribution within 0.1 m, of twice the deviation."""
-    sure = dataclasses.replace(RIGHT, margin=3.0)
+    sure = dataclasses.replace(RIGHT, margin=1.0, num_matches=500)
     assert rule.confidence_of(sure, _covariance(std), rule.MODEL) == pytest.approx(most, abs=0.002)
 
 
 def test_an_alternative_as_good_makes_it_ambiguous_and_nothing_else_does():
-    twin = dataclasses.replace(RIGHT, margin=0.01, alternative_score_ratio=0.98)
+    twin = dataclasses.replace(RIGHT, margin=-0.05, alternative_matches=58)
     status, confidence = rule.classify(twin, SURE, True, 0.9)
     assert status == rule.AMBIGUOUS
     assert confidence < 0.9
     assert rule.classify(twin, SURE, False, 0.9)[0] == rule.NOT_LOCALIZED
-    weak = dataclasses.replace(WRONG, margin=0.18)
+    weak = dataclasses.replace(WRONG, margin=0.2)
     assert rule.classify(weak, None, False, 0.9)[0] == rule.NOT_LOCALIZED
     assert rule.classify(WRONG, None, True, 0.9)[0] == rule.NOT_LOCALIZED
 
@@ -72,15 +78,19 @@ def test_the_line_moves():
     assert rule.classify(WRONG, None, False, half)[0] == rule.LOCALIZED
 
 
-@pytest.mark.parametrize("name", ["margin", "agreement", "score"])
-def test_more_evidence_is_more_confidence(name):
-    stronger = dataclasses.replace(MIDDLING, **{name: getattr(MIDDLING, name) + 0.1})
+@pytest.mark.parametrize(("name", "more"), [("margin", 0.1), ("score", 0.1), ("num_matches", 5)])
+def test_more_evidence_is_more_confidence(name, more):
+    stronger = dataclasses.replace(MIDDLING, **{name: getattr(MIDDLING, name) + more})
     assert rule.confidence_of(MIDDLING, SURE, rule.MODEL) < rule.confidence_of(stronger, SURE, rule.MODEL)
+    if name == "margin":
+        clearer = dataclasses.replace(PAPER_MIDDLING, margin=0.25, agreement=0.5)
+        pair = (rule.confidence_of(e, None, rule.PAPER_MODEL) for e in (PAPER_MIDDLING, clearer))
+        assert next(pair) < next(pair)
 
 
-def test_a_pose_that_is_no_minimum_and_a_credible_alternative_are_held_against_it():
+def test_a_pose_that_is_no_minimum_and_matches_elsewhere_are_held_against_it():
     assert rule.confidence_of(MIDDLING, None, rule.MODEL) < rule.confidence_of(MIDDLING, SURE, rule.MODEL)
-    challenged = dataclasses.replace(MIDDLING, alternative_score_ratio=0.9)
+    challenged = dataclasses.replace(MIDDLING, alternative_matches=8)
     assert rule.confidence_of(challenged, SURE, rule.MODEL) < rule.confidence_of(MIDDLING, SURE, rule.MODEL)
 
 

@@ -16,6 +16,7 @@ from piccolo.panorama.local_normalization import image_pyramid
 from piccolo.runtime.threads import Workers
 
 FINE_BLOCKS = METHOD.fine_view.arrays.blocks
+ALL = np.ones(len(FINE_BLOCKS), bool)
 
 
 @functools.lru_cache
@@ -27,7 +28,7 @@ def _images():
 def _fine():
     """Fine cells about the true camera of a room, and its true pose."""
     true_pose = rooms.scene(1)[2]
-    return render_view(rooms.scan_map(1).octree, true_pose.center_world, METHOD.fine_view), true_pose
+    return render_view(rooms.scan_map(1).octree, true_pose.center_world, METHOD.fine_view, ALL), true_pose
 
 
 def test_channels_in_levels_and_perturbations_to_the_corners_of_a_cube():
@@ -55,7 +56,7 @@ def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off():
     (_, true_pose), images = _fine(), _images()
     off = step(true_pose, descent.perturbations(1.0)[1])
     assert rooms.errors(off, true_pose)[0] > 0.2
-    cells = render_view(rooms.scan_map(1).octree, off.center_world, METHOD.fine_view)
+    cells = render_view(rooms.scan_map(1).octree, off.center_world, METHOD.fine_view, ALL)
     found = descent.descend_around(cells, FINE_BLOCKS, (images.search, images.middle), off, 1.0)
     assert rooms.errors(found.pose, true_pose)[0] < 0.06
     score = descent.score_on(cells, FINE_BLOCKS, off.center_world, images.middle, found.pose)

@@ -15,10 +15,10 @@ from piccolo.coarse_to_fine.query import prepare_query
 from piccolo.coarse_to_fine.search_result import SearchResult
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.coarse_to_fine.starts import Starts, best_and_alternatives, narrow
-from piccolo.coarse_to_fine.view import Cells
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.confidence.score import Agreement
 from piccolo.geometry.pose import Pose, step, yaw_rotation
+from piccolo.geometry.sphere import make_grid
 from piccolo.optimize.channel_loss import CHANCE
 from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers
@@ -101,15 +101,17 @@ def test_halving_keeps_as_many_as_the_beam_says(monkeypatch):
 
 def test_each_stage_has_its_view_its_image_and_its_limits(monkeypatch):
     asked = []
-    monkeypatch.setattr(refinement, "render_view", lambda octree, center, view: view)
-    monkeypatch.setattr(refinement, "visible_points", lambda octree, center, view, count: (view, count))
+    monkeypatch.setattr(refinement, "render_view", lambda octree, center, view, shown: view)
+    monkeypatch.setattr(
+        refinement, "visible_points", lambda octree, center, view, shown, count: (view, count)
+    )
     monkeypatch.setattr(refinement, "descend", lambda *arguments: asked.append(arguments) or arguments[3])
     monkeypatch.setattr(refinement, "score_on", lambda cells, blocks, center, image, pose: len(blocks))
     monkeypatch.setattr(refinement, "refine_unoccluded", lambda query, h: (query, h))
     monkeypatch.setattr(refinement, "without_occluders", lambda query, pose: query)
     monkeypatch.setattr(refinement, "compared", lambda query, h: h)
     images = SimpleNamespace(full="full", fine="fine", middle="middle")
-    query = SimpleNamespace(**vars(QUERY), images=images, photo=SimpleNamespace(valid_share=1.0))
+    query = SimpleNamespace(**vars(QUERY), images=images, shown_cells=lambda *_: None)
     h, full = _at(1.0, 0.2), (METHOD.full_view, 30_000)
     for at, view in (
         (refinement.descend_middle, METHOD.middle_view),
@@ -146,7 +148,8 @@ def test_poses_are_perturbed_for_as_long_as_that_helps(monkeypatch, gains, round
     monkeypatch.setattr(refinement, "render_view", lambda *_: None)
     monkeypatch.setattr(refinement, "descend_around", around)
     monkeypatch.setattr(refinement, "descend_fine", fine)
-    query = SimpleNamespace(**vars(QUERY), images=SimpleNamespace(middle="middle", fine="fine"))
+    images = SimpleNamespace(middle="middle", fine="fine")
+    query = SimpleNamespace(**vars(QUERY), images=images, shown_cells=lambda *_: None)
     found = refinement.refine_by_perturbation(query, _at(0.0, 0.5))
     assert found.score == pytest.approx(expected)
     assert sizes == [0.4] * rounds
@@ -211,19 +214,25 @@ def test_occluders_are_masked_twice_at_most_and_while_that_helps(monkeypatch, hi
     assert (pytest.approx(h.score), shown.hidden, len(looks)) == expected
 
 
-def test_points_are_those_that_the_photo_shows(monkeypatch):
-    """A fifth of the sphere is asked for five times as many; those outside the photo are left out."""
-    asked, turned = [], Pose(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
-    offsets = np.array([[1.0, -1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]], np.float32)
-    cells = Cells(offsets, np.arange(9.0).reshape(3, 3), np.arange(3.0))
-    monkeypatch.setattr(refinement, "visible_points", lambda *arguments: asked.append(arguments[3]) or cells)
-    query = SimpleNamespace(**vars(QUERY), shows=lambda rays: rays[:, 1] > 0.5)
-    for share, num_points, kept in ((1.0, 30_000, [0, 1, 2]), (0.2, 150_000, [1]), (0.001, 1_000_000, [1])):
-        query.photo = SimpleNamespace(valid_share=share)
-        points = refinement.points_at(query, turned)
-        assert asked.pop() == num_points
-        assert points.weights.tolist() == kept
-        assert points.offsets.shape == points.channels.shape == (3, len(kept))
+def test_cells_and_points_are_those_that_the_photo_shows(monkeypatch):
+    """Cells around the camera that point where the photo has a picture; all, for a photo of a sphere."""
+    whole, pose = _query(1), _at(0.0, 0.0, 70.0).pose
+    is_hidden = ~(np.abs(np.arange(16) - 4) < 2) & np.ones((8, 1), bool)  # but a fifth, around the left
+    narrow = whole.without(is_hidden)
+    grid = make_grid(METHOD.full_view.num_rings)
+    azimuth = np.degrees(np.arctan2(*(grid.directions @ pose.R_cam_from_world.T).T[1::-1]))
+    shown = narrow.shown_cells(METHOD.full_view.num_rings, pose)
+    assert whole.shown_cells(METHOD.full_view.num_rings, pose).all()
+    is_inside = np.abs((azimuth - 78.75 + 180) % 360 - 180) < 33.75
+    assert (shown == is_inside).mean() > 0.98
+    monkeypatch.setattr(refinement, "render_view", lambda octree, center, config, shown: shown)
+    monkeypatch.setattr(
+        refinement, "visible_points", lambda octree, center, config, shown, count: (shown, count)
+    )
+    assert (refinement.view_at(narrow, pose, METHOD.full_view) == shown).all()
+    points, count = refinement.points_at(narrow, pose)
+    assert (points == shown).all()
+    assert count == 30_000
 
 
 @pytest.mark.parametrize(("seed", "most"), [(1, 5e-4), (2, 5e-5), (3, 2e-4)])
@@ -378,6 +387,7 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
         "occlusion_at": lambda *_: SimpleNamespace(fractions=lambda: (0.6, 0.3)),
         "count_matches": lambda matches, pose: counts.get(pose.center_world[0], 0),
         "estimate_covariance": lambda *_: None,
+        "is_mirrored": lambda *_: False,
     }.items():
         monkeypatch.setattr(evaluation, name, value)
     alternatives = _at(1.0, 0.3), _at(2.0, 0.2)

@@ -18,6 +18,9 @@ LEAVES = ViewConfig(
 )  # the leaves themselves
 
 
+ALL = np.ones(len(make_grid(24)), bool)
+
+
 @pytest.fixture(scope="module")
 def octree():
     cloud = rooms.room(1)[1]
@@ -30,7 +33,7 @@ def _cells(positions):
 
 def test_view_of_the_leaves_equals_its_twin(octree):
     center = rooms.scene(1)[2].center_world
-    offsets, features, weights = render_view(octree, center, LEAVES)
+    offsets, features, weights = render_view(octree, center, LEAVES, ALL)
     leaves = octree.level(octree.leaf_size).astype(np.float64)
     twin = naive.cells_view(leaves, center, _cells(leaves[:, :3] - center), len(make_grid(24)))
     seen = twin[2] > 0
@@ -42,9 +45,25 @@ def test_view_of_the_leaves_equals_its_twin(octree):
     assert np.abs(features[:, both] - channels[both].T).mean() < 0.01
 
 
+def test_cells_that_are_not_shown_change_nothing_elsewhere(octree):
+    """They have no weight, and the local means and deviations are those of what is shown."""
+    center = rooms.scene(1)[2].center_world
+    shown = make_grid(24).directions[:, 0] > 0.0
+    whole, part = (render_view(octree, center, LEAVES, some) for some in (ALL, shown))
+    assert (part.weights[~shown] == 0).all()
+    np.testing.assert_array_equal(part.weights[shown], whole.weights[shown])
+    leaves = octree.level(octree.leaf_size).astype(np.float64)
+    twin = naive.cells_view(leaves, center, _cells(leaves[:, :3] - center), len(make_grid(24)))
+    channels = naive.normalized_cells(twin[1], (twin[2] > 0) & shown, 24, 16, 22.0)
+    both = part.weights > 0
+    assert np.abs(part.channels[:, both] - channels[both].T).mean() < 0.01
+    points = visible_points(octree, center, LEAVES, shown, 3000)
+    assert shown[_cells(points.offsets.T)].mean() > 0.99
+
+
 def test_coarser_voxels_far_away_change_a_view_little(octree):
     center = rooms.scene(1)[2].center_world
-    exact, coarse = (render_view(octree, center, kind) for kind in (LEAVES, SEARCH_VIEW))
+    exact, coarse = (render_view(octree, center, kind, ALL) for kind in (LEAVES, SEARCH_VIEW))
     both = (exact[2] > 0) & (coarse[2] > 0)
     product = (exact[1] * coarse[1])[:, both].sum()
     assert product / np.sqrt((exact[1][:, both] ** 2).sum() * (coarse[1][:, both] ** 2).sum()) > 0.8
@@ -52,7 +71,7 @@ def test_coarser_voxels_far_away_change_a_view_little(octree):
 
 def test_points_that_are_seen_lie_at_the_front_and_are_bounded(octree):
     center = rooms.scene(1)[2].center_world
-    offsets, _, weights = visible_points(octree, center, LEAVES, 3000)
+    offsets, _, weights = visible_points(octree, center, LEAVES, ALL, 3000)
     assert 1000 < len(weights) <= 3000
     ranges = np.linalg.norm(offsets, axis=0)
     nearest = np.full(len(make_grid(24)), np.inf)
@@ -112,7 +131,7 @@ def test_coverage_is_all_inside_and_little_outside(octree):
 def test_candidates_views_are_views_in_few_bits(octree):
     scan_map = rooms.scan_map(1)
     k = len(scan_map.centers) // 2
-    offsets, features, weights = render_view(octree, scan_map.centers[k], SEARCH_VIEW)
+    offsets, features, weights = render_view(octree, scan_map.centers[k], SEARCH_VIEW, ALL)
     np.testing.assert_array_equal(scan_map.is_seen[k], weights > 0)
     unit = scan_map.offset_unit[k]
     np.testing.assert_allclose(scan_map.offsets[k] * unit, offsets, atol=2 * unit)
