@@ -141,6 +141,6 @@ def scan_of(
 
 
 def up_axis(cloud_settings: CloudSettings, settings: CoarseToFineSettings) -> UpAxis:
-    """The axis that points up: z where the user says that gravity is known, so that nothing turns the scan."""
+    """The axis that points up: z where the user says that gravity is known; nothing then turns the scan."""
     is_known = settings.gravity == "known" and cloud_settings.up == "auto"
     return "z" if is_known else cloud_settings.up

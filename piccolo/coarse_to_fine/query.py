@@ -61,7 +61,7 @@ class Query:
         return pack_texels(small.rgb, small.is_valid)
 
     def shown_cells(self, num_rings: int, pose: Pose) -> NDArray[np.bool_]:
-        """Which cells (N,) of a grid around a pose in the map the photo shows; all, of a photo of a sphere."""
+        """Which cells (N,) of a grid around a pose in the map the photo shows; all, if it shows a sphere."""
         grid = make_grid(num_rings)
         if self.photo.valid_share > MOST_SHARE:
             return np.ones(len(grid), np.bool_)

@@ -101,7 +101,7 @@ def locate_nodes(tree, center, voxel_per_range, view, scratch):
 def render_cells(
     tree, center, voxel_per_range, view, scratch, shown, offsets, channels, weights, sums, stats
 ):
-    """One view: relative position, opponent channels, their local statistics and weight of each cell shown."""
+    """One view: relative position, opponent channels, their statistics and weight of each cell shown."""
     n = locate_nodes(tree, center, voxel_per_range, view, scratch)
     s = scratch
     average_cells(tree.nodes, s.nodes, s.directions, s.cells[:n], s.ranges, view.front, sums)
@@ -116,7 +116,7 @@ def render_cells(
 
 @kernel
 def render(tree, center, voxel_per_range, view, scratch, shown, offsets, channels, weights):
-    """One view: position relative to the centre, normalised channels and weight of each cell that is shown."""
+    """One view: position relative to the centre, normalised channels and weight of each cell shown."""
     sums = np.empty((len(weights), 8), np.float32)
     stats = np.empty((6, len(weights)), np.float32)
     render_cells(tree, center, voxel_per_range, view, scratch, shown, offsets, channels, weights, sums, stats)
