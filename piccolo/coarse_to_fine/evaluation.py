@@ -66,7 +66,7 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
 def is_mirrored(query: Query, evidence: Evidence) -> bool:
     """True if more features of the mirrored photo agree with one pose than of the photo.
 
-    Symmetric things match in a mirror too, but not more of them. A pose that explains nearly all is not asked.
+    Symmetric things match in a mirror too, but not more of them. A pose that explains nearly all needs none.
     """
     if evidence.score >= ENOUGH_EXPLAINED:
         return False
