@@ -98,7 +98,7 @@ def add_cloud_reading_options(group: argparse._ArgumentGroup) -> None:
     unit = group.add_mutually_exclusive_group()
     unit.add_argument("--units", choices=list(METRES), help="of the cloud's coordinates (default m)")
     unit.add_argument("--scale", type=float, metavar="S", help="metres per unit of the cloud, in place of it")
-    text = "up axis of the cloud; auto estimates it (default auto; preset default)"
+    text = "up axis of the cloud; auto estimates it, z with --gravity known (default auto; preset default)"
     group.add_argument("--up", choices=get_args(UpAxis), default="auto", help=text)
     text = "of clouds without colours"
     group.add_argument("--intensity-as-gray", action="store_true", help=text)
@@ -188,7 +188,7 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("method")
     text = "default: prepared views, all positions searched; paper: Kim et al., ICCV 2021, Algorithm 1"
     group.add_argument("--preset", choices=["default", "paper"], default="default", help=text)
-    text = "known: camera upright and the cloud level; unknown: any rotation; auto: both (default auto)"
+    text = "known: camera upright, the cloud's z up; unknown: any rotation; auto: both (default auto)"
     group.add_argument("--gravity", choices=["auto", "known", "unknown"], help=text)
     text = "of the descent (default gauss-newton, with the preset paper adam)"
     group.add_argument("--solver", choices=["gauss-newton", "lbfgs", "adam"], help=text)
