@@ -1,12 +1,11 @@
-"""Poses from three and two matches, against the truth, against PoseLib, and where there is none."""
+"""Poses from three matches, against the truth, against PoseLib, and where there is none."""
 
 import numpy as np
 import poselib
 import pytest
 
-from piccolo.geometry.pose import exp_so3, yaw_rotation
+from piccolo.geometry.pose import exp_so3
 from piccolo.geometry.rotations import random_rotation
-from piccolo.local_features.p2p_upright import p2p_upright
 from piccolo.local_features.p3p import p3p
 
 NUM_CASES = 5000
@@ -25,22 +24,10 @@ def _three(bearings, points):
     return rotations[:count], centers[:count]
 
 
-def _two(bearings, points):
-    yaws, centers = np.full((2, 3, 3), np.nan), np.full((2, 3), np.nan)
-    count = p2p_upright(bearings, points, yaws, centers)
-    return yaws[:count], centers[:count]
-
-
-SOLVERS = {
-    3: (_three, random_rotation),
-    2: (_two, lambda rng: yaw_rotation(rng.uniform(0.0, 7.0))),
-}
-
-
-def _case(rng, num_points):
-    """Points (N, 3) all around a camera, its rotation and center."""
+def _case(rng):
+    """Points (3, 3) all around a camera, its rotation and center."""
     center = RESTS + rng.normal(size=3) * 3.0
-    return RESTS + rng.normal(size=(num_points, 3)) * 4.0, SOLVERS[num_points][1](rng), center
+    return RESTS + rng.normal(size=(3, 3)) * 4.0, random_rotation(rng), center
 
 
 def _off(found, R, center):
@@ -49,15 +36,14 @@ def _off(found, R, center):
     return min((np.abs(r - R).max() + np.linalg.norm(c - center) for r, c in pairs), default=np.inf)
 
 
-@pytest.mark.parametrize("num_points", [3, 2])
-def test_truth_is_found_and_every_pose_sees_the_points(num_points):
-    rng, solve, errors = np.random.default_rng(0), SOLVERS[num_points][0], []
+def test_truth_is_found_and_every_pose_sees_the_points():
+    rng, errors = np.random.default_rng(0), []
     num_behind = 0
     for _ in range(NUM_CASES):
-        points, R, center = _case(rng, num_points)
+        points, R, center = _case(rng)
         bearings = _rays(points, R, center)
         num_behind += int((bearings @ bearings.T).min() < 0.0)
-        found = solve(bearings, points)
+        found = _three(bearings, points)
         errors.append(_off(found, R, center))
         for rotation, position in zip(*found, strict=True):
             np.testing.assert_allclose(_rays(points, rotation, position), bearings, atol=1e-7)
@@ -69,14 +55,13 @@ def test_truth_is_found_and_every_pose_sees_the_points(num_points):
 
 
 @pytest.mark.parametrize("noise", [1e-3, 1e-5])
-@pytest.mark.parametrize("num_points", [3, 2])
-def test_noise_moves_the_pose_in_proportion(num_points, noise):
-    rng, solve, errors = np.random.default_rng(1), SOLVERS[num_points][0], []
+def test_noise_moves_the_pose_in_proportion(noise):
+    rng, errors = np.random.default_rng(1), []
     for _ in range(1000):
-        points, R, center = _case(rng, num_points)
-        rays = _rays(points, R, center) + rng.normal(size=(num_points, 3)) * noise
+        points, R, center = _case(rng)
+        rays = _rays(points, R, center) + rng.normal(size=(3, 3)) * noise
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        errors.append(_off(solve(rays, points), R, center))
+        errors.append(_off(_three(rays, points), R, center))
     assert np.median(errors) < 50.0 * noise
     assert np.mean(np.isfinite(errors)) > 0.97
 
@@ -98,7 +83,7 @@ def test_poses_are_those_of_poselib_where_all_points_are_in_front():
 
 def test_scale_and_order_of_the_points_change_nothing():
     rng = np.random.default_rng(3)
-    points, R, center = _case(rng, 3)
+    points, R, center = _case(rng)
     bearings = _rays(points, R, center)
     for order in ([1, 2, 0], [2, 1, 0]):
         assert _off(_three(bearings[order], points[order]), R, center) < 1e-9
@@ -127,22 +112,6 @@ def _degenerate_three():
 @pytest.mark.parametrize("name", _degenerate_three())
 def test_three_degenerate_matches_have_no_pose(name):
     assert len(_three(*_degenerate_three()[name])[0]) == 0
-
-
-def _degenerate_two():
-    rays, above = _rays(POINTS[:2], np.eye(3), RESTS), POINTS[[0, 0]] + [[0, 0, 0], [0, 0, 2.0]]
-    return {
-        "one above the other": (_rays(above, yaw_rotation(0.3), RESTS), above),
-        "both at the camera's height": (rays * [1, 1, 0], POINTS[:2] * [1, 1, 0]),
-        "equal bearings": (rays[[0, 0]], POINTS[:2]),
-        "equal points": (rays, POINTS[[0, 0]]),
-        "not a number": (rays * np.nan, POINTS[:2]),
-    }
-
-
-@pytest.mark.parametrize("name", _degenerate_two())
-def test_two_degenerate_matches_have_no_pose(name):
-    assert len(_two(*_degenerate_two()[name])[0]) == 0
 
 
 def test_opposite_bearings_and_a_camera_in_the_plane_of_the_points():

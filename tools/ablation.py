@@ -50,6 +50,8 @@ def with_views(change: Callable[[ViewConfig], ViewConfig], scales: ImageScales =
 GLOBAL_SCALES = ImageScales(*(scale._replace(sigma_deg=EVERYTHING) for scale in METHOD.scales))
 PARTS: dict[str, Parts] = {
     "all of it": (METHOD, SEARCH_VIEW, 4000),
+    "search alone": (METHOD._replace(uses_features=False), SEARCH_VIEW, 4000),
+    "features alone": (METHOD._replace(uses_search=False), SEARCH_VIEW, 4000),
     "12 starts": (METHOD._replace(min_starts=12), SEARCH_VIEW, 12),
     "300 starts": (METHOD._replace(min_starts=300), SEARCH_VIEW, 300),
     "no halving": (METHOD._replace(beam=Beam(1000, 1000, 48, 2)), SEARCH_VIEW, 4000),

@@ -191,6 +191,8 @@ def exact_pose(matches: Matches, rough: Pose, R_cam_from_level: Array | None) ->
         members = members_of(matches, Pose(R, t), COS_EXACT)
         some = matches.rays[members].astype(np.float64), matches.points[members].astype(np.float64)
         refine_pose(*some, np.ones(len(members)), R, t, REFINEMENTS, REFINE_SCALE)
+    if R[:, 2] @ up_cam < cos_tilt:
+        return None
     pose = Pose(R, t)
     return MatchedPose(pose, count_matches(matches, pose))
 

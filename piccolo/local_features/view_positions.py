@@ -8,6 +8,10 @@ from ..geometry.sphere import cell_of
 from ..runtime.jit import kernel
 
 SPACING, LAYER = 2.5, 2.4  # [m] across and in height: what is nearer and seen from a position needs none
+MAX_VIEWS, WIDER = 2500, 1.5  # at most, some minutes and 0.4 GB; the growth of the spacing for more
+    2500,
+    1.5,
+)  # at most, some minutes and 0.4 GB; by what the spacing grows where there are more
 ABOVE_LOWEST, HEIGHT_STEP = 1.0, 0.3  # [m] first are positions so high above the lowest around, by steps
 CELL = np.array([2.5, 2.5, 3.0])  # [m] around: a part of a storey
 TABLE_HEIGHT = 48  # directions, by 3.75 degrees
@@ -15,8 +19,8 @@ SLACK = 1.0  # [m] a wall is so much nearer than what is behind it
 
 
 @kernel
-def choose(order, centers, ranges, cells, kept):
-    """Write the indices of the positions kept, in order: each that no kept one is near and sees.
+def choose(order, centers, ranges, cells, spacing, kept):
+    """Write the indices of the positions kept, in order: each that none is near (spacing [m]) and sees.
 
     Ranges (N, cells) [m] are those of the view from each centre (N, 3), 0 where nothing is seen; `cells` is a
     table (h, 2 h) of the cell in each direction.
@@ -30,7 +34,7 @@ def choose(order, centers, ranges, cells, kept):
             dx, dy = centers[i, 0] - centers[j, 0], centers[i, 1] - centers[j, 1]
             dz = centers[i, 2] - centers[j, 2]
             across = dx * dx + dy * dy
-            if across >= SPACING * SPACING or abs(dz) >= LAYER:
+            if across >= spacing * spacing or abs(dz) >= LAYER:
                 continue
             row = min(int((0.5 - np.arctan2(dz, np.sqrt(across)) / np.pi) * height), height - 1)
             column = min(int((0.5 + np.arctan2(dy, dx) / (2.0 * np.pi)) * width), width - 1)
@@ -57,7 +61,7 @@ def cell_table(num_rings: int) -> NDArray[np.int32]:
 def view_positions(centers: Array, ranges: NDArray[np.float32], num_rings: int) -> NDArray[np.int64]:
     """Indices of the candidates (N, 3) [m] from which features are taken.
 
-    Ranges (N, cells) [m] are those of the candidates' views, 0 where nothing is seen.
+    Ranges (N, cells) [m] are those of the candidates' views, 0 where nothing is seen. At most MAX_VIEWS.
     """
     if len(centers) == 0:
         return np.empty(0, np.int64)
@@ -66,5 +70,7 @@ def view_positions(centers: Array, ranges: NDArray[np.float32], num_rings: int) 
     np.minimum.at(lowest, group.ravel(), centers[:, 2])
     off = np.abs(centers[:, 2] - lowest[group.ravel()] - ABOVE_LOWEST)
     order = np.argsort(np.rint(off / HEIGHT_STEP), kind="stable")
-    kept = np.empty(len(centers), np.int64)
-    return kept[: choose(order, centers, ranges, cell_table(num_rings), kept)]
+    kept, spacing = np.empty(len(centers), np.int64), SPACING
+    while (count := choose(order, centers, ranges, cell_table(num_rings), spacing, kept)) > MAX_VIEWS:
+        spacing *= WIDER
+    return kept[:count]
