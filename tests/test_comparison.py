@@ -1,5 +1,6 @@
 """Poses compared by blocks: an occluder costs what it hides, and what is not shown costs nothing."""
 
+import dataclasses
 import functools
 
 import naive
@@ -15,10 +16,13 @@ from piccolo.coarse_to_fine.comparison import (
     sample_photo,
     without_occluders,
 )
+from piccolo.coarse_to_fine.evaluation import is_mirrored
 from piccolo.coarse_to_fine.query import prepare_query
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
+from piccolo.confidence.score import Evidence
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.sphere import cell_of, make_grid, pixel_rays, solid_angles
+from piccolo.local_features.hypotheses import count_matches
 from piccolo.optimize.channel_loss import BLOCK_RINGS, CHANCE, NUM_BLOCKS
 from piccolo.panorama import Panorama
 from piccolo.panorama.texels import pack_texels
@@ -186,3 +190,14 @@ def test_a_mask_is_enlarged_to_the_photo():
     side = height // 8
     assert not rest.panorama.is_valid[2 * side : 3 * side, 5 * side : 6 * side].any()
     assert (~rest.panorama.is_valid).sum() == side * side
+
+
+def test_a_photo_that_was_turned_over_is_told():
+    rgb = rooms.query(1).rgb
+    doubtful = Evidence(0.5, 0.5, 0.5, 0.5, 0.9, num_matches=10)
+    assert is_mirrored(_query(rgb[:, ::-1].copy()), doubtful)
+    right = _query(rgb)
+    matched = dataclasses.replace(doubtful, num_matches=count_matches(right.matches, _clean()[1]))
+    assert matched.num_matches > 10
+    assert not is_mirrored(right, matched)
+    assert not is_mirrored(_query(rgb[:, ::-1].copy()), dataclasses.replace(doubtful, score=0.9))

@@ -5,6 +5,7 @@ import numpy as np
 import rooms
 
 from piccolo.geometry.sphere import make_grid
+from piccolo.local_features import view_positions as view_positions_module
 from piccolo.local_features.view_positions import cell_table, view_positions
 
 RINGS = 24
@@ -48,3 +49,11 @@ def test_a_small_room_takes_few():
     assert 2 <= len(chosen) <= 16
     distance = np.linalg.norm(m.centers[:, None, :2] - m.centers[chosen][:, :2], axis=2).min(axis=1)
     assert distance.max() < 2.5
+
+
+def test_positions_are_bounded(monkeypatch):
+    centers = np.stack(np.meshgrid(np.arange(30) * 3.0, np.arange(30) * 3.0, [1.5]), axis=-1).reshape(-1, 3)
+    ranges = _open(len(centers))
+    assert len(view_positions(centers, ranges, RINGS)) == 900
+    monkeypatch.setattr(view_positions_module, "MAX_VIEWS", 300)
+    assert 50 < len(view_positions(centers, ranges, RINGS)) <= 300

@@ -9,9 +9,6 @@ from ..runtime.jit import kernel
 
 SPACING, LAYER = 2.5, 2.4  # [m] across and in height: what is nearer and seen from a position needs none
 MAX_VIEWS, WIDER = 2500, 1.5  # at most, some minutes and 0.4 GB; the growth of the spacing for more
-    2500,
-    1.5,
-)  # at most, some minutes and 0.4 GB; by what the spacing grows where there are more
 ABOVE_LOWEST, HEIGHT_STEP = 1.0, 0.3  # [m] first are positions so high above the lowest around, by steps
 CELL = np.array([2.5, 2.5, 3.0])  # [m] around: a part of a storey
 TABLE_HEIGHT = 48  # directions, by 3.75 degrees
