@@ -98,3 +98,16 @@ def test_pixel_jacobian_against_central_differences(where):
             difference[0] -= WIDTH * np.round(difference[0] / WIDTH)
             numbers[:, axis] = difference / 2e-6
         np.testing.assert_allclose(numbers, [[ux, uy, 0.0], [vx, vy, vz]], rtol=1e-4, atol=1e-2)
+
+
+def test_pixel_centres_come_back_from_their_rays():
+    for width in (32, 250):
+        u, v = sphere.pixels_of(sphere.pixel_rays(width), width)
+        np.testing.assert_allclose(u, np.broadcast_to(np.arange(width) + 0.5, u.shape), atol=1e-9)
+        np.testing.assert_allclose(v[:, 0], np.arange(width // 2) + 0.5, atol=1e-9)
+        rows, columns = sphere.indices_of(sphere.pixel_rays(width), width)
+        assert np.array_equal(columns[0], np.arange(width)) and np.array_equal(
+            rows[:, 0], np.arange(width // 2)
+        )
+    rows, columns = sphere.indices_of(np.array([[0.0, 0, 1], [0, 0, -1], [-1, 0, 0], [-1, -0.0, 0]]), 8)
+    assert rows.tolist() == [0, 3, 2, 2] and set(columns[2:]) <= {0, 7}

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.pose import Array, Pose
-from ..geometry.sphere import make_grid
+from ..geometry.pose import Array, Pose, rotate_points
+from ..geometry.sphere import indices_of, make_grid
 from ..local_features.keypoints import find_keypoints
 from ..local_features.matching import Matches, match
 from ..panorama import Panorama
@@ -65,11 +65,8 @@ class Query:
         grid = make_grid(num_rings)
         if self.photo.valid_share > MOST_SHARE:
             return np.ones(len(grid), np.bool_)
-        x, y, z = pose.R_cam_from_world.astype(np.float32) @ grid.directions.T
-        height, width = self.panorama.is_valid.shape
-        column = ((0.5 - np.arctan2(y, x) / (2.0 * np.pi)) * width).astype(np.int64) % width
-        row = ((0.5 - np.arcsin(np.clip(z, -1.0, 1.0)) / np.pi) * height).astype(np.int64)
-        return np.asarray(self.panorama.is_valid[np.minimum(row, height - 1), column])
+        rays_cam = rotate_points(grid.directions.astype(np.float64), pose.R_cam_from_world)
+        return np.asarray(self.panorama.is_valid[indices_of(rays_cam, self.panorama.is_valid.shape[1])])
 
     def without(self, is_hidden: NDArray[np.bool_]) -> "Query":
         """The same of what is left of the photo without some pixels (h, 2 h), its contrast taken anew."""

@@ -91,6 +91,20 @@ def rays_at(width: int, u: NDArray[np.floating], v: NDArray[np.floating]) -> NDA
     return rays
 
 
+def pixels_of(rays: NDArray[np.floating], width: int) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Columns u and rows v (...), continuous, of camera directions (..., 3) in a `width` image."""
+    x, y, z = np.moveaxis(rays, -1, 0)
+    u = (0.5 - np.arctan2(y, x) / (2.0 * np.pi)) * width
+    v = (0.5 - np.arctan2(z, np.hypot(x, y)) / np.pi) * width / 2.0
+    return u, v
+
+
+def indices_of(rays: NDArray[np.floating], width: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns (...) of the pixels in which directions (..., 3) lie, in a `width` image."""
+    u, v = pixels_of(rays, width)
+    return np.minimum(v.astype(np.int64), width // 2 - 1), u.astype(np.int64) % width
+
+
 def ray_jacobian(rays: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Derivatives (H, W, 3) of u and of v by the camera coordinates, at pixel_rays, 1 m from the camera."""
     x, y, z = np.moveaxis(rays, -1, 0)

@@ -1,12 +1,12 @@
 """The scan's local features: where views are taken, what they show, and an index of descriptors."""
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cloud.octree import Octree
+from ..geometry.sphere import indices_of
 from ..runtime.jit import inline_kernel, kernel
 from ..runtime.threads import Workers
 from .keypoints import DESCRIPTOR_SIZE, find_keypoints
@@ -61,9 +61,7 @@ def features_of_view(
     """The features seen from a centre (3,) [m] that have a point of the scan."""
     image = render_gray(octree, center_map, width)
     found = find_keypoints(image.gray, image.is_filled)
-    u = (0.5 - np.arctan2(found.rays[:, 1], found.rays[:, 0]) / (2.0 * math.pi)) * width
-    v = (0.5 - np.arcsin(np.clip(found.rays[:, 2], -1.0, 1.0)) / math.pi) * width / 2.0
-    ranges = image.ranges[np.minimum(v.astype(int), width // 2 - 1), u.astype(int) % width]
+    ranges = image.ranges[indices_of(found.rays, width)]
     kept = np.flatnonzero((ranges > 0.0) & (ranges < MAX_RANGE))
     found, ranges = found.take(kept), ranges[kept]
     return FeaturesOfView(

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.sphere import pixels_of
 from ..runtime.threads import Workers
 
 FIELD_DEG = 65.0  # of a view, across
@@ -54,10 +55,8 @@ def perspective_views(width: int) -> list[PerspectiveView]:
     for azimuth, elevation in np.radians(VIEWS_DEG):
         c, s, ce, se = math.cos(azimuth), math.sin(azimuth), math.cos(elevation), math.sin(elevation)
         R = np.array([[c * ce, -s, -c * se], [s * ce, c, -s * se], [se, 0.0, ce]])
-        x, y, z = np.moveaxis(np.stack([np.ones_like(left), left, up], axis=-1) @ R.T, -1, 0)
-        u = (0.5 - np.arctan2(y, x) / (2.0 * np.pi)) * width
-        v = (0.5 - np.arctan2(z, np.hypot(x, y)) / np.pi) * width / 2.0
-        columns, rows = (np.asarray(a - 0.5 + MARGIN, np.float32) for a in (u, v))
+        places = pixels_of(np.stack([np.ones_like(left), left, up], axis=-1) @ R.T, width)
+        columns, rows = (np.asarray(a - 0.5 + MARGIN, np.float32) for a in places)
         views.append(PerspectiveView(R, columns, rows))
     return views
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..geometry.pose import Array
+from ..geometry.sphere import pixels_of
 from .zbuffer import View
 
 MAX_SPHERE_WIDTH = 8192  # [px]
@@ -43,7 +44,5 @@ def _places(
     """Columns and rows of the sphere that pixels show (height, width), and which show any."""
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays, is_in = camera.rays(np.stack([u, v], axis=-1))
-    x, y, z = np.moveaxis(rays @ R_lens_from_cam, -1, 0)
-    columns = width * (0.5 - np.arctan2(y, x) / (2.0 * math.pi))
-    rows = width * (0.25 - np.arctan2(z, np.hypot(x, y)) / (2.0 * math.pi))
+    columns, rows = pixels_of(rays @ R_lens_from_cam, width)
     return columns.astype(np.float32), rows.astype(np.float32), is_in
