@@ -106,8 +106,8 @@ def test_pixel_centres_come_back_from_their_rays():
         np.testing.assert_allclose(u, np.broadcast_to(np.arange(width) + 0.5, u.shape), atol=1e-9)
         np.testing.assert_allclose(v[:, 0], np.arange(width // 2) + 0.5, atol=1e-9)
         rows, columns = sphere.indices_of(sphere.pixel_rays(width), width)
-        assert np.array_equal(columns[0], np.arange(width)) and np.array_equal(
-            rows[:, 0], np.arange(width // 2)
-        )
+        assert np.array_equal(columns[0], np.arange(width))
+        assert np.array_equal(rows[:, 0], np.arange(width // 2))
     rows, columns = sphere.indices_of(np.array([[0.0, 0, 1], [0, 0, -1], [-1, 0, 0], [-1, -0.0, 0]]), 8)
-    assert rows.tolist() == [0, 3, 2, 2] and set(columns[2:]) <= {0, 7}
+    assert rows.tolist() == [0, 3, 2, 2]
+    assert set(columns[2:]) <= {0, 7}
