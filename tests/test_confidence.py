@@ -41,6 +41,7 @@ def test_right_and_wrong_evidence():
         ({}, 0.003, rule.MODEL, 0.9314),
         ({}, None, rule.MODEL, 0.3160),
         ({"margin": 0.6, "alternative_matches": 4}, 0.003, rule.MODEL, 0.9348),
+        ({"margin": 0.2}, 0.003, rule.MODEL, 0.4244),
         ({"margin": 0.15}, None, rule.PAPER_MODEL, 0.1759),
         ({}, None, rule.PAPER_MODEL, 0.4328),
     ],

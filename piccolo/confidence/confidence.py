@@ -27,6 +27,9 @@ MIN_CONFIDENCE = 0.9
 
 LEAST_STD, MOST_STD = 0.003, 0.3  # [m] smaller or larger tells nothing more
 LEAST_SCORE = 0.02
+COPY_MARGIN = (
+    0.25  # with less, a pose elsewhere explains as much of what both show: one of two, whatever the rest
+)
 SAFETY = 2.0  # errors that the whole sphere shares, as by blur, are not in the deviations
 NOISE_MATCHES = 8  # local features that agree with a wrong pose by chance, at most
 # Logistic regression by tools/calibrate_confidence.py on tools/evaluate_confidence.py --seeds 0 8, but for
@@ -57,15 +60,15 @@ def confidence_of(evidence: Evidence, covariance: PoseCovariance | None, model: 
     """How likely it is that the pose is within 0.1 m and 5 degrees: of those with 0.9, nine in ten.
 
     It holds where half of all queries have an answer, as in the trials from which it was learnt. A pose whose
-    own deviation makes 0.1 m doubtful has less.
+    own deviation makes 0.1 m doubtful has less, and one that has a copy half at most.
     """
     is_paper = model is PAPER_MODEL
     features = paper_features_of(evidence) if is_paper else features_of(evidence, covariance)
     logit = model.bias + float(features @ np.array(model.weights))
-    exactness = 1.0
+    factor = 0.5 if evidence.margin < COPY_MARGIN and not is_paper else 1.0
     if covariance is not None:
-        exactness = math.erf(MAX_DISTANCE / (SAFETY * covariance.largest_std * math.sqrt(2.0)))
-    return exactness / (1.0 + math.exp(-min(max(logit, -30.0), 30.0)))
+        factor *= math.erf(MAX_DISTANCE / (SAFETY * covariance.largest_std * math.sqrt(2.0)))
+    return factor / (1.0 + math.exp(-min(max(logit, -30.0), 30.0)))
 
 
 def classify(
