@@ -86,6 +86,13 @@ def test_what_libraries_raise_when_memory_is_short():
     assert not memory.is_shortage(RuntimeError("other"))
 
 
+@pytest.mark.parametrize(("most", "is_one"), [(10**9, True), (resource.RLIM_INFINITY, False)])
+def test_c_code_that_gives_up_lacks_memory_where_that_is_limited(monkeypatch, most, is_one):
+    monkeypatch.setattr(memory.resource, "getrlimit", lambda _: (most, most))
+    assert memory.is_shortage(SystemError("error return without exception set")) == is_one
+    assert not memory.is_shortage(SystemError("other"))
+
+
 def test_all_that_grows_asks_first(monkeypatch, tmp_path):
     picture = tmp_path / "a.png"
     whole, taken = scan_map(1), as_panorama(query(1).rgb)

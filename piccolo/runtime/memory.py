@@ -86,6 +86,9 @@ def is_shortage(error: BaseException) -> bool:
     """True for what NumPy, OpenCV or Python raise where memory, or room for a thread, has run out."""
     if isinstance(error, MemoryError) or getattr(error, "code", None) == OPENCV_NO_MEMORY:
         return True
+    if isinstance(error, SystemError):  # C code that gave up without saying why, under `ulimit -v`
+        is_limited = resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
+        return is_limited and "without exception set" in str(error)
     return isinstance(error, RuntimeError) and "can't start new thread" in str(error)
 
 
