@@ -7,11 +7,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from cameras import four_sides
 from pictures import encoded, write
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 from rooms import room, scan_map, write_room
-from test_panorama_cameras import four_sides
 
 import piccolo
 from piccolo.camera import Mount

@@ -8,6 +8,7 @@ import pytest
 from rooms import as_panorama, query, room, scan_map
 
 from piccolo.cloud import voxels
+from piccolo.cloud.stream import stream_of_arrays
 from piccolo.coarse_to_fine.query import prepare_query
 from piccolo.coarse_to_fine.scan_map import SEARCH_VIEW, prepare_map, render_candidates
 from piccolo.coarse_to_fine.search import search_poses
@@ -77,6 +78,18 @@ def test_a_container_leaves_its_limit_less_what_is_used_but_for_caches(system, l
 def test_address_space_is_a_limit_too(monkeypatch):
     monkeypatch.setattr(resource, "getrlimit", lambda what: (10**12, -1))
     assert 0.0 < memory.free_of_process() < 1e12
+
+
+def test_work_begins_only_where_errors_can_still_be_raised(monkeypatch):
+    cloud = stream_of_arrays(np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
+    monkeypatch.setattr(memory, "free_of_process", lambda: 1.9e8)
+    with pytest.raises(MemoryError, match=r"^ulimit -v leaves 0.19 GB, wanted 0.2 or more"):
+        cloud.read()
+    with pytest.raises(MemoryError, match="ulimit"):
+        list(Workers().map(abs, [1], "a"))
+    monkeypatch.setattr(memory, "free_of_process", lambda: 2e8)
+    assert list(Workers().map(abs, [-1], "a")) == [1]
+    assert len(cloud.read().points) == 1
 
 
 def test_what_libraries_raise_when_memory_is_short():

@@ -1,7 +1,6 @@
 """Where a command begins and how it ends: signals, streams, locale and memory, in processes of their own."""
 
 import json
-import resource
 import signal
 import subprocess
 import sys
@@ -98,27 +97,35 @@ def test_stderr_closed_and_names_that_the_locale_does_not_know(scene, tmp_path, 
     assert err.startswith("localize.py: ")
 
 
-@pytest.mark.parametrize(
-    ("gigabytes", "text"), [(0.5, "found ulimit -v 488281, wanted"), (None, "not enough memory")]
-)
-def test_little_address_space_is_one_line(scene, tmp_path, gigabytes, text):
-    files = "--cloud", scene / "cloud.ply", "--out", tmp_path / "a.map", "--quiet"
-    words = _command("tools/prepare_map.py", *files)
-    if gigabytes is None:  # as little as is allowed, and most of it taken
-        gigabytes = start.LEAST_ADDRESS_SPACE / 1e9
-        held = round(gigabytes * 0.45e9)
-        code = f"import numpy, runpy, sys; held = numpy.empty({held}, 'u1'); sys.argv = sys.argv[1:]; "
-        code += "sys.path.insert(0, 'tools'); runpy.run_path(sys.argv[0], run_name='__main__')"
-        words = [sys.executable, "-c", code, *words[1:]]
-
-    def limit():
-        resource.setrlimit(resource.RLIMIT_AS, (round(gigabytes * 1e9), -1))
-
+def test_little_address_space_is_refused_before_libraries_are_loaded(scene, tmp_path):
+    command = _command("tools/prepare_map.py", "--cloud", scene / "cloud.ply", "--out", tmp_path / "a.map")
     done = subprocess.run(
-        words, cwd=ROOT, preexec_fn=limit, capture_output=True, text=True, check=False, timeout=300
+        ["sh", "-c", 'ulimit -v 488281; exec "$@"', "sh", *command],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 3
+    assert done.stderr.startswith("prepare_map.py: found ulimit -v 488281, wanted ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_address_space_that_runs_out_is_one_line(scene, tmp_path):
+    code = """
+import resource, sys
+from piccolo.cli.prepare_map import main
+taken = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (taken + 100_000_000, -1))
+sys.exit(main(sys.argv[1:]))
+"""
+    files = "--cloud", scene / "cloud.ply", "--out", tmp_path / "a.map", "--quiet"
+    done = subprocess.run(
+        [sys.executable, "-c", code, *map(str, files)], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stderr.count("\n")) == (3, 1), done.stderr
-    assert text in done.stderr
+    assert "not enough memory (ulimit -v leaves " in done.stderr
+    assert not (tmp_path / "a.map").exists()
 
 
 @pytest.mark.parametrize("name", ["one colour", "one point", "one wall"])

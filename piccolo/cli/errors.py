@@ -13,7 +13,7 @@ from types import FrameType
 from tqdm import tqdm
 
 from ..errors import InputError
-from ..runtime.memory import is_shortage
+from ..runtime.memory import check_address_space, is_shortage
 from .parser import as_started, parse
 from .progress import log_shown
 from .start import EXIT_INTERRUPTED, EXIT_TERMINATED
@@ -48,6 +48,7 @@ def run_command(
     arguments, lost = parse(parser, argv), list[KeyboardInterrupt]()
     try:
         with log_shown(arguments.quiet), raising_signals(lost):
+            check_address_space()
             code = run(arguments)
             sys.stdout.flush()  # here, where a closed pipe is caught
         return code

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry.pose import Array, rotate_points
+from ..runtime.memory import check_address_space
 from ..runtime.threads import Progress, no_progress
 from .digest import sha256_of_arrays
 from .readers.columns import brightest_of, colored_chunks
@@ -139,6 +140,7 @@ class CloudStream:
             total = None if source.num_points is None else math.ceil(source.num_points / CHUNK)
             try:
                 for raw in self.show(source.read_chunks(), total, f"read {source.path.name}"):
+                    check_address_space()
                     points_world, colors = validator.filter(raw)
                     for k in range(3 if len(points_world) else 0):
                         column = points_world[:, k]

@@ -5,18 +5,19 @@ wrong one explains all of them a little.
 """
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.pose import Pose
-from ..geometry.sphere import PI, atan2, cell_of, make_grid, pixel_rays
+from ..geometry.sphere import cell_of, make_grid, pixel_rays
 from ..optimize.channel_loss import BLOCK_RINGS, CHANCE, NUM_BLOCKS
 from ..panorama.local_normalization import opponent, zscore
-from ..panorama.texels import bilinear_weights, blend, is_valid, texel_at
-from ..runtime.jit import F0, HALF, kernel
-from .cells import local_statistics
+from ..panorama.texels import blend, is_valid, texels_around
+from ..runtime.jit import F0, kernel
+from .cells import local_statistics, locate
 from .query import Query
 from .view import render_cells, thread_scratch
 
@@ -60,26 +61,21 @@ def sample_photo(offsets, weights, photo, R_cam_from_map, grid, colors, shared, 
     Blocks are those of the photo: cells of a grid of `num_columns`, `first` in the camera's frame.
     """
     texels, width = photo
-    num_columns, first = grid
-    num_rings = np.float32(len(num_columns))
-    R, stride = R_cam_from_map, np.int32(width + 2)
+    R, rays = R_cam_from_map, np.empty((3, len(weights)), np.float32)
     for n in range(len(weights)):
         dx, dy, dz = offsets[0, n], offsets[1, n], offsets[2, n]
         x = np.float32(R[0, 0] * dx + R[0, 1] * dy + R[0, 2] * dz)
         y = np.float32(R[1, 0] * dx + R[1, 1] * dy + R[1, 2] * dz)
         z = np.float32(R[2, 0] * dx + R[2, 1] * dy + R[2, 2] * dz)
-        k, fu, fv = texel_at(x, y, z, math.sqrt(x * x + y * y), width)
-        bilinear = bilinear_weights(fu, fv)
-        t00, t10, t01, t11 = texels[k], texels[k + 1], texels[k + stride], texels[k + stride + 1]
+        (t00, t10, t01, t11), bilinear = texels_around(texels, x, y, z, width)
         shared[n] = weights[n] * is_valid(t00, t10, t01, t11)
         r = blend(t00, t10, t01, t11, bilinear, 0) * PER_LEVEL
         g = blend(t00, t10, t01, t11, bilinear, 8) * PER_LEVEL
         b = blend(t00, t10, t01, t11, bilinear, 16) * PER_LEVEL
         colors[0, n], colors[1, n], colors[2, n] = opponent(r, g, b)
-        ring = np.int32((HALF - atan2(z, math.sqrt(x * x + y * y)) / PI) * num_rings)
-        ring = min(max(ring, np.int32(0)), np.int32(len(num_columns) - 1))
-        column = np.int32((HALF + atan2(y, x) / (PI + PI)) * np.float32(num_columns[ring]))
-        blocks[n] = first[ring] + min(column, num_columns[ring] - np.int32(1))
+        rays[0, n], rays[1, n], rays[2, n] = x, y, z
+    ranges, turns = np.empty(len(weights), np.float32), np.empty(len(weights), np.float32)
+    locate(rays[0], rays[1], rays[2], *grid, blocks, ranges, turns)
 
 
 @kernel
@@ -139,7 +135,15 @@ def compare_cells(
 
 
 def compare(query: Query, pose: Pose) -> Comparison:
-    """The scan as seen from a pose and the photo, by blocks."""
+    """The scan as seen from a pose and the photo, by blocks; worked out once a pose."""
+    key = pose.R_cam_from_world.tobytes() + pose.center_world.tobytes()
+    if key not in query.comparisons:
+        query.comparisons[key] = _compare(query, pose)
+    found: Comparison = query.comparisons[key]
+    return found
+
+
+def _compare(query: Query, pose: Pose) -> Comparison:
     config, photo = query.method.fine_view, query.photo
     n = len(make_grid(config.num_rings))
     offsets, colors = np.empty((3, n), np.float32), np.empty((3, n), np.float32)
@@ -160,5 +164,15 @@ def without_occluders(query: Query, pose: Pose) -> Query:
     contradicts = (seen.correlation < CONTRADICTS) & (seen.visible_area > 0.0)
     if not contradicts.any():
         return query
-    is_hidden = contradicts[cell_of(pixel_rays(MASK_WIDTH).reshape(-1, 3).astype(np.float32), BLOCK_RINGS)]
-    return query.without(is_hidden.reshape(MASK_WIDTH // 2, MASK_WIDTH))
+    key = contradicts.tobytes()
+    if key not in query.comparisons:
+        query.comparisons[key] = query.without(contradicts[pixel_blocks()])
+    rest: Query = query.comparisons[key]
+    return rest
+
+
+@lru_cache(maxsize=1)
+def pixel_blocks() -> NDArray[np.int32]:
+    """The block in which each pixel (h, 2 h) of a mask lies."""
+    rays = pixel_rays(MASK_WIDTH).astype(np.float32)
+    return cell_of(rays.reshape(-1, 3), BLOCK_RINGS).reshape(rays.shape[:2])

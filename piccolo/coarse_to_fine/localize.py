@@ -16,12 +16,7 @@ from .config import METHOD, MethodConfig
 from .evaluation import evaluate
 from .prior import apply_prior, is_allowed, nothing_allowed
 from .query import Query, prepare_query
-from .refinement import (
-    refine,
-    refine_full_resolution,
-    refine_matched,
-    settle,
-)
+from .refinement import refine, refine_full_resolution, refine_matched, settle
 from .scan_map import ScanMap
 from .search import search_poses
 from .search_result import SearchResult, found_among

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -59,6 +59,11 @@ class Query:
         """The photo's colours at the size at which poses are compared."""
         small = resize(self.panorama, COMPARED_WIDTH)
         return pack_texels(small.rgb, small.is_valid)
+
+    @cached_property
+    def comparisons(self) -> dict[bytes, Any]:
+        """What comparison.py has worked out already, by pose, and by the blocks that are left out."""
+        return {}
 
     def shown_cells(self, num_rings: int, pose: Pose) -> NDArray[np.bool_]:
         """Which cells (N,) of a grid around a pose in the map the photo shows; all, if it shows a sphere."""

@@ -55,13 +55,11 @@ NO_FEATURES = FeaturesOfView(
 )
 
 
-def features_of_view(
-    octree: Octree, center_map: NDArray[np.float64], width: int = VIEW_WIDTH
-) -> FeaturesOfView:
+def features_of_view(octree: Octree, center_map: NDArray[np.float64]) -> FeaturesOfView:
     """The features seen from a centre (3,) [m] that have a point of the scan."""
-    image = render_gray(octree, center_map, width)
+    image = render_gray(octree, center_map, VIEW_WIDTH)
     found = find_keypoints(image.gray, image.is_filled)
-    ranges = image.ranges[indices_of(found.rays, width)]
+    ranges = image.ranges[indices_of(found.rays, VIEW_WIDTH)]
     kept = np.flatnonzero((ranges > 0.0) & (ranges < MAX_RANGE))
     found, ranges = found.take(kept), ranges[kept]
     return FeaturesOfView(

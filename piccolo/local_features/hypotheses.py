@@ -24,6 +24,7 @@ COS_ROUGH, COS_EXACT = math.cos(math.radians(20.0)), math.cos(math.radians(1.0))
 COS_TANGENT = math.cos(math.radians(40.0))
 SIZE_RATIO = 1.7  # of a keypoint's size as predicted and as found, at most
 COS_TILT = math.cos(math.radians(12.0))  # by which a pose may be off the known vertical
+LEAST_ANGLE = np.float32(1e-6)  # [rad] of a keypoint
 MAX_VOTERS = 1200  # single matches whose poses are tried
 BATCH = 64  # of them a thread tries at a time
 CLUSTER_DISTANCE, CLUSTER_ANGLE = 1.0, math.radians(30.0)  # [m], [rad] rough poses nearer than both are one
@@ -106,7 +107,7 @@ def rough_poses(matches, voters, R_cam_from_level, is_upright, rotations, center
     m = matches
     for k in range(len(voters)):
         j, R, t = voters[k], rotations[k], centers[k]
-        distance = m.sizes[j] / max(m.angles[j], F0 + np.float32(1e-6))
+        distance = m.sizes[j] / max(m.angles[j], LEAST_ANGLE)
         for i in range(3):
             t[i] = m.points[j, i] - distance * m.directions[j, i]
         if is_upright:

@@ -42,6 +42,7 @@ class PerspectiveView(NamedTuple):
     R_sphere_from_view: NDArray[np.float64]  # (3, 3), +x the view's middle, +y left, +z up
     columns: NDArray[np.float32]  # (s, s) of each pixel in the sphere's picture with its margin
     rows: NDArray[np.float32]
+    is_own: NDArray[np.uint8]  # (s, s) 255 where no other view's middle is nearer, and a little beyond
 
 
 @lru_cache(maxsize=4)
@@ -51,13 +52,16 @@ def perspective_views(width: int) -> list[PerspectiveView]:
     side = round(2.0 * reach * width / (2.0 * math.pi))
     across = reach * (1.0 - (2.0 * np.arange(side) + 1.0) / side)
     left, up = np.meshgrid(across, across)
-    views = []
+    rays, turns, views = np.stack([np.ones_like(left), left, up], axis=-1), [], []
     for azimuth, elevation in np.radians(VIEWS_DEG):
         c, s, ce, se = math.cos(azimuth), math.sin(azimuth), math.cos(elevation), math.sin(elevation)
-        R = np.array([[c * ce, -s, -c * se], [s * ce, c, -s * se], [se, 0.0, ce]])
-        places = pixels_of(np.stack([np.ones_like(left), left, up], axis=-1) @ R.T, width)
-        columns, rows = (np.asarray(a - 0.5 + MARGIN, np.float32) for a in places)
-        views.append(PerspectiveView(R, columns, rows))
+        turns.append(np.array([[c * ce, -s, -c * se], [s * ce, c, -s * se], [se, 0.0, ce]]))
+    middles = np.stack(turns)[:, :, 0]
+    for k, R in enumerate(turns):
+        columns, rows = (np.asarray(a - 0.5 + MARGIN, np.float32) for a in pixels_of(rays @ R.T, width))
+        is_nearest = np.argmax(rays @ R.T @ middles.T, axis=-1) == k
+        own = cv2.dilate(is_nearest.astype(np.uint8) * np.uint8(255), np.ones((5, 5), np.uint8))
+        views.append(PerspectiveView(R, columns, rows, np.asarray(own)))
     return views
 
 
@@ -74,7 +78,7 @@ def find_keypoints(
         shown = cv2.remap(mask, view.columns, view.rows, cv2.INTER_NEAREST)
         if not shown.any():
             return _nothing()
-        shown = cv2.erode(shown, np.ones((3, 3), np.uint8))
+        shown = cv2.bitwise_and(cv2.erode(shown, np.ones((3, 3), np.uint8)), view.is_own)
         image = cv2.remap(picture, view.columns, view.rows, cv2.INTER_LINEAR)
         sift = cv2.SIFT.create(contrastThreshold=CONTRAST)
         found, shares = sift.detectAndCompute(image, shown)

@@ -64,9 +64,10 @@ def put_in_order(at, value, total, values, totals):
 
 @kernel
 def search_lists(descriptors, probes, map_descriptors, list_start, points, found, distances):
-    """Write the nearest features (N, K) of the map, no two of which are one place, and squared distances.
+    """Write the nearest features (N, K) of the map, of one place the nearest, and squared distances.
 
-    `probes` (N, P) are the lists to look through; -1 and FAR where there is no other.
+    `probes` (N, P) are the lists to look through; -1 and FAR where there is no other. A nearer feature takes
+    the place of the first kept one that is near it: of a few that stand in a row, two may stay.
     """
     found[:], distances[:] = -1, FAR
     for i in range(len(descriptors)):
@@ -107,10 +108,9 @@ def match(keypoints: Keypoints, feature_map: FeatureMap, workers: Workers) -> Ma
         search_lists(descriptors[part], probes[part], *lists, found[part], distances[part])
 
     list(workers.map(run, range(0, len(descriptors), BATCH), "match"))
-    following = np.minimum(distances[:, 1:], FAR).astype(np.float64)
     query, rank = np.nonzero(found[:, :NUM_NEIGHBORS] >= 0)
     chosen = found[query, rank]
-    is_distinct = (rank == 0) & (distances[query, 0] < DISTINCT_RATIO * following[query, 0])
+    is_distinct = (rank == 0) & (distances[query, 0] < DISTINCT_RATIO * distances[query, 1])
     weights = np.where(is_distinct, 1.0, 0.5).astype(np.float32)
     return Matches(
         query.astype(np.int32),

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.pose import Array
-from ..geometry.sphere import cell_of
+from ..geometry.sphere import cell_of, direction_to_pixel, pixel_rays
 from ..runtime.jit import kernel
 
 SPACING, LAYER = 2.5, 2.4  # [m] across and in height: what is nearer and seen from a position needs none
@@ -33,9 +33,8 @@ def choose(order, centers, ranges, cells, spacing, kept):
             across = dx * dx + dy * dy
             if across >= spacing * spacing or abs(dz) >= LAYER:
                 continue
-            row = min(int((0.5 - np.arctan2(dz, np.sqrt(across)) / np.pi) * height), height - 1)
-            column = min(int((0.5 + np.arctan2(dy, dx) / (2.0 * np.pi)) * width), width - 1)
-            limit = ranges[j, cells[row, column]]
+            u, v = direction_to_pixel(dx, dy, dz, np.sqrt(across), width)
+            limit = ranges[j, cells[min(int(v), height - 1), min(int(u), width - 1)]]
             if limit == 0.0 or np.sqrt(across + dz * dz) < limit + SLACK:
                 is_covered = True
                 break
@@ -46,13 +45,9 @@ def choose(order, centers, ranges, cells, spacing, kept):
 
 
 def cell_table(num_rings: int) -> NDArray[np.int32]:
-    """The cell (h, 2 h) of a grid in each direction, from the zenith down, azimuth from -pi."""
-    h = TABLE_HEIGHT
-    azimuth = ((np.arange(2 * h) + 0.5) / (2 * h) - 0.5) * 2.0 * np.pi
-    elevation = (0.5 - (np.arange(h) + 0.5) / h)[:, None] * np.pi
-    z = np.broadcast_to(np.sin(elevation), (h, 2 * h))
-    rays = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), z], axis=-1)
-    return cell_of(rays.reshape(-1, 3).astype(np.float32), num_rings).reshape(h, 2 * h)
+    """The cell (h, 2 h) of a grid in each direction, by the pixels of a sphere."""
+    rays = pixel_rays(2 * TABLE_HEIGHT).astype(np.float32)
+    return cell_of(rays.reshape(-1, 3), num_rings).reshape(rays.shape[:2])
 
 
 def view_positions(centers: Array, ranges: NDArray[np.float32], num_rings: int) -> NDArray[np.int64]:

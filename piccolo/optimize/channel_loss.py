@@ -10,7 +10,7 @@ import numpy as np
 
 from ..geometry.sphere import make_grid
 from ..panorama.local_normalization import ZERO_LEVEL
-from ..panorama.texels import bilinear_weights, blend, is_valid, texel_at
+from ..panorama.texels import blend, is_valid, texels_around
 from ..runtime.jit import F1, HALF, inline_kernel, kernel
 from .levenberg_marquardt import levenberg_marquardt
 from .normal_equations import COUNT, LOSS, block_adder
@@ -72,16 +72,13 @@ descend_channels = kernel(levenberg_marquardt(channel_equations))
 def correlate(points, channels, weights, blocks, texels, width, R_cam_from_world, center_world, sums):
     """Write, block by block (B, 4), product, energies and shared weight of points' and image's channels."""
     R, t = R_cam_from_world, center_world
-    stride = np.int32(width + 2)
     sums[:] = 0.0
     for n in range(len(weights)):
         dx, dy, dz = points[0, n] - t[0], points[1, n] - t[1], points[2, n] - t[2]
         x = np.float32(R[0, 0] * dx + R[0, 1] * dy + R[0, 2] * dz)
         y = np.float32(R[1, 0] * dx + R[1, 1] * dy + R[1, 2] * dz)
         z = np.float32(R[2, 0] * dx + R[2, 1] * dy + R[2, 2] * dz)
-        k, fu, fv = texel_at(x, y, z, math.sqrt(x * x + y * y), width)
-        bilinear = bilinear_weights(fu, fv)
-        t00, t10, t01, t11 = texels[k], texels[k + 1], texels[k + stride], texels[k + stride + 1]
+        (t00, t10, t01, t11), bilinear = texels_around(texels, x, y, z, width)
         w = weights[n] * is_valid(t00, t10, t01, t11)
         s = sums[blocks[n]]
         s[3] += w

@@ -13,7 +13,7 @@ from ..geometry.sphere import pixel_rays, solid_angles
 from ..runtime.jit import F0, F1, HALF, inline_kernel, kernel
 from . import Panorama
 from .model import resize
-from .texels import Texels, bilinear_weights, blend, is_valid, texel_at
+from .texels import Texels, blend, is_valid, texels_around
 
 CLIP = 2.0  # deviations; what differs more from its surroundings counts no more
 MIN_DEVIATION = 0.03  # of a channel in [0, 1]: flatter surroundings are not amplified further
@@ -195,7 +195,6 @@ def image_pyramid(panorama: Panorama, scales: Sequence[ImageScale]) -> list[Texe
 @kernel
 def sample_channels(texels, width, directions, rotations, samples, validity):
     """Write channels (rotations, 3, cells), less the zero level, and validity along each turned direction."""
-    stride = np.int32(width + 2)
     for k in range(len(rotations)):
         R = rotations[k]
         for c in range(len(directions)):
@@ -203,9 +202,7 @@ def sample_channels(texels, width, directions, rotations, samples, validity):
             x = R[0, 0] * d0 + R[0, 1] * d1 + R[0, 2] * d2
             y = R[1, 0] * d0 + R[1, 1] * d1 + R[1, 2] * d2
             z = R[2, 0] * d0 + R[2, 1] * d1 + R[2, 2] * d2
-            n, fu, fv = texel_at(x, y, z, math.sqrt(x * x + y * y), width)
-            bilinear = bilinear_weights(fu, fv)
-            t00, t10, t01, t11 = texels[n], texels[n + 1], texels[n + stride], texels[n + stride + 1]
+            (t00, t10, t01, t11), bilinear = texels_around(texels, x, y, z, width)
             validity[k, c] = is_valid(t00, t10, t01, t11)
             for ch in range(3):
                 value = blend(t00, t10, t01, t11, bilinear, 8 * ch) - np.float32(ZERO_LEVEL)

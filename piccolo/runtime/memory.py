@@ -14,6 +14,7 @@ PROC, CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 V2 = ("", "memory.max", "memory.current", "inactive_file")
 V1 = ("memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
 OPENCV_NO_MEMORY = -4  # `code` of a cv2.error
+LEAST_LEFT = 200e6  # [byte] of address space: with less, Python may abort where it should raise
 
 
 @dataclass
@@ -49,6 +50,15 @@ def memory_left() -> float:
     if LIMIT.num_bytes is None:
         return DEFAULT_FRACTION * free
     return min(LIMIT.num_bytes - _of_process(1), free)
+
+
+def check_address_space() -> None:
+    """Raise a MemoryError where `ulimit -v` leaves too little for errors to be raised as they should."""
+    left = free_of_process()
+    if left < LEAST_LEFT:
+        raise MemoryError(
+            f"ulimit -v leaves {max(left, 0.0) / GB:.2g} GB, wanted {LEAST_LEFT / GB:g} or more"
+        )
 
 
 def free_of_machine() -> float:

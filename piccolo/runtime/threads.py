@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from ..errors import InputError
+from .memory import check_address_space
 
 Item = TypeVar("Item")
 Value = TypeVar("Value")
@@ -65,6 +66,7 @@ class Workers:
         Nothing is summed across items here, so results have the same bits for any number of threads. An error
         or Ctrl-C drops the items that have not begun.
         """
+        check_address_space()
         if self.num_threads == 1:
             yield from self.show(map(function, items), len(items), label)
             return

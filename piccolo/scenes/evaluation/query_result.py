@@ -47,8 +47,8 @@ class QueryResult:
 
     @property
     def seconds(self) -> float:
-        """Search and refinement, without reading and preparing."""
-        return sum(self.result.seconds.get(stage, 0.0) for stage in ("search", "refine"))
+        """All stages but reading the photo."""
+        return sum(seconds for stage, seconds in self.result.seconds.items() if stage != "read")
 
     def is_correct(self, thresholds: Thresholds = PAPER_THRESHOLDS) -> bool:
         """True if both errors are below the thresholds."""

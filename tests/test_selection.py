@@ -1,0 +1,187 @@
+"""Which pose is taken, and how much search that needs, each in a made-up case where one rule decides."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import rooms
+
+from piccolo.coarse_to_fine import evaluation, refinement
+from piccolo.coarse_to_fine import localize as method
+from piccolo.coarse_to_fine.comparison import Comparison
+from piccolo.coarse_to_fine.config import METHOD
+from piccolo.coarse_to_fine.search_result import SearchResult
+from piccolo.coarse_to_fine.settings import CoarseToFineSettings
+from piccolo.confidence.alternatives import Hypothesis
+from piccolo.confidence.score import Agreement
+from piccolo.geometry.pose import Pose, yaw_rotation
+from piccolo.optimize.channel_loss import CHANCE
+from piccolo.runtime.stopwatch import Stopwatch
+from piccolo.runtime.threads import Workers
+
+QUERY = SimpleNamespace(workers=Workers(1), method=METHOD, scan_map=SimpleNamespace(octree=None))
+
+
+def _at(x, score, yaw_deg=0.0):
+    return Hypothesis(Pose(yaw_rotation(np.radians(yaw_deg)), np.array([x, 0.0, 0.0])), score)
+
+
+def _places(hypotheses):
+    return [round(float(h.pose.center_world[0]), 6) for h in hypotheses]
+
+
+# The beam
+
+
+def _seen(explains, num_blocks=4):
+    """A comparison that explains a part of each of some blocks of a hundredth of the sphere."""
+    beyond = CHANCE + (1.0 - CHANCE) * explains
+    return Comparison(np.full(num_blocks, beyond), *[np.full(num_blocks, 0.01)] * 2, 0.04)
+
+
+def test_of_poses_that_matches_gave_the_better_end_is_taken(monkeypatch):
+    """As found, or after a descent on fine cells, whichever explains more."""
+    scores = {0.0: 0.3, 1.0: 0.5, 5.0: 0.6, 6.0: 0.2}
+    down = lambda query, h: _at(h.pose.center_world[0] + 1.0, 0.9)  # noqa: E731
+    monkeypatch.setattr(refinement, "descend_fine", down)
+    monkeypatch.setattr(refinement, "perturb_middle", lambda query, h: _at(-1.0, 0.9))
+    to_score = lambda query, h: Hypothesis(h.pose, scores[h.pose.center_world[0]])  # noqa: E731
+    monkeypatch.setattr(refinement, "compared", to_score)
+    found = refinement.refine_matched(QUERY, [_at(0.0, 0).pose, _at(5.0, 0).pose])
+    assert [(h.pose.center_world[0], h.score) for h in found] == [(5.0, 0.6), (1.0, 0.5)]
+
+
+def test_alternatives_that_come_near_are_refined_and_what_explains_more_wins(monkeypatch):
+    """The third explains more of what both show, though its score is less; the far one stays as it is."""
+    explains = {0.0: 0.5, 3.0: 0.4, 6.0: 0.6, 9.0: 0.1}
+    refined = []
+
+    def full(query, h, num_rounds):
+        refined.append((h.pose.center_world[0], num_rounds))
+        return Hypothesis(h.pose, h.score + 0.01)
+
+    monkeypatch.setattr(method, "refine_full_resolution", full)
+    monkeypatch.setattr(method, "compare", lambda query, pose: _seen(explains[pose.center_world[0]]))
+    monkeypatch.setattr(method, "settle", lambda query, h: h)
+    found = method.finished(QUERY, [_at(9.0, 0.1), _at(0.0, 0.5), _at(6.0, 0.31), _at(3.0, 0.4)])
+    assert refined == [(0.0, 2), (3.0, 2), (6.0, 2)]
+    assert found.best == Hypothesis(found.best.pose, 0.32)
+    assert _places([found.best, *found.alternatives]) == [6.0, 0.0, 3.0, 9.0]
+    assert found.rival_ratio == pytest.approx(0.5 / 0.6)
+
+
+def test_an_alternative_must_explain_five_hundredths_more_to_win(monkeypatch):
+    for other, best in ((0.52, 0.0), (0.53, 3.0)):
+        explains = {0.0: 0.5, 3.0: other}
+        monkeypatch.setattr(
+            method, "compare", lambda query, pose, of=explains: _seen(of[pose.center_world[0]])
+        )
+        found = method.fairly_selected(QUERY, SearchResult(_at(0.0, 0.5), (_at(3.0, 0.4),)))
+        assert _places([found.best]) == [best]
+    alone = SearchResult(_at(0.0, 0.5), ())
+    assert method.fairly_selected(QUERY, alone) is alone
+
+
+def test_margin_is_the_lesser_of_two_leads_and_a_result_is_sure_by_three_things():
+    for score, other, rival, margin in ((0.5, 0.1, 0.3, 0.7), (0.5, 0.4, 0.3, 0.2), (0.1, 0.4, 0.0, -1.0)):
+        found = SearchResult(_at(0.0, score), (_at(3.0, other),), rival)
+        assert found.margin == pytest.approx(margin)
+    assert SearchResult(_at(0.0, 0.3), ()).margin == 1.0
+    for score, other, matches, is_sure in (
+        (0.05, 0.02, 12, True),
+        (0.04, 0.01, 12, False),
+        (0.5, 0.24, 11, False),
+        (0.5, 0.26, 99, False),
+    ):
+        assert SearchResult(_at(0.0, score), (_at(3.0, other),)).is_sure(matches) == is_sure
+
+
+def _run(monkeypatch, matched, searches, gravity="auto", config=METHOD):
+    """Localize with made-up poses from matches and from searches; the searches made, what is evaluated.
+
+    A score in hundredths is also how many features agree, and what a pose explains.
+    """
+    made, left = [], list(searches)
+    scan_map = SimpleNamespace(centers=np.zeros((1, 3)))
+    scores = {h.pose.center_world[0]: h.score for some in (matched, *searches) for h in some}
+
+    def search_poses(query, gravity):
+        made.append(gravity)
+        return gravity
+
+    monkeypatch.setattr(method, "apply_prior", lambda *_: scan_map)
+    monkeypatch.setattr(method, "prepare_query", lambda *_: SimpleNamespace(**vars(QUERY), matches=None))
+    monkeypatch.setattr(method, "matched_poses", lambda query: "matched")
+    monkeypatch.setattr(method, "refine_matched", lambda query, poses: list(matched))
+    monkeypatch.setattr(method, "count_matches", lambda _, pose: 100 * scores.get(pose.center_world[0], 0))
+    monkeypatch.setattr(method, "compare", lambda query, pose: _seen(scores[pose.center_world[0]]))
+    monkeypatch.setattr(method, "search_poses", search_poses)
+    monkeypatch.setattr(method, "refine", lambda query, starts, beam: left.pop(0))
+    monkeypatch.setattr(method, "refine_full_resolution", lambda query, h, num_rounds: h)
+    monkeypatch.setattr(method, "settle", lambda query, h: Hypothesis(h.pose, h.score + 0.001))
+    monkeypatch.setattr(method, "evaluate", lambda query, panorama, found: found)
+    settings = CoarseToFineSettings(gravity=gravity)
+    found = method.localize(None, rooms.scene(1)[1], settings, Workers(1), Stopwatch(), config)
+    return made, found
+
+
+@pytest.mark.parametrize(
+    ("matched", "searches", "gravity", "num_made", "best"),
+    [
+        ([_at(1, 0.6)], [], "auto", 0, 1),
+        ([], [[_at(1, 0.6)]], "auto", 1, 1),
+        ([_at(1, 0.1)], [[_at(2, 0.6)]], "auto", 1, 2),  # too few matches
+        ([_at(1, 0.6), _at(5, 0.4)], [[_at(7, 0.1)], [_at(7, 0.1)]], "auto", 2, 1),  # two that are alike
+        ([_at(1, 0.1)], [[_at(2, 0.11)], [_at(3, 0.09)]], "auto", 2, 2),
+        ([], [[_at(2, 0.1)]], "known", 1, 2),
+        ([_at(1, 0.08)], [[_at(2, 0.05)]], "unknown", 1, 1),
+    ],
+)
+def test_searches_are_made_where_matches_leave_doubt(monkeypatch, matched, searches, gravity, num_made, best):
+    made, found = _run(monkeypatch, matched, searches, gravity)
+    assert made == [way for way in ("known", "unknown") if gravity in ("auto", way)][:num_made]
+    assert found.best.pose.center_world[0] == best
+    assert found.best.score in {h.score + 0.001 for some in (matched, *searches) for h in some}  # settled
+
+
+def test_matches_or_searches_can_be_taken_out(monkeypatch):
+    alone = METHOD._replace(uses_features=False)
+    made, found = _run(monkeypatch, [_at(1, 0.6)], [[_at(2, 0.1)], [_at(2, 0.1)]], config=alone)
+    assert (made, _places([found.best])) == (["known", "unknown"], [2])
+    made, found = _run(monkeypatch, [_at(1, 0.1)], [], config=METHOD._replace(uses_search=False))
+    assert (made, _places([found.best])) == ([], [1])
+
+
+# Evaluation
+
+
+def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
+    scan_map = SimpleNamespace(points=None, coarse_points=None, to_world=lambda pose: pose)
+    query = SimpleNamespace(scan_map=scan_map, settings=CoarseToFineSettings(), matches=None)
+    counts = {0.0: 30, 1.0: 4, 2.0: 6}
+    for name, value in {
+        "visible_points": lambda *_: None,
+        "sampling_loss": lambda *_: 0.07,
+        "agreement_at": lambda points, panorama, pose: Agreement(0.8, 1.0),
+        "occlusion_at": lambda *_: SimpleNamespace(fractions=lambda: (0.6, 0.3)),
+        "count_matches": lambda matches, pose: counts.get(pose.center_world[0], 0),
+        "estimate_covariance": lambda *_: None,
+        "is_mirrored": lambda *_: False,
+    }.items():
+        monkeypatch.setattr(evaluation, name, value)
+    alternatives = _at(1.0, 0.3), _at(2.0, 0.2)
+    found = evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(_at(0.0, 0.6), alternatives, 0.7))
+    e = found.evidence
+    assert (e.score, e.agreement, e.seen_fraction) == (0.6, 0.8, 1.0)
+    assert (e.explained_fraction, e.contradicted_fraction) == (0.6, 0.3)
+    assert (e.num_matches, e.alternative_matches) == (30, 6)
+    assert e.margin == pytest.approx(0.3)
+    assert _places(found.alternatives) == [1.0, 2.0]
+    assert found.loss == 0.07
+    many = tuple(_at(1.0 + 0.001 * k, 0.1) for k in range(9))
+    found = evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(_at(0.0, 0.6), many))
+    assert len(found.alternatives) == 5
+    alone = evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(_at(0.0, 0.6), ()))
+    assert (alone.evidence.margin, alone.evidence.alternative_matches) == (1.0, 0)
+    monkeypatch.setattr(evaluation, "sampling_loss", lambda *_: np.inf)
+    assert evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(_at(0.0, 0.6), ())).pose is None
