@@ -7,12 +7,11 @@ import rooms
 
 from piccolo.coarse_to_fine import descent
 from piccolo.coarse_to_fine.config import METHOD
-from piccolo.coarse_to_fine.query import QueryImages
+from piccolo.coarse_to_fine.query import query_images
 from piccolo.coarse_to_fine.starts import Starts
 from piccolo.coarse_to_fine.view import Cells, render_view
 from piccolo.geometry.pose import Pose, step
 from piccolo.geometry.sphere import make_grid
-from piccolo.panorama.local_normalization import image_pyramid
 from piccolo.runtime.threads import Workers
 
 FINE_BLOCKS = METHOD.fine_view.arrays.blocks
@@ -21,7 +20,7 @@ ALL = np.ones(len(FINE_BLOCKS), bool)
 
 @functools.lru_cache
 def _images():
-    return QueryImages(*image_pyramid(rooms.scene(1)[1], METHOD.scales))
+    return query_images(rooms.scene(1)[1], METHOD.scales)
 
 
 @functools.lru_cache

@@ -8,8 +8,8 @@ import pytest
 import rooms
 
 from piccolo.coarse_to_fine import search
-from piccolo.coarse_to_fine.query import prepare_query
-from piccolo.coarse_to_fine.scan_map import SEARCH_VIEW
+from piccolo.coarse_to_fine.config import METHOD
+from piccolo.coarse_to_fine.query import prepare_query, query_images
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings, Prior
 from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
@@ -17,15 +17,12 @@ from piccolo.geometry.sphere import averaging, make_grid
 from piccolo.panorama import Panorama
 from piccolo.panorama.gpano import GPano
 from piccolo.panorama.local_normalization import (
-    ImageScale,
-    image_pyramid,
     normalize_panorama,
     sample_channels,
 )
 from piccolo.panorama.model import resize
 from piccolo.runtime.threads import Workers
 
-SCALE = ImageScale(128, 7.5, SEARCH_VIEW.sigma_deg)
 AREA = make_grid(24).solid_angle
 
 
@@ -55,15 +52,19 @@ def test_what_is_masked_does_not_bleed():
     is_valid[200:] = False
     black, white = panorama.rgb.copy(), panorama.rgb.copy()
     black[200:], white[200:] = 0, 255
-    black_and_white = (image_pyramid(Panorama(rgb, is_valid), [SCALE])[0] for rgb in (black, white))
+    black_and_white = (query_images(Panorama(rgb, is_valid), METHOD.scales).search for rgb in (black, white))
     (a, valid), (b, _) = map(_levels, black_and_white)
     np.testing.assert_array_equal(a[valid], b[valid])
     assert valid.mean() == pytest.approx(200 / 256, abs=0.02)
 
 
-def test_images_of_every_scale_have_their_width():
-    scales = [ImageScale(1024, 0.0, 10.0), ImageScale(256, 0.0, 10.0), SCALE]
-    assert [image.width for image in image_pyramid(rooms.scene(1)[1], scales)] == [1024, 256, 128]
+def test_images_are_made_when_asked_for_and_once():
+    images = query_images(rooms.scene(1)[1], METHOD.scales)
+    assert images.made == {}
+    assert images.search is images.search
+    assert list(images.made) == [3]
+    of_all = images.full, images.fine, images.middle, images.search
+    assert [image.width for image in of_all] == [1024, 256, 128, 128]
 
 
 def test_samples_along_turned_directions_equal_their_twin():

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-from ..panorama.local_normalization import ImageScale
 from .scan_map import SEARCH_VIEW
 from .view import ViewConfig
 
@@ -14,6 +13,14 @@ class Beam(NamedTuple):
     num_middle: int  # after the descent on prepared views
     num_fine: int  # after the descent on middle cells
     num_perturbed: int  # are perturbed and refined for as long as that helps
+
+
+class ImageScale(NamedTuple):
+    """One size of the panorama."""
+
+    width: int  # [px] a multiple of local_normalization's STATS_WIDTH
+    cell_deg: float  # colours are averaged over cells this wide
+    sigma_deg: float  # of the Gaussian in which contrast is judged
 
 
 class ImageScales(NamedTuple):

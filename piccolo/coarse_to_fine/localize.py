@@ -25,6 +25,7 @@ from .settings import CoarseToFineSettings
 NUM_MATCHED = 6  # poses from matches that are refined
 ALTERNATIVES_COMPARED, ALTERNATIVES_REFINED = 8, 4  # at most
 HOPELESS_SCORE = 0.02  # of black, white and noisy pictures, and of most views of other places
+FAINT_SCORE, FAINT_MATCHES = 0.1, 6  # nothing that has less of both is ever localized
 FAIRLY_BETTER = 1.05  # what an alternative explains of what both show, by the best, to take its place
 NO_PIXEL = "the panorama: no pixel counts, all are masked"
 
@@ -86,10 +87,14 @@ def finished(query: Query, hypotheses: Sequence[Hypothesis]) -> SearchResult:
     def refined(h: Hypothesis) -> Hypothesis:
         return refine_full_resolution(query, h, 2)
 
+    def matches_of(h: Hypothesis) -> int:
+        return count_matches(query.matches, h.pose)
+
     found = found_among(hypotheses, ALTERNATIVES_COMPARED)
     if found.best.score < HOPELESS_SCORE:
         return found
-    near = found.near[:ALTERNATIVES_REFINED]
+    is_faint = found.best.score < FAINT_SCORE and matches_of(found.best) < FAINT_MATCHES
+    near = found.near[: 1 if is_faint else ALTERNATIVES_REFINED]
     ends = list(query.workers.map(refined, [found.best, *near], "descend"))
     far = found.alternatives[len(near) :]
     found = fairly_selected(query, found_among([*ends, *far], ALTERNATIVES_COMPARED))

@@ -1,8 +1,8 @@
 """A query: a panorama at several scales, and the map in which it is searched."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,11 +14,11 @@ from ..local_features.keypoints import find_keypoints
 from ..local_features.matching import Matches, match
 from ..panorama import Panorama
 from ..panorama.gpano import rotation_to_level
-from ..panorama.local_normalization import image_pyramid
+from ..panorama.local_normalization import normalize_panorama
 from ..panorama.model import resize
 from ..panorama.texels import Texels, pack_texels
 from ..runtime.threads import Workers
-from .config import METHOD, MethodConfig
+from .config import METHOD, ImageScales, MethodConfig
 from .scan_map import ScanMap
 from .settings import CoarseToFineSettings
 
@@ -26,13 +26,47 @@ COMPARED_WIDTH = 256  # [px]
 MOST_SHARE = 0.98  # of the sphere: of a photo that shows more, all cells are shown
 
 
-class QueryImages(NamedTuple):
-    """The panorama's locally normalised channels."""
+@dataclass(frozen=True)
+class QueryImages:
+    """The panorama's locally normalised channels at several scales, each made when it is first asked for."""
 
-    full: Texels  # for the last millimetres
-    fine: Texels  # for fine views
-    middle: Texels
-    search: Texels
+    pyramid: ImageScales
+    panoramas: tuple[Panorama, ...]  # at the width of each scale
+    made: dict[int, Texels] = field(default_factory=dict)
+
+    @property
+    def full(self) -> Texels:
+        """For the last millimetres."""
+        return self._image(0)
+
+    @property
+    def fine(self) -> Texels:
+        """For fine views."""
+        return self._image(1)
+
+    @property
+    def middle(self) -> Texels:
+        """For middle views."""
+        return self._image(2)
+
+    @property
+    def search(self) -> Texels:
+        """For prepared views."""
+        return self._image(3)
+
+    def _image(self, k: int) -> Texels:
+        if k not in self.made:
+            self.made[k] = normalize_panorama(self.panoramas[k], *self.pyramid[k][1:])
+        return self.made[k]
+
+
+def query_images(panorama: Panorama, pyramid: ImageScales) -> QueryImages:
+    """The images of a panorama, each resized from the one before, widest first."""
+    panoramas = []
+    for scale in pyramid:
+        panorama = resize(panorama, scale.width)
+        panoramas.append(panorama)
+    return QueryImages(pyramid, tuple(panoramas))
 
 
 @dataclass(frozen=True)
@@ -78,7 +112,7 @@ class Query:
         height, width = self.panorama.is_valid.shape
         enlarged = cv2.resize(is_hidden.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
         rest = replace(self.panorama, is_valid=self.panorama.is_valid & (enlarged == 0))
-        return replace(self, images=QueryImages(*image_pyramid(rest, self.method.scales)), panorama=rest)
+        return replace(self, images=query_images(rest, self.method.scales), panorama=rest)
 
 
 def prepare_query(
@@ -92,5 +126,5 @@ def prepare_query(
     R_level_from_cam = rotation_to_level(panorama.gpano) if panorama.gpano else None
     R_cam_from_level = np.eye(3) if R_level_from_cam is None else R_level_from_cam.T
     panorama = resize(panorama, method.scales.full.width)
-    images = QueryImages(*image_pyramid(panorama, method.scales))
+    images = query_images(panorama, method.scales)
     return Query(scan_map, images, R_cam_from_level, settings, workers, method, panorama)

@@ -18,7 +18,7 @@ FULL_LIMITS, LAST_LIMITS = (FULL_LOSS, 10, 1e-4), (FULL_LOSS, 30, 1e-7)
 PERTURBATION = 0.4  # of that on middle cells, on fine ones
 MAX_UNOCCLUDED = 2  # times that occluders are looked for
 MAX_PERTURBATIONS, MIN_GAIN = 5, 0.02  # rounds; by the score in one, else it was the last
-MOST_OTHERS = 6  # poses on middle cells that are alternatives
+NUM_FOUND = 12  # poses of a search, at most
 NUM_POINTS = 30_000  # for the last millimetres, in what the photo shows
 MAX_LAST_ROUNDS, SETTLED = 6, 1e-4  # [m] a camera that moves by less in a round has arrived
 MIN_SCORE_LEFT = 0.97  # of the score, in exchange for millimetres
@@ -155,11 +155,10 @@ def refine(query: Query, starts: Starts, beam: Beam) -> list[Hypothesis]:
     perturbed = each(perturb_middle, narrow(middle, beam.num_fine))
     fine = each(descend_fine, narrow(perturbed, beam.num_fine))
     best = best_distinct(fine, beam.num_perturbed, CLOSE_DISTANCE, SAME_ANGLE)
-    found = alternative_candidates([*each(refine_by_perturbation, best), *fine], middle)
-    return by_score(each(compared, found))
+    return by_score(each(compared, distinct([*each(refine_by_perturbation, best), *fine], middle)))
 
 
-def alternative_candidates(fine: Sequence[Hypothesis], middle: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """The best on fine cells, and the best of those on middle cells that are near none of them."""
-    near = suppressed([*by_score(fine), *by_score(middle)], len(fine) + MOST_OTHERS, MIN_DISTANCE, MIN_ANGLE)
-    return [*fine, *(h for h in near if not any(h is f for f in fine))]
+def distinct(fine: Sequence[Hypothesis], middle: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """The best on fine cells, and the best of those on middle cells, none near another."""
+    ranked = [*by_score(fine), *by_score(middle)]
+    return suppressed(ranked, NUM_FOUND, MIN_DISTANCE, MIN_ANGLE)

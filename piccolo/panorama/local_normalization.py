@@ -1,9 +1,7 @@
 """Local normalisation on the sphere: opponent channels less their local mean, by their local deviation."""
 
 import math
-from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -12,7 +10,6 @@ from numpy.typing import NDArray
 from ..geometry.sphere import pixel_rays, solid_angles
 from ..runtime.jit import F0, F1, HALF, inline_kernel, kernel
 from . import Panorama
-from .model import resize
 from .texels import Texels, blend, is_valid, texels_around
 
 CLIP = 2.0  # deviations; what differs more from its surroundings counts no more
@@ -43,14 +40,6 @@ def zscore(value, mean, inverse_std):
 def inverse_std(mean, mean_square):
     """1 / standard deviation, bounded where nothing varies."""
     return F1 / math.sqrt(max(mean_square - mean * mean, F0) + _MIN_VARIANCE)
-
-
-class ImageScale(NamedTuple):
-    """One size of the panorama."""
-
-    width: int  # [px] a multiple of STATS_WIDTH
-    cell_deg: float  # colours are averaged over cells this wide
-    sigma_deg: float  # of the Gaussian in which contrast is judged
 
 
 @lru_cache(maxsize=8)
@@ -181,15 +170,6 @@ def normalize_panorama(panorama: Panorama, cell_deg: float, sigma_deg: float) ->
     texels = np.empty((height + 2, width + 2), np.int32)
     pack_normalized(channels, weight, statistics, texels)
     return Texels(texels.reshape(-1), width)
-
-
-def image_pyramid(panorama: Panorama, scales: Sequence[ImageScale]) -> list[Texels]:
-    """The panorama's channels at several scales, widest first, each made from the one before."""
-    images = []
-    for scale in scales:
-        panorama = resize(panorama, scale.width)
-        images.append(normalize_panorama(panorama, scale.cell_deg, scale.sigma_deg))
-    return images
 
 
 @kernel

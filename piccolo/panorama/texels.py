@@ -23,9 +23,11 @@ class Texels(NamedTuple):
 
 def pack_texels(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = None) -> Texels:
     """Texels of an image (H, W, 3), W = 2 H, with the pixels that count (H, W), all if None."""
-    inner = pack_rgbx(rgb, is_valid)
-    width = inner.shape[1]
-    padded = np.pad(np.pad(inner, ((0, 0), (1, 1)), mode="wrap"), ((1, 1), (0, 0)), mode="edge")
+    height, width = rgb.shape[:2]
+    padded = np.empty((height + 2, width + 2), np.int32)
+    padded[1:-1, 1:-1] = pack_rgbx(rgb, is_valid)
+    padded[:, 0], padded[:, -1] = padded[:, -2], padded[:, 1]
+    padded[0], padded[-1] = padded[1], padded[-2]
     share = 1.0 if is_valid is None else float(solid_angles(width) @ is_valid.sum(axis=1)) / (4.0 * np.pi)
     return Texels(padded.reshape(-1), width, share)
 
