@@ -62,12 +62,12 @@ def test_turning_the_sphere_turns_the_keypoints():
 
 
 def test_what_views_share_counts_once():
-    """No two keypoints of the same place, size and tangent."""
+    """Hardly two keypoints of the same place, size and tangent, but where views meet."""
     found = _found()
     values = np.concatenate([found.rays / PIXEL, 3.0 * found.tangents], axis=1)
     pairs = cKDTree(values).query_pairs(0.7, output_type="ndarray")
     ratio = found.sizes[pairs[:, 0]] / found.sizes[pairs[:, 1]]
-    assert (np.abs(np.log(ratio)) < 0.1).sum() <= 0.005 * len(found.rays)
+    assert (np.abs(np.log(ratio)) < 0.1).sum() <= 0.02 * len(found.rays)
     views = perspective_views(WIDTH)
     middles = np.stack([view.R_sphere_from_view[:, 0] for view in views])
     assert len(middles) == len(VIEWS_DEG) == 20
@@ -112,3 +112,17 @@ def test_same_bits_for_any_number_of_threads():
     alone = find_keypoints(_gray(), np.ones(_gray().shape, bool), Workers(1))
     for own, other in zip(_found(), alone, strict=True):
         np.testing.assert_array_equal(own, other)
+
+
+def test_keypoints_turned_over_are_those_of_the_picture_turned_over():
+    gray = np.ascontiguousarray(_gray()[:, ::-1])
+    expected = find_keypoints(gray, np.ones(gray.shape, bool), Workers(2))
+    found = _found().mirrored()
+    distance, nearest = cKDTree(np.hstack([expected.rays, expected.tangents])).query(
+        np.hstack([found.rays, found.tangents])
+    )
+    is_same = distance < 0.01
+    assert is_same.mean() > 0.75
+    np.testing.assert_allclose(found.sizes[is_same], expected.sizes[nearest[is_same]], rtol=0.05)
+    off = found.descriptors[is_same].astype(int) - expected.descriptors[nearest[is_same]]
+    assert np.abs(off).mean() < 1.0

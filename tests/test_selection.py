@@ -70,6 +70,18 @@ def test_alternatives_that_come_near_are_refined_and_what_explains_more_wins(mon
     assert found.rival_ratio == pytest.approx(0.5 / 0.6)
 
 
+@pytest.mark.parametrize(("best", "num_matches", "num_refined"), [(0.09, 5, 2), (0.09, 6, 5), (0.1, 5, 5)])
+def test_of_faint_poses_one_alternative_is_refined(monkeypatch, best, num_matches, num_refined):
+    refined = []
+    query = SimpleNamespace(**vars(QUERY), matches=None)
+    monkeypatch.setattr(method, "count_matches", lambda matches, pose: num_matches)
+    monkeypatch.setattr(method, "refine_full_resolution", lambda query, h, num_rounds: refined.append(h) or h)
+    monkeypatch.setattr(method, "compare", lambda query, pose: _seen(0.1))
+    monkeypatch.setattr(method, "settle", lambda query, h: h)
+    method.finished(query, [_at(3.0 * k, best - 0.001 * k) for k in range(8)])
+    assert len(refined) == num_refined
+
+
 def test_an_alternative_must_explain_five_hundredths_more_to_win(monkeypatch):
     for other, best in ((0.52, 0.0), (0.53, 3.0)):
         explains = {0.0: 0.5, 3.0: other}

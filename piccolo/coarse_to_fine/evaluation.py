@@ -1,7 +1,6 @@
 """What speaks for the pose that was found and against it, and the status that follows."""
 
 import math
-from dataclasses import replace
 
 from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
 from ..confidence.confidence import NOT_LOCALIZED, classify
@@ -9,6 +8,7 @@ from ..confidence.localization import Localization
 from ..confidence.occlusion import occlusion_at
 from ..confidence.score import Evidence, agreement_at
 from ..local_features.hypotheses import count_matches, poses_of
+from ..local_features.matching import match
 from ..optimize.refine import refine, sampling_loss_of
 from ..optimize.sampling_loss import sampling_loss
 from ..optimize.settings import DescentSettings
@@ -70,7 +70,6 @@ def is_mirrored(query: Query, evidence: Evidence) -> bool:
     """
     if evidence.score >= ENOUGH_EXPLAINED:
         return False
-    shown = query.panorama
-    flipped = replace(shown, rgb=shown.rgb[:, ::-1].copy(), is_valid=shown.is_valid[:, ::-1].copy())
-    found = poses_of(replace(query, panorama=flipped).matches, None, 1, query.workers)
+    matches = match(query.keypoints.mirrored(), query.scan_map.local_features, query.workers)
+    found = poses_of(matches, None, 1, query.workers)
     return len(found) > 0 and found[0].num_matches > max(MIRROR_RATIO * evidence.num_matches, SURE_MATCHES)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..geometry.pose import Array, Pose, rotate_points
 from ..geometry.sphere import indices_of, make_grid
-from ..local_features.keypoints import find_keypoints
+from ..local_features.keypoints import Keypoints, find_keypoints
 from ..local_features.matching import Matches, match
 from ..panorama import Panorama
 from ..panorama.gpano import rotation_to_level
@@ -82,11 +82,15 @@ class Query:
     panorama: Panorama  # at the width of its features
 
     @cached_property
+    def keypoints(self) -> Keypoints:
+        """The photo's keypoints."""
+        gray = np.asarray(cv2.cvtColor(self.panorama.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
+        return find_keypoints(gray, self.panorama.is_valid, self.workers)
+
+    @cached_property
     def matches(self) -> Matches:
         """The photo's keypoints and the features of the map that look alike."""
-        gray = np.asarray(cv2.cvtColor(self.panorama.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
-        keypoints = find_keypoints(gray, self.panorama.is_valid, self.workers)
-        return match(keypoints, self.scan_map.local_features, self.workers)
+        return match(self.keypoints, self.scan_map.local_features, self.workers)
 
     @cached_property
     def photo(self) -> Texels:

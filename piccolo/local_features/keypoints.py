@@ -35,6 +35,13 @@ class Keypoints(NamedTuple):
         taken: list[Any] = [values[indices] for values in self]
         return Keypoints(*taken)
 
+    def mirrored(self) -> "Keypoints":
+        """Those of the picture turned over, left for right: rays and descriptors alike."""
+        left_for_right = np.array([1.0, -1.0, 1.0], np.float32)
+        histograms = self.descriptors.reshape(-1, 4, 4, 8)[:, ::-1, :, -np.arange(8) % 8]
+        rays, tangents = self.rays * left_for_right, self.tangents * left_for_right
+        return Keypoints(rays, tangents, self.sizes, histograms.reshape(-1, DESCRIPTOR_SIZE))
+
 
 class PerspectiveView(NamedTuple):
     """A perspective view of a sphere's picture."""
@@ -80,7 +87,7 @@ def find_keypoints(
             return _nothing()
         shown = cv2.bitwise_and(cv2.erode(shown, np.ones((3, 3), np.uint8)), view.is_own)
         image = cv2.remap(picture, view.columns, view.rows, cv2.INTER_LINEAR)
-        sift = cv2.SIFT.create(contrastThreshold=CONTRAST)
+        sift = cv2.SIFT.create(contrastThreshold=CONTRAST, enable_precise_upscale=True)
         found, shares = sift.detectAndCompute(image, shown)
         keypoints = _on_sphere(found, np.asarray(shares, np.float32), view) if found else _nothing()
         is_own = np.argmax(keypoints.rays @ middles.T, axis=1) == k  # what views share counts once
