@@ -160,7 +160,8 @@ class Result:
 
 def result_of(found: Localization, warnings: tuple[str, ...] = (), **about: Any) -> Result:
     """The result of a localization; `about` are the fields of Result that say what it is of and how made."""
-    values = {f.name: getattr(found, f.name) for f in fields(found) if f.name not in ("pose", "warnings")}
+    apart = "pose", "warnings", "cameras"
+    values = {f.name: getattr(found, f.name) for f in fields(found) if f.name not in apart}
     return Result(best_pose=found.pose, warnings=warnings + found.warnings, **values, **about)
 
 

@@ -1,6 +1,6 @@
 """A scan that photos are localized in: what `import piccolo` gives."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from os import PathLike
 from pathlib import Path
@@ -13,6 +13,7 @@ from .camera import Calibration
 from .camera.files import read_calibration, read_rig
 from .cloud.settings import CloudSettings
 from .cloud.soa import PackedPoints
+from .coarse_to_fine.focal_refinement import localize_and_refine_focal
 from .coarse_to_fine.gps import GpsPrior, gps_prior
 from .coarse_to_fine.localize import localize
 from .coarse_to_fine.scan_map import ScanMap
@@ -50,6 +51,7 @@ class QueryOptions(TypedDict, total=False):
     camera: File  # calibration of the camera, see docs/CAMERAS.md
     rig: File  # the same of several cameras; the panorama is the folder of one instant's pictures
     gravity_vector: tuple[float, float, float]  # down, in the camera's axes
+    refine_focal: bool  # the focal length is a first guess
     cube_order: str  # the picture is six cube faces in this order, such as "rludfb"
     use_gps: bool  # a GPS position in the file narrows the search (default), or not
     gravity: Gravity  # "known": upright camera, "unknown": any rotation, "auto": both are tried
@@ -186,8 +188,11 @@ class Scan:
         gps = None
         if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
             gps = self.gps_prior_of(photo, settings) if read_options.use_gps else None
-            found, gps = self._localized(self.prepared, picture, settings, gps, watch)
+            by = localize_and_refine_focal if read_options.refine_focal else localize
+            found, gps = self._localized(by, self.prepared, picture, settings, gps, watch)
         elif isinstance(self.prepared, PaperMap) and isinstance(settings, PaperSettings):
+            if read_options.refine_focal:
+                raise InputError("--refine-focal: not an option of the preset paper")
             found = localize_by_paper(self.prepared, picture, settings, self.workers, watch)
         else:
             raise InputError("settings: of another method than the one that the scan was prepared for")
@@ -202,7 +207,7 @@ class Scan:
                 self.prepared.scan_sha256 or None, photo.sha256, photo.image_size, photo.capture_time
             ),
             gps_prior=gps,
-            cameras=picture.cameras,
+            cameras=found.cameras or picture.cameras,
         )
 
     def gps_prior_of(self, photo: Photo, settings: CoarseToFineSettings) -> GpsPrior | None:
@@ -214,6 +219,7 @@ class Scan:
 
     def _localized(
         self,
+        by: Callable[..., Localization],
         scan_map: ScanMap,
         picture: Panorama,
         settings: CoarseToFineSettings,
@@ -223,11 +229,11 @@ class Scan:
         """What is found near the GPS position, or else anywhere, if that is as good."""
         if gps is not None:
             near = replace(settings, prior=gps.applied_to(settings.prior))
-            found = localize(scan_map, picture, near, self.workers, watch)
+            found = by(scan_map, picture, near, self.workers, watch)
             if found.status == LOCALIZED:
                 return found, gps
             gps = replace(gps, is_used=False)
-        return localize(scan_map, picture, settings, self.workers, watch), gps
+        return by(scan_map, picture, settings, self.workers, watch), gps
 
 
 def settings_json(

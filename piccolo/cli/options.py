@@ -130,6 +130,8 @@ def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--projection", choices=get_args(Projection), help=text)
     text = "focal length of a pinhole photo, in its own pixels"
     group.add_argument("--focal", type=float, metavar="PX", help=text)
+    text = "refine the focal length, and k1 where the camera's model has it; takes three times as long"
+    group.add_argument("--refine-focal", action="store_true", help=text)
     text = "calibration: COLMAP's cameras.txt, OpenSfM's camera_models.json, or JSON of docs/CAMERAS.md"
     group.add_argument("--camera", type=Path, metavar="FILE", help=text)
     text = "cameras whose pictures, a folder, are one query: COLMAP's rig_config.json, or our JSON"
@@ -164,6 +166,7 @@ def read_options_from(arguments: argparse.Namespace) -> ReadOptions:
         arguments.focal,
         read_rig(arguments.rig) if arguments.rig else calibration,
         tuple(arguments.gravity_vector) if arguments.gravity_vector else None,
+        arguments.refine_focal,
     )
 
 

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from ..camera import Mount
 from ..geometry.pose import Pose
 from .alternatives import Hypothesis
 from .confidence import NOT_LOCALIZED
@@ -21,3 +22,4 @@ class Localization:
     alternatives: tuple[Hypothesis, ...] = ()  # poses elsewhere, best first
     covariance: PoseCovariance | None = None
     warnings: tuple[str, ...] = ()  # one line each: why there is no pose
+    cameras: tuple[Mount, ...] = ()  # refined; none if they stay as they were given

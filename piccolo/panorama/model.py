@@ -50,6 +50,7 @@ class ReadOptions:
     focal_px: float | None = None  # of a pinhole [px], at the picture's own size
     calibration: Calibration | None = None  # of the camera, or of a rig whose pictures are in a folder
     gravity_vector: tuple[float, float, float] | None = None  # down, in the camera's axes, of any length
+    refine_focal: bool = False  # the focal length is a first guess
 
     def __post_init__(self) -> None:
         """Refuse values that mean nothing, naming the option."""
