@@ -15,10 +15,9 @@ from .camera import Mount
 from .camera.files import document_of as camera_document
 from .camera.files import mounts_of
 from .coarse_to_fine.gps import GpsPrior
-from .confidence.alternatives import Hypothesis
 from .confidence.confidence import AMBIGUOUS, LOCALIZED
 from .confidence.covariance import PoseCovariance
-from .confidence.localization import Localization
+from .confidence.localization import Alternative, Localization
 from .confidence.score import Evidence
 from .errors import InputError
 from .geometry.pose import Pose, T_world_from_cam, checked_rotation, quaternion_wxyz
@@ -59,7 +58,7 @@ class Result:
     best_pose: Pose | None  # found, in the scan's own coordinates; None if there was no start
     loss: float | None  # sampling loss [0, sqrt(3)] over the points seen from the pose
     evidence: Evidence | None
-    alternatives: tuple[Hypothesis, ...]  # poses elsewhere, best first, at most 5
+    alternatives: tuple[Alternative, ...]  # poses elsewhere, best first, at most 5
     covariance: PoseCovariance | None  # None with the preset paper, and where the points do not fix the pose
     seconds: dict[str, float]  # of this photo: read, search, refine
     settings: dict[str, object]  # effective settings, seed included
@@ -68,6 +67,13 @@ class Result:
     error: str | None = None  # why a photo is "unreadable"
     gps_prior: GpsPrior | None = None  # where the photo's GPS position lies in the scan, if both are known
     cameras: tuple[Mount, ...] = ()  # that took it; none if it came as a sphere or a part of one
+    probability_none: float | None = None  # that neither the pose nor an alternative is right, if known
+
+    @property
+    def is_calibrated(self) -> bool:
+        """True if probabilities were learnt on photos like this: not with labels or the preset paper."""
+        panorama: Any = self.settings.get("panorama", {})
+        return self.probability_none is not None and not panorama.get("labels")
 
     @property
     def pose(self) -> Pose | None:
@@ -115,6 +121,8 @@ class Result:
             "format": FORMAT,
             "status": self.status,
             "confidence": self.confidence,
+            "probability_none": self.probability_none,
+            "calibrated": self.is_calibrated,
             "error": self.error,
             "cloud": self.cloud,
             "pano": self.pano,
@@ -124,7 +132,7 @@ class Result:
             "best_guess": _pose_json(self.best_guess),
             "loss": self.loss,
             "evidence": self.evidence and asdict(self.evidence),
-            "alternatives": [{**_rotation_and_center(h.pose), "score": h.score} for h in self.alternatives],
+            "alternatives": [_alternative_json(alternative) for alternative in self.alternatives],
             "covariance": self.covariance and self.covariance.matrix.tolist(),
             "covariance_convention": COVARIANCE_CONVENTION,
             "std_mm": self.covariance and self.covariance.std_mm.tolist(),
@@ -170,7 +178,7 @@ def unreadable_result(error: str, cloud: str | tuple[str, ...], pano: str, **mor
     return Result(UNREADABLE, 0.0, cloud, pano, None, None, None, (), None, {}, error=error, **more)
 
 
-_PLAIN_FIELDS = ("status", "confidence", "pano", "loss", "seconds", "settings", "error")
+_PLAIN_FIELDS = ("status", "confidence", "probability_none", "pano", "loss", "seconds", "settings", "error")
 
 
 def _rotation_and_center(pose: Pose) -> dict[str, object]:
@@ -209,14 +217,21 @@ def _covariance_from_json(document: dict[str, Any]) -> PoseCovariance | None:
     )
 
 
-def _alternative_from_json(document: dict[str, Any]) -> Hypothesis:
+def _alternative_json(alternative: Alternative) -> dict[str, object]:
+    numbers = {f.name: getattr(alternative, f.name) for f in fields(alternative) if f.name != "pose"}
+    return _rotation_and_center(alternative.pose) | numbers
+
+
+def _alternative_from_json(document: dict[str, Any]) -> Alternative:
     pose = Pose(np.array(document["R_cam_from_world"]), np.array(document["center_world"]))
-    return Hypothesis(pose, document["score"])
+    return Alternative(pose, **{f.name: document[f.name] for f in fields(Alternative) if f.name != "pose"})
 
 
-def _place(h: Hypothesis) -> str:
-    x, y, z = h.pose.center_world
-    return f"({x:.3f}, {y:.3f}, {z:.3f}) m, score {h.score:.2f}"
+def _place(alternative: Alternative) -> str:
+    x, y, z = alternative.pose.center_world
+    p = alternative.probability
+    sure = f"score {alternative.score:.2f}" if p is None else f"probability {p:.2f}"
+    return f"({x:.3f}, {y:.3f}, {z:.3f}) m, {sure}"
 
 
 def _paths(value: object) -> tuple[str, ...]:

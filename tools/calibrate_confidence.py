@@ -4,7 +4,6 @@
 import argparse
 import json
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,19 +16,18 @@ from scipy.stats import chi2
 from piccolo.cli.command import command, option
 from piccolo.confidence.confidence import (
     AMBIGUOUS,
-    DIRECTIONS,
     FEATURES,
     LOCALIZED,
     MIN_CONFIDENCE,
-    MODEL,
-    PAPER_MODEL,
-    LogisticModel,
+    NONE_FEATURES,
+    ChoiceModel,
+    Standing,
     classify,
-    confidence_of,
     features_of,
+    none_features_of,
+    posterior,
 )
 from piccolo.confidence.covariance import PoseCovariance
-from piccolo.confidence.score import Evidence
 from piccolo.geometry.pose import Pose, is_correct, log_so3
 from piccolo.result import Result
 from piccolo.runtime.json_file import parse_lines, read_bytes
@@ -39,24 +37,27 @@ example:
   python tools/calibrate_confidence.py --fit trials.jsonl --check others.jsonl bench.jsonl
 
 Files are those of tools/evaluate_confidence.py. The weights printed go into
-piccolo/confidence/confidence.py; the tables show how reliable the confidence in use is on each set, and the
-fraction of true poses in the region of the covariance.
+piccolo/confidence/confidence.py; the tables show how reliable the probabilities are on each set, by the model
+just learnt or else the one in use, and the fraction of true poses in the region of the covariance.
 """
 PENALTY = 0.05  # on squared weights of features of deviation 1: without, easy trials ask for ever larger ones
-LEVELS = (0.0, 0.5, 0.9, 0.99, 1.01)
 Array = NDArray[np.float64]
 
 
 class Outcome(NamedTuple):
-    """One trial's evidence, and whether its pose was right."""
+    """One trial's poses, and which of them was right."""
 
     case: str
-    evidence: Evidence
+    standings: list[Standing]  # the best first
     covariance: PoseCovariance | None
-    has_alternatives: bool
-    model: LogisticModel  # in use for the preset
-    is_correct: bool
-    error: Array  # (6,) of the pose, as PoseCovariance has it; NaN without truth
+    right: int  # of the poses, or their number if none is
+    probabilities: Array  # (K + 1,) as the result has them
+    error: Array  # (6,) of the best pose, as PoseCovariance has it; NaN without truth
+
+    @property
+    def is_correct(self) -> bool:
+        """True if the best pose is right."""
+        return self.right == 0
 
 
 def read_outcomes(paths: Sequence[Path]) -> list[Outcome]:
@@ -67,60 +68,80 @@ def read_outcomes(paths: Sequence[Path]) -> list[Outcome]:
 
 
 def outcome_of(line: str) -> Outcome | None:
-    """One line of tools/evaluate_confidence.py; None if no pose was found."""
+    """One line of tools/evaluate_confidence.py; None if no pose was found, or one without probabilities."""
     trial = json.loads(line)
     result, truth = Result.from_json(json.dumps(trial["result"])), trial["truth"]
-    if result.best_pose is None or result.evidence is None:
+    if result.best_pose is None or result.evidence is None or result.probability_none is None:
         return None
-    error, ok = np.full(6, np.nan), False
+    e, poses = result.evidence, [result.best_pose, *(a.pose for a in result.alternatives)]
+    standings = [Standing(1.0, e.score, e.num_matches)]
+    standings += [Standing(a.share or 0.0, a.score, a.num_matches or 0) for a in result.alternatives]
+    error, right = np.full(6, np.nan), len(poses)
     if isinstance(truth, dict):
         true_pose = Pose(np.array(truth["R_cam_from_world"]), np.array(truth["center_world"]))
         turn = log_so3(true_pose.R_cam_from_world @ result.best_pose.R_cam_from_world.T)
         error = np.concatenate([turn, true_pose.center_world - result.best_pose.center_world])
-        ok = is_correct(result.best_pose, true_pose)
-    model = PAPER_MODEL if result.settings["preset"] == "paper" else MODEL
-    has_alternatives = len(result.alternatives) > 0
-    return Outcome(str(trial["case"]), result.evidence, result.covariance, has_alternatives, model, ok, error)
+        right = next((k for k, pose in enumerate(poses) if is_correct(pose, true_pose)), right)
+    stated = [result.confidence, *(a.probability or 0.0 for a in result.alternatives)]
+    is_refused = (
+        result.confidence == 0.0 and result.probability_none == 1.0
+    )  # as mirrored: no choice was made
+    probabilities = posterior(standings, result.covariance)
+    if is_refused:
+        probabilities = np.array([*stated, 1.0])
+    return Outcome(str(trial["case"]), standings, result.covariance, right, probabilities, error)
 
 
-def fit(outcomes: Sequence[Outcome]) -> tuple[float, Array]:
-    """Bias and weights of the logistic regression with the least penalised loss."""
-    X = np.array([features_of(o.evidence, o.covariance)[: len(o.model.weights)] for o in outcomes])
-    y = np.array([o.is_correct for o in outcomes], float)
-    mean, deviation = X.mean(axis=0), X.std(axis=0)
-    deviation[deviation == 0.0] = 1.0  # a feature that is the same in all trials
-    Z = np.column_stack([np.ones(len(X)), (X - mean) / deviation])
+def fit(outcomes: Sequence[Outcome]) -> ChoiceModel:
+    """The weights of the greatest penalised likelihood."""
+    poses = [np.array([features_of(s) for s in o.standings]) for o in outcomes]
+    nones = np.array([none_features_of(o.covariance) for o in outcomes])
+    deviations = np.concatenate([np.concatenate(poses).std(axis=0), [1.0, max(nones[:, 1].std(), 1e-9)]])
 
     def loss(w: Array) -> tuple[float, Array]:
-        logit = Z @ w
-        p = 1.0 / (1.0 + np.exp(-logit))
-        gradient = Z.T @ (p - y) + PENALTY * np.r_[0.0, w[1:]]
-        return float(np.logaddexp(0.0, logit).sum() - y @ logit + 0.5 * PENALTY * w[1:] @ w[1:]), gradient
+        total, gradient = 0.5 * PENALTY * w @ w, PENALTY * w
+        v = w / deviations
+        for features, none, o in zip(poses, nones, outcomes, strict=True):
+            logits = np.append(features @ v[:3], none @ v[3:])
+            p = np.exp(logits - logits.max())
+            p /= p.sum()
+            total -= np.log(max(p[o.right], 1e-300))
+            p[o.right] -= 1.0
+            gradient = gradient + np.append(p[:-1] @ features, p[-1] * none) / deviations
+        return float(total), gradient
 
-    ranges = [(0.0, None) if sign > 0 else (None, 0.0) for sign in DIRECTIONS[: X.shape[1]]]
-    w = minimize(loss, np.zeros(Z.shape[1]), jac=True, method="L-BFGS-B", bounds=[(None, None), *ranges]).x
-    weights = w[1:] / deviation
-    return float(w[0] - weights @ mean), weights
+    bounds = [(0.0, None)] * 3 + [(None, None), (0.0, None)]
+    v = minimize(loss, np.zeros(5), jac=True, method="L-BFGS-B", bounds=bounds).x / deviations
+    return ChoiceModel(tuple(v[:3].tolist()), (float(v[3]), float(v[4])))
+
+
+def with_model(outcome: Outcome, model: ChoiceModel) -> Outcome:
+    """The same by another model, but for photos that were refused before any choice."""
+    is_refused = outcome.probabilities[-1] == 1.0
+    chosen = posterior(outcome.standings, outcome.covariance, model)
+    return outcome if is_refused else outcome._replace(probabilities=chosen)
 
 
 def print_reliability(name: str, outcomes: Sequence[Outcome]) -> None:
-    """How many poses were right in each range of confidence."""
-    print(f"\n| confidence, {name} | poses | right | wrong |")
+    """How many of the poses listed, and of the answers none, were right in each tenth of the probability."""
+    stated = np.concatenate([o.probabilities for o in outcomes])
+    right = np.concatenate([np.arange(len(o.probabilities)) == o.right for o in outcomes])
+    print(f"\n| probability, {name} | answers | mean stated | right |")
     print("|---|---:|---:|---:|")
-    for low, high in pairwise(LEVELS):
-        some = [o for o in outcomes if low <= confidence_of(o.evidence, o.covariance, o.model) < high]
-        right = sum(o.is_correct for o in some)
-        print(f"| {low} to {min(high, 1.0)} | {len(some)} | {right} | {len(some) - right} |")
+    for low in np.arange(10) / 10:
+        some = (stated >= low) & ((stated < low + 0.1) | (low == 0.9))
+        if some.any():
+            means = f"{stated[some].mean():.3f} | {right[some].mean():.3f}"
+            print(f"| {low:.1f} to {low + 0.1:.1f} | {some.sum()} | {means} |")
 
 
 def print_cases(name: str, outcomes: Sequence[Outcome]) -> None:
-    """The statuses of each case with the confidence in use."""
-    print(f"\n| case, {name} | poses | right | localized | ambiguous | false |")
+    """The statuses of each case with the model in use."""
+    print(f"\n| case, {name} | trials | right | localized | ambiguous | false |")
     print("|---|---:|---:|---:|---:|---:|")
     for case in dict.fromkeys(o.case for o in outcomes):
         some = [o for o in outcomes if o.case == case]
-        evidence = [(o.evidence, o.covariance, o.has_alternatives, MIN_CONFIDENCE, o.model) for o in some]
-        called = [classify(*one)[0] for one in evidence]
+        called = [classify(o.probabilities, MIN_CONFIDENCE) for o in some]
         false = sum(s == LOCALIZED and not o.is_correct for s, o in zip(called, some, strict=True))
         counts = sum(o.is_correct for o in some), called.count(LOCALIZED), called.count(AMBIGUOUS), false
         print(f"| {case} | {len(some)} | {' | '.join(map(str, counts))} |")
@@ -156,9 +177,10 @@ def main(arguments: argparse.Namespace) -> int:
     sets = {"learnt from": read_outcomes(arguments.fit), "others": read_outcomes(arguments.check)}
     sets = {k: [o for o in rows if o.case not in arguments.without] for k, rows in sets.items()}
     if arguments.fit:
-        bias, weights = fit(sets["learnt from"])
-        print(f"bias {bias:.2f}, weights " + ", ".join(f"{w:.2f}" for w in weights))
-        print(f"of {', '.join(FEATURES[: len(weights)])}")
+        model = fit(sets["learnt from"])
+        for names, weights in ((FEATURES, model.weights), (NONE_FEATURES, model.none_weights)):
+            print(", ".join(f"{name} {w:.2f}" for name, w in zip(names, weights, strict=True)))
+        sets = {k: [with_model(o, model) for o in rows] for k, rows in sets.items()}
     for name, outcomes in sets.items():
         if outcomes:
             print_cases(name, outcomes)

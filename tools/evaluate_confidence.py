@@ -29,6 +29,7 @@ from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers, num_cores
 from piccolo.scan import Settings
 from piccolo.scenes.scene import Scene, read_scene
+from piccolo.scenes.synthetic.alike import ALIKE_KINDS, CHANGED, make_alike
 from piccolo.scenes.synthetic.damage import occluded, outside_field, unevenly_lit, without_texture
 from piccolo.scenes.synthetic.room import REPEATED_KINDS, make_repeated
 from piccolo.scenes.synthetic.world import (
@@ -150,6 +151,22 @@ def repeated_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[
         yield cloud, [_trial(world, kind, "clean", workers, index) for index in range(2)]
 
 
+def alike_trials(seed: int, kinds: Sequence[str], workers: Workers) -> Iterator[tuple[Points, list[Trial]]]:
+    """Places alike to a degree: photos of them, one half hidden, and one of another place of the kind."""
+    for kind in kinds:
+        rng = np.random.default_rng([seed, 53, ALIKE_KINDS.index(kind)])
+        elsewhere = World(seed, make_alike(kind, seed + 100_000, 0.2))
+        for changed in CHANGED:
+            world = World(seed, make_alike(kind, seed, changed))
+            cloud = scan_world(world, POINTS_PER_ROOM * max(3, len(world.rooms)), workers)[:2]
+            case = f"{kind}, {changed:.0%} changed"
+            trials = [_trial(world, case, "clean", workers, index) for index in range(4)]
+            another = _trial(elsewhere, f"{kind}, elsewhere", "clean", workers, 1)._replace(true_pose=None)
+            hidden = occluded(trials[0].rgb, another.rgb, 0.3, rng)
+            trials += [trials[0]._replace(case=f"{case}, hidden 30%", rgb=hidden), another]
+            yield cloud, trials
+
+
 def _trial(world: World, case: str, variant: str, workers: Workers, index: int = 0) -> Trial:
     query = make_query(world, index, variant, WIDTH, workers)
     return Trial(case, query.rgb, query.pose)
@@ -182,7 +199,8 @@ def all_trials(
 ) -> Iterator[tuple[str, CloudStream, list[Trial]]]:
     """Name of a scene, its cloud, its trials."""
     for seed in range(*arguments.seeds):
-        for points, trials in chain(room_trials(seed, workers), repeated_trials(seed, workers)):
+        alike = alike_trials(seed, arguments.kinds, workers)
+        for points, trials in chain(room_trials(seed, workers), repeated_trials(seed, workers), alike):
             yield f"seed {seed}", cloud_of(points), trials
     scenes = [read_scene(folder) for folder in arguments.scenes]
     for scene in scenes:
@@ -223,6 +241,7 @@ def print_table(counts: dict[str, list[tuple[str, bool]]]) -> int:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
     option(parser, "--seeds FIRST END", required=True)
+    option(parser, "--kinds KIND ...", "alike places", choices=ALIKE_KINDS, default=list(ALIKE_KINDS))
     option(parser, "--scenes FOLDER ...", default=[])
     option(parser, "--out FILE", "JSON lines, written as they come", required=True)
     option(parser, "--preset", choices=["default", "paper"], default="default")

@@ -1,12 +1,16 @@
 """What speaks for the pose that was found and against it, and the status that follows."""
 
 import math
+from collections.abc import Sequence
+
+import numpy as np
 
 from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
-from ..confidence.confidence import NOT_LOCALIZED, classify
-from ..confidence.localization import Localization
+from ..confidence.confidence import NOT_LOCALIZED, Standing, classify, posterior
+from ..confidence.localization import Alternative, Localization
 from ..confidence.occlusion import occlusion_at
 from ..confidence.score import Evidence, agreement_at
+from ..geometry.pose import Pose
 from ..local_features.hypotheses import count_matches, poses_of
 from ..local_features.matching import match
 from ..optimize.refine import refine, sampling_loss_of
@@ -16,6 +20,7 @@ from ..panorama import Panorama
 from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
 from ..render.zbuffer import visible_points
+from .comparison import compare
 from .covariance import estimate_covariance
 from .query import Query
 from .search_result import SURE_MATCHES, SearchResult
@@ -40,9 +45,37 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
     loss = sampling_loss(visible_points(scan_map.points, pose.center_world), texels, pose)
     if not math.isfinite(loss):
         return Localization()
+    evidence = evidence_of(query, panorama, pose, found)
+    covariance = estimate_covariance(query, pose)
+    reported = found.alternatives[:MAX_ALTERNATIVES]
+    standings = standings_of(query, found.best, reported)
+    probabilities = posterior(standings, covariance)
+    warnings: tuple[str, ...] = ()
+    if classify(probabilities, settings.min_confidence) != NOT_LOCALIZED and is_mirrored(query, evidence):
+        probabilities, warnings = np.append(np.zeros(len(standings)), 1.0), (MIRRORED,)
+    alternatives = tuple(
+        Alternative(scan_map.to_world(h.pose), h.score, s.share, s.num_matches, float(p))
+        for h, s, p in zip(reported, standings[1:], probabilities[1:-1], strict=True)
+    )
+    return Localization(
+        classify(probabilities, settings.min_confidence),
+        float(probabilities[0]),
+        float(probabilities[-1]),
+        scan_map.to_world(pose),
+        loss,
+        evidence,
+        alternatives,
+        covariance,
+        warnings,
+    )
+
+
+def evidence_of(query: Query, panorama: Panorama, pose: Pose, found: SearchResult) -> Evidence:
+    """What a result tells of the pose it reports, which the last descent made of the best one found."""
+    scan_map = query.scan_map
     at_pose = agreement_at(scan_map.coarse_points, panorama, pose)
     explained, contradicted = occlusion_at(scan_map.points, panorama, pose).fractions()
-    evidence = Evidence(
+    return Evidence(
         score=found.best.score,
         margin=found.margin,
         agreement=at_pose.value,
@@ -52,15 +85,16 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
         num_matches=count_matches(query.matches, found.best.pose),
         alternative_matches=max([0, *(count_matches(query.matches, h.pose) for h in found.alternatives)]),
     )
-    covariance = estimate_covariance(query, pose)
-    status, confidence = classify(evidence, covariance, len(found.alternatives) > 0, settings.min_confidence)
-    warnings: tuple[str, ...] = ()
-    if status != NOT_LOCALIZED and is_mirrored(query, evidence):
-        status, confidence, warnings = NOT_LOCALIZED, 0.0, (MIRRORED,)
-    reported = found.alternatives[:MAX_ALTERNATIVES]
-    alternatives = tuple(Hypothesis(scan_map.to_world(h.pose), h.score) for h in reported)
-    in_world = scan_map.to_world(pose)
-    return Localization(status, confidence, in_world, loss, evidence, alternatives, covariance, warnings)
+
+
+def standings_of(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> list[Standing]:
+    """What speaks for the best pose and for others elsewhere."""
+    at_best = compare(query, best.pose)
+    shares = [1.0, *(compare(query, h.pose).ratio_to(at_best) for h in others)]
+    return [
+        Standing(share, h.score, count_matches(query.matches, h.pose))
+        for share, h in zip(shares, [best, *others], strict=True)
+    ]
 
 
 def is_mirrored(query: Query, evidence: Evidence) -> bool:

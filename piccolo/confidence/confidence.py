@@ -1,7 +1,7 @@
-"""From evidence to a status: how likely a pose is right, and what to call it."""
+"""From evidence to probabilities: how likely each pose is right, or none of them, and what to call that."""
 
 import math
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,80 +12,85 @@ from ..geometry.pose import MAX_DISTANCE
 from .covariance import PoseCovariance
 from .score import Evidence
 
-
-class LogisticModel(NamedTuple):
-    """Logistic regression on the first features."""
-
-    bias: float
-    weights: tuple[float, ...]
-
-
+Array = NDArray[np.float64]
 LOCALIZED = "localized"
 AMBIGUOUS = "ambiguous"
 NOT_LOCALIZED = "not_localized"
 MIN_CONFIDENCE = 0.9
 
+
+class Standing(NamedTuple):
+    """What speaks for one of the poses found."""
+
+    share: float  # what it explains by what the best pose does, over what both views show; 1 of the best
+    score: float  # [0, 1] what the photo's blocks explain beyond chance
+    num_matches: int  # local features that agree with it
+
+
+class ChoiceModel(NamedTuple):
+    """A conditional logit (McFadden, 1974): each pose, and none of them, has odds; they add up to 1."""
+
+    weights: tuple[float, ...]  # of a pose's features
+    none_weights: tuple[float, float]  # of none of them: a constant, and log10 of the best's deviation [m]
+
+
 LEAST_STD, MOST_STD = 0.003, 0.3  # [m] smaller or larger tells nothing more
-LEAST_SCORE = 0.02
-COPY_MARGIN = (
-    0.25  # with less, a pose elsewhere explains as much of what both show: one of two, whatever the rest
-)
+LEAST_SCORE, MOST_SHARE = 0.02, 1.2
 SAFETY = 2.0  # errors that the whole sphere shares, as by blur, are not in the deviations
 NOISE_MATCHES = 8  # local features that agree with a wrong pose by chance, at most
-# Logistic regression by tools/calibrate_confidence.py on tools/evaluate_confidence.py --seeds 0 8, but for
-# mirrored photos, which are told otherwise. Each feature counts in one direction only.
-FEATURES = ("margin", "log of the score", "lead of matches", "log10 of the largest deviation [m]")
-DIRECTIONS = (1, 1, 1, -1)
-MODEL = LogisticModel(-4.16, (5.88, 1.04, 3.49, -1.69))
-# The preset paper knows no covariance, and too few alternatives to tell places that repeat: learnt without
-# those, on tools/evaluate_confidence.py --preset paper --seeds 0 6 and --seeds 100 104.
-PAPER_MODEL = LogisticModel(-0.20, (6.37, 2.51))
+# By tools/calibrate_confidence.py. Each feature counts in one direction only.
+FEATURES = ("share", "log of the score", "log of the matches")
+NONE_FEATURES = ("constant", "log10 of the largest deviation [m]")
+MODEL = ChoiceModel((8.0, 1.0, 2.0), (10.0, 1.0))
+# The preset paper knows no covariance, and too few alternatives to tell places that repeat: a rough guide, by
+# margin and log of the agreement, learnt without such places.
+PAPER_BIAS, PAPER_WEIGHTS = -0.20, (6.37, 2.51)
 
 
-def features_of(evidence: Evidence, covariance: PoseCovariance | None) -> NDArray[np.float64]:
-    """What the confidence goes by, (4,), as FEATURES names them."""
-    e = evidence
-    margin = min(max(e.margin, 0.0), 1.0)
-    lead = math.log((e.num_matches + NOISE_MATCHES) / (e.alternative_matches + NOISE_MATCHES))
+def features_of(standing: Standing) -> Array:
+    """What a pose's odds go by, (3,), as FEATURES names them."""
+    share = min(max(standing.share, 0.0), MOST_SHARE)
+    return np.array(
+        [share, math.log(max(standing.score, LEAST_SCORE)), math.log(standing.num_matches + NOISE_MATCHES)]
+    )
+
+
+def none_features_of(covariance: PoseCovariance | None) -> Array:
+    """What the odds of none of the poses go by, (2,), as NONE_FEATURES names them."""
     std = MOST_STD if covariance is None else min(max(covariance.largest_std, LEAST_STD), MOST_STD)
-    return np.array([margin, math.log(max(e.score, LEAST_SCORE)), max(lead, 0.0), math.log10(std)])
+    return np.array([1.0, math.log10(std)])
 
 
-def paper_features_of(evidence: Evidence) -> NDArray[np.float64]:
-    """What the confidence of preset paper goes by, (2,): margin and log of the agreement."""
-    return np.array([evidence.margin, math.log(max(evidence.agreement, LEAST_SCORE))])
+def posterior(
+    standings: Sequence[Standing], covariance: PoseCovariance | None, model: ChoiceModel = MODEL
+) -> Array:
+    """Probabilities (K + 1,) that each of K poses, the best first, is right to 0.1 m and 5 degrees; and none.
 
-
-def confidence_of(evidence: Evidence, covariance: PoseCovariance | None, model: LogisticModel) -> float:
-    """How likely it is that the pose is within 0.1 m and 5 degrees: of those with 0.9, nine in ten.
-
-    It holds where half of all queries have an answer, as in the trials from which it was learnt. A pose whose
-    own deviation makes 0.1 m doubtful has less, and one that has a copy half at most.
+    They hold where half of all queries have an answer, as in the trials from which they were learnt. None has
+    more where the best pose's own deviation makes 0.1 m doubtful.
     """
-    is_paper = model is PAPER_MODEL
-    features = paper_features_of(evidence) if is_paper else features_of(evidence, covariance)
-    logit = model.bias + float(features @ np.array(model.weights))
-    factor = 0.5 if evidence.margin < COPY_MARGIN and not is_paper else 1.0
+    logits = [float(features_of(s) @ np.array(model.weights)) for s in standings]
+    logits.append(float(none_features_of(covariance) @ np.array(model.none_weights)))
+    odds = np.exp(np.array(logits) - max(logits))
+    probabilities = odds / odds.sum()
     if covariance is not None:
-        factor *= math.erf(MAX_DISTANCE / (SAFETY * covariance.largest_std * math.sqrt(2.0)))
-    return factor / (1.0 + math.exp(-min(max(logit, -30.0), 30.0)))
+        probabilities[:-1] *= math.erf(MAX_DISTANCE / (SAFETY * covariance.largest_std * math.sqrt(2.0)))
+    probabilities[-1] = 1.0 - probabilities[:-1].sum()
+    return np.asarray(probabilities)
 
 
-def classify(
-    evidence: Evidence,
-    covariance: PoseCovariance | None,
-    has_alternatives: bool,
-    min_confidence: float,
-    model: LogisticModel = MODEL,
-) -> tuple[str, float]:
-    """Status and confidence; ambiguous is a pose that would be called localized if it had no alternative."""
-    confidence = confidence_of(evidence, covariance, model)
-    if confidence >= min_confidence:
-        return LOCALIZED, confidence
-    alone = replace(evidence, margin=1.0, alternative_matches=0)
-    if has_alternatives and confidence_of(alone, covariance, model) >= min_confidence:
-        return AMBIGUOUS, confidence
-    return NOT_LOCALIZED, confidence
+def classify(probabilities: Array, min_confidence: float) -> str:
+    """The status of poses with such probabilities (K + 1,); ambiguous if it is one of several."""
+    if probabilities[0] >= min_confidence:
+        return LOCALIZED
+    return AMBIGUOUS if 1.0 - probabilities[-1] >= min_confidence else NOT_LOCALIZED
+
+
+def paper_confidence(evidence: Evidence) -> float:
+    """How likely a pose of the preset paper is right: a rough guide, not calibrated."""
+    features = evidence.margin, math.log(max(evidence.agreement, LEAST_SCORE))
+    logit = PAPER_BIAS + sum(w * f for w, f in zip(PAPER_WEIGHTS, features, strict=True))
+    return 1.0 / (1.0 + math.exp(-min(max(logit, -30.0), 30.0)))
 
 
 def check_confidence(min_confidence: float) -> None:

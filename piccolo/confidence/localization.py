@@ -4,10 +4,20 @@ from dataclasses import dataclass
 
 from ..camera import Mount
 from ..geometry.pose import Pose
-from .alternatives import Hypothesis
 from .confidence import NOT_LOCALIZED
 from .covariance import PoseCovariance
 from .score import Evidence
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """A pose elsewhere that was found too, in world coordinates."""
+
+    pose: Pose
+    score: float  # as of Evidence
+    share: float | None = None  # what it explains by what the best does, over what both views show
+    num_matches: int | None = None  # local features that agree with it
+    probability: float | None = None  # that it is right; of the preset paper none is known
 
 
 @dataclass(frozen=True)
@@ -15,11 +25,12 @@ class Localization:
     """The best pose for one panorama, in world coordinates, and what speaks for it and against it."""
 
     status: str = NOT_LOCALIZED
-    confidence: float = 0.0
+    confidence: float = 0.0  # probability of the best pose
+    probability_none: float | None = 1.0  # that no pose listed is right; of the preset paper unknown
     pose: Pose | None = None  # None if there was no start, and then all that follows
     loss: float | None = None
     evidence: Evidence | None = None
-    alternatives: tuple[Hypothesis, ...] = ()  # poses elsewhere, best first
+    alternatives: tuple[Alternative, ...] = ()  # poses elsewhere, best first
     covariance: PoseCovariance | None = None
     warnings: tuple[str, ...] = ()  # one line each: why there is no pose
     cameras: tuple[Mount, ...] = ()  # refined; none if they stay as they were given

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from ..cloud.soa import LocalCloud, PackedPoints, pack_points
 from ..cloud.stream import Cloud
 from ..confidence.alternatives import Hypothesis, alternative_poses, score_margin
-from ..confidence.confidence import PAPER_MODEL, classify
-from ..confidence.localization import Localization
+from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED, paper_confidence
+from ..confidence.localization import Alternative, Localization
 from ..confidence.occlusion import occlusion_at
 from ..confidence.score import Evidence, agreement_at
 from ..geometry.rotations import uniform_rotations, uniform_yaws
@@ -63,9 +63,14 @@ def localize(
         return Localization()
     with watch.stage("refine"):
         evidence, others = evaluate(points, panorama, best, refined)
-    status, confidence = classify(evidence, None, len(others) > 0, settings.min_confidence, PAPER_MODEL)
-    in_world = tuple(replace(h, pose=paper_map.to_world(h.pose)) for h in others)
-    return Localization(status, confidence, paper_map.to_world(best.pose), best.loss, evidence, in_world)
+    confidence = paper_confidence(evidence)
+    alone = paper_confidence(replace(evidence, margin=1.0))
+    sure = AMBIGUOUS if others and alone >= settings.min_confidence else NOT_LOCALIZED
+    status = LOCALIZED if confidence >= settings.min_confidence else sure
+    in_world = tuple(Alternative(paper_map.to_world(h.pose), h.score) for h in others)
+    return Localization(
+        status, confidence, None, paper_map.to_world(best.pose), best.loss, evidence, in_world
+    )
 
 
 def evaluate(

@@ -78,7 +78,7 @@ class Room(NamedTuple):
         return float((outside + inside).min())
 
 
-def _shell(b: RoomBuilder, size: Array) -> None:
+def put_shell(b: RoomBuilder, size: Array) -> None:
     """Floor, ceiling and four walls."""
     x, y, z = size
     d = WALL_THICKNESS
@@ -116,7 +116,8 @@ def _wall_hangings(b: RoomBuilder, size: Array) -> None:
                 b.put(center, extent, b.paint(patterns, low, high))
 
 
-def _table(b: RoomBuilder, at: Array, yaw: float) -> None:
+def put_table(b: RoomBuilder, at: Array, yaw: float) -> None:
+    """A table with a thing on it, at (2,) of the floor."""
     length, width, height = b.rng.uniform([0.9, 0.6, 0.5], [1.6, 0.9, 0.8])
     wood = b.paint((PLANKS, PLAIN), 0.2, 0.7)
     b.put([*at, height], [length, width, 0.04], wood, yaw)
@@ -126,7 +127,8 @@ def _table(b: RoomBuilder, at: Array, yaw: float) -> None:
     b.put([*at, height + 0.12], b.rng.uniform(0.1, 0.25, 3), b.paint((CHECKS, PICTURE), 0.1, 1.0), yaw)
 
 
-def _shelf(b: RoomBuilder, at: Array, yaw: float) -> None:
+def put_shelf(b: RoomBuilder, at: Array, yaw: float) -> None:
+    """A shelf with books, at (2,) of the floor."""
     height = b.rng.uniform(1.2, 2.0)
     frame = b.paint((PLANKS, PLAIN), 0.2, 0.8)
     b.put([*at, height / 2], [0.9, 0.02, height], frame, yaw)
@@ -137,14 +139,16 @@ def _shelf(b: RoomBuilder, at: Array, yaw: float) -> None:
         b.put([*at, level + books[2] / 2], books, b.paint((STRIPES,), 0.1, 0.9), yaw, (x, 0.0))
 
 
-def _sofa(b: RoomBuilder, at: Array, yaw: float) -> None:
+def put_sofa(b: RoomBuilder, at: Array, yaw: float) -> None:
+    """A sofa, at (2,) of the floor."""
     length = b.rng.uniform(1.2, 2.0)
     cloth = b.paint((PLAIN, STRIPES, CHECKS), 0.15, 0.8)
     b.put([*at, 0.22], [length, 0.8, 0.44], cloth, yaw)
     b.put([*at, 0.5], [length, 0.15, 0.9], cloth, yaw, (0.0, 0.35))
 
 
-def _crate(b: RoomBuilder, at: Array, yaw: float) -> None:
+def put_crate(b: RoomBuilder, at: Array, yaw: float) -> None:
+    """A crate, at (2,) of the floor."""
     size = b.rng.uniform([0.3, 0.3, 0.3], [0.7, 0.7, 1.3])
     b.put([*at, size[2] / 2], size, b.paint((PLANKS, CHECKS, PICTURE, PLAIN), 0.15, 0.9), yaw)
 
@@ -156,7 +160,7 @@ def _furniture(b: RoomBuilder, size: Array, moves: np.random.Generator | None) -
     rug = [size[0] * b.rng.uniform(0.3, 0.6), size[1] * b.rng.uniform(0.3, 0.6), 0.01]
     b.kind = "rug"
     b.put([size[0] / 2, size[1] / 2, 0.005], rug, b.paint((CHECKS, STRIPES, PICTURE), 0.1, 0.8))
-    pieces = {"table": _table, "shelf": _shelf, "sofa": _sofa, "crate": _crate}
+    pieces = {"table": put_table, "shelf": put_shelf, "sofa": put_sofa, "crate": put_crate}
     kinds = ("table", "shelf", "sofa", "crate", "crate")
     for seed in seeds:  # each of its own stream, so that a piece that moves stays what it is
         b.rng = np.random.default_rng(seed)
@@ -171,7 +175,7 @@ def make_room(seed: int, size: Array, corner: Array, changed: int = 0) -> Room:
     """The room of `seed`; the same shell with other furniture and more crates for each `changed` above 0."""
     fixed = RoomBuilder(np.random.default_rng([seed, 0]), np.asarray(corner, dtype=float))
     size = np.asarray(size, dtype=float)
-    _shell(fixed, size)
+    put_shell(fixed, size)
     _wall_hangings(fixed, size)
     loose = RoomBuilder(np.random.default_rng([seed, 1]), fixed.corner)
     moves = np.random.default_rng([seed, 2, changed]) if changed else None
@@ -179,7 +183,7 @@ def make_room(seed: int, size: Array, corner: Array, changed: int = 0) -> Room:
     if moves is not None:
         loose.rng, loose.kind = moves, "crate"
         for _ in range(3):
-            _crate(loose, moves.uniform([0.5, 0.5], size[:2] - 0.5), float(moves.uniform(0, np.pi)))
+            put_crate(loose, moves.uniform([0.5, 0.5], size[:2] - 0.5), float(moves.uniform(0, np.pi)))
     light = fixed.corner + size * [*fixed.rng.uniform(0.35, 0.65, 2), 0.93]
     boxes, materials = np.stack(fixed.boxes + loose.boxes), np.stack(fixed.materials + loose.materials)
     return Room(fixed.corner, size, boxes, materials, light, np.array(fixed.labels + loose.labels))
