@@ -1,10 +1,12 @@
-import dataclasses
+import itertools
+import math
 
 import numpy as np
 import pytest
 
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.confidence import confidence as rule
+from piccolo.confidence.confidence import Standing, classify, posterior
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.confidence.score import Evidence
 from piccolo.errors import InputError
@@ -16,89 +18,92 @@ def _covariance(std):
 
 
 SURE = _covariance(0.002)
-RIGHT = Evidence(
-    score=0.8, margin=0.9, agreement=0.85, explained_fraction=0.85, seen_fraction=0.93, num_matches=60
-)
-WRONG = dataclasses.replace(
-    RIGHT, score=0.03, margin=0.1, agreement=0.25, num_matches=3, alternative_matches=4
-)
-MIDDLING = dataclasses.replace(RIGHT, score=0.15, margin=0.35, agreement=0.4, num_matches=8)
-PAPER_RIGHT = dataclasses.replace(RIGHT, margin=0.6)
-PAPER_MIDDLING = dataclasses.replace(RIGHT, margin=0.15, agreement=0.4)
+RIGHT, WRONG = Standing(1.0, 0.8, 60), Standing(1.0, 0.03, 3)
+ELSEWHERE = Standing(0.1, 0.05, 3)
+MODEL = rule.ChoiceModel((3.0, 1.0, 2.0), (10.0, 2.0))
+
+
+def test_probabilities_are_those_of_the_formula_and_add_up_to_one():
+    """A conditional logit by a pocket calculator, with made-up weights."""
+    p = posterior([Standing(1.0, 0.5, 12), Standing(0.5, 0.1, 2)], _covariance(0.01), MODEL)
+    e = math.exp
+    odds = [
+        e(3.0) * 0.5 * 20.0**2,
+        e(1.5) * 0.1 * 10.0**2,
+        e(10.0 - 2.0 * 2.0),
+    ]
+    doubt = math.erf(0.1 / (2.0 * 0.01 * math.sqrt(2.0)))
+    expected = [doubt * odds[0] / sum(odds), doubt * odds[1] / sum(odds)]
+    np.testing.assert_allclose(p, [*expected, 1.0 - sum(expected)], rtol=1e-12)
 
 
 def test_right_and_wrong_evidence():
-    assert rule.classify(RIGHT, SURE, True, 0.9) == ("localized", rule.confidence_of(RIGHT, SURE, rule.MODEL))
-    assert rule.classify(WRONG, None, True, 0.9)[0] == rule.NOT_LOCALIZED
-    assert rule.confidence_of(RIGHT, SURE, rule.MODEL) > 0.99
-    assert rule.confidence_of(WRONG, None, rule.MODEL) < 0.2
-    assert rule.classify(PAPER_RIGHT, None, True, 0.9, rule.PAPER_MODEL)[0] == rule.LOCALIZED
+    assert all(w > 0.0 for w in rule.MODEL.weights)
+    assert rule.MODEL.none_weights[1] >= 0.0
+    p = posterior([RIGHT, ELSEWHERE], SURE)
+    assert p[0] > 0.98
+    assert classify(p, 0.9) == rule.LOCALIZED
+    p = posterior([WRONG, ELSEWHERE._replace(share=0.9)], None)
+    assert p[0] < 0.2
+    assert classify(p, 0.9) == rule.NOT_LOCALIZED
 
 
-@pytest.mark.parametrize(
-    ("changes", "std", "model", "expected"),
-    [
-        ({}, 0.003, rule.MODEL, 0.9314),
-        ({}, None, rule.MODEL, 0.3160),
-        ({"margin": 0.6, "alternative_matches": 4}, 0.003, rule.MODEL, 0.9348),
-        ({"margin": 0.2}, 0.003, rule.MODEL, 0.4244),
-        ({"margin": 0.15}, None, rule.PAPER_MODEL, 0.1759),
-        ({}, None, rule.PAPER_MODEL, 0.4328),
-    ],
-)
-def test_confidence_is_what_was_learnt(changes, std, model, expected):
-    """From the models as they were fitted, by a pocket calculator; a new fit changes these numbers."""
-    assert tuple(np.sign(model.weights)) == rule.DIRECTIONS[: len(model.weights)]
-    evidence = dataclasses.replace(MIDDLING, **changes)
-    assert rule.confidence_of(evidence, std and _covariance(std), model) == pytest.approx(expected, abs=0.001)
+@pytest.mark.parametrize("copies", [2, 3, 5])
+def test_copies_share_the_probability_alike_and_none_of_them_is_localized(copies):
+    p = posterior([RIGHT] * copies, SURE)
+    np.testing.assert_allclose(p[:-1], (1.0 - p[-1]) / copies)
+    assert p[-1] < 0.05
+    assert classify(p, 0.9) == rule.AMBIGUOUS
+
+
+def test_what_a_copy_explains_less_makes_it_less_likely():
+    shares = (1.0, 0.95, 0.8, 0.6, 0.3)
+    best = [posterior([RIGHT, RIGHT._replace(share=share)], SURE)[0] for share in shares]
+    assert all(a < b for a, b in itertools.pairwise(best))
+    assert best[0] < 0.51
+    assert best[-1] > 0.9
+
+
+@pytest.mark.parametrize(("name", "more"), [("score", 0.1), ("num_matches", 5)])
+def test_more_evidence_is_more_probability(name, more):
+    middling = Standing(1.0, 0.15, 8)
+    stronger = middling._replace(**{name: getattr(middling, name) + more})
+    assert posterior([middling], SURE)[0] < posterior([stronger], SURE)[0]
+    assert posterior([middling], None)[0] < posterior([middling], SURE)[0]
+    pair = [posterior([middling, e], SURE)[0] for e in (middling, stronger)]
+    assert pair[1] < pair[0] < posterior([middling], SURE)[0]
 
 
 @pytest.mark.parametrize(("std", "most"), [(0.05, 0.683), (0.1, 0.383), (0.3, 0.132)])
 def test_a_pose_that_may_be_a_decimetre_off_is_doubtful_whatever_the_evidence(std, most):
     """The part of a normal distribution within 0.1 m, of twice the deviation."""
-    sure = dataclasses.replace(RIGHT, margin=1.0, num_matches=500)
-    assert rule.confidence_of(sure, _covariance(std), rule.MODEL) == pytest.approx(most, abs=0.002)
-
-
-def test_an_alternative_as_good_makes_it_ambiguous_and_nothing_else_does():
-    twin = dataclasses.replace(RIGHT, margin=-0.05, alternative_matches=58)
-    status, confidence = rule.classify(twin, SURE, True, 0.9)
-    assert status == rule.AMBIGUOUS
-    assert confidence < 0.9
-    assert rule.classify(twin, SURE, False, 0.9)[0] == rule.NOT_LOCALIZED
-    weak = dataclasses.replace(WRONG, margin=0.2)
-    assert rule.classify(weak, None, False, 0.9)[0] == rule.NOT_LOCALIZED
-    assert rule.classify(WRONG, None, True, 0.9)[0] == rule.NOT_LOCALIZED
-
-
-def test_the_line_moves():
-    confidence = rule.confidence_of(RIGHT, SURE, rule.MODEL)
-    assert rule.classify(RIGHT, SURE, False, 0.5 * (1.0 + confidence))[0] != rule.LOCALIZED
-    assert rule.classify(RIGHT, SURE, False, confidence)[0] == rule.LOCALIZED
-    half = 0.5 * rule.confidence_of(WRONG, None, rule.MODEL)
-    assert rule.classify(WRONG, None, False, half)[0] == rule.LOCALIZED
-
-
-@pytest.mark.parametrize(("name", "more"), [("margin", 0.1), ("score", 0.1), ("num_matches", 5)])
-def test_more_evidence_is_more_confidence(name, more):
-    stronger = dataclasses.replace(MIDDLING, **{name: getattr(MIDDLING, name) + more})
-    assert rule.confidence_of(MIDDLING, SURE, rule.MODEL) < rule.confidence_of(stronger, SURE, rule.MODEL)
-    if name == "margin":
-        clearer = dataclasses.replace(PAPER_MIDDLING, margin=0.25, agreement=0.5)
-        pair = (rule.confidence_of(e, None, rule.PAPER_MODEL) for e in (PAPER_MIDDLING, clearer))
-        assert next(pair) < next(pair)
-
-
-def test_a_pose_that_is_no_minimum_and_matches_elsewhere_are_held_against_it():
-    assert rule.confidence_of(MIDDLING, None, rule.MODEL) < rule.confidence_of(MIDDLING, SURE, rule.MODEL)
-    challenged = dataclasses.replace(MIDDLING, alternative_matches=8)
-    assert rule.confidence_of(challenged, SURE, rule.MODEL) < rule.confidence_of(MIDDLING, SURE, rule.MODEL)
+    p = posterior([RIGHT._replace(num_matches=5000)], _covariance(std))
+    assert p[0] == pytest.approx(most, abs=0.002)
+    assert p.sum() == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(("a", "b"), [(1.0, 50.0), (0.003, 0.001)])
-def test_deviations_beyond_reason_change_nothing_more(a, b):
-    np.testing.assert_array_equal(*(rule.features_of(RIGHT, _covariance(std)) for std in (a, b)))
-    assert (rule.features_of(RIGHT, None) == rule.features_of(RIGHT, _covariance(0.3))).all()
+def test_numbers_beyond_reason_change_nothing_more(a, b):
+    np.testing.assert_array_equal(*(rule.none_features_of(_covariance(std)) for std in (a, b)))
+    assert (rule.none_features_of(None) == rule.none_features_of(_covariance(0.3))).all()
+    faint, nothing = (rule.features_of(Standing(-0.5, score, 0)) for score in (0.02, -0.3))
+    np.testing.assert_array_equal(faint, nothing)
+    np.testing.assert_array_equal(faint, [0.0, math.log(0.02), math.log(8.0)])
+
+
+def test_the_line_moves():
+    p = np.array([0.6, 0.3, 0.1])
+    for line, status in ((0.6, rule.LOCALIZED), (0.61, rule.AMBIGUOUS), (0.9, rule.AMBIGUOUS)):
+        assert classify(p, line) == status
+    assert classify(p, 0.91) == rule.NOT_LOCALIZED
+
+
+def test_the_preset_paper_goes_by_margin_and_agreement():
+    """From the weights as they were fitted, by a pocket calculator."""
+    evidence = Evidence(0.15, 0.15, 0.4, 0.85, 0.93)
+    assert rule.paper_confidence(evidence) == pytest.approx(0.1759, abs=0.001)
+    clearer = Evidence(0.15, 0.25, 0.5, 0.85, 0.93)
+    assert rule.paper_confidence(clearer) > rule.paper_confidence(evidence)
 
 
 @pytest.mark.parametrize("settings", [CoarseToFineSettings, PaperSettings])

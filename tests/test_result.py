@@ -4,8 +4,8 @@ import json
 import numpy as np
 import pytest
 
-from piccolo.confidence.alternatives import Hypothesis
 from piccolo.confidence.covariance import PoseCovariance
+from piccolo.confidence.localization import Alternative
 from piccolo.confidence.score import Evidence
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3
@@ -13,7 +13,9 @@ from piccolo.result import Result, Source, unreadable_result
 
 POSE = Pose(exp_so3(np.array([0.3, -0.2, 0.9])), np.array([500_000.123, 4_000_000.456, 12.0]))
 EVIDENCE = Evidence(0.7, 0.5, 0.8, 0.6, 0.9, 0.5)
-ALTERNATIVE = Hypothesis(Pose(exp_so3(np.array([0.1, 0.2, -2.0])), np.array([1.0, 2.0, 3.0])), 0.2)
+ALTERNATIVE = Alternative(
+    Pose(exp_so3(np.array([0.1, 0.2, -2.0])), np.array([1.0, 2.0, 3.0])), 0.2, 0.3, 7, 0.008
+)
 RESULT = Result(
     status="localized",
     confidence=0.99,
@@ -27,6 +29,7 @@ RESULT = Result(
     seconds={"read": 0.1, "search": 0.2},
     settings={"preset": "paper", "seed": 0},
     warnings=("odd",),
+    probability_none=0.002,
 )
 WITHOUT_ARRAYS = {"status": "not_localized", "best_pose": None, "alternatives": (), "covariance": None}
 
@@ -38,7 +41,8 @@ def test_json_round_trip_keeps_every_bit_of_the_pose():
     found, kept = (a.pose.R_cam_from_world for a in (back.alternatives[0], ALTERNATIVE))
     np.testing.assert_array_equal(found, kept)
     np.testing.assert_array_equal(back.covariance.matrix, RESULT.covariance.matrix)
-    assert (back.alternatives[0].score, back.covariance.least_constrained_direction) == (0.2, "up and down")
+    assert dataclasses.replace(back.alternatives[0], pose=POSE) == dataclasses.replace(ALTERNATIVE, pose=POSE)
+    assert back.covariance.least_constrained_direction == "up and down"
     plain = dataclasses.replace(RESULT, **WITHOUT_ARRAYS)
     assert dataclasses.replace(back, **WITHOUT_ARRAYS) == plain
 
@@ -60,17 +64,20 @@ def test_summary_says_what_a_person_asks_first():
     assert "ambiguous with the best guess (500000.123, 4000000.456, 12.000) m" in text
     assert "confidence 0.990" in text
     assert "one sigma 4.0 mm (up and down)" in text
+    assert "or (1.000, 2.000, 3.000) m, probability 0.01" in text
+    by_paper = dataclasses.replace(ALTERNATIVE, probability=None)
+    text = dataclasses.replace(RESULT, status="ambiguous", alternatives=(by_paper,)).summary()
     assert "or (1.000, 2.000, 3.000) m, score 0.20" in text
     assert "or (" not in RESULT.summary()
 
 
-def test_json_names_what_the_next_tool_needs():
+def test_json_says_how_far_probabilities_hold():
     document = json.loads(RESULT.to_json())
-    assert document["format"] == "piccolo-pose/5"
-    T = np.array(document["T_world_from_cam"])
-    np.testing.assert_allclose(T[:3, 3], RESULT.pose.center_world)
-    np.testing.assert_allclose(T[:3, :3], np.array(document["R_cam_from_world"]).T)
-    assert "R_cam_from_world @ (x_world - center_world)" in document["convention"]
+    assert document["alternatives"][0]["probability"] == 0.008
+    assert (document["probability_none"], document["calibrated"]) == (0.002, True)
+    labelled = dataclasses.replace(RESULT, settings={"panorama": {"labels": {"ignored": []}}})
+    by_paper = dataclasses.replace(RESULT, probability_none=None)
+    assert not any(json.loads(r.to_json())["calibrated"] for r in (labelled, by_paper))
 
 
 @pytest.mark.parametrize("status", ["ambiguous", "not_localized"])

@@ -177,6 +177,7 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
         "agreement_at": lambda points, panorama, pose: Agreement(0.8, 1.0),
         "occlusion_at": lambda *_: SimpleNamespace(fractions=lambda: (0.6, 0.3)),
         "count_matches": lambda matches, pose: counts.get(pose.center_world[0], 0),
+        "compare": lambda query, pose: _seen(0.6 - 0.1 * pose.center_world[0]),
         "estimate_covariance": lambda *_: None,
         "is_mirrored": lambda *_: False,
     }.items():
@@ -190,6 +191,11 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
     assert e.margin == pytest.approx(0.3)
     assert _places(found.alternatives) == [1.0, 2.0]
     assert found.loss == 0.07
+    told = [(a.score, round(a.share, 6), a.num_matches) for a in found.alternatives]
+    assert told == [(0.3, round(0.5 / 0.6, 6), 4), (0.2, round(0.4 / 0.6, 6), 6)]
+    stated = [found.confidence, *(a.probability for a in found.alternatives), found.probability_none]
+    assert sum(stated) == pytest.approx(1.0)
+    assert stated[0] > stated[1] > stated[2]
     many = tuple(_at(1.0 + 0.001 * k, 0.1) for k in range(9))
     found = evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(_at(0.0, 0.6), many))
     assert len(found.alternatives) == 5

@@ -20,6 +20,8 @@ from .refinement import points_at
 from .view import Cells
 
 BLOCK_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
+MOST_SHARE = 1.001  # of a block in what fixes the pose, a little above 1 for one that does alone
+LEAST_TURN, LEAST_MOVE = math.radians(0.02), 0.001  # [rad], [m] deviations of scans and stitching themselves
 SCALE = FULL_LOSS * LEVELS_PER_UNIT
 
 
@@ -39,11 +41,15 @@ STEPS = (
 )
 
 
-def gradient_at(image: Texels, points: Cells, R_cam_from_map: Array, shift: Array) -> Array:
-    """Gradient (6,) of the robust loss, in the camera's frame, at a shift (3,) [m] of the centre."""
-    sums = np.empty(NUM_SUMS)
+def equations_at(image: Texels, points: Cells, R_cam_from_map: Array, shift: Array) -> tuple[Array, Array]:
+    """Gradient (6,) and Gauss-Newton matrix (6, 6) of the robust loss, in the camera's frame.
+
+    `shift` (3,) [m] is that of the centre.
+    """
+    sums, matrix = np.empty(NUM_SUMS), np.zeros((6, 6))
     channel_equations((*points, image.rgbx, image.width, SCALE), R_cam_from_map, shift, sums)
-    return np.asarray(sums[GRADIENT:MATRIX])
+    matrix[np.triu_indices(6)] = sums[MATRIX:]
+    return sums[GRADIENT:MATRIX].copy(), matrix + np.triu(matrix, 1).T
 
 
 def hessian_at(image: Texels, points: Cells, pose: Pose, steps: DifferenceSteps) -> Array:
@@ -57,34 +63,48 @@ def hessian_at(image: Texels, points: Cells, pose: Pose, steps: DifferenceSteps)
         gradients = []
         for sign in (1.0, -1.0):
             R = exp_so3(sign * step[:3]) @ pose.R_cam_from_world
-            gradients.append(gradient_at(image, points, R, sign * pose.R_cam_from_world.T @ step[3:]))
+            shift = sign * pose.R_cam_from_world.T @ step[3:]
+            gradients.append(equations_at(image, points, R, shift)[0])
         rows.append((gradients[0] - gradients[1]) / (2.0 * step.sum()))
     return np.asarray(0.5 * (np.array(rows) + np.array(rows).T))
 
 
 def block_gradients(image: Texels, points: Cells, pose: Pose) -> Array:
-    """Gradients (B, 6), in the camera's frame, of the points in each block of the sphere."""
+    """Gradients (B, 6), in the camera's frame, of the points in each block of the sphere, as if left out."""
     offsets, levels, weights = points
     block = cell_of(offsets.T / np.linalg.norm(offsets, axis=0)[:, None], BLOCK_RINGS)
     parts = np.split(np.argsort(block, kind="stable"), np.cumsum(np.bincount(block))[:-1])
     chosen = (Cells(offsets[:, part], levels[:, part], weights[part]) for part in parts if len(part))
-    found = [gradient_at(image, part, pose.R_cam_from_world, np.zeros(3)) for part in chosen]
-    gradients = np.reshape(found, (-1, 6))
-    return np.asarray(gradients[gradients.any(axis=1)])  # blocks that the photo does not show have none
+    found = [equations_at(image, part, pose.R_cam_from_world, np.zeros(3)) for part in chosen]
+    found = [(gradient, matrix) for gradient, matrix in found if gradient.any()]  # what the photo shows
+    if not found:
+        return np.empty((0, 6))
+    gradients, matrices = (np.array(values) for values in zip(*found, strict=True))
+    return as_left_out(gradients, matrices)
+
+
+def as_left_out(gradients: Array, matrices: Array) -> Array:
+    """Gradients (B, 6) of blocks as they would be at a pose found without the block, by matrices (B, 6, 6).
+
+    The more of what fixes the pose lies in one block, the more the pose has followed its errors, and the less
+    of them its gradient shows: g <- (I - A_b A^-1)^-1 g, of the block's part A_b of the Gauss-Newton matrix A
+    (the estimate CR3 of Bell and McCaffrey, 2002).
+    """
+    shares = matrices @ np.linalg.pinv(matrices.sum(axis=0))
+    return np.asarray(np.linalg.solve(MOST_SHARE * np.eye(6) - shares, gradients[..., None])[..., 0])
 
 
 def covariance_of(hessian: Array, gradients: Array) -> Array | None:
     """Covariance (6, 6) [rad, m] in the camera's frame, robust to errors that go together within a block.
 
-    The sandwich H^-1 (sum g g^T) H^-1 (Huber 1967; Liang and Zeger 1986 for clusters), with the usual factor
-    for few blocks. None where the points do not fix the pose.
+    The sandwich H^-1 (sum g g^T) H^-1 (Huber 1967; Liang and Zeger 1986 for clusters). None where the points
+    do not fix the pose.
     """
     variances, axes = np.linalg.eigh(hessian)
     if len(gradients) <= 12 or variances[0] <= 1e-9 * variances[-1]:
         return None
     inverse = (axes / variances) @ axes.T
-    middle = gradients.T @ gradients * (len(gradients) / (len(gradients) - 6))
-    return np.asarray(inverse @ middle @ inverse)
+    return np.asarray(inverse @ (gradients.T @ gradients) @ inverse)
 
 
 def covariance_at(query: Query, points: Cells, pose: Pose) -> Array | None:
@@ -113,7 +133,7 @@ def estimate_covariance(query: Query, pose: Pose) -> PoseCovariance | None:
     R_map_from_cam, R_map_from_world = pose.R_cam_from_world.T, query.scan_map.R_map_from_world
     J = np.eye(6)
     J[3:, 3:] = R_map_from_cam
-    covariance_map = J @ covariance @ J.T
+    covariance_map = J @ covariance @ J.T + np.diag([LEAST_TURN**2] * 3 + [LEAST_MOVE**2] * 3)
     J[3:, 3:] = R_map_from_world.T
     covariance_world = J @ covariance_map @ J.T
     words = least_constrained_direction(covariance_map[3:, 3:], covariance_world[3:, 3:], points.offsets)
