@@ -11,6 +11,7 @@ import rooms
 from piccolo.coarse_to_fine.comparison import (
     CONTRADICTS,
     Comparison,
+    add_misfits,
     compare,
     correlate_blocks,
     sample_photo,
@@ -21,7 +22,7 @@ from piccolo.coarse_to_fine.query import prepare_query
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.confidence.score import Evidence
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
-from piccolo.geometry.sphere import cell_of, make_grid, pixel_rays, solid_angles
+from piccolo.geometry.sphere import cell_of, pixel_rays, solid_angles
 from piccolo.local_features.hypotheses import count_matches
 from piccolo.optimize.channel_loss import BLOCK_RINGS, CHANCE, NUM_BLOCKS
 from piccolo.panorama import Panorama
@@ -68,21 +69,16 @@ def test_a_photo_is_sampled_as_its_twin():
     v, u = np.mgrid[0:128, 0:256] / 256 * 2 * np.pi
     rgb = np.stack([127 + 100 * np.sin((k + 1) * u + v) for k in range(3)], axis=-1).astype(np.uint8)
     offsets, texels = rng.normal(size=(3, 900)).astype(np.float32), pack_texels(rgb, is_valid)
-    weights, grid = rng.uniform(0.5, 1.5, 900).astype(np.float32), make_grid(BLOCK_RINGS)
-    colors, shared, blocks = (
-        np.empty((3, 900), np.float32),
-        np.empty(900, np.float32),
-        np.empty(900, np.int32),
-    )
+    weights = rng.uniform(0.5, 1.5, 900).astype(np.float32)
+    colors, shared, rays = (np.empty(shape, np.float32) for shape in ((3, 900), 900, (3, 900)))
     photo = texels.rgbx, texels.width
-    sample_photo(offsets, weights, photo, TILTED, (grid.num_columns, grid.first), colors, shared, blocks)
+    sample_photo(offsets, weights, photo, TILTED, colors, shared, rays)
     pixels = naive.project(offsets.T, TILTED, np.zeros(3), 256)
     r, g, b = naive.sample(rgb, pixels).T / 255
     np.testing.assert_allclose(colors, [(r + g + b) / 3, (r - b) / 2, (2 * g - r - b) / 4], atol=2e-3)
     shows = naive.sample(is_valid[..., None], pixels)[:, 0] > 1 - 1e-9
     assert (shared == weights * shows).mean() > 0.995
-    rays = (offsets / np.linalg.norm(offsets, axis=0)).T @ TILTED.T
-    assert (blocks == cell_of(rays.astype(np.float32), BLOCK_RINGS)).mean() > 0.995
+    np.testing.assert_allclose(rays, TILTED @ offsets, atol=1e-5)
 
 
 def test_blocks_correlate_as_their_twin():
@@ -103,21 +99,48 @@ def test_score_and_ratio_by_hand():
     """Blocks below chance give nothing; only what both poses show is compared."""
     half = CHANCE + 0.5 * (1 - CHANCE)
     area = np.array([0.2, 0.1, 0.1])
-    a = Comparison(np.array([half, 0.1, -0.9]), area, area, 0.5)
+    rest = 0.5, area, area  # valid area; misfits and areas of finer cells
+    a = Comparison(np.array([half, 0.1, -0.9]), area, area, *rest)
     assert a.score == pytest.approx(0.5 * 0.2 / 0.5)
-    b = Comparison(np.array([1.0, 1.0, half]), area, np.array([0.1, 0.0, 0.1]), 0.5)
+    b = Comparison(np.array([1.0, 1.0, half]), area, np.array([0.1, 0.0, 0.1]), *rest)
     assert a.ratio_to(b) == pytest.approx((0.5 * 0.1) / (1.0 * 0.1 + 0.5 * 0.1))
     assert b.ratio_to(a) == pytest.approx(1 / a.ratio_to(b))
     assert a.ratio_to(a) == 1.0
-    elsewhere = Comparison(np.ones(3), area, np.array([0.01, 0.0, 0.3]), 0.5)
-    other = Comparison(np.ones(3), area, np.array([0.3, 0.0, 0.02]), 0.5)
+    elsewhere = Comparison(np.ones(3), area, np.array([0.01, 0.0, 0.3]), *rest)
+    other = Comparison(np.ones(3), area, np.array([0.3, 0.0, 0.02]), *rest)
     assert elsewhere.ratio_to(other) == 0.0
+
+
+def test_the_lead_is_a_sum_of_leads_by_its_deviation():
+    area, nothing = np.array([0.1, 0.2, 0.1, 0.0]), np.zeros(4)
+    fits, other = (
+        Comparison(*[nothing] * 3, 0.5, np.array(misfit) * area, area)
+        for misfit in ([0.1, 0.2, 0.5, 0.9], [0.4, 0.2, 0.4, 0.1])
+    )
+    leads = np.array([0.3 * 0.1, 0.0, -0.1 * 0.1])
+    assert fits.lead_over(other) == pytest.approx(leads.sum() / np.sqrt(leads @ leads))
+    assert other.lead_over(fits) == -fits.lead_over(other)
+    assert fits.lead_over(fits) == 0.0
+    apart = other._replace(cell_area=np.array([0.0, 0.0, 0.01, 0.4]))
+    assert fits.lead_over(apart) == 0.0
+
+
+def test_misfits_add_up_as_their_twin():
+    rng = np.random.default_rng(4)
+    first, second = (rng.normal(size=(3, 800)).astype(np.float32) for _ in range(2))
+    shared, blocks = rng.uniform(size=800).astype(np.float32), rng.integers(5, size=800).astype(np.int32)
+    misfit, area = np.empty(6), np.empty(6)
+    add_misfits(first, second, shared, blocks, misfit, area)
+    square = ((first.astype(float) - second) ** 2).sum(axis=0)
+    np.testing.assert_allclose(misfit, np.bincount(blocks, shared * square / (1 + square), 6), rtol=1e-5)
+    np.testing.assert_allclose(area, np.bincount(blocks, shared, 6), rtol=1e-5)
 
 
 def test_the_true_pose_explains_more_than_others():
     seen, true_pose = _clean()
     assert 0.6 < seen.score < 1.0
     assert seen.ratio_to(seen) == 1.0
+    assert seen.lead_over(seen) == 0.0
     assert seen.valid_area == pytest.approx(1.0, abs=1e-3)
     query = _query(rooms.query(1).rgb)
     turned = compare(query, Pose(yaw_rotation(1.0) @ true_pose.R_cam_from_world, true_pose.center_world))

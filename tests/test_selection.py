@@ -36,7 +36,8 @@ def _places(hypotheses):
 def _seen(explains, num_blocks=4):
     """A comparison that explains a part of each of some blocks of a hundredth of the sphere."""
     beyond = CHANCE + (1.0 - CHANCE) * explains
-    return Comparison(np.full(num_blocks, beyond), *[np.full(num_blocks, 0.01)] * 2, 0.04)
+    area = np.full(num_blocks, 0.01)
+    return Comparison(np.full(num_blocks, beyond), area, area, 0.04, (1.0 - explains) * area, area)
 
 
 def test_of_poses_that_matches_gave_the_better_end_is_taken(monkeypatch):

@@ -74,8 +74,10 @@ def outcome_of(line: str) -> Outcome | None:
     if result.best_pose is None or result.evidence is None or result.probability_none is None:
         return None
     e, poses = result.evidence, [result.best_pose, *(a.pose for a in result.alternatives)]
-    standings = [Standing(1.0, e.score, e.num_matches)]
-    standings += [Standing(a.share or 0.0, a.score, a.num_matches or 0) for a in result.alternatives]
+    standings = [Standing(1.0, 0.0, e.score, e.num_matches)]
+    standings += [
+        Standing(a.share or 0.0, a.lead or 0.0, a.score, a.num_matches or 0) for a in result.alternatives
+    ]
     error, right = np.full(6, np.nan), len(poses)
     if isinstance(truth, dict):
         true_pose = Pose(np.array(truth["R_cam_from_world"]), np.array(truth["center_world"]))
@@ -102,7 +104,7 @@ def fit(outcomes: Sequence[Outcome]) -> ChoiceModel:
         total, gradient = 0.5 * PENALTY * w @ w, PENALTY * w
         v = w / deviations
         for features, none, o in zip(poses, nones, outcomes, strict=True):
-            logits = np.append(features @ v[:3], none @ v[3:])
+            logits = np.append(features @ v[:-2], none @ v[-2:])
             p = np.exp(logits - logits.max())
             p /= p.sum()
             total -= np.log(max(p[o.right], 1e-300))
@@ -110,9 +112,9 @@ def fit(outcomes: Sequence[Outcome]) -> ChoiceModel:
             gradient = gradient + np.append(p[:-1] @ features, p[-1] * none) / deviations
         return float(total), gradient
 
-    bounds = [(0.0, None)] * 3 + [(None, None), (0.0, None)]
-    v = minimize(loss, np.zeros(5), jac=True, method="L-BFGS-B", bounds=bounds).x / deviations
-    return ChoiceModel(tuple(v[:3].tolist()), (float(v[3]), float(v[4])))
+    bounds = [(0.0, None)] * len(FEATURES) + [(None, None), (0.0, None)]
+    v = minimize(loss, np.zeros(len(bounds)), jac=True, method="L-BFGS-B", bounds=bounds).x / deviations
+    return ChoiceModel(tuple(v[:-2].tolist()), (float(v[-2]), float(v[-1])))
 
 
 def with_model(outcome: Outcome, model: ChoiceModel) -> Outcome:

@@ -1,12 +1,11 @@
 """What speaks for the pose that was found and against it, and the status that follows."""
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
-from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
-from ..confidence.confidence import NOT_LOCALIZED, Standing, classify, posterior
+from ..confidence.alternatives import MAX_ALTERNATIVES
+from ..confidence.confidence import NOT_LOCALIZED, classify, posterior
 from ..confidence.localization import Alternative, Localization
 from ..confidence.occlusion import occlusion_at
 from ..confidence.score import Evidence, agreement_at
@@ -20,10 +19,10 @@ from ..panorama import Panorama
 from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
 from ..render.zbuffer import visible_points
-from .comparison import compare
 from .covariance import estimate_covariance
 from .query import Query
 from .search_result import SURE_MATCHES, SearchResult
+from .standings import standings_of
 
 ENOUGH_EXPLAINED = 0.7  # score from which a photo is not mirrored
 MIRROR_RATIO = 1.2  # of matches, mirrored by not
@@ -54,7 +53,7 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
     if classify(probabilities, settings.min_confidence) != NOT_LOCALIZED and is_mirrored(query, evidence):
         probabilities, warnings = np.append(np.zeros(len(standings)), 1.0), (MIRRORED,)
     alternatives = tuple(
-        Alternative(scan_map.to_world(h.pose), h.score, s.share, s.num_matches, float(p))
+        Alternative(scan_map.to_world(h.pose), h.score, s.share, s.lead, s.num_matches, float(p))
         for h, s, p in zip(reported, standings[1:], probabilities[1:-1], strict=True)
     )
     return Localization(
@@ -85,16 +84,6 @@ def evidence_of(query: Query, panorama: Panorama, pose: Pose, found: SearchResul
         num_matches=count_matches(query.matches, found.best.pose),
         alternative_matches=max([0, *(count_matches(query.matches, h.pose) for h in found.alternatives)]),
     )
-
-
-def standings_of(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> list[Standing]:
-    """What speaks for the best pose and for others elsewhere."""
-    at_best = compare(query, best.pose)
-    shares = [1.0, *(compare(query, h.pose).ratio_to(at_best) for h in others)]
-    return [
-        Standing(share, h.score, count_matches(query.matches, h.pose))
-        for share, h in zip(shares, [best, *others], strict=True)
-    ]
 
 
 def is_mirrored(query: Query, evidence: Evidence) -> bool:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import compress
 from typing import Literal
 
 from ..confidence.alternatives import Hypothesis
@@ -11,7 +12,6 @@ from ..local_features.hypotheses import count_matches, poses_of
 from ..panorama import Panorama
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
-from .comparison import compare
 from .config import METHOD, MethodConfig
 from .evaluation import evaluate
 from .prior import apply_prior, is_allowed, nothing_allowed
@@ -19,14 +19,15 @@ from .query import Query, prepare_query
 from .refinement import refine, refine_full_resolution, refine_matched, settle
 from .scan_map import ScanMap
 from .search import search_poses
-from .search_result import SearchResult, found_among
+from .search_result import NEAR_RATIO, SURE_MATCHES, SearchResult, found_among
 from .settings import CoarseToFineSettings
+from .standings import fairly_selected
 
 NUM_MATCHED = 6  # poses from matches that are refined
 ALTERNATIVES_COMPARED, ALTERNATIVES_REFINED = 8, 4  # at most
 HOPELESS_SCORE = 0.02  # of black, white and noisy pictures, and of most views of other places
 FAINT_SCORE, FAINT_MATCHES = 0.1, 6  # nothing that has less of both is ever localized
-FAIRLY_BETTER = 1.05  # what an alternative explains of what both show, by the best, to take its place
+NEAR_MATCHES = 0.5  # an alternative with this part of the matches is refined as carefully as the best
 NO_PIXEL = "the panorama: no pixel counts, all are masked"
 
 
@@ -94,23 +95,10 @@ def finished(query: Query, hypotheses: Sequence[Hypothesis]) -> SearchResult:
     if found.best.score < HOPELESS_SCORE:
         return found
     is_faint = found.best.score < FAINT_SCORE and matches_of(found.best) < FAINT_MATCHES
-    near = found.near[: 1 if is_faint else ALTERNATIVES_REFINED]
+    least = max(NEAR_MATCHES * matches_of(found.best), SURE_MATCHES)
+    is_near = [h.score > NEAR_RATIO * found.best.score or matches_of(h) >= least for h in found.alternatives]
+    near = list(compress(found.alternatives, is_near))[: 1 if is_faint else ALTERNATIVES_REFINED]
     ends = list(query.workers.map(refined, [found.best, *near], "descend"))
-    far = found.alternatives[len(near) :]
+    far = [h for h in found.alternatives if not any(h is other for other in near)]
     found = fairly_selected(query, found_among([*ends, *far], ALTERNATIVES_COMPARED))
     return replace(found, best=settle(query, found.best))
-
-
-def fairly_selected(query: Query, found: SearchResult) -> SearchResult:
-    """The same with the margin over what both views show; one that explains more of that becomes the best."""
-    if not found.alternatives:
-        return found
-    ranked = [found.best, *found.alternatives]
-    seen = list(query.workers.map(lambda h: compare(query, h.pose), ranked, "compare"))
-    best = 0
-    for k in range(1, len(ranked)):
-        if seen[k].ratio_to(seen[best]) > FAIRLY_BETTER:
-            best = k
-    others = [k for k in range(len(ranked)) if k != best]
-    rival_ratio = max(seen[k].ratio_to(seen[best]) for k in others)
-    return SearchResult(ranked[best], tuple(ranked[k] for k in others), rival_ratio)

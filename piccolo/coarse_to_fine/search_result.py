@@ -32,11 +32,6 @@ class SearchResult:
         is_alone = self.margin >= 1.0 - SURE_RATIO
         return is_alone and self.best.score >= SURE_SCORE and num_matches >= SURE_MATCHES
 
-    @property
-    def near(self) -> list[Hypothesis]:
-        """The alternatives that come near the best."""
-        return [h for h in self.alternatives if h.score > NEAR_RATIO * self.best.score]
-
 
 NOTHING = SearchResult(Hypothesis(Pose(np.eye(3), np.zeros(3)), -1.0), ())
 
