@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import rooms
 
-from piccolo.coarse_to_fine import evaluation, refinement
+from piccolo.coarse_to_fine import evaluation, refinement, standings
 from piccolo.coarse_to_fine import localize as method
 from piccolo.coarse_to_fine.comparison import Comparison
 from piccolo.coarse_to_fine.config import METHOD
@@ -52,47 +52,70 @@ def test_of_poses_that_matches_gave_the_better_end_is_taken(monkeypatch):
     assert [(h.pose.center_world[0], h.score) for h in found] == [(5.0, 0.6), (1.0, 0.5)]
 
 
-def test_alternatives_that_come_near_are_refined_and_what_explains_more_wins(monkeypatch):
-    """The third explains more of what both show, though its score is less; the far one stays as it is."""
-    explains = {0.0: 0.5, 3.0: 0.4, 6.0: 0.6, 9.0: 0.1}
-    refined = []
+def _compared(monkeypatch, explains, counts):
+    """Made-up comparisons and matches, by the x of a pose."""
+    query = SimpleNamespace(**vars(QUERY), matches=None)
+    for module in (method, standings):
+        count = lambda matches, pose: counts.get(pose.center_world[0], 0)  # noqa: E731
+        monkeypatch.setattr(module, "count_matches", count)
+    monkeypatch.setattr(standings, "compare", lambda query, pose: _seen(explains[pose.center_world[0]]))
+    return query
+
+
+def test_alternatives_that_come_near_are_refined_and_the_greatest_odds_win(monkeypatch):
+    """By score or by matches; the third explains more of what both show, though its score is less."""
+    explains = {0.0: 0.5, 3.0: 0.4, 6.0: 0.6, 9.0: 0.1, 12.0: 0.1}
+    query, refined = _compared(monkeypatch, explains, {0.0: 20, 3.0: 3, 6.0: 21, 9.0: 11, 12.0: 12}), []
 
     def full(query, h, num_rounds):
         refined.append((h.pose.center_world[0], num_rounds))
         return Hypothesis(h.pose, h.score + 0.01)
 
     monkeypatch.setattr(method, "refine_full_resolution", full)
-    monkeypatch.setattr(method, "compare", lambda query, pose: _seen(explains[pose.center_world[0]]))
     monkeypatch.setattr(method, "settle", lambda query, h: h)
-    found = method.finished(QUERY, [_at(9.0, 0.1), _at(0.0, 0.5), _at(6.0, 0.31), _at(3.0, 0.4)])
-    assert refined == [(0.0, 2), (3.0, 2), (6.0, 2)]
+    hypotheses = [_at(9.0, 0.1), _at(0.0, 0.5), _at(6.0, 0.31), _at(3.0, 0.4), _at(12.0, 0.05)]
+    found = method.finished(query, hypotheses)
+    assert refined == [(0.0, 2), (3.0, 2), (6.0, 2), (12.0, 2)]
     assert found.best == Hypothesis(found.best.pose, 0.32)
-    assert _places([found.best, *found.alternatives]) == [6.0, 0.0, 3.0, 9.0]
+    assert _places([found.best, *found.alternatives]) == [6.0, 0.0, 3.0, 9.0, 12.0]
     assert found.rival_ratio == pytest.approx(0.5 / 0.6)
 
 
 @pytest.mark.parametrize(("best", "num_matches", "num_refined"), [(0.09, 5, 2), (0.09, 6, 5), (0.1, 5, 5)])
 def test_of_faint_poses_one_alternative_is_refined(monkeypatch, best, num_matches, num_refined):
-    refined = []
-    query = SimpleNamespace(**vars(QUERY), matches=None)
-    monkeypatch.setattr(method, "count_matches", lambda matches, pose: num_matches)
+    places, refined = [3.0 * k for k in range(8)], []
+    query = _compared(monkeypatch, dict.fromkeys(places, 0.1), dict.fromkeys(places, num_matches))
     monkeypatch.setattr(method, "refine_full_resolution", lambda query, h, num_rounds: refined.append(h) or h)
-    monkeypatch.setattr(method, "compare", lambda query, pose: _seen(0.1))
     monkeypatch.setattr(method, "settle", lambda query, h: h)
     method.finished(query, [_at(3.0 * k, best - 0.001 * k) for k in range(8)])
     assert len(refined) == num_refined
 
 
-def test_an_alternative_must_explain_five_hundredths_more_to_win(monkeypatch):
-    for other, best in ((0.52, 0.0), (0.53, 3.0)):
-        explains = {0.0: 0.5, 3.0: other}
-        monkeypatch.setattr(
-            method, "compare", lambda query, pose, of=explains: _seen(of[pose.center_world[0]])
-        )
-        found = method.fairly_selected(QUERY, SearchResult(_at(0.0, 0.5), (_at(3.0, 0.4),)))
-        assert _places([found.best]) == [best]
+@pytest.mark.parametrize(
+    ("explains", "matches", "best"),
+    [
+        ((0.5, 0.5), (20, 20), 0.0),  # by score
+        ((0.5, 0.6), (20, 20), 3.0),  # by what both views show
+        ((0.5, 0.5), (20, 60), 3.0),  # by matches
+        ((0.5, 0.3), (20, 60), 0.0),
+    ],
+)
+def test_the_pose_with_the_greatest_odds_is_selected(monkeypatch, explains, matches, best):
+    query = _compared(
+        monkeypatch, *(dict(zip((0.0, 3.0), pair, strict=True)) for pair in (explains, matches))
+    )
+    found = standings.fairly_selected(query, SearchResult(_at(0.0, 0.5), (_at(3.0, 0.4),)))
+    assert _places([found.best]) == [best]
+    assert found.rival_ratio == pytest.approx(explains[0 if best else 1] / explains[1 if best else 0])
     alone = SearchResult(_at(0.0, 0.5), ())
-    assert method.fairly_selected(QUERY, alone) is alone
+    assert standings.fairly_selected(query, alone) is alone
+
+
+def test_what_speaks_for_poses_is_compared_with_the_best(monkeypatch):
+    query = _compared(monkeypatch, {0.0: 0.6, 3.0: 0.3}, {0.0: 9, 3.0: 4})
+    best, other = standings.standings_of(query, _at(0.0, 0.5), [_at(3.0, 0.2)])
+    assert best == (1.0, 0.0, 0.5, 9)
+    assert other == (pytest.approx(0.5), pytest.approx(-2.0), 0.2, 4)  # four cells of the same lead
 
 
 def test_margin_is_the_lesser_of_two_leads_and_a_result_is_sure_by_three_things():
@@ -126,8 +149,7 @@ def _run(monkeypatch, matched, searches, gravity="auto", config=METHOD):
     monkeypatch.setattr(method, "prepare_query", lambda *_: SimpleNamespace(**vars(QUERY), matches=None))
     monkeypatch.setattr(method, "matched_poses", lambda query: "matched")
     monkeypatch.setattr(method, "refine_matched", lambda query, poses: list(matched))
-    monkeypatch.setattr(method, "count_matches", lambda _, pose: 100 * scores.get(pose.center_world[0], 0))
-    monkeypatch.setattr(method, "compare", lambda query, pose: _seen(scores[pose.center_world[0]]))
+    _compared(monkeypatch, scores, {x: 100 * score for x, score in scores.items()})
     monkeypatch.setattr(method, "search_poses", search_poses)
     monkeypatch.setattr(method, "refine", lambda query, starts, beam: left.pop(0))
     monkeypatch.setattr(method, "refine_full_resolution", lambda query, h, num_rounds: h)
@@ -178,12 +200,12 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
         "agreement_at": lambda points, panorama, pose: Agreement(0.8, 1.0),
         "occlusion_at": lambda *_: SimpleNamespace(fractions=lambda: (0.6, 0.3)),
         "count_matches": lambda matches, pose: counts.get(pose.center_world[0], 0),
-        "compare": lambda query, pose: _seen(0.6 - 0.1 * pose.center_world[0]),
         "estimate_covariance": lambda *_: None,
         "is_mirrored": lambda *_: False,
     }.items():
         monkeypatch.setattr(evaluation, name, value)
     alternatives = _at(1.0, 0.3), _at(2.0, 0.2)
+    _compared(monkeypatch, {0.0: 0.6, 1.0: 0.5, 2.0: 0.4} | {1.0 + 0.001 * k: 0.5 for k in range(9)}, counts)
     found = evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(_at(0.0, 0.6), alternatives, 0.7))
     e = found.evidence
     assert (e.score, e.agreement, e.seen_fraction) == (0.6, 0.8, 1.0)
@@ -194,6 +216,7 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
     assert found.loss == 0.07
     told = [(a.score, round(a.share, 6), a.num_matches) for a in found.alternatives]
     assert told == [(0.3, round(0.5 / 0.6, 6), 4), (0.2, round(0.4 / 0.6, 6), 6)]
+    assert all(a.lead == pytest.approx(-2.0) for a in found.alternatives)
     stated = [found.confidence, *(a.probability for a in found.alternatives), found.probability_none]
     assert sum(stated) == pytest.approx(1.0)
     assert stated[0] > stated[1] > stated[2]
