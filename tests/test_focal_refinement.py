@@ -8,7 +8,7 @@ from rooms import scan_map
 from test_localize_cameras import place, scan
 
 import piccolo
-from piccolo.camera import Camera, Mount
+from piccolo.camera import Calibration, Camera, Mount
 from piccolo.camera.model import pinhole
 from piccolo.camera.resampling import View, recalibrated, sphere_of
 from piccolo.coarse_to_fine import focal_refinement as focal
@@ -135,3 +135,14 @@ def test_what_has_no_focal_length_is_refused_and_what_cannot_be_told_stays():
     result = scan().localize(rgb, focal_px=100.0, refine_focal=True)
     assert result.warnings[-1] == focal.NOT_REFINED
     assert result.cameras == (Mount(pinhole(160, 120, 100.0)),)
+
+
+def test_pictures_of_a_result_are_made_with_its_refined_camera():
+    found = (Mount(pinhole(640, 480, 321.5)),)
+    options = ReadOptions(focal_px=300.0, refine_focal=True).refined(found)
+    assert (options.focal_px, options.calibration.mounts) == (None, found)
+    turned = Mount(pinhole(640, 480, 300.0), ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
+    given = ReadOptions(calibration=Calibration("a.json", (turned,)), refine_focal=True)
+    assert given.refined(found).calibration.mounts == (turned.with_camera(found[0].camera),)
+    plain = ReadOptions(focal_px=300.0)
+    assert plain.refined(found) is plain

@@ -160,7 +160,8 @@ def report(run: Run, scan: Scan, result: Result) -> None:
     if result.error is not None:
         print_error(arguments, result.error, EXIT_BAD_INPUT)
         return
-    pano, pose, read_options = Path(result.pano), result.best_pose, run.batch.read_options
+    pano, pose = Path(result.pano), result.best_pose
+    read_options = run.batch.read_options.refined(result.cameras)
     if arguments.overlay and pose is not None:
         panorama = read_panorama(pano, read_options)
         png = overlay_png(scan.points, panorama, scan.from_world(pose), scan.workers)

@@ -1,7 +1,7 @@
 """A panorama at any size, what is known of it, and how it is to be read."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Calibration, Mount
+from ..camera.rig import IDENTITY
 from ..cloud.label_colors import Labels
 from ..errors import InputError
 
@@ -73,6 +74,16 @@ class ReadOptions:
     def rig(self) -> Calibration | None:
         """The rig whose pictures a panorama is made of; None for pictures that stand alone."""
         return self.calibration if self.calibration is not None and self.calibration.is_rig else None
+
+    def refined(self, cameras: tuple[Mount, ...]) -> "ReadOptions":
+        """The same with the camera that a result refined, as a calibration of the picture as it is stored."""
+        if not self.refine_focal or len(cameras) != 1:
+            return self
+        given = self.calibration
+        R_lens_from_cam = IDENTITY if given is None or given.is_choice else given.mounts[0].R_lens_from_cam
+        mount = replace(cameras[0], R_lens_from_cam=R_lens_from_cam)
+        camera = Calibration("the refined camera", (mount,))
+        return replace(self, calibration=camera, focal_px=None, fov_deg=None, projection=None)
 
     def _check_together(self) -> None:
         """Refuse options that say the same thing twice, or of different pictures."""
