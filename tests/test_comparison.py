@@ -11,7 +11,6 @@ import rooms
 from piccolo.coarse_to_fine.comparison import (
     CONTRADICTS,
     Comparison,
-    add_misfits,
     compare,
     correlate_blocks,
     sample_photo,
@@ -99,48 +98,21 @@ def test_score_and_ratio_by_hand():
     """Blocks below chance give nothing; only what both poses show is compared."""
     half = CHANCE + 0.5 * (1 - CHANCE)
     area = np.array([0.2, 0.1, 0.1])
-    rest = 0.5, area, area  # valid area; misfits and areas of finer cells
-    a = Comparison(np.array([half, 0.1, -0.9]), area, area, *rest)
+    a = Comparison(np.array([half, 0.1, -0.9]), area, area, 0.5)
     assert a.score == pytest.approx(0.5 * 0.2 / 0.5)
-    b = Comparison(np.array([1.0, 1.0, half]), area, np.array([0.1, 0.0, 0.1]), *rest)
+    b = Comparison(np.array([1.0, 1.0, half]), area, np.array([0.1, 0.0, 0.1]), 0.5)
     assert a.ratio_to(b) == pytest.approx((0.5 * 0.1) / (1.0 * 0.1 + 0.5 * 0.1))
     assert b.ratio_to(a) == pytest.approx(1 / a.ratio_to(b))
     assert a.ratio_to(a) == 1.0
-    elsewhere = Comparison(np.ones(3), area, np.array([0.01, 0.0, 0.3]), *rest)
-    other = Comparison(np.ones(3), area, np.array([0.3, 0.0, 0.02]), *rest)
+    elsewhere = Comparison(np.ones(3), area, np.array([0.01, 0.0, 0.3]), 0.5)
+    other = Comparison(np.ones(3), area, np.array([0.3, 0.0, 0.02]), 0.5)
     assert elsewhere.ratio_to(other) == 0.0
-
-
-def test_the_lead_is_a_sum_of_leads_by_its_deviation():
-    area, nothing = np.array([0.1, 0.2, 0.1, 0.0]), np.zeros(4)
-    fits, other = (
-        Comparison(*[nothing] * 3, 0.5, np.array(misfit) * area, area)
-        for misfit in ([0.1, 0.2, 0.5, 0.9], [0.4, 0.2, 0.4, 0.1])
-    )
-    leads = np.array([0.3 * 0.1, 0.0, -0.1 * 0.1])
-    assert fits.lead_over(other) == pytest.approx(leads.sum() / np.sqrt(leads @ leads))
-    assert other.lead_over(fits) == -fits.lead_over(other)
-    assert fits.lead_over(fits) == 0.0
-    apart = other._replace(cell_area=np.array([0.0, 0.0, 0.01, 0.4]))
-    assert fits.lead_over(apart) == 0.0
-
-
-def test_misfits_add_up_as_their_twin():
-    rng = np.random.default_rng(4)
-    first, second = (rng.normal(size=(3, 800)).astype(np.float32) for _ in range(2))
-    shared, blocks = rng.uniform(size=800).astype(np.float32), rng.integers(5, size=800).astype(np.int32)
-    misfit, area = np.empty(6), np.empty(6)
-    add_misfits(first, second, shared, blocks, misfit, area)
-    square = ((first.astype(float) - second) ** 2).sum(axis=0)
-    np.testing.assert_allclose(misfit, np.bincount(blocks, shared * square / (1 + square), 6), rtol=1e-5)
-    np.testing.assert_allclose(area, np.bincount(blocks, shared, 6), rtol=1e-5)
 
 
 def test_the_true_pose_explains_more_than_others():
     seen, true_pose = _clean()
     assert 0.6 < seen.score < 1.0
     assert seen.ratio_to(seen) == 1.0
-    assert seen.lead_over(seen) == 0.0
     assert seen.valid_area == pytest.approx(1.0, abs=1e-3)
     query = _query(rooms.query(1).rgb)
     turned = compare(query, Pose(yaw_rotation(1.0) @ true_pose.R_cam_from_world, true_pose.center_world))

@@ -14,7 +14,7 @@ from piccolo.result import Result, Source, unreadable_result
 POSE = Pose(exp_so3(np.array([0.3, -0.2, 0.9])), np.array([500_000.123, 4_000_000.456, 12.0]))
 EVIDENCE = Evidence(0.7, 0.5, 0.8, 0.6, 0.9, 0.5)
 ALTERNATIVE = Alternative(
-    Pose(exp_so3(np.array([0.1, 0.2, -2.0])), np.array([1.0, 2.0, 3.0])), 0.2, 0.3, -2.5, 7, 0.008
+    Pose(exp_so3(np.array([0.1, 0.2, -2.0])), np.array([1.0, 2.0, 3.0])), 0.2, 0.3, 7, 0.008
 )
 RESULT = Result(
     status="localized",

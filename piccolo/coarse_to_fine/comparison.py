@@ -16,14 +16,13 @@ from ..geometry.sphere import cell_of, make_grid, pixel_rays
 from ..optimize.channel_loss import BLOCK_RINGS, CHANCE, NUM_BLOCKS
 from ..panorama.local_normalization import opponent, zscore
 from ..panorama.texels import blend, is_valid, texels_around
-from ..runtime.jit import F0, F1, kernel
+from ..runtime.jit import F0, kernel
 from .cells import local_statistics, locate
 from .query import Query
 from .view import render_cells, thread_scratch
 
 CONTRADICTS = 0.1  # a block of less is left out of the local means and deviations
 LEAST_SHARED = 0.3  # of what the poorer view shows
-CELL_RINGS = 12  # of cells of 15 degrees, in which two poses are told apart
 MASK_WIDTH = 256  # [px] of the mask of blocks that contradict
 PER_LEVEL = np.float32(1.0 / 255.0)
 
@@ -35,8 +34,6 @@ class Comparison(NamedTuple):
     area: NDArray[np.float64]  # (blocks,) fractions of the sphere that both show and do not contradict
     visible_area: NDArray[np.float64]  # (blocks,) that both show
     valid_area: float  # of the sphere that the photo shows
-    misfit: NDArray[np.float64]  # (cells,) finer than blocks: what colours differ by, at most the area
-    cell_area: NDArray[np.float64]  # (cells,) that both show
 
     @property
     def score(self) -> float:
@@ -56,19 +53,6 @@ class Comparison(NamedTuple):
         mine, others = (np.maximum(c.correlation - CHANCE, 0.0) @ shared for c in (self, other))
         return float(mine / max(others, 1e-9))
 
-    def lead_over(self, other: "Comparison") -> float:
-        """By how many standard deviations this pose fits better than another where both views show something.
-
-        The sum over cells of what misfits differ by, by the root of the sum of their squares. 0 where hardly
-        anything is shared.
-        """
-        shared = np.minimum(self.cell_area, other.cell_area)
-        if shared.sum() < LEAST_SHARED * min(self.cell_area.sum(), other.cell_area.sum()):
-            return 0.0
-        mine, others = (c.misfit / np.maximum(c.cell_area, 1e-12) for c in (self, other))
-        leads = shared * (others - mine)
-        return float(leads.sum() / max(math.sqrt(leads @ leads), 1e-12))
-
 
 @kernel
 def sample_photo(offsets, weights, photo, R_cam_from_map, colors, shared, rays):
@@ -87,18 +71,6 @@ def sample_photo(offsets, weights, photo, R_cam_from_map, colors, shared, rays):
         b = blend(t00, t10, t01, t11, bilinear, 16) * PER_LEVEL
         colors[0, n], colors[1, n], colors[2, n] = opponent(r, g, b)
         rays[0, n], rays[1, n], rays[2, n] = x, y, z
-
-
-@kernel
-def add_misfits(first, second, shared, blocks, misfit, area):
-    """Write by block what two sets of channels (3, N) differ by, of each cell at most 1, and the area."""
-    misfit[:], area[:] = 0.0, 0.0
-    for n in range(len(shared)):
-        square = F0
-        for k in range(3):
-            square += (first[k, n] - second[k, n]) ** 2
-        misfit[blocks[n]] += shared[n] * square / (square + F1)
-        area[blocks[n]] += shared[n]
 
 
 @kernel
@@ -135,26 +107,25 @@ def correlate_blocks(first, second, shared, blocks, correlation, area):
 
 
 @kernel
-def compare_cells(offsets, colors, weights, photo, R_cam_from_map, view, grids, by_block, by_cell):
-    """Write what speaks for a pose, of cells (3, N) around it, by blocks and by finer cells of the photo.
+def compare_cells(
+    offsets, colors, weights, photo, R_cam_from_map, view, grid, correlation, area, visible_area
+):
+    """Write the correlation and the shared area (blocks,) of cells (3, N) around a camera with its photo.
 
-    By block correlation, shared area, and visible area, by cell misfit and area. Blocks that contradict are
-    left out of the local means and deviations, and correlation and area are taken anew.
+    Blocks are cells of a grid of `num_columns`, `first` in the camera's frame. Those that contradict are left
+    out of the local means and deviations, and all is taken anew.
     """
     of_photo, shared, n = np.empty_like(colors), np.empty_like(weights), len(weights)
-    rays, blocks, cells = np.empty_like(colors), np.empty(n, np.int32), np.empty(n, np.int32)
+    rays, blocks = np.empty_like(colors), np.empty(n, np.int32)
     sample_photo(offsets, weights, photo, R_cam_from_map, of_photo, shared, rays)
     ranges, turns = np.empty(n, np.float32), np.empty(n, np.float32)
-    locate(rays[0], rays[1], rays[2], grids[0][0], grids[0][1], blocks, ranges, turns)
-    locate(rays[0], rays[1], rays[2], grids[1][0], grids[1][1], cells, ranges, turns)
+    locate(rays[0], rays[1], rays[2], grid[0], grid[1], blocks, ranges, turns)
     first, second, kept = np.empty_like(colors), np.empty_like(colors), shared.copy()
-    correlation, area, visible_area = by_block
     for k in range(2):
         normalize(colors, kept, view, first)
         normalize(of_photo, kept, view, second)
         correlate_blocks(first, second, kept, blocks, correlation, area)
         if k == 0:
-            add_misfits(first, second, kept, cells, by_cell[0], by_cell[1])
             visible_area[:] = area
             for i in range(n):
                 if correlation[blocks[i]] < CONTRADICTS:
@@ -178,12 +149,10 @@ def _compare(query: Query, pose: Pose) -> Comparison:
     how = config.voxel_per_range, config.arrays, thread_scratch(), np.ones(n, np.bool_)
     render_cells(query.scan_map.octree, pose.center_world, *how, offsets, colors, weights, sums, stats)
     by_block = np.empty(NUM_BLOCKS), np.empty(NUM_BLOCKS), np.empty(NUM_BLOCKS)
-    num_cells = len(make_grid(CELL_RINGS))
-    by_cell = np.empty(num_cells), np.empty(num_cells)
-    image, R = (photo.rgbx, photo.width), pose.R_cam_from_world
-    grids = tuple((grid.num_columns, grid.first) for grid in map(make_grid, (BLOCK_RINGS, CELL_RINGS)))
-    compare_cells(offsets, colors, weights, image, R, config.arrays, grids, by_block, by_cell)
-    return Comparison(*by_block, photo.valid_share, *by_cell)
+    image, blocks = (photo.rgbx, photo.width), make_grid(BLOCK_RINGS)
+    grid = blocks.num_columns, blocks.first
+    compare_cells(offsets, colors, weights, image, pose.R_cam_from_world, config.arrays, grid, *by_block)
+    return Comparison(*by_block, photo.valid_share)
 
 
 def without_occluders(query: Query, pose: Pose) -> Query:

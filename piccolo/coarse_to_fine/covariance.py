@@ -36,8 +36,8 @@ class DifferenceSteps:
 
 
 STEPS = (
-    DifferenceSteps("full", math.radians(0.1), 0.005, 2.5),
-    DifferenceSteps("fine", math.radians(0.3), 0.015, 0.8),
+    DifferenceSteps("full", math.radians(0.1), 0.005, 1.1),
+    DifferenceSteps("fine", math.radians(0.3), 0.015, 0.36),
 )
 
 

@@ -53,7 +53,7 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
     if classify(probabilities, settings.min_confidence) != NOT_LOCALIZED and is_mirrored(query, evidence):
         probabilities, warnings = np.append(np.zeros(len(standings)), 1.0), (MIRRORED,)
     alternatives = tuple(
-        Alternative(scan_map.to_world(h.pose), h.score, s.share, s.lead, s.num_matches, float(p))
+        Alternative(scan_map.to_world(h.pose), h.score, s.share, s.num_matches, float(p))
         for h, s, p in zip(reported, standings[1:], probabilities[1:-1], strict=True)
     )
     return Localization(

@@ -14,12 +14,11 @@ from .search_result import SearchResult
 def standings_of(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> list[Standing]:
     """What speaks for the best pose and for others elsewhere, compared over what both views show."""
     at_best = compare(query, best.pose)
-    standings = [Standing(1.0, 0.0, best.score, count_matches(query.matches, best.pose))]
-    for h in others:
-        seen = compare(query, h.pose)
-        matches = count_matches(query.matches, h.pose)
-        standings.append(Standing(seen.ratio_to(at_best), seen.lead_over(at_best), h.score, matches))
-    return standings
+    shares = [1.0, *(compare(query, h.pose).ratio_to(at_best) for h in others)]
+    return [
+        Standing(share, h.score, count_matches(query.matches, h.pose))
+        for share, h in zip(shares, [best, *others], strict=True)
+    ]
 
 
 def fairly_selected(query: Query, found: SearchResult) -> SearchResult:

@@ -23,7 +23,6 @@ class Standing(NamedTuple):
     """What speaks for one of the poses found."""
 
     share: float  # what it explains by what the best pose does, over what both views show; 1 of the best
-    lead: float  # over the best pose [standard deviations], see Comparison.lead_over; 0 of the best
     score: float  # [0, 1] what the photo's blocks explain beyond chance
     num_matches: int  # local features that agree with it
 
@@ -36,24 +35,21 @@ class ChoiceModel(NamedTuple):
 
 
 LEAST_STD, MOST_STD = 0.003, 0.3  # [m] smaller or larger tells nothing more
-LEAST_SCORE, MOST_SHARE, LEAST_LEAD = 0.02, 1.2, -8.0
-SAFETY = 2.0  # errors that the whole sphere shares, as by blur, are not in the deviations
+LEAST_SCORE, LEAST_SHARE, MOST_SHARE = 0.02, 0.1, 1.2
 NOISE_MATCHES = 8  # local features that agree with a wrong pose by chance, at most
 # By tools/calibrate_confidence.py. Each feature counts in one direction only.
-FEATURES = ("share", "lead", "log of the score", "log of the matches")
+FEATURES = ("log of the share", "log of the score", "log of the matches")
 NONE_FEATURES = ("constant", "log10 of the largest deviation [m]")
-MODEL = ChoiceModel((6.96, 0.3, 1.01, 1.15), (14.62, 3.78))
+MODEL = ChoiceModel((5.73, 0.71, 1.42), (8.00, 3.30))
 # The preset paper knows no covariance, and too few alternatives to tell places that repeat: a rough guide, by
 # margin and log of the agreement, learnt without such places.
 PAPER_BIAS, PAPER_WEIGHTS = -0.20, (6.37, 2.51)
 
 
 def features_of(standing: Standing) -> Array:
-    """What a pose's odds go by, (4,), as FEATURES names them."""
-    share = min(max(standing.share, 0.0), MOST_SHARE)
-    lead = min(max(standing.lead, LEAST_LEAD), -LEAST_LEAD)
-    score = math.log(max(standing.score, LEAST_SCORE))
-    return np.array([share, lead, score, math.log(standing.num_matches + NOISE_MATCHES)])
+    """What a pose's odds go by, (3,), as FEATURES names them."""
+    share = min(max(standing.share, LEAST_SHARE), MOST_SHARE)
+    return np.log([share, max(standing.score, LEAST_SCORE), standing.num_matches + NOISE_MATCHES])
 
 
 def log_odds(standing: Standing, model: ChoiceModel = MODEL) -> float:
@@ -80,7 +76,7 @@ def posterior(
     odds = np.exp(np.array(logits) - max(logits))
     probabilities = odds / odds.sum()
     if covariance is not None:
-        probabilities[:-1] *= math.erf(MAX_DISTANCE / (SAFETY * covariance.largest_std * math.sqrt(2.0)))
+        probabilities[:-1] *= math.erf(MAX_DISTANCE / (covariance.largest_std * math.sqrt(2.0)))
     probabilities[-1] = 1.0 - probabilities[:-1].sum()
     return np.asarray(probabilities)
 

@@ -16,7 +16,6 @@ class Alternative:
     pose: Pose
     score: float  # as of Evidence
     share: float | None = None  # what it explains by what the best does, over what both views show
-    lead: float | None = None  # over the best pose [standard deviations], over what both views show
     num_matches: int | None = None  # local features that agree with it
     probability: float | None = None  # that it is right; of the preset paper none is known
 
