@@ -40,7 +40,7 @@ NOISE_MATCHES = 8  # local features that agree with a wrong pose by chance, at m
 # By tools/calibrate_confidence.py. Each feature counts in one direction only.
 FEATURES = ("log of the share", "log of the score", "log of the matches")
 NONE_FEATURES = ("constant", "log10 of the largest deviation [m]")
-MODEL = ChoiceModel((5.73, 0.71, 1.42), (8.00, 3.30))
+MODEL = ChoiceModel((5.75, 0.43, 1.10), (8.30, 3.82))
 # The preset paper knows no covariance, and too few alternatives to tell places that repeat: a rough guide, by
 # margin and log of the agreement, learnt without such places.
 PAPER_BIAS, PAPER_WEIGHTS = -0.20, (6.37, 2.51)
