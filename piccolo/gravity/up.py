@@ -4,7 +4,7 @@ Every axis that many flat points face is a candidate, in both senses. What speak
 is added up as log-odds (up_features.py): how much of the cloud lies in a few levels across it (floors,
 ceilings), how little is aslant to it (floors and walls are not), how low the cloud is along it, whether
 clutter and furniture are at the bottom of the storeys, whether one level carries everything, and the
-convention that scans have z up.
+convention that scans have z up, where z is square to the cloud's own levels.
 """
 
 from collections.abc import Iterator
@@ -26,7 +26,8 @@ MAX_MODES = 6  # twice the three directions of a box
 MIN_MODE = 0.02  # fraction of the flat points
 DISTINCT_ANGLE = np.radians(15.0)  # between two candidates: twice the angle of the first refinement
 INLIER_ANGLES = np.radians([8.0, 4.0, 2.0, 2.0])  # of a normal to the axis or across it, step by step
-Z_UP_LOG_ODDS = 1.5  # of the convention that scans have z up, by hand: it decides a bare room
+Z_UP_LOG_ODDS = float(np.log(1000.0))  # of z up against z down: scanners level themselves
+OTHER_LOG_ODDS = float(np.log(3.0))  # of any other axis against z down: meshes with y up are not so rare
 PRIOR_ANGLE = np.radians(10.0)  # of +z to a direction that the convention speaks for
 SNAP_ANGLE = np.radians(0.2)  # of +z to a direction that is called +z itself
 NONE_ODDS = 0.05  # that it is none of the hypotheses, to those of the best one
@@ -101,10 +102,9 @@ class Up(NamedTuple):
 def find_up(cloud: PointNormals, z_up_log_odds: float = Z_UP_LOG_ODDS) -> Up:
     """The direction that points up in a cloud, thinned evenly in space (5 to 20 cm).
 
-    By convention scans have z up: `z_up_log_odds` count for a direction within 10 deg of +z, decide between
-    close alternatives and often the sense; within 0.2 deg of it, +z itself is returned. In a frame turned at
-    random the convention speaks for a wall or the ground below one time in 25, and sometimes misleads: with 0
-    no direction is favoured, and none is rounded to +z.
+    By convention scans have z up. Where a hypothesis is within 10 deg of +z, upside down needs evidence of a
+    thousand to one against it, any other axis hundreds to one; within 0.2 deg of it, +z itself is returned.
+    `z_up_log_odds` is the logarithm of that thousand: with 0 no direction is favoured, none rounded to +z.
 
     The confidence is the winner's part of the odds of all directions, less where few points are flat or
     they face about it, and where ground and a house front could be mixed up. A bare room turned at random
@@ -159,7 +159,7 @@ def named_axis(up: UpAxis) -> Array:
 def _choose(hypotheses: list[UpFeatures], z_up_log_odds: float, neighborhood_radius: float) -> Up:
     """The hypothesis of the largest odds, its part of all odds less what makes it doubtful, and why."""
     logits = log_odds(np.array([h.cues for h in hypotheses]), np.array(WEIGHTS), SENSE_SHARING)
-    logits += z_up_log_odds * np.array([h.axis[2] > np.cos(PRIOR_ANGLE) for h in hypotheses])
+    logits += _convention(np.array([h.axis[2] for h in hypotheses]), z_up_log_odds)
     odds = np.exp(logits - logits.max())
     odds /= odds.sum() + NONE_ODDS
     rank = np.argsort(-odds, kind="stable")
@@ -176,6 +176,14 @@ def _choose(hypotheses: list[UpFeatures], z_up_log_odds: float, neighborhood_rad
     is_z = z_up_log_odds > 0.0 and best.axis[2] > np.cos(SNAP_ANGLE)
     direction = np.array([0.0, 0.0, 1.0]) if is_z else best.axis
     return Up(direction, float(odds[rank[0]] * factor), "; ".join([reason, *doubts]))
+
+
+def _convention(heights: Array, z_up_log_odds: float) -> Array:
+    """Log-odds (H,) by convention of directions whose z are given; all 0 where none is near +z."""
+    is_z, is_flipped = heights > np.cos(PRIOR_ANGLE), heights < -np.cos(PRIOR_ANGLE)
+    if not is_z.any():
+        return np.zeros(len(heights))
+    return np.where(is_z, z_up_log_odds, np.where(is_flipped, 0.0, min(OTHER_LOG_ODDS, z_up_log_odds)))
 
 
 def _doubts(
