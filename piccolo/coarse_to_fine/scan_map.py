@@ -124,7 +124,7 @@ def widen(
 
 
 def align_to_gravity(octree: Octree) -> tuple[Array, tuple[str, ...]]:
-    """Rotation (3, 3) that turns the cloud's up to +z, identity where it is there or in doubt; and warnings."""
+    """Rotation (3, 3) that turns the cloud's up to +z, identity if it is there or in doubt; warnings."""
     up = find_up(estimate_normals(octree.level(0.08)[:, :3]))
     tilt = np.arccos(np.clip(up.direction_world[2], -1.0, 1.0))
     if tilt < MIN_TILT:

@@ -1,4 +1,4 @@
-"""Seeded clouds of large places: showroom, racks, shop, warehouse, garage, church, tunnel, parking deck, basement."""
+"""Seeded clouds of halls and the like: showroom, racks, shop, garage, church, tunnel, basement."""
 
 import math
 
@@ -89,7 +89,9 @@ def warehouse(seed: int) -> Array:
     s.beams([x, y], z, 5.0, 0.5)
     for _ in range(int(x * y / 14)):
         size = s.rng.uniform([0.8, 0.8, 0.6], [2.4, 1.6, 3.0])
-        s.box([*s.rng.uniform([1.5, 1.5], [x - 1.5, y - 1.5]), 0.0], size, float(s.rng.choice([0.0, 0.1, 1.57])))
+        s.box(
+            [*s.rng.uniform([1.5, 1.5], [x - 1.5, y - 1.5]), 0.0], size, float(s.rng.choice([0.0, 0.1, 1.57]))
+        )
     return s.points()
 
 
@@ -103,7 +105,10 @@ def garage(seed: int) -> Array:
     s.walls([0, 0, 0], [x, y, z], 1, 1)
     for k in range(num_cars):
         if s.rng.random() < 0.8:
-            s.car([0.5 * x + s.rng.uniform(-0.4, 0.4), (k + 0.5) * y / num_cars, 0.0], float(s.rng.normal(0, 0.03)))
+            s.car(
+                [0.5 * x + s.rng.uniform(-0.4, 0.4), (k + 0.5) * y / num_cars, 0.0],
+                float(s.rng.normal(0, 0.03)),
+            )
         s.box([0.5 * x, (k + 0.5) * y / num_cars, z - 0.25], [3.0, 0.1, 0.1], hangs=True)
     for at in np.arange(0.8, x - 0.8, 1.1):
         if s.rng.random() < 0.6:

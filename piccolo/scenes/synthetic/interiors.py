@@ -14,7 +14,9 @@ def _sampler(seed: int, stream: int) -> SurfaceSampler:
     return SurfaceSampler(np.random.default_rng([seed, stream]), DENSITY)
 
 
-def flight(s: SurfaceSampler, foot: Array, width: float, height: float, num_steps: int, tread: float = 0.28) -> None:
+def flight(
+    s: SurfaceSampler, foot: Array, width: float, height: float, num_steps: int, tread: float = 0.28
+) -> None:
     """A flight of stairs along x from its `foot` (3,), with its underside."""
     rise = height / num_steps
     for k in range(num_steps):

@@ -1,11 +1,11 @@
-"""Seeded clouds under the open sky: ground with trees, aerial views, fronts, streets, terraces, houses, courtyards."""
+"""Seeded clouds under the open sky: ground with trees, aerial views, fronts, streets, houses, courtyards."""
 
 import math
 
 import numpy as np
 
 from ...geometry.pose import Array
-from .surfaces import DENSITY, SurfaceSampler
+from .surfaces import SurfaceSampler
 
 STREET_DENSITY = 80.0  # points a m2
 
@@ -80,13 +80,15 @@ def _facade(s: SurfaceSampler, corner: Array, along: Array, height: float) -> No
     """A front with rows of windows and a door."""
     length = float(np.linalg.norm(along))
     panes = [
-        (x, x + 1.1, z, z + 1.5) for z in np.arange(0.9, height - 1.6, 3.0) for x in np.arange(1.0, length - 1.2, 2.4)
+        (x, x + 1.1, z, z + 1.5)
+        for z in np.arange(0.9, height - 1.6, 3.0)
+        for x in np.arange(1.0, length - 1.2, 2.4)
     ]
     s.parallelogram(corner, along, [0, 0, height], [*panes, (0.2, 1.1, 0.0, 2.1)])
 
 
 def street(seed: int) -> Array:
-    """A street with parked cars, lamp posts, trees; houses on one side or on both, and nothing at its ends."""
+    """A street with parked cars, lamp posts, trees; houses on one side or both, nothing at its ends."""
     s = SurfaceSampler(np.random.default_rng([seed, 100]), STREET_DENSITY)
     x, y = s.rng.uniform([25.0, 9.0], [50.0, 16.0])
     s.parallelogram([0, 0, 0], [x, 0, 0], [0, y, 0])
@@ -97,7 +99,9 @@ def street(seed: int) -> Array:
         at = 0.0
         while is_built and at < x - 6.0:
             length = float(s.rng.uniform(6.0, 14.0))
-            _facade(s, np.array([at, side, 0.0]), np.array([min(length, x - at), 0, 0]), s.rng.uniform(5.0, 13.0))
+            _facade(
+                s, np.array([at, side, 0.0]), np.array([min(length, x - at), 0, 0]), s.rng.uniform(5.0, 13.0)
+            )
             at += length + float(s.rng.choice([0.0, 2.0]))
     for at in np.arange(3.0, x - 3.0, 6.0):
         for side in (2.9, y - 2.9):
