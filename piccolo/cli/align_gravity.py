@@ -38,10 +38,10 @@ Writes the cloud as binary PLY in the unit of the scan, and beside it the transf
 aligned.txt with four rows of four numbers, as CloudCompare reads them (docs/CONVENTIONS.md). One PLY file
 keeps its other properties and faces, its normals are turned; all else becomes x y z and red green blue.
 One JSON object on stdout: status, up, yaw, planes, transform. Without --out nothing else is written.
-Nothing is written either where the confidence is below --min-confidence (default {MIN_CONFIDENCE}). A z
-that is square to the scan's levels is up by convention. A scan that was turned needs --assume-nothing,
-by which a room without furniture may be upside down, and roofs and stairs mislead: --pano tells. If you know the axis,
-give it by --up. The explanation has the log-odds cue by cue, "hypotheses" those of every direction.
+Nothing is written either where the confidence is below --min-confidence (default {MIN_CONFIDENCE}).
+A z that is square to the scan's levels is up by convention. A scan that was turned needs --assume-nothing, by
+which a room without furniture may be upside down, and roofs and stairs mislead: --pano tells. If you know
+the axis, give it by --up. The explanation has the log-odds cue by cue, "hypotheses" those of each direction.
 """
 
 
