@@ -199,14 +199,22 @@ def test_same_bits_every_run_and_for_every_thread_count(run, tilted, tmp_path):
 
 def test_nothing_is_written_where_up_is_uncertain(run, tmp_path):
     np.savez(tmp_path / "bare.npz", points=bare_room(), colors=np.full((18_000, 3), 99, np.uint8))
-    code, report, err = run("--cloud", tmp_path / "bare.npz", "--out", tmp_path / "out.ply")
+    bare = ("--cloud", tmp_path / "bare.npz", "--out", tmp_path / "out.ply")
+    code, report, err = run(*bare, "--assume-nothing")
     assert (code, report["status"], report["out"]) == (1, "uncertain", None)
     assert err.count("\n") == 1
     assert f"confidence {report['confidence']:.2f} is below {MIN_CONFIDENCE:g}" in err
     assert [path.name for path in tmp_path.iterdir()] == ["bare.npz"]
-    arguments = ("--cloud", tmp_path / "bare.npz", "--out", tmp_path / "out.ply")
-    assert run(*arguments, "--min-confidence", ANGLE)[0] == 0
-    code, report, _ = run(*arguments, "--up", "-z")
+    assert run(*bare, "--assume-nothing", "--min-confidence", ANGLE)[0] == 0
+    for convention in ([], ["--assume-z-up"]):
+        code, report, _ = run(*bare, *convention)
+        assert (code, report["tilt_deg"]) == (0, pytest.approx(0.0, abs=1e-9))
+        assert "convention" in report["explanation"]
+    probabilities = [hypothesis["probability"] for hypothesis in report["hypotheses"]]
+    assert probabilities == sorted(probabilities, reverse=True)
+    assert sum(probabilities) < 1.0
+    assert report["hypotheses"][0]["evidence"]["convention"] > 6.0
+    code, report, _ = run(*bare, "--up", "-z")
     assert (code, report["explanation"]) == (0, "up is the axis -z, as given")
     np.testing.assert_array_equal(np.array(report["T_aligned_from_scan"])[:3, :3], np.diag([1.0, -1.0, -1.0]))
 
@@ -247,6 +255,9 @@ def test_true_poses_go_along(run, tilted, tmp_path):
         ("--apply T.json", "--apply needs --out"),
         ("--apply T.json --out o.ply --yaw-walls", "--yaw-walls can't be combined with --apply"),
         ("--apply T.json --out o.ply --up -y", "--up can't be combined with --apply"),
+        ("--apply T.json --out o.ply --assume-nothing", "--assume-nothing can't be combined with --apply"),
+        ("--up y --assume-z-up", "--assume-z-up can't be combined with --up y"),
+        ("--up y --pano photo.jpg", "--pano can't be combined with --up y"),
         ("--min-confidence 1.5", "--min-confidence"),
         ("--scale -1", "--scale"),
         ("--out o.json", "--out o.json: wanted a name that ends with .ply"),

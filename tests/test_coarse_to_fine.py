@@ -75,7 +75,7 @@ def test_nothing_that_counts_or_no_place_for_a_camera_is_no_error():
 
 def test_cloud_that_lies_on_its_side_is_levelled():
     cloud, taken = room(1)[1], query(1)
-    turn = exp_so3(np.array([np.pi / 2, 0.0, 0.0])) @ exp_so3(np.array([0.0, 0.3, 0.0]))
+    turn = exp_so3(np.array([np.pi / 2, 0.0, 0.0])) @ exp_so3(np.array([0.3, 0.3, 0.0]))
     lying = Cloud((cloud.points @ turn.T).astype(np.float32), cloud.colors, cloud.origin_world)
     lying_map = prepare_map(lying, Workers(2))
     assert any("levelled" in warning for warning in lying_map.warnings)

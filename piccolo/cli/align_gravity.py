@@ -3,6 +3,7 @@
 import argparse
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,19 +14,23 @@ from ..confidence.confidence import check_confidence
 from ..errors import InputError
 from ..gravity import MIN_CONFIDENCE
 from ..gravity.alignment import Alignment, AlignmentReport, find_alignment, read_alignment
+from ..gravity.up import Z_UP_LOG_ODDS
 from ..runtime.atomic import is_stream, write_atomically
+from ..runtime.threads import Workers, num_cores
 from ..scenes.scene import QUERIES_NAME, Query, read_scene, write_queries
 from .command import command, option, print_warnings
 from .errors import checking_options, print_error
 from .options import add_cloud_options, cloud_settings_from
 from .outputs import check_outputs, check_suffix, print_report
 from .progress import progress_bar
+from .up_by_photo import settle_by_photo
 
 EXIT_ALIGNED, EXIT_UNCERTAIN = 0, 1
 Outputs = tuple[list[Path], tuple[Query, ...]]  # files of the transform, JSON and text; poses to be turned
 EPILOG = f"""\
 examples:
   python tools/align_gravity.py --cloud scan.e57 --out aligned.ply --yaw-walls
+  python tools/align_gravity.py --cloud scan.e57 --out aligned.ply --assume-nothing --pano photo.jpg
   python tools/align_gravity.py --cloud room/cloud.ply --queries room/queries.json --out aligned/cloud.ply
   python tools/align_gravity.py --cloud aligned.ply --apply aligned.json --inverse --out as_scanned.ply
 
@@ -33,8 +38,10 @@ Writes the cloud as binary PLY in the unit of the scan, and beside it the transf
 aligned.txt with four rows of four numbers, as CloudCompare reads them (docs/CONVENTIONS.md). One PLY file
 keeps its other properties and faces, its normals are turned; all else becomes x y z and red green blue.
 One JSON object on stdout: status, up, yaw, planes, transform. Without --out nothing else is written.
-Nothing is written either where the confidence is below --min-confidence (default {MIN_CONFIDENCE}): a room
-without furniture may be upside down, steep roofs and stairs mislead. If you know the axis, give it by --up.
+Nothing is written either where the confidence is below --min-confidence (default {MIN_CONFIDENCE}).
+A z that is square to the scan's levels is up by convention. A scan that was turned needs --assume-nothing, by
+which a room without furniture may be upside down, and roofs and stairs mislead: --pano tells. If you know
+the axis, give it by --up. The explanation has the log-odds cue by cue, "hypotheses" those of each direction.
 """
 
 
@@ -49,9 +56,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(group, "--transform-only", "write no file, only the report on stdout")
     group = parser.add_argument_group("method")
     option(group, "--yaw-walls", "also turn about z, least, so that the dominant walls are along x and y")
+    assumption = group.add_mutually_exclusive_group()
+    text = "the file's z is up unless the evidence against it is a thousand to one (default)"
+    option(assumption, "--assume-z-up", text)
+    option(assumption, "--assume-nothing", "the scan may lie in any way: its own evidence alone decides")
+    text = "upright photo taken in the scan: localized under one up and no other, it decides"
+    option(group, "--pano FILE", text)
     option(group, "--min-confidence X", f"write nothing below this confidence (default {MIN_CONFIDENCE})")
     option(group, "--apply FILE", "apply this transform instead of finding one")
     option(group, "--inverse", "apply the inverse of --apply")
+
+
+def check_search(arguments: argparse.Namespace) -> None:
+    """Refuse options of the search for up where it does not take place."""
+    assuming = {"--assume-z-up": arguments.assume_z_up, "--assume-nothing": arguments.assume_nothing,
+                "--pano": arguments.pano is not None}  # fmt: skip
+    searching = {"--yaw-walls": arguments.yaw_walls, "--min-confidence": arguments.min_confidence is not None,
+                 "--up": arguments.up != "auto", "--transform-only": arguments.transform_only}  # fmt: skip
+    wrong = [name for name, is_given in (searching | assuming).items() if is_given]
+    if arguments.apply and wrong:
+        raise InputError(f"{wrong[0]} can't be combined with --apply, which searches for nothing")
+    if arguments.up != "auto" and any(assuming.values()):
+        raise InputError(f"{wrong[-1]} can't be combined with --up {arguments.up}, which is taken as it is")
 
 
 def check_arguments(arguments: argparse.Namespace) -> None:
@@ -61,10 +87,7 @@ def check_arguments(arguments: argparse.Namespace) -> None:
         check_confidence(arguments.min_confidence)
     if arguments.inverse and not arguments.apply:
         raise InputError("--inverse needs --apply")
-    searching = {"--yaw-walls": arguments.yaw_walls, "--min-confidence": arguments.min_confidence is not None,
-                 "--up": arguments.up != "auto", "--transform-only": arguments.transform_only}  # fmt: skip
-    if arguments.apply and (wrong := [name for name, is_given in searching.items() if is_given]):
-        raise InputError(f"{wrong[0]} can't be combined with --apply, which searches for nothing")
+    check_search(arguments)
     for name in ("apply", "queries"):
         if getattr(arguments, name) and not arguments.out:
             raise InputError(f"--{name} needs --out")
@@ -133,6 +156,10 @@ def evidence_of(report: AlignmentReport) -> dict[str, object]:
         "plane_rms_angle_deg": None if rms_angle is None else float(np.degrees(rms_angle)),
         "yaw_deg": None if report.yaw is None else float(np.degrees(report.yaw)),
         "planes": planes,
+        "hypotheses": [
+            {"up_scan": up.tolist(), "probability": probability, "evidence": evidence}
+            for up, probability, evidence in report.hypotheses
+        ],
     }
 
 
@@ -141,7 +168,12 @@ def align(arguments: argparse.Namespace) -> int:
     outputs = outputs_of(arguments)
     show = progress_bar(arguments.quiet)
     cloud = open_cloud(arguments.cloud, cloud_settings_from(arguments), show)
-    found, warnings = find_alignment(cloud, arguments.up, arguments.yaw_walls)
+    settle = None
+    if arguments.pano:
+        workers = Workers(num_cores(), show)
+        settle = partial(settle_by_photo, cloud=cloud, pano=arguments.pano, workers=workers)
+    log_odds = 0.0 if arguments.assume_nothing else Z_UP_LOG_ODDS
+    found, warnings = find_alignment(cloud, arguments.up, arguments.yaw_walls, log_odds, settle)
     print_warnings(arguments, warnings)
     alignment = found.alignment
     least = MIN_CONFIDENCE if arguments.min_confidence is None else arguments.min_confidence

@@ -124,13 +124,15 @@ def widen(
 
 
 def align_to_gravity(octree: Octree) -> tuple[Array, tuple[str, ...]]:
-    """Rotation (3, 3) that turns the cloud's up to +z, identity where it is there already or not known."""
+    """Rotation (3, 3) that turns the cloud's up to +z, identity if it is there or in doubt; warnings."""
     up = find_up(estimate_normals(octree.level(0.08)[:, :3]))
     tilt = np.arccos(np.clip(up.direction_world[2], -1.0, 1.0))
-    if up.confidence < MIN_CONFIDENCE or tilt < MIN_TILT:
+    if tilt < MIN_TILT:
         return np.eye(3), ()
-    text = f"the cloud's z is {np.degrees(tilt):.0f} deg off its up direction; levelled by its own planes"
-    return rotation_to_z_up(up.direction_world), (text,)
+    text = f"the cloud's z is {np.degrees(tilt):.0f} deg off its up direction"
+    if up.confidence < MIN_CONFIDENCE:
+        return np.eye(3), (f"perhaps {text} (confidence {up.confidence:.2f}); z is kept, --up sets another",)
+    return rotation_to_z_up(up.direction_world), (f"{text}; levelled by its own planes",)
 
 
 class Voxelized(Protocol):
@@ -158,7 +160,7 @@ def read_aligned(cloud: Voxelized, up: UpAxis) -> AlignedCloud:
     octree = build_octree(voxels)
     if up == "auto":
         R_map_from_world, more = align_to_gravity(octree)
-        if more:
+        if not np.array_equal(R_map_from_world, np.eye(3)):
             del voxels, octree  # their room is needed
             voxels = cloud.voxels(R_map_from_world)
             octree = build_octree(voxels)

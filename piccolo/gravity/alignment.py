@@ -1,6 +1,7 @@
 """The transform that turns a cloud's z up, what it is based on, and the JSON file that holds it."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +23,7 @@ from .planes import (
     ransac_planes,
     refine_up,
 )
-from .up import Up, find_up, named_axis, rotation_to_z_up
+from .up import Z_UP_LOG_ODDS, Hypothesis, Up, find_up, named_axis, rotation_to_z_up
 
 FORMAT = "piccolo-alignment/1"
 CONVENTION = "x_aligned = T_aligned_from_scan @ (x_scan, 1) in the unit given; z_aligned is up"
@@ -30,7 +31,6 @@ MAX_FILE_SIZE = 1 << 20  # [byte]
 UNIT_RANGE = (1e-300, 1e300)  # [m] its inverse is a number too
 ROUNDING = 1e-6  # of a rotation's numbers in a file
 SPACING = 0.08  # of the points used [m]
-NO_CONVENTION = 0.0  # log-odds of z up: a scan that is to be aligned may lie anyhow
 
 
 class Alignment(NamedTuple):
@@ -114,21 +114,28 @@ class AlignmentReport(NamedTuple):
     plane_rms_angle: float | None  # of level and upright planes to up [rad]
     yaw: float | None  # turn about z that put the walls along the axes [rad]
     planes: list[Plane]  # in the scan's frame, metres
+    hypotheses: tuple[Hypothesis, ...]  # for up, the likeliest first; none if the axis was given
 
 
 def find_alignment(
-    cloud: CloudStream, up: UpAxis, along_walls: bool
+    cloud: CloudStream,
+    up: UpAxis,
+    along_walls: bool,
+    z_up_log_odds: float = Z_UP_LOG_ODDS,
+    settle: Callable[[Up], Up] | None = None,
 ) -> tuple[AlignmentReport, tuple[str, ...]]:
     """The turn of a cloud that makes z up, about the middle of its box in whole metres; and warnings.
 
-    An axis given as `up` is taken as it is; `auto` finds it. With `along_walls` the dominant walls come to
-    stand along x and y by the smallest turn about z.
+    An axis given as `up` is taken as it is; `auto` finds it, with the log-odds of the convention that z is
+    up (0: the scan may lie anyhow), and `settle` may choose another of its hypotheses. With `along_walls` the
+    dominant walls come to stand along x and y by the smallest turn about z.
     """
     voxels = cloud.voxels(np.eye(3))
     sample = normals_of(voxels)
     planes = ransac_planes(sample)
     if up == "auto":
-        found = find_up(sample, NO_CONVENTION)
+        found = find_up(sample, z_up_log_odds)
+        found = settle(found) if settle else found
         direction, rms_angle = refine_up(found.direction_world, planes)
     else:
         found, rms_angle = Up(named_axis(up), 1.0, f"up is the axis {up}, as given"), None
@@ -146,7 +153,8 @@ def find_alignment(
         plane._replace(offset=plane.offset + float(np.einsum("i,i->", plane.normal_world, voxels.origin)))
         for plane in planes
     ]
-    return AlignmentReport(alignment, direction, rms_angle, yaw, in_scan), voxels.warnings
+    report = AlignmentReport(alignment, direction, rms_angle, yaw, in_scan, found.hypotheses)
+    return report, voxels.warnings
 
 
 def normals_of(voxels: Voxels) -> PointNormals:

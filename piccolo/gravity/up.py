@@ -1,10 +1,11 @@
 """Which way is up in a cloud.
 
 Every axis that many flat points face is a candidate, in both senses. What speaks for each of these hypotheses
-is added up as log-odds (up_features.py): how much of the cloud lies in a few levels across it (floors,
-ceilings), how little is aslant to it (floors and walls are not), how low the cloud is along it, whether
-clutter and furniture are at the bottom of the storeys, whether one level carries everything, and the
-convention that scans have z up.
+is added up as log-odds (up_features.py, sheet_features.py): how much of the cloud lies in a few levels across
+it (floors, ceilings), how little is aslant to it (floors and walls are not), how low the cloud is along it,
+whether heights repeat as stairs do, whether clutter and furniture are at the bottom of the storeys, whether
+one level carries everything, holes under scanners, tops of things, roofs, and the convention that scans have
+z up, where z is square to the cloud's own levels.
 """
 
 from collections.abc import Iterator
@@ -16,7 +17,8 @@ from scipy.spatial import cKDTree
 from ..cloud.settings import UpAxis
 from ..geometry.pose import Array
 from .planes import PointNormals, dot
-from .up_features import ALIGNED_ANGLE, SENSE_SHARING, WEIGHTS, UpFeatures, log_odds, up_features
+from .sheet_features import sides_of
+from .up_features import NUM_SENSE_CUES, SENSE_SHARING, WEIGHTS, UpFeatures, Weights, log_odds, up_features
 
 # Chosen by hand: the sphere in cells finer than the spread of a noisy plane's normals (3 to 8 deg)
 MIN_POINTS = 300  # of a cloud
@@ -26,23 +28,22 @@ MAX_MODES = 6  # twice the three directions of a box
 MIN_MODE = 0.02  # fraction of the flat points
 DISTINCT_ANGLE = np.radians(15.0)  # between two candidates: twice the angle of the first refinement
 INLIER_ANGLES = np.radians([8.0, 4.0, 2.0, 2.0])  # of a normal to the axis or across it, step by step
-Z_UP_LOG_ODDS = 1.5  # of the convention that scans have z up, by hand: it decides a bare room
+Z_UP_LOG_ODDS = float(np.log(1000.0))  # of z up against z down: scanners level themselves
+OTHER_LOG_ODDS = float(np.log(3.0))  # of any other axis against z down: meshes with y up are not so rare
 PRIOR_ANGLE = np.radians(10.0)  # of +z to a direction that the convention speaks for
 SNAP_ANGLE = np.radians(0.2)  # of +z to a direction that is called +z itself
 NONE_ODDS = 0.05  # that it is none of the hypotheses, to those of the best one
 # Below it up is not relied on. The surest wrong answer of tools/evaluate_gravity.py has 0.69.
 MIN_CONFIDENCE = 0.8
 
-# Fraction of directions drawn at random that are within ALIGNED_ANGLE of an axis or of the plane across it
-RANDOM_ALIGNED = 1.0 - np.cos(ALIGNED_ANGLE) + np.sin(ALIGNED_ANGLE)
-
-# What lowers the confidence, by hand. On 330 places of tools/evaluate_gravity.py a factor of 1 accepts a
-# wrong roof, and the surest wrong front has 0.72; a factor of 0.3 changes no answer.
+# What lowers the confidence, by hand on seeds 0 to 29 of tools/evaluate_gravity.py
 CLEAR_RADIUS, BLURRED_RADIUS = 1.0, 2.5  # of neighbourhoods where furniture fades, and is gone [m]
 OPEN_BALANCE = 0.3  # above_below_balance of a plane with open space before it: ground or a front
 OPEN_ENERGY_RATIO = 0.2  # of its level energy to the winner's, from which on they are mixed up
 SLAB_EXTENT = 2.0  # along up, below which nobody stands in the scan: one wall, a table [m]
-ROOF_THRESHOLD = 0.2  # fraction of walls at odd angles, from which on they may be a roof along its ridge
+CONFIRMED = 1.1  # of what the strongest cue says on the sense, by all together: a second one agrees
+MIN_TOPS = 0.2  # log-ratio of tops, from which on things stand on the ground, and not a front's window sills
+MAX_OFF_AXIS = 0.55  # fraction of the flat points that are neither floor nor wall
 DOUBT_FACTOR = 0.6  # on the confidence, for each of these
 
 
@@ -90,21 +91,29 @@ def _refine(normals: Array, axis: Array) -> Array:
     return np.asarray(axis)
 
 
+class Hypothesis(NamedTuple):
+    """A direction that may be up."""
+
+    direction_world: Array  # (3,) unit vector
+    probability: float  # all and "none of these" add up to 1, before what makes the best one doubtful
+    evidence: dict[str, float]  # log-odds by cue, which count by their differences between hypotheses
+
+
 class Up(NamedTuple):
     """Which way is up in a cloud, and how far that can be relied on."""
 
     direction_world: Array  # (3,) unit vector that points up, in the cloud's frame
     confidence: float  # [0, 1] part of the odds for this direction; below 0.5 it is a mere guess
     reason: str  # one line for a person
+    hypotheses: tuple[Hypothesis, ...] = ()  # all that were compared, the likeliest first
 
 
 def find_up(cloud: PointNormals, z_up_log_odds: float = Z_UP_LOG_ODDS) -> Up:
     """The direction that points up in a cloud, thinned evenly in space (5 to 20 cm).
 
-    By convention scans have z up: `z_up_log_odds` count for a direction within 10 deg of +z, decide between
-    close alternatives and often the sense; within 0.2 deg of it, +z itself is returned. In a frame turned at
-    random the convention speaks for a wall or the ground below one time in 25, and sometimes misleads: with 0
-    no direction is favoured, and none is rounded to +z.
+    By convention scans have z up. Where a hypothesis is within 10 deg of +z, upside down needs evidence of a
+    thousand to one against it, any other axis hundreds to one; within 0.2 deg of it, +z itself is returned.
+    `z_up_log_odds` is the logarithm of that thousand: with 0 no direction is favoured, none rounded to +z.
 
     The confidence is the winner's part of the odds of all directions, less where few points are flat or
     they face about it, and where ground and a house front could be mixed up. A bare room turned at random
@@ -120,7 +129,9 @@ def find_up(cloud: PointNormals, z_up_log_odds: float = Z_UP_LOG_ODDS) -> Up:
 
 def up_hypotheses(cloud: PointNormals) -> list[UpFeatures]:
     """The features of a cloud along every axis that may be upright, in both senses."""
-    return [up_features(cloud, sense * axis) for axis in candidate_axes(cloud) for sense in (1.0, -1.0)]
+    axes = candidate_axes(cloud)
+    sides = sides_of(cloud) if axes else None
+    return [up_features(cloud, sides, sense * axis) for axis in axes for sense in (1.0, -1.0) if sides]
 
 
 def rotation_to_z_up(direction_world: Array) -> Array:
@@ -158,44 +169,70 @@ def named_axis(up: UpAxis) -> Array:
 
 def _choose(hypotheses: list[UpFeatures], z_up_log_odds: float, neighborhood_radius: float) -> Up:
     """The hypothesis of the largest odds, its part of all odds less what makes it doubtful, and why."""
-    logits = log_odds(np.array([h.cues for h in hypotheses]), np.array(WEIGHTS), SENSE_SHARING)
-    logits += z_up_log_odds * np.array([h.axis[2] > np.cos(PRIOR_ANGLE) for h in hypotheses])
+    cues = np.array([h.cues for h in hypotheses])
+    convention = _convention(np.array([h.axis[2] for h in hypotheses]), z_up_log_odds)
+    logits = log_odds(cues, np.array(WEIGHTS), SENSE_SHARING) + convention
     odds = np.exp(logits - logits.max())
     odds /= odds.sum() + NONE_ODDS
     rank = np.argsort(-odds, kind="stable")
-    best, second = hypotheses[rank[0]], hypotheses[rank[1]]
-    factor, doubts = _doubts(best, hypotheses, neighborhood_radius)
-    alternative = "upside down" if best.axis @ second.axis < -0.9 else "another axis"
-    reason = (
-        f"{best.aligned_fraction:.0%} of the points are floor or wall,"
-        f" {best.sharp_fraction:.0%} of these within 2 deg;"
-        f" clutter in lower to upper halves of storeys {np.exp(best.clutter_log_ratio):.1f} : 1,"
-        f" furniture on floors to ceilings {np.exp(best.furniture_log_ratio):.1f} : 1;"
-        f" next best is {alternative}, {odds[rank[1]]:.0%}"
+    names = ("convention", *Weights._fields)
+    terms = np.column_stack([convention, cues * np.array(WEIGHTS)])
+    ranked = tuple(
+        Hypothesis(hypotheses[k].axis, float(odds[k]), dict(zip(names, terms[k].tolist(), strict=True)))
+        for k in rank
     )
+    best = hypotheses[rank[0]]
+    is_by_convention = bool(convention[rank[0]] > convention.min())
+    factor, doubts = _doubts(best, hypotheses, neighborhood_radius, is_by_convention)
     is_z = z_up_log_odds > 0.0 and best.axis[2] > np.cos(SNAP_ANGLE)
     direction = np.array([0.0, 0.0, 1.0]) if is_z else best.axis
-    return Up(direction, float(odds[rank[0]] * factor), "; ".join([reason, *doubts]))
+    return Up(direction, ranked[0].probability * factor, "; ".join([_explained(ranked), *doubts]), ranked)
+
+
+def _explained(ranked: tuple[Hypothesis, ...]) -> str:
+    """The evidence for the best hypothesis against the next one, cue by cue, the strongest first."""
+    best, second = ranked[:2]
+    is_flip = best.direction_world @ second.direction_world < -0.9
+    against = f"{'upside down' if is_flip else 'another axis'} ({second.probability:.0%})"
+    differences = {name: value - second.evidence[name] for name, value in best.evidence.items()}
+    told = [
+        f"{n} {d:+.1f}" for n, d in sorted(differences.items(), key=lambda x: -abs(x[1])) if abs(d) > 0.05
+    ]
+    return f"log-odds against {against}: {', '.join(told) or 'none'}"
+
+
+def _convention(heights: Array, z_up_log_odds: float) -> Array:
+    """Log-odds (H,) by convention of directions whose z are given; all 0 where none is near +z."""
+    is_z, is_flipped = heights > np.cos(PRIOR_ANGLE), heights < -np.cos(PRIOR_ANGLE)
+    if not is_z.any():
+        return np.zeros(len(heights))
+    return np.where(is_z, z_up_log_odds, np.where(is_flipped, 0.0, min(OTHER_LOG_ODDS, z_up_log_odds)))
 
 
 def _doubts(
-    best: UpFeatures, hypotheses: list[UpFeatures], neighborhood_radius: float
+    best: UpFeatures, hypotheses: list[UpFeatures], neighborhood_radius: float, is_by_convention: bool
 ) -> tuple[float, list[str]]:
-    """A factor [0, 1] on the confidence in the best hypothesis, and the reasons to doubt it."""
-    factor = np.clip(best.aligned_fraction / RANDOM_ALIGNED - 1.0, 0.0, 1.0)
-    factor *= np.clip((BLURRED_RADIUS - neighborhood_radius) / (BLURRED_RADIUS - CLEAR_RADIUS), 0.0, 1.0)
+    """A factor [0, 1] on the confidence in the best hypothesis, and the reasons to doubt it.
+
+    Where the convention speaks for it, what misleads the other cues is no reason.
+    """
+    factor = float(
+        np.clip((BLURRED_RADIUS - neighborhood_radius) / (BLURRED_RADIUS - CLEAR_RADIUS), 0.0, 1.0)
+    )
     doubts = []
     if neighborhood_radius > CLEAR_RADIUS:
         doubts.append(f"points so sparse that 24 neighbours reach {neighborhood_radius:.1f} m")
     across = [other for other in hypotheses if abs(other.axis @ best.axis) < 0.3]
-    energy = OPEN_ENERGY_RATIO * best.level_energy
-    if any(h.above_below_balance > OPEN_BALANCE and h.level_energy > energy for h in across):
-        factor *= DOUBT_FACTOR
-        doubts.append("ground and the front of a building look alike")
-    if best.extent < SLAB_EXTENT:
-        factor *= DOUBT_FACTOR
-        doubts.append(f"only {best.extent:.1f} m high, maybe a wall")
-    if best.non_manhattan_fraction > ROOF_THRESHOLD:
-        factor *= DOUBT_FACTOR
-        doubts.append("walls at odd angles, maybe a roof")
-    return float(factor), doubts
+    energy, balance = OPEN_ENERGY_RATIO * best.level_energy, max(OPEN_BALANCE, best.above_below_balance)
+    is_open = any(h.above_below_balance > balance and h.level_energy > energy for h in across)
+    evidence = dict(zip(Weights._fields, best.cues * np.array(WEIGHTS), strict=True))
+    for_sense = [evidence[name] for name in Weights._fields[-NUM_SENSE_CUES:]]
+    needed = CONFIRMED * max(for_sense) - evidence["balance"]
+    reasons = {
+        "ground and the front of a building look alike": is_open and best.sheets.top_log_ratio < MIN_TOPS,
+        "one cue alone tells top from bottom": sum(for_sense) < needed,
+        "little is floor or wall, maybe a roof": best.off_axis_fraction > MAX_OFF_AXIS,
+        f"only {best.extent:.1f} m high, maybe a wall": best.extent < SLAB_EXTENT,
+    }
+    found = [] if is_by_convention else [reason for reason, holds in reasons.items() if holds]
+    return factor * DOUBT_FACTOR ** len(found), doubts + found

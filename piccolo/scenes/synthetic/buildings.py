@@ -1,76 +1,24 @@
 """Seeded clouds of places that mislead a search for up: clutter, roofs, stairs, missing floors, open ground.
 
-Surfaces are sampled evenly, without a scanner's shadows but with its noise. z is up.
+Surfaces are sampled evenly, without a scanner's shadows but with its noise. z is up. Places of odd seeds have
+holes in the ground, where the scanner stood.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ...geometry.pose import Array
 from ...runtime.threads import Workers
+from . import halls, interiors, outdoors
 from .room import make_repeated
-from .world import RANGE_NOISE, make_world, random_size, scan_room, scan_world
+from .surfaces import DENSITY, SurfaceSampler, with_station_holes
+from .world import make_world, random_size, scan_room, scan_world
 
-DENSITY = 250.0  # points a m2
 ROOM_POINTS = 80_000
 CLUTTER_FRACTION = 0.4
-WALL_DISTANCE = np.array([0.5, 0.5, 0.0])  # of furniture [m]
 MARGIN = 0.05  # of a floor or ceiling that is taken away [m]
-
-
-@dataclass
-class SurfaceSampler:
-    """Points on surfaces as they are added."""
-
-    rng: np.random.Generator
-    parts: list[Array] = field(default_factory=list)
-
-    def parallelogram(self, corner: ArrayLike, a: ArrayLike, b: ArrayLike) -> None:
-        """Points from `corner` along the edges `a` and `b` (3,) [m]."""
-        edge_a, edge_b = np.asarray(a, float), np.asarray(b, float)
-        area = float(np.linalg.norm(np.cross(edge_a, edge_b)))
-        s = self.rng.uniform(0.0, 1.0, (int(DENSITY * area) + 1, 2))
-        self.add(np.asarray(corner) + s[:, :1] * edge_a + s[:, 1:] * edge_b)
-
-    def add(self, points: Array) -> None:
-        """Points (N, 3) [m], blurred by the scanner's noise."""
-        self.parts.append(points + self.rng.normal(0.0, RANGE_NOISE, points.shape))
-
-    def box(self, center: ArrayLike, size: ArrayLike, yaw: float = 0.0) -> None:
-        """The sides and the top of a box of `size` (3,) whose bottom's centre is at `center` (3,) [m]."""
-        x, y, z = np.asarray(size, float)
-        c, s = np.cos(yaw), np.sin(yaw)
-        along, across, up = np.array([c * x, s * x, 0.0]), np.array([-s * y, c * y, 0.0]), np.array([0, 0, z])
-        corner = np.asarray(center) - 0.5 * (along + across)
-        for origin, a, b in (
-            (corner, along, up), (corner + across, along, up),
-            (corner, across, up), (corner + along, across, up), (corner + up, along, across),
-        ):  # fmt: skip
-            self.parallelogram(origin, a, b)
-
-    def shell(self, x: float, y: float, z: float) -> None:
-        """The inside of a box from the origin to (x, y, z): floor, ceiling and walls."""
-        along, across, up = [x, 0, 0], [0, y, 0], [0, 0, z]
-        for corner, a, b in (
-            ([0, 0, 0], along, across), (up, along, across), ([0, 0, 0], along, up),
-            (across, along, up), ([0, 0, 0], across, up), (along, across, up),
-        ):  # fmt: skip
-            self.parallelogram(corner, a, b)
-
-    def furnish(self, low: Array, high: Array, num_pieces: int) -> None:
-        """Boxes on the floor between two corners (3,)."""
-        for _ in range(num_pieces):
-            at = self.rng.uniform(low + WALL_DISTANCE, high - WALL_DISTANCE)
-            size = self.rng.uniform([0.3, 0.3, 0.3], [1.6, 0.8, 1.2])
-            self.box([at[0], at[1], low[2]], size, float(self.rng.normal(0.0, 0.3)))
-
-    def points(self) -> Array:
-        """All points (N, 3)."""
-        return np.concatenate(self.parts)
 
 
 def _room(seed: int) -> Array:
@@ -142,69 +90,6 @@ def _stairwell(seed: int) -> Array:
     return s.points()
 
 
-def _outdoors(seed: int) -> Array:
-    """Sloping, uneven ground with trees, cars and perhaps a house front."""
-    s = SurfaceSampler(np.random.default_rng([seed, 64]))
-    size = s.rng.uniform(20.0, 40.0)
-    xy = s.rng.uniform(0.0, size, (int(40 * size * size), 2))
-    slope = s.rng.normal(0.0, 0.015, 2)
-    phase = s.rng.uniform(0.0, 6.0, 2)
-
-    def ground(xy: Array) -> Array:
-        waves = np.sin(xy[:, 0] / 4.0 + phase[0]) * np.sin(xy[:, 1] / 5.0 + phase[1])
-        return np.asarray(xy @ slope + 0.1 * waves)
-
-    s.add(np.column_stack([xy, ground(xy)]))
-    for at in s.rng.uniform(2.0, size - 2.0, (int(s.rng.integers(3, 16)), 2)):
-        level, height = float(ground(at[None])[0]), s.rng.uniform(3.0, 7.0)
-        trunk = s.rng.uniform(0.0, 1.0, (600, 2)) * [2 * np.pi, height]
-        bark = at + 0.15 * np.column_stack([np.cos(trunk[:, 0]), np.sin(trunk[:, 0])])
-        s.add(np.column_stack([bark, level + trunk[:, 1]]))
-        s.add(s.rng.normal([*at, level + height], [1.2, 1.2, 1.0], (3000, 3)))
-    for at in s.rng.uniform(3.0, size - 3.0, (int(s.rng.integers(0, 6)), 2)):
-        s.box([*at, float(ground(at[None])[0])], [4.2, 1.8, 1.4], float(s.rng.uniform(0, np.pi)))
-    if s.rng.random() < 0.7:
-        s.parallelogram([0, size, -0.5], [size, 0, 0], [0, 0, s.rng.uniform(4.0, 10.0)])
-    return s.points()
-
-
-def _aerial(seed: int) -> Array:
-    """Houses and trees as a drone sees them: roofs, ground, no walls."""
-    s = SurfaceSampler(np.random.default_rng([seed, 68]))
-    size = s.rng.uniform(40.0, 90.0)
-    xy = s.rng.uniform(0.0, size, (int(8 * size * size), 2))
-    slope = s.rng.normal(0.0, 0.01, 2)
-    level = xy @ slope + 0.05 * np.sin(xy[:, 0] / 9.0) + s.rng.normal(0.0, 0.03, len(xy))
-    for at in s.rng.uniform(8.0, size - 8.0, (int(s.rng.integers(3, 15)), 2)):
-        half, eaves = s.rng.uniform([4.0, 3.0], [8.0, 6.0]), s.rng.uniform(3.0, 8.0)
-        pitch = float(s.rng.choice([0.0, s.rng.uniform(0.4, 0.9)]))
-        place = np.abs(xy - at)
-        is_roof = np.all(place < half, axis=1)
-        level[is_roof] = at @ slope + eaves + pitch * (half[1] - place[is_roof, 1])
-    for at in s.rng.uniform(0.0, size, (int(s.rng.integers(5, 40)), 2)):
-        radius = s.rng.uniform(1.0, 3.5)
-        distance = np.linalg.norm(xy - at, axis=1)
-        is_crown = distance < radius
-        crown = 2.0 * radius + np.sqrt(radius**2 - distance[is_crown] ** 2)
-        level[is_crown] = at @ slope + crown + s.rng.normal(0.0, 0.3, len(crown))
-    s.add(np.column_stack([xy, level]))
-    return s.points()
-
-
-def _front(seed: int) -> Array:
-    """A house front and a strip of ground before it."""
-    s = SurfaceSampler(np.random.default_rng([seed, 65]))
-    length, height, depth = s.rng.uniform([10.0, 5.0, 1.5], [20.0, 12.0, 6.0])
-    s.parallelogram([0, 0, 0], [length, 0, 0], [0, 0, height])
-    s.parallelogram([0, 0, 0], [length, 0, 0], [0, -depth, 0])
-    for x in np.arange(1.5, length - 1.5, 2.5):
-        for z in np.arange(1.0, height - 1.5, 3.0):
-            s.parallelogram([x, 0.15, z], [1.0, 0, 0], [0, 0, 1.3])
-            s.parallelogram([x, 0, z], [1.0, 0, 0], [0, 0.15, 0])
-    s.furnish(np.array([0, -depth - 0.6, 0.0]), np.array([length, 0.6, 0.0]), int(s.rng.integers(0, 4)))
-    return s.points()
-
-
 def _bare(seed: int) -> Array:
     """A closed box with nothing in it: no honest answer is sure."""
     s = SurfaceSampler(np.random.default_rng([seed, 66]))
@@ -218,16 +103,48 @@ def _corridor(seed: int) -> Array:
     return scan_room(corridor, 2 * ROOM_POINTS, rng, Workers())[0].astype(np.float64)
 
 
-BUILDINGS: dict[str, Callable[[int], Array]] = {  # points (N, 3) [m] by a seed
+_KINDS: dict[str, Callable[[int], Array]] = {
     "room": _room,
     "clutter": _cluttered,
     "no ceiling": partial(_open_room, is_open_above=True),
     "no floor": partial(_open_room, is_open_above=False),
     "attic": _attic,
     "stairs": _stairwell,
-    "outdoors": _outdoors,
-    "aerial": _aerial,
-    "front": _front,
+    "outdoors": outdoors.outdoors,
+    "aerial": outdoors.aerial,
+    "front": outdoors.front,
     "corridor": _corridor,
     "bare": _bare,
+    "showroom": halls.showroom,
+    "racks": halls.racks,
+    "shop": halls.shop,
+    "warehouse": halls.warehouse,
+    "garage": halls.garage,
+    "church": halls.church,
+    "tunnel": halls.tunnel,
+    "parking deck": halls.parking,
+    "basement": halls.basement,
+    "storeys": interiors.storeys,
+    "loft": interiors.loft,
+    "furnished attic": interiors.furnished_attic,
+    "cubicles": interiors.cubicles,
+    "hotel": interiors.hotel,
+    "lecture hall": interiors.lecture,
+    "street": outdoors.street,
+    "terrace": outdoors.terrace,
+    "gable house": outdoors.gable_house,
+    "roof": outdoors.roof,
+    "courtyard": outdoors.courtyard,
+}
+FROM_ABOVE = ("aerial", "roof")  # a drone stands nowhere
+
+
+def _scanned(kind: str, seed: int) -> Array:
+    points = _KINDS[kind](seed)
+    has_holes = seed % 2 == 1 and kind not in FROM_ABOVE
+    return with_station_holes(points, np.random.default_rng([seed, 69])) if has_holes else points
+
+
+BUILDINGS: dict[str, Callable[[int], Array]] = {  # points (N, 3) [m] by a seed
+    kind: partial(_scanned, kind) for kind in _KINDS
 }
