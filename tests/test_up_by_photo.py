@@ -1,0 +1,66 @@
+"""Up of a scan by a photo that was taken in it, from the file to the transform."""
+
+import json
+
+import numpy as np
+import pytest
+from pictures import encoded
+from rooms import query, room
+
+from piccolo.cli import align_gravity, up_by_photo
+from piccolo.coarse_to_fine import scan_map as mapping
+from piccolo.gravity.up import Hypothesis, Up
+from piccolo.runtime.threads import Workers
+
+FLIP = np.diag([1.0, -1.0, -1.0])
+
+
+def test_a_photo_tells_that_a_scan_is_upside_down(tmp_path, capsys):
+    """A furnished room, turned over: the photo is localized under one of the two senses only."""
+    cloud = room(1)[1]
+    points = (cloud.points + cloud.origin_world) @ FLIP.T
+    np.savetxt(tmp_path / "scan.xyz", np.hstack([points, cloud.colors]), "%.4f")
+    (tmp_path / "photo.png").write_bytes(encoded(query(1).rgb, ".png"))
+    files = ["--cloud", str(tmp_path / "scan.xyz"), "--pano", str(tmp_path / "photo.png"), "--transform-only"]
+    assert align_gravity.main([*files, "--assume-nothing", "--quiet"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(report["up_scan"], [0.0, 0.0, -1.0], atol=np.radians(0.3))
+    assert "is localized under this of" in report["explanation"]
+    assert report["confidence"] > 0.9
+    assert len(report["hypotheses"]) >= 2
+
+
+@pytest.mark.parametrize(
+    ("statuses", "chosen"),
+    [
+        (("not_localized", "localized"), 1),
+        (("localized", "localized"), None),
+        (("not_localized", "ambiguous"), None),
+    ],
+)
+def test_exactly_one_sense_must_be_localized(monkeypatch, tmp_path, statuses, chosen):
+    senses = [np.array([0.0, 0.0, z]) for z in (1.0, -1.0)]
+    hypotheses = [Hypothesis(up, p, {}) for up, p in zip(senses, (0.6, 0.4), strict=True)]
+    found = Up(senses[0], 0.6, "by its planes", tuple(hypotheses))
+    outcomes = iter([(status, 0.95) for status in statuses])
+    monkeypatch.setattr(up_by_photo, "_localized", lambda *_: next(outcomes))
+    settled = up_by_photo.settle_by_photo(found, None, tmp_path / "a.jpg", Workers(1))
+    if chosen is None:
+        assert settled.confidence == 0.6
+        assert settled.reason.startswith("by its planes; ")
+        assert "settles nothing: " in settled.reason
+    else:
+        assert (settled.direction_world == senses[chosen]).all()
+        assert settled.confidence == 0.95
+
+
+def test_z_in_doubt_is_kept_and_said(monkeypatch):
+    octree = type("Octree", (), {"level": lambda self, size: np.zeros((1, 6))})()
+    monkeypatch.setattr(mapping, "estimate_normals", lambda points: None)
+    for confidence, is_kept in ((0.5, True), (0.99, False)):
+        up = Up(np.array([1.0, 0.0, 0.0]), confidence, "", ())
+        monkeypatch.setattr(mapping, "find_up", lambda cloud, up=up: up)
+        R, (warning,) = mapping.align_to_gravity(octree)
+        assert np.array_equal(R, np.eye(3)) == is_kept
+        assert ("z is kept, --up sets another" in warning) == is_kept
+        assert "the cloud's z is 90 deg off its up direction" in warning
