@@ -146,6 +146,7 @@ def test_panorama_from_elsewhere_exits_with_one(scene, tmp_path, capsys):
         (["--preset", "paper", "--num-translations", "0"], 2, "num_translations: found 0"),
         (["--num-translations", "9"], 2, "--num-translations: not an option of the preset default"),
         (["--preset", "paper", "--near", "0", "0", "0"], 2, "--near: not an option of the preset paper"),
+        (["--preset", "paper", "--refine-focal"], 2, "--refine-focal: not an option of the preset paper"),
         (["--preset", "paper", "--gravity", "auto"], 2, "gravity: found auto"),
         (["--near", "0", "0", "0"], 2, "--near, --radius: found one of them"),
         (["--height", "2", "1"], 2, "--height: found [2.0, 1.0]"),

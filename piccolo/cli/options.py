@@ -130,7 +130,7 @@ def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--projection", choices=get_args(Projection), help=text)
     text = "focal length of a pinhole photo, in its own pixels"
     group.add_argument("--focal", type=float, metavar="PX", help=text)
-    text = "refine the focal length, and k1 where the camera's model has it; takes three times as long"
+    text = "refine the focal length, and k1 where the camera's model has it; takes several times as long"
     group.add_argument("--refine-focal", action="store_true", help=text)
     text = "calibration: COLMAP's cameras.txt, OpenSfM's camera_models.json, or JSON of docs/CAMERAS.md"
     group.add_argument("--camera", type=Path, metavar="FILE", help=text)
@@ -260,6 +260,7 @@ def settings_from(arguments: argparse.Namespace) -> CoarseToFineSettings | Paper
         foreign = [option for option, *_ in DEFAULT_OPTIONS if option != NUM_ROTATIONS[0]]
         foreign += ["--" + name.replace("_", "-") for name in PRIORS]
         foreign += ["--up"] if arguments.up != "auto" else []
+        foreign += ["--refine-focal"] if given.get("refine_focal") else []
     else:
         foreign = [option for option, *_ in PAPER_ONLY]
     if wrong := [option for option in foreign if setting_of(option) in given]:
