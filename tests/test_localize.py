@@ -246,7 +246,7 @@ def test_first_use_is_announced_and_two_processes_may_share_it(scene, tmp_path):
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
     processes = [_process([*_arguments(scene), *PAPER], env=environment) for _ in range(2)]
     said = [process.communicate(timeout=120) for process in processes]
-    assert all("first use: compiling kernels" in err for _, err in said)
+    assert any("first use: compiling kernels" in err for _, err in said)  # of both, unless one begins late
     poses = [json.loads(out)["center_world"] for out, _ in said]
     assert poses[0] == poses[1]
     again = _process([*_arguments(scene), *PAPER], env=environment)
