@@ -77,8 +77,8 @@ def test_more_evidence_is_more_probability(name, more):
 @pytest.mark.parametrize(("std", "most"), [(0.05, 0.954), (0.1, 0.683), (0.3, 0.261)])
 def test_a_pose_that_may_be_a_decimetre_off_is_doubtful_whatever_the_evidence(std, most):
     """The part of a normal distribution within 0.1 m."""
-    p = posterior([RIGHT._replace(num_matches=50_000)], _covariance(std))
-    assert p[0] == pytest.approx(most, abs=0.004)
+    p = posterior([RIGHT._replace(num_matches=10**7)], _covariance(std))
+    assert p[0] == pytest.approx(most, abs=0.002)
     assert p.sum() == pytest.approx(1.0)
 
 

@@ -45,12 +45,14 @@ def test_wrong_usage(tool, arguments, message, capsys):
 def test_the_fit_finds_the_cue_that_tells():
     rng = np.random.default_rng(1)
     choices = [
-        Choice("room", rng.normal(size=(6, len(Weights._fields))), np.arange(6) == 0) for _ in range(60)
+        Choice("room", rng.normal(size=(6, len(Weights._fields))), np.arange(6) == 0) for _ in range(300)
     ]
     for choice in choices:
         choice.cues[0, 3] += 3.0
     fitted = calibrate_gravity.fit(choices)
-    assert fitted[3] > 2.0 * np.delete(fitted, 3).max()
+    tops = Weights._fields.index("tops")
+    assert fitted[tops] == IN_USE[tops]  # is by hand
+    assert fitted[3] > 5.0 * np.delete(fitted, [3, tops]).max()
     likelihoods, is_right = calibrate_gravity.log_likelihoods(fitted, choices)
     assert likelihoods.mean() > calibrate_gravity.log_likelihoods(IN_USE, choices)[0].mean()
     assert is_right.mean() > 0.8

@@ -130,10 +130,10 @@ def test_points_too_sparse_for_furniture_are_no_evidence():
 
 
 def test_what_could_stand_another_way_is_uncertain():
-    for seed in (14, 20):
+    for seed, reason in ((3, "ground and the front of a building look alike"), (14, "maybe a wall")):
         up = find_up(turned(BUILDINGS["front"](seed), TURNS[2]), 0.0)
         assert up.confidence < 0.75
-        assert "front of a building" in up.reason or "maybe a wall" in up.reason
+        assert reason in up.reason
     points = plane(np.random.default_rng(1), 2000, np.array([0.002, 3.0, 3.0]))
     assert find_up(np.append(points, [[5.0, 0, 0]], axis=0).astype(np.float32)).confidence < 0.5
     up = find_up(turned(bare_room(), TURNS[0]))

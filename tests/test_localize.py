@@ -243,11 +243,16 @@ def test_closed_pipe_is_no_error_message(scene):
 
 
 def test_first_use_is_announced_and_two_processes_may_share_it(scene, tmp_path):
+    """The first one waits, where it begins to compile, until the second has come as far."""
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
-    processes = [_process([*_arguments(scene), *PAPER], env=environment) for _ in range(2)]
-    said = [process.communicate(timeout=120) for process in processes]
-    assert any("first use: compiling kernels" in err for _, err in said)  # of both, unless one begins late
-    poses = [json.loads(out)["center_world"] for out, _ in said]
+    first, second = (_process([*_arguments(scene), *PAPER], env=environment) for _ in range(2))
+    try:
+        assert any("first use: compiling kernels" in line for line in first.stderr)
+        first.send_signal(signal.SIGSTOP)
+        assert any("first use: compiling kernels" in line for line in second.stderr)
+    finally:
+        first.send_signal(signal.SIGCONT)
+    poses = [json.loads(process.communicate(timeout=120)[0])["center_world"] for process in (first, second)]
     assert poses[0] == poses[1]
     again = _process([*_arguments(scene), *PAPER], env=environment)
     out, err = again.communicate(timeout=60)

@@ -129,9 +129,10 @@ def find_up(cloud: PointNormals, z_up_log_odds: float = Z_UP_LOG_ODDS) -> Up:
 
 def up_hypotheses(cloud: PointNormals) -> list[UpFeatures]:
     """The features of a cloud along every axis that may be upright, in both senses."""
-    axes = candidate_axes(cloud)
-    sides = sides_of(cloud) if axes else None
-    return [up_features(cloud, sides, sense * axis) for axis in axes for sense in (1.0, -1.0) if sides]
+    if not (axes := candidate_axes(cloud)):
+        return []
+    sides = sides_of(cloud)
+    return [up_features(cloud, sides, sense * axis) for axis in axes for sense in (1.0, -1.0)]
 
 
 def rotation_to_z_up(direction_world: Array) -> Array:

@@ -46,8 +46,8 @@ class Weights(NamedTuple):
 
 
 NUM_SENSE_CUES = 5  # the last ones: what tells one sense of an axis from the other
-# By the fit of tools/calibrate_gravity.py on seeds 0 to 9 of all kinds without tops, whose weight is by hand:
-# made-up things have no undersides, and in the scenes house, hospital and hall tops speak against the truth.
+# By a fit as that of tools/calibrate_gravity.py, on seeds 0 to 9 of all kinds, without tops, weighed
+# by hand: made-up things have no undersides, and in house, hospital and hall tops speak against the truth.
 WEIGHTS = Weights(0.0, 0.0, 1.05, 0.0, 5.65, 3.5, 20.55, 2.81, 2.33, 0.35, 1.0, 3.04)
 SENSE_SHARING = 0.13  # 0: what tells the senses of an axis apart speaks for the axis in full; 1: not at all
 

@@ -18,8 +18,7 @@ def showroom(seed: int) -> Array:
     """Cars below an open ceiling with beams, ducts and lamps, a glass front on one or two sides."""
     s = _sampler(seed, 80)
     x, y, z = s.rng.uniform([14.0, 10.0, 3.8], [26.0, 18.0, 6.0])
-    s.parallelogram([0, 0, 0], [x, 0, 0], [0, y, 0])
-    s.parallelogram([0, 0, z], [x, 0, 0], [0, y, 0])
+    s.floor_and_ceiling(x, y, z)
     s.parallelogram([0, y, 0], [x, 0, 0], [0, 0, z], [(2.0, 3.0, 0.0, 2.1)])
     s.parallelogram([x, 0, 0], [0, y, 0], [0, 0, z])
     panes = [(at + 0.05, at + 1.45, 0.1, z - 0.3) for at in np.arange(0.0, x - 1.5, 1.5)]
@@ -64,8 +63,7 @@ def shop(seed: int) -> Array:
     """Rows of shelves, a counter, lamps below the ceiling."""
     s = _sampler(seed, 82)
     x, y, z = s.rng.uniform([9.0, 7.0, 2.8], [18.0, 14.0, 4.0])
-    s.parallelogram([0, 0, 0], [x, 0, 0], [0, y, 0])
-    s.parallelogram([0, 0, z], [x, 0, 0], [0, y, 0])
+    s.floor_and_ceiling(x, y, z)
     s.walls([0, 0, 0], [x, y, z], 1, 2)
     s.lamps([x, y], z, 2.4, s.rng.uniform(0.0, 0.6))
     height = s.rng.uniform(1.4, 2.2)
@@ -100,8 +98,7 @@ def garage(seed: int) -> Array:
     s = SurfaceSampler(np.random.default_rng([seed, 84]))
     num_cars = int(s.rng.integers(1, 3))
     x, y, z = s.rng.uniform([5.8, 3.0 * num_cars, 2.3], [7.5, 3.0 * num_cars + 1.5, 2.9])
-    s.parallelogram([0, 0, 0], [x, 0, 0], [0, y, 0])
-    s.parallelogram([0, 0, z], [x, 0, 0], [0, y, 0])
+    s.floor_and_ceiling(x, y, z)
     s.walls([0, 0, 0], [x, y, z], 1, 1)
     for k in range(num_cars):
         if s.rng.random() < 0.8:
@@ -161,8 +158,7 @@ def parking(seed: int) -> Array:
     """A parking deck: low ceiling with beams, columns, cars, open sides with parapets."""
     s = _sampler(seed, 87)
     x, y, z = s.rng.uniform([20.0, 14.0, 2.4], [32.0, 17.0, 3.0])
-    s.parallelogram([0, 0, 0], [x, 0, 0], [0, y, 0])
-    s.parallelogram([0, 0, z], [x, 0, 0], [0, y, 0])
+    s.floor_and_ceiling(x, y, z)
     s.walls([0, 0, 0], [x, y, 1.0])
     s.beams([x, y], z, 5.0, 0.4)
     for at_x in np.arange(2.5, x - 0.5, 5.0):
@@ -179,8 +175,7 @@ def basement(seed: int) -> Array:
     """Pipes and ducts below a low ceiling, a boiler, shelves, piles."""
     s = SurfaceSampler(np.random.default_rng([seed, 88]))
     x, y, z = s.rng.uniform([5.0, 4.0, 2.1], [11.0, 8.0, 2.7])
-    s.parallelogram([0, 0, 0], [x, 0, 0], [0, y, 0])
-    s.parallelogram([0, 0, z], [x, 0, 0], [0, y, 0])
+    s.floor_and_ceiling(x, y, z)
     s.walls([0, 0, 0], [x, y, z], 2, 1)
     for _ in range(int(s.rng.integers(3, 9))):
         radius, drop = s.rng.uniform([0.03, 0.15], [0.12, 0.5])

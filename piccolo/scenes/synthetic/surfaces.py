@@ -64,10 +64,14 @@ class SurfaceSampler:
         shift = 2.0 * SKIN if hangs else -2.0 * SKIN
         self.hidden.append((np.asarray(center) + [0.0, 0.0, 0.5 * z + shift], np.array([x, y, z]), yaw))
 
+    def floor_and_ceiling(self, x: float, y: float, z: float) -> None:
+        """Level rectangles from the origin to (x, y), at heights of 0 and z."""
+        for height in (0.0, z):
+            self.parallelogram([0, 0, height], [x, 0, 0], [0, y, 0])
+
     def shell(self, x: float, y: float, z: float) -> None:
         """The inside of a box from the origin to (x, y, z): floor, ceiling and walls."""
-        self.parallelogram([0, 0, 0], [x, 0, 0], [0, y, 0])
-        self.parallelogram([0, 0, z], [x, 0, 0], [0, y, 0])
+        self.floor_and_ceiling(x, y, z)
         self.walls([0, 0, 0], [x, y, z])
 
     def walls(self, corner: ArrayLike, size: ArrayLike, num_doors: int = 0, num_windows: int = 0) -> None:
