@@ -32,6 +32,7 @@ from piccolo.coarse_to_fine.settings import CoarseToFineSettings, Prior
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, is_correct
 from piccolo.panorama import Panorama
+from piccolo.runtime.array_archive import write_archive
 from piccolo.runtime.kernel_cache import digest_of, read_whole
 from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers
@@ -149,7 +150,7 @@ def trial_of_maps(folder: Path) -> Trial:
         if rng.random() < 0.01:
             del members[rng.choice(list(members))]
         with path.open("wb") as file:
-            np.savez(file, **members)
+            write_archive(file, members)
         try:
             found = load_map(path)
         except InputError as error:

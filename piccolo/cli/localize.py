@@ -82,6 +82,11 @@ def check_files(arguments: argparse.Namespace, panoramas: list[Path], total: int
         check_output(path)
 
 
+def cache_of(arguments: argparse.Namespace) -> CachePolicy:
+    """Where prepared maps are kept."""
+    return CachePolicy(not arguments.no_cache, arguments.cache)
+
+
 def prepare_run(arguments: argparse.Namespace) -> Run:
     """What is to be done: the options, the panoramas, and how many of them are finished."""
     with checking_options():
@@ -108,7 +113,8 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
         paths = arguments.cloud
         name = str(paths[0]) if len(paths) == 1 else tuple(map(str, paths))
         checked = show(panoramas, total, "check what is finished")
-        counts, size = batch.pass_finished(arguments.out, checked, name, scan_sha256_of(paths))
+        digest = scan_sha256_of(paths, cache_of(arguments))
+        counts, size = batch.pass_finished(arguments.out, checked, name, digest)
     return Run(arguments, batch, panoramas, total, counts, size)
 
 
@@ -117,9 +123,8 @@ def open_scan(run: Run) -> Scan:
     arguments, batch = run.arguments, run.batch
     if is_first_use():
         print_note(arguments, f"first use: compiling kernels, once (about a minute), into {kernel_folder()}")
-    cache = CachePolicy(not arguments.no_cache, arguments.cache)
     workers = Workers(arguments.threads, progress_bar(arguments.quiet), warn_once(arguments.quiet))
-    scan = open_files(arguments.cloud, batch.cloud_settings, batch.settings, cache, workers)
+    scan = open_files(arguments.cloud, batch.cloud_settings, batch.settings, cache_of(arguments), workers)
     for warning in scan.warnings:  # those of a map prepared earlier; others have been written
         workers.warn(warning)
     return scan

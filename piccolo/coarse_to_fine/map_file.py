@@ -1,31 +1,31 @@
-"""A prepared map on disk: a NumPy archive, and the cache of such files.
+"""A prepared map on disk: a NumPy archive that is mapped into memory.
 
 A file of another format, or damaged in any byte (each member of an archive has a checksum), is never trusted;
-`map_validation.py` checks what is whole.
+`map_validation.py` checks what is whole. Of a file that has been checked, its identity is remembered.
 FORMAT changes with what the arrays mean, so that a file outlives an update; the cache also knows the sources
 by which a map was made, and makes it anew when they have changed.
 """
 
-import math
-import zipfile
+import os
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
-from warnings import catch_warnings, simplefilter
 
 import numpy as np
-from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from .. import __version__
 from ..cloud.octree import Octree
 from ..cloud.readers.npz import damage_named
 from ..errors import InputError
 from ..local_features.feature_map import FeatureMap
+from ..runtime.array_archive import MappedArchive, write_archive
 from ..runtime.atomic import replacing
+from ..runtime.file_facts import recall, remember
 from .map_validation import LAYOUT, check_arrays, clean_warnings
 from .scan_map import ScanMap
 
-FORMAT = "piccolo-map/4"
+FORMAT = "piccolo-map/5"
 OTHERS = ("octree", "local_features", "warnings", "crs", "is_partial")
 ARRAYS = [f.name for f in fields(ScanMap) if f.name not in OTHERS]
 MEMBERS = {*LAYOUT, "format", "warnings"}
@@ -38,18 +38,16 @@ FIRST_VALUE, FIRST_VALUE_WITHIN = FORMAT.partition("/")[0].encode("utf-32-le"), 
 
 def save_map(scan_map: ScanMap, path: Path) -> None:
     """Write a map to `path`, whole or not at all."""
-    members = {name: getattr(scan_map, name) for name in ARRAYS}
+    members: dict[str, NDArray[Any]] = {
+        "format": np.array(FORMAT),
+        "warnings": np.array(scan_map.warnings, dtype=np.str_),
+        "crs": np.frombuffer(scan_map.crs.encode(), np.uint8),
+    }
+    members.update((name, np.asarray(getattr(scan_map, name))) for name in ARRAYS)
     for label, part in (("octree", scan_map.octree), ("local", scan_map.local_features)):
-        members.update({f"{label}_{name}": value for name, value in part._asdict().items()})
+        members.update((f"{label}_{name}", np.asarray(value)) for name, value in part._asdict().items())
     with replacing(path) as file:
-        np.savez(
-            file,
-            format=np.array(FORMAT),
-            warnings=np.array(scan_map.warnings, dtype=np.str_),
-            crs=np.frombuffer(scan_map.crs.encode(), np.uint8),
-            allow_pickle=False,
-            **members,
-        )
+        write_archive(file, members)
 
 
 def is_map_file(path: Path) -> bool:
@@ -63,20 +61,27 @@ def is_map_file(path: Path) -> bool:
     return head.startswith(ZIP_MAGIC) and (has_name or FIRST_VALUE in head)
 
 
-def load_map(path: Path) -> ScanMap:
-    """Read what `save_map` wrote; InputError for anything else, before more is read than the file holds."""
-    with damage_named(path, WANTED), path.open("rb") as file, zipfile.ZipFile(file) as archive:
-        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-        size = sum(info.file_size for info in archive.infolist())
-        if size > path.stat().st_size:
-            raise ValueError(f"arrays of {size} bytes")
-        if "format" in members and (found := str(_read(archive, members["format"]))) != FORMAT:
+def load_map(path: Path, remembers: bool = False) -> ScanMap:
+    """Map into memory what `save_map` wrote; InputError for anything else.
+
+    All of it is read and checked; with `remembers` only once, as long as the file stays as it is.
+    """
+    what = f"checked as {FORMAT} by {__version__}"
+    with damage_named(path, WANTED), path.open("rb") as file:
+        status = os.fstat(file.fileno())
+        archive = MappedArchive(file)
+        if "format" in archive.members and (found := str(archive.array("format"))) != FORMAT:
             text = f"a map of format {found[:40]!r}, but this version reads {FORMAT}; prepare it again"
             raise InputError(f"{path}: {text}")
-        if set(members) != MEMBERS or len(archive.infolist()) != len(MEMBERS):
-            raise ValueError(f"not the arrays of a map: {sorted(MEMBERS ^ set(members))}")
-        arrays = {name: _read(archive, info) for name, info in members.items()}
-        check_arrays(path, arrays)
+        if set(archive.members) != MEMBERS:
+            raise ValueError(f"not the arrays of a map: {sorted(MEMBERS ^ set(archive.members))}")
+        arrays = {name: archive.array(name) for name in archive.members}
+        if not (remembers and recall(what, status) is not None):
+            for name in archive.members:
+                archive.check(name)
+            check_arrays(path, arrays)
+            if remembers:
+                remember(what, status, "")
         warnings = clean_warnings(path, arrays["warnings"])
     own: dict[str, Any] = {name: arrays[name] for name in ARRAYS if name not in ("has_labels", "scan_sha256")}
     return ScanMap(
@@ -93,17 +98,3 @@ def load_map(path: Path) -> ScanMap:
         crs=arrays["crs"].tobytes().decode(),
         **own,
     )
-
-
-def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
-    """The array in a member as `np.savez` writes it: not compressed, and as long as its header says."""
-    with archive.open(info) as member, catch_warnings():
-        simplefilter("error")  # NumPy warns of headers that it had to mend
-        if info.compress_type != zipfile.ZIP_STORED or npy.read_magic(member) != (1, 0):
-            raise ValueError(f"{info.filename} in another way than NumPy's savez has it")
-        shape, is_fortran, dtype = npy.read_array_header_1_0(member)
-        promised, found = math.prod(shape) * dtype.itemsize, info.file_size - member.tell()
-        if is_fortran or dtype.hasobject or promised != found:
-            raise ValueError(f"{info.filename} of {found} bytes, which promises {dtype} of shape {shape}")
-        member.seek(0)
-        return np.asarray(npy.read_array(member, allow_pickle=False))

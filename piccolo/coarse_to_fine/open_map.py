@@ -56,7 +56,7 @@ def open_map(
         if len(paths) > 1 or replace(cloud_settings, labels=None, crs=None) != IN_METRES:
             raise InputError(f"{map_path}: found a prepared map, wanted it alone, without options for clouds")
         with watch.stage("read"):
-            scan_map = load_map(map_path)
+            scan_map = load_map(map_path, cache.is_used)
         if scan_map.has_labels != (cloud_settings.labels is not None):
             kind = "labels, wanted --labels too" if scan_map.has_labels else "colours, wanted no --labels"
             raise InputError(f"{map_path}: found a prepared map of {kind}")
@@ -65,7 +65,7 @@ def open_map(
     digest = ""
     if all(path.is_file() for path in paths):  # what is none is refused when it is opened
         with watch.stage("read"):
-            digest = sha256_of_files(paths)
+            digest = sha256_of_files(paths, cache.is_used)
 
     def build() -> ScanMap:
         with watch.stage("read"):
@@ -89,10 +89,12 @@ def prepared_map_among(paths: Sequence[Path]) -> Path | None:
     return next((path for path in paths if path.is_file() and is_map_file(path)), None)
 
 
-def scan_sha256_of(paths: Sequence[Path]) -> str:
+def scan_sha256_of(paths: Sequence[Path], cache: CachePolicy) -> str:
     """The digest of a scan's files, or the one of what the prepared map in place of them was made from."""
     map_path = prepared_map_among(paths)
-    return load_map(map_path).scan_sha256 if map_path else sha256_of_files(paths)
+    if map_path:
+        return load_map(map_path, cache.is_used).scan_sha256
+    return sha256_of_files(paths, cache.is_used)
 
 
 def content_key(scan_sha256: str, settings: CloudSettings) -> str:
@@ -127,9 +129,9 @@ def cached_map(
         path = kept_in / f"{key}.piccolo-map"
         if path.exists():
             with watch.stage("read"):
-                scan_map = load_map(path)
-            if scan_map.scan_sha256 == scan_sha256:
                 mark_used(path)
+                scan_map = load_map(path, remembers=True)
+            if scan_map.scan_sha256 == scan_sha256:
                 return scan_map, ""
             warning = f"{path}: found the map of another scan; it is made anew"
     except InputError as error:

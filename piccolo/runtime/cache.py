@@ -16,7 +16,7 @@ from pathlib import Path
 
 from .atomic import write_atomically
 
-STALE_AFTER_S = 30 * 24 * 3600.0
+STALE_AFTER_S, MARKED_FOR_S = 30 * 24 * 3600.0, 24 * 3600.0
 PRIVATE, ALL = 0o700, 0o777
 WRITABLE, OPEN = 0o022, 0o077  # by others; in any way
 TAG = "CACHEDIR.TAG"  # https://bford.info/cachedir/: backups leave such folders out
@@ -83,9 +83,10 @@ def remove_stale(folder: Path, name: re.Pattern[str]) -> None:
 
 
 def mark_used(path: Path) -> None:
-    """Set a file's time to now, so that it stays; a file that may only be read keeps its time."""
+    """Set a file's time to now, once a day, so that it stays; a file that may only be read keeps its time."""
     with suppress(OSError):
-        os.utime(path)
+        if time.time() - path.stat().st_mtime > MARKED_FOR_S:
+            os.utime(path)
 
 
 def in_words(error: OSError) -> str:

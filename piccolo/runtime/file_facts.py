@@ -1,0 +1,54 @@
+"""What is known of a file's whole content, kept for as long as the file stays as it is.
+
+A fact goes by the file's identity: device, inode, size, times of the last change of content and of status.
+Only the system sets the last: nobody who writes to a file can give it the identity of the old one.
+"""
+
+import hashlib
+import os
+import re
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+
+from .atomic import write_atomically
+from .cache import PRIVATE, WRITABLE, cache_root, is_own, mark_used, own_folder
+
+NAME = re.compile(r"[0-9a-f]{32}\.fact|\.[0-9a-f]{32}\.fact\.\w{8}")  # and one that was being written
+MAX_SIZE = 200  # [byte] of a fact
+
+
+@cache
+def facts_folder() -> Path | None:
+    """The user's folder of facts, made now; None where others could write to it, or there can be none."""
+    with suppress(OSError):
+        folder = own_folder(cache_root() / "facts", NAME, PRIVATE)
+        return folder if is_own(folder.stat(), WRITABLE) else None
+    return None
+
+
+def _path(what: str, status: os.stat_result) -> Path | None:
+    """The file in which `what` is kept of a file of this status."""
+    identity = status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+    folder, key = facts_folder(), repr((what, identity))
+    return folder and folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.fact"
+
+
+def recall(what: str, status: os.stat_result) -> str | None:
+    """What was remembered of a file by its status; None if nothing was, or the file has changed since."""
+    path = _path(what, status)
+    if path is None:
+        return None
+    with suppress(OSError, UnicodeDecodeError):
+        with path.open("rb") as file:
+            fact = file.read(MAX_SIZE).decode()
+        mark_used(path)
+        return fact
+    return None
+
+
+def remember(what: str, status: os.stat_result, fact: str) -> None:
+    """Keep a line about a file, by the status that it had before it was read; lost where that can't be."""
+    if path := _path(what, status):
+        with suppress(OSError):
+            write_atomically(path, fact.encode())
