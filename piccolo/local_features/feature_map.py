@@ -94,9 +94,9 @@ def project(
 
 @inline_kernel
 def squared_gap(first, second):
-    """Squared distance of two descriptors (D,) of 8 bits."""
+    """Squared distance of two descriptors (NUM_COMPONENTS,) of 8 bits."""
     total = np.int32(0)
-    for d in range(len(first)):
+    for d in range(NUM_COMPONENTS):
         gap = np.int32(first[d]) - np.int32(second[d])
         total += gap * gap
     return total

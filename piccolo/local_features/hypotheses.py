@@ -16,11 +16,12 @@ from ..geometry.pose import Array, Pose
 from ..geometry.suppression import non_maximum_suppression
 from ..runtime.jit import F0, inline_kernel, kernel
 from ..runtime.threads import Workers
-from .matching import Matches
+from .matching import LEAST_WEIGHT, Matches
 from .p3p import p3p
 from .pose_refinement import refine_pose
 
 COS_ROUGH, COS_EXACT = math.cos(math.radians(20.0)), math.cos(math.radians(1.0))  # a match off by less agrees
+COS2_NEAR = np.float32(math.cos(math.radians(20.1)) ** 2)  # in float32 first, and a little wider
 COS_TANGENT = math.cos(math.radians(40.0))
 SIZE_RATIO = 1.7  # of a keypoint's size as predicted and as found, at most
 COS_TILT = math.cos(math.radians(12.0))  # by which a pose may be off the known vertical
@@ -29,7 +30,8 @@ MAX_VOTERS = 1200  # single matches whose poses are tried
 BATCH = 64  # of them a thread tries at a time
 CLUSTER_DISTANCE, CLUSTER_ANGLE = 1.0, math.radians(30.0)  # [m], [rad] rough poses nearer than both are one
 SAME_DISTANCE, SAME_ANGLE = 0.3, math.radians(10.0)  # exact poses nearer than both are one
-NUM_CLUSTERS = 48
+NUM_CLUSTERS, FIRST_CLUSTERS = 48, 8  # that are made exact: at most, and before it is asked which of the rest
+FAIR_PART = 0.2  # of the best pose's matches
 NUM_SAMPLES = 200  # of three matches, a cluster
 LEAST_MATCHES = 4  # that agree with a pose
 REFINEMENTS, REFINE_SCALE = 8, math.radians(0.5)  # steps, scale of the loss [rad]
@@ -89,10 +91,28 @@ def write_turned(m, j, R):
 
 
 @inline_kernel
-def agreeing_weight(m, R, t):
+def find_near(points, rays, R, t, is_near):
+    """Write which of the matches' points (3, M) a pose puts near their rays (3, M): most are not."""
+    r00, r01, r02 = np.float32(R[0, 0]), np.float32(R[0, 1]), np.float32(R[0, 2])
+    r10, r11, r12 = np.float32(R[1, 0]), np.float32(R[1, 1]), np.float32(R[1, 2])
+    r20, r21, r22 = np.float32(R[2, 0]), np.float32(R[2, 1]), np.float32(R[2, 2])
+    cx, cy, cz = np.float32(t[0]), np.float32(t[1]), np.float32(t[2])
+    for i in range(points.shape[1]):
+        dx, dy, dz = points[0, i] - cx, points[1, i] - cy, points[2, i] - cz
+        x = r00 * dx + r01 * dy + r02 * dz
+        y = r10 * dx + r11 * dy + r12 * dz
+        z = r20 * dx + r21 * dy + r22 * dz
+        along = x * rays[0, i] + y * rays[1, i] + z * rays[2, i]
+        is_near[i] = (along > F0) & (along * along >= COS2_NEAR * (x * x + y * y + z * z))
+
+
+@inline_kernel
+def agreeing_weight(m, is_near, R, t):
     """Sum over the photo's features of the largest weight of a match that roughly agrees with a pose."""
     total, last, best = 0.0, -1, F0
     for i in range(len(m.query)):
+        if not is_near[i]:
+            continue
         if m.query[i] != last:
             total += best
             last, best = m.query[i], F0
@@ -102,9 +122,12 @@ def agreeing_weight(m, R, t):
 
 
 @kernel
-def rough_poses(matches, voters, R_cam_from_level, is_upright, rotations, centers, votes):
-    """Write the pose (n, 3, 3), (n, 3) of each single match, and the weight (n,) of all that agree."""
-    m = matches
+def rough_poses(matches, columns, voters, R_cam_from_level, is_upright, rotations, centers, votes):
+    """Write the pose (n, 3, 3), (n, 3) of each single match, and the weight (n,) of all that agree.
+
+    `columns` are the matches' points and rays once more, (3, M) each.
+    """
+    m, is_near = matches, np.empty(len(matches.query), np.bool_)
     for k in range(len(voters)):
         j, R, t = voters[k], rotations[k], centers[k]
         distance = m.sizes[j] / max(m.angles[j], LEAST_ANGLE)
@@ -114,7 +137,8 @@ def rough_poses(matches, voters, R_cam_from_level, is_upright, rotations, center
             write_upright(m, j, R_cam_from_level, R)
         else:
             write_turned(m, j, R)
-        votes[k] = agreeing_weight(m, R, t)
+        find_near(columns[0], columns[1], R, t, is_near)
+        votes[k] = agreeing_weight(m, is_near, R, t)
 
 
 @inline_kernel
@@ -203,6 +227,7 @@ def poses_of(
 ) -> list[MatchedPose]:
     """At most `count` poses that most matches agree with, best first, in the map's frame.
 
+    A pose with less than FAIR_PART of the best one's matches is none.
     R_cam_from_level (3, 3) says how the camera was tilted, None if nobody knows.
     """
     voters = np.argsort(-matches.weights, kind="stable")[:MAX_VOTERS]
@@ -210,10 +235,12 @@ def poses_of(
     votes = np.empty(len(voters))
     level = np.eye(3) if R_cam_from_level is None else np.ascontiguousarray(R_cam_from_level, np.float64)
 
+    columns = np.ascontiguousarray(matches.points.T), np.ascontiguousarray(matches.rays.T)
+
     def vote(lo: int) -> None:
         part = slice(lo, lo + BATCH)
         how = level, R_cam_from_level is not None
-        rough_poses(matches, voters[part], *how, rotations[part], centers[part], votes[part])
+        rough_poses(matches, columns, voters[part], *how, rotations[part], centers[part], votes[part])
 
     list(workers.map(vote, range(0, len(voters), BATCH), "vote"))
     order = np.argsort(-votes, kind="stable")
@@ -223,8 +250,15 @@ def poses_of(
     def exact(k: int) -> MatchedPose | None:
         return exact_pose(matches, Pose(rotations[k], centers[k]), R_cam_from_level)
 
-    found = [f for f in workers.map(exact, list(kept), "sample") if f and f.num_matches >= LEAST_MATCHES]
-    found.sort(key=lambda f: -f.num_matches)
+    def exact_ones(clusters: NDArray[np.int64]) -> list[MatchedPose]:
+        return [f for f in workers.map(exact, list(clusters), "sample") if f]
+
+    found = exact_ones(kept[:FIRST_CLUSTERS])
+    least = max([LEAST_MATCHES, *(FAIR_PART * f.num_matches for f in found)])
+    rest = kept[FIRST_CLUSTERS:]
+    found += exact_ones(rest[votes[rest] >= LEAST_WEIGHT * least])  # others hardly have so many matches
+    least = max([LEAST_MATCHES, *(FAIR_PART * f.num_matches for f in found)])
+    found = sorted((f for f in found if f.num_matches >= least), key=lambda f: -f.num_matches)
     if not found:
         return []
     R, t = np.array([f.pose.R_cam_from_world for f in found]), np.array([f.pose.center_world for f in found])

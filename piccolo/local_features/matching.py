@@ -15,6 +15,7 @@ NUM_LISTS = 16  # that are looked through
 APART = np.float32(0.3)  # [m] features of the map nearer to each other are one
 BATCH = 64  # features a thread takes at a time
 DISTINCT_RATIO = 0.8  # of squared distances, best by second best elsewhere (Lowe)
+LEAST_WEIGHT = 0.5
 FAR = np.int32(2147483647)
 
 
@@ -29,7 +30,7 @@ class Matches(NamedTuple):
     directions: NDArray[np.float32]  # (M, 3) from which the map knows it, camera to point
     tangents: NDArray[np.float32]  # (M, 3)
     sizes: NDArray[np.float32]  # (M,) diameter [m]
-    weights: NDArray[np.float32]  # (M,) how much it tells: 1 of a distinct one
+    weights: NDArray[np.float32]  # (M,) how much it tells: 1 of a distinct one, else LEAST_WEIGHT
 
 
 @inline_kernel
@@ -111,7 +112,7 @@ def match(keypoints: Keypoints, feature_map: FeatureMap, workers: Workers) -> Ma
     query, rank = np.nonzero(found[:, :NUM_NEIGHBORS] >= 0)
     chosen = found[query, rank]
     is_distinct = (rank == 0) & (distances[query, 0] < DISTINCT_RATIO * distances[query, 1])
-    weights = np.where(is_distinct, 1.0, 0.5).astype(np.float32)
+    weights = np.where(is_distinct, 1.0, LEAST_WEIGHT).astype(np.float32)
     return Matches(
         query.astype(np.int32),
         keypoints.rays[query],
