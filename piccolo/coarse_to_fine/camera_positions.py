@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from ..cloud.octree import Octree
 from ..errors import InputError
@@ -125,6 +124,8 @@ def candidate_centers(
 
     `within` and the error as of supported_cells.
     """
+    from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
+
     cells = supported_cells(top_surfaces(octree), within)
     tree = cKDTree(octree.level(0.08)[:, :3], balanced_tree=False, compact_nodes=False)
     middle = (cells + 0.5) * COARSE_SPACING
@@ -156,6 +157,8 @@ def heights_above_floor(octree: Octree, centers: NDArray[np.float64]) -> NDArray
 
     inf where there is none within SUPPORT_RADIUS and STOREY.
     """
+    from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
+
     surfaces = top_surfaces(octree)
     near = cKDTree(surfaces[:, :2]).query_ball_point(centers[:, :2], SUPPORT_RADIUS)
     heights = np.full(len(centers), np.inf)

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from ..camera import Camera, Mount
 from ..camera.model import MODELS
@@ -157,6 +156,8 @@ def fit(points: Array, pixels: Array, pose: Pose, mount: Mount, scale: float) ->
         return np.asarray((changed(camera, delta[POSE:]).pixels(rays)[0] - pixels).ravel())
 
     start = np.zeros(POSE + 1 + has_radial)
+    from scipy.optimize import least_squares  # noqa: PLC0415  # 0.2 s that only this option waits for
+
     found = least_squares(residuals, start, loss="cauchy", f_scale=f_scale, x_scale="jac")
     variance = covariance_of(found.jac, residuals(found.x), f_scale)[POSE, POSE]
     return step(pose, found.x[:POSE]), changed(camera, found.x[POSE:]), math.sqrt(variance)

@@ -5,12 +5,13 @@ lost. The thresholds were set by hand, apart from both sides: tests/test_panoram
 they must leave alone and the patches that they find.
 """
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from ..errors import InputError
 from .cube import SUFFIXES
@@ -66,12 +67,18 @@ def black_borders(
             if is_black.mean() < min_fraction:
                 continue
             depth = _depth_of_black(inwards, is_black)
-            core = np.maximum(minimum_filter1d(depth, 2 * RIM + 1) - RIM, 0)
+            core = np.maximum(_filtered(cv2.erode, depth) - RIM, 0)
             if _black_fraction(inwards, core if core.any() else depth) >= MIN_PURE:
                 depth = np.where(depth > 0, depth + RIM, 0)
                 border = found.swapaxes(0, axis)[::step][: depth.max()]
-                border |= np.arange(len(border))[:, None] < maximum_filter1d(depth, 2 * RIM + 1)
+                border |= np.arange(len(border))[:, None] < _filtered(cv2.dilate, depth)
     return found if found.any() else None
+
+
+def _filtered(which: Callable[..., Any], depth: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The least (cv2.erode) or largest (cv2.dilate) of the depths (columns,) within RIM of each."""
+    column = depth[:, None].astype(np.float32)  # whole numbers that small are exact
+    return np.asarray(which(column, np.ones((2 * RIM + 1, 1), np.uint8))[:, 0], np.int64)
 
 
 def _depth_of_black(inwards: NDArray[np.uint8], is_black: NDArray[np.bool_]) -> NDArray[np.int64]:
