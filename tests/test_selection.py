@@ -1,6 +1,7 @@
 """Which pose is taken, and how much search that needs, each in a made-up case where one rule decides."""
 
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -109,6 +110,47 @@ def test_the_pose_with_the_greatest_odds_is_selected(monkeypatch, explains, matc
     assert found.rival_ratio == pytest.approx(explains[0 if best else 1] / explains[1 if best else 0])
     alone = SearchResult(_at(0.0, 0.5), ())
     assert standings.fairly_selected(query, alone) is alone
+
+
+def test_of_poses_that_beat_each_other_in_turn_the_one_beaten_least_is_best(monkeypatch):
+    """Each two are compared over other parts of the sphere."""
+    query = _compared(monkeypatch, {}, {0.0: 20, 3.0: 20, 6.0: 20})
+    ratios = {(0.0, 3.0): 0.7, (3.0, 6.0): 0.8, (6.0, 0.0): 0.9}  # of the first, by the second
+    ratios |= {(second, first): 1.0 / ratio for (first, second), ratio in ratios.items()}
+    ratios |= {(place, place): 1.0 for place in (0.0, 3.0, 6.0)}
+
+    class Seen(NamedTuple):
+        place: float
+
+        def ratio_to(self, other):
+            return ratios[self.place, other.place]
+
+    monkeypatch.setattr(standings, "compare", lambda query, pose: Seen(pose.center_world[0]))
+    for first, second, third in ((0.0, 3.0, 6.0), (6.0, 0.0, 3.0), (3.0, 6.0, 0.0)):
+        found = SearchResult(_at(first, 0.5), (_at(second, 0.5), _at(third, 0.5)))
+        selected = standings.fairly_selected(query, found)
+        assert _places([selected.best, *selected.alternatives]) == [6.0, 0.0, 3.0]
+        assert selected.rival_ratio == pytest.approx(1.0 / 0.9)
+
+
+def test_the_best_pose_has_come_to_rest_and_is_still_the_best(monkeypatch):
+    """At rest, the first explains less than the second; of the two at rest, the second is better."""
+    explains, rested = {0.0: 0.5, 3.0: 0.45, 0.01: 0.3, 3.01: 0.46}, []
+    query = _compared(monkeypatch, explains, dict.fromkeys(explains, 20))
+
+    def settle(query, h):
+        place = h.pose.center_world[0]
+        rested.append(place)
+        return _at(place + 0.01, h.score) if place in (0.0, 3.0) else h
+
+    monkeypatch.setattr(method, "settle", settle)
+    found = method.settled(query, SearchResult(_at(0.0, 0.5), (_at(3.0, 0.5),)))
+    assert rested == [0.0, 3.0]
+    assert _places([found.best, *found.alternatives]) == [3.01, 0.01]
+    rested.clear()
+    explains[0.01] = 0.49
+    found = method.settled(query, SearchResult(_at(0.0, 0.5), (_at(3.0, 0.5),)))
+    assert (rested, found.best.pose.center_world[0]) == ([0.0], 0.01)
 
 
 def test_what_speaks_for_poses_is_compared_with_the_best(monkeypatch):

@@ -100,5 +100,16 @@ def finished(query: Query, hypotheses: Sequence[Hypothesis]) -> SearchResult:
     near = list(compress(found.alternatives, is_near))[: 1 if is_faint else ALTERNATIVES_REFINED]
     ends = list(query.workers.map(refined, [found.best, *near], "descend"))
     far = [h for h in found.alternatives if not any(h is other for other in near)]
-    found = fairly_selected(query, found_among([*ends, *far], ALTERNATIVES_COMPARED))
-    return replace(found, best=settle(query, found.best))
+    return settled(query, fairly_selected(query, found_among([*ends, *far], ALTERNATIVES_COMPARED)))
+
+
+def settled(query: Query, found: SearchResult) -> SearchResult:
+    """The same with a best pose that has come to rest, and that is still the best one then."""
+    at_rest: list[Hypothesis] = []
+    for _ in range(1 + len(found.alternatives)):
+        best = settle(query, found.best)
+        at_rest.append(best)
+        found = fairly_selected(query, replace(found, best=best))
+        if any(found.best is h for h in at_rest):
+            break
+    return found

@@ -3,6 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import Standing, log_odds
 from ..local_features.hypotheses import count_matches
@@ -21,15 +24,30 @@ def standings_of(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -
     ]
 
 
+def odds_by_pair(query: Query, poses: Sequence[Hypothesis]) -> NDArray[np.float64]:
+    """Log odds (N, N) of each pose, a column, against each, a row, over what the two show."""
+    seen = list(query.workers.map(lambda h: compare(query, h.pose), poses, "compare"))
+    alone = [Standing(1.0, h.score, count_matches(query.matches, h.pose)) for h in poses]
+    odds = [
+        [log_odds(a._replace(share=c.ratio_to(best))) for a, c in zip(alone, seen, strict=True)]
+        for best in seen
+    ]
+    return np.array(odds) - np.diag(odds)[:, None]
+
+
 def fairly_selected(query: Query, found: SearchResult) -> SearchResult:
-    """The same with the margin over what both views show, and as best the pose with the greatest odds."""
+    """The same with the margin over what both views show, and as best the pose with the greatest odds.
+
+    As each two are compared over other parts of the sphere, three poses may beat each other in turn: the best
+    is the one that is beaten least (minimax; Simpson 1969, Kramer 1977). The others follow by their odds.
+    """
     if not found.alternatives:
         return found
     ranked = [found.best, *found.alternatives]
-    list(query.workers.map(lambda h: compare(query, h.pose), ranked, "compare"))
-    odds = [log_odds(standing) for standing in standings_of(query, found.best, found.alternatives)]
-    best = max(range(len(ranked)), key=lambda k: odds[k])
-    others = tuple(h for k, h in enumerate(ranked) if k != best)
-    at_best = compare(query, ranked[best].pose)
+    odds = odds_by_pair(query, ranked)
+    worst = np.where(np.eye(len(ranked), dtype=bool), -np.inf, odds).max(axis=1)
+    best = int(np.argmin(worst))
+    order = [int(k) for k in np.argsort(-odds[best], kind="stable") if k != best]
+    others, at_best = tuple(ranked[k] for k in order), compare(query, ranked[best].pose)
     rival_ratio = max(compare(query, h.pose).ratio_to(at_best) for h in others)
     return replace(found, best=ranked[best], alternatives=others, rival_ratio=rival_ratio)
