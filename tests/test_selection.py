@@ -20,7 +20,8 @@ from piccolo.optimize.channel_loss import CHANCE
 from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers
 
-QUERY = SimpleNamespace(workers=Workers(1), method=METHOD, scan_map=SimpleNamespace(octree=None))
+OF_MAP = SimpleNamespace(octree=None)
+QUERY = SimpleNamespace(workers=Workers(1), method=METHOD, scan_map=OF_MAP, by_features=True)
 
 
 def _at(x, score, yaw_deg=0.0):
@@ -189,6 +190,7 @@ def _run(monkeypatch, matched, searches, gravity="auto", config=METHOD):
 
     monkeypatch.setattr(method, "apply_prior", lambda *_: scan_map)
     monkeypatch.setattr(method, "prepare_query", lambda *_: SimpleNamespace(**vars(QUERY), matches=None))
+    monkeypatch.setattr(method, "is_whole", lambda query: False)
     monkeypatch.setattr(method, "matched_poses", lambda query: "matched")
     monkeypatch.setattr(method, "refine_matched", lambda query, poses: list(matched))
     _compared(monkeypatch, scores, {x: 100 * score for x, score in scores.items()})
@@ -234,7 +236,9 @@ def test_matches_or_searches_can_be_taken_out(monkeypatch):
 
 def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
     scan_map = SimpleNamespace(points=None, coarse_points=None, to_world=lambda pose: pose)
-    query = SimpleNamespace(scan_map=scan_map, settings=CoarseToFineSettings(), matches=None)
+    query = SimpleNamespace(
+        scan_map=scan_map, settings=CoarseToFineSettings(), matches=None, by_features=True
+    )
     counts = {0.0: 30, 1.0: 4, 2.0: 6}
     for name, value in {
         "visible_points": lambda *_: None,

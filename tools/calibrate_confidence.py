@@ -16,6 +16,7 @@ from scipy.stats import chi2
 from piccolo.cli.command import command, option
 from piccolo.confidence.confidence import (
     AMBIGUOUS,
+    CLEAR_MATCHES,
     FEATURES,
     LOCALIZED,
     MIN_CONFIDENCE,
@@ -74,8 +75,11 @@ def outcome_of(line: str) -> Outcome | None:
     if result.best_pose is None or result.evidence is None or result.probability_none is None:
         return None
     e, poses = result.evidence, [result.best_pose, *(a.pose for a in result.alternatives)]
-    standings = [Standing(1.0, e.score, e.num_matches)]
-    standings += [Standing(a.share or 0.0, a.score, a.num_matches or 0) for a in result.alternatives]
+    standings = [Standing(1.0, e.score, CLEAR_MATCHES if e.num_matches is None else e.num_matches)]
+    standings += [
+        Standing(a.share or 0.0, a.score, CLEAR_MATCHES if a.num_matches is None else a.num_matches)
+        for a in result.alternatives
+    ]
     error, right = np.full(6, np.nan), len(poses)
     if isinstance(truth, dict):
         true_pose = Pose(np.array(truth["R_cam_from_world"]), np.array(truth["center_world"]))

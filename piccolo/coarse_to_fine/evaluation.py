@@ -52,9 +52,10 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
     warnings: tuple[str, ...] = ()
     if classify(probabilities, settings.min_confidence) != NOT_LOCALIZED and is_mirrored(query, evidence):
         probabilities, warnings = np.append(np.zeros(len(standings)), 1.0), (MIRRORED,)
+    matches = [s.num_matches if query.by_features else None for s in standings[1:]]
     alternatives = tuple(
-        Alternative(scan_map.to_world(h.pose), h.score, s.share, s.num_matches, float(p))
-        for h, s, p in zip(reported, standings[1:], probabilities[1:-1], strict=True)
+        Alternative(scan_map.to_world(h.pose), h.score, s.share, num_matches, float(p))
+        for h, s, num_matches, p in zip(reported, standings[1:], matches, probabilities[1:-1], strict=True)
     )
     return Localization(
         classify(probabilities, settings.min_confidence),
@@ -74,6 +75,7 @@ def evidence_of(query: Query, panorama: Panorama, pose: Pose, found: SearchResul
     scan_map = query.scan_map
     at_pose = agreement_at(scan_map.coarse_points, panorama, pose)
     explained, contradicted = occlusion_at(scan_map.points, panorama, pose).fractions()
+    num_matches = [count_matches(query.matches, h.pose) for h in (found.best, *found.alternatives)]
     return Evidence(
         score=found.best.score,
         margin=found.margin,
@@ -81,17 +83,20 @@ def evidence_of(query: Query, panorama: Panorama, pose: Pose, found: SearchResul
         explained_fraction=explained,
         contradicted_fraction=contradicted,
         seen_fraction=at_pose.seen_fraction,
-        num_matches=count_matches(query.matches, found.best.pose),
-        alternative_matches=max([0, *(count_matches(query.matches, h.pose) for h in found.alternatives)]),
+        num_matches=num_matches[0] if query.by_features else None,
+        alternative_matches=max(num_matches[1:], default=0) if query.by_features else None,
     )
 
 
 def is_mirrored(query: Query, evidence: Evidence) -> bool:
     """True if more features of the mirrored photo agree with one pose than of the photo.
 
-    Symmetric things match in a mirror too, but not more of them. A pose that explains nearly all needs none.
+    Symmetric things match in a mirror too, but not more of them. A pose that explains nearly all needs none,
+    and a first look has asked.
     """
-    if evidence.score >= ENOUGH_EXPLAINED:
+    if (
+        evidence.score >= ENOUGH_EXPLAINED or evidence.num_matches is None
+    ):  # a clear whole view has been asked
         return False
     matches = match(query.keypoints.mirrored(), query.scan_map.local_features, query.workers)
     found = poses_of(matches, None, 1, query.workers)

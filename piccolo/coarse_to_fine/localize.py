@@ -8,12 +8,14 @@ from typing import Literal
 from ..confidence.alternatives import Hypothesis
 from ..confidence.localization import Localization
 from ..geometry.pose import Pose
+from ..geometry.rotations import Gravity
 from ..local_features.hypotheses import count_matches, poses_of
 from ..panorama import Panorama
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from .config import METHOD, MethodConfig
 from .evaluation import evaluate
+from .first_look import is_clear, is_whole
 from .prior import apply_prior, is_allowed, nothing_allowed
 from .query import Query, prepare_query
 from .refinement import refine, refine_full_resolution, refine_matched, settle
@@ -22,6 +24,7 @@ from .search import search_poses
 from .search_result import NEAR_RATIO, SURE_MATCHES, SearchResult, found_among
 from .settings import CoarseToFineSettings
 from .standings import fairly_selected
+from .starts import Starts
 
 NUM_MATCHED = 6  # poses from matches that are refined
 ALTERNATIVES_COMPARED, ALTERNATIVES_REFINED = 8, 4  # at most
@@ -39,10 +42,11 @@ def localize(
     watch: Stopwatch,
     method: MethodConfig = METHOD,
 ) -> Localization:
-    """Where the panorama was taken: match features, search, refine, compare with the alternatives, evaluate.
+    """Where the panorama was taken: search, refine, match features, compare with the alternatives, evaluate.
 
-    The poses that matches vote for come first. Where they leave doubt, whole views are searched too: with the
-    gravity `auto` as known, then as unknown, until one is sure.
+    A whole upright sphere that is clear by whole views needs no more. Else come the poses that matches vote
+    for, and where they leave doubt, whole views: with the gravity `auto` as known, then as unknown, until one
+    is sure.
     """
     candidates = apply_prior(scan_map, settings.prior)
     if len(candidates.centers) == 0 or not panorama.is_valid.any():
@@ -52,20 +56,31 @@ def localize(
     with watch.stage("search"):
         query = prepare_query(panorama, candidates, settings, workers, method)
     hypotheses: list[Hypothesis] = []
-    if method.uses_features:
-        with watch.stage("match"):
-            hypotheses = refine_matched(query, matched_poses(query))
     gravities: list[Literal["known", "unknown"]]
     gravities = ["known", "unknown"] if settings.gravity == "auto" else [settings.gravity]
-    for gravity in gravities if method.uses_search else []:
+    gravities = gravities if method.uses_search else []
+    if method.uses_features and is_whole(query) and gravities:
+        first = replace(query, by_features=False)
+        starts, hypotheses = searched(first, gravities.pop(0), watch)
+        with watch.stage("search"):
+            query = first if is_clear(first, starts, hypotheses) else query
+    if method.uses_features and query.by_features:
+        with watch.stage("match"):
+            hypotheses += refine_matched(query, matched_poses(query))
+    for gravity in gravities if query.by_features else []:
         if is_sure(query, hypotheses):
             break
-        with watch.stage("search"):
-            starts = search_poses(query, gravity)
-        with watch.stage("refine"):
-            hypotheses += refine(query, starts, method.beam)
+        hypotheses += searched(query, gravity, watch)[1]
     with watch.stage("refine"):
         return evaluate(query, panorama, finished(query, hypotheses))
+
+
+def searched(query: Query, gravity: Gravity, watch: Stopwatch) -> tuple[Starts, list[Hypothesis]]:
+    """The starts of a search by whole views, and where they lead."""
+    with watch.stage("search"):
+        starts = search_poses(query, gravity)
+    with watch.stage("refine"):
+        return starts, refine(query, starts, query.method.beam)
 
 
 def is_sure(query: Query, hypotheses: Sequence[Hypothesis]) -> bool:

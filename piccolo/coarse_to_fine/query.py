@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..geometry.pose import Array, Pose, rotate_points
 from ..geometry.sphere import indices_of, make_grid
 from ..local_features.keypoints import Keypoints, find_keypoints
-from ..local_features.matching import Matches, match
+from ..local_features.matching import NO_MATCHES, Matches, match
 from ..panorama import Panorama
 from ..panorama.gpano import rotation_to_level
 from ..panorama.local_normalization import normalize_panorama
@@ -80,6 +80,8 @@ class Query:
     workers: Workers
     method: MethodConfig
     panorama: Panorama  # at the width of its features
+    by_features: bool = True  # False where whole views alone are asked
+    comparisons: dict[bytes, Any] = field(default_factory=dict)  # worked out already, by comparison.py
 
     @cached_property
     def keypoints(self) -> Keypoints:
@@ -89,7 +91,9 @@ class Query:
 
     @cached_property
     def matches(self) -> Matches:
-        """The photo's keypoints and the features of the map that look alike."""
+        """The photo's keypoints and the features of the map that look alike; none if they are not needed."""
+        if not self.by_features:
+            return NO_MATCHES
         return match(self.keypoints, self.scan_map.local_features, self.workers)
 
     @cached_property
@@ -97,11 +101,6 @@ class Query:
         """The photo's colours at the size at which poses are compared."""
         small = resize(self.panorama, COMPARED_WIDTH)
         return pack_texels(small.rgb, small.is_valid)
-
-    @cached_property
-    def comparisons(self) -> dict[bytes, Any]:
-        """What comparison.py has worked out already, by pose, and by the blocks that are left out."""
-        return {}
 
     def shown_cells(self, num_rings: int, pose: Pose) -> NDArray[np.bool_]:
         """Which cells (N,) of a grid around a pose in the map the photo shows; all, if it shows a sphere."""
@@ -116,7 +115,12 @@ class Query:
         height, width = self.panorama.is_valid.shape
         enlarged = cv2.resize(is_hidden.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
         rest = replace(self.panorama, is_valid=self.panorama.is_valid & (enlarged == 0))
-        return replace(self, images=query_images(rest, self.method.scales), panorama=rest)
+        return self.of_panorama(rest)
+
+    def of_panorama(self, panorama: Panorama) -> "Query":
+        """The same of another panorama of the same size."""
+        images = query_images(panorama, self.method.scales)
+        return replace(self, images=images, panorama=panorama, comparisons={})
 
 
 def prepare_query(

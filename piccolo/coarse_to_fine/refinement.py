@@ -3,6 +3,8 @@
 import math
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE, Hypothesis, best_distinct, by_score, suppressed
 from ..geometry.pose import Pose
 from .comparison import compare, without_occluders
@@ -13,6 +15,7 @@ from .starts import CLOSE_DISTANCE, SAME_ANGLE, SAME_DISTANCE, Starts, best_and_
 from .view import Cells, ViewConfig, render_view, visible_points
 
 FIRST_ITERATIONS, SECOND_ITERATIONS = 5, 12  # of the descents on prepared views
+NUM_SCORED = 64  # starts, where only the best score is asked for
 MIDDLE_LIMITS, FINE_LIMITS = (COARSE_LOSS, 12, 1e-3), (FINE_LOSS, 12, 1e-4)
 FULL_LIMITS, LAST_LIMITS = (FULL_LOSS, 10, 1e-4), (FULL_LOSS, 30, 1e-7)
 PERTURBATION = 0.4  # of that on middle cells, on fine ones
@@ -138,6 +141,13 @@ def refine_matched(query: Query, poses: Sequence[Pose]) -> list[Hypothesis]:
         return max((compared(query, end) for end in ends), key=lambda h: h.score)
 
     return by_score(list(query.workers.map(refined, poses, "descend")))
+
+
+def first_score(query: Query, starts: Starts) -> float:
+    """The best score after a short descent from the best starts on their candidates' prepared views."""
+    some = starts.take(np.arange(min(NUM_SCORED, len(starts.score))))
+    ends = descend_all(query.scan_map, query.images.search, some, FIRST_ITERATIONS, query.workers)
+    return float(ends.score.max(initial=0.0))
 
 
 def refine(query: Query, starts: Starts, beam: Beam) -> list[Hypothesis]:

@@ -7,11 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..confidence.alternatives import Hypothesis
-from ..confidence.confidence import Standing, log_odds
+from ..confidence.confidence import CLEAR_MATCHES, Standing, log_odds
+from ..geometry.pose import Pose
 from ..local_features.hypotheses import count_matches
 from .comparison import compare
 from .query import Query
 from .search_result import SearchResult
+
+
+def num_matches_of(query: Query, pose: Pose) -> int:
+    """How many features of the photo agree with a pose; where none is asked, what a clear view is worth."""
+    return count_matches(query.matches, pose) if query.by_features else CLEAR_MATCHES
 
 
 def standings_of(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> list[Standing]:
@@ -19,7 +25,7 @@ def standings_of(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -
     at_best = compare(query, best.pose)
     shares = [1.0, *(compare(query, h.pose).ratio_to(at_best) for h in others)]
     return [
-        Standing(share, h.score, count_matches(query.matches, h.pose))
+        Standing(share, h.score, num_matches_of(query, h.pose))
         for share, h in zip(shares, [best, *others], strict=True)
     ]
 
@@ -27,7 +33,7 @@ def standings_of(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -
 def odds_by_pair(query: Query, poses: Sequence[Hypothesis]) -> NDArray[np.float64]:
     """Log odds (N, N) of each pose, a column, against each, a row, over what the two show."""
     seen = list(query.workers.map(lambda h: compare(query, h.pose), poses, "compare"))
-    alone = [Standing(1.0, h.score, count_matches(query.matches, h.pose)) for h in poses]
+    alone = [Standing(1.0, h.score, num_matches_of(query, h.pose)) for h in poses]
     odds = [
         [log_odds(a._replace(share=c.ratio_to(best))) for a, c in zip(alone, seen, strict=True)]
         for best in seen

@@ -36,6 +36,7 @@ class ChoiceModel(NamedTuple):
 
 LEAST_STD, MOST_STD = 0.003, 0.3  # [m] smaller or larger tells nothing more
 LEAST_SCORE, LEAST_SHARE, MOST_SHARE = 0.02, 0.1, 1.2
+CLEAR_MATCHES = 40  # as many as a clear whole view of an upright sphere is worth, see docs/METHOD.md
 NOISE_MATCHES = 8  # local features that agree with a wrong pose by chance, at most
 # By tools/calibrate_confidence.py. Each feature counts in one direction only.
 FEATURES = ("log of the share", "log of the score", "log of the matches")

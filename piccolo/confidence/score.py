@@ -30,8 +30,8 @@ class Evidence:
     explained_fraction: float  # of what the panorama shows, by solid angle, see occlusion.py
     seen_fraction: float  # of the sphere, on which both show anything
     contradicted_fraction: float = 0.0  # of what the panorama shows; what is left was not scanned
-    num_matches: int = 0  # local features of the photo that agree with the pose
-    alternative_matches: int = 0  # the most that agree with a pose elsewhere
+    num_matches: int | None = None  # local features of the photo that agree with the pose; None: not asked
+    alternative_matches: int | None = None  # the most that agree with a pose elsewhere
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,10 @@ class Matches(NamedTuple):
     weights: NDArray[np.float32]  # (M,) how much it tells: 1 of a distinct one, else LEAST_WEIGHT
 
 
+_ROWS, _NUMBERS = np.empty((0, 3), np.float32), np.empty(0, np.float32)
+NO_MATCHES = Matches(np.empty(0, np.int32), _ROWS, _ROWS, _NUMBERS, _ROWS, _ROWS, _ROWS, _NUMBERS, _NUMBERS)
+
+
 @inline_kernel
 def is_one_place(points, f, g):
     """True if two features of the map are nearer to each other than APART."""

@@ -1,0 +1,47 @@
+"""The first look: a photo of the whole sphere, upright, is compared with whole views alone.
+
+Most such photos fit one view and no other, and need no local features. What these would tell more is whether
+the photo is mirrored: its mirrored picture is searched too, as far as that is cheap.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..confidence.alternatives import Hypothesis
+from .query import Query
+from .refinement import first_score
+from .search import search_poses
+from .search_result import found_among
+from .standings import fairly_selected
+from .starts import Starts
+
+WHOLE = 0.9  # of the sphere that the photo shows, at least
+CLEAR_SCORE, CLEAR_MARGIN = 0.3, 0.5  # at least, see docs/METHOD.md
+MIRROR_RATIO = 1.1  # of the first scores, the photo as it is by its mirrored picture
+NUM_COMPARED = 8
+
+
+def is_whole(query: Query) -> bool:
+    """True if the photo shows nearly the whole sphere, upright or at a known tilt."""
+    return query.settings.gravity != "unknown" and query.photo.valid_share >= WHOLE
+
+
+def is_clear(query: Query, starts: Starts, hypotheses: Sequence[Hypothesis]) -> bool:
+    """True if one pose explains a whole photo, no other does, and the mirrored photo fits worse."""
+    found = fairly_selected(query, found_among(hypotheses, NUM_COMPARED))
+    if found.best.score < CLEAR_SCORE or found.margin < CLEAR_MARGIN:
+        return False
+    mirror = mirrored(query)
+    return first_score(query, starts) >= MIRROR_RATIO * first_score(mirror, search_poses(mirror, "known"))
+
+
+def mirrored(query: Query) -> Query:
+    """The query of the photo turned over, left for right; nothing is known of where it heads."""
+    rgb = np.ascontiguousarray(query.panorama.rgb[:, ::-1])
+    is_valid = np.ascontiguousarray(query.panorama.is_valid[:, ::-1])
+    panorama, across = replace(query.panorama, rgb=rgb, is_valid=is_valid), np.diag([1.0, -1.0, 1.0])
+    prior = replace(query.settings.prior, heading_deg=None)
+    level, settings = across @ query.R_cam_from_level @ across, replace(query.settings, prior=prior)
+    return replace(query.of_panorama(panorama), R_cam_from_level=level, settings=settings)
