@@ -23,6 +23,7 @@ RIM = 0.4  # width of the ring around a hole [m]
 NUM_SECTORS, MIN_SECTORS = 12, 11  # of the ring, in which the sheet is there
 MAX_HOLES = 30  # looked at in a sheet
 HEADROOM = (0.25, 1.7)  # above a hole, empty where a tripod stood [m]
+REVEAL = (0.06, 0.4)  # behind a sheet, where windows and doors have jambs, and the ground has nothing [m]
 AROUND = 2.0  # beyond a hole's rim, where there are things on the side that was scanned [m]
 MAX_CELLS = 4_000_000  # of a grid; in larger scans no holes are looked for
 PASSAGE_CELL = 0.25  # of the grid over a sheet on which people may walk [m]
@@ -159,18 +160,22 @@ def _hole_log_ratio(grid: _Grid | None, heights: Array, is_level: NDArray[np.boo
             holes = _round_holes(sheet)
             for k, sign in enumerate((1.0, -1.0)):
                 things = grid.occupied((sign * off > HEADROOM[0]) & (sign * off < HEADROOM[1]))
-                counts[k] += sum(_has_headroom(things, *hole) for hole in holes)
+                behind = grid.occupied((sign * off < -REVEAL[0]) & (sign * off > -REVEAL[1]))
+                counts[k] += sum(_has_headroom(things, behind, *hole) for hole in holes)
     return float(np.log((counts[0] + COUNT_SOFTENING) / (counts[1] + COUNT_SOFTENING)))
 
 
-def _has_headroom(things: NDArray[np.bool_], i: int, j: int, radius: float) -> bool:
-    """Whether nothing is at a hole itself, though there are things around: outside of a building are none."""
+def _has_headroom(
+    things: NDArray[np.bool_], behind: NDArray[np.bool_], i: int, j: int, radius: float
+) -> bool:
+    """Whether nothing is at a hole itself, nor behind it, though there are things around, as in a building."""
 
-    def around(reach: float) -> NDArray[np.bool_]:
+    def has(grid: NDArray[np.bool_], reach: float) -> bool:
         k = max(int(reach), 1)
-        return things[max(i - k, 0) : i + k + 1, max(j - k, 0) : j + k + 1]
+        return bool(grid[max(i - k, 0) : i + k + 1, max(j - k, 0) : j + k + 1].any())
 
-    return not around(0.6 * radius).any() and bool(around(radius + AROUND / CELL).any())
+    is_clear = not has(things, 0.6 * radius) and not has(behind, radius + 1.0)
+    return is_clear and has(things, radius + AROUND / CELL)
 
 
 def _round_holes(sheet: NDArray[np.bool_]) -> list[tuple[int, int, float]]:

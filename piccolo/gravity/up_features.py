@@ -43,7 +43,7 @@ class Weights(NamedTuple):
 
 
 # By tools/calibrate_gravity.py --fit 10 20
-WEIGHTS = Weights(1.91, 6.24, 5.39, 34.27, 1.38, 1.89, 2.42, 1.42, 3.08)
+WEIGHTS = Weights(1.92, 6.35, 5.29, 33.14, 1.36, 1.9, 2.36, 2.15, 3.06)
 
 
 class UpFeatures(NamedTuple):
