@@ -18,8 +18,8 @@ Y_UP, Z_DOWN = np.array([-np.pi / 2, 0.0, 0.0]), np.array([np.pi, 0.0, 0.0])
 DIRECTIONS = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda d: np.linalg.norm(d) > 1e-3)
 
 
-def find_up(points, *log_odds):
-    return gravity.find_up(estimate_normals(points), *log_odds)
+def find_up(points, *priors):
+    return gravity.find_up(estimate_normals(points), *priors)
 
 
 def thinned(seed):
@@ -130,7 +130,7 @@ def test_points_too_sparse_for_furniture_are_no_evidence():
 
 
 def test_what_could_stand_another_way_is_uncertain():
-    for seed, reason in ((9, "ground and the front of a building look alike"), (16, "maybe a wall")):
+    for seed, reason in ((18, "ground and the front of a building look alike"), (16, "maybe a wall")):
         up = find_up(turned(BUILDINGS["front"](seed), TURNS[2]), 0.0)
         assert up.confidence < 0.75
         assert reason in up.reason
@@ -157,6 +157,18 @@ def test_by_convention_a_bare_room_has_z_up():
     assert up.confidence > 0.5
     w = np.array([0.1, 0.0, 0.0])  # 5.7 deg: the convention gives the sense, planes the direction
     assert error_deg(find_up(turned(points, w)).direction_world, exp_so3(w) @ Z) < 0.5
+
+
+def test_scanners_that_agree_tell_the_axis_and_its_sense():
+    points, R = turned(bare_room(), TURNS[1]), exp_so3(TURNS[1])
+    leaning = exp_so3(np.array([0.05, 0.0, 0.0])) @ R
+    axes = [np.array([R[:, 2], leaning[:, 2]]), np.array([-R[:, 0]] * 2), np.array([R[:, 2], -R[:, 2]])]
+    first, second, split = (find_up(points, 0.0, station_axes) for station_axes in axes)
+    assert error_deg(first.direction_world, R[:, 2]) < 0.5
+    assert error_deg(second.direction_world, -R[:, 0]) < 0.5
+    assert min(first.confidence, second.confidence) > 0.8
+    assert split.confidence < 0.55
+    assert "stations +5.7" in first.reason
 
 
 def test_two_far_strays_change_little():

@@ -66,6 +66,13 @@ def test_what_stands_in_a_hole_or_makes_it_small_is_no_tripod():
     assert features(room(0.0, radius=0.4), [0.0, 2.6]).hole_log_ratio == 0.0
 
 
+def test_a_hole_with_jambs_behind_it_is_a_window():
+    floor = room(0.0)
+    t = np.linspace(0.0, 2.0 * np.pi, 60)
+    jamb = np.column_stack([3.0 + 0.85 * np.cos(t), 2.5 + 0.85 * np.sin(t), np.full(60, -0.2)])
+    assert features([*floor, (jamb, np.array([1.0, 0.0, 0.0]))], [0.0, 2.6]).hole_log_ratio == 0.0
+
+
 def test_furniture_has_many_heights_and_beams_have_one():
     tables = [rectangle([k, 2, 0.45 + 0.13 * k], [0.6, 0, 0], [0, 0.6, 0], 200.0) for k in range(5)]
     beams = [rectangle([k, 0, 2.03], [0.4, 0, 0], [0, 5, 0]) for k in range(5)]

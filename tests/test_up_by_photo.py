@@ -1,4 +1,4 @@
-"""Up of a scan by a photo that was taken in it, from the file to the transform."""
+"""Up of a scan by what is beside its points, a photo or scanner poses, from the file to the transform."""
 
 import json
 
@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 from pictures import encoded
 from rooms import query, room
+from scans import bare_room
+from test_cloud_ptx import scan as ptx_lines
+from test_cloud_ptx import write as write_lines
 
 from piccolo.cli import align_gravity, up_by_photo
 from piccolo.coarse_to_fine import scan_map as mapping
+from piccolo.geometry.pose import exp_so3
 from piccolo.gravity.up import Hypothesis, Up
 from piccolo.runtime.threads import Workers
 
@@ -28,6 +32,18 @@ def test_a_photo_tells_that_a_scan_is_upside_down(tmp_path, capsys):
     assert "is localized under this of" in report["explanation"]
     assert report["confidence"] > 0.9
     assert len(report["hypotheses"]) >= 2
+
+
+def test_the_scanners_of_a_file_tell_up_in_a_bare_room(tmp_path, capsys):
+    R = exp_so3(np.array([1.4, 0.6, -0.3]))
+    points = bare_room() @ R.T
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[3, :3] = R.T, R @ [2.0, 2.0, 1.5]
+    path = write_lines(tmp_path / "a.ptx", ptx_lines(points, np.full(points.shape, 128), matrix))
+    assert align_gravity.main(["--cloud", str(path), "--transform-only", "--assume-nothing", "--quiet"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(report["up_scan"], R[:, 2], atol=np.radians(0.3))
+    assert report["hypotheses"][0]["evidence"]["stations"] > 5.0
 
 
 @pytest.mark.parametrize(

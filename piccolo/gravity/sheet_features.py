@@ -168,7 +168,7 @@ def _hole_log_ratio(grid: _Grid | None, heights: Array, is_level: NDArray[np.boo
 def _has_headroom(
     things: NDArray[np.bool_], behind: NDArray[np.bool_], i: int, j: int, radius: float
 ) -> bool:
-    """Whether nothing is at a hole itself, nor behind it, though there are things around, as in a building."""
+    """Whether nothing is at a hole, nor behind it, though there are things around: outside are none."""
 
     def has(grid: NDArray[np.bool_], reach: float) -> bool:
         k = max(int(reach), 1)

@@ -30,7 +30,8 @@ DISTINCT_ANGLE = np.radians(15.0)  # between two candidates: twice the angle of 
 INLIER_ANGLES = np.radians([8.0, 4.0, 2.0, 2.0])  # of a normal to the axis or across it, step by step
 Z_UP_LOG_ODDS = float(np.log(1000.0))  # of z up against z down: scanners level themselves
 OTHER_LOG_ODDS = float(np.log(3.0))  # of any other axis against z down: meshes with y up are not so rare
-PRIOR_ANGLE = np.radians(10.0)  # of +z to a direction that the convention speaks for
+STATION_LOG_ODDS = float(np.log(300.0))  # of the z of scanners that a file tells: they level themselves
+PRIOR_ANGLE = np.radians(10.0)  # of +z, or a scanner's z, to a direction that it speaks for
 SNAP_ANGLE = np.radians(0.2)  # of +z to a direction that is called +z itself
 NONE_ODDS = 0.08  # that it is none of the hypotheses, to those of the best one
 # Below it up is not relied on; of clouds turned at random 3 of 93 were wrong above it (BENCHMARK.md).
@@ -107,12 +108,15 @@ class Up(NamedTuple):
     hypotheses: tuple[Hypothesis, ...] = ()  # all that were compared, the likeliest first
 
 
-def find_up(cloud: PointNormals, z_up_log_odds: float = Z_UP_LOG_ODDS) -> Up:
+def find_up(
+    cloud: PointNormals, z_up_log_odds: float = Z_UP_LOG_ODDS, station_axes: Array | None = None
+) -> Up:
     """The direction that points up in a cloud, thinned evenly in space (5 to 20 cm).
 
     By convention scans have z up. Where a hypothesis is within 10 deg of +z, upside down needs evidence of a
     thousand to one against it, any other axis hundreds to one; within 0.2 deg of it, +z itself is returned.
     `z_up_log_odds` is the logarithm of that thousand: with 0 no direction is favoured, none rounded to +z.
+    The z axes (S, 3) of scanners, as E57 and PTX files tell them, count three hundred to one where all agree.
 
     The confidence is the winner's part of the odds of all directions, less where few points are flat or
     they face about it, and where ground and a house front could be mixed up. A bare room turned at random
@@ -123,7 +127,8 @@ def find_up(cloud: PointNormals, z_up_log_odds: float = Z_UP_LOG_ODDS) -> Up:
     hypotheses = up_hypotheses(cloud)
     if not hypotheses:
         return Up(np.array([0.0, 0.0, 1.0]), 0.0, "no axis that flat points face: +z is assumed")
-    return _choose(hypotheses, z_up_log_odds, cloud.neighborhood_radius)
+    priors = _priors(np.array([h.axis for h in hypotheses]), z_up_log_odds, station_axes)
+    return _choose(hypotheses, priors, z_up_log_odds > 0.0, cloud.neighborhood_radius)
 
 
 def up_hypotheses(cloud: PointNormals) -> list[UpFeatures]:
@@ -167,24 +172,22 @@ def named_axis(up: UpAxis) -> Array:
     return np.asarray((-1.0 if up.startswith("-") else 1.0) * np.eye(3)["xyz".index(up[-1])] + 0.0)
 
 
-def _choose(hypotheses: list[UpFeatures], z_up_log_odds: float, neighborhood_radius: float) -> Up:
+def _choose(hypotheses: list[UpFeatures], priors: Array, rounds_to_z: bool, neighborhood_radius: float) -> Up:
     """The hypothesis of the largest odds, its part of all odds less what makes it doubtful, and why."""
-    cues = np.array([h.cues for h in hypotheses])
-    convention = _convention(np.array([h.axis[2] for h in hypotheses]), z_up_log_odds)
-    terms = np.column_stack([convention, cues * np.array(WEIGHTS)])
+    terms = np.column_stack([priors, np.array([h.cues for h in hypotheses]) * np.array(WEIGHTS)])
     logits = terms.sum(axis=1)
     odds = np.exp(logits - logits.max())
     odds /= odds.sum() + NONE_ODDS
     rank = np.argsort(-odds, kind="stable")
-    names = ("convention", *Weights._fields)
+    names = ("convention", "stations", *Weights._fields)
     ranked = tuple(
         Hypothesis(hypotheses[k].axis, float(odds[k]), dict(zip(names, terms[k].tolist(), strict=True)))
         for k in rank
     )
     best = hypotheses[rank[0]]
-    is_by_convention = bool(convention[rank[0]] > convention.min())
-    factor, doubts = _doubts(best, hypotheses, neighborhood_radius, is_by_convention)
-    is_z = z_up_log_odds > 0.0 and best.axis[2] > np.cos(SNAP_ANGLE)
+    is_told = bool(np.any(priors[rank[0]] > priors.min(axis=0)))
+    factor, doubts = _doubts(best, hypotheses, neighborhood_radius, is_told)
+    is_z = rounds_to_z and best.axis[2] > np.cos(SNAP_ANGLE)
     direction = np.array([0.0, 0.0, 1.0]) if is_z else best.axis
     return Up(direction, ranked[0].probability * factor, "; ".join([_explained(ranked), *doubts]), ranked)
 
@@ -201,20 +204,25 @@ def _explained(ranked: tuple[Hypothesis, ...]) -> str:
     return f"log-odds against {against}: {', '.join(told) or 'none'}"
 
 
-def _convention(heights: Array, z_up_log_odds: float) -> Array:
-    """Log-odds (H,) by convention of directions whose z are given; all 0 where none is near +z."""
-    is_z, is_flipped = heights > np.cos(PRIOR_ANGLE), heights < -np.cos(PRIOR_ANGLE)
-    if not is_z.any():
-        return np.zeros(len(heights))
-    return np.where(is_z, z_up_log_odds, np.where(is_flipped, 0.0, min(OTHER_LOG_ODDS, z_up_log_odds)))
+def _priors(axes: Array, z_up_log_odds: float, station_axes: Array | None) -> Array:
+    """Log-odds (H, 2) of directions (H, 3) by convention, 0 where none is near +z, and by scanners' axes."""
+    is_z, is_flipped = axes[:, 2] > np.cos(PRIOR_ANGLE), axes[:, 2] < -np.cos(PRIOR_ANGLE)
+    priors = np.zeros((len(axes), 2))
+    if is_z.any():
+        other = np.where(is_flipped, 0.0, min(OTHER_LOG_ODDS, z_up_log_odds))
+        priors[:, 0] = np.where(is_z, z_up_log_odds, other)
+    if station_axes is not None and len(station_axes):
+        cosines = np.einsum("hi,si->hs", axes, station_axes)
+        priors[:, 1] = STATION_LOG_ODDS * (cosines > np.cos(PRIOR_ANGLE)).mean(axis=1)
+    return priors
 
 
 def _doubts(
-    best: UpFeatures, hypotheses: list[UpFeatures], neighborhood_radius: float, is_by_convention: bool
+    best: UpFeatures, hypotheses: list[UpFeatures], neighborhood_radius: float, is_told: bool
 ) -> tuple[float, list[str]]:
     """A factor [0, 1] on the confidence in the best hypothesis, and the reasons to doubt it.
 
-    Where the convention speaks for it, what misleads the other cues is no reason.
+    Where the convention or the scanners speak for it, what misleads the other cues is no reason.
     """
     factor = float(
         np.clip((BLURRED_RADIUS - neighborhood_radius) / (BLURRED_RADIUS - CLEAR_RADIUS), 0.0, 1.0)
@@ -230,5 +238,5 @@ def _doubts(
         "what is slanted is open upwards": best.sheets.roof_log_ratio < MIN_ROOFS,
         f"only {best.extent:.1f} m high, maybe a wall": best.extent < SLAB_EXTENT,
     }
-    found = [] if is_by_convention else [reason for reason, holds in reasons.items() if holds]
+    found = [] if is_told else [reason for reason, holds in reasons.items() if holds]
     return factor * DOUBT_FACTOR ** len(found), doubts + found
