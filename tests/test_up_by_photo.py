@@ -46,6 +46,24 @@ def test_the_scanners_of_a_file_tell_up_in_a_bare_room(tmp_path, capsys):
     assert report["hypotheses"][0]["evidence"]["stations"] > 5.0
 
 
+def test_a_photo_that_is_none_is_refused_before_the_cloud_is_read(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(align_gravity, "open_cloud", lambda *_: pytest.fail("the cloud was opened"))
+    (tmp_path / "text.jpg").write_text("no picture")
+    (tmp_path / "scan.ply").write_text("never read")
+    for name in ("no such photo.jpg", "text.jpg"):
+        files = ["--cloud", tmp_path / "scan.ply", "--pano", tmp_path / name, "--out", tmp_path / "out.ply"]
+        assert align_gravity.main([*map(str, files), "--quiet"]) == 3
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert err.count("\n") == 1
+        assert name in err
+    assert {path.name for path in tmp_path.iterdir()} == {"text.jpg", "scan.ply"}
+    photo = ["--pano", tmp_path / "a.ply", "--out", tmp_path / "a.ply"]
+    (tmp_path / "a.ply").write_text("")
+    assert align_gravity.main(["--cloud", str(tmp_path / "scan.ply"), *map(str, photo)]) == 2
+    assert "found an input as the output" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("statuses", "chosen"),
     [

@@ -15,6 +15,7 @@ from ..errors import InputError
 from ..gravity import MIN_CONFIDENCE
 from ..gravity.alignment import Alignment, AlignmentReport, find_alignment, read_alignment
 from ..gravity.up import Z_UP_LOG_ODDS
+from ..panorama import read_panorama
 from ..runtime.atomic import is_stream, write_atomically
 from ..runtime.threads import Workers, num_cores
 from ..scenes.scene import QUERIES_NAME, Query, read_scene, write_queries
@@ -106,7 +107,7 @@ def outputs_of(arguments: argparse.Namespace) -> Outputs:
     text = path and path.with_suffix(".txt")
     queries = arguments.out.with_name(QUERIES_NAME) if arguments.queries else None
     outputs = {"--out": arguments.out, "--transform": path, "its .txt": text, "the poses": queries}
-    inputs = [*arguments.cloud, *filter(None, (arguments.apply, arguments.queries))]
+    inputs = [*arguments.cloud, *filter(None, (arguments.apply, arguments.queries, arguments.pano))]
     inputs += [arguments.queries / QUERIES_NAME] if arguments.queries else []
     check_outputs(outputs, inputs)
     transforms = [path, text] if path and text else []
@@ -166,6 +167,8 @@ def evidence_of(report: AlignmentReport) -> dict[str, object]:
 def align(arguments: argparse.Namespace) -> int:
     """Find the alignment, write what is sure enough; returns the exit code."""
     outputs = outputs_of(arguments)
+    if arguments.pano:
+        read_panorama(arguments.pano)  # refused before the cloud is read
     show = progress_bar(arguments.quiet)
     cloud = open_cloud(arguments.cloud, cloud_settings_from(arguments), show)
     settle = None
