@@ -41,8 +41,9 @@ keeps its other properties and faces, its normals are turned; all else becomes x
 One JSON object on stdout: status, up, yaw, planes, transform. Without --out nothing else is written.
 Nothing is written either where the confidence is below --min-confidence (default {MIN_CONFIDENCE}).
 A z that is square to the scan's levels is up by convention. A scan that was turned needs --assume-nothing, by
-which a room without furniture may be upside down, and roofs and stairs mislead: --pano tells. If you know
-the axis, give it by --up. The explanation has the log-odds cue by cue, "hypotheses" those of each direction.
+which a room without furniture may be upside down, and roofs and fronts mislead: --pano tells, and the poses
+of scanners in E57 and PTX files do. If you know the axis, give it by --up. The explanation has the log-odds
+cue by cue (docs/CONVENTIONS.md), "hypotheses" those of each direction.
 """
 
 

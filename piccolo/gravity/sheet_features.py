@@ -17,7 +17,6 @@ from .planes import PointNormals, dot
 # Lengths of people, tripods and buildings, by hand
 CELL = 0.2  # of the grids over a sheet in which holes are looked for [m]
 SHEET = 0.12  # half of a sheet's thickness [m]
-MIN_DENSITY = 12.0  # points a m2 of a sheet in which a hole is no accident
 HOLE_RADIUS = (0.6, 1.3)  # of what a scanner 1.2 to 2 m high doesn't see [m]
 RIM = 0.4  # width of the ring around a hole [m]
 NUM_SECTORS, MIN_SECTORS = 12, 11  # of the ring, in which the sheet is there
@@ -91,18 +90,16 @@ def sheet_features(
 
 
 class _Grid(NamedTuple):
-    """Cells of a grid across an axis, and which points are in each."""
+    """Cells of a grid across an axis, and which of them each point is in."""
 
     shape: NDArray[np.int64]  # (2,)
-    cells: NDArray[np.int64]  # (N, 2)
-    is_inside: NDArray[np.bool_]  # (N,), all but strays
+    cells: NDArray[np.int64]  # (N,) in row order; one more cell for strays
 
     def occupied(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Which cells have points of a mask (N,)."""
-        grid = np.zeros(self.shape, np.bool_)
-        cells = self.cells[mask & self.is_inside]
-        grid[cells[:, 0], cells[:, 1]] = True
-        return grid
+        grid = np.zeros(int(self.shape.prod()) + 1, np.bool_)
+        grid[self.cells[mask]] = True
+        return grid[:-1].reshape(self.shape)
 
 
 def _grid_over(places: Array, cell: float) -> _Grid | None:
@@ -110,8 +107,10 @@ def _grid_over(places: Array, cell: float) -> _Grid | None:
     low, high = np.quantile(places, [0.001, 0.999], axis=0)
     cells = np.floor((places - low) / cell).astype(np.int64)
     shape = np.floor((high - low) / cell).astype(np.int64) + 1
+    if shape.prod() > MAX_CELLS:
+        return None
     is_inside = np.all((cells >= 0) & (cells < shape), axis=1)
-    return _Grid(shape, cells, is_inside) if shape.prod() <= MAX_CELLS else None
+    return _Grid(shape, np.where(is_inside, cells[:, 0] * shape[1] + cells[:, 1], shape.prod()))
 
 
 def _passage_log_ratio(
@@ -154,14 +153,12 @@ def _hole_log_ratio(grid: _Grid | None, heights: Array, is_level: NDArray[np.boo
         return 0.0
     for level in levels:
         off = heights - level
-        in_sheet = is_level & (np.abs(off) < SHEET)
-        sheet = grid.occupied(in_sheet)
-        if np.count_nonzero(in_sheet & grid.is_inside) > MIN_DENSITY * CELL**2 * sheet.sum():
-            holes = _round_holes(sheet)
-            for k, sign in enumerate((1.0, -1.0)):
-                things = grid.occupied((sign * off > HEADROOM[0]) & (sign * off < HEADROOM[1]))
-                behind = grid.occupied((sign * off < -REVEAL[0]) & (sign * off > -REVEAL[1]))
-                counts[k] += sum(_has_headroom(things, behind, *hole) for hole in holes)
+        sheet = grid.occupied(is_level & (np.abs(off) < SHEET))
+        holes = _round_holes(sheet) if sheet.any() else []
+        for k, sign in enumerate((1.0, -1.0) if holes else ()):
+            things = grid.occupied((sign * off > HEADROOM[0]) & (sign * off < HEADROOM[1]))
+            behind = grid.occupied((sign * off < -REVEAL[0]) & (sign * off > -REVEAL[1]))
+            counts[k] += sum(_has_headroom(things, behind, *hole) for hole in holes)
     return float(np.log((counts[0] + COUNT_SOFTENING) / (counts[1] + COUNT_SOFTENING)))
 
 
