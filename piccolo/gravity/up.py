@@ -28,6 +28,7 @@ MAX_MODES = 6  # twice the three directions of a box
 MIN_MODE = 0.02  # fraction of the flat points
 DISTINCT_ANGLE = np.radians(15.0)  # between two candidates: twice the angle of the first refinement
 INLIER_ANGLES = np.radians([8.0, 4.0, 2.0, 2.0])  # of a normal to the axis or across it, step by step
+Z = np.array([0.0, 0.0, 1.0])
 Z_UP_LOG_ODDS = float(np.log(1000.0))  # of z up against z down: scanners level themselves
 OTHER_LOG_ODDS = float(np.log(3.0))  # of any other axis against z down: meshes with y up are not so rare
 STATION_LOG_ODDS = float(np.log(300.0))  # of the z of scanners that a file tells: they level themselves
@@ -44,6 +45,7 @@ OPEN_ENERGY_RATIO = 0.2  # of its level energy to the winner's, from which on th
 MIN_FURNITURE = 0.7  # log-ratio, from which on things stand on the ground, and not a front's window sills
 SLAB_EXTENT = 2.0  # along up, below which nobody stands in the scan: one wall, a table [m]
 MIN_ROOFS = -0.17  # log-ratio, below which what is slanted speaks for another direction
+MIN_ROOF_OF_Z = 0.65  # log-ratio along +z, from which on that may be up though nothing is square to it
 DOUBT_FACTOR = 0.6  # on the confidence, for each of these
 
 
@@ -123,12 +125,17 @@ def find_up(
     stays below 0.5, for its floor may be its ceiling.
     """
     if len(cloud.points) < MIN_POINTS:
-        return Up(np.array([0.0, 0.0, 1.0]), 0.0, f"only {len(cloud.points)} points: +z is assumed")
+        return Up(Z.copy(), 0.0, f"only {len(cloud.points)} points: +z is assumed")
     hypotheses = up_hypotheses(cloud)
     if not hypotheses:
-        return Up(np.array([0.0, 0.0, 1.0]), 0.0, "no axis that flat points face: +z is assumed")
-    priors = _priors(np.array([h.axis for h in hypotheses]), z_up_log_odds, station_axes)
-    return _choose(hypotheses, priors, z_up_log_odds > 0.0, cloud.neighborhood_radius)
+        return Up(Z.copy(), 0.0, "no axis that flat points face: +z is assumed")
+    axes = np.array([h.axis for h in hypotheses])
+    priors = _priors(axes, z_up_log_odds, station_axes)
+    up = _choose(hypotheses, priors, z_up_log_odds > 0.0, cloud.neighborhood_radius)
+    if z_up_log_odds > 0.0 and not priors.any() and sides_of(cloud).roof_log_ratio(Z) > MIN_ROOF_OF_Z:
+        reason = f"{up.reason}; +z is square to nothing, and yet what is slanted to it is a roof"
+        return up._replace(confidence=DOUBT_FACTOR * up.confidence, reason=reason)
+    return up
 
 
 def up_hypotheses(cloud: PointNormals) -> list[UpFeatures]:
@@ -188,7 +195,7 @@ def _choose(hypotheses: list[UpFeatures], priors: Array, rounds_to_z: bool, neig
     is_told = bool(np.any(priors[rank[0]] > priors.min(axis=0)))
     factor, doubts = _doubts(best, hypotheses, neighborhood_radius, is_told)
     is_z = rounds_to_z and best.axis[2] > np.cos(SNAP_ANGLE)
-    direction = np.array([0.0, 0.0, 1.0]) if is_z else best.axis
+    direction = Z.copy() if is_z else best.axis
     return Up(direction, ranked[0].probability * factor, "; ".join([_explained(ranked), *doubts]), ranked)
 
 
