@@ -141,6 +141,19 @@ def test_what_could_stand_another_way_is_uncertain():
     assert up.confidence < 0.5
 
 
+def test_a_file_of_roofs_is_not_turned_though_nothing_is_square_to_its_z():
+    for seed in (10, 13, 14, 18):
+        points = BUILDINGS["roof"](seed)[::2].astype(np.float32)
+        up = find_up(points)
+        assert up.confidence < 0.6
+        assert "what is slanted to it is a roof" in up.reason
+        assert "is a roof" not in find_up(points, 0.0).reason
+    w = np.array([0.4, 0.0, 0.0])  # 23 deg: nothing is square to the z of a tilted room either
+    up = find_up(turned(thinned(1), w))
+    assert error_deg(up.direction_world, exp_so3(w) @ Z) < 0.5
+    assert up.confidence > 0.8
+
+
 def test_a_ceiling_is_not_the_ground_though_furniture_hides_the_floor():
     points = bare_room()
     furniture = np.random.default_rng(9).uniform([0.0, 0.0, 0.2], [4.0, 4.0, 1.1], (4000, 3))

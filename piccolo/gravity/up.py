@@ -35,7 +35,7 @@ STATION_LOG_ODDS = float(np.log(300.0))  # of the z of scanners that a file tell
 PRIOR_ANGLE = np.radians(10.0)  # of +z, or a scanner's z, to a direction that it speaks for
 SNAP_ANGLE = np.radians(0.2)  # of +z to a direction that is called +z itself
 NONE_ODDS = 0.08  # that it is none of the hypotheses, to those of the best one
-# Below it up is not relied on; of clouds turned at random 3 of 93 were wrong above it (BENCHMARK.md).
+# Below it up is not relied on; how many above it are wrong is in BENCHMARK.md.
 MIN_CONFIDENCE = 0.8
 
 # What lowers the confidence, by hand on seeds 10 to 19 of tools/evaluate_gravity.py
@@ -46,6 +46,7 @@ MIN_FURNITURE = 0.7  # log-ratio, from which on things stand on the ground, and 
 SLAB_EXTENT = 2.0  # along up, below which nobody stands in the scan: one wall, a table [m]
 MIN_ROOFS = -0.17  # log-ratio, below which what is slanted speaks for another direction
 MIN_ROOF_OF_Z = 0.65  # log-ratio along +z, from which on that may be up though nothing is square to it
+SURE = 0.9  # confidence without such a doubt: level ground with trees, on its side, is like a roof to +z too
 DOUBT_FACTOR = 0.6  # on the confidence, for each of these
 
 
@@ -132,7 +133,8 @@ def find_up(
     axes = np.array([h.axis for h in hypotheses])
     priors = _priors(axes, z_up_log_odds, station_axes)
     up = _choose(hypotheses, priors, z_up_log_odds > 0.0, cloud.neighborhood_radius)
-    if z_up_log_odds > 0.0 and not priors.any() and sides_of(cloud).roof_log_ratio(Z) > MIN_ROOF_OF_Z:
+    is_in_doubt = z_up_log_odds > 0.0 and not priors.any() and up.confidence < SURE
+    if is_in_doubt and sides_of(cloud).roof_log_ratio(Z) > MIN_ROOF_OF_Z:
         reason = f"{up.reason}; +z is square to nothing, and yet what is slanted to it is a roof"
         return up._replace(confidence=DOUBT_FACTOR * up.confidence, reason=reason)
     return up
