@@ -53,6 +53,13 @@ def test_scans_stand_at_their_poses_by_quaternions_of_any_length(tmp_path):
     np.testing.assert_allclose(points, RAW.points_world @ R_WORLD.T, atol=1e-12)
 
 
+def test_scanners_with_a_pose_tell_their_z_axis(tmp_path):
+    path = write(tmp_path / "a.e57", [placed(), scan(center_world=(1.0, 2.0, 3.0)), scan()])
+    np.testing.assert_allclose(open_source(path).station_axes, [R_WORLD[:, 2], [0.0, 0.0, 1.0]], atol=1e-12)
+    identity = scan(rotation_wxyz=(1.0, 0.0, 0.0, 0.0), center_world=(0.0, 0.0, 0.0))
+    assert open_source(write(tmp_path / "b.e57", [identity])).station_axes == ()
+
+
 def test_spherical_coordinates_single_precision_and_scaled_integers(tmp_path):
     distance = np.linalg.norm(RAW.points_world, axis=1)
     x, y, z = RAW.points_world.T

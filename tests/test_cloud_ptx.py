@@ -71,6 +71,15 @@ TWO_SCANS = [
 ]
 
 
+def test_scanners_with_a_place_tell_their_z_axis(tmp_path):
+    lines = [*scan(RAW.points_world, RAW.colors, THERE), *scan(RAW.points_world, RAW.colors, np.eye(4))]
+    (axis,) = open_ptx(write(tmp_path / "a.ptx", lines)).station_axes
+    np.testing.assert_allclose(axis, THERE[2, :3], atol=1e-12)
+    doubled = THERE * np.array([[2.0], [2.0], [2.0], [1.0]])  # a matrix that scales
+    (axis,) = open_ptx(write(tmp_path / "a.ptx", scan(RAW.points_world, RAW.colors, doubled))).station_axes
+    np.testing.assert_allclose(axis, THERE[2, :3], atol=1e-12)
+
+
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
 def test_scans_are_put_in_the_world(tmp_path, end):
     path = write(tmp_path / "a.ptx", TWO_SCANS, end)

@@ -18,8 +18,8 @@ Y_UP, Z_DOWN = np.array([-np.pi / 2, 0.0, 0.0]), np.array([np.pi, 0.0, 0.0])
 DIRECTIONS = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda d: np.linalg.norm(d) > 1e-3)
 
 
-def find_up(points, *log_odds):
-    return gravity.find_up(estimate_normals(points), *log_odds)
+def find_up(points, *priors):
+    return gravity.find_up(estimate_normals(points), *priors)
 
 
 def thinned(seed):
@@ -130,7 +130,7 @@ def test_points_too_sparse_for_furniture_are_no_evidence():
 
 
 def test_what_could_stand_another_way_is_uncertain():
-    for seed, reason in ((3, "ground and the front of a building look alike"), (14, "maybe a wall")):
+    for seed, reason in ((18, "ground and the front of a building look alike"), (16, "maybe a wall")):
         up = find_up(turned(BUILDINGS["front"](seed), TURNS[2]), 0.0)
         assert up.confidence < 0.75
         assert reason in up.reason
@@ -139,6 +139,19 @@ def test_what_could_stand_another_way_is_uncertain():
     up = find_up(turned(bare_room(), TURNS[0]))
     assert abs(up.direction_world @ exp_so3(TURNS[0]) @ Z) > np.cos(np.radians(0.5))
     assert up.confidence < 0.5
+
+
+def test_a_file_of_roofs_is_not_turned_though_nothing_is_square_to_its_z():
+    for seed in (10, 13, 14, 18):
+        points = BUILDINGS["roof"](seed)[::2].astype(np.float32)
+        up = find_up(points)
+        assert up.confidence < 0.6
+        assert "what is slanted to it is a roof" in up.reason
+        assert "is a roof" not in find_up(points, 0.0).reason
+    w = np.array([0.4, 0.0, 0.0])  # 23 deg: nothing is square to the z of a tilted room either
+    up = find_up(turned(thinned(1), w))
+    assert error_deg(up.direction_world, exp_so3(w) @ Z) < 0.5
+    assert up.confidence > 0.8
 
 
 def test_a_ceiling_is_not_the_ground_though_furniture_hides_the_floor():
@@ -157,6 +170,18 @@ def test_by_convention_a_bare_room_has_z_up():
     assert up.confidence > 0.5
     w = np.array([0.1, 0.0, 0.0])  # 5.7 deg: the convention gives the sense, planes the direction
     assert error_deg(find_up(turned(points, w)).direction_world, exp_so3(w) @ Z) < 0.5
+
+
+def test_scanners_that_agree_tell_the_axis_and_its_sense():
+    points, R = turned(bare_room(), TURNS[1]), exp_so3(TURNS[1])
+    leaning = exp_so3(np.array([0.05, 0.0, 0.0])) @ R
+    axes = [np.array([R[:, 2], leaning[:, 2]]), np.array([-R[:, 0]] * 2), np.array([R[:, 2], -R[:, 2]])]
+    first, second, split = (find_up(points, 0.0, station_axes) for station_axes in axes)
+    assert error_deg(first.direction_world, R[:, 2]) < 0.5
+    assert error_deg(second.direction_world, -R[:, 0]) < 0.5
+    assert min(first.confidence, second.confidence) > 0.8
+    assert split.confidence < 0.55
+    assert "stations +5.7" in first.reason
 
 
 def test_two_far_strays_change_little():

@@ -1,4 +1,4 @@
-"""Up of a scan by a photo that was taken in it, from the file to the transform."""
+"""Up of a scan by what is beside its points, a photo or scanner poses, from the file to the transform."""
 
 import json
 
@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 from pictures import encoded
 from rooms import query, room
+from scans import bare_room
+from test_cloud_ptx import scan as ptx_lines
+from test_cloud_ptx import write as write_lines
 
 from piccolo.cli import align_gravity, up_by_photo
 from piccolo.coarse_to_fine import scan_map as mapping
+from piccolo.geometry.pose import exp_so3
 from piccolo.gravity.up import Hypothesis, Up
 from piccolo.runtime.threads import Workers
 
@@ -28,6 +32,36 @@ def test_a_photo_tells_that_a_scan_is_upside_down(tmp_path, capsys):
     assert "is localized under this of" in report["explanation"]
     assert report["confidence"] > 0.9
     assert len(report["hypotheses"]) >= 2
+
+
+def test_the_scanners_of_a_file_tell_up_in_a_bare_room(tmp_path, capsys):
+    R = exp_so3(np.array([1.4, 0.6, -0.3]))
+    points = bare_room() @ R.T
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[3, :3] = R.T, R @ [2.0, 2.0, 1.5]
+    path = write_lines(tmp_path / "a.ptx", ptx_lines(points, np.full(points.shape, 128), matrix))
+    assert align_gravity.main(["--cloud", str(path), "--transform-only", "--assume-nothing", "--quiet"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(report["up_scan"], R[:, 2], atol=np.radians(0.3))
+    assert report["hypotheses"][0]["evidence"]["stations"] > 5.0
+
+
+def test_a_photo_that_is_none_is_refused_before_the_cloud_is_read(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(align_gravity, "open_cloud", lambda *_: pytest.fail("the cloud was opened"))
+    (tmp_path / "text.jpg").write_text("no picture")
+    (tmp_path / "scan.ply").write_text("never read")
+    for name in ("no such photo.jpg", "text.jpg"):
+        files = ["--cloud", tmp_path / "scan.ply", "--pano", tmp_path / name, "--out", tmp_path / "out.ply"]
+        assert align_gravity.main([*map(str, files), "--quiet"]) == 3
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert err.count("\n") == 1
+        assert name in err
+    assert {path.name for path in tmp_path.iterdir()} == {"text.jpg", "scan.ply"}
+    photo = ["--pano", tmp_path / "a.ply", "--out", tmp_path / "a.ply"]
+    (tmp_path / "a.ply").write_text("")
+    assert align_gravity.main(["--cloud", str(tmp_path / "scan.ply"), *map(str, photo)]) == 2
+    assert "found an input as the output" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

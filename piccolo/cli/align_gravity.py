@@ -15,6 +15,7 @@ from ..errors import InputError
 from ..gravity import MIN_CONFIDENCE
 from ..gravity.alignment import Alignment, AlignmentReport, find_alignment, read_alignment
 from ..gravity.up import Z_UP_LOG_ODDS
+from ..panorama import read_panorama
 from ..runtime.atomic import is_stream, write_atomically
 from ..runtime.threads import Workers, num_cores
 from ..scenes.scene import QUERIES_NAME, Query, read_scene, write_queries
@@ -40,8 +41,9 @@ keeps its other properties and faces, its normals are turned; all else becomes x
 One JSON object on stdout: status, up, yaw, planes, transform. Without --out nothing else is written.
 Nothing is written either where the confidence is below --min-confidence (default {MIN_CONFIDENCE}).
 A z that is square to the scan's levels is up by convention. A scan that was turned needs --assume-nothing, by
-which a room without furniture may be upside down, and roofs and stairs mislead: --pano tells. If you know
-the axis, give it by --up. The explanation has the log-odds cue by cue, "hypotheses" those of each direction.
+which a room without furniture may be upside down, and roofs and fronts mislead: --pano tells, and the poses
+of scanners in E57 and PTX files do. If you know the axis, give it by --up. The explanation has the log-odds
+cue by cue (docs/CONVENTIONS.md), "hypotheses" those of each direction.
 """
 
 
@@ -106,7 +108,7 @@ def outputs_of(arguments: argparse.Namespace) -> Outputs:
     text = path and path.with_suffix(".txt")
     queries = arguments.out.with_name(QUERIES_NAME) if arguments.queries else None
     outputs = {"--out": arguments.out, "--transform": path, "its .txt": text, "the poses": queries}
-    inputs = [*arguments.cloud, *filter(None, (arguments.apply, arguments.queries))]
+    inputs = [*arguments.cloud, *filter(None, (arguments.apply, arguments.queries, arguments.pano))]
     inputs += [arguments.queries / QUERIES_NAME] if arguments.queries else []
     check_outputs(outputs, inputs)
     transforms = [path, text] if path and text else []
@@ -166,6 +168,8 @@ def evidence_of(report: AlignmentReport) -> dict[str, object]:
 def align(arguments: argparse.Namespace) -> int:
     """Find the alignment, write what is sure enough; returns the exit code."""
     outputs = outputs_of(arguments)
+    if arguments.pano:
+        read_panorama(arguments.pano)  # refused before the cloud is read
     show = progress_bar(arguments.quiet)
     cloud = open_cloud(arguments.cloud, cloud_settings_from(arguments), show)
     settle = None

@@ -133,6 +133,11 @@ class CloudStream:
         first, num_more = self.sources[0].path, len(self.sources) - 1
         return f"{first} and {num_more} more" if num_more else str(first)
 
+    @property
+    def station_axes(self) -> Array:
+        """The z axes (S, 3) of the scanners whose poses the files tell, unit, in the files' axes."""
+        return np.array([axis for source in self.sources for axis in source.station_axes]).reshape(-1, 3)
+
     def chunks(self, validators: list[PointValidator]) -> Iterator[Chunk]:
         """Yield the finite points in metres; `validators` gets what is then known of each file."""
         for source in self.sources:

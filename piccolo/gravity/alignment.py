@@ -134,7 +134,7 @@ def find_alignment(
     sample = normals_of(voxels)
     planes = ransac_planes(sample)
     if up == "auto":
-        found = find_up(sample, z_up_log_odds)
+        found = find_up(sample, z_up_log_odds, cloud.station_axes)
         found = settle(found) if settle else found
         direction, rms_angle = refine_up(found.direction_world, planes)
     else:

@@ -1,74 +1,76 @@
-"""What tells the upper from the lower side of sheets: holes under scanners, tops, roofs; and steps.
+"""What tells the upper from the lower side of sheets: holes under scanners, passages, roofs; and steps.
 
 A scanner sees nothing right below it: all around the hole the ground is there, and above it there is room for
-a tripod. Things stand on floors, and hide them, more than they hang from ceilings.
+a tripod. People walk from room to room through doors, below beams and lamps: over a floor the free space is
+in one piece, below a ceiling walls and lintels and beams divide it.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
-from scipy.spatial import cKDTree
+from scipy.ndimage import binary_closing, binary_dilation, distance_transform_edt, label
 
 from ..geometry.pose import Array
 from .planes import PointNormals, dot
 
 # Lengths of people, tripods and buildings, by hand
-CELL = 0.2  # of the grids over a sheet [m]
+CELL = 0.2  # of the grids over a sheet in which holes are looked for [m]
 SHEET = 0.12  # half of a sheet's thickness [m]
-MIN_DENSITY = 12.0  # points a m2 of a sheet in which a hole is no accident
 HOLE_RADIUS = (0.6, 1.3)  # of what a scanner 1.2 to 2 m high doesn't see [m]
 RIM = 0.4  # width of the ring around a hole [m]
 NUM_SECTORS, MIN_SECTORS = 12, 11  # of the ring, in which the sheet is there
 MAX_HOLES = 30  # looked at in a sheet
 HEADROOM = (0.25, 1.7)  # above a hole, empty where a tripod stood [m]
+REVEAL = (0.06, 0.4)  # behind a sheet, where windows and doors have jambs, and the ground has nothing [m]
 AROUND = 2.0  # beyond a hole's rim, where there are things on the side that was scanned [m]
 MAX_CELLS = 4_000_000  # of a grid; in larger scans no holes are looked for
-LEVEL_ANGLE = np.radians(8.0)  # of a normal to up: floors, tops
+PASSAGE_CELL = 0.25  # of the grid over a sheet on which people may walk [m]
+PASSAGE = (0.3, 1.9)  # above it, free where people walk [m]
+REACH = 2  # cells between the points of a sheet, or of what is above it
+MIN_AREA, MIN_AREAS = 8, 100  # cells, in one piece and in all
+AREA_SOFTENING = 20.0  # cells
 STEP = (0.15, 0.20)  # rise of stairs [m]
 STEP_BIN, STEP_WINDOW = 0.02, 15  # of the histogram of heights [m]; bins of its running mean
 STEEPNESS = np.radians((20.0, 60.0))  # of a normal to up: flights of stairs, roofs
 NUM_SIDES = 3000  # points of which is looked at both sides
-SIDE_REACH, SIDE_SKIN = 0.4, 0.08  # of these [m]
-NUM_SIDE_NEIGHBORS = 48
 NUM_BEYOND, BEYOND_SKIN = 800, 0.3  # points of the cloud that are before or behind a surface; how far [m]
 COUNT_SOFTENING, SIDE_SOFTENING = 0.5, 0.01  # holes; fraction of the points
 
 
 class Sides(NamedTuple):
-    """Flat points with what is on either side of their tangent planes: -1 all behind, 1 all before it."""
+    """Normals of flat points, and on which side of their tangent planes the cloud is."""
 
-    points: Array  # (S, 3) [m]
     normals: Array  # (S, 3) unit, of either sign
-    near: Array  # (S,) [-1, 1] of the points within SIDE_REACH
-    all: Array  # (S,) [-1, 1] of the whole cloud
+    balance: Array  # (S,) [-1, 1]: all of it behind, all before
+
+    def roof_log_ratio(self, axis: Array) -> float:
+        """Logarithm of how many slanted points have the cloud below to how many have it above."""
+        cosines = dot(self.normals, axis)
+        is_slanted = (np.abs(cosines) < np.cos(STEEPNESS[0])) & (np.abs(cosines) > np.cos(STEEPNESS[1]))
+        is_above = (np.sign(cosines) * self.balance)[is_slanted]
+        softening = SIDE_SOFTENING * max(len(cosines), 1)
+        below, above = (float((sign * is_above).clip(0.0).sum()) + softening for sign in (-1.0, 1.0))
+        return float(np.log(below / above))
 
 
 def sides_of(cloud: PointNormals) -> Sides:
-    """On which side of a sample of the flat points other surfaces are."""
+    """On which side of a sample of the flat points the cloud is."""
     flat = np.flatnonzero(cloud.is_flat)
     flat = flat[:: 1 + len(flat) // NUM_SIDES]
     points, normals = cloud.points[flat], cloud.normals[flat]
-    neighbors = cKDTree(cloud.points).query(points, NUM_SIDE_NEIGHBORS, distance_upper_bound=SIDE_REACH)[1]
-    padded = np.vstack([cloud.points, np.full(3, np.nan)])  # where there are fewer neighbours
-    near = np.einsum("sni,si->sn", padded[neighbors] - points[:, None], normals)
     some = cloud.points[:: 1 + len(cloud.points) // NUM_BEYOND]
-    beyond = np.einsum("ni,si->sn", some, normals) - np.einsum("si,si->s", points, normals)[:, None]
-    return Sides(points, normals, _balance(near, SIDE_SKIN, 4.0), _balance(beyond, BEYOND_SKIN, 1.0))
-
-
-def _balance(offsets: Array, skin: float, softening: float) -> Array:
-    """How far (S,) offsets (S, N) off the skin are rather positive, 1, or negative, -1."""
-    num_before, num_behind = (offsets > skin).sum(axis=1), (offsets < -skin).sum(axis=1)
-    return np.asarray((num_before - num_behind) / (num_before + num_behind + softening))
+    offsets = np.einsum("ni,si->sn", some, normals) - np.einsum("si,si->s", points, normals)[:, None]
+    num_before = (offsets > BEYOND_SKIN).sum(axis=1)
+    num_behind = (offsets < -BEYOND_SKIN).sum(axis=1)
+    return Sides(normals, (num_before - num_behind) / (num_before + num_behind + 1.0))
 
 
 class SheetFeatures(NamedTuple):
     """Logarithms of ratios, above 0 where they speak for the sense; and the steps, for the axis."""
 
     hole_log_ratio: float  # of round holes that have headroom above to those that have it below
-    top_log_ratio: float  # of small level surfaces with things below, tops, to those with things above
+    passage_log_ratio: float  # of how far free space above the levels is in one piece to that below them
     roof_log_ratio: float  # of slanted surfaces with the cloud below to those with the cloud above
     steps: float  # [0, 1] how far heights repeat at the rise of stairs
 
@@ -77,67 +79,100 @@ def sheet_features(
     cloud: PointNormals, sides: Sides, axis: Array, is_level: NDArray[np.bool_], levels: Array
 ) -> SheetFeatures:
     """Features of a cloud along `axis` (3,), whose levels (L,) [m] ascend; some of its points are level."""
-    cosines = dot(sides.normals, axis)
-    upwards = np.sign(cosines)
-    distances = np.abs(dot(sides.points, axis)[:, None] - levels).min(axis=1, initial=np.inf)
-    is_small = (np.abs(cosines) > np.cos(LEVEL_ANGLE)) & (distances > SHEET)
-    is_slanted = (np.abs(cosines) < np.cos(STEEPNESS[0])) & (np.abs(cosines) > np.cos(STEEPNESS[1]))
     heights = dot(cloud.points, axis)
+    places = cloud.points @ np.linalg.svd(axis[None])[2][1:].T
     return SheetFeatures(
-        hole_log_ratio=_hole_log_ratio(cloud.points, heights, axis, is_level, levels),
-        top_log_ratio=_log_ratio_below(upwards * sides.near, is_small),
-        roof_log_ratio=_log_ratio_below(upwards * sides.all, is_slanted),
+        hole_log_ratio=_hole_log_ratio(_grid_over(places, CELL), heights, is_level, levels),
+        passage_log_ratio=_passage_log_ratio(_grid_over(places, PASSAGE_CELL), heights, is_level, levels),
+        roof_log_ratio=sides.roof_log_ratio(axis),
         steps=_steps(heights),
     )
 
 
-def _log_ratio_below(things_above: Array, mask: NDArray[np.bool_]) -> float:
-    """Logarithm of how many surfaces have things below to how many have them above, among all (S,)."""
-    above, below = (float((sign * things_above[mask]).clip(0.0).sum()) for sign in (1.0, -1.0))
-    softening = SIDE_SOFTENING * max(len(mask), 1)
-    return float(np.log((below + softening) / (above + softening)))
+class _Grid(NamedTuple):
+    """Cells of a grid across an axis, and which of them each point is in."""
+
+    shape: NDArray[np.int64]  # (2,)
+    cells: NDArray[np.int64]  # (N,) in row order; one more cell for strays
+
+    def occupied(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which cells have points of a mask (N,)."""
+        grid = np.zeros(int(self.shape.prod()) + 1, np.bool_)
+        grid[self.cells[mask]] = True
+        return grid[:-1].reshape(self.shape)
 
 
-def _hole_log_ratio(
-    points: Array, heights: Array, axis: Array, is_level: NDArray[np.bool_], levels: Array
-) -> float:
-    """Logarithm of the number of holes in the levels with headroom above to that with headroom below."""
-    places = points @ np.linalg.svd(axis[None])[2][1:].T
+def _grid_over(places: Array, cell: float) -> _Grid | None:
+    """The grid over places (N, 2) [m]; None where it had too many cells."""
     low, high = np.quantile(places, [0.001, 0.999], axis=0)
-    cells = np.floor((places - low) / CELL).astype(np.int64)
-    shape = np.floor((high - low) / CELL).astype(np.int64) + 1
-    is_inside = np.all((cells >= 0) & (cells < shape), axis=1)
+    cells = np.floor((places - low) / cell).astype(np.int64)
+    shape = np.floor((high - low) / cell).astype(np.int64) + 1
     if shape.prod() > MAX_CELLS:
+        return None
+    is_inside = np.all((cells >= 0) & (cells < shape), axis=1)
+    return _Grid(shape, np.where(is_inside, cells[:, 0] * shape[1] + cells[:, 1], shape.prod()))
+
+
+def _passage_log_ratio(
+    grid: _Grid | None, heights: Array, is_level: NDArray[np.bool_], levels: Array
+) -> float:
+    """Logarithm of how far free space above the levels is in one piece to how far that below them is.
+
+    That is the mean, over the free area of a level, of the fraction that the piece has of the level's.
+    """
+    in_pieces, in_all = np.zeros(2), np.zeros(2)
+    if grid is None:
         return 0.0
-    counts = np.zeros(2)
     for level in levels:
         off = heights - level
-        in_sheet = is_inside & is_level & (np.abs(off) < SHEET)
-        sheet = _grid(cells[in_sheet], shape)
-        if np.count_nonzero(in_sheet) > MIN_DENSITY * CELL**2 * sheet.sum():
-            holes = _round_holes(sheet)
-            for k, sign in enumerate((1.0, -1.0)):
-                is_off = is_inside & (sign * off > HEADROOM[0]) & (sign * off < HEADROOM[1])
-                things = _grid(cells[is_off], shape)
-                counts[k] += sum(_has_headroom(things, *hole) for hole in holes)
+        sheet = _closed(grid.occupied(is_level & (np.abs(off) < SHEET)))
+        for k, sign in enumerate((1.0, -1.0)):
+            is_off = sign * off > PASSAGE[0]
+            is_free = sheet & ~grid.occupied(is_off & (sign * off < PASSAGE[1]))
+            pieces, _ = label(is_free & binary_dilation(grid.occupied(is_off), iterations=REACH))
+            areas = np.bincount(pieces.ravel())[1:]
+            areas = areas[areas > MIN_AREA]
+            in_all[k] += areas.sum()
+            in_pieces[k] += (areas**2).sum() / max(areas.sum(), 1)
+    if in_all.min() < MIN_AREAS:
+        return 0.0
+    above, below = (in_pieces + AREA_SOFTENING) / (in_all + AREA_SOFTENING)
+    return float(np.log(above / below))
+
+
+def _closed(sheet: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """A sheet without the gaps between its points."""
+    closed = binary_closing(np.pad(sheet, 2 * REACH), iterations=REACH)
+    return np.asarray(closed[2 * REACH : -2 * REACH, 2 * REACH : -2 * REACH])
+
+
+def _hole_log_ratio(grid: _Grid | None, heights: Array, is_level: NDArray[np.bool_], levels: Array) -> float:
+    """Logarithm of the number of holes in the levels with headroom above to that with headroom below."""
+    counts = np.zeros(2)
+    if grid is None:
+        return 0.0
+    for level in levels:
+        off = heights - level
+        sheet = grid.occupied(is_level & (np.abs(off) < SHEET))
+        holes = _round_holes(sheet) if sheet.any() else []
+        for k, sign in enumerate((1.0, -1.0) if holes else ()):
+            things = grid.occupied((sign * off > HEADROOM[0]) & (sign * off < HEADROOM[1]))
+            behind = grid.occupied((sign * off < -REVEAL[0]) & (sign * off > -REVEAL[1]))
+            counts[k] += sum(_has_headroom(things, behind, *hole) for hole in holes)
     return float(np.log((counts[0] + COUNT_SOFTENING) / (counts[1] + COUNT_SOFTENING)))
 
 
-def _grid(cells: NDArray[np.int64], shape: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which cells are among `cells` (N, 2)."""
-    grid = np.zeros(shape, np.bool_)
-    grid[cells[:, 0], cells[:, 1]] = True
-    return grid
+def _has_headroom(
+    things: NDArray[np.bool_], behind: NDArray[np.bool_], i: int, j: int, radius: float
+) -> bool:
+    """Whether nothing is at a hole, nor behind it, though there are things around: outside are none."""
 
-
-def _has_headroom(things: NDArray[np.bool_], i: int, j: int, radius: float) -> bool:
-    """Whether nothing is at a hole itself, though there are things around: outside of a building are none."""
-
-    def around(reach: float) -> NDArray[np.bool_]:
+    def has(grid: NDArray[np.bool_], reach: float) -> bool:
         k = max(int(reach), 1)
-        return things[max(i - k, 0) : i + k + 1, max(j - k, 0) : j + k + 1]
+        return bool(grid[max(i - k, 0) : i + k + 1, max(j - k, 0) : j + k + 1].any())
 
-    return not around(0.6 * radius).any() and bool(around(radius + AROUND / CELL).any())
+    is_clear = not has(things, 0.6 * radius) and not has(behind, radius + 1.0)
+    return is_clear and has(things, radius + AROUND / CELL)
 
 
 def _round_holes(sheet: NDArray[np.bool_]) -> list[tuple[int, int, float]]:

@@ -1,11 +1,11 @@
 """Which way is up in a cloud.
 
 Every axis that many flat points face is a candidate, in both senses. What speaks for each of these hypotheses
-is added up as log-odds (up_features.py, sheet_features.py): how much of the cloud lies in a few levels across
-it (floors, ceilings), how little is aslant to it (floors and walls are not), how low the cloud is along it,
-whether heights repeat as stairs do, whether clutter and furniture are at the bottom of the storeys, whether
-one level carries everything, holes under scanners, tops of things, roofs, and the convention that scans have
-z up, where z is square to the cloud's own levels.
+is added up as log-odds (up_features.py, sheet_features.py): how little is aslant to it (floors and walls are
+not), how low the cloud is along it, whether one level carries everything, whether heights repeat as stairs
+do, whether things and level faces of many heights stand on the levels rather than hang from them, whether one
+can walk on them from room to room, holes under scanners, roofs, and the convention that scans have z up,
+where z is square to the cloud's own levels.
 """
 
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ from ..cloud.settings import UpAxis
 from ..geometry.pose import Array
 from .planes import PointNormals, dot
 from .sheet_features import sides_of
-from .up_features import NUM_SENSE_CUES, SENSE_SHARING, WEIGHTS, UpFeatures, Weights, log_odds, up_features
+from .up_features import WEIGHTS, UpFeatures, Weights, up_features
 
 # Chosen by hand: the sphere in cells finer than the spread of a noisy plane's normals (3 to 8 deg)
 MIN_POINTS = 300  # of a cloud
@@ -28,22 +28,25 @@ MAX_MODES = 6  # twice the three directions of a box
 MIN_MODE = 0.02  # fraction of the flat points
 DISTINCT_ANGLE = np.radians(15.0)  # between two candidates: twice the angle of the first refinement
 INLIER_ANGLES = np.radians([8.0, 4.0, 2.0, 2.0])  # of a normal to the axis or across it, step by step
+Z = np.array([0.0, 0.0, 1.0])
 Z_UP_LOG_ODDS = float(np.log(1000.0))  # of z up against z down: scanners level themselves
 OTHER_LOG_ODDS = float(np.log(3.0))  # of any other axis against z down: meshes with y up are not so rare
-PRIOR_ANGLE = np.radians(10.0)  # of +z to a direction that the convention speaks for
+STATION_LOG_ODDS = float(np.log(300.0))  # of the z of scanners that a file tells: they level themselves
+PRIOR_ANGLE = np.radians(10.0)  # of +z, or a scanner's z, to a direction that it speaks for
 SNAP_ANGLE = np.radians(0.2)  # of +z to a direction that is called +z itself
-NONE_ODDS = 0.05  # that it is none of the hypotheses, to those of the best one
-# Below it up is not relied on; of clouds turned at random 3 of 93 were wrong above it (BENCHMARK.md).
+NONE_ODDS = 0.08  # that it is none of the hypotheses, to those of the best one
+# Below it up is not relied on; how many above it are wrong is in BENCHMARK.md.
 MIN_CONFIDENCE = 0.8
 
-# What lowers the confidence, by hand on seeds 0 to 29 of tools/evaluate_gravity.py
+# What lowers the confidence, by hand on seeds 10 to 19 of tools/evaluate_gravity.py
 CLEAR_RADIUS, BLURRED_RADIUS = 1.0, 2.5  # of neighbourhoods where furniture fades, and is gone [m]
 OPEN_BALANCE = 0.3  # above_below_balance of a plane with open space before it: ground or a front
 OPEN_ENERGY_RATIO = 0.2  # of its level energy to the winner's, from which on they are mixed up
+MIN_FURNITURE = 0.7  # log-ratio, from which on things stand on the ground, and not a front's window sills
 SLAB_EXTENT = 2.0  # along up, below which nobody stands in the scan: one wall, a table [m]
-CONFIRMED = 1.1  # of what the strongest cue says on the sense, by all together: a second one agrees
-MIN_TOPS = 0.2  # log-ratio of tops, from which on things stand on the ground, and not a front's window sills
-MAX_OFF_AXIS = 0.55  # fraction of the flat points that are neither floor nor wall
+MIN_ROOFS = -0.17  # log-ratio, below which what is slanted speaks for another direction
+MIN_ROOF_OF_Z = 0.65  # log-ratio along +z, from which on that may be up though nothing is square to it
+SURE = 0.9  # confidence without such a doubt: level ground with trees, on its side, is like a roof to +z too
 DOUBT_FACTOR = 0.6  # on the confidence, for each of these
 
 
@@ -108,23 +111,33 @@ class Up(NamedTuple):
     hypotheses: tuple[Hypothesis, ...] = ()  # all that were compared, the likeliest first
 
 
-def find_up(cloud: PointNormals, z_up_log_odds: float = Z_UP_LOG_ODDS) -> Up:
+def find_up(
+    cloud: PointNormals, z_up_log_odds: float = Z_UP_LOG_ODDS, station_axes: Array | None = None
+) -> Up:
     """The direction that points up in a cloud, thinned evenly in space (5 to 20 cm).
 
     By convention scans have z up. Where a hypothesis is within 10 deg of +z, upside down needs evidence of a
     thousand to one against it, any other axis hundreds to one; within 0.2 deg of it, +z itself is returned.
     `z_up_log_odds` is the logarithm of that thousand: with 0 no direction is favoured, none rounded to +z.
+    The z axes (S, 3) of scanners, as E57 and PTX files tell them, count three hundred to one where all agree.
 
     The confidence is the winner's part of the odds of all directions, less where few points are flat or
     they face about it, and where ground and a house front could be mixed up. A bare room turned at random
     stays below 0.5, for its floor may be its ceiling.
     """
     if len(cloud.points) < MIN_POINTS:
-        return Up(np.array([0.0, 0.0, 1.0]), 0.0, f"only {len(cloud.points)} points: +z is assumed")
+        return Up(Z.copy(), 0.0, f"only {len(cloud.points)} points: +z is assumed")
     hypotheses = up_hypotheses(cloud)
     if not hypotheses:
-        return Up(np.array([0.0, 0.0, 1.0]), 0.0, "no axis that flat points face: +z is assumed")
-    return _choose(hypotheses, z_up_log_odds, cloud.neighborhood_radius)
+        return Up(Z.copy(), 0.0, "no axis that flat points face: +z is assumed")
+    axes = np.array([h.axis for h in hypotheses])
+    priors = _priors(axes, z_up_log_odds, station_axes)
+    up = _choose(hypotheses, priors, z_up_log_odds > 0.0, cloud.neighborhood_radius)
+    is_in_doubt = z_up_log_odds > 0.0 and not priors.any() and up.confidence < SURE
+    if is_in_doubt and sides_of(cloud).roof_log_ratio(Z) > MIN_ROOF_OF_Z:
+        reason = f"{up.reason}; +z is square to nothing, and yet what is slanted to it is a roof"
+        return up._replace(confidence=DOUBT_FACTOR * up.confidence, reason=reason)
+    return up
 
 
 def up_hypotheses(cloud: PointNormals) -> list[UpFeatures]:
@@ -168,25 +181,23 @@ def named_axis(up: UpAxis) -> Array:
     return np.asarray((-1.0 if up.startswith("-") else 1.0) * np.eye(3)["xyz".index(up[-1])] + 0.0)
 
 
-def _choose(hypotheses: list[UpFeatures], z_up_log_odds: float, neighborhood_radius: float) -> Up:
+def _choose(hypotheses: list[UpFeatures], priors: Array, rounds_to_z: bool, neighborhood_radius: float) -> Up:
     """The hypothesis of the largest odds, its part of all odds less what makes it doubtful, and why."""
-    cues = np.array([h.cues for h in hypotheses])
-    convention = _convention(np.array([h.axis[2] for h in hypotheses]), z_up_log_odds)
-    logits = log_odds(cues, np.array(WEIGHTS), SENSE_SHARING) + convention
+    terms = np.column_stack([priors, np.array([h.cues for h in hypotheses]) * np.array(WEIGHTS)])
+    logits = terms.sum(axis=1)
     odds = np.exp(logits - logits.max())
     odds /= odds.sum() + NONE_ODDS
     rank = np.argsort(-odds, kind="stable")
-    names = ("convention", *Weights._fields)
-    terms = np.column_stack([convention, cues * np.array(WEIGHTS)])
+    names = ("convention", "stations", *Weights._fields)
     ranked = tuple(
         Hypothesis(hypotheses[k].axis, float(odds[k]), dict(zip(names, terms[k].tolist(), strict=True)))
         for k in rank
     )
     best = hypotheses[rank[0]]
-    is_by_convention = bool(convention[rank[0]] > convention.min())
-    factor, doubts = _doubts(best, hypotheses, neighborhood_radius, is_by_convention)
-    is_z = z_up_log_odds > 0.0 and best.axis[2] > np.cos(SNAP_ANGLE)
-    direction = np.array([0.0, 0.0, 1.0]) if is_z else best.axis
+    is_told = bool(np.any(priors[rank[0]] > priors.min(axis=0)))
+    factor, doubts = _doubts(best, hypotheses, neighborhood_radius, is_told)
+    is_z = rounds_to_z and best.axis[2] > np.cos(SNAP_ANGLE)
+    direction = Z.copy() if is_z else best.axis
     return Up(direction, ranked[0].probability * factor, "; ".join([_explained(ranked), *doubts]), ranked)
 
 
@@ -202,20 +213,25 @@ def _explained(ranked: tuple[Hypothesis, ...]) -> str:
     return f"log-odds against {against}: {', '.join(told) or 'none'}"
 
 
-def _convention(heights: Array, z_up_log_odds: float) -> Array:
-    """Log-odds (H,) by convention of directions whose z are given; all 0 where none is near +z."""
-    is_z, is_flipped = heights > np.cos(PRIOR_ANGLE), heights < -np.cos(PRIOR_ANGLE)
-    if not is_z.any():
-        return np.zeros(len(heights))
-    return np.where(is_z, z_up_log_odds, np.where(is_flipped, 0.0, min(OTHER_LOG_ODDS, z_up_log_odds)))
+def _priors(axes: Array, z_up_log_odds: float, station_axes: Array | None) -> Array:
+    """Log-odds (H, 2) of directions (H, 3) by convention, 0 where none is near +z, and by scanners' axes."""
+    is_z, is_flipped = axes[:, 2] > np.cos(PRIOR_ANGLE), axes[:, 2] < -np.cos(PRIOR_ANGLE)
+    priors = np.zeros((len(axes), 2))
+    if is_z.any():
+        other = np.where(is_flipped, 0.0, min(OTHER_LOG_ODDS, z_up_log_odds))
+        priors[:, 0] = np.where(is_z, z_up_log_odds, other)
+    if station_axes is not None and len(station_axes):
+        cosines = np.einsum("hi,si->hs", axes, station_axes)
+        priors[:, 1] = STATION_LOG_ODDS * (cosines > np.cos(PRIOR_ANGLE)).mean(axis=1)
+    return priors
 
 
 def _doubts(
-    best: UpFeatures, hypotheses: list[UpFeatures], neighborhood_radius: float, is_by_convention: bool
+    best: UpFeatures, hypotheses: list[UpFeatures], neighborhood_radius: float, is_told: bool
 ) -> tuple[float, list[str]]:
     """A factor [0, 1] on the confidence in the best hypothesis, and the reasons to doubt it.
 
-    Where the convention speaks for it, what misleads the other cues is no reason.
+    Where the convention or the scanners speak for it, what misleads the other cues is no reason.
     """
     factor = float(
         np.clip((BLURRED_RADIUS - neighborhood_radius) / (BLURRED_RADIUS - CLEAR_RADIUS), 0.0, 1.0)
@@ -226,14 +242,10 @@ def _doubts(
     across = [other for other in hypotheses if abs(other.axis @ best.axis) < 0.3]
     energy, balance = OPEN_ENERGY_RATIO * best.level_energy, max(OPEN_BALANCE, best.above_below_balance)
     is_open = any(h.above_below_balance > balance and h.level_energy > energy for h in across)
-    evidence = dict(zip(Weights._fields, best.cues * np.array(WEIGHTS), strict=True))
-    for_sense = [evidence[name] for name in Weights._fields[-NUM_SENSE_CUES:]]
-    needed = CONFIRMED * max(for_sense) - evidence["balance"]
     reasons = {
-        "ground and the front of a building look alike": is_open and best.sheets.top_log_ratio < MIN_TOPS,
-        "one cue alone tells top from bottom": sum(for_sense) < needed,
-        "little is floor or wall, maybe a roof": best.off_axis_fraction > MAX_OFF_AXIS,
+        "ground and the front of a building look alike": is_open and best.furniture_log_ratio < MIN_FURNITURE,
+        "what is slanted is open upwards": best.sheets.roof_log_ratio < MIN_ROOFS,
         f"only {best.extent:.1f} m high, maybe a wall": best.extent < SLAB_EXTENT,
     }
-    found = [] if is_by_convention else [reason for reason, holds in reasons.items() if holds]
+    found = [] if is_told else [reason for reason, holds in reasons.items() if holds]
     return factor * DOUBT_FACTOR ** len(found), doubts + found

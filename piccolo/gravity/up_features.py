@@ -8,9 +8,7 @@ from ..geometry.pose import Array
 from .planes import PointNormals, dot
 from .sheet_features import SheetFeatures, Sides, sheet_features
 
-# Lengths and angles of buildings, by hand. On 138 clouds (twelve made-up places of each kind, two turns each
-# of the scenes house, hospital and hall) one of them halved or doubled changes at most 7 answers, but for
-# FURNITURE up to 2.4 m (11) and a MIDDLE without margins (10 of 69).
+# Lengths and angles of buildings, by hand
 ALIGNED_ANGLE = np.radians(8.0)  # of a normal to the axis (floors), or to the plane across it (walls)
 SHARP_ANGLE = np.radians(2.0)  # the same of what is built, not grown or slumped
 BIN = 0.1  # of the histogram of heights, half a level's thickness [m]
@@ -22,8 +20,10 @@ MIN_STOREY = 1.5  # height, lower than any room [m]
 MAX_STOREY = 5.0  # height of one whose floor or ceiling was not scanned [m]
 UNSEEN_END_FACTOR = 0.5  # on the balance above and below for such a storey
 FAR = 0.5  # beyond a level, further than it bends [m]
-FURNITURE = (0.3, 1.2)  # height of seats, beds, tables, boxes [m]
-MIDDLE = (0.15, 0.5, 0.85)  # fractions of a storey: skirting below, clutter or air, lamps and beams above
+CLUTTER = (0.25, 2.0)  # height of what people use: skirting below, lamps and beams above [m]
+FURNITURE = (0.3, 1.6)  # height of the tops of seats, tables, shelves, counters, cars [m]
+FURNITURE_BIN = 0.05  # [m]
+MAX_FURNITURE = 0.002  # fraction of the points that counts in a bin: furniture has many heights, beams one
 # fractions of the points added to both counts of a ratio, so that a handful of points says little
 CLUTTER_SOFTENING, FURNITURE_SOFTENING, BALANCE_SOFTENING = 0.003, 0.001, 0.1
 
@@ -31,25 +31,19 @@ CLUTTER_SOFTENING, FURNITURE_SOFTENING, BALANCE_SOFTENING = 0.003, 0.001, 0.1
 class Weights(NamedTuple):
     """Log-odds a unit of each cue, in the order of UpFeatures.cues."""
 
-    level_energy: float
-    off_axis: float
     misaligned: float
-    non_manhattan: float
     extent: float
     balance: float
     steps: float
     clutter: float
     furniture: float
+    passages: float
     holes: float
-    tops: float
     roofs: float
 
 
-NUM_SENSE_CUES = 5  # the last ones: what tells one sense of an axis from the other
-# By a fit as that of tools/calibrate_gravity.py, on seeds 0 to 9 of all kinds, without tops, weighed
-# by hand: made-up things have no undersides, and in house, hospital and hall tops speak against the truth.
-WEIGHTS = Weights(0.0, 0.0, 1.05, 0.0, 5.65, 3.5, 20.55, 2.81, 2.33, 0.35, 1.0, 3.04)
-SENSE_SHARING = 0.13  # 0: what tells the senses of an axis apart speaks for the axis in full; 1: not at all
+# By tools/calibrate_gravity.py --fit 10 20
+WEIGHTS = Weights(1.92, 6.35, 5.29, 33.14, 1.36, 1.9, 2.36, 2.15, 3.06)
 
 
 class UpFeatures(NamedTuple):
@@ -57,47 +51,29 @@ class UpFeatures(NamedTuple):
 
     axis: Array  # (3,) unit
     level_energy: float  # root of the sum of squares of the levels' fractions of all points
-    off_axis_fraction: float  # of the flat points: neither floor nor wall
     misaligned_fraction: float  # of the flat points: neither floor nor wall within 2 deg
-    non_manhattan_fraction: float  # of the flat points: walls at odd angles to the other walls
-    aligned_fraction: float  # of all points: floor or wall
-    sharp_fraction: float  # of the aligned points: floor or wall within 2 deg
     extent: float  # of the cloud along the axis [m]
-    clutter_log_ratio: float  # of clutter below to clutter above the middle of the storeys
-    furniture_log_ratio: float  # of level tops as high as furniture above a level to those as far below one
+    clutter_log_ratio: float  # of what stands on the levels to what hangs from them
+    furniture_log_ratio: float  # of level faces as high as furniture above a level to those as far below one
     above_below_balance: float  # [-1, 1] points above the last level less those below the first, to both
     sheets: SheetFeatures  # what is above and below sheets
 
     @property
     def cues(self) -> Array:
-        """Numbers (12,) of which the log-odds are a sum, in the order of Weights."""
+        """Numbers (9,) of which the log-odds are a sum, in the order of Weights."""
         return np.array(
             [
-                np.log(self.level_energy + 0.03),
-                -np.log(self.off_axis_fraction + 0.05),
                 -np.log(self.misaligned_fraction + 0.02),
-                -self.non_manhattan_fraction,
                 -np.log(self.extent + 2.0),
                 self.above_below_balance,
                 np.clip(self.sheets.steps - 0.15, 0.0, 0.3),
-                np.clip(self.clutter_log_ratio, -1.2, 1.2),
-                np.clip(self.furniture_log_ratio, -1.5, 1.5),
+                np.clip(self.clutter_log_ratio, -1.5, 1.5),
+                np.clip(self.furniture_log_ratio, -2.0, 2.0),
+                np.clip(self.sheets.passage_log_ratio, -1.5, 1.5),
                 np.clip(self.sheets.hole_log_ratio, -2.5, 2.5),
-                np.clip(self.sheets.top_log_ratio, -1.5, 1.5),
                 np.clip(self.sheets.roof_log_ratio, -2.0, 2.0),
             ]
         )
-
-
-def log_odds(cues: Array, weights: Array, sense_sharing: float) -> Array:
-    """Log-odds (...) of directions with the cues (..., 12) pointing up, before any convention.
-
-    The last cues tell one sense of an axis from the other. What they say is shared out between the two by
-    `sense_sharing`, so that shelves along a wall do not make it a floor.
-    """
-    terms = cues * weights
-    sense = terms[..., -NUM_SENSE_CUES:].sum(axis=-1)
-    return np.asarray(terms.sum(axis=-1) - sense_sharing * np.log(2.0 * np.cosh(sense)))
 
 
 def up_features(cloud: PointNormals, sides: Sides, axis: Array) -> UpFeatures:
@@ -107,8 +83,7 @@ def up_features(cloud: PointNormals, sides: Sides, axis: Array) -> UpFeatures:
     is_wall = is_flat & (cosines < np.sin(ALIGNED_ANGLE))
     is_sharp = is_flat & ((cosines > np.cos(SHARP_ANGLE)) | (cosines < np.sin(SHARP_ANGLE)))
     heights = dot(cloud.points, axis)
-    num_points, num_flat = len(heights), int(np.count_nonzero(is_flat))
-    num_aligned, num_sharp = int(np.count_nonzero(is_level | is_wall)), int(np.count_nonzero(is_sharp))
+    num_points = len(heights)
     low, high = map(float, np.quantile(heights, [0.01, 0.99]))
     levels, fractions = _find_levels(heights[is_level], num_points)
     storeys, balance = levels, 0.0
@@ -125,11 +100,7 @@ def up_features(cloud: PointNormals, sides: Sides, axis: Array) -> UpFeatures:
     return UpFeatures(
         axis=axis,
         level_energy=float(np.sqrt(np.sum(fractions**2))),
-        off_axis_fraction=1.0 - num_aligned / num_flat,
-        misaligned_fraction=1.0 - num_sharp / num_flat,
-        non_manhattan_fraction=_num_non_manhattan(cloud.normals[is_wall], axis) / num_flat,
-        aligned_fraction=num_aligned / num_points,
-        sharp_fraction=num_sharp / max(num_aligned, 1),
+        misaligned_fraction=1.0 - np.count_nonzero(is_sharp) / np.count_nonzero(is_flat),
         extent=high - low,
         clutter_log_ratio=_clutter_log_ratio(heights[~is_wall], storeys, num_points),
         furniture_log_ratio=_furniture_log_ratio(heights[is_level], storeys, num_points),
@@ -163,41 +134,37 @@ def _find_levels(heights: Array, num_points: int) -> tuple[Array, Array]:
     return levels[is_kept], fractions[is_kept]
 
 
+def _distances_to_levels(heights: Array, levels: Array) -> tuple[Array, Array]:
+    """How far `heights` (N,) are above the next level, and below the next; inf where there is none [m]."""
+    next_level = np.searchsorted(levels, heights)
+    return heights - np.append(-np.inf, levels)[next_level], np.append(levels, np.inf)[next_level] - heights
+
+
 def _clutter_log_ratio(heights: Array, levels: Array, num_points: int) -> float:
-    """Logarithm of the number of `heights` below the middle of their storey to the number above it."""
-    if len(levels) < 2:
-        return 0.0
-    upper_level = np.searchsorted(levels, heights)
-    is_between = (upper_level > 0) & (upper_level < len(levels))
-    floors, ceilings = levels[upper_level[is_between] - 1], levels[upper_level[is_between]]
-    parts = (heights[is_between] - floors) / (ceilings - floors)
-    parts = parts[ceilings - floors > MIN_STOREY]
-    lower = np.count_nonzero((parts > MIDDLE[0]) & (parts < MIDDLE[1]))
-    upper = np.count_nonzero((parts > MIDDLE[1]) & (parts < MIDDLE[2]))
+    """Logarithm of the number of `heights` between levels that are near the lower to those near the upper."""
+    above, below = _distances_to_levels(heights, levels)
+    is_between = np.isfinite(above) & np.isfinite(below)
+    low, high = CLUTTER
+    lower = np.count_nonzero(is_between & (above > low) & (above < np.minimum(high, below)))
+    upper = np.count_nonzero(is_between & (below > low) & (below < np.minimum(high, above)))
     softening = CLUTTER_SOFTENING * num_points
     return float(np.log((lower + softening) / (upper + softening)))
 
 
 def _furniture_log_ratio(heights: Array, levels: Array, num_points: int) -> float:
-    """Logarithm of the number of `heights` at a piece of furniture's above a level to those below one."""
-    if len(levels) == 0:
-        return 0.0
+    """Logarithm of the number of `heights` at a piece of furniture's above a level to those below one.
+
+    Of those at the same height only so many count: rows of beams or lamps are no more than one table.
+    """
+    above, below = _distances_to_levels(heights, levels)
     low, high = FURNITURE
-    next_level = np.searchsorted(levels, heights)
-    above = heights - np.append(-np.inf, levels)[next_level]
-    below = np.append(levels, np.inf)[next_level] - heights
-    lower = np.count_nonzero((above > low) & (above < high) & (below > low))
-    upper = np.count_nonzero((below > low) & (below < high) & (above > low))
+    lower = _spread_count(above[(above > low) & (above < np.minimum(high, below))], num_points)
+    upper = _spread_count(below[(below > low) & (below < np.minimum(high, above))], num_points)
     softening = FURNITURE_SOFTENING * num_points
     return float(np.log((lower + softening) / (upper + softening)))
 
 
-def _num_non_manhattan(normals: Array, axis: Array) -> int:
-    """How many normals (N, 3) of walls are at odd angles to the main directions, two and perpendicular."""
-    if len(normals) == 0:
-        return 0
-    a, b = np.linalg.svd(axis[None])[2][1:]
-    yaw = np.degrees(np.arctan2(dot(normals, b), dot(normals, a))) % 90.0
-    counts = np.bincount((yaw / 2.0).astype(np.int64) % 45, minlength=45)
-    wide = np.sum([np.roll(counts, k) for k in range(-4, 5)], axis=0)  # 18 deg
-    return len(normals) - int(wide.max())
+def _spread_count(heights: Array, num_points: int) -> float:
+    """The number of `heights` [m], of which no more than a fraction of all points counts in a bin."""
+    counts = np.bincount((heights / FURNITURE_BIN).astype(np.int64))
+    return float(np.minimum(counts, MAX_FURNITURE * num_points).sum())

@@ -85,7 +85,14 @@ def open_e57(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     read_chunks = intensity_reader(path, lambda: ((p, v[:, 0]) for _, p, v in _read(path, measured)))
     if scans:
         read_chunks = partial(_read_colored, path, scans)
-    return PointSource(path, read_chunks, num_points, warnings)
+    poses = [scan.pose for scan in scans or measured if scan.pose is not None]
+    axes = [pose.R_cam_from_world[2] for pose in poses if not _is_identity(pose)]
+    return PointSource(path, read_chunks, num_points, warnings, tuple(axes))
+
+
+def _is_identity(pose: Pose) -> bool:
+    """Whether a pose is what programs write that know of no scanner."""
+    return bool(np.array_equal(pose.R_cam_from_world, np.eye(3)) and not pose.center_world.any())
 
 
 def _scans(file: E57File, channels: tuple[str, ...]) -> tuple[list[E57Scan], list[str]]:

@@ -62,7 +62,17 @@ def open_ptx(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
         raise InputError(f"{path}: no line of numbers, {WANTED}")
     read = partial(_read, path, COLORED if has_colors else WITH_INTENSITY, scans)
     read_chunks = (lambda: starmap(RawCloud, read())) if has_colors else intensity_reader(path, read)
-    return PointSource(path, read_chunks, sum(scan.num_points for scan in scans), tuple(warnings))
+    num_points = sum(scan.num_points for scan in scans)
+    return PointSource(path, read_chunks, num_points, tuple(warnings), tuple(_station_axes(scans)))
+
+
+def _station_axes(scans: list[PtxScan]) -> Iterator[NDArray[np.float64]]:
+    """The z axes (3,) of the scanners in the world, unit; of those that have a place in it."""
+    for scan in scans:
+        z = scan.T_world_from_scanner[:3, 2]
+        length = float(np.linalg.norm(z))
+        if length > 0.0 and not np.array_equal(scan.T_world_from_scanner, np.eye(4)):
+            yield z / length
 
 
 def has_ptx_magic(head: bytes) -> bool:

@@ -1,6 +1,7 @@
 """Seeded clouds of places that mislead a search for up: clutter, roofs, stairs, missing floors, open ground.
 
-Surfaces are sampled evenly, without a scanner's shadows but with its noise. z is up. Places of odd seeds have
+Surfaces are sampled evenly, without a scanner's shadows but with its noise; of boxes and openings, tops and
+undersides as scanners 1.2 to 1.9 m high see them. z is up. Places of odd seeds have
 holes in the ground, where the scanner stood.
 """
 

@@ -138,7 +138,7 @@ def tunnel(seed: int) -> Array:
     """A tube with a road, walkways on both sides, pipes or fans above."""
     s = _sampler(seed, 86)
     x, radius = float(s.rng.uniform(20.0, 45.0)), float(s.rng.uniform(3.0, 5.0))
-    level = -0.45 * radius
+    s.ground = level = -0.45 * radius
     half = math.sqrt(radius**2 - level**2)
     t = s.rng.uniform(0.0, 1.0, (int(DENSITY * x * 4.2 * radius), 2))
     angle = -0.45 + t[:, 1] * (math.pi + 0.9)

@@ -32,7 +32,7 @@ def storeys(seed: int) -> Array:
     x, y, z = s.rng.uniform([7.0, 5.5, 2.4], [11.0, 8.0, 2.9])
     num_storeys, slab = int(s.rng.integers(2, 5)), 0.3
     for k in range(num_storeys):
-        level = k * (z + slab)
+        s.ground = level = k * (z + slab)
         hole = [(1.0, 5.0, y - 1.2, y)]
         s.parallelogram([0, 0, level], [x, 0, 0], [0, y, 0], hole if k else ())
         s.parallelogram([0, 0, level + z], [x, 0, 0], [0, y, 0], hole if k < num_storeys - 1 else ())
@@ -54,7 +54,7 @@ def loft(seed: int) -> Array:
     s.beams([x, y], z, s.rng.uniform(0.8, 1.8), s.rng.uniform(0.2, 0.4))
     depth = s.rng.uniform(2.0, 3.0)
     s.box([depth / 2, y / 2, 2.2], [depth, y, 0.2])
-    s.parallelogram([0, 0, 2.2], [depth, 0, 0], [0, y, 0])
+    s.parallelogram([0, 0, 2.4], [depth, 0, 0], [0, y, 0])  # scanned from above too
     flight(s, np.array([depth, 0.1, 0.0]), 0.9, 2.4, 11, 0.22)
     s.furnish([0, 0, 0], [x, y, 0], int(x * y / s.rng.uniform(4.0, 8.0)))
     s.lamps([x, y], z, 3.0, s.rng.uniform(0.6, 1.4))
@@ -135,9 +135,11 @@ def lecture(seed: int) -> Array:
     s.walls([0, 0, 0], [x, y, z], 1, 0)
     for k in range(rows):
         at, level = front + k * depth, (k + 1) * rise
+        s.ground = level
         s.parallelogram([at, 0, level - rise], [0, y, 0], [0, 0, rise])
         s.parallelogram([at, 0, level], [0, y, 0], [depth, 0, 0])
         s.box([at + 0.3, y / 2, level], [0.35, y - 2.4, 0.75])
         s.box([at + 0.75, y / 2, level], [0.08, y - 2.4, 0.85])
+    s.ground = 0.0
     s.table([1.5, y / 2, 0], np.array([0.8, 2.5, 0.9]))
     return s.points()

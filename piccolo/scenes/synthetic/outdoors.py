@@ -60,12 +60,12 @@ def front(seed: int) -> Array:
     """A house front and a strip of ground before it."""
     s = SurfaceSampler(np.random.default_rng([seed, 65]))
     length, height, depth = s.rng.uniform([10.0, 5.0, 1.5], [20.0, 12.0, 6.0])
-    s.parallelogram([0, 0, 0], [length, 0, 0], [0, 0, height])
     s.parallelogram([0, 0, 0], [length, 0, 0], [0, -depth, 0])
-    for x in np.arange(1.5, length - 1.5, 2.5):
-        for z in np.arange(1.0, height - 1.5, 3.0):
-            s.parallelogram([x, 0.15, z], [1.0, 0, 0], [0, 0, 1.3])
-            s.parallelogram([x, 0, z], [1.0, 0, 0], [0, 0.15, 0])
+    places = [(x, z) for x in np.arange(1.5, length - 1.5, 2.5) for z in np.arange(1.0, height - 1.5, 3.0)]
+    windows = [(x, x + 1.0, z, z + 1.3) for x, z in places]
+    s.pierced_wall([0, 0, 0], [length, 0, 0], height, np.array([0.0, 1.0, 0.0]), windows)
+    for x, z in places:
+        s.parallelogram([x, 0.15, z], [1.0, 0, 0], [0, 0, 1.3])
     s.furnish(np.array([0, -depth - 0.6, 0.0]), np.array([length, 0.6, 0.0]), int(s.rng.integers(0, 4)))
     return s.points()
 
@@ -76,15 +76,15 @@ def _tree(s: SurfaceSampler, at: Array, height: float) -> None:
     s.add(s.rng.normal(at + [0, 0, height + 0.5], [1.2, 1.2, 1.0], (1500, 3)))
 
 
-def _facade(s: SurfaceSampler, corner: Array, along: Array, height: float) -> None:
-    """A front with rows of windows and a door."""
+def _facade(s: SurfaceSampler, corner: Array, along: Array, height: float, outward: Array) -> None:
+    """A front with rows of windows, of which `outward` (3,) are rooms, and a door."""
     length = float(np.linalg.norm(along))
     panes = [
         (x, x + 1.1, z, z + 1.5)
         for z in np.arange(0.9, height - 1.6, 3.0)
         for x in np.arange(1.0, length - 1.2, 2.4)
     ]
-    s.parallelogram(corner, along, [0, 0, height], [*panes, (0.2, 1.1, 0.0, 2.1)])
+    s.pierced_wall(corner, along, height, outward, [*panes, (0.2, 1.1, 0.0, 2.1)])
 
 
 def street(seed: int) -> Array:
@@ -99,9 +99,9 @@ def street(seed: int) -> Array:
         at = 0.0
         while is_built and at < x - 6.0:
             length = float(s.rng.uniform(6.0, 14.0))
-            _facade(
-                s, np.array([at, side, 0.0]), np.array([min(length, x - at), 0, 0]), s.rng.uniform(5.0, 13.0)
-            )
+            along = np.array([min(length, x - at), 0.0, 0.0])
+            outward = np.array([0.0, 1.0 if side else -1.0, 0.0])
+            _facade(s, np.array([at, side, 0.0]), along, s.rng.uniform(5.0, 13.0), outward)
             at += length + float(s.rng.choice([0.0, 2.0]))
     for at in np.arange(3.0, x - 3.0, 6.0):
         for side in (2.9, y - 2.9):
@@ -119,7 +119,8 @@ def terrace(seed: int) -> Array:
     s = SurfaceSampler(np.random.default_rng([seed, 101]))
     x, y = s.rng.uniform([6.0, 3.5], [12.0, 7.0])
     s.parallelogram([0, 0, 0], [x, 0, 0], [0, y, 0])
-    _facade(s, np.array([0.0, y, 0.0]), np.array([x, 0, 0]), s.rng.uniform(3.0, 6.5))
+    outward = np.array([0.0, 1.0, 0.0])
+    _facade(s, np.array([0.0, y, 0.0]), np.array([x, 0, 0]), s.rng.uniform(3.0, 6.5), outward)
     for corner, along in (([0, 0, 0], [x, 0, 0]), ([0, 0, 0], [0, y, 0]), ([x, 0, 0], [0, y, 0])):
         s.parallelogram(np.array(corner) + [0, 0, 0.95], along, [0, 0, 0.06])
         for t in np.arange(0.0, 1.0, 0.05):
@@ -163,7 +164,7 @@ def gable_house(seed: int) -> Array:
 
 def roof(seed: int) -> Array:
     """Roofs alone, as from a drone that looks down: slopes, chimneys, dormers, a flat part."""
-    s = SurfaceSampler(np.random.default_rng([seed, 103]), STREET_DENSITY)
+    s = SurfaceSampler(np.random.default_rng([seed, 103]), STREET_DENSITY, is_from_above=True)
     for k in range(int(s.rng.integers(1, 4))):
         x, y, wall = s.rng.uniform([8.0, 7.0, 0.0], [14.0, 10.0, 1.5])
         rise = 0.5 * y * math.tan(s.rng.uniform(0.5, 0.8))
@@ -181,10 +182,11 @@ def courtyard(seed: int) -> Array:
     s = SurfaceSampler(np.random.default_rng([seed, 104]), STREET_DENSITY)
     x, y, z = s.rng.uniform([9.0, 8.0, 6.0], [20.0, 16.0, 15.0])
     s.parallelogram([0, 0, 0], [x, 0, 0], [0, y, 0])
-    for corner, along in (
-        ([0, 0, 0], [x, 0, 0]), ([0, y, 0], [x, 0, 0]), ([0, 0, 0], [0, y, 0]), ([x, 0, 0], [0, y, 0])
+    for corner, along, outward in (
+        ([0, 0, 0], [x, 0, 0], [0, -1, 0]), ([0, y, 0], [x, 0, 0], [0, 1, 0]),
+        ([0, 0, 0], [0, y, 0], [-1, 0, 0]), ([x, 0, 0], [0, y, 0], [1, 0, 0]),
     ):  # fmt: skip
-        _facade(s, np.array(corner, float), np.array(along, float), z)
+        _facade(s, np.array(corner, float), np.array(along, float), z, np.array(outward, float))
     for at in s.rng.uniform([2.0, 2.0], [x - 2.0, y - 2.0], (int(s.rng.integers(0, 4)), 2)):
         _tree(s, np.array([*at, 0.0]), s.rng.uniform(2.0, 4.0))
     s.furnish([0, 0, 0], [x, y, 0], int(s.rng.integers(3, 10)))

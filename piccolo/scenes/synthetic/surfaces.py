@@ -13,9 +13,14 @@ from .world import RANGE_NOISE
 
 DENSITY = 250.0  # points a m2
 WALL_DISTANCE = np.array([0.5, 0.5, 0.0])  # of furniture [m]
+WALL_THICKNESS = (0.08, 0.3)  # [m]
 SKIN = 0.03  # of a box: what lies deeper inside is hidden [m]
 STATION_AREA = 40.0  # of ground for each scanner position [m2]
 BLIND_ANGLE = math.radians(30.0)  # around straight down, where a scanner sees nothing
+EYES = (1.2, 1.9)  # heights of scanners above the ground they stand on [m]
+NUM_EYES = 3
+GRAZING = 0.3  # difference in height from which on a scanner sees most of a level face [m]
+FROM_THE_AIR = 100.0  # height of a drone [m]
 HEADROOM = (0.15, 1.7)  # above the ground, empty where a tripod stands [m]
 FOOTING = 0.5  # radius around a tripod in which the ground is whole [m]
 Opening = tuple[float, float, float, float]  # from and to along each edge [m]
@@ -23,19 +28,33 @@ Opening = tuple[float, float, float, float]  # from and to along each edge [m]
 
 @dataclass
 class SurfaceSampler:
-    """Points on surfaces as they are added; z is up."""
+    """Points on surfaces as they are added; z is up.
+
+    Of boxes, a scanner sees the tops below its eye and the undersides above it, fewer points near its height.
+    """
 
     rng: np.random.Generator
     density: float = DENSITY  # [1/m2]
+    is_from_above: bool = False  # seen by a drone
+    ground: float = 0.0  # height of what scanners stand on, where boxes are added [m]
     parts: list[Array] = field(default_factory=list)
     hidden: list[tuple[Array, Array, float]] = field(default_factory=list)  # middles, sizes, yaws of boxes
+    eyes: Array = field(init=False)  # heights of scanners above the ground [m]
+
+    def __post_init__(self) -> None:
+        self.eyes = np.full(1, FROM_THE_AIR) if self.is_from_above else self.rng.uniform(*EYES, NUM_EYES)
 
     def parallelogram(
-        self, corner: ArrayLike, a: ArrayLike, b: ArrayLike, openings: Sequence[Opening] = ()
+        self,
+        corner: ArrayLike,
+        a: ArrayLike,
+        b: ArrayLike,
+        openings: Sequence[Opening] = (),
+        seen: float = 1.0,
     ) -> None:
-        """Points from `corner` along the edges `a` and `b` (3,) [m], none in the openings."""
+        """Points from `corner` along the edges `a` and `b` (3,) [m], none in the openings, a part `seen`."""
         edge_a, edge_b = np.asarray(a, float), np.asarray(b, float)
-        area = float(np.linalg.norm(np.cross(edge_a, edge_b)))
+        area = seen * float(np.linalg.norm(np.cross(edge_a, edge_b)))
         s = self.rng.uniform(0.0, 1.0, (int(self.density * area) + 1, 2))
         x, y = s[:, 0] * np.linalg.norm(edge_a), s[:, 1] * np.linalg.norm(edge_b)
         for x0, x1, y0, y1 in openings:
@@ -48,21 +67,27 @@ class SurfaceSampler:
         self.parts.append(points + self.rng.normal(0.0, RANGE_NOISE, points.shape))
 
     def box(self, center: ArrayLike, size: ArrayLike, yaw: float = 0.0, *, hangs: bool = False) -> None:
-        """A box of `size` (3,) whose bottom's centre is at `center` (3,) [m], without its bottom.
+        """A box of `size` (3,), its bottom's centre at `center` (3,) [m]; top and bottom as they are seen.
 
-        One that `hangs` has a bottom and no top. What is inside, and the floor or ceiling there, is hidden.
+        What is inside, and the floor below, or the ceiling above one that `hangs`, is hidden.
         """
         x, y, z = np.asarray(size, float)
         c, s = np.cos(yaw), np.sin(yaw)
         along, across, up = np.array([c * x, s * x, 0.0]), np.array([-s * y, c * y, 0.0]), np.array([0, 0, z])
         corner = np.asarray(center) - 0.5 * (along + across)
-        for origin, a, b in (
-            (corner, along, up), (corner + across, along, up), (corner, across, up),
-            (corner + along, across, up), (corner if hangs else corner + up, along, across),
+        for origin, a in (
+            (corner, along), (corner + across, along), (corner, across), (corner + along, across)
         ):  # fmt: skip
-            self.parallelogram(origin, a, b)
-        shift = 2.0 * SKIN if hangs else -2.0 * SKIN
-        self.hidden.append((np.asarray(center) + [0.0, 0.0, 0.5 * z + shift], np.array([x, y, z]), yaw))
+            self.parallelogram(origin, a, up)
+        seen_below = self.seen_from_below(corner[2])
+        for origin, seen in ((corner, seen_below), (corner + up, self.seen_from_above(corner[2] + z))):
+            if seen > 0.0:
+                self.parallelogram(origin, along, across, seen=seen)
+        shift = 2.0 * SKIN if hangs else 0.0 if seen_below else -2.0 * SKIN
+        thickness = z if shift else z - 2.0 * SKIN  # of one that floats, top and bottom are in sight
+        self.hidden.append(
+            (np.asarray(center) + [0.0, 0.0, 0.5 * z + shift], np.array([x, y, thickness]), yaw)
+        )
 
     def floor_and_ceiling(self, x: float, y: float, z: float) -> None:
         """Level rectangles from the origin to (x, y), at heights of 0 and z."""
@@ -85,14 +110,38 @@ class SurfaceSampler:
             is_door = k < num_doors
             sides[side].append((at, at + (0.9 if is_door else 1.0), *((0.0, 2.1) if is_door else (0.9, 2.1))))
         low = np.asarray(corner, float)
-        for origin, a, openings in (
-            (low, [x, 0, 0], sides[0]), (low + [0, y, 0], [x, 0, 0], sides[1]),
-            (low, [0, y, 0], sides[2]), (low + [x, 0, 0], [0, y, 0], sides[3]),
+        for origin, a, outward, openings in (
+            (low, [x, 0, 0], [0, -1, 0], sides[0]), (low + [0, y, 0], [x, 0, 0], [0, 1, 0], sides[1]),
+            (low, [0, y, 0], [-1, 0, 0], sides[2]), (low + [x, 0, 0], [0, y, 0], [1, 0, 0], sides[3]),
         ):  # fmt: skip
-            self.parallelogram(origin, a, [0, 0, z], openings)
+            self.pierced_wall(origin, a, z, np.array(outward), openings)
+
+    def pierced_wall(
+        self, corner: ArrayLike, a: ArrayLike, height: float, outward: Array, openings: Sequence[Opening]
+    ) -> None:
+        """A wall on the edge `a` (3,) [m]; its openings have sills, lintels and jambs."""
+        origin, edge = np.asarray(corner, float), np.asarray(a, float)
+        self.parallelogram(origin, edge, [0, 0, height], openings)
+        along, depth = edge / np.linalg.norm(edge), self.rng.uniform(*WALL_THICKNESS) * outward
+        for x0, x1, y0, y1 in openings:
+            foot = origin + x0 * along
+            sill, lintel = self.seen_from_above(origin[2] + y0), self.seen_from_below(origin[2] + y1)
+            for level, seen in ((y0, sill if y0 else 0.0), (y1, lintel)):
+                if seen > 0.0:
+                    self.parallelogram(foot + [0, 0, level], (x1 - x0) * along, depth, seen=seen)
+            for at in (0.0, x1 - x0):
+                self.parallelogram(foot + at * along + [0, 0, y0], [0, 0, y1 - y0], depth)
+
+    def seen_from_above(self, height: float) -> float:
+        """The fraction [0, 1] of a level face's points that scanners above it see."""
+        return float(np.mean(1.0 - np.exp(-(self.eyes + self.ground - height).clip(0.0) / GRAZING)))
+
+    def seen_from_below(self, height: float) -> float:
+        """The fraction [0, 1] of a level face's points that scanners below it see."""
+        return float(np.mean(1.0 - np.exp(-(height - self.eyes - self.ground).clip(0.0) / GRAZING)))
 
     def furnish(self, low: ArrayLike, high: ArrayLike, num_pieces: int) -> None:
-        """Tables, shelves and boxes on the floor between two corners (3,)."""
+        """Tables, shelves and boxes on the floor between two corners (3,), cupboards hung at their sides."""
         first, last = np.asarray(low, float), np.asarray(high, float)
         for _ in range(num_pieces):
             at = self.rng.uniform(first + WALL_DISTANCE, last - WALL_DISTANCE)
@@ -103,8 +152,11 @@ class SurfaceSampler:
                 self.table(at, self.rng.uniform([0.8, 0.6, 0.7], [1.8, 0.9, 0.78]), yaw)
             elif kind < 0.5:
                 self.shelf(at, self.rng.uniform([0.7, 0.3, 1.0], [1.2, 0.45, 2.1]), yaw)
-            else:
+            elif kind < 0.9:
                 self.box(at, self.rng.uniform([0.3, 0.3, 0.3], [1.6, 0.8, 1.2]), yaw)
+            else:
+                hung = [at[0], self.rng.choice([first[1], last[1]]), at[2] + self.rng.uniform(1.3, 1.6)]
+                self.box(hung, self.rng.uniform([0.6, 0.5, 0.4], [1.8, 0.8, 0.8]))
 
     def table(self, at: ArrayLike, size: Array, yaw: float = 0.0) -> None:
         """A slab on four legs; `size` (3,) with its height."""
