@@ -4,7 +4,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from ..errors import InputError
 from ..geometry.pose import Array
@@ -48,6 +47,8 @@ def estimate_normals(points: NDArray[np.float32]) -> PointNormals:
 
     Raises InputError if the shape is not (N, 3), or a coordinate is not finite.
     """
+    from scipy.spatial import cKDTree  # noqa: PLC0415  # only who asks for up waits for it
+
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"points: the shape is {points.shape}, must be (N, 3)")
     if not np.isfinite(points).all():

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_closing, binary_dilation, distance_transform_edt, label
 
 from ..geometry.pose import Array
 from .planes import PointNormals, dot
@@ -120,6 +119,8 @@ def _passage_log_ratio(
 
     That is the mean, over the free area of a level, of the fraction that the piece has of the level's.
     """
+    from scipy.ndimage import binary_dilation, label  # noqa: PLC0415  # only who asks for up waits for it
+
     in_pieces, in_all = np.zeros(2), np.zeros(2)
     if grid is None:
         return 0.0
@@ -142,6 +143,8 @@ def _passage_log_ratio(
 
 def _closed(sheet: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """A sheet without the gaps between its points."""
+    from scipy.ndimage import binary_closing  # noqa: PLC0415  # only who asks for up waits for it
+
     closed = binary_closing(np.pad(sheet, 2 * REACH), iterations=REACH)
     return np.asarray(closed[2 * REACH : -2 * REACH, 2 * REACH : -2 * REACH])
 
@@ -177,6 +180,8 @@ def _has_headroom(
 
 def _round_holes(sheet: NDArray[np.bool_]) -> list[tuple[int, int, float]]:
     """Middles (cell, cell) and radii [cells] of the round holes of a sheet that surrounds them."""
+    from scipy.ndimage import distance_transform_edt  # noqa: PLC0415  # only who asks for up waits for it
+
     distances = distance_transform_edt(~np.pad(sheet, 1))[1:-1, 1:-1]
     holes: list[tuple[int, int, float]] = []
     low, high = HOLE_RADIUS[0] / CELL, HOLE_RADIUS[1] / CELL

@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ..cloud.settings import UpAxis
 from ..geometry.pose import Array
@@ -52,6 +51,8 @@ DOUBT_FACTOR = 0.6  # on the confidence, for each of these
 
 def candidate_axes(cloud: PointNormals) -> list[Array]:
     """Unit vectors (3,) that many flat points face, and those perpendicular to two such axes; either sign."""
+    from scipy.spatial import cKDTree  # noqa: PLC0415  # only who asks for up waits for it
+
     normals = cloud.normals[cloud.is_flat]
     k = np.arange(NUM_CELLS) + 0.5  # directions (NUM_CELLS, 3) evenly over the sphere, a Fibonacci spiral
     azimuth, z = k * np.pi * (3.0 - np.sqrt(5.0)), 1.0 - 2.0 * k / NUM_CELLS
