@@ -38,6 +38,7 @@ class DifferenceSteps:
 STEPS = (
     DifferenceSteps("full", math.radians(0.1), 0.005, 1.1),
     DifferenceSteps("fine", math.radians(0.3), 0.015, 0.36),
+    DifferenceSteps("middle", math.radians(0.3), 0.015, 1.0),  # of dark and noisy photos; too few to calibrate
 )
 
 
@@ -110,7 +111,7 @@ def covariance_of(hessian: Array, gradients: Array) -> Array | None:
 def covariance_at(query: Query, points: Cells, pose: Pose) -> Array | None:
     """Covariance (6, 6) [rad, m] in the camera's frame, by the image in which the pose is best determined.
 
-    Noise and stitching roughen the loss in the finest image; the next one is smoother.
+    Noise and stitching roughen the loss in the finest image; the next ones are smoother.
     """
     found = []
     for steps in STEPS:
