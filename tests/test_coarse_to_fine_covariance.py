@@ -122,20 +122,31 @@ def test_no_covariance_where_the_points_fix_no_pose(found, monkeypatch):
     assert covariance.estimate_covariance(found[0], found[1]) is None
 
 
-def test_where_the_finest_image_has_no_minimum_the_next_one_tells(found, monkeypatch):
+@pytest.mark.parametrize("num_rough", [1, 2, 3])
+def test_where_the_finest_images_have_no_minimum_the_next_one_tells(found, monkeypatch, num_rough):
     prepared, pose, _ = found
-    asked = []
+    images, asked = prepared.images, []
+    ways = list(
+        zip(
+            (images.full, images.fine, images.middle),
+            (*covariance.STEPS, covariance.ROUGH_STEPS),
+            strict=True,
+        )
+    )
 
     def hessian(image, points, pose, steps):
         asked.append((image, steps))
-        return np.diag([1.0] * 5 + [-1.0 if image is prepared.images.full else 1.0])
+        return np.diag([1.0] * 5 + [-1.0 if any(image is i for i, _ in ways[:num_rough]) else 1.0])
 
     gradients = np.random.default_rng(0).normal(size=(100, 6))
     monkeypatch.setattr(covariance, "hessian_at", hessian)
     monkeypatch.setattr(covariance, "block_gradients", lambda *_: gradients)
     matrix = covariance.covariance_at(prepared, _points(prepared, pose), pose)
-    assert asked == [(prepared.images.full, covariance.STEPS[0]), (prepared.images.fine, covariance.STEPS[1])]
-    np.testing.assert_allclose(matrix, covariance.STEPS[1].inflation * gradients.T @ gradients)
+    assert asked == ways[: 2 if num_rough == 1 else 3]
+    if num_rough == 3:
+        assert matrix is None
+    else:
+        np.testing.assert_allclose(matrix, ways[num_rough][1].inflation * gradients.T @ gradients)
 
 
 @pytest.mark.parametrize("kind", REPEATED_KINDS)

@@ -29,7 +29,7 @@ SCALE = FULL_LOSS * LEVELS_PER_UNIT
 class DifferenceSteps:
     """At what detail the loss is differentiated for a covariance."""
 
-    image: Literal["full", "fine"]  # of the query's
+    image: Literal["full", "fine", "middle"]  # of the query's
     turn: float  # step of the differences [rad]
     move: float  # [m]
     inflation: float  # so that 95 % of true poses lie in the 95 % region (tools/calibrate_confidence.py)
@@ -38,8 +38,10 @@ class DifferenceSteps:
 STEPS = (
     DifferenceSteps("full", math.radians(0.1), 0.005, 1.1),
     DifferenceSteps("fine", math.radians(0.3), 0.015, 0.36),
-    DifferenceSteps("middle", math.radians(0.3), 0.015, 1.0),  # of dark and noisy photos; too few to calibrate
 )
+ROUGH_STEPS = DifferenceSteps(
+    "middle", math.radians(0.3), 0.015, 1.0
+)  # of few dark, noisy photos; not calibrated
 
 
 def equations_at(image: Texels, points: Cells, R_cam_from_map: Array, shift: Array) -> tuple[Array, Array]:
@@ -111,16 +113,20 @@ def covariance_of(hessian: Array, gradients: Array) -> Array | None:
 def covariance_at(query: Query, points: Cells, pose: Pose) -> Array | None:
     """Covariance (6, 6) [rad, m] in the camera's frame, by the image in which the pose is best determined.
 
-    Noise and stitching roughen the loss in the finest image; the next ones are smoother.
+    Noise and stitching roughen the loss in the finest image; the next one is smoother. Where both are too
+    rough, a third tells.
     """
-    found = []
-    for steps in STEPS:
+
+    def by(steps: DifferenceSteps) -> Array | None:
         image: Texels = getattr(query.images, steps.image)
         hessian = hessian_at(image, points, pose, steps)
         covariance = covariance_of(hessian, block_gradients(image, points, pose))
-        if covariance is not None:
-            found.append(steps.inflation * covariance)
-    return min(found, key=lambda c: float(np.linalg.eigvalsh(c[3:, 3:])[-1]), default=None)
+        return covariance if covariance is None else steps.inflation * covariance
+
+    found = [covariance for steps in STEPS if (covariance := by(steps)) is not None]
+    if not found:
+        return by(ROUGH_STEPS)
+    return min(found, key=lambda c: float(np.linalg.eigvalsh(c[3:, 3:])[-1]))
 
 
 def estimate_covariance(query: Query, pose: Pose) -> PoseCovariance | None:
