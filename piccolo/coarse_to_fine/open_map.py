@@ -21,6 +21,8 @@ from ..runtime.cache import cache_root, in_words, mark_used, own_folder
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from .map_file import FORMAT, is_map_file, load_map, save_map
+from .named_scans import named
+from .scan_addition import add_scan
 from .scan_map import ScanMap, prepare_map
 from .settings import NOTHING_KNOWN, Prior
 
@@ -57,9 +59,7 @@ def open_map(
             raise InputError(f"{map_path}: found a prepared map, wanted it alone, without options for clouds")
         with watch.stage("read"):
             scan_map = load_map(map_path, cache.is_used)
-        if scan_map.has_labels != (cloud_settings.labels is not None):
-            kind = "labels, wanted --labels too" if scan_map.has_labels else "colours, wanted no --labels"
-            raise InputError(f"{map_path}: found a prepared map of {kind}")
+        check_labels(map_path, scan_map, cloud_settings)
         return scan_map
 
     digest = ""
@@ -82,6 +82,42 @@ def open_map(
         return scan_map
     workers.warn(warning)
     return replace(scan_map, warnings=(*scan_map.warnings, warning))
+
+
+def extended_map(
+    map_path: Path,
+    paths: Sequence[Path],
+    cloud_settings: CloudSettings,
+    name: str,
+    workers: Workers,
+    watch: Stopwatch,
+) -> ScanMap:
+    """A prepared map with the scan of some files put in under a name; a map without names gets its file's."""
+    if not prepared_map_among([map_path]):
+        raise InputError(f"{map_path}: found no prepared map, wanted one by tools/prepare_map.py")
+    if path := prepared_map_among(paths):
+        raise InputError(f"{path}: found a prepared map, wanted the files of a scan to add")
+    if cloud_settings.up != "auto":
+        raise InputError("--up: found beside --add, wanted without; a scan is added in the map's axes")
+    with watch.stage("read"):
+        old = load_map(map_path)
+        cloud = open_cloud(paths, cloud_settings, workers.show)
+        digest = sha256_of_files(paths)
+        crs = crs_of(paths)
+    check_labels(map_path, old, cloud_settings)
+    if crs and old.crs and crs != old.crs:
+        workers.warn(f"{paths[0]}: names another coordinate system than the map, whose is taken for both")
+    old = old if old.scan_names else named(old, map_path.stem)
+    both = "\n".join(sorted([old.scan_sha256, digest]))
+    added = add_scan(old, cloud, name, workers, watch)
+    return replace(added, scan_sha256=hashlib.sha256(both.encode()).hexdigest(), crs=old.crs or crs)
+
+
+def check_labels(map_path: Path, scan_map: ScanMap, cloud_settings: CloudSettings) -> None:
+    """Refuse a map of labels where colours are asked for, and the other way round."""
+    if scan_map.has_labels != (cloud_settings.labels is not None):
+        kind = "labels, wanted --labels too" if scan_map.has_labels else "colours, wanted no --labels"
+        raise InputError(f"{map_path}: found a prepared map of {kind}")
 
 
 def prepared_map_among(paths: Sequence[Path]) -> Path | None:

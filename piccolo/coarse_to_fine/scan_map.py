@@ -19,7 +19,7 @@ from ..local_features.view_positions import view_positions
 from ..runtime.memory import check_memory
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
-from .camera_positions import BLOCK, COARSE_SPACING, TooManyPositionsError, candidate_centers
+from .camera_positions import BLOCK, COARSE_SPACING, Ball, TooManyPositionsError, candidate_centers
 from .settings import NOTHING_KNOWN, Prior
 from .view import ViewConfig, render_block, thread_scratch
 
@@ -41,15 +41,18 @@ class ScanMap:
     offset_unit: NDArray[np.float32]  # (candidates,) [m]
     features: NDArray[np.int8]  # (candidates, 3, cells) channels in levels, 0 where nothing is seen
     is_seen: NDArray[np.bool_]  # (candidates, cells)
+    scan_of_candidate: NDArray[np.uint16]  # (candidates,) index of its name in scan_names
     sparse: NDArray[np.int64]  # candidates of which no two share a cell of the coarse grid
     wide_features: NDArray[np.int8]  # (sparse, 3 * wide cells) means over wider cells, for SO(3)
     wide_seen: NDArray[np.uint8]  # (sparse, wide cells) fraction seen of each, 255 for all
     local_features: FeatureMap
     has_labels: bool = False  # colours are those of labels
+    scan_names: tuple[str, ...] = ()  # of the scans put together; none if none was named
     warnings: tuple[str, ...] = ()
     scan_sha256: str = ""  # of the files or arrays that it was made from, in hexadecimal digits
     crs: str = ""  # coordinate system that the scan's file names, as WKT or EPSG:code; empty if none
     is_partial: bool = False  # of a scan too large as a whole: candidates where a prior asks; not in files
+    whole: "ScanMap | None" = None  # with all candidates, of a map narrowed by a prior; not in files
 
     @cached_property
     def points(self) -> PackedPoints:
@@ -96,6 +99,13 @@ def render_candidates(
 
     list(workers.map(run, range(0, len(centers), BLOCK), "render views"))
     return offsets, unit, levels, is_seen
+
+
+def ranges_of(
+    offsets: NDArray[np.int16], unit: NDArray[np.float32], is_seen: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """How far away (N, cells) [m] is what views show, as ScanMap holds them; 0 where nothing is seen."""
+    return np.asarray(np.linalg.norm(offsets.astype(np.float32), axis=1) * unit[:, None] * is_seen)
 
 
 def sparse_candidates(centers: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -178,7 +188,7 @@ def candidates_of(
         if prior.near_world is None or prior.radius is None:
             raise
     near = aligned.R_map_from_world @ (np.array(prior.near_world) - aligned.origin_world)
-    centers = candidate_centers(aligned.octree, workers, (near, prior.radius))
+    centers = candidate_centers(aligned.octree, workers, Ball(near, prior.radius))
     text = (
         f"the scan is too large as a whole: prepared within {prior.radius:g} m of --near, for this run only"
     )
@@ -209,8 +219,7 @@ def prepare_map(
         offsets, unit, levels, is_seen = render_candidates(octree, centers, view, workers)
         sparse = sparse_candidates(centers)
         wide_features, wide_seen = widen(levels, is_seen, sparse)
-        ranges = np.linalg.norm(offsets.astype(np.float32), axis=1) * unit[:, None] * is_seen
-        chosen = view_positions(centers, ranges, view.num_rings)
+        chosen = view_positions(centers, ranges_of(offsets, unit, is_seen), view.num_rings)
         local_features = make_feature_map(octree, centers[chosen], workers)
     return ScanMap(
         octree=octree,
@@ -221,6 +230,7 @@ def prepare_map(
         offset_unit=unit,
         features=levels,
         is_seen=is_seen,
+        scan_of_candidate=np.zeros(len(centers), np.uint16),
         sparse=sparse,
         wide_features=wide_features,
         wide_seen=wide_seen,
