@@ -8,6 +8,7 @@ from ..coarse_to_fine.named_scans import check_name, named
 from ..coarse_to_fine.open_map import CachePolicy, extended_map, open_map
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers, num_cores
+from ..runtime.unfinished import Unfinished
 from .command import command, option
 from .errors import checking_options
 from .options import add_cloud_options, cloud_settings_from
@@ -51,7 +52,8 @@ def main(arguments: argparse.Namespace) -> int:
     name = arguments.cloud[0].stem if arguments.name is None else arguments.name
     check_name(name, ())
     watch = Stopwatch()
-    workers = Workers(num_cores(), progress_bar(arguments.quiet), warn_once(arguments.quiet))
+    show, warn, work = progress_bar(arguments.quiet), warn_once(arguments.quiet), Unfinished()
+    workers = Workers(num_cores(), show, warn, work)
     if arguments.add:
         scan_map = extended_map(arguments.add, arguments.cloud, cloud_settings, name, workers, watch)
     else:
@@ -59,6 +61,7 @@ def main(arguments: argparse.Namespace) -> int:
         if arguments.name is not None or not scan_map.scan_names:  # a map keeps its names
             scan_map = named(scan_map, name)
     save_map(scan_map, arguments.out)
+    work.finish()
     seconds = {stage: round(seconds, 3) for stage, seconds in watch.seconds.items()}
     counts = {"points": len(scan_map.points), "candidates": len(scan_map.centers)}
     warnings = list(scan_map.warnings)

@@ -115,16 +115,16 @@ def supported_cells(surfaces: NDArray[np.float32], within: Ball | Box | None = N
 
 def coverage(octree: Octree, centers: NDArray[np.floating[Any]], workers: Workers) -> NDArray[np.float32]:
     """Fraction of the sphere (N,) around each centre (N, 3) that is not empty, seen at a low resolution."""
-    fraction = np.empty(len(centers), np.float32)
     view = FREE_SPACE_VIEW.arrays
 
-    def glance(lo: int) -> None:
-        part = slice(lo, lo + BLOCK)
-        voxels = FREE_SPACE_VIEW.voxel_per_range
-        filled_fractions(octree, centers[part], voxels, view, thread_scratch(), fraction[part])
+    def glance(lo: int) -> tuple[NDArray[np.float32]]:
+        some = centers[lo : lo + BLOCK]
+        fraction = np.empty(len(some), np.float32)
+        filled_fractions(octree, some, FREE_SPACE_VIEW.voxel_per_range, view, thread_scratch(), fraction)
+        return (fraction,)
 
-    list(workers.map(glance, range(0, len(centers), BLOCK), "find free space"))
-    return fraction
+    parts = workers.collect(glance, range(0, len(centers), BLOCK), "find free space", centers)
+    return np.concatenate([np.empty(0, np.float32), *(fraction for (fraction,) in parts)])
 
 
 def warn_if_long(octree: Octree, centers: NDArray[np.floating[Any]], workers: Workers) -> None:

@@ -21,7 +21,16 @@ from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from .camera_positions import CLEARANCE_VOXEL, MIN_CLEARANCE, Box, candidate_centers
 from .named_scans import check_name
-from .scan_map import SEARCH_VIEW, ScanMap, Voxelized, ranges_of, render_candidates, sparse_candidates, widen
+from .scan_map import (
+    SEARCH_VIEW,
+    ScanMap,
+    Views,
+    Voxelized,
+    ranges_of,
+    render_candidates,
+    sparse_candidates,
+    widen,
+)
 
 REACH = 3.0  # [m] beside the new scan there may be new places for a camera
 NEARER = 0.9  # of two scans the one in front is nearer by this
@@ -29,7 +38,6 @@ LEAST_CHANGED = 0.01  # fraction of the sphere in which a view shows the new sca
 FAR_APART = 500.0  # [m] between scans that perhaps have no common coordinates
 COARSE_VOXEL = 2.56  # [m]
 ROWS = 8192  # views compared at a time
-Views = tuple[NDArray[np.int16], NDArray[np.float32], NDArray[np.int8], NDArray[np.bool_]]
 
 
 class Candidates(NamedTuple):
@@ -109,7 +117,7 @@ def joined_candidates(old: ScanMap, new: Octree, octree: Octree, workers: Worker
     gap, _ = cKDTree(old.centers).query(positions)
     more = positions[box.holds(positions) & (gap > 0.0)]
     in_front, behind = fractions_in_front(old, new, rows, workers)
-    views = render_candidates(old.octree, more, SEARCH_VIEW, workers)
+    views = render_candidates(old.octree, more, SEARCH_VIEW, workers, "look around")
     of_more = compared(new, more, ranges_of(*views[:2], views[3]), workers)
     is_changed = np.concatenate([in_front > LEAST_CHANGED, np.ones(len(more), np.bool_)])
     is_new = np.concatenate([in_front > behind, of_more[0] > of_more[1]])
@@ -136,7 +144,7 @@ def compared(
 
     Of the others ranges (N, cells) [m] are known, 0 where nothing is seen.
     """
-    offsets, unit, _, is_seen = render_candidates(new, centers, SEARCH_VIEW, workers)
+    offsets, unit, _, is_seen = render_candidates(new, centers, SEARCH_VIEW, workers, "compare views")
     ranges_new = np.where(is_seen, ranges_of(offsets, unit, is_seen), np.inf)
     ranges_old = np.where(ranges > 0.0, ranges, np.inf)
     area = make_grid(SEARCH_VIEW.num_rings).solid_angle.astype(np.float64)
