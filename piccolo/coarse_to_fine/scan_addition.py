@@ -34,7 +34,9 @@ from .scan_map import (
 
 REACH = 3.0  # [m] beside the new scan there may be new places for a camera
 NEARER = 0.9  # of two scans the one in front is nearer by this
-LEAST_CHANGED = 0.01  # fraction of the sphere in which a view shows the new scan, else it stays
+# Fractions of the sphere in which a view shows the new scan, else it stays, or its features do: what they
+# miss, new views have from nearer.
+LEAST_CHANGED, LEAST_FOR_FEATURES = 0.01, 0.1
 FAR_APART = 500.0  # [m] between scans that perhaps have no common coordinates
 COARSE_VOXEL = 2.56  # [m]
 ROWS = 8192  # views compared at a time
@@ -45,13 +47,13 @@ class Candidates(NamedTuple):
 
     rows: NDArray[np.int64]  # (S,) of the map's candidates, those that stay
     centers: NDArray[np.float64]  # (N, 3) [m]
-    is_changed: NDArray[np.bool_]  # (N,) the view is to be made anew
+    fraction: Array  # (N,) of the sphere in which the new scan is in front; of new ones 1
     is_new: NDArray[np.bool_]  # (N,) more of the sphere shows the new scan in front than the others
 
     @property
     def changed(self) -> NDArray[np.int64]:
         """Indices of those whose views are to be made anew."""
-        return np.flatnonzero(self.is_changed)
+        return np.flatnonzero(self.fraction > LEAST_CHANGED)
 
 
 def add_scan(old: ScanMap, cloud: Voxelized, name: str, workers: Workers, watch: Stopwatch) -> ScanMap:
@@ -119,9 +121,9 @@ def joined_candidates(old: ScanMap, new: Octree, octree: Octree, workers: Worker
     in_front, behind = fractions_in_front(old, new, rows, workers)
     views = render_candidates(old.octree, more, SEARCH_VIEW, workers, "look around")
     of_more = compared(new, more, ranges_of(*views[:2], views[3]), workers)
-    is_changed = np.concatenate([in_front > LEAST_CHANGED, np.ones(len(more), np.bool_)])
-    is_new = np.concatenate([in_front > behind, of_more[0] > of_more[1]])
-    return Candidates(rows, np.concatenate([old.centers[rows], more]), is_changed, is_changed & is_new)
+    fraction = np.concatenate([in_front, np.ones(len(more))])
+    is_new = np.concatenate([in_front > behind, of_more[0] > of_more[1]]) & (fraction > LEAST_CHANGED)
+    return Candidates(rows, np.concatenate([old.centers[rows], more]), fraction, is_new)
 
 
 def fractions_in_front(
@@ -188,7 +190,7 @@ def joined_features(
     gap, place = cKDTree(found.centers).query(view_centers)
     has_place = gap == 0.0  # it is that of a candidate which stays
     is_kept = has_place.copy()
-    is_kept[has_place] = ~found.is_changed[place[has_place]]
+    is_kept[has_place] = found.fraction[place[has_place]] <= LEAST_FOR_FEATURES
     looked_at = np.concatenate([place[has_place], found.changed])
     offsets, unit, _, is_seen = (values[looked_at] for values in views)
     ranges = ranges_of(offsets, unit, is_seen)
