@@ -13,6 +13,7 @@ from .cloud import open_cloud
 from .cloud.digest import sha256_of_files
 from .cloud.settings import METRES, CloudSettings, UpAxis
 from .cloud.stream import ARRAYS, CloudStream, stream_of_arrays
+from .coarse_to_fine.named_scans import check_within
 from .coarse_to_fine.open_map import CachePolicy, open_map, prepared_map_among
 from .coarse_to_fine.scan_map import ScanMap, prepare_map
 from .coarse_to_fine.settings import CoarseToFineSettings
@@ -107,6 +108,7 @@ def open_files(
     if isinstance(settings, CoarseToFineSettings):
         up = cloud_settings.up if prepared_map_among(paths) else up_axis(cloud_settings, settings)
         scan_map = open_map(paths, replace(cloud_settings, up=up), cache, workers, watch, settings.prior)
+        check_within(scan_map, settings.prior.within)
         return Scan(scan_map, name, cloud_settings, settings, workers, watch.seconds)
     if map_path := prepared_map_among(paths):
         raise InputError(f"{map_path}: a prepared map; the preset paper needs the cloud itself")

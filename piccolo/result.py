@@ -24,7 +24,7 @@ from .geometry.pose import Pose, T_world_from_cam, checked_rotation, quaternion_
 from .geometry.sphere import CONVENTION
 from .runtime.json_file import document_of, parse_lines, read_bytes
 
-FORMAT = "piccolo-pose/5"
+FORMAT = "piccolo-pose/6"
 UNREADABLE = "unreadable"
 POSE_FIELDS = ("R_cam_from_world", "center_world", "quaternion_wxyz", "T_world_from_cam")
 MAX_ROTATION_ERROR = 1e-6  # of R R^T from the identity, in a file
@@ -67,6 +67,7 @@ class Result:
     error: str | None = None  # why a photo is "unreadable"
     gps_prior: GpsPrior | None = None  # where the photo's GPS position lies in the scan, if both are known
     cameras: tuple[Mount, ...] = ()  # that took it; none if it came as a sphere or a part of one
+    scan: str | None = None  # name of the scan in which the best pose lies, of a map that names its scans
     probability_none: float | None = None  # that neither the pose nor an alternative is right, if known
 
     @property
@@ -98,7 +99,8 @@ class Result:
         x, y, z = self.best_pose.center_world
         total = sum(self.seconds.values())
         where = "at" if self.pose else "with the best guess"
-        lines = [f"{self.pano}: {self.status} {where} ({x:.3f}, {y:.3f}, {z:.3f}) m in {total:.1f} s"]
+        place = f"({x:.3f}, {y:.3f}, {z:.3f}) m{_in(self.scan)}"
+        lines = [f"{self.pano}: {self.status} {where} {place} in {total:.1f} s"]
         if self.evidence is not None:
             e = self.evidence
             lines.append(
@@ -130,6 +132,7 @@ class Result:
             **asdict(self.source),
             **(_pose_json(self.pose) or dict.fromkeys(POSE_FIELDS)),
             "best_guess": _pose_json(self.best_guess),
+            "scan": self.scan,
             "loss": self.loss,
             "evidence": self.evidence and asdict(self.evidence),
             "alternatives": [_alternative_json(alternative) for alternative in self.alternatives],
@@ -178,7 +181,17 @@ def unreadable_result(error: str, cloud: str | tuple[str, ...], pano: str, **mor
     return Result(UNREADABLE, 0.0, cloud, pano, None, None, None, (), None, {}, error=error, **more)
 
 
-_PLAIN_FIELDS = ("status", "confidence", "probability_none", "pano", "loss", "seconds", "settings", "error")
+_PLAIN_FIELDS = (
+    "status",
+    "confidence",
+    "probability_none",
+    "pano",
+    "scan",
+    "loss",
+    "seconds",
+    "settings",
+    "error",
+)
 
 
 def _rotation_and_center(pose: Pose) -> dict[str, object]:
@@ -231,7 +244,11 @@ def _place(alternative: Alternative) -> str:
     x, y, z = alternative.pose.center_world
     p = alternative.probability
     sure = f"score {alternative.score:.2f}" if p is None else f"probability {p:.2f}"
-    return f"({x:.3f}, {y:.3f}, {z:.3f}) m, {sure}"
+    return f"({x:.3f}, {y:.3f}, {z:.3f}) m{_in(alternative.scan)}, {sure}"
+
+
+def _in(scan: str | None) -> str:
+    return f" ({scan})" if scan else ""
 
 
 def _paths(value: object) -> tuple[str, ...]:
@@ -261,7 +278,8 @@ def read_results(paths: Sequence[Path]) -> list[Result]:
 def _checked_result(text: str) -> Result:
     """A result of one line; refused are names and numbers that can't be written, and a pose that is none."""
     result = Result.from_json(text)
-    for label, value in (("status", result.status), ("cloud", result.cloud_name), ("pano", result.pano)):
+    texts = {"status": result.status, "cloud": result.cloud_name, "pano": result.pano}
+    for label, value in {**texts, "scan": result.scan or ""}.items():
         if not isinstance(value, str) or UNWRITABLE.search(value):
             raise InputError(f"result: found {label} {value!r}, wanted text on one line")
     values = [result.confidence, *([result.evidence.score] if result.evidence else [])]

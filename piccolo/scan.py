@@ -16,6 +16,7 @@ from .cloud.soa import PackedPoints
 from .coarse_to_fine.focal_refinement import localize_and_refine_focal
 from .coarse_to_fine.gps import GpsPrior, gps_prior
 from .coarse_to_fine.localize import localize
+from .coarse_to_fine.named_scans import check_within, with_scans
 from .coarse_to_fine.scan_map import ScanMap
 from .coarse_to_fine.settings import CoarseToFineSettings, Prior
 from .confidence.confidence import LOCALIZED
@@ -61,6 +62,7 @@ class QueryOptions(TypedDict, total=False):
     height: tuple[float, float]  # [m] least and most above the floor
     heading_deg: float  # of the image centre, clockwise from the cloud's +y
     heading_tolerance_deg: float
+    within: tuple[str, ...]  # names of the map's scans that the camera may be in
     min_confidence: float  # below it a pose is not called localized
 
 
@@ -135,8 +137,10 @@ class Scan:
         elif "mask" in given:
             given["mask"] = Path(given["mask"])
         prior = {k: given.pop(k) for k in PRIOR_FIELDS & given.keys()}
+        if isinstance(prior.get("within"), str):
+            raise InputError(f"within: found the text {prior['within']!r}, wanted a list of names")
         if prior:
-            given["prior"] = Prior(**prior)
+            given["prior"] = Prior(**prior | {"within": tuple(prior.get("within", ()))})
         if "camera" in given and "rig" in given:
             raise InputError("camera, rig: wanted only one of them")
         if "camera" in given:
@@ -189,7 +193,9 @@ class Scan:
         if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
             gps = self.gps_prior_of(photo, settings) if read_options.use_gps else None
             by = localize_and_refine_focal if read_options.refine_focal else localize
+            check_within(self.prepared, settings.prior.within)
             found, gps = self._localized(by, self.prepared, picture, settings, gps, watch)
+            found = with_scans(self.prepared, found)
         elif isinstance(self.prepared, PaperMap) and isinstance(settings, PaperSettings):
             if read_options.refine_focal:
                 raise InputError("--refine-focal: not an option of the preset paper")

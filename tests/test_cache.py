@@ -22,6 +22,7 @@ from piccolo.coarse_to_fine.map_file import save_map
 from piccolo.coarse_to_fine.open_map import CachePolicy
 from piccolo.errors import InputError
 from piccolo.runtime import cache, file_facts, kernel_cache
+from piccolo.runtime.atomic import replacing
 from piccolo.runtime.jit import kernel
 from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers
@@ -121,6 +122,19 @@ def _full(*_):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
+@pytest.mark.parametrize("ending", ["kernel", "fact", "piccolo-map"])
+def test_what_a_killed_process_was_writing_has_a_name_of_ours(tmp_path, ending):
+    name = cache.own_names(ending)
+    with replacing(tmp_path / f"{32 * 'c'}.{ending}") as file:
+        file.write(b"whole")
+        (begun,) = tmp_path.iterdir()
+    (whole,) = tmp_path.iterdir()
+    for path in (begun, whole):
+        assert name.fullmatch(path.name)
+        assert not name.fullmatch(path.name[1:])
+        assert not name.fullmatch(f"{path.name}~")
+
+
 def test_only_stale_files_of_ours_go_and_only_from_a_folder_that_is_marked(tmp_path):
     """Not the user's own, not a link, not a fresh one; what a killed process was writing goes too."""
     folder, key = tmp_path / "new", 32 * "0"
@@ -129,7 +143,7 @@ def test_only_stale_files_of_ours_go_and_only_from_a_folder_that_is_marked(tmp_p
     assert tag.startswith(b"Signature: 8a477f597d28d172789f06886806bc55\n")
     names = [
         f"{key}.kernel",
-        f".{key}.kernel.a_1b2c3d",
+        f".{key}.kernel.{16 * 'a'}",
         f"{key[1:]}.kernel",
         "a.txt",
         "1" + f"{key[1:]}.kernel",

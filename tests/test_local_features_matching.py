@@ -149,7 +149,7 @@ def test_same_bits_for_any_number_of_threads_and_none_where_nothing_is():
         np.testing.assert_array_equal(own, other)
     assert len(one.points) > 300
     nothing = make_feature_map(octree, np.empty((0, 3)), Workers())
-    assert [len(values) for values in nothing] == [0, 0, 0, 0, 0, 128, 128, 1, 2]
+    assert [len(values) for values in nothing] == [0, 0, 0, 0, 0, 0, 0, 128, 128, 1, 2]
     gray = octree._replace(nodes=np.where(np.arange(6) < 3, octree.nodes, np.float32(128 / 255)))
     flat = make_feature_map(gray, _centers(), Workers())
     assert len(flat.points) < 5  # at the edges of what was scanned

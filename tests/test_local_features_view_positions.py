@@ -37,6 +37,17 @@ def test_what_is_near_and_seen_needs_no_position():
     assert len(view_positions(np.empty((0, 3)), _open(0), RINGS)) == 0
 
 
+def test_known_positions_spare_others_and_are_not_named_again():
+    rng = np.random.default_rng(4)
+    centers = rng.uniform([0, 0, 0], [9, 7, 3], (120, 3))
+    alone = view_positions(centers, _open(120), RINGS)
+    known = np.concatenate([centers[alone[:4]], centers])
+    more = view_positions(known, _open(124), RINGS, 4)
+    assert more.min() >= 4
+    assert (more - 4).tolist() == alone[4:].tolist()
+    assert len(view_positions(np.concatenate([centers[alone], centers]), _open(200), RINGS, len(alone))) == 0
+
+
 def test_positions_a_metre_above_the_lowest_come_first():
     centers = np.array([[1.0, 1, 0.3], [1.0, 1, 1.3], [1.0, 1, 2.3]])
     assert view_positions(centers, _open(3), RINGS).tolist() == [1]

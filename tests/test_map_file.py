@@ -31,8 +31,11 @@ def built(tmp_path_factory):
 
 @pytest.fixture
 def arrays(built):
+    """Those of a map of two scans."""
     with np.load(built) as archive:
-        return dict(archive)
+        arrays = dict(archive)
+    scans = (np.arange(len(arrays["centers"])) % 2).astype(np.uint16)
+    return arrays | {"scan_names": np.array(["A", "B"]), "scan_of_candidate": scans}
 
 
 def _save(path, arrays):
@@ -148,6 +151,18 @@ DAMAGE = {  # member, what is done to it, the words of the refusal
     "a list after the end": ("local_list_start", _changed(-1, 2**31 - 1), "lists of features that do not"),
     "a list before the start": ("local_list_start", _changed(0, -1), "lists of features that do not"),
     "lists that overlap": ("local_list_start", _changed(2, 2**30), "lists of features that do not"),
+    "another view": ("local_views", _changed(0, 60_000), "a feature of view 60000 of"),
+    "a view nowhere": ("local_view_centers", _changed((0, 2), np.nan), "a view at no finite place"),
+    "a view less": ("local_view_centers", lambda a: a[:0], "a feature of view .* of 0"),
+    "another scan": ("scan_of_candidate", _changed(3, 2), "a candidate in scan 2 of 2"),
+    "scans of too few": ("scan_of_candidate", lambda a: a[1:], "scan_of_candidate of type uint16 and shape"),
+    "no names": ("scan_names", lambda a: np.arange(2), "scan_names of type int64"),
+    "a name": ("scan_names", lambda a: np.array("A"), "scan_names of type <U1 and shape"),
+    "many names": ("scan_names", lambda a: np.arange(1001).astype(str), "scan_names of type <U"),
+    "an empty name": ("scan_names", lambda a: np.array(["A", ""]), "names of scans that are none"),
+    "a name of two lines": ("scan_names", lambda a: np.array(["A", "B\nC"]), "names of scans that are none"),
+    "a long name": ("scan_names", lambda a: np.array(["A", "B" * 101]), "names of scans that are none"),
+    "a name twice": ("scan_names", lambda a: np.array(["A", "A"]), "twice the same"),
     "no digest": ("scan_sha256", lambda a: np.array("G" * 64), "a scan_sha256 that is no digest"),
     "no text": ("scan_sha256", lambda a: np.full(64, 2**32 - 1, "u4").view("<U64")[0], "that is no digest"),
     "short digest": ("scan_sha256", lambda a: np.array("0"), "scan_sha256 of type <U1"),

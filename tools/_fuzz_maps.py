@@ -27,6 +27,7 @@ from piccolo.coarse_to_fine.localize import localize
 from piccolo.coarse_to_fine.map_file import ARRAYS, load_map, save_map
 from piccolo.coarse_to_fine.open_map import FOLDER, cached_map
 from piccolo.coarse_to_fine.prior import apply_prior
+from piccolo.coarse_to_fine.scan_addition import add_scan
 from piccolo.coarse_to_fine.scan_map import ScanMap, prepare_map, sparse_candidates, widen
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings, Prior
 from piccolo.errors import InputError
@@ -40,9 +41,10 @@ from piccolo.scenes.synthetic.world import make_query, make_world, scan_world
 
 ROOM_SIZE, SHIFT, NEAR = np.array([2.4, 2.2, 2.2]), np.array([320.0, -150.0, 7.0]), 0.3  # [m]
 QUICK = METHOD._replace(beam=Beam(32, 8, 3, 1), min_starts=48)
-SETTINGS, WORKERS, SHA256 = CoarseToFineSettings(gravity="known", num_yaws=24), Workers(1), 64 * "0"
+NAMES, WORKERS, SHA256 = ("A", "B"), Workers(1), 64 * "0"
+SETTINGS = CoarseToFineSettings(gravity="known", num_yaws=24, prior=Prior(within=NAMES[:1]))
 HANG_S, MEMORY_KB = 10.0, 2 << 20  # of processor time, at most, for one; of memory for all
-LOCALIZED_FRACTION = 0.1  # of the maps that are read
+LOCALIZED_FRACTION, ADDED_FRACTION = 0.1, 0.05  # of the maps that are read
 Trial = Callable[[np.random.Generator], str]
 
 
@@ -57,6 +59,8 @@ def small_map() -> tuple[ScanMap, Panorama, Pose]:
     sparse = sparse_candidates(near.centers)
     wide_features, wide_seen = widen(near.features, near.is_seen, sparse)
     small = replace(near, sparse=sparse, wide_features=wide_features, wide_seen=wide_seen, scan_sha256=SHA256)
+    scans = (np.arange(len(small.centers)) == len(small.centers) - 1).astype(np.uint16)
+    small = replace(small, scan_names=NAMES, scan_of_candidate=scans, whole=None)
     return small, Panorama(query.rgb, np.ones(query.rgb.shape[:2], np.bool_)), pose
 
 
@@ -132,6 +136,26 @@ def status_in(scan_map: ScanMap, panorama: Panorama, pose: Pose) -> str:
     return result.status
 
 
+def added_to(scan_map: ScanMap) -> str:
+    """Whether a scan of points here and there could be put into a map, which must stay one."""
+    rng = np.random.default_rng(1)
+    points, colors = (
+        rng.uniform(-2.0, 2.0, (1500, 3)) + SHIFT,
+        rng.integers(256, size=(1500, 3), dtype=np.uint8),
+    )
+    try:
+        with np.errstate(all="ignore"):
+            added = add_scan(scan_map, stream_of_arrays(points, colors), "C", WORKERS, Stopwatch())
+    except InputError as error:
+        if "\n" in str(error):
+            raise RuntimeError(f"more than a line: {error}") from error
+        return "nothing added"
+    with tempfile.TemporaryDirectory() as folder:
+        save_map(added, Path(folder) / "added.map")
+        load_map(Path(folder) / "added.map")
+    return "added to"
+
+
 def trial_of_maps(folder: Path) -> Trial:
     """Mutates arrays of a map, writes it with right checksums, reads it, and localizes in what is read."""
     scan_map, panorama, pose = small_map()
@@ -157,9 +181,9 @@ def trial_of_maps(folder: Path) -> Trial:
             if "\n" in str(error) or not str(error).startswith(f"{path}: "):
                 raise RuntimeError(f"no line that names the file: {error}") from error
             return "refused"
-        if rng.random() > LOCALIZED_FRACTION:
-            return "read"
-        return f"read and {status_in(found, panorama, pose)}"
+        if rng.random() < ADDED_FRACTION:
+            return f"read and {added_to(found)}"
+        return f"read and {status_in(found, panorama, pose)}" if rng.random() < LOCALIZED_FRACTION else "read"
 
     return run
 

@@ -56,7 +56,7 @@ PAPER_ONLY: tuple[Option, ...] = (
     ("--no-visibility", None, bool, "see through walls"),
 )
 PAPER_OPTIONS = (NUM_ROTATIONS, *PAPER_ONLY)
-PRIORS = ("near", "radius", "height", "heading", "heading_tolerance")
+PRIORS = ("near", "radius", "height", "heading", "heading_tolerance", "within")
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -250,6 +250,8 @@ def add_prior_options(parser: argparse.ArgumentParser) -> None:
     text = "of the image centre, clockwise from the cloud's +y"
     group.add_argument("--heading", type=float, metavar="DEG", help=text)
     group.add_argument("--heading-tolerance", type=float, metavar="DEG", help="(default 20)")
+    text = "only in these scans of a map that tools/prepare_map.py --add has put together"
+    group.add_argument("--within", nargs="+", metavar="NAME", help=text)
 
 
 def settings_from(arguments: argparse.Namespace) -> CoarseToFineSettings | PaperSettings:
@@ -273,6 +275,7 @@ def settings_from(arguments: argparse.Namespace) -> CoarseToFineSettings | Paper
         height=tuple(given["height"]) if "height" in given else None,
         heading_deg=given.get("heading"),
         heading_tolerance_deg=given.get("heading_tolerance", Prior.heading_tolerance_deg),
+        within=tuple(given.get("within", ())),
     )
     own = {name: given[name] for option, *_ in DEFAULT_OPTIONS if (name := setting_of(option)) in given}
     return CoarseToFineSettings(prior=prior, **shared, **own)

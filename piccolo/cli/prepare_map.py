@@ -4,9 +4,11 @@ import argparse
 import json
 
 from ..coarse_to_fine.map_file import save_map
-from ..coarse_to_fine.open_map import CachePolicy, open_map
+from ..coarse_to_fine.named_scans import check_name, named
+from ..coarse_to_fine.open_map import CachePolicy, extended_map, open_map
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers, num_cores
+from ..runtime.unfinished import Unfinished
 from .command import command, option
 from .errors import checking_options
 from .options import add_cloud_options, cloud_settings_from
@@ -17,6 +19,9 @@ EPILOG = """\
 example:
   python tools/prepare_map.py --cloud scan.ply --out scan.map
   python localize.py --cloud scan.map --pano query.jpg
+  python tools/prepare_map.py --cloud 1.ply --name "Storey 1" --out house.map
+  python tools/prepare_map.py --add house.map --cloud 2.e57 --name "Storey 2" --out house.map
+  python localize.py --cloud house.map --pano query.jpg --within "Storey 2"
 
 localize.py prepares and caches a map by itself; this tool is for maps that are copied, or made beforehand.
 One JSON object on stdout describes the map.
@@ -26,6 +31,14 @@ One JSON object on stdout describes the map.
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
     add_cloud_options(parser, "coloured scan, as for localize.py")
+    text = (
+        "put the scan into this map, whose coordinates it has; without what it changes, nothing is made anew"
+    )
+    option(parser, "--add FILE", text)
+    text = (
+        "of the scan: building, storey, room; for results and localize.py --within (default the file's stem)"
+    )
+    option(parser, "--name NAME", text)
     option(parser, "--out FILE", "the map; - is stdout", required=True)
 
 
@@ -36,13 +49,28 @@ def main(arguments: argparse.Namespace) -> int:
         cloud_settings = cloud_settings_from(arguments)
     outputs = {"--out": arguments.out}
     check_outputs(outputs, arguments.cloud)
+    name = arguments.cloud[0].stem if arguments.name is None else arguments.name
+    check_name(name, ())
     watch = Stopwatch()
-    workers = Workers(num_cores(), progress_bar(arguments.quiet), warn_once(arguments.quiet))
-    scan_map = open_map(arguments.cloud, cloud_settings, CachePolicy(is_used=False), workers, watch)
+    show, warn, work = progress_bar(arguments.quiet), warn_once(arguments.quiet), Unfinished()
+    workers = Workers(num_cores(), show, warn, work)
+    if arguments.add:
+        scan_map = extended_map(arguments.add, arguments.cloud, cloud_settings, name, workers, watch)
+    else:
+        scan_map = open_map(arguments.cloud, cloud_settings, CachePolicy(is_used=False), workers, watch)
+        if arguments.name is not None or not scan_map.scan_names:  # a map keeps its names
+            scan_map = named(scan_map, name)
     save_map(scan_map, arguments.out)
+    work.finish()
     seconds = {stage: round(seconds, 3) for stage, seconds in watch.seconds.items()}
     counts = {"points": len(scan_map.points), "candidates": len(scan_map.centers)}
     warnings = list(scan_map.warnings)
-    report = {"map": str(arguments.out), **counts, "seconds": seconds, "warnings": warnings}
+    report = {
+        "map": str(arguments.out),
+        "scans": scan_map.scan_names,
+        **counts,
+        "seconds": seconds,
+        "warnings": warnings,
+    }
     print_report(arguments, outputs, json.dumps(report))
     return 0

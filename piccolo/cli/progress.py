@@ -11,6 +11,8 @@ from tqdm import tqdm
 from ..runtime.threads import Progress
 
 DELAY = 0.5  # seconds: what takes less needs no bar
+COUNTED, UNCOUNTED = "{desc}: {percentage:3.0f} % |{bar:20}| {remaining} left", "{desc}: {n_fmt} in {elapsed}"
+STEPS = {"find free space": 1, "render views": 2, "find features": 3}  # of a map, when its scan has been read
 tqdm.monitor_interval = 0  # no thread of tqdm's own, which might not start, for bars that stand still
 
 
@@ -18,7 +20,9 @@ def progress_bar(is_quiet: bool) -> Progress:
     """A function that wraps values in a progress bar, or in nothing."""
 
     def show(values: Iterator[Any], total: int | None, label: str) -> Iterator[Any]:
-        return iter(tqdm(values, label, total, leave=False, disable=is_quiet, file=sys.stderr, delay=DELAY))
+        title = f"prepare, {STEPS[label]} of {len(STEPS)}: {label}" if label in STEPS else label
+        form = {"bar_format": UNCOUNTED if total is None else COUNTED, "delay": DELAY, "leave": False}
+        return iter(tqdm(values, title, total, disable=is_quiet, file=sys.stderr, **form))
 
     return show
 

@@ -153,6 +153,25 @@ class Voxels(NamedTuple):
     warnings: tuple[str, ...] = ()  # one line each, for the user
 
 
+def join_voxels(
+    first: NDArray[np.float32], second: NDArray[np.float32], origin: NDArray[np.float64]
+) -> Voxels:
+    """The voxels of two clouds' nodes (N, 6) about one origin (3,), as of Voxels; both may have some voxels.
+
+    Those that one of them has stay as they are, bit by bit; the others have the means of both means.
+    """
+    num = len(first) + len(second)
+    check_memory(num * VOXEL_BYTES, f"the scan: sorting {num} voxels of 2 cm", THIN)
+    nodes = np.concatenate([first, second])
+    cells = np.floor((nodes[:, :3] + (origin + PHASE / QUANTA_PER_METRE)) / LEAF_SIZE).astype(np.int64)
+    codes = morton_codes(cells - cells.min(axis=0) // COARSEST * COARSEST)
+    order = np.argsort(codes, kind="stable")
+    begin = np.flatnonzero(np.diff(codes[order], prepend=-1))
+    counts = np.diff(begin, append=num)
+    columns = [np.add.reduceat(column[order], begin, dtype=np.float64) / counts for column in nodes.T]
+    return Voxels(codes[order][begin], np.stack(columns, axis=1, dtype=np.float32), origin)
+
+
 class VoxelTable:
     """Sums over the points in each voxel, an open hash table that grows as it fills."""
 

@@ -1,7 +1,7 @@
 """Where a camera can be: free space at a camera's height above something that carries it."""
 
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ SUPPORT_RADIUS = 0.9  # [m] the floor right below a scanner is never scanned
 STOREY = 2.6  # [m] a floor is not farther below a camera
 SURFACE_VOXEL = 0.16  # [m]
 COARSE_SPACING = 0.6  # [m] of the grid; the half of it where surfaces are near
+CLEARANCE_VOXEL = 0.08  # [m]
 NEAR = 0.3  # [m] clearance below which the grid is refined
 BLOCK = 64  # views a thread makes at a time
 MAX_POSITIONS = 250_000  # looked at, and views rendered: some ten minutes on two cores, 1.9 GB
@@ -45,6 +46,31 @@ def top_surfaces(octree: Octree) -> NDArray[np.float32]:
     return np.asarray(xyz[~is_covered])
 
 
+class Ball(NamedTuple):
+    """All within a radius [m] of a place (3,)."""
+
+    center: Array
+    radius: float
+
+    def holds(self, points: NDArray[np.floating[Any]], margin: float = 0.0) -> NDArray[np.bool_]:
+        """Which of some points (N, 3) or (N, 2) lie in it, or at most a margin [m] beside it."""
+        distance = np.linalg.norm(points - self.center[: points.shape[1]], axis=1)
+        return np.asarray(distance <= self.radius + margin)
+
+
+class Box(NamedTuple):
+    """All between two corners (3,) [m]."""
+
+    low: Array
+    high: Array
+
+    def holds(self, points: NDArray[np.floating[Any]], margin: float = 0.0) -> NDArray[np.bool_]:
+        """As of Ball."""
+        k = points.shape[1]
+        is_inside = (points >= self.low[:k] - margin) & (points <= self.high[:k] + margin)
+        return np.asarray(is_inside.all(axis=1))
+
+
 class TooManyPositionsError(InputError):
     """A scan of land, or in another unit: a camera could be at more places than are searched."""
 
@@ -52,19 +78,16 @@ class TooManyPositionsError(InputError):
         super().__init__(f"the scan: {what} leave more than {MAX_POSITIONS} camera positions, {ADVICE}")
 
 
-def supported_cells(
-    surfaces: NDArray[np.float32], within: tuple[Array, float] | None = None
-) -> NDArray[np.int64]:
+def supported_cells(surfaces: NDArray[np.float32], within: Ball | Box | None = None) -> NDArray[np.int64]:
     """Cells (N, 3) of the coarse grid whose centres are at a camera's height above a surface (M, 3).
 
-    Those `within` a radius [m] of a place (3,), by a spacing more than it says. TooManyPositionsError if they
+    Those `within` a part of the scan, by a spacing more than it says. TooManyPositionsError if they
     are more than MAX_POSITIONS; no more memory than for these is taken.
     """
     s = COARSE_SPACING
     reach = int(np.ceil(SUPPORT_RADIUS / s))
     if within is not None:
-        distance = np.linalg.norm(surfaces[:, :2] - within[0][:2], axis=1)
-        surfaces = surfaces[distance <= within[1] + SUPPORT_RADIUS + 2 * s]
+        surfaces = surfaces[within.holds(surfaces[:, :2], SUPPORT_RADIUS + 2 * s)]
     if len(surfaces) == 0:
         return np.empty((0, 3), np.int64)
     base = np.floor(surfaces / s).astype(np.int64)
@@ -82,8 +105,7 @@ def supported_cells(
         around_some = np.unique(codes[begin : begin + BASES, None] + steps @ weights)
         cells = np.stack(np.unravel_index(around_some, shape), axis=1) + low
         if within is not None:
-            distance = np.linalg.norm((cells + 0.5) * s - within[0], axis=1)
-            around_some = around_some[distance <= within[1] + s]
+            around_some = around_some[within.holds((cells + 0.5) * s, s)]
         found = np.union1d(found, around_some)
         if len(found) > MAX_POSITIONS:
             size = "{:.0f} x {:.0f} x {:.0f} m".format(*np.ptp(surfaces, axis=0))
@@ -93,16 +115,16 @@ def supported_cells(
 
 def coverage(octree: Octree, centers: NDArray[np.floating[Any]], workers: Workers) -> NDArray[np.float32]:
     """Fraction of the sphere (N,) around each centre (N, 3) that is not empty, seen at a low resolution."""
-    fraction = np.empty(len(centers), np.float32)
     view = FREE_SPACE_VIEW.arrays
 
-    def glance(lo: int) -> None:
-        part = slice(lo, lo + BLOCK)
-        voxels = FREE_SPACE_VIEW.voxel_per_range
-        filled_fractions(octree, centers[part], voxels, view, thread_scratch(), fraction[part])
+    def glance(lo: int) -> tuple[NDArray[np.float32]]:
+        some = centers[lo : lo + BLOCK]
+        fraction = np.empty(len(some), np.float32)
+        filled_fractions(octree, some, FREE_SPACE_VIEW.voxel_per_range, view, thread_scratch(), fraction)
+        return (fraction,)
 
-    list(workers.map(glance, range(0, len(centers), BLOCK), "find free space"))
-    return fraction
+    parts = workers.collect(glance, range(0, len(centers), BLOCK), "find free space", centers)
+    return np.concatenate([np.empty(0, np.float32), *(fraction for (fraction,) in parts)])
 
 
 def warn_if_long(octree: Octree, centers: NDArray[np.floating[Any]], workers: Workers) -> None:
@@ -118,7 +140,7 @@ def warn_if_long(octree: Octree, centers: NDArray[np.floating[Any]], workers: Wo
 
 
 def candidate_centers(
-    octree: Octree, workers: Workers, within: tuple[Array, float] | None = None
+    octree: Octree, workers: Workers, within: Ball | Box | None = None
 ) -> NDArray[np.float64]:
     """Positions (N, 3) [m] in free space, 0.6 m apart, or 0.3 m where surfaces are near.
 
@@ -127,7 +149,10 @@ def candidate_centers(
     from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
 
     cells = supported_cells(top_surfaces(octree), within)
-    tree = cKDTree(octree.level(0.08)[:, :3], balanced_tree=False, compact_nodes=False)
+    points = octree.level(CLEARANCE_VOXEL)[:, :3]
+    if within is not None:
+        points = points[within.holds(points, 3 * COARSE_SPACING)]  # of what is farther none is near
+    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
     middle = (cells + 0.5) * COARSE_SPACING
     warn_if_long(octree, middle, workers)
     clearance, _ = tree.query(middle, workers=workers.num_threads)

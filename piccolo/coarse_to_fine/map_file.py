@@ -25,10 +25,10 @@ from ..runtime.file_facts import recall, remember
 from .map_validation import LAYOUT, check_arrays, clean_warnings
 from .scan_map import ScanMap
 
-FORMAT = "piccolo-map/5"
-OTHERS = ("octree", "local_features", "warnings", "crs", "is_partial")
+FORMAT = "piccolo-map/6"
+OTHERS = ("octree", "local_features", "scan_names", "warnings", "crs", "is_partial", "whole")
 ARRAYS = [f.name for f in fields(ScanMap) if f.name not in OTHERS]
-MEMBERS = {*LAYOUT, "format", "warnings"}
+MEMBERS = {*LAYOUT, "format", "scan_names", "warnings"}
 WANTED = "wanted a whole map by tools/prepare_map.py"
 ZIP_MAGIC = b"PK\x03\x04"
 # The first member of a map: its name and where that stands, and the beginning of its value somewhere behind.
@@ -40,6 +40,7 @@ def save_map(scan_map: ScanMap, path: Path) -> None:
     """Write a map to `path`, whole or not at all."""
     members: dict[str, NDArray[Any]] = {
         "format": np.array(FORMAT),
+        "scan_names": np.array(scan_map.scan_names, dtype=np.str_),
         "warnings": np.array(scan_map.warnings, dtype=np.str_),
         "crs": np.frombuffer(scan_map.crs.encode(), np.uint8),
     }
@@ -93,6 +94,7 @@ def load_map(path: Path, remembers: bool = False) -> ScanMap:
         ),
         local_features=FeatureMap(*(arrays[f"local_{name}"] for name in FeatureMap._fields)),
         has_labels=bool(arrays["has_labels"]),
+        scan_names=tuple(map(str, arrays["scan_names"])),
         warnings=warnings,
         scan_sha256=str(arrays["scan_sha256"]),
         crs=arrays["crs"].tobytes().decode(),

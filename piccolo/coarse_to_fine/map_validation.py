@@ -16,9 +16,10 @@ from ..cloud.voxels import NUM_LEVELS, PHASE, QUANTUM_BITS, WINDOW
 from ..errors import InputError
 from ..geometry.pose import Array, checked_rotation
 from ..geometry.sphere import make_grid
-from ..local_features.feature_map import MAX_LISTS, MAX_RANGE, NUM_COMPONENTS
+from ..local_features.feature_map import MAX_LISTS, MAX_RANGE, MOST_VIEWS, NUM_COMPONENTS
 from ..local_features.keypoints import DESCRIPTOR_SIZE
 from ..runtime.jit import F0, F1, inline_kernel, kernel
+from .named_scans import MAX_SCANS, is_name
 from .scan_map import SEARCH_VIEW, WIDE_RINGS, sparse_candidates
 
 Arrays = dict[str, NDArray[Any]]
@@ -36,6 +37,7 @@ LAYOUT: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "offset_unit": ("<f4", ("candidates",)),
     "features": ("|i1", ("candidates", 3, CELLS)),
     "is_seen": ("|b1", ("candidates", CELLS)),
+    "scan_of_candidate": ("<u2", ("candidates",)),
     "sparse": ("<i8", ("sparse",)),
     "wide_features": ("|i1", ("sparse", 3 * WIDE_CELLS)),
     "wide_seen": ("|u1", ("sparse", WIDE_CELLS)),
@@ -44,6 +46,8 @@ LAYOUT: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "local_tangents": ("|i1", ("local", 3)),
     "local_sizes": ("<f4", ("local",)),
     "local_descriptors": ("|i1", ("local", NUM_COMPONENTS)),
+    "local_views": ("<u2", ("local",)),
+    "local_view_centers": ("<f8", ("views", 3)),
     "local_mean": ("<i2", (DESCRIPTOR_SIZE,)),
     "local_components": ("|i1", (DESCRIPTOR_SIZE, NUM_COMPONENTS)),
     "local_middles": ("|i1", ("lists", NUM_COMPONENTS)),
@@ -108,6 +112,8 @@ def check_arrays(path: Path, arrays: Arrays) -> None:
     _check_octree(path, arrays)
     _check_views(path, arrays)
     _check_features(path, arrays)
+    _check_feature_views(path, arrays)
+    _check_scans(path, arrays)
     if not SHA256.fullmatch(str(arrays["scan_sha256"])):
         _refuse(path, "a scan_sha256 that is no digest")
     text = arrays["crs"].tobytes()
@@ -187,6 +193,28 @@ def _check_features(path: Path, arrays: Arrays) -> None:
         _refuse(path, f"{len(arrays['local_middles'])} lists of features with {len(start)} beginnings")
     if start[0] != 0 or start[-1] != len(points) or (np.diff(start) < 0).any():
         _refuse(path, "lists of features that do not follow each other")
+
+
+def _check_feature_views(path: Path, arrays: Arrays) -> None:
+    """Each feature was seen from one of the views, all of which are where the scan is."""
+    centers, views = arrays["local_view_centers"], arrays["local_views"]
+    reach = WINDOW * float(arrays["octree_leaf_size"]) + MARGIN
+    if not np.abs(centers).max(initial=0.0) <= reach:
+        _refuse(path, "a view at no finite place or too far away")
+    if len(centers) > MOST_VIEWS or views.max(initial=0) >= max(len(centers), 1):
+        _refuse(path, f"a feature of view {views.max(initial=0)} of {len(centers)}")
+
+
+def _check_scans(path: Path, arrays: Arrays) -> None:
+    """Names are text, all different, and each candidate lies in the scan of one of them."""
+    found, index = arrays["scan_names"], arrays["scan_of_candidate"]
+    if found.dtype.kind != "U" or found.ndim != 1 or len(found) > MAX_SCANS:
+        _refuse(path, f"scan_names of type {found.dtype} and shape {found.shape}")
+    names = list(map(str, found))
+    if len(set(names)) < len(names) or not all(map(is_name, names)):
+        _refuse(path, "names of scans that are none, or twice the same")
+    if index.max(initial=0) >= max(len(names), 1):
+        _refuse(path, f"a candidate in scan {index.max()} of {len(names)}")
 
 
 def clean_warnings(path: Path, warnings: NDArray[Any]) -> tuple[str, ...]:

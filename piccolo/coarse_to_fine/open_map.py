@@ -1,7 +1,6 @@
 """The map of a cloud: prepared already, from the cache, or made now."""
 
 import hashlib
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -17,15 +16,17 @@ from ..cloud.soa import LocalCloud, pack_points
 from ..errors import InputError
 from ..geometry.pose import rotate_points
 from ..gravity import R_z_from_axis
-from ..runtime.cache import cache_root, in_words, mark_used, own_folder
+from ..runtime.cache import cache_root, in_words, mark_used, own_folder, own_names
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
+from ..runtime.unfinished import Unfinished
 from .map_file import FORMAT, is_map_file, load_map, save_map
+from .named_scans import named
+from .scan_addition import add_scan
 from .scan_map import ScanMap, prepare_map
 from .settings import NOTHING_KNOWN, Prior
 
-# of a file in the cache, and of one that was being written when its process was killed
-NAME = re.compile(r"[0-9a-f]{32}\.piccolo-map|\.[0-9a-f]{32}\.piccolo-map\.\w{8}")
+NAME = own_names("piccolo-map")
 FOLDER = "piccolo-maps"  # within the folder that the user names
 # What makes a map: folders of the package. The cache makes maps anew when one of their files has changed.
 MAKERS = ("cloud", "coarse_to_fine", "geometry", "gravity", "local_features", "optimize", "panorama")
@@ -50,6 +51,8 @@ def open_map(
     """The map of a cloud's files: prepared already, from the cache, or built now.
 
     A prepared map may stand in place of the files. The prior is asked where the scan is too large as a whole.
+    What is built for the cache goes on where a killed process stood; without it only with `workers.work`,
+    whose parts the caller removes.
     """
     map_path = prepared_map_among(paths)
     if map_path:
@@ -57,9 +60,7 @@ def open_map(
             raise InputError(f"{map_path}: found a prepared map, wanted it alone, without options for clouds")
         with watch.stage("read"):
             scan_map = load_map(map_path, cache.is_used)
-        if scan_map.has_labels != (cloud_settings.labels is not None):
-            kind = "labels, wanted --labels too" if scan_map.has_labels else "colours, wanted no --labels"
-            raise InputError(f"{map_path}: found a prepared map of {kind}")
+        check_labels(map_path, scan_map, cloud_settings)
         return scan_map
 
     digest = ""
@@ -74,14 +75,59 @@ def open_map(
         has_labels = cloud_settings.labels is not None
         return replace(scan_map, has_labels=has_labels, scan_sha256=digest, crs=crs_of(paths))
 
-    if not (cache.is_used and digest):
+    key = content_key(digest, cloud_settings) if digest else ""
+    if workers.work:
+        workers.work.key = key
+    if not (cache.is_used and key):
         return build()
-    key = content_key(digest, cloud_settings)
+    work = Unfinished(key)
+    workers = replace(workers, work=work)
     scan_map, warning = cached_map(cache.folder, key, digest, build, watch)
+    work.finish()
     if not warning:
         return scan_map
     workers.warn(warning)
     return replace(scan_map, warnings=(*scan_map.warnings, warning))
+
+
+def extended_map(
+    map_path: Path,
+    paths: Sequence[Path],
+    cloud_settings: CloudSettings,
+    name: str,
+    workers: Workers,
+    watch: Stopwatch,
+) -> ScanMap:
+    """A prepared map with the scan of some files put in under a name; a map without names gets its file's."""
+    if not prepared_map_among([map_path]):
+        raise InputError(f"{map_path}: found no prepared map, wanted one by tools/prepare_map.py")
+    if path := prepared_map_among(paths):
+        raise InputError(f"{path}: found a prepared map, wanted the files of a scan to add")
+    if cloud_settings.up != "auto":
+        raise InputError("--up: found beside --add, wanted without; a scan is added in the map's axes")
+    with watch.stage("read"):
+        old = load_map(map_path)
+        cloud = open_cloud(paths, cloud_settings, workers.show)
+        digest = sha256_of_files(paths)
+        if workers.work:
+            workers.work.key = (
+                f"{content_key(digest, cloud_settings)} in {sha256_of_files([map_path])} as {name}"
+            )
+        crs = crs_of(paths)
+    check_labels(map_path, old, cloud_settings)
+    if crs and old.crs and crs != old.crs:
+        workers.warn(f"{paths[0]}: names another coordinate system than the map, whose is taken for both")
+    old = old if old.scan_names else named(old, map_path.stem)
+    both = "\n".join(sorted([old.scan_sha256, digest]))
+    added = add_scan(old, cloud, name, workers, watch)
+    return replace(added, scan_sha256=hashlib.sha256(both.encode()).hexdigest(), crs=old.crs or crs)
+
+
+def check_labels(map_path: Path, scan_map: ScanMap, cloud_settings: CloudSettings) -> None:
+    """Refuse a map of labels where colours are asked for, and the other way round."""
+    if scan_map.has_labels != (cloud_settings.labels is not None):
+        kind = "labels, wanted --labels too" if scan_map.has_labels else "colours, wanted no --labels"
+        raise InputError(f"{map_path}: found a prepared map of {kind}")
 
 
 def prepared_map_among(paths: Sequence[Path]) -> Path | None:

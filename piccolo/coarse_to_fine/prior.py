@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from ..geometry.pose import Pose
 from .camera_positions import COARSE_SPACING, heights_above_floor
+from .named_scans import candidates_within, scan_at
 from .scan_map import ScanMap
 from .settings import Prior
 
@@ -21,6 +22,8 @@ def allowed_by_option(scan_map: ScanMap, prior: Prior) -> dict[str, NDArray[np.b
         heights = heights_above_floor(scan_map.octree, scan_map.centers)
         low, high = prior.height[0] - COARSE_SPACING / 2, prior.height[1] + COARSE_SPACING / 2
         allowed["--height"] = (heights >= low) & (heights <= high)
+    if prior.within:
+        allowed["--within"] = candidates_within(scan_map, prior.within)
     return allowed
 
 
@@ -63,9 +66,11 @@ def apply_prior(scan_map: ScanMap, prior: Prior) -> ScanMap:
         offset_unit=scan_map.offset_unit[is_allowed],
         features=scan_map.features[is_allowed],
         is_seen=scan_map.is_seen[is_allowed],
+        scan_of_candidate=scan_map.scan_of_candidate[is_allowed],
         sparse=index[scan_map.sparse[is_kept]],
         wide_features=scan_map.wide_features[is_kept],
         wide_seen=scan_map.wide_seen[is_kept],
+        whole=scan_map.whole or scan_map,
     )
 
 
@@ -85,6 +90,8 @@ def allowed_rotations(
 def is_allowed(scan_map: ScanMap, pose: Pose, prior: Prior) -> bool:
     """True for a pose of the map's frame within what the prior says, by a grid spacing more."""
     world = scan_map.to_world(pose)
+    if prior.within and scan_at(scan_map, pose.center_world) not in prior.within:
+        return False
     if prior.near_world is not None and prior.radius is not None:
         x, y, z = prior.near_world
         gap = (

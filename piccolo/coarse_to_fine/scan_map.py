@@ -19,13 +19,16 @@ from ..local_features.view_positions import view_positions
 from ..runtime.memory import check_memory
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
-from .camera_positions import BLOCK, COARSE_SPACING, TooManyPositionsError, candidate_centers
+from ..runtime.unfinished import Unfinished
+from .camera_positions import BLOCK, COARSE_SPACING, Ball, TooManyPositionsError, candidate_centers
 from .settings import NOTHING_KNOWN, Prior
 from .view import ViewConfig, render_block, thread_scratch
 
 WIDE_RINGS = 12
 SEARCH_VIEW = ViewConfig(num_rings=SEARCH_RINGS, stats_rings=16, sigma_deg=22.0, voxel_per_range=1 / 15)
 BYTES_PER_CELL = 6 + 3 + 1 + 4  # of a view: offsets, channels, seen; and what is made of them for a search
+# of some centres, as ScanMap holds them: offsets, their units, channels and seen cells
+Views = tuple[NDArray[np.int16], NDArray[np.float32], NDArray[np.int8], NDArray[np.bool_]]
 MIN_TILT = np.radians(5.0)  # a cloud whose up is nearer to its z is taken as it is
 
 
@@ -41,15 +44,18 @@ class ScanMap:
     offset_unit: NDArray[np.float32]  # (candidates,) [m]
     features: NDArray[np.int8]  # (candidates, 3, cells) channels in levels, 0 where nothing is seen
     is_seen: NDArray[np.bool_]  # (candidates, cells)
+    scan_of_candidate: NDArray[np.uint16]  # (candidates,) index of its name in scan_names
     sparse: NDArray[np.int64]  # candidates of which no two share a cell of the coarse grid
     wide_features: NDArray[np.int8]  # (sparse, 3 * wide cells) means over wider cells, for SO(3)
     wide_seen: NDArray[np.uint8]  # (sparse, wide cells) fraction seen of each, 255 for all
     local_features: FeatureMap
     has_labels: bool = False  # colours are those of labels
+    scan_names: tuple[str, ...] = ()  # of the scans put together; none if none was named
     warnings: tuple[str, ...] = ()
     scan_sha256: str = ""  # of the files or arrays that it was made from, in hexadecimal digits
     crs: str = ""  # coordinate system that the scan's file names, as WKT or EPSG:code; empty if none
     is_partial: bool = False  # of a scan too large as a whole: candidates where a prior asks; not in files
+    whole: "ScanMap | None" = None  # with all candidates, of a map narrowed by a prior; not in files
 
     @cached_property
     def points(self) -> PackedPoints:
@@ -78,24 +84,37 @@ def _as_points(nodes: NDArray[np.float32]) -> PackedPoints:
 
 
 def render_candidates(
-    octree: Octree, centers: NDArray[np.float64], config: ViewConfig, workers: Workers
-) -> tuple[NDArray[np.int16], NDArray[np.float32], NDArray[np.int8], NDArray[np.bool_]]:
-    """Offsets, their units, channels and seen cells of the view from each centre, as ScanMap holds them."""
+    octree: Octree,
+    centers: NDArray[np.float64],
+    config: ViewConfig,
+    workers: Workers,
+    label: str = "render views",
+) -> Views:
+    """The views from some centres (N, 3) [m]; the label of the progress also tells octrees apart."""
     cells = len(make_grid(config.num_rings))
     num_bytes = len(centers) * cells * BYTES_PER_CELL
     check_memory(num_bytes, f"the scan: {len(centers)} prepared views", "cut out a part of it")
     offsets, unit = np.empty((len(centers), 3, cells), np.int16), np.empty(len(centers), np.float32)
     levels, is_seen = np.empty((len(centers), 3, cells), np.int8), np.empty((len(centers), cells), np.bool_)
-    view = config.arrays
+    view, begins = config.arrays, range(0, len(centers), BLOCK)
 
-    def run(lo: int) -> None:
+    def run(lo: int) -> Views:
         part = slice(lo, lo + BLOCK)
         out = offsets[part], unit[part], levels[part], is_seen[part]
-        voxels = config.voxel_per_range
-        render_block(octree, centers[part], voxels, view, thread_scratch(), *out)
+        render_block(octree, centers[part], config.voxel_per_range, view, thread_scratch(), *out)
+        return out
 
-    list(workers.map(run, range(0, len(centers), BLOCK), "render views"))
+    for lo, found in zip(begins, workers.collect(run, begins, label, centers), strict=True):
+        for whole, part in zip((offsets, unit, levels, is_seen), found, strict=True):
+            whole[lo : lo + BLOCK] = part  # what was made before; the rest is there
     return offsets, unit, levels, is_seen
+
+
+def ranges_of(
+    offsets: NDArray[np.int16], unit: NDArray[np.float32], is_seen: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """How far away (N, cells) [m] is what views show, as ScanMap holds them; 0 where nothing is seen."""
+    return np.asarray(np.linalg.norm(offsets.astype(np.float32), axis=1) * unit[:, None] * is_seen)
 
 
 def sparse_candidates(centers: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -168,6 +187,19 @@ def read_aligned(cloud: Voxelized, up: UpAxis) -> AlignedCloud:
     return AlignedCloud(octree, R_map_from_world, origin_world, voxels.warnings + more)
 
 
+def read_once(cloud: Voxelized, up: UpAxis, work: Unfinished | None) -> AlignedCloud:
+    """The same, or what a process that was killed has read."""
+    stage = (work or Unfinished()).stage("read", ())
+    stage.read()
+    if not stage.done:
+        a = read_aligned(cloud, up)
+        leaf_size, warnings = np.array(a.octree.leaf_size), np.array(a.warnings, np.str_)
+        stage.add((*a.octree[:3], leaf_size, a.R_map_from_world, a.origin_world, warnings))
+    nodes, first_child, level_start, leaf_size, R_map_from_world, origin_world, warnings = stage.done[0]
+    octree = Octree(nodes, first_child, level_start, float(leaf_size))
+    return AlignedCloud(octree, R_map_from_world, origin_world, tuple(map(str, warnings)))
+
+
 def candidates_of(
     aligned: AlignedCloud, prior: Prior, workers: Workers
 ) -> tuple[NDArray[np.float64], tuple[str, ...]]:
@@ -178,7 +210,7 @@ def candidates_of(
         if prior.near_world is None or prior.radius is None:
             raise
     near = aligned.R_map_from_world @ (np.array(prior.near_world) - aligned.origin_world)
-    centers = candidate_centers(aligned.octree, workers, (near, prior.radius))
+    centers = candidate_centers(aligned.octree, workers, Ball(near, prior.radius))
     text = (
         f"the scan is too large as a whole: prepared within {prior.radius:g} m of --near, for this run only"
     )
@@ -200,7 +232,7 @@ def prepare_map(
     """
     watch = watch or Stopwatch()
     with watch.stage("read"):
-        aligned = read_aligned(cloud, up)
+        aligned = read_once(cloud, up, workers.work)
     for warning in aligned.warnings:  # now: a wrong unit makes what follows long
         workers.warn(warning)
     with watch.stage("prepare"):
@@ -209,8 +241,7 @@ def prepare_map(
         offsets, unit, levels, is_seen = render_candidates(octree, centers, view, workers)
         sparse = sparse_candidates(centers)
         wide_features, wide_seen = widen(levels, is_seen, sparse)
-        ranges = np.linalg.norm(offsets.astype(np.float32), axis=1) * unit[:, None] * is_seen
-        chosen = view_positions(centers, ranges, view.num_rings)
+        chosen = view_positions(centers, ranges_of(offsets, unit, is_seen), view.num_rings)
         local_features = make_feature_map(octree, centers[chosen], workers)
     return ScanMap(
         octree=octree,
@@ -221,6 +252,7 @@ def prepare_map(
         offset_unit=unit,
         features=levels,
         is_seen=is_seen,
+        scan_of_candidate=np.zeros(len(centers), np.uint16),
         sparse=sparse,
         wide_features=wide_features,
         wide_seen=wide_seen,

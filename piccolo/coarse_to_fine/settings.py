@@ -19,6 +19,7 @@ class Prior:
     height: tuple[float, float] | None = None  # [m] least and most above the floor
     heading_deg: float | None = None  # of the image centre, clockwise from the cloud's +y, as GPano counts
     heading_tolerance_deg: float = 20.0
+    within: tuple[str, ...] = ()  # names of the map's scans that the camera may be in; all if none
 
     def __post_init__(self) -> None:
         """Refuse what contradicts itself, naming the option."""

@@ -18,6 +18,7 @@ class Alternative:
     share: float | None = None  # what it explains by what the best does, over what both views show
     num_matches: int | None = None  # local features that agree with it
     probability: float | None = None  # that it is right; of the preset paper none is known
+    scan: str | None = None  # name of the scan in which it lies, of a map that names its scans
 
 
 @dataclass(frozen=True)
@@ -34,3 +35,4 @@ class Localization:
     covariance: PoseCovariance | None = None
     warnings: tuple[str, ...] = ()  # one line each: why there is no pose
     cameras: tuple[Mount, ...] = ()  # refined; none if they stay as they were given
+    scan: str | None = None  # as of Alternative

@@ -1,5 +1,6 @@
 """The scan's local features: where views are taken, what they show, and an index of descriptors."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +18,8 @@ NUM_COMPONENTS = 64
 MAX_RANGE = 30.0  # [m] farther away the scan is too thin, and a match tells little of the position
 SAMPLE = 20_000  # descriptors from which the components and the lists' middles are learnt
 LIST_SIZE = 128  # features of a list, on average
-MAX_LISTS = 4096
+MAX_LISTS, MOST_VIEWS = 4096, 1 << 16
+GROWTH = 2  # of the features, by those for which the lists were made, before new ones are
 KMEANS_ROUNDS = 5
 BLOCK = 4096  # descriptors a thread sorts into lists at a time
 
@@ -30,6 +32,8 @@ class FeatureMap(NamedTuple):
     tangents: NDArray[np.int8]  # (F, 3) in which the keypoint points, across the direction, by 127
     sizes: NDArray[np.float32]  # (F,) diameter [m]
     descriptors: NDArray[np.int8]  # (F, NUM_COMPONENTS)
+    views: NDArray[np.uint16]  # (F,) index of the view that each is from
+    view_centers: NDArray[np.float64]  # (V, 3) [m]
     mean: NDArray[np.int16]  # (128,) of the descriptors, and
     components: NDArray[np.int8]  # (128, NUM_COMPONENTS) their principal components, by 127
     middles: NDArray[np.int8]  # (L, NUM_COMPONENTS) of the lists
@@ -130,15 +134,21 @@ def list_middles(descriptors: NDArray[np.int8], num_lists: int) -> NDArray[np.in
     return np.asarray(middles)
 
 
-def make_feature_map(octree: Octree, centers: NDArray[np.float64], workers: Workers) -> FeatureMap:
-    """The features of the views from some centres (N, 3) [m]."""
-    views = list(workers.map(lambda c: features_of_view(octree, c), list(centers), "find features"))
+def find_features(
+    octree: Octree, centers: NDArray[np.float64], workers: Workers
+) -> tuple[FeaturesOfView, NDArray[np.uint16]]:
+    """The features of the views from some centres (N, 3) [m], and the view that each is from."""
+    views = workers.collect(lambda c: features_of_view(octree, c), list(centers), "find features", centers)
     joined: list[Any] = [np.concatenate(values) for values in zip(NO_FEATURES, *views, strict=True)]
-    found = FeaturesOfView(*joined)
-    sample = found.descriptors[:: 1 + len(found.points) // SAMPLE]
-    mean, components = principal_components(sample)
-    descriptors = project(found.descriptors, mean, components)
-    middles = list_middles(descriptors, int(np.clip(len(descriptors) // LIST_SIZE, 1, MAX_LISTS)))
+    counts = np.array([len(view[0]) for view in views], np.int64)
+    return FeaturesOfView(*joined), np.repeat(np.arange(len(views), dtype=np.uint16), counts)
+
+
+def in_lists(
+    of_points: Sequence[NDArray[Any]], middles: NDArray[np.int8], workers: Workers
+) -> tuple[list[NDArray[Any]], NDArray[np.int32]]:
+    """The first six arrays of a FeatureMap sorted by the nearest of middles, and where each list begins."""
+    descriptors = of_points[4]
     nearest = np.empty(len(descriptors), np.int32)
 
     def assign(lo: int) -> None:
@@ -147,6 +157,51 @@ def make_feature_map(octree: Octree, centers: NDArray[np.float64], workers: Work
     list(workers.map(assign, range(0, len(descriptors), BLOCK), "sort features"))
     order = np.argsort(nearest, kind="stable")
     start = np.searchsorted(nearest[order], np.arange(len(middles) + 1)).astype(np.int32)
-    of_points: list[Any] = [values[order] for values in (*found[:-1], descriptors)]
-    of_lists: list[Any] = [mean, components, middles, start]
-    return FeatureMap(*of_points, *of_lists)
+    return [values[order] for values in of_points], start
+
+
+def num_lists(num_features: int) -> int:
+    """How many lists hold so many features."""
+    return int(np.clip(num_features // LIST_SIZE, 1, MAX_LISTS))
+
+
+def make_feature_map(octree: Octree, centers: NDArray[np.float64], workers: Workers) -> FeatureMap:
+    """The features of the views from some centres (N, 3) [m]."""
+    found, views = find_features(octree, centers, workers)
+    sample = found.descriptors[:: 1 + len(found.points) // SAMPLE]
+    mean, components = principal_components(sample)
+    descriptors = project(found.descriptors, mean, components)
+    middles = list_middles(descriptors, num_lists(len(descriptors)))
+    of_points, start = in_lists((*found[:-1], descriptors, views), middles, workers)
+    of_all: list[Any] = [*of_points, centers, mean, components, middles, start]
+    return FeatureMap(*of_all)
+
+
+def extend_feature_map(
+    old: FeatureMap,
+    is_kept: NDArray[np.bool_],
+    octree: Octree,
+    centers: NDArray[np.float64],
+    workers: Workers,
+) -> FeatureMap:
+    """The features of those views (V,) that are kept, and of the views from more centres (N, 3) [m].
+
+    The components stay; the lists too, unless they have grown to twice their size.
+    """
+    num_kept = np.count_nonzero(is_kept)
+    if num_kept == 0:
+        return make_feature_map(octree, centers, workers)
+    found, views = find_features(octree, centers, workers)
+    descriptors = project(found.descriptors, old.mean, old.components)
+    rows = np.flatnonzero(is_kept[old.views])
+    renumbered = (np.cumsum(is_kept) - 1).astype(np.uint16)[old.views]
+    known: list[Any] = [*old[:5], renumbered]
+    more: list[Any] = [*found[:-1], descriptors, views + np.uint16(num_kept)]
+    joined = [np.concatenate([a[rows], b]) for a, b in zip(known, more, strict=True)]
+    middles, wanted = old.middles, num_lists(len(joined[0]))
+    if wanted >= GROWTH * len(middles):
+        middles = list_middles(joined[4], wanted)
+    of_points, start = in_lists(joined, middles, workers)
+    all_centers = np.concatenate([old.view_centers[is_kept], centers])
+    of_all: list[Any] = [*of_points, all_centers, old.mean, old.components, middles, start]
+    return FeatureMap(*of_all)

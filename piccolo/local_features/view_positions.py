@@ -16,14 +16,13 @@ SLACK = 1.0  # [m] a wall is so much nearer than what is behind it
 
 
 @kernel
-def choose(order, centers, ranges, cells, spacing, kept):
-    """Write the indices of the positions kept, in order: each that none is near (spacing [m]) and sees.
+def choose(order, centers, ranges, cells, spacing, kept, count):
+    """Write the indices of the positions kept behind the `count` first: each that none near (spacing) sees.
 
-    Ranges (N, cells) [m] are those of the view from each centre (N, 3), 0 where nothing is seen; `cells` is a
-    table (h, 2 h) of the cell in each direction.
+    In order. Ranges (N, cells) [m] are those of the view from each centre (N, 3), 0 where nothing is seen;
+    `cells` is a table (h, 2 h) of the cell in each direction. Returns how many are kept.
     """
     height, width = cells.shape
-    count = 0
     for i in order:
         is_covered = False
         for k in range(count):
@@ -50,8 +49,10 @@ def cell_table(num_rings: int) -> NDArray[np.int32]:
     return cell_of(rays.reshape(-1, 3), num_rings).reshape(rays.shape[:2])
 
 
-def view_positions(centers: Array, ranges: NDArray[np.float32], num_rings: int) -> NDArray[np.int64]:
-    """Indices of the candidates (N, 3) [m] from which features are taken.
+def view_positions(
+    centers: Array, ranges: NDArray[np.float32], num_rings: int, num_known: int = 0
+) -> NDArray[np.int64]:
+    """Indices of the candidates (N, 3) [m] from which features are taken, beside the first, already known.
 
     Ranges (N, cells) [m] are those of the candidates' views, 0 where nothing is seen. At most MAX_VIEWS.
     """
@@ -62,7 +63,8 @@ def view_positions(centers: Array, ranges: NDArray[np.float32], num_rings: int) 
     np.minimum.at(lowest, group.ravel(), centers[:, 2])
     off = np.abs(centers[:, 2] - lowest[group.ravel()] - ABOVE_LOWEST)
     order = np.argsort(np.rint(off / HEIGHT_STEP), kind="stable")
-    kept, spacing = np.empty(len(centers), np.int64), SPACING
-    while (count := choose(order, centers, ranges, cell_table(num_rings), spacing, kept)) > MAX_VIEWS:
+    order, cells = order[order >= num_known], cell_table(num_rings)
+    kept, spacing = np.arange(len(centers)), SPACING
+    while (count := choose(order, centers, ranges, cells, spacing, kept, num_known)) > MAX_VIEWS + num_known:
         spacing *= WIDER
-    return kept[:count]
+    return kept[num_known:count]

@@ -79,9 +79,14 @@ def _target_of(path: Path) -> Path:
         return Path(os.path.realpath(path))
 
 
+def temporary_prefix(name: str) -> str:
+    """How the names begin under which a file of this name is written; 16 hexadecimal digits follow."""
+    return f".{name[:40]}."
+
+
 def _temporary_beside(target: Path) -> Path:
     """A name in the target's folder that nobody else has."""
-    return target.with_name(f".{target.name[:40]}.{secrets.token_hex(8)}")
+    return target.with_name(temporary_prefix(target.name) + secrets.token_hex(8))
 
 
 @contextmanager

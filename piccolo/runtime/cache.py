@@ -14,7 +14,7 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
-from .atomic import write_atomically
+from .atomic import temporary_prefix, write_atomically
 
 STALE_AFTER_S, MARKED_FOR_S = 30 * 24 * 3600.0, 24 * 3600.0
 PRIVATE, ALL = 0o700, 0o777
@@ -59,6 +59,13 @@ def make_writable(folder: Path) -> Path:
 def is_own(status: os.stat_result, forbidden: int) -> bool:
     """True for the user's own folder without the `forbidden` permissions."""
     return stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & forbidden
+
+
+def own_names(ending: str) -> re.Pattern[str]:
+    """The names of our files in a folder, by digest, and of those that a killed process was writing."""
+    name = f"{32 * '0'}.{ending}"
+    either = f"{re.escape(name)}|{re.escape(temporary_prefix(name))}[0-9a-f]{{16}}"
+    return re.compile(either.replace(32 * "0", "[0-9a-f]{32}"))
 
 
 def own_folder(folder: Path, name: re.Pattern[str], mode: int = ALL) -> Path:

@@ -6,15 +6,14 @@ Only the system sets the last: nobody who writes to a file can give it the ident
 
 import hashlib
 import os
-import re
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
 from .atomic import write_atomically
-from .cache import PRIVATE, WRITABLE, cache_root, is_own, mark_used, own_folder
+from .cache import PRIVATE, WRITABLE, cache_root, is_own, mark_used, own_folder, own_names
 
-NAME = re.compile(r"[0-9a-f]{32}\.fact|\.[0-9a-f]{32}\.fact\.\w{8}")  # and one that was being written
+NAME = own_names("fact")
 MAX_SIZE = 200  # [byte] of a fact
 
 

@@ -7,7 +7,6 @@ file has changed, and loads machine code without a checksum.
 import hashlib
 import logging
 import pickle
-import re
 import sys
 from functools import cache
 from pathlib import Path
@@ -17,9 +16,9 @@ import numba
 from numba.core import compiler, serialize
 
 from .atomic import write_atomically
-from .cache import PRIVATE, WRITABLE, cache_root, in_words, is_own, mark_used, own_folder
+from .cache import PRIVATE, WRITABLE, cache_root, in_words, is_own, mark_used, own_folder, own_names
 
-NAME = re.compile(r"[0-9a-f]{32}\.kernel|\.[0-9a-f]{32}\.kernel\.\w{8}")  # and one that was being written
+NAME = own_names("kernel")
 DIGEST_SIZE = hashlib.sha256().digest_size
 log = logging.getLogger("piccolo")
 

@@ -6,8 +6,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from numpy.typing import NDArray
+
 from ..errors import InputError
 from .memory import check_address_space
+from .unfinished import Arrays, Unfinished
 
 Item = TypeVar("Item")
 Value = TypeVar("Value")
@@ -54,6 +57,7 @@ class Workers:
     num_threads: int = 1
     show: Progress = no_progress  # progress
     warn: Callable[[str], None] = ignore_warning  # of what should be known before the work is done
+    work: Unfinished | None = None  # keeps what `collect` has done; None keeps nothing
 
     def __post_init__(self) -> None:
         """Refuse a count that means nothing."""
@@ -75,3 +79,20 @@ class Workers:
             yield from self.show(pool.map(function, items), len(items), label)
         finally:
             pool.shutdown(cancel_futures=True)
+
+    def collect(
+        self,
+        function: Callable[[Item], Arrays],
+        items: Sequence[Item],
+        label: str,
+        *about: NDArray[Any],
+    ) -> list[Arrays]:
+        """The arrays that a function makes of each item, in order; what a killed process did stays done.
+
+        What the function depends on, beside the items and the key of `work`, is told by label and arrays.
+        """
+        stage = (self.work or Unfinished()).stage(label, about)
+        stage.read()
+        for arrays in self.map(function, items[len(stage.done) :], label):
+            stage.add(arrays)
+        return stage.done

@@ -1,0 +1,81 @@
+"""Maps of several scans, buildings or storeys: their names, and in which of them a place lies."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..confidence.localization import Localization
+from ..errors import InputError
+from ..geometry.pose import Array, Pose
+from .scan_map import ScanMap
+
+MAX_NAME, MAX_SCANS = 100, 1000  # characters; scans of a map
+
+
+def is_name(name: str) -> bool:
+    """True for one line of text that can be printed."""
+    return 1 <= len(name) <= MAX_NAME and name.isprintable() and name == name.strip()
+
+
+def check_name(name: str, taken: Sequence[str]) -> None:
+    """Refuse what is no name for a scan that is put beside others."""
+    if not is_name(name):
+        raise InputError(f"--name: found {name[:200]!r}, wanted 1 to {MAX_NAME} printable characters")
+    if name in taken:
+        raise InputError(f"--name: found {name!r}, which the map has already: {_listed(taken)}")
+    if len(taken) >= MAX_SCANS:
+        raise InputError(f"--add: found a map of {len(taken)} scans, the most that one holds")
+
+
+def named(scan_map: ScanMap, name: str) -> ScanMap:
+    """A map of one scan under a name."""
+    check_name(name, ())
+    if len(scan_map.scan_names) > 1:
+        raise InputError(f"--name: found a map of several scans: {_listed(scan_map.scan_names)}")
+    return replace(scan_map, scan_names=(name,), scan_of_candidate=np.zeros_like(scan_map.scan_of_candidate))
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(map(repr, names))
+
+
+def check_within(scan_map: ScanMap, within: Sequence[str]) -> None:
+    """Refuse names that no scan of a map has."""
+    names = scan_map.scan_names
+    if within and not names:
+        raise InputError("--within: found a scan without names, wanted a map by tools/prepare_map.py --name")
+    for name in within:
+        if name not in names:
+            raise InputError(f"--within: found {name!r}, wanted of {_listed(names)}")
+
+
+def candidates_within(scan_map: ScanMap, within: Sequence[str]) -> NDArray[np.bool_]:
+    """Which candidates (N,) lie in the scans of these names."""
+    wanted = [k for k, name in enumerate(scan_map.scan_names) if name in within]
+    return np.isin(scan_map.scan_of_candidate, wanted)
+
+
+def scan_at(scan_map: ScanMap, center_map: Array) -> str | None:
+    """The scan in which a place (3,) lies, that of the nearest candidate; None if there are no names.
+
+    Of a map narrowed by a prior, among all its candidates.
+    """
+    whole = scan_map.whole or scan_map
+    if not (whole.scan_names and len(whole.centers)):
+        return None
+    nearest = np.square(whole.centers - center_map).sum(axis=1).argmin()
+    return whole.scan_names[int(whole.scan_of_candidate[nearest])]
+
+
+def with_scans(scan_map: ScanMap, found: Localization) -> Localization:
+    """What was found, each pose with the scan in which it lies."""
+
+    def scan_of(pose: Pose) -> str | None:
+        return scan_at(scan_map, scan_map.from_world(pose).center_world)
+
+    if found.pose is None or not scan_map.scan_names:
+        return found
+    alternatives = tuple(replace(a, scan=scan_of(a.pose)) for a in found.alternatives)
+    return replace(found, scan=scan_of(found.pose), alternatives=alternatives)
