@@ -6,32 +6,36 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from dataclasses import dataclass, replace
+from functools import partial
 from io import FileIO
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import cast
 
 from tqdm import tqdm
 
 from ..batch.batch import Batch
 from ..batch.inputs import is_from_stdin, panoramas_of
+from ..batch.localizer import Answer, Localizer, Task
 from ..batch.priors import read_priors
 from ..coarse_to_fine.open_map import CachePolicy, scan_sha256_of
 from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
-from ..opening import open_files
-from ..panorama import read_panorama
 from ..panorama.cube import is_cube
-from ..render.surfel_renderer import encode_image, overlay_png
-from ..result import UNREADABLE, Result
+from ..result import UNREADABLE
 from ..runtime.atomic import STDOUT, check_output, is_stdout, is_stream, write_atomically
 from ..runtime.kernel_cache import is_first_use, kernel_folder
 from ..runtime.line_file import appending
 from ..runtime.memory import limit_memory
+from ..runtime.processes import Processes
 from ..runtime.stopwatch import Stopwatch
-from ..runtime.threads import Workers
+from ..runtime.tasks import Executor, Here, Pair, WorkerLostError
+from ..runtime.threads import Workers, num_cores
 from ..scan import Scan
 from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error, print_note, run_command
+from .executing import fitting_jobs, memory_of_a_job, threads_of_a_job, wanted_jobs
 from .interruption import SIGNALS, Interruption, Stopped, interruptible
 from .options import build_parser, check_arguments, cloud_settings_from, read_options_from, settings_from
 from .outputs import check_distinct, check_suffix
@@ -48,10 +52,13 @@ class Run:
 
     arguments: argparse.Namespace
     batch: Batch
+    localizer: Localizer
     panoramas: Iterator[Path]
     total: int | None  # of the panoramas; None if they come on standard input
     counts: Counter[str]  # results by status, those of an earlier run too
     size: int | None  # of the lines that an earlier run has left [byte]; None: they are overwritten
+    cloud: str | tuple[str, ...] = ""  # the scan's name and digest, when it has been opened
+    cloud_sha256: str = ""
 
     @property
     def num_finished(self) -> int:
@@ -109,17 +116,52 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
         name = str(paths[0]) if len(paths) == 1 else tuple(map(str, paths))
         checked = show(panoramas, total, "check what is finished")
         counts, size = batch.pass_finished(arguments.out, checked, name, scan_sha256_of(paths))
-    return Run(arguments, batch, panoramas, total, counts, size)
+    return Run(arguments, batch, localizer_of(arguments, batch), panoramas, total, counts, size)
 
 
-def open_scan(run: Run) -> Scan:
+def localizer_of(arguments: argparse.Namespace, batch: Batch) -> Localizer:
+    """What answers the photos in one process."""
+    return Localizer(
+        tuple(arguments.cloud),
+        batch.settings,
+        batch.cloud_settings,
+        batch.read_options,
+        CachePolicy(not arguments.no_cache, arguments.cache),
+        makes_overlays=arguments.overlay is not None,
+        makes_occlusion_masks=arguments.occlusion_mask is not None,
+    )
+
+
+@contextmanager
+def executing(run: Run) -> Iterator[Executor]:
+    """Where the photos are localized, when the scan has been prepared: here, or where others open it."""
+    arguments, left = run.arguments, None if run.total is None else run.total - run.num_finished
+    num_jobs = wanted_jobs(arguments, left)
+    with ExitStack() as stack:
+        if num_jobs > 1 and arguments.no_cache:
+            folder = Path(stack.enter_context(TemporaryDirectory(prefix="piccolo-")))
+            run.localizer = replace(run.localizer, cache=CachePolicy(folder=folder))
+        scan = open_scan(run, arguments.threads or num_cores())
+        run.cloud, run.cloud_sha256 = scan.name, scan.prepared.scan_sha256
+        num_jobs = fitting_jobs(arguments, num_jobs)
+        if num_jobs == 1:
+            yield Here(partial(run.localizer.answer, scan))
+            return
+        del scan  # others open it from the cache
+        threads, memory = threads_of_a_job(arguments, num_jobs), memory_of_a_job(arguments, num_jobs)
+        opening = replace(run.localizer, num_threads=threads, max_memory=memory).opened
+        processes = Processes(opening, num_jobs, threads)
+        stack.callback(processes.close)
+        yield processes
+
+
+def open_scan(run: Run, num_threads: int) -> Scan:
     """Read and prepare the scan."""
-    arguments, batch = run.arguments, run.batch
+    arguments = run.arguments
     if is_first_use():
         print_note(arguments, f"first use: compiling kernels, once (about a minute), into {kernel_folder()}")
-    cache = CachePolicy(not arguments.no_cache, arguments.cache)
-    workers = Workers(arguments.threads, progress_bar(arguments.quiet), warn_once(arguments.quiet))
-    scan = open_files(arguments.cloud, batch.cloud_settings, batch.settings, cache, workers)
+    workers = Workers(num_threads, progress_bar(arguments.quiet), warn_once(arguments.quiet))
+    scan = run.localizer.open_scan(workers)
     for warning in scan.warnings:  # those of a map prepared earlier; others have been written
         workers.warn(warning)
     return scan
@@ -154,38 +196,44 @@ def write_picture(path: Path, pano: Path, png: bytes) -> None:
     write_atomically(path / f"{pano.stem}.png" if path.is_dir() else path, png)
 
 
-def report(run: Run, scan: Scan, result: Result) -> None:
-    """Write the pictures that are asked for, and say what was found."""
-    arguments = run.arguments
+def answer_of(run: Run, pair: Pair) -> Answer:
+    """What has come of a task."""
+    task, pending = pair
+    try:
+        return cast(Answer, pending.result())
+    except WorkerLostError as error:
+        return run.localizer.failed(task, f"{task.pano}: {error}", run.cloud, run.cloud_sha256)
+
+
+def record(run: Run, answer: Answer, write: Write) -> None:
+    """Write the pictures that are asked for and the result, and say what was found."""
+    arguments, result = run.arguments, answer.result
+    pictures = (arguments.overlay, answer.overlay), (arguments.occlusion_mask, answer.occlusion_mask)
+    for path, png in pictures:
+        if path and png is not None:
+            write_picture(path, Path(result.pano), png)
     if result.error is not None:
         print_error(arguments, result.error, EXIT_BAD_INPUT)
-        return
-    pano, pose = Path(result.pano), result.best_pose
-    read_options = run.batch.read_options.refined(result.cameras)
-    if arguments.overlay and pose is not None:
-        panorama = read_panorama(pano, read_options)
-        png = overlay_png(scan.points, panorama, scan.from_world(pose), scan.workers)
-        write_picture(arguments.overlay, pano, png)
-    if arguments.occlusion_mask and pose is not None:
-        mask = scan.occlusion_mask(pano, pose, read_options)
-        write_picture(arguments.occlusion_mask, pano, encode_image(mask, ".png"))
-    warnings = [f"warning: {warning}" for warning in result.warnings[len(scan.warnings) :]]
-    for line in () if arguments.quiet else (*warnings, result.summary()):
-        tqdm.write(line, file=sys.stderr)
+    elif not arguments.quiet:
+        for line in (*(f"warning: {warning}" for warning in answer.warnings), result.summary()):
+            tqdm.write(line, file=sys.stderr)
+    write(result.to_json())
+    run.counts[result.status] += 1
 
 
-def localize_all(run: Run, scan: Scan, write: Write, interruption: Interruption) -> None:
+def localize_all(run: Run, executor: Executor, write: Write, interruption: Interruption) -> None:
     """Localize the panoramas that are left, write each result as it comes, until a signal ends it."""
     hidden = run.arguments.quiet or run.total == 1
     bar = {"total": run.total, "initial": run.num_finished, "disable": hidden, "file": sys.stderr}
-    for pano in tqdm(run.panoramas, "panoramas", unit="", **bar):
+    values = executor.values(Task(pano, run.batch.settings_of(pano)) for pano in run.panoramas)
+    for pair in tqdm(values, "panoramas", unit="", **bar):
         with interruption.postponed() if run.total != 1 else nullcontext():
-            result = run.batch.localize(scan, pano)
-            report(run, scan, result)
-            write(result.to_json())
-            run.counts[result.status] += 1
+            record(run, answer_of(run, pair), write)
         if interruption.number:
-            return
+            break
+    for pair in values.finished():  # behind the one after which a signal has ended it
+        with interruption.postponed():
+            record(run, answer_of(run, pair), write)
 
 
 def finish(run: Run, interruption: Interruption, seconds: float) -> int:
@@ -215,11 +263,15 @@ def run(arguments: argparse.Namespace) -> int:
     if first is None:
         print_note(arguments, f"{arguments.out or 'nothing'}: nothing is left to do")
         return finish(run, Interruption(), 0.0)
-    scan = open_scan(run)
-    with watch.stage("all"), output(run) as write, interruptible() as interruption:
+    with (
+        executing(run) as executor,
+        watch.stage("all"),
+        output(run) as write,
+        interruptible() as interruption,
+    ):
         run.panoramas = itertools.chain([first], run.panoramas)
         with suppress(Stopped):
-            localize_all(run, scan, write, interruption)
+            localize_all(run, executor, write, interruption)
     return finish(run, interruption, watch.seconds["all"])
 
 
