@@ -2,7 +2,6 @@
 
 import argparse
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,8 @@ from ..scenes.evaluation.query_result import QueryResult, Thresholds, match_resu
 from ..scenes.evaluation.runner import RunConfig, input_files, open_run, read_run
 from ..scenes.scene import find_scenes
 from .command import check_least, command, option
-from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error
+from .errors import EXIT_BAD_INPUT, UsageError, checking_options
+from .executing import resumed
 from .options import (
     add_cloud_reading_options,
     add_method_options,
@@ -28,7 +28,6 @@ from .options import (
     settings_from,
 )
 from .outputs import check_distinct, check_outputs, check_suffix, print_report
-from .progress import progress_bar
 
 EPILOG = """\
 examples:
@@ -156,8 +155,7 @@ def main(arguments: argparse.Namespace) -> int:
         rows = list(match_results(scenes, read_results([arguments.results])))
     else:
         found = open_run(arguments.out, config, scenes, arguments.variants)
-        report = partial(print_error, arguments, exit_code=EXIT_BAD_INPUT)
-        rows, num_failed = found.resume(arguments.jobs, progress_bar(arguments.quiet), report)
+        rows, num_failed = resumed(found, arguments)
     if arguments.variants:
         rows = [row for row in rows if row.variant in arguments.variants]
     if not rows:

@@ -29,13 +29,12 @@ from ..runtime.atomic import STDOUT, check_output, is_stdout, is_stream, write_a
 from ..runtime.kernel_cache import is_first_use, kernel_folder
 from ..runtime.line_file import appending
 from ..runtime.memory import limit_memory
-from ..runtime.processes import Processes
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.tasks import Executor, Here, Pair, WorkerLostError
 from ..runtime.threads import Workers, num_cores
 from ..scan import Scan
 from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error, print_note, run_command
-from .executing import fitting_jobs, memory_of_a_job, threads_of_a_job, wanted_jobs
+from .executing import elsewhere, fitting_jobs, memory_of_a_job, threads_of_a_job, wanted_jobs
 from .interruption import SIGNALS, Interruption, Stopped, interruptible
 from .options import build_parser, check_arguments, cloud_settings_from, read_options_from, settings_from
 from .outputs import check_distinct, check_suffix
@@ -150,9 +149,7 @@ def executing(run: Run) -> Iterator[Executor]:
         del scan  # others open it from the cache
         threads, memory = threads_of_a_job(arguments, num_jobs), memory_of_a_job(arguments, num_jobs)
         opening = replace(run.localizer, num_threads=threads, max_memory=memory).opened
-        processes = Processes(opening, num_jobs, threads)
-        stack.callback(processes.close)
-        yield processes
+        yield stack.enter_context(elsewhere(opening, num_jobs, threads))
 
 
 def open_scan(run: Run, num_threads: int) -> Scan:
@@ -221,19 +218,21 @@ def record(run: Run, answer: Answer, write: Write) -> None:
     run.counts[result.status] += 1
 
 
-def localize_all(run: Run, executor: Executor, write: Write, interruption: Interruption) -> None:
+def localize_all(run: Run, executor: Executor, write: Write) -> Interruption:
     """Localize the panoramas that are left, write each result as it comes, until a signal ends it."""
     hidden = run.arguments.quiet or run.total == 1
     bar = {"total": run.total, "initial": run.num_finished, "disable": hidden, "file": sys.stderr}
     values = executor.values(Task(pano, run.batch.settings_of(pano)) for pano in run.panoramas)
-    for pair in tqdm(values, "panoramas", unit="", **bar):
-        with interruption.postponed() if run.total != 1 else nullcontext():
-            record(run, answer_of(run, pair), write)
-        if interruption.number:
-            break
-    for pair in values.finished():  # behind the one after which a signal has ended it
-        with interruption.postponed():
-            record(run, answer_of(run, pair), write)
+    with interruptible() as interruption, suppress(Stopped):
+        for pair in tqdm(values, "panoramas", unit="", **bar):
+            with interruption.postponed() if run.total != 1 else nullcontext():
+                record(run, answer_of(run, pair), write)
+            if interruption.number:
+                break
+        for pair in values.finished():  # behind the one after which a signal has ended it
+            with interruption.postponed():
+                record(run, answer_of(run, pair), write)
+    return interruption
 
 
 def finish(run: Run, interruption: Interruption, seconds: float) -> int:
@@ -263,15 +262,9 @@ def run(arguments: argparse.Namespace) -> int:
     if first is None:
         print_note(arguments, f"{arguments.out or 'nothing'}: nothing is left to do")
         return finish(run, Interruption(), 0.0)
-    with (
-        executing(run) as executor,
-        watch.stage("all"),
-        output(run) as write,
-        interruptible() as interruption,
-    ):
-        run.panoramas = itertools.chain([first], run.panoramas)
-        with suppress(Stopped):
-            localize_all(run, executor, write, interruption)
+    run.panoramas = itertools.chain([first], run.panoramas)
+    with executing(run) as executor, watch.stage("all"), output(run) as write:
+        interruption = localize_all(run, executor, write)
     return finish(run, interruption, watch.seconds["all"])
 
 
