@@ -18,7 +18,8 @@ from ..scenes.evaluation.runner import RunConfig, input_files, open_run, read_ru
 from ..scenes.scene import find_scenes
 from .command import check_least, command, option
 from .errors import EXIT_BAD_INPUT, UsageError, checking_options
-from .executing import resumed
+from .evaluating import resumed
+from .executing import DASK, check_execution
 from .options import (
     add_cloud_reading_options,
     add_method_options,
@@ -54,6 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(kind, "--results JSONL", "results of localize.py")
     option(kind, "--compare JSONL", "two runs, side by side", nargs=2)
     option(group, "--jobs N", "processes, which divide the cores", default=1)
+    option(group, "--dask ADDRESS", DASK)
     option(group, "--cache FOLDER", "of prepared maps (default the user's)")
     group = parser.add_argument_group("tables and plots")
     option(group, "--max-distance M", "correct is under", default=0.1)
@@ -76,6 +78,7 @@ def check_usage(arguments: argparse.Namespace) -> None:
     if not (0.0 < arguments.max_distance < np.inf and 0.0 < arguments.max_angle < np.inf):
         raise UsageError("--max-distance, --max-angle: wanted numbers above 0")
     check_least(arguments, jobs=1)
+    check_execution(arguments)
     for option_ in ("errors", "risk"):
         check_suffix(f"--{option_}", getattr(arguments, option_), (".png",))
     if arguments.out and is_stream(arguments.out):

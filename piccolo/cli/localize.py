@@ -6,19 +6,18 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, nullcontext, suppress
-from dataclasses import dataclass, replace
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass
 from functools import partial
 from io import FileIO
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import cast
 
 from tqdm import tqdm
 
 from ..batch.batch import Batch
 from ..batch.inputs import is_from_stdin, panoramas_of
-from ..batch.localizer import Answer, Localizer, Task
+from ..batch.localizer import Answer, Localizer
 from ..batch.priors import read_priors
 from ..coarse_to_fine.open_map import CachePolicy, scan_sha256_of
 from ..coarse_to_fine.settings import CoarseToFineSettings
@@ -30,11 +29,11 @@ from ..runtime.kernel_cache import is_first_use, kernel_folder
 from ..runtime.line_file import appending
 from ..runtime.memory import limit_memory
 from ..runtime.stopwatch import Stopwatch
-from ..runtime.tasks import Executor, Here, Pair, WorkerLostError
-from ..runtime.threads import Workers, num_cores
+from ..runtime.tasks import Executor, Pair, WorkerLostError
+from ..runtime.threads import Workers
 from ..scan import Scan
 from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error, print_note, run_command
-from .executing import elsewhere, fitting_jobs, memory_of_a_job, threads_of_a_job, wanted_jobs
+from .executing import check_execution, executing
 from .interruption import SIGNALS, Interruption, Stopped, interruptible
 from .options import build_parser, check_arguments, cloud_settings_from, read_options_from, settings_from
 from .outputs import check_distinct, check_suffix
@@ -92,6 +91,7 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
     """What is to be done: the options, the panoramas, and how many of them are finished."""
     with checking_options():
         check_arguments(arguments)
+        check_execution(arguments)
         limit_memory(arguments.max_memory)
         settings, read_options = settings_from(arguments), read_options_from(arguments)
         cloud_settings = cloud_settings_from(arguments)
@@ -131,36 +131,16 @@ def localizer_of(arguments: argparse.Namespace, batch: Batch) -> Localizer:
     )
 
 
-@contextmanager
-def executing(run: Run) -> Iterator[Executor]:
-    """Where the photos are localized, when the scan has been prepared: here, or where others open it."""
-    arguments, left = run.arguments, None if run.total is None else run.total - run.num_finished
-    num_jobs = wanted_jobs(arguments, left)
-    with ExitStack() as stack:
-        if num_jobs > 1 and arguments.no_cache:
-            folder = Path(stack.enter_context(TemporaryDirectory(prefix="piccolo-")))
-            run.localizer = replace(run.localizer, cache=CachePolicy(folder=folder))
-        scan = open_scan(run, arguments.threads or num_cores())
-        run.cloud, run.cloud_sha256 = scan.name, scan.prepared.scan_sha256
-        num_jobs = fitting_jobs(arguments, num_jobs)
-        if num_jobs == 1:
-            yield Here(partial(run.localizer.answer, scan))
-            return
-        del scan  # others open it from the cache
-        threads, memory = threads_of_a_job(arguments, num_jobs), memory_of_a_job(arguments, num_jobs)
-        opening = replace(run.localizer, num_threads=threads, max_memory=memory).opened
-        yield stack.enter_context(elsewhere(opening, num_jobs, threads))
-
-
-def open_scan(run: Run, num_threads: int) -> Scan:
+def open_scan(run: Run, localizer: Localizer, num_threads: int) -> Scan:
     """Read and prepare the scan."""
     arguments = run.arguments
     if is_first_use():
         print_note(arguments, f"first use: compiling kernels, once (about a minute), into {kernel_folder()}")
     workers = Workers(num_threads, progress_bar(arguments.quiet), warn_once(arguments.quiet))
-    scan = run.localizer.open_scan(workers)
+    scan = localizer.open_scan(workers)
     for warning in scan.warnings:  # those of a map prepared earlier; others have been written
         workers.warn(warning)
+    run.cloud, run.cloud_sha256 = scan.name, scan.prepared.scan_sha256
     return scan
 
 
@@ -199,7 +179,8 @@ def answer_of(run: Run, pair: Pair) -> Answer:
     try:
         return cast(Answer, pending.result())
     except WorkerLostError as error:
-        return run.localizer.failed(task, f"{task.pano}: {error}", run.cloud, run.cloud_sha256)
+        text = f"{task.pano}: {error}"
+        return run.localizer.failed(task, text, run.cloud, run.cloud_sha256, task.pano)
 
 
 def record(run: Run, answer: Answer, write: Write) -> None:
@@ -222,7 +203,7 @@ def localize_all(run: Run, executor: Executor, write: Write) -> Interruption:
     """Localize the panoramas that are left, write each result as it comes, until a signal ends it."""
     hidden = run.arguments.quiet or run.total == 1
     bar = {"total": run.total, "initial": run.num_finished, "disable": hidden, "file": sys.stderr}
-    values = executor.values(Task(pano, run.batch.settings_of(pano)) for pano in run.panoramas)
+    values = executor.values(run.localizer.task(pano, run.batch.settings_of(pano)) for pano in run.panoramas)
     with interruptible() as interruption, suppress(Stopped):
         for pair in tqdm(values, "panoramas", unit="", **bar):
             with interruption.postponed() if run.total != 1 else nullcontext():
@@ -263,7 +244,9 @@ def run(arguments: argparse.Namespace) -> int:
         print_note(arguments, f"{arguments.out or 'nothing'}: nothing is left to do")
         return finish(run, Interruption(), 0.0)
     run.panoramas = itertools.chain([first], run.panoramas)
-    with executing(run) as executor, watch.stage("all"), output(run) as write:
+    left = None if run.total is None else run.total - run.num_finished
+    place = executing(arguments, run.localizer, left, partial(open_scan, run))
+    with place as (executor, run.localizer), watch.stage("all"), output(run) as write:
         interruption = localize_all(run, executor, write)
     return finish(run, interruption, watch.seconds["all"])
 

@@ -15,6 +15,7 @@ from ..panorama import ReadOptions
 from ..panorama.model import Projection
 from ..paper.settings import Initialization, PaperSettings, PoseLoss
 from .command import check_least
+from .executing import add_execution_options
 from .parser import add_run_options, new_parser
 
 DESCRIPTION = "Find where in a coloured point cloud 360-degree panoramas were taken."
@@ -78,22 +79,9 @@ def build_parser() -> argparse.ArgumentParser:
     files.add_argument("--no-cache", action="store_true", help="prepare the map again, and do not keep it")
     add_method_options(parser)
     add_prior_options(parser)
-    add_resource_options(parser)
+    add_execution_options(parser)
     add_run_options(parser)
     return parser
-
-
-def add_resource_options(parser: argparse.ArgumentParser) -> None:
-    """What the work may take of the machine."""
-    group = parser.add_argument_group("resources")
-    text = "that may be taken in all, divided among --jobs (default 80 %% of what is free)"
-    group.add_argument("--max-memory", type=float, metavar="GB", help=text)
-    text = (
-        "processes over one prepared map (default a core each, where memory is enough and each has 8 photos "
-    )
-    group.add_argument("--jobs", type=int, metavar="N", help=f"{text}or more; 1 with - or --threads)")
-    text = "of each process (default the cores, divided among --jobs)"
-    group.add_argument("--threads", type=int, metavar="N", help=text)
 
 
 def add_cloud_options(parser: argparse.ArgumentParser, text: str) -> None:

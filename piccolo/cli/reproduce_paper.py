@@ -21,7 +21,7 @@ from ..scenes.reproduce_paper.experiments import EXPERIMENTS, Condition, Setting
 from ..scenes.scene import Scene, find_scenes
 from .command import check_least, command, option
 from .errors import EXIT_BAD_INPUT, checking_options, print_error
-from .executing import resumed
+from .evaluating import resumed
 from .options import PAPER_OPTIONS, add_options, paper_settings_from
 from .outputs import check_distinct, check_folder_name
 

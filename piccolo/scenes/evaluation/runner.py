@@ -5,7 +5,7 @@ A run on disk is one JSON line a query, flushed as it comes, so that a stopped r
 
 import json
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +16,7 @@ from ...errors import InputError
 from ...opening import open_files
 from ...panorama import ReadOptions
 from ...paper.settings import PaperSettings
+from ...result import named
 from ...runtime.atomic import check_output
 from ...runtime.json_file import parse_lines, read_bytes
 from ...runtime.line_file import appending, whole_size
@@ -40,6 +41,7 @@ class RunConfig:
     read_options: ReadOptions
     cache: CachePolicy
     num_threads: int  # of each process
+    folder: Path = Path()  # which paths are relative to
 
     def opened(self) -> Callable[["Job"], tuple["QueryResult | Failure", ...]]:
         """What runs jobs in this process, each as a whole."""
@@ -96,9 +98,9 @@ class JobRunner:
     def _scan_of(self, cloud: Path) -> Scan:
         if self._opened is None or self._opened[0] != cloud:
             self._opened = None  # before the next is opened: two may not fit
-            config = self.config
-            scan = open_files([cloud], config.cloud_settings, config.settings, config.cache, self.workers)
-            self._opened = cloud, scan
+            config, paths = self.config, [self.config.folder / cloud]
+            scan = open_files(paths, config.cloud_settings, config.settings, config.cache, self.workers)
+            self._opened = cloud, replace(scan, name=str(cloud))
         return self._opened[1]
 
     def _result_of(self, scan: Scan, scene: Scene, query: Query) -> QueryResult:
@@ -106,8 +108,9 @@ class JobRunner:
         image = query.labels if options.labels else query.image
         if image is None:
             raise InputError(f"{scene.folder}: {scene.name_of(query)} has no labels in queries.json")
-        result = scan.localize_query(image, options, self.config.settings, calibration=camera)
-        return query_result_of(scene, query, result, is_in_box(scan, query.pose))
+        path = self.config.folder / image
+        result = scan.localize_query(path, options, self.config.settings, calibration=camera)
+        return query_result_of(scene, query, named(result, path, image), is_in_box(scan, query.pose))
 
 
 def run(executor: Executor, jobs: Sequence[Job]) -> Iterator[QueryResult | Failure]:
