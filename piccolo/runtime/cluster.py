@@ -1,15 +1,18 @@
 """Items worked on by a Dask cluster, whose scheduler gives what a lost worker had to others."""
 
+import json
 import logging
 import pickle
 import signal
+import socket
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from .. import __version__
 from ..errors import InputError
@@ -23,7 +26,12 @@ TIMEOUT = 10.0  # [s] for a scheduler to answer, and for a first worker to be th
 LEAST_IN_FLIGHT = 64  # as workers may come later
 KEPT_OPEN = 2  # functions of a worker, when several commands use it
 LOGGING = dict.fromkeys(("distributed", "distributed.client", "distributed.gc"), "critical")
-SETTINGS = {"logging": LOGGING, "distributed.scheduler.worker-saturation": 1.0}  # none waits behind another
+SETTINGS = {
+    "logging": LOGGING,
+    "distributed.scheduler.worker-saturation": 1.0,  # none waits behind another whose worker may be lost
+}
+NO_SCHEDULER = f"--dask {{}}: no scheduler answers there within {TIMEOUT:.0f} s ({{}}); wanted "
+NO_SCHEDULER += f"its address, such as tcp://host:8786, the file that it has written, or {LOCAL}"
 _opening = threading.Lock()
 
 
@@ -39,17 +47,34 @@ def connected(address: str, num_processes: int, num_threads: int) -> Iterator["C
     import_optional("--dask", "dask", "distributed").config.set(SETTINGS)
     distributed = import_optional("--dask", "distributed", "distributed")
     with ExitStack() as stack:
-        where = {"scheduler_file" if Path(address).is_file() else "address": address}
         if address == LOCAL:
-            where = {"address": stack.enter_context(_local_cluster(distributed, num_processes, num_threads))}
+            scheduler = stack.enter_context(_local_cluster(distributed, num_processes, num_threads))
+        else:
+            scheduler = _scheduler_at(address)
         try:
-            client = stack.enter_context(distributed.Client(**where, timeout=TIMEOUT, set_as_default=False))
-        except (OSError, ValueError, TypeError, KeyError) as error:
-            text = f"--dask {address}: no scheduler answers there within {TIMEOUT:.0f} s"
-            raise InputError(f"{text}; wanted the address or file of one, or {LOCAL}") from error
+            client = stack.enter_context(distributed.Client(scheduler, timeout=TIMEOUT, set_as_default=False))
+        except OSError as error:
+            raise InputError(NO_SCHEDULER.format(address, error)) from error
         cluster = Cluster(address, client, distributed)
         cluster.check_workers()
-        yield cluster
+        try:
+            yield cluster
+        finally:
+            cluster.forget()
+
+
+def _scheduler_at(address: str) -> str:
+    """The URL of the scheduler at an address or in the file that it has written, where something listens."""
+    try:
+        if Path(address).is_file():
+            address = str(json.loads(Path(address).read_bytes())["address"])
+        url = urlsplit(address if "://" in address else f"tcp://{address}")
+        with socket.create_connection((url.hostname, url.port or 0), TIMEOUT) as connection:
+            if url.scheme == "tcp" and not connection.recv(1):  # for which a client would wait for ever
+                raise OSError("it says nothing")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(NO_SCHEDULER.format(address, error)) from error
+    return url.geturl()
 
 
 @contextmanager
@@ -79,6 +104,7 @@ class Cluster:
 
     def __init__(self, address: str, client: Any, distributed: Any) -> None:
         self.address, self._client, self._distributed = address, client, distributed
+        self._sent: list[str] = []  # names of files
 
     def check_workers(self) -> None:
         """Refuse a cluster without workers, or with one of another version."""
@@ -88,8 +114,8 @@ class Cluster:
         except TimeoutError as error:
             text = f"found a scheduler without workers for {TIMEOUT:.0f} s, wanted one at least"
             raise InputError(f"--dask {self.address}: {text}") from error
-        except ImportError as error:
-            text = f"a worker can't import piccolo ({error}); install it there, of version {__version__}"
+        except Exception as error:  # of a worker, in words
+            text = f"a worker can't run piccolo ({error}); install version {__version__} there"
             raise InputError(f"--dask {self.address}: {text}") from error
         if odd := sorted(versions - {__version__}):
             text = f"found a worker with piccolo {odd[0]}, wanted {__version__} as here"
@@ -103,6 +129,15 @@ class Cluster:
         """Send a file to each worker, those that come later too: `sent_file` finds it there by its name."""
         plugin = self._distributed.diagnostics.plugin.UploadFile(str(path), load=False)
         self._client.register_plugin(plugin, name=path.name)
+        self._sent.append(path.name)
+
+    def forget(self) -> None:
+        """Let the workers, which go on, drop what was sent and opened; nothing if they are lost."""
+        if self.address != LOCAL and self._client.status == "running":
+            with suppress(OSError, self._distributed.client.FutureCancelledError):
+                for name in self._sent:
+                    self._client.unregister_worker_plugin(name)
+                self._client.run(_forget, self._sent)
 
     def executor(self, opening: Opening) -> "ClusterExecutor":
         """What works on items by the function that `opening` gives."""
@@ -165,6 +200,12 @@ def value_of(opening: bytes, item: object) -> Any:
     with _opening:  # once, however many threads the worker has
         function = _function(opening)
     return function(item)
+
+
+def _forget(names: Sequence[str], dask_worker: Any) -> None:
+    _function.cache_clear()
+    for name in names:
+        (Path(dask_worker.local_directory) / name).unlink(missing_ok=True)
 
 
 def _version() -> str:
