@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
 from functools import lru_cache
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -80,6 +81,7 @@ def _scheduler_at(address: str) -> str:
 @contextmanager
 def _local_cluster(distributed: Any, num_processes: int, num_threads: int) -> Iterator[str]:
     """The address of a scheduler in this process, with workers in others that end with it."""
+    resource_tracker.ensure_running()  # which unblocks signals in the thread that begins it
     # What this thread blocks, its children do: Ctrl-C is for this process, and not for the others.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

@@ -13,6 +13,7 @@ import traceback
 from collections.abc import Iterator
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any, NamedTuple
@@ -47,6 +48,7 @@ class Processes:
         self._own = threading.local()  # its `worker` is the process of each thread
         self._workers: list[Worker] = []
         self._starting, self._is_closed = threading.Lock(), False
+        resource_tracker.ensure_running()  # which unblocks signals in the thread that begins it
         # What a thread blocks, its processes do from their first moment on.
         self._threads = ThreadPoolExecutor(num_processes, initializer=_block_signals)
 
