@@ -26,9 +26,11 @@ HOST = "127.0.0.1"  # of the scheduler and workers of "local"
 TIMEOUT = 10.0  # [s] for a scheduler to answer, and for a first worker to be there
 LEAST_IN_FLIGHT = 64  # as workers may come later
 KEPT_OPEN = 2  # functions of a worker, when several commands use it
+ENVIRONMENT = "distributed.nanny.pre-spawn-environ"
 LOGGING = dict.fromkeys(("distributed", "distributed.client", "distributed.gc"), "critical")
 SETTINGS = {
     "logging": LOGGING,
+    "distributed.worker.profile.enabled": False,  # samples of all stacks, a hundred a second
     "distributed.scheduler.worker-saturation": 1.0,  # none waits behind another whose worker may be lost
 }
 NO_SCHEDULER = f"--dask {{}}: no scheduler answers there within {TIMEOUT:.0f} s ({{}}); wanted "
@@ -81,6 +83,9 @@ def _scheduler_at(address: str) -> str:
 @contextmanager
 def _local_cluster(distributed: Any, num_processes: int, num_threads: int) -> Iterator[str]:
     """The address of a scheduler in this process, with workers in others that end with it."""
+    # In place of Dask's own, of which MALLOC_TRIM_THRESHOLD_ makes large arrays slow.
+    environment = dict.fromkeys(LIBRARIES, str(num_threads))
+    import_optional("--dask", "dask", "distributed").config.set({ENVIRONMENT: environment})
     resource_tracker.ensure_running()  # which unblocks signals in the thread that begins it
     # What this thread blocks, its children do: Ctrl-C is for this process, and not for the others.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -93,7 +98,6 @@ def _local_cluster(distributed: Any, num_processes: int, num_threads: int) -> It
             dashboard_address=None,
             memory_limit=0,  # piccolo itself refuses what is too much
             silence_logs=logging.CRITICAL,
-            env=dict.fromkeys(LIBRARIES, str(num_threads)),
         )
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
