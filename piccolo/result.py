@@ -4,7 +4,7 @@ import json
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -179,6 +179,12 @@ def result_of(found: Localization, warnings: tuple[str, ...] = (), **about: Any)
 def unreadable_result(error: str, cloud: str | tuple[str, ...], pano: str, **more: Any) -> Result:
     """The result of a photo that can't be read; `more` as in Result."""
     return Result(UNREADABLE, 0.0, cloud, pano, None, None, None, (), None, {}, error=error, **more)
+
+
+def named(result: Result, path: Path, pano: Path) -> Result:
+    """The result of a photo that was read at `path` under the name that was given for it."""
+    warnings = tuple(warning.replace(str(path), str(pano)) for warning in result.warnings)
+    return replace(result, pano=str(pano), warnings=warnings)
 
 
 _PLAIN_FIELDS = (

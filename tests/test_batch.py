@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from rooms import write_room
 
-from piccolo.batch import batch as module
+from piccolo.batch import localizer as module
 from piccolo.batch.inputs import panoramas_of
 from piccolo.batch.priors import read_priors
 from piccolo.cli import localize
@@ -32,13 +32,13 @@ def scene(tmp_path_factory):
 @pytest.fixture
 def counted(monkeypatch):
     """The panoramas that are localized, in order."""
-    names, localized = [], module.Batch.localize
+    names, answer = [], module.Localizer.answer
 
-    def counting(self, scan, pano):
-        names.append(pano.name)
-        return localized(self, scan, pano)
+    def counting(self, scan, task):
+        names.append(task.pano.name)
+        return answer(self, scan, task)
 
-    monkeypatch.setattr(module.Batch, "localize", counting)
+    monkeypatch.setattr(module.Localizer, "answer", counting)
     return names
 
 

@@ -115,14 +115,15 @@ def test_no_file_of_a_cloud_is_overwritten(scene, capsys):
 
 @pytest.mark.parametrize("quiet", [False, True])
 def test_a_warning_is_written_once_whenever_it_comes(monkeypatch, capsys, quiet):
-    def opened(paths, cloud_settings, settings, cache, workers):
+    def opened(localizer, workers):
         workers.warn("early")
-        return SimpleNamespace(warnings=("early", "late"))
+        prepared = SimpleNamespace(scan_sha256="")
+        return SimpleNamespace(name="a", warnings=("early", "late"), prepared=prepared)
 
-    monkeypatch.setattr(localize, "open_files", opened)
+    monkeypatch.setattr(localize.Localizer, "open_scan", opened)
     monkeypatch.setattr(localize, "is_first_use", lambda: False)
     run = localize.prepare_run(parse(build_parser(), [*ONE, *["--quiet"] * quiet]))
-    assert localize.open_scan(run).warnings == ("early", "late")
+    assert localize.open_scan(run, run.localizer, 1).warnings == ("early", "late")
     assert capsys.readouterr().err == ("" if quiet else "warning: early\nwarning: late\n")
 
 

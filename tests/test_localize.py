@@ -195,7 +195,7 @@ def test_traceback_only_with_debug_and_internal_errors_have_a_code(scene, capsys
     def fail(*_):
         raise ZeroDivisionError("made by the test")
 
-    monkeypatch.setattr(localize, "open_files", fail)
+    monkeypatch.setattr(localize.Localizer, "open_scan", fail)
     assert localize.main(_arguments(scene, "--quiet")) == 4
     assert "internal error: ZeroDivisionError" in capsys.readouterr().err
 

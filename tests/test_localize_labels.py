@@ -17,7 +17,7 @@ from piccolo.errors import InputError
 from piccolo.panorama import ReadOptions
 from piccolo.paper.settings import PaperSettings
 from piccolo.result import Result
-from piccolo.scenes.evaluation.runner import Failure, Job, RunConfig, run_job
+from piccolo.scenes.evaluation.runner import Failure, Job, JobRunner, RunConfig
 from piccolo.scenes.scene import read_scene
 from piccolo.scenes.synthetic.room import LABEL_NAMES
 
@@ -110,13 +110,13 @@ def test_evaluation_takes_the_pictures_of_labels(scene):
     reading = CloudSettings(labels=labels), ReadOptions(labels=labels)
     config = RunConfig(settings, *reading, CachePolicy(False), 2)
     here = read_scene(scene)
-    (row,) = run_job(config, Job(here, here.queries))
+    (row,) = JobRunner(config)(Job(here, here.queries))
     assert row.result.pano == str(here.queries[0].labels)
     document = json.loads((scene / "queries.json").read_text())
     del document["queries"][0]["labels"]
     (scene / "unlabelled.json").write_text(json.dumps(document))
     here = read_scene(scene / "unlabelled.json")
-    (failure,) = run_job(config, Job(here, here.queries))
+    (failure,) = JobRunner(config)(Job(here, here.queries))
     assert isinstance(failure, Failure)
     assert "images/clean_0.jpg has no labels in queries.json" in failure.text
 

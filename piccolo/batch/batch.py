@@ -14,8 +14,7 @@ from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..errors import InputError
 from ..panorama import ReadOptions
 from ..panorama.photo import photo_of
-from ..result import Result, Source, unreadable_result
-from ..scan import Scan, Settings, settings_json
+from ..scan import Settings, settings_json
 from .priors import PriorTable
 from .results_file import WAYS, check_finished, finished_lines
 
@@ -34,16 +33,6 @@ class Batch:
         if self.priors is None or not isinstance(self.settings, CoarseToFineSettings):
             return self.settings
         return replace(self.settings, prior=self.priors.prior_of(pano, self.settings.prior))
-
-    def localize(self, scan: Scan, pano: Path) -> Result:
-        """The result of one panorama; of one that can't be read the reason."""
-        settings = self.settings_of(pano)
-        try:
-            return scan.localize_query(pano, self.read_options, settings)
-        except (OSError, InputError) as error:
-            source = Source(scan.prepared.scan_sha256 or None, pano_sha256(pano, self.read_options.rig))
-            repeated = settings_json(settings, self.cloud_settings, self.read_options)
-            return unreadable_result(str(error), scan.name, str(pano), settings=repeated, source=source)
 
     def expected(self, pano: Path, cloud: str | tuple[str, ...], cloud_sha256: str) -> Mapping[str, Any]:
         """What the line of a panorama says of how it was made, as JSON gives it back."""

@@ -1,5 +1,6 @@
 """The panoramas of a batch: pictures, folders of pictures, lists, and names that come on standard input."""
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TextIO
@@ -32,12 +33,21 @@ def panoramas_of(
     """
     for word in words:
         if word == STDIN:
-            yield from (Path(line.rstrip("\r\n")) for line in stdin if line.strip())
+            yield from _lines(stdin)
         elif word.startswith("@"):
             lines = read_text(Path(word[1:]), WANTED_LIST).splitlines()
             yield from (Path(line) for line in lines if line.strip())
         else:
             yield from _at(Path(word), is_panorama)
+
+
+def _lines(stdin: TextIO) -> Iterator[Path]:
+    """The names on standard input, read past Python's buffers.
+
+    A thread that waits there for a name would hold their lock, without which the program can't end.
+    """
+    with open(stdin.fileno(), "rb", buffering=0, closefd=False) as file:
+        yield from (Path(os.fsdecode(line.rstrip(b"\r\n"))) for line in file if line.strip())
 
 
 def _at(path: Path, is_panorama: Callable[[Path], bool]) -> Iterator[Path]:

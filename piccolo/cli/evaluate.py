@@ -2,7 +2,6 @@
 
 import argparse
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,9 @@ from ..scenes.evaluation.query_result import QueryResult, Thresholds, match_resu
 from ..scenes.evaluation.runner import RunConfig, input_files, open_run, read_run
 from ..scenes.scene import find_scenes
 from .command import check_least, command, option
-from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error
+from .errors import EXIT_BAD_INPUT, UsageError, checking_options
+from .evaluating import resumed
+from .executing import DASK, check_execution
 from .options import (
     add_cloud_reading_options,
     add_method_options,
@@ -28,7 +29,6 @@ from .options import (
     settings_from,
 )
 from .outputs import check_distinct, check_outputs, check_suffix, print_report
-from .progress import progress_bar
 
 EPILOG = """\
 examples:
@@ -55,6 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(kind, "--results JSONL", "results of localize.py")
     option(kind, "--compare JSONL", "two runs, side by side", nargs=2)
     option(group, "--jobs N", "processes, which divide the cores", default=1)
+    option(group, "--dask ADDRESS", DASK)
     option(group, "--cache FOLDER", "of prepared maps (default the user's)")
     group = parser.add_argument_group("tables and plots")
     option(group, "--max-distance M", "correct is under", default=0.1)
@@ -77,6 +78,7 @@ def check_usage(arguments: argparse.Namespace) -> None:
     if not (0.0 < arguments.max_distance < np.inf and 0.0 < arguments.max_angle < np.inf):
         raise UsageError("--max-distance, --max-angle: wanted numbers above 0")
     check_least(arguments, jobs=1)
+    check_execution(arguments)
     for option_ in ("errors", "risk"):
         check_suffix(f"--{option_}", getattr(arguments, option_), (".png",))
     if arguments.out and is_stream(arguments.out):
@@ -156,8 +158,7 @@ def main(arguments: argparse.Namespace) -> int:
         rows = list(match_results(scenes, read_results([arguments.results])))
     else:
         found = open_run(arguments.out, config, scenes, arguments.variants)
-        report = partial(print_error, arguments, exit_code=EXIT_BAD_INPUT)
-        rows, num_failed = found.resume(arguments.jobs, progress_bar(arguments.quiet), report)
+        rows, num_failed = resumed(found, arguments)
     if arguments.variants:
         rows = [row for row in rows if row.variant in arguments.variants]
     if not rows:

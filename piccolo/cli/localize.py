@@ -8,30 +8,32 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from functools import partial
 from io import FileIO
 from pathlib import Path
+from typing import cast
 
 from tqdm import tqdm
 
 from ..batch.batch import Batch
 from ..batch.inputs import is_from_stdin, panoramas_of
+from ..batch.localizer import Answer, Localizer
 from ..batch.priors import read_priors
 from ..coarse_to_fine.open_map import CachePolicy, scan_sha256_of
 from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
-from ..opening import open_files
-from ..panorama import read_panorama
 from ..panorama.cube import is_cube
-from ..render.surfel_renderer import encode_image, overlay_png
-from ..result import UNREADABLE, Result
+from ..result import UNREADABLE
 from ..runtime.atomic import STDOUT, check_output, is_stdout, is_stream, write_atomically
 from ..runtime.kernel_cache import is_first_use, kernel_folder
 from ..runtime.line_file import appending
 from ..runtime.memory import limit_memory
 from ..runtime.stopwatch import Stopwatch
+from ..runtime.tasks import Executor, Pair, WorkerLostError
 from ..runtime.threads import Workers
 from ..scan import Scan
 from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error, print_note, run_command
+from .executing import check_execution, executing
 from .interruption import SIGNALS, Interruption, Stopped, interruptible
 from .options import build_parser, check_arguments, cloud_settings_from, read_options_from, settings_from
 from .outputs import check_distinct, check_suffix
@@ -48,10 +50,13 @@ class Run:
 
     arguments: argparse.Namespace
     batch: Batch
+    localizer: Localizer
     panoramas: Iterator[Path]
     total: int | None  # of the panoramas; None if they come on standard input
     counts: Counter[str]  # results by status, those of an earlier run too
     size: int | None  # of the lines that an earlier run has left [byte]; None: they are overwritten
+    cloud: str | tuple[str, ...] = ""  # the scan's name and digest, when it has been opened
+    cloud_sha256: str = ""
 
     @property
     def num_finished(self) -> int:
@@ -91,6 +96,7 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
     """What is to be done: the options, the panoramas, and how many of them are finished."""
     with checking_options():
         check_arguments(arguments)
+        check_execution(arguments)
         limit_memory(arguments.max_memory)
         settings, read_options = settings_from(arguments), read_options_from(arguments)
         cloud_settings = cloud_settings_from(arguments)
@@ -115,18 +121,32 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
         checked = show(panoramas, total, "check what is finished")
         digest = scan_sha256_of(paths, cache_of(arguments))
         counts, size = batch.pass_finished(arguments.out, checked, name, digest)
-    return Run(arguments, batch, panoramas, total, counts, size)
+    return Run(arguments, batch, localizer_of(arguments, batch), panoramas, total, counts, size)
 
 
-def open_scan(run: Run) -> Scan:
+def localizer_of(arguments: argparse.Namespace, batch: Batch) -> Localizer:
+    """What answers the photos in one process."""
+    return Localizer(
+        tuple(arguments.cloud),
+        batch.settings,
+        batch.cloud_settings,
+        batch.read_options,
+        cache_of(arguments),
+        makes_overlays=arguments.overlay is not None,
+        makes_occlusion_masks=arguments.occlusion_mask is not None,
+    )
+
+
+def open_scan(run: Run, localizer: Localizer, num_threads: int) -> Scan:
     """Read and prepare the scan."""
-    arguments, batch = run.arguments, run.batch
+    arguments = run.arguments
     if is_first_use():
         print_note(arguments, f"first use: compiling kernels, once (about a minute), into {kernel_folder()}")
-    workers = Workers(arguments.threads, progress_bar(arguments.quiet), warn_once(arguments.quiet))
-    scan = open_files(arguments.cloud, batch.cloud_settings, batch.settings, cache_of(arguments), workers)
+    workers = Workers(num_threads, progress_bar(arguments.quiet), warn_once(arguments.quiet))
+    scan = localizer.open_scan(workers)
     for warning in scan.warnings:  # those of a map prepared earlier; others have been written
         workers.warn(warning)
+    run.cloud, run.cloud_sha256 = scan.name, scan.prepared.scan_sha256
     return scan
 
 
@@ -159,38 +179,47 @@ def write_picture(path: Path, pano: Path, png: bytes) -> None:
     write_atomically(path / f"{pano.stem}.png" if path.is_dir() else path, png)
 
 
-def report(run: Run, scan: Scan, result: Result) -> None:
-    """Write the pictures that are asked for, and say what was found."""
-    arguments = run.arguments
+def answer_of(run: Run, pair: Pair) -> Answer:
+    """What has come of a task."""
+    task, pending = pair
+    try:
+        return cast(Answer, pending.result())
+    except WorkerLostError as error:
+        text = f"{task.pano}: {error}"
+        return run.localizer.failed(task, text, run.cloud, run.cloud_sha256, task.pano)
+
+
+def record(run: Run, answer: Answer, write: Write) -> None:
+    """Write the pictures that are asked for and the result, and say what was found."""
+    arguments, result = run.arguments, answer.result
+    pictures = (arguments.overlay, answer.overlay), (arguments.occlusion_mask, answer.occlusion_mask)
+    for path, png in pictures:
+        if path and png is not None:
+            write_picture(path, Path(result.pano), png)
     if result.error is not None:
         print_error(arguments, result.error, EXIT_BAD_INPUT)
-        return
-    pano, pose = Path(result.pano), result.best_pose
-    read_options = run.batch.read_options.refined(result.cameras)
-    if arguments.overlay and pose is not None:
-        panorama = read_panorama(pano, read_options)
-        png = overlay_png(scan.points, panorama, scan.from_world(pose), scan.workers)
-        write_picture(arguments.overlay, pano, png)
-    if arguments.occlusion_mask and pose is not None:
-        mask = scan.occlusion_mask(pano, pose, read_options)
-        write_picture(arguments.occlusion_mask, pano, encode_image(mask, ".png"))
-    warnings = [f"warning: {warning}" for warning in result.warnings[len(scan.warnings) :]]
-    for line in () if arguments.quiet else (*warnings, result.summary()):
-        tqdm.write(line, file=sys.stderr)
+    elif not arguments.quiet:
+        for line in (*(f"warning: {warning}" for warning in answer.warnings), result.summary()):
+            tqdm.write(line, file=sys.stderr)
+    write(result.to_json())
+    run.counts[result.status] += 1
 
 
-def localize_all(run: Run, scan: Scan, write: Write, interruption: Interruption) -> None:
+def localize_all(run: Run, executor: Executor, write: Write) -> Interruption:
     """Localize the panoramas that are left, write each result as it comes, until a signal ends it."""
     hidden = run.arguments.quiet or run.total == 1
     bar = {"total": run.total, "initial": run.num_finished, "disable": hidden, "file": sys.stderr}
-    for pano in tqdm(run.panoramas, "panoramas", unit="", **bar):
-        with interruption.postponed() if run.total != 1 else nullcontext():
-            result = run.batch.localize(scan, pano)
-            report(run, scan, result)
-            write(result.to_json())
-            run.counts[result.status] += 1
-        if interruption.number:
-            return
+    values = executor.values(run.localizer.task(pano, run.batch.settings_of(pano)) for pano in run.panoramas)
+    with interruptible() as interruption, suppress(Stopped):
+        for pair in tqdm(values, "panoramas", unit="", **bar):
+            with interruption.postponed() if run.total != 1 else nullcontext():
+                record(run, answer_of(run, pair), write)
+            if interruption.number:
+                break
+        for pair in values.finished():  # behind the one after which a signal has ended it
+            with interruption.postponed():
+                record(run, answer_of(run, pair), write)
+    return interruption
 
 
 def finish(run: Run, interruption: Interruption, seconds: float) -> int:
@@ -220,11 +249,11 @@ def run(arguments: argparse.Namespace) -> int:
     if first is None:
         print_note(arguments, f"{arguments.out or 'nothing'}: nothing is left to do")
         return finish(run, Interruption(), 0.0)
-    scan = open_scan(run)
-    with watch.stage("all"), output(run) as write, interruptible() as interruption:
-        run.panoramas = itertools.chain([first], run.panoramas)
-        with suppress(Stopped):
-            localize_all(run, scan, write, interruption)
+    run.panoramas = itertools.chain([first], run.panoramas)
+    left = None if run.total is None else run.total - run.num_finished
+    place = executing(arguments, run.localizer, left, partial(open_scan, run))
+    with place as (executor, run.localizer), watch.stage("all"), output(run) as write:
+        interruption = localize_all(run, executor, write)
     return finish(run, interruption, watch.seconds["all"])
 
 

@@ -14,7 +14,8 @@ from ..errors import InputError
 from ..panorama import ReadOptions
 from ..panorama.model import Projection
 from ..paper.settings import Initialization, PaperSettings, PoseLoss
-from ..runtime.threads import num_cores
+from .command import check_least
+from .executing import add_execution_options
 from .parser import add_run_options, new_parser
 
 DESCRIPTION = "Find where in a coloured point cloud 360-degree panoramas were taken."
@@ -78,10 +79,7 @@ def build_parser() -> argparse.ArgumentParser:
     files.add_argument("--no-cache", action="store_true", help="prepare the map again, and do not keep it")
     add_method_options(parser)
     add_prior_options(parser)
-    text = "that may be taken (default 80 %% of what is free)"
-    parser.add_argument("--max-memory", type=float, metavar="GB", help=text)
-    text = "(default all cores)"
-    parser.add_argument("--threads", type=int, default=num_cores(), metavar="N", help=text)
+    add_execution_options(parser)
     add_run_options(parser)
     return parser
 
@@ -289,8 +287,7 @@ def paper_settings_from(arguments: argparse.Namespace, **more: Any) -> PaperSett
 
 def check_arguments(arguments: argparse.Namespace) -> None:
     """Refuse values that are wrong whatever the files hold."""
-    if arguments.threads < 1:
-        raise InputError(f"--threads: found {arguments.threads}, wanted at least 1")
+    check_least(arguments, threads=1, jobs=1)
     cloud_settings_from(arguments)
     if arguments.overwrite and not arguments.out:
         raise InputError("--overwrite: only with --out")

@@ -21,9 +21,9 @@ from ..scenes.reproduce_paper.experiments import EXPERIMENTS, Condition, Setting
 from ..scenes.scene import Scene, find_scenes
 from .command import check_least, command, option
 from .errors import EXIT_BAD_INPUT, checking_options, print_error
+from .evaluating import resumed
 from .options import PAPER_OPTIONS, add_options, paper_settings_from
 from .outputs import check_distinct, check_folder_name
-from .progress import progress_bar
 
 _EXPERIMENTS = "\n".join(f"  {name:<15} {experiment.title}" for name, experiment in EXPERIMENTS.items())
 EPILOG = f"""\
@@ -87,7 +87,7 @@ def run_condition(
         config = RunConfig(condition.settings, *reading, cache, max(1, num_cores() // arguments.jobs))
         variants = condition.variants or arguments.variants  # those of a condition are of the wanted
         run = open_run(out / file_name(condition), config, transformed, variants)
-        rows, num_failed_later = run.resume(arguments.jobs, progress_bar(arguments.quiet), report)
+        rows, num_failed_later = resumed(run, arguments)
     return rows, num_failed + num_failed_later
 
 

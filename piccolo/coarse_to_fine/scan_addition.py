@@ -157,8 +157,9 @@ def compared(
 def joined_views(old: ScanMap, octree: Octree, found: Candidates, workers: Workers) -> Views:
     """Views as of render_candidates: the map's, and those that have changed anew."""
     anew = render_candidates(octree, found.centers[found.changed], SEARCH_VIEW, workers)
+    kept: list[NDArray[Any]] = [old.offsets, old.offset_unit, old.features, old.is_seen]
     views: list[Any] = []
-    for known, rendered in zip((old.offsets, old.offset_unit, old.features, old.is_seen), anew, strict=True):
+    for known, rendered in zip(kept, anew, strict=True):
         joined = np.empty((len(found.centers), *known.shape[1:]), known.dtype)
         joined[: len(found.rows)] = known[found.rows]
         joined[found.changed] = rendered

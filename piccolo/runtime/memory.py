@@ -49,7 +49,12 @@ def memory_left() -> float:
     free = min(free_of_machine(), free_of_cgroup(), free_of_process())
     if LIMIT.num_bytes is None:
         return DEFAULT_FRACTION * free
-    return min(LIMIT.num_bytes - _of_process(1), free)
+    return min(LIMIT.num_bytes - memory_taken(), free)
+
+
+def memory_taken() -> float:
+    """Bytes of memory that this process has."""
+    return _of_process(1)
 
 
 def check_address_space() -> None:

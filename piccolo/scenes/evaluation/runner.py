@@ -1,17 +1,13 @@
-"""Localize the queries of many scenes, in this process or in several.
+"""Localize the queries of many scenes, in this process or elsewhere.
 
 A run on disk is one JSON line a query, flushed as it comes, so that a stopped run can be resumed.
 """
 
 import json
-import multiprocessing
-import queue
-import signal
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
-from multiprocessing.queues import Queue
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ...cloud.settings import CloudSettings
 from ...coarse_to_fine.open_map import CachePolicy
@@ -20,16 +16,17 @@ from ...errors import InputError
 from ...opening import open_files
 from ...panorama import ReadOptions
 from ...paper.settings import PaperSettings
+from ...result import named
 from ...runtime.atomic import check_output
 from ...runtime.json_file import parse_lines, read_bytes
 from ...runtime.line_file import appending, whole_size
+from ...runtime.tasks import Executor, WorkerLostError
 from ...runtime.threads import Progress, Workers, no_progress
-from ...scan import settings_json
+from ...scan import Scan, settings_json
 from ..scene import QUERIES_NAME, Query, Scene
 from .query_result import FORMAT, QueryResult, is_in_box, query_result_of
 
-QUERIES_PER_JOB = 32  # so that several processes can share a scene with many
-PATIENCE = 1.0  # seconds between checks that the other processes are alive
+QUERIES_PER_JOB = 8  # so that several processes can share a scene, and little is lost with one of them
 WANTED = "wanted a run of tools/evaluate.py"
 LINE_BEGINS = f'{{"format": "{FORMAT}"'.encode()
 MAX_DIFFERENCE = 1e-6  # [m], [rad] between errors of the same poses
@@ -44,6 +41,12 @@ class RunConfig:
     read_options: ReadOptions
     cache: CachePolicy
     num_threads: int  # of each process
+    folder: Path = Path()  # which paths are relative to
+
+    def opened(self) -> Callable[["Job"], tuple["QueryResult | Failure", ...]]:
+        """What runs jobs in this process, each as a whole."""
+        runner = JobRunner(self)
+        return lambda job: tuple(runner(job))
 
 
 class Job(NamedTuple):
@@ -71,100 +74,61 @@ def jobs_of(scenes: Sequence[Scene], done: Collection[tuple[str, str]], variants
     return jobs
 
 
-def run_job(config: RunConfig, job: Job, show: Progress = no_progress) -> Iterator[QueryResult | Failure]:
-    """The results of a job as they come; a Failure for what can't be read."""
-    scene, workers = job.scene, Workers(config.num_threads, show)
-    try:
-        scan = open_files([scene.cloud], config.cloud_settings, config.settings, config.cache, workers)
-    except (OSError, InputError) as error:
-        yield Failure(f"{scene.name}: {error}", len(job.queries))
-        return
-    for query in job.queries:
+class JobRunner:
+    """Runs jobs in one process; the scan of the last one stays open for the next."""
+
+    def __init__(self, config: RunConfig, show: Progress = no_progress) -> None:
+        self.config, self.workers = config, Workers(config.num_threads, show)
+        self._opened: tuple[Path, Scan] | None = None
+
+    def __call__(self, job: Job) -> Iterator[QueryResult | Failure]:
+        """The results of a job as they come; a Failure for what can't be read."""
+        scene = job.scene
         try:
-            image = query.labels if config.read_options.labels else query.image
-            if image is None:
-                raise InputError(f"{scene.folder}: {scene.name_of(query)} has no labels in queries.json")
-            options, camera = config.read_options, query.calibration
-            result = scan.localize_query(image, options, config.settings, calibration=camera)
-            yield query_result_of(scene, query, result, is_in_box(scan, query.pose))
+            scan = self._scan_of(scene.cloud)
         except (OSError, InputError) as error:
-            yield Failure(str(error), 1)
-
-
-def run(
-    config: RunConfig, jobs: Sequence[Job], num_processes: int, show: Progress = no_progress
-) -> Iterator[QueryResult | Failure]:
-    """The results of all jobs as they come, out of order if there are several processes."""
-    if num_processes == 1:
-        for job in jobs:
-            yield from run_job(config, job, show)
-    else:
-        yield from _run_in_processes(config, jobs, num_processes)
-
-
-def _run_in_processes(
-    config: RunConfig, jobs: Sequence[Job], num_processes: int
-) -> Iterator[QueryResult | Failure]:
-    context = multiprocessing.get_context("spawn")
-    todo: Queue[Job | None] = context.Queue()
-    found: Queue[QueryResult | Failure | None] = context.Queue()
-    for job in jobs:
-        todo.put(job)
-    count = min(num_processes, len(jobs))
-    for _ in range(count):
-        todo.put(None)  # no more
-    processes = [context.Process(target=_work, args=(config, todo, found), daemon=True) for _ in range(count)]
-    # Ctrl-C reaches every process: the new ones inherit that it is ignored, and this one ends them.
-    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        for process in processes:
-            process.start()
-        signal.signal(signal.SIGINT, handler)
-        yield from _collect(found, processes)
-    finally:
-        for process in processes:
-            process.terminate()
-            process.join()
-
-
-def _collect(
-    found: "Queue[QueryResult | Failure | None]", processes: Sequence[Any]
-) -> Iterator[QueryResult | Failure]:
-    """Yield from the queue until each process has put None."""
-    num_working = len(processes)
-    while num_working:
-        try:
-            value = found.get(timeout=PATIENCE)
-        except queue.Empty:
-            codes = [process.exitcode for process in processes]
-            if any(codes):
-                raise ChildProcessError(f"a process ended with code {max(filter(None, codes))}") from None
-            continue
-        if value is None:
-            num_working -= 1
-        else:
-            yield value
-
-
-def _work(config: RunConfig, todo: "Queue[Job | None]", found: "Queue[QueryResult | Failure | None]") -> None:
-    """Worker loop: runs until the queue is empty or the parent process has died."""
-    while _has_parent():
-        try:
-            job = todo.get(timeout=PATIENCE)
-        except queue.Empty:
-            continue
-        if job is None:
-            found.put(None)
+            yield Failure(f"{scene.name}: {error}", len(job.queries))
             return
-        for value in run_job(config, job):
-            if not _has_parent():
-                return
-            found.put(value)
+        for query in job.queries:
+            try:
+                yield self._result_of(scan, scene, query)
+            except (OSError, InputError) as error:
+                yield Failure(str(error), 1)
+
+    def _scan_of(self, cloud: Path) -> Scan:
+        if self._opened is None or self._opened[0] != cloud:
+            self._opened = None  # before the next is opened: two may not fit
+            config, paths = self.config, [self.config.folder / cloud]
+            scan = open_files(paths, config.cloud_settings, config.settings, config.cache, self.workers)
+            self._opened = cloud, replace(scan, name=str(cloud))
+        return self._opened[1]
+
+    def _result_of(self, scan: Scan, scene: Scene, query: Query) -> QueryResult:
+        options, camera = self.config.read_options, query.calibration
+        image = query.labels if options.labels else query.image
+        if image is None:
+            raise InputError(f"{scene.folder}: {scene.name_of(query)} has no labels in queries.json")
+        path = self.config.folder / image
+        result = scan.localize_query(path, options, self.config.settings, calibration=camera)
+        return query_result_of(scene, query, named(result, path, image), is_in_box(scan, query.pose))
 
 
-def _has_parent() -> bool:
-    parent = multiprocessing.parent_process()
-    return parent is not None and parent.is_alive()
+def run(executor: Executor, jobs: Sequence[Job]) -> Iterator[QueryResult | Failure]:
+    """The results of all jobs as they come.
+
+    Of a job whose processes were killed, each query is tried by itself, after all others.
+    """
+    alone: list[Job] = []
+    for job, pending in executor.values(iter(jobs)):
+        try:
+            yield from pending.result()
+        except WorkerLostError as error:
+            if len(job.queries) == 1:
+                yield Failure(f"{job.queries[0].image}: {error}", 1)
+            else:
+                alone += [Job(job.scene, (query,)) for query in job.queries]
+    if alone:
+        yield from run(executor, alone)
 
 
 def read_run(path: Path) -> tuple[list[QueryResult], int]:
@@ -188,7 +152,7 @@ class Run(NamedTuple):
     size: int  # of the file, up to its last whole line [byte]
 
     def resume(
-        self, num_processes: int, show: Progress, report: Callable[[str], object]
+        self, executor: Executor, show: Progress, report: Callable[[str], object]
     ) -> tuple[list[QueryResult], int]:
         """All queries, old and new, and how many failed; `report` gets a line for each failure.
 
@@ -199,7 +163,7 @@ class Run(NamedTuple):
             return rows, num_failed
         num_left = sum(len(job.queries) for job in self.jobs)
         with appending(self.path, self.size) as append:
-            for found in show(run(self.config, self.jobs, num_processes, show), num_left, "queries"):
+            for found in show(run(executor, self.jobs), num_left, "queries"):
                 if isinstance(found, Failure):
                     report(found.text)
                     num_failed += found.num_queries

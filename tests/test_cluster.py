@@ -1,0 +1,181 @@
+"""Batches on a Dask cluster: the same files, whichever worker is killed; on 127.0.0.1 only."""
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from rooms import write_room
+
+from piccolo.cli import evaluate, localize
+from piccolo.runtime import cluster
+
+ROOT = Path(__file__).resolve().parents[1]
+PAPER = ["--preset", "paper", "--num-translations", "4", "--num-iterations", "5", "--max-points", "5000"]
+NUM_PHOTOS = 24
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A scene of a few photos under many names."""
+    words = "--seed 7 --size 4.5 3.5 2.5 --points 60000 --panoramas 2 --width 512"
+    folder = write_room(tmp_path_factory.mktemp("a cluster"), words)
+    document = json.loads((folder / "queries.json").read_text())
+    queries = []
+    for k in range(NUM_PHOTOS):
+        query = document["queries"][k % 2]
+        (folder / "images" / f"{k:02d}.jpg").hardlink_to(folder / query["image"])
+        queries.append({**query, "image": f"images/{k:02d}.jpg"})
+    for name in ("clean_0.jpg", "clean_1.jpg"):
+        (folder / "images" / name).unlink()
+    (folder / "queries.json").write_text(json.dumps({**document, "queries": queries}))
+    return folder
+
+
+def _dask(log, *words):
+    """A part of a cluster, which sees piccolo, at work in another folder."""
+    log.parent.mkdir(exist_ok=True)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "dask", *words, "--host", "127.0.0.1", "--no-dashboard"]
+    with log.open("w") as file:
+        return subprocess.Popen(
+            command, cwd=log.parent, env=environment, stdout=file, stderr=subprocess.STDOUT
+        )
+
+
+@pytest.fixture(scope="module")
+def scheduler(tmp_path_factory):
+    """The file of a scheduler with two workers."""
+    folder = tmp_path_factory.mktemp("elsewhere")
+    file = folder / "scheduler.json"
+    begun = [_dask(folder / "log" / "s", "scheduler", "--port", "0", "--scheduler-file", str(file))]
+    while not file.exists() or not file.read_text().endswith("}"):
+        assert begun[0].poll() is None
+        time.sleep(0.05)
+    words = "worker", "--scheduler-file", str(file), "--nworkers", "2", "--nthreads", "1"
+    begun.append(_dask(folder / "log" / "w", *words, "--local-directory", str(folder)))
+    yield file
+    for process in reversed(begun):
+        process.terminate()
+        process.wait()
+
+
+def _untimed(out):
+    return re.sub(r'"seconds": {[^}]*}', "", out.read_text())
+
+
+def _wait_for_lines(process, out, count):
+    while not out.exists() or out.read_bytes().count(b"\n") < count:
+        assert process.poll() is None
+        time.sleep(0.01)
+
+
+def _whole(scene, tmp_path, *preset):
+    """The results by one process, the paths relative to the scene."""
+    out = tmp_path / "whole.jsonl"
+    words = ["--cloud", "cloud.ply", "--pano", "missing.jpg", "images", "--quiet", *preset]
+    assert localize.main([*words, "--out", str(out), "--jobs", "1"]) == 3
+    return words, _untimed(out)
+
+
+def test_a_local_cluster_writes_the_same_file_though_a_worker_is_killed(scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(scene)
+    words, expected = _whole(scene, tmp_path, *PAPER)
+    out = tmp_path / "poses.jsonl"
+    words += ["--out", str(out), "--dask", "local", "--jobs", "2"]
+    command = [sys.executable, str(ROOT / "localize.py"), *words]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        _wait_for_lines(process, out, 3)
+        children = Path(f"/proc/{process.pid}/task").glob("*/children")
+        ids = [int(word) for path in children for word in path.read_text().split()]
+        workers = [id_ for id_ in ids if b"spawn_main" in Path(f"/proc/{id_}/cmdline").read_bytes()]
+        os.kill(workers[0], signal.SIGKILL)
+        err = process.stderr.read()
+        assert process.wait() == 3
+    assert len(workers) == 2
+    assert err.count("\n") == 1  # the missing photo
+    assert _untimed(out) == expected
+
+
+def test_ctrl_c_ends_a_local_cluster_and_the_same_command_goes_on(scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(scene)
+    words, expected = _whole(scene, tmp_path, *PAPER)
+    out = tmp_path / "poses.jsonl"
+    words += ["--out", str(out), "--dask", "local", "--jobs", "2"]
+    command = [sys.executable, str(ROOT / "localize.py"), *words]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+        _wait_for_lines(process, out, 3)
+        os.killpg(process.pid, signal.SIGINT)
+        err = process.stderr.read()
+        assert process.wait() == 130
+    assert "the same command goes on from here" in err
+    assert "Traceback" not in err
+    assert 3 <= out.read_text().count("\n") < NUM_PHOTOS
+    command[-4:] = ["--jobs", "1"]
+    assert subprocess.run(command, check=False, stderr=subprocess.PIPE).returncode == 3
+    assert _untimed(out) == expected
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_workers_elsewhere_open_the_scan_or_are_sent_it(scene, scheduler, tmp_path, monkeypatch, shared):
+    monkeypatch.chdir(scene)
+    preset = ["--gravity", "known"]
+    names = [f"images/{k:02d}.jpg" for k in range(3)]
+    words = ["--cloud", "cloud.ply", "--pano", "missing.jpg", *names, "--quiet", *preset]
+    whole, out = tmp_path / "whole.jsonl", tmp_path / "poses.jsonl"
+    assert localize.main([*words, "--out", str(whole), "--jobs", "1"]) == 3
+    if not shared:
+        monkeypatch.setattr(cluster.Cluster, "has_files", lambda *_: False)
+    assert localize.main([*words, "--out", str(out), "--dask", str(scheduler)]) == 3
+    assert _untimed(out) == _untimed(whole)
+    assert list(scheduler.parent.rglob("*.piccolo-map")) == []  # what was sent is gone
+    if not shared:
+        paper = [word for word in words if word not in preset]
+        assert (
+            localize.main([*paper, *PAPER, "--overwrite", "--out", str(out), "--dask", str(scheduler)]) == 3
+        )
+
+
+def test_an_evaluation_on_a_cluster_gives_the_same(scene, scheduler, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(scene.parent)
+    words = ["--scenes", scene.name, "--quiet", *PAPER]
+    outs = [tmp_path / name for name in ("whole.jsonl", "run.jsonl")]
+    for out, more in zip(outs, ([], ["--dask", str(scheduler)]), strict=True):
+        assert evaluate.main([*words, "--out", str(out), *more]) == 0
+    assert _untimed(outs[0]) == _untimed(outs[1])
+    monkeypatch.setattr(cluster.Cluster, "has_files", lambda *_: False)
+    assert evaluate.main([*words, "--out", str(tmp_path / "c"), "--dask", str(scheduler)]) == 3
+    assert "not all workers see" in capsys.readouterr().err
+
+
+def test_a_cluster_that_is_none_is_told_in_one_line(scene, tmp_path, monkeypatch, capsys):
+    words = ["--cloud", str(scene / "cloud.ply"), "--pano", str(scene / "images"), "--quiet"]
+    damaged = tmp_path / "scheduler.json"
+    damaged.write_text("{}")
+    monkeypatch.setattr(cluster, "TIMEOUT", 0.2)
+    with socket.create_server(("127.0.0.1", 0)) as silent, socket.create_server(("127.0.0.1", 0)) as closed:
+        port = closed.getsockname()[1]
+        closed.close()
+        silent_port = silent.getsockname()[1]
+        for address in (f"127.0.0.1:{silent_port}", f"tcp://127.0.0.1:{port}", "127.0.0.1:x", str(damaged)):
+            assert localize.main([*words, "--dask", address]) == 3
+            err = capsys.readouterr().err
+            assert err.startswith(f"localize.py: --dask {address}: no scheduler answers there within")
+            assert err.count("\n") == 1
+    for more, message in (
+        (["--jobs", "2"], "--jobs: not with --dask x"),
+        (["--mask", "a.png"], "--mask a.png: wanted an absolute path"),
+    ):
+        assert localize.main([*words, "--dask", "x", *more]) == 2
+        assert message in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert localize.main([*words, "--dask", "local"]) == 3
+    err = capsys.readouterr().err
+    assert "--dask: needs distributed" in err
+    assert "pip install 'piccolo-localize[distributed]'" in err

@@ -1,0 +1,150 @@
+"""Items worked on in processes, some of which are killed."""
+
+import os
+import queue
+import signal
+import subprocess
+import sys
+import time
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from piccolo.errors import InputError
+from piccolo.runtime.processes import IN_FLIGHT, Processes
+from piccolo.runtime.tasks import Here, WorkerLostError
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def _die():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _square(folder, item):
+    """The square; 5 kills its process always, 7 once, and 9 is an error."""
+    if item == 5 or (item == 7 and not (folder / "seven").exists()):
+        (folder / "seven").touch()
+        _die()
+    if item == 9:
+        raise InputError("nine")
+    return item * item
+
+
+def _squares(folder):
+    return partial(_square, folder)
+
+
+def _told():
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    return lambda item: (os.environ[item], signal.SIGINT in blocked, signal.SIGTERM in blocked)
+
+
+def _refused():
+    raise InputError("no scan")
+
+
+def _sleeping():
+    os.write(1, f"{os.getpid()}\n".encode())
+    return time.sleep
+
+
+def _outcome(pending):
+    try:
+        return pending.result()
+    except (InputError, WorkerLostError) as error:
+        return f"{type(error).__name__}: {error}"
+
+
+def test_values_come_in_order_and_a_killed_process_costs_one_at_most(tmp_path):
+    lost = "WorkerLostError: each of 2 processes at work on it was killed by SIGKILL"
+    expected = [k * k for k in range(12)]
+    expected[5], expected[9] = lost, "InputError: nine"
+    with closing(Processes(partial(_squares, tmp_path), 2)) as processes:
+        pairs = [(item, _outcome(pending)) for item, pending in processes.values(iter(range(12)))]
+    assert pairs == list(enumerate(expected))
+    (tmp_path / "seven").touch()
+    here = Here(_squares(tmp_path)).values(iter([1, 9, 2]))
+    assert [_outcome(pending) for _, pending in here] == [1, "InputError: nine", 4]
+    assert list(here.finished()) == []
+
+
+def test_an_error_brings_its_traceback(tmp_path):
+    with closing(Processes(partial(_squares, tmp_path), 1)) as processes:
+        ((_, pending),) = processes.values(iter([9]))
+        with pytest.raises(InputError, match="nine") as error:
+            pending.result()
+    assert "in _square" in error.value.__notes__[0]
+
+
+def test_few_items_are_under_way_and_one_awaited_keeps_nobody(tmp_path):
+    names, taken = queue.SimpleQueue(), []
+
+    def items():
+        while (item := names.get()) is not None:
+            taken.append(item)
+            yield item
+
+    with closing(Processes(partial(_squares, tmp_path), 1)) as processes:
+        values = processes.values(items())
+        pairs = iter(values)
+        for item in (2, 3):  # each is answered before the next is there
+            names.put(item)
+            found, pending = next(pairs)
+            assert (found, pending.result()) == (item, item * item)
+        for item in range(10, 110):
+            names.put(item)
+        names.put(None)
+        _, pending = next(pairs)
+        assert pending.result() == 100
+        assert len(taken) <= 2 + IN_FLIGHT + 2
+        assert [pending.result() for _, pending in pairs] == [k * k for k in range(11, 110)]
+
+
+def test_what_is_done_behind_the_last_value_taken_can_be_had(tmp_path):
+    with closing(Processes(partial(_squares, tmp_path), 1)) as processes:
+        values = processes.values(iter([1, 2, 3, 4]))
+        next(iter(values))
+        values._pairs[2][1].result()  # the last; a process works in order
+        assert [(item, pending.result()) for item, pending in values.finished()] == [(2, 4), (3, 9), (4, 16)]
+
+
+def test_processes_have_their_threads_and_leave_signals_to_their_parent():
+    with closing(Processes(_told, 1, num_threads=3)) as processes:
+        names = ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"]
+        found = [pending.result() for _, pending in processes.values(iter(names))]
+    assert found == [(os.environ.get(name, "3"), True, True) for name in names]
+
+
+def test_the_first_process_of_all_leaves_signals_to_its_parent_too():
+    code = (
+        "import test_processes as t; t.test_processes_have_their_threads_and_leave_signals_to_their_parent()"
+    )
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True)
+
+
+@pytest.mark.parametrize(
+    ("opening", "message"),
+    [(_refused, "no scan"), (_die, "a process was killed by SIGKILL while it opened the scan")],
+)
+def test_what_cannot_be_opened_is_an_error(opening, message):
+    with closing(Processes(opening, 1)) as processes:
+        ((_, pending),) = processes.values(iter([1]))
+        with pytest.raises(InputError, match=message):
+            pending.result()
+
+
+def test_processes_end_with_a_parent_that_is_killed():
+    code = "import test_processes as t; from piccolo.runtime.processes import Processes\n"
+    code += "for _, p in Processes(t._sleeping, 1).values(iter([600])): p.result()"
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}
+    with subprocess.Popen(
+        [sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True
+    ) as parent:
+        worker = int(parent.stdout.readline())
+        parent.kill()
+        assert parent.stdout.read() == ""  # until the worker, which has it open too, has ended
+    assert not Path(f"/proc/{worker}/exe").exists()
