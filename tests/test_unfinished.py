@@ -13,6 +13,7 @@ import pytest
 import rooms
 
 from piccolo.cli import prepare_map as prepare_command
+from piccolo.cli import progress
 from piccolo.cloud.settings import CloudSettings
 from piccolo.coarse_to_fine.map_file import load_map
 from piccolo.coarse_to_fine.open_map import CachePolicy, open_map
@@ -164,7 +165,7 @@ def test_a_killed_command_goes_on_and_leaves_nothing(tmp_path, number):
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     out, parts = tmp_path / "a.map", unfinished.parts_folder()
     command = ["--cloud", str(room / "cloud.ply"), "--out", str(out), "--name", str(number)]
-    known = set(parts.glob("*.part"))
+    known = set(parts.glob("*"))
     killed = subprocess.Popen([sys.executable, "-c", KILLED, *command], env=env, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 120.0
     while len(set(parts.glob("*.part")) - known) < 12 and killed.poll() is None:
@@ -175,9 +176,25 @@ def test_a_killed_command_goes_on_and_leaves_nothing(tmp_path, number):
     assert not out.exists()
     assert len(set(parts.glob("*.part")) - known) >= 12
     assert prepare_command.main([*command, "--quiet"]) == 0
-    assert not set(parts.glob("*")) - known - {parts / "CACHEDIR.TAG"} - set(parts.glob(".*"))
+    assert not set(parts.glob("*")) - known - {parts / "CACHEDIR.TAG"}
     resumed = out.read_bytes()
     out.unlink()
     assert prepare_command.main([*command, "--quiet"]) == 0
     assert out.read_bytes() == resumed
     assert load_map(out).scan_names == (str(number),)
+
+
+def test_progress_says_step_and_time_left(capsys, monkeypatch):
+    monkeypatch.setattr(progress, "DELAY", 0.0)
+    show = progress.progress_bar(is_quiet=False)
+    for label, title in (("find features", "prepare, 3 of 4: find features: "), ("write", "write: ")):
+        shown = show(iter([1, 2]), 2, label)
+        next(shown)
+        time.sleep(0.2)
+        next(shown)
+        assert list(shown) == []
+        printed = capsys.readouterr().err
+        assert title in printed
+        assert " left" in printed
+    assert list(show(iter([1]), None, "read")) == [1]
+    assert "read: 0 in 00:00" in capsys.readouterr().err

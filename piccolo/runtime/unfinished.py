@@ -87,10 +87,11 @@ class Unfinished:
                 file.write(digest)
 
     def finish(self) -> None:
-        """Remove all parts: the work is done."""
-        path = self._path("0") if self.is_begun else None
-        for part in path.parent.glob(f"{path.name.partition('-')[0]}-*.part") if path else ():
-            part.unlink(missing_ok=True)
+        """Remove all parts, also half written ones: the work is done."""
+        if self.is_begun and (path := self._path("")):
+            prefix = path.name.partition("-")[0]
+            for part in (*path.parent.glob(f"{prefix}-*"), *path.parent.glob(f".{prefix}-*")):
+                part.unlink(missing_ok=True)
 
 
 class Stage:
