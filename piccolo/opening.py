@@ -130,7 +130,7 @@ def scan_of(
     prepared: ScanMap | PaperMap
     if isinstance(settings, CoarseToFineSettings):
         up = up_axis(cloud_settings, settings)
-        prepared = prepare_map(cloud, workers, up, watch, prior=settings.prior)
+        prepared = prepare_map(cloud, workers, up, watch, prior=settings.prior, has_features=False)
     else:
         with watch.stage("read"):
             points = cloud.read()

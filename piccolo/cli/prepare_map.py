@@ -6,6 +6,7 @@ import json
 from ..coarse_to_fine.map_file import save_map
 from ..coarse_to_fine.named_scans import check_name, named
 from ..coarse_to_fine.open_map import CachePolicy, extended_map, open_map
+from ..coarse_to_fine.scan_map import with_features
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers, num_cores
 from ..runtime.unfinished import Unfinished
@@ -57,10 +58,11 @@ def main(arguments: argparse.Namespace) -> int:
     if arguments.add:
         scan_map = extended_map(arguments.add, arguments.cloud, cloud_settings, name, workers, watch)
     else:
-        scan_map = open_map(arguments.cloud, cloud_settings, CachePolicy(is_used=False), workers, watch)
+        how = CachePolicy(is_used=False), workers, watch
+        scan_map = open_map(arguments.cloud, cloud_settings, *how, has_features=True)
         if arguments.name is not None or not scan_map.scan_names:  # a map keeps its names
             scan_map = named(scan_map, name)
-    save_map(scan_map, arguments.out)
+    save_map(with_features(scan_map, workers), arguments.out)
     work.finish()
     seconds = {stage: round(seconds, 3) for stage, seconds in watch.seconds.items()}
     counts = {"points": len(scan_map.points), "candidates": len(scan_map.centers)}

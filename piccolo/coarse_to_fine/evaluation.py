@@ -98,6 +98,6 @@ def is_mirrored(query: Query, evidence: Evidence) -> bool:
         evidence.score >= ENOUGH_EXPLAINED or evidence.num_matches is None
     ):  # a clear whole view has been asked
         return False
-    matches = match(query.keypoints.mirrored(), query.scan_map.local_features, query.workers)
+    matches = match(query.keypoints.mirrored(), query.scan_map.features_now(query.workers), query.workers)
     found = poses_of(matches, None, 1, query.workers)
     return len(found) > 0 and found[0].num_matches > max(MIRROR_RATIO * evidence.num_matches, SURE_MATCHES)

@@ -23,10 +23,10 @@ from ..runtime.array_archive import MappedArchive, write_archive
 from ..runtime.atomic import replacing
 from ..runtime.file_facts import recall, remember
 from .map_validation import LAYOUT, check_arrays, clean_warnings
-from .scan_map import ScanMap
+from .scan_map import ScanMap, with_late_features
 
 FORMAT = "piccolo-map/6"
-OTHERS = ("octree", "local_features", "scan_names", "warnings", "crs", "is_partial", "whole")
+OTHERS = ("octree", "local_features", "scan_names", "warnings", "crs", "is_partial", "whole", "late")
 ARRAYS = [f.name for f in fields(ScanMap) if f.name not in OTHERS]
 MEMBERS = {*LAYOUT, "format", "scan_names", "warnings"}
 WANTED = "wanted a whole map by tools/prepare_map.py"
@@ -85,7 +85,7 @@ def load_map(path: Path, remembers: bool = False) -> ScanMap:
                 remember(what, status, "")
         warnings = clean_warnings(path, arrays["warnings"])
     own: dict[str, Any] = {name: arrays[name] for name in ARRAYS if name not in ("has_labels", "scan_sha256")}
-    return ScanMap(
+    scan_map = ScanMap(
         octree=Octree(
             nodes=arrays["octree_nodes"],
             first_child=arrays["octree_first_child"],
@@ -100,3 +100,4 @@ def load_map(path: Path, remembers: bool = False) -> ScanMap:
         crs=arrays["crs"].tobytes().decode(),
         **own,
     )
+    return with_late_features(scan_map) if scan_map.lacks_features else scan_map

@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -16,6 +17,7 @@ from ..cloud.soa import LocalCloud, pack_points
 from ..errors import InputError
 from ..geometry.pose import rotate_points
 from ..gravity import R_z_from_axis
+from ..local_features.feature_map import FeatureMap
 from ..runtime.cache import cache_root, in_words, mark_used, own_folder, own_names
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
@@ -23,7 +25,7 @@ from ..runtime.unfinished import Unfinished
 from .map_file import FORMAT, is_map_file, load_map, save_map
 from .named_scans import named
 from .scan_addition import add_scan
-from .scan_map import ScanMap, prepare_map
+from .scan_map import ScanMap, prepare_map, with_features
 from .settings import NOTHING_KNOWN, Prior
 
 NAME = own_names("piccolo-map")
@@ -47,10 +49,12 @@ def open_map(
     workers: Workers,
     watch: Stopwatch,
     prior: Prior = NOTHING_KNOWN,
+    has_features: bool = False,
 ) -> ScanMap:
     """The map of a cloud's files: prepared already, from the cache, or built now.
 
     A prepared map may stand in place of the files. The prior is asked where the scan is too large as a whole.
+    Local features come late, and into the cache then, unless `has_features`.
     What is built for the cache goes on where a killed process stood; without it only with `workers.work`,
     whose parts the caller removes.
     """
@@ -71,7 +75,8 @@ def open_map(
     def build() -> ScanMap:
         with watch.stage("read"):
             cloud = open_cloud(paths, cloud_settings, workers.show)
-        scan_map = prepare_map(cloud, workers, cloud_settings.up, watch, prior=prior)
+        how = cloud_settings.up, watch
+        scan_map = prepare_map(cloud, workers, *how, prior=prior, has_features=has_features)
         has_labels = cloud_settings.labels is not None
         return replace(scan_map, has_labels=has_labels, scan_sha256=digest, crs=crs_of(paths))
 
@@ -117,6 +122,7 @@ def extended_map(
     check_labels(map_path, old, cloud_settings)
     if crs and old.crs and crs != old.crs:
         workers.warn(f"{paths[0]}: names another coordinate system than the map, whose is taken for both")
+    old = with_features(old, workers)
     old = old if old.scan_names else named(old, map_path.stem)
     both = "\n".join(sorted([old.scan_sha256, digest]))
     added = add_scan(old, cloud, name, workers, watch)
@@ -178,7 +184,7 @@ def cached_map(
                 mark_used(path)
                 scan_map = load_map(path, remembers=True)
             if scan_map.scan_sha256 == scan_sha256:
-                return scan_map, ""
+                return kept_late(scan_map, path), ""
             warning = f"{path}: found the map of another scan; it is made anew"
     except InputError as error:
         warning = f"{error}; it is made anew"
@@ -192,7 +198,27 @@ def cached_map(
             save_map(scan_map, path)
     except OSError as error:
         warning = f"{kept_in}: {error.strerror or error}; the prepared map is not kept"
-    return scan_map, warning
+        return scan_map, warning
+    return kept_late(scan_map, path), warning
+
+
+def kept_late(scan_map: ScanMap, path: Path) -> ScanMap:
+    """The same; when its local features are made, the map is written once more, with them."""
+
+    def look() -> FeatureMap | None:
+        with suppress(OSError, InputError):
+            found = load_map(path, remembers=True)
+            if found.scan_sha256 == scan_map.scan_sha256 and not found.lacks_features:
+                return found.local_features
+        return None
+
+    def keep(features: FeatureMap) -> None:
+        with suppress(OSError):  # they are made again by the next process
+            save_map(replace(scan_map, local_features=features), path)
+
+    if scan_map.late:
+        scan_map.late.keep_by(look, keep, f"features of {path.name}")
+    return scan_map
 
 
 def open_points(paths: Sequence[Path], settings: CloudSettings, workers: Workers) -> LocalCloud:

@@ -94,7 +94,7 @@ class Query:
         """The photo's keypoints and the features of the map that look alike; none if they are not needed."""
         if not self.by_features:
             return NO_MATCHES
-        return match(self.keypoints, self.scan_map.local_features, self.workers)
+        return match(self.keypoints, self.scan_map.features_now(self.workers), self.workers)
 
     @cached_property
     def photo(self) -> Texels:

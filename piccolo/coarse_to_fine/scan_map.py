@@ -1,8 +1,8 @@
 """What is prepared once per cloud: octree, places where a camera can be, and what it sees from each."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from ..runtime.unfinished import Unfinished
 from .camera_positions import BLOCK, COARSE_SPACING, Ball, TooManyPositionsError, candidate_centers
+from .late_features import LateFeatures
 from .settings import NOTHING_KNOWN, Prior
 from .view import ViewConfig, render_block, thread_scratch
 
@@ -48,7 +49,7 @@ class ScanMap:
     sparse: NDArray[np.int64]  # candidates of which no two share a cell of the coarse grid
     wide_features: NDArray[np.int8]  # (sparse, 3 * wide cells) means over wider cells, for SO(3)
     wide_seen: NDArray[np.uint8]  # (sparse, wide cells) fraction seen of each, 255 for all
-    local_features: FeatureMap
+    local_features: FeatureMap  # none of any view where they are made late; asked for by `features_now`
     has_labels: bool = False  # colours are those of labels
     scan_names: tuple[str, ...] = ()  # of the scans put together; none if none was named
     warnings: tuple[str, ...] = ()
@@ -56,6 +57,7 @@ class ScanMap:
     crs: str = ""  # coordinate system that the scan's file names, as WKT or EPSG:code; empty if none
     is_partial: bool = False  # of a scan too large as a whole: candidates where a prior asks; not in files
     whole: "ScanMap | None" = None  # with all candidates, of a map narrowed by a prior; not in files
+    late: LateFeatures | None = None  # of a map that was prepared without local features; not in files
 
     @cached_property
     def points(self) -> PackedPoints:
@@ -66,6 +68,15 @@ class ScanMap:
     def coarse_points(self) -> PackedPoints:
         """The same from voxels four times as wide: enough for views of a few degrees."""
         return _as_points(self.octree.level(4.0 * self.octree.leaf_size))
+
+    @property
+    def lacks_features(self) -> bool:
+        """True if no view was looked at for local features, though there are some."""
+        return len(self.local_features.view_centers) == 0 < len(self.centers)
+
+    def features_now(self, workers: Workers) -> FeatureMap:
+        """The local features, made now where they are late."""
+        return self.late.get(workers) if self.late else self.local_features
 
     def to_world(self, pose: Pose) -> Pose:
         """A pose of the map's frame in the world."""
@@ -96,6 +107,7 @@ def render_candidates(
     check_memory(num_bytes, f"the scan: {len(centers)} prepared views", "cut out a part of it")
     offsets, unit = np.empty((len(centers), 3, cells), np.int16), np.empty(len(centers), np.float32)
     levels, is_seen = np.empty((len(centers), 3, cells), np.int8), np.empty((len(centers), cells), np.bool_)
+    wholes: list[NDArray[Any]] = [offsets, unit, levels, is_seen]
     view, begins = config.arrays, range(0, len(centers), BLOCK)
 
     def run(lo: int) -> Views:
@@ -105,7 +117,7 @@ def render_candidates(
         return out
 
     for lo, found in zip(begins, workers.collect(run, begins, label, centers), strict=True):
-        for whole, part in zip((offsets, unit, levels, is_seen), found, strict=True):
+        for whole, part in zip(wholes, found, strict=True):
             whole[lo : lo + BLOCK] = part  # what was made before; the rest is there
     return offsets, unit, levels, is_seen
 
@@ -225,8 +237,9 @@ def prepare_map(
     watch: Stopwatch | None = None,
     view: ViewConfig = SEARCH_VIEW,
     prior: Prior = NOTHING_KNOWN,
+    has_features: bool = True,
 ) -> ScanMap:
-    """Everything about a cloud that does not depend on the panorama.
+    """Everything about a cloud that does not depend on the panorama; local features may come late.
 
     Of a scan too large as a whole, what the prior allows; TooManyPositionsError if it names no place.
     """
@@ -241,9 +254,8 @@ def prepare_map(
         offsets, unit, levels, is_seen = render_candidates(octree, centers, view, workers)
         sparse = sparse_candidates(centers)
         wide_features, wide_seen = widen(levels, is_seen, sparse)
-        chosen = view_positions(centers, ranges_of(offsets, unit, is_seen), view.num_rings)
-        local_features = make_feature_map(octree, centers[chosen], workers)
-    return ScanMap(
+        local_features = make_feature_map(octree, centers[:0], workers)
+    scan_map = ScanMap(
         octree=octree,
         R_map_from_world=aligned.R_map_from_world,
         origin_world=aligned.origin_world,
@@ -260,3 +272,24 @@ def prepare_map(
         warnings=aligned.warnings + notes,
         is_partial=bool(notes),
     )
+    if not has_features:
+        return with_late_features(scan_map, view)
+    with watch.stage("prepare"):
+        return replace(scan_map, local_features=find_local_features(scan_map, view, workers))
+
+
+def find_local_features(scan_map: ScanMap, view: ViewConfig, workers: Workers) -> FeatureMap:
+    """The features of the views from few of a map's candidates, chosen by what they see."""
+    m = scan_map
+    chosen = view_positions(m.centers, ranges_of(m.offsets, m.offset_unit, m.is_seen), view.num_rings)
+    return make_feature_map(m.octree, m.centers[chosen], workers)
+
+
+def with_features(scan_map: ScanMap, workers: Workers) -> ScanMap:
+    """A map that has its local features."""
+    return replace(scan_map, local_features=scan_map.features_now(workers), late=None)
+
+
+def with_late_features(scan_map: ScanMap, view: ViewConfig = SEARCH_VIEW) -> ScanMap:
+    """A map without local features, which makes them when they are first asked for."""
+    return replace(scan_map, late=LateFeatures(lambda workers: find_local_features(scan_map, view, workers)))

@@ -1,0 +1,39 @@
+"""The local features of a map, made when a photo first needs them: many photos never do."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+
+from ..local_features.feature_map import FeatureMap
+from ..runtime.threads import Workers
+from ..runtime.unfinished import Unfinished
+
+
+class LateFeatures:
+    """Local features that are made once; threads that ask meanwhile wait."""
+
+    def __init__(self, make: Callable[[Workers], FeatureMap]) -> None:
+        self._make = make
+        self._look: Callable[[], FeatureMap | None] = lambda: None
+        self._keep: Callable[[FeatureMap], None] = lambda features: None
+        self._key = ""
+        self._made: FeatureMap | None = None
+        self._lock = threading.Lock()
+
+    def keep_by(
+        self, look: Callable[[], FeatureMap | None], keep: Callable[[FeatureMap], None], key: str
+    ) -> None:
+        """Look first for what another process has kept; keep what is made. A key tells unfinished work."""
+        self._look, self._keep, self._key = look, keep, key
+
+    def get(self, workers: Workers) -> FeatureMap:
+        """The features, made now if nobody has."""
+        with self._lock:
+            if self._made is None:
+                self._made = self._look()
+            if self._made is None:
+                work = Unfinished(self._key)
+                self._made = self._make(replace(workers, work=work))
+                self._keep(self._made)
+                work.finish()
+            return self._made

@@ -1,0 +1,124 @@
+"""Local features that are made when a photo first needs them, by whom, and what is kept of them."""
+
+import threading
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import rooms
+
+from piccolo.cloud.settings import IN_METRES
+from piccolo.coarse_to_fine import late_features, open_map, scan_map
+from piccolo.coarse_to_fine.late_features import LateFeatures
+from piccolo.coarse_to_fine.map_file import load_map, save_map
+from piccolo.coarse_to_fine.open_map import CachePolicy
+from piccolo.opening import open_scan
+from piccolo.runtime.stopwatch import Stopwatch
+from piccolo.runtime.threads import Workers
+
+WORKERS = Workers(2)
+
+
+@pytest.fixture
+def finding(monkeypatch):
+    """Counts how often features are looked for; they are those of the room."""
+    asked = []
+    found = rooms.scan_map(1).local_features
+    monkeypatch.setattr(scan_map, "find_local_features", lambda *_: asked.append(1) or found)
+    return asked
+
+
+@pytest.fixture
+def opened(tmp_path):
+    folder = rooms.write_room(tmp_path / "room", "--seed 3 --points 40000 --panoramas 1")
+    cache = CachePolicy(folder=tmp_path / "cache")
+
+    def open_it():
+        return open_map.open_map([folder / "cloud.ply"], IN_METRES, cache, WORKERS, Stopwatch())
+
+    return open_it
+
+
+def test_late_features_are_those_of_a_map_that_has_them():
+    whole = rooms.scan_map(1)
+    late = scan_map.with_late_features(replace(whole, local_features=None))
+    for own, other in zip(late.features_now(WORKERS), whole.local_features, strict=True):
+        np.testing.assert_array_equal(own, other)
+
+
+def test_they_are_made_once_and_threads_wait_for_them():
+    made, threads, got = [], [], []
+    started, go_on = threading.Event(), threading.Event()
+
+    def make(workers):
+        made.append(workers)
+        started.set()
+        assert go_on.wait(60)
+        return "features"
+
+    late = LateFeatures(make)
+    for _ in range(3):
+        threads.append(threading.Thread(target=lambda: got.append(late.get(WORKERS))))
+        threads[-1].start()
+    assert started.wait(60)
+    go_on.set()
+    for thread in threads:
+        thread.join(60)
+    assert (got, len(made)) == (["features"] * 3, 1)
+
+
+def test_the_cache_keeps_them_for_the_next_process(opened, finding):
+    first = opened()
+    assert first.lacks_features
+    first.features_now(WORKERS)
+    assert finding == [1]
+    other = opened()
+    assert not other.lacks_features
+    np.testing.assert_array_equal(other.features_now(WORKERS).points, first.features_now(WORKERS).points)
+    assert finding == [1]
+
+
+def test_what_another_process_has_made_meanwhile_is_taken(opened, finding):
+    first, second = opened(), opened()
+    first.features_now(WORKERS)
+    second.features_now(WORKERS)
+    assert finding == [1]
+
+
+def test_where_they_can_not_be_kept_they_are_there_all_the_same(opened, finding, monkeypatch):
+    found = opened()
+    monkeypatch.setattr(open_map, "save_map", lambda *_: (_ for _ in ()).throw(OSError(28, "full")))
+    assert len(found.features_now(WORKERS).points) > 1000
+    assert opened().lacks_features
+
+
+def test_unfinished_work_is_told_by_its_key_and_removed(monkeypatch):
+    finished = []
+    monkeypatch.setattr(
+        late_features, "Unfinished", lambda key: SimpleNamespace(finish=lambda: finished.append(key))
+    )
+    late = LateFeatures(lambda workers: workers.work)
+    late.keep_by(lambda: None, lambda made: None, "a key")
+    assert late.get(WORKERS).finish.__name__ == "<lambda>"
+    assert finished == ["a key"]
+
+
+def test_a_map_file_without_them_makes_them_too(tmp_path, finding):
+    """As it is sent to the workers of a cluster."""
+    whole = rooms.scan_map(1)
+    none = scan_map.make_feature_map(whole.octree, whole.centers[:0], WORKERS)
+    save_map(replace(whole, local_features=none), tmp_path / "a.map")
+    loaded = load_map(tmp_path / "a.map")
+    assert loaded.lacks_features
+    assert len(loaded.features_now(WORKERS).points) > 1000
+    assert finding == [1]
+
+
+def test_a_scan_of_arrays_is_opened_without_them(finding):
+    cloud = rooms.room(1)[1]
+    scan = open_scan(cloud.points.astype(float), cloud.colors, num_threads=2)
+    assert scan.prepared.lacks_features
+    assert finding == []
+    scan.localize(rooms.query(1).rgb, gravity="unknown")
+    assert finding == [1]
