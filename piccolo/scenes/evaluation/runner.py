@@ -168,8 +168,9 @@ class Run(NamedTuple):
                     report(found.text)
                     num_failed += found.num_queries
                 else:
-                    append(found.to_json())
-                    rows.append(found)
+                    line = found.to_json()
+                    append(line)
+                    rows.append(QueryResult.from_json(line))  # as whoever reads the file has it
         return rows, num_failed
 
 
