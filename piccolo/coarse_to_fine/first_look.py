@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..confidence.alternatives import Hypothesis
+from .config import Beam
 from .query import Query
 from .refinement import first_score
 from .search import search_poses
@@ -21,11 +22,18 @@ WHOLE = 0.9  # of the sphere that the photo shows, at least
 CLEAR_SCORE, CLEAR_MARGIN = 0.3, 0.5  # at least, see docs/METHOD.md
 MIRROR_RATIO = 1.1  # of the first scores, the photo as it is by its mirrored picture
 NUM_COMPARED = 8
+FIRST_STARTS, FIRST_BEAM = 300, Beam(100, 12, 4, 1)  # few: what is clear is found by them
 
 
 def is_whole(query: Query) -> bool:
     """True if the photo shows nearly the whole sphere, upright or at a known tilt."""
     return query.settings.gravity != "unknown" and query.photo.valid_share >= WHOLE
+
+
+def first_query(query: Query) -> Query:
+    """The query as it is first asked: by whole views alone, from few starts."""
+    num_starts = min(FIRST_STARTS, query.settings.max_starts)
+    return replace(query, settings=replace(query.settings, max_starts=num_starts), by_features=False)
 
 
 def is_clear(query: Query, starts: Starts, hypotheses: Sequence[Hypothesis]) -> bool:

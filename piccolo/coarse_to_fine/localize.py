@@ -13,9 +13,9 @@ from ..local_features.hypotheses import count_matches, poses_of
 from ..panorama import Panorama
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
-from .config import METHOD, MethodConfig
+from .config import METHOD, Beam, MethodConfig
 from .evaluation import evaluate
-from .first_look import is_clear, is_whole
+from .first_look import FIRST_BEAM, first_query, is_clear, is_whole
 from .prior import apply_prior, is_allowed, nothing_allowed
 from .query import Query, prepare_query
 from .refinement import refine, refine_full_resolution, refine_matched, settle
@@ -60,8 +60,8 @@ def localize(
     gravities = ["known", "unknown"] if settings.gravity == "auto" else [settings.gravity]
     gravities = gravities if method.uses_search else []
     if method.uses_features and is_whole(query) and gravities:
-        first = replace(query, by_features=False)
-        starts, hypotheses = searched(first, gravities.pop(0), watch)
+        first = first_query(query)
+        starts, hypotheses = searched(first, "known", FIRST_BEAM, watch)
         with watch.stage("search"):
             query = first if is_clear(first, starts, hypotheses) else query
     if method.uses_features and query.by_features:
@@ -70,17 +70,17 @@ def localize(
     for gravity in gravities if query.by_features else []:
         if is_sure(query, hypotheses):
             break
-        hypotheses += searched(query, gravity, watch)[1]
+        hypotheses += searched(query, gravity, method.beam, watch)[1]
     with watch.stage("refine"):
         return evaluate(query, panorama, finished(query, hypotheses))
 
 
-def searched(query: Query, gravity: Gravity, watch: Stopwatch) -> tuple[Starts, list[Hypothesis]]:
+def searched(query: Query, gravity: Gravity, beam: Beam, watch: Stopwatch) -> tuple[Starts, list[Hypothesis]]:
     """The starts of a search by whole views, and where they lead."""
     with watch.stage("search"):
         starts = search_poses(query, gravity)
     with watch.stage("refine"):
-        return starts, refine(query, starts, query.method.beam)
+        return starts, refine(query, starts, beam)
 
 
 def is_sure(query: Query, hypotheses: Sequence[Hypothesis]) -> bool:
