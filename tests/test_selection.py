@@ -184,7 +184,8 @@ def _run(monkeypatch, matched, searches, gravity="auto", config=METHOD):
     scan_map = SimpleNamespace(centers=np.zeros((1, 3)))
     scores = {h.pose.center_world[0]: h.score for some in (matched, *searches) for h in some}
 
-    def search_poses(query, gravity):
+    def search_poses(query, gravity, is_first):
+        assert not is_first
         made.append(gravity)
         return gravity
 

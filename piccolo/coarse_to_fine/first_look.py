@@ -42,7 +42,9 @@ def is_clear(query: Query, starts: Starts, hypotheses: Sequence[Hypothesis]) -> 
     if found.best.score < CLEAR_SCORE or found.margin < CLEAR_MARGIN:
         return False
     mirror = mirrored(query)
-    return first_score(query, starts) >= MIRROR_RATIO * first_score(mirror, search_poses(mirror, "known"))
+    return first_score(query, starts) >= MIRROR_RATIO * first_score(
+        mirror, search_poses(mirror, "known", is_first=True)
+    )
 
 
 def mirrored(query: Query) -> Query:

@@ -78,7 +78,7 @@ def localize(
 def searched(query: Query, gravity: Gravity, beam: Beam, watch: Stopwatch) -> tuple[Starts, list[Hypothesis]]:
     """The starts of a search by whole views, and where they lead."""
     with watch.stage("search"):
-        starts = search_poses(query, gravity)
+        starts = search_poses(query, gravity, is_first=not query.by_features)
     with watch.stage("refine"):
         return starts, refine(query, starts, beam)
 

@@ -155,8 +155,11 @@ def best_poses(scores: Samples, pool: int) -> tuple[NDArray[np.int64], NDArray[n
     return *np.divmod(top, scores.shape[1]), flat[top]
 
 
-def search_poses(query: Query, gravity: Gravity) -> Starts:
-    """Every candidate position with every rotation as matrix products; the distinct best."""
+def search_poses(query: Query, gravity: Gravity, is_first: bool = False) -> Starts:
+    """Every candidate position with every rotation as matrix products; the distinct best.
+
+    With gravity unknown, and in a first look, in stages: fewer positions on wider cells come first.
+    """
     m, settings = query.scan_map, query.settings
     num_starts = min(
         max(len(m.centers) // CANDIDATES_PER_START, query.method.min_starts), settings.max_starts
@@ -167,14 +170,15 @@ def search_poses(query: Query, gravity: Gravity) -> Starts:
     else:
         rotations = uniform_rotations(settings.num_rotations)
     rotations = allowed_rotations(rotations @ m.R_map_from_world, settings.prior) @ m.R_map_from_world.T
-    num_views = len(m.centers) if gravity == "known" else len(m.sparse)
+    is_staged = is_first or gravity == "unknown"
+    num_views = len(m.sparse) if is_staged else len(m.centers)
     num_bytes = len(rotations) * (len(make_grid(SEARCH_RINGS)) * TURNED_BYTES + 4 * num_views)
     what = f"a search of {num_views} positions in {len(rotations)} rotations"
     check_memory(num_bytes, what, "set fewer --num-yaws or --num-rotations")
     samples, validity = turn_panorama(query.images.search, rotations)
-    if gravity == "known":
+    if not is_staged:
         candidate, rotation, scores = best_poses(score_poses(m, samples, validity), num_pool)
-    else:  # on wide cells and fewer positions first, as there are so many rotations
+    else:
         sparse, rotation, scores = best_poses(score_poses_wide(m, samples, validity), num_pool)
         candidate, area = m.sparse[sparse], make_grid(SEARCH_RINGS).solid_angle
         units = np.rint(area / area.max() * np.float32(AREA_UNITS))
