@@ -34,12 +34,13 @@ examples:
 
 --scene: a folder with cloud.ply, queries.json and images; more points than it has are made by repeating it
 with 5 mm noise, fewer by leaving some out. --rooms: rooms of tools/make_room.py, 50,000 points each.
-Each row is measured in a process of its own; queries are the first six clean ones, gravity known and unknown.
+Each row is measured in a process of its own; local features, which come late, by themselves. Queries are the
+first six clean ones, gravity known and unknown.
 """
 NUM_QUERIES = 6
 GRAVITIES: tuple[Gravity, ...] = ("known", "unknown")
 COLUMNS = (
-    "case", "points", "candidates", "prepare s", "known s", "found", "unknown s", "found",
+    "case", "points", "candidates", "prepare s", "features s", "known s", "found", "unknown s", "found",
     "peak MB", "before",
 )  # fmt: skip
 
@@ -83,9 +84,11 @@ def measure(label: str, make: Callable[[], Case], results: "multiprocessing.Queu
         localize(prepare_map(small, workers), queries[0][0], settings, workers, Stopwatch())
     before_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     begin = time.perf_counter()
-    scan_map = prepare_map(cloud, workers)
-    seconds = time.perf_counter() - begin
-    columns = [label, str(len(cloud.points)), str(len(scan_map.centers)), f"{seconds:.1f}"]
+    scan_map = prepare_map(cloud, workers, has_features=False)
+    prepared = time.perf_counter()
+    scan_map.features_now(workers)
+    seconds = f"{prepared - begin:.1f}", f"{time.perf_counter() - prepared:.1f}"
+    columns = [label, str(len(cloud.points)), str(len(scan_map.centers)), *seconds]
     for gravity in GRAVITIES:
         settings = CoarseToFineSettings(gravity=gravity)
         times, correct = [], 0
