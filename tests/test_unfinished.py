@@ -17,6 +17,7 @@ from piccolo.cli import progress
 from piccolo.cloud.settings import CloudSettings
 from piccolo.coarse_to_fine.map_file import load_map
 from piccolo.coarse_to_fine.open_map import CachePolicy, open_map
+from piccolo.coarse_to_fine.scan_map import with_features
 from piccolo.runtime import unfinished
 from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers
@@ -127,7 +128,8 @@ def test_a_map_is_the_same_with_parts_of_every_stage(folder, tmp_path, monkeypat
 
         workers = Workers(2, show)
         policy = CachePolicy(cache is not None, cache)
-        return open_map([room / "cloud.ply"], CloudSettings(up="z"), policy, workers, Stopwatch())
+        found = open_map([room / "cloud.ply"], CloudSettings(up="z"), policy, workers, Stopwatch())
+        return with_features(found, workers)
 
     whole = prepared()
     assert not list(folder.iterdir())

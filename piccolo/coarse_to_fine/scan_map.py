@@ -254,7 +254,7 @@ def prepare_map(
         offsets, unit, levels, is_seen = render_candidates(octree, centers, view, workers)
         sparse = sparse_candidates(centers)
         wide_features, wide_seen = widen(levels, is_seen, sparse)
-        local_features = make_feature_map(octree, centers[:0], workers)
+        local_features = make_feature_map(octree, centers[:0], Workers())
     scan_map = ScanMap(
         octree=octree,
         R_map_from_world=aligned.R_map_from_world,
