@@ -1,31 +1,19 @@
 """What is kept between runs: where, and what is trusted of it."""
 
 import errno
-import hashlib
 import os
-import resource
 import subprocess
 import sys
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rooms import scan_map
 
 from piccolo.cli import progress
-from piccolo.cloud import digest
-from piccolo.cloud.settings import IN_METRES
-from piccolo.coarse_to_fine import map_file, open_map
-from piccolo.coarse_to_fine.map_file import save_map
-from piccolo.coarse_to_fine.open_map import CachePolicy
-from piccolo.errors import InputError
-from piccolo.runtime import cache, file_facts, kernel_cache
+from piccolo.runtime import cache, kernel_cache
 from piccolo.runtime.atomic import replacing
 from piccolo.runtime.jit import kernel
-from piccolo.runtime.stopwatch import Stopwatch
-from piccolo.runtime.threads import Workers
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -208,178 +196,9 @@ def test_a_logged_warning_is_one_line_and_quiet_is_quiet(capsys):
         assert capsys.readouterr().err == ("" if is_quiet else "warning: a: damaged\n")
 
 
-@pytest.fixture(scope="module")
-def cloud(tmp_path_factory):
-    path, points = tmp_path_factory.mktemp("cloud") / "a.npy", np.random.default_rng(1).random((500, 3))
-    np.save(path, np.hstack([points, np.full((500, 3), 100.0)]))
-    return path
-
-
-def _open(cloud, folder, monkeypatch, num_made=1):
-    """The map by `open_map`, and the warnings; `prepare_map` is called so many times."""
-    made, heard = [], []
-
-    def prepare(*_, prior, has_features):
-        made.append(1)
-        return scan_map(1)
-
-    monkeypatch.setattr(open_map, "prepare_map", prepare)
-    workers = Workers(1, warn=heard.append)
-    found = open_map.open_map([cloud], IN_METRES, CachePolicy(True, folder), workers, Stopwatch())
-    np.testing.assert_array_equal(found.centers, scan_map(1).centers)
-    assert found.scan_sha256 == hashlib.sha256(cloud.read_bytes()).hexdigest()
-    assert len(made) == num_made
-    assert found.warnings == (*scan_map(1).warnings, *heard)
-    return heard
-
-
-def test_maps_are_kept_in_a_folder_of_their_own(cloud, tmp_path, monkeypatch):
-    """What lies in the user's folder is left, however old it is and whatever its name."""
-    foreign = [tmp_path / f"{32 * 'a'}.piccolo-map", tmp_path / "notes.txt"]
-    for path in foreign:
-        path.touch()
-        os.utime(path, (0, 0))
-    assert _open(cloud, tmp_path, monkeypatch) == []
-    assert _open(cloud, tmp_path, monkeypatch, 0) == []
-    assert sorted(tmp_path.iterdir()) == sorted([*foreign, tmp_path / "piccolo-maps"])
-    assert sorted(path.suffix for path in (tmp_path / "piccolo-maps").iterdir()) == [".TAG", ".piccolo-map"]
-
-
-@pytest.mark.parametrize("how", ["flipped", "cut", "empty", "no directory", "another", "folder"])
-def test_a_damaged_map_is_made_anew_with_one_warning(cloud, tmp_path, monkeypatch, how):
-    assert _open(cloud, tmp_path, monkeypatch) == []
-    (path,) = tmp_path.glob("*/*.piccolo-map")
-    whole = path.read_bytes()
-    middle, directory = len(whole) // 2, whole.rindex(b"PK\x01\x02")
-    path.write_bytes(
-        {
-            "flipped": whole[:middle] + bytes([whole[middle] ^ 4]) + whole[middle + 1 :],
-            "cut": whole[:middle],
-            "empty": b"",
-            "no directory": whole[:directory] + bytes(20) + whole[directory + 20 :],
-        }.get(how, whole)
-    )
-    if how == "another":
-        save_map(replace(scan_map(1), scan_sha256=64 * "1"), path)
-    if how == "folder":
-        path.unlink()
-        path.mkdir()
-    (warning,) = _open(cloud, tmp_path, monkeypatch)
-    assert str(path) in warning
-    assert warning.endswith("the prepared map is not kept" if how == "folder" else "it is made anew")
-    assert how == "folder" or path.read_bytes() == whole
-    assert how == "folder" or _open(cloud, tmp_path, monkeypatch, 0) == []
-
-
-@pytest.mark.parametrize("how", ["a file", "its place is a file", "full disk", "link to nothing"])
-def test_a_cache_that_can_not_be_used_is_a_warning(cloud, tmp_path, monkeypatch, how):
-    folder, limit = tmp_path / "cache", resource.getrlimit(resource.RLIMIT_FSIZE)
-    if how == "a file":
-        folder.touch()
-    elif how == "its place is a file":
-        folder.mkdir()
-        (folder / "piccolo-maps").touch()
-    elif how == "link to nothing":
-        folder.mkdir()
-        (folder / "piccolo-maps").symlink_to("nothing")
-    else:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limit[1]))
-    try:
-        (warning,) = _open(cloud, folder, monkeypatch)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
-    assert str(folder) in warning
-    assert warning.endswith("; the prepared map is not kept")
-    assert [path.name for path in folder.rglob("*") if path.is_file()] in (
-        [],
-        ["CACHEDIR.TAG"],
-        ["piccolo-maps"],
-    )
-
-
 def test_importing_writes_nothing(tmp_path):
     folders = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
     environment = {**os.environ, **folders, "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, "-c", "import piccolo.cli.localize, piccolo.cli.evaluate"]
     subprocess.run(command, cwd=ROOT, env=environment, check=True)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.fixture
-def facts(tmp_path, monkeypatch):
-    folder = tmp_path / "facts"
-    folder.mkdir(mode=0o700)
-    monkeypatch.setattr(file_facts, "facts_folder", lambda: folder)
-    return folder
-
-
-def test_a_fact_holds_until_its_file_changes_in_any_way(facts, tmp_path):
-    path = tmp_path / "a"
-    path.write_bytes(b"one")
-    before = path.stat()
-    assert file_facts.recall("what", before) is None
-    file_facts.remember("what", before, "a fact")
-    assert file_facts.recall("what", path.stat()) == "a fact"
-    assert file_facts.recall("another", path.stat()) is None
-    path.write_bytes(b"two")
-    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))  # its time is put back, by who changed it
-    assert path.stat().st_mtime_ns == before.st_mtime_ns
-    assert file_facts.recall("what", path.stat()) is None
-
-
-def test_facts_that_can_not_be_kept_or_read_are_lost(facts, tmp_path, monkeypatch):
-    status = tmp_path.stat()
-    file_facts.remember("what", status, "a fact")
-    (kept,) = facts.iterdir()
-    kept.write_bytes(b"\xff\xff")
-    assert file_facts.recall("what", status) is None
-    monkeypatch.setattr(file_facts, "write_atomically", _full)
-    file_facts.remember("other", status, "a fact")
-    monkeypatch.setattr(file_facts, "facts_folder", lambda: None)
-    file_facts.remember("more", status, "a fact")
-    assert file_facts.recall("more", status) is None
-    assert [entry.name for entry in facts.iterdir()] == [kept.name]
-
-
-def test_facts_are_kept_where_nobody_else_can_write(folders):
-    kept = file_facts.facts_folder.__wrapped__
-    folder = _root() / "facts"
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(file_facts, "cache_root", cache.cache_root.__wrapped__)
-        assert kept() == folder
-        assert folder.stat().st_mode & 0o777 == 0o700
-        folder.chmod(0o777)
-        assert kept() is None
-
-
-def test_a_digest_is_taken_once_and_anew_when_the_file_changes(facts, tmp_path, monkeypatch):
-    path, read = tmp_path / "a.ply", []
-    path.write_bytes(b"one")
-    of_file = hashlib.file_digest
-    monkeypatch.setattr(hashlib, "file_digest", lambda *args: read.append(args) or of_file(*args))
-    monkeypatch.setattr(digest, "TICK_NS", 10**15)
-    assert digest.sha256_of_files([path], True) == hashlib.sha256(b"one").hexdigest()
-    assert list(facts.iterdir()) == []  # it has changed just now, and may once more
-    monkeypatch.setattr(digest, "TICK_NS", -(10**15))
-    for _ in range(2):
-        assert digest.sha256_of_files([path], True) == hashlib.sha256(b"one").hexdigest()
-    assert len(read) == 2
-    assert digest.sha256_of_files([path]) == hashlib.sha256(b"one").hexdigest()
-    assert len(read) == 3
-    path.write_bytes(b"two!")
-    assert digest.sha256_of_files([path], True) == hashlib.sha256(b"two!").hexdigest()
-
-
-def test_a_map_is_checked_once_by_who_remembers_it(facts, tmp_path, monkeypatch):
-    path, checked = tmp_path / "a.map", []
-    save_map(scan_map(1), path)
-    check = map_file.check_arrays
-    monkeypatch.setattr(map_file, "check_arrays", lambda *args: checked.append(args) or check(*args))
-    for remembers, count in ((False, 1), (True, 2), (True, 2), (False, 3)):
-        assert len(map_file.load_map(path, remembers).centers) == len(scan_map(1).centers)
-        assert len(checked) == count
-    content = bytearray(path.read_bytes())
-    content[-5000] ^= 1
-    path.write_bytes(content)
-    with pytest.raises(InputError, match="damaged"):
-        map_file.load_map(path, remembers=True)

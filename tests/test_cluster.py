@@ -84,12 +84,17 @@ def _whole(scene, tmp_path, *preset):
     return words, _untimed(out)
 
 
-def test_a_local_cluster_writes_the_same_file_though_a_worker_is_killed(scene, tmp_path, monkeypatch):
-    monkeypatch.chdir(scene)
+def _local(scene, tmp_path):
+    """The command of a cluster on this machine, the file that it writes, and what is to be in it."""
     words, expected = _whole(scene, tmp_path, *PAPER)
     out = tmp_path / "poses.jsonl"
     words += ["--out", str(out), "--dask", "local", "--jobs", "2"]
-    command = [sys.executable, str(ROOT / "localize.py"), *words]
+    return [sys.executable, str(ROOT / "localize.py"), *words], out, expected
+
+
+def test_a_local_cluster_writes_the_same_file_though_a_worker_is_killed(scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(scene)
+    command, out, expected = _local(scene, tmp_path)
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         _wait_for_lines(process, out, 3)
         children = Path(f"/proc/{process.pid}/task").glob("*/children")
@@ -105,10 +110,7 @@ def test_a_local_cluster_writes_the_same_file_though_a_worker_is_killed(scene, t
 
 def test_ctrl_c_ends_a_local_cluster_and_the_same_command_goes_on(scene, tmp_path, monkeypatch):
     monkeypatch.chdir(scene)
-    words, expected = _whole(scene, tmp_path, *PAPER)
-    out = tmp_path / "poses.jsonl"
-    words += ["--out", str(out), "--dask", "local", "--jobs", "2"]
-    command = [sys.executable, str(ROOT / "localize.py"), *words]
+    command, out, expected = _local(scene, tmp_path)
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
         _wait_for_lines(process, out, 3)
         os.killpg(process.pid, signal.SIGINT)

@@ -46,7 +46,7 @@ def test_pose_on_stdout_and_a_summary_on_stderr(scene, capsys):
     distance, angle_deg = errors(result.pose, _truth(scene, 0))
     assert distance < 0.03
     assert angle_deg < 0.5
-    assert {"read", "refine"} < set(result.seconds) <= {"read", "search", "match", "refine"}
+    assert set(result.seconds) == {"read", "search", "refine"}  # a clear photo: no features are matched
     assert "localized at" in err
     assert out.count("\n") == 1
 

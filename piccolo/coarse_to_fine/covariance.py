@@ -39,9 +39,8 @@ STEPS = (
     DifferenceSteps("full", math.radians(0.1), 0.005, 1.1),
     DifferenceSteps("fine", math.radians(0.3), 0.015, 0.36),
 )
-ROUGH_STEPS = DifferenceSteps(
-    "middle", math.radians(0.3), 0.015, 1.0
-)  # of few dark, noisy photos; not calibrated
+# of dark, noisy photos; they are too few to calibrate
+ROUGH_STEPS = DifferenceSteps("middle", math.radians(0.3), 0.015, 1.0)
 
 
 def equations_at(image: Texels, points: Cells, R_cam_from_map: Array, shift: Array) -> tuple[Array, Array]:

@@ -79,6 +79,15 @@ def own_folder(folder: Path, name: re.Pattern[str], mode: int = ALL) -> Path:
     return folder
 
 
+@cache
+def private_folder(name: str, files: re.Pattern[str]) -> Path | None:
+    """A folder of the user's cache that nobody else can write to, made now; None where that can't be."""
+    with suppress(OSError):
+        folder = own_folder(cache_root() / name, files, PRIVATE)
+        return folder if is_own(folder.stat(), WRITABLE) else None
+    return None
+
+
 def remove_stale(folder: Path, name: re.Pattern[str]) -> None:
     """Delete the files of a folder that have a name of ours and have not been used for a month."""
     for entry in folder.iterdir():

@@ -7,29 +7,19 @@ Only the system sets the last: nobody who writes to a file can give it the ident
 import hashlib
 import os
 from contextlib import suppress
-from functools import cache
 from pathlib import Path
 
 from .atomic import write_atomically
-from .cache import PRIVATE, WRITABLE, cache_root, is_own, mark_used, own_folder, own_names
+from .cache import mark_used, own_names, private_folder
 
 NAME = own_names("fact")
 MAX_SIZE = 200  # [byte] of a fact
 
 
-@cache
-def facts_folder() -> Path | None:
-    """The user's folder of facts, made now; None where others could write to it, or there can be none."""
-    with suppress(OSError):
-        folder = own_folder(cache_root() / "facts", NAME, PRIVATE)
-        return folder if is_own(folder.stat(), WRITABLE) else None
-    return None
-
-
 def _path(what: str, status: os.stat_result) -> Path | None:
     """The file in which `what` is kept of a file of this status."""
     identity = status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
-    folder, key = facts_folder(), repr((what, identity))
+    folder, key = private_folder("facts", NAME), repr((what, identity))
     return folder and folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.fact"
 
 

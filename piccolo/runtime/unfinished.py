@@ -10,7 +10,6 @@ import re
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .atomic import replacing
-from .cache import PRIVATE, WRITABLE, cache_root, is_own, own_folder
+from .cache import private_folder
 
 # of a part, and of one that was being written
 NAME = re.compile(r"[0-9a-f]{32}-[0-9a-f]{16}-\d+\.part|\.[0-9a-f]{32}-[0-9a-f]{7}\.[0-9a-f]{16}")
@@ -27,13 +26,9 @@ EVERY_S = 5.0  # of work are lost at most, in each stage
 Arrays = tuple[NDArray[Any], ...]
 
 
-@cache
 def parts_folder() -> Path | None:
-    """The user's folder of parts, made now; None where others could write to it, or there can be none."""
-    with suppress(OSError):
-        folder = own_folder(cache_root() / "unfinished", NAME, PRIVATE)
-        return folder if is_own(folder.stat(), WRITABLE) else None
-    return None
+    """The user's folder of parts; None where there can be none."""
+    return private_folder("unfinished", NAME)
 
 
 def digest_from_here(file: Any, path: Path) -> bytes:

@@ -1,0 +1,98 @@
+"""What is known of a file's content for as long as it stays as it is: digests of scans, checks of maps."""
+
+import errno
+import hashlib
+import os
+
+import pytest
+from rooms import scan_map
+
+from piccolo.cloud import digest
+from piccolo.coarse_to_fine import map_file
+from piccolo.coarse_to_fine.map_file import save_map
+from piccolo.errors import InputError
+from piccolo.runtime import cache, file_facts
+
+
+def _full(*_):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.fixture
+def facts(tmp_path, monkeypatch):
+    folder = tmp_path / "facts"
+    folder.mkdir(mode=0o700)
+    monkeypatch.setattr(file_facts, "private_folder", lambda *_: folder)
+    return folder
+
+
+def test_a_fact_holds_until_its_file_changes_in_any_way(facts, tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes(b"one")
+    before = path.stat()
+    assert file_facts.recall("what", before) is None
+    file_facts.remember("what", before, "a fact")
+    assert file_facts.recall("what", path.stat()) == "a fact"
+    assert file_facts.recall("another", path.stat()) is None
+    path.write_bytes(b"two")
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))  # its time is put back, by who changed it
+    assert path.stat().st_mtime_ns == before.st_mtime_ns
+    assert file_facts.recall("what", path.stat()) is None
+
+
+def test_facts_that_can_not_be_kept_or_read_are_lost(facts, tmp_path, monkeypatch):
+    status = tmp_path.stat()
+    file_facts.remember("what", status, "a fact")
+    (kept,) = facts.iterdir()
+    kept.write_bytes(b"\xff\xff")
+    assert file_facts.recall("what", status) is None
+    monkeypatch.setattr(file_facts, "write_atomically", _full)
+    file_facts.remember("other", status, "a fact")
+    monkeypatch.setattr(file_facts, "private_folder", lambda *_: None)
+    file_facts.remember("more", status, "a fact")
+    assert file_facts.recall("more", status) is None
+    assert [entry.name for entry in facts.iterdir()] == [kept.name]
+
+
+def test_facts_are_kept_where_nobody_else_can_write(tmp_path, monkeypatch):
+    monkeypatch.setattr(cache, "cache_root", lambda: tmp_path)
+    kept = cache.private_folder.__wrapped__
+    assert kept("facts", file_facts.NAME) == tmp_path / "facts"
+    assert (tmp_path / "facts").stat().st_mode & 0o777 == 0o700
+    (tmp_path / "facts").chmod(0o777)
+    assert kept("facts", file_facts.NAME) is None
+    (tmp_path / "file").touch()
+    assert kept("file", file_facts.NAME) is None
+
+
+def test_a_digest_is_taken_once_and_anew_when_the_file_changes(facts, tmp_path, monkeypatch):
+    path, read = tmp_path / "a.ply", []
+    path.write_bytes(b"one")
+    of_file = hashlib.file_digest
+    monkeypatch.setattr(hashlib, "file_digest", lambda *args: read.append(args) or of_file(*args))
+    monkeypatch.setattr(digest, "TICK_NS", 10**15)
+    assert digest.sha256_of_files([path], True) == hashlib.sha256(b"one").hexdigest()
+    assert list(facts.iterdir()) == []  # it has changed just now, and may once more
+    monkeypatch.setattr(digest, "TICK_NS", -(10**15))
+    for _ in range(2):
+        assert digest.sha256_of_files([path], True) == hashlib.sha256(b"one").hexdigest()
+    assert len(read) == 2
+    assert digest.sha256_of_files([path]) == hashlib.sha256(b"one").hexdigest()
+    assert len(read) == 3
+    path.write_bytes(b"two!")
+    assert digest.sha256_of_files([path], True) == hashlib.sha256(b"two!").hexdigest()
+
+
+def test_a_map_is_checked_once_by_who_remembers_it(facts, tmp_path, monkeypatch):
+    path, checked = tmp_path / "a.map", []
+    save_map(scan_map(1), path)
+    check = map_file.check_arrays
+    monkeypatch.setattr(map_file, "check_arrays", lambda *args: checked.append(args) or check(*args))
+    for remembers, count in ((False, 1), (True, 2), (True, 2), (False, 3)):
+        assert len(map_file.load_map(path, remembers).centers) == len(scan_map(1).centers)
+        assert len(checked) == count
+    content = bytearray(path.read_bytes())
+    content[-5000] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="damaged"):
+        map_file.load_map(path, remembers=True)
