@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "calibration or rig (docs/CAMERAS.md) that takes the pictures, in place of spheres"
     option(parser, "--camera FILE", text)
     option(parser, "--size X Y Z", "of a room [m]", default=[6.0, 5.0, 2.7])
-    option(parser, "--rooms N", "side by side, at most 64", default=1)
+    option(parser, "--rooms N", "side by side, at most 256", default=1)
     option(parser, "--labels", "label points and pixels by their kind of surface, for localize.py --labels")
     option(parser, "--scenes N", "write N scenes, FOLDER/000 on, of the seeds from --seed on", default=0)
 

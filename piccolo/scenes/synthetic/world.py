@@ -27,7 +27,8 @@ NUM_TRIES = 2000
 VARIANTS = ("clean", "tilt", "photo", "change")
 GAP = 0.4  # between rooms [m]
 MIN_SIZE, MAX_SIZE = 2.0, 50.0  # of a room, each way [m]
-MAX_ROOMS = 64
+MAX_ROOMS = 256
+SEED_STEP = 64  # between the rooms of two seeds; larger buildings share rooms with the next seed
 MIN_POINTS = 1000  # of a room
 
 
@@ -130,7 +131,7 @@ def make_world(seed: int, size: Array, num_rooms: int = 1) -> World:
     rooms = []
     for k in range(num_rooms):
         corner = np.array([*((size[:2] + GAP) * divmod(k, columns)), 0.0])
-        rooms.append(make_room(seed * MAX_ROOMS + k, size, corner))
+        rooms.append(make_room(seed * SEED_STEP + k, size, corner))
     return World(seed, tuple(rooms))
 
 
@@ -169,7 +170,7 @@ def room_of_query(world: World, index: int, variant: str) -> tuple[Room, np.rand
     number = int(rng.integers(len(world.rooms)))
     room = world.rooms[number]
     if variant == "change":
-        room = make_room(world.seed * MAX_ROOMS + number, room.size, room.corner, changed=index + 1)
+        room = make_room(world.seed * SEED_STEP + number, room.size, room.corner, changed=index + 1)
     return room, rng
 
 
