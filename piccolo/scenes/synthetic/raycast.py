@@ -94,7 +94,7 @@ def hit_boxes(origin, directions, boxes, ranges, hits):
 
 @kernel
 def shade(origin, directions, ranges, hits, boxes, materials, lights, rgb):
-    """Write the colour (N, 3) in [0, 1] of each hit, lit by its box's light; black where a ray hits nothing."""
+    """Write the colour (N, 3) in [0, 1] of each hit, lit by its box's lamp; black where nothing is hit."""
     for n in range(len(directions)):
         rgb[n, :] = 0.0
         if hits[n] < 0:
@@ -120,7 +120,7 @@ def shade(origin, directions, ranges, hits, boxes, materials, lights, rgb):
 def boxes_ahead(
     origin: Array, directions: NDArray[np.float64], boxes: NDArray[np.float64]
 ) -> NDArray[np.intp]:
-    """The boxes (B, 7), in order, that some of the unit `directions` (N, 3) may hit: by the cone around them."""
+    """The boxes (B, 7) that some of the unit `directions` (N, 3) may hit, in order: by their cone."""
     axis = directions.mean(axis=0)
     axis /= max(float(np.linalg.norm(axis)), 1e-12)  # of opposite rays, for which the cone is the sphere
     width = math.acos(np.clip((directions @ axis).min(), -1.0, 1.0)) + MARGIN
