@@ -13,6 +13,7 @@ from ..camera.files import read_cameras
 from ..cloud.ply_writer import vertex_rows, write_ply
 from ..render.surfel_renderer import encode_image
 from ..runtime.atomic import write_atomically
+from ..runtime.optional import import_optional
 from ..runtime.threads import Workers, num_cores
 from ..scenes import scene as scenes
 from ..scenes.datasets.files import write_labels
@@ -50,8 +51,8 @@ a picture of labels, FOLDER/labels/VARIANT_K.png. With --camera queries.json has
 which evaluate.py takes; the pictures of a rig are a folder. One JSON object a scene on stdout.
 With --storeys the rooms stand along corridors of equal doors between halls with stairs. With --walk a person
 carries the camera through it: FOLDER/images/VARIANT_walk_K_FRAME.jpg with walk and time in queries.json, and
-FOLDER/VARIANT_walk_K_poses.tum (optical axes). Frames of --bad-frames are black, mirrored or of elsewhere, each
-a variant, with "answerable": false: right is to refuse them.
+FOLDER/VARIANT_walk_K_poses.tum (optical axes). Frames of --bad-frames are black, mirrored or of elsewhere,
+each a variant, with "answerable": false: right is to refuse them.
 """
 
 
@@ -161,6 +162,8 @@ def main(arguments: argparse.Namespace) -> int:
             check_can_be_made(cameras, arguments.labels)
     with checking_options():
         check_walk_usage(arguments)
+    if arguments.video:
+        import_optional("--video", "av", "video")
     workers = Workers(num_cores(), progress_bar(arguments.quiet))
     for number in range(max(1, arguments.scenes)):
         made = made_of(arguments, arguments.seed + number)

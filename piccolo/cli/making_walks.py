@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from ..render.surfel_renderer import encode_image
 from ..runtime.atomic import write_atomically
-from ..runtime.optional import import_optional
 from ..runtime.threads import Workers
 from ..scenes import scene as scenes
 from ..scenes.export.formats import tum_lines, write_lines
@@ -33,7 +32,7 @@ def add_walk_options(parser: argparse.ArgumentParser) -> None:
     option(
         group,
         "--storeys N",
-        "a building: corridors, halls and stairs join the rooms (with --walk 1)",
+        "a building: corridors, halls and stairs join the rooms (1 with --walk)",
         default=0,
     )
     option(group, "--twins FRACTION", "of a building's rooms that are exact copies of others", default=0.0)
@@ -73,8 +72,6 @@ def _check_walk(arguments: argparse.Namespace) -> None:
         raise UsageError(f"--visit: found room {missing[0]}, wanted 0 to {arguments.rooms - 1}")
     for variant in arguments.variants:
         walk_options(arguments, variant)
-    if arguments.video:
-        import_optional("--video", "av", "video")
 
 
 def building_of(arguments: argparse.Namespace, seed: int) -> Office | None:

@@ -12,6 +12,7 @@ from .room import Room
 
 AMBIENT, LAMP, LAMP_DECAY = 0.55, 0.9, 0.15  # of a surface's colour; the decay [1/m2]
 CHUNK = 4_096  # rays
+NUM_FIRST = 32  # boxes
 MARGIN = 1e-6  # of a cone around rays [rad]
 
 
@@ -119,8 +120,8 @@ def shade(origin, directions, ranges, hits, boxes, materials, lights, rgb):
 
 def boxes_ahead(
     origin: Array, directions: NDArray[np.float64], boxes: NDArray[np.float64]
-) -> NDArray[np.intp]:
-    """The boxes (B, 7) that some of the unit `directions` (N, 3) may hit, in order: by their cone."""
+) -> tuple[NDArray[np.intp], Array]:
+    """Which boxes (B, 7) unit `directions` (N, 3) may hit, by their cone, and at what least range [m]."""
     axis = directions.mean(axis=0)
     axis /= max(float(np.linalg.norm(axis)), 1e-12)  # of opposite rays, for which the cone is the sphere
     width = math.acos(np.clip((directions @ axis).min(), -1.0, 1.0)) + MARGIN
@@ -128,7 +129,8 @@ def boxes_ahead(
     distances = np.linalg.norm(offsets, axis=1)
     reach = np.arcsin(np.minimum(radii / np.maximum(distances, 1e-12), 1.0)) + width
     is_around = (distances <= radii) | (reach >= np.pi)
-    return np.flatnonzero(is_around | (offsets @ axis >= distances * np.cos(np.minimum(reach, np.pi))))
+    ahead = np.flatnonzero(is_around | (offsets @ axis >= distances * np.cos(np.minimum(reach, np.pi))))
+    return ahead, distances[ahead] - radii[ahead]
 
 
 def cast_rays(
@@ -146,7 +148,11 @@ def cast_rays(
     def run(lo: int) -> None:
         part = slice(lo, lo + CHUNK)
         rays, hits = directions[part], np.empty(len(ranges[part]), dtype=np.int64)
-        ahead = boxes_ahead(origin, rays, room.boxes)
+        ahead, least = boxes_ahead(origin, rays, room.boxes)
+        if len(ahead) > NUM_FIRST:  # what the nearest boxes hide needs no look
+            nearest = np.argpartition(least, NUM_FIRST)[:NUM_FIRST]
+            hit_boxes(origin, rays, room.boxes[ahead[nearest]], ranges[part], hits)
+            ahead = ahead[least <= ranges[part].max()]
         boxes, materials = room.boxes[ahead], room.materials[ahead]
         hit_boxes(origin, rays, boxes, ranges[part], hits)
         shade(origin, rays, ranges[part], hits, boxes, materials, lights[ahead], rgb[part])
