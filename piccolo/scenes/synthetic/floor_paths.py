@@ -11,7 +11,8 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from ...geometry.pose import Array
-from .office import Flight, Office
+from .floor_plan import Flight
+from .office import Office
 
 CELL = 0.1  # [m]
 STEP_OVER, HEAD = 0.15, 1.85  # what is between these heights is in a person's way [m]

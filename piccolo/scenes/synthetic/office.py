@@ -1,21 +1,28 @@
-"""A seeded building: rooms off corridors of equal doors, halls, storeys joined by stairs; some are copies.
+"""A seeded building, from its floor plan: rooms, some of them copies, corridors, halls, stairs."""
 
-Corridors run along x between a hall in the west, with the stairs, and one in the east. Rooms stand on both
-sides, each with an open door to its corridor. z is up, the floors are at multiples of the storeys' height.
-"""
-
-import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.pose import Array
+from .floor_plan import (
+    BETWEEN,
+    EAST_WIDTH,
+    HALL_WIDTH,
+    PASSAGE,
+    SLAB,
+    TREAD,
+    Flight,
+    Plan,
+    flight_of,
+    place_of,
+    plan_of,
+)
+from .repeated import CORRIDOR_WIDTH
 from .room import (
-    CORRIDOR_WIDTH,
     DOOR_ROOM,
     PICTURE,
     PLAIN,
@@ -31,26 +38,11 @@ from .room import (
     put_wall,
     put_walls,
 )
-from .world import MAX_ROOMS, MAX_SIZE, World
+from .world import MAX_ROOMS, World
 
-MAX_STOREYS = 4
-MIN_ROOM = (2.6, 2.6, 2.3)  # [m]
-SLAB = 0.3  # between a ceiling and the next floor [m]
-BETWEEN = 2.0 * WALL_THICKNESS  # rooms [m]
-HALL_WIDTH, EAST_WIDTH, PASSAGE = 6.0, 4.0, 1.6  # halls, and the doors between them and corridors [m]
-COLUMNS = 8  # rooms on each side of a corridor
-RISE, TREAD, FLIGHT_WIDTH, FLIGHT_BEGIN = 0.19, 0.28, 1.4, 1.3  # of stairs [m]
 RAIL = 0.06, 1.0  # thickness and height [m]
 HALL_AREA = 8.0  # for a piece of furniture [m2]
 LAMP_DISTANCE = 6.0  # [m]
-
-
-class Flight(NamedTuple):
-    """A straight flight of stairs along +y."""
-
-    foot: Array  # (3,) middle of the edge of the first step, on the floor [m]
-    top: Array  # (3,) middle of the last step's far edge, on the next floor [m]
-    width: float  # [m]
 
 
 @dataclass(frozen=True)
@@ -62,69 +54,6 @@ class Office:
     copies: NDArray[np.int64]  # (num_rooms,) the room of which a room is a copy; itself if of none
     levels: Array  # (S,) heights of the floors [m]
     flights: tuple[Flight, ...]
-
-
-class Plan(NamedTuple):
-    """How many of everything, and where it stands."""
-
-    size: Array  # (3,) of a room [m]
-    num_rooms: int
-    num_storeys: int
-    num_corridors: int  # a storey
-    num_columns: int
-
-    @property
-    def height(self) -> float:
-        """From floor to floor [m]."""
-        return float(self.size[2]) + SLAB
-
-    @property
-    def length(self) -> float:
-        """Of a corridor [m]."""
-        return self.num_columns * (float(self.size[0]) + BETWEEN) - BETWEEN
-
-    @property
-    def depth(self) -> float:
-        """From a corridor to the next [m]."""
-        return 2.0 * float(self.size[1]) + CORRIDOR_WIDTH + 3.0 * BETWEEN
-
-    @property
-    def passages(self) -> list[float]:
-        """Where along y the corridors' middles are [m]."""
-        first = float(self.size[1]) + BETWEEN + CORRIDOR_WIDTH / 2
-        return [first + k * self.depth for k in range(self.num_corridors)]
-
-    @property
-    def door(self) -> Door:
-        """Of a room, in the wall at its y = 0."""
-        return Door(1, False, max(0.9, 0.3 * float(self.size[0])))
-
-    def slots(self) -> list[tuple[int, int, int, bool]]:
-        """Storey, corridor, column and whether it is south of the corridor, of each room."""
-        ranges = range(self.num_storeys), range(self.num_corridors), range(self.num_columns), (True, False)
-        per_storey = -(-self.num_rooms // self.num_storeys)
-        found = [
-            slot
-            for s in ranges[0]
-            for slot in itertools.islice(itertools.product([s], *ranges[1:]), per_storey)
-        ]
-        return found[: self.num_rooms]
-
-
-def plan_of(size: Array, num_rooms: int, num_storeys: int) -> Plan:
-    """The plan of a building; InputError if there can be none."""
-    size = np.asarray(size, float)
-    if not ((size >= MIN_ROOM) & (size <= MAX_SIZE)).all():
-        raise InputError(
-            f"size: found {size.tolist()}, wanted {list(MIN_ROOM)} to {MAX_SIZE} m in a building"
-        )
-    if not 1 <= num_storeys <= MAX_STOREYS:
-        raise InputError(f"storeys: found {num_storeys}, wanted 1 to {MAX_STOREYS}")
-    if not num_storeys <= num_rooms <= MAX_ROOMS:
-        raise InputError(f"rooms: found {num_rooms}, wanted one a storey to {MAX_ROOMS}")
-    per_storey = -(-num_rooms // num_storeys)
-    num_corridors = -(-per_storey // (2 * COLUMNS))
-    return Plan(size, num_rooms, num_storeys, num_corridors, -(-per_storey // (2 * num_corridors)))
 
 
 def make_office(seed: int, size: Array, num_rooms: int, num_storeys: int, twins: float) -> Office:
@@ -140,12 +69,14 @@ def make_office(seed: int, size: Array, num_rooms: int, num_storeys: int, twins:
         int(k): make_room(seed * MAX_ROOMS + int(k), plan.size, np.zeros(3), doors=[plan.door])
         for k in np.unique(copies)
     }
-    rooms = [placed(made[int(k)], *_place(plan, slot)) for k, slot in zip(copies, plan.slots(), strict=True)]
+    rooms = [
+        placed(made[int(k)], *place_of(plan, slot)) for k, slot in zip(copies, plan.slots(), strict=True)
+    ]
     others = [*corridors(seed, plan, twins > 0.0), *halls(seed, plan)]
     parts = [part for other in others for part in _parts(other)]
     cells = [(cell.corner, cell.size) for cell in (*rooms, *parts)]
     levels = plan.height * np.arange(num_storeys, dtype=np.float64)
-    flights = tuple(_flight(plan, storey) for storey in range(num_storeys - 1))
+    flights = tuple(flight_of(plan, storey) for storey in range(num_storeys - 1))
     return Office(World(seed, _joined([*rooms, *others], cells)), num_rooms, copies, levels, flights)
 
 
@@ -166,13 +97,6 @@ def placed(room: Room, corner: Array, is_turned: bool) -> Room:
     boxes[:, :3] = sign * boxes[:, :3] + shift
     boxes[:, 6] += np.pi * is_turned
     return room._replace(corner=corner, boxes=boxes, light=sign * room.light + shift)
-
-
-def _place(plan: Plan, slot: tuple[int, int, int, bool]) -> tuple[Array, bool]:
-    """The corner (3,) of a slot's room, and whether the room is turned so that its door is in the north."""
-    storey, corridor, column, is_south = slot
-    y = corridor * plan.depth + (0.0 if is_south else plan.size[1] + CORRIDOR_WIDTH + 2.0 * BETWEEN)
-    return np.array([column * (plan.size[0] + BETWEEN), y, storey * plan.height]), is_south
 
 
 def _room_of(b: RoomBuilder, size: Array) -> Room:
@@ -230,15 +154,6 @@ def corridors(seed: int, plan: Plan, are_alike: bool) -> Iterator[Room]:
         yield _room_of(b, size)
 
 
-def _flight(plan: Plan, storey: int) -> Flight:
-    """The stairs from a storey to the next, on alternate sides of the west hall."""
-    middle = 0.8 + FLIGHT_WIDTH / 2
-    x = -BETWEEN - HALL_WIDTH + (middle if storey % 2 == 0 else HALL_WIDTH - middle)
-    run = TREAD * np.ceil(plan.height / RISE)
-    foot = np.array([x, FLIGHT_BEGIN, storey * plan.height])
-    return Flight(foot, foot + np.array([0.0, run, plan.height]), FLIGHT_WIDTH)
-
-
 def halls(seed: int, plan: Plan) -> Iterator[Room]:
     """The halls at both ends of the corridors of every storey, all different."""
     y = plan.num_corridors * plan.depth - BETWEEN
@@ -249,8 +164,8 @@ def halls(seed: int, plan: Plan) -> Iterator[Room]:
             corner, size = np.array([left, 0.0, storey * plan.height]), np.array([width, y, plan.size[2]])
             b = RoomBuilder(np.random.default_rng([seed, 52, storey, int(is_east)]), corner)
             doors = [Door(0, not is_east, passage, PASSAGE) for passage in plan.passages]
-            up = _flight(plan, storey) if storey < plan.num_storeys - 1 and not is_east else None
-            down = _flight(plan, storey - 1) if storey and not is_east else None
+            up = flight_of(plan, storey) if storey < plan.num_storeys - 1 and not is_east else None
+            down = flight_of(plan, storey - 1) if storey and not is_east else None
             b.clear = [door.clear(size, DOOR_ROOM) for door in doors] + [
                 _around(b, f) for f in (up, down) if f
             ]
@@ -289,17 +204,17 @@ def _slab(b: RoomBuilder, size: Array, ends: tuple[float, float], hole: Flight |
 def _stairs(b: RoomBuilder, up: Flight | None, down: Flight | None) -> None:
     """Steps, solid down to the floor, and rails around the opening of those that come from below."""
     if up is not None:
-        foot, (_, run, height) = up.foot - b.corner, up.top - up.foot
-        num_steps = round(run / TREAD)
+        foot, height = up.foot - b.corner, up.top[2] - up.foot[2]
+        num_steps = round(up.run / TREAD)
         b.kind, wood = "floor", b.paint((PLANKS,), 0.25, 0.7)
         for k in range(num_steps):
             z = (k + 1) * height / num_steps
             b.put([foot[0], foot[1] + (k + 0.5) * TREAD, z / 2], [up.width, TREAD, z], wood)
     if down is not None:
-        foot, top = down.foot - b.corner, down.top - b.corner
+        foot, run = down.foot * [1.0, 1.0, 0.0] - b.corner * [1.0, 1.0, 0.0], down.run
         b.kind, steel = "wall", b.paint((PLAIN,), 0.3, 0.7)
         thickness, height = RAIL
-        run, aside = top[1] - foot[1], (down.width + thickness) / 2
+        aside = (down.width + thickness) / 2
         for sign in (-1, 1):
             b.put([foot[0] + sign * aside, foot[1] + run / 2, height / 2], [thickness, run, height], steel)
         b.put([foot[0], foot[1] - thickness / 2, height / 2], [down.width, thickness, height], steel)

@@ -73,7 +73,7 @@ class Walker:
         self.office, self.space = office, free_space_of(office)
         corridor = office.world.rooms[office.num_rooms]
         middle = corridor.corner + corridor.size * [0.5, 0.5, 0.0]
-        self._everywhere = reach_from(self.space, self.space.cell(middle))  # but what furniture encloses
+        self.everywhere = reach_from(self.space, self.space.cell(middle))  # but what furniture encloses
 
     def walk(self, length: float, visited: Sequence[int], rng: np.random.Generator) -> Walk:
         """A walk of so many metres through rooms, the given ones first, then others at random."""
@@ -84,7 +84,7 @@ class Walker:
         """Ways (M, 3) from room to room until they are long enough."""
         left, legs, done = list(visited), list[Array](), 0.0
         number = left.pop(0) if left else int(rng.integers(self.office.num_rooms))
-        cell = int(rng.choice(_reached(self._everywhere, number)))
+        cell = int(rng.choice(_reached(self.everywhere, number)))
         seen = {number}
         while done < length:
             reach = reach_from(self.space, cell)
