@@ -257,7 +257,7 @@ def test_a_building_without_a_walk_has_single_panoramas(tmp_path, capsys):
         ("--walk 5 --people 21", "people: found 21, wanted 0 to 20"),
         ("--walk 5 --twins 1", "twins: found 1.0, wanted at least 0 and less than 1"),
         ("--storeys 5", "storeys: found 5, wanted 1 to 4"),
-        ("--storeys 3", "rooms: found 2, wanted one a storey to 64"),
+        ("--storeys 3", "rooms: found 2, wanted one a storey to 256"),
         (
             "--storeys 1 --size 2.5 4 3",
             "size: found [2.5, 4.0, 3.0], wanted [2.6, 2.6, 2.3] to 50.0 m in a building",
