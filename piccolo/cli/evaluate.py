@@ -42,8 +42,8 @@ Scenes are folders with a queries.json, a cloud and images, at any depth below -
 command again to resume a run that was stopped. --results are lines of localize.py instead; each belongs to
 the query of the same path, or else of the same file name. Tables are Markdown, on stdout (on stderr where
 one of the files is stdout).
-Frames of walks (make_room.py --walk) also have a table with a line a walk: ATE and RPE are evo's, of localized
-frames, nothing aligned, steps over other frames left out. A photo that has no answer is right when refused.
+Walks (make_room.py --walk) have a table with a line each: ATE and RPE are evo's, of localized frames, nothing
+aligned, steps over other frames left out. A photo that has no answer is right when refused.
 Queries that can't be read are named on stderr, and the rest is done before exit code 3.
 """
 

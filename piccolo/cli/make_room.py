@@ -36,7 +36,7 @@ from .outputs import check_folder_name
 from .progress import progress_bar
 
 QUALITY = {"photo": 70}  # of a variant's JPEGs
-ROOM_POINTS, BUILDING_POINTS = 300_000, 30_000  # of rooms side by side, of each room of a building
+ROOM_POINTS, BUILDING_POINTS = 300_000, 60_000  # of rooms side by side; of each part of a building
 EPILOG = """\
 examples:
   python tools/make_room.py --out room --seed 3
@@ -68,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
     option(parser, "--out FOLDER", "made if it is not there", required=True)
     option(parser, "--seed N", "equal seeds, equal bits", default=0)
-    text = f"(default {ROOM_POINTS}, in a building {BUILDING_POINTS} a room)"
+    text = f"(default {ROOM_POINTS}, in a building {BUILDING_POINTS} a room and stretch of corridor)"
     option(parser, "--points N", text)
     option(parser, "--panoramas N", "of each variant", default=3)
     option(parser, "--variants", nargs="+", choices=VARIANTS, default=["clean"])
