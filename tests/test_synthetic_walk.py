@@ -1,7 +1,9 @@
 import functools
 import itertools
 import json
+import sys
 
+import av
 import cv2
 import naive
 import numpy as np
@@ -217,7 +219,6 @@ def written(folder, words):
 
 
 def test_command_line_writes_walks_that_read_back(tmp_path, capsys):
-    av = pytest.importorskip("av")
     folder = tmp_path / "walks"
     assert written(folder, "--walk 12 --walks 2 --bad-frames 0.3 --video --twins 0.5") == 0
     assert json.loads(capsys.readouterr().out)["queries"] == len(list((folder / "images").iterdir()))
@@ -242,6 +243,14 @@ def test_command_line_writes_walks_that_read_back(tmp_path, capsys):
     assert len(shown) == len(first)
     for query, rgb in zip(first, shown, strict=True):
         assert np.abs(cv2.imread(str(query.image))[..., ::-1].astype(float) - rgb).mean() < 6.0
+
+
+def test_a_video_without_its_library_is_refused_before_anything_is_made(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    assert written(tmp_path / "r", "--walk 5 --video") == 3
+    assert "--video: needs av" in (message := capsys.readouterr().err)
+    assert "pip install 'piccolo-localize[video]'" in message
+    assert not (tmp_path / "r").exists()
 
 
 def test_equal_seeds_make_equal_bits(tmp_path):
