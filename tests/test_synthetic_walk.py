@@ -1,7 +1,9 @@
 import functools
 import itertools
 import json
+import sys
 
+import av
 import cv2
 import naive
 import numpy as np
@@ -15,7 +17,7 @@ from piccolo.geometry.sphere import pixel_rays
 from piccolo.runtime.threads import Workers
 from piccolo.scenes.scene import read_scene
 from piccolo.scenes.synthetic.office import make_office
-from piccolo.scenes.synthetic.raycast import cast_rays
+from piccolo.scenes.synthetic.raycast import cast_rays, ranges_ahead
 from piccolo.scenes.synthetic.walk_frames import BAD_KINDS, WalkOptions, frames_of
 from piccolo.scenes.synthetic.walking import HEIGHT, Walker
 from piccolo.scenes.synthetic.world import exposed, scan_world
@@ -66,6 +68,26 @@ def test_rays_meet_what_is_nearest_among_hundreds_of_boxes():
             np.testing.assert_allclose(ranges, naive.nearest_box(origin, rays, room.boxes), rtol=1e-9)
             assert np.isfinite(ranges).all(), "the building is not closed"
             assert (labels > 0).all()
+
+
+@pytest.mark.parametrize("width_deg", [0.5, 20.0, 80.0, 100.0, 179.0])
+def test_boxes_outside_a_cone_are_left_out_and_others_have_their_distance(width_deg):
+    room = office().world.rooms[0]
+    rng = np.random.default_rng(1)
+    origin, axis = room.corner + np.array([1.0, 1.1, 1.9]), np.array([0.48, -0.6, 0.64])
+    angles, turns = np.radians(width_deg) * np.sqrt(rng.random(4000)), rng.uniform(0.0, 2.0 * np.pi, 4000)
+    across = np.linalg.svd(axis[None])[2][1:]
+    around = np.column_stack([np.cos(turns), np.sin(turns)]) @ across
+    rays = np.cos(angles)[:, None] * axis + np.sin(angles)[:, None] * around
+    least = np.empty(len(room.boxes))
+    ranges_ahead(origin, axis, np.radians(width_deg), room.boxes, least)
+    alone = [room._replace(boxes=room.boxes[b : b + 1]) for b in range(len(room.boxes))]
+    is_hit = [np.isfinite(naive.nearest_box(origin, rays, box.boxes)).any() for box in alone]
+    assert np.isfinite(least[is_hit]).all()
+    distances = [max(box.clearance(origin), 0.0) for box in alone]
+    is_ahead = np.isfinite(least)
+    np.testing.assert_allclose(least[is_ahead], np.array(distances)[is_ahead], atol=1e-9)
+    assert (is_ahead.sum() < 0.5 * len(least)) == (width_deg < 45.0)
 
 
 def test_copies_are_exact_and_others_are_not():
@@ -197,7 +219,6 @@ def written(folder, words):
 
 
 def test_command_line_writes_walks_that_read_back(tmp_path, capsys):
-    av = pytest.importorskip("av")
     folder = tmp_path / "walks"
     assert written(folder, "--walk 12 --walks 2 --bad-frames 0.3 --video --twins 0.5") == 0
     assert json.loads(capsys.readouterr().out)["queries"] == len(list((folder / "images").iterdir()))
@@ -222,6 +243,14 @@ def test_command_line_writes_walks_that_read_back(tmp_path, capsys):
     assert len(shown) == len(first)
     for query, rgb in zip(first, shown, strict=True):
         assert np.abs(cv2.imread(str(query.image))[..., ::-1].astype(float) - rgb).mean() < 6.0
+
+
+def test_a_video_without_its_library_is_refused_before_anything_is_made(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    assert written(tmp_path / "r", "--walk 5 --video") == 3
+    assert "--video: needs av" in (message := capsys.readouterr().err)
+    assert "pip install 'piccolo-localize[video]'" in message
+    assert not (tmp_path / "r").exists()
 
 
 def test_equal_seeds_make_equal_bits(tmp_path):

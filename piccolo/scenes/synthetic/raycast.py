@@ -13,7 +13,7 @@ from .room import Room
 AMBIENT, LAMP, LAMP_DECAY = 0.55, 0.9, 0.15  # of a surface's colour; the decay [1/m2]
 CHUNK = 4_096  # rays
 NUM_FIRST = 32  # boxes
-MARGIN = 1e-6  # of a cone around rays [rad]
+MARGIN = 1e-6  # of a cone around rays [rad], and of a range [m]
 
 
 @inline_kernel
@@ -118,19 +118,45 @@ def shade(origin, directions, ranges, hits, boxes, materials, lights, rgb):
             rgb[n, k] = min(1.0, lit * (m[2 + k] * (1.0 - fraction) + m[5 + k] * fraction))
 
 
+@kernel
+def ranges_ahead(origin, axis, cone_width, boxes, least):
+    """Write the distance [m] of each box (B, 7), inf where its bounding sphere is outside a cone of rays.
+
+    The cone is around the unit `axis` (3,), its half width [rad].
+    """
+    cone_cos, cone_sin = math.cos(cone_width), math.sin(cone_width)
+    for b in range(len(boxes)):
+        ox, oy, oz = boxes[b, 0] - origin[0], boxes[b, 1] - origin[1], boxes[b, 2] - origin[2]
+        half_x, half_y, half_z = boxes[b, 3], boxes[b, 4], boxes[b, 5]
+        radius = math.sqrt(half_x * half_x + half_y * half_y + half_z * half_z)
+        distance = math.sqrt(ox * ox + oy * oy + oz * oz)
+        if distance > radius:
+            sine = radius / distance
+            cosine = math.sqrt(1.0 - sine * sine)
+            ahead = ox * axis[0] + oy * axis[1] + oz * axis[2]
+            # the angle of cone and sphere together is below pi, and that to the sphere's middle is above it
+            if cone_sin * cosine + cone_cos * sine > 0.0 and ahead < distance * (
+                cone_cos * cosine - cone_sin * sine
+            ):
+                least[b] = np.inf
+                continue
+        c, s = math.cos(boxes[b, 6]), math.sin(boxes[b, 6])
+        x = max(abs(c * ox + s * oy) - half_x, 0.0)
+        y = max(abs(c * oy - s * ox) - half_y, 0.0)
+        z = max(abs(oz) - half_z, 0.0)
+        least[b] = math.sqrt(x * x + y * y + z * z)
+
+
 def boxes_ahead(
     origin: Array, directions: NDArray[np.float64], boxes: NDArray[np.float64]
 ) -> tuple[NDArray[np.intp], Array]:
-    """Which boxes (B, 7) unit `directions` (N, 3) may hit, by their cone, and at what least range [m]."""
+    """Which boxes (B, 7) unit `directions` (N, 3) may hit, by their cone, and from what range on [m]."""
     axis = directions.mean(axis=0)
     axis /= max(float(np.linalg.norm(axis)), 1e-12)  # of opposite rays, for which the cone is the sphere
-    width = math.acos(np.clip((directions @ axis).min(), -1.0, 1.0)) + MARGIN
-    offsets, radii = boxes[:, :3] - origin, np.linalg.norm(boxes[:, 3:6], axis=1)
-    distances = np.linalg.norm(offsets, axis=1)
-    reach = np.arcsin(np.minimum(radii / np.maximum(distances, 1e-12), 1.0)) + width
-    is_around = (distances <= radii) | (reach >= np.pi)
-    ahead = np.flatnonzero(is_around | (offsets @ axis >= distances * np.cos(np.minimum(reach, np.pi))))
-    return ahead, distances[ahead] - radii[ahead]
+    width, least = math.acos(np.clip((directions @ axis).min(), -1.0, 1.0)) + MARGIN, np.empty(len(boxes))
+    ranges_ahead(origin, axis, width, boxes, least)
+    ahead = np.flatnonzero(least < np.inf)
+    return ahead, least[ahead]
 
 
 def cast_rays(
@@ -152,7 +178,7 @@ def cast_rays(
         if len(ahead) > NUM_FIRST:  # what the nearest boxes hide needs no look
             nearest = np.argpartition(least, NUM_FIRST)[:NUM_FIRST]
             hit_boxes(origin, rays, room.boxes[ahead[nearest]], ranges[part], hits)
-            ahead = ahead[least <= ranges[part].max()]
+            ahead = ahead[least <= ranges[part].max() + MARGIN]
         boxes, materials = room.boxes[ahead], room.materials[ahead]
         hit_boxes(origin, rays, boxes, ranges[part], hits)
         shade(origin, rays, ranges[part], hits, boxes, materials, lights[ahead], rgb[part])
