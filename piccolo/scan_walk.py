@@ -1,6 +1,7 @@
 """A walk through a scan, frame by frame, and its results: what `Scan.track` gives."""
 
-from dataclasses import dataclass, replace
+import json
+from dataclasses import dataclass, fields, replace
 from os import PathLike
 from pathlib import Path
 
@@ -43,23 +44,24 @@ class Taken:
 
 
 class Walk:
-    """A camera followed through a scan. `add` frames in order; `finish` tells what all of them say together."""
+    """A camera followed through a scan: `add` frames in order; `finish` tells what all say together."""
 
     def __init__(self, tracker: Tracker, read_options: ReadOptions, about: WalkAbout) -> None:
         self.tracker, self.read_options, self.about = tracker, read_options, about
         self.taken: list[Taken] = []
 
-    def add(self, frame: Picture, time: float | None = None) -> Result:
+    def add(self, frame: Picture, time: float | None = None, name: str | None = None) -> Result:
         """Where the camera is now, by this frame and those before.
 
         A frame that can't be read is a result that says so. `time` [s] is that since any beginning, of all
-        frames or of none.
+        frames or of none; `name` stands in the result in place of the path.
         """
         number = len(self.taken)
         when = float(number) if time is None else float(time)
         if self.tracker.frames:
             checked_times([self.tracker.frames[-1].time, when])
         watch = Stopwatch()
+        name = name or ("array" if isinstance(frame, np.ndarray) else str(frame))
         try:
             with watch.stage("read"):
                 panorama = read_query(frame, self.read_options)
@@ -67,18 +69,41 @@ class Walk:
         except (OSError, InputError) as error:
             if isinstance(frame, np.ndarray):
                 raise
-            self.accept(Taken(frame, str(frame), None, watch.seconds, error=str(error)), Frame(when))
-            return self._result(self.taken[-1], Localization(), None)
+            text = str(error).replace(str(frame), name)
+            self.accept(Taken(frame, name, None, watch.seconds, error=text), Frame(when))
+            return self._now(self.tracker.frames[-1], number)
         with watch.stage("track"):
             found = self.tracker.add(panorama, when)
-        name = "array" if isinstance(frame, np.ndarray) else str(frame)
-        self.taken.append(Taken(frame, name, photo, watch.seconds, panorama.warnings))
+        warnings = tuple(warning.replace(str(frame), name) for warning in panorama.warnings)
+        self.taken.append(Taken(frame, name, photo, watch.seconds, warnings))
         return self._now(found, number)
 
     def accept(self, taken: Taken, frame: Frame) -> None:
         """A frame that was found earlier, or that can't be read."""
         self.taken.append(taken)
         self.tracker.accept(frame)
+
+    def last_to_json(self) -> str:
+        """What was found of the last frame, on one line, from which `restore` goes on."""
+        taken, frame = self.taken[-1], self.tracker.frames[-1]
+        alone = frame.alone and result_of(frame.alone, cloud="", pano="", seconds={}, settings={}).to_json()
+        photo = taken.photo and (taken.photo.sha256, taken.photo.image_size, taken.photo.capture_time)
+        about = {"pano": taken.name, "photo": photo, "seconds": taken.seconds, "warnings": taken.warnings}
+        return json.dumps({**about, "error": taken.error, "frame": frame.to_json(), "alone": alone})
+
+    def restore(self, line: str, picture: Path, time: float, name: str) -> bool:
+        """Take the next frame from a line of `last_to_json`, if it is of this picture as it is now."""
+        document = json.loads(line)
+        if document["pano"] != name or document["frame"]["time"] != time or not document["photo"]:
+            return False
+        digest, size, capture_time = document["photo"]
+        if photo_of(picture, self.read_options.rig).sha256 != digest:
+            return False
+        alone = document["alone"] and localization_in(Result.from_json(document["alone"]))
+        photo = Photo(digest, (size[0], size[1]), capture_time, None)
+        taken = Taken(picture, name, photo, document["seconds"], tuple(document["warnings"]))
+        self.accept(taken, Frame.from_json(document["frame"], alone))
+        return True
 
     def finish(self) -> list[Result]:
         """The result of each frame, by all of them."""
@@ -126,3 +151,9 @@ class Walk:
             source=Source(digest, photo.sha256, photo.image_size, photo.capture_time),
             walk=walk,
         )
+
+
+def localization_in(result: Result) -> Localization:
+    """The localization of which a result is made."""
+    names = {f.name for f in fields(Localization)} - {"pose", "warnings", "cameras"}
+    return Localization(pose=result.best_pose, **{name: getattr(result, name) for name in names})

@@ -58,6 +58,12 @@ class Frame:
         """All but what it was alone."""
         return {"time": self.time, "how": self.how, "states": [_state_json(state) for state in self.states]}
 
+    @classmethod
+    def from_json(cls, document: dict[str, Any], alone: Localization | None) -> "Frame":
+        """Read back what `to_json` wrote."""
+        states = [_state_from_json(state) for state in document["states"]]
+        return cls(float(document["time"]), states, document["how"], alone)
+
 
 def checked_times(times: Sequence[float]) -> None:
     """Refuse times that do not rise."""
@@ -113,7 +119,7 @@ def _state_json(state: State) -> dict[str, Any]:
     }
 
 
-def state_from_json(document: dict[str, Any]) -> State:
+def _state_from_json(document: dict[str, Any]) -> State:
     """Read back what `Frame.to_json` wrote of a state."""
     matrix = document["covariance"]
     return State(

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from ..coarse_to_fine.first_look import CLEAR_SCORE
 from ..coarse_to_fine.localize import localize
 from ..coarse_to_fine.query import prepare_query
 from ..confidence.alternatives import MAX_ALTERNATIVES
@@ -18,7 +19,7 @@ from ..runtime.stopwatch import Stopwatch
 from .frames import Frame, State, states_of
 from .path import REACH_SLACK, Path, lattice_of
 from .smoothing import smoothed
-from .tracker import MAX_RADIUS, Follower, Tracker, follow
+from .tracker import MAX_RADIUS, Follower, Tracker, follow, least_score
 from .tracking import beside, found_near, states_at
 
 MAX_SWEEPS = 4
@@ -96,10 +97,11 @@ def _found_again(tracker: Tracker, k: int, follower: Follower, panorama: Panoram
     frame = tracker.frames[k]
     query = prepare_query(panorama, tracker.scan_map, tracker.settings, tracker.workers)
     end = follow(query, follower, frame.time, tracker.motion)
-    found = [] if end is None else [end]
+    is_there = end.score >= least_score(follower)
+    found = [end] if is_there else []
     radius = tracker.motion.max_speed * abs(frame.time - follower.time) + REACH_SLACK
     if not found and radius <= MAX_RADIUS:
-        found = found_near(query, tracker.scan_map, follower.state.pose, radius)
+        found = found_near(query, tracker.scan_map, follower.state.pose, radius, CLEAR_SCORE)
     if not found and not frame.states and radius <= MAX_RADIUS:
         return _searched_near(tracker, frame, follower, radius, panorama)
     if found and frame.states:
@@ -107,7 +109,7 @@ def _found_again(tracker: Tracker, k: int, follower: Follower, panorama: Panoram
         frame.states += [] if more is None else [more]
         return more is not None
     if found:
-        frame.states, frame.how = states_at(query, found), "tracked" if end else "near"
+        frame.states, frame.how = states_at(query, found), "tracked" if is_there else "near"
     return len(found) > 0
 
 

@@ -18,6 +18,7 @@ from .frames import MOST_ODDS, Frame, Motion, centers_of
 from .free_space import FreeSpace
 
 COPY_LOG_ODDS = 5.0  # copies of a place differ by as much where one of them was scanned better
+SAME_PLACE = 1.5  # [m] poses nearer to each other are of one place, not of copies
 TELLING_DISTANCE = 2.0  # [m] after which a frame says something new of its place
 REACH_SLACK, REACH_SIGMA = 0.3, 0.25  # [m] beyond what a person walks; deviation of more
 GAP_LOG = -9.0  # a jump to any place: lift, cut, pocket
@@ -42,14 +43,26 @@ def emissions(frames: Sequence[Frame]) -> list[Array]:
         if len(odds) == 0:
             found.append(odds)
             continue
-        best, moved = int(odds.argmax()), TELLING_DISTANCE
+        moved = TELLING_DISTANCE
         if last is not None:
             moved = float(np.linalg.norm(here[:, None] - last[None], axis=2).min())
         last, share = here, min(moved / TELLING_DISTANCE, 1.0)
         total = np.clip(np.logaddexp.reduce(odds), -MOST_ODDS, MOST_ODDS)
-        behind = -share * np.maximum(odds[best] - odds - COPY_LOG_ODDS, 0.0)
+        of_place = odds[places_of(odds, here)]
+        behind = -share * np.maximum(odds.max() - of_place - COPY_LOG_ODDS, 0.0) - (of_place - odds)
         found.append(total + behind - np.logaddexp.reduce(behind))
     return found
+
+
+def places_of(odds: Array, centers: Array) -> NDArray[np.int64]:
+    """Index (S,) of the likeliest pose in the place of each pose (S, 3) [m], by their log odds (S,)."""
+    leaders: list[int] = []
+    place = np.empty(len(odds), np.int64)
+    for j in np.argsort(-odds, kind="stable"):
+        here = [i for i in leaders if np.linalg.norm(centers[i] - centers[j]) < SAME_PLACE]
+        leaders += [] if here else [int(j)]
+        place[j] = here[0] if here else j
+    return place
 
 
 def log_transition(distance: Array, seconds: float, motion: Motion) -> Array:

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..coarse_to_fine.first_look import CLEAR_SCORE
 from ..coarse_to_fine.localize import localize
 from ..coarse_to_fine.prior import apply_prior
 from ..coarse_to_fine.query import Query, prepare_query
@@ -17,7 +18,7 @@ from ..runtime.threads import Workers
 from .frames import Frame, Motion, State, states_of
 from .free_space import FreeSpace
 from .path import REACH_SLACK, Lattice
-from .tracking import LEAST_KEPT, LEAST_SCORE, beside, found_near, predicted, states_at, tracked
+from .tracking import KEPT_BESIDE, LEAST_KEPT, LEAST_SCORE, beside, found_near, predicted, states_at, tracked
 
 MOST_TRACKED = 6  # poses from which a frame is tracked
 MOST_SOUGHT = 3  # of those at which it is not, around which it is looked for
@@ -88,19 +89,20 @@ class Tracker:
 
     def _follow(self, query: Query, frame: Frame) -> None:
         """Descend from where the camera should be by each of its last poses, or look near these."""
-        found: list[Hypothesis] = []
-        lost: list[Follower] = []
-        for f in self.followers():
-            end = follow(query, f, frame.time, self.motion)
-            found += [] if end is None else [end]
-            lost += [f] if end is None else []
-        frame.how = "tracked" if found else "near"
+        followers = self.followers()
+        if not followers:
+            return
+        ends = [follow(query, f, frame.time, self.motion) for f in followers]
+        is_there = any(end.score >= least_score(f) for f, end in zip(followers, ends, strict=True))
+        least = KEPT_BESIDE * max(end.score for end in ends) if is_there else CLEAR_SCORE
+        found = [end for end in ends if end.score >= least] if is_there else []
+        lost = [f for f, end in zip(followers, ends, strict=True) if not is_there or end.score < least]
         for f in lost[:MOST_SOUGHT]:
             radius = self.motion.max_speed * (frame.time - f.time) + REACH_SLACK
             if radius <= MAX_RADIUS:
-                found += found_near(query, self.scan_map, f.state.pose, radius)
-        frame.states = states_at(query, found) if found else []
-        frame.how = frame.how if found else "none"
+                found += found_near(query, self.scan_map, f.state.pose, radius, least)
+        if found:
+            frame.states, frame.how = states_at(query, found), "tracked" if is_there else "near"
 
     def followers(self) -> list[Follower]:
         """The poses from which the next frame may come, the likeliest first."""
@@ -140,12 +142,17 @@ def merged(query: Query, alone: list[State], followed: list[State]) -> list[Stat
     return alone
 
 
-def follow(query: Query, f: Follower, time: float, motion: Motion) -> Hypothesis | None:
-    """Descend from where a camera should be after a pose; None if it is not there."""
+def least_score(f: Follower) -> float:
+    """What a frame must explain to be there where it was followed."""
+    return max(LEAST_SCORE, LEAST_KEPT * f.state.score)
+
+
+def follow(query: Query, f: Follower, time: float, motion: Motion) -> Hypothesis:
+    """Descend from where a camera should be after a pose."""
     seconds, before = time - f.time, f.state.pose
     span = f.time - f.earlier_time
     starts = [before]
     if f.earlier is not None and span != 0.0:
         reach = motion.max_speed * abs(seconds) + REACH_SLACK
         starts.insert(0, predicted(before, f.earlier, seconds / span, reach))
-    return tracked(query, starts, max(LEAST_SCORE, LEAST_KEPT * f.state.score))
+    return tracked(query, starts, least_score(f))

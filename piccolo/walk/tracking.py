@@ -8,7 +8,7 @@ import numpy as np
 
 from ..coarse_to_fine.covariance import estimate_covariance
 from ..coarse_to_fine.descent import FULL_LOSS, descend
-from ..coarse_to_fine.first_look import CLEAR_SCORE, FIRST_BEAM, first_query, is_rather_mirrored
+from ..coarse_to_fine.first_look import FIRST_BEAM, first_query, is_rather_mirrored
 from ..coarse_to_fine.localize import searched
 from ..coarse_to_fine.prior import apply_prior
 from ..coarse_to_fine.query import Query
@@ -16,7 +16,7 @@ from ..coarse_to_fine.refinement import compared, descend_fine, descend_middle, 
 from ..coarse_to_fine.scan_map import ScanMap
 from ..coarse_to_fine.search_result import found_among
 from ..coarse_to_fine.settings import Prior
-from ..coarse_to_fine.standings import fairly_selected, standings_of
+from ..coarse_to_fine.standings import standings_of
 from ..confidence.alternatives import MAX_ALTERNATIVES, MIN_ANGLE, MIN_DISTANCE, Hypothesis, suppressed
 from ..confidence.confidence import posterior
 from ..geometry.pose import Pose, exp_so3, log_so3, pose_errors
@@ -26,7 +26,7 @@ from .frames import State, log_ratio
 
 LEAST_SCORE = 0.2  # of a frame that is tracked
 LEAST_KEPT = 0.6  # of the score of the frame before
-NEAR_KEPT = 0.4  # of the best score nearby: copies of a place are kept until the walk tells them apart
+KEPT_BESIDE = 0.4  # of the best score: copies of a place are kept until the walk tells them apart
 LAST_LIMITS = (FULL_LOSS, 10, 1e-5)  # of the last descent, as in refinement
 MAX_TURN_RATE = math.radians(120.0)  # [rad/s] that is taken to go on as it was
 
@@ -45,20 +45,21 @@ def predicted(before: Pose, earlier: Pose | None, ratio: float, max_distance: fl
     return Pose(exp_so3(turn) @ before.R_cam_from_world, before.center_world + move)
 
 
-def tracked(query: Query, starts: Sequence[Pose], least_score: float) -> Hypothesis | None:
-    """The pose to which a frame descends from the best of some near it; None if it explains too little."""
+def tracked(query: Query, starts: Sequence[Pose], least_score: float) -> Hypothesis:
+    """The pose to which a frame descends from the best of some near it, or from farther around."""
     ends = [descend_fine(query, descend_middle(query, Hypothesis(pose, 0.0))) for pose in starts]
     best = max(ends, key=lambda h: h.score)
     if best.score < least_score:
         best = max([best, descend_fine(query, perturb_middle(query, best))], key=lambda h: h.score)
     points = points_at(query, best.pose)
     pose = descend(points, best.pose.center_world, query.images.full, best.pose, LAST_LIMITS)
-    found = max((compared(query, Hypothesis(p, 0.0)) for p in (pose, best.pose)), key=lambda h: h.score)
-    return found if found.score >= least_score else None
+    return max((compared(query, Hypothesis(p, 0.0)) for p in (pose, best.pose)), key=lambda h: h.score)
 
 
-def found_near(query: Query, scan_map: ScanMap, near: Pose, radius: float) -> list[Hypothesis]:
-    """Poses found within a radius [m] by whole views; none if none of them explains enough."""
+def found_near(
+    query: Query, scan_map: ScanMap, near: Pose, radius: float, least_score: float
+) -> list[Hypothesis]:
+    """Poses found within a radius [m] by whole views; none if the best has less than a score."""
     x, y, z = (float(value) for value in scan_map.to_world(near).center_world)
     some = apply_prior(scan_map, Prior(near_world=(x, y, z), radius=radius))
     if len(some.centers) == 0:
@@ -66,14 +67,12 @@ def found_near(query: Query, scan_map: ScanMap, near: Pose, radius: float) -> li
     first = first_query(replace(query, scan_map=some, comparisons={}))
     gravity: Gravity = "unknown" if query.settings.gravity == "unknown" else "known"
     starts, hypotheses = searched(first, gravity, FIRST_BEAM, Stopwatch())
-    if not hypotheses:
+    found = found_among(hypotheses, MAX_ALTERNATIVES)
+    if found.best.score < least_score or is_rather_mirrored(first, starts):
         return []
-    found = fairly_selected(first, found_among(hypotheses, MAX_ALTERNATIVES))
-    if found.best.score < CLEAR_SCORE or is_rather_mirrored(first, starts):
-        return []
-    close = [h for h in found.alternatives if h.score >= NEAR_KEPT * found.best.score]
-    ends = (tracked(query, [h.pose], NEAR_KEPT * found.best.score) for h in [found.best, *close])
-    return [end for end in ends if end is not None]
+    least = KEPT_BESIDE * found.best.score
+    close = [h for h in (found.best, *found.alternatives) if h.score >= least]
+    return [end for h in close if (end := tracked(query, [h.pose], least)).score >= least]
 
 
 def states_at(query: Query, hypotheses: Sequence[Hypothesis]) -> list[State]:
