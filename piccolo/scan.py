@@ -223,7 +223,8 @@ class Scan:
         if read_options.refine_focal:
             raise InputError("--refine-focal: not an option of walks; refine it with one photo")
         check_within(self.prepared, settings.prior.within)
-        tracker = Tracker(self.prepared, settings, self.workers, motion)
+        quiet = Workers(self.workers.num_threads, warn=self.workers.warn)
+        tracker = Tracker(self.prepared, settings, quiet, motion)
         repeated = settings_json(settings, self.cloud_settings, read_options)
         about = WalkAbout(self.name, self.warnings, {**repeated, "walk": asdict(motion)})
         return Walk(tracker, read_options, about)

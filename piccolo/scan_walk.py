@@ -16,7 +16,8 @@ from .panorama.photo import Photo, photo_of, photo_of_array
 from .result import Result, Source, result_of, unreadable_result
 from .runtime.stopwatch import Stopwatch
 from .walk.frames import Frame, checked_times
-from .walk.localize import WalkFrame, alone_of, finished, localization_of, localizations_of
+from .walk.localize import WalkFrame, alone_of, localization_of, localizations_of
+from .walk.second_look import finished
 from .walk.tracker import Tracker
 
 Picture = str | PathLike[str] | NDArray[np.uint8]

@@ -11,9 +11,7 @@ from ..coarse_to_fine.scan_map import SEARCH_VIEW, ScanMap
 from ..geometry.pose import Array
 from ..geometry.sphere import cell_of
 
-REACH = (
-    0.95  # [m] between candidates that may be neighbours: those of one grid cell of 0.6 m, not of all corners
-)
+REACH = 0.95  # [m] between neighbours in the grid of candidates, 0.6 m wide: across edges, not all corners
 SLACK = 0.1  # [m] by which a surface may be nearer than a neighbour, as views are coarse
 NEAR = 0.5  # [m] cameras keep 0.25 m from a wall: nearer ones have none between them
 DETOUR, ENDS = 1.1, 0.6  # paths along a grid are so much longer; and to its nodes [m]
@@ -21,7 +19,7 @@ MAX_SOURCES = 256  # whose distances are kept
 
 
 class FreeSpace:
-    """A map's candidates as a graph, with an edge where two neighbours see each other."""
+    """A map's candidates as a graph, with an edge where neighbours see each other."""
 
     def __init__(self, scan_map: ScanMap) -> None:
         self.scan_map = scan_map
@@ -40,8 +38,8 @@ class FreeSpace:
 
         first, second = self._tree.query_pairs(REACH, output_type="ndarray").T
         length = np.linalg.norm(self.scan_map.centers[second] - self.scan_map.centers[first], axis=1)
-        is_open = sees(self.scan_map, first, second) & sees(self.scan_map, second, first)
-        edges = length[is_open], (first[is_open], second[is_open])
+        views = looks(self.scan_map, first, second) + looks(self.scan_map, second, first)
+        edges = length[views > 0], (first[views > 0], second[views > 0])
         return coo_matrix(edges, (len(self.scan_map.centers),) * 2).tocsr()
 
     def distance(self, start: Array, ends: Array, limit: float) -> Array:
@@ -53,8 +51,13 @@ class FreeSpace:
             _, nodes = self._tree.query(np.concatenate([start[None], ends[far]]))
             along = self._from(int(nodes[0]), DETOUR * (limit + 2.0 * ENDS))[nodes[1:]]
             walked[far] = np.maximum(straight[far], along / DETOUR - ENDS)
-        walked[straight > limit] = np.inf
+        walked[walked > limit] = np.inf
         return np.asarray(walked)
+
+    def share_within(self, center: Array, radius: float) -> float:
+        """Fraction of the map's candidates within a radius [m] of a place (3,), at least one."""
+        near = np.linalg.norm(self.scan_map.centers - center, axis=1) < radius
+        return max(int(np.count_nonzero(near)), 1) / max(len(near), 1)
 
     def _from(self, node: int, limit: float) -> NDArray[np.float64]:
         """Lengths (candidates,) of the shortest paths from a node, inf beyond the limit [m]."""
@@ -69,12 +72,16 @@ class FreeSpace:
         return known[1]
 
 
-def sees(scan_map: ScanMap, first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.bool_]:
-    """True (N,) where nothing that a candidate sees is nearer than a neighbour in that direction."""
+def looks(scan_map: ScanMap, first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.int64]:
+    """What candidates see (N,) in the direction of neighbours: 1 what lies behind them, 0 nothing, else -2.
+
+    A sum above 0 is a free way: nobody sees anything between, and somebody sees past.
+    """
     m = scan_map
     toward = m.centers[second] - m.centers[first]
     length = np.linalg.norm(toward, axis=1)
     cell = cell_of((toward / length[:, None]).astype(np.float32), SEARCH_VIEW.num_rings)
     offsets = m.offsets[first, :, cell].astype(np.float32)
     ranges = np.linalg.norm(offsets, axis=1) * m.offset_unit[first]
-    return np.asarray(~m.is_seen[first, cell] | (ranges > length - SLACK))
+    is_behind = ranges > length - SLACK
+    return np.where(m.is_seen[first, cell], np.where(is_behind, 1, -2), 0)

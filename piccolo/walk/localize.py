@@ -1,32 +1,21 @@
-"""A walk as a whole: frames followed in time, those that were lost looked for again, then all together."""
+"""What a walk makes of its frames."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
-from ..coarse_to_fine.first_look import CLEAR_SCORE
-from ..coarse_to_fine.localize import localize
-from ..coarse_to_fine.query import prepare_query
 from ..confidence.alternatives import MAX_ALTERNATIVES
-from ..confidence.confidence import NOT_LOCALIZED, classify
+from ..confidence.confidence import classify
 from ..confidence.localization import Alternative, Localization
 from ..geometry.pose import MAX_DISTANCE, Array, Pose
-from ..panorama import Panorama
-from ..runtime.stopwatch import Stopwatch
-from .frames import Frame, State, states_of
-from .path import REACH_SLACK, Path, lattice_of
+from .frames import Frame
+from .path import Path
 from .smoothing import smoothed
-from .tracker import MAX_RADIUS, Follower, Tracker, follow, least_score
-from .tracking import beside, found_near, states_at
+from .tracker import Tracker
 
-MAX_SWEEPS = 4
-FARTHEST = 12  # frames from one that is sure, in which lost ones are looked for
-SURE = 0.5
-
-Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
+SURE = 0.5  # frames with less are not smoothed with the others
 
 
 @dataclass(frozen=True)
@@ -55,111 +44,6 @@ class WalkFrame:
     how: str  # where its pose comes from: "alone", "tracked", "near", or "none"
     alone: Alone | None  # if it was searched without regard to the others
     gap: Gap | None  # before it
-
-
-def finished(tracker: Tracker, read: Read) -> Path:
-    """The path of all frames that a tracker has followed; lost ones are looked for from their neighbours."""
-    path = tracker.lattice.smoothed()
-    tried: set[tuple[int, int]] = set()
-    for _ in range(MAX_SWEEPS):
-        num_found = 0
-        for step in (-1, 1):
-            for k in range(len(tracker.frames))[::step]:
-                follower = _follower_of_lost(tracker, path, k, step, tried)
-                panorama = read(k) if follower else None
-                if follower and panorama is not None and panorama.is_valid.any():
-                    num_found += _found_again(tracker, k, follower, panorama)
-            path = lattice_of(tracker.frames, tracker.lattice.space, tracker.motion).smoothed()
-        if num_found == 0:
-            break
-    return path
-
-
-def _follower_of_lost(
-    tracker: Tracker, path: Path, k: int, step: int, tried: set[tuple[int, int]]
-) -> Follower | None:
-    """Whence a frame that has no pose on the path is looked for: from the nearest that is sure, once."""
-    chosen, frames = path.chosen[k], tracker.frames
-    if chosen is not None and path.probabilities[k][chosen] > SURE:
-        return None
-    near = range(k - step, k - step * (FARTHEST + 1), -step)
-    sure = next((m for m in near if _is_sure(tracker, path, m)), None)
-    if sure is None or (k, sure) in tried:
-        return None
-    tried.add((k, sure))
-    follower = _follower(tracker, path, sure, step)
-    is_there = any(_is_within(tracker, follower, state, frames[k].time) for state in frames[k].states)
-    return None if is_there else follower
-
-
-def _found_again(tracker: Tracker, k: int, follower: Follower, panorama: Panorama) -> bool:
-    """True if a frame has got a pose more, near where a follower leads."""
-    frame = tracker.frames[k]
-    query = prepare_query(panorama, tracker.scan_map, tracker.settings, tracker.workers)
-    end = follow(query, follower, frame.time, tracker.motion)
-    is_there = end.score >= least_score(follower)
-    found = [end] if is_there else []
-    radius = tracker.motion.max_speed * abs(frame.time - follower.time) + REACH_SLACK
-    if not found and radius <= MAX_RADIUS:
-        found = found_near(query, tracker.scan_map, follower.state.pose, radius, CLEAR_SCORE)
-    if not found and not frame.states and radius <= MAX_RADIUS:
-        return _searched_near(tracker, frame, follower, radius, panorama)
-    if found and frame.states:
-        more = beside(query, frame.states, found[0])
-        frame.states += [] if more is None else [more]
-        return more is not None
-    if found:
-        frame.states, frame.how = states_at(query, found), "tracked" if is_there else "near"
-    return len(found) > 0
-
-
-def _searched_near(
-    tracker: Tracker, frame: Frame, follower: Follower, radius: float, panorama: Panorama
-) -> bool:
-    """True if a frame is found near a pose by all means, local features too."""
-    x, y, z = (float(v) for v in tracker.scan_map.to_world(follower.state.pose).center_world)
-    near = replace(tracker.settings.prior, near_world=(x, y, z), radius=radius)
-    settings = replace(tracker.settings, prior=near)
-    found = localize(tracker.scan_map, panorama, settings, tracker.workers, Stopwatch())
-    if found.status == NOT_LOCALIZED:
-        return False
-    frame.states, frame.how = states_of(tracker.scan_map, found), "near"
-    return True
-
-
-def _is_sure(tracker: Tracker, path: Path, m: int) -> bool:
-    """True for a frame whose pose the path knows, or that has just been found."""
-    if not 0 <= m < len(tracker.frames) or not tracker.frames[m].states:
-        return False
-    chosen = path.chosen[m]
-    if chosen is None or len(path.probabilities[m]) != len(tracker.frames[m].states):
-        return len(path.probabilities[m]) != len(tracker.frames[m].states)
-    return bool(path.probabilities[m][chosen] > SURE)
-
-
-def _state_on(tracker: Tracker, path: Path, m: int) -> State:
-    """The state of a sure frame: on the path, or what was found last."""
-    states, chosen = tracker.frames[m].states, path.chosen[m]
-    is_old = chosen is not None and len(path.probabilities[m]) == len(states)
-    return states[chosen] if is_old and chosen is not None else states[-1]
-
-
-def _follower(tracker: Tracker, path: Path, m: int, step: int) -> Follower:
-    """The pose of a sure frame, and of the one before it in the direction of the sweep."""
-    state, other = _state_on(tracker, path, m), m - step
-    if _is_sure(tracker, path, other):
-        earlier = _state_on(tracker, path, other)
-        follower = Follower(state, tracker.frames[m].time, earlier.pose, tracker.frames[other].time)
-        if _is_within(tracker, follower, earlier, tracker.frames[other].time):
-            return follower
-    return Follower(state, tracker.frames[m].time, None, 0.0)
-
-
-def _is_within(tracker: Tracker, f: Follower, state: State, time: float) -> bool:
-    """True for a state that a person can walk to."""
-    reach = tracker.motion.max_speed * abs(time - f.time) + REACH_SLACK
-    ends = state.pose.center_world[None]
-    return bool(tracker.lattice.space.distance(f.state.pose.center_world, ends, 2.0 * reach)[0] <= reach)
 
 
 def localizations_of(tracker: Tracker, path: Path) -> list[tuple[Localization, WalkFrame]]:

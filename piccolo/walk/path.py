@@ -22,6 +22,7 @@ SAME_PLACE = 1.5  # [m] poses nearer to each other are of one place, not of copi
 TELLING_DISTANCE = 2.0  # [m] after which a frame says something new of its place
 REACH_SLACK, REACH_SIGMA = 0.3, 0.25  # [m] beyond what a person walks; deviation of more
 GAP_LOG = -9.0  # a jump to any place: lift, cut, pocket
+MOST_EXPECTED = 3.0  # [log] that a pose gains by being where it was to be expected
 MAX_SKIPPED = 25.0  # [log] frames that speak for their poses by more in all are not passed over
 LONGEST_SKIP = 400  # frames
 
@@ -65,10 +66,13 @@ def places_of(odds: Array, centers: Array) -> NDArray[np.int64]:
     return place
 
 
-def log_transition(distance: Array, seconds: float, motion: Motion) -> Array:
-    """Log probability (N,) that a camera has gone so far [m] in so many seconds, but for a constant."""
+def log_transition(distance: Array, seconds: float, motion: Motion, expected: Array | float = 0.0) -> Array:
+    """Log odds (N,) that a camera has gone so far [m] in so many seconds, against any place of the map.
+
+    `expected` is what a place gains that it can reach; a jump has its price.
+    """
     excess = np.maximum(distance - motion.max_speed * seconds - REACH_SLACK, 0.0)
-    return np.maximum(-0.5 * (excess / REACH_SIGMA) ** 2, GAP_LOG)
+    return np.maximum(expected - 0.5 * (excess / REACH_SIGMA) ** 2, GAP_LOG)
 
 
 class _Steps(NamedTuple):
@@ -127,12 +131,21 @@ class Lattice:
                 continue
             seconds = self.frames[k].time - frame.time
             limit = self.motion.max_speed * seconds + REACH_SLACK + 5.0 * REACH_SIGMA
-            distances = [self.space.distance(c, ends, limit) for c in centers_of(frame.states)]
-            steps.append(_Steps(m, log_transition(np.array(distances), seconds, self.motion)))
+            starts = centers_of(frame.states)
+            distances = [self.space.distance(start, ends, limit) for start in starts]
+            expected = np.array([[self._expected(start, limit)] for start in starts])
+            steps.append(_Steps(m, log_transition(np.array(distances), seconds, self.motion, expected)))
             passed += max(float(np.logaddexp.reduce(self.emitted[m])), 0.0)
             if passed > MAX_SKIPPED:
                 break
         return steps
+
+    def _expected(self, start: Array, reach: float) -> float:
+        """What a pose within a reach [m] gains: the more, the less of the map lies there.
+
+        A frame's own odds hold where each place of the map is as likely as the others.
+        """
+        return min(-math.log(self.space.share_within(start, reach)), MOST_EXPECTED)
 
     def filtered(self) -> Array:
         """Probability (S,) of each state of the last frame by all that was before."""

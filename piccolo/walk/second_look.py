@@ -1,0 +1,174 @@
+"""Frames looked at once more, when those after them are known too."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from ..coarse_to_fine.first_look import CLEAR_SCORE
+from ..coarse_to_fine.localize import localize
+from ..coarse_to_fine.query import prepare_query
+from ..confidence.confidence import NOT_LOCALIZED
+from ..panorama import Panorama
+from ..runtime.stopwatch import Stopwatch
+from .frames import MOST_ODDS, Frame, State, centers_of, states_of
+from .path import REACH_SLACK, Path, lattice_of, places_of
+from .tracker import MAX_RADIUS, Follower, Tracker, follow, least_score
+from .tracking import beside, found_near, states_at
+
+MAX_SWEEPS = 4
+FARTHEST = 12  # frames from one that is sure, in which lost ones are looked for
+SURE = 0.5
+MOST_RIVALS = 4  # places of a frame that are followed to its neighbours
+
+Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
+
+
+def finished(tracker: Tracker, read: Read) -> Path:
+    """The path of all frames that a tracker has followed.
+
+    Each place that a frame may show is looked for in its neighbours: a copy that was not on a frame's list
+    would lose the whole walk. Then lost frames are looked for from those that are sure.
+    """
+    for step in (1, -1):
+        for k in range(len(tracker.frames))[::step]:
+            _complete(tracker, k, step, read)
+    path = _path_of(tracker)
+    tried: set[tuple[int, int]] = set()
+    for _ in range(MAX_SWEEPS):
+        num_found = 0
+        for step in (-1, 1):
+            for k in range(len(tracker.frames))[::step]:
+                follower = _follower_of_lost(tracker, path, k, step, tried)
+                panorama = read(k) if follower else None
+                if follower and panorama is not None and panorama.is_valid.any():
+                    num_found += _found_again(tracker, k, follower, panorama)
+            path = _path_of(tracker)
+        if num_found == 0:
+            break
+    return path
+
+
+def _path_of(tracker: Tracker) -> Path:
+    return lattice_of(tracker.frames, tracker.lattice.space, tracker.motion).smoothed()
+
+
+def _complete(tracker: Tracker, k: int, step: int, read: Read) -> None:
+    """Give a frame the places of the frame a step before it that can be reached, and that it lacks."""
+    frame, m = tracker.frames[k], k - step
+    if not frame.states or not 0 <= m < len(tracker.frames):
+        return
+    missing = [f for f in _rivals(tracker, m) if not _is_reached(tracker, f, k)]
+    panorama = read(k) if missing else None
+    if panorama is None:
+        return
+    query = prepare_query(panorama, tracker.scan_map, tracker.settings, tracker.workers)
+    for follower in missing:
+        end = follow(query, follower, frame.time, tracker.motion)
+        more = beside(query, frame.states, end)
+        if more is not None and _is_within(tracker, follower, more, frame.time):
+            frame.states.append(more)
+
+
+def _rivals(tracker: Tracker, m: int) -> list[Follower]:
+    """The likelier poses of a frame, one of each place; none if there is only one."""
+    frame = tracker.frames[m]
+    odds = np.array([state.log_odds for state in frame.states])
+    if len(odds) < 2:
+        return []
+    leaders = np.unique(places_of(odds, centers_of(frame.states)))
+    likely = [int(j) for j in leaders if odds[j] > odds.max() - MOST_ODDS]
+    likely = sorted(likely, key=lambda j: -odds[j])[:MOST_RIVALS]
+    return [Follower(frame.states[j], frame.time, None, 0.0) for j in likely] if len(likely) > 1 else []
+
+
+def _is_reached(tracker: Tracker, f: Follower, k: int) -> bool:
+    """True if a frame has a pose to which a person can have walked."""
+    frame = tracker.frames[k]
+    return any(_is_within(tracker, f, state, frame.time) for state in frame.states)
+
+
+def _follower_of_lost(
+    tracker: Tracker, path: Path, k: int, step: int, tried: set[tuple[int, int]]
+) -> Follower | None:
+    """Whence a frame that has no pose on the path is looked for: from the nearest that is sure, once."""
+    chosen = path.chosen[k]
+    if chosen is not None and path.probabilities[k][chosen] > SURE:
+        return None
+    near = range(k - step, k - step * (FARTHEST + 1), -step)
+    sure = next((m for m in near if _is_sure(tracker, path, m)), None)
+    if sure is None or (k, sure) in tried:
+        return None
+    tried.add((k, sure))
+    follower = _follower(tracker, path, sure, step)
+    return None if _is_reached(tracker, follower, k) else follower
+
+
+def _found_again(tracker: Tracker, k: int, follower: Follower, panorama: Panorama) -> bool:
+    """True if a frame has got a pose more, near where a follower leads."""
+    frame = tracker.frames[k]
+    query = prepare_query(panorama, tracker.scan_map, tracker.settings, tracker.workers)
+    end = follow(query, follower, frame.time, tracker.motion)
+    is_there = end.score >= least_score(follower)
+    found = [end] if is_there else []
+    radius = tracker.motion.max_speed * abs(frame.time - follower.time) + REACH_SLACK
+    if not found and radius <= MAX_RADIUS:
+        found = found_near(query, tracker.scan_map, follower.state.pose, radius, CLEAR_SCORE)
+    if not found and not frame.states and radius <= MAX_RADIUS:
+        return _searched_near(tracker, frame, follower, radius, panorama)
+    if found and frame.states:
+        more = beside(query, frame.states, found[0])
+        frame.states += [] if more is None else [more]
+        return more is not None
+    if found:
+        frame.states, frame.how = states_at(query, found), "tracked" if is_there else "near"
+    return len(found) > 0
+
+
+def _searched_near(
+    tracker: Tracker, frame: Frame, follower: Follower, radius: float, panorama: Panorama
+) -> bool:
+    """True if a frame is found near a pose by all means, local features too."""
+    x, y, z = (float(v) for v in tracker.scan_map.to_world(follower.state.pose).center_world)
+    near = replace(tracker.settings.prior, near_world=(x, y, z), radius=radius)
+    settings = replace(tracker.settings, prior=near)
+    found = localize(tracker.scan_map, panorama, settings, tracker.workers, Stopwatch())
+    if found.status == NOT_LOCALIZED:
+        return False
+    frame.states, frame.how = states_of(tracker.scan_map, found), "near"
+    return True
+
+
+def _is_sure(tracker: Tracker, path: Path, m: int) -> bool:
+    """True for a frame whose pose the path knows, or that has just been found."""
+    if not 0 <= m < len(tracker.frames) or not tracker.frames[m].states:
+        return False
+    chosen = path.chosen[m]
+    if chosen is None or len(path.probabilities[m]) != len(tracker.frames[m].states):
+        return len(path.probabilities[m]) != len(tracker.frames[m].states)
+    return bool(path.probabilities[m][chosen] > SURE)
+
+
+def _state_on(tracker: Tracker, path: Path, m: int) -> State:
+    """The state of a sure frame: on the path, or what was found last."""
+    states, chosen = tracker.frames[m].states, path.chosen[m]
+    is_old = chosen is not None and len(path.probabilities[m]) == len(states)
+    return states[chosen] if is_old and chosen is not None else states[-1]
+
+
+def _follower(tracker: Tracker, path: Path, m: int, step: int) -> Follower:
+    """The pose of a sure frame, and of the one before it in the direction of the sweep."""
+    state, other = _state_on(tracker, path, m), m - step
+    if _is_sure(tracker, path, other):
+        earlier = _state_on(tracker, path, other)
+        follower = Follower(state, tracker.frames[m].time, earlier.pose, tracker.frames[other].time)
+        if _is_within(tracker, follower, earlier, tracker.frames[other].time):
+            return follower
+    return Follower(state, tracker.frames[m].time, None, 0.0)
+
+
+def _is_within(tracker: Tracker, f: Follower, state: State, time: float) -> bool:
+    """True for a state that a person can walk to."""
+    reach = tracker.motion.max_speed * abs(time - f.time) + REACH_SLACK
+    ends = state.pose.center_world[None]
+    return bool(tracker.lattice.space.distance(f.state.pose.center_world, ends, 2.0 * reach)[0] <= reach)

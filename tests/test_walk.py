@@ -1,0 +1,218 @@
+"""Walks through a small building, in Python and on the command line."""
+
+import json
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+import rooms
+
+import piccolo
+from piccolo.batch.frame_times import times_of
+from piccolo.cli import localize as localize_command
+from piccolo.cli import localize_walk as walk_command
+from piccolo.errors import InputError
+from piccolo.geometry.pose import pose_errors
+from piccolo.result import read_results
+from piccolo.scan_walk import Walk
+from piccolo.scenes.scene import read_scene
+
+
+@pytest.fixture(scope="module")
+def building(tmp_path_factory):
+    """Two rooms, a corridor, and a walk of a frame a second; as files and as the scene's queries."""
+    words = "--rooms 2 --storeys 1 --walk 8 --frame-rate 1 --width 512 --points 40000 --seed 2 --video"
+    folder = rooms.write_room(tmp_path_factory.mktemp("walk") / "a b", words)
+    return folder, [query for query in read_scene(folder).queries if query.walk]
+
+
+@pytest.fixture(scope="module")
+def scan(building):
+    """The building's scan."""
+    return piccolo.open_scan(building[0] / "cloud.ply", cache=False, num_threads=2)
+
+
+def _assert_right(results, queries):
+    """All frames are localized, each where it was taken."""
+    assert [result.status for result in results] == ["localized"] * len(queries)
+    errors = [pose_errors(r.pose, q.pose) for r, q in zip(results, queries, strict=True)]
+    assert max(distance for distance, _ in errors) < 0.03
+    assert np.degrees(max(angle for _, angle in errors)) < 0.5
+
+
+def test_a_walk_with_bad_frames_between(scan, building):
+    """The lost ones are refused, and break the path of nobody else."""
+    _, queries = building
+    frames = [cv2.imread(str(q.image))[..., ::-1].copy() for q in queries]
+    noise = np.random.default_rng(0).integers(0, 255, frames[0].shape, dtype=np.uint8)
+    frames[3], frames[4] = np.ascontiguousarray(frames[3][:, ::-1]), noise
+    results = scan.localize_walk(frames, times=[q.time for q in queries], gravity="known")
+    bad = {3, 4}
+    assert all(results[k].status != "localized" for k in bad)
+    good = [k for k in range(len(queries)) if k not in bad]
+    _assert_right([results[k] for k in good], [queries[k] for k in good])
+    assert [result.walk.frame for result in results] == list(range(len(queries)))
+    assert [result.walk.time for result in results] == [q.time for q in queries]
+    assert results[0].walk.how == "alone"
+    assert results[0].walk.alone.status == "localized"
+    assert {results[k].walk.how for k in good[1:]} <= {"tracked", "near"}
+    assert all(result.walk.gap is None for result in results)
+    assert all(results[k].covariance is not None for k in good)
+    again = piccolo.Result.from_json(results[0].to_json())
+    assert again.walk.alone.pose.center_world.tolist() == results[0].walk.alone.pose.center_world.tolist()
+    assert again.to_json() == results[0].to_json()
+
+
+def test_live_results_come_frame_by_frame_and_need_no_times(scan, building):
+    _, queries = building
+    tracker = scan.track(max_speed=3.0, gravity="known")
+    live = [tracker.add(q.image) for q in queries]
+    _assert_right(live, queries)
+    assert [result.walk.time for result in live] == [float(k) for k in range(len(queries))]
+    assert live[1].pano == str(queries[1].image)
+    assert live[1].source.pano_sha256 is not None
+    _assert_right(tracker.finish(), queries)
+
+
+def test_a_walk_is_the_same_with_any_number_of_threads(building):
+    folder, queries = building
+    found = []
+    for num_threads in (1, 2):
+        scan = piccolo.open_scan(folder / "cloud.ply", cache=False, num_threads=num_threads)
+        found.append(scan.localize_walk([q.image for q in queries[:4]], [q.time for q in queries[:4]]))
+    for a, b in zip(*found, strict=True):
+        assert a.pose.R_cam_from_world.tobytes() == b.pose.R_cam_from_world.tobytes()
+        assert a.pose.center_world.tobytes() == b.pose.center_world.tobytes()
+        assert a.covariance.matrix.tobytes() == b.covariance.matrix.tobytes()
+        assert a.confidence == b.confidence
+
+
+def _command(folder, *words):
+    """A command line over the building's frames."""
+    common = ["--cloud", str(folder / "cloud.ply"), "--cache", str(folder), "--gravity", "known", "--quiet"]
+    return localize_command.main([*common, *words])
+
+
+def _times(folder, queries):
+    """A table of times."""
+    lines = ["name,time", *(f"{q.image.name},{q.time + 100.0}" for q in queries)]
+    (folder / "times.csv").write_text("\n".join(lines))
+    return str(folder / "times.csv")
+
+
+def test_a_walk_that_was_stopped_goes_on_where_it_stood(building, tmp_path, monkeypatch):
+    folder, queries = building
+    walk = ["--walk", "--pano", str(folder / "images"), "--times", _times(folder, queries), "--out"]
+    whole, stopped = tmp_path / "whole.jsonl", tmp_path / "stopped.jsonl"
+    assert _command(folder, *walk, str(whole)) == 0
+    _assert_right(read_results([whole]), queries)
+    assert not walk_command.kept_in(whole).exists()
+
+    def killed(self):
+        raise MemoryError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Walk, "finish", killed)
+        assert _command(folder, *walk, str(stopped)) != 0
+    kept = walk_command.kept_in(stopped)
+    lines = kept.read_bytes().splitlines(keepends=True)
+    assert len(lines) == 1 + len(queries)
+    kept.write_bytes(b"".join(lines[:-2]) + lines[-2][:30])
+    added = []
+    add = Walk.add
+    monkeypatch.setattr(Walk, "add", lambda self, *a: added.append(a[2]) or add(self, *a))
+    assert _command(folder, *walk, str(stopped)) == 0
+    assert added == [str(q.image) for q in queries[-2:]]
+
+    def told(path):
+        return [{**json.loads(line), "seconds": None} for line in path.read_text().splitlines()]
+
+    assert told(stopped) == told(whole)
+    assert _command(folder, *walk, str(stopped)) == 0
+    assert len(added) == 2
+
+
+def test_results_of_another_walk_are_not_overwritten(building, tmp_path, capsys):
+    folder, queries = building
+    walk = ["--walk", "--pano", *(str(q.image) for q in queries[:2]), "--out", str(tmp_path / "a.jsonl")]
+    assert _command(folder, *walk, "--times", _times(folder, queries)) == 0
+    before = (tmp_path / "a.jsonl").read_bytes()
+    assert _command(folder, *walk, "--times", "order") == 3
+    assert "of another run (settings); --overwrite starts anew" in capsys.readouterr().err
+    assert (tmp_path / "a.jsonl").read_bytes() == before
+    assert _command(folder, *walk, "--times", "order", "--overwrite") == 0
+
+
+def test_a_video_is_a_walk(building, tmp_path):
+    """A frame every two seconds, named by its time; and a metre apart."""
+    folder, queries = building
+    (video,) = folder.glob("*.mp4")
+    out = tmp_path / "video.jsonl"
+    assert _command(folder, "--video", str(video), "--every", "2s", "--out", str(out)) == 0
+    results = read_results([out])
+    _assert_right(results, queries[: 2 * len(results) : 2])
+    assert [r.pano for r in results] == [f"{video}#t={2 * k}.000" for k in range(len(results))]
+    assert len(results) == (len(queries) + 1) // 2
+    assert _command(folder, "--video", str(video), "--every", "1.5m", "--out", str(out), "--overwrite") == 0
+    centers = [r.pose.center_world for r in read_results([out])]
+    assert 2 <= len(centers) < len(queries)
+    assert all(np.linalg.norm(b - a) >= 1.5 for a, b in pairwise(centers))
+
+
+REFUSED = {
+    "--video and --pano": (
+        ["--video", "a.mp4", "--pano", "a.jpg"],
+        2,
+        "wanted --walk with --pano, or --video",
+    ),
+    "no frame": (["--walk"], 2, "wanted --walk with --pano, or --video alone"),
+    "no photo": ([], 2, "the following arguments are required: --pano"),
+    "stdin": (["--walk", "--pano", "-"], 2, "--walk: found names on stdin, wanted files or folders"),
+    "speed alone": (["--pano", "a.jpg", "--max-speed", "2"], 2, "--max-speed: only with --walk or --video"),
+    "jobs": (["--walk", "--pano", "a.jpg", "--jobs", "2"], 2, "--jobs: not with a walk"),
+    "every": (["--walk", "--pano", "a.jpg", "--every", "1s"], 2, "--every: only with --video"),
+    "step": (["--video", "a.mp4", "--every", "fast"], 2, "--every: found 'fast', wanted seconds or metres"),
+    "paper": (["--walk", "--pano", "a.jpg", "--preset", "paper"], 2, "not options of the preset paper"),
+    "no times": (["--walk", "--pano", "a.jpg", "--max-speed", "2"], 2, "--max-speed: found no times"),
+    "no video": (["--video", "missing.mp4"], 3, "missing.mp4: no such file, wanted a video that PyAV reads"),
+    "no table": (["--walk", "--pano", "a.jpg", "--times", "missing.csv"], 3, "missing.csv"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_wrong_words_are_one_line(case, building, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words, code, text = REFUSED[case]
+    assert _command(building[0], *words) == code
+    error = capsys.readouterr().err
+    assert text in error
+    assert error.count("\n") == 1 or code == 2
+
+
+def test_what_is_no_video_is_one_line(building, tmp_path, capsys):
+    (tmp_path / "a.mp4").write_bytes(b"no video" * 100)
+    assert _command(building[0], "--video", str(tmp_path / "a.mp4")) == 3
+    error = capsys.readouterr().err
+    assert "wanted a video that PyAV reads, such as MP4" in error
+    assert error.count("\n") == 1
+
+
+def test_times_by_names_tables_and_exif(tmp_path):
+    frames = [tmp_path / f"walk_{text}.jpg" for text in ("10.5", "11", "13.25")]
+    assert times_of(frames, "names") == [0.0, 0.5, 2.75]
+    assert times_of(frames, "order") is None
+    assert times_of(frames, None) is None  # no file, no EXIF
+    (tmp_path / "t.csv").write_text("name,time\nwalk_10.5.jpg,3\nwalk_11.jpg,4\n")
+    assert times_of(frames[:2], str(tmp_path / "t.csv")) == [0.0, 1.0]
+    with pytest.raises(InputError, match=r"t\.csv: found no time of .*walk_13\.25\.jpg, wanted a CSV file"):
+        times_of(frames, str(tmp_path / "t.csv"))
+    (tmp_path / "t.csv").write_text("name,when\na,3\n")
+    with pytest.raises(InputError, match=r"t\.csv: found KeyError 'time', wanted a CSV file"):
+        times_of(frames, str(tmp_path / "t.csv"))
+    with pytest.raises(InputError, match="wanted them to rise"):
+        times_of(frames[::-1], "names")
+    with pytest.raises(InputError, match=r"^--times names: found no number in walk\.jpg"):
+        times_of([tmp_path / "walk.jpg"], "names")
+    with pytest.raises(InputError, match=r"^--times exif: found a frame without a time in EXIF"):
+        times_of(frames, "exif")

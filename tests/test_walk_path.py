@@ -1,0 +1,202 @@
+import itertools
+
+import numpy as np
+import pytest
+import rooms
+
+from piccolo.cloud.stream import stream_of_arrays
+from piccolo.coarse_to_fine.scan_map import prepare_map
+from piccolo.errors import InputError
+from piccolo.geometry.pose import Pose
+from piccolo.runtime.threads import Workers
+from piccolo.scenes.synthetic.world import make_world, scan_world
+from piccolo.walk.frames import Frame, Motion, State, checked_times
+from piccolo.walk.free_space import FreeSpace
+from piccolo.walk.path import COPY_LOG_ODDS, MOST_EXPECTED, emissions, lattice_of, log_transition
+
+MOTION = Motion(max_speed=1.0)
+
+
+class Open:
+    """Free space without walls."""
+
+    share = 1.0
+
+    def distance(self, start, ends, limit):
+        """Straight."""
+        straight = np.linalg.norm(ends - start, axis=1)
+        return np.where(straight > limit, np.inf, straight)
+
+    def share_within(self, center, radius):
+        """Any place is as good as another, or what a test says."""
+        return self.share
+
+
+def _frame(time, *states):
+    """A frame with poses at (x, y, z), each with log odds."""
+    return Frame(float(time), [State(Pose(np.eye(3), np.array(p, float)), o, 0.5) for p, o in states])
+
+
+def _naive(frames):
+    """Probabilities of all frames' states, and the likeliest way, by going every way there is."""
+    emitted = emissions(frames)
+    weights, best = [np.zeros(len(f.states)) for f in frames], (0.0, [None] * len(frames))
+    total = 0.0
+    for way in itertools.product(*([None, *range(len(f.states))] for f in frames)):
+        log, before = 0.0, None
+        for k, j in enumerate(way):
+            if j is None:
+                continue
+            log += emitted[k][j]
+            if before is not None:
+                m, i = before
+                gap = np.linalg.norm(
+                    frames[k].states[j].pose.center_world - frames[m].states[i].pose.center_world
+                )
+                log += log_transition(np.array([gap]), frames[k].time - frames[m].time, MOTION)[0]
+            before = k, j
+        total += np.exp(log)
+        best = max(best, (log, list(way)), key=lambda b: b[0])
+        for k, j in enumerate(way):
+            if j is not None:
+                weights[k][j] += np.exp(log)
+    return [w / total for w in weights], best[1]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_probabilities_and_way_are_those_of_all_ways_there_are(seed):
+    rng = np.random.default_rng(seed)
+    frames = []
+    for k in range(5):
+        states = [(rng.uniform(0.0, 4.0, 3), float(rng.normal(0.5, 2.0))) for _ in range(rng.integers(0, 4))]
+        frames.append(_frame(k + 0.3 * rng.random(), *states))
+    lattice = lattice_of(frames, Open(), MOTION)
+    path, (probabilities, chosen) = lattice.smoothed(), _naive(frames)
+    for found, wanted in zip(path.probabilities, probabilities, strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
+    assert path.chosen == chosen
+    if frames[-1].states:
+        np.testing.assert_allclose(lattice.filtered(), probabilities[-1], rtol=1e-9, atol=1e-12)
+
+
+def test_what_copies_say_of_each_other_does_not_add_up():
+    """Twenty frames in twin rooms, each a little for the wrong one; then a place that there is once."""
+    twins = [
+        _frame(k, ((0.1 * k, 0, 0), 3.0), ((0.1 * k + 20, 0, 0), 3.0 + 0.9 * COPY_LOG_ODDS))
+        for k in range(20)
+    ]
+    alone = lattice_of(twins, Open(), MOTION).smoothed()
+    np.testing.assert_allclose([p[0] for p in alone.probabilities], 0.5, atol=0.01)
+    told = lattice_of([*twins, _frame(20, ((2.0, 0, 0), 6.0))], Open(), MOTION).smoothed()
+    assert told.chosen == [0] * 21
+    assert min(p[0] for p in told.probabilities) > 0.99
+
+
+def test_what_tells_copies_apart_counts_as_far_as_the_camera_has_moved():
+    def behind(step):
+        frames = [
+            _frame(k, ((step * k, 0, 0), 6.0), ((step * k + 20, 0, 0), 6.0 - COPY_LOG_ODDS - 3.0))
+            for k in range(2)
+        ]
+        first, second = emissions(frames)
+        assert first[0] - first[1] == pytest.approx(3.0)
+        return second[0] - second[1]
+
+    assert behind(0.0) == pytest.approx(0.0)
+    assert behind(1.0) == pytest.approx(1.5)
+    assert behind(4.0) == pytest.approx(3.0)
+
+
+def test_a_worse_pose_in_the_same_place_is_no_copy():
+    (odds,) = emissions([_frame(0, ((0, 0, 0), 5.0), ((0.6, 0, 0), 1.0))])
+    assert odds[0] - odds[1] == pytest.approx(4.0)
+
+
+def test_a_jump_has_a_price_and_is_reported():
+    frames = [
+        *(_frame(k, ((k, 0, 0), 5.0)) for k in range(4)),
+        *(_frame(k, ((k + 50, 0, 0), 5.0)) for k in range(4, 8)),
+    ]
+    path = lattice_of(frames, Open(), MOTION).smoothed()
+    assert path.chosen == [0] * 8
+    assert path.gaps == [None] * 4 + [(51.0, 1.0)] + [None] * 3
+    lonely = [*frames[:4], _frame(4, ((54, 0, 0), 2.0)), _frame(5, ((5, 0, 0), 5.0))]
+    path = lattice_of(lonely, Open(), MOTION).smoothed()
+    assert path.chosen == [0, 0, 0, 0, None, 0]
+    assert path.probabilities[4][0] < 0.01
+
+
+def test_a_pose_where_it_was_to_be_expected_gains():
+    frames = [_frame(0, ((0, 0, 0), 5.0)), _frame(1, ((0.5, 0, 0), 0.0))]
+    space = Open()
+    assert lattice_of(frames, space, MOTION).smoothed().probabilities[1][0] == pytest.approx(0.5, abs=0.01)
+    space.share = 0.1
+    assert lattice_of(frames, space, MOTION).smoothed().probabilities[1][0] == pytest.approx(
+        10 / 11, abs=0.01
+    )
+    space.share = 1e-6
+    most = np.exp(MOST_EXPECTED)
+    found = lattice_of(frames, space, MOTION).smoothed().probabilities[1][0]
+    assert found == pytest.approx(most / (1 + most), abs=0.01)
+
+
+def test_frames_without_a_pose_are_passed_over():
+    frames = [
+        _frame(0, ((0, 0, 0), 5.0)),
+        Frame(1.0),
+        Frame(2.0),
+        _frame(3, ((2.5, 0, 0), 5.0), ((9, 0, 0), 5.0)),
+    ]
+    path = lattice_of(frames, Open(), MOTION).smoothed()
+    assert path.chosen == [0, None, None, 0]
+    assert path.probabilities[3][1] < 1.1 * np.exp(-5.0)  # as likely as that the walk begins there
+    assert path.gaps == [None] * 4
+    assert lattice_of([Frame(0.0)], Open(), MOTION).smoothed().chosen == [None]
+
+
+@pytest.fixture(scope="module")
+def two_rooms():
+    """Two rooms side by side, and their map."""
+    world = make_world(5, np.array(rooms.SIZE), 2)
+    points, colors, _ = scan_world(world, 80_000, Workers(2))
+    cloud = stream_of_arrays(points.astype(np.float64), colors)
+    return world, prepare_map(cloud, Workers(2), "z", has_features=False)
+
+
+def test_nobody_walks_through_a_wall(two_rooms):
+    """Places at a camera's height in one room and in the other, which have no door."""
+    world, scan_map = two_rooms
+    centers = scan_map.centers + scan_map.origin_world
+    is_high = np.abs(centers[:, 2] - 1.6) < 0.4
+    first, second = (
+        scan_map.centers[is_high & ((centers > r.corner) & (centers < r.corner + rooms.SIZE)).all(axis=1)]
+        for r in world.rooms
+    )
+    space, start = FreeSpace(scan_map), first[np.argmax(first[:, 1])]
+    same = space.distance(start, first, 20.0)
+    assert len(first) > 20
+    assert np.isfinite(same).mean() > 0.95
+    straight = np.linalg.norm(first - start, axis=1)
+    assert (same >= straight - 1e-9).all()
+    assert np.median(same[straight > 1.0] / straight[straight > 1.0]) < 1.4
+    assert len(second) > 20
+    assert np.linalg.norm(second - start, axis=1).min() < 2.0
+    across = space.distance(start, second, 20.0)  # by the windows at best
+    assert across.min() > np.linalg.norm(second - start, axis=1).min() + 1.5
+    assert np.isinf(space.distance(start, second, 2.3)).all()
+
+
+def test_far_places_are_beyond_the_limit(two_rooms):
+    centers = two_rooms[1].centers
+    distance = FreeSpace(two_rooms[1]).distance(centers[0], centers, 1.0)
+    assert np.isinf(distance[np.linalg.norm(centers - centers[0], axis=1) > 1.0]).all()
+    assert distance[0] == 0.0
+
+
+def test_refusals():
+    with pytest.raises(InputError, match=r"^times: found 1.0 after 2.0 at frame 2, wanted them to rise$"):
+        checked_times([0.0, 2.0, 1.0])
+    with pytest.raises(InputError, match=r"^times: found one that is no finite number, wanted seconds$"):
+        checked_times([0.0, np.nan])
+    with pytest.raises(InputError, match=r"^max_speed: found -1.0, wanted a number above 0$"):
+        Motion(max_speed=-1.0)
