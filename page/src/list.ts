@@ -149,5 +149,5 @@ export function percent(value: number): string {
 /** Millimetres for reading. */
 export function length(mm: number): string {
   if (mm >= 1000) return `${(mm / 1000).toFixed(2)} m`;
-  return mm >= 100 ? `${(mm / 10).toFixed(0)} cm` : `${mm.toFixed(mm < 10 ? 1 : 0)} mm`;
+  return mm >= 100 ? `${(mm / 10).toFixed(0)} cm` : `${Number(mm.toFixed(mm < 10 ? 1 : 0))} mm`;
 }

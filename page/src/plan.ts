@@ -4,6 +4,7 @@ import { ahead, type Model } from "./model";
 import type { Photo, Status, Storey } from "./types";
 
 const MOST_ZOOM = 2000; // px a metre
+const SMALL = 420; // px, width of a plan in a corner
 const CLICK = 5; // px that a finger may move
 const WEDGE_FROM = 9; // px a metre, from which headings are drawn
 const NAMES_FROM = 42; // px a metre, from which names are
@@ -113,7 +114,7 @@ export class Plan {
     const pad = Math.min(48, width * 0.06);
     this.scale = Math.min((width - 2 * pad) / (x1 - x0), (height - 2 * pad) / (y1 - y0));
     const pose = this.model.photo?.pose;
-    if (width < 420 && pose && this.model.photo?.storey === this.model.storey) {
+    if (width < SMALL && pose && this.model.photo?.storey === this.model.storey) {
       this.scale = Math.max(this.scale, Math.min(width / 9, 40));
       this.center(pose.center[0], pose.center[1]);
     } else {
@@ -133,7 +134,7 @@ export class Plan {
     const [x, y] = photo.pose.center;
     const at = this.toScreen(x, y);
     const { clientWidth: width, clientHeight: height } = this.canvas;
-    const margin = Math.min(width, height) * (width < 420 ? 0.4 : 0.12);
+    const margin = Math.min(width, height) * (width < SMALL ? 0.4 : 0.12);
     const isWithin = at.x > margin && at.x < width - margin && at.y > margin && at.y < height - margin;
     if (!isWithin) this.center(x, y);
     this.viewChanged();
@@ -277,8 +278,9 @@ export class Plan {
     for (const walk of this.model.walks.values()) this.paintWalk(walk);
     const shown = this.shown();
     const { selected } = this.model;
-    const radius = Math.max(4.5, Math.min(8, this.scale * 0.28));
-    if (this.scale > WEDGE_FROM) for (const index of shown) if (index !== selected) this.paintWedge(index, radius);
+    const isSmall = Math.max(this.canvas.clientWidth, this.canvas.clientHeight) < SMALL;
+    const radius = Math.max(4, Math.min(isSmall ? 5 : 8, this.scale * 0.28));
+    if (this.scale > WEDGE_FROM && !isSmall) for (const index of shown) if (index !== selected) this.paintWedge(index, radius);
     for (const index of shown) if (index !== selected) this.paintMark(index, radius);
     if (selected !== null) this.paintSelected(selected, radius + 2);
     this.paintNames(shown, radius);

@@ -178,7 +178,7 @@ export class Viewer {
       const { alternative } = this.model;
       const scan = alternative === null ? images.scan : images.alternatives[alternative] ?? null;
       const rotation = this.pose?.rotation ?? [1, 0, 0, 0, 1, 0, 0, 0, 1];
-      this.sphere.look(this.model.view);
+      this.looked();
       this.sphere.show({ photo: images.sphere, scan, mask: alternative === null ? images.mask : null, rotation }, true);
       this.say(photo.pose ? "" : text.noScan, false);
       this.combine();
@@ -253,7 +253,7 @@ export class Viewer {
     const label = text.neighbor(shortName(photo.name), metres.toFixed(1));
     const button = h(
       "button",
-      { type: "button", class: "way", "aria-label": label, title: label, onclick: () => this.model.select(index) },
+      { type: "button", class: "way away", "aria-label": label, title: label, onclick: () => this.model.select(index) },
       h("span", { class: "way-ring" }),
     );
     return { index, to, metres, button };

@@ -11,15 +11,17 @@ from ..geometry.pose import Array
 from .camera_positions import SURFACE_VOXEL
 
 HEADROOM = 11  # voxels above a surface that are empty, 1.8 m
-THICKNESS = 2  # voxels up and down that are of one floor: noise, thresholds, ramps
-OPENING = 7  # [voxels] width of the disc that fits on a floor, 1.1 m: on shelves and steps it does not
-LEAST_AREA, LEAST_FRACTION = 3.0, 0.05  # of a storey's floor [m2], by the largest floor's area
-LEAST_APART = 2.0  # [m] between the floors of two storeys
+THICKNESS = 1  # voxels up and down that are of one floor: noise, thresholds, ramps
+OPENING = 5  # [voxels] width of the disc that fits on a floor, 0.8 m: on shelves and steps it does not
+LEAST_AREA, LEAST_FRACTION = 3.0, 0.15  # of a storey's floor [m2], by the largest floor's area
+LEAST_APART = 2.3  # [m] between the floors of two storeys
 LEAST_ABOVE = 1.0  # voxels a m2 of walls or furniture above a floor: a ceiling from above has none
 LEAST_OVERLAP = 0.15  # of the smaller floor; below, two are one storey on a slope or in two wings
-NEAR_LEVEL = 0.5  # [m] of a storey's levels lie its surfaces
+# [m] below and above a storey's levels lie its surfaces; farther below is the ceiling of the next one
+BELOW_LEVEL, ABOVE_LEVEL = 0.25, 0.5
+GAP = 17  # [voxels] of a floor that furniture hid from the scanner, 2.7 m
 BESIDE = 1.5  # [m] a camera may be from the nearest scanned floor of its storey
-NUM_NEAREST = 5  # surfaces whose median is the floor at a place
+NUM_NEAREST, LOW = 40, 10.0  # surfaces around a place, 0.6 m, and the percentile of them that is the floor
 
 
 class Storey(NamedTuple):
@@ -45,7 +47,7 @@ class Storeys(NamedTuple):
         for k, one in enumerate(self.storeys):
             count = min(NUM_NEAREST, len(one.surfaces))
             distance, nearest = one.tree.query(centers[:, :2], [*range(1, count + 1)])
-            above = centers[:, 2] - np.median(one.surfaces[nearest, 2], axis=1)
+            above = centers[:, 2] - np.percentile(one.surfaces[nearest, 2], LOW, axis=1)
             is_near = distance[:, 0] < BESIDE
             is_better = (above > 0.0) & (is_near | ~is_sure) | (storey < 0)
             storey[is_better], height[is_better] = k, above[is_better]
@@ -66,7 +68,8 @@ def find_storeys(octree: Octree) -> Storeys:
     storeys = []
     for group in _united(masks):
         level_z = [float(np.median(top_xyz[tops[:, 2] == k, 2])) for k in group]
-        is_of = (np.abs(top_xyz[:, 2, None] - np.array(level_z)) < NEAR_LEVEL).any(axis=1)
+        above = top_xyz[:, 2, None] - np.array(level_z)
+        is_of = ((above > -BELOW_LEVEL) & (above < ABOVE_LEVEL)).any(axis=1)
         largest = max(range(len(group)), key=lambda i: masks[group[i]].sum())
         surfaces = top_xyz[is_of]
         storeys.append(Storey(level_z[largest], surfaces, cKDTree(surfaces[:, :2])))
@@ -88,7 +91,7 @@ def _levels(ijk: NDArray[np.int64], tops: NDArray[np.int64]) -> dict[int, NDArra
     """The floors by their height [voxels], ascending: which cells (I, J) each has.
 
     `ijk` (N, 3) are all voxels, `tops` those that have room above. The largest floor first, then what is
-    LEAST_APART from those found. None if nothing stands on any.
+    LEAST_APART from those found above or below it. None if nothing stands on any.
     """
     if not len(tops):
         return {}
@@ -99,11 +102,15 @@ def _levels(ijk: NDArray[np.int64], tops: NDArray[np.int64]) -> dict[int, NDArra
     while thick.max() > most:
         around = slice(max(int(thick.argmax()) - THICKNESS, 0), int(thick.argmax()) + THICKNESS + 1)
         level = around.start + int(counts[around].argmax())
-        mask, reach = _opened(ijk, tops, level), THICKNESS
-        if mask.sum() > most and _has_things_above(ijk, level, mask):
-            found[level], reach = mask, round(LEAST_APART / SURFACE_VOXEL)
+        mask = _opened(ijk, tops, level)
+        is_apart = all(
+            abs(level - other) * SURFACE_VOXEL >= LEAST_APART or _overlap(mask, below) < LEAST_OVERLAP
+            for other, below in found.items()
+        )
+        if is_apart and mask.sum() > most and _has_things_above(ijk, level, mask):
+            found[level] = mask
             most = max(most, LEAST_FRACTION * mask.sum())
-        thick[max(level - reach, 0) : level + reach + 1] = 0.0
+        thick[max(level - THICKNESS, 0) : level + THICKNESS + 1] = 0.0
     return dict(sorted(found.items()))
 
 
@@ -125,13 +132,19 @@ def _has_things_above(ijk: NDArray[np.int64], level: int, mask: NDArray[np.bool_
     return bool(count >= LEAST_ABOVE * mask.sum() * SURFACE_VOXEL**2)
 
 
+def _overlap(mask: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
+    """The fraction of the smaller of two floors that is above or below the other, or a gap in it."""
+    square = np.ones((GAP, GAP), np.uint8)
+    one, two = (cv2.morphologyEx(m.astype(np.uint8), cv2.MORPH_CLOSE, square) > 0 for m in (mask, other))
+    return float((one & two).sum() / max(min(one.sum(), two.sum()), 1))
+
+
 def _united(masks: dict[int, NDArray[np.bool_]]) -> list[list[int]]:
     """The levels of each storey: one that is hardly above those before it joins them."""
     groups: list[list[int]] = []
     for level, mask in masks.items():
         below = sum((masks[other] for other in groups[-1]), np.zeros_like(mask)) if groups else mask
-        overlap = (mask & below).sum() / max(min(mask.sum(), below.sum()), 1)
-        if groups and overlap < LEAST_OVERLAP:
+        if groups and _overlap(mask, below) < LEAST_OVERLAP:
             groups[-1].append(level)
         else:
             groups.append([level])

@@ -27,6 +27,12 @@ from .site import begin_folder
 SUFFIXES = (".png", ".svg", ".dxf")
 COLORS = {LOCALIZED: (8, 120, 76), AMBIGUOUS: (166, 83, 0), NOT_LOCALIZED: (193, 37, 45)}
 CAD_COLORS = {LOCALIZED: 3, AMBIGUOUS: 30, NOT_LOCALIZED: 1}  # of AutoCAD's index
+ROUND = np.linspace(0.0, math.tau, 32, endpoint=False)
+SHAPES = {  # corners of marks of radius 1, so that not the colour alone tells
+    LOCALIZED: np.column_stack([np.cos(ROUND), np.sin(ROUND)]),
+    AMBIGUOUS: np.array([[0.0, -1.2], [1.2, 0.0], [0.0, 1.2], [-1.2, 0.0]]),
+    NOT_LOCALIZED: np.array([[0.0, -1.15], [1.1, 0.85], [-1.1, 0.85]]),
+}
 INK = (20, 32, 46)
 TITLE = 60  # [px] above each plan
 RADIUS = 9  # [px] of a mark
@@ -106,10 +112,11 @@ def _drawn_sheet(
         at = pixels_of_plan(plan, photo["pose"]["center"]) + np.array([0.0, TITLE])
         tip = at + 3.0 * RADIUS * heading_in_pixels(plan, photo["pose"]["rotation"])
         color = COLORS[photo["status"]]
-        (u, v), (u1, v1) = ([round(x * (1 << SHIFT)) for x in point] for point in (at, tip))
-        cv2.line(sheet, (u, v), (u1, v1), color, 3, cv2.LINE_AA, SHIFT)
-        for radius, fill in ((RADIUS + 2, (255, 255, 255)), (RADIUS, color)):
-            cv2.circle(sheet, (u, v), radius << SHIFT, fill, -1, cv2.LINE_AA, SHIFT)
+        ends = [tuple(round(x * (1 << SHIFT)) for x in point) for point in (at, tip)]
+        cv2.line(sheet, ends[0], ends[1], color, 3, cv2.LINE_AA, SHIFT)
+        for radius, fill in ((RADIUS + 2.5, (255, 255, 255)), (RADIUS, color)):
+            corners = np.rint((at + radius * SHAPES[photo["status"]]) * (1 << SHIFT)).astype(np.int32)
+            cv2.fillPoly(sheet, [corners], fill, cv2.LINE_AA, SHIFT)
         where = round(at[0]) + RADIUS + 3, round(at[1]) - RADIUS
         for thickness, ink in ((4, (255, 255, 255)), (1, INK)):
             cv2.putText(sheet, str(number), where, FONT, 0.55, ink, thickness, cv2.LINE_AA)

@@ -21,6 +21,7 @@ FLOOR_CELL = 0.5  # [m] on which the height of the floor is looked up
 WALL_FROM, WALL_BINS, WALL_BIN = 0.6, 13, 0.1  # [m] above the floor: what fills most of this is a wall
 WALL_FILLED = 8  # bins
 WALL_COLOR = (52, 60, 72)
+HOLE_COLOR, HOLE_ALPHA, LARGEST_HOLE = (150, 158, 168), 90, 12.0  # of gaps in a floor, and area [m2]
 PALENESS = 0.25  # of the colours, so that what is drawn on them is seen
 GAP = 13  # [px] that is closed
 SHADOW, SHADOW_WIDTH = 0.35, 0.25  # of walls on the floor: strength, width [m]
@@ -102,9 +103,20 @@ def _painted(
     shadow = cv2.GaussianBlur(is_wall.astype(np.float32), (0, 0), SHADOW_WIDTH / pixel)
     filled *= (np.float32(1.0) - np.float32(SHADOW) * np.minimum(2.0 * shadow, 1.0))[..., None]
     filled[is_wall] = WALL_COLOR
-    alpha = np.where(is_drawn | is_wall, 255, 0).astype(np.uint8)
+    is_hole = _holes(is_drawn | is_wall, pixel)
+    filled[is_hole] = HOLE_COLOR
+    alpha = np.where(is_drawn | is_wall, 255, np.where(is_hole, HOLE_ALPHA, 0)).astype(np.uint8)
     smooth = cv2.GaussianBlur(alpha, (3, 3), 0)
     return np.dstack([np.rint(filled).astype(np.uint8), np.where(is_wall, 255, smooth)])
+
+
+def _holes(is_drawn: NDArray[np.bool_], pixel: float) -> NDArray[np.bool_]:
+    """(H, W), true in gaps that what is drawn encloses: floor that no scanner saw."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats((~is_drawn).astype(np.uint8), connectivity=4)
+    is_hole = stats[:, cv2.CC_STAT_AREA] * pixel**2 < LARGEST_HOLE
+    is_hole &= (stats[:, cv2.CC_STAT_LEFT] > 0) & (stats[:, cv2.CC_STAT_TOP] > 0)
+    is_hole[0] = False  # what is drawn
+    return np.asarray(is_hole[labels])
 
 
 def _walls(
