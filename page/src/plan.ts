@@ -14,10 +14,14 @@ interface Point {
   y: number;
 }
 
-/** Colours of the theme, by the names of CSS variables. */
+/** Colours of the theme, by the names of CSS variables, asked for once. */
 function colors(element: Element): (name: string) => string {
   const style = getComputedStyle(element);
-  return (name) => style.getPropertyValue(`--${name}`).trim();
+  const known = new Map<string, string>();
+  return (name) => {
+    if (!known.has(name)) known.set(name, style.getPropertyValue(`--${name}`).trim());
+    return known.get(name)!;
+  };
 }
 
 export class Plan {
@@ -33,6 +37,8 @@ export class Plan {
   private frame = 0;
   private fitted = "";
   private color: (name: string) => string;
+  /** Marks and sectors drawn once, by what they show: gradients are slow. */
+  private readonly sprites = new Map<string, HTMLCanvasElement>();
 
   constructor(
     private readonly model: Model,
@@ -69,6 +75,7 @@ export class Plan {
 
   themed(): void {
     this.color = colors(this.canvas);
+    this.sprites.clear();
     this.draw();
   }
 
@@ -339,44 +346,65 @@ export class Plan {
     }
   }
 
-  /** What a camera looks at: a sector that fades out, at an azimuth of the plan [rad]. */
-  private paintSector(at: Point, yaw: number, half: number, reach: number, color: string, strength: number): void {
-    const { context } = this;
-    const gradient = context.createRadialGradient(at.x, at.y, 0, at.x, at.y, reach);
-    gradient.addColorStop(0, color);
-    gradient.addColorStop(1, `${color}00`);
-    context.globalAlpha = strength;
-    context.fillStyle = gradient;
-    context.beginPath();
-    context.moveTo(at.x, at.y);
-    context.arc(at.x, at.y, reach, -yaw - half, -yaw + half);
-    context.closePath();
-    context.fill();
-    context.globalAlpha = 1;
-  }
-
   private statusColor(status: Status): string {
     return this.color(status.replace("_", "-"));
   }
 
+  /** A drawing of `size` x `size` px around the middle, made once under a name. */
+  private sprite(name: string, size: number, paint: (context: CanvasRenderingContext2D) => void): HTMLCanvasElement {
+    const ratio = this.canvas.width / Math.max(1, this.canvas.clientWidth);
+    const key = `${name} ${size.toFixed(1)} ${ratio}`;
+    let made = this.sprites.get(key);
+    if (!made) {
+      if (this.sprites.size > 100) this.sprites.clear();
+      made = document.createElement("canvas");
+      made.width = made.height = Math.ceil(size * ratio);
+      const context = made.getContext("2d")!;
+      context.setTransform(ratio, 0, 0, ratio, made.width / 2, made.width / 2);
+      paint(context);
+      this.sprites.set(key, made);
+    }
+    return made;
+  }
+
   private paintWedge(index: number, radius: number): void {
+    const { context } = this;
     const photo = this.model.report.photos[index];
     const at = this.toScreen(photo.pose!.center[0], photo.pose!.center[1]);
-    this.paintSector(at, ahead(photo).yaw, 0.45, radius * 3.6, this.statusColor(photo.status), 0.75);
+    if (!this.isSeen(at)) return;
+    const reach = radius * 3.6;
+    const sector = this.sprite(`sector ${photo.status}`, 2 * reach, (own) =>
+      paintSector(own, { x: 0, y: 0 }, [0, 0.45, reach], this.statusColor(photo.status), 0.75),
+    );
+    context.save();
+    context.translate(at.x, at.y);
+    context.rotate(-ahead(photo).yaw);
+    context.drawImage(sector, -reach, -reach, 2 * reach, 2 * reach);
+    context.restore();
+  }
+
+  private isSeen(at: Point): boolean {
+    const { clientWidth, clientHeight } = this.canvas;
+    return at.x > -50 && at.y > -50 && at.x < clientWidth + 50 && at.y < clientHeight + 50;
   }
 
   private paintMark(index: number, radius: number): void {
     const { context } = this;
     const photo = this.model.report.photos[index];
     const at = this.toScreen(photo.pose!.center[0], photo.pose!.center[1]);
+    if (!this.isSeen(at)) return;
     this.paintEllipse(photo, at);
     const grown = index === this.hovered ? radius + 2 : radius;
-    trace(context, photo.status, at.x, at.y, grown);
-    context.fillStyle = this.statusColor(photo.status);
-    context.fill();
-    context.lineWidth = 2;
-    context.strokeStyle = this.color("halo");
-    context.stroke();
+    const size = 2 * (1.2 * grown + 3);
+    const mark = this.sprite(`mark ${photo.status}`, size, (own) => {
+      trace(own, photo.status, 0, 0, grown);
+      own.fillStyle = this.statusColor(photo.status);
+      own.fill();
+      own.lineWidth = 2;
+      own.strokeStyle = this.color("halo");
+      own.stroke();
+    });
+    context.drawImage(mark, at.x - size / 2, at.y - size / 2, size, size);
   }
 
   private paintEllipse(photo: Photo, at: Point): void {
@@ -404,7 +432,8 @@ export class Plan {
     const at = this.toScreen(center[0], center[1]);
     const { view } = model;
     const half = Math.atan(Math.tan(view.fov / 2) * 1.3);
-    this.paintSector(at, view.yaw, half, Math.max(46, Math.min(110, this.scale * 3)), this.color("accent"), 0.85);
+    const reach = Math.max(46, Math.min(110, this.scale * 3));
+    paintSector(context, at, [view.yaw, half, reach], this.color("accent"), 0.85);
     this.paintEllipse(photo, at);
     context.beginPath();
     context.arc(at.x, at.y, radius + 5, 0, 2 * Math.PI);
@@ -474,6 +503,27 @@ export class Plan {
     context.fillStyle = this.color("label-ink");
     context.fillText(words, x, y + 0.5);
   }
+}
+
+/** What a camera looks at: a sector that fades out, by azimuth of the plan, half its angle [rad], reach [px]. */
+function paintSector(
+  context: CanvasRenderingContext2D,
+  at: Point,
+  [yaw, half, reach]: [number, number, number],
+  color: string,
+  strength: number,
+): void {
+  const gradient = context.createRadialGradient(at.x, at.y, 0, at.x, at.y, reach);
+  gradient.addColorStop(0, color);
+  gradient.addColorStop(1, `${color}00`);
+  context.globalAlpha = strength;
+  context.fillStyle = gradient;
+  context.beginPath();
+  context.moveTo(at.x, at.y);
+  context.arc(at.x, at.y, reach, -yaw - half, -yaw + half);
+  context.closePath();
+  context.fill();
+  context.globalAlpha = 1;
 }
 
 /** The file's own name without its ending. */
