@@ -75,7 +75,7 @@ export class Facts {
     const [x, y, z] = pose.world;
     const rows: [string, string][] = [
       ["x, y, z [m]", `${x.toFixed(3)}, ${y.toFixed(3)}, ${z.toFixed(3)}`],
-      [text.angles, pose.angles.map((angle) => `${angle.toFixed(1)}°`).join(", ")],
+      [text.angles, pose.angles.map((angle) => `${angle.toFixed(1).replace(/^-0\.0$/, "0.0")}°`).join(", ")],
     ];
     const { storeys } = this.model.report;
     const { storey } = photo;
@@ -170,7 +170,7 @@ export class Facts {
     const rows: [string, string][] = [[text.file, photo.file]];
     if (photo.captured) rows.push([text.captured, photo.captured.replace("T", " ")]);
     if (photo.size) rows.push([text.size, `${photo.size[0]} × ${photo.size[1]}`]);
-    return section(text.size, table(rows));
+    return section(text.about, table(rows));
   }
 }
 

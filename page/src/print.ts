@@ -8,6 +8,7 @@ import { text } from "./text";
 import type { Photo, Storey } from "./types";
 
 const MARK = 0.14; // m, or more on a large plan
+const MANY = 60; // photos, whose marks are smaller
 
 /** Fill the part of the page that only printers see. */
 export function fillPrint(model: Model, box: HTMLElement): void {
@@ -35,7 +36,7 @@ function figure(storey: Storey, photos: (readonly [number, Photo])[]): HTMLEleme
   const top = Math.min(...corners.map(([, y]) => y));
   const width = Math.max(...corners.map(([x]) => x)) - left;
   const height = Math.max(...corners.map(([, y]) => y)) - top;
-  const radius = Math.max(MARK, Math.max(width, height) / 110);
+  const radius = Math.max(MARK, Math.max(width, height) / 110) * (photos.length > MANY ? 0.65 : 1);
   const image = svg("image", { href: plan.file, width: plan.width, height: plan.height, transform: `matrix(${a} ${-b} ${c} ${-d} ${e} ${-f})` });
   const marks = photos.map(([index, photo]) => {
     const [x, y] = photo.pose!.center;
@@ -46,7 +47,7 @@ function figure(storey: Storey, photos: (readonly [number, Photo])[]): HTMLEleme
       {},
       svg("line", { x1: x, y1: -y, ...tip, class: `heading ${photo.status}`, "stroke-width": radius / 2.5 }),
       shape(photo.status, x, -y, radius),
-      svg("text", { x: x + 1.3 * radius, y: -y - 1.3 * radius, "font-size": 2.4 * radius }, String(index + 1)),
+      svg("text", { x: x + 1.3 * radius, y: -y - 1.3 * radius, "font-size": 2 * radius }, String(index + 1)),
     );
   });
   const bar = [1, 2, 5, 10, 20, 50, 100].find((metres) => metres > width / 8) ?? 200;

@@ -86,6 +86,7 @@ export const text = {
   best: "Best pose",
   none: "None of these",
   warnings: "Notes",
+  about: "Photo",
   captured: "Taken",
   size: "Picture",
   file: "File",
