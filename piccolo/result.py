@@ -23,8 +23,9 @@ from .errors import InputError
 from .geometry.pose import Pose, T_world_from_cam, checked_rotation, quaternion_wxyz
 from .geometry.sphere import CONVENTION
 from .runtime.json_file import document_of, parse_lines, read_bytes
+from .walk.localize import Alone, Gap, WalkFrame
 
-FORMAT = "piccolo-pose/6"
+FORMAT = "piccolo-pose/7"
 UNREADABLE = "unreadable"
 POSE_FIELDS = ("R_cam_from_world", "center_world", "quaternion_wxyz", "T_world_from_cam")
 MAX_ROTATION_ERROR = 1e-6  # of R R^T from the identity, in a file
@@ -69,6 +70,9 @@ class Result:
     cameras: tuple[Mount, ...] = ()  # that took it; none if it came as a sphere or a part of one
     scan: str | None = None  # name of the scan in which the best pose lies, of a map that names its scans
     probability_none: float | None = None  # that neither the pose nor an alternative is right, if known
+    walk: WalkFrame | None = (
+        None  # of a frame of a walk, whose status, pose and covariance are then the walk's
+    )
 
     @property
     def is_calibrated(self) -> bool:
@@ -144,6 +148,7 @@ class Result:
             "convention": CONVENTION,
             "seconds": {stage: round(seconds, 4) for stage, seconds in self.seconds.items()},
             "gps_prior": self.gps_prior and asdict(self.gps_prior),
+            "walk": self.walk and _walk_json(self.walk),
             "settings": self.settings,
             "warnings": list(self.warnings),
             "version": __version__,
@@ -164,6 +169,7 @@ class Result:
                 evidence=document["evidence"] and Evidence(**document["evidence"]),
                 alternatives=tuple(map(_alternative_from_json, document["alternatives"])),
                 covariance=_covariance_from_json(document),
+                walk=document["walk"] and _walk_from_json(document["walk"]),
                 warnings=tuple(document["warnings"]),
                 **{name: document[name] for name in _PLAIN_FIELDS},
             )
@@ -244,6 +250,29 @@ def _alternative_json(alternative: Alternative) -> dict[str, object]:
 def _alternative_from_json(document: dict[str, Any]) -> Alternative:
     pose = Pose(np.array(document["R_cam_from_world"]), np.array(document["center_world"]))
     return Alternative(pose, **{f.name: document[f.name] for f in fields(Alternative) if f.name != "pose"})
+
+
+def _walk_json(walk: WalkFrame) -> dict[str, object]:
+    alone: dict[str, object] | None = None
+    if walk.alone is not None:
+        about = {"status": walk.alone.status, "confidence": walk.alone.confidence}
+        alone = {**about, **(_pose_json(walk.alone.pose) or dict.fromkeys(POSE_FIELDS))}
+    return {
+        "frame": walk.frame,
+        "time": walk.time,
+        "how": walk.how,
+        "alone": alone,
+        "gap": walk.gap and asdict(walk.gap),
+    }
+
+
+def _walk_from_json(value: dict[str, Any]) -> WalkFrame:
+    gap, alone = value["gap"], value["alone"]
+    if alone is not None:
+        R, center = alone["R_cam_from_world"], alone["center_world"]
+        pose = None if R is None else Pose(np.array(R), np.array(center))
+        alone = Alone(alone["status"], alone["confidence"], pose)
+    return WalkFrame(value["time"], value["frame"], value["how"], alone, gap and Gap(**gap))
 
 
 def _place(alternative: Alternative) -> str:

@@ -1,10 +1,10 @@
 """A scan that photos are localized in: what `import piccolo` gives."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypedDict, Unpack
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ from .errors import InputError
 from .geometry.pose import Pose
 from .geometry.rotations import Gravity
 from .optimize.settings import Solver
-from .panorama import Panorama, ReadOptions, panorama_of_array, read_panorama
+from .panorama import Panorama, ReadOptions, read_query
 from .panorama.model import Projection
 from .panorama.photo import Photo, photo_of, photo_of_array
 from .paper.localize import PaperMap
@@ -35,6 +35,9 @@ from .paper.settings import PaperSettings
 from .result import Result, Source, result_of
 from .runtime.stopwatch import Stopwatch
 from .runtime.threads import Workers
+from .scan_walk import Walk, WalkAbout
+from .walk.frames import MAX_ACCELERATION, MAX_SPEED, Motion
+from .walk.tracker import Tracker
 
 File = str | PathLike[str]
 Settings = CoarseToFineSettings | PaperSettings
@@ -74,6 +77,14 @@ def refuse_unknown(options: Mapping[str, object], known: type, function: str) ->
 
 READ_FIELDS = {f.name for f in fields(ReadOptions)}
 PRIOR_FIELDS = {f.name for f in fields(Prior)}
+
+
+class Asked(NamedTuple):
+    """What options say of a photo."""
+
+    read_options: ReadOptions
+    settings: Settings
+    is_masked: NDArray[np.bool_] | None  # of an array
 
 
 @dataclass(frozen=True)
@@ -130,11 +141,22 @@ class Scan:
         >>> result.status, result.pose.center_world.round(2)
         ('localized', array([2.6 , 3.17, 1.21]))
         """
-        refuse_unknown(options, QueryOptions, "localize")
+        asked = self._asked(options, "localize")
+        return self.localize_query(panorama, asked.read_options, asked.settings, asked.is_masked)
+
+    def localize_many(
+        self, panoramas: Iterable[File | NDArray[np.uint8]], **options: Unpack[QueryOptions]
+    ) -> Iterator[Result]:
+        """The result of each panorama in order, as it comes; options as in `localize`."""
+        for panorama in panoramas:
+            yield self.localize(panorama, **options)
+
+    def _asked(self, options: QueryOptions, function: str) -> "Asked":
+        """What options say."""
+        refuse_unknown(options, QueryOptions, function)
         given: dict[str, Any] = dict(options)
-        if isinstance(given.get("mask"), np.ndarray):
-            given["mask_array"] = given.pop("mask")
-        elif "mask" in given:
+        is_masked = given.pop("mask") if isinstance(given.get("mask"), np.ndarray) else None
+        if "mask" in given:
             given["mask"] = Path(given["mask"])
         prior = {k: given.pop(k) for k in PRIOR_FIELDS & given.keys()}
         if isinstance(prior.get("within"), str):
@@ -150,15 +172,61 @@ class Scan:
         read_options = ReadOptions(
             labels=self.cloud_settings.labels, **{k: given.pop(k) for k in READ_FIELDS & given.keys()}
         )
-        mask = given.pop("mask_array", None)
-        return self.localize_query(panorama, read_options, replace(self.settings, **given), mask)
+        return Asked(read_options, replace(self.settings, **given), is_masked)
 
-    def localize_many(
-        self, panoramas: Iterable[File | NDArray[np.uint8]], **options: Unpack[QueryOptions]
-    ) -> Iterator[Result]:
-        """The result of each panorama in order, as it comes; options as in `localize`."""
-        for panorama in panoramas:
-            yield self.localize(panorama, **options)
+    def track(
+        self,
+        max_speed: float = MAX_SPEED,
+        max_acceleration: float = MAX_ACCELERATION,
+        **options: Unpack[QueryOptions],
+    ) -> Walk:
+        """A camera that is carried through the scan, followed frame by frame: `add` each as it comes.
+
+        Parameters
+        ----------
+        max_speed
+            [m/s] at which it is carried at most; where frames have no times, [m] from one to the next.
+        max_acceleration
+            [m/s^2] standard deviation along each axis; it smooths the path of `finish`.
+        **options
+            As in `localize`, of all frames; not `refine_focal`, and `mask` as a path.
+        """
+        asked = self._asked(options, "track")
+        return self.walk(asked.read_options, asked.settings, Motion(max_speed, max_acceleration))
+
+    def localize_walk(
+        self,
+        frames: Iterable[File | NDArray[np.uint8]],
+        times: Sequence[float] | None = None,
+        max_speed: float = MAX_SPEED,
+        max_acceleration: float = MAX_ACCELERATION,
+        **options: Unpack[QueryOptions],
+    ) -> list[Result]:
+        """The results of a walk's frames, in order: each told by those before and after it.
+
+        `times` [s] rise; without them only the order counts. The others are as in `track`.
+
+        Examples
+        --------
+        >>> frames = [f"walk/images/clean_walk_0_{k:04}.jpg" for k in range(120)]
+        >>> results = scan.localize_walk(frames, times=[0.5 * k for k in range(120)])
+        """
+        walk = self.track(max_speed, max_acceleration, **options)
+        for k, frame in enumerate(frames):
+            walk.add(frame, None if times is None else times[k])
+        return walk.finish()
+
+    def walk(self, read_options: ReadOptions, settings: Settings, motion: Motion) -> Walk:
+        """The same as `track` with all options as objects."""
+        if not isinstance(self.prepared, ScanMap) or not isinstance(settings, CoarseToFineSettings):
+            raise InputError("walks: not of the preset paper")
+        if read_options.refine_focal:
+            raise InputError("--refine-focal: not an option of walks; refine it with one photo")
+        check_within(self.prepared, settings.prior.within)
+        tracker = Tracker(self.prepared, settings, self.workers, motion)
+        repeated = settings_json(settings, self.cloud_settings, read_options)
+        about = WalkAbout(self.name, self.warnings, {**repeated, "walk": asdict(motion)})
+        return Walk(tracker, read_options, about)
 
     def occlusion_mask(
         self, panorama: File | NDArray[np.uint8], pose: Pose, read_options: ReadOptions | None = None
@@ -248,28 +316,3 @@ def settings_json(
     """What a result repeats of how it was made."""
     how = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(read_options).items()}
     return {**settings.to_json(), "cloud": asdict(cloud_settings), "panorama": how}
-
-
-def read_query(
-    panorama: File | NDArray[np.uint8], options: ReadOptions, is_masked: NDArray[np.bool_] | None = None
-) -> Panorama:
-    """The panorama in a file; or in an array (H, W, 3), with a mask (H, W) of what is to be ignored.
-
-    An array that no camera is given for is a full sphere.
-    """
-    if not isinstance(panorama, np.ndarray):
-        if is_masked is not None:
-            raise InputError("mask: an array goes with a panorama that is an array; give a picture's path")
-        return read_panorama(Path(panorama), options)
-    if panorama.dtype != np.uint8 or panorama.ndim != 3 or panorama.shape[2] != 3 or not panorama.size:
-        found = f"{panorama.dtype} of shape {panorama.shape}"
-        raise InputError(f"panorama: found {found}, wanted RGB in uint8 of shape (H, W, 3)")
-    is_crop = options.fov_deg is not None and options.projection not in ("pinhole", "fisheye")
-    if options.mask or options.mask_nadir_deg or options.cube_order or options.rig or is_crop:
-        raise InputError("panorama: fov_deg, cube_order, mask_nadir_deg, rig and a mask's path go with files")
-    is_valid = np.ones(panorama.shape[:2], np.bool_)
-    if is_masked is not None:
-        if is_masked.shape != is_valid.shape or is_masked.dtype != np.bool_:
-            raise InputError(f"mask: wanted an array of bool of shape {is_valid.shape}, as the panorama's")
-        is_valid = ~is_masked
-    return panorama_of_array(np.ascontiguousarray(panorama), is_valid, options)

@@ -211,3 +211,30 @@ def test_interrupt_ends_all_processes_without_a_traceback(scenes, tmp_path):
 def test_wrong_usage(words, message, capsys):
     assert evaluate.main(words.split()) == 2
     assert message in capsys.readouterr().err
+
+
+def test_walks_have_a_line_each_and_what_shows_nothing_is_refused(tmp_path, capsys):
+    """Also a black frame, of which no pixel is left: it is answered, and the run goes on after it."""
+    folder, out = tmp_path / "walk", tmp_path / "run.jsonl"
+    words = "--walk 4 --walks 2 --frame-rate 1 --bad-frames 0.4 --rooms 1 --points 20000 --width 256"
+    write_room(folder, words)
+    capsys.readouterr()
+    assert _run(folder, out) == 0
+    text = capsys.readouterr().out
+    queries, rows = read_scene(folder).by_name, read_run(out)[0]
+    assert len(rows) == len(queries)
+    by_variant = {row.variant: row for row in rows}
+    assert by_variant["black"].result.status == "unreadable"
+    assert "no pixel is left" in by_variant["black"].result.error
+    assert all(not row.has_errors for row in rows if row.variant in ("black", "mirrored", "elsewhere"))
+    table = text[text.index("walks; correct: under 0.1 m and 5 deg") :].splitlines()
+    names = [line.split(" | ")[0].strip("| ") for line in table[4:7]]
+    assert names == ["walk clean_walk_0", "walk clean_walk_1", "all"]
+    counts = [int(line.split(" | ")[1]) for line in table[4:7]]
+    assert counts == [counts[0], counts[1], len(rows)]
+    assert sum(counts[:2]) == len(rows)
+    before = out.read_bytes()
+    assert _run(folder, out) == 0
+    assert out.read_bytes() == before
+    again = capsys.readouterr().out
+    assert again == text

@@ -52,7 +52,7 @@ def test_json_names_what_the_next_tool_needs_in_its_units():
     assert document["std_mm"] == pytest.approx([2.0, 3.0, 4.0])
     assert document["std_deg"] == pytest.approx([np.degrees(1e-3)] * 3)
     assert "R_true = exp([w]x) R_cam_from_world" in document["covariance_convention"]
-    assert document["format"] == "piccolo-pose/6"
+    assert document["format"] == "piccolo-pose/7"
     T = np.array(document["T_world_from_cam"])
     np.testing.assert_allclose(T[:3, 3], RESULT.pose.center_world)
     np.testing.assert_allclose(T[:3, :3], np.array(document["R_cam_from_world"]).T)
@@ -127,8 +127,8 @@ def test_nan_is_never_written():
 
 
 @pytest.mark.parametrize(
-    "text", ["{", "[]", "{}", '{"format": "piccolo-pose/3"}', '{"format": "piccolo-pose/6"}']
+    "text", ["{", "[]", "{}", '{"format": "piccolo-pose/3"}', '{"format": "piccolo-pose/7"}']
 )
 def test_other_text_is_refused(text):
-    with pytest.raises(InputError, match="piccolo-pose/6"):
+    with pytest.raises(InputError, match="piccolo-pose/7"):
         Result.from_json(text)

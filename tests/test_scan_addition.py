@@ -197,6 +197,9 @@ def test_a_map_of_two_scans_by_the_command_line(tmp_path, capsys):
     cloud, pano = str(room / "cloud.ply"), str(room / "images" / "clean_0.jpg")
     assert prepare_command.main(["--cloud", cloud, "--add", cloud, "--out", path, "--quiet"]) == 3
     assert "found no prepared map" in capsys.readouterr().err
+    missing = str(tmp_path / "missing.map")
+    assert prepare_command.main(["--cloud", cloud, "--add", missing, "--out", str(out), "--quiet"]) == 3
+    assert f"{missing}: found no such file, wanted a map by" in capsys.readouterr().err
     assert prepare_command.main(["--cloud", path, "--add", path, "--out", str(out), "--quiet"]) == 3
     assert "wanted the files of a scan to add" in capsys.readouterr().err
     add = ["--add", path, "--cloud", cloud, "--out", path, "--quiet"]

@@ -153,7 +153,7 @@ def test_command_line_writes_a_world_that_reads_back(tmp_path, capsys):
         ("--points 10", "points: 10 are too few, use at least 1000 a room"),
         ("--width 127", "width: 127 is not an even number of at least 128"),
         ("--size nan 3 2.4", "size: [nan, 3.0, 2.4] is not between 2.0 and 50.0 m each way"),
-        ("--rooms 65", "rooms: 65 is not between 1 and 64"),
+        ("--rooms 257", "rooms: 257 is not between 1 and 256"),
         ("--seed -1", "--seed: found -1, wanted at least 0"),
     ],
 )

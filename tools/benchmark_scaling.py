@@ -106,7 +106,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
     option(parser, "--scene FOLDER", "with --points")
     option(parser, "--points N ...", "with --scene", default=[])
-    option(parser, "--rooms N ...", "1 to 64", default=[])
+    option(parser, "--rooms N ...", "1 to 256", default=[])
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)

@@ -31,7 +31,7 @@ from piccolo.scan import Settings
 from piccolo.scenes.scene import Scene, read_scene
 from piccolo.scenes.synthetic.alike import ALIKE_KINDS, CHANGED, make_alike
 from piccolo.scenes.synthetic.damage import occluded, outside_field, unevenly_lit, without_texture
-from piccolo.scenes.synthetic.room import REPEATED_KINDS, make_repeated
+from piccolo.scenes.synthetic.repeated import REPEATED_KINDS, make_repeated
 from piccolo.scenes.synthetic.world import (
     VARIANTS,
     World,

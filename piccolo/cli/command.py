@@ -10,8 +10,8 @@ from .parser import add_run_options, new_parser
 
 KINDS: dict[str, type] = {  # of the values, by the first metavar; of others text
     **dict.fromkeys(("FILE", "FOLDER", "JSONL", "PNG"), Path),
-    **dict.fromkeys(("N", "PX", "FIRST", "W"), int),
-    **dict.fromkeys(("X", "M", "DEG", "X0", "MIN"), float),
+    **dict.fromkeys(("N", "PX", "FIRST", "W", "ROOM"), int),
+    **dict.fromkeys(("X", "M", "DEG", "X0", "MIN", "HZ", "FRACTION"), float),
 }
 Main = Callable[..., int]  # runs a command line, by default this program's, and returns its exit code
 

@@ -15,7 +15,8 @@ from ..scenes.evaluation import tables
 from ..scenes.evaluation.plots import errors_figure, figure_png, risk_figure
 from ..scenes.evaluation.query_result import QueryResult, Thresholds, match_results
 from ..scenes.evaluation.runner import RunConfig, input_files, open_run, read_run
-from ..scenes.scene import find_scenes
+from ..scenes.evaluation.walks import walk_table, walks_of
+from ..scenes.scene import Scene, find_scenes
 from .command import check_least, command, option
 from .errors import EXIT_BAD_INPUT, UsageError, checking_options
 from .evaluating import resumed
@@ -41,6 +42,8 @@ Scenes are folders with a queries.json, a cloud and images, at any depth below -
 command again to resume a run that was stopped. --results are lines of localize.py instead; each belongs to
 the query of the same path, or else of the same file name. Tables are Markdown, on stdout (on stderr where
 one of the files is stdout).
+Walks (make_room.py --walk) have a table with a line each: ATE and RPE are evo's, of localized frames, nothing
+aligned, steps over other frames left out. A photo that has no answer is right when refused.
 Queries that can't be read are named on stderr, and the rest is done before exit code 3.
 """
 
@@ -85,7 +88,7 @@ def check_usage(arguments: argparse.Namespace) -> None:
         raise UsageError(f"--out {arguments.out}: a run is read again to be resumed, wanted a file")
 
 
-def report_of(rows: Sequence[QueryResult], thresholds: Thresholds) -> str:
+def report_of(scenes: Sequence[Scene], rows: Sequence[QueryResult], thresholds: Thresholds) -> str:
     """All tables of one run as Markdown."""
     inside = [row for row in rows if row.is_in_box]
     num_outside = sum(row.is_in_box is False for row in rows)
@@ -95,6 +98,8 @@ def report_of(rows: Sequence[QueryResult], thresholds: Thresholds) -> str:
         found.append(tables.summary_table(inside, thresholds, title))
     found.append(tables.threshold_table(rows, thresholds))
     found.append(tables.risk_table(tables.risk_and_coverage(rows, thresholds)))
+    if walks := walks_of(scenes, rows):
+        found.append(walk_table(walks, thresholds))
     return "\n".join(table.markdown() for table in found)
 
 
@@ -170,5 +175,5 @@ def main(arguments: argparse.Namespace) -> int:
         points = tables.risk_and_coverage(rows, thresholds)
         write_atomically(arguments.risk, figure_png(risk_figure(points)))
     name = (arguments.out or arguments.results).stem
-    write_report(arguments, report_of(rows, thresholds), {name: rows}, thresholds)
+    write_report(arguments, report_of(scenes, rows, thresholds), {name: rows}, thresholds)
     return EXIT_BAD_INPUT if num_failed else 0

@@ -30,14 +30,16 @@ from ..runtime.line_file import appending
 from ..runtime.memory import limit_memory
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.tasks import Executor, Pair, WorkerLostError
-from ..runtime.threads import Workers
+from ..runtime.threads import Workers, num_cores
 from ..scan import Scan
 from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error, print_note, run_command
 from .executing import check_execution, executing
 from .interruption import SIGNALS, Interruption, Stopped, interruptible
+from .localize_walk import run_walk
 from .options import build_parser, check_arguments, cloud_settings_from, read_options_from, settings_from
 from .outputs import check_distinct, check_suffix
 from .progress import progress_bar, warn_once
+from .walking import check_walk_options, walk_inputs
 
 EXIT_ALL_LOCALIZED, EXIT_SOME_NOT = 0, 1
 STATUSES = (LOCALIZED, AMBIGUOUS, NOT_LOCALIZED, UNREADABLE)
@@ -71,7 +73,8 @@ def is_resumable(out: Path | None) -> bool:
 
 def check_files(arguments: argparse.Namespace, panoramas: list[Path], total: int | None) -> None:
     """Refuse, before any work, what could not be written, or would replace an input or another output."""
-    given = filter(None, (arguments.mask, arguments.priors, arguments.camera, arguments.rig))
+    files = arguments.mask, arguments.priors, arguments.camera, arguments.rig, arguments.video
+    given = filter(None, files)
     lists = [Path(word[1:]) for word in arguments.pano if word.startswith("@")]
     pictures = {"--overlay": arguments.overlay, "--occlusion-mask": arguments.occlusion_mask}
     outputs = {"--out": arguments.out or STDOUT, **pictures}
@@ -96,6 +99,7 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
     """What is to be done: the options, the panoramas, and how many of them are finished."""
     with checking_options():
         check_arguments(arguments)
+        check_walk_options(arguments)
         check_execution(arguments)
         limit_memory(arguments.max_memory)
         settings, read_options = settings_from(arguments), read_options_from(arguments)
@@ -114,7 +118,8 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
         panoramas, total = iter(known), len(known)
     check_files(arguments, known, total)
     counts, size = Counter[str](), None if arguments.overwrite else 0
-    if is_resumable(arguments.out) and arguments.out.exists() and not arguments.overwrite:
+    is_walk = arguments.walk or arguments.video
+    if is_resumable(arguments.out) and arguments.out.exists() and not (arguments.overwrite or is_walk):
         show = progress_bar(arguments.quiet)
         paths = arguments.cloud
         name = str(paths[0]) if len(paths) == 1 else tuple(map(str, paths))
@@ -241,8 +246,21 @@ def finish(run: Run, interruption: Interruption, seconds: float) -> int:
     return EXIT_ALL_LOCALIZED if counts[LOCALIZED] == run.num_finished else EXIT_SOME_NOT
 
 
+def run_frames(arguments: argparse.Namespace) -> int:
+    """The same of the frames of one walk."""
+    run = prepare_run(arguments)
+    settings = run.batch.settings
+    if not isinstance(settings, CoarseToFineSettings):
+        raise UsageError("--walk, --video: not options of the preset paper")
+    with walk_inputs(arguments, list(run.panoramas)) as inputs:
+        opening = partial(open_scan, run, run.localizer, arguments.threads or num_cores())
+        return run_walk(arguments, inputs, settings, run.batch.read_options, opening)
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Localize every panorama, write the results, return the exit code."""
+    if arguments.walk or arguments.video:
+        return run_frames(arguments)
     watch = Stopwatch()
     run = prepare_run(arguments)
     first = next(run.panoramas, None)

@@ -17,6 +17,7 @@ from ..paper.settings import Initialization, PaperSettings, PoseLoss
 from .command import check_least
 from .executing import add_execution_options
 from .parser import add_run_options, new_parser
+from .walking import add_walk_options
 
 DESCRIPTION = "Find where in a coloured point cloud 360-degree panoramas were taken."
 EPILOG = """\
@@ -26,6 +27,8 @@ examples:
   python localize.py --cloud scan.ply --pano photos --out poses.jsonl --priors priors.csv
   ls photos/*.jpg | python localize.py --cloud scan.ply --pano - > poses.jsonl
   python localize.py --cloud scan.ply --pano query.jpg --near 12 3 1.5 --radius 4
+  python localize.py --cloud scan.ply --walk --pano frames --out walk.jsonl
+  python localize.py --cloud scan.ply --video walk.mp4 --every 0.5s --out walk.jsonl
   python localize.py --cloud scan.ply --pano query.jpg --preset paper --solver lbfgs
 
 output: one JSON object a panorama, one a line, in the order given (docs/RESULT.md); messages and progress go
@@ -79,6 +82,7 @@ def build_parser() -> argparse.ArgumentParser:
     files.add_argument("--no-cache", action="store_true", help="prepare the map again, and do not keep it")
     add_method_options(parser)
     add_prior_options(parser)
+    add_walk_options(parser)
     add_execution_options(parser)
     add_run_options(parser)
     return parser
@@ -116,7 +120,7 @@ def add_panorama_options(parser: argparse.ArgumentParser) -> None:
         "a folder of six cube faces, or with --rig of the pictures of one instant; "
         "or a folder of pictures, @FILE with a path a line, or - for paths on stdin, answered as they come"
     )
-    group.add_argument("--pano", required=True, nargs="+", help=text)
+    group.add_argument("--pano", nargs="+", default=[], help=text)
     add_panorama_reading_options(group)
 
 

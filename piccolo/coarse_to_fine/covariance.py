@@ -21,7 +21,7 @@ from .view import Cells
 
 BLOCK_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
 MOST_SHARE = 1.001  # of a block in what fixes the pose, a little above 1 for one that does alone
-LEAST_TURN, LEAST_MOVE = math.radians(0.02), 0.001  # [rad], [m] deviations of scans and stitching themselves
+PIXEL_SHARE = 0.04  # of a pixel that is left in a pose, by trials with photos of 256 and 2048 px
 SCALE = FULL_LOSS * LEVELS_PER_UNIT
 
 
@@ -128,6 +128,20 @@ def covariance_at(query: Query, points: Cells, pose: Pose) -> Array | None:
     return min(found, key=lambda c: float(np.linalg.eigvalsh(c[3:, 3:])[-1]))
 
 
+def errors_of_source(query: Query, points: Cells) -> Array:
+    """What the errors of the photo and of the scan add to a covariance (6, 6) [rad, m] in the map's axes.
+
+    They go together over many blocks: a photo's grid and stitching by its pixels, a scan's noise and doubled
+    surfaces by what `surface_noise` tells. At the median range an angle and a displacement are one.
+    """
+    median_range = float(np.median(np.linalg.norm(points.offsets, axis=0)))
+    turn, surface = PIXEL_SHARE * query.pixel, query.scan_map.surface_variance
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = np.eye(3) * (turn**2 + np.trace(surface) / 3.0 / median_range**2)
+    covariance[3:, 3:] = np.eye(3) * (turn * median_range) ** 2 + surface
+    return covariance
+
+
 def estimate_covariance(query: Query, pose: Pose) -> PoseCovariance | None:
     """The covariance of a pose, in world axes; None where the points do not fix it."""
     query = without_occluders(query, pose)
@@ -139,7 +153,7 @@ def estimate_covariance(query: Query, pose: Pose) -> PoseCovariance | None:
     R_map_from_cam, R_map_from_world = pose.R_cam_from_world.T, query.scan_map.R_map_from_world
     J = np.eye(6)
     J[3:, 3:] = R_map_from_cam
-    covariance_map = J @ covariance @ J.T + np.diag([LEAST_TURN**2] * 3 + [LEAST_MOVE**2] * 3)
+    covariance_map = J @ covariance @ J.T + errors_of_source(query, points)
     J[3:, 3:] = R_map_from_world.T
     covariance_world = J @ covariance_map @ J.T
     words = least_constrained_direction(covariance_map[3:, 3:], covariance_world[3:, 3:], points.offsets)

@@ -41,10 +41,14 @@ def is_clear(query: Query, starts: Starts, hypotheses: Sequence[Hypothesis]) -> 
     found = fairly_selected(query, found_among(hypotheses, NUM_COMPARED))
     if found.best.score < CLEAR_SCORE or found.margin < CLEAR_MARGIN:
         return False
+    return not is_rather_mirrored(query, starts)
+
+
+def is_rather_mirrored(query: Query, starts: Starts) -> bool:
+    """True if the mirrored photo fits nearly as well, by the first scores from the starts of the photo."""
     mirror = mirrored(query)
-    return first_score(query, starts) >= MIRROR_RATIO * first_score(
-        mirror, search_poses(mirror, "known", is_first=True)
-    )
+    of_mirror = first_score(mirror, search_poses(mirror, "known", is_first=True))
+    return first_score(query, starts) < MIRROR_RATIO * of_mirror
 
 
 def mirrored(query: Query) -> Query:

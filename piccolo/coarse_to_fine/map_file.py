@@ -25,7 +25,7 @@ from ..runtime.file_facts import recall, remember
 from .map_validation import LAYOUT, check_arrays, clean_warnings
 from .scan_map import ScanMap, with_late_features
 
-FORMAT = "piccolo-map/6"
+FORMAT = "piccolo-map/7"
 OTHERS = ("octree", "local_features", "scan_names", "warnings", "crs", "is_partial", "whole", "late")
 ARRAYS = [f.name for f in fields(ScanMap) if f.name not in OTHERS]
 MEMBERS = {*LAYOUT, "format", "scan_names", "warnings"}

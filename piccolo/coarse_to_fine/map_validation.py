@@ -32,6 +32,7 @@ LAYOUT: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "octree_leaf_size": ("<f8", ()),
     "R_map_from_world": ("<f8", (3, 3)),
     "origin_world": ("<f8", (3,)),
+    "surface_variance": ("<f8", (3, 3)),
     "centers": ("<f8", ("candidates", 3)),
     "offsets": ("<i2", ("candidates", 3, CELLS)),
     "offset_unit": ("<f4", ("candidates",)),
@@ -62,6 +63,7 @@ LEAF_SIZES = 1e-3, 0.1  # [m] least and most
 FARTHEST_ORIGIN, MARGIN = 1e12, 10.0  # [m] of the world; around the voxels that are kept
 BRIGHTEST = np.float32(1.0 + 1e-6)
 LEAST_UNIT, MOST_OFFSET = 3e-8, 1e6  # [m] of the offsets; how far they reach
+LARGEST_DEVIATION = 1.0  # [m] of points from their surfaces
 MAX_CRS = 4 * 20_000  # [byte]
 MAX_WARNINGS, MAX_WARNING = 1000, 5000  # lines, and characters of a line
 
@@ -126,11 +128,15 @@ def _refuse(path: Path, found: str) -> None:
 
 
 def _check_frame(path: Path, arrays: Arrays) -> None:
-    """The rotation is one, and the origin lies at whole metres of the map's axes."""
+    """The rotation and the variance are such, and the origin lies at whole metres of the map's axes."""
     R = checked_rotation(arrays["R_map_from_world"], ROUNDING, f"{path}: R_map_from_world of the map")
     origin: Array = arrays["origin_world"]
     if not (np.abs(origin).max() < FARTHEST_ORIGIN and np.abs(R @ origin - np.rint(R @ origin)).max() < 1e-3):
         _refuse(path, f"an origin_world of {origin.tolist()}")
+    T: Array = arrays["surface_variance"]
+    is_one = np.isfinite(T).all() and np.allclose(T, T.T, rtol=0.0, atol=ROUNDING)
+    if not (is_one and -ROUNDING <= np.linalg.eigvalsh(T)[0] <= np.trace(T) <= LARGEST_DEVIATION**2):
+        _refuse(path, f"a surface_variance of {T.tolist()}")
 
 
 def _check_octree(path: Path, arrays: Arrays) -> None:

@@ -105,7 +105,8 @@ def extended_map(
 ) -> ScanMap:
     """A prepared map with the scan of some files put in under a name; a map without names gets its file's."""
     if not prepared_map_among([map_path]):
-        raise InputError(f"{map_path}: found no prepared map, wanted one by tools/prepare_map.py")
+        found = "no prepared map" if map_path.exists() else "no such file"
+        raise InputError(f"{map_path}: found {found}, wanted a map by tools/prepare_map.py")
     if path := prepared_map_among(paths):
         raise InputError(f"{path}: found a prepared map, wanted the files of a scan to add")
     if cloud_settings.up != "auto":

@@ -1,5 +1,6 @@
 """A query: a panorama at several scales, and the map in which it is searched."""
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -80,6 +81,7 @@ class Query:
     workers: Workers
     method: MethodConfig
     panorama: Panorama  # at the width of its features
+    pixel: float  # [rad] of the photo as it was given, but none finer than those that are compared
     by_features: bool = True  # False where whole views alone are asked
     comparisons: dict[bytes, Any] = field(default_factory=dict)  # worked out already, by comparison.py
 
@@ -133,6 +135,7 @@ def prepare_query(
     """The query of a panorama among a map's candidates; its metadata say how the camera was tilted."""
     R_level_from_cam = rotation_to_level(panorama.gpano) if panorama.gpano else None
     R_cam_from_level = np.eye(3) if R_level_from_cam is None else R_level_from_cam.T
+    pixel = math.tau / min(panorama.rgb.shape[1], method.scales.full.width)
     panorama = resize(panorama, method.scales.full.width)
     images = query_images(panorama, method.scales)
-    return Query(scan_map, images, R_cam_from_level, settings, workers, method, panorama)
+    return Query(scan_map, images, R_cam_from_level, settings, workers, method, panorama, pixel)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cloud.octree import Octree, build_octree
+from ..cloud.surface_noise import surface_variance
 from ..cloud.voxels import LEAF_SIZE, WINDOW, Voxels, join_voxels
 from ..errors import InputError
 from ..geometry.pose import Array
@@ -73,6 +74,7 @@ def add_scan(old: ScanMap, cloud: Voxelized, name: str, workers: Workers, watch:
         return replace(
             old,
             octree=octree,
+            surface_variance=surface_variance(octree),
             centers=found.centers,
             offsets=offsets,
             offset_unit=unit,

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ..cloud.octree import Octree, build_octree
 from ..cloud.settings import UpAxis
 from ..cloud.soa import PackedPoints, pack_points
+from ..cloud.surface_noise import surface_variance
 from ..cloud.voxels import Voxels
 from ..geometry.pose import Array, Pose
 from ..geometry.sphere import SEARCH_RINGS, averaging, make_grid
@@ -40,6 +41,7 @@ class ScanMap:
     octree: Octree
     R_map_from_world: Array  # (3, 3), identity where the cloud's z is up
     origin_world: Array  # (3,) [m] middle of the leaves' box, in whole metres along the map's axes
+    surface_variance: Array  # (3, 3) [m^2] that the scan's noise and doubled surfaces give to a position
     centers: NDArray[np.float64]  # (candidates, 3) [m]
     offsets: NDArray[np.int16]  # (candidates, 3, cells) from the centre to what is seen, in units of
     offset_unit: NDArray[np.float32]  # (candidates,) [m]
@@ -259,6 +261,7 @@ def prepare_map(
         octree=octree,
         R_map_from_world=aligned.R_map_from_world,
         origin_world=aligned.origin_world,
+        surface_variance=surface_variance(octree),
         centers=centers,
         offsets=offsets,
         offset_unit=unit,

@@ -1,6 +1,7 @@
 """A picture file or a folder of cube faces read as a panorama: a full sphere, and the pixels that count."""
 
 from dataclasses import replace
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -225,3 +226,30 @@ def _sphere_fraction(is_there: NDArray[np.bool_], region: CropRegion) -> float:
     rows = (np.arange(len(is_there)) + 0.5) / len(is_there) * region.height + region.top
     per_row = is_there.mean(axis=1) * np.sin(np.clip(rows, 0.0, 1.0) * np.pi)
     return float(per_row.mean() * region.width * region.height * np.pi / 2.0)
+
+
+def read_query(
+    panorama: str | PathLike[str] | NDArray[np.uint8],
+    options: ReadOptions,
+    is_masked: NDArray[np.bool_] | None = None,
+) -> Panorama:
+    """The panorama in a file; or in an array (H, W, 3), with a mask (H, W) of what is to be ignored.
+
+    An array that no camera is given for is a full sphere.
+    """
+    if not isinstance(panorama, np.ndarray):
+        if is_masked is not None:
+            raise InputError("mask: an array goes with a panorama that is an array; give a picture's path")
+        return read_panorama(Path(panorama), options)
+    if panorama.dtype != np.uint8 or panorama.ndim != 3 or panorama.shape[2] != 3 or not panorama.size:
+        found = f"{panorama.dtype} of shape {panorama.shape}"
+        raise InputError(f"panorama: found {found}, wanted RGB in uint8 of shape (H, W, 3)")
+    is_crop = options.fov_deg is not None and options.projection not in ("pinhole", "fisheye")
+    if options.mask or options.mask_nadir_deg or options.cube_order or options.rig or is_crop:
+        raise InputError("panorama: fov_deg, cube_order, mask_nadir_deg, rig and a mask's path go with files")
+    is_valid = np.ones(panorama.shape[:2], np.bool_)
+    if is_masked is not None:
+        if is_masked.shape != is_valid.shape or is_masked.dtype != np.bool_:
+            raise InputError(f"mask: wanted an array of bool of shape {is_valid.shape}, as the panorama's")
+        is_valid = ~is_masked
+    return panorama_of_array(np.ascontiguousarray(panorama), is_valid, options)

@@ -1,6 +1,7 @@
 """Scenes on disk: a folder with a cloud, panoramas, and a queries.json with their true poses."""
 
 import json
+import math
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -32,6 +33,9 @@ class Query:
     pose: Pose  # in the cloud's coordinates
     labels: Path | None = None  # a picture of what each pixel shows, as numbers
     cameras: tuple[Mount, ...] = ()  # that took it; none for a sphere
+    walk: str | None = None  # the walk of which it is a frame
+    time: float | None = None  # of a frame, from its walk's beginning [s]
+    is_answerable: bool = True  # else it shows nothing of the cloud: a black, mirrored or foreign frame
 
     @property
     def calibration(self) -> Calibration | None:
@@ -111,7 +115,24 @@ def _query(folder: Path, number: int, entry: dict[str, Any]) -> Query:
     labels = folder / entry["labels"] if entry.get("labels") else None
     cameras = mounts_of(entry["camera"]) if entry.get("camera") else ()
     pose = Pose(R_cam_from_world, center_world)
-    return Query(folder / entry["image"], entry["variant"], pose, labels, cameras)
+    more = _walk_of(entry)
+    return Query(folder / entry["image"], entry["variant"], pose, labels, cameras, *more)
+
+
+def _walk_of(entry: dict[str, Any]) -> tuple[str | None, float | None, bool]:
+    """A frame's walk and time, and whether it has an answer; ValueError if they are none."""
+    walk, time, is_answerable = entry.get("walk"), entry.get("time"), entry.get("answerable", True)
+    if (walk is None) != (time is None) or not isinstance(is_answerable, bool):
+        raise ValueError(
+            f"{entry['image']}: a walk without a time, or an answerable that is not true or false"
+        )
+    if walk is None:
+        return None, None, is_answerable
+    if not isinstance(walk, str) or not walk.isprintable():
+        raise ValueError(f"{entry['image']}: a walk that is no plain text")
+    if isinstance(time, bool) or not isinstance(time, int | float) or not math.isfinite(time):
+        raise ValueError(f"{entry['image']}: a time that is no finite number")
+    return walk, float(time), is_answerable
 
 
 def _relative(path: Path, folder: Path) -> str:
@@ -127,6 +148,9 @@ def write_queries(folder: Path, queries: Iterable[Query], **more: object) -> Non
         labels = {"labels": _relative(query.labels, folder)} if query.labels else {}
         image = _relative(query.image, folder)
         camera = {"camera": document_of(query.cameras)} if query.cameras else {}
-        entries.append({"image": image, "variant": query.variant, **pose, **labels, **camera})
+        walk = {"walk": query.walk, "time": query.time} if query.walk is not None else {}
+        refused = {} if query.is_answerable else {"answerable": False}
+        own = {**labels, **camera, **walk, **refused}
+        entries.append({"image": image, "variant": query.variant, **pose, **own})
     document = {"cloud": CLOUD_NAME, "convention": CONVENTION, **more, "queries": entries}
     write_atomically(folder / QUERIES_NAME, json.dumps(document, indent=1).encode())

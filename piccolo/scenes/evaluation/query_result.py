@@ -36,14 +36,19 @@ class QueryResult:
     image: str  # as the scene's queries.json names it
     variant: str
     is_in_box: bool | None  # the true position lies in the box of the cloud's points; None if not known
-    position_error: float  # [m], inf without a pose
-    rotation_error: float  # [rad], inf without a pose
+    position_error: float  # [m], inf without a pose, or of a photo that has no answer
+    rotation_error: float  # [rad], likewise
     result: Result
 
     @property
     def key(self) -> tuple[str, str]:
         """The query, unique in a run."""
         return self.scene, self.image
+
+    @property
+    def has_errors(self) -> bool:
+        """True if there is a pose, and a true one."""
+        return bool(np.isfinite(self.position_error))
 
     @property
     def seconds(self) -> float:
@@ -58,9 +63,8 @@ class QueryResult:
         """One line."""
         names = "scene", "image", "variant", "is_in_box"
         line: dict[str, object] = {"format": FORMAT, **{name: getattr(self, name) for name in names}}
-        has_pose = self.result.best_pose is not None
-        line["position_error"] = self.position_error if has_pose else None
-        line["rotation_error_deg"] = float(np.degrees(self.rotation_error)) if has_pose else None
+        line["position_error"] = self.position_error if self.has_errors else None
+        line["rotation_error_deg"] = float(np.degrees(self.rotation_error)) if self.has_errors else None
         line["result"] = json.loads(self.result.to_json())
         return json.dumps(line, allow_nan=False)
 
@@ -78,7 +82,7 @@ class QueryResult:
 
 def query_result_of(scene: Scene, query: Query, result: Result, is_in_box: bool | None) -> QueryResult:
     """A query's result with its errors."""
-    pose = result.best_pose
+    pose = result.best_pose if query.is_answerable else None
     errors = (np.inf, np.inf) if pose is None else pose_errors(pose, query.pose)
     return QueryResult(scene.name, scene.name_of(query), query.variant, is_in_box, *errors, result)
 

@@ -16,7 +16,7 @@ from ...errors import InputError
 from ...opening import open_files
 from ...panorama import ReadOptions
 from ...paper.settings import PaperSettings
-from ...result import named
+from ...result import named, unreadable_result
 from ...runtime.atomic import check_output
 from ...runtime.json_file import parse_lines, read_bytes
 from ...runtime.line_file import appending, whole_size
@@ -93,7 +93,15 @@ class JobRunner:
             try:
                 yield self._result_of(scan, scene, query)
             except (OSError, InputError) as error:
-                yield Failure(str(error), 1)
+                is_refused = isinstance(error, InputError) and not query.is_answerable
+                yield self._refused(scene, query, str(error)) if is_refused else Failure(str(error), 1)
+
+    def _refused(self, scene: Scene, query: Query, error: str) -> QueryResult:
+        """That a picture which has no answer could not be used."""
+        config = self.config
+        settings = settings_json(config.settings, config.cloud_settings, config.read_options)
+        result = unreadable_result(error, str(scene.cloud), str(query.image), settings=settings)
+        return query_result_of(scene, query, result, None)
 
     def _scan_of(self, cloud: Path) -> Scan:
         if self._opened is None or self._opened[0] != cloud:

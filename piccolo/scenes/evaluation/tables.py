@@ -167,8 +167,7 @@ def csv_text(rows: Sequence[QueryResult]) -> str:
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow((*columns, "rotation_error_deg", "loss", "seconds"))
     for row in rows:
-        has_pose = row.result.best_pose is not None
-        errors = (row.position_error, float(np.degrees(row.rotation_error))) if has_pose else ("", "")
+        errors = (row.position_error, float(np.degrees(row.rotation_error))) if row.has_errors else ("", "")
         box = "" if row.is_in_box is None else str(row.is_in_box).lower()
         status = row.result.status, row.result.confidence
         words = row.scene, row.image, row.variant, box

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import InputError
-from ...geometry.pose import T_world_from_cam, log_so3, quaternion_wxyz
+from ...geometry.pose import Pose, T_world_from_cam, log_so3, quaternion_wxyz
 from ...geometry.rotations import (
     CAMERA_AXES,
     OPENGL_FROM_CAM,
@@ -85,12 +85,19 @@ def write_csv(images: Sequence[PosedImage], out: Path, options: Options) -> None
 
 def write_tum(images: Sequence[PosedImage], out: Path, options: Options) -> None:
     """Write rows "timestamp tx ty tz qx qy qz qw", world from camera, by time, below a comment."""
-    lines = [f"# timestamp tx ty tz qx qy qz qw, camera axes {options.axes}", *offset_comment(options)]
-    for image in sorted(images, key=lambda image: Decimal(image.time)):
-        T = T_world_from_cam(turned(image.pose, CAMERA_AXES[options.axes]))
+    ordered = sorted(images, key=lambda image: Decimal(image.time))
+    header, *rows = tum_lines([(image.time, image.pose) for image in ordered], options.axes)
+    write_lines(out, [header, *offset_comment(options), *rows])
+
+
+def tum_lines(poses: Iterable[tuple[str, Pose]], axes: str) -> list[str]:
+    """A comment and the rows of poses, each with the text of its time; `axes` as in CAMERA_AXES."""
+    lines = [f"# timestamp tx ty tz qx qy qz qw, camera axes {axes}"]
+    for time, pose in poses:
+        T = T_world_from_cam(turned(pose, CAMERA_AXES[axes]))
         w, x, y, z = quaternion_wxyz(T[:3, :3])
-        lines.append(f"{image.time} {numbers([*T[:3, 3], x, y, z, w])}")
-    write_lines(out, lines)
+        lines.append(f"{time} {numbers([*T[:3, 3], x, y, z, w])}")
+    return lines
 
 
 def write_kitti(images: Sequence[PosedImage], out: Path, options: Options) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from ...geometry.pose import Array
 from ...runtime.threads import Workers
 from . import halls, interiors, outdoors
-from .room import make_repeated
+from .repeated import make_repeated
 from .surfaces import DENSITY, SurfaceSampler, with_station_holes
 from .world import make_world, random_size, scan_room, scan_world
 

@@ -12,6 +12,8 @@ from .room import Room
 
 AMBIENT, LAMP, LAMP_DECAY = 0.55, 0.9, 0.15  # of a surface's colour; the decay [1/m2]
 CHUNK = 4_096  # rays
+NUM_FIRST = 32  # boxes
+MARGIN = 1e-6  # of a cone around rays [rad], and of a range [m]
 
 
 @inline_kernel
@@ -92,8 +94,8 @@ def hit_boxes(origin, directions, boxes, ranges, hits):
 
 
 @kernel
-def shade(origin, directions, ranges, hits, boxes, materials, light, rgb):
-    """Write the colour (N, 3) in [0, 1] of each hit; black where a ray hits nothing."""
+def shade(origin, directions, ranges, hits, boxes, materials, lights, rgb):
+    """Write the colour (N, 3) in [0, 1] of each hit, lit by its box's lamp; black where nothing is hit."""
     for n in range(len(directions)):
         rgb[n, :] = 0.0
         if hits[n] < 0:
@@ -108,7 +110,7 @@ def shade(origin, directions, ranges, hits, boxes, materials, light, rgb):
         along, up = (py, oz) if axis == 0 else (px, oz) if axis == 1 else (px, py)
         m = materials[b]
         fraction = second_color_fraction(np.int64(m[0]), along, up, m[1], np.int64(m[8]) + axis)
-        lx, ly, lz = light[0] - x, light[1] - y, light[2] - z
+        lx, ly, lz = lights[b, 0] - x, lights[b, 1] - y, lights[b, 2] - z
         distance2 = lx * lx + ly * ly + lz * lz
         towards = abs((c * lx + s * ly) if axis == 0 else (c * ly - s * lx) if axis == 1 else lz)
         lit = AMBIENT + LAMP * towards / math.sqrt(distance2) / (1.0 + LAMP_DECAY * distance2)
@@ -116,22 +118,72 @@ def shade(origin, directions, ranges, hits, boxes, materials, light, rgb):
             rgb[n, k] = min(1.0, lit * (m[2 + k] * (1.0 - fraction) + m[5 + k] * fraction))
 
 
+@kernel
+def ranges_ahead(origin, axis, cone_width, boxes, least):
+    """Write the distance [m] of each box (B, 7), inf where its bounding sphere is outside a cone of rays.
+
+    The cone is around the unit `axis` (3,), its half width [rad].
+    """
+    cone_cos, cone_sin = math.cos(cone_width), math.sin(cone_width)
+    for b in range(len(boxes)):
+        ox, oy, oz = boxes[b, 0] - origin[0], boxes[b, 1] - origin[1], boxes[b, 2] - origin[2]
+        half_x, half_y, half_z = boxes[b, 3], boxes[b, 4], boxes[b, 5]
+        radius = math.sqrt(half_x * half_x + half_y * half_y + half_z * half_z)
+        distance = math.sqrt(ox * ox + oy * oy + oz * oz)
+        if distance > radius:
+            sine = radius / distance
+            cosine = math.sqrt(1.0 - sine * sine)
+            ahead = ox * axis[0] + oy * axis[1] + oz * axis[2]
+            # the angle of cone and sphere together is below pi, and that to the sphere's middle is above it
+            if cone_sin * cosine + cone_cos * sine > 0.0 and ahead < distance * (
+                cone_cos * cosine - cone_sin * sine
+            ):
+                least[b] = np.inf
+                continue
+        c, s = math.cos(boxes[b, 6]), math.sin(boxes[b, 6])
+        x = max(abs(c * ox + s * oy) - half_x, 0.0)
+        y = max(abs(c * oy - s * ox) - half_y, 0.0)
+        z = max(abs(oz) - half_z, 0.0)
+        least[b] = math.sqrt(x * x + y * y + z * z)
+
+
+def boxes_ahead(
+    origin: Array, directions: NDArray[np.float64], boxes: NDArray[np.float64]
+) -> tuple[NDArray[np.intp], Array]:
+    """Which boxes (B, 7) unit `directions` (N, 3) may hit, by their cone, and from what range on [m]."""
+    axis = directions.mean(axis=0)
+    axis /= max(float(np.linalg.norm(axis)), 1e-12)  # of opposite rays, for which the cone is the sphere
+    width, least = math.acos(np.clip((directions @ axis).min(), -1.0, 1.0)) + MARGIN, np.empty(len(boxes))
+    ranges_ahead(origin, axis, width, boxes, least)
+    ahead = np.flatnonzero(least < np.inf)
+    return ahead, least[ahead]
+
+
 def cast_rays(
     room: Room, origin: Array, directions: NDArray[np.float64], workers: Workers, label: str
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Ranges (N,) [m], colours (N, 3) in [0, 1] and labels (N,) along unit world `directions` (N, 3).
 
-    Where nothing is hit the range is inf, the colour black and the label 0.
+    Where nothing is hit the range is inf, the colour black and the label 0. Quickest where directions that
+    follow each other are near each other: what lies elsewhere is not asked.
     """
     ranges, rgb = np.empty(len(directions)), np.empty((len(directions), 3))
-    labels = np.empty(len(directions), dtype=np.int64)
+    labels = np.zeros(len(directions), dtype=np.int64)
+    lights = np.broadcast_to(room.light, (len(room.boxes), 3))
 
     def run(lo: int) -> None:
         part = slice(lo, lo + CHUNK)
-        hits = np.empty(len(ranges[part]), dtype=np.int64)
-        hit_boxes(origin, directions[part], room.boxes, ranges[part], hits)
-        shade(origin, directions[part], ranges[part], hits, room.boxes, room.materials, room.light, rgb[part])
-        labels[part] = np.where(hits < 0, 0, room.labels[hits // 3])
+        rays, hits = directions[part], np.empty(len(ranges[part]), dtype=np.int64)
+        ahead, least = boxes_ahead(origin, rays, room.boxes)
+        if len(ahead) > NUM_FIRST:  # what the nearest boxes hide needs no look
+            nearest = np.argpartition(least, NUM_FIRST)[:NUM_FIRST]
+            hit_boxes(origin, rays, room.boxes[ahead[nearest]], ranges[part], hits)
+            ahead = ahead[least <= ranges[part].max() + MARGIN]
+        boxes, materials = room.boxes[ahead], room.materials[ahead]
+        hit_boxes(origin, rays, boxes, ranges[part], hits)
+        shade(origin, rays, ranges[part], hits, boxes, materials, lights[ahead], rgb[part])
+        is_hit = hits >= 0
+        labels[part][is_hit] = room.labels[ahead[hits[is_hit] // 3]]
 
     list(workers.map(run, range(0, len(directions), CHUNK), label))
     return ranges, rgb, labels

@@ -1,5 +1,7 @@
 """The seeded layout of a room: boxes, each with a material; places that look the same from several poses."""
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -16,9 +18,7 @@ LABEL_NAMES = (  # kinds of surfaces; a label is the place in this list, and 0 i
 )
 Pair = tuple[float, float]
 SATURATION = 0.5  # paints are paler than colours drawn at random
-REPEATED_KINDS = ("twins", "hall", "corridor")
-GAP = 0.4  # between twins [m]
-NUM_DOORS, DOOR_DISTANCE, CORRIDOR_WIDTH = 6, 3.0, 2.2  # [m]
+DOOR_ROOM = 1.2  # left free before an open door [m]
 
 
 @dataclass
@@ -31,6 +31,7 @@ class RoomBuilder:
     materials: list[Array] = field(default_factory=list)
     labels: list[int] = field(default_factory=list)
     kind: str = "nothing"  # of what is put next, one of LABEL_NAMES
+    clear: list[tuple[Array, Array]] = field(default_factory=list)  # low, high (3,) of places to be left free
 
     def material(self, pattern: int, scale: float, colors: tuple[Array, Array]) -> Array:
         """A material row."""
@@ -57,6 +58,34 @@ class RoomBuilder:
         self.materials.append(material)
         self.labels.append(LABEL_NAMES.index(self.kind))
 
+    def leave_clear(self, first: int) -> None:
+        """Take back the boxes from number `first` on if one of them is in a place that is to be left free."""
+        for box in self.boxes[first:]:
+            c, s = abs(np.cos(box[6])), abs(np.sin(box[6]))
+            half = np.array([c * box[3] + s * box[4], s * box[3] + c * box[4], box[5]])
+            middle = box[:3] - self.corner
+            if any(((middle - half < high) & (middle + half > low)).all() for low, high in self.clear):
+                del self.boxes[first:], self.materials[first:], self.labels[first:]
+                return
+
+
+class Door(NamedTuple):
+    """An opening of a room's wall, from the floor up."""
+
+    axis: int  # that the wall crosses: 0 is x
+    is_far: bool  # the wall is at the far end of the axis
+    middle: float  # along the wall [m]
+    width: float = 1.0  # [m]
+    height: float = 2.1  # [m]
+
+    def clear(self, size: Array, depth: float) -> tuple[Array, Array]:
+        """Least and greatest corner (3,) of what is in the door and up to `depth` [m] before it."""
+        low, high = np.array([0.0, 0.0, 0.02]), np.full(3, self.height)
+        wall, along = self.axis, 1 - self.axis
+        low[along], high[along] = self.middle - 0.5 * self.width - 0.1, self.middle + 0.5 * self.width + 0.1
+        low[wall], high[wall] = (size[wall] - depth, size[wall] + 0.2) if self.is_far else (-0.2, depth)
+        return low, high
+
 
 class Room(NamedTuple):
     """A closed room full of boxes, z up."""
@@ -65,7 +94,7 @@ class Room(NamedTuple):
     size: Array  # (3,) [m]
     boxes: NDArray[np.float64]  # (B, 7) center (3) [m], half size (3) [m], yaw [rad]
     materials: NDArray[np.float64]  # (B, 9) pattern, scale [m], two colours (3) in [0, 1], seed
-    light: Array  # (3,) position of the lamp [m]
+    light: Array  # (3,) position of the lamp [m], or (B, 3) of each box's
     labels: NDArray[np.int64]  # (B,) see LABEL_NAMES
 
     def clearance(self, position: Array) -> float:
@@ -78,8 +107,8 @@ class Room(NamedTuple):
         return float((outside + inside).min())
 
 
-def put_shell(b: RoomBuilder, size: Array) -> None:
-    """Floor, ceiling and four walls."""
+def put_shell(b: RoomBuilder, size: Array, doors: Sequence[Door] = ()) -> None:
+    """Floor, ceiling and four walls, open at the doors."""
     x, y, z = size
     d = WALL_THICKNESS
     ceiling = b.paint((PLAIN,), 0.75, 0.95)
@@ -87,15 +116,44 @@ def put_shell(b: RoomBuilder, size: Array) -> None:
     b.put([x / 2, y / 2, -d / 2], [x + 2 * d, y + 2 * d, d], b.paint((PLANKS, TILES), 0.35, 0.75))
     b.kind = "ceiling"
     b.put([x / 2, y / 2, z + d / 2], [x + 2 * d, y + 2 * d, d], ceiling)
+    put_walls(b, size, doors)
+
+
+def put_walls(b: RoomBuilder, size: Array, doors: Sequence[Door]) -> None:
+    """Four walls, each of one paint, open at the doors."""
     b.kind = "wall"
-    for axis in (0, 1):
-        for side in (-d / 2, size[axis] + d / 2):
-            center, extent = size / 2, size.copy()
-            center[axis], extent[axis] = side, d
-            b.put(center, extent, b.paint((PLAIN, PLAIN, STRIPES, TILES), 0.5, 0.9))
+    for wall in itertools.product((0, 1), (False, True)):
+        own = [door for door in doors if (door.axis, door.is_far) == wall]
+        put_wall(b, size, wall, b.paint((PLAIN, PLAIN, STRIPES, TILES), 0.5, 0.9), own)
 
 
-def _wall_hangings(b: RoomBuilder, size: Array) -> None:
+def put_wall(
+    b: RoomBuilder, size: Array, wall: tuple[int, bool], paint: Array, doors: Sequence[Door]
+) -> None:
+    """The wall that crosses an axis at its near or far end: pieces beside its doors and above them."""
+    axis, is_far = wall
+    along = 1 - axis
+
+    def put_piece(begin: float, end: float, bottom: float) -> None:
+        center, extent = size / 2, size.copy()
+        center[axis], extent[axis] = (
+            size[axis] + WALL_THICKNESS / 2 if is_far else -WALL_THICKNESS / 2,
+            WALL_THICKNESS,
+        )
+        center[along], extent[along] = (begin + end) / 2, end - begin
+        center[2], extent[2] = (bottom + size[2]) / 2, size[2] - bottom
+        b.put(center, extent, paint)
+
+    begin = 0.0
+    for door in sorted(doors, key=lambda door: door.middle):
+        left, right = door.middle - door.width / 2, door.middle + door.width / 2
+        put_piece(begin, left, 0.0)
+        put_piece(left, right, door.height)
+        begin = right
+    put_piece(begin, size[along], 0.0)
+
+
+def put_hangings(b: RoomBuilder, size: Array) -> None:
     """Pictures, a door and windows: thin boxes on the walls."""
     for axis in (0, 1):
         along = 1 - axis
@@ -114,6 +172,7 @@ def _wall_hangings(b: RoomBuilder, size: Array) -> None:
                 b.kind = str(kind)
                 low, high = {"picture": (0.1, 1.0), "window": (0.7, 1.0), "door": (0.2, 0.6)}[kind]
                 b.put(center, extent, b.paint(patterns, low, high))
+                b.leave_clear(len(b.boxes) - 1)
 
 
 def put_table(b: RoomBuilder, at: Array, yaw: float) -> None:
@@ -153,13 +212,16 @@ def put_crate(b: RoomBuilder, at: Array, yaw: float) -> None:
     b.put([*at, size[2] / 2], size, b.paint((PLANKS, CHECKS, PICTURE, PLAIN), 0.15, 0.9), yaw)
 
 
-def _furniture(b: RoomBuilder, size: Array, moves: np.random.Generator | None) -> None:
-    """A rug and about one piece in 3 m2; half of the pieces go elsewhere if there are `moves`."""
-    num_pieces = max(3, round(size[0] * size[1] / 3.0))
+def put_furniture(
+    b: RoomBuilder, size: Array, moves: np.random.Generator | None = None, area: float = 3.0
+) -> None:
+    """A rug and about one piece in an area [m2]; half of the pieces go elsewhere if there are `moves`."""
+    num_pieces = max(3, round(size[0] * size[1] / area))
     seeds = b.rng.integers(0, 1 << 30, num_pieces)
     rug = [size[0] * b.rng.uniform(0.3, 0.6), size[1] * b.rng.uniform(0.3, 0.6), 0.01]
     b.kind = "rug"
     b.put([size[0] / 2, size[1] / 2, 0.005], rug, b.paint((CHECKS, STRIPES, PICTURE), 0.1, 0.8))
+    b.leave_clear(len(b.boxes) - 1)
     pieces = {"table": put_table, "shelf": put_shelf, "sofa": put_sofa, "crate": put_crate}
     kinds = ("table", "shelf", "sofa", "crate", "crate")
     for seed in seeds:  # each of its own stream, so that a piece that moves stays what it is
@@ -168,18 +230,21 @@ def _furniture(b: RoomBuilder, size: Array, moves: np.random.Generator | None) -
         where = moves if moves is not None and moves.random() < 0.5 else np.random.default_rng([seed, 1])
         at = where.uniform([0.5, 0.5], size[:2] - 0.5)
         yaw = float(where.choice([0.0, np.pi / 2, np.pi, -np.pi / 2]) + where.normal(0, 0.2))
+        first = len(b.boxes)
         pieces[b.kind](b, at, yaw)
+        b.leave_clear(first)
 
 
-def make_room(seed: int, size: Array, corner: Array, changed: int = 0) -> Room:
+def make_room(seed: int, size: Array, corner: Array, changed: int = 0, doors: Sequence[Door] = ()) -> Room:
     """The room of `seed`; the same shell with other furniture and more crates for each `changed` above 0."""
     fixed = RoomBuilder(np.random.default_rng([seed, 0]), np.asarray(corner, dtype=float))
     size = np.asarray(size, dtype=float)
-    put_shell(fixed, size)
-    _wall_hangings(fixed, size)
-    loose = RoomBuilder(np.random.default_rng([seed, 1]), fixed.corner)
+    fixed.clear = [door.clear(size, DOOR_ROOM) for door in doors]
+    put_shell(fixed, size, doors)
+    put_hangings(fixed, size)
+    loose = RoomBuilder(np.random.default_rng([seed, 1]), fixed.corner, clear=fixed.clear)
     moves = np.random.default_rng([seed, 2, changed]) if changed else None
-    _furniture(loose, size, moves)
+    put_furniture(loose, size, moves)
     if moves is not None:
         loose.rng, loose.kind = moves, "crate"
         for _ in range(3):
@@ -187,56 +252,3 @@ def make_room(seed: int, size: Array, corner: Array, changed: int = 0) -> Room:
     light = fixed.corner + size * [*fixed.rng.uniform(0.35, 0.65, 2), 0.93]
     boxes, materials = np.stack(fixed.boxes + loose.boxes), np.stack(fixed.materials + loose.materials)
     return Room(fixed.corner, size, boxes, materials, light, np.array(fixed.labels + loose.labels))
-
-
-def make_repeated(kind: str, seed: int, size: Array) -> tuple[Room, ...]:
-    """Rooms of one of REPEATED_KINDS; a corridor has a length and a width of its own."""
-    if kind == "twins":
-        return twin_rooms(seed, size)
-    return (symmetric_hall(seed, size) if kind == "hall" else corridor(seed, float(size[2])),)
-
-
-def twin_rooms(seed: int, size: Array) -> tuple[Room, Room]:
-    """The same furnished room twice, side by side."""
-    room = make_room(seed, size, np.zeros(3))
-    shift = np.array([room.size[0] + GAP, 0.0, 0.0])
-    boxes = room.boxes + np.array([*shift, 0.0, 0.0, 0.0, 0.0])
-    return room, room._replace(corner=room.corner + shift, boxes=boxes, light=room.light + shift)
-
-
-def symmetric_hall(seed: int, size: Array) -> Room:
-    """A room that half a turn about its middle takes to itself."""
-    room = make_room(seed, size, np.zeros(3))
-    x, y, _ = room.size
-    is_long = room.boxes[:, 3] > 0.45 * x  # floor, ceiling and two of the walls: their half
-    boxes = room.boxes.copy()
-    boxes[is_long, 0], boxes[is_long, 3] = 0.25 * x - 0.5 * WALL_THICKNESS, 0.25 * x + 0.5 * WALL_THICKNESS
-    is_kept = boxes[:, 0] < 0.5 * x
-    half, materials = boxes[is_kept], np.tile(room.materials[is_kept], (2, 1))
-    turned = half.copy()
-    turned[:, 0], turned[:, 1], turned[:, 6] = x - half[:, 0], y - half[:, 1], half[:, 6] + np.pi
-    light = np.array([0.5 * x, 0.5 * y, room.light[2]])
-    labels = np.tile(room.labels[is_kept], 2)
-    return Room(room.corner, room.size, np.vstack([half, turned]), materials, light, labels)
-
-
-def corridor(seed: int, height: float) -> Room:
-    """A corridor whose doors and pictures repeat; both ends are alike."""
-    b = RoomBuilder(np.random.default_rng([seed, 3]), np.zeros(3))
-    length, width, d = DOOR_DISTANCE, CORRIDOR_WIDTH, WALL_THICKNESS
-    floor, ceiling = b.paint((PLANKS, TILES), 0.3, 0.7), b.paint((PLAIN,), 0.75, 0.95)
-    walls = [b.paint((PLAIN,), 0.5, 0.9) for _ in range(2)]
-    door, picture = b.paint((PLANKS,), 0.2, 0.6), b.paint((PICTURE,), 0.1, 1.0)
-    for k in range(NUM_DOORS):
-        x = (k + 0.5) * length
-        b.put([x, width / 2, -d / 2], [length, width + 2 * d, d], floor)
-        b.put([x, width / 2, height + d / 2], [length, width + 2 * d, d], ceiling)
-        b.put([x, -d / 2, height / 2], [length, d, height], walls[0])
-        b.put([x, width + d / 2, height / 2], [length, d, height], walls[1])
-        b.put([x, 0.0, 1.0], [0.9, 0.06, 2.0], door)
-        b.put([x, width, 1.5], [0.8, 0.06, 0.6], picture)
-    for x in (-d / 2, NUM_DOORS * length + d / 2):
-        b.put([x, width / 2, height / 2], [d, width, height], walls[0])
-    size = np.array([NUM_DOORS * length, width, height])
-    light = size * [0.5, 0.5, 0.93]
-    return Room(b.corner, size, np.stack(b.boxes), np.stack(b.materials), light, np.array(b.labels))

@@ -3,6 +3,8 @@
 The scanner has noise, shadows and uneven density; light, lens and file change the panoramas.
 """
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -19,7 +21,7 @@ from .raycast import cast_rays
 from .room import Room, make_room
 
 SUPERSAMPLING = 2  # rays a pixel, each way
-BAND = 8  # rows cast at once: all rays of a large image would take a gigabyte
+TILE = 64  # side [px] of what is cast at once: rays near each other meet few boxes
 
 RANGE_NOISE = 0.003  # of the scanner, standard deviation [m]
 MIN_CLEARANCE = 0.35  # of a station or camera [m]
@@ -27,8 +29,18 @@ NUM_TRIES = 2000
 VARIANTS = ("clean", "tilt", "photo", "change")
 GAP = 0.4  # between rooms [m]
 MIN_SIZE, MAX_SIZE = 2.0, 50.0  # of a room, each way [m]
-MAX_ROOMS = 64
+MAX_ROOMS = 256
+SEED_STEP = 64  # between the rooms of two seeds; larger buildings share rooms with the next seed
 MIN_POINTS = 1000  # of a room
+
+
+Tile = tuple[slice, slice]  # rows and columns of an image
+
+
+def tiles(width: int) -> list[Tile]:
+    """The tiles of an image (width / 2, width)."""
+    corners = itertools.product(range(0, width // 2, TILE), range(0, width, TILE))
+    return [(slice(top, top + TILE), slice(left, left + TILE)) for top, left in corners]
 
 
 def free_position(room: Room, rng: np.random.Generator, heights: tuple[float, float]) -> Array:
@@ -68,26 +80,41 @@ def scan_room(
 
 def photograph(room: Room, pose: Pose, width: int, workers: Workers) -> NDArray[np.uint8]:
     """Equirectangular image (width / 2, width, 3) of a room at `pose`."""
+    return exposed(room, [pose], width, workers)
+
+
+def exposed(room: Room, poses: Sequence[Pose], width: int, workers: Workers) -> NDArray[np.uint8]:
+    """Equirectangular image (width / 2, width, 3): the mean over poses, one or a multiple of four."""
     rays_cam = pixel_rays(SUPERSAMPLING * width)
+    rgb = np.empty((width // 2, width, 3), np.uint8)
+    parts = [divmod(k, SUPERSAMPLING) for k in range(SUPERSAMPLING**2)]
+    samples = [
+        (pose, parts[k % len(parts)]) for k, pose in enumerate([*poses] * (len(parts) // len(poses) or 1))
+    ]
 
-    def run(top: int) -> NDArray[np.uint8]:
-        rows = rays_cam[SUPERSAMPLING * top : SUPERSAMPLING * (top + BAND)].reshape(-1, 3)
-        rgb = cast_rays(room, pose.center_world, rows @ pose.R_cam_from_world, Workers(), "band")[1]
-        blocks = rgb.reshape(-1, SUPERSAMPLING, width, SUPERSAMPLING, 3)
-        return np.asarray(np.round(blocks.mean(axis=(1, 3)) * 255.0), dtype=np.uint8)
+    def run(tile: Tile) -> None:
+        total = np.zeros((rgb[tile].size // 3, 3))
+        for pose, (row, column) in samples:
+            rays = rays_cam[row::SUPERSAMPLING, column::SUPERSAMPLING][tile].reshape(-1, 3)
+            total += cast_rays(room, pose.center_world, rays @ pose.R_cam_from_world, Workers(), "tile")[1]
+        rgb[tile] = np.round(255.0 / len(samples) * total).reshape(rgb[tile].shape)
 
-    return np.concatenate(list(workers.map(run, range(0, width // 2, BAND), "panorama")))
+    list(workers.map(run, tiles(width), "panorama"))
+    return rgb
 
 
 def label_image(room: Room, pose: Pose, width: int, workers: Workers) -> NDArray[np.uint16]:
     """Equirectangular image (width / 2, width) of a room's labels at `pose`, of pixels' centres."""
+    rays_cam = pixel_rays(width)
+    labels = np.empty((width // 2, width), np.uint16)
 
-    def run(top: int) -> NDArray[np.uint16]:
-        rays = pixel_rays(width, slice(top, top + BAND)).reshape(-1, 3) @ pose.R_cam_from_world
-        labels = cast_rays(room, pose.center_world, rays, Workers(), "band")[2]
-        return labels.reshape(-1, width).astype(np.uint16)
+    def run(tile: Tile) -> None:
+        rays = rays_cam[tile].reshape(-1, 3) @ pose.R_cam_from_world
+        found = cast_rays(room, pose.center_world, rays, Workers(), "tile")[2]
+        labels[tile] = found.reshape(labels[tile].shape)
 
-    return np.concatenate(list(workers.map(run, range(0, width // 2, BAND), "labels")))
+    list(workers.map(run, tiles(width), "labels"))
+    return labels
 
 
 def blur(image: Array, sigma: float) -> Array:
@@ -130,7 +157,7 @@ def make_world(seed: int, size: Array, num_rooms: int = 1) -> World:
     rooms = []
     for k in range(num_rooms):
         corner = np.array([*((size[:2] + GAP) * divmod(k, columns)), 0.0])
-        rooms.append(make_room(seed * MAX_ROOMS + k, size, corner))
+        rooms.append(make_room(seed * SEED_STEP + k, size, corner))
     return World(seed, tuple(rooms))
 
 
@@ -169,7 +196,7 @@ def room_of_query(world: World, index: int, variant: str) -> tuple[Room, np.rand
     number = int(rng.integers(len(world.rooms)))
     room = world.rooms[number]
     if variant == "change":
-        room = make_room(world.seed * MAX_ROOMS + number, room.size, room.corner, changed=index + 1)
+        room = make_room(world.seed * SEED_STEP + number, room.size, room.corner, changed=index + 1)
     return room, rng
 
 

@@ -1,0 +1,80 @@
+"""When the frames of a walk were taken."""
+
+import csv
+import re
+from collections.abc import Sequence
+from datetime import datetime
+from itertools import pairwise
+from pathlib import Path
+
+from ..errors import InputError
+from ..panorama.photo import photo_of
+from ..runtime.json_file import read_text
+from ..walk.frames import checked_times
+
+EXIF, NAMES, ORDER = "exif", "names", "order"
+NUMBER = re.compile(r"\d+(?:\.\d+)?")
+WANTED = "wanted a CSV file whose first line is name,time: frames by path or file name, and seconds"
+
+
+def times_of(frames: Sequence[Path], source: str | None) -> list[float] | None:
+    """Seconds of each frame since the first; None where only their order counts.
+
+    By EXIF, by the last number in each name, or by a table; without a source by EXIF if it tells the times of
+    all frames, one after another.
+
+    Raises
+    ------
+    InputError
+        The source lacks a frame, or its times do not rise.
+    """
+    if source == ORDER:
+        return None
+    if source in (None, EXIF):
+        times = exif_times(frames)
+        if source is None and not (times and all(a < b for a, b in pairwise(times))):
+            return None
+        if times is None:
+            raise InputError("--times exif: found a frame without a time in EXIF, wanted one in all")
+    elif source == NAMES:
+        times = [_number_in(frame) for frame in frames]
+    else:
+        times = _times_in(Path(str(source)), frames)
+    checked_times(times)
+    return [time - times[0] for time in times]
+
+
+def exif_times(frames: Sequence[Path]) -> list[float] | None:
+    """Seconds by EXIF; None if one has none, or can't be read."""
+    times: list[float] = []
+    for frame in frames:
+        try:
+            text = photo_of(frame).capture_time
+        except (OSError, InputError):
+            return None
+        if text is None:
+            return None
+        times.append(datetime.fromisoformat(text).timestamp())
+    return times
+
+
+def _number_in(frame: Path) -> float:
+    found = NUMBER.findall(frame.stem)
+    if not found:
+        raise InputError(f"--times names: found no number in {frame.name}, wanted seconds in each name")
+    return float(found[-1])
+
+
+def _times_in(path: Path, frames: Sequence[Path]) -> list[float]:
+    rows = csv.DictReader(read_text(path, WANTED).splitlines())
+    try:
+        by_name = {row["name"]: float(row["time"]) for row in rows}
+    except (KeyError, ValueError, TypeError, csv.Error) as error:
+        raise InputError(f"{path}: found {type(error).__name__} {error}, {WANTED}") from error
+    times = []
+    for frame in frames:
+        name = next((name for name in (str(frame), frame.name) if name in by_name), None)
+        if name is None:
+            raise InputError(f"{path}: found no time of {frame}, {WANTED}")
+        times.append(by_name[name])
+    return times

@@ -1,0 +1,168 @@
+"""localize.py --walk and --video: each frame is told by those before and after it."""
+
+import argparse
+import json
+import math
+import sys
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from .. import __version__
+from ..batch.results_file import WAYS, finished_lines
+from ..coarse_to_fine.settings import CoarseToFineSettings
+from ..confidence.confidence import LOCALIZED
+from ..errors import InputError
+from ..panorama import ReadOptions
+from ..result import UNREADABLE, Result
+from ..runtime.atomic import STDOUT, is_stream, write_atomically
+from ..runtime.line_file import appending, whole_lines, whole_size
+from ..runtime.stopwatch import Stopwatch
+from ..scan import Scan
+from ..scan_walk import Walk
+from .errors import EXIT_BAD_INPUT, print_error, print_note
+from .interruption import SIGNALS, Interruption, Stopped, interruptible
+from .walking import WalkInput, WalkInputs
+
+EXIT_ALL_LOCALIZED, EXIT_SOME_NOT = 0, 1
+KEY_BEGINS = b'{"'
+KEYS = ("settings", "cloud_sha256", "version")  # that all results of a walk have in common
+
+
+def run_walk(
+    arguments: argparse.Namespace,
+    inputs: WalkInputs,
+    settings: CoarseToFineSettings,
+    read_options: ReadOptions,
+    open_scan: Callable[[], Scan],
+) -> int:
+    """Localize a walk, write its results, return the exit code."""
+    watch = Stopwatch()
+    walk = open_scan().walk(read_options, settings, inputs.motion)
+    key = key_of(walk)
+    if (statuses := finished_statuses(arguments, key)) is not None:
+        print_note(arguments, f"{arguments.out}: nothing is left to do")
+        return exit_code_of(statuses)
+    with watch.stage("all"):
+        interruption = follow_all(arguments, walk, inputs.frames, json.dumps(key))
+        if interruption.number:
+            kept = "the same command goes on" if kept_in(arguments.out) else "with --out FILE it would go on"
+            text = f"ended by {SIGNALS[interruption.number]} after {len(walk.taken)} frames; {kept}"
+            return print_error(arguments, text, interruption.exit_code)
+        print_note(arguments, "looking again for frames that were lost, and for the path of all")
+        results = spaced(walk.finish(), inputs.min_distance)
+    write_all(arguments.out, results)
+    if path := kept_in(arguments.out):
+        path.unlink(missing_ok=True)
+    counts = Counter(result.status for result in results)
+    words = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in counts.items())
+    gaps = sum(result.walk is not None and result.walk.gap is not None for result in results)
+    print_note(arguments, f"{len(results)} frames in {watch.seconds['all']:.0f} s: {words}; {gaps} gaps")
+    return exit_code_of(list(counts.elements()))
+
+
+def exit_code_of(statuses: Sequence[str]) -> int:
+    """0 if all frames are localized, 3 if one can't be read, else 1."""
+    if UNREADABLE in statuses:
+        return EXIT_BAD_INPUT
+    return EXIT_ALL_LOCALIZED if set(statuses) <= {LOCALIZED} else EXIT_SOME_NOT
+
+
+def key_of(walk: Walk) -> dict[str, Any]:
+    """What must be the same where a walk goes on."""
+    digest = walk.tracker.scan_map.scan_sha256 or None
+    settings = json.loads(json.dumps(walk.about.settings))
+    return {"settings": settings, "cloud_sha256": digest, "version": __version__}
+
+
+def kept_in(out: Path | None) -> Path | None:
+    """Where what was found of each frame is kept until the walk is finished; None for a stream."""
+    return None if out is None or is_stream(out) else out.with_name(f"{out.name}.frames")
+
+
+def follow_all(
+    arguments: argparse.Namespace, walk: Walk, frames: Sequence[WalkInput], key: str
+) -> Interruption:
+    """Follow the frames, and keep what was found of each."""
+    path = kept_in(arguments.out)
+    size = take_up(walk, frames, path, key) if path and not arguments.overwrite else 0
+    bar = {"initial": len(walk.taken), "disable": arguments.quiet, "file": sys.stderr, "unit": ""}
+    left = tqdm(frames[len(walk.taken) :], "frames", len(frames), **bar)
+    with interruptible() as interruption, suppress(Stopped):
+        if path is None:
+            for frame in left:
+                walk.add(frame.path, frame.time, frame.name)
+            return interruption
+        with appending(path, size) as append:
+            if not size:
+                append(key)
+            for frame in left:
+                with interruption.postponed():
+                    walk.add(frame.path, frame.time, frame.name)
+                    append(walk.last_to_json())
+                if interruption.number:
+                    break
+    return interruption
+
+
+def take_up(walk: Walk, frames: Sequence[WalkInput], path: Path, key: str) -> int:
+    """Restore the frames that an earlier run of the same walk has left; the size of their lines [byte]."""
+    size = whole_size(path, KEY_BEGINS, f"frames of a walk: {WAYS}")
+    lines = whole_lines(path, size)
+    first = next(lines, b"")
+    if first.decode().strip() != key:
+        return 0
+    kept = len(first)
+    for frame, line in zip(frames, lines, strict=False):
+        try:
+            is_same = walk.restore(line.decode(), frame.path, frame.time, frame.name)
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{path}: found a damaged line ({type(error).__name__}); {WAYS}") from error
+        if not is_same:
+            break
+        kept += len(line)
+    return kept
+
+
+def spaced(results: Sequence[Result], metres: float) -> list[Result]:
+    """The results that lie so far apart, and all that have no pose."""
+    kept: list[Result] = []
+    last = None
+    for result in results:
+        center = result.pose.center_world if result.pose else None
+        if center is not None and last is not None and math.dist(center, last) < metres:
+            continue
+        last = last if center is None else center
+        kept.append(result)
+    return kept
+
+
+def finished_statuses(arguments: argparse.Namespace, key: dict[str, Any]) -> list[str] | None:
+    """The statuses of the results that an earlier run of this walk has left; None if there are none.
+
+    InputError for results of something else.
+    """
+    out = arguments.out
+    if arguments.overwrite or out is None or is_stream(out) or not out.exists() or not out.stat().st_size:
+        return None
+    statuses = []
+    for fields in finished_lines(out)[0]:
+        different = next((name for name in KEYS if fields.get(name) != key[name]), None)
+        if different or fields["walk"] is None:
+            raise InputError(f"{fields['line']}: of another run ({different or 'no walk'}); {WAYS}")
+        statuses.append(str(fields["status"]))
+    return statuses
+
+
+def write_all(out: Path | None, results: Sequence[Result]) -> None:
+    """Write the results, whole or not at all."""
+    text = "".join(f"{result.to_json()}\n" for result in results)
+    if out is None or out == STDOUT:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    else:
+        write_atomically(out, text.encode())

@@ -1,0 +1,86 @@
+"""Frames of a video as picture files: the sharpest at each step of time."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..runtime.optional import import_optional
+
+SHARPNESS_WIDTH = 512  # [px] at which sharpness is judged
+NEIGHBORHOOD = 0.25  # of a step, before and after its time, in which the sharpest frame is taken
+QUALITY = 95  # of the JPEG files
+WANTED = "wanted a video that PyAV reads, such as MP4"
+
+
+class VideoFrame(NamedTuple):
+    """A frame taken out of a video."""
+
+    time: float  # [s] from its beginning
+    path: Path  # of the picture
+
+
+def frames_of(video: Path, every: float, folder: Path) -> Iterator[VideoFrame]:
+    """Write a frame every so many seconds into a folder, the sharpest around each.
+
+    Raises
+    ------
+    InputError
+        The file is no video or is damaged, or PyAV is not there.
+    """
+    best: tuple[float, float, NDArray[np.uint8]] | None = None  # sharpness, time, RGB
+    slot = 0
+    for time, frame in _decoded(video):
+        while time > (slot + NEIGHBORHOOD) * every:
+            if best is not None:
+                yield _written(video, folder, best)
+            best, slot = None, slot + 1
+        if time >= (slot - NEIGHBORHOOD) * every:
+            rgb = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
+            sharpness = sharpness_of(rgb)
+            if best is None or sharpness > best[0]:
+                best = sharpness, time, rgb
+    if best is not None:
+        yield _written(video, folder, best)
+
+
+def sharpness_of(rgb: NDArray[np.uint8]) -> float:
+    """Variance of the Laplacian of an image (H, W, 3), made smaller (Pech-Pacheco et al., 2000)."""
+    height = max(round(rgb.shape[0] * SHARPNESS_WIDTH / rgb.shape[1]), 1)
+    gray = cv2.cvtColor(
+        cv2.resize(rgb, (SHARPNESS_WIDTH, height), interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY
+    )
+    return float(cv2.Laplacian(gray, cv2.CV_32F).var())
+
+
+def _decoded(video: Path) -> Iterator[tuple[float, Any]]:
+    """Times [s] from the first frame, and the frames as PyAV has them."""
+    av = import_optional(video, "av", "video")
+    begin: float | None = None
+    try:
+        with av.open(str(video)) as container:
+            if not container.streams.video:
+                raise InputError(f"{video}: found no picture in it, {WANTED}")
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            for frame in container.decode(stream):
+                if frame.time is None:
+                    raise InputError(f"{video}: found a frame without a time, {WANTED}")
+                begin = frame.time if begin is None else begin
+                yield float(frame.time - begin), frame
+    except av.FFmpegError as error:
+        if isinstance(error, OSError) and not video.exists():
+            raise InputError(f"{video}: no such file, {WANTED}") from error
+        raise InputError(f"{video}: found {error.strerror}, {WANTED}") from error
+
+
+def _written(video: Path, folder: Path, best: tuple[float, float, NDArray[np.uint8]]) -> VideoFrame:
+    _, time, rgb = best
+    path = folder / f"{video.stem}_{round(1000.0 * time):08d}.jpg"
+    if not cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY]):
+        raise OSError(f"{path}: can't be written")
+    return VideoFrame(time, path)

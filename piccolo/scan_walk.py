@@ -1,0 +1,159 @@
+"""A walk through a scan, frame by frame, and its results: what `Scan.track` gives."""
+
+import json
+from dataclasses import dataclass, fields, replace
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .coarse_to_fine.named_scans import with_scans
+from .confidence.localization import Localization
+from .errors import InputError
+from .panorama import Panorama, ReadOptions, read_query
+from .panorama.photo import Photo, photo_of, photo_of_array
+from .result import Result, Source, result_of, unreadable_result
+from .runtime.stopwatch import Stopwatch
+from .walk.frames import Frame, checked_times
+from .walk.localize import WalkFrame, alone_of, finished, localization_of, localizations_of
+from .walk.tracker import Tracker
+
+Picture = str | PathLike[str] | NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class WalkAbout:
+    """What all results of a walk repeat."""
+
+    cloud: str | tuple[str, ...]
+    warnings: tuple[str, ...]
+    settings: dict[str, object]
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A frame as it was given."""
+
+    picture: Picture
+    name: str
+    photo: Photo | None  # None of one that can't be read
+    seconds: dict[str, float]
+    warnings: tuple[str, ...] = ()
+    error: str | None = None
+
+
+class Walk:
+    """A camera followed through a scan: `add` frames in order; `finish` tells what all say together."""
+
+    def __init__(self, tracker: Tracker, read_options: ReadOptions, about: WalkAbout) -> None:
+        self.tracker, self.read_options, self.about = tracker, read_options, about
+        self.taken: list[Taken] = []
+
+    def add(self, frame: Picture, time: float | None = None, name: str | None = None) -> Result:
+        """Where the camera is now, by this frame and those before.
+
+        A frame that can't be read is a result that says so. `time` [s] is that since any beginning, of all
+        frames or of none; `name` stands in the result in place of the path.
+        """
+        number = len(self.taken)
+        when = float(number) if time is None else float(time)
+        if self.tracker.frames:
+            checked_times([self.tracker.frames[-1].time, when])
+        watch = Stopwatch()
+        name = name or ("array" if isinstance(frame, np.ndarray) else str(frame))
+        try:
+            with watch.stage("read"):
+                panorama = read_query(frame, self.read_options)
+                photo = self._photo(frame)
+        except (OSError, InputError) as error:
+            if isinstance(frame, np.ndarray):
+                raise
+            text = str(error).replace(str(frame), name)
+            self.accept(Taken(frame, name, None, watch.seconds, error=text), Frame(when))
+            return self._now(self.tracker.frames[-1], number)
+        with watch.stage("track"):
+            found = self.tracker.add(panorama, when)
+        warnings = tuple(warning.replace(str(frame), name) for warning in panorama.warnings)
+        self.taken.append(Taken(frame, name, photo, watch.seconds, warnings))
+        return self._now(found, number)
+
+    def accept(self, taken: Taken, frame: Frame) -> None:
+        """A frame that was found earlier, or that can't be read."""
+        self.taken.append(taken)
+        self.tracker.accept(frame)
+
+    def last_to_json(self) -> str:
+        """What was found of the last frame, on one line, from which `restore` goes on."""
+        taken, frame = self.taken[-1], self.tracker.frames[-1]
+        alone = frame.alone and result_of(frame.alone, cloud="", pano="", seconds={}, settings={}).to_json()
+        photo = taken.photo and (taken.photo.sha256, taken.photo.image_size, taken.photo.capture_time)
+        about = {"pano": taken.name, "photo": photo, "seconds": taken.seconds, "warnings": taken.warnings}
+        return json.dumps({**about, "error": taken.error, "frame": frame.to_json(), "alone": alone})
+
+    def restore(self, line: str, picture: Path, time: float, name: str) -> bool:
+        """Take the next frame from a line of `last_to_json`, if it is of this picture as it is now."""
+        document = json.loads(line)
+        if document["pano"] != name or document["frame"]["time"] != time or not document["photo"]:
+            return False
+        digest, size, capture_time = document["photo"]
+        if photo_of(picture, self.read_options.rig).sha256 != digest:
+            return False
+        alone = document["alone"] and localization_in(Result.from_json(document["alone"]))
+        photo = Photo(digest, (size[0], size[1]), capture_time, None)
+        taken = Taken(picture, name, photo, document["seconds"], tuple(document["warnings"]))
+        self.accept(taken, Frame.from_json(document["frame"], alone))
+        return True
+
+    def finish(self) -> list[Result]:
+        """The result of each frame, by all of them."""
+        path = finished(self.tracker, self._panorama)
+        found = localizations_of(self.tracker, path)
+        return [
+            self._result(taken, with_scans(self.tracker.scan_map, f), walk)
+            for taken, (f, walk) in zip(self.taken, found, strict=True)
+        ]
+
+    def _now(self, frame: Frame, number: int) -> Result:
+        probabilities = self.tracker.lattice.filtered()
+        chosen = int(probabilities.argmax()) if len(probabilities) else None
+        found = localization_of(self.tracker, frame, probabilities, chosen)
+        walk = WalkFrame(frame.time, number, frame.how, alone_of(frame), None)
+        return self._result(self.taken[number], with_scans(self.tracker.scan_map, found), walk)
+
+    def _panorama(self, k: int) -> Panorama | None:
+        taken = self.taken[k]
+        if taken.error is not None:
+            return None
+        return read_query(taken.picture, self.read_options)
+
+    def _photo(self, frame: Picture) -> Photo:
+        if isinstance(frame, np.ndarray):
+            return photo_of_array(frame)
+        return photo_of(Path(frame), self.read_options.rig)
+
+    def _result(self, taken: Taken, found: Localization, walk: WalkFrame | None) -> Result:
+        """The result of a frame; one that can't be read keeps its place in the walk."""
+        about, photo = self.about, taken.photo
+        digest = self.tracker.scan_map.scan_sha256 or None
+        if photo is None:
+            source = Source(digest)
+            error = taken.error or ""
+            failed = unreadable_result(error, about.cloud, taken.name, settings=about.settings, source=source)
+            return replace(failed, walk=walk)
+        return result_of(
+            found,
+            cloud=about.cloud,
+            pano=taken.name,
+            seconds=taken.seconds,
+            settings=about.settings,
+            warnings=about.warnings + taken.warnings,
+            source=Source(digest, photo.sha256, photo.image_size, photo.capture_time),
+            walk=walk,
+        )
+
+
+def localization_in(result: Result) -> Localization:
+    """The localization of which a result is made."""
+    names = {f.name for f in fields(Localization)} - {"pose", "warnings", "cameras"}
+    return Localization(pose=result.best_pose, **{name: getattr(result, name) for name in names})

@@ -1,0 +1,36 @@
+"""Frames as an MP4 video."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...runtime.atomic import replacing
+from ...runtime.optional import import_optional
+
+QUALITY = "18"  # CRF of H.264: nothing to be seen is lost
+MAX_DENOMINATOR = 1001  # of a frame rate
+
+
+@contextmanager
+def writing_video(
+    path: Path, rate: float, size: tuple[int, int]
+) -> Iterator[Callable[[NDArray[np.uint8]], None]]:
+    """What takes the frames (H, W, 3) of an MP4 video (H.264), `rate` a second, of `size` (W, H), both even.
+
+    Raises InputError if PyAV is not there.
+    """
+    av = import_optional("video", "av", "video")
+    with replacing(path) as file, av.open(file, "w", format="mp4") as container:
+        stream = container.add_stream("libx264", Fraction(rate).limit_denominator(MAX_DENOMINATOR))
+        stream.width, stream.height = size
+        stream.pix_fmt, stream.options = "yuv420p", {"crf": QUALITY}
+
+        def add(rgb: NDArray[np.uint8]) -> None:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(rgb, format="rgb24")))
+
+        yield add
+        container.mux(stream.encode())

@@ -1,0 +1,149 @@
+"""What a camera that is carried through a building takes: blur, people in the way, useless frames."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError
+from ...geometry.pose import Array, Pose
+from ...runtime.threads import Workers
+from .office import Office
+from .room import CHECKS, PLAIN, STRIPES, Room, RoomBuilder
+from .walking import Walk
+from .world import exposed, make_query, make_world, other_light
+
+BAD_KINDS = ("black", "mirrored", "elsewhere")
+WALK_VARIANTS = ("clean", "photo")
+SHUTTER, NUM_EXPOSURES = 1.0 / 30.0, 8  # how long it is open [s], and poses meanwhile
+DISTANCES = (1.5, 6.0)  # of people before and after the camera [s]
+ASIDE = 0.25  # of people off the way, at most [m]
+LEAST_DISTANCE = 0.8  # of a person from the camera [m]
+MAX_PEOPLE = 20
+NUM_ELSEWHERE = 8  # rooms of another building
+LAMP = np.array([0.0, 0.5, 2.4])  # above a person's feet [m]
+
+
+@dataclass(frozen=True)
+class WalkOptions:
+    """How a walk is taken."""
+
+    rate: float = 2.0  # frames a second
+    variant: str = "clean"  # one of WALK_VARIANTS
+    num_people: int = 0  # who walk the same way
+    is_blurred: bool = False  # by the camera's motion while the shutter is open
+    bad_fraction: float = 0.0  # of frames that show nothing of the place
+    width: int = 1024  # [px]
+
+    def __post_init__(self) -> None:
+        """Refuse what means nothing."""
+        if self.variant not in WALK_VARIANTS:
+            raise InputError(f"variants: found {self.variant}, wanted {' or '.join(WALK_VARIANTS)} in a walk")
+        if not 0.1 <= self.rate <= 120.0:
+            raise InputError(f"frame-rate: found {self.rate}, wanted 0.1 to 120 a second")
+        if not 0.0 <= self.bad_fraction <= 1.0:
+            raise InputError(f"bad-frames: found {self.bad_fraction}, wanted 0 to 1")
+        if not 0 <= self.num_people <= MAX_PEOPLE:
+            raise InputError(f"people: found {self.num_people}, wanted 0 to {MAX_PEOPLE}")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picture of a walk."""
+
+    rgb: NDArray[np.uint8]  # (H, W, 3)
+    pose: Pose  # of the camera, whatever the picture shows
+    time: float  # [s] from the walk's beginning
+    kind: str  # the walk's variant, or one of BAD_KINDS
+
+
+def frames_of(
+    office: Office, walk: Walk, options: WalkOptions, number: int, workers: Workers
+) -> Iterator[Frame]:
+    """The frames of the walk of a number in a building, one after another."""
+    seed = office.world.seed
+    times = [k / options.rate for k in range(walk.num_frames(options.rate))]
+    rng = np.random.default_rng([seed, 54, number])
+    kinds = _kinds(len(times), options, rng)
+    people = [Person(walk, rng) for _ in range(options.num_people)]
+    elsewhere = make_world(seed + 1_000_003, office.world.rooms[0].size, NUM_ELSEWHERE)
+    for k, (time, kind) in enumerate(zip(times, kinds, strict=True)):
+        pose = walk.pose(time)
+        if kind == "black":
+            rgb = rng.integers(0, 4, (options.width // 2, options.width, 3), np.uint8)
+        elif kind == "elsewhere":
+            rgb = make_query(elsewhere, k, "clean", options.width, workers).rgb
+        else:
+            rgb = _picture(with_people(office.world.rooms[0], people, time), walk, time, options, workers)
+        if options.variant == "photo" and kind != "black":
+            rgb = other_light(rgb, np.random.default_rng([seed, 55, number]))  # one light for the whole walk
+        yield Frame(rgb[:, ::-1].copy() if kind == "mirrored" else rgb, pose, time, kind)
+
+
+def _kinds(count: int, options: WalkOptions, rng: np.random.Generator) -> list[str]:
+    """The kind of each frame: a fraction of them bad, of each bad kind about as many."""
+    kinds = [options.variant] * count
+    for k, frame in enumerate(rng.permutation(count)[: round(options.bad_fraction * count)]):
+        kinds[frame] = BAD_KINDS[k % len(BAD_KINDS)]
+    return kinds
+
+
+def _picture(
+    room: Room, walk: Walk, time: float, options: WalkOptions, workers: Workers
+) -> NDArray[np.uint8]:
+    poses = [walk.pose(time)]
+    if options.is_blurred:
+        moments = time + SHUTTER * (np.arange(NUM_EXPOSURES) + 0.5 - NUM_EXPOSURES / 2) / NUM_EXPOSURES
+        poses = [walk.pose(float(moment)) for moment in np.clip(moments, 0.0, walk.duration)]
+    return exposed(room, poses, options.width, workers)
+
+
+class Person:
+    """Somebody who walks a camera's way, some seconds before or after it."""
+
+    def __init__(self, walk: Walk, rng: np.random.Generator) -> None:
+        self.walk, self.rng = walk, rng
+        self.delay = float(rng.uniform(*DISTANCES) * rng.choice([-1.0, 1.0]))
+        self.aside = float(rng.uniform(-ASIDE, ASIDE))
+        b = RoomBuilder(rng, np.zeros(3))
+        self.paints = [b.paint(p, 0.1, 0.9) for p in ((PLAIN,), (STRIPES, CHECKS, PLAIN), (PLAIN,))]
+
+    def boxes_at(self, time: float) -> tuple[Array, Array] | None:
+        """Where the feet are (3,), and the boxes (3, 7): legs, trunk and head; None if not on the way."""
+        moment = time - self.delay
+        if not 0.0 <= moment <= self.walk.duration:
+            return None
+        yaw = self.walk.yaw(moment)
+        feet = self.walk.foot(moment) + self.aside * np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+        if np.linalg.norm(feet[:2] - self.walk.foot(time)[:2]) < LEAST_DISTANCE:
+            return None
+        b = RoomBuilder(self.rng, feet)
+        for z, size, paint in zip(
+            (0.4, 1.12, 1.6),
+            ([0.2, 0.32, 0.8], [0.26, 0.46, 0.64], [0.2, 0.18, 0.26]),
+            self.paints,
+            strict=True,
+        ):
+            b.put([0.0, 0.0, z], size, paint, yaw)
+        return feet, np.stack(b.boxes)
+
+
+def with_people(room: Room, people: Sequence[Person], time: float) -> Room:
+    """The room with those who are on the way at a time [s]."""
+    light = np.broadcast_to(room.light, (len(room.boxes), 3))
+    boxes, materials, lights = [room.boxes], [room.materials], [light]
+    for person in people:
+        if (found := person.boxes_at(time)) is not None:
+            feet, own = found
+            boxes.append(own)
+            materials.append(np.stack(person.paints))
+            lights.append(np.tile(feet + LAMP, (len(own), 1)))
+    labels = np.zeros(sum(map(len, boxes)), np.int64)
+    labels[: len(room.labels)] = room.labels
+    return room._replace(
+        boxes=np.concatenate(boxes),
+        materials=np.concatenate(materials),
+        light=np.concatenate(lights),
+        labels=labels,
+    )

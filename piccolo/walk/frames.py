@@ -1,0 +1,133 @@
+"""What is known of the frames of a walk: poses that each may have, and how likely each of them is."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any, Literal
+
+import numpy as np
+
+from ..coarse_to_fine.scan_map import ScanMap
+from ..confidence.covariance import PoseCovariance
+from ..confidence.localization import Localization
+from ..errors import InputError
+from ..geometry.pose import Array, Pose
+
+How = Literal["alone", "near", "tracked", "none"]
+MOST_ODDS = 8.0  # [log] that one frame may add: what is surer is not so of errors that no model has
+MAX_SPEED, MAX_ACCELERATION = 2.0, 2.0  # [m/s], [m/s^2] of a walking person with a camera
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How a camera is carried."""
+
+    max_speed: float = MAX_SPEED  # [m/s]; of frames without times [m] from one to the next
+    max_acceleration: float = MAX_ACCELERATION  # [m/s^2] standard deviation along each axis
+
+    def __post_init__(self) -> None:
+        """Refuse what means nothing."""
+        for name in ("max_speed", "max_acceleration"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise InputError(f"{name}: found {value}, wanted a number above 0")
+
+
+@dataclass(frozen=True)
+class State:
+    """A pose that a frame may have."""
+
+    pose: Pose  # in the map's frame
+    log_odds: float  # against none of the frame's poses being right
+    score: float
+    covariance: PoseCovariance | None = None  # in the world
+    num_matches: int | None = None  # local features that agree with it
+
+
+@dataclass
+class Frame:
+    """A frame, and what has been found of it so far."""
+
+    time: float  # [s] from any beginning
+    states: list[State] = field(default_factory=list)
+    how: How = "none"
+    alone: Localization | None = None  # if it was searched without regard to the others
+
+    def to_json(self) -> dict[str, Any]:
+        """All but what it was alone."""
+        return {"time": self.time, "how": self.how, "states": [_state_json(state) for state in self.states]}
+
+    @classmethod
+    def from_json(cls, document: dict[str, Any], alone: Localization | None) -> "Frame":
+        """Read back what `to_json` wrote."""
+        states = [_state_from_json(state) for state in document["states"]]
+        return cls(float(document["time"]), states, document["how"], alone)
+
+
+def checked_times(times: Sequence[float]) -> None:
+    """Refuse times that do not rise."""
+    if not all(math.isfinite(time) for time in times):
+        raise InputError("times: found one that is no finite number, wanted seconds")
+    for k, (before, after) in enumerate(pairwise(times)):
+        if after <= before:
+            raise InputError(f"times: found {after} after {before} at frame {k + 1}, wanted them to rise")
+
+
+def states_of(scan_map: ScanMap, found: Localization) -> list[State]:
+    """The poses that a frame has alone, with its own probabilities."""
+    if found.pose is None or found.probability_none is None or found.evidence is None:
+        return []
+    none = max(found.probability_none, 1e-9)
+    best = State(
+        scan_map.from_world(found.pose),
+        log_ratio(found.confidence, none),
+        found.evidence.score,
+        found.covariance,
+        found.evidence.num_matches,
+    )
+    others = [
+        State(
+            scan_map.from_world(a.pose), log_ratio(a.probability or 0.0, none), a.score, None, a.num_matches
+        )
+        for a in found.alternatives
+    ]
+    return [best, *others]
+
+
+def log_ratio(probability: float, other: float) -> float:
+    """Logarithm of the odds of two probabilities, within what one frame may add."""
+    ratio = math.log(max(probability, 1e-12) / max(other, 1e-12))
+    return min(max(ratio, -2.0 * MOST_ODDS), MOST_ODDS)
+
+
+def centers_of(states: Sequence[State]) -> Array:
+    """Positions (N, 3) [m] of states."""
+    return np.array([state.pose.center_world for state in states]).reshape(-1, 3)
+
+
+def _state_json(state: State) -> dict[str, Any]:
+    covariance = state.covariance
+    return {
+        "R_cam_from_map": state.pose.R_cam_from_world.tolist(),
+        "center_map": state.pose.center_world.tolist(),
+        "log_odds": state.log_odds,
+        "score": state.score,
+        "covariance": covariance and covariance.matrix.tolist(),
+        "least_constrained_direction": covariance and covariance.least_constrained_direction,
+        "num_matches": state.num_matches,
+    }
+
+
+def _state_from_json(document: dict[str, Any]) -> State:
+    """Read back what `Frame.to_json` wrote of a state."""
+    matrix = document["covariance"]
+    return State(
+        Pose(np.array(document["R_cam_from_map"]), np.array(document["center_map"])),
+        float(document["log_odds"]),
+        float(document["score"]),
+        None
+        if matrix is None
+        else PoseCovariance(np.array(matrix), str(document["least_constrained_direction"])),
+        document["num_matches"],
+    )

@@ -1,0 +1,158 @@
+"""A camera followed through a scan: frame by frame, each by what is known so far."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..coarse_to_fine.first_look import CLEAR_SCORE
+from ..coarse_to_fine.localize import localize
+from ..coarse_to_fine.prior import apply_prior
+from ..coarse_to_fine.query import Query, prepare_query
+from ..coarse_to_fine.scan_map import ScanMap
+from ..coarse_to_fine.settings import CoarseToFineSettings
+from ..confidence.alternatives import Hypothesis
+from ..geometry.pose import Pose
+from ..panorama import Panorama
+from ..runtime.stopwatch import Stopwatch
+from ..runtime.threads import Workers
+from .frames import Frame, Motion, State, states_of
+from .free_space import FreeSpace
+from .path import REACH_SLACK, Lattice
+from .tracking import KEPT_BESIDE, LEAST_KEPT, LEAST_SCORE, beside, found_near, predicted, states_at, tracked
+
+MOST_TRACKED = 6  # poses from which a frame is tracked
+MOST_SOUGHT = 3  # of those at which it is not, around which it is looked for
+LEAST_WEIGHT = 0.02  # of such a pose, by the likeliest
+MAX_RADIUS = (
+    6.0  # [m] around the last pose in which a lost camera is looked for before it is looked for everywhere
+)
+FIRST_SEARCH, LAST_SEARCH = (
+    3,
+    48,
+)  # frames in which a camera is lost until it is searched everywhere, and again
+SURE, EVERY_UNSURE = 0.9, 8  # frames tracked with less are searched alone so often
+
+
+class Follower(NamedTuple):
+    """A state from which the next frame is predicted."""
+
+    state: State
+    time: float
+    earlier: Pose | None
+    earlier_time: float
+
+
+class Tracker:
+    """The forward half of a walk: needs no future, and keeps what it found."""
+
+    def __init__(
+        self,
+        scan_map: ScanMap,
+        settings: CoarseToFineSettings,
+        workers: Workers,
+        motion: Motion,
+        space: FreeSpace | None = None,
+    ) -> None:
+        self.scan_map = apply_prior(scan_map, settings.prior)
+        self.settings, self.workers, self.motion = settings, workers, motion
+        self.lattice = Lattice(space or FreeSpace(scan_map), motion)
+        self.num_lost, self.next_search, self.num_unsure = 0, 1, 0
+
+    @property
+    def frames(self) -> list[Frame]:
+        """All so far."""
+        return self.lattice.frames
+
+    def add(self, panorama: Panorama, time: float) -> Frame:
+        """Find the next frame."""
+        query = prepare_query(panorama, self.scan_map, self.settings, self.workers)
+        frame = Frame(time)
+        if panorama.is_valid.any() and len(self.scan_map.centers) > 0:
+            self._follow(query, frame)
+            is_lost = not frame.states and self.num_lost + 1 >= self.next_search
+            if is_lost or (frame.states and self.num_unsure >= EVERY_UNSURE):
+                self._search(query, panorama, frame)
+        self.accept(frame)
+        return frame
+
+    def accept(self, frame: Frame) -> None:
+        """Count a frame that was found now or earlier."""
+        self.lattice.add(frame)
+        if frame.states:
+            self.num_lost, self.next_search = 0, FIRST_SEARCH
+            is_sure = self.lattice.filtered().max() >= SURE or frame.how == "alone"
+            self.num_unsure = 0 if is_sure else self.num_unsure + 1
+            return
+        self.num_lost += 1
+        if frame.how == "alone":
+            self.next_search = self.num_lost + min(max(self.num_lost, FIRST_SEARCH), LAST_SEARCH)
+
+    def _follow(self, query: Query, frame: Frame) -> None:
+        """Descend from where the camera should be by each of its last poses, or look near these."""
+        followers = self.followers()
+        if not followers:
+            return
+        ends = [follow(query, f, frame.time, self.motion) for f in followers]
+        is_there = any(end.score >= least_score(f) for f, end in zip(followers, ends, strict=True))
+        least = KEPT_BESIDE * max(end.score for end in ends) if is_there else CLEAR_SCORE
+        found = [end for end in ends if end.score >= least] if is_there else []
+        lost = [f for f, end in zip(followers, ends, strict=True) if not is_there or end.score < least]
+        for f in lost[:MOST_SOUGHT]:
+            radius = self.motion.max_speed * (frame.time - f.time) + REACH_SLACK
+            if radius <= MAX_RADIUS:
+                found += found_near(query, self.scan_map, f.state.pose, radius, least)
+        if found:
+            frame.states, frame.how = states_at(query, found), "tracked" if is_there else "near"
+
+    def followers(self) -> list[Follower]:
+        """The poses from which the next frame may come, the likeliest first."""
+        known = [k for k, frame in enumerate(self.frames) if frame.states][-2:]
+        if not known:
+            return []
+        last = self.frames[known[-1]]
+        earlier = self.frames[known[0]] if len(known) == 2 else None
+        weights = self.lattice.forward[known[-1]]
+        order = [int(i) for i in np.argsort(-weights, kind="stable")]
+        order = [i for i in order if weights[i] > weights.max() + np.log(LEAST_WEIGHT)][:MOST_TRACKED]
+        return [self._follower(last, last.states[i], earlier) for i in order]
+
+    def _follower(self, last: Frame, state: State, earlier: Frame | None) -> Follower:
+        pose, time = None, 0.0
+        if earlier is not None and earlier.states:
+            gaps = [np.linalg.norm(s.pose.center_world - state.pose.center_world) for s in earlier.states]
+            k = int(np.argmin(gaps))
+            if gaps[k] <= self.motion.max_speed * (last.time - earlier.time) + REACH_SLACK:
+                pose, time = earlier.states[k].pose, earlier.time
+        return Follower(state, last.time, pose, time)
+
+    def _search(self, query: Query, panorama: Panorama, frame: Frame) -> None:
+        """Search the whole scan, and keep what was tracked beside."""
+        alone = localize(self.scan_map, panorama, self.settings, self.workers, Stopwatch())
+        frame.states = merged(query, states_of(self.scan_map, alone), frame.states)
+        frame.alone, frame.how = alone, "alone"
+
+
+def merged(query: Query, alone: list[State], followed: list[State]) -> list[State]:
+    """The states of a frame that was searched alone, and others at which it was tracked."""
+    if not alone:
+        return followed
+    for state in followed:
+        more = beside(query, alone, Hypothesis(state.pose, state.score))
+        alone = alone if more is None else [*alone, more]
+    return alone
+
+
+def least_score(f: Follower) -> float:
+    """What a frame must explain to be there where it was followed."""
+    return max(LEAST_SCORE, LEAST_KEPT * f.state.score)
+
+
+def follow(query: Query, f: Follower, time: float, motion: Motion) -> Hypothesis:
+    """Descend from where a camera should be after a pose."""
+    seconds, before = time - f.time, f.state.pose
+    span = f.time - f.earlier_time
+    starts = [before]
+    if f.earlier is not None and span != 0.0:
+        reach = motion.max_speed * abs(seconds) + REACH_SLACK
+        starts.insert(0, predicted(before, f.earlier, seconds / span, reach))
+    return tracked(query, starts, least_score(f))

@@ -1,0 +1,107 @@
+"""One frame, when it is known about where the camera was: a descent from there, or a search nearby."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..coarse_to_fine.covariance import estimate_covariance
+from ..coarse_to_fine.descent import FULL_LOSS, descend
+from ..coarse_to_fine.first_look import FIRST_BEAM, first_query, is_rather_mirrored
+from ..coarse_to_fine.localize import searched
+from ..coarse_to_fine.prior import apply_prior
+from ..coarse_to_fine.query import Query
+from ..coarse_to_fine.refinement import compared, descend_fine, descend_middle, perturb_middle, points_at
+from ..coarse_to_fine.scan_map import ScanMap
+from ..coarse_to_fine.search_result import found_among
+from ..coarse_to_fine.settings import Prior
+from ..coarse_to_fine.standings import standings_of
+from ..confidence.alternatives import MAX_ALTERNATIVES, MIN_ANGLE, MIN_DISTANCE, Hypothesis, suppressed
+from ..confidence.confidence import posterior
+from ..geometry.pose import Pose, exp_so3, log_so3, pose_errors
+from ..geometry.rotations import Gravity
+from ..runtime.stopwatch import Stopwatch
+from .frames import State, log_ratio
+
+LEAST_SCORE = 0.2  # of a frame that is tracked
+LEAST_KEPT = 0.6  # of the score of the frame before
+KEPT_BESIDE = 0.4  # of the best score: copies of a place are kept until the walk tells them apart
+LAST_LIMITS = (FULL_LOSS, 10, 1e-5)  # of the last descent, as in refinement
+MAX_TURN_RATE = math.radians(120.0)  # [rad/s] that is taken to go on as it was
+
+
+def predicted(before: Pose, earlier: Pose | None, ratio: float, max_distance: float) -> Pose:
+    """Where a camera is, going on as it went from an earlier pose to the last.
+
+    `ratio` is the time since by the time between the two. At most max_distance [m] away.
+    """
+    if earlier is None:
+        return before
+    move = ratio * (before.center_world - earlier.center_world)
+    length = float(np.linalg.norm(move))
+    move *= min(1.0, max_distance / max(length, 1e-9))
+    turn = ratio * log_so3(before.R_cam_from_world @ earlier.R_cam_from_world.T)
+    return Pose(exp_so3(turn) @ before.R_cam_from_world, before.center_world + move)
+
+
+def tracked(query: Query, starts: Sequence[Pose], least_score: float) -> Hypothesis:
+    """The pose to which a frame descends from the best of some near it, or from farther around."""
+    ends = [descend_fine(query, descend_middle(query, Hypothesis(pose, 0.0))) for pose in starts]
+    best = max(ends, key=lambda h: h.score)
+    if best.score < least_score:
+        best = max([best, descend_fine(query, perturb_middle(query, best))], key=lambda h: h.score)
+    points = points_at(query, best.pose)
+    pose = descend(points, best.pose.center_world, query.images.full, best.pose, LAST_LIMITS)
+    return max((compared(query, Hypothesis(p, 0.0)) for p in (pose, best.pose)), key=lambda h: h.score)
+
+
+def found_near(
+    query: Query, scan_map: ScanMap, near: Pose, radius: float, least_score: float
+) -> list[Hypothesis]:
+    """Poses found within a radius [m] by whole views; none if the best has less than a score."""
+    x, y, z = (float(value) for value in scan_map.to_world(near).center_world)
+    some = apply_prior(scan_map, Prior(near_world=(x, y, z), radius=radius))
+    if len(some.centers) == 0:
+        return []
+    first = first_query(replace(query, scan_map=some, comparisons={}))
+    gravity: Gravity = "unknown" if query.settings.gravity == "unknown" else "known"
+    starts, hypotheses = searched(first, gravity, FIRST_BEAM, Stopwatch())
+    found = found_among(hypotheses, MAX_ALTERNATIVES)
+    if found.best.score < least_score or is_rather_mirrored(first, starts):
+        return []
+    least = KEPT_BESIDE * found.best.score
+    close = [h for h in (found.best, *found.alternatives) if h.score >= least]
+    return [end for h in close if (end := tracked(query, [h.pose], least)).score >= least]
+
+
+def states_at(query: Query, hypotheses: Sequence[Hypothesis]) -> list[State]:
+    """Poses of a frame as states, with the odds that they have by whole views, the best first."""
+    ranked = sorted(hypotheses, key=lambda h: -h.score)
+    ranked = suppressed(ranked, MAX_ALTERNATIVES + 1, MIN_DISTANCE, MIN_ANGLE)
+    asked = replace(query, by_features=False)
+    best, *others = ranked
+    covariance = estimate_covariance(query, best.pose)
+    standings = standings_of(asked, best, others)
+    *probabilities, none = posterior(standings, covariance)
+    return [
+        State(h.pose, log_ratio(float(p), float(none)), h.score, covariance if h is best else None)
+        for h, p in zip(ranked, probabilities, strict=True)
+    ]
+
+
+def beside(query: Query, states: Sequence[State], found: Hypothesis) -> State | None:
+    """A pose as a state beside others of its frame, by what it explains by the best; None if it is one."""
+    best = max(states, key=lambda state: state.log_odds)
+    if any(is_same(state.pose, found.pose) for state in states):
+        return None
+    asked, at_best = replace(query, by_features=False), Hypothesis(best.pose, best.score)
+    first, second = posterior(standings_of(asked, at_best, [found]), None)[:2]
+    odds = best.log_odds + log_ratio(float(second), float(first))
+    return State(found.pose, odds, found.score, estimate_covariance(query, found.pose), best.num_matches)
+
+
+def is_same(pose: Pose, other: Pose) -> bool:
+    """True for two poses that are one answer."""
+    distance, angle = pose_errors(pose, other)
+    return distance < MIN_DISTANCE and angle < MIN_ANGLE

@@ -1,0 +1,134 @@
+"""Tables of walks, against evo and by hand."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from evo.core import metrics
+from evo.core.trajectory import PosePath3D
+from poses import result
+
+from piccolo.geometry.pose import Pose, T_world_from_cam, exp_so3
+from piccolo.scenes.evaluation.query_result import PAPER_THRESHOLDS, QueryResult, query_result_of
+from piccolo.scenes.evaluation.walks import summarize_all, summarize_walk, walk_table, walks_of
+from piccolo.scenes.scene import Query, Scene
+
+RATE = 2.0
+
+
+def walk_of(tmp_path, name="w", count=8, seed=0):
+    """Frames along a tilted path, in a shuffled order; the third has no answer."""
+    rng = np.random.default_rng(seed)
+    queries = []
+    for k in range(count):
+        pose = Pose(exp_so3(rng.normal(size=3)), np.array([0.6 * k, 0.2 * k, 1.6]) + 0.1 * rng.normal(size=3))
+        queries.append(Query(tmp_path / f"{name}_{k}.jpg", "clean", pose, None, (), name, k / RATE, k != 2))
+    return [queries[k] for k in rng.permutation(count)]
+
+
+def found(query, distance=0.02, angle_deg=1.0, status="localized"):
+    """A result that is off by so much, in a direction of its own."""
+    rng = np.random.default_rng(int(1000 * query.time))
+    axis, away = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+    turn = exp_so3(np.radians(angle_deg) * axis)
+    pose = Pose(turn @ query.pose.R_cam_from_world, query.pose.center_world + distance * away)
+    return result(query.image, None if status == "unreadable" else pose, status)
+
+
+def frames_of(tmp_path, changes, **more):
+    """The frames of a walk whose results are changed by number."""
+    queries = walk_of(tmp_path, **more)
+    scene = Scene("hall", tmp_path, tmp_path / "cloud.ply", tuple(queries))
+    rows = [
+        query_result_of(scene, query, found(query, **changes.get(int(RATE * query.time), {})), None)
+        for query in queries
+    ]
+    return walks_of([scene], rows)
+
+
+def test_path_errors_equal_evo(tmp_path):
+    """Of a walk whose frames are all localized but the first."""
+    ((_, frames),) = frames_of(
+        tmp_path, {0: {"status": "ambiguous"}, 5: {"distance": 0.3, "angle_deg": 20.0}}
+    ).items()
+    frames = [frame._replace(query=dataclasses.replace(frame.query, is_answerable=True)) for frame in frames]
+    summary = summarize_walk(frames)
+    paths = [
+        PosePath3D(poses_se3=[T_world_from_cam(pose) for pose in poses])
+        for poses in ([f.query.pose for f in frames[1:]], [f.pose for f in frames[1:]])
+    ]
+    ate = metrics.APE(metrics.PoseRelation.translation_part)
+    ate.process_data(tuple(paths))
+    assert summary.ate == pytest.approx(ate.get_statistic(metrics.StatisticsType.rmse), rel=1e-9)
+    for k, relation in enumerate(
+        (metrics.PoseRelation.translation_part, metrics.PoseRelation.rotation_angle_rad)
+    ):
+        rpe = metrics.RPE(relation, 1, metrics.Unit.frames)
+        rpe.process_data(tuple(paths))
+        assert summary.rpe[k] == pytest.approx(rpe.get_statistic(metrics.StatisticsType.rmse), rel=1e-9)
+
+
+def test_walk_counts_what_is_right_sure_wrong_and_refused(tmp_path):
+    changes = {
+        0: {"status": "not_localized", "distance": 2.0},
+        1: {"status": "ambiguous"},  # right, not sure
+        2: {"status": "unreadable"},  # has no answer
+        4: {"distance": 0.5},  # sure and wrong
+        6: {"angle_deg": 9.0},  # sure and wrong too
+    }
+    ((name, frames),) = frames_of(tmp_path, changes).items()
+    assert name == ("hall", "w")
+    assert [frame.query.time for frame in frames] == [k / RATE for k in range(8)]
+    s = summarize_walk(frames)
+    assert (s.num_frames, s.num_correct, s.num_localized, s.num_wrong) == (8, 4, 5, 2)
+    assert (s.num_bad, s.num_refused) == (1, 1)
+    assert s.first_sure == 3 / RATE
+    assert s.ate == pytest.approx(np.sqrt((4 * 0.02**2 + 0.5**2) / 5))
+    assert s.squared_steps.shape == (4, 2), "3-4, 4-5, 5-6, 6-7: none over the frames that are not sure"
+    table = walk_table({name: frames}, PAPER_THRESHOLDS)
+    (cells,) = table.rows
+    assert cells[:6] == ("hall w", "8", "0.571", "0.714", "2", "1 of 1")
+    assert cells[-1] == "1.5"
+
+
+def test_a_bad_frame_that_is_called_localized_is_wrong_and_no_part_of_the_path(tmp_path):
+    """Even where it happens to be at the camera."""
+    ((name, frames),) = frames_of(tmp_path, {2: {"distance": 0.0, "angle_deg": 0.0}}).items()
+    s = summarize_walk(frames)
+    assert (s.num_correct, s.num_localized, s.num_wrong, s.num_refused) == (7, 7, 1, 0)
+    assert len(s.squared_errors) == 7
+    assert len(s.squared_steps) == 5
+    assert walk_table({name: frames}, PAPER_THRESHOLDS).rows[0][5] == "0 of 1"
+
+
+def test_walks_are_summed_up_without_a_step_from_one_to_the_next(tmp_path):
+    first = frames_of(tmp_path, {}, name="a", seed=1)
+    second = frames_of(tmp_path, {0: {"status": "ambiguous"}}, name="b", seed=2, count=5)
+    lost = frames_of(tmp_path, {k: {"status": "unreadable"} for k in range(4)}, name="c", count=4)
+    parts = [summarize_walk(frames) for walks in (first, second, lost) for frames in walks.values()]
+    s = summarize_all(parts[:2])
+    assert (s.num_frames, s.num_localized, len(s.squared_errors)) == (13, 10, 10)
+    assert len(s.squared_steps) == sum(len(part.squared_steps) for part in parts)
+    assert s.first_sure == parts[1].first_sure == 0.5
+    table = walk_table(first | second | lost, PAPER_THRESHOLDS)
+    assert [row[0] for row in table.rows] == ["hall a", "hall b", "hall c", "all"]
+    assert table.rows[2][2:] == ("0.000", "0.000", "0", "1 of 1", "-", "-", "-", "-")
+    assert table.rows[3][-1] == "-", "one of the walks has no sure frame"
+
+
+def test_a_photo_without_an_answer_has_no_errors_and_is_read_back_without(tmp_path):
+    query = dataclasses.replace(walk_of(tmp_path)[0], is_answerable=False)
+    scene = Scene("hall", tmp_path, tmp_path / "cloud.ply", (query,))
+    row = query_result_of(scene, query, found(query), None)
+    again = QueryResult.from_json(row.to_json())
+    assert not row.is_correct()
+    assert (again.position_error, again.rotation_error) == (np.inf, np.inf)
+    assert again.result.best_pose is not None
+    assert not again.has_errors
+
+
+def test_single_photos_are_no_walk(tmp_path):
+    frame = walk_of(tmp_path)[0]
+    query = dataclasses.replace(frame, walk=None, time=None)
+    scene = Scene("hall", tmp_path, tmp_path / "cloud.ply", (query,))
+    assert walks_of([scene], [query_result_of(scene, query, found(frame), None)]) == {}
