@@ -1,6 +1,6 @@
 """A made-up house of two storeys with photos, and results of all kinds, for tests of reports."""
 
-import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from piccolo.render.surfel_renderer import encode_image
 from piccolo.result import Result, Source, unreadable_result
 from piccolo.runtime.threads import Workers
 from piccolo.scenes.synthetic.world import make_world, photograph, pose_of_query, scan_world
+from piccolo.walk.localize import Gap, WalkFrame
 
 SIZE = np.array([4.5, 3.5, 2.5])
 STOREY = 3.0  # [m] from floor to floor
@@ -66,8 +67,8 @@ class House:
             pose = Pose(yaw_rotation(0.5 * k + np.pi / 2), at)
             path = self.folder / "photos" / f"walk_{k}.jpg"
             path.write_bytes(encode_image(photograph(room, pose, self.width, Workers(2)), ".jpg", 90))
-            document = json.loads(result_of(path, pose).to_json())
-            lines.append(json.dumps({**document, "walk": {"time": 1.5 * k, "frame": k, "alone": {}}}))
+            walk = WalkFrame(1.5 * k, k, "tracked", None, Gap(9.0, 1.5) if k == 4 else None)
+            lines.append(replace(result_of(path, pose), walk=walk).to_json())
         return lines
 
     def write_results(self, name="poses.jsonl", lines=None):

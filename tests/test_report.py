@@ -100,6 +100,7 @@ def test_every_status_is_there_with_what_it_has(made):
     assert "no picture" in unreadable["error"]
     walk = [photo for photo in photos if photo["walk"] is not None]
     assert [photo["time"] for photo in walk] == [1.5 * k for k in range(6)]
+    assert [photo["gap"] for photo in walk] == [k == 4 for k in range(6)]
 
 
 def test_sphere_and_scan_show_the_same_in_every_direction(made):

@@ -329,11 +329,11 @@ export class Plan {
     context.beginPath();
     let isOn = false;
     for (const index of walk) {
-      const { pose, storey, status } = photos[index];
+      const { pose, storey, status, gap } = photos[index];
       const isHere = pose !== null && storey === this.model.storey && status === "localized";
       if (isHere) {
         const at = this.toScreen(pose.center[0], pose.center[1]);
-        if (isOn) context.lineTo(at.x, at.y);
+        if (isOn && !gap) context.lineTo(at.x, at.y);
         else context.moveTo(at.x, at.y);
       }
       if (pose) isOn = isHere;

@@ -55,6 +55,8 @@ export interface Photo {
   size: [number, number] | null;
   walk: number | null;
   time: number | null;
+  /** True if nobody can have walked there from the frame before. */
+  gap: boolean;
   pose: Pose | null;
   storey: number | null;
   height: number | null;

@@ -14,7 +14,6 @@ import numpy as np
 from .. import __version__
 from ..cloud.soa import PackedPoints
 from ..coarse_to_fine.scan_map import ScanMap
-from ..coarse_to_fine.storeys import find_storeys
 from ..errors import InputError
 from ..geometry.pose import Array, Pose
 from ..panorama.photo import photo_of
@@ -82,7 +81,7 @@ def build_report(
     if settings.is_self_contained and len(entries) > MAX_SELF_CONTAINED:
         found = f"found {len(entries)} photos, wanted {MAX_SELF_CONTAINED} or fewer"
         raise InputError(f"--self-contained: {found}; without it the report is a folder")
-    place = Place(scan_map, find_storeys(scan_map.octree))
+    place = Place(scan_map, scan_map.storeys)
     check_settings(settings, place)
     with TemporaryDirectory(prefix="piccolo-") if settings.is_self_contained else nullcontext(out) as made:
         folder = Path(made)

@@ -1,6 +1,5 @@
 """The results of a report with what the page says of each: where it is on which plan, how sure, why."""
 
-import json
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -61,9 +60,8 @@ def read_entries(paths: Sequence[Path]) -> list[Entry]:
         results = read_results([path])
         lines = [line for line in read_bytes(path, "wanted results").decode().splitlines() if line.strip()]
         for result, line in zip(results, lines, strict=True):
-            walk = json.loads(line).get("walk")
-            time = float(walk["time"]) if walk else float(len(entries))
-            entries.append(Entry(result, line, number if walk else None, time))
+            time = result.walk.time if result.walk else float(len(entries))
+            entries.append(Entry(result, line, number if result.walk else None, time))
     return entries
 
 
@@ -99,6 +97,7 @@ def document_of_entry(entry: Entry, name: str, key: str, place: Place) -> dict[s
         "size": result.source.image_size,
         "walk": entry.walk,
         "time": entry.time if entry.walk is not None else None,
+        "gap": bool(result.walk and result.walk.gap),
         **(found_document(result, result.best_pose, place) if result.best_pose else NOTHING_FOUND),
     }
 

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..coarse_to_fine.scan_map import ScanMap
-from ..coarse_to_fine.storeys import find_storeys
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..panorama.picture import read_picture
 from ..render.surfel_renderer import encode_image
@@ -48,7 +47,7 @@ def write_plan_file(entries: Sequence[Entry], scan_map: ScanMap, out: Path, sett
     PNG and SVG: the plans of the storeys, one below the other. DXF: points, headings, 95 % ellipses and names
     in the scan's own coordinates, a layer a storey.
     """
-    place = Place(scan_map, find_storeys(scan_map.octree))
+    place = Place(scan_map, scan_map.storeys)
     check_settings(settings, place)
     with TemporaryDirectory(prefix="piccolo-") as made:
         folder = Path(made)
