@@ -4,6 +4,7 @@ import base64
 import hashlib
 import json
 import re
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from piccolo.cli import report
 from piccolo.errors import InputError
 from piccolo.report.entries import names_of, read_entries
 from piccolo.report.own_plan import plan_matrix
+from piccolo.scenes.export.video import writing_video
 
 STOREYS = ["--storeys", "Ground floor", "First floor"]
 
@@ -265,6 +267,29 @@ def test_refusals(house, tmp_path, capsys, more, code, text):
     assert report.main([*words, *(word.format(tmp_path) for word in more)]) == code
     (line,) = capsys.readouterr().err.splitlines()
     assert text in line
+
+
+def test_frames_of_a_video_are_taken_out_of_it(house, tmp_path, capsys):
+    scene, _ = house
+    results = [
+        replace(result, pano=f"{tmp_path}/walk.mp4#t={k}.000") for k, result in enumerate(scene.results[:2])
+    ]
+    with writing_video(tmp_path / "walk.mp4", 1.0, (128, 64)) as add:
+        for result in scene.results[:2]:
+            add(cv2.cvtColor(cv2.imread(result.pano), cv2.COLOR_BGR2RGB))
+    lines = tmp_path / "poses.jsonl"
+    lines.write_text("".join(result.to_json() + "\n" for result in results))
+    words = ["--results", str(lines), "--cloud", str(scene.cloud), "--out", str(tmp_path / "r")]
+    assert report.main(words) == 0
+    document = _document(tmp_path / "r")
+    for photo, result in zip(document["photos"], scene.results, strict=False):
+        frame = _decoded(_pictures(tmp_path / "r", photo)["sphere"]).astype(float)
+        assert np.abs(frame - cv2.imread(result.pano)).mean() < 8.0
+    (tmp_path / "walk.mp4").write_bytes(b"damaged")
+    for path in (tmp_path / "r" / "photos").iterdir():
+        path.unlink()
+    assert report.main(words) == 0
+    assert capsys.readouterr().err.count("no pictures of it") == 2
 
 
 def test_only_few_photos_fit_into_one_file(house, tmp_path, capsys):

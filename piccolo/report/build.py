@@ -34,6 +34,7 @@ from .site import (
     self_contained,
     write_photo_script,
 )
+from .video_frames import taken_out
 
 FORMAT = "piccolo-report/1"
 WIDTH = 2048  # [px] of spheres
@@ -142,8 +143,10 @@ def write_pictures(
         return ()
     points = place.scan_map.points.subsample(MAX_SURFELS)
     scan = surfels_of(points, workers) if any(task.poses for task in todo) else None
-    write = writer(scan, points, folder, settings.width)
-    return tuple(warning for warning in workers.map(write, todo, "photos") if warning)
+    with taken_out([task.photo for task in todo]) as files:
+        write = writer(scan, points, folder, settings.width)
+        taken = [task._replace(photo=files.get(task.photo, task.photo)) for task in todo]
+        return tuple(warning for warning in workers.map(write, taken, "photos") if warning)
 
 
 def needs_pictures(task: Task, folder: Path) -> bool:
