@@ -168,6 +168,7 @@ export class Facts {
 
   private about(photo: Photo): HTMLElement {
     const rows: [string, string][] = [[text.file, photo.file]];
+    if (photo.walk !== null) rows.push([text.walk, text.walkAt(photo.walk + 1, photo.time!.toFixed(1))]);
     if (photo.captured) rows.push([text.captured, photo.captured.replace("T", " ")]);
     if (photo.size) rows.push([text.size, `${photo.size[0]} × ${photo.size[1]}`]);
     return section(text.about, table(rows));

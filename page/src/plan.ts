@@ -4,6 +4,7 @@ import { ahead, type Model } from "./model";
 import type { Photo, Status, Storey } from "./types";
 
 const MOST_ZOOM = 2000; // px a metre
+const MANY = 400; // photos in sight, of which only marks are drawn
 const SMALL = 420; // px, width of a plan in a corner
 const CLICK = 5; // px that a finger may move
 const WEDGE_FROM = 9; // px a metre, from which headings are drawn
@@ -228,8 +229,7 @@ export class Plan {
   private photoAt(at: Point, reach: number): number | null {
     let nearest: number | null = null;
     for (const index of this.shown()) {
-      const [x, y] = this.model.report.photos[index].pose!.center;
-      const mark = this.toScreen(x, y);
+      const mark = this.markOf(index);
       const distance = Math.hypot(mark.x - at.x, mark.y - at.y);
       if (distance <= reach) {
         reach = distance;
@@ -283,11 +283,12 @@ export class Plan {
     this.paintGrid();
     this.paintImage(ratio);
     for (const walk of this.model.walks.values()) this.paintWalk(walk);
-    const shown = this.shown();
+    const shown = this.shown().filter((index) => this.isSeen(this.markOf(index)));
     const { selected } = this.model;
     const isSmall = Math.max(this.canvas.clientWidth, this.canvas.clientHeight) < SMALL;
-    const radius = Math.max(4, Math.min(isSmall ? 5 : 8, this.scale * 0.28));
-    if (this.scale > WEDGE_FROM && !isSmall) for (const index of shown) if (index !== selected) this.paintWedge(index, radius);
+    const isDense = shown.length > MANY;
+    const radius = Math.max(4, Math.min(isSmall || isDense ? 5 : 8, this.scale * 0.28));
+    if (this.scale > WEDGE_FROM && !isSmall && !isDense) for (const index of shown) if (index !== selected) this.paintWedge(index, radius);
     for (const index of shown) if (index !== selected) this.paintMark(index, radius);
     if (selected !== null) this.paintSelected(selected, radius + 2);
     this.paintNames(shown, radius);
@@ -370,8 +371,7 @@ export class Plan {
   private paintWedge(index: number, radius: number): void {
     const { context } = this;
     const photo = this.model.report.photos[index];
-    const at = this.toScreen(photo.pose!.center[0], photo.pose!.center[1]);
-    if (!this.isSeen(at)) return;
+    const at = this.markOf(index);
     const reach = radius * 3.6;
     const sector = this.sprite(`sector ${photo.status}`, 2 * reach, (own) =>
       paintSector(own, { x: 0, y: 0 }, [0, 0.45, reach], this.statusColor(photo.status), 0.75),
@@ -383,6 +383,11 @@ export class Plan {
     context.restore();
   }
 
+  private markOf(index: number): Point {
+    const [x, y] = this.model.report.photos[index].pose!.center;
+    return this.toScreen(x, y);
+  }
+
   private isSeen(at: Point): boolean {
     const { clientWidth, clientHeight } = this.canvas;
     return at.x > -50 && at.y > -50 && at.x < clientWidth + 50 && at.y < clientHeight + 50;
@@ -391,8 +396,7 @@ export class Plan {
   private paintMark(index: number, radius: number): void {
     const { context } = this;
     const photo = this.model.report.photos[index];
-    const at = this.toScreen(photo.pose!.center[0], photo.pose!.center[1]);
-    if (!this.isSeen(at)) return;
+    const at = this.markOf(index);
     this.paintEllipse(photo, at);
     const grown = index === this.hovered ? radius + 2 : radius;
     const size = 2 * (1.2 * grown + 3);
@@ -475,13 +479,11 @@ export class Plan {
   private paintNames(shown: number[], radius: number): void {
     const { model } = this;
     const first = [this.hovered, model.selected].filter((index) => index !== null && shown.includes(index)) as number[];
-    const wanted = this.scale > NAMES_FROM ? [...first, ...shown] : first;
+    const wanted = this.scale > NAMES_FROM && shown.length <= MANY ? [...first, ...shown] : first;
     const taken: [number, number, number][] = [];
     for (const index of new Set(wanted)) {
-      const photo = model.report.photos[index];
-      const at = this.toScreen(photo.pose!.center[0], photo.pose!.center[1]);
-      if (at.x < -50 || at.y < -20 || at.x > this.canvas.clientWidth + 50 || at.y > this.canvas.clientHeight + 20) continue;
-      const name = shortName(photo.name);
+      const at = this.markOf(index);
+      const name = shortName(model.report.photos[index].name);
       const half = name.length * 3.8 + 6;
       const y = at.y - radius - (index === model.selected ? 17 : 10);
       if (taken.some(([x, other, reach]) => Math.abs(at.x - x) < half + reach && Math.abs(y - other) < 20)) continue;

@@ -35,7 +35,6 @@ export const text = {
   minConfidence: "Least confidence",
   nothingFound: "No photo matches. Clear the filters to see all of them.",
   clear: "Clear filters",
-  plan: "Plan",
   planHelp:
     "Plan with the cameras. Arrow keys move it, plus and minus zoom, 0 fits it, N and P go through the photos, Enter opens one.",
   planEmpty: "No plan: nothing of this storey was scanned.",
@@ -44,7 +43,6 @@ export const text = {
   fit: "Fit the plan",
   north: "Grid north",
   level: (metres: string) => `floor at ${metres} m`,
-  openPhoto: "Open",
   back: "Back to the plan",
   previous: "Previous photo",
   next: "Next photo",
@@ -91,7 +89,8 @@ export const text = {
   size: "Picture",
   file: "File",
   inScan: "Scan",
-  walk: (index: number) => `Walk ${index}`,
+  walk: "Walk",
+  walkAt: (index: number, seconds: string) => `${index}, at ${seconds} s`,
   copyPosition: "Copy coordinates",
   copyPose: "Copy pose",
   copyLink: "Copy link",
@@ -117,5 +116,4 @@ export const text = {
   ] as [string, string][],
   table: ["Photo", "Status", "Confidence", "Storey", "x [m]", "y [m]", "z [m]", "Heading [°]", "1 σ [mm]"],
   madeBy: (version: string) => `Made by PICCOLO ${version}`,
-  scaleNote: (metres: string) => `Bar: ${metres} m`,
 };
