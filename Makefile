@@ -1,13 +1,15 @@
-# make demo    set up, make a room, localize a panorama in it, print the error against the truth
-# make test    set up, run every test
-# make check   set up, lint, format and types
-# make clean   remove what these made
+# make demo          set up, make a room, localize panoramas in it, print the errors against the truth, write a report
+# make test          set up, run every test but those of the report's page
+# make test-browser  set up, run the tests of the report's page in Chromium (apt-get install chromium npm)
+# make check         set up, lint, format and types
+# make check-page    the same of the report's page, and that its bundle is made from its sources (Node 20)
+# make clean         remove what these made
 
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check clean
+.PHONY: demo test test-browser check check-page clean
 
 $(VENV)/ready: requirements.lock requirements-formats.lock requirements-tools.lock requirements-distributed.lock requirements-video.lock requirements-dev.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "found $$($(PYTHON) --version), wanted Python 3.11 or newer: make PYTHON=python3.11" >&2; exit 1; }
@@ -16,12 +18,29 @@ $(VENV)/ready: requirements.lock requirements-formats.lock requirements-tools.lo
 	@touch $@
 
 demo: $(VENV)/ready
-	$(BIN)/python tools/make_room.py --out demo --seed 7 --points 200000 --panoramas 1 > /dev/null
+	$(BIN)/python tools/make_room.py --out demo --seed 7 --points 200000 --panoramas 3 > /dev/null
 	$(BIN)/python localize.py --cloud demo/cloud.ply --pano demo/images/clean_0.jpg --out demo/pose.json --overwrite --overlay demo/overlay.png
-	$(BIN)/python tools/evaluate.py --scenes demo --results demo/pose.json
+	$(BIN)/python localize.py --cloud demo/cloud.ply --pano demo/images --out demo/poses.jsonl --overwrite --quiet
+	$(BIN)/python tools/evaluate.py --scenes demo --results demo/poses.jsonl
+	$(BIN)/python tools/report.py --results demo/poses.jsonl --cloud demo/cloud.ply --out demo/report --title "Demo room"
 
 test: $(VENV)/ready
 	$(BIN)/python -m pytest -n auto --dist loadfile
+
+test-browser: $(VENV)/browser page/node_modules/ready
+	$(BIN)/python -m pytest browser_tests
+
+$(VENV)/browser: $(VENV)/ready requirements-browser.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-browser.lock
+	@touch $@
+
+page/node_modules/ready: page/package-lock.json
+	@command -v npm > /dev/null || { echo "found no npm; on Debian: apt-get install npm" >&2; exit 1; }
+	cd page && npm ci --ignore-scripts --no-fund --no-audit
+	@touch $@
+
+check-page: page/node_modules/ready
+	cd page && npm run check
 
 check: $(VENV)/ready
 	$(BIN)/ruff check .
@@ -29,4 +48,4 @@ check: $(VENV)/ready
 	$(BIN)/mypy
 
 clean:
-	rm -rf $(VENV) demo .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) demo page/node_modules browser_tests/screenshots .mypy_cache .ruff_cache .pytest_cache .hypothesis

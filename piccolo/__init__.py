@@ -19,11 +19,18 @@ from .errors import InputError
 if TYPE_CHECKING:
     from .geometry.pose import Pose
     from .opening import open_scan
+    from .report.report import write_report
     from .result import Result
     from .scan import Scan
 
-__all__ = ["InputError", "Pose", "Result", "Scan", "__version__", "open_scan"]
-MODULES = {"Pose": ".geometry.pose", "Result": ".result", "Scan": ".scan", "open_scan": ".opening"}
+__all__ = ["InputError", "Pose", "Result", "Scan", "__version__", "open_scan", "write_report"]
+MODULES = {
+    "Pose": ".geometry.pose",
+    "Result": ".result",
+    "Scan": ".scan",
+    "open_scan": ".opening",
+    "write_report": ".report.report",
+}
 
 
 def __getattr__(name: str) -> object:

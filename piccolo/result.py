@@ -70,6 +70,8 @@ class Result:
     cameras: tuple[Mount, ...] = ()  # that took it; none if it came as a sphere or a part of one
     scan: str | None = None  # name of the scan in which the best pose lies, of a map that names its scans
     probability_none: float | None = None  # that neither the pose nor an alternative is right, if known
+    storey: int | None = None  # in which the best pose lies, 1 the lowest; None where no floor was found
+    height_above_floor: float | None = None  # [m] of the best pose, above the floor there
     walk: WalkFrame | None = (
         None  # of a frame of a walk, whose status, pose and covariance are then the walk's
     )
@@ -137,6 +139,8 @@ class Result:
             **(_pose_json(self.pose) or dict.fromkeys(POSE_FIELDS)),
             "best_guess": _pose_json(self.best_guess),
             "scan": self.scan,
+            "storey": self.storey,
+            "height_above_floor_m": self.height_above_floor,
             "loss": self.loss,
             "evidence": self.evidence and asdict(self.evidence),
             "alternatives": [_alternative_json(alternative) for alternative in self.alternatives],
@@ -169,6 +173,7 @@ class Result:
                 evidence=document["evidence"] and Evidence(**document["evidence"]),
                 alternatives=tuple(map(_alternative_from_json, document["alternatives"])),
                 covariance=_covariance_from_json(document),
+                height_above_floor=document["height_above_floor_m"],
                 walk=document["walk"] and _walk_from_json(document["walk"]),
                 warnings=tuple(document["warnings"]),
                 **{name: document[name] for name in _PLAIN_FIELDS},
@@ -199,6 +204,7 @@ _PLAIN_FIELDS = (
     "probability_none",
     "pano",
     "scan",
+    "storey",
     "loss",
     "seconds",
     "settings",

@@ -16,7 +16,8 @@ from .cloud.soa import PackedPoints
 from .coarse_to_fine.focal_refinement import localize_and_refine_focal
 from .coarse_to_fine.gps import GpsPrior, gps_prior
 from .coarse_to_fine.localize import localize
-from .coarse_to_fine.named_scans import check_within, with_scans
+from .coarse_to_fine.named_scans import check_within
+from .coarse_to_fine.places import with_places
 from .coarse_to_fine.scan_map import ScanMap
 from .coarse_to_fine.settings import CoarseToFineSettings, Prior
 from .confidence.confidence import LOCALIZED
@@ -264,7 +265,7 @@ class Scan:
             by = localize_and_refine_focal if read_options.refine_focal else localize
             check_within(self.prepared, settings.prior.within)
             found, gps = self._localized(by, self.prepared, picture, settings, gps, watch)
-            found = with_scans(self.prepared, found)
+            found = with_places(self.prepared, found)
         elif isinstance(self.prepared, PaperMap) and isinstance(settings, PaperSettings):
             if read_options.refine_focal:
                 raise InputError("--refine-focal: not an option of the preset paper")

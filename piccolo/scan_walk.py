@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .coarse_to_fine.named_scans import with_scans
+from .coarse_to_fine.places import with_places
 from .confidence.localization import Localization
 from .errors import InputError
 from .panorama import Panorama, ReadOptions, read_query
@@ -111,7 +111,7 @@ class Walk:
         path = finished(self.tracker, self._panorama)
         found = localizations_of(self.tracker, path)
         return [
-            self._result(taken, with_scans(self.tracker.scan_map, f), walk)
+            self._result(taken, with_places(self.tracker.scan_map, f), walk)
             for taken, (f, walk) in zip(self.taken, found, strict=True)
         ]
 
@@ -120,7 +120,7 @@ class Walk:
         chosen = int(probabilities.argmax()) if len(probabilities) else None
         found = localization_of(self.tracker, frame, probabilities, chosen)
         walk = WalkFrame(frame.time, number, frame.how, alone_of(frame), None)
-        return self._result(self.taken[number], with_scans(self.tracker.scan_map, found), walk)
+        return self._result(self.taken[number], with_places(self.tracker.scan_map, found), walk)
 
     def _panorama(self, k: int) -> Panorama | None:
         taken = self.taken[k]

@@ -12,6 +12,7 @@ PACKAGE = ROOT / "piccolo"
 # A module imports from its own folder or from one further down this list.
 LAYERS = [
     "cli",
+    "report",
     "batch",
     "scenes.reproduce_paper",
     "scenes.evaluation",

@@ -30,6 +30,8 @@ RESULT = Result(
     settings={"preset": "paper", "seed": 0},
     warnings=("odd",),
     probability_none=0.002,
+    storey=2,
+    height_above_floor=1.51,
 )
 WITHOUT_ARRAYS = {"status": "not_localized", "best_pose": None, "alternatives": (), "covariance": None}
 
@@ -53,6 +55,7 @@ def test_json_names_what_the_next_tool_needs_in_its_units():
     assert document["std_deg"] == pytest.approx([np.degrees(1e-3)] * 3)
     assert "R_true = exp([w]x) R_cam_from_world" in document["covariance_convention"]
     assert document["format"] == "piccolo-pose/7"
+    assert (document["storey"], document["height_above_floor_m"]) == (2, 1.51)
     T = np.array(document["T_world_from_cam"])
     np.testing.assert_allclose(T[:3, 3], RESULT.pose.center_world)
     np.testing.assert_allclose(T[:3, :3], np.array(document["R_cam_from_world"]).T)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 # those that are installed as console commands too: piccolo-localize, piccolo-make-room ...
 COMMANDS = (
-    "localize", "align_gravity", "prepare_map", "render_pose", "export_poses", "e57_images", "make_room",
-    "convert_dataset", "evaluate", "reproduce_paper", "loss_surface",
+    "localize", "align_gravity", "prepare_map", "render_pose", "export_poses", "report", "e57_images",
+    "make_room", "convert_dataset", "evaluate", "reproduce_paper", "loss_surface",
 )  # fmt: skip
 SCRIPT = re.compile(rf"(?:python )?(?:tools/)?\b({'|'.join(COMMANDS)})\.py\b")
 

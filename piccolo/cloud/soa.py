@@ -68,6 +68,11 @@ def pack_rgbx(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = None)
     return rgbx.view("<i4")[..., 0].astype(np.int32, copy=False)
 
 
+def unpack_rgb(rgbx: NDArray[np.int32]) -> NDArray[np.uint8]:
+    """The colours (N, 3) that pack_rgbx packed (N,)."""
+    return np.ascontiguousarray(rgbx.astype("<i4")).view(np.uint8).reshape(-1, 4)[:, :3]
+
+
 def pack_points(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> PackedPoints:
     """Points (N, 3) [m] with colours (N, 3) as PackedPoints."""
     x, y, z = np.ascontiguousarray(points.T, dtype=np.float32)

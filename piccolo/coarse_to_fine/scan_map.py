@@ -24,6 +24,7 @@ from ..runtime.unfinished import Unfinished
 from .camera_positions import BLOCK, COARSE_SPACING, Ball, TooManyPositionsError, candidate_centers
 from .late_features import LateFeatures
 from .settings import NOTHING_KNOWN, Prior
+from .storeys import Storeys, find_storeys
 from .view import ViewConfig, render_block, thread_scratch
 
 WIDE_RINGS = 12
@@ -70,6 +71,11 @@ class ScanMap:
     def coarse_points(self) -> PackedPoints:
         """The same from voxels four times as wide: enough for views of a few degrees."""
         return _as_points(self.octree.level(4.0 * self.octree.leaf_size))
+
+    @cached_property
+    def storeys(self) -> Storeys:
+        """The storeys, in the map's frame."""
+        return find_storeys(self.octree)
 
     @property
     def lacks_features(self) -> bool:

@@ -36,3 +36,5 @@ class Localization:
     warnings: tuple[str, ...] = ()  # one line each: why there is no pose
     cameras: tuple[Mount, ...] = ()  # refined; none if they stay as they were given
     scan: str | None = None  # as of Alternative
+    storey: int | None = None  # of the pose, 1 the lowest; None where no floor was found
+    height_above_floor: float | None = None  # [m] of the pose, above the floor there

@@ -1,6 +1,6 @@
 """Frames of a video as picture files: the sharpest at each step of time."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -46,6 +46,17 @@ def frames_of(video: Path, every: float, folder: Path) -> Iterator[VideoFrame]:
                 best = sharpness, time, rgb
     if best is not None:
         yield _written(video, folder, best)
+
+
+def frames_at(video: Path, times: Collection[float], folder: Path) -> Iterator[VideoFrame]:
+    """Write the frames at some times [s], in whole milliseconds, into a folder; as of frames_of."""
+    left = {round(1000.0 * time) for time in times}
+    for time, frame in _decoded(video) if left else ():
+        if round(1000.0 * time) in left:
+            left.remove(round(1000.0 * time))
+            yield _written(video, folder, (0.0, time, np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)))
+        if not left:
+            return
 
 
 def sharpness_of(rgb: NDArray[np.uint8]) -> float:

@@ -136,11 +136,12 @@ def fill_holes(rgb: NDArray[np.uint8], is_seen: NDArray[np.bool_]) -> NDArray[np
 
 
 def encode_image(image: NDArray[np.uint8] | NDArray[np.uint16], suffix: str, quality: int = 95) -> bytes:
-    """Bytes of a file with an image (H, W, 3) RGB or (H, W) gray, of the kind that the suffix names.
+    """Bytes of a file with an image (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) gray, as the suffix says.
 
     The quality, up to 100, is that of a JPEG.
     """
-    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
+    order = cv2.COLOR_RGBA2BGRA if image.ndim == 3 and image.shape[2] == 4 else cv2.COLOR_RGB2BGR
+    bgr = cv2.cvtColor(image, order) if image.ndim == 3 else image
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if suffix in (".jpg", ".jpeg") else []
     is_encoded, content = cv2.imencode(suffix, bgr, options)
     if not is_encoded:

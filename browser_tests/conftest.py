@@ -1,0 +1,106 @@
+"""Reports in Debian's Chromium, opened from disk: what they need, and what all of them must never do."""
+
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import sync_playwright
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path += [str(ROOT), str(ROOT / "tests")]
+
+from report_scenes import HOSTILE, House, mixed_house  # noqa: E402
+
+from piccolo.cli import localize, make_room, report  # noqa: E402
+
+ARTIFACTS = ROOT / "browser_tests" / "screenshots"
+FLAGS = ["--no-sandbox", "--enable-unsafe-swiftshader"]
+
+
+@pytest.fixture(scope="session")
+def browser():
+    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    assert path, "found no chromium, wanted it installed: apt-get install chromium"
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=path, args=FLAGS)
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def open_page(browser, request):
+    """A function that opens a report; at the end nothing may have gone wrong, or been asked of anywhere."""
+    contexts, wrong = [], []
+
+    def watch(page):
+        page.on("console", lambda message: message.type == "error" and wrong.append(message.text))
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on("requestfailed", lambda asked: wrong.append(f"failed: {asked.url}"))
+        page.on("dialog", lambda dialog: wrong.append(f"dialog: {dialog.message}"))
+        page.on("request", lambda asked: _is_local(asked.url) or wrong.append(f"asked: {asked.url}"))
+
+    def open_page(file, hash="", width=1440, height=900, **more):
+        context = browser.new_context(viewport={"width": width, "height": height}, **more)
+        contexts.append(context)
+        page = context.new_page()
+        watch(page)
+        page.goto(file.resolve().as_uri() + hash)
+        page.wait_for_selector("html[data-ready]")
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert wrong == []
+
+
+def _is_local(url):
+    return url.startswith(("file:", "data:", "blob:"))
+
+
+@pytest.fixture
+def shoot(request):
+    """A function that keeps a screenshot as an artifact of the test."""
+    ARTIFACTS.mkdir(exist_ok=True)
+    return lambda page, name: page.screenshot(path=ARTIFACTS / f"{name}.png")
+
+
+@pytest.fixture(scope="session")
+def demo(tmp_path_factory):
+    """The room of the demo with three photos at full width: its folder, and the page."""
+    folder = tmp_path_factory.mktemp("demo")
+    words = "--seed 7 --points 200000 --panoramas 3 --width 2048 --quiet"
+    assert make_room.main(["--out", str(folder), *words.split()]) == 0
+    cloud, results = folder / "cloud.ply", folder / "poses.jsonl"
+    words = ["--cloud", str(cloud), "--pano", str(folder / "images"), "--out", str(results), "--quiet"]
+    assert localize.main(words) == 0
+    words = ["--results", str(results), "--cloud", str(cloud), "--out", str(folder / "report"), "--quiet"]
+    assert report.main([*words, "--title", "Demo room"]) == 0
+    return folder, folder / "report" / "index.html"
+
+
+@pytest.fixture(scope="session")
+def many(tmp_path_factory):
+    """Three hundred small photos of every status on two storeys, and a walk."""
+    folder = tmp_path_factory.mktemp("many")
+    house, results = mixed_house(folder, 300, width=128)
+    words = ["--results", *map(str, results), "--cloud", str(house.cloud), "--out", str(folder / "report")]
+    storeys = ["--storeys", "Ground floor", "First floor", "--title", "12 High Street", "--quiet"]
+    assert report.main([*words, *storeys]) == 0
+    return folder / "report" / "index.html"
+
+
+@pytest.fixture(scope="session")
+def hostile(tmp_path_factory):
+    """Photos whose names try to be markup, code and links, as a folder and as one file."""
+    folder = tmp_path_factory.mktemp("hostile")
+    house = House(folder, 128)
+    house.write_cloud()
+    for k, name in enumerate(HOSTILE):
+        house.add(k, name.replace("/", "\u2215"))
+    words = ["--results", str(house.write_results()), "--cloud", str(house.cloud), "--quiet"]
+    words += ["--title", HOSTILE[1], "--storeys", HOSTILE[0], HOSTILE[2]]
+    assert report.main([*words, "--out", str(folder / "report")]) == 0
+    assert report.main([*words, "--out", str(folder / "report.html"), "--self-contained"]) == 0
+    return folder / "report" / "index.html", folder / "report.html"

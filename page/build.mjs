@@ -1,0 +1,50 @@
+// Bundles the page into ../piccolo/report/page; with --check, fails if what is there differs from the sources.
+import { build } from "esbuild";
+import { readFileSync, writeFileSync } from "node:fs";
+
+const out = new URL("../piccolo/report/page/", import.meta.url);
+const version = JSON.parse(readFileSync(new URL("node_modules/three/package.json", import.meta.url))).version;
+const license = readFileSync(new URL("node_modules/three/LICENSE", import.meta.url), "utf8").trim();
+
+const made = await build({
+  absWorkingDir: new URL(".", import.meta.url).pathname,
+  entryPoints: { app: "src/main.ts", style: "src/style.css" },
+  bundle: true,
+  minify: true,
+  format: "iife",
+  target: ["chrome100", "firefox100", "safari15.4"],
+  charset: "ascii",
+  legalComments: "none",
+  banner: { js: "/* PICCOLO report page, GPL-3.0-or-later; with three.js, MIT: see LICENSES.txt */" },
+  outdir: "out",
+  write: false,
+});
+const files = {
+  "app.js": made.outputFiles.find((file) => file.path.endsWith("app.js")).text,
+  "app.css": made.outputFiles.find((file) => file.path.endsWith("style.css")).text,
+  "index.html": readFileSync(new URL("src/index.html", import.meta.url), "utf8"),
+  "LICENSES.txt": [
+    "app.js is made from page/src of the PICCOLO checkout (GPL-3.0-or-later), by `npm ci && npm run build` in page/.",
+    "It holds the following package from https://www.npmjs.com, changed only by leaving out what is not used:",
+    "",
+    `three ${version} (MIT)`,
+    "",
+    license,
+    "",
+  ].join("\n"),
+};
+
+let differs = false;
+for (const [name, text] of Object.entries(files)) {
+  const path = new URL(name, out);
+  if (process.argv.includes("--check")) {
+    if (readFileSync(path, "utf8") !== text) {
+      console.error(`${path.pathname}: differs from its sources; npm run build`);
+      differs = true;
+    }
+  } else {
+    writeFileSync(path, text);
+    console.log(`${name} ${Buffer.byteLength(text)} bytes`);
+  }
+}
+process.exitCode = differs ? 1 : 0;

@@ -1,0 +1,188 @@
+/** What was measured of the photo that is opened, in words. */
+import { h, icon } from "./dom";
+import { length, percent } from "./list";
+import { badge } from "./marks";
+import type { Model } from "./model";
+import { text } from "./text";
+import type { Photo, Pose } from "./types";
+
+/** Put a text on the clipboard, also where a page on disk may not ask the browser to. */
+async function copy(words: string): Promise<void> {
+  try {
+    await navigator.clipboard.writeText(words);
+  } catch {
+    const field = h("textarea", { class: "off-screen", "aria-hidden": "true" });
+    field.value = words;
+    document.body.append(field);
+    field.select();
+    document.execCommand("copy");
+    field.remove();
+  }
+}
+
+export function copyButton(name: string, label: string, words: () => string): HTMLElement {
+  const caption = h("span", {}, label);
+  const onclick = () =>
+    void copy(words()).then(() => {
+      caption.textContent = text.copied;
+      setTimeout(() => (caption.textContent = label), 1600);
+    });
+  return h("button", { type: "button", class: "copy", onclick }, icon(name), caption);
+}
+
+export class Facts {
+  constructor(
+    private readonly model: Model,
+    private readonly box: HTMLElement,
+  ) {
+    model.on("selected alternative", () => this.render());
+  }
+
+  private render(): void {
+    const { photo, alternative } = this.model;
+    if (!photo) return this.box.replaceChildren();
+    const pose = alternative === null ? photo.pose : photo.alternatives[alternative].pose;
+    this.box.replaceChildren(
+      ...[
+        this.heading(photo),
+        photo.error ? h("p", { class: "error" }, photo.error) : null,
+        pose ? this.place(photo, pose) : null,
+        photo.spread && alternative === null ? this.spread(photo) : null,
+        photo.alternatives.length ? this.alternatives(photo) : null,
+        photo.evidence ? this.evidence(photo) : null,
+        this.about(photo),
+        photo.warnings.length ? section(text.warnings, h("ul", { class: "notes" }, ...photo.warnings.map((w) => h("li", {}, w)))) : null,
+      ].filter((part) => part !== null),
+    );
+  }
+
+  private heading(photo: Photo): HTMLElement {
+    const meter = h("div", { class: `meter ${photo.status}` }, h("span", { class: "meter-fill" }));
+    (meter.firstElementChild as HTMLElement).style.width = `${100 * photo.confidence}%`;
+    return h(
+      "section",
+      { class: "facts-head" },
+      h("p", { class: `verdict ${photo.status}` }, badge(photo.status), text.status[photo.status]),
+      h("p", { class: "meaning" }, text.statusMeaning[photo.status]),
+      photo.pose
+        ? h("div", { class: "confidence", title: text.confidenceHelp }, h("span", {}, text.confidence), h("b", {}, percent(photo.confidence)))
+        : null,
+      photo.pose ? meter : null,
+    );
+  }
+
+  private place(photo: Photo, pose: Pose): HTMLElement {
+    const [x, y, z] = pose.world;
+    const rows: [string, string][] = [
+      ["x, y, z [m]", `${x.toFixed(3)}, ${y.toFixed(3)}, ${z.toFixed(3)}`],
+      [text.angles, pose.angles.map((angle) => `${angle.toFixed(1).replace(/^-0\.0$/, "0.0")}°`).join(", ")],
+    ];
+    const { storeys } = this.model.report;
+    const { storey } = photo;
+    if (storey !== null && storeys[storey]) rows.push([text.storey, storeys[storey].name]);
+    if (photo.height !== null) rows.push([text.height, `${photo.height.toFixed(2)} m`]);
+    if (photo.scan) rows.push([text.inScan, photo.scan]);
+    const json = () => JSON.stringify({ R_cam_from_world: chunked(pose.worldRotation), center_world: pose.world });
+    const buttons = h(
+      "div",
+      { class: "copies" },
+      copyButton("copy", text.copyPosition, () => pose.world.join(" ")),
+      copyButton("copy", text.copyPose, json),
+      copyButton("link", text.copyLink, () => location.href),
+    );
+    return section(text.position, table(rows), buttons);
+  }
+
+  private spread(photo: Photo): HTMLElement {
+    const { mm, deg, direction, ellipse } = photo.spread!;
+    const isEven = direction.startsWith("much the same");
+    return section(
+      text.uncertainty,
+      h("p", {}, text.spread(Math.max(...mm).toFixed(1), Math.max(...deg).toFixed(2))),
+      h("p", { class: "quiet" }, isEven ? text.spreadSame : text.spreadMost(direction)),
+      h("p", { class: "quiet" }, text.ellipse((2000 * ellipse[0]).toFixed(1), (2000 * ellipse[1]).toFixed(1))),
+    );
+  }
+
+  private alternatives(photo: Photo): HTMLElement {
+    const { model } = this;
+    const row = (index: number | null, label: string, probability: number | null, where: string) =>
+      h(
+        "button",
+        {
+          type: "button",
+          class: "alternative",
+          "aria-pressed": String(model.alternative === index),
+          onclick: () => {
+            model.alternative = index;
+            const storey = index === null ? photo.storey : photo.alternatives[index].storey;
+            if (storey !== null && storey !== model.storey) {
+              model.storey = storey;
+              model.changed("storey");
+            }
+            model.changed("alternative");
+            model.changed("view");
+          },
+        },
+        h("span", {}, label),
+        h("span", { class: "quiet" }, where),
+        h("b", {}, probability === null ? "" : percent(probability)),
+      );
+    const away = (pose: Pose) => length(1000 * Math.hypot(...pose.world.map((value, k) => value - photo.pose!.world[k])));
+    const rows = photo.alternatives.map((other, index) => row(index, text.alternative(index + 1), other.probability, away(other.pose)));
+    const isLikely = (index: number) => (photo.alternatives[index].probability ?? 1) >= 0.01;
+    const unlikely = rows.filter((_, index) => !isLikely(index));
+    return section(
+      text.alternatives,
+      row(null, text.best, photo.confidence, ""),
+      ...rows.filter((_, index) => isLikely(index)),
+      unlikely.length ? this.unlikely(unlikely, model.alternative !== null && !isLikely(model.alternative)) : null,
+      photo.probabilityNone === null
+        ? null
+        : h("p", { class: "alternative none" }, h("span", {}, text.none), h("span", {}), h("b", {}, percent(photo.probabilityNone))),
+    );
+  }
+
+  private unlikely(rows: HTMLElement[], isOpen: boolean): HTMLElement {
+    return h("details", { class: "unlikely", open: isOpen }, h("summary", {}, text.unlikely(rows.length)), ...rows);
+  }
+
+  private evidence(photo: Photo): HTMLElement {
+    const e = photo.evidence!;
+    const bar = (label: string, value: number, kind: string) => {
+      const fill = h("span", { class: `bar-fill ${kind}` });
+      fill.style.width = `${100 * Math.max(0, Math.min(1, value))}%`;
+      return h("div", { class: "bar-row" }, h("span", {}, label), h("span", { class: "bar" }, fill), h("b", {}, percent(value)));
+    };
+    return section(
+      text.score,
+      bar(text.explained, e.explained_fraction, "good"),
+      bar(text.contradicted, e.contradicted_fraction, "bad"),
+      bar(text.seen, e.seen_fraction, ""),
+      table([
+        [text.score, e.score.toFixed(2)],
+        [text.margin, e.margin.toFixed(2)],
+      ]),
+    );
+  }
+
+  private about(photo: Photo): HTMLElement {
+    const rows: [string, string][] = [[text.file, photo.file]];
+    if (photo.walk !== null) rows.push([text.walk, text.walkAt(photo.walk + 1, photo.time!.toFixed(1))]);
+    if (photo.captured) rows.push([text.captured, photo.captured.replace("T", " ")]);
+    if (photo.size) rows.push([text.size, `${photo.size[0]} × ${photo.size[1]}`]);
+    return section(text.about, table(rows));
+  }
+}
+
+function chunked(rows: number[]): number[][] {
+  return [rows.slice(0, 3), rows.slice(3, 6), rows.slice(6, 9)];
+}
+
+function section(title: string, ...children: (Node | null)[]): HTMLElement {
+  return h("section", {}, h("h3", {}, title), ...children);
+}
+
+function table(rows: [string, string][]): HTMLElement {
+  return h("dl", {}, ...rows.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
+}

@@ -1,0 +1,109 @@
+/** What a report's data hold: see piccolo/report/build.py and entries.py, which write them. */
+
+export type Status = "localized" | "ambiguous" | "not_localized" | "unreadable";
+export const STATUSES: readonly Status[] = ["localized", "ambiguous", "not_localized", "unreadable"];
+export type Vector = [number, number, number];
+
+export interface Pose {
+  /** Of the camera, in the frame of the plans [m], z up. */
+  center: Vector;
+  /** R_cam_from_plan, row by row; camera axes +x image centre, +y left, +z up. */
+  rotation: number[];
+  world: Vector;
+  worldRotation: number[];
+  /** Heading, pitch, roll [deg], in the world. */
+  angles: Vector;
+}
+
+export interface Alternative {
+  pose: Pose;
+  score: number;
+  probability: number | null;
+  scan: string | null;
+  storey: number | null;
+}
+
+export interface Spread {
+  /** Half axes [m] and direction of the larger one, counterclockwise from +x [deg], of 95 %. */
+  ellipse: Vector;
+  mm: Vector;
+  deg: Vector;
+  largest: number;
+  direction: string;
+}
+
+export interface Evidence {
+  score: number;
+  margin: number;
+  explained_fraction: number;
+  seen_fraction: number;
+  contradicted_fraction: number;
+  num_matches: number | null;
+}
+
+export interface Photo {
+  name: string;
+  file: string;
+  key: string;
+  status: Status;
+  confidence: number;
+  probabilityNone: number | null;
+  error: string | null;
+  warnings: string[];
+  scan: string | null;
+  captured: string | null;
+  size: [number, number] | null;
+  walk: number | null;
+  time: number | null;
+  /** True if nobody can have walked there from the frame before. */
+  gap: boolean;
+  pose: Pose | null;
+  storey: number | null;
+  height: number | null;
+  alternatives: Alternative[];
+  evidence: Evidence | null;
+  spread: Spread | null;
+  hasPictures: boolean;
+  thumb: string | null;
+}
+
+export interface Plan {
+  file: string;
+  width: number;
+  height: number;
+  /** a, b, c, d, e, f of x = a u + c v + e, y = b u + d v + f [m] of pixels (u, v). */
+  matrix: [number, number, number, number, number, number];
+  pixel: number;
+}
+
+export interface Storey {
+  name: string;
+  floor: number;
+  level: number;
+  plan: Plan | null;
+}
+
+export interface Report {
+  format: string;
+  version: string;
+  title: string;
+  cloud: string;
+  crs: string;
+  north: [number, number] | null;
+  storeys: Storey[];
+  photos: Photo[];
+}
+
+export interface Pictures {
+  sphere: string;
+  scan?: string;
+  mask?: string;
+  alternatives?: (string | null)[];
+}
+
+declare global {
+  interface Window {
+    PICCOLO_REPORT?: Report;
+    PICCOLO_PHOTOS?: Record<string, Pictures>;
+  }
+}

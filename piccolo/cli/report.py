@@ -1,0 +1,116 @@
+"""Write a page of results: plans of the storeys, the photos as spheres, and the scan from the poses found."""
+
+import argparse
+import json
+from collections import Counter
+from pathlib import Path
+
+from ..coarse_to_fine.open_map import CachePolicy, open_map
+from ..errors import InputError
+from ..report.build import WIDTH, ReportSettings, build_report
+from ..report.entries import read_entries
+from ..report.own_plan import OwnPlan
+from ..report.plan_file import SUFFIXES, write_plan_file
+from ..report.site import check_folder
+from ..runtime.atomic import check_output
+from ..runtime.stopwatch import Stopwatch
+from ..runtime.threads import Workers, num_cores
+from .command import check_least, command, option, print_warnings
+from .errors import UsageError, checking_options
+from .options import add_cloud_options, cloud_settings_from
+from .outputs import check_distinct, check_suffix, print_report
+from .progress import progress_bar, warn_once
+
+EPILOG = """\
+examples:
+  python tools/report.py --results poses.jsonl --cloud scan.ply --out report
+  python tools/report.py --results monday.jsonl tuesday.jsonl --cloud house.map --out report \\
+      --title "12 High Street" --storeys Cellar "Ground floor" "First floor"
+  python tools/report.py --results poses.jsonl --cloud scan.ply --out report.html --self-contained
+  python tools/report.py --results poses.jsonl --cloud scan.ply --plan plan.dxf
+
+FOLDER/index.html opens from disk in any browser, without a server or the net. The same command goes on where
+it was stopped, and makes again only what has changed. Without a browser: --plan, of the camera positions.
+Control points of --own-plan: a CSV file with the columns u, v (pixels of the image) and x, y (metres, in the
+scan's coordinates), and two rows or more. One JSON object on stdout.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """All options."""
+    option(parser, "--results FILE ...", "JSON lines of localize.py", required=True)
+    add_cloud_options(parser, "coloured scan, as for localize.py, or a map by tools/prepare_map.py")
+    option(parser, "--out FOLDER", "the report; new, empty, or an earlier report")
+    option(parser, "--self-contained", "--out is one HTML file, of at most 50 photos")
+    option(parser, "--title TEXT", "of the page (default: the scan's name)")
+    option(parser, "--storeys NAME ...", "names of the storeys found, the lowest first", default=[])
+    option(parser, "--images FOLDER", "of the photos, where they are no more at the results' paths")
+    option(parser, "--full-size", f"spheres as wide as the photos (default: {WIDTH} px at most)")
+    text = "in place of the plan of a storey (1: the lowest): an image, and its control points, see below"
+    option(parser, "--own-plan K IMAGE CSV", text, type=str, nargs=3, action="append", default=[])
+    option(parser, "--crs EPSG", "the scan's coordinate system, for an arrow to grid north, if it names none")
+    option(parser, "--plan FILE", "the camera positions on the plans: .png, .svg or .dxf")
+    option(parser, "--jobs N", "photos worked on at a time", default=num_cores())
+    option(parser, "--cache FOLDER", "of prepared maps (default the user's)")
+    option(parser, "--no-cache", "prepare the map again, and do not keep it")
+
+
+def settings_from(arguments: argparse.Namespace) -> ReportSettings:
+    """What the options ask for; those that make no sense are refused."""
+    check_least(arguments, jobs=1)
+    if not (arguments.out or arguments.plan):
+        raise UsageError("--out, --plan: found none of them, wanted one or both")
+    if arguments.cache and arguments.no_cache:
+        raise UsageError("--cache, --no-cache: only one of them")
+    check_suffix("--plan", arguments.plan, SUFFIXES)
+    if arguments.self_contained:
+        check_suffix("--out", arguments.out, (".html", ".htm"))
+    for number, *_ in arguments.own_plan:
+        if not number.isdecimal():
+            raise UsageError(f"--own-plan: found storey {number!r}, wanted a number, 1 for the lowest")
+    return ReportSettings(
+        title=arguments.title or "",
+        storey_names=tuple(arguments.storeys),
+        images=arguments.images,
+        width=None if arguments.full_size else WIDTH,
+        is_self_contained=arguments.self_contained,
+        own_plans=tuple(OwnPlan(int(k), Path(image), Path(csv)) for k, image, csv in arguments.own_plan),
+        crs=arguments.crs or "",
+    )
+
+
+def check_files(arguments: argparse.Namespace) -> None:
+    """Refuse, before any work, what could not be written, or would replace an input."""
+    own = [Path(name) for _, *names in arguments.own_plan for name in names]
+    inputs = [*arguments.results, *arguments.cloud, *own]
+    check_distinct({"--out": arguments.out, "--plan": arguments.plan}, inputs)
+    if arguments.plan:
+        check_output(arguments.plan)
+    if arguments.out:
+        (check_output if arguments.self_contained else check_folder)(arguments.out)
+    if arguments.images and not arguments.images.is_dir():
+        raise InputError(f"{arguments.images}: found no folder, wanted that of the photos")
+
+
+@command(__file__, __doc__, EPILOG, add_arguments)
+def main(arguments: argparse.Namespace) -> int:
+    """Read, draw, write; returns the exit code."""
+    with checking_options():
+        settings, cloud_settings = settings_from(arguments), cloud_settings_from(arguments)
+    check_files(arguments)
+    entries = read_entries(arguments.results)
+    workers = Workers(arguments.jobs, progress_bar(arguments.quiet), warn_once(arguments.quiet))
+    cache = CachePolicy(not arguments.no_cache, arguments.cache)
+    scan_map = open_map(arguments.cloud, cloud_settings, cache, workers, Stopwatch())
+    line: dict[str, object] = {"photos": len(entries)}
+    if arguments.plan:
+        line["plan"] = str(arguments.plan)
+        line["storeys"] = write_plan_file(entries, scan_map, arguments.plan, settings)
+    if arguments.out:
+        report = build_report(entries, scan_map, arguments.out, settings, workers)
+        print_warnings(arguments, report.warnings)
+        line["out"], line["url"] = str(arguments.out), report.page.resolve().as_uri()
+        line["storeys"] = len(report.document["storeys"])
+    line |= Counter(entry.result.status for entry in entries)
+    print_report(arguments, {"--plan": arguments.plan}, json.dumps(line))
+    return 0

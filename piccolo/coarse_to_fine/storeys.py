@@ -1,0 +1,151 @@
+"""The storeys of a building: level surfaces that people can stand on, one above the other."""
+
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cloud.octree import Octree
+from ..geometry.pose import Array
+from .camera_positions import SURFACE_VOXEL
+
+HEADROOM = 11  # voxels above a surface that are empty, 1.8 m
+THICKNESS = 1  # voxels up and down that are of one floor: noise, thresholds, ramps
+OPENING = 5  # [voxels] width of the disc that fits on a floor, 0.8 m: on shelves and steps it does not
+LEAST_AREA, LEAST_FRACTION = 3.0, 0.15  # of a storey's floor [m2], by the largest floor's area
+LEAST_APART = 2.3  # [m] between the floors of two storeys
+LEAST_ABOVE = 1.0  # voxels a m2 of walls or furniture above a floor: a ceiling from above has none
+LEAST_OVERLAP = 0.15  # of the smaller floor; below, two are one storey on a slope or in two wings
+# [m] below and above a storey's levels lie its surfaces; farther below is the ceiling of the next one
+BELOW_LEVEL, ABOVE_LEVEL = 0.25, 0.5
+GAP = 17  # [voxels] of a floor that furniture hid from the scanner, 2.7 m
+BESIDE = 1.5  # [m] a camera may be from the nearest scanned floor of its storey
+NUM_NEAREST, LOW = 40, 10.0  # surfaces around a place, 0.6 m, and the percentile of them that is the floor
+
+
+class Storey(NamedTuple):
+    """One storey, in the map's frame."""
+
+    floor: float  # [m] height of its largest level
+    surfaces: NDArray[np.float32]  # (N, 3) [m] of its floor
+    tree: Any  # cKDTree of their x and y
+
+
+class Storeys(NamedTuple):
+    """The storeys of a map, the lowest first; none where nothing is level."""
+
+    storeys: tuple[Storey, ...]
+
+    def at(self, centers: Array) -> tuple[NDArray[np.int64], Array]:
+        """Index of the storey of each place (N, 3), and its height above the floor there (N,) [m].
+
+        The highest floor that is below a place and scanned around it; -1 and NaN where there is no storey.
+        """
+        storey, height = np.full(len(centers), -1), np.full(len(centers), np.nan)
+        is_sure = np.zeros(len(centers), np.bool_)
+        for k, one in enumerate(self.storeys):
+            count = min(NUM_NEAREST, len(one.surfaces))
+            distance, nearest = one.tree.query(centers[:, :2], [*range(1, count + 1)])
+            above = centers[:, 2] - np.percentile(one.surfaces[nearest, 2], LOW, axis=1)
+            is_near = distance[:, 0] < BESIDE
+            is_better = (above > 0.0) & (is_near | ~is_sure) | (storey < 0)
+            storey[is_better], height[is_better] = k, above[is_better]
+            is_sure |= is_near & (above > 0.0)
+        return storey, height
+
+
+def find_storeys(octree: Octree) -> Storeys:
+    """The storeys of a map by the surfaces of its octree."""
+    from scipy.spatial import cKDTree  # noqa: PLC0415  # who asks for no storey need not wait for it
+
+    xyz = octree.level(SURFACE_VOXEL)[:, :3]
+    ijk = np.floor(xyz / SURFACE_VOXEL).astype(np.int64)
+    ijk -= ijk.min(axis=0) - 1
+    is_top = _is_standable(ijk)
+    tops, top_xyz = ijk[is_top], xyz[is_top]
+    masks = _levels(ijk, tops)
+    storeys = []
+    for group in _united(masks):
+        level_z = [float(np.median(top_xyz[tops[:, 2] == k, 2])) for k in group]
+        above = top_xyz[:, 2, None] - np.array(level_z)
+        is_of = ((above > -BELOW_LEVEL) & (above < ABOVE_LEVEL)).any(axis=1)
+        largest = max(range(len(group)), key=lambda i: masks[group[i]].sum())
+        surfaces = top_xyz[is_of]
+        storeys.append(Storey(level_z[largest], surfaces, cKDTree(surfaces[:, :2])))
+    return Storeys(tuple(storeys))
+
+
+def _is_standable(ijk: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which voxels (N, 3) have room for a person above them."""
+    shape = ijk.max(axis=0, initial=0) + HEADROOM + 2
+    code = (ijk[:, 0] * shape[1] + ijk[:, 1]) * shape[2] + ijk[:, 2]
+    order = np.argsort(code)
+    following = np.append(np.diff(code[order]), HEADROOM + 1)  # voxels to the next one above, or beyond it
+    is_free = np.empty(len(code), np.bool_)
+    is_free[order] = following > HEADROOM
+    return is_free
+
+
+def _levels(ijk: NDArray[np.int64], tops: NDArray[np.int64]) -> dict[int, NDArray[np.bool_]]:
+    """The floors by their height [voxels], ascending: which cells (I, J) each has.
+
+    `ijk` (N, 3) are all voxels, `tops` those that have room above. The largest floor first, then what is
+    LEAST_APART from those found above or below it. None if nothing stands on any.
+    """
+    if not len(tops):
+        return {}
+    counts = np.bincount(tops[:, 2])
+    thick = np.convolve(counts, np.ones(2 * THICKNESS + 1), "same")
+    found: dict[int, NDArray[np.bool_]] = {}
+    most = LEAST_AREA / SURFACE_VOXEL**2
+    while thick.max() > most:
+        around = slice(max(int(thick.argmax()) - THICKNESS, 0), int(thick.argmax()) + THICKNESS + 1)
+        level = around.start + int(counts[around].argmax())
+        mask = _opened(ijk, tops, level)
+        is_apart = all(
+            abs(level - other) * SURFACE_VOXEL >= LEAST_APART or _overlap(mask, below) < LEAST_OVERLAP
+            for other, below in found.items()
+        )
+        if is_apart and mask.sum() > most and _has_things_above(ijk, level, mask):
+            found[level] = mask
+            most = max(most, LEAST_FRACTION * mask.sum())
+        thick[max(level - THICKNESS, 0) : level + THICKNESS + 1] = 0.0
+    return dict(sorted(found.items()))
+
+
+def _opened(ijk: NDArray[np.int64], tops: NDArray[np.int64], level: int) -> NDArray[np.bool_]:
+    """Cells (I, J) of a level on which a disc fits, small gaps closed."""
+    mask = np.zeros(ijk.max(axis=0)[:2] + 2, np.uint8)
+    own = tops[np.abs(tops[:, 2] - level) <= THICKNESS]
+    mask[own[:, 0], own[:, 1]] = 1
+    closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (OPENING, OPENING))
+    return np.asarray(cv2.morphologyEx(closed, cv2.MORPH_OPEN, disc) > 0)
+
+
+def _has_things_above(ijk: NDArray[np.int64], level: int, mask: NDArray[np.bool_]) -> bool:
+    """True if anything stands on a floor or around it."""
+    wide = cv2.dilate(mask.astype(np.uint8), np.ones((OPENING, OPENING), np.uint8))
+    is_above = (ijk[:, 2] > level + THICKNESS) & (ijk[:, 2] <= level + HEADROOM)
+    count = wide[ijk[is_above, 0], ijk[is_above, 1]].sum()
+    return bool(count >= LEAST_ABOVE * mask.sum() * SURFACE_VOXEL**2)
+
+
+def _overlap(mask: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
+    """The fraction of the smaller of two floors that is above or below the other, or a gap in it."""
+    square = np.ones((GAP, GAP), np.uint8)
+    one, two = (cv2.morphologyEx(m.astype(np.uint8), cv2.MORPH_CLOSE, square) > 0 for m in (mask, other))
+    return float((one & two).sum() / max(min(one.sum(), two.sum()), 1))
+
+
+def _united(masks: dict[int, NDArray[np.bool_]]) -> list[list[int]]:
+    """The levels of each storey: one that is hardly above those before it joins them."""
+    groups: list[list[int]] = []
+    for level, mask in masks.items():
+        below = sum((masks[other] for other in groups[-1]), np.zeros_like(mask)) if groups else mask
+        if groups and _overlap(mask, below) < LEAST_OVERLAP:
+            groups[-1].append(level)
+        else:
+            groups.append([level])
+    return groups

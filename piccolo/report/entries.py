@@ -1,0 +1,169 @@
+"""The results of a report with what the page says of each: where it is on which plan, how sure, why."""
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..coarse_to_fine.scan_map import ScanMap
+from ..coarse_to_fine.storeys import Storeys
+from ..confidence.covariance import PoseCovariance
+from ..geometry.pose import Array, Pose
+from ..geometry.rotations import heading_pitch_roll_deg
+from ..result import Result, read_results
+from ..runtime.json_file import read_bytes
+
+CHI_SQUARE_95 = 5.991  # of two degrees of freedom
+DIGITS = 6  # of positions [m] and rotations
+EVIDENCE = (
+    *("score", "margin", "explained_fraction", "seen_fraction", "contradicted_fraction"),
+    "num_matches",
+)
+NOTHING_FOUND: dict[str, Any] = {
+    **dict.fromkeys(("pose", "storey", "height", "evidence", "spread")),
+    "alternatives": [],
+}
+
+
+class Entry(NamedTuple):
+    """A result of a report."""
+
+    result: Result
+    line: str  # as it stands in its file
+    walk: int | None  # which walk it is of, a number; None for a photo that stands alone
+    time: float  # [s] by which a walk's photos are in order; else its place in the files
+
+
+class Place(NamedTuple):
+    """The frame of the plans: that of the prepared map."""
+
+    scan_map: ScanMap
+    storeys: Storeys
+
+    def storey_at(self, centers: Array) -> tuple[list[int | None], list[float | None]]:
+        """Index of the storey and height above the floor [m] of places (N, 3) of the map's frame."""
+        storey, height = self.storeys.at(centers)
+        is_known = (storey >= 0).tolist()
+        return (
+            [int(s) if known else None for s, known in zip(storey, is_known, strict=True)],
+            [round(float(h), 3) if known else None for h, known in zip(height, is_known, strict=True)],
+        )
+
+
+def read_entries(paths: Sequence[Path]) -> list[Entry]:
+    """The results in files of JSON lines, in their order; each file with walks is one walk."""
+    entries: list[Entry] = []
+    for number, path in enumerate(paths):
+        results = read_results([path])
+        lines = [line for line in read_bytes(path, "wanted results").decode().splitlines() if line.strip()]
+        for result, line in zip(results, lines, strict=True):
+            time = result.walk.time if result.walk else float(len(entries))
+            entries.append(Entry(result, line, number if result.walk else None, time))
+    return entries
+
+
+def names_of(entries: Sequence[Entry]) -> list[str]:
+    """A name for each, which no other has: its path below the folder that all share."""
+    paths = [Path(entry.result.pano) for entry in entries]
+    folders = [path.parent.parts for path in paths]
+    shared = 0
+    while all(len(f) > shared and f[shared] == folders[0][shared] for f in folders):
+        shared += 1
+    names, counts = [], Counter[str]()
+    for path in paths:
+        name = "/".join(path.parts[shared:])
+        counts[name] += 1
+        names.append(f"{name} ({counts[name]})" if counts[name] > 1 else name)
+    return names
+
+
+def document_of_entry(entry: Entry, name: str, key: str, place: Place) -> dict[str, Any]:
+    """What the page knows of a result before it is opened; angles in degrees, lengths in metres."""
+    result = entry.result
+    return {
+        "name": name,
+        "file": result.pano,
+        "key": key,
+        "status": result.status,
+        "confidence": round(result.confidence, 5),
+        "probabilityNone": _rounded(result.probability_none, 5),
+        "error": result.error,
+        "warnings": list(result.warnings),
+        "scan": result.scan,
+        "captured": result.source.capture_time,
+        "size": result.source.image_size,
+        "walk": entry.walk,
+        "time": entry.time if entry.walk is not None else None,
+        "gap": bool(result.walk and result.walk.gap),
+        **(found_document(result, result.best_pose, place) if result.best_pose else NOTHING_FOUND),
+    }
+
+
+def found_document(result: Result, best_pose: Pose, place: Place) -> dict[str, Any]:
+    """What was found: the best pose, the others, and what speaks for them."""
+    poses = [best_pose, *(alternative.pose for alternative in result.alternatives)]
+    storeys, heights = place.storey_at(_centers(poses, place))
+    alternatives = [
+        {
+            **pose_document(other.pose, place),
+            "score": round(other.score, 3),
+            "probability": _rounded(other.probability, 5),
+            "scan": other.scan,
+            "storey": storey,
+        }
+        for other, storey in zip(result.alternatives, storeys[1:], strict=True)
+    ]
+    evidence, covariance = result.evidence, result.covariance
+    R_map_from_world = place.scan_map.R_map_from_world
+    return {
+        **pose_document(best_pose, place),
+        "storey": storeys[0],
+        "height": heights[0],
+        "alternatives": alternatives,
+        "evidence": evidence and {name: _rounded(getattr(evidence, name), 4) for name in EVIDENCE},
+        "spread": covariance and spread_document(covariance, R_map_from_world),
+    }
+
+
+def pose_document(pose: Pose, place: Place) -> dict[str, Any]:
+    """A pose in the plan's frame, and as the world has it."""
+    local = place.scan_map.from_world(pose)
+    heading, pitch, roll = heading_pitch_roll_deg(pose)
+    return {
+        "pose": {
+            "center": _list(local.center_world),
+            "rotation": _list(local.R_cam_from_world.ravel()),
+            "world": _list(pose.center_world),
+            "worldRotation": _list(pose.R_cam_from_world.ravel(), 12),
+            "angles": [round(heading, 2), round(pitch, 2), round(roll, 2)],
+        }
+    }
+
+
+def spread_document(covariance: PoseCovariance, R_map_from_world: Array) -> dict[str, Any]:
+    """How far the pose may be off: the ellipse on the plan that holds 95 % [m], deviations, in words."""
+    level = (R_map_from_world @ covariance.matrix[3:, 3:] @ R_map_from_world.T)[:2, :2]
+    variances, axes = np.linalg.eigh(level)
+    half = np.sqrt(np.maximum(variances, 0.0) * CHI_SQUARE_95)
+    return {
+        "ellipse": [*_list(half[::-1]), round(math.degrees(math.atan2(axes[1, 1], axes[0, 1])), 2)],
+        "mm": _list(covariance.std_mm, 2),
+        "deg": _list(covariance.std_deg, 4),
+        "largest": round(1000.0 * covariance.largest_std, 2),
+        "direction": covariance.least_constrained_direction,
+    }
+
+
+def _centers(poses: Sequence[Pose], place: Place) -> Array:
+    return np.array([place.scan_map.from_world(pose).center_world for pose in poses])
+
+
+def _list(values: Array, digits: int = DIGITS) -> list[float]:
+    return [round(float(value), digits) for value in values]
+
+
+def _rounded(value: float | None, digits: int) -> float | None:
+    return None if value is None else round(value, digits)

@@ -1,0 +1,132 @@
+"""The pictures of a photo: thumbnail, sphere, the scan from its pose, and what of it contradicts the scan."""
+
+import base64
+import json
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera import Calibration
+from ..camera.model import pinhole
+from ..cloud.label_colors import Labels
+from ..cloud.soa import PackedPoints
+from ..confidence.confidence import AMBIGUOUS
+from ..confidence.occlusion import occlusion_mask
+from ..geometry.pose import Array, Pose
+from ..panorama import Panorama, ReadOptions, read_panorama
+from ..panorama.model import shrink
+from ..render.field import cut
+from ..render.surfel_renderer import encode_image, fill_holes, render_surfels, visible_indices
+from ..render.surfels import Surfels
+from ..result import Result
+from ..runtime.threads import Workers
+
+QUALITY, THUMB_QUALITY = 80, 78  # of JPEG
+THUMB_SIZE, THUMB_FOV_DEG = (256, 160), 100.0
+MASK_WIDTH, SCAN_WIDTH, ALTERNATIVE_WIDTH = 1024, 1536, 1024  # [px] a voxel of the map is wider than a pixel
+LEAST_PROBABILITY, MAX_ALTERNATIVES = 0.02, 3  # of alternatives from which the scan is drawn
+MAX_WIDTH = 8192  # [px] of a sphere at full size
+GAP = 0.004  # by the width: wider gaps are marked as not scanned
+UNSCANNED = np.array([96, 100, 106], np.float32)
+
+
+class Pictures(NamedTuple):
+    """What the page shows of a photo, as files."""
+
+    thumbnail: bytes | None  # JPEG
+    script: str  # the JSON of the others
+
+
+def read_options_of(result: Result) -> ReadOptions:
+    """How the photo of a result is to be read: as it was when it was localized."""
+    how: Any = result.settings.get("panorama") or {}
+    labels = Labels(tuple(how["labels"]["ignored"])) if how.get("labels") else None
+    if result.cameras:
+        return ReadOptions(labels=labels, calibration=Calibration("the result", result.cameras))
+    return ReadOptions(
+        labels=labels,
+        fov_deg=how.get("fov_deg"),
+        projection=how.get("projection"),
+        cube_order=how.get("cube_order"),
+    )
+
+
+def make_pictures(
+    photo: Path, result: Result, poses: list[Pose], scan: tuple[Surfels, PackedPoints], width: int | None
+) -> Pictures:
+    """The pictures of a photo, of which `poses` are the best and the alternatives in the scan's frame.
+
+    Spheres are at most `width` px wide, None for the photo's own size. Without a pose there is no scan.
+    """
+    panorama = read_panorama(photo, read_options_of(result))
+    surfels, points = scan
+    full = min(panorama.rgb.shape[1], width or MAX_WIDTH)
+    small = shrink(panorama, full)
+    document: dict[str, Any] = {"sphere": _base64(encode_image(small.rgb, ".jpg", QUALITY))}
+    if poses:
+        view_width = min(full, SCAN_WIDTH) & ~1
+        document["scan"] = _base64(scan_picture(surfels, poses[0], view_width))
+        mask = occlusion_mask(points, shrink(panorama, MASK_WIDTH), poses[0])
+        document["mask"] = _base64(encode_image(mask, ".png"))
+        document["alternatives"] = [
+            _base64(scan_picture(surfels, pose, ALTERNATIVE_WIDTH)) if is_shown else None
+            for pose, is_shown in zip(poses[1:], _shown(result), strict=True)
+        ]
+    return Pictures(thumbnail_of(small, poses[0] if poses else None), json.dumps(document))
+
+
+def _shown(result: Result) -> list[bool]:
+    """Which alternatives are worth a picture."""
+    likely = [(a.probability or 0.0) >= LEAST_PROBABILITY for a in result.alternatives]
+    return [
+        result.status == AMBIGUOUS and is_likely and k < MAX_ALTERNATIVES
+        for k, is_likely in enumerate(likely)
+    ]
+
+
+def scan_picture(surfels: Surfels, pose: Pose, width: int) -> bytes:
+    """JPEG of the sphere that the scan shows from a pose of its frame; grey where nothing was scanned."""
+    visible = surfels.take(visible_indices(surfels.points, pose.center_world))
+    view = render_surfels(visible, pose, width, Workers())
+    rgb = fill_holes(view.rgb, view.is_seen)
+    return encode_image(_grey_where_unscanned(rgb, view.is_seen), ".jpg", QUALITY)
+
+
+def _grey_where_unscanned(rgb: NDArray[np.uint8], is_seen: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """A sphere (H, W, 3) whose larger gaps (H, W) are dimmed towards grey."""
+    size = 2 * math.ceil(GAP * rgb.shape[1]) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    seen = np.pad(is_seen.view(np.uint8), ((0, 0), (size, size)), mode="wrap")
+    closed = cv2.morphologyEx(seen, cv2.MORPH_CLOSE, disc)[:, size:-size]
+    if closed.all():
+        return rgb
+    weight = (np.float32(0.75) * (closed == 0))[..., None]
+    return np.asarray(rgb + weight * (UNSCANNED - rgb), np.uint8)
+
+
+def thumbnail_of(panorama: Panorama, pose: Pose | None) -> bytes:
+    """JPEG of what lies ahead of the camera; level if the pose is known."""
+    width, height = THUMB_SIZE
+    camera = pinhole(width, height, 0.5 * width / math.tan(math.radians(0.5 * THUMB_FOV_DEG)))
+    R_lens_from_cam = np.eye(3) if pose is None else level(pose.R_cam_from_world)
+    small = shrink(panorama, 4 * width)
+    return encode_image(cut(small.rgb, camera, R_lens_from_cam), ".jpg", THUMB_QUALITY)
+
+
+def level(R_cam_from_world: Array) -> Array:
+    """R_lens_from_cam (3, 3) of a level lens that looks where the image centre does."""
+    forward = R_cam_from_world[0] * np.array([1.0, 1.0, 0.0])
+    if np.linalg.norm(forward) < 1e-6:
+        forward = np.array([1.0, 0.0, 0.0])
+    forward /= np.linalg.norm(forward)
+    up = np.array([0.0, 0.0, 1.0])
+    R_lens_from_world = np.stack([forward, np.cross(up, forward), up])
+    return np.asarray(R_lens_from_world @ R_cam_from_world.T)
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode()

@@ -1,0 +1,136 @@
+"""The plan of a storey: the scan from above, cut below the ceiling, walls drawn as they are cut."""
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cloud.soa import PackedPoints, unpack_rgb
+from ..geometry.pose import Array
+from ..render.surfel_renderer import fill_holes
+
+CUT = 1.9  # [m] above the floor: below ceilings and lintels, above most furniture
+BELOW_FLOOR = 0.4  # [m] that still belongs to the storey: steps, ramps
+REACH = 5.0  # [m] around the places of a camera that is drawn
+PIXEL = 0.02  # [m] of a plan, or more if it would be larger than
+MAX_SIDE = 3072  # [px]
+MARGIN = 0.5  # [m] around what is drawn
+FLOOR_CELL = 0.5  # [m] on which the height of the floor is looked up
+WALL_FROM, WALL_BINS, WALL_BIN = 0.6, 13, 0.1  # [m] above the floor: what fills most of this is a wall
+WALL_FILLED = 8  # bins
+WALL_COLOR = (52, 60, 72)
+HOLE_COLOR, HOLE_ALPHA, LARGEST_HOLE = (150, 158, 168), 90, 12.0  # of gaps in a floor, and area [m2]
+PALENESS = 0.25  # of the colours, so that what is drawn on them is seen
+GAP = 13  # [px] that is closed
+SHADOW, SHADOW_WIDTH = 0.35, 0.25  # of walls on the floor: strength, width [m]
+
+
+class PlanImage(NamedTuple):
+    """A plan in pixels."""
+
+    rgba: NDArray[np.uint8]  # (H, W, 4), transparent where nothing is
+    pixel: float  # [m] side of a pixel
+    left: float  # [m] x of the left edge, in the map's frame
+    top: float  # [m] y of the upper edge
+
+    @property
+    def matrix(self) -> tuple[float, ...]:
+        """a, b, c, d, e, f of x = a u + c v + e, y = b u + d v + f [m], from pixels (u, v)."""
+        return self.pixel, 0.0, 0.0, -self.pixel, self.left, self.top
+
+
+def draw_plan(points: PackedPoints, places: Array, floors: Array) -> PlanImage | None:
+    """The plan of a storey of a map's points.
+
+    Around the places (P, 3) [m] in it where a camera can be, above each of which the floor is at `floors`
+    (P,) [m]. None if nothing is there.
+    """
+    shown = _of_storey(points, places, floors) if len(places) else None
+    if shown is None:
+        return None
+    x, y, above, rgb = shown
+    width, height = np.ptp(x) + 2 * MARGIN, np.ptp(y) + 2 * MARGIN
+    pixel = max(PIXEL, float(max(width, height)) / MAX_SIDE)
+    left, top = float(x.min()) - MARGIN, float(y.max()) + MARGIN
+    columns = ((x - left) / pixel).astype(np.int64)
+    rows = ((top - y) / pixel).astype(np.int64)
+    shape = math.ceil(height / pixel), math.ceil(width / pixel)
+    return PlanImage(_painted(columns, rows, above, rgb, shape, pixel), pixel, left, top)
+
+
+def _of_storey(
+    points: PackedPoints, places: Array, floors: Array
+) -> tuple[Array, Array, Array, NDArray[np.uint8]] | None:
+    """X, y and height above the floor [m] of a storey's points below the cut, and their colours (N, 3)."""
+    from scipy.spatial import cKDTree  # noqa: PLC0415  # who draws no plan need not wait for it
+
+    low, high = places[:, :2].min(axis=0) - REACH, places[:, :2].max(axis=0) + REACH
+    count = np.ceil((high - low) / FLOOR_CELL).astype(np.int64) + 1
+    grid = np.stack(np.meshgrid(*(np.arange(n) for n in count), indexing="ij"), axis=-1).reshape(-1, 2)
+    distance, nearest = cKDTree(places[:, :2]).query(low + (grid + 0.5) * FLOOR_CELL)
+    floor = np.where(distance < REACH, floors[nearest], np.inf).reshape(count)
+    cells = np.stack([(points.x - low[0]) / FLOOR_CELL, (points.y - low[1]) / FLOOR_CELL]).astype(np.int64)
+    is_inside = ((cells >= 0) & (cells < count[:, None])).all(axis=0)
+    above = np.full(len(points), np.inf)
+    above[is_inside] = points.z[is_inside] - floor[tuple(cells[:, is_inside])]
+    kept = np.flatnonzero((above > -BELOW_FLOOR) & (above < CUT))
+    if not len(kept):
+        return None
+    x, y = points.x[kept].astype(np.float64), points.y[kept].astype(np.float64)
+    return x, y, above[kept], unpack_rgb(points.rgbx[kept])
+
+
+def _painted(
+    columns: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    above: Array,
+    rgb: NDArray[np.uint8],
+    shape: tuple[int, int],
+    pixel: float,
+) -> NDArray[np.uint8]:
+    """The picture (H, W, 4): what is highest below the cut, gaps closed, shadows of the walls, the walls."""
+    order = np.argsort(above, kind="stable")  # what is higher is written later
+    color, is_seen = np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.bool_)
+    color[rows[order], columns[order]] = rgb[order]
+    is_seen[rows, columns] = True
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (GAP, GAP))
+    is_drawn = cv2.morphologyEx(is_seen.view(np.uint8), cv2.MORPH_CLOSE, disc) > 0
+    filled = cv2.medianBlur(fill_holes(color, is_seen), 3).astype(np.float32)
+    filled += (np.float32(255.0) - filled) * np.float32(PALENESS)
+    is_wall = _walls(columns, rows, above, shape)
+    shadow = cv2.GaussianBlur(is_wall.astype(np.float32), (0, 0), SHADOW_WIDTH / pixel)
+    filled *= (np.float32(1.0) - np.float32(SHADOW) * np.minimum(2.0 * shadow, 1.0))[..., None]
+    filled[is_wall] = WALL_COLOR
+    is_hole = _holes(is_drawn | is_wall, pixel)
+    filled[is_hole] = HOLE_COLOR
+    alpha = np.where(is_drawn | is_wall, 255, np.where(is_hole, HOLE_ALPHA, 0)).astype(np.uint8)
+    smooth = cv2.GaussianBlur(alpha, (3, 3), 0)
+    return np.dstack([np.rint(filled).astype(np.uint8), np.where(is_wall, 255, smooth)])
+
+
+def _holes(is_drawn: NDArray[np.bool_], pixel: float) -> NDArray[np.bool_]:
+    """(H, W), true in gaps that what is drawn encloses: floor that no scanner saw."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats((~is_drawn).astype(np.uint8), connectivity=4)
+    is_hole = stats[:, cv2.CC_STAT_AREA] * pixel**2 < LARGEST_HOLE
+    is_hole &= (stats[:, cv2.CC_STAT_LEFT] > 0) & (stats[:, cv2.CC_STAT_TOP] > 0)
+    is_hole[0] = False  # what is drawn
+    return np.asarray(is_hole[labels])
+
+
+def _walls(
+    columns: NDArray[np.int64], rows: NDArray[np.int64], above: Array, shape: tuple[int, int]
+) -> NDArray[np.bool_]:
+    """(H, W), true where most heights of a person are filled, small gaps closed."""
+    bins = np.floor((above - WALL_FROM) / WALL_BIN).astype(np.int64)
+    is_in = (bins >= 0) & (bins < WALL_BINS)
+    filled = np.zeros((WALL_BINS, *shape), np.uint8)
+    filled[bins[is_in], rows[is_in], columns[is_in]] = 1
+    square = np.ones((3, 3), np.uint8)
+    count = np.zeros(shape, np.uint8)
+    for level in filled:
+        count += np.asarray(cv2.dilate(level, square), np.uint8)
+    is_wall = cv2.erode((count >= WALL_FILLED).astype(np.uint8), square)
+    closed = cv2.morphologyEx(is_wall, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    return np.asarray(cv2.dilate(closed, square) > 0)

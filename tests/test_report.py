@@ -1,0 +1,299 @@
+"""Reports: what is in the folder, what is made again, what is refused; names of strangers stay text."""
+
+import base64
+import hashlib
+import json
+import re
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from report_scenes import HOSTILE, STOREY, House, lifted, mixed_house
+
+import piccolo
+from piccolo.cli import report
+from piccolo.errors import InputError
+from piccolo.report.entries import names_of, read_entries
+from piccolo.report.own_plan import plan_matrix
+from piccolo.scenes.export.video import writing_video
+
+STOREYS = ["--storeys", "Ground floor", "First floor"]
+
+
+@pytest.fixture(scope="module")
+def house(tmp_path_factory):
+    """Fourteen photos of every status, six of them frames of a walk, and their result files."""
+    return mixed_house(tmp_path_factory.mktemp("house"), 26, width=128)
+
+
+@pytest.fixture(scope="module")
+def made(house, tmp_path_factory):
+    """A report of it, in a folder."""
+    out = tmp_path_factory.mktemp("made") / "report"
+    assert _run(house, out, *STOREYS, "--title", "12 High Street") == 0
+    return out
+
+
+def _run(house, out, *more):
+    house, results = house
+    words = ["--results", *map(str, results), "--cloud", str(house.cloud), "--quiet", "--jobs", "2"]
+    return report.main([*words, "--out", str(out), *more])
+
+
+def _document(out):
+    text = (out / "report.js").read_text()
+    return json.loads(text.removeprefix("window.PICCOLO_REPORT = ").removesuffix(";\n"))
+
+
+def _photo(document, name):
+    return next(photo for photo in document["photos"] if photo["name"] == name)
+
+
+def _pictures(out, photo):
+    text = (out / "photos" / f"{photo['key']}.js").read_text()
+    return json.loads(text.partition(" = ")[2].removesuffix(";\n"))
+
+
+def _decoded(text):
+    return cv2.imdecode(np.frombuffer(base64.b64decode(text), np.uint8), cv2.IMREAD_COLOR)
+
+
+def test_storeys_have_their_names_levels_and_plans_in_metres(made):
+    lower, upper = _document(made)["storeys"]
+    assert [lower["name"], upper["name"]] == ["Ground floor", "First floor"]
+    assert [lower["level"], upper["level"]] == pytest.approx([0.0, STOREY], abs=0.03)
+    for storey in (lower, upper):
+        plan = storey["plan"]
+        image = cv2.imread(str(made / plan["file"]), cv2.IMREAD_UNCHANGED)
+        assert image.shape == (plan["height"], plan["width"], 4)
+        assert plan["matrix"][0] == plan["pixel"] == -plan["matrix"][3]
+        assert plan["width"] * plan["pixel"] == pytest.approx(
+            2 * 4.5 + 0.4 + 1.0, abs=0.6
+        )  # two rooms, margins
+        assert 0.5 < (image[..., 3] > 0).mean() < 1.0
+
+
+def test_photos_know_their_storey_height_and_place_on_the_plan(house, made):
+    document = _document(made)
+    for index in (0, 1, 2, 3):
+        _, _, pose = house[0].pose(index)
+        photo = _photo(document, f"{index:03}.jpg")
+        assert photo["storey"] == index % 2
+        assert photo["height"] == pytest.approx(pose.center_world[2], abs=0.05)
+        world = lifted(pose, index % 2).center_world
+        np.testing.assert_allclose(photo["pose"]["world"], world, atol=1e-6)
+        np.testing.assert_allclose(photo["pose"]["rotation"], pose.R_cam_from_world.ravel(), atol=1e-6)
+        center = photo["pose"]["center"] + np.array(document["origin"])
+        np.testing.assert_allclose(center, world, atol=1e-6)
+    assert _photo(document, "000.jpg")["spread"]["ellipse"] == pytest.approx(
+        [0.004895, 0.002448, 0], abs=2e-5
+    )
+
+
+def test_every_status_is_there_with_what_it_has(made):
+    photos = _document(made)["photos"]
+    ambiguous = _photo({"photos": photos}, "007.jpg")
+    assert ambiguous["status"] == "ambiguous"
+    assert [other["probability"] for other in ambiguous["alternatives"]] == [0.3, 0.1]
+    assert len([a for a in _pictures(made, ambiguous)["alternatives"] if a]) == 2
+    unreadable = _photo({"photos": photos}, "019.jpg")
+    assert (unreadable["pose"], unreadable["thumb"], unreadable["hasPictures"]) == (None, None, False)
+    assert "no picture" in unreadable["error"]
+    walk = [photo for photo in photos if photo["walk"] is not None]
+    assert [photo["time"] for photo in walk] == [1.5 * k for k in range(6)]
+    assert [photo["gap"] for photo in walk] == [k == 4 for k in range(6)]
+
+
+def test_sphere_and_scan_show_the_same_in_every_direction(made):
+    document = _document(made)
+    for name in ("000.jpg", "001.jpg", "walk_3.jpg"):
+        pictures = _pictures(made, _photo(document, name))
+        sphere, scan = _decoded(pictures["sphere"]), _decoded(pictures["scan"])
+        assert sphere.shape == scan.shape == (64, 128, 3)
+        blurred = [cv2.GaussianBlur(p, (0, 0), 1.5).astype(float).ravel() for p in (sphere, scan)]
+        turned = cv2.GaussianBlur(np.roll(scan, 8, axis=1), (0, 0), 1.5).astype(float).ravel()
+        assert np.corrcoef(*blurred)[0, 1] > 0.85
+        assert np.corrcoef(blurred[0], turned)[0, 1] < np.corrcoef(*blurred)[0, 1] - 0.1
+        mask = cv2.imdecode(np.frombuffer(base64.b64decode(pictures["mask"]), np.uint8), cv2.IMREAD_GRAYSCALE)
+        assert (mask == 255).mean() < 0.2
+
+
+def test_the_same_command_makes_only_what_has_changed(house, made, tmp_path):
+    before = {path.name: path.stat().st_mtime_ns for path in made.glob("photos/*")}
+    document = _document(made)
+    assert _run(house, made, *STOREYS, "--title", "12 High Street") == 0
+    assert {path.name: path.stat().st_mtime_ns for path in made.glob("photos/*")} == before
+    assert _document(made) == document
+    key = _photo(document, "002.jpg")["key"]
+    (made / "photos" / f"{key}.js").unlink()  # as where a run was stopped
+    (made / "photos" / f".{key}.js.0123456789abcdef").write_bytes(b"half")
+    (made / "thumbs" / f"{'0' * 32}.jpg").write_bytes(b"of an earlier report")
+    (made / "thumbs" / "mine.jpg").write_bytes(b"of the user")
+    assert _run(house, made, *STOREYS, "--title", "12 High Street") == 0
+    after = {path.name: path.stat().st_mtime_ns for path in made.glob("photos/*")}
+    assert {name for name in after if after[name] != before[name]} == {f"{key}.js"}
+    assert not (made / "thumbs" / f"{'0' * 32}.jpg").exists()
+    assert (made / "thumbs" / "mine.jpg").exists()
+
+
+def test_a_moved_folder_of_photos_and_one_that_is_gone(house, tmp_path, capsys):
+    scene, (results, _) = house
+    words = ["--results", str(results), "--cloud", str(scene.cloud), "--jobs", "1"]
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert report.main([*words, "--out", str(tmp_path / "r"), "--images", str(empty)]) == 0
+    assert "no pictures of it" in capsys.readouterr().err
+    assert {photo["hasPictures"] for photo in _document(tmp_path / "r")["photos"]} == {False}
+    assert report.main([*words, "--out", str(tmp_path / "r"), "--images", str(tmp_path / "no")]) == 3
+
+
+def test_the_page_and_its_policy_come_with_it(made):
+    page = (made / "index.html").read_text()
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)[1]
+    assert "default-src 'none'" in policy
+    assert "unsafe" not in policy
+    assert not re.search(r"\son\w+=|style=|javascript:", page)
+    assert {"app.js", "app.css", "LICENSES.txt"} <= {path.name for path in made.iterdir()}
+    assert "three" in (made / "LICENSES.txt").read_text()
+    assert (made / "app.js").stat().st_size < 1_000_000
+
+
+def test_one_file_holds_all_of_a_small_report(house, tmp_path):
+    out = tmp_path / "report.html"
+    assert _run(house, out, "--self-contained") == 0
+    page = out.read_text()
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+    scripts = re.findall(r"<script>(.*?)</script>", page, flags=re.DOTALL)
+    (style,) = re.findall(r"<style>(.*?)</style>", page, flags=re.DOTALL)
+    for text in (*scripts, style):
+        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        assert f"'sha256-{digest}'" in page
+    data = re.search(r'<script type="application/json" id="report">(.*?)</script>', page, flags=re.DOTALL)[1]
+    photos = json.loads(data)["photos"]
+    assert all(photo["thumb"].startswith("data:image/jpeg") for photo in photos if photo["thumb"])
+    assert all(f'id="photo-{photo["key"]}"' in page for photo in photos if photo["hasPictures"])
+
+
+def test_names_that_try_to_be_markup_stay_text(tmp_path):
+    house = House(tmp_path, 128)
+    house.write_cloud()
+    for k, name in enumerate(HOSTILE):
+        house.add(k, name.replace("/", "\u2215"), confidence=0.99)
+    house.results = [  # a name with a slash is a folder's: given to the results only
+        result.__class__(**{**vars(result), "warnings": (HOSTILE[1],), "pano": result.pano})
+        for result in house.results
+    ]
+    words = ["--cloud", str(house.cloud), "--title", HOSTILE[1], "--quiet"]
+    results = ["--results", str(house.write_results())]
+    assert report.main([*results, *words, "--out", str(tmp_path / "r")]) == 0
+    assert "<" not in (tmp_path / "r" / "report.js").read_text()
+    assert _document(tmp_path / "r")["title"] == HOSTILE[1]
+    assert report.main([*results, *words, "--out", str(tmp_path / "r.html"), "--self-contained"]) == 0
+    page = (tmp_path / "r.html").read_text()
+    assert "<img src=x" not in page
+    assert page.count("</script>") == 2 + len(HOSTILE)
+
+
+def test_an_own_plan_is_put_where_its_control_points_are(house, made, tmp_path):
+    plan = tmp_path / "plan.png"
+    cv2.imwrite(str(plan), np.full((300, 400, 3), 200, np.uint8))
+    points = tmp_path / "points.csv"
+    points.write_text("u,v,x,y\n0,0,0,7\n400,0,10,7\n400,300,10,-0.5\n")
+    how = "--own-plan", "2", str(plan), str(points)
+    assert _run(house, tmp_path / "r", *how) == 0
+    own = _document(tmp_path / "r")["storeys"][1]["plan"]
+    origin = np.array(_document(made)["origin"])
+    expected = [0.025, 0.0, 0.0, -0.025, -origin[0], 7.0 - origin[1]]
+    assert own["matrix"] == pytest.approx(expected)
+    assert (own["width"], own["height"]) == (400, 300)
+    points.write_text("u,v,x,y\n5,5,0,7\n5,5,10,7\n")
+    assert _run(house, tmp_path / "r", *how) == 3
+
+
+def test_two_control_points_give_a_turn_and_a_scale():
+    pixels = np.array([[100.0, 200.0], [300.0, 50.0]])
+    angle, scale = 0.7, 0.02
+    flipped = pixels * [1.0, -1.0]
+    turn = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    (a, b, c, d, e, f), error = plan_matrix(pixels, flipped @ turn.T + [3.0, -4.0])
+    np.testing.assert_allclose([[a, c], [b, d]], turn @ np.diag([1.0, -1.0]))
+    np.testing.assert_allclose([e, f, error], [3.0, -4.0, 0.0], atol=1e-9)
+    with pytest.raises(InputError, match="one point or on one line"):
+        plan_matrix(np.array([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]), np.zeros((3, 2)))
+
+
+def test_names_are_short_and_different(tmp_path):
+    house = House(tmp_path, 128)
+    for name in ("a.jpg", "b.jpg", "a.jpg"):
+        house.add(0, name)
+    assert names_of(read_entries([house.write_results()])) == ["a.jpg", "b.jpg", "a.jpg (2)"]
+
+
+def test_in_python(house, tmp_path):
+    scene, results = house
+    scan = piccolo.open_scan(scene.cloud)
+    told = []
+    page = piccolo.write_report(
+        results[1], scan, tmp_path / "r", title="A walk", progress=lambda *words: told.append(words)
+    )
+    assert page == tmp_path / "r" / "index.html"
+    assert _document(tmp_path / "r")["title"] == "A walk"
+    assert ("photos", 6, 6) in told
+    with pytest.raises(TypeError, match="no option 'titel'"):
+        piccolo.write_report(results, scan, tmp_path / "r", titel="x")
+    with pytest.raises(InputError, match="found 1 names, wanted 2"):
+        piccolo.write_report(results, str(scene.cloud), tmp_path / "r", storeys=["Ground floor"])
+
+
+@pytest.mark.parametrize(
+    ("more", "code", "text"),
+    [
+        ([], 2, "--out, --plan: found none"),
+        (["--out", "{}/r", "--storeys", "one"], 3, "--storeys: found 1 names, wanted 2"),
+        (["--out", "{}", "--jobs", "1"], 3, "found a folder of something else"),
+        (["--out", "{}/no/r"], 3, "wanted one that exists"),
+        (["--out", "{}/r.txt", "--self-contained"], 2, "wanted a name that ends with .html"),
+        (["--plan", "{}/p.pdf"], 2, "wanted a name that ends with .png, .svg, .dxf"),
+        (["--out", "{}/r", "--own-plan", "x", "a", "b"], 2, "found storey 'x'"),
+        (["--out", "{}/r", "--own-plan", "3", "a", "b"], 3, "found storey 3, wanted 1 to 2"),
+        (["--out", "{}/r", "--jobs", "0"], 2, "--jobs: found 0"),
+    ],
+)
+def test_refusals(house, tmp_path, capsys, more, code, text):
+    scene, results = house
+    (tmp_path / "other.txt").touch()
+    words = ["--results", *map(str, results), "--cloud", str(scene.cloud), "--quiet"]
+    assert report.main([*words, *(word.format(tmp_path) for word in more)]) == code
+    (line,) = capsys.readouterr().err.splitlines()
+    assert text in line
+
+
+def test_frames_of_a_video_are_taken_out_of_it(house, tmp_path, capsys):
+    scene, _ = house
+    results = [
+        replace(result, pano=f"{tmp_path}/walk.mp4#t={k}.000") for k, result in enumerate(scene.results[:2])
+    ]
+    with writing_video(tmp_path / "walk.mp4", 1.0, (128, 64)) as add:
+        for result in scene.results[:2]:
+            add(cv2.cvtColor(cv2.imread(result.pano), cv2.COLOR_BGR2RGB))
+    lines = tmp_path / "poses.jsonl"
+    lines.write_text("".join(result.to_json() + "\n" for result in results))
+    words = ["--results", str(lines), "--cloud", str(scene.cloud), "--out", str(tmp_path / "r")]
+    assert report.main(words) == 0
+    document = _document(tmp_path / "r")
+    for photo, result in zip(document["photos"], scene.results, strict=False):
+        frame = _decoded(_pictures(tmp_path / "r", photo)["sphere"]).astype(float)
+        assert np.abs(frame - cv2.imread(result.pano)).mean() < 8.0
+    (tmp_path / "walk.mp4").write_bytes(b"damaged")
+    for path in (tmp_path / "r" / "photos").iterdir():
+        path.unlink()
+    assert report.main(words) == 0
+    assert capsys.readouterr().err.count("no pictures of it") == 2
+
+
+def test_only_few_photos_fit_into_one_file(house, tmp_path, capsys):
+    scene, results = house
+    words = ["--cloud", str(scene.cloud), "--quiet", "--self-contained", "--out", str(tmp_path / "r.html")]
+    assert report.main(["--results", *map(str, [*results, *results]), *words]) == 3
+    assert "found 52 photos, wanted 50 or fewer" in capsys.readouterr().err

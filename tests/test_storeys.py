@@ -1,0 +1,94 @@
+import numpy as np
+import pytest
+from rooms import scan_map
+
+from piccolo.cloud.octree import build_octree
+from piccolo.cloud.stream import Cloud
+from piccolo.coarse_to_fine.storeys import find_storeys
+
+
+def _octree(*parts):
+    points = np.concatenate(parts).astype(np.float32)
+    cloud = Cloud(points, np.full((len(points), 3), 128, np.uint8), np.zeros(3))
+    voxels = cloud.voxels(np.eye(3))
+    return build_octree(voxels), voxels.origin
+
+
+def _plate(x0, y0, x1, y1, z, slope=0.0):
+    step = 0.08
+    x, y = np.meshgrid(np.arange(x0, x1, step), np.arange(y0, y1, step))
+    return np.column_stack([x.ravel(), y.ravel(), z + slope * x.ravel()])
+
+
+def _box(x0, y0, x1, y1, low, high):
+    """Floor, ceiling and walls."""
+    z, x, y = np.arange(low, high, 0.08), np.arange(x0, x1, 0.08), np.arange(y0, y1, 0.08)
+    walls = [np.stack(np.meshgrid([at], y, z), axis=-1).reshape(-1, 3) for at in (x0, x1)] + [
+        np.stack(np.meshgrid(x, [at], z), axis=-1).reshape(-1, 3) for at in (y0, y1)
+    ]
+    return np.concatenate([_plate(x0, y0, x1, y1, low), _plate(x0, y0, x1, y1, high), *walls])
+
+
+def _storeys(*parts):
+    """The floors of some surfaces [m], and what tells the storey and height of places (N, 3)."""
+    octree, origin = _octree(*parts)
+    storeys = find_storeys(octree)
+    floors = [storey.floor + origin[2] for storey in storeys.storeys]
+    return floors, lambda places: storeys.at(np.array(places) - origin)
+
+
+def test_a_room_is_one_storey_and_its_ceiling_none():
+    assert _storeys(_box(0, 0, 6, 5, 0.0, 2.6))[0] == pytest.approx([0.0], abs=0.05)
+
+
+def test_storeys_one_above_the_other_lowest_first():
+    floors, at = _storeys(*(_box(0, 0, 6, 5, low, low + 2.5) for low in (-2.9, 0.0, 2.9)))
+    assert floors == pytest.approx([-2.9, 0.0, 2.9], abs=0.05)
+    storey, height = at([[3, 2, 4.5], [3, 2, 1.5], [1, 1, -1.4], [9.0, 2, 1.0]])
+    assert storey.tolist() == [2, 1, 0, 1]  # the last is outside: of the floor below its height
+    np.testing.assert_allclose(height, [1.6, 1.5, 1.5, 1.0], atol=0.05)
+
+
+def test_shelves_tables_and_stairs_are_no_storeys():
+    shelves = [_plate(1, y, 5, y + 0.5, z) for y in (1.0, 2.5) for z in (0.5, 2.6)]
+    table = _plate(3, 4, 4.5, 4.9, 0.75)
+    stairs = [_plate(0.3 * k, 0, 0.3 * k + 0.3, 0.9, 0.18 * k) for k in range(16)]
+    assert len(_storeys(_box(0, 0, 7, 6, 0.0, 5.0), *shelves, table, *stairs)[0]) == 1
+
+
+def test_wings_at_different_heights_are_one_storey():
+    floors, at = _storeys(_box(0, 0, 6, 5, 0.0, 2.6), _box(8, 0, 13, 5, 1.2, 3.8))
+    assert floors == pytest.approx([0.0], abs=0.05)
+    storey, height = at([[3.0, 2.0, 1.5], [10.0, 2.0, 2.8]])
+    assert storey.tolist() == [0, 0]
+    np.testing.assert_allclose(height, [1.5, 1.6], atol=0.05)  # above the floor of each wing
+
+
+def test_a_gallery_above_the_hall_is_a_storey_of_its_own():
+    floors, at = _storeys(_box(0, 0, 12, 8, 0.0, 6.0), _plate(0, 0, 12, 3, 3.0))
+    assert floors == pytest.approx([0.0, 3.0], abs=0.05)
+    storey, _ = at([[6.0, 1.5, 4.5], [6.0, 1.5, 1.5], [6.0, 6.5, 4.5]])
+    assert storey.tolist() == [1, 0, 0]  # high above the hall beside the gallery is still the hall
+
+
+def test_a_camera_over_a_sofa_is_as_high_as_beside_it():
+    _, at = _storeys(_box(0, 0, 6, 5, 0.0, 2.6), _plate(2, 2, 4, 2.8, 0.42))
+    np.testing.assert_allclose(at([[3.0, 2.4, 1.5], [3.0, 4.0, 1.5]])[1], [1.5, 1.5], atol=0.05)
+
+
+def test_no_storey_where_nothing_is_level():
+    floors, at = _storeys(_plate(0, 0, 6, 6, 0.0, slope=1.0))
+    assert floors == []
+    storey, height = at(np.zeros((2, 3)))
+    assert storey.tolist() == [-1, -1]
+    assert np.isnan(height).all()
+
+
+def test_a_scanned_room_has_its_floor_at_its_own_height():
+    m = scan_map(3)
+    storeys = find_storeys(m.octree)
+    assert [s.floor + m.origin_world[2] for s in storeys.storeys] == pytest.approx([0.0], abs=0.02)
+    storey, height = storeys.at(m.centers)
+    assert (storey == 0).all()
+    error = np.abs(height - m.centers[:, 2] - m.origin_world[2])
+    assert np.percentile(error, 97.0) < 0.02  # others are above the middle of a large table
