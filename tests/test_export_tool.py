@@ -73,7 +73,7 @@ def test_every_format_writes_whole_files_and_nothing_else(run, tmp_path, name, m
     for picture in ("a", "e"):
         jpeg(Path("p", f"{picture}.jpg"))
     before = {path.name for path in tmp_path.iterdir()}
-    extra = ["--crs", "EPSG:32632"] if name == "geojson" else []
+    extra = ["--crs", "EPSG:32632"] if name in ("geojson", "gpx") else []
     assert run("--format", name, "--images", "p", "--out", "made", *extra)[0] == 0
     assert {path.name for path in tmp_path.iterdir()} == before | {"made"}
     assert Path("made").is_dir() == FORMATS[name].is_folder
@@ -223,7 +223,7 @@ def test_poses_on_stdout_are_those_of_a_file_and_the_report_goes_to_stderr(tmp_p
     write_results(tmp_path / "r.jsonl", MIXED)
     arguments = ["--results", str(tmp_path / "r.jsonl"), "--format", name, "--out"]
     sizes = ["--size", "64", "32"] if "size" in FORMATS[name].options else []
-    extra = ["--crs", "EPSG:32632"] if name == "geojson" else sizes
+    extra = ["--crs", "EPSG:32632"] if name in ("geojson", "gpx") else sizes
     assert export_poses.main([*arguments, str(tmp_path / "file"), *extra]) == 0
     capsys.readouterr()
     assert export_poses.main([*arguments, "-", *extra]) == 0
