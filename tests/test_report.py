@@ -4,6 +4,7 @@ import base64
 import hashlib
 import json
 import re
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -115,6 +116,8 @@ def test_sphere_and_scan_show_the_same_in_every_direction(made):
         turned = cv2.GaussianBlur(np.roll(scan, 8, axis=1), (0, 0), 1.5).astype(float).ravel()
         assert np.corrcoef(*blurred)[0, 1] > 0.85
         assert np.corrcoef(blurred[0], turned)[0, 1] < np.corrcoef(*blurred)[0, 1] - 0.1
+        reach = np.frombuffer(base64.b64decode(pictures["reach"]), np.uint8).reshape(48, 96) / 10.0
+        assert 0.5 < np.median(reach) < 4.0  # of a room of 4.5 x 3.5 m
         mask = cv2.imdecode(np.frombuffer(base64.b64decode(pictures["mask"]), np.uint8), cv2.IMREAD_GRAYSCALE)
         assert (mask == 255).mean() < 0.2
 
@@ -201,6 +204,7 @@ def test_an_own_plan_is_put_where_its_control_points_are(house, made, tmp_path):
     points = tmp_path / "points.csv"
     points.write_text("u,v,x,y\n0,0,0,7\n400,0,10,7\n400,300,10,-0.5\n")
     how = "--own-plan", "2", str(plan), str(points)
+    shutil.copytree(made, tmp_path / "r")  # whose pictures stay as they are
     assert _run(house, tmp_path / "r", *how) == 0
     own = _document(tmp_path / "r")["storeys"][1]["plan"]
     origin = np.array(_document(made)["origin"])
