@@ -22,7 +22,7 @@ from piccolo.cli.options import add_cloud_options
 from piccolo.errors import InputError
 
 PHOTOS = 20  # opened in the page
-# milliseconds from frame to frame while the plan is moved; {} is "zoom" or "pan"
+# milliseconds from frame to frame while the plan is moved; kind is "zoom" or "pan"
 FRAMES = """kind => new Promise(resolve => {
   const plan = document.getElementById('plan'), box = plan.getBoundingClientRect(), times = [];
   const at = (x, y) => ({ clientX: box.left + x, clientY: box.top + y, bubbles: true, cancelable: true });
