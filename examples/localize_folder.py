@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import piccolo
-from piccolo.scan import QueryOptions
+from piccolo.query_options import QueryOptions
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 

@@ -20,9 +20,10 @@ from .coarse_to_fine.settings import CoarseToFineSettings
 from .errors import InputError
 from .paper.localize import PaperMap
 from .paper.localize import prepare as prepare_by_paper
+from .query_options import File, Settings, refuse_unknown
 from .runtime.stopwatch import Stopwatch
 from .runtime.threads import ProgressCallback, Workers, no_progress, num_cores, progress_to
-from .scan import File, Scan, Settings, refuse_unknown
+from .scan import Scan
 
 
 class ScanOptions(TypedDict, total=False):

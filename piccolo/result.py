@@ -20,14 +20,23 @@ from .confidence.covariance import PoseCovariance
 from .confidence.localization import Alternative, Localization
 from .confidence.score import Evidence
 from .errors import InputError
-from .geometry.pose import Pose, T_world_from_cam, checked_rotation, quaternion_wxyz
+from .geometry.pose import Pose, checked_rotation
 from .geometry.sphere import CONVENTION
+from .result_parts import (
+    POSE_FIELDS,
+    alternative_from_json,
+    alternative_json,
+    covariance_from_json,
+    gps_prior_from_json,
+    pose_json,
+    walk_from_json,
+    walk_json,
+)
 from .runtime.json_file import document_of, parse_lines, read_bytes
-from .walk.localize import Alone, Gap, WalkFrame
+from .walk.localize import WalkFrame
 
 FORMAT = "piccolo-pose/7"
 UNREADABLE = "unreadable"
-POSE_FIELDS = ("R_cam_from_world", "center_world", "quaternion_wxyz", "T_world_from_cam")
 MAX_ROTATION_ERROR = 1e-6  # of R R^T from the identity, in a file
 # control characters, line ends, halves of characters
 UNWRITABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
@@ -136,14 +145,14 @@ class Result:
             "pano": self.pano,
             "camera": camera_document(self.cameras) if self.cameras else None,
             **asdict(self.source),
-            **(_pose_json(self.pose) or dict.fromkeys(POSE_FIELDS)),
-            "best_guess": _pose_json(self.best_guess),
+            **(pose_json(self.pose) or dict.fromkeys(POSE_FIELDS)),
+            "best_guess": pose_json(self.best_guess),
             "scan": self.scan,
             "storey": self.storey,
             "height_above_floor_m": self.height_above_floor,
             "loss": self.loss,
             "evidence": self.evidence and asdict(self.evidence),
-            "alternatives": [_alternative_json(alternative) for alternative in self.alternatives],
+            "alternatives": [alternative_json(alternative) for alternative in self.alternatives],
             "covariance": self.covariance and self.covariance.matrix.tolist(),
             "covariance_convention": COVARIANCE_CONVENTION,
             "std_mm": self.covariance and self.covariance.std_mm.tolist(),
@@ -152,7 +161,7 @@ class Result:
             "convention": CONVENTION,
             "seconds": {stage: round(seconds, 4) for stage, seconds in self.seconds.items()},
             "gps_prior": self.gps_prior and asdict(self.gps_prior),
-            "walk": self.walk and _walk_json(self.walk),
+            "walk": self.walk and walk_json(self.walk),
             "settings": self.settings,
             "warnings": list(self.warnings),
             "version": __version__,
@@ -169,12 +178,12 @@ class Result:
                 best_pose=_best_pose_from_json(document),
                 source=_source_from_json(document),
                 cameras=mounts_of(document["camera"]) if document.get("camera") else (),
-                gps_prior=_gps_prior_from_json(document["gps_prior"]),
+                gps_prior=gps_prior_from_json(document["gps_prior"]),
                 evidence=document["evidence"] and Evidence(**document["evidence"]),
-                alternatives=tuple(map(_alternative_from_json, document["alternatives"])),
-                covariance=_covariance_from_json(document),
+                alternatives=tuple(map(alternative_from_json, document["alternatives"])),
+                covariance=covariance_from_json(document),
                 height_above_floor=document["height_above_floor_m"],
-                walk=document["walk"] and _walk_from_json(document["walk"]),
+                walk=document["walk"] and walk_from_json(document["walk"]),
                 warnings=tuple(document["warnings"]),
                 **{name: document[name] for name in _PLAIN_FIELDS},
             )
@@ -212,73 +221,14 @@ _PLAIN_FIELDS = (
 )
 
 
-def _rotation_and_center(pose: Pose) -> dict[str, object]:
-    return {"R_cam_from_world": pose.R_cam_from_world.tolist(), "center_world": pose.center_world.tolist()}
-
-
-def _pose_json(pose: Pose | None) -> dict[str, object] | None:
-    """A pose in all its forms, POSE_FIELDS."""
-    if pose is None:
-        return None
-    quaternion, T = quaternion_wxyz(pose.R_cam_from_world), T_world_from_cam(pose)
-    other = {"quaternion_wxyz": quaternion.tolist(), "T_world_from_cam": T.tolist()}
-    return {**_rotation_and_center(pose), **other}
-
-
 def _source_from_json(document: dict[str, Any]) -> Source:
     values = {f.name: document[f.name] for f in fields(Source)}
     return Source(**values | {"image_size": values["image_size"] and tuple(values["image_size"])})
 
 
-def _gps_prior_from_json(value: dict[str, Any] | None) -> GpsPrior | None:
-    return (
-        None if value is None else GpsPrior(tuple(value["center_world"]), value["radius"], value["is_used"])
-    )
-
-
 def _best_pose_from_json(document: dict[str, Any]) -> Pose | None:
     own = document if document["status"] == LOCALIZED else document["best_guess"]
     return None if own is None else Pose(np.array(own["R_cam_from_world"]), np.array(own["center_world"]))
-
-
-def _covariance_from_json(document: dict[str, Any]) -> PoseCovariance | None:
-    matrix = document["covariance"]
-    return (
-        None if matrix is None else PoseCovariance(np.array(matrix), document["least_constrained_direction"])
-    )
-
-
-def _alternative_json(alternative: Alternative) -> dict[str, object]:
-    numbers = {f.name: getattr(alternative, f.name) for f in fields(alternative) if f.name != "pose"}
-    return _rotation_and_center(alternative.pose) | numbers
-
-
-def _alternative_from_json(document: dict[str, Any]) -> Alternative:
-    pose = Pose(np.array(document["R_cam_from_world"]), np.array(document["center_world"]))
-    return Alternative(pose, **{f.name: document[f.name] for f in fields(Alternative) if f.name != "pose"})
-
-
-def _walk_json(walk: WalkFrame) -> dict[str, object]:
-    alone: dict[str, object] | None = None
-    if walk.alone is not None:
-        about = {"status": walk.alone.status, "confidence": walk.alone.confidence}
-        alone = {**about, **(_pose_json(walk.alone.pose) or dict.fromkeys(POSE_FIELDS))}
-    return {
-        "frame": walk.frame,
-        "time": walk.time,
-        "how": walk.how,
-        "alone": alone,
-        "gap": walk.gap and asdict(walk.gap),
-    }
-
-
-def _walk_from_json(value: dict[str, Any]) -> WalkFrame:
-    gap, alone = value["gap"], value["alone"]
-    if alone is not None:
-        R, center = alone["R_cam_from_world"], alone["center_world"]
-        pose = None if R is None else Pose(np.array(R), np.array(center))
-        alone = Alone(alone["status"], alone["confidence"], pose)
-    return WalkFrame(value["time"], value["frame"], value["how"], alone, gap and Gap(**gap))
 
 
 def _place(alternative: Alternative) -> str:

@@ -1,16 +1,14 @@
 """A scan that photos are localized in: what `import piccolo` gives."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
-from os import PathLike
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypedDict, Unpack
+from typing import Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .camera import Calibration
-from .camera.files import read_calibration, read_rig
 from .cloud.settings import CloudSettings
 from .cloud.soa import PackedPoints
 from .coarse_to_fine.focal_refinement import localize_and_refine_focal
@@ -19,20 +17,18 @@ from .coarse_to_fine.localize import localize
 from .coarse_to_fine.named_scans import check_within
 from .coarse_to_fine.places import with_places
 from .coarse_to_fine.scan_map import ScanMap
-from .coarse_to_fine.settings import CoarseToFineSettings, Prior
+from .coarse_to_fine.settings import CoarseToFineSettings
 from .confidence.confidence import LOCALIZED
 from .confidence.localization import Localization
 from .confidence.occlusion import occlusion_mask
 from .errors import InputError
 from .geometry.pose import Pose
-from .geometry.rotations import Gravity
-from .optimize.settings import Solver
 from .panorama import Panorama, ReadOptions, read_query
-from .panorama.model import Projection
 from .panorama.photo import Photo, photo_of, photo_of_array
 from .paper.localize import PaperMap
 from .paper.localize import localize as localize_by_paper
 from .paper.settings import PaperSettings
+from .query_options import File, QueryOptions, Settings, asked_of
 from .result import Result, Source, result_of
 from .runtime.stopwatch import Stopwatch
 from .runtime.threads import Workers
@@ -40,52 +36,7 @@ from .scan_walk import Walk, WalkAbout
 from .walk.frames import MAX_ACCELERATION, MAX_SPEED, Motion
 from .walk.tracker import Tracker
 
-File = str | PathLike[str]
-Settings = CoarseToFineSettings | PaperSettings
 LABELS_WARNING = "labels: the confidence was learnt on colours, and is a rough guide only"
-
-
-class QueryOptions(TypedDict, total=False):
-    """What `Scan.localize` may be told about a photo; all may be left out."""
-
-    mask: File | NDArray[np.bool_]  # what is to be ignored: white pixels of a picture, True of an array
-    mask_nadir_deg: float  # the cap of this half angle about the camera's down axis is ignored
-    fov_deg: float  # horizontal field of view of a picture that is a part of the sphere
-    projection: Projection  # of the picture: "equirectangular", "pinhole" or "fisheye"
-    focal_px: float  # focal length of a pinhole photo [px]
-    camera: File  # calibration of the camera, see docs/CAMERAS.md
-    rig: File  # the same of several cameras; the panorama is the folder of one instant's pictures
-    gravity_vector: tuple[float, float, float]  # down, in the camera's axes
-    refine_focal: bool  # the focal length is a first guess
-    cube_order: str  # the picture is six cube faces in this order, such as "rludfb"
-    use_gps: bool  # a GPS position in the file narrows the search (default), or not
-    gravity: Gravity  # "known": upright camera, "unknown": any rotation, "auto": both are tried
-    solver: Solver  # of the last descent
-    near_world: tuple[float, float, float]  # [m] the camera is within `radius` of this
-    radius: float  # [m]
-    height: tuple[float, float]  # [m] least and most above the floor
-    heading_deg: float  # of the image centre, clockwise from the cloud's +y
-    heading_tolerance_deg: float
-    within: tuple[str, ...]  # names of the map's scans that the camera may be in
-    min_confidence: float  # below it a pose is not called localized
-
-
-def refuse_unknown(options: Mapping[str, object], known: type, function: str) -> None:
-    """TypeError for an option that is none, as Python has it for keywords."""
-    for name in options.keys() - known.__annotations__.keys():
-        raise TypeError(f"{function}() has no option {name!r}; it has {', '.join(known.__annotations__)}")
-
-
-READ_FIELDS = {f.name for f in fields(ReadOptions)}
-PRIOR_FIELDS = {f.name for f in fields(Prior)}
-
-
-class Asked(NamedTuple):
-    """What options say of a photo."""
-
-    read_options: ReadOptions
-    settings: Settings
-    is_masked: NDArray[np.bool_] | None  # of an array
 
 
 @dataclass(frozen=True)
@@ -142,7 +93,7 @@ class Scan:
         >>> result.status, result.pose.center_world.round(2)
         ('localized', array([2.6 , 3.17, 1.21]))
         """
-        asked = self._asked(options, "localize")
+        asked = asked_of(options, "localize", self.settings, self.cloud_settings)
         return self.localize_query(panorama, asked.read_options, asked.settings, asked.is_masked)
 
     def localize_many(
@@ -151,29 +102,6 @@ class Scan:
         """The result of each panorama in order, as it comes; options as in `localize`."""
         for panorama in panoramas:
             yield self.localize(panorama, **options)
-
-    def _asked(self, options: QueryOptions, function: str) -> "Asked":
-        """What options say."""
-        refuse_unknown(options, QueryOptions, function)
-        given: dict[str, Any] = dict(options)
-        is_masked = given.pop("mask") if isinstance(given.get("mask"), np.ndarray) else None
-        if "mask" in given:
-            given["mask"] = Path(given["mask"])
-        prior = {k: given.pop(k) for k in PRIOR_FIELDS & given.keys()}
-        if isinstance(prior.get("within"), str):
-            raise InputError(f"within: found the text {prior['within']!r}, wanted a list of names")
-        if prior:
-            given["prior"] = Prior(**prior | {"within": tuple(prior.get("within", ()))})
-        if "camera" in given and "rig" in given:
-            raise InputError("camera, rig: wanted only one of them")
-        if "camera" in given:
-            given["calibration"] = read_calibration(Path(given.pop("camera")))
-        if "rig" in given:
-            given["calibration"] = read_rig(Path(given.pop("rig")))
-        read_options = ReadOptions(
-            labels=self.cloud_settings.labels, **{k: given.pop(k) for k in READ_FIELDS & given.keys()}
-        )
-        return Asked(read_options, replace(self.settings, **given), is_masked)
 
     def track(
         self,
@@ -192,7 +120,7 @@ class Scan:
         **options
             As in `localize`, of all frames; not `refine_focal`, and `mask` as a path.
         """
-        asked = self._asked(options, "track")
+        asked = asked_of(options, "track", self.settings, self.cloud_settings)
         return self.walk(asked.read_options, asked.settings, Motion(max_speed, max_acceleration))
 
     def localize_walk(
@@ -206,11 +134,6 @@ class Scan:
         """The results of a walk's frames, in order: each told by those before and after it.
 
         `times` [s] rise; without them only the order counts. The others are as in `track`.
-
-        Examples
-        --------
-        >>> frames = [f"walk/images/clean_walk_0_{k:04}.jpg" for k in range(120)]
-        >>> results = scan.localize_walk(frames, times=[0.5 * k for k in range(120)])
         """
         walk = self.track(max_speed, max_acceleration, **options)
         for k, frame in enumerate(frames):

@@ -2,7 +2,9 @@
 
 import csv
 import sys
+from dataclasses import replace
 from importlib import import_module
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -11,7 +13,9 @@ from poses import json_of, lines_of, result, tilted_poses
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, rotation_from_quaternion_wxyz
 from piccolo.geometry.rotations import heading_pitch_roll_deg
+from piccolo.result import Source
 from piccolo.scenes.export import Options, export
+from piccolo.walk.localize import Gap, WalkFrame
 
 POSES = tilted_poses(4)
 EYE = np.eye(3)
@@ -137,6 +141,38 @@ def test_geojson_is_in_wgs84(tmp_path):
     convergence = (longitude - 9.0) * np.sin(np.radians(latitude))
     assert convergence > 2.0
     assert second["properties"]["heading_true_deg"] == pytest.approx(75.0 + convergence, abs=0.01)
+
+
+def _frame(number, time, gap=None):
+    """What a walk says of a frame."""
+    return WalkFrame(time, number, "tracked", None, gap)
+
+
+def test_gpx_is_a_track_with_a_segment_behind_each_gap(tmp_path):
+    places = [np.array([500_000.0 + 10.0 * k, 5_538_630.7026, 80.5]) for k in range(4)]
+    results = [
+        result(f"{k}.jpg", Pose(EYE, place), walk=_frame(k, 0.5 * k, Gap(30.0, 1.0) if k == 2 else None))
+        for k, place in enumerate(places)
+    ]
+    taken = replace(results[0], source=Source(capture_time="2026-11-22T10:00:00+01:00"))
+    export([taken, *results[1:]], "gpx", tmp_path / "p.gpx", Options(crs="EPSG:32632"))
+    root = ElementTree.parse(tmp_path / "p.gpx").getroot()
+    names = {"g": "http://www.topografix.com/GPX/1/1"}
+    segments = root.findall("g:trk/g:trkseg", names)
+    assert [len(segment.findall("g:trkpt", names)) for segment in segments] == [2, 2]
+    first = segments[0].find("g:trkpt", names)
+    np.testing.assert_allclose([float(first.get("lon")), float(first.get("lat"))], [9.0, 50.0], atol=1e-8)
+    assert first.find("g:time", names).text == "2026-11-22T10:00:00+01:00"
+    assert [point.text for point in root.iterfind(".//g:name", names)] == [f"{k}.jpg" for k in range(4)]
+    assert len(root.findall(".//g:time", names)) == 1
+
+
+def test_tum_has_the_times_of_a_walk(tmp_path):
+    walked = [replace(r, walk=_frame(k, 0.25 * k)) for k, r in enumerate(_results())]
+    export(walked, "tum", tmp_path / "p.tum", Options(timestamps="walk"))
+    assert [float(line.split()[0]) for line in lines_of(tmp_path / "p.tum")] == [0.0, 0.25, 0.5, 0.75]
+    with pytest.raises(InputError, match=r"^a\.jpg: found no frame of a walk, as --timestamps walk needs$"):
+        export(_results(), "tum", tmp_path / "q.tum", Options(timestamps="walk"))
 
 
 @pytest.mark.parametrize(

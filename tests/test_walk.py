@@ -1,7 +1,9 @@
-"""Walks through a small building, in Python and on the command line."""
+"""A walk through a room, in Python and on the command line."""
 
 import json
 from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -12,24 +14,58 @@ import piccolo
 from piccolo.batch.frame_times import times_of
 from piccolo.cli import localize as localize_command
 from piccolo.cli import localize_walk as walk_command
+from piccolo.cloud.ply_writer import vertex_rows, write_ply
 from piccolo.errors import InputError
-from piccolo.geometry.pose import pose_errors
+from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
 from piccolo.result import read_results
+from piccolo.runtime.threads import Workers
 from piccolo.scan_walk import Walk
-from piccolo.scenes.scene import read_scene
+from piccolo.scenes.export.video import writing_video
+from piccolo.scenes.synthetic.world import free_position, photograph
+
+NUM_FRAMES, STEP_S = 8, 0.5
+
+
+class Taken(NamedTuple):
+    """A frame of the walk, as a scene on disk has it."""
+
+    image: Path
+    pose: Pose
+    time: float
+
+
+def _walk_through(world):
+    """Poses from one free place of a room to the farthest of some others, turning a little."""
+    rng, room = np.random.default_rng(4), world.rooms[0]
+    start, *others = (free_position(room, rng, (1.4, 1.5)) for _ in range(12))
+    end = max(others, key=lambda place: np.linalg.norm(place - start))
+    end = start + (end - start) / np.linalg.norm(end - start) * 1.6
+    shares = np.linspace(0.0, 1.0, NUM_FRAMES)
+    return [Pose(yaw_rotation(0.3 + 0.8 * s), start + s * (end - start)) for s in shares]
 
 
 @pytest.fixture(scope="module")
 def building(tmp_path_factory):
-    """Two rooms, a corridor, and a walk of a frame a second; as files and as the scene's queries."""
-    words = "--rooms 2 --storeys 1 --walk 8 --frame-rate 1 --width 512 --points 40000 --seed 2 --video"
-    folder = rooms.write_room(tmp_path_factory.mktemp("walk") / "a b", words)
-    return folder, [query for query in read_scene(folder).queries if query.walk]
+    """A scan of a room, frames and a video of a walk through it; the folder, and the frames."""
+    folder = tmp_path_factory.mktemp("walk") / "a b"
+    (folder / "images").mkdir(parents=True)
+    world, cloud = rooms.room(3)
+    points = cloud.points.astype(np.float64) + cloud.origin_world
+    write_ply(folder / "cloud.ply", vertex_rows(points, cloud.colors))
+    frames = []
+    with writing_video(folder / "walk.mp4", 1 / STEP_S, (rooms.WIDTH, rooms.WIDTH // 2)) as add:
+        for k, pose in enumerate(_walk_through(world)):
+            rgb = photograph(world.rooms[0], pose, rooms.WIDTH, Workers(2))
+            path = folder / "images" / f"{k:02}.png"
+            cv2.imwrite(str(path), rgb[..., ::-1])
+            add(rgb)
+            frames.append(Taken(path, pose, STEP_S * k))
+    return folder, frames
 
 
 @pytest.fixture(scope="module")
 def scan(building):
-    """The building's scan."""
+    """The room's scan."""
     return piccolo.open_scan(building[0] / "cloud.ply", cache=False, num_threads=2)
 
 
@@ -66,7 +102,7 @@ def test_a_walk_with_bad_frames_between(scan, building):
 
 def test_live_results_come_frame_by_frame_and_need_no_times(scan, building):
     _, queries = building
-    tracker = scan.track(max_speed=3.0, gravity="known")
+    tracker = scan.track(max_speed=0.5, gravity="known")
     live = [tracker.add(q.image) for q in queries]
     _assert_right(live, queries)
     assert [result.walk.time for result in live] == [float(k) for k in range(len(queries))]
@@ -145,19 +181,19 @@ def test_results_of_another_walk_are_not_overwritten(building, tmp_path, capsys)
 
 
 def test_a_video_is_a_walk(building, tmp_path):
-    """A frame every two seconds, named by its time; and a metre apart."""
+    """A frame every second, named by its time; and half a metre apart."""
     folder, queries = building
-    (video,) = folder.glob("*.mp4")
+    video = folder / "walk.mp4"
     out = tmp_path / "video.jsonl"
-    assert _command(folder, "--video", str(video), "--every", "2s", "--out", str(out)) == 0
+    assert _command(folder, "--video", str(video), "--every", "1s", "--out", str(out)) == 0
     results = read_results([out])
     _assert_right(results, queries[: 2 * len(results) : 2])
-    assert [r.pano for r in results] == [f"{video}#t={2 * k}.000" for k in range(len(results))]
+    assert [r.pano for r in results] == [f"{video}#t={k}.000" for k in range(len(results))]
     assert len(results) == (len(queries) + 1) // 2
-    assert _command(folder, "--video", str(video), "--every", "1.5m", "--out", str(out), "--overwrite") == 0
+    assert _command(folder, "--video", str(video), "--every", "0.5m", "--out", str(out), "--overwrite") == 0
     centers = [r.pose.center_world for r in read_results([out])]
     assert 2 <= len(centers) < len(queries)
-    assert all(np.linalg.norm(b - a) >= 1.5 for a, b in pairwise(centers))
+    assert all(np.linalg.norm(b - a) >= 0.5 for a, b in pairwise(centers))
 
 
 REFUSED = {

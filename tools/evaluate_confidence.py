@@ -24,10 +24,10 @@ from piccolo.geometry.rotations import Gravity
 from piccolo.opening import scan_of
 from piccolo.panorama import AS_STORED, read_panorama
 from piccolo.paper.settings import PaperSettings
+from piccolo.query_options import Settings
 from piccolo.result import Result
 from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers, num_cores
-from piccolo.scan import Settings
 from piccolo.scenes.scene import Scene, read_scene
 from piccolo.scenes.synthetic.alike import ALIKE_KINDS, CHANGED, make_alike
 from piccolo.scenes.synthetic.damage import occluded, outside_field, unevenly_lit, without_texture

@@ -14,7 +14,8 @@ from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..errors import InputError
 from ..panorama import ReadOptions
 from ..panorama.photo import photo_of
-from ..scan import Settings, settings_json
+from ..query_options import Settings
+from ..scan import settings_json
 from .priors import PriorTable
 from .results_file import WAYS, check_finished, finished_lines
 

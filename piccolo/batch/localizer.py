@@ -14,12 +14,13 @@ from ..coarse_to_fine.open_map import CachePolicy
 from ..errors import InputError
 from ..opening import open_files
 from ..panorama import ReadOptions, read_panorama
+from ..query_options import Settings
 from ..render.surfel_renderer import encode_image, overlay_png
 from ..result import Result, Source, named, unreadable_result
 from ..runtime.cluster import sent_file
 from ..runtime.memory import limit_memory
 from ..runtime.threads import Workers
-from ..scan import Scan, Settings, settings_json
+from ..scan import Scan, settings_json
 from .batch import pano_sha256
 
 

@@ -47,8 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(group, "--offset X Y Z", f"subtracted from positions, written beside ({_takers('offset')})")
     text = "optical (default): right, down, forward; piccolo: forward, left, up"
     option(group, "--axes", f"{text} ({_takers('axes')})", choices=CAMERA_AXES)
-    text = "index (default): 0, 1, ...; name: the number that is the picture's name"
-    option(group, "--timestamps", f"{text} ({_takers('timestamps')})", choices=["index", "name"])
+    text = "index (default): 0, 1, ...; name: the number that is the picture's name; walk: of the frame"
+    option(group, "--timestamps", f"{text} ({_takers('timestamps')})", choices=["index", "name", "walk"])
     option(group, "--crs EPSG", f"of the cloud's coordinates, such as EPSG:25832 ({_takers('crs')})")
 
 

@@ -9,9 +9,10 @@ from ..cloud.settings import METRES, CloudSettings, UpAxis
 from ..coarse_to_fine.open_map import CachePolicy, open_map
 from ..coarse_to_fine.scan_map import ScanMap
 from ..errors import InputError
+from ..query_options import File, refuse_unknown
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import ProgressCallback, Workers, no_progress, num_cores, progress_to
-from ..scan import File, Scan, refuse_unknown
+from ..scan import Scan
 from .build import WIDTH, ReportSettings, build_report
 from .entries import read_entries
 from .own_plan import OwnPlan

@@ -6,13 +6,14 @@ from pathlib import Path
 from ...errors import InputError
 from ...result import Result
 from ...runtime.atomic import check_output, check_output_folder
-from .formats import COLMAP, CSV, GEOJSON, KITTI, NERFSTUDIO, OPENSFM, POTREE, TUM
+from .formats import COLMAP, CSV, KITTI, NERFSTUDIO, OPENSFM, POTREE, TUM
 from .gpano import GPANO
 from .posed_images import Format, Options, Selection, posed_images, select, true_results
+from .world_maps import GEOJSON, GPX
 
 __all__ = ["FORMATS", "Format", "Options", "Selection", "export", "select", "true_results"]
 
-_ALL = COLMAP, NERFSTUDIO, OPENSFM, TUM, KITTI, CSV, GEOJSON, POTREE, GPANO
+_ALL = COLMAP, NERFSTUDIO, OPENSFM, TUM, KITTI, CSV, GEOJSON, GPX, POTREE, GPANO
 FORMATS: dict[str, Format] = {form.name: form for form in _ALL}
 
 

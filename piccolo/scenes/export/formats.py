@@ -10,7 +10,6 @@ import json
 from collections.abc import Iterable, Sequence
 from decimal import Decimal
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,7 +24,6 @@ from ...geometry.rotations import (
     turned,
 )
 from ...runtime.atomic import is_stream, replacing_folder, write_atomically
-from ...runtime.optional import import_optional
 from .posed_images import Format, Options, PosedImage
 
 COLUMNS = (
@@ -33,9 +31,6 @@ COLUMNS = (
     *("quaternion_w", "quaternion_x", "quaternion_y", "quaternion_z"),  # of R_cam_from_world
     *("heading_deg", "pitch_deg", "roll_deg"),
 )
-STEP = 10.0  # [m] ahead, to find true north
-MARGIN_DEG = 3.0  # around a system's area: a country that spans two zones often uses one for both
-LOCAL = 10_000.0  # [m] from (0, 0): without a margin, as scans with coordinates of their own lie there
 
 
 def numbers(values: Iterable[float], separator: str = " ") -> str:
@@ -212,63 +207,6 @@ def write_json(out: Path, document: object) -> None:
     write_atomically(out, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
 
 
-def write_geojson(images: Sequence[PosedImage], out: Path, options: Options) -> None:
-    """Write a FeatureCollection (RFC 7946) with a point a result: longitude and latitude in WGS84."""
-    pyproj, crs = import_optional("GeoJSON", "pyproj", "tools"), options.crs
-    if crs is None:
-        raise InputError("--crs: not given, wanted the cloud's coordinate system, such as EPSG:25832")
-    try:
-        system = pyproj.CRS.from_user_input(crs)
-    except pyproj.exceptions.CRSError as error:
-        raise InputError(f"--crs: found {crs!r}, wanted a coordinate system such as EPSG:25832") from error
-    units = {axis.unit_name for axis in system.axis_info[:2]}
-    if not system.is_projected or units != {"metre"}:
-        raise InputError(f"--crs: found {crs} ({system.name}), wanted a projected system in metres")
-    transformer = pyproj.Transformer.from_crs(system, "EPSG:4326", always_xy=True)
-    for image in images:
-        _check_place(image, system, transformer, crs)
-    features = [_feature(image, transformer, pyproj.Geod(ellps="WGS84"), crs) for image in images]
-    write_json(out, {"type": "FeatureCollection", "features": features})
-
-
-def _check_place(image: PosedImage, system: Any, transformer: Any, crs: str) -> None:
-    """Refuse a camera outside of the area where the system is used, as far as the system says it."""
-    x, y = image.pose.center_world[:2].tolist()
-    longitude, latitude = transformer.transform(x, y)
-    parts = [system, *system.sub_crs_list]  # a system with a height says it of its parts
-    area = next((part.area_of_use for part in parts if part.area_of_use), None)
-    if not np.isfinite([longitude, latitude]).all() or (area and not _is_in(area, longitude, latitude, x, y)):
-        name = str(system.name)
-        if area:
-            name += f", {area.west:g} to {area.east:g} E, {area.south:g} to {area.north:g} N"
-        found = f"found a camera at ({x:g}, {y:g})"
-        raise InputError(f"{image.path}: {found}, wanted one where {crs} holds ({name})")
-
-
-def _is_in(area: Any, longitude: float, latitude: float, x: float, y: float) -> bool:
-    """True if a place [deg], (x, y) [m] in the system, is in its area with a margin; some cross 180 E."""
-    margin = 0.0 if np.hypot(x, y) < LOCAL else MARGIN_DEG
-    width = 360.0 if area.east - area.west >= 360.0 else (area.east - area.west) % 360.0
-    is_between = (longitude - area.west + margin) % 360.0 <= width + 2.0 * margin
-    return bool(is_between and area.south - margin <= latitude <= area.north + margin)
-
-
-def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[str, object]:
-    """The point without a height, which would have to be above WGS84's ellipsoid: z is a property."""
-    result, (x, y, z) = image.result, image.pose.center_world.tolist()
-    heading, pitch, roll = heading_pitch_roll_deg(image.pose)
-    ahead = np.radians(heading)
-    eastings, northings = [x, x + STEP * np.sin(ahead)], [y, y + STEP * np.cos(ahead)]
-    longitudes, latitudes = transformer.transform(eastings, northings)
-    true_heading, _, _ = geod.inv(longitudes[0], latitudes[0], longitudes[1], latitudes[1])
-    properties: dict[str, object] = {"image": image.name, "cloud": result.cloud_name, "status": result.status}
-    properties |= {"confidence": result.confidence, "score": result.evidence and result.evidence.score}
-    properties |= {"crs": crs, "x": x, "y": y, "z": z, "heading_deg": heading}
-    properties |= {"heading_true_deg": true_heading % 360.0, "pitch_deg": pitch, "roll_deg": roll}
-    point = {"type": "Point", "coordinates": [longitudes[0], latitudes[0]]}
-    return {"type": "Feature", "geometry": point, "properties": properties}
-
-
 OFFSET, MODEL = frozenset({"offset"}), frozenset({"size", "offset"})
 COLMAP_TEXT = "text model of COLMAP 4 and pycolmap; --out is a new folder"
 NERFSTUDIO_TEXT = "transforms.json of nerfstudio, in the folder that --images names"
@@ -282,5 +220,3 @@ KITTI = Format("kitti", "trajectory for evo and others", write_kitti, OFFSET | {
 POTREE = Format(
     "potree", POTREE_TEXT, write_potree, OFFSET | {"timestamps"}, forbidden='"', cameras="spheres"
 )
-GEOJSON_TEXT = "points for maps, in WGS84; needs --crs and the library pyproj"
-GEOJSON = Format("geojson", GEOJSON_TEXT, write_geojson, frozenset({"crs"}), has_unique_names=False)

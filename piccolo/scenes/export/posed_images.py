@@ -43,7 +43,7 @@ class Options:
     size: tuple[int, int] | None = None  # W, H [px] of all pictures; None: read from each
     offset: tuple[float, float, float] | None = None  # subtracted from positions [m]
     axes: str = "optical"  # of the camera in a trajectory: "optical" or "piccolo"
-    timestamps: str = "index"  # "index", or "name": the number that is the picture's name
+    timestamps: str = "index"  # "index"; "name": the number that is the picture's name; "walk": of its frame
     crs: str | None = None  # of the cloud's coordinates, such as EPSG:25832
 
     def __post_init__(self) -> None:
@@ -122,6 +122,10 @@ def posed_images(results: Sequence[Result], form: Format, options: Options) -> l
             image = _posed_image(result, path, mount, form, options)
             if options.timestamps == "index":
                 image = image._replace(time=str(index))
+            elif options.timestamps == "walk":
+                if result.walk is None:
+                    raise InputError(f"{path}: found no frame of a walk, as --timestamps walk needs")
+                image = image._replace(time=repr(result.walk.time))
             elif not TIMESTAMP.fullmatch(image.time):
                 raise InputError(f"{path}: its name {path.stem!r} is no number, as --timestamps name needs")
             key = image.name if form.has_unique_names else str(index)
