@@ -14,15 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import _checkout  # noqa: F401
+from playwright.sync_api import sync_playwright
 
 from piccolo.cli import report
 from piccolo.cli.command import command, option
 from piccolo.cli.options import add_cloud_options
 from piccolo.errors import InputError
-from piccolo.runtime.optional import import_optional
 
 PHOTOS = 20  # opened in the page
-# milliseconds from frame to frame while the plan is moved; {} is "zoom" or "pan"
+# milliseconds from frame to frame while the plan is moved; kind is "zoom" or "pan"
 FRAMES = """kind => new Promise(resolve => {
   const plan = document.getElementById('plan'), box = plan.getBoundingClientRect(), times = [];
   const at = (x, y) => ({ clientX: box.left + x, clientY: box.top + y, bubbles: true, cancelable: true });
@@ -46,11 +46,10 @@ FRAMES = """kind => new Promise(resolve => {
 
 def measure_page(index: Path) -> dict[str, float]:
     """First view [s], median frames a second while zooming and moving, memory of the tab [MB]."""
-    playwright = import_optional("the page", "playwright.sync_api", "browser")
     chromium = shutil.which("chromium")
     if chromium is None:
         raise InputError("found no chromium, wanted it installed: apt-get install chromium")
-    with playwright.sync_playwright() as p:
+    with sync_playwright() as p:
         flags = ["--no-sandbox", "--enable-unsafe-swiftshader"]
         browser = p.chromium.launch(executable_path=chromium, args=flags)
         page = browser.new_page(viewport={"width": 1440, "height": 900})

@@ -2,7 +2,7 @@
 import { h } from "./dom";
 import { badge } from "./marks";
 import type { Model } from "./model";
-import { shortName } from "./plan";
+import { shortName } from "./plan_painter";
 import { text } from "./text";
 import type { Photo } from "./types";
 

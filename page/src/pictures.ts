@@ -6,6 +6,7 @@ export interface Images {
   scan: ImageBitmap | null;
   mask: ImageBitmap | null;
   alternatives: (ImageBitmap | null)[];
+  reach: Uint8Array | null;
 }
 
 const KEPT = 4; // photos whose pictures stay in memory
@@ -39,12 +40,15 @@ async function decoded(key: string, most: number): Promise<Images> {
     picture(pictures.mask, "image/png"),
     ...(pictures.alternatives ?? []).map((data) => picture(data)),
   ]);
-  return { sphere, scan, mask, alternatives };
+  return { sphere, scan, mask, alternatives, reach: pictures.reach ? bytesOf(pictures.reach) : null };
+}
+
+function bytesOf(data: string): Uint8Array<ArrayBuffer> {
+  return Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0));
 }
 
 async function bitmap(data: string, type: string, most: number): Promise<ImageBitmap> {
-  const bytes = Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0));
-  const blob = new Blob([bytes], { type });
+  const blob = new Blob([bytesOf(data)], { type });
   const whole = await createImageBitmap(blob);
   if (whole.width <= most) return whole;
   whole.close();

@@ -3,7 +3,7 @@ import { h, svg } from "./dom";
 import { percent } from "./list";
 import { shape } from "./marks";
 import { ahead, type Model } from "./model";
-import { shortName } from "./plan";
+import { shortName } from "./plan_painter";
 import { text } from "./text";
 import type { Photo, Storey } from "./types";
 

@@ -98,6 +98,8 @@ export interface Pictures {
   sphere: string;
   scan?: string;
   mask?: string;
+  /** How far one can see, 96 x 48 bytes of a sphere [0.1 m]. */
+  reach?: string;
   alternatives?: (string | null)[];
 }
 

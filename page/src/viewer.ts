@@ -2,7 +2,7 @@
 import { h } from "./dom";
 import { FOV, type Mode, type Model } from "./model";
 import { imagesOf } from "./pictures";
-import { shortName } from "./plan";
+import { shortName } from "./plan_painter";
 import { Sphere } from "./sphere";
 import { text } from "./text";
 import type { Photo, Pose, Vector } from "./types";
@@ -11,6 +11,8 @@ const MODES: Mode[] = ["photo", "blend", "split", "scan"];
 const REACH = 9; // m, to photos that one can go to
 const APART = 0.6; // rad, between ways to them
 const MOST_WAYS = 7;
+const REACH_WIDTH = 96; // px of the sphere that tells how far one can see
+const SLACK = 0.4; // m, of that
 const FOOT = 1.5; // m, height of a camera where no floor is known
 
 interface Way {
@@ -161,7 +163,7 @@ export class Viewer {
   private async open(): Promise<void> {
     const { photo } = this.model;
     const asked = ++this.asked;
-    this.findWays();
+    this.findWays(null);
     if (!photo) return;
     if (!photo.hasPictures) return this.say(photo.error ?? text.noPictures, true);
     if (!this.sphere) {
@@ -181,6 +183,7 @@ export class Viewer {
       this.looked();
       this.sphere.show({ photo: images.sphere, scan, mask: alternative === null ? images.mask : null, rotation }, true);
       this.say(photo.pose ? "" : text.noScan, false);
+      this.findWays(images.reach);
       this.combine();
       this.box.dataset.shown = String(this.model.selected);
     } catch {
@@ -217,16 +220,16 @@ export class Viewer {
     this.placeWays();
   }
 
-  /** The photos around that one can go to: the nearest in each direction. */
-  private findWays(): void {
+  /** The photos around that one can go to: the nearest in each direction, of those that the scan lets one see. */
+  private findWays(reach: Uint8Array | null): void {
     const from = this.pose;
     this.waysBox.replaceChildren();
     this.ways = [];
-    if (!from || this.model.alternative !== null) return;
+    if (!from || !reach || this.model.alternative !== null) return;
     for (const [index, photo, metres] of this.near(from)) {
       const way = this.wayTo(index, photo, metres, from);
       const isFree = this.ways.every((other) => angleBetween(other.to, way.to) > APART);
-      if (!isFree) continue;
+      if (!isFree || !isSeen(reach, from, photo.pose!, metres)) continue;
       this.ways.push(way);
       if (this.ways.length === MOST_WAYS) break;
     }
@@ -272,6 +275,16 @@ export class Viewer {
       button.style.zIndex = String(Math.round(100 - 10 * metres));
     }
   }
+}
+
+/** True if no wall is between two cameras, by how far one can see from the first. */
+function isSeen(reach: Uint8Array, from: Pose, other: Pose, metres: number): boolean {
+  const d = other.center.map((value, axis) => value - from.center[axis]);
+  const r = from.rotation;
+  const [x, y, z] = [0, 3, 6].map((row) => r[row] * d[0] + r[row + 1] * d[1] + r[row + 2] * d[2]);
+  const column = Math.floor((0.5 - Math.atan2(y, x) / (2 * Math.PI)) * REACH_WIDTH) % REACH_WIDTH;
+  const row = Math.min(REACH_WIDTH / 2 - 1, Math.floor((0.5 - Math.atan2(z, Math.hypot(x, y)) / Math.PI) * (REACH_WIDTH / 2)));
+  return reach[row * REACH_WIDTH + column] / 10 > metres - SLACK;
 }
 
 function angleBetween(a: Vector, b: Vector): number {

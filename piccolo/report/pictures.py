@@ -22,12 +22,14 @@ from ..panorama.model import shrink
 from ..render.field import cut
 from ..render.surfel_renderer import encode_image, fill_holes, render_surfels, visible_indices
 from ..render.surfels import Surfels
+from ..render.zbuffer import View
 from ..result import Result
 from ..runtime.threads import Workers
 
 QUALITY, THUMB_QUALITY = 80, 78  # of JPEG
 THUMB_SIZE, THUMB_FOV_DEG = (256, 160), 100.0
 MASK_WIDTH, SCAN_WIDTH, ALTERNATIVE_WIDTH = 1024, 1536, 1024  # [px] a voxel of the map is wider than a pixel
+REACH_SIZE = (96, 48)  # [px]
 LEAST_PROBABILITY, MAX_ALTERNATIVES = 0.02, 3  # of alternatives from which the scan is drawn
 MAX_WIDTH = 8192  # [px] of a sphere at full size
 GAP = 0.004  # by the width: wider gaps are marked as not scanned
@@ -69,11 +71,13 @@ def make_pictures(
     document: dict[str, Any] = {"sphere": _base64(encode_image(small.rgb, ".jpg", QUALITY))}
     if poses:
         view_width = min(full, SCAN_WIDTH) & ~1
-        document["scan"] = _base64(scan_picture(surfels, poses[0], view_width))
+        view = scan_view(surfels, poses[0], view_width)
+        document["scan"] = _base64(scan_picture(view))
+        document["reach"] = _base64(reach_of(view).tobytes())
         mask = occlusion_mask(points, shrink(panorama, MASK_WIDTH), poses[0])
         document["mask"] = _base64(encode_image(mask, ".png"))
         document["alternatives"] = [
-            _base64(scan_picture(surfels, pose, ALTERNATIVE_WIDTH)) if is_shown else None
+            _base64(scan_picture(scan_view(surfels, pose, ALTERNATIVE_WIDTH))) if is_shown else None
             for pose, is_shown in zip(poses[1:], _shown(result), strict=True)
         ]
     return Pictures(thumbnail_of(small, poses[0] if poses else None), json.dumps(document))
@@ -88,10 +92,20 @@ def _shown(result: Result) -> list[bool]:
     ]
 
 
-def scan_picture(surfels: Surfels, pose: Pose, width: int) -> bytes:
-    """JPEG of the sphere that the scan shows from a pose of its frame; grey where nothing was scanned."""
+def scan_view(surfels: Surfels, pose: Pose, width: int) -> View:
+    """What the scan shows from a pose of its frame."""
     visible = surfels.take(visible_indices(surfels.points, pose.center_world))
-    view = render_surfels(visible, pose, width, Workers())
+    return render_surfels(visible, pose, width, Workers())
+
+
+def reach_of(view: View) -> NDArray[np.uint8]:
+    """How far one can see (h, w) [0.1 m], on a small sphere; 255 for 25.5 m and more, or nothing scanned."""
+    tenths = np.minimum(10.0 * view.depth, 255.0).astype(np.uint8)
+    return np.asarray(cv2.resize(tenths, REACH_SIZE, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def scan_picture(view: View) -> bytes:
+    """JPEG of a view; grey where nothing was scanned."""
     rgb = fill_holes(view.rgb, view.is_seen)
     return encode_image(_grey_where_unscanned(rgb, view.is_seen), ".jpg", QUALITY)
 
