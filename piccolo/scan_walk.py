@@ -4,11 +4,13 @@ import json
 from dataclasses import dataclass, fields, replace
 from os import PathLike
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .coarse_to_fine.places import with_places
+from .coarse_to_fine.query import Query
 from .confidence.localization import Localization
 from .errors import InputError
 from .panorama import Panorama, ReadOptions, read_query
@@ -44,6 +46,14 @@ class Taken:
     error: str | None = None
 
 
+class Prepared(NamedTuple):
+    """A frame that is ready to be followed."""
+
+    taken: Taken
+    panorama: Panorama | None  # None of one that can't be read
+    query: Query | None
+
+
 class Walk:
     """A camera followed through a scan: `add` frames in order; `finish` tells what all say together."""
 
@@ -57,10 +67,10 @@ class Walk:
         A frame that can't be read is a result that says so. `time` [s] is that since any beginning, of all
         frames or of none; `name` stands in the result in place of the path.
         """
-        number = len(self.taken)
-        when = float(number) if time is None else float(time)
-        if self.tracker.frames:
-            checked_times([self.tracker.frames[-1].time, when])
+        return self.follow(self.prepare(frame, name), time)
+
+    def prepare(self, frame: Picture, name: str | None = None) -> Prepared:
+        """Read a frame, and make all of it that does not depend on the others; another thread may do it."""
         watch = Stopwatch()
         name = name or ("array" if isinstance(frame, np.ndarray) else str(frame))
         try:
@@ -71,13 +81,26 @@ class Walk:
             if isinstance(frame, np.ndarray):
                 raise
             text = str(error).replace(str(frame), name)
-            self.accept(Taken(frame, name, None, watch.seconds, error=text), Frame(when))
-            return self._now(self.tracker.frames[-1], number)
-        with watch.stage("track"):
-            found = self.tracker.add(panorama, when)
+            return Prepared(Taken(frame, name, None, watch.seconds, error=text), None, None)
+        with watch.stage("prepare"):
+            query = self.tracker.prepared(panorama)
         warnings = tuple(warning.replace(str(frame), name) for warning in panorama.warnings)
-        self.taken.append(Taken(frame, name, photo, watch.seconds, warnings))
-        return self._now(found, number)
+        return Prepared(Taken(frame, name, photo, watch.seconds, warnings), panorama, query)
+
+    def follow(self, prepared: Prepared, time: float | None = None) -> Result:
+        """The result of `add`, of a frame that was prepared."""
+        number, (taken, panorama, query) = len(self.taken), prepared
+        when = float(number) if time is None else float(time)
+        if self.tracker.frames:
+            checked_times([self.tracker.frames[-1].time, when])
+        watch = Stopwatch(taken.seconds)
+        if panorama is None or query is None:
+            self.accept(taken, Frame(when))
+        else:
+            with watch.stage("track"):
+                self.tracker.add(panorama, query, when)
+            self.taken.append(taken)
+        return self._now(self.tracker.frames[-1], number)
 
     def accept(self, taken: Taken, frame: Frame) -> None:
         """A frame that was found earlier, or that can't be read."""
@@ -95,8 +118,12 @@ class Walk:
     def restore(self, line: str, picture: Path, time: float, name: str) -> bool:
         """Take the next frame from a line of `last_to_json`, if it is of this picture as it is now."""
         document = json.loads(line)
-        if document["pano"] != name or document["frame"]["time"] != time or not document["photo"]:
+        if document["pano"] != name or document["frame"]["time"] != time:
             return False
+        if document["photo"] is None:  # it could not be read
+            taken = Taken(picture, name, None, document["seconds"], error=document["error"])
+            self.accept(taken, Frame.from_json(document["frame"], None))
+            return True
         digest, size, capture_time = document["photo"]
         if photo_of(picture, self.read_options.rig).sha256 != digest:
             return False

@@ -156,8 +156,8 @@ def test_a_walk_that_was_stopped_goes_on_where_it_stood(building, tmp_path, monk
     assert len(lines) == 1 + len(queries)
     kept.write_bytes(b"".join(lines[:-2]) + lines[-2][:30])
     added = []
-    add = Walk.add
-    monkeypatch.setattr(Walk, "add", lambda self, *a: added.append(a[2]) or add(self, *a))
+    prepare = Walk.prepare
+    monkeypatch.setattr(Walk, "prepare", lambda self, *a: added.append(a[1]) or prepare(self, *a))
     assert _command(folder, *walk, str(stopped)) == 0
     assert added == [str(q.image) for q in queries[-2:]]
 

@@ -5,7 +5,8 @@ import json
 import math
 import sys
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from ..runtime.atomic import STDOUT, is_stream, write_atomically
 from ..runtime.line_file import appending, whole_lines, whole_size
 from ..runtime.stopwatch import Stopwatch
 from ..scan import Scan
-from ..scan_walk import Walk
+from ..scan_walk import Prepared, Walk
 from .errors import EXIT_BAD_INPUT, print_error, print_note
 from .interruption import SIGNALS, Interruption, Stopped, interruptible
 from .walking import WalkInput, WalkInputs
@@ -94,19 +95,31 @@ def follow_all(
     left = tqdm(frames[len(walk.taken) :], "frames", len(frames), **bar)
     with interruptible() as interruption, suppress(Stopped):
         if path is None:
-            for frame in left:
-                walk.add(frame.path, frame.time, frame.name)
+            for frame, prepared in ahead(walk, left):
+                walk.follow(prepared, frame.time)
             return interruption
         with appending(path, size) as append:
             if not size:
                 append(key)
-            for frame in left:
+            for frame, prepared in ahead(walk, left):
                 with interruption.postponed():
-                    walk.add(frame.path, frame.time, frame.name)
+                    walk.follow(prepared, frame.time)
                     append(walk.last_to_json())
                 if interruption.number:
                     break
     return interruption
+
+
+def ahead(walk: Walk, frames: Iterable[WalkInput]) -> Iterator[tuple[WalkInput, Prepared]]:
+    """Frames, each prepared while the one before it is followed."""
+    with ThreadPoolExecutor(1) as pool:
+        waiting: tuple[WalkInput, Future[Prepared]] | None = None
+        for frame in frames:
+            last, waiting = waiting, (frame, pool.submit(walk.prepare, frame.path, frame.name))
+            if last is not None:
+                yield last[0], last[1].result()
+        if waiting is not None:
+            yield waiting[0], waiting[1].result()
 
 
 def take_up(walk: Walk, frames: Sequence[WalkInput], path: Path, key: str) -> int:

@@ -122,7 +122,7 @@ def covariance_at(query: Query, points: Cells, pose: Pose) -> Array | None:
         covariance = covariance_of(hessian, block_gradients(image, points, pose))
         return covariance if covariance is None else steps.inflation * covariance
 
-    found = [covariance for steps in STEPS if (covariance := by(steps)) is not None]
+    found = [c for c in query.workers.map(by, STEPS, "covariance") if c is not None]
     if not found:
         return by(ROUGH_STEPS)
     return min(found, key=lambda c: float(np.linalg.eigvalsh(c[3:, 3:])[-1]))

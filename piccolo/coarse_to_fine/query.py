@@ -38,24 +38,25 @@ class QueryImages:
     @property
     def full(self) -> Texels:
         """For the last millimetres."""
-        return self._image(0)
+        return self.image(0)
 
     @property
     def fine(self) -> Texels:
         """For fine views."""
-        return self._image(1)
+        return self.image(1)
 
     @property
     def middle(self) -> Texels:
         """For middle views."""
-        return self._image(2)
+        return self.image(2)
 
     @property
     def search(self) -> Texels:
         """For prepared views."""
-        return self._image(3)
+        return self.image(3)
 
-    def _image(self, k: int) -> Texels:
+    def image(self, k: int) -> Texels:
+        """Of a scale by its number, widest first."""
         if k not in self.made:
             self.made[k] = normalize_panorama(self.panoramas[k], *self.pyramid[k][1:])
         return self.made[k]
@@ -103,6 +104,12 @@ class Query:
         """The photo's colours at the size at which poses are compared."""
         small = resize(self.panorama, COMPARED_WIDTH)
         return pack_texels(small.rgb, small.is_valid)
+
+    def make_images(self) -> None:
+        """Make what descents and comparisons need, before they ask for it."""
+        for k in range(len(self.method.scales)):
+            self.images.image(k)
+        self.photo  # noqa: B018  # kept when it is first asked for
 
     def shown_cells(self, num_rings: int, pose: Pose) -> NDArray[np.bool_]:
         """Which cells (N,) of a grid around a pose in the map the photo shows; all, if it shows a sphere."""

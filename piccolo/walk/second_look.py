@@ -35,6 +35,7 @@ def finished(tracker: Tracker, read: Read) -> Path:
             _complete(tracker, k, step, read)
     path = _path_of(tracker)
     tried: set[tuple[int, int]] = set()
+    searched: set[int] = set()
     for _ in range(MAX_SWEEPS):
         num_found = 0
         for step in (-1, 1):
@@ -42,7 +43,7 @@ def finished(tracker: Tracker, read: Read) -> Path:
                 follower = _follower_of_lost(tracker, path, k, step, tried)
                 panorama = read(k) if follower else None
                 if follower and panorama is not None and panorama.is_valid.any():
-                    num_found += _found_again(tracker, k, follower, panorama)
+                    num_found += _found_again(tracker, k, follower, panorama, searched)
             path = _path_of(tracker)
         if num_found == 0:
             break
@@ -104,8 +105,10 @@ def _follower_of_lost(
     return None if _is_reached(tracker, follower, k) else follower
 
 
-def _found_again(tracker: Tracker, k: int, follower: Follower, panorama: Panorama) -> bool:
-    """True if a frame has got a pose more, near where a follower leads."""
+def _found_again(
+    tracker: Tracker, k: int, follower: Follower, panorama: Panorama, searched: set[int]
+) -> bool:
+    """True if a frame has got a pose more, near where a follower leads; by all means only once."""
     frame = tracker.frames[k]
     query = prepare_query(panorama, tracker.scan_map, tracker.settings, tracker.workers)
     end = follow(query, follower, frame.time, tracker.motion)
@@ -114,7 +117,8 @@ def _found_again(tracker: Tracker, k: int, follower: Follower, panorama: Panoram
     radius = tracker.motion.max_speed * abs(frame.time - follower.time) + REACH_SLACK
     if not found and radius <= MAX_RADIUS:
         found = found_near(query, tracker.scan_map, follower.state.pose, radius, CLEAR_SCORE)
-    if not found and not frame.states and radius <= MAX_RADIUS:
+    if not found and not frame.states and radius <= MAX_RADIUS and k not in searched:
+        searched.add(k)
         return _searched_near(tracker, frame, follower, radius, panorama)
     if found and frame.states:
         more = beside(query, frame.states, found[0])

@@ -63,9 +63,14 @@ class Tracker:
         """All so far."""
         return self.lattice.frames
 
-    def add(self, panorama: Panorama, time: float) -> Frame:
-        """Find the next frame."""
+    def prepared(self, panorama: Panorama) -> Query:
+        """The query of a frame, with the images that its descents need."""
         query = prepare_query(panorama, self.scan_map, self.settings, self.workers)
+        query.make_images()
+        return query
+
+    def add(self, panorama: Panorama, query: Query, time: float) -> Frame:
+        """Find the next frame, whose query is prepared."""
         frame = Frame(time)
         if panorama.is_valid.any() and len(self.scan_map.centers) > 0:
             self._follow(query, frame)
@@ -151,8 +156,10 @@ def follow(query: Query, f: Follower, time: float, motion: Motion) -> Hypothesis
     """Descend from where a camera should be after a pose."""
     seconds, before = time - f.time, f.state.pose
     span = f.time - f.earlier_time
-    starts = [before]
     if f.earlier is not None and span != 0.0:
         reach = motion.max_speed * abs(seconds) + REACH_SLACK
-        starts.insert(0, predicted(before, f.earlier, seconds / span, reach))
-    return tracked(query, starts, least_score(f))
+        end = tracked(query, predicted(before, f.earlier, seconds / span, reach), least_score(f))
+        if end.score >= least_score(f):
+            return end
+        return max((end, tracked(query, before, least_score(f))), key=lambda h: h.score)
+    return tracked(query, before, least_score(f))

@@ -45,15 +45,15 @@ def predicted(before: Pose, earlier: Pose | None, ratio: float, max_distance: fl
     return Pose(exp_so3(turn) @ before.R_cam_from_world, before.center_world + move)
 
 
-def tracked(query: Query, starts: Sequence[Pose], least_score: float) -> Hypothesis:
-    """The pose to which a frame descends from the best of some near it, or from farther around."""
-    ends = [descend_fine(query, descend_middle(query, Hypothesis(pose, 0.0))) for pose in starts]
-    best = max(ends, key=lambda h: h.score)
-    if best.score < least_score:
-        best = max([best, descend_fine(query, perturb_middle(query, best))], key=lambda h: h.score)
-    points = points_at(query, best.pose)
-    pose = descend(points, best.pose.center_world, query.images.full, best.pose, LAST_LIMITS)
-    return max((compared(query, Hypothesis(p, 0.0)) for p in (pose, best.pose)), key=lambda h: h.score)
+def tracked(query: Query, start: Pose, least_score: float) -> Hypothesis:
+    """The pose to which a frame descends from one near it, or where it explains less, from farther around."""
+    near = descend_fine(query, descend_middle(query, Hypothesis(start, 0.0)))
+    if near.score < least_score:
+        near = max([near, descend_fine(query, perturb_middle(query, near))], key=lambda h: h.score)
+    points = points_at(query, near.pose)
+    pose = descend(points, near.pose.center_world, query.images.full, near.pose, LAST_LIMITS)
+    end = compared(query, Hypothesis(pose, 0.0))
+    return end if end.score >= least_score else max(end, compared(query, near), key=lambda h: h.score)
 
 
 def found_near(
@@ -72,7 +72,7 @@ def found_near(
         return []
     least = KEPT_BESIDE * found.best.score
     close = [h for h in (found.best, *found.alternatives) if h.score >= least]
-    return [end for h in close if (end := tracked(query, [h.pose], least)).score >= least]
+    return [end for h in close if (end := tracked(query, h.pose, least)).score >= least]
 
 
 def states_at(query: Query, hypotheses: Sequence[Hypothesis]) -> list[State]:
