@@ -48,6 +48,8 @@ def test_a_mask_is_left_out_and_settings_are_repeated(scan):
     spoilt = np.where(mask[..., None], np.uint8(255), image)
     result = scan.localize(spoilt, mask=mask, gravity="known", heading_tolerance_deg=30.0)
     assert rooms.errors(result.pose, true_pose)[0] < 0.02
+    assert result.storey == 1
+    assert result.height_above_floor == pytest.approx(true_pose.center_world[2], abs=0.05)
     assert result.settings["gravity"] == "known"
     assert result.settings["prior"]["heading_tolerance_deg"] == 30.0
     assert len(repr(scan)) < 1000
