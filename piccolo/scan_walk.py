@@ -17,6 +17,7 @@ from .panorama import Panorama, ReadOptions, read_query
 from .panorama.photo import Photo, photo_of, photo_of_array
 from .result import Result, Source, result_of, unreadable_result
 from .runtime.stopwatch import Stopwatch
+from .runtime.threads import Progress, no_progress
 from .walk.frames import Frame, checked_times
 from .walk.localize import WalkFrame, alone_of, localization_of, localizations_of
 from .walk.second_look import finished
@@ -133,9 +134,9 @@ class Walk:
         self.accept(taken, Frame.from_json(document["frame"], alone))
         return True
 
-    def finish(self) -> list[Result]:
+    def finish(self, show: Progress = no_progress) -> list[Result]:
         """The result of each frame, by all of them."""
-        path = finished(self.tracker, self._panorama)
+        path = finished(self.tracker, self._panorama, show)
         found = localizations_of(self.tracker, path)
         return [
             self._result(taken, with_places(self.tracker.scan_map, f), walk)

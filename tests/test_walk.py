@@ -145,7 +145,7 @@ def test_a_walk_that_was_stopped_goes_on_where_it_stood(building, tmp_path, monk
     _assert_right(read_results([whole]), queries)
     assert not walk_command.kept_in(whole).exists()
 
-    def killed(self):
+    def killed(self, show):
         raise MemoryError
 
     with monkeypatch.context() as patched:

@@ -27,6 +27,7 @@ from ..scan import Scan
 from ..scan_walk import Prepared, Walk
 from .errors import EXIT_BAD_INPUT, print_error, print_note
 from .interruption import SIGNALS, Interruption, Stopped, interruptible
+from .progress import progress_bar
 from .walking import WalkInput, WalkInputs
 
 EXIT_ALL_LOCALIZED, EXIT_SOME_NOT = 0, 1
@@ -54,8 +55,7 @@ def run_walk(
             kept = "the same command goes on" if kept_in(arguments.out) else "with --out FILE it would go on"
             text = f"ended by {SIGNALS[interruption.number]} after {len(walk.taken)} frames; {kept}"
             return print_error(arguments, text, interruption.exit_code)
-        print_note(arguments, "looking again for frames that were lost, and for the path of all")
-        results = spaced(walk.finish(), inputs.min_distance)
+        results = spaced(walk.finish(progress_bar(arguments.quiet)), inputs.min_distance)
     write_all(arguments.out, results)
     if path := kept_in(arguments.out):
         path.unlink(missing_ok=True)

@@ -11,6 +11,7 @@ from ..coarse_to_fine.query import prepare_query
 from ..confidence.confidence import NOT_LOCALIZED
 from ..panorama import Panorama
 from ..runtime.stopwatch import Stopwatch
+from ..runtime.threads import Progress, no_progress
 from .frames import MOST_ODDS, Frame, State, centers_of, states_of
 from .path import REACH_SLACK, Path, lattice_of, places_of
 from .tracker import MAX_RADIUS, Follower, Tracker, follow, least_score
@@ -24,14 +25,15 @@ MOST_RIVALS = 4  # places of a frame that are followed to its neighbours
 Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
 
 
-def finished(tracker: Tracker, read: Read) -> Path:
+def finished(tracker: Tracker, read: Read, show: Progress = no_progress) -> Path:
     """The path of all frames that a tracker has followed.
 
     Each place that a frame may show is looked for in its neighbours: a copy that was not on a frame's list
     would lose the whole walk. Then lost frames are looked for from those that are sure.
     """
+    num = len(tracker.frames)
     for step in (1, -1):
-        for k in range(len(tracker.frames))[::step]:
+        for k in show(iter(range(num)[::step]), num, "look for copies"):
             _complete(tracker, k, step, read)
     path = _path_of(tracker)
     tried: set[tuple[int, int]] = set()
@@ -39,7 +41,7 @@ def finished(tracker: Tracker, read: Read) -> Path:
     for _ in range(MAX_SWEEPS):
         num_found = 0
         for step in (-1, 1):
-            for k in range(len(tracker.frames))[::step]:
+            for k in show(iter(range(num)[::step]), num, "look for lost frames"):
                 follower = _follower_of_lost(tracker, path, k, step, tried)
                 panorama = read(k) if follower else None
                 if follower and panorama is not None and panorama.is_valid.any():
