@@ -1,8 +1,7 @@
 """How far it is to walk from place to place: through free space, never through a wall."""
 
-from collections import OrderedDict
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,14 @@ REACH = 0.95  # [m] between neighbours in the grid of candidates, 0.6 m wide: ac
 SLACK = 0.1  # [m] by which a surface may be nearer than a neighbour, as views are coarse
 NEAR = 0.5  # [m] cameras keep 0.25 m from a wall: nearer ones have none between them
 DETOUR, ENDS = 1.1, 0.6  # paths along a grid are so much longer; and to its nodes [m]
-MAX_SOURCES = 256  # whose distances are kept
+
+
+class _Reached(NamedTuple):
+    """What is within a limit [m] of a node: other nodes, rising, and the lengths of the ways there."""
+
+    limit: float
+    nodes: NDArray[np.int64]
+    lengths: NDArray[np.float64]
 
 
 class FreeSpace:
@@ -23,7 +29,7 @@ class FreeSpace:
 
     def __init__(self, scan_map: ScanMap) -> None:
         self.scan_map = scan_map
-        self._known = OrderedDict[int, tuple[float, NDArray[np.float64]]]()
+        self._known: dict[int, _Reached] = {}
 
     @cached_property
     def _tree(self) -> Any:
@@ -49,27 +55,27 @@ class FreeSpace:
         far = (straight > NEAR) & (straight <= limit)
         if far.any():
             _, nodes = self._tree.query(np.concatenate([start[None], ends[far]]))
-            along = self._from(int(nodes[0]), DETOUR * (limit + 2.0 * ENDS))[nodes[1:]]
+            along = self._from(int(nodes[0]), nodes[1:], DETOUR * (limit + 2.0 * ENDS))
             walked[far] = np.maximum(straight[far], along / DETOUR - ENDS)
         walked[walked > limit] = np.inf
         return np.asarray(walked)
 
     def share_within(self, center: Array, radius: float) -> float:
         """Fraction of the map's candidates within a radius [m] of a place (3,), at least one."""
-        near = np.linalg.norm(self.scan_map.centers - center, axis=1) < radius
-        return max(int(np.count_nonzero(near)), 1) / max(len(near), 1)
+        near = self._tree.query_ball_point(center, radius, return_length=True)
+        return max(int(near), 1) / max(len(self.scan_map.centers), 1)
 
-    def _from(self, node: int, limit: float) -> NDArray[np.float64]:
-        """Lengths (candidates,) of the shortest paths from a node, inf beyond the limit [m]."""
+    def _from(self, node: int, ends: NDArray[np.int64], limit: float) -> NDArray[np.float64]:
+        """Lengths (N,) of the shortest paths from a node to others (N,), inf beyond the limit [m]."""
         from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415
 
         known = self._known.get(node)
-        if known is None or known[0] < limit:
-            found = dijkstra(self._graph, directed=False, indices=node, limit=limit)
-            self._known[node] = known = limit, np.asarray(found)
-            if len(self._known) > MAX_SOURCES:
-                self._known.popitem(last=False)
-        return known[1]
+        if known is None or known.limit < limit:
+            lengths = np.asarray(dijkstra(self._graph, directed=False, indices=node, limit=limit))
+            near = np.flatnonzero(np.isfinite(lengths))
+            self._known[node] = known = _Reached(limit, near, lengths[near])
+        place = np.minimum(np.searchsorted(known.nodes, ends), len(known.nodes) - 1)
+        return np.asarray(np.where(known.nodes[place] == ends, known.lengths[place], np.inf))
 
 
 def looks(scan_map: ScanMap, first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.int64]:
