@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..coarse_to_fine.config import METHOD
 from ..coarse_to_fine.first_look import CLEAR_SCORE
 from ..coarse_to_fine.localize import localize
 from ..coarse_to_fine.query import prepare_query
@@ -110,7 +111,7 @@ def _follower_of_lost(
 def _found_again(
     tracker: Tracker, k: int, follower: Follower, panorama: Panorama, searched: set[int]
 ) -> bool:
-    """True if a frame has got a pose more, near where a follower leads; by all means only once."""
+    """True if a frame has got a pose more, near where a follower leads; by features only once."""
     frame = tracker.frames[k]
     query = prepare_query(panorama, tracker.scan_map, tracker.settings, tracker.workers)
     end = follow(query, follower, frame.time, tracker.motion)
@@ -134,11 +135,12 @@ def _found_again(
 def _searched_near(
     tracker: Tracker, frame: Frame, follower: Follower, radius: float, panorama: Panorama
 ) -> bool:
-    """True if a frame is found near a pose by all means, local features too."""
+    """True if a frame is found near a pose by local features; whole views have been asked."""
     x, y, z = (float(v) for v in tracker.scan_map.to_world(follower.state.pose).center_world)
     near = replace(tracker.settings.prior, near_world=(x, y, z), radius=radius)
     settings = replace(tracker.settings, prior=near)
-    found = localize(tracker.scan_map, panorama, settings, tracker.workers, Stopwatch())
+    method = METHOD._replace(uses_search=False)
+    found = localize(tracker.scan_map, panorama, settings, tracker.workers, Stopwatch(), method)
     if found.status == NOT_LOCALIZED:
         return False
     frame.states, frame.how = states_of(tracker.scan_map, found), "near"
