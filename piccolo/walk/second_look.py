@@ -1,5 +1,6 @@
 """Frames looked at once more, when those after them are known too."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -8,7 +9,8 @@ import numpy as np
 from ..coarse_to_fine.config import METHOD
 from ..coarse_to_fine.first_look import CLEAR_SCORE
 from ..coarse_to_fine.localize import localize
-from ..coarse_to_fine.query import prepare_query
+from ..coarse_to_fine.query import Query, prepare_query
+from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import NOT_LOCALIZED
 from ..panorama import Panorama
 from ..runtime.stopwatch import Stopwatch
@@ -16,11 +18,12 @@ from ..runtime.threads import Progress, no_progress
 from .frames import MOST_ODDS, Frame, State, centers_of, states_of
 from .path import REACH_SLACK, Path, lattice_of, places_of
 from .tracker import MAX_RADIUS, Follower, Tracker, follow, least_score
-from .tracking import beside, found_near, states_at
+from .tracking import beside, found_near, is_same, states_at
 
 MAX_SWEEPS = 4
 FARTHEST = 12  # frames from one that is sure, in which lost ones are looked for
-SURE = 0.5
+SURE, LEAST_ODDS = 0.5, 0.0
+MIN_GAIN = 1.1  # of the score, by which a pose replaces one nearby
 MOST_RIVALS = 4  # places of a frame that are followed to its neighbours
 
 Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
@@ -86,10 +89,11 @@ def _rivals(tracker: Tracker, m: int) -> list[Follower]:
     return [Follower(frame.states[j], frame.time, None, 0.0) for j in likely] if len(likely) > 1 else []
 
 
-def _is_reached(tracker: Tracker, f: Follower, k: int) -> bool:
-    """True if a frame has a pose to which a person can have walked."""
+def _is_reached(tracker: Tracker, f: Follower, k: int, least_odds: float = -math.inf) -> bool:
+    """True if a frame has a pose of some log odds to which a person can have walked."""
     frame = tracker.frames[k]
-    return any(_is_within(tracker, f, state, frame.time) for state in frame.states)
+    states = [state for state in frame.states if state.log_odds > least_odds]
+    return any(_is_within(tracker, f, state, frame.time) for state in states)
 
 
 def _follower_of_lost(
@@ -105,7 +109,7 @@ def _follower_of_lost(
         return None
     tried.add((k, sure))
     follower = _follower(tracker, path, sure, step)
-    return None if _is_reached(tracker, follower, k) else follower
+    return None if _is_reached(tracker, follower, k, LEAST_ODDS) else follower
 
 
 def _found_again(
@@ -124,12 +128,21 @@ def _found_again(
         searched.add(k)
         return _searched_near(tracker, frame, follower, radius, panorama)
     if found and frame.states:
-        more = beside(query, frame.states, found[0])
-        frame.states += [] if more is None else [more]
-        return more is not None
+        return _joined(query, frame, found[0])
     if found:
         frame.states, frame.how = states_at(query, found), "tracked" if is_there else "near"
     return len(found) > 0
+
+
+def _joined(query: Query, frame: Frame, found: Hypothesis) -> bool:
+    """True if a pose was put beside those of a frame, or in place of one from which it is the better end."""
+    for j, state in enumerate(frame.states):
+        if is_same(state.pose, found.pose) and found.score > MIN_GAIN * state.score:
+            frame.states[j] = states_at(query, [found])[0]
+            return True
+    more = beside(query, frame.states, found)
+    frame.states += [] if more is None else [more]
+    return more is not None
 
 
 def _searched_near(
