@@ -136,7 +136,10 @@ class Scan:
         `times` [s] rise; without them only the order counts. The others are as in `track`.
         """
         walk = self.track(max_speed, max_acceleration, **options)
-        for k, frame in enumerate(frames):
+        taken = list(frames)
+        if times is not None and len(times) != len(taken):
+            raise InputError(f"times: found {len(times)} of {len(taken)} frames, wanted one of each")
+        for k, frame in enumerate(taken):
             walk.add(frame, None if times is None else times[k])
         return walk.finish()
 

@@ -65,7 +65,7 @@ def test_a_file_outlives_other_sources_but_the_cache_does_not(built, monkeypatch
     """Its format alone says whether a file can be read; the cache also goes by what made it."""
     key = content_key("00", CloudSettings())
     assert content_key("00", CloudSettings()) == key != content_key("00", CloudSettings(scale=0.1))
-    monkeypatch.setattr(open_map, "sources_digest", lambda: "of other sources")
+    monkeypatch.setattr(open_map, "digest_of_sources", lambda _: "of other sources")
     assert content_key("00", CloudSettings()) != key
     assert len(load_map(built).centers) == len(scan_map(1).centers)
 

@@ -11,7 +11,7 @@ from test_cloud_ptx import scan as ptx_lines
 from test_cloud_ptx import write as write_lines
 
 from piccolo.cli import align_gravity, up_by_photo
-from piccolo.coarse_to_fine import scan_map as mapping
+from piccolo.coarse_to_fine import aligned_cloud as mapping
 from piccolo.geometry.pose import exp_so3
 from piccolo.gravity.up import Hypothesis, Up
 from piccolo.runtime.threads import Workers

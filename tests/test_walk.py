@@ -100,6 +100,22 @@ def test_a_walk_with_bad_frames_between(scan, building):
     assert again.to_json() == results[0].to_json()
 
 
+def test_times_are_of_all_frames(scan, building):
+    frames = [q.image for q in building[1][:2]]
+    with pytest.raises(InputError, match=r"^times: found 1 of 2 frames, wanted one of each$"):
+        scan.localize_walk(frames, [0.0])
+
+
+def test_a_frame_that_can_not_be_read_is_a_line_and_an_error(building, tmp_path, capsys):
+    folder, queries = building
+    frames, out = [str(queries[0].image), "missing.jpg", str(queries[1].image)], tmp_path / "a.jsonl"
+    assert _command(folder, "--walk", "--pano", *frames, "--times", "order", "--out", str(out)) == 3
+    assert "missing.jpg" in capsys.readouterr().err
+    results = read_results([out])
+    assert [r.status for r in results] == ["localized", "unreadable", "localized"]
+    assert results[1].walk.frame == 1
+
+
 def test_live_results_come_frame_by_frame_and_need_no_times(scan, building):
     _, queries = building
     tracker = scan.track(max_speed=0.5, gravity="known")
@@ -210,6 +226,11 @@ REFUSED = {
     "every": (["--walk", "--pano", "a.jpg", "--every", "1s"], 2, "--every: only with --video"),
     "step": (["--video", "a.mp4", "--every", "fast"], 2, "--every: found 'fast', wanted seconds or metres"),
     "paper": (["--walk", "--pano", "a.jpg", "--preset", "paper"], 2, "not options of the preset paper"),
+    "no step": (
+        ["--walk", "--pano", "a.jpg", "--max-step", "0"],
+        2,
+        "--max-step: found 0.0, wanted",
+    ),
     "no times": (["--walk", "--pano", "a.jpg", "--max-speed", "2"], 2, "--max-speed: found no times"),
     "no video": (["--video", "missing.mp4"], 3, "missing.mp4: no such file, wanted a video that PyAV reads"),
     "no table": (["--walk", "--pano", "a.jpg", "--times", "missing.csv"], 3, "missing.csv"),

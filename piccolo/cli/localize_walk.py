@@ -96,18 +96,25 @@ def follow_all(
     with interruptible() as interruption, suppress(Stopped):
         if path is None:
             for frame, prepared in ahead(walk, left):
-                walk.follow(prepared, frame.time)
+                follow(arguments, walk, prepared, frame)
             return interruption
         with appending(path, size) as append:
             if not size:
                 append(key)
             for frame, prepared in ahead(walk, left):
                 with interruption.postponed():
-                    walk.follow(prepared, frame.time)
+                    follow(arguments, walk, prepared, frame)
                     append(walk.last_to_json())
                 if interruption.number:
                     break
     return interruption
+
+
+def follow(arguments: argparse.Namespace, walk: Walk, prepared: Prepared, frame: WalkInput) -> None:
+    """Follow a frame, and say why one can't be read."""
+    result = walk.follow(prepared, frame.time)
+    if result.error is not None:
+        print_error(arguments, result.error, EXIT_BAD_INPUT)
 
 
 def ahead(walk: Walk, frames: Iterable[WalkInput]) -> Iterator[tuple[WalkInput, Prepared]]:

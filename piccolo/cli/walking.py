@@ -91,10 +91,14 @@ def _check_walk(arguments: argparse.Namespace) -> None:
 
 def motion_of(arguments: argparse.Namespace, has_times: bool) -> Motion:
     """How the camera is carried."""
-    if has_times and arguments.max_step:
+    if has_times and arguments.max_step is not None:
         raise UsageError("--max-step: found times of the frames, wanted --max-speed")
-    if not has_times and arguments.max_speed:
+    if not has_times and arguments.max_speed is not None:
         raise UsageError("--max-speed: found no times of the frames, wanted --times or --max-step")
+    for name in ("max_speed", "max_step", "acceleration"):
+        value = getattr(arguments, name)
+        if value is not None and not 0.0 < value < math.inf:
+            raise UsageError(f"--{name.replace('_', '-')}: found {value}, wanted a number above 0")
     speed = arguments.max_speed or MAX_SPEED if has_times else arguments.max_step or DEFAULT_STEP
     # without times nothing is known of accelerations
     acceleration = arguments.acceleration or (MAX_ACCELERATION if has_times else 1e3)

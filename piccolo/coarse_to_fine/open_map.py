@@ -4,7 +4,6 @@ import hashlib
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from ..errors import InputError
 from ..geometry.pose import rotate_points
 from ..gravity import R_z_from_axis
 from ..local_features.feature_map import FeatureMap
-from ..runtime.cache import cache_root, in_words, mark_used, own_folder, own_names
+from ..runtime.cache import cache_root, digest_of_sources, in_words, mark_used, own_folder, own_names
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from ..runtime.unfinished import Unfinished
@@ -153,19 +152,9 @@ def scan_sha256_of(paths: Sequence[Path], cache: CachePolicy) -> str:
 def content_key(scan_sha256: str, settings: CloudSettings) -> str:
     """Name for the map of a cloud's files: by what is in them and the settings, wherever they lie."""
     digest = hashlib.sha256(
-        " ".join([FORMAT, sources_digest(), repr(replace(settings, crs=None)), scan_sha256]).encode()
+        " ".join([FORMAT, digest_of_sources(MAKERS), repr(replace(settings, crs=None)), scan_sha256]).encode()
     )
     return digest.hexdigest()[:32]
-
-
-@cache
-def sources_digest() -> str:
-    """Digest of the sources by which a map is made."""
-    digest = hashlib.sha256()
-    for folder in MAKERS:
-        for path in sorted((Path(__file__).parents[1] / folder).rglob("*.py")):
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
 
 
 def cached_map(

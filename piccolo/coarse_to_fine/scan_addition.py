@@ -20,13 +20,13 @@ from ..local_features.feature_map import MOST_VIEWS, FeatureMap, extend_feature_
 from ..local_features.view_positions import view_positions
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
+from .aligned_cloud import Voxelized
 from .camera_positions import CLEARANCE_VOXEL, MIN_CLEARANCE, Box, candidate_centers
 from .named_scans import check_name
 from .scan_map import (
     SEARCH_VIEW,
     ScanMap,
     Views,
-    Voxelized,
     ranges_of,
     render_candidates,
     sparse_candidates,

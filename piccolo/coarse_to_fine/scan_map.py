@@ -2,25 +2,23 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cloud.octree import Octree, build_octree
+from ..cloud.octree import Octree
 from ..cloud.settings import UpAxis
 from ..cloud.soa import PackedPoints, pack_points
 from ..cloud.surface_noise import surface_variance
-from ..cloud.voxels import Voxels
 from ..geometry.pose import Array, Pose
 from ..geometry.sphere import SEARCH_RINGS, averaging, make_grid
-from ..gravity import MIN_CONFIDENCE, R_z_from_axis, estimate_normals, find_up, rotation_to_z_up
 from ..local_features.feature_map import FeatureMap, make_feature_map
 from ..local_features.view_positions import view_positions
 from ..runtime.memory import check_memory
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
-from ..runtime.unfinished import Unfinished
+from .aligned_cloud import AlignedCloud, Voxelized, read_once
 from .camera_positions import BLOCK, COARSE_SPACING, Ball, TooManyPositionsError, candidate_centers
 from .late_features import LateFeatures
 from .settings import NOTHING_KNOWN, Prior
@@ -32,7 +30,6 @@ SEARCH_VIEW = ViewConfig(num_rings=SEARCH_RINGS, stats_rings=16, sigma_deg=22.0,
 BYTES_PER_CELL = 6 + 3 + 1 + 4  # of a view: offsets, channels, seen; and what is made of them for a search
 # of some centres, as ScanMap holds them: offsets, their units, channels and seen cells
 Views = tuple[NDArray[np.int16], NDArray[np.float32], NDArray[np.int8], NDArray[np.bool_]]
-MIN_TILT = np.radians(5.0)  # a cloud whose up is nearer to its z is taken as it is
 
 
 @dataclass(frozen=True)
@@ -160,64 +157,6 @@ def widen(
         seen = np.minimum(is_seen[part].astype(np.float32) @ matrix / area, 1.0)
         fraction[lo : lo + 1024] = np.rint(seen * 255.0)
     return features.reshape(len(rows), 3 * len(area)), fraction
-
-
-def align_to_gravity(octree: Octree) -> tuple[Array, tuple[str, ...]]:
-    """Rotation (3, 3) that turns the cloud's up to +z, identity if it is there or in doubt; warnings."""
-    up = find_up(estimate_normals(octree.level(0.08)[:, :3]))
-    tilt = np.arccos(np.clip(up.direction_world[2], -1.0, 1.0))
-    if tilt < MIN_TILT:
-        return np.eye(3), ()
-    text = f"the cloud's z is {np.degrees(tilt):.0f} deg off its up direction"
-    if up.confidence < MIN_CONFIDENCE:
-        return np.eye(3), (f"perhaps {text} (confidence {up.confidence:.2f}); z is kept, --up sets another",)
-    return rotation_to_z_up(up.direction_world), (f"{text}; levelled by its own planes",)
-
-
-class Voxelized(Protocol):
-    """A cloud in memory, or in files that are read anew."""
-
-    def voxels(self, R_map_from_world: Array) -> Voxels:
-        """Its points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
-
-
-@dataclass(frozen=True)
-class AlignedCloud:
-    """A cloud as an octree with z up; the other fields as in ScanMap."""
-
-    octree: Octree
-    R_map_from_world: Array
-    origin_world: Array
-    warnings: tuple[str, ...]
-
-
-def read_aligned(cloud: Voxelized, up: UpAxis) -> AlignedCloud:
-    """A cloud whose axis `up` points up, as octree; `auto` asks the cloud, and reads a tilted one anew."""
-    more: tuple[str, ...] = ()
-    R_map_from_world = R_z_from_axis(up)
-    voxels = cloud.voxels(R_map_from_world)
-    octree = build_octree(voxels)
-    if up == "auto":
-        R_map_from_world, more = align_to_gravity(octree)
-        if not np.array_equal(R_map_from_world, np.eye(3)):
-            del voxels, octree  # their room is needed
-            voxels = cloud.voxels(R_map_from_world)
-            octree = build_octree(voxels)
-    origin_world = R_map_from_world.T @ voxels.origin
-    return AlignedCloud(octree, R_map_from_world, origin_world, voxels.warnings + more)
-
-
-def read_once(cloud: Voxelized, up: UpAxis, work: Unfinished | None) -> AlignedCloud:
-    """The same, or what a process that was killed has read."""
-    stage = (work or Unfinished()).stage("read", ())
-    stage.read()
-    if not stage.done:
-        a = read_aligned(cloud, up)
-        leaf_size, warnings = np.array(a.octree.leaf_size), np.array(a.warnings, np.str_)
-        stage.add((*a.octree[:3], leaf_size, a.R_map_from_world, a.origin_world, warnings))
-    nodes, first_child, level_start, leaf_size, R_map_from_world, origin_world, warnings = stage.done[0]
-    octree = Octree(nodes, first_child, level_start, float(leaf_size))
-    return AlignedCloud(octree, R_map_from_world, origin_world, tuple(map(str, warnings)))
 
 
 def candidates_of(

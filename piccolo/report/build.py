@@ -4,7 +4,6 @@ import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -21,6 +20,7 @@ from ..render.surfel_renderer import MAX_SURFELS, encode_image
 from ..render.surfels import Surfels, surfels_of
 from ..result import UNREADABLE
 from ..runtime.atomic import write_atomically
+from ..runtime.cache import digest_of_sources
 from ..runtime.threads import Workers
 from .entries import Entry, Place, document_of_entry, names_of
 from .own_plan import OwnPlan, check_own_plans, own_plan
@@ -118,20 +118,10 @@ def task_of(entry: Entry, place: Place, settings: ReportSettings) -> Task:
         digest = photo_of(photo, read_options_of(result).rig).sha256
     except (OSError, InputError):
         digest = ""
-    parts = entry.line, digest, place.scan_map.scan_sha256, repr(settings.width), sources_digest()
+    parts = entry.line, digest, place.scan_map.scan_sha256, repr(settings.width), digest_of_sources(MAKERS)
     key = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
     found = [result.best_pose, *(a.pose for a in result.alternatives)] if result.best_pose else []
     return Task(entry, photo, key, [place.scan_map.from_world(pose) for pose in found if pose])
-
-
-@cache
-def sources_digest() -> str:
-    """Digest of the sources by which pictures are made."""
-    digest = hashlib.sha256()
-    for folder in MAKERS:
-        for path in sorted((Path(__file__).parents[1] / folder).rglob("*.py")):
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
 
 
 def write_pictures(

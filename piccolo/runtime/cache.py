@@ -4,6 +4,7 @@ Nothing is deleted but files that have a name of ours, in a folder that this pro
 """
 
 import errno
+import hashlib
 import logging
 import os
 import re
@@ -24,6 +25,16 @@ TAG_CONTENT = (
     b"Signature: 8a477f597d28d172789f06886806bc55\n# Made by PICCOLO, which deletes its own old files.\n"
 )
 log = logging.getLogger("piccolo")
+
+
+@cache
+def digest_of_sources(folders: tuple[str, ...]) -> str:
+    """Digest of the sources in some of the package's folders: what they make is made anew when it changes."""
+    digest = hashlib.sha256()
+    for folder in folders:
+        for path in sorted((Path(__file__).parents[1] / folder).rglob("*.py")):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 @cache

@@ -23,13 +23,8 @@ from .tracking import KEPT_BESIDE, LEAST_KEPT, LEAST_SCORE, beside, found_near, 
 MOST_TRACKED = 6  # poses from which a frame is tracked
 MOST_SOUGHT = 3  # of those at which it is not, around which it is looked for
 LEAST_WEIGHT = 0.02  # of such a pose, by the likeliest
-MAX_RADIUS = (
-    6.0  # [m] around the last pose in which a lost camera is looked for before it is looked for everywhere
-)
-FIRST_SEARCH, LAST_SEARCH = (
-    3,
-    48,
-)  # frames in which a camera is lost until it is searched everywhere, and again
+MAX_RADIUS = 6.0  # [m] around its last pose in which a lost camera is looked for
+FIRST_SEARCH, LAST_SEARCH = 3, 48  # frames after which a lost camera is searched everywhere, and again
 SURE, EVERY_UNSURE = 0.9, 8  # frames tracked with less are searched alone so often
 
 

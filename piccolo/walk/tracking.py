@@ -1,6 +1,5 @@
 """One frame, when it is known about where the camera was: a descent from there, or a search nearby."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -28,16 +27,13 @@ LEAST_SCORE = 0.2  # of a frame that is tracked
 LEAST_KEPT = 0.6  # of the score of the frame before
 KEPT_BESIDE = 0.4  # of the best score: copies of a place are kept until the walk tells them apart
 LAST_LIMITS = (FULL_LOSS, 10, 1e-5)  # of the last descent, as in refinement
-MAX_TURN_RATE = math.radians(120.0)  # [rad/s] that is taken to go on as it was
 
 
-def predicted(before: Pose, earlier: Pose | None, ratio: float, max_distance: float) -> Pose:
+def predicted(before: Pose, earlier: Pose, ratio: float, max_distance: float) -> Pose:
     """Where a camera is, going on as it went from an earlier pose to the last.
 
     `ratio` is the time since by the time between the two. At most max_distance [m] away.
     """
-    if earlier is None:
-        return before
     move = ratio * (before.center_world - earlier.center_world)
     length = float(np.linalg.norm(move))
     move *= min(1.0, max_distance / max(length, 1e-9))
