@@ -1,13 +1,14 @@
 // Bundles the page into ../piccolo/report/page; with --check, fails if what is there differs from the sources.
 import { build } from "esbuild";
 import { readFileSync, writeFileSync } from "node:fs";
+import { fileURLToPath } from "node:url";
 
 const out = new URL("../piccolo/report/page/", import.meta.url);
 const version = JSON.parse(readFileSync(new URL("node_modules/three/package.json", import.meta.url))).version;
 const license = readFileSync(new URL("node_modules/three/LICENSE", import.meta.url), "utf8").trim();
 
 const made = await build({
-  absWorkingDir: new URL(".", import.meta.url).pathname,
+  absWorkingDir: fileURLToPath(new URL(".", import.meta.url)),
   entryPoints: { app: "src/main.ts", style: "src/style.css" },
   bundle: true,
   minify: true,
@@ -39,7 +40,7 @@ for (const [name, text] of Object.entries(files)) {
   const path = new URL(name, out);
   if (process.argv.includes("--check")) {
     if (readFileSync(path, "utf8") !== text) {
-      console.error(`${path.pathname}: differs from its sources; npm run build`);
+      console.error(`${fileURLToPath(path)}: differs from its sources; npm run build`);
       differs = true;
     }
   } else {
