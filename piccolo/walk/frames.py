@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..coarse_to_fine.scan_map import ScanMap
+from ..confidence.alternatives import MAX_ALTERNATIVES
 from ..confidence.covariance import PoseCovariance
 from ..confidence.localization import Localization
 from ..errors import InputError
@@ -16,6 +17,7 @@ from ..geometry.pose import Array, Pose
 
 How = Literal["alone", "near", "tracked", "none"]
 MOST_ODDS = 8.0  # [log] that one frame may add: what is surer is not so of errors that no model has
+COPY_LOG_ODDS = 5.0  # copies of a place differ by as much where one of them was scanned better
 MAX_SPEED, MAX_ACCELERATION = 2.0, 2.0  # [m/s], [m/s^2] of a walking person with a camera
 
 
@@ -53,6 +55,19 @@ class Frame:
     states: list[State] = field(default_factory=list)
     how: How = "none"
     alone: Localization | None = None  # if it was searched without regard to the others
+
+    @property
+    def is_credible(self) -> bool:
+        """True if its poses are more likely than that it has none."""
+        return bool(np.logaddexp.reduce([state.log_odds for state in self.states]) > 0.0)
+
+    @property
+    def is_telling(self) -> bool:
+        """True if the whole scan was searched, and the list of poses does not end in a copy."""
+        if self.how != "alone" or not self.states:
+            return False
+        odds = [state.log_odds for state in self.states]
+        return len(odds) <= MAX_ALTERNATIVES or min(odds) < max(odds) - COPY_LOG_ODDS
 
     def to_json(self) -> dict[str, Any]:
         """All but what it was alone."""

@@ -4,6 +4,9 @@ A state is a pose of a frame; a frame may have none, and the way goes on from an
 finds the likeliest way, forward-backward (Rabiner 1989) the probability of each pose. Frames of one place
 err alike: what they say of one pose against another counts only as far as the camera has moved on, and only
 beyond what exact copies of a room say against each other.
+
+The camera may also be at a place that no frame has listed, as a copy of one that is: what is followed from
+frame to frame speaks as much for that. Only a search of the whole scan tells, and each only so much.
 """
 
 import math
@@ -14,10 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.pose import Array
-from .frames import MOST_ODDS, Frame, Motion, centers_of
+from .frames import COPY_LOG_ODDS, MOST_ODDS, Frame, Motion, centers_of
 from .free_space import FreeSpace
 
-COPY_LOG_ODDS = 5.0  # copies of a place differ by as much where one of them was scanned better
 SAME_PLACE = 1.5  # [m] poses nearer to each other are of one place, not of copies
 TELLING_DISTANCE = 2.0  # [m] after which a frame says something new of its place
 REACH_SLACK, REACH_SIGMA = 0.3, 0.25  # [m] beyond what a person walks; deviation of more
@@ -25,6 +27,10 @@ GAP_LOG = -9.0  # a jump to any place: lift, cut, pocket
 MOST_EXPECTED = 3.0  # [log] that a pose gains by being where it was to be expected
 MAX_SKIPPED = 25.0  # [log] frames that speak for their poses by more in all are not passed over
 LONGEST_SKIP = 400  # frames
+TELLING_LOG = 5.0  # what a search of the whole scan tells against places that it did not list
+LOST_LOG = -3.0  # that a camera is where nothing was listed, when a frame is not where it was followed to
+FOLLOWED_LOG = -6.0  # that it comes to be at a pose that was followed from another
+UNLISTED = -1  # in place of the number of a state
 
 
 class Path(NamedTuple):
@@ -38,21 +44,26 @@ class Path(NamedTuple):
 def emissions(frames: Sequence[Frame]) -> list[Array]:
     """Log odds (S,) of each frame's states against none, as far as they tell something new."""
     found: list[Array] = []
-    last: Array | None = None
+    last: Frame | None = None
     for frame in frames:
         odds, here = np.array([state.log_odds for state in frame.states]), centers_of(frame.states)
         if len(odds) == 0:
             found.append(odds)
             continue
-        moved = TELLING_DISTANCE
-        if last is not None:
-            moved = float(np.linalg.norm(here[:, None] - last[None], axis=2).min())
-        last, share = here, min(moved / TELLING_DISTANCE, 1.0)
+        share = 1.0 if last is None else share_moved(last, frame)
+        last = frame
         total = np.clip(np.logaddexp.reduce(odds), -MOST_ODDS, MOST_ODDS)
         of_place = odds[places_of(odds, here)]
         behind = -share * np.maximum(odds.max() - of_place - COPY_LOG_ODDS, 0.0) - (of_place - odds)
         found.append(total + behind - np.logaddexp.reduce(behind))
     return found
+
+
+def share_moved(before: Frame, frame: Frame) -> float:
+    """How much of a new place a frame shows, 0 to 1, by how far the camera has moved at least."""
+    starts, ends = centers_of(before.states), centers_of(frame.states)
+    moved = float(np.linalg.norm(ends[:, None] - starts[None], axis=2).min())
+    return min(moved / TELLING_DISTANCE, 1.0)
 
 
 def places_of(odds: Array, centers: Array) -> NDArray[np.int64]:
@@ -75,6 +86,17 @@ def log_transition(distance: Array, seconds: float, motion: Motion, expected: Ar
     return np.maximum(expected - 0.5 * (excess / REACH_SIGMA) ** 2, GAP_LOG)
 
 
+def left(log: Array, frame: Frame) -> Array:
+    """Log odds (S,) of leaving states for a place that is not listed, by the steps (S, N) to a frame."""
+    is_kept = (log.max(axis=1) > GAP_LOG / 2.0) & (frame.how == "tracked" or frame.is_telling)
+    return np.asarray(np.where(is_kept, GAP_LOG, LOST_LOG))
+
+
+def entering(frame: Frame) -> float:
+    """Log odds of coming to a frame's poses from a place that is not listed."""
+    return 0.0 if frame.how == "alone" else FOLLOWED_LOG
+
+
 class _Steps(NamedTuple):
     """From a frame's states to those of a later one."""
 
@@ -82,8 +104,20 @@ class _Steps(NamedTuple):
     log: NDArray[np.float64]  # (S before, S)
 
 
+class _Unlisted(NamedTuple):
+    """The ways that lead to a frame at a place that is not listed."""
+
+    emitted: float = 0.0
+    forward: float = 0.0  # sum over ways, emissions included
+    best: float = 0.0  # of the best way
+    back: tuple[int, int] | None = None  # whence it comes
+
+
 class Lattice:
-    """The frames so far, with the logs of all ways that lead to each state; grows frame by frame."""
+    """The frames so far, with the logs of all ways that lead to each state; grows frame by frame.
+
+    A way begins where nothing is listed, at a log of 0.
+    """
 
     def __init__(self, space: FreeSpace, motion: Motion) -> None:
         self.space, self.motion = space, motion
@@ -93,17 +127,20 @@ class Lattice:
         self.forward: list[Array] = []  # sums over ways, emissions included
         self.best: list[Array] = []  # of the best way
         self.back: list[list[tuple[int, int] | None]] = []
+        self.unlisted: list[_Unlisted] = []
 
     def add(self, frame: Frame) -> None:
         """The next frame in time."""
         self.frames.append(frame)
-        self.emitted = emissions(self.frames) if len(self.frames) < 2 else [*self.emitted, self._emission()]
         k = len(self.frames) - 1
+        self.emitted.append(self._emission())
         steps = self._steps_to(k)
         self.steps.append(steps)
-        num = len(frame.states)
-        sums, best = np.zeros(num), np.zeros(num)  # the way begins here
-        back: list[tuple[int, int] | None] = [None] * num
+        before, begin = (self.unlisted[-1], (k - 1, UNLISTED)) if k else (_Unlisted(), None)
+        self.unlisted.append(self._unlisted_at(k, before))
+        enter, num = entering(frame), len(frame.states)
+        sums, best = np.full(num, enter + before.forward), np.full(num, enter + before.best)
+        back: list[tuple[int, int] | None] = [begin] * num
         for s in steps:
             sums = np.logaddexp(sums, np.logaddexp.reduce(self.forward[s.begin][:, None] + s.log, axis=0))
             ways = self.best[s.begin][:, None] + s.log
@@ -114,6 +151,31 @@ class Lattice:
         self.forward.append(sums + self.emitted[k])
         self.best.append(best + self.emitted[k])
         self.back.append(back)
+
+    def _unlisted_at(self, k: int, before: "_Unlisted") -> "_Unlisted":
+        """What a frame says for places that are not listed.
+
+        If it does not tell, as much as for the best that is listed.
+        """
+        gained = max([0.0, *(float(s.log.max()) for s in self.steps[k])])
+        emitted = float(self.emitted[k].max(initial=-math.inf)) + gained
+        emitted = max(emitted - self._telling(k) * (TELLING_LOG + gained), 0.0)
+        forward, best, back = before.forward, before.best, (k - 1, UNLISTED) if k else None
+        for s in self.steps[k]:
+            leave = left(s.log, self.frames[k])
+            forward = float(np.logaddexp(forward, np.logaddexp.reduce(self.forward[s.begin] + leave)))
+            ways = self.best[s.begin] + leave
+            if ways.max() > best:
+                best, back = float(ways.max()), (s.begin, int(ways.argmax()))
+        return _Unlisted(emitted, forward + emitted, best + emitted, back)
+
+    def _telling(self, k: int) -> float:
+        """How much of what a search of the whole scan can tell is new in a frame, 0 to 1."""
+        frame = self.frames[k]
+        if not frame.is_telling:
+            return 0.0
+        last = next((f for f in reversed(self.frames[:k]) if f.is_telling), None)
+        return 1.0 if last is None else share_moved(last, frame)
 
     def _emission(self) -> Array:
         """Of the last frame."""
@@ -149,29 +211,39 @@ class Lattice:
 
     def filtered(self) -> Array:
         """Probability (S,) of each state of the last frame by all that was before."""
-        ends = [0.0, *(float(np.logaddexp.reduce(f)) for f in self.forward if len(f))]
-        return np.asarray(np.exp(self.forward[-1] - np.logaddexp.reduce(ends)))
+        return np.asarray(np.exp(self.forward[-1] - self._total()))
+
+    def _total(self) -> float:
+        ends = [self.unlisted[-1].forward, *(np.logaddexp.reduce(f) for f in self.forward if len(f))]
+        return float(np.logaddexp.reduce(ends))
 
     def smoothed(self) -> Path:
         """The likeliest way, and the probability of each state by all frames."""
-        backward = [np.zeros(len(f.states)) for f in self.frames]
+        backward, unlisted = [np.zeros(len(f.states)) for f in self.frames], 0.0
         for k in range(len(self.frames) - 1, -1, -1):
+            onward, unlisted = self.emitted[k] + backward[k], self.unlisted[k].emitted + unlisted
             for s in self.steps[k]:
-                onward = s.log + (self.emitted[k] + backward[k])[None]
-                backward[s.begin] = np.logaddexp(backward[s.begin], np.logaddexp.reduce(onward, axis=1))
-        total = np.logaddexp.reduce([0.0, *(float(np.logaddexp.reduce(f)) for f in self.forward if len(f))])
+                leave = left(s.log, self.frames[k]) + unlisted
+                ways = np.concatenate([s.log + onward[None], leave[:, None]], axis=1)
+                backward[s.begin] = np.logaddexp(backward[s.begin], np.logaddexp.reduce(ways, axis=1))
+            unlisted = float(np.logaddexp.reduce([unlisted, *(entering(self.frames[k]) + onward)]))
+        total = self._total() if self.frames else 0.0
         probabilities = [np.exp(f + b - total) for f, b in zip(self.forward, backward, strict=True)]
         chosen = self._likeliest()
         return Path(chosen, probabilities, self._gaps(chosen))
 
     def _likeliest(self) -> list[int | None]:
         chosen: list[int | None] = [None] * len(self.frames)
-        ends = [(float(b.max()), k, int(b.argmax())) for k, b in enumerate(self.best) if len(b)]
-        end = max(ends, default=(-math.inf, 0, 0))
-        at = (end[1], end[2]) if end[0] > 0.0 else None
+        if not self.frames:
+            return chosen
+        ends = [(float(b.max()), (k, int(b.argmax()))) for k, b in enumerate(self.best) if len(b)]
+        at: tuple[int, int] | None = max([*ends, (self.unlisted[-1].best, (len(self.frames) - 1, UNLISTED))])[
+            1
+        ]
         while at is not None:
-            chosen[at[0]] = at[1]
-            at = self.back[at[0]][at[1]]
+            k, j = at
+            chosen[k] = None if j == UNLISTED else j
+            at = self.unlisted[k].back if j == UNLISTED else self.back[k][j]
         return chosen
 
     def _gaps(self, chosen: Sequence[int | None]) -> list[tuple[float, float] | None]:

@@ -123,7 +123,7 @@ def _found_again(
     found = [end] if is_there else []
     radius = tracker.motion.max_speed * abs(frame.time - follower.time) + REACH_SLACK
     if not found and radius <= MAX_RADIUS:
-        found = found_near(query, tracker.scan_map, follower.state.pose, radius, CLEAR_SCORE)
+        found = found_near(query, follower.state.pose, radius, CLEAR_SCORE)
     if not found and not frame.states and radius <= MAX_RADIUS and k not in searched:
         searched.add(k)
         return _searched_near(tracker, frame, follower, radius, panorama)

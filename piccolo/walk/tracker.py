@@ -15,17 +15,27 @@ from ..geometry.pose import Pose
 from ..panorama import Panorama
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
-from .frames import Frame, Motion, State, states_of
+from .frames import Frame, Motion, State, centers_of, states_of
 from .free_space import FreeSpace
 from .path import REACH_SLACK, Lattice
-from .tracking import KEPT_BESIDE, LEAST_KEPT, LEAST_SCORE, beside, found_near, predicted, states_at, tracked
+from .tracking import (
+    KEPT_BESIDE,
+    LEAST_KEPT,
+    LEAST_SCORE,
+    beside,
+    found_everywhere,
+    found_near,
+    predicted,
+    states_at,
+    tracked,
+)
 
 MOST_TRACKED = 6  # poses from which a frame is tracked
 MOST_SOUGHT = 3  # of those at which it is not, around which it is looked for
 LEAST_WEIGHT = 0.02  # of such a pose, by the likeliest
-MAX_RADIUS = 6.0  # [m] around its last pose in which a lost camera is looked for
+MAX_RADIUS = 12.0  # [m] around its last pose in which a lost camera is looked for
 FIRST_SEARCH, LAST_SEARCH = 3, 48  # frames after which a lost camera is searched everywhere, and again
-SURE, EVERY_UNSURE = 0.9, 8  # frames tracked with less are searched alone so often
+SURE, CHECKED_SURE, CHECKED_UNSURE = 0.9, 8.0, 3.0  # [m] walked, after which the whole scan is searched
 
 
 class Follower(NamedTuple):
@@ -51,7 +61,8 @@ class Tracker:
         self.scan_map = apply_prior(scan_map, settings.prior)
         self.settings, self.workers, self.motion = settings, workers, motion
         self.lattice = Lattice(space or FreeSpace(scan_map), motion)
-        self.num_lost, self.next_search, self.num_unsure = 0, 1, 0
+        self.num_lost, self.next_search = 0, 1
+        self.walked, self.is_sure = 0.0, False  # [m] since the whole scan was searched
 
     @property
     def frames(self) -> list[Frame]:
@@ -69,23 +80,36 @@ class Tracker:
         frame = Frame(time)
         if panorama.is_valid.any() and len(self.scan_map.centers) > 0:
             self._follow(query, frame)
-            is_lost = not frame.states and self.num_lost + 1 >= self.next_search
-            if is_lost or (frame.states and self.num_unsure >= EVERY_UNSURE):
+            is_lost = self.num_lost + 1 >= self.next_search
+            is_due = self.walked + self._moved(frame) >= (CHECKED_SURE if self.is_sure else CHECKED_UNSURE)
+            if frame.is_credible and is_due:
+                self._check(query, frame)
+            elif not frame.is_credible and is_lost:
                 self._search(query, panorama, frame)
         self.accept(frame)
         return frame
 
     def accept(self, frame: Frame) -> None:
         """Count a frame that was found now or earlier."""
+        self.walked += self._moved(frame)
         self.lattice.add(frame)
-        if frame.states:
+        if frame.how == "alone":
+            self.walked = 0.0
+        if frame.is_credible:
             self.num_lost, self.next_search = 0, FIRST_SEARCH
-            is_sure = self.lattice.filtered().max() >= SURE or frame.how == "alone"
-            self.num_unsure = 0 if is_sure else self.num_unsure + 1
+            self.is_sure = bool(self.lattice.filtered().max() >= SURE)
             return
         self.num_lost += 1
         if frame.how == "alone":
             self.next_search = self.num_lost + min(max(self.num_lost, FIRST_SEARCH), LAST_SEARCH)
+
+    def _moved(self, frame: Frame) -> float:
+        """Metres from the frame before, from its nearest pose; 0 if one of the two has none."""
+        before = next((f for f in reversed(self.frames) if f.states), None)
+        if before is None or not frame.states:
+            return 0.0
+        best = max(frame.states, key=lambda state: state.log_odds).pose.center_world
+        return float(np.linalg.norm(centers_of(before.states) - best, axis=1).min())
 
     def _follow(self, query: Query, frame: Frame) -> None:
         """Descend from where the camera should be by each of its last poses, or look near these."""
@@ -100,20 +124,23 @@ class Tracker:
         for f in lost[:MOST_SOUGHT]:
             radius = self.motion.max_speed * (frame.time - f.time) + REACH_SLACK
             if radius <= MAX_RADIUS:
-                found += found_near(query, self.scan_map, f.state.pose, radius, least)
+                found += found_near(query, f.state.pose, radius, least)
         if found:
             frame.states, frame.how = states_at(query, found), "tracked" if is_there else "near"
 
     def followers(self) -> list[Follower]:
-        """The poses from which the next frame may come, the likeliest first."""
-        known = [k for k, frame in enumerate(self.frames) if frame.states][-2:]
-        if not known:
-            return []
-        last = self.frames[known[-1]]
-        earlier = self.frames[known[0]] if len(known) == 2 else None
-        weights = self.lattice.forward[known[-1]]
+        """The poses from which the next frame may come: of the last that is credible, then of later ones."""
+        known = [k for k, frame in enumerate(self.frames) if frame.states]
+        credible = [k for k in known if self.frames[k].is_credible][-1:]
+        later = [k for k in known[-1:] if k not in credible]
+        return [f for k in (*credible, *later) for f in self._followers_of(k, known)][:MOST_TRACKED]
+
+    def _followers_of(self, k: int, known: list[int]) -> list[Follower]:
+        """The poses of a frame, the likeliest first."""
+        last, weights = self.frames[k], self.lattice.forward[k]
+        earlier = next((self.frames[m] for m in reversed(known) if m < k), None)
         order = [int(i) for i in np.argsort(-weights, kind="stable")]
-        order = [i for i in order if weights[i] > weights.max() + np.log(LEAST_WEIGHT)][:MOST_TRACKED]
+        order = [i for i in order if weights[i] > weights.max() + np.log(LEAST_WEIGHT)]
         return [self._follower(last, last.states[i], earlier) for i in order]
 
     def _follower(self, last: Frame, state: State, earlier: Frame | None) -> Follower:
@@ -124,6 +151,12 @@ class Tracker:
             if gaps[k] <= self.motion.max_speed * (last.time - earlier.time) + REACH_SLACK:
                 pose, time = earlier.states[k].pose, earlier.time
         return Follower(state, last.time, pose, time)
+
+    def _check(self, query: Query, frame: Frame) -> None:
+        """Look for a frame that is followed in the whole scan too."""
+        found = found_everywhere(query, CLEAR_SCORE)
+        if found:
+            frame.states, frame.how = merged(query, states_at(query, found), frame.states), "alone"
 
     def _search(self, query: Query, panorama: Panorama, frame: Frame) -> None:
         """Search the whole scan, and keep what was tracked beside."""

@@ -12,11 +12,10 @@ from ..coarse_to_fine.localize import searched
 from ..coarse_to_fine.prior import apply_prior
 from ..coarse_to_fine.query import Query
 from ..coarse_to_fine.refinement import compared, descend_fine, descend_middle, perturb_middle, points_at
-from ..coarse_to_fine.scan_map import ScanMap
 from ..coarse_to_fine.search_result import found_among
 from ..coarse_to_fine.settings import Prior
 from ..coarse_to_fine.standings import standings_of
-from ..confidence.alternatives import MAX_ALTERNATIVES, MIN_ANGLE, MIN_DISTANCE, Hypothesis, suppressed
+from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE, Hypothesis, suppressed
 from ..confidence.confidence import posterior
 from ..geometry.pose import Pose, exp_so3, log_so3, pose_errors
 from ..geometry.rotations import Gravity
@@ -25,6 +24,7 @@ from .frames import State, log_ratio
 
 LEAST_SCORE = 0.2  # of a frame that is tracked
 LEAST_KEPT = 0.6  # of the score of the frame before
+MOST_LISTED = 12  # poses of a frame
 KEPT_BESIDE = 0.4  # of the best score: copies of a place are kept until the walk tells them apart
 LAST_LIMITS = (FULL_LOSS, 10, 1e-5)  # of the last descent, as in refinement
 
@@ -52,29 +52,33 @@ def tracked(query: Query, start: Pose, least_score: float) -> Hypothesis:
     return end if end.score >= least_score else max(end, compared(query, near), key=lambda h: h.score)
 
 
-def found_near(
-    query: Query, scan_map: ScanMap, near: Pose, radius: float, least_score: float
-) -> list[Hypothesis]:
+def found_near(query: Query, near: Pose, radius: float, least_score: float) -> list[Hypothesis]:
     """Poses found within a radius [m] by whole views; none if the best has less than a score."""
-    x, y, z = (float(value) for value in scan_map.to_world(near).center_world)
-    some = apply_prior(scan_map, Prior(near_world=(x, y, z), radius=radius))
+    x, y, z = (float(value) for value in query.scan_map.to_world(near).center_world)
+    some = apply_prior(query.scan_map, Prior(near_world=(x, y, z), radius=radius))
     if len(some.centers) == 0:
         return []
-    first = first_query(replace(query, scan_map=some, comparisons={}))
+    return found_everywhere(replace(query, scan_map=some, comparisons={}), least_score)
+
+
+def found_everywhere(query: Query, least_score: float) -> list[Hypothesis]:
+    """Poses found in a whole map by whole views, copies too; none if the best has less than a score."""
+    first = first_query(query)
     gravity: Gravity = "unknown" if query.settings.gravity == "unknown" else "known"
     starts, hypotheses = searched(first, gravity, FIRST_BEAM, Stopwatch())
-    found = found_among(hypotheses, MAX_ALTERNATIVES)
+    found = found_among(hypotheses, MOST_LISTED - 1)
     if found.best.score < least_score or is_rather_mirrored(first, starts):
         return []
     least = KEPT_BESIDE * found.best.score
     close = [h for h in (found.best, *found.alternatives) if h.score >= least]
-    return [end for h in close if (end := tracked(query, h.pose, least)).score >= least]
+    ends = query.workers.map(lambda h: tracked(query, h.pose, least), close, "descend")
+    return [end for end in ends if end.score >= least]
 
 
 def states_at(query: Query, hypotheses: Sequence[Hypothesis]) -> list[State]:
     """Poses of a frame as states, with the odds that they have by whole views, the best first."""
     ranked = sorted(hypotheses, key=lambda h: -h.score)
-    ranked = suppressed(ranked, MAX_ALTERNATIVES + 1, MIN_DISTANCE, MIN_ANGLE)
+    ranked = suppressed(ranked, MOST_LISTED, MIN_DISTANCE, MIN_ANGLE)
     asked = replace(query, by_features=False)
     best, *others = ranked
     covariance = estimate_covariance(query, best.pose)
