@@ -94,6 +94,8 @@ class Walk:
         when = float(number) if time is None else float(time)
         if self.tracker.frames:
             checked_times([self.tracker.frames[-1].time, when])
+        elif time is None:
+            self.tracker.forget_times()
         watch = Stopwatch(taken.seconds)
         if panorama is None or query is None:
             self.accept(taken, Frame(when))

@@ -15,11 +15,11 @@ from tqdm import tqdm
 from ..batch.frame_times import EXIF, NAMES, ORDER, times_of
 from ..batch.inputs import is_from_stdin
 from ..panorama.video import frames_of
-from ..walk.frames import MAX_ACCELERATION, MAX_SPEED, Motion
+from ..walk.frames import MAX_ACCELERATION, MAX_SPEED, NO_ACCELERATION, Motion
 from .errors import UsageError
 
 EVERY = re.compile(r"(\d+(?:\.\d+)?)(s|m)")
-DEFAULT_EVERY, DEFAULT_STEP = "0.5s", 3.0
+DEFAULT_EVERY, DEFAULT_STEP = "0.5s", 5.0
 ONLY_WITH = ("every", "times", "max_speed", "max_step", "acceleration")
 NOT_WITH = ("jobs", "dask", "overlay", "occlusion_mask", "priors", "refine_focal")
 
@@ -100,9 +100,8 @@ def motion_of(arguments: argparse.Namespace, has_times: bool) -> Motion:
         if value is not None and not 0.0 < value < math.inf:
             raise UsageError(f"--{name.replace('_', '-')}: found {value}, wanted a number above 0")
     speed = arguments.max_speed or MAX_SPEED if has_times else arguments.max_step or DEFAULT_STEP
-    # without times nothing is known of accelerations
-    acceleration = arguments.acceleration or (MAX_ACCELERATION if has_times else 1e3)
-    return Motion(speed, acceleration)
+    acceleration = arguments.acceleration or (MAX_ACCELERATION if has_times else NO_ACCELERATION)
+    return Motion(speed, acceleration, has_times)
 
 
 def every_of(text: str, max_speed: float) -> tuple[float, float]:

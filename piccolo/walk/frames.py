@@ -19,6 +19,7 @@ How = Literal["alone", "near", "tracked", "none"]
 MOST_ODDS = 8.0  # [log] that one frame may add: what is surer is not so of errors that no model has
 COPY_LOG_ODDS = 5.0  # copies of a place differ by as much where one of them was scanned better
 MAX_SPEED, MAX_ACCELERATION = 2.0, 2.0  # [m/s], [m/s^2] of a walking person with a camera
+NO_ACCELERATION = 1e3  # [m] of frames without times: nothing is known of it
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,7 @@ class Motion:
 
     max_speed: float = MAX_SPEED  # [m/s]; of frames without times [m] from one to the next
     max_acceleration: float = MAX_ACCELERATION  # [m/s^2] standard deviation along each axis
+    is_timed: bool = True  # False if only the order of the frames is known
 
     def __post_init__(self) -> None:
         """Refuse what means nothing."""
@@ -68,6 +70,12 @@ class Frame:
             return False
         odds = [state.log_odds for state in self.states]
         return len(odds) <= MAX_ALTERNATIVES or min(odds) < max(odds) - COPY_LOG_ODDS
+
+    @property
+    def likely(self) -> list[State]:
+        """Its best pose, and those that may be copies."""
+        best = max((state.log_odds for state in self.states), default=0.0)
+        return [state for state in self.states if state.log_odds > best - COPY_LOG_ODDS]
 
     def to_json(self) -> dict[str, Any]:
         """All but what it was alone."""

@@ -21,13 +21,16 @@ from .frames import COPY_LOG_ODDS, MOST_ODDS, Frame, Motion, centers_of
 from .free_space import FreeSpace
 
 SAME_PLACE = 1.5  # [m] poses nearer to each other are of one place, not of copies
+OTHER_LOG_ODDS = 8.0  # behind the best: no copy
 TELLING_DISTANCE = 2.0  # [m] after which a frame says something new of its place
 REACH_SLACK, REACH_SIGMA = 0.3, 0.25  # [m] beyond what a person walks; deviation of more
-GAP_LOG = -9.0  # a jump to any place: lift, cut, pocket
+GAP_LOG, UNTIMED_GAP_LOG = -9.0, -4.0  # a jump to any place: lift, cut, pocket; of frames without times
+JUMPED = -2.0  # less is a jump
 MOST_EXPECTED = 3.0  # [log] that a pose gains by being where it was to be expected
 MAX_SKIPPED = 25.0  # [log] frames that speak for their poses by more in all are not passed over
 LONGEST_SKIP = 400  # frames
 TELLING_LOG = 5.0  # what a search of the whole scan tells against places that it did not list
+LEAST_TOLD = 0.3  # of it, by one more from the same place
 LOST_LOG = -3.0  # that a camera is where nothing was listed, when a frame is not where it was followed to
 FOLLOWED_LOG = -6.0  # that it comes to be at a pose that was followed from another
 UNLISTED = -1  # in place of the number of a state
@@ -54,14 +57,23 @@ def emissions(frames: Sequence[Frame]) -> list[Array]:
         last = frame
         total = np.clip(np.logaddexp.reduce(odds), -MOST_ODDS, MOST_ODDS)
         of_place = odds[places_of(odds, here)]
-        behind = -share * np.maximum(odds.max() - of_place - COPY_LOG_ODDS, 0.0) - (of_place - odds)
+        behind = -new_differences(odds.max() - of_place, share) - (of_place - odds)
         found.append(total + behind - np.logaddexp.reduce(behind))
     return found
 
 
+def new_differences(behind: Array, share: float) -> Array:
+    """How much of what poses lack to the best (S,) [log] counts, in a frame that is new to a share.
+
+    Copies differ by a little for as long as the camera is in one of them; what is no copy is just worse.
+    """
+    is_other = np.clip((behind - COPY_LOG_ODDS) / (OTHER_LOG_ODDS - COPY_LOG_ODDS), 0.0, 1.0)
+    return np.asarray(is_other * behind + (1.0 - is_other) * share * np.maximum(behind - COPY_LOG_ODDS, 0.0))
+
+
 def share_moved(before: Frame, frame: Frame) -> float:
     """How much of a new place a frame shows, 0 to 1, by how far the camera has moved at least."""
-    starts, ends = centers_of(before.states), centers_of(frame.states)
+    starts, ends = centers_of(before.likely), centers_of(frame.likely)
     moved = float(np.linalg.norm(ends[:, None] - starts[None], axis=2).min())
     return min(moved / TELLING_DISTANCE, 1.0)
 
@@ -83,12 +95,13 @@ def log_transition(distance: Array, seconds: float, motion: Motion, expected: Ar
     `expected` is what a place gains that it can reach; a jump has its price.
     """
     excess = np.maximum(distance - motion.max_speed * seconds - REACH_SLACK, 0.0)
-    return np.maximum(expected - 0.5 * (excess / REACH_SIGMA) ** 2, GAP_LOG)
+    jump = GAP_LOG if motion.is_timed else UNTIMED_GAP_LOG
+    return np.maximum(expected - 0.5 * (excess / REACH_SIGMA) ** 2, jump)
 
 
 def left(log: Array, frame: Frame) -> Array:
     """Log odds (S,) of leaving states for a place that is not listed, by the steps (S, N) to a frame."""
-    is_kept = (log.max(axis=1) > GAP_LOG / 2.0) & (frame.how == "tracked" or frame.is_telling)
+    is_kept = (log.max(axis=1) > JUMPED) & (frame.how == "tracked" or frame.is_telling)
     return np.asarray(np.where(is_kept, GAP_LOG, LOST_LOG))
 
 
@@ -175,7 +188,7 @@ class Lattice:
         if not frame.is_telling:
             return 0.0
         last = next((f for f in reversed(self.frames[:k]) if f.is_telling), None)
-        return 1.0 if last is None else share_moved(last, frame)
+        return 1.0 if last is None else max(share_moved(last, frame), LEAST_TOLD)
 
     def _emission(self) -> Array:
         """Of the last frame."""
@@ -255,7 +268,7 @@ class Lattice:
             if before is not None:
                 m, i = before
                 log = next((s.log[i, j] for s in self.steps[k] if s.begin == m), GAP_LOG)
-                if log < GAP_LOG / 2.0:
+                if log < JUMPED:
                     there, here = self.frames[m].states[i].pose, self.frames[k].states[j].pose
                     metres = float(np.linalg.norm(here.center_world - there.center_world))
                     gaps[k] = metres, self.frames[k].time - self.frames[m].time

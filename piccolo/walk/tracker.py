@@ -1,5 +1,6 @@
 """A camera followed through a scan: frame by frame, each by what is known so far."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from ..geometry.pose import Pose
 from ..panorama import Panorama
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
-from .frames import Frame, Motion, State, centers_of, states_of
+from .frames import NO_ACCELERATION, Frame, Motion, State, centers_of, states_of
 from .free_space import FreeSpace
 from .path import REACH_SLACK, Lattice
 from .tracking import (
@@ -35,6 +36,7 @@ MOST_SOUGHT = 3  # of those at which it is not, around which it is looked for
 LEAST_WEIGHT = 0.02  # of such a pose, by the likeliest
 MAX_RADIUS = 12.0  # [m] around its last pose in which a lost camera is looked for
 FIRST_SEARCH, LAST_SEARCH = 3, 48  # frames after which a lost camera is searched everywhere, and again
+FAR = 3.0  # [m] from frame to frame, where each is searched in the whole scan
 SURE, CHECKED_SURE, CHECKED_UNSURE = 0.9, 8.0, 3.0  # [m] walked, after which the whole scan is searched
 
 
@@ -69,6 +71,11 @@ class Tracker:
         """All so far."""
         return self.lattice.frames
 
+    def forget_times(self) -> None:
+        """From the first frame on only their order is known: their times are numbers."""
+        self.motion = replace(self.motion, max_acceleration=NO_ACCELERATION, is_timed=False)
+        self.lattice = Lattice(self.lattice.space, self.motion)
+
     def prepared(self, panorama: Panorama) -> Query:
         """The query of a frame, with the images that its descents need."""
         query = prepare_query(panorama, self.scan_map, self.settings, self.workers)
@@ -79,13 +86,14 @@ class Tracker:
         """Find the next frame, whose query is prepared."""
         frame = Frame(time)
         if panorama.is_valid.any() and len(self.scan_map.centers) > 0:
-            self._follow(query, frame)
+            is_far = self._reach(frame) >= FAR
+            self._follow(query, frame, not is_far)
             is_lost = self.num_lost + 1 >= self.next_search
             is_due = self.walked + self._moved(frame) >= (CHECKED_SURE if self.is_sure else CHECKED_UNSURE)
-            if frame.is_credible and is_due:
-                self._check(query, frame)
-            elif not frame.is_credible and is_lost:
+            if is_far or (is_lost and not frame.is_credible):
                 self._search(query, panorama, frame)
+            elif is_due and frame.is_credible:
+                self._check(query, frame)
         self.accept(frame)
         return frame
 
@@ -103,6 +111,11 @@ class Tracker:
         if frame.how == "alone":
             self.next_search = self.num_lost + min(max(self.num_lost, FIRST_SEARCH), LAST_SEARCH)
 
+    def _reach(self, frame: Frame) -> float:
+        """Metres that the camera may have gone since the frame before."""
+        seconds = frame.time - self.frames[-1].time if self.frames else 0.0
+        return self.motion.max_speed * seconds
+
     def _moved(self, frame: Frame) -> float:
         """Metres from the frame before, from its nearest pose; 0 if one of the two has none."""
         before = next((f for f in reversed(self.frames) if f.states), None)
@@ -111,7 +124,7 @@ class Tracker:
         best = max(frame.states, key=lambda state: state.log_odds).pose.center_world
         return float(np.linalg.norm(centers_of(before.states) - best, axis=1).min())
 
-    def _follow(self, query: Query, frame: Frame) -> None:
+    def _follow(self, query: Query, frame: Frame, looks_near: bool) -> None:
         """Descend from where the camera should be by each of its last poses, or look near these."""
         followers = self.followers()
         if not followers:
@@ -121,7 +134,7 @@ class Tracker:
         least = KEPT_BESIDE * max(end.score for end in ends) if is_there else CLEAR_SCORE
         found = [end for end in ends if end.score >= least] if is_there else []
         lost = [f for f, end in zip(followers, ends, strict=True) if not is_there or end.score < least]
-        for f in lost[:MOST_SOUGHT]:
+        for f in lost[:MOST_SOUGHT] if looks_near else []:
             radius = self.motion.max_speed * (frame.time - f.time) + REACH_SLACK
             if radius <= MAX_RADIUS:
                 found += found_near(query, f.state.pose, radius, least)
