@@ -105,7 +105,7 @@ class Scan:
 
     def track(
         self,
-        max_speed: float = MAX_SPEED,
+        max_speed: float | None = None,
         max_acceleration: float = MAX_ACCELERATION,
         **options: Unpack[QueryOptions],
     ) -> Walk:
@@ -114,20 +114,23 @@ class Scan:
         Parameters
         ----------
         max_speed
-            [m/s] at which it is carried at most; where frames have no times, [m] from one to the next.
+            [m/s] at which it is carried at most (2 by default); where frames have no times, [m] from one to
+            the next, by default as the poses found of them tell.
         max_acceleration
             [m/s^2] standard deviation along each axis; it smooths the path of `finish`.
         **options
             As in `localize`, of all frames; not `refine_focal`, and `mask` as a path.
         """
         asked = asked_of(options, "track", self.settings, self.cloud_settings)
-        return self.walk(asked.read_options, asked.settings, Motion(max_speed, max_acceleration))
+        speed = MAX_SPEED if max_speed is None else max_speed
+        motion = Motion(speed, max_acceleration, is_guess=max_speed is None)
+        return self.walk(asked.read_options, asked.settings, motion)
 
     def localize_walk(
         self,
         frames: Iterable[File | NDArray[np.uint8]],
         times: Sequence[float] | None = None,
-        max_speed: float = MAX_SPEED,
+        max_speed: float | None = None,
         max_acceleration: float = MAX_ACCELERATION,
         **options: Unpack[QueryOptions],
     ) -> list[Result]:

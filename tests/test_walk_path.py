@@ -15,6 +15,7 @@ from piccolo.walk.free_space import FreeSpace
 from piccolo.walk.path import (
     LEAST_TOLD,
     MOST_EXPECTED,
+    OTHER_LOG_ODDS,
     TELLING_LOG,
     UNLISTED,
     emissions,
@@ -203,18 +204,17 @@ def test_what_copies_say_of_each_other_does_not_add_up():
 
 
 def test_what_tells_copies_apart_counts_as_far_as_the_camera_has_moved():
-    def behind(step):
-        frames = [
-            _frame(k, ((step * k, 0, 0), 6.0), ((step * k + 20, 0, 0), 6.0 - COPY_LOG_ODDS - 3.0))
-            for k in range(2)
-        ]
-        first, second = emissions(frames)
-        assert first[0] - first[1] == pytest.approx(3.0)
-        return second[0] - second[1]
+    def behind(step, gap):
+        frames = [_frame(k, ((step * k, 0, 0), 6.0), ((step * k + 20, 0, 0), 6.0 - gap)) for k in range(2)]
+        return [odds[0] - odds[1] for odds in emissions(frames)]
 
-    assert behind(0.0) == pytest.approx(0.0)
-    assert behind(1.0) == pytest.approx(1.5)
-    assert behind(4.0) == pytest.approx(3.0)
+    middle = (COPY_LOG_ODDS + OTHER_LOG_ODDS) / 2.0
+    first, at_once = behind(0.0, middle)
+    assert 0.0 < at_once < first < middle
+    assert behind(1.0, middle)[1] == pytest.approx((at_once + first) / 2.0)
+    assert behind(4.0, middle) == pytest.approx([first, first])
+    assert behind(4.0, COPY_LOG_ODDS) == pytest.approx([0.0, 0.0])
+    assert behind(0.0, OTHER_LOG_ODDS) == pytest.approx([OTHER_LOG_ODDS, OTHER_LOG_ODDS])
 
 
 def test_a_worse_pose_in_the_same_place_is_no_copy():

@@ -15,11 +15,11 @@ from tqdm import tqdm
 from ..batch.frame_times import EXIF, NAMES, ORDER, times_of
 from ..batch.inputs import is_from_stdin
 from ..panorama.video import frames_of
-from ..walk.frames import MAX_ACCELERATION, MAX_SPEED, NO_ACCELERATION, Motion
+from ..walk.frames import MAX_ACCELERATION, MAX_SPEED, MAX_STEP, NO_ACCELERATION, Motion
 from .errors import UsageError
 
 EVERY = re.compile(r"(\d+(?:\.\d+)?)(s|m)")
-DEFAULT_EVERY, DEFAULT_STEP = "0.5s", 5.0
+DEFAULT_EVERY = "0.5s"
 ONLY_WITH = ("every", "times", "max_speed", "max_step", "acceleration")
 NOT_WITH = ("jobs", "dask", "overlay", "occlusion_mask", "priors", "refine_focal")
 
@@ -53,7 +53,7 @@ def add_walk_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--times", metavar="SOURCE", help=text)
     text = f"of the camera [m/s] (default {MAX_SPEED:g})"
     group.add_argument("--max-speed", type=float, metavar="X", help=text)
-    text = f"from a frame to the next, where only their order is known [m] (default {DEFAULT_STEP:g})"
+    text = "from a frame to the next, where only their order is known [m] (default by what is found of them)"
     group.add_argument("--max-step", type=float, metavar="M", help=text)
     text = "standard deviation of the camera's acceleration, by which the path is smoothed [m/s^2] "
     text += f"(default {MAX_ACCELERATION:g})"
@@ -99,9 +99,9 @@ def motion_of(arguments: argparse.Namespace, has_times: bool) -> Motion:
         value = getattr(arguments, name)
         if value is not None and not 0.0 < value < math.inf:
             raise UsageError(f"--{name.replace('_', '-')}: found {value}, wanted a number above 0")
-    speed = arguments.max_speed or MAX_SPEED if has_times else arguments.max_step or DEFAULT_STEP
+    speed = arguments.max_speed or MAX_SPEED if has_times else arguments.max_step or MAX_STEP
     acceleration = arguments.acceleration or (MAX_ACCELERATION if has_times else NO_ACCELERATION)
-    return Motion(speed, acceleration, has_times)
+    return Motion(speed, acceleration, has_times, not has_times and arguments.max_step is None)
 
 
 def every_of(text: str, max_speed: float) -> tuple[float, float]:

@@ -19,6 +19,7 @@ How = Literal["alone", "near", "tracked", "none"]
 MOST_ODDS = 8.0  # [log] that one frame may add: what is surer is not so of errors that no model has
 COPY_LOG_ODDS = 5.0  # copies of a place differ by as much where one of them was scanned better
 MAX_SPEED, MAX_ACCELERATION = 2.0, 2.0  # [m/s], [m/s^2] of a walking person with a camera
+MAX_STEP = 5.0  # [m] from one frame to the next, if nothing is known
 NO_ACCELERATION = 1e3  # [m] of frames without times: nothing is known of it
 
 
@@ -29,6 +30,7 @@ class Motion:
     max_speed: float = MAX_SPEED  # [m/s]; of frames without times [m] from one to the next
     max_acceleration: float = MAX_ACCELERATION  # [m/s^2] standard deviation along each axis
     is_timed: bool = True  # False if only the order of the frames is known
+    is_guess: bool = False  # True if nobody said how far from one to the next: the poses found will
 
     def __post_init__(self) -> None:
         """Refuse what means nothing."""

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -11,11 +12,11 @@ from ..coarse_to_fine.first_look import CLEAR_SCORE
 from ..coarse_to_fine.localize import localize
 from ..coarse_to_fine.query import Query, prepare_query
 from ..confidence.alternatives import Hypothesis
-from ..confidence.confidence import NOT_LOCALIZED
+from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED
 from ..panorama import Panorama
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Progress, no_progress
-from .frames import MOST_ODDS, Frame, State, centers_of, states_of
+from .frames import MAX_STEP, MOST_ODDS, Frame, Motion, State, centers_of, states_of
 from .path import REACH_SLACK, Path, lattice_of, places_of
 from .tracker import MAX_RADIUS, Follower, Tracker, follow, least_score
 from .tracking import beside, found_near, is_same, states_at
@@ -24,6 +25,7 @@ MAX_SWEEPS = 4
 FARTHEST = 12  # frames from one that is sure, in which lost ones are looked for
 SURE, LEAST_ODDS = 0.5, 0.0
 MIN_GAIN = 1.1  # of the score, by which a pose replaces one nearby
+MOST_STEPS, LONGER = 0.9, 1.5  # of the steps found: the longest is so much longer than so many of them
 MOST_RIVALS = 4  # places of a frame that are followed to its neighbours
 
 Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
@@ -36,6 +38,7 @@ def finished(tracker: Tracker, read: Read, show: Progress = no_progress) -> Path
     would lose the whole walk. Then lost frames are looked for from those that are sure.
     """
     num = len(tracker.frames)
+    tracker.motion = motion_of(tracker)
     for step in (1, -1):
         for k in show(iter(range(num)[::step]), num, "look for copies"):
             _complete(tracker, k, step, read)
@@ -54,6 +57,21 @@ def finished(tracker: Tracker, read: Read, show: Progress = no_progress) -> Path
         if num_found == 0:
             break
     return path
+
+
+def motion_of(tracker: Tracker) -> Motion:
+    """How the camera is carried: if nobody said how far, by the frames that are localized alone."""
+    motion = tracker.motion
+    if motion.is_timed or not motion.is_guess:
+        return motion
+    alone = [f.alone.pose if f.alone and f.alone.status == LOCALIZED else None for f in tracker.frames]
+    steps = [
+        float(np.linalg.norm(pose.center_world - before.center_world))
+        for before, pose in pairwise(alone)
+        if before is not None and pose is not None
+    ]
+    longest = LONGER * float(np.quantile(steps, MOST_STEPS)) if steps else 0.0
+    return replace(motion, max_speed=max(MAX_STEP, longest), is_guess=False)
 
 
 def _path_of(tracker: Tracker) -> Path:

@@ -16,7 +16,7 @@ from ..geometry.pose import Pose
 from ..panorama import Panorama
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
-from .frames import NO_ACCELERATION, Frame, Motion, State, centers_of, states_of
+from .frames import MAX_STEP, NO_ACCELERATION, Frame, Motion, State, centers_of, states_of
 from .free_space import FreeSpace
 from .path import REACH_SLACK, Lattice
 from .tracking import (
@@ -72,8 +72,9 @@ class Tracker:
         return self.lattice.frames
 
     def forget_times(self) -> None:
-        """From the first frame on only their order is known: their times are numbers."""
-        self.motion = replace(self.motion, max_acceleration=NO_ACCELERATION, is_timed=False)
+        """Of frames of which only the order is known: their times are numbers. Before the first one."""
+        step = MAX_STEP if self.motion.is_guess else self.motion.max_speed
+        self.motion = replace(self.motion, max_speed=step, max_acceleration=NO_ACCELERATION, is_timed=False)
         self.lattice = Lattice(self.lattice.space, self.motion)
 
     def prepared(self, panorama: Panorama) -> Query:
