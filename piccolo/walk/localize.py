@@ -76,6 +76,15 @@ def _is_on(found: Localization) -> bool:
     return found.confidence > SURE
 
 
+def accuracy_of(frame: Frame) -> float:
+    """Probability that a frame has come to the very pose, if it is at the place where the walk has it.
+
+    The frames around tell the place of one that is blurred or dark, but not where in it.
+    """
+    odds = float(np.logaddexp.reduce([state.log_odds for state in frame.states]))
+    return 1.0 / (1.0 + math.exp(-odds))
+
+
 def localization_of(tracker: Tracker, frame: Frame, probabilities: Array, chosen: int | None) -> Localization:
     """A frame with the probabilities that a walk gives its poses."""
     if not frame.states:
@@ -84,6 +93,7 @@ def localization_of(tracker: Tracker, frame: Frame, probabilities: Array, chosen
     best, values = frame.states[order[0]], [float(probabilities[j]) for j in order]
     if best.covariance is not None:
         values[0] *= math.erf(MAX_DISTANCE / (best.covariance.largest_std * math.sqrt(2.0)))
+    values[0] *= accuracy_of(frame)
     none = max(1.0 - sum(values), 0.0)
     to_world, alone = tracker.scan_map.to_world, frame.alone
     is_own = alone is not None and alone.pose is not None and order[0] == 0 and frame.how == "alone"
