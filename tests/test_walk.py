@@ -1,8 +1,10 @@
 """A walk through a room, in Python and on the command line."""
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import cv2
@@ -15,6 +17,7 @@ from piccolo.batch.frame_times import times_of
 from piccolo.cli import localize as localize_command
 from piccolo.cli import localize_walk as walk_command
 from piccolo.cloud.ply_writer import vertex_rows, write_ply
+from piccolo.confidence.localization import Localization
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
 from piccolo.result import read_results
@@ -22,6 +25,10 @@ from piccolo.runtime.threads import Workers
 from piccolo.scan_walk import Walk
 from piccolo.scenes.export.video import writing_video
 from piccolo.scenes.synthetic.world import free_position, photograph
+from piccolo.walk import tracker as tracker_module
+from piccolo.walk.frames import MAX_STEP, NO_ACCELERATION, Frame, Motion, State
+from piccolo.walk.localize import accuracy_of
+from piccolo.walk.second_look import motion_of
 
 NUM_FRAMES, STEP_S = 8, 0.5
 
@@ -125,6 +132,53 @@ def test_live_results_come_frame_by_frame_and_need_no_times(scan, building):
     assert live[1].pano == str(queries[1].image)
     assert live[1].source.pano_sha256 is not None
     _assert_right(tracker.finish(), queries)
+
+
+def test_photos_in_any_order_are_each_searched_in_the_whole_scan(scan, building):
+    """Without times, and where nobody says how far apart: no worse than each alone."""
+    _, queries = building
+    some = [queries[k] for k in (5, 0, 7, 2)]
+    results = scan.localize_walk([q.image for q in some], gravity="known")
+    _assert_right(results, some)
+    assert [(r.walk.how, r.walk.alone.status) for r in results] == [("alone", "localized")] * 4
+
+
+def test_however_sure_the_whole_scan_is_searched_now_and_then(scan, building, monkeypatch):
+    _, queries = building
+    monkeypatch.setattr(tracker_module, "CHECKED_SURE", 0.4)  # [m] the camera goes 0.23 at a time
+    results = scan.localize_walk([q.image for q in queries], [q.time for q in queries], gravity="known")
+    _assert_right(results, queries)
+    is_searched = [r.walk.how == "alone" for r in results]
+    assert is_searched == [k % 2 == 0 for k in range(NUM_FRAMES)]
+    assert results[0].walk.alone is not None
+    assert all(r.walk.alone is None for r in results[1:])
+
+
+def test_the_longest_step_is_told_by_the_frames_that_are_localized_alone():
+    def frame(x, status="localized"):
+        return Frame(0.0, alone=Localization(status=status, pose=Pose(np.eye(3), np.array([x, 0.0, 0.0]))))
+
+    frames = [*(frame(6.0 * k) for k in range(10)), frame(500.0), frame(900.0, "ambiguous"), Frame(0.0)]
+    guess = Motion(MAX_STEP, NO_ACCELERATION, is_timed=False, is_guess=True)
+
+    def longest(motion, frames):
+        return motion_of(SimpleNamespace(motion=motion, frames=frames)).max_speed
+
+    assert longest(guess, frames) == pytest.approx(9.0)
+    assert longest(guess, [frame(0.0), frame(1.0)]) == MAX_STEP
+    assert longest(guess, [Frame(0.0)]) == MAX_STEP
+    assert longest(replace(guess, is_guess=False), frames) == MAX_STEP
+    assert longest(replace(guess, is_timed=True), frames) == MAX_STEP
+
+
+def test_a_frame_is_as_sure_as_its_own_picture():
+    """Those around it tell the place of a blurred frame, but not where in it."""
+
+    def state(odds):
+        return State(Pose(np.eye(3), np.zeros(3)), odds, 0.5)
+
+    assert accuracy_of(Frame(0.0, [state(0.0)])) == pytest.approx(0.5)
+    assert accuracy_of(Frame(0.0, [state(2.0), state(2.0)])) == pytest.approx(1 / (1 + np.exp(-2.0) / 2))
 
 
 def test_a_walk_is_the_same_with_any_number_of_threads(building):

@@ -70,7 +70,7 @@ def motion_of(tracker: Tracker) -> Motion:
         for before, pose in pairwise(alone)
         if before is not None and pose is not None
     ]
-    longest = LONGER * float(np.quantile(steps, MOST_STEPS)) if steps else 0.0
+    longest = LONGER * float(np.quantile(steps, MOST_STEPS, method="lower")) if steps else 0.0
     return replace(motion, max_speed=max(MAX_STEP, longest), is_guess=False)
 
 
