@@ -290,6 +290,14 @@ def test_damaged_tables_are_refused_in_one_line(tmp_path, text, message):
     assert "\n" not in str(error.value)
 
 
+def test_a_table_names_the_scans_that_a_photo_may_be_in(tmp_path):
+    table = tmp_path / "priors.csv"
+    table.write_text("name,within\na.jpg, Storey 1 ;Storey 2;\nb.jpg,\n")
+    priors = read_priors(table, Prior(within=("Roof",)))
+    assert priors.prior_of(Path("a.jpg"), Prior(within=("Roof",))).within == ("Storey 1", "Storey 2")
+    assert priors.prior_of(Path("b.jpg"), Prior(within=("Roof",))).within == ("Roof",)
+
+
 def test_empty_cells_fall_back_and_paths_go_before_names(tmp_path):
     table = tmp_path / "priors.csv"
     table.write_text(f"name,x,y,z,heading,tolerance\na.jpg,1,2,3,90,\n{os.sep}b{os.sep}a.jpg,,,,10,5\n")

@@ -5,15 +5,27 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
+from ..coarse_to_fine.named_scans import check_within
+from ..coarse_to_fine.scan_map import ScanMap
 from ..coarse_to_fine.settings import Prior
 from ..errors import InputError
 from ..runtime.json_file import read_text
 
-COLUMNS = ("x", "y", "z", "radius", "heading", "tolerance", "height")
+NUMBERS = ("x", "y", "z", "radius", "heading", "tolerance", "height")
+COLUMNS = (*NUMBERS, "within")
+BETWEEN_NAMES = ";"
 WANTED = f"wanted a CSV file whose first line names its columns: name and any of {', '.join(COLUMNS)}"
 DEFAULT_RADIUS = 5.0  # [m]
 HEIGHT_TOLERANCE = 0.3  # [m] either side of a height
+
+
+class Row(NamedTuple):
+    """The cells of a panorama that are not empty."""
+
+    numbers: Mapping[str, float]
+    within: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -21,7 +33,7 @@ class PriorTable:
     """A prior for each panorama named, in place of what it says of the one that all have."""
 
     path: Path
-    by_name: Mapping[str, Mapping[str, float]]
+    by_name: Mapping[str, Row]
     used: set[str] = field(default_factory=set)
 
     def prior_of(self, pano: Path, general: Prior) -> Prior:
@@ -32,14 +44,23 @@ class PriorTable:
         self.used.add(name)
         return _prior_from(self.by_name[name], general)
 
+    def check_scans(self, scan_map: ScanMap) -> None:
+        """Refuse names that no scan of a map has."""
+        for name, row in self.by_name.items():
+            try:
+                check_within(scan_map, row.within)
+            except InputError as error:
+                text = str(error).replace("--within", f"{self.path}: within, of {name}")
+                raise InputError(text) from error
+
     @property
     def unused(self) -> list[str]:
         """Names that no panorama has had."""
         return [name for name in self.by_name if name not in self.used]
 
 
-def _prior_from(row: Mapping[str, float], general: Prior) -> Prior:
-    prior = general
+def _prior_from(cells: Row, general: Prior) -> Prior:
+    prior, row = replace(general, within=cells.within or general.within), cells.numbers
     if "x" in row:
         radius = row.get("radius", general.radius or DEFAULT_RADIUS)
         prior = replace(prior, near_world=(row["x"], row["y"], row.get("z")), radius=radius)
@@ -57,7 +78,7 @@ def read_priors(path: Path, general: Prior) -> PriorTable:
 
     Columns: name (the panorama's path as given, or its file name), x, y, z [m] in the scan's frame (without z
     in any height), radius [m] about them, heading [deg] of the image centre clockwise from +y, its tolerance
-    [deg], height [m] above the floor.
+    [deg], height [m] above the floor, within (names of the map's scans, with semicolons between them).
 
     Raises
     ------
@@ -74,7 +95,7 @@ def read_priors(path: Path, general: Prior) -> PriorTable:
     ):
         found = f"found a column {odd[0]!r}" if "name" in names and odd else f"found the columns {names}"
         raise InputError(f"{path}: {found}, {WANTED}")
-    by_name: dict[str, Mapping[str, float]] = {}
+    by_name: dict[str, Row] = {}
     for row in rows:
         where = f"{path}, line {rows.line_num}"
         name = (row.pop("name") or "").strip()
@@ -87,7 +108,8 @@ def read_priors(path: Path, general: Prior) -> PriorTable:
                 else "no name"
             )
             raise InputError(f"{where}: found {wrong}")
-        by_name[name] = _numbers(where, row)
+        within = (row.pop("within", None) or "").split(BETWEEN_NAMES)
+        by_name[name] = Row(_numbers(where, row), tuple(w.strip() for w in within if w.strip()))
         try:
             _prior_from(by_name[name], general)
         except InputError as error:

@@ -20,6 +20,7 @@ from ..batch.inputs import is_from_stdin, panoramas_of
 from ..batch.localizer import Answer, Localizer
 from ..batch.priors import read_priors
 from ..coarse_to_fine.open_map import CachePolicy, scan_sha256_of
+from ..coarse_to_fine.scan_map import ScanMap
 from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..panorama.cube import is_cube
@@ -152,6 +153,8 @@ def open_scan(run: Run, localizer: Localizer, num_threads: int) -> Scan:
     for warning in scan.warnings:  # those of a map prepared earlier; others have been written
         workers.warn(warning)
     run.cloud, run.cloud_sha256 = scan.name, scan.prepared.scan_sha256
+    if run.batch.priors and isinstance(scan.prepared, ScanMap):
+        run.batch.priors.check_scans(scan.prepared)
     return scan
 
 
