@@ -1,6 +1,7 @@
 """The errors of one result against the true pose."""
 
 import json
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,8 @@ from ...scan import Scan
 from ..scene import Query, Scene
 
 FORMAT = "piccolo-evaluation/1"
+VIDEO_FRAME = re.compile(r"(.+)#t=(\d+\.\d+)")
+MAX_TIME_DIFFERENCE = 2e-3  # [s] of a video's frame from a walk's
 
 
 class Thresholds(NamedTuple):
@@ -95,10 +98,24 @@ def is_in_box(scan: Scan, pose: Pose) -> bool:
     return all(bool(axis.min() <= value <= axis.max()) for value, axis in axes)
 
 
+def frames_of_video(pairs: Sequence[tuple[Scene, Query]], pano: str) -> list[tuple[Scene, Query]]:
+    """The queries that a frame of a video may be: of the walk of its name, at its time."""
+    found = VIDEO_FRAME.fullmatch(pano)
+    if found is None:
+        return []
+    walk, time = Path(found[1]).stem, float(found[2])
+    return [
+        pair
+        for pair in pairs
+        if pair[1].walk == walk and abs((pair[1].time or 0.0) - time) < MAX_TIME_DIFFERENCE
+    ]
+
+
 def match_results(scenes: Sequence[Scene], results: Sequence[Result]) -> Iterator[QueryResult]:
     """Results of localize.py with their errors; each belongs to the query whose image it names.
 
-    The image is found by its path, or else by its file name if only one query has that.
+    The image is found by its path, or else by its file name if only one query has that. A frame of a video,
+    FOLDER/WALK.mp4#t=SECONDS, is the query of the walk of that name and time.
 
     Raises InputError if a result belongs to no query, or its name to several.
     """
@@ -109,6 +126,7 @@ def match_results(scenes: Sequence[Scene], results: Sequence[Result]) -> Iterato
     for result in results:
         found = by_path.get(Path(result.pano).resolve())
         named = [(scene, query) for scene, query, path in queries if path.name == Path(result.pano).name]
+        named += frames_of_video(pairs, result.pano)
         if found is None and len(named) != 1:
             names = sorted(path.name for _, _, path in queries)[:3]
             text = f"{len(named)} queries of this name" if named else "a result without a true pose"
