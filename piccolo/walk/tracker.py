@@ -29,6 +29,7 @@ from .tracking import (
     predicted,
     states_at,
     tracked,
+    tracked_on,
 )
 
 MOST_TRACKED = 6  # poses from which a frame is tracked
@@ -37,6 +38,7 @@ LEAST_WEIGHT = 0.02  # of such a pose, by the likeliest
 MAX_RADIUS = 12.0  # [m] around its last pose in which a lost camera is looked for
 FIRST_SEARCH, LAST_SEARCH = 3, 48  # frames after which a lost camera is searched everywhere, and again
 FAR = 3.0  # [m] from frame to frame, where each is searched in the whole scan
+USUAL = 0.9  # of the score of the frame before
 SURE, CHECKED_SURE, CHECKED_UNSURE = 0.9, 8.0, 3.0  # [m] walked, after which the whole scan is searched
 
 
@@ -195,13 +197,13 @@ def least_score(f: Follower) -> float:
 
 
 def follow(query: Query, f: Follower, time: float, motion: Motion) -> Hypothesis:
-    """Descend from where a camera should be after a pose."""
-    seconds, before = time - f.time, f.state.pose
-    span = f.time - f.earlier_time
+    """Descend from where a camera should be after a pose; farther around if it explains less than before."""
+    least, seconds = least_score(f), time - f.time
+    starts, span = [f.state.pose], f.time - f.earlier_time
     if f.earlier is not None and span != 0.0:
         reach = motion.max_speed * abs(seconds) + REACH_SLACK
-        end = tracked(query, predicted(before, f.earlier, seconds / span, reach), least_score(f))
-        if end.score >= least_score(f):
-            return end
-        return max((end, tracked(query, before, least_score(f))), key=lambda h: h.score)
-    return tracked(query, before, least_score(f))
+        starts.insert(0, predicted(f.state.pose, f.earlier, seconds / span, reach))
+    end = tracked(query, starts[0], least)
+    if end.score < least:
+        end = max([end, *(tracked(query, start, least) for start in starts[1:])], key=lambda h: h.score)
+    return tracked_on(query, end) if least <= end.score < USUAL * f.state.score else end

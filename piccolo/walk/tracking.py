@@ -46,10 +46,21 @@ def tracked(query: Query, start: Pose, least_score: float) -> Hypothesis:
     near = descend_fine(query, descend_middle(query, Hypothesis(start, 0.0)))
     if near.score < least_score:
         near = max([near, descend_fine(query, perturb_middle(query, near))], key=lambda h: h.score)
-    points = points_at(query, near.pose)
-    pose = descend(points, near.pose.center_world, query.images.full, near.pose, LAST_LIMITS)
-    end = compared(query, Hypothesis(pose, 0.0))
+    end = descend_last(query, near)
     return end if end.score >= least_score else max(end, compared(query, near), key=lambda h: h.score)
+
+
+def tracked_on(query: Query, end: Hypothesis) -> Hypothesis:
+    """A pose that explains more, farther around one that was tracked; else the same."""
+    around = descend_last(query, descend_fine(query, perturb_middle(query, end)))
+    return max(end, around, key=lambda h: h.score)
+
+
+def descend_last(query: Query, h: Hypothesis) -> Hypothesis:
+    """The last descent, on the points themselves, with the score by which poses are selected."""
+    points = points_at(query, h.pose)
+    pose = descend(points, h.pose.center_world, query.images.full, h.pose, LAST_LIMITS)
+    return compared(query, Hypothesis(pose, 0.0))
 
 
 def found_near(query: Query, near: Pose, radius: float, least_score: float) -> list[Hypothesis]:
