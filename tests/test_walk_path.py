@@ -10,12 +10,11 @@ from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose
 from piccolo.runtime.threads import Workers
 from piccolo.scenes.synthetic.world import make_world, scan_world
-from piccolo.walk.frames import COPY_LOG_ODDS, Frame, Motion, State, centers_of, checked_times
+from piccolo.walk.frames import COPY_LOG_ODDS, OTHER_LOG_ODDS, Frame, Motion, State, centers_of, checked_times
 from piccolo.walk.free_space import FreeSpace
 from piccolo.walk.path import (
     LEAST_TOLD,
     MOST_EXPECTED,
-    OTHER_LOG_ODDS,
     TELLING_LOG,
     UNLISTED,
     emissions,

@@ -18,6 +18,7 @@ from ..geometry.pose import Array, Pose
 How = Literal["alone", "near", "tracked", "none"]
 MOST_ODDS = 8.0  # [log] that one frame may add: what is surer is not so of errors that no model has
 COPY_LOG_ODDS = 4.0  # copies of a place differ by as much where one of them was scanned better
+OTHER_LOG_ODDS = 6.0  # behind the best: no copy
 MAX_SPEED, MAX_ACCELERATION = 2.0, 2.0  # [m/s], [m/s^2] of a walking person with a camera
 MAX_STEP = 5.0  # [m] from one frame to the next, if nothing is known
 NO_ACCELERATION = 1e3  # [m] of frames without times: nothing is known of it

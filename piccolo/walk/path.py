@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.pose import Array
-from .frames import COPY_LOG_ODDS, MOST_ODDS, Frame, Motion, centers_of
+from .frames import COPY_LOG_ODDS, MOST_ODDS, OTHER_LOG_ODDS, Frame, Motion, centers_of
 from .free_space import FreeSpace
 
 SAME_PLACE = 1.5  # [m] poses nearer to each other are of one place, not of copies
-OTHER_LOG_ODDS = 6.0  # behind the best: no copy
 TELLING_DISTANCE = 2.0  # [m] after which a frame says something new of its place
 REACH_SLACK, REACH_SIGMA = 0.3, 0.25  # [m] beyond what a person walks; deviation of more
 GAP_LOG, UNTIMED_GAP_LOG = -9.0, -4.0  # a jump to any place: lift, cut, pocket; of frames without times

@@ -16,7 +16,7 @@ from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED
 from ..panorama import Panorama
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Progress, no_progress
-from .frames import MAX_STEP, MOST_ODDS, Frame, Motion, State, centers_of, states_of
+from .frames import MAX_STEP, Frame, Motion, State, centers_of, states_of
 from .path import REACH_SLACK, Path, lattice_of, places_of
 from .tracker import MAX_RADIUS, Follower, Tracker, follow, least_score
 from .tracking import beside, found_near, is_same, states_at
@@ -97,14 +97,14 @@ def _complete(tracker: Tracker, k: int, step: int, read: Read) -> None:
 
 def _rivals(tracker: Tracker, m: int) -> list[Follower]:
     """The likelier poses of a frame, one of each place; none if there is only one."""
-    frame = tracker.frames[m]
-    odds = np.array([state.log_odds for state in frame.states])
-    if len(odds) < 2:
+    likely = tracker.frames[m].likely
+    if len(likely) < 2:
         return []
-    leaders = np.unique(places_of(odds, centers_of(frame.states)))
-    likely = [int(j) for j in leaders if odds[j] > odds.max() - MOST_ODDS]
-    likely = sorted(likely, key=lambda j: -odds[j])[:MOST_RIVALS]
-    return [Follower(frame.states[j], frame.time, None, 0.0) for j in likely] if len(likely) > 1 else []
+    odds = np.array([state.log_odds for state in likely])
+    places = {int(j) for j in places_of(odds, centers_of(likely))}
+    leaders = sorted(places, key=lambda j: (-odds[j], j))[:MOST_RIVALS]
+    time = tracker.frames[m].time
+    return [Follower(likely[j], time, None, 0.0) for j in leaders] if len(leaders) > 1 else []
 
 
 def _is_reached(tracker: Tracker, f: Follower, k: int, least_odds: float = -math.inf) -> bool:

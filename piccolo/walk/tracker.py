@@ -38,7 +38,7 @@ LEAST_WEIGHT = 0.02  # of such a pose, by the likeliest
 MAX_RADIUS = 12.0  # [m] around its last pose in which a lost camera is looked for
 FIRST_SEARCH, LAST_SEARCH = 3, 48  # frames after which a lost camera is searched everywhere, and again
 FAR = 3.0  # [m] from frame to frame, where each is searched in the whole scan
-USUAL = 0.9  # of the score of the frame before
+USUAL = 0.95  # of the score of the frame before
 SURE, CHECKED_SURE, CHECKED_UNSURE = 0.9, 8.0, 3.0  # [m] walked, after which the whole scan is searched
 
 

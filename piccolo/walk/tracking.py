@@ -20,7 +20,7 @@ from ..confidence.confidence import posterior
 from ..geometry.pose import Pose, exp_so3, log_so3, pose_errors
 from ..geometry.rotations import Gravity
 from ..runtime.stopwatch import Stopwatch
-from .frames import State, log_ratio
+from .frames import OTHER_LOG_ODDS, State, log_ratio
 
 LEAST_SCORE = 0.2  # of a frame that is tracked
 LEAST_KEPT = 0.6  # of the score of the frame before
@@ -102,13 +102,18 @@ def states_at(query: Query, hypotheses: Sequence[Hypothesis]) -> list[State]:
 
 
 def beside(query: Query, states: Sequence[State], found: Hypothesis) -> State | None:
-    """A pose as a state beside others of its frame, by what it explains by the best; None if it is one."""
+    """A pose as a state beside others of its frame, by what it explains by the best.
+
+    None if it is one of them, or so much worse that it can't be a copy.
+    """
     best = max(states, key=lambda state: state.log_odds)
     if any(is_same(state.pose, found.pose) for state in states):
         return None
     asked, at_best = replace(query, by_features=False), Hypothesis(best.pose, best.score)
     first, second = posterior(standings_of(asked, at_best, [found]), None)[:2]
     odds = best.log_odds + log_ratio(float(second), float(first))
+    if odds < best.log_odds - OTHER_LOG_ODDS:
+        return None
     return State(found.pose, odds, found.score, estimate_covariance(query, found.pose), best.num_matches)
 
 
