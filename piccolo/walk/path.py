@@ -140,6 +140,7 @@ class Lattice:
         self.best: list[Array] = []  # of the best way
         self.back: list[list[tuple[int, int] | None]] = []
         self.unlisted: list[_Unlisted] = []
+        self.ended = -math.inf  # the sum over ways that end at a state
 
     def add(self, frame: Frame) -> None:
         """The next frame in time."""
@@ -161,6 +162,7 @@ class Lattice:
                 if ways[i, j] > best[j]:
                     best[j], back[j] = ways[i, j], (s.begin, i)
         self.forward.append(sums + self.emitted[k])
+        self.ended = float(np.logaddexp(self.ended, np.logaddexp.reduce(self.forward[k])))
         self.best.append(best + self.emitted[k])
         self.back.append(back)
 
@@ -226,8 +228,8 @@ class Lattice:
         return np.asarray(np.exp(self.forward[-1] - self._total()))
 
     def _total(self) -> float:
-        ends = [self.unlisted[-1].forward, *(np.logaddexp.reduce(f) for f in self.forward if len(f))]
-        return float(np.logaddexp.reduce(ends))
+        """Log of the sum over all ways."""
+        return float(np.logaddexp(self.unlisted[-1].forward, self.ended))
 
     def smoothed(self) -> Path:
         """The likeliest way, and the probability of each state by all frames."""
