@@ -8,10 +8,18 @@ import numpy as np
 from ..coarse_to_fine.covariance import estimate_covariance
 from ..coarse_to_fine.descent import FULL_LOSS, descend
 from ..coarse_to_fine.first_look import FIRST_BEAM, first_query, is_rather_mirrored
-from ..coarse_to_fine.localize import searched
 from ..coarse_to_fine.prior import apply_prior
 from ..coarse_to_fine.query import Query
-from ..coarse_to_fine.refinement import compared, descend_fine, descend_middle, perturb_middle, points_at
+from ..coarse_to_fine.refinement import (
+    compared,
+    descend_fine,
+    descend_middle,
+    first_score,
+    perturb_middle,
+    points_at,
+    refine,
+)
+from ..coarse_to_fine.search import search_poses
 from ..coarse_to_fine.search_result import found_among
 from ..coarse_to_fine.settings import Prior
 from ..coarse_to_fine.standings import standings_of
@@ -19,7 +27,6 @@ from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE, Hypothesis, suppr
 from ..confidence.confidence import posterior
 from ..geometry.pose import Pose, exp_so3, log_so3, pose_errors
 from ..geometry.rotations import Gravity
-from ..runtime.stopwatch import Stopwatch
 from .frames import OTHER_LOG_ODDS, State, log_ratio
 
 LEAST_SCORE = 0.2  # of a frame that is tracked
@@ -76,9 +83,11 @@ def found_everywhere(query: Query, least_score: float) -> list[Hypothesis]:
     """Poses found in a whole map by whole views, copies too; none if the best has less than a score."""
     first = first_query(query)
     gravity: Gravity = "unknown" if query.settings.gravity == "unknown" else "known"
-    starts, hypotheses = searched(first, gravity, FIRST_BEAM, Stopwatch())
-    found = found_among(hypotheses, MOST_LISTED - 1)
-    if found.best.score < least_score or is_rather_mirrored(first, starts):
+    starts = search_poses(first, gravity, is_first=True)
+    if first_score(first, starts) < least_score or is_rather_mirrored(first, starts):
+        return []
+    found = found_among(refine(first, starts, FIRST_BEAM), MOST_LISTED - 1)
+    if found.best.score < least_score:
         return []
     least = KEPT_BESIDE * found.best.score
     close = [h for h in (found.best, *found.alternatives) if h.score >= least]
