@@ -66,6 +66,7 @@ class House:
             at[2] = start.center_world[2]
             pose = Pose(yaw_rotation(0.5 * k + np.pi / 2), at)
             path = self.folder / "photos" / f"walk_{k}.jpg"
+            path.parent.mkdir(exist_ok=True)
             path.write_bytes(encode_image(photograph(room, pose, self.width, Workers(2)), ".jpg", 90))
             walk = WalkFrame(1.5 * k, k, "tracked", None, Gap(9.0, 1.5) if k == 4 else None)
             lines.append(replace(result_of(path, pose), walk=walk).to_json())

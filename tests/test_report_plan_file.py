@@ -1,6 +1,7 @@
 """Plans without a browser: what other programs read from the PNG, SVG and DXF."""
 
 import base64
+import json
 import math
 import re
 from xml.etree import ElementTree
@@ -12,6 +13,7 @@ import pytest
 from report_scenes import HOSTILE, House, lifted
 
 from piccolo.cli import report
+from piccolo.report.plan_path import color_of, segments_of
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -76,3 +78,54 @@ def test_png_shows_each_photo_in_the_color_of_its_status(house, tmp_path):
     for color in ((76, 120, 8), (0, 83, 166), (45, 37, 193)):
         is_there = (np.abs(sheet.astype(int) - color).max(axis=2) < 3).astype(np.uint8)
         assert cv2.erode(is_there, np.ones((9, 9))).any()
+
+
+@pytest.fixture(scope="module")
+def walked(tmp_path_factory):
+    """A walk of seven frames, with a gap before the fifth; the last but one is not very sure."""
+    house = House(tmp_path_factory.mktemp("walked"), 128)
+    house.write_cloud()
+    lines = [json.loads(line) for line in house.add_walk(7)]
+    lines[5]["confidence"] = 0.6
+    house.write_results(lines=[json.dumps(line) for line in lines])
+    return house
+
+
+def test_a_walk_is_a_path_in_the_colors_of_its_confidence(walked, tmp_path):
+    root = ElementTree.fromstring(_plan(walked, tmp_path / "p.svg").read_bytes())
+    lines = list(root.iter(f"{SVG}line"))
+    sure, unsure = ("#{:02x}{:02x}{:02x}".format(*color_of(confidence)) for confidence in (0.995, 0.6))
+    assert [line.get("stroke") for line in lines] == [sure] * 4 + [unsure] * 2
+    assert [line.get("stroke-dasharray") is not None for line in lines] == [k == 3 for k in range(6)]
+    numbers = [text.text for text in root.iter(f"{SVG}text") if text.text.isdecimal()]
+    assert numbers == ["1"]
+    sheet = cv2.imread(str(_plan(walked, tmp_path / "p.png"))).astype(int)
+    for confidence in (0.995, 0.6):
+        is_there = np.abs(sheet[60:] - color_of(confidence)[::-1]).max(axis=2) < 12
+        assert is_there.sum() > 50, confidence
+    space = ezdxf.readfile(_plan(walked, tmp_path / "p.dxf")).modelspace()
+    assert [line.rgb for line in space.query("LINE") if line.rgb] == [color_of(0.995)] * 4 + [
+        color_of(0.6)
+    ] * 2
+
+
+def test_frames_that_are_likely_elsewhere_are_passed_over():
+    def frame(time, confidence, storey=0, walk=0):
+        pose = {"center": [time, 0.0, 0.0]}
+        return {
+            "walk": walk,
+            "time": time,
+            "confidence": confidence,
+            "pose": pose,
+            "storey": storey,
+            "gap": False,
+        }
+
+    photos = [frame(2.0, 0.95), frame(0.0, 0.9), frame(1.0, 0.4), frame(3.0, 0.9, 1), frame(4.0, 0.9, None)]
+    photos += [
+        {**frame(9.0, 1.0), "walk": None},
+        frame(1.5, 1.0, walk=1),
+        {**frame(2.5, 1.0, walk=1), "pose": None},
+    ]
+    found = [(s.begin["time"], s.end["time"], s.confidence) for s in segments_of(photos)]
+    assert found == [(0.0, 2.0, 0.9), (3.0, 4.0, 0.9)]

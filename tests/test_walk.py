@@ -158,7 +158,12 @@ def test_the_longest_step_is_told_by_the_frames_that_are_localized_alone():
     def frame(x, status="localized"):
         return Frame(0.0, alone=Localization(status=status, pose=Pose(np.eye(3), np.array([x, 0.0, 0.0]))))
 
-    frames = [*(frame(6.0 * k) for k in range(10)), frame(500.0), frame(900.0, "ambiguous"), Frame(0.0)]
+    frames = [
+        *(frame(6.0 * (k // 2)) for k in range(40)),
+        frame(500.0),
+        frame(900.0, "ambiguous"),
+        Frame(0.0),
+    ]
     guess = Motion(MAX_STEP, NO_ACCELERATION, is_timed=False, is_guess=True)
 
     def longest(motion, frames):
@@ -260,6 +265,13 @@ def test_a_video_is_a_walk(building, tmp_path):
     _assert_right(results, queries[: 2 * len(results) : 2])
     assert [r.pano for r in results] == [f"{video}#t={k}.000" for k in range(len(results))]
     assert len(results) == (len(queries) + 1) // 2
+    plan = tmp_path / "plan.svg"
+    assert (
+        _command(folder, "--video", str(video), "--every", "1s", "--out", str(out), "--plan", str(plan)) == 0
+    )
+    text = plan.read_text()  # of the results that are there
+    assert (text.count("<line"), text.count("<title")) == (len(results) - 1, len(results))
+    assert _command(folder, "--video", str(video), "--plan", str(tmp_path / "none" / "a.png")) == 3
     assert _command(folder, "--video", str(video), "--every", "0.5m", "--out", str(out), "--overwrite") == 0
     centers = [r.pose.center_world for r in read_results([out])]
     assert 2 <= len(centers) < len(queries)
@@ -284,6 +296,12 @@ REFUSED = {
         ["--walk", "--pano", "a.jpg", "--max-step", "0"],
         2,
         "--max-step: found 0.0, wanted",
+    ),
+    "plan alone": (["--pano", "a.jpg", "--plan", "a.png"], 2, "--plan: only with --walk or --video"),
+    "plan of a kind": (
+        ["--walk", "--pano", "a.jpg", "--plan", "a.pdf"],
+        2,
+        "--plan a.pdf: wanted a name that ends with .png, .svg, .dxf",
     ),
     "no times": (["--walk", "--pano", "a.jpg", "--max-speed", "2"], 2, "--max-speed: found no times"),
     "no video": (["--video", "missing.mp4"], 3, "missing.mp4: no such file, wanted a video that PyAV reads"),

@@ -36,7 +36,7 @@ from ..scan import Scan
 from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error, print_note, run_command
 from .executing import check_execution, executing
 from .interruption import SIGNALS, Interruption, Stopped, interruptible
-from .localize_walk import run_walk
+from .localize_walk import check_plan, run_walk
 from .options import build_parser, check_arguments, cloud_settings_from, read_options_from, settings_from
 from .outputs import check_distinct, check_suffix
 from .progress import progress_bar, warn_once
@@ -78,9 +78,11 @@ def check_files(arguments: argparse.Namespace, panoramas: list[Path], total: int
     given = filter(None, files)
     lists = [Path(word[1:]) for word in arguments.pano if word.startswith("@")]
     pictures = {"--overlay": arguments.overlay, "--occlusion-mask": arguments.occlusion_mask}
-    outputs = {"--out": arguments.out or STDOUT, **pictures}
+    outputs = {"--out": arguments.out or STDOUT, "--plan": arguments.plan, **pictures}
     check_distinct(outputs, [*arguments.cloud, *panoramas, *lists, *given])
     check_output(arguments.out or STDOUT)
+    if arguments.plan:
+        check_plan(arguments.plan)
     for option, path in pictures.items():
         if path is None or path.is_dir():
             continue

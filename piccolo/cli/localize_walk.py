@@ -15,18 +15,21 @@ from tqdm import tqdm
 
 from .. import __version__
 from ..batch.results_file import WAYS, finished_lines
+from ..coarse_to_fine.scan_map import ScanMap
 from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..confidence.confidence import LOCALIZED
 from ..errors import InputError
 from ..panorama import ReadOptions
-from ..result import UNREADABLE, Result
-from ..runtime.atomic import STDOUT, is_stream, write_atomically
+from ..result import UNREADABLE, Result, read_results
+from ..runtime.atomic import STDOUT, check_output, is_stream, write_atomically
 from ..runtime.line_file import appending, whole_lines, whole_size
+from ..runtime.optional import import_optional
 from ..runtime.stopwatch import Stopwatch
 from ..scan import Scan
 from ..scan_walk import Prepared, Walk
 from .errors import EXIT_BAD_INPUT, print_error, print_note
 from .interruption import SIGNALS, Interruption, Stopped, interruptible
+from .outputs import check_suffix
 from .progress import progress_bar
 from .walking import WalkInput, WalkInputs
 
@@ -44,10 +47,12 @@ def run_walk(
 ) -> int:
     """Localize a walk, write its results, return the exit code."""
     watch = Stopwatch()
-    walk = open_scan().walk(read_options, settings, inputs.motion)
+    scan = open_scan()
+    walk = scan.walk(read_options, settings, inputs.motion)
     key = key_of(walk)
     if (statuses := finished_statuses(arguments, key)) is not None:
         print_note(arguments, f"{arguments.out}: nothing is left to do")
+        write_plan(arguments.plan, scan, read_results([arguments.out]) if arguments.plan else [])
         return exit_code_of(statuses)
     with watch.stage("all"):
         interruption = follow_all(arguments, walk, inputs.frames, json.dumps(key))
@@ -57,6 +62,7 @@ def run_walk(
             return print_error(arguments, text, interruption.exit_code)
         results = spaced(walk.finish(progress_bar(arguments.quiet)), inputs.min_distance)
     write_all(arguments.out, results)
+    write_plan(arguments.plan, scan, results)
     if path := kept_in(arguments.out):
         path.unlink(missing_ok=True)
     counts = Counter(result.status for result in results)
@@ -64,6 +70,27 @@ def run_walk(
     gaps = sum(result.walk is not None and result.walk.gap is not None for result in results)
     print_note(arguments, f"{len(results)} frames in {watch.seconds['all']:.0f} s: {words}; {gaps} gaps")
     return exit_code_of(list(counts.elements()))
+
+
+def check_plan(path: Path) -> None:
+    """Refuse, before any work, a plan that could not be written."""
+    from ..report.plan_file import SUFFIXES  # noqa: PLC0415  # only walks with a plan wait for it
+
+    check_suffix("--plan", path, SUFFIXES)
+    check_output(path)
+    if path.suffix.lower() == ".dxf":
+        import_optional("--plan", "ezdxf", "tools")
+
+
+def write_plan(path: Path | None, scan: Scan, results: Sequence[Result]) -> None:
+    """Draw the path on the scan from above, if asked for."""
+    if path is None or not isinstance(scan.prepared, ScanMap):
+        return
+    from ..report.build import ReportSettings  # noqa: PLC0415  # only walks with a plan wait for it
+    from ..report.entries import entries_of_walk  # noqa: PLC0415
+    from ..report.plan_file import write_plan_file  # noqa: PLC0415
+
+    write_plan_file(entries_of_walk(results), scan.prepared, path, ReportSettings())
 
 
 def exit_code_of(statuses: Sequence[str]) -> int:

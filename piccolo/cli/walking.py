@@ -20,7 +20,7 @@ from .errors import UsageError
 
 EVERY = re.compile(r"(\d+(?:\.\d+)?)(s|m)")
 DEFAULT_EVERY = "0.5s"
-ONLY_WITH = ("every", "times", "max_speed", "max_step", "acceleration")
+ONLY_WITH = ("every", "times", "max_speed", "max_step", "acceleration", "plan")
 NOT_WITH = ("jobs", "dask", "overlay", "occlusion_mask", "priors", "refine_focal")
 
 
@@ -55,6 +55,8 @@ def add_walk_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--max-speed", type=float, metavar="X", help=text)
     text = "from a frame to the next, where only their order is known [m] (default by what is found of them)"
     group.add_argument("--max-step", type=float, metavar="M", help=text)
+    text = "the path on the scan from above, coloured by its frames' confidence: .png, .svg or .dxf"
+    group.add_argument("--plan", type=Path, metavar="FILE", help=text)
     text = "standard deviation of the camera's acceleration, by which the path is smoothed [m/s^2] "
     text += f"(default {MAX_ACCELERATION:g})"
     group.add_argument("--acceleration", type=float, metavar="X", help=text)

@@ -65,6 +65,12 @@ def read_entries(paths: Sequence[Path]) -> list[Entry]:
     return entries
 
 
+def entries_of_walk(results: Sequence[Result]) -> list[Entry]:
+    """The results of one walk."""
+    times = [float(k) if r.walk is None else r.walk.time for k, r in enumerate(results)]
+    return [Entry(r, r.to_json(), 0, time) for r, time in zip(results, times, strict=True)]
+
+
 def names_of(entries: Sequence[Entry]) -> list[str]:
     """A name for each, which no other has: its path below the folder that all share."""
     paths = [Path(entry.result.pano) for entry in entries]

@@ -21,6 +21,7 @@ from ..runtime.atomic import write_atomically
 from ..runtime.optional import import_optional
 from .build import ReportSettings, Task, check_settings, document_of
 from .entries import Entry, Place
+from .plan_path import LEAST_ON_PATH, color_of, draw_scale, is_numbered, segments_of
 from .site import begin_folder
 
 SUFFIXES = (".png", ".svg", ".dxf")
@@ -34,7 +35,8 @@ SHAPES = {  # corners of marks of radius 1, so that not the colour alone tells
 }
 INK = (20, 32, 46)
 TITLE = 60  # [px] above each plan
-RADIUS = 9  # [px] of a mark
+RADIUS, FRAME_RADIUS = 9, 4  # [px] of a mark, and of a walk's frame
+PATH_WIDTH, SCALE = 5, (160, 14)  # [px] of a walk's path, and of the scale of its colours
 HEADING = 1.0  # [m] length of a line in the DXF
 TEXT_HEIGHT = 0.12  # [m] of the DXF
 FONT = cv2.FONT_HERSHEY_DUPLEX
@@ -107,19 +109,44 @@ def _drawn_sheet(
     end = 12 + round(metres / plan["pixel"])
     cv2.line(sheet, (12, 52), (end, 52), INK, 4, cv2.LINE_AA)
     cv2.putText(sheet, f"{metres:g} m", (end + 8, 57), FONT, 0.5, INK, 1, cv2.LINE_AA)
+    _draw_paths(sheet, plan, [photo for _, photo in photos])
     for number, photo in photos:
+        size = radius_of(photo)
         at = pixels_of_plan(plan, photo["pose"]["center"]) + np.array([0.0, TITLE])
-        tip = at + 3.0 * RADIUS * heading_in_pixels(plan, photo["pose"]["rotation"])
+        tip = at + 3.0 * size * heading_in_pixels(plan, photo["pose"]["rotation"])
         color = COLORS[photo["status"]]
         ends = [tuple(round(x * (1 << SHIFT)) for x in point) for point in (at, tip)]
-        cv2.line(sheet, ends[0], ends[1], color, 3, cv2.LINE_AA, SHIFT)
-        for radius, fill in ((RADIUS + 2.5, (255, 255, 255)), (RADIUS, color)):
+        cv2.line(sheet, ends[0], ends[1], color, 3 if size == RADIUS else 1, cv2.LINE_AA, SHIFT)
+        for radius, fill in ((1.25 * size, (255, 255, 255)), (size, color)):
             corners = np.rint((at + radius * SHAPES[photo["status"]]) * (1 << SHIFT)).astype(np.int32)
             cv2.fillPoly(sheet, [corners], fill, cv2.LINE_AA, SHIFT)
+        if not is_numbered(number, photo):
+            continue
         where = round(at[0]) + RADIUS + 3, round(at[1]) - RADIUS
         for thickness, ink in ((4, (255, 255, 255)), (1, INK)):
             cv2.putText(sheet, str(number), where, FONT, 0.55, ink, thickness, cv2.LINE_AA)
     return np.asarray(sheet, np.uint8)
+
+
+def radius_of(photo: dict[str, Any]) -> int:
+    """Of a photo's mark [px]: those of a walk lie close together."""
+    return RADIUS if photo["walk"] is None else FRAME_RADIUS
+
+
+def _draw_paths(sheet: NDArray[np.uint8], plan: dict[str, Any], photos: list[dict[str, Any]]) -> None:
+    """The paths of walks, and what their colours mean."""
+    segments = list(segments_of(photos))
+    for s in segments:
+        ends = [pixels_of_plan(plan, photo["pose"]["center"]) for photo in (s.begin, s.end)]
+        first, last = ((round(u * (1 << SHIFT)), round((v + TITLE) * (1 << SHIFT))) for u, v in ends)
+        cv2.line(
+            sheet, first, last, color_of(s.confidence), 1 if s.is_gap else PATH_WIDTH, cv2.LINE_AA, SHIFT
+        )
+    left, (width, height) = sheet.shape[1] - SCALE[0] - 150, SCALE
+    if segments and left > 0:
+        draw_scale(sheet, left, 30, width, height)
+        for text, at in ((f"{LEAST_ON_PATH:g}", left - 40), ("1 confidence", left + width + 8)):
+            cv2.putText(sheet, text, (at, 42), FONT, 0.5, INK, 1, cv2.LINE_AA)
 
 
 def _bar_length(width: float) -> float:
@@ -139,7 +166,9 @@ def svg_of(document: dict[str, Any], folder: Path) -> bytes:
             title.text = storey["name"]
             group = _add(root, "g", transform=f"translate(0 {y + 600:.0f}) scale({scale:.6f})")
             _add_plan(group, plan, folder)
-            for number, photo in on_storey(document, k):
+            photos = on_storey(document, k)
+            _add_paths(group, plan, [photo for _, photo in photos])
+            for number, photo in photos:
                 _add_photo(group, plan, number, photo)
             y += 1000.0 + scale * plan["height"]
             widest = max(widest, scale * plan["width"])
@@ -164,21 +193,35 @@ def _add_plan(group: ElementTree.Element, plan: dict[str, Any], folder: Path) ->
     ).text = f"{metres:g} m"
 
 
+def _add_paths(group: ElementTree.Element, plan: dict[str, Any], photos: list[dict[str, Any]]) -> None:
+    for s in segments_of(photos):
+        (x1, y1), (x2, y2) = (pixels_of_plan(plan, photo["pose"]["center"]) for photo in (s.begin, s.end))
+        color = "#{:02x}{:02x}{:02x}".format(*color_of(s.confidence))
+        line = _add(
+            group, "line", x1=f"{x1:.2f}", y1=f"{y1:.2f}", x2=f"{x2:.2f}", y2=f"{y2:.2f}", stroke=color
+        )
+        line.set("stroke-width", str(PATH_WIDTH))
+        line.set("stroke-linecap", "round")
+        if s.is_gap:
+            line.set("stroke-dasharray", "4 8")
+
+
 def _add_photo(group: ElementTree.Element, plan: dict[str, Any], number: int, photo: dict[str, Any]) -> None:
     u, v = pixels_of_plan(plan, photo["pose"]["center"])
-    du, dv = 3.0 * RADIUS * heading_in_pixels(plan, photo["pose"]["rotation"])
+    size = radius_of(photo)
+    du, dv = 3.0 * size * heading_in_pixels(plan, photo["pose"]["rotation"])
     color = "#{:02x}{:02x}{:02x}".format(*COLORS[photo["status"]])
     mark = _add(group, "g", fill=color, stroke=color)
     _add(mark, "title").text = f"{photo['name']}: {photo['status'].replace('_', ' ')}"
     _add(mark, "path", d=f"M{u:.2f} {v:.2f}l{du:.2f} {dv:.2f}", **{"stroke-width": "3"})
-    _add(
-        mark, "circle", cx=f"{u:.2f}", cy=f"{v:.2f}", r=str(RADIUS), stroke="#ffffff", **{"stroke-width": "2"}
-    )
+    _add(mark, "circle", cx=f"{u:.2f}", cy=f"{v:.2f}", r=str(size), stroke="#ffffff", **{"stroke-width": "2"})
     if spread := photo["spread"]:
         a, b, degrees = spread["ellipse"]
-        size = {"rx": f"{a / plan['pixel']:.3f}", "ry": f"{b / plan['pixel']:.3f}"}
+        radii = {"rx": f"{a / plan['pixel']:.3f}", "ry": f"{b / plan['pixel']:.3f}"}
         turn = f"translate({u:.2f} {v:.2f}) rotate({-degrees:.2f})"
-        _add(mark, "ellipse", transform=turn, fill="none", **size)
+        _add(mark, "ellipse", transform=turn, fill="none", **radii)
+    if not is_numbered(number, photo):
+        return
     text = _add(mark, "text", x=f"{u + RADIUS + 3:.2f}", y=f"{v - RADIUS:.2f}", stroke="none")
     text.set("font-size", "16")
     text.text = str(number)
@@ -204,6 +247,10 @@ def dxf_of(document: dict[str, Any]) -> bytes:
             text.set_placement((x + 0.1, y + 0.1, z))
             if photo["spread"]:
                 _add_ellipse(space, photo, how, document["R"])
+        for s in segments_of([photo for _, photo in on_storey(document, k)]):
+            ends = [tuple(photo["pose"]["world"]) for photo in (s.begin, s.end)]
+            path = space.add_line(*ends, dxfattribs={"layer": layer})
+            path.rgb = color_of(s.confidence)
     file = io.StringIO()
     drawing.write(file)
     return file.getvalue().encode("utf-8")

@@ -25,6 +25,7 @@ MAX_SWEEPS = 4
 FARTHEST = 12  # frames from one that is sure, in which lost ones are looked for
 SURE, LEAST_ODDS = 0.5, 0.0
 MIN_GAIN = 1.1  # of the score, by which a pose replaces one nearby
+LEAST_STEP = 0.5  # [m] several photos of one place are no steps
 MOST_STEPS, LONGER = 0.9, 1.5  # of the steps found: the longest is so much longer than so many of them
 MOST_RIVALS = 4  # places of a frame that are followed to its neighbours
 
@@ -65,12 +66,9 @@ def motion_of(tracker: Tracker) -> Motion:
     if motion.is_timed or not motion.is_guess:
         return motion
     alone = [f.alone.pose if f.alone and f.alone.status == LOCALIZED else None for f in tracker.frames]
-    steps = [
-        float(np.linalg.norm(pose.center_world - before.center_world))
-        for before, pose in pairwise(alone)
-        if before is not None and pose is not None
-    ]
-    longest = LONGER * float(np.quantile(steps, MOST_STEPS, method="lower")) if steps else 0.0
+    pairs = [(a.center_world, b.center_world) for a, b in pairwise(alone) if a is not None and b is not None]
+    steps = [step for a, b in pairs if (step := float(np.linalg.norm(b - a))) >= LEAST_STEP]
+    longest = LONGER * float(np.quantile(steps, MOST_STEPS, method="higher")) if steps else 0.0
     return replace(motion, max_speed=max(MAX_STEP, longest), is_guess=False)
 
 
