@@ -18,12 +18,12 @@ from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Progress, no_progress
 from .frames import MAX_STEP, Frame, Motion, State, centers_of, states_of
 from .path import REACH_SLACK, Path, lattice_of, places_of
-from .tracker import MAX_RADIUS, Follower, Tracker, follow, least_score
+from .tracker import MAX_RADIUS, Follower, Tracker, follow, followed, least_score
 from .tracking import beside, found_near, is_same, states_at
 
 MAX_SWEEPS = 4
 FARTHEST = 12  # frames from one that is sure, in which lost ones are looked for
-SURE, LEAST_ODDS = 0.5, 0.0
+SURE, CERTAIN, LEAST_ODDS = 0.5, 0.98, 0.0
 MIN_GAIN = 1.1  # of the score, by which a pose replaces one nearby
 LEAST_STEP = 0.5  # [m] several photos of one place are no steps
 MOST_STEPS, LONGER = 0.9, 1.5  # of the steps found: the longest is so much longer than so many of them
@@ -35,13 +35,15 @@ Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it ca
 def finished(tracker: Tracker, read: Read, show: Progress = no_progress) -> Path:
     """The path of all frames that a tracker has followed.
 
-    Each place that a frame may show is looked for in its neighbours: a copy that was not on a frame's list
-    would lose the whole walk. Then lost frames are looked for from those that are sure.
+    Where the path is in doubt, each place that a frame may show is looked for in its neighbours, so that no
+    copy loses by not having been listed. Then lost frames are looked for from those that are sure.
     """
     num = len(tracker.frames)
     tracker.motion = motion_of(tracker)
+    path = _path_of(tracker)
     for step in (1, -1):
-        for k in show(iter(range(num)[::step]), num, "look for copies"):
+        unsure = [k for k in range(num)[::step] if not _is_certain(path, k)]
+        for k in show(iter(unsure), len(unsure), "look for copies"):
             _complete(tracker, k, step, read)
     path = _path_of(tracker)
     tried: set[tuple[int, int]] = set()
@@ -76,6 +78,12 @@ def _path_of(tracker: Tracker) -> Path:
     return lattice_of(tracker.frames, tracker.lattice.space, tracker.motion).smoothed()
 
 
+def _is_certain(path: Path, k: int) -> bool:
+    """True if the path leaves no doubt of a frame's pose."""
+    chosen = path.chosen[k]
+    return chosen is not None and bool(path.probabilities[k][chosen] > CERTAIN)
+
+
 def _complete(tracker: Tracker, k: int, step: int, read: Read) -> None:
     """Give a frame the places of the frame a step before it that can be reached, and that it lacks."""
     frame, m = tracker.frames[k], k - step
@@ -86,8 +94,8 @@ def _complete(tracker: Tracker, k: int, step: int, read: Read) -> None:
     if panorama is None:
         return
     query = prepare_query(panorama, tracker.scan_map, tracker.settings, tracker.workers)
-    for follower in missing:
-        end = follow(query, follower, frame.time, tracker.motion)
+    query.make_images()
+    for follower, end in zip(missing, followed(query, missing, frame.time, tracker.motion), strict=True):
         more = beside(query, frame.states, end)
         if more is not None and _is_within(tracker, follower, more, frame.time):
             frame.states.append(more)

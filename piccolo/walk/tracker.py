@@ -1,5 +1,6 @@
 """A camera followed through a scan: frame by frame, each by what is known so far."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -38,7 +39,7 @@ LEAST_WEIGHT = 0.02  # of such a pose, by the likeliest
 MAX_RADIUS = 12.0  # [m] around its last pose in which a lost camera is looked for
 FIRST_SEARCH, LAST_SEARCH = 3, 48  # frames after which a lost camera is searched everywhere, and again
 FAR = 3.0  # [m] from frame to frame, where each is searched in the whole scan
-USUAL = 0.95  # of the score of the frame before
+USUAL = 0.92  # of the score of the frame before
 SURE, CHECKED_SURE, CHECKED_UNSURE = 0.9, 8.0, 3.0  # [m] walked, after which the whole scan is searched
 
 
@@ -132,7 +133,7 @@ class Tracker:
         followers = self.followers()
         if not followers:
             return
-        ends = [follow(query, f, frame.time, self.motion) for f in followers]
+        ends = followed(query, followers, frame.time, self.motion)
         is_there = any(end.score >= least_score(f) for f, end in zip(followers, ends, strict=True))
         least = KEPT_BESIDE * max(end.score for end in ends) if is_there else CLEAR_SCORE
         found = [end for end in ends if end.score >= least] if is_there else []
@@ -194,6 +195,11 @@ def merged(query: Query, alone: list[State], followed: list[State]) -> list[Stat
 def least_score(f: Follower) -> float:
     """What a frame must explain to be there where it was followed."""
     return max(LEAST_SCORE, LEAST_KEPT * f.state.score)
+
+
+def followed(query: Query, followers: Sequence[Follower], time: float, motion: Motion) -> list[Hypothesis]:
+    """Where each of some poses leads, worked out beside each other; the query's images are made."""
+    return list(query.workers.map(lambda f: follow(query, f, time, motion), followers, "descend"))
 
 
 def follow(query: Query, f: Follower, time: float, motion: Motion) -> Hypothesis:
