@@ -40,7 +40,7 @@ MAX_RADIUS = 12.0  # [m] around its last pose in which a lost camera is looked f
 FIRST_SEARCH, LAST_SEARCH = 3, 48  # frames after which a lost camera is searched everywhere, and again
 FAR = 3.0  # [m] from frame to frame, where each is searched in the whole scan
 USUAL = 0.92  # of the score of the frame before
-SURE, CHECKED_SURE, CHECKED_UNSURE = 0.9, 8.0, 3.0  # [m] walked, after which the whole scan is searched
+SURE, CHECKED_SURE, CHECKED_UNSURE = 0.9, 8.0, 4.0  # [m] walked, after which the whole scan is searched
 
 
 class Follower(NamedTuple):
@@ -173,23 +173,23 @@ class Tracker:
         """Look for a frame that is followed in the whole scan too."""
         found = found_everywhere(query, CLEAR_SCORE)
         if found:
-            frame.states, frame.how = merged(query, states_at(query, found), frame.states), "alone"
+            frame.states, frame.how = merged(query, frame.states, found), "alone"
 
     def _search(self, query: Query, panorama: Panorama, frame: Frame) -> None:
         """Search the whole scan, and keep what was tracked beside."""
         alone = localize(self.scan_map, panorama, self.settings, self.workers, Stopwatch())
-        frame.states = merged(query, states_of(self.scan_map, alone), frame.states)
+        tracked_to = [Hypothesis(state.pose, state.score) for state in frame.states]
+        states = states_of(self.scan_map, alone)
+        frame.states = merged(query, states, tracked_to) if states else frame.states
         frame.alone, frame.how = alone, "alone"
 
 
-def merged(query: Query, alone: list[State], followed: list[State]) -> list[State]:
-    """The states of a frame that was searched alone, and others at which it was tracked."""
-    if not alone:
-        return followed
-    for state in followed:
-        more = beside(query, alone, Hypothesis(state.pose, state.score))
-        alone = alone if more is None else [*alone, more]
-    return alone
+def merged(query: Query, states: list[State], others: Sequence[Hypothesis]) -> list[State]:
+    """The states of a frame, and other poses beside them."""
+    for other in others:
+        more = beside(query, states, other)
+        states = states if more is None else [*states, more]
+    return states
 
 
 def least_score(f: Follower) -> float:

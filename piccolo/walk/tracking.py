@@ -76,11 +76,17 @@ def found_near(query: Query, near: Pose, radius: float, least_score: float) -> l
     some = apply_prior(query.scan_map, Prior(near_world=(x, y, z), radius=radius))
     if len(some.centers) == 0:
         return []
-    return found_everywhere(replace(query, scan_map=some, comparisons={}), least_score)
+    close = found_everywhere(replace(query, scan_map=some, comparisons={}), least_score)
+    least = KEPT_BESIDE * max((h.score for h in close), default=0.0)
+    ends = query.workers.map(lambda h: tracked(query, h.pose, least), close, "descend")
+    return [end for end in ends if end.score >= least]
 
 
 def found_everywhere(query: Query, least_score: float) -> list[Hypothesis]:
-    """Poses found in a whole map by whole views, copies too; none if the best has less than a score."""
+    """Poses found in a whole map by whole views, copies too, to centimetres, the best first.
+
+    None if the best has less than a score.
+    """
     first = first_query(query)
     gravity: Gravity = "unknown" if query.settings.gravity == "unknown" else "known"
     starts = search_poses(first, gravity, is_first=True)
@@ -90,9 +96,7 @@ def found_everywhere(query: Query, least_score: float) -> list[Hypothesis]:
     if found.best.score < least_score:
         return []
     least = KEPT_BESIDE * found.best.score
-    close = [h for h in (found.best, *found.alternatives) if h.score >= least]
-    ends = query.workers.map(lambda h: tracked(query, h.pose, least), close, "descend")
-    return [end for end in ends if end.score >= least]
+    return [h for h in (found.best, *found.alternatives) if h.score >= least]
 
 
 def states_at(query: Query, hypotheses: Sequence[Hypothesis]) -> list[State]:
