@@ -71,7 +71,7 @@ class Workers:
         or Ctrl-C drops the items that have not begun.
         """
         check_address_space()
-        if self.num_threads == 1:
+        if self.num_threads == 1 or len(items) < 2:
             yield from self.show(map(function, items), len(items), label)
             return
         pool = ThreadPoolExecutor(self.num_threads)
