@@ -50,8 +50,10 @@ def test_a_frame_that_explains_less_than_the_one_before_is_looked_for_farther_ar
     for usual, num_asked in ((1.0, 0), (1.05, 0), (1.3, 1), (2.0, 0)):  # as much; a little less; less; lost
         asked.clear()
         before = State(true, 5.0, usual * best.score)
-        follow(query, Follower(before, 0.0, None, 0.0), 1.0, Motion())
+        follow(query, Follower(before, 0.0, None, 0.0), 0.5, Motion())
         assert len(asked) == num_asked, usual
+    follow(query, Follower(State(true, 5.0, best.score), 0.0, None, 0.0), 1.0, Motion())  # farther away
+    assert len(asked) == 1
 
 
 def test_a_frame_is_found_near_and_everywhere(seen):

@@ -38,8 +38,9 @@ MOST_SOUGHT = 3  # of those at which it is not, around which it is looked for
 LEAST_WEIGHT = 0.02  # of such a pose, by the likeliest
 MAX_RADIUS = 12.0  # [m] around its last pose in which a lost camera is looked for
 FIRST_SEARCH, LAST_SEARCH = 3, 48  # frames after which a lost camera is searched everywhere, and again
+SHORT = 1.5  # [m] that a camera may have gone: a descent from there does not end in a neighbouring minimum
 FAR = 3.0  # [m] from frame to frame, where each is searched in the whole scan
-USUAL = 0.92  # of the score of the frame before
+USUAL = 0.95  # of the score of the frame before
 SURE, CHECKED_SURE, CHECKED_UNSURE = 0.9, 8.0, 4.0  # [m] walked, after which the whole scan is searched
 
 
@@ -203,7 +204,7 @@ def followed(query: Query, followers: Sequence[Follower], time: float, motion: M
 
 
 def follow(query: Query, f: Follower, time: float, motion: Motion) -> Hypothesis:
-    """Descend from where a camera should be after a pose; farther around if it explains less than before."""
+    """Descend from where a camera should be; farther around if it may be far, or explains less."""
     least, seconds = least_score(f), time - f.time
     starts, span = [f.state.pose], f.time - f.earlier_time
     if f.earlier is not None and span != 0.0:
@@ -212,4 +213,5 @@ def follow(query: Query, f: Follower, time: float, motion: Motion) -> Hypothesis
     end = tracked(query, starts[0], least)
     if end.score < least:
         end = max([end, *(tracked(query, start, least) for start in starts[1:])], key=lambda h: h.score)
-    return tracked_on(query, end) if least <= end.score < USUAL * f.state.score else end
+    is_usual = end.score >= USUAL * f.state.score and motion.max_speed * abs(seconds) < SHORT
+    return end if is_usual or end.score < least else tracked_on(query, end)
