@@ -98,20 +98,42 @@ def cells_view(leaves, center, cell, num_cells):
 
 
 def normalized_cells(rgb, is_seen, num_rings, stats_rings, sigma_deg):
-    """Opponent channels (cells, 3) less their Gaussian local mean, by the local deviation, clipped to 2."""
+    """Opponent channels (cells, 3) less their Gaussian local mean, by the local deviation, clipped to 2.
+
+    The means and the inverse deviations at coarse cells, interpolated cell by cell.
+    """
     fine, coarse = make_grid(num_rings), make_grid(stats_rings)
     r, g, b = rgb.T
     channels = np.stack([(r + g + b) / 3, (r - b) / 2, (2 * g - r - b) / 4], axis=1)
     moments = np.zeros((len(coarse), 7))
     rows = np.column_stack([np.ones(len(r)), channels, channels**2]) * (fine.solid_angle * is_seen)[:, None]
     np.add.at(moments, cell_of(fine.directions, stats_rings), rows)
-    cosine = fine.directions.astype(float) @ coarse.directions.T
+    cosine = coarse.directions.astype(float) @ coarse.directions.T
     weight = np.exp((cosine - 1) / math.radians(sigma_deg) ** 2) * coarse.solid_angle
     weight[cosine <= math.cos(2.3 * math.radians(sigma_deg))] = 0
     sums = weight @ moments
     mean, square = (sums[:, k : k + 3] / np.maximum(sums[:, :1], 1e-12) for k in (1, 4))
-    deviation = np.sqrt(np.maximum(square - mean**2, 0) + 0.03**2)
-    return np.clip((channels - mean) / deviation, -2, 2)
+    gain = 1.0 / np.sqrt(np.maximum(square - mean**2, 0) + 0.03**2)
+    mean, gain = (between_cells(fine.directions, coarse_rings=stats_rings, values=v) for v in (mean, gain))
+    return np.clip((channels - mean) * gain, -2, 2)
+
+
+def between_cells(directions, coarse_rings, values):
+    """Values of a grid's cells (M, 3) at directions (N, 3): linear along each ring, then between two."""
+    grid, found = make_grid(coarse_rings), []
+    for x, y, z in directions.astype(float):
+        place = (math.pi / 2 - math.asin(max(-1.0, min(1.0, z)))) / math.pi * coarse_rings - 0.5
+        along = []
+        for beside in (math.floor(place), math.floor(place) + 1):
+            ring = min(max(beside, 0), coarse_rings - 1)
+            n, first = int(grid.num_columns[ring]), int(grid.first[ring])
+            column = (math.atan2(y, x) / math.tau + (0.5 if ring == beside else 1.0)) * n - 0.5
+            part = column - math.floor(column)
+            a, b = values[first + math.floor(column) % n], values[first + (math.floor(column) + 1) % n]
+            along.append((1.0 - part) * a + part * b)
+        part = place - math.floor(place)
+        found.append((1.0 - part) * along[0] + part * along[1])
+    return np.array(found)
 
 
 def decompress_lzf(data):

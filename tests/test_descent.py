@@ -71,9 +71,10 @@ def test_starts_descend_on_their_candidates_views_as_one_does_alone():
     ends = descent.descend_all(scan_map, image, starts, 12, Workers(2))
     assert ends.candidate.tolist() == [k, k, far]  # the best first
     assert ends.score[0] == ends.score[1] > max(0.4, ends.score[2])
-    offsets = (scan_map.offsets[k] * scan_map.offset_unit[k]).astype(np.float32)
-    channels = scan_map.features[k].astype(np.float32) / np.float32(63.75)
-    weights = (scan_map.is_seen[k] * make_grid(24).solid_angle).astype(np.float32)
+    (row,), views = scan_map.views.at(np.array([k]), Workers(1))
+    offsets = (views.offsets[row] * views.offset_unit[row]).astype(np.float32)
+    channels = views.features[row].astype(np.float32) / np.float32(63.75)
+    weights = (views.is_seen[row] * make_grid(24).solid_angle).astype(np.float32)
     cells, center = Cells(offsets, channels, weights), scan_map.centers[k]
     alone = descent.descend(cells, center, image, Pose(R, center), (1.2, 12, 2e-3))
     np.testing.assert_allclose(ends.center_map[0], alone.center_world, atol=1e-4)

@@ -80,7 +80,7 @@ def test_clear_are_score_margin_and_the_mirrored_photo(monkeypatch, score, margi
     monkeypatch.setattr(first_look, "fairly_selected", lambda query, found: found)
     monkeypatch.setattr(first_look, "found_among", lambda some, count: SearchResult(best, (other,)))
     monkeypatch.setattr(first_look, "mirrored", lambda query: mirror)
-    monkeypatch.setattr(first_look, "search_poses", lambda query, gravity, is_first: "starts of its own")
+    monkeypatch.setattr(first_look, "search_poses", lambda query, gravity: "starts of its own")
     scores = {(id(own), "starts"): first, (id(mirror), "starts of its own"): mirrored}
     monkeypatch.setattr(first_look, "first_score", lambda query, starts: scores[id(query), starts])
     assert first_look.is_clear(own, "starts", [best, other]) == is_clear
@@ -107,5 +107,5 @@ def test_the_mirrored_query_is_that_of_the_mirrored_photo():
 def test_the_first_score_tells_a_photo_from_its_mirror():
     asked = _query(rooms.as_panorama(rooms.query(1).rgb))
     mirror = first_look.mirrored(asked)
-    own, other = (refinement.first_score(q, search_poses(q, "known", is_first=True)) for q in (asked, mirror))
+    own, other = (refinement.first_score(q, search_poses(q, "known")) for q in (asked, mirror))
     assert own > 1.5 * other > 0.0

@@ -223,11 +223,11 @@ def test_no_objects_are_unpickled(arrays, tmp_path):
 def test_no_more_is_read_than_the_file_holds(built, tmp_path):
     """An array's header, or the archive's directory, promises more."""
     path, content = tmp_path / "a.map", built.read_bytes()
-    shape = str(scan_map(1).offsets.shape).encode()
-    path.write_bytes(content.replace(shape, shape.replace(b"3", b"9")))
+    shape = str(scan_map(1).wide_features.shape).encode()
+    path.write_bytes(content.replace(shape, b"(9" + shape[2:]))
     assert "which promises" in read_or_refused(load_map, path)[1]
     with zipfile.ZipFile(built) as archive:
-        info = archive.getinfo("offsets.npy")
+        info = archive.getinfo("wide_features.npy")
     sizes = struct.pack("<II", info.file_size, info.file_size)
     path.write_bytes(content.replace(sizes, struct.pack("<II", 2**32 - 2, 2**32 - 2)))
     assert "damaged" in read_or_refused(load_map, path)[1]

@@ -9,8 +9,9 @@ from rooms import as_panorama, query, room, scan_map
 
 from piccolo.cloud import voxels
 from piccolo.cloud.stream import stream_of_arrays
+from piccolo.coarse_to_fine.candidate_views import SEARCH_VIEW, render_views, render_wide
 from piccolo.coarse_to_fine.query import prepare_query
-from piccolo.coarse_to_fine.scan_map import SEARCH_VIEW, prepare_map, render_candidates
+from piccolo.coarse_to_fine.scan_map import prepare_map
 from piccolo.coarse_to_fine.search import search_poses
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.errors import InputError
@@ -120,7 +121,8 @@ def test_all_that_grows_asks_first(monkeypatch, tmp_path):
         ("a.png: found 512 x 256, which needs 0.0016 GB", lambda: read_panorama(picture)),
         ("a.ply: a table of 131072 voxels", lambda: table.add(spread, colors)),
         ("voxels of 2 cm needs", lambda: prepare_map(room(1)[1], workers)),
-        ("prepared views", lambda: render_candidates(whole.octree, whole.centers, SEARCH_VIEW, workers)),
+        ("prepared views", lambda: render_wide(whole.octree, whole.centers, SEARCH_VIEW, workers)),
+        ("[0-9] views needs", lambda: render_views(whole.octree, whole.centers, SEARCH_VIEW, workers)),
         ("rotations needs .*--num-yaws", lambda: search_poses(asked, "known")),
     ):
         with pytest.raises(InputError, match=text):

@@ -15,11 +15,12 @@ from piccolo.cli import prepare_map as prepare_command
 from piccolo.cloud.stream import Cloud
 from piccolo.cloud.voxels import LEAF_SIZE, VoxelTable, join_voxels
 from piccolo.coarse_to_fine.camera_positions import MIN_CLEARANCE
+from piccolo.coarse_to_fine.candidate_views import SEARCH_VIEW, WideViews, render_wide
 from piccolo.coarse_to_fine.localize import localize
 from piccolo.coarse_to_fine.map_file import load_map, save_map
 from piccolo.coarse_to_fine.named_scans import named, scan_at, with_scans
 from piccolo.coarse_to_fine.scan_addition import add_scan
-from piccolo.coarse_to_fine.scan_map import SEARCH_VIEW, prepare_map, render_candidates
+from piccolo.coarse_to_fine.scan_map import prepare_map
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings, Prior
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose
@@ -61,6 +62,13 @@ def _rows(scan_map, centers):
     return rows, gap > 0.0
 
 
+def _wide_of(scan_map, candidates):
+    """Wide views of some candidates that are searched."""
+    place = {int(k): n for n, k in enumerate(scan_map.sparse)}
+    rows = [place[int(k)] for k in candidates]
+    return WideViews(scan_map.wide_features[rows], scan_map.wide_seen[rows])
+
+
 def _features_of(scan_map, view_centers):
     """Points and descriptors of the features seen from some views, in an order of their own."""
     m = scan_map.local_features
@@ -92,8 +100,10 @@ def test_what_the_new_scan_does_not_change_keeps_every_bit():
     rows, is_gone = _rows(scan_map, old.centers)
     assert not is_gone.any()
     np.testing.assert_array_equal(rows, np.arange(len(old.centers)))
-    for name in ("centers", "offsets", "offset_unit", "features", "is_seen", "scan_of_candidate"):
+    for name in ("centers", "scan_of_candidate"):
         np.testing.assert_array_equal(getattr(scan_map, name)[rows], getattr(old, name))
+    for found, expected in zip(_wide_of(scan_map, rows[old.sparse]), _wide_of(old, old.sparse), strict=True):
+        np.testing.assert_array_equal(found, expected)
     np.testing.assert_array_equal(scan_map.scan_of_candidate[len(rows) :], 1)
     centers = old.local_features.view_centers
     assert _features_of(scan_map, centers) == _features_of(old, centers)
@@ -121,14 +131,20 @@ def test_views_are_made_anew_where_the_new_scan_is_seen():
     inside, far = (beside < 0.0).all(axis=1), np.linalg.norm(np.maximum(beside, 0.0), axis=1) > 0.35
     assert gone[(np.abs(beside).min(axis=1) < MIN_CLEARANCE / 2) & inside].all()
     assert not gone[far].any()
-    rows, _ = _rows(scan_map, old.centers[far])
-    changed = (scan_map.offsets[rows] != old.offsets[far]).any(axis=(1, 2))
-    distance = np.linalg.norm(old.centers[far] - place, axis=1)
+    known = old.sparse[far[old.sparse]]
+    rows, _ = _rows(scan_map, old.centers[known])
+    views, before = _wide_of(scan_map, rows), _wide_of(old, known)
+    changed = (views.features != before.features).any(axis=1)
+    distance = np.linalg.norm(old.centers[known] - place, axis=1)
     assert changed[distance < 1.2].mean() > 0.8
     assert not changed.all()  # the column covers less than a hundredth, or is hidden
-    views = render_candidates(scan_map.octree, scan_map.centers[rows[changed]], SEARCH_VIEW, WORKERS)
-    for name, expected in zip(("offsets", "offset_unit", "features", "is_seen"), views, strict=True):
-        np.testing.assert_array_equal(getattr(scan_map, name)[rows[changed]], expected)
+    anew = render_wide(scan_map.octree, scan_map.centers[rows[changed]], SEARCH_VIEW, WORKERS)
+    for found, expected in zip(views, anew, strict=True):
+        np.testing.assert_array_equal(found[changed], expected)
+    everywhere = render_wide(scan_map.octree, scan_map.centers[scan_map.sparse], SEARCH_VIEW, WORKERS)
+    like = (scan_map.wide_features == everywhere.features).mean(axis=1)
+    assert like.min() > 0.5
+    assert np.median(like) > 0.99
     assert scan_at(scan_map, old.centers[far][0]) == "A"
     assert len(_features_of(scan_map, place[None] + [0.0, 0.0, 1e-9])) == 0
 

@@ -13,7 +13,7 @@ from piccolo.coarse_to_fine.query import prepare_query, query_images
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings, Prior
 from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
-from piccolo.geometry.sphere import averaging, make_grid
+from piccolo.geometry.sphere import averaging, make_grid, whole_areas
 from piccolo.panorama import Panorama
 from piccolo.panorama.gpano import GPano
 from piccolo.panorama.local_normalization import (
@@ -87,16 +87,19 @@ def test_scores_equal_correlations_one_by_one():
     validity[:, rng.random(validity.shape[1]) < 0.2] = 0
     samples *= validity[:, None]
     panorama = search.turned(samples, validity, AREA, 1)
-    scores = search.score_poses(scan_map, samples, validity)
-    candidate, rotation = rng.integers(0, len(scores), 40), rng.integers(0, 50, 40)
-    pairs, area = np.empty(40, np.float32), np.rint(1000 * AREA / AREA.max())
-    search.correlate_pairs(scan_map.features, scan_map.is_seen, area, panorama, candidate, rotation, pairs)
+    candidate, rotation = rng.integers(0, len(scan_map.centers), 40), rng.integers(0, 50, 40)
+    row, views = scan_map.views.at(candidate, Workers(2))
+    pairs = np.empty(40, np.float32)
+    features, seen = views.features.reshape(len(views.features), -1), views.is_seen.view(np.uint8)
+    scores = search.masked_correlation(features, seen, AREA, panorama)
+    how = whole_areas(24), panorama, row, rotation
+    search.correlate_pairs(views.features, views.is_seen, *how, pairs)
     twin = []
-    for c, r in zip(candidate, rotation, strict=True):
-        w = AREA * scan_map.is_seen[c] * validity[r]
-        f, s = scan_map.features[c].astype(float), samples[r].astype(float)
+    for c, r in zip(row, rotation, strict=True):
+        w = AREA * views.is_seen[c] * validity[r]
+        f, s = views.features[c].astype(float), samples[r].astype(float)
         twin.append((w * f * s).sum() / np.sqrt((w * f * f).sum() * (w * s * s).sum()))
-    for found in (scores[candidate, rotation], pairs):  # each up to a factor of its own
+    for found in (scores[row, rotation], pairs):  # each up to a factor of its own
         factor = (found @ twin) / (found @ found)
         np.testing.assert_allclose(factor * found, twin, atol=3e-3)
 
@@ -125,21 +128,23 @@ def test_sums_of_a_search_are_exact():
     np.testing.assert_array_equal(found, expected[views])
 
 
-@pytest.mark.parametrize("is_wide", [False, True])
-def test_best_score_is_near_the_true_pose(is_wide):
+@pytest.mark.parametrize(("gravity", "most"), [("known", 10), ("unknown", 100)])
+def test_best_score_is_near_the_true_pose(gravity, most):
+    """Among wide cells, and among the starts, which fine cells put in order."""
     true_pose, scan_map = rooms.scene(1)[2], rooms.scan_map(1)
-    rotations = uniform_rotations(2000) if is_wide else uniform_yaws(48)
+    rotations = uniform_yaws(48) if gravity == "known" else uniform_rotations(2000)
     samples, validity = search.turn_panorama(_query().images.search, rotations)
-    scores = (search.score_poses_wide if is_wide else search.score_poses)(scan_map, samples, validity)
-    candidate, rotation, values = search.best_poses(scores, 200)
-    centers = scan_map.centers[scan_map.sparse] if is_wide else scan_map.centers
+    sparse, rotation, values = search.best_poses(search.score_poses_wide(scan_map, samples, validity), 200)
     assert (np.diff(values) <= 0).all()
-    near = [
-        np.linalg.norm(centers[c] - true_pose.center_world) < 0.8
-        and np.degrees(angle_between(rotations[r], true_pose.R_cam_from_world)) < 25
-        for c, r in zip(candidate, rotation, strict=True)
-    ]
-    assert any(near[: 100 if is_wide else 10])
+    starts = search.search_poses(_query(), gravity)
+    centers = scan_map.centers[scan_map.sparse[sparse]]
+    for found in ((centers, rotations[rotation]), (starts.center_map, starts.R_cam_from_map)):
+        near = [
+            np.linalg.norm(center - true_pose.center_world) < 0.8
+            and np.degrees(angle_between(R, true_pose.R_cam_from_world)) < 25
+            for center, R in zip(*found, strict=True)
+        ]
+        assert any(near[:most])
 
 
 def test_best_poses_are_the_largest_in_order():
@@ -172,15 +177,15 @@ def test_heading_is_the_worlds_where_the_map_was_levelled(gravity):
 
 @pytest.mark.parametrize(("fewest", "most", "expected"), [(150, 4000, 150), (150, 20, 20), (1, 4000, None)])
 def test_number_of_starts(fewest, most, expected):
-    """One for every four candidates, but not fewer and not more than asked for."""
+    """One for every two candidates that are searched, but not fewer and not more than asked for."""
     query = _query()
     method = query.method._replace(min_starts=fewest)
     settings = dataclasses.replace(query.settings, max_starts=most)
     few = dataclasses.replace(query, method=method, settings=settings)
     for gravity in ("known", "unknown"):
         starts = search.search_poses(few, gravity)
-        num_candidates = len(query.scan_map.centers)
-        assert len(starts.score) == (expected or num_candidates // 4)
+        num_searched = len(query.scan_map.sparse)
+        assert len(starts.score) == (expected or num_searched // 2)
         assert (np.diff(starts.score) <= 0).all()
         np.testing.assert_array_equal(starts.center_map, query.scan_map.centers[starts.candidate])
         pairs = list(itertools.combinations(starts.hypotheses(), 2))

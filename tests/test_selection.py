@@ -181,11 +181,10 @@ def _run(monkeypatch, matched, searches, gravity="auto", config=METHOD):
     A score in hundredths is also how many features agree, and what a pose explains.
     """
     made, left = [], list(searches)
-    scan_map = SimpleNamespace(centers=np.zeros((1, 3)))
+    scan_map = SimpleNamespace(sparse=np.zeros(1))
     scores = {h.pose.center_world[0]: h.score for some in (matched, *searches) for h in some}
 
-    def search_poses(query, gravity, is_first):
-        assert not is_first
+    def search_poses(query, gravity):
         made.append(gravity)
         return gravity
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from piccolo.geometry.sphere import averaging, cell_of, make_grid, make_neighbors
+from piccolo.geometry.sphere import averaging, cell_of, interpolation, make_grid, make_neighbors
 
 
 @pytest.mark.parametrize("num_rings", [12, 24, 96])
@@ -26,13 +26,29 @@ def test_random_directions_fall_into_cells_by_solid_angle():
 
 
 def test_neighbours_are_near_and_weighted_by_a_gaussian():
-    near, fine, coarse = make_neighbors(48, 24, 14.0), make_grid(48), make_grid(24)
-    for cell in (0, len(fine) // 2, len(fine) - 1):
+    near, grid = make_neighbors(24, 14.0), make_grid(24)
+    for cell in (0, len(grid) // 2, len(grid) - 1):
         rows = slice(near.row[cell], near.row[cell + 1])
-        angle = np.arccos(np.clip(coarse.directions[near.cell[rows]] @ fine.directions[cell], -1, 1))
+        angle = np.arccos(np.clip(grid.directions[near.cell[rows]] @ grid.directions[cell], -1, 1))
         assert np.degrees(angle.max()) < 2.4 * 14.0
-        gaussian = np.exp((np.cos(angle) - 1) / np.radians(14.0) ** 2) * coarse.solid_angle[near.cell[rows]]
+        gaussian = np.exp((np.cos(angle) - 1) / np.radians(14.0) ** 2) * grid.solid_angle[near.cell[rows]]
         np.testing.assert_allclose(near.weight[rows], gaussian, rtol=1e-3)
+
+
+@pytest.mark.parametrize(("num_rings", "coarse_rings"), [(24, 12), (96, 24), (24, 16), (12, 12)])
+def test_interpolated_values_are_those_of_a_smooth_field(num_rings, coarse_rings):
+    fine, coarse = make_grid(num_rings), make_grid(coarse_rings)
+    cells, weights = interpolation(num_rings, coarse_rings)
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0, atol=1e-6)
+    assert weights.min() >= 0.0
+    width = np.pi / coarse_rings
+    for axis in np.eye(3):
+        found = (weights * (coarse.directions @ axis)[cells]).sum(axis=1)
+        off = np.abs(found - fine.directions @ axis)
+        assert np.median(off) < width**2 / 8
+        assert off.max() < width / 4  # three cells around a pole
+    apart = np.arccos(np.clip((coarse.directions[cells] * fine.directions[:, None]).sum(axis=2), -1.0, 1.0))
+    assert (apart[weights > 1e-6]).max() < 2.0 * width
 
 
 def test_averaging_adds_up_the_solid_angle_in_whole_numbers():

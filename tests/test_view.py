@@ -7,10 +7,9 @@ from scipy.spatial import cKDTree
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.stream import Cloud
 from piccolo.coarse_to_fine import camera_positions
-from piccolo.coarse_to_fine.scan_map import SEARCH_VIEW, render_candidates
+from piccolo.coarse_to_fine.candidate_views import SEARCH_VIEW
 from piccolo.coarse_to_fine.view import ViewConfig, render_view, visible_points
 from piccolo.geometry.sphere import cell_of, make_grid
-from piccolo.panorama.local_normalization import LEVELS_PER_UNIT
 from piccolo.runtime.threads import Workers
 
 LEAVES = ViewConfig(
@@ -126,20 +125,3 @@ def test_coverage_is_all_inside_and_little_outside(octree):
     share = camera_positions.coverage(octree, np.array([[0.3, 0.2, 0.3], [30.0, 0.0, 0.0]]), Workers(1))
     assert share[0] > 0.9
     assert share[1] < 0.2
-
-
-def test_candidates_views_are_views_in_few_bits(octree):
-    scan_map = rooms.scan_map(1)
-    k = len(scan_map.centers) // 2
-    offsets, features, weights = render_view(octree, scan_map.centers[k], SEARCH_VIEW, ALL)
-    np.testing.assert_array_equal(scan_map.is_seen[k], weights > 0)
-    unit = scan_map.offset_unit[k]
-    np.testing.assert_allclose(scan_map.offsets[k] * unit, offsets, atol=2 * unit)
-    np.testing.assert_allclose(scan_map.features[k] / LEVELS_PER_UNIT, features, atol=0.01)
-
-
-def test_map_has_the_same_bits_for_any_number_of_threads(octree):
-    centers = rooms.scan_map(1).centers[:200]
-    one, two = (render_candidates(octree, centers, SEARCH_VIEW, Workers(n)) for n in (1, 2))
-    for a, b in zip(one, two, strict=True):
-        np.testing.assert_array_equal(a, b)

@@ -281,7 +281,7 @@ def test_nobody_walks_through_a_wall(two_rooms):
         scan_map.centers[is_high & ((centers > r.corner) & (centers < r.corner + rooms.SIZE)).all(axis=1)]
         for r in world.rooms
     )
-    space, start = FreeSpace(scan_map), first[np.argmax(first[:, 1])]
+    space, start = FreeSpace(scan_map, Workers(2)), first[np.argmax(first[:, 1])]
     same = space.distance(start, first, 20.0)
     assert len(first) > 20
     assert np.isfinite(same).mean() > 0.95
@@ -297,7 +297,7 @@ def test_nobody_walks_through_a_wall(two_rooms):
 
 def test_far_places_are_beyond_the_limit(two_rooms):
     centers = two_rooms[1].centers
-    distance = FreeSpace(two_rooms[1]).distance(centers[0], centers, 1.0)
+    distance = FreeSpace(two_rooms[1], Workers(1)).distance(centers[0], centers, 1.0)
     assert np.isinf(distance[np.linalg.norm(centers - centers[0], axis=1) > 1.0]).all()
     assert distance[0] == 0.0
 

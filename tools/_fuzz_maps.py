@@ -22,13 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from piccolo.cloud.stream import stream_of_arrays
+from piccolo.coarse_to_fine.candidate_views import CandidateViews
 from piccolo.coarse_to_fine.config import METHOD, Beam
 from piccolo.coarse_to_fine.localize import localize
 from piccolo.coarse_to_fine.map_file import ARRAYS, load_map, save_map
 from piccolo.coarse_to_fine.open_map import FOLDER, cached_map
 from piccolo.coarse_to_fine.prior import apply_prior
 from piccolo.coarse_to_fine.scan_addition import add_scan
-from piccolo.coarse_to_fine.scan_map import ScanMap, prepare_map, sparse_candidates, widen
+from piccolo.coarse_to_fine.scan_map import ScanMap, prepare_map, sparse_candidates
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings, Prior
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, is_correct
@@ -56,11 +57,19 @@ def small_map() -> tuple[ScanMap, Panorama, Pose]:
     query = make_query(world, 0, "clean", 256, WORKERS)
     pose = Pose(query.pose.R_cam_from_world, query.pose.center_world + SHIFT)
     near = apply_prior(whole, Prior(tuple(pose.center_world), NEAR))
-    sparse = sparse_candidates(near.centers)
-    wide_features, wide_seen = widen(near.features, near.is_seen, sparse)
-    small = replace(near, sparse=sparse, wide_features=wide_features, wide_seen=wide_seen, scan_sha256=SHA256)
-    scans = (np.arange(len(small.centers)) == len(small.centers) - 1).astype(np.uint16)
-    small = replace(small, scan_names=NAMES, scan_of_candidate=scans, whole=None)
+    centers = whole.centers[near.sparse]
+    sparse, _ = sparse_candidates(centers)
+    small = replace(
+        near,
+        centers=centers,
+        sparse=sparse,
+        wide_features=near.wide_features[sparse],
+        wide_seen=near.wide_seen[sparse],
+        views=CandidateViews(near.octree, centers),
+        scan_sha256=SHA256,
+        scan_names=NAMES,
+        scan_of_candidate=(np.arange(len(centers)) == len(centers) - 1).astype(np.uint16),
+    )
     return small, Panorama(query.rgb, np.ones(query.rgb.shape[:2], np.bool_)), pose
 
 

@@ -13,9 +13,10 @@ import numpy as np
 from piccolo.cli.command import command
 from piccolo.cloud import read_cloud
 from piccolo.cloud.stream import Cloud
+from piccolo.coarse_to_fine.candidate_views import SEARCH_VIEW
 from piccolo.coarse_to_fine.config import METHOD, Beam, ImageScales, MethodConfig
 from piccolo.coarse_to_fine.localize import localize
-from piccolo.coarse_to_fine.scan_map import SEARCH_VIEW, prepare_map
+from piccolo.coarse_to_fine.scan_map import prepare_map
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.coarse_to_fine.view import ViewConfig
 from piccolo.geometry.pose import is_correct

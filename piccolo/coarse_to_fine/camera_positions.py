@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from ..cloud.octree import Octree
 from ..errors import InputError
 from ..geometry.pose import Array
+from ..geometry.sphere import whole_areas
 from ..runtime.threads import Workers
-from .view import ViewConfig, filled_fractions, thread_scratch
+from .view import ViewConfig, ranges_around
 
 MIN_CLEARANCE = 0.25  # [m] a camera is not nearer to a surface
 MIN_COVERAGE = 0.55  # fraction of the sphere that shows something: flat ground or a roof alone fills half
@@ -113,18 +114,16 @@ def supported_cells(surfaces: NDArray[np.float32], within: Ball | Box | None = N
     return np.asarray(np.stack(np.unravel_index(found, shape), axis=1) + low)
 
 
-def coverage(octree: Octree, centers: NDArray[np.floating[Any]], workers: Workers) -> NDArray[np.float32]:
+def coverage(octree: Octree, centers: NDArray[np.floating[Any]], workers: Workers) -> NDArray[np.float64]:
     """Fraction of the sphere (N,) around each centre (N, 3) that is not empty, seen at a low resolution."""
-    view = FREE_SPACE_VIEW.arrays
+    area = whole_areas(FREE_SPACE_VIEW.num_rings).astype(np.int64)
 
-    def glance(lo: int) -> tuple[NDArray[np.float32]]:
-        some = centers[lo : lo + BLOCK]
-        fraction = np.empty(len(some), np.float32)
-        filled_fractions(octree, some, FREE_SPACE_VIEW.voxel_per_range, view, thread_scratch(), fraction)
-        return (fraction,)
+    def glance(lo: int) -> tuple[NDArray[np.float64]]:
+        is_filled = ranges_around(octree, centers[lo : lo + BLOCK], FREE_SPACE_VIEW) > 0.0
+        return (is_filled @ area / area.sum(),)
 
     parts = workers.collect(glance, range(0, len(centers), BLOCK), "find free space", centers)
-    return np.concatenate([np.empty(0, np.float32), *(fraction for (fraction,) in parts)])
+    return np.concatenate([np.empty(0), *(fraction for (fraction,) in parts)])
 
 
 def warn_if_long(octree: Octree, centers: NDArray[np.floating[Any]], workers: Workers) -> None:
@@ -156,8 +155,9 @@ def candidate_centers(
     middle = (cells + 0.5) * COARSE_SPACING
     warn_if_long(octree, middle, workers)
     clearance, _ = tree.query(middle, workers=workers.num_threads)
-    fraction = coverage(octree, middle, workers)
     is_free = clearance > MIN_CLEARANCE
+    fraction = np.zeros(len(middle))  # where it is not free, nobody asks
+    fraction[is_free] = coverage(octree, middle[is_free], workers)
     is_open = np.mean(fraction[is_free] > MIN_COVERAGE) < MIN_ENCLOSED if is_free.any() else False
     min_coverage = OPEN_COVERAGE if is_open else MIN_COVERAGE
     is_enclosed = fraction > min_coverage

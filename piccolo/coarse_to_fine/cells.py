@@ -77,11 +77,13 @@ def average_colors(sums, view, offsets, channels, weights, moments):
 
 @kernel
 def local_statistics(moments, view, weights, stats):
-    """Write the local means of the channels and 1 / deviations (6, cells) around cells of positive weight."""
+    """Write the local means of the channels and 1 / deviations (6, cells) around cells of positive weight.
+
+    Taken at the wider cells that hold the moments, and interpolated between these.
+    """
     row, neighbor, weight = view.neighbor_row, view.neighbor_cell, view.neighbor_weight
-    for c in range(len(weights)):
-        if weights[c] <= F0:
-            continue
+    coarse = np.empty((view.num_stats, 8), np.float32)
+    for c in range(view.num_stats):
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = F0
         for j in range(row[c], row[c + 1]):
             w = weight[j]
@@ -94,8 +96,14 @@ def local_statistics(moments, view, weights, stats):
             s5 += w * m[5]
             s6 += w * m[6]
             s7 += w * m[7]  # always 0: eight sums fill a vector register
-        per = F1 / s0
-        stats[0, c], stats[1, c], stats[2, c] = s1 * per, s2 * per, s3 * per
-        stats[3, c] = inverse_std(s1 * per, s4 * per)
-        stats[4, c] = inverse_std(s2 * per, s5 * per)
-        stats[5, c] = inverse_std(s3 * per, s6 * per)
+        per = F1 / s0 if s0 > F0 else F0
+        coarse[c, 0], coarse[c, 1], coarse[c, 2] = s1 * per, s2 * per, s3 * per
+        coarse[c, 3] = inverse_std(s1 * per, s4 * per)
+        coarse[c, 4] = inverse_std(s2 * per, s5 * per)
+        coarse[c, 5] = inverse_std(s3 * per, s6 * per)
+    for c in range(len(weights)):
+        if weights[c] > F0:
+            near, w = view.near_stats[c], view.near_weight[c]
+            a, b, d, e = coarse[near[0]], coarse[near[1]], coarse[near[2]], coarse[near[3]]
+            for k in range(6):
+                stats[k, c] = w[0] * a[k] + w[1] * b[k] + w[2] * d[k] + w[3] * e[k]

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from .scan_map import SEARCH_VIEW
+from .candidate_views import SEARCH_VIEW
 from .view import ViewConfig
 
 

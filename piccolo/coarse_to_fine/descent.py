@@ -13,7 +13,8 @@ from ..panorama.local_normalization import LEVELS_PER_UNIT, ZERO_LEVEL
 from ..panorama.texels import Texels
 from ..runtime.jit import F0, kernel
 from ..runtime.threads import Workers
-from .scan_map import SEARCH_VIEW, ScanMap
+from .candidate_views import SEARCH_VIEW
+from .scan_map import ScanMap
 from .starts import Starts
 from .view import Cells
 
@@ -25,16 +26,17 @@ BATCH = 16  # starts a thread takes at a time
 
 
 @kernel
-def descend_starts(views, image, scale, num_iterations, candidate, R_cam_from_map, center_map, scores):
-    """Descend from each start, (n, 3, 3) and (n, 3) in place, on the cells of its candidate's view."""
-    offsets, unit, features, is_seen, solid_angle, blocks, centers = views
+def descend_starts(views, cells, image, scale, num_iterations, row, R_cam_from_map, center_map, scores):
+    """Descend from each start, (n, 3, 3) and (n, 3) in place, on the cells of a row (n,) of views."""
+    centers, offsets, unit, features, is_seen = views
+    solid_angle, blocks = cells
     texels, width = image
     R, t = R_cam_from_map, center_map
     n = len(solid_angle)
     points, levels = np.empty((3, n), np.float32), np.empty((3, n), np.float32)
     weights = np.empty(n, np.float32)
-    for k in range(len(candidate)):
-        c = candidate[k]
+    for k in range(len(row)):
+        c = row[k]
         for i in range(3):
             for j in range(n):
                 points[i, j] = np.float32(offsets[c, i, j]) * unit[c]
@@ -83,17 +85,16 @@ def descend_all(
     scan_map: ScanMap, image: Texels, starts: Starts, num_iterations: int, workers: Workers
 ) -> Starts:
     """Where a descent from each start ends, on its candidate's prepared view; best first."""
-    m = scan_map
     R, t = starts.R_cam_from_map.copy(), starts.center_map.copy()
     scores = np.empty(len(t))
-    view = SEARCH_VIEW.arrays
-    views = m.offsets, m.offset_unit, m.features, m.is_seen, view.solid_angle, view.blocks, m.centers
+    row, views = scan_map.views.at(starts.candidate, workers)
+    cells = SEARCH_VIEW.arrays.solid_angle, SEARCH_VIEW.arrays.blocks
     scale = COARSE_LOSS * LEVELS_PER_UNIT
 
     def run(lo: int) -> None:
         part = slice(lo, lo + BATCH)
-        some = starts.candidate[part], R[part], t[part], scores[part]
-        descend_starts(views, (image.rgbx, image.width), scale, num_iterations, *some)
+        some = row[part], R[part], t[part], scores[part]
+        descend_starts(views, cells, (image.rgbx, image.width), scale, num_iterations, *some)
 
     list(workers.map(run, range(0, len(t), BATCH), "descend"))
     return Starts(R, t, starts.candidate, scores).take(np.argsort(-scores, kind="stable"))

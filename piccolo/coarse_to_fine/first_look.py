@@ -47,7 +47,7 @@ def is_clear(query: Query, starts: Starts, hypotheses: Sequence[Hypothesis]) -> 
 def is_rather_mirrored(query: Query, starts: Starts) -> bool:
     """True if the mirrored photo fits nearly as well, by the first scores from the starts of the photo."""
     mirror = mirrored(query)
-    of_mirror = first_score(mirror, search_poses(mirror, "known", is_first=True))
+    of_mirror = first_score(mirror, search_poses(mirror, "known"))
     return first_score(query, starts) < MIRROR_RATIO * of_mirror
 
 

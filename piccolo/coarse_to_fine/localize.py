@@ -49,8 +49,8 @@ def localize(
     is sure.
     """
     candidates = apply_prior(scan_map, settings.prior)
-    if len(candidates.centers) == 0 or not panorama.is_valid.any():
-        is_masked = len(candidates.centers) > 0
+    if len(candidates.sparse) == 0 or not panorama.is_valid.any():
+        is_masked = len(candidates.sparse) > 0
         why = NO_PIXEL if is_masked else nothing_allowed(scan_map, settings.prior)
         return Localization(warnings=(why,))
     with watch.stage("search"):
@@ -78,7 +78,7 @@ def localize(
 def searched(query: Query, gravity: Gravity, beam: Beam, watch: Stopwatch) -> tuple[Starts, list[Hypothesis]]:
     """The starts of a search by whole views, and where they lead."""
     with watch.stage("search"):
-        starts = search_poses(query, gravity, is_first=not query.by_features)
+        starts = search_poses(query, gravity)
     with watch.stage("refine"):
         return starts, refine(query, starts, beam)
 

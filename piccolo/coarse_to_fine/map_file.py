@@ -22,11 +22,12 @@ from ..local_features.feature_map import FeatureMap
 from ..runtime.array_archive import MappedArchive, write_archive
 from ..runtime.atomic import replacing
 from ..runtime.file_facts import recall, remember
+from .candidate_views import CandidateViews
 from .map_validation import LAYOUT, check_arrays, clean_warnings
 from .scan_map import ScanMap, with_late_features
 
-FORMAT = "piccolo-map/7"
-OTHERS = ("octree", "local_features", "scan_names", "warnings", "crs", "is_partial", "whole", "late")
+FORMAT = "piccolo-map/8"
+OTHERS = ("octree", "local_features", "scan_names", "warnings", "crs", "is_partial", "views", "late")
 ARRAYS = [f.name for f in fields(ScanMap) if f.name not in OTHERS]
 MEMBERS = {*LAYOUT, "format", "scan_names", "warnings"}
 WANTED = "wanted a whole map by tools/prepare_map.py"
@@ -85,13 +86,15 @@ def load_map(path: Path, remembers: bool = False) -> ScanMap:
                 remember(what, status, "")
         warnings = clean_warnings(path, arrays["warnings"])
     own: dict[str, Any] = {name: arrays[name] for name in ARRAYS if name not in ("has_labels", "scan_sha256")}
+    octree = Octree(
+        nodes=arrays["octree_nodes"],
+        first_child=arrays["octree_first_child"],
+        level_start=arrays["octree_level_start"],
+        leaf_size=float(arrays["octree_leaf_size"]),
+    )
     scan_map = ScanMap(
-        octree=Octree(
-            nodes=arrays["octree_nodes"],
-            first_child=arrays["octree_first_child"],
-            level_start=arrays["octree_level_start"],
-            leaf_size=float(arrays["octree_leaf_size"]),
-        ),
+        octree=octree,
+        views=CandidateViews(octree, arrays["centers"]),
         local_features=FeatureMap(*(arrays[f"local_{name}"] for name in FeatureMap._fields)),
         has_labels=bool(arrays["has_labels"]),
         scan_names=tuple(map(str, arrays["scan_names"])),

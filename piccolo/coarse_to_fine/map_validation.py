@@ -19,11 +19,12 @@ from ..geometry.sphere import make_grid
 from ..local_features.feature_map import MAX_LISTS, MAX_RANGE, MOST_VIEWS, NUM_COMPONENTS
 from ..local_features.keypoints import DESCRIPTOR_SIZE
 from ..runtime.jit import F0, F1, inline_kernel, kernel
+from .candidate_views import WIDE_RINGS
 from .named_scans import MAX_SCANS, is_name
-from .scan_map import SEARCH_VIEW, WIDE_RINGS, sparse_candidates
+from .scan_map import sparse_candidates
 
 Arrays = dict[str, NDArray[Any]]
-CELLS, WIDE_CELLS = len(make_grid(SEARCH_VIEW.num_rings)), len(make_grid(WIDE_RINGS))
+WIDE_CELLS = len(make_grid(WIDE_RINGS))
 # Type and shape; an axis that has a name is as long as the others of that name.
 LAYOUT: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "octree_nodes": ("<f4", ("nodes", 6)),
@@ -34,10 +35,6 @@ LAYOUT: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "origin_world": ("<f8", (3,)),
     "surface_variance": ("<f8", (3, 3)),
     "centers": ("<f8", ("candidates", 3)),
-    "offsets": ("<i2", ("candidates", 3, CELLS)),
-    "offset_unit": ("<f4", ("candidates",)),
-    "features": ("|i1", ("candidates", 3, CELLS)),
-    "is_seen": ("|b1", ("candidates", CELLS)),
     "scan_of_candidate": ("<u2", ("candidates",)),
     "sparse": ("<i8", ("sparse",)),
     "wide_features": ("|i1", ("sparse", 3 * WIDE_CELLS)),
@@ -62,7 +59,6 @@ ROUNDING = 1e-9  # of a rotation
 LEAF_SIZES = 1e-3, 0.1  # [m] least and most
 FARTHEST_ORIGIN, MARGIN = 1e12, 10.0  # [m] of the world; around the voxels that are kept
 BRIGHTEST = np.float32(1.0 + 1e-6)
-LEAST_UNIT, MOST_OFFSET = 3e-8, 1e6  # [m] of the offsets; how far they reach
 LARGEST_DEVIATION = 1.0  # [m] of points from their surfaces
 MAX_CRS = 4 * 20_000  # [byte]
 MAX_WARNINGS, MAX_WARNING = 1000, 5000  # lines, and characters of a line
@@ -163,18 +159,13 @@ def _check_octree(path: Path, arrays: Arrays) -> None:
 
 def _check_views(path: Path, arrays: Arrays) -> None:
     """Candidates and what they see are in range, and the sparse ones are those of the coarse grid."""
-    centers, unit = arrays["centers"], arrays["offset_unit"]
+    centers = arrays["centers"]
     reach = WINDOW * float(arrays["octree_leaf_size"]) + MARGIN
     if not np.abs(centers).max(initial=0.0) <= reach:
         _refuse(path, "a candidate at no finite place or too far away")
-    if not (unit.min(initial=1.0) >= LEAST_UNIT and unit.max(initial=0.0) <= MOST_OFFSET / 32767):
-        _refuse(path, f"an offset_unit of {unit.min()} to {unit.max()} m")
-    if arrays["is_seen"].view(np.uint8).max(initial=0) > 1:
-        _refuse(path, "an is_seen that is neither true nor false")
-    for name in ("features", "wide_features"):
-        if arrays[name].min(initial=0) < -127:
-            _refuse(path, f"{name} below -127")
-    if not np.array_equal(arrays["sparse"], sparse_candidates(centers)):
+    if arrays["wide_features"].min(initial=0) < -127:
+        _refuse(path, "wide_features below -127")
+    if not np.array_equal(arrays["sparse"], sparse_candidates(centers)[0]):
         _refuse(path, "sparse candidates that are not those of the coarse grid")
 
 

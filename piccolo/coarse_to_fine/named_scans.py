@@ -58,15 +58,12 @@ def candidates_within(scan_map: ScanMap, within: Sequence[str]) -> NDArray[np.bo
 
 
 def scan_at(scan_map: ScanMap, center_map: Array) -> str | None:
-    """The scan in which a place (3,) lies, that of the nearest candidate; None if there are no names.
-
-    Of a map narrowed by a prior, among all its candidates.
-    """
-    whole = scan_map.whole or scan_map
-    if not (whole.scan_names and len(whole.centers)):
+    """The scan in which a place (3,) lies, that of the nearest candidate; None if there are no names."""
+    m = scan_map
+    if not (m.scan_names and len(m.centers)):
         return None
-    nearest = np.square(whole.centers - center_map).sum(axis=1).argmin()
-    return whole.scan_names[int(whole.scan_of_candidate[nearest])]
+    nearest = np.square(m.centers - center_map).sum(axis=1).argmin()
+    return m.scan_names[int(m.scan_of_candidate[nearest])]
 
 
 def with_scans(scan_map: ScanMap, found: Localization) -> Localization:

@@ -51,26 +51,18 @@ def nothing_allowed(scan_map: ScanMap, prior: Prior) -> str:
 
 
 def apply_prior(scan_map: ScanMap, prior: Prior) -> ScanMap:
-    """The map with only the candidates that the prior allows."""
+    """The map, of which those cells of the coarse grid are searched in which the prior allows a candidate."""
     is_allowed = np.ones(len(scan_map.centers), dtype=bool)
     for mask in allowed_by_option(scan_map, prior).values():
         is_allowed &= mask
     if is_allowed.all():
         return scan_map
-    index = np.cumsum(is_allowed) - 1
-    is_kept = is_allowed[scan_map.sparse]
+    kept = np.unique(scan_map.sparse_of_candidate[is_allowed])
     return replace(
         scan_map,
-        centers=scan_map.centers[is_allowed],
-        offsets=scan_map.offsets[is_allowed],
-        offset_unit=scan_map.offset_unit[is_allowed],
-        features=scan_map.features[is_allowed],
-        is_seen=scan_map.is_seen[is_allowed],
-        scan_of_candidate=scan_map.scan_of_candidate[is_allowed],
-        sparse=index[scan_map.sparse[is_kept]],
-        wide_features=scan_map.wide_features[is_kept],
-        wide_seen=scan_map.wide_seen[is_kept],
-        whole=scan_map.whole or scan_map,
+        sparse=scan_map.sparse[kept],
+        wide_features=scan_map.wide_features[kept],
+        wide_seen=scan_map.wide_seen[kept],
     )
 
 

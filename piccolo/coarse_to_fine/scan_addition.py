@@ -5,7 +5,7 @@ else keeps every bit.
 """
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,23 +15,17 @@ from ..cloud.surface_noise import surface_variance
 from ..cloud.voxels import LEAF_SIZE, WINDOW, Voxels, join_voxels
 from ..errors import InputError
 from ..geometry.pose import Array
-from ..geometry.sphere import make_grid
+from ..geometry.sphere import make_grid, whole_areas
 from ..local_features.feature_map import MOST_VIEWS, FeatureMap, extend_feature_map
 from ..local_features.view_positions import view_positions
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from .aligned_cloud import Voxelized
-from .camera_positions import CLEARANCE_VOXEL, MIN_CLEARANCE, Box, candidate_centers
+from .camera_positions import BLOCK, CLEARANCE_VOXEL, MIN_CLEARANCE, Box, candidate_centers
+from .candidate_views import SEARCH_VIEW, WIDE_RINGS, CandidateViews, WideViews, render_wide
 from .named_scans import check_name
-from .scan_map import (
-    SEARCH_VIEW,
-    ScanMap,
-    Views,
-    ranges_of,
-    render_candidates,
-    sparse_candidates,
-    widen,
-)
+from .scan_map import ScanMap, seen_by, sparse_candidates
+from .view import ranges_around
 
 REACH = 3.0  # [m] beside the new scan there may be new places for a camera
 NEARER = 0.9  # of two scans the one in front is nearer by this
@@ -40,7 +34,6 @@ NEARER = 0.9  # of two scans the one in front is nearer by this
 LEAST_CHANGED, LEAST_FOR_FEATURES = 0.01, 0.1
 FAR_APART = 500.0  # [m] between scans that perhaps have no common coordinates
 COARSE_VOXEL = 2.56  # [m]
-ROWS = 8192  # views compared at a time
 
 
 class Candidates(NamedTuple):
@@ -68,23 +61,19 @@ def add_scan(old: ScanMap, cloud: Voxelized, name: str, workers: Workers, watch:
         leaves = old.octree.level(LEAF_SIZE), new.level(LEAF_SIZE)
         octree = build_octree(join_voxels(*leaves, old.R_map_from_world @ old.origin_world))
         found = joined_candidates(old, new, octree, workers)
-        offsets, unit, levels, is_seen = views = joined_views(old, octree, found, workers)
-        sparse = sparse_candidates(found.centers)
-        wide_features, wide_seen = widen(levels, is_seen, sparse)
+        sparse, _ = sparse_candidates(found.centers)
+        wide = joined_views(old, octree, found, sparse, workers)
         return replace(
             old,
             octree=octree,
             surface_variance=surface_variance(octree),
             centers=found.centers,
-            offsets=offsets,
-            offset_unit=unit,
-            features=levels,
-            is_seen=is_seen,
             scan_of_candidate=scans_of(old, found),
             sparse=sparse,
-            wide_features=wide_features,
-            wide_seen=wide_seen,
-            local_features=joined_features(old, octree, found, views, workers),
+            wide_features=wide.features,
+            wide_seen=wide.seen,
+            views=CandidateViews(octree, found.centers),
+            local_features=joined_features(old, octree, found, workers),
             scan_names=(*old.scan_names, name),
             warnings=tuple(dict.fromkeys(old.warnings + warnings)),
         )
@@ -120,53 +109,46 @@ def joined_candidates(old: ScanMap, new: Octree, octree: Octree, workers: Worker
     positions = candidate_centers(octree, workers, box)
     gap, _ = cKDTree(old.centers).query(positions)
     more = positions[box.holds(positions) & (gap > 0.0)]
-    in_front, behind = fractions_in_front(old, new, rows, workers)
-    views = render_candidates(old.octree, more, SEARCH_VIEW, workers, "look around")
-    of_more = compared(new, more, ranges_of(*views[:2], views[3]), workers)
+    in_front, behind = compared(new, old.octree, old.centers[rows], workers)
+    of_more = compared(new, old.octree, more, workers)
     fraction = np.concatenate([in_front, np.ones(len(more))])
     is_new = np.concatenate([in_front > behind, of_more[0] > of_more[1]]) & (fraction > LEAST_CHANGED)
     return Candidates(rows, np.concatenate([old.centers[rows], more]), fraction, is_new)
 
 
-def fractions_in_front(
-    old: ScanMap, new: Octree, rows: NDArray[np.int64], workers: Workers
-) -> tuple[Array, Array]:
-    """What `compared` says of some of a map's candidates (S,)."""
-    parts = [np.empty((2, 0))]
-    for lo in range(0, len(rows), ROWS):
-        some = rows[lo : lo + ROWS]
-        ranges = ranges_of(old.offsets[some], old.offset_unit[some], old.is_seen[some])
-        parts.append(np.stack(compared(new, old.centers[some], ranges, workers)))
-    in_front, behind = np.concatenate(parts, axis=1)
-    return in_front, behind
+def compared(new: Octree, old: Octree, centers: Array, workers: Workers) -> tuple[Array, Array]:
+    """Fractions of the sphere (N,) about centres (N, 3) where a new scan is in front, and where behind."""
+    area = whole_areas(SEARCH_VIEW.num_rings).astype(np.float64)
+
+    def compare(lo: int) -> tuple[Array, Array]:
+        some = centers[lo : lo + BLOCK]
+        of_new, of_old = (ranges_around(octree, some, SEARCH_VIEW) for octree in (new, old))
+        of_new[of_new == 0.0], of_old[of_old == 0.0] = np.inf, np.inf
+        return (of_new < NEARER * of_old) @ area, (of_old < NEARER * of_new) @ area
+
+    parts = list(workers.map(compare, range(0, len(centers), BLOCK), "compare views"))
+    in_front, behind = (np.concatenate([np.empty(0), *(part[k] for part in parts)]) for k in range(2))
+    return in_front / area.sum(), behind / area.sum()
 
 
-def compared(
-    new: Octree, centers: Array, ranges: NDArray[np.float32], workers: Workers
-) -> tuple[Array, Array]:
-    """Fractions of the sphere (N,) about each centre (N, 3) where a new scan is in front, and behind.
-
-    Of the others ranges (N, cells) [m] are known, 0 where nothing is seen.
-    """
-    offsets, unit, _, is_seen = render_candidates(new, centers, SEARCH_VIEW, workers, "compare views")
-    ranges_new = np.where(is_seen, ranges_of(offsets, unit, is_seen), np.inf)
-    ranges_old = np.where(ranges > 0.0, ranges, np.inf)
-    area = make_grid(SEARCH_VIEW.num_rings).solid_angle.astype(np.float64)
-    area /= area.sum()
-    return (ranges_new < NEARER * ranges_old) @ area, (ranges_old < NEARER * ranges_new) @ area
-
-
-def joined_views(old: ScanMap, octree: Octree, found: Candidates, workers: Workers) -> Views:
-    """Views as of render_candidates: the map's, and those that have changed anew."""
-    anew = render_candidates(octree, found.centers[found.changed], SEARCH_VIEW, workers)
-    kept: list[NDArray[Any]] = [old.offsets, old.offset_unit, old.features, old.is_seen]
-    views: list[Any] = []
-    for known, rendered in zip(kept, anew, strict=True):
-        joined = np.empty((len(found.centers), *known.shape[1:]), known.dtype)
-        joined[: len(found.rows)] = known[found.rows]
-        joined[found.changed] = rendered
-        views.append(joined)
-    return (views[0], views[1], views[2], views[3])
+def joined_views(
+    old: ScanMap, octree: Octree, found: Candidates, sparse: NDArray[np.int64], workers: Workers
+) -> WideViews:
+    """Wide views of the sparse candidates: the map's, and those that it lacks or that have changed anew."""
+    num_wide = len(make_grid(WIDE_RINGS))
+    joined = WideViews(
+        np.empty((len(sparse), 3 * num_wide), np.int8), np.empty((len(sparse), num_wide), np.uint8)
+    )
+    known, place = np.full(len(old.centers), -1), np.full(len(found.centers), -1)  # among those of the map
+    known[old.sparse] = np.arange(len(old.sparse))
+    place[: len(found.rows)] = known[found.rows]
+    place[found.changed] = -1
+    is_kept = place[sparse] >= 0
+    joined.features[is_kept] = old.wide_features[place[sparse[is_kept]]]
+    joined.seen[is_kept] = old.wide_seen[place[sparse[is_kept]]]
+    anew = render_wide(octree, found.centers[sparse[~is_kept]], SEARCH_VIEW, workers)
+    joined.features[~is_kept], joined.seen[~is_kept] = anew
+    return joined
 
 
 def scans_of(old: ScanMap, found: Candidates) -> NDArray[np.uint16]:
@@ -183,9 +165,7 @@ def scans_of(old: ScanMap, found: Candidates) -> NDArray[np.uint16]:
     return scans
 
 
-def joined_features(
-    old: ScanMap, octree: Octree, found: Candidates, views: Views, workers: Workers
-) -> FeatureMap:
+def joined_features(old: ScanMap, octree: Octree, found: Candidates, workers: Workers) -> FeatureMap:
     """Features of the map's views, taken anew where these have changed, and of as many more as are needed."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
 
@@ -195,10 +175,9 @@ def joined_features(
     is_kept = has_place.copy()
     is_kept[has_place] = found.fraction[place[has_place]] <= LEAST_FOR_FEATURES
     looked_at = np.concatenate([place[has_place], found.changed])
-    offsets, unit, _, is_seen = (values[looked_at] for values in views)
-    ranges = ranges_of(offsets, unit, is_seen)
+    centers = found.centers[looked_at]
     num_known = int(np.count_nonzero(has_place))
-    more = view_positions(found.centers[looked_at], ranges, SEARCH_VIEW.num_rings, num_known)
+    more = view_positions(centers, seen_by(octree, centers), SEARCH_VIEW.num_rings, num_known)
     anew = np.concatenate([place[has_place & ~is_kept], looked_at[more]])
     if np.count_nonzero(is_kept) + len(anew) > MOST_VIEWS:
         raise InputError(f"--add: found more than {MOST_VIEWS} views with features, the most of one map")

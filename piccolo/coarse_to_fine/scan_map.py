@@ -1,8 +1,7 @@
-"""What is prepared once per cloud: octree, places where a camera can be, and what it sees from each."""
+"""What is prepared once per cloud: octree, places where a camera can be, and coarsely what it sees there."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,24 +11,17 @@ from ..cloud.settings import UpAxis
 from ..cloud.soa import PackedPoints, pack_points
 from ..cloud.surface_noise import surface_variance
 from ..geometry.pose import Array, Pose
-from ..geometry.sphere import SEARCH_RINGS, averaging, make_grid
 from ..local_features.feature_map import FeatureMap, make_feature_map
-from ..local_features.view_positions import view_positions
-from ..runtime.memory import check_memory
+from ..local_features.view_positions import Look, view_positions
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from .aligned_cloud import AlignedCloud, Voxelized, read_once
-from .camera_positions import BLOCK, COARSE_SPACING, Ball, TooManyPositionsError, candidate_centers
+from .camera_positions import COARSE_SPACING, Ball, TooManyPositionsError, candidate_centers
+from .candidate_views import SEARCH_VIEW, CandidateViews, render_wide
 from .late_features import LateFeatures
 from .settings import NOTHING_KNOWN, Prior
 from .storeys import Storeys, find_storeys
-from .view import ViewConfig, render_block, thread_scratch
-
-WIDE_RINGS = 12
-SEARCH_VIEW = ViewConfig(num_rings=SEARCH_RINGS, stats_rings=16, sigma_deg=22.0, voxel_per_range=1 / 15)
-BYTES_PER_CELL = 6 + 3 + 1 + 4  # of a view: offsets, channels, seen; and what is made of them for a search
-# of some centres, as ScanMap holds them: offsets, their units, channels and seen cells
-Views = tuple[NDArray[np.int16], NDArray[np.float32], NDArray[np.int8], NDArray[np.bool_]]
+from .view import ViewConfig, ranges_around
 
 
 @dataclass(frozen=True)
@@ -41,14 +33,11 @@ class ScanMap:
     origin_world: Array  # (3,) [m] middle of the leaves' box, in whole metres along the map's axes
     surface_variance: Array  # (3, 3) [m^2] that the scan's noise and doubled surfaces give to a position
     centers: NDArray[np.float64]  # (candidates, 3) [m]
-    offsets: NDArray[np.int16]  # (candidates, 3, cells) from the centre to what is seen, in units of
-    offset_unit: NDArray[np.float32]  # (candidates,) [m]
-    features: NDArray[np.int8]  # (candidates, 3, cells) channels in levels, 0 where nothing is seen
-    is_seen: NDArray[np.bool_]  # (candidates, cells)
     scan_of_candidate: NDArray[np.uint16]  # (candidates,) index of its name in scan_names
-    sparse: NDArray[np.int64]  # candidates of which no two share a cell of the coarse grid
-    wide_features: NDArray[np.int8]  # (sparse, 3 * wide cells) means over wider cells, for SO(3)
+    sparse: NDArray[np.int64]  # candidates that are searched: no two share a cell of the coarse grid
+    wide_features: NDArray[np.int8]  # (sparse, 3 * wide cells) what is seen from them, channels in levels
     wide_seen: NDArray[np.uint8]  # (sparse, wide cells) fraction seen of each, 255 for all
+    views: CandidateViews  # of fine cells, made when they are asked for; not in files
     local_features: FeatureMap  # none of any view where they are made late; asked for by `features_now`
     has_labels: bool = False  # colours are those of labels
     scan_names: tuple[str, ...] = ()  # of the scans put together; none if none was named
@@ -56,7 +45,6 @@ class ScanMap:
     scan_sha256: str = ""  # of the files or arrays that it was made from, in hexadecimal digits
     crs: str = ""  # coordinate system that the scan's file names, as WKT or EPSG:code; empty if none
     is_partial: bool = False  # of a scan too large as a whole: candidates where a prior asks; not in files
-    whole: "ScanMap | None" = None  # with all candidates, of a map narrowed by a prior; not in files
     late: LateFeatures | None = None  # of a map that was prepared without local features; not in files
 
     @cached_property
@@ -73,6 +61,11 @@ class ScanMap:
     def storeys(self) -> Storeys:
         """The storeys, in the map's frame."""
         return find_storeys(self.octree)
+
+    @cached_property
+    def sparse_of_candidate(self) -> NDArray[np.int64]:
+        """Which of the sparse ones (candidates,) lies in the same cell of the coarse grid."""
+        return sparse_candidates(self.centers)[1]
 
     @property
     def lacks_features(self) -> bool:
@@ -99,64 +92,16 @@ def _as_points(nodes: NDArray[np.float32]) -> PackedPoints:
     return pack_points(nodes[:, :3], np.round(nodes[:, 3:] * 255.0).astype(np.uint8))
 
 
-def render_candidates(
-    octree: Octree,
-    centers: NDArray[np.float64],
-    config: ViewConfig,
-    workers: Workers,
-    label: str = "render views",
-) -> Views:
-    """The views from some centres (N, 3) [m]; the label of the progress also tells octrees apart."""
-    cells = len(make_grid(config.num_rings))
-    num_bytes = len(centers) * cells * BYTES_PER_CELL
-    check_memory(num_bytes, f"the scan: {len(centers)} prepared views", "cut out a part of it")
-    offsets, unit = np.empty((len(centers), 3, cells), np.int16), np.empty(len(centers), np.float32)
-    levels, is_seen = np.empty((len(centers), 3, cells), np.int8), np.empty((len(centers), cells), np.bool_)
-    wholes: list[NDArray[Any]] = [offsets, unit, levels, is_seen]
-    view, begins = config.arrays, range(0, len(centers), BLOCK)
+def sparse_candidates(centers: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Indices of the candidates (N, 3) [m] that come first in their cells of the coarse grid.
 
-    def run(lo: int) -> Views:
-        part = slice(lo, lo + BLOCK)
-        out = offsets[part], unit[part], levels[part], is_seen[part]
-        render_block(octree, centers[part], config.voxel_per_range, view, thread_scratch(), *out)
-        return out
-
-    for lo, found in zip(begins, workers.collect(run, begins, label, centers), strict=True):
-        for whole, part in zip(wholes, found, strict=True):
-            whole[lo : lo + BLOCK] = part  # what was made before; the rest is there
-    return offsets, unit, levels, is_seen
-
-
-def ranges_of(
-    offsets: NDArray[np.int16], unit: NDArray[np.float32], is_seen: NDArray[np.bool_]
-) -> NDArray[np.float32]:
-    """How far away (N, cells) [m] is what views show, as ScanMap holds them; 0 where nothing is seen."""
-    return np.asarray(np.linalg.norm(offsets.astype(np.float32), axis=1) * unit[:, None] * is_seen)
-
-
-def sparse_candidates(centers: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Indices of the candidates (N, 3) [m] that come first in their cells of the coarse grid."""
+    And for each candidate (N,) which of these it is that lies in the same cell.
+    """
     cells = np.floor(centers / COARSE_SPACING).astype(np.int64)
     cells -= cells.min(axis=0, initial=0)
     codes = np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0, initial=0) + 1))
-    return np.unique(codes, return_index=True)[1]
-
-
-def widen(
-    levels: NDArray[np.int8], is_seen: NDArray[np.bool_], rows: NDArray[np.int64]
-) -> tuple[NDArray[np.int8], NDArray[np.uint8]]:
-    """Some rows of views (N, 3, cells) averaged over the wider cells, and the fraction seen of these."""
-    matrix = averaging(WIDE_RINGS)
-    area = matrix.sum(axis=0)
-    features = np.empty((len(rows), 3, len(area)), np.int8)
-    fraction = np.empty((len(rows), len(area)), np.uint8)
-    for lo in range(0, len(rows), 1024):
-        part = rows[lo : lo + 1024]
-        mean = levels[part].astype(np.float32) @ matrix / area
-        features[lo : lo + 1024] = np.rint(np.clip(mean, -127, 127))
-        seen = np.minimum(is_seen[part].astype(np.float32) @ matrix / area, 1.0)
-        fraction[lo : lo + 1024] = np.rint(seen * 255.0)
-    return features.reshape(len(rows), 3 * len(area)), fraction
+    _, first, cell = np.unique(codes, return_index=True, return_inverse=True)
+    return first, cell.reshape(-1)
 
 
 def candidates_of(
@@ -198,9 +143,8 @@ def prepare_map(
     with watch.stage("prepare"):
         octree = aligned.octree
         centers, notes = candidates_of(aligned, prior, workers)
-        offsets, unit, levels, is_seen = render_candidates(octree, centers, view, workers)
-        sparse = sparse_candidates(centers)
-        wide_features, wide_seen = widen(levels, is_seen, sparse)
+        sparse, _ = sparse_candidates(centers)
+        wide = render_wide(octree, centers[sparse], view, workers)
         local_features = make_feature_map(octree, centers[:0], Workers())
     scan_map = ScanMap(
         octree=octree,
@@ -208,29 +152,31 @@ def prepare_map(
         origin_world=aligned.origin_world,
         surface_variance=surface_variance(octree),
         centers=centers,
-        offsets=offsets,
-        offset_unit=unit,
-        features=levels,
-        is_seen=is_seen,
         scan_of_candidate=np.zeros(len(centers), np.uint16),
         sparse=sparse,
-        wide_features=wide_features,
-        wide_seen=wide_seen,
+        wide_features=wide.features,
+        wide_seen=wide.seen,
+        views=CandidateViews(octree, centers, view),
         local_features=local_features,
         warnings=aligned.warnings + notes,
         is_partial=bool(notes),
     )
     if not has_features:
-        return with_late_features(scan_map, view)
+        return with_late_features(scan_map)
     with watch.stage("prepare"):
-        return replace(scan_map, local_features=find_local_features(scan_map, view, workers))
+        return replace(scan_map, local_features=find_local_features(scan_map, workers))
 
 
-def find_local_features(scan_map: ScanMap, view: ViewConfig, workers: Workers) -> FeatureMap:
+def find_local_features(scan_map: ScanMap, workers: Workers) -> FeatureMap:
     """The features of the views from few of a map's candidates, chosen by what they see."""
-    m = scan_map
-    chosen = view_positions(m.centers, ranges_of(m.offsets, m.offset_unit, m.is_seen), view.num_rings)
-    return make_feature_map(m.octree, m.centers[chosen], workers)
+    octree, centers = scan_map.octree, scan_map.centers
+    chosen = view_positions(centers, seen_by(octree, centers), SEARCH_VIEW.num_rings)
+    return make_feature_map(octree, centers[chosen], workers)
+
+
+def seen_by(octree: Octree, centers: NDArray[np.float64]) -> Look:
+    """How far one sees from each of some centres (N, 3), by its index."""
+    return lambda k: ranges_around(octree, centers[k : k + 1], SEARCH_VIEW)[0]
 
 
 def with_features(scan_map: ScanMap, workers: Workers) -> ScanMap:
@@ -238,6 +184,6 @@ def with_features(scan_map: ScanMap, workers: Workers) -> ScanMap:
     return replace(scan_map, local_features=scan_map.features_now(workers), late=None)
 
 
-def with_late_features(scan_map: ScanMap, view: ViewConfig = SEARCH_VIEW) -> ScanMap:
+def with_late_features(scan_map: ScanMap) -> ScanMap:
     """A map without local features, which makes them when they are first asked for."""
-    return replace(scan_map, late=LateFeatures(lambda workers: find_local_features(scan_map, view, workers)))
+    return replace(scan_map, late=LateFeatures(lambda workers: find_local_features(scan_map, workers)))

@@ -11,15 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.rotations import Gravity, uniform_rotations, uniform_yaws
-from ..geometry.sphere import AREA_UNITS, SEARCH_RINGS, averaging, make_grid
+from ..geometry.sphere import SEARCH_RINGS, averaging, make_grid, whole_areas
 from ..geometry.suppression import non_maximum_suppression
 from ..panorama.local_normalization import sample_channels
 from ..panorama.texels import Texels
 from ..runtime.jit import kernel
 from ..runtime.memory import check_memory
+from .candidate_views import WIDE_RINGS
 from .prior import allowed_rotations
 from .query import Query
-from .scan_map import WIDE_RINGS, ScanMap
+from .scan_map import ScanMap
 from .starts import START_ANGLE, START_DISTANCE, Starts
 
 BLOCK = 2048  # views a matrix product
@@ -27,7 +28,7 @@ TURNED_BYTES = 4 * 16  # of a rotation, a cell: channels, validity, energy, and 
 EXACT = (1 << 24) - 1  # whole numbers up to this are exact in float32
 MOST_LEVEL = 127.5  # of a channel
 MOST_ENERGY = 3.0 * MOST_LEVEL**2  # of a cell
-CANDIDATES_PER_START, POSES_PER_START = 4, 12
+CANDIDATES_PER_START, POSES_PER_START = 2, 12
 Samples = NDArray[np.float32]
 
 
@@ -89,16 +90,8 @@ def masked_correlation(
     return scores
 
 
-def score_poses(scan_map: ScanMap, samples: Samples, validity: Samples) -> Samples:
-    """Masked correlation (candidates, rotations) of all views with the turned panorama."""
-    features = scan_map.features.reshape(len(scan_map.features), -1)
-    area = make_grid(SEARCH_RINGS).solid_angle
-    panorama = turned(samples, validity, area, 1)
-    return masked_correlation(features, scan_map.is_seen.view(np.uint8), area, panorama)
-
-
 def score_poses_wide(scan_map: ScanMap, samples: Samples, validity: Samples) -> Samples:
-    """The same over wide cells for the sparse candidates: (sparse, rotations)."""
+    """Masked correlation (sparse, rotations) of wide views with the turned panorama, its cells averaged."""
     weights = averaging(WIDE_RINGS)
     area = weights.sum(axis=0)
     wide_samples, wide_validity = np.rint(samples) @ weights / area, validity @ weights / area
@@ -107,14 +100,14 @@ def score_poses_wide(scan_map: ScanMap, samples: Samples, validity: Samples) -> 
 
 
 @kernel
-def correlate_pairs(features, is_seen, area, panorama, candidate, rotation, scores):
-    """Write the masked correlation, up to a factor, of each pair of a view and a turned panorama.
+def correlate_pairs(features, is_seen, area, panorama, row, rotation, scores):
+    """Write the masked correlation, up to a factor, of each pair of a view's row and a turned panorama.
 
     Whole numbers in float64, exact in any order. The area (cells,) is in whole numbers too.
     """
     for k in range(len(scores)):
-        f, s = features[candidate[k]], panorama.samples[rotation[k]]
-        seen, valid = is_seen[candidate[k]], panorama.validity[rotation[k]]
+        f, s = features[row[k]], panorama.samples[rotation[k]]
+        seen, valid = is_seen[row[k]], panorama.validity[rotation[k]]
         energies = panorama.energy[rotation[k]]
         product = view_energy = energy = 0.0
         for c in range(len(area)):
@@ -155,37 +148,43 @@ def best_poses(scores: Samples, pool: int) -> tuple[NDArray[np.int64], NDArray[n
     return *np.divmod(top, scores.shape[1]), flat[top]
 
 
-def search_poses(query: Query, gravity: Gravity, is_first: bool = False) -> Starts:
-    """Every candidate position with every rotation as matrix products; the distinct best.
+def search_poses(query: Query, gravity: Gravity) -> Starts:
+    """The distinct best of all candidates with all rotations, in two stages.
 
-    With gravity unknown, and in a first look, in stages: fewer positions on wider cells come first.
+    Wide cells of the sparse candidates, as matrix products; then fine cells of the poses that are left.
     """
     m, settings = query.scan_map, query.settings
-    num_starts = min(
-        max(len(m.centers) // CANDIDATES_PER_START, query.method.min_starts), settings.max_starts
-    )
-    num_pool = num_starts * POSES_PER_START
+    least = max(len(m.sparse) // CANDIDATES_PER_START, query.method.min_starts)
+    num_starts = min(least, settings.max_starts)
     if gravity == "known":
         rotations = query.R_cam_from_level @ uniform_yaws(settings.num_yaws)
     else:
         rotations = uniform_rotations(settings.num_rotations)
     rotations = allowed_rotations(rotations @ m.R_map_from_world, settings.prior) @ m.R_map_from_world.T
-    is_staged = is_first or gravity == "unknown"
-    num_views = len(m.sparse) if is_staged else len(m.centers)
-    num_bytes = len(rotations) * (len(make_grid(SEARCH_RINGS)) * TURNED_BYTES + 4 * num_views)
-    what = f"a search of {num_views} positions in {len(rotations)} rotations"
+    num_bytes = len(rotations) * (len(make_grid(SEARCH_RINGS)) * TURNED_BYTES + 4 * len(m.sparse))
+    what = f"a search of {len(m.sparse)} positions in {len(rotations)} rotations"
     check_memory(num_bytes, what, "set fewer --num-yaws or --num-rotations")
     samples, validity = turn_panorama(query.images.search, rotations)
-    if not is_staged:
-        candidate, rotation, scores = best_poses(score_poses(m, samples, validity), num_pool)
-    else:
-        sparse, rotation, scores = best_poses(score_poses_wide(m, samples, validity), num_pool)
-        candidate, area = m.sparse[sparse], make_grid(SEARCH_RINGS).solid_angle
-        units = np.rint(area / area.max() * np.float32(AREA_UNITS))
-        panorama = turned(samples, validity, area, 1)
-        correlate_pairs(m.features, m.is_seen, units, panorama, candidate, rotation, scores)
-        order = np.lexsort((rotation, candidate, -scores))
-        candidate, rotation, scores = candidate[order], rotation[order], scores[order]
-    R, centers = rotations[rotation], m.centers[candidate]
+    scores = score_poses_wide(m, samples, validity)
+    sparse, rotation, _ = best_poses(scores, num_starts * POSES_PER_START)
+    R, centers = rotations[rotation], m.centers[m.sparse[sparse]]
     kept = non_maximum_suppression(R, centers, num_starts, START_DISTANCE, START_ANGLE)
-    return Starts(R, centers, candidate, scores.astype(np.float64)).take(kept)
+    return rescored(query, m.sparse[sparse[kept]], rotations, rotation[kept], samples, validity)
+
+
+def rescored(
+    query: Query,
+    candidate: NDArray[np.int64],
+    rotations: NDArray[np.float64],
+    rotation: NDArray[np.int64],
+    samples: Samples,
+    validity: Samples,
+) -> Starts:
+    """Some candidates (n,) and rotations (n,) of all (rotations, 3, 3) as starts, by their fine views."""
+    area, scores = make_grid(SEARCH_RINGS).solid_angle, np.empty(len(candidate), np.float32)
+    panorama = turned(samples, validity, area, 1)
+    row, views = query.scan_map.views.at(candidate, query.workers)
+    correlate_pairs(views.features, views.is_seen, whole_areas(SEARCH_RINGS), panorama, row, rotation, scores)
+    order = np.lexsort((rotation, candidate, -scores))
+    candidate, R = candidate[order], rotations[rotation[order]]
+    return Starts(R, query.scan_map.centers[candidate], candidate, scores[order].astype(np.float64))

@@ -4,13 +4,13 @@ import math
 import threading
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cloud.octree import MAX_NODES, Octree, collect
-from ..geometry.sphere import cell_of, make_grid, make_neighbors
+from ..geometry.sphere import cell_of, interpolation, make_grid, make_neighbors
 from ..optimize.channel_loss import BLOCK_RINGS
 from ..panorama.local_normalization import LEVELS_PER_UNIT, opponent, zscore
 from ..runtime.jit import F0, F1, HALF, inline_kernel, kernel
@@ -38,9 +38,11 @@ class ViewArrays(NamedTuple):
     stats_cell: NDArray[np.int32]  # (cells,) the wider cell that each lies in
     num_stats: int  # wider cells
     solid_angle: NDArray[np.float32]  # (cells,) fraction of the sphere
-    neighbor_row: NDArray[np.int32]  # (cells + 1,) where each cell's neighbours begin
+    neighbor_row: NDArray[np.int32]  # (wider cells + 1,) where each wider cell's neighbours begin
     neighbor_cell: NDArray[np.int32]  # wider cells
     neighbor_weight: NDArray[np.float32]
+    near_stats: NDArray[np.int32]  # (cells, 4) wider cells around each cell
+    near_weight: NDArray[np.float32]  # (cells, 4) of statistics there
     front: np.float32
     visible: np.float32
     blocks: NDArray[np.int32]  # (cells,) the block of the sphere that each lies in, for scores
@@ -71,7 +73,7 @@ class ViewConfig:
     def arrays(self) -> ViewArrays:
         """What the kernels read."""
         grid = make_grid(self.num_rings)
-        neighbors = make_neighbors(self.num_rings, self.stats_rings, self.sigma_deg)
+        neighbors = make_neighbors(self.stats_rings, self.sigma_deg)
         return ViewArrays(
             grid.num_columns,
             grid.first,
@@ -81,6 +83,7 @@ class ViewConfig:
             neighbors.row,
             neighbors.cell,
             neighbors.weight,
+            *interpolation(self.num_rings, self.stats_rings),
             np.float32(self.front),
             np.float32(self.visible),
             cell_of(grid.directions, BLOCK_RINGS),
@@ -126,6 +129,13 @@ def render(tree, center, voxel_per_range, view, scratch, shown, offsets, channel
                 channels[k, c] = zscore(channels[k, c], stats[k, c], stats[3 + k, c])
 
 
+@inline_kernel
+def as_level(channel):
+    """A normalised channel in 8 bits."""
+    level = math.floor(channel * np.float32(LEVELS_PER_UNIT) + HALF)
+    return np.int8(min(max(level, np.float32(-127)), np.float32(127)))
+
+
 @kernel
 def render_block(tree, centers, voxel_per_range, view, scratch, offsets, unit, levels, is_seen):
     """Views from several centres in few bits: offsets in units of their own, channels in levels."""
@@ -142,12 +152,37 @@ def render_block(tree, centers, voxel_per_range, view, scratch, offsets, unit, l
         for i in range(3):
             for c in range(n):
                 offsets[k, i, c] = np.int16(points[i, c] / unit[k])
-                level = channels[i, c] * np.float32(LEVELS_PER_UNIT)
-                levels[k, i, c] = np.int8(
-                    min(max(math.floor(level + HALF), np.float32(-127)), np.float32(127))
-                )
+                levels[k, i, c] = as_level(channels[i, c])
         for c in range(n):
             is_seen[k, c] = weights[c] > F0
+
+
+@kernel
+def render_wide_block(tree, centers, voxel_per_range, view, scratch, features, seen):
+    """Views from several centres averaged over the wider cells that hold their statistics, in few bits.
+
+    Channels (n, 3, wider cells) in levels, by the whole cell's area, and how much of it is seen (n, wider
+    cells), 255 for all.
+    """
+    n, m = len(view.solid_angle), view.num_stats
+    points, channels = np.empty((3, n), np.float32), np.empty((3, n), np.float32)
+    weights, shown = np.empty(n, np.float32), np.ones(n, np.bool_)
+    sums, area = np.empty((m, 4), np.float32), np.zeros(m, np.float32)
+    for c in range(n):
+        area[view.stats_cell[c]] += view.solid_angle[c]
+    for k in range(len(centers)):
+        render(tree, centers[k], voxel_per_range, view, scratch, shown, points, channels, weights)
+        sums[:] = F0
+        for c in range(n):
+            if weights[c] > F0:
+                total = sums[view.stats_cell[c]]
+                for i in range(3):
+                    total[i] += weights[c] * channels[i, c]
+                total[3] += weights[c]
+        for c in range(m):
+            for i in range(3):
+                features[k, i, c] = as_level(sums[c, i] / area[c])
+            seen[k, c] = np.uint8(min(sums[c, 3] / area[c], F1) * np.float32(255) + HALF)
 
 
 @inline_kernel
@@ -195,18 +230,15 @@ def render_points(tree, center, voxel_per_range, view, scratch, shown, offsets, 
 
 
 @kernel
-def filled_fractions(tree, centers, voxel_per_range, view, scratch, fraction):
-    """Write the fraction of the sphere (n,) around each centre (n, 3) whose cells hold any node."""
-    is_filled = np.empty(len(view.solid_angle), np.bool_)
+def nearest_ranges(tree, centers, voxel_per_range, view, scratch, ranges):
+    """Write ranges [m] of the nearest nodes in the cells (n, cells) around each centre (n, 3), 0 for none."""
     for k in range(len(centers)):
         n = locate_nodes(tree, centers[k], voxel_per_range, view, scratch)
-        is_filled[:] = False
+        ranges[k] = F0
         for i in range(n):
-            is_filled[scratch.cells[i]] = True
-        fraction[k] = F0
-        for c in range(len(is_filled)):
-            if is_filled[c]:
-                fraction[k] += view.solid_angle[c]
+            cell = scratch.cells[i]
+            if ranges[k, cell] == F0 or scratch.ranges[i] < ranges[k, cell]:
+                ranges[k, cell] = scratch.ranges[i]
 
 
 def make_scratch() -> Scratch:
@@ -255,3 +287,12 @@ def visible_points(
     center, view = np.asarray(center_map, np.float64), config.arrays
     n = render_points(octree, center, config.voxel_per_range, view, thread_scratch(), shown, *cells)
     return Cells(cells.offsets[:, :n].copy(), cells.channels[:, :n].copy(), cells.weights[:n].copy())
+
+
+def ranges_around(
+    octree: Octree, centers_map: NDArray[np.floating[Any]], config: ViewConfig
+) -> NDArray[np.float32]:
+    """How far away (n, cells) [m] the nearest of what is seen from each centre (n, 3) is, 0 for nothing."""
+    ranges = np.empty((len(centers_map), len(make_grid(config.num_rings))), np.float32)
+    nearest_ranges(octree, centers_map, config.voxel_per_range, config.arrays, thread_scratch(), ranges)
+    return ranges

@@ -166,15 +166,37 @@ def make_grid(num_rings: int) -> SphereGrid:
 
 
 @lru_cache(maxsize=8)
-def make_neighbors(num_rings: int, stats_rings: int, sigma_deg: float) -> Neighbors:
-    """Gaussian weights of the statistics cells within 2.3 sigmas of each cell of a grid."""
-    fine, coarse = make_grid(num_rings), make_grid(stats_rings)
-    sigma = np.radians(sigma_deg)
-    cosine = fine.directions @ coarse.directions.T
+def make_neighbors(num_rings: int, sigma_deg: float) -> Neighbors:
+    """Gaussian weights of the cells of a grid within 2.3 sigmas of each cell."""
+    grid, sigma = make_grid(num_rings), np.radians(sigma_deg)
+    cosine = grid.directions @ grid.directions.T
     rows, cells = np.nonzero(cosine > np.cos(2.3 * sigma))
-    weight = np.exp((cosine[rows, cells] - 1) / sigma**2) * coarse.solid_angle[cells]
-    row = np.searchsorted(rows, np.arange(len(fine) + 1)).astype(np.int32)
+    weight = np.exp((cosine[rows, cells] - 1) / sigma**2) * grid.solid_angle[cells]
+    row = np.searchsorted(rows, np.arange(len(grid) + 1)).astype(np.int32)
     return Neighbors(row, cells.astype(np.int32), weight.astype(np.float32))
+
+
+@lru_cache(maxsize=8)
+def interpolation(num_rings: int, coarse_rings: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Cells (cells, 4) of a coarser grid around each cell's middle, and bilinear weights (cells, 4).
+
+    Two rings, of each two cells; beyond the last ring it is that ring on the other side of the pole.
+    """
+    fine, coarse = make_grid(num_rings).directions.astype(np.float64), make_grid(coarse_rings)
+    place = (0.5 - np.arcsin(np.clip(fine[:, 2], -1.0, 1.0)) / np.pi) * coarse_rings - 0.5
+    turn = np.arctan2(fine[:, 1], fine[:, 0]) / (2.0 * np.pi) + 0.5
+    cells, weights = [], []
+    for step in (0, 1):
+        along = 1.0 - np.abs(place - np.floor(place) - step)
+        beside = np.floor(place).astype(int) + step
+        ring = np.clip(beside, 0, coarse_rings - 1)
+        n = coarse.num_columns[ring]
+        column = (turn + 0.5 * (beside != ring)) * n - 0.5
+        for side in (0, 1):
+            across = 1.0 - np.abs(column - np.floor(column) - side)
+            cells.append(coarse.first[ring] + (np.floor(column).astype(int) + side) % n)
+            weights.append(along * across)
+    return np.stack(cells, axis=1).astype(np.int32), np.stack(weights, axis=1).astype(np.float32)
 
 
 @lru_cache(maxsize=4)
@@ -185,9 +207,14 @@ def averaging(num_rings: int) -> NDArray[np.float32]:
     """
     grid, wide = make_grid(SEARCH_RINGS), make_grid(num_rings)
     matrix = np.zeros((len(grid), len(wide)), np.float32)
-    area = np.rint(grid.solid_angle / grid.solid_angle.max() * np.float32(AREA_UNITS))
-    matrix[np.arange(len(grid)), cell_of(grid.directions, num_rings)] = area
+    matrix[np.arange(len(grid)), cell_of(grid.directions, num_rings)] = whole_areas(SEARCH_RINGS)
     return matrix
+
+
+def whole_areas(num_rings: int) -> NDArray[np.float32]:
+    """Solid angles (cells,) of a grid in whole numbers up to AREA_UNITS: sums of them are exact."""
+    area = make_grid(num_rings).solid_angle
+    return np.asarray(np.rint(area / area.max() * np.float32(AREA_UNITS)))
 
 
 def cell_of(directions: NDArray[np.float32], num_rings: int) -> NDArray[np.int32]:

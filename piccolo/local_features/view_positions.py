@@ -1,5 +1,8 @@
 """From where the scan's features are taken: few positions that see all that a camera can see."""
 
+from collections.abc import Callable
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,22 +13,23 @@ from ..runtime.jit import kernel
 SPACING, LAYER = 2.5, 2.4  # [m] across and in height: what is nearer and seen from a position needs none
 MAX_VIEWS, WIDER = 2500, 1.5  # at most, some minutes and 0.4 GB; the growth of the spacing for more
 ABOVE_LOWEST, HEIGHT_STEP = 1.0, 0.3  # [m] first are positions so high above the lowest around, by steps
+Look = Callable[[int], NDArray[np.float32]]  # ranges (cells,) [m] seen from a candidate, 0 for nothing
 CELL = np.array([2.5, 2.5, 3.0])  # [m] around: a part of a storey
 TABLE_HEIGHT = 48  # directions, by 3.75 degrees
 SLACK = 1.0  # [m] a wall is so much nearer than what is behind it
 
 
 @kernel
-def choose(order, centers, ranges, cells, spacing, kept, count):
-    """Write the indices of the positions kept behind the `count` first: each that none near (spacing) sees.
+def next_unseen(order, begin, centers, kept, ranges, cells, spacing):
+    """The first place from `begin` in an order of positions that none of those kept (k,) sees nearby.
 
-    In order. Ranges (N, cells) [m] are those of the view from each centre (N, 3), 0 where nothing is seen;
-    `cells` is a table (h, 2 h) of the cell in each direction. Returns how many are kept.
+    Ranges (k, cells) [m] are those of the view from each, 0 where nothing is seen; `cells` is a table
+    (h, 2 h) of the cell in each direction.
     """
     height, width = cells.shape
-    for i in order:
-        is_covered = False
-        for k in range(count):
+    for place in range(begin, len(order)):
+        i, is_covered = order[place], False
+        for k in range(len(kept)):
             j = kept[k]
             dx, dy = centers[i, 0] - centers[j, 0], centers[i, 1] - centers[j, 1]
             dz = centers[i, 2] - centers[j, 2]
@@ -33,14 +37,13 @@ def choose(order, centers, ranges, cells, spacing, kept, count):
             if across >= spacing * spacing or abs(dz) >= LAYER:
                 continue
             u, v = direction_to_pixel(dx, dy, dz, np.sqrt(across), width)
-            limit = ranges[j, cells[min(int(v), height - 1), min(int(u), width - 1)]]
+            limit = ranges[k, cells[min(int(v), height - 1), min(int(u), width - 1)]]
             if limit == 0.0 or np.sqrt(across + dz * dz) < limit + SLACK:
                 is_covered = True
                 break
         if not is_covered:
-            kept[count] = i
-            count += 1
-    return count
+            return place
+    return len(order)
 
 
 def cell_table(num_rings: int) -> NDArray[np.int32]:
@@ -49,12 +52,10 @@ def cell_table(num_rings: int) -> NDArray[np.int32]:
     return cell_of(rays.reshape(-1, 3), num_rings).reshape(rays.shape[:2])
 
 
-def view_positions(
-    centers: Array, ranges: NDArray[np.float32], num_rings: int, num_known: int = 0
-) -> NDArray[np.int64]:
+def view_positions(centers: Array, look: Look, num_rings: int, num_known: int = 0) -> NDArray[np.int64]:
     """Indices of the candidates (N, 3) [m] from which features are taken, beside the first, already known.
 
-    Ranges (N, cells) [m] are those of the candidates' views, 0 where nothing is seen. At most MAX_VIEWS.
+    At most MAX_VIEWS. A look from a candidate tells ranges on the cells of `num_rings`.
     """
     if len(centers) == 0:
         return np.empty(0, np.int64)
@@ -63,8 +64,31 @@ def view_positions(
     np.minimum.at(lowest, group.ravel(), centers[:, 2])
     off = np.abs(centers[:, 2] - lowest[group.ravel()] - ABOVE_LOWEST)
     order = np.argsort(np.rint(off / HEIGHT_STEP), kind="stable")
-    order, cells = order[order >= num_known], cell_table(num_rings)
-    kept, spacing = np.arange(len(centers)), SPACING
-    while (count := choose(order, centers, ranges, cells, spacing, kept, num_known)) > MAX_VIEWS + num_known:
+    order, known = order[order >= num_known], np.arange(num_known)
+    look, spacing = lru_cache(maxsize=None)(look), SPACING
+    while (kept := chosen(order, centers, known, look, cell_table(num_rings), spacing)) is None:
         spacing *= WIDER
-    return kept[num_known:count]
+    return kept
+
+
+def chosen(
+    order: NDArray[np.int64],
+    centers: Array,
+    known: NDArray[np.int64],
+    look: Look,
+    cells: NDArray[np.int32],
+    spacing: float,
+) -> NDArray[np.int64] | None:
+    """Of some positions, in order, each that none of those known or chosen before sees; None if too many."""
+    room = len(known) + MAX_VIEWS
+    kept, ranges = np.empty(room, np.int64), np.empty((room, cells.max() + 1), np.float32)
+    count, place = len(known), 0
+    kept[:count] = known
+    for k in known:
+        ranges[k] = look(int(k))
+    while (place := next_unseen(order, place, centers, kept[:count], ranges, cells, spacing)) < len(order):
+        if count == room:
+            return None
+        kept[count], ranges[count] = order[place], look(int(order[place]))
+        count += 1
+    return kept[len(known) : count]

@@ -6,9 +6,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..coarse_to_fine.scan_map import SEARCH_VIEW, ScanMap
+from ..coarse_to_fine.camera_positions import BLOCK
+from ..coarse_to_fine.candidate_views import SEARCH_VIEW
+from ..coarse_to_fine.scan_map import ScanMap
+from ..coarse_to_fine.view import ranges_around
 from ..geometry.pose import Array
 from ..geometry.sphere import cell_of
+from ..runtime.threads import Workers
 
 REACH = 0.95  # [m] between neighbours in the grid of candidates, 0.6 m wide: across edges, not all corners
 SLACK = 0.1  # [m] by which a surface may be nearer than a neighbour, as views are coarse
@@ -27,8 +31,8 @@ class _Reached(NamedTuple):
 class FreeSpace:
     """A map's candidates as a graph, with an edge where neighbours see each other."""
 
-    def __init__(self, scan_map: ScanMap) -> None:
-        self.scan_map = scan_map
+    def __init__(self, scan_map: ScanMap, workers: Workers) -> None:
+        self.scan_map, self.workers = scan_map, workers
         self._known: dict[int, _Reached] = {}
 
     @cached_property
@@ -42,11 +46,15 @@ class FreeSpace:
         """Sparse matrix (candidates, candidates) of lengths [m]."""
         from scipy.sparse import coo_matrix  # noqa: PLC0415
 
-        first, second = self._tree.query_pairs(REACH, output_type="ndarray").T
-        length = np.linalg.norm(self.scan_map.centers[second] - self.scan_map.centers[first], axis=1)
-        views = looks(self.scan_map, first, second) + looks(self.scan_map, second, first)
-        edges = length[views > 0], (first[views > 0], second[views > 0])
-        return coo_matrix(edges, (len(self.scan_map.centers),) * 2).tocsr()
+        m, pairs = self.scan_map, self._tree.query_pairs(REACH, output_type="ndarray")
+        both = np.concatenate([pairs, pairs[:, ::-1]])  # there and back
+        order = np.argsort(both[:, 0], kind="stable")
+        seen = np.empty(len(both), np.int64)
+        seen[order] = looks(m, both[order, 0], both[order, 1], self.workers)
+        is_free = seen[: len(pairs)] + seen[len(pairs) :] > 0
+        first, second = pairs[is_free].T
+        length = np.linalg.norm(m.centers[second] - m.centers[first], axis=1)
+        return coo_matrix((length, (first, second)), (len(m.centers),) * 2).tocsr()
 
     def distance(self, start: Array, ends: Array, limit: float) -> Array:
         """Metres (N,) from a place (3,) to others (N, 3) of the map's frame; inf beyond a limit."""
@@ -78,16 +86,26 @@ class FreeSpace:
         return np.asarray(np.where(known.nodes[place] == ends, known.lengths[place], np.inf))
 
 
-def looks(scan_map: ScanMap, first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.int64]:
+def looks(
+    scan_map: ScanMap, first: NDArray[Any], second: NDArray[Any], workers: Workers
+) -> NDArray[np.int64]:
     """What candidates see (N,) in the direction of neighbours: 1 what lies behind them, 0 nothing, else -2.
 
-    A sum above 0 is a free way: nobody sees anything between, and somebody sees past.
+    A sum above 0 is a free way: nobody sees anything between, and somebody sees past. Both index candidates,
+    the first rise.
     """
     m = scan_map
     toward = m.centers[second] - m.centers[first]
     length = np.linalg.norm(toward, axis=1)
     cell = cell_of((toward / length[:, None]).astype(np.float32), SEARCH_VIEW.num_rings)
-    offsets = m.offsets[first, :, cell].astype(np.float32)
-    ranges = np.linalg.norm(offsets, axis=1) * m.offset_unit[first]
-    is_behind = ranges > length - SLACK
-    return np.where(m.is_seen[first, cell], np.where(is_behind, 1, -2), 0)
+    nodes = np.unique(first)
+
+    def ranges_from(lo: int) -> NDArray[np.float32]:
+        some = nodes[lo : lo + BLOCK]
+        part = slice(*np.searchsorted(first, [some[0], some[-1] + 1]))
+        ranges = ranges_around(m.octree, m.centers[some], SEARCH_VIEW)
+        return ranges[np.searchsorted(some, first[part]), cell[part]]
+
+    parts = workers.map(ranges_from, range(0, len(nodes), BLOCK), "find ways")
+    ranges = np.concatenate([np.empty(0, np.float32), *parts])
+    return np.where(ranges > 0.0, np.where(ranges > length - SLACK, 1, -2), 0)

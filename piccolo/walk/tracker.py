@@ -66,7 +66,7 @@ class Tracker:
     ) -> None:
         self.scan_map = apply_prior(scan_map, settings.prior)
         self.settings, self.workers, self.motion = settings, workers, motion
-        self.lattice = Lattice(space or FreeSpace(scan_map), motion)
+        self.lattice = Lattice(space or FreeSpace(scan_map, workers), motion)
         self.num_lost, self.next_search = 0, 1
         self.walked, self.is_sure = 0.0, False  # [m] since the whole scan was searched
 

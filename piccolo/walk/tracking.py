@@ -74,7 +74,7 @@ def found_near(query: Query, near: Pose, radius: float, least_score: float) -> l
     """Poses found within a radius [m] by whole views; none if the best has less than a score."""
     x, y, z = (float(value) for value in query.scan_map.to_world(near).center_world)
     some = apply_prior(query.scan_map, Prior(near_world=(x, y, z), radius=radius))
-    if len(some.centers) == 0:
+    if len(some.sparse) == 0:
         return []
     close = found_everywhere(replace(query, scan_map=some, comparisons={}), least_score)
     least = KEPT_BESIDE * max((h.score for h in close), default=0.0)
@@ -89,7 +89,7 @@ def found_everywhere(query: Query, least_score: float) -> list[Hypothesis]:
     """
     first = first_query(query)
     gravity: Gravity = "unknown" if query.settings.gravity == "unknown" else "known"
-    starts = search_poses(first, gravity, is_first=True)
+    starts = search_poses(first, gravity)
     if first_score(first, starts) < least_score or is_rather_mirrored(first, starts):
         return []
     found = found_among(refine(first, starts, FIRST_BEAM), MOST_LISTED - 1)

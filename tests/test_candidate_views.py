@@ -1,0 +1,101 @@
+"""What is seen from a map's candidates: wide cells prepared, fine ones made when they are asked for."""
+
+import threading
+
+import numpy as np
+import pytest
+import rooms
+
+from piccolo.coarse_to_fine import candidate_views
+from piccolo.coarse_to_fine.candidate_views import SEARCH_VIEW, CandidateViews, render_views, render_wide
+from piccolo.coarse_to_fine.view import render_view
+from piccolo.geometry.sphere import averaging, make_grid
+from piccolo.panorama.local_normalization import LEVELS_PER_UNIT
+from piccolo.runtime.threads import Workers
+
+ALL = np.ones(len(make_grid(24)), bool)
+
+
+def _views():
+    m = rooms.scan_map(1)
+    return m, CandidateViews(m.octree, m.centers)
+
+
+def test_views_are_views_in_few_bits():
+    m, kept = _views()
+    k = len(m.centers) // 2
+    offsets, features, weights = render_view(m.octree, m.centers[k], SEARCH_VIEW, ALL)
+    (row,), views = kept.at(np.array([k]), Workers(1))
+    np.testing.assert_array_equal(views.centers[row], m.centers[k])
+    np.testing.assert_array_equal(views.is_seen[row], weights > 0)
+    unit = views.offset_unit[row]
+    np.testing.assert_allclose(views.offsets[row] * unit, offsets, atol=2 * unit)
+    np.testing.assert_allclose(views.features[row] / LEVELS_PER_UNIT, features, atol=0.01)
+
+
+def test_views_are_made_once_whatever_is_asked_for(monkeypatch):
+    m, kept = _views()
+    monkeypatch.setattr(candidate_views, "LEAST_ROOM", 1)
+    asked, made = [], candidate_views.render_views
+    monkeypatch.setattr(candidate_views, "render_views", lambda *how: asked.append(len(how[1])) or made(*how))
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        candidates = rng.integers(len(m.centers), size=30)
+        rows, views = kept.at(candidates, Workers(2))
+        np.testing.assert_array_equal(views.centers[rows], m.centers[candidates])
+    assert sum(asked) == kept.num_made == len(np.unique(kept.made.centers[: kept.num_made], axis=0))
+    rows, views = kept.at(np.arange(len(m.centers)), Workers(2))
+    for found, expected in zip(views, made(m.octree, m.centers, SEARCH_VIEW, Workers(1)), strict=True):
+        np.testing.assert_array_equal(found[rows], expected)
+
+
+def test_threads_may_ask_at_once():
+    m, kept = _views()
+    found, errors = {}, []
+
+    def ask(seed):
+        candidates = np.random.default_rng(seed).permutation(len(m.centers))[:200]
+        try:
+            for part in np.split(candidates, 20):
+                rows, views = kept.at(part, Workers(1))
+                np.testing.assert_array_equal(views.centers[rows], m.centers[part])
+        except AssertionError as error:
+            errors.append(error)
+        found[seed] = candidates
+
+    threads = [threading.Thread(target=ask, args=(seed,)) for seed in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert errors == []
+    assert kept.num_made == len(np.unique(np.concatenate(list(found.values()))))
+
+
+def test_wide_views_are_averages_of_fine_ones():
+    m, _ = _views()
+    centers = m.centers[m.sparse]
+    fine, matrix = render_views(m.octree, centers, SEARCH_VIEW, Workers(2)), averaging(12)
+    expected = fine.features.astype(np.float64) @ matrix / matrix.sum(axis=0)
+    found = m.wide_features.reshape(expected.shape).astype(np.float64)
+    correlation = (found * expected).sum() / np.sqrt((found**2).sum() * (expected**2).sum())
+    assert correlation > 0.9
+    seen = fine.is_seen @ matrix / matrix.sum(axis=0)
+    assert np.abs(m.wide_seen / 255.0 - seen).mean() < 0.06
+    assert m.wide_seen.max() == 255
+
+
+@pytest.mark.parametrize("count", [0, 200])
+def test_wide_views_have_the_same_bits_for_any_number_of_threads(count):
+    m, _ = _views()
+    one, two = (render_wide(m.octree, m.centers[:count], SEARCH_VIEW, Workers(n)) for n in (1, 2))
+    for a, b in zip(one, two, strict=True):
+        assert len(a) == count
+        np.testing.assert_array_equal(a, b)
+
+
+def test_views_have_the_same_bits_for_any_number_of_threads():
+    m, _ = _views()
+    one, two = (render_views(m.octree, m.centers[:200], SEARCH_VIEW, Workers(n)) for n in (1, 2))
+    for a, b in zip(one, two, strict=True):
+        np.testing.assert_array_equal(a, b)
