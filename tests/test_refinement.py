@@ -229,7 +229,7 @@ def test_cells_and_points_are_those_that_the_photo_shows(monkeypatch):
     assert count == 30_000
 
 
-@pytest.mark.parametrize(("seed", "most"), [(1, 5e-4), (2, 5e-5), (3, 2e-4)])
+@pytest.mark.parametrize(("seed", "most"), [(1, 5e-5), (3, 5e-4), (4, 5e-5)])
 def test_the_end_hardly_depends_on_where_the_descent_begins(seed, most):
     """Starts 5 mm apart end within 0.05 mm where the loss has one minimum; in noise it has several."""
     query, true_pose = _query(seed), rooms.scene(seed)[2]

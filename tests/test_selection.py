@@ -235,12 +235,13 @@ def test_matches_or_searches_can_be_taken_out(monkeypatch):
 
 
 def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
-    scan_map = SimpleNamespace(points=None, coarse_points=None, to_world=lambda pose: pose)
+    scan_map = SimpleNamespace(octree=None, to_world=lambda pose: pose)
     query = SimpleNamespace(
         scan_map=scan_map, settings=CoarseToFineSettings(), matches=None, by_features=True
     )
     counts = {0.0: 30, 1.0: 4, 2.0: 6}
     for name, value in {
+        "points_around": lambda *_: None,
         "visible_points": lambda *_: None,
         "sampling_loss": lambda *_: 0.07,
         "agreement_at": lambda points, panorama, pose: Agreement(0.8, 1.0),

@@ -142,7 +142,7 @@ def test_a_map_is_the_same_with_parts_of_every_stage(folder, tmp_path, monkeypat
     again = prepared(None, tmp_path / "cache")
     assert {label for label, total in stages if total != 0} == {"sort features"}
     assert not list(folder.iterdir())
-    for name in ("centers", "offsets", "offset_unit", "features", "is_seen", "wide_features", "warnings"):
+    for name in ("centers", "sparse", "wide_features", "wide_seen", "warnings"):
         np.testing.assert_array_equal(getattr(again, name), getattr(whole, name))
     for own, other in zip(
         (*again.octree, *again.local_features), (*whole.octree, *whole.local_features), strict=True

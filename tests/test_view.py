@@ -5,10 +5,12 @@ import rooms
 from scipy.spatial import cKDTree
 
 from piccolo.cloud.octree import build_octree
+from piccolo.cloud.soa import unpack_rgb
 from piccolo.cloud.stream import Cloud
 from piccolo.coarse_to_fine import camera_positions
 from piccolo.coarse_to_fine.candidate_views import SEARCH_VIEW
-from piccolo.coarse_to_fine.view import ViewConfig, render_view, visible_points
+from piccolo.coarse_to_fine.points_around import points_around, visible_points
+from piccolo.coarse_to_fine.view import ViewConfig, render_view
 from piccolo.geometry.sphere import cell_of, make_grid
 from piccolo.runtime.threads import Workers
 
@@ -125,3 +127,20 @@ def test_coverage_is_all_inside_and_little_outside(octree):
     share = camera_positions.coverage(octree, np.array([[0.3, 0.2, 0.3], [30.0, 0.0, 0.0]]), Workers(1))
     assert share[0] > 0.9
     assert share[1] < 0.2
+
+
+def test_points_around_are_all_near_ones_and_fewer_far_ones(octree):
+    """The leaves where these are as large as asked, and means of theirs that grow with the distance."""
+    center = rooms.scene(1)[2].center_world
+    leaves = octree.level(octree.leaf_size)
+    found = points_around(octree, center, 1e-9)
+    order = np.lexsort((found.z, found.y, found.x))
+    expected = leaves[np.lexsort(leaves.T[2::-1])]
+    np.testing.assert_array_equal(np.stack([found.x, found.y, found.z], axis=1)[order], expected[:, :3])
+    colors = unpack_rgb(found.rgbx)[order]
+    np.testing.assert_allclose(colors / 255.0, expected[:, 3:], atol=0.51 / 255.0)
+    coarse = points_around(octree, center, 1 / 20)
+    assert len(coarse) < 0.5 * len(leaves)
+    gap, _ = cKDTree(leaves[:, :3]).query(np.stack([coarse.x, coarse.y, coarse.z], axis=1))
+    ranges = np.linalg.norm(np.stack([coarse.x, coarse.y, coarse.z], axis=1) - center, axis=1)
+    assert (gap < np.maximum(ranges / 20, 2.0 * octree.leaf_size)).all()

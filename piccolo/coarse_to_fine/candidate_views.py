@@ -98,7 +98,7 @@ def render_wide(
     return WideViews(features, seen)
 
 
-@dataclass
+@dataclass(eq=False)
 class CandidateViews:
     """Views of fine cells from a map's candidates, each made when it is first asked for, by any thread."""
 

@@ -9,7 +9,7 @@ import numpy as np
 from ..confidence.covariance import PoseCovariance, least_constrained_direction
 from ..geometry.pose import Array, Pose, exp_so3
 from ..geometry.sphere import cell_of
-from ..optimize.channel_loss import channel_equations
+from ..optimize.channel_loss import channel_equations, equations_by_part
 from ..optimize.normal_equations import GRADIENT, MATRIX, NUM_SUMS
 from ..panorama.local_normalization import LEVELS_PER_UNIT
 from ..panorama.texels import Texels
@@ -48,10 +48,17 @@ def equations_at(image: Texels, points: Cells, R_cam_from_map: Array, shift: Arr
 
     `shift` (3,) [m] is that of the centre.
     """
-    sums, matrix = np.empty(NUM_SUMS), np.zeros((6, 6))
+    sums = np.empty(NUM_SUMS)
     channel_equations((*points, image.rgbx, image.width, SCALE), R_cam_from_map, shift, sums)
-    matrix[np.triu_indices(6)] = sums[MATRIX:]
-    return sums[GRADIENT:MATRIX].copy(), matrix + np.triu(matrix, 1).T
+    return sums[GRADIENT:MATRIX].copy(), symmetric(sums[MATRIX:])
+
+
+def symmetric(upper: Array) -> Array:
+    """Symmetric matrices (..., 6, 6) of their upper triangles (..., 21), row by row."""
+    matrix = np.zeros((*upper.shape[:-1], 6, 6))
+    rows, columns = np.triu_indices(6)
+    matrix[..., rows, columns] = matrix[..., columns, rows] = upper
+    return matrix
 
 
 def hessian_at(image: Texels, points: Cells, pose: Pose, steps: DifferenceSteps) -> Array:
@@ -73,16 +80,14 @@ def hessian_at(image: Texels, points: Cells, pose: Pose, steps: DifferenceSteps)
 
 def block_gradients(image: Texels, points: Cells, pose: Pose) -> Array:
     """Gradients (B, 6), in the camera's frame, of the points in each block of the sphere, as if left out."""
-    offsets, levels, weights = points
-    block = cell_of(offsets.T / np.linalg.norm(offsets, axis=0)[:, None], BLOCK_RINGS)
-    parts = np.split(np.argsort(block, kind="stable"), np.cumsum(np.bincount(block))[:-1])
-    chosen = (Cells(offsets[:, part], levels[:, part], weights[part]) for part in parts if len(part))
-    found = [equations_at(image, part, pose.R_cam_from_world, np.zeros(3)) for part in chosen]
-    found = [(gradient, matrix) for gradient, matrix in found if gradient.any()]  # what the photo shows
-    if not found:
-        return np.empty((0, 6))
-    gradients, matrices = (np.array(values) for values in zip(*found, strict=True))
-    return as_left_out(gradients, matrices)
+    block = cell_of(points.offsets.T / np.linalg.norm(points.offsets, axis=0)[:, None], BLOCK_RINGS)
+    order, counts = np.argsort(block, kind="stable"), np.bincount(block)
+    offsets, levels, weights = (np.ascontiguousarray(values[..., order]) for values in points)
+    begins, sums = np.concatenate([[0], np.cumsum(counts)]), np.empty((len(counts), NUM_SUMS))
+    problem = offsets, levels, weights, image.rgbx, image.width, SCALE
+    equations_by_part(problem, pose.R_cam_from_world, np.zeros(3), begins, sums)
+    shown = sums[sums[:, GRADIENT:MATRIX].any(axis=1)]  # of what the photo shows
+    return as_left_out(shown[:, GRADIENT:MATRIX], symmetric(shown[:, MATRIX:]))
 
 
 def as_left_out(gradients: Array, matrices: Array) -> Array:

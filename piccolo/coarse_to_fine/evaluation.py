@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from ..cloud.soa import PackedPoints
 from ..confidence.alternatives import MAX_ALTERNATIVES
 from ..confidence.confidence import NOT_LOCALIZED, classify, posterior
 from ..confidence.localization import Alternative, Localization
@@ -20,6 +21,7 @@ from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
 from ..render.zbuffer import visible_points
 from .covariance import estimate_covariance
+from .points_around import points_around
 from .query import Query
 from .search_result import SURE_MATCHES, SearchResult
 from .standings import standings_of
@@ -28,6 +30,7 @@ ENOUGH_EXPLAINED = 0.7  # score from which a photo is not mirrored
 MIRROR_RATIO = 1.2  # of matches, mirrored by not
 MIRRORED = "the photo fits the scan better mirrored, left for right: turn it over and try again"
 MAX_WIDTH = 4096  # [px] of the panorama that the loss is taken from: more costs seconds and tells nothing
+VOXEL_PER_RANGE, COARSE_VOXEL_PER_RANGE = 1 / 150, 1 / 40  # of points that are compared with the photo
 LAST_STEP = 0.01  # [rad, m] of Adam and the first of L-BFGS, where they take the last descent
 
 
@@ -36,15 +39,16 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
     if found.best.score < 0.0:
         return Localization()
     scan_map, settings, pose = query.scan_map, query.settings, found.best.pose
+    points = points_around(scan_map.octree, pose.center_world, VOXEL_PER_RANGE)
     panorama = shrink(panorama, MAX_WIDTH)
     texels = pack_texels(panorama.rgb, panorama.is_valid)
     if settings.solver != "gauss-newton":
         how = DescentSettings(solver=settings.solver, step_size=LAST_STEP)
-        pose = refine(scan_map.points, sampling_loss_of(texels), pose, how).pose
-    loss = sampling_loss(visible_points(scan_map.points, pose.center_world), texels, pose)
+        pose = refine(points, sampling_loss_of(texels), pose, how).pose
+    loss = sampling_loss(visible_points(points, pose.center_world), texels, pose)
     if not math.isfinite(loss):
         return Localization()
-    evidence = evidence_of(query, panorama, pose, found)
+    evidence = evidence_of(query, points, panorama, pose, found)
     covariance = estimate_covariance(query, pose)
     reported = found.alternatives[:MAX_ALTERNATIVES]
     standings = standings_of(query, found.best, reported)
@@ -70,11 +74,16 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
     )
 
 
-def evidence_of(query: Query, panorama: Panorama, pose: Pose, found: SearchResult) -> Evidence:
-    """What a result tells of the pose it reports, which the last descent made of the best one found."""
-    scan_map = query.scan_map
-    at_pose = agreement_at(scan_map.coarse_points, panorama, pose)
-    explained, contradicted = occlusion_at(scan_map.points, panorama, pose).fractions()
+def evidence_of(
+    query: Query, points: PackedPoints, panorama: Panorama, pose: Pose, found: SearchResult
+) -> Evidence:
+    """What a result tells of the pose it reports, which the last descent made of the best one found.
+
+    The points are those around it.
+    """
+    coarse = points_around(query.scan_map.octree, pose.center_world, COARSE_VOXEL_PER_RANGE)
+    at_pose = agreement_at(coarse, panorama, pose)
+    explained, contradicted = occlusion_at(points, panorama, pose).fractions()
     num_matches = [count_matches(query.matches, h.pose) for h in (found.best, *found.alternatives)]
     return Evidence(
         score=found.best.score,

@@ -12,7 +12,7 @@ import numpy as np
 from ..confidence.alternatives import Hypothesis
 from .config import Beam
 from .query import Query
-from .refinement import first_score
+from .refinement import NUM_SCORED, first_score
 from .search import search_poses
 from .search_result import found_among
 from .standings import fairly_selected
@@ -52,10 +52,8 @@ def is_rather_mirrored(query: Query, starts: Starts) -> bool:
 
 
 def mirrored(query: Query) -> Query:
-    """The query of the photo turned over, left for right; nothing is known of where it heads."""
-    rgb = np.ascontiguousarray(query.panorama.rgb[:, ::-1])
-    is_valid = np.ascontiguousarray(query.panorama.is_valid[:, ::-1])
-    panorama, across = replace(query.panorama, rgb=rgb, is_valid=is_valid), np.diag([1.0, -1.0, 1.0])
-    prior = replace(query.settings.prior, heading_deg=None)
-    level, settings = across @ query.R_cam_from_level @ across, replace(query.settings, prior=prior)
-    return replace(query.of_panorama(panorama), R_cam_from_level=level, settings=settings)
+    """The query of the photo turned over, left for right, for a first score; no heading is known of it."""
+    across, prior = np.diag([1.0, -1.0, 1.0]), replace(query.settings.prior, heading_deg=None)
+    settings = replace(query.settings, prior=prior, max_starts=min(NUM_SCORED, query.settings.max_starts))
+    level = across @ query.R_cam_from_level @ across
+    return replace(query, images=query.images.mirrored(), R_cam_from_level=level, settings=settings)

@@ -55,6 +55,13 @@ class QueryImages:
         """For prepared views."""
         return self.image(3)
 
+    def mirrored(self) -> "QueryImages":
+        """The image for prepared views turned over, left for right; no other."""
+        k, image = len(self.pyramid) - 1, self.search
+        across = image.rgbx.reshape(-1, image.width + 2)[:, ::-1]
+        texels = Texels(np.ascontiguousarray(across).reshape(-1), image.width)
+        return QueryImages(self.pyramid, (), {k: texels})
+
     def image(self, k: int) -> Texels:
         """Of a scale by its number, widest first."""
         if k not in self.made:

@@ -10,9 +10,10 @@ from ..geometry.pose import Pose
 from .comparison import compare, without_occluders
 from .config import Beam
 from .descent import COARSE_LOSS, FINE_LOSS, FULL_LOSS, descend, descend_all, descend_around, score_on
+from .points_around import visible_points
 from .query import Query
 from .starts import CLOSE_DISTANCE, SAME_ANGLE, SAME_DISTANCE, Starts, best_and_alternatives, narrow
-from .view import Cells, ViewConfig, render_view, visible_points
+from .view import Cells, ViewConfig, render_view
 
 FIRST_ITERATIONS, SECOND_ITERATIONS = 5, 12  # of the descents on prepared views
 NUM_SCORED = 64  # starts, where only the best score is asked for

@@ -50,12 +50,8 @@ class ScanMap:
     @cached_property
     def points(self) -> PackedPoints:
         """The leaves of the octree as coloured points, in the map's frame."""
-        return _as_points(self.octree.level(self.octree.leaf_size))
-
-    @cached_property
-    def coarse_points(self) -> PackedPoints:
-        """The same from voxels four times as wide: enough for views of a few degrees."""
-        return _as_points(self.octree.level(4.0 * self.octree.leaf_size))
+        leaves = self.octree.level(self.octree.leaf_size)
+        return pack_points(leaves[:, :3], np.round(leaves[:, 3:] * 255.0).astype(np.uint8))
 
     @cached_property
     def storeys(self) -> Storeys:
@@ -86,10 +82,6 @@ class ScanMap:
         """A pose of the world in the map's frame."""
         center = self.R_map_from_world @ (pose.center_world - self.origin_world)
         return Pose(pose.R_cam_from_world @ self.R_map_from_world.T, center)
-
-
-def _as_points(nodes: NDArray[np.float32]) -> PackedPoints:
-    return pack_points(nodes[:, :3], np.round(nodes[:, 3:] * 255.0).astype(np.uint8))
 
 
 def sparse_candidates(centers: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

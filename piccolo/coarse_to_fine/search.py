@@ -136,11 +136,11 @@ def best_poses(scores: Samples, pool: int) -> tuple[NDArray[np.int64], NDArray[n
     flat = scores.ravel()
     pool = min(pool, flat.size)
     step = max(flat.size // 100_000, 1)
-    sample = np.sort(flat[::step])
+    sample = flat[::step]
     # A threshold from a sample that lets about twice the pool through; a smaller share if it was unlucky.
-    indices = np.empty(flat.size if step == 1 else 8 * pool, np.int64)
+    indices = np.empty(min(8 * pool, flat.size), np.int64)
     rank = len(sample) - 1 - int(min(2 * pool / step + 20, len(sample) - 1))
-    threshold = sample[rank] if step > 1 else -np.inf
+    threshold = np.partition(sample, rank)[rank] if rank > 0 else -np.inf
     top = indices[: min(count_above(flat, threshold, indices), len(indices))]
     if len(top) == 0:  # all fit alike: a scan of one colour
         top = np.flatnonzero(flat == threshold)

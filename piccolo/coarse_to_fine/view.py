@@ -12,14 +12,9 @@ from numpy.typing import NDArray
 from ..cloud.octree import MAX_NODES, Octree, collect
 from ..geometry.sphere import cell_of, interpolation, make_grid, make_neighbors
 from ..optimize.channel_loss import BLOCK_RINGS
-from ..panorama.local_normalization import LEVELS_PER_UNIT, opponent, zscore
+from ..panorama.local_normalization import LEVELS_PER_UNIT, zscore
 from ..runtime.jit import F0, F1, HALF, inline_kernel, kernel
 from .cells import average_cells, average_colors, local_statistics, locate
-
-VISIBLE_OFFSET = np.float32(0.1)  # [m] of range noise
-U15, U16, LOW_32 = np.uint64(15), np.uint64(16), np.uint64(0xFFFFFFFF)
-MIX_1, MIX_2 = np.uint64(0x7FEB352D), np.uint64(0x846CA68B)
-FILLED = 0.97  # of the room for points; the rest is for chance
 
 
 class Cells(NamedTuple):
@@ -185,50 +180,6 @@ def render_wide_block(tree, centers, voxel_per_range, view, scratch, features, s
             seen[k, c] = np.uint8(min(sums[c, 3] / area[c], F1) * np.float32(255) + HALF)
 
 
-@inline_kernel
-def node_fraction(node):
-    """A number in [0, 1) that is drawn from a node's index, always the same (lowbias32, Wellons 2018)."""
-    h = np.uint64(node)
-    h = ((h ^ (h >> U16)) * MIX_1) & LOW_32
-    h = ((h ^ (h >> U15)) * MIX_2) & LOW_32
-    return np.float32(h ^ (h >> U16)) * np.float32(2.0**-32)
-
-
-@kernel
-def render_points(tree, center, voxel_per_range, view, scratch, shown, offsets, channels, weights):
-    """The visible points in cells that are shown, thinned to what fits: as `render`, with weight 1.
-
-    Each node is kept or left out by its own number, so that a camera a little farther on sees nearly the same
-    points: a descent that is begun again from where it ended then ends there. Returns how many.
-    """
-    num_cells = len(view.solid_angle)
-    sums, stats = np.empty((num_cells, 8), np.float32), np.empty((6, num_cells), np.float32)
-    cell_offsets, cell_channels = np.empty((3, num_cells), np.float32), np.empty((3, num_cells), np.float32)
-    cell_weights = np.empty(num_cells, np.float32)
-    cells = cell_offsets, cell_channels, cell_weights, sums, stats
-    n = render_cells(tree, center, voxel_per_range, view, scratch, shown, *cells)
-    s = scratch
-    for c in range(num_cells):  # how far what is seen reaches; nothing of cells that are not shown
-        sums[c, 7] = sums[c, 7] * view.visible + VISIBLE_OFFSET if cell_weights[c] > F0 else F0
-    num_visible = 0
-    for i in range(n):
-        if s.ranges[i] <= sums[s.cells[i], 7]:
-            num_visible += 1
-    kept = np.float32(FILLED * len(weights) / max(num_visible, 1))
-    count = 0
-    for i in range(n):
-        is_visible = s.ranges[i] <= sums[s.cells[i], 7]
-        if is_visible and node_fraction(s.nodes[i]) < kept and count < len(weights):
-            node, c = s.nodes[i], s.cells[i]
-            colors = opponent(tree.nodes[node, 3], tree.nodes[node, 4], tree.nodes[node, 5])
-            for k in range(3):
-                offsets[k, count] = s.directions[k, i]
-                channels[k, count] = zscore(colors[k], stats[k, c], stats[3 + k, c])
-            weights[count] = F1
-            count += 1
-    return count
-
-
 @kernel
 def nearest_ranges(tree, centers, voxel_per_range, view, scratch, ranges):
     """Write ranges [m] of the nearest nodes in the cells (n, cells) around each centre (n, 3), 0 for none."""
@@ -265,7 +216,8 @@ def thread_scratch() -> Scratch:
     return scratch
 
 
-def _empty_cells(n: int) -> Cells:
+def empty_cells(n: int) -> Cells:
+    """Room for some cells or points."""
     return Cells(np.empty((3, n), np.float32), np.empty((3, n), np.float32), np.empty(n, np.float32))
 
 
@@ -273,20 +225,10 @@ def render_view(
     octree: Octree, center_map: NDArray[np.float64], config: ViewConfig, shown: NDArray[np.bool_]
 ) -> Cells:
     """What is seen around a centre (3,) [m], on those cells (N,) of `config` that are shown."""
-    cells = _empty_cells(len(make_grid(config.num_rings)))
+    cells = empty_cells(len(make_grid(config.num_rings)))
     center = np.asarray(center_map, np.float64)
     render(octree, center, config.voxel_per_range, config.arrays, thread_scratch(), shown, *cells)
     return cells
-
-
-def visible_points(
-    octree: Octree, center_map: NDArray[np.float64], config: ViewConfig, shown: NDArray[np.bool_], count: int
-) -> Cells:
-    """The same of at most `count` visible points instead of cells, with equal weights."""
-    cells = _empty_cells(count)
-    center, view = np.asarray(center_map, np.float64), config.arrays
-    n = render_points(octree, center, config.voxel_per_range, view, thread_scratch(), shown, *cells)
-    return Cells(cells.offsets[:, :n].copy(), cells.channels[:, :n].copy(), cells.weights[:n].copy())
 
 
 def ranges_around(

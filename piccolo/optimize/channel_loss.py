@@ -65,6 +65,24 @@ def channel_equations(problem, R_cam_from_world, center_world, sums):
     sums[LOSS] += (total_weight - sums[COUNT]) * 0.25 * scale * scale
 
 
+@kernel
+def equations_by_part(problem, R_cam_from_world, center_world, begins, sums):
+    """Write gradient and matrix, as `channel_equations` does (parts, 29), of each part of a problem's points.
+
+    A part ends where the next begins (parts + 1,).
+    """
+    points, channels, weights, texels, width, scale = problem
+    sums[:] = 0.0
+    inverse_scale2 = np.float32(1.0 / (scale * scale))
+    for k in range(len(sums)):
+        for lo in range(begins[k], begins[k + 1], BLOCK):
+            hi = min(lo + BLOCK, begins[k + 1])
+            x, y, z, w = points[0][lo:hi], points[1][lo:hi], points[2][lo:hi], weights[lo:hi]
+            colors = channels[0][lo:hi], channels[1][lo:hi], channels[2][lo:hi], w
+            how = texels, width, R_cam_from_world, center_world, inverse_scale2
+            add_channels(x, y, z, colors, *how, sums[k])
+
+
 descend_channels = kernel(levenberg_marquardt(channel_equations))
 
 

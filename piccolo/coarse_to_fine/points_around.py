@@ -1,0 +1,125 @@
+"""The points that a camera sees around it, as fine as it can tell them apart: for the last millimetres."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cloud.octree import Octree, collect
+from ..cloud.soa import PackedPoints
+from ..panorama.local_normalization import opponent, zscore
+from ..runtime.jit import F0, F1, HALF, inline_kernel, kernel
+from .cells import locate
+from .view import Cells, ViewConfig, empty_cells, render_cells, thread_scratch
+
+VISIBLE_OFFSET = np.float32(0.1)  # [m] of range noise
+U15, U16, LOW_32 = np.uint64(15), np.uint64(16), np.uint64(0xFFFFFFFF)
+MIX_1, MIX_2 = np.uint64(0x7FEB352D), np.uint64(0x846CA68B)
+FILLED = 0.97  # of the room for points; the rest is for chance
+
+
+@inline_kernel
+def node_fraction(node):
+    """A number in [0, 1) that is drawn from a node's index, always the same (lowbias32, Wellons 2018)."""
+    h = np.uint64(node)
+    h = ((h ^ (h >> U16)) * MIX_1) & LOW_32
+    h = ((h ^ (h >> U15)) * MIX_2) & LOW_32
+    return np.float32(h ^ (h >> U16)) * np.float32(2.0**-32)
+
+
+@kernel
+def take_children(tree, center, nodes, cells, ranges, limits, kept, found, offsets):
+    """Write the children of visible nodes, or those without any, and their offsets (3, N), thinned by `kept`.
+
+    Each is kept or left out by its own number, so that a camera a little farther on sees nearly the same
+    points: a descent that is begun again from where it ended then ends there. Returns how many.
+    """
+    cx, cy, cz = np.float32(center[0]), np.float32(center[1]), np.float32(center[2])
+    count = 0
+    for i in range(len(cells)):
+        if ranges[i] > limits[cells[i], 7]:
+            continue
+        first, last = tree.first_child[nodes[i]], tree.first_child[nodes[i] + 1]
+        if first == last:
+            first, last = nodes[i], nodes[i] + 1
+        for node in range(first, last):
+            if node_fraction(node) < kept and count < len(found):
+                found[count] = node
+                offsets[0, count] = tree.nodes[node, 0] - cx
+                offsets[1, count] = tree.nodes[node, 1] - cy
+                offsets[2, count] = tree.nodes[node, 2] - cz
+                count += 1
+    return count
+
+
+@kernel
+def render_points(tree, center, voxel_per_range, view, scratch, shown, offsets, channels, weights):
+    """The visible points in cells that are shown, thinned to what fits: as `view.render`, with weight 1.
+
+    Voxels twice as large tell what is in front, and how colours vary. Returns how many.
+    """
+    num_cells, s = len(view.solid_angle), scratch
+    sums, stats = np.empty((num_cells, 8), np.float32), np.empty((6, num_cells), np.float32)
+    cell_offsets, cell_channels = np.empty((3, num_cells), np.float32), np.empty((3, num_cells), np.float32)
+    cell_weights = np.empty(num_cells, np.float32)
+    around = cell_offsets, cell_channels, cell_weights, sums, stats
+    n = render_cells(tree, center, 2.0 * voxel_per_range, view, scratch, shown, *around)
+    for c in range(num_cells):  # how far what is seen reaches; nothing of cells that are not shown
+        sums[c, 7] = sums[c, 7] * view.visible + VISIBLE_OFFSET if cell_weights[c] > F0 else F0
+    num_visible = 0
+    for i in range(n):
+        if s.ranges[i] <= sums[s.cells[i], 7]:
+            node = s.nodes[i]
+            num_visible += max(tree.first_child[node + 1] - tree.first_child[node], 1)
+    kept = np.float32(FILLED * len(weights) / max(num_visible, 1))
+    found = np.empty(len(weights), np.int32)
+    n = take_children(tree, center, s.nodes, s.cells[:n], s.ranges, sums, kept, found, offsets)
+    cells, ranges, turns = np.empty(n, np.int32), np.empty(n, np.float32), np.empty(n, np.float32)
+    x, y, z = offsets[0, :n], offsets[1, :n], offsets[2, :n]
+    locate(x, y, z, view.num_columns, view.first, cells, ranges, turns)
+    count = 0
+    for i in range(n):
+        node, c = found[i], cells[i]
+        if ranges[i] <= sums[c, 7]:
+            colors = opponent(tree.nodes[node, 3], tree.nodes[node, 4], tree.nodes[node, 5])
+            for k in range(3):
+                offsets[k, count] = offsets[k, i]
+                channels[k, count] = zscore(colors[k], stats[k, c], stats[3 + k, c])
+            weights[count] = F1
+            count += 1
+    return count
+
+
+def visible_points(
+    octree: Octree, center_map: NDArray[np.float64], config: ViewConfig, shown: NDArray[np.bool_], count: int
+) -> Cells:
+    """What is seen around a centre (3,) [m], as at most `count` points with equal weights, not as cells."""
+    cells = empty_cells(count)
+    center, view = np.asarray(center_map, np.float64), config.arrays
+    n = render_points(octree, center, config.voxel_per_range, view, thread_scratch(), shown, *cells)
+    return Cells(cells.offsets[:, :n].copy(), cells.channels[:, :n].copy(), cells.weights[:n].copy())
+
+
+@kernel
+def pack_nodes(nodes, found, x, y, z, rgbx):
+    """Write the positions of some nodes and their colours in 8 bits."""
+    for i in range(len(found)):
+        node = nodes[found[i]]
+        x[i], y[i], z[i] = node[0], node[1], node[2]
+        color = np.int32(1 << 24)
+        for k in range(3):
+            color |= np.int32(math.floor(node[3 + k] * np.float32(255.0) + HALF)) << np.int32(8 * k)
+        rgbx[i] = color
+
+
+def points_around(octree: Octree, center_map: NDArray[np.float64], voxel_per_range: float) -> PackedPoints:
+    """All nodes as coloured points, those far from a centre (3,) [m] as large as it is far to them.
+
+    Of however large a scan, some hundred thousand.
+    """
+    scratch, center = thread_scratch(), np.asarray(center_map, np.float64)
+    n = collect(octree, center, voxel_per_range, scratch.nodes, scratch.directions)
+    x, y, z = np.empty((3, n), np.float32)
+    points = PackedPoints(x, y, z, np.empty(n, np.int32))
+    pack_nodes(octree.nodes, scratch.nodes[:n], points.x, points.y, points.z, points.rgbx)
+    return points
