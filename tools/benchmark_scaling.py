@@ -4,6 +4,7 @@
 import argparse
 import multiprocessing
 import resource
+import tempfile
 import time
 from collections.abc import Callable
 from functools import partial
@@ -17,7 +18,8 @@ from piccolo.cli.errors import UsageError
 from piccolo.cloud import Cloud, read_cloud, stream_of
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.coarse_to_fine.localize import localize
-from piccolo.coarse_to_fine.scan_map import prepare_map
+from piccolo.coarse_to_fine.map_file import load_map, save_map
+from piccolo.coarse_to_fine.scan_map import ScanMap, prepare_map
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.geometry.pose import Pose, is_correct
 from piccolo.geometry.rotations import Gravity
@@ -40,8 +42,8 @@ first six clean ones, gravity known and unknown.
 NUM_QUERIES = 6
 GRAVITIES: tuple[Gravity, ...] = ("known", "unknown")
 COLUMNS = (
-    "case", "points", "candidates", "prepare s", "features s", "known s", "found", "unknown s", "found",
-    "peak MB", "before",
+    "case", "points", "candidates", "prepare s", "map MB", "open ms", "features s", "known s", "found",
+    "unknown s", "found", "peak MB", "before",
 )  # fmt: skip
 
 Case = tuple[Cloud, list[tuple[Panorama, Pose]]]  # a cloud, and panoramas in it with their true poses
@@ -74,6 +76,17 @@ def rooms_case(num_rooms: int) -> Case:
     return stream_of(Path("rooms"), RawCloud(points.astype(np.float64), colors)).read(), queries
 
 
+def size_and_opening(scan_map: ScanMap) -> tuple[str, str]:
+    """Size [MB] of a map's file, and how long it takes to open it [ms] once it has been checked."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scan.map"
+        save_map(scan_map, path)
+        load_map(path, remembers=True)
+        begin = time.perf_counter()
+        load_map(path, remembers=True)
+        return f"{path.stat().st_size / 1e6:.1f}", f"{1000.0 * (time.perf_counter() - begin):.0f}"
+
+
 def measure(label: str, make: Callable[[], Case], results: "multiprocessing.Queue[str]") -> None:
     """Put one row of the table."""
     (cloud, queries), workers = make(), Workers(num_cores())
@@ -85,10 +98,16 @@ def measure(label: str, make: Callable[[], Case], results: "multiprocessing.Queu
     before_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     begin = time.perf_counter()
     scan_map = prepare_map(cloud, workers, has_features=False)
-    prepared = time.perf_counter()
+    columns = [
+        label,
+        str(len(cloud.points)),
+        str(len(scan_map.centers)),
+        f"{time.perf_counter() - begin:.1f}",
+    ]
+    columns += size_and_opening(scan_map)
+    begin = time.perf_counter()
     scan_map.features_now(workers)
-    seconds = f"{prepared - begin:.1f}", f"{time.perf_counter() - prepared:.1f}"
-    columns = [label, str(len(cloud.points)), str(len(scan_map.centers)), *seconds]
+    columns.append(f"{time.perf_counter() - begin:.1f}")
     for gravity in GRAVITIES:
         settings = CoarseToFineSettings(gravity=gravity)
         times, correct = [], 0
