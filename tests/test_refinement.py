@@ -140,19 +140,23 @@ def test_poses_are_perturbed_for_as_long_as_that_helps(monkeypatch, gains, round
 
     score = [0.5]
     monkeypatch.setattr(refinement, "render_view", lambda *_: None)
+    monkeypatch.setattr(refinement, "score_on", lambda *_: 0.5)  # whatever another way of scoring said
     monkeypatch.setattr(refinement, "descend_around", around)
     monkeypatch.setattr(refinement, "descend_fine", fine)
     images = SimpleNamespace(middle="middle", fine="fine")
-    query = SimpleNamespace(**vars(QUERY), images=images, shown_cells=lambda *_: None)
-    found = refinement.refine_by_perturbation(query, _at(0.0, 0.5))
+    query = SimpleNamespace(**vars(QUERY), images=images, shown_cells=lambda *_: None, ends=set())
+    found = refinement.refine_by_perturbation(query, _at(0.0, 0.9))
     assert found.score == pytest.approx(expected)
+    assert sizes == [0.4] * rounds
+    again = Hypothesis(found.pose, 0.3)
+    assert refinement.refine_by_perturbation(query, again) is again
     assert sizes == [0.4] * rounds
 
 
 @pytest.mark.parametrize(("after", "is_taken"), [(0.60, True), (0.515, True), (0.503, False), (0.1, False)])
 def test_full_resolution_is_taken_back_where_the_score_falls(monkeypatch, after, is_taken):
     """By three parts in a hundred at most may it fall, in exchange for millimetres."""
-    moved, start = _at(0.004, 0.0).pose, _at(0.0, 0.52)
+    moved, start = _at(0.04, 0.0).pose, _at(0.0, 0.52)
     query = SimpleNamespace(**vars(QUERY), images=SimpleNamespace(full="full"))
     asked, descents = [], []
     monkeypatch.setattr(refinement, "refine_unoccluded", lambda query, h: (query, h))
@@ -162,12 +166,15 @@ def test_full_resolution_is_taken_back_where_the_score_falls(monkeypatch, after,
     monkeypatch.setattr(refinement, "descend", lambda *arguments: descents.append(arguments[-1]) or moved)
     expected = Hypothesis(moved, after) if is_taken else start
     assert refinement.refine_full_resolution(query, start, 2) == expected
-    assert asked == [0.0, 0.004]  # the points are taken anew from where the pose is
+    assert asked == [0.0, 0.04]  # the points are taken anew from where the pose is
     assert refinement.settle(query, start) == expected
     assert len(asked) == len(descents) == 4  # the second round of settling moves nothing
     monkeypatch.setattr(refinement, "descend", lambda *arguments: _at(len(asked), 0.0).pose)
     refinement.settle(query, start)
     assert len(asked) == 10  # six rounds at most
+    monkeypatch.setattr(refinement, "descend", lambda *arguments: _at(0.019, 0.0).pose)
+    refinement.refine_full_resolution(query, start, 2)
+    assert len(asked) == 11  # so near by it sees the same points
 
 
 @pytest.mark.parametrize(

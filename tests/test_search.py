@@ -91,7 +91,7 @@ def test_scores_equal_correlations_one_by_one():
     row, views = scan_map.views.at(candidate, Workers(2))
     pairs = np.empty(40, np.float32)
     features, seen = views.features.reshape(len(views.features), -1), views.is_seen.view(np.uint8)
-    scores = search.masked_correlation(features, seen, AREA, panorama)
+    scores = search.masked_correlation(features, seen, AREA, panorama, Workers(2))
     how = whole_areas(24), panorama, row, rotation
     search.correlate_pairs(views.features, views.is_seen, *how, pairs)
     twin = []
@@ -120,11 +120,11 @@ def test_sums_of_a_search_are_exact():
     features = rng.choice(np.array([-127, 127, 126], np.int8), (50, 3, len(AREA)))
     seen = rng.integers(0, 2, (50, len(AREA)), dtype=np.uint8)
     panorama = search.turned(samples * validity[:, None], validity, AREA, 1)
-    expected = search.masked_correlation(features.reshape(50, -1), seen, AREA, panorama)
+    expected = search.masked_correlation(features.reshape(50, -1), seen, AREA, panorama, Workers(1))
     cells, views = rng.permutation(len(AREA)), rng.permutation(50)
     shuffled = search.TurnedPanorama(*(values[..., cells] for values in panorama))
     features, seen = features[views][..., cells].reshape(50, -1), seen[views][:, cells]
-    found = search.masked_correlation(features, seen, AREA[cells], shuffled)
+    found = search.masked_correlation(features, seen, AREA[cells], shuffled, Workers(1))
     np.testing.assert_array_equal(found, expected[views])
 
 
@@ -134,7 +134,9 @@ def test_best_score_is_near_the_true_pose(gravity, most):
     true_pose, scan_map = rooms.scene(1)[2], rooms.scan_map(1)
     rotations = uniform_yaws(48) if gravity == "known" else uniform_rotations(2000)
     samples, validity = search.turn_panorama(_query().images.search, rotations)
-    sparse, rotation, values = search.best_poses(search.score_poses_wide(scan_map, samples, validity), 200)
+    sparse, rotation, values = search.best_poses(
+        search.score_poses_wide(scan_map, samples, validity, Workers(2)), 200
+    )
     assert (np.diff(values) <= 0).all()
     starts = search.search_poses(_query(), gravity)
     centers = scan_map.centers[scan_map.sparse[sparse]]

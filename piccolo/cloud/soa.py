@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -61,11 +62,14 @@ class LocalCloud:
 
 def pack_rgbx(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = None) -> NDArray[np.int32]:
     """One int32 (...) for each colour (..., 3): R, G, B from the lowest byte up and 1 where valid on top."""
-    rgbx = np.ones((*rgb.shape[:-1], 4), dtype=np.uint8)
-    rgbx[..., :3] = rgb
-    if is_valid is not None:
-        rgbx[..., 3] = is_valid
-    return rgbx.view("<i4")[..., 0].astype(np.int32, copy=False)
+    shape = rgb.shape[:-1]
+    if 0 in shape:
+        return np.empty(shape, np.int32)
+    valid = np.ones(shape, np.uint8) if is_valid is None else is_valid.astype(np.uint8, copy=False)
+    colors = np.ascontiguousarray(rgb, np.uint8).reshape(-1, 1, 3)
+    rgbx = np.empty((len(colors), 1, 4), np.uint8)
+    cv2.mixChannels([colors, valid.reshape(-1, 1)], [rgbx], [0, 0, 1, 1, 2, 2, 3, 3])
+    return rgbx.view("<i4").reshape(shape).astype(np.int32, copy=False)
 
 
 def unpack_rgb(rgbx: NDArray[np.int32]) -> NDArray[np.uint8]:

@@ -134,10 +134,9 @@ def compare_cells(
 
 def compare(query: Query, pose: Pose) -> Comparison:
     """The scan as seen from a pose and the photo, by blocks; worked out once a pose."""
-    key = pose.R_cam_from_world.tobytes() + pose.center_world.tobytes()
-    if key not in query.comparisons:
-        query.comparisons[key] = _compare(query, pose)
-    found: Comparison = query.comparisons[key]
+    if pose.key not in query.comparisons:
+        query.comparisons[pose.key] = _compare(query, pose)
+    found: Comparison = query.comparisons[pose.key]
     return found
 
 

@@ -1,6 +1,8 @@
 """What speaks for the pose that was found and against it, and the status that follows."""
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -48,8 +50,11 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
     loss = sampling_loss(visible_points(points, pose.center_world), texels, pose)
     if not math.isfinite(loss):
         return Localization()
-    evidence = evidence_of(query, points, panorama, pose, found)
-    covariance = estimate_covariance(query, pose)
+    told: list[Callable[[], Any]] = [
+        lambda: evidence_of(query, points, panorama, pose, found),
+        lambda: estimate_covariance(query, pose),
+    ]
+    evidence, covariance = query.workers.map(lambda tell: tell(), told, "evaluate")
     reported = found.alternatives[:MAX_ALTERNATIVES]
     standings = standings_of(query, found.best, reported)
     probabilities = posterior(standings, covariance)

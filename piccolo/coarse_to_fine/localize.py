@@ -11,6 +11,7 @@ from ..geometry.pose import Pose
 from ..geometry.rotations import Gravity
 from ..local_features.hypotheses import count_matches, poses_of
 from ..panorama import Panorama
+from ..runtime.blas import one_blas_thread
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from .config import METHOD, Beam, MethodConfig
@@ -34,6 +35,7 @@ NEAR_MATCHES = 0.5  # an alternative with this part of the matches is refined as
 NO_PIXEL = "the panorama: no pixel counts, all are masked"
 
 
+@one_blas_thread
 def localize(
     scan_map: ScanMap,
     panorama: Panorama,

@@ -92,6 +92,7 @@ class Query:
     pixel: float  # [rad] of the photo as it was given, but none finer than those that are compared
     by_features: bool = True  # False where whole views alone are asked
     comparisons: dict[bytes, Any] = field(default_factory=dict)  # worked out already, by comparison.py
+    ends: set[bytes] = field(default_factory=set)  # poses which no perturbation improves any more
 
     @cached_property
     def keypoints(self) -> Keypoints:
@@ -136,7 +137,7 @@ class Query:
     def of_panorama(self, panorama: Panorama) -> "Query":
         """The same of another panorama of the same size."""
         images = query_images(panorama, self.method.scales)
-        return replace(self, images=images, panorama=panorama, comparisons={})
+        return replace(self, images=images, panorama=panorama, comparisons={}, ends=set())
 
 
 def prepare_query(

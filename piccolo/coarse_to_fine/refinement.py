@@ -25,6 +25,7 @@ MAX_PERTURBATIONS, MIN_GAIN = 5, 0.02  # rounds; by the score in one, else it wa
 NUM_FOUND = 12  # poses of a search, at most
 NUM_POINTS = 30_000  # for the last millimetres, in what the photo shows
 MAX_LAST_ROUNDS, SETTLED = 6, 1e-4  # [m] a camera that moves by less in a round has arrived
+NEARLY = 0.02  # [m] and one that does by less sees the same points
 MIN_SCORE_LEFT = 0.97  # of the score, in exchange for millimetres
 
 
@@ -60,16 +61,24 @@ def descend_fine(query: Query, h: Hypothesis) -> Hypothesis:
 
 
 def refine_by_perturbation(query: Query, h: Hypothesis) -> Hypothesis:
-    """Perturb and refine for as long as the score rises: a pose that stopped short creeps on."""
+    """Perturb and refine for as long as the score rises: a pose that stopped short creeps on.
+
+    Where that has ended before, it has ended.
+    """
     config, images = query.method.fine_view, (query.images.middle, query.images.fine)
+    if h.pose.key in query.ends:
+        return h
+    blocks, cells = config.arrays.blocks, view_at(query, h.pose, config)
+    h = Hypothesis(h.pose, score_on(cells, blocks, h.pose.center_world, query.images.fine, h.pose))
     for _ in range(MAX_PERTURBATIONS):
-        cells = view_at(query, h.pose, config)
-        around = descend_around(cells, config.arrays.blocks, images, h.pose, PERTURBATION)
+        around = descend_around(cells, blocks, images, h.pose, PERTURBATION)
         refined = descend_fine(query, around)
         gain = refined.score - h.score
         h = refined if gain > 0.0 else h
         if gain < MIN_GAIN * refined.score:
             break
+        cells = view_at(query, h.pose, config)
+    query.ends.add(h.pose.key)
     return h
 
 
@@ -111,12 +120,16 @@ def refine_unoccluded(query: Query, h: Hypothesis) -> tuple[Query, Hypothesis]:
 def refine_full_resolution(query: Query, h: Hypothesis, num_rounds: int) -> Hypothesis:
     """The last millimetres: the visible points themselves in the finest image, unless the score falls.
 
-    In each round the points are taken anew, from where the pose is then. The score is that of `compared`.
+    In each round the points are taken anew, from where the pose is then, unless it has hardly moved. The
+    score is that of `compared`.
     """
     shown, before = refine_unoccluded(query, h)
     pose = before.pose
     for _ in range(num_rounds):
-        pose = descend(points_at(shown, pose), pose.center_world, shown.images.full, pose, FULL_LIMITS)
+        center = pose.center_world
+        pose = descend(points_at(shown, pose), center, shown.images.full, pose, FULL_LIMITS)
+        if math.dist(pose.center_world, center) < NEARLY:
+            break
     after = compared(query, Hypothesis(pose, 0.0))
     return after if after.score > MIN_SCORE_LEFT * before.score else before
 

@@ -17,13 +17,14 @@ from ..panorama.local_normalization import sample_channels
 from ..panorama.texels import Texels
 from ..runtime.jit import kernel
 from ..runtime.memory import check_memory
+from ..runtime.threads import Workers
 from .candidate_views import WIDE_RINGS
 from .prior import allowed_rotations
 from .query import Query
 from .scan_map import ScanMap
 from .starts import START_ANGLE, START_DISTANCE, Starts
 
-BLOCK = 2048  # views a matrix product
+BLOCK = 512  # views a matrix product
 TURNED_BYTES = 4 * 16  # of a rotation, a cell: channels, validity, energy, and what they are made from
 EXACT = (1 << 24) - 1  # whole numbers up to this are exact in float32
 MOST_LEVEL = 127.5  # of a channel
@@ -68,7 +69,11 @@ def turn_panorama(texels: Texels, rotations: NDArray[np.float64]) -> tuple[Sampl
 
 
 def masked_correlation(
-    features: NDArray[np.int8], seen: NDArray[np.uint8], area: Samples, panorama: TurnedPanorama
+    features: NDArray[np.int8],
+    seen: NDArray[np.uint8],
+    area: Samples,
+    panorama: TurnedPanorama,
+    workers: Workers,
 ) -> Samples:
     """Correlation (views, rotations), up to a factor, over the cells that both show.
 
@@ -78,7 +83,8 @@ def masked_correlation(
     relative, num_cells = area / area.max(), len(area)
     scores = np.empty((len(features), len(weighted)), np.float32)
     is_full = bool(panorama.validity.all())
-    for lo in range(0, len(scores), BLOCK):
+
+    def correlate(lo: int) -> None:
         view = features[lo : lo + BLOCK].astype(np.float32)
         norm = seen[lo : lo + BLOCK].astype(np.float32) @ panorama.energy.T
         energy = np.square(view).reshape(len(view), 3, num_cells).sum(axis=1) * relative
@@ -87,16 +93,18 @@ def masked_correlation(
         np.sqrt(np.maximum(norm, 1.0, out=norm), out=norm)
         np.matmul(view, weighted.T, out=scores[lo : lo + BLOCK])
         scores[lo : lo + BLOCK] /= norm
+
+    list(workers.map(correlate, range(0, len(scores), BLOCK), "search"))
     return scores
 
 
-def score_poses_wide(scan_map: ScanMap, samples: Samples, validity: Samples) -> Samples:
+def score_poses_wide(scan_map: ScanMap, samples: Samples, validity: Samples, workers: Workers) -> Samples:
     """Masked correlation (sparse, rotations) of wide views with the turned panorama, its cells averaged."""
     weights = averaging(WIDE_RINGS)
     area = weights.sum(axis=0)
     wide_samples, wide_validity = np.rint(samples) @ weights / area, validity @ weights / area
     panorama = turned(wide_samples, np.rint(wide_validity), area, 255)
-    return masked_correlation(scan_map.wide_features, scan_map.wide_seen, area, panorama)
+    return masked_correlation(scan_map.wide_features, scan_map.wide_seen, area, panorama, workers)
 
 
 @kernel
@@ -165,7 +173,7 @@ def search_poses(query: Query, gravity: Gravity) -> Starts:
     what = f"a search of {len(m.sparse)} positions in {len(rotations)} rotations"
     check_memory(num_bytes, what, "set fewer --num-yaws or --num-rotations")
     samples, validity = turn_panorama(query.images.search, rotations)
-    scores = score_poses_wide(m, samples, validity)
+    scores = score_poses_wide(m, samples, validity, query.workers)
     sparse, rotation, _ = best_poses(scores, num_starts * POSES_PER_START)
     R, centers = rotations[rotation], m.centers[m.sparse[sparse]]
     kept = non_maximum_suppression(R, centers, num_starts, START_DISTANCE, START_ANGLE)

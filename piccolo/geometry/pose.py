@@ -28,6 +28,11 @@ class Pose:
     R_cam_from_world: Array  # (3, 3) rotation, camera axes: +x image centre, +y left, +z up
     center_world: Array  # (3,) camera position [m]
 
+    @property
+    def key(self) -> bytes:
+        """What tells it from every other pose."""
+        return self.R_cam_from_world.tobytes() + self.center_world.tobytes()
+
 
 def skew(w: Array) -> Array:
     """The (3, 3) matrix of the cross product `w x .`."""

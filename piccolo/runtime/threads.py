@@ -1,9 +1,11 @@
 """Serial kernels on several threads: whole items are spread, and results come back in the items' order."""
 
 import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, TypeVar
 
 from numpy.typing import NDArray
@@ -22,6 +24,26 @@ def num_cores() -> int:
     return min(len(os.sched_getaffinity(0)), MAX_THREADS)
 
 
+class _Thread(threading.local):
+    """What is known of the calling thread."""
+
+    is_of_pool = False
+
+
+_thread = _Thread()
+
+
+def _begin_thread() -> None:
+    _thread.is_of_pool = True
+
+
+@cache
+def pool_of(num_threads: int) -> ThreadPoolExecutor:
+    """Threads of this process that work for `Workers`: they keep their scratch, as fresh memory is slow."""
+    return ThreadPoolExecutor(num_threads, "piccolo", _begin_thread)
+
+
+os.register_at_fork(after_in_child=pool_of.cache_clear)  # a child has none of its parent's threads
 # wraps values as tqdm does: how many there will be, None if unknown, and what they are
 Progress = Callable[[Iterator[Any], int | None, str], Iterator[Any]]
 
@@ -65,20 +87,22 @@ class Workers:
             raise InputError(f"num_threads: found {self.num_threads}, wanted 1 to {MAX_THREADS}")
 
     def map(self, function: Callable[[Item], Value], items: Sequence[Item], label: str) -> Iterator[Value]:
-        """Yield function(item) for each item, in order.
+        """Yield function(item) for each item, in order; within another call's function one after another.
 
         Nothing is summed across items here, so results have the same bits for any number of threads. An error
         or Ctrl-C drops the items that have not begun.
         """
         check_address_space()
-        if self.num_threads == 1 or len(items) < 2:
+        if self.num_threads == 1 or len(items) < 2 or _thread.is_of_pool:
             yield from self.show(map(function, items), len(items), label)
             return
-        pool = ThreadPoolExecutor(self.num_threads)
+        futures = [pool_of(self.num_threads).submit(function, item) for item in items]
         try:
-            yield from self.show(pool.map(function, items), len(items), label)
+            yield from self.show((future.result() for future in futures), len(items), label)
         finally:
-            pool.shutdown(cancel_futures=True)
+            for future in futures:
+                future.cancel()
+            wait(futures)
 
     def collect(
         self,

@@ -14,6 +14,7 @@ from ..coarse_to_fine.query import Query, prepare_query
 from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED
 from ..panorama import Panorama
+from ..runtime.blas import one_blas_thread
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Progress, no_progress
 from .frames import MAX_STEP, Frame, Motion, State, centers_of, states_of
@@ -32,6 +33,7 @@ MOST_RIVALS = 4  # places of a frame that are followed to its neighbours
 Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
 
 
+@one_blas_thread
 def finished(tracker: Tracker, read: Read, show: Progress = no_progress) -> Path:
     """The path of all frames that a tracker has followed.
 

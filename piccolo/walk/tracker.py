@@ -15,6 +15,7 @@ from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..confidence.alternatives import Hypothesis
 from ..geometry.pose import Pose
 from ..panorama import Panorama
+from ..runtime.blas import one_blas_thread
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from .frames import MAX_STEP, NO_ACCELERATION, Frame, Motion, State, centers_of, states_of
@@ -87,6 +88,7 @@ class Tracker:
         query.make_images()
         return query
 
+    @one_blas_thread
     def add(self, panorama: Panorama, query: Query, time: float) -> Frame:
         """Find the next frame, whose query is prepared."""
         frame = Frame(time)

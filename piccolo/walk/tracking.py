@@ -76,7 +76,7 @@ def found_near(query: Query, near: Pose, radius: float, least_score: float) -> l
     some = apply_prior(query.scan_map, Prior(near_world=(x, y, z), radius=radius))
     if len(some.sparse) == 0:
         return []
-    close = found_everywhere(replace(query, scan_map=some, comparisons={}), least_score)
+    close = found_everywhere(replace(query, scan_map=some, comparisons={}, ends=set()), least_score)
     least = KEPT_BESIDE * max((h.score for h in close), default=0.0)
     ends = query.workers.map(lambda h: tracked(query, h.pose, least), close, "descend")
     return [end for end in ends if end.score >= least]
