@@ -1,7 +1,6 @@
 """Batches: what is named, what is written, and how a stopped one goes on."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -12,9 +11,7 @@ from rooms import write_room
 
 from piccolo.batch import localizer as module
 from piccolo.batch.inputs import panoramas_of
-from piccolo.batch.priors import read_priors
 from piccolo.cli import localize
-from piccolo.coarse_to_fine.settings import Prior
 from piccolo.errors import InputError
 from piccolo.result import Result
 from piccolo.runtime.line_file import appending, whole_lines, whole_size
@@ -257,51 +254,3 @@ def test_priors_of_a_table_go_before_the_general_one(scene, tmp_path, capsys):
     assert (priors[0]["radius"], priors[0]["height"]) == (0.5, [1.2, 1.8])
     assert [prior["near_world"] for prior in priors[1:]] == [None, None]
     assert priors[1]["height"] == priors[2]["height"] == [0.2, 2.2]
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("x,y\n1,2\n", "found the columns"),
-        ("name,x,z\n", None),
-        ("name,east\na,1\n", "found a column 'east'"),
-        ("name,x,x\na,1,1\n", "found the columns"),
-        ("name,x,y\na,1\n", "line 2: found x without y"),
-        ("name,z\na,1\n", "line 2: found z without x"),
-        ("name,tolerance\na,1\n", "line 2: found tolerance without heading"),
-        ("name,heading\na,north\n", "line 2: found heading 'north', wanted a number"),
-        ("name,heading\na,nan\n", "line 2: found heading nan, wanted a finite number"),
-        ("name,x,y,radius\na,1,2,-3\n", "line 2: --radius: found -3.0"),
-        ("name,heading\na,1\na,2\n", "line 3: found the name 'a' twice"),
-        ("name,heading\n ,1\n", "line 2: found no name"),
-        ("name,heading\na,1,2\n", "line 2: found more cells than columns"),
-        ("", "found the columns"),
-    ],
-)
-def test_damaged_tables_are_refused_in_one_line(tmp_path, text, message):
-    table = tmp_path / "priors.csv"
-    table.write_text(text)
-    if message is None:
-        assert read_priors(table, Prior()).by_name == {}
-        return
-    with pytest.raises(InputError, match=message) as error:
-        read_priors(table, Prior())
-    assert str(error.value).startswith(f"{table}")
-    assert "\n" not in str(error.value)
-
-
-def test_a_table_names_the_scans_that_a_photo_may_be_in(tmp_path):
-    table = tmp_path / "priors.csv"
-    table.write_text("name,within\na.jpg, Storey 1 ;Storey 2;\nb.jpg,\n")
-    priors = read_priors(table, Prior(within=("Roof",)))
-    assert priors.prior_of(Path("a.jpg"), Prior(within=("Roof",))).within == ("Storey 1", "Storey 2")
-    assert priors.prior_of(Path("b.jpg"), Prior(within=("Roof",))).within == ("Roof",)
-
-
-def test_empty_cells_fall_back_and_paths_go_before_names(tmp_path):
-    table = tmp_path / "priors.csv"
-    table.write_text(f"name,x,y,z,heading,tolerance\na.jpg,1,2,3,90,\n{os.sep}b{os.sep}a.jpg,,,,10,5\n")
-    priors = read_priors(table, Prior(heading_tolerance_deg=30.0))
-    found = priors.prior_of(Path("c/a.jpg"), Prior(heading_tolerance_deg=30.0))
-    assert found == Prior((1.0, 2.0, 3.0), 5.0, None, 90.0, 30.0)
-    assert priors.prior_of(Path("/b/a.jpg"), Prior()) == Prior(heading_deg=10.0, heading_tolerance_deg=5.0)

@@ -1,0 +1,58 @@
+"""Tables of what is known of each photo: what they say, and what is refused."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from piccolo.batch.priors import read_priors
+from piccolo.coarse_to_fine.settings import Prior
+from piccolo.errors import InputError
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x,y\n1,2\n", "found the columns"),
+        ("name,x,z\n", None),
+        ("name,east\na,1\n", "found a column 'east'"),
+        ("name,x,x\na,1,1\n", "found the columns"),
+        ("name,x,y\na,1\n", "line 2: found x without y"),
+        ("name,z\na,1\n", "line 2: found z without x"),
+        ("name,tolerance\na,1\n", "line 2: found tolerance without heading"),
+        ("name,heading\na,north\n", "line 2: found heading 'north', wanted a number"),
+        ("name,heading\na,nan\n", "line 2: found heading nan, wanted a finite number"),
+        ("name,x,y,radius\na,1,2,-3\n", "line 2: --radius: found -3.0"),
+        ("name,heading\na,1\na,2\n", "line 3: found the name 'a' twice"),
+        ("name,heading\n ,1\n", "line 2: found no name"),
+        ("name,heading\na,1,2\n", "line 2: found more cells than columns"),
+        ("", "found the columns"),
+    ],
+)
+def test_damaged_tables_are_refused_in_one_line(tmp_path, text, message):
+    table = tmp_path / "priors.csv"
+    table.write_text(text)
+    if message is None:
+        assert read_priors(table, Prior()).by_name == {}
+        return
+    with pytest.raises(InputError, match=message) as error:
+        read_priors(table, Prior())
+    assert str(error.value).startswith(f"{table}")
+    assert "\n" not in str(error.value)
+
+
+def test_a_table_names_the_scans_that_a_photo_may_be_in(tmp_path):
+    table = tmp_path / "priors.csv"
+    table.write_text("name,within\na.jpg, Storey 1 ;Storey 2;\nb.jpg,\n")
+    priors = read_priors(table, Prior(within=("Roof",)))
+    assert priors.prior_of(Path("a.jpg"), Prior(within=("Roof",))).within == ("Storey 1", "Storey 2")
+    assert priors.prior_of(Path("b.jpg"), Prior(within=("Roof",))).within == ("Roof",)
+
+
+def test_empty_cells_fall_back_and_paths_go_before_names(tmp_path):
+    table = tmp_path / "priors.csv"
+    table.write_text(f"name,x,y,z,heading,tolerance\na.jpg,1,2,3,90,\n{os.sep}b{os.sep}a.jpg,,,,10,5\n")
+    priors = read_priors(table, Prior(heading_tolerance_deg=30.0))
+    found = priors.prior_of(Path("c/a.jpg"), Prior(heading_tolerance_deg=30.0))
+    assert found == Prior((1.0, 2.0, 3.0), 5.0, None, 90.0, 30.0)
+    assert priors.prior_of(Path("/b/a.jpg"), Prior()) == Prior(heading_deg=10.0, heading_tolerance_deg=5.0)
