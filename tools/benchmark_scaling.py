@@ -7,6 +7,7 @@ import resource
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -80,7 +81,7 @@ def size_and_opening(scan_map: ScanMap) -> tuple[str, str]:
     """Size [MB] of a map's file, and how long it takes to open it [ms] once it has been checked."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scan.map"
-        save_map(scan_map, path)
+        save_map(replace(scan_map, scan_sha256=64 * "0"), path)  # whatever the scan is
         load_map(path, remembers=True)
         begin = time.perf_counter()
         load_map(path, remembers=True)

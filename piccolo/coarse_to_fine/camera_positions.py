@@ -31,7 +31,7 @@ ADVICE = (
     "the most that are searched; if its unit is not the metre, set --units, else say where the camera was "
     "(--near X Y Z --radius M) or cut out a part"
 )
-BASES = 1 << 14  # cells on surfaces, around which others are supported, at a time
+BASES = 1 << 14  # cells on surfaces, around which others are supported, or centres, at a time
 LONG = 60.0  # [s] a warning tells how long the views take, if more
 COST_OF_VIEW = 4.0  # looking and rendering at a position, in the time of looking
 
@@ -126,6 +126,16 @@ def coverage(octree: Octree, centers: NDArray[np.floating[Any]], workers: Worker
     return np.concatenate([np.empty(0), *(fraction for (fraction,) in parts)])
 
 
+def nearest_distances(tree: Any, centers: NDArray[np.floating[Any]], workers: Workers) -> NDArray[np.float64]:
+    """Distance (N,) [m] of each centre (N, 3) from the nearest point of a cKDTree.
+
+    In threads of our own: the tree's are left running, in memory that is freed, where a signal ends the work.
+    """
+    begins = range(0, len(centers), BASES)
+    parts = workers.map(lambda lo: tree.query(centers[lo : lo + BASES])[0], begins, "find free space")
+    return np.concatenate([np.empty(0), *parts])
+
+
 def warn_if_long(octree: Octree, centers: NDArray[np.floating[Any]], workers: Workers) -> None:
     """Say about how many minutes the views from the centres (N, 3) take, by a sample of them."""
     sample, alone = centers[:: 1 + len(centers) // BLOCK], Workers()
@@ -154,7 +164,7 @@ def candidate_centers(
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
     middle = (cells + 0.5) * COARSE_SPACING
     warn_if_long(octree, middle, workers)
-    clearance, _ = tree.query(middle, workers=workers.num_threads)
+    clearance = nearest_distances(tree, middle, workers)
     is_free = clearance > MIN_CLEARANCE
     fraction = np.zeros(len(middle))  # where it is not free, nobody asks
     fraction[is_free] = coverage(octree, middle[is_free], workers)
@@ -170,7 +180,7 @@ def candidate_centers(
     is_split = is_tight & (clearance + 0.87 * COARSE_SPACING > MIN_CLEARANCE)
     finer = (2 * cells[is_split][:, None] + corners).reshape(-1, 3)
     middle = (finer + 0.5) * half
-    clearance, _ = tree.query(middle, workers=workers.num_threads)
+    clearance = nearest_distances(tree, middle, workers)
     middle = middle[clearance > MIN_CLEARANCE]
     if len(middle) > MAX_POSITIONS:
         raise TooManyPositionsError("narrow places")
