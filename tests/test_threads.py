@@ -1,4 +1,7 @@
+import multiprocessing
+import sys
 import threading
+import warnings
 
 import pytest
 
@@ -31,3 +34,49 @@ def test_an_error_drops_what_has_not_begun():
     with pytest.raises(ValueError, match="first"):
         list(Workers(2).map(work, range(1000), "work"))
     assert len(begun) < 10  # what the two threads had begun
+
+
+def test_threads_are_kept_and_work_within_work_is_done_by_the_same_one():
+    workers, both = Workers(2), threading.Barrier(2, timeout=60)
+
+    def within(_):
+        both.wait()
+        inner = set(workers.map(lambda _: threading.get_ident(), range(4), "within"))
+        assert inner == {threading.get_ident()}
+        return threading.get_ident()
+
+    first, second = (set(workers.map(within, range(2), "work")) for _ in range(2))
+    assert first == second
+    assert len(first) == 2
+    assert threading.get_ident() not in first
+
+
+def test_one_callers_work_may_wait_for_anothers():
+    """Two tasks that fill a pool wait for what another caller's tasks do."""
+    is_done, workers = threading.Event(), Workers(2)
+
+    def other():
+        list(workers.map(lambda _: None, range(4), "other"))
+        is_done.set()
+
+    def wait_for_other(k):
+        if k == 0:
+            caller.start()
+        return is_done.wait(60)
+
+    caller = threading.Thread(target=other)
+    assert all(workers.map(wait_for_other, range(2), "work"))
+    caller.join()
+
+
+def test_a_forked_process_has_threads_of_its_own():
+    workers = Workers(2)
+    list(workers.map(abs, range(4), "before"))
+    child = multiprocessing.get_context("fork").Process(
+        target=lambda: sys.exit(sum(workers.map(abs, range(4), "in the child")))
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a fork beside threads, which is what is tried
+        child.start()
+    child.join(60)
+    assert child.exitcode == 6

@@ -22,10 +22,8 @@ from .view import ViewConfig, render_block, render_wide_block, thread_scratch
 WIDE_RINGS = 12
 SEARCH_VIEW = ViewConfig(num_rings=SEARCH_RINGS, stats_rings=16, sigma_deg=22.0, voxel_per_range=1 / 15)
 WIDE_VOXEL_PER_RANGE = 1 / 8  # of the same view where it is averaged over wide cells
-BYTES_PER_CELL, WIDE_BYTES_PER_CELL = (
-    6 + 3 + 1,
-    2 * (3 + 1),
-)  # of a view: offsets, channels, seen; in parts, and joined
+BYTES_PER_CELL = 6 + 3 + 1  # of a view: offsets, channels, seen
+WIDE_BYTES_PER_CELL = 2 * (3 + 1)  # of a wide one, twice: in parts, and joined
 LEAST_ROOM = 256  # views
 
 

@@ -4,8 +4,8 @@ import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
 from typing import Any, TypeVar
 
 from numpy.typing import NDArray
@@ -37,13 +37,27 @@ def _begin_thread() -> None:
     _thread.is_of_pool = True
 
 
-@cache
-def pool_of(num_threads: int) -> ThreadPoolExecutor:
-    """Threads of this process that work for `Workers`: they keep their scratch, as fresh memory is slow."""
-    return ThreadPoolExecutor(num_threads, "piccolo", _begin_thread)
+_idle: dict[int, list[ThreadPoolExecutor]] = {}  # pools by their number of threads
+os.register_at_fork(after_in_child=_idle.clear)  # a child has none of its parent's threads
 
 
-os.register_at_fork(after_in_child=pool_of.cache_clear)  # a child has none of its parent's threads
+@contextmanager
+def pool_of(num_threads: int) -> Iterator[ThreadPoolExecutor]:
+    """Threads for one caller at a time, kept for the next: they keep their scratch, as fresh memory is slow.
+
+    Callers in several threads have a pool each: none waits for what another's work keeps from being done.
+    """
+    idle = _idle.setdefault(num_threads, [])
+    try:
+        pool = idle.pop()
+    except IndexError:
+        pool = ThreadPoolExecutor(num_threads, "piccolo", _begin_thread)
+    try:
+        yield pool
+    finally:
+        idle.append(pool)
+
+
 # wraps values as tqdm does: how many there will be, None if unknown, and what they are
 Progress = Callable[[Iterator[Any], int | None, str], Iterator[Any]]
 
@@ -96,13 +110,14 @@ class Workers:
         if self.num_threads == 1 or len(items) < 2 or _thread.is_of_pool:
             yield from self.show(map(function, items), len(items), label)
             return
-        futures = [pool_of(self.num_threads).submit(function, item) for item in items]
-        try:
-            yield from self.show((future.result() for future in futures), len(items), label)
-        finally:
-            for future in futures:
-                future.cancel()
-            wait(futures)
+        with pool_of(self.num_threads) as pool:
+            futures = [pool.submit(function, item) for item in items]
+            try:
+                yield from self.show((future.result() for future in futures), len(items), label)
+            finally:
+                for future in futures:
+                    future.cancel()
+                wait(futures)
 
     def collect(
         self,
