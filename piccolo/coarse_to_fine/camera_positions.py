@@ -132,7 +132,8 @@ def nearest_distances(tree: Any, centers: NDArray[np.floating[Any]], workers: Wo
     In threads of our own: the tree's are left running, in memory that is freed, where a signal ends the work.
     """
     begins = range(0, len(centers), BASES)
-    parts = workers.map(lambda lo: tree.query(centers[lo : lo + BASES])[0], begins, "find free space")
+    alone = Workers(workers.num_threads)  # too short a work to be shown
+    parts = alone.map(lambda lo: tree.query(centers[lo : lo + BASES])[0], begins, "")
     return np.concatenate([np.empty(0), *parts])
 
 
