@@ -109,11 +109,25 @@ def joined_candidates(old: ScanMap, new: Octree, octree: Octree, workers: Worker
     positions = candidate_centers(octree, workers, box)
     gap, _ = cKDTree(old.centers).query(positions)
     more = positions[box.holds(positions) & (gap > 0.0)]
-    in_front, behind = compared(new, old.octree, old.centers[rows], workers)
+    in_front, behind = np.zeros((2, len(rows)))
+    scan = Box(points.min(axis=0) - CLEARANCE_VOXEL, points.max(axis=0) + CLEARANCE_VOXEL)
+    near = most_of_sphere(scan, old.centers[rows]) > LEAST_CHANGED
+    in_front[near], behind[near] = compared(new, old.octree, old.centers[rows[near]], workers)
     of_more = compared(new, old.octree, more, workers)
     fraction = np.concatenate([in_front, np.ones(len(more))])
     is_new = np.concatenate([in_front > behind, of_more[0] > of_more[1]]) & (fraction > LEAST_CHANGED)
     return Candidates(rows, np.concatenate([old.centers[rows], more]), fraction, is_new)
+
+
+def most_of_sphere(box: Box, centers: Array) -> Array:
+    """The most of the sphere (N,) that what is in a box can take around centres (N, 3), by the ball around it.
+
+    A half within the ball, where it may be all.
+    """
+    radius = 0.5 * float(np.linalg.norm(box.high - box.low))
+    distance = np.linalg.norm(centers - 0.5 * (box.low + box.high), axis=1)
+    sine = np.minimum(radius / np.maximum(distance, radius), 1.0)
+    return np.asarray(0.5 * (1.0 - np.sqrt(1.0 - sine**2)))
 
 
 def compared(new: Octree, old: Octree, centers: Array, workers: Workers) -> tuple[Array, Array]:
