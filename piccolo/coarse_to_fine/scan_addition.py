@@ -120,9 +120,9 @@ def joined_candidates(old: ScanMap, new: Octree, octree: Octree, workers: Worker
 
 
 def most_of_sphere(box: Box, centers: Array) -> Array:
-    """The most of the sphere (N,) that what is in a box can take around centres (N, 3), by the ball around it.
+    """The most of the sphere (N,) that what is in a box can take around centres (N, 3), by a ball around it.
 
-    A half within the ball, where it may be all.
+    A half within that ball, where it may be all.
     """
     radius = 0.5 * float(np.linalg.norm(box.high - box.low))
     distance = np.linalg.norm(centers - 0.5 * (box.low + box.high), axis=1)
