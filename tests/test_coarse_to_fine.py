@@ -98,7 +98,8 @@ def test_priors_leave_what_they_say():
     whole, origin = scan_map(1), room(1)[1].origin_world
     turn = exp_so3(np.array([0.0, 0.0, 2.0]))  # of a map that was levelled
     turned = dataclasses.replace(whole, R_map_from_world=turn)
-    near = apply_prior(turned, Prior(near_world=tuple(origin + turn.T @ [0.5, 0, 0]), radius=1.0))
+    near_it = Prior(near_world=tuple(origin + turn.T @ [0.5, 0, 0]), radius=1.0)
+    near = apply_prior(turned, near_it)
     distance = np.linalg.norm(whole.centers - [0.5, 0, 0], axis=1)
     is_near = distance <= 1.3  # half a spacing more
     assert 0 < is_near.sum() < len(is_near)
@@ -115,6 +116,12 @@ def test_priors_leave_what_they_say():
         np.testing.assert_array_equal(left.wide_seen, whole.wide_seen[is_kept])
     both = apply_prior(turned, Prior(tuple(origin + turn.T @ [0.5, 0, 0]), 1.0, (0.5, 1.0)))
     assert len(both.sparse) == len(np.unique(cells[is_near & is_low], axis=0))
+    for again in (apply_prior(near, Prior(height=(0.5, 1.0))), apply_prior(near, near_it)):  # as walks do
+        rows = np.flatnonzero(np.isin(near.sparse, again.sparse))
+        np.testing.assert_array_equal(again.sparse, near.sparse[rows])
+        np.testing.assert_array_equal(again.wide_features, near.wide_features[rows])
+    assert set(both.sparse) <= set(apply_prior(near, Prior(height=(0.5, 1.0))).sparse)
+    np.testing.assert_array_equal(apply_prior(near, near_it).sparse, near.sparse)
     assert apply_prior(whole, Prior()) is whole
 
 

@@ -57,7 +57,7 @@ def apply_prior(scan_map: ScanMap, prior: Prior) -> ScanMap:
         is_allowed &= mask
     if is_allowed.all():
         return scan_map
-    kept = np.unique(scan_map.sparse_of_candidate[is_allowed])
+    kept = np.isin(scan_map.sparse, scan_map.searched_for[is_allowed])
     return replace(
         scan_map,
         sparse=scan_map.sparse[kept],

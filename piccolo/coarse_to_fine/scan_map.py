@@ -59,9 +59,10 @@ class ScanMap:
         return find_storeys(self.octree)
 
     @cached_property
-    def sparse_of_candidate(self) -> NDArray[np.int64]:
-        """Which of the sparse ones (candidates,) lies in the same cell of the coarse grid."""
-        return sparse_candidates(self.centers)[1]
+    def searched_for(self) -> NDArray[np.int64]:
+        """The candidate (candidates,) of each one's cell of the coarse grid that is searched in its place."""
+        first, cell = sparse_candidates(self.centers)
+        return first[cell]
 
     @property
     def lacks_features(self) -> bool:
