@@ -1,10 +1,8 @@
 """A walk through a room, in Python and on the command line."""
 
 import json
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 from typing import NamedTuple
 
 import cv2
@@ -13,11 +11,9 @@ import pytest
 import rooms
 
 import piccolo
-from piccolo.batch.frame_times import times_of
 from piccolo.cli import localize as localize_command
 from piccolo.cli import localize_walk as walk_command
 from piccolo.cloud.ply_writer import vertex_rows, write_ply
-from piccolo.confidence.localization import Localization
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
 from piccolo.result import read_results
@@ -26,9 +22,6 @@ from piccolo.scan_walk import Walk
 from piccolo.scenes.export.video import writing_video
 from piccolo.scenes.synthetic.world import free_position, photograph
 from piccolo.walk import tracker as tracker_module
-from piccolo.walk.frames import MAX_STEP, NO_ACCELERATION, Frame, Motion, State
-from piccolo.walk.localize import accuracy_of
-from piccolo.walk.second_look import motion_of
 
 NUM_FRAMES, STEP_S = 8, 0.5
 
@@ -107,6 +100,18 @@ def test_a_walk_with_bad_frames_between(scan, building):
     assert again.to_json() == results[0].to_json()
 
 
+def test_a_walk_keeps_within_a_prior(scan, building):
+    """Which narrows the map, as looking near a place or in the whole scan does once more."""
+    queries = building[1]
+    x, y, z = np.mean([q.pose.center_world for q in queries], axis=0)
+    frames = [q.image for q in queries]
+    frames[3] = np.zeros((rooms.WIDTH // 2, rooms.WIDTH, 3), np.uint8) + 99  # lost: looked for near and far
+    results = scan.localize_walk(frames, gravity="known", near_world=(x, y, z), radius=2.0)
+    good = [k for k in range(len(queries)) if k != 3]
+    _assert_right([results[k] for k in good], [queries[k] for k in good])
+    assert results[3].status != "localized"
+
+
 def test_times_are_of_all_frames(scan, building):
     frames = [q.image for q in building[1][:2]]
     with pytest.raises(InputError, match=r"^times: found 1 of 2 frames, wanted one of each$"):
@@ -152,38 +157,6 @@ def test_however_sure_the_whole_scan_is_searched_now_and_then(scan, building, mo
     assert is_searched == [k % 2 == 0 for k in range(NUM_FRAMES)]
     assert results[0].walk.alone is not None
     assert all(r.walk.alone is None for r in results[1:])
-
-
-def test_the_longest_step_is_told_by_the_frames_that_are_localized_alone():
-    def frame(x, status="localized"):
-        return Frame(0.0, alone=Localization(status=status, pose=Pose(np.eye(3), np.array([x, 0.0, 0.0]))))
-
-    frames = [
-        *(frame(6.0 * (k // 2)) for k in range(40)),
-        frame(500.0),
-        frame(900.0, "ambiguous"),
-        Frame(0.0),
-    ]
-    guess = Motion(MAX_STEP, NO_ACCELERATION, is_timed=False, is_guess=True)
-
-    def longest(motion, frames):
-        return motion_of(SimpleNamespace(motion=motion, frames=frames)).max_speed
-
-    assert longest(guess, frames) == pytest.approx(9.0)
-    assert longest(guess, [frame(0.0), frame(1.0)]) == MAX_STEP
-    assert longest(guess, [Frame(0.0)]) == MAX_STEP
-    assert longest(replace(guess, is_guess=False), frames) == MAX_STEP
-    assert longest(replace(guess, is_timed=True), frames) == MAX_STEP
-
-
-def test_a_frame_is_as_sure_as_its_own_picture():
-    """Those around it tell the place of a blurred frame, but not where in it."""
-
-    def state(odds):
-        return State(Pose(np.eye(3), np.zeros(3)), odds, 0.5)
-
-    assert accuracy_of(Frame(0.0, [state(0.0)])) == pytest.approx(0.5)
-    assert accuracy_of(Frame(0.0, [state(2.0), state(2.0)])) == pytest.approx(1 / (1 + np.exp(-2.0) / 2))
 
 
 def test_a_walk_is_the_same_with_any_number_of_threads(building):
@@ -325,23 +298,3 @@ def test_what_is_no_video_is_one_line(building, tmp_path, capsys):
     error = capsys.readouterr().err
     assert "wanted a video that PyAV reads, such as MP4" in error
     assert error.count("\n") == 1
-
-
-def test_times_by_names_tables_and_exif(tmp_path):
-    frames = [tmp_path / f"walk_{text}.jpg" for text in ("10.5", "11", "13.25")]
-    assert times_of(frames, "names") == [0.0, 0.5, 2.75]
-    assert times_of(frames, "order") is None
-    assert times_of(frames, None) is None  # no file, no EXIF
-    (tmp_path / "t.csv").write_text("name,time\nwalk_10.5.jpg,3\nwalk_11.jpg,4\n")
-    assert times_of(frames[:2], str(tmp_path / "t.csv")) == [0.0, 1.0]
-    with pytest.raises(InputError, match=r"t\.csv: found no time of .*walk_13\.25\.jpg, wanted a CSV file"):
-        times_of(frames, str(tmp_path / "t.csv"))
-    (tmp_path / "t.csv").write_text("name,when\na,3\n")
-    with pytest.raises(InputError, match=r"t\.csv: found KeyError 'time', wanted a CSV file"):
-        times_of(frames, str(tmp_path / "t.csv"))
-    with pytest.raises(InputError, match="wanted them to rise"):
-        times_of(frames[::-1], "names")
-    with pytest.raises(InputError, match=r"^--times names: found no number in walk\.jpg"):
-        times_of([tmp_path / "walk.jpg"], "names")
-    with pytest.raises(InputError, match=r"^--times exif: found a frame without a time in EXIF"):
-        times_of(frames, "exif")
