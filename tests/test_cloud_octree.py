@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from piccolo.cloud import Cloud
-from piccolo.cloud.octree import build_octree
+from piccolo.cloud.octree import MAX_NODES, build_octree, collect
 from piccolo.cloud.voxels import LEAF_SIZE, NUM_LEVELS
 
 
@@ -50,3 +50,40 @@ def test_level_is_the_nearest_in_size(size, level):
     octree = _octree(*_cloud())
     begin, end = octree.level_start[level : level + 2]
     np.testing.assert_array_equal(octree.level(size), octree.nodes[begin:end])
+
+
+def _drawn(octree, center, voxel_per_range):
+    """What `collect` is to find, from the definition: nodes far enough for their size, their parents not."""
+    found = []
+    waiting = [(node, 0) for node in range(octree.level_start[1])]
+    while waiting:
+        node, level = waiting.pop()
+        size = octree.leaf_size * 2.0 ** (NUM_LEVELS - 1 - level)
+        distance = np.linalg.norm(octree.nodes[node, :3] - center)
+        if level == NUM_LEVELS - 1 or distance >= size / voxel_per_range:
+            found.append(node)
+        else:
+            children = range(octree.first_child[node], octree.first_child[node + 1])
+            waiting += [(child, level + 1) for child in children]
+    return sorted(found)
+
+
+@pytest.mark.parametrize("voxel_per_range", [1 / 4, 1 / 15, 1 / 30, 1 / 80, 1 / 300])
+@pytest.mark.parametrize("center", [[0.0, 0.0, 0.0], [4.0, -1.0, 0.5], [60.0, 0.0, 0.0]])
+def test_collects_the_coarsest_nodes_that_are_small_from_where_one_is(voxel_per_range, center):
+    rng = np.random.default_rng(1)
+    wall = np.stack([rng.uniform(-9, 9, 60_000), np.full(60_000, 3.0), rng.uniform(0, 4, 60_000)], axis=1)
+    points = np.concatenate([wall.astype(np.float32), _cloud()[0]])
+    octree = _octree(points, np.full((len(points), 3), 90, np.uint8))
+    found, directions = np.empty(MAX_NODES, np.int32), np.empty((3, MAX_NODES), np.float32)
+    count = collect(octree, np.array(center), voxel_per_range, found, directions)
+    assert sorted(found[:count].tolist()) == _drawn(octree, np.float32(center), voxel_per_range)
+    expected = octree.nodes[found[:count], :3] - np.float32(center)
+    np.testing.assert_allclose(directions[:, :count].T, expected, atol=1e-5)
+
+
+def test_collects_no_more_than_there_is_room_for():
+    octree = _octree(*_cloud())
+    found, directions = np.full(110, -1, np.int32), np.zeros((3, 100), np.float32)
+    assert collect(octree, np.zeros(3), 1 / 300, found[:100], directions) == 100
+    assert (found[100:] == -1).all()

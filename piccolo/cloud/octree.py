@@ -1,5 +1,6 @@
 """The octree of a cloud: a pyramid of its voxels, in Morton order, and what of it a view needs."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,8 @@ from .voxels import LEAF_SIZE, NUM_LEVELS, THIN, Voxels
 
 NODE_BYTES = 6 * 4 + 8 + 4  # mean, code, first child
 MAX_NODES = 1 << 22  # that a view collects; reserved, but used only as far as a dense cloud fills it
+RANGES_BELOW = 1 / 20  # voxels by their distance: larger ones are drawn at one level in few places
+DIAGONAL = 1.75  # of a voxel, and a little more for rounding: all in it is so near to its mean
 
 
 class Octree(NamedTuple):
@@ -47,43 +50,82 @@ def build_octree(voxels: Voxels) -> Octree:
     return Octree(np.concatenate(levels), np.concatenate(first_child).astype(np.int32), start, LEAF_SIZE)
 
 
+@inline_kernel
+def uniform_level(least_distance, level, low, high):
+    """The level at which all below a node of `level`, from low to high away, is drawn; 0 if there is none."""
+    k = level + 1
+    while least_distance[k] > low and least_distance[k] > F0:
+        k += 1
+    return k if high < least_distance[k - 1] else 0
+
+
+@inline_kernel
+def take_all(nodes, first, last, center, found, directions, count):
+    """Write nodes that follow one another, and their positions relative to the centre, from `count` on."""
+    x, y, z = directions[0], directions[1], directions[2]
+    for i in range(last - first):
+        node, k = np.uintp(first + i), np.uintp(count + i)
+        found[k] = node
+        x[k], y[k], z[k] = nodes[node, 0] - center[0], nodes[node, 1] - center[1], nodes[node, 2] - center[2]
+
+
+@inline_kernel
+def take_far(nodes, first, last, center, least, found, directions, count, stack, top):
+    """The same with those that are `least` [m^2] away; the others go on the stack. Returns both counts."""
+    x, y, z = directions[0], directions[1], directions[2]
+    for node in range(first, last):
+        i, k = np.uintp(node), np.uintp(count)
+        dx, dy, dz = nodes[i, 0] - center[0], nodes[i, 1] - center[1], nodes[i, 2] - center[2]
+        if dx * dx + dy * dy + dz * dz >= least:
+            found[k], x[k], y[k], z[k] = node, dx, dy, dz
+            count += 1
+        else:
+            stack[top] = node
+            top += 1
+    return count, top
+
+
 @kernel
 def collect(tree, center, voxel_per_range, found, directions):
     """Write the nodes that, seen from `center`, are as small as asked, or leaves; returns how many.
 
-    `directions` (3, N) get the positions relative to the centre [m].
+    `directions` (3, N) get the positions relative to the centre [m]. Where all below a node is drawn at one
+    level, its nodes there follow one another: most of them are found so, without a question to each.
     """
     nodes, first_child = tree.nodes, tree.first_child
-    num_levels = len(tree.level_start) - 1
-    stack = np.empty(8 * num_levels, np.int32)
-    levels = np.empty(8 * num_levels, np.int32)
-    cx, cy, cz = np.float32(center[0]), np.float32(center[1]), np.float32(center[2])
-    per2 = np.float32(1.0 / (voxel_per_range * voxel_per_range))
-    min_d2 = np.empty(num_levels, np.float32)
+    num_levels, num_roots = len(tree.level_start) - 1, tree.level_start[1]
+    room = num_roots + 8 * num_levels
+    stack, levels = np.empty(room, np.int32), np.empty(room, np.int32)
+    at = np.float32(center[0]), np.float32(center[1]), np.float32(center[2])
+    least_distance, diagonal = np.empty(num_levels, np.float32), np.empty(num_levels, np.float32)
     for level in range(num_levels):
-        size = np.float32(tree.leaf_size * 2.0 ** (num_levels - 1 - level))
-        min_d2[level] = size * size * per2
-    min_d2[num_levels - 1] = F0
-    count = 0
-    for root in range(tree.level_start[1]):
-        stack[0] = root
-        levels[0] = 0
-        top = 1
-        while top > 0:
-            top -= 1
-            node = stack[top]
-            level = levels[top]
-            dx, dy, dz = nodes[node, 0] - cx, nodes[node, 1] - cy, nodes[node, 2] - cz
-            if dx * dx + dy * dy + dz * dz >= min_d2[level]:
-                if count < len(found):
-                    found[count] = node
-                    directions[0, count], directions[1, count], directions[2, count] = dx, dy, dz
-                    count += 1
-            else:
-                for child in range(first_child[node], first_child[node + 1]):
-                    stack[top] = child
-                    levels[top] = level + 1
-                    top += 1
+        size = tree.leaf_size * 2.0 ** (num_levels - 1 - level)
+        least_distance[level], diagonal[level] = size / voxel_per_range, size * DIAGONAL
+    least_distance[num_levels - 1] = F0
+    least = least_distance[0] * least_distance[0]
+    count, top = take_far(nodes, 0, min(num_roots, len(found)), at, least, found, directions, 0, stack, 0)
+    levels[:top] = 0
+    while top > 0:
+        top -= 1
+        node, level = stack[top], levels[top] + 1
+        first, last = np.int64(first_child[node]), np.int64(first_child[node + 1])
+        is_uniform = level == num_levels - 1
+        if voxel_per_range < RANGES_BELOW and level < num_levels - 2:
+            dx, dy, dz = nodes[node, 0] - at[0], nodes[node, 1] - at[1], nodes[node, 2] - at[2]
+            distance, reach = math.sqrt(dx * dx + dy * dy + dz * dz), diagonal[level - 1]
+            uniform = uniform_level(least_distance, level, distance - reach, distance + reach)
+            is_uniform = level < uniform
+            while level < uniform:
+                first, last = np.int64(first_child[first]), np.int64(first_child[last])
+                level += 1
+        last = min(last, first + len(found) - count)
+        if is_uniform:
+            take_all(nodes, first, last, at, found, directions, count)
+            count += last - first
+        else:
+            least, begin = least_distance[level] * least_distance[level], top
+            count, top = take_far(nodes, first, last, at, least, found, directions, count, stack, top)
+            levels[begin:top] = level
     return count
 
 

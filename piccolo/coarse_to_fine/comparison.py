@@ -15,7 +15,8 @@ from ..geometry.pose import Pose
 from ..geometry.sphere import cell_of, make_grid, pixel_rays
 from ..optimize.channel_loss import BLOCK_RINGS, CHANCE, NUM_BLOCKS
 from ..panorama.local_normalization import opponent, zscore
-from ..panorama.texels import blend, is_valid, texels_around
+from ..panorama.projection import CHUNK, gather, make_projected, project
+from ..panorama.texels import bilinear_weights, blend, is_valid
 from ..runtime.jit import F0, kernel
 from .cells import local_statistics, locate
 from .query import Query
@@ -57,20 +58,23 @@ class Comparison(NamedTuple):
 @kernel
 def sample_photo(offsets, weights, photo, R_cam_from_map, colors, shared, rays):
     """Write the photo's opponent channels (3, N) at cells (3, N), weights of what both show, rays (3, N)."""
-    texels, width = photo
-    R = R_cam_from_map
-    for n in range(len(weights)):
-        dx, dy, dz = offsets[0, n], offsets[1, n], offsets[2, n]
-        x = np.float32(R[0, 0] * dx + R[0, 1] * dy + R[0, 2] * dz)
-        y = np.float32(R[1, 0] * dx + R[1, 1] * dy + R[1, 2] * dz)
-        z = np.float32(R[2, 0] * dx + R[2, 1] * dy + R[2, 2] * dz)
-        (t00, t10, t01, t11), bilinear = texels_around(texels, x, y, z, width)
-        shared[n] = weights[n] * is_valid(t00, t10, t01, t11)
-        r = blend(t00, t10, t01, t11, bilinear, 0) * PER_LEVEL
-        g = blend(t00, t10, t01, t11, bilinear, 8) * PER_LEVEL
-        b = blend(t00, t10, t01, t11, bilinear, 16) * PER_LEVEL
-        colors[0, n], colors[1, n], colors[2, n] = opponent(r, g, b)
-        rays[0, n], rays[1, n], rays[2, n] = x, y, z
+    (texels, width), p = photo, make_projected()
+    center = np.zeros(3)
+    for lo in range(0, len(weights), CHUNK):
+        hi = min(lo + CHUNK, len(weights))
+        project(offsets[0][lo:hi], offsets[1][lo:hi], offsets[2][lo:hi], R_cam_from_map, center, width, p)
+        gather(texels, width, p, hi - lo)
+        c0, c1, c2, both = colors[0][lo:hi], colors[1][lo:hi], colors[2][lo:hi], shared[lo:hi]
+        weight, count = weights[lo:hi], hi - lo
+        for n in range(count):
+            bilinear = bilinear_weights(p.fu[n], p.fv[n])
+            t00, t10, t01, t11 = p.t00[n], p.t10[n], p.t01[n], p.t11[n]
+            r = blend(t00, t10, t01, t11, bilinear, 0) * PER_LEVEL
+            g = blend(t00, t10, t01, t11, bilinear, 8) * PER_LEVEL
+            b = blend(t00, t10, t01, t11, bilinear, 16) * PER_LEVEL
+            c0[n], c1[n], c2[n] = opponent(r, g, b)
+            both[n] = weight[n] * is_valid(t00, t10, t01, t11)
+        rays[0][lo:hi], rays[1][lo:hi], rays[2][lo:hi] = p.x[:count], p.y[:count], p.z[:count]
 
 
 @kernel

@@ -10,7 +10,8 @@ import numpy as np
 
 from ..geometry.sphere import make_grid
 from ..panorama.local_normalization import ZERO_LEVEL
-from ..panorama.texels import blend, is_valid, texels_around
+from ..panorama.projection import CHUNK, gather, make_projected, project
+from ..panorama.texels import bilinear_weights, blend, is_valid
 from ..runtime.jit import F1, HALF, inline_kernel, kernel
 from .levenberg_marquardt import levenberg_marquardt
 from .normal_equations import COUNT, LOSS, block_adder
@@ -18,7 +19,7 @@ from .normal_equations import COUNT, LOSS, block_adder
 BLOCK_RINGS = 6  # blocks of the sphere of 30 degrees, in which a score is taken
 NUM_BLOCKS = len(make_grid(BLOCK_RINGS))
 CHANCE = 0.35  # a block's correlation that wrong poses reach
-BLOCK = 512  # points: float32 sums within, float64 over blocks
+ZERO = np.float32(ZERO_LEVEL)
 
 
 @inline_kernel
@@ -51,17 +52,13 @@ def channel_equations(problem, R_cam_from_world, center_world, sums):
     panorama's channels, scale of the loss [levels].
     """
     points, channels, weights, texels, width, scale = problem
-    R, t = R_cam_from_world, center_world
+    colors = channels[0], channels[1], channels[2], weights
+    how = texels, width, R_cam_from_world, center_world, np.float32(1.0 / (scale * scale))
     sums[:] = 0.0
-    inverse_scale2 = np.float32(1.0 / (scale * scale))
+    add_channels(points[0], points[1], points[2], colors, *how, sums)
     total_weight = 0.0
-    for lo in range(0, len(weights), BLOCK):
-        hi = min(lo + BLOCK, len(weights))
-        x, y, z, w = points[0][lo:hi], points[1][lo:hi], points[2][lo:hi], weights[lo:hi]
-        colors = channels[0][lo:hi], channels[1][lo:hi], channels[2][lo:hi], w
-        add_channels(x, y, z, colors, texels, width, R, t, inverse_scale2, sums)
-        for i in range(len(w)):
-            total_weight += w[i]
+    for n in range(len(weights)):
+        total_weight += weights[n]
     sums[LOSS] += (total_weight - sums[COUNT]) * 0.25 * scale * scale
 
 
@@ -72,15 +69,12 @@ def equations_by_part(problem, R_cam_from_world, center_world, begins, sums):
     A part ends where the next begins (parts + 1,).
     """
     points, channels, weights, texels, width, scale = problem
+    how = texels, width, R_cam_from_world, center_world, np.float32(1.0 / (scale * scale))
     sums[:] = 0.0
-    inverse_scale2 = np.float32(1.0 / (scale * scale))
     for k in range(len(sums)):
-        for lo in range(begins[k], begins[k + 1], BLOCK):
-            hi = min(lo + BLOCK, begins[k + 1])
-            x, y, z, w = points[0][lo:hi], points[1][lo:hi], points[2][lo:hi], weights[lo:hi]
-            colors = channels[0][lo:hi], channels[1][lo:hi], channels[2][lo:hi], w
-            how = texels, width, R_cam_from_world, center_world, inverse_scale2
-            add_channels(x, y, z, colors, *how, sums[k])
+        lo, hi = begins[k], begins[k + 1]
+        colors = channels[0][lo:hi], channels[1][lo:hi], channels[2][lo:hi], weights[lo:hi]
+        add_channels(points[0][lo:hi], points[1][lo:hi], points[2][lo:hi], colors, *how, sums[k])
 
 
 descend_channels = kernel(levenberg_marquardt(channel_equations))
@@ -89,23 +83,29 @@ descend_channels = kernel(levenberg_marquardt(channel_equations))
 @kernel
 def correlate(points, channels, weights, blocks, texels, width, R_cam_from_world, center_world, sums):
     """Write, block by block (B, 4), product, energies and shared weight of points' and image's channels."""
-    R, t = R_cam_from_world, center_world
     sums[:] = 0.0
-    for n in range(len(weights)):
-        dx, dy, dz = points[0, n] - t[0], points[1, n] - t[1], points[2, n] - t[2]
-        x = np.float32(R[0, 0] * dx + R[0, 1] * dy + R[0, 2] * dz)
-        y = np.float32(R[1, 0] * dx + R[1, 1] * dy + R[1, 2] * dz)
-        z = np.float32(R[2, 0] * dx + R[2, 1] * dy + R[2, 2] * dz)
-        (t00, t10, t01, t11), bilinear = texels_around(texels, x, y, z, width)
-        w = weights[n] * is_valid(t00, t10, t01, t11)
-        s = sums[blocks[n]]
-        s[3] += w
-        for c in range(3):
-            value = blend(t00, t10, t01, t11, bilinear, 8 * c) - np.float32(ZERO_LEVEL)
-            feature = channels[c, n] - np.float32(ZERO_LEVEL)
-            s[0] += w * value * feature
-            s[1] += w * feature * feature
-            s[2] += w * value * value
+    p, found = make_projected(), np.empty((4, CHUNK), np.float32)
+    for lo in range(0, len(weights), CHUNK):
+        hi = min(lo + CHUNK, len(weights))
+        x, y, z = points[0][lo:hi], points[1][lo:hi], points[2][lo:hi]
+        project(x, y, z, R_cam_from_world, center_world, width, p)
+        gather(texels, width, p, hi - lo)
+        f0, f1, f2, weight = channels[0][lo:hi], channels[1][lo:hi], channels[2][lo:hi], weights[lo:hi]
+        for n in range(hi - lo):
+            bilinear = bilinear_weights(p.fu[n], p.fv[n])
+            t00, t10, t01, t11 = p.t00[n], p.t10[n], p.t01[n], p.t11[n]
+            a0, b0 = f0[n] - ZERO, blend(t00, t10, t01, t11, bilinear, 0) - ZERO
+            a1, b1 = f1[n] - ZERO, blend(t00, t10, t01, t11, bilinear, 8) - ZERO
+            a2, b2 = f2[n] - ZERO, blend(t00, t10, t01, t11, bilinear, 16) - ZERO
+            w = weight[n] * is_valid(t00, t10, t01, t11)
+            found[0, n] = w * (a0 * b0 + a1 * b1 + a2 * b2)
+            found[1, n] = w * (a0 * a0 + a1 * a1 + a2 * a2)
+            found[2, n] = w * (b0 * b0 + b1 * b1 + b2 * b2)
+            found[3, n] = w
+        for n in range(hi - lo):
+            s = sums[blocks[lo + n]]
+            for k in range(4):
+                s[k] += found[k, n]
 
 
 @kernel

@@ -6,57 +6,35 @@ the derivatives of the pixel (u, v) by the step, and G (2, 2) the weighted sum o
 products of the image gradients, a point adds [Ju Jv] G [Ju Jv]^T to the matrix: no row is ever stored.
 """
 
-import math
 from typing import Any
 
 import numpy as np
 
 from ..geometry.sphere import pixel_jacobian
-from ..panorama.texels import blend_with_gradient, is_valid, texel_at
+from ..panorama.projection import CHUNK, gather, make_projected, project
+from ..panorama.texels import blend_with_gradient, is_valid
 from ..runtime.jit import F0, inline_kernel, kernel
 
 NUM_SUMS = 29  # loss, count, gradient (6), upper triangle of the normal matrix (21)
 LOSS, COUNT, GRADIENT, MATRIX = 0, 1, 2, 8  # where they begin
 
 
-@inline_kernel
-def rotation_float32(R):
-    """The nine entries of a rotation (3, 3)."""
-    f = np.float32
-    return (
-        f(R[0, 0]), f(R[0, 1]), f(R[0, 2]),
-        f(R[1, 0]), f(R[1, 1]), f(R[1, 2]),
-        f(R[2, 0]), f(R[2, 1]), f(R[2, 2]),
-    )  # fmt: skip
-
-
 def block_adder(read_point: Any, robust: Any) -> Any:
-    """A kernel that adds a block of points to the sums (29,) of the normal equations.
+    """A kernel that adds points to the sums (29,) of the normal equations: in float32 within chunks.
 
     read_point(colors, i) gives three channels [8-bit levels] and a weight; robust(square, scale) gives, for a
     residual's squared length, its loss and its weight, which is the loss' derivative by half the square.
     """
 
-    @kernel
-    def add_block(X, Y, Z, colors, texels, width, R_cam_from_world, center_world, scale, sums):
-        r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_float32(R_cam_from_world)
-        t = center_world
-        tx, ty, tz = np.float32(t[0]), np.float32(t[1]), np.float32(t[2])
-        # An unsigned index needs no test for being negative; four bases and one 32-bit index gather fastest.
-        stride, W = np.int32(width + 2), np.float32(width)
-        right, below, below_right = texels[1:], texels[stride:], texels[stride + 1 :]
+    @inline_kernel
+    def add_chunk(points, count, colors, first, width, scale, sums):
         a00 = a01 = a02 = a03 = a04 = a05 = a11 = a12 = a13 = a14 = a15 = a22 = a23 = a24 = a25 = F0
-        a33 = a34 = a35 = a44 = a45 = a55 = g0 = g1 = g2 = g3 = g4 = g5 = total = count = F0
-        for n in range(len(X)):
-            dx, dy, dz = X[n] - tx, Y[n] - ty, Z[n] - tz
-            x = r00 * dx + r01 * dy + r02 * dz
-            y = r10 * dx + r11 * dy + r12 * dz
-            z = r20 * dx + r21 * dy + r22 * dz
+        a33 = a34 = a35 = a44 = a45 = a55 = g0 = g1 = g2 = g3 = g4 = g5 = total = loaded = F0
+        for n in range(count):
+            x, y, z, fu, fv = points.x[n], points.y[n], points.z[n], points.fu[n], points.fv[n]
+            t00, t10, t01, t11 = points.t00[n], points.t10[n], points.t01[n], points.t11[n]
             rho2 = x * x + y * y
-            at, fu, fv = texel_at(x, y, z, math.sqrt(rho2), width)
-            k = np.uintp(at)
-            t00, t10, t01, t11 = texels[k], right[k], below[k], below_right[k]
-            c0, c1, c2, weight = read_point(colors, n)
+            c0, c1, c2, weight = read_point(colors, np.uintp(first + n))
             weight *= is_valid(t00, t10, t01, t11)
             e0, u0, v0 = blend_with_gradient(t00, t10, t01, t11, fu, fv, 0)
             e1, u1, v1 = blend_with_gradient(t00, t10, t01, t11, fu, fv, 8)
@@ -64,13 +42,13 @@ def block_adder(read_point: Any, robust: Any) -> Any:
             e0, e1, e2 = e0 - c0, e1 - c1, e2 - c2
             loss, w = robust(e0 * e0 + e1 * e1 + e2 * e2, scale)
             total += weight * loss
-            count += weight
+            loaded += weight
             w *= weight
             guu = w * (u0 * u0 + u1 * u1 + u2 * u2)
             guv = w * (u0 * v0 + u1 * v1 + u2 * v2)
             gvv = w * (v0 * v0 + v1 * v1 + v2 * v2)
             bu, bv = w * (u0 * e0 + u1 * e1 + u2 * e2), w * (v0 * e0 + v1 * e1 + v2 * e2)
-            ux, uy, vx, vy, vz = pixel_jacobian(x, y, z, rho2, W)
+            ux, uy, vx, vy, vz = pixel_jacobian(x, y, z, rho2, width)
             # Rows [p x g, -g] of u and of v; du/dz is 0, and no turn about z moves v.
             p0, p1, p2, p3, p4 = -z * uy, z * ux, x * uy - y * ux, -ux, -uy
             q0, q1, q3, q4, q5 = y * vz - z * vy, z * vx - x * vz, -vx, -vy, -vz
@@ -108,10 +86,19 @@ def block_adder(read_point: Any, robust: Any) -> Any:
             g4 += p4 * bu + q4 * bv
             g5 += q5 * bv
         block = (
-            total, count, g0, g1, g2, g3, g4, g5, a00, a01, a02, a03, a04, a05, a11, a12, a13, a14, a15,
+            total, loaded, g0, g1, g2, g3, g4, g5, a00, a01, a02, a03, a04, a05, a11, a12, a13, a14, a15,
             a22, a23, a24, a25, a33, a34, a35, a44, a45, a55,
         )  # fmt: skip
         for m in range(NUM_SUMS):
             sums[m] += block[m]
 
-    return add_block
+    @kernel
+    def add_points(X, Y, Z, colors, texels, width, R_cam_from_world, center_world, scale, sums):
+        points = make_projected()
+        for lo in range(0, len(X), CHUNK):
+            hi = min(lo + CHUNK, len(X))
+            project(X[lo:hi], Y[lo:hi], Z[lo:hi], R_cam_from_world, center_world, width, points)
+            gather(texels, width, points, hi - lo)
+            add_chunk(points, hi - lo, colors, lo, np.float32(width), scale, sums)
+
+    return add_points

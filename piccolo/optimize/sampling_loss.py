@@ -5,8 +5,8 @@
 over the N' points that do not fall on masked pixels; colours in [0, 1], a mean of unsquared norms. Steps are
 those of normal_equations.
 
-Kernels sum float32 within blocks of 4,096 points; the blocks' sums are added in float64 in order. The result
-has the same bits for any number of threads.
+Kernels sum float32 within chunks of 512 points, and these in float64, in order, within blocks of 4,096 and
+over them. The result has the same bits for any number of threads.
 """
 
 import math
@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from ..cloud.soa import FARTHEST, PackedPoints
 from ..geometry.pose import Array, Pose
-from ..panorama.texels import Texels, bilinear_weights, blend, channel, is_valid, texel_at
+from ..panorama.projection import CHUNK, gather, make_projected, project
+from ..panorama.texels import Texels, bilinear_weights, blend, channel, is_valid
 from ..runtime.jit import F0, F1, inline_kernel, kernel
 from ..runtime.threads import Workers
-from .normal_equations import GRADIENT, MATRIX, NUM_SUMS, block_adder, rotation_float32
+from .normal_equations import GRADIENT, MATRIX, NUM_SUMS, block_adder
 
 BLOCK = 4096
 # A pose that hides more of the cloud behind masked pixels has no loss. Of a panorama valid in part, the least
@@ -33,37 +34,28 @@ TO_UNIT = 1.0 / 255.0
 @kernel
 def loss_blocks(x, y, z, rgbx, R_cam_from_world, center_world, texels, width, first_block, sums):
     """Write for each block (blocks, 2): the sum of the residual norms [8-bit levels], the count of points."""
-    R, t = R_cam_from_world, center_world
-    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_float32(R)
-    tx, ty, tz = np.float32(t[0]), np.float32(t[1]), np.float32(t[2])
-    stride = np.int32(width + 2)
-    # An unsigned index needs no test for being negative; four bases and one 32-bit index gather fastest.
-    right, below, below_right = texels[1:], texels[stride:], texels[stride + 1 :]
+    points = make_projected()
     for block in range(len(sums)):
-        lo = (first_block + block) * BLOCK
-        hi = min(len(x), lo + BLOCK)
-        # Slices counted from 0: a loop from `lo` keeps the test for negative indices in every load.
-        xs, ys, zs, cs = x[lo:hi], y[lo:hi], z[lo:hi], rgbx[lo:hi]
-        total = F0
-        count = F0
-        for i in range(hi - lo):
-            dx, dy, dz = xs[i] - tx, ys[i] - ty, zs[i] - tz
-            px = r00 * dx + r01 * dy + r02 * dz
-            py = r10 * dx + r11 * dy + r12 * dz
-            pz = r20 * dx + r21 * dy + r22 * dz
-            k, fu, fv = texel_at(px, py, pz, math.sqrt(px * px + py * py), width)
-            weights = bilinear_weights(fu, fv)
-            at = np.uintp(k)
-            t00, t10, t01, t11 = texels[at], right[at], below[at], below_right[at]
-            c = cs[i]
-            dr = blend(t00, t10, t01, t11, weights, 0) - channel(c, 0)
-            dg = blend(t00, t10, t01, t11, weights, 8) - channel(c, 8)
-            db = blend(t00, t10, t01, t11, weights, 16) - channel(c, 16)
-            counts = is_valid(t00, t10, t01, t11)
-            total += counts * math.sqrt(dr * dr + dg * dg + db * db)
-            count += counts
-        sums[block, 0] = total
-        sums[block, 1] = count
+        begin = (first_block + block) * BLOCK
+        end = min(len(x), begin + BLOCK)
+        sums[block] = 0.0
+        for lo in range(begin, end, CHUNK):
+            hi = min(lo + CHUNK, end)
+            project(x[lo:hi], y[lo:hi], z[lo:hi], R_cam_from_world, center_world, width, points)
+            gather(texels, width, points, hi - lo)
+            colors, total, count = rgbx[lo:hi], F0, F0
+            for n in range(hi - lo):
+                weights = bilinear_weights(points.fu[n], points.fv[n])
+                t00, t10, t01, t11 = points.t00[n], points.t10[n], points.t01[n], points.t11[n]
+                c = colors[n]
+                dr = blend(t00, t10, t01, t11, weights, 0) - channel(c, 0)
+                dg = blend(t00, t10, t01, t11, weights, 8) - channel(c, 8)
+                db = blend(t00, t10, t01, t11, weights, 16) - channel(c, 16)
+                counts = is_valid(t00, t10, t01, t11)
+                total += counts * math.sqrt(dr * dr + dg * dg + db * db)
+                count += counts
+            sums[block, 0] += total
+            sums[block, 1] += count
 
 
 @inline_kernel

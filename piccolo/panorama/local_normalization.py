@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from ..geometry.sphere import pixel_rays, solid_angles
 from ..runtime.jit import F0, F1, HALF, inline_kernel, kernel
 from . import Panorama
-from .texels import Texels, blend, is_valid, texels_around
+from .projection import CHUNK, gather, make_projected, project
+from .texels import Texels, bilinear_weights, blend, is_valid
 
 CLIP = 2.0  # deviations; what differs more from its surroundings counts no more
 MIN_DEVIATION = 0.03  # of a channel in [0, 1]: flatter surroundings are not amplified further
@@ -175,15 +176,21 @@ def normalize_panorama(panorama: Panorama, cell_deg: float, sigma_deg: float) ->
 @kernel
 def sample_channels(texels, width, directions, rotations, samples, validity):
     """Write channels (rotations, 3, cells), less the zero level, and validity along each turned direction."""
+    p, center, zero = make_projected(), np.zeros(3), np.float32(ZERO_LEVEL)
+    axes = directions.T.copy()
+    X, Y, Z = axes[0], axes[1], axes[2]
     for k in range(len(rotations)):
-        R = rotations[k]
-        for c in range(len(directions)):
-            d0, d1, d2 = directions[c, 0], directions[c, 1], directions[c, 2]
-            x = R[0, 0] * d0 + R[0, 1] * d1 + R[0, 2] * d2
-            y = R[1, 0] * d0 + R[1, 1] * d1 + R[1, 2] * d2
-            z = R[2, 0] * d0 + R[2, 1] * d1 + R[2, 2] * d2
-            (t00, t10, t01, t11), bilinear = texels_around(texels, x, y, z, width)
-            validity[k, c] = is_valid(t00, t10, t01, t11)
-            for ch in range(3):
-                value = blend(t00, t10, t01, t11, bilinear, 8 * ch) - np.float32(ZERO_LEVEL)
-                samples[k, ch, c] = value * validity[k, c]
+        for lo in range(0, len(X), CHUNK):
+            hi = min(lo + CHUNK, len(X))
+            project(X[lo:hi], Y[lo:hi], Z[lo:hi], rotations[k], center, width, p)
+            gather(texels, width, p, hi - lo)
+            s0, s1, s2 = samples[k, 0, lo:hi], samples[k, 1, lo:hi], samples[k, 2, lo:hi]
+            valid = validity[k, lo:hi]
+            for n in range(hi - lo):
+                bilinear = bilinear_weights(p.fu[n], p.fv[n])
+                t00, t10, t01, t11 = p.t00[n], p.t10[n], p.t01[n], p.t11[n]
+                v = is_valid(t00, t10, t01, t11)
+                s0[n] = v * (blend(t00, t10, t01, t11, bilinear, 0) - zero)
+                s1[n] = v * (blend(t00, t10, t01, t11, bilinear, 8) - zero)
+                s2[n] = v * (blend(t00, t10, t01, t11, bilinear, 16) - zero)
+                valid[n] = v

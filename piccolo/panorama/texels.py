@@ -1,6 +1,5 @@
 """The panorama as texels: one int32 a pixel, and the bilinear value and gradient at a continuous pixel."""
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -49,14 +48,6 @@ def texel_at(x, y, z, rho, width):
     u, v = u + HALF, v + HALF
     j, i = np.int32(u), np.int32(v)
     return np.int32(i * np.int32(width + 2) + j), u - np.float32(j), v - np.float32(i)
-
-
-@inline_kernel
-def texels_around(texels, x, y, z, width):
-    """The texels (0, 0), (1, 0), (0, 1), (1, 1) around a camera direction, and their bilinear weights."""
-    n, fu, fv = texel_at(x, y, z, math.sqrt(x * x + y * y), width)
-    stride = np.int32(width + 2)
-    return (texels[n], texels[n + 1], texels[n + stride], texels[n + stride + 1]), bilinear_weights(fu, fv)
 
 
 @inline_kernel
