@@ -33,6 +33,23 @@ def _places(hypotheses):
     return [round(float(h.pose.center_world[0]), 6) for h in hypotheses]
 
 
+# What is compared
+
+
+@pytest.mark.parametrize(
+    ("scores", "kept"),
+    [
+        ([0.6, 0.3, 0.16, 0.14], [0.6, 0.3, 0.16]),  # the best is plain: less than a quarter of it is nothing
+        ([0.05, 0.21, 0.04], [0.21]),
+        ([0.19, 0.03, 0.01], [0.19, 0.03, 0.01]),  # half hidden, perhaps: who knows what a comparison brings
+        ([], []),
+    ],
+)
+def test_faint_poses_are_compared_only_where_the_best_is_not_plain(scores, kept):
+    found = refinement.plain([_at(k, score) for k, score in enumerate(scores)])
+    assert sorted((h.score for h in found), reverse=True) == kept
+
+
 # The beam
 
 

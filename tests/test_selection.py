@@ -236,9 +236,8 @@ def test_matches_or_searches_can_be_taken_out(monkeypatch):
 
 def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
     scan_map = SimpleNamespace(octree=None, to_world=lambda pose: pose)
-    query = SimpleNamespace(
-        scan_map=scan_map, settings=CoarseToFineSettings(), matches=None, by_features=True, workers=Workers(1)
-    )
+    query = SimpleNamespace(scan_map=scan_map, settings=CoarseToFineSettings(), workers=Workers(1))
+    query.matches, query.by_features, query.panorama = None, True, rooms.scene(1)[1]
     counts = {0.0: 30, 1.0: 4, 2.0: 6}
     for name, value in {
         "points_around": lambda *_: None,

@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from ..cloud.soa import PackedPoints
 from ..confidence.alternatives import MAX_ALTERNATIVES
 from ..confidence.confidence import NOT_LOCALIZED, classify, posterior
 from ..confidence.localization import Alternative, Localization
 from ..confidence.occlusion import occlusion_at
-from ..confidence.score import Evidence, agreement_at
+from ..confidence.score import Agreement, Evidence, agreement_at
 from ..geometry.pose import Pose
 from ..local_features.hypotheses import count_matches, poses_of
 from ..local_features.matching import match
@@ -47,14 +46,16 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
     if settings.solver != "gauss-newton":
         how = DescentSettings(solver=settings.solver, step_size=LAST_STEP)
         pose = refine(points, sampling_loss_of(texels), pose, how).pose
-    loss = sampling_loss(visible_points(points, pose.center_world), texels, pose)
+    told: list[Callable[[], Any]] = [
+        lambda: sampling_loss(visible_points(points, pose.center_world), texels, pose),
+        lambda: occlusion_at(points, panorama, pose).fractions(),
+        lambda: estimate_covariance(query, pose),
+        lambda: agreement_of(query, pose),
+    ]
+    loss, fractions, covariance, agreement = query.workers.map(lambda tell: tell(), told, "evaluate")
     if not math.isfinite(loss):
         return Localization()
-    told: list[Callable[[], Any]] = [
-        lambda: evidence_of(query, points, panorama, pose, found),
-        lambda: estimate_covariance(query, pose),
-    ]
-    evidence, covariance = query.workers.map(lambda tell: tell(), told, "evaluate")
+    evidence = evidence_of(query, found, agreement, fractions)
     reported = found.alternatives[:MAX_ALTERNATIVES]
     standings = standings_of(query, found.best, reported)
     probabilities = posterior(standings, covariance)
@@ -79,24 +80,24 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
     )
 
 
-def evidence_of(
-    query: Query, points: PackedPoints, panorama: Panorama, pose: Pose, found: SearchResult
-) -> Evidence:
-    """What a result tells of the pose it reports, which the last descent made of the best one found.
+def agreement_of(query: Query, pose: Pose) -> Agreement:
+    """How well the scan at a pose explains the photo, by wide cells."""
+    points = points_around(query.scan_map.octree, pose.center_world, COARSE_VOXEL_PER_RANGE)
+    return agreement_at(points, query.panorama, pose)
 
-    The points are those around it.
-    """
-    coarse = points_around(query.scan_map.octree, pose.center_world, COARSE_VOXEL_PER_RANGE)
-    at_pose = agreement_at(coarse, panorama, pose)
-    explained, contradicted = occlusion_at(points, panorama, pose).fractions()
+
+def evidence_of(
+    query: Query, found: SearchResult, agreement: Agreement, fractions: tuple[float, float]
+) -> Evidence:
+    """What a result tells of its pose: fractions of the photo are explained and contradicted."""
     num_matches = [count_matches(query.matches, h.pose) for h in (found.best, *found.alternatives)]
     return Evidence(
         score=found.best.score,
         margin=found.margin,
-        agreement=at_pose.value,
-        explained_fraction=explained,
-        contradicted_fraction=contradicted,
-        seen_fraction=at_pose.seen_fraction,
+        agreement=agreement.value,
+        explained_fraction=fractions[0],
+        contradicted_fraction=fractions[1],
+        seen_fraction=agreement.seen_fraction,
         num_matches=num_matches[0] if query.by_features else None,
         alternative_matches=max(num_matches[1:], default=0) if query.by_features else None,
     )

@@ -27,28 +27,42 @@ def node_fraction(node):
     return np.float32(h ^ (h >> U16)) * np.float32(2.0**-32)
 
 
-@kernel
-def take_children(tree, center, nodes, cells, ranges, limits, kept, found, offsets):
-    """Write the children of visible nodes, or those without any, and their offsets (3, N), thinned by `kept`.
-
-    Each is kept or left out by its own number, so that a camera a little farther on sees nearly the same
-    points: a descent that is begun again from where it ended then ends there. Returns how many.
-    """
-    cx, cy, cz = np.float32(center[0]), np.float32(center[1]), np.float32(center[2])
-    count = 0
+@inline_kernel
+def keep_visible(tree, nodes, cells, ranges, limits):
+    """Put the visible ones of some nodes first. Returns how many these are, and their children."""
+    count = num_children = 0
     for i in range(len(cells)):
-        if ranges[i] > limits[cells[i], 7]:
-            continue
-        first, last = tree.first_child[nodes[i]], tree.first_child[nodes[i] + 1]
+        if ranges[i] <= limits[cells[i], 7]:
+            node = nodes[i]
+            nodes[count] = node
+            count += 1
+            num_children += max(tree.first_child[node + 1] - tree.first_child[node], 1)
+    return count, num_children
+
+
+@inline_kernel
+def take_children(tree, nodes, kept, found):
+    """Write the children of some nodes, or those without any, each with the probability `kept`; how many.
+
+    Each is kept or left out by a number of its parent's, so that a camera a little farther on sees nearly the
+    same points: a descent that is begun again from where it ended then ends there.
+    """
+    count = 0
+    for i in range(len(nodes)):
+        node = nodes[i]
+        drawn = node_fraction(node) / kept  # a child's share of [0, 1) is `kept`, where they fit in
+        first, last = tree.first_child[node], tree.first_child[node + 1]
         if first == last:
-            first, last = nodes[i], nodes[i] + 1
-        for node in range(first, last):
-            if node_fraction(node) < kept and count < len(found):
-                found[count] = node
-                offsets[0, count] = tree.nodes[node, 0] - cx
-                offsets[1, count] = tree.nodes[node, 1] - cy
-                offsets[2, count] = tree.nodes[node, 2] - cz
+            first, last = node, node + 1
+        if np.float32(last - first) * kept <= F1:
+            if drawn < np.float32(last - first) and count < len(found):
+                found[count] = first + np.int32(drawn)
                 count += 1
+        else:
+            for child in range(first, last):
+                if node_fraction(child) < kept and count < len(found):
+                    found[count] = child
+                    count += 1
     return count
 
 
@@ -66,14 +80,13 @@ def render_points(tree, center, voxel_per_range, view, scratch, shown, offsets, 
     n = render_cells(tree, center, 2.0 * voxel_per_range, view, scratch, shown, *around)
     for c in range(num_cells):  # how far what is seen reaches; nothing of cells that are not shown
         sums[c, 7] = sums[c, 7] * view.visible + VISIBLE_OFFSET if cell_weights[c] > F0 else F0
-    num_visible = 0
-    for i in range(n):
-        if s.ranges[i] <= sums[s.cells[i], 7]:
-            node = s.nodes[i]
-            num_visible += max(tree.first_child[node + 1] - tree.first_child[node], 1)
+    n, num_visible = keep_visible(tree, s.nodes, s.cells[:n], s.ranges, sums)
     kept = np.float32(FILLED * len(weights) / max(num_visible, 1))
     found = np.empty(len(weights), np.int32)
-    n = take_children(tree, center, s.nodes, s.cells[:n], s.ranges, sums, kept, found, offsets)
+    n = take_children(tree, s.nodes[:n], kept, found)
+    for i in range(n):
+        for k in range(3):
+            offsets[k, i] = tree.nodes[found[i], k] - np.float32(center[k])
     cells, ranges, turns = np.empty(n, np.int32), np.empty(n, np.float32), np.empty(n, np.float32)
     x, y, z = offsets[0, :n], offsets[1, :n], offsets[2, :n]
     locate(x, y, z, view.num_columns, view.first, cells, ranges, turns)

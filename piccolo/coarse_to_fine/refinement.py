@@ -23,6 +23,7 @@ PERTURBATION = 0.4  # of that on middle cells, on fine ones
 MAX_UNOCCLUDED = 2  # times that occluders are looked for
 MAX_PERTURBATIONS, MIN_GAIN = 5, 0.02  # rounds; by the score in one, else it was the last
 NUM_FOUND = 12  # poses of a search, at most
+PLAIN_SCORE, FAINT_PART = 0.2, 0.25  # where the best has this score, no more is asked of what has less of it
 NUM_POINTS = 30_000  # for the last millimetres, in what the photo shows
 MAX_LAST_ROUNDS, SETTLED = 6, 1e-4  # [m] a camera that moves by less in a round has arrived
 NEARLY = 0.02  # [m] and one that does by less sees the same points
@@ -179,10 +180,17 @@ def refine(query: Query, starts: Starts, beam: Beam) -> list[Hypothesis]:
     perturbed = each(perturb_middle, narrow(middle, beam.num_fine))
     fine = each(descend_fine, narrow(perturbed, beam.num_fine))
     best = best_distinct(fine, beam.num_perturbed, CLOSE_DISTANCE, SAME_ANGLE)
-    return by_score(each(compared, distinct([*each(refine_by_perturbation, best), *fine], middle)))
+    return by_score(each(compared, plain(distinct([*each(refine_by_perturbation, best), *fine], middle))))
 
 
 def distinct(fine: Sequence[Hypothesis], middle: Sequence[Hypothesis]) -> list[Hypothesis]:
     """The best on fine cells, and the best of those on middle cells, none near another."""
     ranked = [*by_score(fine), *by_score(middle)]
     return suppressed(ranked, NUM_FOUND, MIN_DISTANCE, MIN_ANGLE)
+
+
+def plain(ranked: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Those that a comparison could bring near the best: all, unless it is good and they are far from it."""
+    best = max((h.score for h in ranked), default=0.0)
+    least = FAINT_PART * best if best >= PLAIN_SCORE else -math.inf
+    return [h for h in ranked if h.score >= least]

@@ -70,14 +70,42 @@ def blur_sphere(image: NDArray[np.float32], sigma_deg: float) -> NDArray[np.floa
 def block_moments(channels, weight, moments):
     """Write (h, w, 7): weighted sums of 1, the channels and their squares over equal blocks of the image."""
     step = channels.shape[0] // moments.shape[0]
-    moments[:] = 0
-    for i in range(channels.shape[0]):
-        for j in range(channels.shape[1]):
-            m, w = moments[i // step, j // step], weight[i, j]
-            m[0] += w
-            for c in range(3):
-                m[1 + c] += w * channels[i, j, c]
-                m[4 + c] += w * channels[i, j, c] * channels[i, j, c]
+    for i in range(moments.shape[0]):
+        for j in range(moments.shape[1]):
+            m0 = m1 = m2 = m3 = m4 = m5 = m6 = F0
+            for k in range(i * step, (i + 1) * step):
+                for n in range(j * step, (j + 1) * step):
+                    w, a, b, c = weight[k, n], channels[k, n, 0], channels[k, n, 1], channels[k, n, 2]
+                    m0 += w
+                    m1 += w * a
+                    m2 += w * b
+                    m3 += w * c
+                    m4 += w * a * a
+                    m5 += w * b * b
+                    m6 += w * c * c
+            m = moments[i, j]
+            m[0], m[1], m[2], m[3], m[4], m[5], m[6] = m0, m1, m2, m3, m4, m5, m6
+
+
+@inline_kernel
+def interpolation_along(num, num_wider):
+    """Where each of `num` pixels lies among fewer, wider ones around a row: indices (num,) and fractions."""
+    left, right, fraction = np.empty(num, np.uintp), np.empty(num, np.uintp), np.empty(num, np.float32)
+    per = np.float32(num_wider) / np.float32(num)
+    for j in range(num):
+        u = (np.float32(j) + HALF) * per - HALF
+        whole = math.floor(u)
+        fraction[j] = u - np.float32(whole)
+        left[j] = np.uintp(np.int64(whole) % num_wider)
+        right[j] = np.uintp((np.int64(whole) + 1) % num_wider)
+    return left, right, fraction
+
+
+@inline_kernel
+def as_texel_channel(value, mean, gain, shift):
+    """A channel's bits of a texel: its normalised value in levels."""
+    level = np.int32(zscore(value, mean, gain) * np.float32(LEVELS_PER_UNIT) + np.float32(ZERO_LEVEL + 0.5))
+    return min(level, np.int32(255)) << np.int32(shift)
 
 
 @kernel
@@ -88,29 +116,27 @@ def pack_normalized(channels, weight, stats, texels):
     and a row clamped on each side.
     """
     height, width = weight.shape
-    per = np.float32(stats.shape[1]) / np.float32(width)
+    num_rows, num_columns = stats.shape[0], stats.shape[1]
+    left, right, fraction = interpolation_along(width, num_columns)
+    wide, along = np.empty((6, num_columns), np.float32), np.empty((6, width), np.float32)
+    per = np.float32(num_columns) / np.float32(width)
     for i in range(height):
-        v = min(max((np.float32(i) + HALF) * per - HALF, F0), np.float32(stats.shape[0] - 1))
-        i0 = min(np.int32(v), stats.shape[0] - 2)
+        v = min(max((np.float32(i) + HALF) * per - HALF, F0), np.float32(num_rows - 1))
+        i0 = min(np.int32(v), num_rows - 2)
         fv = v - np.float32(i0)
+        for j in range(num_columns):
+            for c in range(6):
+                wide[c, j] = stats[i0, j, c] + fv * (stats[i0 + 1, j, c] - stats[i0, j, c])
+        for c in range(6):
+            for j in range(width):
+                at = wide[c, left[j]]
+                along[c, j] = at + fraction[j] * (wide[c, right[j]] - at)
+        row = texels[i + 1, 1 : width + 1]
         for j in range(width):
-            u = (np.float32(j) + HALF) * per - HALF
-            j0 = np.int32(math.floor(u))
-            fu = u - np.float32(j0)
-            j1 = (j0 + 1) % stats.shape[1]
-            j0 = j0 % stats.shape[1]
-            texel = np.int32(0)
-            for c in range(3):
-                mean = (F1 - fv) * ((F1 - fu) * stats[i0, j0, c] + fu * stats[i0, j1, c])
-                mean += fv * ((F1 - fu) * stats[i0 + 1, j0, c] + fu * stats[i0 + 1, j1, c])
-                gain = (F1 - fv) * ((F1 - fu) * stats[i0, j0, 3 + c] + fu * stats[i0, j1, 3 + c])
-                gain += fv * ((F1 - fu) * stats[i0 + 1, j0, 3 + c] + fu * stats[i0 + 1, j1, 3 + c])
-                value = zscore(channels[i, j, c], mean, gain)
-                level = np.int32(value * np.float32(LEVELS_PER_UNIT) + np.float32(ZERO_LEVEL + 0.5))
-                texel |= min(level, np.int32(255)) << np.int32(8 * c)
-            if weight[i, j] > HALF:
-                texel |= np.int32(1 << 24)
-            texels[i + 1, j + 1] = texel
+            texel = as_texel_channel(channels[i, j, 0], along[0, j], along[3, j], 0)
+            texel |= as_texel_channel(channels[i, j, 1], along[1, j], along[4, j], 8)
+            texel |= as_texel_channel(channels[i, j, 2], along[2, j], along[5, j], 16)
+            row[j] = texel | (np.int32(1 << 24) if weight[i, j] > HALF else np.int32(0))
         texels[i + 1, 0], texels[i + 1, width + 1] = texels[i + 1, width], texels[i + 1, 1]
     texels[0], texels[height + 1] = texels[1], texels[height]
 

@@ -6,6 +6,7 @@ they must leave alone and the patches that they find.
 """
 
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -125,7 +126,7 @@ def polar_disc(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], pole: str) -
 def _edge_circle(cap: NDArray[np.float32]) -> int:
     """Number of rows from the pole (row 0) to the outermost circle that is an edge, 0 if there is none."""
     pairs = (cap[1:] + cap[:-1]) / 2.0
-    is_step = np.abs(pairs[2:] - pairs[:-2]).max(axis=2) > MIN_STEP
+    is_step = (cv2.absdiff(pairs[2:], pairs[:-2]) > MIN_STEP) @ np.ones(3, np.bool_)
     fraction = np.concatenate([[0.0, 0.0], is_step.mean(axis=1)])  # fraction[k]: k rows are inside
     for k in CANDIDATES:
         near = np.concatenate([fraction[max(k - 8, 0) : k - 2], fraction[k + 3 : k + 9]])
@@ -134,14 +135,20 @@ def _edge_circle(cap: NDArray[np.float32]) -> int:
     return 0
 
 
-def _detail_circle(cap: NDArray[np.float32]) -> int:
-    """Number of rows from the pole (row 0) to the outermost circle at which all detail ends, 0 if none."""
-    grey = cap.mean(axis=2)
+@lru_cache(maxsize=1)
+def _neighbors_around() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Flat indices (NUM_ROWS, DISC_WIDTH) of the pixels DETAIL_DEG east and west of each."""
     around = np.sin(np.radians((np.arange(NUM_ROWS) + 0.5) / ROWS_PER_DEG))
     spacing = np.clip(np.round(DETAIL_DEG * ROWS_PER_DEG / around), 1, DISC_WIDTH // 8).astype(int)
     rows, columns = np.arange(NUM_ROWS)[:, None], np.arange(DISC_WIDTH)
     east, west = ((columns + sign * spacing[:, None]) % DISC_WIDTH for sign in (1, -1))
-    second = grey[rows, east] + grey[rows, west] - 2.0 * grey
+    return rows * DISC_WIDTH + east, rows * DISC_WIDTH + west
+
+
+def _detail_circle(cap: NDArray[np.float32]) -> int:
+    """Number of rows from the pole (row 0) to the outermost circle at which all detail ends, 0 if none."""
+    grey, (east, west) = cv2.transform(cap, np.full((1, 3), 1.0 / 3.0)), _neighbors_around()
+    second = grey.ravel()[east] + grey.ravel()[west] - 2.0 * grey
     detail = np.abs(second).reshape(NUM_ROWS, NUM_SECTORS, -1).mean(axis=2)
     ends = np.cumsum(np.concatenate([np.zeros((1, NUM_SECTORS)), detail]), axis=0)
     within = (ends[NEAR_ROWS:] - ends[:-NEAR_ROWS]) / NEAR_ROWS  # mean of the NEAR_ROWS from each row on
