@@ -162,3 +162,24 @@ def test_truth_is_among_the_poses_of_a_place_that_repeats(kind):
     assert min(distances) < 0.1
     assert result.status == "ambiguous" or distances[0] < 0.1
     assert 1 <= len(result.alternatives) <= 5
+
+
+def test_a_point_at_a_pole_of_the_photo_tells_nothing(found, monkeypatch):
+    """Its pixels are so narrow that it would outweigh all others."""
+    prepared, pose, result = found
+    taken = covariance.points_at(prepared, pose)
+    down = -pose.R_cam_from_world[2] + 0.002 * pose.R_cam_from_world[0]
+    away = -pose.R_cam_from_world[2] + 0.1 * pose.R_cam_from_world[0]
+    wrong = np.array([2.0, -2.0, 2.0], np.float32)
+
+    def with_one_at(direction):
+        offsets = np.concatenate([taken.offsets, 1.5 * direction[:, None]], axis=1).astype(np.float32)
+        channels = np.concatenate([taken.channels, wrong[:, None]], axis=1)
+        return type(taken)(offsets, channels, np.ones(offsets.shape[1], np.float32))
+
+    assert with_one_at(away).weights.sum() == with_one_at(down).weights.sum()
+    kept = [len(covariance.without_poles(with_one_at(d), pose).weights) for d in (down, away)]
+    assert kept[1] == kept[0] + 1
+    monkeypatch.setattr(covariance, "points_at", lambda query, pose: with_one_at(down))
+    told = covariance.estimate_covariance(prepared, pose).matrix
+    np.testing.assert_allclose(told, result.covariance.matrix, rtol=0.02)

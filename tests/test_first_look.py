@@ -9,6 +9,7 @@ import rooms
 
 from piccolo.coarse_to_fine import first_look, query, refinement
 from piccolo.coarse_to_fine import localize as method
+from piccolo.coarse_to_fine.camera_positions import COARSE_SPACING
 from piccolo.coarse_to_fine.query import prepare_query
 from piccolo.coarse_to_fine.search import search_poses
 from piccolo.coarse_to_fine.search_result import SearchResult
@@ -16,6 +17,7 @@ from piccolo.coarse_to_fine.settings import CoarseToFineSettings, Prior
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.confidence.confidence import LOCALIZED
 from piccolo.geometry.pose import Pose, exp_so3, is_correct
+from piccolo.local_features.matching import NO_MATCHES
 from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers
 
@@ -110,3 +112,34 @@ def test_the_first_score_tells_a_photo_from_its_mirror():
     mirror = first_look.mirrored(asked)
     own, other = (refinement.first_score(q, search_poses(q, "known")) for q in (asked, mirror))
     assert own > 1.5 * other > 0.0
+
+
+@pytest.mark.parametrize(
+    ("gravity", "brief"),
+    [("auto", {"num_rotations": 1000, "max_starts": 300}), ("unknown", {})],
+)
+def test_a_tilted_sphere_without_features_is_found_by_whole_views(monkeypatch, gravity, brief):
+    """With the gravity `auto`, where the upright search came first, by a brief search."""
+    made = []
+
+    def searched(query, gravity):
+        made.append((gravity, query.settings, len(query.scan_map.sparse)))
+        return search_poses(query, gravity)
+
+    monkeypatch.setattr(method, "search_poses", searched)
+    monkeypatch.setattr(query, "match", lambda *_: NO_MATCHES)
+    taken, settings = rooms.query(1, "tilt"), CoarseToFineSettings(gravity=gravity)
+    found = _localized(rooms.as_panorama(taken.rgb), settings)
+    assert is_correct(found.pose, taken.pose)
+    how, asked, num_searched = made[-1]
+    num_candidates = len(rooms.scan_map(1).sparse)
+    assert (how, asked) == ("unknown", replace(settings, **brief))
+    assert 0.3 < num_searched / num_candidates < 0.7 if brief else num_searched == num_candidates
+
+
+def test_a_brief_search_keeps_what_little_a_prior_leaves():
+    one = rooms.scan_map(1).narrowed(np.arange(len(rooms.scan_map(1).sparse)) == 3)
+    for moved in (0.0, COARSE_SPACING):
+        there = replace(one, centers=np.add(one.centers, [moved, 0.0, 0.0]))
+        asked = replace(_query(rooms.as_panorama(rooms.query(1).rgb)), scan_map=there)
+        assert first_look.tilted_query(asked).scan_map.sparse.tolist() == there.sparse.tolist()

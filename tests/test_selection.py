@@ -94,6 +94,26 @@ def test_of_faint_poses_one_alternative_is_refined(monkeypatch, best, num_matche
 
 
 @pytest.mark.parametrize(
+    ("best", "num_matches", "done"),
+    [
+        (0.5, 20, ["unoccluded", "settled"]),  # which refines it at full resolution
+        (0.09, 6, ["unoccluded", "settled"]),
+        (0.09, 5, ["full"]),  # never localized
+        (0.019, 20, []),
+    ],
+)
+def test_how_a_pose_without_rivals_is_finished(monkeypatch, best, num_matches, done):
+    made = []
+    query = _compared(monkeypatch, {0.0: 0.5, 9.0: 0.01}, {0.0: num_matches, 9.0: 0})
+    monkeypatch.setattr(method, "refine_full_resolution", lambda query, h, _: made.append("full") or h)
+    monkeypatch.setattr(method, "refine_unoccluded", lambda query, h: made.append("unoccluded") or (query, h))
+    monkeypatch.setattr(method, "settle", lambda query, h: made.append("settled") or h)
+    found = method.finished(query, [_at(0.0, best), _at(9.0, 0.1 * best)])
+    assert made == done
+    assert _places([found.best, *found.alternatives]) == [0.0, 9.0]
+
+
+@pytest.mark.parametrize(
     ("explains", "matches", "best"),
     [
         ((0.5, 0.5), (20, 20), 0.0),  # by score
@@ -197,6 +217,7 @@ def _run(monkeypatch, matched, searches, gravity="auto", config=METHOD):
     monkeypatch.setattr(method, "search_poses", search_poses)
     monkeypatch.setattr(method, "refine", lambda query, starts, beam: left.pop(0))
     monkeypatch.setattr(method, "refine_full_resolution", lambda query, h, num_rounds: h)
+    monkeypatch.setattr(method, "refine_unoccluded", lambda query, h: (query, h))
     monkeypatch.setattr(method, "settle", lambda query, h: Hypothesis(h.pose, h.score + 0.001))
     monkeypatch.setattr(method, "evaluate", lambda query, panorama, found: found)
     settings = CoarseToFineSettings(gravity=gravity)

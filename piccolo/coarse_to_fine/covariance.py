@@ -22,6 +22,7 @@ from .view import Cells
 BLOCK_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
 MOST_SHARE = 1.001  # of a block in what fixes the pose, a little above 1 for one that does alone
 PIXEL_SHARE = 0.04  # of a pixel that is left in a pose, by trials with photos of 256 and 2048 px
+POLE_DEG = 2.0  # around the photo's poles pixels are so narrow that one point's errors outweigh all others
 SCALE = FULL_LOSS * LEVELS_PER_UNIT
 
 
@@ -59,6 +60,13 @@ def symmetric(upper: Array) -> Array:
     rows, columns = np.triu_indices(6)
     matrix[..., rows, columns] = matrix[..., columns, rows] = upper
     return matrix
+
+
+def without_poles(points: Cells, pose: Pose) -> Cells:
+    """The points that are not within POLE_DEG of the photo's poles, seen from the pose."""
+    heights, ranges = pose.R_cam_from_world[2] @ points.offsets, np.linalg.norm(points.offsets, axis=0)
+    is_kept = np.abs(heights) < math.cos(math.radians(POLE_DEG)) * ranges
+    return Cells(*(np.ascontiguousarray(values[..., is_kept]) for values in points))
 
 
 def hessian_at(image: Texels, points: Cells, pose: Pose, steps: DifferenceSteps) -> Array:
@@ -150,7 +158,7 @@ def errors_of_source(query: Query, points: Cells) -> Array:
 def estimate_covariance(query: Query, pose: Pose) -> PoseCovariance | None:
     """The covariance of a pose, in world axes; None where the points do not fix it."""
     query = without_occluders(query, pose)
-    points = points_at(query, pose)
+    points = without_poles(points_at(query, pose), pose)
     points = points._replace(channels=as_levels(points.channels))
     covariance = covariance_at(query, points, pose)
     if covariance is None:

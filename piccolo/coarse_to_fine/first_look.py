@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..confidence.alternatives import Hypothesis
+from .camera_positions import COARSE_SPACING
 from .config import Beam
 from .query import Query
 from .refinement import NUM_SCORED, first_score
@@ -23,6 +24,7 @@ CLEAR_SCORE, CLEAR_MARGIN = 0.3, 0.5  # at least, see docs/METHOD.md
 MIRROR_RATIO = 1.1  # of the first scores, the photo as it is by its mirrored picture
 NUM_COMPARED = 8
 FIRST_STARTS, FIRST_BEAM = 300, Beam(100, 12, 4, 1)  # few: what is clear is found by them
+FIRST_ROTATIONS = 1000  # of SO(3)
 
 
 def is_whole(query: Query) -> bool:
@@ -34,6 +36,24 @@ def first_query(query: Query) -> Query:
     """The query as it is first asked: by whole views alone, from few starts."""
     num_starts = min(FIRST_STARTS, query.settings.max_starts)
     return replace(query, settings=replace(query.settings, max_starts=num_starts), by_features=False)
+
+
+def tilted_query(query: Query) -> Query:
+    """The query of a whole photo that was searched as upright, as it is then asked with any tilt: briefly.
+
+    In every other cell of the grid, by few rotations, from few starts. Tilted photos that hide nothing are
+    found so, others by their features.
+    """
+    scan_map, settings = query.scan_map, query.settings
+    cells = np.floor(scan_map.centers[scan_map.sparse] / COARSE_SPACING).astype(np.int64)
+    is_even = cells.sum(axis=1) % 2 == 0
+    num_rotations = min(FIRST_ROTATIONS, settings.num_rotations)
+    settings = replace(
+        settings, max_starts=min(FIRST_STARTS, settings.max_starts), num_rotations=num_rotations
+    )
+    return replace(
+        query, scan_map=scan_map.narrowed(is_even) if is_even.any() else scan_map, settings=settings
+    )
 
 
 def is_clear(query: Query, starts: Starts, hypotheses: Sequence[Hypothesis]) -> bool:

@@ -16,10 +16,10 @@ from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from .config import METHOD, Beam, MethodConfig
 from .evaluation import evaluate
-from .first_look import FIRST_BEAM, first_query, is_clear, is_whole
+from .first_look import FIRST_BEAM, first_query, is_clear, is_whole, tilted_query
 from .prior import apply_prior, is_allowed, nothing_allowed
 from .query import Query, prepare_query
-from .refinement import refine, refine_full_resolution, refine_matched, settle
+from .refinement import refine, refine_full_resolution, refine_matched, refine_unoccluded, settle
 from .scan_map import ScanMap
 from .search import search_poses
 from .search_result import NEAR_RATIO, SURE_MATCHES, SearchResult, found_among
@@ -47,8 +47,8 @@ def localize(
     """Where the panorama was taken: search, refine, match features, compare with the alternatives, evaluate.
 
     A whole upright sphere that is clear by whole views needs no more. Else come the poses that matches vote
-    for, and where they leave doubt, whole views: with the gravity `auto` as known, then as unknown, until one
-    is sure.
+    for, and where they leave doubt, whole views: with the gravity `auto` as known, then as unknown (briefly,
+    of a whole sphere), until one is sure.
     """
     candidates = apply_prior(scan_map, settings.prior)
     if len(candidates.sparse) == 0 or not panorama.is_valid.any():
@@ -61,7 +61,8 @@ def localize(
     gravities: list[Literal["known", "unknown"]]
     gravities = ["known", "unknown"] if settings.gravity == "auto" else [settings.gravity]
     gravities = gravities if method.uses_search else []
-    if method.uses_features and is_whole(query) and gravities:
+    is_looked_at = method.uses_features and is_whole(query) and len(gravities) > 0
+    if is_looked_at:
         first = first_query(query)
         starts, hypotheses = searched(first, "known", FIRST_BEAM, watch)
         with watch.stage("search"):
@@ -72,7 +73,9 @@ def localize(
     for gravity in gravities if query.by_features else []:
         if is_sure(query, hypotheses):
             break
-        hypotheses += searched(query, gravity, method.beam, watch)[1]
+        is_brief = is_looked_at and gravity == "unknown"
+        asked, beam = (tilted_query(query), FIRST_BEAM) if is_brief else (query, method.beam)
+        hypotheses += searched(asked, gravity, beam, watch)[1]
     with watch.stage("refine"):
         return evaluate(query, panorama, finished(query, hypotheses))
 
@@ -108,16 +111,21 @@ def finished(query: Query, hypotheses: Sequence[Hypothesis]) -> SearchResult:
     def matches_of(h: Hypothesis) -> int:
         return count_matches(query.matches, h.pose)
 
+    def is_faint(h: Hypothesis) -> bool:
+        return h.score < FAINT_SCORE and matches_of(h) < FAINT_MATCHES
+
     found = found_among(hypotheses, ALTERNATIVES_COMPARED)
     if found.best.score < HOPELESS_SCORE:
         return found
-    is_faint = found.best.score < FAINT_SCORE and matches_of(found.best) < FAINT_MATCHES
     least = max(NEAR_MATCHES * matches_of(found.best), SURE_MATCHES)
     is_near = [h.score > NEAR_RATIO * found.best.score or matches_of(h) >= least for h in found.alternatives]
-    near = list(compress(found.alternatives, is_near))[: 1 if is_faint else ALTERNATIVES_REFINED]
+    near = list(compress(found.alternatives, is_near))[: 1 if is_faint(found.best) else ALTERNATIVES_REFINED]
+    if not near and not is_faint(found.best):
+        return settled(query, replace(found, best=refine_unoccluded(query, found.best)[1]))
     ends = list(query.workers.map(refined, [found.best, *near], "descend"))
     far = [h for h in found.alternatives if not any(h is other for other in near)]
-    return settled(query, fairly_selected(query, found_among([*ends, *far], ALTERNATIVES_COMPARED)))
+    found = fairly_selected(query, found_among([*ends, *far], ALTERNATIVES_COMPARED))
+    return found if is_faint(found.best) else settled(query, found)
 
 
 def settled(query: Query, found: SearchResult) -> SearchResult:

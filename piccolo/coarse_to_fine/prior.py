@@ -1,7 +1,6 @@
 """What the user knows beforehand, as fewer positions and fewer rotations."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,13 +56,7 @@ def apply_prior(scan_map: ScanMap, prior: Prior) -> ScanMap:
         is_allowed &= mask
     if is_allowed.all():
         return scan_map
-    kept = np.isin(scan_map.sparse, scan_map.searched_for[is_allowed])
-    return replace(
-        scan_map,
-        sparse=scan_map.sparse[kept],
-        wide_features=scan_map.wide_features[kept],
-        wide_seen=scan_map.wide_seen[kept],
-    )
+    return scan_map.narrowed(np.isin(scan_map.sparse, scan_map.searched_for[is_allowed]))
 
 
 def allowed_rotations(

@@ -64,6 +64,15 @@ class ScanMap:
         first, cell = sparse_candidates(self.centers)
         return first[cell]
 
+    def narrowed(self, is_kept: NDArray[np.bool_]) -> "ScanMap":
+        """The same in which some (sparse,) of the candidates are searched."""
+        return replace(
+            self,
+            sparse=self.sparse[is_kept],
+            wide_features=self.wide_features[is_kept],
+            wide_seen=self.wide_seen[is_kept],
+        )
+
     @property
     def lacks_features(self) -> bool:
         """True if no view was looked at for local features, though there are some."""
