@@ -10,10 +10,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from rooms import write_room
+from rooms import query, scan_map, write_room
 
 from piccolo.cli import start
 from piccolo.cli.parser import COMMANDS
+from piccolo.coarse_to_fine.map_file import save_map
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -156,3 +157,21 @@ def test_a_mask_that_hides_all_is_refused(scene, tmp_path):
     code, out, err = _shell("", *_command("localize.py", *files, "--no-cache"))
     assert (code, json.loads(out)["status"]) == (3, "unreadable")
     assert "no pixel is left: all are masked" in err
+
+
+def test_a_photo_in_a_prepared_map_does_not_wait_for_scipy(tmp_path):
+    """It takes longer to import than the photo."""
+    prepared, image = tmp_path / "a.map", tmp_path / "a.png"
+    save_map(scan_map(1), prepared)
+    cv2.imwrite(str(image), query(1).rgb[..., ::-1])
+    code = f"""
+import sys
+from piccolo.cli.localize import main
+sys.argv = ["localize.py", "--cloud", {str(prepared)!r}, "--pano", {str(image)!r}, "--quiet"]
+code = main()
+assert not {{"scipy.spatial", "scipy.sparse", "scipy.optimize"}} & set(sys.modules)
+sys.exit(code)
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert json.loads(done.stdout)["storey"] == 1

@@ -4,7 +4,7 @@ from rooms import scan_map
 
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.stream import Cloud
-from piccolo.coarse_to_fine.storeys import find_storeys
+from piccolo.coarse_to_fine.storeys import Storey, find_storeys
 
 
 def _octree(*parts):
@@ -92,3 +92,17 @@ def test_a_scanned_room_has_its_floor_at_its_own_height():
     assert (storey == 0).all()
     error = np.abs(height - m.centers[:, 2] - m.origin_world[2])
     assert np.percentile(error, 97.0) < 0.02  # others are above the middle of a large table
+
+
+def test_nearest_surfaces_are_those_of_all():
+    rng = np.random.default_rng(2)
+    surfaces = (rng.uniform(0, 1, (900, 3)) * [30, 20, 0.1]).astype(np.float32)
+    surfaces = np.asfortranarray(surfaces[np.argsort(surfaces[:, 0])])
+    floor = Storey(0.0, surfaces)
+    for center in ([15.0, 10.0, 1.5], [0.0, 0.0, 1.5], [-40.0, 10.0, 1.5], [29.9, 90.0, 1.5]):
+        beside = np.hypot(*(surfaces[:, :2] - np.float32(center[:2])).T)
+        for count in (1, 40, 1000):
+            distance, heights = floor.nearest(np.array(center), count)
+            order = np.argsort(beside, kind="stable")[:count]
+            np.testing.assert_allclose(distance, beside[order], rtol=1e-5)
+            np.testing.assert_array_equal(heights, surfaces[order, 2])

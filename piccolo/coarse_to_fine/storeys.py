@@ -1,6 +1,6 @@
 """The storeys of a building: level surfaces that people can stand on, one above the other."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,6 +21,7 @@ LEAST_OVERLAP = 0.15  # of the smaller floor; below, two are one storey on a slo
 BELOW_LEVEL, ABOVE_LEVEL = 0.25, 0.5
 GAP = 17  # [voxels] of a floor that furniture hid from the scanner, 2.7 m
 BESIDE = 1.5  # [m] a camera may be from the nearest scanned floor of its storey
+FIRST_REACH = 1.0  # [m] around a place, in which surfaces are looked for first
 NUM_NEAREST, LOW = 40, 10.0  # surfaces around a place, 0.6 m, and the percentile of them that is the floor
 
 
@@ -28,8 +29,22 @@ class Storey(NamedTuple):
     """One storey, in the map's frame."""
 
     floor: float  # [m] height of its largest level
-    surfaces: NDArray[np.float32]  # (N, 3) [m] of its floor
-    tree: Any  # cKDTree of their x and y
+    surfaces: NDArray[np.float32]  # (N, 3) [m] of its floor, in order of their x
+
+    def nearest(self, center: Array, count: int) -> tuple[Array, Array]:
+        """Distances beside a place (3,) of the nearest surfaces, at most `count`, and their heights [m].
+
+        SciPy's tree finds them no faster for the few places of a photo, and takes 0.2 s to import.
+        """
+        x, reach = self.surfaces[:, 0], FIRST_REACH
+        while True:
+            begin, end = np.searchsorted(x, [center[0] - reach, center[0] + reach])
+            near = self.surfaces[begin:end]
+            distance = np.hypot(near[:, 0] - center[0], near[:, 1] - center[1])
+            if np.count_nonzero(distance <= reach) >= count or len(near) == len(x):
+                order = np.argsort(distance, kind="stable")[:count]
+                return distance[order], near[order, 2].astype(np.float64)
+            reach *= 2.0
 
 
 class Storeys(NamedTuple):
@@ -45,10 +60,9 @@ class Storeys(NamedTuple):
         storey, height = np.full(len(centers), -1), np.full(len(centers), np.nan)
         is_sure = np.zeros(len(centers), np.bool_)
         for k, one in enumerate(self.storeys):
-            count = min(NUM_NEAREST, len(one.surfaces))
-            distance, nearest = one.tree.query(centers[:, :2], [*range(1, count + 1)])
-            above = centers[:, 2] - np.percentile(one.surfaces[nearest, 2], LOW, axis=1)
-            is_near = distance[:, 0] < BESIDE
+            found = [one.nearest(center, NUM_NEAREST) for center in centers]
+            above = centers[:, 2] - [np.percentile(heights, LOW) for _, heights in found]
+            is_near = np.array([distance[0] < BESIDE for distance, _ in found], np.bool_)
             is_better = (above > 0.0) & (is_near | ~is_sure) | (storey < 0)
             storey[is_better], height[is_better] = k, above[is_better]
             is_sure |= is_near & (above > 0.0)
@@ -57,8 +71,6 @@ class Storeys(NamedTuple):
 
 def find_storeys(octree: Octree) -> Storeys:
     """The storeys of a map by the surfaces of its octree."""
-    from scipy.spatial import cKDTree  # noqa: PLC0415  # who asks for no storey need not wait for it
-
     xyz = octree.level(SURFACE_VOXEL)[:, :3]
     ijk = np.floor(xyz / SURFACE_VOXEL).astype(np.int64)
     ijk -= ijk.min(axis=0) - 1
@@ -72,7 +84,8 @@ def find_storeys(octree: Octree) -> Storeys:
         is_of = ((above > -BELOW_LEVEL) & (above < ABOVE_LEVEL)).any(axis=1)
         largest = max(range(len(group)), key=lambda i: masks[group[i]].sum())
         surfaces = top_xyz[is_of]
-        storeys.append(Storey(level_z[largest], surfaces, cKDTree(surfaces[:, :2])))
+        surfaces = np.asfortranarray(surfaces[np.argsort(surfaces[:, 0], kind="stable")])
+        storeys.append(Storey(level_z[largest], surfaces))
     return Storeys(tuple(storeys))
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numba
 from numba.core import compiler, serialize
+from numba.core.runtime.nrt import rtsys
 
 from .atomic import write_atomically
 from .cache import PRIVATE, WRITABLE, cache_root, in_words, is_own, mark_used, own_folder, own_names
@@ -106,7 +107,7 @@ class KernelCache:
 
     def load_overload(self, signature: object, target_context: Any) -> Any:
         """Read compiled code; None if there is none that can be trusted."""
-        target_context.refresh()
+        rtsys.initialize(target_context)
         path = self._file(signature, target_context.codegen())
         payload = path and read_whole(path)
         return payload and compiler.CompileResult._rebuild(target_context, *pickle.loads(payload))
