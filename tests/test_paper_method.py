@@ -67,10 +67,12 @@ def test_panorama_of_which_nothing_counts_has_no_pose():
 
 
 def test_golden_poses():
+    """Where the descent has ended: before, processors differ by a centimetre."""
+    settled = dataclasses.replace(QUICK, num_iterations=300)
     check_golden_poses(
         "paper.json",
         lambda seed: [prepare(room(seed)[1], QUICK).positions],
-        lambda seed, variant: _localize(seed, variant, QUICK)[0],
+        lambda seed, variant: _localize(seed, variant, settled)[0],
     )
 
 
