@@ -9,7 +9,6 @@ import rooms
 
 from piccolo.coarse_to_fine import first_look, query, refinement
 from piccolo.coarse_to_fine import localize as method
-from piccolo.coarse_to_fine.camera_positions import COARSE_SPACING
 from piccolo.coarse_to_fine.query import prepare_query
 from piccolo.coarse_to_fine.search import search_poses
 from piccolo.coarse_to_fine.search_result import SearchResult
@@ -138,8 +137,10 @@ def test_a_tilted_sphere_without_features_is_found_by_whole_views(monkeypatch, g
 
 
 def test_a_brief_search_keeps_what_little_a_prior_leaves():
-    one = rooms.scan_map(1).narrowed(np.arange(len(rooms.scan_map(1).sparse)) == 3)
-    for moved in (0.0, COARSE_SPACING):
-        there = replace(one, centers=np.add(one.centers, [moved, 0.0, 0.0]))
-        asked = replace(_query(rooms.as_panorama(rooms.query(1).rgb)), scan_map=there)
-        assert first_look.tilted_query(asked).scan_map.sparse.tolist() == there.sparse.tolist()
+    whole = rooms.scan_map(1)
+    few = whole.narrowed(np.arange(len(whole.sparse)) < 7)
+    asked = _query(rooms.as_panorama(rooms.query(1).rgb))
+    assert (
+        first_look.tilted_query(replace(asked, scan_map=few)).scan_map.sparse.tolist() == few.sparse.tolist()
+    )
+    assert 0.3 < len(first_look.tilted_query(asked).scan_map.sparse) / len(whole.sparse) < 0.7

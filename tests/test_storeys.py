@@ -99,6 +99,7 @@ def test_nearest_surfaces_are_those_of_all():
     surfaces = (rng.uniform(0, 1, (900, 3)) * [30, 20, 0.1]).astype(np.float32)
     surfaces = np.asfortranarray(surfaces[np.argsort(surfaces[:, 0])])
     floor = Storey(0.0, surfaces)
+    assert len(floor.nearest(np.array([np.nan, 0.0, 0.0]), 40)[0]) == 0
     for center in ([15.0, 10.0, 1.5], [0.0, 0.0, 1.5], [-40.0, 10.0, 1.5], [29.9, 90.0, 1.5]):
         beside = np.hypot(*(surfaces[:, :2] - np.float32(center[:2])).T)
         for count in (1, 40, 1000):

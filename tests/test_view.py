@@ -9,7 +9,7 @@ from piccolo.cloud.soa import unpack_rgb
 from piccolo.cloud.stream import Cloud
 from piccolo.coarse_to_fine import camera_positions
 from piccolo.coarse_to_fine.candidate_views import SEARCH_VIEW
-from piccolo.coarse_to_fine.points_around import points_around, visible_points
+from piccolo.coarse_to_fine.points_around import points_around, take_children, visible_points
 from piccolo.coarse_to_fine.view import ViewConfig, render_view
 from piccolo.geometry.sphere import cell_of, make_grid
 from piccolo.runtime.threads import Workers
@@ -144,3 +144,15 @@ def test_points_around_are_all_near_ones_and_fewer_far_ones(octree):
     gap, _ = cKDTree(leaves[:, :3]).query(np.stack([coarse.x, coarse.y, coarse.z], axis=1))
     ranges = np.linalg.norm(np.stack([coarse.x, coarse.y, coarse.z], axis=1) - center, axis=1)
     assert (gap < np.maximum(ranges / 20, 2.0 * octree.leaf_size)).all()
+
+
+@pytest.mark.parametrize(("one", "other"), [(0.2499, 0.2501), (0.1249, 0.1251), (0.1, 0.101), (0.9, 0.91)])
+def test_a_little_more_room_for_points_changes_few_of_them(octree, one, other):
+    nodes = np.arange(octree.level_start[-3], octree.level_start[-2], dtype=np.int32)
+    taken = []
+    for kept in (one, other):
+        found = np.empty(len(octree.nodes), np.int32)
+        taken.append(set(found[: take_children(octree, nodes, np.float32(kept), found)].tolist()))
+    num_children = octree.level_start[-1] - octree.level_start[-2]
+    assert len(taken[0]) == pytest.approx(one * num_children, rel=0.1)
+    assert len(taken[0] & taken[1]) > 0.93 * len(taken[1])

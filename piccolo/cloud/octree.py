@@ -52,7 +52,10 @@ def build_octree(voxels: Voxels) -> Octree:
 
 @inline_kernel
 def uniform_level(least_distance, level, low, high):
-    """The level at which all below a node of `level`, from low to high away, is drawn; 0 if there is none."""
+    """The level at which all below a node, its children of `level`, is drawn if it is from low to high away.
+
+    0 if there is none.
+    """
     k = level + 1
     while least_distance[k] > low and least_distance[k] > F0:
         k += 1
@@ -71,7 +74,7 @@ def take_all(nodes, first, last, center, found, directions, count):
 
 @inline_kernel
 def take_far(nodes, first, last, center, least, found, directions, count, stack, top):
-    """The same with those that are `least` [m^2] away; the others go on the stack. Returns both counts."""
+    """The same with those at least so far, squared [m^2]; the others go on the stack. Returns both counts."""
     x, y, z = directions[0], directions[1], directions[2]
     for node in range(first, last):
         i, k = np.uintp(node), np.uintp(count)

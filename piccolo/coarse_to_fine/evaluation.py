@@ -47,12 +47,12 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
         how = DescentSettings(solver=settings.solver, step_size=LAST_STEP)
         pose = refine(points, sampling_loss_of(texels), pose, how).pose
     told: list[Callable[[], Any]] = [
-        lambda: sampling_loss(visible_points(points, pose.center_world), texels, pose),
+        lambda: estimate_covariance(query, pose),  # takes longest
         lambda: occlusion_at(points, panorama, pose).fractions(),
-        lambda: estimate_covariance(query, pose),
+        lambda: sampling_loss(visible_points(points, pose.center_world), texels, pose),
         lambda: agreement_of(query, pose),
     ]
-    loss, fractions, covariance, agreement = query.workers.map(lambda tell: tell(), told, "evaluate")
+    covariance, fractions, loss, agreement = query.workers.map(lambda tell: tell(), told, "evaluate")
     if not math.isfinite(loss):
         return Localization()
     evidence = evidence_of(query, found, agreement, fractions)

@@ -25,6 +25,7 @@ MIRROR_RATIO = 1.1  # of the first scores, the photo as it is by its mirrored pi
 NUM_COMPARED = 8
 FIRST_STARTS, FIRST_BEAM = 300, Beam(100, 12, 4, 1)  # few: what is clear is found by them
 FIRST_ROTATIONS = 1000  # of SO(3)
+FEW_CELLS = 200  # of the grid: fewer, which a prior has left, are all searched
 
 
 def is_whole(query: Query) -> bool:
@@ -46,14 +47,12 @@ def tilted_query(query: Query) -> Query:
     """
     scan_map, settings = query.scan_map, query.settings
     cells = np.floor(scan_map.centers[scan_map.sparse] / COARSE_SPACING).astype(np.int64)
-    is_even = cells.sum(axis=1) % 2 == 0
+    is_even = (cells.sum(axis=1) % 2 == 0) | (len(cells) < FEW_CELLS)
     num_rotations = min(FIRST_ROTATIONS, settings.num_rotations)
     settings = replace(
         settings, max_starts=min(FIRST_STARTS, settings.max_starts), num_rotations=num_rotations
     )
-    return replace(
-        query, scan_map=scan_map.narrowed(is_even) if is_even.any() else scan_map, settings=settings
-    )
+    return replace(query, scan_map=scan_map.narrowed(is_even), settings=settings)
 
 
 def is_clear(query: Query, starts: Starts, hypotheses: Sequence[Hypothesis]) -> bool:

@@ -121,7 +121,8 @@ def finished(query: Query, hypotheses: Sequence[Hypothesis]) -> SearchResult:
     is_near = [h.score > NEAR_RATIO * found.best.score or matches_of(h) >= least for h in found.alternatives]
     near = list(compress(found.alternatives, is_near))[: 1 if is_faint(found.best) else ALTERNATIVES_REFINED]
     if not near and not is_faint(found.best):
-        return settled(query, replace(found, best=refine_unoccluded(query, found.best)[1]))
+        best = refine_unoccluded(query, found.best)[1]
+        return settled(query, found_among([best, *found.alternatives], ALTERNATIVES_COMPARED))
     ends = list(query.workers.map(refined, [found.best, *near], "descend"))
     far = [h for h in found.alternatives if not any(h is other for other in near)]
     found = fairly_selected(query, found_among([*ends, *far], ALTERNATIVES_COMPARED))

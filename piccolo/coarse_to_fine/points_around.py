@@ -44,25 +44,19 @@ def keep_visible(tree, nodes, cells, ranges, limits):
 def take_children(tree, nodes, kept, found):
     """Write the children of some nodes, or those without any, each with the probability `kept`; how many.
 
-    Each is kept or left out by a number of its parent's, so that a camera a little farther on sees nearly the
-    same points: a descent that is begun again from where it ended then ends there.
+    Each is kept or left out by its own number, so that a camera a little farther on sees nearly the same
+    points: a descent that is begun again from where it ended then ends there.
     """
     count = 0
     for i in range(len(nodes)):
         node = nodes[i]
-        drawn = node_fraction(node) / kept  # a child's share of [0, 1) is `kept`, where they fit in
         first, last = tree.first_child[node], tree.first_child[node + 1]
         if first == last:
             first, last = node, node + 1
-        if np.float32(last - first) * kept <= F1:
-            if drawn < np.float32(last - first) and count < len(found):
-                found[count] = first + np.int32(drawn)
+        for child in range(first, last):
+            if node_fraction(child) < kept and count < len(found):
+                found[count] = child
                 count += 1
-        else:
-            for child in range(first, last):
-                if node_fraction(child) < kept and count < len(found):
-                    found[count] = child
-                    count += 1
     return count
 
 

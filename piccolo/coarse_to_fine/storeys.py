@@ -21,7 +21,7 @@ LEAST_OVERLAP = 0.15  # of the smaller floor; below, two are one storey on a slo
 BELOW_LEVEL, ABOVE_LEVEL = 0.25, 0.5
 GAP = 17  # [voxels] of a floor that furniture hid from the scanner, 2.7 m
 BESIDE = 1.5  # [m] a camera may be from the nearest scanned floor of its storey
-FIRST_REACH = 1.0  # [m] around a place, in which surfaces are looked for first
+FIRST_REACH, FARTHEST = 1.0, 1e7  # [m] around a place, in which surfaces are looked for first, and at most
 NUM_NEAREST, LOW = 40, 10.0  # surfaces around a place, 0.6 m, and the percentile of them that is the floor
 
 
@@ -38,10 +38,10 @@ class Storey(NamedTuple):
         """
         x, reach = self.surfaces[:, 0], FIRST_REACH
         while True:
-            begin, end = np.searchsorted(x, [center[0] - reach, center[0] + reach])
+            begin, end = np.searchsorted(x, np.array([center[0] - reach, center[0] + reach], np.float32))
             near = self.surfaces[begin:end]
             distance = np.hypot(near[:, 0] - center[0], near[:, 1] - center[1])
-            if np.count_nonzero(distance <= reach) >= count or len(near) == len(x):
+            if np.count_nonzero(distance <= reach) >= count or reach > FARTHEST or len(near) == len(x):
                 order = np.argsort(distance, kind="stable")[:count]
                 return distance[order], near[order, 2].astype(np.float64)
             reach *= 2.0

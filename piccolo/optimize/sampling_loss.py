@@ -90,7 +90,7 @@ def normal_blocks(x, y, z, rgbx, R_cam_from_world, center_world, texels, width, 
 def _sum_blocks(
     blocks: Callable[..., None], points: PackedPoints, texels: Texels, pose: Pose, num_threads: int
 ) -> Array:
-    """Sums over all points, float64, by a kernel that fills one row of float32 a block."""
+    """Sums over all points, float64, by a kernel that fills one row a block."""
     if not np.abs(pose.center_world).max() < FARTHEST:  # NaN included: a kernel must not gather there
         return np.zeros(NUM_SUMS)
     num_blocks = -(-len(points) // BLOCK)

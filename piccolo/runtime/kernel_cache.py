@@ -89,13 +89,20 @@ def read_whole(path: Path) -> bytes | None:
     return payload
 
 
+def captured_by(function: Any) -> list[Any]:
+    """The functions that a function takes from around it, and those that these take: they are compiled in."""
+    found = []
+    for cell in getattr(function, "py_func", function).__closure__ or ():
+        found += [cell.cell_contents, *captured_by(cell.cell_contents)]
+    return found
+
+
 class KernelCache:
     """What Numba asks for compiled code: one kernel's files. A file that is damaged is compiled anew."""
 
     def __init__(self, function: Any) -> None:
         """Remember which kernel; nothing is opened."""
-        captured = [cell.cell_contents for cell in function.__closure__ or ()]
-        self.name = " ".join(f"{f.__module__}.{f.__qualname__}" for f in (function, *captured))
+        self.name = " ".join(f"{f.__module__}.{f.__qualname__}" for f in (function, *captured_by(function)))
         self.cache_path = None  # Numba's `stats` shows it
 
     def _file(self, signature: object, codegen: Any) -> Path | None:
