@@ -122,6 +122,8 @@ def test_pictures_of_one_name_are_told_apart(folder, tmp_path, capsys):
         ({"direction": "up"}, "found the direction up"),
         ({"room": "../there"}, "wanted a name for a folder"),
         ({"image": "images/none.png"}, "no such panorama"),
+        ({"image": "/none.png"}, "poses.csv, row 2: /none.png leads to /none.png, out of"),
+        ({"image": "no\0ne.png"}, "no\\x00ne.png', wanted the name of a file"),
     ],
 )
 def test_refused_rows(folder, tmp_path, capsys, change, message):

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cloud.octree import Octree
+from ..cloud.soa import FARTHEST
 from ..geometry.pose import Array
 from .camera_positions import SURFACE_VOXEL
 
@@ -21,7 +22,7 @@ LEAST_OVERLAP = 0.15  # of the smaller floor; below, two are one storey on a slo
 BELOW_LEVEL, ABOVE_LEVEL = 0.25, 0.5
 GAP = 17  # [voxels] of a floor that furniture hid from the scanner, 2.7 m
 BESIDE = 1.5  # [m] a camera may be from the nearest scanned floor of its storey
-FIRST_REACH, FARTHEST = 1.0, 1e7  # [m] around a place, in which surfaces are looked for first, and at most
+FIRST_REACH = 1.0  # [m] around a place, in which surfaces are looked for first
 NUM_NEAREST, LOW = 40, 10.0  # surfaces around a place, 0.6 m, and the percentile of them that is the floor
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..geometry.pose import Array, Pose
 from ..geometry.suppression import non_maximum_suppression
+from ..panorama.projection import in_camera, pose_float32
 from ..runtime.jit import F0, inline_kernel, kernel
 from ..runtime.threads import Workers
 from .matching import LEAST_WEIGHT, Matches
@@ -93,15 +94,9 @@ def write_turned(m, j, R):
 @inline_kernel
 def find_near(points, rays, R, t, is_near):
     """Write which of the matches' points (3, M) a pose puts near their rays (3, M): most are not."""
-    r00, r01, r02 = np.float32(R[0, 0]), np.float32(R[0, 1]), np.float32(R[0, 2])
-    r10, r11, r12 = np.float32(R[1, 0]), np.float32(R[1, 1]), np.float32(R[1, 2])
-    r20, r21, r22 = np.float32(R[2, 0]), np.float32(R[2, 1]), np.float32(R[2, 2])
-    cx, cy, cz = np.float32(t[0]), np.float32(t[1]), np.float32(t[2])
+    pose = pose_float32(R, t)
     for i in range(points.shape[1]):
-        dx, dy, dz = points[0, i] - cx, points[1, i] - cy, points[2, i] - cz
-        x = r00 * dx + r01 * dy + r02 * dz
-        y = r10 * dx + r11 * dy + r12 * dz
-        z = r20 * dx + r21 * dy + r22 * dz
+        x, y, z = in_camera(points[0, i], points[1, i], points[2, i], pose)
         along = x * rays[0, i] + y * rays[1, i] + z * rays[2, i]
         is_near[i] = (along > F0) & (along * along >= COS2_NEAR * (x * x + y * y + z * z))
 

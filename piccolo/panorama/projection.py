@@ -39,18 +39,33 @@ def make_projected():
 
 
 @inline_kernel
+def pose_float32(R_cam_from_world, center_world):
+    """A pose's rotation (3, 3), row by row, and centre (3,), as twelve float32 that registers hold."""
+    f, R, t = np.float32, R_cam_from_world, center_world
+    return (
+        f(R[0, 0]), f(R[0, 1]), f(R[0, 2]), f(R[1, 0]), f(R[1, 1]), f(R[1, 2]),
+        f(R[2, 0]), f(R[2, 1]), f(R[2, 2]), f(t[0]), f(t[1]), f(t[2]),
+    )  # fmt: skip
+
+
+@inline_kernel
+def in_camera(x, y, z, pose):
+    """Camera coordinates of a point, by a pose of `pose_float32`."""
+    r00, r01, r02, r10, r11, r12, r20, r21, r22, tx, ty, tz = pose
+    dx, dy, dz = x - tx, y - ty, z - tz
+    return (
+        r00 * dx + r01 * dy + r02 * dz,
+        r10 * dx + r11 * dy + r12 * dz,
+        r20 * dx + r21 * dy + r22 * dz,
+    )
+
+
+@inline_kernel
 def project(X, Y, Z, R_cam_from_world, center_world, width, projected):
     """Write the camera coordinates, and the texels in an image of `width`, of at most CHUNK points (n,)."""
-    R, t, p = R_cam_from_world, center_world, projected
-    r00, r01, r02 = np.float32(R[0, 0]), np.float32(R[0, 1]), np.float32(R[0, 2])
-    r10, r11, r12 = np.float32(R[1, 0]), np.float32(R[1, 1]), np.float32(R[1, 2])
-    r20, r21, r22 = np.float32(R[2, 0]), np.float32(R[2, 1]), np.float32(R[2, 2])
-    tx, ty, tz = np.float32(t[0]), np.float32(t[1]), np.float32(t[2])
+    p, pose = projected, pose_float32(R_cam_from_world, center_world)
     for n in range(len(X)):
-        dx, dy, dz = X[n] - tx, Y[n] - ty, Z[n] - tz
-        x = r00 * dx + r01 * dy + r02 * dz
-        y = r10 * dx + r11 * dy + r12 * dz
-        z = r20 * dx + r21 * dy + r22 * dz
+        x, y, z = in_camera(X[n], Y[n], Z[n], pose)
         p.index[n], p.fu[n], p.fv[n] = texel_at(x, y, z, math.sqrt(x * x + y * y), width)
         p.x[n], p.y[n], p.z[n] = x, y, z
 

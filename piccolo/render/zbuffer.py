@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from ..cloud.soa import PackedPoints
 from ..geometry.pose import Array, Pose
 from ..geometry.sphere import direction_to_pixel, solid_angles
+from ..panorama.projection import in_camera, pose_float32
 from ..panorama.texels import channel
 from ..runtime.jit import kernel
 
@@ -39,18 +40,10 @@ class View(NamedTuple):
 @kernel
 def cells_and_ranges(x, y, z, R_cam_from_world, center_world, width, cells, ranges):
     """Write for each point the cell (row * width + column) and the range [m] at which the camera sees it."""
-    R, t = R_cam_from_world, center_world
-    W = np.float32(width)
+    W, pose = np.float32(width), pose_float32(R_cam_from_world, center_world)
     last_column, last_row = np.int32(width - 1), np.int32(width // 2 - 1)
-    r00, r01, r02 = np.float32(R[0, 0]), np.float32(R[0, 1]), np.float32(R[0, 2])
-    r10, r11, r12 = np.float32(R[1, 0]), np.float32(R[1, 1]), np.float32(R[1, 2])
-    r20, r21, r22 = np.float32(R[2, 0]), np.float32(R[2, 1]), np.float32(R[2, 2])
-    tx, ty, tz = np.float32(t[0]), np.float32(t[1]), np.float32(t[2])
     for i in range(len(x)):
-        dx, dy, dz = x[i] - tx, y[i] - ty, z[i] - tz
-        px = r00 * dx + r01 * dy + r02 * dz
-        py = r10 * dx + r11 * dy + r12 * dz
-        pz = r20 * dx + r21 * dy + r22 * dz
+        px, py, pz = in_camera(x[i], y[i], z[i], pose)
         rho2 = px * px + py * py
         u, v = direction_to_pixel(px, py, pz, math.sqrt(rho2), W)
         cells[i] = min(np.int32(v), last_row) * np.int32(width) + min(np.int32(u), last_column)

@@ -107,12 +107,12 @@ def _entry(where: str, path: Path, row: Row, options: ConvertOptions) -> tuple[s
     """A row's room, and the row itself."""
     if missing := [name for name in ("image", *NUMBERS) if name not in row]:
         raise InputError(f"{where}: found no {missing[0]}, {WANTED}")
-    image = path.parent / row["image"]
+    image = options.inside(path.parent / row["image"], where)
     room = row.get("room", options.folder.resolve().name)
     if room != Path(room).name or room.startswith(".") or not room.isprintable():
         raise InputError(f"{where}: found the room {room!r}, wanted a name for a folder")
     variant, pose = row.get("variant", VARIANT), _pose(where, row, options)
-    cloud = path.parent / row["cloud"] if "cloud" in row else None
+    cloud = options.inside(path.parent / row["cloud"], where) if "cloud" in row else None
     return room, (cloud, PosedPanorama(image.name, {image.name: image}, variant, pose))
 
 

@@ -38,23 +38,23 @@ def list_scenes(options: ConvertOptions) -> SceneList:
 
 def _panoramas(options: ConvertOptions, folder: Path) -> list[PosedPanorama]:
     paths = map(options.inside, sorted((folder / QUERIES).glob(f"*/{POSES}")))
-    return [each for path in paths for each in _sequence(path)]
+    return [each for path in paths for each in _sequence(path, options)]
 
 
-def _sequence(path: Path) -> Iterator[PosedPanorama]:
+def _sequence(path: Path, options: ConvertOptions) -> Iterator[PosedPanorama]:
     """The panoramas of a sequence: camera-to-world matrices, axes as of COLMAP."""
     document = read_json(path, WANTED)
     if not isinstance(document, dict):
         raise InputError(f"{path}: found no object, {WANTED}")
     for file, value in document.items():
-        where = f"{path}, {file}"
+        where = f"{path}, {file!r}"
         try:
             matrix = np.array(value, dtype=np.float64)
         except (OverflowError, TypeError, ValueError) as error:
             raise InputError(f"{where}: found {error}, {WANTED}") from error
         if matrix.shape not in ((4, 4), (3, 4)):
             raise InputError(f"{where}: found the shape {matrix.shape}, {WANTED}")
-        picture = path.parent / PICTURES / Path(file).name
+        picture = options.inside(path.parent / PICTURES / Path(file).name, where)
         name = f"{path.parent.name}_{picture.name}"
         pose = pose_of_transform(where, matrix, WORLD_FROM_CAM, "optical")
         yield PosedPanorama(name, {name: picture}, path.parent.name, pose)

@@ -37,11 +37,18 @@ class ConvertOptions:
         named = self.folder, self.poses and self.poses.parent, self.cloud, self.images
         return [os.path.realpath(path) for path in named if path]
 
-    def inside(self, path: Path) -> Path:
-        """A file of the dataset, which is refused if it lies elsewhere, by a link or by ".."."""
-        real = Path(os.path.realpath(path))
+    def inside(self, path: Path, where: str = "") -> Path:
+        """A file of the dataset, which is refused if it lies elsewhere, by a link or by "..".
+
+        Where a list names it, `where` is the place in the list.
+        """
+        try:
+            real = Path(os.path.realpath(path))
+        except ValueError as error:  # a zero byte, half a character
+            raise InputError(f"{where}: found {str(path)!r}, wanted the name of a file") from error
         if not any(real.is_relative_to(root) for root in self._roots):
-            raise InputError(f"{path}: leads to {real}, out of {self.folder}; move or copy the file into it")
+            named = f"{where}: {path}" if where else f"{path}:"
+            raise InputError(f"{named} leads to {real}, out of {self.folder}; move or copy the file into it")
         return path
 
 
