@@ -188,6 +188,32 @@ def test_damaged_compiled_code_is_noticed_and_made_anew(tmp_path, monkeypatch, c
     assert kernel_cache.read_whole(tmp_path / "none") is None
 
 
+def test_a_kernel_is_compiled_with_another_that_was_loaded(tmp_path, monkeypatch):
+    monkeypatch.setattr(kernel_cache, "kernel_folder", lambda: tmp_path)
+
+    def scaled_sum(values, factor):
+        return factor * values.sum()
+
+    def made():
+        inner = kernel(scaled_sum)
+
+        def first(values):
+            return inner(values, 2.0) + 1.0
+
+        def second(values):
+            return inner(values, 2.0) - 1.0
+
+        return inner, kernel(first), kernel(second)
+
+    values = np.array([1.0, 2.0, 4.0])
+    inner, first, second = made()
+    assert (first(values), inner(values, 3.0)) == (15.0, 21.0)
+    inner, first, second = made()
+    assert (inner(values, 3.0), second(values), first(values)) == (21.0, 13.0, 15.0)
+    was_loaded = [sum(each.stats.cache_hits.values()) for each in (inner, first, second)]
+    assert was_loaded == [1, 1, 0]
+
+
 def test_a_logged_warning_is_one_line_and_quiet_is_quiet(capsys):
     for is_quiet in (False, True):
         with progress.log_shown(is_quiet):

@@ -8,10 +8,11 @@ import hashlib
 import logging
 import pickle
 import sys
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+import llvmlite.binding as llvm
 import numba
 from numba.core import compiler, serialize
 from numba.core.runtime.nrt import rtsys
@@ -97,6 +98,23 @@ def captured_by(function: Any) -> list[Any]:
     return found
 
 
+def rebuilt(
+    target_context: Any, library: tuple[str, str, tuple[bytes, bytes]], description: Any, *others: object
+) -> Any:
+    """A compiled kernel from its pickled parts.
+
+    Numba parses a kernel's bitcode, up to 1 MB, to learn which names its machine code has, and to compile
+    others that call it. Here the two names that are asked for stand in; it is parsed only for the latter.
+    """
+    name, kind, (machine_code, bitcode) = library
+    names = description.llvm_func_name, description.llvm_cpython_wrapper_name
+    stand_in = llvm.parse_assembly("".join(f'define void @"{each}"() {{ ret void }}\n' for each in names))
+    parts = (name, kind, (machine_code, stand_in.as_bitcode())), description
+    compiled = compiler.CompileResult._rebuild(target_context, *parts, *others)
+    compiled.library._get_module_for_linking = cache(partial(llvm.parse_bitcode, bitcode))
+    return compiled
+
+
 class KernelCache:
     """What Numba asks for compiled code: one kernel's files. A file that is damaged is compiled anew."""
 
@@ -117,7 +135,7 @@ class KernelCache:
         rtsys.initialize(target_context)
         path = self._file(signature, target_context.codegen())
         payload = path and read_whole(path)
-        return payload and compiler.CompileResult._rebuild(target_context, *pickle.loads(payload))
+        return payload and rebuilt(target_context, *pickle.loads(payload))
 
     def save_overload(self, signature: object, compiled: Any) -> None:
         """Write compiled code whole; where that can't be done it is compiled again by the next run."""
