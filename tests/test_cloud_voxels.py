@@ -9,10 +9,11 @@ from scipy.spatial import cKDTree
 from test_cloud_morton import seeded_cloud
 from test_cloud_stream import LEVEL, TURN, stream
 
-from piccolo.cloud import voxels
+from piccolo.cloud import voxel_table, voxels
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.readers.reader import RawCloud
-from piccolo.cloud.voxels import COUNT, LEAF_SIZE, NUM_COLUMNS, POSITION, VoxelTable, add_points, move_voxels
+from piccolo.cloud.voxel_table import COUNT, NUM_COLUMNS, POSITION, VoxelTable, add_points, fill_index
+from piccolo.cloud.voxels import LEAF_SIZE
 from piccolo.errors import InputError
 from piccolo.geometry.pose import rotate_points
 
@@ -55,15 +56,17 @@ def test_a_floor_at_a_round_height_is_one_layer_at_every_level(z):
         assert len(np.unique(columns, axis=0)) == end - begin
 
 
-def test_a_larger_table_holds_the_same_rows_and_may_be_fed_with_nothing():
-    table, larger = np.zeros((64, NUM_COLUMNS), np.int32), np.zeros((256, NUM_COLUMNS), np.int32)
-    raw = seeded_cloud(16, 40)
-    assert add_points(raw.points_world, raw.colors, np.zeros(3, np.int64), table, 0, 40) == (40, 40)
-    move_voxels(table, larger)
-    kept = [set(map(tuple, rows[rows[:, COUNT] > 0].tolist())) for rows in (table, larger)]
-    assert kept[0] == kept[1]
-    assert len(kept[0]) == 40
-    assert add_points(raw.points_world, raw.colors, np.zeros(3, np.int64), larger, 40, 99) == (40, 40)
+def test_a_larger_index_names_the_same_rows_and_the_table_may_be_fed_with_nothing():
+    index, larger = np.zeros(64, np.int32), np.zeros(256, np.int32)
+    rows, base = np.full((40, NUM_COLUMNS), -1, np.int32), np.zeros(3, np.int64)
+    raw = seeded_cloud(16, 41)
+    assert add_points(raw.points_world, raw.colors, base, index, rows, 0) == (40, 40)
+    fill_index(rows, 40, larger)
+    for names in (index, larger):
+        assert sorted(names[names > 0]) == list(range(1, 41))
+    more = np.vstack([rows, rows])
+    assert add_points(raw.points_world[:40], raw.colors, base, larger, more, 40) == (40, 40)
+    np.testing.assert_array_equal(more[:, COUNT], np.repeat([2, 1], 40))
     table = VoxelTable("a")
     table.add(np.empty((0, 3)), np.empty((0, 3), np.uint8))
     table.add(np.full((2, 3), 7.5), np.full((2, 3), 51, np.uint8))
@@ -73,15 +76,15 @@ def test_a_larger_table_holds_the_same_rows_and_may_be_fed_with_nothing():
 
 
 def test_a_full_voxel_takes_no_more_and_fits_its_sums(monkeypatch):
-    monkeypatch.setattr(voxels, "MAX_COUNT", 3)
-    table = np.zeros((8, NUM_COLUMNS), np.int32)
+    monkeypatch.setattr(voxel_table, "MAX_COUNT", 3)
+    index, rows = np.zeros(8, np.int32), np.zeros((4, NUM_COLUMNS), np.int32)
     points, colors = np.full((5, 3), 0.01), np.full((5, 3), 200, np.uint8)
-    done = add_points.py_func(points, colors, np.zeros(3, np.int64), table, 0, 4)
+    done = add_points.py_func(points, colors, np.zeros(3, np.int64), index, rows, 0)
     assert done == (5, 1)
-    (row,) = table[table[:, COUNT] > 0]
+    row = rows[0]
     assert row[COUNT] == 3
     assert row[POSITION] == 3 * ((128 + voxels.PHASE) % 256)
-    assert voxels.MAX_COUNT * max(255, voxels.QUANTUM_MASK) <= np.iinfo(np.int32).max
+    assert voxel_table.MAX_COUNT * max(255, voxels.QUANTUM_MASK) <= np.iinfo(np.int32).max
 
 
 def test_turning_gives_each_point_the_same_bits_alone_as_among_others():
@@ -109,6 +112,6 @@ def test_points_too_far_away_are_left_out_and_two_scenes_are_no_map():
 
 
 def test_too_many_voxels_are_refused(monkeypatch):
-    monkeypatch.setattr(voxels, "MAX_ROWS", voxels.FIRST_ROWS)
-    with pytest.raises(InputError, match=r"more than 39321 voxels of 0\.02 m are filled.*--units"):
+    monkeypatch.setattr(voxel_table, "MAX_VOXELS", 40_000)
+    with pytest.raises(InputError, match=r"more than 40000 voxels of 0\.02 m are filled.*--units"):
         stream(seeded_cloud(9, 50_000, size=(900.0, 900.0, 900.0))).voxels(LEVEL)

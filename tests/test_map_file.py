@@ -12,7 +12,8 @@ from rooms import scan_map
 
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.settings import CloudSettings
-from piccolo.cloud.voxels import LEAF_SIZE, PHASE, QUANTA_PER_METRE, VoxelTable
+from piccolo.cloud.voxel_table import VoxelTable
+from piccolo.cloud.voxels import LEAF_SIZE, PHASE, QUANTA_PER_METRE
 from piccolo.coarse_to_fine import map_file, open_map
 from piccolo.coarse_to_fine.map_file import is_map_file, load_map, save_map
 from piccolo.coarse_to_fine.map_validation import first_misplaced

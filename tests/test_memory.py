@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rooms import as_panorama, query, room, scan_map
 
-from piccolo.cloud import voxels
+from piccolo.cloud import voxel_table
 from piccolo.cloud.stream import stream_of_arrays
 from piccolo.coarse_to_fine.candidate_views import SEARCH_VIEW, render_views, render_wide
 from piccolo.coarse_to_fine.query import prepare_query
@@ -112,14 +112,14 @@ def test_all_that_grows_asks_first(monkeypatch, tmp_path):
     whole, taken = scan_map(1), as_panorama(query(1).rgb)
     cv2.imwrite(str(picture), taken.rgb)
     rng = np.random.default_rng(0)
-    table = voxels.VoxelTable("a.ply")
+    table = voxel_table.VoxelTable("a.ply")
     workers = Workers(1)
     asked = prepare_query(taken, whole, CoarseToFineSettings(), workers)
     monkeypatch.setattr(memory, "memory_left", lambda: 1e5)
     spread, colors = rng.uniform(0, 90, (50_000, 3)), np.full((50_000, 3), 9, np.uint8)
     for text, ask in (
         ("a.png: found 512 x 256, which needs 0.0016 GB", lambda: read_panorama(picture)),
-        ("a.ply: a table of 131072 voxels", lambda: table.add(spread, colors)),
+        ("a.ply: a table of more than 32768 voxels", lambda: table.add(spread, colors)),
         ("voxels of 2 cm needs", lambda: prepare_map(room(1)[1], workers)),
         ("prepared views", lambda: render_wide(whole.octree, whole.centers, SEARCH_VIEW, workers)),
         ("[0-9] views needs", lambda: render_views(whole.octree, whole.centers, SEARCH_VIEW, workers)),

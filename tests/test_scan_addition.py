@@ -13,7 +13,8 @@ from scipy.spatial import cKDTree
 from piccolo.cli import localize as localize_command
 from piccolo.cli import prepare_map as prepare_command
 from piccolo.cloud.stream import Cloud
-from piccolo.cloud.voxels import LEAF_SIZE, VoxelTable, join_voxels
+from piccolo.cloud.voxel_table import VoxelTable
+from piccolo.cloud.voxels import LEAF_SIZE, join_voxels
 from piccolo.coarse_to_fine import scan_addition
 from piccolo.coarse_to_fine.camera_positions import MIN_CLEARANCE
 from piccolo.coarse_to_fine.candidate_views import SEARCH_VIEW, WideViews, render_wide

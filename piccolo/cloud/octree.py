@@ -10,7 +10,9 @@ from ..runtime.jit import F0, inline_kernel, kernel
 from ..runtime.memory import check_memory
 from .voxels import LEAF_SIZE, NUM_LEVELS, THIN, Voxels
 
-NODE_BYTES = 6 * 4 + 8 + 4  # mean, code, first child
+NODE_BYTES = 6 * 4 + 4  # mean, first child
+LEVEL_BYTES = 8 + 8 + 8 + 1  # codes, first children, codes of these, which begin a parent
+AT_ONCE = 1 << 18  # nodes, whose temporary arrays stay small
 MAX_NODES = 1 << 22  # that a view collects; reserved, but used only as far as a dense cloud fills it
 RANGES_BELOW = 1 / 20  # voxels by their distance: larger ones are drawn at one level in few places
 DIAGONAL = 1.75  # of a voxel, and a little more for rounding: all in it is so near to its mean
@@ -32,22 +34,36 @@ class Octree(NamedTuple):
 
 def build_octree(voxels: Voxels) -> Octree:
     """The octree whose leaves are the voxels."""
-    nodes, node_codes = voxels.nodes, voxels.codes
-    levels, children = [nodes], [np.zeros(len(nodes), np.int32)]
+    codes = voxels.codes
+    firsts: list[NDArray[np.int32]] = []  # of each level but the finest: its nodes' first children there
     for _ in range(NUM_LEVELS - 1):
-        check_memory(2 * len(nodes) * NODE_BYTES, f"the scan: a level of {len(nodes)} voxels", THIN)
-        first = np.flatnonzero(np.diff(node_codes >> 3, prepend=-1))  # children of a parent follow each other
-        counts = np.diff(first, append=len(nodes))
-        columns = [np.add.reduceat(column, first, dtype=np.float64) / counts for column in nodes.T]
-        nodes, node_codes = np.stack(columns, axis=1, dtype=np.float32), node_codes[first] >> 3
-        levels.insert(0, nodes)
-        children.insert(0, first.astype(np.int32))
-    num_nodes = sum(map(len, levels))
+        check_memory(len(codes) * LEVEL_BYTES, f"the scan: a level of {len(codes)} voxels", THIN)
+        codes = codes >> 3  # children of a parent follow each other
+        first = np.flatnonzero(np.concatenate([[True], codes[1:] != codes[:-1]]))
+        firsts.insert(0, first.astype(np.int32))
+        codes = codes[first]
+    start = np.cumsum([0, *map(len, firsts), len(voxels.nodes)], dtype=np.int32)
+    num_nodes = int(start[-1])
     check_memory(num_nodes * NODE_BYTES, f"the scan: a tree of {num_nodes} voxels", THIN)
-    start = np.concatenate([[0], np.cumsum([len(level) for level in levels])]).astype(np.int32)
-    first_child = [c + s for c, s in zip(children[:-1], start[1:-1], strict=True)]
-    first_child.append(np.full(len(levels[-1]) + 1, start[-1], np.int32))  # leaves have none
-    return Octree(np.concatenate(levels), np.concatenate(first_child).astype(np.int32), start, LEAF_SIZE)
+    nodes = np.empty((num_nodes, 6), np.float32)
+    nodes[start[-2] :] = voxels.nodes
+    first_child = np.full(num_nodes + 1, num_nodes, np.int32)  # leaves have none
+    for level in reversed(range(NUM_LEVELS - 1)):
+        begin, end = start[level : level + 2]
+        average(nodes[end : start[level + 2]], firsts[level], nodes[begin:end])
+        np.add(firsts[level], end, out=first_child[begin:end])
+    return Octree(nodes, first_child, start, LEAF_SIZE)
+
+
+def average(children: NDArray[np.float32], first: NDArray[np.int32], parents: NDArray[np.float32]) -> None:
+    """Write the means (M, 6) of the children (N, 6) that begin at `first` (M,)."""
+    for begin in range(0, len(first), AT_ONCE):
+        part = slice(begin, begin + AT_ONCE)
+        last = first[begin + AT_ONCE] if begin + AT_ONCE < len(first) else len(children)
+        own, places = children[first[begin] : last], first[part] - first[begin]
+        counts = np.diff(places, append=len(own))
+        for k, column in enumerate(own.T):
+            parents[part, k] = np.add.reduceat(column, places, dtype=np.float64) / counts
 
 
 @inline_kernel

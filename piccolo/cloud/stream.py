@@ -16,7 +16,8 @@ from ..runtime.threads import Progress, no_progress
 from .digest import sha256_of_arrays
 from .readers.columns import brightest_of, colored_chunks
 from .readers.reader import CHUNK, PointSource, RawCloud
-from .voxels import Voxels, VoxelTable, morton_order
+from .voxel_table import VoxelTable
+from .voxels import Voxels, morton_order
 
 MIN_POINTS = 1000
 MAX_COORDINATE = 1e8  # [m], ten times the Earth: beyond it lie only broken numbers, and float32 gives way

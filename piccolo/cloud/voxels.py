@@ -1,15 +1,10 @@
-"""Points averaged voxel by voxel as they stream by: the memory grows with the scene, not with the points.
-
-The grid is fixed in the map's axes, and all sums are integers: neither the order of the points nor how they
-are cut into chunks changes a bit.
-"""
+"""Voxels in Morton order, on a grid that is fixed in the map's axes."""
 
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
 from ..runtime.jit import inline_kernel, kernel
 from ..runtime.memory import check_memory
 
@@ -18,21 +13,14 @@ LEAF_SIZE = 0.02  # [m]
 QUANTUM_BITS = 8  # a voxel is 256 quanta wide: positions are summed in steps of 78 um
 QUANTUM_MASK = (1 << QUANTUM_BITS) - 1
 QUANTA_PER_METRE = (1 << QUANTUM_BITS) / LEAF_SIZE
-MAX_COUNT = 1 << 23  # points of a voxel that are summed, at most: int32 holds no more of their colours
-MAX_CELL = 1 << 31  # cells from the first point to any other, below this: 43,000 km
 WINDOW = (NUM_CELLS // 2) - 128  # cells from the median to those kept: 21 km
 COARSEST = 128  # leaves along a voxel of the coarsest level
 # From a corner of all levels' grids to zero, in quanta: a third of the coarsest voxel, so that zero and whole
 # metres lie on no voxel's border. A floor at z = 0 would fall to both sides by its noise, and count twice.
 PHASE = (COARSEST << QUANTUM_BITS) // 3 + 1
 
-# columns of the table: cell, number of points (0: the row is free), sums of quanta, sums of colours
-CELL, COUNT, POSITION, COLOR, NUM_COLUMNS = 0, 3, 4, 7, 10
-FIRST_ROWS, MAX_ROWS = 1 << 16, 1 << 27  # 40 bytes a row; the most are 80 million voxels, 20,000 m^2 or more
-ROW_BYTES = 4 * NUM_COLUMNS
-VOXEL_BYTES = ROW_BYTES + 3 * 8 + 3 * 8 + 3 * 8 + 6 * 4  # rows, cells, a copy of them, codes and order, nodes
+JOINING_BYTES = 160  # a voxel, of which two clouds' are joined: nodes, cells, codes, order, sums
 THIN = "set --units if its unit is not the metre, or cut out a part"
-MAX_LOAD = 0.6  # share of the rows in use
 NUM_LEVELS = COARSEST.bit_length()  # from 128 leaves wide (2.56 m) down to one
 
 
@@ -88,62 +76,6 @@ def morton_order(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> NDAr
     return order
 
 
-@inline_kernel
-def find_row(table, x, y, z):
-    """The row of a cell in the table, or the free one where it belongs."""
-    mask = len(table) - 1
-    # Teschner et al., VMV 2003. Products of less than 63 bits: none overflows, with or without Numba.
-    mixed = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
-    row = (mixed ^ (mixed >> 17)) & mask
-    while table[row, COUNT] != 0 and not (
-        table[row, CELL] == x and table[row, CELL + 1] == y and table[row, CELL + 2] == z
-    ):
-        row = (row + 1) & mask
-    return row
-
-
-@kernel
-def add_points(points, colors, base, table, num_voxels, max_voxels):
-    """Add points (N, 3) [m] with colours (N, 3) to a table (2^k, 10) of `num_voxels` voxels.
-
-    Stops at a point farther than the table reaches, or when `max_voxels` are there. Returns how many points
-    were added and how many voxels there are.
-    """
-    for i in range(len(points)):
-        if num_voxels == max_voxels:
-            return i, num_voxels
-        qx = np.int64(np.floor(points[i, 0] * QUANTA_PER_METRE)) + PHASE
-        qy = np.int64(np.floor(points[i, 1] * QUANTA_PER_METRE)) + PHASE
-        qz = np.int64(np.floor(points[i, 2] * QUANTA_PER_METRE)) + PHASE
-        x = (qx >> QUANTUM_BITS) - base[0]
-        y = (qy >> QUANTUM_BITS) - base[1]
-        z = (qz >> QUANTUM_BITS) - base[2]
-        if max(abs(x), abs(y), abs(z)) >= MAX_CELL:
-            return i, num_voxels
-        row = table[find_row(table, x, y, z)]
-        if row[COUNT] == 0:
-            row[CELL], row[CELL + 1], row[CELL + 2] = x, y, z
-            num_voxels += 1
-        if row[COUNT] < MAX_COUNT:
-            row[COUNT] += 1
-            row[POSITION] += qx & QUANTUM_MASK
-            row[POSITION + 1] += qy & QUANTUM_MASK
-            row[POSITION + 2] += qz & QUANTUM_MASK
-            row[COLOR] += colors[i, 0]
-            row[COLOR + 1] += colors[i, 1]
-            row[COLOR + 2] += colors[i, 2]
-    return len(points), num_voxels
-
-
-@kernel
-def move_voxels(table, larger):
-    """Copy the voxels of a table to a larger, empty one."""
-    for k in range(len(table)):
-        if table[k, COUNT] != 0:
-            x, y, z = np.int64(table[k, CELL]), np.int64(table[k, CELL + 1]), np.int64(table[k, CELL + 2])
-            larger[find_row(larger, x, y, z)] = table[k]
-
-
 class Voxels(NamedTuple):
     """The voxels in which there are points, in Morton order."""
 
@@ -161,7 +93,7 @@ def join_voxels(
     Those that one of them has stay as they are, bit by bit; the others have the means of both means.
     """
     num = len(first) + len(second)
-    check_memory(num * VOXEL_BYTES, f"the scan: sorting {num} voxels of 2 cm", THIN)
+    check_memory(num * JOINING_BYTES, f"the scan: sorting {num} voxels of 2 cm", THIN)
     nodes = np.concatenate([first, second])
     cells = np.floor((nodes[:, :3] + (origin + PHASE / QUANTA_PER_METRE)) / LEAF_SIZE).astype(np.int64)
     codes = morton_codes(cells - cells.min(axis=0) // COARSEST * COARSEST)
@@ -170,69 +102,3 @@ def join_voxels(
     counts = np.diff(begin, append=num)
     columns = [np.add.reduceat(column[order], begin, dtype=np.float64) / counts for column in nodes.T]
     return Voxels(codes[order][begin], np.stack(columns, axis=1, dtype=np.float32), origin)
-
-
-class VoxelTable:
-    """Sums over the points in each voxel, an open hash table that grows as it fills."""
-
-    def __init__(self, label: str) -> None:
-        self.label = label  # of the cloud, for messages
-        self.num_voxels = 0
-        self.base: NDArray[np.int64] | None = None  # cell of the first point
-        self.table = np.zeros((FIRST_ROWS, NUM_COLUMNS), np.int32)
-
-    def add(self, points: NDArray[np.float64], colors: NDArray[np.uint8]) -> None:
-        """Add finite points (N, 3) [m], in the map's axes, with colours (N, 3)."""
-        points, colors = np.ascontiguousarray(points), np.ascontiguousarray(colors)  # one kernel for all
-        if self.base is None and len(points):
-            self.base = np.floor(points[0] / LEAF_SIZE).astype(np.int64)
-        while len(points):
-            full = int(MAX_LOAD * len(self.table))
-            added = add_points(points, colors, self.base, self.table, self.num_voxels, full)
-            num_added, self.num_voxels = added
-            points, colors = points[num_added:], colors[num_added:]
-            if len(points) and self.num_voxels < full:
-                far = f"points more than {MAX_CELL * LEAF_SIZE / 1000:.0f} km apart, wanted one scene"
-                raise InputError(f"{self.label}: {far}; remove broken points or set --units or --scale")
-            if len(points):
-                self._grow()
-
-    def _grow(self) -> None:
-        if len(self.table) >= MAX_ROWS:
-            found = f"more than {self.num_voxels} voxels of {LEAF_SIZE} m are filled"
-            raise InputError(f"{self.label}: {found}; if its unit is not the metre, set --units or --scale")
-        num_rows = 2 * len(self.table)
-        check_memory(num_rows * ROW_BYTES, f"{self.label}: a table of {num_rows} voxels of 2 cm", THIN)
-        larger = np.zeros((num_rows, NUM_COLUMNS), np.int32)
-        move_voxels(self.table, larger)
-        self.table = larger
-
-    def finish(self) -> Voxels:
-        """The means; those too far from the rest for a Morton code are left out. The table is spent."""
-        num = self.num_voxels
-        check_memory(num * VOXEL_BYTES, f"{self.label}: sorting {num} voxels of 2 cm", THIN)
-        rows = self.table[self.table[:, COUNT] > 0]
-        self.table = self.table[:0]
-        cells = rows[:, :COUNT] + (np.zeros(3, np.int64) if self.base is None else self.base)
-        middle = [np.partition(column, len(column) // 2)[len(column) // 2] for column in cells.T]
-        is_near = np.all(np.abs(cells - middle) <= WINDOW, axis=1)
-        warnings: tuple[str, ...] = ()
-        if not is_near.all():
-            num_far = int(rows[~is_near, COUNT].sum(dtype=np.int64))
-            text = f"{num_far} points farther than {WINDOW * LEAF_SIZE / 1000:.0f} km from the middle"
-            rows, cells = rows[is_near], cells[is_near]
-            if len(rows) == 0:
-                raise InputError(f"{self.label}: {text}, and none nearer, wanted one scene")
-            warnings = (f"{self.label}: {text} left out",)
-        low, high = cells.min(axis=0), cells.max(axis=0) + 1
-        codes = morton_codes(cells - low // COARSEST * COARSEST)
-        order = np.argsort(codes)
-        # + 0.0 turns -0.0 into 0.0
-        origin = np.round(0.5 * LEAF_SIZE * (low + high) - PHASE / QUANTA_PER_METRE) + 0.0
-        nodes = np.empty((len(rows), 6), np.float32)
-        counts = rows[order, COUNT].astype(np.float64)
-        for k in range(3):  # one at a time, for the memory's sake
-            corners = cells[order, k] * LEAF_SIZE - origin[k]
-            nodes[:, k] = corners + (rows[order, POSITION + k] / counts + 0.5 - PHASE) / QUANTA_PER_METRE
-            nodes[:, 3 + k] = rows[order, COLOR + k] / counts / 255.0
-        return Voxels(codes[order], nodes, origin, warnings)
