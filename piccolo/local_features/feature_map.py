@@ -21,7 +21,7 @@ LIST_SIZE = 128  # features of a list, on average
 MAX_LISTS, MOST_VIEWS = 4096, 1 << 16
 GROWTH = 2  # of the features, by those for which the lists were made, before new ones are
 KMEANS_ROUNDS = 5
-BLOCK = 4096  # descriptors a thread sorts into lists at a time
+BLOCK = 4096  # descriptors that are projected, or that a thread sorts into lists, at a time
 
 
 class FeatureMap(NamedTuple):
@@ -91,9 +91,12 @@ def project(
     descriptors: NDArray[np.uint8], mean: NDArray[np.int16], components: NDArray[np.int8]
 ) -> NDArray[np.int8]:
     """Components (N, NUM_COMPONENTS) of descriptors (N, 128); sums of whole numbers below 2^24 are exact."""
-    values = descriptors.astype(np.float32) - mean.astype(np.float32)
-    projected = values @ components.astype(np.float32)
-    return np.asarray(np.clip(np.rint(projected / np.float32(127.0)), -127, 127), np.int8)
+    projected = np.empty((len(descriptors), NUM_COMPONENTS), np.int8)
+    for lo in range(0, len(descriptors), BLOCK):
+        values = descriptors[lo : lo + BLOCK].astype(np.float32) - mean.astype(np.float32)
+        sums = values @ components.astype(np.float32)
+        projected[lo : lo + BLOCK] = np.clip(np.rint(sums / np.float32(127.0)), -127, 127)
+    return projected
 
 
 @inline_kernel
