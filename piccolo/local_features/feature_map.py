@@ -171,11 +171,12 @@ def num_lists(num_features: int) -> int:
 def make_feature_map(octree: Octree, centers: NDArray[np.float64], workers: Workers) -> FeatureMap:
     """The features of the views from some centres (N, 3) [m]."""
     found, views = find_features(octree, centers, workers)
-    sample = found.descriptors[:: 1 + len(found.points) // SAMPLE]
-    mean, components = principal_components(sample)
+    mean, components = principal_components(found.descriptors[:: 1 + len(found.points) // SAMPLE])
     descriptors = project(found.descriptors, mean, components)
+    unsorted = (*found[:-1], descriptors, views)
+    del found  # the room of its descriptors is needed
     middles = list_middles(descriptors, num_lists(len(descriptors)))
-    of_points, start = in_lists((*found[:-1], descriptors, views), middles, workers)
+    of_points, start = in_lists(unsorted, middles, workers)
     of_all: list[Any] = [*of_points, centers, mean, components, middles, start]
     return FeatureMap(*of_all)
 
