@@ -134,9 +134,7 @@ def test_best_score_is_near_the_true_pose(gravity, most):
     true_pose, scan_map = rooms.scene(1)[2], rooms.scan_map(1)
     rotations = uniform_yaws(48) if gravity == "known" else uniform_rotations(2000)
     samples, validity = search.turn_panorama(_query().images.search, rotations)
-    sparse, rotation, values = search.best_poses(
-        search.score_poses_wide(scan_map, samples, validity, Workers(2)), 200
-    )
+    sparse, rotation, values = search.best_poses_wide(scan_map, samples, validity, 200, Workers(2))
     assert (np.diff(values) <= 0).all()
     starts = search.search_poses(_query(), gravity)
     centers = scan_map.centers[scan_map.sparse[sparse]]
@@ -147,6 +145,18 @@ def test_best_score_is_near_the_true_pose(gravity, most):
             for center, R in zip(*found, strict=True)
         ]
         assert any(near[:most])
+
+
+def test_a_part_of_the_candidates_at_a_time_gives_the_same_poses(monkeypatch):
+    scan_map, rotations = rooms.scan_map(1), uniform_rotations(200)
+    samples, validity = search.turn_panorama(_query().images.search, rotations)
+    whole = search.best_poses_wide(scan_map, samples, validity, 500, Workers(1))
+    monkeypatch.setattr(search, "BLOCK", 7)
+    monkeypatch.setattr(search, "SCORES_AT_ONCE", 30 * len(rotations))
+    assert len(scan_map.sparse) > 3 * search.views_at_once(len(rotations))
+    in_parts = search.best_poses_wide(scan_map, samples, validity, 500, Workers(2))
+    for expected, found in zip(whole, in_parts, strict=True):
+        np.testing.assert_array_equal(found, expected)
 
 
 def test_best_poses_are_the_largest_in_order():

@@ -25,6 +25,7 @@ from .scan_map import ScanMap
 from .starts import START_ANGLE, START_DISTANCE, Starts
 
 BLOCK = 512  # views a matrix product
+SCORES_AT_ONCE = 1 << 24  # 64 MB
 TURNED_BYTES = 4 * 16  # of a rotation, a cell: channels, validity, energy, and what they are made from
 EXACT = (1 << 24) - 1  # whole numbers up to this are exact in float32
 MOST_LEVEL = 127.5  # of a channel
@@ -98,13 +99,31 @@ def masked_correlation(
     return scores
 
 
-def score_poses_wide(scan_map: ScanMap, samples: Samples, validity: Samples, workers: Workers) -> Samples:
-    """Masked correlation (sparse, rotations) of wide views with the turned panorama, its cells averaged."""
+def best_poses_wide(
+    scan_map: ScanMap, samples: Samples, validity: Samples, pool: int, workers: Workers
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Samples]:
+    """As `best_poses`, by the masked correlation of wide views with the turned panorama, its cells averaged.
+
+    Of some candidates at a time: scores of all are a gigabyte where a campus meets all rotations.
+    """
     weights = averaging(WIDE_RINGS)
     area = weights.sum(axis=0)
     wide_samples, wide_validity = np.rint(samples) @ weights / area, validity @ weights / area
     panorama = turned(wide_samples, np.rint(wide_validity), area, 255)
-    return masked_correlation(scan_map.wide_features, scan_map.wide_seen, area, panorama, workers)
+    num_views, found = views_at_once(len(samples)), []
+    for lo in range(0, max(len(scan_map.sparse), 1), num_views):
+        part = slice(lo, lo + num_views)
+        views = scan_map.wide_features[part], scan_map.wide_seen[part]
+        sparse, rotation, scores = best_poses(masked_correlation(*views, area, panorama, workers), pool)
+        found.append((sparse + lo, rotation, scores))
+    sparse, rotation, scores = (np.concatenate(values) for values in zip(*found, strict=True))
+    best = np.lexsort((rotation, sparse, -scores))[:pool]
+    return sparse[best], rotation[best], scores[best]
+
+
+def views_at_once(num_rotations: int) -> int:
+    """How many views' scores are held at a time."""
+    return max(SCORES_AT_ONCE // num_rotations, BLOCK)
 
 
 @kernel
@@ -169,12 +188,13 @@ def search_poses(query: Query, gravity: Gravity) -> Starts:
     else:
         rotations = uniform_rotations(settings.num_rotations)
     rotations = allowed_rotations(rotations @ m.R_map_from_world, settings.prior) @ m.R_map_from_world.T
-    num_bytes = len(rotations) * (len(make_grid(SEARCH_RINGS)) * TURNED_BYTES + 4 * len(m.sparse))
+    num_views = min(views_at_once(len(rotations)), len(m.sparse))
+    num_bytes = len(rotations) * (len(make_grid(SEARCH_RINGS)) * TURNED_BYTES + 4 * num_views)
     what = f"a search of {len(m.sparse)} positions in {len(rotations)} rotations"
     check_memory(num_bytes, what, "set fewer --num-yaws or --num-rotations")
     samples, validity = turn_panorama(query.images.search, rotations)
-    scores = score_poses_wide(m, samples, validity, query.workers)
-    sparse, rotation, _ = best_poses(scores, num_starts * POSES_PER_START)
+    pool = num_starts * POSES_PER_START
+    sparse, rotation, _ = best_poses_wide(m, samples, validity, pool, query.workers)
     R, centers = rotations[rotation], m.centers[m.sparse[sparse]]
     kept = non_maximum_suppression(R, centers, num_starts, START_DISTANCE, START_ANGLE)
     return rescored(query, m.sparse[sparse[kept]], rotations, rotation[kept], samples, validity)
