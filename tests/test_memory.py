@@ -1,13 +1,14 @@
 """What may be taken of the memory, and that it is asked before much is."""
 
 import resource
+import tracemalloc
 
 import cv2
 import numpy as np
 import pytest
 from rooms import as_panorama, query, room, scan_map
 
-from piccolo.cloud import voxel_table
+from piccolo.cloud import octree, voxel_table
 from piccolo.cloud.stream import stream_of_arrays
 from piccolo.coarse_to_fine.candidate_views import SEARCH_VIEW, render_views, render_wide
 from piccolo.coarse_to_fine.query import prepare_query
@@ -91,6 +92,34 @@ def test_work_begins_only_where_errors_can_still_be_raised(monkeypatch):
     monkeypatch.setattr(memory, "free_of_process", lambda: 2e8)
     assert list(Workers().map(abs, [-1], "a")) == [1]
     assert len(cloud.read().points) == 1000
+
+
+def test_voxels_and_their_octree_take_what_they_say(monkeypatch):
+    for module in (voxel_table, octree):
+        monkeypatch.setattr(module, "AT_ONCE", 1 << 10)
+    rng, num = np.random.default_rng(0), 200_000
+    points, colors = rng.uniform(0, 60, (num, 3)), rng.integers(0, 256, (num, 3), np.uint8)
+    kernels_compiled = voxel_table.VoxelTable("a.ply")
+    kernels_compiled.add(points[: num // 4], colors[: num // 4])
+    kernels_compiled.finish()
+    tracemalloc.start()
+    try:
+        table = voxel_table.VoxelTable("a.ply")
+        table.add(points, colors)
+        slots = 2 * voxel_table.SLOT_BYTES / voxel_table.MAX_LOAD
+        at_most = voxel_table.ROW_BYTES * (1 + 1 / voxel_table.MORE_ROWS) + slots
+        assert tracemalloc.get_traced_memory()[1] < 1.05 * num * at_most + 1e6
+        tracemalloc.reset_peak()
+        voxels = table.finish()
+        at_most = voxel_table.ROW_BYTES * (1 + 1 / voxel_table.MORE_ROWS) + voxel_table.SORTED_BYTES
+        assert tracemalloc.get_traced_memory()[1] < 1.05 * num * at_most + 1e6
+        assert tracemalloc.get_traced_memory()[0] < 1.05 * num * (8 + 24)
+        tracemalloc.reset_peak()
+        tree = octree.build_octree(voxels)
+        at_most = len(voxels.nodes) * (8 + 24 + octree.LEVEL_BYTES) + len(tree.nodes) * octree.NODE_BYTES
+        assert tracemalloc.get_traced_memory()[1] < 1.05 * at_most + 1e6
+    finally:
+        tracemalloc.stop()
 
 
 def test_what_libraries_raise_when_memory_is_short():

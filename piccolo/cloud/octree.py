@@ -39,7 +39,9 @@ def build_octree(voxels: Voxels) -> Octree:
     for _ in range(NUM_LEVELS - 1):
         check_memory(len(codes) * LEVEL_BYTES, f"the scan: a level of {len(codes)} voxels", THIN)
         codes = codes >> 3  # children of a parent follow each other
-        first = np.flatnonzero(np.concatenate([[True], codes[1:] != codes[:-1]]))
+        is_first = np.ones(len(codes), dtype=np.bool_)
+        np.not_equal(codes[1:], codes[:-1], out=is_first[1:])
+        first = np.flatnonzero(is_first)
         firsts.insert(0, first.astype(np.int32))
         codes = codes[first]
     start = np.cumsum([0, *map(len, firsts), len(voxels.nodes)], dtype=np.int32)
