@@ -10,6 +10,7 @@ from piccolo.cloud.soa import pack_points
 from piccolo.cloud.stream import Cloud
 from piccolo.cloud.voxels import morton_order
 from piccolo.coarse_to_fine.scan_map import prepare_map
+from piccolo.coarse_to_fine.view import average_view, normalized_view
 from piccolo.geometry.pose import Pose, angle_between
 from piccolo.panorama import Panorama
 from piccolo.runtime.threads import Workers
@@ -69,6 +70,11 @@ def scene(seed):
     """A room's points as kernels read them, a panorama of it, and its true pose near the local origin."""
     taken = query(seed)
     return packed(seed), as_panorama(taken.rgb), local(seed, taken.pose)
+
+
+def view(octree, center_map, config, shown):
+    """What is seen around a centre on the cells that are shown."""
+    return normalized_view(average_view(octree, center_map, config), center_map, config, shown)
 
 
 def write_room(folder, words):

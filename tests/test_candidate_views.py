@@ -8,7 +8,6 @@ import rooms
 
 from piccolo.coarse_to_fine import candidate_views
 from piccolo.coarse_to_fine.candidate_views import SEARCH_VIEW, CandidateViews, render_views, render_wide
-from piccolo.coarse_to_fine.view import render_view
 from piccolo.geometry.sphere import averaging, make_grid
 from piccolo.panorama.local_normalization import LEVELS_PER_UNIT
 from piccolo.runtime.threads import Workers
@@ -24,7 +23,7 @@ def _views():
 def test_views_are_views_in_few_bits():
     m, kept = _views()
     k = len(m.centers) // 2
-    offsets, features, weights = render_view(m.octree, m.centers[k], SEARCH_VIEW, ALL)
+    offsets, features, weights, _ = rooms.view(m.octree, m.centers[k], SEARCH_VIEW, ALL)
     (row,), views = kept.at(np.array([k]), Workers(1))
     np.testing.assert_array_equal(views.centers[row], m.centers[k])
     np.testing.assert_array_equal(views.is_seen[row], weights > 0)

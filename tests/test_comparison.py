@@ -70,14 +70,14 @@ def test_a_photo_is_sampled_as_its_twin():
     offsets, texels = rng.normal(size=(3, 900)).astype(np.float32), pack_texels(rgb, is_valid)
     weights = rng.uniform(0.5, 1.5, 900).astype(np.float32)
     colors, shared, rays = (np.empty(shape, np.float32) for shape in ((3, 900), 900, (3, 900)))
-    photo = texels.rgbx, texels.width
-    sample_photo(offsets, weights, photo, TILTED, colors, shared, rays)
-    pixels = naive.project(offsets.T, TILTED, np.zeros(3), 256)
+    photo, center = (texels.rgbx, texels.width), np.array([0.01, -0.02, 0.03])
+    sample_photo(offsets, weights, photo, TILTED, center, colors, shared, rays)
+    pixels = naive.project(offsets.T, TILTED, center, 256)
     r, g, b = naive.sample(rgb, pixels).T / 255
     np.testing.assert_allclose(colors, [(r + g + b) / 3, (r - b) / 2, (2 * g - r - b) / 4], atol=2e-3)
     shows = naive.sample(is_valid[..., None], pixels)[:, 0] > 1 - 1e-9
     assert (shared == weights * shows).mean() > 0.995
-    np.testing.assert_allclose(rays, TILTED @ offsets, atol=1e-5)
+    np.testing.assert_allclose(rays, TILTED @ (offsets - center[:, None]), atol=1e-5)
 
 
 def test_blocks_correlate_as_their_twin():

@@ -9,7 +9,7 @@ from piccolo.coarse_to_fine import descent
 from piccolo.coarse_to_fine.config import METHOD
 from piccolo.coarse_to_fine.query import query_images
 from piccolo.coarse_to_fine.starts import Starts
-from piccolo.coarse_to_fine.view import Cells, render_view
+from piccolo.coarse_to_fine.view import Cells
 from piccolo.geometry.pose import Pose, step
 from piccolo.geometry.sphere import make_grid
 from piccolo.runtime.threads import Workers
@@ -27,7 +27,7 @@ def _images():
 def _fine():
     """Fine cells about the true camera of a room, and its true pose."""
     true_pose = rooms.scene(1)[2]
-    return render_view(rooms.scan_map(1).octree, true_pose.center_world, METHOD.fine_view, ALL), true_pose
+    return rooms.view(rooms.scan_map(1).octree, true_pose.center_world, METHOD.fine_view, ALL), true_pose
 
 
 def test_channels_in_levels_and_perturbations_to_the_corners_of_a_cube():
@@ -43,22 +43,22 @@ def test_channels_in_levels_and_perturbations_to_the_corners_of_a_cube():
 
 def test_descent_finds_the_true_pose_again():
     (cells, true_pose), image = _fine(), _images().fine
-    center, off = true_pose.center_world, step(true_pose, np.array([0.03, -0.02, 0.04, 0.06, -0.05, 0.04]))
-    pose = descent.descend(cells, center, image, off, (1.0, 30, 1e-5))
+    off = step(true_pose, np.array([0.03, -0.02, 0.04, 0.06, -0.05, 0.04]))
+    pose = descent.descend(cells, image, off, (1.0, 30, 1e-5))
     assert rooms.errors(pose, true_pose)[0] < 0.01
-    before, after = (descent.score_on(cells, FINE_BLOCKS, center, image, p) for p in (off, pose))
+    before, after = (descent.score_on(cells, FINE_BLOCKS, image, p) for p in (off, pose))
     assert after > max(0.6, before)
-    assert rooms.errors(descent.descend(cells, center, image, off, (1.0, 1, 1e-5)), true_pose)[0] > 0.01
+    assert rooms.errors(descent.descend(cells, image, off, (1.0, 1, 1e-5)), true_pose)[0] > 0.01
 
 
 def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off():
     (_, true_pose), images = _fine(), _images()
     off = step(true_pose, descent.perturbations(1.0)[1])
     assert rooms.errors(off, true_pose)[0] > 0.2
-    cells = render_view(rooms.scan_map(1).octree, off.center_world, METHOD.fine_view, ALL)
+    cells = rooms.view(rooms.scan_map(1).octree, off.center_world, METHOD.fine_view, ALL)
     found = descent.descend_around(cells, FINE_BLOCKS, (images.search, images.middle), off, 1.0)
     assert rooms.errors(found.pose, true_pose)[0] < 0.06
-    score = descent.score_on(cells, FINE_BLOCKS, off.center_world, images.middle, found.pose)
+    score = descent.score_on(cells, FINE_BLOCKS, images.middle, found.pose)
     np.testing.assert_allclose(found.score, score, atol=1e-5)
 
 
@@ -75,8 +75,8 @@ def test_starts_descend_on_their_candidates_views_as_one_does_alone():
     offsets = (views.offsets[row] * views.offset_unit[row]).astype(np.float32)
     channels = views.features[row].astype(np.float32) / np.float32(63.75)
     weights = (views.is_seen[row] * make_grid(24).solid_angle).astype(np.float32)
-    cells, center = Cells(offsets, channels, weights), scan_map.centers[k]
-    alone = descent.descend(cells, center, image, Pose(R, center), (1.2, 12, 2e-3))
+    cells, center = Cells(offsets, channels, weights, scan_map.centers[k]), scan_map.centers[k]
+    alone = descent.descend(cells, image, Pose(R, center), (1.2, 12, 2e-3))
     np.testing.assert_allclose(ends.center_map[0], alone.center_world, atol=1e-4)
     np.testing.assert_allclose(ends.R_cam_from_map[0], alone.R_cam_from_world, atol=1e-4)
     assert rooms.errors(alone, true_pose)[0] < 0.1

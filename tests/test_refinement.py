@@ -1,6 +1,7 @@
 """Decisions of the default method, each in a made-up case where one rule changes the outcome."""
 
 import functools
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,7 @@ import rooms
 from piccolo.coarse_to_fine import refinement
 from piccolo.coarse_to_fine.config import METHOD, Beam
 from piccolo.coarse_to_fine.query import prepare_query
+from piccolo.coarse_to_fine.recent_views import RecentViews
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.coarse_to_fine.starts import Starts, best_and_alternatives, narrow
 from piccolo.confidence.alternatives import Hypothesis
@@ -17,7 +19,7 @@ from piccolo.geometry.pose import Pose, step, yaw_rotation
 from piccolo.geometry.sphere import make_grid
 from piccolo.runtime.threads import Workers
 
-QUERY = SimpleNamespace(workers=Workers(1), method=METHOD, scan_map=SimpleNamespace(octree=None))
+QUERY = SimpleNamespace(workers=Workers(1), method=METHOD, scan_map=None)
 
 
 def _at(x, score, yaw_deg=0.0):
@@ -112,17 +114,15 @@ def test_halving_keeps_as_many_as_the_beam_says(monkeypatch):
 
 def test_each_stage_has_its_view_its_image_and_its_limits(monkeypatch):
     asked = []
-    monkeypatch.setattr(refinement, "render_view", lambda octree, center, view, shown: view)
-    monkeypatch.setattr(
-        refinement, "visible_points", lambda octree, center, view, shown, count: (view, count)
-    )
-    monkeypatch.setattr(refinement, "descend", lambda *arguments: asked.append(arguments) or arguments[3])
-    monkeypatch.setattr(refinement, "score_on", lambda cells, blocks, center, image, pose: len(blocks))
+    monkeypatch.setattr(refinement, "normalized_view", lambda sums, center, view, shown: view)
+    monkeypatch.setattr(refinement, "descend", lambda *arguments: asked.append(arguments) or arguments[2])
+    monkeypatch.setattr(refinement, "score_on", lambda cells, blocks, image, pose: len(blocks))
     monkeypatch.setattr(refinement, "refine_unoccluded", lambda query, h: (query, h))
     monkeypatch.setattr(refinement, "without_occluders", lambda query, pose: query)
     monkeypatch.setattr(refinement, "compared", lambda query, h: h)
     images = SimpleNamespace(full="full", fine="fine", middle="middle")
-    query = SimpleNamespace(**vars(QUERY), images=images, shown_cells=lambda *_: None)
+    views = RecentViews(lambda *_: None, lambda place, view, shown, count: (view, count))
+    query = SimpleNamespace(**vars(QUERY), images=images, shown_cells=lambda *_: np.ones(3), views=views)
     h, full = _at(1.0, 0.2), (METHOD.full_view, 30_000)
     for at, view in (
         (refinement.descend_middle, METHOD.middle_view),
@@ -131,7 +131,7 @@ def test_each_stage_has_its_view_its_image_and_its_limits(monkeypatch):
         assert at(query, h).score == len(view.arrays.blocks)
     refinement.refine_full_resolution(query, h, 1)
     refinement.settle(query, h)
-    assert [(cells, image, *limits) for cells, _, image, _, limits in asked] == [
+    assert [(cells, image, *limits) for cells, image, _, limits in asked] == [
         (METHOD.middle_view, "middle", 1.2, 12, 1e-3),
         (METHOD.fine_view, "fine", 1.0, 12, 1e-4),
         (full, "full", 0.7, 10, 1e-4),
@@ -156,7 +156,7 @@ def test_poses_are_perturbed_for_as_long_as_that_helps(monkeypatch, gains, round
         return Hypothesis(h.pose, score[0])
 
     score = [0.5]
-    monkeypatch.setattr(refinement, "render_view", lambda *_: None)
+    monkeypatch.setattr(refinement, "view_at", lambda *_: None)
     monkeypatch.setattr(refinement, "score_on", lambda *_: 0.5)  # whatever another way of scoring said
     monkeypatch.setattr(refinement, "descend_around", around)
     monkeypatch.setattr(refinement, "descend_fine", fine)
@@ -243,14 +243,11 @@ def test_cells_and_points_are_those_that_the_photo_shows(monkeypatch):
     assert whole.shown_cells(METHOD.full_view.num_rings, pose).all()
     is_inside = np.abs((azimuth - 78.75 + 180) % 360 - 180) < 33.75
     assert (shown == is_inside).mean() > 0.98
-    monkeypatch.setattr(refinement, "render_view", lambda octree, center, config, shown: shown)
-    monkeypatch.setattr(
-        refinement, "visible_points", lambda octree, center, config, shown, count: (shown, count)
-    )
-    assert (refinement.view_at(narrow, pose, METHOD.full_view) == shown).all()
-    points, count = refinement.points_at(narrow, pose)
-    assert (points == shown).all()
-    assert count == 30_000
+    monkeypatch.setattr(refinement, "normalized_view", lambda sums, center, config, shown: shown)
+    views = RecentViews(lambda *_: None, lambda place, config, shown, count: (shown, count))
+    asked = replace(narrow, views=views)
+    assert (refinement.view_at(asked, pose, METHOD.full_view) == shown).all()
+    assert refinement.points_at(asked, pose) == (shown.tobytes(), 30_000)
 
 
 @pytest.mark.parametrize(("seed", "most"), [(1, 5e-5), (3, 5e-4), (4, 5e-5)])

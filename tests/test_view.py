@@ -10,7 +10,7 @@ from piccolo.cloud.stream import Cloud
 from piccolo.coarse_to_fine import camera_positions
 from piccolo.coarse_to_fine.candidate_views import SEARCH_VIEW
 from piccolo.coarse_to_fine.points_around import points_around, take_children, visible_points
-from piccolo.coarse_to_fine.view import ViewConfig, render_view
+from piccolo.coarse_to_fine.view import ViewConfig
 from piccolo.geometry.sphere import cell_of, make_grid
 from piccolo.runtime.threads import Workers
 
@@ -34,7 +34,7 @@ def _cells(positions):
 
 def test_view_of_the_leaves_equals_its_twin(octree):
     center = rooms.scene(1)[2].center_world
-    offsets, features, weights = render_view(octree, center, LEAVES, ALL)
+    offsets, features, weights, _ = rooms.view(octree, center, LEAVES, ALL)
     leaves = octree.level(octree.leaf_size).astype(np.float64)
     twin = naive.cells_view(leaves, center, _cells(leaves[:, :3] - center), len(make_grid(24)))
     seen = twin[2] > 0
@@ -50,7 +50,7 @@ def test_cells_that_are_not_shown_change_nothing_elsewhere(octree):
     """They have no weight, and the local means and deviations are those of what is shown."""
     center = rooms.scene(1)[2].center_world
     shown = make_grid(24).directions[:, 0] > 0.0
-    whole, part = (render_view(octree, center, LEAVES, some) for some in (ALL, shown))
+    whole, part = (rooms.view(octree, center, LEAVES, some) for some in (ALL, shown))
     assert (part.weights[~shown] == 0).all()
     np.testing.assert_array_equal(part.weights[shown], whole.weights[shown])
     leaves = octree.level(octree.leaf_size).astype(np.float64)
@@ -64,7 +64,7 @@ def test_cells_that_are_not_shown_change_nothing_elsewhere(octree):
 
 def test_coarser_voxels_far_away_change_a_view_little(octree):
     center = rooms.scene(1)[2].center_world
-    exact, coarse = (render_view(octree, center, kind, ALL) for kind in (LEAVES, SEARCH_VIEW))
+    exact, coarse = (rooms.view(octree, center, kind, ALL) for kind in (LEAVES, SEARCH_VIEW))
     both = (exact[2] > 0) & (coarse[2] > 0)
     product = (exact[1] * coarse[1])[:, both].sum()
     assert product / np.sqrt((exact[1][:, both] ** 2).sum() * (coarse[1][:, both] ** 2).sum()) > 0.8
@@ -72,7 +72,7 @@ def test_coarser_voxels_far_away_change_a_view_little(octree):
 
 def test_points_that_are_seen_lie_at_the_front_and_are_bounded(octree):
     center = rooms.scene(1)[2].center_world
-    offsets, _, weights = visible_points(octree, center, LEAVES, ALL, 3000)
+    offsets, _, weights, _ = visible_points(octree, center, LEAVES, ALL, 3000)
     assert 1000 < len(weights) <= 3000
     ranges = np.linalg.norm(offsets, axis=0)
     nearest = np.full(len(make_grid(24)), np.inf)

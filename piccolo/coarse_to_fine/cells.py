@@ -51,11 +51,11 @@ def average_cells(nodes, found, directions, cells, ranges, front, sums):
 
 
 @kernel
-def average_colors(sums, view, offsets, channels, weights, moments):
-    """Turn sums into relative positions, opponent channels and weights of cells; add up their moments."""
+def average_colors(sums, view, shown, offsets, channels, weights, moments):
+    """Write relative positions, opponent channels and weights of the cells shown; add up their moments."""
     moments[:] = F0
     for c in range(len(sums)):
-        if sums[c, 6] > F0:
+        if shown[c] and sums[c, 6] > F0:
             per = F1 / sums[c, 6]
             for k in range(3):
                 offsets[k, c] = sums[c, k] * per

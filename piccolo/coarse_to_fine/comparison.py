@@ -18,9 +18,10 @@ from ..panorama.local_normalization import opponent, zscore
 from ..panorama.projection import CHUNK, gather, make_projected, project
 from ..panorama.texels import bilinear_weights, blend, is_valid
 from ..runtime.jit import F0, kernel
-from .cells import local_statistics, locate
+from .cells import average_colors, local_statistics, locate
 from .query import Query
-from .view import render_cells, thread_scratch
+from .recent_views import place_of
+from .view import empty_cells
 
 CONTRADICTS = 0.1  # a block of less is left out of the local means and deviations
 LEAST_SHARED = 0.3  # of what the poorer view shows
@@ -56,10 +57,12 @@ class Comparison(NamedTuple):
 
 
 @kernel
-def sample_photo(offsets, weights, photo, R_cam_from_map, colors, shared, rays):
-    """Write the photo's opponent channels (3, N) at cells (3, N), weights of what both show, rays (3, N)."""
+def sample_photo(offsets, weights, photo, R_cam_from_map, center, colors, shared, rays):
+    """Write the photo's opponent channels (3, N) at cells (3, N), weights of what both show, rays (3, N).
+
+    `center` (3,) [m] of the camera counts from where the offsets of the cells do.
+    """
     (texels, width), p = photo, make_projected()
-    center = np.zeros(3)
     for lo in range(0, len(weights), CHUNK):
         hi = min(lo + CHUNK, len(weights))
         project(offsets[0][lo:hi], offsets[1][lo:hi], offsets[2][lo:hi], R_cam_from_map, center, width, p)
@@ -112,7 +115,7 @@ def correlate_blocks(first, second, shared, blocks, correlation, area):
 
 @kernel
 def compare_cells(
-    offsets, colors, weights, photo, R_cam_from_map, view, grid, correlation, area, visible_area
+    offsets, colors, weights, photo, R_cam_from_map, center, view, grid, correlation, area, visible_area
 ):
     """Write the correlation and the shared area (blocks,) of cells (3, N) around a camera with its photo.
 
@@ -121,7 +124,7 @@ def compare_cells(
     """
     of_photo, shared, n = np.empty_like(colors), np.empty_like(weights), len(weights)
     rays, blocks = np.empty_like(colors), np.empty(n, np.int32)
-    sample_photo(offsets, weights, photo, R_cam_from_map, of_photo, shared, rays)
+    sample_photo(offsets, weights, photo, R_cam_from_map, center, of_photo, shared, rays)
     ranges, turns = np.empty(n, np.float32), np.empty(n, np.float32)
     locate(rays[0], rays[1], rays[2], grid[0], grid[1], blocks, ranges, turns)
     first, second, kept = np.empty_like(colors), np.empty_like(colors), shared.copy()
@@ -145,16 +148,15 @@ def compare(query: Query, pose: Pose) -> Comparison:
 
 
 def _compare(query: Query, pose: Pose) -> Comparison:
-    config, photo = query.method.fine_view, query.photo
-    n = len(make_grid(config.num_rings))
-    offsets, colors = np.empty((3, n), np.float32), np.empty((3, n), np.float32)
-    weights, sums, stats = np.empty(n, np.float32), np.empty((n, 8), np.float32), np.empty((6, n), np.float32)
-    how = config.voxel_per_range, config.arrays, thread_scratch(), np.ones(n, np.bool_)
-    render_cells(query.scan_map.octree, pose.center_world, *how, offsets, colors, weights, sums, stats)
+    config, photo, place = query.method.fine_view, query.photo, place_of(pose)
+    sums, view = query.views.averages(place, config), config.arrays
+    *cells, center = empty_cells(len(sums), place)
+    moments = np.empty((view.num_stats, 8), np.float32)
+    average_colors(sums, view, np.ones(len(sums), np.bool_), *cells, moments)
     by_block = np.empty(NUM_BLOCKS), np.empty(NUM_BLOCKS), np.empty(NUM_BLOCKS)
     image, blocks = (photo.rgbx, photo.width), make_grid(BLOCK_RINGS)
-    grid = blocks.num_columns, blocks.first
-    compare_cells(offsets, colors, weights, image, pose.R_cam_from_world, config.arrays, grid, *by_block)
+    at, grid = (pose.R_cam_from_world, pose.center_world - center), (blocks.num_columns, blocks.first)
+    compare_cells(*cells, image, *at, view, grid, *by_block)
     return Comparison(*by_block, photo.valid_share)
 
 

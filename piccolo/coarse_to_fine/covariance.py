@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from ..confidence.covariance import PoseCovariance, least_constrained_direction
-from ..geometry.pose import Array, Pose, exp_so3
+from ..geometry.pose import Array, Pose, step
 from ..geometry.sphere import cell_of
 from ..optimize.channel_loss import channel_equations, equations_by_part
 from ..optimize.normal_equations import GRADIENT, MATRIX, NUM_SUMS
@@ -44,13 +44,10 @@ STEPS = (
 ROUGH_STEPS = DifferenceSteps("middle", math.radians(0.3), 0.015, 1.0)
 
 
-def equations_at(image: Texels, points: Cells, R_cam_from_map: Array, shift: Array) -> tuple[Array, Array]:
-    """Gradient (6,) and Gauss-Newton matrix (6, 6) of the robust loss, in the camera's frame.
-
-    `shift` (3,) [m] is that of the centre.
-    """
-    sums = np.empty(NUM_SUMS)
-    channel_equations((*points, image.rgbx, image.width, SCALE), R_cam_from_map, shift, sums)
+def equations_at(image: Texels, points: Cells, pose: Pose) -> tuple[Array, Array]:
+    """Gradient (6,) and Gauss-Newton matrix (6, 6) of the robust loss, in the camera's frame."""
+    sums, center = np.empty(NUM_SUMS), pose.center_world - points.center_map
+    channel_equations((*points[:3], image.rgbx, image.width, SCALE), pose.R_cam_from_world, center, sums)
     return sums[GRADIENT:MATRIX].copy(), symmetric(sums[MATRIX:])
 
 
@@ -63,10 +60,11 @@ def symmetric(upper: Array) -> Array:
 
 
 def without_poles(points: Cells, pose: Pose) -> Cells:
-    """The points that are not within POLE_DEG of the photo's poles, seen from the pose."""
+    """The points around a pose that are not within POLE_DEG of the photo's poles."""
     heights, ranges = pose.R_cam_from_world[2] @ points.offsets, np.linalg.norm(points.offsets, axis=0)
     is_kept = np.abs(heights) < math.cos(math.radians(POLE_DEG)) * ranges
-    return Cells(*(np.ascontiguousarray(values[..., is_kept]) for values in points))
+    offsets, channels, weights = (np.ascontiguousarray(values[..., is_kept]) for values in points[:3])
+    return Cells(offsets, channels, weights, points.center_map)
 
 
 def hessian_at(image: Texels, points: Cells, pose: Pose, steps: DifferenceSteps) -> Array:
@@ -76,21 +74,17 @@ def hessian_at(image: Texels, points: Cells, pose: Pose, steps: DifferenceSteps)
     small.
     """
     rows = []
-    for step in np.diag([steps.turn] * 3 + [steps.move] * 3):
-        gradients = []
-        for sign in (1.0, -1.0):
-            R = exp_so3(sign * step[:3]) @ pose.R_cam_from_world
-            shift = sign * pose.R_cam_from_world.T @ step[3:]
-            gradients.append(equations_at(image, points, R, shift)[0])
-        rows.append((gradients[0] - gradients[1]) / (2.0 * step.sum()))
+    for delta in np.diag([steps.turn] * 3 + [steps.move] * 3):
+        after, before = (equations_at(image, points, step(pose, sign * delta))[0] for sign in (1.0, -1.0))
+        rows.append((after - before) / (2.0 * delta.sum()))
     return np.asarray(0.5 * (np.array(rows) + np.array(rows).T))
 
 
 def block_gradients(image: Texels, points: Cells, pose: Pose) -> Array:
-    """Gradients (B, 6), in the camera's frame, of the points in each block of the sphere, as if left out."""
+    """Gradients (B, 6), in the camera's frame, of the points in each block around it, as if left out."""
     block = cell_of(points.offsets.T / np.linalg.norm(points.offsets, axis=0)[:, None], BLOCK_RINGS)
     order, counts = np.argsort(block, kind="stable"), np.bincount(block)
-    offsets, levels, weights = (np.ascontiguousarray(values[..., order]) for values in points)
+    offsets, levels, weights = (np.ascontiguousarray(values[..., order]) for values in points[:3])
     begins, sums = np.concatenate([[0], np.cumsum(counts)]), np.empty((len(counts), NUM_SUMS))
     problem = offsets, levels, weights, image.rgbx, image.width, SCALE
     equations_by_part(problem, pose.R_cam_from_world, np.zeros(3), begins, sums)
@@ -158,7 +152,7 @@ def errors_of_source(query: Query, points: Cells) -> Array:
 def estimate_covariance(query: Query, pose: Pose) -> PoseCovariance | None:
     """The covariance of a pose, in world axes; None where the points do not fix it."""
     query = without_occluders(query, pose)
-    points = without_poles(points_at(query, pose), pose)
+    points = without_poles(points_at(query, pose).around(pose.center_world), pose)
     points = points._replace(channels=as_levels(points.channels))
     covariance = covariance_at(query, points, pose)
     if covariance is None:

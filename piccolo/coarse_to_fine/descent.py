@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..confidence.alternatives import Hypothesis
-from ..geometry.pose import Array, Pose, orthonormal
+from ..geometry.pose import Pose, orthonormal
 from ..optimize.channel_loss import descend_channels, score
 from ..optimize.levenberg_marquardt import retract
 from ..panorama.local_normalization import LEVELS_PER_UNIT, ZERO_LEVEL
@@ -100,38 +100,36 @@ def descend_all(
     return Starts(R, t, starts.candidate, scores).take(np.argsort(-scores, kind="stable"))
 
 
-def descend(cells: Cells, center: Array, image: Texels, pose: Pose, limits: tuple[float, int, float]) -> Pose:
-    """The pose where a descent from `pose` ends, on cells around `center` (3,).
+def descend(cells: Cells, image: Texels, pose: Pose, limits: tuple[float, int, float]) -> Pose:
+    """The pose where a descent from `pose` ends.
 
     Limits are the loss' scale [standard deviations], the iterations, the least step [rad + m]. Coordinates
-    relative to the centre keep float32 exact.
+    relative to the cells' centre keep float32 exact.
     """
     loss_scale, num_iterations, tolerance = limits
-    R, t = pose.R_cam_from_world.copy(), pose.center_world - center
+    R, t = pose.R_cam_from_world.copy(), pose.center_world - cells.center_map
     levels, scale = as_levels(cells.channels), loss_scale * LEVELS_PER_UNIT
     problem = cells.offsets, levels, cells.weights, image.rgbx, image.width, scale
     descend_channels(problem, num_iterations, tolerance, R, t)
-    return Pose(orthonormal(R), t + center)
+    return Pose(orthonormal(R), t + cells.center_map)
 
 
-def score_on(cells: Cells, blocks: NDArray[np.int32], center: Array, image: Texels, pose: Pose) -> float:
-    """The score of a pose on cells around `center` (3,), each in its block of the sphere."""
-    levels, R, t = as_levels(cells.channels), pose.R_cam_from_world, pose.center_world - center
+def score_on(cells: Cells, blocks: NDArray[np.int32], image: Texels, pose: Pose) -> float:
+    """The score of a pose on cells, each in its block of the sphere."""
+    levels, R, t = as_levels(cells.channels), pose.R_cam_from_world, pose.center_world - cells.center_map
     return float(score(cells.offsets, levels, cells.weights, blocks, image.rgbx, image.width, R, t))
 
 
 def descend_around(
     cells: Cells, blocks: NDArray[np.int32], images: tuple[Texels, Texels], pose: Pose, size: float
 ) -> Hypothesis:
-    """The best end of descents from around a pose, the wider image first, and from the pose itself.
-
-    The cells are those around the pose.
-    """
+    """The best end of descents from around a pose, the wider image first, and from the pose itself."""
     steps, (wide, narrow) = perturbations(size), images
-    R, t = np.repeat(pose.R_cam_from_world[None], len(steps), axis=0), np.zeros((len(steps), 3))
+    R = np.repeat(pose.R_cam_from_world[None], len(steps), axis=0)
+    t = np.repeat((pose.center_world - cells.center_map)[None], len(steps), axis=0)
     scores = np.empty(len(steps))
     both = (wide.rgbx, wide.width), (narrow.rgbx, narrow.width)
     levels, scale = as_levels(cells.channels), COARSE_LOSS * LEVELS_PER_UNIT
     descend_perturbed(cells.offsets, levels, cells.weights, blocks, *both, scale, steps, R, t, scores)
     best = int(np.argmax(scores))
-    return Hypothesis(Pose(orthonormal(R[best]), t[best] + pose.center_world), float(scores[best]))
+    return Hypothesis(Pose(orthonormal(R[best]), t[best] + cells.center_map), float(scores[best]))

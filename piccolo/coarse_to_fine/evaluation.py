@@ -40,9 +40,12 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
     if found.best.score < 0.0:
         return Localization()
     scan_map, settings, pose = query.scan_map, query.settings, found.best.pose
-    points = points_around(scan_map.octree, pose.center_world, VOXEL_PER_RANGE)
     panorama = shrink(panorama, MAX_WIDTH)
-    texels = pack_texels(panorama.rgb, panorama.is_valid)
+    needed: list[Callable[[], Any]] = [
+        lambda: pack_texels(panorama.rgb, panorama.is_valid),
+        lambda: points_around(scan_map.octree, pose.center_world, VOXEL_PER_RANGE),
+    ]
+    texels, points = query.workers.map(lambda make: make(), needed, "evaluate")
     if settings.solver != "gauss-newton":
         how = DescentSettings(solver=settings.solver, step_size=LAST_STEP)
         pose = refine(points, sampling_loss_of(texels), pose, how).pose

@@ -128,9 +128,8 @@ def refine_by_picture(query: Query, pose: Pose, panorama: Panorama) -> Mount | N
         camera = changed(small.cameras[0].camera, np.array([change]))
         shown = taken_by(small, small.cameras[0].with_camera(camera))
         images = query_images(shown, query.method.scales)
-        center = pose.center_world
-        end = descend(cells, center, images.full, descend(fine, center, images.fine, pose, NEAR), CLOSE)
-        return score_on(cells, np.zeros(cells.weights.shape, np.int32), center, images.full, end)
+        end = descend(cells, images.full, descend(fine, images.fine, pose, NEAR), CLOSE)
+        return score_on(cells, np.zeros(cells.weights.shape, np.int32), images.full, end)
 
     values = list(query.workers.map(agreement, list(CHANGES), "refine focal length"))
     curvature, slope, _ = np.polyfit(CHANGES, values, 2)

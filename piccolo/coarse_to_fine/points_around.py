@@ -10,7 +10,7 @@ from ..cloud.soa import PackedPoints
 from ..panorama.local_normalization import opponent, zscore
 from ..runtime.jit import F0, F1, HALF, inline_kernel, kernel
 from .cells import locate
-from .view import Cells, ViewConfig, empty_cells, render_cells, thread_scratch
+from .view import Cells, Center, ViewConfig, average_nodes, describe_cells, empty_cells, thread_scratch
 
 VISIBLE_OFFSET = np.float32(0.1)  # [m] of range noise
 U15, U16, LOW_32 = np.uint64(15), np.uint64(16), np.uint64(0xFFFFFFFF)
@@ -62,7 +62,7 @@ def take_children(tree, nodes, kept, found):
 
 @kernel
 def render_points(tree, center, voxel_per_range, view, scratch, shown, offsets, channels, weights):
-    """The visible points in cells that are shown, thinned to what fits: as `view.render`, with weight 1.
+    """The visible points in cells that are shown, thinned to what fits: as `normalize_cells`, with weight 1.
 
     Voxels twice as large tell what is in front, and how colours vary. Returns how many.
     """
@@ -70,8 +70,8 @@ def render_points(tree, center, voxel_per_range, view, scratch, shown, offsets, 
     sums, stats = np.empty((num_cells, 8), np.float32), np.empty((6, num_cells), np.float32)
     cell_offsets, cell_channels = np.empty((3, num_cells), np.float32), np.empty((3, num_cells), np.float32)
     cell_weights = np.empty(num_cells, np.float32)
-    around = cell_offsets, cell_channels, cell_weights, sums, stats
-    n = render_cells(tree, center, 2.0 * voxel_per_range, view, scratch, shown, *around)
+    n = average_nodes(tree, center, 2.0 * voxel_per_range, view, scratch, sums)
+    describe_cells(sums, view, shown, cell_offsets, cell_channels, cell_weights, stats)
     for c in range(num_cells):  # how far what is seen reaches; nothing of cells that are not shown
         sums[c, 7] = sums[c, 7] * view.visible + VISIBLE_OFFSET if cell_weights[c] > F0 else F0
     n, num_visible = keep_visible(tree, s.nodes, s.cells[:n], s.ranges, sums)
@@ -98,13 +98,14 @@ def render_points(tree, center, voxel_per_range, view, scratch, shown, offsets, 
 
 
 def visible_points(
-    octree: Octree, center_map: NDArray[np.float64], config: ViewConfig, shown: NDArray[np.bool_], count: int
+    octree: Octree, center_map: Center, config: ViewConfig, shown: NDArray[np.bool_], count: int
 ) -> Cells:
     """What is seen around a centre (3,) [m], as at most `count` points with equal weights, not as cells."""
-    cells = empty_cells(count)
-    center, view = np.asarray(center_map, np.float64), config.arrays
-    n = render_points(octree, center, config.voxel_per_range, view, thread_scratch(), shown, *cells)
-    return Cells(cells.offsets[:, :n].copy(), cells.channels[:, :n].copy(), cells.weights[:n].copy())
+    *found, center = empty_cells(count, center_map)
+    how = config.voxel_per_range, config.arrays, thread_scratch(), shown
+    n = render_points(octree, center, *how, *found)
+    offsets, channels, weights = (values[..., :n].copy() for values in found)
+    return Cells(offsets, channels, weights, center)
 
 
 @kernel

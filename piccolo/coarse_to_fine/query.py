@@ -20,6 +20,7 @@ from ..panorama.model import resize
 from ..panorama.texels import Texels, pack_texels
 from ..runtime.threads import Workers
 from .config import METHOD, ImageScales, MethodConfig
+from .recent_views import RecentViews, recent_views
 from .scan_map import ScanMap
 from .settings import CoarseToFineSettings
 
@@ -90,6 +91,7 @@ class Query:
     method: MethodConfig
     panorama: Panorama  # at the width of its features
     pixel: float  # [rad] of the photo as it was given, but none finer than those that are compared
+    views: RecentViews  # of the map
     by_features: bool = True  # False where whole views alone are asked
     comparisons: dict[bytes, Any] = field(default_factory=dict)  # worked out already, by comparison.py
     ends: set[bytes] = field(default_factory=set)  # poses which no perturbation improves any more
@@ -152,5 +154,5 @@ def prepare_query(
     R_cam_from_level = np.eye(3) if R_level_from_cam is None else R_level_from_cam.T
     pixel = math.tau / min(panorama.rgb.shape[1], method.scales.full.width)
     panorama = resize(panorama, method.scales.full.width)
-    images = query_images(panorama, method.scales)
-    return Query(scan_map, images, R_cam_from_level, settings, workers, method, panorama, pixel)
+    images, views = query_images(panorama, method.scales), recent_views(scan_map.octree)
+    return Query(scan_map, images, R_cam_from_level, settings, workers, method, panorama, pixel, views)

@@ -10,10 +10,10 @@ from ..geometry.pose import Pose
 from .comparison import compare, without_occluders
 from .config import Beam
 from .descent import COARSE_LOSS, FINE_LOSS, FULL_LOSS, descend, descend_all, descend_around, score_on
-from .points_around import visible_points
 from .query import Query
+from .recent_views import place_of
 from .starts import CLOSE_DISTANCE, SAME_ANGLE, SAME_DISTANCE, Starts, best_and_alternatives, narrow
-from .view import Cells, ViewConfig, render_view
+from .view import Cells, ViewConfig, normalized_view
 
 FIRST_ITERATIONS, SECOND_ITERATIONS = 5, 12  # of the descents on prepared views
 NUM_SCORED = 64  # starts, where only the best score is asked for
@@ -38,11 +38,10 @@ def descend_prepared(query: Query, starts: Starts, num_iterations: int, count: i
 
 def descend_middle(query: Query, h: Hypothesis) -> Hypothesis:
     """Descend on middle cells, seen from where the pose is now."""
-    center, image = h.pose.center_world, query.images.middle
-    config = query.method.middle_view
+    image, config = query.images.middle, query.method.middle_view
     cells = view_at(query, h.pose, config)
-    pose = descend(cells, center, image, h.pose, MIDDLE_LIMITS)
-    return Hypothesis(pose, score_on(cells, config.arrays.blocks, center, image, pose))
+    pose = descend(cells, image, h.pose, MIDDLE_LIMITS)
+    return Hypothesis(pose, score_on(cells, config.arrays.blocks, image, pose))
 
 
 def perturb_middle(query: Query, h: Hypothesis) -> Hypothesis:
@@ -54,11 +53,10 @@ def perturb_middle(query: Query, h: Hypothesis) -> Hypothesis:
 
 def descend_fine(query: Query, h: Hypothesis) -> Hypothesis:
     """Descend on fine cells, seen from where the pose is now."""
-    center, image = h.pose.center_world, query.images.fine
-    config = query.method.fine_view
+    image, config = query.images.fine, query.method.fine_view
     cells = view_at(query, h.pose, config)
-    pose = descend(cells, center, image, h.pose, FINE_LIMITS)
-    return Hypothesis(pose, score_on(cells, config.arrays.blocks, center, image, pose))
+    pose = descend(cells, image, h.pose, FINE_LIMITS)
+    return Hypothesis(pose, score_on(cells, config.arrays.blocks, image, pose))
 
 
 def refine_by_perturbation(query: Query, h: Hypothesis) -> Hypothesis:
@@ -70,7 +68,7 @@ def refine_by_perturbation(query: Query, h: Hypothesis) -> Hypothesis:
     if h.pose.key in query.ends:
         return h
     blocks, cells = config.arrays.blocks, view_at(query, h.pose, config)
-    h = Hypothesis(h.pose, score_on(cells, blocks, h.pose.center_world, query.images.fine, h.pose))
+    h = Hypothesis(h.pose, score_on(cells, blocks, query.images.fine, h.pose))
     for _ in range(MAX_PERTURBATIONS):
         around = descend_around(cells, blocks, images, h.pose, PERTURBATION)
         refined = descend_fine(query, around)
@@ -89,16 +87,16 @@ def compared(query: Query, h: Hypothesis) -> Hypothesis:
 
 
 def view_at(query: Query, pose: Pose, config: ViewConfig) -> Cells:
-    """The cells seen from a pose that the photo shows."""
-    shown = query.shown_cells(config.num_rings, pose)
-    return render_view(query.scan_map.octree, pose.center_world, config, shown)
+    """The cells seen from about a pose that the photo shows."""
+    place, shown = place_of(pose), query.shown_cells(config.num_rings, pose)
+    return normalized_view(query.views.averages(place, config), place, config, shown)
 
 
 def points_at(query: Query, pose: Pose) -> Cells:
-    """The points that the last descent goes by: those seen from a pose that the photo shows too."""
+    """The points that the last descent goes by: those seen from about a pose that the photo shows too."""
     config = query.method.full_view
     shown = query.shown_cells(config.num_rings, pose)
-    return visible_points(query.scan_map.octree, pose.center_world, config, shown, NUM_POINTS)
+    return query.views.points(place_of(pose), config, shown.tobytes(), NUM_POINTS)
 
 
 def refine_unoccluded(query: Query, h: Hypothesis) -> tuple[Query, Hypothesis]:
@@ -128,7 +126,7 @@ def refine_full_resolution(query: Query, h: Hypothesis, num_rounds: int) -> Hypo
     pose = before.pose
     for _ in range(num_rounds):
         center = pose.center_world
-        pose = descend(points_at(shown, pose), center, shown.images.full, pose, FULL_LIMITS)
+        pose = descend(points_at(shown, pose), shown.images.full, pose, FULL_LIMITS)
         if math.dist(pose.center_world, center) < NEARLY:
             break
     after = compared(query, Hypothesis(pose, 0.0))
@@ -140,7 +138,7 @@ def settle(query: Query, h: Hypothesis) -> Hypothesis:
     pose, shown = h.pose, without_occluders(query, h.pose)
     for _ in range(MAX_LAST_ROUNDS):
         center = pose.center_world
-        pose = descend(points_at(shown, pose), center, shown.images.full, pose, LAST_LIMITS)
+        pose = descend(points_at(shown, pose), shown.images.full, pose, LAST_LIMITS)
         if math.dist(pose.center_world, center) < SETTLED:
             break
     settled = compared(query, Hypothesis(pose, 0.0))

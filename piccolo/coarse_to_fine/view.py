@@ -2,6 +2,7 @@
 
 import math
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -10,19 +11,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cloud.octree import MAX_NODES, Octree, collect
+from ..geometry.pose import Array
 from ..geometry.sphere import cell_of, interpolation, make_grid, make_neighbors
 from ..optimize.channel_loss import BLOCK_RINGS
 from ..panorama.local_normalization import LEVELS_PER_UNIT, zscore
 from ..runtime.jit import F0, F1, HALF, inline_kernel, kernel
 from .cells import average_cells, average_colors, local_statistics, locate
 
+Array32 = NDArray[np.float32]
+Center = Sequence[float] | Array
+
 
 class Cells(NamedTuple):
-    """What a camera sees around a centre, on cells of the sphere or as points."""
+    """What is seen around a centre, on cells of the sphere or as points."""
 
     offsets: NDArray[np.float32]  # (3, N) [m] from the centre
     channels: NDArray[np.float32]  # (3, N) opponent colours, locally normalised [standard deviations]
     weights: NDArray[np.float32]  # (N,) fraction of the sphere; 0 where nothing is seen; 1 of a point
+    center_map: Array  # (3,) [m]
+
+    def around(self, center_map: Array) -> "Cells":
+        """The same with offsets from another centre (3,)."""
+        shift = np.asarray(center_map - self.center_map, np.float32)
+        return self._replace(offsets=self.offsets - shift[:, None], center_map=center_map)
 
 
 class ViewArrays(NamedTuple):
@@ -96,28 +107,27 @@ def locate_nodes(tree, center, voxel_per_range, view, scratch):
 
 
 @kernel
-def render_cells(
-    tree, center, voxel_per_range, view, scratch, shown, offsets, channels, weights, sums, stats
-):
-    """One view: relative position, opponent channels, their statistics and weight of each cell shown."""
+def average_nodes(tree, center, voxel_per_range, view, scratch, sums):
+    """Write what `average_cells` makes of the nodes around a centre, which are in the scratch; how many."""
     n = locate_nodes(tree, center, voxel_per_range, view, scratch)
     s = scratch
     average_cells(tree.nodes, s.nodes, s.directions, s.cells[:n], s.ranges, view.front, sums)
-    for c in range(len(shown)):
-        if not shown[c]:
-            sums[c, 6] = F0
-    moments = np.empty((view.num_stats, 8), np.float32)
-    average_colors(sums, view, offsets, channels, weights, moments)
-    local_statistics(moments, view, weights, stats)
     return n
 
 
 @kernel
-def render(tree, center, voxel_per_range, view, scratch, shown, offsets, channels, weights):
-    """One view: position relative to the centre, normalised channels and weight of each cell shown."""
-    sums = np.empty((len(weights), 8), np.float32)
+def describe_cells(sums, view, shown, offsets, channels, weights, stats):
+    """Write position, opponent channels, weight and local statistics of each cell shown, by its sums."""
+    moments = np.empty((view.num_stats, 8), np.float32)
+    average_colors(sums, view, shown, offsets, channels, weights, moments)
+    local_statistics(moments, view, weights, stats)
+
+
+@kernel
+def normalize_cells(sums, view, shown, offsets, channels, weights):
+    """The same with normalised channels."""
     stats = np.empty((6, len(weights)), np.float32)
-    render_cells(tree, center, voxel_per_range, view, scratch, shown, offsets, channels, weights, sums, stats)
+    describe_cells(sums, view, shown, offsets, channels, weights, stats)
     for k in range(3):
         for c in range(len(weights)):
             if weights[c] > F0:
@@ -136,9 +146,10 @@ def render_block(tree, centers, voxel_per_range, view, scratch, offsets, unit, l
     """Views from several centres in few bits: offsets in units of their own, channels in levels."""
     n = len(view.solid_angle)
     points, channels = np.empty((3, n), np.float32), np.empty((3, n), np.float32)
-    weights, shown = np.empty(n, np.float32), np.ones(n, np.bool_)
+    weights, shown, sums = np.empty(n, np.float32), np.ones(n, np.bool_), np.empty((n, 8), np.float32)
     for k in range(len(centers)):
-        render(tree, centers[k], voxel_per_range, view, scratch, shown, points, channels, weights)
+        average_nodes(tree, centers[k], voxel_per_range, view, scratch, sums)
+        normalize_cells(sums, view, shown, points, channels, weights)
         largest = np.float32(1e-3)
         for i in range(3):
             for c in range(n):
@@ -161,23 +172,24 @@ def render_wide_block(tree, centers, voxel_per_range, view, scratch, features, s
     """
     n, m = len(view.solid_angle), view.num_stats
     points, channels = np.empty((3, n), np.float32), np.empty((3, n), np.float32)
-    weights, shown = np.empty(n, np.float32), np.ones(n, np.bool_)
-    sums, area = np.empty((m, 4), np.float32), np.zeros(m, np.float32)
+    weights, shown, sums = np.empty(n, np.float32), np.ones(n, np.bool_), np.empty((n, 8), np.float32)
+    wide, area = np.empty((m, 4), np.float32), np.zeros(m, np.float32)
     for c in range(n):
         area[view.stats_cell[c]] += view.solid_angle[c]
     for k in range(len(centers)):
-        render(tree, centers[k], voxel_per_range, view, scratch, shown, points, channels, weights)
-        sums[:] = F0
+        average_nodes(tree, centers[k], voxel_per_range, view, scratch, sums)
+        normalize_cells(sums, view, shown, points, channels, weights)
+        wide[:] = F0
         for c in range(n):
             if weights[c] > F0:
-                total = sums[view.stats_cell[c]]
+                total = wide[view.stats_cell[c]]
                 for i in range(3):
                     total[i] += weights[c] * channels[i, c]
                 total[3] += weights[c]
         for c in range(m):
             for i in range(3):
-                features[k, i, c] = as_level(sums[c, i] / area[c])
-            seen[k, c] = np.uint8(min(sums[c, 3] / area[c], F1) * np.float32(255) + HALF)
+                features[k, i, c] = as_level(wide[c, i] / area[c])
+            seen[k, c] = np.uint8(min(wide[c, 3] / area[c], F1) * np.float32(255) + HALF)
 
 
 @kernel
@@ -216,18 +228,24 @@ def thread_scratch() -> Scratch:
     return scratch
 
 
-def empty_cells(n: int) -> Cells:
-    """Room for some cells or points."""
-    return Cells(np.empty((3, n), np.float32), np.empty((3, n), np.float32), np.empty(n, np.float32))
-
-
-def render_view(
-    octree: Octree, center_map: NDArray[np.float64], config: ViewConfig, shown: NDArray[np.bool_]
-) -> Cells:
-    """What is seen around a centre (3,) [m], on those cells (N,) of `config` that are shown."""
-    cells = empty_cells(len(make_grid(config.num_rings)))
+def average_view(octree: Octree, center_map: Center, config: ViewConfig) -> Array32:
+    """Sums (cells, 8), as `average_cells` writes them, of what is seen around a centre (3,) [m]."""
+    sums = np.empty((len(make_grid(config.num_rings)), 8), np.float32)
     center = np.asarray(center_map, np.float64)
-    render(octree, center, config.voxel_per_range, config.arrays, thread_scratch(), shown, *cells)
+    average_nodes(octree, center, config.voxel_per_range, config.arrays, thread_scratch(), sums)
+    return sums
+
+
+def empty_cells(n: int, center_map: Center) -> Cells:
+    """Room for some cells or points around a centre (3,) [m]."""
+    offsets, channels = np.empty((3, n), np.float32), np.empty((3, n), np.float32)
+    return Cells(offsets, channels, np.empty(n, np.float32), np.asarray(center_map, np.float64))
+
+
+def normalized_view(sums: Array32, center_map: Center, config: ViewConfig, shown: NDArray[np.bool_]) -> Cells:
+    """A view around a centre (3,) [m] by its sums (N, 8): those cells (N,) of `config` that are shown."""
+    cells = empty_cells(len(sums), center_map)
+    normalize_cells(sums, config.arrays, shown, *cells[:3])
     return cells
 
 

@@ -66,7 +66,7 @@ def tracked_on(query: Query, end: Hypothesis) -> Hypothesis:
 def descend_last(query: Query, h: Hypothesis) -> Hypothesis:
     """The last descent, on the points themselves, with the score by which poses are selected."""
     points = points_at(query, h.pose)
-    pose = descend(points, h.pose.center_world, query.images.full, h.pose, LAST_LIMITS)
+    pose = descend(points, query.images.full, h.pose, LAST_LIMITS)
     return compared(query, Hypothesis(pose, 0.0))
 
 

@@ -1,0 +1,83 @@
+"""Views from a grid of places: what a pose that hardly moves need not draw again."""
+
+import numpy as np
+import pytest
+import rooms
+
+from piccolo.coarse_to_fine import recent_views
+from piccolo.coarse_to_fine.config import METHOD
+from piccolo.coarse_to_fine.points_around import visible_points
+from piccolo.coarse_to_fine.query import prepare_query
+from piccolo.coarse_to_fine.refinement import points_at, view_at
+from piccolo.coarse_to_fine.settings import CoarseToFineSettings
+from piccolo.geometry.pose import Pose, yaw_rotation
+from piccolo.geometry.sphere import make_grid
+from piccolo.runtime.threads import Workers
+
+FINE, FULL = METHOD.fine_view, METHOD.full_view
+ALL = np.ones(len(make_grid(FINE.num_rings)), bool)
+
+
+def _pose(*center):
+    return Pose(yaw_rotation(0.3), np.array(center))
+
+
+def _query():
+    return prepare_query(rooms.scene(1)[1], rooms.scan_map(1), CoarseToFineSettings(), Workers(1))
+
+
+def test_a_place_is_within_a_centimetre_along_each_axis():
+    rng = np.random.default_rng(0)
+    for center in rng.uniform(-50.0, 50.0, (200, 3)):
+        place = np.array(recent_views.place_of(_pose(*center)))
+        assert np.abs(place - center).max() <= 0.01 + 1e-12
+        np.testing.assert_allclose(place / 0.02, np.rint(place / 0.02), atol=1e-9)
+
+
+def test_poses_near_one_place_share_what_is_drawn_and_no_others(monkeypatch):
+    query, drawn = _query(), []
+    octree = query.scan_map.octree
+
+    def average_view(octree, place, config):
+        drawn.append((place, config))
+        return original(octree, place, config)
+
+    original = recent_views.average_view
+    monkeypatch.setattr(recent_views, "average_view", average_view)
+    views = recent_views.recent_views(octree)
+    here, near, far = _pose(0.301, 0.2, 0.3), _pose(0.309, 0.195, 0.305), _pose(0.311, 0.2, 0.3)
+    places = [recent_views.place_of(pose) for pose in (here, near, far)]
+    assert places[0] == places[1] != places[2]
+    sums = [views.averages(place, FINE) for place in places]
+    assert sums[0] is sums[1]
+    assert len(drawn) == 2
+    np.testing.assert_array_equal(sums[0], original(octree, places[0], FINE))
+    for k in range(recent_views.NUM_VIEWS):
+        views.averages((0.02 * k, 0.5, 0.3), FINE)
+    assert views.averages(places[0], FINE) is not sums[0]  # only the last are kept
+
+
+def test_views_and_points_count_from_their_place():
+    query, pose = _query(), _pose(0.307, 0.194, 0.304)
+    place = recent_views.place_of(pose)
+    expected = rooms.view(query.scan_map.octree, place, FINE, ALL)
+    points = visible_points(query.scan_map.octree, place, FULL, ALL, 30_000)
+    for found, wanted in ((view_at(query, pose, FINE), expected), (points_at(query, pose), points)):
+        for values, others in zip(found, wanted, strict=True):
+            np.testing.assert_array_equal(values, others)
+    assert points_at(query, pose) is points_at(query, _pose(0.302, 0.202, 0.304))
+    moved = expected.around(pose.center_world)
+    at, there = (cells.center_map[:, None] + cells.offsets for cells in (expected, moved))
+    np.testing.assert_allclose(at, there, atol=1e-6)
+    np.testing.assert_array_equal(moved.center_map, pose.center_world)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.008])
+def test_points_depend_on_what_the_photo_shows(shift):
+    query, pose = _query(), _pose(0.3 + shift, 0.2, 0.3)
+    height, width = query.panorama.is_valid.shape
+    half = query.without(np.arange(width)[None] < np.full((height, 1), width // 2))
+    assert half.views is query.views
+    assert 0.3 < len(points_at(half, pose).weights) / len(points_at(query, pose).weights) <= 1.01
+    azimuth = np.arctan2(*(pose.R_cam_from_world @ points_at(half, pose).offsets)[1::-1])
+    assert (azimuth < 0.1).mean() > 0.98
