@@ -212,6 +212,11 @@ def test_a_kernel_is_compiled_with_another_that_was_loaded(tmp_path, monkeypatch
     assert (inner(values, 3.0), second(values), first(values)) == (21.0, 13.0, 15.0)
     was_loaded = [sum(each.stats.cache_hits.values()) for each in (inner, first, second)]
     assert was_loaded == [1, 1, 0]
+    (loaded,) = inner.overloads.values()
+    names = loaded.fndesc
+    wrappers = names.llvm_cpython_wrapper_name, names.llvm_cfunc_wrapper_name
+    for name in (names.llvm_func_name, *wrappers):
+        assert loaded.library.get_pointer_to_function(name) > 0
 
 
 def test_a_logged_warning_is_one_line_and_quiet_is_quiet(capsys):

@@ -3,7 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from piccolo.cloud import Cloud
+from piccolo.cloud import Cloud, voxel_table
+from piccolo.cloud import octree as octree_module
 from piccolo.cloud.octree import MAX_NODES, build_octree, collect
 from piccolo.cloud.voxels import LEAF_SIZE, NUM_LEVELS
 
@@ -43,6 +44,16 @@ def test_shuffling_points_changes_no_bit(seed):
     a, b = _octree(points, colors), _octree(points[order], colors[order])
     np.testing.assert_array_equal(a.nodes, b.nodes)
     np.testing.assert_array_equal(a.first_child, b.first_child)
+
+
+@pytest.mark.parametrize("num", [1, 7, 1000])
+def test_voxels_and_their_means_are_the_same_in_parts(monkeypatch, num):
+    points, colors = _cloud(3000)
+    whole = _octree(points, colors)
+    for module in (octree_module, voxel_table):
+        monkeypatch.setattr(module, "AT_ONCE", num)
+    for values, others in zip(_octree(points, colors), whole, strict=True):
+        np.testing.assert_array_equal(values, others)
 
 
 @pytest.mark.parametrize(("size", "level"), [(0.02, 7), (0.04, 6), (0.16, 4), (100.0, 0), (0.001, 7)])

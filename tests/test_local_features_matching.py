@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from piccolo.coarse_to_fine.query import prepare_query
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
+from piccolo.local_features import feature_map
 from piccolo.local_features.feature_map import (
     LIST_SIZE,
     NUM_COMPONENTS,
@@ -88,7 +89,7 @@ def test_nearest_lists_and_middles_by_brute_force():
     np.testing.assert_array_equal(nearest, squares.argmin(axis=1))
 
 
-def test_components_keep_distances_and_middles_are_of_clusters():
+def test_components_keep_distances_and_middles_are_of_clusters(monkeypatch):
     rng = np.random.default_rng(8)
     axes = rng.normal(size=(10, 128))
     values = np.clip(np.rint(120 + 4 * rng.normal(size=(500, 10)) @ axes), 0, 255).astype(np.uint8)
@@ -97,6 +98,8 @@ def test_components_keep_distances_and_middles_are_of_clusters():
     gram = components[:, :8].T.astype(float) @ components[:, :8] / 127**2
     np.testing.assert_allclose(gram, np.eye(8), atol=0.03)
     projected = project(values, mean, components).astype(float)
+    monkeypatch.setattr(feature_map, "BLOCK", 7)
+    np.testing.assert_array_equal(project(values, mean, components), projected)
     gaps = np.linalg.norm(values[:-1].astype(float) - values[1:], axis=1)
     is_unclipped = np.abs(projected).max(axis=1) < 127
     both = is_unclipped[:-1] & is_unclipped[1:]

@@ -114,12 +114,22 @@ def test_voxels_and_their_octree_take_what_they_say(monkeypatch):
         at_most = voxel_table.ROW_BYTES * (1 + 1 / voxel_table.MORE_ROWS) + voxel_table.SORTED_BYTES
         assert tracemalloc.get_traced_memory()[1] < 1.05 * num * at_most + 1e6
         assert tracemalloc.get_traced_memory()[0] < 1.05 * num * (8 + 24)
-        tracemalloc.reset_peak()
-        tree = octree.build_octree(voxels)
-        at_most = len(voxels.nodes) * (8 + 24 + octree.LEVEL_BYTES) + len(tree.nodes) * octree.NODE_BYTES
-        assert tracemalloc.get_traced_memory()[1] < 1.05 * at_most + 1e6
+        asked, before, peaks = [], [], []
+
+        def ask(num_bytes, *_):
+            peaks.append(tracemalloc.get_traced_memory()[1])
+            asked.append(num_bytes)
+            before.append(tracemalloc.get_traced_memory()[0])
+            tracemalloc.reset_peak()
+
+        monkeypatch.setattr(octree, "check_memory", ask)
+        octree.build_octree(voxels)
+        ask(0)
     finally:
         tracemalloc.stop()
+    assert asked[0] == len(voxels.nodes) * octree.LEVEL_BYTES
+    for num_bytes, at_first, peak in zip(asked[:-1], before[:-1], peaks[1:], strict=True):
+        assert peak - at_first < 1.02 * num_bytes + 1e5
 
 
 def test_what_libraries_raise_when_memory_is_short():

@@ -8,11 +8,10 @@ from numpy.typing import NDArray
 
 from ..runtime.jit import F0, inline_kernel, kernel
 from ..runtime.memory import check_memory
-from .voxels import LEAF_SIZE, NUM_LEVELS, THIN, Voxels
+from .voxels import AT_ONCE, LEAF_SIZE, NUM_LEVELS, THIN, Voxels
 
 NODE_BYTES = 6 * 4 + 4  # mean, first child
-LEVEL_BYTES = 8 + 8 + 8 + 1  # codes, first children, codes of these, which begin a parent
-AT_ONCE = 1 << 18  # nodes, whose temporary arrays stay small
+LEVEL_BYTES = 8 + 1 + 8 + 4 + 8  # codes, which begin a parent, first children, twice, codes of these
 MAX_NODES = 1 << 22  # that a view collects; reserved, but used only as far as a dense cloud fills it
 RANGES_BELOW = 1 / 20  # voxels by their distance: larger ones are drawn at one level in few places
 DIAGONAL = 1.75  # of a voxel, and a little more for rounding: all in it is so near to its mean

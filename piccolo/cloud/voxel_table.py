@@ -1,6 +1,7 @@
 """Points averaged voxel by voxel as they stream by: the memory grows with the scene, not with the points.
 
-All sums are integers: neither the order of the points nor how they are cut into chunks changes a bit.
+All sums are integers: neither the order of the points nor how they are cut into chunks changes a bit, unless
+more than MAX_COUNT lie in one voxel.
 """
 
 import numpy as np
@@ -10,6 +11,7 @@ from ..errors import InputError
 from ..runtime.jit import inline_kernel, kernel
 from ..runtime.memory import check_memory
 from .voxels import (
+    AT_ONCE,
     COARSEST,
     LEAF_SIZE,
     PHASE,
@@ -32,7 +34,6 @@ MAX_VOXELS = 80_000_000  # 20,000 m^2 or more
 MAX_LOAD = 0.6  # share of the index in use
 ROW_BYTES, SLOT_BYTES = 4 * NUM_COLUMNS, 4
 SORTED_BYTES = 3 * 8 + 6 * 4  # a voxel: codes, order, codes in order, nodes
-AT_ONCE = 1 << 18  # rows, whose temporary arrays stay small
 
 
 @inline_kernel
@@ -98,10 +99,7 @@ def fill_index(rows, num_voxels, index):
     """Name the rows (n, 10) of `num_voxels` voxels in an index (2^k,) of zeros."""
     for k in range(num_voxels):
         x, y, z = np.int64(rows[k, CELL]), np.int64(rows[k, CELL + 1]), np.int64(rows[k, CELL + 2])
-        slot = first_slot(x, y, z, len(index))
-        while index[slot] != 0:
-            slot = (slot + 1) & (len(index) - 1)
-        index[slot] = k + 1
+        index[find_slot(index, rows, x, y, z)] = k + 1
 
 
 class VoxelTable:
@@ -137,7 +135,7 @@ class VoxelTable:
         if self.num_voxels == len(self.rows):
             num_more = max(FIRST_ROWS, len(self.rows) // MORE_ROWS)
             self._check_memory(num_more * ROW_BYTES)
-            # Where pages can be mapped elsewhere (Linux), nothing is copied.
+            # Where pages can be mapped elsewhere (Linux), nothing is copied; elsewhere all is, for a moment.
             self.rows.resize((len(self.rows) + num_more, NUM_COLUMNS), refcheck=False)
         if self.num_voxels >= int(MAX_LOAD * len(self.index)):
             num_slots = 2 * len(self.index)
@@ -151,10 +149,9 @@ class VoxelTable:
 
     def finish(self) -> Voxels:
         """The means; those too far from the rest for a Morton code are left out. The table is spent."""
-        num = self.num_voxels
+        num, self.index = self.num_voxels, np.zeros(0, np.int32)
         check_memory(num * SORTED_BYTES, f"{self.label}: sorting {num} voxels of 2 cm", THIN)
         rows, self.rows = self.rows[:num], np.empty((0, NUM_COLUMNS), np.int32)
-        self.index = np.zeros(0, np.int32)
         rows, warnings = self._without_far(rows)
         cells = [rows[:, k] for k in range(COUNT)]
         low = np.array([column.min() for column in cells]) + self.base

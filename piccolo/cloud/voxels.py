@@ -20,6 +20,7 @@ COARSEST = 128  # leaves along a voxel of the coarsest level
 PHASE = (COARSEST << QUANTUM_BITS) // 3 + 1
 
 JOINING_BYTES = 160  # a voxel, of which two clouds' are joined: nodes, cells, codes, order, sums
+AT_ONCE = 1 << 18  # voxels, whose temporary arrays stay small
 THIN = "set --units if its unit is not the metre, or cut out a part"
 NUM_LEVELS = COARSEST.bit_length()  # from 128 leaves wide (2.56 m) down to one
 

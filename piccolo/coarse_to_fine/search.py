@@ -24,7 +24,7 @@ from .query import Query
 from .scan_map import ScanMap
 from .starts import START_ANGLE, START_DISTANCE, Starts
 
-BLOCK = 512  # views a matrix product
+BLOCK = 512  # views a matrix product, at most
 SCORES_AT_ONCE = 1 << 24  # 64 MB
 TURNED_BYTES = 4 * 16  # of a rotation, a cell: channels, validity, energy, and what they are made from
 EXACT = (1 << 24) - 1  # whole numbers up to this are exact in float32
@@ -84,18 +84,19 @@ def masked_correlation(
     relative, num_cells = area / area.max(), len(area)
     scores = np.empty((len(features), len(weighted)), np.float32)
     is_full = bool(panorama.validity.all())
+    block = max(min(BLOCK, -(-len(features) // workers.num_threads)), 1)  # so that none is idle
 
     def correlate(lo: int) -> None:
-        view = features[lo : lo + BLOCK].astype(np.float32)
-        norm = seen[lo : lo + BLOCK].astype(np.float32) @ panorama.energy.T
+        view = features[lo : lo + block].astype(np.float32)
+        norm = seen[lo : lo + block].astype(np.float32) @ panorama.energy.T
         energy = np.square(view).reshape(len(view), 3, num_cells).sum(axis=1) * relative
         energy = whole(energy, MOST_ENERGY, 1, num_cells)
         norm *= energy.sum(axis=1)[:, None] if is_full else energy @ panorama.validity.T
         np.sqrt(np.maximum(norm, 1.0, out=norm), out=norm)
-        np.matmul(view, weighted.T, out=scores[lo : lo + BLOCK])
-        scores[lo : lo + BLOCK] /= norm
+        np.matmul(view, weighted.T, out=scores[lo : lo + block])
+        scores[lo : lo + block] /= norm
 
-    list(workers.map(correlate, range(0, len(scores), BLOCK), "search"))
+    list(workers.map(correlate, range(0, len(scores), block), "search"))
     return scores
 
 

@@ -104,10 +104,11 @@ def rebuilt(
     """A compiled kernel from its pickled parts.
 
     Numba parses a kernel's bitcode, up to 1 MB, to learn which names its machine code has, and to compile
-    others that call it. Here the two names that are asked for stand in; it is parsed only for the latter.
+    others that call it. Here the names that may be asked for stand in; it is parsed only for the latter.
     """
     name, kind, (machine_code, bitcode) = library
-    names = description.llvm_func_name, description.llvm_cpython_wrapper_name
+    wrappers = description.llvm_cpython_wrapper_name, description.llvm_cfunc_wrapper_name
+    names = description.llvm_func_name, *wrappers
     stand_in = llvm.parse_assembly("".join(f'define void @"{each}"() {{ ret void }}\n' for each in names))
     parts = (name, kind, (machine_code, stand_in.as_bitcode())), description
     compiled = compiler.CompileResult._rebuild(target_context, *parts, *others)

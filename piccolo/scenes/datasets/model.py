@@ -42,13 +42,14 @@ class ConvertOptions:
 
         Where a list names it, `where` is the place in the list.
         """
+        at = f"{where}: " if where else ""
         try:
             real = Path(os.path.realpath(path))
         except ValueError as error:  # a zero byte, half a character
-            raise InputError(f"{where}: found {str(path)!r}, wanted the name of a file") from error
+            raise InputError(f"{at}found {str(path)!r}, wanted the name of a file") from error
         if not any(real.is_relative_to(root) for root in self._roots):
-            named = f"{where}: {path}" if where else f"{path}:"
-            raise InputError(f"{named} leads to {real}, out of {self.folder}; move or copy the file into it")
+            leads = f"{at}{path} leads to {real}"
+            raise InputError(f"{leads}, out of {self.folder}; move or copy the file into it")
         return path
 
 
