@@ -215,8 +215,8 @@ def test_a_kernel_is_compiled_with_another_that_was_loaded(tmp_path, monkeypatch
     (loaded,) = inner.overloads.values()
     names = loaded.fndesc
     wrappers = names.llvm_cpython_wrapper_name, names.llvm_cfunc_wrapper_name
-    for name in (names.llvm_func_name, *wrappers):
-        assert loaded.library.get_pointer_to_function(name) > 0
+    found = {function.name for function in loaded.library.get_defined_functions()}
+    assert found == {names.llvm_func_name, *wrappers}
 
 
 def test_a_logged_warning_is_one_line_and_quiet_is_quiet(capsys):
