@@ -215,7 +215,7 @@ def test_a_kernel_is_compiled_with_another_that_was_loaded(tmp_path, monkeypatch
     (loaded,) = inner.overloads.values()
     names = loaded.fndesc
     wrappers = names.llvm_cpython_wrapper_name, names.llvm_cfunc_wrapper_name
-    found = {function.name for function in loaded.library.get_defined_functions()}
+    found = {function.name for function in loaded.library._shared_module.functions}
     assert found == {names.llvm_func_name, *wrappers}
 
 
