@@ -17,6 +17,7 @@ from piccolo.confidence.alternatives import Hypothesis
 from piccolo.confidence.confidence import LOCALIZED
 from piccolo.geometry.pose import Pose, exp_so3, is_correct
 from piccolo.local_features.matching import NO_MATCHES
+from piccolo.runtime.once import Once
 from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers
 
@@ -84,7 +85,8 @@ def test_clear_are_score_margin_and_the_mirrored_photo(monkeypatch, score, margi
     monkeypatch.setattr(first_look, "search_poses", lambda query, gravity: "starts of its own")
     scores = {(id(own), "starts"): first, (id(mirror), "starts of its own"): mirrored}
     monkeypatch.setattr(first_look, "first_score", lambda query, starts: scores[id(query), starts])
-    assert first_look.is_clear(own, "starts", [best, other]) == is_clear
+    of_mirror = Once(lambda: first_look.mirror_score(own))
+    assert first_look.is_clear(own, "starts", [best, other], of_mirror) == is_clear
 
 
 def test_the_mirrored_query_is_that_of_the_mirrored_photo():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import rooms
 
+from piccolo.coarse_to_fine import query as query_module
 from piccolo.coarse_to_fine import search
 from piccolo.coarse_to_fine.config import METHOD
 from piccolo.coarse_to_fine.query import prepare_query, query_images
@@ -58,13 +59,21 @@ def test_what_is_masked_does_not_bleed():
     assert valid.mean() == pytest.approx(200 / 256, abs=0.02)
 
 
-def test_images_are_made_when_asked_for_and_once():
+def test_images_are_made_when_asked_for_and_once(monkeypatch):
+    made = []
+
+    def normalize(panorama, *how):
+        made.append(panorama.rgb.shape[1])
+        return normalize_panorama(panorama, *how)
+
+    monkeypatch.setattr(query_module, "normalize_panorama", normalize)
     images = query_images(rooms.scene(1)[1], METHOD.scales)
-    assert images.made == {}
+    assert made == []
     assert images.search is images.search
-    assert list(images.made) == [3]
+    assert made == [128]
     of_all = images.full, images.fine, images.middle, images.search
     assert [image.width for image in of_all] == [1024, 256, 128, 128]
+    assert sorted(made) == [128, 128, 256, 1024]
 
 
 def test_samples_along_turned_directions_equal_their_twin():

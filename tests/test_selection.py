@@ -209,7 +209,11 @@ def _run(monkeypatch, matched, searches, gravity="auto", config=METHOD):
         return gravity
 
     monkeypatch.setattr(method, "apply_prior", lambda *_: scan_map)
-    monkeypatch.setattr(method, "prepare_query", lambda *_: SimpleNamespace(**vars(QUERY), matches=None))
+    settings = CoarseToFineSettings(gravity=gravity)
+    query = SimpleNamespace(**vars(QUERY), matches=None, settings=settings, colors=None, soon_needed=list)
+    query.method = config
+    monkeypatch.setattr(method, "prepare_query", lambda *_: query)
+    monkeypatch.setattr(method, "first_query", lambda query: query)
     monkeypatch.setattr(method, "is_whole", lambda query: False)
     monkeypatch.setattr(method, "matched_poses", lambda query: "matched")
     monkeypatch.setattr(method, "refine_matched", lambda query, poses: list(matched))
@@ -220,7 +224,6 @@ def _run(monkeypatch, matched, searches, gravity="auto", config=METHOD):
     monkeypatch.setattr(method, "refine_unoccluded", lambda query, h: (query, h))
     monkeypatch.setattr(method, "settle", lambda query, h: Hypothesis(h.pose, h.score + 0.001))
     monkeypatch.setattr(method, "evaluate", lambda query, panorama, found: found)
-    settings = CoarseToFineSettings(gravity=gravity)
     found = method.localize(None, rooms.scene(1)[1], settings, Workers(1), Stopwatch(), config)
     return made, found
 
@@ -259,6 +262,7 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
     scan_map = SimpleNamespace(octree=None, to_world=lambda pose: pose)
     query = SimpleNamespace(scan_map=scan_map, settings=CoarseToFineSettings(), workers=Workers(1))
     query.matches, query.by_features, query.panorama = None, True, rooms.scene(1)[1]
+    query.colors = lambda: None
     counts = {0.0: 30, 1.0: 4, 2.0: 6}
     for name, value in {
         "points_around": lambda *_: None,

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,9 +19,8 @@ from ..optimize.refine import refine, sampling_loss_of
 from ..optimize.sampling_loss import sampling_loss
 from ..optimize.settings import DescentSettings
 from ..panorama import Panorama
-from ..panorama.model import shrink
-from ..panorama.texels import pack_texels
 from ..render.zbuffer import visible_points
+from ..runtime.once import Once
 from .covariance import estimate_covariance
 from .points_around import points_around
 from .query import Query
@@ -30,7 +30,6 @@ from .standings import standings_of
 ENOUGH_EXPLAINED = 0.7  # score from which a photo is not mirrored
 MIRROR_RATIO = 1.2  # of matches, mirrored by not
 MIRRORED = "the photo fits the scan better mirrored, left for right: turn it over and try again"
-MAX_WIDTH = 4096  # [px] of the panorama that the loss is taken from: more costs seconds and tells nothing
 VOXEL_PER_RANGE, COARSE_VOXEL_PER_RANGE = 1 / 150, 1 / 40  # of points that are compared with the photo
 LAST_STEP = 0.01  # [rad, m] of Adam and the first of L-BFGS, where they take the last descent
 
@@ -40,19 +39,14 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
     if found.best.score < 0.0:
         return Localization()
     scan_map, settings, pose = query.scan_map, query.settings, found.best.pose
-    panorama = shrink(panorama, MAX_WIDTH)
-    needed: list[Callable[[], Any]] = [
-        lambda: pack_texels(panorama.rgb, panorama.is_valid),
-        lambda: points_around(scan_map.octree, pose.center_world, VOXEL_PER_RANGE),
-    ]
-    texels, points = query.workers.map(lambda make: make(), needed, "evaluate")
+    points = Once(partial(points_around, scan_map.octree, pose.center_world, VOXEL_PER_RANGE))
     if settings.solver != "gauss-newton":
         how = DescentSettings(solver=settings.solver, step_size=LAST_STEP)
-        pose = refine(points, sampling_loss_of(texels), pose, how).pose
+        pose = refine(points(), sampling_loss_of(query.colors()), pose, how).pose
     told: list[Callable[[], Any]] = [
         lambda: estimate_covariance(query, pose),  # takes longest
-        lambda: occlusion_at(points, panorama, pose).fractions(),
-        lambda: sampling_loss(visible_points(points, pose.center_world), texels, pose),
+        lambda: occlusion_at(points(), panorama, pose).fractions(),
+        lambda: sampling_loss(visible_points(points(), pose.center_world), query.colors(), pose),
         lambda: agreement_of(query, pose),
     ]
     covariance, fractions, loss, agreement = query.workers.map(lambda tell: tell(), told, "evaluate")

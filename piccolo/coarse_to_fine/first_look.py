@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..confidence.alternatives import Hypothesis
+from ..runtime.once import Once
 from .camera_positions import COARSE_SPACING
 from .config import Beam
 from .query import Query
@@ -55,19 +56,26 @@ def tilted_query(query: Query) -> Query:
     return replace(query, scan_map=scan_map.narrowed(is_even), settings=settings)
 
 
-def is_clear(query: Query, starts: Starts, hypotheses: Sequence[Hypothesis]) -> bool:
-    """True if one pose explains a whole photo, no other does, and the mirrored photo fits worse."""
+def is_clear(query: Query, starts: Starts, hypotheses: Sequence[Hypothesis], of_mirror: Once[float]) -> bool:
+    """True if one pose explains a whole photo, no other does, and the mirrored photo fits worse.
+
+    `of_mirror` is its `mirror_score`.
+    """
     found = fairly_selected(query, found_among(hypotheses, NUM_COMPARED))
     if found.best.score < CLEAR_SCORE or found.margin < CLEAR_MARGIN:
         return False
-    return not is_rather_mirrored(query, starts)
+    return not is_rather_mirrored(query, starts, of_mirror())
 
 
-def is_rather_mirrored(query: Query, starts: Starts) -> bool:
+def is_rather_mirrored(query: Query, starts: Starts, of_mirror: float) -> bool:
     """True if the mirrored photo fits nearly as well, by the first scores from the starts of the photo."""
-    mirror = mirrored(query)
-    of_mirror = first_score(mirror, search_poses(mirror, "known"))
     return first_score(query, starts) < MIRROR_RATIO * of_mirror
+
+
+def mirror_score(query: Query) -> float:
+    """The first score of the mirrored photo, by a search of its own."""
+    mirror = mirrored(query)
+    return first_score(mirror, search_poses(mirror, "known"))
 
 
 def mirrored(query: Query) -> Query:

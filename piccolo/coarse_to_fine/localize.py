@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import compress
-from typing import Literal
 
 from ..confidence.alternatives import Hypothesis
 from ..confidence.localization import Localization
@@ -12,11 +11,12 @@ from ..geometry.rotations import Gravity
 from ..local_features.hypotheses import count_matches, poses_of
 from ..panorama import Panorama
 from ..runtime.blas import one_blas_thread
+from ..runtime.once import Once
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from .config import METHOD, Beam, MethodConfig
 from .evaluation import evaluate
-from .first_look import FIRST_BEAM, first_query, is_clear, is_whole, tilted_query
+from .first_look import FIRST_BEAM, first_query, is_clear, is_whole, mirror_score, tilted_query
 from .prior import apply_prior, is_allowed, nothing_allowed
 from .query import Query, prepare_query
 from .refinement import refine, refine_full_resolution, refine_matched, refine_unoccluded, settle
@@ -32,6 +32,8 @@ ALTERNATIVES_COMPARED, ALTERNATIVES_REFINED = 8, 4  # at most
 HOPELESS_SCORE = 0.02  # of black, white and noisy pictures, and of most views of other places
 FAINT_SCORE, FAINT_MATCHES = 0.1, 6  # nothing that has less of both is ever localized
 NEAR_MATCHES = 0.5  # an alternative with this part of the matches is refined as carefully as the best
+GRAVITIES: dict[str, tuple[Gravity, ...]]  # in which whole views are searched, one after the other
+GRAVITIES = {"known": ("known",), "unknown": ("unknown",), "auto": ("known", "unknown")}
 NO_PIXEL = "the panorama: no pixel counts, all are masked"
 
 
@@ -57,27 +59,38 @@ def localize(
         return Localization(warnings=(why,))
     with watch.stage("search"):
         query = prepare_query(panorama, candidates, settings, workers, method)
-    hypotheses: list[Hypothesis] = []
-    gravities: list[Literal["known", "unknown"]]
-    gravities = ["known", "unknown"] if settings.gravity == "auto" else [settings.gravity]
-    gravities = gravities if method.uses_search else []
-    is_looked_at = method.uses_features and is_whole(query) and len(gravities) > 0
-    if is_looked_at:
-        first = first_query(query)
-        starts, hypotheses = searched(first, "known", FIRST_BEAM, watch)
-        with watch.stage("search"):
-            query = first if is_clear(first, starts, hypotheses) else query
-    if method.uses_features and query.by_features:
+    first = first_query(query)
+    of_mirror = Once(lambda: mirror_score(first))
+    is_looked_at = method.uses_features and method.uses_search and is_whole(query)
+    soon = [*query.soon_needed(), of_mirror] if is_looked_at else query.soon_needed()
+    with workers.beside(*soon, query.colors):
+        hypotheses: list[Hypothesis] = []
+        if is_looked_at:
+            starts, hypotheses = searched(first, "known", FIRST_BEAM, watch)
+            with watch.stage("search"):
+                query = first if is_clear(first, starts, hypotheses, of_mirror) else query
+        if query.by_features:
+            hypotheses = in_doubt(query, hypotheses, is_looked_at, watch)
+        with watch.stage("refine"):
+            return evaluate(query, panorama, finished(query, hypotheses))
+
+
+def in_doubt(
+    query: Query, hypotheses: Sequence[Hypothesis], is_looked_at: bool, watch: Stopwatch
+) -> list[Hypothesis]:
+    """The hypotheses of a first look, if one was taken, and those of matches and of whole views."""
+    method, settings = query.method, query.settings
+    found, gravities = list(hypotheses), GRAVITIES[settings.gravity] if method.uses_search else ()
+    if method.uses_features:
         with watch.stage("match"):
-            hypotheses += refine_matched(query, matched_poses(query))
-    for gravity in gravities if query.by_features else []:
-        if is_sure(query, hypotheses):
+            found += refine_matched(query, matched_poses(query))
+    for gravity in gravities:
+        if is_sure(query, found):
             break
         is_brief = is_looked_at and gravity == "unknown"
         asked, beam = (tilted_query(query), FIRST_BEAM) if is_brief else (query, method.beam)
-        hypotheses += searched(asked, gravity, beam, watch)[1]
-    with watch.stage("refine"):
-        return evaluate(query, panorama, finished(query, hypotheses))
+        found += searched(asked, gravity, beam, watch)[1]
+    return found
 
 
 def searched(query: Query, gravity: Gravity, beam: Beam, watch: Stopwatch) -> tuple[Starts, list[Hypothesis]]:

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import cv2
@@ -16,8 +16,9 @@ from ..local_features.matching import NO_MATCHES, Matches, match
 from ..panorama import Panorama
 from ..panorama.gpano import rotation_to_level
 from ..panorama.local_normalization import normalize_panorama
-from ..panorama.model import resize
+from ..panorama.model import resize, shrink
 from ..panorama.texels import Texels, pack_texels
+from ..runtime.once import Once
 from ..runtime.threads import Workers
 from .config import METHOD, ImageScales, MethodConfig
 from .recent_views import RecentViews, recent_views
@@ -25,6 +26,7 @@ from .scan_map import ScanMap
 from .settings import CoarseToFineSettings
 
 COMPARED_WIDTH = 256  # [px]
+MAX_WIDTH = 4096  # [px] of the photo that the loss is taken from: more costs seconds and tells nothing
 MOST_SHARE = 0.98  # of the sphere: of a photo that shows more, all cells are shown
 
 
@@ -32,51 +34,47 @@ MOST_SHARE = 0.98  # of the sphere: of a photo that shows more, all cells are sh
 class QueryImages:
     """The panorama's locally normalised channels at several scales, each made when it is first asked for."""
 
-    pyramid: ImageScales
-    panoramas: tuple[Panorama, ...]  # at the width of each scale
-    made: dict[int, Texels] = field(default_factory=dict)
+    by_scale: tuple[Once[Texels], ...]  # widest first
 
     @property
     def full(self) -> Texels:
         """For the last millimetres."""
-        return self.image(0)
+        return self.by_scale[0]()
 
     @property
     def fine(self) -> Texels:
         """For fine views."""
-        return self.image(1)
+        return self.by_scale[1]()
 
     @property
     def middle(self) -> Texels:
         """For middle views."""
-        return self.image(2)
+        return self.by_scale[2]()
 
     @property
     def search(self) -> Texels:
         """For prepared views."""
-        return self.image(3)
+        return self.by_scale[3]()
 
     def mirrored(self) -> "QueryImages":
-        """The image for prepared views turned over, left for right; no other."""
-        k, image = len(self.pyramid) - 1, self.search
-        across = image.rgbx.reshape(-1, image.width + 2)[:, ::-1]
-        texels = Texels(np.ascontiguousarray(across).reshape(-1), image.width)
-        return QueryImages(self.pyramid, (), {k: texels})
+        """All images turned over, left for right."""
+        return QueryImages(tuple(Once(partial(turned_over, image)) for image in self.by_scale))
 
-    def image(self, k: int) -> Texels:
-        """Of a scale by its number, widest first."""
-        if k not in self.made:
-            self.made[k] = normalize_panorama(self.panoramas[k], *self.pyramid[k][1:])
-        return self.made[k]
+
+def turned_over(image: Once[Texels]) -> Texels:
+    """An image with left and right exchanged."""
+    texels = image()
+    across = texels.rgbx.reshape(-1, texels.width + 2)[:, ::-1]
+    return Texels(np.ascontiguousarray(across).reshape(-1), texels.width)
 
 
 def query_images(panorama: Panorama, pyramid: ImageScales) -> QueryImages:
     """The images of a panorama, each resized from the one before, widest first."""
-    panoramas = []
+    images = []
     for scale in pyramid:
         panorama = resize(panorama, scale.width)
-        panoramas.append(panorama)
-    return QueryImages(pyramid, tuple(panoramas))
+        images.append(Once(partial(normalize_panorama, panorama, scale.cell_deg, scale.sigma_deg)))
+    return QueryImages(tuple(images))
 
 
 @dataclass(frozen=True)
@@ -92,6 +90,7 @@ class Query:
     panorama: Panorama  # at the width of its features
     pixel: float  # [rad] of the photo as it was given, but none finer than those that are compared
     views: RecentViews  # of the map
+    colors: Once[Texels]  # of the photo at the size at which its loss is taken
     by_features: bool = True  # False where whole views alone are asked
     comparisons: dict[bytes, Any] = field(default_factory=dict)  # worked out already, by comparison.py
     ends: set[bytes] = field(default_factory=set)  # poses which no perturbation improves any more
@@ -117,9 +116,13 @@ class Query:
 
     def make_images(self) -> None:
         """Make what descents and comparisons need, before they ask for it."""
-        for k in range(len(self.method.scales)):
-            self.images.image(k)
+        for image in self.images.by_scale:
+            image()
         self.photo  # noqa: B018  # kept when it is first asked for
+
+    def soon_needed(self) -> list[Once[Texels]]:
+        """The images that descents will ask for, in that order."""
+        return list(self.images.by_scale[2::-1])
 
     def shown_cells(self, num_rings: int, pose: Pose) -> NDArray[np.bool_]:
         """Which cells (N,) of a grid around a pose in the map the photo shows; all, if it shows a sphere."""
@@ -153,6 +156,14 @@ def prepare_query(
     R_level_from_cam = rotation_to_level(panorama.gpano) if panorama.gpano else None
     R_cam_from_level = np.eye(3) if R_level_from_cam is None else R_level_from_cam.T
     pixel = math.tau / min(panorama.rgb.shape[1], method.scales.full.width)
+    colors = Once(partial(texels_of, panorama))
     panorama = resize(panorama, method.scales.full.width)
     images, views = query_images(panorama, method.scales), recent_views(scan_map.octree)
-    return Query(scan_map, images, R_cam_from_level, settings, workers, method, panorama, pixel, views)
+    how = settings, workers, method
+    return Query(scan_map, images, R_cam_from_level, *how, panorama, pixel, views, colors)
+
+
+def texels_of(panorama: Panorama) -> Texels:
+    """A panorama as texels, at most MAX_WIDTH wide."""
+    panorama = shrink(panorama, MAX_WIDTH)
+    return pack_texels(panorama.rgb, panorama.is_valid)

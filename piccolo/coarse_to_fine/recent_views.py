@@ -10,7 +10,7 @@ from ..geometry.pose import Pose
 from .points_around import visible_points
 from .view import Array32, Cells, ViewConfig, average_view
 
-SPACING = 0.02  # [m] between places
+SPACING = 0.01  # [m] between places
 NUM_VIEWS, NUM_POINT_SETS = 32, 8  # are kept: 12 MB and 7 MB
 Place = tuple[float, float, float]  # [m] in the map
 

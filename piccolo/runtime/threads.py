@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .memory import check_address_space
+from .once import Once
 from .unfinished import Arrays, Unfinished
 
 Item = TypeVar("Item")
@@ -114,6 +115,24 @@ class Workers:
             futures = [pool.submit(function, item) for item in items]
             try:
                 yield from self.show((future.result() for future in futures), len(items), label)
+            finally:
+                for future in futures:
+                    future.cancel()
+                wait(futures)
+
+    @contextmanager
+    def beside(self, *values: Once[Any]) -> Iterator[None]:
+        """A context in which an idle core works out values, in order, before they are asked for.
+
+        At its end, those that nobody has begun are left. What they raise reaches who asks.
+        """
+        if self.num_threads == 1 or _thread.is_of_pool:
+            yield
+            return
+        with pool_of(1) as pool:
+            futures = [pool.submit(value) for value in values]
+            try:
+                yield
             finally:
                 for future in futures:
                     future.cancel()

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..coarse_to_fine.covariance import estimate_covariance
 from ..coarse_to_fine.descent import FULL_LOSS, descend
-from ..coarse_to_fine.first_look import FIRST_BEAM, first_query, is_rather_mirrored
+from ..coarse_to_fine.first_look import FIRST_BEAM, first_query, is_rather_mirrored, mirror_score
 from ..coarse_to_fine.prior import apply_prior
 from ..coarse_to_fine.query import Query
 from ..coarse_to_fine.refinement import (
@@ -90,7 +90,7 @@ def found_everywhere(query: Query, least_score: float) -> list[Hypothesis]:
     first = first_query(query)
     gravity: Gravity = "unknown" if query.settings.gravity == "unknown" else "known"
     starts = search_poses(first, gravity)
-    if first_score(first, starts) < least_score or is_rather_mirrored(first, starts):
+    if first_score(first, starts) < least_score or is_rather_mirrored(first, starts, mirror_score(first)):
         return []
     found = found_among(refine(first, starts, FIRST_BEAM), MOST_LISTED - 1)
     if found.best.score < least_score:
