@@ -9,7 +9,14 @@ from scipy.spatial import cKDTree
 
 from piccolo.geometry.pose import yaw_rotation
 from piccolo.geometry.sphere import pixel_rays
-from piccolo.local_features.keypoints import DESCRIPTOR_SIZE, VIEWS_DEG, find_keypoints, perspective_views
+from piccolo.local_features.keypoints import (
+    DESCRIPTOR_SIZE,
+    HALVES,
+    VIEWS_DEG,
+    find_keypoints,
+    joined_keypoints,
+    perspective_views,
+)
 from piccolo.runtime.threads import Workers
 
 WIDTH = rooms.WIDTH
@@ -73,6 +80,22 @@ def test_what_views_share_counts_once():
     is_alike = np.abs(np.log(found.sizes[pairs[:, 0]] / found.sizes[pairs[:, 1]])) < 0.1
     of_two_views = own[pairs[:, 0]] != own[pairs[:, 1]]
     assert not (is_alike & of_two_views).any()
+
+
+def test_halves_of_the_views_are_every_other_one_and_find_what_all_find():
+    gray, whole = _gray(), _found()
+    is_valid = np.ones(gray.shape, bool)
+    assert sorted(HALVES[0] + HALVES[1]) == list(range(len(VIEWS_DEG)))
+    halves = [find_keypoints(gray, is_valid, Workers(2), views) for views in HALVES]
+    joined = joined_keypoints(halves)
+    by_ray = [np.lexsort((found.sizes, *found.rays.T)) for found in (joined, whole)]
+    for own, other in zip(joined.take(by_ray[0]), whole.take(by_ray[1]), strict=True):
+        np.testing.assert_array_equal(np.sort(own, axis=0), np.sort(other, axis=0))
+    middles = np.stack([view.R_sphere_from_view[:, 0] for view in perspective_views(WIDTH)])
+    for k in range(2):
+        assert len(halves[k].rays) > 0.3 * len(whole.rays)
+        cosine = middles[list(HALVES[k])] @ middles[list(HALVES[1 - k])].T
+        assert cosine.max(axis=0).min() > np.cos(np.radians(60.0))  # each has neighbours of the other
 
 
 def test_views_are_perspective_and_of_the_pictures_resolution():

@@ -1,5 +1,7 @@
 """The map's features and matches with them: lists against all, and places that count once."""
 
+import dataclasses
+
 import naive
 import numpy as np
 import pytest
@@ -168,6 +170,23 @@ def test_same_bits_for_any_number_of_threads_and_none_where_nothing_is():
 def matches():
     query = prepare_query(rooms.scene(1)[1], rooms.scan_map(1), CoarseToFineSettings(), Workers(2))
     return query.matches
+
+
+def test_matches_of_halves_are_those_of_the_whole_numbered_on():
+    query = prepare_query(rooms.scene(1)[1], rooms.scan_map(1), CoarseToFineSettings(), Workers(2))
+    halves = [half() for half in query.features]
+    joined, keypoints = query.matches, query.keypoints
+    assert len(joined.query) == sum(len(half.matches.query) for half in halves)
+    np.testing.assert_array_equal(keypoints.rays[joined.query], joined.rays)
+    own = match(keypoints, rooms.scan_map(1).local_features, Workers(1))
+    for values, others in zip(joined, own, strict=True):
+        assert values.dtype == others.dtype
+        np.testing.assert_array_equal(values, others)
+    half = dataclasses.replace(query, num_halves=1)
+    assert half.matches.query.tolist() == halves[0].matches.query.tolist()
+    none = dataclasses.replace(query, num_halves=0)
+    assert len(none.matches.query) == len(none.keypoints.rays) == 0
+    assert (query.by_features, none.by_features) == (True, False)
 
 
 def test_matches_come_in_the_photos_order_the_distinct_ones_weigh_most(matches):

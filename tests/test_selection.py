@@ -1,5 +1,6 @@
 """Which pose is taken, and how much search that needs, each in a made-up case where one rule decides."""
 
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -215,8 +216,7 @@ def _run(monkeypatch, matched, searches, gravity="auto", config=METHOD):
     monkeypatch.setattr(method, "prepare_query", lambda *_: query)
     monkeypatch.setattr(method, "first_query", lambda query: query)
     monkeypatch.setattr(method, "is_whole", lambda query: False)
-    monkeypatch.setattr(method, "matched_poses", lambda query: "matched")
-    monkeypatch.setattr(method, "refine_matched", lambda query, poses: list(matched))
+    monkeypatch.setattr(method, "matched", lambda query, found: (query, [*found, *matched]))
     _compared(monkeypatch, scores, {x: 100 * score for x, score in scores.items()})
     monkeypatch.setattr(method, "search_poses", search_poses)
     monkeypatch.setattr(method, "refine", lambda query, starts, beam: left.pop(0))
@@ -253,6 +253,43 @@ def test_matches_or_searches_can_be_taken_out(monkeypatch):
     assert (made, _places([found.best])) == (["known", "unknown"], [2])
     made, found = _run(monkeypatch, [_at(1, 0.1)], [], config=METHOD._replace(uses_search=False))
     assert (made, _places([found.best])) == ([], [1])
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A query of which only the halves of its features count."""
+
+    num_halves: int = 2
+
+    @property
+    def matches(self):
+        return self.num_halves
+
+
+@pytest.mark.parametrize(
+    ("num_matches", "is_sure", "halves"),
+    [(40, True, 1), (39, True, 2), (40, False, 2), (None, True, 2)],
+)
+def test_half_of_the_features_are_asked_where_these_leave_no_doubt(monkeypatch, num_matches, is_sure, halves):
+    """As many matches as a clear whole view is worth, and no pose of the first look near it."""
+    looked, asked = _at(9, 0.2), []
+
+    def poses(query):
+        asked.append(query.num_halves)
+        return [] if num_matches is None else [f"poses of {query.num_halves}"]
+
+    def sure(query, found):
+        assert found[0] is looked
+        return is_sure
+
+    monkeypatch.setattr(method, "matched_poses", poses)
+    monkeypatch.setattr(method, "count_matches", lambda matches, pose: num_matches)
+    monkeypatch.setattr(method, "is_sure", sure)
+    monkeypatch.setattr(method, "refine_matched", lambda query, poses: [_at(query.num_halves, 0.5)])
+    query, found = method.matched(Asked(), [looked])
+    assert query == Asked(halves)
+    assert _places(found) == [9, halves]
+    assert asked == [1, 2][:halves]
 
 
 # Evaluation

@@ -37,7 +37,7 @@ def is_whole(query: Query) -> bool:
 def first_query(query: Query) -> Query:
     """The query as it is first asked: by whole views alone, from few starts."""
     num_starts = min(FIRST_STARTS, query.settings.max_starts)
-    return replace(query, settings=replace(query.settings, max_starts=num_starts), by_features=False)
+    return replace(query, settings=replace(query.settings, max_starts=num_starts), num_halves=0)
 
 
 def tilted_query(query: Query) -> Query:

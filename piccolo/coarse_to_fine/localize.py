@@ -5,6 +5,7 @@ from dataclasses import replace
 from itertools import compress
 
 from ..confidence.alternatives import Hypothesis
+from ..confidence.confidence import CLEAR_MATCHES
 from ..confidence.localization import Localization
 from ..geometry.pose import Pose
 from ..geometry.rotations import Gravity
@@ -70,27 +71,40 @@ def localize(
             with watch.stage("search"):
                 query = first if is_clear(first, starts, hypotheses, of_mirror) else query
         if query.by_features:
-            hypotheses = in_doubt(query, hypotheses, is_looked_at, watch)
+            query, hypotheses = in_doubt(query, hypotheses, is_looked_at, watch)
         with watch.stage("refine"):
             return evaluate(query, panorama, finished(query, hypotheses))
 
 
 def in_doubt(
-    query: Query, hypotheses: Sequence[Hypothesis], is_looked_at: bool, watch: Stopwatch
-) -> list[Hypothesis]:
-    """The hypotheses of a first look, if one was taken, and those of matches and of whole views."""
+    query: Query, hypotheses: list[Hypothesis], is_looked_at: bool, watch: Stopwatch
+) -> tuple[Query, list[Hypothesis]]:
+    """The hypotheses of a first look, if one was taken, and those of matches and of whole views.
+
+    And the query, of half of the photo's features where these suffice.
+    """
     method, settings = query.method, query.settings
-    found, gravities = list(hypotheses), GRAVITIES[settings.gravity] if method.uses_search else ()
     if method.uses_features:
         with watch.stage("match"):
-            found += refine_matched(query, matched_poses(query))
-    for gravity in gravities:
-        if is_sure(query, found):
+            query, hypotheses = matched(query, hypotheses)
+    for gravity in GRAVITIES[settings.gravity] if method.uses_search else ():
+        if is_sure(query, hypotheses):
             break
         is_brief = is_looked_at and gravity == "unknown"
         asked, beam = (tilted_query(query), FIRST_BEAM) if is_brief else (query, method.beam)
-        found += searched(asked, gravity, beam, watch)[1]
-    return found
+        hypotheses = hypotheses + searched(asked, gravity, beam, watch)[1]
+    return query, hypotheses
+
+
+def matched(query: Query, hypotheses: list[Hypothesis]) -> tuple[Query, list[Hypothesis]]:
+    """Hypotheses, and the poses that matches vote for: those of half of the views if that leaves no doubt."""
+    half = replace(query, num_halves=1)
+    poses = matched_poses(half)
+    if poses and count_matches(half.matches, poses[0]) >= CLEAR_MATCHES:
+        found = hypotheses + refine_matched(half, poses)
+        if is_sure(half, found):
+            return half, found
+    return query, hypotheses + refine_matched(query, matched_poses(query))
 
 
 def searched(query: Query, gravity: Gravity, beam: Beam, watch: Stopwatch) -> tuple[Starts, list[Hypothesis]]:

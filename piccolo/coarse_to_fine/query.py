@@ -1,9 +1,10 @@
 """A query: a panorama at several scales, and the map in which it is searched."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -11,8 +12,8 @@ from numpy.typing import NDArray
 
 from ..geometry.pose import Array, Pose, rotate_points
 from ..geometry.sphere import indices_of, make_grid
-from ..local_features.keypoints import Keypoints, find_keypoints
-from ..local_features.matching import NO_MATCHES, Matches, match
+from ..local_features.keypoints import HALVES, Keypoints, find_keypoints, joined_keypoints
+from ..local_features.matching import Matches, joined_matches, match
 from ..panorama import Panorama
 from ..panorama.gpano import rotation_to_level
 from ..panorama.local_normalization import normalize_panorama
@@ -77,6 +78,13 @@ def query_images(panorama: Panorama, pyramid: ImageScales) -> QueryImages:
     return QueryImages(tuple(images))
 
 
+class Features(NamedTuple):
+    """Keypoints of a photo, and the features of the map that look alike."""
+
+    keypoints: Keypoints
+    matches: Matches
+
+
 @dataclass(frozen=True)
 class Query:
     """A panorama and the map in which it is searched."""
@@ -91,22 +99,26 @@ class Query:
     pixel: float  # [rad] of the photo as it was given, but none finer than those that are compared
     views: RecentViews  # of the map
     colors: Once[Texels]  # of the photo at the size at which its loss is taken
-    by_features: bool = True  # False where whole views alone are asked
+    features: tuple[Once[Features], ...]  # of half of the photo's views each
+    num_halves: int = len(HALVES)  # that are asked; none where whole views alone are
     comparisons: dict[bytes, Any] = field(default_factory=dict)  # worked out already, by comparison.py
     ends: set[bytes] = field(default_factory=set)  # poses which no perturbation improves any more
+
+    @property
+    def by_features(self) -> bool:
+        """False where whole views alone are asked."""
+        return self.num_halves > 0
 
     @cached_property
     def keypoints(self) -> Keypoints:
         """The photo's keypoints."""
-        gray = np.asarray(cv2.cvtColor(self.panorama.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
-        return find_keypoints(gray, self.panorama.is_valid, self.workers)
+        return joined_keypoints([half().keypoints for half in self.features[: self.num_halves]])
 
     @cached_property
     def matches(self) -> Matches:
-        """The photo's keypoints and the features of the map that look alike; none if they are not needed."""
-        if not self.by_features:
-            return NO_MATCHES
-        return match(self.keypoints, self.scan_map.features_now(self.workers), self.workers)
+        """The photo's keypoints and the features of the map that look alike."""
+        halves = [half() for half in self.features[: self.num_halves]]
+        return joined_matches([h.matches for h in halves], [len(h.keypoints.rays) for h in halves])
 
     @cached_property
     def photo(self) -> Texels:
@@ -142,7 +154,8 @@ class Query:
     def of_panorama(self, panorama: Panorama) -> "Query":
         """The same of another panorama of the same size."""
         images = query_images(panorama, self.method.scales)
-        return replace(self, images=images, panorama=panorama, comparisons={}, ends=set())
+        features = features_of(panorama, self.scan_map, self.workers)
+        return replace(self, images=images, panorama=panorama, features=features, comparisons={}, ends=set())
 
 
 def prepare_query(
@@ -159,8 +172,19 @@ def prepare_query(
     colors = Once(partial(texels_of, panorama))
     panorama = resize(panorama, method.scales.full.width)
     images, views = query_images(panorama, method.scales), recent_views(scan_map.octree)
-    how = settings, workers, method
-    return Query(scan_map, images, R_cam_from_level, *how, panorama, pixel, views, colors)
+    how, features = (settings, workers, method), features_of(panorama, scan_map, workers)
+    return Query(scan_map, images, R_cam_from_level, *how, panorama, pixel, views, colors, features)
+
+
+def features_of(panorama: Panorama, scan_map: ScanMap, workers: Workers) -> tuple[Once[Features], ...]:
+    """The features of a panorama, half of its views each."""
+
+    def found(views: Sequence[int]) -> Features:
+        gray = np.asarray(cv2.cvtColor(panorama.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
+        keypoints = find_keypoints(gray, panorama.is_valid, workers, views)
+        return Features(keypoints, match(keypoints, scan_map.features_now(workers), workers))
+
+    return tuple(Once(partial(found, views)) for views in HALVES)
 
 
 def texels_of(panorama: Panorama) -> Texels:

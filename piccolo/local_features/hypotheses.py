@@ -22,7 +22,8 @@ from .p3p import p3p
 from .pose_refinement import refine_pose
 
 COS_ROUGH, COS_EXACT = math.cos(math.radians(20.0)), math.cos(math.radians(1.0))  # a match off by less agrees
-COS2_NEAR = np.float32(math.cos(math.radians(20.1)) ** 2)  # in float32 first, and a little wider
+# in float32 first, and a little wider
+COS2_NEAR, COS2_CLOSE = (np.float32(math.cos(math.radians(angle)) ** 2) for angle in (20.1, 1.1))
 COS_TANGENT = math.cos(math.radians(40.0))
 SIZE_RATIO = 1.7  # of a keypoint's size as predicted and as found, at most
 COS_TILT = math.cos(math.radians(12.0))  # by which a pose may be off the known vertical
@@ -92,13 +93,16 @@ def write_turned(m, j, R):
 
 
 @inline_kernel
-def find_near(points, rays, R, t, is_near):
-    """Write which of the matches' points (3, M) a pose puts near their rays (3, M): most are not."""
+def find_near(points, rays, R, t, cos2, is_near):
+    """Write which of the matches' points (3, M) a pose puts near their rays (3, M): most are not.
+
+    By the squared cosine, in float32: one a little smaller than is asked in float64.
+    """
     pose = pose_float32(R, t)
     for i in range(points.shape[1]):
         x, y, z = in_camera(points[0, i], points[1, i], points[2, i], pose)
         along = x * rays[0, i] + y * rays[1, i] + z * rays[2, i]
-        is_near[i] = (along > F0) & (along * along >= COS2_NEAR * (x * x + y * y + z * z))
+        is_near[i] = (along > F0) & (along * along >= cos2 * (x * x + y * y + z * z))
 
 
 @inline_kernel
@@ -132,20 +136,34 @@ def rough_poses(matches, columns, voters, R_cam_from_level, is_upright, rotation
             write_upright(m, j, R_cam_from_level, R)
         else:
             write_turned(m, j, R)
-        find_near(columns[0], columns[1], R, t, is_near)
+        find_near(columns[0], columns[1], R, t, COS2_NEAR, is_near)
         votes[k] = agreeing_weight(m, is_near, R, t)
 
 
 @inline_kernel
-def count_exact(m, members, R, t):
-    """How many features of the photo, of the matches `members`, agree with a pose to a degree."""
+def count_exact(m, members, points, rays, is_near, R, t):
+    """How many features of the photo, of the matches `members`, agree with a pose to a degree.
+
+    The members' points and rays are in columns (3, n), too.
+    """
     count, last = 0, -1
+    find_near(points, rays, R, t, COS2_CLOSE, is_near)
     for k in range(len(members)):
         j = members[k]
-        if m.query[j] != last and agreement(m, j, R, t, COS_EXACT) > 0.0:
+        if is_near[k] and m.query[j] != last and agreement(m, j, R, t, COS_EXACT) > 0.0:
             count += 1
             last = m.query[j]
     return count
+
+
+@inline_kernel
+def columns_at(m, members):
+    """The points and rays (6, n) of some matches."""
+    columns = np.empty((6, len(members)), np.float32)
+    for k in range(len(members)):
+        for c in range(3):
+            columns[c, k], columns[3 + c, k] = m.points[members[k], c], m.rays[members[k], c]
+    return columns
 
 
 @kernel
@@ -158,6 +176,7 @@ def sample_poses(matches, members, up_cam, cos_tilt, R_best, t_best):
     m, best = matches, 0
     bearings, points = np.empty((3, 3)), np.empty((3, 3))
     rotations, centers = np.empty((4, 3, 3)), np.empty((4, 3))
+    columns, is_near = columns_at(m, members), np.empty(len(members), np.bool_)
     state = np.uint32(12345)
     for _ in range(NUM_SAMPLES):
         for i in range(3):
@@ -169,7 +188,7 @@ def sample_poses(matches, members, up_cam, cos_tilt, R_best, t_best):
             R = rotations[k]
             if R[0, 2] * up_cam[0] + R[1, 2] * up_cam[1] + R[2, 2] * up_cam[2] < cos_tilt:
                 continue
-            count = count_exact(m, members, R, centers[k])
+            count = count_exact(m, members, columns[:3], columns[3:], is_near, R, centers[k])
             if count > best:
                 best = count
                 R_best[:], t_best[:] = R, centers[k]
@@ -177,20 +196,30 @@ def sample_poses(matches, members, up_cam, cos_tilt, R_best, t_best):
 
 
 @kernel
-def list_members(matches, R_cam_from_map, center_map, cos_rough, members):
-    """Write the indices of the matches that agree with a pose; returns how many."""
-    count = 0
+def list_members(matches, columns, R_cam_from_map, center_map, cos_rough, members):
+    """Write the indices of the matches that agree with a pose; returns how many.
+
+    `columns` as of `rough_poses`; the cosine is of 20 degrees at most.
+    """
+    count, is_near = 0, np.empty(len(matches.query), np.bool_)
+    find_near(columns[0], columns[1], R_cam_from_map, center_map, COS2_NEAR, is_near)
     for j in range(len(matches.query)):
-        if agreement(matches, j, R_cam_from_map, center_map, cos_rough) > 0.0:
+        if is_near[j] and agreement(matches, j, R_cam_from_map, center_map, cos_rough) > 0.0:
             members[count] = j
             count += 1
     return count
 
 
+def columns_of(matches: Matches) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The matches' points and rays once more, (3, M) each."""
+    return np.ascontiguousarray(matches.points.T), np.ascontiguousarray(matches.rays.T)
+
+
 def members_of(matches: Matches, pose: Pose, cos_rough: float) -> NDArray[np.int64]:
     """Indices of the matches that agree with a pose."""
     members = np.empty(len(matches.query), np.int64)
-    count = list_members(matches, pose.R_cam_from_world, pose.center_world, cos_rough, members)
+    at = pose.R_cam_from_world, pose.center_world
+    count = list_members(matches, columns_of(matches), *at, cos_rough, members)
     return members[:count]
 
 
@@ -230,7 +259,7 @@ def poses_of(
     votes = np.empty(len(voters))
     level = np.eye(3) if R_cam_from_level is None else np.ascontiguousarray(R_cam_from_level, np.float64)
 
-    columns = np.ascontiguousarray(matches.points.T), np.ascontiguousarray(matches.rays.T)
+    columns = columns_of(matches)
 
     def vote(lo: int) -> None:
         part = slice(lo, lo + BATCH)

@@ -20,6 +20,8 @@ ALONE = Workers()
 # azimuth and elevation of the views' middles [deg]; at the poles pictures show floor and ceiling, or nothing
 VIEWS_DEG = [(45.0 * k, 0.0) for k in range(8)]
 VIEWS_DEG += [(60.0 * k + 30.0, elevation) for elevation in (45.0, -45.0) for k in range(6)]
+ALL_VIEWS = tuple(range(len(VIEWS_DEG)))
+HALVES = (0, 2, 4, 6, 8, 10, 12, 15, 17, 19), (1, 3, 5, 7, 9, 11, 13, 14, 16, 18)  # every other view
 
 
 class Keypoints(NamedTuple):
@@ -73,9 +75,12 @@ def perspective_views(width: int) -> list[PerspectiveView]:
 
 
 def find_keypoints(
-    gray: NDArray[np.uint8], is_valid: NDArray[np.bool_], workers: Workers = ALONE
+    gray: NDArray[np.uint8],
+    is_valid: NDArray[np.bool_],
+    workers: Workers = ALONE,
+    chosen: Sequence[int] = ALL_VIEWS,
 ) -> Keypoints:
-    """The keypoints of an equirectangular picture (H, W), W = 2 H, where it is valid."""
+    """The keypoints of an equirectangular picture (H, W), W = 2 H, where it is valid, in the views chosen."""
     views = perspective_views(gray.shape[1])
     middles = np.stack([view.R_sphere_from_view[:, 0] for view in views])
     picture, mask = _with_margin(gray), _with_margin(is_valid.view(np.uint8) * np.uint8(255))
@@ -93,8 +98,12 @@ def find_keypoints(
         is_own = np.argmax(keypoints.rays @ middles.T, axis=1) == k  # what views share counts once
         return keypoints.take(np.flatnonzero(is_own))
 
-    found = workers.map(find, range(len(views)), "find keypoints")
-    return Keypoints(*(np.concatenate(values) for values in zip(*found, strict=True)))
+    return joined_keypoints(list(workers.map(find, chosen, "find keypoints")))
+
+
+def joined_keypoints(parts: Sequence[Keypoints]) -> Keypoints:
+    """Keypoints of several views, one after the other."""
+    return Keypoints(*(np.concatenate(values) for values in zip(_nothing(), *parts, strict=True)))
 
 
 def _with_margin(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

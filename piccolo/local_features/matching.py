@@ -1,5 +1,6 @@
 """Features of a photo and the features of the map that look alike."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -128,3 +129,10 @@ def match(keypoints: Keypoints, feature_map: FeatureMap, workers: Workers) -> Ma
         m.sizes[chosen],
         weights,
     )
+
+
+def joined_matches(parts: Sequence[Matches], counts: Sequence[int]) -> Matches:
+    """Matches of parts of a photo, of so many features each, which are numbered one part after the other."""
+    first = np.repeat(np.cumsum([0, *counts])[:-1], [len(part.query) for part in parts])
+    query, *others = (np.concatenate(values) for values in zip(NO_MATCHES, *parts, strict=True))
+    return Matches(query + first.astype(np.int32), *others)

@@ -103,7 +103,7 @@ def states_at(query: Query, hypotheses: Sequence[Hypothesis]) -> list[State]:
     """Poses of a frame as states, with the odds that they have by whole views, the best first."""
     ranked = sorted(hypotheses, key=lambda h: -h.score)
     ranked = suppressed(ranked, MOST_LISTED, MIN_DISTANCE, MIN_ANGLE)
-    asked = replace(query, by_features=False)
+    asked = replace(query, num_halves=0)
     best, *others = ranked
     covariance = estimate_covariance(query, best.pose)
     standings = standings_of(asked, best, others)
@@ -122,7 +122,7 @@ def beside(query: Query, states: Sequence[State], found: Hypothesis) -> State | 
     best = max(states, key=lambda state: state.log_odds)
     if any(is_same(state.pose, found.pose) for state in states):
         return None
-    asked, at_best = replace(query, by_features=False), Hypothesis(best.pose, best.score)
+    asked, at_best = replace(query, num_halves=0), Hypothesis(best.pose, best.score)
     first, second = posterior(standings_of(asked, at_best, [found]), None)[:2]
     odds = best.log_odds + log_ratio(float(second), float(first))
     if odds < best.log_odds - OTHER_LOG_ODDS:
