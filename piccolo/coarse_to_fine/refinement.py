@@ -2,11 +2,13 @@
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
 from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE, Hypothesis, best_distinct, by_score, suppressed
 from ..geometry.pose import Pose
+from ..runtime.once import Once
 from .comparison import compare, without_occluders
 from .config import Beam
 from .descent import COARSE_LOSS, FINE_LOSS, FULL_LOSS, descend, descend_all, descend_around, score_on
@@ -178,7 +180,10 @@ def refine(query: Query, starts: Starts, beam: Beam) -> list[Hypothesis]:
     perturbed = each(perturb_middle, narrow(middle, beam.num_fine))
     fine = each(descend_fine, narrow(perturbed, beam.num_fine))
     best = best_distinct(fine, beam.num_perturbed, CLOSE_DISTANCE, SAME_ANGLE)
-    return by_score(each(compared, plain(distinct([*each(refine_by_perturbation, best), *fine], middle))))
+    others = plain(distinct(fine, middle))[len(best) :]  # which most likely stay
+    with query.workers.beside(*(Once(partial(compare, query, h.pose)) for h in others)):
+        ends = each(refine_by_perturbation, best)
+    return by_score(each(compared, plain(distinct([*ends, *fine], middle))))
 
 
 def distinct(fine: Sequence[Hypothesis], middle: Sequence[Hypothesis]) -> list[Hypothesis]:
