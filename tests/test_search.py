@@ -201,7 +201,7 @@ def test_starts_that_are_much_worse_on_wide_cells_are_left_out(monkeypatch):
     query, given = _query(), []
 
     def best_poses_wide(*_):
-        rotation = np.array([0, 20, 40])
+        rotation = np.array([0, 4, 8])
         return np.zeros(3, np.int64), rotation, np.array(given[-1], np.float32)
 
     monkeypatch.setattr(search, "best_poses_wide", best_poses_wide)
