@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.soa import unpack_rgb
 from piccolo.cloud.stream import Cloud
-from piccolo.coarse_to_fine import camera_positions
+from piccolo.coarse_to_fine import camera_positions, view
 from piccolo.coarse_to_fine.candidate_views import SEARCH_VIEW
 from piccolo.coarse_to_fine.points_around import points_around, take_children, visible_points
 from piccolo.coarse_to_fine.view import ViewConfig
@@ -114,6 +114,15 @@ def test_more_must_be_seen_around_a_candidate_than_on_open_land():
         fractions = camera_positions.coverage(octree, centers, Workers(2))
         assert len(fractions) > 50
         assert least < fractions.min() < most
+
+
+def test_every_other_centre_is_seen_by_the_kernel_that_sees_all(octree):
+    """A kernel of its own would be compiled while the time of a sample is taken."""
+    centers = rooms.scene(1)[2].center_world + np.linspace(0.0, 0.3, 15).reshape(5, 3)
+    ranges = view.ranges_around(octree, centers, SEARCH_VIEW)
+    compiled = list(view.nearest_ranges.signatures)
+    np.testing.assert_array_equal(view.ranges_around(octree, centers[::2], SEARCH_VIEW), ranges[::2])
+    assert view.nearest_ranges.signatures == compiled
 
 
 def test_top_surfaces_have_nothing_right_above(octree):

@@ -254,5 +254,6 @@ def ranges_around(
 ) -> NDArray[np.float32]:
     """How far away (n, cells) [m] the nearest of what is seen from each centre (n, 3) is, 0 for nothing."""
     ranges = np.empty((len(centers_map), len(make_grid(config.num_rings))), np.float32)
+    centers_map = np.ascontiguousarray(centers_map)  # one kernel for all
     nearest_ranges(octree, centers_map, config.voxel_per_range, config.arrays, thread_scratch(), ranges)
     return ranges
