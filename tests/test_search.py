@@ -196,27 +196,6 @@ def test_heading_is_the_worlds_where_the_map_was_levelled(gravity):
     assert np.abs(off).max() < 20.0 + 1e-6
 
 
-def test_starts_that_are_much_worse_on_wide_cells_are_left_out(monkeypatch):
-    """The best always stays, whatever the scores are."""
-    query, given = _query(), []
-
-    def best_poses_wide(*_):
-        rotation = np.array([0, 4, 8])
-        return np.zeros(3, np.int64), rotation, np.array(given[-1], np.float32)
-
-    monkeypatch.setattr(search, "best_poses_wide", best_poses_wide)
-    for scores, least, count in (
-        ([0.5, 0.4, 0.2], 0.6, 2),
-        ([0.5, 0.4, 0.2], None, 3),
-        ([0.0, -0.1, -0.2], 0.6, 1),
-        ([-0.1, -0.2, -0.3], 0.6, 1),
-        ([-0.1, -0.2, -0.3], None, 3),
-    ):
-        given.append(scores)
-        starts = search.search_poses(dataclasses.replace(query, least_wide=least), "known")
-        assert len(starts.score) == count
-
-
 @pytest.mark.parametrize(("fewest", "most", "expected"), [(150, 4000, 150), (150, 20, 20), (1, 4000, None)])
 def test_number_of_starts(fewest, most, expected):
     """One for every two candidates that are searched, but not fewer and not more than asked for."""

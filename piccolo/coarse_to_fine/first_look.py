@@ -25,7 +25,6 @@ CLEAR_SCORE, CLEAR_MARGIN = 0.3, 0.5  # at least, see docs/METHOD.md
 MIRROR_RATIO = 1.1  # of the first scores, the photo as it is by its mirrored picture
 NUM_COMPARED = 8
 FIRST_STARTS, FIRST_BEAM = 300, Beam(100, 12, 4, 1)  # few: what is clear is found by them
-FIRST_WIDE = 0.6  # of the best score on wide cells: of 194 whole photos none had its pose among the rest
 FIRST_ROTATIONS = 1000  # of SO(3)
 FEW_CELLS = 200  # of the grid: fewer, which a prior has left, are all searched
 
@@ -36,9 +35,9 @@ def is_whole(query: Query) -> bool:
 
 
 def first_query(query: Query) -> Query:
-    """The query as it is first asked: by whole views alone, from the few best starts on wide cells."""
+    """The query as it is first asked: by whole views alone, from few starts."""
     settings = replace(query.settings, max_starts=min(FIRST_STARTS, query.settings.max_starts))
-    return replace(query, settings=settings, num_halves=0, least_wide=FIRST_WIDE)
+    return replace(query, settings=settings, num_halves=0)
 
 
 def tilted_query(query: Query) -> Query:

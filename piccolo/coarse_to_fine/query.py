@@ -101,7 +101,6 @@ class Query:
     colors: Once[Texels]  # of the photo at the size at which its loss is taken
     features: tuple[Once[Features], ...]  # of half of the photo's views each
     num_halves: int = len(HALVES)  # that are asked; none where whole views alone are
-    least_wide: float | None = None  # of a start's score on wide cells, by the best one's
     comparisons: dict[bytes, Any] = field(default_factory=dict)  # worked out already, by comparison.py
     ends: set[bytes] = field(default_factory=set)  # poses which no perturbation improves any more
 

@@ -244,10 +244,7 @@ def search_poses(query: Query, gravity: Gravity) -> Starts:
     check_memory(num_bytes, what, "set fewer --num-yaws or --num-rotations")
     samples, validity = turn_panorama(query.images.search, rotations)
     pool = num_starts * POSES_PER_START
-    sparse, rotation, scores = best_poses_wide(m, samples, validity, pool, query.workers)
-    if query.least_wide is not None:
-        is_kept = scores >= min(query.least_wide * scores[0], scores[0])
-        sparse, rotation = sparse[is_kept], rotation[is_kept]
+    sparse, rotation, _ = best_poses_wide(m, samples, validity, pool, query.workers)
     R, centers = rotations[rotation], m.centers[m.sparse[sparse]]
     kept = non_maximum_suppression(R, centers, num_starts, START_DISTANCE, START_ANGLE)
     return rescored(query, m.sparse[sparse[kept]], rotations, rotation[kept], samples, validity)

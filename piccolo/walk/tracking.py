@@ -87,7 +87,7 @@ def found_everywhere(query: Query, least_score: float) -> list[Hypothesis]:
 
     None if the best has less than a score.
     """
-    first = replace(first_query(query), least_wide=None)  # copies may differ more
+    first = first_query(query)
     gravity: Gravity = "unknown" if query.settings.gravity == "unknown" else "known"
     starts = search_poses(first, gravity)
     if first_score(first, starts) < least_score or is_rather_mirrored(first, starts, mirror_score(first)):
