@@ -168,6 +168,16 @@ def test_a_part_of_the_candidates_at_a_time_gives_the_same_poses(monkeypatch):
         np.testing.assert_array_equal(found, expected)
 
 
+def test_a_threads_block_is_as_large_as_it_is_asked_for(monkeypatch):
+    """It is kept, and the next search may need more views, or other cells."""
+    monkeypatch.setattr(search, "BLOCK", 7)
+    for num_views, num_cells in ((5, 40), (7, 40), (30, 40), (3, 11), (40, 60)):
+        block = search.thread_block(num_views, num_cells)
+        shapes = [each.shape for each in block]
+        views_by_cells = (num_views, num_cells)
+        assert shapes == [(num_views, 3 * num_cells), views_by_cells, views_by_cells, (num_views,)]
+
+
 def test_best_poses_are_the_largest_in_order():
     scores = np.random.default_rng(1).normal(size=(400, 600)).astype(np.float32)
     candidate, rotation, values = search.best_poses(scores, 100)

@@ -5,6 +5,7 @@ come out the same whatever the processor and its BLAS.
 """
 
 import math
+import threading
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from ..geometry.sphere import SEARCH_RINGS, averaging, make_grid, whole_areas
 from ..geometry.suppression import non_maximum_suppression
 from ..panorama.local_normalization import sample_channels
 from ..panorama.texels import Texels
-from ..runtime.jit import kernel
+from ..runtime.jit import F0, F1, kernel
 from ..runtime.memory import check_memory
 from ..runtime.threads import Workers
 from .candidate_views import WIDE_RINGS
@@ -44,7 +45,12 @@ class TurnedPanorama(NamedTuple):
 
 def whole(values: Samples, most: float, most_other: int, num_terms: int) -> Samples:
     """Values up to `most`, scaled and rounded: sums of products with numbers up to another are exact."""
-    return np.asarray(np.rint(values * np.float32(EXACT // (most_other * num_terms) / most)))
+    return np.asarray(np.rint(values * whole_scale(most, most_other, num_terms)))
+
+
+def whole_scale(most: float, most_other: int, num_terms: int) -> np.float32:
+    """The factor for `whole`."""
+    return np.float32(EXACT // (most_other * num_terms) / most)
 
 
 def turned(samples: Samples, validity: Samples, area: Samples, most_seen: int) -> TurnedPanorama:
@@ -69,6 +75,49 @@ def turn_panorama(texels: Texels, rotations: NDArray[np.float64]) -> tuple[Sampl
     return samples, validity
 
 
+@kernel
+def unpack_views(features, seen, area, values, fractions, energy, total):
+    """Write views' 8-bit channels (n, 3 * cells) and what is seen (n, cells) as float32, and their energies.
+
+    Energies (n, cells) are squared channels by the area (cells,), in whole numbers; (n,) their totals.
+    """
+    num_cells = len(area)
+    for i in range(len(features)):
+        f, s, v, e = features[i], seen[i], values[i], energy[i]
+        for c in range(3 * num_cells):
+            v[c] = np.float32(f[c])
+        whole_total = F0
+        for c in range(num_cells):
+            fractions[i, c] = np.float32(s[c])
+            square = v[c] * v[c] + v[num_cells + c] * v[num_cells + c]
+            square += v[2 * num_cells + c] * v[2 * num_cells + c]
+            e[c] = np.rint(square * area[c])
+            whole_total += e[c]
+        total[i] = whole_total
+
+
+class Unpacked(NamedTuple):
+    """A block of views, and their energies beside each rotation's, as one thread needs them."""
+
+    values: Samples  # (views, 3 * cells)
+    fractions: Samples  # (views, cells)
+    energy: Samples  # (views, cells)
+    total: Samples  # (views,)
+
+
+_local = threading.local()
+
+
+def thread_block(num_views: int, num_cells: int) -> Unpacked:
+    """The calling thread's own block, kept for the next: fresh memory costs as much as the products."""
+    block: Unpacked | None = getattr(_local, "block", None)
+    if block is None or len(block.total) < num_views or block.energy.shape[1] != num_cells:
+        num_rows = max(BLOCK, num_views)
+        shapes = (num_rows, 3 * num_cells), (num_rows, num_cells), (num_rows, num_cells), (num_rows,)
+        block = _local.block = Unpacked(*(np.empty(shape, np.float32) for shape in shapes))
+    return Unpacked(*(each[:num_views] for each in block))
+
+
 def masked_correlation(
     features: NDArray[np.int8],
     seen: NDArray[np.uint8],
@@ -81,22 +130,23 @@ def masked_correlation(
     Views (views, 3 * cells) in 8 bits; seen (views, cells) is how much of each cell is seen.
     """
     weighted = panorama.samples.reshape(len(panorama.samples), -1)
-    relative, num_cells = area / area.max(), len(area)
+    num_cells = len(area)
+    scaled = (area / area.max() * whole_scale(MOST_ENERGY, 1, num_cells)).astype(np.float32)
     scores = np.empty((len(features), len(weighted)), np.float32)
     is_full = bool(panorama.validity.all())
-    block = max(min(BLOCK, -(-len(features) // workers.num_threads)), 1)  # so that none is idle
+    size = max(min(BLOCK, -(-len(features) // workers.num_threads)), 1)  # so that none is idle
 
     def correlate(lo: int) -> None:
-        view = features[lo : lo + block].astype(np.float32)
-        norm = seen[lo : lo + block].astype(np.float32) @ panorama.energy.T
-        energy = np.square(view).reshape(len(view), 3, num_cells).sum(axis=1) * relative
-        energy = whole(energy, MOST_ENERGY, 1, num_cells)
-        norm *= energy.sum(axis=1)[:, None] if is_full else energy @ panorama.validity.T
-        np.sqrt(np.maximum(norm, 1.0, out=norm), out=norm)
-        np.matmul(view, weighted.T, out=scores[lo : lo + block])
-        scores[lo : lo + block] /= norm
+        some = features[lo : lo + size]
+        values, fractions, energy, total = thread_block(len(some), num_cells)
+        unpack_views(some, seen[lo : lo + size], scaled, values, fractions, energy, total)
+        np.matmul(values, weighted.T, out=scores[lo : lo + size])
+        norm = fractions @ panorama.energy.T
+        norm *= total[:, None] if is_full else energy @ panorama.validity.T
+        np.sqrt(np.maximum(norm, F1, out=norm), out=norm)
+        scores[lo : lo + size] /= norm
 
-    list(workers.map(correlate, range(0, len(scores), block), "search"))
+    list(workers.map(correlate, range(0, len(scores), size), "search"))
     return scores
 
 
