@@ -62,7 +62,10 @@ def scan_at(scan_map: ScanMap, center_map: Array) -> str | None:
     m = scan_map
     if not (m.scan_names and len(m.centers)):
         return None
-    nearest = np.square(m.centers - center_map).sum(axis=1).argmin()
+    if len(m.scan_names) == 1:
+        return m.scan_names[0]
+    offsets = m.centers - center_map
+    nearest = np.einsum("ij,ij->i", offsets, offsets).argmin()
     return m.scan_names[int(m.scan_of_candidate[nearest])]
 
 

@@ -101,11 +101,14 @@ def project(
 
 @inline_kernel
 def squared_gap(first, second):
-    """Squared distance of two descriptors (NUM_COMPONENTS,) of 8 bits."""
+    """Squared distance of two descriptors (NUM_COMPONENTS,) of 8 bits.
+
+    Numba's products of 32 bits have 64, which are cut again: 16 at a time then.
+    """
     total = np.int32(0)
     for d in range(NUM_COMPONENTS):
-        gap = np.int32(first[d]) - np.int32(second[d])
-        total += gap * gap
+        gap = np.int32(np.int32(first[d]) - np.int32(second[d]))
+        total = np.int32(total + np.int32(gap * gap))
     return total
 
 
