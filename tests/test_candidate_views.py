@@ -8,7 +8,7 @@ import rooms
 
 from piccolo.coarse_to_fine import candidate_views
 from piccolo.coarse_to_fine.candidate_views import SEARCH_VIEW, CandidateViews, render_views, render_wide
-from piccolo.geometry.sphere import averaging, make_grid
+from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
 from piccolo.panorama.local_normalization import LEVELS_PER_UNIT
 from piccolo.runtime.threads import Workers
 
@@ -74,7 +74,8 @@ def test_threads_may_ask_at_once():
 def test_wide_views_are_averages_of_fine_ones():
     m, _ = _views()
     centers = m.centers[m.sparse]
-    fine, matrix = render_views(m.octree, centers, SEARCH_VIEW, Workers(2)), averaging(12)
+    fine, (cells, areas) = render_views(m.octree, centers, SEARCH_VIEW, Workers(2)), wider_cells(12)
+    matrix = np.eye(len(areas))[cells] * whole_areas(24)[:, None]
     expected = fine.features.astype(np.float64) @ matrix / matrix.sum(axis=0)
     found = m.wide_features.reshape(expected.shape).astype(np.float64)
     correlation = (found * expected).sum() / np.sqrt((found**2).sum() * (expected**2).sum())

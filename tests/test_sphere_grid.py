@@ -1,7 +1,14 @@
 import numpy as np
 import pytest
 
-from piccolo.geometry.sphere import averaging, cell_of, interpolation, make_grid, make_neighbors
+from piccolo.geometry.sphere import (
+    cell_of,
+    interpolation,
+    make_grid,
+    make_neighbors,
+    whole_areas,
+    wider_cells,
+)
 
 
 @pytest.mark.parametrize("num_rings", [12, 24, 96])
@@ -51,9 +58,13 @@ def test_interpolated_values_are_those_of_a_smooth_field(num_rings, coarse_rings
     assert (apart[weights > 1e-6]).max() < 2.0 * width
 
 
-def test_averaging_adds_up_the_solid_angle_in_whole_numbers():
-    matrix, area = averaging(12), make_grid(24).solid_angle
-    np.testing.assert_array_equal(matrix, np.rint(matrix))
-    np.testing.assert_array_equal(np.count_nonzero(matrix, axis=1), 1)
-    np.testing.assert_allclose(matrix.sum(axis=1), 1000 * area / area.max(), atol=0.51)
-    np.testing.assert_allclose(matrix.sum(axis=0) / matrix.sum(), make_grid(12).solid_angle, rtol=0.5)
+def test_wider_cells_add_up_the_solid_angle_in_whole_numbers():
+    (cells, areas), wide = wider_cells(12), make_grid(12)
+    np.testing.assert_array_equal(areas, np.rint(areas))
+    np.testing.assert_array_equal(np.unique(cells), np.arange(len(wide)))
+    apart = np.arccos(np.sum(wide.directions[cells] * make_grid(24).directions, axis=1))
+    assert apart.max() < np.pi / 12
+    area, units = make_grid(24).solid_angle, whole_areas(24)
+    np.testing.assert_allclose(units, 1000 * area / area.max(), atol=0.51)
+    np.testing.assert_array_equal(areas, [units[cells == k].sum() for k in range(len(wide))])
+    np.testing.assert_allclose(areas / areas.sum(), wide.solid_angle, rtol=0.5)

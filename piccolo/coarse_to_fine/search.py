@@ -1,7 +1,6 @@
 """Score every candidate position with every rotation, and keep the distinct best.
 
-All sums are of whole numbers that stay below 2^24: exact in float32 in any order, so that matrix products
-come out the same whatever the processor and its BLAS.
+All sums are of whole numbers: exact in any order (turned_panorama.py).
 """
 
 import math
@@ -12,10 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.rotations import Gravity, uniform_rotations, uniform_yaws
-from ..geometry.sphere import SEARCH_RINGS, averaging, make_grid, whole_areas
+from ..geometry.sphere import SEARCH_RINGS, make_grid, whole_areas, wider_cells
 from ..geometry.suppression import non_maximum_suppression
-from ..panorama.local_normalization import sample_channels
-from ..panorama.texels import Texels
 from ..runtime.jit import F0, F1, kernel
 from ..runtime.memory import check_memory
 from ..runtime.threads import Workers
@@ -24,55 +21,20 @@ from .prior import allowed_rotations
 from .query import Query
 from .scan_map import ScanMap
 from .starts import START_ANGLE, START_DISTANCE, Starts
+from .turned_panorama import (
+    MOST_ENERGY,
+    Samples,
+    TurnedPanorama,
+    turn_panorama,
+    turned,
+    whole_scale,
+    widened,
+)
 
 BLOCK = 512  # views a matrix product, at most
 SCORES_AT_ONCE = 1 << 24  # 64 MB
 TURNED_BYTES = 4 * 16  # of a rotation, a cell: channels, validity, energy, and what they are made from
-EXACT = (1 << 24) - 1  # whole numbers up to this are exact in float32
-MOST_LEVEL = 127.5  # of a channel
-MOST_ENERGY = 3.0 * MOST_LEVEL**2  # of a cell
 CANDIDATES_PER_START, POSES_PER_START = 2, 12
-Samples = NDArray[np.float32]
-
-
-class TurnedPanorama(NamedTuple):
-    """The panorama on the cells of the sphere, turned many ways; whole numbers."""
-
-    samples: Samples  # (rotations, 3, cells) channels times solid angle
-    energy: Samples  # (rotations, cells) squared channels times solid angle, 0 where nothing is shown
-    validity: Samples  # (rotations, cells) 1 where the panorama shows something
-
-
-def whole(values: Samples, most: float, most_other: int, num_terms: int) -> Samples:
-    """Values up to `most`, scaled and rounded: sums of products with numbers up to another are exact."""
-    return np.asarray(np.rint(values * whole_scale(most, most_other, num_terms)))
-
-
-def whole_scale(most: float, most_other: int, num_terms: int) -> np.float32:
-    """The factor for `whole`."""
-    return np.float32(EXACT // (most_other * num_terms) / most)
-
-
-def turned(samples: Samples, validity: Samples, area: Samples, most_seen: int) -> TurnedPanorama:
-    """Channels (rotations, 3, cells) [levels] and validity (rotations, cells) by area, as whole numbers."""
-    num_cells = len(area)
-    relative = area / area.max()
-    energy = np.square(samples).sum(axis=1) * relative
-    return TurnedPanorama(
-        whole(samples * relative, MOST_LEVEL, 127, 3 * num_cells),
-        whole(energy, MOST_ENERGY, most_seen, num_cells),
-        validity,
-    )
-
-
-def turn_panorama(texels: Texels, rotations: NDArray[np.float64]) -> tuple[Samples, Samples]:
-    """Channels (rotations, 3, cells) of the search grid, in levels, and validity (rotations, cells)."""
-    grid = make_grid(SEARCH_RINGS)
-    samples = np.empty((len(rotations), 3, len(grid)), np.float32)
-    validity = np.empty((len(rotations), len(grid)), np.float32)
-    turns = rotations.astype(np.float32)
-    sample_channels(texels.rgbx, texels.width, grid.directions, turns, samples, validity)
-    return samples, validity
 
 
 @kernel
@@ -157,10 +119,8 @@ def best_poses_wide(
 
     Of some candidates at a time: scores of all are a gigabyte where a campus meets all rotations.
     """
-    weights = averaging(WIDE_RINGS)
-    area = weights.sum(axis=0)
-    wide_samples, wide_validity = np.rint(samples) @ weights / area, validity @ weights / area
-    panorama = turned(wide_samples, np.rint(wide_validity), area, 255)
+    area = wider_cells(WIDE_RINGS)[1]
+    panorama = turned(*widened(samples, validity, workers), area, 255)
     num_views, found = views_at_once(len(samples)), []
     for lo in range(0, max(len(scan_map.sparse), 1), num_views):
         part = slice(lo, lo + num_views)
@@ -261,9 +221,10 @@ def rescored(
 ) -> Starts:
     """Some candidates (n,) and rotations (n,) of all (rotations, 3, 3) as starts, by their fine views."""
     area, scores = make_grid(SEARCH_RINGS).solid_angle, np.empty(len(candidate), np.float32)
-    panorama = turned(samples, validity, area, 1)
+    used, turn = np.unique(rotation, return_inverse=True)
+    panorama = turned(samples[used], validity[used], area, 1)
     row, views = query.scan_map.views.at(candidate, query.workers)
-    correlate_pairs(views.features, views.is_seen, whole_areas(SEARCH_RINGS), panorama, row, rotation, scores)
+    correlate_pairs(views.features, views.is_seen, whole_areas(SEARCH_RINGS), panorama, row, turn, scores)
     order = np.lexsort((rotation, candidate, -scores))
     candidate, R = candidate[order], rotations[rotation[order]]
     return Starts(R, query.scan_map.centers[candidate], candidate, scores[order].astype(np.float64))

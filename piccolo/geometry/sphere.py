@@ -200,15 +200,11 @@ def interpolation(num_rings: int, coarse_rings: int) -> tuple[NDArray[np.int32],
 
 
 @lru_cache(maxsize=4)
-def averaging(num_rings: int) -> NDArray[np.float32]:
-    """Weights (search cells, cells of num_rings) that sum search cells into wider ones.
-
-    They go with the solid angle, in whole numbers up to AREA_UNITS: sums of whole numbers come out exact.
-    """
-    grid, wide = make_grid(SEARCH_RINGS), make_grid(num_rings)
-    matrix = np.zeros((len(grid), len(wide)), np.float32)
-    matrix[np.arange(len(grid)), cell_of(grid.directions, num_rings)] = whole_areas(SEARCH_RINGS)
-    return matrix
+def wider_cells(num_rings: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """The cell of `num_rings` in which each search cell lies, and the sum (cells,) of `whole_areas` in it."""
+    cells = cell_of(make_grid(SEARCH_RINGS).directions, num_rings)
+    areas = np.bincount(cells, whole_areas(SEARCH_RINGS), len(make_grid(num_rings)))
+    return cells, areas.astype(np.float32)
 
 
 def whole_areas(num_rings: int) -> NDArray[np.float32]:
