@@ -3,6 +3,7 @@
 import functools
 
 import numpy as np
+import pytest
 import rooms
 
 from piccolo.coarse_to_fine import descent
@@ -51,12 +52,14 @@ def test_descent_finds_the_true_pose_again():
     assert rooms.errors(descent.descend(cells, image, off, (1.0, 1, 1e-5)), true_pose)[0] > 0.01
 
 
-def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off():
+@pytest.mark.parametrize("num_threads", [1, 2])
+def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off(num_threads):
     (_, true_pose), images = _fine(), _images()
     off = step(true_pose, descent.perturbations(1.0)[1])
     assert rooms.errors(off, true_pose)[0] > 0.2
     cells = rooms.view(rooms.scan_map(1).octree, off.center_world, METHOD.fine_view, ALL)
-    found = descent.descend_around(cells, FINE_BLOCKS, (images.search, images.middle), off, 1.0)
+    both, workers = (images.search, images.middle), Workers(num_threads)
+    found = descent.descend_around(cells, FINE_BLOCKS, both, off, 1.0, workers)
     assert rooms.errors(found.pose, true_pose)[0] < 0.06
     score = descent.score_on(cells, FINE_BLOCKS, images.middle, found.pose)
     np.testing.assert_allclose(found.score, score, atol=1e-5)

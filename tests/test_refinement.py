@@ -146,7 +146,7 @@ def test_each_stage_has_its_view_its_image_and_its_limits(monkeypatch):
 def test_poses_are_perturbed_for_as_long_as_that_helps(monkeypatch, gains, rounds, expected):
     left, sizes = list(gains), []
 
-    def around(cells, blocks, images, pose, size):
+    def around(cells, blocks, images, pose, size, workers):
         sizes.append(size)
         assert images == ("middle", "fine")
         return Hypothesis(pose, score[0])

@@ -1,74 +1,38 @@
-"""Which pose is taken, and how much search that needs, each in a made-up case where one rule decides."""
+"""Which pose is taken, each in a made-up case where one rule decides."""
 
-from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 import rooms
+from made_up import QUERY, at, compared, places
 
 from piccolo.coarse_to_fine import evaluation, refinement, standings
 from piccolo.coarse_to_fine import localize as method
-from piccolo.coarse_to_fine.comparison import Comparison
-from piccolo.coarse_to_fine.config import METHOD
 from piccolo.coarse_to_fine.search_result import SearchResult
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.confidence.score import Agreement
-from piccolo.geometry.pose import Pose, yaw_rotation
-from piccolo.optimize.channel_loss import CHANCE
-from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers
-
-OF_MAP = SimpleNamespace(octree=None)
-QUERY = SimpleNamespace(workers=Workers(1), method=METHOD, scan_map=OF_MAP, by_features=True)
-
-
-def _at(x, score, yaw_deg=0.0):
-    return Hypothesis(Pose(yaw_rotation(np.radians(yaw_deg)), np.array([x, 0.0, 0.0])), score)
-
-
-def _places(hypotheses):
-    return [round(float(h.pose.center_world[0]), 6) for h in hypotheses]
-
-
-# The beam
-
-
-def _seen(explains, num_blocks=4):
-    """A comparison that explains a part of each of some blocks of a hundredth of the sphere."""
-    beyond = CHANCE + (1.0 - CHANCE) * explains
-    area = np.full(num_blocks, 0.01)
-    return Comparison(np.full(num_blocks, beyond), area, area, 0.04)
 
 
 def test_of_poses_that_matches_gave_the_better_end_is_taken(monkeypatch):
     """As found, or after a descent on fine cells, whichever explains more."""
     scores = {0.0: 0.3, 1.0: 0.5, 5.0: 0.6, 6.0: 0.2}
-    down = lambda query, h: _at(h.pose.center_world[0] + 1.0, 0.9)  # noqa: E731
+    down = lambda query, h: at(h.pose.center_world[0] + 1.0, 0.9)  # noqa: E731
     monkeypatch.setattr(refinement, "descend_fine", down)
-    monkeypatch.setattr(refinement, "perturb_middle", lambda query, h: _at(-1.0, 0.9))
+    monkeypatch.setattr(refinement, "perturb_middle", lambda query, h: at(-1.0, 0.9))
     to_score = lambda query, h: Hypothesis(h.pose, scores[h.pose.center_world[0]])  # noqa: E731
     monkeypatch.setattr(refinement, "compared", to_score)
-    found = refinement.refine_matched(QUERY, [_at(0.0, 0).pose, _at(5.0, 0).pose])
+    found = refinement.refine_matched(QUERY, [at(0.0, 0).pose, at(5.0, 0).pose])
     assert [(h.pose.center_world[0], h.score) for h in found] == [(5.0, 0.6), (1.0, 0.5)]
-
-
-def _compared(monkeypatch, explains, counts):
-    """Made-up comparisons and matches, by the x of a pose."""
-    query = SimpleNamespace(**vars(QUERY), matches=None)
-    for module in (method, standings):
-        count = lambda matches, pose: counts.get(pose.center_world[0], 0)  # noqa: E731
-        monkeypatch.setattr(module, "count_matches", count)
-    monkeypatch.setattr(standings, "compare", lambda query, pose: _seen(explains[pose.center_world[0]]))
-    return query
 
 
 def test_alternatives_that_come_near_are_refined_and_the_greatest_odds_win(monkeypatch):
     """By score or by matches; the third explains more of what both show, though its score is less."""
     explains = {0.0: 0.5, 3.0: 0.4, 6.0: 0.6, 9.0: 0.1, 12.0: 0.1}
-    query, refined = _compared(monkeypatch, explains, {0.0: 20, 3.0: 3, 6.0: 21, 9.0: 11, 12.0: 12}), []
+    query, refined = compared(monkeypatch, explains, {0.0: 20, 3.0: 3, 6.0: 21, 9.0: 11, 12.0: 12}), []
 
     def full(query, h, num_rounds):
         refined.append((h.pose.center_world[0], num_rounds))
@@ -76,21 +40,29 @@ def test_alternatives_that_come_near_are_refined_and_the_greatest_odds_win(monke
 
     monkeypatch.setattr(method, "refine_full_resolution", full)
     monkeypatch.setattr(method, "settle", lambda query, h: h)
-    hypotheses = [_at(9.0, 0.1), _at(0.0, 0.5), _at(6.0, 0.31), _at(3.0, 0.4), _at(12.0, 0.05)]
+    hypotheses = [at(9.0, 0.1), at(0.0, 0.5), at(6.0, 0.31), at(3.0, 0.4), at(12.0, 0.05)]
     found = method.finished(query, hypotheses)
     assert refined == [(0.0, 2), (3.0, 2), (6.0, 2), (12.0, 2)]
     assert found.best == Hypothesis(found.best.pose, 0.32)
-    assert _places([found.best, *found.alternatives]) == [6.0, 0.0, 3.0, 9.0, 12.0]
+    assert places([found.best, *found.alternatives]) == [6.0, 0.0, 3.0, 9.0, 12.0]
     assert found.rival_ratio == pytest.approx(0.5 / 0.6)
 
 
-@pytest.mark.parametrize(("best", "num_matches", "num_refined"), [(0.09, 5, 2), (0.09, 6, 5), (0.1, 5, 5)])
-def test_of_faint_poses_one_alternative_is_refined(monkeypatch, best, num_matches, num_refined):
+@pytest.mark.parametrize(
+    ("best", "num_matches", "gain", "num_refined"),
+    [(0.09, 5, 0.0, 0), (0.09, 6, 0.0, 5), (0.1, 5, 0.0, 5), (0.09, 5, 0.02, 5)],
+)
+def test_of_a_faint_pose_no_alternative_is_refined_unless_it_gains(
+    monkeypatch, best, num_matches, gain, num_refined
+):
     places, refined = [3.0 * k for k in range(8)], []
-    query = _compared(monkeypatch, dict.fromkeys(places, 0.1), dict.fromkeys(places, num_matches))
+    query = compared(monkeypatch, dict.fromkeys(places, 0.1), dict.fromkeys(places, num_matches))
     monkeypatch.setattr(method, "refine_full_resolution", lambda query, h, num_rounds: refined.append(h) or h)
+    monkeypatch.setattr(
+        method, "refine_unoccluded", lambda query, h: (query, Hypothesis(h.pose, h.score + gain))
+    )
     monkeypatch.setattr(method, "settle", lambda query, h: h)
-    method.finished(query, [_at(3.0 * k, best - 0.001 * k) for k in range(8)])
+    method.finished(query, [at(3.0 * k, best - 0.001 * k) for k in range(8)])
     assert len(refined) == num_refined
 
 
@@ -99,19 +71,19 @@ def test_of_faint_poses_one_alternative_is_refined(monkeypatch, best, num_matche
     [
         (0.5, 20, ["unoccluded", "settled"]),  # which refines it at full resolution
         (0.09, 6, ["unoccluded", "settled"]),
-        (0.09, 5, ["full"]),  # never localized
+        (0.09, 5, ["unoccluded"]),  # never localized
         (0.019, 20, []),
     ],
 )
 def test_how_a_pose_without_rivals_is_finished(monkeypatch, best, num_matches, done):
     made = []
-    query = _compared(monkeypatch, {0.0: 0.5, 9.0: 0.01}, {0.0: num_matches, 9.0: 0})
+    query = compared(monkeypatch, {0.0: 0.5, 9.0: 0.01}, {0.0: num_matches, 9.0: 0})
     monkeypatch.setattr(method, "refine_full_resolution", lambda query, h, _: made.append("full") or h)
     monkeypatch.setattr(method, "refine_unoccluded", lambda query, h: made.append("unoccluded") or (query, h))
     monkeypatch.setattr(method, "settle", lambda query, h: made.append("settled") or h)
-    found = method.finished(query, [_at(0.0, best), _at(9.0, 0.1 * best)])
+    found = method.finished(query, [at(0.0, best), at(9.0, 0.1 * best)])
     assert made == done
-    assert _places([found.best, *found.alternatives]) == [0.0, 9.0]
+    assert places([found.best, *found.alternatives]) == [0.0, 9.0]
 
 
 @pytest.mark.parametrize(
@@ -124,19 +96,17 @@ def test_how_a_pose_without_rivals_is_finished(monkeypatch, best, num_matches, d
     ],
 )
 def test_the_pose_with_the_greatest_odds_is_selected(monkeypatch, explains, matches, best):
-    query = _compared(
-        monkeypatch, *(dict(zip((0.0, 3.0), pair, strict=True)) for pair in (explains, matches))
-    )
-    found = standings.fairly_selected(query, SearchResult(_at(0.0, 0.5), (_at(3.0, 0.4),)))
-    assert _places([found.best]) == [best]
+    query = compared(monkeypatch, *(dict(zip((0.0, 3.0), pair, strict=True)) for pair in (explains, matches)))
+    found = standings.fairly_selected(query, SearchResult(at(0.0, 0.5), (at(3.0, 0.4),)))
+    assert places([found.best]) == [best]
     assert found.rival_ratio == pytest.approx(explains[0 if best else 1] / explains[1 if best else 0])
-    alone = SearchResult(_at(0.0, 0.5), ())
+    alone = SearchResult(at(0.0, 0.5), ())
     assert standings.fairly_selected(query, alone) is alone
 
 
 def test_of_poses_that_beat_each_other_in_turn_the_one_beaten_least_is_best(monkeypatch):
     """Each two are compared over other parts of the sphere."""
-    query = _compared(monkeypatch, {}, {0.0: 20, 3.0: 20, 6.0: 20})
+    query = compared(monkeypatch, {}, {0.0: 20, 3.0: 20, 6.0: 20})
     ratios = {(0.0, 3.0): 0.7, (3.0, 6.0): 0.8, (6.0, 0.0): 0.9}  # of the first, by the second
     ratios |= {(second, first): 1.0 / ratio for (first, second), ratio in ratios.items()}
     ratios |= {(place, place): 1.0 for place in (0.0, 3.0, 6.0)}
@@ -149,150 +119,51 @@ def test_of_poses_that_beat_each_other_in_turn_the_one_beaten_least_is_best(monk
 
     monkeypatch.setattr(standings, "compare", lambda query, pose: Seen(pose.center_world[0]))
     for first, second, third in ((0.0, 3.0, 6.0), (6.0, 0.0, 3.0), (3.0, 6.0, 0.0)):
-        found = SearchResult(_at(first, 0.5), (_at(second, 0.5), _at(third, 0.5)))
+        found = SearchResult(at(first, 0.5), (at(second, 0.5), at(third, 0.5)))
         selected = standings.fairly_selected(query, found)
-        assert _places([selected.best, *selected.alternatives]) == [6.0, 0.0, 3.0]
+        assert places([selected.best, *selected.alternatives]) == [6.0, 0.0, 3.0]
         assert selected.rival_ratio == pytest.approx(1.0 / 0.9)
 
 
 def test_the_best_pose_has_come_to_rest_and_is_still_the_best(monkeypatch):
     """At rest, the first explains less than the second; of the two at rest, the second is better."""
     explains, rested = {0.0: 0.5, 3.0: 0.45, 0.01: 0.3, 3.01: 0.46}, []
-    query = _compared(monkeypatch, explains, dict.fromkeys(explains, 20))
+    query = compared(monkeypatch, explains, dict.fromkeys(explains, 20))
 
     def settle(query, h):
         place = h.pose.center_world[0]
         rested.append(place)
-        return _at(place + 0.01, h.score) if place in (0.0, 3.0) else h
+        return at(place + 0.01, h.score) if place in (0.0, 3.0) else h
 
     monkeypatch.setattr(method, "settle", settle)
-    found = method.settled(query, SearchResult(_at(0.0, 0.5), (_at(3.0, 0.5),)))
+    found = method.settled(query, SearchResult(at(0.0, 0.5), (at(3.0, 0.5),)))
     assert rested == [0.0, 3.0]
-    assert _places([found.best, *found.alternatives]) == [3.01, 0.01]
+    assert places([found.best, *found.alternatives]) == [3.01, 0.01]
     rested.clear()
     explains[0.01] = 0.49
-    found = method.settled(query, SearchResult(_at(0.0, 0.5), (_at(3.0, 0.5),)))
+    found = method.settled(query, SearchResult(at(0.0, 0.5), (at(3.0, 0.5),)))
     assert (rested, found.best.pose.center_world[0]) == ([0.0], 0.01)
 
 
 def test_what_speaks_for_poses_is_compared_with_the_best(monkeypatch):
-    query = _compared(monkeypatch, {0.0: 0.6, 3.0: 0.3}, {0.0: 9, 3.0: 4})
-    best, other = standings.standings_of(query, _at(0.0, 0.5), [_at(3.0, 0.2)])
+    query = compared(monkeypatch, {0.0: 0.6, 3.0: 0.3}, {0.0: 9, 3.0: 4})
+    best, other = standings.standings_of(query, at(0.0, 0.5), [at(3.0, 0.2)])
     assert best == (1.0, 0.5, 9)
     assert other == (pytest.approx(0.5), 0.2, 4)
 
 
 def test_margin_is_the_lesser_of_two_leads_and_a_result_is_sure_by_three_things():
     for score, other, rival, margin in ((0.5, 0.1, 0.3, 0.7), (0.5, 0.4, 0.3, 0.2), (0.1, 0.4, 0.0, -1.0)):
-        found = SearchResult(_at(0.0, score), (_at(3.0, other),), rival)
+        found = SearchResult(at(0.0, score), (at(3.0, other),), rival)
         assert found.margin == pytest.approx(margin)
-    assert SearchResult(_at(0.0, 0.3), ()).margin == 1.0
+    assert SearchResult(at(0.0, 0.3), ()).margin == 1.0
     for score, other, matches, is_sure in (
         (0.05, 0.02, 12, True),
         (0.04, 0.01, 12, False),
         (0.5, 0.24, 11, False),
         (0.5, 0.26, 99, False),
     ):
-        assert SearchResult(_at(0.0, score), (_at(3.0, other),)).is_sure(matches) == is_sure
-
-
-def _run(monkeypatch, matched, searches, gravity="auto", config=METHOD):
-    """Localize with made-up poses from matches and from searches; the searches made, what is evaluated.
-
-    A score in hundredths is also how many features agree, and what a pose explains.
-    """
-    made, left = [], list(searches)
-    scan_map = SimpleNamespace(sparse=np.zeros(1))
-    scores = {h.pose.center_world[0]: h.score for some in (matched, *searches) for h in some}
-
-    def search_poses(query, gravity):
-        made.append(gravity)
-        return gravity
-
-    monkeypatch.setattr(method, "apply_prior", lambda *_: scan_map)
-    settings = CoarseToFineSettings(gravity=gravity)
-    query = SimpleNamespace(**vars(QUERY), matches=None, settings=settings, colors=None, soon_needed=list)
-    query.method = config
-    monkeypatch.setattr(method, "prepare_query", lambda *_: query)
-    monkeypatch.setattr(method, "first_query", lambda query: query)
-    monkeypatch.setattr(method, "is_whole", lambda query: False)
-    monkeypatch.setattr(method, "matched", lambda query, found: (query, [*found, *matched]))
-    _compared(monkeypatch, scores, {x: 100 * score for x, score in scores.items()})
-    monkeypatch.setattr(method, "search_poses", search_poses)
-    monkeypatch.setattr(method, "refine", lambda query, starts, beam: left.pop(0))
-    monkeypatch.setattr(method, "refine_full_resolution", lambda query, h, num_rounds: h)
-    monkeypatch.setattr(method, "refine_unoccluded", lambda query, h: (query, h))
-    monkeypatch.setattr(method, "settle", lambda query, h: Hypothesis(h.pose, h.score + 0.001))
-    monkeypatch.setattr(method, "evaluate", lambda query, panorama, found: found)
-    found = method.localize(None, rooms.scene(1)[1], settings, Workers(1), Stopwatch(), config)
-    return made, found
-
-
-@pytest.mark.parametrize(
-    ("matched", "searches", "gravity", "num_made", "best"),
-    [
-        ([_at(1, 0.6)], [], "auto", 0, 1),
-        ([], [[_at(1, 0.6)]], "auto", 1, 1),
-        ([_at(1, 0.1)], [[_at(2, 0.6)]], "auto", 1, 2),  # too few matches
-        ([_at(1, 0.6), _at(5, 0.4)], [[_at(7, 0.1)], [_at(7, 0.1)]], "auto", 2, 1),  # two that are alike
-        ([_at(1, 0.1)], [[_at(2, 0.11)], [_at(3, 0.09)]], "auto", 2, 2),
-        ([], [[_at(2, 0.1)]], "known", 1, 2),
-        ([_at(1, 0.08)], [[_at(2, 0.05)]], "unknown", 1, 1),
-    ],
-)
-def test_searches_are_made_where_matches_leave_doubt(monkeypatch, matched, searches, gravity, num_made, best):
-    made, found = _run(monkeypatch, matched, searches, gravity)
-    assert made == [way for way in ("known", "unknown") if gravity in ("auto", way)][:num_made]
-    assert found.best.pose.center_world[0] == best
-    assert found.best.score in {h.score + 0.001 for some in (matched, *searches) for h in some}  # settled
-
-
-def test_matches_or_searches_can_be_taken_out(monkeypatch):
-    alone = METHOD._replace(uses_features=False)
-    made, found = _run(monkeypatch, [_at(1, 0.6)], [[_at(2, 0.1)], [_at(2, 0.1)]], config=alone)
-    assert (made, _places([found.best])) == (["known", "unknown"], [2])
-    made, found = _run(monkeypatch, [_at(1, 0.1)], [], config=METHOD._replace(uses_search=False))
-    assert (made, _places([found.best])) == ([], [1])
-
-
-@dataclass(frozen=True)
-class Asked:
-    """A query of which only the halves of its features count."""
-
-    num_halves: int = 2
-
-    @property
-    def matches(self):
-        return self.num_halves
-
-
-@pytest.mark.parametrize(
-    ("num_matches", "is_sure", "halves"),
-    [(40, True, 1), (39, True, 2), (40, False, 2), (None, True, 2)],
-)
-def test_half_of_the_features_are_asked_where_these_leave_no_doubt(monkeypatch, num_matches, is_sure, halves):
-    """As many matches as a clear whole view is worth, and no pose of the first look near it."""
-    looked, asked = _at(9, 0.2), []
-
-    def poses(query):
-        asked.append(query.num_halves)
-        return [] if num_matches is None else [f"poses of {query.num_halves}"]
-
-    def sure(query, found):
-        assert found[0] is looked
-        return is_sure
-
-    monkeypatch.setattr(method, "matched_poses", poses)
-    monkeypatch.setattr(method, "count_matches", lambda matches, pose: num_matches)
-    monkeypatch.setattr(method, "is_sure", sure)
-    monkeypatch.setattr(method, "refine_matched", lambda query, poses: [_at(query.num_halves, 0.5)])
-    query, found = method.matched(Asked(), [looked])
-    assert query == Asked(halves)
-    assert _places(found) == [9, halves]
-    assert asked == [1, 2][:halves]
-
-
-# Evaluation
+        assert SearchResult(at(0.0, score), (at(3.0, other),)).is_sure(matches) == is_sure
 
 
 def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
@@ -312,25 +183,25 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
         "is_mirrored": lambda *_: False,
     }.items():
         monkeypatch.setattr(evaluation, name, value)
-    alternatives = _at(1.0, 0.3), _at(2.0, 0.2)
-    _compared(monkeypatch, {0.0: 0.6, 1.0: 0.5, 2.0: 0.4} | {1.0 + 0.001 * k: 0.5 for k in range(9)}, counts)
-    found = evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(_at(0.0, 0.6), alternatives, 0.7))
+    alternatives = at(1.0, 0.3), at(2.0, 0.2)
+    compared(monkeypatch, {0.0: 0.6, 1.0: 0.5, 2.0: 0.4} | {1.0 + 0.001 * k: 0.5 for k in range(9)}, counts)
+    found = evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(at(0.0, 0.6), alternatives, 0.7))
     e = found.evidence
     assert (e.score, e.agreement, e.seen_fraction) == (0.6, 0.8, 1.0)
     assert (e.explained_fraction, e.contradicted_fraction) == (0.6, 0.3)
     assert (e.num_matches, e.alternative_matches) == (30, 6)
     assert e.margin == pytest.approx(0.3)
-    assert _places(found.alternatives) == [1.0, 2.0]
+    assert places(found.alternatives) == [1.0, 2.0]
     assert found.loss == 0.07
     told = [(a.score, round(a.share, 6), a.num_matches) for a in found.alternatives]
     assert told == [(0.3, round(0.5 / 0.6, 6), 4), (0.2, round(0.4 / 0.6, 6), 6)]
     stated = [found.confidence, *(a.probability for a in found.alternatives), found.probability_none]
     assert sum(stated) == pytest.approx(1.0)
     assert stated[0] > stated[1] > stated[2]
-    many = tuple(_at(1.0 + 0.001 * k, 0.1) for k in range(9))
-    found = evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(_at(0.0, 0.6), many))
+    many = tuple(at(1.0 + 0.001 * k, 0.1) for k in range(9))
+    found = evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(at(0.0, 0.6), many))
     assert len(found.alternatives) == 5
-    alone = evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(_at(0.0, 0.6), ()))
+    alone = evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(at(0.0, 0.6), ()))
     assert (alone.evidence.margin, alone.evidence.alternative_matches) == (1.0, 0)
     monkeypatch.setattr(evaluation, "sampling_loss", lambda *_: np.inf)
-    assert evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(_at(0.0, 0.6), ())).pose is None
+    assert evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(at(0.0, 0.6), ())).pose is None

@@ -22,7 +22,7 @@ COARSE_LOSS, FINE_LOSS, FULL_LOSS = 1.2, 1.0, 0.7  # scales of the loss [standar
 START_TOLERANCE, PERTURBED_TOLERANCE = 2e-3, 1e-3  # [rad + m] a shorter step ends a descent
 WIDE_ITERATIONS, NARROW_ITERATIONS = 6, 8  # of a descent from around a pose
 PERTURBED_DISTANCE, PERTURBED_ANGLE = 0.25, math.radians(8.0)  # [m], [rad]
-BATCH = 16  # starts a thread takes at a time
+BATCH, PERTURBED_BATCH = 16, 3  # starts that a thread takes at a time, and of those around a pose
 
 
 @kernel
@@ -56,11 +56,14 @@ def descend_starts(views, cells, image, scale, num_iterations, row, R_cam_from_m
 def descend_perturbed(
     points, levels, weights, blocks, wide, narrow, scale, steps, R_cam_from_map, center, scores
 ):
-    """Descend from each step (n, 6) away from (n, 3, 3), (n, 3): on the wide image, then on the other."""
+    """Descend from each step (n, 6) away from (n, 3, 3), (n, 3): on the wide image, then on the other.
+
+    A step that is none is taken on the other alone.
+    """
     R, t = R_cam_from_map, center
     for k in range(len(steps)):
         retract(R[k].copy(), t[k].copy(), steps[k], R[k], t[k])
-        for image in range(0 if k > 0 else 1, 2):
+        for image in range(0 if np.any(steps[k] != 0.0) else 1, 2):
             texels, width, num_iterations = narrow[0], narrow[1], NARROW_ITERATIONS
             if image == 0:
                 texels, width, num_iterations = wide[0], wide[1], WIDE_ITERATIONS
@@ -121,7 +124,12 @@ def score_on(cells: Cells, blocks: NDArray[np.int32], image: Texels, pose: Pose)
 
 
 def descend_around(
-    cells: Cells, blocks: NDArray[np.int32], images: tuple[Texels, Texels], pose: Pose, size: float
+    cells: Cells,
+    blocks: NDArray[np.int32],
+    images: tuple[Texels, Texels],
+    pose: Pose,
+    size: float,
+    workers: Workers,
 ) -> Hypothesis:
     """The best end of descents from around a pose, the wider image first, and from the pose itself."""
     steps, (wide, narrow) = perturbations(size), images
@@ -130,6 +138,12 @@ def descend_around(
     scores = np.empty(len(steps))
     both = (wide.rgbx, wide.width), (narrow.rgbx, narrow.width)
     levels, scale = as_levels(cells.channels), COARSE_LOSS * LEVELS_PER_UNIT
-    descend_perturbed(cells.offsets, levels, cells.weights, blocks, *both, scale, steps, R, t, scores)
+    problem = cells.offsets, levels, cells.weights, blocks, *both, scale
+
+    def run(lo: int) -> None:
+        part = slice(lo, lo + PERTURBED_BATCH)
+        descend_perturbed(*problem, steps[part], R[part], t[part], scores[part])
+
+    list(workers.map(run, range(0, len(steps), PERTURBED_BATCH), "descend"))
     best = int(np.argmax(scores))
     return Hypothesis(Pose(orthonormal(R[best]), t[best] + cells.center_map), float(scores[best]))

@@ -130,7 +130,10 @@ def matched_poses(query: Query) -> list[Pose]:
 
 
 def finished(query: Query, hypotheses: Sequence[Hypothesis]) -> SearchResult:
-    """The best of some hypotheses, and the best elsewhere, those near it refined to the same end."""
+    """The best of some hypotheses, and the best elsewhere, those near it refined to the same end.
+
+    A faint one is refined on fine cells by itself first: if it stays faint, no more is asked of the photo.
+    """
 
     def refined(h: Hypothesis) -> Hypothesis:
         return refine_full_resolution(query, h, 2)
@@ -144,16 +147,19 @@ def finished(query: Query, hypotheses: Sequence[Hypothesis]) -> SearchResult:
     found = found_among(hypotheses, ALTERNATIVES_COMPARED)
     if found.best.score < HOPELESS_SCORE:
         return found
+    if is_faint(found.best):
+        found = fairly_selected(query, replace(found, best=refine_unoccluded(query, found.best)[1]))
+        if is_faint(found.best):
+            return found
     least = max(NEAR_MATCHES * matches_of(found.best), SURE_MATCHES)
     is_near = [h.score > NEAR_RATIO * found.best.score or matches_of(h) >= least for h in found.alternatives]
-    near = list(compress(found.alternatives, is_near))[: 1 if is_faint(found.best) else ALTERNATIVES_REFINED]
-    if not near and not is_faint(found.best):
+    near = list(compress(found.alternatives, is_near))[:ALTERNATIVES_REFINED]
+    if not near:
         best = refine_unoccluded(query, found.best)[1]
         return settled(query, found_among([best, *found.alternatives], ALTERNATIVES_COMPARED))
     ends = list(query.workers.map(refined, [found.best, *near], "descend"))
     far = [h for h in found.alternatives if not any(h is other for other in near)]
-    found = fairly_selected(query, found_among([*ends, *far], ALTERNATIVES_COMPARED))
-    return found if is_faint(found.best) else settled(query, found)
+    return settled(query, fairly_selected(query, found_among([*ends, *far], ALTERNATIVES_COMPARED)))
 
 
 def settled(query: Query, found: SearchResult) -> SearchResult:

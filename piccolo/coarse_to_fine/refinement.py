@@ -50,7 +50,7 @@ def perturb_middle(query: Query, h: Hypothesis) -> Hypothesis:
     """Descend again from around a pose on middle cells."""
     config, images = query.method.middle_view, (query.images.search, query.images.middle)
     cells = view_at(query, h.pose, config)
-    return descend_around(cells, config.arrays.blocks, images, h.pose, 1.0)
+    return descend_around(cells, config.arrays.blocks, images, h.pose, 1.0, query.workers)
 
 
 def descend_fine(query: Query, h: Hypothesis) -> Hypothesis:
@@ -72,7 +72,7 @@ def refine_by_perturbation(query: Query, h: Hypothesis) -> Hypothesis:
     blocks, cells = config.arrays.blocks, view_at(query, h.pose, config)
     h = Hypothesis(h.pose, score_on(cells, blocks, query.images.fine, h.pose))
     for _ in range(MAX_PERTURBATIONS):
-        around = descend_around(cells, blocks, images, h.pose, PERTURBATION)
+        around = descend_around(cells, blocks, images, h.pose, PERTURBATION, query.workers)
         refined = descend_fine(query, around)
         gain = refined.score - h.score
         h = refined if gain > 0.0 else h

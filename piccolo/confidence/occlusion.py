@@ -19,14 +19,15 @@ from ..panorama import Panorama
 from ..panorama.local_normalization import block_moments, blur_sphere, finish_statistics, opponent_channels
 from ..panorama.model import resize
 from ..render.zbuffer import View, render_view
+from ..runtime.jit import F0, F1, kernel
 
 WIDTHS = (256, 128, 64)  # [px] of the comparison, cells of 1.4 degrees and more: where the scan is sparse
 LEAST_FILLED = 0.75  # of the cells twice as wide in which anything is seen: less is sparse
 STATS_WIDTH = 64  # [px] of local means
 SIGMA_DEG, SMOOTHING = 15.0, 0.9  # of the Gaussians for contrast, and [cells] for the difference
 GLOBAL_WEIGHTS = (10.0, 1.0, 0.3)  # round by round, of the whole photo beside a full neighbourhood
-FLAT_DEVIATION = 0.08  # of a channel in [0, 1]: flatter surroundings make a difference count less
-MOST_DIFFERENCE = 2.0  # deviations; what differs more counts no more
+FLAT_VARIANCE = np.float32(0.08**2)  # of a channel in [0, 1]: flatter surroundings make a difference count less
+MOST_DIFFERENCE = np.float32(2.0)  # deviations; what differs more counts no more
 CONTRADICTING = 0.5  # squared deviations, summed over channels
 WEIGHT_SCALE = 1.0  # the same, of Geman and McClure's weights
 LEAST_COVERED = 0.3  # of the neighbourhood that both show: less was not scanned
@@ -110,13 +111,32 @@ def _squared_difference(
     An edge that is off by less than a cell, or blurred, differs by nothing.
     """
     photo, scan = (_statistics(c, weight, global_weight) for c in (of_photo, of_scan))
-    value = (of_photo - photo[..., :3]) * photo[..., 3:]
     contrast = (of_scan - scan[..., :3]) * scan[..., 3:]
     low, high = _extreme(contrast, is_shared, cv2.erode, 9.0), _extreme(contrast, is_shared, cv2.dilate, -9.0)
-    outside = np.maximum(np.maximum(low - value, value - high), np.float32(0.0))
-    variance = np.float32(1.0) / np.minimum(photo[..., 3:], scan[..., 3:]) ** 2
-    outside *= np.sqrt(variance / (variance + np.float32(FLAT_DEVIATION**2)))
-    return np.asarray((np.minimum(outside, np.float32(MOST_DIFFERENCE)) ** 2).sum(axis=2))
+    squares = np.empty(is_shared.shape, np.float32)
+    write_squares(of_photo, photo, scan, low, high, squares)
+    return squares
+
+
+@kernel
+def write_squares(channels, photo, scan, low, high, squares):
+    """Write the squared distance (H, W) of contrasts from a range (H, W, 3), `low` to `high`, over channels.
+
+    Of the photo's channels (H, W, 3) by its statistics (H, W, 6); flat surroundings, of the photo or of the
+    scan, make it count less.
+    """
+    for i in range(squares.shape[0]):
+        for j in range(squares.shape[1]):
+            total = F0
+            for c in range(3):
+                value = (channels[i, j, c] - photo[i, j, c]) * photo[i, j, 3 + c]
+                outside = max(max(low[i, j, c] - value, value - high[i, j, c]), F0)
+                per_deviation = min(photo[i, j, 3 + c], scan[i, j, 3 + c])
+                variance = F1 / (per_deviation * per_deviation)
+                outside *= math.sqrt(variance / (variance + FLAT_VARIANCE))
+                outside = min(outside, MOST_DIFFERENCE)
+                total += outside * outside
+            squares[i, j] = total
 
 
 def _statistics(
