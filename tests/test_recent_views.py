@@ -1,11 +1,14 @@
 """Views from a grid of places: what a pose that hardly moves need not draw again."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import rooms
 
 from piccolo.coarse_to_fine import recent_views
 from piccolo.coarse_to_fine.config import METHOD
+from piccolo.coarse_to_fine.evaluation import COARSE_VOXEL_PER_RANGE, VOXEL_PER_RANGE, surroundings_of
 from piccolo.coarse_to_fine.points_around import visible_points
 from piccolo.coarse_to_fine.query import prepare_query
 from piccolo.coarse_to_fine.refinement import points_at, view_at
@@ -14,6 +17,7 @@ from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.geometry.sphere import make_grid
 from piccolo.runtime.threads import Workers
 
+SCALES = VOXEL_PER_RANGE, COARSE_VOXEL_PER_RANGE
 FINE, FULL = METHOD.fine_view, METHOD.full_view
 ALL = np.ones(len(make_grid(FINE.num_rings)), bool)
 
@@ -81,3 +85,21 @@ def test_points_depend_on_what_the_photo_shows(shift):
     assert 0.3 < len(points_at(half, pose).weights) / len(points_at(query, pose).weights) <= 1.01
     azimuth = np.arctan2(*(pose.R_cam_from_world @ points_at(half, pose).offsets)[1::-1])
     assert (azimuth < 0.1).mean() > 0.98
+
+
+def test_what_is_around_a_place_is_made_once(monkeypatch):
+    query, made = _query(), []
+    original = recent_views.points_around
+
+    def points_around(octree, center, voxel_per_range):
+        made.append((tuple(center), voxel_per_range))
+        return original(octree, center, voxel_per_range)
+
+    monkeypatch.setattr(recent_views, "points_around", points_around)
+    views, pose = recent_views.recent_views(query.scan_map.octree), _pose(0.296, 0.2, 0.3)
+    query = dataclasses.replace(query, views=views)
+    for at in (pose, _pose(0.304, 0.197, 0.304), _pose(0.4, 0.2, 0.3), pose):
+        fine, coarse = (points() for points in surroundings_of(query, at))
+        assert len(fine.x) > len(coarse.x) > 0
+    places = [recent_views.place_of(at) for at in (pose, _pose(0.4, 0.2, 0.3), pose)]
+    assert made == [(place, scale) for place in places for scale in SCALES]  # the last place's alone are kept

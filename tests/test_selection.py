@@ -173,10 +173,10 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
     query.colors = lambda: None
     counts = {0.0: 30, 1.0: 4, 2.0: 6}
     for name, value in {
-        "points_around": lambda *_: None,
+        "surroundings_of": lambda *_: [lambda: "points", lambda: "coarse points"],
         "visible_points": lambda *_: None,
         "sampling_loss": lambda *_: 0.07,
-        "agreement_at": lambda points, panorama, pose: Agreement(0.8, 1.0),
+        "agreement_at": lambda points, panorama, pose: Agreement({"coarse points": 0.8}[points], 1.0),
         "occlusion_at": lambda *_: SimpleNamespace(fractions=lambda: (0.6, 0.3)),
         "count_matches": lambda matches, pose: counts.get(pose.center_world[0], 0),
         "estimate_covariance": lambda *_: None,

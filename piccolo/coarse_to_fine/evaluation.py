@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..cloud.soa import PackedPoints
 from ..confidence.alternatives import MAX_ALTERNATIVES
 from ..confidence.confidence import NOT_LOCALIZED, classify, posterior
 from ..confidence.localization import Alternative, Localization
@@ -22,8 +23,8 @@ from ..panorama import Panorama
 from ..render.zbuffer import visible_points
 from ..runtime.once import Once
 from .covariance import estimate_covariance
-from .points_around import points_around
 from .query import Query
+from .recent_views import place_of
 from .search_result import SURE_MATCHES, SearchResult
 from .standings import standings_of
 
@@ -39,7 +40,7 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
     if found.best.score < 0.0:
         return Localization()
     scan_map, settings, pose = query.scan_map, query.settings, found.best.pose
-    points = Once(partial(points_around, scan_map.octree, pose.center_world, VOXEL_PER_RANGE))
+    points, coarse = (Once(points) for points in surroundings_of(query, pose))
     if settings.solver != "gauss-newton":
         how = DescentSettings(solver=settings.solver, step_size=LAST_STEP)
         pose = refine(points(), sampling_loss_of(query.colors()), pose, how).pose
@@ -47,7 +48,7 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
         lambda: estimate_covariance(query, pose),  # takes longest
         lambda: occlusion_at(points(), panorama, pose).fractions(),
         lambda: sampling_loss(visible_points(points(), pose.center_world), query.colors(), pose),
-        lambda: agreement_of(query, pose),
+        lambda: agreement_at(coarse(), query.panorama, pose),
     ]
     covariance, fractions, loss, agreement = query.workers.map(lambda tell: tell(), told, "evaluate")
     if not math.isfinite(loss):
@@ -77,10 +78,10 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
     )
 
 
-def agreement_of(query: Query, pose: Pose) -> Agreement:
-    """How well the scan at a pose explains the photo, by wide cells."""
-    points = points_around(query.scan_map.octree, pose.center_world, COARSE_VOXEL_PER_RANGE)
-    return agreement_at(points, query.panorama, pose)
+def surroundings_of(query: Query, pose: Pose) -> list[Callable[[], PackedPoints]]:
+    """What `evaluate` asks for around a pose in the map: points, and coarser ones."""
+    scales = VOXEL_PER_RANGE, COARSE_VOXEL_PER_RANGE
+    return [partial(query.views.surroundings, place_of(pose), scale) for scale in scales]
 
 
 def evidence_of(

@@ -16,7 +16,7 @@ from ..runtime.once import Once
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
 from .config import METHOD, Beam, MethodConfig
-from .evaluation import evaluate
+from .evaluation import evaluate, surroundings_of
 from .first_look import FIRST_BEAM, first_query, is_clear, is_whole, mirror_score, tilted_query
 from .prior import apply_prior, is_allowed, nothing_allowed
 from .query import Query, prepare_query
@@ -165,10 +165,11 @@ def finished(query: Query, hypotheses: Sequence[Hypothesis]) -> SearchResult:
 def settled(query: Query, found: SearchResult) -> SearchResult:
     """The same with a best pose that has come to rest, and that is still the best one then."""
     at_rest: list[Hypothesis] = []
-    for _ in range(1 + len(found.alternatives)):
-        best = settle(query, found.best)
-        at_rest.append(best)
-        found = fairly_selected(query, replace(found, best=best))
-        if any(found.best is h for h in at_rest):
-            break
+    with query.workers.beside(*map(Once, surroundings_of(query, found.best.pose))):  # it hardly moves
+        for _ in range(1 + len(found.alternatives)):
+            best = settle(query, found.best)
+            at_rest.append(best)
+            found = fairly_selected(query, replace(found, best=best))
+            if any(found.best is h for h in at_rest):
+                break
     return found

@@ -6,12 +6,13 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from ..cloud.octree import Octree
+from ..cloud.soa import PackedPoints
 from ..geometry.pose import Pose
-from .points_around import visible_points
+from .points_around import points_around, visible_points
 from .view import Array32, Cells, ViewConfig, average_view
 
 SPACING = 0.01  # [m] between places
-NUM_VIEWS, NUM_POINT_SETS = 32, 8  # are kept: 12 MB and 7 MB
+NUM_VIEWS, NUM_POINT_SETS, NUM_SURROUNDINGS = 32, 8, 2  # are kept: 12, 7 and 8 MB
 Place = tuple[float, float, float]  # [m] in the map
 
 
@@ -29,11 +30,19 @@ class PointsFrom(Protocol):
         """At most `count` points, in the cells that are shown: a byte each."""
 
 
+class SurroundingsOf(Protocol):
+    """What `points_around.points_around` tells of a place."""
+
+    def __call__(self, place: Place, voxel_per_range: float, /) -> PackedPoints:
+        """Coloured points."""
+
+
 class RecentViews(NamedTuple):
     """Views of one scan; from any thread."""
 
     averages: AveragesFrom
     points: PointsFrom
+    surroundings: SurroundingsOf
 
 
 def recent_views(octree: Octree) -> RecentViews:
@@ -42,8 +51,11 @@ def recent_views(octree: Octree) -> RecentViews:
     def points(place: Place, config: ViewConfig, shown: bytes, count: int) -> Cells:
         return visible_points(octree, place, config, np.frombuffer(shown, np.bool_), count)
 
+    def surroundings(place: Place, voxel_per_range: float) -> PackedPoints:
+        return points_around(octree, np.array(place), voxel_per_range)
+
     averages = lru_cache(NUM_VIEWS)(partial(average_view, octree))
-    return RecentViews(averages, lru_cache(NUM_POINT_SETS)(points))
+    return RecentViews(averages, lru_cache(NUM_POINT_SETS)(points), lru_cache(NUM_SURROUNDINGS)(surroundings))
 
 
 def place_of(pose: Pose) -> Place:

@@ -26,7 +26,7 @@ LEAST_FILLED = 0.75  # of the cells twice as wide in which anything is seen: les
 STATS_WIDTH = 64  # [px] of local means
 SIGMA_DEG, SMOOTHING = 15.0, 0.9  # of the Gaussians for contrast, and [cells] for the difference
 GLOBAL_WEIGHTS = (10.0, 1.0, 0.3)  # round by round, of the whole photo beside a full neighbourhood
-FLAT_VARIANCE = np.float32(0.08**2)  # of a channel in [0, 1]: flatter surroundings make a difference count less
+FLAT_VARIANCE = np.float32(0.08**2)  # of a channel in [0, 1]: where it is less, a difference counts less
 MOST_DIFFERENCE = np.float32(2.0)  # deviations; what differs more counts no more
 CONTRADICTING = 0.5  # squared deviations, summed over channels
 WEIGHT_SCALE = 1.0  # the same, of Geman and McClure's weights
@@ -130,7 +130,7 @@ def write_squares(channels, photo, scan, low, high, squares):
             total = F0
             for c in range(3):
                 value = (channels[i, j, c] - photo[i, j, c]) * photo[i, j, 3 + c]
-                outside = max(max(low[i, j, c] - value, value - high[i, j, c]), F0)
+                outside = max(low[i, j, c] - value, value - high[i, j, c], F0)
                 per_deviation = min(photo[i, j, 3 + c], scan[i, j, 3 + c])
                 variance = F1 / (per_deviation * per_deviation)
                 outside *= math.sqrt(variance / (variance + FLAT_VARIANCE))
