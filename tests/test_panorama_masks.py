@@ -9,6 +9,7 @@ from piccolo.errors import InputError
 from piccolo.geometry.pose import exp_so3
 from piccolo.geometry.sphere import pixel_rays, solid_angles
 from piccolo.panorama import ReadOptions, read_panorama
+from piccolo.panorama.masks import is_dual_fisheye
 
 WIDTH, HEIGHT = 1024, 512
 
@@ -155,6 +156,13 @@ def fisheyes(radius=0.49, floor=0.0):
 def test_two_fisheyes_are_refused(tmp_path, radius, floor):
     with pytest.raises(InputError, match="two fisheye pictures side by side, wanted their calibration"):
         read(tmp_path / "a.insp", fisheyes(radius, floor))
+
+
+def test_a_picture_with_a_bright_first_row_shows_no_two_fisheyes():
+    picture = np.asarray(fisheyes(), np.uint8)
+    assert is_dual_fisheye(picture)
+    picture[0] = 60
+    assert not is_dual_fisheye(picture)
 
 
 def checker_mask(width, height):

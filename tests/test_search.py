@@ -196,6 +196,16 @@ def test_best_poses_are_the_largest_in_order():
     np.testing.assert_array_equal(scores[candidate, rotation], values)
 
 
+@pytest.mark.parametrize(("rank", "count"), [(60, 60), (100, 100), (3000, 100), (0, 0)])
+def test_best_poses_have_more_than_the_least(rank, count):
+    """As many as there are, however many more have it than fit at first."""
+    scores = np.random.default_rng(1).normal(size=(400, 600)).astype(np.float32)
+    ranked = np.sort(scores.ravel())[::-1]
+    candidate, rotation, values = search.best_poses(scores, 100, ranked[rank])
+    np.testing.assert_array_equal(values, ranked[:count])
+    np.testing.assert_array_equal(scores[candidate, rotation], values)
+
+
 def test_tilt_in_the_metadata_is_that_of_every_start():
     """Pitch raises the image centre, roll lowers the camera's right side."""
     starts = search.search_poses(_query(GPano(pitch_deg=20.0, roll_deg=10.0)), "known")

@@ -32,7 +32,7 @@ from .turned_panorama import (
 )
 
 BLOCK = 512  # views a matrix product, at most
-SCORES_AT_ONCE = 1 << 24  # 64 MB
+SCORES_AT_ONCE, LOWEST = 1 << 23, np.float32(-np.inf)  # 32 MB
 TURNED_BYTES = 4 * 16  # of a rotation, a cell: channels, validity, energy, and what they are made from
 CANDIDATES_PER_START, POSES_PER_START = 2, 12
 
@@ -121,15 +121,18 @@ def best_poses_wide(
     """
     area = wider_cells(WIDE_RINGS)[1]
     panorama = turned(*widened(samples, validity, workers), area, 255)
-    num_views, found = views_at_once(len(samples)), []
-    for lo in range(0, max(len(scan_map.sparse), 1), num_views):
+    num_views, least = views_at_once(len(samples)), LOWEST
+    sparse, rotation, scores = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32)
+    for lo in range(0, len(scan_map.sparse), num_views):
         part = slice(lo, lo + num_views)
         views = scan_map.wide_features[part], scan_map.wide_seen[part]
-        sparse, rotation, scores = best_poses(masked_correlation(*views, area, panorama, workers), pool)
-        found.append((sparse + lo, rotation, scores))
-    sparse, rotation, scores = (np.concatenate(values) for values in zip(*found, strict=True))
-    best = np.lexsort((rotation, sparse, -scores))[:pool]
-    return sparse[best], rotation[best], scores[best]
+        row, turn, values = best_poses(masked_correlation(*views, area, panorama, workers), pool, least)
+        sparse, rotation = np.concatenate([sparse, row + lo]), np.concatenate([rotation, turn])
+        scores = np.concatenate([scores, values])
+        best = np.lexsort((rotation, sparse, -scores))[:pool]
+        sparse, rotation, scores = sparse[best], rotation[best], scores[best]
+        least = scores[-1] if len(best) == pool else LOWEST
+    return sparse, rotation, scores
 
 
 def views_at_once(num_rotations: int) -> int:
@@ -169,21 +172,31 @@ def count_above(flat, threshold, indices):
     return count
 
 
-def best_poses(scores: Samples, pool: int) -> tuple[NDArray[np.int64], NDArray[np.int64], Samples]:
-    """Candidates, rotations and scores of the best `pool` poses, best first."""
+def best_poses(
+    scores: Samples, pool: int, least: np.float32 = LOWEST
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Samples]:
+    """Candidates, rotations and scores of the best `pool` poses that have more than `least`, best first."""
     flat = scores.ravel()
     pool = min(pool, flat.size)
-    step = max(flat.size // 100_000, 1)
-    sample = flat[::step]
-    # A threshold from a sample that lets about twice the pool through; a smaller share if it was unlucky.
-    indices = np.empty(min(8 * pool, flat.size), np.int64)
-    rank = len(sample) - 1 - int(min(2 * pool / step + 20, len(sample) - 1))
-    threshold = np.partition(sample, rank)[rank] if rank > 0 else -np.inf
-    top = indices[: min(count_above(flat, threshold, indices), len(indices))]
-    if len(top) == 0:  # all fit alike: a scan of one colour
-        top = np.flatnonzero(flat == threshold)
+    top = np.empty(min(8 * pool, flat.size), np.int64)
+    count = count_above(flat, least, top) if least > LOWEST else flat.size
+    if least > LOWEST and count <= len(top):
+        top = top[:count]
+    else:
+        threshold = max(likely_threshold(flat, pool), least)
+        top = top[: min(count_above(flat, threshold, top), len(top))]
+        if len(top) == 0 and threshold > least:  # all fit alike: a scan of one colour
+            top = np.flatnonzero(flat == threshold)
     top = top[np.lexsort((top, -flat[top]))][:pool]
     return *np.divmod(top, scores.shape[1]), flat[top]
+
+
+def likely_threshold(flat: Samples, pool: int) -> np.float32:
+    """A value of a sample that lets about twice the pool through; a smaller share if it was unlucky."""
+    step = max(flat.size // 100_000, 1)
+    sample = flat[::step]
+    rank = len(sample) - 1 - int(min(2 * pool / step + 20, len(sample) - 1))
+    return np.float32(np.partition(sample, rank)[rank]) if rank > 0 else LOWEST
 
 
 def search_poses(query: Query, gravity: Gravity) -> Starts:
