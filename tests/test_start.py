@@ -1,6 +1,7 @@
 """Where a command begins and how it ends: signals, streams, locale and memory, in processes of their own."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -34,6 +35,35 @@ def _shell(redirection, *words):
     line = ["sh", "-c", f'"$@" {redirection}', "sh", *words]
     done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=300)
     return done.returncode, done.stdout, done.stderr
+
+
+COUNT_ARENAS = """
+import ctypes, sys, threading
+from piccolo.cli import start
+start.share_arenas()
+barrier = threading.Barrier(6)
+def allocate():
+    barrier.wait()
+    kept = [bytes(1000) for _ in range(1000)]
+    barrier.wait()
+threads = [threading.Thread(target=allocate) for _ in range(6)]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+libc = ctypes.CDLL(None)
+libc.fopen.restype = ctypes.c_void_p
+file = ctypes.c_void_p(libc.fopen(sys.argv[1].encode(), b"w"))
+libc.malloc_info(0, file)
+libc.fclose(file)
+"""
+
+
+@pytest.mark.parametrize(("told", "least", "most"), [(None, 2, 2), ("8", 3, 8)])
+def test_threads_share_two_arenas_unless_the_environment_says_more(tmp_path, told, least, most):
+    environment = {k: v for k, v in os.environ.items() if k != "MALLOC_ARENA_MAX"}
+    environment |= {} if told is None else {"MALLOC_ARENA_MAX": told}
+    command = [sys.executable, "-c", COUNT_ARENAS, tmp_path / "info.xml"]
+    subprocess.run(command, check=True, env=environment, cwd=ROOT, timeout=60)
+    assert least <= (tmp_path / "info.xml").read_text().count("<heap nr") <= most
 
 
 def test_console_commands_begin_before_their_libraries():

@@ -3,6 +3,7 @@
 `piccolo.cli.start.NAME` is a function without arguments that runs the command NAME, for console commands.
 """
 
+import ctypes
 import os
 import resource
 import signal
@@ -14,6 +15,7 @@ from types import FrameType
 
 # [byte] below it LLVM and OpenBLAS crash or wait for ever, where NumPy raises; each core has a thread
 LEAST_ADDRESS_SPACE = 1_000_000_000 + 250_000_000 * (os.cpu_count() or 1)
+M_ARENA_MAX, MOST_ARENAS = -8, 2  # of mallopt(3): what threads allocate from, each keeping what it has freed
 EXIT_CANNOT_START, EXIT_INTERRUPTED, EXIT_TERMINATED = 3, 130, 143
 
 
@@ -27,6 +29,7 @@ def __getattr__(name: str) -> Callable[[], int]:
 def run(name: str) -> int:
     """Import the command `name` of piccolo.cli and run it; returns its exit code."""
     open_closed_streams()
+    share_arenas()
     space, _ = resource.getrlimit(resource.RLIMIT_AS)
     if 0 <= space < LEAST_ADDRESS_SPACE:
         print_line(
@@ -67,6 +70,16 @@ def open_closed_streams() -> None:
         else:
             if name != "stdin":
                 getattr(sys, name).reconfigure(errors="backslashreplace")
+
+
+def share_arenas() -> None:
+    """Let all threads share two of glibc's arenas: a process of four keeps some 50 MB less.
+
+    As MALLOC_ARENA_MAX in the environment does, which is left to what it says. Other C libraries have none.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None and "MALLOC_ARENA_MAX" not in os.environ:
+        mallopt(M_ARENA_MAX, MOST_ARENAS)
 
 
 def print_line(text: str) -> None:
