@@ -82,7 +82,7 @@ def local_statistics(moments, view, weights, stats):
     Taken at the wider cells that hold the moments, and interpolated between these.
     """
     row, neighbor, weight = view.neighbor_row, view.neighbor_cell, view.neighbor_weight
-    coarse = np.empty((view.num_stats, 8), np.float32)
+    coarse, around = np.zeros((view.num_stats, 8), np.float32), np.empty(8, np.float32)
     for c in range(view.num_stats):
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = F0
         for j in range(row[c], row[c + 1]):
@@ -105,5 +105,7 @@ def local_statistics(moments, view, weights, stats):
         if weights[c] > F0:
             near, w = view.near_stats[c], view.near_weight[c]
             a, b, d, e = coarse[near[0]], coarse[near[1]], coarse[near[2]], coarse[near[3]]
+            for k in range(8):  # two of them 0, as above; and stored apart, or each is read for itself
+                around[k] = w[0] * a[k] + w[1] * b[k] + w[2] * d[k] + w[3] * e[k]
             for k in range(6):
-                stats[k, c] = w[0] * a[k] + w[1] * b[k] + w[2] * d[k] + w[3] * e[k]
+                stats[k, c] = around[k]
