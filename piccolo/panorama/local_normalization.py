@@ -105,7 +105,7 @@ def interpolation_along(num, num_wider):
 def as_texel_channel(value, mean, gain, shift):
     """A channel's bits of a texel: its normalised value in levels."""
     level = np.int32(zscore(value, mean, gain) * np.float32(LEVELS_PER_UNIT) + np.float32(ZERO_LEVEL + 0.5))
-    return min(level, np.int32(255)) << np.int32(shift)
+    return np.int32(min(level, np.int32(255)) << np.int32(shift))
 
 
 @kernel
@@ -119,6 +119,7 @@ def pack_normalized(channels, weight, stats, texels):
     num_rows, num_columns = stats.shape[0], stats.shape[1]
     left, right, fraction = interpolation_along(width, num_columns)
     wide, along = np.empty((6, num_columns), np.float32), np.empty((6, width), np.float32)
+    planes = np.empty((3, width), np.float32)  # of a row's channels: what follows is vectorised then
     per = np.float32(num_columns) / np.float32(width)
     for i in range(height):
         v = min(max((np.float32(i) + HALF) * per - HALF, F0), np.float32(num_rows - 1))
@@ -131,11 +132,14 @@ def pack_normalized(channels, weight, stats, texels):
             for j in range(width):
                 at = wide[c, left[j]]
                 along[c, j] = at + fraction[j] * (wide[c, right[j]] - at)
+        for j in range(width):
+            for c in range(3):
+                planes[c, j] = channels[i, j, c]
         row = texels[i + 1, 1 : width + 1]
         for j in range(width):
-            texel = as_texel_channel(channels[i, j, 0], along[0, j], along[3, j], 0)
-            texel |= as_texel_channel(channels[i, j, 1], along[1, j], along[4, j], 8)
-            texel |= as_texel_channel(channels[i, j, 2], along[2, j], along[5, j], 16)
+            texel = as_texel_channel(planes[0, j], along[0, j], along[3, j], 0)
+            texel |= as_texel_channel(planes[1, j], along[1, j], along[4, j], 8)
+            texel |= as_texel_channel(planes[2, j], along[2, j], along[5, j], 16)
             row[j] = texel | (np.int32(1 << 24) if weight[i, j] > HALF else np.int32(0))
         texels[i + 1, 0], texels[i + 1, width + 1] = texels[i + 1, width], texels[i + 1, 1]
     texels[0], texels[height + 1] = texels[1], texels[height]
