@@ -1,7 +1,5 @@
 """The points that a camera sees around it, as fine as it can tell them apart: for the last millimetres."""
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +13,7 @@ from .view import Cells, Center, ViewConfig, average_nodes, describe_cells, empt
 VISIBLE_OFFSET = np.float32(0.1)  # [m] of range noise
 U15, U16, LOW_32 = np.uint64(15), np.uint64(16), np.uint64(0xFFFFFFFF)
 MIX_1, MIX_2 = np.uint64(0x7FEB352D), np.uint64(0x846CA68B)
+OPAQUE = np.int32(1 << 24)  # the fourth of a packed point's bytes
 FILLED = 0.97  # of the room for points; the rest is for chance
 
 
@@ -108,16 +107,19 @@ def visible_points(
     return Cells(offsets, channels, weights, center)
 
 
+@inline_kernel
+def in_8_bits(color, shift):
+    """A colour in [0, 1], rounded, at its place among 32 bits."""
+    return np.int32(np.int32(color * np.float32(255.0) + HALF) << np.int32(shift))
+
+
 @kernel
 def pack_nodes(nodes, found, x, y, z, rgbx):
     """Write the positions of some nodes and their colours in 8 bits."""
     for i in range(len(found)):
         node = nodes[found[i]]
         x[i], y[i], z[i] = node[0], node[1], node[2]
-        color = np.int32(1 << 24)
-        for k in range(3):
-            color |= np.int32(math.floor(node[3 + k] * np.float32(255.0) + HALF)) << np.int32(8 * k)
-        rgbx[i] = color
+        rgbx[i] = np.int32(in_8_bits(node[3], 0) | in_8_bits(node[4], 8) | in_8_bits(node[5], 16) | OPAQUE)
 
 
 def points_around(octree: Octree, center_map: NDArray[np.float64], voxel_per_range: float) -> PackedPoints:

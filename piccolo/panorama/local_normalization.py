@@ -132,9 +132,7 @@ def pack_normalized(channels, weight, stats, texels):
             for j in range(width):
                 at = wide[c, left[j]]
                 along[c, j] = at + fraction[j] * (wide[c, right[j]] - at)
-        for j in range(width):
-            for c in range(3):
-                planes[c, j] = channels[i, j, c]
+        planes[:] = channels[i].T
         row = texels[i + 1, 1 : width + 1]
         for j in range(width):
             texel = as_texel_channel(planes[0, j], along[0, j], along[3, j], 0)
