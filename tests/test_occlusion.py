@@ -8,10 +8,13 @@ import rooms
 from piccolo.confidence.occlusion import (
     CONTRADICTED,
     EXPLAINED,
+    FLAT_VARIANCE,
     LEAST_COVERED,
+    MOST_DIFFERENCE,
     NOT_SCANNED,
     occlusion_at,
     occlusion_mask,
+    write_squares,
 )
 from piccolo.geometry.pose import Pose, exp_so3, step
 from piccolo.geometry.sphere import pixel_rays, solid_angles
@@ -125,3 +128,22 @@ def test_nothing_in_common_is_neither_explained_nor_contradicted():
     nothing = occlusion_at(points, Panorama(panorama.rgb, np.zeros(panorama.rgb.shape[:2], bool)), pose)
     assert nothing.fractions() == (0.0, 0.0)
     assert not (nothing.coverage > LEAST_COVERED).any()
+
+
+def test_squared_differences_are_as_their_formula_says():
+    """Beyond a range in the photo's contrast, less where the photo or the scan is flat; nothing is unseen."""
+    rng, shape = np.random.default_rng(0), (20, 30, 3)
+    channels, means = rng.random(shape), rng.random((2, *shape))
+    per_deviation = 1.0 / rng.uniform(0.01, 0.5, (2, *shape))
+    low, high = np.sort(rng.normal(0.0, 1.0, (2, *shape)), axis=0)
+    low[:, :5], high[:, :5] = 9.0, -9.0  # as where nothing of the scan is seen
+    value = (channels - means[0]) * per_deviation[0]
+    outside = np.maximum(np.maximum(low - value, value - high), 0.0)
+    variance = 1.0 / per_deviation.min(axis=0) ** 2
+    outside *= np.sqrt(variance / (variance + FLAT_VARIANCE))
+    expected = (np.minimum(outside, MOST_DIFFERENCE) ** 2).sum(axis=2)
+    statistics = (np.concatenate([m, d], axis=2) for m, d in zip(means, per_deviation, strict=True))
+    squares = np.empty(shape[:2], np.float32)
+    write_squares(*(a.astype(np.float32) for a in (channels, *statistics, low, high)), squares)
+    np.testing.assert_allclose(squares, expected, rtol=1e-4, atol=1e-4)
+    assert 0.0 < np.median(squares) < 3.0 * MOST_DIFFERENCE**2

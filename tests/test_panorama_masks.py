@@ -158,10 +158,12 @@ def test_two_fisheyes_are_refused(tmp_path, radius, floor):
         read(tmp_path / "a.insp", fisheyes(radius, floor))
 
 
-def test_a_picture_with_a_bright_first_row_shows_no_two_fisheyes():
+def test_a_bright_upper_edge_shows_no_two_fisheyes_but_one_bad_row_does_not_hide_them():
     picture = np.asarray(fisheyes(), np.uint8)
     assert is_dual_fisheye(picture)
     picture[0] = 60
+    assert is_dual_fisheye(picture)
+    picture[: HEIGHT // 128] = 60
     assert not is_dual_fisheye(picture)
 
 

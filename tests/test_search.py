@@ -196,6 +196,16 @@ def test_best_poses_are_the_largest_in_order():
     np.testing.assert_array_equal(scores[candidate, rotation], values)
 
 
+@pytest.mark.parametrize("least", [search.LOWEST, np.float32(0.5)])
+def test_of_poses_that_fit_alike_the_first_are_taken(least):
+    scores = np.ones((100, 100), np.float32)
+    scores[90, 7], scores[95, 3] = 5.0, 6.0
+    candidate, rotation, values = search.best_poses(scores, 10, least)
+    np.testing.assert_array_equal(values, [6.0, 5.0] + [1.0] * 8)
+    np.testing.assert_array_equal(candidate, [95, 90] + [0] * 8)
+    np.testing.assert_array_equal(rotation, [3, 7, *range(8)])
+
+
 @pytest.mark.parametrize(("rank", "count"), [(60, 60), (100, 100), (3000, 100), (0, 0)])
 def test_best_poses_have_more_than_the_least(rank, count):
     """As many as there are, however many more have it than fit at first."""

@@ -66,6 +66,25 @@ def test_of_a_faint_pose_no_alternative_is_refined_unless_it_gains(
     assert len(refined) == num_refined
 
 
+def test_a_faint_pose_beside_one_with_matches_is_refined_with_it(monkeypatch):
+    """What a third of its score hides: twenty matches, and more once it is refined."""
+    query = compared(monkeypatch, {0.0: 0.09, 3.0: 0.06, 3.01: 0.36}, {0.0: 0, 3.0: 20, 3.01: 22})
+    ends = {0.0: at(0.0, 0.09), 3.0: at(3.01, 0.36)}
+    end = lambda query, h, num_rounds: ends[h.pose.center_world[0]]  # noqa: E731
+    monkeypatch.setattr(method, "refine_full_resolution", end)
+    monkeypatch.setattr(method, "settle", lambda query, h: h)
+    assert places([method.finished(query, [at(0.0, 0.09), at(3.0, 0.06)]).best]) == [3.01]
+
+
+def test_a_faint_pose_that_moves_to_an_alternative_is_not_its_own(monkeypatch):
+    query = compared(
+        monkeypatch, dict.fromkeys((3.01, 3.0, 6.0), 0.09), dict.fromkeys((0.0, 3.01, 3.0, 6.0), 0)
+    )
+    monkeypatch.setattr(method, "refine_unoccluded", lambda query, h: (query, at(3.01, 0.09)))
+    found = method.finished(query, [at(0.0, 0.09), at(3.0, 0.08), at(6.0, 0.05)])
+    assert places([found.best, *found.alternatives]) == [3.01, 6.0]
+
+
 @pytest.mark.parametrize(
     ("best", "num_matches", "done"),
     [

@@ -39,8 +39,8 @@ def _shell(redirection, *words):
 
 COUNT_ARENAS = """
 import ctypes, sys, threading
-from piccolo.cli import start
-start.share_arenas()
+from piccolo.runtime.arenas import share_arenas
+share_arenas()
 barrier = threading.Barrier(6)
 def allocate():
     barrier.wait()
@@ -57,10 +57,13 @@ libc.fclose(file)
 """
 
 
-@pytest.mark.parametrize(("told", "least", "most"), [(None, 2, 2), ("8", 3, 8)])
+@pytest.mark.parametrize(
+    ("told", "least", "most"),
+    [({}, 2, 2), ({"MALLOC_ARENA_MAX": "8"}, 3, 8), ({"GLIBC_TUNABLES": "glibc.malloc.arena_max=6"}, 3, 6)],
+)
 def test_threads_share_two_arenas_unless_the_environment_says_more(tmp_path, told, least, most):
-    environment = {k: v for k, v in os.environ.items() if k != "MALLOC_ARENA_MAX"}
-    environment |= {} if told is None else {"MALLOC_ARENA_MAX": told}
+    of_malloc = ("MALLOC_ARENA_MAX", "GLIBC_TUNABLES")
+    environment = {k: v for k, v in os.environ.items() if k not in of_malloc} | told
     command = [sys.executable, "-c", COUNT_ARENAS, tmp_path / "info.xml"]
     subprocess.run(command, check=True, env=environment, cwd=ROOT, timeout=60)
     assert least <= (tmp_path / "info.xml").read_text().count("<heap nr") <= most

@@ -3,7 +3,6 @@
 `piccolo.cli.start.NAME` is a function without arguments that runs the command NAME, for console commands.
 """
 
-import ctypes
 import os
 import resource
 import signal
@@ -13,9 +12,10 @@ from functools import partial
 from importlib import import_module
 from types import FrameType
 
+from ..runtime.arenas import share_arenas
+
 # [byte] below it LLVM and OpenBLAS crash or wait for ever, where NumPy raises; each core has a thread
 LEAST_ADDRESS_SPACE = 1_000_000_000 + 250_000_000 * (os.cpu_count() or 1)
-M_ARENA_MAX, MOST_ARENAS = -8, 2  # of mallopt(3): what threads allocate from, each keeping what it has freed
 EXIT_CANNOT_START, EXIT_INTERRUPTED, EXIT_TERMINATED = 3, 130, 143
 
 
@@ -70,16 +70,6 @@ def open_closed_streams() -> None:
         else:
             if name != "stdin":
                 getattr(sys, name).reconfigure(errors="backslashreplace")
-
-
-def share_arenas() -> None:
-    """Let all threads share two of glibc's arenas: a process of four keeps some 50 MB less.
-
-    As MALLOC_ARENA_MAX in the environment does, which is left to what it says. Other C libraries have none.
-    """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is not None and "MALLOC_ARENA_MAX" not in os.environ:
-        mallopt(M_ARENA_MAX, MOST_ARENAS)
 
 
 def print_line(text: str) -> None:

@@ -132,7 +132,7 @@ def matched_poses(query: Query) -> list[Pose]:
 def finished(query: Query, hypotheses: Sequence[Hypothesis]) -> SearchResult:
     """The best of some hypotheses, and the best elsewhere, those near it refined to the same end.
 
-    A faint one is refined on fine cells by itself first: if it stays faint, no more is asked of the photo.
+    Where all are faint, the best is refined on fine cells by itself first: if it stays so, no more is asked.
     """
 
     def refined(h: Hypothesis) -> Hypothesis:
@@ -141,15 +141,17 @@ def finished(query: Query, hypotheses: Sequence[Hypothesis]) -> SearchResult:
     def matches_of(h: Hypothesis) -> int:
         return count_matches(query.matches, h.pose)
 
-    def is_faint(h: Hypothesis) -> bool:
-        return h.score < FAINT_SCORE and matches_of(h) < FAINT_MATCHES
+    def is_faint(found: SearchResult) -> bool:
+        some = found.best, *found.alternatives
+        return all(h.score < FAINT_SCORE and matches_of(h) < FAINT_MATCHES for h in some)
 
     found = found_among(hypotheses, ALTERNATIVES_COMPARED)
     if found.best.score < HOPELESS_SCORE:
         return found
-    if is_faint(found.best):
-        found = fairly_selected(query, replace(found, best=refine_unoccluded(query, found.best)[1]))
-        if is_faint(found.best):
+    if is_faint(found):
+        best = refine_unoccluded(query, found.best)[1]
+        found = fairly_selected(query, found_among([best, *found.alternatives], ALTERNATIVES_COMPARED))
+        if is_faint(found):
             return found
     least = max(NEAR_MATCHES * matches_of(found.best), SURE_MATCHES)
     is_near = [h.score > NEAR_RATIO * found.best.score or matches_of(h) >= least for h in found.alternatives]

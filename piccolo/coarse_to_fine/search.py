@@ -179,14 +179,17 @@ def best_poses(
     flat = scores.ravel()
     pool = min(pool, flat.size)
     top = np.empty(min(8 * pool, flat.size), np.int64)
-    count = count_above(flat, least, top) if least > LOWEST else flat.size
-    if least > LOWEST and count <= len(top):
-        top = top[:count]
-    else:
+    count = count_above(flat, least, top) if least > LOWEST else flat.size + 1
+    if count > len(top):
         threshold = max(likely_threshold(flat, pool), least)
-        top = top[: min(count_above(flat, threshold, top), len(top))]
-        if len(top) == 0 and threshold > least:  # all fit alike: a scan of one colour
-            top = np.flatnonzero(flat == threshold)
+        count = count_above(flat, threshold, top)
+        if count > len(top):
+            top = np.empty(count, np.int64)
+            count_above(flat, threshold, top)
+        if count < pool and threshold > least:  # many fit alike: a scan of one colour
+            alike = np.flatnonzero(flat == threshold)[: pool - count]
+            top, count = np.concatenate([top[:count], alike]), count + len(alike)
+    top = top[:count]
     top = top[np.lexsort((top, -flat[top]))][:pool]
     return *np.divmod(top, scores.shape[1]), flat[top]
 

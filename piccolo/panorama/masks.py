@@ -167,7 +167,8 @@ def is_dual_fisheye(rgb: NDArray[np.uint8]) -> bool:
     A panorama with black poles is black within the circles' upper and lower parts too; a dark one is dark all
     around. Circles down to 0.9 of the halves' height are found.
     """
-    if np.median(rgb[0]) >= 2 * FISHEYE_BLACK:  # three quarters of the first row are outside
+    upper = rgb[: max(len(rgb) // FISHEYE_SIZE, 1)]  # of which three quarters are outside
+    if np.median(upper) >= 2 * FISHEYE_BLACK:
         return False
     small = cv2.resize(rgb, (2 * FISHEYE_SIZE, FISHEYE_SIZE), interpolation=cv2.INTER_AREA).max(axis=2)
     v, u = np.mgrid[:FISHEYE_SIZE, :FISHEYE_SIZE] + 0.5 - FISHEYE_SIZE / 2

@@ -19,6 +19,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any, NamedTuple
 
 from ..errors import InputError
+from .arenas import share_arenas
 from .tasks import Function, InFlight, Opening, WorkerLostError
 
 ATTEMPTS = 2  # to work on an item, or to open
@@ -150,6 +151,7 @@ def library_threads(count: int) -> Iterator[None]:
 def _work(opening: Opening, connection: Connection) -> None:
     """What a process does: open, say so, then a value or an error for each item, until the pipe is closed."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    share_arenas()
     with suppress(EOFError, OSError):  # the pipe is closed
         try:
             function = opening()
