@@ -63,7 +63,10 @@ def descend_perturbed(
     R, t = R_cam_from_map, center
     for k in range(len(steps)):
         retract(R[k].copy(), t[k].copy(), steps[k], R[k], t[k])
-        for image in range(0 if np.any(steps[k] != 0.0) else 1, 2):
+        first = 1
+        for i in range(6):
+            first = 0 if steps[k, i] != 0.0 else first
+        for image in range(first, 2):
             texels, width, num_iterations = narrow[0], narrow[1], NARROW_ITERATIONS
             if image == 0:
                 texels, width, num_iterations = wide[0], wide[1], WIDE_ITERATIONS
