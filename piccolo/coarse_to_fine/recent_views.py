@@ -12,7 +12,7 @@ from .points_around import points_around, visible_points
 from .view import Array32, Cells, ViewConfig, average_view
 
 SPACING = 0.01  # [m] between places
-NUM_VIEWS, NUM_POINT_SETS, NUM_SURROUNDINGS = 32, 8, 2  # are kept: 12, 7 and 8 MB
+NUM_VIEWS, NUM_POINT_SETS, NUM_SURROUNDINGS = 32, 8, 2  # are kept: 12, 7 and 11 MB
 Place = tuple[float, float, float]  # [m] in the map
 
 

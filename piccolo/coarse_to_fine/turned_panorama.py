@@ -88,12 +88,11 @@ def widen(samples, validity, cells, cell_areas, areas, wide_samples, wide_validi
 def widened(samples: Samples, validity: Samples, workers: Workers) -> tuple[Samples, Samples]:
     """Averages (rotations, 3, wide cells) [levels] of channels of the search grid, and of validity."""
     cells, areas = wider_cells(WIDE_RINGS)
-    shape = len(samples), len(areas)
+    how, shape = (cells, whole_areas(SEARCH_RINGS), areas), (len(samples), len(areas))
     wide, is_valid = np.empty((shape[0], 3, shape[1]), np.float32), np.empty(shape, np.float32)
 
     def average(lo: int) -> None:
         part = slice(lo, lo + ROTATIONS_AT_ONCE)
-        how = cells, whole_areas(SEARCH_RINGS), areas
         widen(samples[part], validity[part], *how, wide[part], is_valid[part])
 
     list(workers.map(average, range(0, len(samples), ROTATIONS_AT_ONCE), "search"))
