@@ -2,6 +2,7 @@
 
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ sys.path += [str(ROOT), str(ROOT / "tests")]
 from report_scenes import HOSTILE, House, mixed_house  # noqa: E402
 
 from piccolo.cli import localize, make_room, report  # noqa: E402
+from piccolo.result import Source  # noqa: E402
 
 ARTIFACTS = ROOT / "browser_tests" / "screenshots"
 FLAGS = ["--no-sandbox", "--enable-unsafe-swiftshader"]
@@ -88,6 +90,27 @@ def many(tmp_path_factory):
     words = ["--results", *map(str, results), "--cloud", str(house.cloud), "--out", str(folder / "report")]
     storeys = ["--storeys", "Ground floor", "First floor", "--title", "12 High Street", "--quiet"]
     assert report.main([*words, *storeys]) == 0
+    return folder / "report" / "index.html"
+
+
+@pytest.fixture(scope="session")
+def odd(tmp_path_factory):
+    """Photos with one name in two folders, three at one spot, guesses, and results of another scan."""
+    folder = tmp_path_factory.mktemp("odd")
+    house = House(folder, 128)
+    house.write_cloud()
+    for name in ("a/0.jpg", "b/0.jpg", "1.jpg"):
+        (folder / "photos" / name).parent.mkdir(parents=True, exist_ok=True)
+        house.add(0 if "/" in name else 2, name)
+    house.results += [replace(house.results[-1], pano=str(folder / "photos" / f"{k}.jpg")) for k in (2, 3)]
+    house.add(4, "guess.jpg", status="not_localized")
+    house.add(6, "hopeless.jpg", status="not_localized", confidence=0.003)
+    house.add(8, "gone.jpg", status="unreadable")
+    house.add(10, "=cmd|' !A1.jpg")
+    source = Source(cloud_sha256="0" * 64)
+    house.results = [replace(result, source=source) for result in house.results]
+    words = ["--results", str(house.write_results()), "--cloud", str(house.cloud), "--quiet", "--force"]
+    assert report.main([*words, "--out", str(folder / "report")]) == 0
     return folder / "report" / "index.html"
 
 

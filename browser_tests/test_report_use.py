@@ -1,5 +1,6 @@
 """The page of a report as people use it: with the mouse, fingers and keys."""
 
+import csv
 import json
 import re
 
@@ -9,6 +10,7 @@ import pytest
 
 from piccolo.result import read_results
 
+DOWNLOAD = "Download as a table (CSV)"
 # the names of all photos that the key n leads to
 STEPS = """() => {
   const names = [], name = document.getElementById('photo-name');
@@ -177,6 +179,47 @@ def test_filters_and_orders(many, open_page, shoot):
     assert page.locator(".empty").is_visible()
     page.click(".link")
     shoot(page, "many-plan")
+
+
+def test_guesses_stacks_folders_and_the_table(odd, open_page, shoot):
+    page = open_page(odd)
+    page.wait_for_timeout(400)
+    shoot(page, "odd-plan")
+    assert "another scan" in page.inner_text("#note")
+    names = page.locator(".row-name").all_inner_texts()
+    assert names[:3] == ["a/0.jpg", "b/0.jpg", "1"]
+    assert page.locator("#filters select").last.locator("option").all_inner_texts()[:2] == [
+        "As in the results",
+        "Name",
+    ]
+    with page.expect_download() as saved:
+        page.click(f'button[aria-label="{DOWNLOAD}"]')
+    with saved.value.path().open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert saved.value.suggested_filename == "house.csv"
+    assert [row["photo"] for row in rows][-1] == "'=cmd|' !A1.jpg"
+    assert float(rows[0]["x"]) == page.evaluate("PICCOLO_REPORT.photos[0].pose.world[0]")
+    page.click("#row-0")
+    page.wait_for_selector("#viewer[data-shown]")
+    assert page.locator(".viewer-bar").is_visible()
+    page.evaluate("location.hash = '#photo=gone.jpg'")
+    page.wait_for_selector(".viewer.no-picture")
+    assert not page.locator(".viewer-bar").is_visible()
+    page.evaluate("location.hash = '#photo=hopeless.jpg'")
+    page.wait_for_selector("text=Most likely not of this scan")
+
+
+def test_clicks_on_a_stack_go_through_it(odd, open_page):
+    page = open_page(odd, "#photo=1.jpg", width=1800)
+    page.wait_for_selector("#viewer[data-shown]")
+    page.click("#swap")
+    page.wait_for_timeout(300)
+    page.click("#zooms button:nth-child(3)")
+    opened = []
+    for _ in range(3):
+        page.mouse.click(*_mark(page, "1.jpg"))
+        opened.append(page.inner_text("#photo-name"))
+    assert opened == ["2", "3", "1"]
 
 
 def test_links_lead_to_photos_views_and_alternatives(many, open_page, shoot):

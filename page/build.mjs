@@ -4,8 +4,6 @@ import { readFileSync, writeFileSync } from "node:fs";
 import { fileURLToPath } from "node:url";
 
 const out = new URL("../piccolo/report/page/", import.meta.url);
-const version = JSON.parse(readFileSync(new URL("node_modules/three/package.json", import.meta.url))).version;
-const license = readFileSync(new URL("node_modules/three/LICENSE", import.meta.url), "utf8").trim();
 
 const made = await build({
   absWorkingDir: fileURLToPath(new URL(".", import.meta.url)),
@@ -16,7 +14,7 @@ const made = await build({
   target: ["chrome100", "firefox100", "safari15.4"],
   charset: "ascii",
   legalComments: "none",
-  banner: { js: "/* PICCOLO report page, GPL-3.0-or-later; with three.js, MIT: see LICENSES.txt */" },
+  banner: { js: "/* PICCOLO report page, GPL-3.0-or-later */" },
   outdir: "out",
   write: false,
 });
@@ -24,15 +22,6 @@ const files = {
   "app.js": made.outputFiles.find((file) => file.path.endsWith("app.js")).text,
   "app.css": made.outputFiles.find((file) => file.path.endsWith("style.css")).text,
   "index.html": readFileSync(new URL("src/index.html", import.meta.url), "utf8"),
-  "LICENSES.txt": [
-    "app.js is made from page/src of the PICCOLO checkout (GPL-3.0-or-later), by `npm ci && npm run build` in page/.",
-    "It holds the following package from https://www.npmjs.com, changed only by leaving out what is not used:",
-    "",
-    `three ${version} (MIT)`,
-    "",
-    license,
-    "",
-  ].join("\n"),
 };
 
 let differs = false;

@@ -1,12 +1,48 @@
-"""The one exception that bad input raises."""
+"""The exceptions of bad input and of a system that gave way, in words for a person."""
 
+import errno
+import re
 from pathlib import Path
+
+# of the system's errors those of the path itself, which come again however often it is tried
+LASTING = {
+    *(errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.EPERM),
+    *(errno.ELOOP, errno.ENAMETOOLONG, errno.EINVAL, errno.ENXIO, errno.ENODEV),
+}
+# control characters, line ends, halves of characters
+UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
 class InputError(ValueError):
     """Bad input: one line that names the file or option, says what is wrong and what to do."""
 
 
-def unreadable(path: Path, error: OSError) -> InputError:
-    """The InputError for a file that the system refuses to read."""
-    return InputError(f"{path}: cannot be read ({error.strerror or error})")
+class ResourceError(InputError):
+    """Memory, a disk or a network gave way: the same input may do when it is tried again."""
+
+
+def unreadable(path: Path, error: OSError | ValueError) -> InputError:
+    """The error for a file that the system refuses to read; a ValueError is of its name."""
+    kind = ResourceError if isinstance(error, OSError) and is_passing(error) else InputError
+    return kind(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})")
+
+
+def is_passing(error: Exception) -> bool:
+    """True for an error that may not come again when the same is tried again."""
+    if isinstance(error, OSError):
+        return error.errno not in LASTING
+    return isinstance(error, ResourceError) or not isinstance(error, InputError)
+
+
+def text_of(error: OSError | InputError) -> str:
+    """An error in one line: of the system's, the file and what went wrong."""
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return f"{error.filename}: cannot be used ({error.strerror})"
+    if isinstance(error, OSError) and error.strerror:  # of a stream or pipe, which have no name
+        return f"writing or reading failed ({error.strerror})"
+    return str(error)
+
+
+def printable(text: str) -> str:
+    """A text on one line: control characters and bytes of names that are no text are escaped."""
+    return UNPRINTABLE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)

@@ -30,7 +30,7 @@ class ScanOptions(TypedDict, total=False):
     """How `open_scan` understands and prepares a scan; all may be left out."""
 
     units: Literal["mm", "cm", "m", "ft", "us-ft"]  # of the coordinates; metres if not given
-    up: UpAxis  # the axis that points up; "auto" (default): z, or what the cloud's own planes say
+    up: UpAxis  # the axis that points up; "auto" (default): the file's, z or in glTF y
     intensity_as_gray: bool  # for files without colours
     crs: str  # coordinate system, such as EPSG:25832, for photos with GPS; else what the file names
     cache: bool | File  # keep the prepared map in the user's cache (default), nowhere, or in a folder
@@ -107,8 +107,7 @@ def open_files(
     watch = Stopwatch()
     name = str(paths[0]) if len(paths) == 1 else tuple(map(str, paths))
     if isinstance(settings, CoarseToFineSettings):
-        up = cloud_settings.up if prepared_map_among(paths) else up_axis(cloud_settings, settings)
-        scan_map = open_map(paths, replace(cloud_settings, up=up), cache, workers, watch, settings.prior)
+        scan_map = open_map(paths, cloud_settings, cache, workers, watch, settings.prior)
         check_within(scan_map, settings.prior.within)
         return Scan(scan_map, name, cloud_settings, settings, workers, watch.seconds)
     if map_path := prepared_map_among(paths):
@@ -130,8 +129,8 @@ def scan_of(
     """A scan prepared anew for the method of the settings."""
     prepared: ScanMap | PaperMap
     if isinstance(settings, CoarseToFineSettings):
-        up = up_axis(cloud_settings, settings)
-        prepared = prepare_map(cloud, workers, up, watch, prior=settings.prior, has_features=False)
+        how = cloud_settings.up, watch
+        prepared = prepare_map(cloud, workers, *how, prior=settings.prior, has_features=False)
     else:
         with watch.stage("read"):
             points = cloud.read()
@@ -141,9 +140,3 @@ def scan_of(
             prepared = prepare_by_paper(points, settings)
     prepared = replace(prepared, scan_sha256=cloud.sha256)
     return Scan(prepared, name, cloud_settings, settings, workers, watch.seconds)
-
-
-def up_axis(cloud_settings: CloudSettings, settings: CoarseToFineSettings) -> UpAxis:
-    """The axis that points up: z where the user says that gravity is known; nothing then turns the scan."""
-    is_known = settings.gravity == "known" and cloud_settings.up == "auto"
-    return "z" if is_known else cloud_settings.up

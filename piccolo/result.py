@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,9 +17,9 @@ from .camera.files import mounts_of
 from .coarse_to_fine.gps import GpsPrior
 from .confidence.confidence import AMBIGUOUS, LOCALIZED
 from .confidence.covariance import PoseCovariance
-from .confidence.localization import Alternative, Localization
+from .confidence.localization import Alternative, FocalLength, Localization
 from .confidence.score import Evidence
-from .errors import InputError
+from .errors import UNPRINTABLE, InputError, is_passing, printable, text_of
 from .geometry.pose import Pose, checked_rotation
 from .geometry.sphere import CONVENTION
 from .result_parts import (
@@ -33,13 +33,13 @@ from .result_parts import (
     walk_json,
 )
 from .runtime.json_file import document_of, parse_lines, read_bytes
+from .runtime.memory import is_shortage
 from .walk.localize import WalkFrame
 
-FORMAT = "piccolo-pose/7"
-UNREADABLE = "unreadable"
+FORMAT = "piccolo-pose/8"
+UNREADABLE, FAILED = "unreadable", "failed"
 MAX_ROTATION_ERROR = 1e-6  # of R R^T from the identity, in a file
-# control characters, line ends, halves of characters
-UNWRITABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+NO_NAME = re.compile("[\ud800-\udc7f\udd00-\udfff]")  # what os.fsdecode never gives
 WANTED = "wanted JSON lines of localize.py"
 COVARIANCE_CONVENTION = (
     "of (w, d), rotation [rad] about the camera's axes, then translation [m] along the world's: "
@@ -61,7 +61,7 @@ class Source:
 class Result:
     """Where one panorama was taken, and what speaks for it."""
 
-    status: str  # "localized", "ambiguous", "not_localized" or "unreadable"
+    status: str  # "localized", "ambiguous", "not_localized", "unreadable" or "failed"
     confidence: float  # [0, 1] how likely the pose is right, see piccolo.confidence
     cloud: str | tuple[str, ...]  # path as given, or the paths of several files that are one cloud
     pano: str  # path as given
@@ -74,9 +74,10 @@ class Result:
     settings: dict[str, object]  # effective settings, seed included
     warnings: tuple[str, ...] = ()
     source: Source = Source()
-    error: str | None = None  # why a photo is "unreadable"
+    error: str | None = None  # why a photo is "unreadable" or has "failed"
     gps_prior: GpsPrior | None = None  # where the photo's GPS position lies in the scan, if both are known
     cameras: tuple[Mount, ...] = ()  # that took it; none if it came as a sphere or a part of one
+    focal_length: FocalLength | None = None  # of a photo whose focal length is not exact
     scan: str | None = None  # name of the scan in which the best pose lies, of a map that names its scans
     probability_none: float | None = None  # that neither the pose nor an alternative is right, if known
     storey: int | None = None  # in which the best pose lies, 1 the lowest; None where no floor was found
@@ -110,12 +111,12 @@ class Result:
         """Two lines for a person."""
         if self.best_pose is None:
             why = self.error or "no place for a camera, or nothing of the panorama counts"
-            return f"{self.pano}: {self.status}\n  {why}"
+            return f"{printable(self.pano)}: {self.status}\n  {printable(why)}"
         x, y, z = self.best_pose.center_world
         total = sum(self.seconds.values())
         where = "at" if self.pose else "with the best guess"
         place = f"({x:.3f}, {y:.3f}, {z:.3f}) m{_in(self.scan)}"
-        lines = [f"{self.pano}: {self.status} {where} {place} in {total:.1f} s"]
+        lines = [f"{printable(self.pano)}: {self.status} {where} {place} in {total:.1f} s"]
         if self.evidence is not None:
             e = self.evidence
             lines.append(
@@ -144,6 +145,7 @@ class Result:
             "cloud": self.cloud,
             "pano": self.pano,
             "camera": camera_document(self.cameras) if self.cameras else None,
+            "focal_length": self.focal_length and asdict(self.focal_length),
             **asdict(self.source),
             **(pose_json(self.pose) or dict.fromkeys(POSE_FIELDS)),
             "best_guess": pose_json(self.best_guess),
@@ -178,6 +180,7 @@ class Result:
                 best_pose=_best_pose_from_json(document),
                 source=_source_from_json(document),
                 cameras=mounts_of(document["camera"]) if document.get("camera") else (),
+                focal_length=document["focal_length"] and FocalLength(**document["focal_length"]),
                 gps_prior=gps_prior_from_json(document["gps_prior"]),
                 evidence=document["evidence"] and Evidence(**document["evidence"]),
                 alternatives=tuple(map(alternative_from_json, document["alternatives"])),
@@ -196,9 +199,28 @@ def result_of(found: Localization, warnings: tuple[str, ...] = (), **about: Any)
     return Result(best_pose=found.pose, warnings=warnings + found.warnings, **values, **about)
 
 
-def unreadable_result(error: str, cloud: str | tuple[str, ...], pano: str, **more: Any) -> Result:
-    """The result of a photo that can't be read; `more` as in Result."""
-    return Result(UNREADABLE, 0.0, cloud, pano, None, None, None, (), None, {}, error=error, **more)
+class Failure(NamedTuple):
+    """Why a photo has no result."""
+
+    text: str  # one line
+    is_passing: bool  # it may have one when it is tried again
+
+
+def failure_of(error: Exception) -> Failure:
+    """The failure of a photo; an error of none, but of the program, is raised."""
+    if isinstance(error, OSError | InputError):
+        return Failure(text_of(error), is_passing(error))
+    if is_shortage(error):
+        return Failure(f"not enough memory ({' '.join(str(error).split()) or 'none is left'})", True)
+    raise error
+
+
+def unreadable_result(
+    error: str, cloud: str | tuple[str, ...], pano: str, is_passing: bool = False, **more: Any
+) -> Result:
+    """The result of a photo that can't be read, or could not at the moment; `more` as in Result."""
+    status = FAILED if is_passing else UNREADABLE
+    return Result(status, 0.0, cloud, pano, None, None, None, (), None, {}, error=error, **more)
 
 
 def named(result: Result, path: Path, pano: Path) -> Result:
@@ -266,13 +288,27 @@ def read_results(paths: Sequence[Path]) -> list[Result]:
     return results
 
 
+def check_scan(results: Sequence[Result], cloud_sha256: str, scan: str, is_forced: bool) -> str:
+    """Words on the results of another scan than that of a digest, if any; without force an InputError."""
+    others = [r for r in results if r.source.cloud_sha256 not in (None, cloud_sha256)] if cloud_sha256 else []
+    if not others:
+        return ""
+    words = f"found {len(others)} of {len(results)} results of another scan than {scan}"
+    if not is_forced:
+        first = f"the first of {others[0].cloud_name}"
+        raise InputError(f"{others[0].pano}: {words}, {first}, wanted this scan, or force")
+    return words
+
+
 def _checked_result(text: str) -> Result:
     """A result of one line; refused are names and numbers that can't be written, and a pose that is none."""
     result = Result.from_json(text)
-    texts = {"status": result.status, "cloud": result.cloud_name, "pano": result.pano}
-    for label, value in {**texts, "scan": result.scan or ""}.items():
-        if not isinstance(value, str) or UNWRITABLE.search(value):
+    texts = {"status": result.status, "cloud": result.cloud_name, "scan": result.scan or ""}
+    for label, value in texts.items():
+        if not isinstance(value, str) or UNPRINTABLE.search(value):
             raise InputError(f"result: found {label} {value!r}, wanted text on one line")
+    if not isinstance(result.pano, str) or NO_NAME.search(result.pano):
+        raise InputError(f"result: found pano {result.pano!r}, wanted a file's name as os.fsdecode gives it")
     values = [result.confidence, *([result.evidence.score] if result.evidence else [])]
     if not all(isinstance(value, int | float) and math.isfinite(value) for value in values):
         raise InputError(f"result: found confidence and score {values}, wanted finite numbers")

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from .camera import Calibration
 from .cloud.settings import CloudSettings
 from .cloud.soa import PackedPoints
-from .coarse_to_fine.focal_refinement import localize_and_refine_focal
 from .coarse_to_fine.gps import GpsPrior, gps_prior
-from .coarse_to_fine.localize import localize
+from .coarse_to_fine.localize_guessed import localize_guessed
 from .coarse_to_fine.named_scans import check_within
 from .coarse_to_fine.places import with_places
 from .coarse_to_fine.scan_map import ScanMap
@@ -30,6 +29,7 @@ from .paper.localize import localize as localize_by_paper
 from .paper.settings import PaperSettings
 from .query_options import File, QueryOptions, Settings, asked_of
 from .result import Result, Source, result_of
+from .runtime.json_file import reading_once
 from .runtime.stopwatch import Stopwatch
 from .runtime.threads import Workers
 from .scan_walk import Walk, WalkAbout
@@ -70,8 +70,8 @@ class Scan:
         Parameters
         ----------
         panorama
-            Path of a picture (JPEG, PNG, TIFF, WebP) or of a folder of six cube faces; or an equirectangular
-            image (H, W, 3), W = 2 H, RGB in 8 bits.
+            Path of a picture (JPEG, PNG, TIFF, WebP, HEIC) or of a folder of six cube faces; or an
+            equirectangular image (H, W, 3), W = 2 H, RGB in 8 bits.
         **options
             See QueryOptions; what is not given is as in `settings`.
 
@@ -182,7 +182,7 @@ class Scan:
         repeated = settings_json(settings, self.cloud_settings, read_options)
         if calibration is not None and read_options.calibration is None:
             read_options = replace(read_options, calibration=calibration)
-        with watch.stage("read"):
+        with watch.stage("read"), reading_once():
             picture = read_query(panorama, read_options, is_masked)
             if isinstance(panorama, np.ndarray):
                 photo = photo_of_array(panorama)
@@ -191,9 +191,8 @@ class Scan:
         gps = None
         if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
             gps = self.gps_prior_of(photo, settings) if read_options.use_gps else None
-            by = localize_and_refine_focal if read_options.refine_focal else localize
             check_within(self.prepared, settings.prior.within)
-            found, gps = self._localized(by, self.prepared, picture, settings, gps, watch)
+            found, gps = self._localized(localize_guessed, self.prepared, picture, settings, gps, watch)
             found = with_places(self.prepared, found)
         elif isinstance(self.prepared, PaperMap) and isinstance(settings, PaperSettings):
             if read_options.refine_focal:

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from .coarse_to_fine.places import with_places
 from .coarse_to_fine.query import Query
 from .confidence.localization import Localization
-from .errors import InputError
 from .panorama import Panorama, ReadOptions, read_query
-from .panorama.photo import Photo, photo_of, photo_of_array
-from .result import Result, Source, result_of, unreadable_result
+from .panorama.photo import Photo, photo_of, photo_of_array, sha256_of
+from .result import Failure, Result, Source, failure_of, result_of, unreadable_result
+from .runtime.json_file import reading_once
 from .runtime.stopwatch import Stopwatch
 from .runtime.threads import Progress, no_progress
 from .walk.frames import Frame, checked_times
@@ -44,7 +44,8 @@ class Taken:
     photo: Photo | None  # None of one that can't be read
     seconds: dict[str, float]
     warnings: tuple[str, ...] = ()
-    error: str | None = None
+    sha256: str | None = None  # of a photo that can't be read
+    failure: Failure | None = None  # why it can't
 
 
 class Prepared(NamedTuple):
@@ -74,15 +75,18 @@ class Walk:
         """Read a frame, and make all of it that does not depend on the others; another thread may do it."""
         watch = Stopwatch()
         name = name or ("array" if isinstance(frame, np.ndarray) else str(frame))
-        try:
-            with watch.stage("read"):
-                panorama = read_query(frame, self.read_options)
-                photo = self._photo(frame)
-        except (OSError, InputError) as error:
-            if isinstance(frame, np.ndarray):
-                raise
-            text = str(error).replace(str(frame), name)
-            return Prepared(Taken(frame, name, None, watch.seconds, error=text), None, None)
+        with reading_once():
+            try:
+                with watch.stage("read"):
+                    panorama = replace(read_query(frame, self.read_options), focal_prior=None)  # as exact
+                    photo = self._photo(frame)
+            except Exception as error:
+                text, is_passing = failure_of(error)
+                if isinstance(frame, np.ndarray):
+                    raise
+                failure = Failure(text.replace(str(frame), name), is_passing)
+                digest = sha256_of(Path(frame), self.read_options.rig)
+                return Prepared(Taken(frame, name, None, watch.seconds, (), digest, failure), None, None)
         with watch.stage("prepare"):
             query = self.tracker.prepared(panorama)
         warnings = tuple(warning.replace(str(frame), name) for warning in panorama.warnings)
@@ -116,19 +120,24 @@ class Walk:
         alone = frame.alone and result_of(frame.alone, cloud="", pano="", seconds={}, settings={}).to_json()
         photo = taken.photo and (taken.photo.sha256, taken.photo.image_size, taken.photo.capture_time)
         about = {"pano": taken.name, "photo": photo, "seconds": taken.seconds, "warnings": taken.warnings}
-        return json.dumps({**about, "error": taken.error, "frame": frame.to_json(), "alone": alone})
+        failure = {"sha256": taken.sha256, "failure": taken.failure}
+        return json.dumps({**about, **failure, "frame": frame.to_json(), "alone": alone})
 
     def restore(self, line: str, picture: Path, time: float, name: str) -> bool:
         """Take the next frame from a line of `last_to_json`, if it is of this picture as it is now."""
         document = json.loads(line)
         if document["pano"] != name or document["frame"]["time"] != time:
             return False
-        if document["photo"] is None:  # it could not be read
-            taken = Taken(picture, name, None, document["seconds"], error=document["error"])
+        now = sha256_of(picture, self.read_options.rig)
+        if document["photo"] is None:
+            failure = Failure(*document["failure"])
+            if failure.is_passing or now != document["sha256"]:
+                return False
+            taken = Taken(picture, name, None, document["seconds"], (), now, failure)
             self.accept(taken, Frame.from_json(document["frame"], None))
             return True
         digest, size, capture_time = document["photo"]
-        if photo_of(picture, self.read_options.rig).sha256 != digest:
+        if now != digest:
             return False
         alone = document["alone"] and localization_in(Result.from_json(document["alone"]))
         photo = Photo(digest, (size[0], size[1]), capture_time, None)
@@ -154,9 +163,9 @@ class Walk:
 
     def _panorama(self, k: int) -> Panorama | None:
         taken = self.taken[k]
-        if taken.error is not None:
+        if taken.failure is not None:
             return None
-        return read_query(taken.picture, self.read_options)
+        return replace(read_query(taken.picture, self.read_options), focal_prior=None)
 
     def _photo(self, frame: Picture) -> Photo:
         if isinstance(frame, np.ndarray):
@@ -168,10 +177,9 @@ class Walk:
         about, photo = self.about, taken.photo
         digest = self.tracker.scan_map.scan_sha256 or None
         if photo is None:
-            source = Source(digest)
-            error = taken.error or ""
-            failed = unreadable_result(error, about.cloud, taken.name, settings=about.settings, source=source)
-            return replace(failed, walk=walk)
+            text, is_passing = taken.failure or ("", False)
+            more = {"settings": about.settings, "source": Source(digest, taken.sha256)}
+            return unreadable_result(text, about.cloud, taken.name, is_passing, walk=walk, **more)
         return result_of(
             found,
             cloud=about.cloud,

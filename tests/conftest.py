@@ -1,6 +1,7 @@
 """Every result that a test makes is checked by the schema that users have."""
 
 import json
+import signal
 from pathlib import Path
 
 import jsonschema
@@ -10,6 +11,9 @@ from piccolo.result import Result
 
 SCHEMA = json.loads((Path(__file__).resolve().parents[1] / "docs" / "result.schema.json").read_text())
 VALIDATOR = jsonschema.Draft202012Validator(SCHEMA)
+
+# A shell starts what runs in the background with Ctrl-C ignored, as then would be what a test starts.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(autouse=True, scope="session")

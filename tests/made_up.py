@@ -9,6 +9,7 @@ from piccolo.coarse_to_fine import standings
 from piccolo.coarse_to_fine.comparison import Comparison
 from piccolo.coarse_to_fine.config import METHOD
 from piccolo.coarse_to_fine.recent_views import RecentViews
+from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.optimize.channel_loss import CHANCE
@@ -16,7 +17,14 @@ from piccolo.runtime.threads import Workers
 
 OF_MAP = SimpleNamespace(octree=None)
 VIEWS = RecentViews(*[lambda *_: None] * 3)
-QUERY = SimpleNamespace(workers=Workers(1), method=METHOD, scan_map=OF_MAP, by_features=True, views=VIEWS)
+QUERY = SimpleNamespace(
+    workers=Workers(1),
+    method=METHOD,
+    scan_map=OF_MAP,
+    by_features=True,
+    views=VIEWS,
+    settings=CoarseToFineSettings(),
+)
 
 
 def at(x, score, yaw_deg=0.0):

@@ -8,20 +8,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pictures import encoded
 from plyfile import PlyData, PlyElement
 from poses import tilted_poses
+from rooms import query as photo_of
 from scans import bare_room, points_of, scan, write_scan
+from test_cloud_ptx import scan as ptx_lines
+from test_cloud_ptx import write as write_lines
 
 from piccolo.cli import align_gravity
 from piccolo.geometry.pose import exp_so3
-from piccolo.gravity import MIN_CONFIDENCE
-from piccolo.gravity.alignment import FORMAT, read_alignment
 from piccolo.scenes.scene import Query, read_scene, write_queries
 
 ROOT = Path(__file__).resolve().parents[1]
 TURN = np.array([1.4, 0.6, -0.3])
 UTM = np.array([691_234.0, 5_335_678.0, 512.0])
-ANGLE = 0.01
+FREE = "--assume-nothing"
 
 
 @pytest.fixture
@@ -47,7 +49,7 @@ def tilted(tmp_path):
 
 def test_the_cloud_and_the_transform_are_written(run, tilted):
     out = tilted.with_name("aligned.ply")
-    code, report, err = run("--cloud", tilted, "--out", out)
+    code, report, err = run("--cloud", tilted, "--out", out, FREE)
     assert (code, err, report["status"]) == (0, "", "aligned")
     T = np.array(report["T_aligned_from_scan"])
     up = np.array(report["up_scan"])
@@ -56,37 +58,16 @@ def test_the_cloud_and_the_transform_are_written(run, tilted):
     assert report["tilt_deg"] == pytest.approx(np.degrees(np.arccos(up[2])))
     np.testing.assert_allclose(points_of(out), points_of(tilted) @ T[:3, :3].T + T[:3, 3], atol=1e-6)
     assert {path.name for path in tilted.parent.iterdir()} == {
-        "scan 1.ply", "aligned.ply", "aligned.json", "aligned.txt"
+        "scan 1.ply", "aligned.ply", "aligned.txt"
     }  # fmt: skip
     np.testing.assert_array_equal(np.loadtxt(out.with_suffix(".txt")), T)
-    document = json.loads(out.with_suffix(".json").read_text())
-    np.testing.assert_array_equal(document["T_aligned_from_scan"], T)
-    assert (document["format"], document["metres_per_unit"]) == (FORMAT, 1.0)
-    assert document["confidence"] == report["confidence"] >= MIN_CONFIDENCE
-    assert "\n" not in document["explanation"]
-
-
-def test_planes_are_reported_with_their_kinds(run, tilted):
-    _, report, _ = run("--cloud", tilted)
-    assert report["out"] is None
-    kinds = [plane["kind"] for plane in report["planes"]]
-    assert (kinds.count("floor"), kinds.count("ceiling")) == (1, 1)
-    assert kinds.count("wall") >= 4
-    points, up = points_of(tilted), exp_so3(TURN)[:, 2]
-    low, high = np.quantile(points @ up, [0.01, 0.99])
-    for plane, height in (("floor", low), ("ceiling", high)):
-        found = report["planes"][kinds.index(plane)]
-        assert np.dot(found["normal_scan"], up) > np.cos(np.radians(0.5))
-        assert found["offset"] == pytest.approx(height, abs=0.05)
-        assert found["rms"] < 0.02
-        assert 0.05 < found["fraction"] < 0.5
-        assert found["num_inliers"] > 100
-    assert sorted(report["planes"], key=lambda plane: -plane["num_inliers"]) == report["planes"]
+    assert report["metres_per_unit"] == 1.0
+    assert "furniture +" in report["explanation"]
 
 
 def test_other_properties_survive_and_normals_turn(run, tilted):
     out = tilted.with_name("aligned.ply")
-    _, report, _ = run("--cloud", tilted, "--out", out)
+    _, report, _ = run("--cloud", tilted, "--out", out, FREE)
     before, after = PlyData.read(tilted), PlyData.read(out)
     assert after["vertex"].data.dtype == before["vertex"].data.dtype
     for name in ("red", "green", "blue", "scalar_intensity", "label"):
@@ -103,7 +84,7 @@ def test_ascii_and_big_endian_are_read_too(run, tmp_path, text, byte_order):
     write_scan(tmp_path / "scan.ply", points, text=text, byte_order=byte_order)
     write_scan(tmp_path / "same.ply", points)
     for name in ("scan", "same"):
-        assert run("--cloud", tmp_path / f"{name}.ply", "--out", tmp_path / f"{name}_out.ply")[0] == 0
+        assert run("--cloud", tmp_path / f"{name}.ply", "--out", tmp_path / f"{name}_out.ply", FREE)[0] == 0
     a, b = (PlyData.read(tmp_path / name)["vertex"].data for name in ("scan_out.ply", "same_out.ply"))
     assert a.dtype == b.dtype
     for name in a.dtype.names:
@@ -126,7 +107,7 @@ def test_faces_stay(run, tmp_path):
     assert (code, err) == (0, "")
     after = PlyData.read(tmp_path / "out.ply")
     np.testing.assert_array_equal(np.stack(after["face"]["vertex_indices"]), faces["vertex_indices"])
-    assert np.ptp(after["vertex"]["z"] + corners[:, 1]) < 1e-6
+    assert np.ptp(after["vertex"]["z"] - 2.6 * np.indices((2, 2, 2))[2].ravel()) < 0.01
 
 
 @pytest.mark.parametrize("byte_order", ["<", ">"])
@@ -134,11 +115,11 @@ def test_map_coordinates_stay_near_and_come_back(run, tmp_path, byte_order):
     points = scan()[0] @ exp_so3(TURN).T + UTM
     scan_path, out, back = tmp_path / "utm.ply", tmp_path / "out.ply", tmp_path / "back.ply"
     write_scan(scan_path, points, "<f8", byte_order=byte_order)
-    code, report, _ = run("--cloud", scan_path, "--out", out, "--yaw-walls")
+    code, report, _ = run("--cloud", scan_path, "--out", out, "--yaw-walls", FREE)
     assert code == 0
     assert PlyData.read(out)["vertex"].data.dtype["x"] == np.float64
     assert np.abs(points_of(out) - UTM).max() < 20.0
-    code, inverse, _ = run("--cloud", out, "--apply", out.with_suffix(".json"), "--inverse", "--out", back)
+    code, inverse, _ = run("--cloud", out, "--apply", out.with_suffix(".txt"), "--inverse", "--out", back)
     assert (code, inverse["status"]) == (0, "applied")
     np.testing.assert_allclose(points_of(back), points, rtol=0.0, atol=1e-8)
     origin = np.round(0.5 * (points.min(axis=0) + points.max(axis=0)))
@@ -146,25 +127,20 @@ def test_map_coordinates_stay_near_and_come_back(run, tmp_path, byte_order):
     np.testing.assert_allclose(T[:3, :3] @ origin + T[:3, 3], origin, atol=1e-8)
 
 
-def test_a_transform_applies_to_another_cloud_in_its_unit(run, tmp_path, tilted):
-    out, mm, mm_out = tilted.with_name("aligned.ply"), tmp_path / "mm.ply", tmp_path / "mm_out.ply"
-    run("--cloud", tilted, "--out", out)
-    write_scan(mm, 1000.0 * points_of(tilted))
-    apply = ("--apply", out.with_suffix(".json"), "--transform", tmp_path / "T.json")
-    code, report, _ = run("--cloud", mm, "--units", "mm", *apply, "--out", mm_out)
-    assert code == 0
-    np.testing.assert_allclose(points_of(mm_out), 1000.0 * points_of(out), atol=0.01)
-    assert read_alignment(tmp_path / "T.json").metres_per_unit == report["metres_per_unit"] == 0.001
-    code, report, _ = run("--cloud", mm, "--units", "mm", "--out", mm_out)
-    assert code == 0
-    np.testing.assert_allclose(np.ptp(points_of(mm_out)[:, 2]), 2500.0, atol=60.0)
-    floor = next(plane for plane in report["planes"] if plane["kind"] == "floor")
-    assert abs(floor["offset"]) > 100.0
+def test_a_transform_is_in_the_unit_of_the_files(run, tmp_path, tilted):
+    mm, out, again = tmp_path / "mm.ply", tmp_path / "out.ply", tmp_path / "again.ply"
+    write_scan(mm, 1000.0 * points_of(tilted) + 5000.0)
+    code, report, _ = run("--cloud", mm, "--units", "mm", "--out", out, FREE)
+    assert (code, report["metres_per_unit"]) == (0, 0.001)
+    np.testing.assert_allclose(np.ptp(points_of(out)[:, 2]), 2500.0, atol=60.0)
+    code, report, _ = run("--cloud", mm, "--apply", out.with_suffix(".txt"), "--out", again)
+    assert (code, report["status"]) == (0, "applied")
+    np.testing.assert_allclose(points_of(again), points_of(out), atol=1e-3)
 
 
 def test_walls_come_to_stand_along_the_axes(run, tilted):
     out = tilted.with_name("aligned.ply")
-    code, report, _ = run("--cloud", tilted, "--out", out, "--yaw-walls")
+    code, report, _ = run("--cloud", tilted, "--out", out, "--yaw-walls", FREE)
     assert code == 0
     full = np.array(report["T_aligned_from_scan"])[:3, :3] @ exp_so3(TURN)
     yaw = np.degrees(np.arctan2(full[1, 0], full[0, 0]))
@@ -178,7 +154,7 @@ def test_other_formats_become_ply(run, tmp_path):
     np.savez(tmp_path / "a.npz", points=turned[::2], colors=colors[::2])
     np.savez(tmp_path / "b.npz", points=turned[1::2], colors=colors[1::2])
     out = tmp_path / "out.ply"
-    code, report, _ = run("--cloud", tmp_path / "a.npz", tmp_path / "b.npz", "--out", out)
+    code, report, _ = run("--cloud", tmp_path / "a.npz", tmp_path / "b.npz", "--out", out, FREE)
     assert (code, len(report["cloud"])) == (0, 2)
     vertex = PlyData.read(out)["vertex"]
     assert [p.name for p in vertex.properties] == ["x", "y", "z", "red", "green", "blue"]
@@ -189,34 +165,69 @@ def test_other_formats_become_ply(run, tmp_path):
 
 def test_same_bits_every_run_and_for_every_thread_count(run, tilted, tmp_path):
     outs = [tmp_path / f"{k}.ply" for k in range(2)]
-    assert run("--cloud", tilted, "--out", outs[0], "--yaw-walls")[0] == 0
+    assert run("--cloud", tilted, "--out", outs[0], "--yaw-walls", FREE)[0] == 0
     command = [sys.executable, ROOT / "tools" / "align_gravity.py", "--cloud", tilted, "--out", outs[1]]
     limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
-    subprocess.run([*command, "--yaw-walls", "--quiet"], env=os.environ | limits, check=True)
-    for suffix in (".ply", ".json", ".txt"):
+    subprocess.run([*command, "--yaw-walls", FREE, "--quiet"], env=os.environ | limits, check=True)
+    for suffix in (".ply", ".txt"):
         assert outs[0].with_suffix(suffix).read_bytes() == outs[1].with_suffix(suffix).read_bytes()
 
 
-def test_nothing_is_written_where_up_is_uncertain(run, tmp_path):
+def test_nothing_is_written_where_up_is_not_known(run, tmp_path):
     np.savez(tmp_path / "bare.npz", points=bare_room(), colors=np.full((18_000, 3), 99, np.uint8))
     bare = ("--cloud", tmp_path / "bare.npz", "--out", tmp_path / "out.ply")
-    code, report, err = run(*bare, "--assume-nothing")
-    assert (code, report["status"], report["out"]) == (1, "uncertain", None)
-    assert err.count("\n") == 1
-    assert f"confidence {report['confidence']:.2f} is below {MIN_CONFIDENCE:g}" in err
+    code, report, err = run(*bare, FREE)
+    assert (code, report["status"], report["out"], report["up_scan"]) == (1, "uncertain", None, None)
+    assert err.endswith("up is not known: floor and ceiling look alike: furniture +0.0, free ways +0.0\n")
     assert [path.name for path in tmp_path.iterdir()] == ["bare.npz"]
-    assert run(*bare, "--assume-nothing", "--min-confidence", ANGLE)[0] == 0
-    for convention in ([], ["--assume-z-up"]):
-        code, report, _ = run(*bare, *convention)
-        assert (code, report["tilt_deg"]) == (0, pytest.approx(0.0, abs=1e-9))
-        assert "convention" in report["explanation"]
-    probabilities = [hypothesis["probability"] for hypothesis in report["hypotheses"]]
-    assert probabilities == sorted(probabilities, reverse=True)
-    assert sum(probabilities) < 1.0
-    assert report["hypotheses"][0]["evidence"]["convention"] > 6.0
+    code, report, _ = run(*bare)
+    assert (code, report["tilt_deg"], report["explanation"]) == (0, 0.0, "up is the named axis")
+    np.testing.assert_array_equal(report["T_aligned_from_scan"], np.eye(4))
     code, report, _ = run(*bare, "--up", "-z")
-    assert (code, report["explanation"]) == (0, "up is the axis -z, as given")
+    assert code == 0
     np.testing.assert_array_equal(np.array(report["T_aligned_from_scan"])[:3, :3], np.diag([1.0, -1.0, -1.0]))
+
+
+@pytest.mark.parametrize("w", [[0.5 * np.pi, 0.0, 0.0], [np.pi, 0.0, 0.0], [0.7, 0.0, 0.0]])
+def test_the_files_axis_is_not_believed_against_plain_evidence(run, tmp_path, w):
+    write_scan(tmp_path / "scan.ply", scan()[0] @ exp_so3(np.array(w)).T)
+    code, report, err = run("--cloud", tmp_path / "scan.ply", "--out", tmp_path / "out.ply")
+    assert (code, report["status"], (tmp_path / "out.ply").exists()) == (1, "uncertain", False)
+    assert "up is not known: the floors do not face z, by their furniture +" in err
+
+
+def test_a_named_axis_is_levelled_by_planes_that_are_near_it(run, tmp_path):
+    R = exp_so3(np.array([0.5 * np.pi, 0.0, 0.0])) @ exp_so3(np.array([0.1, 0.05, 0.0]))
+    write_scan(tmp_path / "scan.ply", scan()[0] @ R.T)
+    code, report, _ = run("--cloud", tmp_path / "scan.ply", "--up", "-y")
+    assert code == 0
+    np.testing.assert_allclose(report["up_scan"], R[:, 2], atol=np.radians(0.2))
+
+
+def test_scanners_tell_up_in_a_bare_room(run, tmp_path):
+    R = exp_so3(TURN)
+    points = bare_room() @ R.T
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[3, :3] = R.T, R @ [2.0, 2.0, 1.5]
+    path = write_lines(tmp_path / "a.ptx", ptx_lines(points, np.full(points.shape, 128), matrix))
+    code, report, _ = run("--cloud", path, FREE)
+    assert (code, report["explanation"]) == (0, "the scanners stood upright")
+    np.testing.assert_allclose(report["up_scan"], R[:, 2], atol=np.radians(0.3))
+
+
+@pytest.mark.parametrize("assumed", [[], [FREE]])
+def test_a_photo_tells_up(run, tilted, tmp_path, assumed):
+    (tmp_path / "photo.png").write_bytes(encoded(photo_of(1).rgb, ".png"))
+    code, report, _ = run("--cloud", tilted, "--pano", tmp_path / "photo.png", *assumed)
+    assert (code, report["explanation"]) == (0, f"{tmp_path / 'photo.png'} is localized")
+    np.testing.assert_allclose(report["up_scan"], exp_so3(TURN)[:, 2], atol=np.radians(0.2))
+
+
+def test_a_photo_from_elsewhere_tells_nothing(run, tilted, tmp_path):
+    (tmp_path / "photo.png").write_bytes(encoded(photo_of(2).rgb, ".png"))
+    code, report, err = run("--cloud", tilted, "--pano", tmp_path / "photo.png", FREE)
+    assert (code, report["up_scan"]) == (1, None)
+    assert "photo.png is not_localized" in err
 
 
 def test_no_wall_no_yaw(run, tmp_path):
@@ -234,7 +245,9 @@ def test_true_poses_go_along(run, tilted, tmp_path):
     queries = [Query(tmp_path / "raw" / f"{k}.jpg", "robot", pose) for k, pose in enumerate(poses)]
     write_queries(tmp_path / "raw", queries)
     out = tmp_path / "aligned.ply"
-    code, report, _ = run("--cloud", tilted, "--queries", tmp_path / "raw" / "queries.json", "--out", out)
+    code, report, _ = run(
+        "--cloud", tilted, "--queries", tmp_path / "raw" / "queries.json", "--out", out, FREE
+    )
     assert code == 0
     T = np.array(report["T_aligned_from_scan"])
     scene = read_scene(tmp_path)
@@ -252,16 +265,14 @@ def test_true_poses_go_along(run, tilted, tmp_path):
     ("arguments", "message"),
     [
         ("--inverse", "--inverse needs --apply"),
-        ("--apply T.json", "--apply needs --out"),
-        ("--apply T.json --out o.ply --yaw-walls", "--yaw-walls can't be combined with --apply"),
-        ("--apply T.json --out o.ply --up -y", "--up can't be combined with --apply"),
-        ("--apply T.json --out o.ply --assume-nothing", "--assume-nothing can't be combined with --apply"),
-        ("--up y --assume-z-up", "--assume-z-up can't be combined with --up y"),
-        ("--up y --pano photo.jpg", "--pano can't be combined with --up y"),
-        ("--min-confidence 1.5", "--min-confidence"),
+        ("--apply T.txt", "--apply needs --out"),
+        ("--apply T.txt --out o.ply --yaw-walls", "--yaw-walls can't be combined with --apply"),
+        ("--apply T.txt --out o.ply --up -y", "--up can't be combined with --apply"),
+        ("--apply T.txt --out o.ply --assume-nothing", "--assume-nothing can't be combined with --apply"),
+        ("--up y --assume-nothing", "--assume-nothing can't be combined with --apply or --up"),
+        ("--up y --pano photo.jpg", "--pano can't be combined with --apply or --up"),
         ("--scale -1", "--scale"),
         ("--out o.json", "--out o.json: wanted a name that ends with .ply"),
-        ("--out o.ply --transform T.txt", "--transform T.txt: wanted a name that ends with .json"),
     ],
 )
 def test_wrong_usage(run, tilted, arguments, message):
@@ -271,8 +282,9 @@ def test_wrong_usage(run, tilted, arguments, message):
 
 
 def test_bad_input(run, tilted, tmp_path, monkeypatch):
-    (tmp_path / "T.json").write_text("{}")
-    out, missing = tmp_path / "o.ply", tmp_path / "none.json"
+    (tmp_path / "T.txt").write_text("{}")
+    (tmp_path / "text.jpg").write_text("no picture")
+    out, missing = tmp_path / "o.ply", tmp_path / "none.txt"
 
     def refuse(named, *arguments, code=3):
         found, report, err = run(*arguments)
@@ -282,8 +294,9 @@ def test_bad_input(run, tilted, tmp_path, monkeypatch):
     refuse(tmp_path / "none.ply", "--cloud", tmp_path / "none.ply", "--out", out)
     refuse(tilted, "--cloud", tilted, "--out", tilted, code=2)
     refuse(tmp_path / "no", "--cloud", tilted, "--out", tmp_path / "no" / "o.ply")
-    refuse(tmp_path / "T.json", "--cloud", tilted, "--out", out, "--apply", tmp_path / "T.json")
+    refuse(tmp_path / "T.txt", "--cloud", tilted, "--out", out, "--apply", tmp_path / "T.txt")
     refuse(missing, "--cloud", tilted, "--out", out, "--apply", missing)
+    refuse("text.jpg", "--cloud", tilted, "--out", out, "--pano", tmp_path / "text.jpg")
     monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may write everywhere
     refuse(out, "--cloud", tilted, "--out", out)
     assert not out.exists()
@@ -297,4 +310,4 @@ def test_a_cloud_on_stdout_and_nothing_beside_it(tilted, tmp_path, capfdbinary):
     assert capfdbinary.readouterr() == (out.read_bytes(), b"")
     assert align_gravity.main(["--cloud", str(tilted), "--out", "-", "--queries", "q.json"]) == 2
     assert b"--queries: nothing can be written beside --out -" in capfdbinary.readouterr().err
-    assert not Path("-.json").exists()
+    assert not Path("-.txt").exists()

@@ -2,12 +2,12 @@
 
 import itertools
 
-import evaluate_confidence
 import numpy as np
 import pytest
+from measuring import confidence
+from measuring.alike import ALIKE_KINDS, CHANGED, make_alike, thing_seeds
 
 from piccolo.runtime.threads import Workers
-from piccolo.scenes.synthetic.alike import ALIKE_KINDS, CHANGED, make_alike, thing_seeds
 from piccolo.scenes.synthetic.world import World, make_query
 
 
@@ -50,9 +50,9 @@ def test_photos_are_taken_in_free_space(kind):
 
 
 def test_trials_of_alike_places(monkeypatch):
-    monkeypatch.setattr(evaluate_confidence, "WIDTH", 128)
-    monkeypatch.setattr(evaluate_confidence, "POINTS_PER_ROOM", 2000)
-    found = list(evaluate_confidence.alike_trials(1, ["doors"], Workers(2)))
+    monkeypatch.setattr(confidence, "WIDTH", 128)
+    monkeypatch.setattr(confidence, "POINTS_PER_ROOM", 2000)
+    found = list(confidence.alike_trials(1, ["doors"], Workers(2)))
     assert len(found) == len(CHANGED)
     for (_, trials), changed in zip(found, CHANGED, strict=True):
         cases = [trial.case for trial in trials]

@@ -1,10 +1,17 @@
 """Batches: what is named, what is written, and how a stopped one goes on."""
 
+import contextlib
+import errno
+import fcntl
+import hashlib
 import json
+import os
 import signal
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 from rooms import write_room
@@ -13,10 +20,13 @@ from piccolo.batch import localizer as module
 from piccolo.batch.inputs import panoramas_of
 from piccolo.cli import localize
 from piccolo.errors import InputError
-from piccolo.result import Result
+from piccolo.panorama import picture
+from piccolo.result import Result, read_results
+from piccolo.runtime import memory
 from piccolo.runtime.line_file import appending, whole_lines, whole_size
 
 ROOT = Path(__file__).resolve().parents[1]
+PAPER = ["--preset", "paper", "--num-translations", "4", "--num-iterations", "5", "--max-points", "5000"]
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +66,7 @@ def test_folders_lists_and_standard_input_name_panoramas(scene, tmp_path):
     with (tmp_path / "stdin").open("w+") as stdin:
         stdin.write("e.jpg\r\n\nf.jpg")
         stdin.seek(0)
-        found = list(panoramas_of([str(scene), "a.jpg", f"@{listed}", "-"], stdin))
+        found = list(panoramas_of([str(scene), "a.jpg", f"@{listed}", "-"], stdin, Counter()))
     assert found[:3] == [scene / "images" / name for name in names]
     assert [str(path) for path in found[3:]] == ["a.jpg", "b c.jpg", "d.png", "e.jpg", "f.jpg"]
     cube = tmp_path / "photos" / "cube"
@@ -65,11 +75,14 @@ def test_folders_lists_and_standard_input_name_panoramas(scene, tmp_path):
         (cube / f"{face}.png").touch()
     (tmp_path / "photos" / "a.webp").touch()
     (tmp_path / "photos" / ".hidden.jpg").touch()
-    assert list(panoramas_of([str(tmp_path / "photos")], None)) == [tmp_path / "photos/a.webp", cube]
-    assert list(panoramas_of([str(cube)], None)) == [cube]
+    assert list(panoramas_of([str(tmp_path / "photos")], None, Counter())) == [
+        tmp_path / "photos/a.webp",
+        cube,
+    ]
+    assert list(panoramas_of([str(cube)], None, Counter())) == [cube]
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="empty: a folder without a JPEG"):
-        list(panoramas_of([str(tmp_path / "empty")], None))
+        list(panoramas_of([str(tmp_path / "empty")], None, Counter()))
 
 
 def test_a_batch_goes_on_where_it_was_stopped(scene, tmp_path, counted, capsys):
@@ -99,9 +112,7 @@ def test_a_batch_goes_on_where_it_was_stopped(scene, tmp_path, counted, capsys):
         (["--gravity", "known"], "line 1: made with gravity 'auto', not 'known'"),
         (["--height", "0.5", "2"], "line 1: made with prior"),
         (["--cloud", "other"], "line 1: made with another scan, or the scan has changed since"),
-        (["--pano", "clean_1.jpg"], "line 1: of "),
-        (["--pano", "clean_0.jpg"], "line 2: more results than this command has panoramas"),
-        ("photo", "clean_1.jpg has changed since"),
+        (["--pano", "clean_1.jpg"], "none of its results is of a panorama that this command names"),
         (b"some notes of the user\n", "line 1: no result of localize.py"),
         (b"notes without an end", "its end is no line of results"),
         (b'{"format": "piccolo-pose/3"}\n', "line 1: of format 'piccolo-pose/3'"),
@@ -114,9 +125,7 @@ def test_a_file_of_another_run_is_refused_with_both_ways(scene, tmp_path, change
     out, panos = tmp_path / "poses.jsonl", [str(first), str(photo)]
     assert _run(scene, out, "--quiet", pano=panos) == 0
     more = []
-    if change == "photo":
-        photo.write_bytes(second.read_bytes() + b"\0")
-    elif isinstance(change, bytes):
+    if isinstance(change, bytes):
         out.write_bytes(change)
     elif change[0] == "--cloud":
         other = tmp_path / "other.ply"
@@ -135,7 +144,7 @@ def test_a_file_of_another_run_is_refused_with_both_ways(scene, tmp_path, change
     assert out.read_bytes() == before
 
 
-def test_an_unreadable_photo_is_a_line_and_stays_one(scene, tmp_path, counted, capsys):
+def test_an_unreadable_photo_is_a_line_until_its_file_is_another(scene, tmp_path, counted, capsys):
     bad, out = tmp_path / "bad.jpg", tmp_path / "poses.jsonl"
     bad.write_bytes(b"\xff\xd8\xff nothing more")
     panos = [str(bad), str(tmp_path / "missing.jpg"), str(scene / "images" / "clean_0.jpg")]
@@ -145,9 +154,213 @@ def test_an_unreadable_photo_is_a_line_and_stays_one(scene, tmp_path, counted, c
         assert counted == expected
     assert [line["status"] for line in _lines(out)] == ["unreadable", "unreadable", "localized"]
     assert "1 localized, 0 ambiguous, 0 not localized, 2 unreadable" in capsys.readouterr().err
-    bad.write_bytes((scene / "images" / "clean_1.jpg").read_bytes())
-    assert _run(scene, out, pano=panos) == 3
-    assert "bad.jpg has changed since" in capsys.readouterr().err
+    for name in ("bad.jpg", "missing.jpg"):
+        counted.clear()
+        (tmp_path / name).write_bytes((scene / "images" / "clean_1.jpg").read_bytes())
+        assert _run(scene, out, pano=panos) == (3 if name == "bad.jpg" else 0)
+        assert counted == [name]
+    assert [line["pano"] for line in _lines(out)] == panos
+    assert {line["status"] for line in _lines(out)} == {"localized"}
+
+
+def test_photos_added_removed_changed_and_reordered_cost_only_their_own_lines(
+    scene, tmp_path, counted, capsys
+):
+    """The file is that of a new run, though each run does only what the one before has not done."""
+    photos, out, whole = tmp_path / "photos", tmp_path / "poses.jsonl", tmp_path / "whole.jsonl"
+    images = [(scene / "images" / f"clean_{k}.jpg").read_bytes() for k in range(3)]
+    photos.mkdir()
+
+    def written(contents, *panos):
+        for path in photos.iterdir():
+            path.unlink()
+        for name, content in contents.items():
+            (photos / name).write_bytes(content)
+        counted.clear()
+        assert _run(scene, out, *PAPER, pano=[*panos] or [str(photos)]) < 2
+        done, err = list(counted), capsys.readouterr().err
+        assert _run(scene, whole, *PAPER, "--overwrite", "--quiet", pano=[*panos] or [str(photos)]) < 2
+        assert _lines(out) == _lines(whole)
+        return done, err
+
+    first = {"b.jpg": images[0], "d.jpg": images[1]}
+    assert written(first)[0] == ["b.jpg", "d.jpg"]
+    assert written({**first, "a.jpg": images[2], "c.jpg": images[0]})[0] == ["a.jpg", "c.jpg"]
+    done, err = written({"d.jpg": images[1], "c.jpg": images[2]})
+    assert done == ["c.jpg"]
+    assert "; dropped 2 results of panoramas not named any more\n" in err
+    names = [str(photos / name) for name in ("d.jpg", "c.jpg", "d.jpg")]
+    assert written({"d.jpg": images[1], "c.jpg": images[2]}, *names)[0] == ["d.jpg"]
+    before = _lines(out)
+    for path in photos.iterdir():
+        path.unlink()
+    counted.clear()
+    assert _run(scene, out, *PAPER, pano=names) < 2  # a disk that is not there takes no result along
+    assert (counted, _lines(out)) == ([], before)
+
+
+def test_a_batch_that_is_stopped_between_keeps_all_that_it_had(scene, tmp_path, counted):
+    """Lines that the panoramas of now do not need stay until all of these are done."""
+    names = [str(scene / "images" / f"clean_{k}.jpg") for k in range(3)]
+    whole, out = tmp_path / "whole.jsonl", tmp_path / "poses.jsonl"
+    assert _run(scene, whole, *PAPER, pano=names) < 2
+    lines = whole.read_bytes().splitlines(keepends=True)
+    out.write_bytes(lines[2] + lines[0] + lines[1][:99])  # torn, while the second was written
+    assert _run(scene, out, *PAPER, pano=names[:2]) < 2
+    assert counted[3:] == ["clean_1.jpg"]
+    assert _lines(out) == _lines(whole)[:2]
+
+
+def test_names_that_come_on_standard_input_take_what_is_done_and_drop_nothing(scene, tmp_path):
+    names = [str(scene / "images" / f"clean_{k}.jpg") for k in range(3)]
+    out = tmp_path / "poses.jsonl"
+    command = [sys.executable, str(ROOT / "localize.py"), "--cloud", str(scene / "cloud.ply"), *PAPER]
+    command += ["--pano", "-", "--out", str(out)]
+    for given, left in ((names[:2], names[:2]), ([names[2], names[1]], [names[0], names[2], names[1]])):
+        before = out.read_text().splitlines() if out.exists() else []
+        done = subprocess.run(command, input="\n".join(given), text=True, capture_output=True, check=False)
+        assert done.returncode < 2
+        assert f"{len(given)} panoramas in" in done.stderr
+        assert "dropped" not in done.stderr
+        after = out.read_text().splitlines()
+        assert [json.loads(line)["pano"] for line in after] == left
+        assert set(before) <= set(after)
+
+
+class Short(module.Localizer):
+    """Localizes, but memory and a disk give way at two of the photos, once."""
+
+    errors: ClassVar = {}
+
+    def open_scan(self, workers):
+        scan = super().open_scan(workers)
+        ask = type(scan).localize_query
+
+        def localize_query(self, path, *more, **options):
+            if error := Short.errors.pop(path.name, None):
+                raise error
+            return ask(self, path, *more, **options)
+
+        return type("Scan", (type(scan),), {"localize_query": localize_query})(**vars(scan))
+
+
+def test_what_the_system_did_to_a_photo_is_tried_again(scene, tmp_path, counted, monkeypatch, capsys):
+    out, names = tmp_path / "poses.jsonl", ["clean_0.jpg", "clean_1.jpg", "clean_2.jpg"]
+    monkeypatch.setattr(localize, "Localizer", Short)
+    Short.errors.update({names[0]: MemoryError(), names[2]: OSError(errno.EIO, "Input/output error", "x")})
+    assert _run(scene, out, *PAPER) == 3
+    err = capsys.readouterr().err
+    assert "0 unreadable, 2 failed, which the same command tries again" in err
+    assert "not enough memory (none is left)" in err
+    assert [line["status"] == "failed" for line in _lines(out)] == [True, False, True]
+    counted.clear()
+    assert _run(scene, out, *PAPER) < 2
+    assert counted == [names[0], names[2]]
+    assert [Path(line["pano"]).name for line in _lines(out)] == names
+    assert "failed" not in {line["status"] for line in _lines(out)}
+
+
+def test_a_limit_of_memory_is_no_fault_of_the_photos(scene, tmp_path):
+    out = tmp_path / "poses.jsonl"
+    with pytest.MonkeyPatch().context() as patched:
+        patched.setattr(picture, "check_memory", lambda *given: memory.check_memory(1e15, *given[1:]))
+        assert _run(scene, out, *PAPER) == 3
+    assert {line["status"] for line in _lines(out)} == {"failed"}
+    assert "may be taken; make the picture smaller" in _lines(out)[0]["error"]
+    assert _run(scene, out, *PAPER) < 2
+    assert "failed" not in {line["status"] for line in _lines(out)}
+
+
+def test_a_photo_is_read_once_so_that_its_digest_is_of_its_pixels(scene, tmp_path, monkeypatch):
+    photo, out = tmp_path / "a.jpg", tmp_path / "poses.jsonl"
+    first, second = ((scene / "images" / f"clean_{k}.jpg").read_bytes() for k in (0, 1))
+    read, reads = Path.read_bytes, []
+
+    def read_and_replaced(path):
+        content = read(path)
+        if path == photo:
+            reads.append(path)
+            photo.write_bytes(second)
+        return content
+
+    monkeypatch.setattr(Path, "read_bytes", read_and_replaced)
+    for content in (first, first[:2000]):
+        photo.write_bytes(content)
+        _run(scene, out, *PAPER, "--overwrite", pano=[str(photo)])
+        assert _lines(out)[0]["pano_sha256"] == hashlib.sha256(content).hexdigest()
+    assert len(reads) == 2
+    assert _lines(out)[0]["status"] == "unreadable"
+
+
+ODD = [
+    b"a\nb.jpg",
+    b"a\tb.jpg",
+    b"caf\xe9.jpg",
+    b"\x1b[31m.jpg",
+    "x\u2028\x85y.jpg".encode(),
+    b"y" * 251 + b".jpg",
+]
+
+
+@pytest.mark.parametrize("more", [[], ["--jobs", "2"], ["--walk", "--times", "order"]])
+def test_any_name_that_a_file_may_have_is_localized(scene, tmp_path, more, capsys):
+    photos, out, overlays = tmp_path / "photos", tmp_path / "poses.jsonl", tmp_path / "overlays"
+    photos.mkdir()
+    overlays.mkdir()
+    image = (scene / "images" / "clean_0.jpg").read_bytes()
+    for name in ODD:
+        (photos / os.fsdecode(name)).write_bytes(image)
+    (photos / "bad\n.jpg").write_bytes(image[:999])
+    more = more if "--walk" in more else [*more, *PAPER, "--overlay", str(overlays)]
+    assert _run(scene, out, *more, pano=[str(photos), "z" * 5000]) == 3
+    found = {os.fsencode(Path(result.pano).name): result.status for result in read_results([out])}
+    assert set(found) == {*ODD, b"bad\n.jpg", b"z" * 5000}
+    assert [name for name, status in found.items() if status == "unreadable"] == [b"bad\n.jpg", b"z" * 5000]
+    err = capsys.readouterr().err
+    assert "bad\\n.jpg: " in err
+    assert "File name too long" in err
+    assert "\x1b" not in err
+    assert "Errno" not in err
+
+
+def test_any_name_in_a_list_or_on_standard_input_costs_its_own_line_at_most(scene, tmp_path):
+    image = (scene / "images" / "clean_0.jpg").read_bytes()
+    (tmp_path / os.fsdecode(b"caf\xe9.jpg")).write_bytes(image)
+    names = b"\xef\xbb\xbfx\0y.jpg\n" + b"z" * 5000 + b"\n\ncaf\xe9.jpg\r\n"
+    (tmp_path / "list.txt").write_bytes(names)
+    command = [sys.executable, str(ROOT / "localize.py"), "--cloud", str(scene / "cloud.ply"), *PAPER]
+    for word, given in (("@list.txt", b""), ("-", names[3:])):
+        done = subprocess.run(
+            [*command, "--pano", word], cwd=tmp_path, input=given, capture_output=True, check=False
+        )
+        found = [Result.from_json(line) for line in done.stdout.decode("ascii").splitlines()]
+        assert [os.fsencode(result.pano) for result in found] == [b"x\0y.jpg", b"z" * 5000, b"caf\xe9.jpg"]
+        assert [result.status == "unreadable" for result in found] == [True, True, False]
+        assert done.returncode == 3
+        assert b"embedded null byte" in done.stderr
+
+
+def test_files_left_out_are_counted_and_links_to_folders_searched(scene, tmp_path, capsys):
+    photos, elsewhere = tmp_path / "photos", tmp_path / "elsewhere"
+    (elsewhere / "inner").mkdir(parents=True)
+    photos.mkdir()
+    (photos / "link").symlink_to(elsewhere)
+    (elsewhere / "inner" / "loop").symlink_to(photos)
+    (photos / "self").symlink_to("self")
+    (elsewhere / "inner" / "a.jpg").write_bytes((scene / "images" / "clean_0.jpg").read_bytes())
+    left_out = Counter()
+    found = list(panoramas_of([str(photos)], None, left_out))
+    assert found == [photos / "link" / "inner" / "a.jpg"]
+    assert left_out == Counter({"": 1})  # the link that leads to itself
+    for name in ("a.GIF", "b.gif", "c.bmp", "d"):
+        (photos / name).touch()
+    assert _run(scene, tmp_path / "poses.jsonl", *PAPER, pano=[str(photos)]) < 2
+    assert "; 5 files left out: 2 without an ending, 2 .gif, 1 .bmp\n" in capsys.readouterr().err
+    (tmp_path / "few").mkdir()
+    for name in "abcdefg":
+        (tmp_path / "few" / f"x.{name}").touch()
+    with pytest.raises(InputError, match=r"; 7 files left out: 1 \.\w, .* 2 of other kinds$"):
+        list(panoramas_of([str(tmp_path / "few")], None, Counter()))
 
 
 def _process(scene, out, panos, **options):
@@ -207,6 +420,22 @@ def test_two_processes_do_not_write_one_file(tmp_path):
     assert not (tmp_path / "new").exists()
 
 
+def test_a_file_that_was_removed_before_it_was_locked_is_opened_again(tmp_path, monkeypatch):
+    """The first of two writes nothing and removes the file, which the second has opened before."""
+    out, flock = tmp_path / "poses.jsonl", fcntl.flock
+    first = contextlib.ExitStack()
+    first.enter_context(appending(out, None))
+
+    def flock_late(handle, how):
+        first.close()
+        flock(handle, how)
+
+    monkeypatch.setattr(fcntl, "flock", flock_late)
+    with appending(out, None) as append:
+        append("{}")
+    assert out.read_text() == "{}\n"
+
+
 def test_a_full_disk_keeps_the_lines_before(tmp_path):
     code = (
         "import resource, sys\n"
@@ -248,7 +477,9 @@ def test_priors_of_a_table_go_before_the_general_one(scene, tmp_path, capsys):
         f"name,x,y,radius,height\nclean_0.jpg,{x},{y},0.5,1.5\nclean_9.jpg,1,2,,\nclean_1.jpg,,,,\n"
     )
     assert _run(scene, out, "--priors", str(table), "--height", "0.2", "2.2") == 0
-    assert "1 names of no panorama here, such as clean_9.jpg" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert "1 names of no panorama here, such as clean_9.jpg" in err.splitlines()[0]  # before the work
+    assert "%|" not in err  # a bar is for a terminal
     priors = [line["settings"]["prior"] for line in _lines(out)]
     assert priors[0]["near_world"] == [x, y, None]
     assert (priors[0]["radius"], priors[0]["height"]) == (0.5, [1.2, 1.8])

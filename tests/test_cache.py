@@ -1,12 +1,14 @@
 """What is kept between runs: where, and what is trusted of it."""
 
 import errno
+import logging
 import os
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 
@@ -101,9 +103,8 @@ def test_where_no_kernel_can_be_kept_one_warning_says_so(folders, tmp_path, monk
         compiled = kernel(eval(f"lambda {name}: {name} + 1"))
         assert compiled(np.float64(3.0)) == 4.0
     (warning,) = [record.getMessage() for record in caplog.records]
-    assert warning.endswith("compiled code is not kept, and each run takes a minute more")
+    assert warning.endswith("compiled code is not kept, and each run takes half a minute more")
     assert not list(root.rglob("*.kernel"))
-    assert kernel_cache.is_first_use() == (how == "full disk")
 
 
 def _full(*_):
@@ -157,11 +158,9 @@ def test_damaged_compiled_code_is_noticed_and_made_anew(tmp_path, monkeypatch, c
     def total(values):
         return values.sum()
 
-    assert kernel_cache.is_first_use()
     values = np.arange(5.0)
     assert kernel(total)(values) == 10.0
     (path,) = tmp_path.iterdir()
-    assert not kernel_cache.is_first_use()
     whole = path.read_bytes()
     os.utime(path, (0, 0))
     loaded = kernel(total)
@@ -217,6 +216,51 @@ def test_a_kernel_is_compiled_with_another_that_was_loaded(tmp_path, monkeypatch
     wrappers = names.llvm_cpython_wrapper_name, names.llvm_cfunc_wrapper_name
     found = {function.name for function in loaded.library._shared_module.functions}
     assert found == {names.llvm_func_name, *wrappers}
+
+
+@pytest.mark.parametrize("fails", ["rebuilt", "serialize"])
+def test_where_numba_is_not_as_it_was_kernels_are_compiled(tmp_path, monkeypatch, caplog, fails):
+    def total(values):
+        return values.sum()
+
+    kernel_cache.warn_not_kept.cache_clear()
+    monkeypatch.setattr(kernel_cache, "kernel_folder", lambda: tmp_path)
+    values = np.arange(5.0)
+    if fails == "rebuilt":
+        kernel(total)(values)
+    monkeypatch.setattr(kernel_cache, fails, None)
+    assert kernel(total)(values) == 10.0
+    (warning,) = [record.getMessage() for record in caplog.records]
+    assert warning.startswith(f"Numba {numba.__version__}: ")
+    assert warning.endswith("compiled code is not kept, and each run takes half a minute more")
+
+
+def test_bounds_are_checked_where_code_without_is_kept(tmp_path, monkeypatch):
+    def third(values):
+        return values[2]
+
+    monkeypatch.setattr(kernel_cache, "kernel_folder", lambda: tmp_path)
+    values = np.zeros(3)
+    kernel(third)(values)
+    monkeypatch.setattr(numba.config, "BOUNDSCHECK", 1)
+    with pytest.raises(IndexError):
+        kernel(third)(values[:2])
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_who_waits_for_kernels_is_told_how_many_are_left(monkeypatch, capsys):
+    seconds = iter([10.0, 11.0, 14.0])
+    monkeypatch.setattr(kernel_cache.time, "monotonic", lambda: next(seconds))
+    for is_quiet in (False, True):
+        compiling = kernel_cache.Compiling()
+        with progress.log_shown(is_quiet):
+            compiling.start()
+            compiling.finish()
+            compiling.finish()
+        text = "compiling kernels, once: 2 of about 49, some 94 s left\n"
+        assert capsys.readouterr().err == ("" if is_quiet else text)
+        seconds = iter([10.0, 11.0, 14.0])
+    assert logging.getLogger("piccolo").level == logging.NOTSET
 
 
 def test_a_logged_warning_is_one_line_and_quiet_is_quiet(capsys):

@@ -48,6 +48,26 @@ def test_views_are_made_once_whatever_is_asked_for(monkeypatch):
         np.testing.assert_array_equal(found[rows], expected)
 
 
+def test_no_more_than_so_many_are_kept_and_those_given_out_stay(monkeypatch):
+    m, kept = _views()
+    monkeypatch.setattr(candidate_views, "MOST_KEPT", 40)
+    monkeypatch.setattr(candidate_views, "LEAST_ROOM", 1)
+    rng, given = np.random.default_rng(0), []
+    for count in (30, 30, 5, 60, 60, 10):
+        candidates = rng.choice(len(m.centers), count, replace=False)
+        given.append((candidates, *kept.at(candidates, Workers(1))))
+        assert len(kept.made.centers) <= max(40, count)
+    for candidates, rows, views in given:
+        expected = render_views(m.octree, m.centers[candidates], SEARCH_VIEW, Workers(1))
+        for found, wanted in zip(views, expected, strict=True):
+            np.testing.assert_array_equal(found[rows], wanted)
+
+
+def test_no_memory_is_asked_for_no_views(monkeypatch):
+    monkeypatch.setattr(candidate_views, "check_memory", lambda *_: pytest.fail("asked"))
+    assert len(candidate_views.empty_views(0, 10).centers) == 0
+
+
 def test_threads_may_ask_at_once():
     m, kept = _views()
     found, errors = {}, []

@@ -34,6 +34,11 @@ def test_a_gltf_texture_stands_upright(tmp_path, kind):
     made.assert_quadrants(whole(open_mesh, path))
 
 
+def test_y_is_up_in_gltf_by_its_specification_and_z_in_other_meshes(tmp_path):
+    assert open_mesh(made.textured_gltf().glb(tmp_path / "a.glb")).up == "y"
+    assert open_mesh(made.write_obj(tmp_path)).up == "z"
+
+
 def test_a_glb_by_trimesh_stands_upright(tmp_path):
     image = Image.fromarray(made.QUADRANTS)
     material = trimesh.visual.material.PBRMaterial(baseColorTexture=image)

@@ -20,8 +20,7 @@ from piccolo.coarse_to_fine.open_map import CachePolicy, content_key, open_map
 from piccolo.coarse_to_fine.scan_map import prepare_map
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose, exp_so3
-from piccolo.gravity import rotation_to_z_up
+from piccolo.geometry.pose import Pose, exp_so3, rotation_to_z
 from piccolo.opening import open_files
 from piccolo.paper.settings import PaperSettings
 from piccolo.runtime.stopwatch import Stopwatch
@@ -143,7 +142,7 @@ def _lying(turn):
 def test_up_axis_is_believed_and_poses_stay_in_the_files_frame(up):
     axis = np.eye(3)["xyz".index(up[-1])] * (-1 if up[0] == "-" else 1)
     yaw = exp_so3(np.array([0.0, 0.0, 0.4]))
-    cloud, truth = _lying(rotation_to_z_up(axis).T @ yaw)
+    cloud, truth = _lying(rotation_to_z(axis).T @ yaw)
     scan_map = prepare_map(cloud, Workers(2), up)
     np.testing.assert_array_equal(scan_map.R_map_from_world @ axis, [0.0, 0.0, 1.0])
     np.testing.assert_array_equal(np.abs(scan_map.R_map_from_world).sum(axis=0), 1.0)
@@ -156,19 +155,28 @@ def test_up_axis_is_believed_and_poses_stay_in_the_files_frame(up):
     assert angle_deg < 0.2
 
 
-def test_a_tilted_cloud_is_read_twice_and_another_once():
-    lying, _ = _lying(exp_so3(np.array([1.2, 0.3, 0.0])))
-    counts = []
-    for up in ("auto", "z"):
-        readings = []
+@pytest.mark.parametrize("up", ["auto", "z", "-y"])
+def test_floors_on_edge_are_told_and_nothing_is_turned_but_by_word(up):
+    lying, _ = _lying(exp_so3(np.array([0.5 * np.pi, 0.0, 0.0])))
+    scan_map = prepare_map(lying, Workers(2), up)
+    assert np.array_equal(scan_map.R_map_from_world, LEVEL) == (up != "-y")
+    if up == "auto":
+        (warning,) = scan_map.warnings
+        assert warning.startswith("the floors face 90 deg away from z, which is taken for up (furniture +")
+        assert warning.endswith("; set up=-y, or turn the scan by tools/align_gravity.py")
+    else:
+        assert scan_map.warnings == ()
 
-        def show(values, total, label, readings=readings):
-            readings.append(label)
-            return values
 
-        scan_map = prepare_map(dataclasses.replace(lying, show=show), Workers(2), up)
-        counts.append((len(readings), np.array_equal(scan_map.R_map_from_world, LEVEL)))
-    assert counts == [(2, False), (1, True)]
+def test_the_files_own_axis_is_up_unless_they_disagree():
+    lying, _ = _lying(rotation_to_z(np.array([0.0, 1.0, 0.0])).T)
+    (source,) = lying.sources
+    y_up = dataclasses.replace(lying, sources=[source._replace(up="y")])
+    scan_map = prepare_map(y_up, Workers(2))
+    np.testing.assert_array_equal(scan_map.R_map_from_world @ [0.0, 1.0, 0.0], [0.0, 0.0, 1.0])
+    assert scan_map.warnings == ()
+    assert (y_up.up, y_up.read().up) == ("y", "y")
+    assert dataclasses.replace(lying, sources=[source, source._replace(up="y")]).up == "z"
 
 
 def _write_text(path, raw, decimals=6):

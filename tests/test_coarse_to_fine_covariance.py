@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rooms
+from measuring.repeated import REPEATED_KINDS, make_repeated
 from rooms import as_panorama, errors, query
 
 from piccolo.cloud import stream_of
@@ -16,7 +17,6 @@ from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.geometry.pose import exp_so3, log_so3, step
 from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers
-from piccolo.scenes.synthetic.repeated import REPEATED_KINDS, make_repeated
 from piccolo.scenes.synthetic.world import World, make_query, scan_world
 
 SETTINGS = CoarseToFineSettings(gravity="known")

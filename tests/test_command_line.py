@@ -121,7 +121,6 @@ def test_a_warning_is_written_once_whenever_it_comes(monkeypatch, capsys, quiet)
         return SimpleNamespace(name="a", warnings=("early", "late"), prepared=prepared)
 
     monkeypatch.setattr(localize.Localizer, "open_scan", opened)
-    monkeypatch.setattr(localize, "is_first_use", lambda: False)
     run = localize.prepare_run(parse(build_parser(), [*ONE, *["--quiet"] * quiet]))
     assert localize.open_scan(run, run.localizer, 1).warnings == ("early", "late")
     assert capsys.readouterr().err == ("" if quiet else "warning: early\nwarning: late\n")

@@ -7,6 +7,7 @@ import naive
 import numpy as np
 import pytest
 import rooms
+from measuring.damage import occluded, outside_field
 
 from piccolo.coarse_to_fine.comparison import (
     CONTRADICTS,
@@ -27,7 +28,6 @@ from piccolo.optimize.channel_loss import BLOCK_RINGS, CHANCE, NUM_BLOCKS
 from piccolo.panorama import Panorama
 from piccolo.panorama.texels import pack_texels
 from piccolo.runtime.threads import Workers
-from piccolo.scenes.synthetic.damage import occluded, outside_field
 
 WIDTH = rooms.WIDTH
 TILTED = exp_so3(np.array([0.4, -1.1, 0.7]))

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 import rooms
-
-from piccolo.geometry.sphere import pixel_rays, solid_angles
-from piccolo.scenes.synthetic.damage import (
+from measuring.damage import (
     MOST_RADIUS,
     occluded,
     outside_field,
     unevenly_lit,
     without_texture,
 )
+
+from piccolo.geometry.sphere import pixel_rays, solid_angles
 from piccolo.scenes.synthetic.room import PLAIN
 
 WIDTH = 256

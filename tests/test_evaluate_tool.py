@@ -1,5 +1,6 @@
 """tools/evaluate.py over scenes: run, stopped, taken up again, in several processes, compared."""
 
+import hashlib
 import json
 import os
 import shutil
@@ -12,9 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from poses import result, write_results
 from rooms import write_room
 
 from piccolo.cli import evaluate
+from piccolo.panorama import picture
+from piccolo.result import Source
+from piccolo.runtime import memory
 from piccolo.scenes.evaluation.runner import read_run
 from piccolo.scenes.scene import Query, read_scene, write_queries
 
@@ -102,6 +107,37 @@ def test_another_scene_of_the_same_name_does_not_go_into_the_same_file(scenes, t
     assert out.read_bytes() == before
 
 
+def test_results_of_localize_are_those_of_the_scene_s_cloud(scenes, tmp_path, capsys):
+    queries = read_scene(scenes / "room").queries
+    right = hashlib.sha256((scenes / "room" / "cloud.ply").read_bytes()).hexdigest()
+    lines = tmp_path / "poses.jsonl"
+    words = ["--scenes", str(scenes / "room"), "--results", str(lines)]
+
+    def run(digest, *more):
+        digests = (right, digest)
+        results = [
+            result(q.image, q.pose, source=Source(cloud_sha256=d))
+            for q, d in zip(queries, digests, strict=True)
+        ]
+        strangers = [result(name, queries[0].pose) for name in ("new\nline\udcff.jpg", "NUL\0.jpg")]
+        write_results(lines, [*strangers, *results] if more == ("strangers",) else results)
+        code = evaluate.main([*words, *(word for word in more if word != "strangers")])
+        return code, *capsys.readouterr()
+
+    assert run(right)[0] == 0
+    code, out, err = run("0" * 64)
+    assert (code, out) == (3, "")
+    assert "clean_1.jpg: found 1 of 2 results of another scan than" in err
+    code, out, err = run("0" * 64, "--force")
+    assert (code, "all 2 queries" in out) == (0, True)
+    assert "warning: found 1 of 2 results of another scan" in err
+    code, out, err = run(right, "strangers")
+    assert (code, "all 2 queries" in out) == (3, True)
+    first, second = err.splitlines()
+    assert r"evaluate.py: new\nline\udcff.jpg: found a result without a true pose" in first
+    assert r"NUL\x00.jpg: found a result without a true pose" in second
+
+
 @pytest.mark.parametrize("option", ["--csv", "--markdown", "--errors"])
 def test_no_output_replaces_an_input_or_another_output(scenes, tmp_path, capsys, option):
     truth = scenes / "room" / "queries.json"
@@ -157,6 +193,45 @@ def test_what_cannot_be_read_is_named_and_the_rest_done(scenes, tmp_path, capsys
     assert "clean_0.jpg: " in err
     assert [row.key for row in read_run(out)[0]] == [("room", "images/clean_1.jpg")]
     assert "| all | 1 |" in text
+
+
+def test_any_name_that_a_file_may_have_costs_its_own_line_at_most(scenes, tmp_path, capsys):
+    folder, out, csv = tmp_path / "room", tmp_path / "run.jsonl", tmp_path / "table.csv"
+    shutil.copytree(scenes / "room", folder)
+    document = json.loads((folder / "queries.json").read_text())
+    names = ["a\nb.jpg", os.fsdecode(b"caf\xe9.jpg")]
+    for query, name in zip(document["queries"], names, strict=True):
+        (folder / query["image"]).rename(folder / name)
+        query["image"] = name
+    document["queries"].append({**query, "image": "z" * 5000 + ".jpg"})
+    (folder / "queries.json").write_text(json.dumps(document))
+    assert _run(folder, out, "--csv", str(csv)) == 3
+    text, err = capsys.readouterr()
+    assert [row.key[1] for row in read_run(out)[0]] == names
+    assert (err.count("\n"), "File name too long" in err) == (1, True)
+    assert "| a\\nb.jpg |" in text
+    assert [line.split(",")[1] for line in csv.read_text().splitlines()[1:]] == [
+        "a\\nb.jpg",
+        "caf\\udce9.jpg",
+    ]
+    capsys.readouterr()
+    results = tmp_path / "poses.jsonl"
+    results.write_text("".join(f"{row.result.to_json()}\n" for row in read_run(out)[0]))
+    assert evaluate.main(["--scenes", str(folder), "--results", str(results)]) == 0
+
+
+def test_what_the_system_did_is_no_refusal_of_a_photo_without_an_answer(scenes, tmp_path, monkeypatch):
+    folder, out = tmp_path / "room", tmp_path / "run.jsonl"
+    shutil.copytree(scenes / "room", folder)
+    document = json.loads((folder / "queries.json").read_text())
+    for query in document["queries"]:
+        query["answerable"] = False
+    (folder / "queries.json").write_text(json.dumps(document))
+    with monkeypatch.context() as patched:
+        patched.setattr(picture, "check_memory", lambda *given: memory.check_memory(1e15, *given[1:]))
+        assert _run(folder, out) == 3
+    assert not out.exists()
+    assert _run(folder, out) == 0
 
 
 def _is_alive(group):

@@ -150,12 +150,14 @@ def test_colmap_has_a_camera_a_size_and_refuses_blanks_in_names(tmp_path):
     assert [words[2:] for words in cameras] == [["512", "256"] * 2, ["256", "128"] * 2]
     model = pycolmap.Reconstruction(str(tmp_path / "model"))
     assert {image.name: image.camera.width for image in model.images.values()} == {"a.jpg": 512, "b.jpg": 256}
-    narrow = "\u202f"  # macOS has this blank in names; COLMAP reads over it
-    export([result(f"my{narrow}ph\u00f6to.jpg", POSES[0])], "colmap", tmp_path / "narrow", SIZED)
-    (image,) = pycolmap.Reconstruction(str(tmp_path / "narrow")).images.values()
-    assert image.name == f"my{narrow}ph\u00f6to.jpg"
-    with pytest.raises(InputError, match="can't read ' ' in a name"):
-        export([result("my photo.jpg", POSES[0])], "colmap", tmp_path / "other", SIZED)
+    # macOS has \u202f in names: COLMAP reads over it, but readers in Python end the name there
+    names = ["my photo.jpg", "ph\u00f6to.jpg", "my\u202fphoto.jpg"]
+    left_out = export([result(name, POSES[0]) for name in names], "colmap", tmp_path / "some", SIZED)
+    assert [left for reason in left_out.values() for left in reason] == [names[0], names[2]]
+    (image,) = pycolmap.Reconstruction(str(tmp_path / "some")).images.values()
+    assert image.name == names[1]
+    with pytest.raises(InputError, match=r"my photo\.jpg: colmap can't read ' ' in a name"):
+        export([result(names[0], POSES[0])], "colmap", tmp_path / "other", SIZED)
     assert not (tmp_path / "other").exists()
 
 

@@ -1,5 +1,7 @@
 """The command line of tools/export_poses.py, and which results it writes."""
 
+import csv
+import hashlib
 import json
 import os
 from dataclasses import replace
@@ -9,13 +11,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from poses import jpeg, lines_of, result, tilted_poses, write_results
+from PIL import Image
+from poses import SIZE, jpeg, lines_of, result, tilted_poses, write_results
 from refusals import mutated, read_or_refused
 
 from piccolo.cli import export_poses
 from piccolo.errors import InputError
-from piccolo.result import read_results
+from piccolo.result import Source, read_results
 from piccolo.runtime.atomic import check_output_folder, replacing_folder
+from piccolo.scenes.datasets.generic import _table
 from piccolo.scenes.export import FORMATS, select
 from piccolo.scenes.scene import Query, write_queries
 
@@ -131,6 +135,102 @@ def test_two_results_of_one_picture_are_refused_where_the_name_is_the_key(run, t
     assert run("--format", "csv", "--out", out, results=["3.jsonl"])[1]["poses"] == 2
 
 
+STRANGE = {
+    "p/new\nline.jpg": {"colmap", "potree"},
+    "p/a\ttab.jpg": {"colmap", "potree"},
+    "p/\udcff.jpg": {"colmap", "csv", "nerfstudio", "opensfm", "potree", "geojson"},
+    "p/b c.jpg": {"colmap"},
+    'p/q".jpg': {"potree"},
+    f"p/{'x' * 5000}.jpg": set(),
+    "=cmd|' !A1.jpg": {"colmap"},
+}  # names, and the formats that can't hold them
+
+
+@pytest.mark.parametrize("name", [name for name in FORMATS if name != "gpano"])
+def test_a_name_costs_at_most_its_own_picture(run, tmp_path, name):
+    results = [result(pano, POSES[0]) for pano in ("p/a.jpg", *STRANGE)]
+    write_results(tmp_path / "s.jsonl", results)
+    extra = ["--crs", "EPSG:32632"] if name in ("geojson", "gpx") else []
+    extra += ["--size", "64", "32"] if "size" in FORMATS[name].options else []
+    out = tmp_path / "out"
+    if not FORMATS[name].is_folder:
+        out.touch()
+    code, document, err = run("--format", name, "--out", out, *extra, results=["s.jsonl"])
+    left_out = [pano for pano, formats in STRANGE.items() if name in formats]
+    assert code == bool(left_out)
+    assert document["poses"] == len(results) - len(left_out)
+    assert sum(document["left_out"].values()) == len(left_out)
+    assert err.count("left out") == len(document["left_out"])
+    text = (out / "images.txt" if out.is_dir() else out).read_text(encoding="utf-8")
+    assert ("b c" in text) == (name in ("nerfstudio", "opensfm", "csv", "potree", "geojson", "gpx"))
+
+
+def test_a_reason_is_told_once_with_the_first_name(run, tmp_path):
+    write_results(tmp_path / "s.jsonl", [result(f"p/{k} \n.jpg", POSES[0]) for k in range(3)] + MIXED[:1])
+    words = ["--format", "colmap", "--size", "64", "32", "--out", tmp_path / "out"]
+    code, document, err = run(*words, results=["s.jsonl"])
+    assert (code, document["poses"]) == (1, 1)
+    why = r"left out 3, the first p/0 \n.jpg: colmap can't read ' ' in a name: rename the picture"
+    assert err.splitlines() == [f"export_poses.py: {why}"]
+
+
+def test_names_in_a_table_are_no_formulas_and_come_back(run, tmp_path):
+    names = ["=cmd|' !A1.jpg", "+1.jpg", "-1.jpg", "@a.jpg", "'a.jpg", "p/=a.jpg", 'two\nlines, "q".jpg']
+    write_results(tmp_path / "s.jsonl", [result(name, POSES[0], cloud="=b.ply") for name in names])
+    assert run("--format", "csv", "--out", tmp_path / "poses.csv", results=["s.jsonl"])[0] == 0
+    with (tmp_path / "poses.csv").open(newline="") as file:
+        cells = [row["image"] for row in csv.DictReader(file)]
+    assert cells == [*(f"'{name}" for name in names[:5]), *names[5:]]
+    assert [row["image"] for row in _table(tmp_path / "poses.csv")] == names
+
+
+def test_a_picture_stored_turned_is_left_out(run, tmp_path):
+    (tmp_path / "p").mkdir()
+    for name, orientation, size in (("a", 1, (64, 32)), ("b", 6, (32, 64)), ("c", 3, (64, 32))):
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        Image.new("RGB", size).save(tmp_path / "p" / f"{name}.jpg", exif=exif)
+    write_results(tmp_path / "s.jsonl", [result(tmp_path / "p" / f"{n}.jpg", POSES[0]) for n in "abc"])
+    for name in ("nerfstudio", "opensfm", "colmap"):
+        words = ["--format", name, "--out", tmp_path / name]
+        code, document, err = run(*words, results=["s.jsonl"])
+        assert (code, document["poses"]) == (1, 1)
+        assert "b.jpg: found it stored turned (EXIF orientation 6), wanted it upright" in err
+        words = ["--format", name, "--out", tmp_path / f"{name}-sized", "--size", "64", "32"]
+        assert run(*words, results=["s.jsonl"])[1]["poses"] == 3
+
+
+def test_one_png_among_jpegs_is_left_out_of_gpano(run, tmp_path):
+    (tmp_path / "p").mkdir()
+    jpeg(tmp_path / "p" / "a.jpg")
+    Image.new("RGB", SIZE).save(tmp_path / "p" / "b.png")
+    names = ("a.jpg", "b.png", "gone.jpg")
+    write_results(tmp_path / "s.jsonl", [result(tmp_path / "p" / name, POSES[0]) for name in names])
+    code, document, err = run("--format", "gpano", "--out", tmp_path / "out", results=["s.jsonl"])
+    assert (code, document["poses"], len(document["left_out"])) == (1, 1, 2)
+    assert "b.png: no JPEG" in err
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.jpg"]
+
+
+def test_results_of_another_content_of_the_cloud_are_refused(run, tmp_path):
+    cloud = tmp_path / "a.ply"
+    cloud.write_bytes(b"a scan")
+    right, wrong = (hashlib.sha256(content).hexdigest() for content in (b"a scan", b"another"))
+    sources = [Source(cloud_sha256=digest) for digest in (right, wrong, None)]
+    panos = [f"{k}.jpg" for k in range(3)]
+    results = [result(p, POSES[0], cloud=str(cloud), source=s) for p, s in zip(panos, sources, strict=True)]
+    write_results(tmp_path / "s.jsonl", results)
+    words = ["--format", "csv", "--out", tmp_path / "p.csv", "--cloud", cloud]
+    code, _, err = run(*words, results=["s.jsonl"])
+    assert code == 3
+    assert f"1.jpg: found 1 of 3 results of another scan than {cloud}, the first of {cloud}" in err
+    code, document, err = run(*words, "--force", results=["s.jsonl"])
+    assert (code, document["poses"]) == (0, 3)
+    assert "found 1 of 3 results of another scan" in err
+    code, document, err = run(*words[:4], results=["s.jsonl"])
+    assert "poses in 3 clouds are taken as in one coordinate system" in err
+
+
 DOCUMENT = json.loads(MIXED[0].to_json())
 DAMAGED = {
     "no JSON": "{",
@@ -143,7 +243,6 @@ DAMAGED = {
     "mirrored": json.dumps(DOCUMENT | {"R_cam_from_world": np.diag([1.0, 1.0, -1.0]).tolist()}),
     "NaN": json.dumps(DOCUMENT | {"R_cam_from_world": np.full((3, 3), np.nan).tolist()}),
     "number as name": json.dumps(DOCUMENT | {"pano": 7}),
-    "line break in a name": json.dumps(DOCUMENT | {"pano": "a\nb.jpg"}),
     "half a character": json.dumps(DOCUMENT | {"pano": "\ud800.jpg"}),
     "infinite score": json.dumps(DOCUMENT | {"evidence": DOCUMENT["evidence"] | {"score": float("inf")}}),
     "confidence in words": json.dumps(DOCUMENT | {"confidence": "high"}),

@@ -4,6 +4,7 @@ import errno
 import hashlib
 import os
 
+import numpy as np
 import pytest
 from rooms import scan_map
 
@@ -21,8 +22,10 @@ def _full(*_):
 @pytest.fixture
 def facts(tmp_path, monkeypatch):
     folder = tmp_path / "facts"
-    folder.mkdir(mode=0o700)
+    for each in (folder, tmp_path / "maps"):
+        each.mkdir(mode=0o700)
     monkeypatch.setattr(file_facts, "private_folder", lambda *_: folder)
+    monkeypatch.setattr(map_file, "private_folder", lambda *_: tmp_path / "maps")
     return folder
 
 
@@ -96,3 +99,30 @@ def test_a_map_is_checked_once_by_who_remembers_it(facts, tmp_path, monkeypatch)
     path.write_bytes(content)
     with pytest.raises(InputError, match="damaged"):
         map_file.load_map(path, remembers=True)
+
+
+@pytest.mark.parametrize("how", ["cut off", "overwritten", "removed"])
+@pytest.mark.parametrize("is_kept", [False, True])
+def test_a_map_in_memory_stays_as_it_was_whatever_becomes_of_its_file(facts, tmp_path, is_kept, how):
+    """Mapped as it is, a file cut off would kill this process."""
+    path = tmp_path / "a.map"
+    save_map(scan_map(1), path)
+    loaded = map_file.load_map(path, remembers=is_kept)
+    if how == "cut off":
+        os.truncate(path, 4096)
+    elif how == "overwritten":
+        path.write_bytes(np.random.default_rng(0).bytes(path.stat().st_size))
+    else:
+        path.unlink()
+    np.testing.assert_array_equal(loaded.octree.nodes, scan_map(1).octree.nodes)
+    np.testing.assert_array_equal(loaded.wide_features, scan_map(1).wide_features)
+    assert len(list((facts.parent / "maps").glob("*.piccolo-map"))) == is_kept
+
+
+def test_a_damaged_map_leaves_no_copy(facts, tmp_path):
+    path = tmp_path / "a.map"
+    save_map(scan_map(1), path)
+    os.truncate(path, path.stat().st_size - 1)
+    with pytest.raises(InputError, match="damaged"):
+        map_file.load_map(path, remembers=True)
+    assert not list((facts.parent / "maps").glob("*.piccolo-map"))

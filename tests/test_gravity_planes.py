@@ -1,19 +1,11 @@
-"""Dominant planes, what they are called, up as they agree on it, and the walls' direction."""
+"""Dominant planes, the vertical by them near what is said, and the walls' direction."""
 
 import numpy as np
 import pytest
 
-from piccolo.geometry.pose import exp_so3, yaw_rotation
-from piccolo.gravity.planes import (
-    Plane,
-    PointNormals,
-    classify_planes,
-    estimate_normals,
-    manhattan_yaw,
-    ransac_planes,
-    refine_up,
-)
-from piccolo.gravity.up import rotation_to_z_up
+from piccolo.geometry.pose import exp_so3, rotation_to_z, yaw_rotation
+from piccolo.gravity.alignment import level, wall_yaw
+from piccolo.gravity.planes import Planes, estimate_normals, ransac_planes
 
 TURN = exp_so3(np.array([0.7, -1.9, 0.5]))
 UP = TURN[:, 2]
@@ -41,82 +33,63 @@ def hut():
     return estimate_normals((np.concatenate(parts) @ TURN.T + [7.0, -3.0, 2.0]).astype(np.float32))
 
 
-def test_every_plane_is_found_and_called_by_its_name(hut):
-    planes = classify_planes(ransac_planes(hut), hut, UP)
-    assert [plane.num_inliers for plane in planes] == sorted((p.num_inliers for p in planes), reverse=True)
-    kinds = [plane.kind for plane in planes]
-    assert sorted(kinds) == ["ceiling", "floor", "platform", "slanted", "wall", "wall"]
-    height_of_origin = float(UP @ [7.0, -3.0, 2.0])
-    for kind, height in (("floor", 0.0), ("platform", 0.8), ("ceiling", 2.5)):
-        plane = planes[kinds.index(kind)]
-        np.testing.assert_allclose(plane.normal_world, UP, atol=0.003)
-        assert plane.offset == pytest.approx(height + height_of_origin, abs=0.02)
-        assert 0.002 < plane.rms < 0.005
-    assert sum(plane.fraction for plane in planes) == pytest.approx(1.0, abs=0.1)
-    assert planes[0].num_inliers == pytest.approx(24 * 400, rel=0.05)
+def test_every_plane_is_found_the_largest_first(hut):
+    planes = ransac_planes(hut)
+    assert (np.diff(planes.areas) <= 0.0).all()
+    assert planes.areas.sum() == pytest.approx(1.0, abs=0.1)
+    sines = np.abs(planes.normals @ UP)
+    assert [np.count_nonzero(sines > 0.999), np.count_nonzero(sines < 0.03), len(sines)] == [3, 2, 6]
+    heights = (planes.centers[sines > 0.999] - [7.0, -3.0, 2.0]) @ UP
+    np.testing.assert_allclose(sorted(heights), [0.0, 0.8, 2.5], atol=0.02)
 
 
-def test_names_turn_over_with_up_and_noise_has_no_planes(hut):
-    kinds = [plane.kind for plane in classify_planes(ransac_planes(hut), hut, -UP)]
-    assert kinds[0] == "ceiling"
+def test_same_points_same_planes_and_noise_has_none(hut):
     a, b = ransac_planes(hut), ransac_planes(hut)
-    bits = [[(p.normal_world.tobytes(), p.offset, p.rms) for p in planes] for planes in (a, b)]
-    assert bits[0] == bits[1]
+    assert all(own.tobytes() == other.tobytes() for own, other in zip(a, b, strict=True))
     points = np.random.default_rng(2).uniform(-3.0, 3.0, (9000, 3)).astype(np.float32)
-    assert ransac_planes(estimate_normals(points)) == []
-    assert ransac_planes(estimate_normals(points[:10])) == []
+    for few in (points, points[:10], points[:1]):
+        assert ransac_planes(estimate_normals(few)).normals.shape == (0, 3)
 
 
-def plane(normal, fraction=0.2, rms=0.003, kind="wall"):
-    return Plane(np.asarray(normal, float) / np.linalg.norm(normal), 1.0, 1000, fraction, rms, kind)
+def planes_of(*normals, areas=None):
+    normals = np.array(normals, float)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return Planes(normals, np.zeros_like(normals), np.array(areas or [1.0 / len(normals)] * len(normals)))
 
 
-def test_planes_correct_up_and_plumb_walls_count_more_than_uneven_ground(hut):
-    askew = exp_so3(np.array([0.004, 0.002, 0.0])) @ UP
-    refined, spread = refine_up(askew, ransac_planes(hut))
-    assert np.linalg.norm(refined - UP) < 0.001 < np.linalg.norm(askew - UP)
-    assert 0.0 < spread < 0.002
-    up = np.array([0.0, 0.01, 1.0]) / np.hypot(1.0, 0.01)
-    walls = [plane([1, 0, 0], 0.1), plane([0, 1, 0], 0.1)]
-    refined, spread = refine_up(up, [plane([0.0, 0.02, 1.0], 0.4, rms=0.1), *walls])
-    assert np.degrees(np.arccos(refined[2])) < 0.1
-    assert spread > 0.0
+@pytest.mark.parametrize("lean_deg", [0.5, 3.0, 14.0])
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_the_vertical_near_what_is_said_keeps_its_sense(hut, lean_deg, sense):
+    lean = exp_so3(np.radians(lean_deg) * np.array([0.6, 0.8, 0.0]))
+    found = level(ransac_planes(hut), sense * lean @ UP)
+    assert np.linalg.norm(found - sense * UP) < 0.002
 
 
-def test_what_has_no_say_changes_nothing():
-    up = np.array([0.0, 0.0, 1.0])
-    assert refine_up(up, [])[1] is None
-    for planes in ([plane([1, 0, 0.001])], [plane([1, 0, 1])]):
-        refined, spread = refine_up(up, planes)
-        np.testing.assert_array_equal(refined, up)
-        assert spread is None
-    refined, spread = refine_up(up, [plane([0.01, 0, 1])])
-    assert (refined[0] > 0.009, spread) == (True, None)
-    far = refine_up(up, [plane([0.03, 0.0, 1.0])])[0]  # 1.7 deg
-    np.testing.assert_array_equal(far, up)
+@pytest.mark.parametrize(
+    ("planes", "said"),
+    [
+        (planes_of([0, 0.002, 1], [1, 0, 0]), [0, 0, 1]),  # it fits within 0.2 deg
+        (planes_of([0, 0.5, 1], [1, 0, 0]), [0, 0, 1]),  # 27 deg off
+        (planes_of([1, 0, 0], [0, 1, 0]), [0, 0, 1]),  # no floor
+        (planes_of([0, 0.2, 1], [0, -0.2, 1], [1, 0, 1], [-1, 0, 1]), [0, 0, 1]),  # a roof
+    ],
+)
+def test_what_is_said_is_kept_where_no_vertical_is_near(planes, said):
+    np.testing.assert_array_equal(level(planes, np.array(said, float)), said)
 
 
 @pytest.mark.parametrize("azimuth_deg", [-170, -100, -46, -44, -1, 0, 30, 44, 46, 91, 179])
 def test_the_smallest_turn_puts_walls_along_the_axes(azimuth_deg):
     a = np.radians(azimuth_deg)
-    along = [plane([np.cos(a + k), np.sin(a + k), 0.0]) for k in (0.0, 0.5 * np.pi, 0.001)]
-    odd = plane([np.cos(a + 0.6), np.sin(a + 0.6), 0.0], 0.3)
-    R = rotation_to_z_up(UP)
-    scan = [Plane(R.T @ p.normal_world, 0.0, 10, p.fraction, 0.0, "wall") for p in [*along, odd]]
-    turn = manhattan_yaw(scan, R)
+    angles = [a, a + 0.5 * np.pi, a + 0.001, a + 0.6]
+    R = rotation_to_z(UP)
+    normals = np.array([[np.cos(b), np.sin(b), 0.0] for b in angles])
+    turn = wall_yaw(planes_of(*(normals @ R), areas=[0.2, 0.2, 0.2, 0.3]), R)
     assert -np.pi / 4 < turn <= np.pi / 4
-    normal = yaw_rotation(-turn) @ along[0].normal_world
-    assert np.abs(normal).max() == pytest.approx(1.0, abs=1e-5)
+    assert np.abs(yaw_rotation(-turn) @ normals[0]).max() == pytest.approx(1.0, abs=1e-5)
 
 
 def test_walls_at_45_degrees_turn_one_way_and_none_none():
-    assert manhattan_yaw([plane([1.0, 1.0, 0.0])], np.eye(3)) == pytest.approx(np.pi / 4)
-    assert manhattan_yaw([plane([1.0, -1.0, 0.0])], np.eye(3)) == pytest.approx(np.pi / 4)
-    assert manhattan_yaw([plane([0, 0, 1], kind="floor")], np.eye(3)) is None
-
-
-def test_estimate_normals_too_few_points_have_no_reach():
-    found = estimate_normals(np.zeros((5, 3), np.float32))
-    assert isinstance(found, PointNormals)
-    assert not found.is_flat.any()
-    assert found.neighborhood_radius == np.inf
+    assert wall_yaw(planes_of([1, 1, 0]), np.eye(3)) == pytest.approx(np.pi / 4)
+    assert wall_yaw(planes_of([1, -1, 0]), np.eye(3)) == pytest.approx(np.pi / 4)
+    assert wall_yaw(planes_of([0, 0, 1]), np.eye(3)) is None

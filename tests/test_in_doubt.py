@@ -31,7 +31,8 @@ def _run(monkeypatch, matched, searches, gravity="auto", config=METHOD):
 
     monkeypatch.setattr(method, "apply_prior", lambda *_: scan_map)
     settings = CoarseToFineSettings(gravity=gravity)
-    query = SimpleNamespace(**vars(QUERY), matches=None, settings=settings, colors=None, soon_needed=list)
+    own = {"matches": None, "settings": settings, "colors": None, "soon_needed": list}
+    query = SimpleNamespace(**vars(QUERY) | own)
     query.method = config
     monkeypatch.setattr(method, "prepare_query", lambda *_: query)
     monkeypatch.setattr(method, "first_query", lambda query: query)

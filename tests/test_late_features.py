@@ -2,14 +2,13 @@
 
 import threading
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import rooms
 
 from piccolo.cloud.settings import IN_METRES
-from piccolo.coarse_to_fine import late_features, open_map, scan_map
+from piccolo.coarse_to_fine import open_map, scan_map
 from piccolo.coarse_to_fine.late_features import LateFeatures
 from piccolo.coarse_to_fine.map_file import load_map, save_map
 from piccolo.coarse_to_fine.open_map import CachePolicy
@@ -91,17 +90,6 @@ def test_where_they_can_not_be_kept_they_are_there_all_the_same(opened, finding,
     monkeypatch.setattr(open_map, "save_map", lambda *_: (_ for _ in ()).throw(OSError(28, "full")))
     assert len(found.features_now(WORKERS).points) > 1000
     assert opened().lacks_features
-
-
-def test_unfinished_work_is_told_by_its_key_and_removed(monkeypatch):
-    finished = []
-    monkeypatch.setattr(
-        late_features, "Unfinished", lambda key: SimpleNamespace(finish=lambda: finished.append(key))
-    )
-    late = LateFeatures(lambda workers: workers.work)
-    late.keep_by(lambda: None, lambda made: None, "a key")
-    assert late.get(WORKERS).finish.__name__ == "<lambda>"
-    assert finished == ["a key"]
 
 
 def test_a_map_file_without_them_makes_them_too(tmp_path, finding):

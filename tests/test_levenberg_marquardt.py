@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 
@@ -49,3 +51,16 @@ def test_descent_arrives_and_takes_no_step_up():
     assert max(losses) == 100.0
     assert len(losses) < 60
     assert len(np.empty(NUM_SUMS)) == 29
+
+
+def test_a_start_without_a_loss_takes_no_step():
+    calls = []
+
+    def equations(problem, R, t, sums):
+        sums[:] = np.nan
+        calls.append(t.copy())
+
+    R, t = np.eye(3), np.ones(3)
+    assert levenberg_marquardt(equations)(None, 9, 1e-7, R, t) == math.inf
+    np.testing.assert_array_equal(calls, [np.ones(3)])
+    np.testing.assert_array_equal(R, np.eye(3))

@@ -9,7 +9,7 @@ import pytest
 import rooms
 
 from piccolo.coarse_to_fine.localize import localize, matched_poses
-from piccolo.coarse_to_fine.prior import is_allowed
+from piccolo.coarse_to_fine.prior import contradictions
 from piccolo.coarse_to_fine.query import prepare_query
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings, Prior
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
@@ -125,23 +125,42 @@ def test_noise_has_no_pose_that_many_matches_agree_with():
     assert poses_of(flat.matches, None, 6, Workers(2)) == []
 
 
-def test_only_poses_that_the_prior_allows_are_refined():
-    query, world = _query(1), rooms.query(1).pose
+def test_poses_that_contradict_a_prior_are_told():
+    scan_map, world = rooms.scan_map(1), rooms.query(1).pose
     x, y, z = world.center_world
     heading = np.degrees(np.arctan2(*world.R_cam_from_world[0, :2]))
-    for prior, holds in (
-        (Prior(), True),
-        (Prior(near_world=(x, y, z), radius=0.5), True),
-        (Prior(near_world=(x + 1.4, y, None), radius=0.5), False),
-        (Prior(height=(z - 0.3, z + 0.3)), True),
-        (Prior(height=(z + 1.0, z + 1.2)), False),
-        (Prior(heading_deg=heading + 15.0), True),
-        (Prior(heading_deg=heading + 25.0), False),
+    for prior, wrong in (
+        (Prior(), ""),
+        (Prior(near_world=(x + 0.55, y, z), radius=0.5), ""),
+        (
+            Prior(near_world=(x + 1.4, y, None), radius=0.5),
+            "is 1.40 m from the place given, not within 0.5 m",
+        ),
+        (Prior(height=(z - 0.3, z + 0.3)), ""),
+        (Prior(height=(z + 1.0, z + 1.2)), "m above the floor, not"),
+        (Prior(heading_deg=heading + 24.0), ""),
+        (Prior(heading_deg=heading + 27.0), "looks 27 deg away from the heading given, more than 20 deg"),
     ):
-        asked = replace(query, settings=CoarseToFineSettings(gravity="known", prior=prior))
-        poses = matched_poses(asked)
-        assert all(is_allowed(query.scan_map, pose, prior) for pose in poses)
-        assert any(rooms.errors(pose, _true_pose(1))[0] < 0.1 for pose in poses) == holds
+        told = contradictions(scan_map, _true_pose(1), prior)
+        assert len(told) == bool(wrong)
+        assert wrong in "".join(told)
+
+
+def test_matches_beyond_a_prior_are_asked_too():
+    query, world = _query(1), rooms.query(1).pose
+    x, y, _ = world.center_world
+    prior = Prior(near_world=(x + 1.4, y, None), radius=0.5)
+    poses = matched_poses(replace(query, settings=CoarseToFineSettings(gravity="known", prior=prior)))
+    assert any(rooms.errors(pose, _true_pose(1))[0] < 0.1 for pose in poses)
+
+
+def test_a_prior_that_excludes_the_place_makes_no_pose_sure():
+    x, y, _ = rooms.query(1).pose.center_world
+    prior = Prior(near_world=(x + 1.4, y, None), radius=0.5)
+    settings = CoarseToFineSettings(gravity="known", prior=prior)
+    result = localize(rooms.scan_map(1), rooms.scene(1)[1], settings, Workers(2), Stopwatch())
+    assert result.status == "not_localized"
+    assert "from the place given, not within 0.5 m" in result.warnings[-1]
 
 
 def test_without_features_the_search_finds_the_pose():

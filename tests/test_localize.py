@@ -1,11 +1,14 @@
 """The command line, in processes of its own where signals and streams matter."""
 
+import contextlib
 import json
 import os
+import pty
 import re
 import signal
 import subprocess
 import sys
+import termios
 from pathlib import Path
 
 import cv2
@@ -143,6 +146,7 @@ def test_panorama_from_elsewhere_exits_with_one(scene, tmp_path, capsys):
     [
         (["--threads", "0"], 2, "--threads: found 0, wanted at least 1"),
         (["--scale", "-1"], 2, "--scale: found -1.0"),
+        (["--heading-tolerance", "9"], 2, "--heading-tolerance: only with --heading or --priors"),
         (["--preset", "paper", "--num-translations", "0"], 2, "num_translations: found 0"),
         (["--num-translations", "9"], 2, "--num-translations: not an option of the preset default"),
         (["--preset", "paper", "--near", "0", "0", "0"], 2, "--near: not an option of the preset paper"),
@@ -150,7 +154,7 @@ def test_panorama_from_elsewhere_exits_with_one(scene, tmp_path, capsys):
         (["--preset", "paper", "--gravity", "auto"], 2, "gravity: found auto"),
         (["--near", "0", "0", "0"], 2, "--near, --radius: found one of them"),
         (["--height", "2", "1"], 2, "--height: found [2.0, 1.0]"),
-        (["--heading-tolerance", "0"], 2, "--heading-tolerance: found 0.0"),
+        (["--heading", "1", "--heading-tolerance", "0"], 2, "--heading-tolerance: found 0.0"),
         (["--max-starts", "0"], 2, "max_starts: found 0"),
         (["--num-yaws", "1000000"], 2, "num_yaws: found 1000000, wanted 1 to 3600"),
         (["--near", "nan", "0", "0", "--radius", "1"], 2, "found nan or inf, wanted finite numbers"),
@@ -225,13 +229,20 @@ def _process(arguments, **options):
 def test_a_signal_leaves_nothing_half_written(scene, tmp_path, number, code, word):
     out = tmp_path / "pose.json"
     arguments = _arguments(scene, "--out", str(out))
-    process = _process([*arguments, *PAPER, "--num-translations", "5000"], cwd=tmp_path)
-    process.stderr.read(1)  # the bar of the search: imports are over
-    process.send_signal(number)
-    _, err = process.communicate(timeout=60)
+    terminal, stderr = pty.openpty()
+    termios.tcsetwinsize(terminal, (24, 80))
+    command = [sys.executable, str(ROOT / "localize.py"), *arguments, *PAPER, "--num-translations", "5000"]
+    with subprocess.Popen(command, stderr=stderr, cwd=tmp_path) as process:
+        os.close(stderr)
+        err = os.read(terminal, 1)  # the bar of the search, which a terminal gets: imports are over
+        process.send_signal(number)
+        with contextlib.suppress(OSError):  # the end
+            while part := os.read(terminal, 4096):
+                err += part
+    os.close(terminal)
     assert process.returncode == code
-    assert "Traceback" not in err
-    assert f"localize.py: ended by {word} after 0 results" in err
+    assert b"Traceback" not in err
+    assert f"localize.py: ended by {word} after 0 results".encode() in err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -247,9 +258,9 @@ def test_first_use_is_announced_and_two_processes_may_share_it(scene, tmp_path):
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
     first, second = (_process([*_arguments(scene), *PAPER], env=environment) for _ in range(2))
     try:
-        assert any("first use: compiling kernels" in line for line in first.stderr)
+        assert any("compiling kernels, once" in line for line in first.stderr)
         first.send_signal(signal.SIGSTOP)
-        assert any("first use: compiling kernels" in line for line in second.stderr)
+        assert any("compiling kernels, once" in line for line in second.stderr)
     finally:
         first.send_signal(signal.SIGCONT)
     poses = [json.loads(process.communicate(timeout=120)[0])["center_world"] for process in (first, second)]

@@ -106,7 +106,7 @@ def test_a_tilted_wide_photo_is_found_by_its_gravity(tmp_path):
     assert distance < 0.02
     assert np.degrees(angle) < 0.5
     (mount,) = result.cameras
-    assert mount.camera.params == pytest.approx(camera.params)
+    assert mount.camera.params == pytest.approx(camera.params, rel=0.01)  # its focal length is fitted
 
 
 def test_arrays_of_photos_need_a_camera():

@@ -8,6 +8,7 @@ import pytest
 from plyfile import PlyData
 from rooms import errors, write_room
 
+from piccolo.batch.localizer import Localizer
 from piccolo.cli import localize, prepare_map
 from piccolo.cloud.label_colors import Labels
 from piccolo.cloud.settings import CloudSettings
@@ -17,7 +18,7 @@ from piccolo.errors import InputError
 from piccolo.panorama import ReadOptions
 from piccolo.paper.settings import PaperSettings
 from piccolo.result import Result
-from piccolo.scenes.evaluation.runner import Failure, Job, JobRunner, RunConfig
+from piccolo.scenes.evaluation.runner import Failure, Job, JobRunner
 from piccolo.scenes.scene import read_scene
 from piccolo.scenes.synthetic.room import LABEL_NAMES
 
@@ -108,7 +109,7 @@ def test_evaluation_takes_the_pictures_of_labels(scene):
     labels = Labels()
     settings = CoarseToFineSettings(max_starts=100)
     reading = CloudSettings(labels=labels), ReadOptions(labels=labels)
-    config = RunConfig(settings, *reading, CachePolicy(False), 2)
+    config = Localizer((), settings, *reading, CachePolicy(False), num_threads=2)
     here = read_scene(scene)
     (row,) = JobRunner(config)(Job(here, here.queries))
     assert row.result.pano == str(here.queries[0].labels)

@@ -3,9 +3,13 @@
 import resource
 import tracemalloc
 
+import av
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
+from PIL.ExifTags import IFD, Base
+from PIL.PngImagePlugin import PngImageFile
 from rooms import as_panorama, query, room, scan_map
 
 from piccolo.cloud import octree, voxel_table
@@ -17,6 +21,8 @@ from piccolo.coarse_to_fine.search import search_poses
 from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.errors import InputError
 from piccolo.panorama import read_panorama
+from piccolo.panorama.photo import photo_of
+from piccolo.panorama.video import frames_of
 from piccolo.runtime import memory
 from piccolo.runtime.threads import Workers
 
@@ -166,3 +172,32 @@ def test_all_that_grows_asks_first(monkeypatch, tmp_path):
     ):
         with pytest.raises(InputError, match=text):
             ask()
+
+
+def test_frames_of_a_video_are_asked_for_before_one_is_decoded(system, tmp_path):
+    path = tmp_path / "a.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=1)
+        stream.width, stream.height, stream.pix_fmt = 256, 128, "yuv420p"
+        frame = av.VideoFrame.from_ndarray(np.zeros((128, 256, 3), np.uint8), "rgb24")
+        for packet in (*stream.encode(frame), *stream.encode()):
+            container.mux(packet)
+    assert len(list(frames_of(path, 1.0, tmp_path))) == 1
+    memory.limit_memory(1.0 + 1e-5)
+    with pytest.raises(InputError, match=r"a.mp4: frames of 256 x 128 needs? .* make the video smaller"):
+        next(frames_of(path, 1.0, tmp_path))
+
+
+@pytest.mark.parametrize("is_behind", [False, True])
+def test_the_file_of_a_photo_tells_of_it_without_being_decoded(tmp_path, monkeypatch, is_behind):
+    exif = Image.Exif()
+    exif[IFD.Exif] = {Base.DateTimeOriginal: "2024:05:06 07:08:09"}
+    path = tmp_path / "a.png"
+    Image.new("RGB", (256, 128)).save(path, exif=exif)
+    content = path.read_bytes()
+    begin = content.index(b"eXIf") - 4
+    end = begin + 12 + int.from_bytes(content[begin : begin + 4])
+    if is_behind:
+        path.write_bytes(content[:begin] + content[end:-12] + content[begin:end] + content[-12:])
+    monkeypatch.setattr(PngImageFile, "load", lambda *_: pytest.fail("decoded"))
+    assert photo_of(path).capture_time == "2024-05-06T07:08:09"

@@ -1,10 +1,14 @@
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from piccolo.errors import InputError
 from piccolo.geometry import pose as poses
 
 VECTORS = [np.zeros(3), np.array([1e-9, 0, 0]), np.array([0.3, -0.2, 0.9]), np.array([0.0, 3.14159, 0.0])]
+
+DIRECTIONS = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda d: np.linalg.norm(d) > 1e-3)
 
 
 @pytest.mark.parametrize("w", VECTORS)
@@ -81,3 +85,23 @@ def test_rotations_are_checked_to_a_tolerance():
     for wrong in (R + 4e-4, R[::-1], np.full((3, 3), np.nan), R * 1e300, R[0], np.eye(4)):
         with pytest.raises(InputError, match="file: R is no rotation"):
             poses.checked_rotation(wrong, 1e-4, "file: R")
+
+
+@given(DIRECTIONS)
+def test_rotation_takes_the_direction_to_z_by_the_smallest_turn(direction):
+    direction = np.array(direction) / np.linalg.norm(direction)
+    R = poses.rotation_to_z(direction)
+    np.testing.assert_allclose(R @ direction, [0.0, 0.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) == pytest.approx(1.0)
+    smallest = np.arctan2(np.hypot(*direction[:2]), direction[2])
+    assert poses.angle_between(R, np.eye(3)) == pytest.approx(smallest, abs=1e-7)
+
+
+@pytest.mark.parametrize("tiny", [0.0, 1e-300, 1e-12])
+def test_rotation_near_the_poles(tiny):
+    np.testing.assert_allclose(poses.rotation_to_z(np.array([tiny, 0.0, 1.0])), np.eye(3), atol=2e-12)
+    R = poses.rotation_to_z(np.array([tiny, tiny, -1.0]))
+    np.testing.assert_allclose(R @ [0.0, 0.0, -1.0], [0.0, 0.0, 1.0], atol=2e-12)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) == pytest.approx(1.0)

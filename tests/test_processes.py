@@ -1,18 +1,22 @@
 """Items worked on in processes, some of which are killed."""
 
+import gc
 import os
 import queue
 import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from functools import partial
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import pytest
 
 from piccolo.errors import InputError
+from piccolo.runtime import processes as module
 from piccolo.runtime.processes import IN_FLIGHT, Processes
 from piccolo.runtime.tasks import Here, WorkerLostError
 
@@ -51,9 +55,9 @@ def _sleeping():
     return time.sleep
 
 
-def _outcome(pending):
+def _outcome(wait):
     try:
-        return pending.result()
+        return wait()
     except (InputError, WorkerLostError) as error:
         return f"{type(error).__name__}: {error}"
 
@@ -63,19 +67,19 @@ def test_values_come_in_order_and_a_killed_process_costs_one_at_most(tmp_path):
     expected = [k * k for k in range(12)]
     expected[5], expected[9] = lost, "InputError: nine"
     with closing(Processes(partial(_squares, tmp_path), 2)) as processes:
-        pairs = [(item, _outcome(pending)) for item, pending in processes.values(iter(range(12)))]
+        pairs = [(item, _outcome(wait)) for item, wait in processes.values(iter(range(12)))]
     assert pairs == list(enumerate(expected))
     (tmp_path / "seven").touch()
     here = Here(_squares(tmp_path)).values(iter([1, 9, 2]))
-    assert [_outcome(pending) for _, pending in here] == [1, "InputError: nine", 4]
+    assert [_outcome(wait) for _, wait in here] == [1, "InputError: nine", 4]
     assert list(here.finished()) == []
 
 
 def test_an_error_brings_its_traceback(tmp_path):
     with closing(Processes(partial(_squares, tmp_path), 1)) as processes:
-        ((_, pending),) = processes.values(iter([9]))
+        ((_, wait),) = processes.values(iter([9]))
         with pytest.raises(InputError, match="nine") as error:
-            pending.result()
+            wait()
     assert "in _square" in error.value.__notes__[0]
 
 
@@ -92,15 +96,15 @@ def test_few_items_are_under_way_and_one_awaited_keeps_nobody(tmp_path):
         pairs = iter(values)
         for item in (2, 3):  # each is answered before the next is there
             names.put(item)
-            found, pending = next(pairs)
-            assert (found, pending.result()) == (item, item * item)
+            found, wait = next(pairs)
+            assert (found, wait()) == (item, item * item)
         for item in range(10, 110):
             names.put(item)
         names.put(None)
-        _, pending = next(pairs)
-        assert pending.result() == 100
+        _, wait = next(pairs)
+        assert wait() == 100
         assert len(taken) <= 2 + IN_FLIGHT + 2
-        assert [pending.result() for _, pending in pairs] == [k * k for k in range(11, 110)]
+        assert [wait() for _, wait in pairs] == [k * k for k in range(11, 110)]
 
 
 def test_what_is_done_behind_the_last_value_taken_can_be_had(tmp_path):
@@ -108,13 +112,13 @@ def test_what_is_done_behind_the_last_value_taken_can_be_had(tmp_path):
         values = processes.values(iter([1, 2, 3, 4]))
         next(iter(values))
         values._pairs[2][1].result()  # the last; a process works in order
-        assert [(item, pending.result()) for item, pending in values.finished()] == [(2, 4), (3, 9), (4, 16)]
+        assert [(item, wait()) for item, wait in values.finished()] == [(2, 4), (3, 9), (4, 16)]
 
 
 def test_processes_have_their_threads_and_leave_signals_to_their_parent():
     with closing(Processes(_told, 1, num_threads=3)) as processes:
         names = ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"]
-        found = [pending.result() for _, pending in processes.values(iter(names))]
+        found = [wait() for _, wait in processes.values(iter(names))]
     assert found == [(os.environ.get(name, "3"), True, True) for name in names]
 
 
@@ -132,9 +136,34 @@ def test_the_first_process_of_all_leaves_signals_to_its_parent_too():
 )
 def test_what_cannot_be_opened_is_an_error(opening, message):
     with closing(Processes(opening, 1)) as processes:
-        ((_, pending),) = processes.values(iter([1]))
+        ((_, wait),) = processes.values(iter([1]))
         with pytest.raises(InputError, match=message):
-            pending.result()
+            wait()
+
+
+def _hanging(item):
+    """Leave the pipe, and hang in the exit."""
+    for thing in gc.get_objects():
+        if isinstance(thing, Connection):
+            thing.close()
+    time.sleep(60)
+
+
+def _hang():
+    return _hanging
+
+
+def test_one_that_hangs_in_its_exit_keeps_nobody_from_starting_another(monkeypatch):
+    monkeypatch.setattr(module, "GRACE", 3.0)
+    with closing(Processes(_hang, 1)) as processes, ThreadPoolExecutor(1) as pool:
+        ((_, wait),) = processes.values(iter([1]))
+        value = pool.submit(wait)
+        while not value.done():
+            assert processes._starting.acquire(timeout=2.0)
+            processes._starting.release()
+            time.sleep(0.01)
+        with pytest.raises(WorkerLostError, match="was killed by SIGKILL"):
+            value.result()
 
 
 def test_processes_end_with_a_parent_that_is_killed():

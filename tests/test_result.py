@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import os
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from piccolo.confidence.localization import Alternative
 from piccolo.confidence.score import Evidence
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3
-from piccolo.result import Result, Source, unreadable_result
+from piccolo.result import Result, Source, read_results, unreadable_result
 
 POSE = Pose(exp_so3(np.array([0.3, -0.2, 0.9])), np.array([500_000.123, 4_000_000.456, 12.0]))
 EVIDENCE = Evidence(0.7, 0.5, 0.8, 0.6, 0.9, 0.5)
@@ -54,7 +55,7 @@ def test_json_names_what_the_next_tool_needs_in_its_units():
     assert document["std_mm"] == pytest.approx([2.0, 3.0, 4.0])
     assert document["std_deg"] == pytest.approx([np.degrees(1e-3)] * 3)
     assert "R_true = exp([w]x) R_cam_from_world" in document["covariance_convention"]
-    assert document["format"] == "piccolo-pose/7"
+    assert document["format"] == "piccolo-pose/8"
     assert (document["storey"], document["height_above_floor_m"]) == (2, 1.51)
     T = np.array(document["T_world_from_cam"])
     np.testing.assert_allclose(T[:3, 3], RESULT.pose.center_world)
@@ -101,6 +102,18 @@ def test_unreadable_photo_has_a_reason_and_nothing_else():
     assert result.summary() == "b.jpg: unreadable\n  b.jpg: is empty"
 
 
+def test_any_name_that_a_file_may_have_comes_back_from_ascii(tmp_path):
+    names = ["a\nb\t.jpg", os.fsdecode(b"caf\xe9.jpg"), "\u2028\x7f.jpg", "x" * 5000, "nul\0.jpg"]
+    text = "".join(f"{dataclasses.replace(RESULT, pano=name).to_json()}\n" for name in names)
+    file = tmp_path / "poses.jsonl"
+    file.write_text(text, "ascii")
+    assert [os.fsencode(result.pano) for result in read_results([file])] == [os.fsencode(n) for n in names]
+    for name in ("half a character \ud83d", 7):
+        file.write_text(json.dumps(json.loads(RESULT.to_json()) | {"pano": name}))
+        with pytest.raises(InputError, match="wanted a file's name as"):
+            read_results([file])
+
+
 def test_source_comes_back():
     source = Source("0" * 64, "1" * 64, (2048, 1024), "2026-11-22T10:00:00+01:00")
     assert Result.from_json(dataclasses.replace(RESULT, source=source).to_json()).source == source
@@ -130,8 +143,8 @@ def test_nan_is_never_written():
 
 
 @pytest.mark.parametrize(
-    "text", ["{", "[]", "{}", '{"format": "piccolo-pose/3"}', '{"format": "piccolo-pose/7"}']
+    "text", ["{", "[]", "{}", '{"format": "piccolo-pose/3"}', '{"format": "piccolo-pose/8"}']
 )
 def test_other_text_is_refused(text):
-    with pytest.raises(InputError, match="piccolo-pose/7"):
+    with pytest.raises(InputError, match="piccolo-pose/8"):
         Result.from_json(text)

@@ -167,8 +167,8 @@ def test_the_best_pose_has_come_to_rest_and_is_still_the_best(monkeypatch):
 def test_what_speaks_for_poses_is_compared_with_the_best(monkeypatch):
     query = compared(monkeypatch, {0.0: 0.6, 3.0: 0.3}, {0.0: 9, 3.0: 4})
     best, other = standings.standings_of(query, at(0.0, 0.5), [at(3.0, 0.2)])
-    assert best == (1.0, 0.5, 9)
-    assert other == (pytest.approx(0.5), 0.2, 4)
+    assert best == (1.0, 0.5, 9, 0.0)
+    assert other == (pytest.approx(0.5), 0.2, 4, 0.0)
 
 
 def test_margin_is_the_lesser_of_two_leads_and_a_result_is_sure_by_three_things():

@@ -2,9 +2,11 @@ import multiprocessing
 import sys
 import threading
 import warnings
+from contextlib import ExitStack
 
 import pytest
 
+from piccolo.runtime import threads
 from piccolo.runtime.threads import Workers
 
 
@@ -80,3 +82,14 @@ def test_a_forked_process_has_threads_of_its_own():
         child.start()
     child.join(60)
     assert child.exitcode == 6
+
+
+def test_a_burst_of_callers_leaves_no_more_threads_than_the_cores_have_use_for(monkeypatch):
+    monkeypatch.setattr(threads, "num_cores", lambda: 2)
+    monkeypatch.setattr(threads, "_idle", {})
+    with ExitStack() as stack:
+        pools = [stack.enter_context(threads.pool_of(2)) for _ in range(5)]
+        assert [pool.submit(abs, -1).result() for pool in pools] == [1] * 5
+    assert len(threads._idle[2]) == 2
+    with threads.pool_of(2) as pool:
+        assert pool.submit(abs, -1).result() == 1

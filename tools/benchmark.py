@@ -1,137 +1,35 @@
 #!/usr/bin/env python3
-"""Kernel speed against named references, as ratios within one run."""
+"""Measure the method: its kernels, its parts, time and memory by size, and how far its confidences hold."""
 
 import argparse
-import time
-from collections.abc import Callable
-from pathlib import Path
+import sys
 
 import _checkout  # noqa: F401
-import cv2
-import numpy as np
-from numpy.typing import NDArray
+from measuring import ablation, calibration, confidence, kernels, scaling
 
-from piccolo.cli.command import command, option
-from piccolo.cli.errors import UsageError
-from piccolo.cloud import read_cloud
-from piccolo.cloud.soa import PackedPoints, pack_points
-from piccolo.cloud.voxels import morton_order
-from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose, yaw_rotation
-from piccolo.optimize.sampling_loss import sampling_equations, sampling_loss
-from piccolo.panorama import read_panorama
-from piccolo.panorama.texels import pack_texels
-from piccolo.runtime.threads import num_cores
+from piccolo.cli.errors import run_command
+from piccolo.cli.parser import HelpFormatter, add_run_options, new_parser
 
-EPILOG = """\
-example:
-  python tools/benchmark.py --cloud scan.ply --pano query.jpg
-
-Every kernel is timed once in each round, so that a disturbance hits all; ratios are of the medians.
-The reference is cv2.remap: 8-bit, 3 channels, bilinear, one thread, a coherent map, a pixel a point.
-"""
-
-Case = tuple[PackedPoints, NDArray[np.uint8], Pose]  # what is timed: points, image (H, W, 3), pose
+MODULES = kernels, scaling, ablation, confidence, calibration
+MEASUREMENTS = {module.__name__.rpartition(".")[2]: module for module in MODULES}
 
 
-def box_case(num_points: int, width: int) -> Case:
-    """Seeded points on the walls of a box, in Morton order, and a smooth image."""
-    rng = np.random.default_rng(0)
-    size = np.array([8.0, 6.0, 3.0])
-    points = rng.uniform(0.0, 1.0, (num_points, 3))
-    axis = rng.integers(0, 3, num_points)
-    points[np.arange(num_points), axis] = rng.integers(0, 2, num_points)
-    points = ((points - 0.5) * size).astype(np.float32)
-    colors = rng.integers(0, 256, (num_points, 3), dtype=np.uint8)
-    order = morton_order(points, colors)
-    noise = rng.integers(0, 256, (width // 2, width, 3), dtype=np.uint8)
-    rgb = np.asarray(cv2.GaussianBlur(noise, (0, 0), 2.0), dtype=np.uint8)
-    pose = Pose(yaw_rotation(0.7), np.array([0.5, -0.3, 0.1]))
-    return pack_points(points[order], colors[order]), rgb, pose
+def run(arguments: argparse.Namespace) -> int:
+    """Run the measurement asked for; returns the exit code."""
+    return int(MEASUREMENTS[arguments.measurement].run(arguments))
 
 
-def file_case(cloud_path: Path, pano_path: Path, num_points: int) -> Case:
-    """A user's cloud, `num_points` of it, and panorama, the camera at the middle of the cloud."""
-    cloud = read_cloud(cloud_path)
-    if len(cloud.points) < num_points:
-        raise InputError(f"{cloud_path}: found {len(cloud.points)} points, wanted --points {num_points}")
-    chosen = np.linspace(0, len(cloud.points) - 1, num_points).astype(np.int64)
-    pose = Pose(yaw_rotation(0.7), np.median(cloud.points, axis=0).astype(np.float64))
-    points = pack_points(cloud.points[chosen], cloud.colors[chosen])
-    return points, read_panorama(pano_path).rgb, pose
-
-
-def coherent_map(num_pixels: int, width: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """A smooth map of about `num_pixels` that runs over a whole image of `width` x width / 2."""
-    side = round(num_pixels**0.5)
-    u, v = np.meshgrid(np.linspace(4, width - 5, side), np.linspace(4, width // 2 - 5, side))
-    return (u + 3 * np.sin(v / 50)).astype(np.float32), (v + 3 * np.sin(u / 50)).astype(np.float32)
-
-
-def medians(contenders: dict[str, Callable[[], object]], num_rounds: int) -> dict[str, float]:
-    """Median seconds of each kernel over the rounds."""
-    seconds: dict[str, list[float]] = {name: [] for name in contenders}
-    for run in contenders.values():
-        run()  # compiles, and warms the caches
-    for _ in range(num_rounds):
-        for name, run in contenders.items():
-            begin = time.perf_counter()
-            run()
-            seconds[name].append(time.perf_counter() - begin)
-    return {name: float(np.median(values)) for name, values in seconds.items()}
-
-
-def run_kernels(case: Case, num_rounds: int) -> None:
-    """Print the table of the kernels."""
-    cv2.setNumThreads(1)
-    points, rgb, pose = case
-    texels = pack_texels(rgb)
-    map_u, map_v = coherent_map(len(points), rgb.shape[1])
-    seconds = medians(
-        {
-            "cv2.remap, 1 thread": lambda: cv2.remap(rgb, map_u, map_v, cv2.INTER_LINEAR),
-            "loss, 1 thread": lambda: sampling_loss(points, texels, pose, 1),
-            "loss, 2 threads": lambda: sampling_loss(points, texels, pose, 2),
-            "loss + gradient + normal matrix, 1 thread": lambda: sampling_equations(points, texels, pose, 1),
-            "loss + gradient + normal matrix, 2 threads": lambda: sampling_equations(points, texels, pose, 2),
-        },
-        num_rounds,
-    )
-    reference = map_u.size / seconds["cv2.remap, 1 thread"]
-    same = sampling_loss(points, texels, pose, 1) == sampling_loss(points, texels, pose, 2)
-    print(f"{len(points)} points, {rgb.shape[1]} x {rgb.shape[0]} image, {num_cores()} cores\n")
-    print("| kernel | Mpoint/s | of cv2.remap | of its one thread |")
-    print("|---|---:|---:|---:|")
-    for name, value in seconds.items():
-        count = map_u.size if name.startswith("cv2") else len(points)
-        alone = seconds[name.replace("2 threads", "1 thread")]
-        speed = count / value
-        print(f"| {name} | {speed / 1e6:.0f} | {speed / reference:.2f} | {alone / value:.2f} |")
-    print(f"\nsame bits with 1 and 2 threads: {'yes' if same else 'NO'}")
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """All options."""
-    option(parser, "--cloud FILE", "a scan (default: a box with seeded points)")
-    option(parser, "--pano FILE", "a panorama, with --cloud")
-    option(parser, "--points N", default=1_000_000)
-    option(parser, "--rounds N", "at least 7", default=15)
-
-
-@command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: argparse.Namespace) -> int:
-    """Make the case, time the kernels."""
-    if (arguments.cloud is None) != (arguments.pano is None):
-        raise UsageError("--cloud and --pano go together")
-    if arguments.rounds < 7 or arguments.points < 1000:
-        raise UsageError("wanted --rounds of at least 7 and --points of at least 1000")
-    if arguments.cloud:
-        case = file_case(arguments.cloud, arguments.pano, arguments.points)
-    else:
-        case = box_case(arguments.points, 2048)
-    run_kernels(case, arguments.rounds)
-    return 0
+def main(argv: list[str] | None = None) -> int:
+    """Run a command line, by default this program's; returns the exit code."""
+    parser = new_parser("benchmark", __doc__, "", "0 done, 1 a false answer")
+    subparsers = parser.add_subparsers(dest="measurement", required=True)
+    for name, module in MEASUREMENTS.items():
+        lines = {"help": module.__doc__, "description": module.__doc__, "epilog": module.EPILOG}
+        subparser = subparsers.add_parser(name, formatter_class=HelpFormatter, **lines)
+        module.add_arguments(subparser)
+        add_run_options(subparser)
+    return run_command(parser, argv, run)
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    sys.exit(main())

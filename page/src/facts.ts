@@ -63,7 +63,7 @@ export class Facts {
       "section",
       { class: "facts-head" },
       h("p", { class: `verdict ${photo.status}` }, badge(photo.status), text.status[photo.status]),
-      h("p", { class: "meaning" }, text.statusMeaning[photo.status]),
+      h("p", { class: "meaning" }, photo.pose && !photo.isOnPlan ? text.hopeless : text.statusMeaning[photo.status]),
       photo.pose
         ? h("div", { class: "confidence", title: text.confidenceHelp }, h("span", {}, text.confidence), h("b", {}, percent(photo.confidence)))
         : null,
@@ -167,7 +167,7 @@ export class Facts {
   }
 
   private about(photo: Photo): HTMLElement {
-    const rows: [string, string][] = [[text.file, photo.file]];
+    const rows: [string, string][] = [[text.file, photo.name]];
     if (photo.walk !== null) rows.push([text.walk, text.walkAt(photo.walk + 1, photo.time!.toFixed(1))]);
     if (photo.captured) rows.push([text.captured, photo.captured.replace("T", " ")]);
     if (photo.size) rows.push([text.size, `${photo.size[0]} × ${photo.size[1]}`]);

@@ -2,7 +2,7 @@
 import { h } from "./dom";
 import { badge } from "./marks";
 import type { Model } from "./model";
-import { shortName } from "./plan_painter";
+import { labelOf } from "./plan_painter";
 import { text } from "./text";
 import type { Photo } from "./types";
 
@@ -92,7 +92,7 @@ export class List {
       h(
         "div",
         { class: "row-text" },
-        h("div", { class: "row-name", title: photo.file }, shortName(photo.name)),
+        h("div", { class: "row-name", title: photo.name }, labelOf(photo)),
         h("div", { class: `row-status ${photo.status}` }, badge(photo.status), text.status[photo.status]),
         h("div", { class: "row-facts" }, this.facts(photo)),
       ),

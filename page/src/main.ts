@@ -6,8 +6,9 @@ import { List } from "./list";
 import { badge } from "./marks";
 import { type Mode, Model, type Sort } from "./model";
 import { Plan } from "./plan";
-import { shortName } from "./plan_painter";
+import { labelOf } from "./plan_painter";
 import { fillPrint } from "./print";
+import { download } from "./table";
 import { text } from "./text";
 import { STATUSES, type Report } from "./types";
 import { Viewer } from "./viewer";
@@ -31,8 +32,10 @@ function fillHead(): void {
   byId("skip").textContent = text.skip;
   const counts = STATUSES.map((status) => [status, report.photos.filter((photo) => photo.status === status).length] as const);
   byId("counts").replaceChildren(
-    ...counts.filter(([, count]) => count).map(([status, count]) => h("span", { class: `count ${status}` }, badge(status), `${count} ${text.status[status].toLowerCase()}`)),
+    ...counts.filter(([, count]) => count).map(([status, count]) => h("span", { class: `count ${status}` }, badge(status), String(count), h("span", { class: "count-word" }, text.status[status].toLowerCase()))),
   );
+  byId("note").textContent = text.note(report.note);
+  byId("note").hidden = !report.note;
   const theme = iconButton(isDark() ? "sun" : "moon", isDark() ? text.light : text.dark, () => {
     setTheme(isDark() ? "light" : "dark");
     theme.replaceChildren(icon(isDark() ? "sun" : "moon"));
@@ -101,7 +104,8 @@ function fillFilters(): void {
     relist();
   });
   storey.hidden = report.storeys.length < 2;
-  const sort = h("select", { "aria-label": text.sort }, ...Object.entries(text.sorts).map(([value, label]) => h("option", { value }, label)));
+  const sorts = Object.entries(text.sorts).filter(([value]) => value !== "taken" || report.photos.some((photo) => photo.captured));
+  const sort = h("select", { "aria-label": text.sort }, ...sorts.map(([value, label]) => h("option", { value }, label)));
   sort.addEventListener("change", () => {
     model.sort = sort.value as Sort;
     relist();
@@ -134,7 +138,7 @@ function fillFilters(): void {
     h("div", { class: "chips", role: "group", "aria-label": text.filters }, ...chips),
     h("div", { class: "selects" }, storey, sort),
     h("label", { class: "least" }, h("span", {}, text.minConfidence), least, shownLeast),
-    h("div", { class: "shown-row" }, shown, clear),
+    h("div", { class: "shown-row" }, shown, clear, iconButton("download", text.download, () => download(model))),
   );
 }
 
@@ -196,7 +200,7 @@ function fillViewerHead(): void {
   model.on("selected list", () => {
     const { photo } = model;
     const [at, count] = model.place;
-    name.replaceChildren(...(photo ? [badge(photo.status), shortName(photo.name)] : []));
+    name.replaceChildren(...(photo ? [badge(photo.status), labelOf(photo)] : []));
     name.className = photo?.status ?? "";
     place.textContent = at < 0 ? "" : text.of(at + 1, count);
     previous.disabled = at <= 0;
@@ -292,7 +296,7 @@ function onSelected(): void {
     if (wasViewing) byId("plan").focus();
     return;
   }
-  byId("announce").textContent = text.opened(shortName(photo.name), text.status[photo.status]);
+  byId("announce").textContent = text.opened(labelOf(photo), text.status[photo.status]);
   if (wasViewing) plan.reveal(photo);
 }
 

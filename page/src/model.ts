@@ -2,7 +2,7 @@
 import { STATUSES, type Photo, type Report, type Status } from "./types";
 
 export type Mode = "photo" | "blend" | "split" | "scan";
-export type Sort = "order" | "name" | "confidence" | "storey";
+export type Sort = "order" | "taken" | "name" | "confidence" | "storey";
 export interface View {
   /** Azimuth in the plan's frame, counterclockwise from +x, elevation, vertical field [rad]. */
   yaw: number;
@@ -71,6 +71,7 @@ export class Model {
     const storey = (index: number) => photos[index].storey ?? Number.MAX_SAFE_INTEGER;
     const orders: Record<Sort, (a: number, b: number) => number> = {
       order: (a, b) => a - b,
+      taken: (a, b) => takenAt(photos[a]) - takenAt(photos[b]),
       name: (a, b) => NAMES.compare(photos[a].name, photos[b].name),
       confidence: (a, b) => photos[a].confidence - photos[b].confidence,
       storey: (a, b) => storey(a) - storey(b),
@@ -109,6 +110,11 @@ export class Model {
     const order = photo && photo.walk !== null ? this.walks.get(photo.walk)! : this.listed;
     return [this.selected === null ? -1 : order.indexOf(this.selected), order.length];
   }
+}
+
+/** When a photo was taken, for comparing; what does not say so comes last. */
+export function takenAt(photo: Photo): number {
+  return photo.captured ? Date.parse(photo.captured) : Number.MAX_SAFE_INTEGER;
 }
 
 /** The azimuth at which the middle of a photo looks. */

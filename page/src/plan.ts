@@ -55,8 +55,8 @@ export class Plan extends PlanPainter {
         ys.push(b * u + d * v + f);
       }
     }
-    for (const { pose, storey } of this.model.report.photos) {
-      if (!pose || (plan && storey !== this.model.storey)) continue;
+    for (const { pose, storey, isOnPlan } of this.model.report.photos) {
+      if (!pose || !isOnPlan || (plan && storey !== this.model.storey)) continue;
       xs.push(pose.center[0] - 1, pose.center[0] + 1);
       ys.push(pose.center[1] - 1, pose.center[1] + 1);
     }
@@ -88,7 +88,7 @@ export class Plan extends PlanPainter {
 
   /** Bring a photo into the picture, if it is not well within. */
   reveal(photo: Photo): void {
-    if (!photo.pose || photo.storey !== this.model.storey) return;
+    if (!photo.pose || !photo.isOnPlan || photo.storey !== this.model.storey) return;
     const [x, y] = photo.pose.center;
     const at = this.toScreen(x, y);
     const { clientWidth: width, clientHeight: height } = this.canvas;
@@ -171,18 +171,15 @@ export class Plan extends PlanPainter {
     this.draw();
   }
 
-  /** The photo nearest to a point of the screen, if it is so near [px]. */
+  /** The photo nearest to a point of the screen, if it is so near [px]; of several at its place, the next. */
   private photoAt(at: Point, reach: number): number | null {
-    let nearest: number | null = null;
-    for (const index of this.shown()) {
-      const mark = this.markOf(index);
-      const distance = Math.hypot(mark.x - at.x, mark.y - at.y);
-      if (distance <= reach) {
-        reach = distance;
-        nearest = index;
-      }
-    }
-    return nearest;
+    const distance = (index: number) => Math.hypot(this.markOf(index).x - at.x, this.markOf(index).y - at.y);
+    const near = this.shown().filter((index) => distance(index) <= reach);
+    if (!near.length) return null;
+    const nearest = near.reduce((one, other) => (distance(other) < distance(one) ? other : one));
+    const stack = near.filter((index) => this.placeOf(index) === this.placeOf(nearest));
+    const next = stack.indexOf(this.model.selected ?? -1) + 1;
+    return next ? stack[next % stack.length] : nearest;
   }
 
   private key(event: KeyboardEvent): void {

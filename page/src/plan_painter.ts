@@ -1,10 +1,13 @@
 /** What the plan of a storey shows: the picture, walks, marks, names. */
 import { trace } from "./marks";
 import { ahead, type Model } from "./model";
+import { text } from "./text";
 import type { Photo, Status, Storey } from "./types";
 
 const MANY = 400; // photos in sight, of which only marks are drawn
 export const SMALL = 420; // px, width of a plan in a corner
+const SPOT = 0.15; // m, photos nearer than that are counted where they are
+const MARK = 6; // px, nearer than these, too
 const WEDGE_FROM = 9; // px a metre, from which headings are drawn
 const NAMES_FROM = 42; // px a metre, from which names are
 
@@ -56,7 +59,7 @@ export class PlanPainter {
   /** Photos of the list that lie on this storey. */
   protected shown(): number[] {
     const { photos } = this.model.report;
-    return this.model.listed.filter((index) => photos[index].pose && photos[index].storey === this.model.storey);
+    return this.model.listed.filter((index) => photos[index].isOnPlan && photos[index].storey === this.model.storey);
   }
 
   private image(): HTMLImageElement | null {
@@ -89,6 +92,24 @@ export class PlanPainter {
     for (const index of shown) if (index !== selected) this.paintMark(index, radius);
     if (selected !== null) this.paintSelected(selected, radius + 2);
     this.paintNames(shown, radius);
+    if (!isDense && !isSmall) this.paintCounts(shown, radius);
+  }
+
+  /** How many photos there are where several lie on each other. */
+  private paintCounts(shown: number[], radius: number): void {
+    const counts = new Map<string, number[]>();
+    for (const index of shown) counts.set(this.placeOf(index), [...(counts.get(this.placeOf(index)) ?? []), index]);
+    for (const [first, ...others] of counts.values()) {
+      const at = this.markOf(first);
+      if (others.length) this.label(`×${others.length + 1}`, at.x + radius + 16, at.y);
+    }
+  }
+
+  /** The place of a mark, which those that cover each other have in common. */
+  protected placeOf(index: number): string {
+    const [x, y] = this.model.report.photos[index].pose!.center;
+    const side = Math.min(SPOT, MARK / this.scale);
+    return `${Math.round(x / side)} ${Math.round(y / side)}`;
   }
 
   private paintGrid(): void {
@@ -171,7 +192,7 @@ export class PlanPainter {
     const at = this.markOf(index);
     const reach = radius * 3.6;
     const sector = this.sprite(`sector ${photo.status}`, 2 * reach, (own) =>
-      paintSector(own, { x: 0, y: 0 }, [0, 0.45, reach], this.statusColor(photo.status), 0.75),
+      paintSector(own, { x: 0, y: 0 }, [0, 0.45, reach], this.statusColor(photo.status), photo.status === "localized" ? 0.75 : 0.25),
     );
     context.save();
     context.translate(at.x, at.y);
@@ -199,10 +220,11 @@ export class PlanPainter {
     const size = 2 * (1.2 * grown + 3);
     const mark = this.sprite(`mark ${photo.status}`, size, (own) => {
       trace(own, photo.status, 0, 0, grown);
-      own.fillStyle = this.statusColor(photo.status);
+      const isSure = photo.status === "localized"; // a guess is hollow
+      own.fillStyle = isSure ? this.statusColor(photo.status) : `${this.color("halo")}b0`;
       own.fill();
       own.lineWidth = 2;
-      own.strokeStyle = this.color("halo");
+      own.strokeStyle = isSure ? this.color("halo") : this.statusColor(photo.status);
       own.stroke();
     });
     context.drawImage(mark, at.x - size / 2, at.y - size / 2, size, size);
@@ -225,7 +247,7 @@ export class PlanPainter {
   private paintSelected(index: number, radius: number): void {
     const { context, model } = this;
     const photo = model.report.photos[index];
-    if (!photo.pose) return;
+    if (!photo.pose || !photo.isOnPlan) return;
     const away = model.alternative === null ? null : photo.alternatives[model.alternative];
     this.paintAlternatives(photo);
     const { center } = (away ?? photo).pose!;
@@ -280,7 +302,8 @@ export class PlanPainter {
     const taken: [number, number, number][] = [];
     for (const index of new Set(wanted)) {
       const at = this.markOf(index);
-      const name = shortName(model.report.photos[index].name);
+      const photo = model.report.photos[index];
+      const name = photo.status === "localized" ? labelOf(photo) : text.guess(labelOf(photo));
       const half = name.length * 3.8 + 6;
       const y = at.y - radius - (index === model.selected ? 17 : 10);
       if (taken.some(([x, other, reach]) => Math.abs(at.x - x) < half + reach && Math.abs(y - other) < 20)) continue;
@@ -339,8 +362,7 @@ function paintSector(
   context.globalAlpha = 1;
 }
 
-/** The file's own name without its ending. */
-export function shortName(name: string): string {
-  const own = name.slice(name.lastIndexOf("/") + 1).replace(/\.[a-z]{3,4}( \(\d+\))?$/i, "$1");
-  return own.length > 28 ? `${own.slice(0, 13)}…${own.slice(-13)}` : own;
+/** What a photo is called where there is little room. */
+export function labelOf({ short }: Photo): string {
+  return short.length > 28 ? `${short.slice(0, 9)}…${short.slice(-17)}` : short;
 }

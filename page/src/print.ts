@@ -3,7 +3,7 @@ import { h, svg } from "./dom";
 import { percent } from "./list";
 import { shape } from "./marks";
 import { ahead, type Model } from "./model";
-import { shortName } from "./plan_painter";
+import { labelOf } from "./plan_painter";
 import { text } from "./text";
 import type { Photo, Storey } from "./types";
 
@@ -17,7 +17,7 @@ export function fillPrint(model: Model, box: HTMLElement): void {
   box.replaceChildren(
     h("h1", {}, report.title),
     h("p", {}, `${report.cloud}. ${text.shown(rows.length, report.photos.length)}. ${text.madeBy(report.version)}`),
-    ...report.storeys.map((storey, index) => figure(storey, rows.filter(([, photo]) => photo.pose && photo.storey === index))),
+    ...report.storeys.map((storey, index) => figure(storey, rows.filter(([, photo]) => photo.isOnPlan && photo.storey === index))),
     h(
       "table",
       {},
@@ -44,7 +44,7 @@ function figure(storey: Storey, photos: (readonly [number, Photo])[]): HTMLEleme
     const tip = { x2: x + 3 * radius * Math.cos(yaw), y2: -y - 3 * radius * Math.sin(yaw) };
     return svg(
       "g",
-      {},
+      { class: photo.status === "localized" ? "" : "guess" },
       svg("line", { x1: x, y1: -y, ...tip, class: `heading ${photo.status}`, "stroke-width": radius / 2.5 }),
       shape(photo.status, x, -y, radius),
       svg("text", { x: x + 1.3 * radius, y: -y - 1.3 * radius, "font-size": 2 * radius }, String(index + 1)),
@@ -70,6 +70,6 @@ function line(index: number, photo: Photo, storeys: Storey[]): HTMLElement {
   const place = photo.pose
     ? [percent(photo.confidence), storeys[photo.storey ?? 0]?.name ?? "", ...photo.pose.world.map((value) => value.toFixed(3)), photo.pose.angles[0].toFixed(1)]
     : ["", "", "", "", "", ""];
-  const cells = [shortName(photo.name), text.status[photo.status], ...place, photo.spread ? photo.spread.largest.toFixed(1) : ""];
+  const cells = [labelOf(photo), text.status[photo.status], ...place, photo.spread ? photo.spread.largest.toFixed(1) : ""];
   return h("tr", {}, h("td", {}, String(index + 1)), ...cells.map((cell) => h("td", {}, cell)));
 }

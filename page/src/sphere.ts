@@ -1,40 +1,27 @@
-/** A photo and the scan as spheres, one over the other, drawn by three.js in one pass over the screen. */
-import {
-  Camera,
-  LinearFilter,
-  LinearSRGBColorSpace,
-  Matrix3,
-  Mesh,
-  NoColorSpace,
-  PlaneGeometry,
-  RepeatWrapping,
-  Scene,
-  ShaderMaterial,
-  Texture,
-  Vector2,
-  WebGLRenderer,
-} from "three";
+/** A photo and the scan as spheres, one over the other, drawn by WebGL as one triangle over the whole screen. */
 import type { Mode, View } from "./model";
 import type { Vector } from "./types";
 
 export const LEAST_FOV = 0.25;
 export const MOST_FOV = 2.0;
 const MOST_PITCH = Math.PI / 2 - 0.01;
+const FADE = 320; // ms
 
-const VERTEX = `
-varying vec2 screen;
+const VERTEX = `#version 300 es
+out vec2 screen;
 void main() {
-  screen = position.xy;
-  gl_Position = vec4(position.xy, 0.0, 1.0);
+  screen = vec2(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0);
+  gl_Position = vec4(screen, 0.0, 1.0);
 }`;
 
 // A ray of the screen in the plan's frame, turned into each camera's, gives the pixel of its sphere:
 // u = (1/2 - azimuth / 2 pi) W, v = (1/2 - elevation / pi) H.
-const FRAGMENT = `
+const FRAGMENT = `#version 300 es
 precision highp float;
-varying vec2 screen;
+in vec2 screen;
+out vec4 shown;
 uniform sampler2D photo, scan, mask, before;
-uniform mat3 photoFromPlan, scanFromPlan, beforeFromPlan;
+uniform mat3 camFromPlan, beforeFromPlan;
 uniform vec2 tangents;
 uniform vec2 looks;
 uniform float mixing, splitAt, fading, hatching;
@@ -51,17 +38,17 @@ void main() {
   ray = vec3(c * ray.x - s * ray.z, ray.y, s * ray.x + c * ray.z);
   c = cos(looks.x), s = sin(looks.x);
   ray = vec3(c * ray.x - s * ray.y, s * ray.x + c * ray.y, ray.z);
-  vec2 at = pixelOf(photoFromPlan * ray);
-  vec3 color = texture2D(photo, at).rgb;
+  vec2 at = pixelOf(camFromPlan * ray);
+  vec3 color = texture(photo, at).rgb;
   float ofScan = splitAt >= -1.5 ? step(splitAt, screen.x) : mixing;
-  if (ofScan > 0.0) color = mix(color, texture2D(scan, pixelOf(scanFromPlan * ray)).rgb, ofScan);
+  if (ofScan > 0.0) color = mix(color, texture(scan, at).rgb, ofScan);
   if (hatching > 0.0) {
-    float level = smoothstep(0.62, 0.82, texture2D(mask, at).r);
+    float level = smoothstep(0.62, 0.82, texture(mask, at).r);
     float line = step(0.5, fract((gl_FragCoord.x + gl_FragCoord.y) / 12.0));
     color = mix(color, vec3(1.0, 0.16, 0.45), level * mix(0.3, 0.62, line));
   }
-  if (fading > 0.0) color = mix(color, texture2D(before, pixelOf(beforeFromPlan * ray)).rgb, fading);
-  gl_FragColor = vec4(color, 1.0);
+  if (fading > 0.0) color = mix(color, texture(before, pixelOf(beforeFromPlan * ray)).rgb, fading);
+  shown = vec4(color, 1.0);
 }`;
 
 /** What is on the spheres. */
@@ -73,86 +60,105 @@ export interface Content {
   rotation: number[];
 }
 
+const LAYERS = ["photo", "scan", "mask", "before"] as const;
+const EYE = [1, 0, 0, 0, 1, 0, 0, 0, 1];
+
 export class Sphere {
   readonly mostWidth: number;
-  private readonly renderer: WebGLRenderer;
-  private readonly scene = new Scene();
-  private readonly camera = new Camera();
-  private readonly uniforms = {
-    photo: { value: new Texture() },
-    scan: { value: new Texture() },
-    mask: { value: new Texture() },
-    before: { value: new Texture() },
-    photoFromPlan: { value: new Matrix3() },
-    scanFromPlan: { value: new Matrix3() },
-    beforeFromPlan: { value: new Matrix3() },
-    tangents: { value: new Vector2(1, 1) },
-    looks: { value: new Vector2() },
-    mixing: { value: 0 },
-    splitAt: { value: -2 },
-    fading: { value: 0 },
-    hatching: { value: 0 },
-  };
+  private readonly gl: WebGL2RenderingContext;
+  private program!: WebGLProgram;
+  /** The pictures that the graphics hold, in the order of LAYERS. */
+  private textures: WebGLTexture[] = [];
+  private content: Content | null = null;
+  private rotationBefore = EYE;
+  private readonly numbers = { mixing: 0, splitAt: -2, fading: 0, hatching: 0 };
+  private tangents: [number, number] = [1, 1];
   private frame = 0;
   private fadeFrom = 0;
-  private hasContent = false;
   private view: View = { yaw: 0, pitch: 0, fov: 1.2 };
   private readonly isStill = matchMedia("(prefers-reduced-motion: reduce)");
 
   /** Throws where there is no WebGL. */
   constructor(readonly canvas: HTMLCanvasElement) {
-    this.renderer = new WebGLRenderer({ canvas, antialias: false, powerPreference: "low-power" });
-    this.renderer.outputColorSpace = LinearSRGBColorSpace;
-    this.mostWidth = this.renderer.capabilities.maxTextureSize;
-    const material = new ShaderMaterial({
-      vertexShader: VERTEX,
-      fragmentShader: FRAGMENT,
-      uniforms: this.uniforms,
-      depthTest: false,
-    });
-    const screen = new Mesh(new PlaneGeometry(2, 2), material);
-    screen.frustumCulled = false;
-    this.scene.add(screen);
+    const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "low-power" });
+    if (!gl) throw new Error("no WebGL");
+    this.gl = gl;
+    this.mostWidth = gl.getParameter(gl.MAX_TEXTURE_SIZE) as number;
+    this.begin();
+    canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
+    canvas.addEventListener("webglcontextrestored", () => this.begin());
     new ResizeObserver(() => this.resized()).observe(canvas);
   }
 
+  /** Hand the graphics what they work with, again where they have lost it. */
+  private begin(): void {
+    const { gl } = this;
+    this.program = gl.createProgram();
+    for (const [type, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]] as const) {
+      const shader = gl.createShader(type)!;
+      gl.shaderSource(shader, source);
+      gl.compileShader(shader);
+      gl.attachShader(this.program, shader);
+    }
+    gl.linkProgram(this.program);
+    if (!gl.getProgramParameter(this.program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(this.program) ?? "WebGL");
+    gl.useProgram(this.program);
+    LAYERS.forEach((name, unit) => gl.uniform1i(this.at(name), unit));
+    this.textures = LAYERS.map(() => gl.createTexture());
+    LAYERS.forEach((_, unit) => this.fill(unit, null));
+    const { content } = this;
+    this.content = null;
+    this.numbers.fading = 0;
+    if (content) this.show(content, false);
+  }
+
+  private at(name: string): WebGLUniformLocation | null {
+    return this.gl.getUniformLocation(this.program, name);
+  }
+
   private resized(): void {
-    const { clientWidth, clientHeight } = this.canvas;
-    if (!clientWidth || !clientHeight) return;
-    this.renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
-    this.renderer.setSize(clientWidth, clientHeight, false);
+    const { canvas } = this;
+    if (!canvas.clientWidth || !canvas.clientHeight) return;
+    const ratio = Math.min(window.devicePixelRatio || 1, 2);
+    canvas.width = Math.floor(canvas.clientWidth * ratio);
+    canvas.height = Math.floor(canvas.clientHeight * ratio);
     this.look(this.view);
     this.paint(performance.now());
   }
 
   /** Put a photo on the sphere; the one before fades out if `fades`. */
   show(content: Content, fades: boolean): void {
-    const u = this.uniforms;
-    const isNewPhoto = u.photo.value.image !== content.photo;
-    if (fades && this.hasContent && isNewPhoto && !this.isStill.matches) {
-      const unused = u.before.value;
-      u.before.value = u.photo.value;
-      u.beforeFromPlan.value.copy(u.photoFromPlan.value);
-      u.photo.value = unused;
+    const old = this.content;
+    if (fades && old && old.photo !== content.photo && !this.isStill.matches) {
+      [this.textures[0], this.textures[3]] = [this.textures[3], this.textures[0]];
+      this.rotationBefore = old.rotation;
       this.fadeFrom = performance.now();
-      u.fading.value = 1;
+      this.numbers.fading = 1;
     }
-    u.photo.value = replaced(u.photo.value, content.photo);
-    u.scan.value = replaced(u.scan.value, content.scan);
-    u.mask.value = replaced(u.mask.value, content.mask);
-    u.photoFromPlan.value.fromArray(content.rotation).transpose();
-    u.scanFromPlan.value.fromArray(content.rotation).transpose();
-    this.hasContent = true;
+    for (const [unit, name] of (["photo", "scan", "mask"] as const).entries()) {
+      if (old?.[name] !== content[name]) this.fill(unit, content[name]);
+    }
+    this.content = content;
     this.draw();
+  }
+
+  /** Put a picture into a texture; a black pixel for none. */
+  private fill(unit: number, image: ImageBitmap | null): void {
+    const { gl } = this;
+    gl.bindTexture(gl.TEXTURE_2D, this.textures[unit]);
+    if (image) gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, image);
+    else gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, null);
+    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.REPEAT);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
   }
 
   /** How photo and scan are put together: blend by `amount`, or side by side there. */
   combine(mode: Mode, amount: number, showsDifferences: boolean): void {
-    const u = this.uniforms;
-    const hasScan = u.scan.value.image !== null;
-    u.mixing.value = !hasScan || mode === "photo" ? 0 : mode === "scan" ? 1 : amount;
-    u.splitAt.value = hasScan && mode === "split" ? 2 * amount - 1 : -2;
-    u.hatching.value = showsDifferences && u.mask.value.image !== null ? 1 : 0;
+    const hasScan = Boolean(this.content?.scan);
+    this.numbers.mixing = !hasScan || mode === "photo" ? 0 : mode === "scan" ? 1 : amount;
+    this.numbers.splitAt = hasScan && mode === "split" ? 2 * amount - 1 : -2;
+    this.numbers.hatching = showsDifferences && this.content?.mask ? 1 : 0;
     this.draw();
   }
 
@@ -162,8 +168,7 @@ export class Sphere {
     this.view = view;
     const { clientWidth: width, clientHeight: height } = this.canvas;
     const tangent = Math.tan(view.fov / 2);
-    this.uniforms.tangents.value.set((tangent * width) / Math.max(1, height), tangent);
-    this.uniforms.looks.value.set(view.yaw, view.pitch);
+    this.tangents = [(tangent * width) / Math.max(1, height), tangent];
     this.draw();
   }
 
@@ -175,14 +180,24 @@ export class Sphere {
   }
 
   private paint(now: number): void {
-    if (!this.hasContent) return;
-    const { fading } = this.uniforms;
-    if (fading.value > 0) {
-      const part = Math.max(0, Math.min(1, (now - this.fadeFrom) / 320));
-      fading.value = 1 - part * part * (3 - 2 * part);
-      if (fading.value > 0) this.draw();
+    const { gl, content, numbers } = this;
+    if (!content) return;
+    if (numbers.fading > 0) {
+      const part = Math.max(0, Math.min(1, (now - this.fadeFrom) / FADE));
+      numbers.fading = 1 - part * part * (3 - 2 * part);
+      if (numbers.fading > 0) this.draw();
     }
-    this.renderer.render(this.scene, this.camera);
+    this.textures.forEach((texture, unit) => {
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+    });
+    gl.uniformMatrix3fv(this.at("camFromPlan"), true, content.rotation);
+    gl.uniformMatrix3fv(this.at("beforeFromPlan"), true, this.rotationBefore);
+    gl.uniform2fv(this.at("tangents"), this.tangents);
+    gl.uniform2f(this.at("looks"), this.view.yaw, this.view.pitch);
+    for (const [name, value] of Object.entries(numbers)) gl.uniform1f(this.at(name), value);
+    gl.viewport(0, 0, this.canvas.width, this.canvas.height);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
   /** Where a direction of the plan's frame lies on the canvas [px]; null if it is behind. */
@@ -193,28 +208,13 @@ export class Sphere {
     const depth = Math.cos(pitch) * ahead + Math.sin(pitch) * z;
     const up = Math.cos(pitch) * z - Math.sin(pitch) * ahead;
     if (depth < 0.05) return null;
-    const { x: tx, y: ty } = this.uniforms.tangents.value;
+    const [tx, ty] = this.tangents;
     const { clientWidth: width, clientHeight: height } = this.canvas;
     return { x: (width / 2) * (1 - left / depth / tx), y: (height / 2) * (1 - up / depth / ty) };
   }
 
   /** Angle [rad] of a pixel in the middle of the canvas. */
   get pixelAngle(): number {
-    return (2 * this.uniforms.tangents.value.y) / Math.max(1, this.canvas.clientHeight);
+    return (2 * this.tangents[1]) / Math.max(1, this.canvas.clientHeight);
   }
-}
-
-/** A texture of another picture; the one before is given back. */
-function replaced(texture: Texture, image: ImageBitmap | null): Texture {
-  if (texture.image === image && image !== null) return texture;
-  texture.dispose();
-  const made = new Texture(image ?? undefined);
-  made.image = image as never;
-  made.colorSpace = NoColorSpace;
-  made.flipY = false;
-  made.generateMipmaps = false;
-  made.minFilter = made.magFilter = LinearFilter;
-  made.wrapS = RepeatWrapping;
-  made.needsUpdate = image !== null;
-  return made;
 }

@@ -19,6 +19,9 @@ export const text = {
     not_localized: "Not sure: this is only the best guess.",
     unreadable: "The photo's file could not be read.",
   } satisfies Record<Status, string>,
+  note: (words: string) => `Careful: ${words}.`,
+  hopeless: "Most likely not of this scan: its best guess is not on the plan.",
+  guess: (name: string) => `${name}, a guess`,
   list: "Photos",
   search: "Search photos",
   filters: "Filters",
@@ -27,7 +30,8 @@ export const text = {
   storey: "Storey",
   sort: "Sort by",
   sorts: {
-    order: "Order taken",
+    order: "As in the results",
+    taken: "Time taken",
     name: "Name",
     confidence: "Least sure first",
     storey: "Storey",
@@ -114,6 +118,7 @@ export const text = {
     ["Esc", "back to the plan"],
     ["/", "search"],
   ] as [string, string][],
+  download: "Download as a table (CSV)",
   table: ["Photo", "Status", "Confidence", "Storey", "x [m]", "y [m]", "z [m]", "Heading [°]", "1 σ [mm]"],
   madeBy: (version: string) => `Made by PICCOLO ${version}`,
 };

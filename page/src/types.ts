@@ -42,8 +42,9 @@ export interface Evidence {
 }
 
 export interface Photo {
+  /** Its path below the folder that all share, which no other has; and as short as it can be told apart. */
   name: string;
-  file: string;
+  short: string;
   key: string;
   status: Status;
   confidence: number;
@@ -57,6 +58,8 @@ export interface Photo {
   time: number | null;
   /** True if nobody can have walked there from the frame before. */
   gap: boolean;
+  /** False where there is no pose, or a best guess that is hopeless. */
+  isOnPlan: boolean;
   pose: Pose | null;
   storey: number | null;
   height: number | null;
@@ -89,6 +92,8 @@ export interface Report {
   title: string;
   cloud: string;
   crs: string;
+  /** What is wrong with all of it, in words; empty if nothing is. */
+  note: string;
   north: [number, number] | null;
   storeys: Storey[];
   photos: Photo[];

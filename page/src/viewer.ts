@@ -2,7 +2,7 @@
 import { h } from "./dom";
 import { FOV, type Mode, type Model } from "./model";
 import { imagesOf } from "./pictures";
-import { shortName } from "./plan_painter";
+import { labelOf } from "./plan_painter";
 import { Sphere } from "./sphere";
 import { text } from "./text";
 import type { Photo, Pose, Vector } from "./types";
@@ -253,7 +253,7 @@ export class Viewer {
     const center = photo.pose!.center;
     const down = photo.height ?? FOOT;
     const to: Vector = [center[0] - from.center[0], center[1] - from.center[1], center[2] - down - from.center[2]];
-    const label = text.neighbor(shortName(photo.name), metres.toFixed(1));
+    const label = text.neighbor(labelOf(photo), metres.toFixed(1));
     const button = h(
       "button",
       { type: "button", class: "way away", "aria-label": label, title: label, onclick: () => this.model.select(index) },

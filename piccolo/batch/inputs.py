@@ -1,16 +1,19 @@
 """The panoramas of a batch: pictures, folders of pictures, lists, and names that come on standard input."""
 
+import codecs
 import os
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TextIO
 
-from ..errors import InputError
+from ..errors import InputError, printable
 from ..panorama.cube import SUFFIXES, is_cube
-from ..runtime.json_file import read_text
+from ..runtime.json_file import read_bytes
 
 STDIN = "-"
 WANTED_LIST = "wanted a text file, a panorama's path on each line"
+MAX_KINDS = 5  # of files left out that are named
 
 
 def is_from_stdin(words: Sequence[str]) -> bool:
@@ -19,12 +22,12 @@ def is_from_stdin(words: Sequence[str]) -> bool:
 
 
 def panoramas_of(
-    words: Iterable[str], stdin: TextIO, is_panorama: Callable[[Path], bool] = is_cube
+    words: Iterable[str], stdin: TextIO, left_out: Counter[str], is_panorama: Callable[[Path], bool] = is_cube
 ) -> Iterator[Path]:
     """The panoramas that words name, in order: a picture, a folder, `@list.txt`, or `-` for lines of `stdin`.
 
     A folder is one panorama if it holds the six faces of a cube, or what else `is_panorama` tells, else all
-    pictures in it and in its folders, sorted by path.
+    pictures in it and in its folders, sorted by path; its other files are counted in `left_out` by suffix.
 
     Raises
     ------
@@ -33,36 +36,61 @@ def panoramas_of(
     """
     for word in words:
         if word == STDIN:
-            yield from _lines(stdin)
+            with open(stdin.fileno(), "rb", buffering=0, closefd=False) as file:
+                # Past Python's buffers: a thread that waits there for a name would hold their lock, without
+                # which the program can't end.
+                yield from _names(file)
         elif word.startswith("@"):
-            lines = read_text(Path(word[1:]), WANTED_LIST).splitlines()
-            yield from (Path(line) for line in lines if line.strip())
+            content = read_bytes(Path(word[1:]), WANTED_LIST)
+            yield from _names(content.removeprefix(codecs.BOM_UTF8).split(b"\n"))
         else:
-            yield from _at(Path(word), is_panorama)
+            yield from _at(Path(word), left_out, is_panorama)
 
 
-def _lines(stdin: TextIO) -> Iterator[Path]:
-    """The names on standard input, read past Python's buffers.
-
-    A thread that waits there for a name would hold their lock, without which the program can't end.
-    """
-    with open(stdin.fileno(), "rb", buffering=0, closefd=False) as file:
-        yield from (Path(os.fsdecode(line.rstrip(b"\r\n"))) for line in file if line.strip())
+def _names(lines: Iterable[bytes]) -> Iterator[Path]:
+    return (Path(os.fsdecode(line.rstrip(b"\r\n"))) for line in lines if line.strip())
 
 
-def _at(path: Path, is_panorama: Callable[[Path], bool]) -> Iterator[Path]:
-    if not path.is_dir() or is_panorama(path):
+def _at(path: Path, left_out: Counter[str], is_panorama: Callable[[Path], bool]) -> Iterator[Path]:
+    if not os.path.isdir(path) or is_panorama(path):  # noqa: PTH112  # Path.is_dir raises for a long name
         yield path
         return
-    folders = [path, *(folder for folder in path.rglob("*") if folder.is_dir())]
-    whole = [folder for folder in folders if is_panorama(folder)]
-    files = (
-        file
-        for folder in folders
-        if not any(folder.is_relative_to(other) for other in whole)
-        for file in folder.iterdir()
-    )
-    pictures = [file for file in files if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")]
-    if not pictures and not whole:
-        raise InputError(f"{path}: a folder without a JPEG, PNG, TIFF or WebP picture")
-    yield from sorted([*pictures, *whole])
+    found: list[Path] = []
+    others = Counter[str]()
+    for folder, is_one in _folders(path, is_panorama):
+        if is_one:
+            found.append(folder)
+            continue
+        files = [file for file in folder.iterdir() if file.name[0] != "." and not file.is_dir()]
+        found += [file for file in files if file.suffix.lower() in SUFFIXES]
+        others.update(file.suffix.lower() for file in files if file.suffix.lower() not in SUFFIXES)
+    left_out.update(others)
+    if not found:
+        text = f"{path}: a folder without a JPEG, PNG, TIFF, WebP or HEIC picture"
+        raise InputError("; ".join(filter(None, (text, described(others)))))
+    yield from sorted(found)
+
+
+def _folders(top: Path, is_panorama: Callable[[Path], bool]) -> Iterator[tuple[Path, bool]]:
+    """A folder and those in it, and whether each is one panorama; by a link only what has no other name."""
+    waiting = deque([top])
+    seen = set[tuple[int, int]]()
+    while waiting:
+        folder = waiting.popleft()
+        status = folder.stat()
+        if (status.st_dev, status.st_ino) not in seen:
+            seen.add((status.st_dev, status.st_ino))
+            is_one = is_panorama(folder)
+            yield folder, is_one
+            for entry in () if is_one else folder.iterdir():
+                if entry.is_dir():
+                    (waiting.append if entry.is_symlink() else waiting.appendleft)(entry)
+
+
+def described(left_out: Counter[str]) -> str:
+    """Say how many files are left out, by kind; nothing if none are."""
+    kinds = sorted(left_out.items(), key=lambda kind: (-kind[1], kind[0]))[:MAX_KINDS]
+    if rest := left_out.total() - sum(count for _, count in kinds):
+        kinds.append(("of other kinds", rest))
+    listed = ", ".join(f"{count} {printable(kind) or 'without an ending'}" for kind, count in kinds)
+    return f"{left_out.total()} files left out: {listed}" if kinds else ""

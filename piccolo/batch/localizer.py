@@ -1,27 +1,32 @@
 """What answers the panoramas of a batch: in this process, or where else the scan is opened."""
 
+import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from .. import __version__
+from ..camera import Calibration
 from ..cloud.settings import CloudSettings
 from ..coarse_to_fine.map_file import load_map
 from ..coarse_to_fine.open_map import CachePolicy
-from ..errors import InputError
+from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..opening import open_files
 from ..panorama import ReadOptions, read_panorama
+from ..panorama.photo import sha256_of
 from ..query_options import Settings
 from ..render.surfel_renderer import encode_image, overlay_png
-from ..result import Result, Source, named, unreadable_result
+from ..result import Failure, Result, Source, failure_of, named, unreadable_result
 from ..runtime.cluster import sent_file
+from ..runtime.json_file import reading_once
 from ..runtime.memory import limit_memory
 from ..runtime.threads import Workers
 from ..scan import Scan, settings_json
-from .batch import pano_sha256
+from .priors import PriorTable
 
 
 class Task(NamedTuple):
@@ -29,6 +34,7 @@ class Task(NamedTuple):
 
     pano: Path
     settings: Settings
+    calibration: Calibration | None = None  # the camera of this photo
     files: Mapping[str, bytes] | None = None  # what is at `pano`, where that is not to be seen
 
     @contextmanager
@@ -47,8 +53,8 @@ class Task(NamedTuple):
 
 def files_of(pano: Path) -> dict[str, bytes]:
     """The content of a photo's file, or of all files in its folder; none of what can't be read."""
-    paths = sorted(pano.rglob("*")) if pano.is_dir() else [pano]
     with suppress(OSError):
+        paths = sorted(pano.rglob("*")) if pano.is_dir() else [pano]
         return {str(path.relative_to(pano.parent)): path.read_bytes() for path in paths if path.is_file()}
     return {}
 
@@ -71,6 +77,7 @@ class Localizer:
     cloud_settings: CloudSettings
     read_options: ReadOptions
     cache: CachePolicy
+    priors: PriorTable | None = None
     num_threads: int = 1
     max_memory: float | None = None  # [10^9 byte], of a process
     makes_overlays: bool = False
@@ -79,9 +86,32 @@ class Localizer:
     map_name: str | None = None  # of the map's file that a cluster's workers have been sent
     sends_photos: bool = False
 
-    def task(self, pano: Path, settings: Settings) -> Task:
+    @property
+    def name(self) -> str | tuple[str, ...]:
+        """The scan's path as given, or the paths of its files."""
+        return str(self.paths[0]) if len(self.paths) == 1 else tuple(map(str, self.paths))
+
+    def task(self, pano: Path) -> Task:
         """What is to be done for a panorama."""
-        return Task(pano, settings, files_of(pano) if self.sends_photos else None)
+        files = files_of(pano) if self.sends_photos else None
+        return Task(pano, self.settings_of(pano), files=files)
+
+    def settings_of(self, pano: Path) -> Settings:
+        """The settings of one panorama: its own prior, if it has one."""
+        if self.priors is None or not isinstance(self.settings, CoarseToFineSettings):
+            return self.settings
+        return replace(self.settings, prior=self.priors.prior_of(pano, self.settings.prior))
+
+    def expected(self, cloud_sha256: str) -> Callable[[Path], Mapping[str, Any]]:
+        """Return the fields of a panorama's line that say how it was made, the most telling first."""
+
+        @lru_cache
+        def expected_of(settings: Settings) -> Mapping[str, Any]:
+            scan = {"cloud_sha256": cloud_sha256, "cloud": self.name}
+            repeated = settings_json(settings, self.cloud_settings, self.read_options)
+            return dict(json.loads(json.dumps({**scan, "settings": repeated, "version": __version__})))
+
+        return lambda pano: expected_of(self.settings_of(pano))
 
     def opened(self) -> Callable[[Task], Answer]:
         """What answers tasks in this process, when the scan has been opened for it."""
@@ -90,33 +120,34 @@ class Localizer:
 
     def open_scan(self, workers: Workers) -> Scan:
         """Read and prepare the scan."""
-        name = str(self.paths[0]) if len(self.paths) == 1 else tuple(map(str, self.paths))
         if self.map_name:
             scan_map = load_map(sent_file(self.map_name))
-            return Scan(scan_map, name, self.cloud_settings, self.settings, workers, {})
+            return Scan(scan_map, self.name, self.cloud_settings, self.settings, workers, {})
         paths = [self.folder / path for path in self.paths]
         scan = open_files(paths, self.cloud_settings, self.settings, self.cache, workers)
-        return replace(scan, name=name)
+        return replace(scan, name=self.name)
 
     def answer(self, scan: Scan, task: Task) -> Answer:
         """Localize one panorama, and make the pictures asked for; of one that can't be read say why."""
-        with task.placed(self.folder) as path:
+        with task.placed(self.folder) as path, reading_once():
             try:
-                found = scan.localize_query(path, self.read_options, task.settings)
+                found = scan.localize_query(
+                    path, self.read_options, task.settings, calibration=task.calibration
+                )
                 overlay, mask = self._pictures(scan, path, found)
-            except (OSError, InputError) as error:
-                text = str(error).replace(str(path), str(task.pano))
-                return self.failed(task, text, scan.name, scan.prepared.scan_sha256, path)
+            except Exception as error:
+                text, is_passing = failure_of(error)
+                failure = Failure(text.replace(str(path), str(task.pano)), is_passing)
+                source = Source(scan.prepared.scan_sha256 or None, sha256_of(path, self.read_options.rig))
+                return self.failed(task, failure, source)
         result = named(found, path, task.pano)
         return Answer(result, result.warnings[len(scan.warnings) :], overlay, mask)
 
-    def failed(
-        self, task: Task, error: str, cloud: str | tuple[str, ...], cloud_sha256: str, path: Path
-    ) -> Answer:
-        """The answer to a task whose photo is at `path`, when nothing but an error in one line has come."""
-        source = Source(cloud_sha256 or None, pano_sha256(path, self.read_options.rig))
+    def failed(self, task: Task, failure: Failure, source: Source) -> Answer:
+        """The answer to a task of which nothing but a failure has come."""
         repeated = settings_json(task.settings, self.cloud_settings, self.read_options)
-        return Answer(unreadable_result(error, cloud, str(task.pano), settings=repeated, source=source))
+        about = {"settings": repeated, "source": source}
+        return Answer(unreadable_result(failure.text, self.name, str(task.pano), failure.is_passing, **about))
 
     def _pictures(self, scan: Scan, pano: Path, result: Result) -> tuple[bytes | None, bytes | None]:
         """Overlay and occlusion mask as PNG, where they are asked for and there is a pose."""

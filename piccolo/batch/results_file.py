@@ -1,56 +1,137 @@
 """Results on disk, one line a panorama, appended as they come, so that a stopped batch goes on."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+from ..camera import Calibration
 from ..errors import InputError
-from ..result import FORMAT
-from ..runtime.line_file import whole_lines, whole_size
+from ..panorama.photo import sha256_of
+from ..result import FAILED, FORMAT
+from ..runtime.line_file import LineFile, whole_lines, whole_size
 
 LINE_BEGINS = f'{{"format": "{FORMAT}"'.encode()
 WAYS = "--overwrite starts anew, another --out keeps both"
-# What a finished line must have in common with the one that would be written now, the most telling first.
-KEYS = ("pano", "pano_sha256", "cloud_sha256", "cloud", "settings", "version")
 
 
-def finished_lines(path: Path) -> tuple[Iterator[dict[str, Any]], int]:
-    """The fields of each whole line that an earlier run has left, and their size [byte].
+def finished_lines(path: Path) -> Iterator[dict[str, Any]]:
+    """The fields of each whole line that an earlier run has left, and its bytes, `span`.
 
-    Raises
-    ------
-    InputError
-        The file is none of results: at once if its end is not, or when the iterator comes to it.
+    Raises InputError, when the iterator comes to it, for what is no result.
     """
     size = whole_size(path, LINE_BEGINS, f"results of localize.py: {WAYS}")
-
-    def parsed() -> Iterator[dict[str, Any]]:
-        for number, line in enumerate(whole_lines(path, size), 1):
-            try:
-                fields = json.loads(line)
-                found = fields["format"]
-            except (ValueError, KeyError, TypeError, RecursionError) as error:
-                raise InputError(f"{path}, line {number}: no result of localize.py; {WAYS}") from error
-            if found != FORMAT:
-                raise InputError(f"{path}, line {number}: of format {found!r}, not {FORMAT!r}; {WAYS}")
-            yield {**fields, "line": f"{path}, line {number}"}
-
-    return parsed(), size
+    end = 0
+    for number, line in enumerate(whole_lines(path, size), 1):
+        try:
+            fields = json.loads(line)
+            found = fields["format"]
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise InputError(f"{path}, line {number}: no result of localize.py; {WAYS}") from error
+        if found != FORMAT:
+            raise InputError(f"{path}, line {number}: of format {found!r}, not {FORMAT!r}; {WAYS}")
+        begin, end = end, end + len(line)
+        yield {**fields, "line": f"{path}, line {number}", "span": (begin, end)}
 
 
 def check_finished(fields: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
-    """InputError for a finished line that is not of the panorama, scan and settings `expected` there."""
-    different = next((key for key in KEYS if fields.get(key) != expected[key]), None)
+    """InputError for a finished line that is not of the scan and settings `expected` there."""
+    different = next((key for key in expected if fields.get(key) != expected[key]), None)
     if different is None:
         return
     found, wanted = fields.get(different), expected[different]
     if different == "settings" and isinstance(found, dict):
         name = next(name for name in sorted({*found, *wanted}) if found.get(name) != wanted.get(name))
         found, wanted, different = found.get(name), wanted.get(name), name
-    text = {
-        "pano": f"of {found}, where this command has {wanted}",
-        "pano_sha256": f"{fields['pano']} has changed since",
-        "cloud_sha256": "made with another scan, or the scan has changed since",
-    }.get(different, f"made with {different} {found!r}, not {wanted!r}")
+    text = f"made with {different} {found!r}, not {wanted!r}"
+    if different == "cloud_sha256":
+        text = "made with another scan, or the scan has changed since"
     raise InputError(f"{fields['line']}: {text}; {WAYS}")
+
+
+class Finished(NamedTuple):
+    """A line that an earlier run has left."""
+
+    span: tuple[int, int]  # [byte] in the file
+    pano_sha256: str | None
+    status: str
+
+
+class Records:
+    """Which panoramas have results in a file, and the order in which the lines are to stand at the end."""
+
+    def __init__(self, file: LineFile | None = None) -> None:
+        self.file = file
+        self.size = 0  # [byte] of the lines of earlier runs
+        self.order: list[Finished | None] = []  # of the panoramas so far; None for one that is done now
+        self._others: dict[str, list[Finished]] = {}  # by panorama: lines that are in no place of the order
+        self._named: set[str] = set()
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Results of earlier runs that stay, by status."""
+        return Counter(line.status for line in self.order if line)
+
+    def read(self, expected: Callable[[Path], Mapping[str, Any]], panoramas: Iterable[Path] | None) -> None:
+        """Take up what earlier runs have left.
+
+        Raises InputError if a line is not as one of its panorama would be now, or none is of the `panoramas`
+        that are known to come (None: they are not known).
+        """
+        if self.file is None:
+            return
+        named = None if panoramas is None else set(map(str, panoramas))
+        for fields in finished_lines(self.file.path):
+            pano = str(fields.get("pano"))
+            if named is None or pano in named:
+                check_finished(fields, expected(Path(pano)))
+            line = Finished(fields["span"], fields.get("pano_sha256"), str(fields.get("status")))
+            self._others.setdefault(pano, []).append(line)
+            self.size = line.span[1]
+        if self._others and named is not None and named.isdisjoint(self._others):
+            text = f"none of its results is of a panorama that this command names; {WAYS}"
+            raise InputError(f"{self.file.path}: {text}")
+
+    def left(self, panoramas: Iterable[Path], rig: Calibration | None) -> Iterator[Path]:
+        """The panoramas without a result, as they come."""
+        if self.file is None:
+            yield from panoramas
+            return
+        for pano in panoramas:
+            self.order.append(self._taken(pano, rig))
+            if self.order[-1] is None:
+                yield pano
+
+    def _taken(self, pano: Path, rig: Calibration | None) -> Finished | None:
+        """The line of a panorama as it is now; where it can't be read now, as it was."""
+        if lines := self._others.get(str(pano)):
+            self._named.add(str(pano))
+            digest = sha256_of(pano, rig)
+            for line in lines:
+                if line.status != FAILED and digest in (None, line.pano_sha256):
+                    lines.remove(line)
+                    return line
+        return None
+
+    def begin(self) -> None:
+        """Cut off what is no whole line of earlier runs, before the first is appended."""
+        if self.file:
+            self.file.cut(self.size)
+
+    def finish(self, keeps_others: bool) -> int:
+        """Put the lines into the order of the panoramas, without older ones of them.
+
+        Those of panoramas that were not named are kept before them, or dropped; returns how many were.
+        """
+        if self.file is None:
+            return 0
+        others = [line for name in self._others.keys() - self._named for line in self._others[name]]
+        spans = sorted(line.span for line in others) if keeps_others else []
+        num_dropped = len(others) - len(spans)
+        new_lines = whole_lines(self.file.path, self.file.size, self.size)
+        new_spans = pairwise(accumulate(map(len, new_lines), initial=self.size))
+        spans += [line.span if line else next(new_spans) for line in self.order]
+        self.file.rearrange(spans)
+        return num_dropped

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.pose import Array
-from ..geometry.sphere import pixels_of, rays_at
+from ..geometry.sphere import rays_at
 from .model import SPHERE
 from .rig import Mount
 
@@ -61,25 +61,6 @@ def sphere_of(views: Sequence[View], width: int) -> Pixels:
             np.copyto(rgb[block], pixels, where=is_better[..., None])
             np.copyto(nearest[block], closeness, where=is_better)
     return rgb, nearest > -2.0
-
-
-def recalibrated(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], before: Mount, after: Mount) -> Pixels:
-    """A sphere of one camera's picture as another calibration of that camera would make it.
-
-    What it shows lies within what it showed.
-    """
-    pixels_now, valid_now = np.zeros_like(rgb), np.zeros_like(is_valid)
-    if not is_valid.any():
-        return pixels_now, valid_now
-    width, rows, columns = rgb.shape[1], np.flatnonzero(is_valid.any(1)), np.flatnonzero(is_valid.any(0))
-    box = np.ix_(rows, columns)
-    pixels, is_in = after.camera.pixels(rays_at(width, columns + 0.5, rows + 0.5) @ before.rotation.T)
-    u, v = pixels_of(before.camera.rays(pixels)[0] @ before.rotation, width)
-    x, y = (u - 0.5).astype(np.float32), (v - 0.5).astype(np.float32)
-    shown = cv2.remap(is_valid.view(np.uint8), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
-    pixels_now[box] = cv2.remap(rgb, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    valid_now[box] = is_valid[box] & is_in & (shown > 0)
-    return pixels_now, valid_now
 
 
 def shrunk(view: View, width: int = MAX_SPHERE_WIDTH) -> View:

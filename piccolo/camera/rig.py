@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, unreadable
 from ..geometry.pose import Array, Pose, checked_rotation
 from .model import Camera
 
@@ -151,6 +151,6 @@ def _names_in(folder: Path) -> Sequence[str]:
     try:
         entries = sorted(folder.iterdir())
         inner = [file for entry in entries if entry.is_dir() for file in sorted(entry.iterdir())]
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be read ({error.strerror or error}), wanted a folder") from error
+    except (OSError, ValueError) as error:
+        raise unreadable(folder, error) from error
     return [f.relative_to(folder).as_posix() for f in [*entries, *inner] if f.is_file() and f.name[0] != "."]

@@ -12,7 +12,7 @@ from types import FrameType
 
 from tqdm import tqdm
 
-from ..errors import InputError
+from ..errors import InputError, printable, text_of
 from ..runtime.memory import check_address_space, is_shortage
 from .parser import as_started, parse
 from .progress import log_shown
@@ -59,7 +59,7 @@ def run_command(
         if isinstance(error, BrokenPipeError) and not error.filename:  # stdout's reader has gone: say nothing
             return EXIT_BROKEN_PIPE
         code = EXIT_BAD_USAGE if isinstance(error, UsageError) else EXIT_BAD_INPUT
-        return print_error(arguments, format_error(error), code)
+        return print_error(arguments, text_of(error), code)
     except Exception as error:  # the last line of defence: a code and one line for the shell
         return _unforeseen(arguments, error, lost)
 
@@ -127,20 +127,11 @@ def print_error(arguments: argparse.Namespace, text: str, exit_code: int) -> int
     """One line on stderr, with --debug after the traceback of the error at hand; returns the exit code."""
     if arguments.debug and sys.exc_info()[0]:
         traceback.print_exc()
-    tqdm.write(f"{arguments.program}: {as_started(text)}", file=sys.stderr)
+    tqdm.write(f"{arguments.program}: {as_started(printable(text))}", file=sys.stderr)
     return exit_code
 
 
 def print_note(arguments: argparse.Namespace, text: str) -> None:
     """One line on stderr, but not with --quiet."""
     if not arguments.quiet:
-        tqdm.write(f"{arguments.program}: {text}", file=sys.stderr)
-
-
-def format_error(error: OSError | InputError) -> str:
-    """An error in one line: of the system's, the file and what went wrong."""
-    if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        return f"{error.filename}: cannot be used ({error.strerror})"
-    if isinstance(error, OSError) and error.strerror:  # of a stream or pipe, which have no name
-        return f"writing or reading failed ({error.strerror})"
-    return str(error)
+        tqdm.write(f"{arguments.program}: {printable(text)}", file=sys.stderr)

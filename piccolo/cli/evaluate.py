@@ -2,23 +2,25 @@
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from ..coarse_to_fine.open_map import CachePolicy
+from ..batch.localizer import Localizer
+from ..coarse_to_fine.open_map import CachePolicy, scan_sha256_of
 from ..errors import InputError
-from ..result import read_results
+from ..result import check_scan, read_results
 from ..runtime.atomic import is_stream, write_atomically
 from ..runtime.threads import num_cores
 from ..scenes.evaluation import tables
 from ..scenes.evaluation.plots import errors_figure, figure_png, risk_figure
 from ..scenes.evaluation.query_result import QueryResult, Thresholds, match_results
-from ..scenes.evaluation.runner import RunConfig, input_files, open_run, read_run
+from ..scenes.evaluation.runner import input_files, open_run, read_run
 from ..scenes.evaluation.walks import walk_table, walks_of
 from ..scenes.scene import Scene, find_scenes
 from .command import check_least, command, option
-from .errors import EXIT_BAD_INPUT, UsageError, checking_options
+from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error, print_note
 from .evaluating import resumed
 from .executing import DASK, check_execution
 from .options import (
@@ -44,7 +46,8 @@ the query of the same path, or else of the same file name. Tables are Markdown, 
 one of the files is stdout).
 Walks (make_room.py --walk) have a table with a line each: ATE and RPE are evo's, of localized frames, nothing
 aligned, steps over other frames left out. A photo that has no answer is right when refused.
-Queries that can't be read are named on stderr, and the rest is done before exit code 3.
+Queries that can't be read, and --results of no query, are named on stderr, and the rest is done before exit
+code 3.
 """
 
 
@@ -57,6 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(kind, "--out JSONL", "begin this run, or resume it")
     option(kind, "--results JSONL", "results of localize.py")
     option(kind, "--compare JSONL", "two runs, side by side", nargs=2)
+    option(group, "--force", "take --results of another scan than a scene's cloud too")
     option(group, "--jobs N", "processes, which divide the cores", default=1)
     option(group, "--dask ADDRESS", DASK)
     option(group, "--cache FOLDER", "of prepared maps (default the user's)")
@@ -145,6 +149,17 @@ def check_files(arguments: argparse.Namespace, inputs: list[Path]) -> None:
     check_outputs(outputs_of(arguments))
 
 
+def check_clouds(scenes: Sequence[Scene], rows: Sequence[QueryResult], arguments: argparse.Namespace) -> None:
+    """Refuse results of other content than the scenes' clouds have, or with --force say so."""
+    cache = CachePolicy(True, arguments.cache)
+    for scene in scenes:
+        results = [row.result for row in rows if row.scene == scene.name and row.result.source.cloud_sha256]
+        if results and scene.cloud.is_file():
+            digest = scan_sha256_of([scene.cloud], cache)
+            if note := check_scan(results, digest, str(scene.cloud), arguments.force):
+                print_note(arguments, f"warning: {note}")
+
+
 @command(__file__, __doc__, EPILOG, add_arguments)
 def main(arguments: argparse.Namespace) -> int:
     """Run or read the results, print the tables; returns the exit code."""
@@ -152,7 +167,7 @@ def main(arguments: argparse.Namespace) -> int:
     with checking_options():
         reading = cloud_settings_from(arguments), read_options_from(arguments)
         cache, num_threads = CachePolicy(True, arguments.cache), max(1, num_cores() // arguments.jobs)
-        config = RunConfig(settings_from(arguments), *reading, cache, num_threads)
+        config = Localizer((), settings_from(arguments), *reading, cache, num_threads=num_threads)
     thresholds = Thresholds(arguments.max_distance, float(np.radians(arguments.max_angle)))
     scenes = find_scenes(arguments.scenes or [])
     check_files(arguments, input_files(scenes))
@@ -160,7 +175,11 @@ def main(arguments: argparse.Namespace) -> int:
         return compare(arguments, thresholds)
     num_failed = 0
     if arguments.results:
-        rows = list(match_results(scenes, read_results([arguments.results])))
+        results = read_results([arguments.results])
+        report = partial(print_error, arguments, exit_code=EXIT_BAD_INPUT)
+        rows = list(match_results(scenes, results, report))
+        num_failed = len(results) - len(rows)
+        check_clouds(scenes, rows, arguments)
     else:
         found = open_run(arguments.out, config, scenes, arguments.variants)
         rows, num_failed = resumed(found, arguments)

@@ -6,12 +6,13 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from ..batch.localizer import Localizer
 from ..errors import InputError
 from ..runtime.cluster import Cluster, connected
 from ..runtime.processes import Processes
 from ..runtime.tasks import Executor, Here
 from ..scenes.evaluation.query_result import QueryResult
-from ..scenes.evaluation.runner import JobRunner, Run, RunConfig
+from ..scenes.evaluation.runner import JobRunner, Run, opened
 from .errors import EXIT_BAD_INPUT, print_error
 from .progress import progress_bar
 
@@ -25,14 +26,14 @@ def resumed(run: Run, arguments: argparse.Namespace) -> tuple[list[QueryResult],
         num_jobs = min(arguments.jobs, len(run.jobs))
         if run.jobs and (address := vars(arguments).get("dask")):
             cluster = stack.enter_context(connected(address, num_jobs, run.config.num_threads))
-            executor = cluster.executor(config_at_the_workers(run, cluster).opened)
+            executor = cluster.executor(partial(opened, config_at_the_workers(run, cluster)))
         elif num_jobs > 1:
-            processes = Processes(run.config.opened, num_jobs, run.config.num_threads)
+            processes = Processes(partial(opened, run.config), num_jobs, run.config.num_threads)
             executor = stack.enter_context(closing(processes))
         return run.resume(executor, show, report)
 
 
-def config_at_the_workers(run: Run, cluster: Cluster) -> RunConfig:
+def config_at_the_workers(run: Run, cluster: Cluster) -> Localizer:
     """The run's configuration for workers that see its scenes at their paths."""
     here = Path.cwd()
     for cloud in sorted({job.scene.cloud for job in run.jobs}):

@@ -2,13 +2,14 @@
 
 import argparse
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..coarse_to_fine.open_map import CachePolicy, scan_sha256_of
 from ..errors import InputError
 from ..geometry.rotations import CAMERA_AXES
-from ..result import read_results
+from ..result import Result, check_scan, read_results
 from ..scenes.evaluation.runner import input_files
 from ..scenes.export import FORMATS, Options, Selection, export, select, true_results
 from ..scenes.export.formats import offset_file
@@ -26,9 +27,13 @@ examples:
   python tools/export_poses.py --results poses.jsonl --format colmap --images photos --out model
   python tools/export_poses.py --results poses.jsonl --format geojson --crs EPSG:25832 --out poses.geojson
 
-Results that are not localized are left out and counted on stderr. docs/CONVENTIONS.md has axes and angles.
+Results that are not localized are left out and counted on stderr; so are pictures that a format can't hold,
+as one with a blank in its name for colmap, or a sphere that is stored turned for nerfstudio. A path that
+begins as a formula does has an apostrophe before it in csv. docs/CONVENTIONS.md has axes and angles.
 A file at --out is replaced; - is stdout. One JSON object on stdout, on stderr if the poses are there.
 """
+EXIT_LEFT_OUT = 1
+EXIT_CODES = "0 done, 1 done but for pictures that the format can't hold"
 OPTIONS = ("size", "offset", "axes", "timestamps", "crs")  # those that only some formats take
 
 
@@ -41,7 +46,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--out FILE", "a new folder for colmap and gpano", required=True)
     option(parser, "--images FOLDER", "pictures' names are relative to it (default: as in the results)")
     option(parser, "--all", "write ambiguous and not localized poses too")
-    option(parser, "--cloud PATH ...", "only results of these clouds", default=[])
+    option(
+        parser,
+        "--cloud PATH ...",
+        "only results of these clouds",
+        default=[],
+    )
+    option(parser, "--force", "take results of other content than --cloud has")
     group = parser.add_argument_group("of some formats")
     option(group, "--size W H", f"of all pictures, not read from each ({_takers('size')})")
     option(group, "--offset X Y Z", f"subtracted from positions, written beside ({_takers('offset')})")
@@ -80,7 +91,18 @@ def notes_on(selection: Selection) -> Iterable[str]:
         yield f"poses in {num_clouds} clouds are taken as in one coordinate system; --cloud chooses"
 
 
-@command(__file__, __doc__, EPILOG, add_arguments)
+def check_content(arguments: argparse.Namespace, results: Sequence[Result]) -> Iterable[str]:
+    """Notes on results of other content than the clouds chosen have, which are refused without --force."""
+    for cloud in dict.fromkeys(result.cloud for result in results if result.cloud_name in arguments.cloud):
+        paths = [Path(path) for path in ([cloud] if isinstance(cloud, str) else cloud)]
+        if all(path.is_file() for path in paths):
+            own = [result for result in results if result.cloud == cloud]
+            digest = scan_sha256_of(paths, CachePolicy(True, None))
+            if note := check_scan(own, digest, own[0].cloud_name, arguments.force):
+                yield note
+
+
+@command(__file__, __doc__, EPILOG, add_arguments, EXIT_CODES)
 def main(arguments: argparse.Namespace) -> int:
     """Read, choose, write; returns the exit code."""
     with checking_options():
@@ -93,9 +115,13 @@ def main(arguments: argparse.Namespace) -> int:
     files = {Path(name) for result in results for name in (result.pano, result.cloud_name)}
     check_distinct(outputs, [*arguments.results, *input_files(scenes), *files])
     selection = select(results, arguments.cloud, arguments.all)
-    for note in notes_on(selection):
+    for note in (*notes_on(selection), *check_content(arguments, selection.results)):
         print_note(arguments, note)
-    export(selection.results, arguments.format, arguments.out, options)
-    report = {"out": str(arguments.out), "format": arguments.format, "poses": len(selection.results)}
-    print_report(arguments, outputs, json.dumps({**report, "left_out": selection.left_out}))
-    return 0
+    left_out = export(selection.results, arguments.format, arguments.out, options)
+    counts = {reason: len(names) for reason, names in left_out.items()}
+    for reason, names in left_out.items():
+        print_note(arguments, f"left out {len(names)}, the first {names[0]}: {reason}")
+    num_poses = len(selection.results) - sum(counts.values())
+    report = {"out": str(arguments.out), "format": arguments.format, "poses": num_poses}
+    print_report(arguments, outputs, json.dumps({**report, "left_out": {**selection.left_out, **counts}}))
+    return EXIT_LEFT_OUT if left_out else 0

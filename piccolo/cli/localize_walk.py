@@ -5,24 +5,24 @@ import json
 import math
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from .. import __version__
 from ..batch.results_file import WAYS, finished_lines
+from ..camera import Calibration
 from ..coarse_to_fine.scan_map import ScanMap
 from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..confidence.confidence import LOCALIZED
 from ..errors import InputError
 from ..panorama import ReadOptions
-from ..result import UNREADABLE, Result, read_results
+from ..panorama.photo import sha256_of
+from ..result import FAILED, UNREADABLE, Result, read_results
 from ..runtime.atomic import STDOUT, check_output, is_stream, write_atomically
-from ..runtime.line_file import appending, whole_lines, whole_size
+from ..runtime.line_file import locked, whole_lines, whole_size
 from ..runtime.optional import import_optional
 from ..runtime.stopwatch import Stopwatch
 from ..scan import Scan
@@ -30,7 +30,7 @@ from ..scan_walk import Prepared, Walk
 from .errors import EXIT_BAD_INPUT, print_error, print_note
 from .interruption import SIGNALS, Interruption, Stopped, interruptible
 from .outputs import check_suffix
-from .progress import progress_bar
+from .progress import progress_bar, shown
 from .walking import WalkInput, WalkInputs
 
 EXIT_ALL_LOCALIZED, EXIT_SOME_NOT = 0, 1
@@ -50,7 +50,7 @@ def run_walk(
     scan = open_scan()
     walk = scan.walk(read_options, settings, inputs.motion)
     key = key_of(walk)
-    if (statuses := finished_statuses(arguments, key)) is not None:
+    if (statuses := finished_statuses(arguments, key, inputs, read_options.rig)) is not None:
         print_note(arguments, f"{arguments.out}: nothing is left to do")
         write_plan(arguments.plan, scan, read_results([arguments.out]) if arguments.plan else [])
         return exit_code_of(statuses)
@@ -63,23 +63,22 @@ def run_walk(
         results = spaced(walk.finish(progress_bar(arguments.quiet)), inputs.min_distance)
     write_all(arguments.out, results)
     write_plan(arguments.plan, scan, results)
-    if path := kept_in(arguments.out):
-        path.unlink(missing_ok=True)
     counts = Counter(result.status for result in results)
+    if (path := kept_in(arguments.out)) and not counts[FAILED]:
+        path.unlink(missing_ok=True)
     words = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in counts.items())
     gaps = sum(result.walk is not None and result.walk.gap is not None for result in results)
     print_note(arguments, f"{len(results)} frames in {watch.seconds['all']:.0f} s: {words}; {gaps} gaps")
-    return exit_code_of(list(counts.elements()))
+    return exit_code_of(counts)
 
 
 def check_plan(path: Path) -> None:
     """Refuse, before any work, a plan that could not be written."""
-    from ..report.plan_file import SUFFIXES  # noqa: PLC0415  # only walks with a plan wait for it
+    from ..report.plan_file import DXF, SUFFIXES  # noqa: PLC0415  # only walks with a plan wait for it
 
     check_suffix("--plan", path, SUFFIXES)
     check_output(path)
-    if path.suffix.lower() == ".dxf":
-        import_optional("--plan", "ezdxf", "tools")
+    import_optional("--plan", "ezdxf" if path.suffix.lower() == DXF else "matplotlib", "tools")
 
 
 def write_plan(path: Path | None, scan: Scan, results: Sequence[Result]) -> None:
@@ -93,9 +92,9 @@ def write_plan(path: Path | None, scan: Scan, results: Sequence[Result]) -> None
     write_plan_file(entries_of_walk(results), scan.prepared, path, ReportSettings())
 
 
-def exit_code_of(statuses: Sequence[str]) -> int:
-    """0 if all frames are localized, 3 if one can't be read, else 1."""
-    if UNREADABLE in statuses:
+def exit_code_of(statuses: Collection[str]) -> int:
+    """0 if all photos are localized, 3 if one can't be read or has failed, else 1."""
+    if UNREADABLE in statuses or FAILED in statuses:
         return EXIT_BAD_INPUT
     return EXIT_ALL_LOCALIZED if set(statuses) <= {LOCALIZED} else EXIT_SOME_NOT
 
@@ -117,21 +116,19 @@ def follow_all(
 ) -> Interruption:
     """Follow the frames, and keep what was found of each."""
     path = kept_in(arguments.out)
-    size = take_up(walk, frames, path, key) if path and not arguments.overwrite else 0
-    bar = {"initial": len(walk.taken), "disable": arguments.quiet, "file": sys.stderr, "unit": ""}
-    left = tqdm(frames[len(walk.taken) :], "frames", len(frames), **bar)
-    with interruptible() as interruption, suppress(Stopped):
-        if path is None:
+    with locked(path) if path else nullcontext() as file:
+        if file is not None:
+            file.cut(0 if arguments.overwrite else take_up(walk, frames, file.path, key))
+            if file.size == 0:
+                file.append(key)
+        bar = {"desc": "frames", "total": len(frames), "initial": len(walk.taken), "unit": ""}
+        left = shown(frames[len(walk.taken) :], arguments.quiet, **bar)
+        with interruptible() as interruption, suppress(Stopped):
             for frame, prepared in ahead(walk, left):
-                follow(arguments, walk, prepared, frame)
-            return interruption
-        with appending(path, size) as append:
-            if not size:
-                append(key)
-            for frame, prepared in ahead(walk, left):
-                with interruption.postponed():
+                with interruption.postponed() if file else nullcontext():
                     follow(arguments, walk, prepared, frame)
-                    append(walk.last_to_json())
+                    if file is not None:
+                        file.append(walk.last_to_json())
                 if interruption.number:
                     break
     return interruption
@@ -161,8 +158,8 @@ def take_up(walk: Walk, frames: Sequence[WalkInput], path: Path, key: str) -> in
     size = whole_size(path, KEY_BEGINS, f"frames of a walk: {WAYS}")
     lines = whole_lines(path, size)
     first = next(lines, b"")
-    if first.decode().strip() != key:
-        return 0
+    if first.strip() not in (b"", key.encode()):
+        raise InputError(f"{path}: of a walk with other settings, another scan or version; {WAYS}")
     kept = len(first)
     for frame, line in zip(frames, lines, strict=False):
         try:
@@ -188,21 +185,31 @@ def spaced(results: Sequence[Result], metres: float) -> list[Result]:
     return kept
 
 
-def finished_statuses(arguments: argparse.Namespace, key: dict[str, Any]) -> list[str] | None:
-    """The statuses of the results that an earlier run of this walk has left; None if there are none.
+def finished_statuses(
+    arguments: argparse.Namespace, key: dict[str, Any], inputs: WalkInputs, rig: Calibration | None
+) -> list[str] | None:
+    """The statuses of the results that an earlier run of this walk has left; None if it is to be done.
 
-    InputError for results of something else.
+    It is if there are none, one has failed, or frames were others. InputError for results of something else.
     """
     out = arguments.out
     if arguments.overwrite or out is None or is_stream(out) or not out.exists() or not out.stat().st_size:
         return None
-    statuses = []
-    for fields in finished_lines(out)[0]:
+    statuses: list[str] = []
+    digests: dict[str, str | None] = {}
+    for fields in finished_lines(out):
         different = next((name for name in KEYS if fields.get(name) != key[name]), None)
         if different or fields["walk"] is None:
             raise InputError(f"{fields['line']}: of another run ({different or 'no walk'}); {WAYS}")
         statuses.append(str(fields["status"]))
-    return statuses
+        digests[str(fields["pano"])] = fields["pano_sha256"]
+    paths = {frame.name: frame.path for frame in inputs.frames}
+    if not digests.keys() & paths.keys():
+        raise InputError(f"{out}: none of its results is of a frame of this walk; {WAYS}")
+    is_done = digests.keys() <= paths.keys() if inputs.min_distance else list(digests) == list(paths)
+    is_done = is_done and FAILED not in statuses
+    is_done = is_done and all(sha256_of(paths[name], rig) in (None, digests[name]) for name in digests)
+    return statuses if is_done else None
 
 
 def write_all(out: Path | None, results: Sequence[Result]) -> None:

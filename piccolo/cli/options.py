@@ -100,7 +100,7 @@ def add_cloud_reading_options(group: argparse._ArgumentGroup) -> None:
     unit = group.add_mutually_exclusive_group()
     unit.add_argument("--units", choices=list(METRES), help="of the cloud's coordinates (default m)")
     unit.add_argument("--scale", type=float, metavar="S", help="metres per unit of the cloud, in place of it")
-    text = "up axis of the cloud; auto estimates it, z with --gravity known (default auto; preset default)"
+    text = "up axis of the cloud; auto is the file's: z, in glTF y (default auto; preset default)"
     group.add_argument("--up", choices=get_args(UpAxis), default="auto", help=text)
     text = "of clouds without colours"
     group.add_argument("--intensity-as-gray", action="store_true", help=text)
@@ -116,7 +116,7 @@ def add_panorama_options(parser: argparse.ArgumentParser) -> None:
     """The panoramas' files, and how to read them."""
     group = parser.add_argument_group("panorama")
     text = (
-        "JPEG, PNG, TIFF or WebP: 2:1, a crop with Photo Sphere metadata, or a photo with a focal length; "
+        "JPEG, PNG, TIFF, WebP, HEIC: 2:1, a crop with Photo Sphere metadata, a photo with a focal length; "
         "a folder of six cube faces, or with --rig of the pictures of one instant; "
         "or a folder of pictures, @FILE with a path a line, or - for paths on stdin, answered as they come"
     )
@@ -130,9 +130,11 @@ def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--fov", type=float, metavar="DEG", help=text)
     text = "of the picture (default equirectangular; of a photo with EXIF's focal length pinhole)"
     group.add_argument("--projection", choices=get_args(Projection), help=text)
-    text = "focal length of a pinhole photo, in its own pixels"
+    text = "focal length of a pinhole photo, in its own pixels, known to 1 %%"
     group.add_argument("--focal", type=float, metavar="PX", help=text)
-    text = "refine the focal length, and k1 where the camera's model has it; takes several times as long"
+    text = (
+        "the focal length is a guess, within 20 %%: find it, and k1 if the model has it; three times as slow"
+    )
     group.add_argument("--refine-focal", action="store_true", help=text)
     text = "calibration: COLMAP's cameras.txt, OpenSfM's camera_models.json, or JSON of docs/CAMERAS.md"
     group.add_argument("--camera", type=Path, metavar="FILE", help=text)
@@ -243,8 +245,10 @@ class PaperHelp(argparse.Action):
 
 def add_prior_options(parser: argparse.ArgumentParser) -> None:
     """What the user knows beforehand."""
-    group = parser.add_argument_group("prior knowledge (preset default); each narrows the search")
-    text = "CSV: name and any of x, y, z, radius, heading, tolerance, height; goes before the options here"
+    group = parser.add_argument_group(
+        "prior knowledge (preset default); a pose that contradicts it is not localized"
+    )
+    text = "CSV: name and any of x, y, z, radius, heading, tolerance, height, within; before the options here"
     group.add_argument("--priors", type=Path, metavar="FILE", help=text)
     group.add_argument("--near", type=float, nargs=3, metavar=("X", "Y", "Z"), help="rough position [m]")
     group.add_argument("--radius", type=float, metavar="M", help="the camera is within M metres of --near")
@@ -295,5 +299,7 @@ def check_arguments(arguments: argparse.Namespace) -> None:
     cloud_settings_from(arguments)
     if arguments.overwrite and not arguments.out:
         raise InputError("--overwrite: only with --out")
+    if arguments.heading_tolerance is not None and arguments.heading is None and not arguments.priors:
+        raise InputError("--heading-tolerance: only with --heading or --priors")
     if arguments.cache and arguments.no_cache:
         raise InputError("--cache, --no-cache: only one of them")

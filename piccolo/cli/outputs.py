@@ -54,7 +54,7 @@ def _identity(path: Path) -> tuple[int, int] | None:
     """Device and inode of a regular file; None for all else."""
     try:
         status = path.stat()
-    except OSError:
+    except (OSError, ValueError):  # of a name that no file can have
         return None
     return (status.st_dev, status.st_ino) if stat.S_ISREG(status.st_mode) else None
 
@@ -62,7 +62,7 @@ def _identity(path: Path) -> tuple[int, int] | None:
 def _files_of(inputs: Iterable[Path]) -> Iterator[Path]:
     """The inputs, of folders their pictures; those that can't be read are left to their readers."""
     for path in inputs:
-        if path.is_dir() and os.access(path, os.R_OK | os.X_OK):
+        if os.path.isdir(path) and os.access(path, os.R_OK | os.X_OK):  # noqa: PTH112  # Path's raises for long
             yield from (file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
         else:
             yield path

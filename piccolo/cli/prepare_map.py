@@ -9,7 +9,6 @@ from ..coarse_to_fine.open_map import CachePolicy, extended_map, open_map
 from ..coarse_to_fine.scan_map import with_features
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers, num_cores
-from ..runtime.unfinished import Unfinished
 from .command import command, option
 from .errors import checking_options
 from .options import add_cloud_options, cloud_settings_from
@@ -53,8 +52,7 @@ def main(arguments: argparse.Namespace) -> int:
     name = arguments.cloud[0].stem if arguments.name is None else arguments.name
     check_name(name, ())
     watch = Stopwatch()
-    show, warn, work = progress_bar(arguments.quiet), warn_once(arguments.quiet), Unfinished()
-    workers = Workers(num_cores(), show, warn, work)
+    workers = Workers(num_cores(), progress_bar(arguments.quiet), warn_once(arguments.quiet))
     if arguments.add:
         scan_map = extended_map(arguments.add, arguments.cloud, cloud_settings, name, workers, watch)
     else:
@@ -63,7 +61,6 @@ def main(arguments: argparse.Namespace) -> int:
         if arguments.name is not None or not scan_map.scan_names:  # a map keeps its names
             scan_map = named(scan_map, name)
     save_map(with_features(scan_map, workers), arguments.out)
-    work.finish()
     seconds = {stage: round(seconds, 3) for stage, seconds in watch.seconds.items()}
     counts = {"points": len(scan_map.points), "candidates": len(scan_map.centers)}
     warnings = list(scan_map.warnings)

@@ -2,12 +2,13 @@
 
 import logging
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from tqdm import tqdm
 
+from ..errors import printable
 from ..runtime.threads import Progress
 
 DELAY = 0.5  # seconds: what takes less needs no bar
@@ -17,13 +18,18 @@ STEPS = {"find free space": 1, "render views": 2, "find features": 3, "sort feat
 tqdm.monitor_interval = 0  # no thread of tqdm's own, which might not start, for bars that stand still
 
 
+def shown(values: Iterable[Any], is_quiet: bool, **form: Any) -> Iterator[Any]:
+    """Values with a progress bar on stderr, where that is a terminal."""
+    yield from tqdm(values, disable=True if is_quiet else None, file=sys.stderr, **form)
+
+
 def progress_bar(is_quiet: bool) -> Progress:
     """A function that wraps values in a progress bar, or in nothing."""
 
     def show(values: Iterator[Any], total: int | None, label: str) -> Iterator[Any]:
         title = f"prepare, {STEPS[label]} of {len(STEPS)}: {label}" if label in STEPS else label
         form = {"bar_format": UNCOUNTED if total is None else COUNTED, "delay": DELAY, "leave": False}
-        return iter(tqdm(values, title, total, disable=is_quiet, file=sys.stderr, **form))
+        return shown(values, is_quiet, desc=title, total=total, **form)
 
     return show
 
@@ -35,29 +41,39 @@ def warn_once(is_quiet: bool) -> Callable[[str], None]:
     def warn(warning: str) -> None:
         if not is_quiet and warning not in printed:
             printed.add(warning)
-            tqdm.write(f"warning: {warning}", file=sys.stderr)
+            tqdm.write(f"warning: {printable(warning).replace(' up=', ' --up ')}", file=sys.stderr)
 
     return warn
 
 
-class WarningHandler(logging.Handler):
-    """Hands the text of what is logged to a function."""
+class LogHandler(logging.Handler):
+    """Hands the text of what is logged to one of two functions: news, or warnings."""
 
-    def __init__(self, warn: Callable[[str], None]) -> None:
-        super().__init__(logging.WARNING)
+    def __init__(self, tell: Callable[[str], None], warn: Callable[[str], None]) -> None:
+        super().__init__(logging.INFO)
+        self.tell = tell
         self.warn = warn
 
     def emit(self, record: logging.LogRecord) -> None:
         """Hand one over."""
-        self.warn(record.getMessage())
+        (self.warn if record.levelno >= logging.WARNING else self.tell)(record.getMessage())
 
 
 @contextmanager
 def log_shown(is_quiet: bool) -> Iterator[None]:
-    """Within this, what the package logs is printed as warnings, each once, or not at all."""
-    log, handler = logging.getLogger("piccolo"), WarningHandler(warn_once(is_quiet))
+    """Within this, what the package logs is printed, warnings once, or nothing at all."""
+
+    def tell(news: str) -> None:
+        if not is_quiet:
+            tqdm.write(news, file=sys.stderr)
+
+    log = logging.getLogger("piccolo")
+    handler = LogHandler(tell, warn_once(is_quiet))
+    level = log.level
     log.addHandler(handler)
+    log.setLevel(logging.INFO)
     try:
         yield
     finally:
         log.removeHandler(handler)
+        log.setLevel(level)

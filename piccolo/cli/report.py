@@ -49,7 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "in place of the plan of a storey (1: the lowest): an image, and its control points, see below"
     option(parser, "--own-plan K IMAGE CSV", text, type=str, nargs=3, action="append", default=[])
     option(parser, "--crs EPSG", "the scan's coordinate system, for an arrow to grid north, if it names none")
-    option(parser, "--plan FILE", "the camera positions on the plans: .png, .svg or .dxf")
+    option(parser, "--plan FILE", "the camera positions on the plans: .png, .svg, .pdf or .dxf")
+    option(parser, "--force", "show results of another scan too; the page says so")
     option(parser, "--jobs N", "photos worked on at a time", default=num_cores())
     option(parser, "--cache FOLDER", "of prepared maps (default the user's)")
     option(parser, "--no-cache", "prepare the map again, and do not keep it")
@@ -76,6 +77,7 @@ def settings_from(arguments: argparse.Namespace) -> ReportSettings:
         is_self_contained=arguments.self_contained,
         own_plans=tuple(OwnPlan(int(k), Path(image), Path(csv)) for k, image, csv in arguments.own_plan),
         crs=arguments.crs or "",
+        is_forced=arguments.force,
     )
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
+from ..batch.localizer import Localizer
 from ..cloud.label_colors import Labels
 from ..cloud.settings import CloudSettings
 from ..coarse_to_fine.open_map import CachePolicy
@@ -16,7 +17,7 @@ from ..paper.settings import PaperSettings
 from ..runtime.atomic import write_atomically
 from ..runtime.threads import num_cores
 from ..scenes.evaluation.query_result import QueryResult
-from ..scenes.evaluation.runner import RunConfig, input_files, open_run
+from ..scenes.evaluation.runner import input_files, open_run
 from ..scenes.reproduce_paper.experiments import EXPERIMENTS, Condition, Settings, plot_png, table
 from ..scenes.scene import Scene, find_scenes
 from .command import check_least, command, option
@@ -84,7 +85,8 @@ def run_condition(
     with tempfile.TemporaryDirectory(prefix="piccolo-") as temporary:
         transformed, num_failed = transformed_scenes(condition, scenes, Path(temporary), report)
         cache = CachePolicy(True, Path(temporary))
-        config = RunConfig(condition.settings, *reading, cache, max(1, num_cores() // arguments.jobs))
+        num_threads = max(1, num_cores() // arguments.jobs)
+        config = Localizer((), condition.settings, *reading, cache, num_threads=num_threads)
         variants = condition.variants or arguments.variants  # those of a condition are of the wanted
         run = open_run(out / file_name(condition), config, transformed, variants)
         rows, num_failed_later = resumed(run, arguments)

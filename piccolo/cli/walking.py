@@ -3,20 +3,18 @@
 import argparse
 import math
 import re
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import NamedTuple
-
-from tqdm import tqdm
 
 from ..batch.frame_times import EXIF, NAMES, ORDER, times_of
 from ..batch.inputs import is_from_stdin
 from ..panorama.video import frames_of
+from ..runtime.temporary import temporary_folder
 from ..walk.frames import MAX_ACCELERATION, MAX_SPEED, MAX_STEP, NO_ACCELERATION, Motion
 from .errors import UsageError
+from .progress import shown
 
 EVERY = re.compile(r"(\d+(?:\.\d+)?)(s|m)")
 DEFAULT_EVERY = "0.5s"
@@ -55,7 +53,7 @@ def add_walk_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--max-speed", type=float, metavar="X", help=text)
     text = "from a frame to the next, where only their order is known [m] (default by what is found of them)"
     group.add_argument("--max-step", type=float, metavar="M", help=text)
-    text = "the path on the scan from above, coloured by its frames' confidence: .png, .svg or .dxf"
+    text = "the path on the scan from above, coloured by its frames' confidence: .png, .svg, .pdf or .dxf"
     group.add_argument("--plan", type=Path, metavar="FILE", help=text)
     text = "standard deviation of the camera's acceleration, by which the path is smoothed [m/s^2] "
     text += f"(default {MAX_ACCELERATION:g})"
@@ -126,11 +124,11 @@ def walk_inputs(arguments: argparse.Namespace, panoramas: Sequence[Path]) -> Ite
         return
     motion = motion_of(arguments, True)
     seconds, metres = every_of(arguments.every or DEFAULT_EVERY, motion.max_speed)
-    with TemporaryDirectory(prefix="piccolo-") as folder:
-        found = frames_of(arguments.video, seconds, Path(folder))
-        bar = {"unit": " frames", "disable": arguments.quiet, "file": sys.stderr, "leave": False}
+    with temporary_folder() as folder:
+        found = frames_of(arguments.video, seconds, folder)
+        bar = {"desc": "read the video", "unit": " frames", "leave": False}
         frames = [
             WalkInput(f.path, f.time, f"{arguments.video}#t={f.time:.3f}")
-            for f in tqdm(found, "read the video", **bar)
+            for f in shown(found, arguments.quiet, **bar)
         ]
         yield WalkInputs(frames, motion, metres)

@@ -4,7 +4,10 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+import numpy as np
+
 from ..errors import InputError
+from ..geometry.pose import Array, rotation_to_z
 from .label_colors import Labels
 
 UpAxis = Literal["auto", "z", "y", "x", "-z", "-y", "-x"]
@@ -17,7 +20,7 @@ class CloudSettings:
     """How the files of a cloud are to be understood."""
 
     scale: float = 1.0  # metres per unit of the files
-    up: UpAxis = "auto"  # the axis that points up; auto: z, or what the cloud's own planes say
+    up: UpAxis = "auto"  # the axis that points up; auto: the one of the file, z or in glTF y
     intensity_as_gray: bool = False  # where a file has no colours
     labels: Labels | None = None  # the points' labels are taken for their colours
     crs: str | None = None  # coordinate system, such as EPSG:25832; None: what the file names
@@ -33,3 +36,10 @@ class CloudSettings:
 
 
 IN_METRES = CloudSettings()
+
+
+def R_z_from_axis(up: UpAxis, of_file: UpAxis) -> Array:
+    """The rotation (3, 3) that turns a named axis to z; for auto that of the file."""
+    name = of_file if up == "auto" else up
+    sign = -1.0 if name.startswith("-") else 1.0
+    return np.round(rotation_to_z(sign * np.eye(3)["xyz".index(name[-1])])) + 0.0

@@ -41,7 +41,7 @@ class LocalCloud:
     """A cloud's points near a local origin, and where that is: x_local = R (x_world - origin_world)."""
 
     points: PackedPoints
-    R_local_from_world: Array  # (3, 3) turns the axis that --up names, or the map's up, to z; else identity
+    R_local_from_world: Array  # (3, 3) turns the axis that points up, or the map's up, to z
     origin_world: Array  # (3,) [m]
     warnings: tuple[str, ...]
 

@@ -16,6 +16,7 @@ from ..runtime.threads import Progress, no_progress
 from .digest import sha256_of_arrays
 from .readers.columns import brightest_of, colored_chunks
 from .readers.reader import CHUNK, PointSource, RawCloud
+from .settings import UpAxis
 from .voxel_table import VoxelTable
 from .voxels import Voxels, morton_order
 
@@ -100,6 +101,7 @@ class Cloud:
     origin_world: NDArray[np.float64]  # (3,) what was subtracted from the file's coordinates [m]
     num_dropped: int = 0  # points with NaN or infinite coordinates, left out
     warnings: tuple[str, ...] = ()  # one line each, for the user
+    up: UpAxis = "z"  # the axis that points up by the files
 
     def voxels(self, R_map_from_world: NDArray[np.float64]) -> Voxels:
         """The points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
@@ -138,6 +140,12 @@ class CloudStream:
     def station_axes(self) -> Array:
         """The z axes (S, 3) of the scanners whose poses the files tell, unit, in the files' axes."""
         return np.array([axis for source in self.sources for axis in source.station_axes]).reshape(-1, 3)
+
+    @property
+    def up(self) -> UpAxis:
+        """The axis that points up by the files; z where they disagree."""
+        axes = {source.up for source in self.sources}
+        return axes.pop() if len(axes) == 1 else "z"
 
     def chunks(self, validators: list[PointValidator]) -> Iterator[Chunk]:
         """Yield the finite points in metres; `validators` gets what is then known of each file."""
@@ -187,7 +195,7 @@ class CloudStream:
         points, colors = points[order], colors[order]
         warnings = (*self._warnings(validators), *unit_warnings(self.label, points))
         num_dropped = sum(validator.num_dropped for validator in validators)
-        return Cloud(points, colors, origin_world, num_dropped, warnings)
+        return Cloud(points, colors, origin_world, num_dropped, warnings, self.up)
 
 
 def stream_of_arrays(points: NDArray[np.floating[Any]], colors: NDArray[Any] | None) -> CloudStream:

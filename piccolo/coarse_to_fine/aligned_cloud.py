@@ -1,4 +1,4 @@
-"""A cloud turned so that up is z, as an octree; read once, also by a process that goes on for another."""
+"""A cloud turned so that the axis which its file or the user names is z, as an octree."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -6,29 +6,20 @@ from typing import Protocol
 import numpy as np
 
 from ..cloud.octree import Octree, build_octree
-from ..cloud.settings import UpAxis
+from ..cloud.settings import R_z_from_axis, UpAxis
 from ..cloud.voxels import Voxels
 from ..geometry.pose import Array
-from ..gravity import MIN_CONFIDENCE, R_z_from_axis, estimate_normals, find_up, rotation_to_z_up
-from ..runtime.unfinished import Unfinished
+from ..gravity.alignment import find_up
 
-MIN_TILT = np.radians(5.0)  # a cloud whose up is nearer to its z is taken as it is
-
-
-def align_to_gravity(octree: Octree) -> tuple[Array, tuple[str, ...]]:
-    """Rotation (3, 3) that turns the cloud's up to +z, identity if it is there or in doubt; warnings."""
-    up = find_up(estimate_normals(octree.level(0.08)[:, :3]))
-    tilt = np.arccos(np.clip(up.direction_world[2], -1.0, 1.0))
-    if tilt < MIN_TILT:
-        return np.eye(3), ()
-    text = f"the cloud's z is {np.degrees(tilt):.0f} deg off its up direction"
-    if up.confidence < MIN_CONFIDENCE:
-        return np.eye(3), (f"perhaps {text} (confidence {up.confidence:.2f}); z is kept, --up sets another",)
-    return rotation_to_z_up(up.direction_world), (f"{text}; levelled by its own planes",)
+MAX_TILT = np.radians(5.0)  # of what seems to be up to what is taken for it, that goes without saying
 
 
 class Voxelized(Protocol):
     """A cloud in memory, or in files that are read anew."""
+
+    @property
+    def up(self) -> UpAxis:
+        """The axis that points up by its file."""
 
     def voxels(self, R_map_from_world: Array) -> Voxels:
         """Its points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
@@ -44,30 +35,26 @@ class AlignedCloud:
     warnings: tuple[str, ...]
 
 
-def read_aligned(cloud: Voxelized, up: UpAxis) -> AlignedCloud:
-    """A cloud whose axis `up` points up, as octree; `auto` asks the cloud, and reads a tilted one anew."""
-    more: tuple[str, ...] = ()
-    R_map_from_world = R_z_from_axis(up)
+def read_aligned(cloud: Voxelized, up: UpAxis | Array) -> AlignedCloud:
+    """A cloud as octree: a named axis is up, with `auto` the file's; or a rotation (3, 3) makes z up."""
+    R_map_from_world = R_z_from_axis(up, cloud.up) if isinstance(up, str) else up
     voxels = cloud.voxels(R_map_from_world)
     octree = build_octree(voxels)
-    if up == "auto":
-        R_map_from_world, more = align_to_gravity(octree)
-        if not np.array_equal(R_map_from_world, np.eye(3)):
-            del voxels, octree  # their room is needed
-            voxels = cloud.voxels(R_map_from_world)
-            octree = build_octree(voxels)
     origin_world = R_map_from_world.T @ voxels.origin
-    return AlignedCloud(octree, R_map_from_world, origin_world, voxels.warnings + more)
+    is_doubtful = isinstance(up, str) and up == "auto"
+    doubts = doubts_about_up(octree, R_map_from_world, cloud.up) if is_doubtful else ()
+    return AlignedCloud(octree, R_map_from_world, origin_world, voxels.warnings + doubts)
 
 
-def read_once(cloud: Voxelized, up: UpAxis, work: Unfinished | None) -> AlignedCloud:
-    """The same, or what a process that was killed has read."""
-    stage = (work or Unfinished()).stage("read", ())
-    stage.read()
-    if not stage.done:
-        a = read_aligned(cloud, up)
-        leaf_size, warnings = np.array(a.octree.leaf_size), np.array(a.warnings, np.str_)
-        stage.add((*a.octree[:3], leaf_size, a.R_map_from_world, a.origin_world, warnings))
-    nodes, first_child, level_start, leaf_size, R_map_from_world, origin_world, warnings = stage.done[0]
-    octree = Octree(nodes, first_child, level_start, float(leaf_size))
-    return AlignedCloud(octree, R_map_from_world, origin_world, tuple(map(str, warnings)))
+def doubts_about_up(octree: Octree, R_map_from_world: Array, taken: UpAxis) -> tuple[str, ...]:
+    """A line if the floors plainly face another way than the map's z, with the axis nearest to their way."""
+    axis, sense, reason, _ = find_up(octree)
+    cosine = sense * axis[2]
+    if sense == 0.0 or cosine > np.cos(MAX_TILT):
+        return ()
+    up_world = R_map_from_world.T @ (sense * axis)
+    k = int(np.abs(up_world).argmax())
+    nearest = f"{'-' if up_world[k] < 0.0 else ''}{'xyz'[k]}"
+    angle = np.degrees(np.arccos(max(cosine, -1.0)))
+    text = f"the floors face {angle:.0f} deg away from {taken}, which is taken for up ({reason})"
+    return (f"{text}; set up={nearest}, or turn the scan by tools/align_gravity.py",)

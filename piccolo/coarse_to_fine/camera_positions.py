@@ -118,12 +118,12 @@ def coverage(octree: Octree, centers: NDArray[np.floating[Any]], workers: Worker
     """Fraction of the sphere (N,) around each centre (N, 3) that is not empty, seen at a low resolution."""
     area = whole_areas(FREE_SPACE_VIEW.num_rings).astype(np.int64)
 
-    def glance(lo: int) -> tuple[NDArray[np.float64]]:
+    def glance(lo: int) -> NDArray[np.float64]:
         is_filled = ranges_around(octree, centers[lo : lo + BLOCK], FREE_SPACE_VIEW) > 0.0
-        return (is_filled @ area / area.sum(),)
+        return np.asarray(is_filled @ area / area.sum())
 
-    parts = workers.collect(glance, range(0, len(centers), BLOCK), "find free space", centers)
-    return np.concatenate([np.empty(0), *(fraction for (fraction,) in parts)])
+    parts = workers.map(glance, range(0, len(centers), BLOCK), "find free space")
+    return np.concatenate([np.empty(0), *parts])
 
 
 def nearest_distances(tree: Any, centers: NDArray[np.floating[Any]], workers: Workers) -> NDArray[np.float64]:

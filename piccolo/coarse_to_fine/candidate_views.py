@@ -1,7 +1,7 @@
 """What a camera sees from a map's candidates: wide cells of all that are searched, fine ones of some.
 
 Wide cells are prepared with the map. A view of fine cells is made when a search first comes upon its
-candidate, and kept for as long as the map is open.
+candidate, and kept until there are many.
 """
 
 import threading
@@ -25,6 +25,7 @@ WIDE_VOXEL_PER_RANGE = 1 / 8  # of the same view where it is averaged over wide 
 BYTES_PER_CELL = 6 + 3 + 1  # of a view: offsets, channels, seen
 WIDE_BYTES_PER_CELL = 2 * (3 + 1)  # of a wide one, twice: in parts, and joined
 LEAST_ROOM = 256  # views
+MOST_KEPT = 1 << 15  # views, 0.24 GB
 
 
 class Views(NamedTuple):
@@ -46,7 +47,8 @@ class WideViews(NamedTuple):
 
 def empty_views(num: int, num_cells: int) -> Views:
     """Room for some views."""
-    check_memory(num * num_cells * BYTES_PER_CELL, f"the scan: {num} views", "cut out a part of it")
+    if num:
+        check_memory(num * num_cells * BYTES_PER_CELL, f"the scan: {num} views", "cut out a part of it")
     return Views(
         np.empty((num, 3)),
         np.empty((num, 3, num_cells), np.int16),
@@ -90,7 +92,7 @@ def render_wide(
         render_wide_block(octree, some, *how, features, seen)
         return features.reshape(len(some), -1), seen
 
-    parts = workers.collect(run, range(0, len(centers), BLOCK), "render views", centers)
+    parts = list(workers.map(run, range(0, len(centers), BLOCK), "render views"))
     none = np.empty((0, 3 * num_wide), np.int8), np.empty((0, num_wide), np.uint8)
     features, seen = (np.concatenate([part[k] for part in (none, *parts)]) for k in range(2))
     return WideViews(features, seen)
@@ -108,14 +110,23 @@ class CandidateViews:
 
     def __post_init__(self) -> None:
         """None is made."""
-        self.made = empty_views(0, len(make_grid(self.config.num_rings)))
-        self._row = np.full(len(self.centers), -1, np.int64)
         self._lock = threading.Lock()
+        self._forget()
+
+    def _forget(self) -> None:
+        self.made = empty_views(0, len(make_grid(self.config.num_rings)))
+        self.num_made = 0
+        self._row = np.full(len(self.centers), -1, np.int64)
 
     def at(self, candidates: NDArray[np.int64], workers: Workers) -> tuple[NDArray[np.int64], Views]:
         """The rows (n,) of some candidates (n,) among the views made, and these."""
         with self._lock:
             missing = np.unique(candidates[self._row[candidates] < 0])
+            if (
+                len(missing) and self.num_made + len(missing) > MOST_KEPT
+            ):  # who was given the old ones has them
+                missing = np.unique(candidates)
+                self._forget()
             if len(missing):
                 self._append(render_views(self.octree, self.centers[missing], self.config, workers))
                 self._row[missing] = np.arange(self.num_made - len(missing), self.num_made)
@@ -125,7 +136,7 @@ class CandidateViews:
         """Put views behind those made, in arrays twice as long if there is no room: nobody's rows change."""
         begin, end = self.num_made, self.num_made + len(views.centers)
         if end > len(self.made.centers):
-            larger = empty_views(max(end, 2 * begin, LEAST_ROOM), self.made.is_seen.shape[1])
+            larger = empty_views(max(end, min(2 * begin, MOST_KEPT), LEAST_ROOM), self.made.is_seen.shape[1])
             put_rows(larger, 0, [values[:begin] for values in self.made])
             self.made = larger
         put_rows(self.made, begin, views)

@@ -17,7 +17,7 @@ from ..optimize.channel_loss import BLOCK_RINGS, CHANCE, NUM_BLOCKS
 from ..panorama.local_normalization import opponent, zscore
 from ..panorama.projection import CHUNK, gather, make_projected, project
 from ..panorama.texels import bilinear_weights, blend, is_valid
-from ..runtime.jit import F0, kernel
+from ..runtime.jit import F0, copy_to, kernel
 from .cells import average_colors, local_statistics, locate
 from .query import Query
 from .recent_views import place_of
@@ -77,7 +77,9 @@ def sample_photo(offsets, weights, photo, R_cam_from_map, center, colors, shared
             b = blend(t00, t10, t01, t11, bilinear, 16) * PER_LEVEL
             c0[n], c1[n], c2[n] = opponent(r, g, b)
             both[n] = weight[n] * is_valid(t00, t10, t01, t11)
-        rays[0][lo:hi], rays[1][lo:hi], rays[2][lo:hi] = p.x[:count], p.y[:count], p.z[:count]
+        copy_to(rays[0][lo:hi], p.x[:count])
+        copy_to(rays[1][lo:hi], p.y[:count])
+        copy_to(rays[2][lo:hi], p.z[:count])
 
 
 @kernel
@@ -133,7 +135,7 @@ def compare_cells(
         normalize(of_photo, kept, view, second)
         correlate_blocks(first, second, kept, blocks, correlation, area)
         if k == 0:
-            visible_area[:] = area
+            copy_to(visible_area, area)
             for i in range(n):
                 if correlation[blocks[i]] < CONTRADICTS:
                     kept[i] = F0

@@ -1,4 +1,4 @@
-"""What the default method is made of: views, image scales, beams. tools/ablation.py takes parts of it out."""
+"""What the default method is made of: views, image scales, beams. `benchmark.py ablation` removes parts."""
 
 from typing import NamedTuple
 

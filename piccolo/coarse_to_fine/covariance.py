@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..confidence.covariance import PoseCovariance, least_constrained_direction
 from ..geometry.pose import Array, Pose, step
@@ -22,6 +23,7 @@ from .view import Cells
 BLOCK_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
 MOST_SHARE = 1.001  # of a block in what fixes the pose, a little above 1 for one that does alone
 PIXEL_SHARE = 0.04  # of a pixel that is left in a pose, by trials with photos of 256 and 2048 px
+UNCALIBRATED_SHARE = 0.15  # the same of a photo whose principal point and distortion nobody measured
 POLE_DEG = 2.0  # around the photo's poles pixels are so narrow that one point's errors outweigh all others
 SCALE = FULL_LOSS * LEVELS_PER_UNIT
 
@@ -33,7 +35,7 @@ class DifferenceSteps:
     image: Literal["full", "fine", "middle"]  # of the query's
     turn: float  # step of the differences [rad]
     move: float  # [m]
-    inflation: float  # so that 95 % of true poses lie in the 95 % region (tools/calibrate_confidence.py)
+    inflation: float  # so that 95 % of true poses lie in the 95 % region (tools/benchmark.py calibration)
 
 
 STEPS = (
@@ -80,14 +82,24 @@ def hessian_at(image: Texels, points: Cells, pose: Pose, steps: DifferenceSteps)
     return np.asarray(0.5 * (np.array(rows) + np.array(rows).T))
 
 
-def block_gradients(image: Texels, points: Cells, pose: Pose) -> Array:
-    """Gradients (B, 6), in the camera's frame, of the points in each block around it, as if left out."""
-    block = cell_of(points.offsets.T / np.linalg.norm(points.offsets, axis=0)[:, None], BLOCK_RINGS)
+def equations_by_block(image: Texels, points: Cells, pose: Pose, block: NDArray[np.integer]) -> Array:
+    """Sums (B, 29) of the normal equations over the points (N,) of each block; the camera is their centre."""
     order, counts = np.argsort(block, kind="stable"), np.bincount(block)
     offsets, levels, weights = (np.ascontiguousarray(values[..., order]) for values in points[:3])
     begins, sums = np.concatenate([[0], np.cumsum(counts)]), np.empty((len(counts), NUM_SUMS))
     problem = offsets, levels, weights, image.rgbx, image.width, SCALE
     equations_by_part(problem, pose.R_cam_from_world, np.zeros(3), begins, sums)
+    return sums
+
+
+def blocks_of(points: Cells) -> NDArray[np.integer]:
+    """The block (N,) of the sphere in which each point lies."""
+    return cell_of(points.offsets.T / np.linalg.norm(points.offsets, axis=0)[:, None], BLOCK_RINGS)
+
+
+def block_gradients(image: Texels, points: Cells, pose: Pose) -> Array:
+    """Gradients (B, 6), in the camera's frame, of the points in each block around it, as if left out."""
+    sums = equations_by_block(image, points, pose, blocks_of(points))
     shown = sums[sums[:, GRADIENT:MATRIX].any(axis=1)]  # of what the photo shows
     return as_left_out(shown[:, GRADIENT:MATRIX], symmetric(shown[:, MATRIX:]))
 
@@ -135,22 +147,25 @@ def covariance_at(query: Query, points: Cells, pose: Pose) -> Array | None:
     return min(found, key=lambda c: float(np.linalg.eigvalsh(c[3:, 3:])[-1]))
 
 
-def errors_of_source(query: Query, points: Cells) -> Array:
+def errors_of_source(query: Query, points: Cells, pixel_share: float) -> Array:
     """What the errors of the photo and of the scan add to a covariance (6, 6) [rad, m] in the map's axes.
 
     They go together over many blocks: a photo's grid and stitching by its pixels, a scan's noise and doubled
     surfaces by what `surface_noise` tells. At the median range an angle and a displacement are one.
     """
     median_range = float(np.median(np.linalg.norm(points.offsets, axis=0)))
-    turn, surface = PIXEL_SHARE * query.pixel, query.scan_map.surface_variance
+    turn, surface = pixel_share * query.pixel, query.scan_map.surface_variance
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = np.eye(3) * (turn**2 + np.trace(surface) / 3.0 / median_range**2)
     covariance[3:, 3:] = np.eye(3) * (turn * median_range) ** 2 + surface
     return covariance
 
 
-def estimate_covariance(query: Query, pose: Pose) -> PoseCovariance | None:
-    """The covariance of a pose, in world axes; None where the points do not fix it."""
+def estimate_covariance(query: Query, pose: Pose, of_camera: Array | None = None) -> PoseCovariance | None:
+    """The covariance of a pose, in world axes; None where the points do not fix it.
+
+    `of_camera` (6, 6), in the map's axes, is what the uncertainty of the calibration adds.
+    """
     query = without_occluders(query, pose)
     points = without_poles(points_at(query, pose).around(pose.center_world), pose)
     points = points._replace(channels=as_levels(points.channels))
@@ -160,8 +175,13 @@ def estimate_covariance(query: Query, pose: Pose) -> PoseCovariance | None:
     R_map_from_cam, R_map_from_world = pose.R_cam_from_world.T, query.scan_map.R_map_from_world
     J = np.eye(6)
     J[3:, 3:] = R_map_from_cam
-    covariance_map = J @ covariance @ J.T + errors_of_source(query, points)
+    pixel_share = PIXEL_SHARE if of_camera is None else UNCALIBRATED_SHARE
+    covariance_map = J @ covariance @ J.T + errors_of_source(query, points, pixel_share)
+    std_of_fit = None
+    if of_camera is not None:
+        std_of_fit = math.sqrt(float(np.linalg.eigvalsh(covariance_map[3:, 3:])[-1]))
+        covariance_map += of_camera
     J[3:, 3:] = R_map_from_world.T
     covariance_world = J @ covariance_map @ J.T
     words = least_constrained_direction(covariance_map[3:, 3:], covariance_world[3:, 3:], points.offsets)
-    return PoseCovariance(0.5 * (covariance_world + covariance_world.T), words)
+    return PoseCovariance(0.5 * (covariance_world + covariance_world.T), words, std_of_fit)

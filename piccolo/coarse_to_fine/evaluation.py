@@ -9,7 +9,7 @@ import numpy as np
 
 from ..cloud.soa import PackedPoints
 from ..confidence.alternatives import MAX_ALTERNATIVES
-from ..confidence.confidence import NOT_LOCALIZED, classify, posterior
+from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED, classify, posterior
 from ..confidence.localization import Alternative, Localization
 from ..confidence.occlusion import occlusion_at
 from ..confidence.score import Agreement, Evidence, agreement_at
@@ -23,6 +23,8 @@ from ..panorama import Panorama
 from ..render.zbuffer import visible_points
 from ..runtime.once import Once
 from .covariance import estimate_covariance
+from .focal_length import FocalFit
+from .prior import contradictions
 from .query import Query
 from .recent_views import place_of
 from .search_result import SURE_MATCHES, SearchResult
@@ -32,11 +34,18 @@ ENOUGH_EXPLAINED = 0.7  # score from which a photo is not mirrored
 MIRROR_RATIO = 1.2  # of matches, mirrored by not
 MIRRORED = "the photo fits the scan better mirrored, left for right: turn it over and try again"
 VOXEL_PER_RANGE, COARSE_VOXEL_PER_RANGE = 1 / 150, 1 / 40  # of points that are compared with the photo
+MOST_CONFLICT = 4.0  # deviations between the focal length found and that given
+TELLING_STD = 0.03  # [m] of a position: what a focal length adds beyond it is told
 LAST_STEP = 0.01  # [rad, m] of Adam and the first of L-BFGS, where they take the last descent
 
 
-def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localization:
-    """The pose found in world coordinates, after the descent that the solver asks for, with its evidence."""
+def evaluate(
+    query: Query, panorama: Panorama, found: SearchResult, fit: FocalFit | None = None
+) -> Localization:
+    """The pose found in world coordinates, after the descent that the solver asks for, with its evidence.
+
+    `fit` is that of the focal length, of a photo whose is not exact.
+    """
     if found.best.score < 0.0:
         return Localization()
     scan_map, settings, pose = query.scan_map, query.settings, found.best.pose
@@ -45,7 +54,7 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
         how = DescentSettings(solver=settings.solver, step_size=LAST_STEP)
         pose = refine(points(), sampling_loss_of(query.colors()), pose, how).pose
     told: list[Callable[[], Any]] = [
-        lambda: estimate_covariance(query, pose),  # takes longest
+        lambda: estimate_covariance(query, pose, fit and fit.pose_covariance),  # takes longest
         lambda: occlusion_at(points(), panorama, pose).fractions(),
         lambda: sampling_loss(visible_points(points(), pose.center_world), query.colors(), pose),
         lambda: agreement_at(coarse(), query.panorama, pose),
@@ -57,9 +66,13 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
     reported = found.alternatives[:MAX_ALTERNATIVES]
     standings = standings_of(query, found.best, reported)
     probabilities = posterior(standings, covariance)
-    warnings: tuple[str, ...] = ()
+    warnings = contradictions(scan_map, pose, settings.prior)
     if classify(probabilities, settings.min_confidence) != NOT_LOCALIZED and is_mirrored(query, evidence):
-        probabilities, warnings = np.append(np.zeros(len(standings)), 1.0), (MIRRORED,)
+        warnings += (MIRRORED,)
+    if warnings or (fit is not None and fit.conflict > MOST_CONFLICT):
+        probabilities = np.append(np.zeros(len(standings)), 1.0)
+    if fit is not None and classify(probabilities, settings.min_confidence) != LOCALIZED:
+        warnings += doubts_of(panorama, fit)
     matches = [s.num_matches if query.by_features else None for s in standings[1:]]
     alternatives = tuple(
         Alternative(scan_map.to_world(h.pose), h.score, s.share, num_matches, float(p))
@@ -75,7 +88,20 @@ def evaluate(query: Query, panorama: Panorama, found: SearchResult) -> Localizat
         alternatives,
         covariance,
         warnings,
+        cameras=() if fit is None else panorama.cameras,
+        focal_length=None if fit is None else fit.focal_length(panorama),
     )
+
+
+def doubts_of(panorama: Panorama, fit: FocalFit) -> tuple[str, ...]:
+    """Say what a focal length has to do with a pose that is not sure."""
+    focal = fit.focal_length(panorama)
+    found = f"focal length: found {focal.px:.0f} px within {focal.std_px:.0f}"
+    given = f"given {focal.given_px:.0f} px within {focal.given_std_px:.0f}"
+    if fit.conflict > MOST_CONFLICT:
+        return (f"{found}, which contradicts what was {given}",)
+    std = math.sqrt(float(np.linalg.eigvalsh(fit.pose_covariance[3:, 3:])[-1]))
+    return (f"{found}, {given}: this leaves the position open by {std:.2f} m",) if std > TELLING_STD else ()
 
 
 def surroundings_of(query: Query, pose: Pose) -> list[Callable[[], PackedPoints]]:

@@ -2,11 +2,9 @@
 
 import threading
 from collections.abc import Callable
-from dataclasses import replace
 
 from ..local_features.feature_map import FeatureMap
 from ..runtime.threads import Workers
-from ..runtime.unfinished import Unfinished
 
 
 class LateFeatures:
@@ -16,15 +14,13 @@ class LateFeatures:
         self._make = make
         self._look: Callable[[], FeatureMap | None] = lambda: None
         self._keep: Callable[[FeatureMap], None] = lambda features: None
-        self._key = ""
         self._made: FeatureMap | None = None
         self._lock = threading.Lock()
 
-    def keep_by(
-        self, look: Callable[[], FeatureMap | None], keep: Callable[[FeatureMap], None], key: str
-    ) -> None:
-        """Look first for what another process has kept; keep what is made. A key tells unfinished work."""
-        self._look, self._keep, self._key = look, keep, key
+    def keep_by(self, look: Callable[[], FeatureMap | None], keep: Callable[[FeatureMap], None]) -> None:
+        """Look first for what another process has kept; keep what is made."""
+        self._look = look
+        self._keep = keep
 
     def get(self, workers: Workers) -> FeatureMap:
         """The features, made now if nobody has."""
@@ -32,8 +28,6 @@ class LateFeatures:
             if self._made is None:
                 self._made = self._look()
             if self._made is None:
-                work = Unfinished(self._key)
-                self._made = self._make(replace(workers, work=work))
+                self._made = self._make(workers)
                 self._keep(self._made)
-                work.finish()
             return self._made

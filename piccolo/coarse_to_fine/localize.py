@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import compress
 
 from ..confidence.alternatives import Hypothesis
@@ -18,18 +19,20 @@ from ..runtime.threads import Workers
 from .config import METHOD, Beam, MethodConfig
 from .evaluation import evaluate, surroundings_of
 from .first_look import FIRST_BEAM, first_query, is_clear, is_whole, mirror_score, tilted_query
-from .prior import apply_prior, is_allowed, nothing_allowed
+from .focal_length import FocalFit, fit_focal, recalibrated
+from .prior import apply_prior, contradictions, nothing_allowed
 from .query import Query, prepare_query
-from .refinement import refine, refine_full_resolution, refine_matched, refine_unoccluded, settle
+from .refinement import compared, refine, refine_full_resolution, refine_matched, refine_unoccluded, settle
 from .scan_map import ScanMap
 from .search import search_poses
 from .search_result import NEAR_RATIO, SURE_MATCHES, SearchResult, found_among
-from .settings import CoarseToFineSettings
+from .settings import NOTHING_KNOWN, CoarseToFineSettings
 from .standings import fairly_selected
 from .starts import Starts
 
 NUM_MATCHED = 6  # poses from matches that are refined
 ALTERNATIVES_COMPARED, ALTERNATIVES_REFINED = 8, 4  # at most
+MAX_CALIBRATIONS = 4  # fits of a focal length
 HOPELESS_SCORE = 0.02  # of black, white and noisy pictures, and of most views of other places
 FAINT_SCORE, FAINT_MATCHES = 0.1, 6  # nothing that has less of both is ever localized
 NEAR_MATCHES = 0.5  # an alternative with this part of the matches is refined as carefully as the best
@@ -72,8 +75,13 @@ def localize(
                 query = first if is_clear(first, starts, hypotheses, of_mirror) else query
         if query.by_features:
             query, hypotheses = in_doubt(query, hypotheses, is_looked_at, watch)
+        if settings.prior != NOTHING_KNOWN and method.uses_search:
+            hypotheses = hypotheses + beyond_prior(query, scan_map, watch)
         with watch.stage("refine"):
-            return evaluate(query, panorama, finished(query, hypotheses))
+            found = finished(query, hypotheses)
+            if panorama.focal_prior is None or found.best.score < HOPELESS_SCORE:
+                return evaluate(query, panorama, found)
+            return evaluate(*calibrated(query, panorama, found))
 
 
 def in_doubt(
@@ -107,6 +115,15 @@ def matched(query: Query, hypotheses: list[Hypothesis]) -> tuple[Query, list[Hyp
     return query, hypotheses + refine_matched(query, matched_poses(query))
 
 
+def beyond_prior(query: Query, scan_map: ScanMap, watch: Stopwatch) -> list[Hypothesis]:
+    """Search a whole photo in all of the map: what the prior leaves must be better than what it excludes."""
+    if not is_whole(query):
+        return []
+    settings = replace(query.settings, prior=NOTHING_KNOWN)
+    anywhere = first_query(replace(query, scan_map=scan_map, settings=settings))
+    return searched(anywhere, "known", FIRST_BEAM, watch)[1]
+
+
 def searched(query: Query, gravity: Gravity, beam: Beam, watch: Stopwatch) -> tuple[Starts, list[Hypothesis]]:
     """The starts of a search by whole views, and where they lead."""
     with watch.stage("search"):
@@ -122,11 +139,16 @@ def is_sure(query: Query, hypotheses: Sequence[Hypothesis]) -> bool:
 
 
 def matched_poses(query: Query) -> list[Pose]:
-    """The poses that matches vote for and the prior allows, best first."""
+    """Return the poses that matches vote for, best first.
+
+    Where whole views are not asked, only those that the prior allows.
+    """
     is_known = query.settings.gravity == "known"
     level = query.R_cam_from_level if is_known else None
-    found = poses_of(query.matches, level, NUM_MATCHED, query.workers)
-    return [f.pose for f in found if is_allowed(query.scan_map, f.pose, query.settings.prior)]
+    poses = [f.pose for f in poses_of(query.matches, level, NUM_MATCHED, query.workers)]
+    if query.method.uses_search:
+        return poses
+    return [pose for pose in poses if not contradictions(query.scan_map, pose, query.settings.prior)]
 
 
 def finished(query: Query, hypotheses: Sequence[Hypothesis]) -> SearchResult:
@@ -162,6 +184,24 @@ def finished(query: Query, hypotheses: Sequence[Hypothesis]) -> SearchResult:
     ends = list(query.workers.map(refined, [found.best, *near], "descend"))
     far = [h for h in found.alternatives if not any(h is other for other in near)]
     return settled(query, fairly_selected(query, found_among([*ends, *far], ALTERNATIVES_COMPARED)))
+
+
+def calibrated(
+    query: Query, panorama: Panorama, found: SearchResult
+) -> tuple[Query, Panorama, SearchResult, FocalFit]:
+    """Fit the focal length at the best pose, and refine the poses with it, until it is at rest."""
+    for k in range(MAX_CALIBRATIONS):
+        fit = fit_focal(query, panorama, found.best.pose, is_first=k == 0)
+        if fit.is_at_rest:
+            break
+        query, panorama = recalibrated(query, panorama, fit.change)
+        poses = [fit.moved(found.best.pose), *(h.pose for h in found.alternatives)]
+        again = partial(compared, query)
+        moved = [Hypothesis(pose, 0.0) for pose in poses]
+        found = finished(query, list(query.workers.map(again, moved, "compare")))
+    else:
+        fit = fit_focal(query, panorama, found.best.pose, is_first=False)
+    return query, panorama, found, fit
 
 
 def settled(query: Query, found: SearchResult) -> SearchResult:

@@ -1,4 +1,4 @@
-"""A prepared map on disk: a NumPy archive that is mapped into memory.
+"""A prepared map on disk: a NumPy archive that is mapped into memory where nobody can cut it off meanwhile.
 
 A file of another format, or damaged in any byte (each member of an archive has a checksum), is never trusted;
 `map_validation.py` checks what is whole. Of a file that has been checked, its identity is remembered.
@@ -7,6 +7,9 @@ by which a map was made, and makes it anew when they have changed.
 """
 
 import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -19,19 +22,22 @@ from ..cloud.octree import Octree
 from ..cloud.readers.npz import damage_named
 from ..errors import InputError
 from ..local_features.feature_map import FeatureMap
-from ..runtime.array_archive import MappedArchive, write_archive
+from ..runtime.array_archive import open_archive, write_archive
 from ..runtime.atomic import replacing
-from ..runtime.file_facts import recall, remember
+from ..runtime.cache import WRITABLE, is_own, mark_used, own_names, private_folder
+from ..runtime.file_facts import key_of, recall, remember
 from .candidate_views import CandidateViews
 from .map_validation import LAYOUT, check_arrays, clean_warnings
 from .scan_map import ScanMap, with_late_features
 
 FORMAT = "piccolo-map/8"
+NAME = own_names("piccolo-map")  # in a cache
 OTHERS = ("octree", "local_features", "scan_names", "warnings", "crs", "is_partial", "views", "late")
 ARRAYS = [f.name for f in fields(ScanMap) if f.name not in OTHERS]
 MEMBERS = {*LAYOUT, "format", "scan_names", "warnings"}
 WANTED = "wanted a whole map by tools/prepare_map.py"
 ZIP_MAGIC = b"PK\x03\x04"
+COPIED_AT_ONCE = 1 << 22  # [byte]
 # The first member of a map: its name and where that stands, and the beginning of its value somewhere behind.
 FIRST_NAME, FIRST_NAME_AT = b"format.npy", 30
 FIRST_VALUE, FIRST_VALUE_WITHIN = FORMAT.partition("/")[0].encode("utf-32-le"), 512
@@ -63,27 +69,61 @@ def is_map_file(path: Path) -> bool:
     return head.startswith(ZIP_MAGIC) and (has_name or FIRST_VALUE in head)
 
 
+@contextmanager
+def lasting(path: Path, is_copied: bool) -> Iterator[Path | None]:
+    """A map's file that may be mapped: itself, or a copy in the user's cache; None where there is none.
+
+    A file of the cache, where nobody else may write, is only ever replaced whole. Any other may be cut off or
+    overwritten in place at any time, which would kill, or mislead, a process that has mapped it. A copy that
+    the caller finds damaged is removed.
+    """
+    if NAME.fullmatch(path.name) and is_own(path.parent.stat(), WRITABLE):
+        yield path
+        return
+    folder = private_folder("maps", NAME) if is_copied else None
+    copy = folder and copied(path, folder)
+    try:
+        yield copy
+    except BaseException:
+        if copy:
+            copy.unlink(missing_ok=True)
+        raise
+
+
+def copied(path: Path, folder: Path) -> Path | None:
+    """The copy of a file in a folder, made if there is none of it as it is now; None if it can't be made."""
+    with path.open("rb") as file:
+        copy = folder / f"{key_of('copy', os.fstat(file.fileno()))}.piccolo-map"
+        try:
+            if not copy.exists():
+                with replacing(copy) as out:
+                    shutil.copyfileobj(file, out, COPIED_AT_ONCE)
+        except OSError:  # as where the disk is full: it is read instead
+            return None
+    mark_used(copy)
+    return copy
+
+
 def load_map(path: Path, remembers: bool = False) -> ScanMap:
-    """Map into memory what `save_map` wrote; InputError for anything else.
+    """Read or map into memory what `save_map` wrote; InputError for anything else.
 
     All of it is read and checked; with `remembers` only once, as long as the file stays as it is.
     """
     what = f"checked as {FORMAT} by {__version__}"
-    with damage_named(path, WANTED), path.open("rb") as file:
-        status = os.fstat(file.fileno())
-        archive = MappedArchive(file)
+    with damage_named(path, WANTED), lasting(path, remembers) as place:
+        archive = open_archive(place or path, is_mapped=place is not None)
         if "format" in archive.members and (found := str(archive.array("format"))) != FORMAT:
             text = f"a map of format {found[:40]!r}, but this version reads {FORMAT}; prepare it again"
             raise InputError(f"{path}: {text}")
         if set(archive.members) != MEMBERS:
             raise ValueError(f"not the arrays of a map: {sorted(MEMBERS ^ set(archive.members))}")
         arrays = {name: archive.array(name) for name in archive.members}
-        if not (remembers and recall(what, status) is not None):
+        if not (remembers and recall(what, archive.status) is not None):
             for name in archive.members:
                 archive.check(name)
             check_arrays(path, arrays)
             if remembers:
-                remember(what, status, "")
+                remember(what, archive.status, "")
         warnings = clean_warnings(path, arrays["warnings"])
     own: dict[str, Any] = {name: arrays[name] for name in ARRAYS if name not in ("has_labels", "scan_sha256")}
     octree = Octree(

@@ -11,23 +11,20 @@ import numpy as np
 from ..cloud import open_cloud
 from ..cloud.crs import crs_of
 from ..cloud.digest import sha256_of_files
-from ..cloud.settings import IN_METRES, CloudSettings
+from ..cloud.settings import IN_METRES, CloudSettings, R_z_from_axis
 from ..cloud.soa import LocalCloud, pack_points
 from ..errors import InputError
 from ..geometry.pose import rotate_points
-from ..gravity import R_z_from_axis
 from ..local_features.feature_map import FeatureMap
-from ..runtime.cache import cache_root, digest_of_sources, in_words, mark_used, own_folder, own_names
+from ..runtime.cache import cache_root, digest_of_sources, in_words, mark_used, own_folder
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
-from ..runtime.unfinished import Unfinished
-from .map_file import FORMAT, is_map_file, load_map, save_map
+from .map_file import FORMAT, NAME, is_map_file, load_map, save_map
 from .named_scans import named
 from .scan_addition import add_scan
 from .scan_map import ScanMap, prepare_map, with_features
 from .settings import NOTHING_KNOWN, Prior
 
-NAME = own_names("piccolo-map")
 FOLDER = "piccolo-maps"  # within the folder that the user names
 # What makes a map: folders of the package. The cache makes maps anew when one of their files has changed.
 MAKERS = ("cloud", "coarse_to_fine", "geometry", "gravity", "local_features", "optimize", "panorama")
@@ -54,8 +51,6 @@ def open_map(
 
     A prepared map may stand in place of the files. The prior is asked where the scan is too large as a whole.
     Local features come late, and into the cache then, unless `has_features`.
-    What is built for the cache goes on where a killed process stood; without it only with `workers.work`,
-    whose parts the caller removes.
     """
     map_path = prepared_map_among(paths)
     if map_path:
@@ -80,14 +75,9 @@ def open_map(
         return replace(scan_map, has_labels=has_labels, scan_sha256=digest, crs=crs_of(paths))
 
     key = content_key(digest, cloud_settings) if digest else ""
-    if workers.work:
-        workers.work.key = key
     if not (cache.is_used and key):
         return build()
-    work = Unfinished(key)
-    workers = replace(workers, work=work)
     scan_map, warning = cached_map(cache.folder, key, digest, build, watch)
-    work.finish()
     if not warning:
         return scan_map
     workers.warn(warning)
@@ -114,10 +104,6 @@ def extended_map(
         old = load_map(map_path)
         cloud = open_cloud(paths, cloud_settings, workers.show)
         digest = sha256_of_files(paths)
-        if workers.work:
-            workers.work.key = (
-                f"{content_key(digest, cloud_settings)} in {sha256_of_files([map_path])} as {name}"
-            )
         crs = crs_of(paths)
     check_labels(map_path, old, cloud_settings)
     if crs and old.crs and crs != old.crs:
@@ -207,7 +193,7 @@ def kept_late(scan_map: ScanMap, path: Path) -> ScanMap:
             save_map(replace(scan_map, local_features=features), path)
 
     if scan_map.late:
-        scan_map.late.keep_by(look, keep, f"features of {path.name}")
+        scan_map.late.keep_by(look, keep)
     return scan_map
 
 
@@ -217,7 +203,7 @@ def open_points(paths: Sequence[Path], settings: CloudSettings, workers: Workers
         m = open_map(paths, settings, CachePolicy(is_used=False), workers, Stopwatch())
         return LocalCloud(m.points, m.R_map_from_world, m.origin_world, m.warnings)
     cloud = open_cloud(paths, settings, workers.show).read()
-    R_local_from_world = R_z_from_axis(settings.up)
+    R_local_from_world = R_z_from_axis(settings.up, cloud.up)
     points = rotate_points(cloud.points.astype(np.float64), R_local_from_world).astype(np.float32)
     packed = pack_points(points, cloud.colors)
     return LocalCloud(packed, R_local_from_world, cloud.origin_world, cloud.warnings)

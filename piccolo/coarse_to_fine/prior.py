@@ -5,11 +5,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.pose import Pose
+from ..geometry.pose import MAX_ANGLE, MAX_DISTANCE, Pose
 from .camera_positions import COARSE_SPACING, heights_above_floor
 from .named_scans import candidates_within, scan_at
 from .scan_map import ScanMap
-from .settings import Prior
+from .settings import NOTHING_KNOWN, Prior
+
+STEEP = 0.2  # cosine of an elevation: what looks up or down more steeply has no heading
 
 
 def allowed_by_option(scan_map: ScanMap, prior: Prior) -> dict[str, NDArray[np.bool_]]:
@@ -59,35 +61,50 @@ def apply_prior(scan_map: ScanMap, prior: Prior) -> ScanMap:
     return scan_map.narrowed(np.isin(scan_map.sparse, scan_map.searched_for[is_allowed]))
 
 
-def allowed_rotations(
-    R_cam_from_world: NDArray[np.float64], prior: Prior, is_strict: bool = False
-) -> NDArray[np.float64]:
-    """The rotations (N, 3, 3) whose image centre looks where the prior says; else the nearest, or none."""
+def allowed_rotations(R_cam_from_world: NDArray[np.float64], prior: Prior) -> NDArray[np.float64]:
+    """The rotations (N, 3, 3) whose image centre looks where the prior says; else the nearest."""
     if prior.heading_deg is None:
         return R_cam_from_world
+    off = heading_errors(R_cam_from_world, prior.heading_deg)
+    return np.asarray(R_cam_from_world[off <= max(np.radians(prior.heading_tolerance_deg), float(off.min()))])
+
+
+def heading_errors(R_cam_from_world: NDArray[np.float64], heading_deg: float) -> NDArray[np.float64]:
+    """Angles (N,) [rad] between a heading and where the image centre of rotations (N, 3, 3) looks."""
     forward = R_cam_from_world[:, 0]  # of the camera's +x, in the world
     heading = np.arctan2(forward[:, 0], forward[:, 1])
-    off = np.abs((heading - np.radians(prior.heading_deg) + np.pi) % (2.0 * np.pi) - np.pi)
-    least = 0.0 if is_strict else float(off.min())
-    return np.asarray(R_cam_from_world[off <= max(np.radians(prior.heading_tolerance_deg), least)])
+    return np.asarray(np.abs((heading - np.radians(heading_deg) + np.pi) % (2.0 * np.pi) - np.pi))
 
 
-def is_allowed(scan_map: ScanMap, pose: Pose, prior: Prior) -> bool:
-    """True for a pose of the map's frame within what the prior says, by a grid spacing more."""
+def contradictions(scan_map: ScanMap, pose: Pose, prior: Prior) -> tuple[str, ...]:
+    """Say how a pose of the map's frame contradicts the prior by more than a right pose may be off."""
+    if prior == NOTHING_KNOWN:
+        return ()
     world = scan_map.to_world(pose)
-    if prior.within and scan_at(scan_map, pose.center_world) not in prior.within:
-        return False
+    found = []
+    if prior.within and (scan := scan_at(scan_map, pose.center_world)) not in prior.within:
+        found.append(f"the pose found is in the scan {scan!r}, not in {', '.join(map(repr, prior.within))}")
     if prior.near_world is not None and prior.radius is not None:
-        x, y, z = prior.near_world
-        gap = (
-            math.dist(world.center_world[:2], (x, y))
-            if z is None
-            else math.dist(world.center_world, (x, y, z))
-        )
-        if gap > prior.radius + COARSE_SPACING:
-            return False
+        given = [value for value in prior.near_world if value is not None]
+        gap = math.dist(world.center_world[: len(given)], given)
+        if gap > prior.radius + MAX_DISTANCE:
+            found.append(f"the pose found is {gap:.2f} m from the place given, not within {prior.radius:g} m")
     if prior.height is not None:
         height = float(heights_above_floor(scan_map.octree, pose.center_world[None])[0])
-        if not prior.height[0] - COARSE_SPACING <= height <= prior.height[1] + COARSE_SPACING:
-            return False
-    return len(allowed_rotations(world.R_cam_from_world[None], prior, is_strict=True)) > 0
+        low, high = prior.height
+        if not low - MAX_DISTANCE <= height <= high + MAX_DISTANCE:
+            found.append(f"the pose found is {height:.2f} m above the floor, not {low:g} to {high:g} m")
+    found += contradicted_heading(world, prior)
+    return tuple(found)
+
+
+def contradicted_heading(pose_world: Pose, prior: Prior) -> list[str]:
+    """Say how a pose contradicts a heading; nothing of a camera that looks steeply up or down."""
+    forward = pose_world.R_cam_from_world[0]
+    if prior.heading_deg is None or math.hypot(forward[0], forward[1]) < STEEP:
+        return []
+    off = math.degrees(float(heading_errors(pose_world.R_cam_from_world[None], prior.heading_deg)[0]))
+    if off <= prior.heading_tolerance_deg + math.degrees(MAX_ANGLE):
+        return []
+    limit = f"more than {prior.heading_tolerance_deg:g} deg"
+    return [f"the pose found looks {off:.0f} deg away from the heading given, {limit}"]

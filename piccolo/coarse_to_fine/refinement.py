@@ -29,7 +29,7 @@ PLAIN_SCORE, FAINT_PART = 0.2, 0.25  # where the best has this score, no more is
 NUM_POINTS = 30_000  # for the last millimetres, in what the photo shows
 MAX_LAST_ROUNDS, SETTLED = 6, 1e-4  # [m] a camera that moves by less in a round has arrived
 NEARLY = 0.02  # [m] and one that does by less sees the same points
-MIN_SCORE_LEFT = 0.97  # of the score, in exchange for millimetres
+MIN_SCORE_LEFT = 0.94  # of the score, in exchange for millimetres
 
 
 def descend_prepared(query: Query, starts: Starts, num_iterations: int, count: int) -> Starts:

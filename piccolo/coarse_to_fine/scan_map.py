@@ -15,7 +15,7 @@ from ..local_features.feature_map import FeatureMap, make_feature_map
 from ..local_features.view_positions import Look, view_positions
 from ..runtime.stopwatch import Stopwatch
 from ..runtime.threads import Workers
-from .aligned_cloud import AlignedCloud, Voxelized, read_once
+from .aligned_cloud import AlignedCloud, Voxelized, read_aligned
 from .camera_positions import COARSE_SPACING, Ball, TooManyPositionsError, candidate_centers
 from .candidate_views import SEARCH_VIEW, CandidateViews, render_wide
 from .late_features import LateFeatures
@@ -127,7 +127,7 @@ def candidates_of(
 def prepare_map(
     cloud: Voxelized,
     workers: Workers,
-    up: UpAxis = "auto",
+    up: UpAxis | Array = "auto",
     watch: Stopwatch | None = None,
     view: ViewConfig = SEARCH_VIEW,
     prior: Prior = NOTHING_KNOWN,
@@ -139,7 +139,7 @@ def prepare_map(
     """
     watch = watch or Stopwatch()
     with watch.stage("read"):
-        aligned = read_once(cloud, up, workers.work)
+        aligned = read_aligned(cloud, up)
     for warning in aligned.warnings:  # now: a wrong unit makes what follows long
         workers.warn(warning)
     with watch.stage("prepare"):

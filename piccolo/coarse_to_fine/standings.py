@@ -1,5 +1,6 @@
 """What speaks for each of several poses, and which of them is the best for all of it."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -7,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..confidence.alternatives import Hypothesis
-from ..confidence.confidence import CLEAR_MATCHES, Standing, log_odds
+from ..confidence.confidence import CLEAR_MATCHES, CONTRADICTED, Standing, log_odds
 from ..geometry.pose import Pose
 from ..local_features.hypotheses import count_matches
 from .comparison import compare
+from .prior import contradictions
 from .query import Query
 from .search_result import SearchResult
 
@@ -24,16 +26,26 @@ def standings_of(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -
     """What speaks for the best pose and for others elsewhere, compared over what both views show."""
     at_best = compare(query, best.pose)
     shares = [1.0, *(compare(query, h.pose).ratio_to(at_best) for h in others)]
+    return [s._replace(share=v) for s, v in zip(standings_alone(query, [best, *others]), shares, strict=True)]
+
+
+def standings_alone(query: Query, poses: Sequence[Hypothesis]) -> list[Standing]:
+    """Return what speaks for each of several poses by itself.
+
+    Those that contradict the prior share the odds that it is wrong.
+    """
+    is_wrong = [bool(contradictions(query.scan_map, h.pose, query.settings.prior)) for h in poses]
+    log_prior = math.log(CONTRADICTED / max(sum(is_wrong), 1))
     return [
-        Standing(share, h.score, num_matches_of(query, h.pose))
-        for share, h in zip(shares, [best, *others], strict=True)
+        Standing(1.0, h.score, num_matches_of(query, h.pose), log_prior if wrong else 0.0)
+        for h, wrong in zip(poses, is_wrong, strict=True)
     ]
 
 
 def odds_by_pair(query: Query, poses: Sequence[Hypothesis]) -> NDArray[np.float64]:
     """Log odds (N, N) of each pose, a column, against each, a row, over what the two show."""
     seen = list(query.workers.map(lambda h: compare(query, h.pose), poses, "compare"))
-    alone = [Standing(1.0, h.score, num_matches_of(query, h.pose)) for h in poses]
+    alone = standings_alone(query, poses)
     odds = [
         [log_odds(a._replace(share=c.ratio_to(best))) for a, c in zip(alone, seen, strict=True)]
         for best in seen

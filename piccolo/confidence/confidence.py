@@ -25,6 +25,7 @@ class Standing(NamedTuple):
     share: float  # what it explains by what the best pose does, over what both views show; 1 of the best
     score: float  # [0, 1] what the photo's blocks explain beyond chance
     num_matches: int  # local features that agree with it
+    log_prior: float = 0.0  # logarithm of what is known beforehand: less of what contradicts the user
 
 
 class ChoiceModel(NamedTuple):
@@ -37,8 +38,9 @@ class ChoiceModel(NamedTuple):
 LEAST_STD, MOST_STD = 0.003, 0.3  # [m] smaller or larger tells nothing more
 LEAST_SCORE, LEAST_SHARE, MOST_SHARE = 0.02, 0.1, 1.2
 CLEAR_MATCHES = 40  # as many as a clear whole view of an upright sphere is worth, see docs/METHOD.md
+CONTRADICTED = 0.01  # odds of what the user says to be wrong
 NOISE_MATCHES = 8  # local features that agree with a wrong pose by chance, at most
-# By tools/calibrate_confidence.py. Each feature counts in one direction only.
+# By tools/benchmark.py calibration. Each feature counts in one direction only.
 FEATURES = ("log of the share", "log of the score", "log of the matches")
 NONE_FEATURES = ("constant", "log10 of the largest deviation [m]")
 MODEL = ChoiceModel((5.75, 0.43, 1.10), (8.30, 3.82))
@@ -55,13 +57,15 @@ def features_of(standing: Standing) -> Array:
 
 def log_odds(standing: Standing, model: ChoiceModel = MODEL) -> float:
     """The logarithm of a pose's odds, but for a constant."""
-    return float(features_of(standing) @ np.array(model.weights))
+    return float(features_of(standing) @ np.array(model.weights)) + standing.log_prior
 
 
 def none_features_of(covariance: PoseCovariance | None) -> Array:
     """What the odds of none of the poses go by, (2,), as NONE_FEATURES names them."""
-    std = MOST_STD if covariance is None else min(max(covariance.largest_std, LEAST_STD), MOST_STD)
-    return np.array([1.0, math.log10(std)])
+    if covariance is None:
+        return np.array([1.0, math.log10(MOST_STD)])
+    std = covariance.largest_std if covariance.std_of_fit is None else covariance.std_of_fit
+    return np.array([1.0, math.log10(min(max(std, LEAST_STD), MOST_STD))])
 
 
 def posterior(

@@ -22,6 +22,16 @@ class Alternative:
 
 
 @dataclass(frozen=True)
+class FocalLength:
+    """A focal length as a photo and the scan tell it, and what was known of it beforehand."""
+
+    px: float  # across
+    std_px: float
+    given_px: float
+    given_std_px: float
+
+
+@dataclass(frozen=True)
 class Localization:
     """The best pose for one panorama, in world coordinates, and what speaks for it and against it."""
 
@@ -34,7 +44,8 @@ class Localization:
     alternatives: tuple[Alternative, ...] = ()  # poses elsewhere, best first
     covariance: PoseCovariance | None = None
     warnings: tuple[str, ...] = ()  # one line each: why there is no pose
-    cameras: tuple[Mount, ...] = ()  # refined; none if they stay as they were given
+    cameras: tuple[Mount, ...] = ()  # of a photo whose focal length was fitted: the camera found
+    focal_length: FocalLength | None = None  # of such a photo
     scan: str | None = None  # as of Alternative
     storey: int | None = None  # of the pose, 1 the lowest; None where no floor was found
     height_above_floor: float | None = None  # [m] of the pose, above the floor there

@@ -17,8 +17,8 @@ Array = NDArray[np.float64]
 NEWTON_STEPS = 4  # from an error of 5 % to rounding
 MAX_DISTANCE, MAX_ANGLE = 0.1, math.radians(5.0)  # the paper's line between correct and wrong [m], [rad]
 MAX_FILE_SIZE = 65_536  # [byte] sixteen numbers and some comments
+TINY = 1e-150  # sine of an angle; of smaller ones the direction is lost to underflow
 MAX_SKEW = 1e-3  # off a rotation, for matrices written with few digits
-WANTED = "wanted the 4 x 4 numbers of T_world_from_cam"
 
 
 @dataclass(frozen=True)
@@ -108,6 +108,15 @@ def yaw_rotation(yaw: float) -> Array:
     return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
+def rotation_to_z(direction: Array) -> Array:
+    """Return the smallest rotation (3, 3) that takes a unit vector (3,) to +z; half a turn about x for -z."""
+    x, y, z = direction
+    sine = math.hypot(x, y)
+    if sine < TINY:
+        return np.diag([1.0, 1.0, 1.0] if z > 0.0 else [1.0, -1.0, -1.0])
+    return exp_so3(math.atan2(sine, z) / sine * np.array([y, -x, 0.0]))
+
+
 def quaternion_wxyz(R: Array) -> Array:
     """Unit quaternion (4,), scalar first and not negative, of a rotation (3, 3)."""
     # The eigenvector of Bar-Itzhack's symmetric matrix: no case distinction, accurate for every angle.
@@ -158,20 +167,33 @@ def is_correct(pose: Pose | None, true_pose: Pose) -> bool:
 
 
 def read_pose_matrix(path: Path) -> Pose:
-    """The pose in a text file of T_world_from_cam, 4 x 4 numbers; lines that begin with # are comments."""
-    lines = read_text(path, WANTED, MAX_FILE_SIZE).splitlines()
+    """The pose in a text file of T_world_from_cam."""
+    T_world_from_cam = read_transform(path, "T_world_from_cam")
+    return Pose(T_world_from_cam[:3, :3].T, T_world_from_cam[:3, 3])
+
+
+def read_transform(path: Path, name: str) -> Array:
+    """The rigid transform (4, 4) in a text file of as many numbers; lines that begin with # are comments."""
+    wanted = f"wanted the 4 x 4 numbers of {name}"
+    lines = read_text(path, wanted, MAX_FILE_SIZE).splitlines()
     rows = [line.replace(",", " ").split() for line in lines if line.split("#")[0].strip()]
     try:
-        T_world_from_cam = np.array(rows, dtype=np.float64)
+        T = np.array(rows, dtype=np.float64)
     except ValueError as error:  # words, lines of several lengths
-        raise InputError(f"{path}: found {error}, {WANTED}") from error
-    if T_world_from_cam.shape != (4, 4) or not np.isfinite(T_world_from_cam).all():
-        shape = " x ".join(map(str, T_world_from_cam.shape))
-        raise InputError(f"{path}: found {shape} numbers, not all finite or not as many, {WANTED}")
-    if not np.allclose(T_world_from_cam[3], [0.0, 0.0, 0.0, 1.0]):
-        raise InputError(f"{path}: the last row is not 0 0 0 1, {WANTED}")
-    R = checked_rotation(T_world_from_cam[:3, :3], MAX_SKEW, f"{path}: the matrix on the left")
-    return Pose(orthonormal(R).T, T_world_from_cam[:3, 3])
+        raise InputError(f"{path}: found {error}, {wanted}") from error
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        shape = " x ".join(map(str, T.shape))
+        raise InputError(f"{path}: found {shape} numbers, not all finite or not as many, {wanted}")
+    if not np.allclose(T[3], [0.0, 0.0, 0.0, 1.0]):
+        raise InputError(f"{path}: the last row is not 0 0 0 1, {wanted}")
+    T[:3, :3] = orthonormal(checked_rotation(T[:3, :3], MAX_SKEW, f"{path}: the matrix on the left"))
+    return T
+
+
+def move(pose: Pose, T_target_from_source: Array, metres_per_unit: float) -> Pose:
+    """A pose of the source in the target's coordinates, under a rigid transform (4, 4) in some unit."""
+    R, t = T_target_from_source[:3, :3], T_target_from_source[:3, 3] * metres_per_unit
+    return Pose(orthonormal(pose.R_cam_from_world @ R.T), R @ pose.center_world + t)
 
 
 def rotate_points(points: Array, R_target_from_source: Array) -> Array:

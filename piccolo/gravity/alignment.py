@@ -1,162 +1,122 @@
-"""The transform that turns a cloud's z up, what it is based on, and the JSON file that holds it."""
+"""The transform that turns a scan upright: vertical and walls by its planes, up by word or by evidence."""
 
-import json
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from ..cloud import CloudStream
-from ..cloud.octree import build_octree
-from ..cloud.settings import UpAxis
-from ..cloud.voxels import Voxels
-from ..errors import InputError
-from ..geometry.pose import Array, Pose, checked_rotation, orthonormal, yaw_rotation
-from ..runtime.json_file import read_json
-from .planes import (
-    Plane,
-    PointNormals,
-    classify_planes,
-    estimate_normals,
-    manhattan_yaw,
-    ransac_planes,
-    refine_up,
-)
-from .up import Z_UP_LOG_ODDS, Hypothesis, Up, find_up, named_axis, rotation_to_z_up
+from ..cloud.octree import Octree, build_octree
+from ..cloud.settings import R_z_from_axis, UpAxis
+from ..geometry.pose import Array, orthonormal, rotation_to_z, yaw_rotation
+from .planes import SPACING, Planes, dot, estimate_normals, ransac_planes
+from .sense import LEVEL_ANGLE, find_sense
 
-FORMAT = "piccolo-alignment/1"
-CONVENTION = "x_aligned = T_aligned_from_scan @ (x_scan, 1) in the unit given; z_aligned is up"
-MAX_FILE_SIZE = 1 << 20  # [byte]
-UNIT_RANGE = (1e-300, 1e300)  # [m] its inverse is a number too
-ROUNDING = 1e-6  # of a rotation's numbers in a file
-SPACING = 0.08  # of the points used [m]
+MAX_LEAN = np.radians(15.0)  # of the vertical to a direction that is said to be up
+SNAP_ANGLE = np.radians(0.2)  # of the vertical to such a direction that is then taken itself
+AGREE_ANGLE = np.radians(3.0)  # of a plane to level or upright, that counts for the vertical
+MIN_ALIGNED = 0.6  # fraction of the planes' area that is level or upright: roofs are neither
+MAX_FLATNESS = 0.75  # height to the lesser width of a scan, above which a wall may be its floor
+# up (3,) by a photo in the scan turned by its vertical (3,), None if it isn't localized; and why
+FindByPhoto = Callable[[Array], tuple[Array | None, str]]
 
 
 class Alignment(NamedTuple):
-    """A rigid transform of a scan, and how far it can be relied on."""
+    """A rigid transform of a scan, and what it is based on."""
 
-    T_aligned_from_scan: Array  # (4, 4) in the unit of the files
-    metres_per_unit: float
-    confidence: float  # [0, 1] that up is up
-    explanation: str  # one line
-
-    def in_unit(self, metres_per_unit: float) -> "Alignment":
-        """The same transform for coordinates in another unit."""
-        T = self.T_aligned_from_scan.copy()
-        T[:3, 3] *= self.metres_per_unit / metres_per_unit
-        return self._replace(T_aligned_from_scan=T, metres_per_unit=metres_per_unit)
-
-    def inverse(self) -> "Alignment":
-        """The way back, from aligned coordinates to the scan's."""
-        T, R = np.eye(4), self.T_aligned_from_scan[:3, :3]
-        T[:3, :3] = R.T
-        T[:3, 3] = -np.einsum("ji,j->i", R, self.T_aligned_from_scan[:3, 3]) + 0.0
-        return self._replace(T_aligned_from_scan=T)
-
-    def transform_pose(self, pose: Pose) -> Pose:
-        """A pose of the scan in aligned coordinates, both in the unit of the transform."""
-        R, t = self.T_aligned_from_scan[:3, :3], self.T_aligned_from_scan[:3, 3]
-        return Pose(orthonormal(pose.R_cam_from_world @ R.T), R @ pose.center_world + t)
-
-    def numbers(self) -> dict[str, object]:
-        """The fields by their names, as JSON takes them."""
-        return {**self._asdict(), "T_aligned_from_scan": self.T_aligned_from_scan.tolist()}
-
-    def to_json(self) -> str:
-        """One JSON object; every number reads back as the same float64."""
-        document = {"format": FORMAT, "convention": CONVENTION, **self.numbers()}
-        return json.dumps(document, indent=1, allow_nan=False) + "\n"
-
-    def to_text(self) -> str:
-        """Four rows of four numbers, as CloudCompare reads and writes a transform."""
-        return "".join(" ".join(map(repr, row)) + "\n" for row in self.T_aligned_from_scan.tolist())
-
-
-def read_alignment(path: Path) -> Alignment:
-    """The alignment in a file by Alignment.to_json; InputError if it is not one."""
-    document = read_json(path, "use a transform by align_gravity.py", MAX_FILE_SIZE)
-    if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise InputError(f"{path}: the format is not {FORMAT!r}; use a transform by align_gravity.py")
-    T = _rigid(path, document.get("T_aligned_from_scan"))
-    metres_per_unit = _number(path, document, "metres_per_unit", UNIT_RANGE)
-    confidence = _number(path, document, "confidence", (0.0, 1.0))
-    return Alignment(T, metres_per_unit, confidence, str(document.get("explanation", "")))
-
-
-def _number(path: Path, document: dict[str, object], name: str, limits: tuple[float, float]) -> float:
-    """A field within limits."""
-    value, (low, high) = document.get(name), limits
-    if isinstance(value, int | float) and low <= value <= high:
-        return float(value)
-    raise InputError(f"{path}: {name} is {value!r:.40}, must be a number from {low:g} to {high:g}")
-
-
-def _rigid(path: Path, rows: object) -> Array:
-    """A transform (4, 4) of nested lists; refused if it is not a rotation and a translation."""
-    try:
-        T = np.array(rows)
-    except ValueError as error:  # rows of several lengths
-        raise InputError(f"{path}: T_aligned_from_scan is not four rows of four numbers") from error
-    if T.shape != (4, 4) or T.dtype.kind not in "if":
-        raise InputError(f"{path}: T_aligned_from_scan is not four rows of four numbers")
-    if not np.isfinite(T).all() or not np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]):
-        raise InputError(f"{path}: T_aligned_from_scan is not a rotation and a translation")
-    checked_rotation(T[:3, :3], ROUNDING, f"{path}: the matrix in T_aligned_from_scan")
-    return T.astype(np.float64)
-
-
-class AlignmentReport(NamedTuple):
-    """An alignment with the evidence for it."""
-
-    alignment: Alignment
-    up_scan: Array  # (3,) unit vector that points up, in the scan's frame
-    plane_rms_angle: float | None  # of level and upright planes to up [rad]
-    yaw: float | None  # turn about z that put the walls along the axes [rad]
-    planes: list[Plane]  # in the scan's frame, metres
-    hypotheses: tuple[Hypothesis, ...]  # for up, the likeliest first; none if the axis was given
+    T_aligned_from_scan: Array  # (4, 4) [m], about the middle of the cloud's box in whole metres
+    up_scan: Array | None  # (3,) unit; None where it isn't known
+    reason: str  # one line
+    yaw: float | None  # turn about z that puts the dominant walls along x and y [rad]; None without walls
+    warnings: tuple[str, ...]
 
 
 def find_alignment(
-    cloud: CloudStream,
-    up: UpAxis,
-    along_walls: bool,
-    z_up_log_odds: float = Z_UP_LOG_ODDS,
-    settle: Callable[[Up], Up] | None = None,
-) -> tuple[AlignmentReport, tuple[str, ...]]:
-    """The turn of a cloud that makes z up, about the middle of its box in whole metres; and warnings.
+    cloud: CloudStream, up: UpAxis | None, find_by_photo: FindByPhoto | None, along_walls: bool
+) -> Alignment:
+    """Return the least turn that makes z up, and with `along_walls` the least further one about z.
 
-    An axis given as `up` is taken as it is; `auto` finds it, with the log-odds of the convention that z is
-    up (0: the scan may lie anyhow), and `settle` may choose another of its hypotheses. With `along_walls` the
-    dominant walls come to stand along x and y by the smallest turn about z.
+    Up is told by a photo; or by a named axis, but for the file's own (`auto`) where plain evidence is against
+    it; or, with None, by the scanners' poses or plain evidence.
     """
     voxels = cloud.voxels(np.eye(3))
-    sample = normals_of(voxels)
-    planes = ransac_planes(sample)
-    if up == "auto":
-        found = find_up(sample, z_up_log_odds, cloud.station_axes)
-        found = settle(found) if settle else found
-        direction, rms_angle = refine_up(found.direction_world, planes)
-    else:
-        found, rms_angle = Up(named_axis(up), 1.0, f"up is the axis {up}, as given"), None
-        direction = found.direction_world
-    planes = classify_planes(planes, sample, direction)
-    R = rotation_to_z_up(direction)
-    yaw = manhattan_yaw(planes, R) if along_walls else None
-    if yaw is not None:
-        R = np.einsum("ij,jk->ik", yaw_rotation(-yaw), R)
-    R = orthonormal(R)
-    T = np.eye(4)  # turns about the middle
-    T[:3, :3], T[:3, 3] = R + 0.0, voxels.origin - np.einsum("ij,j->i", R, voxels.origin) + 0.0
-    alignment = Alignment(T, 1.0, found.confidence, found.reason).in_unit(cloud.scale)
-    in_scan = [
-        plane._replace(offset=plane.offset + float(np.einsum("i,i->", plane.normal_world, voxels.origin)))
-        for plane in planes
-    ]
-    report = AlignmentReport(alignment, direction, rms_angle, yaw, in_scan, found.hypotheses)
-    return report, voxels.warnings
+    axis, sense, reason, planes = find_up(build_octree(voxels))
+    scanners = cloud.station_axes
+    said: Array | None = sense * axis if sense else None
+    if find_by_photo:
+        said, reason = find_by_photo(axis)
+    elif up:
+        named = R_z_from_axis(up, cloud.up)[2]
+        if up == "auto" and said is not None and said @ named < np.cos(MAX_LEAN):
+            said, reason = None, f"the floors do not face {cloud.up}, by their {reason}"
+        else:
+            said, reason = named, "up is the named axis"
+    elif len(scanners) and dot(scanners, scanners[0]).min() > np.cos(MAX_LEAN):
+        said, reason = scanners[0], "the scanners stood upright"
+    up_scan = None if said is None else level(planes, said)
+    R = np.eye(3) if up_scan is None else rotation_to_z(up_scan)
+    yaw = wall_yaw(planes, R) if along_walls else None
+    T = np.eye(4)
+    T[:3, :3] = orthonormal(R if yaw is None else yaw_rotation(-yaw) @ R) + 0.0
+    T[:3, 3] = voxels.origin - np.einsum("ij,j->i", T[:3, :3], voxels.origin) + 0.0
+    return Alignment(T, up_scan, reason, yaw, voxels.warnings)
 
 
-def normals_of(voxels: Voxels) -> PointNormals:
-    """Normals of a cloud thinned to SPACING."""
-    return estimate_normals(build_octree(voxels).level(SPACING)[:, :3])
+def find_up(octree: Octree) -> tuple[Array, float, str, Planes]:
+    """Return a scan's vertical (3,), the sign of up along it or 0 if that is not plain, why, and the planes.
+
+    The vertical is square to the largest area, and along it the scan is lower than it is wide.
+    """
+    cloud = estimate_normals(octree.level(SPACING)[:, :3])
+    planes = ransac_planes(cloud)
+    if not len(planes.areas):
+        return np.array([0.0, 0.0, 1.0]), 0.0, "there are no dominant planes", planes
+    level_areas, aligned_areas = _areas_by(planes)
+    largest = int(level_areas.argmax())
+    axis = _refine(planes, planes.normals[largest])
+    places = np.einsum("ni,ji->nj", cloud.points, np.linalg.svd(axis[None])[2][1:])
+    across = places @ np.linalg.eigh(np.cov(places.T))[1][:, 0]
+    height, width = (np.ptp(np.quantile(x, [0.01, 0.99])) for x in (dot(cloud.points, axis), across))
+    if aligned_areas[largest] < MIN_ALIGNED:
+        return axis, 0.0, "too many planes are neither level nor upright", planes
+    if height > MAX_FLATNESS * width:
+        return axis, 0.0, f"{height:.1f} m high and {width:.1f} m wide, a wall may be the floor", planes
+    return axis, *find_sense(cloud, planes, axis), planes
+
+
+def level(planes: Planes, said: Array) -> Array:
+    """Return the vertical (3,) near a direction that is said to be up; that itself if none is, or it fits."""
+    is_near = np.abs(dot(planes.normals, said)) > np.cos(MAX_LEAN)
+    is_vertical = is_near & (_areas_by(planes)[1] > MIN_ALIGNED)
+    if not is_vertical.any():
+        return said
+    axis = _refine(planes, planes.normals[is_vertical.argmax()])
+    cosine = float(axis @ said)
+    return said if abs(cosine) > np.cos(SNAP_ANGLE) else axis * np.sign(cosine)
+
+
+def _areas_by(planes: Planes) -> tuple[Array, Array]:
+    """Return what fraction of the planes' area is level, and level or upright, by the normal of each (P,)."""
+    cosines = np.abs(planes.normals @ planes.normals.T)
+    areas = planes.areas / planes.areas.sum()
+    is_level = cosines > np.cos(LEVEL_ANGLE)
+    return is_level @ areas, (is_level | (cosines < np.sin(LEVEL_ANGLE))) @ areas
+
+
+def _refine(planes: Planes, axis: Array) -> Array:
+    """Return the vertical (3,) by least squares on the planes that are nearly level or upright."""
+    cosines = np.abs(dot(planes.normals, axis))
+    signs = 1.0 * (cosines < np.sin(AGREE_ANGLE)) - (cosines > np.cos(AGREE_ANGLE))
+    spread = np.einsum("n,ni,nj->ij", signs * planes.areas, planes.normals, planes.normals)
+    return np.asarray(np.linalg.eigh(spread)[1][:, 0])
+
+
+def wall_yaw(planes: Planes, R_level_from_scan: Array) -> float | None:
+    """Return the smallest turn about z [rad], in (-45, 45] deg, that puts dominant walls along x and y."""
+    x, y, z = R_level_from_scan @ planes.normals.T
+    is_wall = np.abs(z) < np.sin(LEVEL_ANGLE)
+    if not is_wall.any():
+        return None
+    k = (is_wall * _areas_by(planes)[1]).argmax()  # a wall to which most others are parallel or square
+    turns = -np.arctan2(y[k], x[k]) / (0.5 * np.pi)
+    return float(turns - np.ceil(turns - 0.5)) * 0.5 * np.pi

@@ -144,7 +144,7 @@ def find_features(
     octree: Octree, centers: NDArray[np.float64], workers: Workers
 ) -> tuple[FeaturesOfView, NDArray[np.uint16]]:
     """The features of the views from some centres (N, 3) [m], and the view that each is from."""
-    views = workers.collect(lambda c: features_of_view(octree, c), list(centers), "find features", centers)
+    views = list(workers.map(lambda c: features_of_view(octree, c), list(centers), "find features"))
     joined: list[Any] = [np.concatenate(values) for values in zip(NO_FEATURES, *views, strict=True)]
     counts = np.array([len(view[0]) for view in views], np.int64)
     return FeaturesOfView(*joined), np.repeat(np.arange(len(views), dtype=np.uint16), counts)

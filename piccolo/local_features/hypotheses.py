@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..geometry.pose import Array, Pose
 from ..geometry.suppression import non_maximum_suppression
 from ..panorama.projection import in_camera, pose_float32
-from ..runtime.jit import F0, inline_kernel, kernel
+from ..runtime.jit import F0, copy_to, inline_kernel, kernel
 from ..runtime.threads import Workers
 from .matching import LEAST_WEIGHT, Matches
 from .p3p import p3p
@@ -191,7 +191,8 @@ def sample_poses(matches, members, up_cam, cos_tilt, R_best, t_best):
             count = count_exact(m, members, columns[:3], columns[3:], is_near, R, centers[k])
             if count > best:
                 best = count
-                R_best[:], t_best[:] = R, centers[k]
+                copy_to(R_best, R)
+                copy_to(t_best, centers[k])
     return best
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..runtime.jit import kernel
+from ..runtime.jit import copy_to, kernel
 from .normal_equations import GRADIENT, LOSS, MATRIX, NUM_SUMS
 
 MAX_TURN, MAX_MOVE = 0.15, 0.3  # [rad], [m] a step: farther away the matrix means nothing
@@ -87,18 +87,21 @@ def levenberg_marquardt(equations: Any) -> Callable[..., float]:
         R, t = R_cam_from_world, center_world
         sums, new_sums, step = np.empty(NUM_SUMS), np.empty(NUM_SUMS), np.empty(6)
         R_new, t_new = np.empty((3, 3)), np.empty(3)
-        R_new[:], t_new[:] = R, t
+        copy_to(R_new, R)
+        copy_to(t_new, t)
         sums[LOSS], damping, length = np.inf, FIRST_DAMPING / FALL, np.inf
         # The equations stand in one place, as they are compiled into it; the start is accepted first.
         for left in range(num_iterations, -1, -1):
             equations(problem, R_new, t_new, new_sums)
             if new_sums[LOSS] <= sums[LOSS] * (1.0 + ROUNDING):
-                R[:], t[:] = R_new, t_new
-                sums[:] = new_sums
+                copy_to(R, R_new)
+                copy_to(t, t_new)
+                copy_to(sums, new_sums)
                 damping = max(damping * FALL, LEAST_DAMPING)
             else:
                 damping *= RISE
-            if length < tolerance or damping > MOST_DAMPING or left == 0:
+            # infinite: the start has no loss, and the sums nothing to take a step by
+            if length < tolerance or damping > MOST_DAMPING or left == 0 or math.isinf(sums[LOSS]):
                 break
             if not solve_damped(sums, damping, step):
                 break

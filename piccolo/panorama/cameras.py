@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,36 +28,54 @@ TURNED: dict[object, tuple[NDArray[np.float64], int]] = {
 }
 HOW = "; --camera, --focal, or --fov with --projection pinhole say it exactly"
 MIN_REPORTED = 0.01  # of a picture: black borders below this are masked without a warning
+# standard deviations of the logarithm of a focal length: a first guess, a number of pixels, a field of view
+OF_GUESS, OF_PIXELS, OF_FIELD = 0.2, 0.01, 0.03
 
 
-def cameras_of(
-    path: Path, picture: Picture, options: ReadOptions, has_gpano: bool
-) -> tuple[tuple[Mount, ...], tuple[str, ...]]:
-    """The cameras of a picture, none if it is a sphere or a part of one, and what the user should know.
+class Cameras(NamedTuple):
+    """The cameras of a picture."""
+
+    mounts: tuple[Mount, ...] = ()  # none if it is a sphere or a part of one
+    deviation: float = 0.0  # standard deviation of the logarithm of the focal length; 0 where it is exact
+    notes: tuple[str, ...] = ()  # what the user should know
+
+
+def cameras_of(path: Path, picture: Picture, options: ReadOptions, has_gpano: bool) -> Cameras:
+    """The cameras of a picture, by the options or by EXIF.
 
     Raises InputError if a calibration does not fit, or a pinhole is asked for and nothing tells its field.
     """
+    found = _cameras_of(path, picture, options, has_gpano)
+    if not options.refine_focal:
+        return found
+    if len(found.mounts) != 1:
+        what = f"{len(found.mounts)} cameras" if found.mounts else "a sphere or a part of one"
+        raise InputError(f"{path}: found {what}, wanted the photo of one camera to refine its focal length")
+    return found._replace(deviation=OF_GUESS)
+
+
+def _cameras_of(path: Path, picture: Picture, options: ReadOptions, has_gpano: bool) -> Cameras:
     width, height = picture.size
     if options.calibration is not None:
         mounts = _calibrated(path, picture, options.calibration)
-        return (() if _is_sphere(mounts) else mounts), ()
+        return Cameras(() if _is_sphere(mounts) else mounts)
     if options.focal_px is not None:
-        return (Mount(pinhole(width, height, options.focal_px)),), ()
+        return Cameras((Mount(pinhole(width, height, options.focal_px)),), OF_PIXELS)
     lens = options.projection
     if lens in ("pinhole", "fisheye") and options.fov_deg is not None:
-        return (Mount(camera_of_fov(lens, options.fov_deg, width, height)),), ()
+        return Cameras((Mount(camera_of_fov(lens, options.fov_deg, width, height)),), OF_FIELD)
     is_two_to_one = abs(width - 2 * height) <= ASPECT_TOLERANCE * 2 * height
     is_photo = lens is None and options.fov_deg is None and not has_gpano and not is_two_to_one
     if not (is_photo or lens == "pinhole"):
-        return (), ()
+        return Cameras()
     found = focal_of(picture.exif, picture.size)
     if found is None:
         if lens == "pinhole":
             raise InputError(f"{path}: found no focal length in EXIF, wanted --focal, --fov or --camera")
-        return (), ()
+        return Cameras()
     fov = 2.0 * math.degrees(math.atan(width / 2.0 / found.focal))
     note = f"read as a pinhole photo {fov:.1f} deg wide, focal length {found.focal:.0f} px by {found.source}"
-    return (Mount(pinhole(width, height, found.focal)),), (note + HOW,)
+    return Cameras((Mount(pinhole(width, height, found.focal)),), found.deviation, (note + HOW,))
 
 
 def _is_sphere(mounts: tuple[Mount, ...]) -> bool:

@@ -35,7 +35,7 @@ R_FACE_FROM_CAM = {
     }.items()
 }
 Faces = dict[str, NDArray[np.uint8]]  # by letter, (size, size, 4): RGB and 255 where valid
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".heic", ".heif", ".insp")
 MIN_FACE = 32  # [px]
 MAX_FACE = MAX_WIDTH // 4
 MAX_CUBE_FILES = 64  # a folder with more pictures is a folder of panoramas

@@ -15,6 +15,7 @@ from PIL.ExifTags import Base
 FILM_DIAGONAL = math.hypot(36.0, 24.0)  # [mm]
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of FocalPlaneResolutionUnit; 2 where it is missing
 MIN_FILM, MAX_FILM = 8.0, 800.0  # [mm] what is wider is no photo by a plain lens
+BREATHING, ZOOMING = 0.01, 0.03  # of a focal length: what focusing changes, and what a zoom rounds
 MAX_DISAGREEMENT = 0.25  # of the two: one of them is of the picture before it was cropped
 CAMERA_ELEVATION = 0x9405  # CameraElevationAngle of EXIF 2.31 [deg]
 
@@ -23,6 +24,7 @@ class ExifFocal(NamedTuple):
     """A focal length, and where it comes from."""
 
     focal: float  # [px]
+    deviation: float  # standard deviation of its logarithm
     source: str  # in words
 
 
@@ -36,11 +38,21 @@ def focal_of(exif: Mapping[int, object], size: tuple[int, int]) -> ExifFocal | N
         plane = None
     if plane and film and abs(plane / diagonal * FILM_DIAGONAL / film - 1.0) > MAX_DISAGREEMENT:
         plane = None
+    lens = ZOOMING if _is_zoom(exif) else BREATHING
     if plane:
-        return ExifFocal(plane, "EXIF's focal length and the resolution of its sensor")
+        return ExifFocal(plane, lens, "EXIF's focal length and the resolution of its sensor")
     if film:
-        return ExifFocal(film / FILM_DIAGONAL * diagonal, f"EXIF's 35 mm equivalent of {film:g} mm")
+        rounding = 1.0 / math.sqrt(12.0) / film  # whole millimetres
+        focal = film / FILM_DIAGONAL * diagonal
+        return ExifFocal(focal, math.hypot(lens, rounding), f"EXIF's 35 mm equivalent of {film:g} mm")
     return None
+
+
+def _is_zoom(exif: Mapping[int, object]) -> bool:
+    """True if the lens has several focal lengths, or a part of the picture was enlarged."""
+    lens = exif.get(Base.LensSpecification)
+    has_range = isinstance(lens, tuple) and len(lens) > 1 and lens[0] != lens[1]
+    return has_range or (_number(exif, Base.DigitalZoomRatio) or 1.0) > 1.0
 
 
 def _focal_by_plane(exif: Mapping[int, object], size: tuple[int, int]) -> float | None:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.sphere import pixel_rays, solid_angles
-from ..runtime.jit import F0, F1, HALF, inline_kernel, kernel
+from ..runtime.jit import F0, F1, HALF, copy_to, inline_kernel, kernel
 from . import Panorama
 from .projection import CHUNK, gather, make_projected, project
 from .texels import Texels, bilinear_weights, blend, is_valid
@@ -119,7 +119,6 @@ def pack_normalized(channels, weight, stats, texels):
     num_rows, num_columns = stats.shape[0], stats.shape[1]
     left, right, fraction = interpolation_along(width, num_columns)
     wide, along = np.empty((6, num_columns), np.float32), np.empty((6, width), np.float32)
-    planes = np.empty((3, width), np.float32)  # of a row's channels: what follows is vectorised then
     per = np.float32(num_columns) / np.float32(width)
     for i in range(height):
         v = min(max((np.float32(i) + HALF) * per - HALF, F0), np.float32(num_rows - 1))
@@ -132,7 +131,7 @@ def pack_normalized(channels, weight, stats, texels):
             for j in range(width):
                 at = wide[c, left[j]]
                 along[c, j] = at + fraction[j] * (wide[c, right[j]] - at)
-        planes[:] = channels[i].T
+        planes = channels[i].T.copy()  # (3, width): what follows is vectorised then
         row = texels[i + 1, 1 : width + 1]
         for j in range(width):
             texel = as_texel_channel(planes[0, j], along[0, j], along[3, j], 0)
@@ -140,7 +139,8 @@ def pack_normalized(channels, weight, stats, texels):
             texel |= as_texel_channel(planes[2, j], along[2, j], along[5, j], 16)
             row[j] = texel | (np.int32(1 << 24) if weight[i, j] > HALF else np.int32(0))
         texels[i + 1, 0], texels[i + 1, width + 1] = texels[i + 1, width], texels[i + 1, 1]
-    texels[0], texels[height + 1] = texels[1], texels[height]
+    copy_to(texels[0], texels[1])
+    copy_to(texels[height + 1], texels[height])
 
 
 @kernel

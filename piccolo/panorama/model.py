@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..camera import Calibration, Mount
+from ..camera import Calibration, Camera, Mount
+from ..camera.resampling import View, sphere_of
 from ..camera.rig import IDENTITY
 from ..cloud.label_colors import Labels
 from ..errors import InputError
@@ -27,6 +28,16 @@ class GPano:
 
 
 @dataclass(frozen=True)
+class FocalPrior:
+    """A focal length with its deviation, known before a photo is localized, and the photo itself."""
+
+    focal: float  # [px] across
+    deviation: float  # standard deviation of its logarithm
+    view: View  # the photo, what is masked in it left out
+    is_hidden: NDArray[np.bool_]  # (H, W) of the sphere, masked beside
+
+
+@dataclass(frozen=True)
 class Panorama:
     """A full equirectangular picture, W = 2 H."""
 
@@ -35,6 +46,18 @@ class Panorama:
     gpano: GPano | None = None  # None for a file without such metadata
     warnings: tuple[str, ...] = ()  # what the user should know of the reading
     cameras: tuple[Mount, ...] = ()  # that took it; none if it came as a sphere or a part of one
+    focal_prior: FocalPrior | None = None  # of one camera whose focal length is not exact
+
+    def retaken(self, camera: Camera, width: int) -> "Panorama":
+        """The panorama, `width` x width / 2, by another calibration of its camera; it has a focal_prior."""
+        assert self.focal_prior is not None
+        mount = self.cameras[0].with_camera(camera)
+        rgb, is_valid = sphere_of([self.focal_prior.view._replace(mount=mount)], width)
+        hidden = self.focal_prior.is_hidden
+        if hidden.any():
+            at_width = cv2.resize(hidden.view(np.uint8), rgb.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+            is_valid = is_valid & (at_width == 0)
+        return replace(self, rgb=rgb, is_valid=is_valid, cameras=(mount,))
 
 
 @dataclass(frozen=True)
@@ -77,7 +100,7 @@ class ReadOptions:
 
     def refined(self, cameras: tuple[Mount, ...]) -> "ReadOptions":
         """The same with the camera that a result refined, as a calibration of the picture as it is stored."""
-        if not self.refine_focal or len(cameras) != 1:
+        if len(cameras) != 1:
             return self
         given = self.calibration
         R_lens_from_cam = IDENTITY if given is None or given.is_choice else given.mounts[0].R_lens_from_cam

@@ -9,13 +9,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 
 from ..camera import Calibration
 from ..cloud.digest import sha256_of_arrays
-from ..runtime.json_file import read_bytes
+from ..errors import InputError
+from ..runtime.json_file import read_bytes, reading_once
 from .cube import face_paths
-from .picture import WANTED, opened
+from .picture import PNG_MAGIC, WANTED, opened
 
 TIME = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)")
 OFFSET = re.compile(r"[+-]\d\d:\d\d")
@@ -39,6 +41,25 @@ class Photo(NamedTuple):
     gps: GpsPosition | None
 
 
+def sha256_of(path: Path, rig: Calibration | None = None) -> str | None:
+    """Digest of a photo's file or files, whether they are pictures or not; None where they can't be read."""
+    try:
+        return _digest(_files_of(path, rig))
+    except (OSError, InputError):
+        return None
+
+
+def _files_of(path: Path, rig: Calibration | None) -> list[Path]:
+    if rig is not None:
+        return rig.images_in(path)
+    return list(face_paths(path).values()) if path.is_dir() else [path]
+
+
+def _digest(files: list[Path]) -> str:
+    digests = [hashlib.sha256(read_bytes(file, WANTED)).hexdigest() for file in files]
+    return digests[0] if len(files) == 1 else hashlib.sha256("\n".join(digests).encode()).hexdigest()
+
+
 def photo_of(path: Path, rig: Calibration | None = None) -> Photo:
     """What a photo's file, or the first of a folder of cube faces or of a rig's pictures, says of itself.
 
@@ -47,21 +68,28 @@ def photo_of(path: Path, rig: Calibration | None = None) -> Photo:
     InputError
         The file is missing or no picture. Metadata that are damaged count as missing.
     """
-    if rig is not None:
-        files = rig.images_in(path)
-    else:
-        files = list(face_paths(path).values()) if path.is_dir() else [path]
-    contents = [read_bytes(file, WANTED) for file in files]
-    digests = [hashlib.sha256(content).hexdigest() for content in contents]
-    sha256 = digests[0] if len(files) == 1 else hashlib.sha256("\n".join(digests).encode()).hexdigest()
-    with opened(files[0], contents[0]) as image:
+    files = _files_of(path, rig)
+    with reading_once(), opened(files[0], content := read_bytes(files[0], WANTED)) as image:
         exif: Mapping[int, Any]
         try:
-            own = image.getexif()
+            if chunk := _exif_chunk(content):
+                image.info["exif"] = chunk
+            own = Image.Image.getexif(image)  # that of PngImageFile decodes the picture to find the chunk
             exif, gps = own.get_ifd(IFD.Exif), own.get_ifd(IFD.GPSInfo)
         except Exception:  # Pillow raises whatever damaged metadata bring
             exif, gps = {}, {}
-        return Photo(sha256, image.size, _capture_time(exif), _gps_position(gps))
+        return Photo(_digest(files), image.size, _capture_time(exif), _gps_position(gps))
+
+
+def _exif_chunk(content: bytes) -> bytes:
+    """The EXIF in a PNG file, before or behind the pixels; empty if there is none, or for another file."""
+    begin = len(PNG_MAGIC) if content.startswith(PNG_MAGIC) else len(content)
+    while begin + 8 <= len(content):
+        end = begin + 8 + int.from_bytes(content[begin : begin + 4])
+        if content[begin + 4 : begin + 8] == b"eXIf":
+            return content[begin + 8 : end]
+        begin = end + 4  # behind its checksum
+    return b""
 
 
 def photo_of_array(rgb: NDArray[np.uint8]) -> Photo:

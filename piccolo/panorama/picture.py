@@ -1,4 +1,4 @@
-"""The pixels in a JPEG, PNG, TIFF or WebP file, 8 bits a channel, turned as EXIF says; Pillow reads them.
+"""The pixels in a JPEG, PNG, TIFF, WebP or HEIC file, 8 bits a channel, turned as EXIF says, by Pillow.
 
 Sizes are checked before anything is decoded. Each format's class is called by itself, as the limit of
 Image.open, which large panoramas exceed, can be lifted for the whole process only.
@@ -6,7 +6,6 @@ Image.open, which large panoramas exceed, can be lifted for the whole process on
 
 import subprocess
 import sys
-import threading
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -27,23 +26,32 @@ from PIL.TiffImagePlugin import TiffImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
 from ..cloud.label_colors import Labels, colors_of
-from ..errors import InputError
+from ..errors import InputError, ResourceError
 from ..runtime.json_file import read_bytes
 from ..runtime.memory import check_memory
+from ..runtime.optional import import_optional
 
-WANTED = "wanted a whole JPEG, PNG, TIFF or WebP panorama"
+WANTED = "wanted a whole JPEG, PNG, TIFF, WebP or HEIC panorama"
 MIN_WIDTH, MIN_HEIGHT = 128, 64
 MAX_WIDTH, MAX_HEIGHT = 32768, 16384
 BYTES_PER_PIXEL = 12  # while a picture is decoded, turned and masked; 10 were measured, more with alpha
 MAX_XMP_SIZE = 1 << 20  # [byte] what is longer is left aside
+PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 FORMATS: dict[bytes, type[ImageFile]] = {
-    b"\x89PNG\r\n\x1a\n": PngImageFile,
+    PNG_MAGIC: PngImageFile,
     b"\xff\xd8": JpegImageFile,
     **dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), TiffImageFile),
     b"RIFF": WebPImageFile,
 }
+HEIF_BRANDS = (
+    b"heic",
+    b"heix",
+    b"heim",
+    b"heis",
+    b"mif1",
+)  # of still pictures, behind a box's size and "ftyp"
 # at best: a bit a block of 8 x 8; 1040 bytes of 8 pixels by zlib; 3840 by LZW; a plain WebP packs to nothing
-MAX_PIXELS_PER_BYTE = {"JPEG": 512, "PNG": 8 * 1040, "TIFF": 8 * 3840, "WEBP": 1 << 30}
+MAX_PIXELS_PER_BYTE = {"JPEG": 512, "PNG": 8 * 1040, "TIFF": 8 * 3840, "WEBP": 1 << 30, "HEIF": 1 << 30}
 # what a viewer does to the stored picture, by EXIF's number
 TURNS: dict[object, Transpose] = {
     2: Transpose.FLIP_LEFT_RIGHT,
@@ -68,7 +76,8 @@ image.load()
 sys.stdout.buffer.write(image.convert(sys.argv[1]).tobytes())
 """
 
-_warnings_lock = threading.Lock()  # their filter is the whole process's
+# Pillow warns of what it makes do with. Once, here: the filters are the process's, no thread may change them.
+warnings.filterwarnings("ignore", module=r"PIL\.")
 
 
 @dataclass(frozen=True)
@@ -135,23 +144,30 @@ def picture_size(path: Path) -> tuple[int, int]:
         return image.size
 
 
+def picture_orientation(path: Path) -> object:
+    """EXIF's number of how the picture in a file is to be turned, without decoding it; None without."""
+    with opened(path, read_bytes(path, WANTED)) as image:
+        return _orientation(image)
+
+
 @contextmanager
 def opened(path: Path, data: bytes) -> Iterator[ImageFile]:
     """The picture in `data` as Pillow opens it, not decoded; what Pillow raises becomes an InputError."""
     if not data:
         raise InputError(f"{path}: the file is empty, {WANTED}")
     kind = next((kind for magic, kind in FORMATS.items() if data.startswith(magic)), None)
+    if data[4:8] == b"ftyp" and data[8:12] in HEIF_BRANDS:
+        kind = import_optional(path, "pillow_heif").HeifImageFile
     if kind is None:
         raise InputError(f"{path}: begins with {data[:8]!r}, {WANTED}")
-    with _warnings_lock, warnings.catch_warnings(action="ignore"):
-        try:
-            yield kind(BytesIO(data))
-        except (InputError, MemoryError):
-            raise
-        except Exception as error:  # Pillow's readers raise whatever their formats bring
-            words = " ".join(str(error).split())
-            why = f"the {kind.format} is cut off, damaged or of a rare kind ({words})"
-            raise InputError(f"{path}: {why}, {WANTED}") from error
+    try:
+        yield kind(BytesIO(data))
+    except (InputError, MemoryError):
+        raise
+    except Exception as error:  # Pillow's readers raise whatever their formats bring
+        words = " ".join(str(error).split())
+        why = f"the {kind.format} is cut off, damaged or of a rare kind ({words})"
+        raise InputError(f"{path}: {why}, {WANTED}") from error
 
 
 def _check(path: Path, image: ImageFile, num_bytes: int, min_size: tuple[int, int]) -> None:
@@ -178,7 +194,7 @@ def _decoded(path: Path, data: bytes, image: ImageFile, mode: str) -> Image.Imag
     """The picture decoded, turned as EXIF says, and converted to Pillow's `mode`."""
     if isinstance(image, TiffImageFile):  # which Pillow turns while it decodes
         if image.use_load_libtiff:
-            return _decoded_apart(data, mode, image.size)
+            return _decoded_apart(path, data, mode, image.size)
         image.im = Image.new(image.mode, image._tile_size).im  # else Pillow does, with a limit of its own
     if isinstance(image, PngImageFile):
         PngImageFile(BytesIO(data)).verify()  # of checksums, which decoding leaves aside
@@ -209,12 +225,17 @@ def exif_of(image: ImageFile) -> dict[int, object]:
         return {}
 
 
-def _decoded_apart(data: bytes, mode: str, size: tuple[int, int]) -> Image.Image:
+def _decoded_apart(path: Path, data: bytes, mode: str, size: tuple[int, int]) -> Image.Image:
     """The packed TIFF in `data`, decoded by a process of its own."""
     command = [sys.executable, "-P", "-c", DECODE_TIFF, mode]
     done = subprocess.run(command, input=data, capture_output=True, check=False)
+    if done.returncode < 0:
+        raise ResourceError(f"{path}: the process that decodes the TIFF was killed; it may need more memory")
     if done.returncode:
-        raise OSError((done.stderr.decode(errors="replace").splitlines() or ["its decoder was killed"])[-1])
+        text = (done.stderr.decode(errors="replace").splitlines() or ["nothing said"])[-1]
+        if text.startswith("MemoryError"):
+            raise ResourceError(f"{path}: the process that decodes the TIFF has too little memory")
+        raise OSError(text)
     return Image.frombytes(mode, size, done.stdout)
 
 

@@ -28,8 +28,15 @@ from .gpano import (
     region_of_fov,
 )
 from .masks import black_borders, find_mask, is_dual_fisheye, mask_pole, polar_disc, read_mask
-from .model import GPano, Panorama, ReadOptions
-from .picture import BYTES_PER_PIXEL, Picture, picture_size, read_labels, read_picture
+from .model import FocalPrior, GPano, Panorama, ReadOptions
+from .picture import (
+    BYTES_PER_PIXEL,
+    Picture,
+    picture_orientation,
+    picture_size,
+    read_labels,
+    read_picture,
+)
 
 Shot = tuple[Path, Picture, tuple[Mount, ...]]  # a file with the cameras that took it
 AS_STORED = ReadOptions()
@@ -41,7 +48,7 @@ MIN_REPORTED = 0.001  # of the sphere: borders below this are masked without a w
 
 
 def read_panorama(path: Path, options: ReadOptions = AS_STORED) -> Panorama:
-    """The panorama in a JPEG, PNG, TIFF or WebP file or in a folder of six cube faces, as a full sphere.
+    """The panorama in a JPEG, PNG, TIFF, WebP or HEIC file or a folder of six cube faces, as a full sphere.
 
     Colours have 8 bits (of 16 the upper 8, v >> 8), grey becomes RGB, EXIF's orientation is applied. Not
     valid are pixels of alpha 0, what a crop leaves open, masks, black borders and discs put over a pole.
@@ -68,13 +75,13 @@ def panorama_of(path: Path, picture: Picture, options: ReadOptions) -> Panorama:
     if cube := cube_of_cells(path, picture, options.cube_order):
         return _embedded_and_masked(path, cube, CropRegion(), options, None)
     fields = gpano_fields(picture.xmp)
-    cameras, notes = cameras_of(path, picture, options, bool(fields))
+    cameras = cameras_of(path, picture, options, bool(fields))
     gpano = attitude(fields) if fields else None
-    if cameras:
+    if cameras.mounts:
         if gpano is None and (elevation := elevation_deg(picture.exif)) is not None:
             gpano = GPano(elevation)
-        picture = replace(picture, warnings=(*picture.warnings, *notes))
-        return _on_sphere(path, [(path, picture, cameras)], options, gpano)
+        picture = replace(picture, warnings=(*picture.warnings, *cameras.notes))
+        return _on_sphere(path, [(path, picture, cameras.mounts)], options, gpano, cameras.deviation)
     region, more = _region_of(path, picture, fields, options)
     picture = replace(picture, warnings=(*picture.warnings, *more))
     return _embedded_and_masked(path, picture, region, options, gpano)
@@ -83,9 +90,9 @@ def panorama_of(path: Path, picture: Picture, options: ReadOptions) -> Panorama:
 def panorama_of_array(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], options: ReadOptions) -> Panorama:
     """The panorama of an image (H, W, 3) of a camera that the options name, or else of a full sphere."""
     path, picture = Path("array"), Picture(rgb, is_valid)
-    cameras, _ = cameras_of(path, picture, options, has_gpano=True)
-    if cameras:
-        return _on_sphere(path, [(path, picture, cameras)], options, None)
+    cameras = cameras_of(path, picture, options, has_gpano=True)
+    if cameras.mounts:
+        return _on_sphere(path, [(path, picture, cameras.mounts)], options, None, cameras.deviation)
     if rgb.shape[1] != 2 * len(rgb):
         found = f"{rgb.dtype} of shape {rgb.shape}"
         raise InputError(f"panorama: found {found}, wanted RGB in uint8 of shape (H, 2 H, 3), or a camera")
@@ -105,8 +112,13 @@ def _read_rig(folder: Path, rig: Calibration, options: ReadOptions) -> Panorama:
     return replace(panorama, warnings=(*panorama.warnings, note))
 
 
-def _on_sphere(path: Path, shots: list[Shot], options: ReadOptions, gpano: GPano | None) -> Panorama:
-    """The pictures of one instant on one sphere, each with its file and cameras, masks taken out."""
+def _on_sphere(
+    path: Path, shots: list[Shot], options: ReadOptions, gpano: GPano | None, deviation: float = 0.0
+) -> Panorama:
+    """The pictures of one instant on one sphere, each with its file and cameras, masks taken out.
+
+    `deviation` is that of the one camera's focal length.
+    """
     cameras = tuple(mount for *_, mounts in shots for mount in mounts)
     width = sphere_width(cameras)
     num_bytes = width * width // 2 * BYTES_PER_PIXEL
@@ -123,12 +135,23 @@ def _on_sphere(path: Path, shots: list[Shot], options: ReadOptions, gpano: GPano
         notes += [*picture.warnings, *more]
     rgb, is_valid = sphere_of(views, width)
     panorama = Panorama(rgb, is_valid, gpano, tuple(dict.fromkeys(notes)), cameras)
-    return _masked(path, panorama, counts, options)
+    masked = _masked(path, panorama, counts, options)
+    if deviation == 0.0:
+        return masked
+    prior = FocalPrior(cameras[0].camera.focal[0], deviation, views[0], is_valid & ~masked.is_valid)
+    return replace(masked, focal_prior=prior)
 
 
 def panorama_size(path: Path) -> tuple[int, int]:
-    """Width and height [px] of a panorama's file, or of the sphere of a folder of cube faces, not decoded."""
+    """Width and height [px] of a panorama's file, or of the sphere of a folder of cube faces, not decoded.
+
+    Raises InputError if EXIF says that it is to be turned, which many programs leave aside.
+    """
     if not path.is_dir():
+        if (orientation := picture_orientation(path)) not in (None, 1):
+            raise InputError(
+                f"{path}: found it stored turned (EXIF orientation {orientation}), wanted it upright"
+            )
         return picture_size(path)
     size, _ = picture_size(face_paths(path)["f"])
     return 4 * size, 2 * size

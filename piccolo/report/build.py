@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,11 +17,12 @@ from ..geometry.pose import Array, Pose
 from ..panorama.photo import photo_of
 from ..render.surfel_renderer import MAX_SURFELS, encode_image
 from ..render.surfels import Surfels, surfels_of
-from ..result import UNREADABLE
+from ..result import FAILED, UNREADABLE, check_scan
 from ..runtime.atomic import write_atomically
 from ..runtime.cache import digest_of_sources
+from ..runtime.temporary import temporary_folder
 from ..runtime.threads import Workers
-from .entries import Entry, Place, document_of_entry, names_of
+from .entries import Entry, Place, document_of_entry, names_of, short_names_of
 from .own_plan import OwnPlan, check_own_plans, own_plan
 from .pictures import make_pictures, read_options_of
 from .plan_image import draw_plan
@@ -54,6 +54,7 @@ class ReportSettings:
     is_self_contained: bool = False  # one file, of few photos
     own_plans: tuple[OwnPlan, ...] = ()  # in place of those drawn from the scan
     crs: str = ""  # coordinate system of the scan, if its map names none
+    is_forced: bool = False  # results of another scan are shown all the same, and the page says so
 
 
 class Report(NamedTuple):
@@ -83,15 +84,14 @@ def build_report(
         found = f"found {len(entries)} photos, wanted {MAX_SELF_CONTAINED} or fewer"
         raise InputError(f"--self-contained: {found}; without it the report is a folder")
     place = Place(scan_map, scan_map.storeys)
-    check_settings(settings, place)
-    with TemporaryDirectory(prefix="piccolo-") if settings.is_self_contained else nullcontext(out) as made:
-        folder = Path(made)
+    note = check_settings(settings, place, entries)
+    with temporary_folder() if settings.is_self_contained else nullcontext(out) as folder:
         if not settings.is_self_contained:
             check_folder(out)
         begin_folder(folder)
         tasks = [task_of(entry, place, settings) for entry in entries]
-        warnings = write_pictures(tasks, place, folder, settings, workers)
-        document = document_of(tasks, place, folder, settings)
+        warnings = (*filter(None, [note]), *write_pictures(tasks, place, folder, settings, workers))
+        document = {**document_of(tasks, place, folder, settings), "note": note}
         if not settings.is_self_contained:
             finish_folder(folder, document)
             return Report(out / "index.html", document, warnings)
@@ -99,13 +99,16 @@ def build_report(
         return Report(out, document, warnings)
 
 
-def check_settings(settings: ReportSettings, place: Place) -> None:
-    """Refuse names and plans of storeys that are not there."""
+def check_settings(settings: ReportSettings, place: Place, entries: Sequence[Entry]) -> str:
+    """Refuse storeys that are not there, and results of another scan; if forced, return words on these."""
     found = max(len(place.storeys.storeys), 1)
     if settings.storey_names and len(settings.storey_names) != found:
         names = f"found {len(settings.storey_names)} names"
         raise InputError(f"--storeys: {names}, wanted {found}, as the scan has storeys, the lowest first")
     check_own_plans(settings.own_plans, found)
+    return check_scan(
+        [entry.result for entry in entries], place.scan_map.scan_sha256, "that given", settings.is_forced
+    )
 
 
 def task_of(entry: Entry, place: Place, settings: ReportSettings) -> Task:
@@ -142,7 +145,7 @@ def write_pictures(
 def needs_pictures(task: Task, folder: Path) -> bool:
     """True unless they are there, or can't be: the photo was not read when it was localized."""
     is_there = picture_path(folder, "photos", task.key).exists()
-    return task.entry.result.status != UNREADABLE and not is_there
+    return task.entry.result.status not in (UNREADABLE, FAILED) and not is_there
 
 
 def writer(
@@ -172,19 +175,20 @@ def document_of(
     m = place.scan_map
     names = names_of([task.entry for task in tasks])
     photos = []
-    for task, name in zip(tasks, names, strict=True):
+    for task, name, short in zip(tasks, names, short_names_of(names), strict=True):
         has_pictures = picture_path(folder, "photos", task.key).exists()
         thumb = f"thumbs/{task.key}.jpg" if picture_path(folder, "thumbs", task.key).exists() else None
         entry = document_of_entry(task.entry, name, task.key, place)
-        photos.append({**entry, "hasPictures": has_pictures, "thumb": thumb})
-    result = tasks[0].entry.result
+        photos.append({**entry, "short": short, "hasPictures": has_pictures, "thumb": thumb})
+    cloud = tasks[0].entry.result.cloud
+    clouds = [Path(path).name for path in ([cloud] if isinstance(cloud, str) else cloud)]
     north = m.R_map_from_world @ np.array([0.0, 1.0, 0.0])
     has_north = bool(settings.crs or m.crs)
     return {
         "format": FORMAT,
         "version": __version__,
-        "title": settings.title or Path(result.cloud_name.split(", ")[0]).stem,
-        "cloud": result.cloud_name,
+        "title": settings.title or Path(clouds[0]).stem,
+        "cloud": ", ".join(clouds),
         "crs": settings.crs or m.crs,
         "north": [float(north[0]), float(north[1])] if has_north else None,
         "origin": m.origin_world.tolist(),

@@ -1,6 +1,7 @@
 """The results of a report with what the page says of each: where it is on which plan, how sure, why."""
 
 import math
+import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,13 +11,17 @@ import numpy as np
 
 from ..coarse_to_fine.scan_map import ScanMap
 from ..coarse_to_fine.storeys import Storeys
+from ..confidence.confidence import NOT_LOCALIZED
 from ..confidence.covariance import PoseCovariance
+from ..errors import printable
 from ..geometry.pose import Array, Pose
 from ..geometry.rotations import heading_pitch_roll_deg
-from ..result import Result, read_results
+from ..result import FAILED, UNREADABLE, Result, read_results
 from ..runtime.json_file import read_bytes
 
 CHI_SQUARE_95 = 5.991  # of two degrees of freedom
+LEAST_CONFIDENCE = 0.05  # of a photo that is not localized: a best guess below it is on no plan
+ENDING = re.compile(r"\.[A-Za-z0-9]{3,4}( \(\d+\))?$")
 DIGITS = 6  # of positions [m] and rotations
 EVIDENCE = (
     *("score", "margin", "explained_fraction", "seen_fraction", "contradicted_fraction"),
@@ -58,7 +63,7 @@ def read_entries(paths: Sequence[Path]) -> list[Entry]:
     entries: list[Entry] = []
     for number, path in enumerate(paths):
         results = read_results([path])
-        lines = [line for line in read_bytes(path, "wanted results").decode().splitlines() if line.strip()]
+        lines = [line.decode() for line in read_bytes(path, "wanted results").splitlines() if line.strip()]
         for result, line in zip(results, lines, strict=True):
             time = result.walk.time if result.walk else float(len(entries))
             entries.append(Entry(result, line, number if result.walk else None, time))
@@ -80,24 +85,32 @@ def names_of(entries: Sequence[Entry]) -> list[str]:
         shared += 1
     names, counts = [], Counter[str]()
     for path in paths:
-        name = "/".join(path.parts[shared:])
+        name = printable("/".join(path.parts[shared:]))
         counts[name] += 1
         names.append(f"{name} ({counts[name]})" if counts[name] > 1 else name)
     return names
 
 
+def short_names_of(names: Sequence[str]) -> list[str]:
+    """The file's own name without its ending, or the name as it is where several would be the same."""
+    own = [ENDING.sub(r"\1", name.rpartition("/")[2]) for name in names]
+    counts = Counter(own)
+    return [short if counts[short] == 1 else name for short, name in zip(own, names, strict=True)]
+
+
 def document_of_entry(entry: Entry, name: str, key: str, place: Place) -> dict[str, Any]:
     """What the page knows of a result before it is opened; angles in degrees, lengths in metres."""
     result = entry.result
+    is_hopeless = result.status == NOT_LOCALIZED and result.confidence < LEAST_CONFIDENCE
     return {
         "name": name,
-        "file": result.pano,
         "key": key,
-        "status": result.status,
+        "status": UNREADABLE if result.status == FAILED else result.status,  # the page has no word for it
         "confidence": round(result.confidence, 5),
         "probabilityNone": _rounded(result.probability_none, 5),
-        "error": result.error,
-        "warnings": list(result.warnings),
+        "error": result.error and _below(result.error, result.pano, name),
+        "warnings": [_below(warning, result.pano, name) for warning in result.warnings],
+        "isOnPlan": result.best_pose is not None and not is_hopeless,
         "scan": result.scan,
         "captured": result.source.capture_time,
         "size": result.source.image_size,
@@ -161,6 +174,11 @@ def spread_document(covariance: PoseCovariance, R_map_from_world: Array) -> dict
         "largest": round(1000.0 * covariance.largest_std, 2),
         "direction": covariance.least_constrained_direction,
     }
+
+
+def _below(words: str, pano: str, name: str) -> str:
+    """Words on a photo with its name in place of its path."""
+    return printable(words.replace(pano, name))
 
 
 def _centers(poses: Sequence[Pose], place: Place) -> Array:

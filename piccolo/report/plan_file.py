@@ -1,230 +1,190 @@
-"""Camera positions on the plans, for those without a browser: PNG, SVG, and DXF for CAD."""
+"""Camera positions on the plans, for those without a browser: PNG, SVG, PDF, and DXF for CAD."""
 
-import base64
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any
-from xml.etree import ElementTree
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from ..coarse_to_fine.scan_map import ScanMap
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
+from ..geometry.pose import Array
 from ..panorama.picture import read_picture
-from ..render.surfel_renderer import encode_image
 from ..runtime.atomic import write_atomically
+from ..runtime.figure import new_figure
 from ..runtime.optional import import_optional
+from ..runtime.temporary import temporary_folder
 from .build import ReportSettings, Task, check_settings, document_of
 from .entries import Entry, Place
-from .plan_path import LEAST_ON_PATH, color_of, draw_scale, is_numbered, segments_of
+from .plan_path import LEAST_ON_PATH, color_of, is_numbered, segments_of
 from .site import begin_folder
 
-SUFFIXES = (".png", ".svg", ".dxf")
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+DXF = ".dxf"
+SUFFIXES = (".png", ".svg", ".pdf", DXF)
 COLORS = {LOCALIZED: (8, 120, 76), AMBIGUOUS: (166, 83, 0), NOT_LOCALIZED: (193, 37, 45)}
-CAD_COLORS = {LOCALIZED: 3, AMBIGUOUS: 30, NOT_LOCALIZED: 1}  # of AutoCAD's index
-ROUND = np.linspace(0.0, math.tau, 32, endpoint=False)
-SHAPES = {  # corners of marks of radius 1, so that not the colour alone tells
-    LOCALIZED: np.column_stack([np.cos(ROUND), np.sin(ROUND)]),
-    AMBIGUOUS: np.array([[0.0, -1.2], [1.2, 0.0], [0.0, 1.2], [-1.2, 0.0]]),
-    NOT_LOCALIZED: np.array([[0.0, -1.15], [1.1, 0.85], [-1.1, 0.85]]),
-}
+MARKERS = {LOCALIZED: "o", AMBIGUOUS: "D", NOT_LOCALIZED: "^"}  # so that not the colour alone tells
 INK = (20, 32, 46)
-TITLE = 60  # [px] above each plan
-RADIUS, FRAME_RADIUS = 9, 4  # [px] of a mark, and of a walk's frame
-PATH_WIDTH, SCALE = 5, (160, 14)  # [px] of a walk's path, and of the scale of its colours
-HEADING = 1.0  # [m] length of a line in the DXF
+DPI, MARGIN = 100, 0.5  # a pixel of a plan is one of the PNG; [inch] around a plan
+SIZE, FRAME_SIZE, PATH_WIDTH = 12.0, 5.0, 3.5  # [pt] of a mark, and of a walk's frame and path
+HEADING, FRAME_HEADING = 0.5, 0.2  # [m] length of the line from a mark
 TEXT_HEIGHT = 0.12  # [m] of the DXF
-FONT = cv2.FONT_HERSHEY_DUPLEX
-SHIFT = 4  # bits of cv2's fractions of pixels
+BARS = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # [m] of the scale
+
+
+class Line(NamedTuple):
+    """A heading, or a part of a walk's path."""
+
+    ends: Array  # (2, 3) [m]
+    color: tuple[int, int, int]
+    width: float  # [pt]
+    is_dashed: bool = False
+
+
+class Ellipse(NamedTuple):
+    """Where a camera lies with 95 %."""
+
+    center: Array  # (3,) [m]
+    half_axes: tuple[float, float]  # [m]
+    angle: float  # [rad] of the larger one, counterclockwise from +x
+    color: tuple[int, int, int]
+
+
+class Mark(NamedTuple):
+    """A camera."""
+
+    center: Array  # (3,) [m]
+    status: str
+    size: float  # [pt]
+    number: str  # beside it; empty for most of a walk's frames
+    name: str
+
+
+Shape = Line | Ellipse | Mark
 
 
 def write_plan_file(entries: Sequence[Entry], scan_map: ScanMap, out: Path, settings: ReportSettings) -> int:
     """Write the positions as the suffix says; how many storeys there are.
 
-    PNG and SVG: the plans of the storeys, one below the other. DXF: points, headings, 95 % ellipses and names
-    in the scan's own coordinates, a layer a storey.
+    PNG, SVG, PDF: the plans of the storeys, one below the other. DXF: points, headings, 95 % ellipses and
+    names in the scan's own coordinates, a layer a storey.
     """
     place = Place(scan_map, scan_map.storeys)
-    check_settings(settings, place)
-    with TemporaryDirectory(prefix="piccolo-") as made:
-        folder = Path(made)
+    check_settings(settings, place, entries)
+    suffix = out.suffix.lower()
+    with temporary_folder() as folder:
         begin_folder(folder)
         tasks = [Task(entry, Path(), "", []) for entry in entries]
         document = document_of(tasks, place, folder, settings)
-        if out.suffix.lower() == ".dxf":
-            content = dxf_of(document)
-        else:
-            content = (png_of if out.suffix.lower() == ".png" else svg_of)(document, folder)
+        content = dxf_of(document) if suffix == DXF else figure_of(document, folder, suffix[1:])
     write_atomically(out, content)
     return len(document["storeys"])
 
 
-def on_storey(document: dict[str, Any], index: int) -> list[tuple[int, dict[str, Any]]]:
-    """The photos of a storey that have a pose, with their numbers from 1."""
-    photos = enumerate(document["photos"], 1)
-    return [(number, photo) for number, photo in photos if photo["pose"] and photo["storey"] in (index, None)]
+def shapes_of(document: dict[str, Any], index: int) -> Iterator[Shape]:
+    """What is drawn of a storey, in the map's frame: paths first, marks last."""
+    numbered = enumerate(document["photos"], 1)
+    photos = [(n, photo) for n, photo in numbered if photo["isOnPlan"] and photo["storey"] in (index, None)]
+    for s in segments_of([photo for _, photo in photos]):
+        ends = np.array([s.begin["pose"]["center"], s.end["pose"]["center"]])
+        yield Line(ends, color_of(s.confidence), PATH_WIDTH, s.is_gap)
+    for number, photo in photos:
+        center, color = np.array(photo["pose"]["center"]), COLORS[photo["status"]]
+        is_frame = photo["walk"] is not None
+        ahead = np.array([*photo["pose"]["rotation"][:2], 0.0])
+        ahead *= (FRAME_HEADING if is_frame else HEADING) / max(float(np.linalg.norm(ahead)), 1e-12)
+        yield Line(np.array([center, center + ahead]), color, 2.0)
+        if photo["spread"]:
+            a, b, degrees = photo["spread"]["ellipse"]
+            yield Ellipse(center, (a, b), math.radians(degrees), color)
+        text = str(number) if is_numbered(number, photo) else ""
+        yield Mark(center, photo["status"], FRAME_SIZE if is_frame else SIZE, text, photo["name"])
 
 
-def pixels_of_plan(plan: dict[str, Any], xy: Sequence[float]) -> NDArray[np.float64]:
-    """Pixel (2,) of a place (2,) [m] of the map's frame."""
-    a, b, c, d, e, f = plan["matrix"]
-    return np.linalg.solve(np.array([[a, c], [b, d]]), np.array(xy[:2]) - np.array([e, f]))
+def figure_of(document: dict[str, Any], folder: Path, form: str) -> bytes:
+    """The plans one below the other as matplotlib draws them, with a scale each."""
+    plans = [(k, storey) for k, storey in enumerate(document["storeys"]) if storey["plan"]]
+    sides = [np.array([s["plan"]["width"], s["plan"]["height"]]) / DPI + MARGIN for _, s in plans]
+    heights = [float(side[1]) for side in sides] or [1.0]
+    figure = new_figure(figsize=(max([float(side[0]) for side in sides] or [1.0]), sum(heights)), dpi=DPI)
+    top = sum(heights)
+    for (k, storey), (width, height) in zip(plans, sides, strict=True):
+        top -= height
+        box = MARGIN / 2, top + MARGIN / 4, width - MARGIN, height - MARGIN
+        axes = figure.add_axes((np.array(box) / np.tile(figure.get_size_inches(), 2)).tolist())
+        _draw_plan(axes, storey, folder)
+        for shape in shapes_of(document, k):
+            _draw(axes, shape)
+        if any(photo["walk"] is not None for photo in document["photos"]):
+            _draw_scale(axes)
+    file = io.BytesIO()
+    how = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(form, {})
+    options = {"svg.fonttype": "none", "svg.hashsalt": "piccolo"}  # texts stay texts, the same each time
+    with import_optional("--plan", "matplotlib", "tools").rc_context(options):
+        figure.savefig(file, format=form, metadata=how)
+    return file.getvalue()
 
 
-def heading_in_pixels(plan: dict[str, Any], rotation: Sequence[float]) -> NDArray[np.float64]:
-    """Unit direction (2,) in pixels in which a camera looks, by R_cam_from_map (9,)."""
-    a, b, c, d, *_ = plan["matrix"]
-    ahead = np.linalg.solve(np.array([[a, c], [b, d]]), np.array(rotation[:2]))
-    return np.asarray(ahead / max(float(np.linalg.norm(ahead)), 1e-12))
+def _draw_plan(axes: "Axes", storey: dict[str, Any], folder: Path) -> None:
+    """The plan of a storey with its name and scale, in metres of the map's frame."""
+    from matplotlib.transforms import Affine2D  # noqa: PLC0415  # as of new_figure
 
-
-def png_of(document: dict[str, Any], folder: Path) -> bytes:
-    """The plans one below the other, with marks, numbers and scale bars."""
-    sheets = [
-        _drawn_sheet(storey, on_storey(document, k), folder)
-        for k, storey in enumerate(document["storeys"])
-        if storey["plan"]
-    ]
-    width = max((sheet.shape[1] for sheet in sheets), default=2 * TITLE)
-    padded = [np.pad(s, ((0, 0), (0, width - s.shape[1]), (0, 0)), constant_values=255) for s in sheets]
-    blank = np.full((TITLE, width, 3), 255, np.uint8)
-    return encode_image(np.concatenate([*padded, blank]), ".png")
-
-
-def _drawn_sheet(
-    storey: dict[str, Any], photos: list[tuple[int, dict[str, Any]]], folder: Path
-) -> NDArray[np.uint8]:
     plan = storey["plan"]
     picture = read_picture(folder / plan["file"], (1, 1))
-    rgb = np.where(picture.is_valid[..., None], picture.rgb, np.uint8(255))
-    sheet = np.pad(rgb, ((TITLE, 0), (0, 0), (0, 0)), constant_values=255)
-    text = f"{storey['name']}   1 px = {1000 * plan['pixel']:.0f} mm"
-    cv2.putText(sheet, text, (12, 40), FONT, 0.8, INK, 2, cv2.LINE_AA)
-    metres = _bar_length(plan["width"] * plan["pixel"])
-    end = 12 + round(metres / plan["pixel"])
-    cv2.line(sheet, (12, 52), (end, 52), INK, 4, cv2.LINE_AA)
-    cv2.putText(sheet, f"{metres:g} m", (end + 8, 57), FONT, 0.5, INK, 1, cv2.LINE_AA)
-    _draw_paths(sheet, plan, [photo for _, photo in photos])
-    for number, photo in photos:
-        size = radius_of(photo)
-        at = pixels_of_plan(plan, photo["pose"]["center"]) + np.array([0.0, TITLE])
-        tip = at + 3.0 * size * heading_in_pixels(plan, photo["pose"]["rotation"])
-        color = COLORS[photo["status"]]
-        ends = [tuple(round(x * (1 << SHIFT)) for x in point) for point in (at, tip)]
-        cv2.line(sheet, ends[0], ends[1], color, 3 if size == RADIUS else 1, cv2.LINE_AA, SHIFT)
-        for radius, fill in ((1.25 * size, (255, 255, 255)), (size, color)):
-            corners = np.rint((at + radius * SHAPES[photo["status"]]) * (1 << SHIFT)).astype(np.int32)
-            cv2.fillPoly(sheet, [corners], fill, cv2.LINE_AA, SHIFT)
-        if not is_numbered(number, photo):
-            continue
-        where = round(at[0]) + RADIUS + 3, round(at[1]) - RADIUS
-        for thickness, ink in ((4, (255, 255, 255)), (1, INK)):
-            cv2.putText(sheet, str(number), where, FONT, 0.55, ink, thickness, cv2.LINE_AA)
-    return np.asarray(sheet, np.uint8)
+    rgba = np.dstack([picture.rgb, 255 * picture.is_valid.astype(np.uint8)])
+    to_metres = Affine2D.from_values(*plan["matrix"])
+    width, height = plan["width"], plan["height"]
+    corners = to_metres.transform([(0, 0), (width, 0), (0, height), (width, height)])
+    axes.imshow(rgba, extent=(0, width, height, 0), transform=to_metres + axes.transData)
+    left, bottom = corners.min(axis=0)
+    right, top = corners.max(axis=0)
+    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
+    axes.set_axis_off()
+    axes.set_title(storey["name"], loc="left", color=_fraction(INK))
+    metres = max((m for m in BARS if m < (right - left) / 4.0), default=0.2)
+    axes.plot([left, left + metres], [bottom, bottom], color=_fraction(INK), lw=4, clip_on=False)
+    axes.annotate(f"{metres:g} m", (left + metres, bottom), (4, 2), textcoords="offset points")
 
 
-def radius_of(photo: dict[str, Any]) -> int:
-    """Of a photo's mark [px]: those of a walk lie close together."""
-    return RADIUS if photo["walk"] is None else FRAME_RADIUS
+def _draw_scale(axes: "Axes") -> None:
+    """The colours of a walk's path."""
+    from matplotlib.cm import ScalarMappable  # noqa: PLC0415
+    from matplotlib.colors import Normalize  # noqa: PLC0415
+
+    colors = ScalarMappable(Normalize(LEAST_ON_PATH, 1.0), "viridis_r")
+    bar = axes.figure.colorbar(
+        colors, cax=axes.inset_axes((0.72, 1.02, 0.26, 0.02)), orientation="horizontal"
+    )
+    bar.set_ticks([LEAST_ON_PATH, 1.0], labels=[f"{LEAST_ON_PATH:g}", "1"])
+    axes.text(0.71, 1.02, "confidence", transform=axes.transAxes, ha="right")
 
 
-def _draw_paths(sheet: NDArray[np.uint8], plan: dict[str, Any], photos: list[dict[str, Any]]) -> None:
-    """The paths of walks, and what their colours mean."""
-    segments = list(segments_of(photos))
-    for s in segments:
-        ends = [pixels_of_plan(plan, photo["pose"]["center"]) for photo in (s.begin, s.end)]
-        first, last = ((round(u * (1 << SHIFT)), round((v + TITLE) * (1 << SHIFT))) for u, v in ends)
-        cv2.line(
-            sheet, first, last, color_of(s.confidence), 1 if s.is_gap else PATH_WIDTH, cv2.LINE_AA, SHIFT
-        )
-    left, (width, height) = sheet.shape[1] - SCALE[0] - 150, SCALE
-    if segments and left > 0:
-        draw_scale(sheet, left, 30, width, height)
-        for text, at in ((f"{LEAST_ON_PATH:g}", left - 40), ("1 confidence", left + width + 8)):
-            cv2.putText(sheet, text, (at, 42), FONT, 0.5, INK, 1, cv2.LINE_AA)
+def _draw(axes: "Axes", shape: Shape) -> None:
+    from matplotlib import patches  # noqa: PLC0415
+
+    if isinstance(shape, Line):
+        style = (0, (1, 2)) if shape.is_dashed else "-"
+        axes.plot(*shape.ends[:, :2].T, color=_fraction(shape.color), lw=shape.width, ls=style)
+    elif isinstance(shape, Ellipse):
+        width, height = 2.0 * np.array(shape.half_axes)
+        ellipse = patches.Ellipse(tuple(shape.center[:2]), width, height, angle=math.degrees(shape.angle))
+        ellipse.set(fill=False, edgecolor=_fraction(shape.color))
+        axes.add_patch(ellipse)
+    else:
+        color, is_sure = _fraction(COLORS[shape.status]), shape.status == LOCALIZED
+        fill, edge = (color, "white") if is_sure else ("white", color)  # a guess is hollow
+        (mark,) = axes.plot(*shape.center[:2], marker=MARKERS[shape.status], ms=shape.size, gid=shape.name)
+        mark.set(markerfacecolor=fill, markeredgecolor=edge, markeredgewidth=1.5)
+        place = (shape.size / 2 + 2, shape.size / 2)
+        axes.annotate(shape.number, tuple(shape.center[:2]), place, textcoords="offset points", weight="bold")
 
 
-def _bar_length(width: float) -> float:
-    """Length [m] of the scale bar of a plan."""
-    return max((m for m in (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0) if m < width / 4.0), default=0.2)
-
-
-def svg_of(document: dict[str, Any], folder: Path) -> bytes:
-    """The same with vectors over the plans; a user unit is a millimetre of the building."""
-    ElementTree.register_namespace("", "http://www.w3.org/2000/svg")
-    root = ElementTree.Element("{http://www.w3.org/2000/svg}svg")
-    y, widest = 0.0, 0.0
-    for k, storey in enumerate(document["storeys"]):
-        if plan := storey["plan"]:
-            scale = 1000.0 * plan["pixel"]
-            title = _add(root, "text", x="100", y=f"{y + 450:.0f}", **{"font-size": "350"})
-            title.text = storey["name"]
-            group = _add(root, "g", transform=f"translate(0 {y + 600:.0f}) scale({scale:.6f})")
-            _add_plan(group, plan, folder)
-            photos = on_storey(document, k)
-            _add_paths(group, plan, [photo for _, photo in photos])
-            for number, photo in photos:
-                _add_photo(group, plan, number, photo)
-            y += 1000.0 + scale * plan["height"]
-            widest = max(widest, scale * plan["width"])
-    root.set("viewBox", f"0 0 {widest:.0f} {y:.0f}")
-    text: bytes = ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
-    return text
-
-
-def _add(parent: ElementTree.Element, tag: str, **attributes: str) -> ElementTree.Element:
-    return ElementTree.SubElement(parent, f"{{http://www.w3.org/2000/svg}}{tag}", attributes)
-
-
-def _add_plan(group: ElementTree.Element, plan: dict[str, Any], folder: Path) -> None:
-    content = base64.b64encode((folder / plan["file"]).read_bytes()).decode()
-    size = {"width": str(plan["width"]), "height": str(plan["height"])}
-    _add(group, "image", href=f"data:image/png;base64,{content}", **size)
-    metres = _bar_length(plan["width"] * plan["pixel"])
-    end, bottom = 10.0 + metres / plan["pixel"], plan["height"] - 10.0
-    _add(group, "path", d=f"M10 {bottom}H{end:.2f}", stroke="#14202e", **{"stroke-width": "4"})
-    _add(
-        group, "text", x=f"{end + 6:.2f}", y=f"{bottom + 5:.2f}", **{"font-size": "16"}
-    ).text = f"{metres:g} m"
-
-
-def _add_paths(group: ElementTree.Element, plan: dict[str, Any], photos: list[dict[str, Any]]) -> None:
-    for s in segments_of(photos):
-        (x1, y1), (x2, y2) = (pixels_of_plan(plan, photo["pose"]["center"]) for photo in (s.begin, s.end))
-        color = "#{:02x}{:02x}{:02x}".format(*color_of(s.confidence))
-        line = _add(
-            group, "line", x1=f"{x1:.2f}", y1=f"{y1:.2f}", x2=f"{x2:.2f}", y2=f"{y2:.2f}", stroke=color
-        )
-        line.set("stroke-width", str(PATH_WIDTH))
-        line.set("stroke-linecap", "round")
-        if s.is_gap:
-            line.set("stroke-dasharray", "4 8")
-
-
-def _add_photo(group: ElementTree.Element, plan: dict[str, Any], number: int, photo: dict[str, Any]) -> None:
-    u, v = pixels_of_plan(plan, photo["pose"]["center"])
-    size = radius_of(photo)
-    du, dv = 3.0 * size * heading_in_pixels(plan, photo["pose"]["rotation"])
-    color = "#{:02x}{:02x}{:02x}".format(*COLORS[photo["status"]])
-    mark = _add(group, "g", fill=color, stroke=color)
-    _add(mark, "title").text = f"{photo['name']}: {photo['status'].replace('_', ' ')}"
-    _add(mark, "path", d=f"M{u:.2f} {v:.2f}l{du:.2f} {dv:.2f}", **{"stroke-width": "3"})
-    _add(mark, "circle", cx=f"{u:.2f}", cy=f"{v:.2f}", r=str(size), stroke="#ffffff", **{"stroke-width": "2"})
-    if spread := photo["spread"]:
-        a, b, degrees = spread["ellipse"]
-        radii = {"rx": f"{a / plan['pixel']:.3f}", "ry": f"{b / plan['pixel']:.3f}"}
-        turn = f"translate({u:.2f} {v:.2f}) rotate({-degrees:.2f})"
-        _add(mark, "ellipse", transform=turn, fill="none", **radii)
-    if not is_numbered(number, photo):
-        return
-    text = _add(mark, "text", x=f"{u + RADIUS + 3:.2f}", y=f"{v - RADIUS:.2f}", stroke="none")
-    text.set("font-size", "16")
-    text.text = str(number)
+def _fraction(color: tuple[int, int, int]) -> tuple[float, ...]:
+    return tuple(value / 255.0 for value in color)
 
 
 def dxf_of(document: dict[str, Any]) -> bytes:
@@ -232,40 +192,36 @@ def dxf_of(document: dict[str, Any]) -> bytes:
     ezdxf = import_optional("--plan", "ezdxf", "tools")
     drawing = ezdxf.new("R2010", setup=True)
     drawing.header["$INSUNITS"], drawing.header["$PDMODE"], drawing.header["$PDSIZE"] = 6, 34, 0.1
-    space = drawing.modelspace()
+    R_map_from_world = np.array(document["R"]).reshape(3, 3)
     for k, storey in enumerate(document["storeys"]):
         layer = _layer_name(storey["name"], k)
         drawing.layers.add(layer)
-        for _, photo in on_storey(document, k):
-            how = {"layer": layer, "color": CAD_COLORS[photo["status"]]}
-            x, y, z = photo["pose"]["world"]
-            heading = math.radians(90.0 - photo["pose"]["angles"][0])
-            space.add_point((x, y, z), dxfattribs=how)
-            tip = x + HEADING * math.cos(heading), y + HEADING * math.sin(heading), z
-            space.add_line((x, y, z), tip, dxfattribs=how)
-            text = space.add_text(photo["name"], height=TEXT_HEIGHT, dxfattribs=how)
-            text.set_placement((x + 0.1, y + 0.1, z))
-            if photo["spread"]:
-                _add_ellipse(space, photo, how, document["R"])
-        for s in segments_of([photo for _, photo in on_storey(document, k)]):
-            ends = [tuple(photo["pose"]["world"]) for photo in (s.begin, s.end)]
-            path = space.add_line(*ends, dxfattribs={"layer": layer})
-            path.rgb = color_of(s.confidence)
+        for shape in shapes_of(document, k):
+            _add(drawing.modelspace(), shape, layer, R_map_from_world, np.array(document["origin"]))
     file = io.StringIO()
     drawing.write(file)
     return file.getvalue().encode("utf-8")
+
+
+def _add(space: Any, shape: Shape, layer: str, R_map_from_world: Array, origin: Array) -> None:
+    """A shape in the world's coordinates; no ellipse that is smaller than a hundredth of a millimetre."""
+    color = COLORS[shape.status] if isinstance(shape, Mark) else shape.color
+    how = {"layer": layer, "true_color": color[0] << 16 | color[1] << 8 | color[2]}
+    if isinstance(shape, Line):
+        space.add_line(*(shape.ends @ R_map_from_world + origin).tolist(), dxfattribs=how)
+        return
+    center = shape.center @ R_map_from_world + origin
+    if isinstance(shape, Mark):
+        space.add_point(center.tolist(), dxfattribs=how)
+        text = space.add_text(shape.name, height=TEXT_HEIGHT, dxfattribs=how)
+        text.set_placement((center + np.array([0.1, 0.1, 0.0])).tolist())
+    elif shape.half_axes[1] > 1e-5:
+        a, b = shape.half_axes
+        axis = a * np.array([math.cos(shape.angle), math.sin(shape.angle), 0.0]) @ R_map_from_world
+        space.add_ellipse(center.tolist(), axis.tolist(), b / a, dxfattribs=how)
 
 
 def _layer_name(name: str, index: int) -> str:
     """A storey's name as DXF takes it."""
     kept = "".join("_" if letter in '<>/\\":;?*|=`,' else letter for letter in name)
     return f"PHOTOS {index + 1} {kept}"[:200]
-
-
-def _add_ellipse(space: Any, photo: dict[str, Any], how: dict[str, Any], R: Sequence[float]) -> None:
-    """The ellipse of a photo, if it is not smaller than a hundredth of a millimetre."""
-    a, b, degrees = photo["spread"]["ellipse"]
-    angle = math.radians(degrees) - math.atan2(R[3], R[0])  # from the map's frame to the world's
-    if b > 1e-5:
-        axis = a * math.cos(angle), a * math.sin(angle), 0.0
-        space.add_ellipse(photo["pose"]["world"], axis, b / a, dxfattribs=how)

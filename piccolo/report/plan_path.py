@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 LEAST_ON_PATH = 0.5  # frames that are less likely right are passed over
 EVERY_NUMBER = 20  # of a walk's frames are numbered
@@ -42,10 +41,3 @@ def color_of(confidence: float) -> tuple[int, int, int]:
 def is_numbered(number: int, photo: dict[str, Any]) -> bool:
     """True for a photo that stands alone, and for some of a walk's frames."""
     return photo["walk"] is None or number % EVERY_NUMBER == 1
-
-
-def draw_scale(sheet: NDArray[np.uint8], left: int, top: int, width: int, height: int) -> None:
-    """The colours of confidences from 0.5 to 1, drawn into a sheet [px]."""
-    for column in range(width):
-        confidence = LEAST_ON_PATH + (1.0 - LEAST_ON_PATH) * column / (width - 1)
-        sheet[top : top + height, left + column] = color_of(confidence)

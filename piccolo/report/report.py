@@ -28,6 +28,7 @@ class ReportOptions(TypedDict, total=False):
     self_contained: bool  # `out` is one HTML file, of at most 50 photos
     own_plans: Mapping[int, tuple[File, File]]  # by storey, 1 the lowest: an image, CSV of control points
     crs: str  # the scan's coordinate system, if it does not name it
+    force: bool  # show results of another scan too; the page says so
     units: str  # of the scan's coordinates, as in `open_scan`; these three only for files
     up: UpAxis
     cache: bool | File
@@ -57,7 +58,8 @@ def write_report(
     Raises
     ------
     InputError
-        A file can't be read, the folder holds something else, or an option means nothing.
+        A file can't be read, results are of another scan, the folder holds something else, or an option means
+        nothing.
 
     Examples
     --------
@@ -81,6 +83,7 @@ def write_report(
         is_self_contained=options.get("self_contained", False),
         own_plans=tuple(OwnPlan(k, Path(image), Path(csv)) for k, (image, csv) in own_plans.items()),
         crs=options.get("crs", ""),
+        is_forced=options.get("force", False),
     )
     scan_map = scan.prepared if isinstance(scan, Scan) else _map_of(_paths(scan), options, workers)
     if not isinstance(scan_map, ScanMap):

@@ -18,7 +18,7 @@ from ..errors import InputError
 from ..runtime.atomic import is_stream, write_atomically
 
 INDEX = "index.html"
-PAGE_FILES = ("app.js", "app.css", "LICENSES.txt")
+PAGE_FILES = ("app.js", "app.css")
 FOLDERS = {"photos": ".js", "thumbs": ".jpg", "plans": ".png"}
 KEY = re.compile(r"[0-9a-f]{32}")
 MARK = "piccolo-report"  # in the page, by which a folder is known as a report

@@ -5,10 +5,10 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from ..errors import InputError
 from ..panorama.video import frames_at
+from ..runtime.temporary import temporary_folder
 
 FRAME = re.compile(r"(?P<video>.+)#t=(?P<time>\d+\.\d{3})", re.DOTALL)
 
@@ -23,10 +23,10 @@ def taken_out(photos: Sequence[Path]) -> Iterator[dict[Path, Path]]:
     for photo in photos:
         if found := FRAME.fullmatch(str(photo)):
             by_video[Path(found["video"])][round(1000.0 * float(found["time"]))] = photo
-    with TemporaryDirectory(prefix="piccolo-") as folder:
+    with temporary_folder() as folder:
         files: dict[Path, Path] = {}
         for number, (video, frames) in enumerate(by_video.items()):
-            own = Path(folder) / str(number)
+            own = folder / str(number)
             own.mkdir()
             try:
                 for frame in frames_at(video, [time / 1000.0 for time in frames], own):

@@ -1,4 +1,4 @@
-"""A NumPy archive (.npz) whose arrays are mapped into memory: opened at once, shared by processes.
+"""A NumPy archive (.npz) whose arrays are mapped into memory, opened at once, shared by processes; or read.
 
 `numpy.load` reads it too. Its members are stored, not compressed, and padded in their headers, as zipalign
 does, so that each array begins at a multiple of 64 bytes of the file.
@@ -7,23 +7,29 @@ does, so that each array begins at a multiple of 64 bytes of the file.
 import io
 import math
 import mmap
+import os
+import re
 import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
-from warnings import catch_warnings, simplefilter
 
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
+
+from .memory import check_memory
 
 ALIGNMENT = 64  # [byte]
 PADDING_ID = 0xD935  # of the extra field of a member's header, as zipalign has it
 LOCAL_HEADER = struct.Struct("<4s22xHH")  # magic, lengths of the name and of the extra field behind it
 MEMBER_MAGIC = b"PK\x03\x04"
 MAX_HEADER_SIZE = 4096  # [byte] of an array's header
+MAX_HEAD_SIZE = MAX_HEADER_SIZE + 12  # with what stands before it
+QUOTED = re.compile(rb"'[^']*'|\"[^\"]*\"")
+HEADER_READERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
 
 def write_archive(file: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -41,18 +47,43 @@ def write_archive(file: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
                 npy.write_array(member, array, version=(1, 0), allow_pickle=False)
 
 
-class MappedArchive:
-    """An archive's arrays, mapped into memory: pages are read when they are needed; writing changes no file.
+def read_header(head: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
+    """Shape, order (True for Fortran's) and type of an array, by the head of its file, and where it begins.
+
+    ValueError for a header that NumPy would have to mend, and warn of: filters of warnings are the process's.
+    """
+    file = io.BytesIO(head)
+    version = npy.read_magic(file)
+    if version not in HEADER_READERS:
+        raise ValueError(f"an array of version {version[0]}.{version[1]}, wanted 1.0 or 2.0")
+    if b"L" in QUOTED.sub(b"", head[file.tell() + 2 * version[0] :].partition(b"}")[0]):
+        raise ValueError("a header of Python 2")
+    shape, is_fortran, dtype = HEADER_READERS[version](file, max_header_size=MAX_HEADER_SIZE)
+    return shape, is_fortran, dtype, file.tell()
+
+
+class ArrayArchive:
+    """An archive's arrays, read whole; or mapped: a page is read when it is needed, writing changes no file.
 
     ValueError, and what zipfile raises, for an archive that `write_archive` can't have written.
     """
 
-    def __init__(self, file: IO[bytes]) -> None:
-        """Read the directory."""
+    def __init__(self, file: IO[bytes], is_mapped: bool) -> None:
+        """Read the directory. What may be cut off while it is mapped kills the process (SIGBUS)."""
+        self.status = os.fstat(file.fileno())
         with zipfile.ZipFile(file) as archive:
             infos = archive.infolist()
         self.members = {info.filename.removesuffix(".npy"): info for info in infos}
-        self.content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+        if is_mapped:
+            self.content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+        else:
+            check_memory(self.status.st_size, file.name, "keep it in the cache")
+            self.content = mmap.mmap(-1, self.status.st_size)
+            file.seek(0)
+            with memoryview(self.content) as whole:
+                done = 0
+                while count := file.readinto(whole[done:]):  # type: ignore[attr-defined]
+                    done += count
         size = sum(info.file_size for info in infos)
         if size > len(self.content) or len(self.members) != len(infos):
             raise ValueError(f"arrays of {size} bytes")
@@ -80,13 +111,9 @@ class MappedArchive:
         """A member's array, as long as its header says."""
         info = self.members[name]
         begin = self._begin(info)
-        head = io.BytesIO(self.content[begin : begin + min(MAX_HEADER_SIZE, info.file_size)])
-        with catch_warnings():
-            simplefilter("error")  # NumPy warns of headers that it had to mend
-            if npy.read_magic(head) != (1, 0):
-                raise ValueError(f"{info.filename} of another version than 1.0")
-            shape, is_fortran, dtype = npy.read_array_header_1_0(head, max_header_size=MAX_HEADER_SIZE)
-        first, found = begin + head.tell(), info.file_size - head.tell()
+        head = self.content[begin : begin + min(MAX_HEAD_SIZE, info.file_size)]
+        shape, is_fortran, dtype, size = read_header(head)
+        first, found = begin + size, info.file_size - size
         promised = math.prod(shape) * dtype.itemsize
         if is_fortran or dtype.hasobject or promised != found or min(shape, default=0) < 0:
             raise ValueError(f"{info.filename} of {found} bytes, which promises {dtype} of shape {shape}")
@@ -97,7 +124,7 @@ class MappedArchive:
         return np.frombuffer(self.content, dtype, math.prod(shape), first).reshape(shape)
 
 
-def open_archive(path: Path) -> MappedArchive:
+def open_archive(path: Path, is_mapped: bool = False) -> ArrayArchive:
     """The arrays of an archive that `write_archive` wrote."""
     with path.open("rb") as file:
-        return MappedArchive(file)
+        return ArrayArchive(file, is_mapped)

@@ -16,11 +16,16 @@ NAME = own_names("fact")
 MAX_SIZE = 200  # [byte] of a fact
 
 
+def key_of(what: str, status: os.stat_result) -> str:
+    """A name for `what` of a file of this status: another as soon as it changes."""
+    identity = status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+    return hashlib.sha256(repr((what, identity)).encode()).hexdigest()[:32]
+
+
 def _path(what: str, status: os.stat_result) -> Path | None:
     """The file in which `what` is kept of a file of this status."""
-    identity = status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
-    folder, key = private_folder("facts", NAME), repr((what, identity))
-    return folder and folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.fact"
+    folder = private_folder("facts", NAME)
+    return folder and folder / f"{key_of(what, status)}.fact"
 
 
 def recall(what: str, status: os.stat_result) -> str | None:

@@ -26,6 +26,16 @@ HALF = np.float32(0.5)
 inline_kernel = numba.njit(nogil=True, error_model="numpy", fastmath=FASTMATH, forceinline=True)
 
 
+@inline_kernel
+def copy_to(target, source):
+    """Write an array into another of its shape, both contiguous.
+
+    An assignment of slices compiles the text of the error that it might raise into the kernel, for seconds.
+    """
+    for k in range(target.size):
+        target.flat[k] = source.flat[k]
+
+
 def kernel(function: Callable[..., Any]) -> Any:  # a Numba dispatcher, which has no type
     """Compile a function of arrays and scalars on its first call; kept between runs by KernelCache."""
     dispatcher: Any = inline_kernel(function)

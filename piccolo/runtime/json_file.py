@@ -2,8 +2,10 @@
 
 import json
 import math
+import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,17 +16,44 @@ MAX_SIZE = 1 << 26  # [byte] of a file that is read whole
 # what damaged JSON, or JSON of another kind, raises while it is parsed and its fields are read
 DAMAGE = (AttributeError, IndexError, KeyError, OverflowError, RecursionError, TypeError, ValueError)
 
+_held: ContextVar[dict[Path, bytes] | None] = ContextVar("held", default=None)  # contents, by `reading_once`
+
 
 def read_bytes(path: Path, wanted: str, max_size: float = math.inf) -> bytes:
     """The content of a file of at most `max_size` bytes; `wanted` says in an error what it should hold."""
-    if path.exists() and not path.is_file():
-        raise InputError(f"{path}: not a file but a folder or a device, {wanted}")
+    held = _held.get()
+    if held is not None and path in held:
+        return held[path]
     try:
-        if path.stat().st_size > max_size:
-            raise InputError(f"{path}: found {path.stat().st_size} bytes, {wanted}")
-        return path.read_bytes()
-    except OSError as error:
+        status = path.stat()
+        is_right = stat.S_ISREG(status.st_mode) and status.st_size <= max_size
+        content = path.read_bytes() if is_right else b""
+    except (OSError, ValueError) as error:
         raise unreadable(path, error) from error
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError(f"{path}: not a file but a folder or a device, {wanted}")
+    if not is_right:
+        raise InputError(f"{path}: found {status.st_size} bytes, {wanted}")
+    if held is not None:
+        held[path] = content
+    return content
+
+
+@contextmanager
+def reading_once() -> Iterator[None]:
+    """Within this, the content of a file is read from the disk once, so that all that is said is of one.
+
+    Nested ones share what was read. It is let go where one of them ends, but kept for those around it if that
+    was by an error.
+    """
+    held = _held.get()
+    held = {} if held is None else held
+    token = _held.set(held)
+    try:
+        yield
+        held.clear()
+    finally:
+        _held.reset(token)
 
 
 def read_text(path: Path, wanted: str, max_size: int = MAX_SIZE) -> str:

@@ -1,19 +1,24 @@
 """Compiled kernels on disk, one file a kernel and signature, opened when a kernel is first called.
 
 Numba's own cache makes its folders when a module is imported, does not see that a kernel's callee in another
-file has changed, and loads machine code without a checksum.
+file has changed, never finds a kernel again that takes another from around it, parses the bitcode of each,
+and loads machine code without a checksum. What is used here of Numba's insides may change with its releases:
+its version has an upper bound, and whatever goes wrong, the kernel is compiled.
 """
 
 import hashlib
 import logging
 import pickle
 import sys
+import time
+from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import llvmlite.binding as llvm
 import numba
+import numpy as np
 from numba.core import compiler, serialize
 from numba.core.runtime.nrt import rtsys
 
@@ -22,6 +27,14 @@ from .cache import PRIVATE, WRITABLE, cache_root, in_words, is_own, mark_used, o
 
 NAME = own_names("kernel")
 DIGEST_SIZE = hashlib.sha256().digest_size
+# of numba.config: they change the code that is made
+FLAGS = (
+    "BOUNDSCHECK", "DEBUGINFO_DEFAULT", "DISABLE_INTEL_SVML", "ENABLE_AVX", "ENABLE_PROFILING",
+    "EXTEND_VARIABLE_LIFETIMES", "LLVM_REFPRUNE_FLAGS", "LLVM_REFPRUNE_PASS", "LOOP_VECTORIZE", "OPT",
+    "SLP_VECTORIZE",
+)  # fmt: skip
+TOTALS = 49, 61  # kernels that a first photo takes from a scan on, and that it takes where it is doubtful
+QUIET_S = 3.0  # between two lines on what is compiled, and before the first
 log = logging.getLogger("piccolo")
 
 
@@ -45,7 +58,7 @@ def kernel_folder() -> Path | None:
 @cache
 def warn_not_kept(reason: str) -> None:
     """Warn once that the next run has to compile again."""
-    log.warning("%s; compiled code is not kept, and each run takes a minute more", reason)
+    log.warning("%s; compiled code is not kept, and each run takes half a minute more", reason)
 
 
 @cache
@@ -65,10 +78,32 @@ def sources_digest() -> str:
     return digest.hexdigest()
 
 
-def is_first_use() -> bool:
-    """True while no kernel has been compiled on this machine, where any can be kept."""
-    folder = kernel_folder()
-    return folder is not None and not any(NAME.fullmatch(entry.name) for entry in folder.iterdir())
+@dataclass
+class Compiling:
+    """What this process has compiled, told to those who wait as the log's INFO."""
+
+    count: int = 0
+    begin: float = 0.0
+    told: float = 0.0
+
+    def start(self) -> None:
+        """Note the time at which the first kernel was asked for and not found."""
+        if self.begin == 0.0:
+            self.begin = self.told = time.monotonic()
+
+    def finish(self) -> None:
+        """Count a kernel; tell from time to time how many are left."""
+        self.count += 1
+        now = time.monotonic()
+        if now - self.told >= QUIET_S:
+            self.told = now
+            total = next((total for total in TOTALS if self.count <= total), self.count)
+            seconds = (now - self.begin) / self.count * (total - self.count)
+            text = "compiling kernels, once: %d of about %d, some %.0f s left"
+            log.info(text, self.count, total, seconds)
+
+
+compiling = Compiling()
 
 
 def digest_of(name: str, payload: bytes) -> bytes:
@@ -126,26 +161,35 @@ class KernelCache:
 
     def _file(self, signature: object, codegen: Any) -> Path | None:
         """The file for a signature on this machine's processor."""
-        versions = numba.__version__, sys.version_info[:2], sys.byteorder, codegen.magic_tuple()
-        key = repr((self.name, str(signature), versions, sources_digest()))
+        versions = numba.__version__, np.__version__, sys.version_info[:2], sys.byteorder
+        how = versions, codegen.magic_tuple(), [getattr(numba.config, flag, None) for flag in FLAGS]
+        key = repr((self.name, str(signature), how, sources_digest()))
         folder = kernel_folder()
         return folder and folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.kernel"
 
     def load_overload(self, signature: object, target_context: Any) -> Any:
         """Read compiled code; None if there is none that can be trusted."""
-        rtsys.initialize(target_context)
-        path = self._file(signature, target_context.codegen())
-        payload = path and read_whole(path)
-        return payload and rebuilt(target_context, *pickle.loads(payload))
+        try:
+            rtsys.initialize(target_context)
+            path = self._file(signature, target_context.codegen())
+            if payload := path and read_whole(path):
+                return rebuilt(target_context, *pickle.loads(payload))
+        except Exception as error:  # Numba's insides are not as they were
+            warn_not_kept(f"Numba {numba.__version__}: {error!r}")
+        compiling.start()
+        return None
 
     def save_overload(self, signature: object, compiled: Any) -> None:
         """Write compiled code whole; where that can't be done it is compiled again by the next run."""
-        if path := self._file(signature, compiled.codegen):
-            payload = serialize.dumps(compiled._reduce())
-            try:
+        compiling.finish()
+        try:
+            if path := self._file(signature, compiled.codegen):
+                payload = serialize.dumps(compiled._reduce())
                 write_atomically(path, digest_of(path.name, payload) + payload)
-            except OSError as error:
-                warn_not_kept(f"{path.parent}: {error.strerror or error}")
+        except OSError as error:
+            warn_not_kept(f"{kernel_folder()}: {error.strerror or error}")
+        except Exception as error:  # as above
+            warn_not_kept(f"Numba {numba.__version__}: {error!r}")
 
     def flush(self) -> None:
         """Nothing is held in memory."""

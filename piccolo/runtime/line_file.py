@@ -2,11 +2,12 @@
 
 import fcntl
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ..errors import InputError
+from .atomic import replacing
 
 BLOCK = 1 << 20  # [byte] read at a time
 
@@ -14,12 +15,8 @@ BLOCK = 1 << 20  # [byte] read at a time
 def whole_size(path: Path, begins: bytes, what: str) -> int:
     """The size [byte] of a file of lines up to the end of its last whole one; 0 if there is no file.
 
-    A last line that is torn, as it was being written, begins with `begins`.
-
-    Raises
-    ------
-    InputError
-        The end of the file is no beginning of such a line: it is not `what`.
+    A last line that is torn, as it was being written, begins with `begins`. Raises InputError if the end of
+    the file is no beginning of such a line: it is not `what`.
     """
     if not path.exists():
         return 0
@@ -36,52 +33,100 @@ def whole_size(path: Path, begins: bytes, what: str) -> int:
     return size - len(torn)
 
 
-def whole_lines(path: Path, size: int) -> Iterator[bytes]:
-    """The lines in the first `size` bytes of a file."""
-    if size:
+def whole_lines(path: Path, size: int, begin: int = 0) -> Iterator[bytes]:
+    """The lines in the first `size` bytes of a file, from one that begins at `begin`."""
+    if size > begin:
         with path.open("rb") as file:
+            file.seek(begin)
             while file.tell() < size:
                 yield file.readline()
 
 
+def write_line(handle: int, path: Path, line: str) -> None:
+    """Write a whole line to what is open by a handle; an OSError names its path."""
+    rest = memoryview(line.encode() + b"\n")
+    try:
+        while rest:
+            rest = rest[os.write(handle, rest) :]
+    except OSError as error:
+        raise OSError(error.errno, os.strerror(error.errno or 0), str(path)) from error
+
+
+class LineFile:
+    """A file of lines that this process alone may write."""
+
+    def __init__(self, path: Path, handle: int) -> None:
+        self.path, self._handle = path, handle
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file."""
+        return os.fstat(self._handle).st_size
+
+    @property
+    def is_in_place(self) -> bool:
+        """False if the file was removed or replaced since it was opened."""
+        with suppress(FileNotFoundError):
+            return os.path.samestat(os.fstat(self._handle), self.path.stat())
+        return False
+
+    def cut(self, size: int) -> None:
+        """Keep the first `size` bytes."""
+        os.ftruncate(self._handle, size)
+
+    def append(self, line: str) -> None:
+        """Append a line at once; one that does not fit on the disk is taken back, the others stay whole."""
+        begin = self.size
+        try:
+            write_line(self._handle, self.path, line)
+            os.fsync(self._handle)
+        except OSError:
+            self.cut(begin)
+            raise
+
+    def rearrange(self, spans: Sequence[tuple[int, int]]) -> None:
+        """Keep only these spans of bytes (begin, end), in this order; nobody sees a file between the two."""
+        edges = [0, *(edge for span in spans for edge in span), self.size]
+        if edges[::2] == edges[1::2]:
+            return
+        with replacing(self.path) as file:
+            for begin, end in spans:
+                file.write(os.pread(self._handle, end - begin, begin))
+
+
 @contextmanager
-def appending(path: Path, size: int | None) -> Iterator[Callable[[str], None]]:
-    """A function that appends one line at once, to a file that is made or first cut to `size` bytes.
+def locked(path: Path) -> Iterator[LineFile]:
+    """A file of lines, made if there is none, and then removed at the end if nothing is in it.
 
-    It should have its whole lines within `size`; None begins it anew, whatever is in it.
-
-    A line that does not fit on the disk is taken back: the lines before stay whole.
-
-    Raises
-    ------
-    InputError
-        Another process is writing the file, or has since it was read.
-    OSError
-        The file can't be written.
+    Raises InputError if another process is writing the file.
     """
     is_new = not path.exists()
-    handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
-    try:
+    with path.open("a+b", buffering=0) as stream:
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(stream.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise InputError(f"{path}: another process is writing it; wait for its end") from error
-        if size is not None and b"\n" in os.pread(handle, os.fstat(handle).st_size, size):
-            raise InputError(f"{path}: another process has written it since; start again")
-        os.ftruncate(handle, size or 0)
-
-        def append(line: str) -> None:
-            begin, rest = os.fstat(handle).st_size, memoryview(line.encode() + b"\n")
+        file = LineFile(path, stream.fileno())
+        if file.is_in_place:
             try:
-                while rest:
-                    rest = rest[os.write(handle, rest) :]
-                os.fsync(handle)
-            except OSError as error:
-                os.ftruncate(handle, begin)
-                raise OSError(error.errno, os.strerror(error.errno or 0), str(path)) from error
+                yield file
+            finally:
+                if is_new and file.size == 0 and file.is_in_place:
+                    path.resolve().unlink()
+            return
+    with locked(path) as file:  # as it was removed or replaced by whoever had the lock before
+        yield file
 
-        yield append
-        if is_new and os.fstat(handle).st_size == 0:
-            path.resolve().unlink()
-    finally:
-        os.close(handle)
+
+@contextmanager
+def appending(path: Path, size: int | None) -> Iterator[Callable[[str], None]]:
+    """A function that appends a line to the first `size` bytes of a file, its whole lines; None keeps none.
+
+    Raises InputError if another process is writing the file, or has since it was read.
+    """
+    with locked(path) as file:
+        rest = () if size is None else whole_lines(path, file.size, size)
+        if file.size < (size or 0) or any(line.endswith(b"\n") for line in rest):
+            raise InputError(f"{path}: another process has written it since; start again")
+        file.cut(size or 0)
+        yield file.append

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import InputError
+from ..errors import InputError, ResourceError
 
 GB = 1e9
 DEFAULT_FRACTION = 0.8  # of what is free, where the user sets no limit
@@ -39,7 +39,7 @@ def check_memory(num_bytes: float, purpose: str, advice: str) -> None:
     room = memory_left()
     if num_bytes > room:
         left = f"{max(room, 0.0) / GB:.2g} GB may be taken"
-        raise InputError(
+        raise ResourceError(
             f"{purpose} needs {num_bytes / GB:.2g} GB of memory, {left}; {advice}, or raise --max-memory"
         )
 

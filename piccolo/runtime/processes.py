@@ -25,6 +25,7 @@ from .tasks import Function, InFlight, Opening, WorkerLostError
 ATTEMPTS = 2  # to work on an item, or to open
 IN_FLIGHT = 4  # items a process, so that none waits for a slow one before
 PARENT_LOST = 1  # exit code
+GRACE = 10.0  # [s] for a process that has closed its pipe to end
 # Not fork: the child would have the threads of this process stand still in the middle of their work.
 CONTEXT = multiprocessing.get_context("spawn")
 SIGNALS = {signal.SIGINT, signal.SIGTERM}  # are for this process, which ends the others
@@ -121,12 +122,14 @@ class Processes:
             if self._is_closed:
                 raise CancelledError
             self._workers.remove(worker)
-            self._own.worker = None
-            return _bury(worker)
+        self._own.worker = None
+        return _bury(worker)
 
 
 def _bury(worker: Worker) -> str:
     worker.connection.close()
+    worker.process.join(GRACE)
+    worker.process.kill()  # where it hangs in its exit
     worker.process.join()
     code = worker.process.exitcode or 0
     return f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"

@@ -6,8 +6,9 @@ function needs, a scan for example, and returns the function.
 
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
+from functools import partial
 from typing import Any, Protocol
 
 Function = Callable[[Any], Any]  # of an item
@@ -18,21 +19,12 @@ class WorkerLostError(Exception):
     """The processes at work on an item were killed, as often as it was tried; the text says how."""
 
 
-class Pending(Protocol):
-    """The value of an item, which may not be there yet."""
-
-    def result(self) -> Any:
-        """Wait for the value; or for what the function raised, or WorkerLostError, which are raised."""
-
-    def done(self) -> bool:
-        """True if `result` does not wait."""
-
-
-Pair = tuple[Any, Pending]  # an item with its value
+# an item, and what waits for its value; or for what the function raised, or WorkerLostError, and raises it
+Pair = tuple[Any, Callable[[], Any]]
 
 
 class Values(Protocol):
-    """Items with what is pending of them, in the items' order."""
+    """Items with what waits for their values, in the items' order."""
 
     def __iter__(self) -> Iterator[Pair]:
         """Each, begun as soon as there is an item and room for it."""
@@ -48,41 +40,19 @@ class Executor(Protocol):
         """Begin with the items."""
 
 
-class Deferred:
-    """A value that is computed when it is asked for."""
-
-    def __init__(self, function: Function, item: object) -> None:
-        self.function, self.item = function, item
-
-    def result(self) -> Any:
-        """Compute it."""
-        return self.function(self.item)
-
-    def done(self) -> bool:
-        """It never is."""
-        return False
-
-
 class Here:
     """Works on one item after another in this process, on each when its value is asked for."""
 
-    def __init__(self, function: Function) -> None:
-        self.function = function
-
-    def values(self, items: Iterator[Any]) -> "DeferredValues":
-        """Begin with the items."""
-        return DeferredValues(self.function, items)
-
-
-class DeferredValues:
-    """Values of items that are taken and worked on when they are asked for."""
-
-    def __init__(self, function: Function, items: Iterator[Any]) -> None:
+    def __init__(self, function: Function, items: Iterable[Any] = ()) -> None:
         self.function, self.items = function, items
 
+    def values(self, items: Iterator[Any]) -> "Here":
+        """Begin with the items."""
+        return Here(self.function, items)
+
     def __iter__(self) -> Iterator[Pair]:
-        """Each of them."""
-        return ((item, Deferred(self.function, item)) for item in self.items)
+        """Each, taken when it is asked for."""
+        return ((item, partial(self.function, item)) for item in self.items)
 
     def finished(self) -> Iterator[Pair]:
         """There are none."""
@@ -96,10 +66,10 @@ class InFlight:
     keeps nobody from the values before it.
     """
 
-    def __init__(self, submit: Callable[[Any], Pending], items: Iterator[Any], limit: int) -> None:
+    def __init__(self, submit: Callable[[Any], Any], items: Iterator[Any], limit: int) -> None:
         self._submit, self._items = submit, items
         self._room, self._begun = threading.Semaphore(limit), threading.Semaphore(0)
-        self._pairs = deque[Pair | None]()  # None is the end
+        self._pairs = deque[tuple[Any, Any] | None]()  # an item and its future; None is the end
         threading.Thread(target=self._feed, daemon=True).start()
 
     def _feed(self) -> None:
@@ -113,18 +83,18 @@ class InFlight:
             self._put((None, failed))
         self._put(None)
 
-    def _put(self, pair: Pair | None) -> None:
+    def _put(self, pair: tuple[Any, Any] | None) -> None:
         self._pairs.append(pair)
         self._begun.release()
 
     def __iter__(self) -> Iterator[Pair]:
         """Each, begun as soon as there is an item and room for it."""
         while self._begun.acquire() and (pair := self._pairs.popleft()) is not None:
-            yield pair
+            yield pair[0], pair[1].result
             self._room.release()
 
     def finished(self) -> Iterator[Pair]:
         """What is done already of those that come next."""
         while self._pairs and (pair := self._pairs[0]) is not None and pair[1].done():
             self._pairs.popleft()
-            yield pair
+            yield pair[0], pair[1].result

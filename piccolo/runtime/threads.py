@@ -8,12 +8,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from numpy.typing import NDArray
-
 from ..errors import InputError
 from .memory import check_address_space
 from .once import Once
-from .unfinished import Arrays, Unfinished
 
 Item = TypeVar("Item")
 Value = TypeVar("Value")
@@ -56,7 +53,11 @@ def pool_of(num_threads: int) -> Iterator[ThreadPoolExecutor]:
     try:
         yield pool
     finally:
-        idle.append(pool)
+        # after a burst of callers only so many go on, as each thread's scratch may be 0.2 GB
+        if (len(idle) + 1) * num_threads <= 2 * max(num_cores(), num_threads):
+            idle.append(pool)
+        else:
+            pool.shutdown(wait=False)
 
 
 # wraps values as tqdm does: how many there will be, None if unknown, and what they are
@@ -94,7 +95,6 @@ class Workers:
     num_threads: int = 1
     show: Progress = no_progress  # progress
     warn: Callable[[str], None] = ignore_warning  # of what should be known before the work is done
-    work: Unfinished | None = None  # keeps what `collect` has done; None keeps nothing
 
     def __post_init__(self) -> None:
         """Refuse a count that means nothing."""
@@ -137,20 +137,3 @@ class Workers:
                 for future in futures:
                     future.cancel()
                 wait(futures)
-
-    def collect(
-        self,
-        function: Callable[[Item], Arrays],
-        items: Sequence[Item],
-        label: str,
-        *about: NDArray[Any],
-    ) -> list[Arrays]:
-        """The arrays that a function makes of each item, in order; what a killed process did stays done.
-
-        What the function depends on, beside the items and the key of `work`, is told by label and arrays.
-        """
-        stage = (self.work or Unfinished()).stage(label, about)
-        stage.read()
-        for arrays in self.map(function, items[len(stage.done) :], label):
-            stage.add(arrays)
-        return stage.done

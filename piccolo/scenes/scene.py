@@ -104,8 +104,9 @@ def _query(folder: Path, number: int, entry: dict[str, Any]) -> Query:
     fields = ("image", "variant", "R_cam_from_world", "center_world")
     if not isinstance(entry, dict) or not all(name in entry for name in fields):
         raise ValueError(f"queries[{number}] without one of {', '.join(fields)}")
-    texts = [entry[name] for name in ("image", "variant", "labels") if entry.get(name) is not None]
-    if not all(isinstance(text, str) and text.isprintable() for text in texts) or len(texts) < 2:
+    names = [entry["image"], entry.get("labels") or ""]
+    is_plain = isinstance(entry["variant"], str) and entry["variant"].isprintable()
+    if not is_plain or not all(isinstance(name, str) and "\0" not in name for name in names):
         raise ValueError(f"queries[{number}] with an image, a variant or labels that are no plain text")
     R_cam_from_world = np.array(entry["R_cam_from_world"], float)
     center_world = np.array(entry["center_world"], float)

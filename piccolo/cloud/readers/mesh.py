@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.pose import Array
+from ..settings import UpAxis
 from .columns import BRIGHTEST
 from .mesh_gltf import GLB_MAGIC, NO_MATERIAL
 from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply
@@ -68,7 +69,8 @@ def _source(loaded: Loaded, scale: float) -> PointSource:
         density = f"{num_points / area:.3g} points on each instead of {DENSITY:.0f}"
         notes.append(f"{path}: {area:.3g} square metres of surface, sampled with {density}")
     read_chunks = partial(sample_points, instances, ends, num_points)
-    return PointSource(path, read_chunks, num_points, tuple(notes))
+    up: UpAxis = "z" if loaded.materials is None else "y"  # by the specification of glTF
+    return PointSource(path, read_chunks, num_points, tuple(notes), up=up)
 
 
 def _instances(loaded: Loaded) -> tuple[list[SurfaceInstance], list[str]]:

@@ -30,6 +30,11 @@ LIBRARY_LINE = re.compile(rb"^[ \t]*mtllib[ \t]+(.*?)[ \t\r]*$", re.MULTILINE)
 TEXTURE_LINE = re.compile(r"^[ \t]*map_Kd[ \t]+(.*?)[ \t\r]*$", re.MULTILINE | re.IGNORECASE)
 TEXTURE_COMMENT = re.compile(r"TextureFile[ \t]*(.*?)[ \t\r]*$", re.MULTILINE | re.IGNORECASE)
 
+# Once, here: the filters are of the process, and no thread may change them.
+# NumPy before 2.3 only warned where it stopped at what is no number.
+warnings.filterwarnings("ignore", module=r"trimesh\.")
+warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
+
 
 @dataclass(frozen=True)
 class Loaded:
@@ -97,7 +102,7 @@ def _with_raw_colors(parsed: dict[str, Any]) -> dict[str, Any]:
 def _scene(resolver: FolderResolver, content: bytes, kind: str, has_texture: bool = True) -> Any:
     trimesh = import_optional(resolver.path, "trimesh")
     try:
-        with own_limit(), _strict():
+        with own_limit(), _quiet():
             # vertices are split by texture coordinates only if there is a texture: colours go by vertices
             options = {"fix_texture": has_texture} if kind == "ply" else {}
             load = trimesh.exchange.load.mesh_loaders[kind]
@@ -115,18 +120,15 @@ def _scene(resolver: FolderResolver, content: bytes, kind: str, has_texture: boo
 
 
 @contextmanager
-def _strict() -> Iterator[None]:
-    """Make an error of NumPy's warning that it stopped at what is no number; keep trimesh from printing."""
+def _quiet() -> Iterator[None]:
+    """Keep trimesh from printing."""
     logger = logging.getLogger("trimesh")
     level = logger.level
     logger.setLevel(logging.CRITICAL + 1)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
-        try:
-            yield
-        finally:
-            logger.setLevel(level)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def load_ply(path: Path) -> Loaded:

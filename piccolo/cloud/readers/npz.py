@@ -6,7 +6,6 @@ column), is read whole, after the size that it promises has been compared with t
 
 import errno
 import math
-import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -15,16 +14,15 @@ from pathlib import Path
 from typing import IO, Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from ...errors import InputError
+from ...runtime.array_archive import MAX_HEAD_SIZE, read_header
 from .columns import BRIGHTEST, brightest_of, colored_chunks, in_chunks, read_records
 from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, point_label, quoted
 
 NPY_MAGIC, ZIP_MAGIC = b"\x93NUMPY", b"PK\x03\x04"
 ZIP_NAME_AT = 30  # [byte] in an archive: the name of its first member
-MAX_HEADER_SIZE = 4096  # [byte] of an array's header
 MAX_RATIO = 200  # unpacked to packed; real scans stay below 10, deflate could reach 1032
 MAX_UNPACKED = 1 << 34  # [byte] of an archive's arrays, which are read whole
 POINTS_NAMES, COLORS_NAMES = ("points", "xyz"), ("colors", "rgb")
@@ -136,14 +134,8 @@ def _members(path: Path) -> list[zipfile.ZipInfo]:
 
 def _open_array(path: Path, member: str | None, size: int) -> ArrayInFile:
     """The array in a file or member of `size` bytes, by its header."""
-    with damage_named(path), _open(path, member) as file, warnings.catch_warnings():
-        warnings.simplefilter("error")  # NumPy warns of headers that it had to mend
-        version = npy.read_magic(file)
-        readers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
-        if version not in readers:
-            raise InputError(f"{path}: an array of version {version[0]}.{version[1]}, wanted 1.0 or 2.0")
-        shape, is_fortran, dtype = readers[version](file, max_header_size=MAX_HEADER_SIZE)
-        offset = file.tell()
+    with damage_named(path), _open(path, member) as file:
+        shape, is_fortran, dtype, offset = read_header(file.read(MAX_HEAD_SIZE))
     array = ArrayInFile(path, member, shape, is_fortran, dtype, offset)
     if dtype.hasobject or dtype.itemsize == 0 or any(count < 0 for count in shape):
         raise InputError(f"{path}: {array}, {WANTED}")

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..label_colors import Labels
+from ..settings import UpAxis
 
 HEAD_SIZE = 512  # [byte] by which a format is known
 CHUNK = 1 << 20  # points of a chunk, at most
@@ -50,6 +51,7 @@ class PointSource(NamedTuple):
     station_axes: tuple[
         NDArray[np.float64], ...
     ] = ()  # (3,) unit, in the file's axes: z of scanners with poses
+    up: UpAxis = "z"  # the axis that points up by the format's specification or by convention
 
 
 class CloudFormat(NamedTuple):

@@ -79,6 +79,7 @@ def _renamed(row: dict[str, str]) -> dict[str, str]:
     w = inverse["qw"]
     inverse["qw"] = w[1:] if w.startswith("-") else f"-{w}"
     position = {f"t{letter}": row.get(letter, "") for letter in "xyz"}
+    position["image"] = row.get("image", "").removeprefix("'")  # as of export's `cell`
     return {**row, **inverse, **position, "direction": WORLD_FROM_CAM, "axes": "piccolo", "cloud": ""}
 
 

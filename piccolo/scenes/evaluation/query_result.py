@@ -2,14 +2,14 @@
 
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from ...errors import InputError
+from ...errors import InputError, printable
 from ...geometry.pose import MAX_ANGLE, MAX_DISTANCE, Array, Pose, pose_errors
 from ...result import Result
 from ...runtime.json_file import document_of
@@ -111,26 +111,30 @@ def frames_of_video(pairs: Sequence[tuple[Scene, Query]], pano: str) -> list[tup
     ]
 
 
-def match_results(scenes: Sequence[Scene], results: Sequence[Result]) -> Iterator[QueryResult]:
+def match_results(
+    scenes: Sequence[Scene], results: Sequence[Result], tell: Callable[[str], object]
+) -> Iterator[QueryResult]:
     """Results of localize.py with their errors; each belongs to the query whose image it names.
 
     The image is found by its path, or else by its file name if only one query has that. A frame of a video,
     FOLDER/WALK.mp4#t=SECONDS, is the query of the walk of that name and time.
 
-    Raises InputError if a result belongs to no query, or its name to several.
+    A result of no query, or of a name that several have, is told of and left out. Raises InputError for a
+    second result of a query.
     """
     pairs = [(scene, query) for scene in scenes for query in scene.queries]
     queries = [(*pair, path) for pair in pairs for path in (pair[1].image, pair[1].labels) if path]
     by_path = {path.resolve(): (scene, query) for scene, query, path in queries}
     done: set[tuple[str, str]] = set()
     for result in results:
-        found = by_path.get(Path(result.pano).resolve())
+        found = by_path.get(Path(printable(result.pano)).resolve())  # queries have printable names
         named = [(scene, query) for scene, query, path in queries if path.name == Path(result.pano).name]
         named += frames_of_video(pairs, result.pano)
         if found is None and len(named) != 1:
             names = sorted(path.name for _, _, path in queries)[:3]
             text = f"{len(named)} queries of this name" if named else "a result without a true pose"
-            raise InputError(f"{result.pano}: found {text}, wanted one of {names} ...")
+            tell(f"{result.pano}: found {text}, wanted one of {names} ...")
+            continue
         row = query_result_of(*(found or named[0]), result, None)
         if row.key in done:
             raise InputError(f"{result.pano}: found a second result of this panorama, wanted one")

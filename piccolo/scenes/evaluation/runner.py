@@ -5,18 +5,13 @@ A run on disk is one JSON line a query, flushed as it comes, so that a stopped r
 
 import json
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from ...cloud.settings import CloudSettings
-from ...coarse_to_fine.open_map import CachePolicy
-from ...coarse_to_fine.settings import CoarseToFineSettings
+from ...batch.localizer import Localizer, Task
 from ...errors import InputError
-from ...opening import open_files
-from ...panorama import ReadOptions
-from ...paper.settings import PaperSettings
-from ...result import named, unreadable_result
+from ...result import UNREADABLE, failure_of
 from ...runtime.atomic import check_output
 from ...runtime.json_file import parse_lines, read_bytes
 from ...runtime.line_file import appending, whole_size
@@ -30,23 +25,6 @@ QUERIES_PER_JOB = 8  # so that several processes can share a scene, and little i
 WANTED = "wanted a run of tools/evaluate.py"
 LINE_BEGINS = f'{{"format": "{FORMAT}"'.encode()
 MAX_DIFFERENCE = 1e-6  # [m], [rad] between errors of the same poses
-
-
-@dataclass(frozen=True)
-class RunConfig:
-    """How queries are localized; pickled for other processes."""
-
-    settings: CoarseToFineSettings | PaperSettings
-    cloud_settings: CloudSettings
-    read_options: ReadOptions
-    cache: CachePolicy
-    num_threads: int  # of each process
-    folder: Path = Path()  # which paths are relative to
-
-    def opened(self) -> Callable[["Job"], tuple["QueryResult | Failure", ...]]:
-        """What runs jobs in this process, each as a whole."""
-        runner = JobRunner(self)
-        return lambda job: tuple(runner(job))
 
 
 class Job(NamedTuple):
@@ -77,48 +55,45 @@ def jobs_of(scenes: Sequence[Scene], done: Collection[tuple[str, str]], variants
 class JobRunner:
     """Runs jobs in one process; the scan of the last one stays open for the next."""
 
-    def __init__(self, config: RunConfig, show: Progress = no_progress) -> None:
+    def __init__(self, config: Localizer, show: Progress = no_progress) -> None:
         self.config, self.workers = config, Workers(config.num_threads, show)
-        self._opened: tuple[Path, Scan] | None = None
+        self._opened: tuple[Localizer, Scan] | None = None
 
     def __call__(self, job: Job) -> Iterator[QueryResult | Failure]:
         """The results of a job as they come; a Failure for what can't be read."""
-        scene = job.scene
         try:
-            scan = self._scan_of(scene.cloud)
-        except (OSError, InputError) as error:
-            yield Failure(f"{scene.name}: {error}", len(job.queries))
+            localizer, scan = self._open(job.scene.cloud)
+        except Exception as error:
+            yield Failure(f"{job.scene.name}: {failure_of(error).text}", len(job.queries))
             return
         for query in job.queries:
-            try:
-                yield self._result_of(scan, scene, query)
-            except (OSError, InputError) as error:
-                is_refused = isinstance(error, InputError) and not query.is_answerable
-                yield self._refused(scene, query, str(error)) if is_refused else Failure(str(error), 1)
+            yield self._result_of(localizer, scan, job.scene, query)
 
-    def _refused(self, scene: Scene, query: Query, error: str) -> QueryResult:
-        """That a picture which has no answer could not be used."""
-        config = self.config
-        settings = settings_json(config.settings, config.cloud_settings, config.read_options)
-        result = unreadable_result(error, str(scene.cloud), str(query.image), settings=settings)
-        return query_result_of(scene, query, result, None)
-
-    def _scan_of(self, cloud: Path) -> Scan:
-        if self._opened is None or self._opened[0] != cloud:
+    def _open(self, cloud: Path) -> tuple[Localizer, Scan]:
+        if self._opened is None or self._opened[0].paths != (cloud,):
             self._opened = None  # before the next is opened: two may not fit
-            config, paths = self.config, [self.config.folder / cloud]
-            scan = open_files(paths, config.cloud_settings, config.settings, config.cache, self.workers)
-            self._opened = cloud, replace(scan, name=str(cloud))
-        return self._opened[1]
+            localizer = replace(self.config, paths=(cloud,))
+            self._opened = localizer, localizer.open_scan(self.workers)
+        return self._opened
 
-    def _result_of(self, scan: Scan, scene: Scene, query: Query) -> QueryResult:
-        options, camera = self.config.read_options, query.calibration
-        image = query.labels if options.labels else query.image
+    def _result_of(
+        self, localizer: Localizer, scan: Scan, scene: Scene, query: Query
+    ) -> QueryResult | Failure:
+        image = query.labels if localizer.read_options.labels else query.image
         if image is None:
-            raise InputError(f"{scene.folder}: {scene.name_of(query)} has no labels in queries.json")
-        path = self.config.folder / image
-        result = scan.localize_query(path, options, self.config.settings, calibration=camera)
-        return query_result_of(scene, query, named(result, path, image), is_in_box(scan, query.pose))
+            return Failure(f"{scene.folder}: {scene.name_of(query)} has no labels in queries.json", 1)
+        task = Task(image, localizer.settings, calibration=query.calibration)
+        result = localizer.answer(scan, task).result
+        if result.error is None:
+            return query_result_of(scene, query, result, is_in_box(scan, query.pose))
+        is_refused = result.status == UNREADABLE and not query.is_answerable
+        return query_result_of(scene, query, result, None) if is_refused else Failure(result.error, 1)
+
+
+def opened(config: Localizer) -> Callable[[Job], tuple[QueryResult | Failure, ...]]:
+    """Return a function that runs a job as a whole in this process."""
+    runner = JobRunner(config)
+    return lambda job: tuple(runner(job))
 
 
 def run(executor: Executor, jobs: Sequence[Job]) -> Iterator[QueryResult | Failure]:
@@ -127,9 +102,9 @@ def run(executor: Executor, jobs: Sequence[Job]) -> Iterator[QueryResult | Failu
     Of a job whose processes were killed, each query is tried by itself, after all others.
     """
     alone: list[Job] = []
-    for job, pending in executor.values(iter(jobs)):
+    for job, wait in executor.values(iter(jobs)):
         try:
-            yield from pending.result()
+            yield from wait()
         except WorkerLostError as error:
             if len(job.queries) == 1:
                 yield Failure(f"{job.queries[0].image}: {error}", 1)
@@ -154,7 +129,7 @@ class Run(NamedTuple):
     """A run over scenes: the queries that are done, and those that are left."""
 
     path: Path
-    config: RunConfig
+    config: Localizer  # of any scan
     rows: tuple[QueryResult, ...]  # of these scenes and variants, that are done
     jobs: tuple[Job, ...]  # that are left
     size: int  # of the file, up to its last whole line [byte]
@@ -182,7 +157,7 @@ class Run(NamedTuple):
         return rows, num_failed
 
 
-def open_run(path: Path, config: RunConfig, scenes: Sequence[Scene], variants: Sequence[str]) -> Run:
+def open_run(path: Path, config: Localizer, scenes: Sequence[Scene], variants: Sequence[str]) -> Run:
     """Resume a run, or begin one; no variants stands for all.
 
     Raises InputError if the file can't be written, holds something else, or rows made with other settings.

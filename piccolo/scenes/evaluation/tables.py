@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...confidence.confidence import LOCALIZED
+from ...errors import printable
+from ..export.formats import cell
 from .query_result import PAPER_THRESHOLDS, QueryResult, Thresholds
 
 HUGE = 1e30  # stands for an error without a pose while quartiles are interpolated
@@ -110,7 +112,7 @@ def per_query(rows: Sequence[QueryResult]) -> Table:
         score = (f"{evidence.score:.2f}", f"{evidence.margin:.2f}") if evidence else ("-", "-")
         errors = f"{row.position_error:.4f}", f"{np.degrees(row.rotation_error):.3f}"
         loss = "-" if result.loss is None else f"{result.loss:.3f}"
-        words = row.scene, row.image, result.status
+        words = row.scene, printable(row.image), result.status
         cells.append((*words, *errors, f"{result.confidence:.3f}", *score, loss, f"{row.seconds:.2f}"))
     return Table("", (*columns, "loss", "seconds"), tuple(cells), 3)
 
@@ -170,7 +172,7 @@ def csv_text(rows: Sequence[QueryResult]) -> str:
         errors = (row.position_error, float(np.degrees(row.rotation_error))) if row.has_errors else ("", "")
         box = "" if row.is_in_box is None else str(row.is_in_box).lower()
         status = row.result.status, row.result.confidence
-        words = row.scene, row.image, row.variant, box
+        words = cell(row.scene), cell(printable(row.image)), cell(row.variant), box
         writer.writerow((*words, *status, *errors, row.result.loss, round(row.seconds, 4)))
     return file.getvalue()
 
@@ -201,7 +203,7 @@ def changes(pairs: Sequence[Pair], thresholds: Thresholds) -> Table:
         was, is_now = first.is_correct(thresholds), second.is_correct(thresholds)
         if was != is_now or first.result.status != second.result.status:
             kind = "same error" if was == is_now else "better" if is_now else "worse"
-            rows.append((first.scene, first.image, kind, _outcome(first), _outcome(second)))
+            rows.append((first.scene, printable(first.image), kind, _outcome(first), _outcome(second)))
     columns = "scene", "panorama", "second is", "first", "second"
     return Table("queries that changed", columns, tuple(rows), 5)
 

@@ -8,7 +8,7 @@ from ...result import Result
 from ...runtime.atomic import check_output, check_output_folder
 from .formats import COLMAP, CSV, KITTI, NERFSTUDIO, OPENSFM, POTREE, TUM
 from .gpano import GPANO
-from .posed_images import Format, Options, Selection, posed_images, select, true_results
+from .posed_images import Format, LeftOut, Options, Selection, posed_images, select, true_results
 from .world_maps import GEOJSON, GPX
 
 __all__ = ["FORMATS", "Format", "Options", "Selection", "export", "select", "true_results"]
@@ -17,11 +17,11 @@ _ALL = COLMAP, NERFSTUDIO, OPENSFM, TUM, KITTI, CSV, GEOJSON, GPX, POTREE, GPANO
 FORMATS: dict[str, Format] = {form.name: form for form in _ALL}
 
 
-def export(results: Sequence[Result], name: str, out: Path, options: Options) -> None:
+def export(results: Sequence[Result], name: str, out: Path, options: Options) -> LeftOut:
     """Write the poses of `results`, which all have one, to `out` in the format `name`, whole or not at all.
 
-    Raises InputError if there is no pose, the format can't say what a result says, a picture can't be read,
-    or `out` can't be written.
+    Returns the pictures that are left out, by why: the format can't hold them, or they can't be read.
+    Raises InputError if no pose is left, or `out` can't be written.
     """
     form = FORMATS[name]
     if form.is_folder:
@@ -30,4 +30,6 @@ def export(results: Sequence[Result], name: str, out: Path, options: Options) ->
         check_output(out)
     if not results:
         raise InputError(f"{out}: there is no pose to write; --all also writes those that are not localized")
-    form.write(posed_images(results, form, options), out, options)
+    images, left_out = posed_images(results, form, options)
+    form.write(images, out, options)
+    return left_out

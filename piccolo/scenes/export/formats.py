@@ -24,7 +24,7 @@ from ...geometry.rotations import (
     turned,
 )
 from ...runtime.atomic import is_stream, replacing_folder, write_atomically
-from .posed_images import Format, Options, PosedImage
+from .posed_images import NO_UTF8, Format, Options, PosedImage
 
 COLUMNS = (
     *("image", "cloud", "status", "confidence", "score", "x", "y", "z"),
@@ -63,15 +63,20 @@ def write_offset_beside(out: Path, options: Options) -> None:
         write_lines(offset_file(out), [*offset_comment(options), numbers(options.offset)])
 
 
+def cell(text: str) -> str:
+    """Text that no spreadsheet takes for a formula: after an apostrophe, which marks text there."""
+    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r", "'")) else text
+
+
 def write_csv(images: Sequence[PosedImage], out: Path, options: Options) -> None:
-    """Write a header and a row a result, in our own axes; what is not known is empty."""
+    """Write a header and a row a result, in our own axes; what is not known is empty, paths as of `cell`."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(COLUMNS)
     for image in images:
         result, pose = image.result, image.pose
         score = result.evidence.score if result.evidence else None
-        words = image.name, result.cloud_name, result.status, result.confidence, score
+        words = cell(image.name), cell(result.cloud_name), result.status, result.confidence, score
         wxyz = quaternion_wxyz(pose.R_cam_from_world).tolist()
         table.writerow([*words, *pose.center_world.tolist(), *wxyz, *heading_pitch_roll_deg(pose)])
     write_offset_beside(out, options)
@@ -191,8 +196,6 @@ def write_opensfm(images: Sequence[PosedImage], out: Path, options: Options) -> 
     cameras, shots = {}, {}
     for image in images:
         width, height = image.size
-        if width != 2 * height:
-            raise InputError(f"{image.path}: found {width} x {height}, wanted W = 2 H exactly for OpenSfM")
         camera = f"spherical {width} {height}"
         cameras[camera] = {"projection_type": "spherical", "width": width, "height": height}
         pose = turned(image.pose, OPTICAL_FROM_CAM)
@@ -200,6 +203,13 @@ def write_opensfm(images: Sequence[PosedImage], out: Path, options: Options) -> 
         shots[image.name] = {"rotation": rotation, "translation": t, "camera": camera}
     write_offset_beside(out, options)
     write_json(out, [{"cameras": cameras, "shots": shots, "points": {}}])
+
+
+def _check_shape(image: PosedImage) -> None:
+    """Refuse a sphere that OpenSfM can't take."""
+    width, height = image.size
+    if width != 2 * height:
+        raise InputError(f"{image.path}: found {width} x {height}, wanted W = 2 H exactly for OpenSfM")
 
 
 def write_json(out: Path, document: object) -> None:
@@ -211,12 +221,16 @@ OFFSET, MODEL = frozenset({"offset"}), frozenset({"size", "offset"})
 COLMAP_TEXT = "text model of COLMAP 4 and pycolmap; --out is a new folder"
 NERFSTUDIO_TEXT = "transforms.json of nerfstudio, in the folder that --images names"
 POTREE_TEXT = "coordinates.txt of Potree's 360 images, in the folder that --images names"
-COLMAP = Format("colmap", COLMAP_TEXT, write_colmap, MODEL, True, forbidden=" ", cameras="own")  # ends a name
+# a blank ends a name, for COLMAP as for the readers in Python
+COLMAP = Format("colmap", COLMAP_TEXT, write_colmap, MODEL, True, forbidden=rf"\s|{NO_UTF8}", cameras="own")
 NERFSTUDIO = Format("nerfstudio", NERFSTUDIO_TEXT, write_nerfstudio, MODEL, cameras="spheres")
-OPENSFM = Format("opensfm", "reconstruction.json of OpenSfM", write_opensfm, MODEL, cameras="spheres")
+OPENSFM_TEXT = "reconstruction.json of OpenSfM"
+OPENSFM = Format("opensfm", OPENSFM_TEXT, write_opensfm, MODEL, cameras="spheres", check=_check_shape)
 CSV = Format("csv", "table with a header", write_csv, OFFSET, has_unique_names=False)
-TUM = Format("tum", "trajectory for evo and others", write_tum, OFFSET | {"axes", "timestamps"})
-KITTI = Format("kitti", "trajectory for evo and others", write_kitti, OFFSET | {"axes"})
+TRAJECTORY = "trajectory for evo and others"
+TUM = Format("tum", TRAJECTORY, write_tum, OFFSET | {"axes", "timestamps"}, forbidden="")
+KITTI = Format("kitti", TRAJECTORY, write_kitti, OFFSET | {"axes"}, forbidden="")
+NOT_IN_POTREE = rf"[\"\t\n\r]|{NO_UTF8}"
 POTREE = Format(
-    "potree", POTREE_TEXT, write_potree, OFFSET | {"timestamps"}, forbidden='"', cameras="spheres"
+    "potree", POTREE_TEXT, write_potree, OFFSET | {"timestamps"}, forbidden=NOT_IN_POTREE, cameras="spheres"
 )

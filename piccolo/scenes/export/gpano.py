@@ -14,8 +14,9 @@ from typing import NamedTuple
 from ...errors import InputError
 from ...geometry.rotations import DECIMALS, heading_pitch_roll_deg
 from ...panorama.gpano import CROP_FIELDS, NAMESPACE, PREFIX
-from ...panorama.picture import opened
+from ...panorama.picture import WANTED, opened
 from ...runtime.atomic import replacing_folder, write_atomically
+from ...runtime.json_file import read_bytes
 from .posed_images import Format, Options, PosedImage, check_size
 
 JPEG_MAGIC = b"\xff\xd8"
@@ -55,10 +56,13 @@ def write(images: Sequence[PosedImage], out: Path, options: Options) -> None:
         raise InputError(f"{twice}: two pictures have this name; --images FOLDER tells them apart")
     with replacing_folder(out) as folder:
         for name, image in zip(names, images, strict=True):
-            angles = heading_pitch_roll_deg(image.pose)
-            copy = with_pose(image.path, image.path.read_bytes(), angles)
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(folder / name, copy)
+            write_atomically(folder / name, _copy(image))
+
+
+def _copy(image: PosedImage) -> bytes:
+    """The picture's file with its pose."""
+    return with_pose(image.path, read_bytes(image.path, WANTED), heading_pitch_roll_deg(image.pose))
 
 
 def with_pose(path: Path, data: bytes, angles_deg: tuple[float, float, float]) -> bytes:
@@ -151,4 +155,4 @@ def _with_fields(
 
 
 TEXT = "copies of the JPEGs with heading, pitch and roll as Photo Sphere XMP; --out is a new folder"
-GPANO = Format("gpano", TEXT, write, is_folder=True, cameras="spheres")
+GPANO = Format("gpano", TEXT, write, is_folder=True, forbidden="", cameras="spheres", check=_copy)

@@ -4,7 +4,7 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -13,7 +13,7 @@ import numpy as np
 
 from ...camera import Calibration, Camera, Mount
 from ...confidence.confidence import LOCALIZED
-from ...errors import InputError
+from ...errors import InputError, unreadable
 from ...geometry.pose import Pose
 from ...panorama import panorama_size
 from ...panorama.gpano import ASPECT_TOLERANCE
@@ -21,6 +21,8 @@ from ...result import Result
 from ..scene import Scene
 
 TIMESTAMP = re.compile(r"\d+(\.\d+)?")
+NO_UTF8 = "[\ud800-\udfff]"  # in a name
+LeftOut = dict[str, list[str]]  # names of pictures that a format can't hold, by why
 
 
 class PosedImage(NamedTuple):
@@ -63,7 +65,8 @@ class Format(NamedTuple):
     options: frozenset[str] = frozenset()  # names of the Options that it takes beside `images`
     is_folder: bool = False
     has_unique_names: bool = True  # the picture's name is the key
-    forbidden: str = ""  # regular expression of what a name can't have in it
+    forbidden: str = NO_UTF8  # regular expression of what a name can't have in it; empty for anything
+    check: Callable[[PosedImage], object] | None = None  # raises InputError for a picture that it can't hold
     cameras: Literal["any", "own", "spheres"] = "any"  # of photos: no matter, an image each, or not at all
 
 
@@ -81,9 +84,9 @@ class Selection(NamedTuple):
     left_out: dict[str, int]  # how many, by status or "without a pose"
 
     @property
-    def clouds(self) -> tuple[str, ...]:
-        """The clouds of the results, in order."""
-        return tuple(dict.fromkeys(result.cloud_name for result in self.results))
+    def clouds(self) -> Mapping[str, str]:
+        """Paths of the results' clouds, in order; clouds are one if their content is."""
+        return {result.source.cloud_sha256 or result.cloud_name: result.cloud_name for result in self.results}
 
 
 def true_results(scene: Scene) -> list[Result]:
@@ -114,26 +117,52 @@ def select(results: Sequence[Result], clouds: Sequence[str] = (), use_all: bool 
     return Selection(tuple(chosen), dict(left_out))
 
 
-def posed_images(results: Sequence[Result], form: Format, options: Options) -> list[PosedImage]:
-    """Pictures and poses by the names, times and offset that the options ask for."""
+def posed_images(
+    results: Sequence[Result], form: Format, options: Options
+) -> tuple[list[PosedImage], LeftOut]:
+    """Pictures and poses by the names, times and offset that the options ask for, and what is left out.
+
+    Raises InputError if all are left out, or a name that has to be unique is not.
+    """
     posed: dict[str, PosedImage] = {}
+    left_out: LeftOut = {}
     for index, result in enumerate(results):
-        for path, mount in _pictures(result, form):
-            image = _posed_image(result, path, mount, form, options)
-            if options.timestamps == "index":
-                image = image._replace(time=str(index))
-            elif options.timestamps == "walk":
-                if result.walk is None:
-                    raise InputError(f"{path}: found no frame of a walk, as --timestamps walk needs")
-                image = image._replace(time=repr(result.walk.time))
-            elif not TIMESTAMP.fullmatch(image.time):
-                raise InputError(f"{path}: its name {path.stem!r} is no number, as --timestamps name needs")
+        try:
+            images = _images_of(result, index, form, options)
+        except (OSError, InputError) as error:
+            reason = str(unreadable(Path(result.pano), error) if isinstance(error, OSError) else error)
+            reason = reason.replace(f"{result.pano}: ", "")
+            left_out.setdefault(reason, []).append(result.pano)
+            continue
+        for image in images:
             key = image.name if form.has_unique_names else str(index)
             if key in posed:
                 clouds = f"{posed[key].result.cloud_name}, {result.cloud_name}"
                 raise InputError(f"{key}: has two results (clouds {clouds}); --cloud chooses one")
             posed[key] = image
-    return list(posed.values())
+    if not posed:
+        reason, names = next(iter(left_out.items()))
+        raise InputError(f"{names[0]}: {reason}")
+    return list(posed.values()), left_out
+
+
+def _images_of(result: Result, index: int, form: Format, options: Options) -> list[PosedImage]:
+    """The pictures of a result, each as the format can hold it; InputError if it can't hold one."""
+    images = []
+    for path, mount in _pictures(result, form):
+        image = _posed_image(result, path, mount, form, options)
+        if options.timestamps == "index":
+            image = image._replace(time=str(index))
+        elif options.timestamps == "walk":
+            if result.walk is None:
+                raise InputError(f"{path}: found no frame of a walk, as --timestamps walk needs")
+            image = image._replace(time=repr(result.walk.time))
+        elif not TIMESTAMP.fullmatch(image.time):
+            raise InputError(f"{path}: its name {path.stem!r} is no number, as --timestamps name needs")
+        if form.check is not None:
+            form.check(image)
+        images.append(image)
+    return images
 
 
 def _pictures(result: Result, form: Format) -> list[tuple[Path, Mount | None]]:
@@ -160,7 +189,7 @@ def _posed_image(
         raise InputError(f"{path}: this result has no pose to write")
     name = _name(path, options.images)
     if form.forbidden and (found := re.search(form.forbidden, name)):
-        raise InputError(f"{name}: {form.name} can't read {found[0]!r} in a name: rename the picture")
+        raise InputError(f"{path}: {form.name} can't read {found[0]!r} in a name: rename the picture")
     pose = replace(pose, center_world=pose.center_world - np.array(options.offset or (0.0, 0.0, 0.0)))
     if mount is not None:
         size = mount.camera.width, mount.camera.height

@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ...errors import InputError
+from ...errors import InputError, printable
 from ...geometry.rotations import heading_pitch_roll_deg
 from ...runtime.atomic import write_atomically
 from ...runtime.optional import import_optional
@@ -40,7 +40,7 @@ def write_gpx(images: Sequence[PosedImage], out: Path, options: Options) -> None
         point = ElementTree.SubElement(segment, "trkpt", lat=repr(latitude), lon=repr(longitude))
         if taken := image.result.source.capture_time:
             ElementTree.SubElement(point, "time").text = taken
-        ElementTree.SubElement(point, "name").text = image.name
+        ElementTree.SubElement(point, "name").text = printable(image.name)
     write_atomically(out, ElementTree.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
 
 
@@ -103,4 +103,4 @@ def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[s
 GEOJSON_TEXT = "points for maps, in WGS84; needs --crs and the library pyproj"
 GEOJSON = Format("geojson", GEOJSON_TEXT, write_geojson, frozenset({"crs"}), has_unique_names=False)
 GPX_TEXT = "track of the positions in WGS84; needs --crs and the library pyproj"
-GPX = Format("gpx", GPX_TEXT, write_gpx, frozenset({"crs"}), has_unique_names=False)
+GPX = Format("gpx", GPX_TEXT, write_gpx, frozenset({"crs"}), has_unique_names=False, forbidden="")

@@ -11,7 +11,6 @@ import numpy as np
 
 from ...errors import InputError
 from ...geometry.pose import Array
-from .repeated import CORRIDOR_WIDTH
 from .room import WALL_THICKNESS, Door
 from .world import MAX_ROOMS, MAX_SIZE
 
@@ -20,6 +19,7 @@ MIN_ROOM = (2.6, 2.6, 2.3)  # [m]
 SLAB = 0.3  # between a ceiling and the next floor [m]
 BETWEEN = 2.0 * WALL_THICKNESS  # rooms [m]
 HALL_WIDTH, EAST_WIDTH, PASSAGE = 6.0, 4.0, 1.6  # halls, and the doors between them and corridors [m]
+CORRIDOR_WIDTH = 2.2  # [m]
 COLUMNS = 8  # rooms on each side of a corridor
 RISE, TREAD, FLIGHT_WIDTH, FLIGHT_BEGIN = 0.19, 0.28, 1.4, 1.3  # of stairs [m]
 

@@ -10,6 +10,7 @@ from ...errors import InputError
 from ...geometry.pose import Array
 from .floor_plan import (
     BETWEEN,
+    CORRIDOR_WIDTH,
     EAST_WIDTH,
     HALL_WIDTH,
     PASSAGE,
@@ -21,7 +22,6 @@ from .floor_plan import (
     place_of,
     plan_of,
 )
-from .repeated import CORRIDOR_WIDTH
 from .room import (
     DOOR_ROOM,
     PICTURE,

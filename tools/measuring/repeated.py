@@ -2,12 +2,23 @@
 
 import numpy as np
 
-from ...geometry.pose import Array
-from .room import PICTURE, PLAIN, PLANKS, TILES, WALL_THICKNESS, Room, RoomBuilder, make_room
+from piccolo.geometry.pose import Array
+from piccolo.scenes.synthetic.floor_plan import CORRIDOR_WIDTH
+from piccolo.scenes.synthetic.room import (
+    PICTURE,
+    PLAIN,
+    PLANKS,
+    TILES,
+    WALL_THICKNESS,
+    Room,
+    RoomBuilder,
+    make_room,
+)
 
 REPEATED_KINDS = ("twins", "hall", "corridor")
 GAP = 0.4  # between twins [m]
-NUM_DOORS, DOOR_DISTANCE, CORRIDOR_WIDTH = 6, 3.0, 2.2  # [m]
+NUM_DOORS = 6
+DOOR_DISTANCE = 3.0  # [m]
 
 
 def make_repeated(kind: str, seed: int, size: Array) -> tuple[Room, ...]:

@@ -1,4 +1,3 @@
-#!/usr/bin/env python3
 """The gain of each part of the default method: recall by variant with one part removed at a time."""
 
 import argparse
@@ -7,10 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import _checkout  # noqa: F401
 import numpy as np
 
-from piccolo.cli.command import command
 from piccolo.cloud import read_cloud
 from piccolo.cloud.stream import Cloud
 from piccolo.coarse_to_fine.candidate_views import SEARCH_VIEW
@@ -28,7 +25,7 @@ from piccolo.scenes.scene import Scene, read_scene
 
 EPILOG = """\
 example:
-  python tools/ablation.py BENCH/house BENCH/hospital
+  python tools/benchmark.py ablation BENCH/house BENCH/hospital
 
 A folder has cloud.ply, queries.json and images. Gravity is unknown for the variant tilt, else known;
 correct is under 0.1 m and 5 degrees. Seconds are medians of a query.
@@ -92,8 +89,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scenes", type=Path, nargs="+", metavar="FOLDER", help="scenes with true poses")
 
 
-@command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Print the table."""
     scenes = [(scene, read_cloud(scene.cloud)) for scene in map(read_scene, arguments.scenes)]
     print("| part | clean | tilt | photo | change | median mm | s |")
@@ -102,7 +98,3 @@ def main(arguments: argparse.Namespace) -> int:
     for part in PARTS:
         print(row(part, scenes), flush=True)
     return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -5,9 +5,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.sphere import pixel_rays, solid_angles
-from .room import PLAIN
-from .world import World, blur
+from piccolo.geometry.sphere import pixel_rays, solid_angles
+from piccolo.scenes.synthetic.room import PLAIN
+from piccolo.scenes.synthetic.world import World, blur
 
 Image = NDArray[np.uint8]
 LEAST_RADIUS, MOST_RADIUS = math.radians(8.0), math.radians(28.0)  # of an occluder

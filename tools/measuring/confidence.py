@@ -1,4 +1,3 @@
-#!/usr/bin/env python3
 """Measure the status on seeded queries with and without an answer: how often each is called localized."""
 
 import argparse
@@ -8,11 +7,10 @@ from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
-import _checkout  # noqa: F401
 import numpy as np
 from numpy.typing import NDArray
 
-from piccolo.cli.command import command, option
+from piccolo.cli.command import option
 from piccolo.cli.errors import print_note
 from piccolo.cloud import CloudStream, read_cloud, stream_of
 from piccolo.cloud.readers.reader import RawCloud
@@ -29,9 +27,6 @@ from piccolo.result import Result
 from piccolo.runtime.stopwatch import Stopwatch
 from piccolo.runtime.threads import Workers, num_cores
 from piccolo.scenes.scene import Scene, read_scene
-from piccolo.scenes.synthetic.alike import ALIKE_KINDS, CHANGED, make_alike
-from piccolo.scenes.synthetic.damage import occluded, outside_field, unevenly_lit, without_texture
-from piccolo.scenes.synthetic.repeated import REPEATED_KINDS, make_repeated
 from piccolo.scenes.synthetic.world import (
     VARIANTS,
     World,
@@ -42,9 +37,13 @@ from piccolo.scenes.synthetic.world import (
     scan_world,
 )
 
+from .alike import ALIKE_KINDS, CHANGED, make_alike
+from .damage import occluded, outside_field, unevenly_lit, without_texture
+from .repeated import REPEATED_KINDS, make_repeated
+
 EPILOG = """\
 example:
-  python tools/evaluate_confidence.py --seeds 0 0 --scenes BENCH/house BENCH/hospital --out bench.jsonl
+  python tools/benchmark.py confidence --seeds 0 0 --scenes BENCH/house BENCH/hospital --out bench.jsonl
 
 Seeds make rooms, and places that look the same from several positions; scenes are folders with cloud.ply,
 queries.json and images, each panorama tried in each cloud. A false answer is a pose called localized that is
@@ -248,8 +247,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--threads N", default=num_cores())
 
 
-@command(__file__, __doc__, EPILOG, add_arguments, "0 no false answer, 1 some")
-def main(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Localize every trial, write its line, print the table."""
     counts: dict[str, list[tuple[str, bool]]] = {}
     with arguments.out.open("w") as file:
@@ -263,7 +261,3 @@ def main(arguments: argparse.Namespace) -> int:
             file.flush()
             print_note(arguments, f"{scene}: {trial.case}: {result.status}, {'right' if ok else 'wrong'}")
     return 1 if print_table(counts) else 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

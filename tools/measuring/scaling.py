@@ -1,4 +1,3 @@
-#!/usr/bin/env python3
 """Time, memory and recall of the default method by the number of points and of rooms."""
 
 import argparse
@@ -11,10 +10,9 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import _checkout  # noqa: F401
 import numpy as np
 
-from piccolo.cli.command import command, option
+from piccolo.cli.command import option
 from piccolo.cli.errors import UsageError
 from piccolo.cloud import Cloud, read_cloud, stream_of
 from piccolo.cloud.readers.reader import RawCloud
@@ -32,8 +30,8 @@ from piccolo.scenes.synthetic.world import make_query, make_world, scan_world
 
 EPILOG = """\
 examples:
-  python tools/benchmark_scaling.py --scene BENCH/house --points 10000 100000 1000000
-  python tools/benchmark_scaling.py --rooms 1 4 16 64
+  python tools/benchmark.py scaling --scene BENCH/house --points 10000 100000 1000000
+  python tools/benchmark.py scaling --rooms 1 4 16 64
 
 --scene: a folder with cloud.ply, queries.json and images; more points than it has are made by repeating it
 with 5 mm noise, fewer by leaving some out. --rooms: rooms of tools/make_room.py, 50,000 points each.
@@ -129,8 +127,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--rooms N ...", "1 to 256", default=[])
 
 
-@command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Print the table, each row measured in a process of its own."""
     if bool(arguments.scene) != bool(arguments.points) or not (arguments.points or arguments.rooms):
         raise UsageError("wanted --scene with --points, or --rooms")
@@ -148,7 +145,3 @@ def main(arguments: argparse.Namespace) -> int:
             raise ChildProcessError(f"{label}: failed, see above")
         print(results.get(), flush=True)
     return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

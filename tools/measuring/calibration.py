@@ -1,4 +1,3 @@
-#!/usr/bin/env python3
 """Learn the confidence from trials, and check it, and the covariances, on others."""
 
 import argparse
@@ -7,13 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import _checkout  # noqa: F401
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
-from piccolo.cli.command import command, option
+from piccolo.cli.command import option
 from piccolo.confidence.confidence import (
     AMBIGUOUS,
     CLEAR_MATCHES,
@@ -35,9 +33,9 @@ from piccolo.runtime.json_file import parse_lines, read_bytes
 
 EPILOG = """\
 example:
-  python tools/calibrate_confidence.py --fit trials.jsonl --check others.jsonl bench.jsonl
+  python tools/benchmark.py calibration --fit trials.jsonl --check others.jsonl bench.jsonl
 
-Files are those of tools/evaluate_confidence.py. The weights printed go into
+Files are those of tools/benchmark.py confidence. The weights printed go into
 piccolo/confidence/confidence.py; the tables show how reliable the probabilities are on each set, by the model
 just learnt or else the one in use, and the fraction of true poses in the region of the covariance.
 """
@@ -63,13 +61,13 @@ class Outcome(NamedTuple):
 
 def read_outcomes(paths: Sequence[Path]) -> list[Outcome]:
     """The trials of some files that came to a pose."""
-    wanted = "wanted a file of tools/evaluate_confidence.py"
+    wanted = "wanted a file of tools/benchmark.py confidence"
     lines = [line for path in paths for line in parse_lines(path, read_bytes(path, wanted), outcome_of)]
     return [outcome for outcome in lines if outcome is not None]
 
 
 def outcome_of(line: str) -> Outcome | None:
-    """One line of tools/evaluate_confidence.py; None if no pose was found, or one without probabilities."""
+    """One line of tools/benchmark.py confidence; None if no pose was found, or one without probabilities."""
     trial = json.loads(line)
     result, truth = Result.from_json(json.dumps(trial["result"])), trial["truth"]
     if result.best_pose is None or result.evidence is None or result.probability_none is None:
@@ -175,8 +173,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--without CASE ...", "leave these cases out", default=[])
 
 
-@command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Fit the weights, print the tables."""
     sets = {"learnt from": read_outcomes(arguments.fit), "others": read_outcomes(arguments.check)}
     sets = {k: [o for o in rows if o.case not in arguments.without] for k, rows in sets.items()}
@@ -191,7 +188,3 @@ def main(arguments: argparse.Namespace) -> int:
             print_reliability(name, outcomes)
             print_coverage(name, outcomes)
     return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ...geometry.pose import Array
-from .room import (
+from piccolo.geometry.pose import Array
+from piccolo.scenes.synthetic.room import (
     CHECKS,
     PICTURE,
     PLAIN,

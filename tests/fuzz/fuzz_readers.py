@@ -1,0 +1,66 @@
+"""Fuzz a reader by coverage, with libFuzzer's options: fuzz_readers.py las CORPUS -max_total_time=60.
+
+A result or an InputError is right, else it is a finding. Without a corpus of small files little is reached.
+"""
+
+import sys
+import tempfile
+from pathlib import Path
+from types import FunctionType
+
+import atheris
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from piccolo.batch.priors import read_priors
+from piccolo.camera.files import read_cameras, read_rig
+from piccolo.cloud import FORMATS
+from piccolo.cloud.readers.reader import PLAIN
+from piccolo.coarse_to_fine.map_file import load_map
+from piccolo.coarse_to_fine.settings import Prior
+from piccolo.errors import InputError
+from piccolo.panorama import read_panorama
+from piccolo.panorama.photo import photo_of
+from piccolo.result import Result
+from piccolo.scenes.scene import read_scene
+
+READERS = {suffix[1:]: form.open_source for form in FORMATS for suffix in form.suffixes}
+OTHERS = {
+    "jpg": read_panorama,
+    "tif": photo_of,
+    "rig.json": read_rig,
+    "cameras.txt": read_cameras,
+    "map": load_map,
+    "csv": lambda path: read_priors(path, Prior()),
+    "scene.json": read_scene,
+    "jsonl": lambda path: Result.from_json(path.read_text()),
+}
+
+
+def read(name, path):
+    """Read a file as a whole, by the reader of that name; errors that users are meant to see pass."""
+    try:
+        if name in OTHERS:
+            OTHERS[name](path)
+        else:
+            for _ in READERS[name](path, PLAIN).read_chunks():
+                pass
+    except (InputError, OSError, UnicodeDecodeError):  # what commands turn into one line
+        return
+
+
+def main(name, flags):
+    """Fuzz in this process, which libFuzzer ends; compiled kernels can't be instrumented."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"a.{name}"
+        read(name, path)
+        for module in [m for n, m in sorted(sys.modules.items()) if n.startswith("piccolo.")]:
+            for value in list(vars(module).values()):
+                if isinstance(value, FunctionType) and value.__module__ == module.__name__:
+                    atheris.instrument_func(value)
+        atheris.Setup([sys.argv[0], *flags], lambda data: path.write_bytes(data) and read(name, path))
+        atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], sys.argv[2:])

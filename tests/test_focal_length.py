@@ -1,0 +1,171 @@
+"""A focal length that is not exact: fitted with the pose, and part of the pose's covariance."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rooms import scan_map
+from test_localize_cameras import place, scan
+
+import piccolo
+from piccolo.camera import Calibration, Camera, Mount
+from piccolo.camera.model import pinhole
+from piccolo.camera.resampling import View, sphere_of
+from piccolo.coarse_to_fine import focal_length as focal
+from piccolo.coarse_to_fine.localize_guessed import likeliest
+from piccolo.coarse_to_fine.query import prepare_query
+from piccolo.coarse_to_fine.settings import CoarseToFineSettings
+from piccolo.confidence.localization import Localization
+from piccolo.confidence.score import Evidence
+from piccolo.geometry.pose import Pose, exp_so3
+from piccolo.panorama import ReadOptions, panorama_of_array
+from piccolo.runtime.threads import Workers
+from piccolo.scenes.synthetic.photographs import picture_by
+
+TRUE = 320.0  # [px] of the photos here, 640 x 480
+
+
+def _photo(camera):
+    this, pose = place(1)
+    return picture_by(Mount(camera), this, pose, Workers(2)), pose
+
+
+def _panorama(rgb, **options):
+    return panorama_of_array(rgb, np.ones(rgb.shape[:2], np.bool_), ReadOptions(**options))
+
+
+def _fit(rgb, pose, **options):
+    panorama = _panorama(rgb, **options)
+    query = prepare_query(panorama, scan_map(5), CoarseToFineSettings(), Workers(2))
+    return panorama, focal.fit_focal(query, panorama, scan().from_world(pose))
+
+
+@pytest.mark.parametrize("num", [1, 2])
+def test_the_crest_is_that_of_a_quadratic_loss_and_blocks_that_pull_widen_it(num):
+    true, curvature = np.array([0.01, -0.02])[:num], np.array([[4.0, 1.0], [1.0, 3.0]])[:num, :num]
+    changes = focal.design(num, 0.04)
+    pulls = np.tile([[0.3, -0.3], [-0.3, 0.3], [0.1, 0.2], [-0.1, -0.2]], (2, 1))[:, :num]
+    off = changes - true
+    whole = 0.5 * np.einsum("ki,ij,kj->k", off, curvature, off)
+    losses = whole[:, None] / 8.0 + off @ pulls.T
+    turn = np.array([0.0, 0.0, 0.5])
+    poses = [Pose(exp_so3(turn * c[0]), np.array([3.0 * c[0], 0.0, 0.0])) for c in changes]
+    crest = focal.crest_of(focal.Profile(changes, losses, poses), Pose(np.eye(3), np.zeros(3)))
+    np.testing.assert_allclose(crest.change, true, atol=1e-9)
+    np.testing.assert_allclose(crest.motion[:, 0], [0.0, 0.0, 0.5, 3.0, 0.0, 0.0], atol=1e-9)
+    inverse = np.linalg.inv(curvature)
+    slopes = pulls / (1.0 - 1.0 / 8.0)  # each block has an eighth of what fixes the crest
+    expected = focal.INFLATION * inverse @ slopes.T @ slopes @ inverse
+    np.testing.assert_allclose(np.linalg.inv(crest.information), expected, rtol=1e-6)
+
+
+def test_a_loss_of_few_blocks_or_without_a_crest_tells_nothing():
+    changes = focal.design(1, 0.04)
+    poses = [Pose(np.eye(3), np.zeros(3))] * len(changes)
+    crest = focal.crest_of(focal.Profile(changes, -np.repeat(changes**2, 9, axis=1), poses), poses[0])
+    assert not crest.information.any()
+    few = focal.crest_of(focal.Profile(changes, np.repeat(changes**2, 3, axis=1), poses), poses[0])
+    assert not few.information.any()
+
+
+def test_the_picture_tells_the_focal_length_within_its_deviation():
+    given = 1.015
+    rgb, pose = _photo(pinhole(640, 480, TRUE))
+    panorama, fit = _fit(rgb, pose, focal_px=given * TRUE)
+    off = fit.change[0] + math.log(given)
+    assert abs(off) < 3.0 * fit.deviation
+    assert abs(off) < 0.015
+    assert 0.0005 < fit.deviation < 0.01
+    assert fit.conflict < 3.0
+    assert fit.focal_length(panorama).given_std_px == pytest.approx(0.01 * given * TRUE)
+
+
+def test_k1_is_fitted_with_the_focal_length_of_a_guess():
+    rgb, pose = _photo(Camera("SIMPLE_RADIAL", 640, 480, (TRUE, 320.0, 240.0, -0.04)))
+    mount = Mount(Camera("SIMPLE_RADIAL", 640, 480, (1.03 * TRUE, 320.0, 240.0, 0.0)))
+    _, fit = _fit(rgb, pose, calibration=Calibration("guess", (mount,)), refine_focal=True)
+    f, k1 = focal.changed(mount.camera, fit.change).params[::3]
+    assert f == pytest.approx(TRUE, rel=0.02)
+    assert k1 == pytest.approx(-0.04, abs=0.015)
+
+
+def test_the_focal_length_of_a_bare_part_of_a_wall_stays_open():
+    rgb, pose = _photo(pinhole(640, 480, TRUE))
+    blank = np.full_like(rgb, 128)
+    blank[200:260, 280:360] = rgb[200:260, 280:360]
+    panorama, fit = _fit(blank, pose, focal_px=TRUE, refine_focal=True)
+    assert fit.deviation > 0.05
+    assert fit.conflict < 3.0
+    assert fit.focal_length(panorama).std_px > 15.0
+
+
+def test_a_photo_with_a_guessed_focal_length_is_localized_and_says_what_it_found():
+    rgb, pose = _photo(pinhole(640, 480, TRUE))
+    result = scan().localize(rgb, focal_px=290.0, gravity="known", refine_focal=True)
+    assert result.status == "localized"
+    found = result.focal_length
+    assert abs(found.px - TRUE) < 3.0 * found.std_px
+    assert found.px == pytest.approx(TRUE, rel=0.02)
+    assert (found.given_px, found.given_std_px) == (290.0, pytest.approx(58.0))
+    assert result.cameras[0].camera.focal[0] == found.px
+    assert np.linalg.norm(result.pose.center_world - pose.center_world) < 0.03
+    assert piccolo.Result.from_json(result.to_json()).focal_length == found
+
+
+def test_a_focal_length_that_contradicts_what_was_given_makes_no_sure_pose():
+    rgb, _ = _photo(pinhole(640, 480, TRUE))
+    result = scan().localize(rgb, focal_px=290.0, gravity="known")
+    assert result.status == "not_localized"
+    assert "which contradicts what was given 290 px within 3" in result.warnings[-1]
+
+
+def test_an_exact_calibration_stays_exact():
+    rgb, _ = _photo(pinhole(640, 480, TRUE))
+    mount = Mount(pinhole(640, 480, TRUE))
+    assert _panorama(rgb, calibration=Calibration("exact", (mount,))).focal_prior is None
+    assert _panorama(rgb, projection="fisheye", fov_deg=90.0).focal_prior.deviation == 0.03
+
+
+def test_other_poses_with_other_guesses_share_the_probability():
+    settings = CoarseToFineSettings()
+    evidence = Evidence(0.5, 1.0, 0.5, 0.9, 0.3)
+    here, elsewhere = (Pose(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 3.0))
+    sure = Localization("localized", 0.95, 0.05, here, evidence=evidence)
+    assert likeliest([replace(sure, confidence=0.9), sure], settings) is sure
+    other = replace(sure, confidence=0.9, pose=elsewhere)
+    doubtful = likeliest([sure, other, other], settings)
+    assert doubtful.status == "ambiguous"
+    assert doubtful.confidence == pytest.approx(0.95**2 / 1.85)
+    (rival,) = doubtful.alternatives
+    assert rival.pose is elsewhere
+    assert rival.probability == pytest.approx(0.95 * 0.9 / 1.85)
+    assert doubtful.probability_none == pytest.approx(0.05)
+
+
+def test_a_retaken_sphere_is_the_one_of_that_calibration_and_keeps_its_mask():
+    rgb, _ = _photo(pinhole(640, 480, TRUE))
+    panorama = _panorama(rgb, focal_px=TRUE, mask_nadir_deg=80.0)
+    found = panorama.retaken(pinhole(640, 480, 1.1 * TRUE), 1024)
+    pixels = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
+    wanted, is_wanted = sphere_of([View(Mount(pinhole(640, 480, 1.1 * TRUE)), pixels)], 1024)
+    assert not found.is_valid[300:].any()
+    assert is_wanted[300:].any()
+    assert (found.is_valid == is_wanted)[:270].mean() > 0.998
+    np.testing.assert_array_equal(found.rgb, wanted)
+
+
+def test_only_the_photo_of_one_camera_has_a_focal_length_to_refine():
+    with pytest.raises(piccolo.InputError, match="found a sphere or a part of one, wanted the photo of one"):
+        scan().localize(np.zeros((64, 128, 3), np.uint8), refine_focal=True)
+
+
+def test_pictures_of_a_result_are_made_with_the_camera_found():
+    found = (Mount(pinhole(640, 480, 321.5)),)
+    options = ReadOptions(focal_px=300.0, refine_focal=True).refined(found)
+    assert (options.focal_px, options.calibration.mounts) == (None, found)
+    turned = Mount(pinhole(640, 480, 300.0), ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
+    given = ReadOptions(calibration=Calibration("a.json", (turned,)), refine_focal=True)
+    assert given.refined(found).calibration.mounts == (turned.with_camera(found[0].camera),)
+    plain = ReadOptions()
+    assert plain.refined(()) is plain

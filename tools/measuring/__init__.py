@@ -1,0 +1,1 @@
+"""What tools/benchmark.py measures, a subcommand a module, and the made-up places that it needs."""
