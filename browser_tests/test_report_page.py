@@ -10,11 +10,11 @@ from report_scenes import HOSTILE
 
 from piccolo.camera.model import pinhole
 from piccolo.cloud.settings import IN_METRES
-from piccolo.coarse_to_fine.open_map import open_points
-from piccolo.render.field import cut
-from piccolo.render.surfel_renderer import fill_holes, render_points
+from piccolo.jobs.threads import Workers
 from piccolo.result import read_results
-from piccolo.runtime.threads import Workers
+from piccolo.scan_map.open_map import open_points
+from piccolo.views.field import cut
+from piccolo.views.surfel_renderer import fill_holes, render_points
 
 AXE = Path(__file__).resolve().parents[1] / "page" / "node_modules" / "axe-core" / "axe.min.js"
 LOOKS = [(0, 0), (75, -20), (150, 25), (225, -45), (300, 10)]  # heading and pitch [deg]

@@ -13,17 +13,17 @@ from .cloud import open_cloud
 from .cloud.digest import sha256_of_files
 from .cloud.settings import METRES, CloudSettings, UpAxis
 from .cloud.stream import ARRAYS, CloudStream, stream_of_arrays
-from .coarse_to_fine.named_scans import check_within
-from .coarse_to_fine.open_map import CachePolicy, open_map, prepared_map_among
-from .coarse_to_fine.scan_map import ScanMap, prepare_map
-from .coarse_to_fine.settings import CoarseToFineSettings
 from .errors import InputError
+from .jobs.stopwatch import Stopwatch
+from .jobs.threads import ProgressCallback, Workers, no_progress, num_cores, progress_to
+from .localization.settings import CoarseToFineSettings
 from .paper.localize import PaperMap
 from .paper.localize import prepare as prepare_by_paper
 from .query_options import File, Settings, refuse_unknown
-from .runtime.stopwatch import Stopwatch
-from .runtime.threads import ProgressCallback, Workers, no_progress, num_cores, progress_to
 from .scan import Scan
+from .scan_map.named_scans import check_within
+from .scan_map.open_map import CachePolicy, open_map, prepared_map_among
+from .scan_map.scan_map import ScanMap, prepare_map
 
 
 class ScanOptions(TypedDict, total=False):

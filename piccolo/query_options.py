@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 from .camera.files import read_calibration, read_rig
 from .cloud.settings import CloudSettings
-from .coarse_to_fine.settings import CoarseToFineSettings, Prior
 from .errors import InputError
 from .geometry.rotations import Gravity
+from .localization.settings import CoarseToFineSettings
 from .optimize.settings import Solver
 from .panorama import ReadOptions
 from .panorama.model import Projection
 from .paper.settings import PaperSettings
+from .scan_map.prior import Prior
 
 File = str | PathLike[str]
 Settings = CoarseToFineSettings | PaperSettings

@@ -14,14 +14,15 @@ from . import __version__
 from .camera import Mount
 from .camera.files import document_of as camera_document
 from .camera.files import mounts_of
-from .coarse_to_fine.gps import GpsPrior
 from .confidence.confidence import AMBIGUOUS, LOCALIZED
 from .confidence.covariance import PoseCovariance
 from .confidence.localization import Alternative, FocalLength, Localization
 from .confidence.score import Evidence
 from .errors import UNPRINTABLE, InputError, is_passing, printable, text_of
+from .files.json_file import document_of, parse_lines, read_bytes
 from .geometry.pose import Pose, checked_rotation
 from .geometry.sphere import CONVENTION
+from .jobs.memory import is_shortage
 from .result_parts import (
     POSE_FIELDS,
     alternative_from_json,
@@ -32,8 +33,7 @@ from .result_parts import (
     walk_from_json,
     walk_json,
 )
-from .runtime.json_file import document_of, parse_lines, read_bytes
-from .runtime.memory import is_shortage
+from .scan_map.prior import GpsPrior
 from .walk.localize import WalkFrame
 
 FORMAT = "piccolo-pose/8"

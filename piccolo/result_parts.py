@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from .coarse_to_fine.gps import GpsPrior
 from .confidence.covariance import PoseCovariance
 from .confidence.localization import Alternative
 from .geometry.pose import Pose, T_world_from_cam, quaternion_wxyz
+from .scan_map.prior import GpsPrior
 from .walk.localize import Alone, Gap, WalkFrame
 
 POSE_FIELDS = ("R_cam_from_world", "center_world", "quaternion_wxyz", "T_world_from_cam")

@@ -11,17 +11,16 @@ from numpy.typing import NDArray
 from .camera import Calibration
 from .cloud.settings import CloudSettings
 from .cloud.soa import PackedPoints
-from .coarse_to_fine.gps import GpsPrior, gps_prior
-from .coarse_to_fine.localize_guessed import localize_guessed
-from .coarse_to_fine.named_scans import check_within
-from .coarse_to_fine.places import with_places
-from .coarse_to_fine.scan_map import ScanMap
-from .coarse_to_fine.settings import CoarseToFineSettings
 from .confidence.confidence import LOCALIZED
 from .confidence.localization import Localization
 from .confidence.occlusion import occlusion_mask
 from .errors import InputError
+from .files.json_file import reading_once
 from .geometry.pose import Pose
+from .jobs.stopwatch import Stopwatch
+from .jobs.threads import Workers
+from .localization.localize_guessed import localize_guessed
+from .localization.settings import CoarseToFineSettings
 from .panorama import Panorama, ReadOptions, read_query
 from .panorama.photo import Photo, photo_of, photo_of_array
 from .paper.localize import PaperMap
@@ -29,9 +28,10 @@ from .paper.localize import localize as localize_by_paper
 from .paper.settings import PaperSettings
 from .query_options import File, QueryOptions, Settings, asked_of
 from .result import Result, Source, result_of
-from .runtime.json_file import reading_once
-from .runtime.stopwatch import Stopwatch
-from .runtime.threads import Workers
+from .scan_map.named_scans import check_within
+from .scan_map.places import with_places
+from .scan_map.prior import GpsPrior, gps_prior
+from .scan_map.scan_map import ScanMap
 from .scan_walk import Walk, WalkAbout
 from .walk.frames import MAX_ACCELERATION, MAX_SPEED, Motion
 from .walk.tracker import Tracker

@@ -9,15 +9,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .coarse_to_fine.places import with_places
-from .coarse_to_fine.query import Query
 from .confidence.localization import Localization
+from .files.json_file import reading_once
+from .jobs.stopwatch import Stopwatch
+from .jobs.threads import Progress, no_progress
+from .localization.query import Query
 from .panorama import Panorama, ReadOptions, read_query
 from .panorama.photo import Photo, photo_of, photo_of_array, sha256_of
 from .result import Failure, Result, Source, failure_of, result_of, unreadable_result
-from .runtime.json_file import reading_once
-from .runtime.stopwatch import Stopwatch
-from .runtime.threads import Progress, no_progress
+from .scan_map.places import with_places
 from .walk.frames import Frame, checked_times
 from .walk.localize import WalkFrame, alone_of, localization_of, localizations_of
 from .walk.second_look import finished

@@ -4,16 +4,16 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from piccolo.coarse_to_fine import localize as method
-from piccolo.coarse_to_fine import standings
-from piccolo.coarse_to_fine.comparison import Comparison
-from piccolo.coarse_to_fine.config import METHOD
-from piccolo.coarse_to_fine.recent_views import RecentViews
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.geometry.pose import Pose, yaw_rotation
+from piccolo.jobs.threads import Workers
+from piccolo.localization import localize as method
+from piccolo.localization import standings
+from piccolo.localization.comparison import Comparison
+from piccolo.localization.config import METHOD
+from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.optimize.channel_loss import CHANCE
-from piccolo.runtime.threads import Workers
+from piccolo.views.recent_views import RecentViews
 
 OF_MAP = SimpleNamespace(octree=None)
 VIEWS = RecentViews(*[lambda *_: None] * 3)

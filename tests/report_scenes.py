@@ -9,10 +9,10 @@ from piccolo.confidence.covariance import PoseCovariance
 from piccolo.confidence.localization import Alternative
 from piccolo.confidence.score import Evidence
 from piccolo.geometry.pose import Pose, yaw_rotation
-from piccolo.render.surfel_renderer import encode_image
+from piccolo.jobs.threads import Workers
 from piccolo.result import Result, Source, unreadable_result
-from piccolo.runtime.threads import Workers
 from piccolo.scenes.synthetic.world import make_world, photograph, pose_of_query, scan_world
+from piccolo.views.surfel_renderer import encode_image
 from piccolo.walk.localize import Gap, WalkFrame
 
 SIZE = np.array([4.5, 3.5, 2.5])

@@ -9,12 +9,12 @@ from piccolo.cli import make_room
 from piccolo.cloud.soa import pack_points
 from piccolo.cloud.stream import Cloud
 from piccolo.cloud.voxels import morton_order
-from piccolo.coarse_to_fine.scan_map import prepare_map
-from piccolo.coarse_to_fine.view import average_view, normalized_view
 from piccolo.geometry.pose import Pose, angle_between
+from piccolo.jobs.threads import Workers
 from piccolo.panorama import Panorama
-from piccolo.runtime.threads import Workers
+from piccolo.scan_map.scan_map import prepare_map
 from piccolo.scenes.synthetic.world import make_query, make_world, scan_world
+from piccolo.views.view import average_view, normalized_view
 
 SIZE = (4.5, 3.5, 2.5)
 NUM_POINTS = 60_000

@@ -7,7 +7,7 @@ import pytest
 from measuring import confidence
 from measuring.alike import ALIKE_KINDS, CHANGED, make_alike, thing_seeds
 
-from piccolo.runtime.threads import Workers
+from piccolo.jobs.threads import Workers
 from piccolo.scenes.synthetic.world import World, make_query
 
 

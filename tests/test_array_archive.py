@@ -7,8 +7,8 @@ import zipfile
 import numpy as np
 import pytest
 
-from piccolo.runtime import array_archive
-from piccolo.runtime.array_archive import ALIGNMENT, open_archive, read_header, write_archive
+from piccolo.files import array_archive
+from piccolo.files.array_archive import ALIGNMENT, open_archive, read_header, write_archive
 
 ARRAYS = {
     "a": np.arange(7, dtype=np.int8),

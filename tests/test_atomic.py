@@ -12,15 +12,15 @@ from piccolo.cli.errors import UsageError, run_command
 from piccolo.cli.outputs import check_distinct, check_outputs, check_suffix
 from piccolo.cli.parser import add_run_options, new_parser
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose
-from piccolo.runtime import atomic
-from piccolo.runtime.atomic import (
+from piccolo.files import atomic
+from piccolo.files.atomic import (
     check_output,
     check_output_folder,
     replacing,
     replacing_folder,
     write_atomically,
 )
+from piccolo.geometry.pose import Pose
 from piccolo.scenes.scene import Query, write_queries
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -135,7 +135,7 @@ def test_stdout_gets_bytes(name, capfdbinary):
 
 @pytest.mark.parametrize(("redirection", "found"), [("> out", "1\n2\n3\n"), (">&-", "found a closed stdout")])
 def test_stdout_redirected_keeps_what_is_printed_around_it(tmp_path, redirection, found):
-    code = "from piccolo.runtime.atomic import *; print(1); write_atomically(Path('-'), b'2\\n'); print(3)"
+    code = "from piccolo.files.atomic import *; print(1); write_atomically(Path('-'), b'2\\n'); print(3)"
     command = f'cd "{tmp_path}" && PYTHONPATH="{ROOT}" "{sys.executable}" -c "{code}" {redirection}'
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
     assert found in ((tmp_path / "out").read_text() if "out" in redirection else done.stderr)

@@ -20,10 +20,10 @@ from piccolo.batch import localizer as module
 from piccolo.batch.inputs import panoramas_of
 from piccolo.cli import localize
 from piccolo.errors import InputError
+from piccolo.files.line_file import appending, whole_lines, whole_size
+from piccolo.jobs import memory
 from piccolo.panorama import picture
 from piccolo.result import Result, read_results
-from piccolo.runtime import memory
-from piccolo.runtime.line_file import appending, whole_lines, whole_size
 
 ROOT = Path(__file__).resolve().parents[1]
 PAPER = ["--preset", "paper", "--num-translations", "4", "--num-iterations", "5", "--max-points", "5000"]
@@ -440,7 +440,7 @@ def test_a_full_disk_keeps_the_lines_before(tmp_path):
     code = (
         "import resource, sys\n"
         "from pathlib import Path\n"
-        "from piccolo.runtime.line_file import appending\n"
+        "from piccolo.files.line_file import appending\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
         "with appending(Path(sys.argv[1]), 0) as append:\n"
         "    for k in range(9):\n"

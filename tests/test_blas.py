@@ -7,11 +7,11 @@ import pytest
 import rooms
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from piccolo.coarse_to_fine import localize as method
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings
-from piccolo.runtime.blas import one_blas_thread
-from piccolo.runtime.stopwatch import Stopwatch
-from piccolo.runtime.threads import Workers
+from piccolo.jobs.blas import one_blas_thread
+from piccolo.jobs.stopwatch import Stopwatch
+from piccolo.jobs.threads import Workers
+from piccolo.localization import localize as method
+from piccolo.localization.settings import CoarseToFineSettings
 
 
 def _threads():

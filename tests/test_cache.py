@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from piccolo.cli import progress
-from piccolo.runtime import cache, kernel_cache
-from piccolo.runtime.atomic import replacing
-from piccolo.runtime.jit import kernel
+from piccolo.files import cache
+from piccolo.files.atomic import replacing
+from piccolo.kernels import kernel_cache
+from piccolo.kernels.jit import kernel
 
 ROOT = Path(__file__).resolve().parents[1]
 

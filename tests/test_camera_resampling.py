@@ -15,8 +15,8 @@ from piccolo.camera.model import pinhole
 from piccolo.camera.resampling import View, sphere_of, sphere_width
 from piccolo.geometry.pose import exp_so3
 from piccolo.geometry.sphere import pixel_rays
+from piccolo.jobs.threads import Workers
 from piccolo.panorama import read_panorama
-from piccolo.runtime.threads import Workers
 from piccolo.scenes.synthetic.photographs import picture_by, picture_of_all
 from piccolo.scenes.synthetic.world import make_query, photograph, room_of_query
 

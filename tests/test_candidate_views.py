@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import rooms
 
-from piccolo.coarse_to_fine import candidate_views
-from piccolo.coarse_to_fine.candidate_views import SEARCH_VIEW, CandidateViews, render_views, render_wide
 from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
+from piccolo.jobs.threads import Workers
 from piccolo.panorama.local_normalization import LEVELS_PER_UNIT
-from piccolo.runtime.threads import Workers
+from piccolo.views import candidate_views
+from piccolo.views.candidate_views import SEARCH_VIEW, CandidateViews, render_views, render_wide
 
 ALL = np.ones(len(make_grid(24)), bool)
 

@@ -12,7 +12,7 @@ from test_cloud_morton import read, seeded_cloud
 from piccolo.cloud import open_source, read_cloud
 from piccolo.cloud.readers import npz
 from piccolo.cloud.readers import reader as raw
-from piccolo.coarse_to_fine.map_file import FORMAT, is_map_file, load_map
+from piccolo.scan_map.map_file import FORMAT, is_map_file, load_map
 
 RAW = seeded_cloud(1, num_points=1200)
 XYZ, RGB = RAW.points_world, RAW.colors

@@ -15,16 +15,16 @@ from piccolo.cloud import CloudStream
 from piccolo.cloud.readers.reader import PointSource, RawCloud
 from piccolo.cloud.settings import METRES, CloudSettings
 from piccolo.cloud.voxels import Voxels
-from piccolo.coarse_to_fine.localize import localize
-from piccolo.coarse_to_fine.open_map import CachePolicy, content_key, open_map
-from piccolo.coarse_to_fine.scan_map import prepare_map
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, rotation_to_z
+from piccolo.jobs.stopwatch import Stopwatch
+from piccolo.jobs.threads import Workers
+from piccolo.localization.localize import localize
+from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.opening import open_files
 from piccolo.paper.settings import PaperSettings
-from piccolo.runtime.stopwatch import Stopwatch
-from piccolo.runtime.threads import Workers
+from piccolo.scan_map.open_map import CachePolicy, content_key, open_map
+from piccolo.scan_map.scan_map import prepare_map
 
 ROOT = Path(__file__).resolve().parents[1]
 TURN = exp_so3(np.array([0.3, -0.7, 1.9]))
@@ -246,7 +246,7 @@ def test_a_wrong_unit_is_told_before_the_long_work_begins(tmp_path, monkeypatch,
     def begin(*_):
         raise InterruptedError
 
-    monkeypatch.setattr("piccolo.coarse_to_fine.scan_map.candidate_centers", begin)
+    monkeypatch.setattr("piccolo.scan_map.scan_map.candidate_centers", begin)
     monkeypatch.setattr("piccolo.opening.prepare_by_paper", begin)
     path = tmp_path / "mm.xyz"
     raw = seeded_cloud(1, 1500, size=(6000.0, 5000.0, 2500.0))

@@ -14,7 +14,7 @@ import pytest
 from rooms import write_room
 
 from piccolo.cli import evaluate, localize
-from piccolo.runtime import cluster
+from piccolo.jobs import cluster
 
 ROOT = Path(__file__).resolve().parents[1]
 PAPER = ["--preset", "paper", "--num-translations", "4", "--num-iterations", "5", "--max-points", "5000"]

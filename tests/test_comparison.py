@@ -9,7 +9,12 @@ import pytest
 import rooms
 from measuring.damage import occluded, outside_field
 
-from piccolo.coarse_to_fine.comparison import (
+from piccolo.confidence.score import Evidence
+from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
+from piccolo.geometry.sphere import cell_of, pixel_rays, solid_angles
+from piccolo.jobs.threads import Workers
+from piccolo.local_features.hypotheses import count_matches
+from piccolo.localization.comparison import (
     CONTRADICTS,
     Comparison,
     compare,
@@ -17,17 +22,12 @@ from piccolo.coarse_to_fine.comparison import (
     sample_photo,
     without_occluders,
 )
-from piccolo.coarse_to_fine.evaluation import is_mirrored
-from piccolo.coarse_to_fine.query import prepare_query
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings
-from piccolo.confidence.score import Evidence
-from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
-from piccolo.geometry.sphere import cell_of, pixel_rays, solid_angles
-from piccolo.local_features.hypotheses import count_matches
+from piccolo.localization.evaluation import is_mirrored
+from piccolo.localization.query import prepare_query
+from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.optimize.channel_loss import BLOCK_RINGS, CHANCE, NUM_BLOCKS
 from piccolo.panorama import Panorama
 from piccolo.panorama.texels import pack_texels
-from piccolo.runtime.threads import Workers
 
 WIDTH = rooms.WIDTH
 TILTED = exp_so3(np.array([0.4, -1.1, 0.7]))

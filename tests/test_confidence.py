@@ -4,12 +4,12 @@ import math
 import numpy as np
 import pytest
 
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.confidence import confidence as rule
 from piccolo.confidence.confidence import Standing, classify, posterior
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.confidence.score import Evidence
 from piccolo.errors import InputError
+from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.paper.settings import PaperSettings
 
 

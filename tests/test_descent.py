@@ -5,14 +5,14 @@ import functools
 import numpy as np
 import rooms
 
-from piccolo.coarse_to_fine import descent
-from piccolo.coarse_to_fine.config import METHOD
-from piccolo.coarse_to_fine.query import query_images
-from piccolo.coarse_to_fine.starts import Starts
-from piccolo.coarse_to_fine.view import Cells
 from piccolo.geometry.pose import Pose, step
 from piccolo.geometry.sphere import make_grid
-from piccolo.runtime.threads import Workers
+from piccolo.jobs.threads import Workers
+from piccolo.localization import descent
+from piccolo.localization.config import METHOD
+from piccolo.localization.query import query_images
+from piccolo.localization.starts import Starts
+from piccolo.views.view import Cells
 
 FINE_BLOCKS = METHOD.fine_view.arrays.blocks
 ALL = np.ones(len(FINE_BLOCKS), bool)

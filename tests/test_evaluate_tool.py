@@ -17,9 +17,9 @@ from poses import result, write_results
 from rooms import write_room
 
 from piccolo.cli import evaluate
+from piccolo.jobs import memory
 from piccolo.panorama import picture
 from piccolo.result import Source
-from piccolo.runtime import memory
 from piccolo.scenes.evaluation.runner import read_run
 from piccolo.scenes.scene import Query, read_scene, write_queries
 

@@ -10,8 +10,8 @@ from poses import result
 from refusals import assert_refused
 
 from piccolo.errors import InputError
+from piccolo.files.line_file import appending
 from piccolo.geometry.pose import Pose, exp_so3, is_correct
-from piccolo.runtime.line_file import appending
 from piccolo.scenes.evaluation import tables
 from piccolo.scenes.evaluation.plots import errors_figure, figure_png, risk_figure
 from piccolo.scenes.evaluation.query_result import (

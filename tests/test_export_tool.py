@@ -17,8 +17,8 @@ from refusals import mutated, read_or_refused
 
 from piccolo.cli import export_poses
 from piccolo.errors import InputError
+from piccolo.files.atomic import check_output_folder, replacing_folder
 from piccolo.result import Source, read_results
-from piccolo.runtime.atomic import check_output_folder, replacing_folder
 from piccolo.scenes.datasets.generic import _table
 from piccolo.scenes.export import FORMATS, select
 from piccolo.scenes.scene import Query, write_queries

@@ -9,10 +9,10 @@ import pytest
 from rooms import scan_map
 
 from piccolo.cloud import digest
-from piccolo.coarse_to_fine import map_file
-from piccolo.coarse_to_fine.map_file import save_map
 from piccolo.errors import InputError
-from piccolo.runtime import cache, file_facts
+from piccolo.files import cache, file_facts
+from piccolo.scan_map import map_file
+from piccolo.scan_map.map_file import save_map
 
 
 def _full(*_):

@@ -7,19 +7,20 @@ import numpy as np
 import pytest
 import rooms
 
-from piccolo.coarse_to_fine import first_look, query, refinement
-from piccolo.coarse_to_fine import localize as method
-from piccolo.coarse_to_fine.query import prepare_query
-from piccolo.coarse_to_fine.search import search_poses
-from piccolo.coarse_to_fine.search_result import SearchResult
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings, Prior
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.confidence.confidence import LOCALIZED
 from piccolo.geometry.pose import Pose, exp_so3, is_correct
+from piccolo.jobs.once import Once
+from piccolo.jobs.stopwatch import Stopwatch
+from piccolo.jobs.threads import Workers
 from piccolo.local_features.matching import NO_MATCHES
-from piccolo.runtime.once import Once
-from piccolo.runtime.stopwatch import Stopwatch
-from piccolo.runtime.threads import Workers
+from piccolo.localization import first_look, query, refinement
+from piccolo.localization import localize as method
+from piccolo.localization.query import prepare_query
+from piccolo.localization.search import search_poses
+from piccolo.localization.search_result import SearchResult
+from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.scan_map.prior import Prior
 
 KNOWN = CoarseToFineSettings(gravity="known")
 

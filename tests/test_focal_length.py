@@ -12,15 +12,15 @@ import piccolo
 from piccolo.camera import Calibration, Camera, Mount
 from piccolo.camera.model import pinhole
 from piccolo.camera.resampling import View, sphere_of
-from piccolo.coarse_to_fine import focal_length as focal
-from piccolo.coarse_to_fine.localize_guessed import likeliest
-from piccolo.coarse_to_fine.query import prepare_query
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.confidence.localization import Localization
 from piccolo.confidence.score import Evidence
 from piccolo.geometry.pose import Pose, exp_so3
+from piccolo.jobs.threads import Workers
+from piccolo.localization import focal_length as focal
+from piccolo.localization.localize_guessed import likeliest
+from piccolo.localization.query import prepare_query
+from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import ReadOptions, panorama_of_array
-from piccolo.runtime.threads import Workers
 from piccolo.scenes.synthetic.photographs import picture_by
 
 TRUE = 320.0  # [px] of the photos here, 640 x 480

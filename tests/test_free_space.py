@@ -5,8 +5,8 @@ import pytest
 import rooms
 
 from piccolo.cloud.stream import stream_of_arrays
-from piccolo.coarse_to_fine.scan_map import prepare_map
-from piccolo.runtime.threads import Workers
+from piccolo.jobs.threads import Workers
+from piccolo.scan_map.scan_map import prepare_map
 from piccolo.scenes.synthetic.world import make_world, scan_world
 from piccolo.walk.free_space import FreeSpace
 

@@ -15,9 +15,8 @@ from test_cloud_las import RAW
 
 import piccolo
 from piccolo.cloud.crs import crs_of, from_wgs84
-from piccolo.coarse_to_fine.gps import gps_prior
-from piccolo.coarse_to_fine.settings import Prior
 from piccolo.panorama.photo import GpsPosition, photo_of
+from piccolo.scan_map.prior import Prior, gps_prior
 
 UTM = "EPSG:25832"
 OFFSET = np.array([500_000.0, 5_400_000.0, 300.0])  # of a room in UTM

@@ -8,12 +8,12 @@ import pytest
 import rooms
 from made_up import QUERY, at, compared, places
 
-from piccolo.coarse_to_fine import localize as method
-from piccolo.coarse_to_fine.config import METHOD
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.confidence.alternatives import Hypothesis
-from piccolo.runtime.stopwatch import Stopwatch
-from piccolo.runtime.threads import Workers
+from piccolo.jobs.stopwatch import Stopwatch
+from piccolo.jobs.threads import Workers
+from piccolo.localization import localize as method
+from piccolo.localization.config import METHOD
+from piccolo.localization.settings import CoarseToFineSettings
 
 
 def _run(monkeypatch, matched, searches, gravity="auto", config=METHOD):

@@ -8,13 +8,13 @@ import pytest
 import rooms
 
 from piccolo.cloud.settings import IN_METRES
-from piccolo.coarse_to_fine import open_map, scan_map
-from piccolo.coarse_to_fine.late_features import LateFeatures
-from piccolo.coarse_to_fine.map_file import load_map, save_map
-from piccolo.coarse_to_fine.open_map import CachePolicy
+from piccolo.jobs.stopwatch import Stopwatch
+from piccolo.jobs.threads import Workers
 from piccolo.opening import open_scan
-from piccolo.runtime.stopwatch import Stopwatch
-from piccolo.runtime.threads import Workers
+from piccolo.scan_map import open_map, scan_map
+from piccolo.scan_map.late_features import LateFeatures
+from piccolo.scan_map.map_file import load_map, save_map
+from piccolo.scan_map.open_map import CachePolicy
 
 WORKERS = Workers(2)
 

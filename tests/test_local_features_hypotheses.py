@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 import rooms
 
-from piccolo.coarse_to_fine.localize import localize, matched_poses
-from piccolo.coarse_to_fine.prior import contradictions
-from piccolo.coarse_to_fine.query import prepare_query
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings, Prior
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
+from piccolo.jobs.stopwatch import Stopwatch
+from piccolo.jobs.threads import Workers
 from piccolo.local_features.feature_map import make_feature_map
 from piccolo.local_features.hypotheses import count_matches, exact_pose, poses_of, rough_poses
 from piccolo.local_features.matching import Matches
-from piccolo.runtime.stopwatch import Stopwatch
-from piccolo.runtime.threads import Workers
+from piccolo.localization.localize import localize, matched_poses
+from piccolo.localization.prior import contradictions
+from piccolo.localization.query import prepare_query
+from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.scan_map.prior import Prior
 
 
 @functools.lru_cache

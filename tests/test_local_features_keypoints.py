@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from piccolo.geometry.pose import yaw_rotation
 from piccolo.geometry.sphere import pixel_rays
+from piccolo.jobs.threads import Workers
 from piccolo.local_features.keypoints import (
     DESCRIPTOR_SIZE,
     HALVES,
@@ -17,7 +18,6 @@ from piccolo.local_features.keypoints import (
     joined_keypoints,
     perspective_views,
 )
-from piccolo.runtime.threads import Workers
 
 WIDTH = rooms.WIDTH
 PIXEL = 2.0 * np.pi / WIDTH  # [rad]

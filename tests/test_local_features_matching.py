@@ -8,8 +8,7 @@ import pytest
 import rooms
 from scipy.spatial import cKDTree
 
-from piccolo.coarse_to_fine.query import prepare_query
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings
+from piccolo.jobs.threads import Workers
 from piccolo.local_features import feature_map
 from piccolo.local_features.feature_map import (
     LIST_SIZE,
@@ -24,7 +23,8 @@ from piccolo.local_features.feature_map import (
 from piccolo.local_features.keypoints import Keypoints, find_keypoints
 from piccolo.local_features.matching import APART, FAR, NUM_NEIGHBORS, match, nearest_lists, search_lists
 from piccolo.local_features.view_image import render_gray
-from piccolo.runtime.threads import Workers
+from piccolo.localization.query import prepare_query
+from piccolo.localization.settings import CoarseToFineSettings
 
 
 def _descriptors(rng, count):

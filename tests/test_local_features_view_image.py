@@ -7,8 +7,8 @@ import rooms
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.stream import Cloud
 from piccolo.geometry.sphere import pixel_rays
+from piccolo.jobs.threads import Workers
 from piccolo.local_features.view_image import NOTHING, fill_gaps, is_in_front, render_gray
-from piccolo.runtime.threads import Workers
 from piccolo.scenes.synthetic.raycast import cast_rays
 
 WIDTH = 256

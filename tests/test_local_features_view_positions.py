@@ -4,11 +4,11 @@ import naive
 import numpy as np
 import rooms
 
-from piccolo.coarse_to_fine.candidate_views import SEARCH_VIEW
-from piccolo.coarse_to_fine.view import ranges_around
 from piccolo.geometry.sphere import make_grid
 from piccolo.local_features import view_positions as view_positions_module
 from piccolo.local_features.view_positions import cell_table, view_positions
+from piccolo.views.candidate_views import SEARCH_VIEW
+from piccolo.views.view import ranges_around
 
 RINGS = 24
 CELLS = len(make_grid(RINGS))

@@ -19,10 +19,10 @@ from piccolo.camera.files import document_of
 from piccolo.camera.model import Camera, pinhole
 from piccolo.cli.localize import main
 from piccolo.cloud.settings import CloudSettings
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors
+from piccolo.jobs.threads import Workers
+from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.result import Result, read_results
-from piccolo.runtime.threads import Workers
 from piccolo.scan import Scan
 from piccolo.scenes.synthetic.photographs import picture_by, picture_of_all
 from piccolo.scenes.synthetic.world import make_query, photograph, room_of_query

@@ -12,12 +12,12 @@ from piccolo.batch.localizer import Localizer
 from piccolo.cli import localize, prepare_map
 from piccolo.cloud.label_colors import Labels
 from piccolo.cloud.settings import CloudSettings
-from piccolo.coarse_to_fine.open_map import CachePolicy
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.errors import InputError
+from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import ReadOptions
 from piccolo.paper.settings import PaperSettings
 from piccolo.result import Result
+from piccolo.scan_map.open_map import CachePolicy
 from piccolo.scenes.evaluation.runner import Failure, Job, JobRunner
 from piccolo.scenes.scene import read_scene
 from piccolo.scenes.synthetic.room import LABEL_NAMES

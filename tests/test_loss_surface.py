@@ -13,12 +13,12 @@ from piccolo.cloud import read_cloud
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import Pose, angle_between
 from piccolo.geometry.rotations import uniform_yaws
+from piccolo.jobs.threads import Workers
 from piccolo.optimize.loss_surface import LossSurface, PoseGrid, loss_surface
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama.texels import pack_texels
-from piccolo.render.zbuffer import visible_points
-from piccolo.runtime.threads import Workers
 from piccolo.scenes.scene import read_scene
+from piccolo.views.zbuffer import visible_points
 
 STEP = 0.3
 COARSE = ["--step", STEP, "--rotations", 24, "--max-points", 3000, "--width", 128]

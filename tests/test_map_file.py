@@ -14,13 +14,13 @@ from piccolo.cloud.octree import build_octree
 from piccolo.cloud.settings import CloudSettings
 from piccolo.cloud.voxel_table import VoxelTable
 from piccolo.cloud.voxels import LEAF_SIZE, PHASE, QUANTA_PER_METRE
-from piccolo.coarse_to_fine import map_file, open_map
-from piccolo.coarse_to_fine.map_file import is_map_file, load_map, save_map
-from piccolo.coarse_to_fine.map_validation import first_misplaced
-from piccolo.coarse_to_fine.open_map import content_key
 from piccolo.errors import InputError
+from piccolo.files.array_archive import write_archive
 from piccolo.geometry.pose import exp_so3
-from piccolo.runtime.array_archive import write_archive
+from piccolo.scan_map import map_file, open_map
+from piccolo.scan_map.map_file import is_map_file, load_map, save_map
+from piccolo.scan_map.map_validation import first_misplaced
+from piccolo.scan_map.open_map import content_key
 
 
 @pytest.fixture(scope="module")

@@ -14,17 +14,17 @@ from rooms import as_panorama, query, room, scan_map
 
 from piccolo.cloud import octree, voxel_table
 from piccolo.cloud.stream import stream_of_arrays
-from piccolo.coarse_to_fine.candidate_views import SEARCH_VIEW, render_views, render_wide
-from piccolo.coarse_to_fine.query import prepare_query
-from piccolo.coarse_to_fine.scan_map import prepare_map
-from piccolo.coarse_to_fine.search import search_poses
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.errors import InputError
+from piccolo.jobs import memory
+from piccolo.jobs.threads import Workers
+from piccolo.localization.query import prepare_query
+from piccolo.localization.search import search_poses
+from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import read_panorama
 from piccolo.panorama.photo import photo_of
 from piccolo.panorama.video import frames_of
-from piccolo.runtime import memory
-from piccolo.runtime.threads import Workers
+from piccolo.scan_map.scan_map import prepare_map
+from piccolo.views.candidate_views import SEARCH_VIEW, render_views, render_wide
 
 
 @pytest.fixture

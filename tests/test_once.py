@@ -4,8 +4,8 @@ import threading
 
 import pytest
 
-from piccolo.runtime.once import Once
-from piccolo.runtime.threads import Workers
+from piccolo.jobs.once import Once
+from piccolo.jobs.threads import Workers
 
 
 def test_a_value_is_worked_out_once_whoever_asks():

@@ -10,11 +10,11 @@ import pytest
 from rooms import scan_map
 
 from piccolo.cloud.settings import IN_METRES
-from piccolo.coarse_to_fine import open_map
-from piccolo.coarse_to_fine.map_file import save_map
-from piccolo.coarse_to_fine.open_map import CachePolicy
-from piccolo.runtime.stopwatch import Stopwatch
-from piccolo.runtime.threads import Workers
+from piccolo.jobs.stopwatch import Stopwatch
+from piccolo.jobs.threads import Workers
+from piccolo.scan_map import open_map
+from piccolo.scan_map.map_file import save_map
+from piccolo.scan_map.open_map import CachePolicy
 
 
 @pytest.fixture(scope="module")

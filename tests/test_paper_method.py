@@ -6,10 +6,10 @@ from golden_poses import check_golden_poses
 from rooms import as_panorama, errors, query, room
 
 from piccolo.errors import InputError
+from piccolo.jobs.stopwatch import Stopwatch
+from piccolo.jobs.threads import Workers
 from piccolo.paper.localize import localize, prepare
 from piccolo.paper.settings import PaperSettings
-from piccolo.runtime.stopwatch import Stopwatch
-from piccolo.runtime.threads import Workers
 
 QUICK = dataclasses.replace(PaperSettings(), num_translations=30, max_points=30_000, num_iterations=60)
 

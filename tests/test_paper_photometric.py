@@ -13,14 +13,14 @@ from piccolo.cloud.soa import pack_points
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, step
 from piccolo.geometry.sphere import pixel_rays
+from piccolo.jobs.stopwatch import Stopwatch
+from piccolo.jobs.threads import Workers
 from piccolo.optimize.refine import refine
 from piccolo.panorama.model import shrink
 from piccolo.paper.localize import localize, loss_of, prepare
 from piccolo.paper.photometric import photometric_equations, photometric_loss, pixel_motion, view_gradient
 from piccolo.paper.settings import PaperSettings
-from piccolo.render.zbuffer import View, render_view
-from piccolo.runtime.stopwatch import Stopwatch
-from piccolo.runtime.threads import Workers
+from piccolo.views.zbuffer import View, render_view
 
 HALF_SIZE = np.array([2.5, 2.0, 1.3])
 WIDTH = 128

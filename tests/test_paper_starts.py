@@ -5,7 +5,7 @@ from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import angle_between
 from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
 from piccolo.paper.search import MIN_CLEARANCE, PROBE_WIDTH, box_grid, farthest_point_sampling, free_grid
-from piccolo.render.zbuffer import is_free_space
+from piccolo.views.zbuffer import is_free_space
 
 
 def _hollow_box(seed=0, count=40_000):

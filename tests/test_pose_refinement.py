@@ -11,10 +11,10 @@ import pytest
 
 from piccolo.geometry.pose import Pose, angle_between, exp_so3, pose_errors, step
 from piccolo.geometry.rotations import random_rotation
+from piccolo.jobs.threads import Workers
 from piccolo.local_features.p3p import p3p
 from piccolo.local_features.pose_refinement import angular_equations, refine_pose
 from piccolo.optimize.normal_equations import COUNT, GRADIENT, LOSS, MATRIX, NUM_SUMS
-from piccolo.runtime.threads import Workers
 
 TILTED = Pose(exp_so3(np.array([0.4, -1.1, 0.7])), np.array([0.2, -0.3, 0.1]))
 

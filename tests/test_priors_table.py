@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from piccolo.batch.priors import read_priors
-from piccolo.coarse_to_fine.settings import Prior
 from piccolo.errors import InputError
+from piccolo.scan_map.prior import Prior
 
 
 @pytest.mark.parametrize(

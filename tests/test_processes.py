@@ -16,9 +16,9 @@ from pathlib import Path
 import pytest
 
 from piccolo.errors import InputError
-from piccolo.runtime import processes as module
-from piccolo.runtime.processes import IN_FLIGHT, Processes
-from piccolo.runtime.tasks import Here, WorkerLostError
+from piccolo.jobs import processes as module
+from piccolo.jobs.processes import IN_FLIGHT, Processes
+from piccolo.jobs.tasks import Here, WorkerLostError
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -167,7 +167,7 @@ def test_one_that_hangs_in_its_exit_keeps_nobody_from_starting_another(monkeypat
 
 
 def test_processes_end_with_a_parent_that_is_killed():
-    code = "import test_processes as t; from piccolo.runtime.processes import Processes\n"
+    code = "import test_processes as t; from piccolo.jobs.processes import Processes\n"
     code += "for _, p in Processes(t._sleeping, 1).values(iter([600])): p.result()"
     environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}
     with subprocess.Popen(

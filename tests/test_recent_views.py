@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 import rooms
 
-from piccolo.coarse_to_fine import recent_views
-from piccolo.coarse_to_fine.config import METHOD
-from piccolo.coarse_to_fine.evaluation import COARSE_VOXEL_PER_RANGE, VOXEL_PER_RANGE, surroundings_of
-from piccolo.coarse_to_fine.points_around import visible_points
-from piccolo.coarse_to_fine.query import prepare_query
-from piccolo.coarse_to_fine.refinement import points_at, view_at
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.geometry.sphere import make_grid
-from piccolo.runtime.threads import Workers
+from piccolo.jobs.threads import Workers
+from piccolo.localization.config import METHOD
+from piccolo.localization.evaluation import COARSE_VOXEL_PER_RANGE, VOXEL_PER_RANGE, surroundings_of
+from piccolo.localization.query import prepare_query
+from piccolo.localization.refinement import points_at, view_at
+from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.views import recent_views
+from piccolo.views.points_around import visible_points
 
 SCALES = VOXEL_PER_RANGE, COARSE_VOXEL_PER_RANGE
 FINE, FULL = METHOD.fine_view, METHOD.full_view

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import rooms
 
-from piccolo.coarse_to_fine import refinement
-from piccolo.coarse_to_fine.config import METHOD, Beam
-from piccolo.coarse_to_fine.query import prepare_query
-from piccolo.coarse_to_fine.recent_views import RecentViews
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings
-from piccolo.coarse_to_fine.starts import Starts, best_and_alternatives, narrow
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.geometry.pose import Pose, step, yaw_rotation
 from piccolo.geometry.sphere import make_grid
-from piccolo.runtime.threads import Workers
+from piccolo.jobs.threads import Workers
+from piccolo.localization import refinement
+from piccolo.localization.config import METHOD, Beam
+from piccolo.localization.query import prepare_query
+from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.localization.starts import Starts, best_and_alternatives, narrow
+from piccolo.views.recent_views import RecentViews
 
 QUERY = SimpleNamespace(workers=Workers(1), method=METHOD, scan_map=None)
 

@@ -11,14 +11,13 @@ from rooms import write_room
 from piccolo.cli import reproduce_paper
 from piccolo.cloud import read_cloud
 from piccolo.cloud.soa import pack_points
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, angle_between
+from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama import read_panorama
 from piccolo.panorama.texels import pack_texels
 from piccolo.paper.settings import PaperSettings
-from piccolo.render.zbuffer import visible_points
 from piccolo.scenes.evaluation.runner import read_run
 from piccolo.scenes.reproduce_paper.experiments import EXPERIMENTS
 from piccolo.scenes.reproduce_paper.transforms import (
@@ -29,6 +28,7 @@ from piccolo.scenes.reproduce_paper.transforms import (
     with_random_rotation,
 )
 from piccolo.scenes.scene import Query, read_scene, write_queries
+from piccolo.views.zbuffer import visible_points
 
 PRESETS = [PaperSettings(), CoarseToFineSettings()]
 

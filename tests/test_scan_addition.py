@@ -15,19 +15,20 @@ from piccolo.cli import prepare_map as prepare_command
 from piccolo.cloud.stream import Cloud
 from piccolo.cloud.voxel_table import VoxelTable
 from piccolo.cloud.voxels import LEAF_SIZE, join_voxels
-from piccolo.coarse_to_fine import scan_addition
-from piccolo.coarse_to_fine.camera_positions import MIN_CLEARANCE
-from piccolo.coarse_to_fine.candidate_views import SEARCH_VIEW, WideViews, render_wide
-from piccolo.coarse_to_fine.localize import localize
-from piccolo.coarse_to_fine.map_file import load_map, save_map
-from piccolo.coarse_to_fine.named_scans import named, scan_at, with_scans
-from piccolo.coarse_to_fine.scan_addition import add_scan
-from piccolo.coarse_to_fine.scan_map import prepare_map
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings, Prior
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose
-from piccolo.runtime.stopwatch import Stopwatch
-from piccolo.runtime.threads import Workers
+from piccolo.jobs.stopwatch import Stopwatch
+from piccolo.jobs.threads import Workers
+from piccolo.localization.localize import localize
+from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.scan_map import scan_addition
+from piccolo.scan_map.camera_positions import MIN_CLEARANCE
+from piccolo.scan_map.map_file import load_map, save_map
+from piccolo.scan_map.named_scans import named, scan_at, with_scans
+from piccolo.scan_map.prior import Prior
+from piccolo.scan_map.scan_addition import add_scan
+from piccolo.scan_map.scan_map import prepare_map
+from piccolo.views.candidate_views import SEARCH_VIEW, WideViews, render_wide
 
 BESIDE = np.array([5.3, 0.4, 0.2])  # of a second room, from where it was made [m]
 WORKERS = Workers(2)

@@ -7,14 +7,15 @@ import numpy as np
 import pytest
 import rooms
 
-from piccolo.coarse_to_fine import query as query_module
-from piccolo.coarse_to_fine import search, turned_panorama
-from piccolo.coarse_to_fine.config import METHOD
-from piccolo.coarse_to_fine.query import prepare_query, query_images
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings, Prior
 from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
 from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
+from piccolo.jobs.threads import Workers
+from piccolo.localization import query as query_module
+from piccolo.localization import search, turned_panorama
+from piccolo.localization.config import METHOD
+from piccolo.localization.query import prepare_query, query_images
+from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import Panorama
 from piccolo.panorama.gpano import GPano
 from piccolo.panorama.local_normalization import (
@@ -22,7 +23,7 @@ from piccolo.panorama.local_normalization import (
     sample_channels,
 )
 from piccolo.panorama.model import resize
-from piccolo.runtime.threads import Workers
+from piccolo.scan_map.prior import Prior
 
 AREA = make_grid(24).solid_angle
 

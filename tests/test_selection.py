@@ -8,13 +8,13 @@ import pytest
 import rooms
 from made_up import QUERY, at, compared, places
 
-from piccolo.coarse_to_fine import evaluation, refinement, standings
-from piccolo.coarse_to_fine import localize as method
-from piccolo.coarse_to_fine.search_result import SearchResult
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.confidence.score import Agreement
-from piccolo.runtime.threads import Workers
+from piccolo.jobs.threads import Workers
+from piccolo.localization import evaluation, refinement, standings
+from piccolo.localization import localize as method
+from piccolo.localization.search_result import SearchResult
+from piccolo.localization.settings import CoarseToFineSettings
 
 
 def test_of_poses_that_matches_gave_the_better_end_is_taken(monkeypatch):

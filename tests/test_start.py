@@ -15,7 +15,7 @@ from rooms import query, scan_map, write_room
 
 from piccolo.cli import start
 from piccolo.cli.parser import COMMANDS
-from piccolo.coarse_to_fine.map_file import save_map
+from piccolo.scan_map.map_file import save_map
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -39,7 +39,7 @@ def _shell(redirection, *words):
 
 COUNT_ARENAS = """
 import ctypes, sys, threading
-from piccolo.runtime.arenas import share_arenas
+from piccolo.jobs.arenas import share_arenas
 share_arenas()
 barrier = threading.Barrier(6)
 def allocate():

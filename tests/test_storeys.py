@@ -4,7 +4,7 @@ from rooms import scan_map
 
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.stream import Cloud
-from piccolo.coarse_to_fine.storeys import Storey, find_storeys
+from piccolo.scan_map.storeys import Storey, find_storeys
 
 
 def _octree(*parts):

@@ -15,11 +15,11 @@ from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, T_world_from_cam, angle_between, exp_so3, read_pose_matrix, step
 from piccolo.geometry.rotations import R_cam_from_angles, heading_pitch_roll_deg
 from piccolo.geometry.sphere import pixel_rays
-from piccolo.render.surfel_renderer import encode_image, fill_holes, render_points
-from piccolo.render.surfels import BAND, BAND_OFFSET, MAX_SLOPE, MIN_RADIUS_PX, splat, surfels_of
-from piccolo.render.zbuffer import View
-from piccolo.runtime.threads import Workers
+from piccolo.jobs.threads import Workers
 from piccolo.scenes.synthetic.raycast import cast_rays
+from piccolo.views.surfel_renderer import encode_image, fill_holes, render_points
+from piccolo.views.surfels import BAND, BAND_OFFSET, MAX_SLOPE, MIN_RADIUS_PX, splat, surfels_of
+from piccolo.views.zbuffer import View
 
 WORKERS = Workers(2)
 WIDTH = 256

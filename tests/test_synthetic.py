@@ -10,7 +10,7 @@ from piccolo.cli import make_room as tool
 from piccolo.cloud import read_cloud
 from piccolo.errors import InputError
 from piccolo.geometry.sphere import pixel_rays
-from piccolo.runtime.threads import Workers
+from piccolo.jobs.threads import Workers
 from piccolo.scenes.synthetic.raycast import cast_rays
 from piccolo.scenes.synthetic.room import make_room
 from piccolo.scenes.synthetic.world import (

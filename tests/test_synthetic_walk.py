@@ -7,7 +7,7 @@ import pytest
 
 from piccolo.geometry.pose import Pose, angle_between, yaw_rotation
 from piccolo.geometry.sphere import pixel_rays
-from piccolo.runtime.threads import Workers
+from piccolo.jobs.threads import Workers
 from piccolo.scenes.synthetic.office import make_office
 from piccolo.scenes.synthetic.raycast import cast_rays, ranges_ahead
 from piccolo.scenes.synthetic.walk_frames import BAD_KINDS, WalkOptions, frames_of

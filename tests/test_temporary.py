@@ -7,12 +7,12 @@ import time
 
 import pytest
 
-from piccolo.runtime import temporary
-from piccolo.runtime.temporary import PREFIX, temporary_folder
+from piccolo.files import temporary
+from piccolo.files.temporary import PREFIX, temporary_folder
 
 HOLD = """
 import sys, time
-from piccolo.runtime.temporary import temporary_folder
+from piccolo.files.temporary import temporary_folder
 with temporary_folder() as folder:
     (folder / "frame.jpg").touch()
     print(folder, flush=True)

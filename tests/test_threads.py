@@ -6,8 +6,8 @@ from contextlib import ExitStack
 
 import pytest
 
-from piccolo.runtime import threads
-from piccolo.runtime.threads import Workers
+from piccolo.jobs import threads
+from piccolo.jobs.threads import Workers
 
 
 @pytest.mark.parametrize("num_threads", [1, 3])

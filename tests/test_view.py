@@ -7,12 +7,13 @@ from scipy.spatial import cKDTree
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.soa import unpack_rgb
 from piccolo.cloud.stream import Cloud
-from piccolo.coarse_to_fine import camera_positions, view
-from piccolo.coarse_to_fine.candidate_views import SEARCH_VIEW
-from piccolo.coarse_to_fine.points_around import points_around, take_children, visible_points
-from piccolo.coarse_to_fine.view import ViewConfig
 from piccolo.geometry.sphere import cell_of, make_grid
-from piccolo.runtime.threads import Workers
+from piccolo.jobs.threads import Workers
+from piccolo.scan_map import camera_positions
+from piccolo.views import view
+from piccolo.views.candidate_views import SEARCH_VIEW
+from piccolo.views.points_around import points_around, take_children, visible_points
+from piccolo.views.view import ViewConfig
 
 LEAVES = ViewConfig(
     num_rings=24, stats_rings=16, sigma_deg=22.0, voxel_per_range=1e-6

@@ -16,10 +16,10 @@ from piccolo.cli import localize_walk as walk_command
 from piccolo.cloud.ply_writer import vertex_rows, write_ply
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
+from piccolo.jobs import memory
+from piccolo.jobs.threads import Workers
 from piccolo.panorama import picture
 from piccolo.result import read_results
-from piccolo.runtime import memory
-from piccolo.runtime.threads import Workers
 from piccolo.scan_walk import Walk
 from piccolo.scenes.export.video import writing_video
 from piccolo.scenes.synthetic.world import free_position, photograph

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import rooms
 
-from piccolo.coarse_to_fine.query import prepare_query
-from piccolo.coarse_to_fine.refinement import compared
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors
-from piccolo.runtime.threads import Workers
+from piccolo.jobs.threads import Workers
+from piccolo.localization.query import prepare_query
+from piccolo.localization.refinement import compared
+from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.walk import tracker as tracker_module
 from piccolo.walk.frames import Motion, State
 from piccolo.walk.tracker import Follower, follow

@@ -4,7 +4,7 @@ import pytest
 
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
-from piccolo.render.zbuffer import nearest_depth, render_view, visible_points
+from piccolo.views.zbuffer import nearest_depth, render_view, visible_points
 
 TILTED = Pose(exp_so3(np.array([0.4, -1.1, 0.7])), np.array([0.2, -0.3, 0.1]))
 

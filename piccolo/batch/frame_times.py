@@ -8,8 +8,8 @@ from itertools import pairwise
 from pathlib import Path
 
 from ..errors import InputError
+from ..files.json_file import read_text
 from ..panorama.photo import photo_of
-from ..runtime.json_file import read_text
 from ..walk.frames import checked_times
 
 EXIF, NAMES, ORDER = "exif", "names", "order"

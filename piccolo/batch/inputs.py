@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TextIO
 
 from ..errors import InputError, printable
+from ..files.json_file import read_bytes
 from ..panorama.cube import SUFFIXES, is_cube
-from ..runtime.json_file import read_bytes
 
 STDIN = "-"
 WANTED_LIST = "wanted a text file, a panorama's path on each line"

@@ -12,20 +12,20 @@ from typing import Any, NamedTuple
 from .. import __version__
 from ..camera import Calibration
 from ..cloud.settings import CloudSettings
-from ..coarse_to_fine.map_file import load_map
-from ..coarse_to_fine.open_map import CachePolicy
-from ..coarse_to_fine.settings import CoarseToFineSettings
+from ..files.json_file import reading_once
+from ..jobs.cluster import sent_file
+from ..jobs.memory import limit_memory
+from ..jobs.threads import Workers
+from ..localization.settings import CoarseToFineSettings
 from ..opening import open_files
 from ..panorama import ReadOptions, read_panorama
 from ..panorama.photo import sha256_of
 from ..query_options import Settings
-from ..render.surfel_renderer import encode_image, overlay_png
 from ..result import Failure, Result, Source, failure_of, named, unreadable_result
-from ..runtime.cluster import sent_file
-from ..runtime.json_file import reading_once
-from ..runtime.memory import limit_memory
-from ..runtime.threads import Workers
 from ..scan import Scan, settings_json
+from ..scan_map.map_file import load_map
+from ..scan_map.open_map import CachePolicy
+from ..views.surfel_renderer import encode_image, overlay_png
 from .priors import PriorTable
 
 

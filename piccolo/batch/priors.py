@@ -7,11 +7,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from ..coarse_to_fine.named_scans import check_within
-from ..coarse_to_fine.scan_map import ScanMap
-from ..coarse_to_fine.settings import Prior
 from ..errors import InputError
-from ..runtime.json_file import read_text
+from ..files.json_file import read_text
+from ..scan_map.named_scans import check_within
+from ..scan_map.prior import Prior
+from ..scan_map.scan_map import ScanMap
 
 NUMBERS = ("x", "y", "z", "radius", "heading", "tolerance", "height")
 COLUMNS = (*NUMBERS, "within")

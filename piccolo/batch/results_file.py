@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 from ..camera import Calibration
 from ..errors import InputError
+from ..files.line_file import LineFile, whole_lines, whole_size
 from ..panorama.photo import sha256_of
 from ..result import FAILED, FORMAT
-from ..runtime.line_file import LineFile, whole_lines, whole_size
 
 LINE_BEGINS = f'{{"format": "{FORMAT}"'.encode()
 WAYS = "--overwrite starts anew, another --out keeps both"

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
+from ..files.json_file import DAMAGE, describe, read_text
 from ..geometry.pose import rotation_from_quaternion_wxyz
 from ..geometry.rotations import OPTICAL_FROM_CAM
-from ..runtime.json_file import DAMAGE, describe, read_text
 from .model import Camera
 from .rig import IDENTITY, Calibration, Mount, rows
 

@@ -9,16 +9,16 @@ import numpy as np
 from ..cloud import CloudStream, open_cloud
 from ..cloud.ply_writer import write_transformed
 from ..cloud.settings import CloudSettings
-from ..coarse_to_fine.scan_map import prepare_map
-from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..confidence.confidence import LOCALIZED
 from ..errors import InputError
+from ..files.atomic import is_stream, write_atomically
 from ..geometry.pose import Array, move, read_transform, rotation_to_z
 from ..gravity.alignment import find_alignment
+from ..jobs.threads import Workers, num_cores
+from ..localization.settings import CoarseToFineSettings
 from ..panorama import read_panorama
-from ..runtime.atomic import is_stream, write_atomically
-from ..runtime.threads import Workers, num_cores
 from ..scan import Scan
+from ..scan_map.scan_map import prepare_map
 from ..scenes.scene import QUERIES_NAME, read_scene, write_queries
 from .command import command, option, print_warnings
 from .errors import checking_options, print_error

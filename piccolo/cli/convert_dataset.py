@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import fields
 
 from ..errors import InputError
-from ..runtime.threads import Progress, Workers, num_cores
+from ..jobs.threads import Progress, Workers, num_cores
 from ..scenes.datasets import DATASETS
 from ..scenes.datasets.checking import check_scene
 from ..scenes.datasets.files import AXES, DIRECTIONS

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from ..cloud.readers.e57 import E57Image, list_images, read_image
 from ..errors import InputError
+from ..files.atomic import write_atomically
 from ..geometry.pose import quaternion_wxyz
-from ..runtime.atomic import write_atomically
 from .command import command, option
 from .errors import EXIT_BAD_INPUT, print_error
 from .outputs import check_distinct, check_folder_name

@@ -13,7 +13,7 @@ from types import FrameType
 from tqdm import tqdm
 
 from ..errors import InputError, printable, text_of
-from ..runtime.memory import check_address_space, is_shortage
+from ..jobs.memory import check_address_space, is_shortage
 from .parser import as_started, parse
 from .progress import log_shown
 from .start import EXIT_INTERRUPTED, EXIT_TERMINATED

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from ..batch.localizer import Localizer
-from ..coarse_to_fine.open_map import CachePolicy, scan_sha256_of
 from ..errors import InputError
+from ..files.atomic import is_stream, write_atomically
+from ..jobs.threads import num_cores
 from ..result import check_scan, read_results
-from ..runtime.atomic import is_stream, write_atomically
-from ..runtime.threads import num_cores
+from ..scan_map.open_map import CachePolicy, scan_sha256_of
 from ..scenes.evaluation import tables
 from ..scenes.evaluation.plots import errors_figure, figure_png, risk_figure
 from ..scenes.evaluation.query_result import QueryResult, Thresholds, match_results

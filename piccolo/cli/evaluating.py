@@ -8,9 +8,9 @@ from pathlib import Path
 
 from ..batch.localizer import Localizer
 from ..errors import InputError
-from ..runtime.cluster import Cluster, connected
-from ..runtime.processes import Processes
-from ..runtime.tasks import Executor, Here
+from ..jobs.cluster import Cluster, connected
+from ..jobs.processes import Processes
+from ..jobs.tasks import Executor, Here
 from ..scenes.evaluation.query_result import QueryResult
 from ..scenes.evaluation.runner import JobRunner, Run, opened
 from .errors import EXIT_BAD_INPUT, print_error

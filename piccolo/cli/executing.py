@@ -9,16 +9,16 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from ..batch.localizer import Localizer
-from ..coarse_to_fine.map_file import save_map
-from ..coarse_to_fine.open_map import CachePolicy
-from ..coarse_to_fine.scan_map import ScanMap
 from ..errors import InputError
-from ..runtime.cluster import LOCAL, Cluster, connected
-from ..runtime.memory import GB, memory_left, memory_taken
-from ..runtime.processes import Processes
-from ..runtime.tasks import Executor, Here
-from ..runtime.threads import num_cores
+from ..jobs.cluster import LOCAL, Cluster, connected
+from ..jobs.memory import GB, memory_left, memory_taken
+from ..jobs.processes import Processes
+from ..jobs.tasks import Executor, Here
+from ..jobs.threads import num_cores
 from ..scan import Scan
+from ..scan_map.map_file import save_map
+from ..scan_map.open_map import CachePolicy
+from ..scan_map.scan_map import ScanMap
 from .command import option
 from .errors import UsageError
 

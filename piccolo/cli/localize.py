@@ -17,20 +17,20 @@ from ..batch.inputs import described, is_from_stdin, panoramas_of
 from ..batch.localizer import Answer, Localizer
 from ..batch.priors import PriorTable, read_priors
 from ..batch.results_file import Records
-from ..coarse_to_fine.open_map import CachePolicy, scan_sha256_of
-from ..coarse_to_fine.scan_map import ScanMap
-from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..errors import printable
+from ..files.atomic import STDOUT, check_output, is_stdout, is_stream, write_atomically
+from ..files.line_file import LineFile, locked, write_line
+from ..jobs.memory import limit_memory
+from ..jobs.stopwatch import Stopwatch
+from ..jobs.tasks import Executor, Pair, WorkerLostError
+from ..jobs.threads import Workers, num_cores
+from ..localization.settings import CoarseToFineSettings
 from ..panorama.cube import is_cube
 from ..result import FAILED, UNREADABLE, Failure, Source
-from ..runtime.atomic import STDOUT, check_output, is_stdout, is_stream, write_atomically
-from ..runtime.line_file import LineFile, locked, write_line
-from ..runtime.memory import limit_memory
-from ..runtime.stopwatch import Stopwatch
-from ..runtime.tasks import Executor, Pair, WorkerLostError
-from ..runtime.threads import Workers, num_cores
 from ..scan import Scan
+from ..scan_map.open_map import CachePolicy, scan_sha256_of
+from ..scan_map.scan_map import ScanMap
 from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error, print_note, run_command
 from .executing import check_execution, executing
 from .interruption import SIGNALS, Interruption, Stopped, interruptible

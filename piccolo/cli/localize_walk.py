@@ -14,18 +14,18 @@ from typing import Any
 from .. import __version__
 from ..batch.results_file import WAYS, finished_lines
 from ..camera import Calibration
-from ..coarse_to_fine.scan_map import ScanMap
-from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..confidence.confidence import LOCALIZED
 from ..errors import InputError
+from ..files.atomic import STDOUT, check_output, is_stream, write_atomically
+from ..files.line_file import locked, whole_lines, whole_size
+from ..jobs.stopwatch import Stopwatch
+from ..localization.settings import CoarseToFineSettings
+from ..optional import import_optional
 from ..panorama import ReadOptions
 from ..panorama.photo import sha256_of
 from ..result import FAILED, UNREADABLE, Result, read_results
-from ..runtime.atomic import STDOUT, check_output, is_stream, write_atomically
-from ..runtime.line_file import locked, whole_lines, whole_size
-from ..runtime.optional import import_optional
-from ..runtime.stopwatch import Stopwatch
 from ..scan import Scan
+from ..scan_map.scan_map import ScanMap
 from ..scan_walk import Prepared, Walk
 from .errors import EXIT_BAD_INPUT, print_error, print_note
 from .interruption import SIGNALS, Interruption, Stopped, interruptible

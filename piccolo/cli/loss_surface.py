@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from ..cloud.soa import FARTHEST, LocalCloud
-from ..coarse_to_fine.open_map import open_points
 from ..errors import InputError
+from ..files.atomic import write_atomically
+from ..files.figure import new_figure
 from ..geometry.pose import Array, Pose
 from ..geometry.rotations import uniform_rotations, uniform_yaws
+from ..jobs.threads import Workers, num_cores
 from ..optimize.loss_surface import (
     KnownPoses,
     LossSurface,
@@ -25,9 +27,7 @@ from ..panorama import read_panorama
 from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
 from ..result import read_results
-from ..runtime.atomic import write_atomically
-from ..runtime.figure import new_figure
-from ..runtime.threads import Workers, num_cores
+from ..scan_map.open_map import open_points
 from ..scenes.scene import read_scene
 from .command import check_least, command, option, print_warnings
 from .errors import checking_options

@@ -11,10 +11,9 @@ import numpy as np
 from ..camera import Calibration
 from ..camera.files import read_cameras
 from ..cloud.ply_writer import vertex_rows, write_ply
-from ..render.surfel_renderer import encode_image
-from ..runtime.atomic import write_atomically
-from ..runtime.optional import import_optional
-from ..runtime.threads import Workers, num_cores
+from ..files.atomic import write_atomically
+from ..jobs.threads import Workers, num_cores
+from ..optional import import_optional
 from ..scenes import scene as scenes
 from ..scenes.datasets.files import write_labels
 from ..scenes.synthetic.office import Office
@@ -29,6 +28,7 @@ from ..scenes.synthetic.world import (
     make_world,
     scan_world,
 )
+from ..views.surfel_renderer import encode_image
 from .command import check_least, command, option
 from .errors import checking_options
 from .making_walks import add_walk_options, building_of, check_walk_usage, write_walks

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..render.surfel_renderer import encode_image
-from ..runtime.atomic import write_atomically
-from ..runtime.threads import Workers
+from ..files.atomic import write_atomically
+from ..jobs.threads import Workers
 from ..scenes import scene as scenes
 from ..scenes.export.formats import tum_lines, write_lines
 from ..scenes.export.video import writing_video
 from ..scenes.synthetic.office import Office, make_office
 from ..scenes.synthetic.walk_frames import BAD_KINDS, WalkOptions, frames_of
 from ..scenes.synthetic.walking import Walker
+from ..views.surfel_renderer import encode_image
 from .command import option
 from .errors import UsageError
 

@@ -9,11 +9,12 @@ from ..camera.files import read_calibration, read_rig
 from ..cloud.crs import check_crs
 from ..cloud.label_colors import Labels
 from ..cloud.settings import METRES, CloudSettings, UpAxis
-from ..coarse_to_fine.settings import CoarseToFineSettings, Prior
 from ..errors import InputError
+from ..localization.settings import CoarseToFineSettings
 from ..panorama import ReadOptions
 from ..panorama.model import Projection
 from ..paper.settings import Initialization, PaperSettings, PoseLoss
+from ..scan_map.prior import Prior
 from .command import check_least
 from .executing import add_execution_options
 from .parser import add_run_options, new_parser

@@ -7,8 +7,8 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
+from ..files.atomic import check_output, is_stdout, is_stream
 from ..panorama.cube import SUFFIXES
-from ..runtime.atomic import check_output, is_stdout, is_stream
 from .errors import UsageError
 
 Outputs = Mapping[str, Path | None]  # by option; None where it is not given

@@ -3,12 +3,12 @@
 import argparse
 import json
 
-from ..coarse_to_fine.map_file import save_map
-from ..coarse_to_fine.named_scans import check_name, named
-from ..coarse_to_fine.open_map import CachePolicy, extended_map, open_map
-from ..coarse_to_fine.scan_map import with_features
-from ..runtime.stopwatch import Stopwatch
-from ..runtime.threads import Workers, num_cores
+from ..jobs.stopwatch import Stopwatch
+from ..jobs.threads import Workers, num_cores
+from ..scan_map.map_file import save_map
+from ..scan_map.named_scans import check_name, named
+from ..scan_map.open_map import CachePolicy, extended_map, open_map
+from ..scan_map.scan_map import with_features
 from .command import command, option
 from .errors import checking_options
 from .options import add_cloud_options, cloud_settings_from

@@ -9,7 +9,7 @@ from typing import Any
 from tqdm import tqdm
 
 from ..errors import printable
-from ..runtime.threads import Progress
+from ..jobs.threads import Progress
 
 DELAY = 0.5  # seconds: what takes less needs no bar
 COUNTED, UNCOUNTED = "{desc}: {percentage:3.0f} % |{bar:20}| {remaining} left", "{desc}: {n_fmt} in {elapsed}"

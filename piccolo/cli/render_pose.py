@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from ..camera import Camera, Mount
 from ..camera.files import read_calibration
 from ..cloud.soa import LocalCloud
-from ..coarse_to_fine.open_map import open_points
 from ..errors import InputError
+from ..files.atomic import check_output, check_output_folder, is_stream, replacing_folder, write_atomically
 from ..geometry.pose import Pose, pose_errors, read_pose_matrix
 from ..geometry.rotations import R_cam_from_angles
+from ..jobs.threads import Workers, num_cores
 from ..optimize.descent_animation import (
     FRAME_WIDTH,
     frames_of,
@@ -28,12 +29,11 @@ from ..optimize.settings import DescentSettings
 from ..panorama import read_panorama
 from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
-from ..render.field import cut_view, sphere_width_for
-from ..render.surfel_renderer import encode_image, fill_holes, render_points
 from ..result import read_results
-from ..runtime.atomic import check_output, check_output_folder, is_stream, replacing_folder, write_atomically
-from ..runtime.threads import Workers, num_cores
+from ..scan_map.open_map import open_points
 from ..scenes.scene import read_scene
+from ..views.field import cut_view, sphere_width_for
+from ..views.surfel_renderer import encode_image, fill_holes, render_points
 from .command import check_least, command, option, print_warnings
 from .errors import checking_options
 from .options import add_cloud_options, cloud_settings_from

@@ -5,16 +5,16 @@ import json
 from collections import Counter
 from pathlib import Path
 
-from ..coarse_to_fine.open_map import CachePolicy, open_map
 from ..errors import InputError
+from ..files.atomic import check_output
+from ..jobs.stopwatch import Stopwatch
+from ..jobs.threads import Workers, num_cores
 from ..report.build import WIDTH, ReportSettings, build_report
 from ..report.entries import read_entries
 from ..report.own_plan import OwnPlan
 from ..report.plan_file import SUFFIXES, write_plan_file
 from ..report.site import check_folder
-from ..runtime.atomic import check_output
-from ..runtime.stopwatch import Stopwatch
-from ..runtime.threads import Workers, num_cores
+from ..scan_map.open_map import CachePolicy, open_map
 from .command import check_least, command, option, print_warnings
 from .errors import UsageError, checking_options
 from .options import add_cloud_options, cloud_settings_from

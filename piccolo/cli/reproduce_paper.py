@@ -9,13 +9,13 @@ from pathlib import Path
 from ..batch.localizer import Localizer
 from ..cloud.label_colors import Labels
 from ..cloud.settings import CloudSettings
-from ..coarse_to_fine.open_map import CachePolicy
-from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..errors import InputError
+from ..files.atomic import write_atomically
+from ..jobs.threads import num_cores
+from ..localization.settings import CoarseToFineSettings
 from ..panorama import ReadOptions
 from ..paper.settings import PaperSettings
-from ..runtime.atomic import write_atomically
-from ..runtime.threads import num_cores
+from ..scan_map.open_map import CachePolicy
 from ..scenes.evaluation.query_result import QueryResult
 from ..scenes.evaluation.runner import input_files, open_run
 from ..scenes.reproduce_paper.experiments import EXPERIMENTS, Condition, Settings, plot_png, table

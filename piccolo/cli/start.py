@@ -12,7 +12,7 @@ from functools import partial
 from importlib import import_module
 from types import FrameType
 
-from ..runtime.arenas import share_arenas
+from ..jobs.arenas import share_arenas
 
 # [byte] below it LLVM and OpenBLAS crash or wait for ever, where NumPy raises; each core has a thread
 LEAST_ADDRESS_SPACE = 1_000_000_000 + 250_000_000 * (os.cpu_count() or 1)

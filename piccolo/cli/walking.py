@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 from ..batch.frame_times import EXIF, NAMES, ORDER, times_of
 from ..batch.inputs import is_from_stdin
+from ..files.temporary import temporary_folder
 from ..panorama.video import frames_of
-from ..runtime.temporary import temporary_folder
 from ..walk.frames import MAX_ACCELERATION, MAX_SPEED, MAX_STEP, NO_ACCELERATION, Motion
 from .errors import UsageError
 from .progress import shown

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..runtime.optional import import_optional
+from ..optional import import_optional
 from .readers import e57_file, las_file
 
 PROJECTION_USER, WKT_ID, GEO_KEYS_ID = b"LASF_Projection", 2112, 34735  # of LAS's records

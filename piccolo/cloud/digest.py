@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..runtime.file_facts import recall, remember
+from ..files.file_facts import recall, remember
 
 DIGEST, TICK_NS = "sha256", 50_000_000  # the clock of files moves on every 1 to 10 ms
 

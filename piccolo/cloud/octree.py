@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..runtime.jit import F0, inline_kernel, kernel
-from ..runtime.memory import check_memory
+from ..jobs.memory import check_memory
+from ..kernels.jit import F0, inline_kernel, kernel
 from .voxels import AT_ONCE, LEAF_SIZE, NUM_LEVELS, THIN, Voxels
 
 NODE_BYTES = 6 * 4 + 4  # mean, first child

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import InputError
-from ..runtime.threads import Progress, no_progress
+from ..jobs.threads import Progress, no_progress
 from .readers.e57 import E57
 from .readers.las import LAS
 from .readers.mesh import MESH

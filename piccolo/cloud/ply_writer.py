@@ -11,8 +11,8 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..files.atomic import replacing
 from ..geometry.pose import Array, transform_points
-from ..runtime.atomic import replacing
 from .readers.ply import PLY, PlyHeader, place_of_vertices, read_columns, read_header
 from .readers.reader import CHUNK, HEAD_SIZE
 from .stream import CloudStream

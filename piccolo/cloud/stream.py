@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry.pose import Array, rotate_points
-from ..runtime.memory import check_address_space
-from ..runtime.threads import Progress, no_progress
+from ..jobs.memory import check_address_space
+from ..jobs.threads import Progress, no_progress
 from .digest import sha256_of_arrays
 from .readers.columns import brightest_of, colored_chunks
 from .readers.reader import CHUNK, PointSource, RawCloud

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..runtime.jit import inline_kernel, kernel
-from ..runtime.memory import check_memory
+from ..jobs.memory import check_memory
+from ..kernels.jit import inline_kernel, kernel
 from .voxels import (
     AT_ONCE,
     COARSEST,

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..runtime.jit import inline_kernel, kernel
-from ..runtime.memory import check_memory
+from ..jobs.memory import check_memory
+from ..kernels.jit import inline_kernel, kernel
 
 NUM_CELLS = 1 << 21  # along an axis; three axes fill 63 bits
 LEAF_SIZE = 0.02  # [m]

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from ..cloud.soa import PackedPoints
 from ..geometry.pose import Pose
 from ..geometry.sphere import solid_angles
+from ..kernels.jit import F0, F1, kernel
 from ..panorama import Panorama
 from ..panorama.local_normalization import block_moments, blur_sphere, finish_statistics, opponent_channels
 from ..panorama.model import resize
-from ..render.zbuffer import View, render_view
-from ..runtime.jit import F0, F1, kernel
+from ..views.zbuffer import View, render_view
 
 WIDTHS = (256, 128, 64)  # [px] of the comparison, cells of 1.4 degrees and more: where the scan is sparse
 LEAST_FILLED = 0.75  # of the cells twice as wide in which anything is seen: less is sparse

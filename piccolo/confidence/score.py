@@ -12,7 +12,7 @@ from ..geometry.sphere import solid_angles
 from ..panorama import Panorama
 from ..panorama.local_normalization import normalize_locally
 from ..panorama.model import shrink
-from ..render.zbuffer import render_view
+from ..views.zbuffer import render_view
 
 VIEW_WIDTH = 96  # cells of 3.75 degrees
 SIGMA_DEG = 15.0  # of the Gaussian in which contrast is judged

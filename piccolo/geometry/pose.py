@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..runtime.json_file import read_text
+from ..files.json_file import read_text
 
 Array = NDArray[np.float64]
 NEWTON_STEPS = 4  # from an error of 5 % to rounding

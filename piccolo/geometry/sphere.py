@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ..runtime.jit import F0, HALF, inline_kernel
+from ..kernels.jit import F0, HALF, inline_kernel
 
 PI = np.float32(math.pi)
 HALF_PI = np.float32(math.pi / 2)
@@ -36,6 +36,7 @@ A3 = np.float32(-0.13233341276646)
 A4 = np.float32(0.07962366193533)
 A5 = np.float32(-0.03360421210527)
 A6 = np.float32(0.00681171109960)
+BLOCK_RINGS = 6  # of the blocks of 30 degrees in which a score is taken
 SEARCH_RINGS = 24  # of the views that are searched: cells of 7.5 degrees
 AREA_UNITS = 1000  # of the largest cell
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..runtime.jit import kernel
+from ..kernels.jit import kernel
 
 
 @kernel

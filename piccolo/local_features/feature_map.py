@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from ..cloud.octree import Octree
 from ..geometry.sphere import indices_of
-from ..runtime.jit import inline_kernel, kernel
-from ..runtime.threads import Workers
+from ..jobs.threads import Workers
+from ..kernels.jit import inline_kernel, kernel
 from .keypoints import DESCRIPTOR_SIZE, find_keypoints
 from .view_image import render_gray
 

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from ..geometry.pose import Array, Pose
 from ..geometry.suppression import non_maximum_suppression
+from ..jobs.threads import Workers
+from ..kernels.jit import F0, copy_to, inline_kernel, kernel
 from ..panorama.projection import in_camera, pose_float32
-from ..runtime.jit import F0, copy_to, inline_kernel, kernel
-from ..runtime.threads import Workers
 from .matching import LEAST_WEIGHT, Matches
 from .p3p import p3p
 from .pose_refinement import refine_pose

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.sphere import pixels_of
-from ..runtime.threads import Workers
+from ..jobs.threads import Workers
 
 FIELD_DEG = 65.0  # of a view, across
 CONTRAST = 0.006  # least of a keypoint, as OpenCV counts it: plain walls have faint ones, and they hold

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..runtime.jit import inline_kernel, kernel
-from ..runtime.threads import Workers
+from ..jobs.threads import Workers
+from ..kernels.jit import inline_kernel, kernel
 from .feature_map import FeatureMap, project, squared_gap
 from .keypoints import Keypoints
 

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from ..runtime.jit import inline_kernel, kernel
+from ..kernels.jit import inline_kernel, kernel
 
 LEAST_SINE2 = 1e-10  # of the angles of the triangle of points: below, they lie on a line
 LEAST_GAP = 5e-13  # 1 - cosine of two bearings: below a microradian they are the same

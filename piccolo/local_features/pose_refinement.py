@@ -2,10 +2,10 @@
 
 import math
 
+from ..kernels.jit import kernel
 from ..optimize.channel_loss import geman_mcclure
 from ..optimize.levenberg_marquardt import levenberg_marquardt
 from ..optimize.normal_equations import COUNT, GRADIENT, LOSS, MATRIX
-from ..runtime.jit import kernel
 
 TOLERANCE = 1e-7  # [rad + m] a shorter step ends the descent
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..cloud.octree import MAX_NODES, Octree, collect, level_of
 from ..geometry.pose import Array
 from ..geometry.sphere import direction_to_pixel
-from ..runtime.jit import F0, F1, HALF, kernel
+from ..kernels.jit import F0, F1, HALF, kernel
 
 VOXEL_PER_RANGE = 1.0 / 80.0  # largest voxel by its distance
 REACH = np.float32(0.7)  # half width of what is drawn for a voxel, by the voxel's

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..geometry.pose import Array
 from ..geometry.sphere import cell_of, direction_to_pixel, pixel_rays
-from ..runtime.jit import kernel
+from ..kernels.jit import kernel
 
 SPACING, LAYER = 2.5, 2.4  # [m] across and in height: what is nearer and seen from a position needs none
 MAX_VIEWS, WIDER = 2500, 1.5  # at most, some minutes and 0.4 GB; the growth of the spacing for more

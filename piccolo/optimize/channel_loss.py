@@ -8,15 +8,14 @@ import math
 
 import numpy as np
 
-from ..geometry.sphere import make_grid
+from ..geometry.sphere import BLOCK_RINGS, make_grid
+from ..kernels.jit import F1, HALF, inline_kernel, kernel
 from ..panorama.local_normalization import ZERO_LEVEL
 from ..panorama.projection import CHUNK, gather, make_projected, project
 from ..panorama.texels import bilinear_weights, blend, is_valid
-from ..runtime.jit import F1, HALF, inline_kernel, kernel
 from .levenberg_marquardt import levenberg_marquardt
 from .normal_equations import COUNT, LOSS, block_adder
 
-BLOCK_RINGS = 6  # blocks of the sphere of 30 degrees, in which a score is taken
 NUM_BLOCKS = len(make_grid(BLOCK_RINGS))
 CHANCE = 0.35  # a block's correlation that wrong poses reach
 ZERO = np.float32(ZERO_LEVEL)

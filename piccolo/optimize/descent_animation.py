@@ -13,10 +13,12 @@ from PIL import Image
 
 from ..cloud.soa import PackedPoints
 from ..errors import InputError
+from ..files.atomic import replacing_folder, write_atomically
 from ..geometry.pose import Pose, step
+from ..jobs.threads import Workers
 from ..panorama import Panorama
 from ..panorama.texels import Texels
-from ..render.surfel_renderer import (
+from ..views.surfel_renderer import (
     checkerboard,
     encode_image,
     fill_holes,
@@ -24,9 +26,7 @@ from ..render.surfel_renderer import (
     resized_rgb,
     visible_indices,
 )
-from ..render.surfels import surfels_of
-from ..runtime.atomic import replacing_folder, write_atomically
-from ..runtime.threads import Workers
+from ..views.surfels import surfels_of
 from .refine import Refined, refine, sampling_loss_of
 from .settings import DescentSettings
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..runtime.jit import copy_to, kernel
+from ..kernels.jit import copy_to, kernel
 from .normal_equations import GRADIENT, LOSS, MATRIX, NUM_SUMS
 
 MAX_TURN, MAX_MOVE = 0.15, 0.3  # [rad], [m] a step: farther away the matrix means nothing

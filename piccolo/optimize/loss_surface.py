@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
 from ..cloud.soa import LocalCloud, PackedPoints
+from ..files.figure import new_figure
 from ..geometry.pose import Array, Pose
+from ..jobs.threads import Workers
 from ..panorama.texels import Texels
-from ..render.zbuffer import is_free_space, visible_points
-from ..runtime.figure import new_figure
-from ..runtime.threads import Workers
+from ..views.zbuffer import is_free_space, visible_points
 from .sampling_loss import sampling_loss
 
 POOL_PER_POINT = 8  # points that may be visible, for one that is used

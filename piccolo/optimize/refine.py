@@ -9,7 +9,7 @@ import numpy as np
 from ..cloud.soa import PackedPoints
 from ..geometry.pose import Array, Pose, exp_so3, left_jacobian, orthonormal, step
 from ..panorama.texels import Texels
-from ..render.zbuffer import visible_points
+from ..views.zbuffer import visible_points
 from .levenberg_marquardt import levenberg_marquardt
 from .normal_equations import GRADIENT, LOSS, MATRIX
 from .sampling_loss import sampling_equations, sampling_loss

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.sphere import pixel_rays, solid_angles
-from ..runtime.jit import F0, F1, HALF, copy_to, inline_kernel, kernel
+from ..kernels.jit import F0, F1, HALF, copy_to, inline_kernel, kernel
 from . import Panorama
 from .projection import CHUNK, gather, make_projected, project
 from .texels import Texels, bilinear_weights, blend, is_valid

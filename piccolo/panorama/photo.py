@@ -15,7 +15,7 @@ from PIL.ExifTags import GPS, IFD, Base
 from ..camera import Calibration
 from ..cloud.digest import sha256_of_arrays
 from ..errors import InputError
-from ..runtime.json_file import read_bytes, reading_once
+from ..files.json_file import read_bytes, reading_once
 from .cube import face_paths
 from .picture import PNG_MAGIC, WANTED, opened
 

@@ -27,9 +27,9 @@ from PIL.WebPImagePlugin import WebPImageFile
 
 from ..cloud.label_colors import Labels, colors_of
 from ..errors import InputError, ResourceError
-from ..runtime.json_file import read_bytes
-from ..runtime.memory import check_memory
-from ..runtime.optional import import_optional
+from ..files.json_file import read_bytes
+from ..jobs.memory import check_memory
+from ..optional import import_optional
 
 WANTED = "wanted a whole JPEG, PNG, TIFF, WebP or HEIC panorama"
 MIN_WIDTH, MIN_HEIGHT = 128, 64

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..runtime.jit import inline_kernel
+from ..kernels.jit import inline_kernel
 from .texels import texel_at
 
 CHUNK = 512  # points

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ..cloud.soa import pack_rgbx
 from ..geometry.sphere import direction_to_pixel, solid_angles
-from ..runtime.jit import F1, HALF, inline_kernel
+from ..kernels.jit import F1, HALF, inline_kernel
 
 BYTE = np.int32(255)
 

@@ -13,12 +13,12 @@ from ..confidence.localization import Alternative, Localization
 from ..confidence.occlusion import occlusion_at
 from ..confidence.score import Evidence, agreement_at
 from ..geometry.rotations import uniform_rotations, uniform_yaws
+from ..jobs.stopwatch import Stopwatch
+from ..jobs.threads import Workers
 from ..optimize.refine import Loss, Refined, refine, sampling_loss_of
 from ..panorama import Panorama
 from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
-from ..runtime.stopwatch import Stopwatch
-from ..runtime.threads import Workers
 from .photometric import photometric_loss_of
 from .search import free_grid, search
 from .settings import PaperSettings

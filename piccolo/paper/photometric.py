@@ -18,7 +18,7 @@ from ..geometry.pose import Pose
 from ..geometry.sphere import pixel_rays, ray_jacobian
 from ..optimize.refine import Equations, Loss
 from ..panorama import Panorama
-from ..render.zbuffer import View, render_view
+from ..views.zbuffer import View, render_view
 
 Image = NDArray[np.float32]
 

@@ -7,11 +7,11 @@ from ..cloud.soa import PackedPoints
 from ..confidence.alternatives import Hypothesis, best_distinct
 from ..geometry.pose import Array, Pose
 from ..geometry.sphere import solid_angles
+from ..jobs.threads import Workers
 from ..optimize.refine import Loss
 from ..panorama import Panorama
 from ..panorama.model import shrink
-from ..render.zbuffer import is_free_space, render_view, visible_points
-from ..runtime.threads import Workers
+from ..views.zbuffer import is_free_space, render_view, visible_points
 from .settings import PaperSettings
 
 MIN_CLEARANCE = 0.25  # a camera is not nearer to a surface than this [m]

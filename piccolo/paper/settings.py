@@ -7,7 +7,7 @@ from ..confidence.confidence import MIN_CONFIDENCE, check_confidence
 from ..errors import InputError
 from ..geometry.rotations import Gravity
 from ..optimize.settings import DescentSettings
-from ..render.zbuffer import MAX_VIEW_WIDTH, MIN_VIEW_WIDTH
+from ..views.zbuffer import MAX_VIEW_WIDTH, MIN_VIEW_WIDTH
 
 PoseLoss = Literal["sampling", "photometric"]
 Initialization = Literal["two-stage", "loss-only"]

@@ -11,29 +11,22 @@ import numpy as np
 
 from .. import __version__
 from ..cloud.soa import PackedPoints
-from ..coarse_to_fine.scan_map import ScanMap
 from ..errors import InputError
+from ..files.atomic import write_atomically
+from ..files.cache import digest_of_sources
+from ..files.temporary import temporary_folder
 from ..geometry.pose import Array, Pose
+from ..jobs.threads import Workers
 from ..panorama.photo import photo_of
-from ..render.surfel_renderer import MAX_SURFELS, encode_image
-from ..render.surfels import Surfels, surfels_of
 from ..result import FAILED, UNREADABLE, check_scan
-from ..runtime.atomic import write_atomically
-from ..runtime.cache import digest_of_sources
-from ..runtime.temporary import temporary_folder
-from ..runtime.threads import Workers
+from ..scan_map.scan_map import ScanMap
+from ..views.surfel_renderer import MAX_SURFELS, encode_image
+from ..views.surfels import Surfels, surfels_of
 from .entries import Entry, Place, document_of_entry, names_of, short_names_of
 from .own_plan import OwnPlan, check_own_plans, own_plan
 from .pictures import make_pictures, read_options_of
 from .plan_image import draw_plan
-from .site import (
-    begin_folder,
-    check_folder,
-    finish_folder,
-    picture_path,
-    self_contained,
-    write_photo_script,
-)
+from .site import begin_folder, check_folder, finish_folder, picture_path, self_contained, write_photo_script
 from .video_frames import taken_out
 
 FORMAT = "piccolo-report/1"

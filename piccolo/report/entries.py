@@ -9,15 +9,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..coarse_to_fine.scan_map import ScanMap
-from ..coarse_to_fine.storeys import Storeys
 from ..confidence.confidence import NOT_LOCALIZED
 from ..confidence.covariance import PoseCovariance
 from ..errors import printable
+from ..files.json_file import read_bytes
 from ..geometry.pose import Array, Pose
 from ..geometry.rotations import heading_pitch_roll_deg
 from ..result import FAILED, UNREADABLE, Result, read_results
-from ..runtime.json_file import read_bytes
+from ..scan_map.scan_map import ScanMap
+from ..scan_map.storeys import Storeys
 
 CHI_SQUARE_95 = 5.991  # of two degrees of freedom
 LEAST_CONFIDENCE = 0.05  # of a photo that is not localized: a best guess below it is on no plan

@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..coarse_to_fine.scan_map import ScanMap
 from ..errors import InputError
+from ..files.json_file import read_text
 from ..geometry.pose import Array
 from ..panorama.picture import read_picture
-from ..render.surfel_renderer import encode_image
-from ..runtime.json_file import read_text
+from ..scan_map.scan_map import ScanMap
+from ..views.surfel_renderer import encode_image
 
 COLUMNS = ("u", "v", "x", "y")
 WANTED = "wanted a CSV file with the columns u, v [px] and x, y [m], and two rows or more"

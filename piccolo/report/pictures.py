@@ -17,14 +17,14 @@ from ..cloud.soa import PackedPoints
 from ..confidence.confidence import AMBIGUOUS
 from ..confidence.occlusion import occlusion_mask
 from ..geometry.pose import Array, Pose
+from ..jobs.threads import Workers
 from ..panorama import Panorama, ReadOptions, read_panorama
 from ..panorama.model import shrink
-from ..render.field import cut
-from ..render.surfel_renderer import encode_image, fill_holes, render_surfels, visible_indices
-from ..render.surfels import Surfels
-from ..render.zbuffer import View
 from ..result import Result
-from ..runtime.threads import Workers
+from ..views.field import cut
+from ..views.surfel_renderer import encode_image, fill_holes, render_surfels, visible_indices
+from ..views.surfels import Surfels
+from ..views.zbuffer import View
 
 QUALITY, THUMB_QUALITY = 80, 78  # of JPEG
 THUMB_SIZE, THUMB_FOV_DEG = (256, 160), 100.0

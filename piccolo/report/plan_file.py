@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..coarse_to_fine.scan_map import ScanMap
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
+from ..files.atomic import write_atomically
+from ..files.figure import new_figure
+from ..files.temporary import temporary_folder
 from ..geometry.pose import Array
+from ..optional import import_optional
 from ..panorama.picture import read_picture
-from ..runtime.atomic import write_atomically
-from ..runtime.figure import new_figure
-from ..runtime.optional import import_optional
-from ..runtime.temporary import temporary_folder
+from ..scan_map.scan_map import ScanMap
 from .build import ReportSettings, Task, check_settings, document_of
 from .entries import Entry, Place
 from .plan_path import LEAST_ON_PATH, color_of, is_numbered, segments_of

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import TypedDict, Unpack
 
 from ..cloud.settings import METRES, CloudSettings, UpAxis
-from ..coarse_to_fine.open_map import CachePolicy, open_map
-from ..coarse_to_fine.scan_map import ScanMap
 from ..errors import InputError
+from ..jobs.stopwatch import Stopwatch
+from ..jobs.threads import ProgressCallback, Workers, no_progress, num_cores, progress_to
 from ..query_options import File, refuse_unknown
-from ..runtime.stopwatch import Stopwatch
-from ..runtime.threads import ProgressCallback, Workers, no_progress, num_cores, progress_to
 from ..scan import Scan
+from ..scan_map.open_map import CachePolicy, open_map
+from ..scan_map.scan_map import ScanMap
 from .build import WIDTH, ReportSettings, build_report
 from .entries import read_entries
 from .own_plan import OwnPlan

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..runtime.atomic import is_stream, write_atomically
+from ..files.atomic import is_stream, write_atomically
 
 INDEX = "index.html"
 PAGE_FILES = ("app.js", "app.css")

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ..errors import InputError
+from ..files.temporary import temporary_folder
 from ..panorama.video import frames_at
-from ..runtime.temporary import temporary_folder
 
 FRAME = re.compile(r"(?P<video>.+)#t=(?P<time>\d+\.\d{3})", re.DOTALL)
 

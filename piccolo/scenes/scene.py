@@ -13,10 +13,10 @@ import numpy as np
 from ..camera import Calibration, Mount
 from ..camera.files import document_of, mounts_of
 from ..errors import InputError
+from ..files.atomic import write_atomically
+from ..files.json_file import DAMAGE, describe, read_json
 from ..geometry.pose import Pose, checked_rotation
 from ..geometry.sphere import CONVENTION
-from ..runtime.atomic import write_atomically
-from ..runtime.json_file import DAMAGE, describe, read_json
 
 QUERIES_NAME = "queries.json"
 CLOUD_NAME = "cloud.ply"

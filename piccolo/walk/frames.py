@@ -8,12 +8,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..coarse_to_fine.scan_map import ScanMap
 from ..confidence.alternatives import MAX_ALTERNATIVES
 from ..confidence.covariance import PoseCovariance
 from ..confidence.localization import Localization
 from ..errors import InputError
 from ..geometry.pose import Array, Pose
+from ..scan_map.scan_map import ScanMap
 
 How = Literal["alone", "near", "tracked", "none"]
 MOST_ODDS = 8.0  # [log] that one frame may add: what is surer is not so of errors that no model has

@@ -6,13 +6,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..coarse_to_fine.camera_positions import BLOCK
-from ..coarse_to_fine.candidate_views import SEARCH_VIEW
-from ..coarse_to_fine.scan_map import ScanMap
-from ..coarse_to_fine.view import ranges_around
 from ..geometry.pose import Array
 from ..geometry.sphere import cell_of
-from ..runtime.threads import Workers
+from ..jobs.threads import Workers
+from ..scan_map.scan_map import ScanMap
+from ..views.candidate_views import SEARCH_VIEW
+from ..views.view import BLOCK, ranges_around
 
 REACH = 0.95  # [m] between neighbours in the grid of candidates, 0.6 m wide: across edges, not all corners
 SLACK = 0.1  # [m] by which a surface may be nearer than a neighbour, as views are coarse

@@ -7,16 +7,16 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..coarse_to_fine.config import METHOD
-from ..coarse_to_fine.first_look import CLEAR_SCORE
-from ..coarse_to_fine.localize import localize
-from ..coarse_to_fine.query import Query, prepare_query
 from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED
+from ..jobs.blas import one_blas_thread
+from ..jobs.stopwatch import Stopwatch
+from ..jobs.threads import Progress, no_progress
+from ..localization.config import METHOD
+from ..localization.first_look import CLEAR_SCORE
+from ..localization.localize import localize
+from ..localization.query import Query, prepare_query
 from ..panorama import Panorama
-from ..runtime.blas import one_blas_thread
-from ..runtime.stopwatch import Stopwatch
-from ..runtime.threads import Progress, no_progress
 from .frames import MAX_STEP, Frame, Motion, State, centers_of, states_of
 from .path import REACH_SLACK, Path, lattice_of, places_of
 from .tracker import MAX_RADIUS, Follower, Tracker, follow, followed, least_score

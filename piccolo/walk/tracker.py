@@ -6,18 +6,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..coarse_to_fine.first_look import CLEAR_SCORE
-from ..coarse_to_fine.localize import localize
-from ..coarse_to_fine.prior import apply_prior
-from ..coarse_to_fine.query import Query, prepare_query
-from ..coarse_to_fine.scan_map import ScanMap
-from ..coarse_to_fine.settings import CoarseToFineSettings
 from ..confidence.alternatives import Hypothesis
 from ..geometry.pose import Pose
+from ..jobs.blas import one_blas_thread
+from ..jobs.stopwatch import Stopwatch
+from ..jobs.threads import Workers
+from ..localization.first_look import CLEAR_SCORE
+from ..localization.localize import localize
+from ..localization.prior import apply_prior
+from ..localization.query import Query, prepare_query
+from ..localization.settings import CoarseToFineSettings
 from ..panorama import Panorama
-from ..runtime.blas import one_blas_thread
-from ..runtime.stopwatch import Stopwatch
-from ..runtime.threads import Workers
+from ..scan_map.scan_map import ScanMap
 from .frames import MAX_STEP, NO_ACCELERATION, Frame, Motion, State, centers_of, states_of
 from .free_space import FreeSpace
 from .path import REACH_SLACK, Lattice

@@ -5,12 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..coarse_to_fine.covariance import estimate_covariance
-from ..coarse_to_fine.descent import FULL_LOSS, descend
-from ..coarse_to_fine.first_look import FIRST_BEAM, first_query, is_rather_mirrored, mirror_score
-from ..coarse_to_fine.prior import apply_prior
-from ..coarse_to_fine.query import Query
-from ..coarse_to_fine.refinement import (
+from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE, Hypothesis, suppressed
+from ..confidence.confidence import posterior
+from ..geometry.pose import Pose, exp_so3, log_so3, pose_errors
+from ..geometry.rotations import Gravity
+from ..localization.covariance import estimate_covariance
+from ..localization.descent import FULL_LOSS, descend
+from ..localization.first_look import FIRST_BEAM, first_query, is_rather_mirrored, mirror_score
+from ..localization.prior import apply_prior
+from ..localization.query import Query
+from ..localization.refinement import (
     compared,
     descend_fine,
     descend_middle,
@@ -19,14 +23,10 @@ from ..coarse_to_fine.refinement import (
     points_at,
     refine,
 )
-from ..coarse_to_fine.search import search_poses
-from ..coarse_to_fine.search_result import found_among
-from ..coarse_to_fine.settings import Prior
-from ..coarse_to_fine.standings import standings_of
-from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE, Hypothesis, suppressed
-from ..confidence.confidence import posterior
-from ..geometry.pose import Pose, exp_so3, log_so3, pose_errors
-from ..geometry.rotations import Gravity
+from ..localization.search import search_poses
+from ..localization.search_result import found_among
+from ..localization.standings import standings_of
+from ..scan_map.prior import Prior
 from .frames import OTHER_LOG_ODDS, State, log_ratio
 
 LEAST_SCORE = 0.2  # of a frame that is tracked

@@ -16,12 +16,12 @@ from piccolo.batch.priors import read_priors
 from piccolo.camera.files import read_cameras, read_rig
 from piccolo.cloud import FORMATS
 from piccolo.cloud.readers.reader import PLAIN
-from piccolo.coarse_to_fine.map_file import load_map
-from piccolo.coarse_to_fine.settings import Prior
 from piccolo.errors import InputError
 from piccolo.panorama import read_panorama
 from piccolo.panorama.photo import photo_of
 from piccolo.result import Result
+from piccolo.scan_map.map_file import load_map
+from piccolo.scan_map.prior import Prior
 from piccolo.scenes.scene import read_scene
 
 READERS = {suffix[1:]: form.open_source for form in FORMATS for suffix in form.suffixes}

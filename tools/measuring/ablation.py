@@ -10,18 +10,18 @@ import numpy as np
 
 from piccolo.cloud import read_cloud
 from piccolo.cloud.stream import Cloud
-from piccolo.coarse_to_fine.candidate_views import SEARCH_VIEW
-from piccolo.coarse_to_fine.config import METHOD, Beam, ImageScales, MethodConfig
-from piccolo.coarse_to_fine.localize import localize
-from piccolo.coarse_to_fine.scan_map import prepare_map
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings
-from piccolo.coarse_to_fine.view import ViewConfig
 from piccolo.geometry.pose import is_correct
 from piccolo.geometry.rotations import Gravity
+from piccolo.jobs.stopwatch import Stopwatch
+from piccolo.jobs.threads import Workers, num_cores
+from piccolo.localization.config import METHOD, Beam, ImageScales, MethodConfig
+from piccolo.localization.localize import localize
+from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import read_panorama
-from piccolo.runtime.stopwatch import Stopwatch
-from piccolo.runtime.threads import Workers, num_cores
+from piccolo.scan_map.scan_map import prepare_map
 from piccolo.scenes.scene import Scene, read_scene
+from piccolo.views.candidate_views import SEARCH_VIEW
+from piccolo.views.view import ViewConfig
 
 EPILOG = """\
 example:

@@ -27,9 +27,9 @@ from piccolo.confidence.confidence import (
     posterior,
 )
 from piccolo.confidence.covariance import PoseCovariance
+from piccolo.files.json_file import parse_lines, read_bytes
 from piccolo.geometry.pose import Pose, is_correct, log_so3
 from piccolo.result import Result
-from piccolo.runtime.json_file import parse_lines, read_bytes
 
 EPILOG = """\
 example:

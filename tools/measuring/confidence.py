@@ -15,17 +15,17 @@ from piccolo.cli.errors import print_note
 from piccolo.cloud import CloudStream, read_cloud, stream_of
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import IN_METRES
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.confidence.confidence import AMBIGUOUS, LOCALIZED
 from piccolo.geometry.pose import Pose, is_correct
 from piccolo.geometry.rotations import Gravity
+from piccolo.jobs.stopwatch import Stopwatch
+from piccolo.jobs.threads import Workers, num_cores
+from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.opening import scan_of
 from piccolo.panorama import AS_STORED, read_panorama
 from piccolo.paper.settings import PaperSettings
 from piccolo.query_options import Settings
 from piccolo.result import Result
-from piccolo.runtime.stopwatch import Stopwatch
-from piccolo.runtime.threads import Workers, num_cores
 from piccolo.scenes.scene import Scene, read_scene
 from piccolo.scenes.synthetic.world import (
     VARIANTS,

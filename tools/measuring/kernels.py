@@ -16,10 +16,10 @@ from piccolo.cloud.soa import PackedPoints, pack_points
 from piccolo.cloud.voxels import morton_order
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, yaw_rotation
+from piccolo.jobs.threads import num_cores
 from piccolo.optimize.sampling_loss import sampling_equations, sampling_loss
 from piccolo.panorama import read_panorama
 from piccolo.panorama.texels import pack_texels
-from piccolo.runtime.threads import num_cores
 
 EPILOG = """\
 example:

@@ -16,15 +16,15 @@ from piccolo.cli.command import option
 from piccolo.cli.errors import UsageError
 from piccolo.cloud import Cloud, read_cloud, stream_of
 from piccolo.cloud.readers.reader import RawCloud
-from piccolo.coarse_to_fine.localize import localize
-from piccolo.coarse_to_fine.map_file import load_map, save_map
-from piccolo.coarse_to_fine.scan_map import ScanMap, prepare_map
-from piccolo.coarse_to_fine.settings import CoarseToFineSettings
 from piccolo.geometry.pose import Pose, is_correct
 from piccolo.geometry.rotations import Gravity
+from piccolo.jobs.stopwatch import Stopwatch
+from piccolo.jobs.threads import Workers, num_cores
+from piccolo.localization.localize import localize
+from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import Panorama, read_panorama
-from piccolo.runtime.stopwatch import Stopwatch
-from piccolo.runtime.threads import Workers, num_cores
+from piccolo.scan_map.map_file import load_map, save_map
+from piccolo.scan_map.scan_map import ScanMap, prepare_map
 from piccolo.scenes.scene import read_scene
 from piccolo.scenes.synthetic.world import make_query, make_world, scan_world
 

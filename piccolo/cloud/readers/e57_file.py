@@ -18,7 +18,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...geometry.pose import Array, Pose, rotation_from_quaternion_wxyz
-from ...runtime.optional import import_optional
+from ...optional import import_optional
 from .reader import quoted
 
 MAGIC = b"ASTM-E57"

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...runtime.optional import import_optional
+from ...optional import import_optional
 from .reader import quoted
 
 MAGIC = b"LASF"

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
-from ...runtime.optional import import_optional
+from ...optional import import_optional
 from .mesh_files import FolderResolver, Texture, check_image, first_line, own_limit, texture_of
 from .mesh_gltf import GLB_MAGIC, Material, sanitize_gltf
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...runtime.array_archive import MAX_HEAD_SIZE, read_header
+from ...files.array_archive import MAX_HEAD_SIZE, read_header
 from .columns import BRIGHTEST, brightest_of, colored_chunks, in_chunks, read_records
 from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, point_label, quoted
 

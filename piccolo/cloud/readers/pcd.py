@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...runtime.jit import inline_kernel, kernel
+from ...kernels.jit import inline_kernel, kernel
 from .columns import (
     ColumnReader,
     Columns,

@@ -12,9 +12,9 @@ from ...cloud.octree import build_octree
 from ...cloud.soa import pack_points
 from ...confidence.score import VIEW_WIDTH, agreement_at
 from ...geometry.pose import Array, Pose
+from ...jobs.threads import Progress, Workers, no_progress
 from ...panorama import read_panorama
 from ...panorama.model import shrink
-from ...runtime.threads import Progress, Workers, no_progress
 from ..scene import Query, Scene
 from .files import AXES
 

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from ...cloud import FORMATS
 from ...cloud.stream import MAX_COORDINATE
 from ...errors import InputError
+from ...files.atomic import write_atomically
+from ...files.json_file import read_text
 from ...geometry.pose import Array, Pose, checked_rotation, orthonormal
 from ...geometry.rotations import CAMERA_AXES, OPENGL_FROM_CAM
 from ...panorama.picture import read_picture
-from ...render.surfel_renderer import encode_image
-from ...runtime.atomic import write_atomically
-from ...runtime.json_file import read_text
+from ...views.surfel_renderer import encode_image
 from .model import Labels
 
 SUFFIXES = frozenset().union(*(f.suffixes for f in FORMATS)) - {".csv"}  # as these hold poses too

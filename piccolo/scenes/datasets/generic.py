@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import InputError
+from ...files.json_file import read_json, read_text
 from ...geometry.pose import Pose, rotation_from_quaternion_wxyz
-from ...runtime.json_file import read_json, read_text
 from .files import AXES, DIRECTIONS, WORLD_FROM_CAM, only_cloud_in, pose_of_transform
 from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import InputError
-from ...runtime.json_file import read_json
+from ...files.json_file import read_json
 from .files import WORLD_FROM_CAM, only_cloud_in, pose_of_transform
 from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec, scene_list
 

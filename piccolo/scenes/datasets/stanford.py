@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ...errors import InputError
+from ...files.json_file import read_json
 from ...geometry.pose import Array, Pose
-from ...runtime.json_file import read_json
 from .files import checked_pose, labels_by_index
 from .model import CloudPart, ConvertOptions, PosedPanorama, RigidTransform, SceneList, SceneSpec, scene_list
 

@@ -15,8 +15,8 @@ from ...cloud.ply_writer import vertex_rows, writing_ply
 from ...cloud.readers.reader import CHUNK
 from ...cloud.stream import Chunk, PointValidator
 from ...errors import InputError, unreadable
-from ...runtime.atomic import check_output_folder, replacing_folder
-from ...runtime.threads import Progress, no_progress
+from ...files.atomic import check_output_folder, replacing_folder
+from ...jobs.threads import Progress, no_progress
 from ..scene import CLOUD_NAME, QUERIES_NAME, Query, read_scene, write_queries
 from .files import write_labels
 from .model import PosedPanorama, SceneSpec

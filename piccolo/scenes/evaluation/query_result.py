@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ...errors import InputError, printable
+from ...files.json_file import document_of
 from ...geometry.pose import MAX_ANGLE, MAX_DISTANCE, Array, Pose, pose_errors
 from ...result import Result
-from ...runtime.json_file import document_of
 from ...scan import Scan
 from ..scene import Query, Scene
 

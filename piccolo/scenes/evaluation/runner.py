@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 from ...batch.localizer import Localizer, Task
 from ...errors import InputError
+from ...files.atomic import check_output
+from ...files.json_file import parse_lines, read_bytes
+from ...files.line_file import appending, whole_size
+from ...jobs.tasks import Executor, WorkerLostError
+from ...jobs.threads import Progress, Workers, no_progress
 from ...result import UNREADABLE, failure_of
-from ...runtime.atomic import check_output
-from ...runtime.json_file import parse_lines, read_bytes
-from ...runtime.line_file import appending, whole_size
-from ...runtime.tasks import Executor, WorkerLostError
-from ...runtime.threads import Progress, Workers, no_progress
 from ...scan import Scan, settings_json
 from ..scene import QUERIES_NAME, Query, Scene
 from .query_result import FORMAT, QueryResult, is_in_box, query_result_of

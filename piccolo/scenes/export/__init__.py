@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ...errors import InputError
+from ...files.atomic import check_output, check_output_folder
 from ...result import Result
-from ...runtime.atomic import check_output, check_output_folder
 from .formats import COLMAP, CSV, KITTI, NERFSTUDIO, OPENSFM, POTREE, TUM
 from .gpano import GPANO
 from .posed_images import Format, LeftOut, Options, Selection, posed_images, select, true_results

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import InputError
+from ...files.atomic import is_stream, replacing_folder, write_atomically
 from ...geometry.pose import Pose, T_world_from_cam, log_so3, quaternion_wxyz
 from ...geometry.rotations import (
     CAMERA_AXES,
@@ -23,7 +24,6 @@ from ...geometry.rotations import (
     translation,
     turned,
 )
-from ...runtime.atomic import is_stream, replacing_folder, write_atomically
 from .posed_images import NO_UTF8, Format, Options, PosedImage
 
 COLUMNS = (

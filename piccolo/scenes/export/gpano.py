@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ...errors import InputError
+from ...files.atomic import replacing_folder, write_atomically
+from ...files.json_file import read_bytes
 from ...geometry.rotations import DECIMALS, heading_pitch_roll_deg
 from ...panorama.gpano import CROP_FIELDS, NAMESPACE, PREFIX
 from ...panorama.picture import WANTED, opened
-from ...runtime.atomic import replacing_folder, write_atomically
-from ...runtime.json_file import read_bytes
 from .posed_images import Format, Options, PosedImage, check_size
 
 JPEG_MAGIC = b"\xff\xd8"

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...runtime.atomic import replacing
-from ...runtime.optional import import_optional
+from ...files.atomic import replacing
+from ...optional import import_optional
 
 QUALITY = "18"  # CRF of H.264: nothing to be seen is lost
 MAX_DENOMINATOR = 1001  # of a frame rate

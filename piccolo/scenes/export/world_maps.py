@@ -8,9 +8,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ...errors import InputError, printable
+from ...files.atomic import write_atomically
 from ...geometry.rotations import heading_pitch_roll_deg
-from ...runtime.atomic import write_atomically
-from ...runtime.optional import import_optional
+from ...optional import import_optional
 from .formats import write_json
 from .posed_images import Format, Options, PosedImage
 

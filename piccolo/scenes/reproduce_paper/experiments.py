@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...coarse_to_fine.settings import CoarseToFineSettings
+from ...files.figure import new_figure
+from ...localization.settings import CoarseToFineSettings
 from ...paper.settings import PaperSettings
-from ...runtime.figure import new_figure
 from ..evaluation.plots import figure_png
 from ..evaluation.query_result import QueryResult
 from ..evaluation.tables import Table, summarize

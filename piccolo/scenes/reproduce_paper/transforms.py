@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from ...cloud import read_cloud
 from ...cloud.ply_writer import vertex_rows, write_ply
 from ...errors import InputError
+from ...files.atomic import write_atomically
 from ...geometry.pose import Array, Pose
 from ...geometry.rotations import random_rotation
 from ...panorama import read_panorama
-from ...runtime.atomic import write_atomically
 from ..datasets.model import RigidTransform
 from ..scene import CLOUD_NAME, Query, Scene
 

@@ -11,7 +11,7 @@ from ...camera import Calibration, Mount
 from ...camera.rig import extent_of
 from ...errors import InputError
 from ...geometry.pose import Pose
-from ...runtime.threads import Workers
+from ...jobs.threads import Workers
 from .raycast import cast_rays
 from .room import Room
 from .world import World, other_light, pose_of_query

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry.pose import Array
-from ...runtime.jit import inline_kernel, kernel
-from ...runtime.threads import Workers
+from ...jobs.threads import Workers
+from ...kernels.jit import inline_kernel, kernel
 from .room import Room
 
 AMBIENT, LAMP, LAMP_DECAY = 0.55, 0.9, 0.15  # of a surface's colour; the decay [1/m2]

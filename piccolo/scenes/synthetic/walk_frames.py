@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.pose import Array, Pose
-from ...runtime.threads import Workers
+from ...jobs.threads import Workers
 from .office import Office
 from .room import CHECKS, PLAIN, STRIPES, Room, RoomBuilder
 from .walking import Walk

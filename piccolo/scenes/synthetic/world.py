@@ -16,7 +16,7 @@ from ...errors import InputError
 from ...geometry.pose import Array, Pose, exp_so3, yaw_rotation
 from ...geometry.rotations import uniform_rotations
 from ...geometry.sphere import pixel_rays
-from ...runtime.threads import Workers
+from ...jobs.threads import Workers
 from .raycast import cast_rays
 from .room import Room, make_room
 

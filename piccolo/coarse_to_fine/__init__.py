@@ -1,1 +1,0 @@
-"""The default engine: a prepared map of views, one search over all of them, descent on normalised colours."""

@@ -1,0 +1,1 @@
+"""Threads, processes, other machines, and their memory."""

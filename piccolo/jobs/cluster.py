@@ -1,0 +1,222 @@
+"""Items worked on by a Dask cluster, whose scheduler gives what a lost worker had to others."""
+
+import json
+import logging
+import pickle
+import signal
+import socket
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import ExitStack, contextmanager, suppress
+from functools import lru_cache
+from multiprocessing import resource_tracker
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from .. import __version__
+from ..errors import InputError
+from ..optional import import_optional
+from .processes import IN_FLIGHT, LIBRARIES
+from .tasks import Function, InFlight, Opening, WorkerLostError
+
+LOCAL = "local"
+HOST = "127.0.0.1"  # of the scheduler and workers of "local"
+TIMEOUT = 10.0  # [s] for a scheduler to answer, and for a first worker to be there
+LEAST_IN_FLIGHT = 64  # as workers may come later
+KEPT_OPEN = 2  # functions of a worker, when several commands use it
+ENVIRONMENT = "distributed.nanny.pre-spawn-environ"
+LOGGING = dict.fromkeys(("distributed", "distributed.client", "distributed.gc"), "critical")
+SETTINGS = {
+    "logging": LOGGING,
+    "distributed.worker.profile.enabled": False,  # samples of all stacks, a hundred a second
+    "distributed.scheduler.worker-saturation": 1.0,  # none waits behind another whose worker may be lost
+}
+NO_SCHEDULER = f"--dask {{}}: no scheduler answers there within {TIMEOUT:.0f} s ({{}}); wanted "
+NO_SCHEDULER += f"its address, such as tcp://host:8786, the file that it has written, or {LOCAL}"
+_opening = threading.Lock()
+
+
+@contextmanager
+def connected(address: str, num_processes: int, num_threads: int) -> Iterator["Cluster"]:
+    """The cluster of a scheduler's address or file; or of so many processes here, if it is "local".
+
+    Raises
+    ------
+    InputError
+        dask.distributed is missing, no scheduler answers, or it has no worker with this version of piccolo.
+    """
+    import_optional("--dask", "dask", "distributed").config.set(SETTINGS)
+    distributed = import_optional("--dask", "distributed", "distributed")
+    with ExitStack() as stack:
+        if address == LOCAL:
+            scheduler = stack.enter_context(_local_cluster(distributed, num_processes, num_threads))
+        else:
+            scheduler = _scheduler_at(address)
+        try:
+            client = stack.enter_context(distributed.Client(scheduler, timeout=TIMEOUT, set_as_default=False))
+        except OSError as error:
+            raise InputError(NO_SCHEDULER.format(address, error)) from error
+        cluster = Cluster(address, client, distributed)
+        cluster.check_workers()
+        try:
+            yield cluster
+        finally:
+            cluster.forget()
+
+
+def _scheduler_at(address: str) -> str:
+    """The URL of the scheduler at an address or in the file that it has written, where something listens."""
+    try:
+        if Path(address).is_file():
+            address = str(json.loads(Path(address).read_bytes())["address"])
+        url = urlsplit(address if "://" in address else f"tcp://{address}")
+        with socket.create_connection((url.hostname, url.port or 0), TIMEOUT) as connection:
+            if url.scheme == "tcp" and not connection.recv(1):  # for which a client would wait for ever
+                raise OSError("it says nothing")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(NO_SCHEDULER.format(address, error)) from error
+    return url.geturl()
+
+
+@contextmanager
+def _local_cluster(distributed: Any, num_processes: int, num_threads: int) -> Iterator[str]:
+    """The address of a scheduler in this process, with workers in others that end with it."""
+    # In place of Dask's own, of which MALLOC_TRIM_THRESHOLD_ makes large arrays slow.
+    environment = dict.fromkeys(LIBRARIES, str(num_threads))
+    import_optional("--dask", "dask", "distributed").config.set({ENVIRONMENT: environment})
+    resource_tracker.ensure_running()  # which unblocks signals in the thread that begins it
+    # What this thread blocks, its children do: Ctrl-C is for this process, and not for the others.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        cluster = distributed.LocalCluster(
+            n_workers=num_processes,
+            threads_per_worker=1,
+            processes=True,
+            host=HOST,
+            dashboard_address=None,
+            memory_limit=0,  # piccolo itself refuses what is too much
+            silence_logs=logging.CRITICAL,
+        )
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    with cluster:
+        yield cluster.scheduler_address
+
+
+class Cluster:
+    """The workers of a scheduler."""
+
+    def __init__(self, address: str, client: Any, distributed: Any) -> None:
+        self.address, self._client, self._distributed = address, client, distributed
+        self._sent: list[str] = []  # names of files
+
+    def check_workers(self) -> None:
+        """Refuse a cluster without workers, or with one of another version."""
+        try:
+            self._client.wait_for_workers(1, TIMEOUT)
+            versions = set(self._client.run(_version).values())
+        except TimeoutError as error:
+            text = f"found a scheduler without workers for {TIMEOUT:.0f} s, wanted one at least"
+            raise InputError(f"--dask {self.address}: {text}") from error
+        except Exception as error:  # of a worker, in words
+            text = f"a worker can't run piccolo ({error}); install version {__version__} there"
+            raise InputError(f"--dask {self.address}: {text}") from error
+        if odd := sorted(versions - {__version__}):
+            text = f"found a worker with piccolo {odd[0]}, wanted {__version__} as here"
+            raise InputError(f"--dask {self.address}: {text}")
+
+    def has_files(self, paths: Sequence[Path]) -> bool:
+        """True if all workers see the files."""
+        return all(self._client.run(_are_files, [str(path) for path in paths]).values())
+
+    def send_file(self, path: Path) -> None:
+        """Send a file to each worker, those that come later too: `sent_file` finds it there by its name."""
+        plugin = self._distributed.diagnostics.plugin.UploadFile(str(path), load=False)
+        self._client.register_plugin(plugin, name=path.name)
+        self._sent.append(path.name)
+
+    def forget(self) -> None:
+        """Let the workers, which go on, drop what was sent and opened; nothing if they are lost."""
+        if self.address != LOCAL and self._client.status == "running":
+            with suppress(OSError, self._distributed.client.FutureCancelledError):
+                for name in self._sent:
+                    self._client.unregister_worker_plugin(name)
+                self._client.run(_forget, self._sent)
+
+    def executor(self, opening: Opening) -> "ClusterExecutor":
+        """What works on items by the function that `opening` gives."""
+        return ClusterExecutor(self.address, self._client, self._distributed, opening)
+
+
+def sent_file(name: str) -> Path:
+    """Where a worker has what `Cluster.send_file` has sent it."""
+    worker = import_optional("--dask", "distributed", "distributed").get_worker()
+    return Path(worker.local_directory) / name
+
+
+class ClusterExecutor:
+    """Works on items by a cluster's workers, of which each process opens once what it works with."""
+
+    def __init__(self, address: str, client: Any, distributed: Any, opening: Opening) -> None:
+        self.address, self.client, self.distributed = address, client, distributed
+        self._opening = pickle.dumps(opening)
+
+    def values(self, items: Iterator[Any]) -> InFlight:
+        """Begin with the items."""
+        num_threads = sum(self.client.nthreads().values())
+        return InFlight(self._submit, items, max(LEAST_IN_FLIGHT, IN_FLIGHT * num_threads))
+
+    def _submit(self, item: object) -> "Submitted":
+        return Submitted(self, self.client.submit(value_of, self._opening, item, pure=False))
+
+
+class Submitted:
+    """The value of an item that a cluster has."""
+
+    def __init__(self, executor: ClusterExecutor, future: Any) -> None:
+        self._executor, self._future = executor, future
+
+    def done(self) -> bool:
+        """True if `result` does not wait."""
+        return bool(self._future.done())
+
+    def result(self) -> Any:
+        """Wait for the value; or for what the function raised, or WorkerLostError, which are raised."""
+        own = self._executor
+        try:
+            return self._future.result()
+        except own.distributed.scheduler.KilledWorker as error:
+            count = error.allowed_failures + 1
+            raise WorkerLostError(f"each of {count} workers of the cluster was lost at work on it") from error
+        except (own.distributed.client.FutureCancelledError, CancelledError) as error:
+            text = f"--dask {own.address}: the scheduler was lost; the same command goes on from here"
+            raise InputError(text) from error
+
+
+@lru_cache(KEPT_OPEN)
+def _function(opening: bytes) -> Function:
+    opened: Function = pickle.loads(opening)()
+    return opened
+
+
+def value_of(opening: bytes, item: object) -> Any:
+    """What a worker does with an item."""
+    with _opening:  # once, however many threads the worker has
+        function = _function(opening)
+    return function(item)
+
+
+def _forget(names: Sequence[str], dask_worker: Any) -> None:
+    _function.cache_clear()
+    for name in names:
+        (Path(dask_worker.local_directory) / name).unlink(missing_ok=True)
+
+
+def _version() -> str:
+    return __version__
+
+
+def _are_files(paths: Sequence[str]) -> bool:
+    return all(Path(path).is_file() for path in paths)

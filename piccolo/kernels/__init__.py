@@ -1,0 +1,1 @@
+"""Compiling with Numba, once a machine."""

@@ -1,0 +1,1 @@
+"""The default method: where in a prepared scan a panorama was taken."""

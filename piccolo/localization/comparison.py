@@ -1,0 +1,182 @@
+"""The scan at a pose and the photo compared block by block of the sphere, over what both show.
+
+An occluder costs what it hides and no more: a right pose explains some blocks well and the rest not at all, a
+wrong one explains all of them a little.
+"""
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.pose import Pose
+from ..geometry.sphere import BLOCK_RINGS, cell_of, make_grid, pixel_rays
+from ..kernels.jit import F0, copy_to, kernel
+from ..optimize.channel_loss import CHANCE, NUM_BLOCKS
+from ..panorama.local_normalization import opponent, zscore
+from ..panorama.projection import CHUNK, gather, make_projected, project
+from ..panorama.texels import bilinear_weights, blend, is_valid
+from ..views.cells import average_colors, local_statistics, locate
+from ..views.recent_views import place_of
+from ..views.view import empty_cells
+from .query import Query
+
+CONTRADICTS = 0.1  # a block of less is left out of the local means and deviations
+LEAST_SHARED = 0.3  # of what the poorer view shows
+MASK_WIDTH = 256  # [px] of the mask of blocks that contradict
+PER_LEVEL = np.float32(1.0 / 255.0)
+
+
+class Comparison(NamedTuple):
+    """What speaks for a pose, by blocks of the photo."""
+
+    correlation: NDArray[np.float64]  # (blocks,) of locally normalised colours, 0 where nothing is shared
+    area: NDArray[np.float64]  # (blocks,) fractions of the sphere that both show and do not contradict
+    visible_area: NDArray[np.float64]  # (blocks,) that both show
+    valid_area: float  # of the sphere that the photo shows
+
+    @property
+    def score(self) -> float:
+        """What blocks explain beyond chance, by what the photo shows, in [0, 1]."""
+        beyond = np.maximum(self.correlation - CHANCE, 0.0) / (1.0 - CHANCE)
+        return float(beyond @ self.area) / max(self.valid_area, 1e-9)
+
+    def ratio_to(self, other: "Comparison") -> float:
+        """What this pose explains by what another does, over the blocks that both views show.
+
+        Over all blocks, a pose from which more was scanned would gain by that alone. 0 where hardly any is
+        shared.
+        """
+        shared = np.minimum(self.visible_area, other.visible_area)
+        if shared.sum() < LEAST_SHARED * min(self.visible_area.sum(), other.visible_area.sum()):
+            return 0.0
+        mine, others = (np.maximum(c.correlation - CHANCE, 0.0) @ shared for c in (self, other))
+        return float(mine / max(others, 1e-9))
+
+
+@kernel
+def sample_photo(offsets, weights, photo, R_cam_from_map, center, colors, shared, rays):
+    """Write the photo's opponent channels (3, N) at cells (3, N), weights of what both show, rays (3, N).
+
+    `center` (3,) [m] of the camera counts from where the offsets of the cells do.
+    """
+    (texels, width), p = photo, make_projected()
+    for lo in range(0, len(weights), CHUNK):
+        hi = min(lo + CHUNK, len(weights))
+        project(offsets[0][lo:hi], offsets[1][lo:hi], offsets[2][lo:hi], R_cam_from_map, center, width, p)
+        gather(texels, width, p, hi - lo)
+        c0, c1, c2, both = colors[0][lo:hi], colors[1][lo:hi], colors[2][lo:hi], shared[lo:hi]
+        weight, count = weights[lo:hi], hi - lo
+        for n in range(count):
+            bilinear = bilinear_weights(p.fu[n], p.fv[n])
+            t00, t10, t01, t11 = p.t00[n], p.t10[n], p.t01[n], p.t11[n]
+            r = blend(t00, t10, t01, t11, bilinear, 0) * PER_LEVEL
+            g = blend(t00, t10, t01, t11, bilinear, 8) * PER_LEVEL
+            b = blend(t00, t10, t01, t11, bilinear, 16) * PER_LEVEL
+            c0[n], c1[n], c2[n] = opponent(r, g, b)
+            both[n] = weight[n] * is_valid(t00, t10, t01, t11)
+        copy_to(rays[0][lo:hi], p.x[:count])
+        copy_to(rays[1][lo:hi], p.y[:count])
+        copy_to(rays[2][lo:hi], p.z[:count])
+
+
+@kernel
+def normalize(colors, shared, view, normalized):
+    """Write channels (3, N) less their local mean, by their local deviation, over the shared cells."""
+    moments, stats = np.zeros((view.num_stats, 8), np.float32), np.empty((6, len(shared)), np.float32)
+    for n in range(len(shared)):
+        m, w = moments[view.stats_cell[n]], shared[n]
+        m[0] += w
+        for k in range(3):
+            m[1 + k] += w * colors[k, n]
+            m[4 + k] += w * colors[k, n] * colors[k, n]
+    local_statistics(moments, view, shared, stats)
+    for k in range(3):
+        for n in range(len(shared)):
+            normalized[k, n] = zscore(colors[k, n], stats[k, n], stats[3 + k, n]) if shared[n] > F0 else F0
+
+
+@kernel
+def correlate_blocks(first, second, shared, blocks, correlation, area):
+    """Write the correlation and the area (blocks,) of two sets of channels (3, N) over the shared cells."""
+    energy = np.zeros((len(area), 2))
+    correlation[:] = 0.0
+    area[:] = 0.0
+    for n in range(len(shared)):
+        b, w = blocks[n], shared[n]
+        area[b] += w
+        for k in range(3):
+            correlation[b] += w * first[k, n] * second[k, n]
+            energy[b, 0] += w * first[k, n] * first[k, n]
+            energy[b, 1] += w * second[k, n] * second[k, n]
+    for b in range(len(area)):
+        correlation[b] /= math.sqrt(max(energy[b, 0] * energy[b, 1], 1e-12))
+
+
+@kernel
+def compare_cells(
+    offsets, colors, weights, photo, R_cam_from_map, center, view, grid, correlation, area, visible_area
+):
+    """Write the correlation and the shared area (blocks,) of cells (3, N) around a camera with its photo.
+
+    Blocks are cells of a grid of `num_columns`, `first` in the camera's frame. Those that contradict are left
+    out of the local means and deviations, and all is taken anew.
+    """
+    of_photo, shared, n = np.empty_like(colors), np.empty_like(weights), len(weights)
+    rays, blocks = np.empty_like(colors), np.empty(n, np.int32)
+    sample_photo(offsets, weights, photo, R_cam_from_map, center, of_photo, shared, rays)
+    ranges, turns = np.empty(n, np.float32), np.empty(n, np.float32)
+    locate(rays[0], rays[1], rays[2], grid[0], grid[1], blocks, ranges, turns)
+    first, second, kept = np.empty_like(colors), np.empty_like(colors), shared.copy()
+    for k in range(2):
+        normalize(colors, kept, view, first)
+        normalize(of_photo, kept, view, second)
+        correlate_blocks(first, second, kept, blocks, correlation, area)
+        if k == 0:
+            copy_to(visible_area, area)
+            for i in range(n):
+                if correlation[blocks[i]] < CONTRADICTS:
+                    kept[i] = F0
+
+
+def compare(query: Query, pose: Pose) -> Comparison:
+    """The scan as seen from a pose and the photo, by blocks; worked out once a pose."""
+    if pose.key not in query.comparisons:
+        query.comparisons[pose.key] = _compare(query, pose)
+    found: Comparison = query.comparisons[pose.key]
+    return found
+
+
+def _compare(query: Query, pose: Pose) -> Comparison:
+    config, photo, place = query.method.fine_view, query.photo, place_of(pose)
+    sums, view = query.views.averages(place, config), config.arrays
+    *cells, center = empty_cells(len(sums), place)
+    moments = np.empty((view.num_stats, 8), np.float32)
+    average_colors(sums, view, np.ones(len(sums), np.bool_), *cells, moments)
+    by_block = np.empty(NUM_BLOCKS), np.empty(NUM_BLOCKS), np.empty(NUM_BLOCKS)
+    image, blocks = (photo.rgbx, photo.width), make_grid(BLOCK_RINGS)
+    at, grid = (pose.R_cam_from_world, pose.center_world - center), (blocks.num_columns, blocks.first)
+    compare_cells(*cells, image, *at, view, grid, *by_block)
+    return Comparison(*by_block, photo.valid_share)
+
+
+def without_occluders(query: Query, pose: Pose) -> Query:
+    """The query without the photo's blocks that contradict the scan at a pose; itself if there are none."""
+    seen = compare(query, pose)
+    contradicts = (seen.correlation < CONTRADICTS) & (seen.visible_area > 0.0)
+    if not contradicts.any():
+        return query
+    key = contradicts.tobytes()
+    if key not in query.comparisons:
+        query.comparisons[key] = query.without(contradicts[pixel_blocks()])
+    rest: Query = query.comparisons[key]
+    return rest
+
+
+@lru_cache(maxsize=1)
+def pixel_blocks() -> NDArray[np.int32]:
+    """The block in which each pixel (h, 2 h) of a mask lies."""
+    rays = pixel_rays(MASK_WIDTH).astype(np.float32)
+    return cell_of(rays.reshape(-1, 3), BLOCK_RINGS).reshape(rays.shape[:2])

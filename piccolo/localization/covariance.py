@@ -1,0 +1,187 @@
+"""Covariance of a pose from blocks of the sphere."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..confidence.covariance import PoseCovariance, least_constrained_direction
+from ..geometry.pose import Array, Pose, step
+from ..geometry.sphere import cell_of
+from ..optimize.channel_loss import channel_equations, equations_by_part
+from ..optimize.normal_equations import GRADIENT, MATRIX, NUM_SUMS
+from ..panorama.local_normalization import LEVELS_PER_UNIT
+from ..panorama.texels import Texels
+from ..views.view import Cells
+from .comparison import without_occluders
+from .descent import FULL_LOSS, as_levels
+from .query import Query
+from .refinement import points_at
+
+ERROR_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
+MOST_SHARE = 1.001  # of a block in what fixes the pose, a little above 1 for one that does alone
+PIXEL_SHARE = 0.04  # of a pixel that is left in a pose, by trials with photos of 256 and 2048 px
+UNCALIBRATED_SHARE = 0.15  # the same of a photo whose principal point and distortion nobody measured
+POLE_DEG = 2.0  # around the photo's poles pixels are so narrow that one point's errors outweigh all others
+SCALE = FULL_LOSS * LEVELS_PER_UNIT
+
+
+@dataclass(frozen=True)
+class DifferenceSteps:
+    """At what detail the loss is differentiated for a covariance."""
+
+    image: Literal["full", "fine", "middle"]  # of the query's
+    turn: float  # step of the differences [rad]
+    move: float  # [m]
+    inflation: float  # so that 95 % of true poses lie in the 95 % region (tools/benchmark.py calibration)
+
+
+STEPS = (
+    DifferenceSteps("full", math.radians(0.1), 0.005, 1.1),
+    DifferenceSteps("fine", math.radians(0.3), 0.015, 0.36),
+)
+# of dark, noisy photos; they are too few to calibrate
+ROUGH_STEPS = DifferenceSteps("middle", math.radians(0.3), 0.015, 1.0)
+
+
+def equations_at(image: Texels, points: Cells, pose: Pose) -> tuple[Array, Array]:
+    """Gradient (6,) and Gauss-Newton matrix (6, 6) of the robust loss, in the camera's frame."""
+    sums, center = np.empty(NUM_SUMS), pose.center_world - points.center_map
+    channel_equations((*points[:3], image.rgbx, image.width, SCALE), pose.R_cam_from_world, center, sums)
+    return sums[GRADIENT:MATRIX].copy(), symmetric(sums[MATRIX:])
+
+
+def symmetric(upper: Array) -> Array:
+    """Symmetric matrices (..., 6, 6) of their upper triangles (..., 21), row by row."""
+    matrix = np.zeros((*upper.shape[:-1], 6, 6))
+    rows, columns = np.triu_indices(6)
+    matrix[..., rows, columns] = matrix[..., columns, rows] = upper
+    return matrix
+
+
+def without_poles(points: Cells, pose: Pose) -> Cells:
+    """The points around a pose that are not within POLE_DEG of the photo's poles."""
+    heights, ranges = pose.R_cam_from_world[2] @ points.offsets, np.linalg.norm(points.offsets, axis=0)
+    is_kept = np.abs(heights) < math.cos(math.radians(POLE_DEG)) * ranges
+    offsets, channels, weights = (np.ascontiguousarray(values[..., is_kept]) for values in points[:3])
+    return Cells(offsets, channels, weights, points.center_map)
+
+
+def hessian_at(image: Texels, points: Cells, pose: Pose, steps: DifferenceSteps) -> Array:
+    """Hessian (6, 6) of the robust loss, by central differences over steps as large as errors are.
+
+    The Gauss-Newton matrix leaves out that the loss flattens: with it, deviations come out several times too
+    small.
+    """
+    rows = []
+    for delta in np.diag([steps.turn] * 3 + [steps.move] * 3):
+        after, before = (equations_at(image, points, step(pose, sign * delta))[0] for sign in (1.0, -1.0))
+        rows.append((after - before) / (2.0 * delta.sum()))
+    return np.asarray(0.5 * (np.array(rows) + np.array(rows).T))
+
+
+def equations_by_block(image: Texels, points: Cells, pose: Pose, block: NDArray[np.integer]) -> Array:
+    """Sums (B, 29) of the normal equations over the points (N,) of each block; the camera is their centre."""
+    order, counts = np.argsort(block, kind="stable"), np.bincount(block)
+    offsets, levels, weights = (np.ascontiguousarray(values[..., order]) for values in points[:3])
+    begins, sums = np.concatenate([[0], np.cumsum(counts)]), np.empty((len(counts), NUM_SUMS))
+    problem = offsets, levels, weights, image.rgbx, image.width, SCALE
+    equations_by_part(problem, pose.R_cam_from_world, np.zeros(3), begins, sums)
+    return sums
+
+
+def blocks_of(points: Cells) -> NDArray[np.integer]:
+    """The block (N,) of the sphere in which each point lies."""
+    return cell_of(points.offsets.T / np.linalg.norm(points.offsets, axis=0)[:, None], ERROR_RINGS)
+
+
+def block_gradients(image: Texels, points: Cells, pose: Pose) -> Array:
+    """Gradients (B, 6), in the camera's frame, of the points in each block around it, as if left out."""
+    sums = equations_by_block(image, points, pose, blocks_of(points))
+    shown = sums[sums[:, GRADIENT:MATRIX].any(axis=1)]  # of what the photo shows
+    return as_left_out(shown[:, GRADIENT:MATRIX], symmetric(shown[:, MATRIX:]))
+
+
+def as_left_out(gradients: Array, matrices: Array) -> Array:
+    """Gradients (B, 6) of blocks as they would be at a pose found without the block, by matrices (B, 6, 6).
+
+    The more of what fixes the pose lies in one block, the more the pose has followed its errors, and the less
+    of them its gradient shows: g <- (I - A_b A^-1)^-1 g, of the block's part A_b of the Gauss-Newton matrix A
+    (the estimate CR3 of Bell and McCaffrey, 2002).
+    """
+    shares = matrices @ np.linalg.pinv(matrices.sum(axis=0))
+    return np.asarray(np.linalg.solve(MOST_SHARE * np.eye(6) - shares, gradients[..., None])[..., 0])
+
+
+def covariance_of(hessian: Array, gradients: Array) -> Array | None:
+    """Covariance (6, 6) [rad, m] in the camera's frame, robust to errors that go together within a block.
+
+    The sandwich H^-1 (sum g g^T) H^-1 (Huber 1967; Liang and Zeger 1986 for clusters). None where the points
+    do not fix the pose.
+    """
+    variances, axes = np.linalg.eigh(hessian)
+    if len(gradients) <= 12 or variances[0] <= 1e-9 * variances[-1]:
+        return None
+    inverse = (axes / variances) @ axes.T
+    return np.asarray(inverse @ (gradients.T @ gradients) @ inverse)
+
+
+def covariance_at(query: Query, points: Cells, pose: Pose) -> Array | None:
+    """Covariance (6, 6) [rad, m] in the camera's frame, by the image in which the pose is best determined.
+
+    Noise and stitching roughen the loss in the finest image; the next one is smoother. Where both are too
+    rough, a third tells.
+    """
+
+    def by(steps: DifferenceSteps) -> Array | None:
+        image: Texels = getattr(query.images, steps.image)
+        hessian = hessian_at(image, points, pose, steps)
+        covariance = covariance_of(hessian, block_gradients(image, points, pose))
+        return covariance if covariance is None else steps.inflation * covariance
+
+    found = [c for c in query.workers.map(by, STEPS, "covariance") if c is not None]
+    if not found:
+        return by(ROUGH_STEPS)
+    return min(found, key=lambda c: float(np.linalg.eigvalsh(c[3:, 3:])[-1]))
+
+
+def errors_of_source(query: Query, points: Cells, pixel_share: float) -> Array:
+    """What the errors of the photo and of the scan add to a covariance (6, 6) [rad, m] in the map's axes.
+
+    They go together over many blocks: a photo's grid and stitching by its pixels, a scan's noise and doubled
+    surfaces by what `surface_noise` tells. At the median range an angle and a displacement are one.
+    """
+    median_range = float(np.median(np.linalg.norm(points.offsets, axis=0)))
+    turn, surface = pixel_share * query.pixel, query.scan_map.surface_variance
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = np.eye(3) * (turn**2 + np.trace(surface) / 3.0 / median_range**2)
+    covariance[3:, 3:] = np.eye(3) * (turn * median_range) ** 2 + surface
+    return covariance
+
+
+def estimate_covariance(query: Query, pose: Pose, of_camera: Array | None = None) -> PoseCovariance | None:
+    """The covariance of a pose, in world axes; None where the points do not fix it.
+
+    `of_camera` (6, 6), in the map's axes, is what the uncertainty of the calibration adds.
+    """
+    query = without_occluders(query, pose)
+    points = without_poles(points_at(query, pose).around(pose.center_world), pose)
+    points = points._replace(channels=as_levels(points.channels))
+    covariance = covariance_at(query, points, pose)
+    if covariance is None:
+        return None
+    R_map_from_cam, R_map_from_world = pose.R_cam_from_world.T, query.scan_map.R_map_from_world
+    J = np.eye(6)
+    J[3:, 3:] = R_map_from_cam
+    pixel_share = PIXEL_SHARE if of_camera is None else UNCALIBRATED_SHARE
+    covariance_map = J @ covariance @ J.T + errors_of_source(query, points, pixel_share)
+    std_of_fit = None
+    if of_camera is not None:
+        std_of_fit = math.sqrt(float(np.linalg.eigvalsh(covariance_map[3:, 3:])[-1]))
+        covariance_map += of_camera
+    J[3:, 3:] = R_map_from_world.T
+    covariance_world = J @ covariance_map @ J.T
+    words = least_constrained_direction(covariance_map[3:, 3:], covariance_world[3:, 3:], points.offsets)
+    return PoseCovariance(0.5 * (covariance_world + covariance_world.T), words, std_of_fit)

@@ -1,0 +1,265 @@
+"""The focal length of a photo, fitted with its pose: by the scan, and by what is known of it beforehand.
+
+The photo is put on the sphere anew for each of several focal lengths (and of k1, where a guessed camera has
+it), and the pose refined for each. The losses of these ends are the profile of the loss: its crest is the
+focal length that photo and scan agree on, and how each block of the sphere pulls at the crest is its
+covariance. That of the pose is the marginal one: what a focal length that is off does to a pose is added.
+"""
+
+import itertools
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera import Camera, Mount
+from ..camera.model import MODELS
+from ..confidence.localization import FocalLength
+from ..geometry.pose import Array, Pose, exp_so3, log_so3, rotate_points
+from ..geometry.sphere import indices_of
+from ..optimize.normal_equations import LOSS
+from ..panorama import Panorama
+from ..views.view import Cells
+from .comparison import without_occluders
+from .covariance import blocks_of, equations_by_block, without_poles
+from .descent import FINE_LOSS, FULL_LOSS, as_levels, descend
+from .query import Features, Query, prepare_query, query_images
+from .refinement import points_at, view_at
+
+FOCALS, RADIAL = ("f", "fx", "fy"), "k1"
+WIDE = 0.05  # a focal length that is known worse is a guess: k1 is fitted too
+K1_DEVIATION = 0.05  # of k1 where the camera is a guess
+NUM_VALUES, NUM_VALUES_OF_TWO = 7, 4  # of each parameter in a design: of one, of two
+FIRST_REACH, LAST_REACH = (0.04, 0.1), 0.02  # of a design to either side: at first, least and most; at last
+K1_PER_FOCAL = 1.0  # reach in k1 by that in the focal length's logarithm
+MOST_DESIGNS = 6
+INFLATION = 4.0  # of the covariance, so that 95 % of true focal lengths lie within two deviations
+EDGE_ERROR = 0.4  # [px] of the sphere at the picture's edge, which all blocks may have in common
+LEAST_BLOCKS = 4  # of the sphere that a picture shows, by parameter: fewer tell nothing of a deviation
+MOST_SHARE = 0.7  # of a block in what fixes the focal length
+AT_REST, LEAST_CHANGE = 0.25, 5e-4  # deviations, and part of a focal length, that change no more
+EDGE = 5  # [px] within the picture's edge that no point may come near
+NEARBY, CLOSE = (FINE_LOSS, 12, 1e-4), (FULL_LOSS, 30, 1e-6)
+
+
+class FocalFit(NamedTuple):
+    """The focal length, and k1, fitted to a photo: changes of its camera."""
+
+    change: Array  # (p,) logarithm of the focal length, and k1 if it is fitted: the likeliest
+    covariance: Array  # (p, p) of these
+    motion: Array  # (6, p) of a pose with it: rotation about the camera's axes [rad], centre in the map [m]
+    conflict: float  # deviations between what the picture says and what was given; 0 if it says nothing
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the logarithm of the focal length."""
+        return math.sqrt(self.covariance[0, 0])
+
+    @property
+    def is_at_rest(self) -> bool:
+        """True if the photo need not be put on the sphere anew for what is left of the change."""
+        deviations = np.sqrt(np.diag(self.covariance))
+        return bool(np.all(np.abs(self.change) <= np.maximum(AT_REST * deviations, LEAST_CHANGE)))
+
+    @property
+    def pose_covariance(self) -> Array:
+        """Covariance (6, 6) that a pose has by that of the calibration: rotation, then centre in the map."""
+        return np.asarray(self.motion @ self.covariance @ self.motion.T)
+
+    def moved(self, pose: Pose) -> Pose:
+        """A pose in the map as it follows the change."""
+        delta = self.motion @ self.change
+        return Pose(exp_so3(delta[:3]) @ pose.R_cam_from_world, pose.center_world + delta[3:])
+
+    def focal_length(self, panorama: Panorama) -> FocalLength:
+        """The focal length of a photo with its deviation, and what was known of it."""
+        prior = panorama.focal_prior
+        focal = panorama.cameras[0].camera.focal[0]
+        assert prior is not None
+        given_std = prior.deviation * prior.focal
+        return FocalLength(focal, self.deviation * focal, prior.focal, given_std)
+
+
+def changed(camera: Camera, change: Array) -> Camera:
+    """Change the logarithm of a camera's focal length, and its k1 if `change` (p,) has two numbers."""
+    params = dict(zip(MODELS[camera.model][1], camera.params, strict=True))
+    for name in FOCALS:
+        if name in params:
+            params[name] *= math.exp(change[0])
+    if len(change) > 1:
+        params[RADIAL] += change[1]
+    return replace(camera, params=tuple(float(value) for value in params.values()))
+
+
+class Profile(NamedTuple):
+    """The ends of descents with each of several calibrations."""
+
+    changes: Array  # (K, p) of the camera
+    losses: Array  # (K, B) of each block of the sphere
+    poses: list[Pose]
+
+
+class Crest(NamedTuple):
+    """The calibration at which the loss of a profile is least."""
+
+    change: Array  # (p,)
+    information: Array  # (p, p) inverse of its covariance; 0 where the profile has no crest
+    motion: Array  # (6, p) as of FocalFit
+
+
+def fit_focal(query: Query, panorama: Panorama, pose: Pose, is_first: bool = True) -> FocalFit:
+    """Fit the focal length of a photo whose pose in the map is about known.
+
+    The panorama has a focal_prior; `query` is of the same. Not first, it is about known too.
+    """
+    prior = panorama.focal_prior
+    camera = panorama.cameras[0].camera
+    assert prior is not None
+    names = MODELS[camera.model][1]
+    num = 2 if prior.deviation > WIDE and RADIAL in names else 1
+    expected = np.array([math.log(prior.focal / camera.focal[0])])
+    if num > 1:
+        k1 = names.index(RADIAL)
+        expected = np.append(expected, prior.view.mount.camera.params[k1] - camera.params[k1])
+    precision = np.diag([prior.deviation**-2, K1_DEVIATION**-2][:num])
+    reach = min(max(2.5 * prior.deviation, FIRST_REACH[0]), FIRST_REACH[1]) if is_first else LAST_REACH
+    crest = find_crest(query, panorama, pose, num, reach)
+    if crest.information.any():
+        per_px = math.tau * camera.focal[0] / (0.5 * camera.width * query.panorama.rgb.shape[1])
+        covariance = np.linalg.pinv(crest.information)
+        covariance[0, 0] += (EDGE_ERROR * per_px) ** 2
+        crest = crest._replace(information=np.linalg.pinv(covariance))
+    total = np.linalg.inv(crest.information + precision)
+    change = total @ (crest.information @ crest.change + precision @ expected)
+    conflict = 0.0
+    if crest.information[0, 0] > 0.0:
+        spread = np.linalg.pinv(crest.information)[0, 0] + prior.deviation**2
+        conflict = abs(crest.change[0] - expected[0]) / math.sqrt(spread)
+    return FocalFit(change, np.asarray(total), crest.motion, conflict)
+
+
+def find_crest(query: Query, panorama: Panorama, pose: Pose, num: int, reach: float) -> Crest:
+    """Search the crest of the profile about a pose in ever narrower designs, and move those that miss it.
+
+    Its information is 0 where no design has a crest: the picture does not tell the calibration.
+    """
+    middle = np.zeros(num)
+    found: Crest | None = None
+    for _ in range(MOST_DESIGNS):
+        profile = take_profile(query, panorama, pose, middle + design(num, reach))
+        crest = crest_of(profile, pose)
+        has_crest = bool(crest.information.any())
+        is_inside = has_crest and bool(np.all(np.abs(crest.change - middle) <= reach))
+        if not is_inside and (found is not None or not has_crest):
+            break
+        middle = np.clip(crest.change, middle - reach, middle + reach)
+        pose = profile.poses[int(np.argmin(np.abs(profile.changes - middle).sum(axis=1)))]
+        if is_inside:
+            found = crest
+            if reach <= LAST_REACH:
+                break
+            reach = max(0.5 * reach, LAST_REACH)
+    return found or Crest(np.zeros(num), np.zeros((num, num)), crest.motion)
+
+
+def design(num: int, reach: float) -> Array:
+    """Changes (K, num) of a camera on a grid within a reach on either side."""
+    values = np.linspace(-reach, reach, NUM_VALUES if num == 1 else NUM_VALUES_OF_TWO)
+    scales = [values, values * K1_PER_FOCAL]
+    return np.array(list(itertools.product(*scales[:num])))
+
+
+def take_profile(query: Query, panorama: Panorama, pose: Pose, changes: Array) -> Profile:
+    """Descend from a pose with each of several calibrations (K, p) of the photo's camera."""
+    shown = without_occluders(query, pose)
+    is_left = shown.panorama.is_valid | ~query.panorama.is_valid  # what does not contradict the scan
+    camera = panorama.cameras[0].camera
+    width = query.panorama.rgb.shape[1]
+
+    def taken(change: Array) -> Panorama:
+        found = panorama.retaken(changed(camera, change), width)
+        return replace(found, is_valid=found.is_valid & is_left)
+
+    narrowest = taken(changes.max(axis=0)).is_valid
+    points = within(points_at(shown, pose), pose, narrowest)
+    fine = view_at(shown, pose, query.method.fine_view)
+    around = without_poles(points.around(pose.center_world), pose)
+    block, middle = blocks_of(around), changes.mean(axis=0)
+
+    def end_with(change: Array) -> tuple[Pose, Array]:
+        images = query_images(taken(change), query.method.scales)
+        is_near = abs(changes - middle).max() <= 1.001 * LAST_REACH
+        near = pose if is_near else descend(fine, images.fine, pose, NEARBY)
+        end = descend(points, images.full, near, CLOSE)
+        seen = around.around(end.center_world)
+        seen = seen._replace(channels=as_levels(seen.channels))
+        return end, equations_by_block(images.full, seen, end, block)[:, LOSS]
+
+    ends = list(query.workers.map(end_with, list(changes), "fit the focal length"))
+    return Profile(changes, np.array([losses for _, losses in ends]), [end for end, _ in ends])
+
+
+def within(points: Cells, pose: Pose, is_valid: NDArray[np.bool_]) -> Cells:
+    """Points with those left out that come near the edge of what a photo (H, W) shows."""
+    inner = cv2.erode(is_valid.view(np.uint8), np.ones((EDGE, EDGE), np.uint8))
+    offsets = points.around(pose.center_world).offsets.T.astype(np.float64)
+    rays = rotate_points(offsets / np.linalg.norm(offsets, axis=1, keepdims=True), pose.R_cam_from_world)
+    is_kept = inner[indices_of(rays, is_valid.shape[1])] > 0
+    return points._replace(weights=points.weights * is_kept.astype(np.float32))
+
+
+def crest_of(profile: Profile, pose: Pose) -> Crest:
+    """Find the crest of a profile by a quadratic function (least squares), and how poses follow the camera.
+
+    The covariance of the crest is H^-1 (sum g g^T) H^-1, with the slope g of each block's loss there.
+    """
+    middle, num = profile.changes.mean(axis=0), profile.changes.shape[1]
+    x = profile.changes - middle
+    rows, columns = np.triu_indices(num)
+    terms = np.column_stack([np.ones(len(x)), x, x[:, rows] * x[:, columns]])
+    fitted = np.linalg.lstsq(terms, profile.losses, rcond=None)[0]
+    hessians = np.zeros((profile.losses.shape[1], num, num))
+    hessians[:, rows, columns] += fitted[1 + num :].T
+    hessians[:, columns, rows] += fitted[1 + num :].T
+    H = hessians.sum(axis=0)
+    moved = [
+        np.concatenate(
+            [log_so3(p.R_cam_from_world @ pose.R_cam_from_world.T), p.center_world - pose.center_world]
+        )
+        for p in profile.poses
+    ]
+    motion = np.linalg.lstsq(terms[:, : 1 + num], np.array(moved), rcond=None)[0][1:].T
+    num_blocks = int(profile.losses.any(axis=0).sum())
+    if num_blocks < LEAST_BLOCKS * num or not np.linalg.eigvalsh(H)[0] > 0.0:
+        return Crest(middle, np.zeros((num, num)), motion)
+    offset = -np.linalg.solve(H, fitted[1 : 1 + num].sum(axis=1))
+    slopes = fitted[1 : 1 + num].T + hessians @ offset
+    shares = np.trace(hessians @ np.linalg.inv(H), axis1=1, axis2=2) / num
+    slopes /= (1.0 - np.clip(shares, 0.0, MOST_SHARE))[:, None]  # as if each had been left out, as in CR3
+    information = H @ np.linalg.pinv(INFLATION * slopes.T @ slopes) @ H
+    return Crest(middle + offset, information, motion)
+
+
+def recalibrated(query: Query, panorama: Panorama, change: Array) -> tuple[Query, Panorama]:
+    """The query and panorama of a photo with another calibration; its matches stay, and their rays follow."""
+    before = panorama.cameras[0]
+    after = before.with_camera(changed(before.camera, change))
+    taken = panorama.retaken(after.camera, panorama.rgb.shape[1])
+    fresh = prepare_query(taken, query.scan_map, query.settings, query.workers, query.method)
+    features = tuple(half.then(lambda found: _turned(found, before, after)) for half in query.features)
+    return replace(fresh, features=features, num_halves=query.num_halves), taken
+
+
+def _turned(found: Features, before: Mount, after: Mount) -> Features:
+    """Features with the rays that another calibration gives their pixels."""
+    keypoints = found.keypoints._replace(rays=_rays(found.keypoints.rays, before, after))
+    return Features(keypoints, found.matches._replace(rays=_rays(found.matches.rays, before, after)))
+
+
+def _rays(rays: NDArray[np.float32], before: Mount, after: Mount) -> NDArray[np.float32]:
+    pixels, _ = before.camera.pixels(rotate_points(rays.astype(np.float64), before.rotation))
+    found, _ = after.camera.rays(pixels)
+    return np.asarray(rotate_points(found, before.rotation.T), np.float32)

@@ -1,0 +1,110 @@
+"""What the user knows beforehand, as fewer positions and fewer rotations."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.pose import MAX_ANGLE, MAX_DISTANCE, Pose
+from ..scan_map.camera_positions import COARSE_SPACING, heights_above_floor
+from ..scan_map.named_scans import candidates_within, scan_at
+from ..scan_map.prior import NOTHING_KNOWN, Prior
+from ..scan_map.scan_map import ScanMap
+
+STEEP = 0.2  # cosine of an elevation: what looks up or down more steeply has no heading
+
+
+def allowed_by_option(scan_map: ScanMap, prior: Prior) -> dict[str, NDArray[np.bool_]]:
+    """Which candidates (N,) each option allows, by half a grid spacing more than it says."""
+    allowed: dict[str, NDArray[np.bool_]] = {}
+    if prior.near_world is not None and prior.radius is not None:
+        allowed["--near"] = distances_to(scan_map, prior.near_world) <= prior.radius + COARSE_SPACING / 2
+    if prior.height is not None:
+        heights = heights_above_floor(scan_map.octree, scan_map.centers)
+        low, high = prior.height[0] - COARSE_SPACING / 2, prior.height[1] + COARSE_SPACING / 2
+        allowed["--height"] = (heights >= low) & (heights <= high)
+    if prior.within:
+        allowed["--within"] = candidates_within(scan_map, prior.within)
+    return allowed
+
+
+def distances_to(scan_map: ScanMap, near_world: tuple[float, float, float | None]) -> NDArray[np.float64]:
+    """Distance (N,) [m] of each candidate from a place; without its z, along the ground."""
+    x, y, z = near_world
+    centers_world = scan_map.centers @ scan_map.R_map_from_world + scan_map.origin_world
+    offsets = centers_world[:, :2] - (x, y) if z is None else centers_world - (x, y, z)
+    return np.asarray(np.linalg.norm(offsets, axis=1))
+
+
+def nothing_allowed(scan_map: ScanMap, prior: Prior) -> str:
+    """Why no candidate is left, as a warning: how many each option allows, and the nearest to --near."""
+    num = len(scan_map.centers)
+    if num == 0:
+        return "the scan: found no place for a camera (free space 0.3 to 2.4 m above a surface, closed in)"
+    counts = [f"{name} allows {mask.sum()}" for name, mask in allowed_by_option(scan_map, prior).items()]
+    text = f"no position is left of the scan's {num}: {', '.join(counts)}"
+    if prior.near_world is None:
+        return text
+    distances = distances_to(scan_map, prior.near_world)
+    k = int(distances.argmin())
+    x, y, z = scan_map.R_map_from_world.T @ scan_map.centers[k] + scan_map.origin_world
+    return f"{text}; the nearest to --near is {x:.2f} {y:.2f} {z:.2f}, {distances[k]:.2f} m away"
+
+
+def apply_prior(scan_map: ScanMap, prior: Prior) -> ScanMap:
+    """The map, of which those cells of the coarse grid are searched in which the prior allows a candidate."""
+    is_allowed = np.ones(len(scan_map.centers), dtype=bool)
+    for mask in allowed_by_option(scan_map, prior).values():
+        is_allowed &= mask
+    if is_allowed.all():
+        return scan_map
+    return scan_map.narrowed(np.isin(scan_map.sparse, scan_map.searched_for[is_allowed]))
+
+
+def allowed_rotations(R_cam_from_world: NDArray[np.float64], prior: Prior) -> NDArray[np.float64]:
+    """The rotations (N, 3, 3) whose image centre looks where the prior says; else the nearest."""
+    if prior.heading_deg is None:
+        return R_cam_from_world
+    off = heading_errors(R_cam_from_world, prior.heading_deg)
+    return np.asarray(R_cam_from_world[off <= max(np.radians(prior.heading_tolerance_deg), float(off.min()))])
+
+
+def heading_errors(R_cam_from_world: NDArray[np.float64], heading_deg: float) -> NDArray[np.float64]:
+    """Angles (N,) [rad] between a heading and where the image centre of rotations (N, 3, 3) looks."""
+    forward = R_cam_from_world[:, 0]  # of the camera's +x, in the world
+    heading = np.arctan2(forward[:, 0], forward[:, 1])
+    return np.asarray(np.abs((heading - np.radians(heading_deg) + np.pi) % (2.0 * np.pi) - np.pi))
+
+
+def contradictions(scan_map: ScanMap, pose: Pose, prior: Prior) -> tuple[str, ...]:
+    """Say how a pose of the map's frame contradicts the prior by more than a right pose may be off."""
+    if prior == NOTHING_KNOWN:
+        return ()
+    world = scan_map.to_world(pose)
+    found = []
+    if prior.within and (scan := scan_at(scan_map, pose.center_world)) not in prior.within:
+        found.append(f"the pose found is in the scan {scan!r}, not in {', '.join(map(repr, prior.within))}")
+    if prior.near_world is not None and prior.radius is not None:
+        given = [value for value in prior.near_world if value is not None]
+        gap = math.dist(world.center_world[: len(given)], given)
+        if gap > prior.radius + MAX_DISTANCE:
+            found.append(f"the pose found is {gap:.2f} m from the place given, not within {prior.radius:g} m")
+    if prior.height is not None:
+        height = float(heights_above_floor(scan_map.octree, pose.center_world[None])[0])
+        low, high = prior.height
+        if not low - MAX_DISTANCE <= height <= high + MAX_DISTANCE:
+            found.append(f"the pose found is {height:.2f} m above the floor, not {low:g} to {high:g} m")
+    found += contradicted_heading(world, prior)
+    return tuple(found)
+
+
+def contradicted_heading(pose_world: Pose, prior: Prior) -> list[str]:
+    """Say how a pose contradicts a heading; nothing of a camera that looks steeply up or down."""
+    forward = pose_world.R_cam_from_world[0]
+    if prior.heading_deg is None or math.hypot(forward[0], forward[1]) < STEEP:
+        return []
+    off = math.degrees(float(heading_errors(pose_world.R_cam_from_world[None], prior.heading_deg)[0]))
+    if off <= prior.heading_tolerance_deg + math.degrees(MAX_ANGLE):
+        return []
+    limit = f"more than {prior.heading_tolerance_deg:g} deg"
+    return [f"the pose found looks {off:.0f} deg away from the heading given, {limit}"]

@@ -1,1 +1,0 @@
-"""The cloud as a camera sees it: depths, surfaces, pictures."""

@@ -1,1 +1,0 @@
-"""How kernels are compiled and run, and how files are read and written."""

@@ -1,0 +1,203 @@
+"""Where a camera can be: free space at a camera's height above something that carries it."""
+
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cloud.octree import Octree
+from ..errors import InputError
+from ..geometry.pose import Array
+from ..geometry.sphere import whole_areas
+from ..jobs.threads import Workers
+from ..views.view import BLOCK, ViewConfig, ranges_around
+
+MIN_CLEARANCE = 0.25  # [m] a camera is not nearer to a surface
+MIN_COVERAGE = 0.55  # fraction of the sphere that shows something: flat ground or a roof alone fills half
+OPEN_COVERAGE = 0.3  # the same where hardly any place is closed in: open land
+MIN_ENCLOSED = 0.2  # fraction of the free places that are closed in, else the land counts as open
+FREE_SPACE_VIEW = ViewConfig(num_rings=12, stats_rings=12, sigma_deg=22.0, voxel_per_range=1 / 8)
+MIN_HEIGHT, MAX_HEIGHT = 0.3, 2.4  # [m] above a surface that can carry a tripod or a person
+SUPPORT_RADIUS = 0.9  # [m] the floor right below a scanner is never scanned
+STOREY = 2.6  # [m] a floor is not farther below a camera
+SURFACE_VOXEL = 0.16  # [m]
+COARSE_SPACING = 0.6  # [m] of the grid; the half of it where surfaces are near
+CLEARANCE_VOXEL = 0.08  # [m]
+NEAR = 0.3  # [m] clearance below which the grid is refined
+MAX_POSITIONS = 250_000  # looked at, and views rendered: some ten minutes on two cores, 1.9 GB
+ADVICE = (
+    "the most that are searched; if its unit is not the metre, set --units, else say where the camera was "
+    "(--near X Y Z --radius M) or cut out a part"
+)
+BASES = 1 << 14  # cells on surfaces, around which others are supported, or centres, at a time
+LONG = 60.0  # [s] a warning tells how long the views take, if more
+COST_OF_VIEW = 4.0  # looking and rendering at a position, in the time of looking
+
+
+def top_surfaces(octree: Octree) -> NDArray[np.float32]:
+    """Voxel means (N, 3) above which the next two voxels are empty."""
+    xyz = octree.level(SURFACE_VOXEL)[:, :3]
+    ijk = np.floor(xyz / SURFACE_VOXEL).astype(np.int64)
+    ijk -= ijk.min(axis=0) - 1
+    shape = ijk.max(axis=0) + 4
+    code = (ijk[:, 0] * shape[1] + ijk[:, 1]) * shape[2] + ijk[:, 2]
+    is_covered = np.isin(code + 1, code) | np.isin(code + 2, code)
+    return np.asarray(xyz[~is_covered])
+
+
+class Ball(NamedTuple):
+    """All within a radius [m] of a place (3,)."""
+
+    center: Array
+    radius: float
+
+    def holds(self, points: NDArray[np.floating[Any]], margin: float = 0.0) -> NDArray[np.bool_]:
+        """Which of some points (N, 3) or (N, 2) lie in it, or at most a margin [m] beside it."""
+        distance = np.linalg.norm(points - self.center[: points.shape[1]], axis=1)
+        return np.asarray(distance <= self.radius + margin)
+
+
+class Box(NamedTuple):
+    """All between two corners (3,) [m]."""
+
+    low: Array
+    high: Array
+
+    def holds(self, points: NDArray[np.floating[Any]], margin: float = 0.0) -> NDArray[np.bool_]:
+        """As of Ball."""
+        k = points.shape[1]
+        is_inside = (points >= self.low[:k] - margin) & (points <= self.high[:k] + margin)
+        return np.asarray(is_inside.all(axis=1))
+
+
+class TooManyPositionsError(InputError):
+    """A scan of land, or in another unit: a camera could be at more places than are searched."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__(f"the scan: {what} leave more than {MAX_POSITIONS} camera positions, {ADVICE}")
+
+
+def supported_cells(surfaces: NDArray[np.float32], within: Ball | Box | None = None) -> NDArray[np.int64]:
+    """Cells (N, 3) of the coarse grid whose centres are at a camera's height above a surface (M, 3).
+
+    Those `within` a part of the scan, by a spacing more than it says. TooManyPositionsError if they
+    are more than MAX_POSITIONS; no more memory than for these is taken.
+    """
+    s = COARSE_SPACING
+    reach = int(np.ceil(SUPPORT_RADIUS / s))
+    if within is not None:
+        surfaces = surfaces[within.holds(surfaces[:, :2], SUPPORT_RADIUS + 2 * s)]
+    if len(surfaces) == 0:
+        return np.empty((0, 3), np.int64)
+    base = np.floor(surfaces / s).astype(np.int64)
+    base[:, 2] = np.ceil((surfaces[:, 2] + MIN_HEIGHT) / s - 0.5)
+    around = np.arange(-reach, reach + 1)
+    layers = np.arange(int(np.ceil((MAX_HEIGHT - MIN_HEIGHT) / s)))
+    steps = np.stack(np.meshgrid(around, around, layers, indexing="ij"), axis=-1).reshape(-1, 3)
+    gap = np.maximum(np.abs(steps[:, :2]) - 0.5, 0.0) * s
+    steps = steps[np.hypot(gap[:, 0], gap[:, 1]) < SUPPORT_RADIUS]
+    low = base.min(axis=0) - reach
+    shape = base.max(axis=0) - low + reach + len(layers)
+    weights = np.array([shape[1] * shape[2], shape[2], 1])  # one number a cell sorts as its three do
+    codes, found = np.unique((base - low) @ weights), np.empty(0, np.int64)
+    for begin in range(0, len(codes), BASES):
+        around_some = np.unique(codes[begin : begin + BASES, None] + steps @ weights)
+        cells = np.stack(np.unravel_index(around_some, shape), axis=1) + low
+        if within is not None:
+            around_some = around_some[within.holds((cells + 0.5) * s, s)]
+        found = np.union1d(found, around_some)
+        if len(found) > MAX_POSITIONS:
+            size = "{:.0f} x {:.0f} x {:.0f} m".format(*np.ptp(surfaces, axis=0))
+            raise TooManyPositionsError(f"surfaces of {size}")
+    return np.asarray(np.stack(np.unravel_index(found, shape), axis=1) + low)
+
+
+def coverage(octree: Octree, centers: NDArray[np.floating[Any]], workers: Workers) -> NDArray[np.float64]:
+    """Fraction of the sphere (N,) around each centre (N, 3) that is not empty, seen at a low resolution."""
+    area = whole_areas(FREE_SPACE_VIEW.num_rings).astype(np.int64)
+
+    def glance(lo: int) -> NDArray[np.float64]:
+        is_filled = ranges_around(octree, centers[lo : lo + BLOCK], FREE_SPACE_VIEW) > 0.0
+        return np.asarray(is_filled @ area / area.sum())
+
+    parts = workers.map(glance, range(0, len(centers), BLOCK), "find free space")
+    return np.concatenate([np.empty(0), *parts])
+
+
+def nearest_distances(tree: Any, centers: NDArray[np.floating[Any]], workers: Workers) -> NDArray[np.float64]:
+    """Distance (N,) [m] of each centre (N, 3) from the nearest point of a cKDTree.
+
+    In threads of our own: the tree's are left running, in memory that is freed, where a signal ends the work.
+    """
+    begins = range(0, len(centers), BASES)
+    alone = Workers(workers.num_threads)  # too short a work to be shown
+    parts = alone.map(lambda lo: tree.query(centers[lo : lo + BASES])[0], begins, "")
+    return np.concatenate([np.empty(0), *parts])
+
+
+def warn_if_long(octree: Octree, centers: NDArray[np.floating[Any]], workers: Workers) -> None:
+    """Say about how many minutes the views from the centres (N, 3) take, by a sample of them."""
+    sample, alone = centers[:: 1 + len(centers) // BLOCK], Workers()
+    coverage(octree, sample[:1], alone)  # compiled
+    begin = time.perf_counter()
+    coverage(octree, sample, alone)
+    seconds = (time.perf_counter() - begin) / max(len(sample), 1) * len(centers) * COST_OF_VIEW
+    if seconds > LONG * workers.num_threads:
+        minutes = seconds / workers.num_threads / 60.0
+        workers.warn(f"the scan: {len(centers)} camera positions, about {minutes:.0f} min to prepare, once")
+
+
+def candidate_centers(
+    octree: Octree, workers: Workers, within: Ball | Box | None = None
+) -> NDArray[np.float64]:
+    """Positions (N, 3) [m] in free space, 0.6 m apart, or 0.3 m where surfaces are near.
+
+    `within` and the error as of supported_cells.
+    """
+    from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
+
+    cells = supported_cells(top_surfaces(octree), within)
+    points = octree.level(CLEARANCE_VOXEL)[:, :3]
+    if within is not None:
+        points = points[within.holds(points, 3 * COARSE_SPACING)]  # of what is farther none is near
+    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+    middle = (cells + 0.5) * COARSE_SPACING
+    warn_if_long(octree, middle, workers)
+    clearance = nearest_distances(tree, middle, workers)
+    is_free = clearance > MIN_CLEARANCE
+    fraction = np.zeros(len(middle))  # where it is not free, nobody asks
+    fraction[is_free] = coverage(octree, middle[is_free], workers)
+    is_open = np.mean(fraction[is_free] > MIN_COVERAGE) < MIN_ENCLOSED if is_free.any() else False
+    min_coverage = OPEN_COVERAGE if is_open else MIN_COVERAGE
+    is_enclosed = fraction > min_coverage
+    is_tight = (clearance < NEAR) & (is_enclosed | ~is_free)
+    kept = middle[~is_tight & is_free & is_enclosed]
+
+    # Nothing of a cell is free if its centre is deeper in a surface than the cell is wide.
+    half = COARSE_SPACING / 2
+    corners = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
+    is_split = is_tight & (clearance + 0.87 * COARSE_SPACING > MIN_CLEARANCE)
+    finer = (2 * cells[is_split][:, None] + corners).reshape(-1, 3)
+    middle = (finer + 0.5) * half
+    clearance = nearest_distances(tree, middle, workers)
+    middle = middle[clearance > MIN_CLEARANCE]
+    if len(middle) > MAX_POSITIONS:
+        raise TooManyPositionsError("narrow places")
+    return np.concatenate([kept, middle[coverage(octree, middle, workers) > min_coverage]])
+
+
+def heights_above_floor(octree: Octree, centers: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Height (N,) [m] of each centre (N, 3) above the floor: the lowest surface below in its storey.
+
+    inf where there is none within SUPPORT_RADIUS and STOREY.
+    """
+    from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
+
+    surfaces = top_surfaces(octree)
+    near = cKDTree(surfaces[:, :2]).query_ball_point(centers[:, :2], SUPPORT_RADIUS)
+    heights = np.full(len(centers), np.inf)
+    for k, indices in enumerate(near):
+        gaps = centers[k, 2] - surfaces[indices, 2]
+        heights[k] = gaps[(gaps > 0.0) & (gaps < STOREY)].max(initial=-np.inf)
+    return np.where(np.isfinite(heights), heights, np.inf)

@@ -1,0 +1,146 @@
+"""A prepared map on disk: a NumPy archive that is mapped into memory where nobody can cut it off meanwhile.
+
+A file of another format, or damaged in any byte (each member of an archive has a checksum), is never trusted;
+`map_validation.py` checks what is whole. Of a file that has been checked, its identity is remembered.
+FORMAT changes with what the arrays mean, so that a file outlives an update; the cache also knows the sources
+by which a map was made, and makes it anew when they have changed.
+"""
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import __version__
+from ..cloud.octree import Octree
+from ..cloud.readers.npz import damage_named
+from ..errors import InputError
+from ..files.array_archive import open_archive, write_archive
+from ..files.atomic import replacing
+from ..files.cache import WRITABLE, is_own, mark_used, own_names, private_folder
+from ..files.file_facts import key_of, recall, remember
+from ..local_features.feature_map import FeatureMap
+from ..views.candidate_views import CandidateViews
+from .map_validation import LAYOUT, check_arrays, clean_warnings
+from .scan_map import ScanMap, with_late_features
+
+FORMAT = "piccolo-map/8"
+NAME = own_names("piccolo-map")  # in a cache
+OTHERS = ("octree", "local_features", "scan_names", "warnings", "crs", "is_partial", "views", "late")
+ARRAYS = [f.name for f in fields(ScanMap) if f.name not in OTHERS]
+MEMBERS = {*LAYOUT, "format", "scan_names", "warnings"}
+WANTED = "wanted a whole map by tools/prepare_map.py"
+ZIP_MAGIC = b"PK\x03\x04"
+COPIED_AT_ONCE = 1 << 22  # [byte]
+# The first member of a map: its name and where that stands, and the beginning of its value somewhere behind.
+FIRST_NAME, FIRST_NAME_AT = b"format.npy", 30
+FIRST_VALUE, FIRST_VALUE_WITHIN = FORMAT.partition("/")[0].encode("utf-32-le"), 512
+
+
+def save_map(scan_map: ScanMap, path: Path) -> None:
+    """Write a map to `path`, whole or not at all."""
+    members: dict[str, NDArray[Any]] = {
+        "format": np.array(FORMAT),
+        "scan_names": np.array(scan_map.scan_names, dtype=np.str_),
+        "warnings": np.array(scan_map.warnings, dtype=np.str_),
+        "crs": np.frombuffer(scan_map.crs.encode(), np.uint8),
+    }
+    members.update((name, np.asarray(getattr(scan_map, name))) for name in ARRAYS)
+    for label, part in (("octree", scan_map.octree), ("local", scan_map.local_features)):
+        members.update((f"{label}_{name}", np.asarray(value)) for name, value in part._asdict().items())
+    with replacing(path) as file:
+        write_archive(file, members)
+
+
+def is_map_file(path: Path) -> bool:
+    """True if the file begins as `save_map` writes it, of whatever version; clouds may be archives too.
+
+    The first member's name or its value is enough, so that a damaged map is still refused as a map.
+    """
+    with path.open("rb") as file:
+        head = file.read(FIRST_VALUE_WITHIN)
+    has_name = head.startswith(FIRST_NAME, FIRST_NAME_AT)
+    return head.startswith(ZIP_MAGIC) and (has_name or FIRST_VALUE in head)
+
+
+@contextmanager
+def lasting(path: Path, is_copied: bool) -> Iterator[Path | None]:
+    """A map's file that may be mapped: itself, or a copy in the user's cache; None where there is none.
+
+    A file of the cache, where nobody else may write, is only ever replaced whole. Any other may be cut off or
+    overwritten in place at any time, which would kill, or mislead, a process that has mapped it. A copy that
+    the caller finds damaged is removed.
+    """
+    if NAME.fullmatch(path.name) and is_own(path.parent.stat(), WRITABLE):
+        yield path
+        return
+    folder = private_folder("maps", NAME) if is_copied else None
+    copy = folder and copied(path, folder)
+    try:
+        yield copy
+    except BaseException:
+        if copy:
+            copy.unlink(missing_ok=True)
+        raise
+
+
+def copied(path: Path, folder: Path) -> Path | None:
+    """The copy of a file in a folder, made if there is none of it as it is now; None if it can't be made."""
+    with path.open("rb") as file:
+        copy = folder / f"{key_of('copy', os.fstat(file.fileno()))}.piccolo-map"
+        try:
+            if not copy.exists():
+                with replacing(copy) as out:
+                    shutil.copyfileobj(file, out, COPIED_AT_ONCE)
+        except OSError:  # as where the disk is full: it is read instead
+            return None
+    mark_used(copy)
+    return copy
+
+
+def load_map(path: Path, remembers: bool = False) -> ScanMap:
+    """Read or map into memory what `save_map` wrote; InputError for anything else.
+
+    All of it is read and checked; with `remembers` only once, as long as the file stays as it is.
+    """
+    what = f"checked as {FORMAT} by {__version__}"
+    with damage_named(path, WANTED), lasting(path, remembers) as place:
+        archive = open_archive(place or path, is_mapped=place is not None)
+        if "format" in archive.members and (found := str(archive.array("format"))) != FORMAT:
+            text = f"a map of format {found[:40]!r}, but this version reads {FORMAT}; prepare it again"
+            raise InputError(f"{path}: {text}")
+        if set(archive.members) != MEMBERS:
+            raise ValueError(f"not the arrays of a map: {sorted(MEMBERS ^ set(archive.members))}")
+        arrays = {name: archive.array(name) for name in archive.members}
+        if not (remembers and recall(what, archive.status) is not None):
+            for name in archive.members:
+                archive.check(name)
+            check_arrays(path, arrays)
+            if remembers:
+                remember(what, archive.status, "")
+        warnings = clean_warnings(path, arrays["warnings"])
+    own: dict[str, Any] = {name: arrays[name] for name in ARRAYS if name not in ("has_labels", "scan_sha256")}
+    octree = Octree(
+        nodes=arrays["octree_nodes"],
+        first_child=arrays["octree_first_child"],
+        level_start=arrays["octree_level_start"],
+        leaf_size=float(arrays["octree_leaf_size"]),
+    )
+    scan_map = ScanMap(
+        octree=octree,
+        views=CandidateViews(octree, arrays["centers"]),
+        local_features=FeatureMap(*(arrays[f"local_{name}"] for name in FeatureMap._fields)),
+        has_labels=bool(arrays["has_labels"]),
+        scan_names=tuple(map(str, arrays["scan_names"])),
+        warnings=warnings,
+        scan_sha256=str(arrays["scan_sha256"]),
+        crs=arrays["crs"].tobytes().decode(),
+        **own,
+    )
+    return with_late_features(scan_map) if scan_map.lacks_features else scan_map

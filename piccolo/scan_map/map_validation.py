@@ -1,0 +1,222 @@
+"""Whether the arrays of a map file are what `save_map` writes, before a search takes them.
+
+A map may come from anybody, and checksums are easily mended: every index that a kernel takes from a map is
+checked, every number bounded, and the octree compared with the grid that its voxels come from.
+"""
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cloud.voxels import NUM_LEVELS, PHASE, QUANTUM_BITS, WINDOW
+from ..errors import InputError
+from ..geometry.pose import Array, checked_rotation
+from ..geometry.sphere import make_grid
+from ..kernels.jit import F0, F1, inline_kernel, kernel
+from ..local_features.feature_map import MAX_LISTS, MAX_RANGE, MOST_VIEWS, NUM_COMPONENTS
+from ..local_features.keypoints import DESCRIPTOR_SIZE
+from ..views.candidate_views import WIDE_RINGS
+from .named_scans import MAX_SCANS, is_name
+from .scan_map import sparse_candidates
+
+Arrays = dict[str, NDArray[Any]]
+WIDE_CELLS = len(make_grid(WIDE_RINGS))
+# Type and shape; an axis that has a name is as long as the others of that name.
+LAYOUT: dict[str, tuple[str, tuple[int | str, ...]]] = {
+    "octree_nodes": ("<f4", ("nodes", 6)),
+    "octree_first_child": ("<i4", ("links",)),
+    "octree_level_start": ("<i4", (NUM_LEVELS + 1,)),
+    "octree_leaf_size": ("<f8", ()),
+    "R_map_from_world": ("<f8", (3, 3)),
+    "origin_world": ("<f8", (3,)),
+    "surface_variance": ("<f8", (3, 3)),
+    "centers": ("<f8", ("candidates", 3)),
+    "scan_of_candidate": ("<u2", ("candidates",)),
+    "sparse": ("<i8", ("sparse",)),
+    "wide_features": ("|i1", ("sparse", 3 * WIDE_CELLS)),
+    "wide_seen": ("|u1", ("sparse", WIDE_CELLS)),
+    "local_points": ("<f4", ("local", 3)),
+    "local_directions": ("|i1", ("local", 3)),
+    "local_tangents": ("|i1", ("local", 3)),
+    "local_sizes": ("<f4", ("local",)),
+    "local_descriptors": ("|i1", ("local", NUM_COMPONENTS)),
+    "local_views": ("<u2", ("local",)),
+    "local_view_centers": ("<f8", ("views", 3)),
+    "local_mean": ("<i2", (DESCRIPTOR_SIZE,)),
+    "local_components": ("|i1", (DESCRIPTOR_SIZE, NUM_COMPONENTS)),
+    "local_middles": ("|i1", ("lists", NUM_COMPONENTS)),
+    "local_list_start": ("<i4", ("list_starts",)),
+    "has_labels": ("|b1", ()),
+    "scan_sha256": ("<U64", ()),
+    "crs": ("|u1", ("characters",)),  # UTF-8
+}
+SHA256 = re.compile("[0-9a-f]{64}")
+ROUNDING = 1e-9  # of a rotation
+LEAF_SIZES = 1e-3, 0.1  # [m] least and most
+FARTHEST_ORIGIN, MARGIN = 1e12, 10.0  # [m] of the world; around the voxels that are kept
+BRIGHTEST = np.float32(1.0 + 1e-6)
+LARGEST_DEVIATION = 1.0  # [m] of points from their surfaces
+MAX_CRS = 4 * 20_000  # [byte]
+MAX_WARNINGS, MAX_WARNING = 1000, 5000  # lines, and characters of a line
+
+
+@inline_kernel
+def is_in_range(node, reach):
+    """True if a node (6,) is not farther than `reach` from zero along any axis and its colour is one."""
+    x, y, z, r, g, b = node[0], node[1], node[2], node[3], node[4], node[5]
+    is_near = abs(x) <= reach and abs(y) <= reach and abs(z) <= reach
+    return is_near and F0 <= r <= BRIGHTEST and F0 <= g <= BRIGHTEST and F0 <= b <= BRIGHTEST
+
+
+@kernel
+def first_misplaced(nodes, first_child, level_start, origin, leaf_size, reach):
+    """The first node outside its parent's voxel, farther than `reach` [m], or of no colour; -1 if none is.
+
+    The links must be right. `origin` (3,) leads from a corner of all levels' grids to zero [m].
+    """
+    num_levels = len(level_start) - 1
+    for node in range(len(nodes)):
+        if not is_in_range(nodes[node], reach):
+            return node
+    for level in range(num_levels - 1):
+        size = leaf_size * 2.0 ** (num_levels - 1 - level)
+        for parent in range(level_start[level], level_start[level + 1]):
+            for k in range(3):
+                x = np.float64(nodes[parent, k])
+                low = math.floor((x + origin[k]) / size) * size - origin[k]
+                rounding = 1e-5 + 4e-7 * abs(x)  # float32
+                for child in range(first_child[parent], first_child[parent + 1]):
+                    if not (low - rounding <= nodes[child, k] <= low + size + rounding):
+                        return child
+    return -1
+
+
+def check_arrays(path: Path, arrays: Arrays) -> None:
+    """Refuse the arrays of a map file that `save_map` can't have written, all but its warnings."""
+    sizes: dict[str, int] = {}
+    for name, (dtype, shape) in LAYOUT.items():
+        found = arrays[name]
+        wanted = len(shape) == found.ndim and tuple(
+            sizes.setdefault(axis, length) if isinstance(axis, str) else axis
+            for axis, length in zip(shape, found.shape, strict=True)
+        )
+        if found.dtype.str != dtype or found.shape != wanted:
+            _refuse(path, f"{name} of type {found.dtype} and shape {found.shape}")
+    _check_frame(path, arrays)
+    _check_octree(path, arrays)
+    _check_views(path, arrays)
+    _check_features(path, arrays)
+    _check_feature_views(path, arrays)
+    _check_scans(path, arrays)
+    if not SHA256.fullmatch(str(arrays["scan_sha256"])):
+        _refuse(path, "a scan_sha256 that is no digest")
+    text = arrays["crs"].tobytes()
+    if len(text) > MAX_CRS or not text.decode().isprintable():
+        _refuse(path, "a crs that is no text")
+
+
+def _refuse(path: Path, found: str) -> None:
+    raise InputError(f"{path}: found {found}, wanted a map by tools/prepare_map.py; prepare it again")
+
+
+def _check_frame(path: Path, arrays: Arrays) -> None:
+    """The rotation and the variance are such, and the origin lies at whole metres of the map's axes."""
+    R = checked_rotation(arrays["R_map_from_world"], ROUNDING, f"{path}: R_map_from_world of the map")
+    origin: Array = arrays["origin_world"]
+    if not (np.abs(origin).max() < FARTHEST_ORIGIN and np.abs(R @ origin - np.rint(R @ origin)).max() < 1e-3):
+        _refuse(path, f"an origin_world of {origin.tolist()}")
+    T: Array = arrays["surface_variance"]
+    is_one = np.isfinite(T).all() and np.allclose(T, T.T, rtol=0.0, atol=ROUNDING)
+    if not (is_one and -ROUNDING <= np.linalg.eigvalsh(T)[0] <= np.trace(T) <= LARGEST_DEVIATION**2):
+        _refuse(path, f"a surface_variance of {T.tolist()}")
+
+
+def _check_octree(path: Path, arrays: Arrays) -> None:
+    """Each level's children are the next level, one to eight a node, within its voxel of the grid."""
+    nodes, first_child = arrays["octree_nodes"], arrays["octree_first_child"]
+    start, leaf_size = arrays["octree_level_start"], float(arrays["octree_leaf_size"])
+    if not LEAF_SIZES[0] <= leaf_size <= LEAF_SIZES[1]:
+        _refuse(path, f"leaves of {leaf_size} m")
+    if start[0] != 0 or start[-1] != len(nodes) or not (start[:-1] < start[1:]).all():
+        _refuse(path, f"levels that begin at {start.tolist()} of {len(nodes)} nodes")
+    num_inner = start[-2]
+    num_children = np.diff(first_child)
+    is_tree = len(first_child) == len(nodes) + 1 and (first_child[start[:-1]] == start[1:]).all()
+    inner, leaves = num_children[:num_inner], num_children[num_inner:]
+    if not (is_tree and inner.min() >= 1 and inner.max() <= 8 and not leaves.any()):
+        _refuse(path, "links of an octree that are none")
+    origin_map = np.rint(arrays["R_map_from_world"] @ arrays["origin_world"])
+    origin = origin_map + PHASE / (1 << QUANTUM_BITS) * leaf_size
+    reach = WINDOW * leaf_size + MARGIN
+    misplaced = first_misplaced(nodes, first_child, start, origin, leaf_size, reach)
+    if misplaced >= 0:
+        _refuse(path, f"an octree whose node {misplaced} is {nodes[misplaced].tolist()}")
+
+
+def _check_views(path: Path, arrays: Arrays) -> None:
+    """Candidates and what they see are in range, and the sparse ones are those of the coarse grid."""
+    centers = arrays["centers"]
+    reach = WINDOW * float(arrays["octree_leaf_size"]) + MARGIN
+    if not np.abs(centers).max(initial=0.0) <= reach:
+        _refuse(path, "a candidate at no finite place or too far away")
+    if arrays["wide_features"].min(initial=0) < -127:
+        _refuse(path, "wide_features below -127")
+    if not np.array_equal(arrays["sparse"], sparse_candidates(centers)[0]):
+        _refuse(path, "sparse candidates that are not those of the coarse grid")
+
+
+def _check_features(path: Path, arrays: Arrays) -> None:
+    """Features lie where the scan is, and the lists hold each of them once."""
+    points, sizes, start = arrays["local_points"], arrays["local_sizes"], arrays["local_list_start"]
+    reach = WINDOW * float(arrays["octree_leaf_size"]) + 2.0 * MARGIN + MAX_RANGE
+    if not np.abs(points).max(initial=F0) <= reach:
+        _refuse(path, "a feature at no finite place or too far away")
+    if not (sizes.min(initial=F1) > F0 and sizes.max(initial=F0) <= MAX_RANGE):
+        _refuse(path, f"features of {sizes.min()} to {sizes.max()} m")
+    for name in (
+        "local_directions",
+        "local_tangents",
+        "local_descriptors",
+        "local_components",
+        "local_middles",
+    ):
+        if arrays[name].min(initial=0) < -127:
+            _refuse(path, f"{name} below -127")
+    if not 1 <= len(arrays["local_middles"]) == len(start) - 1 <= MAX_LISTS:
+        _refuse(path, f"{len(arrays['local_middles'])} lists of features with {len(start)} beginnings")
+    if start[0] != 0 or start[-1] != len(points) or (np.diff(start) < 0).any():
+        _refuse(path, "lists of features that do not follow each other")
+
+
+def _check_feature_views(path: Path, arrays: Arrays) -> None:
+    """Each feature was seen from one of the views, all of which are where the scan is."""
+    centers, views = arrays["local_view_centers"], arrays["local_views"]
+    reach = WINDOW * float(arrays["octree_leaf_size"]) + MARGIN
+    if not np.abs(centers).max(initial=0.0) <= reach:
+        _refuse(path, "a view at no finite place or too far away")
+    if len(centers) > MOST_VIEWS or views.max(initial=0) >= max(len(centers), 1):
+        _refuse(path, f"a feature of view {views.max(initial=0)} of {len(centers)}")
+
+
+def _check_scans(path: Path, arrays: Arrays) -> None:
+    """Names are text, all different, and each candidate lies in the scan of one of them."""
+    found, index = arrays["scan_names"], arrays["scan_of_candidate"]
+    if found.dtype.kind != "U" or found.ndim != 1 or len(found) > MAX_SCANS:
+        _refuse(path, f"scan_names of type {found.dtype} and shape {found.shape}")
+    names = list(map(str, found))
+    if len(set(names)) < len(names) or not all(map(is_name, names)):
+        _refuse(path, "names of scans that are none, or twice the same")
+    if index.max(initial=0) >= max(len(names), 1):
+        _refuse(path, f"a candidate in scan {index.max()} of {len(names)}")
+
+
+def clean_warnings(path: Path, warnings: NDArray[Any]) -> tuple[str, ...]:
+    """Lines that can be printed: no control characters, not too many, not too long."""
+    if warnings.dtype.kind != "U" or warnings.ndim != 1:
+        _refuse(path, f"warnings of type {warnings.dtype} and shape {warnings.shape}")
+    lines = (str(line)[:MAX_WARNING] for line in warnings[:MAX_WARNINGS])
+    return tuple("".join(c if c.isprintable() else "?" for c in line) for line in lines)

@@ -1,0 +1,209 @@
+"""The map of a cloud: prepared already, from the cache, or made now."""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..cloud import open_cloud
+from ..cloud.crs import crs_of
+from ..cloud.digest import sha256_of_files
+from ..cloud.settings import IN_METRES, CloudSettings, R_z_from_axis
+from ..cloud.soa import LocalCloud, pack_points
+from ..errors import InputError
+from ..files.cache import cache_root, digest_of_sources, in_words, mark_used, own_folder
+from ..geometry.pose import rotate_points
+from ..jobs.stopwatch import Stopwatch
+from ..jobs.threads import Workers
+from ..local_features.feature_map import FeatureMap
+from ..scan_map.prior import NOTHING_KNOWN, Prior
+from .map_file import FORMAT, NAME, is_map_file, load_map, save_map
+from .named_scans import named
+from .scan_addition import add_scan
+from .scan_map import ScanMap, prepare_map, with_features
+
+FOLDER = "piccolo-maps"  # within the folder that the user names
+# What makes a map: folders of the package. The cache makes maps anew when one of their files has changed.
+MAKERS = ("cloud", "geometry", "gravity", "local_features", "optimize", "panorama", "scan_map", "views")
+
+
+@dataclass(frozen=True)
+class CachePolicy:
+    """Where prepared maps are kept."""
+
+    is_used: bool = True
+    folder: Path | None = None  # None for the user's cache
+
+
+def open_map(
+    paths: Sequence[Path],
+    cloud_settings: CloudSettings,
+    cache: CachePolicy,
+    workers: Workers,
+    watch: Stopwatch,
+    prior: Prior = NOTHING_KNOWN,
+    has_features: bool = False,
+) -> ScanMap:
+    """The map of a cloud's files: prepared already, from the cache, or built now.
+
+    A prepared map may stand in place of the files. The prior is asked where the scan is too large as a whole.
+    Local features come late, and into the cache then, unless `has_features`.
+    """
+    map_path = prepared_map_among(paths)
+    if map_path:
+        if len(paths) > 1 or replace(cloud_settings, labels=None, crs=None) != IN_METRES:
+            raise InputError(f"{map_path}: found a prepared map, wanted it alone, without options for clouds")
+        with watch.stage("read"):
+            scan_map = load_map(map_path, cache.is_used)
+        check_labels(map_path, scan_map, cloud_settings)
+        return scan_map
+
+    digest = ""
+    if all(path.is_file() for path in paths):  # what is none is refused when it is opened
+        with watch.stage("read"):
+            digest = sha256_of_files(paths, cache.is_used)
+
+    def build() -> ScanMap:
+        with watch.stage("read"):
+            cloud = open_cloud(paths, cloud_settings, workers.show)
+        how = cloud_settings.up, watch
+        scan_map = prepare_map(cloud, workers, *how, prior=prior, has_features=has_features)
+        has_labels = cloud_settings.labels is not None
+        return replace(scan_map, has_labels=has_labels, scan_sha256=digest, crs=crs_of(paths))
+
+    key = content_key(digest, cloud_settings) if digest else ""
+    if not (cache.is_used and key):
+        return build()
+    scan_map, warning = cached_map(cache.folder, key, digest, build, watch)
+    if not warning:
+        return scan_map
+    workers.warn(warning)
+    return replace(scan_map, warnings=(*scan_map.warnings, warning))
+
+
+def extended_map(
+    map_path: Path,
+    paths: Sequence[Path],
+    cloud_settings: CloudSettings,
+    name: str,
+    workers: Workers,
+    watch: Stopwatch,
+) -> ScanMap:
+    """A prepared map with the scan of some files put in under a name; a map without names gets its file's."""
+    if not prepared_map_among([map_path]):
+        found = "no prepared map" if map_path.exists() else "no such file"
+        raise InputError(f"{map_path}: found {found}, wanted a map by tools/prepare_map.py")
+    if path := prepared_map_among(paths):
+        raise InputError(f"{path}: found a prepared map, wanted the files of a scan to add")
+    if cloud_settings.up != "auto":
+        raise InputError("--up: found beside --add, wanted without; a scan is added in the map's axes")
+    with watch.stage("read"):
+        old = load_map(map_path)
+        cloud = open_cloud(paths, cloud_settings, workers.show)
+        digest = sha256_of_files(paths)
+        crs = crs_of(paths)
+    check_labels(map_path, old, cloud_settings)
+    if crs and old.crs and crs != old.crs:
+        workers.warn(f"{paths[0]}: names another coordinate system than the map, whose is taken for both")
+    old = with_features(old, workers)
+    old = old if old.scan_names else named(old, map_path.stem)
+    both = "\n".join(sorted([old.scan_sha256, digest]))
+    added = add_scan(old, cloud, name, workers, watch)
+    return replace(added, scan_sha256=hashlib.sha256(both.encode()).hexdigest(), crs=old.crs or crs)
+
+
+def check_labels(map_path: Path, scan_map: ScanMap, cloud_settings: CloudSettings) -> None:
+    """Refuse a map of labels where colours are asked for, and the other way round."""
+    if scan_map.has_labels != (cloud_settings.labels is not None):
+        kind = "labels, wanted --labels too" if scan_map.has_labels else "colours, wanted no --labels"
+        raise InputError(f"{map_path}: found a prepared map of {kind}")
+
+
+def prepared_map_among(paths: Sequence[Path]) -> Path | None:
+    """The first of some files that is a prepared map."""
+    return next((path for path in paths if path.is_file() and is_map_file(path)), None)
+
+
+def scan_sha256_of(paths: Sequence[Path], cache: CachePolicy) -> str:
+    """The digest of a scan's files, or the one of what the prepared map in place of them was made from."""
+    map_path = prepared_map_among(paths)
+    if map_path:
+        return load_map(map_path, cache.is_used).scan_sha256
+    return sha256_of_files(paths, cache.is_used)
+
+
+def content_key(scan_sha256: str, settings: CloudSettings) -> str:
+    """Name for the map of a cloud's files: by what is in them and the settings, wherever they lie."""
+    digest = hashlib.sha256(
+        " ".join([FORMAT, digest_of_sources(MAKERS), repr(replace(settings, crs=None)), scan_sha256]).encode()
+    )
+    return digest.hexdigest()[:32]
+
+
+def cached_map(
+    folder: Path | None, key: str, scan_sha256: str, build: Callable[[], ScanMap], watch: Stopwatch
+) -> tuple[ScanMap, str]:
+    """The map named `key` of a cache within a folder, or built and put there; the user's cache if None.
+
+    Second what went wrong with the cache, in one line: the map is then as good, only not kept. Two processes
+    may build one map at once: each writes its own file whole, the last stays, both are equal.
+    """
+    warning = ""
+    try:
+        kept_in = own_folder(folder / FOLDER if folder else cache_root() / "maps", NAME)
+        path = kept_in / f"{key}.piccolo-map"
+        if path.exists():
+            with watch.stage("read"):
+                mark_used(path)
+                scan_map = load_map(path, remembers=True)
+            if scan_map.scan_sha256 == scan_sha256:
+                return kept_late(scan_map, path), ""
+            warning = f"{path}: found the map of another scan; it is made anew"
+    except InputError as error:
+        warning = f"{error}; it is made anew"
+    except OSError as error:
+        return build(), f"{in_words(error)}; the prepared map is not kept"
+    scan_map = build()
+    if scan_map.is_partial:
+        return scan_map, ""
+    try:
+        with watch.stage("prepare"):
+            save_map(scan_map, path)
+    except OSError as error:
+        warning = f"{kept_in}: {error.strerror or error}; the prepared map is not kept"
+        return scan_map, warning
+    return kept_late(scan_map, path), warning
+
+
+def kept_late(scan_map: ScanMap, path: Path) -> ScanMap:
+    """The same; when its local features are made, the map is written once more, with them."""
+
+    def look() -> FeatureMap | None:
+        with suppress(OSError, InputError):
+            found = load_map(path, remembers=True)
+            if found.scan_sha256 == scan_map.scan_sha256 and not found.lacks_features:
+                return found.local_features
+        return None
+
+    def keep(features: FeatureMap) -> None:
+        with suppress(OSError):  # they are made again by the next process
+            save_map(replace(scan_map, local_features=features), path)
+
+    if scan_map.late:
+        scan_map.late.keep_by(look, keep)
+    return scan_map
+
+
+def open_points(paths: Sequence[Path], settings: CloudSettings, workers: Workers) -> LocalCloud:
+    """All points of a cloud's files, or the voxels of the prepared map that stands in place of them."""
+    if prepared_map_among(paths):
+        m = open_map(paths, settings, CachePolicy(is_used=False), workers, Stopwatch())
+        return LocalCloud(m.points, m.R_map_from_world, m.origin_world, m.warnings)
+    cloud = open_cloud(paths, settings, workers.show).read()
+    R_local_from_world = R_z_from_axis(settings.up, cloud.up)
+    points = rotate_points(cloud.points.astype(np.float64), R_local_from_world).astype(np.float32)
+    packed = pack_points(points, cloud.colors)
+    return LocalCloud(packed, R_local_from_world, cloud.origin_world, cloud.warnings)

@@ -1,0 +1,62 @@
+"""Prior knowledge of a camera's position: by the user, or by a photo's GPS, which may be wrong indoors."""
+
+import math
+from dataclasses import dataclass, replace
+
+from ..cloud.crs import from_wgs84
+from ..errors import InputError
+from ..panorama.photo import GpsPosition
+
+DEFAULT_ACCURACY, LEAST_ACCURACY = 10.0, 5.0  # [m] where the file does not say, or says less
+SIGMAS = 3.0
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What the user knows beforehand; each narrows the search."""
+
+    near_world: tuple[float, float, float | None] | None = None  # [m] within `radius`; None: any height
+    radius: float | None = None  # [m]
+    height: tuple[float, float] | None = None  # [m] least and most above the floor
+    heading_deg: float | None = None  # of the image centre, clockwise from the cloud's +y, as GPano counts
+    heading_tolerance_deg: float = 20.0
+    within: tuple[str, ...] = ()  # names of the map's scans that the camera may be in; all if none
+
+    def __post_init__(self) -> None:
+        """Refuse what contradicts itself, naming the option."""
+        numbers = *(self.near_world or ()), *(self.height or ()), self.radius, self.heading_deg
+        if not all(math.isfinite(number) for number in numbers if number is not None):
+            raise InputError("--near, --radius, --height, --heading: found nan or inf, wanted finite numbers")
+        if (self.near_world is None) != (self.radius is None):
+            raise InputError("--near, --radius: found one of them, wanted both or none")
+        if self.radius is not None and self.radius <= 0.0:
+            raise InputError(f"--radius: found {self.radius}, wanted metres above 0")
+        if self.height is not None and not self.height[0] < self.height[1]:
+            raise InputError(f"--height: found {list(self.height)}, wanted MIN below MAX")
+        if not 0.0 < self.heading_tolerance_deg <= 180.0:
+            raise InputError(f"--heading-tolerance: found {self.heading_tolerance_deg}, wanted 0 to 180")
+
+
+NOTHING_KNOWN = Prior()
+
+
+@dataclass(frozen=True)
+class GpsPrior:
+    """Where a photo's GPS position lies in the scan."""
+
+    center_world: tuple[float, float]  # [m] in the scan's coordinates, of any height
+    radius: float  # [m] within which the camera is searched first
+    is_used: bool = True  # the result lies there; else it was found, or not found, without it
+
+    def applied_to(self, prior: Prior) -> Prior:
+        """The prior with this position in place of none."""
+        return replace(prior, near_world=(*self.center_world, None), radius=self.radius)
+
+
+def gps_prior(gps: GpsPosition, crs: str, metres_per_unit: float) -> GpsPrior | None:
+    """The prior of a position in a scan of this system; None where the system does not hold."""
+    place = from_wgs84(crs, gps.latitude_deg, gps.longitude_deg)
+    if place is None:
+        return None
+    radius = SIGMAS * max(gps.accuracy or DEFAULT_ACCURACY, LEAST_ACCURACY)
+    return GpsPrior((place[0] * metres_per_unit, place[1] * metres_per_unit), radius)

@@ -1,0 +1,198 @@
+"""Another scan in a map: only what it changes is prepared anew.
+
+Candidates stay where they are, views and local features are made anew where the new scan is seen, and all
+else keeps every bit.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cloud.octree import Octree, build_octree
+from ..cloud.surface_noise import surface_variance
+from ..cloud.voxels import LEAF_SIZE, WINDOW, Voxels, join_voxels
+from ..errors import InputError
+from ..geometry.pose import Array
+from ..geometry.sphere import make_grid, whole_areas
+from ..jobs.stopwatch import Stopwatch
+from ..jobs.threads import Workers
+from ..local_features.feature_map import MOST_VIEWS, FeatureMap, extend_feature_map
+from ..local_features.view_positions import view_positions
+from ..views.candidate_views import SEARCH_VIEW, WIDE_RINGS, CandidateViews, WideViews, render_wide
+from ..views.view import BLOCK, ranges_around
+from .aligned_cloud import Voxelized
+from .camera_positions import CLEARANCE_VOXEL, MIN_CLEARANCE, Box, candidate_centers
+from .named_scans import check_name
+from .scan_map import ScanMap, seen_by, sparse_candidates
+
+REACH = 3.0  # [m] beside the new scan there may be new places for a camera
+NEARER = 0.9  # of two scans the one in front is nearer by this
+# Fractions of the sphere in which a view shows the new scan, else it stays, or its features do: what they
+# miss, new views have from nearer.
+LEAST_CHANGED, LEAST_FOR_FEATURES = 0.01, 0.1
+FAR_APART = 500.0  # [m] between scans that perhaps have no common coordinates
+COARSE_VOXEL = 2.56  # [m]
+
+
+class Candidates(NamedTuple):
+    """Candidates of a map and a new scan: those of the map that stay, and then new ones."""
+
+    rows: NDArray[np.int64]  # (S,) of the map's candidates, those that stay
+    centers: NDArray[np.float64]  # (N, 3) [m]
+    fraction: Array  # (N,) of the sphere in which the new scan is in front; of new ones 1
+    is_new: NDArray[np.bool_]  # (N,) more of the sphere shows the new scan in front than the others
+
+    @property
+    def changed(self) -> NDArray[np.int64]:
+        """Indices of those whose views are to be made anew."""
+        return np.flatnonzero(self.fraction > LEAST_CHANGED)
+
+
+def add_scan(old: ScanMap, cloud: Voxelized, name: str, workers: Workers, watch: Stopwatch) -> ScanMap:
+    """A map and another scan in the same coordinates, under a name of its own."""
+    check_name(name, old.scan_names)
+    with watch.stage("read"):
+        new, warnings = read_beside(old, cloud)
+    for warning in warnings:
+        workers.warn(warning)
+    with watch.stage("prepare"):
+        leaves = old.octree.level(LEAF_SIZE), new.level(LEAF_SIZE)
+        octree = build_octree(join_voxels(*leaves, old.R_map_from_world @ old.origin_world))
+        found = joined_candidates(old, new, octree, workers)
+        sparse, _ = sparse_candidates(found.centers)
+        wide = joined_views(old, octree, found, sparse, workers)
+        return replace(
+            old,
+            octree=octree,
+            surface_variance=surface_variance(octree),
+            centers=found.centers,
+            scan_of_candidate=scans_of(old, found),
+            sparse=sparse,
+            wide_features=wide.features,
+            wide_seen=wide.seen,
+            views=CandidateViews(octree, found.centers),
+            local_features=joined_features(old, octree, found, workers),
+            scan_names=(*old.scan_names, name),
+            warnings=tuple(dict.fromkeys(old.warnings + warnings)),
+        )
+
+
+def read_beside(old: ScanMap, cloud: Voxelized) -> tuple[Octree, tuple[str, ...]]:
+    """The octree of a scan alone, in a map's frame, and warnings."""
+    if old.octree.leaf_size != LEAF_SIZE:
+        found = f"found a map of voxels of {old.octree.leaf_size} m"
+        raise InputError(f"--add: {found}, wanted {LEAF_SIZE} m; prepare it again")
+    voxels = cloud.voxels(old.R_map_from_world)
+    nodes = voxels.nodes.copy()
+    nodes[:, :3] += voxels.origin - np.rint(old.R_map_from_world @ old.origin_world)
+    if (farthest := float(np.abs(nodes[:, :3]).max())) > WINDOW * LEAF_SIZE:
+        found = f"found a scan {farthest / 1000.0:.0f} km from the map's"
+        raise InputError(f"--add: {found}, wanted one coordinate system")
+    first, second = old.octree.level(COARSE_VOXEL)[:, :3], nodes[:, :3]
+    gap = np.maximum(second.min(axis=0) - first.max(axis=0), first.min(axis=0) - second.max(axis=0))
+    warnings = voxels.warnings
+    if (apart := float(np.linalg.norm(np.maximum(gap, 0.0)))) > FAR_APART:
+        warnings += (f"the scan lies {apart:.0f} m from the map's; both need one coordinate system",)
+    return build_octree(Voxels(voxels.codes, nodes, voxels.origin)), warnings
+
+
+def joined_candidates(old: ScanMap, new: Octree, octree: Octree, workers: Workers) -> Candidates:
+    """The candidates of a map and a new scan, by the octrees of the new one alone and of both."""
+    from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
+
+    points = new.level(CLEARANCE_VOXEL)[:, :3]
+    clearance, _ = cKDTree(points).query(old.centers, distance_upper_bound=2.0 * MIN_CLEARANCE)
+    rows = np.flatnonzero(clearance > MIN_CLEARANCE)
+    box = Box(points.min(axis=0) - REACH, points.max(axis=0) + REACH)
+    positions = candidate_centers(octree, workers, box)
+    gap, _ = cKDTree(old.centers).query(positions)
+    more = positions[box.holds(positions) & (gap > 0.0)]
+    in_front, behind = np.zeros((2, len(rows)))
+    scan = Box(points.min(axis=0) - CLEARANCE_VOXEL, points.max(axis=0) + CLEARANCE_VOXEL)
+    near = most_of_sphere(scan, old.centers[rows]) > LEAST_CHANGED
+    in_front[near], behind[near] = compared(new, old.octree, old.centers[rows[near]], workers)
+    of_more = compared(new, old.octree, more, workers)
+    fraction = np.concatenate([in_front, np.ones(len(more))])
+    is_new = np.concatenate([in_front > behind, of_more[0] > of_more[1]]) & (fraction > LEAST_CHANGED)
+    return Candidates(rows, np.concatenate([old.centers[rows], more]), fraction, is_new)
+
+
+def most_of_sphere(box: Box, centers: Array) -> Array:
+    """The most of the sphere (N,) that what is in a box can take around centres (N, 3), by a ball around it.
+
+    A half within that ball, where it may be all.
+    """
+    radius = 0.5 * float(np.linalg.norm(box.high - box.low))
+    distance = np.linalg.norm(centers - 0.5 * (box.low + box.high), axis=1)
+    sine = np.minimum(radius / np.maximum(distance, radius), 1.0)
+    return np.asarray(0.5 * (1.0 - np.sqrt(1.0 - sine**2)))
+
+
+def compared(new: Octree, old: Octree, centers: Array, workers: Workers) -> tuple[Array, Array]:
+    """Fractions of the sphere (N,) about centres (N, 3) where a new scan is in front, and where behind."""
+    area = whole_areas(SEARCH_VIEW.num_rings).astype(np.float64)
+
+    def compare(lo: int) -> tuple[Array, Array]:
+        some = centers[lo : lo + BLOCK]
+        of_new, of_old = (ranges_around(octree, some, SEARCH_VIEW) for octree in (new, old))
+        of_new[of_new == 0.0], of_old[of_old == 0.0] = np.inf, np.inf
+        return (of_new < NEARER * of_old) @ area, (of_old < NEARER * of_new) @ area
+
+    parts = list(workers.map(compare, range(0, len(centers), BLOCK), "compare views"))
+    in_front, behind = (np.concatenate([np.empty(0), *(part[k] for part in parts)]) for k in range(2))
+    return in_front / area.sum(), behind / area.sum()
+
+
+def joined_views(
+    old: ScanMap, octree: Octree, found: Candidates, sparse: NDArray[np.int64], workers: Workers
+) -> WideViews:
+    """Wide views of the sparse candidates: the map's, and those that it lacks or that have changed anew."""
+    num_wide = len(make_grid(WIDE_RINGS))
+    joined = WideViews(
+        np.empty((len(sparse), 3 * num_wide), np.int8), np.empty((len(sparse), num_wide), np.uint8)
+    )
+    known, place = np.full(len(old.centers), -1), np.full(len(found.centers), -1)  # among those of the map
+    known[old.sparse] = np.arange(len(old.sparse))
+    place[: len(found.rows)] = known[found.rows]
+    place[found.changed] = -1
+    is_kept = place[sparse] >= 0
+    joined.features[is_kept] = old.wide_features[place[sparse[is_kept]]]
+    joined.seen[is_kept] = old.wide_seen[place[sparse[is_kept]]]
+    anew = render_wide(octree, found.centers[sparse[~is_kept]], SEARCH_VIEW, workers)
+    joined.features[~is_kept], joined.seen[~is_kept] = anew
+    return joined
+
+
+def scans_of(old: ScanMap, found: Candidates) -> NDArray[np.uint16]:
+    """The scan of each candidate (N,): as it was, of new places that of the nearest, or the new one."""
+    from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
+
+    num_known = len(found.rows)
+    scans = np.zeros(len(found.centers), np.uint16)
+    if num_known:
+        _, nearest = cKDTree(found.centers[:num_known]).query(found.centers)
+        scans = old.scan_of_candidate[found.rows][nearest]
+        scans[:num_known] = old.scan_of_candidate[found.rows]
+    scans[found.is_new] = len(old.scan_names)
+    return scans
+
+
+def joined_features(old: ScanMap, octree: Octree, found: Candidates, workers: Workers) -> FeatureMap:
+    """Features of the map's views, taken anew where these have changed, and of as many more as are needed."""
+    from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
+
+    view_centers = old.local_features.view_centers
+    gap, place = cKDTree(found.centers).query(view_centers)
+    has_place = gap == 0.0  # it is that of a candidate which stays
+    is_kept = has_place.copy()
+    is_kept[has_place] = found.fraction[place[has_place]] <= LEAST_FOR_FEATURES
+    looked_at = np.concatenate([place[has_place], found.changed])
+    centers = found.centers[looked_at]
+    num_known = int(np.count_nonzero(has_place))
+    more = view_positions(centers, seen_by(octree, centers), SEARCH_VIEW.num_rings, num_known)
+    anew = np.concatenate([place[has_place & ~is_kept], looked_at[more]])
+    if np.count_nonzero(is_kept) + len(anew) > MOST_VIEWS:
+        raise InputError(f"--add: found more than {MOST_VIEWS} views with features, the most of one map")
+    return extend_feature_map(old.local_features, is_kept, octree, found.centers[anew], workers)

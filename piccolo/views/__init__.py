@@ -1,0 +1,1 @@
+"""The scan as it is seen from a place."""

@@ -1,0 +1,183 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rooms
+from measuring.repeated import REPEATED_KINDS, make_repeated
+from rooms import as_panorama, errors, query
+
+from piccolo.cloud import stream_of
+from piccolo.cloud.readers.reader import RawCloud
+from piccolo.geometry.pose import exp_so3, log_so3, step
+from piccolo.jobs.stopwatch import Stopwatch
+from piccolo.jobs.threads import Workers
+from piccolo.localization import covariance
+from piccolo.localization.localize import localize
+from piccolo.localization.query import prepare_query
+from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.scan_map.scan_map import prepare_map
+from piccolo.scenes.synthetic.world import World, make_query, scan_world
+
+SETTINGS = CoarseToFineSettings(gravity="known")
+
+
+@pytest.fixture(scope="module")
+def found():
+    """The query of a panorama in a room, and the pose found in the map's frame."""
+    scan_map, panorama = rooms.scan_map(2), as_panorama(query(2).rgb)
+    prepared = prepare_query(panorama, scan_map, SETTINGS, Workers(2))
+    result = localize(scan_map, panorama, SETTINGS, Workers(2), Stopwatch())
+    return prepared, scan_map.from_world(result.pose), result
+
+
+def _points(prepared, pose):
+    """The points at a pose with channels in levels."""
+    points = covariance.points_at(prepared, pose).around(pose.center_world)
+    return points._replace(channels=covariance.as_levels(points.channels))
+
+
+def test_gradients_of_blocks_add_up(found, monkeypatch):
+    prepared, pose, _ = found
+    points = _points(prepared, pose)
+    total, _ = covariance.equations_at(prepared.images.full, points, pose)
+    monkeypatch.setattr(covariance, "MOST_SHARE", 1e9)  # so that no block's share counts
+    parts = 1e9 * covariance.block_gradients(prepared.images.full, points, pose)
+    assert len(parts) > 100
+    tolerance = 1e-3 * np.abs(parts).sum(axis=0).max()
+    np.testing.assert_allclose(parts.sum(axis=0), total, rtol=1e-3, atol=tolerance)
+
+
+def test_gradients_as_left_out_are_those_at_the_pose_without_the_block():
+    """Of a linear problem, solved with and without each block."""
+    rng = np.random.default_rng(1)
+    rows, wanted = rng.normal(size=(20, 4, 6)), rng.normal(size=(20, 4))
+    matrices = np.swapaxes(rows, 1, 2) @ rows
+    right = np.einsum("bni,bn->bi", rows, wanted)
+    x = np.linalg.solve(matrices.sum(axis=0), right.sum(axis=0))
+    gradients = np.einsum("bni,bn->bi", rows, rows @ x - wanted)
+    found = covariance.as_left_out(gradients, matrices)
+    for k in (0, 7, 19):
+        others = np.delete(np.arange(20), k)
+        alone = np.linalg.solve(matrices[others].sum(axis=0), right[others].sum(axis=0))
+        np.testing.assert_allclose(found[k], rows[k].T @ (rows[k] @ alone - wanted[k]), rtol=0.02, atol=0.02)
+
+
+def test_hessian_predicts_the_gradient_a_step_away(found):
+    prepared, pose, _ = found
+    points = _points(prepared, pose)
+    hessian = covariance.hessian_at(prepared.images.full, points, pose, covariance.STEPS[0])
+    for delta in ([0.001, 0, 0, 0, 0.003, 0], [0, -0.0015, 0.001, 0.003, 0, -0.004]):
+        moved = step(pose, np.array(delta))
+        before, _ = covariance.equations_at(prepared.images.full, points, pose)
+        after, _ = covariance.equations_at(prepared.images.full, points, moved)
+        expected = hessian @ delta
+        assert np.linalg.norm(after - before - expected) < 0.5 * np.linalg.norm(expected)
+
+
+def test_sandwich_of_independent_blocks_is_the_textbook_covariance():
+    rng = np.random.default_rng(0)
+    hessian = np.diag([4.0, 5.0, 6.0, 1.0, 2.0, 3.0])
+    gradients = rng.normal(size=(5000, 6)) * np.sqrt(np.diag(hessian) / 5000)
+    found = covariance.covariance_of(hessian, gradients)
+    np.testing.assert_allclose(found, np.linalg.inv(hessian), atol=0.05)
+
+
+def test_no_covariance_without_a_minimum_or_with_few_blocks():
+    gradients = np.random.default_rng(0).normal(size=(100, 6))
+    assert covariance.covariance_of(np.diag([1.0, 1, 1, 1, 1, -0.1]), gradients) is None
+    for least, count, is_known in ((1, 12, False), (1, 13, True), (1e-10, 100, False), (1e-8, 100, True)):
+        found = covariance.covariance_of(np.diag([1.0, 1, 1, 1, 1, least]), gradients[:count])
+        assert (found is not None) == is_known
+
+
+def test_covariance_is_in_the_worlds_axes(found):
+    """A map turned against the world: the same deviations, turned along."""
+    prepared, pose, result = found
+    R = exp_so3(np.array([0.2, -0.5, 1.1]))
+    turned = replace(prepared, scan_map=replace(prepared.scan_map, R_map_from_world=R))
+    own, other = result.covariance.matrix, covariance.estimate_covariance(turned, pose).matrix
+    np.testing.assert_allclose(other[:3, :3], own[:3, :3], rtol=1e-6)
+    np.testing.assert_allclose(R @ other[3:, 3:] @ R.T, own[3:, 3:], rtol=1e-6, atol=1e-12)
+
+
+def test_deviations_are_of_the_size_of_the_errors():
+    """Squared errors, weighed by their covariance: 5.3 in the median for six numbers if all is right."""
+    squares = []
+    for seed in (1, 2, 3):
+        scan_map = rooms.scan_map(seed)
+        for variant in ("clean", "tilt", "change"):
+            taken = query(seed, variant)
+            how = CoarseToFineSettings(gravity="unknown" if variant == "tilt" else "known")
+            result = localize(scan_map, as_panorama(taken.rgb), how, Workers(2), Stopwatch())
+            turn = log_so3(taken.pose.R_cam_from_world @ result.pose.R_cam_from_world.T)
+            error = np.concatenate([turn, taken.pose.center_world - result.pose.center_world])
+            squares.append(error @ np.linalg.solve(result.covariance.matrix, error))
+    assert 2.5 < np.median(squares) < 10.5  # deviations right to a factor of 1.4
+
+
+def test_no_covariance_where_the_points_fix_no_pose(found, monkeypatch):
+    monkeypatch.setattr(covariance, "covariance_at", lambda *_: None)
+    assert covariance.estimate_covariance(found[0], found[1]) is None
+
+
+@pytest.mark.parametrize("num_rough", [1, 2, 3])
+def test_where_the_finest_images_have_no_minimum_the_next_one_tells(found, monkeypatch, num_rough):
+    prepared, pose, _ = found
+    images, asked = prepared.images, []
+    ways = list(
+        zip(
+            (images.full, images.fine, images.middle),
+            (*covariance.STEPS, covariance.ROUGH_STEPS),
+            strict=True,
+        )
+    )
+
+    def hessian(image, points, pose, steps):
+        asked.append((image, steps))
+        return np.diag([1.0] * 5 + [-1.0 if any(image is i for i, _ in ways[:num_rough]) else 1.0])
+
+    gradients = np.random.default_rng(0).normal(size=(100, 6))
+    monkeypatch.setattr(covariance, "hessian_at", hessian)
+    monkeypatch.setattr(covariance, "block_gradients", lambda *_: gradients)
+    matrix = covariance.covariance_at(prepared, _points(prepared, pose), pose)
+    assert asked == ways[: 2 if num_rough == 1 else 3]
+    if num_rough == 3:
+        assert matrix is None
+    else:
+        np.testing.assert_allclose(matrix, ways[num_rough][1].inflation * gradients.T @ gradients)
+
+
+@pytest.mark.parametrize("kind", REPEATED_KINDS)
+def test_truth_is_among_the_poses_of_a_place_that_repeats(kind):
+    world = World(1, make_repeated(kind, 1, np.array(rooms.SIZE)))
+    points, colors, _ = scan_world(world, 80_000 * len(world.rooms), Workers(2))
+    cloud = stream_of(Path("repeated"), RawCloud(points.astype(float), colors))
+    taken = make_query(world, 0, "clean", rooms.WIDTH, Workers(2))
+    built, panorama = prepare_map(cloud, Workers(2)), as_panorama(taken.rgb)
+    result = localize(built, panorama, CoarseToFineSettings(), Workers(2), Stopwatch())
+    poses = [result.pose, *(h.pose for h in result.alternatives)]
+    distances = [errors(pose, taken.pose)[0] for pose in poses]
+    assert min(distances) < 0.1
+    assert result.status == "ambiguous" or distances[0] < 0.1
+    assert 1 <= len(result.alternatives) <= 5
+
+
+def test_a_point_at_a_pole_of_the_photo_tells_nothing(found, monkeypatch):
+    """Its pixels are so narrow that it would outweigh all others."""
+    prepared, pose, result = found
+    taken = covariance.points_at(prepared, pose).around(pose.center_world)
+    down = -pose.R_cam_from_world[2] + 0.002 * pose.R_cam_from_world[0]
+    away = -pose.R_cam_from_world[2] + 0.1 * pose.R_cam_from_world[0]
+    wrong = np.array([2.0, -2.0, 2.0], np.float32)
+
+    def with_one_at(direction):
+        offsets = np.concatenate([taken.offsets, 1.5 * direction[:, None]], axis=1).astype(np.float32)
+        channels = np.concatenate([taken.channels, wrong[:, None]], axis=1)
+        return type(taken)(offsets, channels, np.ones(offsets.shape[1], np.float32), taken.center_map)
+
+    kept = [len(covariance.without_poles(with_one_at(d), pose).weights) for d in (down, away)]
+    assert kept[1] == kept[0] + 1
+    monkeypatch.setattr(covariance, "points_at", lambda query, pose: with_one_at(down))
+    told = covariance.estimate_covariance(prepared, pose).matrix
+    np.testing.assert_allclose(told, result.covariance.matrix, rtol=0.02)
