@@ -1,5 +1,6 @@
 # make demo          set up, make a room, localize panoramas in it, print the errors against the truth, write a report
 # make test          set up, run every test but those of the report's page
+# make test-kernels  set up, run the numerical tests once without compiling and once with array bounds checked
 # make test-browser  set up, run the tests of the report's page in Chromium (apt-get install chromium npm)
 # make check         set up, lint, format and types
 # make check-page    the same of the report's page, and that its bundle is made from its sources (Node 20)
@@ -9,7 +10,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-browser check check-page clean
+.PHONY: demo test test-kernels test-browser check check-page clean
 
 $(VENV)/ready: requirements.lock requirements-formats.lock requirements-tools.lock requirements-distributed.lock requirements-video.lock requirements-dev.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "found $$($(PYTHON) --version), wanted Python 3.11 or newer: make PYTHON=python3.11" >&2; exit 1; }
@@ -26,6 +27,14 @@ demo: $(VENV)/ready
 
 test: $(VENV)/ready
 	$(BIN)/python -m pytest -n auto --dist loadfile
+
+# of the tests of kernels, those that need seconds in plain Python
+KERNELS := channel_loss cloud_morton cloud_octree cloud_voxels levenberg_marquardt p3p pose pose_refinement \
+	sampling_loss sphere sphere_grid suppression zbuffer
+
+test-kernels: $(VENV)/ready
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest $(KERNELS:%=tests/test_%.py)
+	NUMBA_BOUNDSCHECK=1 $(BIN)/python -m pytest $(KERNELS:%=tests/test_%.py)
 
 test-browser: $(VENV)/browser page/node_modules/ready
 	$(BIN)/python -m pytest browser_tests

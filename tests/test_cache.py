@@ -17,6 +17,8 @@ from piccolo.files import cache
 from piccolo.files.atomic import replacing
 from piccolo.kernels import kernel_cache
 from piccolo.kernels.jit import kernel
+from piccolo.optimize.channel_loss import add_channels
+from piccolo.optimize.sampling_loss import add_packed
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -247,6 +249,13 @@ def test_bounds_are_checked_where_code_without_is_kept(tmp_path, monkeypatch):
     with pytest.raises(IndexError):
         kernel(third)(values[:2])
     assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_losses_of_one_making_are_kept_apart_on_disk():
+    """Compiled code is looked up by the names of all that is compiled in."""
+    names = {adder._cache.name for adder in (add_channels, add_packed)}
+    assert len(names) == 2
+    assert any("geman_mcclure" in name for name in names)
 
 
 def test_who_waits_for_kernels_is_told_how_many_are_left(monkeypatch, capsys):

@@ -8,13 +8,11 @@ from piccolo.geometry.pose import Pose, exp_so3, step
 from piccolo.optimize.channel_loss import (
     CHANCE,
     NUM_BLOCKS,
-    add_channels,
     channel_equations,
     correlate,
     score,
 )
 from piccolo.optimize.normal_equations import COUNT, GRADIENT, LOSS, MATRIX, NUM_SUMS
-from piccolo.optimize.sampling_loss import add_packed
 from piccolo.panorama.texels import pack_texels
 
 TILTED = Pose(exp_so3(np.array([0.4, -1.1, 0.7])), np.array([0.2, -0.3, 0.1]))
@@ -110,10 +108,3 @@ def test_each_block_correlates_over_what_both_show_and_counts_beyond_chance():
     assert 0.5 < sums[:, 3].sum() < 0.9
     assert score(*arguments) == pytest.approx(total, abs=1e-4)
     assert 0.2 < total < 0.7
-
-
-def test_losses_of_one_making_are_kept_apart_on_disk():
-    """Compiled code is looked up by the names of all that is compiled in."""
-    names = {adder._cache.name for adder in (add_channels, add_packed)}
-    assert len(names) == 2
-    assert any("geman_mcclure" in name for name in names)
