@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -13,23 +14,38 @@ MIN_DISTANCE, MIN_ANGLE = 0.5, math.radians(15.0)  # [m], [rad] poses nearer tha
 MAX_ALTERNATIVES = 5  # reported
 
 
+class Scored(Protocol):
+    """A pose with a score: more is better."""
+
+    @property
+    def pose(self) -> Pose:
+        """The pose."""
+
+    @property
+    def score(self) -> float:
+        """Its score, of what is compared with what."""
+
+
+ScoredPose = TypeVar("ScoredPose", bound=Scored)
+
+
 @dataclass(frozen=True)
 class Hypothesis:
-    """A pose, and how well it explains the panorama: more is better."""
+    """A pose that may be right."""
 
     pose: Pose
-    score: float
+    score: float  # what of the panorama it explains, as of `score.Evidence`
 
 
-def by_score(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+def by_score(poses: Sequence[ScoredPose]) -> list[ScoredPose]:
     """The best first; of equal ones, the first."""
-    return sorted(hypotheses, key=lambda h: -h.score)
+    return sorted(poses, key=lambda p: -p.score)
 
 
 def suppressed(
-    ranked: Sequence[Hypothesis], count: int, min_distance: float, min_angle: float
-) -> list[Hypothesis]:
-    """The first `count` hypotheses that are near (distance [m] and angle [rad]) none before."""
+    ranked: Sequence[ScoredPose], count: int, min_distance: float, min_angle: float
+) -> list[ScoredPose]:
+    """The first `count` poses that are near (distance [m] and angle [rad]) none before."""
     if not ranked:
         return []
     rotations = np.array([h.pose.R_cam_from_world for h in ranked])
@@ -38,10 +54,10 @@ def suppressed(
 
 
 def best_distinct(
-    hypotheses: Sequence[Hypothesis], count: int, min_distance: float, min_angle: float
-) -> list[Hypothesis]:
+    poses: Sequence[ScoredPose], count: int, min_distance: float, min_angle: float
+) -> list[ScoredPose]:
     """At most `count` by falling score, none within distance [m] and angle [rad] of a better one."""
-    return suppressed(by_score(hypotheses), count, min_distance, min_angle)
+    return suppressed(by_score(poses), count, min_distance, min_angle)
 
 
 def alternative_poses(

@@ -1,11 +1,11 @@
 """Descents on the cells of a view: from many starts, from one pose, and from around a pose."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..confidence.alternatives import Hypothesis
 from ..geometry.pose import Pose, orthonormal
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, kernel
@@ -16,13 +16,26 @@ from ..panorama.texels import Texels
 from ..scan_map.scan_map import ScanMap
 from ..views.candidate_views import SEARCH_VIEW
 from ..views.view import Cells
-from .starts import Starts
+from .search import Starts
 
-COARSE_LOSS, FINE_LOSS, FULL_LOSS = 1.2, 1.0, 0.7  # scales of the loss [standard deviations]
-START_TOLERANCE, PERTURBED_TOLERANCE = 2e-3, 1e-3  # [rad + m] a shorter step ends a descent
-WIDE_ITERATIONS, NARROW_ITERATIONS = 6, 8  # of a descent from around a pose
-PERTURBED_DISTANCE, PERTURBED_ANGLE = 0.25, math.radians(8.0)  # [m], [rad]
-BATCH, PERTURBED_BATCH = 16, 3  # starts that a thread takes at a time, and of those around a pose
+COARSE_LOSS = 1.2  # scale of the loss [standard deviations]
+FINE_LOSS = 1.0
+FULL_LOSS = 0.7
+START_TOLERANCE = 2e-3  # [rad + m] a shorter step ends a descent from a start
+PERTURBED_TOLERANCE = 1e-3  # and one from around a pose
+WIDE_ITERATIONS = 6  # of a descent from around a pose, on the wide image
+NARROW_ITERATIONS = 8  # on the other
+PERTURBED_DISTANCE = 0.25  # [m]
+PERTURBED_ANGLE = math.radians(8.0)
+BATCH = 16  # starts that a thread takes at a time
+PERTURBED_BATCH = 3  # of those around a pose
+
+
+class Fit(NamedTuple):
+    """A pose on its way down, with the `channel_loss.score` on the cells of the view it descended on."""
+
+    pose: Pose
+    score: float
 
 
 @kernel
@@ -31,9 +44,11 @@ def descend_starts(views, cells, image, scale, num_iterations, row, R_cam_from_m
     centers, offsets, unit, features, is_seen = views
     solid_angle, blocks = cells
     texels, width = image
-    R, t = R_cam_from_map, center_map
+    R = R_cam_from_map
+    t = center_map
     n = len(solid_angle)
-    points, levels = np.empty((3, n), np.float32), np.empty((3, n), np.float32)
+    points = np.empty((3, n), np.float32)
+    levels = np.empty((3, n), np.float32)
     weights = np.empty(n, np.float32)
     for k in range(len(row)):
         c = row[k]
@@ -60,16 +75,16 @@ def descend_perturbed(
 
     A step that is none is taken on the other alone.
     """
-    R, t = R_cam_from_map, center
+    R = R_cam_from_map
+    t = center
     for k in range(len(steps)):
         retract(R[k].copy(), t[k].copy(), steps[k], R[k], t[k])
         first = 1
         for i in range(6):
             first = 0 if steps[k, i] != 0.0 else first
         for image in range(first, 2):
-            texels, width, num_iterations = narrow[0], narrow[1], NARROW_ITERATIONS
-            if image == 0:
-                texels, width, num_iterations = wide[0], wide[1], WIDE_ITERATIONS
+            texels, width = wide if image == 0 else narrow
+            num_iterations = WIDE_ITERATIONS if image == 0 else NARROW_ITERATIONS
             problem = points, levels, weights, texels, width, scale
             descend_channels(problem, num_iterations, PERTURBED_TOLERANCE, R[k], t[k])
         scores[k] = score(points, levels, weights, blocks, narrow[0], narrow[1], R[k], t[k])
@@ -89,9 +104,10 @@ def perturbations(size: float) -> NDArray[np.float64]:
 
 def descend_all(
     scan_map: ScanMap, image: Texels, starts: Starts, num_iterations: int, workers: Workers
-) -> Starts:
-    """Where a descent from each start ends, on its candidate's prepared view; best first."""
-    R, t = starts.R_cam_from_map.copy(), starts.center_map.copy()
+) -> tuple[Starts, NDArray[np.float64]]:
+    """Where descents from starts end, on their candidates' prepared views, best first; with their scores."""
+    R = starts.R_cam_from_map.copy()
+    t = starts.center_map.copy()
     scores = np.empty(len(t))
     row, views = scan_map.views.at(starts.candidate, workers)
     cells = SEARCH_VIEW.arrays.solid_angle, SEARCH_VIEW.arrays.blocks
@@ -102,8 +118,9 @@ def descend_all(
         some = row[part], R[part], t[part], scores[part]
         descend_starts(views, cells, (image.rgbx, image.width), scale, num_iterations, *some)
 
-    list(workers.map(run, range(0, len(t), BATCH), "descend"))
-    return Starts(R, t, starts.candidate, scores).take(np.argsort(-scores, kind="stable"))
+    workers.map(run, range(0, len(t), BATCH), "descend")
+    order = np.argsort(-scores, kind="stable")
+    return Starts(R, t, starts.candidate).take(order), scores[order]
 
 
 def descend(cells: Cells, image: Texels, pose: Pose, limits: tuple[float, int, float]) -> Pose:
@@ -113,17 +130,19 @@ def descend(cells: Cells, image: Texels, pose: Pose, limits: tuple[float, int, f
     relative to the cells' centre keep float32 exact.
     """
     loss_scale, num_iterations, tolerance = limits
-    R, t = pose.R_cam_from_world.copy(), pose.center_world - cells.center_map
-    levels, scale = as_levels(cells.channels), loss_scale * LEVELS_PER_UNIT
-    problem = cells.offsets, levels, cells.weights, image.rgbx, image.width, scale
+    R = pose.R_cam_from_world.copy()
+    t = pose.center_world - cells.center_map
+    scale = loss_scale * LEVELS_PER_UNIT
+    problem = cells.offsets, as_levels(cells.channels), cells.weights, image.rgbx, image.width, scale
     descend_channels(problem, num_iterations, tolerance, R, t)
     return Pose(orthonormal(R), t + cells.center_map)
 
 
-def score_on(cells: Cells, blocks: NDArray[np.int32], image: Texels, pose: Pose) -> float:
-    """The score of a pose on cells, each in its block of the sphere."""
-    levels, R, t = as_levels(cells.channels), pose.R_cam_from_world, pose.center_world - cells.center_map
-    return float(score(cells.offsets, levels, cells.weights, blocks, image.rgbx, image.width, R, t))
+def fit_on(cells: Cells, blocks: NDArray[np.int32], image: Texels, pose: Pose) -> Fit:
+    """A pose with its score on cells, each in its block of the sphere."""
+    t = pose.center_world - cells.center_map
+    shown = cells.offsets, as_levels(cells.channels), cells.weights
+    return Fit(pose, float(score(*shown, blocks, image.rgbx, image.width, pose.R_cam_from_world, t)))
 
 
 def descend_around(
@@ -133,20 +152,20 @@ def descend_around(
     pose: Pose,
     size: float,
     workers: Workers,
-) -> Hypothesis:
+) -> Fit:
     """The best end of descents from around a pose, the wider image first, and from the pose itself."""
-    steps, (wide, narrow) = perturbations(size), images
+    steps = perturbations(size)
     R = np.repeat(pose.R_cam_from_world[None], len(steps), axis=0)
     t = np.repeat((pose.center_world - cells.center_map)[None], len(steps), axis=0)
     scores = np.empty(len(steps))
-    both = (wide.rgbx, wide.width), (narrow.rgbx, narrow.width)
-    levels, scale = as_levels(cells.channels), COARSE_LOSS * LEVELS_PER_UNIT
-    problem = cells.offsets, levels, cells.weights, blocks, *both, scale
+    both = [(image.rgbx, image.width) for image in images]
+    scale = COARSE_LOSS * LEVELS_PER_UNIT
+    problem = cells.offsets, as_levels(cells.channels), cells.weights, blocks, *both, scale
 
     def run(lo: int) -> None:
         part = slice(lo, lo + PERTURBED_BATCH)
         descend_perturbed(*problem, steps[part], R[part], t[part], scores[part])
 
-    list(workers.map(run, range(0, len(steps), PERTURBED_BATCH), "descend"))
+    workers.map(run, range(0, len(steps), PERTURBED_BATCH), "descend")
     best = int(np.argmax(scores))
-    return Hypothesis(Pose(orthonormal(R[best]), t[best] + cells.center_map), float(scores[best]))
+    return Fit(Pose(orthonormal(R[best]), t[best] + cells.center_map), float(scores[best]))

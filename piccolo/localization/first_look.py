@@ -1,74 +1,58 @@
-"""The first look: a photo of the whole sphere, upright, is compared with whole views alone.
+"""Brief searches by whole views: from few starts, and of the photo mirrored.
 
-Most such photos fit one view and no other, and need no local features. What these would tell more is whether
-the photo is mirrored: its mirrored picture is searched too, as far as that is cheap.
+Most photos of the whole sphere, upright, fit one view and no other, and need no local features. What these
+would tell more is whether the photo is mirrored: its mirrored picture is searched too, as far as is cheap.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from ..confidence.alternatives import Hypothesis
 from ..jobs.once import Once
+from ..panorama.texels import Texels
 from ..scan_map.camera_positions import COARSE_SPACING
-from .config import Beam
+from .descent import descend_all
 from .query import Query
-from .refinement import NUM_SCORED, first_score
-from .search import search_poses
-from .search_result import found_among
-from .standings import fairly_selected
-from .starts import Starts
+from .refinement import FIRST_ITERATIONS
+from .search import Starts, search_poses
+from .settings import Beam
 
 WHOLE = 0.9  # of the sphere that the photo shows, at least
-CLEAR_SCORE, CLEAR_MARGIN = 0.3, 0.5  # at least, see docs/METHOD.md
 MIRROR_RATIO = 1.1  # of the first scores, the photo as it is by its mirrored picture
-NUM_COMPARED = 8
-FIRST_STARTS, FIRST_BEAM = 300, Beam(100, 12, 4, 1)  # few: what is clear is found by them
+FIRST_STARTS = 300  # few: what is clear is found by them
+FIRST_BEAM = Beam(100, 12, 4, 1)
 FIRST_ROTATIONS = 1000  # of SO(3)
 FEW_CELLS = 200  # of the grid: fewer, which a prior has left, are all searched
+NUM_SCORED = 64  # starts, where only the best score is asked for
 
 
 def is_whole(query: Query) -> bool:
     """True if the photo shows nearly the whole sphere, upright or at a known tilt."""
-    return query.settings.gravity != "unknown" and query.photo.valid_share >= WHOLE
+    return query.settings.gravity != "unknown" and query.photo.small.valid_share >= WHOLE
 
 
-def first_query(query: Query) -> Query:
-    """The query as it is first asked: by whole views alone, from few starts."""
+def brief_query(query: Query) -> Query:
+    """The query from few starts."""
     settings = replace(query.settings, max_starts=min(FIRST_STARTS, query.settings.max_starts))
-    return replace(query, settings=settings, num_halves=0)
+    return replace(query, settings=settings)
 
 
 def tilted_query(query: Query) -> Query:
-    """The query of a whole photo that was searched as upright, as it is then asked with any tilt: briefly.
+    """The brief query of a whole photo that was searched as upright, now with any tilt.
 
-    In every other cell of the grid, by few rotations, from few starts. Tilted photos that hide nothing are
-    found so, others by their features.
+    In every other cell of the grid, by few rotations. Tilted photos that hide nothing are found so, others by
+    their features.
     """
-    scan_map, settings = query.scan_map, query.settings
-    cells = np.floor(scan_map.centers[scan_map.sparse] / COARSE_SPACING).astype(np.int64)
+    brief = brief_query(query)
+    cells = np.floor(query.scan_map.centers[query.scan_map.sparse] / COARSE_SPACING).astype(np.int64)
     is_even = (cells.sum(axis=1) % 2 == 0) | (len(cells) < FEW_CELLS)
-    num_rotations = min(FIRST_ROTATIONS, settings.num_rotations)
-    settings = replace(
-        settings, max_starts=min(FIRST_STARTS, settings.max_starts), num_rotations=num_rotations
-    )
-    return replace(query, scan_map=scan_map.narrowed(is_even), settings=settings)
-
-
-def is_clear(query: Query, starts: Starts, hypotheses: Sequence[Hypothesis], of_mirror: Once[float]) -> bool:
-    """True if one pose explains a whole photo, no other does, and the mirrored photo fits worse.
-
-    `of_mirror` is its `mirror_score`.
-    """
-    found = fairly_selected(query, found_among(hypotheses, NUM_COMPARED))
-    if found.best.score < CLEAR_SCORE or found.margin < CLEAR_MARGIN:
-        return False
-    return not is_rather_mirrored(query, starts, of_mirror())
+    settings = replace(brief.settings, num_rotations=min(FIRST_ROTATIONS, query.settings.num_rotations))
+    return replace(brief, scan_map=query.scan_map.narrowed(is_even), settings=settings)
 
 
 def is_rather_mirrored(query: Query, starts: Starts, of_mirror: float) -> bool:
-    """True if the mirrored photo fits nearly as well, by the first scores from the starts of the photo."""
+    """True if the mirrored photo, by its `mirror_score`, fits nearly as well as the photo from some starts."""
     return first_score(query, starts) < MIRROR_RATIO * of_mirror
 
 
@@ -78,9 +62,27 @@ def mirror_score(query: Query) -> float:
     return first_score(mirror, search_poses(mirror, "known"))
 
 
+def first_score(query: Query, starts: Starts) -> float:
+    """The best score after a short descent from the best starts on their candidates' prepared views."""
+    some = starts.take(np.arange(min(NUM_SCORED, len(starts.candidate))))
+    image = query.photo.images.search()
+    _, scores = descend_all(query.scan_map, image, some, FIRST_ITERATIONS, query.workers)
+    return float(scores.max(initial=0.0))
+
+
 def mirrored(query: Query) -> Query:
     """The query of the photo turned over, left for right, for a first score; no heading is known of it."""
-    across, prior = np.diag([1.0, -1.0, 1.0]), replace(query.settings.prior, heading_deg=None)
+    across = np.diag([1.0, -1.0, 1.0])
+    prior = replace(query.settings.prior, heading_deg=None)
     settings = replace(query.settings, prior=prior, max_starts=min(NUM_SCORED, query.settings.max_starts))
-    level = across @ query.R_cam_from_level @ across
-    return replace(query, images=query.images.mirrored(), R_cam_from_level=level, settings=settings)
+    images = query.photo.images._replace(search=Once(partial(turned_over, query.photo.images.search)))
+    level = across @ query.photo.R_cam_from_level @ across
+    photo = replace(query.photo, images=images, R_cam_from_level=level)
+    return replace(query, photo=photo, settings=settings)
+
+
+def turned_over(image: Once[Texels]) -> Texels:
+    """An image with left and right exchanged."""
+    texels = image()
+    across = texels.rgbx.reshape(-1, texels.width + 2)[:, ::-1]
+    return Texels(np.ascontiguousarray(across).reshape(-1), texels.width)

@@ -5,11 +5,13 @@ All sums are of whole numbers: exact in any order (turned_panorama.py).
 
 import math
 import threading
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.pose import Pose
 from ..geometry.rotations import Gravity, uniform_rotations, uniform_yaws
 from ..geometry.sphere import SEARCH_RINGS, make_grid, whole_areas, wider_cells
 from ..geometry.suppression import non_maximum_suppression
@@ -20,13 +22,32 @@ from ..scan_map.scan_map import ScanMap
 from ..views.candidate_views import WIDE_RINGS
 from .prior import allowed_rotations
 from .query import Query
-from .starts import START_ANGLE, START_DISTANCE, Starts
 from .turned_panorama import MOST_ENERGY, Samples, TurnedPanorama, turn_panorama, turned, whole_scale, widened
 
 BLOCK = 512  # views a matrix product, at most
-SCORES_AT_ONCE, LOWEST = 1 << 23, np.float32(-np.inf)  # 32 MB
+SCORES_AT_ONCE = 1 << 23  # 32 MB
+LOWEST = np.float32(-np.inf)
 TURNED_BYTES = 4 * 16  # of a rotation, a cell: channels, validity, energy, and what they are made from
-CANDIDATES_PER_START, POSES_PER_START = 2, 12
+CANDIDATES_PER_START = 2
+POSES_PER_START = 12
+START_DISTANCE, START_ANGLE = 0.5, math.radians(20.0)  # [m], [rad] starts nearer than both are one
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Poses in arrays, best first, and the candidate on whose view each descends."""
+
+    R_cam_from_map: NDArray[np.float64]  # (n, 3, 3)
+    center_map: NDArray[np.float64]  # (n, 3) [m]
+    candidate: NDArray[np.int64]  # (n,)
+
+    def take(self, indices: NDArray[np.int64]) -> "Starts":
+        """The starts at `indices`, in that order."""
+        return Starts(*(values[indices] for values in vars(self).values()))
+
+    def poses(self) -> list[Pose]:
+        """One object each."""
+        return [Pose(R, center) for R, center in zip(self.R_cam_from_map, self.center_map, strict=True)]
 
 
 @kernel
@@ -37,16 +58,17 @@ def unpack_views(features, seen, area, values, fractions, energy, total):
     """
     num_cells = len(area)
     for i in range(len(features)):
-        f, s, v, e = features[i], seen[i], values[i], energy[i]
+        f = features[i]
+        v = values[i]
         for c in range(3 * num_cells):
             v[c] = np.float32(f[c])
         whole_total = F0
         for c in range(num_cells):
-            fractions[i, c] = np.float32(s[c])
+            fractions[i, c] = np.float32(seen[i, c])
             square = v[c] * v[c] + v[num_cells + c] * v[num_cells + c]
             square += v[2 * num_cells + c] * v[2 * num_cells + c]
-            e[c] = np.rint(square * area[c])
-            whole_total += e[c]
+            energy[i, c] = np.rint(square * area[c])
+            whole_total += energy[i, c]
         total[i] = whole_total
 
 
@@ -100,7 +122,7 @@ def masked_correlation(
         np.sqrt(np.maximum(norm, F1, out=norm), out=norm)
         scores[lo : lo + size] /= norm
 
-    list(workers.map(correlate, range(0, len(scores), size), "search"))
+    workers.map(correlate, range(0, len(scores), size), "search")
     return scores
 
 
@@ -113,13 +135,15 @@ def best_poses_wide(
     """
     area = wider_cells(WIDE_RINGS)[1]
     panorama = turned(*widened(samples, validity, workers), area, 255)
-    num_views, least = views_at_once(len(samples)), LOWEST
+    num_views = views_at_once(len(samples))
+    least = LOWEST
     sparse, rotation, scores = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32)
     for lo in range(0, len(scan_map.sparse), num_views):
         part = slice(lo, lo + num_views)
         views = scan_map.wide_features[part], scan_map.wide_seen[part]
         row, turn, values = best_poses(masked_correlation(*views, area, panorama, workers), pool, least)
-        sparse, rotation = np.concatenate([sparse, row + lo]), np.concatenate([rotation, turn])
+        sparse = np.concatenate([sparse, row + lo])
+        rotation = np.concatenate([rotation, turn])
         scores = np.concatenate([scores, values])
         best = np.lexsort((rotation, sparse, -scores))[:pool]
         sparse, rotation, scores = sparse[best], rotation[best], scores[best]
@@ -139,8 +163,10 @@ def correlate_pairs(features, is_seen, area, panorama, row, rotation, scores):
     Whole numbers in float64, exact in any order. The area (cells,) is in whole numbers too.
     """
     for k in range(len(scores)):
-        f, s = features[row[k]], panorama.samples[rotation[k]]
-        seen, valid = is_seen[row[k]], panorama.validity[rotation[k]]
+        f = features[row[k]]
+        s = panorama.samples[rotation[k]]
+        seen = is_seen[row[k]]
+        valid = panorama.validity[rotation[k]]
         energies = panorama.energy[rotation[k]]
         product = view_energy = energy = 0.0
         for c in range(len(area)):
@@ -180,7 +206,8 @@ def best_poses(
             count_above(flat, threshold, top)
         if count < pool and threshold > least:  # many fit alike: a scan of one colour
             alike = np.flatnonzero(flat == threshold)[: pool - count]
-            top, count = np.concatenate([top[:count], alike]), count + len(alike)
+            top = np.concatenate([top[:count], alike])
+            count = len(top)
     top = top[:count]
     top = top[np.lexsort((top, -flat[top]))][:pool]
     return *np.divmod(top, scores.shape[1]), flat[top]
@@ -199,11 +226,12 @@ def search_poses(query: Query, gravity: Gravity) -> Starts:
 
     Wide cells of the sparse candidates, as matrix products; then fine cells of the poses that are left.
     """
-    m, settings = query.scan_map, query.settings
+    m = query.scan_map
+    settings = query.settings
     least = max(len(m.sparse) // CANDIDATES_PER_START, query.method.min_starts)
     num_starts = min(least, settings.max_starts)
     if gravity == "known":
-        rotations = query.R_cam_from_level @ uniform_yaws(settings.num_yaws)
+        rotations = query.photo.R_cam_from_level @ uniform_yaws(settings.num_yaws)
     else:
         rotations = uniform_rotations(settings.num_rotations)
     rotations = allowed_rotations(rotations @ m.R_map_from_world, settings.prior) @ m.R_map_from_world.T
@@ -211,15 +239,15 @@ def search_poses(query: Query, gravity: Gravity) -> Starts:
     num_bytes = len(rotations) * (len(make_grid(SEARCH_RINGS)) * TURNED_BYTES + 4 * num_views)
     what = f"a search of {len(m.sparse)} positions in {len(rotations)} rotations"
     check_memory(num_bytes, what, "set fewer --num-yaws or --num-rotations")
-    samples, validity = turn_panorama(query.images.search, rotations)
+    samples, validity = turn_panorama(query.photo.images.search(), rotations)
     pool = num_starts * POSES_PER_START
     sparse, rotation, _ = best_poses_wide(m, samples, validity, pool, query.workers)
-    R, centers = rotations[rotation], m.centers[m.sparse[sparse]]
-    kept = non_maximum_suppression(R, centers, num_starts, START_DISTANCE, START_ANGLE)
-    return rescored(query, m.sparse[sparse[kept]], rotations, rotation[kept], samples, validity)
+    centers = m.centers[m.sparse[sparse]]
+    kept = non_maximum_suppression(rotations[rotation], centers, num_starts, START_DISTANCE, START_ANGLE)
+    return rescore(query, m.sparse[sparse[kept]], rotations, rotation[kept], samples, validity)
 
 
-def rescored(
+def rescore(
     query: Query,
     candidate: NDArray[np.int64],
     rotations: NDArray[np.float64],
@@ -228,11 +256,11 @@ def rescored(
     validity: Samples,
 ) -> Starts:
     """Some candidates (n,) and rotations (n,) of all (rotations, 3, 3) as starts, by their fine views."""
-    area, scores = make_grid(SEARCH_RINGS).solid_angle, np.empty(len(candidate), np.float32)
+    scores = np.empty(len(candidate), np.float32)
     used, turn = np.unique(rotation, return_inverse=True)
-    panorama = turned(samples[used], validity[used], area, 1)
+    panorama = turned(samples[used], validity[used], make_grid(SEARCH_RINGS).solid_angle, 1)
     row, views = query.scan_map.views.at(candidate, query.workers)
     correlate_pairs(views.features, views.is_seen, whole_areas(SEARCH_RINGS), panorama, row, turn, scores)
     order = np.lexsort((rotation, candidate, -scores))
-    candidate, R = candidate[order], rotations[rotation[order]]
-    return Starts(R, query.scan_map.centers[candidate], candidate, scores[order].astype(np.float64))
+    candidate = candidate[order]
+    return Starts(rotations[rotation[order]], query.scan_map.centers[candidate], candidate)

@@ -71,11 +71,13 @@ def widen(samples, validity, cells, cell_areas, areas, wide_samples, wide_validi
     Validity is rounded.
     """
     for k in range(len(samples)):
-        channels, valid = wide_samples[k], wide_validity[k]
+        channels = wide_samples[k]
+        valid = wide_validity[k]
         channels[:] = F0
         valid[:] = F0
         for c in range(len(cells)):
-            wide, area = cells[c], cell_areas[c]
+            wide = cells[c]
+            area = cell_areas[c]
             for i in range(3):
                 channels[i, wide] += np.rint(samples[k, i, c]) * area
             valid[wide] += validity[k, c] * area
@@ -88,12 +90,13 @@ def widen(samples, validity, cells, cell_areas, areas, wide_samples, wide_validi
 def widened(samples: Samples, validity: Samples, workers: Workers) -> tuple[Samples, Samples]:
     """Averages (rotations, 3, wide cells) [levels] of channels of the search grid, and of validity."""
     cells, areas = wider_cells(WIDE_RINGS)
-    how, shape = (cells, whole_areas(SEARCH_RINGS), areas), (len(samples), len(areas))
-    wide, is_valid = np.empty((shape[0], 3, shape[1]), np.float32), np.empty(shape, np.float32)
+    parts = cells, whole_areas(SEARCH_RINGS), areas
+    wide = np.empty((len(samples), 3, len(areas)), np.float32)
+    is_valid = np.empty((len(samples), len(areas)), np.float32)
 
     def average(lo: int) -> None:
         part = slice(lo, lo + ROTATIONS_AT_ONCE)
-        widen(samples[part], validity[part], *how, wide[part], is_valid[part])
+        widen(samples[part], validity[part], *parts, wide[part], is_valid[part])
 
-    list(workers.map(average, range(0, len(samples), ROTATIONS_AT_ONCE), "search"))
+    workers.map(average, range(0, len(samples), ROTATIONS_AT_ONCE), "search")
     return wide, is_valid
