@@ -9,9 +9,9 @@ from piccolo.geometry.pose import Pose, step
 from piccolo.geometry.sphere import make_grid
 from piccolo.jobs.threads import Workers
 from piccolo.localization import descent
-from piccolo.localization.config import METHOD
-from piccolo.localization.query import query_images
-from piccolo.localization.starts import Starts
+from piccolo.localization.query import images_of
+from piccolo.localization.search import Starts
+from piccolo.localization.settings import METHOD
 from piccolo.views.view import Cells
 
 FINE_BLOCKS = METHOD.fine_view.arrays.blocks
@@ -20,7 +20,7 @@ ALL = np.ones(len(FINE_BLOCKS), bool)
 
 @functools.lru_cache
 def _images():
-    return query_images(rooms.scene(1)[1], METHOD.scales)
+    return images_of(rooms.scene(1)[1], METHOD.scales)
 
 
 @functools.lru_cache
@@ -42,11 +42,11 @@ def test_channels_in_levels_and_perturbations_to_the_corners_of_a_cube():
 
 
 def test_descent_finds_the_true_pose_again():
-    (cells, true_pose), image = _fine(), _images().fine
+    (cells, true_pose), image = _fine(), _images().fine()
     off = step(true_pose, np.array([0.03, -0.02, 0.04, 0.06, -0.05, 0.04]))
     pose = descent.descend(cells, image, off, (1.0, 30, 1e-5))
     assert rooms.errors(pose, true_pose)[0] < 0.01
-    before, after = (descent.score_on(cells, FINE_BLOCKS, image, p) for p in (off, pose))
+    before, after = (descent.fit_on(cells, FINE_BLOCKS, image, p).score for p in (off, pose))
     assert after > max(0.6, before)
     assert rooms.errors(descent.descend(cells, image, off, (1.0, 1, 1e-5)), true_pose)[0] > 0.01
 
@@ -56,23 +56,23 @@ def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off():
     off = step(true_pose, descent.perturbations(1.0)[1])
     assert rooms.errors(off, true_pose)[0] > 0.2
     cells = rooms.view(rooms.scan_map(1).octree, off.center_world, METHOD.fine_view, ALL)
-    problem = cells, FINE_BLOCKS, (images.search, images.middle), off, 1.0
+    problem = cells, FINE_BLOCKS, (images.search(), images.middle()), off, 1.0
     found, by_two = (descent.descend_around(*problem, Workers(n)) for n in (1, 2))
     assert (found.pose.key, found.score) == (by_two.pose.key, by_two.score)
     assert rooms.errors(found.pose, true_pose)[0] < 0.06
-    score = descent.score_on(cells, FINE_BLOCKS, images.middle, found.pose)
-    np.testing.assert_allclose(found.score, score, atol=1e-5)
+    expected = descent.fit_on(cells, FINE_BLOCKS, images.middle(), found.pose)
+    np.testing.assert_allclose(found.score, expected.score, atol=1e-5)
 
 
 def test_starts_descend_on_their_candidates_views_as_one_does_alone():
-    scan_map, (_, true_pose), image = rooms.scan_map(1), _fine(), _images().search
+    scan_map, (_, true_pose), image = rooms.scan_map(1), _fine(), _images().search()
     distance = np.linalg.norm(scan_map.centers - true_pose.center_world, axis=1)
     k, far = int(np.argmin(distance)), int(np.argmax(distance))
     candidate, R = np.array([k, far, k]), true_pose.R_cam_from_world
-    starts = Starts(np.stack([R] * 3), scan_map.centers[candidate], candidate, np.zeros(3))
-    ends = descent.descend_all(scan_map, image, starts, 12, Workers(2))
+    starts = Starts(np.stack([R] * 3), scan_map.centers[candidate], candidate)
+    ends, scores = descent.descend_all(scan_map, image, starts, 12, Workers(2))
     assert ends.candidate.tolist() == [k, k, far]  # the best first
-    assert ends.score[0] == ends.score[1] > max(0.4, ends.score[2])
+    assert scores[0] == scores[1] > max(0.4, scores[2])
     (row,), views = scan_map.views.at(np.array([k]), Workers(1))
     offsets = (views.offsets[row] * views.offset_unit[row]).astype(np.float32)
     channels = views.features[row].astype(np.float32) / np.float32(63.75)

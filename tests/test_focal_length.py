@@ -17,7 +17,7 @@ from piccolo.confidence.score import Evidence
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.jobs.threads import Workers
 from piccolo.localization import focal_length as focal
-from piccolo.localization.localize_guessed import likeliest
+from piccolo.localization.localize import likeliest
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import ReadOptions, panorama_of_array
@@ -85,7 +85,7 @@ def test_k1_is_fitted_with_the_focal_length_of_a_guess():
     rgb, pose = _photo(Camera("SIMPLE_RADIAL", 640, 480, (TRUE, 320.0, 240.0, -0.04)))
     mount = Mount(Camera("SIMPLE_RADIAL", 640, 480, (1.03 * TRUE, 320.0, 240.0, 0.0)))
     _, fit = _fit(rgb, pose, calibration=Calibration("guess", (mount,)), refine_focal=True)
-    f, k1 = focal.changed(mount.camera, fit.change).params[::3]
+    f, k1 = focal.change_camera(mount.camera, fit.change).params[::3]
     assert f == pytest.approx(TRUE, rel=0.02)
     assert k1 == pytest.approx(-0.04, abs=0.015)
 

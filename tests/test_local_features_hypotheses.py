@@ -99,7 +99,7 @@ def test_a_pose_off_the_known_vertical_is_none():
 )
 def test_a_photo_is_found_in_its_room_with_the_same_bits_for_any_threads(variant, is_known):
     query = _query(1, variant)
-    level = query.R_cam_from_level if is_known else None
+    level = query.photo.R_cam_from_level if is_known else None
     found = poses_of(query.matches, level, 6, Workers(2))
     distance, angle_deg = rooms.errors(found[0].pose, _true_pose(1, variant))
     assert distance < 0.05
