@@ -16,9 +16,8 @@ from piccolo.jobs.once import Once
 from piccolo.jobs.threads import Workers
 from piccolo.localization import last_descent, refinement
 from piccolo.localization import query as query_module
-from piccolo.localization.descent import Fit
 from piccolo.localization.query import Cache, Images, prepare_query
-from piccolo.localization.refinement import best_and_alternatives, narrow
+from piccolo.localization.refinement import Fit, best_and_alternatives, narrow
 from piccolo.localization.search import Starts
 from piccolo.localization.settings import METHOD, Beam, CoarseToFineSettings
 from piccolo.views.recent_views import RecentViews

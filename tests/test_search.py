@@ -12,7 +12,7 @@ from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
 from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
 from piccolo.jobs.threads import Workers
 from piccolo.localization import query as query_module
-from piccolo.localization import search, turned_panorama
+from piccolo.localization import search
 from piccolo.localization.query import images_of, prepare_query
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.panorama import Panorama
@@ -91,10 +91,10 @@ def test_samples_along_turned_directions_equal_their_twin():
 
 def test_scores_equal_correlations_one_by_one():
     rng, scan_map = np.random.default_rng(0), rooms.scan_map(1)
-    samples, validity = turned_panorama.turn_panorama(_query().photo.images.search(), uniform_rotations(50))
+    samples, validity = search.turn_panorama(_query().photo.images.search(), uniform_rotations(50))
     validity[:, rng.random(validity.shape[1]) < 0.2] = 0
     samples *= validity[:, None]
-    panorama = turned_panorama.turned(samples, validity, AREA, 1)
+    panorama = search.turned(samples, validity, AREA, 1)
     candidate, rotation = rng.integers(0, len(scan_map.centers), 40), rng.integers(0, 50, 40)
     row, views = scan_map.views.at(candidate, Workers(2))
     pairs = np.empty(40, np.float32)
@@ -118,7 +118,7 @@ def test_wide_samples_are_averages_by_area():
     validity = (rng.random((600, len(AREA))) < 0.6).astype(np.float32)
     matrix = (np.eye(len(areas))[cells] * whole_areas(24)[:, None]).astype(np.float32)
     for num_threads in (1, 2):
-        wide, is_valid = turned_panorama.widened(samples, validity, Workers(num_threads))
+        wide, is_valid = search.widened(samples, validity, Workers(num_threads))
         np.testing.assert_array_equal(wide, np.rint(samples) @ matrix / areas)
         np.testing.assert_array_equal(is_valid, np.rint(validity @ matrix / areas))
 
@@ -127,7 +127,7 @@ def test_sums_of_a_search_are_exact():
     """No partial sum of what features and samples can be at most reaches 2^24, so no order changes a bit."""
     for area, most_seen in ((AREA, 1), (wider_cells(12)[1], 255)):
         one = np.ones((1, 3, len(area)), np.float32)
-        panorama = turned_panorama.turned(127.5 * one, one[:, 0], area, most_seen)
+        panorama = search.turned(127.5 * one, one[:, 0], area, most_seen)
         assert 127 * panorama.samples.sum(dtype=float) < 2**24
         assert most_seen * panorama.energy.sum(dtype=float) < 2**24
         assert 127 * panorama.samples.sum(dtype=float) > 2**22  # the room is used
@@ -138,10 +138,10 @@ def test_sums_of_a_search_are_exact():
     validity = (rng.random((20, len(AREA))) < 0.8).astype(np.float32)
     features = rng.choice(np.array([-127, 127, 126], np.int8), (50, 3, len(AREA)))
     seen = rng.integers(0, 2, (50, len(AREA)), dtype=np.uint8)
-    panorama = turned_panorama.turned(samples * validity[:, None], validity, AREA, 1)
+    panorama = search.turned(samples * validity[:, None], validity, AREA, 1)
     expected = search.masked_correlation(features.reshape(50, -1), seen, AREA, panorama, Workers(1))
     cells, views = rng.permutation(len(AREA)), rng.permutation(50)
-    shuffled = turned_panorama.TurnedPanorama(*(values[..., cells] for values in panorama))
+    shuffled = search.TurnedPanorama(*(values[..., cells] for values in panorama))
     features, seen = features[views][..., cells].reshape(50, -1), seen[views][:, cells]
     found = search.masked_correlation(features, seen, AREA[cells], shuffled, Workers(1))
     np.testing.assert_array_equal(found, expected[views])
@@ -152,7 +152,7 @@ def test_best_score_is_near_the_true_pose(gravity, most):
     """Among wide cells, and among the starts, which fine cells put in order."""
     true_pose, scan_map = rooms.scene(1)[2], rooms.scan_map(1)
     rotations = uniform_yaws(48) if gravity == "known" else uniform_rotations(2000)
-    samples, validity = turned_panorama.turn_panorama(_query().photo.images.search(), rotations)
+    samples, validity = search.turn_panorama(_query().photo.images.search(), rotations)
     sparse, rotation, values = search.best_poses_wide(scan_map, samples, validity, 200, Workers(2))
     assert (np.diff(values) <= 0).all()
     starts = search.search_poses(_query(), gravity)
@@ -168,7 +168,7 @@ def test_best_score_is_near_the_true_pose(gravity, most):
 
 def test_a_part_of_the_candidates_at_a_time_gives_the_same_poses(monkeypatch):
     scan_map, rotations = rooms.scan_map(1), uniform_rotations(200)
-    samples, validity = turned_panorama.turn_panorama(_query().photo.images.search(), rotations)
+    samples, validity = search.turn_panorama(_query().photo.images.search(), rotations)
     whole = search.best_poses_wide(scan_map, samples, validity, 500, Workers(1))
     monkeypatch.setattr(search, "BLOCK", 7)
     monkeypatch.setattr(search, "SCORES_AT_ONCE", 30 * len(rotations))

@@ -16,8 +16,8 @@ from ..panorama.local_normalization import LEVELS_PER_UNIT
 from ..panorama.texels import Texels
 from ..views.view import Cells
 from .comparison import without_occluders
-from .descent import FULL_LOSS, as_levels
 from .query import Query
+from .refinement import FULL_LOSS, as_levels
 
 ERROR_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
 MOST_SHARE = 1.001  # of a block in what fixes the pose, a little above 1 for one that does alone
@@ -44,12 +44,12 @@ STEPS = (
 ROUGH_STEPS = DifferenceSteps(2, math.radians(0.3), 0.015, 1.0)
 
 
-def equations_at(image: Texels, points: Cells, pose: Pose) -> tuple[Array, Array]:
-    """Gradient (6,) and Gauss-Newton matrix (6, 6) of the robust loss, in the camera's frame."""
+def gradient_at(image: Texels, points: Cells, pose: Pose) -> Array:
+    """Gradient (6,) of the robust loss, in the camera's frame."""
     sums = np.empty(NUM_SUMS)
     center = pose.center_world - points.center_map
     channel_equations((*points[:3], image.rgbx, image.width, SCALE), pose.R_cam_from_world, center, sums)
-    return sums[GRADIENT:MATRIX].copy(), symmetric(sums[MATRIX:])
+    return sums[GRADIENT:MATRIX].copy()
 
 
 def symmetric(upper: Array) -> Array:
@@ -77,9 +77,8 @@ def hessian_at(image: Texels, points: Cells, pose: Pose, steps: DifferenceSteps)
     """
     rows = []
     for delta in np.diag([steps.turn] * 3 + [steps.move] * 3):
-        after, _ = equations_at(image, points, step(pose, delta))
-        before, _ = equations_at(image, points, step(pose, -delta))
-        rows.append((after - before) / (2.0 * delta.sum()))
+        rise = gradient_at(image, points, step(pose, delta)) - gradient_at(image, points, step(pose, -delta))
+        rows.append(rise / (2.0 * delta.sum()))
     return np.asarray(0.5 * (np.array(rows) + np.array(rows).T))
 
 

@@ -12,9 +12,8 @@ import numpy as np
 from ..jobs.once import Once
 from ..panorama.texels import Texels
 from ..scan_map.camera_positions import COARSE_SPACING
-from .descent import descend_all
 from .query import Query
-from .refinement import FIRST_ITERATIONS
+from .refinement import FIRST_ITERATIONS, descend_all
 from .search import Starts, search_poses
 from .settings import Beam
 
@@ -52,7 +51,7 @@ def tilted_query(query: Query) -> Query:
 
 
 def is_rather_mirrored(query: Query, starts: Starts, of_mirror: float) -> bool:
-    """True if the mirrored photo, by its `mirror_score`, fits nearly as well as the photo from some starts."""
+    """True if the mirrored photo, by its `mirror_score`, fits nearly as well as the photo itself."""
     return first_score(query, starts) < MIRROR_RATIO * of_mirror
 
 

@@ -27,9 +27,9 @@ from ..panorama import Panorama
 from ..views.view import Cells
 from .comparison import score_pose, without_occluders
 from .covariance import blocks_of, equations_by_block, without_poles
-from .descent import FINE_LOSS, FULL_LOSS, as_levels, descend
 from .last_descent import refine_to_the_end
 from .query import Features, Query, images_of, prepare_query
+from .refinement import FINE_LOSS, FULL_LOSS, as_levels, descend
 from .selection import Selection
 
 FOCALS = "f", "fx", "fy"

@@ -9,9 +9,16 @@ from ..confidence.alternatives import Hypothesis
 from ..geometry.pose import Pose
 from ..local_features.hypotheses import count_matches
 from .comparison import score_pose, without_occluders
-from .descent import FULL_LOSS, Fit, descend
 from .query import Query
-from .refinement import MIN_GAIN, descend_fine, perturb_middle, refine_by_perturbation
+from .refinement import (
+    FULL_LOSS,
+    MIN_GAIN,
+    Fit,
+    descend,
+    descend_fine,
+    perturb_middle,
+    refine_by_perturbation,
+)
 from .selection import SURE_MATCHES, Selection, rank, select
 
 HOPELESS_SCORE = 0.02  # of black, white and noisy pictures, and of most views of other places

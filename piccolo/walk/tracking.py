@@ -11,7 +11,6 @@ from ..geometry.pose import Pose, exp_so3, log_so3, pose_errors
 from ..geometry.rotations import Gravity
 from ..localization.comparison import score_pose
 from ..localization.covariance import estimate_covariance
-from ..localization.descent import FULL_LOSS, descend
 from ..localization.first_look import (
     FIRST_BEAM,
     brief_query,
@@ -21,7 +20,7 @@ from ..localization.first_look import (
 )
 from ..localization.prior import apply_prior
 from ..localization.query import Cache, Query
-from ..localization.refinement import descend_fine, descend_middle, perturb_middle, refine
+from ..localization.refinement import FULL_LOSS, descend, descend_fine, descend_middle, perturb_middle, refine
 from ..localization.search import search_poses
 from ..localization.selection import rank, standings_of
 from ..scan_map.prior import Prior
