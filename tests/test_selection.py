@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-import rooms
 from made_up import at, compared, place, places
 
 from piccolo.confidence.score import Agreement
@@ -185,7 +184,7 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
     explains = {0.0: 0.6, 1.0: 0.5, 2.0: 0.4} | {1.0 + 0.001 * k: 0.5 for k in range(9)}
     around = SimpleNamespace(surroundings=lambda place, scale: "points" if scale < 0.01 else "coarse points")
     query = compared(monkeypatch, explains, counts)
-    photo = SimpleNamespace(panorama=rooms.scene(1)[1], colors=lambda: None)
+    photo = SimpleNamespace(given=None, panorama=None, colors=lambda: None)
     query = replace(query, photo=photo, cache=replace(query.cache, views=around))
     for name, value in {
         "visible_points": lambda *_: None,
@@ -198,7 +197,7 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
     }.items():
         monkeypatch.setattr(evaluation, name, value)
     alternatives = at(1.0, 0.3), at(2.0, 0.2)
-    found = evaluation.evaluate(query, rooms.scene(1)[1], Selection(at(0.0, 0.6), alternatives, 0.7))
+    found = evaluation.evaluate(query, Selection(at(0.0, 0.6), alternatives, 0.7))
     e = found.evidence
     assert (e.score, e.agreement, e.seen_fraction) == (0.6, 0.8, 1.0)
     assert (e.explained_fraction, e.contradicted_fraction) == (0.6, 0.3)
@@ -212,9 +211,9 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
     assert sum(stated) == pytest.approx(1.0)
     assert stated[0] > stated[1] > stated[2]
     many = tuple(at(1.0 + 0.001 * k, 0.1) for k in range(9))
-    found = evaluation.evaluate(query, rooms.scene(1)[1], Selection(at(0.0, 0.6), many))
+    found = evaluation.evaluate(query, Selection(at(0.0, 0.6), many))
     assert len(found.alternatives) == 5
-    alone = evaluation.evaluate(query, rooms.scene(1)[1], Selection(at(0.0, 0.6), ()))
+    alone = evaluation.evaluate(query, Selection(at(0.0, 0.6), ()))
     assert (alone.evidence.margin, alone.evidence.alternative_matches) == (1.0, 0)
     monkeypatch.setattr(evaluation, "sampling_loss", lambda *_: np.inf)
-    assert evaluation.evaluate(query, rooms.scene(1)[1], Selection(at(0.0, 0.6), ())).pose is None
+    assert evaluation.evaluate(query, Selection(at(0.0, 0.6), ())).pose is None

@@ -34,7 +34,7 @@ TELLING_STD = 0.03  # [m] of a position: what a focal length adds beyond it is t
 LAST_STEP = 0.01  # [rad, m] of Adam and the first of L-BFGS, where they take the last descent
 
 
-def evaluate(query: Query, panorama: Panorama, found: Selection, fit: FocalFit | None = None) -> Localization:
+def evaluate(query: Query, found: Selection, fit: FocalFit | None = None) -> Localization:
     """The pose found in world coordinates, after the descent that the solver asks for, with its evidence.
 
     `fit` is that of the focal length, of a photo whose is not exact.
@@ -49,7 +49,7 @@ def evaluate(query: Query, panorama: Panorama, found: Selection, fit: FocalFit |
         pose = refine(points(), sampling_loss_of(query.photo.colors()), pose, how).pose
     asked: list[Callable[[], Any]] = [
         partial(estimate_covariance, query, pose, fit and fit.pose_covariance),  # takes longest
-        lambda: occlusion_at(points(), panorama, pose).fractions(),
+        lambda: occlusion_at(points(), query.photo.given, pose).fractions(),
         lambda: sampling_loss(visible_points(points(), pose.center_world), query.photo.colors(), pose),
         lambda: agreement_at(coarse(), query.photo.panorama, pose),
     ]
@@ -66,7 +66,7 @@ def evaluate(query: Query, panorama: Panorama, found: Selection, fit: FocalFit |
     if warnings or (fit is not None and fit.conflict > MOST_CONFLICT):
         probabilities = np.append(np.zeros(len(standings)), 1.0)
     if fit is not None and classify(probabilities, settings.min_confidence) != LOCALIZED:
-        warnings += doubts_of(panorama, fit)
+        warnings += doubts_of(query.photo.given, fit)
     matches = [s.num_matches if query.by_features else None for s in standings[1:]]
     alternatives = tuple(
         Alternative(query.scan_map.to_world(h.pose), h.score, s.share, num_matches, float(p))
@@ -82,8 +82,8 @@ def evaluate(query: Query, panorama: Panorama, found: Selection, fit: FocalFit |
         alternatives,
         covariance,
         warnings,
-        cameras=() if fit is None else panorama.cameras,
-        focal_length=None if fit is None else fit.focal_length(panorama),
+        cameras=() if fit is None else query.photo.given.cameras,
+        focal_length=None if fit is None else fit.focal_length(query.photo.given),
     )
 
 

@@ -8,6 +8,7 @@ covariance. That of the pose is the marginal one: what a focal length that is of
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -103,14 +104,6 @@ def change_camera(camera: Camera, change: Array) -> Camera:
     return replace(camera, params=tuple(float(value) for value in params.values()))
 
 
-class Profile(NamedTuple):
-    """The ends of descents with each of several calibrations."""
-
-    changes: Array  # (K, p) of the camera
-    losses: Array  # (K, B) of each block of the sphere
-    poses: list[Pose]
-
-
 class Crest(NamedTuple):
     """The calibration at which the loss of a profile is least."""
 
@@ -119,13 +112,13 @@ class Crest(NamedTuple):
     motion: Array  # (6, p) as of FocalFit
 
 
-def fit_focal(query: Query, panorama: Panorama, pose: Pose, is_first: bool = True) -> FocalFit:
-    """Fit the focal length of a photo whose pose in the map is about known.
+def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
+    """Fit the focal length of a photo with a focal_prior whose pose in the map is about known.
 
-    The panorama has a focal_prior; `query` is of the same. Not first, it is about known too.
+    Not first, the focal length is about known too.
     """
-    prior = panorama.focal_prior
-    camera = panorama.cameras[0].camera
+    prior = query.photo.given.focal_prior
+    camera = query.photo.given.cameras[0].camera
     assert prior is not None
     names = MODELS[camera.model][1]
     num = 2 if prior.deviation > WIDE and RADIAL in names else 1
@@ -135,7 +128,7 @@ def fit_focal(query: Query, panorama: Panorama, pose: Pose, is_first: bool = Tru
         expected = np.append(expected, prior.view.mount.camera.params[k1] - camera.params[k1])
     precision = np.diag([prior.deviation**-2, K1_DEVIATION**-2][:num])
     reach = min(max(2.5 * prior.deviation, FIRST_REACH[0]), FIRST_REACH[1]) if is_first else LAST_REACH
-    crest = find_crest(query, panorama, pose, num, reach)
+    crest = find_crest(query, pose, num, reach)
     if crest.information.any():
         per_px = math.tau * camera.focal[0] / (0.5 * camera.width * query.photo.panorama.rgb.shape[1])
         covariance = np.linalg.pinv(crest.information)
@@ -150,7 +143,7 @@ def fit_focal(query: Query, panorama: Panorama, pose: Pose, is_first: bool = Tru
     return FocalFit(change, np.asarray(total), crest.motion, conflict)
 
 
-def find_crest(query: Query, panorama: Panorama, pose: Pose, num: int, reach: float) -> Crest:
+def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
     """Search the crest of the profile about a pose in ever narrower designs, and move those that miss it.
 
     Its information is 0 where no design has a crest: the picture does not tell the calibration.
@@ -158,14 +151,15 @@ def find_crest(query: Query, panorama: Panorama, pose: Pose, num: int, reach: fl
     middle = np.zeros(num)
     found: Crest | None = None
     for _ in range(MOST_DESIGNS):
-        profile = take_profile(query, panorama, pose, middle + design(num, reach))
-        crest = crest_of(profile, pose)
+        changes = middle + design(num, reach)
+        losses, ends = take_profile(query, pose, changes)
+        crest = crest_of(changes, losses, ends, pose)
         has_crest = bool(crest.information.any())
         is_inside = has_crest and bool(np.all(np.abs(crest.change - middle) <= reach))
         if not is_inside and (found is not None or not has_crest):
             break
         middle = np.clip(crest.change, middle - reach, middle + reach)
-        pose = profile.poses[int(np.argmin(np.abs(profile.changes - middle).sum(axis=1)))]
+        pose = ends[int(np.argmin(np.abs(changes - middle).sum(axis=1)))]
         if is_inside:
             found = crest
             if reach <= LAST_REACH:
@@ -181,16 +175,18 @@ def design(num: int, reach: float) -> Array:
     return np.array(list(itertools.product(*scales[:num])))
 
 
-def take_profile(query: Query, panorama: Panorama, pose: Pose, changes: Array) -> Profile:
-    """Descend from a pose with each of several calibrations (K, p) of the photo's camera."""
+def take_profile(query: Query, pose: Pose, changes: Array) -> tuple[Array, list[Pose]]:
+    """Descend from a pose with each of several calibrations (K, p) of the photo's camera.
+
+    Returns the losses (K, B) of each block of the sphere at the ends, and the ends.
+    """
+    given = query.photo.given
     shown = without_occluders(query, pose)
     whole = query.photo.panorama
     is_left = shown.photo.panorama.is_valid | ~whole.is_valid  # what does not contradict the scan
-    camera = panorama.cameras[0].camera
-    width = whole.rgb.shape[1]
 
     def taken(change: Array) -> Panorama:
-        found = panorama.retaken(change_camera(camera, change), width)
+        found = given.retaken(change_camera(given.cameras[0].camera, change), whole.rgb.shape[1])
         return replace(found, is_valid=found.is_valid & is_left)
 
     narrowest = taken(changes.max(axis=0)).is_valid
@@ -210,7 +206,7 @@ def take_profile(query: Query, panorama: Panorama, pose: Pose, changes: Array) -
         return end, equations_by_block(images.full(), seen, end, block)[:, LOSS]
 
     ends = query.workers.map(end_with, list(changes), "fit the focal length")
-    return Profile(changes, np.array([losses for _, losses in ends]), [end for end, _ in ends])
+    return np.array([losses for _, losses in ends]), [end for end, _ in ends]
 
 
 def within(points: Cells, pose: Pose, is_valid: NDArray[np.bool_]) -> Cells:
@@ -222,18 +218,19 @@ def within(points: Cells, pose: Pose, is_valid: NDArray[np.bool_]) -> Cells:
     return points._replace(weights=points.weights * is_kept.astype(np.float32))
 
 
-def crest_of(profile: Profile, pose: Pose) -> Crest:
+def crest_of(changes: Array, losses: Array, poses: Sequence[Pose], pose: Pose) -> Crest:
     """Find the crest of a profile by a quadratic function (least squares), and how poses follow the camera.
 
+    The changes (K, p) of the camera have losses (K, B) by block and poses; `pose` is that of none.
     The covariance of the crest is H^-1 (sum g g^T) H^-1, with the slope g of each block's loss there.
     """
-    middle = profile.changes.mean(axis=0)
-    num = profile.changes.shape[1]
-    x = profile.changes - middle
+    middle = changes.mean(axis=0)
+    num = changes.shape[1]
+    x = changes - middle
     rows, columns = np.triu_indices(num)
     terms = np.column_stack([np.ones(len(x)), x, x[:, rows] * x[:, columns]])
-    fitted = np.linalg.lstsq(terms, profile.losses, rcond=None)[0]
-    hessians = np.zeros((profile.losses.shape[1], num, num))
+    fitted = np.linalg.lstsq(terms, losses, rcond=None)[0]
+    hessians = np.zeros((losses.shape[1], num, num))
     hessians[:, rows, columns] += fitted[1 + num :].T
     hessians[:, columns, rows] += fitted[1 + num :].T
     H = hessians.sum(axis=0)
@@ -241,10 +238,10 @@ def crest_of(profile: Profile, pose: Pose) -> Crest:
         np.concatenate(
             [log_so3(p.R_cam_from_world @ pose.R_cam_from_world.T), p.center_world - pose.center_world]
         )
-        for p in profile.poses
+        for p in poses
     ]
     motion = np.linalg.lstsq(terms[:, : 1 + num], np.array(moved), rcond=None)[0][1:].T
-    num_blocks = int(profile.losses.any(axis=0).sum())
+    num_blocks = int(losses.any(axis=0).sum())
     if num_blocks < LEAST_BLOCKS * num or not np.linalg.eigvalsh(H)[0] > 0.0:
         return Crest(middle, np.zeros((num, num)), motion)
     offset = -np.linalg.solve(H, fitted[1 : 1 + num].sum(axis=1))
@@ -255,31 +252,30 @@ def crest_of(profile: Profile, pose: Pose) -> Crest:
     return Crest(middle + offset, information, motion)
 
 
-def calibrate(
-    query: Query, panorama: Panorama, found: Selection
-) -> tuple[Query, Panorama, Selection, FocalFit]:
+def calibrate(query: Query, found: Selection) -> tuple[Query, Selection, FocalFit]:
     """Fit the focal length at the best pose, and refine the poses with it, until it is at rest."""
     for k in range(MAX_CALIBRATIONS):
-        fit = fit_focal(query, panorama, found.best.pose, is_first=k == 0)
+        fit = fit_focal(query, found.best.pose, is_first=k == 0)
         if fit.is_at_rest:
             break
-        query, panorama = recalibrate(query, panorama, fit.change)
+        query = recalibrate(query, fit.change)
         poses = [fit.moved(found.best.pose), *(h.pose for h in found.alternatives)]
         moved = query.workers.map(partial(score_pose, query), poses, "compare")
         found = refine_to_the_end(query, moved)
     else:
-        fit = fit_focal(query, panorama, found.best.pose, is_first=False)
-    return query, panorama, found, fit
+        fit = fit_focal(query, found.best.pose, is_first=False)
+    return query, found, fit
 
 
-def recalibrate(query: Query, panorama: Panorama, change: Array) -> tuple[Query, Panorama]:
-    """The query and panorama of a photo with another calibration; its matches stay, and their rays follow."""
-    before = panorama.cameras[0]
+def recalibrate(query: Query, change: Array) -> Query:
+    """The query of a photo with another calibration; its matches stay, and their rays follow."""
+    given = query.photo.given
+    before = given.cameras[0]
     after = before.with_camera(change_camera(before.camera, change))
-    taken = panorama.retaken(after.camera, panorama.rgb.shape[1])
+    taken = given.retaken(after.camera, given.rgb.shape[1])
     fresh = prepare_query(taken, query.scan_map, query.settings, query.workers, query.method)
     features = tuple(Once(partial(_turn_features, half, before, after)) for half in query.features)
-    return replace(fresh, features=features, num_halves=query.num_halves), taken
+    return replace(fresh, features=features, num_halves=query.num_halves)
 
 
 def _turn_features(half: Once[Features], before: Mount, after: Mount) -> Features:

@@ -67,8 +67,8 @@ def localize(
         with watch.stage("refine"):
             found = refine_to_the_end(query, hypotheses)
             if panorama.focal_prior is None or found.best.score < HOPELESS_SCORE:
-                return evaluate(query, panorama, found)
-            return evaluate(*calibrate(query, panorama, found))
+                return evaluate(query, found)
+            return evaluate(*calibrate(query, found))
 
 
 class Attempt(NamedTuple):

@@ -57,6 +57,7 @@ def images_of(panorama: Panorama, scales: ImageScales) -> Images:
 class Photo:
     """A photo at the sizes at which it is compared. Nothing of it changes, so threads share it."""
 
+    given: Panorama
     panorama: Panorama  # at the width of its features
     images: Images
     small: Texels  # colours at the size at which poses are compared
@@ -164,6 +165,7 @@ def prepare_query(
     width = method.scales.full.width
     resized = resize(panorama, width)
     photo = Photo(
+        panorama,
         resized,
         images_of(resized, method.scales),
         texels_of(resize(resized, COMPARED_WIDTH)),
