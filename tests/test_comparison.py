@@ -176,17 +176,6 @@ def test_what_contradicts_is_masked_and_the_rest_stays():
     assert (without_occluders(clean, true_pose) is clean) == fits
 
 
-def test_a_mask_is_enlarged_to_the_photo():
-    query = _query(rooms.query(1).rgb)
-    is_hidden = np.zeros((8, 16), bool)
-    is_hidden[2, 5] = True
-    rest = query.without(is_hidden)
-    height = rest.photo.panorama.is_valid.shape[0]
-    side = height // 8
-    assert not rest.photo.panorama.is_valid[2 * side : 3 * side, 5 * side : 6 * side].any()
-    assert (~rest.photo.panorama.is_valid).sum() == side * side
-
-
 def test_a_photo_that_was_turned_over_is_told():
     rgb = rooms.query(1).rgb
     doubtful = Evidence(0.5, 0.5, 0.5, 0.5, 0.9, num_matches=10)

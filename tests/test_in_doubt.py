@@ -4,12 +4,11 @@ from dataclasses import replace
 
 import pytest
 import rooms
-from made_up import QUERY, at, compared, places
+from made_up import QUERY, at, places
 
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
 from piccolo.localization import localize as method
-from piccolo.localization import selection
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
 
 LOOK = ("look_first", 0, "known", False)
@@ -53,23 +52,6 @@ def test_attempts_are_made_until_one_is_sure(monkeypatch, sure, num_made):
     num_halves, found = method.localize(rooms.scan_map(1), rooms.scene(1)[1], *how)
     assert places(found) == [1, 2, 0][:num_made]
     assert num_halves == places(found)[-1]
-
-
-@pytest.mark.parametrize(
-    ("hypotheses", "is_sure"),
-    [
-        ([at(1, 0.6)], True),
-        ([at(1, 0.1)], False),  # too few matches
-        ([at(1, 0.6), at(5, 0.4)], False),  # two that are alike
-        ([at(1, 0.6), at(5, 0.2)], True),
-        ([], False),
-    ],
-)
-def test_a_pose_is_sure_by_matches_and_by_itself(monkeypatch, hypotheses, is_sure):
-    """A score in hundredths is also how many features agree, and what a pose explains."""
-    scores = {h.pose.center_world[0]: h.score for h in hypotheses}
-    query = compared(monkeypatch, scores, {x: 100 * score for x, score in scores.items()})
-    assert selection.is_sure(query, hypotheses) == is_sure
 
 
 @pytest.mark.parametrize(

@@ -116,11 +116,6 @@ def test_deviations_are_of_the_size_of_the_errors():
     assert 2.5 < np.median(squares) < 10.5  # deviations right to a factor of 1.4
 
 
-def test_no_covariance_where_the_points_fix_no_pose(found, monkeypatch):
-    monkeypatch.setattr(covariance, "covariance_at", lambda *_: None)
-    assert covariance.estimate_covariance(found[0], found[1]) is None
-
-
 @pytest.mark.parametrize("num_rough", [1, 2, 3])
 def test_where_the_finest_images_have_no_minimum_the_next_one_tells(found, monkeypatch, num_rough):
     prepared, pose, _ = found

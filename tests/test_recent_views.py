@@ -1,7 +1,5 @@
 """Views from a grid of places: what a pose that hardly moves need not draw again."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import rooms
@@ -82,21 +80,3 @@ def test_points_depend_on_what_the_photo_shows(shift):
     assert 0.3 < len(half.points_at(pose).weights) / len(query.points_at(pose).weights) <= 1.01
     azimuth = np.arctan2(*(pose.R_cam_from_world @ half.points_at(pose).offsets)[1::-1])
     assert (azimuth < 0.1).mean() > 0.98
-
-
-def test_what_is_around_a_place_is_made_once(monkeypatch):
-    query, made = _query(), []
-    original = recent_views.points_around
-
-    def points_around(octree, center, voxel_per_range):
-        made.append((tuple(center), voxel_per_range))
-        return original(octree, center, voxel_per_range)
-
-    monkeypatch.setattr(recent_views, "points_around", points_around)
-    views, pose = recent_views.recent_views(query.scan_map.octree), _pose(0.296, 0.2, 0.3)
-    query = dataclasses.replace(query, cache=dataclasses.replace(query.cache, views=views))
-    for at in (pose, _pose(0.304, 0.197, 0.304), _pose(0.4, 0.2, 0.3), pose):
-        fine, coarse = (points() for points in query.surroundings_at(at))
-        assert len(fine.x) > len(coarse.x) > 0
-    places = [recent_views.place_of(at) for at in (pose, _pose(0.4, 0.2, 0.3), pose)]
-    assert made == [(place, scale) for place in places for scale in SCALES]  # the last place's alone are kept

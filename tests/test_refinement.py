@@ -1,4 +1,4 @@
-"""Decisions of the default method, each in a made-up case where one rule changes the outcome."""
+"""Descents on the views of a room, and decisions of the refinement, each in a made-up case."""
 
 import functools
 from dataclasses import replace
@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rooms
-from made_up import QUERY, at, place
+from made_up import QUERY, VIEWS, at, place
 
 from piccolo.confidence.alternatives import Hypothesis
-from piccolo.geometry.pose import step
+from piccolo.geometry.pose import Pose, step
 from piccolo.geometry.sphere import make_grid
 from piccolo.jobs.once import Once
 from piccolo.jobs.threads import Workers
@@ -21,18 +21,21 @@ from piccolo.localization.refinement import Fit, best_and_alternatives, narrow
 from piccolo.localization.search import Starts
 from piccolo.localization.settings import METHOD, Beam, CoarseToFineSettings
 from piccolo.views.recent_views import RecentViews
+from piccolo.views.view import Cells
+
+FINE_BLOCKS = METHOD.fine_view.arrays.blocks
+ALL = np.ones(len(FINE_BLOCKS), bool)
 
 
 def _fit(x, score, yaw_deg=0.0):
     return Fit(at(x, score, yaw_deg).pose, score)
 
 
-def _asked(views=None):
-    """A query whose images are their names, of a photo that shows all cells, seen through `views`."""
+def _asked():
+    """A query whose images are their names, of a photo that shows all cells."""
     images = Images(*(Once(lambda name=name: name) for name in Images._fields))
     photo = SimpleNamespace(images=images, shown_cells=lambda *_: np.ones(3))
-    views = views or RecentViews(*[lambda *_: None] * 3)
-    return replace(QUERY, photo=photo, cache=Cache(views))
+    return replace(QUERY, photo=photo, cache=Cache(VIEWS))
 
 
 @functools.lru_cache
@@ -116,34 +119,6 @@ def test_halving_keeps_as_many_as_the_beam_says(monkeypatch):
 
 
 # Perturbations and the last millimetres
-
-
-def test_each_stage_has_its_view_its_image_and_its_limits(monkeypatch):
-    asked = []
-    monkeypatch.setattr(query_module, "normalized_view", lambda sums, center, view, shown: view)
-    for module in (refinement, last_descent):
-        monkeypatch.setattr(module, "descend", lambda *arguments: asked.append(arguments) or arguments[2])
-    monkeypatch.setattr(refinement, "fit_on", lambda cells, blocks, image, pose: Fit(pose, len(blocks)))
-    monkeypatch.setattr(last_descent, "refine_unoccluded", lambda query, pose: (query, h))
-    monkeypatch.setattr(last_descent, "without_occluders", lambda query, pose: query)
-    monkeypatch.setattr(last_descent, "score_pose", lambda query, pose: h)
-    query = _asked(
-        RecentViews(lambda *_: None, lambda place, view, shown, count: (view, count), lambda *_: None)
-    )
-    h, full = at(1.0, 0.2), (METHOD.full_view, 30_000)
-    for descend_on, view in (
-        (refinement.descend_middle, METHOD.middle_view),
-        (refinement.descend_fine, METHOD.fine_view),
-    ):
-        assert descend_on(query, h.pose).score == len(view.arrays.blocks)
-    last_descent.refine_full_resolution(query, h.pose)
-    last_descent.settle(query, h)
-    assert [(cells, image, *limits) for cells, image, _, limits in asked] == [
-        (METHOD.middle_view, "middle", 1.2, 12, 1e-3),
-        (METHOD.fine_view, "fine", 1.0, 12, 1e-4),
-        (full, "full", 0.7, 10, 1e-4),
-        (full, "full", 0.7, 30, 1e-7),
-    ]
 
 
 @pytest.mark.parametrize(
@@ -272,3 +247,67 @@ def test_the_end_hardly_depends_on_where_the_descent_begins(seed, most):
     again = last_descent.settle(query, Hypothesis(ends[0], 0.0)).pose
     assert rooms.errors(again, ends[0])[0] < 2e-5
     assert rooms.errors(ends[0], true_pose)[0] < 0.01
+
+
+# Descents on cells
+
+
+@functools.lru_cache
+def _fine():
+    """Fine cells about the true camera of a room, and its true pose."""
+    true_pose = rooms.scene(1)[2]
+    return rooms.view(rooms.scan_map(1).octree, true_pose.center_world, METHOD.fine_view, ALL), true_pose
+
+
+def test_channels_in_levels_and_perturbations_to_the_corners_of_a_cube():
+    np.testing.assert_allclose(refinement.as_levels(np.array([-2, 0, 2], np.float32)), [0, 127.5, 255])
+    steps = refinement.perturbations(0.5)
+    assert steps.shape == (9, 6)
+    assert (steps[0] == 0).all()
+    np.testing.assert_allclose(np.degrees(np.linalg.norm(steps[1:, :3], axis=1)), 4.0)
+    np.testing.assert_allclose(np.linalg.norm(steps[1:, 3:], axis=1), 0.125)
+    assert len(np.unique(np.sign(steps[1:, 3:]), axis=0)) == 8
+    assert (np.sign(steps[1:, 3:]) == np.sign(steps[1:, 2::-1])).all()
+
+
+def test_descent_finds_the_true_pose_again():
+    (cells, true_pose), image = _fine(), _query(1).photo.images.fine()
+    off = step(true_pose, np.array([0.03, -0.02, 0.04, 0.06, -0.05, 0.04]))
+    pose = refinement.descend(cells, image, off, (1.0, 30, 1e-5))
+    assert rooms.errors(pose, true_pose)[0] < 0.01
+    before, after = (refinement.fit_on(cells, FINE_BLOCKS, image, p).score for p in (off, pose))
+    assert after > max(0.6, before)
+    assert rooms.errors(refinement.descend(cells, image, off, (1.0, 1, 1e-5)), true_pose)[0] > 0.01
+
+
+def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off():
+    (_, true_pose), images = _fine(), _query(1).photo.images
+    off = step(true_pose, refinement.perturbations(1.0)[1])
+    assert rooms.errors(off, true_pose)[0] > 0.2
+    cells = rooms.view(rooms.scan_map(1).octree, off.center_world, METHOD.fine_view, ALL)
+    problem = cells, FINE_BLOCKS, (images.search(), images.middle()), off, 1.0
+    found, by_two = (refinement.descend_around(*problem, Workers(n)) for n in (1, 2))
+    assert (found.pose.key, found.score) == (by_two.pose.key, by_two.score)
+    assert rooms.errors(found.pose, true_pose)[0] < 0.06
+    expected = refinement.fit_on(cells, FINE_BLOCKS, images.middle(), found.pose)
+    np.testing.assert_allclose(found.score, expected.score, atol=1e-5)
+
+
+def test_starts_descend_on_their_candidates_views_as_one_does_alone():
+    scan_map, (_, true_pose), image = rooms.scan_map(1), _fine(), _query(1).photo.images.search()
+    distance = np.linalg.norm(scan_map.centers - true_pose.center_world, axis=1)
+    k, far = int(np.argmin(distance)), int(np.argmax(distance))
+    candidate, R = np.array([k, far, k]), true_pose.R_cam_from_world
+    starts = Starts(np.stack([R] * 3), scan_map.centers[candidate], candidate)
+    ends, scores = refinement.descend_all(scan_map, image, starts, 12, Workers(2))
+    assert ends.candidate.tolist() == [k, k, far]  # the best first
+    assert scores[0] == scores[1] > max(0.4, scores[2])
+    (row,), views = scan_map.views.at(np.array([k]), Workers(1))
+    offsets = (views.offsets[row] * views.offset_unit[row]).astype(np.float32)
+    channels = views.features[row].astype(np.float32) / np.float32(63.75)
+    weights = (views.is_seen[row] * make_grid(24).solid_angle).astype(np.float32)
+    cells, center = Cells(offsets, channels, weights, scan_map.centers[k]), scan_map.centers[k]
+    alone = refinement.descend(cells, image, Pose(R, center), (1.2, 12, 2e-3))
+    np.testing.assert_allclose(ends.center_map[0], alone.center_world, atol=1e-4)
+    np.testing.assert_allclose(ends.R_cam_from_map[0], alone.R_cam_from_world, atol=1e-4)
+    assert rooms.errors(alone, true_pose)[0] < 0.1

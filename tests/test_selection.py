@@ -157,13 +157,6 @@ def test_the_best_pose_has_come_to_rest_and_is_still_the_best(monkeypatch):
     assert (rested, found.best.pose.center_world[0]) == ([0.0], 0.01)
 
 
-def test_what_speaks_for_poses_is_compared_with_the_best(monkeypatch):
-    query = compared(monkeypatch, {0.0: 0.6, 3.0: 0.3}, {0.0: 9, 3.0: 4})
-    best, other = selection.standings_of(query, at(0.0, 0.5), [at(3.0, 0.2)])
-    assert best == (1.0, 0.5, 9, 0.0)
-    assert other == (pytest.approx(0.5), 0.2, 4, 0.0)
-
-
 def test_margin_is_the_lesser_of_two_leads_and_a_result_is_sure_by_three_things(monkeypatch):
     for score, other, rival, margin in ((0.5, 0.1, 0.3, 0.7), (0.5, 0.4, 0.3, 0.2), (0.1, 0.4, 0.0, -1.0)):
         found = Selection(at(0.0, score), (at(3.0, other),), rival)

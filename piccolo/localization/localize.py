@@ -71,10 +71,13 @@ def localize(
             return evaluate(*calibrate(query, found))
 
 
+Found = tuple[list[Hypothesis], bool]  # and whether no more attempts need be made
+
+
 class Attempt(NamedTuple):
     """One search with its refinement."""
 
-    run: Callable[["Query", "Attempt", list[Hypothesis], Stopwatch], tuple[list[Hypothesis], bool]]
+    run: Callable[[Query, "Attempt", list[Hypothesis], Stopwatch], Found]  # which adds to what is known
     num_halves: int  # of the photo's features that are asked; 0: whole views alone
     gravity: Gravity = "known"  # with which whole views are searched
     is_brief: bool = False  # whole views from few starts
@@ -99,9 +102,7 @@ def attempts_for(query: Query) -> list[Attempt]:
     return attempts
 
 
-def look_first(
-    query: Query, attempt: Attempt, hypotheses: list[Hypothesis], watch: Stopwatch
-) -> tuple[list[Hypothesis], bool]:
+def look_first(query: Query, attempt: Attempt, known: list[Hypothesis], watch: Stopwatch) -> Found:
     """Where brief whole views lead; True if one pose explains the photo, no other does, nor its mirror."""
     first = brief_query(query)
     of_mirror = Once(partial(mirror_score, query))
@@ -109,13 +110,11 @@ def look_first(
         with watch.stage("search"):
             starts = search_poses(first, attempt.gravity)
         with watch.stage("refine"):
-            found = hypotheses + refine(first, starts, FIRST_BEAM)
+            found = known + refine(first, starts, FIRST_BEAM)
             return found, is_clear(query, found) and not is_rather_mirrored(first, starts, of_mirror())
 
 
-def search_matches(
-    query: Query, attempt: Attempt, hypotheses: list[Hypothesis], watch: Stopwatch
-) -> tuple[list[Hypothesis], bool]:
+def search_matches(query: Query, attempt: Attempt, known: list[Hypothesis], watch: Stopwatch) -> Found:
     """Hypotheses, and the poses that matches vote for; True if these leave no doubt.
 
     Half of the features count for nothing if they leave any: all give the same poses then, and better ones.
@@ -124,21 +123,19 @@ def search_matches(
         poses = matched_poses(query)
         is_half = attempt.num_halves < ALL_HALVES
         if is_half and (not poses or count_matches(query.matches, poses[0]) < CLEAR_MATCHES):
-            return hypotheses, False
-        found = hypotheses + refine_matches(query, poses)
+            return known, False
+        found = known + refine_matches(query, poses)
         is_enough = is_sure(query, found)
-        return hypotheses if is_half and not is_enough else found, is_enough
+        return known if is_half and not is_enough else found, is_enough
 
 
-def search_views(
-    query: Query, attempt: Attempt, hypotheses: list[Hypothesis], watch: Stopwatch
-) -> tuple[list[Hypothesis], bool]:
+def search_views(query: Query, attempt: Attempt, known: list[Hypothesis], watch: Stopwatch) -> Found:
     """Hypotheses, and where whole views lead; True if these leave no doubt."""
     asked = tilted_query(query) if attempt.is_brief else query
     with watch.stage("search"):
         starts = search_poses(asked, attempt.gravity)
     with watch.stage("refine"):
-        found = hypotheses + refine(asked, starts, FIRST_BEAM if attempt.is_brief else query.method.beam)
+        found = known + refine(asked, starts, FIRST_BEAM if attempt.is_brief else query.method.beam)
         return found, is_sure(query, found)
 
 
