@@ -12,7 +12,7 @@ from piccolo.geometry.pose import exp_so3, is_correct
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
 from piccolo.local_features.matching import NO_MATCHES
-from piccolo.localization import first_look, query
+from piccolo.localization import attempts, query
 from piccolo.localization import localize as method
 from piccolo.localization.query import prepare_query
 from piccolo.localization.search import search_poses
@@ -76,8 +76,8 @@ def test_clear_are_score_and_margin(monkeypatch, score, margin, expected):
 
 @pytest.mark.parametrize(("first", "is_mirrored"), [(0.221, False), (0.21, True)])
 def test_a_photo_is_rather_mirrored_unless_it_fits_better_by_a_tenth(monkeypatch, first, is_mirrored):
-    monkeypatch.setattr(first_look, "first_score", lambda query, starts: first)
-    assert first_look.is_rather_mirrored(None, None, 0.2) == is_mirrored
+    monkeypatch.setattr(attempts, "first_score", lambda query, starts: first)
+    assert attempts.is_rather_mirrored(None, None, 0.2) == is_mirrored
 
 
 def test_the_mirrored_query_is_that_of_the_mirrored_photo():
@@ -86,7 +86,7 @@ def test_the_mirrored_query_is_that_of_the_mirrored_photo():
     asked = _query(panorama, replace(KNOWN, prior=Prior(heading_deg=30.0)))
     photo = replace(asked.photo, R_cam_from_level=exp_so3(np.array([0.0, 0.3, 0.0])))
     tilted = replace(asked, photo=photo)
-    mirror = first_look.mirrored(tilted)
+    mirror = attempts.mirrored(tilted)
     other = _query(_turned_over(panorama))
     own, expected = (q.photo.images.search().rgbx.view(np.uint8).astype(int) for q in (mirror, other))
     assert np.abs(own - expected).max() <= 1  # level
@@ -100,8 +100,8 @@ def test_the_mirrored_query_is_that_of_the_mirrored_photo():
 
 def test_the_first_score_tells_a_photo_from_its_mirror():
     asked = _query(rooms.as_panorama(rooms.query(1).rgb))
-    mirror = first_look.mirrored(asked)
-    own, other = (first_look.first_score(q, search_poses(q, "known")) for q in (asked, mirror))
+    mirror = attempts.mirrored(asked)
+    own, other = (attempts.first_score(q, search_poses(q, "known")) for q in (asked, mirror))
     assert own > 1.5 * other > 0.0
 
 
@@ -117,7 +117,7 @@ def test_a_tilted_sphere_without_features_is_found_by_whole_views(monkeypatch, g
         made.append((gravity, query.settings, len(query.scan_map.sparse)))
         return search_poses(query, gravity)
 
-    monkeypatch.setattr(method, "search_poses", searched)
+    monkeypatch.setattr(attempts, "search_poses", searched)
     monkeypatch.setattr(query, "match", lambda *_: NO_MATCHES)
     taken, settings = rooms.query(1, "tilt"), CoarseToFineSettings(gravity=gravity)
     found = _localized(rooms.as_panorama(taken.rgb), settings)
@@ -132,7 +132,5 @@ def test_a_brief_search_keeps_what_little_a_prior_leaves():
     whole = rooms.scan_map(1)
     few = whole.narrowed(np.arange(len(whole.sparse)) < 7)
     asked = _query(rooms.as_panorama(rooms.query(1).rgb))
-    assert (
-        first_look.tilted_query(replace(asked, scan_map=few)).scan_map.sparse.tolist() == few.sparse.tolist()
-    )
-    assert 0.3 < len(first_look.tilted_query(asked).scan_map.sparse) / len(whole.sparse) < 0.7
+    assert attempts.tilted_query(replace(asked, scan_map=few)).scan_map.sparse.tolist() == few.sparse.tolist()
+    assert 0.3 < len(attempts.tilted_query(asked).scan_map.sparse) / len(whole.sparse) < 0.7

@@ -8,6 +8,7 @@ from made_up import QUERY, at, places
 
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
+from piccolo.localization import attempts
 from piccolo.localization import localize as method
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
 
@@ -31,9 +32,9 @@ BRIEFLY = ("search_views", 2, "unknown", True)
     ],
 )
 def test_attempts_are_made_in_this_order(monkeypatch, is_whole, gravity, parts, expected):
-    monkeypatch.setattr(method, "is_whole", lambda query: is_whole)
+    monkeypatch.setattr(attempts, "is_whole", lambda query: is_whole)
     settings = CoarseToFineSettings(gravity=gravity)
-    found = method.attempts_for(replace(QUERY, method=METHOD._replace(**parts), settings=settings))
+    found = attempts.attempts_for(replace(QUERY, method=METHOD._replace(**parts), settings=settings))
     assert [(attempt.run.__name__, *attempt[1:]) for attempt in found] == expected
 
 
@@ -44,8 +45,8 @@ def test_attempts_are_made_until_one_is_sure(monkeypatch, sure, num_made):
     def run(query, attempt, hypotheses, watch):
         return [*hypotheses, at(query.num_halves, 0.5)], query.num_halves == sure
 
-    attempts = [method.Attempt(run, k) for k in (1, 2, 0)]
-    monkeypatch.setattr(method, "attempts_for", lambda query: attempts)
+    made = [attempts.Attempt(run, k) for k in (1, 2, 0)]
+    monkeypatch.setattr(method, "attempts_for", lambda query: made)
     monkeypatch.setattr(method, "refine_to_the_end", lambda query, found: found)
     monkeypatch.setattr(method, "evaluate", lambda query, found: (query.num_halves, found))
     how = CoarseToFineSettings(), Workers(1), Stopwatch()
@@ -70,12 +71,12 @@ def test_half_of_the_features_count_where_these_leave_no_doubt(
 ):
     """As many matches as a clear whole view is worth, and no pose of the first look near it."""
     looked = at(9, 0.2)
-    monkeypatch.setattr(method, "matched_poses", lambda query: [] if num_matches is None else ["pose"])
-    monkeypatch.setattr(method, "count_matches", lambda matches, pose: num_matches)
-    monkeypatch.setattr(method, "is_sure", lambda query, found: found[0] is looked and is_sure)
-    monkeypatch.setattr(method, "refine_matches", lambda query, poses: [at(query.num_halves, 0.5)])
-    attempt = method.Attempt(method.search_matches, num_halves)
+    monkeypatch.setattr(attempts, "matched_poses", lambda query: [] if num_matches is None else ["pose"])
+    monkeypatch.setattr(attempts, "count_matches", lambda matches, pose: num_matches)
+    monkeypatch.setattr(attempts, "is_sure", lambda query, found: found[0] is looked and is_sure)
+    monkeypatch.setattr(attempts, "refine_matches", lambda query, poses: [at(query.num_halves, 0.5)])
+    attempt = attempts.Attempt(attempts.search_matches, num_halves)
     query = replace(QUERY, num_halves=num_halves)
-    found, is_enough = method.search_matches(query, attempt, [looked], Stopwatch())
+    found, is_enough = attempts.search_matches(query, attempt, [looked], Stopwatch())
     assert places(found) == kept
     assert is_enough == (is_sure and len(kept) == 2)

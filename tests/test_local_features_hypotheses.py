@@ -14,7 +14,8 @@ from piccolo.jobs.threads import Workers
 from piccolo.local_features.feature_map import make_feature_map
 from piccolo.local_features.hypotheses import count_matches, exact_pose, poses_of, rough_poses
 from piccolo.local_features.matching import Matches
-from piccolo.localization.localize import localize, matched_poses
+from piccolo.localization.attempts import matched_poses
+from piccolo.localization.localize import localize
 from piccolo.localization.prior import contradictions
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings

@@ -9,15 +9,15 @@ from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE, Hypothesis, by_sc
 from ..confidence.confidence import posterior
 from ..geometry.pose import Pose, exp_so3, log_so3, pose_errors
 from ..geometry.rotations import Gravity
-from ..localization.comparison import score_pose
-from ..localization.covariance import estimate_covariance
-from ..localization.first_look import (
+from ..localization.attempts import (
     FIRST_BEAM,
     brief_query,
     first_score,
     is_rather_mirrored,
     mirror_score,
 )
+from ..localization.comparison import score_pose
+from ..localization.covariance import estimate_covariance
 from ..localization.prior import apply_prior
 from ..localization.query import Cache, Query
 from ..localization.refinement import FULL_LOSS, descend, descend_fine, descend_middle, perturb_middle, refine
