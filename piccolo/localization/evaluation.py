@@ -67,7 +67,7 @@ def evaluate(query: Query, found: Selection, fit: FocalFit | None = None) -> Loc
         probabilities = np.append(np.zeros(len(standings)), 1.0)
     if fit is not None and classify(probabilities, settings.min_confidence) != LOCALIZED:
         warnings += doubts_of(query.photo.given, fit)
-    matches = [s.num_matches if query.by_features else None for s in standings[1:]]
+    matches = [s.num_matches if query.num_halves else None for s in standings[1:]]
     alternatives = tuple(
         Alternative(query.scan_map.to_world(h.pose), h.score, s.share, num_matches, float(p))
         for h, s, num_matches, p in zip(reported, standings[1:], matches, probabilities[1:-1], strict=True)
@@ -110,8 +110,8 @@ def evidence_of(
         explained_fraction=fractions[0],
         contradicted_fraction=fractions[1],
         seen_fraction=agreement.seen_fraction,
-        num_matches=num_matches[0] if query.by_features else None,
-        alternative_matches=max(num_matches[1:], default=0) if query.by_features else None,
+        num_matches=num_matches[0] if query.num_halves else None,
+        alternative_matches=max(num_matches[1:], default=0) if query.num_halves else None,
     )
 
 

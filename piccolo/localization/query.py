@@ -109,11 +109,6 @@ class Query:
     cache: Cache
     num_halves: int = len(HALVES)  # of the features, that are asked; none where whole views alone are
 
-    @property
-    def by_features(self) -> bool:
-        """False where whole views alone are asked."""
-        return self.num_halves > 0
-
     @cached_property
     def keypoints(self) -> Keypoints:
         """The photo's keypoints."""

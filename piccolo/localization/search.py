@@ -158,26 +158,17 @@ def unpack_views(features, seen, area, values, fractions, energy, total):
         total[i] = whole_total
 
 
-class Unpacked(NamedTuple):
-    """A block of views, and their energies beside each rotation's, as one thread needs them."""
-
-    values: Samples  # (views, 3 * cells)
-    fractions: Samples  # (views, cells)
-    energy: Samples  # (views, cells)
-    total: Samples  # (views,)
-
-
 _local = threading.local()
 
 
-def thread_block(num_views: int, num_cells: int) -> Unpacked:
-    """The calling thread's own block, kept for the next: fresh memory costs as much as the products."""
-    block: Unpacked | None = getattr(_local, "block", None)
-    if block is None or len(block.total) < num_views or block.energy.shape[1] != num_cells:
+def thread_block(num_views: int, num_cells: int) -> list[Samples]:
+    """What `unpack_views` writes, in the thread's own arrays: fresh memory costs as much as the products."""
+    kept: list[Samples] = getattr(_local, "block", [])
+    if not kept or len(kept[0]) < num_views or kept[1].shape[1] != num_cells:
         num_rows = max(BLOCK, num_views)
         shapes = (num_rows, 3 * num_cells), (num_rows, num_cells), (num_rows, num_cells), (num_rows,)
-        block = _local.block = Unpacked(*(np.empty(shape, np.float32) for shape in shapes))
-    return Unpacked(*(each[:num_views] for each in block))
+        kept = _local.block = [np.empty(shape, np.float32) for shape in shapes]
+    return [each[:num_views] for each in kept]
 
 
 def masked_correlation(

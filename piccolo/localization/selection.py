@@ -65,7 +65,7 @@ def standings_alone(query: Query, hypotheses: Sequence[Hypothesis]) -> list[Stan
     log_prior = math.log(CONTRADICTED / max(sum(is_wrong), 1))
     standings = []
     for h, wrong in zip(hypotheses, is_wrong, strict=True):
-        num_matches = count_matches(query.matches, h.pose) if query.by_features else CLEAR_MATCHES
+        num_matches = count_matches(query.matches, h.pose) if query.num_halves else CLEAR_MATCHES
         standings.append(Standing(1.0, h.score, num_matches, log_prior if wrong else 0.0))
     return standings
 
