@@ -179,17 +179,12 @@ def first_score(query: Query, starts: Starts) -> float:
 
 def mirrored(query: Query) -> Query:
     """The query of the photo turned over, left for right, for a first score; no heading is known of it."""
+    search = query.photo.images.search()
+    rgbx = np.ascontiguousarray(search.rgbx.reshape(-1, search.width + 2)[:, ::-1]).reshape(-1)
+    images = query.photo.images._replace(search=Once(lambda: Texels(rgbx, search.width)))
     across = np.diag([1.0, -1.0, 1.0])
-    prior = replace(query.settings.prior, heading_deg=None)
-    settings = replace(query.settings, prior=prior, max_starts=min(NUM_SCORED, query.settings.max_starts))
-    images = query.photo.images._replace(search=Once(partial(turned_over, query.photo.images.search)))
     level = across @ query.photo.R_cam_from_level @ across
     photo = replace(query.photo, images=images, R_cam_from_level=level)
+    prior = replace(query.settings.prior, heading_deg=None)
+    settings = replace(query.settings, prior=prior, max_starts=min(NUM_SCORED, query.settings.max_starts))
     return replace(query, photo=photo, settings=settings)
-
-
-def turned_over(image: Once[Texels]) -> Texels:
-    """An image with left and right exchanged."""
-    texels = image()
-    across = texels.rgbx.reshape(-1, texels.width + 2)[:, ::-1]
-    return Texels(np.ascontiguousarray(across).reshape(-1), texels.width)

@@ -2,10 +2,9 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..confidence.alternatives import Hypothesis, alternative_poses, by_score
 from ..confidence.confidence import CLEAR_MATCHES, CONTRADICTED, Standing, log_odds
@@ -70,17 +69,6 @@ def standings_alone(query: Query, hypotheses: Sequence[Hypothesis]) -> list[Stan
     return standings
 
 
-def odds_by_pair(query: Query, hypotheses: Sequence[Hypothesis]) -> NDArray[np.float64]:
-    """Log odds (N, N) of each pose, a column, against each, a row, over what the two show."""
-    seen = [compare(query, h.pose) for h in hypotheses]
-    alone = standings_alone(query, hypotheses)
-    odds = [
-        [log_odds(a._replace(share=c.ratio_to(best))) for a, c in zip(alone, seen, strict=True)]
-        for best in seen
-    ]
-    return np.array(odds) - np.diag(odds)[:, None]
-
-
 def select(query: Query, found: Selection) -> Selection:
     """Take the pose with the greatest odds as the best, and its margin over what both views show.
 
@@ -90,13 +78,18 @@ def select(query: Query, found: Selection) -> Selection:
     if not found.alternatives:
         return found
     ranked = [found.best, *found.alternatives]
-    odds = odds_by_pair(query, ranked)
+    seen = [compare(query, h.pose) for h in ranked]
+    alone = standings_alone(query, ranked)
+    shares = [[other.ratio_to(one) for other in seen] for one in seen]
+    odds = np.array(
+        [[log_odds(a._replace(share=v)) for a, v in zip(alone, row, strict=True)] for row in shares]
+    )
+    odds -= np.diag(odds)[:, None].copy()  # of each pose, a column, against each, a row
     worst = np.where(np.eye(len(ranked), dtype=bool), -np.inf, odds).max(axis=1)
     best = int(np.argmin(worst))
-    others = tuple(ranked[k] for k in np.argsort(-odds[best], kind="stable") if k != best)
-    at_best = compare(query, ranked[best].pose)
-    rival_ratio = max(compare(query, h.pose).ratio_to(at_best) for h in others)
-    return replace(found, best=ranked[best], alternatives=others, rival_ratio=rival_ratio)
+    others = [int(k) for k in np.argsort(-odds[best], kind="stable") if k != best]
+    rival_ratio = max(shares[best][k] for k in others)
+    return Selection(ranked[best], tuple(ranked[k] for k in others), rival_ratio)
 
 
 def is_sure(query: Query, hypotheses: Sequence[Hypothesis]) -> bool:
