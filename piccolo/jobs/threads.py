@@ -110,16 +110,18 @@ class Workers:
         check_address_space()
         values: list[Value] = []
         shown = self.show(iter(values), len(items), label)  # which is moved on as they come
-        if self.num_threads == 1 or len(items) < 2 or _thread.is_of_pool:
-            for item in items:
-                values.append(function(item))
-                next(shown)
-        else:
-            with submitted(self.num_threads, [partial(function, item) for item in items]) as futures:
-                for future in futures:
-                    values.append(future.result())
+        try:
+            if self.num_threads == 1 or len(items) < 2 or _thread.is_of_pool:
+                for item in items:
+                    values.append(function(item))
                     next(shown)
-        next(shown, None)
+            else:
+                with submitted(self.num_threads, [partial(function, item) for item in items]) as futures:
+                    for future in futures:
+                        values.append(future.result())
+                        next(shown)
+        finally:
+            next(shown, None)  # its end, which takes a bar off the screen before an error is printed
         return values
 
     @contextmanager
