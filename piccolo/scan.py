@@ -19,7 +19,7 @@ from .files.json_file import reading_once
 from .geometry.pose import Pose
 from .jobs.stopwatch import Stopwatch
 from .jobs.threads import Workers
-from .localization.localize_guessed import localize_guessed
+from .localization.localize import has_guessed_focal, localize, localize_guessed
 from .localization.settings import CoarseToFineSettings
 from .panorama import Panorama, ReadOptions, read_query
 from .panorama.photo import Photo, photo_of, photo_of_array
@@ -192,7 +192,8 @@ class Scan:
         if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
             gps = self.gps_prior_of(photo, settings) if read_options.use_gps else None
             check_within(self.prepared, settings.prior.within)
-            found, gps = self._localized(localize_guessed, self.prepared, picture, settings, gps, watch)
+            by = localize_guessed if has_guessed_focal(picture) else localize
+            found, gps = self._localized(by, self.prepared, picture, settings, gps, watch)
             found = with_places(self.prepared, found)
         elif isinstance(self.prepared, PaperMap) and isinstance(settings, PaperSettings):
             if read_options.refine_focal:

@@ -12,17 +12,8 @@ def test_alternatives_are_apart_from_the_best_and_from_each_other():
     best = _at(0.0, 0.9)
     near, turned, far, beside_far = _at(0.4, 0.8), _at(0.1, 0.3, 20.0), _at(3.0, 0.5), _at(3.2, 0.4)
     assert alternatives.alternative_poses(best.pose, [best, near, turned, far, beside_far]) == [far, turned]
-    best, refined = _at(0.0, 0.9), _at(3.0, 0.3)
-    middle = [_at(3.1, 0.6), _at(7.0, 0.4), _at(0.2, 0.8)]
-    assert alternatives.alternative_poses(best.pose, [refined], middle) == [middle[1], refined]
     found = alternatives.alternative_poses(_at(0, 1.0).pose, [_at(2.0 * k, 0.5) for k in range(1, 20)])
     assert len(found) == alternatives.MAX_ALTERNATIVES
-
-
-def test_margin_is_over_the_best_alternative_or_over_nothing():
-    assert alternatives.score_margin(0.7, [_at(0, 0.2), _at(0, 0.3)]) == 0.7 - 0.3
-    assert alternatives.score_margin(0.7, []) == 0.7
-    assert alternatives.score_margin(0.7, [_at(0, -0.2)]) == 0.7
 
 
 def test_best_distinct_keeps_the_better_of_two_that_are_near():

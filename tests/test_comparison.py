@@ -159,32 +159,21 @@ def test_what_contradicts_is_masked_and_the_rest_stays():
     rgb, is_hidden = _hidden(0.4)
     query = _query(rgb)
     shown = without_occluders(query, true_pose)
-    masked = _blocks_of(~shown.panorama.is_valid[::2, ::2])
+    masked = _blocks_of(~shown.photo.panorama.is_valid[::2, ::2])
     covered = _blocks_of(is_hidden)
     assert masked[covered > 0.9].mean() > 0.8
     assert masked[covered == 0.0].mean() < 0.15
     assert shown.settings is query.settings
-    assert query.panorama.is_valid.all()  # as it was
+    assert query.photo.panorama.is_valid.all()  # as it was
     after = compare(shown, true_pose)
     seen = compare(query, true_pose)
     assert after.score > seen.score
     assert after.valid_area == pytest.approx(
-        1.0 - (AREAS * ~shown.panorama.is_valid[::2, ::2]).sum(), abs=0.02
+        1.0 - (AREAS * ~shown.photo.panorama.is_valid[::2, ::2]).sum(), abs=0.02
     )
     clean = _query(rooms.query(1).rgb)
     fits = (compare(clean, true_pose).correlation >= CONTRADICTS).all()
     assert (without_occluders(clean, true_pose) is clean) == fits
-
-
-def test_a_mask_is_enlarged_to_the_photo():
-    query = _query(rooms.query(1).rgb)
-    is_hidden = np.zeros((8, 16), bool)
-    is_hidden[2, 5] = True
-    rest = query.without(is_hidden)
-    height = rest.panorama.is_valid.shape[0]
-    side = height // 8
-    assert not rest.panorama.is_valid[2 * side : 3 * side, 5 * side : 6 * side].any()
-    assert (~rest.panorama.is_valid).sum() == side * side
 
 
 def test_a_photo_that_was_turned_over_is_told():

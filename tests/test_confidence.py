@@ -7,7 +7,6 @@ import pytest
 from piccolo.confidence import confidence as rule
 from piccolo.confidence.confidence import Standing, classify, posterior
 from piccolo.confidence.covariance import PoseCovariance
-from piccolo.confidence.score import Evidence
 from piccolo.errors import InputError
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.paper.settings import PaperSettings
@@ -97,14 +96,6 @@ def test_the_line_moves():
     for line, status in ((0.6, rule.LOCALIZED), (0.61, rule.AMBIGUOUS), (0.9, rule.AMBIGUOUS)):
         assert classify(p, line) == status
     assert classify(p, 0.91) == rule.NOT_LOCALIZED
-
-
-def test_the_preset_paper_goes_by_margin_and_agreement():
-    """From the weights as they were fitted, by a pocket calculator."""
-    evidence = Evidence(0.15, 0.15, 0.4, 0.85, 0.93)
-    assert rule.paper_confidence(evidence) == pytest.approx(0.1759, abs=0.001)
-    clearer = Evidence(0.15, 0.25, 0.5, 0.85, 0.93)
-    assert rule.paper_confidence(clearer) > rule.paper_confidence(evidence)
 
 
 @pytest.mark.parametrize("settings", [CoarseToFineSettings, PaperSettings])

@@ -1,24 +1,22 @@
 """The first look: which photos whole views alone are enough for, and what the result then says."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import rooms
+from made_up import at, compared
 
-from piccolo.confidence.alternatives import Hypothesis
 from piccolo.confidence.confidence import LOCALIZED
-from piccolo.geometry.pose import Pose, exp_so3, is_correct
-from piccolo.jobs.once import Once
+from piccolo.geometry.pose import exp_so3, is_correct
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
 from piccolo.local_features.matching import NO_MATCHES
-from piccolo.localization import first_look, query, refinement
+from piccolo.localization import attempts, query
 from piccolo.localization import localize as method
 from piccolo.localization.query import prepare_query
 from piccolo.localization.search import search_poses
-from piccolo.localization.search_result import SearchResult
+from piccolo.localization.selection import is_clear
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.scan_map.prior import Prior
 
@@ -68,51 +66,42 @@ def test_features_are_asked_of_what_is_not_clear(how):
 
 
 @pytest.mark.parametrize(
-    ("score", "margin", "first", "mirrored", "is_clear"),
-    [
-        (0.3, 0.5, 0.221, 0.2, True),
-        (0.29, 0.5, 0.22, 0.2, False),
-        (0.3, 0.49, 0.22, 0.2, False),
-        (0.3, 0.5, 0.21, 0.2, False),
-    ],
+    ("score", "margin", "expected"), [(0.3, 0.51, True), (0.29, 0.51, False), (0.3, 0.49, False)]
 )
-def test_clear_are_score_margin_and_the_mirrored_photo(monkeypatch, score, margin, first, mirrored, is_clear):
-    best = Hypothesis(Pose(np.eye(3), np.zeros(3)), score)
-    other = Hypothesis(Pose(np.eye(3), np.ones(3)), score * (1.0 - margin))
-    own, mirror = SimpleNamespace(), SimpleNamespace()
-    monkeypatch.setattr(first_look, "fairly_selected", lambda query, found: found)
-    monkeypatch.setattr(first_look, "found_among", lambda some, count: SearchResult(best, (other,)))
-    monkeypatch.setattr(first_look, "mirrored", lambda query: mirror)
-    monkeypatch.setattr(first_look, "search_poses", lambda query, gravity: "starts of its own")
-    scores = {(id(own), "starts"): first, (id(mirror), "starts of its own"): mirrored}
-    monkeypatch.setattr(first_look, "first_score", lambda query, starts: scores[id(query), starts])
-    of_mirror = Once(lambda: first_look.mirror_score(own))
-    assert first_look.is_clear(own, "starts", [best, other], of_mirror) == is_clear
+def test_clear_are_score_and_margin(monkeypatch, score, margin, expected):
+    other = score * (1.0 - margin)
+    asked = replace(compared(monkeypatch, {0.0: score, 3.0: other}, {}), num_halves=0)
+    assert is_clear(asked, [at(0.0, score), at(3.0, other)]) == expected
+
+
+@pytest.mark.parametrize(("first", "is_mirrored"), [(0.221, False), (0.21, True)])
+def test_a_photo_is_rather_mirrored_unless_it_fits_better_by_a_tenth(monkeypatch, first, is_mirrored):
+    monkeypatch.setattr(attempts, "first_score", lambda query, starts: first)
+    assert attempts.is_rather_mirrored(None, None, 0.2) == is_mirrored
 
 
 def test_the_mirrored_query_is_that_of_the_mirrored_photo():
     """Its tilt is mirrored with it; where it heads, nothing is known."""
     panorama = rooms.as_panorama(rooms.query(1).rgb)
     asked = _query(panorama, replace(KNOWN, prior=Prior(heading_deg=30.0)))
-    tilted = replace(asked, R_cam_from_level=exp_so3(np.array([0.0, 0.3, 0.0])))
-    mirror = first_look.mirrored(tilted)
+    photo = replace(asked.photo, R_cam_from_level=exp_so3(np.array([0.0, 0.3, 0.0])))
+    tilted = replace(asked, photo=photo)
+    mirror = attempts.mirrored(tilted)
     other = _query(_turned_over(panorama))
-    own, expected = (
-        images.search.rgbx.view(np.uint8).astype(int) for images in (mirror.images, other.images)
-    )
+    own, expected = (q.photo.images.search().rgbx.view(np.uint8).astype(int) for q in (mirror, other))
     assert np.abs(own - expected).max() <= 1  # level
     assert mirror.settings.prior == Prior()
     d = np.array([0.6, -0.2, 0.77])
     across = np.array([1.0, -1.0, 1.0])
     np.testing.assert_allclose(
-        mirror.R_cam_from_level @ (across * d), across * (tilted.R_cam_from_level @ d), atol=1e-12
+        mirror.photo.R_cam_from_level @ (across * d), across * (tilted.photo.R_cam_from_level @ d), atol=1e-12
     )
 
 
 def test_the_first_score_tells_a_photo_from_its_mirror():
     asked = _query(rooms.as_panorama(rooms.query(1).rgb))
-    mirror = first_look.mirrored(asked)
-    own, other = (refinement.first_score(q, search_poses(q, "known")) for q in (asked, mirror))
+    mirror = attempts.mirrored(asked)
+    own, other = (attempts.first_score(q, search_poses(q, "known")) for q in (asked, mirror))
     assert own > 1.5 * other > 0.0
 
 
@@ -128,7 +117,7 @@ def test_a_tilted_sphere_without_features_is_found_by_whole_views(monkeypatch, g
         made.append((gravity, query.settings, len(query.scan_map.sparse)))
         return search_poses(query, gravity)
 
-    monkeypatch.setattr(method, "search_poses", searched)
+    monkeypatch.setattr(attempts, "search_poses", searched)
     monkeypatch.setattr(query, "match", lambda *_: NO_MATCHES)
     taken, settings = rooms.query(1, "tilt"), CoarseToFineSettings(gravity=gravity)
     found = _localized(rooms.as_panorama(taken.rgb), settings)
@@ -143,7 +132,5 @@ def test_a_brief_search_keeps_what_little_a_prior_leaves():
     whole = rooms.scan_map(1)
     few = whole.narrowed(np.arange(len(whole.sparse)) < 7)
     asked = _query(rooms.as_panorama(rooms.query(1).rgb))
-    assert (
-        first_look.tilted_query(replace(asked, scan_map=few)).scan_map.sparse.tolist() == few.sparse.tolist()
-    )
-    assert 0.3 < len(first_look.tilted_query(asked).scan_map.sparse) / len(whole.sparse) < 0.7
+    assert attempts.tilted_query(replace(asked, scan_map=few)).scan_map.sparse.tolist() == few.sparse.tolist()
+    assert 0.3 < len(attempts.tilted_query(asked).scan_map.sparse) / len(whole.sparse) < 0.7

@@ -17,7 +17,7 @@ from piccolo.confidence.score import Evidence
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.jobs.threads import Workers
 from piccolo.localization import focal_length as focal
-from piccolo.localization.localize_guessed import likeliest
+from piccolo.localization.localize import likeliest
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import ReadOptions, panorama_of_array
@@ -38,7 +38,7 @@ def _panorama(rgb, **options):
 def _fit(rgb, pose, **options):
     panorama = _panorama(rgb, **options)
     query = prepare_query(panorama, scan_map(5), CoarseToFineSettings(), Workers(2))
-    return panorama, focal.fit_focal(query, panorama, scan().from_world(pose))
+    return panorama, focal.fit_focal(query, scan().from_world(pose))
 
 
 @pytest.mark.parametrize("num", [1, 2])
@@ -51,7 +51,7 @@ def test_the_crest_is_that_of_a_quadratic_loss_and_blocks_that_pull_widen_it(num
     losses = whole[:, None] / 8.0 + off @ pulls.T
     turn = np.array([0.0, 0.0, 0.5])
     poses = [Pose(exp_so3(turn * c[0]), np.array([3.0 * c[0], 0.0, 0.0])) for c in changes]
-    crest = focal.crest_of(focal.Profile(changes, losses, poses), Pose(np.eye(3), np.zeros(3)))
+    crest = focal.crest_of(changes, losses, poses, Pose(np.eye(3), np.zeros(3)))
     np.testing.assert_allclose(crest.change, true, atol=1e-9)
     np.testing.assert_allclose(crest.motion[:, 0], [0.0, 0.0, 0.5, 3.0, 0.0, 0.0], atol=1e-9)
     inverse = np.linalg.inv(curvature)
@@ -63,9 +63,9 @@ def test_the_crest_is_that_of_a_quadratic_loss_and_blocks_that_pull_widen_it(num
 def test_a_loss_of_few_blocks_or_without_a_crest_tells_nothing():
     changes = focal.design(1, 0.04)
     poses = [Pose(np.eye(3), np.zeros(3))] * len(changes)
-    crest = focal.crest_of(focal.Profile(changes, -np.repeat(changes**2, 9, axis=1), poses), poses[0])
+    crest = focal.crest_of(changes, -np.repeat(changes**2, 9, axis=1), poses, poses[0])
     assert not crest.information.any()
-    few = focal.crest_of(focal.Profile(changes, np.repeat(changes**2, 3, axis=1), poses), poses[0])
+    few = focal.crest_of(changes, np.repeat(changes**2, 3, axis=1), poses, poses[0])
     assert not few.information.any()
 
 
@@ -85,7 +85,7 @@ def test_k1_is_fitted_with_the_focal_length_of_a_guess():
     rgb, pose = _photo(Camera("SIMPLE_RADIAL", 640, 480, (TRUE, 320.0, 240.0, -0.04)))
     mount = Mount(Camera("SIMPLE_RADIAL", 640, 480, (1.03 * TRUE, 320.0, 240.0, 0.0)))
     _, fit = _fit(rgb, pose, calibration=Calibration("guess", (mount,)), refine_focal=True)
-    f, k1 = focal.changed(mount.camera, fit.change).params[::3]
+    f, k1 = focal.change_camera(mount.camera, fit.change).params[::3]
     assert f == pytest.approx(TRUE, rel=0.02)
     assert k1 == pytest.approx(-0.04, abs=0.015)
 

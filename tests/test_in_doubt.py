@@ -1,113 +1,82 @@
 """How much search a photo needs, each in a made-up case where one rule decides."""
 
-from dataclasses import dataclass
-from types import SimpleNamespace
+from dataclasses import replace
 
-import numpy as np
 import pytest
 import rooms
-from made_up import QUERY, at, compared, places
+from made_up import QUERY, at, places
 
-from piccolo.confidence.alternatives import Hypothesis
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
+from piccolo.localization import attempts
 from piccolo.localization import localize as method
-from piccolo.localization.config import METHOD
-from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.localization.settings import METHOD, CoarseToFineSettings
 
-
-def _run(monkeypatch, matched, searches, gravity="auto", config=METHOD):
-    """Localize with made-up poses from matches and from searches; the searches made, what is evaluated.
-
-    A score in hundredths is also how many features agree, and what a pose explains.
-    """
-    made, left = [], list(searches)
-    scan_map = SimpleNamespace(sparse=np.zeros(1))
-    scores = {h.pose.center_world[0]: h.score for some in (matched, *searches) for h in some}
-
-    def search_poses(query, gravity):
-        made.append(gravity)
-        return gravity
-
-    monkeypatch.setattr(method, "apply_prior", lambda *_: scan_map)
-    settings = CoarseToFineSettings(gravity=gravity)
-    own = {"matches": None, "settings": settings, "colors": None, "soon_needed": list}
-    query = SimpleNamespace(**vars(QUERY) | own)
-    query.method = config
-    monkeypatch.setattr(method, "prepare_query", lambda *_: query)
-    monkeypatch.setattr(method, "first_query", lambda query: query)
-    monkeypatch.setattr(method, "is_whole", lambda query: False)
-    monkeypatch.setattr(method, "matched", lambda query, found: (query, [*found, *matched]))
-    compared(monkeypatch, scores, {x: 100 * score for x, score in scores.items()})
-    monkeypatch.setattr(method, "search_poses", search_poses)
-    monkeypatch.setattr(method, "refine", lambda query, starts, beam: left.pop(0))
-    monkeypatch.setattr(method, "refine_full_resolution", lambda query, h, num_rounds: h)
-    monkeypatch.setattr(method, "refine_unoccluded", lambda query, h: (query, h))
-    monkeypatch.setattr(method, "settle", lambda query, h: Hypothesis(h.pose, h.score + 0.001))
-    monkeypatch.setattr(method, "evaluate", lambda query, panorama, found: found)
-    found = method.localize(None, rooms.scene(1)[1], settings, Workers(1), Stopwatch(), config)
-    return made, found
+LOOK = ("look_first", 0, "known", False)
+HALF = ("search_matches", 1, "known", False)
+ALL = ("search_matches", 2, "known", False)
+UPRIGHT = ("search_views", 2, "known", False)
+TILTED = ("search_views", 2, "unknown", False)
+BRIEFLY = ("search_views", 2, "unknown", True)
 
 
 @pytest.mark.parametrize(
-    ("matched", "searches", "gravity", "num_made", "best"),
+    ("is_whole", "gravity", "parts", "expected"),
     [
-        ([at(1, 0.6)], [], "auto", 0, 1),
-        ([], [[at(1, 0.6)]], "auto", 1, 1),
-        ([at(1, 0.1)], [[at(2, 0.6)]], "auto", 1, 2),  # too few matches
-        ([at(1, 0.6), at(5, 0.4)], [[at(7, 0.1)], [at(7, 0.1)]], "auto", 2, 1),  # two that are alike
-        ([at(1, 0.1)], [[at(2, 0.11)], [at(3, 0.09)]], "auto", 2, 2),
-        ([], [[at(2, 0.1)]], "known", 1, 2),
-        ([at(1, 0.08)], [[at(2, 0.05)]], "unknown", 1, 1),
+        (True, "auto", {}, [LOOK, HALF, ALL, UPRIGHT, BRIEFLY]),
+        (True, "known", {}, [LOOK, HALF, ALL, UPRIGHT]),
+        (False, "auto", {}, [HALF, ALL, UPRIGHT, TILTED]),
+        (False, "unknown", {}, [HALF, ALL, TILTED]),
+        (True, "auto", {"uses_features": False}, [UPRIGHT, TILTED]),
+        (True, "auto", {"uses_search": False}, [HALF, ALL]),
     ],
 )
-def test_searches_are_made_where_matches_leave_doubt(monkeypatch, matched, searches, gravity, num_made, best):
-    made, found = _run(monkeypatch, matched, searches, gravity)
-    assert made == [way for way in ("known", "unknown") if gravity in ("auto", way)][:num_made]
-    assert found.best.pose.center_world[0] == best
-    assert found.best.score in {h.score + 0.001 for some in (matched, *searches) for h in some}  # settled
+def test_attempts_are_made_in_this_order(monkeypatch, is_whole, gravity, parts, expected):
+    monkeypatch.setattr(attempts, "is_whole", lambda query: is_whole)
+    settings = CoarseToFineSettings(gravity=gravity)
+    found = attempts.attempts_for(replace(QUERY, method=METHOD._replace(**parts), settings=settings))
+    assert [(attempt.run.__name__, *attempt[1:]) for attempt in found] == expected
 
 
-def test_matches_or_searches_can_be_taken_out(monkeypatch):
-    alone = METHOD._replace(uses_features=False)
-    made, found = _run(monkeypatch, [at(1, 0.6)], [[at(2, 0.1)], [at(2, 0.1)]], config=alone)
-    assert (made, places([found.best])) == (["known", "unknown"], [2])
-    made, found = _run(monkeypatch, [at(1, 0.1)], [], config=METHOD._replace(uses_search=False))
-    assert (made, places([found.best])) == ([], [1])
+@pytest.mark.parametrize(("sure", "num_made"), [(1, 1), (2, 2), (None, 3)])
+def test_attempts_are_made_until_one_is_sure(monkeypatch, sure, num_made):
+    """What is found adds up, and as many features are asked in the end as in the last attempt."""
 
+    def run(query, attempt, hypotheses, watch):
+        return [*hypotheses, at(query.num_halves, 0.5)], query.num_halves == sure
 
-@dataclass(frozen=True)
-class Asked:
-    """A query of which only the halves of its features count."""
-
-    num_halves: int = 2
-
-    @property
-    def matches(self):
-        return self.num_halves
+    made = [attempts.Attempt(run, k) for k in (1, 2, 0)]
+    monkeypatch.setattr(method, "attempts_for", lambda query: made)
+    monkeypatch.setattr(method, "refine_to_the_end", lambda query, found: found)
+    monkeypatch.setattr(method, "evaluate", lambda query, found: (query.num_halves, found))
+    how = CoarseToFineSettings(), Workers(1), Stopwatch()
+    num_halves, found = method.localize(rooms.scan_map(1), rooms.scene(1)[1], *how)
+    assert places(found) == [1, 2, 0][:num_made]
+    assert num_halves == places(found)[-1]
 
 
 @pytest.mark.parametrize(
-    ("num_matches", "is_sure", "halves"),
-    [(40, True, 1), (39, True, 2), (40, False, 2), (None, True, 2)],
+    ("num_halves", "num_matches", "is_sure", "kept"),
+    [
+        (1, 40, True, [9, 1]),
+        (1, 39, True, [9]),
+        (1, 40, False, [9]),
+        (1, None, True, [9]),
+        (2, 39, False, [9, 2]),
+        (2, 5, True, [9, 2]),
+    ],
 )
-def test_half_of_the_features_are_asked_where_these_leave_no_doubt(monkeypatch, num_matches, is_sure, halves):
+def test_half_of_the_features_count_where_these_leave_no_doubt(
+    monkeypatch, num_halves, num_matches, is_sure, kept
+):
     """As many matches as a clear whole view is worth, and no pose of the first look near it."""
-    looked, asked = at(9, 0.2), []
-
-    def poses(query):
-        asked.append(query.num_halves)
-        return [] if num_matches is None else [f"poses of {query.num_halves}"]
-
-    def sure(query, found):
-        assert found[0] is looked
-        return is_sure
-
-    monkeypatch.setattr(method, "matched_poses", poses)
-    monkeypatch.setattr(method, "count_matches", lambda matches, pose: num_matches)
-    monkeypatch.setattr(method, "is_sure", sure)
-    monkeypatch.setattr(method, "refine_matched", lambda query, poses: [at(query.num_halves, 0.5)])
-    query, found = method.matched(Asked(), [looked])
-    assert query == Asked(halves)
-    assert places(found) == [9, halves]
-    assert asked == [1, 2][:halves]
+    looked = at(9, 0.2)
+    monkeypatch.setattr(attempts, "matched_poses", lambda query: [] if num_matches is None else ["pose"])
+    monkeypatch.setattr(attempts, "count_matches", lambda matches, pose: num_matches)
+    monkeypatch.setattr(attempts, "is_sure", lambda query, found: found[0] is looked and is_sure)
+    monkeypatch.setattr(attempts, "refine_matches", lambda query, poses: [at(query.num_halves, 0.5)])
+    attempt = attempts.Attempt(attempts.search_matches, num_halves)
+    query = replace(QUERY, num_halves=num_halves)
+    found, is_enough = attempts.search_matches(query, attempt, [looked], Stopwatch())
+    assert places(found) == kept
+    assert is_enough == (is_sure and len(kept) == 2)

@@ -14,7 +14,8 @@ from piccolo.jobs.threads import Workers
 from piccolo.local_features.feature_map import make_feature_map
 from piccolo.local_features.hypotheses import count_matches, exact_pose, poses_of, rough_poses
 from piccolo.local_features.matching import Matches
-from piccolo.localization.localize import localize, matched_poses
+from piccolo.localization.attempts import matched_poses
+from piccolo.localization.localize import localize
 from piccolo.localization.prior import contradictions
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
@@ -99,7 +100,7 @@ def test_a_pose_off_the_known_vertical_is_none():
 )
 def test_a_photo_is_found_in_its_room_with_the_same_bits_for_any_threads(variant, is_known):
     query = _query(1, variant)
-    level = query.R_cam_from_level if is_known else None
+    level = query.photo.R_cam_from_level if is_known else None
     found = poses_of(query.matches, level, 6, Workers(2))
     distance, angle_deg = rooms.errors(found[0].pose, _true_pose(1, variant))
     assert distance < 0.05

@@ -186,7 +186,6 @@ def test_matches_of_halves_are_those_of_the_whole_numbered_on():
     assert half.matches.query.tolist() == halves[0].matches.query.tolist()
     none = dataclasses.replace(query, num_halves=0)
     assert len(none.matches.query) == len(none.keypoints.rays) == 0
-    assert (query.by_features, none.by_features) == (True, False)
 
 
 def test_matches_come_in_the_photos_order_the_distinct_ones_weigh_most(matches):

@@ -33,16 +33,16 @@ def found():
 
 def _points(prepared, pose):
     """The points at a pose with channels in levels."""
-    points = covariance.points_at(prepared, pose).around(pose.center_world)
+    points = prepared.points_at(pose).around(pose.center_world)
     return points._replace(channels=covariance.as_levels(points.channels))
 
 
 def test_gradients_of_blocks_add_up(found, monkeypatch):
     prepared, pose, _ = found
     points = _points(prepared, pose)
-    total, _ = covariance.equations_at(prepared.images.full, points, pose)
+    total = covariance.gradient_at(prepared.photo.images.full(), points, pose)
     monkeypatch.setattr(covariance, "MOST_SHARE", 1e9)  # so that no block's share counts
-    parts = 1e9 * covariance.block_gradients(prepared.images.full, points, pose)
+    parts = 1e9 * covariance.block_gradients(prepared.photo.images.full(), points, pose)
     assert len(parts) > 100
     tolerance = 1e-3 * np.abs(parts).sum(axis=0).max()
     np.testing.assert_allclose(parts.sum(axis=0), total, rtol=1e-3, atol=tolerance)
@@ -66,11 +66,11 @@ def test_gradients_as_left_out_are_those_at_the_pose_without_the_block():
 def test_hessian_predicts_the_gradient_a_step_away(found):
     prepared, pose, _ = found
     points = _points(prepared, pose)
-    hessian = covariance.hessian_at(prepared.images.full, points, pose, covariance.STEPS[0])
+    hessian = covariance.hessian_at(prepared.photo.images.full(), points, pose, covariance.STEPS[0])
     for delta in ([0.001, 0, 0, 0, 0.003, 0], [0, -0.0015, 0.001, 0.003, 0, -0.004]):
         moved = step(pose, np.array(delta))
-        before, _ = covariance.equations_at(prepared.images.full, points, pose)
-        after, _ = covariance.equations_at(prepared.images.full, points, moved)
+        before = covariance.gradient_at(prepared.photo.images.full(), points, pose)
+        after = covariance.gradient_at(prepared.photo.images.full(), points, moved)
         expected = hessian @ delta
         assert np.linalg.norm(after - before - expected) < 0.5 * np.linalg.norm(expected)
 
@@ -116,18 +116,13 @@ def test_deviations_are_of_the_size_of_the_errors():
     assert 2.5 < np.median(squares) < 10.5  # deviations right to a factor of 1.4
 
 
-def test_no_covariance_where_the_points_fix_no_pose(found, monkeypatch):
-    monkeypatch.setattr(covariance, "covariance_at", lambda *_: None)
-    assert covariance.estimate_covariance(found[0], found[1]) is None
-
-
 @pytest.mark.parametrize("num_rough", [1, 2, 3])
 def test_where_the_finest_images_have_no_minimum_the_next_one_tells(found, monkeypatch, num_rough):
     prepared, pose, _ = found
-    images, asked = prepared.images, []
+    images, asked = [image() for image in prepared.photo.images], []
     ways = list(
         zip(
-            (images.full, images.fine, images.middle),
+            images[:3],
             (*covariance.STEPS, covariance.ROUGH_STEPS),
             strict=True,
         )
@@ -166,7 +161,7 @@ def test_truth_is_among_the_poses_of_a_place_that_repeats(kind):
 def test_a_point_at_a_pole_of_the_photo_tells_nothing(found, monkeypatch):
     """Its pixels are so narrow that it would outweigh all others."""
     prepared, pose, result = found
-    taken = covariance.points_at(prepared, pose).around(pose.center_world)
+    taken = prepared.points_at(pose).around(pose.center_world)
     down = -pose.R_cam_from_world[2] + 0.002 * pose.R_cam_from_world[0]
     away = -pose.R_cam_from_world[2] + 0.1 * pose.R_cam_from_world[0]
     wrong = np.array([2.0, -2.0, 2.0], np.float32)
@@ -178,6 +173,6 @@ def test_a_point_at_a_pole_of_the_photo_tells_nothing(found, monkeypatch):
 
     kept = [len(covariance.without_poles(with_one_at(d), pose).weights) for d in (down, away)]
     assert kept[1] == kept[0] + 1
-    monkeypatch.setattr(covariance, "points_at", lambda query, pose: with_one_at(down))
+    monkeypatch.setattr(type(prepared), "points_at", lambda query, pose: with_one_at(down))
     told = covariance.estimate_covariance(prepared, pose).matrix
     np.testing.assert_allclose(told, result.covariance.matrix, rtol=0.02)

@@ -5,10 +5,11 @@ import pytest
 from golden_poses import check_golden_poses
 from rooms import as_panorama, errors, query, room
 
+from piccolo.confidence.score import Evidence
 from piccolo.errors import InputError
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
-from piccolo.paper.localize import localize, prepare
+from piccolo.paper.localize import localize, paper_confidence, prepare
 from piccolo.paper.settings import PaperSettings
 
 QUICK = dataclasses.replace(PaperSettings(), num_translations=30, max_points=30_000, num_iterations=60)
@@ -94,3 +95,11 @@ def test_settings_that_mean_nothing_are_refused(change, message):
 def test_rotations_default_to_the_papers():
     assert PaperSettings().effective_num_rotations == 8
     assert PaperSettings(gravity="unknown").to_json()["num_rotations"] == 32
+
+
+def test_the_preset_paper_goes_by_margin_and_agreement():
+    """From the weights as they were fitted, by a pocket calculator."""
+    evidence = Evidence(0.15, 0.15, 0.4, 0.85, 0.93)
+    assert paper_confidence(evidence) == pytest.approx(0.1759, abs=0.001)
+    clearer = Evidence(0.15, 0.25, 0.5, 0.85, 0.93)
+    assert paper_confidence(clearer) > paper_confidence(evidence)

@@ -1,7 +1,5 @@
 """Views from a grid of places: what a pose that hardly moves need not draw again."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import rooms
@@ -9,11 +7,8 @@ import rooms
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.geometry.sphere import make_grid
 from piccolo.jobs.threads import Workers
-from piccolo.localization.config import METHOD
-from piccolo.localization.evaluation import COARSE_VOXEL_PER_RANGE, VOXEL_PER_RANGE, surroundings_of
-from piccolo.localization.query import prepare_query
-from piccolo.localization.refinement import points_at, view_at
-from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.localization.query import COARSE_VOXEL_PER_RANGE, VOXEL_PER_RANGE, prepare_query
+from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.views import recent_views
 from piccolo.views.points_around import visible_points
 
@@ -66,10 +61,10 @@ def test_views_and_points_count_from_their_place():
     place = recent_views.place_of(pose)
     expected = rooms.view(query.scan_map.octree, place, FINE, ALL)
     points = visible_points(query.scan_map.octree, place, FULL, ALL, 30_000)
-    for found, wanted in ((view_at(query, pose, FINE), expected), (points_at(query, pose), points)):
+    for found, wanted in ((query.view_at(pose, FINE), expected), (query.points_at(pose), points)):
         for values, others in zip(found, wanted, strict=True):
             np.testing.assert_array_equal(values, others)
-    assert points_at(query, pose) is points_at(query, _pose(0.3135, 0.1875, 0.302))
+    assert query.points_at(pose) is query.points_at(_pose(0.3135, 0.1875, 0.302))
     moved = expected.around(pose.center_world)
     at, there = (cells.center_map[:, None] + cells.offsets for cells in (expected, moved))
     np.testing.assert_allclose(at, there, atol=1e-6)
@@ -79,27 +74,9 @@ def test_views_and_points_count_from_their_place():
 @pytest.mark.parametrize("shift", [0.0, 0.008])
 def test_points_depend_on_what_the_photo_shows(shift):
     query, pose = _query(), _pose(0.3 + shift, 0.2, 0.3)
-    height, width = query.panorama.is_valid.shape
+    height, width = query.photo.panorama.is_valid.shape
     half = query.without(np.arange(width)[None] < np.full((height, 1), width // 2))
-    assert half.views is query.views
-    assert 0.3 < len(points_at(half, pose).weights) / len(points_at(query, pose).weights) <= 1.01
-    azimuth = np.arctan2(*(pose.R_cam_from_world @ points_at(half, pose).offsets)[1::-1])
+    assert half.cache.views is query.cache.views
+    assert 0.3 < len(half.points_at(pose).weights) / len(query.points_at(pose).weights) <= 1.01
+    azimuth = np.arctan2(*(pose.R_cam_from_world @ half.points_at(pose).offsets)[1::-1])
     assert (azimuth < 0.1).mean() > 0.98
-
-
-def test_what_is_around_a_place_is_made_once(monkeypatch):
-    query, made = _query(), []
-    original = recent_views.points_around
-
-    def points_around(octree, center, voxel_per_range):
-        made.append((tuple(center), voxel_per_range))
-        return original(octree, center, voxel_per_range)
-
-    monkeypatch.setattr(recent_views, "points_around", points_around)
-    views, pose = recent_views.recent_views(query.scan_map.octree), _pose(0.296, 0.2, 0.3)
-    query = dataclasses.replace(query, views=views)
-    for at in (pose, _pose(0.304, 0.197, 0.304), _pose(0.4, 0.2, 0.3), pose):
-        fine, coarse = (points() for points in surroundings_of(query, at))
-        assert len(fine.x) > len(coarse.x) > 0
-    places = [recent_views.place_of(at) for at in (pose, _pose(0.4, 0.2, 0.3), pose)]
-    assert made == [(place, scale) for place in places for scale in SCALES]  # the last place's alone are kept

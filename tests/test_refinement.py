@@ -1,4 +1,4 @@
-"""Decisions of the default method, each in a made-up case where one rule changes the outcome."""
+"""Descents on the views of a room, and decisions of the refinement, each in a made-up case."""
 
 import functools
 from dataclasses import replace
@@ -7,32 +7,40 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rooms
+from made_up import QUERY, VIEWS, at, place
 
 from piccolo.confidence.alternatives import Hypothesis
-from piccolo.geometry.pose import Pose, step, yaw_rotation
+from piccolo.geometry.pose import Pose, step
 from piccolo.geometry.sphere import make_grid
+from piccolo.jobs.once import Once
 from piccolo.jobs.threads import Workers
-from piccolo.localization import refinement
-from piccolo.localization.config import METHOD, Beam
-from piccolo.localization.query import prepare_query
-from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.localization.starts import Starts, best_and_alternatives, narrow
+from piccolo.localization import last_descent, refinement
+from piccolo.localization import query as query_module
+from piccolo.localization.query import Cache, Images, prepare_query
+from piccolo.localization.refinement import Fit, best_and_alternatives, narrow
+from piccolo.localization.search import Starts
+from piccolo.localization.settings import METHOD, Beam, CoarseToFineSettings
 from piccolo.views.recent_views import RecentViews
+from piccolo.views.view import Cells
 
-QUERY = SimpleNamespace(workers=Workers(1), method=METHOD, scan_map=None)
+FINE_BLOCKS = METHOD.fine_view.arrays.blocks
+ALL = np.ones(len(FINE_BLOCKS), bool)
 
 
-def _at(x, score, yaw_deg=0.0):
-    return Hypothesis(Pose(yaw_rotation(np.radians(yaw_deg)), np.array([x, 0.0, 0.0])), score)
+def _fit(x, score, yaw_deg=0.0):
+    return Fit(at(x, score, yaw_deg).pose, score)
+
+
+def _asked():
+    """A query whose images are their names, of a photo that shows all cells."""
+    images = Images(*(Once(lambda name=name: name) for name in Images._fields))
+    photo = SimpleNamespace(images=images, shown_cells=lambda *_: np.ones(3))
+    return replace(QUERY, photo=photo, cache=Cache(VIEWS))
 
 
 @functools.lru_cache
 def _query(seed):
     return prepare_query(rooms.scene(seed)[1], rooms.scan_map(seed), CoarseToFineSettings(), Workers(2))
-
-
-def _places(hypotheses):
-    return [round(float(h.pose.center_world[0]), 6) for h in hypotheses]
 
 
 # What is compared
@@ -48,7 +56,7 @@ def _places(hypotheses):
     ],
 )
 def test_faint_poses_are_compared_only_where_the_best_is_not_plain(scores, kept):
-    found = refinement.plain([_at(k, score) for k, score in enumerate(scores)])
+    found = refinement.plain([_fit(k, score) for k, score in enumerate(scores)])
     assert sorted((h.score for h in found), reverse=True) == kept
 
 
@@ -66,17 +74,16 @@ def test_a_quarter_of_the_beam_is_for_the_best_that_lie_far_apart():
     assert best_and_alternatives(rotations, centers, 8, 0.3).tolist() == [0, 2, 3, 4, 6, 8, 9, 10]
 
 
-def test_narrow_ranks_hypotheses_first(monkeypatch):
-    close = [_at(0.0, 0.5), _at(0.05, 0.9), _at(3.0, 0.1), _at(5.0, 0.7)]
-    assert _places(narrow(close, 4)) == [0.05, 5.0, 3.0]
-    assert _places(narrow(close, 1)) == [0.05]
-    turned = [_at(0.0, 0.9), _at(0.09, 0.8), _at(0.11, 0.7), _at(0.0, 0.6, 4.9), _at(0.0, 0.5, 5.1)]
-    assert [h.score for h in narrow(turned, 8)] == [0.9, 0.7, 0.5]
+def test_narrow_ranks_poses_first(monkeypatch):
+    close = [_fit(0.0, 0.5), _fit(0.05, 0.9), _fit(3.0, 0.1), _fit(5.0, 0.7)]
+    assert [place(pose) for pose in narrow(close, 4)] == [0.05, 5.0, 3.0]
+    assert [place(pose) for pose in narrow(close, 1)] == [0.05]
+    turned = [_fit(0.0, 0.9), _fit(0.09, 0.8), _fit(0.11, 0.7), _fit(0.0, 0.6, 4.9), _fit(0.0, 0.5, 5.1)]
+    assert narrow(turned, 8) == [turned[k].pose for k in (0, 2, 4)]
     R, centers = np.repeat(np.eye(3)[None], 3, axis=0), np.outer([0.0, 0.14, 0.16], [1.0, 0, 0])
-    starts = Starts(R, centers, np.arange(3), np.array([0.3, 0.2, 0.1]))
-    monkeypatch.setattr(refinement, "descend_all", lambda scan_map, image, starts, *_: starts)
-    query = SimpleNamespace(**vars(QUERY), images=SimpleNamespace(search=None))
-    assert refinement.descend_prepared(query, starts, 5, 8).candidate.tolist() == [0, 2]
+    starts = Starts(R, centers, np.arange(3))
+    monkeypatch.setattr(refinement, "descend_all", lambda scan_map, image, starts, *_: (starts, None))
+    assert refinement.descend_prepared(_asked(), starts, 5, 8).candidate.tolist() == [0, 2]
 
 
 def test_halving_keeps_as_many_as_the_beam_says(monkeypatch):
@@ -84,59 +91,34 @@ def test_halving_keeps_as_many_as_the_beam_says(monkeypatch):
 
     def descend_prepared(query, starts, num_iterations, count):
         calls.append((num_iterations, count))
-        return starts.take(np.arange(min(count, len(starts.score))))
+        return starts.take(np.arange(min(count, len(starts.candidate))))
 
-    def gaining(name, gain):
-        def function(query, h):
+    def scoring(name, score):
+        def function(query, pose):
             calls.append(name)
-            return Hypothesis(h.pose, h.score + gain)
+            return Fit(pose, score - 0.01 * place(pose))
 
         return function
 
+    def perturb(query, fit):
+        calls.append("perturb")
+        return Fit(fit.pose, fit.score + 0.5)
+
     monkeypatch.setattr(refinement, "descend_prepared", descend_prepared)
-    for name, gain in (("descend_middle", 0.1), ("perturb_middle", 0.1), ("descend_fine", 0.1)):
-        monkeypatch.setattr(refinement, name, gaining(name, gain))
-    monkeypatch.setattr(refinement, "refine_by_perturbation", gaining("perturb", 0.5))
-    monkeypatch.setattr(refinement, "compared", gaining("compared", 1.0))
+    for name, score in (("descend_middle", 0.6), ("perturb_middle", 0.7), ("descend_fine", 0.8)):
+        monkeypatch.setattr(refinement, name, scoring(name, score))
+    monkeypatch.setattr(refinement, "refine_by_perturbation", perturb)
+    monkeypatch.setattr(refinement, "score_pose", scoring("score_pose", 0.9))
     centers = np.outer(np.arange(40.0), [1.0, 0, 0])
-    R, index = np.repeat(np.eye(3)[None], 40, axis=0), np.arange(40)
-    starts = Starts(R, centers, index, 0.5 - 0.01 * index)
+    starts = Starts(np.repeat(np.eye(3)[None], 40, axis=0), centers, np.arange(40))
     found = refinement.refine(QUERY, starts, Beam(30, 20, 5, 2))
     assert calls[:2] == [(5, 30), (12, 20)]
-    stages = ("descend_middle", "perturb_middle", "descend_fine", "perturb", "compared")
+    stages = ("descend_middle", "perturb_middle", "descend_fine", "perturb", "score_pose")
     assert [calls.count(name) for name in stages] == [20, 5, 5, 2, 12]
-    assert _places(found) == [*range(12)]  # each answer once, the last from middle cells
-    assert [found[k].score for k in (0, 2, 5)] == pytest.approx([2.3, 1.78, 1.55])
+    assert [place(h.pose) for h in found] == [*range(12)]  # each answer once, the last from middle cells
 
 
 # Perturbations and the last millimetres
-
-
-def test_each_stage_has_its_view_its_image_and_its_limits(monkeypatch):
-    asked = []
-    monkeypatch.setattr(refinement, "normalized_view", lambda sums, center, view, shown: view)
-    monkeypatch.setattr(refinement, "descend", lambda *arguments: asked.append(arguments) or arguments[2])
-    monkeypatch.setattr(refinement, "score_on", lambda cells, blocks, image, pose: len(blocks))
-    monkeypatch.setattr(refinement, "refine_unoccluded", lambda query, h: (query, h))
-    monkeypatch.setattr(refinement, "without_occluders", lambda query, pose: query)
-    monkeypatch.setattr(refinement, "compared", lambda query, h: h)
-    images = SimpleNamespace(full="full", fine="fine", middle="middle")
-    views = RecentViews(lambda *_: None, lambda place, view, shown, count: (view, count), lambda *_: None)
-    query = SimpleNamespace(**vars(QUERY), images=images, shown_cells=lambda *_: np.ones(3), views=views)
-    h, full = _at(1.0, 0.2), (METHOD.full_view, 30_000)
-    for at, view in (
-        (refinement.descend_middle, METHOD.middle_view),
-        (refinement.descend_fine, METHOD.fine_view),
-    ):
-        assert at(query, h).score == len(view.arrays.blocks)
-    refinement.refine_full_resolution(query, h, 1)
-    refinement.settle(query, h)
-    assert [(cells, image, *limits) for cells, image, _, limits in asked] == [
-        (METHOD.middle_view, "middle", 1.2, 12, 1e-3),
-        (METHOD.fine_view, "fine", 1.0, 12, 1e-4),
-        (full, "full", 0.7, 10, 1e-4),
-        (full, "full", 0.7, 30, 1e-7),
-    ]
 
 
 @pytest.mark.parametrize(
@@ -149,23 +131,22 @@ def test_poses_are_perturbed_for_as_long_as_that_helps(monkeypatch, gains, round
     def around(cells, blocks, images, pose, size, workers):
         sizes.append(size)
         assert images == ("middle", "fine")
-        return Hypothesis(pose, score[0])
+        return Fit(pose, score[0])
 
-    def fine(query, h):
+    def fine(query, pose):
         score[0] += left.pop(0)
-        return Hypothesis(h.pose, score[0])
+        return Fit(pose, score[0])
 
     score = [0.5]
-    monkeypatch.setattr(refinement, "view_at", lambda *_: None)
-    monkeypatch.setattr(refinement, "score_on", lambda *_: 0.5)  # whatever another way of scoring said
+    monkeypatch.setattr(query_module, "normalized_view", lambda *_: None)
+    monkeypatch.setattr(refinement, "fit_on", lambda *_: _fit(0.0, 0.5))  # whatever another view said
     monkeypatch.setattr(refinement, "descend_around", around)
     monkeypatch.setattr(refinement, "descend_fine", fine)
-    images = SimpleNamespace(middle="middle", fine="fine")
-    query = SimpleNamespace(**vars(QUERY), images=images, shown_cells=lambda *_: None, ends=set())
-    found = refinement.refine_by_perturbation(query, _at(0.0, 0.9))
+    query = _asked()
+    found = refinement.refine_by_perturbation(query, _fit(0.0, 0.9))
     assert found.score == pytest.approx(expected)
     assert sizes == [0.4] * rounds
-    again = Hypothesis(found.pose, 0.3)
+    again = Fit(found.pose, 0.3)
     assert refinement.refine_by_perturbation(query, again) is again
     assert sizes == [0.4] * rounds
 
@@ -173,24 +154,24 @@ def test_poses_are_perturbed_for_as_long_as_that_helps(monkeypatch, gains, round
 @pytest.mark.parametrize(("after", "is_taken"), [(0.60, True), (0.495, True), (0.485, False), (0.1, False)])
 def test_full_resolution_is_taken_back_where_the_score_falls(monkeypatch, after, is_taken):
     """By six parts in a hundred at most may it fall, in exchange for millimetres."""
-    moved, start = _at(0.04, 0.0).pose, _at(0.0, 0.52)
-    query = SimpleNamespace(**vars(QUERY), images=SimpleNamespace(full="full"))
+    moved, start = at(0.04, after), at(0.0, 0.52)
     asked, descents = [], []
-    monkeypatch.setattr(refinement, "refine_unoccluded", lambda query, h: (query, h))
-    monkeypatch.setattr(refinement, "without_occluders", lambda query, pose: query)
-    monkeypatch.setattr(refinement, "compared", lambda query, h: Hypothesis(h.pose, after))
-    monkeypatch.setattr(refinement, "points_at", lambda query, pose: asked.append(pose.center_world[0]))
-    monkeypatch.setattr(refinement, "descend", lambda *arguments: descents.append(arguments[-1]) or moved)
-    expected = Hypothesis(moved, after) if is_taken else start
-    assert refinement.refine_full_resolution(query, start, 2) == expected
-    assert asked == [0.0, 0.04]  # the points are taken anew from where the pose is
-    assert refinement.settle(query, start) == expected
+    monkeypatch.setattr(last_descent, "refine_unoccluded", lambda query, pose: (query, start))
+    monkeypatch.setattr(last_descent, "without_occluders", lambda query, pose: query)
+    monkeypatch.setattr(last_descent, "score_pose", lambda query, pose: Hypothesis(pose, after))
+    monkeypatch.setattr(type(QUERY), "points_at", lambda query, pose: asked.append(place(pose)))
+    monkeypatch.setattr(last_descent, "descend", lambda *how: descents.append(how[-1]) or moved.pose)
+    expected = moved if is_taken else start
+    query = _asked()
+    assert last_descent.refine_full_resolution(query, start.pose) == expected
+    assert asked == [0.0, 0.04]  # the points are taken again from where the pose is
+    assert last_descent.settle(query, start) == expected
     assert len(asked) == len(descents) == 4  # the second round of settling moves nothing
-    monkeypatch.setattr(refinement, "descend", lambda *arguments: _at(len(asked), 0.0).pose)
-    refinement.settle(query, start)
+    monkeypatch.setattr(last_descent, "descend", lambda *_: at(len(asked), 0.0).pose)
+    last_descent.settle(query, start)
     assert len(asked) == 10  # six rounds at most
-    monkeypatch.setattr(refinement, "descend", lambda *arguments: _at(0.019, 0.0).pose)
-    refinement.refine_full_resolution(query, start, 2)
+    monkeypatch.setattr(last_descent, "descend", lambda *_: at(0.019, 0.0).pose)
+    last_descent.refine_full_resolution(query, start.pose)
     assert len(asked) == 11  # so near by it sees the same points
 
 
@@ -207,47 +188,49 @@ def test_full_resolution_is_taken_back_where_the_score_falls(monkeypatch, after,
 def test_occluders_are_masked_twice_at_most_and_while_that_helps(monkeypatch, hidden, gains, expected):
     """What is hidden at each look, what is gained; the score, what is hidden at last, the looks."""
     score, looks, left = [0.5], [], list(hidden)
-    query = SimpleNamespace(**vars(QUERY), hidden=None)
+    query = replace(QUERY, photo=None)
 
     def without_occluders(asked, pose):
         assert asked is query  # always of the whole photo
         looks.append(left.pop(0))
-        return query if looks[-1] is None else SimpleNamespace(**{**vars(QUERY), "hidden": looks[-1]})
+        return query if looks[-1] is None else replace(query, photo=looks[-1])
 
-    def perturbed(shown, h):
-        assert shown.hidden == looks[-1]
-        score[0] = max(score[0], h.score) + gains[len(looks) - 1]
-        return h
+    def perturbed(shown, fit):
+        assert shown.photo == looks[-1]
+        score[0] = max(score[0], h[0].score) + gains[len(looks) - 1]
+        return fit
 
-    def compared(asked, h):
+    def score_pose(asked, pose):
         assert asked is query
-        return Hypothesis(h.pose, score[0])
+        h[0] = Hypothesis(pose, score[0])
+        return h[0]
 
-    monkeypatch.setattr(refinement, "without_occluders", without_occluders)
-    monkeypatch.setattr(refinement, "refine_by_perturbation", perturbed)
-    monkeypatch.setattr(refinement, "compared", compared)
-    monkeypatch.setattr(refinement, "perturb_middle", lambda shown, h: h)
-    monkeypatch.setattr(refinement, "descend_fine", lambda shown, h: h)
-    shown, h = refinement.refine_unoccluded(query, _at(0.0, 0.0))
-    assert (pytest.approx(h.score), shown.hidden, len(looks)) == expected
+    h = [None]
+    monkeypatch.setattr(last_descent, "without_occluders", without_occluders)
+    monkeypatch.setattr(last_descent, "refine_by_perturbation", perturbed)
+    monkeypatch.setattr(last_descent, "score_pose", score_pose)
+    for name in ("perturb_middle", "descend_fine"):
+        monkeypatch.setattr(last_descent, name, lambda shown, pose: Fit(pose, 0.0))
+    shown, found = last_descent.refine_unoccluded(query, at(0.0, 0.0).pose)
+    assert (pytest.approx(found.score), shown.photo, len(looks)) == expected
 
 
 def test_cells_and_points_are_those_that_the_photo_shows(monkeypatch):
     """Cells around the camera that point where the photo has a picture; all, for a photo of a sphere."""
-    whole, pose = _query(1), _at(0.0, 0.0, 70.0).pose
+    whole, pose = _query(1), at(0.0, 0.0, 70.0).pose
     is_hidden = ~(np.abs(np.arange(16) - 4) < 2) & np.ones((8, 1), bool)  # but a fifth, around the left
     narrow = whole.without(is_hidden)
     grid = make_grid(METHOD.full_view.num_rings)
     azimuth = np.degrees(np.arctan2(*(grid.directions @ pose.R_cam_from_world.T).T[1::-1]))
-    shown = narrow.shown_cells(METHOD.full_view.num_rings, pose)
-    assert whole.shown_cells(METHOD.full_view.num_rings, pose).all()
+    shown = narrow.photo.shown_cells(METHOD.full_view.num_rings, pose)
+    assert whole.photo.shown_cells(METHOD.full_view.num_rings, pose).all()
     is_inside = np.abs((azimuth - 78.75 + 180) % 360 - 180) < 33.75
     assert (shown == is_inside).mean() > 0.98
-    monkeypatch.setattr(refinement, "normalized_view", lambda sums, center, config, shown: shown)
+    monkeypatch.setattr(query_module, "normalized_view", lambda sums, center, config, shown: shown)
     views = RecentViews(lambda *_: None, lambda place, config, shown, count: (shown, count), lambda *_: None)
-    asked = replace(narrow, views=views)
-    assert (refinement.view_at(asked, pose, METHOD.full_view) == shown).all()
-    assert refinement.points_at(asked, pose) == (shown.tobytes(), 30_000)
+    asked = replace(narrow, cache=Cache(views))
+    assert (asked.view_at(pose, METHOD.full_view) == shown).all()
+    assert asked.points_at(pose) == (shown.tobytes(), 30_000)
 
 
 @pytest.mark.parametrize(("seed", "most"), [(1, 5e-5), (3, 5e-4), (4, 5e-5)])
@@ -255,12 +238,76 @@ def test_the_end_hardly_depends_on_where_the_descent_begins(seed, most):
     """Starts 5 mm apart end within 0.05 mm where the loss has one minimum; in noise it has several."""
     query, true_pose = _query(seed), rooms.scene(seed)[2]
     ends = [
-        refinement.settle(query, Hypothesis(step(true_pose, np.array([0, 0, 0, *d])), 0.0)).pose
+        last_descent.settle(query, Hypothesis(step(true_pose, np.array([0, 0, 0, *d])), 0.0)).pose
         for d in ([0.002, 0.001, 0.0], [-0.002, -0.001, 0.002])
     ]
     distance, angle_deg = rooms.errors(*ends)
     assert distance < most
     assert angle_deg < 0.03
-    again = refinement.settle(query, Hypothesis(ends[0], 0.0)).pose
+    again = last_descent.settle(query, Hypothesis(ends[0], 0.0)).pose
     assert rooms.errors(again, ends[0])[0] < 2e-5
     assert rooms.errors(ends[0], true_pose)[0] < 0.01
+
+
+# Descents on cells
+
+
+@functools.lru_cache
+def _fine():
+    """Fine cells about the true camera of a room, and its true pose."""
+    true_pose = rooms.scene(1)[2]
+    return rooms.view(rooms.scan_map(1).octree, true_pose.center_world, METHOD.fine_view, ALL), true_pose
+
+
+def test_channels_in_levels_and_perturbations_to_the_corners_of_a_cube():
+    np.testing.assert_allclose(refinement.as_levels(np.array([-2, 0, 2], np.float32)), [0, 127.5, 255])
+    steps = refinement.perturbations(0.5)
+    assert steps.shape == (9, 6)
+    assert (steps[0] == 0).all()
+    np.testing.assert_allclose(np.degrees(np.linalg.norm(steps[1:, :3], axis=1)), 4.0)
+    np.testing.assert_allclose(np.linalg.norm(steps[1:, 3:], axis=1), 0.125)
+    assert len(np.unique(np.sign(steps[1:, 3:]), axis=0)) == 8
+    assert (np.sign(steps[1:, 3:]) == np.sign(steps[1:, 2::-1])).all()
+
+
+def test_descent_finds_the_true_pose_again():
+    (cells, true_pose), image = _fine(), _query(1).photo.images.fine()
+    off = step(true_pose, np.array([0.03, -0.02, 0.04, 0.06, -0.05, 0.04]))
+    pose = refinement.descend(cells, image, off, (1.0, 30, 1e-5))
+    assert rooms.errors(pose, true_pose)[0] < 0.01
+    before, after = (refinement.fit_on(cells, FINE_BLOCKS, image, p).score for p in (off, pose))
+    assert after > max(0.6, before)
+    assert rooms.errors(refinement.descend(cells, image, off, (1.0, 1, 1e-5)), true_pose)[0] > 0.01
+
+
+def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off():
+    (_, true_pose), images = _fine(), _query(1).photo.images
+    off = step(true_pose, refinement.perturbations(1.0)[1])
+    assert rooms.errors(off, true_pose)[0] > 0.2
+    cells = rooms.view(rooms.scan_map(1).octree, off.center_world, METHOD.fine_view, ALL)
+    problem = cells, FINE_BLOCKS, (images.search(), images.middle()), off, 1.0
+    found, by_two = (refinement.descend_around(*problem, Workers(n)) for n in (1, 2))
+    assert (found.pose.key, found.score) == (by_two.pose.key, by_two.score)
+    assert rooms.errors(found.pose, true_pose)[0] < 0.06
+    expected = refinement.fit_on(cells, FINE_BLOCKS, images.middle(), found.pose)
+    np.testing.assert_allclose(found.score, expected.score, atol=1e-5)
+
+
+def test_starts_descend_on_their_candidates_views_as_one_does_alone():
+    scan_map, (_, true_pose), image = rooms.scan_map(1), _fine(), _query(1).photo.images.search()
+    distance = np.linalg.norm(scan_map.centers - true_pose.center_world, axis=1)
+    k, far = int(np.argmin(distance)), int(np.argmax(distance))
+    candidate, R = np.array([k, far, k]), true_pose.R_cam_from_world
+    starts = Starts(np.stack([R] * 3), scan_map.centers[candidate], candidate)
+    ends, scores = refinement.descend_all(scan_map, image, starts, 12, Workers(2))
+    assert ends.candidate.tolist() == [k, k, far]  # the best first
+    assert scores[0] == scores[1] > max(0.4, scores[2])
+    (row,), views = scan_map.views.at(np.array([k]), Workers(1))
+    offsets = (views.offsets[row] * views.offset_unit[row]).astype(np.float32)
+    channels = views.features[row].astype(np.float32) / np.float32(63.75)
+    weights = (views.is_seen[row] * make_grid(24).solid_angle).astype(np.float32)
+    cells, center = Cells(offsets, channels, weights, scan_map.centers[k]), scan_map.centers[k]
+    alone = refinement.descend(cells, image, Pose(R, center), (1.2, 12, 2e-3))
+    np.testing.assert_allclose(ends.center_map[0], alone.center_world, atol=1e-4)
+    np.testing.assert_allclose(ends.R_cam_from_map[0], alone.R_cam_from_world, atol=1e-4)
+    assert rooms.errors(alone, true_pose)[0] < 0.1

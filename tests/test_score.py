@@ -6,7 +6,6 @@ from rooms import as_panorama
 from piccolo.confidence.score import Agreement, agreement_at
 from piccolo.geometry.pose import step
 from piccolo.panorama import Panorama
-from piccolo.panorama.local_normalization import normalize_locally
 
 
 @pytest.fixture(scope="module")
@@ -47,14 +46,6 @@ def test_mostly_masked_panorama_is_charged(scene):
     narrow = agreement_at(points, Panorama(panorama.rgb, is_valid), true_pose)
     assert narrow.seen_fraction < 0.15
     assert narrow.value < 0.25
-
-
-def test_normalisation_forgets_gain_and_offset_but_not_pattern():
-    rgb = np.random.default_rng(0).uniform(size=(48, 96, 3)).astype(np.float32)
-    everywhere = np.ones((48, 96), dtype=bool)
-    a, b = (normalize_locally(image, everywhere, 15.0) for image in (rgb, 3.0 * rgb + 5.0))
-    np.testing.assert_allclose(a, b, atol=0.1)
-    assert a.std() > 0.7
 
 
 def test_score_and_value_charge_a_view_of_which_little_is_seen():

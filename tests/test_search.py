@@ -11,11 +11,9 @@ from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
 from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
 from piccolo.jobs.threads import Workers
-from piccolo.localization import query as query_module
-from piccolo.localization import search, turned_panorama
-from piccolo.localization.config import METHOD
-from piccolo.localization.query import prepare_query, query_images
-from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.localization import search
+from piccolo.localization.query import images_of, prepare_query
+from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.panorama import Panorama
 from piccolo.panorama.gpano import GPano
 from piccolo.panorama.local_normalization import (
@@ -54,27 +52,10 @@ def test_what_is_masked_does_not_bleed():
     is_valid[200:] = False
     black, white = panorama.rgb.copy(), panorama.rgb.copy()
     black[200:], white[200:] = 0, 255
-    black_and_white = (query_images(Panorama(rgb, is_valid), METHOD.scales).search for rgb in (black, white))
+    black_and_white = (images_of(Panorama(rgb, is_valid), METHOD.scales).search() for rgb in (black, white))
     (a, valid), (b, _) = map(_levels, black_and_white)
     np.testing.assert_array_equal(a[valid], b[valid])
     assert valid.mean() == pytest.approx(200 / 256, abs=0.02)
-
-
-def test_images_are_made_when_asked_for_and_once(monkeypatch):
-    made = []
-
-    def normalize(panorama, *how):
-        made.append(panorama.rgb.shape[1])
-        return normalize_panorama(panorama, *how)
-
-    monkeypatch.setattr(query_module, "normalize_panorama", normalize)
-    images = query_images(rooms.scene(1)[1], METHOD.scales)
-    assert made == []
-    assert images.search is images.search
-    assert made == [128]
-    of_all = images.full, images.fine, images.middle, images.search
-    assert [image.width for image in of_all] == [1024, 256, 128, 128]
-    assert sorted(made) == [128, 128, 256, 1024]
 
 
 def test_samples_along_turned_directions_equal_their_twin():
@@ -93,10 +74,10 @@ def test_samples_along_turned_directions_equal_their_twin():
 
 def test_scores_equal_correlations_one_by_one():
     rng, scan_map = np.random.default_rng(0), rooms.scan_map(1)
-    samples, validity = turned_panorama.turn_panorama(_query().images.search, uniform_rotations(50))
+    samples, validity = search.turn_panorama(_query().photo.images.search(), uniform_rotations(50))
     validity[:, rng.random(validity.shape[1]) < 0.2] = 0
     samples *= validity[:, None]
-    panorama = turned_panorama.turned(samples, validity, AREA, 1)
+    panorama = search.turned(samples, validity, AREA, 1)
     candidate, rotation = rng.integers(0, len(scan_map.centers), 40), rng.integers(0, 50, 40)
     row, views = scan_map.views.at(candidate, Workers(2))
     pairs = np.empty(40, np.float32)
@@ -120,7 +101,7 @@ def test_wide_samples_are_averages_by_area():
     validity = (rng.random((600, len(AREA))) < 0.6).astype(np.float32)
     matrix = (np.eye(len(areas))[cells] * whole_areas(24)[:, None]).astype(np.float32)
     for num_threads in (1, 2):
-        wide, is_valid = turned_panorama.widened(samples, validity, Workers(num_threads))
+        wide, is_valid = search.widened(samples, validity, Workers(num_threads))
         np.testing.assert_array_equal(wide, np.rint(samples) @ matrix / areas)
         np.testing.assert_array_equal(is_valid, np.rint(validity @ matrix / areas))
 
@@ -129,7 +110,7 @@ def test_sums_of_a_search_are_exact():
     """No partial sum of what features and samples can be at most reaches 2^24, so no order changes a bit."""
     for area, most_seen in ((AREA, 1), (wider_cells(12)[1], 255)):
         one = np.ones((1, 3, len(area)), np.float32)
-        panorama = turned_panorama.turned(127.5 * one, one[:, 0], area, most_seen)
+        panorama = search.turned(127.5 * one, one[:, 0], area, most_seen)
         assert 127 * panorama.samples.sum(dtype=float) < 2**24
         assert most_seen * panorama.energy.sum(dtype=float) < 2**24
         assert 127 * panorama.samples.sum(dtype=float) > 2**22  # the room is used
@@ -140,10 +121,10 @@ def test_sums_of_a_search_are_exact():
     validity = (rng.random((20, len(AREA))) < 0.8).astype(np.float32)
     features = rng.choice(np.array([-127, 127, 126], np.int8), (50, 3, len(AREA)))
     seen = rng.integers(0, 2, (50, len(AREA)), dtype=np.uint8)
-    panorama = turned_panorama.turned(samples * validity[:, None], validity, AREA, 1)
+    panorama = search.turned(samples * validity[:, None], validity, AREA, 1)
     expected = search.masked_correlation(features.reshape(50, -1), seen, AREA, panorama, Workers(1))
     cells, views = rng.permutation(len(AREA)), rng.permutation(50)
-    shuffled = turned_panorama.TurnedPanorama(*(values[..., cells] for values in panorama))
+    shuffled = search.TurnedPanorama(*(values[..., cells] for values in panorama))
     features, seen = features[views][..., cells].reshape(50, -1), seen[views][:, cells]
     found = search.masked_correlation(features, seen, AREA[cells], shuffled, Workers(1))
     np.testing.assert_array_equal(found, expected[views])
@@ -154,7 +135,7 @@ def test_best_score_is_near_the_true_pose(gravity, most):
     """Among wide cells, and among the starts, which fine cells put in order."""
     true_pose, scan_map = rooms.scene(1)[2], rooms.scan_map(1)
     rotations = uniform_yaws(48) if gravity == "known" else uniform_rotations(2000)
-    samples, validity = turned_panorama.turn_panorama(_query().images.search, rotations)
+    samples, validity = search.turn_panorama(_query().photo.images.search(), rotations)
     sparse, rotation, values = search.best_poses_wide(scan_map, samples, validity, 200, Workers(2))
     assert (np.diff(values) <= 0).all()
     starts = search.search_poses(_query(), gravity)
@@ -170,7 +151,7 @@ def test_best_score_is_near_the_true_pose(gravity, most):
 
 def test_a_part_of_the_candidates_at_a_time_gives_the_same_poses(monkeypatch):
     scan_map, rotations = rooms.scan_map(1), uniform_rotations(200)
-    samples, validity = turned_panorama.turn_panorama(_query().images.search, rotations)
+    samples, validity = search.turn_panorama(_query().photo.images.search(), rotations)
     whole = search.best_poses_wide(scan_map, samples, validity, 500, Workers(1))
     monkeypatch.setattr(search, "BLOCK", 7)
     monkeypatch.setattr(search, "SCORES_AT_ONCE", 30 * len(rotations))
@@ -178,23 +159,6 @@ def test_a_part_of_the_candidates_at_a_time_gives_the_same_poses(monkeypatch):
     in_parts = search.best_poses_wide(scan_map, samples, validity, 500, Workers(2))
     for expected, found in zip(whole, in_parts, strict=True):
         np.testing.assert_array_equal(found, expected)
-
-
-def test_a_threads_block_is_as_large_as_it_is_asked_for(monkeypatch):
-    """It is kept, and the next search may need more views, or other cells."""
-    monkeypatch.setattr(search, "BLOCK", 7)
-    for num_views, num_cells in ((5, 40), (7, 40), (30, 40), (3, 11), (40, 60)):
-        block = search.thread_block(num_views, num_cells)
-        shapes = [each.shape for each in block]
-        views_by_cells = (num_views, num_cells)
-        assert shapes == [(num_views, 3 * num_cells), views_by_cells, views_by_cells, (num_views,)]
-
-
-def test_best_poses_are_the_largest_in_order():
-    scores = np.random.default_rng(1).normal(size=(400, 600)).astype(np.float32)
-    candidate, rotation, values = search.best_poses(scores, 100)
-    np.testing.assert_array_equal(values, np.sort(scores.ravel())[::-1][:100])
-    np.testing.assert_array_equal(scores[candidate, rotation], values)
 
 
 @pytest.mark.parametrize("least", [search.LOWEST, np.float32(0.5)])
@@ -207,12 +171,14 @@ def test_of_poses_that_fit_alike_the_first_are_taken(least):
     np.testing.assert_array_equal(rotation, [3, 7, *range(8)])
 
 
-@pytest.mark.parametrize(("rank", "count"), [(60, 60), (100, 100), (3000, 100), (0, 0)])
-def test_best_poses_have_more_than_the_least(rank, count):
-    """As many as there are, however many more have it than fit at first."""
+@pytest.mark.parametrize(("rank", "count"), [(60, 60), (100, 100), (3000, 100), (0, 0), (None, 100)])
+def test_best_poses_are_the_largest_that_have_more_than_the_least(rank, count):
+    """As many as there are, however many more have it than are sorted."""
     scores = np.random.default_rng(1).normal(size=(400, 600)).astype(np.float32)
     ranked = np.sort(scores.ravel())[::-1]
-    candidate, rotation, values = search.best_poses(scores, 100, ranked[rank])
+    candidate, rotation, values = search.best_poses(
+        scores, 100, search.LOWEST if rank is None else ranked[rank]
+    )
     np.testing.assert_array_equal(values, ranked[:count])
     np.testing.assert_array_equal(scores[candidate, rotation], values)
 
@@ -248,11 +214,10 @@ def test_number_of_starts(fewest, most, expected):
     for gravity in ("known", "unknown"):
         starts = search.search_poses(few, gravity)
         num_searched = len(query.scan_map.sparse)
-        assert len(starts.score) == (expected or num_searched // 2)
-        assert (np.diff(starts.score) <= 0).all()
+        assert len(starts.candidate) == (expected or num_searched // 2)
         np.testing.assert_array_equal(starts.center_map, query.scan_map.centers[starts.candidate])
-        pairs = list(itertools.combinations(starts.hypotheses(), 2))
-        apart = np.array([rooms.errors(a.pose, b.pose) for a, b in pairs])
+        pairs = itertools.combinations(starts.poses(), 2)
+        apart = np.array([rooms.errors(*pair) for pair in pairs])
         assert 0.5 <= apart[apart[:, 1] < 20.0, 0].min(initial=0.9) < 1.0
         if gravity == "known":  # turned by twelfths of a turn
             assert 20.0 <= apart[apart[:, 0] < 0.5, 1].min() < 40.0

@@ -1,49 +1,55 @@
 """Which pose is taken, each in a made-up case where one rule decides."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
 import pytest
-import rooms
-from made_up import QUERY, at, compared, places
+from made_up import at, compared, place, places
 
-from piccolo.confidence.alternatives import Hypothesis
 from piccolo.confidence.score import Agreement
-from piccolo.jobs.threads import Workers
-from piccolo.localization import evaluation, refinement, standings
-from piccolo.localization import localize as method
-from piccolo.localization.search_result import SearchResult
-from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.localization import evaluation, last_descent, refinement, selection
+from piccolo.localization.last_descent import refine_to_the_end
+from piccolo.localization.selection import Selection
 
 
 def test_of_poses_that_matches_gave_the_better_end_is_taken(monkeypatch):
     """As found, or after a descent on fine cells, whichever explains more."""
-    scores = {0.0: 0.3, 1.0: 0.5, 5.0: 0.6, 6.0: 0.2}
-    down = lambda query, h: at(h.pose.center_world[0] + 1.0, 0.9)  # noqa: E731
-    monkeypatch.setattr(refinement, "descend_fine", down)
-    monkeypatch.setattr(refinement, "perturb_middle", lambda query, h: at(-1.0, 0.9))
-    to_score = lambda query, h: Hypothesis(h.pose, scores[h.pose.center_world[0]])  # noqa: E731
-    monkeypatch.setattr(refinement, "compared", to_score)
-    found = refinement.refine_matched(QUERY, [at(0.0, 0).pose, at(5.0, 0).pose])
-    assert [(h.pose.center_world[0], h.score) for h in found] == [(5.0, 0.6), (1.0, 0.5)]
+    query = compared(monkeypatch, {0.0: 0.3, 1.0: 0.5, 5.0: 0.6, 6.0: 0.2}, {})
+    monkeypatch.setattr(refinement, "descend_fine", lambda query, pose: at(place(pose) + 1.0, 0.9))
+    found = refinement.refine_matches(query, [at(0.0, 0).pose, at(5.0, 0).pose])
+    assert places(found) == [5.0, 1.0]
+    assert [h.score for h in found] == pytest.approx([0.6, 0.5])
 
 
-def test_alternatives_that_come_near_are_refined_and_the_greatest_odds_win(monkeypatch):
+@pytest.fixture
+def done(monkeypatch):
+    """What is done to poses on their last way, by their places; it changes nothing."""
+    made = []
+
+    def full(query, pose):
+        made.append(("full", place(pose)))
+        return at(place(pose), query.cache.comparisons[pose.key].score)
+
+    def unoccluded(query, pose):
+        made.append(("unoccluded", place(pose)))
+        return query, at(place(pose), query.cache.comparisons[pose.key].score)
+
+    monkeypatch.setattr(last_descent, "refine_full_resolution", full)
+    monkeypatch.setattr(last_descent, "refine_unoccluded", unoccluded)
+    monkeypatch.setattr(last_descent, "settle", lambda query, h: made.append(("settled", place(h.pose))) or h)
+    return made
+
+
+def test_alternatives_that_come_near_are_refined_and_the_greatest_odds_win(monkeypatch, done):
     """By score or by matches; the third explains more of what both show, though its score is less."""
-    explains = {0.0: 0.5, 3.0: 0.4, 6.0: 0.6, 9.0: 0.1, 12.0: 0.1}
-    query, refined = compared(monkeypatch, explains, {0.0: 20, 3.0: 3, 6.0: 21, 9.0: 11, 12.0: 12}), []
-
-    def full(query, h, num_rounds):
-        refined.append((h.pose.center_world[0], num_rounds))
-        return Hypothesis(h.pose, h.score + 0.01)
-
-    monkeypatch.setattr(method, "refine_full_resolution", full)
-    monkeypatch.setattr(method, "settle", lambda query, h: h)
-    hypotheses = [at(9.0, 0.1), at(0.0, 0.5), at(6.0, 0.31), at(3.0, 0.4), at(12.0, 0.05)]
-    found = method.finished(query, hypotheses)
-    assert refined == [(0.0, 2), (3.0, 2), (6.0, 2), (12.0, 2)]
-    assert found.best == Hypothesis(found.best.pose, 0.32)
+    explains = {0.0: 0.5, 3.0: 0.4, 6.0: 0.6, 9.0: 0.1, 12.0: 0.05}
+    query = compared(monkeypatch, explains, {0.0: 20, 3.0: 3, 6.0: 21, 9.0: 11, 12.0: 12})
+    found = refine_to_the_end(
+        query, [at(9.0, 0.1), at(0.0, 0.5), at(6.0, 0.31), at(3.0, 0.4), at(12.0, 0.05)]
+    )
+    assert done == [*(("full", x) for x in (0.0, 3.0, 6.0, 12.0)), ("settled", 6.0)]
     assert places([found.best, *found.alternatives]) == [6.0, 0.0, 3.0, 9.0, 12.0]
     assert found.rival_ratio == pytest.approx(0.5 / 0.6)
 
@@ -53,40 +59,32 @@ def test_alternatives_that_come_near_are_refined_and_the_greatest_odds_win(monke
     [(0.09, 5, 0.0, 0), (0.09, 6, 0.0, 5), (0.1, 5, 0.0, 5), (0.09, 5, 0.02, 5)],
 )
 def test_of_a_faint_pose_no_alternative_is_refined_unless_it_gains(
-    monkeypatch, best, num_matches, gain, num_refined
+    monkeypatch, done, best, num_matches, gain, num_refined
 ):
-    places, refined = [3.0 * k for k in range(8)], []
-    query = compared(monkeypatch, dict.fromkeys(places, 0.1), dict.fromkeys(places, num_matches))
-    monkeypatch.setattr(method, "refine_full_resolution", lambda query, h, num_rounds: refined.append(h) or h)
-    monkeypatch.setattr(
-        method, "refine_unoccluded", lambda query, h: (query, Hypothesis(h.pose, h.score + gain))
-    )
-    monkeypatch.setattr(method, "settle", lambda query, h: h)
-    method.finished(query, [at(3.0 * k, best - 0.001 * k) for k in range(8)])
-    assert len(refined) == num_refined
+    explains = {3.0 * k: best - 0.001 * k for k in range(8)}
+    hypotheses = [at(x, score) for x, score in explains.items()]
+    query = compared(monkeypatch, explains | {0.0: best + gain}, dict.fromkeys(explains, num_matches))
+    refine_to_the_end(query, hypotheses)
+    assert [name for name, _ in done].count("full") == num_refined
 
 
-def test_a_faint_pose_beside_one_with_matches_is_refined_with_it(monkeypatch):
+def test_a_faint_pose_beside_one_with_matches_is_refined_with_it(monkeypatch, done):
     """What a third of its score hides: twenty matches, and more once it is refined."""
     query = compared(monkeypatch, {0.0: 0.09, 3.0: 0.06, 3.01: 0.36}, {0.0: 0, 3.0: 20, 3.01: 22})
     ends = {0.0: at(0.0, 0.09), 3.0: at(3.01, 0.36)}
-    end = lambda query, h, num_rounds: ends[h.pose.center_world[0]]  # noqa: E731
-    monkeypatch.setattr(method, "refine_full_resolution", end)
-    monkeypatch.setattr(method, "settle", lambda query, h: h)
-    assert places([method.finished(query, [at(0.0, 0.09), at(3.0, 0.06)]).best]) == [3.01]
+    monkeypatch.setattr(last_descent, "refine_full_resolution", lambda query, pose: ends[place(pose)])
+    assert places([refine_to_the_end(query, [at(0.0, 0.09), at(3.0, 0.06)]).best]) == [3.01]
 
 
 def test_a_faint_pose_that_moves_to_an_alternative_is_not_its_own(monkeypatch):
-    query = compared(
-        monkeypatch, dict.fromkeys((3.01, 3.0, 6.0), 0.09), dict.fromkeys((0.0, 3.01, 3.0, 6.0), 0)
-    )
-    monkeypatch.setattr(method, "refine_unoccluded", lambda query, h: (query, at(3.01, 0.09)))
-    found = method.finished(query, [at(0.0, 0.09), at(3.0, 0.08), at(6.0, 0.05)])
+    query = compared(monkeypatch, dict.fromkeys((3.01, 3.0, 6.0), 0.09), {})
+    monkeypatch.setattr(last_descent, "refine_unoccluded", lambda query, pose: (query, at(3.01, 0.09)))
+    found = refine_to_the_end(query, [at(0.0, 0.09), at(3.0, 0.08), at(6.0, 0.05)])
     assert places([found.best, *found.alternatives]) == [3.01, 6.0]
 
 
 @pytest.mark.parametrize(
-    ("best", "num_matches", "done"),
+    ("best", "num_matches", "expected"),
     [
         (0.5, 20, ["unoccluded", "settled"]),  # which refines it at full resolution
         (0.09, 6, ["unoccluded", "settled"]),
@@ -94,14 +92,10 @@ def test_a_faint_pose_that_moves_to_an_alternative_is_not_its_own(monkeypatch):
         (0.019, 20, []),
     ],
 )
-def test_how_a_pose_without_rivals_is_finished(monkeypatch, best, num_matches, done):
-    made = []
-    query = compared(monkeypatch, {0.0: 0.5, 9.0: 0.01}, {0.0: num_matches, 9.0: 0})
-    monkeypatch.setattr(method, "refine_full_resolution", lambda query, h, _: made.append("full") or h)
-    monkeypatch.setattr(method, "refine_unoccluded", lambda query, h: made.append("unoccluded") or (query, h))
-    monkeypatch.setattr(method, "settle", lambda query, h: made.append("settled") or h)
-    found = method.finished(query, [at(0.0, best), at(9.0, 0.1 * best)])
-    assert made == done
+def test_a_pose_without_rivals_is_refined_by_itself(monkeypatch, done, best, num_matches, expected):
+    query = compared(monkeypatch, {0.0: best, 9.0: 0.1 * best}, {0.0: num_matches, 9.0: 0})
+    found = refine_to_the_end(query, [at(0.0, best), at(9.0, 0.1 * best)])
+    assert done == [(name, 0.0) for name in expected]
     assert places([found.best, *found.alternatives]) == [0.0, 9.0]
 
 
@@ -116,11 +110,11 @@ def test_how_a_pose_without_rivals_is_finished(monkeypatch, best, num_matches, d
 )
 def test_the_pose_with_the_greatest_odds_is_selected(monkeypatch, explains, matches, best):
     query = compared(monkeypatch, *(dict(zip((0.0, 3.0), pair, strict=True)) for pair in (explains, matches)))
-    found = standings.fairly_selected(query, SearchResult(at(0.0, 0.5), (at(3.0, 0.4),)))
+    found = selection.select(query, Selection(at(0.0, 0.5), (at(3.0, 0.4),)))
     assert places([found.best]) == [best]
     assert found.rival_ratio == pytest.approx(explains[0 if best else 1] / explains[1 if best else 0])
-    alone = SearchResult(at(0.0, 0.5), ())
-    assert standings.fairly_selected(query, alone) is alone
+    alone = Selection(at(0.0, 0.5), ())
+    assert selection.select(query, alone) is alone
 
 
 def test_of_poses_that_beat_each_other_in_turn_the_one_beaten_least_is_best(monkeypatch):
@@ -136,10 +130,10 @@ def test_of_poses_that_beat_each_other_in_turn_the_one_beaten_least_is_best(monk
         def ratio_to(self, other):
             return ratios[self.place, other.place]
 
-    monkeypatch.setattr(standings, "compare", lambda query, pose: Seen(pose.center_world[0]))
+    monkeypatch.setattr(selection, "compare", lambda query, pose: Seen(pose.center_world[0]))
     for first, second, third in ((0.0, 3.0, 6.0), (6.0, 0.0, 3.0), (3.0, 6.0, 0.0)):
-        found = SearchResult(at(first, 0.5), (at(second, 0.5), at(third, 0.5)))
-        selected = standings.fairly_selected(query, found)
+        found = Selection(at(first, 0.5), (at(second, 0.5), at(third, 0.5)))
+        selected = selection.select(query, found)
         assert places([selected.best, *selected.alternatives]) == [6.0, 0.0, 3.0]
         assert selected.rival_ratio == pytest.approx(1.0 / 0.9)
 
@@ -150,61 +144,53 @@ def test_the_best_pose_has_come_to_rest_and_is_still_the_best(monkeypatch):
     query = compared(monkeypatch, explains, dict.fromkeys(explains, 20))
 
     def settle(query, h):
-        place = h.pose.center_world[0]
-        rested.append(place)
-        return at(place + 0.01, h.score) if place in (0.0, 3.0) else h
+        rested.append(place(h.pose))
+        return at(rested[-1] + 0.01, h.score) if rested[-1] in (0.0, 3.0) else h
 
-    monkeypatch.setattr(method, "settle", settle)
-    found = method.settled(query, SearchResult(at(0.0, 0.5), (at(3.0, 0.5),)))
+    monkeypatch.setattr(last_descent, "settle", settle)
+    found = last_descent.settle_best(query, Selection(at(0.0, 0.5), (at(3.0, 0.5),)))
     assert rested == [0.0, 3.0]
     assert places([found.best, *found.alternatives]) == [3.01, 0.01]
     rested.clear()
-    explains[0.01] = 0.49
-    found = method.settled(query, SearchResult(at(0.0, 0.5), (at(3.0, 0.5),)))
+    query = compared(monkeypatch, explains | {0.01: 0.49}, dict.fromkeys(explains, 20))
+    found = last_descent.settle_best(query, Selection(at(0.0, 0.5), (at(3.0, 0.5),)))
     assert (rested, found.best.pose.center_world[0]) == ([0.0], 0.01)
 
 
-def test_what_speaks_for_poses_is_compared_with_the_best(monkeypatch):
-    query = compared(monkeypatch, {0.0: 0.6, 3.0: 0.3}, {0.0: 9, 3.0: 4})
-    best, other = standings.standings_of(query, at(0.0, 0.5), [at(3.0, 0.2)])
-    assert best == (1.0, 0.5, 9, 0.0)
-    assert other == (pytest.approx(0.5), 0.2, 4, 0.0)
-
-
-def test_margin_is_the_lesser_of_two_leads_and_a_result_is_sure_by_three_things():
+def test_margin_is_the_lesser_of_two_leads_and_a_result_is_sure_by_three_things(monkeypatch):
     for score, other, rival, margin in ((0.5, 0.1, 0.3, 0.7), (0.5, 0.4, 0.3, 0.2), (0.1, 0.4, 0.0, -1.0)):
-        found = SearchResult(at(0.0, score), (at(3.0, other),), rival)
+        found = Selection(at(0.0, score), (at(3.0, other),), rival)
         assert found.margin == pytest.approx(margin)
-    assert SearchResult(at(0.0, 0.3), ()).margin == 1.0
-    for score, other, matches, is_sure in (
+    assert Selection(at(0.0, 0.3), ()).margin == 1.0
+    for score, other, num_matches, is_sure in (
         (0.05, 0.02, 12, True),
         (0.04, 0.01, 12, False),
         (0.5, 0.24, 11, False),
         (0.5, 0.26, 99, False),
     ):
-        assert SearchResult(at(0.0, score), (at(3.0, other),)).is_sure(matches) == is_sure
+        query = compared(monkeypatch, {0.0: score, 3.0: other}, {0.0: num_matches})
+        assert selection.is_sure(query, [at(0.0, score), at(3.0, other)]) == is_sure
 
 
 def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
-    scan_map = SimpleNamespace(octree=None, to_world=lambda pose: pose)
-    query = SimpleNamespace(scan_map=scan_map, settings=CoarseToFineSettings(), workers=Workers(1))
-    query.matches, query.by_features, query.panorama = None, True, rooms.scene(1)[1]
-    query.colors = lambda: None
     counts = {0.0: 30, 1.0: 4, 2.0: 6}
+    explains = {0.0: 0.6, 1.0: 0.5, 2.0: 0.4} | {1.0 + 0.001 * k: 0.5 for k in range(9)}
+    around = SimpleNamespace(surroundings=lambda place, scale: "points" if scale < 0.01 else "coarse points")
+    query = compared(monkeypatch, explains, counts)
+    photo = SimpleNamespace(given=None, panorama=None, colors=lambda: None)
+    query = replace(query, photo=photo, cache=replace(query.cache, views=around))
     for name, value in {
-        "surroundings_of": lambda *_: [lambda: "points", lambda: "coarse points"],
         "visible_points": lambda *_: None,
         "sampling_loss": lambda *_: 0.07,
         "agreement_at": lambda points, panorama, pose: Agreement({"coarse points": 0.8}[points], 1.0),
         "occlusion_at": lambda *_: SimpleNamespace(fractions=lambda: (0.6, 0.3)),
-        "count_matches": lambda matches, pose: counts.get(pose.center_world[0], 0),
+        "count_matches": lambda matches, pose: counts.get(place(pose), 0),
         "estimate_covariance": lambda *_: None,
         "is_mirrored": lambda *_: False,
     }.items():
         monkeypatch.setattr(evaluation, name, value)
     alternatives = at(1.0, 0.3), at(2.0, 0.2)
-    compared(monkeypatch, {0.0: 0.6, 1.0: 0.5, 2.0: 0.4} | {1.0 + 0.001 * k: 0.5 for k in range(9)}, counts)
-    found = evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(at(0.0, 0.6), alternatives, 0.7))
+    found = evaluation.evaluate(query, Selection(at(0.0, 0.6), alternatives, 0.7))
     e = found.evidence
     assert (e.score, e.agreement, e.seen_fraction) == (0.6, 0.8, 1.0)
     assert (e.explained_fraction, e.contradicted_fraction) == (0.6, 0.3)
@@ -218,9 +204,9 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
     assert sum(stated) == pytest.approx(1.0)
     assert stated[0] > stated[1] > stated[2]
     many = tuple(at(1.0 + 0.001 * k, 0.1) for k in range(9))
-    found = evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(at(0.0, 0.6), many))
+    found = evaluation.evaluate(query, Selection(at(0.0, 0.6), many))
     assert len(found.alternatives) == 5
-    alone = evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(at(0.0, 0.6), ()))
+    alone = evaluation.evaluate(query, Selection(at(0.0, 0.6), ()))
     assert (alone.evidence.margin, alone.evidence.alternative_matches) == (1.0, 0)
     monkeypatch.setattr(evaluation, "sampling_loss", lambda *_: np.inf)
-    assert evaluation.evaluate(query, rooms.scene(1)[1], SearchResult(at(0.0, 0.6), ())).pose is None
+    assert evaluation.evaluate(query, Selection(at(0.0, 0.6), ())).pose is None

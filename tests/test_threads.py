@@ -23,6 +23,19 @@ def test_results_come_in_order_and_pass_the_display(num_threads):
     assert seen == [(20, "squares")]
 
 
+@pytest.mark.parametrize("num_threads", [1, 2])
+def test_an_error_ends_the_display_before_it_is_raised(num_threads):
+    seen = []
+
+    def show(values, total, label):
+        yield from values
+        seen.append("end")
+
+    with pytest.raises(ZeroDivisionError):
+        Workers(num_threads, show).map(lambda i: 1 // i, [2, 1, 0, 3], "work")
+    assert seen == ["end"]
+
+
 def test_an_error_drops_what_has_not_begun():
     begun = []
     gate = threading.Event()

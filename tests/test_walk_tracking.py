@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 import rooms
 
-from piccolo.confidence.alternatives import Hypothesis
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors
 from piccolo.jobs.threads import Workers
+from piccolo.localization.comparison import score_pose
 from piccolo.localization.query import prepare_query
-from piccolo.localization.refinement import compared
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.walk import tracker as tracker_module
 from piccolo.walk.frames import Motion, State
@@ -34,7 +33,7 @@ def _off(pose, metres, degrees):
 
 def test_a_descent_that_stopped_short_goes_on_farther_around(seen):
     query, true = seen
-    short = compared(query, Hypothesis(_off(true, 0.12, 2.5), 0.0))
+    short = score_pose(query, _off(true, 0.12, 2.5))
     end = tracked_on(query, short)
     assert end.score > 1.2 * short.score
     assert pose_errors(end.pose, true)[0] < 0.02

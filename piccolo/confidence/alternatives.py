@@ -3,61 +3,59 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from ..geometry.pose import Pose
 from ..geometry.suppression import non_maximum_suppression
 
-MIN_DISTANCE, MIN_ANGLE = 0.5, math.radians(15.0)  # [m], [rad] poses nearer than both are one answer
+MIN_DISTANCE = 0.5  # [m] poses nearer than this
+MIN_ANGLE = math.radians(15.0)  # and this are one answer
 MAX_ALTERNATIVES = 5  # reported
 
 
 @dataclass(frozen=True)
-class Hypothesis:
-    """A pose, and how well it explains the panorama: more is better."""
+class Scored:
+    """A pose with a score: more is better."""
 
     pose: Pose
     score: float
 
 
-def by_score(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+class Hypothesis(Scored):
+    """A pose that may be right; its score is what of the panorama it explains, as in `score.Evidence`."""
+
+
+AnyScored = TypeVar("AnyScored", bound=Scored)
+
+
+def by_score(poses: Sequence[AnyScored]) -> list[AnyScored]:
     """The best first; of equal ones, the first."""
-    return sorted(hypotheses, key=lambda h: -h.score)
+    return sorted(poses, key=lambda p: -p.score)
 
 
 def suppressed(
-    ranked: Sequence[Hypothesis], count: int, min_distance: float, min_angle: float
-) -> list[Hypothesis]:
-    """The first `count` hypotheses that are near (distance [m] and angle [rad]) none before."""
+    ranked: Sequence[AnyScored], count: int, min_distance: float, min_angle: float
+) -> list[AnyScored]:
+    """The first `count` poses that are near (distance [m] and angle [rad]) none before."""
     if not ranked:
         return []
-    rotations = np.array([h.pose.R_cam_from_world for h in ranked])
-    centers = np.array([h.pose.center_world for h in ranked])
+    rotations = np.array([p.pose.R_cam_from_world for p in ranked])
+    centers = np.array([p.pose.center_world for p in ranked])
     return [ranked[k] for k in non_maximum_suppression(rotations, centers, count, min_distance, min_angle)]
 
 
 def best_distinct(
-    hypotheses: Sequence[Hypothesis], count: int, min_distance: float, min_angle: float
-) -> list[Hypothesis]:
+    poses: Sequence[AnyScored], count: int, min_distance: float, min_angle: float
+) -> list[AnyScored]:
     """At most `count` by falling score, none within distance [m] and angle [rad] of a better one."""
-    return suppressed(by_score(hypotheses), count, min_distance, min_angle)
+    return suppressed(by_score(poses), count, min_distance, min_angle)
 
 
 def alternative_poses(
-    best: Pose,
-    hypotheses: Sequence[Hypothesis],
-    less_refined: Sequence[Hypothesis] = (),
-    count: int = MAX_ALTERNATIVES,
+    best: Pose, hypotheses: Sequence[Hypothesis], count: int = MAX_ALTERNATIVES
 ) -> list[Hypothesis]:
-    """The `count` best-scoring hypotheses that are distinct from `best` and from each other.
-
-    Of the less refined ones, those take part that are near none of the others.
-    """
-    ranked = [Hypothesis(best, math.inf), *by_score(hypotheses), *by_score(less_refined)]
-    return by_score(suppressed(ranked, count + 1, MIN_DISTANCE, MIN_ANGLE)[1:])
-
-
-def score_margin(score: float, alternatives: Sequence[Hypothesis]) -> float:
-    """Lead of a score over the best alternative's, or over 0 if none has more."""
-    return score - max([0.0, *(h.score for h in alternatives)])
+    """The `count` best-scoring hypotheses that are distinct from `best` and from each other."""
+    ranked = [Hypothesis(best, math.inf), *by_score(hypotheses)]
+    return suppressed(ranked, count + 1, MIN_DISTANCE, MIN_ANGLE)[1:]

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..geometry.pose import MAX_DISTANCE
 from .covariance import PoseCovariance
-from .score import Evidence
 
 Array = NDArray[np.float64]
 LOCALIZED = "localized"
@@ -35,8 +34,11 @@ class ChoiceModel(NamedTuple):
     none_weights: tuple[float, float]  # of none of them: a constant, and log10 of the best's deviation [m]
 
 
-LEAST_STD, MOST_STD = 0.003, 0.3  # [m] smaller or larger tells nothing more
-LEAST_SCORE, LEAST_SHARE, MOST_SHARE = 0.02, 0.1, 1.2
+LEAST_STD = 0.003  # [m] smaller tells nothing more
+MOST_STD = 0.3  # [m] larger
+LEAST_SCORE = 0.02
+LEAST_SHARE = 0.1
+MOST_SHARE = 1.2
 CLEAR_MATCHES = 40  # as many as a clear whole view of an upright sphere is worth, see docs/METHOD.md
 CONTRADICTED = 0.01  # odds of what the user says to be wrong
 NOISE_MATCHES = 8  # local features that agree with a wrong pose by chance, at most
@@ -44,9 +46,6 @@ NOISE_MATCHES = 8  # local features that agree with a wrong pose by chance, at m
 FEATURES = ("log of the share", "log of the score", "log of the matches")
 NONE_FEATURES = ("constant", "log10 of the largest deviation [m]")
 MODEL = ChoiceModel((5.75, 0.43, 1.10), (8.30, 3.82))
-# The preset paper knows no covariance, and too few alternatives to tell places that repeat: a rough guide, by
-# margin and log of the agreement, learnt without such places.
-PAPER_BIAS, PAPER_WEIGHTS = -0.20, (6.37, 2.51)
 
 
 def features_of(standing: Standing) -> Array:
@@ -91,13 +90,6 @@ def classify(probabilities: Array, min_confidence: float) -> str:
     if probabilities[0] >= min_confidence:
         return LOCALIZED
     return AMBIGUOUS if 1.0 - probabilities[-1] >= min_confidence else NOT_LOCALIZED
-
-
-def paper_confidence(evidence: Evidence) -> float:
-    """How likely a pose of the preset paper is right: a rough guide, not calibrated."""
-    features = evidence.margin, math.log(max(evidence.agreement, LEAST_SCORE))
-    logit = PAPER_BIAS + sum(w * f for w, f in zip(PAPER_WEIGHTS, features, strict=True))
-    return 1.0 / (1.0 + math.exp(-min(max(logit, -30.0), 30.0)))
 
 
 def check_confidence(min_confidence: float) -> None:

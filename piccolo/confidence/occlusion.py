@@ -24,14 +24,17 @@ from ..views.zbuffer import View, render_view
 WIDTHS = (256, 128, 64)  # [px] of the comparison, cells of 1.4 degrees and more: where the scan is sparse
 LEAST_FILLED = 0.75  # of the cells twice as wide in which anything is seen: less is sparse
 STATS_WIDTH = 64  # [px] of local means
-SIGMA_DEG, SMOOTHING = 15.0, 0.9  # of the Gaussians for contrast, and [cells] for the difference
+SIGMA_DEG = 15.0  # of the Gaussian for contrast
+SMOOTHING = 0.9  # [cells] of that for the difference
 GLOBAL_WEIGHTS = (10.0, 1.0, 0.3)  # round by round, of the whole photo beside a full neighbourhood
 FLAT_VARIANCE = np.float32(0.08**2)  # of a channel in [0, 1]: where it is less, a difference counts less
 MOST_DIFFERENCE = np.float32(2.0)  # deviations; what differs more counts no more
 CONTRADICTING = 0.5  # squared deviations, summed over channels
 WEIGHT_SCALE = 1.0  # the same, of Geman and McClure's weights
 LEAST_COVERED = 0.3  # of the neighbourhood that both show: less was not scanned
-EXPLAINED, NOT_SCANNED, CONTRADICTED = 0, 128, 255  # levels of the mask
+EXPLAINED = 0  # levels of the mask
+NOT_SCANNED = 128
+CONTRADICTED = 255
 LEVEL = 100  # 8-bit level of the thresholds in maps that are enlarged
 
 
@@ -85,7 +88,8 @@ def occlusion_mask(points: PackedPoints, panorama: Panorama, pose: Pose) -> NDAr
 
     What the photo does not show has the level of what was not scanned.
     """
-    small, shape = occlusion_at(points, panorama, pose), panorama.is_valid.shape
+    small = occlusion_at(points, panorama, pose)
+    shape = panorama.is_valid.shape
 
     def exceeds(values: NDArray[np.float32], threshold: float) -> NDArray[np.bool_]:
         levels = np.clip(values * np.float32(LEVEL / threshold), 0.0, 255.0).astype(np.uint8)
@@ -112,7 +116,8 @@ def _squared_difference(
     """
     photo, scan = (_statistics(c, weight, global_weight) for c in (of_photo, of_scan))
     contrast = (of_scan - scan[..., :3]) * scan[..., 3:]
-    low, high = _extreme(contrast, is_shared, cv2.erode, 9.0), _extreme(contrast, is_shared, cv2.dilate, -9.0)
+    low = _extreme(contrast, is_shared, cv2.erode, 9.0)
+    high = _extreme(contrast, is_shared, cv2.dilate, -9.0)
     squares = np.empty(is_shared.shape, np.float32)
     write_squares(of_photo, photo, scan, low, high, squares)
     return squares

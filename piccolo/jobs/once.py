@@ -5,7 +5,6 @@ from collections.abc import Callable
 from typing import Generic, TypeVar
 
 Value = TypeVar("Value")
-Other = TypeVar("Other")
 
 
 class Once(Generic[Value]):
@@ -15,10 +14,6 @@ class Once(Generic[Value]):
         self._function: Callable[[], Value] | None = function
         self._lock = threading.Lock()
         self._value: Value
-
-    def then(self, function: Callable[[Value], Other]) -> "Once[Other]":
-        """Apply a function to the value, once it is asked for."""
-        return Once(lambda: function(self()))
 
     def __call__(self) -> Value:
         """The value. What the function raises is raised, and it is asked again by the next."""

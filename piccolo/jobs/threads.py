@@ -3,14 +3,14 @@
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeVar
 
 from ..errors import InputError
 from .memory import check_address_space
-from .once import Once
 
 Item = TypeVar("Item")
 Value = TypeVar("Value")
@@ -60,7 +60,7 @@ def pool_of(num_threads: int) -> Iterator[ThreadPoolExecutor]:
             pool.shutdown(wait=False)
 
 
-# wraps values as tqdm does: how many there will be, None if unknown, and what they are
+# wraps values as tqdm does: how many there will be, None if unknown, and their label
 Progress = Callable[[Iterator[Any], int | None, str], Iterator[Any]]
 
 
@@ -101,39 +101,50 @@ class Workers:
         if not 1 <= self.num_threads <= MAX_THREADS:
             raise InputError(f"num_threads: found {self.num_threads}, wanted 1 to {MAX_THREADS}")
 
-    def map(self, function: Callable[[Item], Value], items: Sequence[Item], label: str) -> Iterator[Value]:
-        """Yield function(item) for each item, in order; within another call's function one after another.
+    def map(self, function: Callable[[Item], Value], items: Sequence[Item], label: str) -> list[Value]:
+        """Return function(item) of each item, in order; within another call's function one after another.
 
         Nothing is summed across items here, so results have the same bits for any number of threads. An error
         or Ctrl-C drops the items that have not begun.
         """
         check_address_space()
-        if self.num_threads == 1 or len(items) < 2 or _thread.is_of_pool:
-            yield from self.show(map(function, items), len(items), label)
-            return
-        with pool_of(self.num_threads) as pool:
-            futures = [pool.submit(function, item) for item in items]
-            try:
-                yield from self.show((future.result() for future in futures), len(items), label)
-            finally:
-                for future in futures:
-                    future.cancel()
-                wait(futures)
+        values: list[Value] = []
+        shown = self.show(iter(values), len(items), label)  # which is moved on as they come
+        try:
+            if self.num_threads == 1 or len(items) < 2 or _thread.is_of_pool:
+                for item in items:
+                    values.append(function(item))
+                    next(shown)
+            else:
+                with submitted(self.num_threads, [partial(function, item) for item in items]) as futures:
+                    for future in futures:
+                        values.append(future.result())
+                        next(shown)
+        finally:
+            next(shown, None)  # its end, which takes a bar off the screen before an error is printed
+        return values
 
     @contextmanager
-    def beside(self, *values: Once[Any]) -> Iterator[None]:
-        """A context in which an idle core works out values, in order, before they are asked for.
+    def beside(self, *functions: Callable[[], object]) -> Iterator[None]:
+        """A context in which an idle core calls functions, in order, that keep what they work out.
 
-        At its end, those that nobody has begun are left. What they raise reaches who asks.
+        At its end, those that have not begun are left. What they raise is left to who asks for the value.
         """
         if self.num_threads == 1 or _thread.is_of_pool:
             yield
             return
-        with pool_of(1) as pool:
-            futures = [pool.submit(value) for value in values]
-            try:
-                yield
-            finally:
-                for future in futures:
-                    future.cancel()
-                wait(futures)
+        with submitted(1, functions):
+            yield
+
+
+@contextmanager
+def submitted(num_threads: int, tasks: Sequence[Callable[[], Value]]) -> Iterator[list[Future[Value]]]:
+    """Tasks on so many threads; at the end, those that have not begun are dropped, and others waited for."""
+    with pool_of(num_threads) as pool:
+        futures = [pool.submit(task) for task in tasks]
+        try:
+            yield futures
+        finally:
+            for future in futures:
+                future.cancel()
+            wait(futures)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..confidence.alternatives import Hypothesis
 from ..geometry.pose import Pose
 from ..geometry.sphere import BLOCK_RINGS, cell_of, make_grid, pixel_rays
 from ..kernels.jit import F0, copy_to, kernel
@@ -62,13 +63,18 @@ def sample_photo(offsets, weights, photo, R_cam_from_map, center, colors, shared
 
     `center` (3,) [m] of the camera counts from where the offsets of the cells do.
     """
-    (texels, width), p = photo, make_projected()
+    texels, width = photo
+    p = make_projected()
     for lo in range(0, len(weights), CHUNK):
         hi = min(lo + CHUNK, len(weights))
         project(offsets[0][lo:hi], offsets[1][lo:hi], offsets[2][lo:hi], R_cam_from_map, center, width, p)
         gather(texels, width, p, hi - lo)
-        c0, c1, c2, both = colors[0][lo:hi], colors[1][lo:hi], colors[2][lo:hi], shared[lo:hi]
-        weight, count = weights[lo:hi], hi - lo
+        count = hi - lo
+        c0 = colors[0, lo:hi]
+        c1 = colors[1, lo:hi]
+        c2 = colors[2, lo:hi]
+        both = shared[lo:hi]
+        weight = weights[lo:hi]
         for n in range(count):
             bilinear = bilinear_weights(p.fu[n], p.fv[n])
             t00, t10, t01, t11 = p.t00[n], p.t10[n], p.t01[n], p.t11[n]
@@ -85,9 +91,11 @@ def sample_photo(offsets, weights, photo, R_cam_from_map, center, colors, shared
 @kernel
 def normalize(colors, shared, view, normalized):
     """Write channels (3, N) less their local mean, by their local deviation, over the shared cells."""
-    moments, stats = np.zeros((view.num_stats, 8), np.float32), np.empty((6, len(shared)), np.float32)
+    moments = np.zeros((view.num_stats, 8), np.float32)
+    stats = np.empty((6, len(shared)), np.float32)
     for n in range(len(shared)):
-        m, w = moments[view.stats_cell[n]], shared[n]
+        m = moments[view.stats_cell[n]]
+        w = shared[n]
         m[0] += w
         for k in range(3):
             m[1 + k] += w * colors[k, n]
@@ -105,7 +113,8 @@ def correlate_blocks(first, second, shared, blocks, correlation, area):
     correlation[:] = 0.0
     area[:] = 0.0
     for n in range(len(shared)):
-        b, w = blocks[n], shared[n]
+        b = blocks[n]
+        w = shared[n]
         area[b] += w
         for k in range(3):
             correlation[b] += w * first[k, n] * second[k, n]
@@ -122,14 +131,20 @@ def compare_cells(
     """Write the correlation and the shared area (blocks,) of cells (3, N) around a camera with its photo.
 
     Blocks are cells of a grid of `num_columns`, `first` in the camera's frame. Those that contradict are left
-    out of the local means and deviations, and all is taken anew.
+    out of the local means and deviations, and all is compared once more.
     """
-    of_photo, shared, n = np.empty_like(colors), np.empty_like(weights), len(weights)
-    rays, blocks = np.empty_like(colors), np.empty(n, np.int32)
+    n = len(weights)
+    of_photo = np.empty_like(colors)
+    shared = np.empty_like(weights)
+    rays = np.empty_like(colors)
     sample_photo(offsets, weights, photo, R_cam_from_map, center, of_photo, shared, rays)
-    ranges, turns = np.empty(n, np.float32), np.empty(n, np.float32)
+    blocks = np.empty(n, np.int32)
+    ranges = np.empty(n, np.float32)
+    turns = np.empty(n, np.float32)
     locate(rays[0], rays[1], rays[2], grid[0], grid[1], blocks, ranges, turns)
-    first, second, kept = np.empty_like(colors), np.empty_like(colors), shared.copy()
+    first = np.empty_like(colors)
+    second = np.empty_like(colors)
+    kept = shared.copy()
     for k in range(2):
         normalize(colors, kept, view, first)
         normalize(of_photo, kept, view, second)
@@ -143,23 +158,35 @@ def compare_cells(
 
 def compare(query: Query, pose: Pose) -> Comparison:
     """The scan as seen from a pose and the photo, by blocks; worked out once a pose."""
-    if pose.key not in query.comparisons:
-        query.comparisons[pose.key] = _compare(query, pose)
-    found: Comparison = query.comparisons[pose.key]
-    return found
+    kept = query.cache.comparisons
+    if pose.key not in kept:
+        config = query.method.fine_view
+        view = config.arrays
+        place = place_of(pose)
+        sums = query.cache.views.averages(place, config)
+        *cells, center = empty_cells(len(sums), place)
+        moments = np.empty((view.num_stats, 8), np.float32)
+        average_colors(sums, view, np.ones(len(sums), np.bool_), *cells, moments)
+        photo = query.photo.small
+        grid = make_grid(BLOCK_RINGS)
+        by_block = np.empty((3, NUM_BLOCKS))
+        compare_cells(
+            *cells,
+            (photo.rgbx, photo.width),
+            pose.R_cam_from_world,
+            pose.center_world - center,
+            view,
+            (grid.num_columns, grid.first),
+            *by_block,
+        )
+        kept[pose.key] = Comparison(by_block[0], by_block[1], by_block[2], photo.valid_share)
+    comparison: Comparison = kept[pose.key]
+    return comparison
 
 
-def _compare(query: Query, pose: Pose) -> Comparison:
-    config, photo, place = query.method.fine_view, query.photo, place_of(pose)
-    sums, view = query.views.averages(place, config), config.arrays
-    *cells, center = empty_cells(len(sums), place)
-    moments = np.empty((view.num_stats, 8), np.float32)
-    average_colors(sums, view, np.ones(len(sums), np.bool_), *cells, moments)
-    by_block = np.empty(NUM_BLOCKS), np.empty(NUM_BLOCKS), np.empty(NUM_BLOCKS)
-    image, blocks = (photo.rgbx, photo.width), make_grid(BLOCK_RINGS)
-    at, grid = (pose.R_cam_from_world, pose.center_world - center), (blocks.num_columns, blocks.first)
-    compare_cells(*cells, image, *at, view, grid, *by_block)
-    return Comparison(*by_block, photo.valid_share)
+def score_pose(query: Query, pose: Pose) -> Hypothesis:
+    """A pose with the score by which poses are selected."""
+    return Hypothesis(pose, compare(query, pose).score)
 
 
 def without_occluders(query: Query, pose: Pose) -> Query:
@@ -169,10 +196,9 @@ def without_occluders(query: Query, pose: Pose) -> Query:
     if not contradicts.any():
         return query
     key = contradicts.tobytes()
-    if key not in query.comparisons:
-        query.comparisons[key] = query.without(contradicts[pixel_blocks()])
-    rest: Query = query.comparisons[key]
-    return rest
+    if key not in query.cache.unoccluded:
+        query.cache.unoccluded[key] = query.without(contradicts[pixel_blocks()])
+    return query.cache.unoccluded[key]
 
 
 @lru_cache(maxsize=1)

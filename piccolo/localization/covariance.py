@@ -1,8 +1,8 @@
 """Covariance of a pose from blocks of the sphere."""
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,8 @@ from ..panorama.local_normalization import LEVELS_PER_UNIT
 from ..panorama.texels import Texels
 from ..views.view import Cells
 from .comparison import without_occluders
-from .descent import FULL_LOSS, as_levels
 from .query import Query
-from .refinement import points_at
+from .refinement import FULL_LOSS, as_levels
 
 ERROR_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
 MOST_SHARE = 1.001  # of a block in what fixes the pose, a little above 1 for one that does alone
@@ -28,29 +27,29 @@ POLE_DEG = 2.0  # around the photo's poles pixels are so narrow that one point's
 SCALE = FULL_LOSS * LEVELS_PER_UNIT
 
 
-@dataclass(frozen=True)
-class DifferenceSteps:
+class DifferenceSteps(NamedTuple):
     """At what detail the loss is differentiated for a covariance."""
 
-    image: Literal["full", "fine", "middle"]  # of the query's
+    scale: int  # of the photo's images: 0 the finest
     turn: float  # step of the differences [rad]
     move: float  # [m]
     inflation: float  # so that 95 % of true poses lie in the 95 % region (tools/benchmark.py calibration)
 
 
 STEPS = (
-    DifferenceSteps("full", math.radians(0.1), 0.005, 1.1),
-    DifferenceSteps("fine", math.radians(0.3), 0.015, 0.36),
+    DifferenceSteps(0, math.radians(0.1), 0.005, 1.1),
+    DifferenceSteps(1, math.radians(0.3), 0.015, 0.36),
 )
 # of dark, noisy photos; they are too few to calibrate
-ROUGH_STEPS = DifferenceSteps("middle", math.radians(0.3), 0.015, 1.0)
+ROUGH_STEPS = DifferenceSteps(2, math.radians(0.3), 0.015, 1.0)
 
 
-def equations_at(image: Texels, points: Cells, pose: Pose) -> tuple[Array, Array]:
-    """Gradient (6,) and Gauss-Newton matrix (6, 6) of the robust loss, in the camera's frame."""
-    sums, center = np.empty(NUM_SUMS), pose.center_world - points.center_map
+def gradient_at(image: Texels, points: Cells, pose: Pose) -> Array:
+    """Gradient (6,) of the robust loss, in the camera's frame."""
+    sums = np.empty(NUM_SUMS)
+    center = pose.center_world - points.center_map
     channel_equations((*points[:3], image.rgbx, image.width, SCALE), pose.R_cam_from_world, center, sums)
-    return sums[GRADIENT:MATRIX].copy(), symmetric(sums[MATRIX:])
+    return sums[GRADIENT:MATRIX].copy()
 
 
 def symmetric(upper: Array) -> Array:
@@ -63,7 +62,8 @@ def symmetric(upper: Array) -> Array:
 
 def without_poles(points: Cells, pose: Pose) -> Cells:
     """The points around a pose that are not within POLE_DEG of the photo's poles."""
-    heights, ranges = pose.R_cam_from_world[2] @ points.offsets, np.linalg.norm(points.offsets, axis=0)
+    heights = pose.R_cam_from_world[2] @ points.offsets
+    ranges = np.linalg.norm(points.offsets, axis=0)
     is_kept = np.abs(heights) < math.cos(math.radians(POLE_DEG)) * ranges
     offsets, channels, weights = (np.ascontiguousarray(values[..., is_kept]) for values in points[:3])
     return Cells(offsets, channels, weights, points.center_map)
@@ -77,16 +77,18 @@ def hessian_at(image: Texels, points: Cells, pose: Pose, steps: DifferenceSteps)
     """
     rows = []
     for delta in np.diag([steps.turn] * 3 + [steps.move] * 3):
-        after, before = (equations_at(image, points, step(pose, sign * delta))[0] for sign in (1.0, -1.0))
-        rows.append((after - before) / (2.0 * delta.sum()))
+        rise = gradient_at(image, points, step(pose, delta)) - gradient_at(image, points, step(pose, -delta))
+        rows.append(rise / (2.0 * delta.sum()))
     return np.asarray(0.5 * (np.array(rows) + np.array(rows).T))
 
 
 def equations_by_block(image: Texels, points: Cells, pose: Pose, block: NDArray[np.integer]) -> Array:
     """Sums (B, 29) of the normal equations over the points (N,) of each block; the camera is their centre."""
-    order, counts = np.argsort(block, kind="stable"), np.bincount(block)
+    order = np.argsort(block, kind="stable")
+    counts = np.bincount(block)
     offsets, levels, weights = (np.ascontiguousarray(values[..., order]) for values in points[:3])
-    begins, sums = np.concatenate([[0], np.cumsum(counts)]), np.empty((len(counts), NUM_SUMS))
+    begins = np.concatenate([[0], np.cumsum(counts)])
+    sums = np.empty((len(counts), NUM_SUMS))
     problem = offsets, levels, weights, image.rgbx, image.width, SCALE
     equations_by_part(problem, pose.R_cam_from_world, np.zeros(3), begins, sums)
     return sums
@@ -134,17 +136,19 @@ def covariance_at(query: Query, points: Cells, pose: Pose) -> Array | None:
     Noise and stitching roughen the loss in the finest image; the next one is smoother. Where both are too
     rough, a third tells.
     """
-
-    def by(steps: DifferenceSteps) -> Array | None:
-        image: Texels = getattr(query.images, steps.image)
-        hessian = hessian_at(image, points, pose, steps)
-        covariance = covariance_of(hessian, block_gradients(image, points, pose))
-        return covariance if covariance is None else steps.inflation * covariance
-
+    by = partial(covariance_by, query, points, pose)
     found = [c for c in query.workers.map(by, STEPS, "covariance") if c is not None]
     if not found:
         return by(ROUGH_STEPS)
     return min(found, key=lambda c: float(np.linalg.eigvalsh(c[3:, 3:])[-1]))
+
+
+def covariance_by(query: Query, points: Cells, pose: Pose, steps: DifferenceSteps) -> Array | None:
+    """Covariance (6, 6) in the camera's frame by one of the photo's images; None where it is too rough."""
+    image = query.photo.images[steps.scale]()
+    hessian = hessian_at(image, points, pose, steps)
+    covariance = covariance_of(hessian, block_gradients(image, points, pose))
+    return covariance if covariance is None else steps.inflation * covariance
 
 
 def errors_of_source(query: Query, points: Cells, pixel_share: float) -> Array:
@@ -154,7 +158,8 @@ def errors_of_source(query: Query, points: Cells, pixel_share: float) -> Array:
     surfaces by what `surface_noise` tells. At the median range an angle and a displacement are one.
     """
     median_range = float(np.median(np.linalg.norm(points.offsets, axis=0)))
-    turn, surface = pixel_share * query.pixel, query.scan_map.surface_variance
+    turn = pixel_share * query.photo.pixel
+    surface = query.scan_map.surface_variance
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = np.eye(3) * (turn**2 + np.trace(surface) / 3.0 / median_range**2)
     covariance[3:, 3:] = np.eye(3) * (turn * median_range) ** 2 + surface
@@ -167,21 +172,20 @@ def estimate_covariance(query: Query, pose: Pose, of_camera: Array | None = None
     `of_camera` (6, 6), in the map's axes, is what the uncertainty of the calibration adds.
     """
     query = without_occluders(query, pose)
-    points = without_poles(points_at(query, pose).around(pose.center_world), pose)
+    points = without_poles(query.points_at(pose).around(pose.center_world), pose)
     points = points._replace(channels=as_levels(points.channels))
     covariance = covariance_at(query, points, pose)
     if covariance is None:
         return None
-    R_map_from_cam, R_map_from_world = pose.R_cam_from_world.T, query.scan_map.R_map_from_world
     J = np.eye(6)
-    J[3:, 3:] = R_map_from_cam
+    J[3:, 3:] = pose.R_cam_from_world.T  # R_map_from_cam
     pixel_share = PIXEL_SHARE if of_camera is None else UNCALIBRATED_SHARE
     covariance_map = J @ covariance @ J.T + errors_of_source(query, points, pixel_share)
     std_of_fit = None
     if of_camera is not None:
         std_of_fit = math.sqrt(float(np.linalg.eigvalsh(covariance_map[3:, 3:])[-1]))
         covariance_map += of_camera
-    J[3:, 3:] = R_map_from_world.T
+    J[3:, 3:] = query.scan_map.R_map_from_world.T
     covariance_world = J @ covariance_map @ J.T
     words = least_constrained_direction(covariance_map[3:, 3:], covariance_world[3:, 3:], points.offsets)
     return PoseCovariance(0.5 * (covariance_world + covariance_world.T), words, std_of_fit)

@@ -1,95 +1,89 @@
 """What speaks for the pose that was found and against it, and the status that follows."""
 
 import math
+import operator
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ..cloud.soa import PackedPoints
 from ..confidence.alternatives import MAX_ALTERNATIVES
 from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED, classify, posterior
 from ..confidence.localization import Alternative, Localization
 from ..confidence.occlusion import occlusion_at
 from ..confidence.score import Agreement, Evidence, agreement_at
-from ..geometry.pose import Pose
-from ..jobs.once import Once
 from ..local_features.hypotheses import count_matches, poses_of
 from ..local_features.matching import match
 from ..optimize.refine import refine, sampling_loss_of
 from ..optimize.sampling_loss import sampling_loss
 from ..optimize.settings import DescentSettings
 from ..panorama import Panorama
-from ..views.recent_views import place_of
 from ..views.zbuffer import visible_points
 from .covariance import estimate_covariance
 from .focal_length import FocalFit
 from .prior import contradictions
 from .query import Query
-from .search_result import SURE_MATCHES, SearchResult
-from .standings import standings_of
+from .selection import SURE_MATCHES, Selection, standings_of
 
 ENOUGH_EXPLAINED = 0.7  # score from which a photo is not mirrored
 MIRROR_RATIO = 1.2  # of matches, mirrored by not
 MIRRORED = "the photo fits the scan better mirrored, left for right: turn it over and try again"
-VOXEL_PER_RANGE, COARSE_VOXEL_PER_RANGE = 1 / 150, 1 / 40  # of points that are compared with the photo
 MOST_CONFLICT = 4.0  # deviations between the focal length found and that given
 TELLING_STD = 0.03  # [m] of a position: what a focal length adds beyond it is told
 LAST_STEP = 0.01  # [rad, m] of Adam and the first of L-BFGS, where they take the last descent
 
 
-def evaluate(
-    query: Query, panorama: Panorama, found: SearchResult, fit: FocalFit | None = None
-) -> Localization:
+def evaluate(query: Query, found: Selection, fit: FocalFit | None = None) -> Localization:
     """The pose found in world coordinates, after the descent that the solver asks for, with its evidence.
 
     `fit` is that of the focal length, of a photo whose is not exact.
     """
     if found.best.score < 0.0:
         return Localization()
-    scan_map, settings, pose = query.scan_map, query.settings, found.best.pose
-    points, coarse = (Once(points) for points in surroundings_of(query, pose))
+    settings = query.settings
+    pose = found.best.pose
+    points, coarse = query.surroundings_at(pose)
     if settings.solver != "gauss-newton":
         how = DescentSettings(solver=settings.solver, step_size=LAST_STEP)
-        pose = refine(points(), sampling_loss_of(query.colors()), pose, how).pose
-    told: list[Callable[[], Any]] = [
-        lambda: estimate_covariance(query, pose, fit and fit.pose_covariance),  # takes longest
-        lambda: occlusion_at(points(), panorama, pose).fractions(),
-        lambda: sampling_loss(visible_points(points(), pose.center_world), query.colors(), pose),
-        lambda: agreement_at(coarse(), query.panorama, pose),
+        pose = refine(points(), sampling_loss_of(query.photo.colors()), pose, how).pose
+    asked: list[Callable[[], Any]] = [
+        partial(estimate_covariance, query, pose, fit and fit.pose_covariance),  # takes longest
+        lambda: occlusion_at(points(), query.photo.given, pose).fractions(),
+        lambda: sampling_loss(visible_points(points(), pose.center_world), query.photo.colors(), pose),
+        lambda: agreement_at(coarse(), query.photo.panorama, pose),
     ]
-    covariance, fractions, loss, agreement = query.workers.map(lambda tell: tell(), told, "evaluate")
+    covariance, fractions, loss, agreement = query.workers.map(operator.call, asked, "evaluate")
     if not math.isfinite(loss):
         return Localization()
     evidence = evidence_of(query, found, agreement, fractions)
     reported = found.alternatives[:MAX_ALTERNATIVES]
     standings = standings_of(query, found.best, reported)
     probabilities = posterior(standings, covariance)
-    warnings = contradictions(scan_map, pose, settings.prior)
+    warnings = contradictions(query.scan_map, pose, settings.prior)
     if classify(probabilities, settings.min_confidence) != NOT_LOCALIZED and is_mirrored(query, evidence):
         warnings += (MIRRORED,)
     if warnings or (fit is not None and fit.conflict > MOST_CONFLICT):
         probabilities = np.append(np.zeros(len(standings)), 1.0)
     if fit is not None and classify(probabilities, settings.min_confidence) != LOCALIZED:
-        warnings += doubts_of(panorama, fit)
-    matches = [s.num_matches if query.by_features else None for s in standings[1:]]
+        warnings += doubts_of(query.photo.given, fit)
+    matches = [s.num_matches if query.num_halves else None for s in standings[1:]]
     alternatives = tuple(
-        Alternative(scan_map.to_world(h.pose), h.score, s.share, num_matches, float(p))
+        Alternative(query.scan_map.to_world(h.pose), h.score, s.share, num_matches, float(p))
         for h, s, num_matches, p in zip(reported, standings[1:], matches, probabilities[1:-1], strict=True)
     )
     return Localization(
         classify(probabilities, settings.min_confidence),
         float(probabilities[0]),
         float(probabilities[-1]),
-        scan_map.to_world(pose),
+        query.scan_map.to_world(pose),
         loss,
         evidence,
         alternatives,
         covariance,
         warnings,
-        cameras=() if fit is None else panorama.cameras,
-        focal_length=None if fit is None else fit.focal_length(panorama),
+        cameras=() if fit is None else query.photo.given.cameras,
+        focal_length=None if fit is None else fit.focal_length(query.photo.given),
     )
 
 
@@ -104,14 +98,8 @@ def doubts_of(panorama: Panorama, fit: FocalFit) -> tuple[str, ...]:
     return (f"{found}, {given}: this leaves the position open by {std:.2f} m",) if std > TELLING_STD else ()
 
 
-def surroundings_of(query: Query, pose: Pose) -> list[Callable[[], PackedPoints]]:
-    """What `evaluate` asks for around a pose in the map: points, and coarser ones."""
-    scales = VOXEL_PER_RANGE, COARSE_VOXEL_PER_RANGE
-    return [partial(query.views.surroundings, place_of(pose), scale) for scale in scales]
-
-
 def evidence_of(
-    query: Query, found: SearchResult, agreement: Agreement, fractions: tuple[float, float]
+    query: Query, found: Selection, agreement: Agreement, fractions: tuple[float, float]
 ) -> Evidence:
     """What a result tells of its pose: fractions of the photo are explained and contradicted."""
     num_matches = [count_matches(query.matches, h.pose) for h in (found.best, *found.alternatives)]
@@ -122,8 +110,8 @@ def evidence_of(
         explained_fraction=fractions[0],
         contradicted_fraction=fractions[1],
         seen_fraction=agreement.seen_fraction,
-        num_matches=num_matches[0] if query.by_features else None,
-        alternative_matches=max(num_matches[1:], default=0) if query.by_features else None,
+        num_matches=num_matches[0] if query.num_halves else None,
+        alternative_matches=max(num_matches[1:], default=0) if query.num_halves else None,
     )
 
 
@@ -133,9 +121,7 @@ def is_mirrored(query: Query, evidence: Evidence) -> bool:
     Symmetric things match in a mirror too, but not more of them. A pose that explains nearly all needs none,
     and a first look has asked.
     """
-    if (
-        evidence.score >= ENOUGH_EXPLAINED or evidence.num_matches is None
-    ):  # a clear whole view has been asked
+    if evidence.score >= ENOUGH_EXPLAINED or evidence.num_matches is None:
         return False
     matches = match(query.keypoints.mirrored(), query.scan_map.features_now(query.workers), query.workers)
     found = poses_of(matches, None, 1, query.workers)

@@ -1,6 +1,6 @@
 """The focal length of a photo, fitted with its pose: by the scan, and by what is known of it beforehand.
 
-The photo is put on the sphere anew for each of several focal lengths (and of k1, where a guessed camera has
+The photo is put on the sphere again for each of several focal lengths (and of k1, where a guessed camera has
 it), and the pose refined for each. The losses of these ends are the profile of the loss: its crest is the
 focal length that photo and scan agree on, and how each block of the sphere pulls at the crest is its
 covariance. That of the pose is the marginal one: what a focal length that is off does to a pose is added.
@@ -8,7 +8,9 @@ covariance. That of the pose is the marginal one: what a focal length that is of
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -20,29 +22,37 @@ from ..camera.model import MODELS
 from ..confidence.localization import FocalLength
 from ..geometry.pose import Array, Pose, exp_so3, log_so3, rotate_points
 from ..geometry.sphere import indices_of
+from ..jobs.once import Once
 from ..optimize.normal_equations import LOSS
 from ..panorama import Panorama
 from ..views.view import Cells
-from .comparison import without_occluders
+from .comparison import score_pose, without_occluders
 from .covariance import blocks_of, equations_by_block, without_poles
-from .descent import FINE_LOSS, FULL_LOSS, as_levels, descend
-from .query import Features, Query, prepare_query, query_images
-from .refinement import points_at, view_at
+from .last_descent import refine_to_the_end
+from .query import Features, Query, images_of, prepare_query
+from .refinement import FINE_LOSS, FULL_LOSS, as_levels, descend
+from .selection import Selection
 
-FOCALS, RADIAL = ("f", "fx", "fy"), "k1"
+FOCALS = "f", "fx", "fy"
+RADIAL = "k1"
 WIDE = 0.05  # a focal length that is known worse is a guess: k1 is fitted too
 K1_DEVIATION = 0.05  # of k1 where the camera is a guess
-NUM_VALUES, NUM_VALUES_OF_TWO = 7, 4  # of each parameter in a design: of one, of two
-FIRST_REACH, LAST_REACH = (0.04, 0.1), 0.02  # of a design to either side: at first, least and most; at last
+NUM_VALUES = 7  # of the parameter in a design of one
+NUM_VALUES_OF_TWO = 4  # of each parameter in one of two
+FIRST_REACH = (0.04, 0.1)  # of a design to either side: at first, least and most
+LAST_REACH = 0.02
 K1_PER_FOCAL = 1.0  # reach in k1 by that in the focal length's logarithm
 MOST_DESIGNS = 6
 INFLATION = 4.0  # of the covariance, so that 95 % of true focal lengths lie within two deviations
 EDGE_ERROR = 0.4  # [px] of the sphere at the picture's edge, which all blocks may have in common
 LEAST_BLOCKS = 4  # of the sphere that a picture shows, by parameter: fewer tell nothing of a deviation
 MOST_SHARE = 0.7  # of a block in what fixes the focal length
-AT_REST, LEAST_CHANGE = 0.25, 5e-4  # deviations, and part of a focal length, that change no more
+AT_REST = 0.25  # deviations that change no more
+LEAST_CHANGE = 5e-4  # part of a focal length that does not
+MAX_CALIBRATIONS = 4  # fits of a focal length
 EDGE = 5  # [px] within the picture's edge that no point may come near
-NEARBY, CLOSE = (FINE_LOSS, 12, 1e-4), (FULL_LOSS, 30, 1e-6)
+NEARBY = (FINE_LOSS, 12, 1e-4)
+CLOSE = (FULL_LOSS, 30, 1e-6)
 
 
 class FocalFit(NamedTuple):
@@ -60,7 +70,7 @@ class FocalFit(NamedTuple):
 
     @property
     def is_at_rest(self) -> bool:
-        """True if the photo need not be put on the sphere anew for what is left of the change."""
+        """True if the photo need not be put on the sphere again for what is left of the change."""
         deviations = np.sqrt(np.diag(self.covariance))
         return bool(np.all(np.abs(self.change) <= np.maximum(AT_REST * deviations, LEAST_CHANGE)))
 
@@ -83,7 +93,7 @@ class FocalFit(NamedTuple):
         return FocalLength(focal, self.deviation * focal, prior.focal, given_std)
 
 
-def changed(camera: Camera, change: Array) -> Camera:
+def change_camera(camera: Camera, change: Array) -> Camera:
     """Change the logarithm of a camera's focal length, and its k1 if `change` (p,) has two numbers."""
     params = dict(zip(MODELS[camera.model][1], camera.params, strict=True))
     for name in FOCALS:
@@ -94,14 +104,6 @@ def changed(camera: Camera, change: Array) -> Camera:
     return replace(camera, params=tuple(float(value) for value in params.values()))
 
 
-class Profile(NamedTuple):
-    """The ends of descents with each of several calibrations."""
-
-    changes: Array  # (K, p) of the camera
-    losses: Array  # (K, B) of each block of the sphere
-    poses: list[Pose]
-
-
 class Crest(NamedTuple):
     """The calibration at which the loss of a profile is least."""
 
@@ -110,13 +112,13 @@ class Crest(NamedTuple):
     motion: Array  # (6, p) as of FocalFit
 
 
-def fit_focal(query: Query, panorama: Panorama, pose: Pose, is_first: bool = True) -> FocalFit:
-    """Fit the focal length of a photo whose pose in the map is about known.
+def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
+    """Fit the focal length of a photo with a focal_prior whose pose in the map is about known.
 
-    The panorama has a focal_prior; `query` is of the same. Not first, it is about known too.
+    Not first, the focal length is about known too.
     """
-    prior = panorama.focal_prior
-    camera = panorama.cameras[0].camera
+    prior = query.photo.given.focal_prior
+    camera = query.photo.given.cameras[0].camera
     assert prior is not None
     names = MODELS[camera.model][1]
     num = 2 if prior.deviation > WIDE and RADIAL in names else 1
@@ -126,9 +128,9 @@ def fit_focal(query: Query, panorama: Panorama, pose: Pose, is_first: bool = Tru
         expected = np.append(expected, prior.view.mount.camera.params[k1] - camera.params[k1])
     precision = np.diag([prior.deviation**-2, K1_DEVIATION**-2][:num])
     reach = min(max(2.5 * prior.deviation, FIRST_REACH[0]), FIRST_REACH[1]) if is_first else LAST_REACH
-    crest = find_crest(query, panorama, pose, num, reach)
+    crest = find_crest(query, pose, num, reach)
     if crest.information.any():
-        per_px = math.tau * camera.focal[0] / (0.5 * camera.width * query.panorama.rgb.shape[1])
+        per_px = math.tau * camera.focal[0] / (0.5 * camera.width * query.photo.panorama.rgb.shape[1])
         covariance = np.linalg.pinv(crest.information)
         covariance[0, 0] += (EDGE_ERROR * per_px) ** 2
         crest = crest._replace(information=np.linalg.pinv(covariance))
@@ -141,7 +143,7 @@ def fit_focal(query: Query, panorama: Panorama, pose: Pose, is_first: bool = Tru
     return FocalFit(change, np.asarray(total), crest.motion, conflict)
 
 
-def find_crest(query: Query, panorama: Panorama, pose: Pose, num: int, reach: float) -> Crest:
+def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
     """Search the crest of the profile about a pose in ever narrower designs, and move those that miss it.
 
     Its information is 0 where no design has a crest: the picture does not tell the calibration.
@@ -149,14 +151,15 @@ def find_crest(query: Query, panorama: Panorama, pose: Pose, num: int, reach: fl
     middle = np.zeros(num)
     found: Crest | None = None
     for _ in range(MOST_DESIGNS):
-        profile = take_profile(query, panorama, pose, middle + design(num, reach))
-        crest = crest_of(profile, pose)
+        changes = middle + design(num, reach)
+        losses, ends = take_profile(query, pose, changes)
+        crest = crest_of(changes, losses, ends, pose)
         has_crest = bool(crest.information.any())
         is_inside = has_crest and bool(np.all(np.abs(crest.change - middle) <= reach))
         if not is_inside and (found is not None or not has_crest):
             break
         middle = np.clip(crest.change, middle - reach, middle + reach)
-        pose = profile.poses[int(np.argmin(np.abs(profile.changes - middle).sum(axis=1)))]
+        pose = ends[int(np.argmin(np.abs(changes - middle).sum(axis=1)))]
         if is_inside:
             found = crest
             if reach <= LAST_REACH:
@@ -172,34 +175,38 @@ def design(num: int, reach: float) -> Array:
     return np.array(list(itertools.product(*scales[:num])))
 
 
-def take_profile(query: Query, panorama: Panorama, pose: Pose, changes: Array) -> Profile:
-    """Descend from a pose with each of several calibrations (K, p) of the photo's camera."""
+def take_profile(query: Query, pose: Pose, changes: Array) -> tuple[Array, list[Pose]]:
+    """Descend from a pose with each of several calibrations (K, p) of the photo's camera.
+
+    Returns the losses (K, B) of each block of the sphere at the ends, and the ends.
+    """
+    given = query.photo.given
     shown = without_occluders(query, pose)
-    is_left = shown.panorama.is_valid | ~query.panorama.is_valid  # what does not contradict the scan
-    camera = panorama.cameras[0].camera
-    width = query.panorama.rgb.shape[1]
+    whole = query.photo.panorama
+    is_left = shown.photo.panorama.is_valid | ~whole.is_valid  # what does not contradict the scan
 
     def taken(change: Array) -> Panorama:
-        found = panorama.retaken(changed(camera, change), width)
+        found = given.retaken(change_camera(given.cameras[0].camera, change), whole.rgb.shape[1])
         return replace(found, is_valid=found.is_valid & is_left)
 
     narrowest = taken(changes.max(axis=0)).is_valid
-    points = within(points_at(shown, pose), pose, narrowest)
-    fine = view_at(shown, pose, query.method.fine_view)
+    points = within(shown.points_at(pose), pose, narrowest)
+    fine = shown.view_at(pose, query.method.fine_view)
     around = without_poles(points.around(pose.center_world), pose)
-    block, middle = blocks_of(around), changes.mean(axis=0)
+    block = blocks_of(around)
+    middle = changes.mean(axis=0)
 
     def end_with(change: Array) -> tuple[Pose, Array]:
-        images = query_images(taken(change), query.method.scales)
+        images = images_of(taken(change), query.method.scales)
         is_near = abs(changes - middle).max() <= 1.001 * LAST_REACH
-        near = pose if is_near else descend(fine, images.fine, pose, NEARBY)
-        end = descend(points, images.full, near, CLOSE)
+        near = pose if is_near else descend(fine, images.fine(), pose, NEARBY)
+        end = descend(points, images.full(), near, CLOSE)
         seen = around.around(end.center_world)
         seen = seen._replace(channels=as_levels(seen.channels))
-        return end, equations_by_block(images.full, seen, end, block)[:, LOSS]
+        return end, equations_by_block(images.full(), seen, end, block)[:, LOSS]
 
-    ends = list(query.workers.map(end_with, list(changes), "fit the focal length"))
-    return Profile(changes, np.array([losses for _, losses in ends]), [end for end, _ in ends])
+    ends = query.workers.map(end_with, list(changes), "fit the focal length")
+    return np.array([losses for _, losses in ends]), [end for end, _ in ends]
 
 
 def within(points: Cells, pose: Pose, is_valid: NDArray[np.bool_]) -> Cells:
@@ -211,17 +218,19 @@ def within(points: Cells, pose: Pose, is_valid: NDArray[np.bool_]) -> Cells:
     return points._replace(weights=points.weights * is_kept.astype(np.float32))
 
 
-def crest_of(profile: Profile, pose: Pose) -> Crest:
+def crest_of(changes: Array, losses: Array, poses: Sequence[Pose], pose: Pose) -> Crest:
     """Find the crest of a profile by a quadratic function (least squares), and how poses follow the camera.
 
+    The changes (K, p) of the camera have losses (K, B) by block and poses; `pose` is that of none.
     The covariance of the crest is H^-1 (sum g g^T) H^-1, with the slope g of each block's loss there.
     """
-    middle, num = profile.changes.mean(axis=0), profile.changes.shape[1]
-    x = profile.changes - middle
+    middle = changes.mean(axis=0)
+    num = changes.shape[1]
+    x = changes - middle
     rows, columns = np.triu_indices(num)
     terms = np.column_stack([np.ones(len(x)), x, x[:, rows] * x[:, columns]])
-    fitted = np.linalg.lstsq(terms, profile.losses, rcond=None)[0]
-    hessians = np.zeros((profile.losses.shape[1], num, num))
+    fitted = np.linalg.lstsq(terms, losses, rcond=None)[0]
+    hessians = np.zeros((losses.shape[1], num, num))
     hessians[:, rows, columns] += fitted[1 + num :].T
     hessians[:, columns, rows] += fitted[1 + num :].T
     H = hessians.sum(axis=0)
@@ -229,10 +238,10 @@ def crest_of(profile: Profile, pose: Pose) -> Crest:
         np.concatenate(
             [log_so3(p.R_cam_from_world @ pose.R_cam_from_world.T), p.center_world - pose.center_world]
         )
-        for p in profile.poses
+        for p in poses
     ]
     motion = np.linalg.lstsq(terms[:, : 1 + num], np.array(moved), rcond=None)[0][1:].T
-    num_blocks = int(profile.losses.any(axis=0).sum())
+    num_blocks = int(losses.any(axis=0).sum())
     if num_blocks < LEAST_BLOCKS * num or not np.linalg.eigvalsh(H)[0] > 0.0:
         return Crest(middle, np.zeros((num, num)), motion)
     offset = -np.linalg.solve(H, fitted[1 : 1 + num].sum(axis=1))
@@ -243,23 +252,40 @@ def crest_of(profile: Profile, pose: Pose) -> Crest:
     return Crest(middle + offset, information, motion)
 
 
-def recalibrated(query: Query, panorama: Panorama, change: Array) -> tuple[Query, Panorama]:
-    """The query and panorama of a photo with another calibration; its matches stay, and their rays follow."""
-    before = panorama.cameras[0]
-    after = before.with_camera(changed(before.camera, change))
-    taken = panorama.retaken(after.camera, panorama.rgb.shape[1])
+def calibrate(query: Query, found: Selection) -> tuple[Query, Selection, FocalFit]:
+    """Fit the focal length at the best pose, and refine the poses with it, until it is at rest."""
+    for k in range(MAX_CALIBRATIONS):
+        fit = fit_focal(query, found.best.pose, is_first=k == 0)
+        if fit.is_at_rest:
+            break
+        query = recalibrate(query, fit.change)
+        poses = [fit.moved(found.best.pose), *(h.pose for h in found.alternatives)]
+        moved = query.workers.map(partial(score_pose, query), poses, "compare")
+        found = refine_to_the_end(query, moved)
+    else:
+        fit = fit_focal(query, found.best.pose, is_first=False)
+    return query, found, fit
+
+
+def recalibrate(query: Query, change: Array) -> Query:
+    """The query of a photo with another calibration; its matches stay, and their rays follow."""
+    given = query.photo.given
+    before = given.cameras[0]
+    after = before.with_camera(change_camera(before.camera, change))
+    taken = given.retaken(after.camera, given.rgb.shape[1])
     fresh = prepare_query(taken, query.scan_map, query.settings, query.workers, query.method)
-    features = tuple(half.then(lambda found: _turned(found, before, after)) for half in query.features)
-    return replace(fresh, features=features, num_halves=query.num_halves), taken
+    features = tuple(Once(partial(_turn_features, half, before, after)) for half in query.features)
+    return replace(fresh, features=features, num_halves=query.num_halves)
 
 
-def _turned(found: Features, before: Mount, after: Mount) -> Features:
+def _turn_features(half: Once[Features], before: Mount, after: Mount) -> Features:
     """Features with the rays that another calibration gives their pixels."""
-    keypoints = found.keypoints._replace(rays=_rays(found.keypoints.rays, before, after))
-    return Features(keypoints, found.matches._replace(rays=_rays(found.matches.rays, before, after)))
+    found = half()
+    keypoints = found.keypoints._replace(rays=_turn_rays(found.keypoints.rays, before, after))
+    return Features(keypoints, found.matches._replace(rays=_turn_rays(found.matches.rays, before, after)))
 
 
-def _rays(rays: NDArray[np.float32], before: Mount, after: Mount) -> NDArray[np.float32]:
+def _turn_rays(rays: NDArray[np.float32], before: Mount, after: Mount) -> NDArray[np.float32]:
     pixels, _ = before.camera.pixels(rotate_points(rays.astype(np.float64), before.rotation))
     found, _ = after.camera.rays(pixels)
     return np.asarray(rotate_points(found, before.rotation.T), np.float32)

@@ -21,8 +21,9 @@ def allowed_by_option(scan_map: ScanMap, prior: Prior) -> dict[str, NDArray[np.b
         allowed["--near"] = distances_to(scan_map, prior.near_world) <= prior.radius + COARSE_SPACING / 2
     if prior.height is not None:
         heights = heights_above_floor(scan_map.octree, scan_map.centers)
-        low, high = prior.height[0] - COARSE_SPACING / 2, prior.height[1] + COARSE_SPACING / 2
-        allowed["--height"] = (heights >= low) & (heights <= high)
+        low, high = prior.height
+        is_high_enough = heights >= low - COARSE_SPACING / 2
+        allowed["--height"] = is_high_enough & (heights <= high + COARSE_SPACING / 2)
     if prior.within:
         allowed["--within"] = candidates_within(scan_map, prior.within)
     return allowed

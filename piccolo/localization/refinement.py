@@ -1,199 +1,311 @@
-"""From starts to poses: successive halving on ever finer views, perturbations, the last millimetres."""
+"""From starts to poses: descents on the cells of ever finer views, successive halving, and perturbations."""
 
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE, Hypothesis, best_distinct, by_score, suppressed
-from ..geometry.pose import Pose
-from ..jobs.once import Once
-from ..views.recent_views import place_of
-from ..views.view import Cells, ViewConfig, normalized_view
-from .comparison import compare, without_occluders
-from .config import Beam
-from .descent import COARSE_LOSS, FINE_LOSS, FULL_LOSS, descend, descend_all, descend_around, score_on
+from ..confidence.alternatives import (
+    MIN_ANGLE,
+    MIN_DISTANCE,
+    Hypothesis,
+    Scored,
+    best_distinct,
+    by_score,
+    suppressed,
+)
+from ..geometry.pose import Pose, orthonormal
+from ..geometry.suppression import non_maximum_suppression
+from ..jobs.threads import Workers
+from ..kernels.jit import F0, kernel
+from ..optimize.channel_loss import descend_channels, score
+from ..optimize.levenberg_marquardt import retract
+from ..panorama.local_normalization import LEVELS_PER_UNIT, ZERO_LEVEL
+from ..panorama.texels import Texels
+from ..scan_map.scan_map import ScanMap
+from ..views.candidate_views import SEARCH_VIEW
+from ..views.view import Cells
+from .comparison import compare, score_pose
 from .query import Query
-from .starts import CLOSE_DISTANCE, SAME_ANGLE, SAME_DISTANCE, Starts, best_and_alternatives, narrow
+from .search import Starts
+from .settings import Beam
 
-FIRST_ITERATIONS, SECOND_ITERATIONS = 5, 12  # of the descents on prepared views
-NUM_SCORED = 64  # starts, where only the best score is asked for
-MIDDLE_LIMITS, FINE_LIMITS = (COARSE_LOSS, 12, 1e-3), (FINE_LOSS, 12, 1e-4)
-FULL_LIMITS, LAST_LIMITS = (FULL_LOSS, 10, 1e-4), (FULL_LOSS, 30, 1e-7)
+COARSE_LOSS = 1.2  # scale of the loss [standard deviations]
+FINE_LOSS = 1.0
+FULL_LOSS = 0.7
+START_TOLERANCE = 2e-3  # [rad + m] a shorter step ends a descent from a start
+PERTURBED_TOLERANCE = 1e-3  # and one from around a pose
+WIDE_ITERATIONS = 6  # of a descent from around a pose, on the wide image
+NARROW_ITERATIONS = 8  # on the other
+PERTURBED_DISTANCE = 0.25  # [m]
+PERTURBED_ANGLE = math.radians(8.0)
+BATCH = 16  # starts that a thread takes at a time
+PERTURBED_BATCH = 3  # of those around a pose
+FIRST_ITERATIONS = 5  # of the first descents on prepared views
+SECOND_ITERATIONS = 12
+MIDDLE_LIMITS = (COARSE_LOSS, 12, 1e-3)
+FINE_LIMITS = (FINE_LOSS, 12, 1e-4)
 PERTURBATION = 0.4  # of that on middle cells, on fine ones
-MAX_UNOCCLUDED = 2  # times that occluders are looked for
-MAX_PERTURBATIONS, MIN_GAIN = 5, 0.02  # rounds; by the score in one, else it was the last
+MAX_PERTURBATIONS = 5  # rounds
+MIN_GAIN = 0.02  # by the score in a round; else it was the last
 NUM_FOUND = 12  # poses of a search, at most
 PLAIN_SCORE, FAINT_PART = 0.2, 0.25  # where the best has this score, no more is asked of what has less of it
-NUM_POINTS = 30_000  # for the last millimetres, in what the photo shows
-MAX_LAST_ROUNDS, SETTLED = 6, 1e-4  # [m] a camera that moves by less in a round has arrived
-NEARLY = 0.02  # [m] and one that does by less sees the same points
-MIN_SCORE_LEFT = 0.94  # of the score, in exchange for millimetres
+SAME_DISTANCE = 0.15  # [m] poses on their way down nearer than this
+SAME_ANGLE = math.radians(5.0)  # and this are one
+CLOSE_DISTANCE = 0.1  # [m] the same after the descent on middle cells
 
 
-def descend_prepared(query: Query, starts: Starts, num_iterations: int, count: int) -> Starts:
-    """Descend from each start on its candidate's prepared view; keep the distinct best and alternatives."""
-    ends = descend_all(query.scan_map, query.images.search, starts, num_iterations, query.workers)
-    return ends.take(best_and_alternatives(ends.R_cam_from_map, ends.center_map, count, SAME_DISTANCE))
-
-
-def descend_middle(query: Query, h: Hypothesis) -> Hypothesis:
-    """Descend on middle cells, seen from where the pose is now."""
-    image, config = query.images.middle, query.method.middle_view
-    cells = view_at(query, h.pose, config)
-    pose = descend(cells, image, h.pose, MIDDLE_LIMITS)
-    return Hypothesis(pose, score_on(cells, config.arrays.blocks, image, pose))
-
-
-def perturb_middle(query: Query, h: Hypothesis) -> Hypothesis:
-    """Descend again from around a pose on middle cells."""
-    config, images = query.method.middle_view, (query.images.search, query.images.middle)
-    cells = view_at(query, h.pose, config)
-    return descend_around(cells, config.arrays.blocks, images, h.pose, 1.0, query.workers)
-
-
-def descend_fine(query: Query, h: Hypothesis) -> Hypothesis:
-    """Descend on fine cells, seen from where the pose is now."""
-    image, config = query.images.fine, query.method.fine_view
-    cells = view_at(query, h.pose, config)
-    pose = descend(cells, image, h.pose, FINE_LIMITS)
-    return Hypothesis(pose, score_on(cells, config.arrays.blocks, image, pose))
-
-
-def refine_by_perturbation(query: Query, h: Hypothesis) -> Hypothesis:
-    """Perturb and refine for as long as the score rises: a pose that stopped short creeps on.
-
-    Where that has ended before, it has ended.
-    """
-    config, images = query.method.fine_view, (query.images.middle, query.images.fine)
-    if h.pose.key in query.ends:
-        return h
-    blocks, cells = config.arrays.blocks, view_at(query, h.pose, config)
-    h = Hypothesis(h.pose, score_on(cells, blocks, query.images.fine, h.pose))
-    for _ in range(MAX_PERTURBATIONS):
-        around = descend_around(cells, blocks, images, h.pose, PERTURBATION, query.workers)
-        refined = descend_fine(query, around)
-        gain = refined.score - h.score
-        h = refined if gain > 0.0 else h
-        if gain < MIN_GAIN * refined.score:
-            break
-        cells = view_at(query, h.pose, config)
-    query.ends.add(h.pose.key)
-    return h
-
-
-def compared(query: Query, h: Hypothesis) -> Hypothesis:
-    """The same pose with the score by which poses are selected."""
-    return Hypothesis(h.pose, compare(query, h.pose).score)
-
-
-def view_at(query: Query, pose: Pose, config: ViewConfig) -> Cells:
-    """The cells seen from about a pose that the photo shows."""
-    place, shown = place_of(pose), query.shown_cells(config.num_rings, pose)
-    return normalized_view(query.views.averages(place, config), place, config, shown)
-
-
-def points_at(query: Query, pose: Pose) -> Cells:
-    """The points that the last descent goes by: those seen from about a pose that the photo shows too."""
-    config = query.method.full_view
-    shown = query.shown_cells(config.num_rings, pose)
-    return query.views.points(place_of(pose), config, shown.tobytes(), NUM_POINTS)
-
-
-def refine_unoccluded(query: Query, h: Hypothesis) -> tuple[Query, Hypothesis]:
-    """A pose refined by what of the photo does not contradict it; the query of just that, and the pose.
-
-    The score is that of `compared`, of the whole photo.
-    """
-    h, shown = compared(query, h), query
-    for _ in range(MAX_UNOCCLUDED):
-        shown = without_occluders(query, h.pose)
-        start = h if shown is query else descend_fine(shown, perturb_middle(shown, h))
-        refined = compared(query, refine_by_perturbation(shown, start))
-        gain = refined.score - h.score
-        h = refined if gain > 0.0 else h
-        if shown is query or gain < MIN_GAIN * refined.score:
-            break
-    return shown, h
-
-
-def refine_full_resolution(query: Query, h: Hypothesis, num_rounds: int) -> Hypothesis:
-    """The last millimetres: the visible points themselves in the finest image, unless the score falls.
-
-    In each round the points are taken anew, from where the pose is then, unless it has hardly moved. The
-    score is that of `compared`.
-    """
-    shown, before = refine_unoccluded(query, h)
-    pose = before.pose
-    for _ in range(num_rounds):
-        center = pose.center_world
-        pose = descend(points_at(shown, pose), shown.images.full, pose, FULL_LIMITS)
-        if math.dist(pose.center_world, center) < NEARLY:
-            break
-    after = compared(query, Hypothesis(pose, 0.0))
-    return after if after.score > MIN_SCORE_LEFT * before.score else before
-
-
-def settle(query: Query, h: Hypothesis) -> Hypothesis:
-    """The same until the pose moves no more, so that it does not depend on where the search began."""
-    pose, shown = h.pose, without_occluders(query, h.pose)
-    for _ in range(MAX_LAST_ROUNDS):
-        center = pose.center_world
-        pose = descend(points_at(shown, pose), shown.images.full, pose, LAST_LIMITS)
-        if math.dist(pose.center_world, center) < SETTLED:
-            break
-    settled = compared(query, Hypothesis(pose, 0.0))
-    return settled if settled.score > MIN_SCORE_LEFT * h.score else h
-
-
-def refine_matched(query: Query, poses: Sequence[Pose]) -> list[Hypothesis]:
-    """Poses that matches gave, refined on fine cells; the best first, by the score of `compared`."""
-
-    def refined(pose: Pose) -> Hypothesis:
-        as_found = Hypothesis(pose, 0.0)
-        ends = as_found, descend_fine(query, as_found)
-        return max((compared(query, end) for end in ends), key=lambda h: h.score)
-
-    return by_score(list(query.workers.map(refined, poses, "descend")))
-
-
-def first_score(query: Query, starts: Starts) -> float:
-    """The best score after a short descent from the best starts on their candidates' prepared views."""
-    some = starts.take(np.arange(min(NUM_SCORED, len(starts.score))))
-    ends = descend_all(query.scan_map, query.images.search, some, FIRST_ITERATIONS, query.workers)
-    return float(ends.score.max(initial=0.0))
+class Fit(Scored):
+    """A pose on its way down; its score is `channel_loss.score` on the cells on which it descended."""
 
 
 def refine(query: Query, starts: Starts, beam: Beam) -> list[Hypothesis]:
-    """Successive halving from the starts to a few poses on fine cells, and the best elsewhere; best first.
+    """Successive halving from the starts to a few poses on fine cells, and the best elsewhere; best first."""
 
-    The score is that of `compared`.
-    """
-
-    def each(function: Callable[[Query, Hypothesis], Hypothesis], some: list[Hypothesis]) -> list[Hypothesis]:
-        return list(query.workers.map(lambda h: function(query, h), some, "descend"))
+    def each(descend_on: Callable[[Query, Pose], Fit], poses: Sequence[Pose]) -> list[Fit]:
+        return query.workers.map(partial(descend_on, query), poses, "descend")
 
     coarse = descend_prepared(query, starts, FIRST_ITERATIONS, beam.num_coarse)
     coarse = descend_prepared(query, coarse, SECOND_ITERATIONS, beam.num_middle)
-    middle = each(descend_middle, coarse.hypotheses())
+    middle = each(descend_middle, coarse.poses())
     perturbed = each(perturb_middle, narrow(middle, beam.num_fine))
     fine = each(descend_fine, narrow(perturbed, beam.num_fine))
     best = best_distinct(fine, beam.num_perturbed, CLOSE_DISTANCE, SAME_ANGLE)
     others = plain(distinct(fine, middle))[len(best) :]  # which most likely stay
-    with query.workers.beside(*(Once(partial(compare, query, h.pose)) for h in others)):
-        ends = each(refine_by_perturbation, best)
-    return by_score(each(compared, plain(distinct([*ends, *fine], middle))))
+    with query.workers.beside(*(partial(compare, query, f.pose) for f in others)):
+        ends = query.workers.map(partial(refine_by_perturbation, query), best, "descend")
+    poses = [f.pose for f in plain(distinct([*ends, *fine], middle))]
+    return by_score(query.workers.map(partial(score_pose, query), poses, "descend"))
 
 
-def distinct(fine: Sequence[Hypothesis], middle: Sequence[Hypothesis]) -> list[Hypothesis]:
+def refine_matches(query: Query, poses: Sequence[Pose]) -> list[Hypothesis]:
+    """Poses that matches gave, each as found or after a descent on fine cells; the best first."""
+
+    def refine_match(pose: Pose) -> Hypothesis:
+        end = descend_fine(query, pose).pose
+        return max(score_pose(query, pose), score_pose(query, end), key=lambda h: h.score)
+
+    return by_score(query.workers.map(refine_match, poses, "descend"))
+
+
+def descend_prepared(query: Query, starts: Starts, num_iterations: int, count: int) -> Starts:
+    """Descend from each start on its candidate's prepared view; keep the distinct best and alternatives."""
+    image = query.photo.images.search()
+    ends, _ = descend_all(query.scan_map, image, starts, num_iterations, query.workers)
+    return ends.take(best_and_alternatives(ends.R_cam_from_map, ends.center_map, count, SAME_DISTANCE))
+
+
+def descend_middle(query: Query, pose: Pose) -> Fit:
+    """Descend on middle cells, seen from where the pose is now."""
+    config = query.method.middle_view
+    image = query.photo.images.middle()
+    cells = query.view_at(pose, config)
+    return fit_on(cells, config.arrays.blocks, image, descend(cells, image, pose, MIDDLE_LIMITS))
+
+
+def perturb_middle(query: Query, pose: Pose) -> Fit:
+    """Descend again from around a pose on middle cells."""
+    config = query.method.middle_view
+    images = query.photo.images.search(), query.photo.images.middle()
+    cells = query.view_at(pose, config)
+    return descend_around(cells, config.arrays.blocks, images, pose, 1.0, query.workers)
+
+
+def descend_fine(query: Query, pose: Pose) -> Fit:
+    """Descend on fine cells, seen from where the pose is now."""
+    config = query.method.fine_view
+    image = query.photo.images.fine()
+    cells = query.view_at(pose, config)
+    return fit_on(cells, config.arrays.blocks, image, descend(cells, image, pose, FINE_LIMITS))
+
+
+def refine_by_perturbation(query: Query, fit: Fit) -> Fit:
+    """Perturb and refine for as long as the score rises: a pose that stopped short creeps on.
+
+    Where that has ended before, it has ended.
+    """
+    if fit.pose.key in query.cache.ends:
+        return fit
+    config = query.method.fine_view
+    blocks = config.arrays.blocks
+    images = query.photo.images.middle(), query.photo.images.fine()
+    cells = query.view_at(fit.pose, config)
+    fit = fit_on(cells, blocks, images[1], fit.pose)
+    for _ in range(MAX_PERTURBATIONS):
+        around = descend_around(cells, blocks, images, fit.pose, PERTURBATION, query.workers)
+        refined = descend_fine(query, around.pose)
+        gain = refined.score - fit.score
+        fit = refined if gain > 0.0 else fit
+        if gain < MIN_GAIN * refined.score:
+            break
+        cells = query.view_at(fit.pose, config)
+    query.cache.ends.add(fit.pose.key)
+    return fit
+
+
+def best_and_alternatives(
+    rotations: NDArray[np.float64], centers: NDArray[np.float64], count: int, min_distance: float
+) -> NDArray[np.int64]:
+    """Indices of `count` of the poses (n, 3, 3), (n, 3), best first, which are in order again.
+
+    The best that differ a little and, in a quarter of the places, the best that lie far apart.
+    """
+    near = non_maximum_suppression(rotations, centers, count - count // 4, min_distance, SAME_ANGLE)
+    apart = non_maximum_suppression(rotations, centers, count, MIN_DISTANCE, MIN_ANGLE)
+    others = apart[~np.isin(apart, near)][: count - len(near)]
+    return np.sort(np.concatenate([near, others]))
+
+
+def narrow(fits: Sequence[Fit], count: int) -> list[Pose]:
+    """The `best_and_alternatives` of poses by their scores."""
+    ranked = [f.pose for f in by_score(fits)]
+    rotations = np.array([pose.R_cam_from_world for pose in ranked])
+    centers = np.array([pose.center_world for pose in ranked])
+    return [ranked[k] for k in best_and_alternatives(rotations, centers, count, CLOSE_DISTANCE)]
+
+
+def distinct(fine: Sequence[Fit], middle: Sequence[Fit]) -> list[Fit]:
     """The best on fine cells, and the best of those on middle cells, none near another."""
-    ranked = [*by_score(fine), *by_score(middle)]
-    return suppressed(ranked, NUM_FOUND, MIN_DISTANCE, MIN_ANGLE)
+    return suppressed([*by_score(fine), *by_score(middle)], NUM_FOUND, MIN_DISTANCE, MIN_ANGLE)
 
 
-def plain(ranked: Sequence[Hypothesis]) -> list[Hypothesis]:
+def plain(ranked: Sequence[Fit]) -> list[Fit]:
     """Those that a comparison could bring near the best: all, unless it is good and they are far from it."""
-    best = max((h.score for h in ranked), default=0.0)
+    best = max((f.score for f in ranked), default=0.0)
     least = FAINT_PART * best if best >= PLAIN_SCORE else -math.inf
-    return [h for h in ranked if h.score >= least]
+    return [f for f in ranked if f.score >= least]
+
+
+@kernel
+def descend_starts(views, cells, image, scale, num_iterations, row, R_cam_from_map, center_map, scores):
+    """Descend from each start, (n, 3, 3) and (n, 3) in place, on the cells of a row (n,) of views."""
+    centers, offsets, unit, features, is_seen = views
+    solid_angle, blocks = cells
+    texels, width = image
+    R = R_cam_from_map
+    t = center_map
+    n = len(solid_angle)
+    points = np.empty((3, n), np.float32)
+    levels = np.empty((3, n), np.float32)
+    weights = np.empty(n, np.float32)
+    for k in range(len(row)):
+        c = row[k]
+        for i in range(3):
+            for j in range(n):
+                points[i, j] = np.float32(offsets[c, i, j]) * unit[c]
+                levels[i, j] = np.float32(features[c, i, j]) + np.float32(ZERO_LEVEL)
+        for j in range(n):
+            weights[j] = solid_angle[j] if is_seen[c, j] else F0
+        for i in range(3):
+            t[k, i] -= centers[c, i]
+        problem = points, levels, weights, texels, width, scale
+        descend_channels(problem, num_iterations, START_TOLERANCE, R[k], t[k])
+        scores[k] = score(points, levels, weights, blocks, texels, width, R[k], t[k])
+        for i in range(3):
+            t[k, i] += centers[c, i]
+
+
+@kernel
+def descend_perturbed(
+    points, levels, weights, blocks, wide, narrow, scale, steps, R_cam_from_map, center, scores
+):
+    """Descend from each step (n, 6) away from (n, 3, 3), (n, 3): on the wide image, then on the other.
+
+    A step that is none is taken on the other alone.
+    """
+    R = R_cam_from_map
+    t = center
+    for k in range(len(steps)):
+        retract(R[k].copy(), t[k].copy(), steps[k], R[k], t[k])
+        first = 1
+        for i in range(6):
+            first = 0 if steps[k, i] != 0.0 else first
+        for image in range(first, 2):
+            texels, width = wide if image == 0 else narrow
+            num_iterations = WIDE_ITERATIONS if image == 0 else NARROW_ITERATIONS
+            problem = points, levels, weights, texels, width, scale
+            descend_channels(problem, num_iterations, PERTURBED_TOLERANCE, R[k], t[k])
+        scores[k] = score(points, levels, weights, blocks, narrow[0], narrow[1], R[k], t[k])
+
+
+def as_levels(channels: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Channels in standard deviations as 8-bit levels, not rounded."""
+    return np.asarray(channels * np.float32(LEVELS_PER_UNIT) + np.float32(ZERO_LEVEL))
+
+
+def perturbations(size: float) -> NDArray[np.float64]:
+    """Steps (9, 6), rotation [rad] and translation [m]: none, then to the corners of a cube."""
+    signs = np.array([(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) / math.sqrt(3.0)
+    steps = np.concatenate([signs[:, ::-1] * PERTURBED_ANGLE, signs * PERTURBED_DISTANCE], axis=1) * size
+    return np.concatenate([np.zeros((1, 6)), steps])
+
+
+def descend_all(
+    scan_map: ScanMap, image: Texels, starts: Starts, num_iterations: int, workers: Workers
+) -> tuple[Starts, NDArray[np.float64]]:
+    """Where descents from starts end, on their candidates' prepared views, best first; with their scores."""
+    R = starts.R_cam_from_map.copy()
+    t = starts.center_map.copy()
+    scores = np.empty(len(t))
+    row, views = scan_map.views.at(starts.candidate, workers)
+    cells = SEARCH_VIEW.arrays.solid_angle, SEARCH_VIEW.arrays.blocks
+    scale = COARSE_LOSS * LEVELS_PER_UNIT
+
+    def run(lo: int) -> None:
+        part = slice(lo, lo + BATCH)
+        some = row[part], R[part], t[part], scores[part]
+        descend_starts(views, cells, (image.rgbx, image.width), scale, num_iterations, *some)
+
+    workers.map(run, range(0, len(t), BATCH), "descend")
+    order = np.argsort(-scores, kind="stable")
+    return Starts(R, t, starts.candidate).take(order), scores[order]
+
+
+def descend(cells: Cells, image: Texels, pose: Pose, limits: tuple[float, int, float]) -> Pose:
+    """The pose where a descent from `pose` ends.
+
+    Limits are the loss' scale [standard deviations], the iterations, the least step [rad + m]. Coordinates
+    relative to the cells' centre keep float32 exact.
+    """
+    loss_scale, num_iterations, tolerance = limits
+    R = pose.R_cam_from_world.copy()
+    t = pose.center_world - cells.center_map
+    scale = loss_scale * LEVELS_PER_UNIT
+    problem = cells.offsets, as_levels(cells.channels), cells.weights, image.rgbx, image.width, scale
+    descend_channels(problem, num_iterations, tolerance, R, t)
+    return Pose(orthonormal(R), t + cells.center_map)
+
+
+def fit_on(cells: Cells, blocks: NDArray[np.int32], image: Texels, pose: Pose) -> Fit:
+    """A pose with its score on cells, each in its block of the sphere."""
+    t = pose.center_world - cells.center_map
+    shown = cells.offsets, as_levels(cells.channels), cells.weights
+    return Fit(pose, float(score(*shown, blocks, image.rgbx, image.width, pose.R_cam_from_world, t)))
+
+
+def descend_around(
+    cells: Cells,
+    blocks: NDArray[np.int32],
+    images: tuple[Texels, Texels],
+    pose: Pose,
+    size: float,
+    workers: Workers,
+) -> Fit:
+    """The best end of descents from around a pose, the wider image first, and from the pose itself."""
+    steps = perturbations(size)
+    R = np.repeat(pose.R_cam_from_world[None], len(steps), axis=0)
+    t = np.repeat((pose.center_world - cells.center_map)[None], len(steps), axis=0)
+    scores = np.empty(len(steps))
+    both = [(image.rgbx, image.width) for image in images]
+    scale = COARSE_LOSS * LEVELS_PER_UNIT
+    problem = cells.offsets, as_levels(cells.channels), cells.weights, blocks, *both, scale
+
+    def run(lo: int) -> None:
+        part = slice(lo, lo + PERTURBED_BATCH)
+        descend_perturbed(*problem, steps[part], R[part], t[part], scores[part])
+
+    workers.map(run, range(0, len(steps), PERTURBED_BATCH), "descend")
+    best = int(np.argmax(scores))
+    return Fit(Pose(orthonormal(R[best]), t[best] + cells.center_map), float(scores[best]))

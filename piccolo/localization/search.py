@@ -1,32 +1,139 @@
 """Score every candidate position with every rotation, and keep the distinct best.
 
-All sums are of whole numbers: exact in any order (turned_panorama.py).
+All sums are of whole numbers that stay below 2^24: exact in float32 in any order, so that matrix products
+come out the same whatever the processor and its BLAS.
 """
 
 import math
 import threading
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.pose import Pose
 from ..geometry.rotations import Gravity, uniform_rotations, uniform_yaws
 from ..geometry.sphere import SEARCH_RINGS, make_grid, whole_areas, wider_cells
 from ..geometry.suppression import non_maximum_suppression
 from ..jobs.memory import check_memory
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, F1, kernel
+from ..panorama.local_normalization import sample_channels
+from ..panorama.texels import Texels
 from ..scan_map.scan_map import ScanMap
 from ..views.candidate_views import WIDE_RINGS
 from .prior import allowed_rotations
 from .query import Query
-from .starts import START_ANGLE, START_DISTANCE, Starts
-from .turned_panorama import MOST_ENERGY, Samples, TurnedPanorama, turn_panorama, turned, whole_scale, widened
 
+EXACT = (1 << 24) - 1  # whole numbers up to this are exact in float32
+MOST_LEVEL = 127.5  # of a channel
+MOST_ENERGY = 3.0 * MOST_LEVEL**2  # of a cell
+ROTATIONS_AT_ONCE = 256  # that a thread averages
+Samples = NDArray[np.float32]
 BLOCK = 512  # views a matrix product, at most
-SCORES_AT_ONCE, LOWEST = 1 << 23, np.float32(-np.inf)  # 32 MB
+SCORES_AT_ONCE = 1 << 23  # 32 MB
+LOWEST = np.float32(-np.inf)
 TURNED_BYTES = 4 * 16  # of a rotation, a cell: channels, validity, energy, and what they are made from
-CANDIDATES_PER_START, POSES_PER_START = 2, 12
+CANDIDATES_PER_START = 2
+POSES_PER_START = 12
+START_DISTANCE, START_ANGLE = 0.5, math.radians(20.0)  # [m], [rad] starts nearer than both are one
+
+
+class TurnedPanorama(NamedTuple):
+    """The panorama on the cells of the sphere, turned many ways; whole numbers."""
+
+    samples: Samples  # (rotations, 3, cells) channels times solid angle
+    energy: Samples  # (rotations, cells) squared channels times solid angle, 0 where nothing is shown
+    validity: Samples  # (rotations, cells) 1 where the panorama shows something
+
+
+def whole(values: Samples, most: float, most_other: int, num_terms: int) -> Samples:
+    """Values up to `most`, scaled and rounded: sums of products with numbers up to another are exact."""
+    return np.asarray(np.rint(values * whole_scale(most, most_other, num_terms)))
+
+
+def whole_scale(most: float, most_other: int, num_terms: int) -> np.float32:
+    """The factor for `whole`."""
+    return np.float32(EXACT // (most_other * num_terms) / most)
+
+
+def turned(samples: Samples, validity: Samples, area: Samples, most_seen: int) -> TurnedPanorama:
+    """Channels (rotations, 3, cells) [levels] and validity (rotations, cells) by area, as whole numbers."""
+    num_cells = len(area)
+    relative = area / area.max()
+    energy = np.square(samples).sum(axis=1) * relative
+    return TurnedPanorama(
+        whole(samples * relative, MOST_LEVEL, 127, 3 * num_cells),
+        whole(energy, MOST_ENERGY, most_seen, num_cells),
+        validity,
+    )
+
+
+def turn_panorama(texels: Texels, rotations: NDArray[np.float64]) -> tuple[Samples, Samples]:
+    """Channels (rotations, 3, cells) of the search grid, in levels, and validity (rotations, cells)."""
+    grid = make_grid(SEARCH_RINGS)
+    samples = np.empty((len(rotations), 3, len(grid)), np.float32)
+    validity = np.empty((len(rotations), len(grid)), np.float32)
+    turns = rotations.astype(np.float32)
+    sample_channels(texels.rgbx, texels.width, grid.directions, turns, samples, validity)
+    return samples, validity
+
+
+@kernel
+def widen(samples, validity, cells, cell_areas, areas, wide_samples, wide_validity):
+    """Write the averages of rounded channels (n, 3, cells) and of validity by area, over wider cells.
+
+    `cells` and `cell_areas` (cells,) tell the wider cell of each and its part of that cell's, of `areas`.
+    Validity is rounded.
+    """
+    for k in range(len(samples)):
+        channels = wide_samples[k]
+        valid = wide_validity[k]
+        channels[:] = F0
+        valid[:] = F0
+        for c in range(len(cells)):
+            wide = cells[c]
+            area = cell_areas[c]
+            for i in range(3):
+                channels[i, wide] += np.rint(samples[k, i, c]) * area
+            valid[wide] += validity[k, c] * area
+        for wide in range(len(areas)):
+            for i in range(3):
+                channels[i, wide] /= areas[wide]
+            valid[wide] = np.rint(valid[wide] / areas[wide])
+
+
+def widened(samples: Samples, validity: Samples, workers: Workers) -> tuple[Samples, Samples]:
+    """Averages (rotations, 3, wide cells) [levels] of channels of the search grid, and of validity."""
+    cells, areas = wider_cells(WIDE_RINGS)
+    parts = cells, whole_areas(SEARCH_RINGS), areas
+    wide = np.empty((len(samples), 3, len(areas)), np.float32)
+    is_valid = np.empty((len(samples), len(areas)), np.float32)
+
+    def average(lo: int) -> None:
+        part = slice(lo, lo + ROTATIONS_AT_ONCE)
+        widen(samples[part], validity[part], *parts, wide[part], is_valid[part])
+
+    workers.map(average, range(0, len(samples), ROTATIONS_AT_ONCE), "search")
+    return wide, is_valid
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Poses in arrays, best first, and the candidate on whose view each descends."""
+
+    R_cam_from_map: NDArray[np.float64]  # (n, 3, 3)
+    center_map: NDArray[np.float64]  # (n, 3) [m]
+    candidate: NDArray[np.int64]  # (n,)
+
+    def take(self, indices: NDArray[np.int64]) -> "Starts":
+        """The starts at `indices`, in that order."""
+        return Starts(*(values[indices] for values in vars(self).values()))
+
+    def poses(self) -> list[Pose]:
+        """One object each."""
+        return [Pose(R, center) for R, center in zip(self.R_cam_from_map, self.center_map, strict=True)]
 
 
 @kernel
@@ -37,39 +144,31 @@ def unpack_views(features, seen, area, values, fractions, energy, total):
     """
     num_cells = len(area)
     for i in range(len(features)):
-        f, s, v, e = features[i], seen[i], values[i], energy[i]
+        f = features[i]
+        v = values[i]
         for c in range(3 * num_cells):
             v[c] = np.float32(f[c])
         whole_total = F0
         for c in range(num_cells):
-            fractions[i, c] = np.float32(s[c])
+            fractions[i, c] = np.float32(seen[i, c])
             square = v[c] * v[c] + v[num_cells + c] * v[num_cells + c]
             square += v[2 * num_cells + c] * v[2 * num_cells + c]
-            e[c] = np.rint(square * area[c])
-            whole_total += e[c]
+            energy[i, c] = np.rint(square * area[c])
+            whole_total += energy[i, c]
         total[i] = whole_total
-
-
-class Unpacked(NamedTuple):
-    """A block of views, and their energies beside each rotation's, as one thread needs them."""
-
-    values: Samples  # (views, 3 * cells)
-    fractions: Samples  # (views, cells)
-    energy: Samples  # (views, cells)
-    total: Samples  # (views,)
 
 
 _local = threading.local()
 
 
-def thread_block(num_views: int, num_cells: int) -> Unpacked:
-    """The calling thread's own block, kept for the next: fresh memory costs as much as the products."""
-    block: Unpacked | None = getattr(_local, "block", None)
-    if block is None or len(block.total) < num_views or block.energy.shape[1] != num_cells:
+def thread_block(num_views: int, num_cells: int) -> list[Samples]:
+    """What `unpack_views` writes, in the thread's own arrays: fresh memory costs as much as the products."""
+    kept: list[Samples] = getattr(_local, "block", [])
+    if not kept or len(kept[0]) < num_views or kept[1].shape[1] != num_cells:
         num_rows = max(BLOCK, num_views)
         shapes = (num_rows, 3 * num_cells), (num_rows, num_cells), (num_rows, num_cells), (num_rows,)
-        block = _local.block = Unpacked(*(np.empty(shape, np.float32) for shape in shapes))
-    return Unpacked(*(each[:num_views] for each in block))
+        kept = _local.block = [np.empty(shape, np.float32) for shape in shapes]
+    return [each[:num_views] for each in kept]
 
 
 def masked_correlation(
@@ -100,7 +199,7 @@ def masked_correlation(
         np.sqrt(np.maximum(norm, F1, out=norm), out=norm)
         scores[lo : lo + size] /= norm
 
-    list(workers.map(correlate, range(0, len(scores), size), "search"))
+    workers.map(correlate, range(0, len(scores), size), "search")
     return scores
 
 
@@ -113,13 +212,15 @@ def best_poses_wide(
     """
     area = wider_cells(WIDE_RINGS)[1]
     panorama = turned(*widened(samples, validity, workers), area, 255)
-    num_views, least = views_at_once(len(samples)), LOWEST
+    num_views = views_at_once(len(samples))
+    least = LOWEST
     sparse, rotation, scores = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32)
     for lo in range(0, len(scan_map.sparse), num_views):
         part = slice(lo, lo + num_views)
         views = scan_map.wide_features[part], scan_map.wide_seen[part]
         row, turn, values = best_poses(masked_correlation(*views, area, panorama, workers), pool, least)
-        sparse, rotation = np.concatenate([sparse, row + lo]), np.concatenate([rotation, turn])
+        sparse = np.concatenate([sparse, row + lo])
+        rotation = np.concatenate([rotation, turn])
         scores = np.concatenate([scores, values])
         best = np.lexsort((rotation, sparse, -scores))[:pool]
         sparse, rotation, scores = sparse[best], rotation[best], scores[best]
@@ -139,8 +240,10 @@ def correlate_pairs(features, is_seen, area, panorama, row, rotation, scores):
     Whole numbers in float64, exact in any order. The area (cells,) is in whole numbers too.
     """
     for k in range(len(scores)):
-        f, s = features[row[k]], panorama.samples[rotation[k]]
-        seen, valid = is_seen[row[k]], panorama.validity[rotation[k]]
+        f = features[row[k]]
+        s = panorama.samples[rotation[k]]
+        seen = is_seen[row[k]]
+        valid = panorama.validity[rotation[k]]
         energies = panorama.energy[rotation[k]]
         product = view_energy = energy = 0.0
         for c in range(len(area)):
@@ -152,46 +255,27 @@ def correlate_pairs(features, is_seen, area, panorama, row, rotation, scores):
         scores[k] = product / math.sqrt(max(view_energy * energy, 1.0))
 
 
-@kernel
-def count_above(flat, threshold, indices):
-    """Write the indices of the values above the threshold, as many as fit. Returns how many there are."""
-    count = 0
-    for i in range(len(flat)):
-        if flat[i] > threshold:
-            if count < len(indices):
-                indices[count] = i
-            count += 1
-    return count
-
-
 def best_poses(
     scores: Samples, pool: int, least: np.float32 = LOWEST
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Samples]:
-    """Candidates, rotations and scores of the best `pool` poses that have more than `least`, best first."""
+    """Candidates, rotations and scores of the best `pool` poses that have more than `least`, best first.
+
+    Of equal ones, the first. Where many have more, those that are sorted are few: a sample tells which.
+    """
     flat = scores.ravel()
     pool = min(pool, flat.size)
-    top = np.empty(min(8 * pool, flat.size), np.int64)
-    count = count_above(flat, least, top) if least > LOWEST else flat.size + 1
-    if count > len(top):
-        threshold = max(likely_threshold(flat, pool), least)
-        count = count_above(flat, threshold, top)
-        if count > len(top):
-            top = np.empty(count, np.int64)
-            count_above(flat, threshold, top)
-        if count < pool and threshold > least:  # many fit alike: a scan of one colour
-            alike = np.flatnonzero(flat == threshold)[: pool - count]
-            top, count = np.concatenate([top[:count], alike]), count + len(alike)
-    top = top[:count]
+    threshold = least
+    if least == LOWEST or np.count_nonzero(flat > least) > 8 * pool:
+        step = max(flat.size // 100_000, 1)
+        sample = flat[::step]
+        rank = len(sample) - 1 - int(min(2 * pool / step + 20, len(sample) - 1))
+        threshold = max(np.partition(sample, rank)[rank] if rank > 0 else LOWEST, least)
+    top = np.flatnonzero(flat > threshold)
+    if len(top) < pool and threshold > least:  # many fit alike: a scan of one colour
+        alike = np.flatnonzero(flat == threshold)[: pool - len(top)]
+        top = np.concatenate([top, alike])
     top = top[np.lexsort((top, -flat[top]))][:pool]
     return *np.divmod(top, scores.shape[1]), flat[top]
-
-
-def likely_threshold(flat: Samples, pool: int) -> np.float32:
-    """A value of a sample that lets about twice the pool through; a smaller share if it was unlucky."""
-    step = max(flat.size // 100_000, 1)
-    sample = flat[::step]
-    rank = len(sample) - 1 - int(min(2 * pool / step + 20, len(sample) - 1))
-    return np.float32(np.partition(sample, rank)[rank]) if rank > 0 else LOWEST
 
 
 def search_poses(query: Query, gravity: Gravity) -> Starts:
@@ -199,11 +283,10 @@ def search_poses(query: Query, gravity: Gravity) -> Starts:
 
     Wide cells of the sparse candidates, as matrix products; then fine cells of the poses that are left.
     """
-    m, settings = query.scan_map, query.settings
-    least = max(len(m.sparse) // CANDIDATES_PER_START, query.method.min_starts)
-    num_starts = min(least, settings.max_starts)
+    m = query.scan_map
+    settings = query.settings
     if gravity == "known":
-        rotations = query.R_cam_from_level @ uniform_yaws(settings.num_yaws)
+        rotations = query.photo.R_cam_from_level @ uniform_yaws(settings.num_yaws)
     else:
         rotations = uniform_rotations(settings.num_rotations)
     rotations = allowed_rotations(rotations @ m.R_map_from_world, settings.prior) @ m.R_map_from_world.T
@@ -211,28 +294,19 @@ def search_poses(query: Query, gravity: Gravity) -> Starts:
     num_bytes = len(rotations) * (len(make_grid(SEARCH_RINGS)) * TURNED_BYTES + 4 * num_views)
     what = f"a search of {len(m.sparse)} positions in {len(rotations)} rotations"
     check_memory(num_bytes, what, "set fewer --num-yaws or --num-rotations")
-    samples, validity = turn_panorama(query.images.search, rotations)
-    pool = num_starts * POSES_PER_START
-    sparse, rotation, _ = best_poses_wide(m, samples, validity, pool, query.workers)
-    R, centers = rotations[rotation], m.centers[m.sparse[sparse]]
+    samples, validity = turn_panorama(query.photo.images.search(), rotations)
+    num_starts = max(len(m.sparse) // CANDIDATES_PER_START, query.method.min_starts)
+    num_starts = min(num_starts, settings.max_starts)
+    sparse, turn, _ = best_poses_wide(m, samples, validity, num_starts * POSES_PER_START, query.workers)
+    candidate = m.sparse[sparse]
+    R, centers = rotations[turn], m.centers[candidate]
     kept = non_maximum_suppression(R, centers, num_starts, START_DISTANCE, START_ANGLE)
-    return rescored(query, m.sparse[sparse[kept]], rotations, rotation[kept], samples, validity)
-
-
-def rescored(
-    query: Query,
-    candidate: NDArray[np.int64],
-    rotations: NDArray[np.float64],
-    rotation: NDArray[np.int64],
-    samples: Samples,
-    validity: Samples,
-) -> Starts:
-    """Some candidates (n,) and rotations (n,) of all (rotations, 3, 3) as starts, by their fine views."""
-    area, scores = make_grid(SEARCH_RINGS).solid_angle, np.empty(len(candidate), np.float32)
-    used, turn = np.unique(rotation, return_inverse=True)
-    panorama = turned(samples[used], validity[used], area, 1)
-    row, views = query.scan_map.views.at(candidate, query.workers)
-    correlate_pairs(views.features, views.is_seen, whole_areas(SEARCH_RINGS), panorama, row, turn, scores)
-    order = np.lexsort((rotation, candidate, -scores))
-    candidate, R = candidate[order], rotations[rotation[order]]
-    return Starts(R, query.scan_map.centers[candidate], candidate, scores[order].astype(np.float64))
+    candidate = candidate[kept]
+    scores = np.empty(len(kept), np.float32)
+    used, row_of_turn = np.unique(turn[kept], return_inverse=True)
+    panorama = turned(samples[used], validity[used], make_grid(SEARCH_RINGS).solid_angle, 1)
+    row, views = m.views.at(candidate, query.workers)
+    areas = whole_areas(SEARCH_RINGS)
+    correlate_pairs(views.features, views.is_seen, areas, panorama, row, row_of_turn, scores)
+    order = np.lexsort((turn[kept], candidate, -scores))
+    return Starts(R[kept][order], centers[kept][order], candidate[order])

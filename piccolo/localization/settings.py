@@ -1,13 +1,15 @@
-"""Settings of the default method."""
+"""What the default method can be asked for, and what it is made of: `benchmark.py ablation` removes parts."""
 
 from dataclasses import asdict, dataclass
-from typing import get_args
+from typing import NamedTuple, get_args
 
 from ..confidence.confidence import MIN_CONFIDENCE, check_confidence
 from ..errors import InputError
 from ..geometry.rotations import Gravity
 from ..optimize.settings import Solver
 from ..scan_map.prior import NOTHING_KNOWN, Prior
+from ..views.candidate_views import SEARCH_VIEW
+from ..views.view import ViewConfig
 
 # at most: a minute and a gigabyte for a flat, far beyond what finds more
 MOST = {"num_yaws": 3600, "num_rotations": 50_000, "max_starts": 100_000}
@@ -29,8 +31,8 @@ class CoarseToFineSettings:
         """Refuse counts that mean nothing, naming the setting."""
         for name, kind in (("gravity", Gravity), ("solver", Solver)):
             if getattr(self, name) not in get_args(kind):
-                found, known = getattr(self, name), ", ".join(get_args(kind))
-                raise InputError(f"{name}: found {found!r}, wanted one of {known}")
+                known = ", ".join(get_args(kind))
+                raise InputError(f"{name}: found {getattr(self, name)!r}, wanted one of {known}")
         for name, most in MOST.items():
             if not 1 <= getattr(self, name) <= most:
                 raise InputError(f"{name}: found {getattr(self, name)}, wanted 1 to {most}")
@@ -39,3 +41,45 @@ class CoarseToFineSettings:
     def to_json(self) -> dict[str, object]:
         """The settings as they took effect."""
         return {"preset": "default", **asdict(self)}
+
+
+class Beam(NamedTuple):
+    """How many poses go on to each stage."""
+
+    num_coarse: int  # after a short descent from each start
+    num_middle: int  # after the descent on prepared views
+    num_fine: int  # after the descent on middle cells
+    num_perturbed: int  # are perturbed and refined for as long as that helps
+
+
+class ImageScale(NamedTuple):
+    """One size of the panorama."""
+
+    width: int  # [px] a multiple of local_normalization's STATS_WIDTH
+    cell_deg: float  # colours are averaged over cells this wide
+    sigma_deg: float  # of the Gaussian in which contrast is judged
+
+
+class ImageScales(NamedTuple):
+    """The sizes at which the panorama is compared, widest first: each is made from the one before."""
+
+    full: ImageScale = ImageScale(1024, 0.0, 10.0)
+    fine: ImageScale = ImageScale(256, 0.0, 10.0)
+    middle: ImageScale = ImageScale(128, 0.0, 14.0)
+    search: ImageScale = ImageScale(128, 7.5, SEARCH_VIEW.sigma_deg)
+
+
+class MethodConfig(NamedTuple):
+    """Views from coarse to fine, the image scales that go with them, and how many poses are kept."""
+
+    middle_view: ViewConfig = ViewConfig(num_rings=48, stats_rings=24, sigma_deg=14.0, voxel_per_range=1 / 30)
+    fine_view: ViewConfig = ViewConfig(num_rings=96, stats_rings=24, sigma_deg=10.0, voxel_per_range=1 / 80)
+    full_view: ViewConfig = ViewConfig(num_rings=96, stats_rings=24, sigma_deg=10.0, voxel_per_range=1 / 150)
+    scales: ImageScales = ImageScales()
+    beam: Beam = Beam(400, 48, 8, 2)
+    uses_features: bool = True
+    uses_search: bool = True  # where features alone are not sure
+    min_starts: int = 1000
+
+
+METHOD = MethodConfig()

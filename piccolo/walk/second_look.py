@@ -12,10 +12,10 @@ from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Progress, no_progress
-from ..localization.config import METHOD
-from ..localization.first_look import CLEAR_SCORE
 from ..localization.localize import localize
 from ..localization.query import Query, prepare_query
+from ..localization.selection import CLEAR_SCORE
+from ..localization.settings import METHOD
 from ..panorama import Panorama
 from .frames import MAX_STEP, Frame, Motion, State, centers_of, states_of
 from .path import REACH_SLACK, Path, lattice_of, places_of
@@ -96,7 +96,7 @@ def _complete(tracker: Tracker, k: int, step: int, read: Read) -> None:
     if panorama is None:
         return
     query = prepare_query(panorama, tracker.scan_map, tracker.settings, tracker.workers)
-    query.make_images()
+    query.photo.make_images()
     for follower, end in zip(missing, followed(query, missing, frame.time, tracker.motion), strict=True):
         more = beside(query, frame.states, end)
         if more is not None and _is_within(tracker, follower, more, frame.time):

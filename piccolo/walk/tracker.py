@@ -11,10 +11,10 @@ from ..geometry.pose import Pose
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
-from ..localization.first_look import CLEAR_SCORE
 from ..localization.localize import localize
 from ..localization.prior import apply_prior
 from ..localization.query import Query, prepare_query
+from ..localization.selection import CLEAR_SCORE
 from ..localization.settings import CoarseToFineSettings
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
@@ -85,7 +85,7 @@ class Tracker:
     def prepared(self, panorama: Panorama) -> Query:
         """The query of a frame, with the images that its descents need."""
         query = prepare_query(panorama, self.scan_map, self.settings, self.workers)
-        query.make_images()
+        query.photo.make_images()
         return query
 
     @one_blas_thread

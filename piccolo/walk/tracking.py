@@ -5,27 +5,24 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE, Hypothesis, suppressed
+from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE, Hypothesis, by_score, suppressed
 from ..confidence.confidence import posterior
 from ..geometry.pose import Pose, exp_so3, log_so3, pose_errors
 from ..geometry.rotations import Gravity
-from ..localization.covariance import estimate_covariance
-from ..localization.descent import FULL_LOSS, descend
-from ..localization.first_look import FIRST_BEAM, first_query, is_rather_mirrored, mirror_score
-from ..localization.prior import apply_prior
-from ..localization.query import Query
-from ..localization.refinement import (
-    compared,
-    descend_fine,
-    descend_middle,
+from ..localization.attempts import (
+    FIRST_BEAM,
+    brief_query,
     first_score,
-    perturb_middle,
-    points_at,
-    refine,
+    is_rather_mirrored,
+    mirror_score,
 )
+from ..localization.comparison import score_pose
+from ..localization.covariance import estimate_covariance
+from ..localization.prior import apply_prior
+from ..localization.query import Cache, Query
+from ..localization.refinement import FULL_LOSS, descend, descend_fine, descend_middle, perturb_middle, refine
 from ..localization.search import search_poses
-from ..localization.search_result import found_among
-from ..localization.standings import standings_of
+from ..localization.selection import rank, standings_of
 from ..scan_map.prior import Prior
 from .frames import OTHER_LOG_ODDS, State, log_ratio
 
@@ -50,24 +47,26 @@ def predicted(before: Pose, earlier: Pose, ratio: float, max_distance: float) ->
 
 def tracked(query: Query, start: Pose, least_score: float) -> Hypothesis:
     """The pose to which a frame descends from one near it, or where it explains less, from farther around."""
-    near = descend_fine(query, descend_middle(query, Hypothesis(start, 0.0)))
+    near = descend_fine(query, descend_middle(query, start).pose)
     if near.score < least_score:
-        near = max([near, descend_fine(query, perturb_middle(query, near))], key=lambda h: h.score)
-    end = descend_last(query, near)
-    return end if end.score >= least_score else max(end, compared(query, near), key=lambda h: h.score)
+        around = descend_fine(query, perturb_middle(query, near.pose).pose)
+        near = max(near, around, key=lambda fit: fit.score)
+    end = descend_last(query, near.pose)
+    if end.score >= least_score:
+        return end
+    return max(end, score_pose(query, near.pose), key=lambda h: h.score)
 
 
 def tracked_on(query: Query, end: Hypothesis) -> Hypothesis:
     """A pose that explains more, farther around one that was tracked; else the same."""
-    around = descend_last(query, descend_fine(query, perturb_middle(query, end)))
+    around = descend_last(query, descend_fine(query, perturb_middle(query, end.pose).pose).pose)
     return max(end, around, key=lambda h: h.score)
 
 
-def descend_last(query: Query, h: Hypothesis) -> Hypothesis:
+def descend_last(query: Query, pose: Pose) -> Hypothesis:
     """The last descent, on the points themselves, with the score by which poses are selected."""
-    points = points_at(query, h.pose)
-    pose = descend(points, query.images.full, h.pose, LAST_LIMITS)
-    return compared(query, Hypothesis(pose, 0.0))
+    pose = descend(query.points_at(pose), query.photo.images.full(), pose, LAST_LIMITS)
+    return score_pose(query, pose)
 
 
 def found_near(query: Query, near: Pose, radius: float, least_score: float) -> list[Hypothesis]:
@@ -76,7 +75,7 @@ def found_near(query: Query, near: Pose, radius: float, least_score: float) -> l
     some = apply_prior(query.scan_map, Prior(near_world=(x, y, z), radius=radius))
     if len(some.sparse) == 0:
         return []
-    close = found_everywhere(replace(query, scan_map=some, comparisons={}, ends=set()), least_score)
+    close = found_everywhere(replace(query, scan_map=some, cache=Cache(query.cache.views)), least_score)
     least = KEPT_BESIDE * max((h.score for h in close), default=0.0)
     ends = query.workers.map(lambda h: tracked(query, h.pose, least), close, "descend")
     return [end for end in ends if end.score >= least]
@@ -87,12 +86,12 @@ def found_everywhere(query: Query, least_score: float) -> list[Hypothesis]:
 
     None if the best has less than a score.
     """
-    first = first_query(query)
+    first = brief_query(replace(query, num_halves=0))
     gravity: Gravity = "unknown" if query.settings.gravity == "unknown" else "known"
     starts = search_poses(first, gravity)
     if first_score(first, starts) < least_score or is_rather_mirrored(first, starts, mirror_score(first)):
         return []
-    found = found_among(refine(first, starts, FIRST_BEAM), MOST_LISTED - 1)
+    found = rank(refine(first, starts, FIRST_BEAM), MOST_LISTED - 1)
     if found.best.score < least_score:
         return []
     least = KEPT_BESIDE * found.best.score
@@ -101,8 +100,7 @@ def found_everywhere(query: Query, least_score: float) -> list[Hypothesis]:
 
 def states_at(query: Query, hypotheses: Sequence[Hypothesis]) -> list[State]:
     """Poses of a frame as states, with the odds that they have by whole views, the best first."""
-    ranked = sorted(hypotheses, key=lambda h: -h.score)
-    ranked = suppressed(ranked, MOST_LISTED, MIN_DISTANCE, MIN_ANGLE)
+    ranked = suppressed(by_score(hypotheses), MOST_LISTED, MIN_DISTANCE, MIN_ANGLE)
     asked = replace(query, num_halves=0)
     best, *others = ranked
     covariance = estimate_covariance(query, best.pose)

@@ -14,9 +14,8 @@ from piccolo.geometry.pose import is_correct
 from piccolo.geometry.rotations import Gravity
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers, num_cores
-from piccolo.localization.config import METHOD, Beam, ImageScales, MethodConfig
 from piccolo.localization.localize import localize
-from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.localization.settings import METHOD, Beam, CoarseToFineSettings, ImageScales, MethodConfig
 from piccolo.panorama import read_panorama
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.scenes.scene import Scene, read_scene

@@ -1,0 +1,133 @@
+"""The last millimetres: the best poses, without what occludes the scan, on its points, until they rest."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+from ..confidence.alternatives import Hypothesis
+from ..geometry.pose import Pose
+from ..local_features.hypotheses import count_matches
+from .comparison import score_pose, without_occluders
+from .query import Query
+from .refinement import (
+    FULL_LOSS,
+    MIN_GAIN,
+    Fit,
+    descend,
+    descend_fine,
+    perturb_middle,
+    refine_by_perturbation,
+)
+from .selection import SURE_MATCHES, Selection, rank, select
+
+HOPELESS_SCORE = 0.02  # of black, white and noisy pictures, and of most views of other places
+FAINT_SCORE, FAINT_MATCHES = 0.1, 6  # nothing that has less of both is ever localized
+NEAR_SCORE = 0.6  # an alternative with this part of the best score is refined as carefully as the best
+NEAR_MATCHES = 0.5  # and so is one with this part of its matches
+MAX_REFINED = 4  # alternatives
+MAX_UNOCCLUDED = 2  # times that occluders are looked for
+NUM_ROUNDS = 2  # of the descent at full resolution
+FULL_LIMITS = (FULL_LOSS, 10, 1e-4)
+LAST_LIMITS = (FULL_LOSS, 30, 1e-7)
+NEARLY = 0.02  # [m] a camera that moves by less in a round sees the same points
+MAX_LAST_ROUNDS = 6
+SETTLED = 1e-4  # [m] one that does by less has arrived
+MIN_SCORE_LEFT = 0.94  # of the score, in exchange for millimetres
+
+
+def refine_to_the_end(query: Query, hypotheses: Sequence[Hypothesis]) -> Selection:
+    """The best of some hypotheses, and the best elsewhere, those near it refined to the same end.
+
+    Where all are faint, the best is refined on fine cells by itself first: if it stays so, no more is asked.
+    """
+    found = rank(hypotheses)
+    if found.best.score < HOPELESS_SCORE:
+        return found
+    if is_faint(query, found):
+        best = refine_unoccluded(query, found.best.pose)[1]
+        found = select(query, rank([best, *found.alternatives]))
+        if is_faint(query, found):
+            return found
+    least = max(NEAR_MATCHES * count_matches(query.matches, found.best.pose), SURE_MATCHES)
+    near: list[Hypothesis] = []
+    far: list[Hypothesis] = []
+    for h in found.alternatives:
+        is_near = h.score > NEAR_SCORE * found.best.score or count_matches(query.matches, h.pose) >= least
+        (near if is_near and len(near) < MAX_REFINED else far).append(h)
+    if not near:
+        best = refine_unoccluded(query, found.best.pose)[1]
+        return settle_best(query, rank([best, *found.alternatives]))
+    poses = [h.pose for h in (found.best, *near)]
+    ends = query.workers.map(partial(refine_full_resolution, query), poses, "descend")
+    return settle_best(query, select(query, rank([*ends, *far])))
+
+
+def is_faint(query: Query, found: Selection) -> bool:
+    """True if neither the best nor any alternative explains much, or has matches that agree with it."""
+    return all(
+        h.score < FAINT_SCORE and count_matches(query.matches, h.pose) < FAINT_MATCHES
+        for h in (found.best, *found.alternatives)
+    )
+
+
+def refine_unoccluded(query: Query, pose: Pose) -> tuple[Query, Hypothesis]:
+    """A pose refined by what of the photo does not contradict it; the query of just that, and the pose.
+
+    Its score is that of the whole photo.
+    """
+    h = score_pose(query, pose)
+    for _ in range(MAX_UNOCCLUDED):
+        shown = without_occluders(query, h.pose)
+        start = Fit(h.pose, h.score)
+        if shown is not query:
+            start = descend_fine(shown, perturb_middle(shown, h.pose).pose)
+        refined = score_pose(query, refine_by_perturbation(shown, start).pose)
+        gain = refined.score - h.score
+        h = refined if gain > 0.0 else h
+        if shown is query or gain < MIN_GAIN * refined.score:
+            break
+    return shown, h
+
+
+def refine_full_resolution(query: Query, pose: Pose) -> Hypothesis:
+    """Descend on the visible points themselves in the finest image, unless the score falls.
+
+    In each round the points are those seen from where the pose is then, unless it has hardly moved.
+    """
+    shown, before = refine_unoccluded(query, pose)
+    pose = descend_on_points(shown, before.pose, FULL_LIMITS, NUM_ROUNDS, NEARLY)
+    after = score_pose(query, pose)
+    return after if after.score > MIN_SCORE_LEFT * before.score else before
+
+
+def settle(query: Query, h: Hypothesis) -> Hypothesis:
+    """Descend until the pose moves no more, so that it does not depend on where the search began."""
+    shown = without_occluders(query, h.pose)
+    settled = score_pose(query, descend_on_points(shown, h.pose, LAST_LIMITS, MAX_LAST_ROUNDS, SETTLED))
+    return settled if settled.score > MIN_SCORE_LEFT * h.score else h
+
+
+def descend_on_points(
+    query: Query, pose: Pose, limits: tuple[float, int, float], num_rounds: int, arrived: float
+) -> Pose:
+    """Descend on the points seen from a pose, and again from where it ends until it moves less than [m]."""
+    for _ in range(num_rounds):
+        center = pose.center_world
+        pose = descend(query.points_at(pose), query.photo.images.full(), pose, limits)
+        if math.dist(pose.center_world, center) < arrived:
+            break
+    return pose
+
+
+def settle_best(query: Query, found: Selection) -> Selection:
+    """Bring the best pose to rest, and if it is not the best any more then, the one that is."""
+    at_rest: list[Hypothesis] = []
+    with query.workers.beside(*query.surroundings_at(found.best.pose)):  # it hardly moves
+        for _ in range(1 + len(found.alternatives)):
+            best = settle(query, found.best)
+            at_rest.append(best)
+            found = select(query, replace(found, best=best))
+            if any(found.best is h for h in at_rest):
+                break
+    return found
