@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from piccolo.cli.parser import add_run_options, new_parser
 
 from piccolo.cli.errors import UsageError, run_command
 from piccolo.cli.outputs import check_distinct, check_outputs, check_suffix
-from piccolo.cli.parser import add_run_options, new_parser
 from piccolo.errors import InputError
 from piccolo.files import atomic
 from piccolo.files.atomic import (

@@ -26,7 +26,7 @@ from piccolo.panorama import picture
 from piccolo.result import Result, read_results
 
 ROOT = Path(__file__).resolve().parents[1]
-PAPER = ["--preset", "paper", "--num-translations", "4", "--num-iterations", "5", "--max-points", "5000"]
+PAPER = ["--preset", "paper", "num_translations=4", "num_iterations=5", "max_points=5000"]
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def counted(monkeypatch):
 
 def _run(scene, out, *more, pano=None):
     cloud, panos = str(scene / "cloud.ply"), pano or [str(scene / "images")]
-    return localize.main(["--cloud", cloud, "--pano", *panos, "--out", str(out), "--no-cache", *more])
+    return localize.main(["--cloud", cloud, "--pano", *panos, "--out", str(out), "--cache", "none", *more])
 
 
 def _lines(out):

@@ -17,7 +17,7 @@ from piccolo.cli import evaluate, localize
 from piccolo.jobs import cluster
 
 ROOT = Path(__file__).resolve().parents[1]
-PAPER = ["--preset", "paper", "--num-translations", "4", "--num-iterations", "5", "--max-points", "5000"]
+PAPER = ["--preset", "paper", "num_translations=4", "num_iterations=5", "max_points=5000"]
 NUM_PHOTOS = 24
 
 

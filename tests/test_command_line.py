@@ -15,10 +15,10 @@ import pytest
 from rooms import errors, query, room
 
 from piccolo.cli import localize, prepare_map
-from piccolo.cli.command import command
+from piccolo.cli.command import command, parse
 from piccolo.cli.errors import UsageError, checking_options
 from piccolo.cli.options import build_parser, cloud_settings_from
-from piccolo.cli.parser import COMMANDS, parse
+from piccolo.cli.start import COMMANDS
 from piccolo.cloud.settings import IN_METRES, CloudSettings
 from piccolo.errors import InputError
 from piccolo.result import Result

@@ -20,12 +20,12 @@ from piccolo.cli import evaluate
 from piccolo.jobs import memory
 from piccolo.panorama import picture
 from piccolo.result import Source
-from piccolo.scenes.evaluation.runner import read_run
+from piccolo.scenes.evaluation.runs import read_run
 from piccolo.scenes.scene import Query, read_scene, write_queries
 
 ROOT = Path(__file__).resolve().parents[1]
-QUICK = ["--preset", "paper", "--quiet", "--max-points", "20000"]
-QUICK += ["--num-translations", "12", "--num-iterations", "30"]
+QUICK = ["--quiet", "--preset", "paper", "max_points=20000"]
+QUICK += ["num_translations=12", "num_iterations=30"]
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from piccolo.scenes.evaluation.query_result import (
     match_results,
     query_result_of,
 )
-from piccolo.scenes.evaluation.runner import read_run
+from piccolo.scenes.evaluation.runs import read_run
 from piccolo.scenes.evaluation.tables import (
     accuracies,
     changes,

@@ -18,7 +18,7 @@ from piccolo.cli import executing, localize
 from piccolo.result import Result
 
 ROOT = Path(__file__).resolve().parents[1]
-PAPER = ["--preset", "paper", "--num-translations", "4", "--num-iterations", "5", "--max-points", "5000"]
+PAPER = ["--preset", "paper", "num_translations=4", "num_iterations=5", "max_points=5000"]
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_several_processes_write_the_same_files(scene, tmp_path, capsys):
             path.mkdir(parents=True)
         words = ["--cloud", str(scene / "cloud.ply"), "--pano", str(bad), str(scene / "images")]
         words += ["--out", str(folder / "out"), "--overlay", str(pictures[0]), "--priors", str(table)]
-        words += ["--occlusion-mask", str(pictures[1]), "--no-cache", "--max-memory", "8"]
+        words += ["--occlusion-mask", str(pictures[1]), "--cache", "none", "--max-memory", "8"]
         assert localize.main([*words, "--jobs", jobs]) == 3
         err = re.sub(r" in [0-9.]+ s", "", capsys.readouterr().err)
         lines = [line for line in err.splitlines() if "%|" not in line]
@@ -139,7 +139,7 @@ def test_a_photo_that_kills_its_processes_is_a_line_that_says_so(scene, tmp_path
 def test_a_signal_ends_all_and_the_same_command_goes_on(scene, many, tmp_path, number, code):
     out, temporary = tmp_path / "poses.jsonl", tmp_path / "temporary"
     temporary.mkdir()
-    words = _words(scene, many[0], "--out", str(out), "--jobs", "2", "--no-cache")
+    words = _words(scene, many[0], "--out", str(out), "--jobs", "2", "--cache", "none")
     options = {"env": {**os.environ, "TMPDIR": str(temporary)}, "start_new_session": True}
     with _process(words, **options) as process:
         _wait_for_lines(process, out, 2)

@@ -21,8 +21,8 @@ from piccolo.geometry.pose import Pose
 from piccolo.result import Result
 
 ROOT = Path(__file__).resolve().parents[1]
-QUICK = ["--no-cache"]
-PAPER = ["--preset", "paper", "--num-translations", "30", "--num-iterations", "60", "--max-points", "30000"]
+QUICK = ["--cache", "none"]
+PAPER = ["--preset", "paper", "num_translations=30", "num_iterations=60", "max_points=30000"]
 
 
 @pytest.fixture(scope="module")
@@ -147,8 +147,8 @@ def test_panorama_from_elsewhere_exits_with_one(scene, tmp_path, capsys):
         (["--threads", "0"], 2, "--threads: found 0, wanted at least 1"),
         (["--scale", "-1"], 2, "--scale: found -1.0"),
         (["--heading-tolerance", "9"], 2, "--heading-tolerance: only with --heading or --priors"),
-        (["--preset", "paper", "--num-translations", "0"], 2, "num_translations: found 0"),
-        (["--num-translations", "9"], 2, "--num-translations: not an option of the preset default"),
+        (["--preset", "paper", "num_translations=0"], 2, "num_translations: found 0"),
+        (["num_translations=9"], 2, "--num-translations: not an option of the preset default"),
         (["--preset", "paper", "--near", "0", "0", "0"], 2, "--near: not an option of the preset paper"),
         (["--preset", "paper", "--refine-focal"], 2, "--refine-focal: not an option of the preset paper"),
         (["--preset", "paper", "--gravity", "auto"], 2, "gravity: found auto"),
@@ -231,7 +231,7 @@ def test_a_signal_leaves_nothing_half_written(scene, tmp_path, number, code, wor
     arguments = _arguments(scene, "--out", str(out))
     terminal, stderr = pty.openpty()
     termios.tcsetwinsize(terminal, (24, 80))
-    command = [sys.executable, str(ROOT / "localize.py"), *arguments, *PAPER, "--num-translations", "5000"]
+    command = [sys.executable, str(ROOT / "localize.py"), *arguments, *PAPER, "num_translations=5000"]
     with subprocess.Popen(command, stderr=stderr, cwd=tmp_path) as process:
         os.close(stderr)
         err = os.read(terminal, 1)  # the bar of the search, which a terminal gets: imports are over

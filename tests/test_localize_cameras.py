@@ -128,7 +128,7 @@ def test_rigs_and_phone_photos_on_the_command_line(tmp_path, capsys):
         instant.mkdir(parents=True)
         for mount in mounts:
             write(instant / mount.image, encoded(picture_by(mount, this, pose, Workers(2)), ".png"))
-    cloud = ["--cloud", str(folder / "cloud.ply"), "--no-cache", "--gravity", "known"]
+    cloud = ["--cloud", str(folder / "cloud.ply"), "--cache", "none", "--gravity", "known"]
     main([*cloud, "--pano", str(tmp_path / "walk"), "--rig", str(rig), "--out", str(tmp_path / "out.jsonl")])
     results = read_results([tmp_path / "out.jsonl"])
     assert [Path(result.pano).name for result in results] == ["1", "2"]

@@ -18,11 +18,11 @@ from piccolo.panorama import ReadOptions
 from piccolo.paper.settings import PaperSettings
 from piccolo.result import Result
 from piccolo.scan_map.open_map import CachePolicy
-from piccolo.scenes.evaluation.runner import Failure, Job, JobRunner
+from piccolo.scenes.evaluation.runs import Failure, Job, JobRunner
 from piccolo.scenes.scene import read_scene
 from piccolo.scenes.synthetic.room import LABEL_NAMES
 
-PAPER = ["--preset", "paper", "--num-translations", "30", "--num-iterations", "60", "--max-points", "30000"]
+PAPER = ["--preset", "paper", "num_translations=30", "num_iterations=60", "max_points=30000"]
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def scene(tmp_path_factory):
 
 
 def _localized(scene, capsys, *options, pano="labels/clean_0.png"):
-    files = ["--cloud", str(scene / "cloud.ply"), "--pano", str(scene / pano), "--no-cache", "--quiet"]
+    files = ["--cloud", str(scene / "cloud.ply"), "--pano", str(scene / pano), "--cache", "none", "--quiet"]
     code = localize.main([*files, *options])
     out, err = capsys.readouterr()
     return (Result.from_json(out) if out else None), code, err

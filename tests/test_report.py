@@ -254,7 +254,7 @@ def test_results_of_another_scan_are_refused_or_told_of_on_the_page(house, tmp_p
     results = [replace(r, source=s) for r, s in zip(scene.results, sources, strict=False)]
     lines = tmp_path / "poses.jsonl"
     lines.write_text("".join(result.to_json() + "\n" for result in results))
-    words = ["--results", str(lines), "--cloud", str(scene.cloud), "--no-cache"]
+    words = ["--results", str(lines), "--cloud", str(scene.cloud), "--cache", "none"]
     for option, name in (("--out", "r"), ("--plan", "p.svg")):
         assert report.main([*words, option, str(tmp_path / name)]) == 3
         line = capsys.readouterr().err.splitlines()[-1]

@@ -14,7 +14,7 @@ import pytest
 from rooms import query, scan_map, write_room
 
 from piccolo.cli import start
-from piccolo.cli.parser import COMMANDS
+from piccolo.cli.start import COMMANDS
 from piccolo.scan_map.map_file import save_map
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -175,7 +175,7 @@ def test_scans_of_nearly_nothing_are_no_error(tmp_path, scene, name):
         points[:, 1] = 0.0
     np.savez(tmp_path / "scan.npz", points=points, colors=colors.astype(np.uint8))
     pano = scene / "images/clean_0.jpg"
-    files = "--cloud", tmp_path / "scan.npz", "--pano", pano, "--no-cache", "--quiet"
+    files = "--cloud", tmp_path / "scan.npz", "--pano", pano, "--cache", "none", "--quiet"
     code, out, err = _shell("", *_command("localize.py", *files))
     result = json.loads(out)
     assert (code, err, result["status"]) == (1, "", "not_localized")
@@ -187,7 +187,7 @@ def test_a_mask_that_hides_all_is_refused(scene, tmp_path):
     cv2.imwrite(str(tmp_path / "mask.png"), np.full((128, 256), 255, np.uint8))
     pano = scene / "images/clean_0.jpg"
     files = "--cloud", scene / "cloud.ply", "--pano", pano, "--mask", tmp_path / "mask.png", "--quiet"
-    code, out, err = _shell("", *_command("localize.py", *files, "--no-cache"))
+    code, out, err = _shell("", *_command("localize.py", *files, "--cache", "none"))
     assert (code, json.loads(out)["status"]) == (3, "unreadable")
     assert "no pixel is left: all are masked" in err
 

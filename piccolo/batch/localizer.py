@@ -15,6 +15,7 @@ from ..cloud.settings import CloudSettings
 from ..files.json_file import reading_once
 from ..jobs.cluster import sent_file
 from ..jobs.memory import limit_memory
+from ..jobs.tasks import WorkerLostError
 from ..jobs.threads import Workers
 from ..localization.settings import CoarseToFineSettings
 from ..opening import open_files
@@ -91,10 +92,10 @@ class Localizer:
         """The scan's path as given, or the paths of its files."""
         return str(self.paths[0]) if len(self.paths) == 1 else tuple(map(str, self.paths))
 
-    def task(self, pano: Path) -> Task:
-        """What is to be done for a panorama."""
+    def task(self, pano: Path, calibration: Calibration | None = None) -> Task:
+        """Return what is to be done for a panorama."""
         files = files_of(pano) if self.sends_photos else None
-        return Task(pano, self.settings_of(pano), files=files)
+        return Task(pano, self.settings_of(pano), calibration, files)
 
     def settings_of(self, pano: Path) -> Settings:
         """The settings of one panorama: its own prior, if it has one."""
@@ -113,8 +114,8 @@ class Localizer:
 
         return lambda pano: expected_of(self.settings_of(pano))
 
-    def opened(self) -> Callable[[Task], Answer]:
-        """What answers tasks in this process, when the scan has been opened for it."""
+    def open(self) -> Callable[[Task], Answer]:
+        """Open the scan in this process; return what answers tasks."""
         limit_memory(self.max_memory)
         return partial(self.answer, self.open_scan(Workers(self.num_threads)))
 
@@ -139,12 +140,15 @@ class Localizer:
                 text, is_passing = failure_of(error)
                 failure = Failure(text.replace(str(path), str(task.pano)), is_passing)
                 source = Source(scan.prepared.scan_sha256 or None, sha256_of(path, self.read_options.rig))
-                return self.failed(task, failure, source)
+                return self._failed(task, failure, source)
         result = named(found, path, task.pano)
         return Answer(result, result.warnings[len(scan.warnings) :], overlay, mask)
 
-    def failed(self, task: Task, failure: Failure, source: Source) -> Answer:
-        """The answer to a task of which nothing but a failure has come."""
+    def lost(self, task: Task, error: WorkerLostError, cloud_sha256: str | None) -> Answer:
+        """Return the answer to a task whose workers were lost."""
+        return self._failed(task, Failure(f"{task.pano}: {error}", is_passing=True), Source(cloud_sha256))
+
+    def _failed(self, task: Task, failure: Failure, source: Source) -> Answer:
         repeated = settings_json(task.settings, self.cloud_settings, self.read_options)
         about = {"settings": repeated, "source": source}
         return Answer(unreadable_result(failure.text, self.name, str(task.pano), failure.is_passing, **about))
