@@ -20,23 +20,14 @@ from .confidence.localization import Alternative, FocalLength, Localization
 from .confidence.score import Evidence
 from .errors import UNPRINTABLE, InputError, is_passing, printable, text_of
 from .files.json_file import document_of, parse_lines, read_bytes
-from .geometry.pose import Pose, checked_rotation
+from .geometry.pose import Pose, T_world_from_cam, checked_rotation, quaternion_wxyz
 from .geometry.sphere import CONVENTION
 from .jobs.memory import is_shortage
-from .result_parts import (
-    POSE_FIELDS,
-    alternative_from_json,
-    alternative_json,
-    covariance_from_json,
-    gps_prior_from_json,
-    pose_json,
-    walk_from_json,
-    walk_json,
-)
 from .scan_map.prior import GpsPrior
-from .walk.localize import WalkFrame
+from .walk.localize import Alone, Gap, WalkFrame
 
 FORMAT = "piccolo-pose/8"
+POSE_FIELDS = ("R_cam_from_world", "center_world", "quaternion_wxyz", "T_world_from_cam")
 UNREADABLE, FAILED = "unreadable", "failed"
 MAX_ROTATION_ERROR = 1e-6  # of R R^T from the identity, in a file
 NO_NAME = re.compile("[\ud800-\udc7f\udd00-\udfff]")  # what os.fsdecode never gives
@@ -147,14 +138,14 @@ class Result:
             "camera": camera_document(self.cameras) if self.cameras else None,
             "focal_length": self.focal_length and asdict(self.focal_length),
             **asdict(self.source),
-            **(pose_json(self.pose) or dict.fromkeys(POSE_FIELDS)),
-            "best_guess": pose_json(self.best_guess),
+            **(_pose_json(self.pose) or dict.fromkeys(POSE_FIELDS)),
+            "best_guess": _pose_json(self.best_guess),
             "scan": self.scan,
             "storey": self.storey,
             "height_above_floor_m": self.height_above_floor,
             "loss": self.loss,
             "evidence": self.evidence and asdict(self.evidence),
-            "alternatives": [alternative_json(alternative) for alternative in self.alternatives],
+            "alternatives": [_alternative_json(alternative) for alternative in self.alternatives],
             "covariance": self.covariance and self.covariance.matrix.tolist(),
             "covariance_convention": COVARIANCE_CONVENTION,
             "std_mm": self.covariance and self.covariance.std_mm.tolist(),
@@ -163,7 +154,7 @@ class Result:
             "convention": CONVENTION,
             "seconds": {stage: round(seconds, 4) for stage, seconds in self.seconds.items()},
             "gps_prior": self.gps_prior and asdict(self.gps_prior),
-            "walk": self.walk and walk_json(self.walk),
+            "walk": self.walk and _walk_json(self.walk),
             "settings": self.settings,
             "warnings": list(self.warnings),
             "version": __version__,
@@ -181,12 +172,12 @@ class Result:
                 source=_source_from_json(document),
                 cameras=mounts_of(document["camera"]) if document.get("camera") else (),
                 focal_length=document["focal_length"] and FocalLength(**document["focal_length"]),
-                gps_prior=gps_prior_from_json(document["gps_prior"]),
+                gps_prior=_gps_prior_from_json(document["gps_prior"]),
                 evidence=document["evidence"] and Evidence(**document["evidence"]),
-                alternatives=tuple(map(alternative_from_json, document["alternatives"])),
-                covariance=covariance_from_json(document),
+                alternatives=tuple(map(_alternative_from_json, document["alternatives"])),
+                covariance=_covariance_from_json(document),
                 height_above_floor=document["height_above_floor_m"],
-                walk=document["walk"] and walk_from_json(document["walk"]),
+                walk=document["walk"] and _walk_from_json(document["walk"]),
                 warnings=tuple(document["warnings"]),
                 **{name: document[name] for name in _PLAIN_FIELDS},
             )
@@ -241,6 +232,71 @@ _PLAIN_FIELDS = (
     "settings",
     "error",
 )
+
+
+def _rotation_and_center(pose: Pose) -> dict[str, object]:
+    return {"R_cam_from_world": pose.R_cam_from_world.tolist(), "center_world": pose.center_world.tolist()}
+
+
+def _pose_json(pose: Pose | None) -> dict[str, object] | None:
+    """A pose in all its forms, POSE_FIELDS."""
+    if pose is None:
+        return None
+    quaternion, T = quaternion_wxyz(pose.R_cam_from_world), T_world_from_cam(pose)
+    other = {"quaternion_wxyz": quaternion.tolist(), "T_world_from_cam": T.tolist()}
+    return {**_rotation_and_center(pose), **other}
+
+
+def _gps_prior_from_json(value: dict[str, Any] | None) -> GpsPrior | None:
+    """Read back `gps_prior`."""
+    return (
+        None if value is None else GpsPrior(tuple(value["center_world"]), value["radius"], value["is_used"])
+    )
+
+
+def _covariance_from_json(document: dict[str, Any]) -> PoseCovariance | None:
+    """The covariance in the fields of a result."""
+    matrix = document["covariance"]
+    return (
+        None if matrix is None else PoseCovariance(np.array(matrix), document["least_constrained_direction"])
+    )
+
+
+def _alternative_json(alternative: Alternative) -> dict[str, object]:
+    """An alternative: its pose as rotation and centre, and what speaks for it."""
+    numbers = {f.name: getattr(alternative, f.name) for f in fields(alternative) if f.name != "pose"}
+    return _rotation_and_center(alternative.pose) | numbers
+
+
+def _alternative_from_json(document: dict[str, Any]) -> Alternative:
+    """Read back an alternative."""
+    pose = Pose(np.array(document["R_cam_from_world"]), np.array(document["center_world"]))
+    return Alternative(pose, **{f.name: document[f.name] for f in fields(Alternative) if f.name != "pose"})
+
+
+def _walk_json(walk: WalkFrame) -> dict[str, object]:
+    """What a walk says of a frame."""
+    alone: dict[str, object] | None = None
+    if walk.alone is not None:
+        about = {"status": walk.alone.status, "confidence": walk.alone.confidence}
+        alone = {**about, **(_pose_json(walk.alone.pose) or dict.fromkeys(POSE_FIELDS))}
+    return {
+        "frame": walk.frame,
+        "time": walk.time,
+        "how": walk.how,
+        "alone": alone,
+        "gap": walk.gap and asdict(walk.gap),
+    }
+
+
+def _walk_from_json(value: dict[str, Any]) -> WalkFrame:
+    """Read back `walk`."""
+    gap, alone = value["gap"], value["alone"]
+    if alone is not None:
+        R, center = alone["R_cam_from_world"], alone["center_world"]
+        pose = None if R is None else Pose(np.array(R), np.array(center))
+        alone = Alone(alone["status"], alone["confidence"], pose)
+    return WalkFrame(value["time"], value["frame"], value["how"], alone, gap and Gap(**gap))
 
 
 def _source_from_json(document: dict[str, Any]) -> Source:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .camera import Calibration
 from .confidence.localization import Localization
 from .files.json_file import reading_once
 from .jobs.stopwatch import Stopwatch
@@ -56,6 +57,11 @@ class Prepared(NamedTuple):
     query: Query | None
 
 
+def photo_facts(picture: Picture, rig: Calibration | None) -> Photo:
+    """Return what is known of a photo beside its pixels."""
+    return photo_of_array(picture) if isinstance(picture, np.ndarray) else photo_of(Path(picture), rig)
+
+
 class Walk:
     """A camera followed through a scan: `add` frames in order; `finish` tells what all say together."""
 
@@ -79,7 +85,7 @@ class Walk:
             try:
                 with watch.stage("read"):
                     panorama = replace(read_query(frame, self.read_options), focal_prior=None)  # as exact
-                    photo = self._photo(frame)
+                    photo = photo_facts(frame, self.read_options.rig)
             except Exception as error:
                 text, is_passing = failure_of(error)
                 if isinstance(frame, np.ndarray):
@@ -166,11 +172,6 @@ class Walk:
         if taken.failure is not None:
             return None
         return replace(read_query(taken.picture, self.read_options), focal_prior=None)
-
-    def _photo(self, frame: Picture) -> Photo:
-        if isinstance(frame, np.ndarray):
-            return photo_of_array(frame)
-        return photo_of(Path(frame), self.read_options.rig)
 
     def _result(self, taken: Taken, found: Localization, walk: WalkFrame | None) -> Result:
         """The result of a frame; one that can't be read keeps its place in the walk."""

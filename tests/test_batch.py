@@ -20,7 +20,7 @@ from piccolo.batch import localizer as module
 from piccolo.batch.inputs import panoramas_of
 from piccolo.cli import localize
 from piccolo.errors import InputError
-from piccolo.files.line_file import appending, whole_lines, whole_size
+from piccolo.files.line_file import locked, whole_lines, whole_size
 from piccolo.jobs import memory
 from piccolo.panorama import picture
 from piccolo.result import Result, read_results
@@ -405,17 +405,13 @@ def test_names_on_standard_input_are_answered_as_they_come(scene):
 
 def test_two_processes_do_not_write_one_file(tmp_path):
     out = tmp_path / "poses.jsonl"
-    with appending(out, 0) as append:
-        append('{"a": 1}')
-        with pytest.raises(InputError, match="another process is writing it"), appending(out, 0):
-            pass
-    assert out.read_text() == '{"a": 1}\n'
-    with pytest.raises(InputError, match="has written it since"), appending(out, 0):
-        pass
-    with appending(out, whole_size(out, b"{", "a test")) as append:
-        append('{"b": 2}')
-    assert list(whole_lines(out, out.stat().st_size)) == [b'{"a": 1}\n', b'{"b": 2}\n']
-    with appending(tmp_path / "new", 0):
+    for line in ('{"a": 1}', '{"b": 2}'):
+        with locked(out) as file:
+            file.append(line)
+            with pytest.raises(InputError, match="another process is writing it"), locked(out):
+                pass
+    assert list(whole_lines(out, whole_size(out, b"{", "a test"))) == [b'{"a": 1}\n', b'{"b": 2}\n']
+    with locked(tmp_path / "new"):
         pass
     assert not (tmp_path / "new").exists()
 
@@ -424,15 +420,15 @@ def test_a_file_that_was_removed_before_it_was_locked_is_opened_again(tmp_path, 
     """The first of two writes nothing and removes the file, which the second has opened before."""
     out, flock = tmp_path / "poses.jsonl", fcntl.flock
     first = contextlib.ExitStack()
-    first.enter_context(appending(out, None))
+    first.enter_context(locked(out))
 
     def flock_late(handle, how):
         first.close()
         flock(handle, how)
 
     monkeypatch.setattr(fcntl, "flock", flock_late)
-    with appending(out, None) as append:
-        append("{}")
+    with locked(out) as file:
+        file.append("{}")
     assert out.read_text() == "{}\n"
 
 
@@ -440,11 +436,11 @@ def test_a_full_disk_keeps_the_lines_before(tmp_path):
     code = (
         "import resource, sys\n"
         "from pathlib import Path\n"
-        "from piccolo.files.line_file import appending\n"
+        "from piccolo.files.line_file import locked\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
-        "with appending(Path(sys.argv[1]), 0) as append:\n"
+        "with locked(Path(sys.argv[1])) as file:\n"
         "    for k in range(9):\n"
-        "        append(str(k) * 300)\n"
+        "        file.append(str(k) * 300)\n"
     )
     out = tmp_path / "lines"
     done = subprocess.run(

@@ -88,7 +88,7 @@ def test_other_settings_do_not_go_into_the_same_file(scenes, tmp_path, capsys):
     out = tmp_path / "run.jsonl"
     assert _run(scenes, out, "--variants", "far") == 0
     before = out.read_bytes()
-    assert _run(scenes, out, "--solver", "lbfgs") == 3
+    assert _run(scenes, out, "--preset", *QUICK[2:], "solver=lbfgs") == 3
     assert "its results were made with solver 'adam', not 'lbfgs'" in capsys.readouterr().err
     assert out.read_bytes() == before
 
@@ -248,7 +248,7 @@ def _running(scenes, tmp_path, num_translations):
     out = tmp_path / "run.jsonl"
     tool = str(ROOT / "tools" / "evaluate.py")
     command = [sys.executable, tool, "--scenes", str(scenes), "--out", str(out), "--jobs", "2"]
-    command += ["--preset", "paper", "--num-translations", str(num_translations), "--quiet"]
+    command += ["--preset", "paper", f"num_translations={num_translations}", "--quiet"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True) as process:
         while not out.exists():
             time.sleep(0.1)
@@ -268,7 +268,7 @@ def test_interrupt_ends_all_processes_without_a_traceback(scenes, tmp_path):
     with _running(scenes, tmp_path, 3000) as process:
         os.killpg(process.pid, signal.SIGINT)
         assert process.wait(timeout=60) == 130
-        assert process.stderr.read() == b"evaluate.py: interrupted\n"
+        assert process.stderr.read().endswith(b"evaluate.py: interrupted\n")
     assert _ends(process.pid)
 
 
@@ -280,7 +280,7 @@ def test_interrupt_ends_all_processes_without_a_traceback(scenes, tmp_path):
         ("--scenes x --out y --jobs 0", "--jobs: found 0"),
         ("--scenes x --out y --max-distance -1", "--max-distance, --max-angle: wanted numbers above 0"),
         ("--compare a b --csv c", "--csv, --risk: not with --compare"),
-        ("--scenes x --out y --num-translations 9", "not an option of the preset default"),
+        ("--scenes x --out y --preset paper --refine-focal", "not an option of the preset paper"),
     ],
 )
 def test_wrong_usage(words, message, capsys):

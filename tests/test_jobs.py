@@ -188,7 +188,7 @@ def test_as_many_processes_as_are_worth_it_and_fit(monkeypatch):
     monkeypatch.setattr(executing, "num_cores", lambda: 4)
 
     def wanted(num_left, jobs=None, threads=None):
-        return executing.wanted_jobs(argparse.Namespace(jobs=jobs, threads=threads), num_left)
+        return executing.count_jobs(argparse.Namespace(jobs=jobs, threads=threads), num_left)
 
     assert [wanted(count) for count in (1, 15, 16, 31, 32, 1000, None)] == [1, 1, 2, 3, 4, 4, 1]
     assert [wanted(1000, threads=2), wanted(3, jobs=8), wanted(None, jobs=8), wanted(0, jobs=2)] == [
@@ -199,8 +199,8 @@ def test_as_many_processes_as_are_worth_it_and_fit(monkeypatch):
     ]
     monkeypatch.setattr(executing, "memory_taken", lambda: 1.5e9)
     monkeypatch.setattr(executing, "memory_left", lambda: 4.6e9)
-    assert executing.fitting_jobs(argparse.Namespace(jobs=None), 8) == 3
-    assert executing.fitting_jobs(argparse.Namespace(jobs=8), 8) == 8
+    assert executing.count_fitting(argparse.Namespace(jobs=None), 8) == 3
+    assert executing.count_fitting(argparse.Namespace(jobs=8), 8) == 8
     arguments = argparse.Namespace(jobs=2, threads=None, max_memory=5.5, dask=None)
     localizer = localize.Localizer((), None, None, None, None)
     share = executing.share_of_a_job(arguments, localizer, 2)

@@ -294,7 +294,7 @@ def test_in_python(house, tmp_path):
     assert page == tmp_path / "r" / "index.html"
     assert _document(tmp_path / "r")["title"] == "A walk"
     assert ("photos", 6, 6) in told
-    with pytest.raises(TypeError, match="no option 'titel'"):
+    with pytest.raises(TypeError, match="unexpected keyword argument 'titel'"):
         piccolo.write_report(results, scan, tmp_path / "r", titel="x")
     with pytest.raises(InputError, match="found 1 names, wanted 2"):
         piccolo.write_report(results, str(scene.cloud), tmp_path / "r", storeys=["Ground floor"])

@@ -21,9 +21,8 @@ from ..localization.settings import CoarseToFineSettings
 from ..opening import open_files
 from ..panorama import ReadOptions, read_panorama
 from ..panorama.photo import sha256_of
-from ..query_options import Settings
 from ..result import Failure, Result, Source, failure_of, named, unreadable_result
-from ..scan import Scan, settings_json
+from ..scan import Scan, Settings, settings_json
 from ..scan_map.map_file import load_map
 from ..scan_map.open_map import CachePolicy
 from ..views.surfel_renderer import encode_image, overlay_png

@@ -17,7 +17,7 @@ from ..localization.settings import CoarseToFineSettings
 from ..panorama import ReadOptions
 from ..panorama.model import Projection
 from ..paper.settings import PaperSettings
-from ..query_options import Settings
+from ..scan import Settings
 from ..scan_map.open_map import CachePolicy
 from ..scan_map.prior import Prior
 from ..walk.frames import MAX_SPEED

@@ -1,4 +1,4 @@
-"""A run over scenes on disk: one JSON line a query, appended as it comes, so that a stopped one is resumed."""
+"""A run over scenes on disk, one JSON line a query, appended as it comes, so that a stopped one goes on."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
