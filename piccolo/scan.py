@@ -242,7 +242,7 @@ class Scan:
         is_masked: NDArray[np.bool_] | None = None,
         calibration: Calibration | None = None,
     ) -> Result:
-        """Localize a photo, all options as objects; apart the mask of an array and the camera of this photo."""
+        """Localize a photo, all options as objects; apart a mask that is an array, and the photo's camera."""
         watch = Stopwatch()
         repeated = settings_json(settings, self.cloud_settings, read_options)
         if calibration is not None and read_options.calibration is None:

@@ -89,7 +89,7 @@ def test_other_settings_do_not_go_into_the_same_file(scenes, tmp_path, capsys):
     assert _run(scenes, out, "--variants", "far") == 0
     before = out.read_bytes()
     assert _run(scenes, out, "--preset", *QUICK[2:], "solver=lbfgs") == 3
-    assert "its results were made with solver 'adam', not 'lbfgs'" in capsys.readouterr().err
+    assert "run.jsonl: made with solver 'adam', not 'lbfgs'" in capsys.readouterr().err
     assert out.read_bytes() == before
 
 

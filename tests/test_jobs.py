@@ -14,7 +14,7 @@ import pytest
 from rooms import write_room
 
 from piccolo.batch.localizer import Localizer
-from piccolo.cli import executing, localize
+from piccolo.cli import evaluate, executing, localize
 from piccolo.result import Result
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -94,16 +94,6 @@ def test_several_processes_write_the_same_files(scene, tmp_path, capsys):
     ]
 
 
-def test_a_killed_process_costs_nothing(scene, many, tmp_path):
-    out = tmp_path / "poses.jsonl"
-    with _process(_words(scene, many[0], "--out", str(out), "--jobs", "2")) as process:
-        _wait_for_lines(process, out, 2)
-        os.kill(_workers_of(process)[0], signal.SIGKILL)
-        assert process.stderr.read() == ""
-        assert process.wait() < 2
-    assert _untimed(out) == many[1]
-
-
 class Deadly(Localizer):
     """Localizes; one photo kills the process at work on it."""
 
@@ -118,34 +108,33 @@ def test_a_photo_that_kills_its_processes_is_a_line_that_says_so(scene, tmp_path
     deadly.write_bytes((scene / "images" / "clean_0.jpg").read_bytes())
     monkeypatch.setattr(localize, "Localizer", Deadly)
     panos = tmp_path / "list.txt"
-    names = [str(scene / "images" / "clean_1.jpg"), str(deadly), str(scene / "images" / "clean_2.jpg")] * 2
+    names = [str(scene / "images" / "clean_1.jpg"), str(deadly), str(scene / "images" / "clean_2.jpg")]
     panos.write_text("\n".join(names))
     out = tmp_path / "poses.jsonl"
     assert localize.main(_words(scene, f"@{panos}", "--out", str(out), "--jobs", "2")) == 3
     error = f"{deadly}: each of 2 processes at work on it was killed by SIGKILL"
-    assert capsys.readouterr().err == f"localize.py: {error}\n" * 2
+    assert capsys.readouterr().err == f"localize.py: {error}\n"
     results = [Result.from_json(line) for line in out.read_text().splitlines()]
     assert [result.pano for result in results] == names
-    assert [result.status == "failed" for result in results] == [False, True, False] * 2
+    assert [result.status == "failed" for result in results] == [False, True, False]
     assert results[1].error == error
     monkeypatch.undo()
-    assert localize.main(_words(scene, f"@{panos}", "--out", str(out), "--jobs", "1")) < 2  # both once more
+    assert localize.main(_words(scene, f"@{panos}", "--out", str(out), "--jobs", "1")) < 2  # it once more
     results = [Result.from_json(line) for line in out.read_text().splitlines()]
     assert [result.pano for result in results] == names
     assert "failed" not in {result.status for result in results}
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_ends_all_and_the_same_command_goes_on(scene, many, tmp_path, number, code):
+def test_a_signal_ends_all_and_the_same_command_goes_on(scene, many, tmp_path):
     out, temporary = tmp_path / "poses.jsonl", tmp_path / "temporary"
     temporary.mkdir()
     words = _words(scene, many[0], "--out", str(out), "--jobs", "2", "--cache", "none")
     options = {"env": {**os.environ, "TMPDIR": str(temporary)}, "start_new_session": True}
     with _process(words, **options) as process:
         _wait_for_lines(process, out, 2)
-        os.killpg(process.pid, number)
+        os.killpg(process.pid, signal.SIGTERM)
         err = process.stderr.read()
-        assert process.wait() == code
+        assert process.wait() == 143
     assert "the same command goes on from here" in err
     assert "Traceback" not in err
     assert list(temporary.iterdir()) == []
@@ -156,15 +145,17 @@ def test_a_signal_ends_all_and_the_same_command_goes_on(scene, many, tmp_path, n
     assert _untimed(out) == many[1]
 
 
-def test_a_killed_parent_takes_its_workers_along_and_leaves_whole_lines(scene, many, tmp_path):
+def test_a_killed_process_costs_nothing_and_a_killed_parent_leaves_whole_lines(scene, many, tmp_path):
     out = tmp_path / "poses.jsonl"
     words = _words(scene, many[0], "--out", str(out), "--jobs", "2")
     with _process(words) as process:
         _wait_for_lines(process, out, 2)
+        os.kill(_workers_of(process)[0], signal.SIGKILL)
+        _wait_for_lines(process, out, 9)
         workers = _workers_of(process)
         process.kill()
         process.stderr.read()  # until all have ended that had it open
-    assert len(workers) == 2
+    assert 1 <= len(workers) <= 2
     assert not any(Path(f"/proc/{id_}/exe").exists() for id_ in workers)
     assert localize.main(words) < 2
     assert _untimed(out) == many[1]
@@ -207,24 +198,23 @@ def test_as_many_processes_as_are_worth_it_and_fit(monkeypatch):
     assert (share.num_threads, share.max_memory) == (2, 2.0)
 
 
-def test_evaluations_share_a_scene_and_survive_a_killed_process(scene, tmp_path):
-    whole, out = tmp_path / "whole.jsonl", tmp_path / "run.jsonl"
-    tool = [sys.executable, str(ROOT / "tools" / "evaluate.py"), "--scenes", str(scene), "--quiet", *PAPER]
-    many = tmp_path / "scene"
+def test_an_evaluation_survives_a_killed_process(scene, tmp_path, capsys):
+    whole, out, many = tmp_path / "whole.jsonl", tmp_path / "run.jsonl", tmp_path / "scene"
     many.mkdir()
     document = json.loads((scene / "queries.json").read_text())
     (many / "cloud.ply").hardlink_to(scene / "cloud.ply")
     queries = []
-    for k in range(30):
+    for k in range(16):
         query = dict(document["queries"][k % 3])
         (many / f"{k}.jpg").hardlink_to(scene / query["image"])
         queries.append({**query, "image": f"{k}.jpg"})
     (many / "queries.json").write_text(json.dumps({**document, "queries": queries}))
-    tool[3] = str(many)
-    subprocess.run([*tool, "--out", str(whole)], check=True, stdout=subprocess.DEVNULL)
-    with subprocess.Popen([*tool, "--out", str(out), "--jobs", "2"], stdout=subprocess.DEVNULL) as process:
+    words = ["--scenes", str(many), "--quiet", *PAPER]
+    assert evaluate.main([*words, "--out", str(whole)]) == 0
+    tool = [sys.executable, str(ROOT / "tools" / "evaluate.py"), *words, "--out", str(out), "--jobs", "2"]
+    with subprocess.Popen(tool, stdout=subprocess.DEVNULL) as process:
         _wait_for_lines(process, out, 1)
         os.kill(_workers_of(process)[0], signal.SIGKILL)
         assert process.wait() == 0
     assert _untimed(out) == _untimed(whole)
-    assert _untimed(whole).count("\n") == 30
+    assert _untimed(whole).count("\n") == 16

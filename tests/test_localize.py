@@ -136,7 +136,7 @@ def test_many_panoramas_one_line_each_and_one_bad_among_them(scene, tmp_path, ca
 def test_panorama_from_elsewhere_exits_with_one(scene, tmp_path, capsys):
     elsewhere = tmp_path / "elsewhere.png"
     cv2.imwrite(str(elsewhere), query(1).rgb)
-    code = localize.main(["--cloud", str(scene / "cloud.ply"), "--pano", str(elsewhere), *QUICK, "--quiet"])
+    code = localize.main(["--cloud", str(scene / "cloud.ply"), "--pano", str(elsewhere), *PAPER, "--quiet"])
     assert code == 1
     assert json.loads(capsys.readouterr().out)["status"] == "not_localized"
 
@@ -151,7 +151,7 @@ def test_panorama_from_elsewhere_exits_with_one(scene, tmp_path, capsys):
         (
             ["--preset", "default", "num_translations=9"],
             2,
-            "default: found 'num_translations=9', wanted NAME",
+            "found 'num_translations=9', wanted NAME",
         ),
         (["--preset", "paper", "loss=both"], 2, "found 'loss=both', wanted one of sampling, photometric"),
         (["--preset", "paper", "use_visibility=no"], 2, "found 'use_visibility=no', wanted one of true, fal"),
@@ -222,10 +222,7 @@ def _process(arguments, **options):
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
 
 
-@pytest.mark.parametrize(
-    ("number", "code", "word"), [(signal.SIGINT, 130, "Ctrl-C"), (signal.SIGTERM, 143, "SIGTERM")]
-)
-def test_a_signal_leaves_nothing_half_written(scene, tmp_path, number, code, word):
+def test_a_signal_leaves_nothing_half_written(scene, tmp_path):
     out = tmp_path / "pose.json"
     arguments = _arguments(scene, "--out", str(out))
     terminal, stderr = pty.openpty()
@@ -234,14 +231,14 @@ def test_a_signal_leaves_nothing_half_written(scene, tmp_path, number, code, wor
     with subprocess.Popen(command, stderr=stderr, cwd=tmp_path) as process:
         os.close(stderr)
         err = os.read(terminal, 1)  # the bar of the search, which a terminal gets: imports are over
-        process.send_signal(number)
+        process.send_signal(signal.SIGTERM)
         with contextlib.suppress(OSError):  # the end
             while part := os.read(terminal, 4096):
                 err += part
     os.close(terminal)
-    assert process.returncode == code
+    assert process.returncode == 143
     assert b"Traceback" not in err
-    assert f"localize.py: ended by {word} after 0 results".encode() in err
+    assert b"localize.py: ended by SIGTERM after 0 results" in err
     assert list(tmp_path.iterdir()) == []
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+from ..jobs.memory import check_address_space
 from .errors import UsageError, handling_errors, print_note
 from .start import as_started
 
@@ -114,6 +115,7 @@ def command(
             add_options(parser)
             arguments = parse(parser, argv)
             with handling_errors(arguments) as outcome:
+                check_address_space()
                 outcome.exit_code = run(arguments)
             return outcome.exit_code
 

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from ..confidence.confidence import LOCALIZED
 from ..errors import InputError, printable, text_of
-from ..jobs.memory import check_address_space, is_shortage
+from ..jobs.memory import is_shortage
 from ..result import FAILED, UNREADABLE
 from .progress import log_shown
 from .start import EXIT_INTERRUPTED, EXIT_TERMINATED, as_started
@@ -67,7 +67,6 @@ def handling_errors(arguments: argparse.Namespace) -> Iterator[Outcome]:
     lost: list[KeyboardInterrupt] = []
     try:
         with log_shown(arguments.quiet), raising_signals(lost):
-            check_address_space()
             yield outcome
             sys.stdout.flush()  # here, where a closed pipe is caught
     except KeyboardInterrupt as stop:

@@ -87,11 +87,11 @@ class Evaluation:
             return scan
 
         localizer = replace(self.config, paths=(scene.cloud,))
-        if localizer.read_options.labels:
+        if has_labels := localizer.read_options.labels is not None:
             for query in queries:
                 if query.labels is None:
                     self.report(f"{scene.folder}: {scene.name_of(query)} has no labels in queries.json")
-            queries = [replace(query, image=query.labels) for query in queries if query.labels]
+            queries = [query for query in queries if query.labels]
         num_jobs = count_jobs(self.arguments, len(queries))
         with ExitStack() as stack:
             place = executing(self.arguments, localizer, num_jobs, cluster, open_scan)
@@ -100,7 +100,9 @@ class Evaluation:
             except Exception as error:
                 self.report(f"{scene.name}: {failure_of(error).text}", len(queries))
                 return
-            values = executor.values(localizer.task(query.image, query.calibration) for query in queries)
+            pictures = (query.labels if has_labels and query.labels else query.image for query in queries)
+            tasks = (localizer.task(p, q.calibration) for p, q in zip(pictures, queries, strict=True))
+            values = executor.values(tasks)
             pairs = interruption.each(show(iter(values), len(queries), scene.name), values.finished())
             for query, is_inside, (task, wait) in zip(queries, are_inside, pairs, strict=False):
                 try:

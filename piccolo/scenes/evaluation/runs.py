@@ -35,7 +35,7 @@ def check_run(
         (scene.name, scene.name_of(query)): (scene, query) for scene in scenes for query in scene.queries
     }
     for row in rows:
-        found = {"line": f"{path}: its results were", "settings": row.result.settings}
+        found = {"line": path, "settings": row.result.settings}
         check_as_expected(found, expected, "choose another file")
         if row.key in queries and not _is_of(row, *queries[row.key]):
             text = "made with another true pose or another scene of this name; choose another file"
