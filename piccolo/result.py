@@ -28,7 +28,8 @@ from .walk.localize import Alone, Gap, WalkFrame
 
 FORMAT = "piccolo-pose/8"
 POSE_FIELDS = ("R_cam_from_world", "center_world", "quaternion_wxyz", "T_world_from_cam")
-UNREADABLE, FAILED = "unreadable", "failed"
+UNREADABLE = "unreadable"
+FAILED = "failed"
 MAX_ROTATION_ERROR = 1e-6  # of R R^T from the identity, in a file
 NO_NAME = re.compile("[\ud800-\udc7f\udd00-\udfff]")  # what os.fsdecode never gives
 WANTED = "wanted JSON lines of localize.py"
@@ -116,7 +117,8 @@ class Result:
                 f"{100.0 * e.contradicted_fraction:.0f} % contradicted"
             )
         if self.covariance is not None:
-            mm, deg = 1000.0 * self.covariance.largest_std, self.covariance.std_deg.max()
+            mm = 1000.0 * self.covariance.largest_std
+            deg = self.covariance.std_deg.max()
             lines.append(
                 f"  one sigma {mm:.1f} mm ({self.covariance.least_constrained_direction}), {deg:.2f} deg"
             )
@@ -238,17 +240,22 @@ def _rotation_and_center(pose: Pose) -> dict[str, object]:
     return {"R_cam_from_world": pose.R_cam_from_world.tolist(), "center_world": pose.center_world.tolist()}
 
 
+def _pose_from_json(document: dict[str, Any]) -> Pose:
+    return Pose(np.array(document["R_cam_from_world"]), np.array(document["center_world"]))
+
+
 def _pose_json(pose: Pose | None) -> dict[str, object] | None:
     """A pose in all its forms, POSE_FIELDS."""
     if pose is None:
         return None
-    quaternion, T = quaternion_wxyz(pose.R_cam_from_world), T_world_from_cam(pose)
-    other = {"quaternion_wxyz": quaternion.tolist(), "T_world_from_cam": T.tolist()}
-    return {**_rotation_and_center(pose), **other}
+    return {
+        **_rotation_and_center(pose),
+        "quaternion_wxyz": quaternion_wxyz(pose.R_cam_from_world).tolist(),
+        "T_world_from_cam": T_world_from_cam(pose).tolist(),
+    }
 
 
 def _gps_prior_from_json(value: dict[str, Any] | None) -> GpsPrior | None:
-    """Read back `gps_prior`."""
     return (
         None if value is None else GpsPrior(tuple(value["center_world"]), value["radius"], value["is_used"])
     )
@@ -269,9 +276,10 @@ def _alternative_json(alternative: Alternative) -> dict[str, object]:
 
 
 def _alternative_from_json(document: dict[str, Any]) -> Alternative:
-    """Read back an alternative."""
-    pose = Pose(np.array(document["R_cam_from_world"]), np.array(document["center_world"]))
-    return Alternative(pose, **{f.name: document[f.name] for f in fields(Alternative) if f.name != "pose"})
+    return Alternative(
+        _pose_from_json(document),
+        **{f.name: document[f.name] for f in fields(Alternative) if f.name != "pose"},
+    )
 
 
 def _walk_json(walk: WalkFrame) -> dict[str, object]:
@@ -290,11 +298,10 @@ def _walk_json(walk: WalkFrame) -> dict[str, object]:
 
 
 def _walk_from_json(value: dict[str, Any]) -> WalkFrame:
-    """Read back `walk`."""
-    gap, alone = value["gap"], value["alone"]
+    gap = value["gap"]
+    alone = value["alone"]
     if alone is not None:
-        R, center = alone["R_cam_from_world"], alone["center_world"]
-        pose = None if R is None else Pose(np.array(R), np.array(center))
+        pose = None if alone["R_cam_from_world"] is None else _pose_from_json(alone)
         alone = Alone(alone["status"], alone["confidence"], pose)
     return WalkFrame(value["time"], value["frame"], value["how"], alone, gap and Gap(**gap))
 
@@ -306,7 +313,7 @@ def _source_from_json(document: dict[str, Any]) -> Source:
 
 def _best_pose_from_json(document: dict[str, Any]) -> Pose | None:
     own = document if document["status"] == LOCALIZED else document["best_guess"]
-    return None if own is None else Pose(np.array(own["R_cam_from_world"]), np.array(own["center_world"]))
+    return None if own is None else _pose_from_json(own)
 
 
 def _place(alternative: Alternative) -> str:
@@ -369,7 +376,8 @@ def _checked_result(text: str) -> Result:
     if not all(isinstance(value, int | float) and math.isfinite(value) for value in values):
         raise InputError(f"result: found confidence and score {values}, wanted finite numbers")
     if result.best_pose is not None:
-        R, center = result.best_pose.R_cam_from_world, result.best_pose.center_world
+        R = result.best_pose.R_cam_from_world
+        center = result.best_pose.center_world
         is_number = R.dtype.kind in "fiu" and center.dtype.kind in "fiu"
         if not (is_number and center.shape == (3,) and np.isfinite(center).all()):
             raise InputError("result: found no numbers of a pose, wanted R_cam_from_world and center_world")

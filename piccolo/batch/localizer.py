@@ -154,7 +154,9 @@ class Localizer:
 
     def _pictures(self, scan: Scan, pano: Path, result: Result) -> tuple[bytes | None, bytes | None]:
         """Overlay and occlusion mask as PNG, where they are asked for and there is a pose."""
-        pose, overlay, mask = result.best_pose, None, None
+        pose = result.best_pose
+        overlay = None
+        mask = None
         if pose is None:
             return None, None
         read_options = self.read_options.refined(result.cameras)

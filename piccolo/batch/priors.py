@@ -60,13 +60,14 @@ class PriorTable:
 
 
 def _prior_from(cells: Row, general: Prior) -> Prior:
-    prior, row = replace(general, within=cells.within or general.within), cells.numbers
+    prior = replace(general, within=cells.within or general.within)
+    row = cells.numbers
     if "x" in row:
         radius = row.get("radius", general.radius or DEFAULT_RADIUS)
         prior = replace(prior, near_world=(row["x"], row["y"], row.get("z")), radius=radius)
     if "height" in row:
-        low, high = row["height"] - HEIGHT_TOLERANCE, row["height"] + HEIGHT_TOLERANCE
-        prior = replace(prior, height=(low, high))
+        height = row["height"]
+        prior = replace(prior, height=(height - HEIGHT_TOLERANCE, height + HEIGHT_TOLERANCE))
     if "heading" in row:
         tolerance = row.get("tolerance", general.heading_tolerance_deg)
         prior = replace(prior, heading_deg=row["heading"], heading_tolerance_deg=tolerance)

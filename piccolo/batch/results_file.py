@@ -31,8 +31,9 @@ def finished_lines(path: Path) -> Iterator[dict[str, Any]]:
             raise InputError(f"{path}, line {number}: no result of localize.py; {WAYS}") from error
         if found != FORMAT:
             raise InputError(f"{path}, line {number}: of format {found!r}, not {FORMAT!r}; {WAYS}")
-        begin, end = end, end + len(line)
-        yield {**fields, "line": f"{path}, line {number}", "span": (begin, end)}
+        span = (end, end + len(line))
+        end = span[1]
+        yield {**fields, "line": f"{path}, line {number}", "span": span}
 
 
 def check_as_expected(fields: Mapping[str, Any], expected: Mapping[str, Any], ways: str = WAYS) -> None:

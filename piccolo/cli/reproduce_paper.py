@@ -67,7 +67,8 @@ def transformed_scenes(
     condition: Condition, scenes: Sequence[Scene], root: Path, report: Callable[[str], object]
 ) -> tuple[list[Scene], int]:
     """The scenes under a condition, and the number of queries of those that can't be so."""
-    transformed, num_failed = [], 0
+    transformed = []
+    num_failed = 0
     for number, scene in enumerate(scenes):
         folder = root / str(number)
         folder.mkdir()
@@ -104,7 +105,8 @@ def run_experiment(
     folder: Path = arguments.out / name
     variants = sorted({query.variant for scene in scenes for query in scene.queries})
     variants = [variant for variant in variants if not arguments.variants or variant in arguments.variants]
-    num_failed, found = 0, []
+    num_failed = 0
+    found = []
     conditions = experiment.conditions_of(presets, variants)
     files = [folder / file_name(condition) for condition in conditions]
     files += [folder.with_name(f"{name}{suffix}") for suffix in (".md", ".png")]

@@ -23,7 +23,9 @@ COMMANDS = (
 SCRIPT = re.compile(rf"(?:python )?(?:tools/)?\b({'|'.join(COMMANDS)})\.py\b")
 # [byte] below it LLVM and OpenBLAS crash or wait for ever, where NumPy raises; each core has a thread
 LEAST_ADDRESS_SPACE = 1_000_000_000 + 250_000_000 * (os.cpu_count() or 1)
-EXIT_CANNOT_START, EXIT_INTERRUPTED, EXIT_TERMINATED = 3, 130, 143
+EXIT_CANNOT_START = 3
+EXIT_INTERRUPTED = 130
+EXIT_TERMINATED = 143
 
 
 def __getattr__(name: str) -> Callable[[], int]:
