@@ -302,7 +302,7 @@ ODD = [
 ]
 
 
-@pytest.mark.parametrize("more", [[], ["--jobs", "2"], ["--walk", "--times", "order"]])
+@pytest.mark.parametrize("more", [["--jobs", "2"], ["--walk", "--times", "order"]])
 def test_any_name_that_a_file_may_have_is_localized(scene, tmp_path, more, capsys):
     photos, out, overlays = tmp_path / "photos", tmp_path / "poses.jsonl", tmp_path / "overlays"
     photos.mkdir()

@@ -174,12 +174,6 @@ def test_a_closed_pipe_is_no_message(scenes, tmp_path):
     assert (done.returncode, done.stderr) == (141, b"")
 
 
-def test_a_killed_parent_takes_its_workers_along(scenes, tmp_path):
-    with _running(scenes, tmp_path, 100) as process:
-        process.kill()
-    assert _ends(process.pid)
-
-
 def test_what_cannot_be_read_is_named_and_the_rest_done(scenes, tmp_path, capsys):
     root = tmp_path / "scenes"
     shutil.copytree(scenes, root)
