@@ -21,8 +21,6 @@ from piccolo.batch.inputs import panoramas_of
 from piccolo.cli import localize
 from piccolo.errors import InputError
 from piccolo.files.line_file import locked, whole_lines, whole_size
-from piccolo.jobs import memory
-from piccolo.panorama import picture
 from piccolo.result import Result, read_results
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -260,17 +258,6 @@ def test_what_the_system_did_to_a_photo_is_tried_again(scene, tmp_path, counted,
     assert "failed" not in {line["status"] for line in _lines(out)}
 
 
-def test_a_limit_of_memory_is_no_fault_of_the_photos(scene, tmp_path):
-    out = tmp_path / "poses.jsonl"
-    with pytest.MonkeyPatch().context() as patched:
-        patched.setattr(picture, "check_memory", lambda *given: memory.check_memory(1e15, *given[1:]))
-        assert _run(scene, out, *PAPER) == 3
-    assert {line["status"] for line in _lines(out)} == {"failed"}
-    assert "may be taken; make the picture smaller" in _lines(out)[0]["error"]
-    assert _run(scene, out, *PAPER) < 2
-    assert "failed" not in {line["status"] for line in _lines(out)}
-
-
 def test_a_photo_is_read_once_so_that_its_digest_is_of_its_pixels(scene, tmp_path, monkeypatch):
     photo, out = tmp_path / "a.jpg", tmp_path / "poses.jsonl"
     first, second = ((scene / "images" / f"clean_{k}.jpg").read_bytes() for k in (0, 1))
@@ -392,17 +379,6 @@ def test_a_signal_ends_a_batch_after_the_photo_at_work(scene, tmp_path, number, 
     assert out.read_bytes().endswith(b"\n")
 
 
-def test_names_on_standard_input_are_answered_as_they_come(scene):
-    name = str(scene / "images" / "clean_1.jpg")
-    with _process(scene, None, ["-", "--quiet"], stdout=subprocess.PIPE, bufsize=1) as process:
-        for word, status in ((name, "localized"), ("missing.jpg", "unreadable"), (name, "localized")):
-            process.stdin.write(word + "\n")
-            process.stdin.flush()
-            assert Result.from_json(process.stdout.readline()).status == status
-        process.stdin.close()
-        assert process.wait(timeout=60) == 3
-
-
 def test_two_processes_do_not_write_one_file(tmp_path):
     out = tmp_path / "poses.jsonl"
     for line in ('{"a": 1}', '{"b": 2}'):
@@ -453,16 +429,6 @@ def test_a_full_disk_keeps_the_lines_before(tmp_path):
 def test_a_full_device_is_named(scene, capsys):
     assert _run(scene, Path("/dev/full"), "--quiet", pano=[str(scene / "images" / "clean_0.jpg")]) == 3
     assert capsys.readouterr().err == "localize.py: /dev/full: cannot be used (No space left on device)\n"
-
-
-def test_several_pictures_go_into_folders(scene, tmp_path):
-    folders = tmp_path / "overlays", tmp_path / "changes"
-    for folder in folders:
-        folder.mkdir()
-    options = ["--overlay", str(folders[0]), "--occlusion-mask", str(folders[1])]
-    assert _run(scene, tmp_path / "poses.jsonl", "--quiet", *options) == 0
-    for folder in folders:
-        assert sorted(path.name for path in folder.iterdir()) == ["clean_0.png", "clean_1.png", "clean_2.png"]
 
 
 def test_priors_of_a_table_go_before_the_general_one(scene, tmp_path, capsys):

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from rooms import errors, query, write_room
 
-from piccolo.cli import evaluate, localize, prepare_map
+from piccolo.cli import localize, prepare_map
 from piccolo.geometry.pose import Pose
 from piccolo.result import Result
 
@@ -115,22 +115,6 @@ def test_files_are_written_and_look_right(scene, tmp_path, capsys):
     tile = np.s_[128:192, 0:64], np.s_[128:192, 64:128]
     assert (checkerboard[tile[0]] == photo[tile[0]]).all()
     assert (checkerboard[tile[1]] == cloud[tile[1]]).all()
-
-
-def test_many_panoramas_one_line_each_and_one_bad_among_them(scene, tmp_path, capsys):
-    bad = tmp_path / "bad.jpg"
-    bad.write_bytes(b"\xff\xd8\xff nothing more")
-    panos = [str(scene / "images" / "clean_0.jpg"), str(bad), str(scene / "images" / "clean_1.jpg")]
-    code = localize.main(["--cloud", str(scene / "cloud.ply"), "--pano", *panos, *QUICK, "--quiet"])
-    out, err = capsys.readouterr()
-    assert code == 3
-    names = [Path(json.loads(line)["pano"]).name for line in out.splitlines()]
-    assert names == ["clean_0.jpg", "bad.jpg", "clean_1.jpg"]
-    unreadable = Result.from_json(out.splitlines()[1])
-    assert unreadable.status == "unreadable"
-    assert unreadable.error in err
-    assert err.count("\n") == 1
-    assert "bad.jpg" in err
 
 
 def test_panorama_from_elsewhere_exits_with_one(scene, tmp_path, capsys):
@@ -265,21 +249,3 @@ def test_first_use_is_announced_and_two_processes_may_share_it(scene, tmp_path):
     out, err = again.communicate(timeout=60)
     assert "compiling" not in err
     assert json.loads(out)["center_world"] == poses[0]
-
-
-def test_results_are_evaluated_against_the_truth(scene, tmp_path, capsys):
-    panos = [str(scene / "images" / f"clean_{k}.jpg") for k in (0, 1)]
-    results = tmp_path / "poses.jsonl"
-    quiet = [*QUICK, "--quiet", "--out", str(results)]
-    localize.main(["--cloud", str(scene / "cloud.ply"), "--pano", *panos, *quiet])
-    truth = str(scene)
-    assert evaluate.main(["--scenes", truth, "--results", str(results)]) == 0
-    table = capsys.readouterr().out
-    assert re.search(r"\| images/clean_0.jpg \| localized \| 0\.0\d+ \|", table)
-    assert re.search(r"\| all \| 2 \| 2 \| 1.000 \|", table)
-    (tmp_path / "odd.json").write_text("{}")
-    assert evaluate.main(["--scenes", str(tmp_path / "odd.json"), "--results", str(results)]) == 3
-    assert "wanted a queries.json" in capsys.readouterr().err
-    (tmp_path / "empty.jsonl").write_text("\n")
-    assert evaluate.main(["--scenes", truth, "--results", str(tmp_path / "empty.jsonl")]) == 3
-    assert "found no result" in capsys.readouterr().err

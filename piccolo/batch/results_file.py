@@ -16,24 +16,16 @@ WAYS = "--overwrite starts anew, another --out keeps both"
 Name = TypeVar("Name", Path, str)
 
 
-def finished_lines(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield the fields of each whole line that an earlier run has left, and its bytes, `span`.
-
-    Raises InputError, when the iterator comes to it, for what is no result.
-    """
-    size = whole_size(path, LINE_BEGINS, f"results of localize.py: {WAYS}")
-    end = 0
-    for number, line in enumerate(whole_lines(path, size), 1):
-        try:
-            fields = json.loads(line)
-            found = fields["format"]
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise InputError(f"{path}, line {number}: no result of localize.py; {WAYS}") from error
-        if found != FORMAT:
-            raise InputError(f"{path}, line {number}: of format {found!r}, not {FORMAT!r}; {WAYS}")
-        span = (end, end + len(line))
-        end = span[1]
-        yield {**fields, "line": f"{path}, line {number}", "span": span}
+def _fields_of(line: bytes, where: str) -> dict[str, Any]:
+    """Return the fields of a whole line that an earlier run has left."""
+    try:
+        fields = json.loads(line)
+        found = fields["format"]
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(f"{where}: no result of localize.py; {WAYS}") from error
+    if found != FORMAT:
+        raise InputError(f"{where}: of format {found!r}, not {FORMAT!r}; {WAYS}")
+    return {**fields, "line": where}
 
 
 def check_as_expected(fields: Mapping[str, Any], expected: Mapping[str, Any], ways: str = WAYS) -> None:
@@ -98,13 +90,16 @@ class Records:
         if self.path is None:
             return
         named = None if panoramas is None else set(map(str, panoramas))
-        for fields in finished_lines(self.path):
+        whole = whole_size(self.path, LINE_BEGINS, f"results of localize.py: {WAYS}")
+        for number, content in enumerate(whole_lines(self.path, whole), 1):
+            fields = _fields_of(content, f"{self.path}, line {number}")
             pano = str(fields.get("pano"))
             if named is None or pano in named:
                 check_as_expected(fields, expected(Path(pano)))
-            line = Finished(fields["span"], fields.get("pano_sha256"), str(fields.get("status")))
+            span = (self.size, self.size + len(content))
+            line = Finished(span, fields.get("pano_sha256"), str(fields.get("status")))
             self._others.setdefault(pano, []).append(line)
-            self.size = line.span[1]
+            self.size = span[1]
         if self._others and named is not None and named.isdisjoint(self._others):
             text = f"none of its results is of a panorama that this command names; {WAYS}"
             raise InputError(f"{self.path}: {text}")

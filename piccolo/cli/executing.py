@@ -17,7 +17,7 @@ from ..errors import InputError
 from ..jobs.cluster import LOCAL, Cluster, connected
 from ..jobs.memory import GB, memory_left, memory_taken
 from ..jobs.processes import Processes
-from ..jobs.tasks import Executor, Here
+from ..jobs.tasks import Here
 from ..jobs.threads import num_cores
 from ..scan import Scan
 from ..scan_map.map_file import save_map
@@ -29,6 +29,7 @@ from .options import PHOTOS_OF_A_JOB
 QUERY_MEMORY = 0.5e9  # [byte] of a process beside the map
 SIGNALS: dict[int, str] = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 Item = TypeVar("Item")
+Executor = Here | Processes | Cluster
 
 
 def check_execution(arguments: argparse.Namespace) -> None:

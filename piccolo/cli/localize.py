@@ -23,7 +23,7 @@ from ..files.atomic import STDOUT, check_output, is_stdout, is_stream, write_ato
 from ..files.line_file import LineFile, locked, write_line
 from ..jobs.memory import limit_memory
 from ..jobs.stopwatch import Stopwatch
-from ..jobs.tasks import Executor, WorkerLostError
+from ..jobs.tasks import WorkerLostError
 from ..jobs.threads import Workers, num_cores
 from ..localization.settings import CoarseToFineSettings
 from ..panorama.cube import is_cube
@@ -36,6 +36,7 @@ from .command import command
 from .errors import EXIT_BAD_INPUT, UsageError, checking_options, exit_code_of, print_error, print_note
 from .executing import (
     SIGNALS,
+    Executor,
     Interruption,
     check_execution,
     connecting,

@@ -2,7 +2,6 @@
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -262,31 +261,22 @@ def prior_from(options: dict[str, Any]) -> Prior:
 
 def parse_settings(preset: str, words: Sequence[str]) -> dict[str, Any]:
     """Return the settings of a preset that are written as NAME=VALUE."""
-    kind = PRESETS[preset]
-    hints = get_type_hints(kind)
-    known = [f.name for f in fields(kind) if f.name != "prior"]
+    hints = {name: hint for name, hint in get_type_hints(PRESETS[preset]).items() if name != "prior"}
     given: dict[str, Any] = {}
     for word in words:
         name, _, text = word.partition("=")
-        if name not in known:
-            found = f"found {word!r}, wanted NAME=VALUE of {', '.join(known)}"
-            raise InputError(f"--preset {preset}: {found}")
-        choices = get_args(hints[name]) or ({"true": True, "false": False} if hints[name] is bool else ())
+        if name not in hints:
+            raise InputError(f"--preset {preset}: found {word!r}, wanted NAME=VALUE of {', '.join(hints)}")
+        hint = hints[name]
+        choices: dict[str, Any] = {choice: choice for choice in get_args(hint)}
+        if hint is bool:
+            choices = {"true": True, "false": False}
         try:
-            given[name] = _value_of(text, hints[name], choices)
+            given[name] = choices[text] if choices else hint(text)
         except (KeyError, ValueError) as error:
-            wanted = f"one of {', '.join(choices)}" if choices else f"{hints[name].__name__}"
+            wanted = f"one of {', '.join(choices)}" if choices else hint.__name__
             raise InputError(f"--preset {preset}: found {word!r}, wanted {wanted}") from error
     return given
-
-
-def _value_of(text: str, hint: Any, choices: Any) -> Any:
-    """Return the value of a setting; KeyError or ValueError for a text that is none."""
-    if isinstance(choices, dict):
-        return choices[text]
-    if choices:
-        return choices[choices.index(text)]
-    return hint(text)
 
 
 def check_arguments(arguments: argparse.Namespace) -> None:

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 Function = Callable[[Any], Any]  # of an item
 Opening = Callable[[], Function]  # pickled for other processes
@@ -19,23 +19,6 @@ Pair = tuple[Any, Callable[[], Any]]
 
 class WorkerLostError(Exception):
     """The processes at work on an item were killed, as often as it was tried; the text says how."""
-
-
-class Values(Protocol):
-    """Items with what waits for their values, in the items' order."""
-
-    def __iter__(self) -> Iterator[Pair]:
-        """Yield each, begun as soon as there is an item and room for it."""
-
-    def finished(self) -> Iterator[Pair]:
-        """Yield what is done already of those that come next."""
-
-
-class Executor(Protocol):
-    """Where items are worked on."""
-
-    def values(self, items: Iterator[Any]) -> Values:
-        """Begin with the items."""
 
 
 class Here:
