@@ -1,4 +1,4 @@
-"""How a scan is opened: read, prepared for a method, or taken from a map prepared before."""
+"""Opening a scan: it is read and prepared for a method, or taken from a map prepared before."""
 
 from collections.abc import Sequence
 from dataclasses import replace

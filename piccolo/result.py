@@ -51,7 +51,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Result:
-    """Where one panorama was taken, and what speaks for it."""
+    """The pose of one panorama, its status and its evidence."""
 
     status: str  # "localized", "ambiguous", "not_localized", "unreadable" or "failed"
     confidence: float  # [0, 1] how likely the pose is right, see piccolo.confidence
@@ -86,7 +86,7 @@ class Result:
 
     @property
     def pose(self) -> Pose | None:
-        """Where the photo was taken, if it is localized."""
+        """The pose of a photo that is localized."""
         return self.best_pose if self.status == LOCALIZED else None
 
     @property
@@ -283,7 +283,6 @@ def _alternative_from_json(document: dict[str, Any]) -> Alternative:
 
 
 def _walk_json(walk: WalkFrame) -> dict[str, object]:
-    """What a walk says of a frame."""
     alone: dict[str, object] | None = None
     if walk.alone is not None:
         about = {"status": walk.alone.status, "confidence": walk.alone.confidence}

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple, TypedDict, Unpack
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +45,7 @@ Settings = CoarseToFineSettings | PaperSettings
 
 
 class QueryOptions(TypedDict, total=False):
-    """What `Scan.localize` may be told about a photo; all may be left out."""
+    """Options of `Scan.localize` about a photo; all may be left out."""
 
     mask: File | NDArray[np.bool_]  # what is to be ignored: white pixels of a picture, True of an array
     mask_nadir_deg: float  # the cap of this half angle about the camera's down axis is ignored
@@ -73,16 +73,10 @@ READ_FIELDS = {f.name for f in fields(ReadOptions)}
 PRIOR_FIELDS = {f.name for f in fields(Prior)}
 
 
-class Asked(NamedTuple):
-    """What options say of a photo."""
-
-    read_options: ReadOptions
-    settings: Settings
-    is_masked: NDArray[np.bool_] | None  # of an array
-
-
-def asked_of(options: QueryOptions, settings: Settings, cloud_settings: CloudSettings) -> Asked:
-    """Return what options say of a photo, beside the settings of photos that say nothing else."""
+def parse_options(
+    options: QueryOptions, settings: Settings, cloud_settings: CloudSettings
+) -> tuple[ReadOptions, Settings, NDArray[np.bool_] | None]:
+    """Return options of a photo as objects, beside the settings of all; and the mask, if it is an array."""
     given: dict[str, Any] = dict(options)
     is_masked = given.pop("mask") if isinstance(given.get("mask"), np.ndarray) else None
     if "mask" in given:
@@ -101,7 +95,7 @@ def asked_of(options: QueryOptions, settings: Settings, cloud_settings: CloudSet
     read_options = ReadOptions(
         labels=cloud_settings.labels, **{k: given.pop(k) for k in READ_FIELDS & given.keys()}
     )
-    return Asked(read_options, replace(settings, **given), is_masked)
+    return read_options, replace(settings, **given), is_masked
 
 
 @dataclass(frozen=True)
@@ -122,7 +116,7 @@ class Scan:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the user should know about the scan, one line each."""
+        """Lines that the user should read about the scan."""
         return self.prepared.warnings
 
     def from_world(self, pose: Pose) -> Pose:
@@ -130,7 +124,7 @@ class Scan:
         return self.prepared.from_world(pose)
 
     def localize(self, panorama: File | NDArray[np.uint8], **options: Unpack[QueryOptions]) -> Result:
-        """Where a 360-degree photo was taken.
+        """Find where a 360-degree photo was taken.
 
         Parameters
         ----------
@@ -158,13 +152,13 @@ class Scan:
         >>> result.status, result.pose.center_world.round(2)
         ('localized', array([2.6 , 3.17, 1.21]))
         """
-        asked = asked_of(options, self.settings, self.cloud_settings)
-        return self.localize_query(panorama, asked.read_options, asked.settings, asked.is_masked)
+        parsed = parse_options(options, self.settings, self.cloud_settings)
+        return self.localize_query(panorama, *parsed)
 
     def localize_many(
         self, panoramas: Iterable[File | NDArray[np.uint8]], **options: Unpack[QueryOptions]
     ) -> Iterator[Result]:
-        """The result of each panorama in order, as it comes; options as in `localize`."""
+        """Yield the result of each panorama in order, as it comes; options as in `localize`."""
         for panorama in panoramas:
             yield self.localize(panorama, **options)
 
@@ -174,7 +168,7 @@ class Scan:
         max_acceleration: float = MAX_ACCELERATION,
         **options: Unpack[QueryOptions],
     ) -> Walk:
-        """A camera that is carried through the scan, followed frame by frame: `add` each as it comes.
+        """Follow a camera that is carried through the scan: `add` each frame as it comes.
 
         Parameters
         ----------
@@ -186,10 +180,10 @@ class Scan:
         **options
             As in `localize`, of all frames; not `refine_focal`, and `mask` as a path.
         """
-        asked = asked_of(options, self.settings, self.cloud_settings)
+        read_options, settings, _ = parse_options(options, self.settings, self.cloud_settings)
         speed = MAX_SPEED if max_speed is None else max_speed
         motion = Motion(speed, max_acceleration, is_guess=max_speed is None)
-        return self.walk(asked.read_options, asked.settings, motion)
+        return self.walk(read_options, settings, motion)
 
     def localize_walk(
         self,
@@ -199,7 +193,7 @@ class Scan:
         max_acceleration: float = MAX_ACCELERATION,
         **options: Unpack[QueryOptions],
     ) -> list[Result]:
-        """The results of a walk's frames, in order: each told by those before and after it.
+        """Return the results of a walk's frames, in order, each of which narrows the others.
 
         `times` [s] rise; without them only the order counts. The others are as in `track`.
         """
@@ -227,7 +221,7 @@ class Scan:
     def occlusion_mask(
         self, panorama: File | NDArray[np.uint8], pose: Pose, read_options: ReadOptions | None = None
     ) -> NDArray[np.uint8]:
-        """What of a photo contradicts the scan at a pose of the world: (H, W), of the full sphere's size.
+        """Return which pixels of a photo contradict the scan at a pose of the world: (H, W) of the full sphere.
 
         255 where it contradicts, 0 where the scan explains it, 128 where one of them shows nothing.
         """
@@ -293,6 +287,6 @@ class Scan:
 def settings_json(
     settings: Settings, cloud_settings: CloudSettings, read_options: ReadOptions
 ) -> dict[str, object]:
-    """What a result repeats of how it was made."""
+    """Return the settings that a result repeats."""
     how = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(read_options).items()}
     return {**settings.to_json(), "cloud": asdict(cloud_settings), "panorama": how}

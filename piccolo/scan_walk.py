@@ -29,7 +29,7 @@ Picture = str | PathLike[str] | NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class WalkAbout:
-    """What all results of a walk repeat."""
+    """Fields that all results of a walk repeat."""
 
     cloud: str | tuple[str, ...]
     warnings: tuple[str, ...]
@@ -72,7 +72,7 @@ class Walk:
         self.taken: list[Taken] = []
 
     def add(self, frame: Picture, time: float | None = None, name: str | None = None) -> Result:
-        """Where the camera is now, by this frame and those before.
+        """Find where the camera is now, by this frame and those before.
 
         A frame that can't be read is a result that says so. `time` [s] is that since any beginning, of all
         frames or of none; `name` stands in the result in place of the path.
@@ -101,7 +101,7 @@ class Walk:
         return Prepared(Taken(frame, name, photo, watch.seconds, warnings), panorama, query)
 
     def follow(self, prepared: Prepared, time: float | None = None) -> Result:
-        """The result of `add`, of a frame that was prepared."""
+        """Return the result of `add`, of a frame that was prepared."""
         number = len(self.taken)
         taken, panorama, query = prepared
         when = float(number) if time is None else float(time)
@@ -124,7 +124,7 @@ class Walk:
         self.tracker.accept(frame)
 
     def last_to_json(self) -> str:
-        """What was found of the last frame, on one line, from which `restore` goes on."""
+        """Return the last frame and its pose on one line, from which `restore` goes on."""
         taken = self.taken[-1]
         frame = self.tracker.frames[-1]
         alone = frame.alone and result_of(frame.alone, cloud="", pano="", seconds={}, settings={}).to_json()
@@ -154,7 +154,7 @@ class Walk:
         return True
 
     def finish(self, show: Progress = no_progress) -> list[Result]:
-        """The result of each frame, by all of them."""
+        """Return the result of each frame, by all of them."""
         path = finished(self.tracker, self._panorama, show)
         found = localizations_of(self.tracker, path)
         return [

@@ -137,7 +137,7 @@ def test_a_file_of_another_run_is_refused_with_both_ways(scene, tmp_path, change
     assert _run(scene, out, "--quiet", *more, pano=panos) == 3
     err = capsys.readouterr().err
     assert message in err
-    assert "--overwrite starts anew, another --out keeps both" in err
+    assert "--overwrite starts again, another --out keeps both" in err
     assert err.count("\n") == 1
     assert out.read_bytes() == before
 

@@ -1,4 +1,4 @@
-"""What answers the panoramas of a batch: in this process, or where else the scan is opened."""
+"""Answers to the panoramas of a batch, in this process or where else the scan is opened."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping
@@ -39,7 +39,7 @@ class Task(NamedTuple):
 
     @contextmanager
     def placed(self, folder: Path) -> Iterator[Path]:
-        """Where the panorama is here: relative to a folder, or written from the files."""
+        """The panorama's path here: relative to a folder, or written from the files."""
         if self.files is None:
             yield folder / self.pano
             return
@@ -60,7 +60,7 @@ def files_of(pano: Path) -> dict[str, bytes]:
 
 
 class Answer(NamedTuple):
-    """What is made of a task."""
+    """A result, and the pictures that go with it."""
 
     result: Result
     warnings: tuple[str, ...] = ()  # of the photo, without those of the scan
@@ -70,7 +70,7 @@ class Answer(NamedTuple):
 
 @dataclass(frozen=True)
 class Localizer:
-    """How tasks are answered; pickled for other processes."""
+    """A scan and the options for its photos, which answer tasks; pickled for other processes."""
 
     paths: tuple[Path, ...]  # of the scan
     settings: Settings  # for which the scan is prepared

@@ -1,4 +1,4 @@
-"""What is known of each camera beforehand, from a table."""
+"""Prior knowledge of each camera, from a table."""
 
 import csv
 import math

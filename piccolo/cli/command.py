@@ -1,4 +1,4 @@
-"""What makes a module a command: options written as a help text shows them, and the `main` that runs it."""
+"""Commands: options written as a help text shows them, and the `main` that parses and runs them."""
 
 import argparse
 import sys

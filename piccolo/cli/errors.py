@@ -55,7 +55,7 @@ def checking_options() -> Iterator[None]:
 
 @dataclass
 class Outcome:
-    """How a command ended."""
+    """The end of a command."""
 
     exit_code: int = 0
 

@@ -1,4 +1,4 @@
-"""Where photos are localized: in this process, in several, or on a cluster; and how a signal ends a batch."""
+"""Executors of a batch: this process, several, or a cluster; and its end by a signal."""
 
 import argparse
 import os
@@ -92,7 +92,7 @@ def executing(
     cluster: Cluster | None,
     open_scan: Callable[[Localizer, int], Scan],
 ) -> Iterator[tuple[Executor, Localizer]]:
-    """Where photos are localized, and by what; `open_scan` prepares the scan before, with so many threads."""
+    """An executor, and the localizer for it; `open_scan` prepares the scan before, with so many threads."""
     is_kept = localizer.cache.is_used
     with ExitStack() as stack:
         if not is_kept and (cluster or num_jobs > 1):  # others will open what is prepared here
@@ -146,7 +146,7 @@ class Interruption:
 
     @property
     def exit_code(self) -> int:
-        """What a shell expects of a program that a signal has ended."""
+        """The code that a shell expects of a program that a signal has ended."""
         return 128 + self.number
 
     def each(self, items: Iterable[Item], after: Iterable[Item] = ()) -> Iterator[Item]:

@@ -73,14 +73,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_cloud_options(parser: argparse.ArgumentParser, text: str) -> None:
-    """The cloud's files, described by `text`, and how to read them."""
+    """Add the cloud's files, described by `text`, and how to read them."""
     group = parser.add_argument_group("cloud")
     group.add_argument("--cloud", type=Path, required=True, nargs="+", help=text)
     add_cloud_reading_options(group)
 
 
 def add_cloud_reading_options(group: argparse._ArgumentGroup) -> None:
-    """How to read a cloud's files."""
+    """Add the options of reading a cloud's files."""
     text = f"of the cloud's coordinates: {', '.join(METRES)}, or a number of metres (default m)"
     option(group, "--units UNIT", text, type=_metres_of, default=None)
     text = "up axis of the cloud; auto is the file's: z, in glTF y (default auto; preset default)"
@@ -101,7 +101,7 @@ def _metres_of(text: str) -> float:
 
 
 def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
-    """What the files of the panoramas do not say."""
+    """Add what the files of the panoramas do not say."""
     text = "horizontal field of view, of a part of the sphere about the horizon or as --projection says"
     option(group, "--fov DEG", text)
     text = "of the picture (default equirectangular; of a photo with EXIF's focal length pinhole)"
@@ -128,7 +128,7 @@ def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
 
 
 def add_method_options(parser: argparse.ArgumentParser) -> None:
-    """The preset and its settings."""
+    """Add the preset and its settings."""
     group = parser.add_argument_group("method")
     text = "default: prepared views, all positions searched; paper: Kim et al., ICCV 2021, Algorithm 1; then "
     text += "its settings by name, such as solver=lbfgs loss=photometric (docs/API.md)"
@@ -140,7 +140,7 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_prior_options(parser: argparse.ArgumentParser) -> None:
-    """What the user knows beforehand."""
+    """Add what the user knows beforehand."""
     title = "prior knowledge (preset default); a pose that contradicts it is not localized"
     group = parser.add_argument_group(title)
     text = "CSV: name and any of x, y, z, radius, heading, tolerance, height, within; before the options here"
@@ -153,7 +153,7 @@ def add_prior_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_walk_options(parser: argparse.ArgumentParser) -> None:
-    """How frames of a walk are taken, and how the camera is carried."""
+    """Add the options of walks."""
     group = parser.add_argument_group("walks")
     text = "the panoramas are frames of one walk, in this order, each of which narrows the others"
     option(group, "--walk", text)
@@ -172,7 +172,7 @@ def add_walk_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_execution_options(parser: argparse.ArgumentParser) -> None:
-    """Where the photos are localized, and what may be taken there."""
+    """Add the options of processes, threads and memory."""
     group = parser.add_argument_group("execution")
     text = "processes over one prepared map (default one a core, where memory is enough and each has "
     text += f"{PHOTOS_OF_A_JOB} photos or more; 1 with names on stdin or --threads)"

@@ -1,4 +1,4 @@
-"""What a command writes, checked before it begins to work."""
+"""Outputs of a command, checked before it begins to work."""
 
 import argparse
 import os

@@ -194,7 +194,7 @@ def _function(opening: bytes) -> Function:
 
 
 def value_of(opening: bytes, item: object) -> Any:
-    """What a worker does with an item."""
+    """Return the value of an item, at a worker."""
     with _opening:  # once, however many threads the worker has
         function = _function(opening)
     return function(item)

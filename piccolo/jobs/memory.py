@@ -1,4 +1,4 @@
-"""How much memory may still be taken, asked before much is: a refusal in one line, not the kernel's kill."""
+"""Memory that may still be taken, asked before much is: a refusal in one line, not the kernel's kill."""
 
 import os
 import resource

@@ -123,7 +123,7 @@ def library_threads(count: int) -> Iterator[None]:
 
 
 class _Own:
-    """What a process works with."""
+    """The opening and the function of this process."""
 
     opening: Opening
     function: Function

@@ -20,7 +20,7 @@ ALL = "all"
 
 
 class Summary(NamedTuple):
-    """What a table says about some queries."""
+    """Statistics of some queries."""
 
     num_queries: int
     num_correct: int

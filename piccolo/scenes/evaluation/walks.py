@@ -1,4 +1,4 @@
-"""How well walks were localized: frames right, sure and refused, and the errors of the path."""
+"""Statistics of walks: frames right, sure and refused, and the errors of the path."""
 
 import itertools
 from collections.abc import Iterable, Sequence
@@ -27,7 +27,7 @@ class Frame(NamedTuple):
 
 
 class WalkSummary(NamedTuple):
-    """What the table says about a walk, or about several."""
+    """Statistics of a walk, or of several."""
 
     num_frames: int
     num_correct: int  # of the frames that have an answer
