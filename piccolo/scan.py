@@ -221,7 +221,7 @@ class Scan:
     def occlusion_mask(
         self, panorama: File | NDArray[np.uint8], pose: Pose, read_options: ReadOptions | None = None
     ) -> NDArray[np.uint8]:
-        """Return which pixels of a photo contradict the scan at a pose of the world: (H, W) of the full sphere.
+        """Return the pixels of a photo that contradict the scan at a pose: (H, W), of the full sphere.
 
         255 where it contradicts, 0 where the scan explains it, 128 where one of them shows nothing.
         """

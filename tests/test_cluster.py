@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import signal
 import socket
 import subprocess
@@ -11,6 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
+from batches import untimed, wait_for_lines, workers_of
 from rooms import write_room
 
 from piccolo.cli import evaluate, localize
@@ -66,16 +66,6 @@ def scheduler(tmp_path_factory):
         process.wait()
 
 
-def _untimed(out):
-    return re.sub(r'"seconds": {[^}]*}', "", out.read_text())
-
-
-def _wait_for_lines(process, out, count):
-    while not out.exists() or out.read_bytes().count(b"\n") < count:
-        assert process.poll() is None
-        time.sleep(0.01)
-
-
 def test_a_local_cluster_loses_a_worker_is_interrupted_and_goes_on(scene, tmp_path, monkeypatch):
     """However fast it is, it can't come to its end: it waits for names on standard input."""
     monkeypatch.chdir(scene)
@@ -98,21 +88,19 @@ def test_a_local_cluster_loses_a_worker_is_interrupted_and_goes_on(scene, tmp_pa
     streams = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "bufsize": 1}
     with subprocess.Popen(command, **streams, start_new_session=True) as process:
         process.stdin.writelines(f"{name}\n" for name in names[:4])
-        _wait_for_lines(process, out, 2)
-        children = Path(f"/proc/{process.pid}/task").glob("*/children")
-        ids = [int(word) for path in children for word in path.read_text().split()]
-        workers = [id_ for id_ in ids if b"spawn_main" in Path(f"/proc/{id_}/cmdline").read_bytes()]
+        wait_for_lines(process, out, 2)
+        workers = workers_of(process)
         assert len(workers) == 2
         os.kill(workers[0], signal.SIGKILL)
         process.stdin.writelines(f"{name}\n" for name in names[4:8])
-        _wait_for_lines(process, out, 8)
+        wait_for_lines(process, out, 8)
         os.killpg(process.pid, signal.SIGINT)
         err = process.stderr.read()
         assert process.wait() == 130
     assert "ended by Ctrl-C after 8 results; the same command goes on from here" in err
     assert "Traceback" not in err
     assert localize.main([*words, "--pano", *names, "--jobs", "1"]) == 3
-    assert _untimed(out) == _untimed(whole)
+    assert untimed(out) == untimed(whole)
 
 
 @pytest.mark.parametrize("shared", [True, False])
@@ -126,7 +114,7 @@ def test_workers_elsewhere_open_the_scan_or_are_sent_it(scene, scheduler, tmp_pa
     if not shared:
         monkeypatch.setattr(cluster.Cluster, "has_files", lambda *_: False)
     assert localize.main([*words, "--out", str(out), "--dask", str(scheduler)]) == 3
-    assert _untimed(out) == _untimed(whole)
+    assert untimed(out) == untimed(whole)
     assert list(scheduler.parent.rglob("*.piccolo-map")) == []  # what was sent is gone
     if not shared:
         paper = [word for word in words if word not in preset]
@@ -141,7 +129,7 @@ def test_an_evaluation_on_a_cluster_gives_the_same(scene, scheduler, tmp_path, m
     outs = [tmp_path / name for name in ("whole.jsonl", "run.jsonl")]
     for out, more in zip(outs, ([], ["--dask", str(scheduler)]), strict=True):
         assert evaluate.main([*words, "--out", str(out), *more]) == 0
-    assert _untimed(outs[0]) == _untimed(outs[1])
+    assert untimed(outs[0]) == untimed(outs[1])
     monkeypatch.setattr(cluster.Cluster, "has_files", lambda *_: False)
     assert evaluate.main([*words, "--out", str(tmp_path / "c"), "--dask", str(scheduler)]) == 3
     assert "not all workers see" in capsys.readouterr().err

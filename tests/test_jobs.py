@@ -7,10 +7,10 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
+from batches import untimed, wait_for_lines, workers_of
 from rooms import write_room
 
 from piccolo.batch.localizer import Localizer
@@ -36,35 +36,16 @@ def many(scene, tmp_path_factory):
     (folder / "list.txt").write_text("\n".join(panos))
     out = folder / "poses.jsonl"
     assert localize.main(_words(scene, f"@{folder / 'list.txt'}", "--out", str(out), "--jobs", "1")) < 2
-    return f"@{folder / 'list.txt'}", _untimed(out)
+    return f"@{folder / 'list.txt'}", untimed(out)
 
 
 def _words(scene, pano, *more):
     return ["--cloud", str(scene / "cloud.ply"), "--pano", pano, "--quiet", *PAPER, *more]
 
 
-def _untimed(out):
-    """The text of a file of results without what differs from run to run."""
-    return re.sub(r'"seconds": {[^}]*}', "", out.read_text())
-
-
 def _process(words, **options):
     command = [sys.executable, str(ROOT / "localize.py"), *words]
     return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **options)
-
-
-def _workers_of(process):
-    """The ids of the processes that localize for another."""
-    children = Path(f"/proc/{process.pid}/task").glob("*/children")
-    ids = [int(word) for path in children for word in path.read_text().split()]
-    return [id_ for id_ in ids if b"spawn_main" in Path(f"/proc/{id_}/cmdline").read_bytes()]
-
-
-def _wait_for_lines(process, out, count):
-    """Return when a process has written so many lines to a file."""
-    while not out.exists() or out.read_bytes().count(b"\n") < count:
-        assert process.poll() is None
-        time.sleep(0.01)
 
 
 def test_several_processes_write_the_same_files(scene, tmp_path, capsys):
@@ -85,7 +66,7 @@ def test_several_processes_write_the_same_files(scene, tmp_path, capsys):
         err = re.sub(r" in [0-9.]+ s", "", capsys.readouterr().err)
         lines = [line for line in err.splitlines() if "%|" not in line]
         files = {path.name: path.read_bytes() for folder_ in pictures for path in folder_.iterdir()}
-        found[jobs] = _untimed(folder / "out"), files, [line for line in lines if line.strip()]
+        found[jobs] = untimed(folder / "out"), files, [line for line in lines if line.strip()]
     assert found["1"][0] == found["2"][0]
     assert found["1"][1] == found["2"][1]
     assert len(found["1"][1]) == 3
@@ -131,7 +112,7 @@ def test_a_signal_ends_all_and_the_same_command_goes_on(scene, many, tmp_path):
     words = _words(scene, many[0], "--out", str(out), "--jobs", "2", "--cache", "none")
     options = {"env": {**os.environ, "TMPDIR": str(temporary)}, "start_new_session": True}
     with _process(words, **options) as process:
-        _wait_for_lines(process, out, 2)
+        wait_for_lines(process, out, 2)
         os.killpg(process.pid, signal.SIGTERM)
         err = process.stderr.read()
         assert process.wait() == 143
@@ -142,23 +123,23 @@ def test_a_signal_ends_all_and_the_same_command_goes_on(scene, many, tmp_path):
     assert 2 <= text.count("\n") < 24
     assert text.endswith("\n")
     assert localize.main(words) < 2
-    assert _untimed(out) == many[1]
+    assert untimed(out) == many[1]
 
 
 def test_a_killed_process_costs_nothing_and_a_killed_parent_leaves_whole_lines(scene, many, tmp_path):
     out = tmp_path / "poses.jsonl"
     words = _words(scene, many[0], "--out", str(out), "--jobs", "2")
     with _process(words) as process:
-        _wait_for_lines(process, out, 2)
-        os.kill(_workers_of(process)[0], signal.SIGKILL)
-        _wait_for_lines(process, out, 9)
-        workers = _workers_of(process)
+        wait_for_lines(process, out, 2)
+        os.kill(workers_of(process)[0], signal.SIGKILL)
+        wait_for_lines(process, out, 9)
+        workers = workers_of(process)
         process.kill()
         process.stderr.read()  # until all have ended that had it open
     assert 1 <= len(workers) <= 2
     assert not any(Path(f"/proc/{id_}/exe").exists() for id_ in workers)
     assert localize.main(words) < 2
-    assert _untimed(out) == many[1]
+    assert untimed(out) == many[1]
 
 
 def test_names_on_standard_input_are_answered_as_they_come(scene):
@@ -213,8 +194,8 @@ def test_an_evaluation_survives_a_killed_process(scene, tmp_path, capsys):
     assert evaluate.main([*words, "--out", str(whole)]) == 0
     tool = [sys.executable, str(ROOT / "tools" / "evaluate.py"), *words, "--out", str(out), "--jobs", "2"]
     with subprocess.Popen(tool, stdout=subprocess.DEVNULL) as process:
-        _wait_for_lines(process, out, 1)
-        os.kill(_workers_of(process)[0], signal.SIGKILL)
+        wait_for_lines(process, out, 1)
+        os.kill(workers_of(process)[0], signal.SIGKILL)
         assert process.wait() == 0
-    assert _untimed(out) == _untimed(whole)
-    assert _untimed(whole).count("\n") == 16
+    assert untimed(out) == untimed(whole)
+    assert untimed(whole).count("\n") == 16

@@ -1,4 +1,4 @@
-"""The beginning of a command: signals and streams are in order before the libraries are imported, for a second.
+"""The beginning of a command: signals and streams, before the libraries are imported, for a second.
 
 `piccolo.cli.start.NAME` is a function without arguments that runs the command NAME, for console commands.
 """

@@ -6,13 +6,14 @@ import pickle
 import signal
 import socket
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
 from functools import lru_cache, partial
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any
 from urllib.parse import urlsplit
 
 from .. import __version__
@@ -158,9 +159,9 @@ class Cluster:
         num_threads = sum(self._client.nthreads().values())
         return InFlight(self._submit, items, max(LEAST_IN_FLIGHT, IN_FLIGHT * num_threads))
 
-    def _submit(self, item: object) -> "Submitted":
+    def _submit(self, item: object) -> SimpleNamespace:
         future = self._client.submit(value_of, self._opening, item, pure=False)
-        return Submitted(future.done, partial(self._result_of, future))
+        return SimpleNamespace(done=future.done, result=partial(self._result_of, future))
 
     def _result_of(self, future: Any) -> Any:
         """Wait for a value; or for what the function raised, or WorkerLostError, which are raised."""
@@ -172,13 +173,6 @@ class Cluster:
         except (self._distributed.client.FutureCancelledError, CancelledError) as error:
             text = f"--dask {self.address}: the scheduler was lost; the same command goes on from here"
             raise InputError(text) from error
-
-
-class Submitted(NamedTuple):
-    """The value of an item that a cluster has, as a future of concurrent.futures gives it."""
-
-    done: Callable[[], bool]
-    result: Callable[[], Any]
 
 
 def sent_file(name: str) -> Path:

@@ -125,8 +125,8 @@ def match_results(
     The image is found by its path, or else by its file name if only one query has that. A frame of a video,
     FOLDER/WALK.mp4#t=SECONDS, is the query of the walk of that name and time.
 
-    A result of no query, or of a name that several have, is passed to `tell` and left out. Raises InputError for a
-    second result of a query.
+    A result of no query, or of a name that several have, goes to `tell` and is left out. Raises
+    InputError for a second result of a query.
     """
     pairs = [(scene, query) for scene in scenes for query in scene.queries]
     queries = [(*pair, path) for pair in pairs for path in (pair[1].image, pair[1].labels) if path]
