@@ -72,11 +72,6 @@ def test_wrong_usage(options, capsys):
     assert "usage" in capsys.readouterr().err
 
 
-def test_preset_paper_has_no_up(capsys):
-    assert localize.main([*ONE, "--preset", "paper", "--up", "-y"]) == 2
-    assert "--up: not an option of the preset paper" in capsys.readouterr().err
-
-
 def test_several_files_in_feet_with_y_up(scene, tmp_path, capsys):
     pano = ["--pano", str(scene / "pano.png"), "--quiet"]
     cache = ["--cache", str(tmp_path)]

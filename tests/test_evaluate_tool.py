@@ -5,10 +5,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
-import time
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +12,7 @@ import pytest
 from poses import result, write_results
 from rooms import write_room
 
+from piccolo.batch.localizer import Localizer
 from piccolo.cli import evaluate
 from piccolo.jobs import memory
 from piccolo.panorama import picture
@@ -171,16 +168,6 @@ def test_an_unknown_variant_is_refused_and_runs_of_other_scenes_do_not_compare(s
     assert "no query in common" in capsys.readouterr().err
 
 
-def test_a_closed_pipe_is_no_message(scenes, tmp_path):
-    out = tmp_path / "run.jsonl"
-    assert _run(scenes, out, "--variants", "far") == 0
-    command = f"'{sys.executable}' '{ROOT}/tools/evaluate.py' --compare '{out}' '{out}' | true"
-    command += "; exit ${PIPESTATUS[0]}"
-    environment = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
-    done = subprocess.run(["bash", "-c", command], env=environment, capture_output=True, check=False)
-    assert (done.returncode, done.stderr) == (141, b"")
-
-
 def test_what_cannot_be_read_is_named_and_the_rest_done(scenes, tmp_path, capsys):
     root = tmp_path / "scenes"
     shutil.copytree(scenes, root)
@@ -235,42 +222,22 @@ def test_what_the_system_did_is_no_refusal_of_a_photo_without_an_answer(scenes, 
     assert _run(folder, out) == 0
 
 
-def _is_alive(group):
-    try:
-        os.killpg(group, 0)
-    except ProcessLookupError:
-        return False
-    return True
+def test_a_signal_ends_a_run_after_the_photo_at_work_and_the_same_command_goes_on(
+    scenes, tmp_path, monkeypatch, capsys
+):
+    out, answer = tmp_path / "run.jsonl", Localizer.answer
 
+    def answer_late(self, scan, task):
+        signal.raise_signal(signal.SIGTERM)
+        return answer(self, scan, task)
 
-@contextmanager
-def _running(scenes, tmp_path, num_translations):
-    """The tool at work in two processes, a group of their own."""
-    out = tmp_path / "run.jsonl"
-    tool = str(ROOT / "tools" / "evaluate.py")
-    command = [sys.executable, tool, "--scenes", str(scenes), "--out", str(out), "--jobs", "2"]
-    command += ["--preset", "paper", f"num_translations={num_translations}", "--quiet"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True) as process:
-        while not out.exists():
-            time.sleep(0.1)
-        time.sleep(1.5)
-        yield process
-
-
-def _ends(group):
-    """True if all of a process group end soon: multiprocessing's own helper takes a moment."""
-    deadline = time.monotonic() + 30.0
-    while _is_alive(group) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    return not _is_alive(group)
-
-
-def test_interrupt_ends_all_processes_without_a_traceback(scenes, tmp_path):
-    with _running(scenes, tmp_path, 3000) as process:
-        os.killpg(process.pid, signal.SIGINT)
-        assert process.wait(timeout=60) == 130
-        assert process.stderr.read().endswith(b"evaluate.py: interrupted\n")
-    assert _ends(process.pid)
+    with monkeypatch.context() as patched:
+        patched.setattr(Localizer, "answer", answer_late)
+        assert _run(scenes, out) == 143
+    assert capsys.readouterr().err.endswith("evaluate.py: terminated\n")
+    assert [row.key for row in read_run(out)[0]] == [("hall 2", "images/clean_0.jpg")]
+    assert _run(scenes, out) == 0
+    assert len(read_run(out)[0]) == 5
 
 
 @pytest.mark.parametrize(
