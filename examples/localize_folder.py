@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import piccolo
-from piccolo.query_options import QueryOptions
+from piccolo.scan import QueryOptions
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 

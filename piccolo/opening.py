@@ -1,10 +1,10 @@
-"""How a scan is opened: read, prepared for a method, or taken from a map prepared before."""
+"""Opening a scan: it is read and prepared for a method, or taken from a map prepared before."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, TypedDict, Unpack
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,30 +19,26 @@ from .jobs.threads import ProgressCallback, Workers, no_progress, num_cores, pro
 from .localization.settings import CoarseToFineSettings
 from .paper.localize import PaperMap
 from .paper.localize import prepare as prepare_by_paper
-from .query_options import File, Settings, refuse_unknown
-from .scan import Scan
+from .scan import File, Scan, Settings
 from .scan_map.named_scans import check_within
 from .scan_map.open_map import CachePolicy, open_map, prepared_map_among
 from .scan_map.scan_map import ScanMap, prepare_map
 
-
-class ScanOptions(TypedDict, total=False):
-    """How `open_scan` understands and prepares a scan; all may be left out."""
-
-    units: Literal["mm", "cm", "m", "ft", "us-ft"]  # of the coordinates; metres if not given
-    up: UpAxis  # the axis that points up; "auto" (default): the file's, z or in glTF y
-    intensity_as_gray: bool  # for files without colours
-    crs: str  # coordinate system, such as EPSG:25832, for photos with GPS; else what the file names
-    cache: bool | File  # keep the prepared map in the user's cache (default), nowhere, or in a folder
-    num_threads: int  # all cores if not given
-    progress: ProgressCallback  # is told (what is done, how many are done, of how many or None)
-    settings: Settings  # of the method; the default method's if not given
+DEFAULT = CoarseToFineSettings()
 
 
-def open_scan(
+def open_scan(  # noqa: PLR0913  options by name
     source: File | Sequence[File] | NDArray[np.floating[Any]],
     colors: NDArray[Any] | None = None,
-    **options: Unpack[ScanOptions],
+    *,
+    units: Literal["mm", "cm", "m", "ft", "us-ft"] = "m",
+    up: UpAxis = "auto",
+    intensity_as_gray: bool = False,
+    crs: str | None = None,
+    cache: bool | File = True,
+    num_threads: int | None = None,
+    progress: ProgressCallback | None = None,
+    settings: Settings = DEFAULT,
 ) -> Scan:
     """Read and prepare a coloured scan, in which photos can then be localized.
 
@@ -53,8 +49,22 @@ def open_scan(
         which are one scan; or points (N, 3) [m].
     colors
         With points: (N, 3) RGB, uint8, uint16, or floats in [0, 1].
-    **options
-        See ScanOptions.
+    units
+        Of the coordinates of files.
+    up
+        The axis that points up; "auto" is the file's: z, in glTF y.
+    intensity_as_gray
+        For files without colours.
+    crs
+        Coordinate system, such as EPSG:25832, for photos with GPS; by default what the file names.
+    cache
+        Keep the prepared map in the user's cache, nowhere, or in a folder.
+    num_threads
+        All cores by default.
+    progress
+        Is called with what is done, how many are done, and of how many, None if unknown.
+    settings
+        Of the method.
 
     Raises
     ------
@@ -70,29 +80,20 @@ def open_scan(
     room/images/clean_0.jpg localized
     room/images/clean_1.jpg localized
     """
-    refuse_unknown(options, ScanOptions, "open_scan")
-    if (units := options.get("units", "m")) not in METRES:
+    if units not in METRES:
         raise InputError(f"units: found {units!r}, wanted one of {', '.join(METRES)}")
-    callback = options.get("progress")
-    show = progress_to(callback) if callback else no_progress
-    workers = Workers(options.get("num_threads", num_cores()), show)
-    cache = options.get("cache", True)
-    policy = CachePolicy(cache is not False, None if isinstance(cache, bool) else Path(cache))
-    cloud_settings = CloudSettings(
-        METRES[units],
-        options.get("up", "auto"),
-        options.get("intensity_as_gray", False),
-        crs=options.get("crs"),
-    )
-    settings = options.get("settings", CoarseToFineSettings())
+    show = progress_to(progress) if progress else no_progress
+    workers = Workers(num_cores() if num_threads is None else num_threads, show)
+    cloud_settings = CloudSettings(METRES[units], up, intensity_as_gray, crs=crs)
     if isinstance(source, np.ndarray):
-        cloud, watch = stream_of_arrays(source, colors), Stopwatch()
-        return scan_of(cloud, str(ARRAYS), cloud_settings, settings, workers, watch)
+        cloud = stream_of_arrays(source, colors)
+        return scan_of(cloud, str(ARRAYS), cloud_settings, settings, workers, Stopwatch())
     if colors is not None:
         raise InputError("colors: given beside files, wanted with an array of points only")
     paths = [Path(source)] if isinstance(source, str | PathLike) else [Path(path) for path in source]
     if not paths:
         raise InputError("open_scan: found no file, wanted a scan's path")
+    policy = CachePolicy(cache is not False, None if isinstance(cache, bool) else Path(cache))
     return open_files(paths, cloud_settings, settings, policy, workers)
 
 
@@ -103,7 +104,7 @@ def open_files(
     cache: CachePolicy,
     workers: Workers,
 ) -> Scan:
-    """The same with all options as objects, for files."""
+    """Open the files of a scan; all options are objects."""
     watch = Stopwatch()
     name = str(paths[0]) if len(paths) == 1 else tuple(map(str, paths))
     if isinstance(settings, CoarseToFineSettings):
@@ -126,11 +127,11 @@ def scan_of(
     workers: Workers,
     watch: Stopwatch,
 ) -> Scan:
-    """A scan prepared anew for the method of the settings."""
+    """Prepare a scan for the method of the settings."""
     prepared: ScanMap | PaperMap
     if isinstance(settings, CoarseToFineSettings):
-        how = cloud_settings.up, watch
-        prepared = prepare_map(cloud, workers, *how, prior=settings.prior, has_features=False)
+        prior = settings.prior
+        prepared = prepare_map(cloud, workers, cloud_settings.up, watch, prior=prior, has_features=False)
     else:
         with watch.stage("read"):
             points = cloud.read()

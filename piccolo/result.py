@@ -20,24 +20,16 @@ from .confidence.localization import Alternative, FocalLength, Localization
 from .confidence.score import Evidence
 from .errors import UNPRINTABLE, InputError, is_passing, printable, text_of
 from .files.json_file import document_of, parse_lines, read_bytes
-from .geometry.pose import Pose, checked_rotation
+from .geometry.pose import Pose, T_world_from_cam, checked_rotation, quaternion_wxyz
 from .geometry.sphere import CONVENTION
 from .jobs.memory import is_shortage
-from .result_parts import (
-    POSE_FIELDS,
-    alternative_from_json,
-    alternative_json,
-    covariance_from_json,
-    gps_prior_from_json,
-    pose_json,
-    walk_from_json,
-    walk_json,
-)
 from .scan_map.prior import GpsPrior
-from .walk.localize import WalkFrame
+from .walk.localize import Alone, Gap, WalkFrame
 
 FORMAT = "piccolo-pose/8"
-UNREADABLE, FAILED = "unreadable", "failed"
+POSE_FIELDS = ("R_cam_from_world", "center_world", "quaternion_wxyz", "T_world_from_cam")
+UNREADABLE = "unreadable"
+FAILED = "failed"
 MAX_ROTATION_ERROR = 1e-6  # of R R^T from the identity, in a file
 NO_NAME = re.compile("[\ud800-\udc7f\udd00-\udfff]")  # what os.fsdecode never gives
 WANTED = "wanted JSON lines of localize.py"
@@ -59,7 +51,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Result:
-    """Where one panorama was taken, and what speaks for it."""
+    """The pose of one panorama, its status and its evidence."""
 
     status: str  # "localized", "ambiguous", "not_localized", "unreadable" or "failed"
     confidence: float  # [0, 1] how likely the pose is right, see piccolo.confidence
@@ -94,7 +86,7 @@ class Result:
 
     @property
     def pose(self) -> Pose | None:
-        """Where the photo was taken, if it is localized."""
+        """The pose of a photo that is localized."""
         return self.best_pose if self.status == LOCALIZED else None
 
     @property
@@ -125,7 +117,8 @@ class Result:
                 f"{100.0 * e.contradicted_fraction:.0f} % contradicted"
             )
         if self.covariance is not None:
-            mm, deg = 1000.0 * self.covariance.largest_std, self.covariance.std_deg.max()
+            mm = 1000.0 * self.covariance.largest_std
+            deg = self.covariance.std_deg.max()
             lines.append(
                 f"  one sigma {mm:.1f} mm ({self.covariance.least_constrained_direction}), {deg:.2f} deg"
             )
@@ -147,14 +140,14 @@ class Result:
             "camera": camera_document(self.cameras) if self.cameras else None,
             "focal_length": self.focal_length and asdict(self.focal_length),
             **asdict(self.source),
-            **(pose_json(self.pose) or dict.fromkeys(POSE_FIELDS)),
-            "best_guess": pose_json(self.best_guess),
+            **(_pose_json(self.pose) or dict.fromkeys(POSE_FIELDS)),
+            "best_guess": _pose_json(self.best_guess),
             "scan": self.scan,
             "storey": self.storey,
             "height_above_floor_m": self.height_above_floor,
             "loss": self.loss,
             "evidence": self.evidence and asdict(self.evidence),
-            "alternatives": [alternative_json(alternative) for alternative in self.alternatives],
+            "alternatives": [_alternative_json(alternative) for alternative in self.alternatives],
             "covariance": self.covariance and self.covariance.matrix.tolist(),
             "covariance_convention": COVARIANCE_CONVENTION,
             "std_mm": self.covariance and self.covariance.std_mm.tolist(),
@@ -163,7 +156,7 @@ class Result:
             "convention": CONVENTION,
             "seconds": {stage: round(seconds, 4) for stage, seconds in self.seconds.items()},
             "gps_prior": self.gps_prior and asdict(self.gps_prior),
-            "walk": self.walk and walk_json(self.walk),
+            "walk": self.walk and _walk_json(self.walk),
             "settings": self.settings,
             "warnings": list(self.warnings),
             "version": __version__,
@@ -181,12 +174,12 @@ class Result:
                 source=_source_from_json(document),
                 cameras=mounts_of(document["camera"]) if document.get("camera") else (),
                 focal_length=document["focal_length"] and FocalLength(**document["focal_length"]),
-                gps_prior=gps_prior_from_json(document["gps_prior"]),
+                gps_prior=_gps_prior_from_json(document["gps_prior"]),
                 evidence=document["evidence"] and Evidence(**document["evidence"]),
-                alternatives=tuple(map(alternative_from_json, document["alternatives"])),
-                covariance=covariance_from_json(document),
+                alternatives=tuple(map(_alternative_from_json, document["alternatives"])),
+                covariance=_covariance_from_json(document),
                 height_above_floor=document["height_above_floor_m"],
-                walk=document["walk"] and walk_from_json(document["walk"]),
+                walk=document["walk"] and _walk_from_json(document["walk"]),
                 warnings=tuple(document["warnings"]),
                 **{name: document[name] for name in _PLAIN_FIELDS},
             )
@@ -243,6 +236,75 @@ _PLAIN_FIELDS = (
 )
 
 
+def _rotation_and_center(pose: Pose) -> dict[str, object]:
+    return {"R_cam_from_world": pose.R_cam_from_world.tolist(), "center_world": pose.center_world.tolist()}
+
+
+def _pose_from_json(document: dict[str, Any]) -> Pose:
+    return Pose(np.array(document["R_cam_from_world"]), np.array(document["center_world"]))
+
+
+def _pose_json(pose: Pose | None) -> dict[str, object] | None:
+    """A pose in all its forms, POSE_FIELDS."""
+    if pose is None:
+        return None
+    return {
+        **_rotation_and_center(pose),
+        "quaternion_wxyz": quaternion_wxyz(pose.R_cam_from_world).tolist(),
+        "T_world_from_cam": T_world_from_cam(pose).tolist(),
+    }
+
+
+def _gps_prior_from_json(value: dict[str, Any] | None) -> GpsPrior | None:
+    return (
+        None if value is None else GpsPrior(tuple(value["center_world"]), value["radius"], value["is_used"])
+    )
+
+
+def _covariance_from_json(document: dict[str, Any]) -> PoseCovariance | None:
+    """The covariance in the fields of a result."""
+    matrix = document["covariance"]
+    return (
+        None if matrix is None else PoseCovariance(np.array(matrix), document["least_constrained_direction"])
+    )
+
+
+def _alternative_json(alternative: Alternative) -> dict[str, object]:
+    """An alternative: its pose as rotation and centre, and what speaks for it."""
+    numbers = {f.name: getattr(alternative, f.name) for f in fields(alternative) if f.name != "pose"}
+    return _rotation_and_center(alternative.pose) | numbers
+
+
+def _alternative_from_json(document: dict[str, Any]) -> Alternative:
+    return Alternative(
+        _pose_from_json(document),
+        **{f.name: document[f.name] for f in fields(Alternative) if f.name != "pose"},
+    )
+
+
+def _walk_json(walk: WalkFrame) -> dict[str, object]:
+    alone: dict[str, object] | None = None
+    if walk.alone is not None:
+        about = {"status": walk.alone.status, "confidence": walk.alone.confidence}
+        alone = {**about, **(_pose_json(walk.alone.pose) or dict.fromkeys(POSE_FIELDS))}
+    return {
+        "frame": walk.frame,
+        "time": walk.time,
+        "how": walk.how,
+        "alone": alone,
+        "gap": walk.gap and asdict(walk.gap),
+    }
+
+
+def _walk_from_json(value: dict[str, Any]) -> WalkFrame:
+    gap = value["gap"]
+    alone = value["alone"]
+    if alone is not None:
+        pose = None if alone["R_cam_from_world"] is None else _pose_from_json(alone)
+        alone = Alone(alone["status"], alone["confidence"], pose)
+    return WalkFrame(value["time"], value["frame"], value["how"], alone, gap and Gap(**gap))
+
+
 def _source_from_json(document: dict[str, Any]) -> Source:
     values = {f.name: document[f.name] for f in fields(Source)}
     return Source(**values | {"image_size": values["image_size"] and tuple(values["image_size"])})
@@ -250,7 +312,7 @@ def _source_from_json(document: dict[str, Any]) -> Source:
 
 def _best_pose_from_json(document: dict[str, Any]) -> Pose | None:
     own = document if document["status"] == LOCALIZED else document["best_guess"]
-    return None if own is None else Pose(np.array(own["R_cam_from_world"]), np.array(own["center_world"]))
+    return None if own is None else _pose_from_json(own)
 
 
 def _place(alternative: Alternative) -> str:
@@ -313,7 +375,8 @@ def _checked_result(text: str) -> Result:
     if not all(isinstance(value, int | float) and math.isfinite(value) for value in values):
         raise InputError(f"result: found confidence and score {values}, wanted finite numbers")
     if result.best_pose is not None:
-        R, center = result.best_pose.R_cam_from_world, result.best_pose.center_world
+        R = result.best_pose.R_cam_from_world
+        center = result.best_pose.center_world
         is_number = R.dtype.kind in "fiu" and center.dtype.kind in "fiu"
         if not (is_number and center.shape == (3,) and np.isfinite(center).all()):
             raise InputError("result: found no numbers of a pose, wanted R_cam_from_world and center_world")

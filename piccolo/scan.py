@@ -1,42 +1,101 @@
 """A scan that photos are localized in: what `import piccolo` gives."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from os import PathLike
 from pathlib import Path
-from typing import Unpack
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .camera import Calibration
+from .camera.files import read_calibration, read_rig
 from .cloud.settings import CloudSettings
 from .cloud.soa import PackedPoints
 from .confidence.confidence import LOCALIZED
-from .confidence.localization import Localization
 from .confidence.occlusion import occlusion_mask
 from .errors import InputError
 from .files.json_file import reading_once
 from .geometry.pose import Pose
+from .geometry.rotations import Gravity
 from .jobs.stopwatch import Stopwatch
 from .jobs.threads import Workers
 from .localization.localize import has_guessed_focal, localize, localize_guessed
 from .localization.settings import CoarseToFineSettings
-from .panorama import Panorama, ReadOptions, read_query
-from .panorama.photo import Photo, photo_of, photo_of_array
+from .optimize.settings import Solver
+from .panorama import ReadOptions, read_query
+from .panorama.model import Projection
+from .panorama.photo import Photo
 from .paper.localize import PaperMap
 from .paper.localize import localize as localize_by_paper
 from .paper.settings import PaperSettings
-from .query_options import File, QueryOptions, Settings, asked_of
 from .result import Result, Source, result_of
 from .scan_map.named_scans import check_within
 from .scan_map.places import with_places
-from .scan_map.prior import GpsPrior, gps_prior
+from .scan_map.prior import GpsPrior, Prior, gps_prior
 from .scan_map.scan_map import ScanMap
-from .scan_walk import Walk, WalkAbout
+from .scan_walk import Walk, WalkAbout, photo_facts
 from .walk.frames import MAX_ACCELERATION, MAX_SPEED, Motion
 from .walk.tracker import Tracker
 
 LABELS_WARNING = "labels: the confidence was learnt on colours, and is a rough guide only"
+File = str | PathLike[str]
+Settings = CoarseToFineSettings | PaperSettings
+
+
+class QueryOptions(TypedDict, total=False):
+    """Options of `Scan.localize` about a photo; all may be left out."""
+
+    mask: File | NDArray[np.bool_]  # what is to be ignored: white pixels of a picture, True of an array
+    mask_nadir_deg: float  # the cap of this half angle about the camera's down axis is ignored
+    fov_deg: float  # horizontal field of view of a picture that is a part of the sphere
+    projection: Projection  # of the picture: "equirectangular", "pinhole" or "fisheye"
+    focal_px: float  # focal length of a pinhole photo [px]
+    camera: File  # calibration of the camera, see docs/CAMERAS.md
+    rig: File  # the same of several cameras; the panorama is the folder of one instant's pictures
+    gravity_vector: tuple[float, float, float]  # down, in the camera's axes
+    refine_focal: bool  # the focal length is a first guess
+    cube_order: str  # the picture is six cube faces in this order, such as "rludfb"
+    use_gps: bool  # a GPS position in the file narrows the search (default), or not
+    gravity: Gravity  # "known": upright camera, "unknown": any rotation, "auto": both are tried
+    solver: Solver  # of the last descent
+    near_world: tuple[float, float, float]  # [m] the camera is within `radius` of this
+    radius: float  # [m]
+    height: tuple[float, float]  # [m] least and most above the floor
+    heading_deg: float  # of the image centre, clockwise from the cloud's +y
+    heading_tolerance_deg: float
+    within: tuple[str, ...]  # names of the map's scans that the camera may be in
+    min_confidence: float  # below it a pose is not called localized
+
+
+READ_FIELDS = {f.name for f in fields(ReadOptions)}
+PRIOR_FIELDS = {f.name for f in fields(Prior)}
+
+
+def parse_options(
+    options: QueryOptions, settings: Settings, cloud_settings: CloudSettings
+) -> tuple[ReadOptions, Settings, NDArray[np.bool_] | None]:
+    """Return options of a photo as objects, beside the settings of all; and the mask, if it is an array."""
+    given: dict[str, Any] = dict(options)
+    is_masked = given.pop("mask") if isinstance(given.get("mask"), np.ndarray) else None
+    if "mask" in given:
+        given["mask"] = Path(given["mask"])
+    prior = {k: given.pop(k) for k in PRIOR_FIELDS & given.keys()}
+    if isinstance(prior.get("within"), str):
+        raise InputError(f"within: found the text {prior['within']!r}, wanted a list of names")
+    if prior:
+        given["prior"] = Prior(**prior | {"within": tuple(prior.get("within", ()))})
+    if "camera" in given and "rig" in given:
+        raise InputError("camera, rig: wanted only one of them")
+    if "camera" in given:
+        given["calibration"] = read_calibration(Path(given.pop("camera")))
+    if "rig" in given:
+        given["calibration"] = read_rig(Path(given.pop("rig")))
+    read_options = ReadOptions(
+        labels=cloud_settings.labels, **{k: given.pop(k) for k in READ_FIELDS & given.keys()}
+    )
+    return read_options, replace(settings, **given), is_masked
 
 
 @dataclass(frozen=True)
@@ -57,7 +116,7 @@ class Scan:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the user should know about the scan, one line each."""
+        """Lines that the user should read about the scan."""
         return self.prepared.warnings
 
     def from_world(self, pose: Pose) -> Pose:
@@ -65,7 +124,7 @@ class Scan:
         return self.prepared.from_world(pose)
 
     def localize(self, panorama: File | NDArray[np.uint8], **options: Unpack[QueryOptions]) -> Result:
-        """Where a 360-degree photo was taken.
+        """Find where a 360-degree photo was taken.
 
         Parameters
         ----------
@@ -93,13 +152,13 @@ class Scan:
         >>> result.status, result.pose.center_world.round(2)
         ('localized', array([2.6 , 3.17, 1.21]))
         """
-        asked = asked_of(options, "localize", self.settings, self.cloud_settings)
-        return self.localize_query(panorama, asked.read_options, asked.settings, asked.is_masked)
+        parsed = parse_options(options, self.settings, self.cloud_settings)
+        return self.localize_query(panorama, *parsed)
 
     def localize_many(
         self, panoramas: Iterable[File | NDArray[np.uint8]], **options: Unpack[QueryOptions]
     ) -> Iterator[Result]:
-        """The result of each panorama in order, as it comes; options as in `localize`."""
+        """Yield the result of each panorama in order, as it comes; options as in `localize`."""
         for panorama in panoramas:
             yield self.localize(panorama, **options)
 
@@ -109,7 +168,7 @@ class Scan:
         max_acceleration: float = MAX_ACCELERATION,
         **options: Unpack[QueryOptions],
     ) -> Walk:
-        """A camera that is carried through the scan, followed frame by frame: `add` each as it comes.
+        """Follow a camera that is carried through the scan: `add` each frame as it comes.
 
         Parameters
         ----------
@@ -121,10 +180,10 @@ class Scan:
         **options
             As in `localize`, of all frames; not `refine_focal`, and `mask` as a path.
         """
-        asked = asked_of(options, "track", self.settings, self.cloud_settings)
+        read_options, settings, _ = parse_options(options, self.settings, self.cloud_settings)
         speed = MAX_SPEED if max_speed is None else max_speed
         motion = Motion(speed, max_acceleration, is_guess=max_speed is None)
-        return self.walk(asked.read_options, asked.settings, motion)
+        return self.walk(read_options, settings, motion)
 
     def localize_walk(
         self,
@@ -134,7 +193,7 @@ class Scan:
         max_acceleration: float = MAX_ACCELERATION,
         **options: Unpack[QueryOptions],
     ) -> list[Result]:
-        """The results of a walk's frames, in order: each told by those before and after it.
+        """Return the results of a walk's frames, in order, each of which narrows the others.
 
         `times` [s] rise; without them only the order counts. The others are as in `track`.
         """
@@ -147,7 +206,7 @@ class Scan:
         return walk.finish()
 
     def walk(self, read_options: ReadOptions, settings: Settings, motion: Motion) -> Walk:
-        """The same as `track` with all options as objects."""
+        """Return a walk with all options as objects, as `track` does."""
         if not isinstance(self.prepared, ScanMap) or not isinstance(settings, CoarseToFineSettings):
             raise InputError("walks: not of the preset paper")
         if read_options.refine_focal:
@@ -162,7 +221,7 @@ class Scan:
     def occlusion_mask(
         self, panorama: File | NDArray[np.uint8], pose: Pose, read_options: ReadOptions | None = None
     ) -> NDArray[np.uint8]:
-        """What of a photo contradicts the scan at a pose of the world: (H, W), of the full sphere's size.
+        """Return the pixels of a photo that contradict the scan at a pose: (H, W), of the full sphere.
 
         255 where it contradicts, 0 where the scan explains it, 128 where one of them shows nothing.
         """
@@ -177,23 +236,26 @@ class Scan:
         is_masked: NDArray[np.bool_] | None = None,
         calibration: Calibration | None = None,
     ) -> Result:
-        """The same with all options as objects; apart the mask of an array, and the camera of this photo."""
+        """Localize a photo, all options as objects; apart a mask that is an array, and the photo's camera."""
         watch = Stopwatch()
         repeated = settings_json(settings, self.cloud_settings, read_options)
         if calibration is not None and read_options.calibration is None:
             read_options = replace(read_options, calibration=calibration)
         with watch.stage("read"), reading_once():
             picture = read_query(panorama, read_options, is_masked)
-            if isinstance(panorama, np.ndarray):
-                photo = photo_of_array(panorama)
-            else:
-                photo = photo_of(Path(panorama), read_options.rig)
+            photo = photo_facts(panorama, read_options.rig)
         gps = None
         if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
-            gps = self.gps_prior_of(photo, settings) if read_options.use_gps else None
             check_within(self.prepared, settings.prior.within)
-            by = localize_guessed if has_guessed_focal(picture) else localize
-            found, gps = self._localized(by, self.prepared, picture, settings, gps, watch)
+            attempts: list[tuple[CoarseToFineSettings, GpsPrior | None]] = [(settings, None)]
+            if read_options.use_gps and (gps := self.gps_prior_of(photo, settings)):
+                near = replace(settings, prior=gps.applied_to(settings.prior))
+                attempts = [(near, gps), (settings, replace(gps, is_used=False))]
+            run = localize_guessed if has_guessed_focal(picture) else localize
+            for tried, gps in attempts:  # noqa: B007  near the GPS position, or else anywhere
+                found = run(self.prepared, picture, tried, self.workers, watch)
+                if found.status == LOCALIZED:
+                    break
             found = with_places(self.prepared, found)
         elif isinstance(self.prepared, PaperMap) and isinstance(settings, PaperSettings):
             if read_options.refine_focal:
@@ -222,28 +284,10 @@ class Scan:
             return None
         return gps_prior(photo.gps, crs, self.cloud_settings.scale)
 
-    def _localized(
-        self,
-        by: Callable[..., Localization],
-        scan_map: ScanMap,
-        picture: Panorama,
-        settings: CoarseToFineSettings,
-        gps: GpsPrior | None,
-        watch: Stopwatch,
-    ) -> tuple[Localization, GpsPrior | None]:
-        """What is found near the GPS position, or else anywhere, if that is as good."""
-        if gps is not None:
-            near = replace(settings, prior=gps.applied_to(settings.prior))
-            found = by(scan_map, picture, near, self.workers, watch)
-            if found.status == LOCALIZED:
-                return found, gps
-            gps = replace(gps, is_used=False)
-        return by(scan_map, picture, settings, self.workers, watch), gps
-
 
 def settings_json(
     settings: Settings, cloud_settings: CloudSettings, read_options: ReadOptions
 ) -> dict[str, object]:
-    """What a result repeats of how it was made."""
+    """Return the settings that a result repeats."""
     how = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(read_options).items()}
     return {**settings.to_json(), "cloud": asdict(cloud_settings), "panorama": how}

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .camera import Calibration
 from .confidence.localization import Localization
 from .files.json_file import reading_once
 from .jobs.stopwatch import Stopwatch
@@ -28,7 +29,7 @@ Picture = str | PathLike[str] | NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class WalkAbout:
-    """What all results of a walk repeat."""
+    """Fields that all results of a walk repeat."""
 
     cloud: str | tuple[str, ...]
     warnings: tuple[str, ...]
@@ -56,15 +57,22 @@ class Prepared(NamedTuple):
     query: Query | None
 
 
+def photo_facts(picture: Picture, rig: Calibration | None) -> Photo:
+    """Return what is known of a photo beside its pixels."""
+    return photo_of_array(picture) if isinstance(picture, np.ndarray) else photo_of(Path(picture), rig)
+
+
 class Walk:
     """A camera followed through a scan: `add` frames in order; `finish` tells what all say together."""
 
     def __init__(self, tracker: Tracker, read_options: ReadOptions, about: WalkAbout) -> None:
-        self.tracker, self.read_options, self.about = tracker, read_options, about
+        self.tracker = tracker
+        self.read_options = read_options
+        self.about = about
         self.taken: list[Taken] = []
 
     def add(self, frame: Picture, time: float | None = None, name: str | None = None) -> Result:
-        """Where the camera is now, by this frame and those before.
+        """Find where the camera is now, by this frame and those before.
 
         A frame that can't be read is a result that says so. `time` [s] is that since any beginning, of all
         frames or of none; `name` stands in the result in place of the path.
@@ -79,7 +87,7 @@ class Walk:
             try:
                 with watch.stage("read"):
                     panorama = replace(read_query(frame, self.read_options), focal_prior=None)  # as exact
-                    photo = self._photo(frame)
+                    photo = photo_facts(frame, self.read_options.rig)
             except Exception as error:
                 text, is_passing = failure_of(error)
                 if isinstance(frame, np.ndarray):
@@ -93,8 +101,9 @@ class Walk:
         return Prepared(Taken(frame, name, photo, watch.seconds, warnings), panorama, query)
 
     def follow(self, prepared: Prepared, time: float | None = None) -> Result:
-        """The result of `add`, of a frame that was prepared."""
-        number, (taken, panorama, query) = len(self.taken), prepared
+        """Return the result of `add`, of a frame that was prepared."""
+        number = len(self.taken)
+        taken, panorama, query = prepared
         when = float(number) if time is None else float(time)
         if self.tracker.frames:
             checked_times([self.tracker.frames[-1].time, when])
@@ -115,8 +124,9 @@ class Walk:
         self.tracker.accept(frame)
 
     def last_to_json(self) -> str:
-        """What was found of the last frame, on one line, from which `restore` goes on."""
-        taken, frame = self.taken[-1], self.tracker.frames[-1]
+        """Return the last frame and its pose on one line, from which `restore` goes on."""
+        taken = self.taken[-1]
+        frame = self.tracker.frames[-1]
         alone = frame.alone and result_of(frame.alone, cloud="", pano="", seconds={}, settings={}).to_json()
         photo = taken.photo and (taken.photo.sha256, taken.photo.image_size, taken.photo.capture_time)
         about = {"pano": taken.name, "photo": photo, "seconds": taken.seconds, "warnings": taken.warnings}
@@ -126,27 +136,25 @@ class Walk:
     def restore(self, line: str, picture: Path, time: float, name: str) -> bool:
         """Take the next frame from a line of `last_to_json`, if it is of this picture as it is now."""
         document = json.loads(line)
-        if document["pano"] != name or document["frame"]["time"] != time:
+        failure = document["failure"] and Failure(*document["failure"])
+        digest = document["photo"][0] if document["photo"] else document["sha256"]
+        is_same = document["pano"] == name and document["frame"]["time"] == time
+        if not is_same or (failure and failure.is_passing):
             return False
-        now = sha256_of(picture, self.read_options.rig)
-        if document["photo"] is None:
-            failure = Failure(*document["failure"])
-            if failure.is_passing or now != document["sha256"]:
-                return False
-            taken = Taken(picture, name, None, document["seconds"], (), now, failure)
-            self.accept(taken, Frame.from_json(document["frame"], None))
-            return True
-        digest, size, capture_time = document["photo"]
-        if now != digest:
+        if sha256_of(picture, self.read_options.rig) != digest:
             return False
+        photo = None
+        if document["photo"]:
+            (width, height), capture_time = document["photo"][1:]
+            photo = Photo(digest, (width, height), capture_time, None)
+        warnings = tuple(document["warnings"])
+        taken = Taken(picture, name, photo, document["seconds"], warnings, document["sha256"], failure)
         alone = document["alone"] and localization_in(Result.from_json(document["alone"]))
-        photo = Photo(digest, (size[0], size[1]), capture_time, None)
-        taken = Taken(picture, name, photo, document["seconds"], tuple(document["warnings"]))
         self.accept(taken, Frame.from_json(document["frame"], alone))
         return True
 
     def finish(self, show: Progress = no_progress) -> list[Result]:
-        """The result of each frame, by all of them."""
+        """Return the result of each frame, by all of them."""
         path = finished(self.tracker, self._panorama, show)
         found = localizations_of(self.tracker, path)
         return [
@@ -167,14 +175,10 @@ class Walk:
             return None
         return replace(read_query(taken.picture, self.read_options), focal_prior=None)
 
-    def _photo(self, frame: Picture) -> Photo:
-        if isinstance(frame, np.ndarray):
-            return photo_of_array(frame)
-        return photo_of(Path(frame), self.read_options.rig)
-
     def _result(self, taken: Taken, found: Localization, walk: WalkFrame | None) -> Result:
         """The result of a frame; one that can't be read keeps its place in the walk."""
-        about, photo = self.about, taken.photo
+        about = self.about
+        photo = taken.photo
         digest = self.tracker.scan_map.scan_sha256 or None
         if photo is None:
             text, is_passing = taken.failure or ("", False)

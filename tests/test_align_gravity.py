@@ -271,7 +271,7 @@ def test_true_poses_go_along(run, tilted, tmp_path):
         ("--apply T.txt --out o.ply --assume-nothing", "--assume-nothing can't be combined with --apply"),
         ("--up y --assume-nothing", "--assume-nothing can't be combined with --apply or --up"),
         ("--up y --pano photo.jpg", "--pano can't be combined with --apply or --up"),
-        ("--scale -1", "--scale"),
+        ("--units -1", "--units"),
         ("--out o.json", "--out o.json: wanted a name that ends with .ply"),
     ],
 )

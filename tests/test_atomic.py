@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from piccolo.cli.errors import UsageError, run_command
+from piccolo.cli.command import command
+from piccolo.cli.errors import UsageError
 from piccolo.cli.outputs import check_distinct, check_outputs, check_suffix
-from piccolo.cli.parser import add_run_options, new_parser
 from piccolo.errors import InputError
 from piccolo.files import atomic
 from piccolo.files.atomic import (
@@ -176,11 +176,9 @@ def test_a_signal_leaves_nothing(tmp_path, number, code):
             signal.raise_signal(number)
         return 0
 
-    parser = new_parser("prepare_map", None, "")
-    add_run_options(parser)
     before = [signal.signal(signal.SIGINT, signal.default_int_handler), signal.getsignal(signal.SIGTERM)]
     try:
-        assert run_command(parser, [], run) == code
+        assert command("prepare_map.py", None, "", lambda parser: None)(run)([]) == code
         assert signal.getsignal(signal.SIGTERM) is before[1]
     finally:
         signal.signal(signal.SIGINT, before[0])

@@ -20,13 +20,11 @@ from piccolo.batch import localizer as module
 from piccolo.batch.inputs import panoramas_of
 from piccolo.cli import localize
 from piccolo.errors import InputError
-from piccolo.files.line_file import appending, whole_lines, whole_size
-from piccolo.jobs import memory
-from piccolo.panorama import picture
+from piccolo.files.line_file import locked, whole_lines, whole_size
 from piccolo.result import Result, read_results
 
 ROOT = Path(__file__).resolve().parents[1]
-PAPER = ["--preset", "paper", "--num-translations", "4", "--num-iterations", "5", "--max-points", "5000"]
+PAPER = ["--preset", "paper", "num_translations=4", "num_iterations=5", "max_points=5000"]
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +49,7 @@ def counted(monkeypatch):
 
 def _run(scene, out, *more, pano=None):
     cloud, panos = str(scene / "cloud.ply"), pano or [str(scene / "images")]
-    return localize.main(["--cloud", cloud, "--pano", *panos, "--out", str(out), "--no-cache", *more])
+    return localize.main(["--cloud", cloud, "--pano", *panos, "--out", str(out), "--cache", "none", *more])
 
 
 def _lines(out):
@@ -139,7 +137,7 @@ def test_a_file_of_another_run_is_refused_with_both_ways(scene, tmp_path, change
     assert _run(scene, out, "--quiet", *more, pano=panos) == 3
     err = capsys.readouterr().err
     assert message in err
-    assert "--overwrite starts anew, another --out keeps both" in err
+    assert "--overwrite starts again, another --out keeps both" in err
     assert err.count("\n") == 1
     assert out.read_bytes() == before
 
@@ -260,17 +258,6 @@ def test_what_the_system_did_to_a_photo_is_tried_again(scene, tmp_path, counted,
     assert "failed" not in {line["status"] for line in _lines(out)}
 
 
-def test_a_limit_of_memory_is_no_fault_of_the_photos(scene, tmp_path):
-    out = tmp_path / "poses.jsonl"
-    with pytest.MonkeyPatch().context() as patched:
-        patched.setattr(picture, "check_memory", lambda *given: memory.check_memory(1e15, *given[1:]))
-        assert _run(scene, out, *PAPER) == 3
-    assert {line["status"] for line in _lines(out)} == {"failed"}
-    assert "may be taken; make the picture smaller" in _lines(out)[0]["error"]
-    assert _run(scene, out, *PAPER) < 2
-    assert "failed" not in {line["status"] for line in _lines(out)}
-
-
 def test_a_photo_is_read_once_so_that_its_digest_is_of_its_pixels(scene, tmp_path, monkeypatch):
     photo, out = tmp_path / "a.jpg", tmp_path / "poses.jsonl"
     first, second = ((scene / "images" / f"clean_{k}.jpg").read_bytes() for k in (0, 1))
@@ -302,7 +289,7 @@ ODD = [
 ]
 
 
-@pytest.mark.parametrize("more", [[], ["--jobs", "2"], ["--walk", "--times", "order"]])
+@pytest.mark.parametrize("more", [["--jobs", "2"], ["--walk", "--times", "order"]])
 def test_any_name_that_a_file_may_have_is_localized(scene, tmp_path, more, capsys):
     photos, out, overlays = tmp_path / "photos", tmp_path / "poses.jsonl", tmp_path / "overlays"
     photos.mkdir()
@@ -392,30 +379,15 @@ def test_a_signal_ends_a_batch_after_the_photo_at_work(scene, tmp_path, number, 
     assert out.read_bytes().endswith(b"\n")
 
 
-def test_names_on_standard_input_are_answered_as_they_come(scene):
-    name = str(scene / "images" / "clean_1.jpg")
-    with _process(scene, None, ["-", "--quiet"], stdout=subprocess.PIPE, bufsize=1) as process:
-        for word, status in ((name, "localized"), ("missing.jpg", "unreadable"), (name, "localized")):
-            process.stdin.write(word + "\n")
-            process.stdin.flush()
-            assert Result.from_json(process.stdout.readline()).status == status
-        process.stdin.close()
-        assert process.wait(timeout=60) == 3
-
-
 def test_two_processes_do_not_write_one_file(tmp_path):
     out = tmp_path / "poses.jsonl"
-    with appending(out, 0) as append:
-        append('{"a": 1}')
-        with pytest.raises(InputError, match="another process is writing it"), appending(out, 0):
-            pass
-    assert out.read_text() == '{"a": 1}\n'
-    with pytest.raises(InputError, match="has written it since"), appending(out, 0):
-        pass
-    with appending(out, whole_size(out, b"{", "a test")) as append:
-        append('{"b": 2}')
-    assert list(whole_lines(out, out.stat().st_size)) == [b'{"a": 1}\n', b'{"b": 2}\n']
-    with appending(tmp_path / "new", 0):
+    for line in ('{"a": 1}', '{"b": 2}'):
+        with locked(out) as file:
+            file.append(line)
+            with pytest.raises(InputError, match="another process is writing it"), locked(out):
+                pass
+    assert list(whole_lines(out, whole_size(out, b"{", "a test"))) == [b'{"a": 1}\n', b'{"b": 2}\n']
+    with locked(tmp_path / "new"):
         pass
     assert not (tmp_path / "new").exists()
 
@@ -424,15 +396,15 @@ def test_a_file_that_was_removed_before_it_was_locked_is_opened_again(tmp_path, 
     """The first of two writes nothing and removes the file, which the second has opened before."""
     out, flock = tmp_path / "poses.jsonl", fcntl.flock
     first = contextlib.ExitStack()
-    first.enter_context(appending(out, None))
+    first.enter_context(locked(out))
 
     def flock_late(handle, how):
         first.close()
         flock(handle, how)
 
     monkeypatch.setattr(fcntl, "flock", flock_late)
-    with appending(out, None) as append:
-        append("{}")
+    with locked(out) as file:
+        file.append("{}")
     assert out.read_text() == "{}\n"
 
 
@@ -440,11 +412,11 @@ def test_a_full_disk_keeps_the_lines_before(tmp_path):
     code = (
         "import resource, sys\n"
         "from pathlib import Path\n"
-        "from piccolo.files.line_file import appending\n"
+        "from piccolo.files.line_file import locked\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
-        "with appending(Path(sys.argv[1]), 0) as append:\n"
+        "with locked(Path(sys.argv[1])) as file:\n"
         "    for k in range(9):\n"
-        "        append(str(k) * 300)\n"
+        "        file.append(str(k) * 300)\n"
     )
     out = tmp_path / "lines"
     done = subprocess.run(
@@ -457,16 +429,6 @@ def test_a_full_disk_keeps_the_lines_before(tmp_path):
 def test_a_full_device_is_named(scene, capsys):
     assert _run(scene, Path("/dev/full"), "--quiet", pano=[str(scene / "images" / "clean_0.jpg")]) == 3
     assert capsys.readouterr().err == "localize.py: /dev/full: cannot be used (No space left on device)\n"
-
-
-def test_several_pictures_go_into_folders(scene, tmp_path):
-    folders = tmp_path / "overlays", tmp_path / "changes"
-    for folder in folders:
-        folder.mkdir()
-    options = ["--overlay", str(folders[0]), "--occlusion-mask", str(folders[1])]
-    assert _run(scene, tmp_path / "poses.jsonl", "--quiet", *options) == 0
-    for folder in folders:
-        assert sorted(path.name for path in folder.iterdir()) == ["clean_0.png", "clean_1.png", "clean_2.png"]
 
 
 def test_priors_of_a_table_go_before_the_general_one(scene, tmp_path, capsys):

@@ -68,7 +68,7 @@ def test_localize_overlay_export_and_render_show_the_photo_s_own_field(photos, t
     image, camera = photos / "images/clean_0.jpg", photos / "camera.json"
     out, overlay = tmp_path / "pose.jsonl", tmp_path / "overlay.png"
     cloud = ["--cloud", str(photos / "cloud.ply")]
-    command = [*cloud, "--pano", str(image), "--camera", str(camera), "--gravity", "known", "--no-cache"]
+    command = [*cloud, "--pano", str(image), "--camera", str(camera), "--gravity", "known", "--cache", "none"]
     localize.main([*command, "--out", str(out), "--overlay", str(overlay)])
     (result,) = read_results([out])
     assert result.cameras == (Mount(WIDE),)

@@ -5,10 +5,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
-import time
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -16,16 +12,17 @@ import pytest
 from poses import result, write_results
 from rooms import write_room
 
+from piccolo.batch.localizer import Localizer
 from piccolo.cli import evaluate
 from piccolo.jobs import memory
 from piccolo.panorama import picture
 from piccolo.result import Source
-from piccolo.scenes.evaluation.runner import read_run
+from piccolo.scenes.evaluation.runs import read_run
 from piccolo.scenes.scene import Query, read_scene, write_queries
 
 ROOT = Path(__file__).resolve().parents[1]
-QUICK = ["--preset", "paper", "--quiet", "--max-points", "20000"]
-QUICK += ["--num-translations", "12", "--num-iterations", "30"]
+QUICK = ["--quiet", "--preset", "paper", "max_points=20000"]
+QUICK += ["num_translations=12", "num_iterations=30"]
 
 
 @pytest.fixture(scope="module")
@@ -88,8 +85,8 @@ def test_other_settings_do_not_go_into_the_same_file(scenes, tmp_path, capsys):
     out = tmp_path / "run.jsonl"
     assert _run(scenes, out, "--variants", "far") == 0
     before = out.read_bytes()
-    assert _run(scenes, out, "--solver", "lbfgs") == 3
-    assert "its results were made with solver 'adam', not 'lbfgs'" in capsys.readouterr().err
+    assert _run(scenes, out, "--preset", *QUICK[2:], "solver=lbfgs") == 3
+    assert "run.jsonl: made with solver 'adam', not 'lbfgs'" in capsys.readouterr().err
     assert out.read_bytes() == before
 
 
@@ -138,8 +135,8 @@ def test_results_of_localize_are_those_of_the_scene_s_cloud(scenes, tmp_path, ca
     assert r"NUL\x00.jpg: found a result without a true pose" in second
 
 
-@pytest.mark.parametrize("option", ["--csv", "--markdown", "--errors"])
-def test_no_output_replaces_an_input_or_another_output(scenes, tmp_path, capsys, option):
+def test_no_output_replaces_an_input_or_another_output(scenes, tmp_path, capsys):
+    option = "--errors"
     truth = scenes / "room" / "queries.json"
     before = truth.read_bytes()
     link, out = tmp_path / "link.png", tmp_path / "run.png"
@@ -158,26 +155,17 @@ def test_an_unknown_variant_is_refused_and_runs_of_other_scenes_do_not_compare(s
     assert _run(scenes, tmp_path / "run.jsonl", "--variants", "nope") == 3
     assert "--variants: found no nope, wanted some of clean, far" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+    (tmp_path / "odd.json").write_text("{}")
     (tmp_path / "a").write_text("")
+    for words, message in (
+        (["--scenes", str(tmp_path / "odd.json"), "--results", "a"], "wanted a queries.json"),
+        (["--scenes", str(scenes), "--results", str(tmp_path / "a")], "found no result"),
+    ):
+        assert evaluate.main(words) == 3
+        assert message in capsys.readouterr().err
     (tmp_path / "b").write_text("")
     assert evaluate.main(["--compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 3
     assert "no query in common" in capsys.readouterr().err
-
-
-def test_a_closed_pipe_is_no_message(scenes, tmp_path):
-    out = tmp_path / "run.jsonl"
-    assert _run(scenes, out, "--variants", "far") == 0
-    command = f"'{sys.executable}' '{ROOT}/tools/evaluate.py' --compare '{out}' '{out}' | true"
-    command += "; exit ${PIPESTATUS[0]}"
-    environment = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
-    done = subprocess.run(["bash", "-c", command], env=environment, capture_output=True, check=False)
-    assert (done.returncode, done.stderr) == (141, b"")
-
-
-def test_a_killed_parent_takes_its_workers_along(scenes, tmp_path):
-    with _running(scenes, tmp_path, 100) as process:
-        process.kill()
-    assert _ends(process.pid)
 
 
 def test_what_cannot_be_read_is_named_and_the_rest_done(scenes, tmp_path, capsys):
@@ -234,42 +222,22 @@ def test_what_the_system_did_is_no_refusal_of_a_photo_without_an_answer(scenes, 
     assert _run(folder, out) == 0
 
 
-def _is_alive(group):
-    try:
-        os.killpg(group, 0)
-    except ProcessLookupError:
-        return False
-    return True
+def test_a_signal_ends_a_run_after_the_photo_at_work_and_the_same_command_goes_on(
+    scenes, tmp_path, monkeypatch, capsys
+):
+    out, answer = tmp_path / "run.jsonl", Localizer.answer
 
+    def answer_late(self, scan, task):
+        signal.raise_signal(signal.SIGTERM)
+        return answer(self, scan, task)
 
-@contextmanager
-def _running(scenes, tmp_path, num_translations):
-    """The tool at work in two processes, a group of their own."""
-    out = tmp_path / "run.jsonl"
-    tool = str(ROOT / "tools" / "evaluate.py")
-    command = [sys.executable, tool, "--scenes", str(scenes), "--out", str(out), "--jobs", "2"]
-    command += ["--preset", "paper", "--num-translations", str(num_translations), "--quiet"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True) as process:
-        while not out.exists():
-            time.sleep(0.1)
-        time.sleep(1.5)
-        yield process
-
-
-def _ends(group):
-    """True if all of a process group end soon: multiprocessing's own helper takes a moment."""
-    deadline = time.monotonic() + 30.0
-    while _is_alive(group) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    return not _is_alive(group)
-
-
-def test_interrupt_ends_all_processes_without_a_traceback(scenes, tmp_path):
-    with _running(scenes, tmp_path, 3000) as process:
-        os.killpg(process.pid, signal.SIGINT)
-        assert process.wait(timeout=60) == 130
-        assert process.stderr.read() == b"evaluate.py: interrupted\n"
-    assert _ends(process.pid)
+    with monkeypatch.context() as patched:
+        patched.setattr(Localizer, "answer", answer_late)
+        assert _run(scenes, out) == 143
+    assert capsys.readouterr().err.endswith("evaluate.py: terminated\n")
+    assert [row.key for row in read_run(out)[0]] == [("hall 2", "images/clean_0.jpg")]
+    assert _run(scenes, out) == 0
+    assert len(read_run(out)[0]) == 5
 
 
 @pytest.mark.parametrize(
@@ -280,7 +248,7 @@ def test_interrupt_ends_all_processes_without_a_traceback(scenes, tmp_path):
         ("--scenes x --out y --jobs 0", "--jobs: found 0"),
         ("--scenes x --out y --max-distance -1", "--max-distance, --max-angle: wanted numbers above 0"),
         ("--compare a b --csv c", "--csv, --risk: not with --compare"),
-        ("--scenes x --out y --num-translations 9", "not an option of the preset default"),
+        ("--scenes x --out y --preset paper --refine-focal", "not an option of the preset paper"),
     ],
 )
 def test_wrong_usage(words, message, capsys):

@@ -8,21 +8,15 @@ import pytest
 from plyfile import PlyData
 from rooms import errors, write_room
 
-from piccolo.batch.localizer import Localizer
-from piccolo.cli import localize, prepare_map
-from piccolo.cloud.label_colors import Labels
-from piccolo.cloud.settings import CloudSettings
+from piccolo.cli import evaluate, localize, prepare_map
 from piccolo.errors import InputError
-from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.panorama import ReadOptions
 from piccolo.paper.settings import PaperSettings
 from piccolo.result import Result
-from piccolo.scan_map.open_map import CachePolicy
-from piccolo.scenes.evaluation.runner import Failure, Job, JobRunner
+from piccolo.scenes.evaluation.runs import read_run
 from piccolo.scenes.scene import read_scene
 from piccolo.scenes.synthetic.room import LABEL_NAMES
 
-PAPER = ["--preset", "paper", "--num-translations", "30", "--num-iterations", "60", "--max-points", "30000"]
+PAPER = ["--preset", "paper", "num_translations=30", "num_iterations=60", "max_points=30000"]
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +27,7 @@ def scene(tmp_path_factory):
 
 
 def _localized(scene, capsys, *options, pano="labels/clean_0.png"):
-    files = ["--cloud", str(scene / "cloud.ply"), "--pano", str(scene / pano), "--no-cache", "--quiet"]
+    files = ["--cloud", str(scene / "cloud.ply"), "--pano", str(scene / pano), "--cache", "none", "--quiet"]
     code = localize.main([*files, *options])
     out, err = capsys.readouterr()
     return (Result.from_json(out) if out else None), code, err
@@ -105,35 +99,24 @@ def test_prepared_map_of_labels_wants_labels(scene, tmp_path, capsys):
     assert "scan.map: found a prepared map of colours, wanted no --labels" in capsys.readouterr().err
 
 
-def test_evaluation_takes_the_pictures_of_labels(scene):
-    labels = Labels()
-    settings = CoarseToFineSettings(max_starts=100)
-    reading = CloudSettings(labels=labels), ReadOptions(labels=labels)
-    config = Localizer((), settings, *reading, CachePolicy(False), num_threads=2)
-    here = read_scene(scene)
-    (row,) = JobRunner(config)(Job(here, here.queries))
-    assert row.result.pano == str(here.queries[0].labels)
+def test_evaluation_takes_the_pictures_of_labels(scene, tmp_path, capsys):
+    words = ["--quiet", "--labels", "--preset", "default", "max_starts=100"]
+    assert evaluate.main(["--scenes", str(scene), "--out", str(tmp_path / "run.jsonl"), *words]) == 0
+    (row,) = read_run(tmp_path / "run.jsonl")[0]
+    assert row.result.pano == str(scene / "labels" / "clean_0.png")
     document = json.loads((scene / "queries.json").read_text())
     del document["queries"][0]["labels"]
     (scene / "unlabelled.json").write_text(json.dumps(document))
-    here = read_scene(scene / "unlabelled.json")
-    (failure,) = JobRunner(config)(Job(here, here.queries))
-    assert isinstance(failure, Failure)
-    assert "images/clean_0.jpg has no labels in queries.json" in failure.text
+    unlabelled = ["--scenes", str(scene / "unlabelled.json"), "--out", str(tmp_path / "none.jsonl")]
+    assert evaluate.main([*unlabelled, *words]) == 3
+    assert "images/clean_0.jpg has no labels in queries.json" in capsys.readouterr().err
 
 
 def test_losses_and_initializations_of_the_preset_paper(scene, capsys):
-    options = ["--loss", "photometric", "--photometric-width", "128", "--initialization", "loss-only"]
+    options = ["loss=photometric", "photometric_width=128", "initialization=loss-only"]
     result, _, _ = _localized(scene, capsys, *PAPER, *options, pano="images/clean_0.jpg")
     assert errors(result.pose, read_scene(scene).queries[0].pose)[0] < 0.1
     expected = {"loss": "photometric", "photometric_width": 128, "initialization": "loss-only"}
     assert expected.items() <= result.settings.items()
-    for option in ("--loss", "--initialization"):
-        value = options[options.index(option) + 1]
-        _, code, err = _localized(scene, capsys, option, value)
-        assert (code, f"{option}: not an option of the preset default" in err) == (2, True)
-        with pytest.raises(SystemExit):
-            localize.main(["--cloud", "a", "--pano", "b", *PAPER, option, "both"])
-        assert "invalid choice" in capsys.readouterr().err
     with pytest.raises(InputError, match="photometric_width: found 7"):
         PaperSettings(photometric_width=7)

@@ -168,7 +168,7 @@ def test_all_that_grows_asks_first(monkeypatch, tmp_path):
         ("voxels of 2 cm needs", lambda: prepare_map(room(1)[1], workers)),
         ("prepared views", lambda: render_wide(whole.octree, whole.centers, SEARCH_VIEW, workers)),
         ("[0-9] views needs", lambda: render_views(whole.octree, whole.centers, SEARCH_VIEW, workers)),
-        ("rotations needs .*--num-yaws", lambda: search_poses(asked, "known")),
+        ("rotations needs .*num_yaws", lambda: search_poses(asked, "known")),
     ):
         with pytest.raises(InputError, match=text):
             ask()

@@ -22,7 +22,7 @@ from piccolo.scan_map.prior import Prior
         ("name,tolerance\na,1\n", "line 2: found tolerance without heading"),
         ("name,heading\na,north\n", "line 2: found heading 'north', wanted a number"),
         ("name,heading\na,nan\n", "line 2: found heading nan, wanted a finite number"),
-        ("name,x,y,radius\na,1,2,-3\n", "line 2: --radius: found -3.0"),
+        ("name,x,y,radius\na,1,2,-3\n", "line 2: radius: found -3.0"),
         ("name,heading\na,1\na,2\n", "line 3: found the name 'a' twice"),
         ("name,heading\n ,1\n", "line 2: found no name"),
         ("name,heading\na,1,2\n", "line 2: found more cells than columns"),

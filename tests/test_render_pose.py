@@ -121,7 +121,7 @@ def test_a_descent_is_shown_with_where_it_ended(run, scene, tmp_path, monkeypatc
         (["--at", 0, 0, 1, "--animate", "a.gif"], "--animate: no panorama"),
         (["--pose", "T.txt", "--heading", 3, "--out", "a.png"], "only with --at"),
         (["--at", 0, 0, 1, "--out", "a.png", "--seed", -1], "--seed: found -1"),
-        (["--at", 0, 0, 1, "--out", "a.png", "--scale", 0], "--scale: found 0"),
+        (["--at", 0, 0, 1, "--out", "a.png", "--units", 0], "--units: found 0"),
     ],
 )
 def test_wrong_usage(run, arguments, message):

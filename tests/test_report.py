@@ -254,7 +254,7 @@ def test_results_of_another_scan_are_refused_or_told_of_on_the_page(house, tmp_p
     results = [replace(r, source=s) for r, s in zip(scene.results, sources, strict=False)]
     lines = tmp_path / "poses.jsonl"
     lines.write_text("".join(result.to_json() + "\n" for result in results))
-    words = ["--results", str(lines), "--cloud", str(scene.cloud), "--no-cache"]
+    words = ["--results", str(lines), "--cloud", str(scene.cloud), "--cache", "none"]
     for option, name in (("--out", "r"), ("--plan", "p.svg")):
         assert report.main([*words, option, str(tmp_path / name)]) == 3
         line = capsys.readouterr().err.splitlines()[-1]
@@ -294,7 +294,7 @@ def test_in_python(house, tmp_path):
     assert page == tmp_path / "r" / "index.html"
     assert _document(tmp_path / "r")["title"] == "A walk"
     assert ("photos", 6, 6) in told
-    with pytest.raises(TypeError, match="no option 'titel'"):
+    with pytest.raises(TypeError, match="unexpected keyword argument 'titel'"):
         piccolo.write_report(results, scan, tmp_path / "r", titel="x")
     with pytest.raises(InputError, match="found 1 names, wanted 2"):
         piccolo.write_report(results, str(scene.cloud), tmp_path / "r", storeys=["Ground floor"])

@@ -18,7 +18,7 @@ from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama import read_panorama
 from piccolo.panorama.texels import pack_texels
 from piccolo.paper.settings import PaperSettings
-from piccolo.scenes.evaluation.runner import read_run
+from piccolo.scenes.evaluation.runs import read_run
 from piccolo.scenes.reproduce_paper.experiments import EXPERIMENTS
 from piccolo.scenes.reproduce_paper.transforms import (
     flipped,
@@ -113,7 +113,7 @@ def test_conditions_differ_and_have_files_of_their_own(name):
 
 
 def _command(names, scenes, out, *more):
-    words = ["--presets", "paper", "--num-translations", "8", "--num-iterations", "20", "--quiet", *more]
+    words = ["--presets", "paper", "--settings", "num_translations=8", "num_iterations=20", "--quiet", *more]
     return reproduce_paper.main([*names.split(), "--scenes", str(scenes), "--out", str(out), *words])
 
 
@@ -151,5 +151,5 @@ def test_what_cannot_be_localized_is_named(rooms, tmp_path, capsys):
     assert "| 10000 points | paper | 2 |" in out
     assert _command("variants", scene, tmp_path / "out", "--variants", "none") == 3
     assert "variants: no query could be localized" in capsys.readouterr().err
-    for wrong in (["--jobs", "0"], ["--num-by-loss", "0"]):
+    for wrong in (["--jobs", "0"], ["--settings", "num_by_loss=0"]):
         assert _command("variants", scene, tmp_path / "out", *wrong) == 2

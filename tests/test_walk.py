@@ -12,7 +12,7 @@ import rooms
 
 import piccolo
 from piccolo.cli import localize as localize_command
-from piccolo.cli import localize_walk as walk_command
+from piccolo.cli import walking as walk_command
 from piccolo.cloud.ply_writer import vertex_rows, write_ply
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
@@ -157,7 +157,7 @@ def test_a_walk_is_done_again_from_a_frame_that_was_missing_or_failed(
     others = ["--walk", "--pano", str(queries[3].image), "--times", "order", "--out", str(out)]
     capsys.readouterr()
     assert _command(folder, *others) == 3
-    assert "none of its results is of a frame of this walk; --overwrite" in capsys.readouterr().err
+    assert "is of a panorama that this command names; --overwrite" in capsys.readouterr().err
 
 
 def _short_at(path):
@@ -264,7 +264,7 @@ def test_results_of_another_walk_are_not_overwritten(building, tmp_path, capsys)
     assert _command(folder, *walk, "--times", _times(folder, queries)) == 0
     before = (tmp_path / "a.jsonl").read_bytes()
     assert _command(folder, *walk, "--times", "order") == 3
-    assert "of another run (settings); --overwrite starts anew" in capsys.readouterr().err
+    assert "--overwrite starts again" in capsys.readouterr().err
     assert (tmp_path / "a.jsonl").read_bytes() == before
     assert _command(folder, *walk, "--times", "order", "--overwrite") == 0
 
@@ -307,9 +307,9 @@ REFUSED = {
     "step": (["--video", "a.mp4", "--every", "fast"], 2, "--every: found 'fast', wanted seconds or metres"),
     "paper": (["--walk", "--pano", "a.jpg", "--preset", "paper"], 2, "not options of the preset paper"),
     "no step": (
-        ["--walk", "--pano", "a.jpg", "--max-step", "0"],
+        ["--walk", "--pano", "a.jpg", "--max-speed", "0"],
         2,
-        "--max-step: found 0.0, wanted",
+        "--max-speed: found 0.0, wanted",
     ),
     "plan alone": (["--pano", "a.jpg", "--plan", "a.png"], 2, "--plan: only with --walk or --video"),
     "plan of a kind": (
@@ -317,7 +317,6 @@ REFUSED = {
         2,
         "--plan a.jpg: wanted a name that ends with .png, .svg, .pdf, .dxf",
     ),
-    "no times": (["--walk", "--pano", "a.jpg", "--max-speed", "2"], 2, "--max-speed: found no times"),
     "no video": (["--video", "missing.mp4"], 3, "missing.mp4: no such file, wanted a video that PyAV reads"),
     "no table": (["--walk", "--pano", "a.jpg", "--times", "missing.csv"], 3, "missing.csv"),
 }

@@ -12,7 +12,9 @@ from ..files.json_file import read_text
 from ..panorama.photo import photo_of
 from ..walk.frames import checked_times
 
-EXIF, NAMES, ORDER = "exif", "names", "order"
+EXIF = "exif"
+NAMES = "names"
+ORDER = "order"
 NUMBER = re.compile(r"\d+(?:\.\d+)?")
 WANTED = "wanted a CSV file whose first line is name,time: frames by path or file name, and seconds"
 

@@ -67,7 +67,7 @@ def _at(path: Path, left_out: Counter[str], is_panorama: Callable[[Path], bool])
     left_out.update(others)
     if not found:
         text = f"{path}: a folder without a JPEG, PNG, TIFF, WebP or HEIC picture"
-        raise InputError("; ".join(filter(None, (text, described(others)))))
+        raise InputError("; ".join(filter(None, (text, describe_left_out(others)))))
     yield from sorted(found)
 
 
@@ -87,7 +87,7 @@ def _folders(top: Path, is_panorama: Callable[[Path], bool]) -> Iterator[tuple[P
                     (waiting.append if entry.is_symlink() else waiting.appendleft)(entry)
 
 
-def described(left_out: Counter[str]) -> str:
+def describe_left_out(left_out: Counter[str]) -> str:
     """Say how many files are left out, by kind; nothing if none are."""
     kinds = sorted(left_out.items(), key=lambda kind: (-kind[1], kind[0]))[:MAX_KINDS]
     if rest := left_out.total() - sum(count for _, count in kinds):

@@ -1,4 +1,4 @@
-"""What answers the panoramas of a batch: in this process, or where else the scan is opened."""
+"""Answers to the panoramas of a batch, in this process or where else the scan is opened."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping
@@ -15,14 +15,14 @@ from ..cloud.settings import CloudSettings
 from ..files.json_file import reading_once
 from ..jobs.cluster import sent_file
 from ..jobs.memory import limit_memory
+from ..jobs.tasks import WorkerLostError
 from ..jobs.threads import Workers
 from ..localization.settings import CoarseToFineSettings
 from ..opening import open_files
 from ..panorama import ReadOptions, read_panorama
 from ..panorama.photo import sha256_of
-from ..query_options import Settings
 from ..result import Failure, Result, Source, failure_of, named, unreadable_result
-from ..scan import Scan, settings_json
+from ..scan import Scan, Settings, settings_json
 from ..scan_map.map_file import load_map
 from ..scan_map.open_map import CachePolicy
 from ..views.surfel_renderer import encode_image, overlay_png
@@ -39,7 +39,7 @@ class Task(NamedTuple):
 
     @contextmanager
     def placed(self, folder: Path) -> Iterator[Path]:
-        """Where the panorama is here: relative to a folder, or written from the files."""
+        """The panorama's path here: relative to a folder, or written from the files."""
         if self.files is None:
             yield folder / self.pano
             return
@@ -60,7 +60,7 @@ def files_of(pano: Path) -> dict[str, bytes]:
 
 
 class Answer(NamedTuple):
-    """What is made of a task."""
+    """A result, and the pictures that go with it."""
 
     result: Result
     warnings: tuple[str, ...] = ()  # of the photo, without those of the scan
@@ -70,7 +70,7 @@ class Answer(NamedTuple):
 
 @dataclass(frozen=True)
 class Localizer:
-    """How tasks are answered; pickled for other processes."""
+    """A scan and the options for its photos, which answer tasks; pickled for other processes."""
 
     paths: tuple[Path, ...]  # of the scan
     settings: Settings  # for which the scan is prepared
@@ -91,10 +91,10 @@ class Localizer:
         """The scan's path as given, or the paths of its files."""
         return str(self.paths[0]) if len(self.paths) == 1 else tuple(map(str, self.paths))
 
-    def task(self, pano: Path) -> Task:
-        """What is to be done for a panorama."""
+    def task(self, pano: Path, calibration: Calibration | None = None) -> Task:
+        """Return what is to be done for a panorama."""
         files = files_of(pano) if self.sends_photos else None
-        return Task(pano, self.settings_of(pano), files=files)
+        return Task(pano, self.settings_of(pano), calibration, files)
 
     def settings_of(self, pano: Path) -> Settings:
         """The settings of one panorama: its own prior, if it has one."""
@@ -113,8 +113,8 @@ class Localizer:
 
         return lambda pano: expected_of(self.settings_of(pano))
 
-    def opened(self) -> Callable[[Task], Answer]:
-        """What answers tasks in this process, when the scan has been opened for it."""
+    def open(self) -> Callable[[Task], Answer]:
+        """Open the scan in this process; return what answers tasks."""
         limit_memory(self.max_memory)
         return partial(self.answer, self.open_scan(Workers(self.num_threads)))
 
@@ -139,19 +139,24 @@ class Localizer:
                 text, is_passing = failure_of(error)
                 failure = Failure(text.replace(str(path), str(task.pano)), is_passing)
                 source = Source(scan.prepared.scan_sha256 or None, sha256_of(path, self.read_options.rig))
-                return self.failed(task, failure, source)
+                return self._failed(task, failure, source)
         result = named(found, path, task.pano)
         return Answer(result, result.warnings[len(scan.warnings) :], overlay, mask)
 
-    def failed(self, task: Task, failure: Failure, source: Source) -> Answer:
-        """The answer to a task of which nothing but a failure has come."""
+    def lost(self, task: Task, error: WorkerLostError, cloud_sha256: str | None) -> Answer:
+        """Return the answer to a task whose workers were lost."""
+        return self._failed(task, Failure(f"{task.pano}: {error}", is_passing=True), Source(cloud_sha256))
+
+    def _failed(self, task: Task, failure: Failure, source: Source) -> Answer:
         repeated = settings_json(task.settings, self.cloud_settings, self.read_options)
         about = {"settings": repeated, "source": source}
         return Answer(unreadable_result(failure.text, self.name, str(task.pano), failure.is_passing, **about))
 
     def _pictures(self, scan: Scan, pano: Path, result: Result) -> tuple[bytes | None, bytes | None]:
         """Overlay and occlusion mask as PNG, where they are asked for and there is a pose."""
-        pose, overlay, mask = result.best_pose, None, None
+        pose = result.best_pose
+        overlay = None
+        mask = None
         if pose is None:
             return None, None
         read_options = self.read_options.refined(result.cameras)

@@ -1,11 +1,11 @@
-"""What is known of each camera beforehand, from a table."""
+"""Prior knowledge of each camera, from a table."""
 
 import csv
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 from ..errors import InputError
 from ..files.json_file import read_text
@@ -21,34 +21,27 @@ DEFAULT_RADIUS = 5.0  # [m]
 HEIGHT_TOLERANCE = 0.3  # [m] either side of a height
 
 
-class Row(NamedTuple):
-    """The cells of a panorama that are not empty."""
-
-    numbers: Mapping[str, float]
-    within: tuple[str, ...] = ()
-
-
 @dataclass(frozen=True)
 class PriorTable:
-    """A prior for each panorama named, in place of what it says of the one that all have."""
+    """A prior for each panorama named, in place of the one that all have."""
 
     path: Path
-    by_name: Mapping[str, Row]
+    by_name: Mapping[str, Prior]
     used: set[str] = field(default_factory=set)
 
     def prior_of(self, pano: Path, general: Prior) -> Prior:
-        """The prior of a panorama, found by its path as given, or else by its file name."""
+        """Return the prior of a panorama, found by its path as given, or else by its file name."""
         name = next((name for name in (str(pano), pano.name) if name in self.by_name), None)
         if name is None:
             return general
         self.used.add(name)
-        return _prior_from(self.by_name[name], general)
+        return self.by_name[name]
 
     def check_scans(self, scan_map: ScanMap) -> None:
         """Refuse names that no scan of a map has."""
-        for name, row in self.by_name.items():
+        for name, prior in self.by_name.items():
             try:
-                check_within(scan_map, row.within)
+                check_within(scan_map, prior.within)
             except InputError as error:
                 text = str(error).replace("--within", f"{self.path}: within, of {name}")
                 raise InputError(text) from error
@@ -59,18 +52,18 @@ class PriorTable:
         return [name for name in self.by_name if name not in self.used]
 
 
-def _prior_from(cells: Row, general: Prior) -> Prior:
-    prior, row = replace(general, within=cells.within or general.within), cells.numbers
+def _prior_from(row: Mapping[str, float], within: tuple[str, ...], general: Prior) -> Prior:
+    """Return the prior of a row's numbers and names; `general` fills what they leave open."""
+    changes: dict[str, Any] = {"within": within or general.within}
     if "x" in row:
-        radius = row.get("radius", general.radius or DEFAULT_RADIUS)
-        prior = replace(prior, near_world=(row["x"], row["y"], row.get("z")), radius=radius)
+        changes["near_world"] = (row["x"], row["y"], row.get("z"))
+        changes["radius"] = row.get("radius", general.radius or DEFAULT_RADIUS)
     if "height" in row:
-        low, high = row["height"] - HEIGHT_TOLERANCE, row["height"] + HEIGHT_TOLERANCE
-        prior = replace(prior, height=(low, high))
+        changes["height"] = (row["height"] - HEIGHT_TOLERANCE, row["height"] + HEIGHT_TOLERANCE)
     if "heading" in row:
-        tolerance = row.get("tolerance", general.heading_tolerance_deg)
-        prior = replace(prior, heading_deg=row["heading"], heading_tolerance_deg=tolerance)
-    return prior
+        changes["heading_deg"] = row["heading"]
+        changes["heading_tolerance_deg"] = row.get("tolerance", general.heading_tolerance_deg)
+    return replace(general, **changes)
 
 
 def read_priors(path: Path, general: Prior) -> PriorTable:
@@ -88,30 +81,22 @@ def read_priors(path: Path, general: Prior) -> PriorTable:
     rows = csv.DictReader(read_text(path, WANTED).splitlines(), restkey="more")
     names = [name.strip() for name in rows.fieldnames or ()]
     rows.fieldnames = names
-    if (
-        "name" not in names
-        or (odd := sorted(set(names) - {"name", *COLUMNS}))
-        or len(set(names)) < len(names)
-    ):
+    odd = sorted(set(names) - {"name", *COLUMNS})
+    if "name" not in names or odd or len(set(names)) < len(names):
         found = f"found a column {odd[0]!r}" if "name" in names and odd else f"found the columns {names}"
         raise InputError(f"{path}: {found}, {WANTED}")
-    by_name: dict[str, Row] = {}
+    by_name: dict[str, Prior] = {}
     for row in rows:
         where = f"{path}, line {rows.line_num}"
         name = (row.pop("name") or "").strip()
-        if not name or name in by_name or "more" in row:
-            wrong = (
-                "more cells than columns"
-                if "more" in row
-                else f"the name {name!r} twice"
-                if name
-                else "no name"
-            )
-            raise InputError(f"{where}: found {wrong}")
+        if "more" in row:
+            raise InputError(f"{where}: found more cells than columns")
+        if not name or name in by_name:
+            raise InputError(f"{where}: found {f'the name {name!r} twice' if name else 'no name'}")
         within = (row.pop("within", None) or "").split(BETWEEN_NAMES)
-        by_name[name] = Row(_numbers(where, row), tuple(w.strip() for w in within if w.strip()))
+        numbers = _numbers(where, row)
         try:
-            _prior_from(by_name[name], general)
+            by_name[name] = _prior_from(numbers, tuple(w.strip() for w in within if w.strip()), general)
         except InputError as error:
             raise InputError(f"{where}: {error}") from error
     return PriorTable(path, by_name)

@@ -5,50 +5,44 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
-from ..camera import Calibration
 from ..errors import InputError
 from ..files.line_file import LineFile, whole_lines, whole_size
-from ..panorama.photo import sha256_of
 from ..result import FAILED, FORMAT
 
 LINE_BEGINS = f'{{"format": "{FORMAT}"'.encode()
-WAYS = "--overwrite starts anew, another --out keeps both"
+WAYS = "--overwrite starts again, another --out keeps both"
+Name = TypeVar("Name", Path, str)
 
 
-def finished_lines(path: Path) -> Iterator[dict[str, Any]]:
-    """The fields of each whole line that an earlier run has left, and its bytes, `span`.
-
-    Raises InputError, when the iterator comes to it, for what is no result.
-    """
-    size = whole_size(path, LINE_BEGINS, f"results of localize.py: {WAYS}")
-    end = 0
-    for number, line in enumerate(whole_lines(path, size), 1):
-        try:
-            fields = json.loads(line)
-            found = fields["format"]
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise InputError(f"{path}, line {number}: no result of localize.py; {WAYS}") from error
-        if found != FORMAT:
-            raise InputError(f"{path}, line {number}: of format {found!r}, not {FORMAT!r}; {WAYS}")
-        begin, end = end, end + len(line)
-        yield {**fields, "line": f"{path}, line {number}", "span": (begin, end)}
+def _fields_of(line: bytes, where: str) -> dict[str, Any]:
+    """Return the fields of a whole line that an earlier run has left."""
+    try:
+        fields = json.loads(line)
+        found = fields["format"]
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(f"{where}: no result of localize.py; {WAYS}") from error
+    if found != FORMAT:
+        raise InputError(f"{where}: of format {found!r}, not {FORMAT!r}; {WAYS}")
+    return {**fields, "line": where}
 
 
-def check_finished(fields: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
-    """InputError for a finished line that is not of the scan and settings `expected` there."""
+def check_as_expected(fields: Mapping[str, Any], expected: Mapping[str, Any], ways: str = WAYS) -> None:
+    """Refuse a finished line, `fields["line"]`, that is not of the scan and settings expected there."""
     different = next((key for key in expected if fields.get(key) != expected[key]), None)
     if different is None:
         return
-    found, wanted = fields.get(different), expected[different]
+    found = fields.get(different)
+    wanted = expected[different]
     if different == "settings" and isinstance(found, dict):
-        name = next(name for name in sorted({*found, *wanted}) if found.get(name) != wanted.get(name))
-        found, wanted, different = found.get(name), wanted.get(name), name
+        different = next(name for name in sorted({*found, *wanted}) if found.get(name) != wanted.get(name))
+        found = found.get(different)
+        wanted = wanted.get(different)
     text = f"made with {different} {found!r}, not {wanted!r}"
     if different == "cloud_sha256":
         text = "made with another scan, or the scan has changed since"
-    raise InputError(f"{fields['line']}: {text}; {WAYS}")
+    raise InputError(f"{fields['line']}: {text}; {ways}")
 
 
 class Finished(NamedTuple):
@@ -62,8 +56,8 @@ class Finished(NamedTuple):
 class Records:
     """Which panoramas have results in a file, and the order in which the lines are to stand at the end."""
 
-    def __init__(self, file: LineFile | None = None) -> None:
-        self.file = file
+    def __init__(self, path: Path | None = None) -> None:
+        self.path = path
         self.size = 0  # [byte] of the lines of earlier runs
         self.order: list[Finished | None] = []  # of the panoramas so far; None for one that is done now
         self._others: dict[str, list[Finished]] = {}  # by panorama: lines that are in no place of the order
@@ -74,64 +68,74 @@ class Records:
         """Results of earlier runs that stay, by status."""
         return Counter(line.status for line in self.order if line)
 
-    def read(self, expected: Callable[[Path], Mapping[str, Any]], panoramas: Iterable[Path] | None) -> None:
+    @property
+    def names(self) -> set[str]:
+        """The panoramas of the lines that are in no place of the order."""
+        return {name for name, lines in self._others.items() if lines}
+
+    @property
+    def is_in_order(self) -> bool:
+        """True if the file has the lines of the panoramas so far, in their order, and no others."""
+        spans = [line.span for line in self.order if line]
+        return spans == sorted(spans) and len(spans) == len(self.order) and not self.names
+
+    def read(
+        self, expected: Callable[[Path], Mapping[str, Any]], panoramas: Iterable[Path | str] | None
+    ) -> None:
         """Take up what earlier runs have left.
 
         Raises InputError if a line is not as one of its panorama would be now, or none is of the `panoramas`
         that are known to come (None: they are not known).
         """
-        if self.file is None:
+        if self.path is None:
             return
         named = None if panoramas is None else set(map(str, panoramas))
-        for fields in finished_lines(self.file.path):
+        whole = whole_size(self.path, LINE_BEGINS, f"results of localize.py: {WAYS}")
+        for number, content in enumerate(whole_lines(self.path, whole), 1):
+            fields = _fields_of(content, f"{self.path}, line {number}")
             pano = str(fields.get("pano"))
             if named is None or pano in named:
-                check_finished(fields, expected(Path(pano)))
-            line = Finished(fields["span"], fields.get("pano_sha256"), str(fields.get("status")))
+                check_as_expected(fields, expected(Path(pano)))
+            span = (self.size, self.size + len(content))
+            line = Finished(span, fields.get("pano_sha256"), str(fields.get("status")))
             self._others.setdefault(pano, []).append(line)
-            self.size = line.span[1]
+            self.size = span[1]
         if self._others and named is not None and named.isdisjoint(self._others):
             text = f"none of its results is of a panorama that this command names; {WAYS}"
-            raise InputError(f"{self.file.path}: {text}")
+            raise InputError(f"{self.path}: {text}")
 
-    def left(self, panoramas: Iterable[Path], rig: Calibration | None) -> Iterator[Path]:
-        """The panoramas without a result, as they come."""
-        if self.file is None:
+    def left(self, panoramas: Iterable[Name], digest_of: Callable[[Name], str | None]) -> Iterator[Name]:
+        """Yield the panoramas without a result, as they come.
+
+        One has a result if its file is as it was, by its digest, or can't be read now, and did not fail.
+        """
+        if self.path is None:
             yield from panoramas
             return
         for pano in panoramas:
-            self.order.append(self._taken(pano, rig))
-            if self.order[-1] is None:
+            lines = self._others.get(str(pano), [])
+            taken = None
+            if lines:
+                self._named.add(str(pano))
+                digest = digest_of(pano)
+                same = (line for line in lines if digest in (None, line.pano_sha256))
+                taken = next((line for line in same if line.status != FAILED), None)
+            self.order.append(taken)
+            if taken is None:
                 yield pano
+            else:
+                lines.remove(taken)
 
-    def _taken(self, pano: Path, rig: Calibration | None) -> Finished | None:
-        """The line of a panorama as it is now; where it can't be read now, as it was."""
-        if lines := self._others.get(str(pano)):
-            self._named.add(str(pano))
-            digest = sha256_of(pano, rig)
-            for line in lines:
-                if line.status != FAILED and digest in (None, line.pano_sha256):
-                    lines.remove(line)
-                    return line
-        return None
-
-    def begin(self) -> None:
-        """Cut off what is no whole line of earlier runs, before the first is appended."""
-        if self.file:
-            self.file.cut(self.size)
-
-    def finish(self, keeps_others: bool) -> int:
+    def finish(self, file: LineFile, keeps_others: bool) -> int:
         """Put the lines into the order of the panoramas, without older ones of them.
 
         Those of panoramas that were not named are kept before them, or dropped; returns how many were.
         """
-        if self.file is None:
-            return 0
         others = [line for name in self._others.keys() - self._named for line in self._others[name]]
         spans = sorted(line.span for line in others) if keeps_others else []
         num_dropped = len(others) - len(spans)
-        new_lines = whole_lines(self.file.path, self.file.size, self.size)
+        new_lines = whole_lines(file.path, file.size, self.size)
         new_spans = pairwise(accumulate(map(len, new_lines), initial=self.size))
         spans += [line.span if line else next(new_spans) for line in self.order]
-        self.file.rearrange(spans)
+        file.rearrange(spans)
         return num_dropped

@@ -1,19 +1,65 @@
-"""What makes a module a command: options written as a help text shows them, and the `main` that runs it."""
+"""Commands: options written as a help text shows them, and the `main` that parses and runs them."""
 
 import argparse
+import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from .errors import UsageError, print_note, run_command
-from .parser import add_run_options, new_parser
+from ..jobs.memory import check_address_space
+from .errors import UsageError, handling_errors, print_note
+from .start import as_started
 
 KINDS: dict[str, type] = {  # of the values, by the first metavar; of others text
     **dict.fromkeys(("FILE", "FOLDER", "JSONL", "PNG"), Path),
     **dict.fromkeys(("N", "PX", "FIRST", "W", "ROOM"), int),
-    **dict.fromkeys(("X", "M", "DEG", "X0", "MIN", "HZ", "FRACTION"), float),
+    **dict.fromkeys(("X", "M", "DEG", "X0", "MIN", "HZ", "FRACTION", "GB"), float),
 }
+EXIT_CODES = "2 wrong usage, 3 bad input, 4 internal error, 130 interrupted, 143 terminated."
 Main = Callable[..., int]  # runs a command line, by default this program's, and returns its exit code
+
+
+class HelpFormatter(argparse.RawDescriptionHelpFormatter):
+    """Prints the epilog as it stands, and the names of commands as they were started."""
+
+    def format_help(self) -> str:
+        """Return the usage or the whole help."""
+        return as_started(super().format_help())
+
+
+def new_parser(
+    name: str, description: str | None, epilog: str, exit_codes: str = "0 done"
+) -> argparse.ArgumentParser:
+    """Return a parser of the command `name` with the options of all; `exit_codes` are its own, below 2."""
+    program = as_started(f"{name}.py")
+    epilog += f"exit codes: {exit_codes}, {EXIT_CODES}"
+    parser = argparse.ArgumentParser(
+        program, description=description, epilog=epilog, formatter_class=HelpFormatter
+    )
+    parser.set_defaults(program=program, quiet=False, debug=False)
+    add_run_options(parser)
+    return parser
+
+
+def add_run_options(parser: argparse.ArgumentParser) -> None:
+    """Add --quiet and --debug to a parser, or to one of its subcommands."""
+    flag: dict[str, Any] = {
+        "action": "store_true",
+        "default": argparse.SUPPRESS,
+    }  # a subcommand keeps what stood before it
+    parser.add_argument("--quiet", help="nothing on stderr but errors", **flag)
+    parser.add_argument("--debug", help="show the traceback of an error", **flag)
+
+
+def parse(parser: argparse.ArgumentParser, argv: list[str] | None) -> argparse.Namespace:
+    """Return the options given; argparse alone would take the value of `--up -y` for an option."""
+    words: list[str] = []
+    for word in sys.argv[1:] if argv is None else argv:
+        if words[-1:] == ["--up"]:
+            words[-1] = f"--up={word}"
+        else:
+            words.append(word)
+    return parser.parse_args(words)
 
 
 def option(group: argparse._ActionsContainer, usage: str, text: str = "", **more: Any) -> None:
@@ -46,7 +92,7 @@ def check_least(arguments: argparse.Namespace, **limits: int) -> None:
 
 
 def print_warnings(arguments: argparse.Namespace, warnings: Iterable[str]) -> None:
-    """A line on stderr for each warning, unless --quiet."""
+    """Print a line on stderr for each warning, unless --quiet."""
     for warning in warnings:
         print_note(arguments, f"warning: {warning}")
 
@@ -67,8 +113,11 @@ def command(
         def main(argv: list[str] | None = None) -> int:
             parser = new_parser(Path(file).stem, description, epilog, exit_codes)
             add_options(parser)
-            add_run_options(parser)
-            return run_command(parser, argv, run)
+            arguments = parse(parser, argv)
+            with handling_errors(arguments) as outcome:
+                check_address_space()
+                outcome.exit_code = run(arguments)
+            return outcome.exit_code
 
         return main
 

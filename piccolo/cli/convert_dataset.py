@@ -13,10 +13,9 @@ from ..scenes.datasets.files import AXES, DIRECTIONS
 from ..scenes.datasets.model import ConvertOptions, SceneSpec
 from ..scenes.datasets.writing import write_scene
 from ..scenes.scene import read_scene
-from .command import check_least, option
-from .errors import EXIT_BAD_INPUT, print_error, print_note, run_command
+from .command import HelpFormatter, add_run_options, check_least, command, option
+from .errors import EXIT_BAD_INPUT, print_error, print_note
 from .outputs import check_folder_name
-from .parser import HelpFormatter, add_run_options, new_parser
 from .progress import progress_bar
 
 EXIT_BAD_FIT = 1
@@ -34,10 +33,8 @@ A scene with a damaged file is left out and named on stderr, and the others go o
 """
 
 
-def build_parser() -> argparse.ArgumentParser:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options; those that one dataset alone has are in its own subparser."""
-    codes = "0 done, 1 --check found poses that don't fit the panoramas"
-    parser = new_parser("convert_dataset", __doc__, EPILOG, codes)
     subparsers = parser.add_subparsers(dest="dataset", required=True, metavar="DATASET")
     for name, dataset in DATASETS.items():
         one = subparsers.add_parser(name, description=dataset.description, formatter_class=HelpFormatter)
@@ -53,7 +50,6 @@ def build_parser() -> argparse.ArgumentParser:
         option(images, "--copy", "copy them, so that the dataset can be removed", const="copy", **const)
         add_own_options(one, name)
         add_run_options(one)
-    return parser
 
 
 def add_own_options(parser: argparse.ArgumentParser, dataset: str) -> None:
@@ -85,7 +81,10 @@ def chosen(specs: tuple[SceneSpec, ...], rooms: list[str]) -> list[SceneSpec]:
     return [spec for spec in specs if not rooms or spec.name.split("/")[-1] in rooms]
 
 
-def run(arguments: argparse.Namespace) -> int:
+@command(
+    __file__, __doc__, EPILOG, add_arguments, "0 done, 1 --check found poses that don't fit the panoramas"
+)
+def main(arguments: argparse.Namespace) -> int:
     """Write the scenes one by one; returns the exit code."""
     check_least(arguments, check=0, seed=0)
     check_folder_name("--out", arguments.out)
@@ -122,8 +121,3 @@ def convert_scene(spec: SceneSpec, arguments: argparse.Namespace, show: Progress
     if check and not check.is_passed:
         return print_error(arguments, f"{spec.name}: {check.advice}", EXIT_BAD_FIT)
     return 0
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    return run_command(build_parser(), argv, run)

@@ -6,22 +6,34 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from types import FrameType
 
 from tqdm import tqdm
 
+from ..confidence.confidence import LOCALIZED
 from ..errors import InputError, printable, text_of
-from ..jobs.memory import check_address_space, is_shortage
-from .parser import as_started, parse
+from ..jobs.memory import is_shortage
+from ..result import FAILED, UNREADABLE
 from .progress import log_shown
-from .start import EXIT_INTERRUPTED, EXIT_TERMINATED
+from .start import EXIT_INTERRUPTED, EXIT_TERMINATED, as_started
 
-EXIT_BAD_USAGE, EXIT_BAD_INPUT, EXIT_INTERNAL, EXIT_BROKEN_PIPE = 2, 3, 4, 141
+EXIT_SOME_NOT = 1
+EXIT_BAD_USAGE = 2
+EXIT_BAD_INPUT = 3
+EXIT_INTERNAL = 4
+EXIT_BROKEN_PIPE = 141
 RETRY = 0.1  # [s] after which a signal is sent again
-INTERRUPTED, TERMINATED = ("interrupted", EXIT_INTERRUPTED), ("terminated", EXIT_TERMINATED)
 SHORTAGE = "not enough memory ({}); set --max-memory or fewer --threads, or thin the scan"
+
+
+def exit_code_of(statuses: Collection[str]) -> int:
+    """Return 0 if all photos are localized, 3 if one can't be read or has failed, else 1."""
+    if UNREADABLE in statuses or FAILED in statuses:
+        return EXIT_BAD_INPUT
+    return 0 if set(statuses) <= {LOCALIZED} else EXIT_SOME_NOT
 
 
 class UsageError(InputError):
@@ -41,27 +53,33 @@ def checking_options() -> Iterator[None]:
         raise UsageError(str(error)) from error
 
 
-def run_command(
-    parser: argparse.ArgumentParser, argv: list[str] | None, run: Callable[[argparse.Namespace], int]
-) -> int:
-    """The exit code of `run` with the options given, or of the error that ended it, which is printed."""
-    arguments, lost = parse(parser, argv), list[KeyboardInterrupt]()
+@dataclass
+class Outcome:
+    """The end of a command."""
+
+    exit_code: int = 0
+
+
+@contextmanager
+def handling_errors(arguments: argparse.Namespace) -> Iterator[Outcome]:
+    """Within this a command runs; an error that ends it is printed, and gives the exit code."""
+    outcome = Outcome()
+    lost: list[KeyboardInterrupt] = []
     try:
         with log_shown(arguments.quiet), raising_signals(lost):
-            check_address_space()
-            code = run(arguments)
+            yield outcome
             sys.stdout.flush()  # here, where a closed pipe is caught
-        return code
     except KeyboardInterrupt as stop:
-        return _stopped(arguments, stop)
+        outcome.exit_code = _stopped(arguments, stop)
     except (OSError, InputError) as error:
         discard_stdout()
         if isinstance(error, BrokenPipeError) and not error.filename:  # stdout's reader has gone: say nothing
-            return EXIT_BROKEN_PIPE
-        code = EXIT_BAD_USAGE if isinstance(error, UsageError) else EXIT_BAD_INPUT
-        return print_error(arguments, text_of(error), code)
+            outcome.exit_code = EXIT_BROKEN_PIPE
+        else:
+            code = EXIT_BAD_USAGE if isinstance(error, UsageError) else EXIT_BAD_INPUT
+            outcome.exit_code = print_error(arguments, text_of(error), code)
     except Exception as error:  # the last line of defence: a code and one line for the shell
-        return _unforeseen(arguments, error, lost)
+        outcome.exit_code = _unforeseen(arguments, error, lost)
 
 
 def _unforeseen(arguments: argparse.Namespace, error: Exception, lost: list[KeyboardInterrupt]) -> int:
@@ -94,7 +112,8 @@ def raising_signals(lost: list[KeyboardInterrupt]) -> Iterator[None]:
         else:
             sys.__unraisablehook__(unraisable)
 
-    before, hook = signal.signal(signal.SIGTERM, _terminate), sys.unraisablehook
+    before = signal.signal(signal.SIGTERM, _terminate)
+    hook = sys.unraisablehook
     sys.unraisablehook = send_again
     try:
         yield
@@ -110,8 +129,9 @@ def _terminate(signum: int, frame: FrameType | None) -> None:
 
 
 def _stopped(arguments: argparse.Namespace, stop: KeyboardInterrupt) -> int:
-    text, code = TERMINATED if isinstance(stop, Terminated) else INTERRUPTED
-    return print_error(arguments, text, code)
+    if isinstance(stop, Terminated):
+        return print_error(arguments, "terminated", EXIT_TERMINATED)
+    return print_error(arguments, "interrupted", EXIT_INTERRUPTED)
 
 
 def discard_stdout() -> None:

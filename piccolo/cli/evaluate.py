@@ -10,23 +10,25 @@ import numpy as np
 from ..batch.localizer import Localizer
 from ..errors import InputError
 from ..files.atomic import is_stream, write_atomically
-from ..jobs.threads import num_cores
+from ..jobs.memory import limit_memory
 from ..result import check_scan, read_results
-from ..scan_map.open_map import CachePolicy, scan_sha256_of
+from ..scan_map.open_map import scan_sha256_of
 from ..scenes.evaluation import tables
 from ..scenes.evaluation.plots import errors_figure, figure_png, risk_figure
 from ..scenes.evaluation.query_result import QueryResult, Thresholds, match_results
-from ..scenes.evaluation.runner import input_files, open_run, read_run
+from ..scenes.evaluation.runs import input_files, read_run
 from ..scenes.evaluation.walks import walk_table, walks_of
 from ..scenes.scene import Scene, find_scenes
 from .command import check_least, command, option
 from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error, print_note
-from .evaluating import resumed
-from .executing import DASK, check_execution
+from .evaluating import run_scenes
+from .executing import check_execution
 from .options import (
     add_cloud_reading_options,
+    add_execution_options,
     add_method_options,
     add_panorama_reading_options,
+    cache_from,
     cloud_settings_from,
     read_options_from,
     settings_from,
@@ -61,8 +63,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(kind, "--results JSONL", "results of localize.py")
     option(kind, "--compare JSONL", "two runs, side by side", nargs=2)
     option(group, "--force", "take --results of another scan than a scene's cloud too")
-    option(group, "--jobs N", "processes, which divide the cores", default=1)
-    option(group, "--dask ADDRESS", DASK)
     option(group, "--cache FOLDER", "of prepared maps (default the user's)")
     group = parser.add_argument_group("tables and plots")
     option(group, "--max-distance M", "correct is under", default=0.1)
@@ -74,6 +74,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_cloud_reading_options(parser.add_argument_group("clouds"))
     add_panorama_reading_options(parser.add_argument_group("panoramas"))
     add_method_options(parser)
+    add_execution_options(parser)
+    parser.set_defaults(jobs=1)
 
 
 def check_usage(arguments: argparse.Namespace) -> None:
@@ -84,7 +86,7 @@ def check_usage(arguments: argparse.Namespace) -> None:
         raise UsageError("--csv, --risk: not with --compare, they show one run")
     if not (0.0 < arguments.max_distance < np.inf and 0.0 < arguments.max_angle < np.inf):
         raise UsageError("--max-distance, --max-angle: wanted numbers above 0")
-    check_least(arguments, jobs=1)
+    check_least(arguments, jobs=1, threads=1)
     check_execution(arguments)
     for option_ in ("errors", "risk"):
         check_suffix(f"--{option_}", getattr(arguments, option_), (".png",))
@@ -151,11 +153,10 @@ def check_files(arguments: argparse.Namespace, inputs: list[Path]) -> None:
 
 def check_clouds(scenes: Sequence[Scene], rows: Sequence[QueryResult], arguments: argparse.Namespace) -> None:
     """Refuse results of other content than the scenes' clouds have, or with --force say so."""
-    cache = CachePolicy(True, arguments.cache)
     for scene in scenes:
         results = [row.result for row in rows if row.scene == scene.name and row.result.source.cloud_sha256]
         if results and scene.cloud.is_file():
-            digest = scan_sha256_of([scene.cloud], cache)
+            digest = scan_sha256_of([scene.cloud], cache_from(arguments))
             if note := check_scan(results, digest, str(scene.cloud), arguments.force):
                 print_note(arguments, f"warning: {note}")
 
@@ -165,26 +166,28 @@ def main(arguments: argparse.Namespace) -> int:
     """Run or read the results, print the tables; returns the exit code."""
     check_usage(arguments)
     with checking_options():
-        reading = cloud_settings_from(arguments), read_options_from(arguments)
-        cache, num_threads = CachePolicy(True, arguments.cache), max(1, num_cores() // arguments.jobs)
-        config = Localizer((), settings_from(arguments), *reading, cache, num_threads=num_threads)
+        limit_memory(arguments.max_memory)
+        config = Localizer(
+            (),
+            settings_from(arguments),
+            cloud_settings_from(arguments),
+            read_options_from(arguments),
+            cache_from(arguments),
+        )
     thresholds = Thresholds(arguments.max_distance, float(np.radians(arguments.max_angle)))
     scenes = find_scenes(arguments.scenes or [])
     check_files(arguments, input_files(scenes))
     if arguments.compare:
         return compare(arguments, thresholds)
-    num_failed = 0
     if arguments.results:
         results = read_results([arguments.results])
         report = partial(print_error, arguments, exit_code=EXIT_BAD_INPUT)
         rows = list(match_results(scenes, results, report))
         num_failed = len(results) - len(rows)
         check_clouds(scenes, rows, arguments)
+        rows = [row for row in rows if not arguments.variants or row.variant in arguments.variants]
     else:
-        found = open_run(arguments.out, config, scenes, arguments.variants)
-        rows, num_failed = resumed(found, arguments)
-    if arguments.variants:
-        rows = [row for row in rows if row.variant in arguments.variants]
+        rows, num_failed = run_scenes(arguments, arguments.out, config, scenes, arguments.variants)
     if not rows:
         raise InputError("no query could be localized; check --scenes and --variants")
     rows = sorted(rows, key=lambda row: row.key)

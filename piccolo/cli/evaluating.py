@@ -1,43 +1,127 @@
-"""Where the queries of an evaluation are localized: in this process, in several, or on a cluster."""
+"""The queries of scenes localized, scene by scene, as localize.py localizes photos."""
 
 import argparse
-from contextlib import ExitStack, closing
-from dataclasses import replace
-from functools import partial
+import json
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ..batch.localizer import Localizer
-from ..errors import InputError
-from ..jobs.cluster import Cluster, connected
-from ..jobs.processes import Processes
-from ..jobs.tasks import Executor, Here
-from ..scenes.evaluation.query_result import QueryResult
-from ..scenes.evaluation.runner import JobRunner, Run, opened
+from ..files.atomic import check_output
+from ..files.line_file import LineFile, locked
+from ..jobs.cluster import Cluster
+from ..jobs.tasks import WorkerLostError
+from ..jobs.threads import Workers
+from ..result import UNREADABLE, Result, failure_of
+from ..scan import Scan, settings_json
+from ..scenes.evaluation.query_result import QueryResult, is_in_box, query_result_of
+from ..scenes.evaluation.runs import check_run, check_variants, read_run
+from ..scenes.scene import Query, Scene
 from .errors import EXIT_BAD_INPUT, print_error
+from .executing import Interruption, connecting, count_jobs, executing, interruptible
 from .progress import progress_bar
 
 
-def resumed(run: Run, arguments: argparse.Namespace) -> tuple[list[QueryResult], int]:
-    """All queries of an evaluation, those that are left localized now, and how many failed."""
-    show = progress_bar(arguments.quiet)
-    report = partial(print_error, arguments, exit_code=EXIT_BAD_INPUT)
-    with ExitStack() as stack:
-        executor: Executor = Here(JobRunner(run.config, show))
-        num_jobs = min(arguments.jobs, len(run.jobs))
-        if run.jobs and (address := vars(arguments).get("dask")):
-            cluster = stack.enter_context(connected(address, num_jobs, run.config.num_threads))
-            executor = cluster.executor(partial(opened, config_at_the_workers(run, cluster)))
-        elif num_jobs > 1:
-            processes = Processes(partial(opened, run.config), num_jobs, run.config.num_threads)
-            executor = stack.enter_context(closing(processes))
-        return run.resume(executor, show, report)
+def run_scenes(
+    arguments: argparse.Namespace,
+    path: Path,
+    config: Localizer,
+    scenes: Sequence[Scene],
+    variants: Sequence[str],
+) -> tuple[list[QueryResult], int]:
+    """Localize the queries that a run does not have yet; `config` is for any scan, no variants are all.
+
+    Returns the run's queries of these scenes and variants, and how many failed. Raises InputError if the file
+    can't be written, holds something else, or rows made with other settings.
+    """
+    check_variants(scenes, variants)
+    check_output(path)
+    settings = settings_json(config.settings, config.cloud_settings, config.read_options)
+    with locked(path) as file, ExitStack() as stack:
+        rows, size = read_run(path)
+        check_run(path, rows, scenes, {"settings": json.loads(json.dumps(settings))})
+        done = {row.key for row in rows}
+        wanted = {
+            scene.name: [q for q in scene.queries if not variants or q.variant in variants]
+            for scene in scenes
+        }
+        left = {
+            scene.name: [q for q in wanted[scene.name] if (scene.name, scene.name_of(q)) not in done]
+            for scene in scenes
+        }
+        evaluation = Evaluation(arguments, config, file, rows)
+        if any(left.values()):
+            file.cut(size)
+            num_jobs = count_jobs(arguments, max(map(len, left.values())))
+            cluster = stack.enter_context(connecting(arguments, num_jobs))
+            with interruptible() as interruption:
+                for scene in scenes:
+                    if left[scene.name] and not interruption.number:
+                        evaluation.localize(scene, left[scene.name], cluster, interruption)
+            interruption.raise_again()
+    keys = {(scene.name, scene.name_of(query)) for scene in scenes for query in wanted[scene.name]}
+    return [row for row in evaluation.rows if row.key in keys], evaluation.num_failed
 
 
-def config_at_the_workers(run: Run, cluster: Cluster) -> Localizer:
-    """The run's configuration for workers that see its scenes at their paths."""
-    here = Path.cwd()
-    for cloud in sorted({job.scene.cloud for job in run.jobs}):
-        if not cluster.has_files([here / cloud]):
-            text = f"not all workers see {cloud}; scenes must be in a folder that they share"
-            raise InputError(f"--dask {cluster.address}: {text}")
-    return replace(run.config, folder=here)
+@dataclass
+class Evaluation:
+    """A run over scenes that is being written."""
+
+    arguments: argparse.Namespace
+    config: Localizer  # of any scan
+    file: LineFile
+    rows: list[QueryResult]
+    num_failed: int = 0
+
+    def localize(
+        self, scene: Scene, queries: Sequence[Query], cluster: Cluster | None, interruption: Interruption
+    ) -> None:
+        """Localize queries of a scene, and append their lines."""
+        show = progress_bar(self.arguments.quiet)
+        are_inside: list[bool] = []  # the cloud's box
+
+        def open_scan(localizer: Localizer, num_threads: int) -> Scan:
+            scan = localizer.open_scan(Workers(num_threads, show))
+            are_inside.extend(is_in_box(scan, query.pose) for query in queries)
+            return scan
+
+        localizer = replace(self.config, paths=(scene.cloud,))
+        if has_labels := localizer.read_options.labels is not None:
+            for query in queries:
+                if query.labels is None:
+                    self.report(f"{scene.folder}: {scene.name_of(query)} has no labels in queries.json")
+            queries = [query for query in queries if query.labels]
+        num_jobs = count_jobs(self.arguments, len(queries))
+        with ExitStack() as stack:
+            place = executing(self.arguments, localizer, num_jobs, cluster, open_scan)
+            try:
+                executor, localizer = stack.enter_context(place)
+            except Exception as error:
+                self.report(f"{scene.name}: {failure_of(error).text}", len(queries))
+                return
+            pictures = (query.labels if has_labels and query.labels else query.image for query in queries)
+            tasks = (localizer.task(p, q.calibration) for p, q in zip(pictures, queries, strict=True))
+            values = executor.values(tasks)
+            pairs = interruption.each(show(iter(values), len(queries), scene.name), values.finished())
+            for query, is_inside, (task, wait) in zip(queries, are_inside, pairs, strict=False):
+                try:
+                    result = wait().result
+                except WorkerLostError as error:
+                    result = localizer.lost(task, error, None).result
+                self.record(scene, query, result, is_inside)
+
+    def record(self, scene: Scene, query: Query, result: Result, is_inside: bool) -> None:
+        """Append the line of a query, or say why it has none."""
+        if result.error is not None and (result.status != UNREADABLE or query.is_answerable):
+            self.report(result.error)
+            return
+        row = query_result_of(scene, query, result, None if result.error else is_inside)
+        line = row.to_json()
+        self.file.append(line)
+        self.rows.append(QueryResult.from_json(line))  # as whoever reads the file has it
+
+    def report(self, text: str, num_queries: int = 1) -> None:
+        """Say why queries could not be localized."""
+        print_error(self.arguments, text, EXIT_BAD_INPUT)
+        self.num_failed += num_queries

@@ -1,43 +1,35 @@
-"""Where photos are localized: in this process, in several, or on a cluster."""
+"""Executors of a batch: this process, several, or a cluster; and its end by a signal."""
 
 import argparse
-from collections.abc import Callable, Iterator
+import os
+import signal
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import FrameType
+from typing import TypeVar
 
 from ..batch.localizer import Localizer
 from ..errors import InputError
 from ..jobs.cluster import LOCAL, Cluster, connected
 from ..jobs.memory import GB, memory_left, memory_taken
 from ..jobs.processes import Processes
-from ..jobs.tasks import Executor, Here
+from ..jobs.tasks import Here
 from ..jobs.threads import num_cores
 from ..scan import Scan
 from ..scan_map.map_file import save_map
 from ..scan_map.open_map import CachePolicy
 from ..scan_map.scan_map import ScanMap
-from .command import option
-from .errors import UsageError
+from .errors import Terminated, UsageError
+from .options import PHOTOS_OF_A_JOB
 
-PHOTOS_OF_A_JOB = 8  # as many are localized while a process starts and opens a map
-DASK = "work on a Dask cluster: its scheduler's address or file, or local, of --jobs processes here"
 QUERY_MEMORY = 0.5e9  # [byte] of a process beside the map
-Place = tuple[Executor, Localizer]
-
-
-def add_execution_options(parser: argparse.ArgumentParser) -> None:
-    """Where the photos are localized, and what may be taken there."""
-    group = parser.add_argument_group("execution")
-    text = "processes over one prepared map (default one a core, where memory is enough and each has "
-    text += f"{PHOTOS_OF_A_JOB} photos or more; 1 with names on stdin or --threads)"
-    option(group, "--jobs N", text)
-    option(group, "--dask ADDRESS", DASK)
-    option(group, "--threads N", "of each process (default the cores, divided among --jobs)")
-    text = "that may be taken in all; with --dask ADDRESS by each worker (default 80 %% of what is free)"
-    option(group, "--max-memory GB", text, type=float)
+SIGNALS: dict[int, str] = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
+Item = TypeVar("Item")
+Executor = Here | Processes | Cluster
 
 
 def check_execution(arguments: argparse.Namespace) -> None:
@@ -53,8 +45,8 @@ def is_remote(arguments: argparse.Namespace) -> bool:
     return arguments.dask not in (None, LOCAL)
 
 
-def wanted_jobs(arguments: argparse.Namespace, num_left: int | None) -> int:
-    """Processes asked for, or as many as are worth their start for `num_left` photos (None: unknown)."""
+def count_jobs(arguments: argparse.Namespace, num_left: int | None) -> int:
+    """Return the processes asked for, or as many as are worth their start for `num_left` photos, if known."""
     if arguments.jobs is not None:
         return int(min(arguments.jobs, num_left or arguments.jobs))
     if num_left is None or arguments.threads is not None:
@@ -62,16 +54,16 @@ def wanted_jobs(arguments: argparse.Namespace, num_left: int | None) -> int:
     return max(1, min(num_cores(), num_left // PHOTOS_OF_A_JOB))
 
 
-def fitting_jobs(arguments: argparse.Namespace, wanted: int) -> int:
-    """As many of the processes wanted as memory is left for; called where one has what each will need."""
+def count_fitting(arguments: argparse.Namespace, num_jobs: int) -> int:
+    """Return how many of the processes memory is left for; called where one has what each will need."""
     if arguments.jobs is not None:
-        return wanted
+        return num_jobs
     taken = memory_taken()
-    return max(1, min(wanted, int((memory_left() + taken) // (taken + QUERY_MEMORY))))
+    return max(1, min(num_jobs, int((memory_left() + taken) // (taken + QUERY_MEMORY))))
 
 
 def share_of_a_job(arguments: argparse.Namespace, localizer: Localizer, num_jobs: int) -> Localizer:
-    """A localizer for each of some processes: cores and --max-memory, less what this one has, are divided."""
+    """Return the localizer of one of some processes, which divide cores and --max-memory."""
     if is_remote(arguments):
         return replace(localizer, num_threads=arguments.threads or 1, max_memory=arguments.max_memory)
     num_threads = arguments.threads or max(1, num_cores() // num_jobs)
@@ -82,44 +74,52 @@ def share_of_a_job(arguments: argparse.Namespace, localizer: Localizer, num_jobs
 
 
 @contextmanager
+def connecting(arguments: argparse.Namespace, num_jobs: int) -> Iterator[Cluster | None]:
+    """The cluster of --dask; None without."""
+    if not arguments.dask:
+        yield None
+        return
+    num_threads = arguments.threads or (1 if is_remote(arguments) else max(1, num_cores() // num_jobs))
+    with connected(arguments.dask, num_jobs, num_threads) as cluster:
+        yield cluster
+
+
+@contextmanager
 def executing(
     arguments: argparse.Namespace,
     localizer: Localizer,
-    num_left: int | None,
-    opened: Callable[[Localizer, int], Scan],
-) -> Iterator[Place]:
-    """Where photos are localized, and by what, when `opened` has prepared the scan with so many threads."""
-    num_jobs = wanted_jobs(arguments, num_left)
+    num_jobs: int,
+    cluster: Cluster | None,
+    open_scan: Callable[[Localizer, int], Scan],
+) -> Iterator[tuple[Executor, Localizer]]:
+    """An executor, and the localizer for it; `open_scan` prepares the scan before, with so many threads."""
+    is_kept = localizer.cache.is_used
     with ExitStack() as stack:
-        cluster: Cluster | None = None
-        if arguments.dask:
-            num_threads = share_of_a_job(arguments, localizer, num_jobs).num_threads
-            cluster = stack.enter_context(connected(arguments.dask, num_jobs, num_threads))
-        if arguments.no_cache and (cluster or num_jobs > 1):  # others will open what is prepared here
+        if not is_kept and (cluster or num_jobs > 1):  # others will open what is prepared here
             folder = Path(stack.enter_context(TemporaryDirectory(prefix="piccolo-")))
             localizer = replace(localizer, cache=CachePolicy(folder=folder))
-        scan = opened(localizer, arguments.threads or num_cores())
-        if cluster is None and (num_jobs := fitting_jobs(arguments, num_jobs)) == 1:
+        scan = open_scan(localizer, arguments.threads or num_cores())
+        if cluster is None and (num_jobs := count_fitting(arguments, num_jobs)) == 1:
             yield Here(partial(localizer.answer, scan)), localizer
             return
         if cluster and is_remote(arguments):
-            localizer = at_the_workers(arguments, cluster, localizer, scan)
+            localizer = at_the_workers(arguments, cluster, localizer, scan, is_kept)
         del scan
         localizer = share_of_a_job(arguments, localizer, num_jobs)
         if cluster:
-            yield cluster.executor(localizer.opened), localizer
+            yield cluster.executor(localizer.open), localizer
             return
-        processes = Processes(localizer.opened, num_jobs, localizer.num_threads)
+        processes = Processes(localizer.open, num_jobs, localizer.num_threads)
         yield stack.enter_context(closing(processes)), localizer
 
 
 def at_the_workers(
-    arguments: argparse.Namespace, cluster: Cluster, localizer: Localizer, scan: Scan
+    arguments: argparse.Namespace, cluster: Cluster, localizer: Localizer, scan: Scan, is_kept: bool
 ) -> Localizer:
-    """A localizer whose scan a cluster's workers can open: at its path, or sent to them."""
+    """Return a localizer whose scan a cluster's workers can open: at its path, or sent to them."""
     here = Path.cwd()
     is_shared = cluster.has_files([here / path for path in localizer.paths])
-    if is_shared and not arguments.no_cache:
+    if is_shared and is_kept:
         return replace(localizer, folder=here)
     where = f"--dask {arguments.dask}: not all workers see {scan.name}"
     if not isinstance(scan.prepared, ScanMap):
@@ -131,3 +131,66 @@ def at_the_workers(
         save_map(scan.prepared, path)
         cluster.send_file(path)
     return replace(localizer, folder=here, map_name=path.name, sends_photos=not is_shared)
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal came while nothing was at work, or for the second time."""
+
+
+@dataclass
+class Interruption:
+    """Whether Ctrl-C or SIGTERM is to end a batch, whose photo at work is finished first."""
+
+    number: int = 0  # of the signal
+    is_at_work: bool = False
+
+    @property
+    def exit_code(self) -> int:
+        """The code that a shell expects of a program that a signal has ended."""
+        return 128 + self.number
+
+    def each(self, items: Iterable[Item], after: Iterable[Item] = ()) -> Iterator[Item]:
+        """Yield items until a signal ends it, and then those `after`.
+
+        While one is at work, a first signal is only noted, a second one ends the work at once.
+        """
+        try:
+            for item in items:
+                self.is_at_work = True
+                yield item
+                self.is_at_work = False
+                if self.number:
+                    break
+            for item in after:
+                self.is_at_work = True
+                yield item
+                self.is_at_work = False
+        finally:
+            self.is_at_work = False
+
+    def raise_again(self) -> None:
+        """Raise what the signal that has ended a batch would have raised outside of one."""
+        if self.number:
+            raise Terminated if self.number == signal.SIGTERM else KeyboardInterrupt
+
+    def handle(self, number: int, _frame: FrameType | None) -> None:
+        """Note a signal; raises Stopped where it ends the work at once."""
+        is_second = self.number != 0
+        self.number = self.number or number
+        if is_second or not self.is_at_work:
+            raise Stopped
+        os.write(2, f"\n{SIGNALS[number]}: the photo at work is finished; again to stop now\n".encode())
+
+
+@contextmanager
+def interruptible() -> Iterator[Interruption]:
+    """Within this, signals end the batch as Interruption says; one that ends it at once ends the context."""
+    interruption = Interruption()
+    before = {number: signal.signal(number, interruption.handle) for number in SIGNALS}
+    try:
+        yield interruption
+    except Stopped:
+        pass
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -6,16 +6,16 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from tqdm import tqdm
 
-from ..batch.inputs import described, is_from_stdin, panoramas_of
+from ..batch.inputs import describe_left_out, is_from_stdin, panoramas_of
 from ..batch.localizer import Answer, Localizer
-from ..batch.priors import PriorTable, read_priors
+from ..batch.priors import read_priors
 from ..batch.results_file import Records
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..errors import printable
@@ -23,22 +23,40 @@ from ..files.atomic import STDOUT, check_output, is_stdout, is_stream, write_ato
 from ..files.line_file import LineFile, locked, write_line
 from ..jobs.memory import limit_memory
 from ..jobs.stopwatch import Stopwatch
-from ..jobs.tasks import Executor, Pair, WorkerLostError
+from ..jobs.tasks import WorkerLostError
 from ..jobs.threads import Workers, num_cores
 from ..localization.settings import CoarseToFineSettings
 from ..panorama.cube import is_cube
-from ..result import FAILED, UNREADABLE, Failure, Source
+from ..panorama.photo import sha256_of
+from ..result import FAILED, UNREADABLE
 from ..scan import Scan
-from ..scan_map.open_map import CachePolicy, scan_sha256_of
+from ..scan_map.open_map import scan_sha256_of
 from ..scan_map.scan_map import ScanMap
-from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error, print_note, run_command
-from .executing import check_execution, executing
-from .interruption import SIGNALS, Interruption, Stopped, interruptible
-from .localize_walk import check_plan, exit_code_of, run_walk
-from .options import build_parser, check_arguments, cloud_settings_from, read_options_from, settings_from
+from .command import command
+from .errors import EXIT_BAD_INPUT, UsageError, checking_options, exit_code_of, print_error, print_note
+from .executing import (
+    SIGNALS,
+    Executor,
+    Interruption,
+    check_execution,
+    connecting,
+    count_jobs,
+    executing,
+    interruptible,
+)
+from .options import (
+    DESCRIPTION,
+    EPILOG,
+    add_arguments,
+    cache_from,
+    check_arguments,
+    cloud_settings_from,
+    read_options_from,
+    settings_from,
+)
 from .outputs import check_distinct, check_suffix
 from .progress import progress_bar, shown, warn_once
-from .walking import check_walk_options, walk_inputs
+from .walking import check_plan, check_walk_options, run_walk, walk_inputs
 
 MAX_STEM = 255 - len(".png")  # [byte] of a file name
 STATUSES = (LOCALIZED, AMBIGUOUS, NOT_LOCALIZED, UNREADABLE, FAILED)
@@ -56,11 +74,6 @@ class Run:
     left_out: Counter[str]  # files in the folders named that are no panoramas, by suffix
     counts: Counter[str]  # results written, by status
     cloud_sha256: str | None = None  # of the scan, when it has been opened
-
-
-def is_resumable(out: Path | None) -> bool:
-    """True for an output that can be read again: a file, no stream."""
-    return out is not None and not is_stream(out)
 
 
 def check_files(arguments: argparse.Namespace, panoramas: list[Path], total: int | None) -> None:
@@ -84,19 +97,15 @@ def check_files(arguments: argparse.Namespace, panoramas: list[Path], total: int
         check_output(path)
 
 
-def cache_of(arguments: argparse.Namespace) -> CachePolicy:
-    """Where prepared maps are kept."""
-    return CachePolicy(not arguments.no_cache, arguments.cache)
-
-
 def prepare_run(arguments: argparse.Namespace) -> Run:
-    """What is to be done: the options, the panoramas, and how many of them are finished."""
+    """Return what is to be done: the options, the panoramas, and how many there are."""
     with checking_options():
         check_arguments(arguments)
         check_walk_options(arguments)
         check_execution(arguments)
         limit_memory(arguments.max_memory)
-        settings, read_options = settings_from(arguments), read_options_from(arguments)
+        settings = settings_from(arguments)
+        read_options = read_options_from(arguments)
         cloud_settings = cloud_settings_from(arguments)
     priors = None
     if arguments.priors:
@@ -108,7 +117,7 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
         settings,
         cloud_settings,
         read_options,
-        cache_of(arguments),
+        cache_from(arguments),
         priors,
         makes_overlays=arguments.overlay is not None,
         makes_occlusion_masks=arguments.occlusion_mask is not None,
@@ -123,25 +132,15 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
     check_files(arguments, known, len(known))
     for pano in known:
         localizer.settings_of(pano)
-    note_unused(arguments, priors)
+    note_unused_priors(arguments, localizer)
     return Run(arguments, localizer, known, len(known), left_out, Counter())
 
 
-def note_unused(arguments: argparse.Namespace, priors: PriorTable | None) -> None:
+def note_unused_priors(arguments: argparse.Namespace, localizer: Localizer) -> None:
     """Warn of names in the table of priors that no panorama has had."""
-    if priors and priors.unused:
-        note = f"{len(priors.unused)} names of no panorama here, such as {priors.unused[0]}"
-        print_note(arguments, f"warning: {priors.path}: {note}")
-
-
-def take_up(run: Run, file: LineFile | None) -> Records:
-    """The results of earlier runs in the output, which are to be as those of this run would be."""
-    arguments = run.arguments
-    records = Records(file)
-    if file and file.size and not arguments.overwrite:
-        expected = run.localizer.expected(scan_sha256_of(arguments.cloud, cache_of(arguments)))
-        records.read(expected, None if run.total is None else run.panoramas)
-    return records
+    if localizer.priors and (unused := localizer.priors.unused):
+        note = f"{len(unused)} names of no panorama here, such as {unused[0]}"
+        print_note(arguments, f"warning: {localizer.priors.path}: {note}")
 
 
 def open_scan(run: Run, localizer: Localizer, num_threads: int) -> Scan:
@@ -158,16 +157,25 @@ def open_scan(run: Run, localizer: Localizer, num_threads: int) -> Scan:
 
 
 @contextmanager
-def output(out: Path) -> Iterator[tuple[LineFile | None, Write]]:
+def open_output(out: Path) -> Iterator[tuple[LineFile | None, Write]]:
     """A function that writes one line: to stdout, a FIFO, or to the end of a file, which comes with it."""
-    if is_resumable(out):
-        with locked(out) as file:
-            yield file, file.append
-    elif is_stdout(out):
+    if is_stdout(out):
         yield None, lambda line: print(line, flush=True)
-    else:
+    elif is_stream(out):
         with out.open("wb", buffering=0) as stream:
             yield None, lambda line: write_line(stream.fileno(), out, line)
+    else:
+        with locked(out) as file:
+            yield file, file.append
+
+
+def take_up_results(run: Run, file: LineFile | None) -> Records:
+    """Return the results of earlier runs in the output, which are to be as those of this run would be."""
+    records = Records(file.path if file else None)
+    if file and file.size and not run.arguments.overwrite:
+        expected = run.localizer.expected(scan_sha256_of(run.arguments.cloud, run.localizer.cache))
+        records.read(expected, None if run.total is None else run.panoramas)
+    return records
 
 
 def write_picture(path: Path, pano: Path, png: bytes) -> None:
@@ -176,15 +184,10 @@ def write_picture(path: Path, pano: Path, png: bytes) -> None:
     write_atomically(path / f"{name}.png" if path.is_dir() else path, png)
 
 
-def record(run: Run, pair: Pair, write: Write) -> None:
-    """Wait for the answer to a task; write the pictures asked for and the result, and say what was found."""
-    task, wait = pair
-    try:
-        answer: Answer = wait()
-    except WorkerLostError as error:
-        failure = Failure(f"{task.pano}: {error}", is_passing=True)
-        answer = run.localizer.failed(task, failure, Source(run.cloud_sha256))
-    arguments, result = run.arguments, answer.result
+def record(run: Run, answer: Answer, write: Write) -> None:
+    """Write the pictures asked for and the result, and say what was found."""
+    arguments = run.arguments
+    result = answer.result
     pictures = (arguments.overlay, answer.overlay), (arguments.occlusion_mask, answer.occlusion_mask)
     for path, png in pictures:
         if path and png is not None:
@@ -206,63 +209,69 @@ def localize_all(
     is_quiet = run.arguments.quiet or run.total == 1
     bar = {"desc": "panoramas", "total": run.total, "initial": records.counts.total(), "unit": ""}
     values = executor.values(map(run.localizer.task, left))
-    with interruptible() as interruption, suppress(Stopped):
-        for pair in shown(values, is_quiet, **bar):
-            with interruption.postponed() if run.total != 1 else nullcontext():
-                record(run, pair, write)
-            if interruption.number:
-                break
-        for pair in values.finished():  # behind the one after which a signal has ended it
-            with interruption.postponed():
-                record(run, pair, write)
+    with interruptible() as interruption:
+        pairs = shown(values, is_quiet, **bar)
+        # behind the photo after which a signal has ended it come those that are done already
+        for task, wait in pairs if run.total == 1 else interruption.each(pairs, values.finished()):
+            try:
+                answer = wait()
+            except WorkerLostError as error:
+                answer = run.localizer.lost(task, error, run.cloud_sha256)
+            record(run, answer, write)
     return interruption
 
 
-def finish(run: Run, records: Records, interruption: Interruption, seconds: float) -> int:
-    """Put the results in order, say what was done, and how to go on; the exit code."""
-    arguments, counts = run.arguments, run.counts + records.counts
-    num_dropped = 0 if interruption.number else records.finish(keeps_others=run.total is None)
+def finish(
+    run: Run, records: Records, file: LineFile | None, interruption: Interruption, seconds: float
+) -> int:
+    """Put the results in order, say what was done, and how to go on; return the exit code."""
+    arguments = run.arguments
+    counts = run.counts + records.counts
+    num_dropped = 0
+    if file and not interruption.number:
+        num_dropped = records.finish(file, keeps_others=run.total is None)
     if run.total != 1 or run.left_out or num_dropped:
         words = ", ".join(f"{counts[status]} {status.replace('_', ' ')}" for status in STATUSES)
         again = ", which the same command tries again" if counts[FAILED] else ""
         note = f"{counts.total()} panoramas in {seconds:.0f} s: {words}{again}"
         dropped = f"dropped {num_dropped} results of panoramas not named any more" if num_dropped else ""
-        print_note(arguments, "; ".join(filter(None, (note, dropped, described(run.left_out)))))
+        print_note(arguments, "; ".join(filter(None, (note, dropped, describe_left_out(run.left_out)))))
     if interruption.number:
-        is_kept = is_resumable(arguments.out)
-        how = "the same command goes on from here" if is_kept else "with --out FILE the same command goes on"
+        how = "the same command goes on from here" if file else "with --out FILE the same command goes on"
         text = f"ended by {SIGNALS[interruption.number]} after {counts.total()} results; {how}"
         return print_error(arguments, text, interruption.exit_code)
     if run.total is None:
-        note_unused(arguments, run.localizer.priors)
+        note_unused_priors(arguments, run.localizer)
     return exit_code_of(counts)
 
 
-def run_frames(arguments: argparse.Namespace) -> int:
+def run_frames(run: Run) -> int:
     """Localize the frames of one walk, return the exit code."""
-    run = prepare_run(arguments)
-    settings, read_options = run.localizer.settings, run.localizer.read_options
+    arguments = run.arguments
+    settings = run.localizer.settings
     if not isinstance(settings, CoarseToFineSettings):
         raise UsageError("--walk, --video: not options of the preset paper")
     with walk_inputs(arguments, list(run.panoramas)) as inputs:
         opening = partial(open_scan, run, run.localizer, arguments.threads or num_cores())
         if run.left_out:
-            print_note(arguments, described(run.left_out))
-        return run_walk(arguments, inputs, settings, read_options, opening)
+            print_note(arguments, describe_left_out(run.left_out))
+        return run_walk(arguments, inputs, settings, run.localizer.read_options, opening)
 
 
-def run(arguments: argparse.Namespace) -> int:
+@command(__file__, DESCRIPTION, EPILOG, add_arguments, "0 all localized, 1 some not")
+def main(arguments: argparse.Namespace) -> int:
     """Localize every panorama, write the results, return the exit code."""
-    if arguments.walk or arguments.video:
-        return run_frames(arguments)
     watch = Stopwatch()
     run = prepare_run(arguments)
-    with output(arguments.out or STDOUT) as (file, write):
-        records = take_up(run, file)
+    if arguments.walk or arguments.video:
+        return run_frames(run)
+    rig = run.localizer.read_options.rig
+    with open_output(arguments.out or STDOUT) as (file, write):
+        records = take_up_results(run, file)
         panoramas = iter(run.panoramas)
         if run.total is not None:
             panoramas = progress_bar(arguments.quiet)(panoramas, run.total, "check what is finished")
-        left = records.left(panoramas, run.localizer.read_options.rig)
+        left = records.left(panoramas, lambda pano: sha256_of(pano, rig))
         num_left = None
         if run.total is not None:
             known = list(left)
@@ -271,14 +280,15 @@ def run(arguments: argparse.Namespace) -> int:
         first = next(left, None)
         if first is None:
             print_note(arguments, f"{arguments.out or 'nothing'}: nothing is left to do")
-            return finish(run, records, Interruption(), 0.0)
-        place = executing(arguments, run.localizer, num_left, partial(open_scan, run))
-        with place as (executor, run.localizer), watch.stage("all"):
-            records.begin()
+            return finish(run, records, file, Interruption(), 0.0)
+        num_jobs = count_jobs(arguments, num_left)
+        with (
+            connecting(arguments, num_jobs) as cluster,
+            executing(arguments, run.localizer, num_jobs, cluster, partial(open_scan, run)) as place,
+            watch.stage("all"),
+        ):
+            executor, run.localizer = place
+            if file:
+                file.cut(records.size)  # before the first line is appended
             interruption = localize_all(run, records, itertools.chain([first], left), executor, write)
-        return finish(run, records, interruption, watch.seconds["all"])
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    return run_command(build_parser(), argv, run)
+        return finish(run, records, file, interruption, watch.seconds["all"])

@@ -1,10 +1,12 @@
 """The options of localize.py: what they are, and the settings that they ask for."""
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, get_args, get_type_hints
 
 from .. import __version__
+from ..batch.frame_times import EXIF, NAMES, ORDER
 from ..camera.files import read_calibration, read_rig
 from ..cloud.crs import check_crs
 from ..cloud.label_colors import Labels
@@ -13,12 +15,12 @@ from ..errors import InputError
 from ..localization.settings import CoarseToFineSettings
 from ..panorama import ReadOptions
 from ..panorama.model import Projection
-from ..paper.settings import Initialization, PaperSettings, PoseLoss
+from ..paper.settings import PaperSettings
+from ..scan import Settings
+from ..scan_map.open_map import CachePolicy
 from ..scan_map.prior import Prior
-from .command import check_least
-from .executing import add_execution_options
-from .parser import add_run_options, new_parser
-from .walking import add_walk_options
+from ..walk.frames import MAX_SPEED
+from .command import check_least, option
 
 DESCRIPTION = "Find where in a coloured point cloud 360-degree panoramas were taken."
 EPILOG = """\
@@ -27,94 +29,26 @@ examples:
   python localize.py --cloud scan.ply --pano query.jpg --out pose.json --overlay overlay.png
   python localize.py --cloud scan.ply --pano photos --out poses.jsonl --priors priors.csv
   ls photos/*.jpg | python localize.py --cloud scan.ply --pano - > poses.jsonl
-  python localize.py --cloud scan.ply --pano query.jpg --near 12 3 1.5 --radius 4
+  python localize.py --cloud scan.ply --pano query.jpg --near 12 3 1.5 4
   python localize.py --cloud scan.ply --walk --pano frames --out walk.jsonl
   python localize.py --cloud scan.ply --video walk.mp4 --every 0.5s --out walk.jsonl
-  python localize.py --cloud scan.ply --pano query.jpg --preset paper --solver lbfgs
+  python localize.py --cloud scan.ply --pano query.jpg --preset paper solver=lbfgs
 
 output: one JSON object a panorama, one a line, in the order given (docs/RESULT.md); messages and progress go
 to stderr. Ctrl-C ends a batch after the photo at work, a second one at once.
---help-paper shows the options of the preset paper.
 """
-# Settings that only one preset has, each with an option of its name: option, metavar, type or choices, help.
-Option = tuple[str, str | None, type | tuple[str, ...], str]
-NUM_ROTATIONS: Option = (
-    "--num-rotations", "N", int,
-    "rotations of SO(3) searched where gravity is unknown; preset paper: N_r, 0 for 8 yaws or 32 of SO(3)",
-)  # fmt: skip
-DEFAULT_OPTIONS: tuple[Option, ...] = (
-    ("--num-yaws", "N", int, "rotations searched where gravity is known"),
-    NUM_ROTATIONS,
-    ("--max-starts", "N", int, "poses from which a descent begins, at most"),
-)
-PAPER_ONLY: tuple[Option, ...] = (
-    ("--num-translations", "N_t", int, "start positions in free space"),
-    ("--loss", None, get_args(PoseLoss), "photometric: pixels of the rendered cloud, the paper's comparison"),
-    ("--photometric-width", "PX", int, "of rendered cloud and panorama with the photometric loss, at most"),
-    ("--initialization", None, get_args(Initialization), "loss-only: K2 poses by the loss, no histograms"),
-    ("--num-by-loss", "K1", int, "poses kept by the loss"),
-    ("--num-by-histogram", "K2", int, "poses kept by colour histograms, and refined"),
-    ("--num-iterations", "N", int, "iterations of the solver"),
-    ("--histogram-bins", "N", int, "bins a channel"),
-    ("--grid-margin", "FRACTION", float, "fraction of the box left out on each side of the grid"),
-    ("--max-points", "N", int, "points used of a larger cloud"),
-    ("--no-visibility", None, bool, "see through walls"),
-)
-PAPER_OPTIONS = (NUM_ROTATIONS, *PAPER_ONLY)
-PRIORS = ("near", "radius", "height", "heading", "heading_tolerance", "within")
+PRESETS: dict[str, type[Settings]] = {"default": CoarseToFineSettings, "paper": PaperSettings}
+ONLY_DEFAULT = ("near", "height", "heading", "within", "refine_focal")
+NONE = "none"
+PHOTOS_OF_A_JOB = 8  # as many are localized while a process starts and opens a map
+DEFAULT_EVERY = "0.5s"
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """All options. A setting that is not given stays None, and keeps its preset's default."""
-    parser = new_parser("localize", DESCRIPTION, EPILOG, "0 all localized, 1 some not")
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """All options."""
     parser.add_argument("--version", action="version", version=f"piccolo {__version__}")
     text = "coloured scan in any format of the README, one file or several; or a map by tools/prepare_map.py"
     add_cloud_options(parser, text)
-    files = parser.add_argument_group("files")
-    add_panorama_options(parser)
-    text = "append each JSON line here as it comes; the same command again goes on where it stopped"
-    files.add_argument("--out", type=Path, metavar="FILE", help=text)
-    files.add_argument("--overwrite", action="store_true", help="begin --out anew, whatever is in it")
-    text = "PNG: panorama, cloud at the pose, checkerboard of both; of several panoramas a folder of PNGs"
-    files.add_argument("--overlay", type=Path, metavar="PNG", help=text)
-    text = "PNG of the photo's size: white what contradicts the scan, grey what was not scanned, else black"
-    files.add_argument("--occlusion-mask", type=Path, metavar="PNG", help=f"{text}; of several a folder")
-    files.add_argument("--cache", type=Path, metavar="FOLDER", help="of prepared maps (default the user's)")
-    files.add_argument("--no-cache", action="store_true", help="prepare the map again, and do not keep it")
-    add_method_options(parser)
-    add_prior_options(parser)
-    add_walk_options(parser)
-    add_execution_options(parser)
-    add_run_options(parser)
-    return parser
-
-
-def add_cloud_options(parser: argparse.ArgumentParser, text: str) -> None:
-    """The cloud's files, described by `text`, and how to read them."""
-    group = parser.add_argument_group("cloud")
-    group.add_argument("--cloud", type=Path, required=True, nargs="+", help=text)
-    add_cloud_reading_options(group)
-
-
-def add_cloud_reading_options(group: argparse._ArgumentGroup) -> None:
-    """How to read a cloud's files."""
-    unit = group.add_mutually_exclusive_group()
-    unit.add_argument("--units", choices=list(METRES), help="of the cloud's coordinates (default m)")
-    unit.add_argument("--scale", type=float, metavar="S", help="metres per unit of the cloud, in place of it")
-    text = "up axis of the cloud; auto is the file's: z, in glTF y (default auto; preset default)"
-    group.add_argument("--up", choices=get_args(UpAxis), default="auto", help=text)
-    text = "of clouds without colours"
-    group.add_argument("--intensity-as-gray", action="store_true", help=text)
-    text = (
-        "semantic labels in place of colours: of the points (PLY, LAS, LAZ, PCD), and PNG panoramas of labels"
-    )
-    group.add_argument("--labels", action="store_true", help=text)
-    text = "labels to ignore: left out of the cloud, masked in panoramas"
-    group.add_argument("--ignore-labels", type=int, nargs="+", metavar="N", help=text)
-
-
-def add_panorama_options(parser: argparse.ArgumentParser) -> None:
-    """The panoramas' files, and how to read them."""
     group = parser.add_argument_group("panorama")
     text = (
         "JPEG, PNG, TIFF, WebP, HEIC: 2:1, a crop with Photo Sphere metadata, a photo with a focal length; "
@@ -123,184 +57,230 @@ def add_panorama_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--pano", nargs="+", default=[], help=text)
     add_panorama_reading_options(group)
+    group = parser.add_argument_group("files")
+    option(group, "--out FILE", "append each JSON line here; the same command goes on where it stopped")
+    option(group, "--overwrite", "begin --out again, whatever is in it")
+    text = "panorama, cloud at the pose, checkerboard of both; of several panoramas a folder of PNGs"
+    option(group, "--overlay PNG", text)
+    text = "of the photo's size: white what contradicts the scan, grey what was not scanned, else black; "
+    option(group, "--occlusion-mask PNG", text + "of several a folder")
+    text = f"of prepared maps (default the user's); {NONE}: prepare the map again, and do not keep it"
+    option(group, "--cache FOLDER", text)
+    add_method_options(parser)
+    add_prior_options(parser)
+    add_walk_options(parser)
+    add_execution_options(parser)
+
+
+def add_cloud_options(parser: argparse.ArgumentParser, text: str) -> None:
+    """Add the cloud's files, described by `text`, and how to read them."""
+    group = parser.add_argument_group("cloud")
+    group.add_argument("--cloud", type=Path, required=True, nargs="+", help=text)
+    add_cloud_reading_options(group)
+
+
+def add_cloud_reading_options(group: argparse._ArgumentGroup) -> None:
+    """Add the options of reading a cloud's files."""
+    text = f"of the cloud's coordinates: {', '.join(METRES)}, or a number of metres (default m)"
+    option(group, "--units UNIT", text, type=_metres_of, default=None)
+    text = "up axis of the cloud; auto is the file's: z, in glTF y (default auto; preset default)"
+    group.add_argument("--up", choices=get_args(UpAxis), default="auto", help=text)
+    option(group, "--intensity-as-gray", "of clouds without colours")
+    text = "semantic labels in place of colours: of the points (PLY, LAS, LAZ, PCD), PNG panoramas of labels"
+    option(group, "--labels", text)
+    option(group, "--ignore-labels N ...", "labels left out of the cloud, and masked in panoramas")
+
+
+def _metres_of(text: str) -> float:
+    """Return metres per unit; `text` is the name of a unit or a number."""
+    try:
+        return METRES[text] if text in METRES else float(text)
+    except ValueError:
+        wanted = f"wanted one of {', '.join(METRES)}, or metres a unit"
+        raise argparse.ArgumentTypeError(f"found {text!r}, {wanted}") from None
 
 
 def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
-    """What the files of the panoramas do not tell."""
+    """Add what the files of the panoramas do not say."""
     text = "horizontal field of view, of a part of the sphere about the horizon or as --projection says"
-    group.add_argument("--fov", type=float, metavar="DEG", help=text)
+    option(group, "--fov DEG", text)
     text = "of the picture (default equirectangular; of a photo with EXIF's focal length pinhole)"
     group.add_argument("--projection", choices=get_args(Projection), help=text)
-    text = "focal length of a pinhole photo, in its own pixels, known to 1 %%"
-    group.add_argument("--focal", type=float, metavar="PX", help=text)
-    text = (
-        "the focal length is a guess, within 20 %%: find it, and k1 if the model has it; three times as slow"
-    )
-    group.add_argument("--refine-focal", action="store_true", help=text)
+    option(group, "--focal PX", "of a pinhole photo, in its own pixels, known to 1 %%", type=float)
+    text = "the focal length is a guess, within 20 %%: find it, and k1 if the model has it; takes three times"
+    option(group, "--refine-focal", text)
     text = "calibration: COLMAP's cameras.txt, OpenSfM's camera_models.json, or JSON of docs/CAMERAS.md"
-    group.add_argument("--camera", type=Path, metavar="FILE", help=text)
+    option(group, "--camera FILE", text)
     text = "cameras whose pictures, a folder, are one query: COLMAP's rig_config.json, or our JSON"
-    group.add_argument("--rig", type=Path, metavar="FILE", help=text)
+    option(group, "--rig FILE", text)
     text = "down, in the camera's axes (+x image centre, +y left, +z up), of any length: 0 0 -1 is upright"
-    group.add_argument("--gravity-vector", type=float, nargs=3, metavar=("X", "Y", "Z"), help=text)
-    text = (
-        "picture, white where the panorama is to be ignored; or a folder of masks with the panoramas' names"
-    )
-    group.add_argument("--mask", type=Path, help=text)
+    option(group, "--gravity-vector X Y Z", text)
+    text = "white where the panorama is to be ignored; or a folder of masks with the panoramas' names"
+    option(group, "--mask FILE", text)
     text = "ignore the cap of this half angle straight down: tripod, car roof"
     group.add_argument("--mask-nadir", type=float, default=0.0, metavar="DEG", help=text)
-    text = "the picture is a strip or grid of cube faces in this order, such as rludfb"
-    group.add_argument("--cube-order", metavar="LETTERS", help=text)
-    text = "the cloud's system, such as EPSG:25832, for photos with GPS (default: what LAS, LAZ or E57 say)"
-    group.add_argument("--crs", metavar="CRS", help=text)
-    text = "leave GPS positions in the pictures aside (default: each is searched about first)"
-    group.add_argument("--no-gps", action="store_true", help=text)
+    text = (
+        "the cloud's system, such as EPSG:25832, for photos with GPS, each of which is searched about first "
+    )
+    option(
+        group, "--crs CRS", f"{text}(default: what LAS, LAZ or E57 say); {NONE}: leave GPS positions aside"
+    )
+
+
+def add_method_options(parser: argparse.ArgumentParser) -> None:
+    """Add the preset and its settings."""
+    group = parser.add_argument_group("method")
+    text = "default: prepared views, all positions searched; paper: Kim et al., ICCV 2021, Algorithm 1; then "
+    text += "its settings by name, such as solver=lbfgs loss=photometric (docs/API.md)"
+    group.add_argument("--preset", nargs="+", default=["default"], metavar="NAME", help=text)
+    text = "known: camera upright, the cloud's z up; unknown: any rotation; auto: both (default auto)"
+    group.add_argument("--gravity", choices=["auto", "known", "unknown"], help=text)
+    text = f"a pose with less is not called localized (default {CoarseToFineSettings().min_confidence})"
+    option(group, "--min-confidence X", text)
+
+
+def add_prior_options(parser: argparse.ArgumentParser) -> None:
+    """Add what the user knows beforehand."""
+    title = "prior knowledge (preset default); a pose that contradicts it is not localized"
+    group = parser.add_argument_group(title)
+    text = "CSV: name and any of x, y, z, radius, heading, tolerance, height, within; before the options here"
+    option(group, "--priors FILE", text)
+    option(group, "--near X Y Z RADIUS", "the camera is within RADIUS of this position [m]")
+    option(group, "--height MIN MAX", "above the floor [m]")
+    option(group, "--heading DEG", "of the image centre, clockwise from the cloud's +y, within 20 degrees")
+    text = "only in these scans of a map that tools/prepare_map.py --add has put together"
+    option(group, "--within NAME ...", text)
+
+
+def add_walk_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of walks."""
+    group = parser.add_argument_group("walks")
+    text = "the panoramas are frames of one walk, in this order, each of which narrows the others"
+    option(group, "--walk", text)
+    option(group, "--video FILE", "a walk's video, in place of --pano")
+    text = f"of a video, such as 0.5s or 1m: the sharpest frame each time (default {DEFAULT_EVERY})"
+    option(group, "--every STEP", text)
+    text = f"of the frames: {EXIF}, {NAMES} (the last number in each, seconds), {ORDER}, or a CSV file with "
+    text += f"columns name and time [s] (default {EXIF} if it tells them apart, else {ORDER})"
+    option(group, "--times SOURCE", text)
+    text = (
+        f"of the camera [m/s] (default {MAX_SPEED:g}); where only the order of the frames is known, [m] from "
+    )
+    option(group, "--max-speed X", text + "one to the next (default by what is found of them)")
+    text = "the path on the scan from above, coloured by its frames' confidence: .png, .svg, .pdf or .dxf"
+    option(group, "--plan FILE", text)
+
+
+def add_execution_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of processes, threads and memory."""
+    group = parser.add_argument_group("execution")
+    text = "processes over one prepared map (default one a core, where memory is enough and each has "
+    text += f"{PHOTOS_OF_A_JOB} photos or more; 1 with names on stdin or --threads)"
+    option(group, "--jobs N", text)
+    text = "work on a Dask cluster: its scheduler's address or file, or local, of --jobs processes here"
+    option(group, "--dask ADDRESS", text)
+    option(group, "--threads N", "of each process (default the cores, divided among --jobs)")
+    text = "that may be taken in all; with --dask ADDRESS by each worker (default 80 %% of what is free)"
+    option(group, "--max-memory GB", text)
 
 
 def read_options_from(arguments: argparse.Namespace) -> ReadOptions:
-    """The options of add_panorama_options."""
-    pictures = arguments.fov, arguments.mask, arguments.mask_nadir, arguments.cube_order
+    """Return the options of add_panorama_reading_options."""
     if arguments.camera and arguments.rig:
         raise InputError("--camera, --rig: wanted only one of them")
     calibration = read_calibration(arguments.camera) if arguments.camera else None
     return ReadOptions(
-        *pictures,
-        labels_from(arguments),
-        not arguments.no_gps,
-        arguments.projection,
-        arguments.focal,
-        read_rig(arguments.rig) if arguments.rig else calibration,
-        tuple(arguments.gravity_vector) if arguments.gravity_vector else None,
-        arguments.refine_focal,
+        fov_deg=arguments.fov,
+        mask=arguments.mask,
+        mask_nadir_deg=arguments.mask_nadir,
+        labels=_labels_from(arguments),
+        use_gps=arguments.crs != NONE,
+        projection=arguments.projection,
+        focal_px=arguments.focal,
+        calibration=read_rig(arguments.rig) if arguments.rig else calibration,
+        gravity_vector=tuple(arguments.gravity_vector) if arguments.gravity_vector else None,
+        refine_focal=arguments.refine_focal,
     )
 
 
 def cloud_settings_from(arguments: argparse.Namespace) -> CloudSettings:
-    """The options of add_cloud_options."""
-    scale = METRES[arguments.units or "m"] if arguments.scale is None else arguments.scale
+    """Return the options of add_cloud_reading_options."""
+    scale = METRES["m"] if arguments.units is None else arguments.units
     crs = vars(arguments).get("crs")  # not of commands without photos
+    if crs == NONE:
+        crs = None
     if crs:
         check_crs(crs)
-    return CloudSettings(scale, arguments.up, arguments.intensity_as_gray, labels_from(arguments), crs)
+    return CloudSettings(scale, arguments.up, arguments.intensity_as_gray, _labels_from(arguments), crs)
 
 
-def labels_from(arguments: argparse.Namespace) -> Labels | None:
-    """How labels are to be read, None for colours."""
+def _labels_from(arguments: argparse.Namespace) -> Labels | None:
+    """Return how labels are to be read, None for colours."""
     if arguments.ignore_labels and not arguments.labels:
         raise InputError("--ignore-labels: only with --labels")
     return Labels(tuple(sorted(set(arguments.ignore_labels or ())))) if arguments.labels else None
 
 
-def add_method_options(parser: argparse.ArgumentParser) -> None:
-    """The preset and its settings; those of the preset `paper` are shown by --help-paper only."""
-    group = parser.add_argument_group("method")
-    text = "default: prepared views, all positions searched; paper: Kim et al., ICCV 2021, Algorithm 1"
-    group.add_argument("--preset", choices=["default", "paper"], default="default", help=text)
-    text = "known: camera upright, the cloud's z up; unknown: any rotation; auto: both (default auto)"
-    group.add_argument("--gravity", choices=["auto", "known", "unknown"], help=text)
-    text = "of the descent (default gauss-newton, with the preset paper adam)"
-    group.add_argument("--solver", choices=["gauss-newton", "lbfgs", "adam"], help=text)
-    text = f"a pose with less is not called localized (default {CoarseToFineSettings().min_confidence})"
-    group.add_argument("--min-confidence", type=float, metavar="X", help=text)
-    add_options(group, DEFAULT_OPTIONS, CoarseToFineSettings())
-    add_options(group, PAPER_ONLY, PaperSettings(), is_hidden=True)
-    text = "show the options of the preset paper and exit"
-    group.add_argument("--help-paper", action=PaperHelp, nargs=0, help=text)
+def cache_from(arguments: argparse.Namespace) -> CachePolicy:
+    """Return where prepared maps are kept."""
+    is_used = arguments.cache != Path(NONE)
+    return CachePolicy(is_used, arguments.cache if is_used else None)
 
 
-def add_options(
-    group: argparse._ArgumentGroup,
-    options: tuple[Option, ...],
-    defaults: CoarseToFineSettings | PaperSettings,
-    is_hidden: bool = False,
-) -> None:
-    """Options that have the names of settings."""
-    for option, metavar, kind, text in options:
-        setting = setting_of(option)
-        default = "" if kind is bool else f" (default {getattr(defaults, setting)})"
-        shown = argparse.SUPPRESS if is_hidden else text + default
-        if kind is bool:
-            group.add_argument(option, action="store_const", const=False, dest=setting, help=shown)
-        elif isinstance(kind, tuple):
-            group.add_argument(option, choices=kind, help=shown)
-        else:
-            group.add_argument(option, type=kind, metavar=metavar, help=shown)
-
-
-def setting_of(option: str) -> str:
-    """The name of an option's setting."""
-    return option.removeprefix("--").replace("-", "_").replace("no_visibility", "use_visibility")
-
-
-class PaperHelp(argparse.Action):
-    """Print the options of the preset `paper`, and exit."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *values: object) -> None:
-        """See argparse.Action."""
-        usage = f"{parser.prog} --preset paper [option ...]"
-        paper = argparse.ArgumentParser(usage=usage, add_help=False)
-        add_options(paper.add_argument_group("options of the preset paper"), PAPER_OPTIONS, PaperSettings())
-        paper.print_help()
-        parser.exit()
-
-
-def add_prior_options(parser: argparse.ArgumentParser) -> None:
-    """What the user knows beforehand."""
-    group = parser.add_argument_group(
-        "prior knowledge (preset default); a pose that contradicts it is not localized"
-    )
-    text = "CSV: name and any of x, y, z, radius, heading, tolerance, height, within; before the options here"
-    group.add_argument("--priors", type=Path, metavar="FILE", help=text)
-    group.add_argument("--near", type=float, nargs=3, metavar=("X", "Y", "Z"), help="rough position [m]")
-    group.add_argument("--radius", type=float, metavar="M", help="the camera is within M metres of --near")
-    group.add_argument("--height", type=float, nargs=2, metavar=("MIN", "MAX"), help="above the floor [m]")
-    text = "of the image centre, clockwise from the cloud's +y"
-    group.add_argument("--heading", type=float, metavar="DEG", help=text)
-    group.add_argument("--heading-tolerance", type=float, metavar="DEG", help="(default 20)")
-    text = "only in these scans of a map that tools/prepare_map.py --add has put together"
-    group.add_argument("--within", nargs="+", metavar="NAME", help=text)
-
-
-def settings_from(arguments: argparse.Namespace) -> CoarseToFineSettings | PaperSettings:
-    """The settings that the options ask for; an option of the other preset is refused."""
-    given = {k: v for k, v in vars(arguments).items() if v is not None}
-    shared = {name: given[name] for name in ("gravity", "solver", "min_confidence") if name in given}
-    if arguments.preset == "paper":
-        foreign = [option for option, *_ in DEFAULT_OPTIONS if option != NUM_ROTATIONS[0]]
-        foreign += ["--" + name.replace("_", "-") for name in PRIORS]
-        foreign += ["--up"] if arguments.up != "auto" else []
-        foreign += ["--refine-focal"] if given.get("refine_focal") else []
+def settings_from(arguments: argparse.Namespace) -> Settings:
+    """Return the settings that the options ask for; an option of the other preset is refused."""
+    name, *words = arguments.preset
+    if name not in PRESETS:
+        raise InputError(f"--preset: found {name!r}, wanted {' or '.join(PRESETS)}")
+    given = parse_settings(name, words)
+    asked = {"gravity": arguments.gravity, "min_confidence": arguments.min_confidence}
+    given |= {name: value for name, value in asked.items() if value is not None}
+    options = vars(arguments)
+    if name == "paper":
+        foreign = [option for option in ONLY_DEFAULT if options.get(option) not in (None, False)]
+        foreign += ["up"] if arguments.up != "auto" else []
+        if foreign:
+            raise InputError(f"--{foreign[0].replace('_', '-')}: not an option of the preset paper")
     else:
-        foreign = [option for option, *_ in PAPER_ONLY]
-    if wrong := [option for option in foreign if setting_of(option) in given]:
-        raise InputError(f"{wrong[0]}: not an option of the preset {arguments.preset}")
-    if arguments.preset == "paper":
-        return paper_settings_from(arguments, **shared)
-    prior = Prior(
-        near_world=tuple(given["near"]) if "near" in given else None,
-        radius=given.get("radius"),
-        height=tuple(given["height"]) if "height" in given else None,
-        heading_deg=given.get("heading"),
-        heading_tolerance_deg=given.get("heading_tolerance", Prior.heading_tolerance_deg),
-        within=tuple(given.get("within", ())),
-    )
-    own = {name: given[name] for option, *_ in DEFAULT_OPTIONS if (name := setting_of(option)) in given}
-    return CoarseToFineSettings(prior=prior, **shared, **own)
+        given["prior"] = prior_from(options)
+    return PRESETS[name](**given)
 
 
-def paper_settings_from(arguments: argparse.Namespace, **more: Any) -> PaperSettings:
-    """The settings of the preset `paper` by PAPER_OPTIONS, and `more`."""
-    given = {setting_of(option): getattr(arguments, setting_of(option)) for option, *_ in PAPER_OPTIONS}
-    return PaperSettings(**{name: value for name, value in given.items() if value is not None}, **more)
+def prior_from(options: dict[str, Any]) -> Prior:
+    """Return what the options of add_prior_options say of all photos; nothing of a command without them."""
+    given: dict[str, Any] = {
+        "within": tuple(options.get("within") or ()),
+        "heading_deg": options.get("heading"),
+    }
+    if near := options.get("near"):
+        given |= {"near_world": tuple(near[:3]), "radius": near[3]}
+    if height := options.get("height"):
+        given["height"] = tuple(height)
+    return Prior(**given)
+
+
+def parse_settings(preset: str, words: Sequence[str]) -> dict[str, Any]:
+    """Return the settings of a preset that are written as NAME=VALUE."""
+    hints = {name: hint for name, hint in get_type_hints(PRESETS[preset]).items() if name != "prior"}
+    given: dict[str, Any] = {}
+    for word in words:
+        name, _, text = word.partition("=")
+        if name not in hints:
+            raise InputError(f"--preset {preset}: found {word!r}, wanted NAME=VALUE of {', '.join(hints)}")
+        hint = hints[name]
+        choices: dict[str, Any] = {choice: choice for choice in get_args(hint)}
+        if hint is bool:
+            choices = {"true": True, "false": False}
+        try:
+            given[name] = choices[text] if choices else hint(text)
+        except (KeyError, ValueError) as error:
+            wanted = f"one of {', '.join(choices)}" if choices else hint.__name__
+            raise InputError(f"--preset {preset}: found {word!r}, wanted {wanted}") from error
+    return given
 
 
 def check_arguments(arguments: argparse.Namespace) -> None:
     """Refuse values that are wrong whatever the files hold."""
     check_least(arguments, threads=1, jobs=1)
-    cloud_settings_from(arguments)
     if arguments.overwrite and not arguments.out:
         raise InputError("--overwrite: only with --out")
-    if arguments.heading_tolerance is not None and arguments.heading is None and not arguments.priors:
-        raise InputError("--heading-tolerance: only with --heading or --priors")
-    if arguments.cache and arguments.no_cache:
-        raise InputError("--cache, --no-cache: only one of them")

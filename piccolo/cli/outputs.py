@@ -1,4 +1,4 @@
-"""What a command writes, checked before it begins to work."""
+"""Outputs of a command, checked before it begins to work."""
 
 import argparse
 import os
@@ -46,7 +46,8 @@ def _are_one(path: Path, other: Path) -> bool:
         return is_stdout(path) and is_stdout(other)
     if path.exists() and other.exists() and path.samefile(other):
         return True
-    real, other_real = Path(os.path.realpath(path)), Path(os.path.realpath(other))
+    real = Path(os.path.realpath(path))
+    other_real = Path(os.path.realpath(other))
     return real.is_relative_to(other_real) or other_real.is_relative_to(real)
 
 

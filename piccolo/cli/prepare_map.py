@@ -31,9 +31,7 @@ One JSON object on stdout describes the map.
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
     add_cloud_options(parser, "coloured scan, as for localize.py")
-    text = (
-        "put the scan into this map, whose coordinates it has; without what it changes, nothing is made anew"
-    )
+    text = "put the scan into this map, whose coordinates it has; only what it changes is prepared again"
     option(parser, "--add FILE", text)
     text = (
         "of the scan: building, storey, room; for results and localize.py --within (default the file's stem)"

@@ -12,7 +12,8 @@ from ..errors import printable
 from ..jobs.threads import Progress
 
 DELAY = 0.5  # seconds: what takes less needs no bar
-COUNTED, UNCOUNTED = "{desc}: {percentage:3.0f} % |{bar:20}| {remaining} left", "{desc}: {n_fmt} in {elapsed}"
+COUNTED = "{desc}: {percentage:3.0f} % |{bar:20}| {remaining} left"
+UNCOUNTED = "{desc}: {n_fmt} in {elapsed}"
 # of a map, when its scan has been read
 STEPS = {"find free space": 1, "render views": 2, "find features": 3, "sort features": 4}
 tqdm.monitor_interval = 0  # no thread of tqdm's own, which might not start, for bars that stand still
@@ -47,28 +48,26 @@ def warn_once(is_quiet: bool) -> Callable[[str], None]:
 
 
 class LogHandler(logging.Handler):
-    """Hands the text of what is logged to one of two functions: news, or warnings."""
+    """Prints what is logged: news, and warnings once."""
 
-    def __init__(self, tell: Callable[[str], None], warn: Callable[[str], None]) -> None:
+    def __init__(self, is_quiet: bool) -> None:
         super().__init__(logging.INFO)
-        self.tell = tell
-        self.warn = warn
+        self.is_quiet = is_quiet
+        self.warn = warn_once(is_quiet)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Hand one over."""
-        (self.warn if record.levelno >= logging.WARNING else self.tell)(record.getMessage())
+        """Print a record."""
+        if record.levelno >= logging.WARNING:
+            self.warn(record.getMessage())
+        elif not self.is_quiet:
+            tqdm.write(record.getMessage(), file=sys.stderr)
 
 
 @contextmanager
 def log_shown(is_quiet: bool) -> Iterator[None]:
     """Within this, what the package logs is printed, warnings once, or nothing at all."""
-
-    def tell(news: str) -> None:
-        if not is_quiet:
-            tqdm.write(news, file=sys.stderr)
-
     log = logging.getLogger("piccolo")
-    handler = LogHandler(tell, warn_once(is_quiet))
+    handler = LogHandler(is_quiet)
     level = log.level
     log.addHandler(handler)
     log.setLevel(logging.INFO)

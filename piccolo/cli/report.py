@@ -14,10 +14,10 @@ from ..report.entries import read_entries
 from ..report.own_plan import OwnPlan
 from ..report.plan_file import SUFFIXES, write_plan_file
 from ..report.site import check_folder
-from ..scan_map.open_map import CachePolicy, open_map
+from ..scan_map.open_map import open_map
 from .command import check_least, command, option, print_warnings
 from .errors import UsageError, checking_options
-from .options import add_cloud_options, cloud_settings_from
+from .options import NONE, add_cloud_options, cache_from, cloud_settings_from
 from .outputs import check_distinct, check_suffix, print_report
 from .progress import progress_bar, warn_once
 
@@ -52,8 +52,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--plan FILE", "the camera positions on the plans: .png, .svg, .pdf or .dxf")
     option(parser, "--force", "show results of another scan too; the page says so")
     option(parser, "--jobs N", "photos worked on at a time", default=num_cores())
-    option(parser, "--cache FOLDER", "of prepared maps (default the user's)")
-    option(parser, "--no-cache", "prepare the map again, and do not keep it")
+    text = f"of prepared maps (default the user's); {NONE}: prepare the map again, and do not keep it"
+    option(parser, "--cache FOLDER", text)
 
 
 def settings_from(arguments: argparse.Namespace) -> ReportSettings:
@@ -61,8 +61,6 @@ def settings_from(arguments: argparse.Namespace) -> ReportSettings:
     check_least(arguments, jobs=1)
     if not (arguments.out or arguments.plan):
         raise UsageError("--out, --plan: found none of them, wanted one or both")
-    if arguments.cache and arguments.no_cache:
-        raise UsageError("--cache, --no-cache: only one of them")
     check_suffix("--plan", arguments.plan, SUFFIXES)
     if arguments.self_contained:
         check_suffix("--out", arguments.out, (".html", ".htm"))
@@ -102,7 +100,7 @@ def main(arguments: argparse.Namespace) -> int:
     check_files(arguments)
     entries = read_entries(arguments.results)
     workers = Workers(arguments.jobs, progress_bar(arguments.quiet), warn_once(arguments.quiet))
-    cache = CachePolicy(not arguments.no_cache, arguments.cache)
+    cache = cache_from(arguments)
     scan_map = open_map(arguments.cloud, cloud_settings, cache, workers, Stopwatch())
     line: dict[str, object] = {"photos": len(entries)}
     if arguments.plan:

@@ -11,19 +11,20 @@ from ..cloud.label_colors import Labels
 from ..cloud.settings import CloudSettings
 from ..errors import InputError
 from ..files.atomic import write_atomically
-from ..jobs.threads import num_cores
+from ..jobs.memory import limit_memory
 from ..localization.settings import CoarseToFineSettings
 from ..panorama import ReadOptions
 from ..paper.settings import PaperSettings
 from ..scan_map.open_map import CachePolicy
 from ..scenes.evaluation.query_result import QueryResult
-from ..scenes.evaluation.runner import input_files, open_run
+from ..scenes.evaluation.runs import input_files
 from ..scenes.reproduce_paper.experiments import EXPERIMENTS, Condition, Settings, plot_png, table
 from ..scenes.scene import Scene, find_scenes
 from .command import check_least, command, option
 from .errors import EXIT_BAD_INPUT, checking_options, print_error
-from .evaluating import resumed
-from .options import PAPER_OPTIONS, add_options, paper_settings_from
+from .evaluating import run_scenes
+from .executing import check_execution
+from .options import add_execution_options, parse_settings
 from .outputs import check_distinct, check_folder_name
 
 _EXPERIMENTS = "\n".join(f"  {name:<15} {experiment.title}" for name, experiment in EXPERIMENTS.items())
@@ -48,9 +49,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--out FOLDER", "made if it is not there", required=True)
     option(parser, "--variants NAME ...", "only these splits", default=[])
     option(parser, "--presets", nargs="+", choices=PRESETS, default=PRESETS)
-    option(parser, "--jobs N", "processes", default=1)
-    group = parser.add_argument_group("preset paper, where the experiment does not vary it")
-    add_options(group, PAPER_OPTIONS, PaperSettings())
+    text = (
+        "settings of the preset paper, where the experiment does not vary them, such as num_translations=100"
+    )
+    option(parser, "--settings NAME=VALUE ...", text, default=[])
+    add_execution_options(parser)
+    parser.set_defaults(jobs=1, mask=None)
 
 
 def file_name(condition: Condition) -> str:
@@ -63,7 +67,8 @@ def transformed_scenes(
     condition: Condition, scenes: Sequence[Scene], root: Path, report: Callable[[str], object]
 ) -> tuple[list[Scene], int]:
     """The scenes under a condition, and the number of queries of those that can't be so."""
-    transformed, num_failed = [], 0
+    transformed = []
+    num_failed = 0
     for number, scene in enumerate(scenes):
         folder = root / str(number)
         folder.mkdir()
@@ -85,11 +90,10 @@ def run_condition(
     with tempfile.TemporaryDirectory(prefix="piccolo-") as temporary:
         transformed, num_failed = transformed_scenes(condition, scenes, Path(temporary), report)
         cache = CachePolicy(True, Path(temporary))
-        num_threads = max(1, num_cores() // arguments.jobs)
-        config = Localizer((), condition.settings, *reading, cache, num_threads=num_threads)
+        config = Localizer((), condition.settings, *reading, cache)
         variants = condition.variants or arguments.variants  # those of a condition are of the wanted
-        run = open_run(out / file_name(condition), config, transformed, variants)
-        rows, num_failed_later = resumed(run, arguments)
+        path = out / file_name(condition)
+        rows, num_failed_later = run_scenes(arguments, path, config, transformed, variants)
     return rows, num_failed + num_failed_later
 
 
@@ -101,7 +105,8 @@ def run_experiment(
     folder: Path = arguments.out / name
     variants = sorted({query.variant for scene in scenes for query in scene.queries})
     variants = [variant for variant in variants if not arguments.variants or variant in arguments.variants]
-    num_failed, found = 0, []
+    num_failed = 0
+    found = []
     conditions = experiment.conditions_of(presets, variants)
     files = [folder / file_name(condition) for condition in conditions]
     files += [folder.with_name(f"{name}{suffix}") for suffix in (".md", ".png")]
@@ -126,10 +131,12 @@ def run_experiment(
 @command(__file__, __doc__, EPILOG, add_arguments)
 def main(arguments: argparse.Namespace) -> int:
     """Run the experiments one by one; returns the exit code."""
-    check_least(arguments, jobs=1)
+    check_least(arguments, jobs=1, threads=1)
     check_folder_name("--out", arguments.out)
     with checking_options():
-        paper = paper_settings_from(arguments)
+        check_execution(arguments)
+        limit_memory(arguments.max_memory)
+        paper = PaperSettings(**parse_settings("paper", arguments.settings))
     settings: dict[str, Settings] = {"paper": paper, "default": CoarseToFineSettings(gravity="known")}
     presets = [settings[name] for name in arguments.presets]
     scenes = find_scenes(arguments.scenes)

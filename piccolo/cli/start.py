@@ -1,9 +1,10 @@
-"""Where a command begins: signals and streams are in order before the libraries are imported, for a second.
+"""The beginning of a command: signals and streams, before the libraries are imported, for a second.
 
 `piccolo.cli.start.NAME` is a function without arguments that runs the command NAME, for console commands.
 """
 
 import os
+import re
 import resource
 import signal
 import sys
@@ -14,16 +15,31 @@ from types import FrameType
 
 from ..jobs.arenas import share_arenas
 
+# Modules of this folder that are commands: scripts of the checkout, and piccolo-NAME where it is installed.
+COMMANDS = (
+    "localize", "align_gravity", "prepare_map", "render_pose", "export_poses", "report", "e57_images",
+    "make_room", "convert_dataset", "evaluate", "reproduce_paper", "loss_surface",
+)  # fmt: skip
+SCRIPT = re.compile(rf"(?:python )?(?:tools/)?\b({'|'.join(COMMANDS)})\.py\b")
 # [byte] below it LLVM and OpenBLAS crash or wait for ever, where NumPy raises; each core has a thread
 LEAST_ADDRESS_SPACE = 1_000_000_000 + 250_000_000 * (os.cpu_count() or 1)
-EXIT_CANNOT_START, EXIT_INTERRUPTED, EXIT_TERMINATED = 3, 130, 143
+EXIT_CANNOT_START = 3
+EXIT_INTERRUPTED = 130
+EXIT_TERMINATED = 143
 
 
 def __getattr__(name: str) -> Callable[[], int]:
-    """What runs the command `name`."""
-    if name.startswith("_"):
-        raise AttributeError(name)
+    """Return a function that runs the command `name`."""
+    if name not in COMMANDS:
+        raise AttributeError(f"piccolo has no command {name!r}")
     return partial(run, name)
+
+
+def as_started(text: str) -> str:
+    """Return a text that names commands as scripts, as installed commands if one of these was started."""
+    if not os.path.basename(sys.argv[0]).startswith("piccolo-"):  # noqa: PTH119
+        return text
+    return SCRIPT.sub(lambda match: f"piccolo-{match[1].replace('_', '-')}", text)
 
 
 def run(name: str) -> int:

@@ -1,25 +1,48 @@
-"""The frames of a walk as localize.py --walk and --video name them."""
+"""localize.py --walk and --video: frames of one walk, each of which narrows the others."""
 
 import argparse
+import json
 import math
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from ..batch.frame_times import EXIF, NAMES, ORDER, times_of
+from .. import __version__
+from ..batch.frame_times import times_of
 from ..batch.inputs import is_from_stdin
+from ..batch.results_file import WAYS, Records
+from ..camera import Calibration
+from ..errors import InputError
+from ..files.atomic import STDOUT, check_output, is_stream, write_atomically
+from ..files.line_file import LineFile, locked, whole_lines, whole_size
 from ..files.temporary import temporary_folder
+from ..jobs.stopwatch import Stopwatch
+from ..jobs.tasks import InFlight
+from ..localization.settings import CoarseToFineSettings
+from ..optional import import_optional
+from ..panorama import ReadOptions
+from ..panorama.photo import sha256_of
 from ..panorama.video import frames_of
+from ..result import FAILED, Result, read_results
+from ..scan import Scan
+from ..scan_map.scan_map import ScanMap
+from ..scan_walk import Walk
 from ..walk.frames import MAX_ACCELERATION, MAX_SPEED, MAX_STEP, NO_ACCELERATION, Motion
-from .errors import UsageError
-from .progress import shown
+from .errors import EXIT_BAD_INPUT, UsageError, exit_code_of, print_error, print_note
+from .executing import SIGNALS, Interruption, interruptible
+from .options import DEFAULT_EVERY
+from .outputs import check_suffix
+from .progress import progress_bar, shown
 
 EVERY = re.compile(r"(\d+(?:\.\d+)?)(s|m)")
-DEFAULT_EVERY = "0.5s"
-ONLY_WITH = ("every", "times", "max_speed", "max_step", "acceleration", "plan")
+ONLY_WITH = ("every", "times", "max_speed", "plan")
 NOT_WITH = ("jobs", "dask", "overlay", "occlusion_mask", "priors", "refine_focal")
+KEY_BEGINS = b'{"'
 
 
 class WalkInput(NamedTuple):
@@ -38,74 +61,42 @@ class WalkInputs(NamedTuple):
     min_distance: float  # [m] below which frames are dropped
 
 
-def add_walk_options(parser: argparse.ArgumentParser) -> None:
-    """How frames of a walk are taken, and how the camera is carried."""
-    group = parser.add_argument_group("walks")
-    text = "the panoramas are frames of one walk, in this order: each is told by those before and after it"
-    group.add_argument("--walk", action="store_true", help=text)
-    group.add_argument("--video", type=Path, metavar="FILE", help="a walk's video, in place of --pano")
-    text = f"of a video, such as 0.5s or 1m: the sharpest frame each time (default {DEFAULT_EVERY})"
-    group.add_argument("--every", metavar="STEP", help=text)
-    text = f"of the frames: {EXIF}, {NAMES} (the last number in each, seconds), {ORDER}, or a CSV file with "
-    text += f"columns name and time [s] (default {EXIF} if it tells them apart, else {ORDER})"
-    group.add_argument("--times", metavar="SOURCE", help=text)
-    text = f"of the camera [m/s] (default {MAX_SPEED:g})"
-    group.add_argument("--max-speed", type=float, metavar="X", help=text)
-    text = "from a frame to the next, where only their order is known [m] (default by what is found of them)"
-    group.add_argument("--max-step", type=float, metavar="M", help=text)
-    text = "the path on the scan from above, coloured by its frames' confidence: .png, .svg, .pdf or .dxf"
-    group.add_argument("--plan", type=Path, metavar="FILE", help=text)
-    text = "standard deviation of the camera's acceleration, by which the path is smoothed [m/s^2] "
-    text += f"(default {MAX_ACCELERATION:g})"
-    group.add_argument("--acceleration", type=float, metavar="X", help=text)
-
-
 def check_walk_options(arguments: argparse.Namespace) -> None:
     """Refuse what does not go together."""
-    if arguments.walk or arguments.video is not None:
-        _check_walk(arguments)
-        return
-    if not arguments.pano:
-        raise UsageError("the following arguments are required: --pano")
-    for name in ONLY_WITH:
-        if getattr(arguments, name) is not None:
-            raise UsageError(f"--{name.replace('_', '-')}: only with --walk or --video")
-
-
-def _check_walk(arguments: argparse.Namespace) -> None:
     is_video = arguments.video is not None
+    if not (arguments.walk or is_video):
+        if not arguments.pano:
+            raise UsageError("the following arguments are required: --pano")
+        for name in ONLY_WITH:
+            if getattr(arguments, name) is not None:
+                raise UsageError(f"--{name.replace('_', '-')}: only with --walk or --video")
+        return
     wrong = {
         "--walk, --video: wanted --walk with --pano, or --video alone": is_video == bool(arguments.pano),
         "--walk: found names on stdin, wanted files or folders": is_from_stdin(arguments.pano),
         "--every: only with --video": not is_video and arguments.every is not None,
-        "--times, --max-step: not with --video, which knows its times": is_video
-        and (arguments.times is not None or arguments.max_step is not None),
+        "--times: not with --video, which knows its times": is_video and arguments.times is not None,
+    }
+    wrong |= {
+        f"--{name.replace('_', '-')}: not with a walk": getattr(arguments, name) not in (None, False)
+        for name in NOT_WITH
     }
     for text, is_so in wrong.items():
         if is_so:
             raise UsageError(text)
-    for name in NOT_WITH:
-        if getattr(arguments, name) not in (None, False):
-            raise UsageError(f"--{name.replace('_', '-')}: not with a walk")
 
 
-def motion_of(arguments: argparse.Namespace, has_times: bool) -> Motion:
-    """How the camera is carried."""
-    if has_times and arguments.max_step is not None:
-        raise UsageError("--max-step: found times of the frames, wanted --max-speed")
-    if not has_times and arguments.max_speed is not None:
-        raise UsageError("--max-speed: found no times of the frames, wanted --times or --max-step")
-    for name in ("max_speed", "max_step", "acceleration"):
-        value = getattr(arguments, name)
-        if value is not None and not 0.0 < value < math.inf:
-            raise UsageError(f"--{name.replace('_', '-')}: found {value}, wanted a number above 0")
-    speed = arguments.max_speed or MAX_SPEED if has_times else arguments.max_step or MAX_STEP
-    acceleration = arguments.acceleration or (MAX_ACCELERATION if has_times else NO_ACCELERATION)
-    return Motion(speed, acceleration, has_times, not has_times and arguments.max_step is None)
+def motion_of(max_speed: float | None, has_times: bool) -> Motion:
+    """Return how the camera is carried."""
+    if max_speed is not None and not 0.0 < max_speed < math.inf:
+        raise UsageError(f"--max-speed: found {max_speed}, wanted a number above 0")
+    if has_times:
+        return Motion(max_speed or MAX_SPEED, MAX_ACCELERATION, True, False)
+    return Motion(max_speed or MAX_STEP, NO_ACCELERATION, False, max_speed is None)
 
 
 def every_of(text: str, max_speed: float) -> tuple[float, float]:
-    """Seconds from frame to frame, and the metres below which frames are dropped, of --every."""
+    """Return the seconds from frame to frame, and the metres below which frames are dropped, of --every."""
     found = EVERY.fullmatch(text)
     if not found or not 0.0 < float(found[1]) < math.inf:
         raise UsageError(f"--every: found {text!r}, wanted seconds or metres, such as 0.5s or 1m")
@@ -120,9 +111,9 @@ def walk_inputs(arguments: argparse.Namespace, panoramas: Sequence[Path]) -> Ite
         times = times_of(panoramas, arguments.times)
         numbers = times or [float(k) for k in range(len(panoramas))]
         frames = [WalkInput(p, t, str(p)) for p, t in zip(panoramas, numbers, strict=True)]
-        yield WalkInputs(frames, motion_of(arguments, times is not None), 0.0)
+        yield WalkInputs(frames, motion_of(arguments.max_speed, times is not None), 0.0)
         return
-    motion = motion_of(arguments, True)
+    motion = motion_of(arguments.max_speed, True)
     seconds, metres = every_of(arguments.every or DEFAULT_EVERY, motion.max_speed)
     with temporary_folder() as folder:
         found = frames_of(arguments.video, seconds, folder)
@@ -132,3 +123,156 @@ def walk_inputs(arguments: argparse.Namespace, panoramas: Sequence[Path]) -> Ite
             for f in shown(found, arguments.quiet, **bar)
         ]
         yield WalkInputs(frames, motion, metres)
+
+
+def run_walk(
+    arguments: argparse.Namespace,
+    inputs: WalkInputs,
+    settings: CoarseToFineSettings,
+    read_options: ReadOptions,
+    open_scan: Callable[[], Scan],
+) -> int:
+    """Localize a walk, write its results, return the exit code."""
+    watch = Stopwatch()
+    scan = open_scan()
+    walk = scan.walk(read_options, settings, inputs.motion)
+    key = key_of(walk)
+    if (counts := count_finished(arguments, key, inputs, read_options.rig)) is not None:
+        print_note(arguments, f"{arguments.out}: nothing is left to do")
+        write_plan(arguments.plan, scan, read_results([arguments.out]) if arguments.plan else [])
+        return exit_code_of(counts)
+    with watch.stage("all"):
+        interruption = follow_all(arguments, walk, inputs.frames, json.dumps(key))
+        if interruption.number:
+            kept = "the same command goes on" if kept_in(arguments.out) else "with --out FILE it would go on"
+            text = f"ended by {SIGNALS[interruption.number]} after {len(walk.taken)} frames; {kept}"
+            return print_error(arguments, text, interruption.exit_code)
+        results = keep_spaced(walk.finish(progress_bar(arguments.quiet)), inputs.min_distance)
+    write_all(arguments.out, results)
+    write_plan(arguments.plan, scan, results)
+    counts = Counter(result.status for result in results)
+    if (path := kept_in(arguments.out)) and not counts[FAILED]:
+        path.unlink(missing_ok=True)
+    words = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in counts.items())
+    gaps = sum(result.walk is not None and result.walk.gap is not None for result in results)
+    print_note(arguments, f"{len(results)} frames in {watch.seconds['all']:.0f} s: {words}; {gaps} gaps")
+    return exit_code_of(counts)
+
+
+def check_plan(path: Path) -> None:
+    """Refuse, before any work, a plan that could not be written."""
+    from ..report.plan_file import DXF, SUFFIXES  # noqa: PLC0415  # only walks with a plan wait for it
+
+    check_suffix("--plan", path, SUFFIXES)
+    check_output(path)
+    import_optional("--plan", "ezdxf" if path.suffix.lower() == DXF else "matplotlib", "tools")
+
+
+def write_plan(path: Path | None, scan: Scan, results: Sequence[Result]) -> None:
+    """Draw the path on the scan from above, if asked for."""
+    if path is None or not isinstance(scan.prepared, ScanMap):
+        return
+    from ..report.build import ReportSettings  # noqa: PLC0415  # only walks with a plan wait for it
+    from ..report.entries import entries_of_walk  # noqa: PLC0415
+    from ..report.plan_file import write_plan_file  # noqa: PLC0415
+
+    write_plan_file(entries_of_walk(results), scan.prepared, path, ReportSettings())
+
+
+def key_of(walk: Walk) -> dict[str, Any]:
+    """Return what must be the same where a walk goes on."""
+    digest = walk.tracker.scan_map.scan_sha256 or None
+    settings = json.loads(json.dumps(walk.about.settings))
+    return {"settings": settings, "cloud_sha256": digest, "version": __version__}
+
+
+def kept_in(out: Path | None) -> Path | None:
+    """Return where what was found of each frame is kept until the walk is finished; None for a stream."""
+    return None if out is None or is_stream(out) else out.with_name(f"{out.name}.frames")
+
+
+def follow_all(
+    arguments: argparse.Namespace, walk: Walk, frames: Sequence[WalkInput], key: str
+) -> Interruption:
+    """Follow the frames, and keep what was found of each; say why one can't be read."""
+    path = kept_in(arguments.out)
+    with locked(path) if path else nullcontext() as file, ThreadPoolExecutor(1) as pool:
+        if file is not None:
+            take_up(walk, frames, file, key, arguments.overwrite)
+        bar = {"desc": "frames", "total": len(frames), "initial": len(walk.taken), "unit": ""}
+        left = iter(frames[len(walk.taken) :])
+        # each is prepared while the one before it is followed
+        prepared = InFlight(lambda frame: pool.submit(walk.prepare, frame.path, frame.name), left, 2)
+        with interruptible() as interruption:
+            pairs = shown(prepared, arguments.quiet, **bar)
+            for frame, wait in interruption.each(pairs) if file else pairs:
+                result = walk.follow(wait(), frame.time)
+                if result.error is not None:
+                    print_error(arguments, result.error, EXIT_BAD_INPUT)
+                if file is not None:
+                    file.append(walk.last_to_json())
+        pool.shutdown(cancel_futures=True)
+    return interruption
+
+
+def take_up(walk: Walk, frames: Sequence[WalkInput], file: LineFile, key: str, is_new: bool) -> None:
+    """Restore the frames that an earlier run of the same walk has left, and cut off the rest of the file."""
+    path = file.path
+    size = 0 if is_new else whole_size(path, KEY_BEGINS, f"frames of a walk: {WAYS}")
+    lines = whole_lines(path, size)
+    first = next(lines, b"")
+    if first.strip() not in (b"", key.encode()):
+        raise InputError(f"{path}: of a walk with other settings, another scan or version; {WAYS}")
+    kept = len(first)
+    for frame, line in zip(frames, lines, strict=False):
+        try:
+            is_same = walk.restore(line.decode(), frame.path, frame.time, frame.name)
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{path}: found a damaged line ({type(error).__name__}); {WAYS}") from error
+        if not is_same:
+            break
+        kept += len(line)
+    file.cut(kept)
+    if kept == 0:
+        file.append(key)
+
+
+def keep_spaced(results: Sequence[Result], metres: float) -> list[Result]:
+    """Return the results that lie so far apart, and all that have no pose."""
+    kept: list[Result] = []
+    last = None
+    for result in results:
+        center = result.pose.center_world if result.pose else None
+        if center is not None and last is not None and math.dist(center, last) < metres:
+            continue
+        last = last if center is None else center
+        kept.append(result)
+    return kept
+
+
+def count_finished(
+    arguments: argparse.Namespace, key: dict[str, Any], inputs: WalkInputs, rig: Calibration | None
+) -> Counter[str] | None:
+    """Return the results that an earlier run of this walk has left, by status; None if it is to be done.
+
+    It is if there are none, one has failed, or frames were others. InputError for results of something else.
+    """
+    out = arguments.out
+    if arguments.overwrite or out is None or is_stream(out) or not out.exists() or not out.stat().st_size:
+        return None
+    paths = {frame.name: frame.path for frame in inputs.frames}
+    records = Records(out)
+    records.read(lambda name: key, paths)
+    names = [name for name in paths if name in records.names or not inputs.min_distance]
+    left = list(records.left(names, lambda name: sha256_of(paths[name], rig)))
+    return None if left or not records.is_in_order else records.counts
+
+
+def write_all(out: Path | None, results: Sequence[Result]) -> None:
+    """Write the results, whole or not at all."""
+    text = "".join(f"{result.to_json()}\n" for result in results)
+    if out is None or out == STDOUT:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    else:
+        write_atomically(out, text.encode())

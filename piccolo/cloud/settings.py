@@ -32,7 +32,7 @@ class CloudSettings:
         if self.up not in get_args(UpAxis):
             raise InputError(f"up: found {self.up!r}, wanted one of {', '.join(get_args(UpAxis))}")
         if not (math.isfinite(self.scale) and self.scale > 0.0):
-            raise InputError(f"--scale: found {self.scale}, wanted a number above 0 (metres a unit)")
+            raise InputError(f"--units: found {self.scale}, wanted a number above 0 (metres a unit)")
 
 
 IN_METRES = CloudSettings()

@@ -56,7 +56,7 @@ class PointValidator:
             farthest = max(-float(points.min()), float(points.max()))
             if farthest > MAX_COORDINATE:
                 found = f"a coordinate of {farthest:.3g} m, wanted all within {MAX_COORDINATE:.0e} m"
-                raise InputError(f"{self.path}: {found}; remove broken points or set --units or --scale")
+                raise InputError(f"{self.path}: {found}; remove broken points or set --units")
         return points, colors
 
     def check(self) -> None:

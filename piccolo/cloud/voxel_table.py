@@ -124,14 +124,14 @@ class VoxelTable:
             points, colors = points[num_added:], colors[num_added:]
             if len(points) and self.num_voxels < full:
                 far = f"points more than {MAX_CELL * LEAF_SIZE / 1000:.0f} km apart, wanted one scene"
-                raise InputError(f"{self.label}: {far}; remove broken points or set --units or --scale")
+                raise InputError(f"{self.label}: {far}; remove broken points or set --units")
             if len(points):
                 self._grow()
 
     def _grow(self) -> None:
         if self.num_voxels >= MAX_VOXELS:
             found = f"more than {self.num_voxels} voxels of {LEAF_SIZE} m are filled"
-            raise InputError(f"{self.label}: {found}; if its unit is not the metre, set --units or --scale")
+            raise InputError(f"{self.label}: {found}; if its unit is not the metre, set --units")
         if self.num_voxels == len(self.rows):
             num_more = max(FIRST_ROWS, len(self.rows) // MORE_ROWS)
             self._check_memory(num_more * ROW_BYTES)

@@ -2,7 +2,7 @@
 
 import fcntl
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -116,17 +116,3 @@ def locked(path: Path) -> Iterator[LineFile]:
             return
     with locked(path) as file:  # as it was removed or replaced by whoever had the lock before
         yield file
-
-
-@contextmanager
-def appending(path: Path, size: int | None) -> Iterator[Callable[[str], None]]:
-    """A function that appends a line to the first `size` bytes of a file, its whole lines; None keeps none.
-
-    Raises InputError if another process is writing the file, or has since it was read.
-    """
-    with locked(path) as file:
-        rest = () if size is None else whole_lines(path, file.size, size)
-        if file.size < (size or 0) or any(line.endswith(b"\n") for line in rest):
-            raise InputError(f"{path}: another process has written it since; start again")
-        file.cut(size or 0)
-        yield file.append

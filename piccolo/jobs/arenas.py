@@ -1,4 +1,4 @@
-"""What the threads of a process allocate from. It imports no library, as it is asked before these are."""
+"""Memory arenas of the threads of a process. It imports no library, as it is asked before these are."""
 
 import ctypes
 import os

@@ -9,9 +9,10 @@ import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
-from functools import lru_cache
+from functools import lru_cache, partial
 from multiprocessing import resource_tracker
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -106,10 +107,13 @@ def _local_cluster(distributed: Any, num_processes: int, num_threads: int) -> It
 
 
 class Cluster:
-    """The workers of a scheduler."""
+    """The workers of a scheduler, of which each process opens once what it works with."""
 
     def __init__(self, address: str, client: Any, distributed: Any) -> None:
-        self.address, self._client, self._distributed = address, client, distributed
+        self.address = address
+        self._client = client
+        self._distributed = distributed
+        self._opening = b""  # pickled
         self._sent: list[str] = []  # names of files
 
     def check_workers(self) -> None:
@@ -145,54 +149,36 @@ class Cluster:
                     self._client.unregister_worker_plugin(name)
                 self._client.run(_forget, self._sent)
 
-    def executor(self, opening: Opening) -> "ClusterExecutor":
-        """What works on items by the function that `opening` gives."""
-        return ClusterExecutor(self.address, self._client, self._distributed, opening)
-
-
-def sent_file(name: str) -> Path:
-    """Where a worker has what `Cluster.send_file` has sent it."""
-    worker = import_optional("--dask", "distributed", "distributed").get_worker()
-    return Path(worker.local_directory) / name
-
-
-class ClusterExecutor:
-    """Works on items by a cluster's workers, of which each process opens once what it works with."""
-
-    def __init__(self, address: str, client: Any, distributed: Any, opening: Opening) -> None:
-        self.address, self.client, self.distributed = address, client, distributed
+    def executor(self, opening: Opening) -> "Cluster":
+        """Return what works on items by the function that `opening` gives."""
         self._opening = pickle.dumps(opening)
+        return self
 
     def values(self, items: Iterator[Any]) -> InFlight:
         """Begin with the items."""
-        num_threads = sum(self.client.nthreads().values())
+        num_threads = sum(self._client.nthreads().values())
         return InFlight(self._submit, items, max(LEAST_IN_FLIGHT, IN_FLIGHT * num_threads))
 
-    def _submit(self, item: object) -> "Submitted":
-        return Submitted(self, self.client.submit(value_of, self._opening, item, pure=False))
+    def _submit(self, item: object) -> SimpleNamespace:
+        future = self._client.submit(value_of, self._opening, item, pure=False)
+        return SimpleNamespace(done=future.done, result=partial(self._result_of, future))
 
-
-class Submitted:
-    """The value of an item that a cluster has."""
-
-    def __init__(self, executor: ClusterExecutor, future: Any) -> None:
-        self._executor, self._future = executor, future
-
-    def done(self) -> bool:
-        """True if `result` does not wait."""
-        return bool(self._future.done())
-
-    def result(self) -> Any:
-        """Wait for the value; or for what the function raised, or WorkerLostError, which are raised."""
-        own = self._executor
+    def _result_of(self, future: Any) -> Any:
+        """Wait for a value; or for what the function raised, or WorkerLostError, which are raised."""
         try:
-            return self._future.result()
-        except own.distributed.scheduler.KilledWorker as error:
+            return future.result()
+        except self._distributed.scheduler.KilledWorker as error:
             count = error.allowed_failures + 1
             raise WorkerLostError(f"each of {count} workers of the cluster was lost at work on it") from error
-        except (own.distributed.client.FutureCancelledError, CancelledError) as error:
-            text = f"--dask {own.address}: the scheduler was lost; the same command goes on from here"
+        except (self._distributed.client.FutureCancelledError, CancelledError) as error:
+            text = f"--dask {self.address}: the scheduler was lost; the same command goes on from here"
             raise InputError(text) from error
+
+
+def sent_file(name: str) -> Path:
+    """Return where a worker has what `Cluster.send_file` has sent it."""
+    worker = import_optional("--dask", "distributed", "distributed").get_worker()
+    return Path(worker.local_directory) / name
 
 
 @lru_cache(KEPT_OPEN)
@@ -202,7 +188,7 @@ def _function(opening: bytes) -> Function:
 
 
 def value_of(opening: bytes, item: object) -> Any:
-    """What a worker does with an item."""
+    """Return the value of an item, at a worker."""
     with _opening:  # once, however many threads the worker has
         function = _function(opening)
     return function(item)

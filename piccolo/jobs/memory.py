@@ -1,4 +1,4 @@
-"""How much memory may still be taken, asked before much is: a refusal in one line, not the kernel's kill."""
+"""Memory that may still be taken, asked before much is: a refusal in one line, not the kernel's kill."""
 
 import os
 import resource
@@ -10,7 +10,8 @@ from ..errors import InputError, ResourceError
 
 GB = 1e9
 DEFAULT_FRACTION = 0.8  # of what is free, where the user sets no limit
-PROC, CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
+PROC = Path("/proc")
+CGROUPS = Path("/sys/fs/cgroup")
 V2 = ("", "memory.max", "memory.current", "inactive_file")
 V1 = ("memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
 OPENCV_NO_MEMORY = -4  # `code` of a cv2.error
@@ -91,7 +92,8 @@ def _free_of_cgroups() -> Iterator[float]:
         root, limit, usage, cache = V1 if controllers else V2
         folder = CGROUPS / root / path.lstrip("/")
         while folder.is_relative_to(CGROUPS / root):
-            most, used = _text(folder / limit).strip(), _text(folder / usage).strip()
+            most = _text(folder / limit).strip()
+            used = _text(folder / usage).strip()
             if most.isdigit() and used.isdigit():
                 yield int(most) - int(used) + _number_after(folder / "memory.stat", cache)
             folder = folder.parent

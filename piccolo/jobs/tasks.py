@@ -9,53 +9,35 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 Function = Callable[[Any], Any]  # of an item
 Opening = Callable[[], Function]  # pickled for other processes
+# an item, and what waits for its value; or for what the function raised, or WorkerLostError, and raises it
+Pair = tuple[Any, Callable[[], Any]]
 
 
 class WorkerLostError(Exception):
     """The processes at work on an item were killed, as often as it was tried; the text says how."""
 
 
-# an item, and what waits for its value; or for what the function raised, or WorkerLostError, and raises it
-Pair = tuple[Any, Callable[[], Any]]
-
-
-class Values(Protocol):
-    """Items with what waits for their values, in the items' order."""
-
-    def __iter__(self) -> Iterator[Pair]:
-        """Each, begun as soon as there is an item and room for it."""
-
-    def finished(self) -> Iterator[Pair]:
-        """What is done already of those that come next."""
-
-
-class Executor(Protocol):
-    """Where items are worked on."""
-
-    def values(self, items: Iterator[Any]) -> Values:
-        """Begin with the items."""
-
-
 class Here:
     """Works on one item after another in this process, on each when its value is asked for."""
 
     def __init__(self, function: Function, items: Iterable[Any] = ()) -> None:
-        self.function, self.items = function, items
+        self.function = function
+        self.items = items
 
     def values(self, items: Iterator[Any]) -> "Here":
         """Begin with the items."""
         return Here(self.function, items)
 
     def __iter__(self) -> Iterator[Pair]:
-        """Each, taken when it is asked for."""
+        """Yield each, taken when it is asked for."""
         return ((item, partial(self.function, item)) for item in self.items)
 
     def finished(self) -> Iterator[Pair]:
-        """There are none."""
+        """Yield nothing."""
         return iter(())
 
 
@@ -67,8 +49,10 @@ class InFlight:
     """
 
     def __init__(self, submit: Callable[[Any], Any], items: Iterator[Any], limit: int) -> None:
-        self._submit, self._items = submit, items
-        self._room, self._begun = threading.Semaphore(limit), threading.Semaphore(0)
+        self._submit = submit
+        self._items = items
+        self._room = threading.Semaphore(limit)
+        self._begun = threading.Semaphore(0)
         self._pairs = deque[tuple[Any, Any] | None]()  # an item and its future; None is the end
         threading.Thread(target=self._feed, daemon=True).start()
 
@@ -88,13 +72,13 @@ class InFlight:
         self._begun.release()
 
     def __iter__(self) -> Iterator[Pair]:
-        """Each, begun as soon as there is an item and room for it."""
+        """Yield each, begun as soon as there is an item and room for it."""
         while self._begun.acquire() and (pair := self._pairs.popleft()) is not None:
             yield pair[0], pair[1].result
             self._room.release()
 
     def finished(self) -> Iterator[Pair]:
-        """What is done already of those that come next."""
+        """Yield what is done already of those that come next."""
         while self._pairs and (pair := self._pairs[0]) is not None and pair[1].done():
             self._pairs.popleft()
             yield pair[0], pair[1].result

@@ -175,7 +175,7 @@ def _grid(path: Path, picture: Picture, order: str) -> Faces:
         if width * num_rows == height * num_columns and width % num_columns == 0:
             size = width // num_columns
             return {order[k]: _cell(picture, size, *divmod(k, num_columns)) for k in range(6)}
-    raise InputError(f"{path}: found {width} x {height}, wanted six equal squares as --cube-order says")
+    raise InputError(f"{path}: found {width} x {height}, wanted six equal squares as cube_order says")
 
 
 def _cross(picture: Picture, layout: tuple[str, ...]) -> Faces | None:

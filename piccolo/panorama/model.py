@@ -84,7 +84,7 @@ class ReadOptions:
             raise InputError(f"--mask-nadir: found {self.mask_nadir_deg}, wanted 0 to 90")
         if self.cube_order is not None and sorted(self.cube_order) != sorted(FACE_LETTERS):
             wanted = f"wanted each of the letters {FACE_LETTERS} once (right, left, up, down, front, back)"
-            raise InputError(f"--cube-order: found {self.cube_order}, {wanted}")
+            raise InputError(f"cube_order: found {self.cube_order}, {wanted}")
         if self.projection is not None and self.projection not in get_args(Projection):
             wanted = f"wanted one of {', '.join(get_args(Projection))}"
             raise InputError(f"--projection: found {self.projection!r}, {wanted}")
@@ -113,7 +113,7 @@ class ReadOptions:
         given = {
             "--camera or --rig": self.calibration is not None,
             "--focal": self.focal_px is not None,
-            "--cube-order": self.cube_order is not None,
+            "cube_order": self.cube_order is not None,
             "--fov or --projection": self.fov_deg is not None or self.projection is not None,
         }
         if self.focal_px is not None and self.fov_deg is None and self.projection == "pinhole":

@@ -35,7 +35,7 @@ Shot = tuple[Path, Picture, tuple[Mount, ...]]  # a file with the cameras that t
 AS_STORED = ReadOptions()
 WANTED = (
     "wanted width = 2 x height (a full equirectangular panorama), GPano metadata of a crop, a field of view "
-    "(--fov), a photo's focal length (EXIF, --focal, --camera), or the order of cube faces (--cube-order)"
+    "(--fov), a photo's focal length (EXIF, --focal, --camera), or the order of cube faces (cube_order)"
 )
 MIN_REPORTED = 0.001  # of the sphere: borders below this are masked without a warning
 

@@ -3,14 +3,12 @@
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import TypedDict, Unpack
 
 from ..cloud.settings import METRES, CloudSettings, UpAxis
 from ..errors import InputError
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import ProgressCallback, Workers, no_progress, num_cores, progress_to
-from ..query_options import File, refuse_unknown
-from ..scan import Scan
+from ..scan import File, Scan
 from ..scan_map.open_map import CachePolicy, open_map
 from ..scan_map.scan_map import ScanMap
 from .build import WIDTH, ReportSettings, build_report
@@ -18,29 +16,24 @@ from .entries import read_entries
 from .own_plan import OwnPlan
 
 
-class ReportOptions(TypedDict, total=False):
-    """What `write_report` may be told; all may be left out."""
-
-    title: str  # of the page; by default the scan's name
-    storeys: Sequence[str]  # names, the lowest first
-    images: File  # folder of the photos, where they are no more at the results' paths
-    full_size: bool  # spheres as wide as the photos, in place of 2048 px at most
-    self_contained: bool  # `out` is one HTML file, of at most 50 photos
-    own_plans: Mapping[int, tuple[File, File]]  # by storey, 1 the lowest: an image, CSV of control points
-    crs: str  # the scan's coordinate system, if it does not name it
-    force: bool  # show results of another scan too; the page says so
-    units: str  # of the scan's coordinates, as in `open_scan`; these three only for files
-    up: UpAxis
-    cache: bool | File
-    num_threads: int  # all cores if not given
-    progress: ProgressCallback  # is told (what is done, how many are done, of how many or None)
-
-
-def write_report(
+def write_report(  # noqa: PLR0913  options by name
     results: File | Sequence[File],
     scan: File | Sequence[File] | Scan,
     out: File,
-    **options: Unpack[ReportOptions],
+    *,
+    title: str = "",
+    storeys: Sequence[str] = (),
+    images: File | None = None,
+    full_size: bool = False,
+    self_contained: bool = False,
+    own_plans: Mapping[int, tuple[File, File]] | None = None,
+    crs: str = "",
+    force: bool = False,
+    units: str = "m",
+    up: UpAxis = "auto",
+    cache: bool | File = True,
+    num_threads: int | None = None,
+    progress: ProgressCallback | None = None,
 ) -> Path:
     """Write a page that shows results on plans, and each photo over the scan; returns the page's path.
 
@@ -52,8 +45,24 @@ def write_report(
         Path of the scan, or of a map by tools/prepare_map.py, or several; or a Scan that is open.
     out
         Folder, new, empty or with an earlier report, of which only what has changed is made again.
-    **options
-        See ReportOptions.
+    title
+        Of the page; by default the scan's name.
+    storeys
+        Names, the lowest first.
+    images
+        Folder of the photos, where they are no more at the results' paths.
+    full_size
+        Spheres as wide as the photos, in place of 2048 px at most.
+    self_contained
+        `out` is one HTML file, of at most 50 photos.
+    own_plans
+        By storey, 1 the lowest: an image, and a CSV of control points.
+    crs
+        The scan's coordinate system, if it does not name it.
+    force
+        Show results of another scan too; the page says so.
+    units, up, cache, num_threads, progress
+        As in `open_scan`; the first three only for files.
 
     Raises
     ------
@@ -70,34 +79,28 @@ def write_report(
     >>> piccolo.write_report("one.jsonl", scan, "report", storeys=["Ground floor"])
     PosixPath('report/index.html')
     """
-    refuse_unknown(options, ReportOptions, "write_report")
-    callback = options.get("progress")
-    show = progress_to(callback) if callback else no_progress
-    workers = Workers(options.get("num_threads", num_cores()), show)
-    own_plans = options.get("own_plans", {})
+    show = progress_to(progress) if progress else no_progress
+    workers = Workers(num_cores() if num_threads is None else num_threads, show)
     settings = ReportSettings(
-        title=options.get("title", ""),
-        storey_names=tuple(options.get("storeys", ())),
-        images=Path(options["images"]) if "images" in options else None,
-        width=None if options.get("full_size") else WIDTH,
-        is_self_contained=options.get("self_contained", False),
-        own_plans=tuple(OwnPlan(k, Path(image), Path(csv)) for k, (image, csv) in own_plans.items()),
-        crs=options.get("crs", ""),
-        is_forced=options.get("force", False),
+        title=title,
+        storey_names=tuple(storeys),
+        images=None if images is None else Path(images),
+        width=None if full_size else WIDTH,
+        is_self_contained=self_contained,
+        own_plans=tuple(OwnPlan(k, Path(image), Path(csv)) for k, (image, csv) in (own_plans or {}).items()),
+        crs=crs,
+        is_forced=force,
     )
-    scan_map = scan.prepared if isinstance(scan, Scan) else _map_of(_paths(scan), options, workers)
+    if isinstance(scan, Scan):
+        scan_map = scan.prepared
+    else:
+        if units not in METRES:
+            raise InputError(f"units: found {units!r}, wanted one of {', '.join(METRES)}")
+        policy = CachePolicy(cache is not False, None if isinstance(cache, bool) else Path(cache))
+        scan_map = open_map(_paths(scan), CloudSettings(METRES[units], up), policy, workers, Stopwatch())
     if not isinstance(scan_map, ScanMap):
         raise InputError("write_report: found a scan of the preset paper, wanted one of the default method")
     return build_report(read_entries(_paths(results)), scan_map, Path(out), settings, workers).page
-
-
-def _map_of(paths: Sequence[Path], options: ReportOptions, workers: Workers) -> ScanMap:
-    if (units := options.get("units", "m")) not in METRES:
-        raise InputError(f"units: found {units!r}, wanted one of {', '.join(METRES)}")
-    cache = options.get("cache", True)
-    policy = CachePolicy(cache is not False, None if isinstance(cache, bool) else Path(cache))
-    cloud_settings = CloudSettings(METRES[units], options.get("up", "auto"))
-    return open_map(paths, cloud_settings, policy, workers, Stopwatch())
 
 
 def _paths(files: File | Sequence[File]) -> list[Path]:

@@ -24,8 +24,8 @@ from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.opening import scan_of
 from piccolo.panorama import AS_STORED, read_panorama
 from piccolo.paper.settings import PaperSettings
-from piccolo.query_options import Settings
 from piccolo.result import Result
+from piccolo.scan import Settings
 from piccolo.scenes.scene import Scene, read_scene
 from piccolo.scenes.synthetic.world import (
     VARIANTS,

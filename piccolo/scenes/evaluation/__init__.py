@@ -1,1 +1,1 @@
-"""How good results are: errors of queries, statistics, tables, plots, and runs over whole datasets."""
+"""Quality of results: errors of queries, statistics, tables, plots, and runs over whole datasets."""

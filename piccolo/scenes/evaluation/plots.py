@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MIN_POSITION, MAX_POSITION = 1e-4, 30.0  # of the axis [m]
-MIN_ROTATION_DEG, MAX_ROTATION_DEG = 1e-3, 180.0
+POSITIONS = (1e-4, 30.0)  # of the axis [m]
+ROTATIONS_DEG = (1e-3, 180.0)
 SHOWN_ANGLES_DEG = (1.0, 5.0, 10.0)  # at which recall over distance is drawn
 
 
@@ -48,9 +48,9 @@ def errors_figure(runs: Mapping[str, Sequence[QueryResult]], thresholds: Thresho
     position.axvline(thresholds.max_distance, color="gray", linestyle=":")
     rotation.axvline(float(np.degrees(thresholds.max_angle)), color="gray", linestyle=":")
     recall.axvline(thresholds.max_distance, color="gray", linestyle=":")
-    position.set(xlabel="position error [m]", xlim=(MIN_POSITION, MAX_POSITION))
-    rotation.set(xlabel="rotation error [deg]", xlim=(MIN_ROTATION_DEG, MAX_ROTATION_DEG))
-    recall.set(xlabel="distance [m]", xlim=(MIN_POSITION, MAX_POSITION), title="recall")
+    position.set(xlabel="position error [m]", xlim=POSITIONS)
+    rotation.set(xlabel="rotation error [deg]", xlim=ROTATIONS_DEG)
+    recall.set(xlabel="distance [m]", xlim=POSITIONS, title="recall")
     for axes in (position, rotation, recall):
         axes.set(xscale="log", ylim=(0, 101), ylabel="queries [%]")
         axes.grid(alpha=0.3)
@@ -62,7 +62,8 @@ def risk_figure(points: Sequence[Point]) -> "Figure":
     """The fraction that is wrong over the fraction that is accepted."""
     figure = new_figure(figsize=(6, 4), layout="constrained")
     axes = figure.add_subplot()
-    coverage, risk = [100 * p.coverage for p in points], [100 * p.risk for p in points]
+    coverage = [100 * p.coverage for p in points]
+    risk = [100 * p.risk for p in points]
     axes.step([0.0, *coverage], [risk[0], *risk], where="pre")
     for line in (0.99, 0.9, 0.5):
         inside = [p for p in points if p.confidence >= line]

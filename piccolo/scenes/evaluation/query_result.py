@@ -27,6 +27,10 @@ class Thresholds(NamedTuple):
     max_distance: float = MAX_DISTANCE  # [m]
     max_angle: float = MAX_ANGLE  # [rad]
 
+    def __str__(self) -> str:
+        """In words."""
+        return f"under {self.max_distance:g} m and {np.degrees(self.max_angle):g} deg"
+
 
 PAPER_THRESHOLDS = Thresholds()
 
@@ -75,7 +79,8 @@ class QueryResult:
     def from_json(cls, text: str) -> "QueryResult":
         """Read back what `to_json` wrote; any other text is an InputError."""
         with document_of(text, FORMAT, "evaluation") as row:
-            distance, angle_deg = row["position_error"], row["rotation_error_deg"]
+            distance = row["position_error"]
+            angle_deg = row["rotation_error_deg"]
             words = str(row["scene"]), str(row["image"]), str(row["variant"])
             position_error = np.inf if distance is None else float(distance)
             rotation_error = np.inf if angle_deg is None else float(np.radians(angle_deg))
@@ -103,7 +108,8 @@ def frames_of_video(pairs: Sequence[tuple[Scene, Query]], pano: str) -> list[tup
     found = VIDEO_FRAME.fullmatch(pano)
     if found is None:
         return []
-    walk, time = Path(found[1]).stem, float(found[2])
+    walk = Path(found[1]).stem
+    time = float(found[2])
     return [
         pair
         for pair in pairs
@@ -119,8 +125,8 @@ def match_results(
     The image is found by its path, or else by its file name if only one query has that. A frame of a video,
     FOLDER/WALK.mp4#t=SECONDS, is the query of the walk of that name and time.
 
-    A result of no query, or of a name that several have, is told of and left out. Raises InputError for a
-    second result of a query.
+    A result of no query, or of a name that several have, goes to `tell` and is left out. Raises
+    InputError for a second result of a query.
     """
     pairs = [(scene, query) for scene in scenes for query in scene.queries]
     queries = [(*pair, path) for pair in pairs for path in (pair[1].image, pair[1].labels) if path]

@@ -20,7 +20,7 @@ ALL = "all"
 
 
 class Summary(NamedTuple):
-    """What a table says about some queries."""
+    """Statistics of some queries."""
 
     num_queries: int
     num_correct: int
@@ -108,7 +108,8 @@ def per_query(rows: Sequence[QueryResult]) -> Table:
     columns = "scene", "panorama", "status", "error [m]", "error [deg]", "confidence", "score", "margin"
     cells = []
     for row in rows:
-        result, evidence = row.result, row.result.evidence
+        result = row.result
+        evidence = result.evidence
         score = (f"{evidence.score:.2f}", f"{evidence.margin:.2f}") if evidence else ("-", "-")
         errors = f"{row.position_error:.4f}", f"{np.degrees(row.rotation_error):.3f}"
         loss = "-" if result.loss is None else f"{result.loss:.3f}"
@@ -128,8 +129,7 @@ def groups(rows: Sequence[QueryResult]) -> Iterator[tuple[str, list[QueryResult]
 
 def summary_table(rows: Sequence[QueryResult], thresholds: Thresholds, title: str) -> Table:
     """Quartiles of the errors, accuracy and statuses of every group."""
-    distance, angle_deg = thresholds.max_distance, np.degrees(thresholds.max_angle)
-    words = f"{title}; correct: under {distance:g} m and {angle_deg:g} deg"
+    words = f"{title}; correct: {thresholds}"
     errors = "t 25 % [m]", "t 50 %", "t 75 %", "R 25 % [deg]", "R 50 %", "R 75 %"
     columns = "queries", "number", "correct", "accuracy", *errors, "localized", "wrong of these", "s"
     cells = []
@@ -200,7 +200,8 @@ def changes(pairs: Sequence[Pair], thresholds: Thresholds) -> Table:
     """The queries that one run alone gets right, or whose statuses differ."""
     rows = []
     for first, second in pairs:
-        was, is_now = first.is_correct(thresholds), second.is_correct(thresholds)
+        was = first.is_correct(thresholds)
+        is_now = second.is_correct(thresholds)
         if was != is_now or first.result.status != second.result.status:
             kind = "same error" if was == is_now else "better" if is_now else "worse"
             rows.append((first.scene, printable(first.image), kind, _outcome(first), _outcome(second)))

@@ -1,4 +1,4 @@
-"""How well walks were localized: frames right, sure and refused, and the errors of the path."""
+"""Statistics of walks: frames right, sure and refused, and the errors of the path."""
 
 import itertools
 from collections.abc import Iterable, Sequence
@@ -27,7 +27,7 @@ class Frame(NamedTuple):
 
 
 class WalkSummary(NamedTuple):
-    """What the table says about a walk, or about several."""
+    """Statistics of a walk, or of several."""
 
     num_frames: int
     num_correct: int  # of the frames that have an answer
@@ -124,8 +124,7 @@ def walk_table(walks: dict[tuple[str, str], list[Frame]], thresholds: Thresholds
     }
     if len(summaries) > 1:
         summaries[ALL] = summarize_all(list(summaries.values()))
-    distance, angle_deg = thresholds.max_distance, np.degrees(thresholds.max_angle)
-    title = f"walks; correct: under {distance:g} m and {angle_deg:g} deg; ATE, RPE: RMSE of localized frames"
+    title = f"walks; correct: {thresholds}; ATE, RPE: RMSE of localized frames"
     columns = "walk", "frames", "correct", "localized", "wrong of all", "bad refused"
     errors = "ATE [m]", "RPE [m a frame]", "RPE [deg]", "first localized [s]"
     return Table(title, (*columns, *errors), tuple((name, *_cells(s)) for name, s in summaries.items()))
