@@ -7,7 +7,7 @@ from refusals import assert_refused, read_or_refused
 from test_cloud_las import POINTS_OFFSET, RAW, RECORD_SIZE, assert_read_as_written, patched, read, write
 
 from piccolo.cloud import open_source
-from piccolo.cloud.readers import las_file
+from piccolo.cloud.readers import las
 from piccolo.errors import InputError
 
 
@@ -53,7 +53,7 @@ def test_a_chunk_table_may_be_named_at_the_end_and_fill_no_memory(tmp_path, monk
     (begin,) = struct.unpack_from("<I", content, POINTS_OFFSET)
     assert_read_as_written(write(tmp_path, patched(content, begin, "<q", -1) + content[begin : begin + 8]))
     path = write(tmp_path, laz_bytes(las_bytes(RAW), 600))
-    monkeypatch.setattr(las_file, "MAX_CHUNK_SIZE", 34 * 600 - 1)
+    monkeypatch.setattr(las, "MAX_CHUNK_SIZE", 34 * 600 - 1)
     assert_refused(r"chunk 1 of 600 points in \d+ bytes, wanted 1 to 599 points", open_source, path)
 
 
@@ -64,14 +64,14 @@ def test_layers_larger_than_their_chunk_are_refused(tmp_path, point_format):
     (record_size,) = struct.unpack_from("<H", content, RECORD_SIZE)
     num_layers = {7: 10, 8: 11, 10: 12}[point_format] + 2
     for layer in (0, num_layers - 1):
-        position = begin + las_file.OFFSET_SIZE + record_size + 4 + 4 * layer
+        position = begin + las.OFFSET_SIZE + record_size + 4 + 4 * layer
         with pytest.raises(InputError, match=r"a chunk of 600 points with layers of \d+ bytes, wanted 600"):
             open_source(write(tmp_path, patched(content, position, "<I", 0xFFFFFFFF)))
 
 
 def test_chunks_that_would_fill_the_memory_are_refused(tmp_path, monkeypatch):
     path = write(tmp_path, laz_bytes(las_bytes(RAW), 600))
-    monkeypatch.setattr(las_file, "MAX_CHUNK_SIZE", 34 * 600 - 1)
+    monkeypatch.setattr(las, "MAX_CHUNK_SIZE", 34 * 600 - 1)
     with pytest.raises(InputError, match=r"chunk 1 of 600 points in \d+ bytes, wanted 1 to 599 points"):
         open_source(path)
 

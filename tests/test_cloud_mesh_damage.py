@@ -10,7 +10,7 @@ import pytest
 from refusals import read_or_refused
 
 from piccolo.cloud import open_cloud, read_cloud
-from piccolo.cloud.readers import mesh_gltf
+from piccolo.cloud.readers import mesh_files
 from piccolo.cloud.readers.mesh import open_mesh
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.errors import InputError
@@ -196,7 +196,7 @@ def test_data_that_are_promised_many_times_are_refused(tmp_path, kind):
 
 
 def test_data_that_primitives_share_without_end_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(mesh_gltf, "MAX_ROWS", 9999)
+    monkeypatch.setattr(mesh_files, "MAX_ROWS", 9999)
     gltf = made.Gltf()
     uv = np.tile(made.UV_FROM_ABOVE, (500, 1))
     gltf.node(mesh=gltf.mesh(np.tile(made.SQUARE, (500, 1)), uv, material=gltf.material(made.png())))

@@ -9,8 +9,8 @@ from test_cloud_lzf import compress
 from test_cloud_morton import read, seeded_cloud
 
 from piccolo.cloud import open_source, read_cloud
-from piccolo.cloud.readers import number_lines
 from piccolo.cloud.readers import reader as raw
+from piccolo.cloud.readers import text
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)
@@ -224,7 +224,7 @@ def test_mutated_files_raise_nothing_but_input_error(encoding, data, tmp_path_fa
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_a_file_cut_while_it_is_read_is_refused(tmp_path, monkeypatch, encoding):
     monkeypatch.setattr(raw, "CHUNK", 50)
-    monkeypatch.setattr(number_lines, "BLOCK", 2048)
+    monkeypatch.setattr(text, "BLOCK", 2048)
     path = write(tmp_path / "a.pcd", COLORS["r g b"], encoding)
     source = open_source(path)
     chunks = source.read_chunks()

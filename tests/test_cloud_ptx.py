@@ -8,12 +8,11 @@ from refusals import assert_refused, mutated, read_or_refused
 from test_cloud_morton import read, seeded_cloud
 
 from piccolo.cloud import open_source, read_cloud
-from piccolo.cloud.readers import number_lines
 from piccolo.cloud.readers import reader as raw
-from piccolo.cloud.readers.number_lines import line_blocks
+from piccolo.cloud.readers import text
 from piccolo.cloud.readers.ptx import open_ptx
 from piccolo.cloud.readers.reader import CloudReadOptions
-from piccolo.cloud.readers.text import open_pts
+from piccolo.cloud.readers.text import line_blocks, open_pts
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)
@@ -229,7 +228,7 @@ def test_empty_files_and_scans_that_have_gone_between_two_readings_are_refused(t
 def test_a_file_cut_while_it_is_read_is_refused(tmp_path, monkeypatch, name, gray):
     """At a line's end, where no line is broken, and by all that had not been read yet."""
     monkeypatch.setattr(raw, "CHUNK", 50)
-    monkeypatch.setattr(number_lines, "BLOCK", 4096)
+    monkeypatch.setattr(text, "BLOCK", 4096)
     lines = TWO_SCANS if name == "a.ptx" else ["1200", *pts()]
     if gray:
         fields = [line.split() for line in lines]
@@ -254,7 +253,7 @@ def test_many_small_scans_are_read_once(tmp_path, monkeypatch):
             blocks.append(len(block))
             yield block
 
-    monkeypatch.setattr(number_lines, "line_blocks", counted)
+    monkeypatch.setattr(text, "line_blocks", counted)
     small = [scan(RAW.points_world[k : k + 3], RAW.colors[k : k + 3]) for k in range(0, 1200, 3)]
     path = write(tmp_path / "a.ptx", [line for lines in small for line in lines])
     assert_read_as_written(path)

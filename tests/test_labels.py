@@ -13,10 +13,10 @@ from scipy.spatial.distance import pdist
 from test_cloud_morton import seeded_cloud, whole
 
 from piccolo.cloud import open_cloud, open_source
-from piccolo.cloud.label_colors import NUM_COLORS, Labels, colors_of, palette
 from piccolo.cloud.readers.reader import CloudReadOptions, RawCloud
 from piccolo.cloud.settings import CloudSettings
 from piccolo.errors import InputError
+from piccolo.geometry.colors import NUM_COLORS, Labels, colors_of, palette
 from piccolo.panorama import ReadOptions as PanoramaOptions
 from piccolo.panorama import read_panorama
 

@@ -10,9 +10,9 @@ from rooms import errors, write_room
 
 from piccolo.batch.localizer import Localizer
 from piccolo.cli import localize, prepare_map
-from piccolo.cloud.label_colors import Labels
 from piccolo.cloud.settings import CloudSettings
 from piccolo.errors import InputError
+from piccolo.geometry.colors import Labels
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import ReadOptions
 from piccolo.paper.settings import PaperSettings

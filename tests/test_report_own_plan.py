@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from piccolo.errors import InputError
-from piccolo.report.own_plan import plan_matrix, read_control_points
+from piccolo.report.plan_image import plan_matrix, read_control_points
 
 
 def test_two_control_points_give_a_turn_and_a_scale():

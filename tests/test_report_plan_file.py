@@ -11,9 +11,8 @@ import pytest
 from report_scenes import HOSTILE, House, lifted
 
 from piccolo.cli import report
-from piccolo.report.plan_file import COLORS, DPI
+from piccolo.report.plan_file import COLORS, DPI, color_of, segments_of
 from piccolo.report.plan_image import PIXEL
-from piccolo.report.plan_path import color_of, segments_of
 
 SVG = "{http://www.w3.org/2000/svg}"
 

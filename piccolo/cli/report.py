@@ -11,8 +11,8 @@ from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers, num_cores
 from ..report.build import WIDTH, ReportSettings, build_report
 from ..report.entries import read_entries
-from ..report.own_plan import OwnPlan
 from ..report.plan_file import SUFFIXES, write_plan_file
+from ..report.plan_image import OwnPlan
 from ..report.site import check_folder
 from ..scan_map.open_map import CachePolicy, open_map
 from .command import check_least, command, option, print_warnings

@@ -8,7 +8,7 @@ from typing import Any
 
 from ..errors import InputError
 from ..optional import import_optional
-from .readers import e57_file, las_file
+from .readers import e57_file, las
 
 PROJECTION_USER, WKT_ID, GEO_KEYS_ID = b"LASF_Projection", 2112, 34735  # of LAS's records
 PROJECTED_KEY, GEOGRAPHIC_KEY = 3072, 2048  # GeoTIFF keys whose value is a code of EPSG
@@ -24,7 +24,7 @@ def crs_of(paths: Sequence[Path]) -> str:
     with paths[0].open("rb") as file:
         head = file.read(8)
     text = ""
-    if head.startswith(las_file.MAGIC):
+    if head.startswith(las.MAGIC):
         text = _of_las(paths[0])
     elif head.startswith(e57_file.MAGIC):
         text = e57_file.read_xml(paths[0]).findtext("{*}coordinateMetadata") or ""
@@ -32,10 +32,10 @@ def crs_of(paths: Sequence[Path]) -> str:
 
 
 def _of_las(path: Path) -> str:
-    header = las_file.read_header(path)
+    header = las.read_header(path)
     with path.open("rb") as file:
-        wkt = las_file.record_content(header, file, PROJECTION_USER, WKT_ID)
-        keys = las_file.record_content(header, file, PROJECTION_USER, GEO_KEYS_ID) or b""
+        wkt = las.record_content(header, file, PROJECTION_USER, WKT_ID)
+        keys = las.record_content(header, file, PROJECTION_USER, GEO_KEYS_ID) or b""
     if wkt:
         return wkt.rstrip(b"\0").decode(errors="replace")
     entries = list(struct.iter_unpack("<4H", keys[: len(keys) // 8 * 8]))[1:]

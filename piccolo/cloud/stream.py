@@ -10,15 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..files.digest import sha256_of_arrays
 from ..geometry.pose import Array, rotate_points
 from ..jobs.memory import check_address_space
 from ..jobs.threads import Progress, no_progress
-from .digest import sha256_of_arrays
 from .readers.columns import brightest_of, colored_chunks
 from .readers.reader import CHUNK, PointSource, RawCloud
 from .settings import UpAxis
-from .voxel_table import VoxelTable
-from .voxels import Voxels, morton_order
+from .voxels import Voxels, VoxelTable, morton_order
 
 MIN_POINTS = 1000
 MAX_COORDINATE = 1e8  # [m], ten times the Earth: beyond it lie only broken numbers, and float32 gives way

@@ -14,10 +14,10 @@ from ..camera.resampling import View, shrunk
 from ..camera.rig import extent_of
 from ..errors import InputError
 from .cube import face_pixels
-from .exif import focal_of
 from .gpano import ASPECT_TOLERANCE
 from .masks import black_borders
 from .model import ReadOptions
+from .photo import focal_of
 from .picture import Picture
 
 # By EXIF's orientation: the stored picture's axes from those of the picture as it is shown; and how many

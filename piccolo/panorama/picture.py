@@ -25,9 +25,9 @@ from PIL.PngImagePlugin import PngImageFile
 from PIL.TiffImagePlugin import TiffImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
-from ..cloud.label_colors import Labels, colors_of
 from ..errors import InputError, ResourceError
 from ..files.json_file import read_bytes
+from ..geometry.colors import Labels, colors_of
 from ..jobs.memory import check_memory
 from ..optional import import_optional
 

@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 from ..camera import Calibration, Mount
 from ..camera.resampling import View, sphere_of, sphere_width
 from ..camera.rig import MAX_OFFSET
-from ..cloud.label_colors import Labels
 from ..errors import InputError
+from ..geometry.colors import Labels
 from ..jobs.memory import check_memory
 from .cameras import cameras_of, rig_cameras, views_of
 from .cube import cube_of_cells, face_paths, read_cube_folder
-from .exif import elevation_deg
 from .gpano import (
     ASPECT_TOLERANCE,
     CropRegion,
@@ -29,6 +28,7 @@ from .gpano import (
 )
 from .masks import black_borders, find_mask, is_dual_fisheye, mask_pole, polar_disc, read_mask
 from .model import FocalPrior, GPano, Panorama, ReadOptions
+from .photo import elevation_deg
 from .picture import BYTES_PER_PIXEL, Picture, picture_orientation, picture_size, read_labels, read_picture
 
 Shot = tuple[Path, Picture, tuple[Mount, ...]]  # a file with the cameras that took it

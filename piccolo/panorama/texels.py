@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cloud.soa import pack_rgbx
+from ..geometry.colors import pack_rgbx
 from ..geometry.sphere import direction_to_pixel, solid_angles
 from ..kernels.jit import F1, HALF, inline_kernel
 

@@ -23,11 +23,9 @@ from ..scan_map.scan_map import ScanMap
 from ..views.surfel_renderer import MAX_SURFELS, encode_image
 from ..views.surfels import Surfels, surfels_of
 from .entries import Entry, Place, document_of_entry, names_of, short_names_of
-from .own_plan import OwnPlan, check_own_plans, own_plan
-from .pictures import make_pictures, read_options_of
-from .plan_image import draw_plan
+from .pictures import make_pictures, read_options_of, taken_out
+from .plan_image import OwnPlan, check_own_plans, draw_plan, own_plan
 from .site import begin_folder, check_folder, finish_folder, picture_path, self_contained, write_photo_script
-from .video_frames import taken_out
 
 FORMAT = "piccolo-report/1"
 WIDTH = 2048  # [px] of spheres

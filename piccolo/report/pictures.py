@@ -1,8 +1,15 @@
-"""The pictures of a photo: thumbnail, sphere, the scan from its pose, and what of it contradicts the scan."""
+"""The pictures of a photo: thumbnail, sphere, the scan from its pose, and what of it contradicts the scan.
+
+Photos may be frames of a video, as results of localize.py --video name them: these are taken out.
+"""
 
 import base64
 import json
 import math
+import re
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,14 +19,17 @@ from numpy.typing import NDArray
 
 from ..camera import Calibration
 from ..camera.model import pinhole
-from ..cloud.label_colors import Labels
 from ..cloud.soa import PackedPoints
 from ..confidence.confidence import AMBIGUOUS
 from ..confidence.occlusion import occlusion_mask
+from ..errors import InputError
+from ..files.temporary import temporary_folder
+from ..geometry.colors import Labels
 from ..geometry.pose import Array, Pose
 from ..jobs.threads import Workers
 from ..panorama import Panorama, ReadOptions, read_panorama
 from ..panorama.model import shrink
+from ..panorama.video import frames_at
 from ..result import Result
 from ..views.field import cut
 from ..views.surfel_renderer import encode_image, fill_holes, render_surfels, visible_indices
@@ -34,6 +44,9 @@ LEAST_PROBABILITY, MAX_ALTERNATIVES = 0.02, 3  # of alternatives from which the 
 MAX_WIDTH = 8192  # [px] of a sphere at full size
 GAP = 0.004  # by the width: wider gaps are marked as not scanned
 UNSCANNED = np.array([96, 100, 106], np.float32)
+
+
+FRAME = re.compile(r"(?P<video>.+)#t=(?P<time>\d+\.\d{3})", re.DOTALL)
 
 
 class Pictures(NamedTuple):
@@ -144,3 +157,26 @@ def level(R_cam_from_world: Array) -> Array:
 
 def _base64(content: bytes) -> str:
     return base64.b64encode(content).decode()
+
+
+@contextmanager
+def taken_out(photos: Sequence[Path]) -> Iterator[dict[Path, Path]]:
+    """Files of those photos that are frames of a video, until the end; of others none.
+
+    A video that can't be read has none either: its frames are then photos that are not there.
+    """
+    by_video: dict[Path, dict[int, Path]] = defaultdict(dict)
+    for photo in photos:
+        if found := FRAME.fullmatch(str(photo)):
+            by_video[Path(found["video"])][round(1000.0 * float(found["time"]))] = photo
+    with temporary_folder() as folder:
+        files: dict[Path, Path] = {}
+        for number, (video, frames) in enumerate(by_video.items()):
+            own = folder / str(number)
+            own.mkdir()
+            try:
+                for frame in frames_at(video, [time / 1000.0 for time in frames], own):
+                    files[frames[round(1000.0 * frame.time)]] = frame.path
+            except (OSError, InputError):
+                continue
+        yield files

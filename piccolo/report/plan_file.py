@@ -1,11 +1,13 @@
-"""Camera positions on the plans, for those without a browser: PNG, SVG, PDF, and DXF for CAD."""
+"""Camera positions and paths on the plans, without a browser: PNG, SVG, PDF, and DXF for CAD."""
 
 import io
 import math
 from collections.abc import Iterator, Sequence
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import cv2
 import numpy as np
 
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
@@ -18,7 +20,6 @@ from ..panorama.picture import read_picture
 from ..scan_map.scan_map import ScanMap
 from .build import ReportSettings, Task, check_settings, document_of
 from .entries import Entry, Place
-from .plan_path import LEAST_ON_PATH, color_of, is_numbered, segments_of
 from .site import begin_folder
 
 if TYPE_CHECKING:
@@ -34,6 +35,10 @@ SIZE, FRAME_SIZE, PATH_WIDTH = 12.0, 5.0, 3.5  # [pt] of a mark, and of a walk's
 HEADING, FRAME_HEADING = 0.5, 0.2  # [m] length of the line from a mark
 TEXT_HEIGHT = 0.12  # [m] of the DXF
 BARS = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # [m] of the scale
+
+
+LEAST_ON_PATH = 0.5  # frames that are less likely right are passed over
+EVERY_NUMBER = 20  # of a walk's frames are numbered
 
 
 class Line(NamedTuple):
@@ -225,3 +230,35 @@ def _layer_name(name: str, index: int) -> str:
     """A storey's name as DXF takes it."""
     kept = "".join("_" if letter in '<>/\\":;?*|=`,' else letter for letter in name)
     return f"PHOTOS {index + 1} {kept}"[:200]
+
+
+class Segment(NamedTuple):
+    """From a frame of a walk to the next that is on its path."""
+
+    begin: dict[str, Any]
+    end: dict[str, Any]
+    confidence: float  # the less of both
+    is_gap: bool  # no walking person can have gone there
+
+
+def segments_of(photos: Sequence[dict[str, Any]]) -> Iterator[Segment]:
+    """The paths of the walks among the photos of a plan, from storey to storey not drawn."""
+    frames = sorted((p for p in photos if p["walk"] is not None), key=lambda p: (p["walk"], p["time"]))
+    for _, walk in groupby(frames, key=lambda p: p["walk"]):
+        known = [p for p in walk if p["pose"] and p["confidence"] >= LEAST_ON_PATH]
+        for begin, end in pairwise(known):
+            if begin["storey"] == end["storey"] or None in (begin["storey"], end["storey"]):
+                yield Segment(begin, end, min(begin["confidence"], end["confidence"]), end["gap"])
+
+
+def color_of(confidence: float) -> tuple[int, int, int]:
+    """Red, green, blue: viridis from yellow (0.5) to dark blue (1)."""
+    share = (1.0 - np.clip(confidence, LEAST_ON_PATH, 1.0)) / (1.0 - LEAST_ON_PATH)
+    level = np.array([[round(255 * share)]], np.uint8)
+    blue, green, red = cv2.applyColorMap(level, cv2.COLORMAP_VIRIDIS)[0, 0]
+    return int(red), int(green), int(blue)
+
+
+def is_numbered(number: int, photo: dict[str, Any]) -> bool:
+    """True for a photo that stands alone, and for some of a walk's frames."""
+    return photo["walk"] is None or number % EVERY_NUMBER == 1

@@ -15,7 +15,7 @@ from ..scan_map.open_map import CachePolicy, open_map
 from ..scan_map.scan_map import ScanMap
 from .build import WIDTH, ReportSettings, build_report
 from .entries import read_entries
-from .own_plan import OwnPlan
+from .plan_image import OwnPlan
 
 
 class ReportOptions(TypedDict, total=False):

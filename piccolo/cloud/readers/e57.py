@@ -13,6 +13,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...geometry.pose import Array, Pose, rotate_points
+from .columns import OPTION, intensity_reader
 from .e57_file import (
     MAGIC,
     NAMESPACE,
@@ -28,7 +29,6 @@ from .e57_file import (
     text_of,
 )
 from .reader import CHUNK, PLAIN, CloudFormat, CloudReadOptions, PointSource, RawCloud
-from .scalars import OPTION, intensity_reader
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")

@@ -13,8 +13,17 @@ from typing import Any
 
 from ...errors import InputError
 from ...optional import import_optional
-from .mesh_files import FolderResolver, Texture, check_image, first_line, own_limit, texture_of
-from .mesh_gltf import GLB_MAGIC, Material, sanitize_gltf
+from .mesh_files import (
+    GLB_MAGIC,
+    FolderResolver,
+    Material,
+    Texture,
+    check_image,
+    first_line,
+    own_limit,
+    sanitize_gltf,
+    texture_of,
+)
 
 WANTED = "wanted a mesh with textures, vertex colours or materials"
 # faces whose indices count back from the last vertex, or are 0; trimesh would take wrong vertices

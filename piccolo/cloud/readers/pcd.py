@@ -19,6 +19,7 @@ from ...kernels.jit import inline_kernel, kernel
 from .columns import (
     ColumnReader,
     Columns,
+    check_option,
     color_names,
     column_source,
     in_chunks,
@@ -26,9 +27,8 @@ from .columns import (
     read_records,
     take_records,
 )
-from .number_lines import LineLayout, NumberLines
 from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, RawCloud, point_label, quoted
-from .scalars import check_option
+from .text import LineLayout, NumberLines
 
 MAX_HEADER_SIZE = MAX_ROW_SIZE = 1 << 16  # [byte]; a row is a point
 MAX_COUNT_DIGITS = 10

@@ -15,11 +15,19 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from ...errors import InputError
-from .columns import COLOR_NAMES, Columns, color_names, column_source, read_records
+from .columns import (
+    COLOR_NAMES,
+    INTENSITY_NAMES,
+    LABEL_NAMES,
+    Columns,
+    check_option,
+    color_names,
+    column_source,
+    read_records,
+)
 from .mesh import open_ply_mesh
-from .number_lines import LineLayout, NumberLines
 from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, quoted
-from .scalars import INTENSITY_NAMES, LABEL_NAMES, check_option
+from .text import LineLayout, NumberLines
 
 MAGIC = (b"ply\n", b"ply\r")
 MAX_HEADER_SIZE = 1 << 20  # [byte]

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.pose import transform_points
-from .number_lines import NUM_WITH_INTENSITY, LineLayout, NumberLines
+from .columns import check_option, intensity_reader
 from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, RawCloud, quoted
-from .scalars import check_option, intensity_reader
+from .text import NUM_WITH_INTENSITY, LineLayout, NumberLines
 
 NUMBERS_A_LINE = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
 MAX_COUNT_DIGITS = 9

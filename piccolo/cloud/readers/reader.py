@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..label_colors import Labels
+from ...geometry.colors import Labels
 from ..settings import UpAxis
 
 HEAD_SIZE = 512  # [byte] by which a format is known
