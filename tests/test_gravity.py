@@ -8,8 +8,7 @@ from scans import bare_room
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.stream import Cloud
 from piccolo.geometry.pose import exp_so3
-from piccolo.gravity.alignment import find_up
-from piccolo.gravity.sense import find_levels, furniture_cue, passage_cue
+from piccolo.gravity.alignment import find_levels, find_up, furniture_cue, passage_cue
 
 Z = np.array([0.0, 0.0, 1.0])
 TURNS = [np.array(w) for w in ([0.3, -0.2, 0.9], [1.4, 0.6, -0.3], [2.9, -0.5, 0.4])]

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from piccolo.geometry.pose import exp_so3, rotation_to_z, yaw_rotation
-from piccolo.gravity.alignment import level, wall_yaw
-from piccolo.gravity.planes import Planes, estimate_normals, ransac_planes
+from piccolo.gravity.alignment import Planes, estimate_normals, level, ransac_planes, wall_yaw
 
 TURN = exp_so3(np.array([0.7, -1.9, 0.5]))
 UP = TURN[:, 2]
