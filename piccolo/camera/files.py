@@ -154,7 +154,8 @@ def _of_opensfm(entry: Mapping[str, Any]) -> Camera:
     larger = float(max(width, height))
     focal = float(entry["focal"]) if "focal" in entry else float(entry["focal_x"])
     focals = [focal, float(entry.get("focal_y", focal))][: 2 if "OPENCV" in model else 1]
-    c_x, c_y = float(entry.get("c_x", 0.0)), float(entry.get("c_y", 0.0))
+    c_x = float(entry.get("c_x", 0.0))
+    c_y = float(entry.get("c_y", 0.0))
     center = width / 2.0 + larger * c_x, height / 2.0 + larger * c_y
     more = [0.0 if name == "-" else float(entry.get(name, 0.0)) for name in names.split()]
     return Camera(model, width, height, (*(larger * f for f in focals), *center, *more))

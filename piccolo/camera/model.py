@@ -60,7 +60,8 @@ class Distortion(NamedTuple):
 
     def radial(self, r2: Array) -> tuple[Array, Array]:
         """Values g and dg/dr2 at r2, of any shape."""
-        n, d = self.numerator, self.denominator
+        n = self.numerator
+        d = self.denominator
         below = d(r2)
         below = np.where(np.abs(below) < LEAST, LEAST, below)  # 0 at the limit itself
         value = n(r2) / below
@@ -68,7 +69,9 @@ class Distortion(NamedTuple):
 
     def max_radius(self) -> float:
         """Radius up to which r g(r^2) grows, infinite if it always does: beyond, a pixel is two rays."""
-        n, d, r2 = self.numerator, self.denominator, Polynomial([0.0, 1.0])
+        n = self.numerator
+        d = self.denominator
+        r2 = Polynomial([0.0, 1.0])
         slope = n * d + 2.0 * r2 * (n.deriv() * d - n * d.deriv())
         roots = np.concatenate([slope.trim(NO_MORE).roots(), d.trim(NO_MORE).roots()])
         real = roots[np.abs(roots.imag) < 1e-9 * (1.0 + np.abs(roots))].real
@@ -76,7 +79,8 @@ class Distortion(NamedTuple):
 
     def apply(self, x: Array, y: Array) -> tuple[Array, Array]:
         """The distorted (x', y') of (x, y), arrays of one shape."""
-        r2, xy = x * x + y * y, 2.0 * x * y
+        r2 = x * x + y * y
+        xy = 2.0 * x * y
         g, _ = self.radial(r2)
         return (
             x * g + self.p1 * xy + self.p2 * (r2 + 2.0 * x * x) + self.sx1 * r2,
@@ -108,7 +112,8 @@ class Distortion(NamedTuple):
         """
         length = np.hypot(x_distorted, y_distorted)
         begin = np.interp(length, radii * self.radial(radii**2)[0], radii) / np.maximum(length, 1e-300)
-        x, y = x_distorted * begin, y_distorted * begin
+        x = x_distorted * begin
+        y = y_distorted * begin
         for _ in range(MAX_STEPS):
             found_x, found_y = self.apply(x, y)
             off_x, off_y = found_x - x_distorted, found_y - y_distorted
@@ -117,15 +122,20 @@ class Distortion(NamedTuple):
             a, b, c, d = self.jacobian(x, y)
             determinant = a * d - b * c
             per = 1.0 / np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
-            x, y = x - (d * off_x - b * off_y) * per, y - (a * off_y - c * off_x) * per
+            x = x - (d * off_x - b * off_y) * per
+            y = y - (a * off_y - c * off_x) * per
             shrink = np.minimum(1.0, radii[-1] / np.maximum(np.hypot(x, y), 1e-300))
-            x, y = x * shrink, y * shrink
+            x = x * shrink
+            y = y * shrink
         found_x, found_y = self.apply(x, y)
         is_found = np.hypot(found_x - x_distorted, found_y - y_distorted) < 1e3 * CONVERGED
         return x, y, is_found & self.keeps_sides(x, y)
 
 
-PERSPECTIVE, EQUIDISTANT, FOV, SPHERE = "perspective", "equidistant", "fov", "sphere"
+PERSPECTIVE = "perspective"
+EQUIDISTANT = "equidistant"
+FOV = "fov"
+SPHERE = "sphere"
 # lens, and names of the parameters as the formulas here have them
 MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     model: (lens, tuple(names.split()))
@@ -224,7 +234,8 @@ class Camera:
         """The same camera with its picture at another size; InputError if that has another shape."""
         if (width, height) == (self.width, self.height):
             return self
-        across, down = width / self.width, height / self.height
+        across = width / self.width
+        down = height / self.height
         if abs(across / down - 1.0) > max(MAX_ASPECT_ERROR, 1.5 / min(width, height)):
             found = f"found a picture of {width} x {height}"
             raise InputError(f"{found} and a calibration for {self.width} x {self.height}, wanted one shape")
@@ -242,7 +253,9 @@ class Camera:
 
         Pixels of rays that are not in the picture mean nothing.
         """
-        forward, right, down = rays[..., 0], -rays[..., 1], -rays[..., 2]
+        forward = rays[..., 0]
+        right = -rays[..., 1]
+        down = -rays[..., 2]
         across = np.sqrt(right * right + down * down)
         if self.lens == SPHERE:
             u = self.width * (0.5 + np.arctan2(right, forward) / (2.0 * math.pi))
@@ -255,11 +268,13 @@ class Camera:
             angle = np.arctan2(across, forward)
             is_in = angle <= self.max_angle
             per = np.where(is_in, self._radius(np.where(is_in, angle, 0.0)), 0.0) / np.maximum(across, 1e-300)
-        x, y = right * per, down * per
+        x = right * per
+        y = down * per
         if self.distortion != Distortion():
             is_in = is_in & self.distortion.keeps_sides(x, y)
             x, y = self.distortion.apply(x, y)
-        u, v = self.focal[0] * x + self._named["cx"], self.focal[1] * y + self._named["cy"]
+        u = self.focal[0] * x + self._named["cx"]
+        v = self.focal[1] * y + self._named["cy"]
         is_in = is_in & (u >= 0.0) & (u <= self.width) & (v >= 0.0) & (v <= self.height)
         return np.stack([u, v], axis=-1), is_in
 
@@ -267,11 +282,13 @@ class Camera:
         """Unit rays (..., 3) of pixels (..., 2), and which of them there are (...)."""
         u, v = np.moveaxis(np.asarray(pixels, np.float64), -1, 0)
         if self.lens == SPHERE:
-            azimuth, elevation = (u / self.width - 0.5) * 2.0 * math.pi, (v / self.height - 0.5) * math.pi
+            azimuth = (u / self.width - 0.5) * 2.0 * math.pi
+            elevation = (v / self.height - 0.5) * math.pi
             c = np.cos(elevation)
             ray = np.stack([c * np.cos(azimuth), -c * np.sin(azimuth), -np.sin(elevation)], axis=-1)
             return ray, np.ones(u.shape, np.bool_)
-        x, y = (u - self._named["cx"]) / self.focal[0], (v - self._named["cy"]) / self.focal[1]
+        x = (u - self._named["cx"]) / self.focal[0]
+        y = (v - self._named["cy"]) / self.focal[1]
         x, y, is_found = self.distortion.invert(x, y, self._radii)
         radius = np.hypot(x, y)
         angle = self._angle(radius)

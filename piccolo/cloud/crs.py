@@ -10,8 +10,11 @@ from ..errors import InputError
 from ..optional import import_optional
 from .readers import e57_file, las
 
-PROJECTION_USER, WKT_ID, GEO_KEYS_ID = b"LASF_Projection", 2112, 34735  # of LAS's records
-PROJECTED_KEY, GEOGRAPHIC_KEY = 3072, 2048  # GeoTIFF keys whose value is a code of EPSG
+PROJECTION_USER = b"LASF_Projection"  # of LAS's records
+WKT_ID = 2112
+GEO_KEYS_ID = 34735
+PROJECTED_KEY = 3072  # GeoTIFF keys whose value is a code of EPSG
+GEOGRAPHIC_KEY = 2048
 USER_DEFINED = 32767
 MAX_LENGTH = 20_000  # characters of a system's description; what is longer is left aside
 

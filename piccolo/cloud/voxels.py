@@ -34,11 +34,17 @@ MAX_COUNT = 1 << 23  # points of a voxel that are summed, at most: int32 holds n
 MAX_CELL = 1 << 31  # cells from the first point to any other, below this: 43,000 km
 
 # columns of a voxel's row: cell, number of points, sums of quanta, sums of colours
-CELL, COUNT, POSITION, COLOR, NUM_COLUMNS = 0, 3, 4, 7, 10
-FIRST_ROWS, MORE_ROWS = 1 << 15, 8  # an eighth more at a time
+CELL = 0
+COUNT = 3
+POSITION = 4
+COLOR = 7
+NUM_COLUMNS = 10
+FIRST_ROWS = 1 << 15
+MORE_ROWS = 8  # an eighth more at a time
 MAX_VOXELS = 80_000_000  # 20,000 m^2 or more
 MAX_LOAD = 0.6  # share of the index in use
-ROW_BYTES, SLOT_BYTES = 4 * NUM_COLUMNS, 4
+ROW_BYTES = 4 * NUM_COLUMNS
+SLOT_BYTES = 4
 SORTED_BYTES = 3 * 8 + 6 * 4  # a voxel: codes, order, codes in order, nodes
 
 
@@ -165,7 +171,9 @@ def add_points(points, colors, base, index, rows, num_voxels):
         if index[slot] == 0:
             row = rows[num_voxels]
             row[:] = 0
-            row[CELL], row[CELL + 1], row[CELL + 2] = x, y, z
+            row[CELL] = x
+            row[CELL + 1] = y
+            row[CELL + 2] = z
             num_voxels += 1
             index[slot] = num_voxels
         row = rows[index[slot] - 1]
@@ -200,14 +208,16 @@ class VoxelTable:
 
     def add(self, points: NDArray[np.float64], colors: NDArray[np.uint8]) -> None:
         """Add finite points (N, 3) [m], in the map's axes, with colours (N, 3)."""
-        points, colors = np.ascontiguousarray(points), np.ascontiguousarray(colors)  # one kernel for all
+        points = np.ascontiguousarray(points)  # one kernel for all
+        colors = np.ascontiguousarray(colors)
         if self.num_voxels == 0 and len(points):
             self.base = np.floor(points[0] / LEAF_SIZE).astype(np.int64)
         while len(points):
             full = min(len(self.rows), int(MAX_LOAD * len(self.index)), MAX_VOXELS)
             added = add_points(points, colors, self.base, self.index, self.rows[:full], self.num_voxels)
             num_added, self.num_voxels = added
-            points, colors = points[num_added:], colors[num_added:]
+            points = points[num_added:]
+            colors = colors[num_added:]
             if len(points) and self.num_voxels < full:
                 far = f"points more than {MAX_CELL * LEAF_SIZE / 1000:.0f} km apart, wanted one scene"
                 raise InputError(f"{self.label}: {far}; remove broken points or set --units or --scale")
@@ -235,9 +245,11 @@ class VoxelTable:
 
     def finish(self) -> Voxels:
         """The means; those too far from the rest for a Morton code are left out. The table is spent."""
-        num, self.index = self.num_voxels, np.zeros(0, np.int32)
+        num = self.num_voxels
+        self.index = np.zeros(0, np.int32)
         check_memory(num * SORTED_BYTES, f"{self.label}: sorting {num} voxels of 2 cm", THIN)
-        rows, self.rows = self.rows[:num], np.empty((0, NUM_COLUMNS), np.int32)
+        rows = self.rows[:num]
+        self.rows = np.empty((0, NUM_COLUMNS), np.int32)
         rows, warnings = self._without_far(rows)
         cells = [rows[:, k] for k in range(COUNT)]
         low = np.array([column.min() for column in cells]) + self.base

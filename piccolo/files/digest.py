@@ -22,7 +22,8 @@ NAME = own_names("fact")
 MAX_SIZE = 200  # [byte] of a fact
 
 
-DIGEST, TICK_NS = "sha256", 50_000_000  # the clock of files moves on every 1 to 10 ms
+DIGEST = "sha256"
+TICK_NS = 50_000_000  # the clock of files moves on every 1 to 10 ms
 
 
 def key_of(what: str, status: os.stat_result) -> str:

@@ -77,7 +77,8 @@ def ransac_planes(cloud: PointNormals) -> Planes:
         drawn = rng.choice(left, NUM_HYPOTHESES)
         scoring = rng.choice(left, NUM_SCORING_POINTS)
         votes = _are_inliers(cloud, scoring, cloud.normals[drawn], cloud.points[drawn]).sum(axis=1)
-        normal, center = cloud.normals[drawn[votes.argmax()]], cloud.points[drawn[votes.argmax()]]
+        normal = cloud.normals[drawn[votes.argmax()]]
+        center = cloud.points[drawn[votes.argmax()]]
         for _ in range(NUM_REFITS):
             is_inlier = _are_inliers(cloud, left, normal[None], center[None])[0]
             inliers = cloud.points[left[is_inlier]]
@@ -123,10 +124,12 @@ CELL = 0.25  # of the grid in which people walk [m]
 MAX_CELLS = 4e6  # of a grid: of wider scans the cells are larger
 REACH = 2  # cells between the points of a floor, or between free space and the next thing over a floor
 MIN_PIECE = 8  # cells of free space in one piece
-FEW_POINTS, FEW_CELLS = 0.001, 20.0  # added to both counts of a ratio, so that a handful says little
+FEW_POINTS = 0.001  # added to both counts of a ratio, so that a handful says little
+FEW_CELLS = 20.0  # as well
 PLAIN = 1.0  # sum of both cues from which on they decide: a ratio of e
 LEAST = -0.5  # of the lesser cue, below which they disagree
-HIGH, LEAST_IN_HIGH = 4.0, 0.3  # a storey from which on [m] trusses look like tables: both cues must agree
+HIGH = 4.0  # a storey from which on [m] trusses look like tables
+LEAST_IN_HIGH = 0.3  # there both cues must agree
 
 
 class Alignment(NamedTuple):
@@ -156,11 +159,14 @@ def find_alignment(
     elif up:
         named = R_z_from_axis(up, cloud.up)[2]
         if up == "auto" and said is not None and said @ named < np.cos(MAX_LEAN):
-            said, reason = None, f"the floors do not face {cloud.up}, by their {reason}"
+            said = None
+            reason = f"the floors do not face {cloud.up}, by their {reason}"
         else:
-            said, reason = named, "up is the named axis"
+            said = named
+            reason = "up is the named axis"
     elif len(scanners) and dot(scanners, scanners[0]).min() > np.cos(MAX_LEAN):
-        said, reason = scanners[0], "the scanners stood upright"
+        said = scanners[0]
+        reason = "the scanners stood upright"
     up_scan = None if said is None else level(planes, said)
     R = np.eye(3) if up_scan is None else rotation_to_z(up_scan)
     yaw = wall_yaw(planes, R) if along_walls else None

@@ -33,7 +33,8 @@ DEGREE_PARTS = 1.0, 60.0, 3600.0  # degrees, minutes, seconds
 FILM_DIAGONAL = math.hypot(36.0, 24.0)  # [mm]
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of FocalPlaneResolutionUnit; 2 where it is missing
 MIN_FILM, MAX_FILM = 8.0, 800.0  # [mm] what is wider is no photo by a plain lens
-BREATHING, ZOOMING = 0.01, 0.03  # of a focal length: what focusing changes, and what a zoom rounds
+BREATHING = 0.01  # of a focal length: what focusing changes
+ZOOMING = 0.03  # what a zoom rounds
 MAX_DISAGREEMENT = 0.25  # of the two: one of them is of the picture before it was cropped
 CAMERA_ELEVATION = 0x9405  # CameraElevationAngle of EXIF 2.31 [deg]
 
@@ -89,9 +90,11 @@ def photo_of(path: Path, rig: Calibration | None = None) -> Photo:
             if chunk := _exif_chunk(content):
                 image.info["exif"] = chunk
             own = Image.Image.getexif(image)  # that of PngImageFile decodes the picture to find the chunk
-            exif, gps = own.get_ifd(IFD.Exif), own.get_ifd(IFD.GPSInfo)
+            exif = own.get_ifd(IFD.Exif)
+            gps = own.get_ifd(IFD.GPSInfo)
         except Exception:  # Pillow raises whatever damaged metadata bring
-            exif, gps = {}, {}
+            exif = {}
+            gps = {}
         return Photo(_digest(files), image.size, _capture_time(exif), _gps_position(gps))
 
 
@@ -180,7 +183,8 @@ def _is_zoom(exif: Mapping[int, object]) -> bool:
 
 def _focal_by_plane(exif: Mapping[int, object], size: tuple[int, int]) -> float | None:
     """Focal length [px] by the pixels of the sensor, of which the picture may be a smaller copy."""
-    focal, per_unit = _number(exif, Base.FocalLength), _number(exif, Base.FocalPlaneXResolution)
+    focal = _number(exif, Base.FocalLength)
+    per_unit = _number(exif, Base.FocalPlaneXResolution)
     unit = MM_PER_UNIT.get(int(_number(exif, Base.FocalPlaneResolutionUnit) or 2))
     if not (focal and per_unit and unit):
         return None

@@ -34,14 +34,17 @@ class Projected(NamedTuple):
 @inline_kernel
 def make_projected():
     """Room for a chunk."""
-    f, i = np.empty((5, CHUNK), np.float32), np.empty((5, CHUNK), np.int32)
+    f = np.empty((5, CHUNK), np.float32)
+    i = np.empty((5, CHUNK), np.int32)
     return Projected(f[0], f[1], f[2], f[3], f[4], i[0], i[1], i[2], i[3], i[4])
 
 
 @inline_kernel
 def pose_float32(R_cam_from_world, center_world):
     """A pose's rotation (3, 3), row by row, and centre (3,), as twelve float32 that registers hold."""
-    f, R, t = np.float32, R_cam_from_world, center_world
+    f = np.float32
+    R = R_cam_from_world
+    t = center_world
     return (
         f(R[0, 0]), f(R[0, 1]), f(R[0, 2]), f(R[1, 0]), f(R[1, 1]), f(R[1, 2]),
         f(R[2, 0]), f(R[2, 1]), f(R[2, 2]), f(t[0]), f(t[1]), f(t[2]),
@@ -63,18 +66,27 @@ def in_camera(x, y, z, pose):
 @inline_kernel
 def project(X, Y, Z, R_cam_from_world, center_world, width, projected):
     """Write the camera coordinates, and the texels in an image of `width`, of at most CHUNK points (n,)."""
-    p, pose = projected, pose_float32(R_cam_from_world, center_world)
+    p = projected
+    pose = pose_float32(R_cam_from_world, center_world)
     for n in range(len(X)):
         x, y, z = in_camera(X[n], Y[n], Z[n], pose)
         p.index[n], p.fu[n], p.fv[n] = texel_at(x, y, z, math.sqrt(x * x + y * y), width)
-        p.x[n], p.y[n], p.z[n] = x, y, z
+        p.x[n] = x
+        p.y[n] = y
+        p.z[n] = z
 
 
 @inline_kernel
 def gather(texels, width, projected, count):
     """Write the four texels around each of `count` projected points."""
-    p, stride = projected, np.int32(width + 2)
-    right, below, below_right = texels[1:], texels[stride:], texels[stride + 1 :]
+    p = projected
+    stride = np.int32(width + 2)
+    right = texels[1:]
+    below = texels[stride:]
+    below_right = texels[stride + 1 :]
     for n in range(count):
         k = np.uintp(p.index[n])  # an unsigned index needs no test for being negative
-        p.t00[n], p.t10[n], p.t01[n], p.t11[n] = texels[k], right[k], below[k], below_right[k]
+        p.t00[n] = texels[k]
+        p.t10[n] = right[k]
+        p.t01[n] = below[k]
+        p.t11[n] = below_right[k]

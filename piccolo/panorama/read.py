@@ -82,7 +82,8 @@ def panorama_of(path: Path, picture: Picture, options: ReadOptions) -> Panorama:
 
 def panorama_of_array(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], options: ReadOptions) -> Panorama:
     """The panorama of an image (H, W, 3) of a camera that the options name, or else of a full sphere."""
-    path, picture = Path("array"), Picture(rgb, is_valid)
+    path = Path("array")
+    picture = Picture(rgb, is_valid)
     cameras = cameras_of(path, picture, options, has_gpano=True)
     if cameras.mounts:
         return _on_sphere(path, [(path, picture, cameras.mounts)], options, None, cameras.deviation)
@@ -192,7 +193,8 @@ def _embedded_and_masked(
     path: Path, picture: Picture, region: CropRegion, options: ReadOptions, gpano: GPano | None
 ) -> Panorama:
     """The picture at its place in the sphere, with everything masked that is not to be counted."""
-    size, notes = full_size(path, region, picture.size), [*picture.warnings]
+    size = full_size(path, region, picture.size)
+    notes = [*picture.warnings]
     masks = _user_masks(path, [size, picture.size], options, notes)
     is_valid = picture.is_valid & masks[1] if 1 in masks else picture.is_valid
     borders = black_borders(picture.rgb, is_valid, region.is_full)

@@ -46,7 +46,8 @@ def texel_at(x, y, z, rho, width):
     """
     u, v = direction_to_pixel(x, y, z, rho, np.float32(width))
     u, v = u + HALF, v + HALF
-    j, i = np.int32(u), np.int32(v)
+    j = np.int32(u)
+    i = np.int32(v)
     return np.int32(i * np.int32(width + 2) + j), u - np.float32(j), v - np.float32(i)
 
 

@@ -40,7 +40,8 @@ def frames_of(video: Path, every: float, folder: Path) -> Iterator[VideoFrame]:
         while time > (slot + NEIGHBORHOOD) * every:
             if best is not None:
                 yield _written(video, folder, best)
-            best, slot = None, slot + 1
+            best = None
+            slot = slot + 1
         if time >= (slot - NEIGHBORHOOD) * every:
             rgb = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
             sharpness = sharpness_of(rgb)

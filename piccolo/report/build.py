@@ -197,12 +197,14 @@ def storey_documents(
     origin = float((m.R_map_from_world @ m.origin_world)[2])
     storey, height = place.storeys.at(m.centers)
     if not place.storeys.storeys:
-        storey, height = np.zeros(len(m.centers), np.int64), np.full(len(m.centers), CAMERA_HEIGHT)
+        storey = np.zeros(len(m.centers), np.int64)
+        height = np.full(len(m.centers), CAMERA_HEIGHT)
     own = {plan.storey - 1: plan for plan in settings.own_plans}
     for k in range(max(len(place.storeys.storeys), 1)):
         name = settings.storey_names[k] if settings.storey_names else f"Storey {k + 1}"
         is_here = storey == k
-        places, floors = m.centers[is_here], m.centers[is_here, 2] - height[is_here]
+        places = m.centers[is_here]
+        floors = m.centers[is_here, 2] - height[is_here]
         floor = place.storeys.storeys[k].floor if place.storeys.storeys else float(np.median([*floors, 0.0]))
         plan = write_own_plan(own[k], m, folder) if k in own else write_plan(m, places, floors, folder)
         yield {"name": name, "floor": floor, "level": round(origin + floor, 3), "plan": plan}

@@ -83,7 +83,8 @@ def names_of(entries: Sequence[Entry]) -> list[str]:
     shared = 0
     while all(len(f) > shared and f[shared] == folders[0][shared] for f in folders):
         shared += 1
-    names, counts = [], Counter[str]()
+    names = []
+    counts = Counter[str]()
     for path in paths:
         name = printable("/".join(path.parts[shared:]))
         counts[name] += 1
@@ -135,7 +136,8 @@ def found_document(result: Result, best_pose: Pose, place: Place) -> dict[str, A
         }
         for other, storey in zip(result.alternatives, storeys[1:], strict=True)
     ]
-    evidence, covariance = result.evidence, result.covariance
+    evidence = result.evidence
+    covariance = result.covariance
     R_map_from_world = place.scan_map.R_map_from_world
     return {
         **pose_document(best_pose, place),

@@ -36,11 +36,16 @@ from ..views.surfel_renderer import encode_image, fill_holes, render_surfels, vi
 from ..views.surfels import Surfels
 from ..views.zbuffer import View
 
-QUALITY, THUMB_QUALITY = 80, 78  # of JPEG
-THUMB_SIZE, THUMB_FOV_DEG = (256, 160), 100.0
-MASK_WIDTH, SCAN_WIDTH, ALTERNATIVE_WIDTH = 1024, 1536, 1024  # [px] a voxel of the map is wider than a pixel
+QUALITY = 80  # of JPEG
+THUMB_QUALITY = 78
+THUMB_SIZE = (256, 160)
+THUMB_FOV_DEG = 100.0
+MASK_WIDTH = 1024  # [px]
+SCAN_WIDTH = 1536  # [px] a voxel of the map is wider than a pixel
+ALTERNATIVE_WIDTH = 1024  # [px]
 REACH_SIZE = (96, 48)  # [px]
-LEAST_PROBABILITY, MAX_ALTERNATIVES = 0.02, 3  # of alternatives from which the scan is drawn
+LEAST_PROBABILITY = 0.02  # of alternatives from which the scan is drawn
+MAX_ALTERNATIVES = 3
 MAX_WIDTH = 8192  # [px] of a sphere at full size
 GAP = 0.004  # by the width: wider gaps are marked as not scanned
 UNSCANNED = np.array([96, 100, 106], np.float32)

@@ -30,9 +30,13 @@ SUFFIXES = (".png", ".svg", ".pdf", DXF)
 COLORS = {LOCALIZED: (8, 120, 76), AMBIGUOUS: (166, 83, 0), NOT_LOCALIZED: (193, 37, 45)}
 MARKERS = {LOCALIZED: "o", AMBIGUOUS: "D", NOT_LOCALIZED: "^"}  # so that not the colour alone tells
 INK = (20, 32, 46)
-DPI, MARGIN = 100, 0.5  # a pixel of a plan is one of the PNG; [inch] around a plan
-SIZE, FRAME_SIZE, PATH_WIDTH = 12.0, 5.0, 3.5  # [pt] of a mark, and of a walk's frame and path
-HEADING, FRAME_HEADING = 0.5, 0.2  # [m] length of the line from a mark
+DPI = 100  # a pixel of a plan is one of the PNG
+MARGIN = 0.5  # [inch] around a plan
+SIZE = 12.0  # [pt] of a mark
+FRAME_SIZE = 5.0  # [pt] of that of a walk's frame
+PATH_WIDTH = 3.5  # [pt]
+HEADING = 0.5  # [m] length of the line from a mark
+FRAME_HEADING = 0.2  # [m]
 TEXT_HEIGHT = 0.12  # [m] of the DXF
 BARS = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # [m] of the scale
 
@@ -98,7 +102,8 @@ def shapes_of(document: dict[str, Any], index: int) -> Iterator[Shape]:
         ends = np.array([s.begin["pose"]["center"], s.end["pose"]["center"]])
         yield Line(ends, color_of(s.confidence), PATH_WIDTH, s.is_gap)
     for number, photo in photos:
-        center, color = np.array(photo["pose"]["center"]), COLORS[photo["status"]]
+        center = np.array(photo["pose"]["center"])
+        color = COLORS[photo["status"]]
         is_frame = photo["walk"] is not None
         ahead = np.array([*photo["pose"]["rotation"][:2], 0.0])
         ahead *= (FRAME_HEADING if is_frame else HEADING) / max(float(np.linalg.norm(ahead)), 1e-12)
@@ -180,7 +185,8 @@ def _draw(axes: "Axes", shape: Shape) -> None:
         ellipse.set(fill=False, edgecolor=_fraction(shape.color))
         axes.add_patch(ellipse)
     else:
-        color, is_sure = _fraction(COLORS[shape.status]), shape.status == LOCALIZED
+        color = _fraction(COLORS[shape.status])
+        is_sure = shape.status == LOCALIZED
         fill, edge = (color, "white") if is_sure else ("white", color)  # a guess is hollow
         (mark,) = axes.plot(*shape.center[:2], marker=MARKERS[shape.status], ms=shape.size, gid=shape.name)
         mark.set(markerfacecolor=fill, markeredgecolor=edge, markeredgewidth=1.5)
@@ -196,7 +202,9 @@ def dxf_of(document: dict[str, Any]) -> bytes:
     """Points, headings, 95 % ellipses and names in metres of the scan's coordinates."""
     ezdxf = import_optional("--plan", "ezdxf", "tools")
     drawing = ezdxf.new("R2010", setup=True)
-    drawing.header["$INSUNITS"], drawing.header["$PDMODE"], drawing.header["$PDSIZE"] = 6, 34, 0.1
+    drawing.header["$INSUNITS"] = 6
+    drawing.header["$PDMODE"] = 34
+    drawing.header["$PDSIZE"] = 0.1
     R_map_from_world = np.array(document["R"]).reshape(3, 3)
     for k, storey in enumerate(document["storeys"]):
         layer = _layer_name(storey["name"], k)

@@ -29,13 +29,18 @@ PIXEL = 0.02  # [m] of a plan, or more if it would be larger than
 MAX_SIDE = 3072  # [px]
 MARGIN = 0.5  # [m] around what is drawn
 FLOOR_CELL = 0.5  # [m] on which the height of the floor is looked up
-WALL_FROM, WALL_BINS, WALL_BIN = 0.6, 13, 0.1  # [m] above the floor: what fills most of this is a wall
+WALL_FROM = 0.6  # [m] above the floor
+WALL_BINS = 13  # what fills most of these is a wall
+WALL_BIN = 0.1  # [m]
 WALL_FILLED = 8  # bins
 WALL_COLOR = (52, 60, 72)
-HOLE_COLOR, HOLE_ALPHA, LARGEST_HOLE = (150, 158, 168), 90, 12.0  # of gaps in a floor, and area [m2]
+HOLE_COLOR = (150, 158, 168)  # of gaps in a floor
+HOLE_ALPHA = 90
+LARGEST_HOLE = 12.0  # [m2]
 PALENESS = 0.25  # of the colours, so that what is drawn on them is seen
 GAP = 13  # [px] that is closed
-SHADOW, SHADOW_WIDTH = 0.35, 0.25  # of walls on the floor: strength, width [m]
+SHADOW = 0.35  # of walls on the floor: strength
+SHADOW_WIDTH = 0.25  # [m]
 
 
 COLUMNS = ("u", "v", "x", "y")
@@ -70,7 +75,8 @@ def draw_plan(points: PackedPoints, places: Array, floors: Array) -> PlanImage |
     x, y, above, rgb = shown
     width, height = np.ptp(x) + 2 * MARGIN, np.ptp(y) + 2 * MARGIN
     pixel = max(PIXEL, float(max(width, height)) / MAX_SIDE)
-    left, top = float(x.min()) - MARGIN, float(y.max()) + MARGIN
+    left = float(x.min()) - MARGIN
+    top = float(y.max()) + MARGIN
     columns = ((x - left) / pixel).astype(np.int64)
     rows = ((top - y) / pixel).astype(np.int64)
     shape = math.ceil(height / pixel), math.ceil(width / pixel)
@@ -109,7 +115,8 @@ def _painted(
 ) -> NDArray[np.uint8]:
     """The picture (H, W, 4): what is highest below the cut, gaps closed, shadows of the walls, the walls."""
     order = np.argsort(above, kind="stable")  # what is higher is written later
-    color, is_seen = np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.bool_)
+    color = np.zeros((*shape, 3), np.uint8)
+    is_seen = np.zeros(shape, np.bool_)
     color[rows[order], columns[order]] = rgb[order]
     is_seen[rows, columns] = True
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (GAP, GAP))
@@ -191,7 +198,8 @@ def plan_matrix(pixels: Array, places: Array) -> tuple[tuple[float, ...], float]
     if rank == 1:
         z, w = (complex(*(pair[1] - pair[0])) for pair in (pixels * np.array([1.0, -1.0]), places))
         turn = w / z
-        a, b = turn.real, turn.imag
+        a = turn.real
+        b = turn.imag
         linear = np.array([[a, b], [b, -a]])  # v points down
     else:
         linear = np.linalg.lstsq(centred, places - places.mean(axis=0), rcond=None)[0].T

@@ -107,7 +107,8 @@ def self_contained(folder: Path, document: Mapping[str, Any]) -> str:
     for storey in inlined["storeys"]:
         if storey["plan"]:
             storey["plan"]["file"] = _data_url(folder / storey["plan"]["file"], "image/png")
-    script, style = page_file("app.js"), page_file("app.css")
+    script = page_file("app.js")
+    style = page_file("app.css")
     data = [f'<script type="application/json" id="report">{as_script_text(inlined)}</script>']
     for photo in document["photos"]:
         if photo["hasPictures"]:

@@ -35,7 +35,8 @@ SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 COLORS = ("colorRed", "colorGreen", "colorBlue")
 INVALID = {CARTESIAN: "cartesianInvalidState", SPHERICAL: "sphericalInvalidState"}
 INTENSITY = "intensity"
-INVALID_COLOR, INVALID_INTENSITY = "isColorInvalid", "isIntensityInvalid"
+INVALID_COLOR = "isColorInvalid"
+INVALID_INTENSITY = "isIntensityInvalid"
 TOLERANCE = 0.01  # of 255, what a float colour may lie outside of its range
 WANTED = "wanted scans with colorRed colorGreen colorBlue"
 KINDS = {
@@ -203,7 +204,9 @@ def _read_scan(file: E57File, scan: E57Scan) -> Iterator[dict[str, Array]]:
     """The columns of a scan, a chunk at a time, in room that is used again."""
     names = (*scan.coordinates, *scan.channels, *scan.invalid)
     columns = {name: np.empty(min(scan.num_points, CHUNK)) for name in names}
-    buffers, num_read, count = file.libe57.VectorSourceDestBuffer(), 0, 1
+    buffers = file.libe57.VectorSourceDestBuffer()
+    num_read = 0
+    count = 1
     with refusing(file.path, file.libe57):
         for name, room in columns.items():
             buffers.append(file.libe57.SourceDestBuffer(file.image_file, name, room, len(room), True, True))

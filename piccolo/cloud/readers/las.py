@@ -31,20 +31,26 @@ from .reader import (
 )
 
 MAGIC = b"LASF"
-MIN_HEADER_SIZE, MIN_HEADER_SIZE_1_4 = 227, 375  # [byte]
+MIN_HEADER_SIZE = 227  # [byte]
+MIN_HEADER_SIZE_1_4 = 375  # [byte]
 COMPRESSED_BIT = 0x80  # of the point format
 # The least length of a record by point format, and where red green blue begin in those that have them [byte].
 RECORD_SIZES = {0: 20, 1: 28, 2: 26, 3: 34, 4: 57, 5: 63, 6: 30, 7: 36, 8: 38, 9: 59, 10: 67}
 COLORS_BYTE = {2: 20, 3: 28, 5: 28, 7: 30, 8: 30, 10: 30}
-INTENSITY_BYTE, FLAGS_BYTE = 12, 15
-CLASS_BYTE_OLD, CLASS_BYTE = 15, 16  # in the formats 0-5, whose upper three bits are flags, and 6-10
+INTENSITY_BYTE = 12
+FLAGS_BYTE = 15
+CLASS_BYTE_OLD = 15  # in the formats 0-5, whose upper three bits are flags
+CLASS_BYTE = 16  # in 6-10
 WANTED = "wanted LAS or LAZ with red green blue (point format 2, 3, 5, 7, 8 or 10)"
 OFFSET_SIZE = 8  # [byte] of the chunk table's offset, in front of the first chunk
 MAX_ENTRY_SIZE = 32  # [byte], more than an entry of the table can take
 MAX_VLRS = 1 << 16
 VLR_HEADER = struct.Struct("<2x16sHH32x")  # user, record id, length of what follows
-LASZIP_USER, LASZIP_RECORD_ID = b"laszip encoded", 22204
-ITEMS_AT, ITEM_SIZE, TYPE_AND_SIZE = 34, 6, 4  # [byte] in that record; an item ends with its version
+LASZIP_USER = b"laszip encoded"
+LASZIP_RECORD_ID = 22204
+ITEMS_AT = 34  # [byte] in that record
+ITEM_SIZE = 6  # [byte]; ends with its version
+TYPE_AND_SIZE = 4  # [byte]
 NUM_LAYERS = {6: 9, 7: 10, 8: 11, 9: 10, 10: 12}  # of a chunk, by point format; extra bytes have one each
 MAX_CHUNK_SIZE = 1 << 29  # [byte] of a chunk's records, for it is decompressed at once; 2 MB are usual
 # What is wanted of formats 6 to 10, where fields can be passed over.
@@ -95,13 +101,16 @@ def read_header(path: Path) -> LasHeader:
     if not head.startswith(MAGIC) or len(head) < MIN_HEADER_SIZE:
         wanted = f"wanted 'LASF' and a header of {MIN_HEADER_SIZE} bytes or more"
         raise InputError(f"{path}: begins with {head[:4]!r} and {len(head)} bytes, {wanted}")
-    major, minor = head[24], head[25]
+    major = head[24]
+    minor = head[25]
     sizes = struct.unpack_from("<HIIBHI", head, 94)
     header_size, points_offset, num_vlrs, format_id, record_size, num_points = sizes
     if minor >= 4:
         num_points = int.from_bytes(head[247:255], "little") or num_points
     scales, offsets = np.frombuffer(head, "<f8", 6, 131).reshape(2, 3)
-    size, point_format, is_compressed = path.stat().st_size, format_id & ~COMPRESSED_BIT, format_id >= 0x80
+    size = path.stat().st_size
+    point_format = format_id & ~COMPRESSED_BIT
+    is_compressed = format_id >= 0x80
     if major != 1 or minor > 5:
         raise InputError(f"{path}: found LAS {major}.{minor}, wanted LAS 1.0 to 1.5")
     least = MIN_HEADER_SIZE_1_4 if minor >= 4 else MIN_HEADER_SIZE
@@ -220,7 +229,8 @@ def _table(header: LasHeader, file: BinaryIO, offset: int) -> bytes:
 def _checked_chunks(header: LasHeader, entries: list[LazChunk], num_bytes: int) -> tuple[LazChunk, ...]:
     """The chunks that hold the promised points, the last no more than is left."""
     chunks: list[LazChunk] = []
-    num_left, most = header.num_points, MAX_CHUNK_SIZE // header.record_size
+    num_left = header.num_points
+    most = MAX_CHUNK_SIZE // header.record_size
     for full_count, size in entries:
         if num_left == 0:
             break
@@ -229,7 +239,8 @@ def _checked_chunks(header: LasHeader, entries: list[LazChunk], num_bytes: int) 
             where = f"{header.path}: chunk {len(chunks) + 1} of {count} points in {size} bytes"
             raise InputError(f"{where}, wanted 1 to {most} points, in the file; the chunk table is broken")
         chunks.append((count, size))
-        num_left, num_bytes = num_left - count, num_bytes - size
+        num_left = num_left - count
+        num_bytes = num_bytes - size
     if num_left:
         counts = f"promises {header.num_points} points, the chunk table has {header.num_points - num_left}"
         raise InputError(f"{header.path}: the header {counts}")
@@ -256,7 +267,8 @@ def _check_layers(header: LasHeader, num_layers: int, data: bytes, chunks: Seque
 
     A chunk is a whole point, the number of points, the bytes of each layer, the layers.
     """
-    begin, head_size = 0, header.record_size + 4 * (1 + num_layers)
+    begin = 0
+    head_size = header.record_size + 4 * (1 + num_layers)
     for num_points, size in chunks:
         if size < head_size:
             raise InputError(f"{header.path}: a chunk of {size} bytes, wanted {head_size} or more; {BROKEN}")
@@ -280,9 +292,12 @@ def _refusing(path: Path, lazrs: ModuleType) -> Iterator[None]:
         raise InputError(f"{path}: the compressed points are broken ({why})") from error
 
 
-WITHHELD_OLD, WITHHELD = 0x80, 0x04  # bits of the flags' byte, in the formats 0-5 and 6-10
-CLASS_OLD, CLASS = 0x1F, 0xFF  # bits of the class, in the same
-MAX_SAMPLES, NUM_SAMPLE_RUNS = 1 << 20, 64
+WITHHELD_OLD = 0x80  # bit of the flags' byte, in the formats 0-5
+WITHHELD = 0x04  # in 6-10
+CLASS_OLD = 0x1F  # bits of the class, in the formats 0-5
+CLASS = 0xFF
+MAX_SAMPLES = 1 << 20
+NUM_SAMPLE_RUNS = 64
 TO_8_BIT = ((np.arange(1 << 16, dtype=np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
 
 Records = NDArray[np.void]

@@ -72,7 +72,8 @@ def sample_points(instances: Sequence[SurfaceInstance], ends: Array, num_points:
     last: Texture | None = None
     texels: NDArray[np.uint8] | None = None
     for i, instance in enumerate(instances):
-        first, end = (int(behind[i - 1]) if i else 0), int(behind[i])
+        first = int(behind[i - 1]) if i else 0
+        end = int(behind[i])
         if first == end:
             continue
         texture = instance.surface.texture
@@ -103,7 +104,8 @@ def _points(
     instance: SurfaceInstance, k: NDArray[np.int64], rows: NDArray[np.int64], texels: NDArray[np.uint8] | None
 ) -> RawCloud:
     """The points k in the triangles `rows`; those on texels of alpha 0 are left out."""
-    surface, weights = instance.surface, weights_of(k)
+    surface = instance.surface
+    weights = weights_of(k)
     matrix = instance.T_world_from_surface
     triangles = surface.triangles[rows]
     points_world = _blend(surface.vertices, triangles, weights) @ matrix[:3, :3].T + matrix[:3, 3]
@@ -115,7 +117,8 @@ def _points(
             raise ValueError("a surface without colours")
         return RawCloud(points_world, _bytes(linear_to_srgb(factors) if surface.is_linear else factors))
     found = look_up(texels, _blend(surface.uv, triangles, weights))
-    colors, is_visible = found[:, :3], found[:, 3] > 0
+    colors = found[:, :3]
+    is_visible = found[:, 3] > 0
     if factors is not None:
         colors = _bytes(linear_to_srgb(srgb_to_linear(colors) * factors))
     return RawCloud(points_world[is_visible], np.ascontiguousarray(colors[is_visible]))
@@ -182,7 +185,8 @@ def _source(loaded: Loaded, scale: float) -> PointSource:
     num_triangles = sum(len(instance.surface.triangles) for instance in instances)
     if num_triangles > MAX_TRIANGLES:
         raise InputError(f"{path}: {num_triangles} triangles, wanted at most {MAX_TRIANGLES}")
-    sums, num_flat = [], 0
+    sums = []
+    num_flat = 0
     for instance in instances:
         areas = instance.areas()
         sums.append(areas.sum())
@@ -207,10 +211,12 @@ def _source(loaded: Loaded, scale: float) -> PointSource:
 
 def _instances(loaded: Loaded) -> tuple[list[SurfaceInstance], list[str]]:
     """The coloured surfaces where the scene puts them, and what the user should know."""
-    scene, path = loaded.scene, loaded.path
+    scene = loaded.scene
+    path = loaded.path
     meshes = {name: mesh for name, mesh in scene.geometry.items() if hasattr(mesh, "faces")}
     surfaces = {name: _surface(loaded, mesh) for name, mesh in meshes.items()}
-    instances, num_bare = [], 0
+    instances = []
+    num_bare = 0
     nodes = [scene.graph.get(node) for node in scene.graph.nodes_geometry]
     # not by the nodes' names: trimesh makes some up by chance
     for matrix, name in sorted(nodes, key=lambda node: (node[1], node[0].tobytes())):
@@ -254,7 +260,8 @@ def _surface(loaded: Loaded, mesh: Any) -> Surface | None:
     if loaded.materials is not None:
         return _gltf_surface(loaded, mesh, vertices, triangles)
     material = getattr(mesh.visual, "material", None)
-    uv, texture = getattr(mesh.visual, "uv", None), loaded.texture(getattr(material, "image", None))
+    uv = getattr(mesh.visual, "uv", None)
+    texture = loaded.texture(getattr(material, "image", None))
     if texture is not None:
         if uv is None:
             return Surface(vertices, triangles)  # the material's colour would only be multiplied
@@ -270,12 +277,15 @@ def _checked_uv(path: Path, raw: Any, vertices: Array) -> Array:
     if uv.shape != (len(vertices), 2):
         raise InputError(f"{path}: {len(uv)} texture coordinates, wanted {len(vertices)}")
     is_wrong: NDArray[np.bool_] = ~np.all(np.abs(uv) < 1e6, axis=1)
-    vertices[is_wrong], uv[is_wrong] = np.nan, 0.0
+    vertices[is_wrong] = np.nan
+    uv[is_wrong] = 0.0
     return uv
 
 
 def _gltf_surface(loaded: Loaded, mesh: Any, vertices: Array, triangles: NDArray[np.int64]) -> Surface:
-    visual, path, materials = mesh.visual, loaded.path, loaded.materials or []
+    visual = mesh.visual
+    path = loaded.path
+    materials = loaded.materials or []
     material = materials[int(visual.material.name)]
     texture = loaded.texture(visual.material.baseColorTexture)
     if material.texture is not None and (texture is None or visual.uv is None):
@@ -286,11 +296,13 @@ def _gltf_surface(loaded: Loaded, mesh: Any, vertices: Array, triangles: NDArray
     uv = None if texture is None else _checked_uv(path, visual.uv, vertices)
     factor = np.array([material.factor])
     if raw is not None:
-        colors, corners = _fractions(path, raw, len(vertices)) * factor, triangles
+        colors = _fractions(path, raw, len(vertices)) * factor
+        corners = triangles
     elif texture is not None and np.all(factor == 1.0):
         return Surface(vertices, triangles, uv, texture)
     else:
-        colors, corners = factor, np.broadcast_to(np.int64(0), triangles.shape)
+        colors = factor
+        corners = np.broadcast_to(np.int64(0), triangles.shape)
     return Surface(vertices, triangles, uv, texture, colors, corners, is_linear=True)
 
 

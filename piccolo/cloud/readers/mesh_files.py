@@ -37,7 +37,9 @@ MAX_SHARING = 4  # times that a byte may be part of an accessor, on average
 BYTES_OF_TYPE = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 NUM_OF_SHAPE = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 FLOAT = 5126
-TRIANGLES, STRIP, FAN = 4, 5, 6
+TRIANGLES = 4
+STRIP = 5
+FAN = 6
 COUNTS = {  # numbers that trimesh would count from the end if they were negative
     "bufferViews": ("buffer", "byteOffset", "byteLength", "byteStride"),
     "accessors": ("bufferView", "byteOffset", "count"),
@@ -133,7 +135,8 @@ class FolderResolver:
 
     def get(self, name: str) -> bytes:
         """The content of a file, by the name that the mesh gives it."""
-        folder, problem = self.path.parent.resolve(), ""
+        folder = self.path.parent.resolve()
+        problem = ""
         try:
             file = (folder / name.strip().replace("\\", "/")).resolve()  # names may be written on Windows
             if ":" in name or not file.is_relative_to(folder):  # ':' of a drive or a URL
@@ -226,7 +229,9 @@ def _check_data(path: Path, tree: Json, num_bytes: int) -> None:
         for entry in tree.get(kind, []):
             for name in entry.keys() & names:
                 _count(entry[name])
-    views, accessors, size = tree.get("bufferViews", []), tree.get("accessors", []), 0
+    views = tree.get("bufferViews", [])
+    accessors = tree.get("accessors", [])
+    size = 0
     for i, accessor in enumerate(accessors):
         if "sparse" in accessor or "bufferView" not in accessor:
             raise InputError(f"{path}: accessor {i} is sparse or compressed, wanted plain data")
@@ -242,7 +247,9 @@ def _check_data(path: Path, tree: Json, num_bytes: int) -> None:
 
 def _check_nodes(path: Path, tree: Json) -> None:
     """Refuse nodes that form no tree: they could place any number of meshes."""
-    scenes, nodes, seen = tree.get("scenes", []), tree.get("nodes", []), set[int]()
+    scenes = tree.get("scenes", [])
+    nodes = tree.get("nodes", [])
+    seen = set[int]()
     level = scenes[_count(tree.get("scene", 0))].get("nodes", []) if scenes else []
     for _ in range(MAX_DEPTH):
         num_seen = len(seen)
@@ -279,7 +286,8 @@ def _keep_base_colors(tree: Json, materials: list[Material]) -> None:
 
 def _keep_triangles(path: Path, tree: Json, materials: list[Material], num_bytes: int) -> None:
     """Leave primitives of triangles only; refuse data that too many of them share."""
-    accessors, num_rows = tree.get("accessors", []), 0
+    accessors = tree.get("accessors", [])
+    num_rows = 0
     for mesh in tree.get("meshes", []):
         triangles = [p for p in mesh["primitives"] if p.get("mode", TRIANGLES) in (TRIANGLES, STRIP, FAN)]
         kept = [_primitive(path, accessors, materials, primitive) for primitive in triangles]

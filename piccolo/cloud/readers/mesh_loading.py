@@ -152,7 +152,8 @@ def load_ply(path: Path) -> Loaded:
     loaded = Loaded(path, _scene(resolver, content, "ply", bool(textures)))
     raw = [m.metadata["_ply_raw"] for m in loaded.scene.geometry.values() if "_ply_raw" in m.metadata]
     for elements, name in product(raw, ("vertex", "face")):
-        data, count = elements[name].get("data"), elements[name]["length"]
+        data = elements[name].get("data")
+        count = elements[name]["length"]
         columns = data.values() if isinstance(data, dict) else [data]
         found = min((len(column) for column in columns if column is not None), default=0)
         if found != count:

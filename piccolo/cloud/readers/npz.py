@@ -21,11 +21,13 @@ from ...files.array_archive import MAX_HEAD_SIZE, read_header
 from .columns import BRIGHTEST, brightest_of, colored_chunks, in_chunks, read_records
 from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, point_label, quoted
 
-NPY_MAGIC, ZIP_MAGIC = b"\x93NUMPY", b"PK\x03\x04"
+NPY_MAGIC = b"\x93NUMPY"
+ZIP_MAGIC = b"PK\x03\x04"
 ZIP_NAME_AT = 30  # [byte] in an archive: the name of its first member
 MAX_RATIO = 200  # unpacked to packed; real scans stay below 10, deflate could reach 1032
 MAX_UNPACKED = 1 << 34  # [byte] of an archive's arrays, which are read whole
-POINTS_NAMES, COLORS_NAMES = ("points", "xyz"), ("colors", "rgb")
+POINTS_NAMES = ("points", "xyz")
+COLORS_NAMES = ("colors", "rgb")
 Parts = Iterable[tuple[NDArray[Any], NDArray[Any]]]
 WANTED = "wanted .npy of x y z r g b (N, 6) with colours 0-255, or .npz with points (N, 3) and colors (N, 3)"
 
@@ -126,7 +128,8 @@ def _members(path: Path) -> list[zipfile.ZipInfo]:
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or info.flag_bits & 1:
             name = quoted(info.filename.encode())
             raise InputError(f"{path}: {name} is encrypted or compressed in another way than by NumPy")
-    size, most = sum(info.file_size for info in infos), min(MAX_RATIO * path.stat().st_size, MAX_UNPACKED)
+    size = sum(info.file_size for info in infos)
+    most = min(MAX_RATIO * path.stat().st_size, MAX_UNPACKED)
     if size > most:
         raise InputError(f"{path}: the arrays promise {size} bytes, {most} at most are read; use .npy files")
     return infos
@@ -139,7 +142,8 @@ def _open_array(path: Path, member: str | None, size: int) -> ArrayInFile:
     array = ArrayInFile(path, member, shape, is_fortran, dtype, offset)
     if dtype.hasobject or dtype.itemsize == 0 or any(count < 0 for count in shape):
         raise InputError(f"{path}: {array}, {WANTED}")
-    promised, found = math.prod(shape) * dtype.itemsize, size - offset
+    promised = math.prod(shape) * dtype.itemsize
+    found = size - offset
     if promised != found:
         raise InputError(f"{path}: an array promises {promised} bytes, found {found}; it is cut off")
     return array

@@ -42,7 +42,8 @@ FIRST_LINES = re.compile(rb"(?:#[^\n]*\n|[ \t\r\n])*(?:# \.PCD|VERSION[ \t]+0?\.
 PADDING = "_"
 BROKEN = "the file is cut off or broken"
 PACKED_NAMES = ("rgb", "rgba")  # 0xAARRGGBB in one number
-INTENSITY, LABEL = "intensity", "label"
+INTENSITY = "intensity"
+LABEL = "label"
 SCALAR_TYPES = ("f4", "f8", "u1", "u2", "u4", "i1", "i2", "i4")
 TYPES = {  # of fields that are not colours on their own
     **dict.fromkeys("xyz", (("f4", "f8"), "float32 or float64")),
@@ -166,7 +167,8 @@ def decompress_lzf(data, out):
 
     Broken is what would read before the beginning of `out`, or go beyond the end of either.
     """
-    i, filled = 0, 0
+    i = 0
+    filled = 0
     while filled >= 0 and i < len(data):
         control = int(data[i])
         i += 1
@@ -216,10 +218,12 @@ def _wanted_fields(header: PcdHeader, options: CloudReadOptions) -> tuple[PcdFie
     found = {field.name: field for field in header.fields if field.count == 1}
     names = [field.name for field in header.fields]
     if options.labels:
-        more, wanted = (LABEL,) * (LABEL in found), "wanted x y z and label"
+        more = (LABEL,) * (LABEL in found)
+        wanted = "wanted x y z and label"
     else:
         color = next(((name,) for name in PACKED_NAMES if name in found), color_names(found))
-        more, wanted = color or (INTENSITY,) * (INTENSITY in found), WANTED
+        more = color or (INTENSITY,) * (INTENSITY in found)
+        wanted = WANTED
     if not more or not all(names.count(axis) == 1 and axis in found for axis in "xyz"):
         listed = " ".join(names[:12]) or "none"
         raise InputError(f"{header.path}: the fields are {quoted(listed.encode())}, {wanted}")
@@ -270,7 +274,8 @@ def _read_packed(header: PcdHeader, type_: str, read_columns: ColumnReader) -> I
     """The points with colours 0xAARRGGBB of a declared type, whose numbers ASCII has as text."""
     num_before = 0
     for columns in read_columns():
-        points_world, values = points_of(columns), columns[3]
+        points_world = points_of(columns)
+        values = columns[3]
         if header.encoding == "ascii":
             has_position = np.isfinite(points_world).all(axis=1)
             bits, is_right = _bits_of_text(np.where(has_position, values, 0.0), type_)

@@ -151,7 +151,8 @@ def _property_names(header: PlyHeader, options: CloudReadOptions) -> tuple[str, 
         scalars = [by_lower[name] for name in LABEL_NAMES if name in by_lower]
     if not {*"xyz"} <= {*found} or not (colors or scalars):
         kind = "Gaussian splats without red green blue, " if "f_dc_0" in found else ""
-        listed, wanted = " ".join(found[:9]) or "no properties", LABELS_WANTED if options.labels else WANTED
+        listed = " ".join(found[:9]) or "no properties"
+        wanted = LABELS_WANTED if options.labels else WANTED
         raise InputError(f"{header.path}: {kind}the vertices have {listed}, {wanted}")
     if not colors and not options.labels:
         check_option(header.path, options, WANTED)

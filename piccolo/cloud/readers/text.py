@@ -58,7 +58,9 @@ class NumberLines:
     """The lines of numbers in a file, one after the other; blank lines and comments are passed over."""
 
     def __init__(self, path: Path, layout: LineLayout, wanted: str) -> None:
-        self.path, self.layout, self.wanted = path, layout, wanted
+        self.path = path
+        self.layout = layout
+        self.wanted = wanted
         self.num_taken = 0
         self._kept = partial(_kept, has_counts=layout.has_counts)
         self._lines = chain.from_iterable(map(self._kept, line_blocks(path, layout.start)))
@@ -84,7 +86,8 @@ class NumberLines:
 
     def _take_rows(self, count: int) -> NDArray[np.float64]:
         """The wanted columns (R, C) of the next lines, R <= `count`; R = 0 at the end."""
-        columns, num_columns = list(self.layout.columns), self.layout.num_columns
+        columns = list(self.layout.columns)
+        num_columns = self.layout.num_columns
         most = max(1, raw.MAX_BLOCK_SIZE // (8 * (num_columns or len(columns))))
         if self.peek() is None:
             return np.empty((0, len(columns)))
@@ -121,7 +124,8 @@ class NumberLines:
 
         Colours (N, 3) of six columns x y z r g b, checked to be 0-255; the fourth (N,) of four.
         """
-        first, rows = self.num_taken, self.read_rows(count)
+        first = self.num_taken
+        rows = self.read_rows(count)
         if len(self.layout.columns) == NUM_WITH_INTENSITY:
             return ((some[:, :3], some[:, 3]) for some in rows)
         parts = ((some[:, :3], some[:, 3:]) for some in rows)
@@ -154,7 +158,8 @@ class NumberLines:
     def _fault(self, line: bytes) -> str:
         """What is wrong with a line; empty if nothing is."""
         fields = line.decode("latin-1").split(self.layout.delimiter)
-        exact, columns = self.layout.num_columns, self.layout.columns
+        exact = self.layout.num_columns
+        columns = self.layout.columns
         num_wanted = max(columns) + 1 if exact is None else exact
         if len(fields) < num_wanted or (exact and len(fields) > exact):
             return f"{len(fields)} instead of {num_wanted} columns"
