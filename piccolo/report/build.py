@@ -1,37 +1,42 @@
 """A report of results in a scan: facts, plans, and the pictures of each photo, taken up where stopped."""
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 
 from .. import __version__
-from ..cloud.soa import PackedPoints
+from ..cloud.settings import METRES, CloudSettings, UpAxis
 from ..errors import InputError
 from ..files.atomic import write_atomically
 from ..files.cache import digest_of_sources
 from ..files.temporary import temporary_folder
-from ..geometry.pose import Array, Pose
-from ..jobs.threads import Workers
+from ..geometry.pose import Pose
+from ..jobs.stopwatch import Stopwatch
+from ..jobs.threads import ProgressCallback, Workers, no_progress, num_cores, progress_to
 from ..panorama.photo import photo_of
+from ..query_options import File, refuse_unknown
 from ..result import FAILED, UNREADABLE, check_scan
+from ..scan import Scan
+from ..scan_map.open_map import CachePolicy, open_map
 from ..scan_map.scan_map import ScanMap
 from ..views.surfel_renderer import MAX_SURFELS, encode_image
 from ..views.surfels import Surfels, surfels_of
-from .entries import Entry, Place, document_of_entry, names_of, short_names_of
+from .entries import Entry, Place, document_of_entry, names_of, read_entries, short_names_of
 from .pictures import make_pictures, read_options_of, taken_out
-from .plan_image import OwnPlan, check_own_plans, draw_plan, own_plan
+from .plan_image import OwnPlan, PlanImage, draw_plan, own_plan
 from .site import begin_folder, check_folder, finish_folder, picture_path, self_contained, write_photo_script
 
 FORMAT = "piccolo-report/1"
 WIDTH = 2048  # [px] of spheres
 MAX_SELF_CONTAINED = 50  # photos
 CAMERA_HEIGHT = 1.5  # [m] taken of a map in which nothing is level
-MAKERS = ("report", "render", "confidence", "panorama", "camera")  # folders whose sources make the pictures
+MAKERS = ("report", "views", "confidence", "panorama", "camera")  # folders whose sources make the pictures
 
 
 @dataclass(frozen=True)
@@ -96,7 +101,9 @@ def check_settings(settings: ReportSettings, place: Place, entries: Sequence[Ent
     if settings.storey_names and len(settings.storey_names) != found:
         names = f"found {len(settings.storey_names)} names"
         raise InputError(f"--storeys: {names}, wanted {found}, as the scan has storeys, the lowest first")
-    check_own_plans(settings.own_plans, found)
+    for plan in settings.own_plans:
+        if not 1 <= plan.storey <= found:
+            raise InputError(f"{plan.image}: found storey {plan.storey}, wanted 1 to {found}")
     return check_scan(
         [entry.result for entry in entries], place.scan_map.scan_sha256, "that given", settings.is_forced
     )
@@ -122,41 +129,28 @@ def write_pictures(
     tasks: Sequence[Task], place: Place, folder: Path, settings: ReportSettings, workers: Workers
 ) -> tuple[str, ...]:
     """Make the pictures that are not there yet; why some could not be made."""
-    todo = list({task.key: task for task in tasks if needs_pictures(task, folder)}.values())
+    readable = [task for task in tasks if task.entry.result.status not in (UNREADABLE, FAILED)]
+    missing = [task for task in readable if not picture_path(folder, "photos", task.key).exists()]
+    todo = list({task.key: task for task in missing}.values())
     if not todo:
         return ()
     points = place.scan_map.points.subsample(MAX_SURFELS)
-    scan = surfels_of(points, workers) if any(task.poses for task in todo) else None
-    with taken_out([task.photo for task in todo]) as files:
-        write = writer(scan, points, folder, settings.width)
-        taken = [task._replace(photo=files.get(task.photo, task.photo)) for task in todo]
-        return tuple(warning for warning in workers.map(write, taken, "photos") if warning)
-
-
-def needs_pictures(task: Task, folder: Path) -> bool:
-    """True unless they are there, or can't be: the photo was not read when it was localized."""
-    is_there = picture_path(folder, "photos", task.key).exists()
-    return task.entry.result.status not in (UNREADABLE, FAILED) and not is_there
-
-
-def writer(
-    scan: Surfels | None, points: PackedPoints, folder: Path, width: int | None
-) -> Callable[[Task], str]:
-    """A function that makes and writes a photo's pictures; what it returns says why it could not."""
+    is_found = any(task.poses for task in todo)
+    nothing = Surfels(points, np.empty((0, 3), np.float32), np.empty(0, np.float32))
+    scan = (surfels_of(points, workers) if is_found else nothing), points
 
     def write(task: Task) -> str:
         try:
-            poses = task.poses if scan is not None else []
-            whole = scan or Surfels(points, np.empty((0, 3), np.float32), np.empty(0, np.float32))
-            made = make_pictures(task.photo, task.entry.result, poses, (whole, points), width)
+            thumbnail, script = make_pictures(task.photo, task.entry.result, task.poses, scan, settings.width)
         except (OSError, InputError) as error:
             return f"{task.photo}: no pictures of it ({error})"
-        if made.thumbnail is not None:
-            write_atomically(picture_path(folder, "thumbs", task.key), made.thumbnail)
-        write_photo_script(folder, task.key, made.script)  # last: it says that both are there
+        write_atomically(picture_path(folder, "thumbs", task.key), thumbnail)
+        write_photo_script(folder, task.key, script)  # last: it says that both are there
         return ""
 
-    return write
+    with taken_out([task.photo for task in todo]) as files:
+        taken = [task._replace(photo=files.get(task.photo, task.photo)) for task in todo]
+        return tuple(warning for warning in workers.map(write, taken, "photos") if warning)
 
 
 def document_of(
@@ -206,30 +200,108 @@ def storey_documents(
         places = m.centers[is_here]
         floors = m.centers[is_here, 2] - height[is_here]
         floor = place.storeys.storeys[k].floor if place.storeys.storeys else float(np.median([*floors, 0.0]))
-        plan = write_own_plan(own[k], m, folder) if k in own else write_plan(m, places, floors, folder)
-        yield {"name": name, "floor": floor, "level": round(origin + floor, 3), "plan": plan}
+        plan = own_plan(own[k], m) if k in own else draw_plan(m.points, places, floors)
+        document = plan and write_plan(plan, folder)
+        yield {"name": name, "floor": floor, "level": round(origin + floor, 3), "plan": document}
 
 
-def write_plan(m: ScanMap, places: Array, floors: Array, folder: Path) -> dict[str, Any] | None:
-    """Draw and write the plan of a storey: its file, size [px], matrix and metres a pixel."""
-    plan = draw_plan(m.points, places, floors)
-    if plan is None:
-        return None
-    height, width = plan.rgba.shape[:2]
-    file = keep_plan(folder, encode_image(plan.rgba, ".png"))
-    return {"file": file, "width": width, "height": height, "matrix": plan.matrix, "pixel": plan.pixel}
-
-
-def write_own_plan(plan: OwnPlan, m: ScanMap, folder: Path) -> dict[str, Any]:
-    """The same of the user's plan."""
-    content, (width, height), matrix = own_plan(plan, m)
-    pixel = float(np.hypot(matrix[0], matrix[1]))
-    file = keep_plan(folder, content)
-    return {"file": file, "width": width, "height": height, "matrix": matrix, "pixel": pixel}
-
-
-def keep_plan(folder: Path, content: bytes) -> str:
-    """Write a plan under the name of its content; its path in the report."""
+def write_plan(plan: PlanImage, folder: Path) -> dict[str, Any]:
+    """Write a plan under the name of its content: its file, size [px], matrix and metres a pixel."""
+    content = encode_image(plan.pixels, ".png")
     key = hashlib.sha256(content).hexdigest()[:32]
     write_atomically(picture_path(folder, "plans", key), content)
-    return f"plans/{key}.png"
+    height, width = plan.pixels.shape[:2]
+    pixel = float(np.hypot(plan.matrix[0], plan.matrix[1]))
+    return {
+        "file": f"plans/{key}.png",
+        "width": width,
+        "height": height,
+        "matrix": plan.matrix,
+        "pixel": pixel,
+    }
+
+
+class ReportOptions(TypedDict, total=False):
+    """What `write_report` may be told; all may be left out."""
+
+    title: str  # of the page; by default the scan's name
+    storeys: Sequence[str]  # names, the lowest first
+    images: File  # folder of the photos, where they are no more at the results' paths
+    full_size: bool  # spheres as wide as the photos, in place of 2048 px at most
+    self_contained: bool  # `out` is one HTML file, of at most 50 photos
+    own_plans: Mapping[int, tuple[File, File]]  # by storey, 1 the lowest: an image, CSV of control points
+    crs: str  # the scan's coordinate system, if it does not name it
+    force: bool  # show results of another scan too; the page says so
+    units: str  # of the scan's coordinates, as in `open_scan`; these three only for files
+    up: UpAxis
+    cache: bool | File
+    num_threads: int  # all cores if not given
+    progress: ProgressCallback  # is told (what is done, how many are done, of how many or None)
+
+
+def write_report(
+    results: File | Sequence[File],
+    scan: File | Sequence[File] | Scan,
+    out: File,
+    **options: Unpack[ReportOptions],
+) -> Path:
+    """Write a page that shows results on plans, and each photo over the scan; returns the page's path.
+
+    Parameters
+    ----------
+    results
+        Path of a file of JSON lines by localize.py, or several.
+    scan
+        Path of the scan, or of a map by tools/prepare_map.py, or several; or a Scan that is open.
+    out
+        Folder, new, empty or with an earlier report, of which only what has changed is made again.
+    **options
+        See ReportOptions.
+
+    Raises
+    ------
+    InputError
+        A file can't be read, results are of another scan, the folder holds something else, or an option means
+        nothing.
+
+    Examples
+    --------
+    >>> import piccolo
+    >>> scan = piccolo.open_scan("room/cloud.ply")
+    >>> result = scan.localize("room/images/clean_0.jpg")
+    >>> _ = Path("one.jsonl").write_text(result.to_json())
+    >>> piccolo.write_report("one.jsonl", scan, "report", storeys=["Ground floor"])
+    PosixPath('report/index.html')
+    """
+    refuse_unknown(options, ReportOptions, "write_report")
+    callback = options.get("progress")
+    show = progress_to(callback) if callback else no_progress
+    workers = Workers(options.get("num_threads", num_cores()), show)
+    own_plans = options.get("own_plans", {})
+    settings = ReportSettings(
+        title=options.get("title", ""),
+        storey_names=tuple(options.get("storeys", ())),
+        images=Path(options["images"]) if "images" in options else None,
+        width=None if options.get("full_size") else WIDTH,
+        is_self_contained=options.get("self_contained", False),
+        own_plans=tuple(OwnPlan(k, Path(image), Path(csv)) for k, (image, csv) in own_plans.items()),
+        crs=options.get("crs", ""),
+        is_forced=options.get("force", False),
+    )
+    scan_map = scan.prepared if isinstance(scan, Scan) else _map_of(_paths(scan), options, workers)
+    if not isinstance(scan_map, ScanMap):
+        raise InputError("write_report: found a scan of the preset paper, wanted one of the default method")
+    return build_report(read_entries(_paths(results)), scan_map, Path(out), settings, workers).page
+
+
+def _map_of(paths: Sequence[Path], options: ReportOptions, workers: Workers) -> ScanMap:
+    if (units := options.get("units", "m")) not in METRES:
+        raise InputError(f"units: found {units!r}, wanted one of {', '.join(METRES)}")
+    cache = options.get("cache", True)
+    policy = CachePolicy(cache is not False, None if isinstance(cache, bool) else Path(cache))
+    cloud_settings = CloudSettings(METRES[units], options.get("up", "auto"))
+    return open_map(paths, cloud_settings, policy, workers, Stopwatch())
+
+
+def _paths(files: File | Sequence[File]) -> list[Path]:
+    return [Path(files)] if isinstance(files, str | PathLike) else [Path(file) for file in files]

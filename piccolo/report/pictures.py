@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -54,13 +54,6 @@ UNSCANNED = np.array([96, 100, 106], np.float32)
 FRAME = re.compile(r"(?P<video>.+)#t=(?P<time>\d+\.\d{3})", re.DOTALL)
 
 
-class Pictures(NamedTuple):
-    """What the page shows of a photo, as files."""
-
-    thumbnail: bytes | None  # JPEG
-    script: str  # the JSON of the others
-
-
 def read_options_of(result: Result) -> ReadOptions:
     """How the photo of a result is to be read: as it was when it was localized."""
     how: Any = result.settings.get("panorama") or {}
@@ -77,8 +70,8 @@ def read_options_of(result: Result) -> ReadOptions:
 
 def make_pictures(
     photo: Path, result: Result, poses: list[Pose], scan: tuple[Surfels, PackedPoints], width: int | None
-) -> Pictures:
-    """The pictures of a photo, of which `poses` are the best and the alternatives in the scan's frame.
+) -> tuple[bytes, str]:
+    """The thumbnail of a photo, JPEG, and the JSON of its other pictures.
 
     Spheres are at most `width` px wide, None for the photo's own size. Without a pose there is no scan.
     """
@@ -98,7 +91,7 @@ def make_pictures(
             _base64(scan_picture(scan_view(surfels, pose, ALTERNATIVE_WIDTH))) if is_shown else None
             for pose, is_shown in zip(poses[1:], _shown(result), strict=True)
         ]
-    return Pictures(thumbnail_of(small, poses[0] if poses else None), json.dumps(document))
+    return thumbnail_of(small, poses[0] if poses else None), json.dumps(document)
 
 
 def _shown(result: Result) -> list[bool]:

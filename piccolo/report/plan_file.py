@@ -12,10 +12,9 @@ import numpy as np
 
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..files.atomic import write_atomically
-from ..files.figure import new_figure
 from ..files.temporary import temporary_folder
 from ..geometry.pose import Array
-from ..optional import import_optional
+from ..optional import import_optional, new_figure
 from ..panorama.picture import read_picture
 from ..scan_map.scan_map import ScanMap
 from .build import ReportSettings, Task, check_settings, document_of

@@ -5,7 +5,6 @@ The latter is put into the scan's coordinates by points that are known in both.
 
 import csv
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +19,7 @@ from ..geometry.colors import unpack_rgb
 from ..geometry.pose import Array
 from ..panorama.picture import read_picture
 from ..scan_map.scan_map import ScanMap
-from ..views.surfel_renderer import encode_image, fill_holes
+from ..views.surfel_renderer import fill_holes
 
 CUT = 1.9  # [m] above the floor: below ceilings and lintels, above most furniture
 BELOW_FLOOR = 0.4  # [m] that still belongs to the storey: steps, ramps
@@ -52,15 +51,10 @@ LEAST_SPREAD = 1e-6  # of the control points, by their distance: less is one poi
 class PlanImage(NamedTuple):
     """A plan in pixels."""
 
-    rgba: NDArray[np.uint8]  # (H, W, 4), transparent where nothing is
-    pixel: float  # [m] side of a pixel
-    left: float  # [m] x of the left edge, in the map's frame
-    top: float  # [m] y of the upper edge
-
-    @property
-    def matrix(self) -> tuple[float, ...]:
-        """a, b, c, d, e, f of x = a u + c v + e, y = b u + d v + f [m], from pixels (u, v)."""
-        return self.pixel, 0.0, 0.0, -self.pixel, self.left, self.top
+    pixels: NDArray[np.uint8]  # (H, W, 4) RGBA, transparent where nothing is; or (H, W, 3)
+    matrix: tuple[
+        float, ...
+    ]  # a, b, c, d, e, f of x = a u + c v + e, y = b u + d v + f [m, map], of pixels (u, v)
 
 
 def draw_plan(points: PackedPoints, places: Array, floors: Array) -> PlanImage | None:
@@ -80,7 +74,8 @@ def draw_plan(points: PackedPoints, places: Array, floors: Array) -> PlanImage |
     columns = ((x - left) / pixel).astype(np.int64)
     rows = ((top - y) / pixel).astype(np.int64)
     shape = math.ceil(height / pixel), math.ceil(width / pixel)
-    return PlanImage(_painted(columns, rows, above, rgb, shape, pixel), pixel, left, top)
+    painted = _painted(columns, rows, above, rgb, shape, pixel)
+    return PlanImage(painted, (pixel, 0.0, 0.0, -pixel, left, top))
 
 
 def _of_storey(
@@ -208,8 +203,8 @@ def plan_matrix(pixels: Array, places: Array) -> tuple[tuple[float, ...], float]
     return (*linear.T.ravel().tolist(), *shift.tolist()), error
 
 
-def own_plan(plan: OwnPlan, scan_map: ScanMap) -> tuple[bytes, tuple[int, int], tuple[float, ...]]:
-    """PNG of a user's plan, its width and height, and its matrix in the map's frame, as of plan_matrix."""
+def own_plan(plan: OwnPlan, scan_map: ScanMap) -> PlanImage:
+    """The user's plan in the map's frame."""
     points = read_control_points(plan.control_points)
     world = np.column_stack([points[:, 2:], np.full(len(points), scan_map.origin_world[2])])
     places = ((world - scan_map.origin_world) @ scan_map.R_map_from_world.T)[:, :2]
@@ -222,11 +217,4 @@ def own_plan(plan: OwnPlan, scan_map: ScanMap) -> tuple[bytes, tuple[int, int], 
         matrix, _ = plan_matrix(points[:, :2] * scale, places)
     except InputError as error:
         raise InputError(f"{plan.control_points}: {error}") from error
-    return encode_image(rgb, ".png"), size, matrix
-
-
-def check_own_plans(plans: Sequence[OwnPlan], num_storeys: int) -> None:
-    """Refuse plans of storeys that are not there."""
-    for plan in plans:
-        if not 1 <= plan.storey <= num_storeys:
-            raise InputError(f"{plan.image}: found storey {plan.storey}, wanted 1 to {num_storeys}")
+    return PlanImage(rgb, matrix)
