@@ -180,9 +180,9 @@ CUT = "the file is cut off or broken"
         (COUNT, "<I", 1201, f"promises 1201 points of 34 bytes, found room for 1200; {CUT}"),
         (COUNT, "<I", 0xFFFFFFFF, "promises 4294967295 points of 34 bytes"),
         (COUNT, "<I", 0, "promises 0 points"),
-        (SCALE_X, "<d", 0.0, "scales 0 0.0001 0.002 and offsets .*, wanted finite ones and no scale of 0"),
-        (SCALE_X, "<d", float("nan"), "scales nan 0.0001"),
-        (SCALE_X + 24, "<d", float("inf"), "offsets inf 5.849e"),
+        (SCALE_X, "<d", 0.0, r"scales \[.*\] and offsets .*, wanted finite ones and no scale of 0"),
+        (SCALE_X, "<d", float("nan"), r"scales \[ *nan"),
+        (SCALE_X + 24, "<d", float("inf"), r"offsets \[ *inf"),
     ],
 )
 def test_damaged_headers_are_refused(tmp_path, position, form, value, message):

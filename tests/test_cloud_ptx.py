@@ -11,8 +11,8 @@ from piccolo.cloud import open_source, read_cloud
 from piccolo.cloud.readers import reader as raw
 from piccolo.cloud.readers import text
 from piccolo.cloud.readers.ptx import open_ptx
-from piccolo.cloud.readers.reader import CloudReadOptions
 from piccolo.cloud.readers.text import line_blocks, open_pts
+from piccolo.cloud.settings import CloudSettings
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)
@@ -234,7 +234,7 @@ def test_a_file_cut_while_it_is_read_is_refused(tmp_path, monkeypatch, name, gra
         fields = [line.split() for line in lines]
         lines = [" ".join([*f[:3], str(k)] if len(f) == 7 else f) for k, f in enumerate(fields)]
     path = write(tmp_path / name, lines)
-    chunks = open_source(path, CloudReadOptions(intensity_as_gray=gray)).read_chunks()
+    chunks = open_source(path, CloudSettings(intensity_as_gray=gray)).read_chunks()
     next(chunks)
     content = path.read_bytes()
     with path.open("r+b") as file:

@@ -27,7 +27,7 @@ from ..scan_map.open_map import CachePolicy, open_map
 from ..scan_map.scan_map import ScanMap
 from ..views.surfel_renderer import MAX_SURFELS, encode_image
 from ..views.surfels import Surfels, surfels_of
-from .entries import Entry, Place, document_of_entry, names_of, read_entries, short_names_of
+from .entries import Entry, document_of_entry, names_of, read_entries, short_names_of
 from .pictures import make_pictures, read_options_of, taken_out
 from .plan_image import OwnPlan, PlanImage, draw_plan, own_plan
 from .site import begin_folder, check_folder, finish_folder, picture_path, self_contained, write_photo_script
@@ -79,15 +79,14 @@ def build_report(
     if settings.is_self_contained and len(entries) > MAX_SELF_CONTAINED:
         found = f"found {len(entries)} photos, wanted {MAX_SELF_CONTAINED} or fewer"
         raise InputError(f"--self-contained: {found}; without it the report is a folder")
-    place = Place(scan_map, scan_map.storeys)
-    note = check_settings(settings, place, entries)
+    note = check_settings(settings, scan_map, entries)
     with temporary_folder() if settings.is_self_contained else nullcontext(out) as folder:
         if not settings.is_self_contained:
             check_folder(out)
         begin_folder(folder)
-        tasks = [task_of(entry, place, settings) for entry in entries]
-        warnings = (*filter(None, [note]), *write_pictures(tasks, place, folder, settings, workers))
-        document = {**document_of(tasks, place, folder, settings), "note": note}
+        tasks = [task_of(entry, scan_map, settings) for entry in entries]
+        warnings = (*filter(None, [note]), *write_pictures(tasks, scan_map, folder, settings, workers))
+        document = {**document_of(tasks, scan_map, folder, settings), "note": note}
         if not settings.is_self_contained:
             finish_folder(folder, document)
             return Report(out / "index.html", document, warnings)
@@ -95,9 +94,9 @@ def build_report(
         return Report(out, document, warnings)
 
 
-def check_settings(settings: ReportSettings, place: Place, entries: Sequence[Entry]) -> str:
+def check_settings(settings: ReportSettings, scan_map: ScanMap, entries: Sequence[Entry]) -> str:
     """Refuse storeys that are not there, and results of another scan; if forced, return words on these."""
-    found = max(len(place.storeys.storeys), 1)
+    found = max(len(scan_map.storeys.storeys), 1)
     if settings.storey_names and len(settings.storey_names) != found:
         names = f"found {len(settings.storey_names)} names"
         raise InputError(f"--storeys: {names}, wanted {found}, as the scan has storeys, the lowest first")
@@ -105,11 +104,11 @@ def check_settings(settings: ReportSettings, place: Place, entries: Sequence[Ent
         if not 1 <= plan.storey <= found:
             raise InputError(f"{plan.image}: found storey {plan.storey}, wanted 1 to {found}")
     return check_scan(
-        [entry.result for entry in entries], place.scan_map.scan_sha256, "that given", settings.is_forced
+        [entry.result for entry in entries], scan_map.scan_sha256, "that given", settings.is_forced
     )
 
 
-def task_of(entry: Entry, place: Place, settings: ReportSettings) -> Task:
+def task_of(entry: Entry, scan_map: ScanMap, settings: ReportSettings) -> Task:
     """What is to be done for a result; its key is of all that its pictures depend on."""
     result = entry.result
     photo = Path(result.pano)
@@ -119,14 +118,14 @@ def task_of(entry: Entry, place: Place, settings: ReportSettings) -> Task:
         digest = photo_of(photo, read_options_of(result).rig).sha256
     except (OSError, InputError):
         digest = ""
-    parts = entry.line, digest, place.scan_map.scan_sha256, repr(settings.width), digest_of_sources(MAKERS)
+    parts = entry.line, digest, scan_map.scan_sha256, repr(settings.width), digest_of_sources(MAKERS)
     key = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
     found = [result.best_pose, *(a.pose for a in result.alternatives)] if result.best_pose else []
-    return Task(entry, photo, key, [place.scan_map.from_world(pose) for pose in found if pose])
+    return Task(entry, photo, key, [scan_map.from_world(pose) for pose in found if pose])
 
 
 def write_pictures(
-    tasks: Sequence[Task], place: Place, folder: Path, settings: ReportSettings, workers: Workers
+    tasks: Sequence[Task], scan_map: ScanMap, folder: Path, settings: ReportSettings, workers: Workers
 ) -> tuple[str, ...]:
     """Make the pictures that are not there yet; why some could not be made."""
     readable = [task for task in tasks if task.entry.result.status not in (UNREADABLE, FAILED)]
@@ -134,7 +133,7 @@ def write_pictures(
     todo = list({task.key: task for task in missing}.values())
     if not todo:
         return ()
-    points = place.scan_map.points.subsample(MAX_SURFELS)
+    points = scan_map.points.subsample(MAX_SURFELS)
     is_found = any(task.poses for task in todo)
     nothing = Surfels(points, np.empty((0, 3), np.float32), np.empty(0, np.float32))
     scan = (surfels_of(points, workers) if is_found else nothing), points
@@ -154,16 +153,16 @@ def write_pictures(
 
 
 def document_of(
-    tasks: Sequence[Task], place: Place, folder: Path, settings: ReportSettings
+    tasks: Sequence[Task], scan_map: ScanMap, folder: Path, settings: ReportSettings
 ) -> dict[str, Any]:
     """All that the page knows at once; writes the plans."""
-    m = place.scan_map
+    m = scan_map
     names = names_of([task.entry for task in tasks])
     photos = []
     for task, name, short in zip(tasks, names, short_names_of(names), strict=True):
         has_pictures = picture_path(folder, "photos", task.key).exists()
         thumb = f"thumbs/{task.key}.jpg" if picture_path(folder, "thumbs", task.key).exists() else None
-        entry = document_of_entry(task.entry, name, task.key, place)
+        entry = document_of_entry(task.entry, name, task.key, scan_map)
         photos.append({**entry, "short": short, "hasPictures": has_pictures, "thumb": thumb})
     cloud = tasks[0].entry.result.cloud
     clouds = [Path(path).name for path in ([cloud] if isinstance(cloud, str) else cloud)]
@@ -178,28 +177,32 @@ def document_of(
         "north": [float(north[0]), float(north[1])] if has_north else None,
         "origin": m.origin_world.tolist(),
         "R": m.R_map_from_world.ravel().tolist(),
-        "storeys": list(storey_documents(place, tasks, folder, settings)),
+        "storeys": list(storey_documents(scan_map, tasks, folder, settings)),
         "photos": photos,
     }
 
 
 def storey_documents(
-    place: Place, tasks: Sequence[Task], folder: Path, settings: ReportSettings
+    scan_map: ScanMap, tasks: Sequence[Task], folder: Path, settings: ReportSettings
 ) -> Iterator[dict[str, Any]]:
     """The storeys, each with its plan, which is written."""
-    m = place.scan_map
+    m = scan_map
     origin = float((m.R_map_from_world @ m.origin_world)[2])
-    storey, height = place.storeys.at(m.centers)
-    if not place.storeys.storeys:
+    storey, height = scan_map.storeys.at(m.centers)
+    if not scan_map.storeys.storeys:
         storey = np.zeros(len(m.centers), np.int64)
         height = np.full(len(m.centers), CAMERA_HEIGHT)
     own = {plan.storey - 1: plan for plan in settings.own_plans}
-    for k in range(max(len(place.storeys.storeys), 1)):
+    for k in range(max(len(scan_map.storeys.storeys), 1)):
         name = settings.storey_names[k] if settings.storey_names else f"Storey {k + 1}"
         is_here = storey == k
         places = m.centers[is_here]
         floors = m.centers[is_here, 2] - height[is_here]
-        floor = place.storeys.storeys[k].floor if place.storeys.storeys else float(np.median([*floors, 0.0]))
+        floor = (
+            scan_map.storeys.storeys[k].floor
+            if scan_map.storeys.storeys
+            else float(np.median([*floors, 0.0]))
+        )
         plan = own_plan(own[k], m) if k in own else draw_plan(m.points, places, floors)
         document = plan and write_plan(plan, folder)
         yield {"name": name, "floor": floor, "level": round(origin + floor, 3), "plan": document}

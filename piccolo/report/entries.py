@@ -17,7 +17,6 @@ from ..geometry.pose import Array, Pose
 from ..geometry.rotations import heading_pitch_roll_deg
 from ..result import FAILED, UNREADABLE, Result, read_results
 from ..scan_map.scan_map import ScanMap
-from ..scan_map.storeys import Storeys
 
 CHI_SQUARE_95 = 5.991  # of two degrees of freedom
 LEAST_CONFIDENCE = 0.05  # of a photo that is not localized: a best guess below it is on no plan
@@ -40,22 +39,6 @@ class Entry(NamedTuple):
     line: str  # as it stands in its file
     walk: int | None  # which walk it is of, a number; None for a photo that stands alone
     time: float  # [s] by which a walk's photos are in order; else its place in the files
-
-
-class Place(NamedTuple):
-    """The frame of the plans: that of the prepared map."""
-
-    scan_map: ScanMap
-    storeys: Storeys
-
-    def storey_at(self, centers: Array) -> tuple[list[int | None], list[float | None]]:
-        """Index of the storey and height above the floor [m] of places (N, 3) of the map's frame."""
-        storey, height = self.storeys.at(centers)
-        is_known = (storey >= 0).tolist()
-        return (
-            [int(s) if known else None for s, known in zip(storey, is_known, strict=True)],
-            [round(float(h), 3) if known else None for h, known in zip(height, is_known, strict=True)],
-        )
 
 
 def read_entries(paths: Sequence[Path]) -> list[Entry]:
@@ -99,7 +82,7 @@ def short_names_of(names: Sequence[str]) -> list[str]:
     return [short if counts[short] == 1 else name for short, name in zip(own, names, strict=True)]
 
 
-def document_of_entry(entry: Entry, name: str, key: str, place: Place) -> dict[str, Any]:
+def document_of_entry(entry: Entry, name: str, key: str, scan_map: ScanMap) -> dict[str, Any]:
     """What the page knows of a result before it is opened; angles in degrees, lengths in metres."""
     result = entry.result
     is_hopeless = result.status == NOT_LOCALIZED and result.confidence < LEAST_CONFIDENCE
@@ -118,17 +101,19 @@ def document_of_entry(entry: Entry, name: str, key: str, place: Place) -> dict[s
         "walk": entry.walk,
         "time": entry.time if entry.walk is not None else None,
         "gap": bool(result.walk and result.walk.gap),
-        **(found_document(result, result.best_pose, place) if result.best_pose else NOTHING_FOUND),
+        **(found_document(result, result.best_pose, scan_map) if result.best_pose else NOTHING_FOUND),
     }
 
 
-def found_document(result: Result, best_pose: Pose, place: Place) -> dict[str, Any]:
+def found_document(result: Result, best_pose: Pose, scan_map: ScanMap) -> dict[str, Any]:
     """What was found: the best pose, the others, and what speaks for them."""
     poses = [best_pose, *(alternative.pose for alternative in result.alternatives)]
-    storeys, heights = place.storey_at(_centers(poses, place))
+    centers = np.array([scan_map.from_world(pose).center_world for pose in poses])
+    storey, height = scan_map.storeys.at(centers)
+    storeys = [int(k) if k >= 0 else None for k in storey]
     alternatives = [
         {
-            **pose_document(other.pose, place),
+            **pose_document(other.pose, scan_map),
             "score": round(other.score, 3),
             "probability": _rounded(other.probability, 5),
             "scan": other.scan,
@@ -138,20 +123,20 @@ def found_document(result: Result, best_pose: Pose, place: Place) -> dict[str, A
     ]
     evidence = result.evidence
     covariance = result.covariance
-    R_map_from_world = place.scan_map.R_map_from_world
+    R_map_from_world = scan_map.R_map_from_world
     return {
-        **pose_document(best_pose, place),
+        **pose_document(best_pose, scan_map),
         "storey": storeys[0],
-        "height": heights[0],
+        "height": None if storeys[0] is None else round(float(height[0]), 3),
         "alternatives": alternatives,
         "evidence": evidence and {name: _rounded(getattr(evidence, name), 4) for name in EVIDENCE},
         "spread": covariance and spread_document(covariance, R_map_from_world),
     }
 
 
-def pose_document(pose: Pose, place: Place) -> dict[str, Any]:
+def pose_document(pose: Pose, scan_map: ScanMap) -> dict[str, Any]:
     """A pose in the plan's frame, and as the world has it."""
-    local = place.scan_map.from_world(pose)
+    local = scan_map.from_world(pose)
     heading, pitch, roll = heading_pitch_roll_deg(pose)
     return {
         "pose": {
@@ -181,10 +166,6 @@ def spread_document(covariance: PoseCovariance, R_map_from_world: Array) -> dict
 def _below(words: str, pano: str, name: str) -> str:
     """Words on a photo with its name in place of its path."""
     return printable(words.replace(pano, name))
-
-
-def _centers(poses: Sequence[Pose], place: Place) -> Array:
-    return np.array([place.scan_map.from_world(pose).center_world for pose in poses])
 
 
 def _list(values: Array, digits: int = DIGITS) -> list[float]:

@@ -18,7 +18,7 @@ from ..optional import import_optional, new_figure
 from ..panorama.picture import read_picture
 from ..scan_map.scan_map import ScanMap
 from .build import ReportSettings, Task, check_settings, document_of
-from .entries import Entry, Place
+from .entries import Entry
 from .site import begin_folder
 
 if TYPE_CHECKING:
@@ -81,13 +81,12 @@ def write_plan_file(entries: Sequence[Entry], scan_map: ScanMap, out: Path, sett
     PNG, SVG, PDF: the plans of the storeys, one below the other. DXF: points, headings, 95 % ellipses and
     names in the scan's own coordinates, a layer a storey.
     """
-    place = Place(scan_map, scan_map.storeys)
-    check_settings(settings, place, entries)
+    check_settings(settings, scan_map, entries)
     suffix = out.suffix.lower()
     with temporary_folder() as folder:
         begin_folder(folder)
         tasks = [Task(entry, Path(), "", []) for entry in entries]
-        document = document_of(tasks, place, folder, settings)
+        document = document_of(tasks, scan_map, folder, settings)
         content = dxf_of(document) if suffix == DXF else figure_of(document, folder, suffix[1:])
     write_atomically(out, content)
     return len(document["storeys"])

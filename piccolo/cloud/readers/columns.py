@@ -19,17 +19,9 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.colors import Labels, colors_of
+from ..settings import CloudSettings
 from . import reader as raw
-from .reader import (
-    CUT,
-    ChunkReader,
-    CloudReadOptions,
-    PointSource,
-    PointsWithScalar,
-    RawCloud,
-    ScalarReader,
-    point_label,
-)
+from .reader import CUT, ChunkReader, PointSource, PointsWithScalar, RawCloud, ScalarReader, point_label
 
 # The value that means full brightness, by the type of a field without its byte order.
 BRIGHTEST = {"u1": 255.0, "u2": 65535.0, "f4": 1.0, "f8": 1.0}
@@ -157,7 +149,7 @@ def intensity_reader(path: Path, read_scalar: ScalarReader) -> ChunkReader:
     return read_chunks
 
 
-def check_option(path: Path, options: CloudReadOptions, wanted: str) -> None:
+def check_option(path: Path, options: CloudSettings, wanted: str) -> None:
     """Refuse a file with intensity and no colours unless the user wants its intensity for a gray."""
     if not options.intensity_as_gray:
         raise InputError(f"{path}: has intensity and no colours, {wanted}; {OPTION}")

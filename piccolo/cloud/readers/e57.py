@@ -13,6 +13,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...geometry.pose import Array, Pose, rotate_points
+from ..settings import IN_METRES, CloudSettings
 from .columns import OPTION, intensity_reader
 from .e57_file import (
     MAGIC,
@@ -28,7 +29,7 @@ from .e57_file import (
     scaled,
     text_of,
 )
-from .reader import CHUNK, PLAIN, CloudFormat, CloudReadOptions, PointSource, RawCloud
+from .reader import CHUNK, CloudFormat, PointSource, RawCloud
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
@@ -67,7 +68,7 @@ class _UnusableError(Exception):
     """A scan is whole, but not of use here."""
 
 
-def open_e57(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+def open_e57(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """The coloured points of all scans of an E57 file.
 
     Points with an invalid state (direction only, or nothing) or an invalid colour are left out. A colour's

@@ -17,18 +17,9 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...optional import import_optional
+from ..settings import IN_METRES, CloudSettings
 from .columns import OPTION, intensity_reader, label_reader
-from .reader import (
-    CHUNK,
-    CUT,
-    PLAIN,
-    CloudFormat,
-    CloudReadOptions,
-    PointSource,
-    PointsWithScalar,
-    RawCloud,
-    quoted,
-)
+from .reader import CHUNK, CUT, CloudFormat, PointSource, PointsWithScalar, RawCloud, quoted
 
 MAGIC = b"LASF"
 MIN_HEADER_SIZE = 227  # [byte]
@@ -55,9 +46,16 @@ NUM_LAYERS = {6: 9, 7: 10, 8: 11, 9: 10, 10: 12}  # of a chunk, by point format;
 MAX_CHUNK_SIZE = 1 << 29  # [byte] of a chunk's records, for it is decompressed at once; 2 MB are usual
 # What is wanted of formats 6 to 10, where fields can be passed over.
 SELECTED = ("XY_RETURNS_CHANNEL", "Z", "INTENSITY", "FLAGS", "CLASSIFICATION", "RGB")
-
+WITHHELD_OLD = 0x80  # bit of the flags' byte, in the formats 0-5
+WITHHELD = 0x04  # in 6-10
+CLASS_OLD = 0x1F  # bits of the class, in the formats 0-5
+CLASS = 0xFF
+MAX_SAMPLES = 1 << 20
+NUM_SAMPLE_RUNS = 64
+TO_8_BIT = ((np.arange(1 << 16, dtype=np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
 BROKEN = "the file is cut off or broken"
 
+Records = NDArray[np.void]
 LazChunk = tuple[int, int]  # points, bytes
 
 
@@ -122,7 +120,7 @@ def read_header(path: Path) -> LasHeader:
         wrong = f"records of {record_size} bytes, wanted {least} or more in point format {point_format}"
         raise InputError(f"{path}: {wrong if least else f'unknown point format {point_format}, {WANTED}'}")
     if not (np.isfinite([scales, offsets]).all() and scales.all()):
-        found = f"scales {_listed(scales)} and offsets {_listed(offsets)}"
+        found = f"scales {scales} and offsets {offsets}"
         raise InputError(f"{path}: {found}, wanted finite ones and no scale of 0")
     room = (size - points_offset) // record_size
     if num_points == 0 or (num_points > room and not is_compressed):
@@ -130,10 +128,6 @@ def read_header(path: Path) -> LasHeader:
         raise InputError(f"{path}: the header {promised}; the file is cut off or broken")
     sizes = size, header_size, points_offset, num_vlrs, point_format, record_size, num_points
     return LasHeader(path, *sizes, scales, offsets, is_compressed)
-
-
-def _listed(values: NDArray[np.float64]) -> str:
-    return " ".join(f"{value:g}" for value in values)
 
 
 class LasLayout(NamedTuple):
@@ -149,10 +143,12 @@ def read_laz_layout(header: LasHeader) -> LasLayout:
     """The compression of a LAZ file; InputError if its parts don't fit together or in the file."""
     lazrs = import_optional(header.path, "lazrs")
     with header.path.open("rb") as file:
-        laszip = _laszip_record(header, file)
+        laszip = record_content(header, file, LASZIP_USER, LASZIP_RECORD_ID)
+        if laszip is None:
+            text = "the points are compressed, but no record says how (LASzip's VLR)"
+            raise InputError(f"{header.path}: {text}")
         num_layers = _check_items(header, laszip, lazrs)
-        table_offset = _table_offset(header, file)
-        table = _table(header, file, table_offset)
+        table_offset, table = _table(header, file)
     with _refusing(header.path, lazrs):
         vlr = lazrs.LazVlr(laszip)
         entries = lazrs.read_chunk_table_only(io.BytesIO(table), vlr)
@@ -160,15 +156,6 @@ def read_laz_layout(header: LasHeader) -> LasLayout:
             entries = [(vlr.chunk_size(), size) for _, size in entries]
     offset = header.points_offset + OFFSET_SIZE
     return LasLayout(offset, _checked_chunks(header, entries, table_offset - offset), laszip, num_layers)
-
-
-def _laszip_record(header: LasHeader, file: BinaryIO) -> bytes:
-    """The content of the record that LASzip leaves behind the header."""
-    content = record_content(header, file, LASZIP_USER, LASZIP_RECORD_ID)
-    if content is None:
-        text = "the points are compressed, but no record says how (LASzip's VLR)"
-        raise InputError(f"{header.path}: {text}")
-    return content
 
 
 def record_content(header: LasHeader, file: BinaryIO, wanted_user: bytes, wanted_id: int) -> bytes | None:
@@ -201,20 +188,19 @@ def _without_versions(laszip: bytes) -> list[bytes]:
     return [laszip[:2], laszip[ITEMS_AT - 2 : ITEMS_AT], *items]
 
 
-def _table_offset(header: LasHeader, file: BinaryIO) -> int:
-    """Where the chunk table begins. A writer that could not go back says it in the file's last bytes."""
+def _table(header: LasHeader, file: BinaryIO) -> tuple[int, bytes]:
+    """Where the compressed chunk table begins, and its bytes, if the file has room for what it promises.
+
+    A writer that could not go back says in the file's last bytes where it begins.
+    """
     for position in (header.points_offset, header.size - 8):
         file.seek(position)
         offset = int.from_bytes(file.read(8), "little", signed=True)
-        if header.points_offset + OFFSET_SIZE <= offset <= header.size - 8:
-            return offset
-        if offset > header.points_offset:
+        is_inside = header.points_offset + OFFSET_SIZE <= offset <= header.size - 8
+        if is_inside or offset > header.points_offset:
             break
-    raise InputError(f"{header.path}: no chunk table within the file; it is cut off or broken")
-
-
-def _table(header: LasHeader, file: BinaryIO, offset: int) -> bytes:
-    """The compressed chunk table, if the file has room for as many chunks as it promises."""
+    if not is_inside:
+        raise InputError(f"{header.path}: no chunk table within the file; it is cut off or broken")
     file.seek(offset)
     num_chunks = int.from_bytes(file.read(8)[4:], "little")
     # each chunk begins with a whole point
@@ -223,7 +209,7 @@ def _table(header: LasHeader, file: BinaryIO, offset: int) -> bytes:
         counts = f"promises {num_chunks} chunks, wanted 1 to {max_chunks}"
         raise InputError(f"{header.path}: the chunk table {counts}; {BROKEN}")
     file.seek(offset)
-    return file.read(MAX_ENTRY_SIZE * (num_chunks + 32))
+    return offset, file.read(MAX_ENTRY_SIZE * (num_chunks + 32))
 
 
 def _checked_chunks(header: LasHeader, entries: list[LazChunk], num_bytes: int) -> tuple[LazChunk, ...]:
@@ -239,8 +225,8 @@ def _checked_chunks(header: LasHeader, entries: list[LazChunk], num_bytes: int) 
             where = f"{header.path}: chunk {len(chunks) + 1} of {count} points in {size} bytes"
             raise InputError(f"{where}, wanted 1 to {most} points, in the file; the chunk table is broken")
         chunks.append((count, size))
-        num_left = num_left - count
-        num_bytes = num_bytes - size
+        num_left -= count
+        num_bytes -= size
     if num_left:
         counts = f"promises {header.num_points} points, the chunk table has {header.num_points - num_left}"
         raise InputError(f"{header.path}: the header {counts}")
@@ -292,18 +278,7 @@ def _refusing(path: Path, lazrs: ModuleType) -> Iterator[None]:
         raise InputError(f"{path}: the compressed points are broken ({why})") from error
 
 
-WITHHELD_OLD = 0x80  # bit of the flags' byte, in the formats 0-5
-WITHHELD = 0x04  # in 6-10
-CLASS_OLD = 0x1F  # bits of the class, in the formats 0-5
-CLASS = 0xFF
-MAX_SAMPLES = 1 << 20
-NUM_SAMPLE_RUNS = 64
-TO_8_BIT = ((np.arange(1 << 16, dtype=np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
-
-Records = NDArray[np.void]
-
-
-def open_las(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+def open_las(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """The points of a LAS or LAZ file; withheld ones are left out.
 
     Colours are 16-bit, as the format says. They are taken for 8-bit if none of a million points, spread
@@ -322,14 +297,14 @@ def open_las(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     note = f"{path}: the colours are read as 8-bit values in 16-bit fields"
     return PointSource(
         path,
-        lambda: (_cloud(header, records, is_8_bit) for records in _chunks(header, layout)),
+        lambda: (_colored(header, records, is_8_bit) for records in _chunks(header, layout)),
         header.num_points,
         (f"{note} (largest value {brightest} in {num_samples} points looked at)",) if is_8_bit else (),
     )
 
 
 def _gray_source(
-    header: LasHeader, layout: LasLayout, options: CloudReadOptions, num_samples: int
+    header: LasHeader, layout: LasLayout, options: CloudSettings, num_samples: int
 ) -> PointSource:
     """The points with their intensity for a gray, if that is wanted, of a file without colours."""
     if not options.intensity_as_gray:
@@ -404,7 +379,7 @@ def _points(header: LasHeader, records: Records) -> tuple[NDArray[np.float64], R
         return records["xyz"] * header.scales + header.offsets, records
 
 
-def _cloud(header: LasHeader, records: Records, is_8_bit: bool) -> RawCloud:
+def _colored(header: LasHeader, records: Records, is_8_bit: bool) -> RawCloud:
     points_world, records = _points(header, records)
     rgb = records["rgb"]
     if not is_8_bit:

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.pose import Array
-from ..settings import UpAxis
+from ..settings import IN_METRES, CloudSettings, UpAxis
 from .columns import BRIGHTEST
 from .mesh_files import GLB_MAGIC, NO_MATERIAL, Texture
 from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply
-from .reader import CHUNK, PLAIN, CloudFormat, CloudReadOptions, PointSource, RawCloud
+from .reader import CHUNK, CloudFormat, PointSource, RawCloud
 
 # 1 / p and 1 / p^2 of the plastic number p, the root of p^3 = p + 1
 R2_STEPS = (0.7548776662466927, 0.5698402909980532)
@@ -160,7 +160,7 @@ MAX_POINTS = 30_000_000
 MAX_TRIANGLES = 200_000_000  # those of a mesh count again at each place where the scene puts it
 
 
-def open_mesh(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+def open_mesh(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """The points on the triangles of an OBJ, GLB or glTF file, 10,000 on a square metre.
 
     The options' scale tells what a metre is in the file. A file that would give more than 30 million is
@@ -174,7 +174,7 @@ def open_mesh(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     return _source((load_gltf if is_gltf else load_obj)(path, content), options.scale)
 
 
-def open_ply_mesh(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+def open_ply_mesh(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """The points on the faces of a PLY file, as by open_mesh; with a texture if a comment names one."""
     return _source(load_ply(path), options.scale)
 

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...files.array_archive import MAX_HEAD_SIZE, read_header
+from ..settings import IN_METRES, CloudSettings
 from .columns import BRIGHTEST, brightest_of, colored_chunks, in_chunks, read_records
-from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, point_label, quoted
+from .reader import CloudFormat, PointSource, point_label, quoted
 
 NPY_MAGIC = b"\x93NUMPY"
 ZIP_MAGIC = b"PK\x03\x04"
@@ -60,7 +61,7 @@ class ArrayInFile(NamedTuple):
             yield rows
 
 
-def open_npy(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+def open_npy(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """The points of a .npy file: an array (N, 6) of x y z r g b, colours 0-255."""
     array = _open_array(path, None, path.stat().st_size)
     if len(array.shape) != 2 or array.shape[1] != 6 or array.dtype.kind not in "fiu":
@@ -69,7 +70,7 @@ def open_npy(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     return _source(path, lambda: ((rows[:, :3], rows[:, 3:]) for rows in array.read_rows()), brightest, array)
 
 
-def open_npz(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+def open_npz(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """The points of a .npz file: the arrays `points` (or `xyz`) and `colors` (or `rgb`), both (N, 3).
 
     The range of colours follows from their type: uint8 0-255, uint16 0-65535, float 0-1. An archive whose

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...kernels.jit import inline_kernel, kernel
+from ..settings import IN_METRES, CloudSettings
 from .columns import (
     ColumnReader,
     Columns,
@@ -27,7 +28,7 @@ from .columns import (
     read_records,
     take_records,
 )
-from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, RawCloud, point_label, quoted
+from .reader import CloudFormat, PointSource, RawCloud, point_label, quoted
 from .text import LineLayout, NumberLines
 
 MAX_HEADER_SIZE = MAX_ROW_SIZE = 1 << 16  # [byte]; a row is a point
@@ -189,7 +190,7 @@ def decompress_lzf(data, out):
     return filled
 
 
-def open_pcd(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+def open_pcd(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """The points of a PCD file.
 
     Colours are `rgb` or `rgba`, three bytes in one integer or, if the field is declared a float, in its bits,
@@ -213,7 +214,7 @@ def open_pcd(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     return column_source(path, read_columns, types, header.num_points, options.labels)
 
 
-def _wanted_fields(header: PcdHeader, options: CloudReadOptions) -> tuple[PcdField, ...]:
+def _wanted_fields(header: PcdHeader, options: CloudSettings) -> tuple[PcdField, ...]:
     """The fields x y z and the colour's one or three, or the intensity or label if the options say so."""
     found = {field.name: field for field in header.fields if field.count == 1}
     names = [field.name for field in header.fields]

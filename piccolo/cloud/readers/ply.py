@@ -15,6 +15,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from ...errors import InputError
+from ..settings import IN_METRES, CloudSettings
 from .columns import (
     COLOR_NAMES,
     INTENSITY_NAMES,
@@ -26,7 +27,7 @@ from .columns import (
     read_records,
 )
 from .mesh import open_ply_mesh
-from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, quoted
+from .reader import CloudFormat, PointSource, quoted
 from .text import LineLayout, NumberLines
 
 MAGIC = (b"ply\n", b"ply\r")
@@ -56,7 +57,7 @@ class PlyHeader:
         return self.elements[self.index]
 
 
-def open_ply(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+def open_ply(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """The vertices of a PLY file, binary or ASCII; points on its faces if it has any.
 
     Colours are uchar 0-255, ushort 0-65535, or float and double 0-1. Other properties and elements are left
@@ -141,7 +142,7 @@ def _vertex_index(path: Path, elements: Sequence[PlyElement]) -> int:
     raise InputError(f"{path}: the header has no element 'vertex', {WANTED}")
 
 
-def _property_names(header: PlyHeader, options: CloudReadOptions) -> tuple[str, ...]:
+def _property_names(header: PlyHeader, options: CloudSettings) -> tuple[str, ...]:
     """The vertices' properties for x, y, z and red, green, blue, or intensity, or label."""
     found = [prop.name for prop in header.vertices.properties]
     colors = () if options.labels else color_names(found)

@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.colors import Labels
-from ..settings import UpAxis
+from ..settings import CloudSettings, UpAxis
 
 HEAD_SIZE = 512  # [byte] by which a format is known
 CHUNK = 1 << 20  # points of a chunk, at most
@@ -18,17 +17,6 @@ CUT = "the file was cut while it was read, wanted a whole file"
 # points (N, 3) in the file's unit, and a number (N,) of each: intensity or label
 PointsWithScalar = tuple[NDArray[np.float64], NDArray[np.float64]]
 ScalarReader = Callable[[], Iterator[PointsWithScalar]]  # each call from the start
-
-
-class CloudReadOptions(NamedTuple):
-    """What the user wants of a reader."""
-
-    intensity_as_gray: bool = False  # take intensity for a gray where a file has no colours
-    labels: Labels | None = None  # take the points' labels for their colours
-    scale: float = 1.0  # metres per unit of the file, for what counts by metres; points stay in its unit
-
-
-PLAIN = CloudReadOptions()
 
 
 class RawCloud(NamedTuple):
@@ -60,7 +48,7 @@ class CloudFormat(NamedTuple):
     name: str
     suffixes: frozenset[str]  # lower case, with the dot
     has_magic: Callable[[bytes], bool]  # of a file's first HEAD_SIZE bytes; content goes before names
-    open_source: Callable[[Path, CloudReadOptions], PointSource]
+    open_source: Callable[[Path, CloudSettings], PointSource]
     has_labels: bool = False  # the reader knows them
 
 

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
+from ..settings import IN_METRES, CloudSettings
 from . import reader as raw
 from .columns import BRIGHTEST, INTENSITY_NAMES, check_option, color_names, colored_chunks, intensity_reader
-from .reader import CUT, PLAIN, CloudFormat, CloudReadOptions, PointSource, RawCloud, quoted
+from .reader import CUT, CloudFormat, PointSource, RawCloud, quoted
 
 BLOCK = 1 << 20  # [byte] read at once; no line is longer
 COMMENT_MARKS = (b"#", b"//")
@@ -186,7 +187,7 @@ def is_number(field: str) -> bool:
     return "_" not in field  # which Python takes and np.loadtxt does not
 
 
-def line_source(path: Path, layout: LineLayout, options: CloudReadOptions, wanted: str) -> PointSource:
+def line_source(path: Path, layout: LineLayout, options: CloudSettings, wanted: str) -> PointSource:
     """The points of lines x y z r g b, colours 0-255, or of x y z intensity if the options allow it."""
 
     def read() -> Iterator[tuple[NDArray[np.float64], NDArray[Any]]]:
@@ -207,7 +208,7 @@ COLUMNS = {NUM_WITH_INTENSITY: (0, 1, 2, 3), 6: (0, 1, 2, 3, 4, 5), 7: (0, 1, 2,
 PTS_WANTED = "wanted lines x y z intensity r g b or x y z r g b, colours 0-255"
 
 
-def open_text(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+def open_text(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """The points of a text file: whitespace, comma or semicolon between numbers, colours 0-255.
 
     A header line is passed over, or obeyed if it names x y z and r g b (or red green blue), or x y z and an
@@ -277,7 +278,7 @@ def _named_columns(header: str) -> tuple[int, ...]:
 TEXT = CloudFormat("text x y z r g b", TEXT_SUFFIXES, lambda head: False, open_text)
 
 
-def open_pts(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+def open_pts(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """The points of all scans of a PTS file.
 
     All lines must have as many columns as the first one: x y z r g b if there are
