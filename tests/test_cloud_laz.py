@@ -69,13 +69,6 @@ def test_layers_larger_than_their_chunk_are_refused(tmp_path, point_format):
             open_source(write(tmp_path, patched(content, position, "<I", 0xFFFFFFFF)))
 
 
-def test_chunks_that_would_fill_the_memory_are_refused(tmp_path, monkeypatch):
-    path = write(tmp_path, laz_bytes(las_bytes(RAW), 600))
-    monkeypatch.setattr(las, "MAX_CHUNK_SIZE", 34 * 600 - 1)
-    with pytest.raises(InputError, match=r"chunk 1 of 600 points in \d+ bytes, wanted 1 to 599 points"):
-        open_source(path)
-
-
 def test_broken_points_are_refused(tmp_path):
     content = laz_bytes(las_bytes(RAW, 3), 600)
     (begin,) = struct.unpack_from("<I", content, POINTS_OFFSET)

@@ -64,7 +64,7 @@ def test_lzf_copies_far_and_long():
     assert unpacked(b"\x00a\xe0\xff\x00", 264 + 1) == b"a" * 265
 
 
-@settings(deadline=None, max_examples=300)
+@settings(deadline=None, max_examples=100)
 @given(data=st.binary(max_size=60), size=st.integers(0, 3000))
 def test_lzf_equals_twin_on_any_bytes(data, size):
     expected = naive.decompress_lzf(data)
