@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import numba
@@ -13,8 +14,9 @@ import numpy as np
 import pytest
 
 from piccolo.cli import progress
-from piccolo.files import cache
+from piccolo.files import cache, temporary
 from piccolo.files.atomic import replacing
+from piccolo.files.temporary import PREFIX, temporary_folder
 from piccolo.kernels import jit
 from piccolo.kernels.jit import kernel
 
@@ -278,3 +280,48 @@ def test_importing_writes_nothing(tmp_path):
     command = [sys.executable, "-c", "import piccolo.cli.localize, piccolo.cli.evaluate"]
     subprocess.run(command, cwd=ROOT, env=environment, check=True)
     assert list(tmp_path.iterdir()) == []
+
+
+HOLD = """
+import sys, time
+from piccolo.files.temporary import temporary_folder
+with temporary_folder() as folder:
+    (folder / "frame.jpg").touch()
+    print(folder, flush=True)
+    time.sleep(600)
+"""
+
+
+@pytest.fixture
+def temporary_folders(tmp_path, monkeypatch):
+    """A function that lists the temporary folders there are."""
+    monkeypatch.setattr(temporary.tempfile, "tempdir", str(tmp_path))
+    return lambda: [path for path in tmp_path.iterdir() if path.name.startswith(PREFIX)]
+
+
+def test_a_folder_is_removed_at_the_end_and_after_an_error(temporary_folders):
+    with temporary_folder() as folder:
+        (folder / "a").touch()
+        assert temporary_folders() == [folder]
+    with pytest.raises(ValueError, match="x"), temporary_folder():
+        raise ValueError("x")
+    assert temporary_folders() == []
+
+
+def test_what_a_killed_process_left_is_removed_and_what_a_living_one_has_stays(temporary_folders, tmp_path):
+    command = [sys.executable, "-c", HOLD]
+    where = os.environ | {"TMPDIR": str(tmp_path)}
+    with subprocess.Popen(command, env=where, stdout=subprocess.PIPE, text=True) as process:
+        folder = tmp_path / process.stdout.readline().strip()
+        os.utime(folder, (time.time() - 60, time.time() - 60))
+        with temporary_folder():
+            assert folder in temporary_folders()
+        process.kill()
+    (tmp_path / f"{PREFIX}12345678").symlink_to(tmp_path)
+    (tmp_path / f"{PREFIX}87654321").mkdir()  # made a moment ago
+    with temporary_folder() as own:
+        assert {path.name for path in temporary_folders()} == {
+            own.name,
+            f"{PREFIX}12345678",
+            f"{PREFIX}87654321",
+        }
