@@ -25,7 +25,7 @@ from ..confidence.occlusion import occlusion_mask
 from ..errors import InputError
 from ..files.temporary import temporary_folder
 from ..geometry.colors import Labels
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Array, Pose, yaw_rotation
 from ..jobs.threads import Workers
 from ..panorama import Panorama, ReadOptions, read_panorama
 from ..panorama.model import shrink
@@ -144,13 +144,8 @@ def thumbnail_of(panorama: Panorama, pose: Pose | None) -> bytes:
 
 def level(R_cam_from_world: Array) -> Array:
     """R_lens_from_cam (3, 3) of a level lens that looks where the image centre does."""
-    forward = R_cam_from_world[0] * np.array([1.0, 1.0, 0.0])
-    if np.linalg.norm(forward) < 1e-6:
-        forward = np.array([1.0, 0.0, 0.0])
-    forward /= np.linalg.norm(forward)
-    up = np.array([0.0, 0.0, 1.0])
-    R_lens_from_world = np.stack([forward, np.cross(up, forward), up])
-    return np.asarray(R_lens_from_world @ R_cam_from_world.T)
+    yaw = math.atan2(R_cam_from_world[0, 1], R_cam_from_world[0, 0])
+    return np.asarray(yaw_rotation(yaw) @ R_cam_from_world.T)
 
 
 def _base64(content: bytes) -> str:

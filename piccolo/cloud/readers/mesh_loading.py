@@ -3,8 +3,6 @@
 import logging
 import re
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from io import BytesIO
 from itertools import product
@@ -42,6 +40,7 @@ TEXTURE_COMMENT = re.compile(r"TextureFile[ \t]*(.*?)[ \t\r]*$", re.MULTILINE | 
 # Once, here: the filters are of the process, and no thread may change them.
 # NumPy before 2.3 only warned where it stopped at what is no number.
 warnings.filterwarnings("ignore", module=r"trimesh\.")
+logging.getLogger("trimesh").addHandler(logging.NullHandler())  # else Python prints what nobody listens to
 warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
 
 
@@ -111,7 +110,7 @@ def _with_raw_colors(parsed: dict[str, Any]) -> dict[str, Any]:
 def _scene(resolver: FolderResolver, content: bytes, kind: str, has_texture: bool = True) -> Any:
     trimesh = import_optional(resolver.path, "trimesh")
     try:
-        with own_limit(), _quiet():
+        with own_limit():
             # vertices are split by texture coordinates only if there is a texture: colours go by vertices
             options = {"fix_texture": has_texture} if kind == "ply" else {}
             load = trimesh.exchange.load.mesh_loaders[kind]
@@ -126,18 +125,6 @@ def _scene(resolver: FolderResolver, content: bytes, kind: str, has_texture: boo
     if resolver.refusal is not None:
         raise resolver.refusal
     return scene
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep trimesh from printing."""
-    logger = logging.getLogger("trimesh")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL + 1)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
 
 
 def load_ply(path: Path) -> Loaded:
