@@ -31,6 +31,36 @@ MAX_STEPS = 25  # of Newton; five are usual
 LEAST = 1e-12  # of the denominator
 NO_MORE = 1e-30  # of a coefficient: less does nothing at any radius, but overflows
 CONVERGED = 1e-12  # of x' and y': a thousandth of a millionth of a pixel
+PERSPECTIVE = "perspective"
+EQUIDISTANT = "equidistant"
+FOV = "fov"
+SPHERE = "sphere"
+# lens, and names of the parameters as the formulas here have them
+MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
+    model: (lens, tuple(names.split()))
+    for model, lens, names in (
+        ("SIMPLE_PINHOLE", PERSPECTIVE, "f cx cy"),
+        ("PINHOLE", PERSPECTIVE, "fx fy cx cy"),
+        ("SIMPLE_RADIAL", PERSPECTIVE, "f cx cy k1"),
+        ("RADIAL", PERSPECTIVE, "f cx cy k1 k2"),
+        ("OPENCV", PERSPECTIVE, "fx fy cx cy k1 k2 p1 p2"),
+        ("FULL_OPENCV", PERSPECTIVE, "fx fy cx cy k1 k2 p1 p2 k3 d1 d2 d3"),
+        ("FOV", FOV, "fx fy cx cy omega"),
+        ("SIMPLE_FISHEYE", EQUIDISTANT, "f cx cy"),
+        ("FISHEYE", EQUIDISTANT, "fx fy cx cy"),
+        ("SIMPLE_RADIAL_FISHEYE", EQUIDISTANT, "f cx cy k1"),
+        ("RADIAL_FISHEYE", EQUIDISTANT, "f cx cy k1 k2"),
+        ("OPENCV_FISHEYE", EQUIDISTANT, "fx fy cx cy k1 k2 k3 k4"),
+        ("THIN_PRISM_FISHEYE", EQUIDISTANT, "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1"),
+        ("EQUIRECTANGULAR", SPHERE, "w h"),
+    )
+}
+MAX_PERSPECTIVE = math.radians(89.9)  # half angle: no plane shows more
+MAX_ASPECT_ERROR = 0.01  # of a calibration of another size
+MAX_NUMBER = 1e6
+MIN_FOCAL = 1.0  # [px]
+TABLE_SIZE = 4096  # angles at which the radial part is tabulated, for Newton's first guess
+SMALL = 1e-4  # [rad] from the axis, at which the resolution is taken
 
 
 class Distortion(NamedTuple):
@@ -130,38 +160,6 @@ class Distortion(NamedTuple):
         found_x, found_y = self.apply(x, y)
         is_found = np.hypot(found_x - x_distorted, found_y - y_distorted) < 1e3 * CONVERGED
         return x, y, is_found & self.keeps_sides(x, y)
-
-
-PERSPECTIVE = "perspective"
-EQUIDISTANT = "equidistant"
-FOV = "fov"
-SPHERE = "sphere"
-# lens, and names of the parameters as the formulas here have them
-MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
-    model: (lens, tuple(names.split()))
-    for model, lens, names in (
-        ("SIMPLE_PINHOLE", PERSPECTIVE, "f cx cy"),
-        ("PINHOLE", PERSPECTIVE, "fx fy cx cy"),
-        ("SIMPLE_RADIAL", PERSPECTIVE, "f cx cy k1"),
-        ("RADIAL", PERSPECTIVE, "f cx cy k1 k2"),
-        ("OPENCV", PERSPECTIVE, "fx fy cx cy k1 k2 p1 p2"),
-        ("FULL_OPENCV", PERSPECTIVE, "fx fy cx cy k1 k2 p1 p2 k3 d1 d2 d3"),
-        ("FOV", FOV, "fx fy cx cy omega"),
-        ("SIMPLE_FISHEYE", EQUIDISTANT, "f cx cy"),
-        ("FISHEYE", EQUIDISTANT, "fx fy cx cy"),
-        ("SIMPLE_RADIAL_FISHEYE", EQUIDISTANT, "f cx cy k1"),
-        ("RADIAL_FISHEYE", EQUIDISTANT, "f cx cy k1 k2"),
-        ("OPENCV_FISHEYE", EQUIDISTANT, "fx fy cx cy k1 k2 k3 k4"),
-        ("THIN_PRISM_FISHEYE", EQUIDISTANT, "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1"),
-        ("EQUIRECTANGULAR", SPHERE, "w h"),
-    )
-}
-MAX_PERSPECTIVE = math.radians(89.9)  # half angle: no plane shows more
-MAX_ASPECT_ERROR = 0.01  # of a calibration of another size
-MAX_NUMBER = 1e6
-MIN_FOCAL = 1.0  # [px]
-TABLE_SIZE = 4096  # angles at which the radial part is tabulated, for Newton's first guess
-SMALL = 1e-4  # [rad] from the axis, at which the resolution is taken
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,29 @@ NUM_SCORING_POINTS = 2000  # drawn, on which a hypothesis is scored: a plane of 
 TOLERANCE = 0.03  # of an inlier, from the plane: six times a scanner's noise of 5 mm [m]
 INLIER_ANGLE = np.radians(15.0)  # of its normal, loose since normals near edges lean
 NUM_REFITS = 4  # by least squares, until the inliers stay the same
+MAX_LEAN = np.radians(15.0)  # of the vertical to a direction that is said to be up
+SNAP_ANGLE = np.radians(0.2)  # of the vertical to such a direction that is then taken itself
+AGREE_ANGLE = np.radians(3.0)  # of a plane to level or upright, that counts for the vertical
+MIN_ALIGNED = 0.6  # fraction of the planes' area that is level or upright: roofs are neither
+MAX_FLATNESS = 0.75  # height to the lesser width of a scan, above which a wall may be its floor
+LEVEL_ANGLE = np.radians(8.0)  # of a level surface's normal to the vertical: ramps up to 1 : 7 are floors
+MIN_LEVEL = 0.3  # area of a floor or ceiling to that of the largest: tables have less
+HEADROOM = 1.9  # of a person [m]
+FURNITURE = 0.3, 1.2  # heights of seats, tables, counters, shelves above the floor [m]
+SHEET = 0.12  # half of a floor's thickness [m]
+STEP = 0.3  # what is lower does not keep anybody from walking [m]
+CELL = 0.25  # of the grid in which people walk [m]
+MAX_CELLS = 4e6  # of a grid: of wider scans the cells are larger
+REACH = 2  # cells between the points of a floor, or between free space and the next thing over a floor
+MIN_PIECE = 8  # cells of free space in one piece
+FEW_POINTS = 0.001  # added to both counts of a ratio, so that a handful says little
+FEW_CELLS = 20.0  # as well
+PLAIN = 1.0  # sum of both cues from which on they decide: a ratio of e
+LEAST = -0.5  # of the lesser cue, below which they disagree
+HIGH = 4.0  # a storey from which on [m] trusses look like tables
+LEAST_IN_HIGH = 0.3  # there both cues must agree
+# up (3,) by a photo in the scan turned by its vertical (3,), None if it isn't localized; and why
+FindByPhoto = Callable[[Array], tuple[Array | None, str]]
 
 
 class PointNormals(NamedTuple):
@@ -103,33 +126,6 @@ def _are_inliers(
     distances = np.einsum("hi,ji->hj", normals, cloud.points[some]) - offsets
     cosines = np.einsum("hi,ji->hj", normals, cloud.normals[some])
     return np.asarray((np.abs(distances) < TOLERANCE) & (np.abs(cosines) > np.cos(INLIER_ANGLE)))
-
-
-MAX_LEAN = np.radians(15.0)  # of the vertical to a direction that is said to be up
-SNAP_ANGLE = np.radians(0.2)  # of the vertical to such a direction that is then taken itself
-AGREE_ANGLE = np.radians(3.0)  # of a plane to level or upright, that counts for the vertical
-MIN_ALIGNED = 0.6  # fraction of the planes' area that is level or upright: roofs are neither
-MAX_FLATNESS = 0.75  # height to the lesser width of a scan, above which a wall may be its floor
-# up (3,) by a photo in the scan turned by its vertical (3,), None if it isn't localized; and why
-FindByPhoto = Callable[[Array], tuple[Array | None, str]]
-
-
-LEVEL_ANGLE = np.radians(8.0)  # of a level surface's normal to the vertical: ramps up to 1 : 7 are floors
-MIN_LEVEL = 0.3  # area of a floor or ceiling to that of the largest: tables have less
-HEADROOM = 1.9  # of a person [m]
-FURNITURE = 0.3, 1.2  # heights of seats, tables, counters, shelves above the floor [m]
-SHEET = 0.12  # half of a floor's thickness [m]
-STEP = 0.3  # what is lower does not keep anybody from walking [m]
-CELL = 0.25  # of the grid in which people walk [m]
-MAX_CELLS = 4e6  # of a grid: of wider scans the cells are larger
-REACH = 2  # cells between the points of a floor, or between free space and the next thing over a floor
-MIN_PIECE = 8  # cells of free space in one piece
-FEW_POINTS = 0.001  # added to both counts of a ratio, so that a handful says little
-FEW_CELLS = 20.0  # as well
-PLAIN = 1.0  # sum of both cues from which on they decide: a ratio of e
-LEAST = -0.5  # of the lesser cue, below which they disagree
-HIGH = 4.0  # a storey from which on [m] trusses look like tables
-LEAST_IN_HIGH = 0.3  # there both cues must agree
 
 
 class Alignment(NamedTuple):

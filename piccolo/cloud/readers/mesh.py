@@ -28,6 +28,9 @@ from .reader import CHUNK, CloudFormat, PointSource, RawCloud
 # 1 / p and 1 / p^2 of the plastic number p, the root of p^3 = p + 1
 R2_STEPS = (0.7548776662466927, 0.5698402909980532)
 BLOCK = 1 << 18  # triangles whose corners are held at once
+DENSITY = 10_000.0  # points on a square metre, 1 cm apart
+MAX_POINTS = 30_000_000
+MAX_TRIANGLES = 200_000_000  # those of a mesh count again at each place where the scene puts it
 
 
 class Surface(NamedTuple):
@@ -153,11 +156,6 @@ def linear_to_srgb(linear: Array) -> Array:
 
 def _bytes(colors: Array) -> NDArray[np.uint8]:
     return np.rint(np.clip(colors, 0.0, 1.0) * 255.0).astype(np.uint8)
-
-
-DENSITY = 10_000.0  # points on a square metre, 1 cm apart
-MAX_POINTS = 30_000_000
-MAX_TRIANGLES = 200_000_000  # those of a mesh count again at each place where the scene puts it
 
 
 def open_mesh(path: Path, options: CloudSettings = IN_METRES) -> PointSource:

@@ -22,6 +22,13 @@ from .reader import CUT, CloudFormat, PointSource, RawCloud, quoted
 BLOCK = 1 << 20  # [byte] read at once; no line is longer
 COMMENT_MARKS = (b"#", b"//")
 NUM_WITH_INTENSITY = 4  # columns of a line without colours: x y z intensity
+TEXT_SUFFIXES = frozenset({".txt", ".xyz", ".asc", ".csv", ".xyzrgb"})
+HEAD_SIZE = 1 << 16  # bytes in which the header is looked for
+BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+WANTED = "wanted lines of numbers x y z r g b, with decimal points, colours 0-255"
+# What is read of a line, by the number of its columns; those behind the seventh are left out.
+COLUMNS = {NUM_WITH_INTENSITY: (0, 1, 2, 3), 6: (0, 1, 2, 3, 4, 5), 7: (0, 1, 2, 4, 5, 6)}
+PTS_WANTED = "wanted lines x y z intensity r g b or x y z r g b, colours 0-255"
 
 
 class LineLayout(NamedTuple):
@@ -197,15 +204,6 @@ def line_source(path: Path, layout: LineLayout, options: CloudSettings, wanted: 
         return PointSource(path, lambda: starmap(RawCloud, read()))
     check_option(path, options, wanted)
     return PointSource(path, intensity_reader(path, read))
-
-
-TEXT_SUFFIXES = frozenset({".txt", ".xyz", ".asc", ".csv", ".xyzrgb"})
-HEAD_SIZE = 1 << 16  # bytes in which the header is looked for
-BYTE_ORDER_MARK = b"\xef\xbb\xbf"
-WANTED = "wanted lines of numbers x y z r g b, with decimal points, colours 0-255"
-# What is read of a line, by the number of its columns; those behind the seventh are left out.
-COLUMNS = {NUM_WITH_INTENSITY: (0, 1, 2, 3), 6: (0, 1, 2, 3, 4, 5), 7: (0, 1, 2, 4, 5, 6)}
-PTS_WANTED = "wanted lines x y z intensity r g b or x y z r g b, colours 0-255"
 
 
 def open_text(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
