@@ -118,7 +118,7 @@ def task_of(entry: Entry, scan_map: ScanMap, settings: ReportSettings) -> Task:
         digest = photo_of(photo, read_options_of(result).rig).sha256
     except (OSError, InputError):
         digest = ""
-    parts = entry.line, digest, scan_map.scan_sha256, repr(settings.width), digest_of_sources(MAKERS)
+    parts = result.to_json(), digest, scan_map.scan_sha256, repr(settings.width), digest_of_sources(MAKERS)
     key = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
     found = [result.best_pose, *(a.pose for a in result.alternatives)] if result.best_pose else []
     return Task(entry, photo, key, [scan_map.from_world(pose) for pose in found if pose])

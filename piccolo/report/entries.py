@@ -12,7 +12,6 @@ import numpy as np
 from ..confidence.confidence import NOT_LOCALIZED
 from ..confidence.covariance import PoseCovariance
 from ..errors import printable
-from ..files.json_file import read_bytes
 from ..geometry.pose import Array, Pose
 from ..geometry.rotations import heading_pitch_roll_deg
 from ..result import FAILED, UNREADABLE, Result, read_results
@@ -36,7 +35,6 @@ class Entry(NamedTuple):
     """A result of a report."""
 
     result: Result
-    line: str  # as it stands in its file
     walk: int | None  # which walk it is of, a number; None for a photo that stands alone
     time: float  # [s] by which a walk's photos are in order; else its place in the files
 
@@ -45,18 +43,16 @@ def read_entries(paths: Sequence[Path]) -> list[Entry]:
     """The results in files of JSON lines, in their order; each file with walks is one walk."""
     entries: list[Entry] = []
     for number, path in enumerate(paths):
-        results = read_results([path])
-        lines = [line.decode() for line in read_bytes(path, "wanted results").splitlines() if line.strip()]
-        for result, line in zip(results, lines, strict=True):
+        for result in read_results([path]):
             time = result.walk.time if result.walk else float(len(entries))
-            entries.append(Entry(result, line, number if result.walk else None, time))
+            entries.append(Entry(result, number if result.walk else None, time))
     return entries
 
 
 def entries_of_walk(results: Sequence[Result]) -> list[Entry]:
     """The results of one walk."""
     times = [float(k) if r.walk is None else r.walk.time for k, r in enumerate(results)]
-    return [Entry(r, r.to_json(), 0, time) for r, time in zip(results, times, strict=True)]
+    return [Entry(r, 0, time) for r, time in zip(results, times, strict=True)]
 
 
 def names_of(entries: Sequence[Entry]) -> list[str]:
