@@ -10,13 +10,12 @@ from refusals import assert_refused
 from test_cloud_morton import seeded_cloud, whole
 
 from piccolo.cloud import open_cloud, read_cloud
-from piccolo.cloud.readers.columns import as_gray, intensity_reader
 from piccolo.cloud.readers.e57 import open_e57
 from piccolo.cloud.readers.las import open_las
 from piccolo.cloud.readers.pcd import open_pcd
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.readers.ptx import open_ptx
-from piccolo.cloud.readers.reader import RawCloud
+from piccolo.cloud.readers.reader import RawCloud, as_gray, intensity_reader
 from piccolo.cloud.readers.text import open_text
 from piccolo.cloud.settings import CloudSettings
 from piccolo.errors import InputError

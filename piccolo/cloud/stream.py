@@ -14,8 +14,7 @@ from ..files.digest import sha256_of_arrays
 from ..geometry.pose import Array, rotate_points
 from ..jobs.memory import check_address_space
 from ..jobs.threads import Progress, no_progress
-from .readers.columns import brightest_of, colored_chunks
-from .readers.reader import CHUNK, PointSource, RawCloud
+from .readers.reader import CHUNK, PointSource, RawCloud, brightest_of, colored_chunks
 from .settings import UpAxis
 from .voxels import Voxels, VoxelTable, morton_order
 

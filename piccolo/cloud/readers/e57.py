@@ -14,7 +14,6 @@ import numpy as np
 from ...errors import InputError
 from ...geometry.pose import Array, Pose, rotate_points
 from ..settings import IN_METRES, CloudSettings
-from .columns import OPTION, intensity_reader
 from .e57_file import (
     MAGIC,
     NAMESPACE,
@@ -29,7 +28,7 @@ from .e57_file import (
     scaled,
     text_of,
 )
-from .reader import CHUNK, CloudFormat, PointSource, RawCloud
+from .reader import CHUNK, OPTION, CloudFormat, PointSource, RawCloud, intensity_reader
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")

@@ -18,8 +18,18 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...optional import import_optional
 from ..settings import IN_METRES, CloudSettings
-from .columns import OPTION, intensity_reader, label_reader
-from .reader import CHUNK, CUT, CloudFormat, PointSource, PointsWithScalar, RawCloud, quoted
+from .reader import (
+    CHUNK,
+    CUT,
+    OPTION,
+    CloudFormat,
+    PointSource,
+    PointsWithScalar,
+    RawCloud,
+    intensity_reader,
+    label_reader,
+    quoted,
+)
 
 MAGIC = b"LASF"
 MIN_HEADER_SIZE = 227  # [byte]

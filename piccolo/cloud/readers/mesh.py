@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...geometry.pose import Array
 from ..settings import IN_METRES, CloudSettings, UpAxis
-from .columns import BRIGHTEST
 from .mesh_files import GLB_MAGIC, NO_MATERIAL, Texture
 from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply
-from .reader import CHUNK, CloudFormat, PointSource, RawCloud
+from .reader import BRIGHTEST, CHUNK, CloudFormat, PointSource, RawCloud
 
 # 1 / p and 1 / p^2 of the plastic number p, the root of p^3 = p + 1
 R2_STEPS = (0.7548776662466927, 0.5698402909980532)

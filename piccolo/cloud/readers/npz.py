@@ -19,8 +19,17 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...files.array_archive import MAX_HEAD_SIZE, read_header
 from ..settings import IN_METRES, CloudSettings
-from .columns import BRIGHTEST, brightest_of, colored_chunks, in_chunks, read_records
-from .reader import CloudFormat, PointSource, point_label, quoted
+from .reader import (
+    BRIGHTEST,
+    CloudFormat,
+    PointSource,
+    brightest_of,
+    colored_chunks,
+    in_chunks,
+    point_label,
+    quoted,
+    read_records,
+)
 
 NPY_MAGIC = b"\x93NUMPY"
 ZIP_MAGIC = b"PK\x03\x04"

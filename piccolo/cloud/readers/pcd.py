@@ -16,18 +16,22 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ..settings import IN_METRES, CloudSettings
-from .columns import (
+from .reader import (
+    CloudFormat,
     ColumnReader,
     Columns,
+    PointSource,
+    RawCloud,
     check_option,
     color_names,
     column_source,
     in_chunks,
+    point_label,
     points_of,
+    quoted,
     read_records,
     take_records,
 )
-from .reader import CloudFormat, PointSource, RawCloud, point_label, quoted
 from .text import LineLayout, NumberLines
 
 MAX_HEADER_SIZE = MAX_ROW_SIZE = 1 << 16  # [byte]; a row is a point

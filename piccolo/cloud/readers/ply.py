@@ -16,18 +16,20 @@ from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from ...errors import InputError
 from ..settings import IN_METRES, CloudSettings
-from .columns import (
+from .mesh import open_ply_mesh
+from .reader import (
     COLOR_NAMES,
     INTENSITY_NAMES,
     LABEL_NAMES,
+    CloudFormat,
     Columns,
+    PointSource,
     check_option,
     color_names,
     column_source,
+    quoted,
     read_records,
 )
-from .mesh import open_ply_mesh
-from .reader import CloudFormat, PointSource, quoted
 from .text import LineLayout, NumberLines
 
 MAGIC = (b"ply\n", b"ply\r")

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...geometry.pose import transform_points
 from ..settings import IN_METRES, CloudSettings
-from .columns import check_option, intensity_reader
-from .reader import CloudFormat, PointSource, RawCloud, quoted
+from .reader import CloudFormat, PointSource, RawCloud, check_option, intensity_reader, quoted
 from .text import NUM_WITH_INTENSITY, LineLayout, NumberLines
 
 NUMBERS_A_LINE = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)

@@ -16,8 +16,19 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ..settings import IN_METRES, CloudSettings
 from . import reader as raw
-from .columns import BRIGHTEST, INTENSITY_NAMES, check_option, color_names, colored_chunks, intensity_reader
-from .reader import CUT, CloudFormat, PointSource, RawCloud, quoted
+from .reader import (
+    BRIGHTEST,
+    CUT,
+    INTENSITY_NAMES,
+    CloudFormat,
+    PointSource,
+    RawCloud,
+    check_option,
+    color_names,
+    colored_chunks,
+    intensity_reader,
+    quoted,
+)
 
 BLOCK = 1 << 20  # [byte] read at once; no line is longer
 COMMENT_MARKS = (b"#", b"//")
