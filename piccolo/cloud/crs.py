@@ -53,9 +53,8 @@ def check_crs(crs: str) -> Any:
     try:
         return pyproj.CRS.from_user_input(crs).to_2d()
     except pyproj.exceptions.CRSError as error:
-        raise InputError(
-            f"--crs: found {crs[:80]!r}, wanted a coordinate system such as EPSG:25832"
-        ) from error
+        wanted = "wanted a coordinate system such as EPSG:25832"
+        raise InputError(f"--crs: found {crs[:80]!r}, {wanted}") from error
 
 
 def from_wgs84(crs: str, latitude_deg: float, longitude_deg: float) -> tuple[float, float] | None:
@@ -64,7 +63,6 @@ def from_wgs84(crs: str, latitude_deg: float, longitude_deg: float) -> tuple[flo
     pyproj = import_optional("GPS in photos", "pyproj", "tools")
     if not system.is_projected:
         return None
-    x, y = pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True).transform(
-        longitude_deg, latitude_deg
-    )
+    transformer = pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True)
+    x, y = transformer.transform(longitude_deg, latitude_deg)
     return (float(x), float(y)) if math.isfinite(x) and math.isfinite(y) else None

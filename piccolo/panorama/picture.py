@@ -45,13 +45,8 @@ FORMATS: dict[bytes, type[ImageFile]] = {
     **dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), TiffImageFile),
     b"RIFF": WebPImageFile,
 }
-HEIF_BRANDS = (
-    b"heic",
-    b"heix",
-    b"heim",
-    b"heis",
-    b"mif1",
-)  # of still pictures, behind a box's size and "ftyp"
+# of still pictures, behind a box's size and "ftyp"
+HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1")
 # at best: a bit a block of 8 x 8; 1040 bytes of 8 pixels by zlib; 3840 by LZW; a plain WebP packs to nothing
 MAX_PIXELS_PER_BYTE = {"JPEG": 512, "PNG": 8 * 1040, "TIFF": 8 * 3840, "WEBP": 1 << 30, "HEIF": 1 << 30}
 # what a viewer does to the stored picture, by EXIF's number

@@ -143,9 +143,8 @@ def panorama_size(path: Path) -> tuple[int, int]:
     """
     if not path.is_dir():
         if (orientation := picture_orientation(path)) not in (None, 1):
-            raise InputError(
-                f"{path}: found it stored turned (EXIF orientation {orientation}), wanted it upright"
-            )
+            turned = f"found it stored turned (EXIF orientation {orientation})"
+            raise InputError(f"{path}: {turned}, wanted it upright")
         return picture_size(path)
     size, _ = picture_size(face_paths(path)["f"])
     return 4 * size, 2 * size

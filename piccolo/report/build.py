@@ -156,7 +156,6 @@ def document_of(
     tasks: Sequence[Task], scan_map: ScanMap, folder: Path, settings: ReportSettings
 ) -> dict[str, Any]:
     """All that the page knows at once; writes the plans."""
-    m = scan_map
     names = names_of([task.entry for task in tasks])
     photos = []
     for task, name, short in zip(tasks, names, short_names_of(names), strict=True):
@@ -166,17 +165,17 @@ def document_of(
         photos.append({**entry, "short": short, "hasPictures": has_pictures, "thumb": thumb})
     cloud = tasks[0].entry.result.cloud
     clouds = [Path(path).name for path in ([cloud] if isinstance(cloud, str) else cloud)]
-    north = m.R_map_from_world @ np.array([0.0, 1.0, 0.0])
-    has_north = bool(settings.crs or m.crs)
+    north = scan_map.R_map_from_world @ np.array([0.0, 1.0, 0.0])
+    has_north = bool(settings.crs or scan_map.crs)
     return {
         "format": FORMAT,
         "version": __version__,
         "title": settings.title or Path(clouds[0]).stem,
         "cloud": ", ".join(clouds),
-        "crs": settings.crs or m.crs,
+        "crs": settings.crs or scan_map.crs,
         "north": [float(north[0]), float(north[1])] if has_north else None,
-        "origin": m.origin_world.tolist(),
-        "R": m.R_map_from_world.ravel().tolist(),
+        "origin": scan_map.origin_world.tolist(),
+        "R": scan_map.R_map_from_world.ravel().tolist(),
         "storeys": list(storey_documents(scan_map, tasks, folder, settings)),
         "photos": photos,
     }
@@ -186,24 +185,20 @@ def storey_documents(
     scan_map: ScanMap, tasks: Sequence[Task], folder: Path, settings: ReportSettings
 ) -> Iterator[dict[str, Any]]:
     """The storeys, each with its plan, which is written."""
-    m = scan_map
-    origin = float((m.R_map_from_world @ m.origin_world)[2])
-    storey, height = scan_map.storeys.at(m.centers)
-    if not scan_map.storeys.storeys:
-        storey = np.zeros(len(m.centers), np.int64)
-        height = np.full(len(m.centers), CAMERA_HEIGHT)
+    origin = float((scan_map.R_map_from_world @ scan_map.origin_world)[2])
+    storey, height = scan_map.storeys.at(scan_map.centers)
+    found = scan_map.storeys.storeys
+    if not found:
+        storey = np.zeros(len(scan_map.centers), np.int64)
+        height = np.full(len(scan_map.centers), CAMERA_HEIGHT)
     own = {plan.storey - 1: plan for plan in settings.own_plans}
-    for k in range(max(len(scan_map.storeys.storeys), 1)):
+    for k in range(max(len(found), 1)):
         name = settings.storey_names[k] if settings.storey_names else f"Storey {k + 1}"
         is_here = storey == k
-        places = m.centers[is_here]
-        floors = m.centers[is_here, 2] - height[is_here]
-        floor = (
-            scan_map.storeys.storeys[k].floor
-            if scan_map.storeys.storeys
-            else float(np.median([*floors, 0.0]))
-        )
-        plan = own_plan(own[k], m) if k in own else draw_plan(m.points, places, floors)
+        places = scan_map.centers[is_here]
+        floors = scan_map.centers[is_here, 2] - height[is_here]
+        floor = found[k].floor if found else float(np.median([*floors, 0.0]))
+        plan = own_plan(own[k], scan_map) if k in own else draw_plan(scan_map.points, places, floors)
         document = plan and write_plan(plan, folder)
         yield {"name": name, "floor": floor, "level": round(origin + floor, 3), "plan": document}
 

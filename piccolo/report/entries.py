@@ -21,14 +21,9 @@ CHI_SQUARE_95 = 5.991  # of two degrees of freedom
 LEAST_CONFIDENCE = 0.05  # of a photo that is not localized: a best guess below it is on no plan
 ENDING = re.compile(r"\.[A-Za-z0-9]{3,4}( \(\d+\))?$")
 DIGITS = 6  # of positions [m] and rotations
-EVIDENCE = (
-    *("score", "margin", "explained_fraction", "seen_fraction", "contradicted_fraction"),
-    "num_matches",
-)
-NOTHING_FOUND: dict[str, Any] = {
-    **dict.fromkeys(("pose", "storey", "height", "evidence", "spread")),
-    "alternatives": [],
-}
+EVIDENCE = ("score", "margin", "explained_fraction", "seen_fraction", "contradicted_fraction", "num_matches")
+NOT_FOUND = ("pose", "storey", "height", "evidence", "spread")
+NOTHING_FOUND: dict[str, Any] = {**dict.fromkeys(NOT_FOUND), "alternatives": []}
 
 
 class Entry(NamedTuple):

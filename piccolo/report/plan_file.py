@@ -164,9 +164,8 @@ def _draw_scale(axes: "Axes") -> None:
     from matplotlib.colors import Normalize  # noqa: PLC0415
 
     colors = ScalarMappable(Normalize(LEAST_ON_PATH, 1.0), "viridis_r")
-    bar = axes.figure.colorbar(
-        colors, cax=axes.inset_axes((0.72, 1.02, 0.26, 0.02)), orientation="horizontal"
-    )
+    place = axes.inset_axes((0.72, 1.02, 0.26, 0.02))
+    bar = axes.figure.colorbar(colors, cax=place, orientation="horizontal")
     bar.set_ticks([LEAST_ON_PATH, 1.0], labels=[f"{LEAST_ON_PATH:g}", "1"])
     axes.text(0.71, 1.02, "confidence", transform=axes.transAxes, ha="right")
 

@@ -66,9 +66,7 @@ class PointSource(NamedTuple):
     read_chunks: ChunkReader
     num_points: int | None = None  # for the progress; None if only reading can tell
     warnings: tuple[str, ...] = ()  # one line each, for the user: what was decided about this file
-    station_axes: tuple[
-        NDArray[np.float64], ...
-    ] = ()  # (3,) unit, in the file's axes: z of scanners with poses
+    station_axes: tuple[NDArray[np.float64], ...] = ()  # (3,) unit, z of scanners with poses, file's axes
     up: UpAxis = "z"  # the axis that points up by the format's specification or by convention
 
 
