@@ -19,7 +19,7 @@ from .errors import InputError
 if TYPE_CHECKING:
     from .geometry.pose import Pose
     from .opening import open_scan
-    from .report.report import write_report
+    from .report.build import write_report
     from .result import Result
     from .scan import Scan
 
@@ -29,7 +29,7 @@ MODULES = {
     "Result": ".result",
     "Scan": ".scan",
     "open_scan": ".opening",
-    "write_report": ".report.report",
+    "write_report": ".report.build",
 }
 
 

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cloud import open_cloud
-from .cloud.digest import sha256_of_files
 from .cloud.settings import METRES, CloudSettings, UpAxis
 from .cloud.stream import ARRAYS, CloudStream, stream_of_arrays
 from .errors import InputError
+from .files.digest import sha256_of_files
 from .jobs.stopwatch import Stopwatch
 from .jobs.threads import ProgressCallback, Workers, no_progress, num_cores, progress_to
 from .localization.settings import CoarseToFineSettings

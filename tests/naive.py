@@ -136,28 +136,6 @@ def between_cells(directions, coarse_rings, values):
     return np.array(found)
 
 
-def decompress_lzf(data):
-    """What LZF data (bytes) stand for, by slices; None if they are broken."""
-    out, rest = bytearray(), bytearray(data)
-    while rest:
-        control = rest.pop(0)
-        if control < 32:
-            if len(rest) <= control:
-                return None
-            out += rest[: control + 1]
-            del rest[: control + 1]
-            continue
-        if len(rest) < 1 + (control >= 224):
-            return None
-        length = 2 + (7 + rest.pop(0) if control >= 224 else control // 32)
-        distance = 1 + 256 * (control % 32) + rest.pop(0)
-        if distance > len(out):
-            return None
-        pattern = out[len(out) - distance :]
-        out += (pattern * length)[:length]
-    return bytes(out)
-
-
 def splat(discs, rgb, width, min_radius_px, max_slope, band, band_offset):
     """Range (H, W) and colour (H, W, 3) of discs (N, 9), each pixel's ray against every disc."""
     azimuth = math.pi - (np.arange(width) + 0.5) * math.tau / width

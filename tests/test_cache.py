@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import numba
@@ -13,9 +14,10 @@ import numpy as np
 import pytest
 
 from piccolo.cli import progress
-from piccolo.files import cache
+from piccolo.files import cache, temporary
 from piccolo.files.atomic import replacing
-from piccolo.kernels import kernel_cache
+from piccolo.files.temporary import PREFIX, temporary_folder
+from piccolo.kernels import jit
 from piccolo.kernels.jit import kernel
 from piccolo.optimize.channel_loss import add_channels
 from piccolo.optimize.sampling_loss import add_packed
@@ -89,9 +91,9 @@ def test_a_users_cache_that_others_may_write_to_is_told_and_left(
 
 @pytest.mark.parametrize("how", ["open to the group", "a file", "no place", "full disk"])
 def test_where_no_kernel_can_be_kept_one_warning_says_so(folders, tmp_path, monkeypatch, caplog, how):
-    kernel_cache.warn_not_kept.cache_clear()
-    monkeypatch.setattr(kernel_cache, "kernel_folder", kernel_cache.kernel_folder.__wrapped__)
-    monkeypatch.setattr(kernel_cache, "cache_root", cache.cache_root.__wrapped__)
+    jit.warn_not_kept.cache_clear()
+    monkeypatch.setattr(jit, "kernel_folder", jit.kernel_folder.__wrapped__)
+    monkeypatch.setattr(jit, "cache_root", cache.cache_root.__wrapped__)
     root = _root()
     if how == "open to the group":
         (root / "kernels").mkdir()
@@ -101,7 +103,7 @@ def test_where_no_kernel_can_be_kept_one_warning_says_so(folders, tmp_path, monk
     elif how == "no place":
         root.chmod(0o777)
     else:
-        monkeypatch.setattr(kernel_cache, "write_atomically", _full)
+        monkeypatch.setattr(jit, "write_atomically", _full)
     for name in ("a", "b"):
         compiled = kernel(eval(f"lambda {name}: {name} + 1"))
         assert compiled(np.float64(3.0)) == 4.0
@@ -130,7 +132,7 @@ def test_what_a_killed_process_was_writing_has_a_name_of_ours(tmp_path, ending):
 def test_only_stale_files_of_ours_go_and_only_from_a_folder_that_is_marked(tmp_path):
     """Not the user's own, not a link, not a fresh one; what a killed process was writing goes too."""
     folder, key = tmp_path / "new", 32 * "0"
-    cache.own_folder(folder, kernel_cache.NAME)
+    cache.own_folder(folder, jit.NAME)
     tag = (folder / "CACHEDIR.TAG").read_bytes()
     assert tag.startswith(b"Signature: 8a477f597d28d172789f06886806bc55\n")
     names = [
@@ -149,14 +151,14 @@ def test_only_stale_files_of_ours_go_and_only_from_a_folder_that_is_marked(tmp_p
         os.utime(foreign / f"2{key[1:]}.kernel", (0, 0), follow_symlinks=False)
         cache.mark_used(foreign / names[-1])
         before = sorted(foreign.iterdir())
-        cache.own_folder(foreign, kernel_cache.NAME)
+        cache.own_folder(foreign, jit.NAME)
         gone = {path.name for path in set(before) - set(foreign.iterdir())}
         assert gone == ({names[0], names[1]} if foreign == folder else set())
     assert not (tmp_path / "foreign" / "CACHEDIR.TAG").exists()
 
 
 def test_damaged_compiled_code_is_noticed_and_made_anew(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(kernel_cache, "kernel_folder", lambda: tmp_path)
+    monkeypatch.setattr(jit, "kernel_folder", lambda: tmp_path)
 
     def total(values):
         return values.sum()
@@ -178,20 +180,20 @@ def test_damaged_compiled_code_is_noticed_and_made_anew(tmp_path, monkeypatch, c
     text = "damaged compiled code; it is compiled anew"
     assert [record.getMessage() for record in caplog.records] == [f"{tmp_path}: {text}"]
     other = path.with_name(32 * "0" + ".kernel")
-    damaged = [b"", whole[: kernel_cache.DIGEST_SIZE], whole[:-1], whole + b"0"]
+    damaged = [b"", whole[: jit.DIGEST_SIZE], whole[:-1], whole + b"0"]
     for bit in np.random.default_rng(0).integers(8 * len(whole), size=300):
         flipped = bytearray(whole)
         flipped[bit // 8] ^= 1 << bit % 8
         damaged.append(bytes(flipped))
     for place, content in [*((path, content) for content in damaged), (other, whole)]:
         place.write_bytes(content)
-        assert kernel_cache.read_whole(place) is None
+        assert jit.read_whole(place) is None
     assert len(caplog.records) == 1  # however many are damaged
-    assert kernel_cache.read_whole(tmp_path / "none") is None
+    assert jit.read_whole(tmp_path / "none") is None
 
 
 def test_a_kernel_is_compiled_with_another_that_was_loaded(tmp_path, monkeypatch):
-    monkeypatch.setattr(kernel_cache, "kernel_folder", lambda: tmp_path)
+    monkeypatch.setattr(jit, "kernel_folder", lambda: tmp_path)
 
     def scaled_sum(values, factor):
         return factor * values.sum()
@@ -226,12 +228,12 @@ def test_where_numba_is_not_as_it_was_kernels_are_compiled(tmp_path, monkeypatch
     def total(values):
         return values.sum()
 
-    kernel_cache.warn_not_kept.cache_clear()
-    monkeypatch.setattr(kernel_cache, "kernel_folder", lambda: tmp_path)
+    jit.warn_not_kept.cache_clear()
+    monkeypatch.setattr(jit, "kernel_folder", lambda: tmp_path)
     values = np.arange(5.0)
     if fails == "rebuilt":
         kernel(total)(values)
-    monkeypatch.setattr(kernel_cache, fails, None)
+    monkeypatch.setattr(jit, fails, None)
     assert kernel(total)(values) == 10.0
     (warning,) = [record.getMessage() for record in caplog.records]
     assert warning.startswith(f"Numba {numba.__version__}: ")
@@ -242,7 +244,7 @@ def test_bounds_are_checked_where_code_without_is_kept(tmp_path, monkeypatch):
     def third(values):
         return values[2]
 
-    monkeypatch.setattr(kernel_cache, "kernel_folder", lambda: tmp_path)
+    monkeypatch.setattr(jit, "kernel_folder", lambda: tmp_path)
     values = np.zeros(3)
     kernel(third)(values)
     monkeypatch.setattr(numba.config, "BOUNDSCHECK", 1)
@@ -258,16 +260,16 @@ def test_losses_of_one_making_are_kept_apart_on_disk():
     assert any("geman_mcclure" in name for name in names)
 
 
-def test_who_waits_for_kernels_is_told_how_many_are_left(monkeypatch, capsys):
+def test_who_waits_for_kernels_is_told(monkeypatch, capsys):
     seconds = iter([10.0, 11.0, 14.0])
-    monkeypatch.setattr(kernel_cache.time, "monotonic", lambda: next(seconds))
+    monkeypatch.setattr(jit.time, "monotonic", lambda: next(seconds))
     for is_quiet in (False, True):
-        compiling = kernel_cache.Compiling()
+        compiling = jit.Compiling()
         with progress.log_shown(is_quiet):
             compiling.start()
             compiling.finish()
             compiling.finish()
-        text = "compiling kernels, once: 2 of about 49, some 94 s left\n"
+        text = "compiling kernels, once: 2 so far, half a minute in all\n"
         assert capsys.readouterr().err == ("" if is_quiet else text)
         seconds = iter([10.0, 11.0, 14.0])
     assert logging.getLogger("piccolo").level == logging.NOTSET
@@ -277,7 +279,7 @@ def test_a_logged_warning_is_one_line_and_quiet_is_quiet(capsys):
     for is_quiet in (False, True):
         with progress.log_shown(is_quiet):
             for _ in range(3):
-                kernel_cache.log.warning("%s: damaged", "a")
+                jit.log.warning("%s: damaged", "a")
         assert capsys.readouterr().err == ("" if is_quiet else "warning: a: damaged\n")
 
 
@@ -287,3 +289,48 @@ def test_importing_writes_nothing(tmp_path):
     command = [sys.executable, "-c", "import piccolo.cli.localize, piccolo.cli.evaluate"]
     subprocess.run(command, cwd=ROOT, env=environment, check=True)
     assert list(tmp_path.iterdir()) == []
+
+
+HOLD = """
+import sys, time
+from piccolo.files.temporary import temporary_folder
+with temporary_folder() as folder:
+    (folder / "frame.jpg").touch()
+    print(folder, flush=True)
+    time.sleep(600)
+"""
+
+
+@pytest.fixture
+def temporary_folders(tmp_path, monkeypatch):
+    """A function that lists the temporary folders there are."""
+    monkeypatch.setattr(temporary.tempfile, "tempdir", str(tmp_path))
+    return lambda: [path for path in tmp_path.iterdir() if path.name.startswith(PREFIX)]
+
+
+def test_a_folder_is_removed_at_the_end_and_after_an_error(temporary_folders):
+    with temporary_folder() as folder:
+        (folder / "a").touch()
+        assert temporary_folders() == [folder]
+    with pytest.raises(ValueError, match="x"), temporary_folder():
+        raise ValueError("x")
+    assert temporary_folders() == []
+
+
+def test_what_a_killed_process_left_is_removed_and_what_a_living_one_has_stays(temporary_folders, tmp_path):
+    command = [sys.executable, "-c", HOLD]
+    where = os.environ | {"TMPDIR": str(tmp_path)}
+    with subprocess.Popen(command, env=where, stdout=subprocess.PIPE, text=True) as process:
+        folder = tmp_path / process.stdout.readline().strip()
+        os.utime(folder, (time.time() - 60, time.time() - 60))
+        with temporary_folder():
+            assert folder in temporary_folders()
+        process.kill()
+    (tmp_path / f"{PREFIX}12345678").symlink_to(tmp_path)
+    (tmp_path / f"{PREFIX}87654321").mkdir()  # made a moment ago
+    with temporary_folder() as own:
+        assert {path.name for path in temporary_folders()} == {
+            own.name,
+            f"{PREFIX}12345678",
+            f"{PREFIX}87654321",
+        }

@@ -1,11 +1,18 @@
+import json
+import sys
+
 import numpy as np
 import pytest
-from e57_files import ScanToWrite, write
-from refusals import assert_refused
+from e57_files import ImageToWrite, ScanToWrite, sealed, with_xml, write
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from refusals import assert_refused, mutated, read_or_refused
 from test_cloud_morton import read, seeded_cloud
 
+from piccolo.cli import e57_images
 from piccolo.cloud import open_source, read_cloud
-from piccolo.cloud.readers import e57
+from piccolo.cloud.readers import e57, e57_file
+from piccolo.cloud.readers.e57 import list_images, read_image
 from piccolo.errors import InputError
 from piccolo.geometry.pose import exp_so3, quaternion_wxyz
 
@@ -174,3 +181,178 @@ def test_points_that_are_not_finite_are_handed_on_and_foreign_fields_change_noth
     points, colors = read(write(tmp_path / "a.e57", [scan(extra, {"rowIndex": (0, 1199)})]))
     np.testing.assert_array_equal(points, RAW.points_world)
     np.testing.assert_array_equal(colors, RAW.colors)
+
+
+def with_header(content, position, value):
+    return sealed(content[:position] + value.to_bytes(8, "little") + content[position + 8 :])
+
+
+CUT, LONG = "the file is cut off or broken", 1 << 40
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda content: content[:-1024], CUT),
+        (lambda content: content[:30], "and 30 bytes, wanted 'ASTM-E57'"),
+        (lambda content: b"ASTM-E58" + content[8:], "unknown format|begins with b'ASTM-E58'"),
+        (lambda content: with_header(content, 16, LONG), CUT),
+        (lambda content: with_header(content, 24, LONG), "bytes of XML from byte 1099511627776 on, wanted"),
+        (lambda content: with_header(content, 32, LONG), "promises 1099511627776 bytes of XML"),
+        (lambda content: with_header(content, 40, 4096), "in pages of 4096 bytes, wanted 1 and 1024"),
+        (lambda content: content[:300] + bytes([content[300] ^ 1]) + content[301:], "checksum mismatch"),
+    ],
+)
+def test_damaged_files_are_refused(tmp_path, change, message):
+    path = write(tmp_path / "a.e57", [scan()])
+    path.write_bytes(change(path.read_bytes()))
+    assert_refused(message, read, path)
+
+
+BOMB = b'<?xml version="1.0"?><!DOCTYPE e [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;">]><e57Root'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b'recordCount="1200"', b'recordCount="1201"', "promises 1201 points, found 1200|broken E57 file"),
+        (b'recordCount="1200"', b'recordCount="9999999999999"', "promises 9999999999999 points of 216 bits"),
+        (b'recordCount="1200"', b'recordCount="' + b"9" * 5000 + b'"', "wanted an integer"),
+        (b'recordCount="1200"', b'recordCount="many"', "found 'many' in the XML section, wanted an integer"),
+        (b'recordCount="1200"', b'recordCount="+-5"', "wanted an integer"),
+        (b'recordCount="1200"', b'recordCount="-5"', r"scan 1 of 1 \('a scan'\) has -5 points"),
+        (b'maximum="255"', b'maximum="0"', "colours without a range: colorRed is declared 0 to 0"),
+        (b'<?xml version="1.0" encoding="UTF-8"?>\n<e57Root', BOMB, "a document type definition"),
+        (b"<e57Root", b'<e57Root xsi:noNamespaceSchemaLocation="/etc/x"', "XML section is broken"),
+        (
+            b"<e57Root",
+            b'<e57Root xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance" '
+            b'xsi:noNamespaceSchemaLocation="/etc/x"',
+            "a schema in another file",
+        ),
+        (b"2010-e57-v1.0", b"2010-e57-v9.0", "no element e57Root of E57 1.0"),
+        (b"</data3D>", b"", "the XML section is broken"),
+        (b"</data3D>", b"<x>" * 40 + b"</x>" * 40 + b"</data3D>", "or 32 levels"),
+        (b"</data3D>", b"<x/>" * 20_001 + b"</data3D>", "more than 500 elements .* or 20000 in a vector"),
+        (b"</e57Root>", b"<x/>" * 500 + b"</e57Root>", "more than 500 elements in a structure"),
+        (b">2.5e-01</w>", b">nan</w>", "found 'nan' in the XML section, wanted a finite number"),
+        (b">2.5e-01</w>", b">0</w>", r"rotation is \[0.0, 0.0, 0.0, 0.0\], wanted a quaternion"),
+        (b'"UTF-8"', b'"UTF-99"', "XML section is broken"),
+    ],
+)
+def test_damaged_xml_is_refused(tmp_path, old, new, message):
+    path = write(tmp_path / "a.e57", [scan(rotation_wxyz=(0.25, 0.0, 0.0, 0.0))])
+    path.write_bytes(with_xml(path.read_bytes(), old, new))
+    with pytest.raises(InputError, match=message) as error:
+        read(path)
+    assert str(path) in str(error.value)
+    assert len(str(error.value)) < 500 + len(str(path))
+
+
+def test_limits_of_the_xml_section(tmp_path, monkeypatch):
+    path = write(tmp_path / "a.e57", [scan()])
+    monkeypatch.setattr(e57_file, "MAX_ELEMENTS", 10)
+    assert_refused("more than 10 elements", read, path)
+    monkeypatch.setattr(e57_file, "MAX_XML_SIZE", 500)
+    assert_refused(r"promises \d+ bytes of XML from byte \d+ on, wanted 500 at most", read, path)
+
+
+def test_a_missing_library_is_named(tmp_path, monkeypatch):
+    path = write(tmp_path / "a.e57", [scan()])
+    monkeypatch.setitem(sys.modules, "pye57.libe57", None)
+    assert_refused(r"needs pye57\.libe57, .*-r requirements-formats\.txt", open_source, path)
+
+
+def read_all(path):
+    for index, _ in enumerate(list_images(path)):
+        read_or_refused(lambda p, k=index: read_image(p, k), path)
+    return read(path)
+
+
+@settings(deadline=None, max_examples=50)
+@given(data=st.data(), is_sealed=st.booleans())
+def test_mutated_files_raise_nothing_but_input_error(tmp_path_factory, data, is_sealed):
+    folder = tmp_path_factory.getbasetemp()
+    path = folder / "mutated.e57"
+    if not (folder / "whole.e57").exists():
+        columns = {name: column[:60] for name, column in (cartesian() | colored()).items()}
+        columns["cartesianInvalidState"] = np.zeros(60, dtype=np.int64)
+        write(
+            folder / "whole.e57",
+            [ScanToWrite(columns, BYTES | {"cartesianInvalidState": (0, 2)}, None, (0.5, 0.5, 0.5, 0.5))],
+            [ImageToWrite(b"\xff\xd8\xff and a picture", numbers={"imageWidth": 4, "imageHeight": 2})],
+        )
+    content = mutated(data.draw, st.integers, (folder / "whole.e57").read_bytes())
+    path.write_bytes(sealed(content) if is_sealed else content)
+    result, _ = read_or_refused(read_all, path)
+    if result is not None:
+        assert result[0].shape == result[1].shape
+
+
+SPHERE = {"imageWidth": 400, "imageHeight": 200, "pixelWidth": np.pi / 200, "pixelHeight": np.pi / 200}
+SMALL = {"imageWidth": 30, "imageHeight": 20}
+JPEG, PNG = b"\xff\xd8\xff and a picture" * 90, b"\x89PNG\r\n\x1a\n and a picture"
+IMAGES = [
+    ImageToWrite(JPEG, "sphericalRepresentation", "jpegImage", SPHERE, name="pano", scan_guid="{scan}"),
+    ImageToWrite(PNG, "pinholeRepresentation", "pngImage", SMALL, QUATERNION, tuple(CENTER)),
+    ImageToWrite(PNG, "cylindricalRepresentation", "pngImage", SMALL),
+    ImageToWrite(JPEG, "visualReferenceRepresentation", "jpegImage", SMALL),
+]
+
+
+def test_images_are_listed_and_read(tmp_path):
+    path = write(tmp_path / "a.e57", [scan()], IMAGES)
+    images = list_images(path)
+    assert [image.kind for image in images] == ["spherical", "pinhole", "cylindrical", "visual-reference"]
+    first = images[0]
+    assert (first.name, first.width, first.height, first.size) == ("pano", 400, 200, len(JPEG))
+    assert images[0].fov_deg == pytest.approx((360.0, 180.0))
+    assert (images[0].scan_guid, images[0].pose, images[1].fov_deg) == ("{scan}", None, None)
+    np.testing.assert_allclose(images[1].pose.R_cam_from_world.T, R_WORLD, atol=1e-12)
+    np.testing.assert_array_equal(images[1].pose.center_world, CENTER)
+    assert [read_image(path, k) for k in range(4)] == [JPEG, PNG, PNG, JPEG]
+    assert list_images(write(tmp_path / "b.e57", [scan()])) == []
+
+
+def test_images_are_written_as_files(tmp_path, capsys):
+    path = write(tmp_path / "a scan.e57", [], [*IMAGES, ImageToWrite(b"GIF", numbers=SMALL)])
+    assert e57_images.main([str(path)]) == 0
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [row["is_usable"] for row in rows] == [True, False, False, False, True]
+    assert rows[1]["pose"]["quaternion_wxyz_world_from_image"] == pytest.approx(quaternion_wxyz(R_WORLD))
+    assert "file" not in rows[0]
+    folder = tmp_path / "photos"
+    assert e57_images.main([str(path), "--extract", str(folder)]) == 3  # the last is broken
+    captured = capsys.readouterr()
+    rows = [json.loads(line) for line in captured.out.splitlines()]
+    assert "image 4 begins with b'GIF', wanted a jpeg file" in captured.err
+    names = sorted(p.name for p in folder.iterdir())
+    assert names == ["a_scan_0.jpg", "a_scan_1.png", "a_scan_2.png", "a_scan_3.jpg"]
+    assert (folder / "a_scan_0.jpg").read_bytes() == JPEG
+    assert rows[0]["file"] == str(folder / "a_scan_0.jpg")
+
+
+def test_the_tool_names_its_errors_by_exit_codes(tmp_path, capsys):
+    assert e57_images.main([str(tmp_path / "none.e57")]) == 3
+    (tmp_path / "a.e57").write_bytes(b"ASTM-E57")
+    assert e57_images.main([str(tmp_path / "a.e57")]) == 3
+    assert "e57_images.py: " in capsys.readouterr().err
+    with pytest.raises(SystemExit) as stop:
+        e57_images.main([])
+    assert stop.value.code == 2
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b'length="25"', b'length="99999999"', "image 0 promises 99999999 bytes, found"),
+        (b'length="25"', b'length="-1"', "image 0 promises -1 bytes, found"),
+        (b'length="25"', 'length="²"'.encode(), "wanted an integer"),
+        (b">30</imageWidth>", b">0</imageWidth>", "an image's imageWidth is 0, wanted 1 to"),
+        (b">30</imageWidth>", b">1e999</imageWidth>", "found '1e999' in the XML section"),
+    ],
+)
+def test_damaged_images_are_refused(tmp_path, old, new, message):
+    path = write(tmp_path / "a.e57", [], [ImageToWrite(JPEG[:25], numbers=SMALL)])
+    path.write_bytes(with_xml(path.read_bytes(), old, new))
+    assert_refused(message, list_images, path)

@@ -15,15 +15,14 @@ from piccolo.cloud.readers.las import open_las
 from piccolo.cloud.readers.pcd import open_pcd
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.readers.ptx import open_ptx
-from piccolo.cloud.readers.reader import CloudReadOptions, RawCloud
-from piccolo.cloud.readers.scalars import as_gray, intensity_reader
+from piccolo.cloud.readers.reader import RawCloud, as_gray, intensity_reader
 from piccolo.cloud.readers.text import open_text
 from piccolo.cloud.settings import CloudSettings
 from piccolo.errors import InputError
 from piccolo.geometry.pose import exp_so3
 
 POINTS = seeded_cloud(1, num_points=3000).points_world
-GRAY = CloudReadOptions(intensity_as_gray=True)
+GRAY = CloudSettings(intensity_as_gray=True)
 AS_GRAY = CloudSettings(intensity_as_gray=True)
 
 

@@ -8,9 +8,7 @@ from test_cloud_morton import whole
 
 from piccolo.cloud import open_cloud, read_cloud
 from piccolo.cloud.readers import mesh as mesh_module
-from piccolo.cloud.readers import mesh_sampling
-from piccolo.cloud.readers.mesh import open_mesh
-from piccolo.cloud.readers.mesh_sampling import look_up, weights_of
+from piccolo.cloud.readers.mesh import look_up, open_mesh, weights_of
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.settings import CloudSettings
 
@@ -177,7 +175,7 @@ def test_chunks_and_readings_change_no_bit(tmp_path, monkeypatch):
     path = made.write_obj(tmp_path)
     source = open_mesh(path)
     first = [raw.points_world for raw in source.read_chunks()]
-    monkeypatch.setattr(mesh_sampling, "CHUNK", 777)
+    monkeypatch.setattr(mesh_module, "CHUNK", 777)
     again = [raw.points_world for raw in source.read_chunks()]
     assert (len(first), len(again)) == (1, 13)
     np.testing.assert_array_equal(np.concatenate(again), first[0])

@@ -8,8 +8,7 @@ from test_cloud_morton import whole
 
 from piccolo.cloud import read_cloud
 from piccolo.cloud.readers import mesh_files
-from piccolo.cloud.readers.mesh import open_mesh
-from piccolo.cloud.readers.mesh_sampling import linear_to_srgb, srgb_to_linear
+from piccolo.cloud.readers.mesh import linear_to_srgb, open_mesh, srgb_to_linear
 from piccolo.cloud.readers.ply import open_ply
 
 

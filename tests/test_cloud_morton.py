@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from piccolo.cloud import Cloud, open_source, stream_of
-from piccolo.cloud.readers.reader import PLAIN, RawCloud
+from piccolo.cloud.readers.reader import RawCloud
+from piccolo.cloud.settings import IN_METRES
 from piccolo.cloud.voxels import morton_codes, morton_order
 from piccolo.errors import InputError
 
@@ -30,7 +31,7 @@ def clean(path, raw, scale):
     return replace(stream_of(path, raw), scale=scale).read()
 
 
-def whole(open_file, path, options=PLAIN):
+def whole(open_file, path, options=IN_METRES):
     """All points that a reader finds in a file."""
     chunks = list(open_file(path, options).read_chunks())
     return RawCloud(*(np.concatenate(arrays) for arrays in zip(*chunks, strict=True)))

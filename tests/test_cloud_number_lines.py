@@ -9,11 +9,10 @@ from test_cloud_morton import seeded_cloud, whole
 from test_cloud_ply import vertices, write
 from test_cloud_text import lines_of
 
-from piccolo.cloud.readers import number_lines
 from piccolo.cloud.readers import reader as raw
-from piccolo.cloud.readers.number_lines import is_number, line_blocks
+from piccolo.cloud.readers import text
 from piccolo.cloud.readers.ply import open_ply
-from piccolo.cloud.readers.text import open_text
+from piccolo.cloud.readers.text import is_number, line_blocks, open_text
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)
@@ -22,7 +21,7 @@ RAW = seeded_cloud(1, num_points=1200)
 @pytest.fixture
 def small(monkeypatch):
     """Blocks of two or three lines, chunks of a few blocks."""
-    monkeypatch.setattr(number_lines, "BLOCK", 101)
+    monkeypatch.setattr(text, "BLOCK", 101)
     monkeypatch.setattr(raw, "CHUNK", 13)
 
 
@@ -35,7 +34,7 @@ def test_blocks_hold_all_lines(parts, size, tmp_path_factory):
     content = b"".join(parts)
     path.write_bytes(b"head" + content)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(number_lines, "BLOCK", size)
+        patch.setattr(text, "BLOCK", size)
         try:
             found = [line for block in line_blocks(path, 4) for line in block]
         except InputError:

@@ -3,8 +3,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from piccolo.cloud import Cloud, voxel_table
+from piccolo.cloud import Cloud
 from piccolo.cloud import octree as octree_module
+from piccolo.cloud import voxels as voxels_module
 from piccolo.cloud.octree import MAX_NODES, build_octree, collect
 from piccolo.cloud.voxels import LEAF_SIZE, NUM_LEVELS
 
@@ -50,7 +51,7 @@ def test_shuffling_points_changes_no_bit(seed):
 def test_voxels_and_their_means_are_the_same_in_parts(monkeypatch, num):
     points, colors = _cloud(3000)
     whole = _octree(points, colors)
-    for module in (octree_module, voxel_table):
+    for module in (octree_module, voxels_module):
         monkeypatch.setattr(module, "AT_ONCE", num)
     for values, others in zip(_octree(points, colors), whole, strict=True):
         np.testing.assert_array_equal(values, others)

@@ -1,8 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from refusals import assert_refused, mutated, read_or_refused
+from refusals import assert_refused
 from test_cloud_morton import seeded_cloud, whole
 
 from piccolo.cloud import read_cloud
@@ -120,13 +118,3 @@ def test_other_content_is_refused(tmp_path, content, message):
     path = tmp_path / "a.txt"
     path.write_bytes(content)
     assert_refused(message, read_cloud, path)
-
-
-@settings(deadline=None, max_examples=60)
-@given(data=st.data())
-def test_mutated_text_raises_nothing_but_input_error(data, tmp_path_factory):
-    path = tmp_path_factory.getbasetemp() / "mutated.txt"
-    content = "\n".join(lines_of(RAW)[:1005]).encode()
-    path.write_bytes(mutated(data.draw, st.integers, content))
-    cloud, _ = read_or_refused(read_cloud, path)
-    assert cloud is None or 1000 <= len(cloud.points) <= 1007

@@ -9,11 +9,10 @@ from scipy.spatial import cKDTree
 from test_cloud_morton import seeded_cloud
 from test_cloud_stream import LEVEL, TURN, stream
 
-from piccolo.cloud import voxel_table, voxels
+from piccolo.cloud import voxels
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.readers.reader import RawCloud
-from piccolo.cloud.voxel_table import COUNT, NUM_COLUMNS, POSITION, VoxelTable, add_points, fill_index
-from piccolo.cloud.voxels import LEAF_SIZE
+from piccolo.cloud.voxels import COUNT, LEAF_SIZE, NUM_COLUMNS, POSITION, VoxelTable, add_points, fill_index
 from piccolo.errors import InputError
 from piccolo.geometry.pose import rotate_points
 
@@ -76,7 +75,7 @@ def test_a_larger_index_names_the_same_rows_and_the_table_may_be_fed_with_nothin
 
 
 def test_a_full_voxel_takes_no_more_and_fits_its_sums(monkeypatch):
-    monkeypatch.setattr(voxel_table, "MAX_COUNT", 3)
+    monkeypatch.setattr(voxels, "MAX_COUNT", 3)
     index, rows = np.zeros(8, np.int32), np.zeros((4, NUM_COLUMNS), np.int32)
     points, colors = np.full((5, 3), 0.01), np.full((5, 3), 200, np.uint8)
     add = getattr(add_points, "py_func", add_points)  # itself where nothing is compiled
@@ -85,7 +84,7 @@ def test_a_full_voxel_takes_no_more_and_fits_its_sums(monkeypatch):
     row = rows[0]
     assert row[COUNT] == 3
     assert row[POSITION] == 3 * ((128 + voxels.PHASE) % 256)
-    assert voxel_table.MAX_COUNT * max(255, voxels.QUANTUM_MASK) <= np.iinfo(np.int32).max
+    assert voxels.MAX_COUNT * max(255, voxels.QUANTUM_MASK) <= np.iinfo(np.int32).max
 
 
 def test_turning_gives_each_point_the_same_bits_alone_as_among_others():
@@ -113,6 +112,6 @@ def test_points_too_far_away_are_left_out_and_two_scenes_are_no_map():
 
 
 def test_too_many_voxels_are_refused(monkeypatch):
-    monkeypatch.setattr(voxel_table, "MAX_VOXELS", 40_000)
+    monkeypatch.setattr(voxels, "MAX_VOXELS", 40_000)
     with pytest.raises(InputError, match=r"more than 40000 voxels of 0\.02 m are filled.*--units"):
         stream(seeded_cloud(9, 50_000, size=(900.0, 900.0, 900.0))).voxels(LEVEL)

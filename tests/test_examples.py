@@ -77,7 +77,7 @@ def test_api_page(folder, monkeypatch):
     assert tried > 20
 
 
-@pytest.mark.parametrize("name", ["piccolo", "piccolo.opening", "piccolo.scan", "piccolo.report.report"])
+@pytest.mark.parametrize("name", ["piccolo", "piccolo.opening", "piccolo.scan", "piccolo.report.build"])
 def test_docstrings(name, folder, monkeypatch):
     monkeypatch.chdir(folder)
     known = {"piccolo": piccolo, "open_scan": piccolo.open_scan}

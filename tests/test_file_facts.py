@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from rooms import scan_map
 
-from piccolo.cloud import digest
 from piccolo.errors import InputError
-from piccolo.files import cache, file_facts
+from piccolo.files import cache, digest
 from piccolo.scan_map import map_file
 from piccolo.scan_map.map_file import save_map
 
@@ -24,7 +23,7 @@ def facts(tmp_path, monkeypatch):
     folder = tmp_path / "facts"
     for each in (folder, tmp_path / "maps"):
         each.mkdir(mode=0o700)
-    monkeypatch.setattr(file_facts, "private_folder", lambda *_: folder)
+    monkeypatch.setattr(digest, "private_folder", lambda *_: folder)
     monkeypatch.setattr(map_file, "private_folder", lambda *_: tmp_path / "maps")
     return folder
 
@@ -33,39 +32,39 @@ def test_a_fact_holds_until_its_file_changes_in_any_way(facts, tmp_path):
     path = tmp_path / "a"
     path.write_bytes(b"one")
     before = path.stat()
-    assert file_facts.recall("what", before) is None
-    file_facts.remember("what", before, "a fact")
-    assert file_facts.recall("what", path.stat()) == "a fact"
-    assert file_facts.recall("another", path.stat()) is None
+    assert digest.recall("what", before) is None
+    digest.remember("what", before, "a fact")
+    assert digest.recall("what", path.stat()) == "a fact"
+    assert digest.recall("another", path.stat()) is None
     path.write_bytes(b"two")
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))  # its time is put back, by who changed it
     assert path.stat().st_mtime_ns == before.st_mtime_ns
-    assert file_facts.recall("what", path.stat()) is None
+    assert digest.recall("what", path.stat()) is None
 
 
 def test_facts_that_can_not_be_kept_or_read_are_lost(facts, tmp_path, monkeypatch):
     status = tmp_path.stat()
-    file_facts.remember("what", status, "a fact")
+    digest.remember("what", status, "a fact")
     (kept,) = facts.iterdir()
     kept.write_bytes(b"\xff\xff")
-    assert file_facts.recall("what", status) is None
-    monkeypatch.setattr(file_facts, "write_atomically", _full)
-    file_facts.remember("other", status, "a fact")
-    monkeypatch.setattr(file_facts, "private_folder", lambda *_: None)
-    file_facts.remember("more", status, "a fact")
-    assert file_facts.recall("more", status) is None
+    assert digest.recall("what", status) is None
+    monkeypatch.setattr(digest, "write_atomically", _full)
+    digest.remember("other", status, "a fact")
+    monkeypatch.setattr(digest, "private_folder", lambda *_: None)
+    digest.remember("more", status, "a fact")
+    assert digest.recall("more", status) is None
     assert [entry.name for entry in facts.iterdir()] == [kept.name]
 
 
 def test_facts_are_kept_where_nobody_else_can_write(tmp_path, monkeypatch):
     monkeypatch.setattr(cache, "cache_root", lambda: tmp_path)
     kept = cache.private_folder.__wrapped__
-    assert kept("facts", file_facts.NAME) == tmp_path / "facts"
+    assert kept("facts", digest.NAME) == tmp_path / "facts"
     assert (tmp_path / "facts").stat().st_mode & 0o777 == 0o700
     (tmp_path / "facts").chmod(0o777)
-    assert kept("facts", file_facts.NAME) is None
+    assert kept("facts", digest.NAME) is None
     (tmp_path / "file").touch()
-    assert kept("file", file_facts.NAME) is None
+    assert kept("file", digest.NAME) is None
 
 
 def test_a_digest_is_taken_once_and_anew_when_the_file_changes(facts, tmp_path, monkeypatch):

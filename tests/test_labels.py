@@ -13,16 +13,16 @@ from scipy.spatial.distance import pdist
 from test_cloud_morton import seeded_cloud, whole
 
 from piccolo.cloud import open_cloud, open_source
-from piccolo.cloud.label_colors import NUM_COLORS, Labels, colors_of, palette
-from piccolo.cloud.readers.reader import CloudReadOptions, RawCloud
+from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import CloudSettings
 from piccolo.errors import InputError
+from piccolo.geometry.colors import NUM_COLORS, Labels, colors_of, palette
 from piccolo.panorama import ReadOptions as PanoramaOptions
 from piccolo.panorama import read_panorama
 
 POINTS = seeded_cloud(1, num_points=3000).points_world
 LABELS = np.random.default_rng(2).integers(0, 21, 3000)
-READ = CloudReadOptions(labels=Labels())
+READ = CloudSettings(labels=Labels())
 IMAGE = np.random.default_rng(3).integers(0, 200, (64, 128))
 READ_IMAGE = PanoramaOptions(labels=Labels())
 
@@ -61,7 +61,7 @@ def test_ply(tmp_path, name, kind, text):
 
 
 def test_ignored_labels_are_left_out(tmp_path):
-    read = whole(open_source, _ply(tmp_path / "a.ply"), CloudReadOptions(labels=Labels((0, 7, 99))))
+    read = whole(open_source, _ply(tmp_path / "a.ply"), CloudSettings(labels=Labels((0, 7, 99))))
     is_kept = (LABELS != 0) & (LABELS != 7)
     np.testing.assert_array_equal(read.points_world, POINTS[is_kept])
     np.testing.assert_array_equal(read.colors, colors_of(LABELS[is_kept]))

@@ -12,8 +12,7 @@ from rooms import scan_map
 
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.settings import CloudSettings
-from piccolo.cloud.voxel_table import VoxelTable
-from piccolo.cloud.voxels import LEAF_SIZE, PHASE, QUANTA_PER_METRE
+from piccolo.cloud.voxels import LEAF_SIZE, PHASE, QUANTA_PER_METRE, VoxelTable
 from piccolo.errors import InputError
 from piccolo.files.array_archive import write_archive
 from piccolo.geometry.pose import exp_so3

@@ -12,7 +12,8 @@ from PIL.ExifTags import IFD, Base
 from PIL.PngImagePlugin import PngImageFile
 from rooms import as_panorama, query, room, scan_map
 
-from piccolo.cloud import octree, voxel_table
+from piccolo.cloud import octree
+from piccolo.cloud import voxels as voxels_module
 from piccolo.cloud.stream import stream_of_arrays
 from piccolo.errors import InputError
 from piccolo.jobs import memory
@@ -101,23 +102,23 @@ def test_work_begins_only_where_errors_can_still_be_raised(monkeypatch):
 
 
 def test_voxels_and_their_octree_take_what_they_say(monkeypatch):
-    for module in (voxel_table, octree):
+    for module in (voxels_module, octree):
         monkeypatch.setattr(module, "AT_ONCE", 1 << 10)
     rng, num = np.random.default_rng(0), 200_000
     points, colors = rng.uniform(0, 60, (num, 3)), rng.integers(0, 256, (num, 3), np.uint8)
-    kernels_compiled = voxel_table.VoxelTable("a.ply")
+    kernels_compiled = voxels_module.VoxelTable("a.ply")
     kernels_compiled.add(points[: num // 4], colors[: num // 4])
     kernels_compiled.finish()
     tracemalloc.start()
     try:
-        table = voxel_table.VoxelTable("a.ply")
+        table = voxels_module.VoxelTable("a.ply")
         table.add(points, colors)
-        slots = 2 * voxel_table.SLOT_BYTES / voxel_table.MAX_LOAD
-        at_most = voxel_table.ROW_BYTES * (1 + 1 / voxel_table.MORE_ROWS) + slots
+        slots = 2 * voxels_module.SLOT_BYTES / voxels_module.MAX_LOAD
+        at_most = voxels_module.ROW_BYTES * (1 + 1 / voxels_module.MORE_ROWS) + slots
         assert tracemalloc.get_traced_memory()[1] < 1.05 * num * at_most + 1e6
         tracemalloc.reset_peak()
         voxels = table.finish()
-        at_most = voxel_table.ROW_BYTES * (1 + 1 / voxel_table.MORE_ROWS) + voxel_table.SORTED_BYTES
+        at_most = voxels_module.ROW_BYTES * (1 + 1 / voxels_module.MORE_ROWS) + voxels_module.SORTED_BYTES
         assert tracemalloc.get_traced_memory()[1] < 1.05 * num * at_most + 1e6
         assert tracemalloc.get_traced_memory()[0] < 1.05 * num * (8 + 24)
         asked, before, peaks = [], [], []
@@ -157,7 +158,7 @@ def test_all_that_grows_asks_first(monkeypatch, tmp_path):
     whole, taken = scan_map(1), as_panorama(query(1).rgb)
     cv2.imwrite(str(picture), taken.rgb)
     rng = np.random.default_rng(0)
-    table = voxel_table.VoxelTable("a.ply")
+    table = voxels_module.VoxelTable("a.ply")
     workers = Workers(1)
     asked = prepare_query(taken, whole, CoarseToFineSettings(), workers)
     monkeypatch.setattr(memory, "memory_left", lambda: 1e5)

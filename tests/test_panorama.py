@@ -203,19 +203,7 @@ def test_paths_that_are_no_picture_are_refused(tmp_path, monkeypatch):
     assert_refused(r"cannot be read \(Permission denied\)", read_panorama, write(tmp_path / "a.png", PNG))
 
 
-@pytest.mark.parametrize("suffix", [".png", ".jpg"])
-@settings(deadline=None, max_examples=120)
-@given(data=st.data())
-def test_mutated_files_raise_nothing_but_input_error(suffix, data, tmp_path_factory):
-    content = encoded(RGB, suffix)
-    begin = data.draw(st.integers(0, len(content) // 3))
-    path = tmp_path_factory.getbasetemp() / "mutated"
-    path.write_bytes(content[:begin] + mutated(data.draw, st.integers, content[begin:]))
-    panorama, _ = read_or_refused(read_panorama, path)
-    assert panorama is None or panorama.rgb.shape[1] == 2 * panorama.rgb.shape[0]
-
-
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=40)
 @given(data=st.data())
 def test_mutated_png_with_right_checksums_is_read_or_refused(data, tmp_path_factory):
     path = tmp_path_factory.getbasetemp() / "mutated.png"

@@ -53,7 +53,7 @@ def test_mutated_files_are_read_or_refused(content, data, tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", ["tiff", "tiff, 16 bits, big end", "tiff, packed by 5", "tiff, packed by 8"])
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=30)
 @given(data=st.data())
 def test_tiffs_with_mutated_tags_are_read_or_refused(name, data, tmp_path_factory):
     content = bytearray(FILES[name])
@@ -72,7 +72,7 @@ def test_tiffs_with_mutated_tags_are_read_or_refused(name, data, tmp_path_factor
     check(write(tmp_path_factory.getbasetemp() / "mutated.tif", bytes(content)))
 
 
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=50)
 @given(data=st.data())
 def test_mutated_metadata_is_read_or_refused(data, tmp_path_factory):
     """Over checksums, which would else refuse nearly all."""

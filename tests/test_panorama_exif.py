@@ -13,8 +13,8 @@ from piccolo.camera import Calibration, Camera, Mount
 from piccolo.camera.model import pinhole
 from piccolo.errors import InputError
 from piccolo.panorama import GPano, ReadOptions, panorama_of_array, read_panorama
-from piccolo.panorama.exif import focal_of
 from piccolo.panorama.gpano import attitude_of_gravity, rotation_to_level
+from piccolo.panorama.photo import focal_of
 
 PHOTO = smooth_rgb(360, 480)
 

@@ -158,7 +158,6 @@ def test_the_page_and_its_policy_come_with_it(made):
     assert not re.search(r"\son\w+=|style=|javascript:", page)
     assert {"app.js", "app.css"} <= {path.name for path in made.iterdir()}
     assert (made / "app.js").stat().st_size < 120_000
-    assert (made / "app.js").stat().st_size < 1_000_000
 
 
 def test_one_file_holds_all_of_a_small_report(house, tmp_path):
@@ -177,9 +176,16 @@ def test_one_file_holds_all_of_a_small_report(house, tmp_path):
     assert all(f'id="photo-{photo["key"]}"' in page for photo in photos if photo["hasPictures"])
 
 
-def test_names_that_try_to_be_markup_stay_text(tmp_path):
-    house = House(tmp_path, 128)
-    house.write_cloud()
+@pytest.fixture
+def strangers(house, tmp_path):
+    """The same scan with no photo yet."""
+    empty = House(tmp_path, 128)
+    empty.cloud = house[0].cloud
+    return empty
+
+
+def test_names_that_try_to_be_markup_stay_text(strangers, tmp_path):
+    house = strangers
     for k, name in enumerate(HOSTILE):
         house.add(k, name.replace("/", "\u2215"), confidence=0.99)
     house.results = [  # a name with a slash is a folder's: given to the results only
@@ -226,9 +232,8 @@ def test_short_names_have_folders_where_they_would_repeat():
     assert short_names_of(names) == ["f1/a.jpg", "f2/a.jpg", "b", "c.jpg", "c.png", "d", "d (2)"]
 
 
-def test_a_name_spoils_neither_page_nor_plan(tmp_path):
-    house = House(tmp_path, 128)
-    house.write_cloud()
+def test_a_name_spoils_neither_page_nor_plan(strangers, tmp_path):
+    house = strangers
     for k, name in enumerate(("a.jpg", "new\nline.jpg", "tab\t.jpg", "\udcff.jpg", "\u2028.jpg")):
         house.add(k, name)
     folder = tmp_path / "photos"

@@ -13,8 +13,7 @@ from scipy.spatial import cKDTree
 from piccolo.cli import localize as localize_command
 from piccolo.cli import prepare_map as prepare_command
 from piccolo.cloud.stream import Cloud
-from piccolo.cloud.voxel_table import VoxelTable
-from piccolo.cloud.voxels import LEAF_SIZE, join_voxels
+from piccolo.cloud.voxels import LEAF_SIZE, VoxelTable, join_voxels
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose
 from piccolo.jobs.stopwatch import Stopwatch

@@ -5,8 +5,8 @@ import rooms
 from scipy.spatial import cKDTree
 
 from piccolo.cloud.octree import build_octree
-from piccolo.cloud.soa import unpack_rgb
 from piccolo.cloud.stream import Cloud
+from piccolo.geometry.colors import unpack_rgb
 from piccolo.geometry.sphere import cell_of, make_grid
 from piccolo.jobs.threads import Workers
 from piccolo.scan_map import camera_positions

@@ -4,7 +4,8 @@ docs/CAMERAS.md describes each, and ours.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -49,13 +50,10 @@ def read_cameras(path: Path) -> Calibration:
     Raises InputError if it can't be read, is of no format known, or holds what is no camera.
     """
     text = read_text(path, WANTED, MAX_SIZE)
-    is_json = text.lstrip()[:1] in ("{", "[")
-    try:
-        document = json.loads(text) if is_json else None
-        return _of_document(path, document) if is_json else _of_colmap(path, text)
-    except DAMAGE as error:
-        text = str(error) if isinstance(error, InputError) else f"found {describe(error)}"
-        raise InputError(text if text.startswith(str(path)) else f"{path}: {text}; {WANTED}") from error
+    with _naming(path, WANTED):
+        if text.lstrip()[:1] in ("{", "["):
+            return _of_document(path, json.loads(text))
+        return _of_colmap(path, text)
 
 
 def read_rig(path: Path) -> Calibration:
@@ -64,16 +62,23 @@ def read_rig(path: Path) -> Calibration:
     COLMAP's file does not say how large a picture is: its cameras fit a picture of any size, as they are.
     """
     text = read_text(path, WANTED_RIG, MAX_SIZE)
-    try:
+    with _naming(path, WANTED_RIG):
         document = json.loads(text)
         is_colmap = isinstance(document, list) and "image_prefix" in document[0]["cameras"][0]
         rig = _of_colmap_rig(path, document) if is_colmap else _of_document(path, document)
-    except DAMAGE as error:
-        text = str(error) if isinstance(error, InputError) else f"found {describe(error)}"
-        raise InputError(text if text.startswith(str(path)) else f"{path}: {text}; {WANTED_RIG}") from error
     if not rig.is_rig:
         raise InputError(f"{path}: found a camera without an image, {WANTED_RIG}")
     return rig
+
+
+@contextmanager
+def _naming(path: Path, wanted: str) -> Iterator[None]:
+    """Turn what a damaged file raises into an InputError that names it."""
+    try:
+        yield
+    except DAMAGE as error:
+        text = str(error) if isinstance(error, InputError) else f"found {describe(error)}"
+        raise InputError(text if text.startswith(str(path)) else f"{path}: {text}; {wanted}") from error
 
 
 def document_of(mounts: Sequence[Mount]) -> dict[str, object]:
@@ -154,7 +159,8 @@ def _of_opensfm(entry: Mapping[str, Any]) -> Camera:
     larger = float(max(width, height))
     focal = float(entry["focal"]) if "focal" in entry else float(entry["focal_x"])
     focals = [focal, float(entry.get("focal_y", focal))][: 2 if "OPENCV" in model else 1]
-    c_x, c_y = float(entry.get("c_x", 0.0)), float(entry.get("c_y", 0.0))
+    c_x = float(entry.get("c_x", 0.0))
+    c_y = float(entry.get("c_y", 0.0))
     center = width / 2.0 + larger * c_x, height / 2.0 + larger * c_y
     more = [0.0 if name == "-" else float(entry.get(name, 0.0)) for name in names.split()]
     return Camera(model, width, height, (*(larger * f for f in focals), *center, *more))

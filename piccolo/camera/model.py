@@ -6,22 +6,35 @@ is half a pixel less. Rays are in our camera axes, +x the image centre, +y left,
 
 A ray at the angle theta from the axis comes to the radius r in the plane in front of the lens:
     perspective r = tan theta;  equidistant r = theta (Kannala and Brandt, 2006);
-    FOV r = atan(2 tan(omega / 2) tan theta) / omega (Devernay and Faugeras, 2001);
-then it is distorted (distortion.py), and u = fx x' + cx, v = fy y' + cy.
+    FOV r = atan(2 tan(omega / 2) tan theta) / omega (Devernay and Faugeras, 2001).
+Then it is distorted, with r2 = x^2 + y^2, as OpenCV (modules/calib3d, "Detailed description") has it:
+    g  = (1 + k1 r2 + k2 r2^2 + k3 r2^3 + k4 r2^4) / (1 + d1 r2 + d2 r2^2 + d3 r2^3),
+    x' = x g + 2 p1 x y + p2 (r2 + 2 x^2) + sx1 r2,
+    y' = y g + p1 (r2 + 2 y^2) + 2 p2 x y + sy1 r2,
+and u = fx x' + cx, v = fy y' + cy. d1..d3 are OpenCV's k4..k6 of the rational model. Of a fisheye lens (x, y)
+has the length of the angle.
 """
 
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry.pose import Array
-from .distortion import Distortion
 
-PERSPECTIVE, EQUIDISTANT, FOV, SPHERE = "perspective", "equidistant", "fov", "sphere"
+MAX_STEPS = 25  # of Newton; five are usual
+LEAST = 1e-12  # of the denominator
+NO_MORE = 1e-30  # of a coefficient: less does nothing at any radius, but overflows
+CONVERGED = 1e-12  # of x' and y': a thousandth of a millionth of a pixel
+PERSPECTIVE = "perspective"
+EQUIDISTANT = "equidistant"
+FOV = "fov"
+SPHERE = "sphere"
 # lens, and names of the parameters as the formulas here have them
 MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     model: (lens, tuple(names.split()))
@@ -48,6 +61,105 @@ MAX_NUMBER = 1e6
 MIN_FOCAL = 1.0  # [px]
 TABLE_SIZE = 4096  # angles at which the radial part is tabulated, for Newton's first guess
 SMALL = 1e-4  # [rad] from the axis, at which the resolution is taken
+
+
+class Distortion(NamedTuple):
+    """The coefficients of the formula above."""
+
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    d1: float = 0.0
+    d2: float = 0.0
+    d3: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    sx1: float = 0.0
+    sy1: float = 0.0
+
+    @property
+    def numerator(self) -> Polynomial:
+        """Of g, in r2."""
+        return Polynomial([1.0, self.k1, self.k2, self.k3, self.k4]).trim()
+
+    @property
+    def denominator(self) -> Polynomial:
+        """Of g, in r2."""
+        return Polynomial([1.0, self.d1, self.d2, self.d3]).trim()
+
+    def radial(self, r2: Array) -> tuple[Array, Array]:
+        """Values g and dg/dr2 at r2, of any shape."""
+        n = self.numerator
+        d = self.denominator
+        below = d(r2)
+        below = np.where(np.abs(below) < LEAST, LEAST, below)  # 0 at the limit itself
+        value = n(r2) / below
+        return value, (n.deriv()(r2) - value * d.deriv()(r2)) / below
+
+    def max_radius(self) -> float:
+        """Radius up to which r g(r^2) grows, infinite if it always does: beyond, a pixel is two rays."""
+        n = self.numerator
+        d = self.denominator
+        r2 = Polynomial([0.0, 1.0])
+        slope = n * d + 2.0 * r2 * (n.deriv() * d - n * d.deriv())
+        roots = np.concatenate([slope.trim(NO_MORE).roots(), d.trim(NO_MORE).roots()])
+        real = roots[np.abs(roots.imag) < 1e-9 * (1.0 + np.abs(roots))].real
+        return math.sqrt(min(real[real > 0.0], default=math.inf))
+
+    def apply(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """The distorted (x', y') of (x, y), arrays of one shape."""
+        r2 = x * x + y * y
+        xy = 2.0 * x * y
+        g, _ = self.radial(r2)
+        return (
+            x * g + self.p1 * xy + self.p2 * (r2 + 2.0 * x * x) + self.sx1 * r2,
+            y * g + self.p1 * (r2 + 2.0 * y * y) + self.p2 * xy + self.sy1 * r2,
+        )
+
+    def jacobian(self, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
+        """Derivatives dx'/dx, dx'/dy, dy'/dx, dy'/dy at (x, y), arrays of one shape."""
+        g, by_r2 = self.radial(x * x + y * y)
+        both = 2.0 * x * y * by_r2 + 2.0 * (self.p1 * x + self.p2 * y)
+        return (
+            g + 2.0 * x * x * by_r2 + 2.0 * self.p1 * y + (6.0 * self.p2 + 2.0 * self.sx1) * x,
+            both + 2.0 * self.sx1 * y,
+            both + 2.0 * self.sy1 * x,
+            g + 2.0 * y * y * by_r2 + 2.0 * self.p2 * x + (6.0 * self.p1 + 2.0 * self.sy1) * y,
+        )
+
+    def keeps_sides(self, x: Array, y: Array) -> NDArray[np.bool_]:
+        """True where the distortion does not turn the picture inside out."""
+        a, b, c, d = self.jacobian(x, y)
+        return np.asarray(a * d - b * c > 0.0)
+
+    def invert(
+        self, x_distorted: Array, y_distorted: Array, radii: Array
+    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """The (x, y) whose distortion is (x', y'), and where it was found, arrays of one shape.
+
+        By Newton, from the inverse of the radial part, which grows over `radii` (N,), the last its limit.
+        """
+        length = np.hypot(x_distorted, y_distorted)
+        begin = np.interp(length, radii * self.radial(radii**2)[0], radii) / np.maximum(length, 1e-300)
+        x = x_distorted * begin
+        y = y_distorted * begin
+        for _ in range(MAX_STEPS):
+            found_x, found_y = self.apply(x, y)
+            off_x, off_y = found_x - x_distorted, found_y - y_distorted
+            if max(np.abs(off_x).max(initial=0.0), np.abs(off_y).max(initial=0.0)) < CONVERGED:
+                break
+            a, b, c, d = self.jacobian(x, y)
+            determinant = a * d - b * c
+            per = 1.0 / np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
+            x = x - (d * off_x - b * off_y) * per
+            y = y - (a * off_y - c * off_x) * per
+            shrink = np.minimum(1.0, radii[-1] / np.maximum(np.hypot(x, y), 1e-300))
+            x = x * shrink
+            y = y * shrink
+        found_x, found_y = self.apply(x, y)
+        is_found = np.hypot(found_x - x_distorted, found_y - y_distorted) < 1e3 * CONVERGED
+        return x, y, is_found & self.keeps_sides(x, y)
 
 
 @dataclass(frozen=True)
@@ -120,7 +232,8 @@ class Camera:
         """The same camera with its picture at another size; InputError if that has another shape."""
         if (width, height) == (self.width, self.height):
             return self
-        across, down = width / self.width, height / self.height
+        across = width / self.width
+        down = height / self.height
         if abs(across / down - 1.0) > max(MAX_ASPECT_ERROR, 1.5 / min(width, height)):
             found = f"found a picture of {width} x {height}"
             raise InputError(f"{found} and a calibration for {self.width} x {self.height}, wanted one shape")
@@ -138,7 +251,9 @@ class Camera:
 
         Pixels of rays that are not in the picture mean nothing.
         """
-        forward, right, down = rays[..., 0], -rays[..., 1], -rays[..., 2]
+        forward = rays[..., 0]
+        right = -rays[..., 1]
+        down = -rays[..., 2]
         across = np.sqrt(right * right + down * down)
         if self.lens == SPHERE:
             u = self.width * (0.5 + np.arctan2(right, forward) / (2.0 * math.pi))
@@ -151,11 +266,13 @@ class Camera:
             angle = np.arctan2(across, forward)
             is_in = angle <= self.max_angle
             per = np.where(is_in, self._radius(np.where(is_in, angle, 0.0)), 0.0) / np.maximum(across, 1e-300)
-        x, y = right * per, down * per
+        x = right * per
+        y = down * per
         if self.distortion != Distortion():
             is_in = is_in & self.distortion.keeps_sides(x, y)
             x, y = self.distortion.apply(x, y)
-        u, v = self.focal[0] * x + self._named["cx"], self.focal[1] * y + self._named["cy"]
+        u = self.focal[0] * x + self._named["cx"]
+        v = self.focal[1] * y + self._named["cy"]
         is_in = is_in & (u >= 0.0) & (u <= self.width) & (v >= 0.0) & (v <= self.height)
         return np.stack([u, v], axis=-1), is_in
 
@@ -163,11 +280,13 @@ class Camera:
         """Unit rays (..., 3) of pixels (..., 2), and which of them there are (...)."""
         u, v = np.moveaxis(np.asarray(pixels, np.float64), -1, 0)
         if self.lens == SPHERE:
-            azimuth, elevation = (u / self.width - 0.5) * 2.0 * math.pi, (v / self.height - 0.5) * math.pi
+            azimuth = (u / self.width - 0.5) * 2.0 * math.pi
+            elevation = (v / self.height - 0.5) * math.pi
             c = np.cos(elevation)
             ray = np.stack([c * np.cos(azimuth), -c * np.sin(azimuth), -np.sin(elevation)], axis=-1)
             return ray, np.ones(u.shape, np.bool_)
-        x, y = (u - self._named["cx"]) / self.focal[0], (v - self._named["cy"]) / self.focal[1]
+        x = (u - self._named["cx"]) / self.focal[0]
+        y = (v - self._named["cy"]) / self.focal[1]
         x, y, is_found = self.distortion.invert(x, y, self._radii)
         radius = np.hypot(x, y)
         angle = self._angle(radius)

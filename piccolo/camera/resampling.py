@@ -19,7 +19,8 @@ from .rig import Mount
 
 MAX_SPHERE_WIDTH = 4096  # [px] nothing looks at more
 MIN_SPHERE_WIDTH = 256  # [px]
-ROWS, COLUMNS = 64, 128  # of the sphere, resampled at a time; both divide its size
+ROWS = 64  # of the sphere, resampled at a time; divides its size
+COLUMNS = 128  # as well
 CELL = 4  # [px] within a block in the picture, places are found so far apart and linear between: to 0.05 px
 LOOK = 8  # [px] every so many it is seen first which blocks a camera shows
 MAX_SAMPLES = 8  # a pixel, across and down
@@ -76,18 +77,21 @@ def shrunk(view: View, width: int = MAX_SPHERE_WIDTH) -> View:
 
 def _blocks(view: View, width: int) -> list[tuple[int, int]]:
     """Upper left corners of the sphere's blocks in which the camera may show something."""
-    u, v = np.arange(LOOK // 2, width, LOOK) + 0.5, np.arange(LOOK // 2, width // 2, LOOK) + 0.5
+    u = np.arange(LOOK // 2, width, LOOK) + 0.5
+    v = np.arange(LOOK // 2, width // 2, LOOK) + 0.5
     _, is_in = view.mount.camera.pixels(rays_at(width, u, v) @ view.mount.rotation.T)
     around = np.pad(is_in, ((0, 0), (1, 1)), mode="wrap").astype(np.uint8)
     is_near = cv2.dilate(around, np.ones((3, 3), np.uint8))[:, 1:-1]
-    rows, columns = ROWS // LOOK, COLUMNS // LOOK
+    rows = ROWS // LOOK
+    columns = COLUMNS // LOOK
     is_met = is_near.reshape(len(is_near) // rows, rows, -1, columns).any(axis=(1, 3))
     return [(int(i) * ROWS, int(j) * COLUMNS) for i, j in np.argwhere(is_met)]
 
 
 def _resampled(view: View, width: int, top: int, left: int) -> Pixels:
     """Colours and validity of a block of the sphere's pixels."""
-    u, v = left + np.arange(0.0, COLUMNS + 1, CELL), top + np.arange(0.0, ROWS + 1, CELL)
+    u = left + np.arange(0.0, COLUMNS + 1, CELL)
+    v = top + np.arange(0.0, ROWS + 1, CELL)
     places, is_in = _places(view, width, u, v)
     num = _num_samples(places, is_in)
     if is_in.all() and view.mount.camera.lens != SPHERE:  # whose seam is no place between two others

@@ -58,7 +58,8 @@ class Mount:
 
     def turned(self, R_cam_from_new: Array) -> "Mount":
         """The same camera in a frame that is turned about the origin."""
-        R, center = self.rotation @ R_cam_from_new, R_cam_from_new.T @ np.array(self.center_cam)
+        R = self.rotation @ R_cam_from_new
+        center = R_cam_from_new.T @ np.array(self.center_cam)
         return replace(self, R_lens_from_cam=rows(R), center_cam=tuple(center.tolist()))
 
 

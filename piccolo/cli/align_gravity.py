@@ -12,7 +12,7 @@ from ..cloud.settings import CloudSettings
 from ..confidence.confidence import LOCALIZED
 from ..errors import InputError
 from ..files.atomic import is_stream, write_atomically
-from ..geometry.pose import Array, move, read_transform, rotation_to_z
+from ..geometry.pose import Array, move, rotation_to_z
 from ..gravity.alignment import find_alignment
 from ..jobs.threads import Workers, num_cores
 from ..localization.settings import CoarseToFineSettings
@@ -27,12 +27,10 @@ from .outputs import check_outputs, check_suffix, print_report
 from .progress import progress_bar
 
 EXIT_UNKNOWN = 1
-Found = tuple[Array, dict[str, object], str]
 EPILOG = """\
 examples:
   python tools/align_gravity.py --cloud scan.ply --out aligned.ply --assume-nothing --pano photo.jpg
   python tools/align_gravity.py --cloud room/cloud.ply --queries room/queries.json --out aligned/cloud.ply
-  python tools/align_gravity.py --cloud aligned.ply --apply aligned.txt --inverse --out as_scanned.ply
 
 Planes find the vertical. Which end of it is up says the axis of the file (z, in glTF y) or --up, from which
 it may be 15 degrees off. Of a scan that may lie in any way, --assume-nothing finds up where furniture and
@@ -51,38 +49,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--yaw-walls", "also turn about z, least, so that the dominant walls are along x and y")
     option(parser, "--assume-nothing", "the scan may lie in any way: its own evidence alone decides")
     option(parser, "--pano FILE", "upright photo taken in the scan, which is localized: its up decides")
-    option(parser, "--apply FILE", "apply this transform, four rows of four numbers, instead of finding one")
-    option(parser, "--inverse", "apply the inverse of --apply")
 
 
 def check_arguments(a: argparse.Namespace) -> None:
     """Refuse options that do not go together."""
-    is_told = a.apply or a.up != "auto"
     refusals = {
-        "--apply needs --out": a.apply and not a.out,
         "--queries needs --out": a.queries and not a.out,
-        "--inverse needs --apply": a.inverse and not a.apply,
-        "--yaw-walls can't be combined with --apply": a.apply and a.yaw_walls,
-        "--up can't be combined with --apply": a.apply and a.up != "auto",
-        "--assume-nothing can't be combined with --apply or --up": is_told and a.assume_nothing,
-        "--pano can't be combined with --apply or --up": is_told and a.pano,
+        "--assume-nothing can't be combined with --up": a.up != "auto" and a.assume_nothing,
+        "--pano can't be combined with --up": a.up != "auto" and a.pano,
         f"--queries: nothing can be written beside --out {a.out}": a.queries and a.out and is_stream(a.out),
     }
-    for text in (text for text, is_wrong in refusals.items() if is_wrong):
-        raise InputError(text)
+    for text, is_wrong in refusals.items():
+        if is_wrong:
+            raise InputError(text)
     check_suffix("--out", a.out, (".ply",))
 
 
-def given(arguments: argparse.Namespace, cloud: CloudStream) -> Found:
-    """The transform of --apply, as `find` returns it; the cloud is read for its box."""
-    T = read_transform(arguments.apply, "T_aligned_from_scan")
-    for _ in cloud.chunks([]):
-        pass
-    return np.asarray(np.linalg.inv(T)) if arguments.inverse else T, {"status": "applied"}, ""
-
-
-def find(arguments: argparse.Namespace, cloud: CloudStream) -> Found:
-    """The transform (4, 4) in the scan's unit; what is known of it; why it can't be relied on, if so."""
+def find(arguments: argparse.Namespace, cloud: CloudStream) -> tuple[Array, dict[str, object], str]:
+    """Return the transform (4, 4) in the scan's unit; what is known of it; why it can't be relied on."""
 
     def up_by_photo(axis: Array) -> tuple[Array | None, str]:
         workers = Workers(num_cores(), cloud.show)
@@ -113,21 +97,21 @@ def find(arguments: argparse.Namespace, cloud: CloudStream) -> Found:
 
 @command(__file__, __doc__, EPILOG, add_arguments, "0 done, 1 up is not known")
 def main(arguments: argparse.Namespace) -> int:
-    """Find a transform or take the one given, write what is sure; returns the exit code."""
+    """Find a transform, write what is sure; returns the exit code."""
     with checking_options():
         check_arguments(arguments)
         settings = cloud_settings_from(arguments)
     out = arguments.out
     queries = read_scene(arguments.queries).queries if arguments.queries else ()
-    transform = out.with_suffix(".txt") if out and not arguments.apply and not is_stream(out) else None
+    transform = out.with_suffix(".txt") if out and not is_stream(out) else None
     poses = out.with_name(QUERIES_NAME) if queries else None
     outputs = {"--out": out, "its .txt": transform, "the poses": poses}
-    inputs = [path for path in (arguments.apply, arguments.pano, arguments.queries) if path]
+    inputs = [path for path in (arguments.pano, arguments.queries) if path]
     check_outputs(outputs, [*arguments.cloud, *inputs, *(path / QUERIES_NAME for path in inputs)])
     if arguments.pano:
         read_panorama(arguments.pano)  # refused before the cloud is read
     cloud = open_cloud(arguments.cloud, settings, progress_bar(arguments.quiet))
-    T, report, doubt = (given if arguments.apply else find)(arguments, cloud)
+    T, report, doubt = find(arguments, cloud)
 
     def write_others() -> None:
         if transform:

@@ -10,7 +10,6 @@ import numpy as np
 from ..cloud.soa import FARTHEST, LocalCloud
 from ..errors import InputError
 from ..files.atomic import write_atomically
-from ..files.figure import new_figure
 from ..geometry.pose import Array, Pose
 from ..geometry.rotations import uniform_rotations, uniform_yaws
 from ..jobs.threads import Workers, num_cores
@@ -23,6 +22,7 @@ from ..optimize.loss_surface import (
     surface_npz,
     surface_png,
 )
+from ..optional import new_figure
 from ..panorama import read_panorama
 from ..panorama.model import shrink
 from ..panorama.texels import pack_texels

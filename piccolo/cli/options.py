@@ -9,9 +9,9 @@ from .. import __version__
 from ..batch.frame_times import EXIF, NAMES, ORDER
 from ..camera.files import read_calibration, read_rig
 from ..cloud.crs import check_crs
-from ..cloud.label_colors import Labels
 from ..cloud.settings import METRES, CloudSettings, UpAxis
 from ..errors import InputError
+from ..geometry.colors import Labels
 from ..localization.settings import CoarseToFineSettings
 from ..panorama import ReadOptions
 from ..panorama.model import Projection

@@ -11,8 +11,8 @@ from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers, num_cores
 from ..report.build import WIDTH, ReportSettings, build_report
 from ..report.entries import read_entries
-from ..report.own_plan import OwnPlan
 from ..report.plan_file import SUFFIXES, write_plan_file
+from ..report.plan_image import OwnPlan
 from ..report.site import check_folder
 from ..scan_map.open_map import open_map
 from .command import check_least, command, option, print_warnings
@@ -96,7 +96,8 @@ def check_files(arguments: argparse.Namespace) -> None:
 def main(arguments: argparse.Namespace) -> int:
     """Read, draw, write; returns the exit code."""
     with checking_options():
-        settings, cloud_settings = settings_from(arguments), cloud_settings_from(arguments)
+        settings = settings_from(arguments)
+        cloud_settings = cloud_settings_from(arguments)
     check_files(arguments)
     entries = read_entries(arguments.results)
     workers = Workers(arguments.jobs, progress_bar(arguments.quiet), warn_once(arguments.quiet))
@@ -109,7 +110,8 @@ def main(arguments: argparse.Namespace) -> int:
     if arguments.out:
         report = build_report(entries, scan_map, arguments.out, settings, workers)
         print_warnings(arguments, report.warnings)
-        line["out"], line["url"] = str(arguments.out), report.page.resolve().as_uri()
+        line["out"] = str(arguments.out)
+        line["url"] = report.page.resolve().as_uri()
         line["storeys"] = len(report.document["storeys"])
     line |= Counter(entry.result.status for entry in entries)
     print_report(arguments, {"--plan": arguments.plan}, json.dumps(line))

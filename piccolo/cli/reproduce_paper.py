@@ -7,10 +7,10 @@ from functools import partial
 from pathlib import Path
 
 from ..batch.localizer import Localizer
-from ..cloud.label_colors import Labels
 from ..cloud.settings import CloudSettings
 from ..errors import InputError
 from ..files.atomic import write_atomically
+from ..geometry.colors import Labels
 from ..jobs.memory import limit_memory
 from ..localization.settings import CoarseToFineSettings
 from ..panorama import ReadOptions

@@ -8,10 +8,13 @@ from typing import Any
 
 from ..errors import InputError
 from ..optional import import_optional
-from .readers import e57_file, las_file
+from .readers import e57_file, las
 
-PROJECTION_USER, WKT_ID, GEO_KEYS_ID = b"LASF_Projection", 2112, 34735  # of LAS's records
-PROJECTED_KEY, GEOGRAPHIC_KEY = 3072, 2048  # GeoTIFF keys whose value is a code of EPSG
+PROJECTION_USER = b"LASF_Projection"  # of LAS's records
+WKT_ID = 2112
+GEO_KEYS_ID = 34735
+PROJECTED_KEY = 3072  # GeoTIFF keys whose value is a code of EPSG
+GEOGRAPHIC_KEY = 2048
 USER_DEFINED = 32767
 MAX_LENGTH = 20_000  # characters of a system's description; what is longer is left aside
 
@@ -24,7 +27,7 @@ def crs_of(paths: Sequence[Path]) -> str:
     with paths[0].open("rb") as file:
         head = file.read(8)
     text = ""
-    if head.startswith(las_file.MAGIC):
+    if head.startswith(las.MAGIC):
         text = _of_las(paths[0])
     elif head.startswith(e57_file.MAGIC):
         text = e57_file.read_xml(paths[0]).findtext("{*}coordinateMetadata") or ""
@@ -32,10 +35,10 @@ def crs_of(paths: Sequence[Path]) -> str:
 
 
 def _of_las(path: Path) -> str:
-    header = las_file.read_header(path)
+    header = las.read_header(path)
     with path.open("rb") as file:
-        wkt = las_file.record_content(header, file, PROJECTION_USER, WKT_ID)
-        keys = las_file.record_content(header, file, PROJECTION_USER, GEO_KEYS_ID) or b""
+        wkt = las.record_content(header, file, PROJECTION_USER, WKT_ID)
+        keys = las.record_content(header, file, PROJECTION_USER, GEO_KEYS_ID) or b""
     if wkt:
         return wkt.rstrip(b"\0").decode(errors="replace")
     entries = list(struct.iter_unpack("<4H", keys[: len(keys) // 8 * 8]))[1:]
@@ -50,9 +53,8 @@ def check_crs(crs: str) -> Any:
     try:
         return pyproj.CRS.from_user_input(crs).to_2d()
     except pyproj.exceptions.CRSError as error:
-        raise InputError(
-            f"--crs: found {crs[:80]!r}, wanted a coordinate system such as EPSG:25832"
-        ) from error
+        wanted = "wanted a coordinate system such as EPSG:25832"
+        raise InputError(f"--crs: found {crs[:80]!r}, {wanted}") from error
 
 
 def from_wgs84(crs: str, latitude_deg: float, longitude_deg: float) -> tuple[float, float] | None:
@@ -61,7 +63,6 @@ def from_wgs84(crs: str, latitude_deg: float, longitude_deg: float) -> tuple[flo
     pyproj = import_optional("GPS in photos", "pyproj", "tools")
     if not system.is_projected:
         return None
-    x, y = pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True).transform(
-        longitude_deg, latitude_deg
-    )
+    transformer = pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True)
+    x, y = transformer.transform(longitude_deg, latitude_deg)
     return (float(x), float(y)) if math.isfinite(x) and math.isfinite(y) else None

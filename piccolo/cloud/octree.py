@@ -61,7 +61,8 @@ def average(children: NDArray[np.float32], first: NDArray[np.int32], parents: ND
     for begin in range(0, len(first), AT_ONCE):
         part = slice(begin, begin + AT_ONCE)
         last = first[begin + AT_ONCE] if begin + AT_ONCE < len(first) else len(children)
-        own, places = children[first[begin] : last], first[part] - first[begin]
+        own = children[first[begin] : last]
+        places = first[part] - first[begin]
         counts = np.diff(places, append=len(own))
         for k, column in enumerate(own.T):
             parents[part, k] = np.add.reduceat(column, places, dtype=np.float64) / counts
@@ -84,9 +85,12 @@ def take_all(nodes, first, last, center, found, directions, count):
     """Write nodes that follow one another, and their positions relative to the centre, from `count` on."""
     x, y, z = directions[0], directions[1], directions[2]
     for i in range(last - first):
-        node, k = np.uintp(first + i), np.uintp(count + i)
+        node = np.uintp(first + i)
+        k = np.uintp(count + i)
         found[k] = node
-        x[k], y[k], z[k] = nodes[node, 0] - center[0], nodes[node, 1] - center[1], nodes[node, 2] - center[2]
+        x[k] = nodes[node, 0] - center[0]
+        y[k] = nodes[node, 1] - center[1]
+        z[k] = nodes[node, 2] - center[2]
 
 
 @inline_kernel
@@ -94,10 +98,14 @@ def take_far(nodes, first, last, center, least, found, directions, count, stack,
     """The same with those at least so far, squared [m^2]; the others go on the stack. Returns both counts."""
     x, y, z = directions[0], directions[1], directions[2]
     for node in range(first, last):
-        i, k = np.uintp(node), np.uintp(count)
+        i = np.uintp(node)
+        k = np.uintp(count)
         dx, dy, dz = nodes[i, 0] - center[0], nodes[i, 1] - center[1], nodes[i, 2] - center[2]
         if dx * dx + dy * dy + dz * dz >= least:
-            found[k], x[k], y[k], z[k] = node, dx, dy, dz
+            found[k] = node
+            x[k] = dx
+            y[k] = dy
+            z[k] = dz
             count += 1
         else:
             stack[top] = node
@@ -112,38 +120,48 @@ def collect(tree, center, voxel_per_range, found, directions):
     `directions` (3, N) get the positions relative to the centre [m]. Where all below a node is drawn at one
     level, its nodes there follow one another: most of them are found so, without a question to each.
     """
-    nodes, first_child = tree.nodes, tree.first_child
-    num_levels, num_roots = len(tree.level_start) - 1, tree.level_start[1]
+    nodes = tree.nodes
+    first_child = tree.first_child
+    num_levels = len(tree.level_start) - 1
+    num_roots = tree.level_start[1]
     room = num_roots + 8 * num_levels
-    stack, levels = np.empty(room, np.int32), np.empty(room, np.int32)
+    stack = np.empty(room, np.int32)
+    levels = np.empty(room, np.int32)
     at = np.float32(center[0]), np.float32(center[1]), np.float32(center[2])
-    least_distance, diagonal = np.empty(num_levels, np.float32), np.empty(num_levels, np.float32)
+    least_distance = np.empty(num_levels, np.float32)
+    diagonal = np.empty(num_levels, np.float32)
     for level in range(num_levels):
         size = tree.leaf_size * 2.0 ** (num_levels - 1 - level)
-        least_distance[level], diagonal[level] = size / voxel_per_range, size * DIAGONAL
+        least_distance[level] = size / voxel_per_range
+        diagonal[level] = size * DIAGONAL
     least_distance[num_levels - 1] = F0
     least = least_distance[0] * least_distance[0]
     count, top = take_far(nodes, 0, min(num_roots, len(found)), at, least, found, directions, 0, stack, 0)
     levels[:top] = 0
     while top > 0:
         top -= 1
-        node, level = stack[top], levels[top] + 1
-        first, last = np.int64(first_child[node]), np.int64(first_child[node + 1])
+        node = stack[top]
+        level = levels[top] + 1
+        first = np.int64(first_child[node])
+        last = np.int64(first_child[node + 1])
         is_uniform = level == num_levels - 1
         if voxel_per_range < RANGES_BELOW and level < num_levels - 2:
             dx, dy, dz = nodes[node, 0] - at[0], nodes[node, 1] - at[1], nodes[node, 2] - at[2]
-            distance, reach = math.sqrt(dx * dx + dy * dy + dz * dz), diagonal[level - 1]
+            distance = math.sqrt(dx * dx + dy * dy + dz * dz)
+            reach = diagonal[level - 1]
             uniform = uniform_level(least_distance, level, distance - reach, distance + reach)
             is_uniform = level < uniform
             while level < uniform:
-                first, last = np.int64(first_child[first]), np.int64(first_child[last])
+                first = np.int64(first_child[first])
+                last = np.int64(first_child[last])
                 level += 1
         last = min(last, first + len(found) - count)
         if is_uniform:
             take_all(nodes, first, last, at, found, directions, count)
             count += last - first
         else:
-            least, begin = least_distance[level] * least_distance[level], top
+            least = least_distance[level] * least_distance[level]
+            begin = top
             count, top = take_far(nodes, first, last, at, least, found, directions, count, stack, top)
             levels[begin:top] = level
     return count

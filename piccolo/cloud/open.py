@@ -12,7 +12,7 @@ from .readers.npz import NPY, NPZ
 from .readers.pcd import PCD
 from .readers.ply import PLY
 from .readers.ptx import PTX
-from .readers.reader import HEAD_SIZE, PLAIN, CloudFormat, CloudReadOptions, PointSource
+from .readers.reader import HEAD_SIZE, CloudFormat, PointSource
 from .readers.text import PTS, TEXT
 from .settings import IN_METRES, CloudSettings
 from .stream import Cloud, CloudStream
@@ -29,8 +29,7 @@ def open_cloud(
     Raises InputError if a file is missing, has a damaged header, no colours, or is no format that is read
     here. Reading the points raises it where the data break or fail the checks of `PointValidator`.
     """
-    options = CloudReadOptions(settings.intensity_as_gray, settings.labels, settings.scale)
-    sources = [open_source(path, options) for path in sorted(paths)]
+    sources = [open_source(path, settings) for path in sorted(paths)]
     return CloudStream(sources, settings.scale, show)
 
 
@@ -44,14 +43,14 @@ def read_cloud(path: Path, settings: CloudSettings = IN_METRES) -> Cloud:
     return open_cloud([path], settings).read()
 
 
-def open_source(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+def open_source(path: Path, settings: CloudSettings = IN_METRES) -> PointSource:
     """The points of a file in any format that is read here."""
     try:
         format_ = _format_of(path)
-        if options.labels and not format_.has_labels:
+        if settings.labels and not format_.has_labels:
             known = ", ".join(f.name for f in FORMATS if f.has_labels)
             raise InputError(f"{path}: labels are not read from {format_.name}, wanted {known}")
-        return format_.open_source(path, options)
+        return format_.open_source(path, settings)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}), {WANTED}") from error
 

@@ -25,7 +25,8 @@ COLOR_NAMES = ("red", "green", "blue")
 MAX_DIGITS = 20  # of the number of vertices, for which the header keeps room
 
 Rows = NDArray[np.void]  # structured, a field a property
-AXES, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
+AXES = ("x", "y", "z")
+NORMALS = ("nx", "ny", "nz")
 MAX_LOSS = 1e-4  # of float32 coordinates by rounding [m]
 
 

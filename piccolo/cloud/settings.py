@@ -7,8 +7,8 @@ from typing import Literal, get_args
 import numpy as np
 
 from ..errors import InputError
+from ..geometry.colors import Labels
 from ..geometry.pose import Array, rotation_to_z
-from .label_colors import Labels
 
 UpAxis = Literal["auto", "z", "y", "x", "-z", "-y", "-x"]
 

@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..geometry.colors import pack_rgbx
 from ..geometry.pose import Array, Pose
 
 FARTHEST = 1e7  # [m] from the local origin; squares stay finite in float32 and the loss is inf beyond
@@ -58,23 +58,6 @@ class LocalCloud:
         """A pose of the frame of `points` in the world."""
         R = self.R_local_from_world
         return Pose(pose.R_cam_from_world @ R, R.T @ pose.center_world + self.origin_world)
-
-
-def pack_rgbx(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = None) -> NDArray[np.int32]:
-    """One int32 (...) for each colour (..., 3): R, G, B from the lowest byte up and 1 where valid on top."""
-    shape = rgb.shape[:-1]
-    if 0 in shape:
-        return np.empty(shape, np.int32)
-    valid = np.ones(shape, np.uint8) if is_valid is None else is_valid.astype(np.uint8, copy=False)
-    colors = np.ascontiguousarray(rgb, np.uint8).reshape(-1, 1, 3)
-    rgbx = np.empty((len(colors), 1, 4), np.uint8)
-    cv2.mixChannels([colors, valid.reshape(-1, 1)], [rgbx], [0, 0, 1, 1, 2, 2, 3, 3])
-    return rgbx.view("<i4").reshape(shape).astype(np.int32, copy=False)
-
-
-def unpack_rgb(rgbx: NDArray[np.int32]) -> NDArray[np.uint8]:
-    """The colours (N, 3) that pack_rgbx packed (N,)."""
-    return np.ascontiguousarray(rgbx.astype("<i4")).view(np.uint8).reshape(-1, 4)[:, :3]
 
 
 def pack_points(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> PackedPoints:

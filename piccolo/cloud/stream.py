@@ -10,15 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..files.digest import sha256_of_arrays
 from ..geometry.pose import Array, rotate_points
 from ..jobs.memory import check_address_space
 from ..jobs.threads import Progress, no_progress
-from .digest import sha256_of_arrays
-from .readers.columns import brightest_of, colored_chunks
-from .readers.reader import CHUNK, PointSource, RawCloud
+from .readers.reader import CHUNK, PointSource, RawCloud, brightest_of, colored_chunks
 from .settings import UpAxis
-from .voxel_table import VoxelTable
-from .voxels import Voxels, morton_order
+from .voxels import Voxels, VoxelTable, morton_order
 
 MIN_POINTS = 1000
 MAX_COORDINATE = 1e8  # [m], ten times the Earth: beyond it lie only broken numbers, and float32 gives way
@@ -43,11 +41,13 @@ class PointValidator:
 
     def filter(self, raw: RawCloud) -> Chunk:
         """The finite points of a chunk, after they have been counted."""
-        points, colors = raw.points_world, raw.colors
+        points = raw.points_world
+        colors = raw.colors
         is_finite: NDArray[np.bool_] = np.all(np.isfinite(points), axis=1)
         num_finite = int(np.count_nonzero(is_finite))
         if num_finite < len(points):
-            points, colors = points[is_finite], colors[is_finite]
+            points = points[is_finite]
+            colors = colors[is_finite]
         self.num_finite += num_finite
         self.num_dropped += len(is_finite) - num_finite
         if num_finite:
@@ -133,7 +133,8 @@ class CloudStream:
     @property
     def label(self) -> str:
         """What messages about all files together call them."""
-        first, num_more = self.sources[0].path, len(self.sources) - 1
+        first = self.sources[0].path
+        num_more = len(self.sources) - 1
         return f"{first} and {num_more} more" if num_more else str(first)
 
     @property
@@ -192,7 +193,8 @@ class CloudStream:
         origin_world = np.round(0.5 * (points_world.min(axis=0) + points_world.max(axis=0))) + 0.0
         points = (points_world - origin_world + 0.0).astype(np.float32)
         order = morton_order(points, colors)
-        points, colors = points[order], colors[order]
+        points = points[order]
+        colors = colors[order]
         warnings = (*self._warnings(validators), *unit_warnings(self.label, points))
         num_dropped = sum(validator.num_dropped for validator in validators)
         return Cloud(points, colors, origin_world, num_dropped, warnings, self.up)

@@ -11,7 +11,9 @@ from ..geometry.pose import Array
 from .octree import Octree
 
 CELLS = (3, 4)  # levels above the leaves: cells of 16 cm, or 32 cm where the scan is thin
-MIN_LEAVES, MIN_CELLS, MAX_CELLS = 20, 200, 20_000
+MIN_LEAVES = 20
+MIN_CELLS = 200
+MAX_CELLS = 20_000
 NOISE_SHARE = 0.3  # of the noise's deviation that is left in a pose, by trials with noise of 1 to 5 cm
 ONE_SHEET = 2.5  # kurtosis of noise within a cell, about; of two thin sheets it is 1
 ROUGHNESS = 0.005  # [m] of clean surfaces and the things on them
@@ -45,7 +47,8 @@ def residual_moments(octree: Octree, levels_up: int) -> tuple[Array, Array]:
     products = (offsets[:, :, None] * offsets[:, None, :]).reshape(-1, 9)
     moments = (np.add.reduceat(products, first) / counts[:, None]).reshape(-1, 3, 3)
     variances, axes = np.linalg.eigh(moments)
-    normals, across = axes[:, :, 0], np.maximum(variances[:, 0], ROUGHNESS**2)
+    normals = axes[:, :, 0]
+    across = np.maximum(variances[:, 0], ROUGHNESS**2)
     residuals = np.einsum("ij,ij->i", offsets, normals[cell])
     kurtosis = np.add.reduceat(residuals**4, first) / counts / across**2
     across -= ROUGHNESS**2
@@ -74,7 +77,8 @@ def fitted_tensor(normals: Array, variances: Array) -> Array:
     rows, columns = np.triu_indices(3)
     twice = np.where(rows == columns, 1.0, 2.0)
     design = normals[:, rows] * normals[:, columns] * twice
-    weights, tensor = np.ones(len(variances)), np.zeros((3, 3))
+    weights = np.ones(len(variances))
+    tensor = np.zeros((3, 3))
     for _ in range(NUM_ITERATIONS):  # reweighted least squares
         weighted = design * weights[:, None]
         normal_matrix = design.T @ weighted + RIDGE * weights.sum() * np.diag(twice)

@@ -113,7 +113,8 @@ class ArrayArchive:
         begin = self._begin(info)
         head = self.content[begin : begin + min(MAX_HEAD_SIZE, info.file_size)]
         shape, is_fortran, dtype, size = read_header(head)
-        first, found = begin + size, info.file_size - size
+        first = begin + size
+        found = info.file_size - size
         promised = math.prod(shape) * dtype.itemsize
         if is_fortran or dtype.hasobject or promised != found or min(shape, default=0) < 0:
             raise ValueError(f"{info.filename} of {found} bytes, which promises {dtype} of shape {shape}")

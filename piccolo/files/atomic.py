@@ -16,7 +16,8 @@ from ..errors import InputError
 
 STDOUT = Path("-")
 WRITE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EPIPE}  # that name no file
-NEW_FILE, NEW_FOLDER = 0o666, 0o777  # modes, less the umask
+NEW_FILE = 0o666  # mode, less the umask
+NEW_FOLDER = 0o777
 
 
 def is_stdout(path: Path) -> bool:

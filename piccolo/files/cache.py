@@ -17,9 +17,12 @@ from pathlib import Path
 
 from .atomic import temporary_prefix, write_atomically
 
-STALE_AFTER_S, MARKED_FOR_S = 30 * 24 * 3600.0, 24 * 3600.0
-PRIVATE, ALL = 0o700, 0o777
-WRITABLE, OPEN = 0o022, 0o077  # by others; in any way
+STALE_AFTER_S = 30 * 24 * 3600.0
+MARKED_FOR_S = 24 * 3600.0
+PRIVATE = 0o700
+ALL = 0o777
+WRITABLE = 0o022  # by others
+OPEN = 0o077  # by others in any way
 TAG = "CACHEDIR.TAG"  # https://bford.info/cachedir/: backups leave such folders out
 TAG_CONTENT = (
     b"Signature: 8a477f597d28d172789f06886806bc55\n# Made by PICCOLO, which deletes its own old files.\n"
@@ -45,7 +48,8 @@ def cache_root() -> Path:
     takes its place; what lies there may hold code. OSError where that can't be trusted either.
     """
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111  # never raises
-    root, temporary = Path(home) / "piccolo", Path(tempfile.gettempdir())
+    root = Path(home) / "piccolo"
+    temporary = Path(tempfile.gettempdir())
     with suppress(OSError):
         if not root.is_absolute():
             raise FileNotFoundError

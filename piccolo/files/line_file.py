@@ -26,7 +26,8 @@ def whole_size(path: Path, begins: bytes, what: str) -> int:
         while end > 0 and b"\n" not in torn:
             begin = max(end - BLOCK, 0)
             file.seek(begin)
-            torn, end = file.read(end - begin) + torn, begin
+            torn = file.read(end - begin) + torn
+            end = begin
     torn = torn[torn.rfind(b"\n") + 1 :]
     if torn[: len(begins)] != begins[: len(torn)]:
         raise InputError(f"{path}: its end is no line of {what}")
@@ -56,7 +57,8 @@ class LineFile:
     """A file of lines that this process alone may write."""
 
     def __init__(self, path: Path, handle: int) -> None:
-        self.path, self._handle = path, handle
+        self.path = path
+        self._handle = handle
 
     @property
     def size(self) -> int:

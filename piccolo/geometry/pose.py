@@ -167,14 +167,8 @@ def is_correct(pose: Pose | None, true_pose: Pose) -> bool:
 
 
 def read_pose_matrix(path: Path) -> Pose:
-    """The pose in a text file of T_world_from_cam."""
-    T_world_from_cam = read_transform(path, "T_world_from_cam")
-    return Pose(T_world_from_cam[:3, :3].T, T_world_from_cam[:3, 3])
-
-
-def read_transform(path: Path, name: str) -> Array:
-    """The rigid transform (4, 4) in a text file of as many numbers; lines that begin with # are comments."""
-    wanted = f"wanted the 4 x 4 numbers of {name}"
+    """The pose in a text file of T_world_from_cam, 4 x 4 numbers; lines that begin with # are comments."""
+    wanted = "wanted the 4 x 4 numbers of T_world_from_cam"
     lines = read_text(path, wanted, MAX_FILE_SIZE).splitlines()
     rows = [line.replace(",", " ").split() for line in lines if line.split("#")[0].strip()]
     try:
@@ -186,8 +180,8 @@ def read_transform(path: Path, name: str) -> Array:
         raise InputError(f"{path}: found {shape} numbers, not all finite or not as many, {wanted}")
     if not np.allclose(T[3], [0.0, 0.0, 0.0, 1.0]):
         raise InputError(f"{path}: the last row is not 0 0 0 1, {wanted}")
-    T[:3, :3] = orthonormal(checked_rotation(T[:3, :3], MAX_SKEW, f"{path}: the matrix on the left"))
-    return T
+    R_world_from_cam = orthonormal(checked_rotation(T[:3, :3], MAX_SKEW, f"{path}: the matrix on the left"))
+    return Pose(R_world_from_cam.T, T[:3, 3])
 
 
 def move(pose: Pose, T_target_from_source: Array, metres_per_unit: float) -> Pose:

@@ -1,24 +1,131 @@
-"""The transform that turns a scan upright: vertical and walls by its planes, up by word or by evidence."""
+"""The transform that turns a scan upright: vertical and walls by its planes, up by word or by evidence.
+
+Planes are found by RANSAC. The evidence is what people do over floors and not below ceilings: seats, tables
+and shelves are above floors as high as people reach, and people walk from room to room over floors, while
+lintels, beams and walls divide the space below ceilings. Each cue is the logarithm of a ratio.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..cloud import CloudStream
 from ..cloud.octree import Octree, build_octree
 from ..cloud.settings import R_z_from_axis, UpAxis
 from ..geometry.pose import Array, orthonormal, rotation_to_z, yaw_rotation
-from .planes import SPACING, Planes, dot, estimate_normals, ransac_planes
-from .sense import LEVEL_ANGLE, find_sense
 
+# Chosen by hand; the noise of scanners (2 to 5 mm) is far below the spacing of the points
+SPACING = 0.08  # of the points that are used [m]
+MAX_POINTS = 40_000  # that get a normal: a plane of 1 % of the cloud still has 400
+NUM_NEIGHBORS = 24  # with the point itself: at 8 cm a disc of radius 0.22 m
+MAX_THICKNESS = 0.05  # of a flat neighbourhood: variance across it to the lesser variance along it
+MIN_WIDTH = 0.1  # of a flat neighbourhood: lesser to larger variance along it; below, it is a line
+SEED = 20  # of the draws
+MAX_PLANES = 24
+MIN_FRACTION = 0.01  # of all points, of a dominant plane
+NUM_HYPOTHESES = 200  # for each plane: one lies on a plane of 2 % of the points in 98 % of draws
+NUM_SCORING_POINTS = 2000  # drawn, on which a hypothesis is scored: a plane of 1 % has 20 of them
+TOLERANCE = 0.03  # of an inlier, from the plane: six times a scanner's noise of 5 mm [m]
+INLIER_ANGLE = np.radians(15.0)  # of its normal, loose since normals near edges lean
+NUM_REFITS = 4  # by least squares, until the inliers stay the same
 MAX_LEAN = np.radians(15.0)  # of the vertical to a direction that is said to be up
 SNAP_ANGLE = np.radians(0.2)  # of the vertical to such a direction that is then taken itself
 AGREE_ANGLE = np.radians(3.0)  # of a plane to level or upright, that counts for the vertical
 MIN_ALIGNED = 0.6  # fraction of the planes' area that is level or upright: roofs are neither
 MAX_FLATNESS = 0.75  # height to the lesser width of a scan, above which a wall may be its floor
+LEVEL_ANGLE = np.radians(8.0)  # of a level surface's normal to the vertical: ramps up to 1 : 7 are floors
+MIN_LEVEL = 0.3  # area of a floor or ceiling to that of the largest: tables have less
+HEADROOM = 1.9  # of a person [m]
+FURNITURE = 0.3, 1.2  # heights of seats, tables, counters, shelves above the floor [m]
+SHEET = 0.12  # half of a floor's thickness [m]
+STEP = 0.3  # what is lower does not keep anybody from walking [m]
+CELL = 0.25  # of the grid in which people walk [m]
+MAX_CELLS = 4e6  # of a grid: of wider scans the cells are larger
+REACH = 2  # cells between the points of a floor, or between free space and the next thing over a floor
+MIN_PIECE = 8  # cells of free space in one piece
+FEW_POINTS = 0.001  # added to both counts of a ratio, so that a handful says little
+FEW_CELLS = 20.0  # as well
+PLAIN = 1.0  # sum of both cues from which on they decide: a ratio of e
+LEAST = -0.5  # of the lesser cue, below which they disagree
+HIGH = 4.0  # a storey from which on [m] trusses look like tables
+LEAST_IN_HIGH = 0.3  # there both cues must agree
 # up (3,) by a photo in the scan turned by its vertical (3,), None if it isn't localized; and why
 FindByPhoto = Callable[[Array], tuple[Array | None, str]]
+
+
+class PointNormals(NamedTuple):
+    """A sample of a cloud with the normals there."""
+
+    points: Array  # (M, 3) [m]
+    normals: Array  # (M, 3) unit, of either sign
+    is_flat: NDArray[np.bool_]  # (M,) the neighbourhood is a plane
+
+
+class Planes(NamedTuple):
+    """Dominant planes, the largest first."""
+
+    normals: Array  # (P, 3) unit, of either sign
+    centers: Array  # (P, 3) mean of the inliers [m]
+    areas: Array  # (P,) fraction of all points of the sample, which are spread evenly in space
+
+
+def dot(vectors: Array, axis: Array) -> Array:
+    """Return dot products (M,) of vectors (M, 3) and an axis (3,); by BLAS they would depend on threads."""
+    return np.asarray(np.einsum("ni,i->n", vectors, axis))
+
+
+def estimate_normals(points: NDArray[np.float32]) -> PointNormals:
+    """Return normals of an evenly strided sample of a cloud (N, 3) [m], by PCA of the nearest points."""
+    from scipy.spatial import cKDTree  # noqa: PLC0415  # only who asks for up waits for it
+
+    sample = points[:: -(-len(points) // MAX_POINTS)].astype(np.float64)
+    nearest = list(range(1, min(NUM_NEIGHBORS, len(points)) + 1))
+    neighbors = points[cKDTree(points).query(sample, nearest)[1]].astype(np.float64)
+    neighbors -= neighbors.mean(axis=1, keepdims=True)
+    variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", neighbors, neighbors))
+    across, narrow, wide = variances.T
+    is_flat = (across < MAX_THICKNESS * narrow) & (narrow > MIN_WIDTH * wide)
+    return PointNormals(sample, axes[:, :, 0], is_flat)
+
+
+def ransac_planes(cloud: PointNormals) -> Planes:
+    """Return the dominant planes: RANSAC on flat points, least squares on all inliers."""
+    rng = np.random.default_rng(SEED)
+    left = np.flatnonzero(cloud.is_flat)
+    found: list[tuple[Array, Array, float]] = []
+    least = max(MIN_FRACTION * len(cloud.points), 3)
+    while len(found) < MAX_PLANES and len(left) > least:
+        drawn = rng.choice(left, NUM_HYPOTHESES)
+        scoring = rng.choice(left, NUM_SCORING_POINTS)
+        votes = _are_inliers(cloud, scoring, cloud.normals[drawn], cloud.points[drawn]).sum(axis=1)
+        normal = cloud.normals[drawn[votes.argmax()]]
+        center = cloud.points[drawn[votes.argmax()]]
+        for _ in range(NUM_REFITS):
+            is_inlier = _are_inliers(cloud, left, normal[None], center[None])[0]
+            inliers = cloud.points[left[is_inlier]]
+            if len(inliers) < least:
+                break
+            center = inliers.mean(axis=0)
+            normal = np.linalg.eigh(np.einsum("ni,nj->ij", inliers - center, inliers - center))[1][:, 0]
+        if len(inliers) < least:
+            break
+        found.append((normal, center, len(inliers) / len(cloud.points)))
+        left = left[~is_inlier]
+    found.sort(key=lambda plane: -plane[2])
+    normals, centers, areas = zip(*found, strict=True) if found else ((), (), ())
+    return Planes(np.reshape(normals, (-1, 3)), np.reshape(centers, (-1, 3)), np.array(areas))
+
+
+def _are_inliers(
+    cloud: PointNormals, some: NDArray[np.int64], normals: Array, points: Array
+) -> NDArray[np.bool_]:
+    """Return which of some points (S,) lie on planes (H, S) by normals and points (H, 3)."""
+    offsets = np.einsum("hi,hi->h", normals, points)[:, None]
+    distances = np.einsum("hi,ji->hj", normals, cloud.points[some]) - offsets
+    cosines = np.einsum("hi,ji->hj", normals, cloud.normals[some])
+    return np.asarray((np.abs(distances) < TOLERANCE) & (np.abs(cosines) > np.cos(INLIER_ANGLE)))
 
 
 class Alignment(NamedTuple):
@@ -48,11 +155,14 @@ def find_alignment(
     elif up:
         named = R_z_from_axis(up, cloud.up)[2]
         if up == "auto" and said is not None and said @ named < np.cos(MAX_LEAN):
-            said, reason = None, f"the floors do not face {cloud.up}, by their {reason}"
+            said = None
+            reason = f"the floors do not face {cloud.up}, by their {reason}"
         else:
-            said, reason = named, "up is the named axis"
+            said = named
+            reason = "up is the named axis"
     elif len(scanners) and dot(scanners, scanners[0]).min() > np.cos(MAX_LEAN):
-        said, reason = scanners[0], "the scanners stood upright"
+        said = scanners[0]
+        reason = "the scanners stood upright"
     up_scan = None if said is None else level(planes, said)
     R = np.eye(3) if up_scan is None else rotation_to_z(up_scan)
     yaw = wall_yaw(planes, R) if along_walls else None
@@ -120,3 +230,71 @@ def wall_yaw(planes: Planes, R_level_from_scan: Array) -> float | None:
     k = (is_wall * _areas_by(planes)[1]).argmax()  # a wall to which most others are parallel or square
     turns = -np.arctan2(y[k], x[k]) / (0.5 * np.pi)
     return float(turns - np.ceil(turns - 0.5)) * 0.5 * np.pi
+
+
+def find_sense(cloud: PointNormals, planes: Planes, axis: Array) -> tuple[float, str]:
+    """Return 1 if up is along a vertical (3,), -1 if against it, 0 if that is not plain; and why."""
+    levels = find_levels(planes, axis)
+    if len(levels) < 2:
+        return 0.0, "a floor and a ceiling are not both among the dominant planes"
+    heights = dot(cloud.points, axis)
+    is_level = cloud.is_flat & (np.abs(dot(cloud.normals, axis)) > np.cos(LEVEL_ANGLE))
+    places = np.einsum("ni,ji->nj", cloud.points, np.linalg.svd(axis[None])[2][1:])
+    passages = passage_cue(heights, is_level, levels, places)
+    cues = np.array([furniture_cue(heights, is_level, levels), passages])
+    sense = float(np.sign(cues.sum()))
+    least = LEAST_IN_HIGH if np.diff(levels).max() > HIGH else LEAST
+    is_plain = sense * cues.sum() > PLAIN and (sense * cues).min() > least
+    reason = "furniture {:+.1f}, free ways {:+.1f}".format(*sense * cues)
+    return (sense, reason) if is_plain else (0.0, f"floor and ceiling look alike: {reason}")
+
+
+def find_levels(planes: Planes, axis: Array) -> Array:
+    """Return the heights (L,) of floors and ceilings along a vertical (3,), ascending, a person apart."""
+    is_level = np.abs(dot(planes.normals, axis)) > np.cos(LEVEL_ANGLE)
+    levels: list[float] = []
+    for height, area in zip(dot(planes.centers, axis)[is_level], planes.areas[is_level], strict=True):
+        is_large = area > MIN_LEVEL * planes.areas[is_level][0]
+        if is_large and all(abs(height - other) > HEADROOM for other in levels):
+            levels.append(float(height))
+    return np.array(sorted(levels))
+
+
+def furniture_cue(heights: Array, is_level: NDArray[np.bool_], levels: Array) -> float:
+    """Compare level faces as high as furniture above levels (L,) with those as far below."""
+    next_level = np.searchsorted(levels, heights[is_level])
+    above = heights[is_level] - np.append(-np.inf, levels)[next_level]
+    below = np.append(levels, np.inf)[next_level] - heights[is_level]
+    low, high = FURNITURE
+    few = FEW_POINTS * len(heights)
+    standing = np.count_nonzero((above > low) & (above < np.minimum(high, below)))
+    hanging = np.count_nonzero((below > low) & (below < np.minimum(high, above)))
+    return float(np.log((standing + few) / (hanging + few)))
+
+
+def passage_cue(heights: Array, is_level: NDArray[np.bool_], levels: Array, places: Array) -> float:
+    """Compare how far space that is free for a person is in one piece above levels (L,) and below them.
+
+    That is the mean, over the free area of a level, of the fraction that the piece has of the level's.
+    """
+    from scipy import ndimage  # noqa: PLC0415  # only who asks for up waits for it
+
+    low, high = np.quantile(places, [0.001, 0.999], axis=0)
+    cell = max(CELL, float(np.sqrt(np.prod(high - low) / MAX_CELLS)))
+    edges = [np.arange(a, b + cell, cell) for a, b in zip(low, high, strict=True)]
+
+    def grid(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        return np.asarray(np.histogramdd(places[mask], edges)[0] > 0)
+
+    pieces = np.full((2, 2), FEW_CELLS)  # above, below: free cells times their piece's fraction; free cells
+    for level in levels:
+        sheet = np.pad(grid(is_level & (np.abs(heights - level) < SHEET)), REACH)
+        sheet = ndimage.binary_closing(sheet, iterations=REACH)[REACH:-REACH, REACH:-REACH]
+        for k, off in enumerate((heights - level, level - heights)):
+            is_free = sheet & ~grid((off > STEP) & (off < HEADROOM))
+            is_free &= ndimage.binary_dilation(grid(off > STEP), iterations=REACH)
+            areas = np.bincount(ndimage.label(is_free)[0].ravel())[1:]
+            areas = areas[areas > MIN_PIECE]
+            pieces[k] += (areas**2).sum() / max(areas.sum(), 1), areas.sum()
+    above, below = pieces[:, 0] / pieces[:, 1]
+    return float(np.log(above / below))

@@ -1,16 +1,198 @@
-"""Numba's flags in one place. Importing a kernel compiles, reads and writes nothing.
+"""Numba's flags in one place, and compiled kernels on disk, one file a kernel and signature.
 
-A kernel is serial and releases the GIL; whole poses or fixed blocks of points are spread over threads
-by `piccolo.jobs.threads`.
+Importing a kernel compiles, reads and writes nothing: its file is opened when it is first called. A kernel is
+serial and releases the GIL; whole poses or fixed blocks of points are spread over threads by
+`piccolo.jobs.threads`.
+
+Numba's own cache makes its folders when a module is imported, does not see that a kernel's callee in another
+file has changed, never finds a kernel again that takes another from around it, parses the bitcode of each,
+and loads machine code without a checksum. What is used here of Numba's insides may change with its releases:
+its version has an upper bound, and whatever goes wrong, the kernel is compiled.
 """
 
+import hashlib
+import logging
+import pickle
+import sys
+import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
+import llvmlite.binding as llvm
 import numba
 import numpy as np
+from numba.core import compiler, serialize
+from numba.core.runtime.nrt import rtsys
 
-from .kernel_cache import KernelCache
+from ..files.atomic import write_atomically
+from ..files.cache import PRIVATE, WRITABLE, cache_root, in_words, is_own, mark_used, own_folder, own_names
+
+NAME = own_names("kernel")
+DIGEST_SIZE = hashlib.sha256().digest_size
+# of numba.config: they change the code that is made
+FLAGS = (
+    "BOUNDSCHECK", "DEBUGINFO_DEFAULT", "DISABLE_INTEL_SVML", "ENABLE_AVX", "ENABLE_PROFILING",
+    "EXTEND_VARIABLE_LIFETIMES", "LLVM_REFPRUNE_FLAGS", "LLVM_REFPRUNE_PASS", "LOOP_VECTORIZE", "OPT",
+    "SLP_VECTORIZE",
+)  # fmt: skip
+QUIET_S = 3.0  # between two lines on what is compiled, and before the first
+log = logging.getLogger("piccolo")
+
+
+@cache
+def kernel_folder() -> Path | None:
+    """The folder of compiled kernels, made now; None, after a warning, where there can be none.
+
+    Kernels are pickles, which run code: others must not be able to write there.
+    """
+    try:
+        folder = own_folder(cache_root() / "kernels", NAME, PRIVATE)
+        if is_own(folder.stat(), WRITABLE):
+            return folder
+        reason = f"{folder}: others may write to it; delete it"
+    except OSError as error:
+        reason = in_words(error)
+    warn_not_kept(reason)
+    return None
+
+
+@cache
+def warn_not_kept(reason: str) -> None:
+    """Warn once that the next run has to compile again."""
+    log.warning("%s; compiled code is not kept, and each run takes half a minute more", reason)
+
+
+@cache
+def warn_damaged(folder: Path) -> None:
+    """Warn once, however many files are damaged."""
+    log.warning("%s: damaged compiled code; it is compiled anew", folder)
+
+
+@cache
+def sources_digest() -> str:
+    """Digest of the sources that hold kernels, as one kernel is compiled into another."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+        source = path.read_bytes()
+        if b"kernels.jit import" in source or path.parent == Path(__file__).parent:
+            digest.update(source)
+    return digest.hexdigest()
+
+
+@dataclass
+class Compiling:
+    """What this process has compiled, told to those who wait as the log's INFO."""
+
+    count: int = 0
+    told: float = 0.0  # [s] when the first kernel was asked for and not found, or a line was last logged
+
+    def start(self) -> None:
+        """Note the time at which the first kernel was asked for and not found."""
+        self.told = self.told or time.monotonic()
+
+    def finish(self) -> None:
+        """Count a kernel; from time to time log how many there are."""
+        self.count += 1
+        now = time.monotonic()
+        if now - self.told >= QUIET_S:
+            self.told = now
+            log.info("compiling kernels, once: %d so far, half a minute in all", self.count)
+
+
+compiling = Compiling()
+
+
+def digest_of(name: str, payload: bytes) -> bytes:
+    """What stands before a payload in the file of this name: it tells damage, not malice."""
+    return hashlib.sha256(name.encode() + payload).digest()
+
+
+def read_whole(path: Path) -> bytes | None:
+    """The compiled code in a file, as written; None if there is none or (with a warning) if it is damaged."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    payload = content[DIGEST_SIZE:]
+    if digest_of(path.name, payload) != content[:DIGEST_SIZE]:
+        warn_damaged(path.parent)
+        return None
+    mark_used(path)
+    return payload
+
+
+def captured_by(function: Any) -> list[Any]:
+    """The functions that a function takes from around it, and those that these take: they are compiled in."""
+    found = []
+    for cell in getattr(function, "py_func", function).__closure__ or ():
+        found += [cell.cell_contents, *captured_by(cell.cell_contents)]
+    return found
+
+
+def rebuilt(
+    target_context: Any, library: tuple[str, str, tuple[bytes, bytes]], description: Any, *others: object
+) -> Any:
+    """A compiled kernel from its pickled parts.
+
+    Numba parses a kernel's bitcode, up to 1 MB, to learn which names its machine code has, and to compile
+    others that call it. Here the names that may be asked for stand in; it is parsed only for the latter.
+    """
+    name, kind, (machine_code, bitcode) = library
+    wrappers = description.llvm_cpython_wrapper_name, description.llvm_cfunc_wrapper_name
+    names = description.llvm_func_name, *wrappers
+    stand_in = llvm.parse_assembly("".join(f'define void @"{each}"() {{ ret void }}\n' for each in names))
+    parts = (name, kind, (machine_code, stand_in.as_bitcode())), description
+    compiled = compiler.CompileResult._rebuild(target_context, *parts, *others)
+    compiled.library._get_module_for_linking = cache(partial(llvm.parse_bitcode, bitcode))
+    return compiled
+
+
+class KernelCache:
+    """What Numba asks for compiled code: one kernel's files. A file that is damaged is compiled anew."""
+
+    def __init__(self, function: Any) -> None:
+        """Remember which kernel; nothing is opened."""
+        self.name = " ".join(f"{f.__module__}.{f.__qualname__}" for f in (function, *captured_by(function)))
+        self.cache_path = None  # Numba's `stats` shows it
+
+    def _file(self, signature: object, codegen: Any) -> Path | None:
+        """The file for a signature on this machine's processor."""
+        versions = numba.__version__, np.__version__, sys.version_info[:2], sys.byteorder
+        how = versions, codegen.magic_tuple(), [getattr(numba.config, flag, None) for flag in FLAGS]
+        key = repr((self.name, str(signature), how, sources_digest()))
+        folder = kernel_folder()
+        return folder and folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.kernel"
+
+    def load_overload(self, signature: object, target_context: Any) -> Any:
+        """Read compiled code; None if there is none that can be trusted."""
+        try:
+            rtsys.initialize(target_context)
+            path = self._file(signature, target_context.codegen())
+            if payload := path and read_whole(path):
+                return rebuilt(target_context, *pickle.loads(payload))
+        except Exception as error:  # Numba's insides are not as they were
+            warn_not_kept(f"Numba {numba.__version__}: {error!r}")
+        compiling.start()
+        return None
+
+    def save_overload(self, signature: object, compiled: Any) -> None:
+        """Write compiled code whole; where that can't be done it is compiled again by the next run."""
+        compiling.finish()
+        try:
+            if path := self._file(signature, compiled.codegen):
+                payload = serialize.dumps(compiled._reduce())
+                write_atomically(path, digest_of(path.name, payload) + payload)
+        except OSError as error:
+            warn_not_kept(f"{kernel_folder()}: {error.strerror or error}")
+        except Exception as error:  # as above
+            warn_not_kept(f"Numba {numba.__version__}: {error!r}")
+
+    def flush(self) -> None:
+        """Nothing is held in memory."""
+
 
 # Without error_model="numpy" every float division carries a branch that raises ZeroDivisionError, and that
 # branch alone stops LLVM vectorising a loop. "nnan" and "ninf" stay off: a point at the camera divides by 0.

@@ -16,7 +16,7 @@ from ..geometry.pose import Array, Pose
 from ..geometry.suppression import non_maximum_suppression
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, copy_to, inline_kernel, kernel
-from ..panorama.projection import in_camera, pose_float32
+from ..panorama.texels import in_camera, pose_float32
 from .matching import LEAST_WEIGHT, Matches
 from .p3p import p3p
 from .pose_refinement import refine_pose

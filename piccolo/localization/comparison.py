@@ -17,8 +17,7 @@ from ..geometry.sphere import BLOCK_RINGS, cell_of, make_grid, pixel_rays
 from ..kernels.jit import F0, copy_to, kernel
 from ..optimize.channel_loss import CHANCE, NUM_BLOCKS
 from ..panorama.local_normalization import opponent, zscore
-from ..panorama.projection import CHUNK, gather, make_projected, project
-from ..panorama.texels import bilinear_weights, blend, is_valid
+from ..panorama.texels import CHUNK, bilinear_weights, blend, gather, is_valid, make_projected, project
 from ..views.cells import average_colors, local_statistics, locate
 from ..views.recent_views import place_of
 from ..views.view import empty_cells

@@ -11,8 +11,7 @@ import numpy as np
 from ..geometry.sphere import BLOCK_RINGS, make_grid
 from ..kernels.jit import F1, HALF, inline_kernel, kernel
 from ..panorama.local_normalization import ZERO_LEVEL
-from ..panorama.projection import CHUNK, gather, make_projected, project
-from ..panorama.texels import bilinear_weights, blend, is_valid
+from ..panorama.texels import CHUNK, bilinear_weights, blend, gather, is_valid, make_projected, project
 from .levenberg_marquardt import levenberg_marquardt
 from .normal_equations import COUNT, LOSS, block_adder
 

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
 from ..cloud.soa import LocalCloud, PackedPoints
-from ..files.figure import new_figure
 from ..geometry.pose import Array, Pose
 from ..jobs.threads import Workers
+from ..optional import new_figure
 from ..panorama.texels import Texels
 from ..views.zbuffer import is_free_space, visible_points
 from .sampling_loss import sampling_loss

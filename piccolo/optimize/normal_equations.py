@@ -12,8 +12,7 @@ import numpy as np
 
 from ..geometry.sphere import pixel_jacobian
 from ..kernels.jit import F0, inline_kernel, kernel
-from ..panorama.projection import CHUNK, gather, make_projected, project
-from ..panorama.texels import blend_with_gradient, is_valid
+from ..panorama.texels import CHUNK, blend_with_gradient, gather, is_valid, make_projected, project
 
 NUM_SUMS = 29  # loss, count, gradient (6), upper triangle of the normal matrix (21)
 LOSS, COUNT, GRADIENT, MATRIX = 0, 1, 2, 8  # where they begin

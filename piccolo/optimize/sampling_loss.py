@@ -19,8 +19,17 @@ from ..cloud.soa import FARTHEST, PackedPoints
 from ..geometry.pose import Array, Pose
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, F1, inline_kernel, kernel
-from ..panorama.projection import CHUNK, gather, make_projected, project
-from ..panorama.texels import Texels, bilinear_weights, blend, channel, is_valid
+from ..panorama.texels import (
+    CHUNK,
+    Texels,
+    bilinear_weights,
+    blend,
+    channel,
+    gather,
+    is_valid,
+    make_projected,
+    project,
+)
 from .normal_equations import GRADIENT, MATRIX, NUM_SUMS, block_adder
 
 BLOCK = 4096

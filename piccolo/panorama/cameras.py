@@ -14,10 +14,10 @@ from ..camera.resampling import View, shrunk
 from ..camera.rig import extent_of
 from ..errors import InputError
 from .cube import face_pixels
-from .exif import focal_of
 from .gpano import ASPECT_TOLERANCE
 from .masks import black_borders
 from .model import ReadOptions
+from .photo import focal_of
 from .picture import Picture
 
 # By EXIF's orientation: the stored picture's axes from those of the picture as it is shown; and how many
@@ -29,7 +29,9 @@ TURNED: dict[object, tuple[NDArray[np.float64], int]] = {
 HOW = "; --camera, --focal, or --fov with --projection pinhole say it exactly"
 MIN_REPORTED = 0.01  # of a picture: black borders below this are masked without a warning
 # standard deviations of the logarithm of a focal length: a first guess, a number of pixels, a field of view
-OF_GUESS, OF_PIXELS, OF_FIELD = 0.2, 0.01, 0.03
+OF_GUESS = 0.2
+OF_PIXELS = 0.01
+OF_FIELD = 0.03
 
 
 class Cameras(NamedTuple):
@@ -109,9 +111,11 @@ def views_of(
     whole = extent_of(mounts)
     if picture.size[0] != picture.size[1] and picture.orientation in TURNED and whole == picture.size[::-1]:
         pixels = np.rot90(pixels, TURNED[picture.orientation][1])
-    views, notes = [], []
+    views = []
+    notes = []
     for mount in mounts:
-        (left, top), camera = mount.offset, mount.camera
+        left, top = mount.offset
+        camera = mount.camera
         own = np.ascontiguousarray(pixels[top : top + camera.height, left : left + camera.width])
         is_bounded = camera.max_angle_deg is not None  # what is black within the circle is no border
         borders = None if is_bounded else black_borders(own[..., :3], own[..., 3] > 0, is_full=False)

@@ -74,7 +74,8 @@ def equirectangular(faces: Faces) -> Pixels:
         for left in range(0, 4 * size, size // 2):  # half a face: one face around, and up or down
             columns = slice(left, left + size // 2)
             pixels = _sampled(padded, rays[:, columns], rim=1)
-            rgb[rows, columns], is_valid[rows, columns] = pixels[..., :3], pixels[..., 3] == 255
+            rgb[rows, columns] = pixels[..., :3]
+            is_valid[rows, columns] = pixels[..., 3] == 255
     return rgb, is_valid
 
 
@@ -82,9 +83,11 @@ def _padded(faces: Faces, letter: str) -> NDArray[np.uint8]:
     """A face with a rim of one pixel from the faces around it, for interpolation across the edge."""
     size = len(faces[letter])
     padded = cv2.copyMakeBorder(faces[letter], 1, 1, 1, 1, cv2.BORDER_CONSTANT)
-    ends, along = np.array([0, size + 1]), np.arange(size + 2)
+    ends = np.array([0, size + 1])
+    along = np.arange(size + 2)
     for rows, columns in ((ends[:, None], along[None]), (along[:, None], ends[None])):
-        right, down = (2.0 * columns - 1.0) / size - 1.0, (2.0 * rows - 1.0) / size - 1.0
+        right = (2.0 * columns - 1.0) / size - 1.0
+        down = (2.0 * rows - 1.0) / size - 1.0
         in_face = np.stack(np.broadcast_arrays(right, down, 1.0), axis=-1).astype(np.float32)
         padded[rows, columns] = _sampled(faces, in_face @ R_FACE_FROM_CAM[letter], rim=0)
     return np.asarray(padded)

@@ -102,10 +102,13 @@ def rotation_to_level(gpano: GPano) -> Array | None:
     """
     if gpano.pitch_deg is None and gpano.roll_deg is None:
         return None
-    pitch, roll = math.radians(gpano.pitch_deg or 0.0), math.radians(gpano.roll_deg or 0.0)
-    c, s = math.cos(pitch), math.sin(pitch)
+    pitch = math.radians(gpano.pitch_deg or 0.0)
+    roll = math.radians(gpano.roll_deg or 0.0)
+    c = math.cos(pitch)
+    s = math.sin(pitch)
     R_pitch = np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
-    c, s = math.cos(roll), math.sin(roll)
+    c = math.cos(roll)
+    s = math.sin(roll)
     return np.asarray(R_pitch @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]))
 
 
@@ -155,18 +158,21 @@ def embed_crop(path: Path, rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], 
     """
     height, width = is_valid.shape
     full_width, full_height = full_size(path, region, (width, height))
-    left, top = round(region.left * full_width), max(round(region.top * full_height), 0)
+    left = round(region.left * full_width)
+    top = max(round(region.top * full_height), 0)
     right = left + max(round(region.width * full_width), 1)
     bottom = min(top + max(round(region.height * full_height), 1), full_height)
     size = right - left, bottom - top
     if is_valid.shape != size[::-1]:  # area-averaged; a pixel is valid if all that went into it is
         mask = cv2.resize(is_valid.astype(np.uint8) * 255, size, interpolation=cv2.INTER_AREA)
         small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
-        rgb, is_valid = np.asarray(small, dtype=np.uint8), np.asarray(mask == 255)
+        rgb = np.asarray(small, dtype=np.uint8)
+        is_valid = np.asarray(mask == 255)
     if is_valid.shape == (full_height, full_width) and left % full_width == 0:
         return rgb, is_valid
     full_rgb = np.zeros((full_height, full_width, 3), dtype=np.uint8)
     full_valid = np.zeros((full_height, full_width), dtype=np.bool_)
     columns = np.arange(left, right) % full_width
-    full_rgb[top:bottom, columns], full_valid[top:bottom, columns] = rgb, is_valid
+    full_rgb[top:bottom, columns] = rgb
+    full_valid[top:bottom, columns] = is_valid
     return full_rgb, full_valid

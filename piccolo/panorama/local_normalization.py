@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from ..geometry.sphere import pixel_rays, solid_angles
 from ..kernels.jit import F0, F1, HALF, copy_to, inline_kernel, kernel
 from . import Panorama
-from .projection import CHUNK, gather, make_projected, project
-from .texels import Texels, bilinear_weights, blend, is_valid
+from .texels import CHUNK, Texels, bilinear_weights, blend, gather, is_valid, make_projected, project
 
 CLIP = 2.0  # deviations; what differs more from its surroundings counts no more
 MIN_DEVIATION = 0.03  # of a channel in [0, 1]: flatter surroundings are not amplified further

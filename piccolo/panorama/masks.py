@@ -19,7 +19,8 @@ from .cube import SUFFIXES
 from .gpano import ASPECT_TOLERANCE
 from .picture import read_picture
 
-NEAR_BLACK, BLACK = 8, 2  # levels: where a border goes on, and what most of it has
+NEAR_BLACK = 8  # levels where a border goes on
+BLACK = 2  # levels that most of it has
 MIN_FULL_EDGE = 0.99  # of a full sphere's edge: its rows at the poles and its seam are black as a whole
 MIN_CROP_EDGE = 1.0 / 64.0  # of a crop's edge, which may be ragged
 MIN_PURE = 0.95  # of a border's pixels that are BLACK
@@ -32,7 +33,8 @@ NUM_ROWS = round(45.0 * ROWS_PER_DEG)  # around a pole
 # numbers of rows inside a disc, largest first: half angles of 40 to 3 deg
 CANDIDATES = range(round(40.0 * ROWS_PER_DEG), round(3.0 * ROWS_PER_DEG) - 1, -1)
 MIN_STEP = 12.0  # levels between inside and outside of a disc's edge
-MIN_EDGE_FRACTION, MAX_CALM_FRACTION = 0.9, 0.5  # of columns with a step: at the edge, in the rows near it
+MIN_EDGE_FRACTION = 0.9  # of columns with a step at the edge
+MAX_CALM_FRACTION = 0.5  # in the rows near it
 NUM_SECTORS = 16
 DETAIL_DEG = 0.5  # over which detail is measured
 MIN_DETAIL = 4.0  # levels, around a disc without detail
@@ -140,20 +142,23 @@ def _neighbors_around() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Flat indices (NUM_ROWS, DISC_WIDTH) of the pixels DETAIL_DEG east and west of each."""
     around = np.sin(np.radians((np.arange(NUM_ROWS) + 0.5) / ROWS_PER_DEG))
     spacing = np.clip(np.round(DETAIL_DEG * ROWS_PER_DEG / around), 1, DISC_WIDTH // 8).astype(int)
-    rows, columns = np.arange(NUM_ROWS)[:, None], np.arange(DISC_WIDTH)
+    rows = np.arange(NUM_ROWS)[:, None]
+    columns = np.arange(DISC_WIDTH)
     east, west = ((columns + sign * spacing[:, None]) % DISC_WIDTH for sign in (1, -1))
     return rows * DISC_WIDTH + east, rows * DISC_WIDTH + west
 
 
 def _detail_circle(cap: NDArray[np.float32]) -> int:
     """Number of rows from the pole (row 0) to the outermost circle at which all detail ends, 0 if none."""
-    grey, (east, west) = cv2.transform(cap, np.full((1, 3), 1.0 / 3.0)), _neighbors_around()
+    grey = cv2.transform(cap, np.full((1, 3), 1.0 / 3.0))
+    east, west = _neighbors_around()
     second = grey.ravel()[east] + grey.ravel()[west] - 2.0 * grey
     detail = np.abs(second).reshape(NUM_ROWS, NUM_SECTORS, -1).mean(axis=2)
     ends = np.cumsum(np.concatenate([np.zeros((1, NUM_SECTORS)), detail]), axis=0)
     within = (ends[NEAR_ROWS:] - ends[:-NEAR_ROWS]) / NEAR_ROWS  # mean of the NEAR_ROWS from each row on
     for k in CANDIDATES:
-        inside, outside = within[k - 1 - NEAR_ROWS], within[k + 1]  # row k - 1 is half a step: left out
+        inside = within[k - 1 - NEAR_ROWS]  # row k - 1 is half a step: left out
+        outside = within[k + 1]
         if (outside < np.maximum(MIN_DETAIL_RATIO * inside, MIN_DETAIL)).any():
             continue
         if (outside >= MIN_DETAIL_RATIO * np.median(detail[: k - 1], axis=0)).all():

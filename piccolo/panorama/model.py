@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from ..camera import Calibration, Camera, Mount
 from ..camera.resampling import View, sphere_of
 from ..camera.rig import IDENTITY
-from ..cloud.label_colors import Labels
 from ..errors import InputError
+from ..geometry.colors import Labels
 
 FACE_LETTERS = "rludfb"  # right, left, up, down, front, back
 Projection = Literal["equirectangular", "pinhole", "fisheye"]

@@ -1,11 +1,17 @@
-"""What a photo's file says of itself beside its pixels: a digest, its size, when and where it was taken."""
+"""What a photo's file says of itself beside its pixels: digest, size, time, place, focal length, elevation.
+
+What is damaged counts as not said. The focal length in pixels is the more exact of two:
+- FocalLength with FocalPlaneXResolution and its unit, at the size at which the picture was taken;
+- FocalLengthIn35mmFilm, the focal length that shows the same angle over the diagonal of 36 x 24 mm, 43.27 mm,
+  as CIPA DCG-001 defines it: a phone's 4:3 picture is compared with film of 3:2, so widths can't be.
+"""
 
 import hashlib
 import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsFloat, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +19,8 @@ from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 
 from ..camera import Calibration
-from ..cloud.digest import sha256_of_arrays
 from ..errors import InputError
+from ..files.digest import sha256_of_arrays
 from ..files.json_file import read_bytes, reading_once
 from .cube import face_paths
 from .picture import PNG_MAGIC, WANTED, opened
@@ -22,6 +28,15 @@ from .picture import PNG_MAGIC, WANTED, opened
 TIME = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)")
 OFFSET = re.compile(r"[+-]\d\d:\d\d")
 DEGREE_PARTS = 1.0, 60.0, 3600.0  # degrees, minutes, seconds
+
+
+FILM_DIAGONAL = math.hypot(36.0, 24.0)  # [mm]
+MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of FocalPlaneResolutionUnit; 2 where it is missing
+MIN_FILM, MAX_FILM = 8.0, 800.0  # [mm] what is wider is no photo by a plain lens
+BREATHING = 0.01  # of a focal length: what focusing changes
+ZOOMING = 0.03  # what a zoom rounds
+MAX_DISAGREEMENT = 0.25  # of the two: one of them is of the picture before it was cropped
+CAMERA_ELEVATION = 0x9405  # CameraElevationAngle of EXIF 2.31 [deg]
 
 
 class GpsPosition(NamedTuple):
@@ -75,9 +90,11 @@ def photo_of(path: Path, rig: Calibration | None = None) -> Photo:
             if chunk := _exif_chunk(content):
                 image.info["exif"] = chunk
             own = Image.Image.getexif(image)  # that of PngImageFile decodes the picture to find the chunk
-            exif, gps = own.get_ifd(IFD.Exif), own.get_ifd(IFD.GPSInfo)
+            exif = own.get_ifd(IFD.Exif)
+            gps = own.get_ifd(IFD.GPSInfo)
         except Exception:  # Pillow raises whatever damaged metadata bring
-            exif, gps = {}, {}
+            exif = {}
+            gps = {}
         return Photo(_digest(files), image.size, _capture_time(exif), _gps_position(gps))
 
 
@@ -127,3 +144,65 @@ def _degrees(parts: Any, reference: str, letters: str) -> float:
     """Degrees from degrees, minutes and seconds, positive for the first letter."""
     sign = {letters[0]: 1.0, letters[1]: -1.0}[str(reference).strip("\0 ").upper()]
     return sign * sum(float(part) / unit for part, unit in zip(parts, DEGREE_PARTS, strict=False))
+
+
+class ExifFocal(NamedTuple):
+    """A focal length, and where it comes from."""
+
+    focal: float  # [px]
+    deviation: float  # standard deviation of its logarithm
+    source: str  # in words
+
+
+def focal_of(exif: Mapping[int, object], size: tuple[int, int]) -> ExifFocal | None:
+    """The focal length of a picture of this size [px]; None if EXIF does not say, or what can't be."""
+    diagonal = math.hypot(*size)
+    film = _number(exif, Base.FocalLengthIn35mmFilm)
+    film = film if film and MIN_FILM <= film <= MAX_FILM else None
+    plane = _focal_by_plane(exif, size)
+    if plane and not MIN_FILM <= plane / diagonal * FILM_DIAGONAL <= MAX_FILM:
+        plane = None
+    if plane and film and abs(plane / diagonal * FILM_DIAGONAL / film - 1.0) > MAX_DISAGREEMENT:
+        plane = None
+    lens = ZOOMING if _is_zoom(exif) else BREATHING
+    if plane:
+        return ExifFocal(plane, lens, "EXIF's focal length and the resolution of its sensor")
+    if film:
+        rounding = 1.0 / math.sqrt(12.0) / film  # whole millimetres
+        focal = film / FILM_DIAGONAL * diagonal
+        return ExifFocal(focal, math.hypot(lens, rounding), f"EXIF's 35 mm equivalent of {film:g} mm")
+    return None
+
+
+def _is_zoom(exif: Mapping[int, object]) -> bool:
+    """True if the lens has several focal lengths, or a part of the picture was enlarged."""
+    lens = exif.get(Base.LensSpecification)
+    has_range = isinstance(lens, tuple) and len(lens) > 1 and lens[0] != lens[1]
+    return has_range or (_number(exif, Base.DigitalZoomRatio) or 1.0) > 1.0
+
+
+def _focal_by_plane(exif: Mapping[int, object], size: tuple[int, int]) -> float | None:
+    """Focal length [px] by the pixels of the sensor, of which the picture may be a smaller copy."""
+    focal = _number(exif, Base.FocalLength)
+    per_unit = _number(exif, Base.FocalPlaneXResolution)
+    unit = MM_PER_UNIT.get(int(_number(exif, Base.FocalPlaneResolutionUnit) or 2))
+    if not (focal and per_unit and unit):
+        return None
+    sides = _number(exif, Base.ExifImageWidth), _number(exif, Base.ExifImageHeight)
+    taken = max(side or 0.0 for side in sides) or max(size)
+    return focal * per_unit / unit * max(size) / taken
+
+
+def elevation_deg(exif: Mapping[int, object]) -> float | None:
+    """Elevation of the image centre above the horizon [deg]; None if EXIF does not say."""
+    value = _number(exif, CAMERA_ELEVATION, least=-90.0)
+    return value if value is None or value <= 90.0 else None
+
+
+def _number(exif: Mapping[int, object], tag: int, least: float = 0.0) -> float | None:
+    """The finite number in a tag; None if it is missing, no number or less than `least`."""
+    try:
+        value = float(cast(SupportsFloat, exif[tag]))
+    except (KeyError, TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return value if math.isfinite(value) and value >= least else None

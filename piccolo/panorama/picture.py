@@ -25,15 +25,17 @@ from PIL.PngImagePlugin import PngImageFile
 from PIL.TiffImagePlugin import TiffImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
-from ..cloud.label_colors import Labels, colors_of
 from ..errors import InputError, ResourceError
 from ..files.json_file import read_bytes
+from ..geometry.colors import Labels, colors_of
 from ..jobs.memory import check_memory
 from ..optional import import_optional
 
 WANTED = "wanted a whole JPEG, PNG, TIFF, WebP or HEIC panorama"
-MIN_WIDTH, MIN_HEIGHT = 128, 64
-MAX_WIDTH, MAX_HEIGHT = 32768, 16384
+MIN_WIDTH = 128
+MIN_HEIGHT = 64
+MAX_WIDTH = 32768
+MAX_HEIGHT = 16384
 BYTES_PER_PIXEL = 12  # while a picture is decoded, turned and masked; 10 were measured, more with alpha
 MAX_XMP_SIZE = 1 << 20  # [byte] what is longer is left aside
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
@@ -43,13 +45,8 @@ FORMATS: dict[bytes, type[ImageFile]] = {
     **dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), TiffImageFile),
     b"RIFF": WebPImageFile,
 }
-HEIF_BRANDS = (
-    b"heic",
-    b"heix",
-    b"heim",
-    b"heis",
-    b"mif1",
-)  # of still pictures, behind a box's size and "ftyp"
+# of still pictures, behind a box's size and "ftyp"
+HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1")
 # at best: a bit a block of 8 x 8; 1040 bytes of 8 pixels by zlib; 3840 by LZW; a plain WebP packs to nothing
 MAX_PIXELS_PER_BYTE = {"JPEG": 512, "PNG": 8 * 1040, "TIFF": 8 * 3840, "WEBP": 1 << 30, "HEIF": 1 << 30}
 # what a viewer does to the stored picture, by EXIF's number
@@ -62,8 +59,10 @@ TURNS: dict[object, Transpose] = {
     7: Transpose.TRANSVERSE,
     8: Transpose.ROTATE_90,
 }
-PHOTOMETRIC, SAMPLE_FORMAT = 262, 339  # tags of TIFF
-WHITE_IS_ZERO, UNSIGNED = 0, 1
+PHOTOMETRIC = 262  # tags of TIFF
+SAMPLE_FORMAT = 339
+WHITE_IS_ZERO = 0
+UNSIGNED = 1
 LABEL_KINDS = (b"\x08\x00", b"\x10\x00", b"\x08\x02")  # in a PNG's header: grey of 8 and 16 bits, RGB of 8
 END_MARK = b"\xff\xd9"  # of a JPEG
 # libtiff writes what it finds damaged to stderr, which belongs to the whole process
@@ -172,7 +171,8 @@ def opened(path: Path, data: bytes) -> Iterator[ImageFile]:
 
 def _check(path: Path, image: ImageFile, num_bytes: int, min_size: tuple[int, int]) -> None:
     """Refuse what would be read wrongly, and sizes out of range, before memory is taken for them."""
-    longer, shorter = max(image.size), min(image.size)
+    longer = max(image.size)
+    shorter = min(image.size)
     found = f"{path}: found {image.width} x {image.height}"
     if longer < min_size[0] or shorter < min_size[1]:
         raise InputError(f"{found}, wanted at least {min_size[0]} x {min_size[1]}")

@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 from ..camera import Calibration, Mount
 from ..camera.resampling import View, sphere_of, sphere_width
 from ..camera.rig import MAX_OFFSET
-from ..cloud.label_colors import Labels
 from ..errors import InputError
+from ..geometry.colors import Labels
 from ..jobs.memory import check_memory
 from .cameras import cameras_of, rig_cameras, views_of
 from .cube import cube_of_cells, face_paths, read_cube_folder
-from .exif import elevation_deg
 from .gpano import (
     ASPECT_TOLERANCE,
     CropRegion,
@@ -29,6 +28,7 @@ from .gpano import (
 )
 from .masks import black_borders, find_mask, is_dual_fisheye, mask_pole, polar_disc, read_mask
 from .model import FocalPrior, GPano, Panorama, ReadOptions
+from .photo import elevation_deg
 from .picture import BYTES_PER_PIXEL, Picture, picture_orientation, picture_size, read_labels, read_picture
 
 Shot = tuple[Path, Picture, tuple[Mount, ...]]  # a file with the cameras that took it
@@ -82,7 +82,8 @@ def panorama_of(path: Path, picture: Picture, options: ReadOptions) -> Panorama:
 
 def panorama_of_array(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], options: ReadOptions) -> Panorama:
     """The panorama of an image (H, W, 3) of a camera that the options name, or else of a full sphere."""
-    path, picture = Path("array"), Picture(rgb, is_valid)
+    path = Path("array")
+    picture = Picture(rgb, is_valid)
     cameras = cameras_of(path, picture, options, has_gpano=True)
     if cameras.mounts:
         return _on_sphere(path, [(path, picture, cameras.mounts)], options, None, cameras.deviation)
@@ -142,9 +143,8 @@ def panorama_size(path: Path) -> tuple[int, int]:
     """
     if not path.is_dir():
         if (orientation := picture_orientation(path)) not in (None, 1):
-            raise InputError(
-                f"{path}: found it stored turned (EXIF orientation {orientation}), wanted it upright"
-            )
+            turned = f"found it stored turned (EXIF orientation {orientation})"
+            raise InputError(f"{path}: {turned}, wanted it upright")
         return picture_size(path)
     size, _ = picture_size(face_paths(path)["f"])
     return 4 * size, 2 * size
@@ -192,7 +192,8 @@ def _embedded_and_masked(
     path: Path, picture: Picture, region: CropRegion, options: ReadOptions, gpano: GPano | None
 ) -> Panorama:
     """The picture at its place in the sphere, with everything masked that is not to be counted."""
-    size, notes = full_size(path, region, picture.size), [*picture.warnings]
+    size = full_size(path, region, picture.size)
+    notes = [*picture.warnings]
     masks = _user_masks(path, [size, picture.size], options, notes)
     is_valid = picture.is_valid & masks[1] if 1 in masks else picture.is_valid
     borders = black_borders(picture.rgb, is_valid, region.is_full)

@@ -40,7 +40,8 @@ def frames_of(video: Path, every: float, folder: Path) -> Iterator[VideoFrame]:
         while time > (slot + NEIGHBORHOOD) * every:
             if best is not None:
                 yield _written(video, folder, best)
-            best, slot = None, slot + 1
+            best = None
+            slot = slot + 1
         if time >= (slot - NEIGHBORHOOD) * every:
             rgb = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
             sharpness = sharpness_of(rgb)
@@ -64,10 +65,8 @@ def frames_at(video: Path, times: Collection[float], folder: Path) -> Iterator[V
 def sharpness_of(rgb: NDArray[np.uint8]) -> float:
     """Variance of the Laplacian of an image (H, W, 3), made smaller (Pech-Pacheco et al., 2000)."""
     height = max(round(rgb.shape[0] * SHARPNESS_WIDTH / rgb.shape[1]), 1)
-    gray = cv2.cvtColor(
-        cv2.resize(rgb, (SHARPNESS_WIDTH, height), interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY
-    )
-    return float(cv2.Laplacian(gray, cv2.CV_32F).var())
+    small = cv2.resize(rgb, (SHARPNESS_WIDTH, height), interpolation=cv2.INTER_AREA)
+    return float(cv2.Laplacian(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), cv2.CV_32F).var())
 
 
 def _decoded(video: Path) -> Iterator[tuple[float, Any]]:
@@ -79,10 +78,8 @@ def _decoded(video: Path) -> Iterator[tuple[float, Any]]:
             if not container.streams.video:
                 raise InputError(f"{video}: found no picture in it, {WANTED}")
             stream = container.streams.video[0]
-            size = f"frames of {stream.width} x {stream.height}"
-            check_memory(
-                stream.width * stream.height * BYTES_PER_PIXEL, f"{video}: {size}", "make the video smaller"
-            )
+            label = f"{video}: frames of {stream.width} x {stream.height}"
+            check_memory(stream.width * stream.height * BYTES_PER_PIXEL, label, "make the video smaller")
             stream.thread_type = "AUTO"
             for frame in container.decode(stream):
                 if frame.time is None:

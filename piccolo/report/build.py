@@ -1,39 +1,41 @@
 """A report of results in a scan: facts, plans, and the pictures of each photo, taken up where stopped."""
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .. import __version__
-from ..cloud.soa import PackedPoints
+from ..cloud.settings import METRES, CloudSettings, UpAxis
 from ..errors import InputError
 from ..files.atomic import write_atomically
 from ..files.cache import digest_of_sources
 from ..files.temporary import temporary_folder
-from ..geometry.pose import Array, Pose
-from ..jobs.threads import Workers
+from ..geometry.pose import Pose
+from ..jobs.stopwatch import Stopwatch
+from ..jobs.threads import ProgressCallback, Workers, no_progress, num_cores, progress_to
 from ..panorama.photo import photo_of
 from ..result import FAILED, UNREADABLE, check_scan
+from ..scan import File, Scan
+from ..scan_map.open_map import CachePolicy, open_map
 from ..scan_map.scan_map import ScanMap
 from ..views.surfel_renderer import MAX_SURFELS, encode_image
 from ..views.surfels import Surfels, surfels_of
-from .entries import Entry, Place, document_of_entry, names_of, short_names_of
-from .own_plan import OwnPlan, check_own_plans, own_plan
-from .pictures import make_pictures, read_options_of
-from .plan_image import draw_plan
+from .entries import Entry, document_of_entry, names_of, read_entries, short_names_of
+from .pictures import make_pictures, read_options_of, taken_out
+from .plan_image import OwnPlan, PlanImage, draw_plan, own_plan
 from .site import begin_folder, check_folder, finish_folder, picture_path, self_contained, write_photo_script
-from .video_frames import taken_out
 
 FORMAT = "piccolo-report/1"
 WIDTH = 2048  # [px] of spheres
 MAX_SELF_CONTAINED = 50  # photos
 CAMERA_HEIGHT = 1.5  # [m] taken of a map in which nothing is level
-MAKERS = ("report", "render", "confidence", "panorama", "camera")  # folders whose sources make the pictures
+MAKERS = ("report", "views", "confidence", "panorama", "camera")  # folders whose sources make the pictures
 
 
 @dataclass(frozen=True)
@@ -76,15 +78,14 @@ def build_report(
     if settings.is_self_contained and len(entries) > MAX_SELF_CONTAINED:
         found = f"found {len(entries)} photos, wanted {MAX_SELF_CONTAINED} or fewer"
         raise InputError(f"--self-contained: {found}; without it the report is a folder")
-    place = Place(scan_map, scan_map.storeys)
-    note = check_settings(settings, place, entries)
+    note = check_settings(settings, scan_map, entries)
     with temporary_folder() if settings.is_self_contained else nullcontext(out) as folder:
         if not settings.is_self_contained:
             check_folder(out)
         begin_folder(folder)
-        tasks = [task_of(entry, place, settings) for entry in entries]
-        warnings = (*filter(None, [note]), *write_pictures(tasks, place, folder, settings, workers))
-        document = {**document_of(tasks, place, folder, settings), "note": note}
+        tasks = [task_of(entry, scan_map, settings) for entry in entries]
+        warnings = (*filter(None, [note]), *write_pictures(tasks, scan_map, folder, settings, workers))
+        document = {**document_of(tasks, scan_map, folder, settings), "note": note}
         if not settings.is_self_contained:
             finish_folder(folder, document)
             return Report(out / "index.html", document, warnings)
@@ -92,19 +93,21 @@ def build_report(
         return Report(out, document, warnings)
 
 
-def check_settings(settings: ReportSettings, place: Place, entries: Sequence[Entry]) -> str:
+def check_settings(settings: ReportSettings, scan_map: ScanMap, entries: Sequence[Entry]) -> str:
     """Refuse storeys that are not there, and results of another scan; if forced, return words on these."""
-    found = max(len(place.storeys.storeys), 1)
+    found = max(len(scan_map.storeys.storeys), 1)
     if settings.storey_names and len(settings.storey_names) != found:
         names = f"found {len(settings.storey_names)} names"
         raise InputError(f"--storeys: {names}, wanted {found}, as the scan has storeys, the lowest first")
-    check_own_plans(settings.own_plans, found)
+    for plan in settings.own_plans:
+        if not 1 <= plan.storey <= found:
+            raise InputError(f"{plan.image}: found storey {plan.storey}, wanted 1 to {found}")
     return check_scan(
-        [entry.result for entry in entries], place.scan_map.scan_sha256, "that given", settings.is_forced
+        [entry.result for entry in entries], scan_map.scan_sha256, "that given", settings.is_forced
     )
 
 
-def task_of(entry: Entry, place: Place, settings: ReportSettings) -> Task:
+def task_of(entry: Entry, scan_map: ScanMap, settings: ReportSettings) -> Task:
     """What is to be done for a result; its key is of all that its pictures depend on."""
     result = entry.result
     photo = Path(result.pano)
@@ -114,122 +117,193 @@ def task_of(entry: Entry, place: Place, settings: ReportSettings) -> Task:
         digest = photo_of(photo, read_options_of(result).rig).sha256
     except (OSError, InputError):
         digest = ""
-    parts = entry.line, digest, place.scan_map.scan_sha256, repr(settings.width), digest_of_sources(MAKERS)
+    parts = result.to_json(), digest, scan_map.scan_sha256, repr(settings.width), digest_of_sources(MAKERS)
     key = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
     found = [result.best_pose, *(a.pose for a in result.alternatives)] if result.best_pose else []
-    return Task(entry, photo, key, [place.scan_map.from_world(pose) for pose in found if pose])
+    return Task(entry, photo, key, [scan_map.from_world(pose) for pose in found if pose])
 
 
 def write_pictures(
-    tasks: Sequence[Task], place: Place, folder: Path, settings: ReportSettings, workers: Workers
+    tasks: Sequence[Task], scan_map: ScanMap, folder: Path, settings: ReportSettings, workers: Workers
 ) -> tuple[str, ...]:
     """Make the pictures that are not there yet; why some could not be made."""
-    todo = list({task.key: task for task in tasks if needs_pictures(task, folder)}.values())
+    readable = [task for task in tasks if task.entry.result.status not in (UNREADABLE, FAILED)]
+    missing = [task for task in readable if not picture_path(folder, "photos", task.key).exists()]
+    todo = list({task.key: task for task in missing}.values())
     if not todo:
         return ()
-    points = place.scan_map.points.subsample(MAX_SURFELS)
-    scan = surfels_of(points, workers) if any(task.poses for task in todo) else None
+    points = scan_map.points.subsample(MAX_SURFELS)
+    is_found = any(task.poses for task in todo)
+    nothing = Surfels(points, np.empty((0, 3), np.float32), np.empty(0, np.float32))
+    scan = (surfels_of(points, workers) if is_found else nothing), points
+
+    def write(task: Task) -> str:
+        try:
+            thumbnail, script = make_pictures(task.photo, task.entry.result, task.poses, scan, settings.width)
+        except (OSError, InputError) as error:
+            return f"{task.photo}: no pictures of it ({error})"
+        write_atomically(picture_path(folder, "thumbs", task.key), thumbnail)
+        write_photo_script(folder, task.key, script)  # last: it says that both are there
+        return ""
+
     with taken_out([task.photo for task in todo]) as files:
-        write = writer(scan, points, folder, settings.width)
         taken = [task._replace(photo=files.get(task.photo, task.photo)) for task in todo]
         return tuple(warning for warning in workers.map(write, taken, "photos") if warning)
 
 
-def needs_pictures(task: Task, folder: Path) -> bool:
-    """True unless they are there, or can't be: the photo was not read when it was localized."""
-    is_there = picture_path(folder, "photos", task.key).exists()
-    return task.entry.result.status not in (UNREADABLE, FAILED) and not is_there
-
-
-def writer(
-    scan: Surfels | None, points: PackedPoints, folder: Path, width: int | None
-) -> Callable[[Task], str]:
-    """A function that makes and writes a photo's pictures; what it returns says why it could not."""
-
-    def write(task: Task) -> str:
-        try:
-            poses = task.poses if scan is not None else []
-            whole = scan or Surfels(points, np.empty((0, 3), np.float32), np.empty(0, np.float32))
-            made = make_pictures(task.photo, task.entry.result, poses, (whole, points), width)
-        except (OSError, InputError) as error:
-            return f"{task.photo}: no pictures of it ({error})"
-        if made.thumbnail is not None:
-            write_atomically(picture_path(folder, "thumbs", task.key), made.thumbnail)
-        write_photo_script(folder, task.key, made.script)  # last: it says that both are there
-        return ""
-
-    return write
-
-
 def document_of(
-    tasks: Sequence[Task], place: Place, folder: Path, settings: ReportSettings
+    tasks: Sequence[Task], scan_map: ScanMap, folder: Path, settings: ReportSettings
 ) -> dict[str, Any]:
     """All that the page knows at once; writes the plans."""
-    m = place.scan_map
     names = names_of([task.entry for task in tasks])
     photos = []
     for task, name, short in zip(tasks, names, short_names_of(names), strict=True):
         has_pictures = picture_path(folder, "photos", task.key).exists()
         thumb = f"thumbs/{task.key}.jpg" if picture_path(folder, "thumbs", task.key).exists() else None
-        entry = document_of_entry(task.entry, name, task.key, place)
+        entry = document_of_entry(task.entry, name, task.key, scan_map)
         photos.append({**entry, "short": short, "hasPictures": has_pictures, "thumb": thumb})
     cloud = tasks[0].entry.result.cloud
     clouds = [Path(path).name for path in ([cloud] if isinstance(cloud, str) else cloud)]
-    north = m.R_map_from_world @ np.array([0.0, 1.0, 0.0])
-    has_north = bool(settings.crs or m.crs)
+    north = scan_map.R_map_from_world @ np.array([0.0, 1.0, 0.0])
+    has_north = bool(settings.crs or scan_map.crs)
     return {
         "format": FORMAT,
         "version": __version__,
         "title": settings.title or Path(clouds[0]).stem,
         "cloud": ", ".join(clouds),
-        "crs": settings.crs or m.crs,
+        "crs": settings.crs or scan_map.crs,
         "north": [float(north[0]), float(north[1])] if has_north else None,
-        "origin": m.origin_world.tolist(),
-        "R": m.R_map_from_world.ravel().tolist(),
-        "storeys": list(storey_documents(place, tasks, folder, settings)),
+        "origin": scan_map.origin_world.tolist(),
+        "R": scan_map.R_map_from_world.ravel().tolist(),
+        "storeys": list(storey_documents(scan_map, tasks, folder, settings)),
         "photos": photos,
     }
 
 
 def storey_documents(
-    place: Place, tasks: Sequence[Task], folder: Path, settings: ReportSettings
+    scan_map: ScanMap, tasks: Sequence[Task], folder: Path, settings: ReportSettings
 ) -> Iterator[dict[str, Any]]:
     """The storeys, each with its plan, which is written."""
-    m = place.scan_map
-    origin = float((m.R_map_from_world @ m.origin_world)[2])
-    storey, height = place.storeys.at(m.centers)
-    if not place.storeys.storeys:
-        storey, height = np.zeros(len(m.centers), np.int64), np.full(len(m.centers), CAMERA_HEIGHT)
+    origin = float((scan_map.R_map_from_world @ scan_map.origin_world)[2])
+    storey, height = scan_map.storeys.at(scan_map.centers)
+    found = scan_map.storeys.storeys
+    if not found:
+        storey = np.zeros(len(scan_map.centers), np.int64)
+        height = np.full(len(scan_map.centers), CAMERA_HEIGHT)
     own = {plan.storey - 1: plan for plan in settings.own_plans}
-    for k in range(max(len(place.storeys.storeys), 1)):
+    for k in range(max(len(found), 1)):
         name = settings.storey_names[k] if settings.storey_names else f"Storey {k + 1}"
         is_here = storey == k
-        places, floors = m.centers[is_here], m.centers[is_here, 2] - height[is_here]
-        floor = place.storeys.storeys[k].floor if place.storeys.storeys else float(np.median([*floors, 0.0]))
-        plan = write_own_plan(own[k], m, folder) if k in own else write_plan(m, places, floors, folder)
-        yield {"name": name, "floor": floor, "level": round(origin + floor, 3), "plan": plan}
+        places = scan_map.centers[is_here]
+        floors = scan_map.centers[is_here, 2] - height[is_here]
+        floor = found[k].floor if found else float(np.median([*floors, 0.0]))
+        plan = own_plan(own[k], scan_map) if k in own else draw_plan(scan_map.points, places, floors)
+        document = plan and write_plan(plan, folder)
+        yield {"name": name, "floor": floor, "level": round(origin + floor, 3), "plan": document}
 
 
-def write_plan(m: ScanMap, places: Array, floors: Array, folder: Path) -> dict[str, Any] | None:
-    """Draw and write the plan of a storey: its file, size [px], matrix and metres a pixel."""
-    plan = draw_plan(m.points, places, floors)
-    if plan is None:
-        return None
-    height, width = plan.rgba.shape[:2]
-    file = keep_plan(folder, encode_image(plan.rgba, ".png"))
-    return {"file": file, "width": width, "height": height, "matrix": plan.matrix, "pixel": plan.pixel}
-
-
-def write_own_plan(plan: OwnPlan, m: ScanMap, folder: Path) -> dict[str, Any]:
-    """The same of the user's plan."""
-    content, (width, height), matrix = own_plan(plan, m)
-    pixel = float(np.hypot(matrix[0], matrix[1]))
-    file = keep_plan(folder, content)
-    return {"file": file, "width": width, "height": height, "matrix": matrix, "pixel": pixel}
-
-
-def keep_plan(folder: Path, content: bytes) -> str:
-    """Write a plan under the name of its content; its path in the report."""
+def write_plan(plan: PlanImage, folder: Path) -> dict[str, Any]:
+    """Write a plan under the name of its content: its file, size [px], matrix and metres a pixel."""
+    content = encode_image(plan.pixels, ".png")
     key = hashlib.sha256(content).hexdigest()[:32]
     write_atomically(picture_path(folder, "plans", key), content)
-    return f"plans/{key}.png"
+    height, width = plan.pixels.shape[:2]
+    pixel = float(np.hypot(plan.matrix[0], plan.matrix[1]))
+    return {
+        "file": f"plans/{key}.png",
+        "width": width,
+        "height": height,
+        "matrix": plan.matrix,
+        "pixel": pixel,
+    }
+
+
+def write_report(  # noqa: PLR0913  options by name
+    results: File | Sequence[File],
+    scan: File | Sequence[File] | Scan,
+    out: File,
+    *,
+    title: str = "",
+    storeys: Sequence[str] = (),
+    images: File | None = None,
+    full_size: bool = False,
+    self_contained: bool = False,
+    own_plans: Mapping[int, tuple[File, File]] | None = None,
+    crs: str = "",
+    force: bool = False,
+    units: str = "m",
+    up: UpAxis = "auto",
+    cache: bool | File = True,
+    num_threads: int | None = None,
+    progress: ProgressCallback | None = None,
+) -> Path:
+    """Write a page that shows results on plans, and each photo over the scan; returns the page's path.
+
+    Parameters
+    ----------
+    results
+        Path of a file of JSON lines by localize.py, or several.
+    scan
+        Path of the scan, or of a map by tools/prepare_map.py, or several; or a Scan that is open.
+    out
+        Folder, new, empty or with an earlier report, of which only what has changed is made again.
+    title
+        Of the page; by default the scan's name.
+    storeys
+        Names, the lowest first.
+    images
+        Folder of the photos, where they are no more at the results' paths.
+    full_size
+        Spheres as wide as the photos, in place of 2048 px at most.
+    self_contained
+        `out` is one HTML file, of at most 50 photos.
+    own_plans
+        By storey, 1 the lowest: an image, and a CSV of control points.
+    crs
+        The scan's coordinate system, if it does not name it.
+    force
+        Show results of another scan too; the page says so.
+    units, up, cache, num_threads, progress
+        As in `open_scan`; the first three only for files.
+
+    Raises
+    ------
+    InputError
+        A file can't be read, results are of another scan, the folder holds something else, or an option means
+        nothing.
+
+    Examples
+    --------
+    >>> import piccolo
+    >>> scan = piccolo.open_scan("room/cloud.ply")
+    >>> result = scan.localize("room/images/clean_0.jpg")
+    >>> _ = Path("one.jsonl").write_text(result.to_json())
+    >>> piccolo.write_report("one.jsonl", scan, "report", storeys=["Ground floor"])
+    PosixPath('report/index.html')
+    """
+    show = progress_to(progress) if progress else no_progress
+    workers = Workers(num_cores() if num_threads is None else num_threads, show)
+    settings = ReportSettings(
+        title=title,
+        storey_names=tuple(storeys),
+        images=None if images is None else Path(images),
+        width=None if full_size else WIDTH,
+        is_self_contained=self_contained,
+        own_plans=tuple(OwnPlan(k, Path(image), Path(csv)) for k, (image, csv) in (own_plans or {}).items()),
+        crs=crs,
+        is_forced=force,
+    )
+    if isinstance(scan, Scan):
+        scan_map = scan.prepared
+    else:
+        if units not in METRES:
+            raise InputError(f"units: found {units!r}, wanted one of {', '.join(METRES)}")
+        policy = CachePolicy(cache is not False, None if isinstance(cache, bool) else Path(cache))
+        scan_map = open_map(_paths(scan), CloudSettings(METRES[units], up), policy, workers, Stopwatch())
+    if not isinstance(scan_map, ScanMap):
+        raise InputError("write_report: found a scan of the preset paper, wanted one of the default method")
+    return build_report(read_entries(_paths(results)), scan_map, Path(out), settings, workers).page
+
+
+def _paths(files: File | Sequence[File]) -> list[Path]:
+    return [Path(files)] if isinstance(files, str | PathLike) else [Path(file) for file in files]

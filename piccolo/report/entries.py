@@ -12,68 +12,42 @@ import numpy as np
 from ..confidence.confidence import NOT_LOCALIZED
 from ..confidence.covariance import PoseCovariance
 from ..errors import printable
-from ..files.json_file import read_bytes
 from ..geometry.pose import Array, Pose
 from ..geometry.rotations import heading_pitch_roll_deg
 from ..result import FAILED, UNREADABLE, Result, read_results
 from ..scan_map.scan_map import ScanMap
-from ..scan_map.storeys import Storeys
 
 CHI_SQUARE_95 = 5.991  # of two degrees of freedom
 LEAST_CONFIDENCE = 0.05  # of a photo that is not localized: a best guess below it is on no plan
 ENDING = re.compile(r"\.[A-Za-z0-9]{3,4}( \(\d+\))?$")
 DIGITS = 6  # of positions [m] and rotations
-EVIDENCE = (
-    *("score", "margin", "explained_fraction", "seen_fraction", "contradicted_fraction"),
-    "num_matches",
-)
-NOTHING_FOUND: dict[str, Any] = {
-    **dict.fromkeys(("pose", "storey", "height", "evidence", "spread")),
-    "alternatives": [],
-}
+EVIDENCE = ("score", "margin", "explained_fraction", "seen_fraction", "contradicted_fraction", "num_matches")
+NOT_FOUND = ("pose", "storey", "height", "evidence", "spread")
+NOTHING_FOUND: dict[str, Any] = {**dict.fromkeys(NOT_FOUND), "alternatives": []}
 
 
 class Entry(NamedTuple):
     """A result of a report."""
 
     result: Result
-    line: str  # as it stands in its file
     walk: int | None  # which walk it is of, a number; None for a photo that stands alone
     time: float  # [s] by which a walk's photos are in order; else its place in the files
-
-
-class Place(NamedTuple):
-    """The frame of the plans: that of the prepared map."""
-
-    scan_map: ScanMap
-    storeys: Storeys
-
-    def storey_at(self, centers: Array) -> tuple[list[int | None], list[float | None]]:
-        """Index of the storey and height above the floor [m] of places (N, 3) of the map's frame."""
-        storey, height = self.storeys.at(centers)
-        is_known = (storey >= 0).tolist()
-        return (
-            [int(s) if known else None for s, known in zip(storey, is_known, strict=True)],
-            [round(float(h), 3) if known else None for h, known in zip(height, is_known, strict=True)],
-        )
 
 
 def read_entries(paths: Sequence[Path]) -> list[Entry]:
     """The results in files of JSON lines, in their order; each file with walks is one walk."""
     entries: list[Entry] = []
     for number, path in enumerate(paths):
-        results = read_results([path])
-        lines = [line.decode() for line in read_bytes(path, "wanted results").splitlines() if line.strip()]
-        for result, line in zip(results, lines, strict=True):
+        for result in read_results([path]):
             time = result.walk.time if result.walk else float(len(entries))
-            entries.append(Entry(result, line, number if result.walk else None, time))
+            entries.append(Entry(result, number if result.walk else None, time))
     return entries
 
 
 def entries_of_walk(results: Sequence[Result]) -> list[Entry]:
     """The results of one walk."""
     times = [float(k) if r.walk is None else r.walk.time for k, r in enumerate(results)]
-    return [Entry(r, r.to_json(), 0, time) for r, time in zip(results, times, strict=True)]
+    return [Entry(r, 0, time) for r, time in zip(results, times, strict=True)]
 
 
 def names_of(entries: Sequence[Entry]) -> list[str]:
@@ -83,7 +57,8 @@ def names_of(entries: Sequence[Entry]) -> list[str]:
     shared = 0
     while all(len(f) > shared and f[shared] == folders[0][shared] for f in folders):
         shared += 1
-    names, counts = [], Counter[str]()
+    names = []
+    counts = Counter[str]()
     for path in paths:
         name = printable("/".join(path.parts[shared:]))
         counts[name] += 1
@@ -98,7 +73,7 @@ def short_names_of(names: Sequence[str]) -> list[str]:
     return [short if counts[short] == 1 else name for short, name in zip(own, names, strict=True)]
 
 
-def document_of_entry(entry: Entry, name: str, key: str, place: Place) -> dict[str, Any]:
+def document_of_entry(entry: Entry, name: str, key: str, scan_map: ScanMap) -> dict[str, Any]:
     """What the page knows of a result before it is opened; angles in degrees, lengths in metres."""
     result = entry.result
     is_hopeless = result.status == NOT_LOCALIZED and result.confidence < LEAST_CONFIDENCE
@@ -117,17 +92,19 @@ def document_of_entry(entry: Entry, name: str, key: str, place: Place) -> dict[s
         "walk": entry.walk,
         "time": entry.time if entry.walk is not None else None,
         "gap": bool(result.walk and result.walk.gap),
-        **(found_document(result, result.best_pose, place) if result.best_pose else NOTHING_FOUND),
+        **(found_document(result, result.best_pose, scan_map) if result.best_pose else NOTHING_FOUND),
     }
 
 
-def found_document(result: Result, best_pose: Pose, place: Place) -> dict[str, Any]:
+def found_document(result: Result, best_pose: Pose, scan_map: ScanMap) -> dict[str, Any]:
     """What was found: the best pose, the others, and what speaks for them."""
     poses = [best_pose, *(alternative.pose for alternative in result.alternatives)]
-    storeys, heights = place.storey_at(_centers(poses, place))
+    centers = np.array([scan_map.from_world(pose).center_world for pose in poses])
+    storey, height = scan_map.storeys.at(centers)
+    storeys = [int(k) if k >= 0 else None for k in storey]
     alternatives = [
         {
-            **pose_document(other.pose, place),
+            **pose_document(other.pose, scan_map),
             "score": round(other.score, 3),
             "probability": _rounded(other.probability, 5),
             "scan": other.scan,
@@ -135,21 +112,22 @@ def found_document(result: Result, best_pose: Pose, place: Place) -> dict[str, A
         }
         for other, storey in zip(result.alternatives, storeys[1:], strict=True)
     ]
-    evidence, covariance = result.evidence, result.covariance
-    R_map_from_world = place.scan_map.R_map_from_world
+    evidence = result.evidence
+    covariance = result.covariance
+    R_map_from_world = scan_map.R_map_from_world
     return {
-        **pose_document(best_pose, place),
+        **pose_document(best_pose, scan_map),
         "storey": storeys[0],
-        "height": heights[0],
+        "height": None if storeys[0] is None else round(float(height[0]), 3),
         "alternatives": alternatives,
         "evidence": evidence and {name: _rounded(getattr(evidence, name), 4) for name in EVIDENCE},
         "spread": covariance and spread_document(covariance, R_map_from_world),
     }
 
 
-def pose_document(pose: Pose, place: Place) -> dict[str, Any]:
+def pose_document(pose: Pose, scan_map: ScanMap) -> dict[str, Any]:
     """A pose in the plan's frame, and as the world has it."""
-    local = place.scan_map.from_world(pose)
+    local = scan_map.from_world(pose)
     heading, pitch, roll = heading_pitch_roll_deg(pose)
     return {
         "pose": {
@@ -179,10 +157,6 @@ def spread_document(covariance: PoseCovariance, R_map_from_world: Array) -> dict
 def _below(words: str, pano: str, name: str) -> str:
     """Words on a photo with its name in place of its path."""
     return printable(words.replace(pano, name))
-
-
-def _centers(poses: Sequence[Pose], place: Place) -> Array:
-    return np.array([place.scan_map.from_world(pose).center_world for pose in poses])
 
 
 def _list(values: Array, digits: int = DIGITS) -> list[float]:

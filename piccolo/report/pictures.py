@@ -1,10 +1,17 @@
-"""The pictures of a photo: thumbnail, sphere, the scan from its pose, and what of it contradicts the scan."""
+"""The pictures of a photo: thumbnail, sphere, the scan from its pose, and what of it contradicts the scan.
+
+Photos may be frames of a video, as results of localize.py --video name them: these are taken out.
+"""
 
 import base64
 import json
 import math
+import re
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,35 +19,39 @@ from numpy.typing import NDArray
 
 from ..camera import Calibration
 from ..camera.model import pinhole
-from ..cloud.label_colors import Labels
 from ..cloud.soa import PackedPoints
 from ..confidence.confidence import AMBIGUOUS
 from ..confidence.occlusion import occlusion_mask
-from ..geometry.pose import Array, Pose
+from ..errors import InputError
+from ..files.temporary import temporary_folder
+from ..geometry.colors import Labels
+from ..geometry.pose import Array, Pose, yaw_rotation
 from ..jobs.threads import Workers
 from ..panorama import Panorama, ReadOptions, read_panorama
 from ..panorama.model import shrink
+from ..panorama.video import frames_at
 from ..result import Result
 from ..views.field import cut
 from ..views.surfel_renderer import encode_image, fill_holes, render_surfels, visible_indices
 from ..views.surfels import Surfels
 from ..views.zbuffer import View
 
-QUALITY, THUMB_QUALITY = 80, 78  # of JPEG
-THUMB_SIZE, THUMB_FOV_DEG = (256, 160), 100.0
-MASK_WIDTH, SCAN_WIDTH, ALTERNATIVE_WIDTH = 1024, 1536, 1024  # [px] a voxel of the map is wider than a pixel
+QUALITY = 80  # of JPEG
+THUMB_QUALITY = 78
+THUMB_SIZE = (256, 160)
+THUMB_FOV_DEG = 100.0
+MASK_WIDTH = 1024  # [px]
+SCAN_WIDTH = 1536  # [px] a voxel of the map is wider than a pixel
+ALTERNATIVE_WIDTH = 1024  # [px]
 REACH_SIZE = (96, 48)  # [px]
-LEAST_PROBABILITY, MAX_ALTERNATIVES = 0.02, 3  # of alternatives from which the scan is drawn
+LEAST_PROBABILITY = 0.02  # of alternatives from which the scan is drawn
+MAX_ALTERNATIVES = 3
 MAX_WIDTH = 8192  # [px] of a sphere at full size
 GAP = 0.004  # by the width: wider gaps are marked as not scanned
 UNSCANNED = np.array([96, 100, 106], np.float32)
 
 
-class Pictures(NamedTuple):
-    """What the page shows of a photo, as files."""
-
-    thumbnail: bytes | None  # JPEG
-    script: str  # the JSON of the others
+FRAME = re.compile(r"(?P<video>.+)#t=(?P<time>\d+\.\d{3})", re.DOTALL)
 
 
 def read_options_of(result: Result) -> ReadOptions:
@@ -59,8 +70,8 @@ def read_options_of(result: Result) -> ReadOptions:
 
 def make_pictures(
     photo: Path, result: Result, poses: list[Pose], scan: tuple[Surfels, PackedPoints], width: int | None
-) -> Pictures:
-    """The pictures of a photo, of which `poses` are the best and the alternatives in the scan's frame.
+) -> tuple[bytes, str]:
+    """The thumbnail of a photo, JPEG, and the JSON of its other pictures.
 
     Spheres are at most `width` px wide, None for the photo's own size. Without a pose there is no scan.
     """
@@ -80,7 +91,7 @@ def make_pictures(
             _base64(scan_picture(scan_view(surfels, pose, ALTERNATIVE_WIDTH))) if is_shown else None
             for pose, is_shown in zip(poses[1:], _shown(result), strict=True)
         ]
-    return Pictures(thumbnail_of(small, poses[0] if poses else None), json.dumps(document))
+    return thumbnail_of(small, poses[0] if poses else None), json.dumps(document)
 
 
 def _shown(result: Result) -> list[bool]:
@@ -133,14 +144,32 @@ def thumbnail_of(panorama: Panorama, pose: Pose | None) -> bytes:
 
 def level(R_cam_from_world: Array) -> Array:
     """R_lens_from_cam (3, 3) of a level lens that looks where the image centre does."""
-    forward = R_cam_from_world[0] * np.array([1.0, 1.0, 0.0])
-    if np.linalg.norm(forward) < 1e-6:
-        forward = np.array([1.0, 0.0, 0.0])
-    forward /= np.linalg.norm(forward)
-    up = np.array([0.0, 0.0, 1.0])
-    R_lens_from_world = np.stack([forward, np.cross(up, forward), up])
-    return np.asarray(R_lens_from_world @ R_cam_from_world.T)
+    yaw = math.atan2(R_cam_from_world[0, 1], R_cam_from_world[0, 0])
+    return np.asarray(yaw_rotation(yaw) @ R_cam_from_world.T)
 
 
 def _base64(content: bytes) -> str:
     return base64.b64encode(content).decode()
+
+
+@contextmanager
+def taken_out(photos: Sequence[Path]) -> Iterator[dict[Path, Path]]:
+    """Files of those photos that are frames of a video, until the end; of others none.
+
+    A video that can't be read has none either: its frames are then photos that are not there.
+    """
+    by_video: dict[Path, dict[int, Path]] = defaultdict(dict)
+    for photo in photos:
+        if found := FRAME.fullmatch(str(photo)):
+            by_video[Path(found["video"])][round(1000.0 * float(found["time"]))] = photo
+    with temporary_folder() as folder:
+        files: dict[Path, Path] = {}
+        for number, (video, frames) in enumerate(by_video.items()):
+            own = folder / str(number)
+            own.mkdir()
+            try:
+                for frame in frames_at(video, [time / 1000.0 for time in frames], own):
+                    files[frames[round(1000.0 * frame.time)]] = frame.path
+            except (OSError, InputError):
+                continue
+        yield files

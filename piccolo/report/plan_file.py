@@ -1,24 +1,24 @@
-"""Camera positions on the plans, for those without a browser: PNG, SVG, PDF, and DXF for CAD."""
+"""Camera positions and paths on the plans, without a browser: PNG, SVG, PDF, and DXF for CAD."""
 
 import io
 import math
 from collections.abc import Iterator, Sequence
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import cv2
 import numpy as np
 
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..files.atomic import write_atomically
-from ..files.figure import new_figure
 from ..files.temporary import temporary_folder
 from ..geometry.pose import Array
-from ..optional import import_optional
+from ..optional import import_optional, new_figure
 from ..panorama.picture import read_picture
 from ..scan_map.scan_map import ScanMap
 from .build import ReportSettings, Task, check_settings, document_of
-from .entries import Entry, Place
-from .plan_path import LEAST_ON_PATH, color_of, is_numbered, segments_of
+from .entries import Entry
 from .site import begin_folder
 
 if TYPE_CHECKING:
@@ -29,11 +29,19 @@ SUFFIXES = (".png", ".svg", ".pdf", DXF)
 COLORS = {LOCALIZED: (8, 120, 76), AMBIGUOUS: (166, 83, 0), NOT_LOCALIZED: (193, 37, 45)}
 MARKERS = {LOCALIZED: "o", AMBIGUOUS: "D", NOT_LOCALIZED: "^"}  # so that not the colour alone tells
 INK = (20, 32, 46)
-DPI, MARGIN = 100, 0.5  # a pixel of a plan is one of the PNG; [inch] around a plan
-SIZE, FRAME_SIZE, PATH_WIDTH = 12.0, 5.0, 3.5  # [pt] of a mark, and of a walk's frame and path
-HEADING, FRAME_HEADING = 0.5, 0.2  # [m] length of the line from a mark
+DPI = 100  # a pixel of a plan is one of the PNG
+MARGIN = 0.5  # [inch] around a plan
+SIZE = 12.0  # [pt] of a mark
+FRAME_SIZE = 5.0  # [pt] of that of a walk's frame
+PATH_WIDTH = 3.5  # [pt]
+HEADING = 0.5  # [m] length of the line from a mark
+FRAME_HEADING = 0.2  # [m]
 TEXT_HEIGHT = 0.12  # [m] of the DXF
 BARS = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # [m] of the scale
+
+
+LEAST_ON_PATH = 0.5  # frames that are less likely right are passed over
+EVERY_NUMBER = 20  # of a walk's frames are numbered
 
 
 class Line(NamedTuple):
@@ -73,13 +81,12 @@ def write_plan_file(entries: Sequence[Entry], scan_map: ScanMap, out: Path, sett
     PNG, SVG, PDF: the plans of the storeys, one below the other. DXF: points, headings, 95 % ellipses and
     names in the scan's own coordinates, a layer a storey.
     """
-    place = Place(scan_map, scan_map.storeys)
-    check_settings(settings, place, entries)
+    check_settings(settings, scan_map, entries)
     suffix = out.suffix.lower()
     with temporary_folder() as folder:
         begin_folder(folder)
         tasks = [Task(entry, Path(), "", []) for entry in entries]
-        document = document_of(tasks, place, folder, settings)
+        document = document_of(tasks, scan_map, folder, settings)
         content = dxf_of(document) if suffix == DXF else figure_of(document, folder, suffix[1:])
     write_atomically(out, content)
     return len(document["storeys"])
@@ -93,7 +100,8 @@ def shapes_of(document: dict[str, Any], index: int) -> Iterator[Shape]:
         ends = np.array([s.begin["pose"]["center"], s.end["pose"]["center"]])
         yield Line(ends, color_of(s.confidence), PATH_WIDTH, s.is_gap)
     for number, photo in photos:
-        center, color = np.array(photo["pose"]["center"]), COLORS[photo["status"]]
+        center = np.array(photo["pose"]["center"])
+        color = COLORS[photo["status"]]
         is_frame = photo["walk"] is not None
         ahead = np.array([*photo["pose"]["rotation"][:2], 0.0])
         ahead *= (FRAME_HEADING if is_frame else HEADING) / max(float(np.linalg.norm(ahead)), 1e-12)
@@ -156,9 +164,8 @@ def _draw_scale(axes: "Axes") -> None:
     from matplotlib.colors import Normalize  # noqa: PLC0415
 
     colors = ScalarMappable(Normalize(LEAST_ON_PATH, 1.0), "viridis_r")
-    bar = axes.figure.colorbar(
-        colors, cax=axes.inset_axes((0.72, 1.02, 0.26, 0.02)), orientation="horizontal"
-    )
+    place = axes.inset_axes((0.72, 1.02, 0.26, 0.02))
+    bar = axes.figure.colorbar(colors, cax=place, orientation="horizontal")
     bar.set_ticks([LEAST_ON_PATH, 1.0], labels=[f"{LEAST_ON_PATH:g}", "1"])
     axes.text(0.71, 1.02, "confidence", transform=axes.transAxes, ha="right")
 
@@ -175,7 +182,8 @@ def _draw(axes: "Axes", shape: Shape) -> None:
         ellipse.set(fill=False, edgecolor=_fraction(shape.color))
         axes.add_patch(ellipse)
     else:
-        color, is_sure = _fraction(COLORS[shape.status]), shape.status == LOCALIZED
+        color = _fraction(COLORS[shape.status])
+        is_sure = shape.status == LOCALIZED
         fill, edge = (color, "white") if is_sure else ("white", color)  # a guess is hollow
         (mark,) = axes.plot(*shape.center[:2], marker=MARKERS[shape.status], ms=shape.size, gid=shape.name)
         mark.set(markerfacecolor=fill, markeredgecolor=edge, markeredgewidth=1.5)
@@ -191,7 +199,9 @@ def dxf_of(document: dict[str, Any]) -> bytes:
     """Points, headings, 95 % ellipses and names in metres of the scan's coordinates."""
     ezdxf = import_optional("--plan", "ezdxf", "tools")
     drawing = ezdxf.new("R2010", setup=True)
-    drawing.header["$INSUNITS"], drawing.header["$PDMODE"], drawing.header["$PDSIZE"] = 6, 34, 0.1
+    drawing.header["$INSUNITS"] = 6
+    drawing.header["$PDMODE"] = 34
+    drawing.header["$PDSIZE"] = 0.1
     R_map_from_world = np.array(document["R"]).reshape(3, 3)
     for k, storey in enumerate(document["storeys"]):
         layer = _layer_name(storey["name"], k)
@@ -225,3 +235,35 @@ def _layer_name(name: str, index: int) -> str:
     """A storey's name as DXF takes it."""
     kept = "".join("_" if letter in '<>/\\":;?*|=`,' else letter for letter in name)
     return f"PHOTOS {index + 1} {kept}"[:200]
+
+
+class Segment(NamedTuple):
+    """From a frame of a walk to the next that is on its path."""
+
+    begin: dict[str, Any]
+    end: dict[str, Any]
+    confidence: float  # the less of both
+    is_gap: bool  # no walking person can have gone there
+
+
+def segments_of(photos: Sequence[dict[str, Any]]) -> Iterator[Segment]:
+    """The paths of the walks among the photos of a plan, from storey to storey not drawn."""
+    frames = sorted((p for p in photos if p["walk"] is not None), key=lambda p: (p["walk"], p["time"]))
+    for _, walk in groupby(frames, key=lambda p: p["walk"]):
+        known = [p for p in walk if p["pose"] and p["confidence"] >= LEAST_ON_PATH]
+        for begin, end in pairwise(known):
+            if begin["storey"] == end["storey"] or None in (begin["storey"], end["storey"]):
+                yield Segment(begin, end, min(begin["confidence"], end["confidence"]), end["gap"])
+
+
+def color_of(confidence: float) -> tuple[int, int, int]:
+    """Red, green, blue: viridis from yellow (0.5) to dark blue (1)."""
+    share = (1.0 - np.clip(confidence, LEAST_ON_PATH, 1.0)) / (1.0 - LEAST_ON_PATH)
+    level = np.array([[round(255 * share)]], np.uint8)
+    blue, green, red = cv2.applyColorMap(level, cv2.COLORMAP_VIRIDIS)[0, 0]
+    return int(red), int(green), int(blue)
+
+
+def is_numbered(number: int, photo: dict[str, Any]) -> bool:
+    """True for a photo that stands alone, and for some of a walk's frames."""
+    return photo["walk"] is None or number % EVERY_NUMBER == 1

@@ -1,14 +1,24 @@
-"""The plan of a storey: the scan from above, cut below the ceiling, walls drawn as they are cut."""
+"""The plan of a storey: the scan from above, cut below the ceiling; or an image of the user's own.
 
+The latter is put into the scan's coordinates by points that are known in both.
+"""
+
+import csv
 import math
+from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cloud.soa import PackedPoints, unpack_rgb
+from ..cloud.soa import PackedPoints
+from ..errors import InputError
+from ..files.json_file import read_text
+from ..geometry.colors import unpack_rgb
 from ..geometry.pose import Array
+from ..panorama.picture import read_picture
+from ..scan_map.scan_map import ScanMap
 from ..views.surfel_renderer import fill_holes
 
 CUT = 1.9  # [m] above the floor: below ceilings and lintels, above most furniture
@@ -18,27 +28,33 @@ PIXEL = 0.02  # [m] of a plan, or more if it would be larger than
 MAX_SIDE = 3072  # [px]
 MARGIN = 0.5  # [m] around what is drawn
 FLOOR_CELL = 0.5  # [m] on which the height of the floor is looked up
-WALL_FROM, WALL_BINS, WALL_BIN = 0.6, 13, 0.1  # [m] above the floor: what fills most of this is a wall
+WALL_FROM = 0.6  # [m] above the floor
+WALL_BINS = 13  # what fills most of these is a wall
+WALL_BIN = 0.1  # [m]
 WALL_FILLED = 8  # bins
 WALL_COLOR = (52, 60, 72)
-HOLE_COLOR, HOLE_ALPHA, LARGEST_HOLE = (150, 158, 168), 90, 12.0  # of gaps in a floor, and area [m2]
+HOLE_COLOR = (150, 158, 168)  # of gaps in a floor
+HOLE_ALPHA = 90
+LARGEST_HOLE = 12.0  # [m2]
 PALENESS = 0.25  # of the colours, so that what is drawn on them is seen
 GAP = 13  # [px] that is closed
-SHADOW, SHADOW_WIDTH = 0.35, 0.25  # of walls on the floor: strength, width [m]
+SHADOW = 0.35  # of walls on the floor: strength
+SHADOW_WIDTH = 0.25  # [m]
+
+
+COLUMNS = ("u", "v", "x", "y")
+WANTED = "wanted a CSV file with the columns u, v [px] and x, y [m], and two rows or more"
+MAX_SIDE = 4096  # [px]
+LEAST_SPREAD = 1e-6  # of the control points, by their distance: less is one point, or a line of three
 
 
 class PlanImage(NamedTuple):
     """A plan in pixels."""
 
-    rgba: NDArray[np.uint8]  # (H, W, 4), transparent where nothing is
-    pixel: float  # [m] side of a pixel
-    left: float  # [m] x of the left edge, in the map's frame
-    top: float  # [m] y of the upper edge
-
-    @property
-    def matrix(self) -> tuple[float, ...]:
-        """a, b, c, d, e, f of x = a u + c v + e, y = b u + d v + f [m], from pixels (u, v)."""
-        return self.pixel, 0.0, 0.0, -self.pixel, self.left, self.top
+    pixels: NDArray[np.uint8]  # (H, W, 4) RGBA, transparent where nothing is; or (H, W, 3)
+    matrix: tuple[
+        float, ...
+    ]  # a, b, c, d, e, f of x = a u + c v + e, y = b u + d v + f [m, map], of pixels (u, v)
 
 
 def draw_plan(points: PackedPoints, places: Array, floors: Array) -> PlanImage | None:
@@ -53,11 +69,13 @@ def draw_plan(points: PackedPoints, places: Array, floors: Array) -> PlanImage |
     x, y, above, rgb = shown
     width, height = np.ptp(x) + 2 * MARGIN, np.ptp(y) + 2 * MARGIN
     pixel = max(PIXEL, float(max(width, height)) / MAX_SIDE)
-    left, top = float(x.min()) - MARGIN, float(y.max()) + MARGIN
+    left = float(x.min()) - MARGIN
+    top = float(y.max()) + MARGIN
     columns = ((x - left) / pixel).astype(np.int64)
     rows = ((top - y) / pixel).astype(np.int64)
     shape = math.ceil(height / pixel), math.ceil(width / pixel)
-    return PlanImage(_painted(columns, rows, above, rgb, shape, pixel), pixel, left, top)
+    painted = _painted(columns, rows, above, rgb, shape, pixel)
+    return PlanImage(painted, (pixel, 0.0, 0.0, -pixel, left, top))
 
 
 def _of_storey(
@@ -92,7 +110,8 @@ def _painted(
 ) -> NDArray[np.uint8]:
     """The picture (H, W, 4): what is highest below the cut, gaps closed, shadows of the walls, the walls."""
     order = np.argsort(above, kind="stable")  # what is higher is written later
-    color, is_seen = np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.bool_)
+    color = np.zeros((*shape, 3), np.uint8)
+    is_seen = np.zeros(shape, np.bool_)
     color[rows[order], columns[order]] = rgb[order]
     is_seen[rows, columns] = True
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (GAP, GAP))
@@ -134,3 +153,68 @@ def _walls(
     is_wall = cv2.erode((count >= WALL_FILLED).astype(np.uint8), square)
     closed = cv2.morphologyEx(is_wall, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     return np.asarray(cv2.dilate(closed, square) > 0)
+
+
+class OwnPlan(NamedTuple):
+    """A plan of a storey."""
+
+    storey: int  # 1 for the lowest
+    image: Path
+    control_points: Path  # CSV
+
+
+def read_control_points(path: Path) -> Array:
+    """Rows u, v [px], x, y [m, world] (N, 4) of a CSV file."""
+    rows = csv.DictReader(read_text(path, WANTED).splitlines())
+    names = [name.strip() for name in rows.fieldnames or ()]
+    rows.fieldnames = names
+    if set(COLUMNS) - set(names):
+        raise InputError(f"{path}: found the columns {names}, {WANTED}")
+    try:
+        points = np.array([[float(row[name]) for name in COLUMNS] for row in rows])
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: found {error}, {WANTED}") from error
+    if len(points) < 2 or not np.isfinite(points).all():
+        raise InputError(f"{path}: found {len(points)} control points, {WANTED}")
+    return points
+
+
+def plan_matrix(pixels: Array, places: Array) -> tuple[tuple[float, ...], float]:
+    """a, b, c, d, e, f of x = a u + c v + e, y = b u + d v + f, and the rms error [m] at the points.
+
+    Of pixels (N, 2), v downwards, and places (N, 2) [m]: two points give a turn and a scale, more any affine
+    map by least squares. InputError if they lie in one point or, more than two, on one line.
+    """
+    centred = pixels - pixels.mean(axis=0)
+    spread = np.linalg.svd(centred, compute_uv=False)
+    rank = 1 if len(pixels) == 2 else 2
+    if spread[rank - 1] <= LEAST_SPREAD * max(spread[0], 1.0):
+        raise InputError("control points: found them in one point or on one line, wanted them far apart")
+    if rank == 1:
+        z, w = (complex(*(pair[1] - pair[0])) for pair in (pixels * np.array([1.0, -1.0]), places))
+        turn = w / z
+        a = turn.real
+        b = turn.imag
+        linear = np.array([[a, b], [b, -a]])  # v points down
+    else:
+        linear = np.linalg.lstsq(centred, places - places.mean(axis=0), rcond=None)[0].T
+    shift = places.mean(axis=0) - linear @ pixels.mean(axis=0)
+    error = float(np.sqrt(((pixels @ linear.T + shift - places) ** 2).sum(axis=1).mean()))
+    return (*linear.T.ravel().tolist(), *shift.tolist()), error
+
+
+def own_plan(plan: OwnPlan, scan_map: ScanMap) -> PlanImage:
+    """The user's plan in the map's frame."""
+    points = read_control_points(plan.control_points)
+    world = np.column_stack([points[:, 2:], np.full(len(points), scan_map.origin_world[2])])
+    places = ((world - scan_map.origin_world) @ scan_map.R_map_from_world.T)[:, :2]
+    rgb: NDArray[np.uint8] = read_picture(plan.image).rgb
+    scale = min(1.0, MAX_SIDE / max(rgb.shape[:2]))
+    size = math.ceil(rgb.shape[1] * scale), math.ceil(rgb.shape[0] * scale)
+    if scale < 1.0:
+        rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+    try:
+        matrix, _ = plan_matrix(points[:, :2] * scale, places)
+    except InputError as error:
+        raise InputError(f"{plan.control_points}: {error}") from error
+    return PlanImage(rgb, matrix)

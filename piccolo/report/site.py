@@ -47,13 +47,8 @@ def check_folder(out: Path) -> None:
         raise InputError(f"{out}: found a file or a device, wanted a folder")
     if not out.parent.is_dir():
         raise InputError(f"{out}: found no folder {out.parent}, wanted one that exists")
-    if out.exists() and any(out.iterdir()) and not is_report(out):
+    if out.exists() and any(out.iterdir()) and not (out / f".{MARK}").is_file():
         raise InputError(f"{out}: found a folder of something else, wanted a new or empty one, or a report")
-
-
-def is_report(folder: Path) -> bool:
-    """True for a folder that holds a report, or one half made."""
-    return (folder / f".{MARK}").is_file()
 
 
 def begin_folder(out: Path) -> None:
@@ -72,12 +67,6 @@ def write_photo_script(out: Path, key: str, document: str) -> None:
     """Write the pictures of a photo, in JSON, as a script that hands them to the page."""
     text = f'(window.PICCOLO_PHOTOS ??= {{}})["{key}"] = {document};\n'
     write_atomically(picture_path(out, "photos", key), text.encode())
-
-
-def photo_json(out: Path, key: str) -> str:
-    """The JSON in what write_photo_script wrote."""
-    text = picture_path(out, "photos", key).read_text()
-    return text.partition(" = ")[2].removesuffix(";\n")
 
 
 def finish_folder(out: Path, document: Mapping[str, Any]) -> None:
@@ -107,11 +96,13 @@ def self_contained(folder: Path, document: Mapping[str, Any]) -> str:
     for storey in inlined["storeys"]:
         if storey["plan"]:
             storey["plan"]["file"] = _data_url(folder / storey["plan"]["file"], "image/png")
-    script, style = page_file("app.js"), page_file("app.css")
+    script = page_file("app.js")
+    style = page_file("app.css")
     data = [f'<script type="application/json" id="report">{as_script_text(inlined)}</script>']
     for photo in document["photos"]:
         if photo["hasPictures"]:
-            text = photo_json(folder, photo["key"])
+            script_of_photo = picture_path(folder, "photos", photo["key"]).read_text()
+            text = script_of_photo.partition(" = ")[2].removesuffix(";\n")
             data.append(f'<script type="application/json" id="photo-{photo["key"]}">{text}</script>')
     page = page_file(INDEX)
     page = page.replace("{{policy}}", POLICY.format(script=_hash_of(script), style=_hash_of(style)))

@@ -10,8 +10,7 @@ from ..cloud.soa import PackedPoints
 from ..geometry.pose import Array, Pose
 from ..geometry.sphere import direction_to_pixel, solid_angles
 from ..kernels.jit import kernel
-from ..panorama.projection import in_camera, pose_float32
-from ..panorama.texels import channel
+from ..panorama.texels import channel, in_camera, pose_float32
 
 CHUNK = 4096
 EMPTY = np.float32(np.inf)

@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from piccolo.batch.priors import read_priors
 from piccolo.camera.files import read_cameras, read_rig
 from piccolo.cloud import FORMATS
-from piccolo.cloud.readers.reader import PLAIN
+from piccolo.cloud.settings import IN_METRES
 from piccolo.errors import InputError
 from piccolo.panorama import read_panorama
 from piccolo.panorama.photo import photo_of
@@ -43,7 +43,7 @@ def read(name, path):
         if name in OTHERS:
             OTHERS[name](path)
         else:
-            for _ in READERS[name](path, PLAIN).read_chunks():
+            for _ in READERS[name](path, IN_METRES).read_chunks():
                 pass
     except (InputError, OSError, UnicodeDecodeError):  # what commands turn into one line
         return

@@ -13,6 +13,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...geometry.pose import Array, Pose, rotate_points
+from ..settings import IN_METRES, CloudSettings
 from .e57_file import (
     MAGIC,
     NAMESPACE,
@@ -27,15 +28,15 @@ from .e57_file import (
     scaled,
     text_of,
 )
-from .reader import CHUNK, PLAIN, CloudFormat, CloudReadOptions, PointSource, RawCloud
-from .scalars import OPTION, intensity_reader
+from .reader import CHUNK, OPTION, CloudFormat, PointSource, RawCloud, intensity_reader
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 COLORS = ("colorRed", "colorGreen", "colorBlue")
 INVALID = {CARTESIAN: "cartesianInvalidState", SPHERICAL: "sphericalInvalidState"}
 INTENSITY = "intensity"
-INVALID_COLOR, INVALID_INTENSITY = "isColorInvalid", "isIntensityInvalid"
+INVALID_COLOR = "isColorInvalid"
+INVALID_INTENSITY = "isIntensityInvalid"
 TOLERANCE = 0.01  # of 255, what a float colour may lie outside of its range
 WANTED = "wanted scans with colorRed colorGreen colorBlue"
 KINDS = {
@@ -66,7 +67,7 @@ class _UnusableError(Exception):
     """A scan is whole, but not of use here."""
 
 
-def open_e57(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+def open_e57(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """The coloured points of all scans of an E57 file.
 
     Points with an invalid state (direction only, or nothing) or an invalid colour are left out. A colour's
@@ -203,7 +204,9 @@ def _read_scan(file: E57File, scan: E57Scan) -> Iterator[dict[str, Array]]:
     """The columns of a scan, a chunk at a time, in room that is used again."""
     names = (*scan.coordinates, *scan.channels, *scan.invalid)
     columns = {name: np.empty(min(scan.num_points, CHUNK)) for name in names}
-    buffers, num_read, count = file.libe57.VectorSourceDestBuffer(), 0, 1
+    buffers = file.libe57.VectorSourceDestBuffer()
+    num_read = 0
+    count = 1
     with refusing(file.path, file.libe57):
         for name, room in columns.items():
             buffers.append(file.libe57.SourceDestBuffer(file.image_file, name, room, len(room), True, True))

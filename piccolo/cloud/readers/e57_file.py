@@ -23,11 +23,15 @@ from .reader import quoted
 
 MAGIC = b"ASTM-E57"
 HEADER = struct.Struct("<8sIIQQQQ")  # magic, major, minor, file size, XML offset, XML size, page size
-PAGE_SIZE, PAGE_CONTENT = 1024, 1020  # [byte]; the rest of a page is its checksum
+PAGE_SIZE = 1024  # [byte]
+PAGE_CONTENT = 1020  # [byte]; the rest of a page is its checksum
 NAMESPACE = "{http://www.astm.org/COMMIT/E57/2010-e57-v1.0}"
 MAX_XML_SIZE = 1 << 26  # [byte]
 # libE57 takes time with the square of a structure's parts; a vector holds scans and images
-MAX_ELEMENTS, MAX_PARTS, MAX_IN_VECTOR, MAX_DEPTH = 500_000, 500, 20_000, 32
+MAX_ELEMENTS = 500_000
+MAX_PARTS = 500
+MAX_IN_VECTOR = 20_000
+MAX_DEPTH = 32
 INTEGER = re.compile(r"[+-]?[0-9]{1,19}")
 CHECK_ALL = 100  # [%] of the pages have their checksum verified
 
@@ -71,7 +75,8 @@ def read_xml(path: Path) -> Element:
         if len(head) < HEADER.size or not head.startswith(MAGIC):
             raise InputError(f"{path}: begins with {head[:8]!r} and {len(head)} bytes, wanted 'ASTM-E57'")
         _, major, _, size, offset, length, page_size = HEADER.unpack(head)
-        found, text = path.stat().st_size, f"{path}: the header promises"
+        found = path.stat().st_size
+        text = f"{path}: the header promises"
         if major != 1 or page_size != PAGE_SIZE:
             raise InputError(f"{path}: E57 {major} in pages of {page_size} bytes, wanted 1 and {PAGE_SIZE}")
         if size != found or found % PAGE_SIZE:

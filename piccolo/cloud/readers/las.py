@@ -1,34 +1,294 @@
-"""LAS and LAZ files: the points' positions and colours."""
+"""LAS and LAZ files: header, chunk table, positions and colours, decompressed by lazrs.
 
-from collections.abc import Iterator
+lazrs reserves whatever memory the chunk table and the sizes in the chunks promise, so these are compared with
+the file first. laspy would loop and reserve as a damaged header says.
+"""
+
+import io
+import struct
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from .las_file import (
-    MAGIC,
-    MAX_CHUNK_SIZE,
-    WANTED,
-    LasHeader,
-    LasLayout,
-    decompress,
-    read_header,
-    read_laz_layout,
+from ...optional import import_optional
+from ..settings import IN_METRES, CloudSettings
+from .reader import (
+    CHUNK,
+    CUT,
+    OPTION,
+    CloudFormat,
+    PointSource,
+    PointsWithScalar,
+    RawCloud,
+    intensity_reader,
+    label_reader,
+    quoted,
 )
-from .reader import CHUNK, CUT, PLAIN, CloudFormat, CloudReadOptions, PointSource, PointsWithScalar, RawCloud
-from .scalars import OPTION, intensity_reader, label_reader
 
-WITHHELD_OLD, WITHHELD = 0x80, 0x04  # bits of the flags' byte, in the formats 0-5 and 6-10
-CLASS_OLD, CLASS = 0x1F, 0xFF  # bits of the class, in the same
-MAX_SAMPLES, NUM_SAMPLE_RUNS = 1 << 20, 64
+MAGIC = b"LASF"
+MIN_HEADER_SIZE = 227  # [byte]
+MIN_HEADER_SIZE_1_4 = 375  # [byte]
+COMPRESSED_BIT = 0x80  # of the point format
+# The least length of a record by point format, and where red green blue begin in those that have them [byte].
+RECORD_SIZES = {0: 20, 1: 28, 2: 26, 3: 34, 4: 57, 5: 63, 6: 30, 7: 36, 8: 38, 9: 59, 10: 67}
+COLORS_BYTE = {2: 20, 3: 28, 5: 28, 7: 30, 8: 30, 10: 30}
+INTENSITY_BYTE = 12
+FLAGS_BYTE = 15
+CLASS_BYTE_OLD = 15  # in the formats 0-5, whose upper three bits are flags
+CLASS_BYTE = 16  # in 6-10
+WANTED = "wanted LAS or LAZ with red green blue (point format 2, 3, 5, 7, 8 or 10)"
+OFFSET_SIZE = 8  # [byte] of the chunk table's offset, in front of the first chunk
+MAX_ENTRY_SIZE = 32  # [byte], more than an entry of the table can take
+MAX_VLRS = 1 << 16
+VLR_HEADER = struct.Struct("<2x16sHH32x")  # user, record id, length of what follows
+LASZIP_USER = b"laszip encoded"
+LASZIP_RECORD_ID = 22204
+ITEMS_AT = 34  # [byte] in that record
+ITEM_SIZE = 6  # [byte]; ends with its version
+TYPE_AND_SIZE = 4  # [byte]
+NUM_LAYERS = {6: 9, 7: 10, 8: 11, 9: 10, 10: 12}  # of a chunk, by point format; extra bytes have one each
+MAX_CHUNK_SIZE = 1 << 29  # [byte] of a chunk's records, for it is decompressed at once; 2 MB are usual
+# What is wanted of formats 6 to 10, where fields can be passed over.
+SELECTED = ("XY_RETURNS_CHANNEL", "Z", "INTENSITY", "FLAGS", "CLASSIFICATION", "RGB")
+WITHHELD_OLD = 0x80  # bit of the flags' byte, in the formats 0-5
+WITHHELD = 0x04  # in 6-10
+CLASS_OLD = 0x1F  # bits of the class, in the formats 0-5
+CLASS = 0xFF
+MAX_SAMPLES = 1 << 20
+NUM_SAMPLE_RUNS = 64
 TO_8_BIT = ((np.arange(1 << 16, dtype=np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
+BROKEN = "the file is cut off or broken"
 
 Records = NDArray[np.void]
+LazChunk = tuple[int, int]  # points, bytes
 
 
-def open_las(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+class LasHeader(NamedTuple):
+    """The header of a LAS file."""
+
+    path: Path
+    size: int  # [byte]
+    header_size: int  # [byte]
+    points_offset: int  # [byte]
+    num_vlrs: int
+    point_format: int
+    record_size: int  # [byte]
+    num_points: int
+    scales: NDArray[np.float64]  # (3,) x y z
+    offsets: NDArray[np.float64]  # (3,)
+    is_compressed: bool
+
+    @property
+    def dtype(self) -> np.dtype[np.void]:
+        """The fields that are wanted of a record."""
+        fields = {"xyz": ("3<i4", 0), "intensity": ("<u2", INTENSITY_BYTE), "flags": ("u1", FLAGS_BYTE)}
+        fields["class"] = ("u1", CLASS_BYTE_OLD if self.point_format < 6 else CLASS_BYTE)
+        if self.has_colors:
+            fields["rgb"] = ("3<u2", COLORS_BYTE[self.point_format])
+        kinds, begins = zip(*fields.values(), strict=True)
+        return np.dtype(
+            {"names": [*fields], "formats": kinds, "offsets": begins, "itemsize": self.record_size}
+        )
+
+    @property
+    def has_colors(self) -> bool:
+        """True if the records have fields for colours, whatever is in them."""
+        return self.point_format in COLORS_BYTE
+
+
+def read_header(path: Path) -> LasHeader:
+    """The header of a LAS or LAZ file; InputError if it is broken or promises too much."""
+    with path.open("rb") as file:
+        head = file.read(MIN_HEADER_SIZE_1_4)
+    if not head.startswith(MAGIC) or len(head) < MIN_HEADER_SIZE:
+        wanted = f"wanted 'LASF' and a header of {MIN_HEADER_SIZE} bytes or more"
+        raise InputError(f"{path}: begins with {head[:4]!r} and {len(head)} bytes, {wanted}")
+    major = head[24]
+    minor = head[25]
+    sizes = struct.unpack_from("<HIIBHI", head, 94)
+    header_size, points_offset, num_vlrs, format_id, record_size, num_points = sizes
+    if minor >= 4:
+        num_points = int.from_bytes(head[247:255], "little") or num_points
+    scales, offsets = np.frombuffer(head, "<f8", 6, 131).reshape(2, 3)
+    size = path.stat().st_size
+    point_format = format_id & ~COMPRESSED_BIT
+    is_compressed = format_id >= 0x80
+    if major != 1 or minor > 5:
+        raise InputError(f"{path}: found LAS {major}.{minor}, wanted LAS 1.0 to 1.5")
+    least = MIN_HEADER_SIZE_1_4 if minor >= 4 else MIN_HEADER_SIZE
+    if not least <= header_size <= points_offset <= size:
+        found = f"a header of {header_size} bytes and points from byte {points_offset} on"
+        raise InputError(f"{path}: {found}, wanted {least} or more and points within the file's {size} bytes")
+    least = RECORD_SIZES.get(point_format, 0)
+    if least == 0 or record_size < least:
+        wrong = f"records of {record_size} bytes, wanted {least} or more in point format {point_format}"
+        raise InputError(f"{path}: {wrong if least else f'unknown point format {point_format}, {WANTED}'}")
+    if not (np.isfinite([scales, offsets]).all() and scales.all()):
+        found = f"scales {scales} and offsets {offsets}"
+        raise InputError(f"{path}: {found}, wanted finite ones and no scale of 0")
+    room = (size - points_offset) // record_size
+    if num_points == 0 or (num_points > room and not is_compressed):
+        promised = f"promises {num_points} points of {record_size} bytes, found room for {room}"
+        raise InputError(f"{path}: the header {promised}; the file is cut off or broken")
+    sizes = size, header_size, points_offset, num_vlrs, point_format, record_size, num_points
+    return LasHeader(path, *sizes, scales, offsets, is_compressed)
+
+
+class LasLayout(NamedTuple):
+    """Where a file's chunks are and how to read them."""
+
+    offset: int  # [byte] of the first chunk
+    chunks: tuple[LazChunk, ...]
+    laszip: bytes = b""  # the record that describes the compression, as lazrs takes it; empty without
+    num_layers: int = 0  # 0 if the points are not in layers
+
+
+def read_laz_layout(header: LasHeader) -> LasLayout:
+    """The compression of a LAZ file; InputError if its parts don't fit together or in the file."""
+    lazrs = import_optional(header.path, "lazrs")
+    with header.path.open("rb") as file:
+        laszip = record_content(header, file, LASZIP_USER, LASZIP_RECORD_ID)
+        if laszip is None:
+            text = "the points are compressed, but no record says how (LASzip's VLR)"
+            raise InputError(f"{header.path}: {text}")
+        num_layers = _check_items(header, laszip, lazrs)
+        table_offset, table = _table(header, file)
+    with _refusing(header.path, lazrs):
+        vlr = lazrs.LazVlr(laszip)
+        entries = lazrs.read_chunk_table_only(io.BytesIO(table), vlr)
+        if not vlr.uses_variable_size_chunks():
+            entries = [(vlr.chunk_size(), size) for _, size in entries]
+    offset = header.points_offset + OFFSET_SIZE
+    return LasLayout(offset, _checked_chunks(header, entries, table_offset - offset), laszip, num_layers)
+
+
+def record_content(header: LasHeader, file: BinaryIO, wanted_user: bytes, wanted_id: int) -> bytes | None:
+    """The content of the variable-length record of this user and id; None if there is none."""
+    position = header.header_size
+    for _ in range(min(header.num_vlrs, MAX_VLRS)):
+        if position + VLR_HEADER.size > header.points_offset:
+            break
+        file.seek(position)
+        user, record_id, length = VLR_HEADER.unpack(file.read(VLR_HEADER.size))
+        position += VLR_HEADER.size + length
+        if user.rstrip(b"\0") == wanted_user and record_id == wanted_id:
+            return file.read(length)
+    return None
+
+
+def _check_items(header: LasHeader, laszip: bytes, lazrs: ModuleType) -> int:
+    """The number of layers of a chunk, if the record is one that lazrs would write for these points."""
+    num_extra = header.record_size - RECORD_SIZES[header.point_format]
+    expected = lazrs.LazVlr.new_for_compression(header.point_format, num_extra, False).record_data()
+    if _without_versions(laszip[: len(expected)]) != _without_versions(expected):
+        what = f"point format {header.point_format} in {header.record_size} bytes"
+        raise InputError(f"{header.path}: LASzip's record is not that of {what}: it is broken or too old")
+    return NUM_LAYERS[header.point_format] + num_extra if header.point_format >= 6 else 0
+
+
+def _without_versions(laszip: bytes) -> list[bytes]:
+    """The compressor, the number of items, and the type and size of each."""
+    items = [laszip[k : k + TYPE_AND_SIZE] for k in range(ITEMS_AT, len(laszip), ITEM_SIZE)]
+    return [laszip[:2], laszip[ITEMS_AT - 2 : ITEMS_AT], *items]
+
+
+def _table(header: LasHeader, file: BinaryIO) -> tuple[int, bytes]:
+    """Where the compressed chunk table begins, and its bytes, if the file has room for what it promises.
+
+    A writer that could not go back says in the file's last bytes where it begins.
+    """
+    for position in (header.points_offset, header.size - 8):
+        file.seek(position)
+        offset = int.from_bytes(file.read(8), "little", signed=True)
+        is_inside = header.points_offset + OFFSET_SIZE <= offset <= header.size - 8
+        if is_inside or offset > header.points_offset:
+            break
+    if not is_inside:
+        raise InputError(f"{header.path}: no chunk table within the file; it is cut off or broken")
+    file.seek(offset)
+    num_chunks = int.from_bytes(file.read(8)[4:], "little")
+    # each chunk begins with a whole point
+    max_chunks = (offset - header.points_offset - OFFSET_SIZE) // header.record_size
+    if not 0 < num_chunks <= max_chunks:
+        counts = f"promises {num_chunks} chunks, wanted 1 to {max_chunks}"
+        raise InputError(f"{header.path}: the chunk table {counts}; {BROKEN}")
+    file.seek(offset)
+    return offset, file.read(MAX_ENTRY_SIZE * (num_chunks + 32))
+
+
+def _checked_chunks(header: LasHeader, entries: list[LazChunk], num_bytes: int) -> tuple[LazChunk, ...]:
+    """The chunks that hold the promised points, the last no more than is left."""
+    chunks: list[LazChunk] = []
+    num_left = header.num_points
+    most = MAX_CHUNK_SIZE // header.record_size
+    for full_count, size in entries:
+        if num_left == 0:
+            break
+        count = min(full_count, num_left)
+        if not (0 < count <= most and header.record_size <= size <= num_bytes):
+            where = f"{header.path}: chunk {len(chunks) + 1} of {count} points in {size} bytes"
+            raise InputError(f"{where}, wanted 1 to {most} points, in the file; the chunk table is broken")
+        chunks.append((count, size))
+        num_left -= count
+        num_bytes -= size
+    if num_left:
+        counts = f"promises {header.num_points} points, the chunk table has {header.num_points - num_left}"
+        raise InputError(f"{header.path}: the header {counts}")
+    return tuple(chunks)
+
+
+def decompress(
+    header: LasHeader, layout: LasLayout, data: bytes, chunks: Sequence[LazChunk]
+) -> NDArray[np.uint8]:
+    """The records, one after the other, of the `chunks` whose compressed bytes are `data`."""
+    lazrs = import_optional(header.path, "lazrs")
+    if layout.num_layers:
+        _check_layers(header, layout.num_layers, data, chunks)
+    records = np.empty(sum(count for count, _ in chunks) * header.record_size, dtype=np.uint8)
+    fields = sum(getattr(lazrs, f"SELECTIVE_DECOMPRESS_{name}") for name in SELECTED)
+    selected = lazrs.DecompressionSelection(fields)
+    with _refusing(header.path, lazrs):
+        lazrs.decompress_points_with_chunk_table(data, layout.laszip, records, list(chunks), selected)
+    return records
+
+
+def _check_layers(header: LasHeader, num_layers: int, data: bytes, chunks: Sequence[LazChunk]) -> None:
+    """Refuse layers larger than the chunk they lie in, and another number of points than was promised.
+
+    A chunk is a whole point, the number of points, the bytes of each layer, the layers.
+    """
+    begin = 0
+    head_size = header.record_size + 4 * (1 + num_layers)
+    for num_points, size in chunks:
+        if size < head_size:
+            raise InputError(f"{header.path}: a chunk of {size} bytes, wanted {head_size} or more; {BROKEN}")
+        found, *layers = np.frombuffer(data, "<u4", 1 + num_layers, begin + header.record_size).tolist()
+        if sum(layers) > size - head_size or found != num_points:
+            what = f"a chunk of {found} points with layers of {sum(layers)} bytes"
+            most = f"wanted {num_points} points and {size - head_size} bytes at most"
+            raise InputError(f"{header.path}: {what}, {most}; {BROKEN}")
+        begin += size
+
+
+@contextmanager
+def _refusing(path: Path, lazrs: ModuleType) -> Iterator[None]:
+    """Turn what lazrs says of broken data into an InputError."""
+    try:
+        yield
+    except BaseException as error:  # a panic in Rust: no Exception, and of a class that can't be imported
+        if not isinstance(error, lazrs.LazrsError) and type(error).__name__ != "PanicException":
+            raise
+        why = quoted(str(error).encode())
+        raise InputError(f"{path}: the compressed points are broken ({why})") from error
+
+
+def open_las(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """The points of a LAS or LAZ file; withheld ones are left out.
 
     Colours are 16-bit, as the format says. They are taken for 8-bit if none of a million points, spread
@@ -47,14 +307,14 @@ def open_las(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     note = f"{path}: the colours are read as 8-bit values in 16-bit fields"
     return PointSource(
         path,
-        lambda: (_cloud(header, records, is_8_bit) for records in _chunks(header, layout)),
+        lambda: (_colored(header, records, is_8_bit) for records in _chunks(header, layout)),
         header.num_points,
         (f"{note} (largest value {brightest} in {num_samples} points looked at)",) if is_8_bit else (),
     )
 
 
 def _gray_source(
-    header: LasHeader, layout: LasLayout, options: CloudReadOptions, num_samples: int
+    header: LasHeader, layout: LasLayout, options: CloudSettings, num_samples: int
 ) -> PointSource:
     """The points with their intensity for a gray, if that is wanted, of a file without colours."""
     if not options.intensity_as_gray:
@@ -129,7 +389,7 @@ def _points(header: LasHeader, records: Records) -> tuple[NDArray[np.float64], R
         return records["xyz"] * header.scales + header.offsets, records
 
 
-def _cloud(header: LasHeader, records: Records, is_8_bit: bool) -> RawCloud:
+def _colored(header: LasHeader, records: Records, is_8_bit: bool) -> RawCloud:
     points_world, records = _points(header, records)
     rgb = records["rgb"]
     if not is_8_bit:

@@ -2,30 +2,162 @@
 
 Coordinates are taken as they stand in the file, after its own scene graph: a glTF file's y stays y, in its
 unit. trimesh reads the files; what it would pass over in silence is checked before and after.
+
+Point k of N stands at the fraction (k + 1/2) / N of the area, triangles laid one after the other, so that
+every triangle gets its part of the points within one. Its place in the triangle is the k-th point of the R2
+sequence (Roberts, 2018), which leaves no clumps and no gaps. All depends on k alone: not on chunks, not on
+chance.
 """
 
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.pose import Array
-from ..settings import UpAxis
-from .columns import BRIGHTEST
-from .mesh_gltf import GLB_MAGIC, NO_MATERIAL
+from ..settings import IN_METRES, CloudSettings, UpAxis
+from .mesh_files import GLB_MAGIC, NO_MATERIAL, Texture
 from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply
-from .mesh_sampling import Surface, SurfaceInstance, sample_points
-from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource
+from .reader import BRIGHTEST, CHUNK, CloudFormat, PointSource, RawCloud
 
+# 1 / p and 1 / p^2 of the plastic number p, the root of p^3 = p + 1
+R2_STEPS = (0.7548776662466927, 0.5698402909980532)
+BLOCK = 1 << 18  # triangles whose corners are held at once
 DENSITY = 10_000.0  # points on a square metre, 1 cm apart
 MAX_POINTS = 30_000_000
 MAX_TRIANGLES = 200_000_000  # those of a mesh count again at each place where the scene puts it
 
 
-def open_mesh(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+class Surface(NamedTuple):
+    """Triangles of one material, in a frame of their own."""
+
+    vertices: Array  # (V, 3), NaN: the triangle is left out
+    triangles: NDArray[np.int64]  # (T, 3) rows of vertices
+    uv: Array | None = None  # (V, 2), v upwards from the lower edge
+    texture: Texture | None = None
+    colors: Array | None = None  # (C, 3) in [0, 1]; with a texture: factors
+    corners: NDArray[np.int64] | None = None  # (T, 3) rows of colors
+    is_linear: bool = False  # colors are linear light, not sRGB
+
+
+class SurfaceInstance(NamedTuple):
+    """A surface where a node places it in the world."""
+
+    surface: Surface
+    T_world_from_surface: Array  # (4, 4)
+
+    def areas(self) -> Array:
+        """Areas (T,) of the triangles; 0 for those that aren't finite."""
+        surface = self.surface
+        areas = np.empty(len(surface.triangles))
+        with np.errstate(all="ignore"):
+            matrix = self.T_world_from_surface[:3, :3]
+            for begin in range(0, len(areas), BLOCK):
+                corners = surface.vertices[surface.triangles[begin : begin + BLOCK]]
+                edges = (corners[:, 1:] - corners[:, :1]) @ matrix.T
+                normals = np.cross(edges[:, 0], edges[:, 1])
+                areas[begin : begin + BLOCK] = 0.5 * np.sqrt(np.einsum("ij,ij->i", normals, normals))
+        areas[~np.isfinite(areas)] = 0.0
+        return areas
+
+
+def sample_points(instances: Sequence[SurfaceInstance], ends: Array, num_points: int) -> Iterator[RawCloud]:
+    """Yield points of one surface after the other, at most CHUNK at once; `ends` (P,) are sums of areas."""
+    area_per_point = float(ends[-1]) / num_points
+    # the first point at or behind each instance's end
+    behind = np.ceil(ends / area_per_point - 0.5).astype(np.int64)
+    behind[-1] = num_points
+    last: Texture | None = None
+    texels: NDArray[np.uint8] | None = None
+    for i, instance in enumerate(instances):
+        first = int(behind[i - 1]) if i else 0
+        end = int(behind[i])
+        if first == end:
+            continue
+        texture = instance.surface.texture
+        if texture is not last:
+            texels = None  # before the next is decoded
+            texels = texture.texels() if texture else None
+            last = texture
+        area_up_to = np.add.accumulate(instance.areas())
+        # rounding may put an area behind all ends; never a triangle of area 0
+        last_row = int(np.searchsorted(area_up_to, area_up_to[-1]))
+        area_before = float(ends[i - 1]) if i else 0.0
+        for begin in range(first, end, CHUNK):
+            k = np.arange(begin, min(begin + CHUNK, end))
+            areas = (k + 0.5) * area_per_point - area_before
+            rows = np.minimum(np.searchsorted(area_up_to, areas, side="right"), last_row)
+            yield _points(instance, k, rows, texels)
+
+
+def weights_of(k: NDArray[np.int64]) -> Array:
+    """Barycentric coordinates (N, 3) of the points k: the R2 sequence, its square folded to a triangle."""
+    a, b = (np.modf(0.5 + k * step)[0] for step in R2_STEPS)
+    is_beyond = a + b > 1.0
+    a[is_beyond], b[is_beyond] = 1.0 - a[is_beyond], 1.0 - b[is_beyond]
+    return np.stack([1.0 - a - b, a, b], axis=1)
+
+
+def _points(
+    instance: SurfaceInstance, k: NDArray[np.int64], rows: NDArray[np.int64], texels: NDArray[np.uint8] | None
+) -> RawCloud:
+    """The points k in the triangles `rows`; those on texels of alpha 0 are left out."""
+    surface = instance.surface
+    weights = weights_of(k)
+    matrix = instance.T_world_from_surface
+    triangles = surface.triangles[rows]
+    points_world = _blend(surface.vertices, triangles, weights) @ matrix[:3, :3].T + matrix[:3, 3]
+    factors = None
+    if surface.colors is not None and surface.corners is not None:
+        factors = _blend(surface.colors, surface.corners[rows], weights)
+    if texels is None or surface.uv is None:
+        if factors is None:
+            raise ValueError("a surface without colours")
+        return RawCloud(points_world, _bytes(linear_to_srgb(factors) if surface.is_linear else factors))
+    found = look_up(texels, _blend(surface.uv, triangles, weights))
+    colors = found[:, :3]
+    is_visible = found[:, 3] > 0
+    if factors is not None:
+        colors = _bytes(linear_to_srgb(srgb_to_linear(colors) * factors))
+    return RawCloud(points_world[is_visible], np.ascontiguousarray(colors[is_visible]))
+
+
+def _blend(values: Array, corners: NDArray[np.int64], weights: Array) -> Array:
+    """Values (N, D) between those at the corners (N, 3)."""
+    a, b, c = (values[corners[:, i]] * weights[:, i : i + 1] for i in range(3))
+    return np.asarray(a + b + c)
+
+
+def look_up(texels: NDArray[np.uint8], uv: Array) -> NDArray[np.uint8]:
+    """The texels (N, 4) under uv (N, 2): u to the right, v upwards from the lower edge, both repeating."""
+    height, width = texels.shape[:2]
+    turned = np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)
+    turned -= np.floor(turned)
+    columns = np.minimum((turned[:, 0] * width).astype(np.int64), width - 1)  # 1 - 1e-17 is 1
+    rows = np.minimum((turned[:, 1] * height).astype(np.int64), height - 1)
+    return np.asarray(texels[rows, columns])
+
+
+def srgb_to_linear(colors: NDArray[np.uint8]) -> Array:
+    """Linear light in [0, 1] of sRGB bytes (IEC 61966-2-1)."""
+    levels = np.arange(256) / 255.0
+    return np.asarray(np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)[colors])
+
+
+def linear_to_srgb(linear: Array) -> Array:
+    """Values of sRGB in [0, 1] of linear light in [0, 1]."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
+
+
+def _bytes(colors: Array) -> NDArray[np.uint8]:
+    return np.rint(np.clip(colors, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def open_mesh(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """The points on the triangles of an OBJ, GLB or glTF file, 10,000 on a square metre.
 
     The options' scale tells what a metre is in the file. A file that would give more than 30 million is
@@ -39,7 +171,7 @@ def open_mesh(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     return _source((load_gltf if is_gltf else load_obj)(path, content), options.scale)
 
 
-def open_ply_mesh(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+def open_ply_mesh(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """The points on the faces of a PLY file, as by open_mesh; with a texture if a comment names one."""
     return _source(load_ply(path), options.scale)
 
@@ -50,7 +182,8 @@ def _source(loaded: Loaded, scale: float) -> PointSource:
     num_triangles = sum(len(instance.surface.triangles) for instance in instances)
     if num_triangles > MAX_TRIANGLES:
         raise InputError(f"{path}: {num_triangles} triangles, wanted at most {MAX_TRIANGLES}")
-    sums, num_flat = [], 0
+    sums = []
+    num_flat = 0
     for instance in instances:
         areas = instance.areas()
         sums.append(areas.sum())
@@ -75,10 +208,12 @@ def _source(loaded: Loaded, scale: float) -> PointSource:
 
 def _instances(loaded: Loaded) -> tuple[list[SurfaceInstance], list[str]]:
     """The coloured surfaces where the scene puts them, and what the user should know."""
-    scene, path = loaded.scene, loaded.path
+    scene = loaded.scene
+    path = loaded.path
     meshes = {name: mesh for name, mesh in scene.geometry.items() if hasattr(mesh, "faces")}
     surfaces = {name: _surface(loaded, mesh) for name, mesh in meshes.items()}
-    instances, num_bare = [], 0
+    instances = []
+    num_bare = 0
     nodes = [scene.graph.get(node) for node in scene.graph.nodes_geometry]
     # not by the nodes' names: trimesh makes some up by chance
     for matrix, name in sorted(nodes, key=lambda node: (node[1], node[0].tobytes())):
@@ -122,7 +257,8 @@ def _surface(loaded: Loaded, mesh: Any) -> Surface | None:
     if loaded.materials is not None:
         return _gltf_surface(loaded, mesh, vertices, triangles)
     material = getattr(mesh.visual, "material", None)
-    uv, texture = getattr(mesh.visual, "uv", None), loaded.texture(getattr(material, "image", None))
+    uv = getattr(mesh.visual, "uv", None)
+    texture = loaded.texture(getattr(material, "image", None))
     if texture is not None:
         if uv is None:
             return Surface(vertices, triangles)  # the material's colour would only be multiplied
@@ -138,12 +274,15 @@ def _checked_uv(path: Path, raw: Any, vertices: Array) -> Array:
     if uv.shape != (len(vertices), 2):
         raise InputError(f"{path}: {len(uv)} texture coordinates, wanted {len(vertices)}")
     is_wrong: NDArray[np.bool_] = ~np.all(np.abs(uv) < 1e6, axis=1)
-    vertices[is_wrong], uv[is_wrong] = np.nan, 0.0
+    vertices[is_wrong] = np.nan
+    uv[is_wrong] = 0.0
     return uv
 
 
 def _gltf_surface(loaded: Loaded, mesh: Any, vertices: Array, triangles: NDArray[np.int64]) -> Surface:
-    visual, path, materials = mesh.visual, loaded.path, loaded.materials or []
+    visual = mesh.visual
+    path = loaded.path
+    materials = loaded.materials or []
     material = materials[int(visual.material.name)]
     texture = loaded.texture(visual.material.baseColorTexture)
     if material.texture is not None and (texture is None or visual.uv is None):
@@ -154,11 +293,13 @@ def _gltf_surface(loaded: Loaded, mesh: Any, vertices: Array, triangles: NDArray
     uv = None if texture is None else _checked_uv(path, visual.uv, vertices)
     factor = np.array([material.factor])
     if raw is not None:
-        colors, corners = _fractions(path, raw, len(vertices)) * factor, triangles
+        colors = _fractions(path, raw, len(vertices)) * factor
+        corners = triangles
     elif texture is not None and np.all(factor == 1.0):
         return Surface(vertices, triangles, uv, texture)
     else:
-        colors, corners = factor, np.broadcast_to(np.int64(0), triangles.shape)
+        colors = factor
+        corners = np.broadcast_to(np.int64(0), triangles.shape)
     return Surface(vertices, triangles, uv, texture, colors, corners, is_linear=True)
 
 

@@ -1,11 +1,19 @@
-"""The files that a mesh names: materials, buffers, and textures, which are images held to a size."""
+"""The files that a mesh names: materials, buffers, textures held to a size; and glTF before it is read.
 
+trimesh raises an error where data of glTF are cut off. But it takes zeros for compressed or sparse data,
+passes over what it doesn't know, and follows nodes and copies shared data without a limit: that is checked
+here, and its JSON left without what is not read.
+"""
+
+import json
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +24,30 @@ from ...errors import InputError
 MAX_TEXELS = 1 << 28  # 16,384 x 16,384: 1 GiB while it is looked up, three while it is decoded
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "TGA", "GIF")
 MODES = frozenset({"1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr"})  # 8 bits a channel or less
+
+
+GLB_MAGIC = b"glTF"
+WANTED = "wanted a whole glTF 2.0 mesh"
+KNOWN_EXTENSIONS = frozenset({"KHR_materials_unlit", "EXT_texture_webp"})  # of those a file may require
+UNREAD_EXTENSIONS = frozenset({"KHR_materials_pbrSpecularGlossiness", "KHR_texture_transform"})
+MAX_DEPTH = 200  # nodes below each other: a chain of n costs n^2
+MAX_ROWS = 20_000_000  # vertices and indices of all primitives; more only in a file of more bytes
+MAX_SHARING = 4  # times that a byte may be part of an accessor, on average
+
+BYTES_OF_TYPE = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
+NUM_OF_SHAPE = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+FLOAT = 5126
+TRIANGLES = 4
+STRIP = 5
+FAN = 6
+COUNTS = {  # numbers that trimesh would count from the end if they were negative
+    "bufferViews": ("buffer", "byteOffset", "byteLength", "byteStride"),
+    "accessors": ("bufferView", "byteOffset", "count"),
+    "images": ("bufferView",),
+    "nodes": ("mesh",),
+}
+
+Json = dict[str, Any]
 
 
 class Texture(NamedTuple):
@@ -103,7 +135,8 @@ class FolderResolver:
 
     def get(self, name: str) -> bytes:
         """The content of a file, by the name that the mesh gives it."""
-        folder, problem = self.path.parent.resolve(), ""
+        folder = self.path.parent.resolve()
+        problem = ""
         try:
             file = (folder / name.strip().replace("\\", "/")).resolve()  # names may be written on Windows
             if ":" in name or not file.is_relative_to(folder):  # ':' of a drive or a URL
@@ -121,3 +154,174 @@ class FolderResolver:
         return self._contents[file]
 
     __getitem__ = get
+
+
+class Material(NamedTuple):
+    """The base colour of a glTF material."""
+
+    factor: tuple[float, float, float] = (1.0, 1.0, 1.0)  # linear light
+    texture: Json | None = None
+
+
+NO_MATERIAL = Material()  # of primitives without one, the first of all
+
+
+def sanitize_gltf(content: bytes, resolver: FolderResolver) -> tuple[bytes, list[Material]]:
+    """A checked glTF or GLB file with triangles, base colours and nodes only; materials, by rows as named."""
+    path = resolver.path
+    is_glb = content.startswith(GLB_MAGIC)
+    head, text, data = _glb_parts(path, content) if is_glb else (b"", content, b"")
+    try:
+        tree = json.loads(text)
+        _check_version(path, tree)
+        num_bytes = len(content) + _num_bytes_of_files(tree, resolver)
+        _check_data(path, tree, num_bytes)
+        _check_nodes(path, tree)
+        materials = [NO_MATERIAL, *(_material(path, given) for given in tree.get("materials", []))]
+        _keep_base_colors(tree, materials)
+        _keep_triangles(path, tree, materials, num_bytes)
+        for node in tree.get("nodes", []):
+            node.pop("camera", None)  # with which trimesh passes over the node's mesh
+            node.pop("name", None)  # trimesh before 5 mixes up nodes named "world"
+        text = json.dumps(tree).encode()
+    except InputError:
+        raise
+    except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: broken JSON ({first_line(error)}), {WANTED}") from error
+    return head + (struct.pack("<I4s", len(text), b"JSON") if head else b"") + text + data, materials
+
+
+def _glb_parts(path: Path, content: bytes) -> tuple[bytes, bytes, bytes]:
+    """Head of a GLB file, its JSON, and the parts behind."""
+    version, size, json_size, kind = struct.unpack_from("<III4s", content.ljust(20, b"\0"), 4)
+    if size > len(content) or 20 + json_size > size:
+        raise InputError(f"{path}: {len(content)} bytes of {max(size, 20 + json_size)}, {WANTED}")
+    if version != 2 or kind != b"JSON":
+        raise InputError(f"{path}: GLB version {version}, first part {kind!r}, {WANTED}")
+    return content[:12], content[20 : 20 + json_size], content[20 + json_size : size]
+
+
+def _check_version(path: Path, tree: Json) -> None:
+    if str(tree["asset"]["version"]).partition(".")[0] != "2":
+        raise InputError(f"{path}: glTF version {str(tree['asset']['version'])[:20]!a}, {WANTED}")
+    unknown = set(tree.get("extensionsRequired", [])) - KNOWN_EXTENSIONS
+    if unknown:
+        names = ", ".join(sorted(map(str, unknown)))
+        raise InputError(f"{path}: requires the extensions {names[:100]!a}, wanted a plain glTF mesh")
+
+
+def _num_bytes_of_files(tree: Json, resolver: FolderResolver) -> int:
+    """Size of the buffers that are files of their own; their names are decoded, which trimesh leaves out."""
+    for kind in ("buffers", "images"):
+        for entry in tree.get(kind, []):
+            if entry.get("uri", "data:").startswith("data:"):
+                continue
+            name = entry["uri"] = unquote(entry["uri"])
+            if kind == "buffers" and len(resolver[name]) < _count(entry["byteLength"]):
+                counts = f"has {len(resolver[name])} of {entry['byteLength']} bytes"
+                raise InputError(f"{resolver.path}: the buffer {name[:100]!a} {counts}, {WANTED}")
+    return resolver.num_bytes
+
+
+def _check_data(path: Path, tree: Json, num_bytes: int) -> None:
+    """Refuse data that trimesh would take for zeros, count from the end or copy without a limit."""
+    for kind, names in COUNTS.items():
+        for entry in tree.get(kind, []):
+            for name in entry.keys() & names:
+                _count(entry[name])
+    views = tree.get("bufferViews", [])
+    accessors = tree.get("accessors", [])
+    size = 0
+    for i, accessor in enumerate(accessors):
+        if "sparse" in accessor or "bufferView" not in accessor:
+            raise InputError(f"{path}: accessor {i} is sparse or compressed, wanted plain data")
+        row = BYTES_OF_TYPE[accessor["componentType"]] * NUM_OF_SHAPE[accessor["type"]]
+        stride = views[accessor["bufferView"]].get("byteStride", row)
+        if stride < row:
+            raise InputError(f"{path}: accessor {i} has rows of {row} bytes, {stride} bytes apart, {WANTED}")
+        size += accessor["count"] * row
+    size = max(size, sum(view["byteLength"] for view in views))
+    if size > MAX_SHARING * num_bytes:
+        raise InputError(f"{path}: {size} bytes of data promised in {num_bytes}, {WANTED}")
+
+
+def _check_nodes(path: Path, tree: Json) -> None:
+    """Refuse nodes that form no tree: they could place any number of meshes."""
+    scenes = tree.get("scenes", [])
+    nodes = tree.get("nodes", [])
+    seen = set[int]()
+    level = scenes[_count(tree.get("scene", 0))].get("nodes", []) if scenes else []
+    for _ in range(MAX_DEPTH):
+        num_seen = len(seen)
+        seen.update(level)
+        if len(seen) < num_seen + len(level):
+            raise InputError(f"{path}: a node is named twice in its scene, {WANTED}")
+        level = [child for i in level for child in nodes[_count(i)].get("children", [])]
+    if level:
+        raise InputError(f"{path}: over {MAX_DEPTH} nodes below each other, {WANTED}")
+
+
+def _material(path: Path, material: Json) -> Material:
+    """The base colour of a material."""
+    base = material.get("pbrMetallicRoughness", {})
+    texture = base.get("baseColorTexture")
+    for name in UNREAD_EXTENSIONS & {*material.get("extensions", {}), *(texture or {}).get("extensions", {})}:
+        raise InputError(f"{path}: a material uses {name}, wanted plain base colours")
+    red, green, blue, _ = map(float, base.get("baseColorFactor", [1.0] * 4))
+    if not all(0.0 <= value <= 1.0 for value in (red, green, blue)):
+        raise InputError(f"{path}: a base colour of {red:g} {green:g} {blue:g}, wanted 0 to 1")
+    return Material((red, green, blue), texture)
+
+
+def _keep_base_colors(tree: Json, materials: list[Material]) -> None:
+    """Leave the images of base colours only; materials take their rows as names."""
+    shown = [tree["textures"][_count(m.texture["index"])] for m in materials if m.texture is not None]
+    used = {_count(t.get("extensions", {}).get("EXT_texture_webp", t)["source"]) for t in shown}
+    tree["images"] = [image if i in used else {} for i, image in enumerate(tree.get("images", []))]
+    tree["materials"] = [
+        {"name": str(i), "pbrMetallicRoughness": {"baseColorTexture": material.texture}}
+        for i, material in enumerate(materials)
+    ]
+
+
+def _keep_triangles(path: Path, tree: Json, materials: list[Material], num_bytes: int) -> None:
+    """Leave primitives of triangles only; refuse data that too many of them share."""
+    accessors = tree.get("accessors", [])
+    num_rows = 0
+    for mesh in tree.get("meshes", []):
+        triangles = [p for p in mesh["primitives"] if p.get("mode", TRIANGLES) in (TRIANGLES, STRIP, FAN)]
+        kept = [_primitive(path, accessors, materials, primitive) for primitive in triangles]
+        mesh.clear()
+        mesh["primitives"] = kept
+        rows = [p["attributes"]["POSITION"] for p in kept] + [p["indices"] for p in kept if "indices" in p]
+        num_rows += sum(accessors[row]["count"] for row in rows)
+    if num_rows > max(MAX_ROWS, num_bytes):
+        raise InputError(f"{path}: over {MAX_ROWS} vertices and indices in {num_bytes} bytes")
+
+
+def _primitive(path: Path, accessors: list[Json], materials: list[Material], primitive: Json) -> Json:
+    """A primitive with its positions, colours and the base colour's uv."""
+    if primitive.get("mode") == FAN:
+        raise InputError(f"{path}: has triangle fans, wanted triangles")
+    row = _count(primitive["material"]) + 1 if "material" in primitive else 0
+    texture = materials[row].texture
+    sources = {"POSITION": "POSITION", "COLOR_0": "COLOR_0"}
+    if texture is not None:
+        sources["TEXCOORD_0"] = f"TEXCOORD_{texture.get('texCoord', 0)}"  # the only one that trimesh reads
+    given = primitive["attributes"]
+    attributes = {name: _count(given[source]) for name, source in sources.items() if source in given}
+    counts = {accessors[i]["count"] for i in attributes.values()}
+    if len(counts) > 1:
+        raise InputError(f"{path}: a primitive with {sorted(counts)} rows, wanted as many of each")
+    for name in attributes.keys() - {"COLOR_0"}:
+        if accessors[attributes[name]]["componentType"] != FLOAT:
+            raise InputError(f"{path}: {name} of whole numbers, wanted floats")
+    kept = {name: _count(primitive[name]) for name in ("mode", "indices") if name in primitive}
+    return kept | {"attributes": attributes, "material": row}
+
+
+def _count(value: object) -> int:
+    """A number from JSON that must be whole and not negative."""
+    if not isinstance(value, int) or value < 0:
+        raise ValueError(f"{str(value)[:40]} where a count or an index is wanted")
+    return value

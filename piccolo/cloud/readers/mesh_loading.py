@@ -3,8 +3,6 @@
 import logging
 import re
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from io import BytesIO
 from itertools import product
@@ -13,8 +11,17 @@ from typing import Any
 
 from ...errors import InputError
 from ...optional import import_optional
-from .mesh_files import FolderResolver, Texture, check_image, first_line, own_limit, texture_of
-from .mesh_gltf import GLB_MAGIC, Material, sanitize_gltf
+from .mesh_files import (
+    GLB_MAGIC,
+    FolderResolver,
+    Material,
+    Texture,
+    check_image,
+    first_line,
+    own_limit,
+    sanitize_gltf,
+    texture_of,
+)
 
 WANTED = "wanted a mesh with textures, vertex colours or materials"
 # faces whose indices count back from the last vertex, or are 0; trimesh would take wrong vertices
@@ -33,6 +40,7 @@ TEXTURE_COMMENT = re.compile(r"TextureFile[ \t]*(.*?)[ \t\r]*$", re.MULTILINE | 
 # Once, here: the filters are of the process, and no thread may change them.
 # NumPy before 2.3 only warned where it stopped at what is no number.
 warnings.filterwarnings("ignore", module=r"trimesh\.")
+logging.getLogger("trimesh").addHandler(logging.NullHandler())  # else Python prints what nobody listens to
 warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
 
 
@@ -102,7 +110,7 @@ def _with_raw_colors(parsed: dict[str, Any]) -> dict[str, Any]:
 def _scene(resolver: FolderResolver, content: bytes, kind: str, has_texture: bool = True) -> Any:
     trimesh = import_optional(resolver.path, "trimesh")
     try:
-        with own_limit(), _quiet():
+        with own_limit():
             # vertices are split by texture coordinates only if there is a texture: colours go by vertices
             options = {"fix_texture": has_texture} if kind == "ply" else {}
             load = trimesh.exchange.load.mesh_loaders[kind]
@@ -119,18 +127,6 @@ def _scene(resolver: FolderResolver, content: bytes, kind: str, has_texture: boo
     return scene
 
 
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep trimesh from printing."""
-    logger = logging.getLogger("trimesh")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL + 1)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
-
-
 def load_ply(path: Path) -> Loaded:
     """A PLY file with faces."""
     content = path.read_bytes()
@@ -143,7 +139,8 @@ def load_ply(path: Path) -> Loaded:
     loaded = Loaded(path, _scene(resolver, content, "ply", bool(textures)))
     raw = [m.metadata["_ply_raw"] for m in loaded.scene.geometry.values() if "_ply_raw" in m.metadata]
     for elements, name in product(raw, ("vertex", "face")):
-        data, count = elements[name].get("data"), elements[name]["length"]
+        data = elements[name].get("data")
+        count = elements[name]["length"]
         columns = data.values() if isinstance(data, dict) else [data]
         found = min((len(column) for column in columns if column is not None), default=0)
         if found != count:

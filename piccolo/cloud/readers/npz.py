@@ -18,14 +18,26 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...files.array_archive import MAX_HEAD_SIZE, read_header
-from .columns import BRIGHTEST, brightest_of, colored_chunks, in_chunks, read_records
-from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, point_label, quoted
+from ..settings import IN_METRES, CloudSettings
+from .reader import (
+    BRIGHTEST,
+    CloudFormat,
+    PointSource,
+    brightest_of,
+    colored_chunks,
+    in_chunks,
+    point_label,
+    quoted,
+    read_records,
+)
 
-NPY_MAGIC, ZIP_MAGIC = b"\x93NUMPY", b"PK\x03\x04"
+NPY_MAGIC = b"\x93NUMPY"
+ZIP_MAGIC = b"PK\x03\x04"
 ZIP_NAME_AT = 30  # [byte] in an archive: the name of its first member
 MAX_RATIO = 200  # unpacked to packed; real scans stay below 10, deflate could reach 1032
 MAX_UNPACKED = 1 << 34  # [byte] of an archive's arrays, which are read whole
-POINTS_NAMES, COLORS_NAMES = ("points", "xyz"), ("colors", "rgb")
+POINTS_NAMES = ("points", "xyz")
+COLORS_NAMES = ("colors", "rgb")
 Parts = Iterable[tuple[NDArray[Any], NDArray[Any]]]
 WANTED = "wanted .npy of x y z r g b (N, 6) with colours 0-255, or .npz with points (N, 3) and colors (N, 3)"
 
@@ -58,7 +70,7 @@ class ArrayInFile(NamedTuple):
             yield rows
 
 
-def open_npy(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+def open_npy(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """The points of a .npy file: an array (N, 6) of x y z r g b, colours 0-255."""
     array = _open_array(path, None, path.stat().st_size)
     if len(array.shape) != 2 or array.shape[1] != 6 or array.dtype.kind not in "fiu":
@@ -67,7 +79,7 @@ def open_npy(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     return _source(path, lambda: ((rows[:, :3], rows[:, 3:]) for rows in array.read_rows()), brightest, array)
 
 
-def open_npz(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+def open_npz(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """The points of a .npz file: the arrays `points` (or `xyz`) and `colors` (or `rgb`), both (N, 3).
 
     The range of colours follows from their type: uint8 0-255, uint16 0-65535, float 0-1. An archive whose
@@ -126,7 +138,8 @@ def _members(path: Path) -> list[zipfile.ZipInfo]:
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or info.flag_bits & 1:
             name = quoted(info.filename.encode())
             raise InputError(f"{path}: {name} is encrypted or compressed in another way than by NumPy")
-    size, most = sum(info.file_size for info in infos), min(MAX_RATIO * path.stat().st_size, MAX_UNPACKED)
+    size = sum(info.file_size for info in infos)
+    most = min(MAX_RATIO * path.stat().st_size, MAX_UNPACKED)
     if size > most:
         raise InputError(f"{path}: the arrays promise {size} bytes, {most} at most are read; use .npy files")
     return infos
@@ -139,7 +152,8 @@ def _open_array(path: Path, member: str | None, size: int) -> ArrayInFile:
     array = ArrayInFile(path, member, shape, is_fortran, dtype, offset)
     if dtype.hasobject or dtype.itemsize == 0 or any(count < 0 for count in shape):
         raise InputError(f"{path}: {array}, {WANTED}")
-    promised, found = math.prod(shape) * dtype.itemsize, size - offset
+    promised = math.prod(shape) * dtype.itemsize
+    found = size - offset
     if promised != found:
         raise InputError(f"{path}: an array promises {promised} bytes, found {found}; it is cut off")
     return array

@@ -15,34 +15,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...kernels.jit import inline_kernel, kernel
-from .columns import (
+from ..settings import IN_METRES, CloudSettings
+from .reader import (
+    CloudFormat,
     ColumnReader,
     Columns,
+    PointSource,
+    RawCloud,
+    check_option,
     color_names,
     column_source,
     in_chunks,
+    point_label,
     points_of,
+    quoted,
     read_records,
     take_records,
 )
-from .number_lines import LineLayout, NumberLines
-from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, RawCloud, point_label, quoted
-from .scalars import check_option
+from .text import LineLayout, NumberLines
 
 MAX_HEADER_SIZE = MAX_ROW_SIZE = 1 << 16  # [byte]; a row is a point
 MAX_COUNT_DIGITS = 10
 ENCODINGS = ("ascii", "binary", "binary_compressed")
 WANTED = "wanted a PCD file with the fields x y z and rgb, rgba or r g b"
-LZF_BROKEN = -1
 MAX_RATIO = 88  # three bytes can stand for a copy of 264
 MAX_LITERALS = 32  # a control byte below it is a run of one more bytes than it says
-LONG_COPY = 7  # the length in the control byte's upper three bits that has a byte of its own behind it
+LONG_COPY = 9  # the length by the control byte's upper three bits that goes on in a byte of its own
 FIRST_LINES = re.compile(rb"(?:#[^\n]*\n|[ \t\r\n])*(?:# \.PCD|VERSION[ \t]+0?\.\d)")
 PADDING = "_"
 BROKEN = "the file is cut off or broken"
 PACKED_NAMES = ("rgb", "rgba")  # 0xAARRGGBB in one number
-INTENSITY, LABEL = "intensity", "label"
+INTENSITY = "intensity"
+LABEL = "label"
 SCALAR_TYPES = ("f4", "f8", "u1", "u2", "u4", "i1", "i2", "i4")
 TYPES = {  # of fields that are not colours on their own
     **dict.fromkeys("xyz", (("f4", "f8"), "float32 or float64")),
@@ -150,44 +154,33 @@ def _count(text: str) -> int | None:
     return int(text) if text.isdecimal() and len(text) <= MAX_COUNT_DIGITS else None
 
 
-@inline_kernel
-def append(source, begin, length, out, filled):
-    """How much of `out` is filled when `length` bytes of `source` come after `filled`, or LZF_BROKEN."""
-    if begin < 0 or begin + length > len(source) or filled + length > len(out):
-        return LZF_BROKEN
-    for k in range(length):  # one by one: a copy that reaches into itself repeats a pattern
-        out[filled + k] = source[begin + k]
-    return filled + length
-
-
-@kernel
-def decompress_lzf(data, out):
-    """Fill `out` (uint8) from compressed `data` (uint8); the number of bytes filled, or LZF_BROKEN.
-
-    Broken is what would read before the beginning of `out`, or go beyond the end of either.
-    """
-    i, filled = 0, 0
-    while filled >= 0 and i < len(data):
-        control = int(data[i])
+def decompress_lzf(data: bytes, size: int) -> bytearray | None:
+    """The `size` bytes of compressed data; None if they are more or less, or are copied from nowhere."""
+    out = bytearray()
+    data = data + bytes(2)  # a last code that is cut off reads zeros, and makes too little or too much
+    i = 0
+    while i < len(data) - 2 and len(out) <= size:
+        control = data[i]
         i += 1
         if control < MAX_LITERALS:
-            filled = append(data, i, control + 1, out, filled)
+            out += data[i : i + control + 1]
             i += control + 1
-        else:
-            length = control >> 5
-            is_long = length == LONG_COPY
-            if i + is_long >= len(data):
-                return LZF_BROKEN
-            if is_long:
-                length += int(data[i])
-                i += 1
-            distance = ((control & 31) << 8) + int(data[i]) + 1
-            filled = append(out, filled - distance, length + 2, out, filled)
+            continue
+        length = (control >> 5) + 2
+        if length == LONG_COPY:
+            length += data[i]
             i += 1
-    return filled
+        distance = ((control & 31) << 8) + data[i] + 1
+        i += 1
+        begin = len(out) - distance
+        if begin < 0:
+            return None
+        pattern = out[begin : begin + length]
+        out += (pattern * (length // distance + 1))[:length]  # one that reaches into itself repeats
+    return out if len(out) == size and i == len(data) - 2 else None
 
 
-def open_pcd(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+def open_pcd(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """The points of a PCD file.
 
     Colours are `rgb` or `rgba`, three bytes in one integer or, if the field is declared a float, in its bits,
@@ -211,15 +204,17 @@ def open_pcd(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
     return column_source(path, read_columns, types, header.num_points, options.labels)
 
 
-def _wanted_fields(header: PcdHeader, options: CloudReadOptions) -> tuple[PcdField, ...]:
+def _wanted_fields(header: PcdHeader, options: CloudSettings) -> tuple[PcdField, ...]:
     """The fields x y z and the colour's one or three, or the intensity or label if the options say so."""
     found = {field.name: field for field in header.fields if field.count == 1}
     names = [field.name for field in header.fields]
     if options.labels:
-        more, wanted = (LABEL,) * (LABEL in found), "wanted x y z and label"
+        more = (LABEL,) * (LABEL in found)
+        wanted = "wanted x y z and label"
     else:
         color = next(((name,) for name in PACKED_NAMES if name in found), color_names(found))
-        more, wanted = color or (INTENSITY,) * (INTENSITY in found), WANTED
+        more = color or (INTENSITY,) * (INTENSITY in found)
+        wanted = WANTED
     if not more or not all(names.count(axis) == 1 and axis in found for axis in "xyz"):
         listed = " ".join(names[:12]) or "none"
         raise InputError(f"{header.path}: the fields are {quoted(listed.encode())}, {wanted}")
@@ -257,12 +252,12 @@ def _read_compressed(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterato
             counts = f"found {found}, wanted {promised} for {header.num_points} points"
             raise InputError(f"{header.path}: {size} bytes packed into {packed_size}, {counts}; {BROKEN}")
         packed = take_records(file, header.path, packed_size, np.dtype(np.uint8))
-    table = np.empty(size, dtype=np.uint8)
-    if decompress_lzf(packed, table) != size:
+    table = decompress_lzf(packed.tobytes(), size)
+    if table is None:
         raise InputError(f"{header.path}: the compressed data are broken, {WANTED}")
     # all points' values of a field, then those of the next
     ends = np.cumsum([field.size * header.num_points for field in kept])
-    parts = dict(zip(kept, np.split(table, ends[:-1]), strict=True))
+    parts = dict(zip(kept, np.split(np.frombuffer(table, np.uint8), ends[:-1]), strict=True))
     yield from in_chunks([parts[field].view("<" + field.type) for field in fields])
 
 
@@ -270,7 +265,8 @@ def _read_packed(header: PcdHeader, type_: str, read_columns: ColumnReader) -> I
     """The points with colours 0xAARRGGBB of a declared type, whose numbers ASCII has as text."""
     num_before = 0
     for columns in read_columns():
-        points_world, values = points_of(columns), columns[3]
+        points_world = points_of(columns)
+        values = columns[3]
         if header.encoding == "ascii":
             has_position = np.isfinite(points_world).all(axis=1)
             bits, is_right = _bits_of_text(np.where(has_position, values, 0.0), type_)

@@ -15,11 +15,22 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from ...errors import InputError
-from .columns import COLOR_NAMES, Columns, color_names, column_source, read_records
+from ..settings import IN_METRES, CloudSettings
 from .mesh import open_ply_mesh
-from .number_lines import LineLayout, NumberLines
-from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, quoted
-from .scalars import INTENSITY_NAMES, LABEL_NAMES, check_option
+from .reader import (
+    COLOR_NAMES,
+    INTENSITY_NAMES,
+    LABEL_NAMES,
+    CloudFormat,
+    Columns,
+    PointSource,
+    check_option,
+    color_names,
+    column_source,
+    quoted,
+    read_records,
+)
+from .text import LineLayout, NumberLines
 
 MAGIC = (b"ply\n", b"ply\r")
 MAX_HEADER_SIZE = 1 << 20  # [byte]
@@ -48,7 +59,7 @@ class PlyHeader:
         return self.elements[self.index]
 
 
-def open_ply(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+def open_ply(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """The vertices of a PLY file, binary or ASCII; points on its faces if it has any.
 
     Colours are uchar 0-255, ushort 0-65535, or float and double 0-1. Other properties and elements are left
@@ -133,7 +144,7 @@ def _vertex_index(path: Path, elements: Sequence[PlyElement]) -> int:
     raise InputError(f"{path}: the header has no element 'vertex', {WANTED}")
 
 
-def _property_names(header: PlyHeader, options: CloudReadOptions) -> tuple[str, ...]:
+def _property_names(header: PlyHeader, options: CloudSettings) -> tuple[str, ...]:
     """The vertices' properties for x, y, z and red, green, blue, or intensity, or label."""
     found = [prop.name for prop in header.vertices.properties]
     colors = () if options.labels else color_names(found)
@@ -143,7 +154,8 @@ def _property_names(header: PlyHeader, options: CloudReadOptions) -> tuple[str, 
         scalars = [by_lower[name] for name in LABEL_NAMES if name in by_lower]
     if not {*"xyz"} <= {*found} or not (colors or scalars):
         kind = "Gaussian splats without red green blue, " if "f_dc_0" in found else ""
-        listed, wanted = " ".join(found[:9]) or "no properties", LABELS_WANTED if options.labels else WANTED
+        listed = " ".join(found[:9]) or "no properties"
+        wanted = LABELS_WANTED if options.labels else WANTED
         raise InputError(f"{header.path}: {kind}the vertices have {listed}, {wanted}")
     if not colors and not options.labels:
         check_option(header.path, options, WANTED)

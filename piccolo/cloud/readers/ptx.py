@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.pose import transform_points
-from .number_lines import NUM_WITH_INTENSITY, LineLayout, NumberLines
-from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, RawCloud, quoted
-from .scalars import check_option, intensity_reader
+from ..settings import IN_METRES, CloudSettings
+from .reader import CloudFormat, PointSource, RawCloud, check_option, intensity_reader, quoted
+from .text import NUM_WITH_INTENSITY, LineLayout, NumberLines
 
 NUMBERS_A_LINE = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
 MAX_COUNT_DIGITS = 9
@@ -36,7 +36,7 @@ class PtxScan(NamedTuple):
     T_world_from_scanner: NDArray[np.float64]  # (4, 4)
 
 
-def open_ptx(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+def open_ptx(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """The points of all scans of a PTX file, in the world.
 
     0 0 0 stands where no beam came back and is left out. A last scan with fewer lines than its header

@@ -1,14 +1,25 @@
-"""Types shared by the readers: chunks of points as they stand in a file."""
+"""What the readers share: chunks of points as they stand in a file, and points from columns of numbers.
 
-from collections.abc import Callable, Iterator
+Columns are arrays (N,) of x, y, z and red, green, blue, or of x, y, z and a scalar. Colours of any type
+become 8 bits; their range follows from the declared type and is never guessed. Labels become colours in place
+of the file's own. Intensity becomes a gray for files that have no colours: its unit is each scanner's own,
+and a few mirrors outshine everything, so a file's 1st percentile becomes black and its 99th white, of all its
+points, in a reading of their own, whatever their order.
+"""
+
+import functools
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from functools import partial
+from io import BufferedReader
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..label_colors import Labels
-from ..settings import UpAxis
+from ...errors import InputError
+from ...geometry.colors import Labels, colors_of
+from ..settings import CloudSettings, UpAxis
 
 HEAD_SIZE = 512  # [byte] by which a format is known
 CHUNK = 1 << 20  # points of a chunk, at most
@@ -18,17 +29,24 @@ CUT = "the file was cut while it was read, wanted a whole file"
 # points (N, 3) in the file's unit, and a number (N,) of each: intensity or label
 PointsWithScalar = tuple[NDArray[np.float64], NDArray[np.float64]]
 ScalarReader = Callable[[], Iterator[PointsWithScalar]]  # each call from the start
-
-
-class CloudReadOptions(NamedTuple):
-    """What the user wants of a reader."""
-
-    intensity_as_gray: bool = False  # take intensity for a gray where a file has no colours
-    labels: Labels | None = None  # take the points' labels for their colours
-    scale: float = 1.0  # metres per unit of the file, for what counts by metres; points stay in its unit
-
-
-PLAIN = CloudReadOptions()
+# The value that means full brightness, by the type of a field without its byte order.
+BRIGHTEST = {"u1": 255.0, "u2": 65535.0, "f4": 1.0, "f8": 1.0}
+TYPES_WANTED = "uint8 0-255, uint16 0-65535 or float 0-1, one for all three"
+COLOR_NAMES = (
+    ("red", "green", "blue"),
+    ("r", "g", "b"),
+    ("diffuse_red", "diffuse_green", "diffuse_blue"),
+)
+Columns = list[NDArray[Any]]
+ColumnReader = Callable[[], Iterator[Columns]]  # each call from the start
+INTENSITY_NAMES = frozenset({"intensity", "scalar_intensity", "reflectance", "scalar_reflectance"})
+OPTION = "--intensity-as-gray takes it for a gray"
+BLACK, WHITE = 0.01, 0.99  # share of the points that are darker
+LARGEST = float(np.finfo(np.float32).max)
+NUM_BINS = 1 << 16
+# as they stand in PLY files, in lower case; the first that is there counts. CloudCompare prefixes `scalar_`
+LABEL_NAMES = ("label", "scalar_label", "class", "scalar_class", "classification", "scalar_classification")
+MOST = 2.0**32  # labels are below it, and above its negative
 
 
 class RawCloud(NamedTuple):
@@ -48,9 +66,7 @@ class PointSource(NamedTuple):
     read_chunks: ChunkReader
     num_points: int | None = None  # for the progress; None if only reading can tell
     warnings: tuple[str, ...] = ()  # one line each, for the user: what was decided about this file
-    station_axes: tuple[
-        NDArray[np.float64], ...
-    ] = ()  # (3,) unit, in the file's axes: z of scanners with poses
+    station_axes: tuple[NDArray[np.float64], ...] = ()  # (3,) unit, z of scanners with poses, file's axes
     up: UpAxis = "z"  # the axis that points up by the format's specification or by convention
 
 
@@ -60,7 +76,7 @@ class CloudFormat(NamedTuple):
     name: str
     suffixes: frozenset[str]  # lower case, with the dot
     has_magic: Callable[[bytes], bool]  # of a file's first HEAD_SIZE bytes; content goes before names
-    open_source: Callable[[Path, CloudReadOptions], PointSource]
+    open_source: Callable[[Path, CloudSettings], PointSource]
     has_labels: bool = False  # the reader knows them
 
 
@@ -73,3 +89,166 @@ def quoted(line: bytes) -> str:
 def point_label(path: Path, index: int) -> str:
     """What messages call the point of that index in a file."""
     return f"{path}: point {index + 1}"
+
+
+def color_names(names: Collection[str]) -> tuple[str, ...]:
+    """Which of a file's names are the three colours'; empty if none are."""
+    return next((three for three in COLOR_NAMES if all(name in names for name in three)), ())
+
+
+def brightest_of(path: Path, types: Sequence[str]) -> float:
+    """The value of full brightness in colours of these types, as "u1"."""
+    if len(set(types)) > 1 or types[0] not in BRIGHTEST:
+        raise InputError(f"{path}: the colours are of type {' '.join(types)}, wanted {TYPES_WANTED}")
+    return BRIGHTEST[types[0]]
+
+
+def colored_chunks(
+    chunks: Iterable[tuple[NDArray[np.generic], NDArray[np.generic]]],
+    brightest: float,
+    locate: Callable[[int], str],
+) -> Iterator[RawCloud]:
+    """Yield chunks of positions and colours (N, 3), each of any type, colours from 0 to `brightest`.
+
+    Raises InputError if a colour is out of range: `locate` turns a point's index into the file and a place.
+    """
+    num_before = 0
+    for points, values in chunks:
+        with np.errstate(invalid="ignore"):  # a NaN of the kind that signals
+            points_world = points.astype(np.float64)
+        if values.dtype == np.uint8 and brightest == BRIGHTEST["u1"]:
+            colors = np.array(values, dtype=np.uint8)
+        else:  # a point without a finite position needs no colour: it becomes black
+            is_finite: NDArray[np.bool_] = np.all(np.isfinite(points_world), axis=1)
+            numbers = np.where(is_finite[:, None], values, 0).astype(np.float64)
+            is_wrong = ~((numbers >= 0.0) & (numbers <= brightest)).all(axis=1)
+            if is_wrong.any():
+                wrong = int(np.argmax(is_wrong))
+                color = " ".join(f"{value:g}" for value in values[wrong].tolist())
+                place = locate(num_before + wrong)
+                raise InputError(f"{place} has the colour {color}, wanted 0 to {brightest:g}")
+            colors = np.rint(numbers * (255.0 / brightest)).astype(np.uint8)
+        num_before += len(colors)
+        yield RawCloud(points_world, colors)
+
+
+def read_records(path: Path, offset: int, count: int, dtype: np.dtype[Any]) -> Iterator[NDArray[Any]]:
+    """Yield `count` records from byte `offset` on, CHUNK or fewer at once."""
+    most = max(1, min(CHUNK, MAX_BLOCK_SIZE // dtype.itemsize))
+    with path.open("rb") as file:
+        file.seek(offset)
+        for begin in range(0, count, most):
+            yield take_records(file, path, min(most, count - begin), dtype)
+
+
+def take_records(file: BufferedReader, path: Path, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """The next `count` records of a file; InputError if there are fewer."""
+    records = np.empty(count, dtype)
+    if file.readinto(records.view(np.uint8).data) < records.nbytes:
+        raise InputError(f"{path}: {CUT}")
+    return records
+
+
+def in_chunks(columns: list[NDArray[Any]]) -> Iterator[list[NDArray[Any]]]:
+    """Yield arrays of the same length, CHUNK or fewer rows at once."""
+    for begin in range(0, len(columns[0]), CHUNK):
+        yield [column[begin : begin + CHUNK] for column in columns]
+
+
+def points_of(columns: Columns) -> NDArray[np.float64]:
+    """Points (N, 3) of the first three columns."""
+    with np.errstate(invalid="ignore"):  # a NaN of the kind that signals
+        return np.stack(columns[:3], axis=1, dtype=np.float64)
+
+
+def column_source(
+    path: Path, read_columns: ColumnReader, types: Sequence[str], num_points: int, labels: Labels | None
+) -> PointSource:
+    """Points with three colours of these types, as "u1", or with one scalar: a label, else the intensity."""
+    if len(types) == 3:
+        read_chunks: ChunkReader = partial(_colored, path, read_columns, brightest_of(path, types))
+    elif labels:
+        read_chunks = label_reader(path, partial(_with_scalar, read_columns), labels)
+    else:
+        read_chunks = intensity_reader(path, partial(_with_scalar, read_columns))
+    return PointSource(path, read_chunks, num_points)
+
+
+def _colored(path: Path, read_columns: ColumnReader, brightest: float) -> Iterator[RawCloud]:
+    parts = ((np.stack(c[:3], axis=1), np.stack(c[3:], axis=1)) for c in read_columns())
+    return colored_chunks(parts, brightest, partial(point_label, path))
+
+
+def _with_scalar(read_columns: ColumnReader) -> Iterator[PointsWithScalar]:
+    return ((points_of(columns), columns[3].astype(np.float64)) for columns in read_columns())
+
+
+def intensity_reader(path: Path, read_scalar: ScalarReader) -> ChunkReader:
+    """What a PointSource wants as `read_chunks`, of a reader of points and their intensity."""
+    limits = functools.cache(lambda: _limits(path, read_scalar()))
+
+    def read_chunks() -> Iterator[RawCloud]:
+        low, high = limits()
+        for points, intensity in read_scalar():
+            yield RawCloud(points, as_gray(intensity, low, high))
+
+    return read_chunks
+
+
+def check_option(path: Path, options: CloudSettings, wanted: str) -> None:
+    """Refuse a file with intensity and no colours unless the user wants its intensity for a gray."""
+    if not options.intensity_as_gray:
+        raise InputError(f"{path}: has intensity and no colours, {wanted}; {OPTION}")
+
+
+def as_gray(intensity: NDArray[np.float64], low: float, high: float) -> NDArray[np.uint8]:
+    """Gray (N, 3) of intensity (N,): black up to `low`, white from `high` on; black where it is NaN."""
+    share = (np.nan_to_num(intensity, nan=low) - low) / (high - low)
+    gray = np.rint(255.0 * np.clip(share, 0.0, 1.0)).astype(np.uint8)
+    return np.repeat(gray[:, None], 3, axis=1)
+
+
+def _limits(path: Path, chunks: Iterator[PointsWithScalar]) -> tuple[float, float]:
+    """Percentiles of the intensity of points that have a position, within 1 %, or exact up to 255."""
+    histogram = np.zeros(NUM_BINS, np.int64)
+    for points, intensity in chunks:
+        is_measured = np.isfinite(points).all(axis=1) & np.isfinite(intensity)
+        histogram += np.bincount(_bins(intensity[is_measured]), minlength=NUM_BINS)
+    total = np.cumsum(histogram)
+    if total[-1] == 0:  # no point has a position: others refuse that
+        return 0.0, 1.0
+    low, high = (_lower_edge(int(np.searchsorted(total, share * total[-1]))) for share in (BLACK, WHITE))
+    if not low < high:
+        raise InputError(f"{path}: the intensity is {low:g} nearly everywhere, wanted colours")
+    return low, high
+
+
+def _bins(values: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Bin (N,) of each value: the upper half of its bits as a float32, in ascending order."""
+    # + 0.0 turns -0.0 into 0.0
+    bits = (np.clip(values, -LARGEST, LARGEST) + 0.0).astype(np.float32).view(np.uint32)
+    bits = np.where(bits >> 31, ~bits, bits | np.uint32(1 << 31))
+    return (bits >> 16).astype(np.int64)
+
+
+def _lower_edge(index: int) -> float:
+    """The value nearest to 0 in a bin."""
+    bits = (index << 16) ^ (1 << 31) if index >= NUM_BINS // 2 else ~(index << 16 | 0xFFFF) & 0xFFFFFFFF
+    return float(np.array(bits, np.uint32).view(np.float32))
+
+
+def label_reader(path: Path, read_scalar: ScalarReader, labels: Labels) -> ChunkReader:
+    """What a PointSource wants as `read_chunks`, of a reader of points and their labels."""
+
+    def read_chunks() -> Iterator[RawCloud]:
+        for points, found in read_scalar():
+            values = np.where(np.isfinite(points).all(axis=1), found, 0.0)  # the others are left out later
+            is_whole = (np.abs(values) < MOST) & (values == np.floor(values))
+            if not is_whole.all():
+                wrong = f"found the label {values[np.argmin(is_whole)]:g}"
+                raise InputError(f"{path}: {wrong}, wanted whole numbers")
+            numbers = values.astype(np.int64)
+            is_kept = labels.are_kept(numbers)
+            yield RawCloud(points[is_kept], colors_of(numbers[is_kept]))
+
+    return read_chunks

@@ -1,13 +1,38 @@
-"""Text files of lines x y z r g b, and PTS files: x y z intensity r g b after a count of points."""
+"""Lines of numbers, parsed by np.loadtxt a chunk at a time; text files of lines x y z r g b, and PTS files.
 
+PTS: x y z intensity r g b after a count of points.
+"""
+
+import os
+from collections.abc import Iterator
+from functools import partial
+from itertools import chain, islice, starmap
 from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ...errors import InputError
-from .columns import color_names
-from .number_lines import COMMENT_MARKS, NUM_WITH_INTENSITY, LineLayout, NumberLines, is_number, line_source
-from .reader import PLAIN, CloudFormat, CloudReadOptions, PointSource, quoted
-from .scalars import INTENSITY_NAMES
+from ..settings import IN_METRES, CloudSettings
+from . import reader as raw
+from .reader import (
+    BRIGHTEST,
+    CUT,
+    INTENSITY_NAMES,
+    CloudFormat,
+    PointSource,
+    RawCloud,
+    check_option,
+    color_names,
+    colored_chunks,
+    intensity_reader,
+    quoted,
+)
 
+BLOCK = 1 << 20  # [byte] read at once; no line is longer
+COMMENT_MARKS = (b"#", b"//")
+NUM_WITH_INTENSITY = 4  # columns of a line without colours: x y z intensity
 TEXT_SUFFIXES = frozenset({".txt", ".xyz", ".asc", ".csv", ".xyzrgb"})
 HEAD_SIZE = 1 << 16  # bytes in which the header is looked for
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
@@ -17,7 +42,182 @@ COLUMNS = {NUM_WITH_INTENSITY: (0, 1, 2, 3), 6: (0, 1, 2, 3, 4, 5), 7: (0, 1, 2,
 PTS_WANTED = "wanted lines x y z intensity r g b or x y z r g b, colours 0-255"
 
 
-def open_text(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+class LineLayout(NamedTuple):
+    """Where the lines of numbers begin, and what is in one."""
+
+    columns: tuple[int, ...] = ()  # that are read
+    num_columns: int | None = None  # of each line; None: there may be any more than those read
+    start: int = 0  # [byte] of the first line
+    delimiter: str | None = None  # None: blanks and tabs
+    has_counts: bool = False  # a lone whole number counts the lines that follow, and is passed over
+
+
+def line_blocks(path: Path, start: int) -> Iterator[list[bytes]]:
+    """Yield the lines from byte `start` on, some at a time, without their ends (LF, CR LF or CR)."""
+    rest = b""
+    with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        file.seek(start)
+        while block := file.read(BLOCK):
+            data = rest + block
+            # A return at the end may be half of a line end: it waits for the next block.
+            is_split = data.endswith(b"\r")
+            end = 1 + max(data.rfind(b"\n"), data.rfind(b"\r", 0, len(data) - is_split))
+            rest = data[end:]
+            if len(rest) > BLOCK:
+                raise InputError(f"{path}: a line of more than {BLOCK} bytes, wanted lines of a few numbers")
+            yield data[:end].splitlines()
+        if file.tell() < size:
+            raise InputError(f"{path}: {CUT}")
+    if rest:
+        yield rest.splitlines()
+
+
+class NumberLines:
+    """The lines of numbers in a file, one after the other; blank lines and comments are passed over."""
+
+    def __init__(self, path: Path, layout: LineLayout, wanted: str) -> None:
+        self.path = path
+        self.layout = layout
+        self.wanted = wanted
+        self.num_taken = 0
+        self._kept = partial(_kept, has_counts=layout.has_counts)
+        self._lines = chain.from_iterable(map(self._kept, line_blocks(path, layout.start)))
+
+    def peek(self) -> bytes | None:
+        """The next line, which stays the next; None at the end."""
+        line = next(self._lines, None)
+        if line is not None:
+            self._lines = chain([line], self._lines)
+        return line
+
+    def take_line(self) -> bytes | None:
+        """The next line; None at the end."""
+        line = next(self._lines, None)
+        self.num_taken += line is not None
+        return line
+
+    def skip(self, count: int) -> int:
+        """Pass over lines, whatever is in them; how many: `count`, or as many as are left."""
+        num_skipped = sum(1 for _ in islice(self._lines, count))
+        self.num_taken += num_skipped
+        return num_skipped
+
+    def _take_rows(self, count: int) -> NDArray[np.float64]:
+        """The wanted columns (R, C) of the next lines, R <= `count`; R = 0 at the end."""
+        columns = list(self.layout.columns)
+        num_columns = self.layout.num_columns
+        most = max(1, raw.MAX_BLOCK_SIZE // (8 * (num_columns or len(columns))))
+        if self.peek() is None:
+            return np.empty((0, len(columns)))
+        lines = islice(self._lines, min(count, raw.CHUNK, most))
+        usecols = columns if num_columns is None else None
+        try:
+            rows = np.loadtxt(lines, comments=None, delimiter=self.layout.delimiter, usecols=usecols, ndmin=2)
+        except InputError:  # of line_blocks
+            raise
+        except ValueError as error:
+            raise InputError(self._complaint(str(error))) from error
+        if num_columns is not None:
+            if rows.shape[1] != num_columns:
+                raise InputError(self._complaint("lines of another length"))
+            rows = rows[:, columns]
+        self.num_taken += len(rows)
+        return rows
+
+    def read_rows(self, count: int | None = None) -> Iterator[NDArray[np.float64]]:
+        """Yield the wanted columns of `count` lines, or of all that are left, CHUNK or fewer at once."""
+        num_rows = 0
+        while num_rows != count:
+            rows = self._take_rows(raw.CHUNK if count is None else count - num_rows)
+            num_rows += len(rows)
+            if len(rows):
+                yield rows
+            elif count is None:
+                return
+            else:
+                raise InputError(f"{self.path}: found {num_rows} of {count} points; the file is cut off")
+
+    def read_points(self, count: int | None = None) -> Iterator[tuple[NDArray[np.float64], NDArray[Any]]]:
+        """Points (N, 3) of as many lines as read_rows would read, and what else is in the columns.
+
+        Colours (N, 3) of six columns x y z r g b, checked to be 0-255; the fourth (N,) of four.
+        """
+        first = self.num_taken
+        rows = self.read_rows(count)
+        if len(self.layout.columns) == NUM_WITH_INTENSITY:
+            return ((some[:, :3], some[:, 3]) for some in rows)
+        parts = ((some[:, :3], some[:, 3:]) for some in rows)
+        chunks = colored_chunks(parts, BRIGHTEST["u1"], lambda index: self.locate(first + index))
+        return ((chunk.points_world, chunk.colors) for chunk in chunks)
+
+    def locate(self, index: int) -> str:
+        """The file and the number in it of the line that comes after `index` others."""
+        for number, _ in islice(self._numbered(), index, None):
+            return f"{self.path}: line {number}"
+        raise InputError(f"{self.path}: {CUT}")
+
+    def _numbered(self) -> Iterator[tuple[int, bytes]]:
+        """Number in the file and text of all lines of numbers, from the first on; the file is read again."""
+        with self.path.open("rb") as file:
+            number = len((file.read(self.layout.start) + b".").splitlines()) - 1
+        for lines in line_blocks(self.path, self.layout.start):
+            for line in lines:
+                number += 1
+                for kept in self._kept([line]):
+                    yield number, kept
+
+    def _complaint(self, otherwise: str) -> str:
+        """What is wrong with the first broken line behind those taken, or `otherwise` if all seem right."""
+        for number, line in islice(self._numbered(), self.num_taken, None):
+            if fault := self._fault(line):
+                return f"{self.path}: line {number}: {fault} ({quoted(line)}), {self.wanted}"
+        return f"{self.path}: {otherwise}, {self.wanted}"
+
+    def _fault(self, line: bytes) -> str:
+        """What is wrong with a line; empty if nothing is."""
+        fields = line.decode("latin-1").split(self.layout.delimiter)
+        exact = self.layout.num_columns
+        columns = self.layout.columns
+        num_wanted = max(columns) + 1 if exact is None else exact
+        if len(fields) < num_wanted or (exact and len(fields) > exact):
+            return f"{len(fields)} instead of {num_wanted} columns"
+        parsed = [fields[column] for column in columns] if exact is None else fields
+        broken = next((field for field in parsed if not is_number(field)), None)
+        return "" if broken is None else f"{quoted(broken.encode('latin-1'))} is not a number"
+
+
+def _kept(lines: list[bytes], has_counts: bool) -> list[bytes]:
+    """The lines of numbers among all, without blanks at their ends."""
+    return [
+        line
+        for line in filter(None, map(bytes.strip, lines))
+        if not line.startswith(COMMENT_MARKS) and not (has_counts and line.isdigit())
+    ]
+
+
+def is_number(field: str) -> bool:
+    """True if np.loadtxt takes a field for a number."""
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return "_" not in field  # which Python takes and np.loadtxt does not
+
+
+def line_source(path: Path, layout: LineLayout, options: CloudSettings, wanted: str) -> PointSource:
+    """The points of lines x y z r g b, colours 0-255, or of x y z intensity if the options allow it."""
+
+    def read() -> Iterator[tuple[NDArray[np.float64], NDArray[Any]]]:
+        return NumberLines(path, layout, wanted).read_points()
+
+    if len(layout.columns) > NUM_WITH_INTENSITY:
+        return PointSource(path, lambda: starmap(RawCloud, read()))
+    check_option(path, options, wanted)
+    return PointSource(path, intensity_reader(path, read))
+
+
+def open_text(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """The points of a text file: whitespace, comma or semicolon between numbers, colours 0-255.
 
     A header line is passed over, or obeyed if it names x y z and r g b (or red green blue), or x y z and an
@@ -87,7 +287,7 @@ def _named_columns(header: str) -> tuple[int, ...]:
 TEXT = CloudFormat("text x y z r g b", TEXT_SUFFIXES, lambda head: False, open_text)
 
 
-def open_pts(path: Path, options: CloudReadOptions = PLAIN) -> PointSource:
+def open_pts(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """The points of all scans of a PTS file.
 
     All lines must have as many columns as the first one: x y z r g b if there are

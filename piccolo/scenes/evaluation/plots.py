@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...files.figure import new_figure
+from ...optional import new_figure
 from .query_result import QueryResult, Thresholds
 from .tables import Point
 

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...files.figure import new_figure
 from ...localization.settings import CoarseToFineSettings
+from ...optional import new_figure
 from ...paper.settings import PaperSettings
 from ..evaluation.plots import figure_png
 from ..evaluation.query_result import QueryResult

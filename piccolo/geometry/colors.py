@@ -1,8 +1,9 @@
-"""Semantic labels as colours: each label's own, far apart in RGB, the same in clouds and panoramas."""
+"""Colours packed as kernels read them; labels as colours far apart in RGB, alike in clouds and panoramas."""
 
 import functools
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,3 +43,20 @@ def palette() -> NDArray[np.uint8]:
 def colors_of(labels: NDArray[np.integer]) -> NDArray[np.uint8]:
     """Colour (..., 3) of each label (...); labels that differ by a multiple of NUM_COLORS share theirs."""
     return np.asarray(palette()[labels % NUM_COLORS])
+
+
+def pack_rgbx(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = None) -> NDArray[np.int32]:
+    """One int32 (...) for each colour (..., 3): R, G, B from the lowest byte up and 1 where valid on top."""
+    shape = rgb.shape[:-1]
+    if 0 in shape:
+        return np.empty(shape, np.int32)
+    valid = np.ones(shape, np.uint8) if is_valid is None else is_valid.astype(np.uint8, copy=False)
+    colors = np.ascontiguousarray(rgb, np.uint8).reshape(-1, 1, 3)
+    rgbx = np.empty((len(colors), 1, 4), np.uint8)
+    cv2.mixChannels([colors, valid.reshape(-1, 1)], [rgbx], [0, 0, 1, 1, 2, 2, 3, 3])
+    return rgbx.view("<i4").reshape(shape).astype(np.int32, copy=False)
+
+
+def unpack_rgb(rgbx: NDArray[np.int32]) -> NDArray[np.uint8]:
+    """The colours (N, 3) that pack_rgbx packed (N,)."""
+    return np.ascontiguousarray(rgbx.astype("<i4")).view(np.uint8).reshape(-1, 4)[:, :3]
