@@ -48,7 +48,7 @@ def test_poses_near_one_place_share_what_is_drawn_and_no_others(monkeypatch):
 
     original = recent_views.average_view
     monkeypatch.setattr(recent_views, "average_view", average_view)
-    views = recent_views.recent_views(octree)
+    views = recent_views.RecentViews(octree)
     here, near, far = _pose(0.296, 0.2, 0.3), _pose(0.304, 0.197, 0.304), _pose(0.306, 0.2, 0.3)
     places = [recent_views.place_of(pose) for pose in (here, near, far)]
     assert places[0] == places[1] != places[2]
@@ -65,7 +65,7 @@ def test_views_and_points_count_from_their_place():
     query, pose = _query(), _pose(0.307, 0.191, 0.304)
     place = recent_views.place_of(pose)
     expected = rooms.view(query.scan_map.octree, place, FINE, ALL)
-    points = visible_points(query.scan_map.octree, place, FULL, ALL, 30_000)
+    points = visible_points(query.scan_map.octree, place, FULL, ALL.tobytes(), 30_000)
     for found, wanted in ((view_at(query, pose, FINE), expected), (points_at(query, pose), points)):
         for values, others in zip(found, wanted, strict=True):
             np.testing.assert_array_equal(values, others)
@@ -96,7 +96,7 @@ def test_what_is_around_a_place_is_made_once(monkeypatch):
         return original(octree, center, voxel_per_range)
 
     monkeypatch.setattr(recent_views, "points_around", points_around)
-    views, pose = recent_views.recent_views(query.scan_map.octree), _pose(0.296, 0.2, 0.3)
+    views, pose = recent_views.RecentViews(query.scan_map.octree), _pose(0.296, 0.2, 0.3)
     query = dataclasses.replace(query, views=views)
     for at in (pose, _pose(0.304, 0.197, 0.304), _pose(0.4, 0.2, 0.3), pose):
         fine, coarse = (points() for points in surroundings_of(query, at))

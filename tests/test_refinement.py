@@ -17,7 +17,6 @@ from piccolo.localization.config import METHOD, Beam
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.localization.starts import Starts, best_and_alternatives, narrow
-from piccolo.views.recent_views import RecentViews
 
 QUERY = SimpleNamespace(workers=Workers(1), method=METHOD, scan_map=None)
 
@@ -121,7 +120,7 @@ def test_each_stage_has_its_view_its_image_and_its_limits(monkeypatch):
     monkeypatch.setattr(refinement, "without_occluders", lambda query, pose: query)
     monkeypatch.setattr(refinement, "compared", lambda query, h: h)
     images = SimpleNamespace(full="full", fine="fine", middle="middle")
-    views = RecentViews(lambda *_: None, lambda place, view, shown, count: (view, count), lambda *_: None)
+    views = SimpleNamespace(averages=lambda *_: None, points=lambda place, view, shown, count: (view, count))
     query = SimpleNamespace(**vars(QUERY), images=images, shown_cells=lambda *_: np.ones(3), views=views)
     h, full = _at(1.0, 0.2), (METHOD.full_view, 30_000)
     for at, view in (
@@ -244,7 +243,9 @@ def test_cells_and_points_are_those_that_the_photo_shows(monkeypatch):
     is_inside = np.abs((azimuth - 78.75 + 180) % 360 - 180) < 33.75
     assert (shown == is_inside).mean() > 0.98
     monkeypatch.setattr(refinement, "normalized_view", lambda sums, center, config, shown: shown)
-    views = RecentViews(lambda *_: None, lambda place, config, shown, count: (shown, count), lambda *_: None)
+    views = SimpleNamespace(
+        averages=lambda *_: None, points=lambda place, config, shown, count: (shown, count)
+    )
     asked = replace(narrow, views=views)
     assert (refinement.view_at(asked, pose, METHOD.full_view) == shown).all()
     assert refinement.points_at(asked, pose) == (shown.tobytes(), 30_000)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry.pose import Array
+from ..geometry.sphere import pixels_of, rays_of
 from .distortion import Distortion
 
 PERSPECTIVE, EQUIDISTANT, FOV, SPHERE = "perspective", "equidistant", "fov", "sphere"
@@ -138,12 +139,11 @@ class Camera:
 
         Pixels of rays that are not in the picture mean nothing.
         """
+        if self.lens == SPHERE:
+            u, v = pixels_of(rays, self.width)
+            return np.stack([u, v * (2.0 * self.height / self.width)], axis=-1), np.ones(u.shape, np.bool_)
         forward, right, down = rays[..., 0], -rays[..., 1], -rays[..., 2]
         across = np.sqrt(right * right + down * down)
-        if self.lens == SPHERE:
-            u = self.width * (0.5 + np.arctan2(right, forward) / (2.0 * math.pi))
-            v = self.height * (0.5 + np.arctan2(down, np.hypot(right, forward)) / math.pi)
-            return np.stack([u, v], axis=-1), np.ones(u.shape, np.bool_)
         if self.lens == PERSPECTIVE:
             is_in = (forward > 0.0) & (across <= math.tan(self.max_angle) * forward)
             per = 1.0 / np.where(is_in, forward, np.inf)
@@ -163,9 +163,7 @@ class Camera:
         """Unit rays (..., 3) of pixels (..., 2), and which of them there are (...)."""
         u, v = np.moveaxis(np.asarray(pixels, np.float64), -1, 0)
         if self.lens == SPHERE:
-            azimuth, elevation = (u / self.width - 0.5) * 2.0 * math.pi, (v / self.height - 0.5) * math.pi
-            c = np.cos(elevation)
-            ray = np.stack([c * np.cos(azimuth), -c * np.sin(azimuth), -np.sin(elevation)], axis=-1)
+            ray = rays_of(u, v * (0.5 * self.width / self.height), self.width)
             return ray, np.ones(u.shape, np.bool_)
         x, y = (u - self._named["cx"]) / self.focal[0], (v - self._named["cy"]) / self.focal[1]
         x, y, is_found = self.distortion.invert(x, y, self._radii)

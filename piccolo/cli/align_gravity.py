@@ -12,7 +12,7 @@ from ..cloud.settings import CloudSettings
 from ..confidence.confidence import LOCALIZED
 from ..errors import InputError
 from ..files.atomic import is_stream, write_atomically
-from ..geometry.pose import Array, move, read_transform, rotation_to_z
+from ..geometry.pose import Array, move, rotation_to_z
 from ..gravity.alignment import find_alignment
 from ..jobs.threads import Workers, num_cores
 from ..localization.settings import CoarseToFineSettings
@@ -25,6 +25,7 @@ from .errors import checking_options, print_error
 from .options import add_cloud_options, cloud_settings_from
 from .outputs import check_outputs, check_suffix, print_report
 from .progress import progress_bar
+from .transform_file import read_transform
 
 EXIT_UNKNOWN = 1
 Found = tuple[Array, dict[str, object], str]

@@ -10,6 +10,7 @@ As W = 2 H, both coordinates have the same scale: -W / 2 pi pixels a radian.
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,17 +79,17 @@ def pixel_jacobian(x, y, z, rho2, width):
 
 def pixel_rays(width: int, rows: slice = slice(None)) -> NDArray[np.float64]:
     """Unit camera directions (width / 2, width, 3) of pixel centres of a `width` image, or of its `rows`."""
-    return rays_at(width, np.arange(width) + 0.5, np.arange(width // 2)[rows] + 0.5)
+    return rays_of(np.arange(width) + 0.5, np.arange(width // 2)[rows, None] + 0.5, width)
 
 
-def rays_at(width: int, u: NDArray[np.floating], v: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Unit camera directions (len(v), len(u), 3) of columns and rows, continuous, of a `width` image."""
+def rays_of(u: Any, v: Any, width: int) -> NDArray[np.float64]:
+    """Unit camera directions (..., 3) of columns u and rows v (...), continuous, of a `width` image."""
     azimuth = (0.5 - u / width) * 2.0 * np.pi
-    elevation = (0.5 - v / (width // 2)) * np.pi
-    rays = np.empty((len(elevation), len(azimuth), 3))
-    rays[..., 0] = np.cos(elevation)[:, None] * np.cos(azimuth)
-    rays[..., 1] = np.cos(elevation)[:, None] * np.sin(azimuth)
-    rays[..., 2] = np.sin(elevation)[:, None]
+    elevation = (0.5 - v / (width / 2.0)) * np.pi
+    rays = np.empty((*np.broadcast_shapes(np.shape(u), np.shape(v)), 3))
+    rays[..., 0] = np.cos(elevation) * np.cos(azimuth)
+    rays[..., 1] = np.cos(elevation) * np.sin(azimuth)
+    rays[..., 2] = np.sin(elevation)
     return rays
 
 

@@ -22,7 +22,7 @@ from ..panorama.local_normalization import normalize_panorama
 from ..panorama.model import resize, shrink
 from ..panorama.texels import Texels, pack_texels
 from ..scan_map.scan_map import ScanMap
-from ..views.recent_views import RecentViews, recent_views
+from ..views.recent_views import RecentViews
 from .config import METHOD, ImageScales, MethodConfig
 from .settings import CoarseToFineSettings
 
@@ -171,7 +171,7 @@ def prepare_query(
     pixel = math.tau / min(panorama.rgb.shape[1], method.scales.full.width)
     colors = Once(partial(texels_of, panorama))
     panorama = resize(panorama, method.scales.full.width)
-    images, views = query_images(panorama, method.scales), recent_views(scan_map.octree)
+    images, views = query_images(panorama, method.scales), RecentViews(scan_map.octree)
     how, features = (settings, workers, method), features_of(panorama, scan_map, workers)
     return Query(scan_map, images, R_cam_from_level, *how, panorama, pixel, views, colors, features)
 

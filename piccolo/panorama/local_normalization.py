@@ -38,9 +38,10 @@ def zscore(value, mean, inverse_std):
 
 
 @inline_kernel
-def inverse_std(mean, mean_square):
-    """1 / standard deviation, bounded where nothing varies."""
-    return F1 / math.sqrt(max(mean_square - mean * mean, F0) + _MIN_VARIANCE)
+def mean_and_inverse_std(total, squares, per):
+    """Mean and 1 / standard deviation of weighted sums, `per` weight; bounded where nothing varies."""
+    mean = total * per
+    return mean, F1 / math.sqrt(max(squares * per - mean * mean, F0) + _MIN_VARIANCE)
 
 
 @lru_cache(maxsize=8)
@@ -151,8 +152,7 @@ def finish_statistics(sums):
             s = sums[i, j]
             per = F1 / max(s[0], LEAST_WEIGHT)
             for c in range(3):
-                s[1 + c] *= per
-                s[4 + c] = inverse_std(s[1 + c], s[4 + c] * per)
+                s[1 + c], s[4 + c] = mean_and_inverse_std(s[1 + c], s[4 + c], per)
 
 
 def opponent_channels(rgb: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -20,8 +20,8 @@ from ..jobs.threads import Workers
 from ..panorama.photo import photo_of
 from ..result import FAILED, UNREADABLE, check_scan
 from ..scan_map.scan_map import ScanMap
-from ..views.surfel_renderer import MAX_SURFELS, encode_image
-from ..views.surfels import Surfels, surfels_of
+from ..views.pictures import encode_image
+from ..views.surfels import MAX_SURFELS, Surfels, surfels_of
 from .entries import Entry, Place, document_of_entry, names_of, short_names_of
 from .own_plan import OwnPlan, check_own_plans, own_plan
 from .pictures import make_pictures, read_options_of

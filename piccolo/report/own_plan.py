@@ -15,7 +15,7 @@ from ..files.json_file import read_text
 from ..geometry.pose import Array
 from ..panorama.picture import read_picture
 from ..scan_map.scan_map import ScanMap
-from ..views.surfel_renderer import encode_image
+from ..views.pictures import encode_image
 
 COLUMNS = ("u", "v", "x", "y")
 WANTED = "wanted a CSV file with the columns u, v [px] and x, y [m], and two rows or more"

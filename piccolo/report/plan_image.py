@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..cloud.soa import PackedPoints, unpack_rgb
 from ..geometry.pose import Array
-from ..views.surfel_renderer import fill_holes
+from ..views.pictures import fill_holes
 
 CUT = 1.9  # [m] above the floor: below ceilings and lintels, above most furniture
 BELOW_FLOOR = 0.4  # [m] that still belongs to the storey: steps, ramps
