@@ -24,7 +24,7 @@ from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.scan_map import scan_addition
 from piccolo.scan_map.camera_positions import MIN_CLEARANCE
 from piccolo.scan_map.map_file import load_map, save_map
-from piccolo.scan_map.named_scans import named, scan_at, with_scans
+from piccolo.scan_map.named_scans import named, scan_at, with_places
 from piccolo.scan_map.prior import Prior
 from piccolo.scan_map.scan_addition import add_scan
 from piccolo.scan_map.scan_map import prepare_map
@@ -56,7 +56,7 @@ def of_two_rooms():
 def _localized(scan_map, seed, prior=None):
     settings = CoarseToFineSettings(gravity="known", prior=prior or Prior())
     panorama = rooms.as_panorama(rooms.query(seed).rgb)
-    return with_scans(scan_map, localize(scan_map, panorama, settings, WORKERS, Stopwatch()))
+    return with_places(scan_map, localize(scan_map, panorama, settings, WORKERS, Stopwatch()))
 
 
 def _rows(scan_map, centers):

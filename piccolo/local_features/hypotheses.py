@@ -269,9 +269,8 @@ def poses_of(
 
     def exact_ones(clusters: NDArray[np.int64]) -> list[MatchedPose]:
         rough = [Pose(rotations[k], centers[k]) for k in clusters]
-        return [
-            f for f in workers.map(lambda p: exact_pose(matches, p, R_cam_from_level), rough, "sample") if f
-        ]
+        ends = workers.map(lambda pose: exact_pose(matches, pose, R_cam_from_level), rough, "sample")
+        return [end for end in ends if end]
 
     found = exact_ones(kept[:FIRST_CLUSTERS])
     least = max([LEAST_MATCHES, *(FAIR_PART * f.num_matches for f in found)])

@@ -1,7 +1,7 @@
 """Poses of a camera from three matches: Persson and Nordberg, "Lambda Twist", ECCV 2018.
 
-A bearing is a unit ray in the camera's frame, anywhere on the sphere; a point is at a positive distance along
-it. With distances d and c_ij the cosine of two bearings, the triangle's sides, the longest of which is 1, give
+A bearing is a unit ray in the camera's frame, anywhere on the sphere; a point is at a positive distance
+along it. With distances d and c_ij the cosine of two bearings, the triangle's sides, the longest 1, give
     (1)  d_i^2 + d_j^2 - 2 c_ij d_i d_j = a_ij.
     (2)  M_0, M_1: the equations of the sides 01 and 02, each less a_ij times that of 12: conics d^T M d = 0
     (3)  det(M_m + x M_n) = 0: a degenerate conic of their pencil, which is two lines
@@ -85,7 +85,7 @@ def trace_product(a, m):
 
 @inline_kernel
 def degenerate_conic(conics):
-    """Turn one of two conics (2, 3, 3) into a degenerate one of their pencil, by (3); returns the other's index.
+    """Turn one of two conics (2, 3, 3) into a degenerate one of their pencil (3); returns the other's index.
 
     A cubic of x, whose leading coefficient is det M_n.
     """
@@ -148,7 +148,7 @@ def split_conic(conic, lines):
 
 @inline_kernel
 def meet(line, conic, ratios):
-    """Write where a line (3,) meets a conic (3, 3), at two homogeneous points (2, 3); (4); returns how many."""
+    """Write where a line (3,) meets a conic (3, 3) (4), two homogeneous points (2, 3); returns how many."""
     k = 0
     for i in range(1, 3):
         if abs(line[i]) > abs(line[k]):
@@ -164,11 +164,9 @@ def meet(line, conic, ratios):
     if not discriminant >= -ROUNDING * (b * b + abs(a * c)):
         return 0
     s = -(b + math.copysign(math.sqrt(max(discriminant, 0.0)), b))
-    ratios[0, i] = s
-    ratios[0, j] = a
-    ratios[1, i] = c
-    ratios[1, j] = s
     for n in range(2):
+        ratios[n, i] = s if n == 0 else c
+        ratios[n, j] = a if n == 0 else s
         ratios[n, k] = p * ratios[n, i] + q * ratios[n, j]
     return 2 if discriminant > 0.0 else 1
 
@@ -178,10 +176,12 @@ def polish_distances(ratios, cosines, sides2):
     """Scale distances (3,) known up to a factor, polish them by Newton on (1); False if they do not fit."""
     c01, c02, c12 = cosines
     a01, a02 = sides2
-    d0, d1, d2 = ratios
+    d0 = ratios[0]
+    d1 = ratios[1]
+    d2 = ratios[2]
     total = 2.0 * (d0 * (d0 - c01 * d1 - c02 * d2) + d1 * (d1 - c12 * d2) + d2 * d2)
     scale = math.copysign(math.sqrt((a01 + a02 + 1.0) / total), d0 + d1 + d2)
-    d0, d1, d2 = scaled(scale, ratios)
+    d0, d1, d2 = scale * d0, scale * d1, scale * d2  # at once: one by one, the compiler sums another way
     for left in range(POLISHING, -1, -1):
         e0 = d0 * d0 + d1 * d1 - 2.0 * c01 * d0 * d1 - a01
         e1 = d0 * d0 + d2 * d2 - 2.0 * c02 * d0 * d2 - a02
@@ -198,8 +198,11 @@ def polish_distances(ratios, cosines, sides2):
         d0 += half * (e0 * x * y + v * (e1 * z - e2 * x))
         d1 += half * (w * z * e0 - u * (e1 * z - e2 * x))
         d2 += half * (u * y * e1 + v * w * e2 - w * y * e0)
+    ratios[0] = d0
+    ratios[1] = d1
+    ratios[2] = d2
     is_fit = abs(e0) + abs(e1) + abs(e2) < ROUNDING * (1.0 + d0 * d0 + d1 * d1 + d2 * d2)
-    return is_fit and d0 > 0.0 and d1 > 0.0 and d2 > 0.0, (d0, d1, d2)
+    return is_fit and d0 > 0.0 and d1 > 0.0 and d2 > 0.0
 
 
 @inline_kernel
@@ -229,18 +232,13 @@ def pencil(cosines, sides2, conics):
 
 
 @inline_kernel
-def write_pose(corners_cam, corners_world, points, R, center):
-    """Write R_cam_from_map (3, 3), center (3,) [m] by a triangle's corners in the camera and map, as points."""
-    cam = axes_of(minus(corners_cam[1], corners_cam[0]), minus(corners_cam[2], corners_cam[0]))
-    world = axes_of(minus(corners_world[1], corners_world[0]), minus(corners_world[2], corners_world[0]))
+def pose_of_triangle(d01, d02, e01, e02, R):
+    """Write R_cam_from_map (3, 3) of a triangle's edges from its corner 0, in the camera and in the map."""
+    cam = axes_of(d01, d02)
+    world = axes_of(e01, e02)
     for i in range(3):
         for j in range(3):
             R[i, j] = cam[0][i] * world[0][j] + cam[1][i] * world[1][j] + cam[2][i] * world[2][j]
-    for i in range(3):
-        back = 0.0
-        for j in range(3):
-            back += R[j, i] * (corners_cam[0][j] + corners_cam[1][j] + corners_cam[2][j])
-        center[i] = (points[0, i] + points[1, i] + points[2, i] - back) / 3.0
 
 
 @kernel
@@ -250,33 +248,40 @@ def p3p(bearings, points, rotations, centers):
     Bearings (3, 3) and points (3, 3) [m] are a row each. Points on a line and equal bearings have none.
     """
     i0, i1, i2, longest2 = order_of_corners(points)
-    corners = (row(points, i0), row(points, i1), row(points, i2))
-    rays = (row(bearings, i0), row(bearings, i1), row(bearings, i2))
-    e01 = minus(corners[1], corners[0])
-    e02 = minus(corners[2], corners[0])
+    b0 = bearings[i0]
+    b1 = bearings[i1]
+    b2 = bearings[i2]
+    e01 = minus(points[i1], points[i0])
+    e02 = minus(points[i2], points[i0])
     normal = cross(e01, e02)
-    cosines = (dot(rays[0], rays[1]), dot(rays[0], rays[2]), dot(rays[1], rays[2]))
-    is_triangle = dot(normal, normal) > LEAST_SINE2 * dot(e01, e01) * dot(e02, e02)
-    if not (is_triangle and 1.0 - max(cosines) > LEAST_GAP):
+    a01 = dot(e01, e01)
+    a02 = dot(e02, e02)
+    cosines = (dot(b0, b1), dot(b0, b2), dot(b1, b2))
+    if not (dot(normal, normal) > LEAST_SINE2 * a01 * a02 and 1.0 - max(cosines) > LEAST_GAP):
         return 0
-    conics = np.empty((2, 3, 3))
-    lines = np.empty((2, 3))
-    ratios = np.empty((2, 3))
-    sides2 = (dot(e01, e01) / longest2, dot(e02, e02) / longest2)
+    work = np.empty((4, 3, 3))  # two conics, two lines, two points
+    conics = work[:2]
+    sides2 = (a01 / longest2, a02 / longest2)
     pencil(cosines, sides2, conics)
     other = degenerate_conic(conics)
-    if not split_conic(conics[1 - other], lines):
+    if not split_conic(conics[1 - other], work[2]):
         return 0
     count = 0
     for k in range(4):
         if k % 2 == 0:
-            num_met = meet(lines[k // 2], conics[other], ratios)
-        if k % 2 >= num_met:
+            num_met = meet(work[2, k // 2], conics[other], work[3])
+        d = work[3, k % 2]
+        if k % 2 >= num_met or not polish_distances(d, cosines, sides2):
             continue
-        is_fit, distances = polish_distances(row(ratios, k % 2), cosines, sides2)
-        if is_fit:
-            x, y, z = scaled(math.sqrt(longest2), distances)
-            corners_cam = (scaled(x, rays[0]), scaled(y, rays[1]), scaled(z, rays[2]))
-            write_pose(corners_cam, corners, points, rotations[count], centers[count])
-            count += 1
+        x, y, z = scaled(math.sqrt(longest2), d)
+        d01 = minus(scaled(y, b1), scaled(x, b0))
+        d02 = minus(scaled(z, b2), scaled(x, b0))
+        R = rotations[count]
+        pose_of_triangle(d01, d02, e01, e02, R)
+        for i in range(3):
+            back = 0.0
+            for j in range(3):
+                back += R[j, i] * (x * b0[j] + y * b1[j] + z * b2[j])
+            centers[count, i] = (points[0, i] + points[1, i] + points[2, i] - back) / 3.0
+        count += 1
     return count

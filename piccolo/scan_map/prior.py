@@ -7,7 +7,8 @@ from ..cloud.crs import from_wgs84
 from ..errors import InputError
 from ..panorama.photo import GpsPosition
 
-DEFAULT_ACCURACY, LEAST_ACCURACY = 10.0, 5.0  # [m] where the file does not say, or says less
+DEFAULT_ACCURACY = 10.0  # [m] where the file does not say
+LEAST_ACCURACY = 5.0  # [m] where it says less
 SIGMAS = 3.0
 
 
