@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..geometry.sphere import pixel_rays, solid_angles
 from ..kernels.jit import F0, F1, HALF, copy_to, inline_kernel, kernel
 from . import Panorama
-from .projection import CHUNK, gather, make_projected, project
+from .projection import CHUNK, gather, make_projected, project, texels_around
 from .texels import Texels, bilinear_weights, blend, is_valid
 
 CLIP = 2.0  # deviations; what differs more from its surroundings counts no more
@@ -216,7 +216,7 @@ def sample_channels(texels, width, directions, rotations, samples, validity):
             valid = validity[k, lo:hi]
             for n in range(hi - lo):
                 bilinear = bilinear_weights(p.fu[n], p.fv[n])
-                t00, t10, t01, t11 = p.t00[n], p.t10[n], p.t01[n], p.t11[n]
+                t00, t10, t01, t11 = texels_around(p, n)
                 v = is_valid(t00, t10, t01, t11)
                 s0[n] = v * (blend(t00, t10, t01, t11, bilinear, 0) - zero)
                 s1[n] = v * (blend(t00, t10, t01, t11, bilinear, 8) - zero)

@@ -71,6 +71,12 @@ def project(X, Y, Z, R_cam_from_world, center_world, width, projected):
 
 
 @inline_kernel
+def texels_around(projected, n):
+    """The four texels around a projected point that `gather` has written."""
+    return projected.t00[n], projected.t10[n], projected.t01[n], projected.t11[n]
+
+
+@inline_kernel
 def gather(texels, width, projected, count):
     """Write the four texels around each of `count` projected points."""
     p, stride = projected, np.int32(width + 2)

@@ -77,7 +77,7 @@ def with_places(scan_map: ScanMap, found: Localization) -> Localization:
     if not scan_map.scan_names:
         return found
 
-    poses = [found.pose, *(a.pose for a in found.alternatives)]
-    scan, *others = (scan_at(scan_map, scan_map.from_world(pose).center_world) for pose in poses)
+    poses = map(scan_map.from_world, (found.pose, *(a.pose for a in found.alternatives)))
+    scan, *others = (scan_at(scan_map, pose.center_world) for pose in poses)
     alternatives = tuple(replace(a, scan=s) for a, s in zip(found.alternatives, others, strict=True))
     return replace(found, scan=scan, alternatives=alternatives)
