@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..confidence.localization import Localization
 from ..errors import InputError
-from ..geometry.pose import Array
+from ..geometry.pose import Array, Pose
 from .scan_map import ScanMap
 
 MAX_NAME = 100  # characters
@@ -77,7 +77,10 @@ def with_places(scan_map: ScanMap, found: Localization) -> Localization:
     if not scan_map.scan_names:
         return found
 
-    poses = map(scan_map.from_world, (found.pose, *(a.pose for a in found.alternatives)))
-    scan, *others = (scan_at(scan_map, pose.center_world) for pose in poses)
-    alternatives = tuple(replace(a, scan=s) for a, s in zip(found.alternatives, others, strict=True))
-    return replace(found, scan=scan, alternatives=alternatives)
+    alternatives = tuple(replace(a, scan=scan_of(scan_map, a.pose)) for a in found.alternatives)
+    return replace(found, scan=scan_of(scan_map, found.pose), alternatives=alternatives)
+
+
+def scan_of(scan_map: ScanMap, pose: Pose) -> str | None:
+    """The scan in which a pose of the world lies."""
+    return scan_at(scan_map, scan_map.from_world(pose).center_world)

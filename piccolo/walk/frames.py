@@ -19,7 +19,8 @@ How = Literal["alone", "near", "tracked", "none"]
 MOST_ODDS = 8.0  # [log] that one frame may add: what is surer is not so of errors that no model has
 COPY_LOG_ODDS = 4.0  # copies of a place differ by as much where one of them was scanned better
 OTHER_LOG_ODDS = 6.0  # behind the best: no copy
-MAX_SPEED, MAX_ACCELERATION = 2.0, 2.0  # [m/s], [m/s^2] of a walking person with a camera
+MAX_SPEED = 2.0  # [m/s] of a walking person with a camera
+MAX_ACCELERATION = 2.0  # [m/s^2]
 MAX_STEP = 5.0  # [m] from one frame to the next, if nothing is known
 NO_ACCELERATION = 1e3  # [m] of frames without times: nothing is known of it
 
@@ -64,7 +65,12 @@ class Frame:
     @property
     def is_credible(self) -> bool:
         """True if its poses are more likely than that it has none."""
-        return bool(np.logaddexp.reduce([state.log_odds for state in self.states]) > 0.0)
+        return self.log_odds > 0.0
+
+    @property
+    def log_odds(self) -> float:
+        """Log odds of its poses together against that it has none."""
+        return float(np.logaddexp.reduce([state.log_odds for state in self.states]))
 
     @property
     def is_telling(self) -> bool:
@@ -147,13 +153,10 @@ def _state_json(state: State) -> dict[str, Any]:
 
 def _state_from_json(document: dict[str, Any]) -> State:
     """Read back what `Frame.to_json` wrote of a state."""
-    matrix = document["covariance"]
-    return State(
-        Pose(np.array(document["R_cam_from_map"]), np.array(document["center_map"])),
-        float(document["log_odds"]),
-        float(document["score"]),
-        None
-        if matrix is None
-        else PoseCovariance(np.array(matrix), str(document["least_constrained_direction"])),
-        document["num_matches"],
-    )
+    pose = Pose(np.array(document["R_cam_from_map"]), np.array(document["center_map"]))
+    covariance = None
+    if document["covariance"] is not None:
+        direction = str(document["least_constrained_direction"])
+        covariance = PoseCovariance(np.array(document["covariance"]), direction)
+    odds, score = float(document["log_odds"]), float(document["score"])
+    return State(pose, odds, score, covariance, document["num_matches"])

@@ -22,8 +22,10 @@ from .free_space import FreeSpace
 
 SAME_PLACE = 1.5  # [m] poses nearer to each other are of one place, not of copies
 TELLING_DISTANCE = 2.0  # [m] after which a frame says something new of its place
-REACH_SLACK, REACH_SIGMA = 0.3, 0.25  # [m] beyond what a person walks; deviation of more
-GAP_LOG, UNTIMED_GAP_LOG = -9.0, -4.0  # a jump to any place: lift, cut, pocket; of frames without times
+REACH_SLACK = 0.3  # [m] beyond what a person walks
+REACH_SIGMA = 0.25  # [m] deviation of more
+GAP_LOG = -9.0  # a jump to any place: lift, cut, pocket
+UNTIMED_GAP_LOG = -4.0  # of frames without times
 JUMPED = -2.0  # less is a jump
 MOST_EXPECTED = 3.0  # [log] that a pose gains by being where it was to be expected
 MAX_SKIPPED = 25.0  # [log] frames that speak for their poses by more in all are not passed over
@@ -48,14 +50,14 @@ def emissions(frames: Sequence[Frame]) -> list[Array]:
     found: list[Array] = []
     last: Frame | None = None
     for frame in frames:
-        odds, here = np.array([state.log_odds for state in frame.states]), centers_of(frame.states)
+        odds = np.array([state.log_odds for state in frame.states])
         if len(odds) == 0:
             found.append(odds)
             continue
         share = 1.0 if last is None else share_moved(last, frame)
         last = frame
         total = np.clip(np.logaddexp.reduce(odds), -MOST_ODDS, MOST_ODDS)
-        of_place = odds[places_of(odds, here)]
+        of_place = odds[places_of(odds, centers_of(frame.states))]
         behind = -new_differences(odds.max() - of_place, share) - (of_place - odds)
         found.append(total + behind - np.logaddexp.reduce(behind))
     return found
@@ -132,7 +134,8 @@ class Lattice:
     """
 
     def __init__(self, space: FreeSpace, motion: Motion) -> None:
-        self.space, self.motion = space, motion
+        self.space = space
+        self.motion = motion
         self.frames: list[Frame] = []
         self.emitted: list[Array] = []
         self.steps: list[list[_Steps]] = []
@@ -151,8 +154,9 @@ class Lattice:
         self.steps.append(steps)
         before, begin = (self.unlisted[-1], (k - 1, UNLISTED)) if k else (_Unlisted(), None)
         self.unlisted.append(self._unlisted_at(k, before))
-        enter, num = entering(frame), len(frame.states)
-        sums, best = np.full(num, enter + before.forward), np.full(num, enter + before.best)
+        num = len(frame.states)
+        sums = np.full(num, entering(frame) + before.forward)
+        best = np.full(num, entering(frame) + before.best)
         back: list[tuple[int, int] | None] = [begin] * num
         for s in steps:
             sums = np.logaddexp(sums, np.logaddexp.reduce(self.forward[s.begin][:, None] + s.log, axis=0))
@@ -160,7 +164,8 @@ class Lattice:
             for j in range(num):
                 i = int(ways[:, j].argmax())
                 if ways[i, j] > best[j]:
-                    best[j], back[j] = ways[i, j], (s.begin, i)
+                    best[j] = ways[i, j]
+                    back[j] = (s.begin, i)
         self.forward.append(sums + self.emitted[k])
         self.ended = float(np.logaddexp(self.ended, np.logaddexp.reduce(self.forward[k])))
         self.best.append(best + self.emitted[k])
@@ -174,13 +179,16 @@ class Lattice:
         gained = max([0.0, *(float(s.log.max()) for s in self.steps[k])])
         emitted = float(self.emitted[k].max(initial=-math.inf)) + gained
         emitted = max(emitted - self._telling(k) * (TELLING_LOG + gained), 0.0)
-        forward, best, back = before.forward, before.best, (k - 1, UNLISTED) if k else None
+        forward = before.forward
+        best = before.best
+        back = (k - 1, UNLISTED) if k else None
         for s in self.steps[k]:
             leave = left(s.log, self.frames[k])
             forward = float(np.logaddexp(forward, np.logaddexp.reduce(self.forward[s.begin] + leave)))
             ways = self.best[s.begin] + leave
             if ways.max() > best:
-                best, back = float(ways.max()), (s.begin, int(ways.argmax()))
+                best = float(ways.max())
+                back = (s.begin, int(ways.argmax()))
         return _Unlisted(emitted, forward + emitted, best + emitted, back)
 
     def _telling(self, k: int) -> float:
@@ -198,7 +206,9 @@ class Lattice:
 
     def _steps_to(self, k: int) -> list[_Steps]:
         """Steps from all earlier frames from which the way may lead to a frame."""
-        ends, steps, passed = centers_of(self.frames[k].states), list[_Steps](), 0.0
+        ends = centers_of(self.frames[k].states)
+        steps: list[_Steps] = []
+        passed = 0.0
         if len(ends) == 0:
             return []
         for m in range(k - 1, max(k - 1 - LONGEST_SKIP, -1), -1):
@@ -233,9 +243,11 @@ class Lattice:
 
     def smoothed(self) -> Path:
         """The likeliest way, and the probability of each state by all frames."""
-        backward, unlisted = [np.zeros(len(f.states)) for f in self.frames], 0.0
+        backward = [np.zeros(len(f.states)) for f in self.frames]
+        unlisted = 0.0
         for k in range(len(self.frames) - 1, -1, -1):
-            onward, unlisted = self.emitted[k] + backward[k], self.unlisted[k].emitted + unlisted
+            onward = self.emitted[k] + backward[k]
+            unlisted += self.unlisted[k].emitted
             for s in self.steps[k]:
                 leave = left(s.log, self.frames[k]) + unlisted
                 ways = np.concatenate([s.log + onward[None], leave[:, None]], axis=1)
@@ -251,9 +263,8 @@ class Lattice:
         if not self.frames:
             return chosen
         ends = [(float(b.max()), (k, int(b.argmax()))) for k, b in enumerate(self.best) if len(b)]
-        at: tuple[int, int] | None = max([*ends, (self.unlisted[-1].best, (len(self.frames) - 1, UNLISTED))])[
-            1
-        ]
+        ends.append((self.unlisted[-1].best, (len(self.frames) - 1, UNLISTED)))
+        at: tuple[int, int] | None = max(ends)[1]
         while at is not None:
             k, j = at
             chosen[k] = None if j == UNLISTED else j
@@ -270,8 +281,8 @@ class Lattice:
                 m, i = before
                 log = next((s.log[i, j] for s in self.steps[k] if s.begin == m), GAP_LOG)
                 if log < JUMPED:
-                    there, here = self.frames[m].states[i].pose, self.frames[k].states[j].pose
-                    metres = float(np.linalg.norm(here.center_world - there.center_world))
+                    ends = centers_of([self.frames[m].states[i], self.frames[k].states[j]])
+                    metres = float(np.linalg.norm(ends[1] - ends[0]))
                     gaps[k] = metres, self.frames[k].time - self.frames[m].time
             before = k, j
         return gaps
