@@ -69,16 +69,17 @@ def scan_at(scan_map: ScanMap, center_map: Array) -> str | None:
 
 def with_places(scan_map: ScanMap, found: Localization) -> Localization:
     """What was found, with the scans, the storey (from 1, the lowest) and the height above the floor."""
-    if found.pose is None:
+    pose = found.pose
+    if pose is None:
         return found
-    (storey,), (height,) = scan_map.storeys.at(scan_map.from_world(found.pose).center_world[None])
+    (storey,), (height,) = scan_map.storeys.at(scan_map.from_world(pose).center_world[None])
     if storey >= 0:
         found = replace(found, storey=int(storey) + 1, height_above_floor=round(float(height), 4))
     if not scan_map.scan_names:
         return found
 
     alternatives = tuple(replace(a, scan=scan_of(scan_map, a.pose)) for a in found.alternatives)
-    return replace(found, scan=scan_of(scan_map, found.pose), alternatives=alternatives)
+    return replace(found, scan=scan_of(scan_map, pose), alternatives=alternatives)
 
 
 def scan_of(scan_map: ScanMap, pose: Pose) -> str | None:

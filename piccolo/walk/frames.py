@@ -111,19 +111,14 @@ def states_of(scan_map: ScanMap, found: Localization) -> list[State]:
     if found.pose is None or found.probability_none is None or found.evidence is None:
         return []
     none = max(found.probability_none, 1e-9)
-    best = State(
-        scan_map.from_world(found.pose),
-        log_ratio(found.confidence, none),
-        found.evidence.score,
-        found.covariance,
-        found.evidence.num_matches,
-    )
-    others = [
-        State(
-            scan_map.from_world(a.pose), log_ratio(a.probability or 0.0, none), a.score, None, a.num_matches
-        )
-        for a in found.alternatives
-    ]
+    odds = log_ratio(found.confidence, none)
+    evidence = found.evidence
+    pose = scan_map.from_world(found.pose)
+    best = State(pose, odds, evidence.score, found.covariance, evidence.num_matches)
+    others = []
+    for a in found.alternatives:
+        odds = log_ratio(a.probability or 0.0, none)
+        others.append(State(scan_map.from_world(a.pose), odds, a.score, None, a.num_matches))
     return [best, *others]
 
 
