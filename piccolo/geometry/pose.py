@@ -20,14 +20,14 @@ TINY = 1e-150  # sine of an angle; of smaller ones the direction is lost to unde
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the camera is and how it is turned."""
+    """Position and rotation of a camera."""
 
     R_cam_from_world: Array  # (3, 3) rotation, camera axes: +x image centre, +y left, +z up
     center_world: Array  # (3,) camera position [m]
 
     @property
     def key(self) -> bytes:
-        """What tells it from every other pose."""
+        """The bits of the pose."""
         return self.R_cam_from_world.tobytes() + self.center_world.tobytes()
 
 

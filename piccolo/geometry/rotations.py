@@ -51,7 +51,7 @@ def random_rotation(rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def turned(pose: Pose, other_from_cam: Array) -> Pose:
-    """The same camera, its rotation to other axes."""
+    """Return the camera with its rotation to other axes."""
     return Pose(other_from_cam @ pose.R_cam_from_world, pose.center_world)
 
 

@@ -154,7 +154,7 @@ def find_features(
 
 
 def num_lists(num_features: int) -> int:
-    """How many lists hold so many features."""
+    """The number of lists for so many features."""
     return int(np.clip(num_features // LIST_SIZE, 1, MAX_LISTS))
 
 

@@ -143,7 +143,7 @@ def rough_poses(matches, columns, voters, R_cam_from_level, is_upright, rotation
 
 @inline_kernel
 def count_exact(m, members, columns, is_near, R, t):
-    """How many features of the photo, of the matches `members`, agree with a pose to a degree.
+    """Count the features of the photo, of the matches `members`, that agree with a pose to a degree.
 
     The members' points and rays are in columns (6, n), too.
     """
@@ -220,7 +220,7 @@ def members_of(matches: Matches, pose: Pose, cos_rough: float) -> NDArray[np.int
 
 
 def count_matches(matches: Matches, pose: Pose) -> int:
-    """How many features of the photo a pose puts where the map has them."""
+    """Count the features of the photo that a pose puts where the map has them."""
     return len(np.unique(matches.query[members_of(matches, pose, COS_EXACT)]))
 
 

@@ -78,7 +78,7 @@ def draw_voxels(tree, center, found, directions, ranges, sums):
 
 
 def is_in_front(ranges: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Where (H, W) of nearest ranges, NOTHING where there is none, a pixel is no gap in what is nearer.
+    """Mask (H, W), by nearest ranges, NOTHING where there is none, of pixels no gap in what is nearer.
 
     A pixel is seen through a gap if in all wider pixels around it there is something much nearer.
     """
@@ -118,7 +118,7 @@ def _resized(image: Floats, size: tuple[int, int]) -> Floats:
 
 
 def render_gray(octree: Octree, center_map: Array, width: int) -> ViewImage:
-    """What is seen around a centre (3,) [m], `width` x width / 2 pixels."""
+    """Draw the scan around a centre (3,) [m], `width` x width / 2 pixels."""
     scratch = thread_scratch()
     ranges = np.empty((width // 2, width), np.float32)
     sums = np.empty((width // 2, width, 2), np.float32)

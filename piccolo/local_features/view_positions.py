@@ -82,7 +82,7 @@ def choose(
     cells: NDArray[np.int32],
     spacing: float,
 ) -> NDArray[np.int64] | None:
-    """Of some positions, in order, each that none of the known or before it sees; None if too many."""
+    """Choose of some positions, in order, each that none known or before it sees; None if too many."""
     room = num_known + MAX_VIEWS
     kept = np.arange(room)
     ranges = np.empty((room, cells.max() + 1), np.float32)

@@ -36,7 +36,7 @@ def geman_mcclure(square, inverse_scale2):
 
 @inline_kernel
 def beyond_chance(correlation):
-    """What a block's correlation has beyond what those of wrong poses reach, in [0, 1]."""
+    """A block's correlation beyond what those of wrong poses reach, in [0, 1]."""
     return max(correlation - CHANCE, 0.0) / (1.0 - CHANCE)
 
 

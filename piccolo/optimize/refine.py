@@ -23,7 +23,7 @@ Objective = Callable[[Pose], Equations]
 
 @dataclass(frozen=True)
 class Loss:
-    """What a pose is judged by: functions of the points that count and of the pose; small is good."""
+    """A loss of poses: functions of the points that count and of the pose; small is good."""
 
     value: Callable[[PackedPoints, Pose], float]
     equations: Callable[[PackedPoints, Pose], Equations]
@@ -43,7 +43,7 @@ Watch = Callable[[int, Pose, float], None]
 
 @dataclass(frozen=True)
 class Refined:
-    """Where a descent arrived."""
+    """The end of a descent."""
 
     pose: Pose
     loss: float  # over the points seen from there

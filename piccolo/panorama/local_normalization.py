@@ -93,7 +93,7 @@ def block_moments(channels, weight, moments):
 
 @inline_kernel
 def interpolation_along(num, num_wider):
-    """Where each of `num` pixels lies among fewer, wider ones around a row: indices (num,) and fractions."""
+    """Places of `num` pixels among fewer, wider ones around a row: indices (num,) and fractions."""
     left = np.empty(num, np.uintp)
     right = np.empty(num, np.uintp)
     fraction = np.empty(num, np.float32)

@@ -1,4 +1,4 @@
-"""Where a camera can be: free space at a camera's height above something that carries it."""
+"""Positions of a camera: free space at a camera's height above something that carries it."""
 
 import time
 from typing import Any, NamedTuple
@@ -54,7 +54,7 @@ class Ball(NamedTuple):
     radius: float
 
     def holds(self, points: NDArray[np.floating[Any]], margin: float = 0.0) -> NDArray[np.bool_]:
-        """Which of some points (N, 3) or (N, 2) lie in it, or at most a margin [m] beside it."""
+        """Mask (N,) of points (N, 3) or (N, 2) that lie in it, or at most a margin [m] beside it."""
         distance = np.linalg.norm(points - self.center[: points.shape[1]], axis=1)
         return np.asarray(distance <= self.radius + margin)
 
@@ -66,7 +66,7 @@ class Box(NamedTuple):
     high: Array
 
     def holds(self, points: NDArray[np.floating[Any]], margin: float = 0.0) -> NDArray[np.bool_]:
-        """As of Ball."""
+        """Mask (N,) of points (N, 3) or (N, 2) that lie in it, or at most a margin [m] beside it."""
         k = points.shape[1]
         is_inside = (points >= self.low[:k] - margin) & (points <= self.high[:k] + margin)
         return np.asarray(is_inside.all(axis=1))

@@ -1,4 +1,4 @@
-"""Whether the arrays of a map file are what `save_map` writes, before a search takes them.
+"""Checks of a map file's arrays: they are what `save_map` writes, before a search takes them.
 
 A map may come from anybody, and checksums are easily mended: every index that a kernel takes from a map is
 checked, every number bounded, and the octree compared with the grid that its voxels come from.
@@ -127,7 +127,7 @@ def _refuse(path: Path, found: str) -> None:
 
 
 def _reach(arrays: Arrays) -> float:
-    """How far [m] from the origin along each axis anything in a map can be."""
+    """The most [m] that anything in a map is from the origin along an axis."""
     return WINDOW * float(arrays["octree_leaf_size"]) + MARGIN
 
 

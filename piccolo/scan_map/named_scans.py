@@ -53,7 +53,7 @@ def check_within(scan_map: ScanMap, within: Sequence[str]) -> None:
 
 
 def candidates_within(scan_map: ScanMap, within: Sequence[str]) -> NDArray[np.bool_]:
-    """Which candidates (N,) lie in the scans of these names."""
+    """Mask (N,) of the candidates in the scans of these names."""
     named_so = [k for k, name in enumerate(scan_map.scan_names) if name in within]
     return np.isin(scan_map.scan_of_candidate, named_so)
 
@@ -68,7 +68,7 @@ def scan_at(scan_map: ScanMap, center_map: Array) -> str | None:
 
 
 def with_places(scan_map: ScanMap, found: Localization) -> Localization:
-    """What was found, with the scans, the storey (from 1, the lowest) and the height above the floor."""
+    """Return a result with the scans, the storey (from 1, the lowest) and the height above the floor."""
     pose = found.pose
     if pose is None:
         return found

@@ -32,7 +32,7 @@ MAKERS = ("cloud", "geometry", "gravity", "local_features", "optimize", "panoram
 
 @dataclass(frozen=True)
 class CachePolicy:
-    """Where prepared maps are kept."""
+    """The place of prepared maps."""
 
     is_used: bool = True
     folder: Path | None = None  # None for the user's cache

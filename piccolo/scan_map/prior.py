@@ -14,7 +14,7 @@ SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class Prior:
-    """What the user knows beforehand; each narrows the search."""
+    """Prior knowledge by the user; each narrows the search."""
 
     near_world: tuple[float, float, float | None] | None = None  # [m] within `radius`; None: any height
     radius: float | None = None  # [m]
@@ -43,7 +43,7 @@ NOTHING_KNOWN = Prior()
 
 @dataclass(frozen=True)
 class GpsPrior:
-    """Where a photo's GPS position lies in the scan."""
+    """A photo's GPS position in the scan."""
 
     center_world: tuple[float, float]  # [m] in the scan's coordinates, of any height
     radius: float  # [m] within which the camera is searched first

@@ -1,4 +1,4 @@
-"""What is prepared once per cloud: octree, places where a camera can be, and coarsely what it sees there."""
+"""The map prepared once per cloud: octree, places where a camera can be, and coarsely what it sees there."""
 
 import threading
 from collections.abc import Callable
@@ -234,7 +234,7 @@ def find_local_features(scan_map: ScanMap, workers: Workers) -> FeatureMap:
 
 
 def seen_by(octree: Octree, centers: NDArray[np.float64]) -> Look:
-    """How far one sees from each of some centres (N, 3), by its index."""
+    """Ranges seen from each of some centres (N, 3), by its index."""
     return lambda k: ranges_around(octree, centers[k : k + 1], SEARCH_VIEW)[0]
 
 

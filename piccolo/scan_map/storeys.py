@@ -98,7 +98,7 @@ def find_storeys(octree: Octree) -> Storeys:
 
 
 def _is_standable(ijk: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which voxels (N, 3) have room for a person above them."""
+    """Mask (N,) of the voxels (N, 3) with room for a person above them."""
     shape = ijk.max(axis=0, initial=0) + HEADROOM + 2
     code = (ijk[:, 0] * shape[1] + ijk[:, 1]) * shape[2] + ijk[:, 2]
     order = np.argsort(code)

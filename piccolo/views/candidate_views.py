@@ -1,4 +1,4 @@
-"""What a camera sees from a map's candidates: wide cells of all that are searched, fine ones of some.
+"""Views from a map's candidates: wide cells of all that are searched, fine ones of some.
 
 Wide cells are prepared with the map. A view of fine cells is made when a search first comes upon its
 candidate, and kept until there are many.

@@ -109,7 +109,7 @@ def cut(image: NDArray[np.uint8], camera: Camera, R_lens_from_cam: Array = UPRIG
 
 
 def cut_view(view: View, camera: Camera) -> View:
-    """The same of colours with ranges; these of the nearest pixel, infinite where nothing is shown."""
+    """A camera's view of that of the sphere; ranges of the nearest pixel, infinite where nothing is shown."""
     width = view.depth.shape[1]
     u, v, is_in = _places(camera, width, UPRIGHT)
     rows = np.clip(v.astype(np.int64), 0, width // 2 - 1)

@@ -110,7 +110,7 @@ def render_points(tree, center, voxel_per_range, view, shown, scratch, offsets, 
 
 
 def visible_points(octree: Octree, center_map: Center, config: ViewConfig, shown: bytes, count: int) -> Cells:
-    """What is seen around a centre (3,) [m], as at most `count` points with equal weights, not as cells.
+    """The scan seen from a centre (3,) [m], as at most `count` points with equal weights, not as cells.
 
     In the cells that are shown: a byte each.
     """

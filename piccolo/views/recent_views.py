@@ -1,4 +1,4 @@
-"""What is seen from places on a grid, the last few kept: a pose that hardly moves sees what it saw before."""
+"""Views from places on a grid, the last few kept: a pose that hardly moves sees what it saw before."""
 
 from functools import lru_cache, partial
 

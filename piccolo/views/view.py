@@ -25,7 +25,7 @@ Center = Sequence[float] | Array
 
 
 class Cells(NamedTuple):
-    """What is seen around a centre, on cells of the sphere or as points."""
+    """The scan seen from a centre, on cells of the sphere or as points."""
 
     offsets: NDArray[np.float32]  # (3, N) [m] from the centre
     channels: NDArray[np.float32]  # (3, N) opponent colours, locally normalised [standard deviations]
@@ -68,7 +68,7 @@ class Scratch(NamedTuple):
 
 @dataclass(frozen=True)
 class ViewConfig:
-    """How a view is made: its cells, the neighbourhood that normalises colours, the voxels' angular size."""
+    """Settings of a view: its cells, the neighbourhood that normalises colours, the voxels' angular size."""
 
     num_rings: int
     stats_rings: int  # cells of these rings carry the local statistics: no wider than sigma
@@ -79,7 +79,7 @@ class ViewConfig:
 
     @cached_property
     def arrays(self) -> ViewArrays:
-        """What the kernels read."""
+        """The settings as kernels read them."""
         grid = make_grid(self.num_rings)
         neighbors = make_neighbors(self.stats_rings, self.sigma_deg)
         return ViewArrays(
@@ -350,7 +350,7 @@ def normalized_view(sums: Array32, center_map: Center, config: ViewConfig, shown
 def ranges_around(
     octree: Octree, centers_map: NDArray[np.floating[Any]], config: ViewConfig
 ) -> NDArray[np.float32]:
-    """How far away (n, cells) [m] the nearest of what is seen from each centre (n, 3) is, 0 for nothing."""
+    """Ranges (n, cells) [m] of the nearest of what is seen from each centre (n, 3), 0 for nothing."""
     ranges = np.empty((len(centers_map), len(make_grid(config.num_rings))), np.float32)
     centers_map = np.ascontiguousarray(centers_map)  # one kernel for all
     nearest_ranges(octree, centers_map, config.voxel_per_range, config.arrays, thread_scratch(), ranges)

@@ -29,7 +29,7 @@ MIN_SEEN_FRACTION = 0.4  # of the sphere; less is seen from outside a scan
 
 
 class View(NamedTuple):
-    """What the camera sees of the cloud, on an equirectangular grid."""
+    """A view of the cloud, on an equirectangular grid."""
 
     depth: NDArray[np.float32]  # (H, W) range of what is nearest [m], inf where there is nothing
     rgb: NDArray[Any]  # (H, W, 3) mean colour of what is near that range, 0 where there is nothing

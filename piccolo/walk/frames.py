@@ -1,4 +1,4 @@
-"""What is known of the frames of a walk: poses that each may have, and how likely each of them is."""
+"""The frames of a walk: poses that each may have, and how likely each of them is."""
 
 import math
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ NO_ACCELERATION = 1e3  # [m] of frames without times: nothing is known of it
 
 @dataclass(frozen=True)
 class Motion:
-    """How a camera is carried."""
+    """The motion of a camera that is carried."""
 
     max_speed: float = MAX_SPEED  # [m/s]; of frames without times [m] from one to the next
     max_acceleration: float = MAX_ACCELERATION  # [m/s^2] standard deviation along each axis

@@ -1,4 +1,4 @@
-"""How far it is to walk from place to place: through free space, never through a wall."""
+"""Distances to walk from place to place: through free space, never through a wall."""
 
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ ENDS = 0.6  # [m] to its nodes
 
 
 class _Reached(NamedTuple):
-    """What is within a limit [m] of a node: other nodes, rising, and the lengths of the ways there."""
+    """All within a limit [m] of a node: other nodes, rising, and the lengths of the ways there."""
 
     limit: float
     nodes: NDArray[np.int64]
@@ -91,7 +91,7 @@ class FreeSpace:
 def looks(
     scan_map: ScanMap, first: NDArray[Any], second: NDArray[Any], workers: Workers
 ) -> NDArray[np.int64]:
-    """What candidates see (N,) in the direction of neighbours: 1 what lies behind them, 0 nothing, else -2.
+    """Return 1 (N,) where candidates see past their neighbours, 0 where they see nothing, else -2.
 
     A sum above 0 is a free way: nobody sees anything between, and somebody sees past. Both index candidates,
     the first rise.

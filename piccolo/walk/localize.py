@@ -1,4 +1,4 @@
-"""What a walk makes of its frames."""
+"""The results of a walk's frames."""
 
 import math
 from dataclasses import dataclass, replace
@@ -28,7 +28,7 @@ class Gap:
 
 @dataclass(frozen=True)
 class Alone:
-    """What a frame is without regard to the others."""
+    """The result of a frame without regard to the others."""
 
     status: str
     confidence: float
@@ -47,7 +47,7 @@ class WalkFrame:
 
 
 def localizations_of(tracker: Tracker, path: Path) -> list[tuple[Localization, WalkFrame]]:
-    """What a walk makes of each of its frames, poses smoothed together."""
+    """Return the result of each frame of a walk, poses smoothed together."""
     found = [
         localization_of(tracker, frame, probabilities, chosen)
         for frame, probabilities, chosen in zip(tracker.frames, path.probabilities, path.chosen, strict=True)
@@ -67,7 +67,7 @@ def localizations_of(tracker: Tracker, path: Path) -> list[tuple[Localization, W
 
 
 def alone_of(frame: Frame) -> Alone | None:
-    """What a frame is without regard to the others, if it was searched so."""
+    """Return a frame's result without regard to the others, if it was searched so."""
     a = frame.alone
     return None if a is None else Alone(a.status, a.confidence, a.pose)
 

@@ -38,7 +38,7 @@ UNLISTED = -1  # in place of the number of a state
 
 
 class Path(NamedTuple):
-    """What the walk makes of its frames."""
+    """The likeliest way through a walk's frames."""
 
     chosen: list[int | None]  # the state of each frame on the likeliest way; None for no pose
     probabilities: list[Array]  # (S,) of each frame's states
@@ -64,7 +64,7 @@ def emissions(frames: Sequence[Frame]) -> list[Array]:
 
 
 def new_differences(behind: Array, share: float) -> Array:
-    """How much of what poses lack to the best (S,) [log] counts, in a frame that is new to a share.
+    """Log differences (S,) of poses to the best that count in a frame that is new to a share.
 
     Copies differ by a little for as long as the camera is in one of them; what is no copy is just worse.
     """
@@ -73,7 +73,7 @@ def new_differences(behind: Array, share: float) -> Array:
 
 
 def share_moved(before: Frame, frame: Frame) -> float:
-    """How much of a new place a frame shows, 0 to 1, by how far the camera has moved at least."""
+    """Fraction of a new place that a frame shows, by how far the camera has moved at least."""
     starts, ends = centers_of(before.likely), centers_of(frame.likely)
     moved = float(np.linalg.norm(ends[:, None] - starts[None], axis=2).min())
     return min(moved / TELLING_DISTANCE, 1.0)
@@ -172,7 +172,7 @@ class Lattice:
         self.back.append(back)
 
     def _unlisted_at(self, k: int, before: "_Unlisted") -> "_Unlisted":
-        """What a frame says for places that are not listed.
+        """Return what a frame says for places that are not listed.
 
         If it does not tell, as much as for the best that is listed.
         """
@@ -192,7 +192,7 @@ class Lattice:
         return _Unlisted(emitted, forward + emitted, best + emitted, back)
 
     def _telling(self, k: int) -> float:
-        """How much of what a search of the whole scan can tell is new in a frame, 0 to 1."""
+        """Fraction of what a search of the whole scan can tell that is new in a frame."""
         frame = self.frames[k]
         if not frame.is_telling:
             return 0.0
@@ -200,7 +200,7 @@ class Lattice:
         return 1.0 if last is None else max(share_moved(last, frame), LEAST_TOLD)
 
     def _emission(self) -> Array:
-        """Of the last frame."""
+        """Log odds (S,) of the last frame's states."""
         before = next((f for f in reversed(self.frames[:-1]) if f.states), None)
         return emissions([before, self.frames[-1]] if before else self.frames[-1:])[-1]
 
@@ -227,7 +227,7 @@ class Lattice:
         return steps
 
     def _expected(self, start: Array, reach: float) -> float:
-        """What a pose within a reach [m] gains: the more, the less of the map lies there.
+        """Log odds that a pose within a reach [m] gains: the more, the less of the map lies there.
 
         A frame's own odds hold where each place of the map is as likely as the others.
         """
