@@ -93,8 +93,10 @@ def render_points(tree, center, voxel_per_range, view, shown, scratch, offsets, 
     cells = np.empty(n, np.int32)
     ranges = np.empty(n, np.float32)
     turns = np.empty(n, np.float32)
-    placed = offsets[:, :n]
-    locate(placed[0], placed[1], placed[2], view.num_columns, view.first, cells, ranges, turns)
+    x = offsets[0, :n]
+    y = offsets[1, :n]
+    z = offsets[2, :n]
+    locate(x, y, z, view.num_columns, view.first, cells, ranges, turns)
     count = 0
     for i in range(n):
         c = cells[i]

@@ -106,11 +106,13 @@ def locate(X, Y, Z, num_columns, first, cells, ranges, turns):
     per_turn = np.float32(0.5 / math.pi)
     # Two loops: the arithmetic is vectorised, the look-ups that follow can't be.
     for i in range(len(cells)):
+        x = X[i]
+        y = Y[i]
         z = Z[i]
-        rho2 = X[i] * X[i] + Y[i] * Y[i]
+        rho2 = x * x + y * y
         ring = (HALF * PI - atan2(z, math.sqrt(rho2))) * per_pi
         cells[i] = np.int32(min(max(ring, F0), num_rings - F1))
-        turns[i] = atan2(Y[i], X[i]) * per_turn + HALF
+        turns[i] = atan2(y, x) * per_turn + HALF
         ranges[i] = math.sqrt(rho2 + z * z)
     for i in range(len(cells)):
         ring = cells[i]
@@ -123,8 +125,10 @@ def locate_nodes(tree, center, voxel_per_range, view, scratch):
     """Fill the scratch with the nodes to draw, their offsets, cells and ranges; returns how many."""
     s = scratch
     n = collect(tree, center, voxel_per_range, s.nodes, s.directions)
-    d = s.directions[:, :n]
-    locate(d[0], d[1], d[2], view.num_columns, view.first, s.cells[:n], s.ranges[:n], s.turns)
+    x = s.directions[0, :n]  # a row each: of a cut of all three, the stride is unknown to the compiler
+    y = s.directions[1, :n]
+    z = s.directions[2, :n]
+    locate(x, y, z, view.num_columns, view.first, s.cells[:n], s.ranges[:n], s.turns)
     return n
 
 
