@@ -20,7 +20,7 @@ from ..kernels.jit import F0, copy_to, inline_kernel, kernel
 from ..panorama.projection import in_camera, pose_float32
 from .matching import LEAST_WEIGHT, Matches
 from .p3p import p3p
-from .pose_refinement import refine_pose
+from .pose_refinement import descend_matches
 
 COS_ROUGH = math.cos(math.radians(20.0))  # a match off by less agrees roughly
 COS_EXACT = math.cos(math.radians(1.0))
@@ -41,6 +41,7 @@ NUM_SAMPLES = 200  # of three matches, a cluster
 LEAST_MATCHES = 4  # that agree with a pose
 REFINEMENTS = 8  # steps
 REFINE_SCALE = math.radians(0.5)  # [rad] of the loss
+REFINE_TOLERANCE = 1e-7  # [rad + m] a shorter step ends the descent
 
 
 class MatchedPose(NamedTuple):
@@ -239,7 +240,7 @@ def exact_pose(matches: Matches, rough: Pose, R_cam_from_level: Array | None) ->
     for _ in range(2):
         members = members_of(matches, pose, COS_EXACT)
         rays, points = matches.rays[members].astype(np.float64), matches.points[members].astype(np.float64)
-        refine_pose(rays, points, np.ones(len(members)), R, t, REFINEMENTS, REFINE_SCALE)
+        descend_matches((rays, points, REFINE_SCALE), REFINEMENTS, REFINE_TOLERANCE, R, t)
     return MatchedPose(pose, count_matches(matches, pose)) if R[:, 2] @ up_cam >= cos_tilt else None
 
 

@@ -8,17 +8,16 @@ from ..optimize.channel_loss import geman_mcclure
 from ..optimize.levenberg_marquardt import levenberg_marquardt
 from ..optimize.normal_equations import COUNT, GRADIENT, LOSS, MATRIX
 
-TOLERANCE = 1e-7  # [rad + m] a shorter step ends the descent
-
 
 @kernel
 def angular_equations(problem, R_cam_from_map, center_map, sums):
-    """Write the sums (29,) of normal_equations for bearings (N, 3), points (N, 3), weights (N,), scale [rad].
+    """Write the sums (29,) of normal_equations for bearings (N, 3), points (N, 3) [m], scale [rad].
 
+    The scale is that of Geman and McClure's loss: what is off by much more hardly counts.
     The residual is u - b, with u the unit ray to the point and b the bearing. At distance r,
     du = w x u - (I - u u^T) d / r: its rows add up to products of u and b: no Jacobian is stored.
     """
-    bearings, points, weights, scale = problem
+    bearings, points, scale = problem
     inverse_scale2 = 1.0 / (scale * scale)
     sums[:] = 0.0
     for n in range(len(points)):
@@ -31,9 +30,8 @@ def angular_equations(problem, R_cam_from_map, center_map, sums):
         bx, by, bz = row(bearings, n)
         square = (x - bx) ** 2 + (y - by) ** 2 + (z - bz) ** 2
         loss, w = geman_mcclure(square, inverse_scale2)
-        sums[LOSS] += weights[n] * loss
-        sums[COUNT] += weights[n]
-        w *= weights[n]
+        sums[LOSS] += loss
+        sums[COUNT] += 1.0
         v = w * inverse
         along = x * bx + y * by + z * bz
         gradient = (
@@ -54,14 +52,3 @@ def angular_equations(problem, R_cam_from_map, center_map, sums):
 
 
 descend_matches = kernel(levenberg_marquardt(angular_equations))
-
-
-@kernel
-def refine_pose(bearings, points, weights, R_cam_from_map, center_map, num_iterations, scale):
-    """Move a pose, (3, 3) and (3,) in place, to where bearings and points agree best; returns the loss there.
-
-    Bearings (N, 3) are unit rays in the camera's frame, points (N, 3) [m], weights (N,); the scale [rad] is
-    that of Geman and McClure's loss: what is off by much more hardly counts.
-    """
-    problem = bearings, points, weights, scale
-    return descend_matches(problem, num_iterations, TOLERANCE, R_cam_from_map, center_map)

@@ -62,6 +62,11 @@ class Frame:
     how: How = "none"
     alone: Localization | None = None  # if it was searched without regard to the others
 
+    def put(self, states: list[State], how: How) -> None:
+        """Set its poses, and where they come from."""
+        self.states = states
+        self.how = how
+
     @property
     def is_credible(self) -> bool:
         """True if its poses are more likely than that it has none."""
@@ -153,5 +158,5 @@ def _state_from_json(document: dict[str, Any]) -> State:
     if document["covariance"] is not None:
         direction = str(document["least_constrained_direction"])
         covariance = PoseCovariance(np.array(document["covariance"]), direction)
-    odds, score = float(document["log_odds"]), float(document["score"])
-    return State(pose, odds, score, covariance, document["num_matches"])
+    odds = float(document["log_odds"])
+    return State(pose, odds, float(document["score"]), covariance, document["num_matches"])

@@ -74,7 +74,7 @@ def new_differences(behind: Array, share: float) -> Array:
 
 def share_moved(before: Frame, frame: Frame) -> float:
     """Fraction of a new place that a frame shows, by how far the camera has moved at least."""
-    starts, ends = centers_of(before.likely), centers_of(frame.likely)
+    starts, ends = (centers_of(f.likely) for f in (before, frame))
     moved = float(np.linalg.norm(ends[:, None] - starts[None], axis=2).min())
     return min(moved / TELLING_DISTANCE, 1.0)
 
