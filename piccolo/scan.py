@@ -31,8 +31,7 @@ from .paper.localize import PaperMap
 from .paper.localize import localize as localize_by_paper
 from .paper.settings import PaperSettings
 from .result import Result, Source, result_of
-from .scan_map.named_scans import check_within
-from .scan_map.places import with_places
+from .scan_map.named_scans import check_within, with_places
 from .scan_map.prior import GpsPrior, Prior, gps_prior
 from .scan_map.scan_map import ScanMap
 from .scan_walk import Walk, WalkAbout, photo_facts

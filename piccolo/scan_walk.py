@@ -18,7 +18,7 @@ from .localization.query import Query
 from .panorama import Panorama, ReadOptions, read_query
 from .panorama.photo import Photo, photo_of, photo_of_array, sha256_of
 from .result import Failure, Result, Source, failure_of, result_of, unreadable_result
-from .scan_map.places import with_places
+from .scan_map.named_scans import with_places
 from .walk.frames import Frame, checked_times
 from .walk.localize import WalkFrame, alone_of, localization_of, localizations_of
 from .walk.second_look import finished

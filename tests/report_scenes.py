@@ -12,7 +12,7 @@ from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.result import Result, Source, unreadable_result
 from piccolo.scenes.synthetic.world import make_world, photograph, pose_of_query, scan_world
-from piccolo.views.surfel_renderer import encode_image
+from piccolo.views.pictures import encode_image
 from piccolo.walk.localize import Gap, WalkFrame
 
 SIZE = np.array([4.5, 3.5, 2.5])

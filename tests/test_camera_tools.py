@@ -19,7 +19,7 @@ from piccolo.result import read_results
 from piccolo.scenes.scene import read_scene
 from piccolo.scenes.synthetic.photographs import picture_by
 from piccolo.scenes.synthetic.world import make_world, photograph, pose_of_query
-from piccolo.views.field import cut, sphere_width_for
+from piccolo.views.pictures import cut, sphere_width_for
 
 WIDE = Camera("OPENCV", 480, 400, (150.0, 152.0, 245.0, 198.0, -0.02, 0.001, 1e-3, -1e-3))
 TURN = tuple(map(tuple, exp_so3(np.radians([0.0, 0.0, 90.0])).tolist()))

@@ -63,11 +63,6 @@ def test_no_more_than_so_many_are_kept_and_those_given_out_stay(monkeypatch):
             np.testing.assert_array_equal(found[rows], wanted)
 
 
-def test_no_memory_is_asked_for_no_views(monkeypatch):
-    monkeypatch.setattr(candidate_views, "check_memory", lambda *_: pytest.fail("asked"))
-    assert len(candidate_views.empty_views(0, 10).centers) == 0
-
-
 def test_threads_may_ask_at_once():
     m, kept = _views()
     found, errors = {}, []
@@ -105,17 +100,11 @@ def test_wide_views_are_averages_of_fine_ones():
     assert m.wide_seen.max() == 255
 
 
+@pytest.mark.parametrize("render", [render_views, render_wide])
 @pytest.mark.parametrize("count", [0, 200])
-def test_wide_views_have_the_same_bits_for_any_number_of_threads(count):
+def test_views_have_the_same_bits_for_any_number_of_threads(render, count):
     m, _ = _views()
-    one, two = (render_wide(m.octree, m.centers[:count], SEARCH_VIEW, Workers(n)) for n in (1, 2))
+    one, two = (render(m.octree, m.centers[:count], SEARCH_VIEW, Workers(n)) for n in (1, 2))
     for a, b in zip(one, two, strict=True):
         assert len(a) == count
-        np.testing.assert_array_equal(a, b)
-
-
-def test_views_have_the_same_bits_for_any_number_of_threads():
-    m, _ = _views()
-    one, two = (render_views(m.octree, m.centers[:200], SEARCH_VIEW, Workers(n)) for n in (1, 2))
-    for a, b in zip(one, two, strict=True):
         np.testing.assert_array_equal(a, b)

@@ -12,7 +12,6 @@ from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
 from piccolo.opening import open_scan
 from piccolo.scan_map import open_map, scan_map
-from piccolo.scan_map.late_features import LateFeatures
 from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.open_map import CachePolicy
 
@@ -56,7 +55,7 @@ def test_they_are_made_once_and_threads_wait_for_them():
         assert go_on.wait(60)
         return "features"
 
-    late = LateFeatures(make)
+    late = scan_map.LateFeatures(make)
     for _ in range(3):
         threads.append(threading.Thread(target=lambda: got.append(late.get(WORKERS))))
         threads[-1].start()

@@ -98,25 +98,6 @@ def test_halves_of_the_views_are_every_other_one_and_find_what_all_find():
         assert cosine.max(axis=0).min() > np.cos(np.radians(60.0))  # each has neighbours of the other
 
 
-def test_views_are_perspective_and_of_the_pictures_resolution():
-    """A picture of the rays themselves, remapped, shows those of a pinhole."""
-    for k in (0, 9, 16):
-        view = perspective_views(256)[k]
-        middle = len(view.rows) // 2
-        step = np.hypot(*np.diff(np.stack([view.columns, view.rows])[:, middle, middle : middle + 2], axis=1))
-        assert abs(step[0] * np.cos(np.radians(VIEWS_DEG[k][1])) - 1.0) < 0.1
-        u, v = view.columns - 8 + 0.5, view.rows - 8 + 0.5
-        azimuth, elevation = (0.5 - u / 256) * 2 * np.pi, (0.5 - v / 128) * np.pi
-        rays = np.stack(
-            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-        )
-        x, y, z = np.tensordot(view.R_sphere_from_view.T, rays, axes=1)
-        np.testing.assert_allclose(np.diff(y / x, axis=1), np.diff(y / x, axis=1).mean(), atol=1e-4)
-        np.testing.assert_allclose(np.diff(z / x, axis=0), np.diff(z / x, axis=0).mean(), atol=1e-4)
-        assert y[0, 0] > 0 > y[0, -1]
-        assert z[0, 0] > 0 > z[-1, 0]
-
-
 def test_masked_areas_have_none():
     is_valid = np.ones((WIDTH // 2, WIDTH), bool)
     is_valid[:, 100:300] = False

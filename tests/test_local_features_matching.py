@@ -13,16 +13,14 @@ from piccolo.local_features import feature_map
 from piccolo.local_features.feature_map import (
     LIST_SIZE,
     NUM_COMPONENTS,
-    features_of_view,
     list_middles,
     make_feature_map,
     nearest_middle,
     principal_components,
     project,
 )
-from piccolo.local_features.keypoints import Keypoints, find_keypoints
+from piccolo.local_features.keypoints import Keypoints
 from piccolo.local_features.matching import APART, FAR, NUM_NEIGHBORS, match, nearest_lists, search_lists
-from piccolo.local_features.view_image import render_gray
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
 
@@ -137,15 +135,6 @@ def test_the_maps_features_lie_on_its_surfaces_and_in_one_list_each():
     assert np.abs(across).max() < 0.02
 
 
-def test_a_view_knows_from_where_it_saw_its_features():
-    center = _centers()[0]
-    view = features_of_view(rooms.scan_map(1).octree, center)
-    rays = (view.points - center) / np.linalg.norm(view.points - center, axis=1, keepdims=True)
-    np.testing.assert_allclose(view.directions / 127.0, rays, atol=0.005)
-    angle = view.sizes / np.linalg.norm(view.points - center, axis=1)
-    assert 0.005 < angle.min() < angle.max() < 1.0
-
-
 def test_same_bits_for_any_number_of_threads_and_none_where_nothing_is():
     octree = rooms.scan_map(1).octree
     one, two = (make_feature_map(octree, _centers(), Workers(k)) for k in (1, 2))
@@ -205,16 +194,3 @@ def test_matches_come_in_the_photos_order_the_distinct_ones_weigh_most(matches):
     assert np.median(np.sum(tangents * matches.ray_tangents, axis=1)[is_right]) > 0.9
     ranges = np.linalg.norm(matches.points - true_pose.center_world, axis=1)
     assert abs(np.log(np.median((matches.sizes / (matches.angles * ranges))[is_right]))) < 0.2
-
-
-def test_a_map_is_matched_with_itself():
-    """The features of a view that is in the map find themselves."""
-    center = _centers()[0]
-    octree = rooms.scan_map(1).octree
-    own = make_feature_map(octree, center[None], Workers())
-    view = render_gray(octree, center, 640)
-    keypoints = find_keypoints(view.gray, view.is_filled)
-    found = match(keypoints, own, Workers(2))
-    first = np.flatnonzero(np.diff(found.query, prepend=-1))
-    gaps = np.linalg.norm(np.cross(found.rays[first], found.directions[first]), axis=1)
-    assert (gaps < 0.02).mean() > 0.8  # some are seen where the scan has no point, and left out of the map

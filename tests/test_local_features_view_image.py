@@ -8,7 +8,7 @@ from piccolo.cloud.octree import build_octree
 from piccolo.cloud.stream import Cloud
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
-from piccolo.local_features.view_image import NOTHING, fill_gaps, is_in_front, render_gray
+from piccolo.local_features.view_image import fill_gaps, render_gray
 from piccolo.scenes.synthetic.raycast import cast_rays
 
 WIDTH = 256
@@ -67,20 +67,6 @@ def test_what_is_seen_through_a_thin_scan_is_dropped():
     assert (view.gray[is_inner & view.is_filled] > 200).all()
     aside = pixel_rays(WIDTH)[..., 0] < 0.3
     np.testing.assert_allclose(view.ranges[aside & (view.ranges > 0)], 4.0, rtol=0.02)
-
-
-def test_a_pixel_is_in_front_if_anything_around_it_is_as_far():
-    ranges = np.full((32, 64), 5.0, np.float32)
-    ranges[::4, ::4] = 1.0  # in each of the wider pixels
-    assert (is_in_front(ranges) == (ranges == 1.0)).all()
-    ranges[8:12, 0:4] = 5.0  # but for one at the seam: so nothing around it is hidden either
-    shown = is_in_front(ranges)
-    assert shown[4:16, 0:8].all()
-    assert shown[4:16, -4:].all()
-    assert (shown[20:] == (ranges[20:] == 1.0)).all()
-    ranges[0, 0] = NOTHING
-    assert not is_in_front(ranges)[0, 0]
-    assert is_in_front(np.full((16, 32), 1.19, np.float32) * np.float32([[1.0, 1 / 1.19] * 16])).all()
 
 
 @pytest.mark.parametrize(("gap", "is_closed"), [(3, True), (6, True), (100, False)])

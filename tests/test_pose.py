@@ -72,12 +72,6 @@ def test_orthonormal_repairs_drift():
     np.testing.assert_allclose(poses.orthonormal(rough), U @ Vt, atol=1e-12)
 
 
-def test_upright_camera_looks_along_its_yaw():
-    yaw = 0.7
-    forward = poses.yaw_rotation(yaw).T @ [1.0, 0.0, 0.0]
-    np.testing.assert_allclose(forward, [np.cos(yaw), np.sin(yaw), 0.0], atol=1e-12)
-
-
 def test_rotations_are_checked_to_a_tolerance():
     R = poses.exp_so3(VECTORS[2])
     poses.checked_rotation(R + 4e-4, 1e-2, "R")

@@ -43,7 +43,7 @@ def test_poses_near_one_place_share_what_is_drawn_and_no_others(monkeypatch):
 
     original = recent_views.average_view
     monkeypatch.setattr(recent_views, "average_view", average_view)
-    views = recent_views.recent_views(octree)
+    views = recent_views.RecentViews(octree)
     here, near, far = _pose(0.296, 0.2, 0.3), _pose(0.304, 0.197, 0.304), _pose(0.306, 0.2, 0.3)
     places = [recent_views.place_of(pose) for pose in (here, near, far)]
     assert places[0] == places[1] != places[2]
@@ -60,7 +60,7 @@ def test_views_and_points_count_from_their_place():
     query, pose = _query(), _pose(0.307, 0.191, 0.304)
     place = recent_views.place_of(pose)
     expected = rooms.view(query.scan_map.octree, place, FINE, ALL)
-    points = visible_points(query.scan_map.octree, place, FULL, ALL, 30_000)
+    points = visible_points(query.scan_map.octree, place, FULL, ALL.tobytes(), 30_000)
     for found, wanted in ((query.view_at(pose, FINE), expected), (query.points_at(pose), points)):
         for values, others in zip(found, wanted, strict=True):
             np.testing.assert_array_equal(values, others)

@@ -6,7 +6,7 @@ import rooms
 from rooms import errors
 
 from piccolo.geometry.pose import Pose, step, yaw_rotation
-from piccolo.optimize.refine import Adam, Best, descend_lbfgs, refine, sampling_loss_of
+from piccolo.optimize.refine import Adam, Refined, descend_lbfgs, refine, sampling_loss_of
 from piccolo.panorama.texels import pack_texels
 from piccolo.paper.settings import PaperSettings
 
@@ -45,7 +45,7 @@ def test_adams_first_step_is_the_step_size_against_the_gradient():
 
 
 def test_best_iterate_is_kept_not_the_last():
-    best = Best(Pose(np.eye(3), np.zeros(3)))
+    best = Refined(Pose(np.eye(3), np.zeros(3)))
     for x, loss in ((1.0, 0.5), (2.0, 0.3), (3.0, 0.4)):
         best.offer(Pose(np.eye(3), np.array([x, 0, 0])), loss)
     assert best.loss == 0.3

@@ -25,13 +25,6 @@ def test_a_cells_centre_lies_in_it(num_rings):
     np.testing.assert_array_equal(cell_of(grid.directions, num_rings), np.arange(len(grid)))
 
 
-def test_random_directions_fall_into_cells_by_solid_angle():
-    directions = np.random.default_rng(0).normal(size=(200_000, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    counts = np.bincount(cell_of(directions, 12), minlength=len(make_grid(12)))
-    np.testing.assert_allclose(counts / 200_000, make_grid(12).solid_angle, rtol=0.2)
-
-
 def test_neighbours_are_near_and_weighted_by_a_gaussian():
     near, grid = make_neighbors(24, 14.0), make_grid(24)
     for cell in (0, len(grid) // 2, len(grid) - 1):

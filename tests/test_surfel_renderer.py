@@ -10,15 +10,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import mutated, read_or_refused
 
+from piccolo.cli.transform_file import read_pose_matrix
 from piccolo.cloud.soa import LocalCloud, pack_points
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose, T_world_from_cam, angle_between, exp_so3, read_pose_matrix, step
+from piccolo.geometry.pose import Pose, T_world_from_cam, angle_between, exp_so3, step
 from piccolo.geometry.rotations import R_cam_from_angles, heading_pitch_roll_deg
-from piccolo.geometry.sphere import pixel_rays
+from piccolo.geometry.sphere import pixel_rays, pixels_of
 from piccolo.jobs.threads import Workers
 from piccolo.scenes.synthetic.raycast import cast_rays
-from piccolo.views.surfel_renderer import encode_image, fill_holes, render_points
-from piccolo.views.surfels import BAND, BAND_OFFSET, MAX_SLOPE, MIN_RADIUS_PX, splat, surfels_of
+from piccolo.views.pictures import encode_image, fill_holes
+from piccolo.views.surfels import (
+    BAND,
+    BAND_OFFSET,
+    MAX_SLOPE,
+    MIN_RADIUS_PX,
+    axes_of_pixels,
+    render_points,
+    splat,
+    surfels_of,
+)
 from piccolo.views.zbuffer import View
 
 WORKERS = Workers(2)
@@ -57,14 +67,14 @@ def test_splat_equals_its_twin_over_seam_and_poles():
     surfels = np.column_stack([center, normal, along, radius**-2.0, distance]).astype(np.float32)
     rgb = rng.integers(0, 256, (300, 3), dtype=np.uint8)
     angles = np.maximum(np.arcsin(radius / distance), MIN_RADIUS_PX * 2 * np.pi / 64)
-    azimuth, elevation = np.arctan2(center[:, 1], center[:, 0]), np.arcsin(center[:, 2] / distance)
-    directions = np.stack([azimuth, elevation], axis=1)
+    extents = np.column_stack([*pixels_of(center, 64), angles])
+    axes = axes_of_pixels(64)
     depth, sums = np.full((32, 64), np.inf, np.float32), np.zeros((32, 64, 5), np.float32)
     packed = pack_points(center.astype(np.float32), rgb).rgbx
     for lo in (0, 11):  # two strips of rows
         part = slice(lo, 11 if lo == 0 else 32)
-        splat(surfels, packed, directions, angles, lo, depth[part], sums[:0])
-        splat(surfels, packed, directions, angles, lo, depth[part], sums[part])
+        splat(surfels, packed, extents, *axes, lo, depth[part], sums[:0])
+        splat(surfels, packed, extents, *axes, lo, depth[part], sums[part])
     limits = MIN_RADIUS_PX, MAX_SLOPE, BAND, BAND_OFFSET
     expected_depth, expected_rgb = naive.splat(surfels.astype(float), rgb, 64, *limits)
     is_seen = sums[..., 4] > 0

@@ -59,21 +59,13 @@ def test_cells_that_are_not_shown_change_nothing_elsewhere(octree):
     channels = naive.normalized_cells(twin[1], (twin[2] > 0) & shown, 24, 16, 22.0)
     both = part.weights > 0
     assert np.abs(part.channels[:, both] - channels[both].T).mean() < 0.01
-    points = visible_points(octree, center, LEAVES, shown, 3000)
+    points = visible_points(octree, center, LEAVES, shown.tobytes(), 3000)
     assert shown[_cells(points.offsets.T)].mean() > 0.99
-
-
-def test_coarser_voxels_far_away_change_a_view_little(octree):
-    center = rooms.scene(1)[2].center_world
-    exact, coarse = (rooms.view(octree, center, kind, ALL) for kind in (LEAVES, SEARCH_VIEW))
-    both = (exact[2] > 0) & (coarse[2] > 0)
-    product = (exact[1] * coarse[1])[:, both].sum()
-    assert product / np.sqrt((exact[1][:, both] ** 2).sum() * (coarse[1][:, both] ** 2).sum()) > 0.8
 
 
 def test_points_that_are_seen_lie_at_the_front_and_are_bounded(octree):
     center = rooms.scene(1)[2].center_world
-    offsets, _, weights, _ = visible_points(octree, center, LEAVES, ALL, 3000)
+    offsets, _, weights, _ = visible_points(octree, center, LEAVES, ALL.tobytes(), 3000)
     assert 1000 < len(weights) <= 3000
     ranges = np.linalg.norm(offsets, axis=0)
     nearest = np.full(len(make_grid(24)), np.inf)
@@ -124,13 +116,6 @@ def test_every_other_centre_is_seen_by_the_kernel_that_sees_all(octree):
     compiled = list(view.nearest_ranges.signatures)
     np.testing.assert_array_equal(view.ranges_around(octree, centers[::2], SEARCH_VIEW), ranges[::2])
     assert view.nearest_ranges.signatures == compiled
-
-
-def test_top_surfaces_have_nothing_right_above(octree):
-    surfaces = camera_positions.top_surfaces(octree)
-    cells = camera_positions.supported_cells(surfaces)
-    assert len(np.unique(cells, axis=0)) == len(cells)
-    assert surfaces[:, 2].min() < -1.0  # the floor is among them
 
 
 def test_coverage_is_all_inside_and_little_outside(octree):

@@ -8,7 +8,6 @@ from piccolo.geometry.pose import Pose
 from piccolo.walk.frames import COPY_LOG_ODDS, OTHER_LOG_ODDS, Frame, Motion, State, centers_of, checked_times
 from piccolo.walk.path import (
     LEAST_TOLD,
-    MOST_EXPECTED,
     TELLING_LOG,
     UNLISTED,
     emissions,
@@ -159,16 +158,6 @@ def test_a_list_that_ends_in_a_copy_tells_as_little():
     assert lattice_of([short], Open(), MOTION).filtered().sum() > 0.9
 
 
-def test_one_search_tells_as_much_as_the_camera_has_moved():
-    def unlisted(step):
-        frames = [_frame(k, ((step * k, 0, 0), 8.0)) for k in range(2)]
-        return lattice_of(frames, Open(1.0), MOTION).unlisted[1].emitted
-
-    assert unlisted(0.0) == pytest.approx(8.0 - LEAST_TOLD * TELLING_LOG)
-    assert unlisted(1.0) == pytest.approx(8.0 - TELLING_LOG / 2)
-    assert unlisted(9.0) == pytest.approx(8.0 - TELLING_LOG)
-
-
 def test_a_wrong_copy_that_was_followed_ends_where_the_scan_is_searched():
     """The true place was lost for a while, and a copy of it was followed; then a place that there is once."""
     true = [_frame(k, ((k, 0, 0), 6.0)) for k in range(5)]
@@ -227,34 +216,6 @@ def test_a_jump_has_a_price_and_is_reported():
     path = lattice_of(lonely, Open(), MOTION).smoothed()
     assert path.chosen == [0, 0, 0, 0, None, 0]
     assert path.probabilities[4][0] < 0.01
-
-
-def test_a_pose_where_it_was_to_be_expected_gains():
-    frames = [_frame(0, ((0, 0, 0), 5.0)), _frame(1, ((0.5, 0, 0), 0.0))]
-    space = Open(1.0)
-    assert lattice_of(frames, space, MOTION).smoothed().probabilities[1][0] == pytest.approx(0.5, abs=0.02)
-    space.share = 0.1
-    assert lattice_of(frames, space, MOTION).smoothed().probabilities[1][0] == pytest.approx(
-        10 / 11, abs=0.01
-    )
-    space.share = 1e-6
-    most = np.exp(MOST_EXPECTED)
-    found = lattice_of(frames, space, MOTION).smoothed().probabilities[1][0]
-    assert found == pytest.approx(most / (1 + most), abs=0.01)
-
-
-def test_frames_without_a_pose_are_passed_over():
-    frames = [
-        _frame(0, ((0, 0, 0), 5.0)),
-        Frame(1.0),
-        Frame(2.0),
-        _frame(3, ((2.5, 0, 0), 5.0), ((9, 0, 0), 5.0)),
-    ]
-    path = lattice_of(frames, Open(), MOTION).smoothed()
-    assert path.chosen == [0, None, None, 0]
-    assert path.probabilities[3][1] < 1.1 * np.exp(-TELLING_LOG)  # as likely as that the walk begins there
-    assert path.gaps == [None] * 4
-    assert lattice_of([Frame(0.0)], Open(), MOTION).smoothed().chosen == [None]
 
 
 def test_refusals():

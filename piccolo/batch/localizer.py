@@ -25,7 +25,7 @@ from ..result import Failure, Result, Source, failure_of, named, unreadable_resu
 from ..scan import Scan, Settings, settings_json
 from ..scan_map.map_file import load_map
 from ..scan_map.open_map import CachePolicy
-from ..views.surfel_renderer import encode_image, overlay_png
+from ..views.pictures import encode_image, overlay_png
 from .priors import PriorTable
 
 

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry.pose import Array
+from ..geometry.sphere import pixels_of, rays_of
 
 MAX_STEPS = 25  # of Newton; five are usual
 LEAST = 1e-12  # of the denominator
@@ -251,14 +252,13 @@ class Camera:
 
         Pixels of rays that are not in the picture mean nothing.
         """
+        if self.lens == SPHERE:
+            u, v = pixels_of(rays, self.width)
+            return np.stack([u, v * (2.0 * self.height / self.width)], axis=-1), np.ones(u.shape, np.bool_)
         forward = rays[..., 0]
         right = -rays[..., 1]
         down = -rays[..., 2]
         across = np.sqrt(right * right + down * down)
-        if self.lens == SPHERE:
-            u = self.width * (0.5 + np.arctan2(right, forward) / (2.0 * math.pi))
-            v = self.height * (0.5 + np.arctan2(down, np.hypot(right, forward)) / math.pi)
-            return np.stack([u, v], axis=-1), np.ones(u.shape, np.bool_)
         if self.lens == PERSPECTIVE:
             is_in = (forward > 0.0) & (across <= math.tan(self.max_angle) * forward)
             per = 1.0 / np.where(is_in, forward, np.inf)
@@ -280,10 +280,7 @@ class Camera:
         """Unit rays (..., 3) of pixels (..., 2), and which of them there are (...)."""
         u, v = np.moveaxis(np.asarray(pixels, np.float64), -1, 0)
         if self.lens == SPHERE:
-            azimuth = (u / self.width - 0.5) * 2.0 * math.pi
-            elevation = (v / self.height - 0.5) * math.pi
-            c = np.cos(elevation)
-            ray = np.stack([c * np.cos(azimuth), -c * np.sin(azimuth), -np.sin(elevation)], axis=-1)
+            ray = rays_of(u, v * (0.5 * self.width / self.height), self.width)
             return ray, np.ones(u.shape, np.bool_)
         x = (u - self._named["cx"]) / self.focal[0]
         y = (v - self._named["cy"]) / self.focal[1]

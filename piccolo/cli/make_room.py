@@ -28,7 +28,7 @@ from ..scenes.synthetic.world import (
     make_world,
     scan_world,
 )
-from ..views.surfel_renderer import encode_image
+from ..views.pictures import encode_image
 from .command import check_least, command, option
 from .errors import checking_options
 from .making_walks import add_walk_options, building_of, check_walk_usage, write_walks

@@ -17,7 +17,7 @@ from ..scenes.export.video import writing_video
 from ..scenes.synthetic.office import Office, make_office
 from ..scenes.synthetic.walk_frames import BAD_KINDS, WalkOptions, frames_of
 from ..scenes.synthetic.walking import Walker
-from ..views.surfel_renderer import encode_image
+from ..views.pictures import encode_image
 from .command import option
 from .errors import UsageError
 

@@ -15,7 +15,7 @@ from ..camera.files import read_calibration
 from ..cloud.soa import LocalCloud
 from ..errors import InputError
 from ..files.atomic import check_output, check_output_folder, is_stream, replacing_folder, write_atomically
-from ..geometry.pose import Pose, pose_errors, read_pose_matrix
+from ..geometry.pose import Pose, pose_errors
 from ..geometry.rotations import R_cam_from_angles
 from ..jobs.threads import Workers, num_cores
 from ..optimize.descent_animation import (
@@ -32,13 +32,14 @@ from ..panorama.texels import pack_texels
 from ..result import read_results
 from ..scan_map.open_map import open_points
 from ..scenes.scene import read_scene
-from ..views.field import cut_view, sphere_width_for
-from ..views.surfel_renderer import encode_image, fill_holes, render_points
+from ..views.pictures import cut_view, encode_image, fill_holes, sphere_width_for
+from ..views.surfels import render_points
 from .command import check_least, command, option, print_warnings
 from .errors import checking_options
 from .options import add_cloud_options, cloud_settings_from
 from .outputs import check_distinct, check_suffix, print_report
 from .progress import progress_bar
+from .transform_file import read_pose_matrix
 
 EPILOG = """\
 examples:

@@ -5,32 +5,29 @@ Points are turned term by term: BLAS sums in an order that depends on how many p
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..files.json_file import read_text
 
 Array = NDArray[np.float64]
 NEWTON_STEPS = 4  # from an error of 5 % to rounding
-MAX_DISTANCE, MAX_ANGLE = 0.1, math.radians(5.0)  # the paper's line between correct and wrong [m], [rad]
-MAX_FILE_SIZE = 65_536  # [byte] sixteen numbers and some comments
+MAX_DISTANCE = 0.1  # [m] the paper's line between correct and wrong
+MAX_ANGLE = math.radians(5.0)
 TINY = 1e-150  # sine of an angle; of smaller ones the direction is lost to underflow
-MAX_SKEW = 1e-3  # off a rotation, for matrices written with few digits
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the camera is and how it is turned."""
+    """Position and rotation of a camera."""
 
     R_cam_from_world: Array  # (3, 3) rotation, camera axes: +x image centre, +y left, +z up
     center_world: Array  # (3,) camera position [m]
 
     @property
     def key(self) -> bytes:
-        """What tells it from every other pose."""
+        """The bits of the pose."""
         return self.R_cam_from_world.tobytes() + self.center_world.tobytes()
 
 
@@ -104,7 +101,8 @@ def angle_between(R_a: Array, R_b: Array) -> float:
 
 def yaw_rotation(yaw: float) -> Array:
     """R_cam_from_world (3, 3) of an upright camera whose image centre looks along azimuth `yaw` [rad]."""
-    c, s = np.cos(yaw), np.sin(yaw)
+    c = np.cos(yaw)
+    s = np.sin(yaw)
     return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
@@ -166,28 +164,11 @@ def is_correct(pose: Pose | None, true_pose: Pose) -> bool:
     return distance < MAX_DISTANCE and angle < MAX_ANGLE
 
 
-def read_pose_matrix(path: Path) -> Pose:
-    """The pose in a text file of T_world_from_cam, 4 x 4 numbers; lines that begin with # are comments."""
-    wanted = "wanted the 4 x 4 numbers of T_world_from_cam"
-    lines = read_text(path, wanted, MAX_FILE_SIZE).splitlines()
-    rows = [line.replace(",", " ").split() for line in lines if line.split("#")[0].strip()]
-    try:
-        T = np.array(rows, dtype=np.float64)
-    except ValueError as error:  # words, lines of several lengths
-        raise InputError(f"{path}: found {error}, {wanted}") from error
-    if T.shape != (4, 4) or not np.isfinite(T).all():
-        shape = " x ".join(map(str, T.shape))
-        raise InputError(f"{path}: found {shape} numbers, not all finite or not as many, {wanted}")
-    if not np.allclose(T[3], [0.0, 0.0, 0.0, 1.0]):
-        raise InputError(f"{path}: the last row is not 0 0 0 1, {wanted}")
-    R_world_from_cam = orthonormal(checked_rotation(T[:3, :3], MAX_SKEW, f"{path}: the matrix on the left"))
-    return Pose(R_world_from_cam.T, T[:3, 3])
-
-
 def move(pose: Pose, T_target_from_source: Array, metres_per_unit: float) -> Pose:
     """A pose of the source in the target's coordinates, under a rigid transform (4, 4) in some unit."""
-    R, t = T_target_from_source[:3, :3], T_target_from_source[:3, 3] * metres_per_unit
-    return Pose(orthonormal(pose.R_cam_from_world @ R.T), R @ pose.center_world + t)
+    R = T_target_from_source[:3, :3]
+    center = R @ pose.center_world + T_target_from_source[:3, 3] * metres_per_unit
+    return Pose(orthonormal(pose.R_cam_from_world @ R.T), center)
 
 
 def rotate_points(points: Array, R_target_from_source: Array) -> Array:

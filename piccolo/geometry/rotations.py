@@ -34,8 +34,10 @@ def uniform_yaws(num_rotations: int) -> NDArray[np.float64]:
 def uniform_rotations(num_rotations: int) -> NDArray[np.float64]:
     """Rotations (num_rotations, 3, 3) spread evenly over SO(3) by the super-Fibonacci spiral."""
     s = np.arange(num_rotations) + 0.5
-    r, R = np.sqrt(s / num_rotations), np.sqrt(1.0 - s / num_rotations)
-    alpha, beta = 2.0 * np.pi * s / math.sqrt(2.0), 2.0 * np.pi * s / SUPER_FIBONACCI_PSI
+    r = np.sqrt(s / num_rotations)
+    R = np.sqrt(1.0 - s / num_rotations)
+    alpha = 2.0 * np.pi * s / math.sqrt(2.0)
+    beta = 2.0 * np.pi * s / SUPER_FIBONACCI_PSI
     quaternions = np.stack([r * np.sin(alpha), r * np.cos(alpha), R * np.sin(beta), R * np.cos(beta)], axis=1)
     rotations = np.stack([rotation_from_quaternion_wxyz(q) for q in quaternions])
     rotations.flags.writeable = False  # it is kept for the next query
@@ -49,7 +51,7 @@ def random_rotation(rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def turned(pose: Pose, other_from_cam: Array) -> Pose:
-    """The same camera, its rotation to other axes."""
+    """Return the camera with its rotation to other axes."""
     return Pose(other_from_cam @ pose.R_cam_from_world, pose.center_world)
 
 
@@ -61,7 +63,8 @@ def translation(pose: Pose) -> Array:
 def R_cam_from_angles(heading_deg: float, pitch_deg: float, roll_deg: float) -> Array:
     """R_cam_from_world (3, 3) of the angles [deg] that `heading_pitch_roll_deg` gives."""
     yaw = exp_so3(np.radians([0.0, 0.0, 90.0 - heading_deg]))
-    pitch, roll = exp_so3(np.radians([0.0, -pitch_deg, 0.0])), exp_so3(np.radians([roll_deg, 0.0, 0.0]))
+    pitch = exp_so3(np.radians([0.0, -pitch_deg, 0.0]))
+    roll = exp_so3(np.radians([roll_deg, 0.0, 0.0]))
     return np.asarray((yaw @ pitch @ roll).T)
 
 

@@ -10,6 +10,7 @@ As W = 2 H, both coordinates have the same scale: -W / 2 pi pixels a radian.
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,17 +79,17 @@ def pixel_jacobian(x, y, z, rho2, width):
 
 def pixel_rays(width: int, rows: slice = slice(None)) -> NDArray[np.float64]:
     """Unit camera directions (width / 2, width, 3) of pixel centres of a `width` image, or of its `rows`."""
-    return rays_at(width, np.arange(width) + 0.5, np.arange(width // 2)[rows] + 0.5)
+    return rays_of(np.arange(width) + 0.5, np.arange(width // 2)[rows, None] + 0.5, width)
 
 
-def rays_at(width: int, u: NDArray[np.floating], v: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Unit camera directions (len(v), len(u), 3) of columns and rows, continuous, of a `width` image."""
+def rays_of(u: Any, v: Any, width: int) -> NDArray[np.float64]:
+    """Unit camera directions (..., 3) of columns u and rows v (...), continuous, of a `width` image."""
     azimuth = (0.5 - u / width) * 2.0 * np.pi
-    elevation = (0.5 - v / (width // 2)) * np.pi
-    rays = np.empty((len(elevation), len(azimuth), 3))
-    rays[..., 0] = np.cos(elevation)[:, None] * np.cos(azimuth)
-    rays[..., 1] = np.cos(elevation)[:, None] * np.sin(azimuth)
-    rays[..., 2] = np.sin(elevation)[:, None]
+    elevation = (0.5 - v / (width / 2.0)) * np.pi
+    rays = np.empty((*np.broadcast_shapes(np.shape(u), np.shape(v)), 3))
+    rays[..., 0] = np.cos(elevation) * np.cos(azimuth)
+    rays[..., 1] = np.cos(elevation) * np.sin(azimuth)
+    rays[..., 2] = np.sin(elevation)
     return rays
 
 
@@ -151,11 +152,13 @@ def make_grid(num_rings: int) -> SphereGrid:
     middle = 0.5 * (edges[:-1] + edges[1:])
     num_columns = np.maximum(np.rint(2 * num_rings * np.cos(middle)), 3).astype(np.int32)
     first = np.concatenate([[0], np.cumsum(num_columns)[:-1]]).astype(np.int32)
-    directions, solid_angle = [], []
+    directions = []
+    solid_angle = []
     for ring in range(num_rings):
         n = num_columns[ring]
         azimuth = ((np.arange(n) + 0.5) / n - 0.5) * 2 * np.pi
-        c, s = np.cos(middle[ring]), np.sin(middle[ring])
+        c = np.cos(middle[ring])
+        s = np.sin(middle[ring])
         directions.append(np.stack([c * np.cos(azimuth), c * np.sin(azimuth), np.full(n, s)], axis=1))
         solid_angle.append(np.full(n, 0.5 * (np.sin(edges[ring]) - np.sin(edges[ring + 1])) / n))
     return SphereGrid(
@@ -169,7 +172,8 @@ def make_grid(num_rings: int) -> SphereGrid:
 @lru_cache(maxsize=8)
 def make_neighbors(num_rings: int, sigma_deg: float) -> Neighbors:
     """Gaussian weights of the cells of a grid within 2.3 sigmas of each cell."""
-    grid, sigma = make_grid(num_rings), np.radians(sigma_deg)
+    grid = make_grid(num_rings)
+    sigma = np.radians(sigma_deg)
     cosine = grid.directions @ grid.directions.T
     rows, cells = np.nonzero(cosine > np.cos(2.3 * sigma))
     weight = np.exp((cosine[rows, cells] - 1) / sigma**2) * grid.solid_angle[cells]
@@ -183,10 +187,12 @@ def interpolation(num_rings: int, coarse_rings: int) -> tuple[NDArray[np.int32],
 
     Two rings, of each two cells; beyond the last ring it is that ring on the other side of the pole.
     """
-    fine, coarse = make_grid(num_rings).directions.astype(np.float64), make_grid(coarse_rings)
+    fine = make_grid(num_rings).directions.astype(np.float64)
+    coarse = make_grid(coarse_rings)
     place = (0.5 - np.arcsin(np.clip(fine[:, 2], -1.0, 1.0)) / np.pi) * coarse_rings - 0.5
     turn = np.arctan2(fine[:, 1], fine[:, 0]) / (2.0 * np.pi) + 0.5
-    cells, weights = [], []
+    cells = []
+    weights = []
     for step in (0, 1):
         along = 1.0 - np.abs(place - np.floor(place) - step)
         beside = np.floor(place).astype(int) + step
@@ -216,10 +222,10 @@ def whole_areas(num_rings: int) -> NDArray[np.float32]:
 
 def cell_of(directions: NDArray[np.float32], num_rings: int) -> NDArray[np.int32]:
     """The cell (N,) of a grid in which each direction (N, 3) lies."""
-    d, grid = directions.astype(np.float64), make_grid(num_rings)
-    ring = np.clip(
-        ((0.5 - np.arcsin(np.clip(d[:, 2], -1, 1)) / np.pi) * num_rings).astype(int), 0, num_rings - 1
-    )
+    d = directions.astype(np.float64)
+    grid = make_grid(num_rings)
+    place = (0.5 - np.arcsin(np.clip(d[:, 2], -1, 1)) / np.pi) * num_rings
+    ring = np.clip(place.astype(int), 0, num_rings - 1)
     n = grid.num_columns[ring]
     column = np.minimum(((np.arctan2(d[:, 1], d[:, 0]) / (2 * np.pi) + 0.5) * n).astype(int), n - 1)
     return np.asarray(grid.first[ring] + column, dtype=np.int32)

@@ -5,28 +5,29 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels.jit import kernel
+from ..kernels.jit import copy_to, kernel
+from .vectors import dot, minus, row
 
 
 @kernel
 def suppress(rotations, centers, min_distance, min_trace, kept):
     """Write the indices of the poses, best first, that are near none kept before; returns how many."""
-    R, t = rotations, centers
-    x, y, z = np.empty(len(kept)), np.empty(len(kept)), np.empty(len(kept))
+    places = np.empty((len(kept), 3))
     count = 0
-    for k in range(len(t)):
+    for k in range(len(centers)):
         is_new = True
         for m in range(count):
-            dx, dy, dz = x[m] - t[k, 0], y[m] - t[k, 1], z[m] - t[k, 2]
-            if dx * dx + dy * dy + dz * dz < min_distance * min_distance:
+            gap = minus(row(places, m), row(centers, k))
+            if dot(gap, gap) < min_distance * min_distance:
                 trace = 0.0
                 for i in range(9):
-                    trace += R[k, i // 3, i % 3] * R[kept[m], i // 3, i % 3]
+                    trace += rotations[k, i // 3, i % 3] * rotations[kept[m], i // 3, i % 3]
                 if trace > min_trace:
                     is_new = False
                     break
         if is_new:
-            kept[count], x[count], y[count], z[count] = k, t[k, 0], t[k, 1], t[k, 2]
+            kept[count] = k
+            copy_to(places[count], centers[k])
             count += 1
             if count == len(kept):
                 break

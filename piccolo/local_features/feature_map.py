@@ -18,7 +18,8 @@ NUM_COMPONENTS = 64
 MAX_RANGE = 30.0  # [m] farther away the scan is too thin, and a match tells little of the position
 SAMPLE = 20_000  # descriptors from which the components and the lists' middles are learnt
 LIST_SIZE = 128  # features of a list, on average
-MAX_LISTS, MOST_VIEWS = 4096, 1 << 16
+MAX_LISTS = 4096
+MOST_VIEWS = 1 << 16
 GROWTH = 2  # of the features, by those for which the lists were made, before new ones are
 KMEANS_ROUNDS = 5
 BLOCK = 4096  # descriptors that are projected, or that a thread sorts into lists, at a time
@@ -41,7 +42,7 @@ class FeatureMap(NamedTuple):
 
 
 class FeaturesOfView(NamedTuple):
-    """The features of one view."""
+    """The features of one view, as of FeatureMap but for whole descriptors (F, 128)."""
 
     points: NDArray[np.float32]
     directions: NDArray[np.int8]
@@ -50,10 +51,11 @@ class FeaturesOfView(NamedTuple):
     descriptors: NDArray[np.uint8]
 
 
+_ROWS = np.empty((0, 3), np.int8)
 NO_FEATURES = FeaturesOfView(
     np.empty((0, 3), np.float32),
-    np.empty((0, 3), np.int8),
-    np.empty((0, 3), np.int8),
+    _ROWS,
+    _ROWS,
     np.empty(0, np.float32),
     np.empty((0, DESCRIPTOR_SIZE), np.uint8),
 )
@@ -65,7 +67,8 @@ def features_of_view(octree: Octree, center_map: NDArray[np.float64]) -> Feature
     found = find_keypoints(image.gray, image.is_filled)
     ranges = image.ranges[indices_of(found.rays, VIEW_WIDTH)]
     kept = np.flatnonzero((ranges > 0.0) & (ranges < MAX_RANGE))
-    found, ranges = found.take(kept), ranges[kept]
+    found = found.take(kept)
+    ranges = ranges[kept]
     return FeaturesOfView(
         np.asarray(center_map + found.rays * ranges[:, None], np.float32),
         np.rint(found.rays * 127.0).astype(np.int8),
@@ -146,14 +149,22 @@ def find_features(
     """The features of the views from some centres (N, 3) [m], and the view that each is from."""
     views = list(workers.map(lambda c: features_of_view(octree, c), list(centers), "find features"))
     joined: list[Any] = [np.concatenate(values) for values in zip(NO_FEATURES, *views, strict=True)]
-    counts = np.array([len(view[0]) for view in views], np.int64)
+    counts = np.array([len(view.points) for view in views], np.int64)
     return FeaturesOfView(*joined), np.repeat(np.arange(len(views), dtype=np.uint16), counts)
 
 
-def in_lists(
-    of_points: Sequence[NDArray[Any]], middles: NDArray[np.int8], workers: Workers
-) -> tuple[list[NDArray[Any]], NDArray[np.int32]]:
-    """The first six arrays of a FeatureMap sorted by the nearest of middles, and where each list begins."""
+def num_lists(num_features: int) -> int:
+    """The number of lists for so many features."""
+    return int(np.clip(num_features // LIST_SIZE, 1, MAX_LISTS))
+
+
+def put_in_lists(
+    of_points: Sequence[NDArray[Any]],
+    of_all: tuple[NDArray[np.float64], NDArray[np.int16], NDArray[np.int8]],
+    middles: NDArray[np.int8],
+    workers: Workers,
+) -> FeatureMap:
+    """The map of features by its first six arrays, in any order, its next three, and the lists' middles."""
     descriptors = of_points[4]
     nearest = np.empty(len(descriptors), np.int32)
 
@@ -163,12 +174,8 @@ def in_lists(
     list(workers.map(assign, range(0, len(descriptors), BLOCK), "sort features"))
     order = np.argsort(nearest, kind="stable")
     start = np.searchsorted(nearest[order], np.arange(len(middles) + 1)).astype(np.int32)
-    return [values[order] for values in of_points], start
-
-
-def num_lists(num_features: int) -> int:
-    """How many lists hold so many features."""
-    return int(np.clip(num_features // LIST_SIZE, 1, MAX_LISTS))
+    arrays: list[Any] = [*(values[order] for values in of_points), *of_all, middles, start]
+    return FeatureMap(*arrays)
 
 
 def make_feature_map(octree: Octree, centers: NDArray[np.float64], workers: Workers) -> FeatureMap:
@@ -176,12 +183,10 @@ def make_feature_map(octree: Octree, centers: NDArray[np.float64], workers: Work
     found, views = find_features(octree, centers, workers)
     mean, components = principal_components(found.descriptors[:: 1 + len(found.points) // SAMPLE])
     descriptors = project(found.descriptors, mean, components)
-    unsorted = (*found[:-1], descriptors, views)
+    of_points = (*found[:-1], descriptors, views)
     del found  # the room of its descriptors is needed
     middles = list_middles(descriptors, num_lists(len(descriptors)))
-    of_points, start = in_lists(unsorted, middles, workers)
-    of_all: list[Any] = [*of_points, centers, mean, components, middles, start]
-    return FeatureMap(*of_all)
+    return put_in_lists(of_points, (centers, mean, components), middles, workers)
 
 
 def extend_feature_map(
@@ -199,16 +204,14 @@ def extend_feature_map(
     if num_kept == 0:
         return make_feature_map(octree, centers, workers)
     found, views = find_features(octree, centers, workers)
-    descriptors = project(found.descriptors, old.mean, old.components)
     rows = np.flatnonzero(is_kept[old.views])
     renumbered = (np.cumsum(is_kept) - 1).astype(np.uint16)[old.views]
     known: list[Any] = [*old[:5], renumbered]
+    descriptors = project(found.descriptors, old.mean, old.components)
     more: list[Any] = [*found[:-1], descriptors, views + np.uint16(num_kept)]
     joined = [np.concatenate([a[rows], b]) for a, b in zip(known, more, strict=True)]
-    middles, wanted = old.middles, num_lists(len(joined[0]))
-    if wanted >= GROWTH * len(middles):
-        middles = list_middles(joined[4], wanted)
-    of_points, start = in_lists(joined, middles, workers)
-    all_centers = np.concatenate([old.view_centers[is_kept], centers])
-    of_all: list[Any] = [*of_points, all_centers, old.mean, old.components, middles, start]
-    return FeatureMap(*of_all)
+    middles = old.middles
+    if num_lists(len(joined[0])) >= GROWTH * len(middles):
+        middles = list_middles(joined[4], num_lists(len(joined[0])))
+    of_all = (np.concatenate([old.view_centers[is_kept], centers]), old.mean, old.components)
+    return put_in_lists(joined, of_all, middles, workers)

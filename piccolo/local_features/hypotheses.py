@@ -14,14 +14,16 @@ from numpy.typing import NDArray
 
 from ..geometry.pose import Array, Pose
 from ..geometry.suppression import non_maximum_suppression
+from ..geometry.vectors import cross, dot, minus, rotate, row
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, copy_to, inline_kernel, kernel
 from ..panorama.texels import in_camera, pose_float32
 from .matching import LEAST_WEIGHT, Matches
 from .p3p import p3p
-from .pose_refinement import refine_pose
+from .pose_refinement import descend_matches
 
-COS_ROUGH, COS_EXACT = math.cos(math.radians(20.0)), math.cos(math.radians(1.0))  # a match off by less agrees
+COS_ROUGH = math.cos(math.radians(20.0))  # a match off by less agrees roughly
+COS_EXACT = math.cos(math.radians(1.0))
 # in float32 first, and a little wider
 COS2_NEAR, COS2_CLOSE = (np.float32(math.cos(math.radians(angle)) ** 2) for angle in (20.1, 1.1))
 COS_TANGENT = math.cos(math.radians(40.0))
@@ -30,13 +32,16 @@ COS_TILT = math.cos(math.radians(12.0))  # by which a pose may be off the known 
 LEAST_ANGLE = np.float32(1e-6)  # [rad] of a keypoint
 MAX_VOTERS = 1200  # single matches whose poses are tried
 BATCH = 64  # of them a thread tries at a time
-CLUSTER_DISTANCE, CLUSTER_ANGLE = 1.0, math.radians(30.0)  # [m], [rad] rough poses nearer than both are one
-SAME_DISTANCE, SAME_ANGLE = 0.3, math.radians(10.0)  # exact poses nearer than both are one
-NUM_CLUSTERS, FIRST_CLUSTERS = 48, 8  # that are made exact: at most, and before it is asked which of the rest
+CLUSTER = (1.0, math.radians(30.0))  # [m], [rad] rough poses nearer than both are one
+SAME = (0.3, math.radians(10.0))  # exact poses nearer than both are one
+NUM_CLUSTERS = 48  # that are made exact, at most
+FIRST_CLUSTERS = 8  # of them, before it is asked which of the rest
 FAIR_PART = 0.2  # of the best pose's matches
 NUM_SAMPLES = 200  # of three matches, a cluster
 LEAST_MATCHES = 4  # that agree with a pose
-REFINEMENTS, REFINE_SCALE = 8, math.radians(0.5)  # steps, scale of the loss [rad]
+REFINEMENTS = 8  # steps
+REFINE_SCALE = math.radians(0.5)  # [rad] of the loss
+REFINE_TOLERANCE = 1e-7  # [rad + m] a shorter step ends the descent
 
 
 class MatchedPose(NamedTuple):
@@ -49,32 +54,26 @@ class MatchedPose(NamedTuple):
 @inline_kernel
 def agreement(m, j, R, t, cos_rough):
     """Cosine of a match's ray and its point as seen from a pose; -1 if that, size or tangent differ."""
-    dx, dy, dz = m.points[j, 0] - t[0], m.points[j, 1] - t[1], m.points[j, 2] - t[2]
-    x = R[0, 0] * dx + R[0, 1] * dy + R[0, 2] * dz
-    y = R[1, 0] * dx + R[1, 1] * dy + R[1, 2] * dz
-    z = R[2, 0] * dx + R[2, 1] * dy + R[2, 2] * dz
-    length = math.sqrt(x * x + y * y + z * z)
-    cosine = (x * m.rays[j, 0] + y * m.rays[j, 1] + z * m.rays[j, 2]) / max(length, 1e-9)
+    ray = rotate(R, minus(row(m.points, j), t))
+    length = math.sqrt(dot(ray, ray))
+    cosine = dot(ray, m.rays[j]) / max(length, 1e-9)
     if cosine < cos_rough:
         return -1.0
     ratio = m.sizes[j] / (length * m.angles[j])
     if not 1.0 / SIZE_RATIO < ratio < SIZE_RATIO:
         return -1.0
-    a, b, c = m.tangents[j, 0], m.tangents[j, 1], m.tangents[j, 2]
-    turn = m.ray_tangents[j, 0] * (R[0, 0] * a + R[0, 1] * b + R[0, 2] * c)
-    turn += m.ray_tangents[j, 1] * (R[1, 0] * a + R[1, 1] * b + R[1, 2] * c)
-    turn += m.ray_tangents[j, 2] * (R[2, 0] * a + R[2, 1] * b + R[2, 2] * c)
-    return cosine if turn > COS_TANGENT else -1.0
+    return cosine if dot(m.ray_tangents[j], rotate(R, m.tangents[j])) > COS_TANGENT else -1.0
 
 
 @inline_kernel
 def write_upright(m, j, R_cam_from_level, R):
     """Write the rotation (3, 3) whose yaw takes the azimuth of a match's direction to that of its ray."""
-    L, b, d = R_cam_from_level, m.rays[j], m.directions[j]
-    x = L[0, 0] * b[0] + L[1, 0] * b[1] + L[2, 0] * b[2]
-    y = L[0, 1] * b[0] + L[1, 1] * b[1] + L[2, 1] * b[2]
+    L = R_cam_from_level
+    d = m.directions[j]
+    x, y, _ = rotate(L.T, m.rays[j])
     per = 1.0 / max(math.sqrt((x * x + y * y) * (d[0] * d[0] + d[1] * d[1])), 1e-9)
-    c, s = (x * d[0] + y * d[1]) * per, (y * d[0] - x * d[1]) * per
+    c = (x * d[0] + y * d[1]) * per
+    s = (y * d[0] - x * d[1]) * per
     for i in range(3):
         R[i, 0] = L[i, 0] * c + L[i, 1] * s
         R[i, 1] = L[i, 1] * c - L[i, 0] * s
@@ -84,12 +83,11 @@ def write_upright(m, j, R_cam_from_level, R):
 @inline_kernel
 def write_turned(m, j, R):
     """Write the rotation (3, 3) that takes a match's direction and tangent to its ray and ray's tangent."""
-    b, u, d, v = m.rays[j], m.ray_tangents[j], m.directions[j], m.tangents[j]
+    cam = (m.rays[j], m.ray_tangents[j], cross(m.rays[j], m.ray_tangents[j]))
+    world = (m.directions[j], m.tangents[j], cross(m.directions[j], m.tangents[j]))
     for i in range(3):
-        n_i = b[(i + 1) % 3] * u[(i + 2) % 3] - b[(i + 2) % 3] * u[(i + 1) % 3]
         for h in range(3):
-            n_h = d[(h + 1) % 3] * v[(h + 2) % 3] - d[(h + 2) % 3] * v[(h + 1) % 3]
-            R[i, h] = b[i] * d[h] + u[i] * v[h] + n_i * n_h
+            R[i, h] = cam[0][i] * world[0][h] + cam[1][i] * world[1][h] + cam[2][i] * world[2][h]
 
 
 @inline_kernel
@@ -108,13 +106,16 @@ def find_near(points, rays, R, t, cos2, is_near):
 @inline_kernel
 def agreeing_weight(m, is_near, R, t):
     """Sum over the photo's features of the largest weight of a match that roughly agrees with a pose."""
-    total, last, best = 0.0, -1, F0
+    total = 0.0
+    last = -1
+    best = F0
     for i in range(len(m.query)):
         if not is_near[i]:
             continue
         if m.query[i] != last:
             total += best
-            last, best = m.query[i], F0
+            last = m.query[i]
+            best = F0
         if agreement(m, i, R, t, COS_ROUGH) > 0.0:
             best = max(best, m.weights[i])
     return total + best
@@ -126,28 +127,30 @@ def rough_poses(matches, columns, voters, R_cam_from_level, is_upright, rotation
 
     `columns` are the matches' points and rays once more, (3, M) each.
     """
-    m, is_near = matches, np.empty(len(matches.query), np.bool_)
+    m = matches
+    is_near = np.empty(len(m.query), np.bool_)
     for k in range(len(voters)):
-        j, R, t = voters[k], rotations[k], centers[k]
+        j = voters[k]
         distance = m.sizes[j] / max(m.angles[j], LEAST_ANGLE)
         for i in range(3):
-            t[i] = m.points[j, i] - distance * m.directions[j, i]
+            centers[k, i] = m.points[j, i] - distance * m.directions[j, i]
         if is_upright:
-            write_upright(m, j, R_cam_from_level, R)
+            write_upright(m, j, R_cam_from_level, rotations[k])
         else:
-            write_turned(m, j, R)
-        find_near(columns[0], columns[1], R, t, COS2_NEAR, is_near)
-        votes[k] = agreeing_weight(m, is_near, R, t)
+            write_turned(m, j, rotations[k])
+        find_near(columns[0], columns[1], rotations[k], centers[k], COS2_NEAR, is_near)
+        votes[k] = agreeing_weight(m, is_near, rotations[k], centers[k])
 
 
 @inline_kernel
-def count_exact(m, members, points, rays, is_near, R, t):
-    """How many features of the photo, of the matches `members`, agree with a pose to a degree.
+def count_exact(m, members, columns, is_near, R, t):
+    """Count the features of the photo, of the matches `members`, that agree with a pose to a degree.
 
-    The members' points and rays are in columns (3, n), too.
+    The members' points and rays are in columns (6, n), too.
     """
-    count, last = 0, -1
-    find_near(points, rays, R, t, COS2_CLOSE, is_near)
+    count = 0
+    last = -1
+    find_near(columns[:3], columns[3:], R, t, COS2_CLOSE, is_near)
     for k in range(len(members)):
         j = members[k]
         if is_near[k] and m.query[j] != last and agreement(m, j, R, t, COS_EXACT) > 0.0:
@@ -156,39 +159,32 @@ def count_exact(m, members, points, rays, is_near, R, t):
     return count
 
 
-@inline_kernel
-def columns_at(m, members):
-    """The points and rays (6, n) of some matches."""
-    columns = np.empty((6, len(members)), np.float32)
-    for k in range(len(members)):
-        for c in range(3):
-            columns[c, k], columns[3 + c, k] = m.points[members[k], c], m.rays[members[k], c]
-    return columns
-
-
 @kernel
-def sample_poses(matches, members, up_cam, cos_tilt, R_best, t_best):
+def sample_poses(matches, members, columns, up_cam, cos_tilt, R_best, t_best):
     """Write the pose, (3, 3) and (3,), of three members that most members agree with; returns how many do.
 
-    Poses whose vertical is off `up_cam` (3,) by more than the cosine says are left out. The samples are the
-    same in every run.
+    The members' points and rays are in columns (6, n), too. Poses whose vertical is off `up_cam` (3,) by more
+    than the cosine says are left out. The samples are the same in every run.
     """
-    m, best = matches, 0
-    bearings, points = np.empty((3, 3)), np.empty((3, 3))
-    rotations, centers = np.empty((4, 3, 3)), np.empty((4, 3))
-    columns, is_near = columns_at(m, members), np.empty(len(members), np.bool_)
+    best = 0
+    bearings = np.empty((3, 3))
+    points = np.empty((3, 3))
+    rotations = np.empty((4, 3, 3))
+    centers = np.empty((4, 3))
+    is_near = np.empty(len(members), np.bool_)
     state = np.uint32(12345)
     for _ in range(NUM_SAMPLES):
         for i in range(3):
             state = np.uint32(state * np.uint32(1664525) + np.uint32(1013904223))
-            j = members[np.int64(state >> np.uint32(8)) % len(members)]
+            k = np.int64(state >> np.uint32(8)) % len(members)
             for c in range(3):
-                bearings[i, c], points[i, c] = m.rays[j, c], m.points[j, c]
+                points[i, c] = columns[c, k]
+                bearings[i, c] = columns[3 + c, k]
         for k in range(p3p(bearings, points, rotations, centers)):
             R = rotations[k]
             if R[0, 2] * up_cam[0] + R[1, 2] * up_cam[1] + R[2, 2] * up_cam[2] < cos_tilt:
                 continue
-            count = count_exact(m, members, columns[:3], columns[3:], is_near, R, centers[k])
+            count = count_exact(matches, members, columns, is_near, R, centers[k])
             if count > best:
                 best = count
                 copy_to(R_best, R)
@@ -202,7 +198,8 @@ def list_members(matches, columns, R_cam_from_map, center_map, cos_rough, member
 
     `columns` as of `rough_poses`; the cosine is of 20 degrees at most.
     """
-    count, is_near = 0, np.empty(len(matches.query), np.bool_)
+    count = 0
+    is_near = np.empty(len(matches.query), np.bool_)
     find_near(columns[0], columns[1], R_cam_from_map, center_map, COS2_NEAR, is_near)
     for j in range(len(matches.query)):
         if is_near[j] and agreement(matches, j, R_cam_from_map, center_map, cos_rough) > 0.0:
@@ -219,13 +216,12 @@ def columns_of(matches: Matches) -> tuple[NDArray[np.float32], NDArray[np.float3
 def members_of(matches: Matches, pose: Pose, cos_rough: float) -> NDArray[np.int64]:
     """Indices of the matches that agree with a pose."""
     members = np.empty(len(matches.query), np.int64)
-    at = pose.R_cam_from_world, pose.center_world
-    count = list_members(matches, columns_of(matches), *at, cos_rough, members)
-    return members[:count]
+    R, t = pose.R_cam_from_world, pose.center_world
+    return members[: list_members(matches, columns_of(matches), R, t, cos_rough, members)]
 
 
 def count_matches(matches: Matches, pose: Pose) -> int:
-    """How many features of the photo a pose puts where the map has them."""
+    """Count the features of the photo that a pose puts where the map has them."""
     return len(np.unique(matches.query[members_of(matches, pose, COS_EXACT)]))
 
 
@@ -233,18 +229,19 @@ def exact_pose(matches: Matches, rough: Pose, R_cam_from_level: Array | None) ->
     """The pose that most matches near a rough one agree with, refined; None if they are too few."""
     up_cam = np.array([0.0, 0.0, 1.0]) if R_cam_from_level is None else R_cam_from_level[:, 2].copy()
     cos_tilt = -2.0 if R_cam_from_level is None else COS_TILT
-    members, R, t = members_of(matches, rough, COS_ROUGH), np.empty((3, 3)), np.empty(3)
-    is_enough = len(members) >= LEAST_MATCHES
-    if not is_enough or sample_poses(matches, members, up_cam, cos_tilt, R, t) < LEAST_MATCHES:
+    members = members_of(matches, rough, COS_ROUGH)
+    if len(members) < LEAST_MATCHES:
+        return None
+    pose = Pose(np.empty((3, 3)), np.empty(3))
+    R, t = pose.R_cam_from_world, pose.center_world
+    columns = np.ascontiguousarray(np.hstack([matches.points[members], matches.rays[members]]).T)
+    if sample_poses(matches, members, columns, up_cam, cos_tilt, R, t) < LEAST_MATCHES:
         return None
     for _ in range(2):
-        members = members_of(matches, Pose(R, t), COS_EXACT)
-        some = matches.rays[members].astype(np.float64), matches.points[members].astype(np.float64)
-        refine_pose(*some, np.ones(len(members)), R, t, REFINEMENTS, REFINE_SCALE)
-    if R[:, 2] @ up_cam < cos_tilt:
-        return None
-    pose = Pose(R, t)
-    return MatchedPose(pose, count_matches(matches, pose))
+        members = members_of(matches, pose, COS_EXACT)
+        rays, points = matches.rays[members].astype(np.float64), matches.points[members].astype(np.float64)
+        descend_matches((rays, points, REFINE_SCALE), REFINEMENTS, REFINE_TOLERANCE, R, t)
+    return MatchedPose(pose, count_matches(matches, pose)) if R[:, 2] @ up_cam >= cos_tilt else None
 
 
 def poses_of(
@@ -256,27 +253,25 @@ def poses_of(
     R_cam_from_level (3, 3) says how the camera was tilted, None if nobody knows.
     """
     voters = np.argsort(-matches.weights, kind="stable")[:MAX_VOTERS]
-    rotations, centers = np.empty((len(voters), 3, 3)), np.empty((len(voters), 3))
+    rotations = np.empty((len(voters), 3, 3))
+    centers = np.empty((len(voters), 3))
     votes = np.empty(len(voters))
+    is_upright = R_cam_from_level is not None
     level = np.eye(3) if R_cam_from_level is None else np.ascontiguousarray(R_cam_from_level, np.float64)
-
     columns = columns_of(matches)
 
     def vote(lo: int) -> None:
-        part = slice(lo, lo + BATCH)
-        how = level, R_cam_from_level is not None
-        rough_poses(matches, columns, voters[part], *how, rotations[part], centers[part], votes[part])
+        some, *out = (values[lo : lo + BATCH] for values in (voters, rotations, centers, votes))
+        rough_poses(matches, columns, some, level, is_upright, *out)
 
     list(workers.map(vote, range(0, len(voters), BATCH), "vote"))
     order = np.argsort(-votes, kind="stable")
-    R, t = rotations[order], centers[order]
-    kept = order[non_maximum_suppression(R, t, NUM_CLUSTERS, CLUSTER_DISTANCE, CLUSTER_ANGLE)]
-
-    def exact(k: int) -> MatchedPose | None:
-        return exact_pose(matches, Pose(rotations[k], centers[k]), R_cam_from_level)
+    kept = order[non_maximum_suppression(rotations[order], centers[order], NUM_CLUSTERS, *CLUSTER)]
 
     def exact_ones(clusters: NDArray[np.int64]) -> list[MatchedPose]:
-        return [f for f in workers.map(exact, list(clusters), "sample") if f]
+        rough = [Pose(rotations[k], centers[k]) for k in clusters]
+        ends = workers.map(lambda pose: exact_pose(matches, pose, R_cam_from_level), rough, "sample")
+        return [end for end in ends if end]
 
     found = exact_ones(kept[:FIRST_CLUSTERS])
     least = max([LEAST_MATCHES, *(FAIR_PART * f.num_matches for f in found)])
@@ -284,7 +279,6 @@ def poses_of(
     found += exact_ones(rest[votes[rest] >= LEAST_WEIGHT * least])  # others hardly have so many matches
     least = max([LEAST_MATCHES, *(FAIR_PART * f.num_matches for f in found)])
     found = sorted((f for f in found if f.num_matches >= least), key=lambda f: -f.num_matches)
-    if not found:
-        return []
-    R, t = np.array([f.pose.R_cam_from_world for f in found]), np.array([f.pose.center_world for f in found])
-    return [found[k] for k in non_maximum_suppression(R, t, count, SAME_DISTANCE, SAME_ANGLE)]
+    R = np.array([f.pose.R_cam_from_world for f in found]).reshape(-1, 3, 3)
+    t = np.array([f.pose.center_world for f in found]).reshape(-1, 3)
+    return [found[k] for k in non_maximum_suppression(R, t, count, *SAME)]

@@ -41,8 +41,12 @@ class Keypoints(NamedTuple):
         """Those of the picture turned over, left for right: rays and descriptors alike."""
         left_for_right = np.array([1.0, -1.0, 1.0], np.float32)
         histograms = self.descriptors.reshape(-1, 4, 4, 8)[:, ::-1, :, -np.arange(8) % 8]
-        rays, tangents = self.rays * left_for_right, self.tangents * left_for_right
-        return Keypoints(rays, tangents, self.sizes, histograms.reshape(-1, DESCRIPTOR_SIZE))
+        return Keypoints(
+            self.rays * left_for_right,
+            self.tangents * left_for_right,
+            self.sizes,
+            histograms.reshape(-1, DESCRIPTOR_SIZE),
+        )
 
 
 class PerspectiveView(NamedTuple):
@@ -61,11 +65,13 @@ def perspective_views(width: int) -> list[PerspectiveView]:
     side = round(2.0 * reach * width / (2.0 * math.pi))
     across = reach * (1.0 - (2.0 * np.arange(side) + 1.0) / side)
     left, up = np.meshgrid(across, across)
-    rays, turns, views = np.stack([np.ones_like(left), left, up], axis=-1), [], []
-    for azimuth, elevation in np.radians(VIEWS_DEG):
-        c, s, ce, se = math.cos(azimuth), math.sin(azimuth), math.cos(elevation), math.sin(elevation)
+    rays = np.stack([np.ones_like(left), left, up], axis=-1)
+    turns = []
+    for angles in np.radians(VIEWS_DEG):
+        (c, ce), (s, se) = np.cos(angles), np.sin(angles)
         turns.append(np.array([[c * ce, -s, -c * se], [s * ce, c, -s * se], [se, 0.0, ce]]))
     middles = np.stack(turns)[:, :, 0]
+    views = []
     for k, R in enumerate(turns):
         columns, rows = (np.asarray(a - 0.5 + MARGIN, np.float32) for a in pixels_of(rays @ R.T, width))
         is_nearest = np.argmax(rays @ R.T @ middles.T, axis=-1) == k
@@ -83,7 +89,8 @@ def find_keypoints(
     """The keypoints of an equirectangular picture (H, W), W = 2 H, where it is valid, in the views chosen."""
     views = perspective_views(gray.shape[1])
     middles = np.stack([view.R_sphere_from_view[:, 0] for view in views])
-    picture, mask = _with_margin(gray), _with_margin(is_valid.view(np.uint8) * np.uint8(255))
+    picture = _with_margin(gray)
+    mask = _with_margin(is_valid.view(np.uint8) * np.uint8(255))
 
     def find(k: int) -> Keypoints:
         view = views[k]

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.vectors import dot, minus, row
 from ..jobs.threads import Workers
 from ..kernels.jit import inline_kernel, kernel
 from .feature_map import FeatureMap, project, squared_gap
@@ -34,27 +35,22 @@ class Matches(NamedTuple):
     weights: NDArray[np.float32]  # (M,) how much it tells: 1 of a distinct one, else LEAST_WEIGHT
 
 
-_ROWS, _NUMBERS = np.empty((0, 3), np.float32), np.empty(0, np.float32)
+_ROWS = np.empty((0, 3), np.float32)
+_NUMBERS = np.empty(0, np.float32)
 NO_MATCHES = Matches(np.empty(0, np.int32), _ROWS, _ROWS, _NUMBERS, _ROWS, _ROWS, _ROWS, _NUMBERS, _NUMBERS)
 
 
 @inline_kernel
-def is_one_place(points, f, g):
-    """True if two features of the map are nearer to each other than APART."""
-    dx, dy, dz = points[f, 0] - points[g, 0], points[f, 1] - points[g, 1], points[f, 2] - points[g, 2]
-    return dx * dx + dy * dy + dz * dz < APART * APART
-
-
-@inline_kernel
 def place_taken(points, f, total, found, distances):
-    """Which of the features kept (K,) gives way to another: a worse one of the same place, or the last.
+    """Index of the feature kept (K,) that gives way to another: a worse one within APART, or the last.
 
     -1 if one of the same place is no worse.
     """
     for k in range(len(found)):
         if found[k] < 0:
             break
-        if is_one_place(points, f, found[k]):
+        gap = minus(row(points, f), row(points, found[k]))
+        if dot(gap, gap) < APART * APART:
             return k if total < distances[k] else -1
     return len(found) - 1
 
@@ -63,9 +59,11 @@ def place_taken(points, f, total, found, distances):
 def put_in_order(at, value, total, values, totals):
     """Write a value in place of that `at`, moved forward before all (K,) with a larger total."""
     while at > 0 and totals[at - 1] > total:
-        values[at], totals[at] = values[at - 1], totals[at - 1]
+        values[at] = values[at - 1]
+        totals[at] = totals[at - 1]
         at -= 1
-    values[at], totals[at] = value, total
+    values[at] = value
+    totals[at] = total
 
 
 @kernel
@@ -75,7 +73,8 @@ def search_lists(descriptors, probes, map_descriptors, list_start, points, found
     `probes` (N, P) are the lists to look through; -1 and FAR where there is no other. A nearer feature takes
     the place of the first kept one that is near it: of a few that stand in a row, two may stay.
     """
-    found[:], distances[:] = -1, FAR
+    found[:] = -1
+    distances[:] = FAR
     for i in range(len(descriptors)):
         for p in range(probes.shape[1]):
             for f in range(list_start[probes[i, p]], list_start[probes[i, p] + 1]):
@@ -108,10 +107,9 @@ def match(keypoints: Keypoints, feature_map: FeatureMap, workers: Workers) -> Ma
     probes = np.empty((len(descriptors), min(NUM_LISTS, len(m.middles))), np.int32)
 
     def run(lo: int) -> None:
-        part = slice(lo, lo + BATCH)
-        nearest_lists(descriptors[part], m.middles, probes[part])
-        lists = m.descriptors, m.list_start, m.points
-        search_lists(descriptors[part], probes[part], *lists, found[part], distances[part])
+        some, *out = (values[lo : lo + BATCH] for values in (descriptors, probes, found, distances))
+        nearest_lists(some, m.middles, out[0])
+        search_lists(some, out[0], m.descriptors, m.list_start, m.points, *out[1:])
 
     list(workers.map(run, range(0, len(descriptors), BATCH), "match"))
     query, rank = np.nonzero(found[:, :NUM_NEIGHBORS] >= 0)

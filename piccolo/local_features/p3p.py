@@ -1,13 +1,19 @@
-"""Poses of a camera from three matches.
+"""Poses of a camera from three matches: Persson and Nordberg, "Lambda Twist", ECCV 2018.
 
-A bearing is a unit ray in the camera's frame, anywhere on the sphere; a point is at a positive distance along
-it. With distances d and unknown pose, sides of the triangle give d_i^2 + d_j^2 - 2 c_ij d_i d_j = a_ij.
+A bearing is a unit ray in the camera's frame, anywhere on the sphere; a point is at a positive distance
+along it. With distances d and c_ij the cosine of two bearings, the triangle's sides, the longest 1, give
+    (1)  d_i^2 + d_j^2 - 2 c_ij d_i d_j = a_ij.
+    (2)  M_0, M_1: the equations of the sides 01 and 02, each less a_ij times that of 12: conics d^T M d = 0
+    (3)  det(M_m + x M_n) = 0: a degenerate conic of their pencil, which is two lines
+    (4)  where these meet the other conic are the distances, up to a factor that (1) tells.
+The lines are found by the adjugate, as in Ding et al., "Revisiting the P3P Problem", CVPR 2023.
 """
 
 import math
 
 import numpy as np
 
+from ..geometry.vectors import cross, dot, minus, row
 from ..kernels.jit import inline_kernel, kernel
 
 LEAST_SINE2 = 1e-10  # of the angles of the triangle of points: below, they lie on a line
@@ -17,21 +23,9 @@ POLISHING = 4  # Newton steps on the distances
 
 
 @inline_kernel
-def difference(rows, i, j):
-    """Row i less row j of an array (3, 3)."""
-    return rows[i, 0] - rows[j, 0], rows[i, 1] - rows[j, 1], rows[i, 2] - rows[j, 2]
-
-
-@inline_kernel
-def dot(a, b):
-    """The product of two vectors (3,)."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@inline_kernel
-def cross(a, b):
-    """The cross product of two vectors (3,)."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+def scaled(factor, a):
+    """A vector times a number."""
+    return factor * a[0], factor * a[1], factor * a[2]
 
 
 @inline_kernel
@@ -39,15 +33,10 @@ def axes_of(a, b):
     """Three axes: along the vector a (3,), across it on b's side, and along the cross product."""
     normal = cross(a, b)
     across = cross(normal, a)
-    u, v, w = (
-        1.0 / math.sqrt(dot(a, a)),
-        1.0 / math.sqrt(dot(across, across)),
-        1.0 / math.sqrt(dot(normal, normal)),
-    )
     return (
-        (u * a[0], u * a[1], u * a[2]),
-        (v * across[0], v * across[1], v * across[2]),
-        (w * normal[0], w * normal[1], w * normal[2]),
+        scaled(1.0 / math.sqrt(dot(a, a)), a),
+        scaled(1.0 / math.sqrt(dot(across, across)), across),
+        scaled(1.0 / math.sqrt(dot(normal, normal)), normal),
     )
 
 
@@ -90,33 +79,35 @@ def adjugate(m):
 @inline_kernel
 def trace_product(a, m):
     """The trace of a symmetric matrix of six entries times another, (3, 3)."""
-    return (
-        a[0] * m[0, 0]
-        + a[3] * m[1, 1]
-        + a[5] * m[2, 2]
-        + 2.0 * (a[1] * m[0, 1] + a[2] * m[0, 2] + a[4] * m[1, 2])
-    )
+    diagonal = a[0] * m[0, 0] + a[3] * m[1, 1] + a[5] * m[2, 2]
+    return diagonal + 2.0 * (a[1] * m[0, 1] + a[2] * m[0, 2] + a[4] * m[1, 2])
 
 
 @inline_kernel
 def degenerate_conic(conics):
-    """Turn one of two conics (2, 3, 3) into a degenerate one of their pencil; returns the other's index."""
-    first, second = adjugate(conics[0]), adjugate(conics[1])
-    d0, d1 = trace_product(first, conics[0]) / 3.0, trace_product(second, conics[1]) / 3.0
-    m, n, lead, last = 0, 1, d1, d0  # det(M_m + x M_n) is a cubic, its leading coefficient det M_n
-    quadratic, linear = trace_product(second, conics[0]), trace_product(first, conics[1])
-    if abs(d1) < abs(d0):
-        m, n, lead, last = 1, 0, d0, d1
-        quadratic, linear = linear, quadratic
+    """Turn one of two conics (2, 3, 3) into a degenerate one of their pencil (3); returns the other's index.
+
+    A cubic of x, whose leading coefficient is det M_n.
+    """
+    first = adjugate(conics[0])
+    second = adjugate(conics[1])
+    det_0 = trace_product(first, conics[0]) / 3.0
+    det_1 = trace_product(second, conics[1]) / 3.0
+    mixed_01 = trace_product(second, conics[0])
+    mixed_10 = trace_product(first, conics[1])
+    n = 0 if abs(det_1) < abs(det_0) else 1
+    lead = det_0 if n == 0 else det_1
+    last = det_1 if n == 0 else det_0
+    quadratic = mixed_10 if n == 0 else mixed_01
+    linear = mixed_01 if n == 0 else mixed_10
     if not abs(lead) > 1e-15 * (abs(quadratic) + abs(linear)):
-        return m  # M_n is degenerate already
+        return 1 - n  # M_n is degenerate already
     x = simple_cubic_root(quadratic / lead, linear / lead, last / lead)
-    changed, kept, factor = m, n, x
-    if abs(x) > 1.0:
-        changed, kept, factor = n, m, 1.0 / x
+    kept = 1 - n if abs(x) > 1.0 else n
+    factor = 1.0 / x if abs(x) > 1.0 else x
     for i in range(3):
         for j in range(3):
-            conics[changed, i, j] += factor * conics[kept, i, j]
+            conics[1 - kept, i, j] += factor * conics[kept, i, j]
     return kept
 
 
@@ -128,11 +119,14 @@ def split_conic(conic, lines):
     (Richter-Gebert, "Perspectives on Projective Geometry", 2011, section 11.1). False if they are complex.
     """
     a = adjugate(conic)
-    p, square = (a[0], a[1], a[2]), a[0]
+    p = (a[0], a[1], a[2])
+    square = a[0]
     if abs(a[3]) > abs(square):
-        p, square = (a[1], a[3], a[4]), a[3]
+        p = (a[1], a[3], a[4])
+        square = a[3]
     if abs(a[5]) > abs(square):
-        p, square = (a[2], a[4], a[5]), a[5]
+        p = (a[2], a[4], a[5])
+        square = a[5]
     if not square < ROUNDING:
         return False
     scale = 1.0 / math.sqrt(-square) if square < 0.0 else 0.0
@@ -142,25 +136,27 @@ def split_conic(conic, lines):
     conic[2, 0] -= scale * p[1]
     conic[1, 2] -= scale * p[0]
     conic[2, 1] += scale * p[0]
-    row, column, most = 0, 0, 0.0
+    place = 0
+    for k in range(9):
+        if abs(conic[k // 3, k % 3]) > abs(conic[place // 3, place % 3]):
+            place = k
     for i in range(3):
-        for j in range(3):
-            if abs(conic[i, j]) > most:
-                row, column, most = i, j, abs(conic[i, j])
-    for i in range(3):
-        lines[0, i], lines[1, i] = conic[row, i], conic[i, column]
-    return most > 0.0
+        lines[0, i] = conic[place // 3, i]
+        lines[1, i] = conic[i, place % 3]
+    return abs(conic[place // 3, place % 3]) > 0.0
 
 
 @inline_kernel
 def meet(line, conic, ratios):
-    """Write where a line (3,) meets a conic (3, 3), at two homogeneous points (2, 3); returns how many."""
+    """Write where a line (3,) meets a conic (3, 3) (4), two homogeneous points (2, 3); returns how many."""
     k = 0
     for i in range(1, 3):
         if abs(line[i]) > abs(line[k]):
             k = i
-    i, j = (k + 1) % 3, (k + 2) % 3
-    p, q = -line[i] / line[k], -line[j] / line[k]
+    i = (k + 1) % 3
+    j = (k + 2) % 3
+    p = -line[i] / line[k]
+    q = -line[j] / line[k]
     a = conic[i, i] + p * (p * conic[k, k] + 2.0 * conic[i, k])
     b = conic[i, j] + p * q * conic[k, k] + q * conic[i, k] + p * conic[j, k]
     c = conic[j, j] + q * (q * conic[k, k] + 2.0 * conic[j, k])
@@ -169,107 +165,117 @@ def meet(line, conic, ratios):
         return 0
     s = -(b + math.copysign(math.sqrt(max(discriminant, 0.0)), b))
     for n in range(2):
-        ratios[n, i], ratios[n, j] = (s, a) if n == 0 else (c, s)
+        ratios[n, i] = s if n == 0 else c
+        ratios[n, j] = a if n == 0 else s
         ratios[n, k] = p * ratios[n, i] + q * ratios[n, j]
     return 2 if discriminant > 0.0 else 1
 
 
 @inline_kernel
 def polish_distances(ratios, cosines, sides2):
-    """Scale distances (3,) known up to a factor, polish them by Newton; False if they do not fit."""
-    (c01, c02, c12), (a01, a02) = cosines, sides2
-    d0, d1, d2 = ratios[0], ratios[1], ratios[2]
+    """Scale distances (3,) known up to a factor, polish them by Newton on (1); False if they do not fit."""
+    c01, c02, c12 = cosines
+    a01, a02 = sides2
+    d0 = ratios[0]
+    d1 = ratios[1]
+    d2 = ratios[2]
     total = 2.0 * (d0 * (d0 - c01 * d1 - c02 * d2) + d1 * (d1 - c12 * d2) + d2 * d2)
     scale = math.copysign(math.sqrt((a01 + a02 + 1.0) / total), d0 + d1 + d2)
-    d0, d1, d2 = scale * d0, scale * d1, scale * d2
+    d0, d1, d2 = scale * d0, scale * d1, scale * d2  # at once: one by one, the compiler sums another way
     for left in range(POLISHING, -1, -1):
         e0 = d0 * d0 + d1 * d1 - 2.0 * c01 * d0 * d1 - a01
         e1 = d0 * d0 + d2 * d2 - 2.0 * c02 * d0 * d2 - a02
         e2 = d1 * d1 + d2 * d2 - 2.0 * c12 * d1 * d2 - 1.0
         if left == 0:
             break
-        u, v, w = d0 - c01 * d1, d1 - c01 * d0, d0 - c02 * d2
-        x, y, z = d2 - c02 * d0, d1 - c12 * d2, d2 - c12 * d1
+        u = d0 - c01 * d1  # half the derivatives of e0, e1, e2
+        v = d1 - c01 * d0
+        w = d0 - c02 * d2
+        x = d2 - c02 * d0
+        y = d1 - c12 * d2
+        z = d2 - c12 * d1
         half = -0.5 / (u * x * y + v * w * z)
         d0 += half * (e0 * x * y + v * (e1 * z - e2 * x))
         d1 += half * (w * z * e0 - u * (e1 * z - e2 * x))
         d2 += half * (u * y * e1 + v * w * e2 - w * y * e0)
-    ratios[0], ratios[1], ratios[2] = d0, d1, d2
+    ratios[0] = d0
+    ratios[1] = d1
+    ratios[2] = d2
     is_fit = abs(e0) + abs(e1) + abs(e2) < ROUNDING * (1.0 + d0 * d0 + d1 * d1 + d2 * d2)
     return is_fit and d0 > 0.0 and d1 > 0.0 and d2 > 0.0
 
 
 @inline_kernel
-def pose_of_triangle(d01, d02, e01, e02, R):
-    """Write R_cam_from_map (3, 3) of a triangle's edges from its corner 0, in the camera and in the map."""
-    cam, world = axes_of(d01, d02), axes_of(e01, e02)
-    for i in range(3):
-        for j in range(3):
-            R[i, j] = cam[0][i] * world[0][j] + cam[1][i] * world[1][j] + cam[2][i] * world[2][j]
-
-
-@inline_kernel
 def order_of_corners(points):
     """The corners with the longest side between the last two, and that side's squared length."""
-    first, longest2 = 0, -1.0
+    first = 0
+    longest2 = -1.0
     for i in range(3):
-        side = difference(points, (i + 1) % 3, (i + 2) % 3)
+        side = minus(row(points, (i + 1) % 3), row(points, (i + 2) % 3))
         if dot(side, side) > longest2:
-            first, longest2 = i, dot(side, side)
+            first = i
+            longest2 = dot(side, side)
     return first, (first + 1) % 3, (first + 2) % 3, longest2
 
 
 @inline_kernel
 def pencil(cosines, sides2, conics):
-    """Write the conics (2, 3, 3) on which the distances lie: the sides 01 and 02, less the side 12 = 1."""
-    c01, c02, c12 = cosines
+    """Write the conics (2, 3, 3) on which the distances lie, by (2)."""
     conics[:] = 0.0
     for n in range(2):
-        side2 = sides2[n]
-        conics[n, 0, 0], conics[n, 1, 1], conics[n, 2, 2] = 1.0, -side2, -side2
+        conics[n, 0, 0] = 1.0
+        conics[n, 1, 1] = conics[n, 2, 2] = -sides2[n]
         conics[n, n + 1, n + 1] += 1.0
-        conics[n, 1, 2] = conics[n, 2, 1] = side2 * c12
-    conics[0, 0, 1] = conics[0, 1, 0] = -c01
-    conics[1, 0, 2] = conics[1, 2, 0] = -c02
+        conics[n, 1, 2] = conics[n, 2, 1] = sides2[n] * cosines[2]
+    conics[0, 0, 1] = conics[0, 1, 0] = -cosines[0]
+    conics[1, 0, 2] = conics[1, 2, 0] = -cosines[1]
+
+
+@inline_kernel
+def pose_of_triangle(d01, d02, e01, e02, R):
+    """Write R_cam_from_map (3, 3) of a triangle's edges from its corner 0, in the camera and in the map."""
+    cam = axes_of(d01, d02)
+    world = axes_of(e01, e02)
+    for i in range(3):
+        for j in range(3):
+            R[i, j] = cam[0][i] * world[0][j] + cam[1][i] * world[1][j] + cam[2][i] * world[2][j]
 
 
 @kernel
 def p3p(bearings, points, rotations, centers):
     """Write the poses that see three points, R_cam_from_map (4, 3, 3), centers (4, 3) [m]; returns how many.
 
-    Bearings (3, 3) and points (3, 3) [m] are a row each. Points on a line and equal bearings have none. The
-    two conics of the distances meet on two lines, a degenerate conic of their pencil (Persson and Nordberg,
-    "Lambda Twist", ECCV 2018; the lines by the adjugate, as in Ding et al., "Revisiting the P3P Problem",
-    CVPR 2023).
+    Bearings (3, 3) and points (3, 3) [m] are a row each. Points on a line and equal bearings have none.
     """
     i0, i1, i2, longest2 = order_of_corners(points)
-    e01, e02 = difference(points, i1, i0), difference(points, i2, i0)
-    normal, a01, a02 = cross(e01, e02), dot(e01, e01), dot(e02, e02)
-    c01, c02, c12 = (
-        dot(bearings[i0], bearings[i1]),
-        dot(bearings[i0], bearings[i2]),
-        dot(bearings[i1], bearings[i2]),
-    )
-    if not (dot(normal, normal) > LEAST_SINE2 * a01 * a02 and 1.0 - max(c01, c02, c12) > LEAST_GAP):
+    b0 = bearings[i0]
+    b1 = bearings[i1]
+    b2 = bearings[i2]
+    e01 = minus(points[i1], points[i0])
+    e02 = minus(points[i2], points[i0])
+    normal = cross(e01, e02)
+    a01 = dot(e01, e01)
+    a02 = dot(e02, e02)
+    cosines = (dot(b0, b1), dot(b0, b2), dot(b1, b2))
+    if not (dot(normal, normal) > LEAST_SINE2 * a01 * a02 and 1.0 - max(cosines) > LEAST_GAP):
         return 0
     work = np.empty((4, 3, 3))  # two conics, two lines, two points
-    conics, lines, ratios = work[:2], work[2], work[3]
-    cosines, sides2, length = (c01, c02, c12), (a01 / longest2, a02 / longest2), math.sqrt(longest2)
+    conics = work[:2]
+    sides2 = (a01 / longest2, a02 / longest2)
     pencil(cosines, sides2, conics)
     other = degenerate_conic(conics)
-    if not split_conic(conics[1 - other], lines):
+    if not split_conic(conics[1 - other], work[2]):
         return 0
     count = 0
     for k in range(4):
         if k % 2 == 0:
-            num_met = meet(lines[k // 2], conics[other], ratios)
-        d = ratios[k % 2]
+            num_met = meet(work[2, k // 2], conics[other], work[3])
+        d = work[3, k % 2]
         if k % 2 >= num_met or not polish_distances(d, cosines, sides2):
             continue
-        x, y, z = length * d[0], length * d[1], length * d[2]
-        b0, b1, b2 = bearings[i0], bearings[i1], bearings[i2]
-        d01 = y * b1[0] - x * b0[0], y * b1[1] - x * b0[1], y * b1[2] - x * b0[2]
-        d02 = z * b2[0] - x * b0[0], z * b2[1] - x * b0[1], z * b2[2] - x * b0[2]
+        x, y, z = scaled(math.sqrt(longest2), d)
+        d01 = minus(scaled(y, b1), scaled(x, b0))
+        d02 = minus(scaled(z, b2), scaled(x, b0))
         R = rotations[count]
         pose_of_triangle(d01, d02, e01, e02, R)
         for i in range(3):

@@ -2,37 +2,38 @@
 
 import math
 
+from ..geometry.vectors import dot, minus, rotate, row
 from ..kernels.jit import kernel
 from ..optimize.channel_loss import geman_mcclure
 from ..optimize.levenberg_marquardt import levenberg_marquardt
 from ..optimize.normal_equations import COUNT, GRADIENT, LOSS, MATRIX
 
-TOLERANCE = 1e-7  # [rad + m] a shorter step ends the descent
-
 
 @kernel
 def angular_equations(problem, R_cam_from_map, center_map, sums):
-    """Write the sums (29,) of normal_equations for bearings (N, 3), points (N, 3), weights (N,), scale [rad].
+    """Write the sums (29,) of normal_equations for bearings (N, 3), points (N, 3) [m], scale [rad].
 
+    The scale is that of Geman and McClure's loss: what is off by much more hardly counts.
     The residual is u - b, with u the unit ray to the point and b the bearing. At distance r,
     du = w x u - (I - u u^T) d / r: its rows add up to products of u and b: no Jacobian is stored.
     """
-    bearings, points, weights, scale = problem
-    R, t, inverse_scale2 = R_cam_from_map, center_map, 1.0 / (scale * scale)
+    bearings, points, scale = problem
+    inverse_scale2 = 1.0 / (scale * scale)
     sums[:] = 0.0
     for n in range(len(points)):
-        dx, dy, dz = points[n, 0] - t[0], points[n, 1] - t[1], points[n, 2] - t[2]
-        inverse = 1.0 / max(math.sqrt(dx * dx + dy * dy + dz * dz), 1e-9)
-        x = inverse * (R[0, 0] * dx + R[0, 1] * dy + R[0, 2] * dz)
-        y = inverse * (R[1, 0] * dx + R[1, 1] * dy + R[1, 2] * dz)
-        z = inverse * (R[2, 0] * dx + R[2, 1] * dy + R[2, 2] * dz)
-        bx, by, bz = bearings[n, 0], bearings[n, 1], bearings[n, 2]
+        offset = minus(row(points, n), center_map)
+        inverse = 1.0 / max(math.sqrt(dot(offset, offset)), 1e-9)
+        x, y, z = rotate(R_cam_from_map, offset)
+        x *= inverse
+        y *= inverse
+        z *= inverse
+        bx, by, bz = row(bearings, n)
         square = (x - bx) ** 2 + (y - by) ** 2 + (z - bz) ** 2
         loss, w = geman_mcclure(square, inverse_scale2)
-        sums[LOSS] += weights[n] * loss
-        sums[COUNT] += weights[n]
-        w *= weights[n]
-        v, along = w * inverse, x * bx + y * by + z * bz
+        sums[LOSS] += loss
+        sums[COUNT] += 1.0
+        v = w * inverse
+        along = x * bx + y * by + z * bz
         gradient = (
             w * (z * by - y * bz), w * (x * bz - z * bx), w * (y * bx - x * by),
             v * (bx - along * x), v * (by - along * y), v * (bz - along * z),
@@ -51,14 +52,3 @@ def angular_equations(problem, R_cam_from_map, center_map, sums):
 
 
 descend_matches = kernel(levenberg_marquardt(angular_equations))
-
-
-@kernel
-def refine_pose(bearings, points, weights, R_cam_from_map, center_map, num_iterations, scale):
-    """Move a pose, (3, 3) and (3,) in place, to where bearings and points agree best; returns the loss there.
-
-    Bearings (N, 3) are unit rays in the camera's frame, points (N, 3) [m], weights (N,); the scale [rad] is
-    that of Geman and McClure's loss: what is off by much more hardly counts.
-    """
-    problem = bearings, points, weights, scale
-    return descend_matches(problem, num_iterations, TOLERANCE, R_cam_from_map, center_map)

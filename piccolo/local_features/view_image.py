@@ -1,22 +1,24 @@
 """The scan as a grey picture from a position, to find keypoints in: surfaces closed, small gaps filled."""
 
 import math
-import threading
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cloud.octree import MAX_NODES, Octree, collect, level_of
+from ..cloud.octree import Octree, collect, level_of
 from ..geometry.pose import Array
 from ..geometry.sphere import direction_to_pixel
 from ..kernels.jit import F0, F1, HALF, kernel
+from ..views.view import thread_scratch
 
 VOXEL_PER_RANGE = 1.0 / 80.0  # largest voxel by its distance
 REACH = np.float32(0.7)  # half width of what is drawn for a voxel, by the voxel's
-LEAST_REACH, MOST_REACH = np.float32(0.75), np.float32(12.0)  # [px]
-FRONT, FRONT_OFFSET = np.float32(1.05), np.float32(0.05)  # a pixel's grey is the mean up to this range, [m]
+LEAST_REACH = np.float32(0.75)  # [px]
+MOST_REACH = np.float32(12.0)
+FRONT = np.float32(1.05)  # a pixel's grey is the mean up to this times its nearest range,
+FRONT_OFFSET = np.float32(0.05)  # [m] and this
 BEHIND = np.float32(1.2)  # by its range: a pixel all of whose surroundings are that much nearer is hidden
 WIDER = 4  # [px] of a wider pixel
 FILL_LEVELS = 4  # gaps up to 16 px are filled
@@ -44,7 +46,9 @@ def draw_voxels(tree, center, found, directions, ranges, sums):
     px_per_rad = np.float32(width / (2.0 * math.pi))
     for is_second in range(2):
         for k in range(count):
-            x, y, z = directions[0, k], directions[1, k], directions[2, k]
+            x = directions[0, k]
+            y = directions[1, k]
+            z = directions[2, k]
             rho = math.sqrt(x * x + y * y)
             r = math.sqrt(x * x + y * y + z * z)
             node = tree.nodes[found[k]]
@@ -54,9 +58,11 @@ def draw_voxels(tree, center, found, directions, ranges, sums):
             across = min(reach * r / max(rho, np.float32(1e-3)), np.float32(0.25) * W)
             u, v = direction_to_pixel(x, y, z, rho, W)
             gray = np.float32(0.299) * node[3] + np.float32(0.587) * node[4] + np.float32(0.114) * node[5]
-            top, bottom = np.int32(math.ceil(v - reach - HALF)), np.int32(math.floor(v + reach - HALF))
-            left, right = np.int32(math.ceil(u - across - HALF)), np.int32(math.floor(u + across - HALF))
-            for i in range(max(top, 0), min(bottom, height - 1) + 1):
+            top = max(np.int32(math.ceil(v - reach - HALF)), 0)
+            bottom = min(np.int32(math.floor(v + reach - HALF)), height - 1)
+            left = np.int32(math.ceil(u - across - HALF))
+            right = np.int32(math.floor(u + across - HALF))
+            for i in range(top, bottom + 1):
                 dv = (np.float32(i) + HALF - v) / reach
                 for at in range(left, right + 1):
                     j = at + width if at < 0 else at
@@ -72,13 +78,12 @@ def draw_voxels(tree, center, found, directions, ranges, sums):
 
 
 def is_in_front(ranges: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Where (H, W) of nearest ranges, NOTHING where there is none, a pixel is no gap in what is nearer.
+    """Mask (H, W), by nearest ranges, NOTHING where there is none, of pixels no gap in what is nearer.
 
     A pixel is seen through a gap if in all wider pixels around it there is something much nearer.
     """
     height, width = ranges.shape
-    rows, columns = height // WIDER, width // WIDER
-    nearest = ranges.reshape(rows, WIDER, columns, WIDER).min(axis=(1, 3))
+    nearest = ranges.reshape(height // WIDER, WIDER, width // WIDER, WIDER).min(axis=(1, 3))
     around = np.pad(np.pad(nearest, ((0, 0), (1, 1)), mode="wrap"), ((1, 1), (0, 0)), mode="edge")
     farthest = cv2.dilate(around, np.ones((3, 3), np.uint8))[1:-1, 1:-1]
     limit = np.repeat(np.repeat(farthest, WIDER, axis=0), WIDER, axis=1)
@@ -112,31 +117,13 @@ def _resized(image: Floats, size: tuple[int, int]) -> Floats:
     return np.asarray(cv2.resize(image, size, interpolation=how))
 
 
-class _Scratch(NamedTuple):
-    """Arrays that one thread needs."""
-
-    nodes: NDArray[np.int32]
-    directions: NDArray[np.float32]  # (3, N)
-    sums: NDArray[np.float32]  # (H, W, 2)
-
-
-_local = threading.local()
-
-
-def _thread_scratch(width: int) -> _Scratch:
-    """The calling thread's own arrays, for views of one width."""
-    if not hasattr(_local, "scratch") or _local.scratch.sums.shape[1] != width:
-        sums = np.empty((width // 2, width, 2), np.float32)
-        _local.scratch = _Scratch(np.empty(MAX_NODES, np.int32), np.empty((3, MAX_NODES), np.float32), sums)
-    scratch: _Scratch = _local.scratch
-    return scratch
-
-
 def render_gray(octree: Octree, center_map: Array, width: int) -> ViewImage:
-    """What is seen around a centre (3,) [m], `width` x width / 2 pixels."""
-    nodes, directions, sums = _thread_scratch(width)
+    """Draw the scan around a centre (3,) [m], `width` x width / 2 pixels."""
+    scratch = thread_scratch()
     ranges = np.empty((width // 2, width), np.float32)
-    draw_voxels(octree, np.asarray(center_map, np.float64), nodes, directions, ranges, sums)
+    sums = np.empty((width // 2, width, 2), np.float32)
+    center = np.asarray(center_map, np.float64)
+    draw_voxels(octree, center, scratch.nodes, scratch.directions, ranges, sums)
     weight = is_in_front(ranges).astype(np.float32)
     gray = weight * sums[..., 0] / np.maximum(sums[..., 1], np.float32(1e-6))
     filled, is_filled = fill_gaps(gray, weight)

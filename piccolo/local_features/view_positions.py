@@ -8,11 +8,15 @@ from numpy.typing import NDArray
 
 from ..geometry.pose import Array
 from ..geometry.sphere import cell_of, direction_to_pixel, pixel_rays
+from ..geometry.vectors import minus, row
 from ..kernels.jit import kernel
 
-SPACING, LAYER = 2.5, 2.4  # [m] across and in height: what is nearer and seen from a position needs none
-MAX_VIEWS, WIDER = 2500, 1.5  # at most, some minutes and 0.4 GB; the growth of the spacing for more
-ABOVE_LOWEST, HEIGHT_STEP = 1.0, 0.3  # [m] first are positions so high above the lowest around, by steps
+SPACING = 2.5  # [m] across: what is nearer and seen from a position needs none
+LAYER = 2.4  # [m] in height
+MAX_VIEWS = 2500  # some minutes and 0.4 GB
+WIDER = 1.5  # growth of the spacing where there would be more
+ABOVE_LOWEST = 1.0  # [m] first are positions so high above the lowest around
+HEIGHT_STEP = 0.3  # [m]
 Look = Callable[[int], NDArray[np.float32]]  # ranges (cells,) [m] seen from a candidate, 0 for nothing
 CELL = np.array([2.5, 2.5, 3.0])  # [m] around: a part of a storey
 TABLE_HEIGHT = 48  # directions, by 3.75 degrees
@@ -28,11 +32,9 @@ def next_unseen(order, begin, centers, kept, ranges, cells, spacing):
     """
     height, width = cells.shape
     for place in range(begin, len(order)):
-        i, is_covered = order[place], False
+        is_covered = False
         for k in range(len(kept)):
-            j = kept[k]
-            dx, dy = centers[i, 0] - centers[j, 0], centers[i, 1] - centers[j, 1]
-            dz = centers[i, 2] - centers[j, 2]
+            dx, dy, dz = minus(row(centers, order[place]), row(centers, kept[k]))
             across = dx * dx + dy * dy
             if across >= spacing * spacing or abs(dz) >= LAYER:
                 continue
@@ -64,31 +66,34 @@ def view_positions(centers: Array, look: Look, num_rings: int, num_known: int = 
     np.minimum.at(lowest, group.ravel(), centers[:, 2])
     off = np.abs(centers[:, 2] - lowest[group.ravel()] - ABOVE_LOWEST)
     order = np.argsort(np.rint(off / HEIGHT_STEP), kind="stable")
-    order, known = order[order >= num_known], np.arange(num_known)
-    look, spacing = lru_cache(maxsize=None)(look), SPACING
-    while (kept := chosen(order, centers, known, look, cell_table(num_rings), spacing)) is None:
+    order = order[order >= num_known]
+    look = lru_cache(maxsize=None)(look)
+    cells, spacing = cell_table(num_rings), SPACING
+    while (kept := choose(order, centers, num_known, look, cells, spacing)) is None:
         spacing *= WIDER
     return kept
 
 
-def chosen(
+def choose(
     order: NDArray[np.int64],
     centers: Array,
-    known: NDArray[np.int64],
+    num_known: int,
     look: Look,
     cells: NDArray[np.int32],
     spacing: float,
 ) -> NDArray[np.int64] | None:
-    """Of some positions, in order, each that none of those known or chosen before sees; None if too many."""
-    room = len(known) + MAX_VIEWS
-    kept, ranges = np.empty(room, np.int64), np.empty((room, cells.max() + 1), np.float32)
-    count, place = len(known), 0
-    kept[:count] = known
-    for k in known:
-        ranges[k] = look(int(k))
+    """Choose of some positions, in order, each that none known or before it sees; None if too many."""
+    room = num_known + MAX_VIEWS
+    kept = np.arange(room)
+    ranges = np.empty((room, cells.max() + 1), np.float32)
+    count = num_known
+    for k in range(num_known):
+        ranges[k] = look(k)
+    place = 0
     while (place := next_unseen(order, place, centers, kept[:count], ranges, cells, spacing)) < len(order):
         if count == room:
             return None
-        kept[count], ranges[count] = order[place], look(int(order[place]))
+        kept[count] = order[place]
+        ranges[count] = look(int(order[place]))
         count += 1
-    return kept[len(known) : count]
+    return kept[num_known:count]

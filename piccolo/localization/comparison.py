@@ -18,9 +18,8 @@ from ..kernels.jit import F0, copy_to, kernel
 from ..optimize.channel_loss import CHANCE, NUM_BLOCKS
 from ..panorama.local_normalization import opponent, zscore
 from ..panorama.texels import CHUNK, bilinear_weights, blend, gather, is_valid, make_projected, project
-from ..views.cells import average_colors, local_statistics, locate
 from ..views.recent_views import place_of
-from ..views.view import empty_cells
+from ..views.view import average_colors, cell_statistics, empty_cells, locate
 from .query import Query
 
 CONTRADICTS = 0.1  # a block of less is left out of the local means and deviations
@@ -99,7 +98,7 @@ def normalize(colors, shared, view, normalized):
         for k in range(3):
             m[1 + k] += w * colors[k, n]
             m[4 + k] += w * colors[k, n] * colors[k, n]
-    local_statistics(moments, view, shared, stats)
+    cell_statistics(moments, view, shared, stats)
     for k in range(3):
         for n in range(len(shared)):
             normalized[k, n] = zscore(colors[k, n], stats[k, n], stats[3 + k, n]) if shared[n] > F0 else F0

@@ -23,7 +23,7 @@ from ..panorama.local_normalization import normalize_panorama
 from ..panorama.model import resize, shrink
 from ..panorama.texels import Texels, pack_texels
 from ..scan_map.scan_map import ScanMap
-from ..views.recent_views import RecentViews, place_of, recent_views
+from ..views.recent_views import RecentViews, place_of
 from ..views.view import Cells, ViewConfig, normalized_view
 from .settings import METHOD, CoarseToFineSettings, ImageScales, MethodConfig
 
@@ -170,7 +170,7 @@ def prepare_query(
     )
     photo.images.search()  # with which each search begins
     features = tuple(Once(partial(features_of, resized, scan_map, workers, views)) for views in HALVES)
-    return Query(photo, scan_map, settings, workers, method, features, Cache(recent_views(scan_map.octree)))
+    return Query(photo, scan_map, settings, workers, method, features, Cache(RecentViews(scan_map.octree)))
 
 
 def features_of(panorama: Panorama, scan_map: ScanMap, workers: Workers, views: Sequence[int]) -> Features:

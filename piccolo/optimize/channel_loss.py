@@ -11,7 +11,16 @@ import numpy as np
 from ..geometry.sphere import BLOCK_RINGS, make_grid
 from ..kernels.jit import F1, HALF, inline_kernel, kernel
 from ..panorama.local_normalization import ZERO_LEVEL
-from ..panorama.texels import CHUNK, bilinear_weights, blend, gather, is_valid, make_projected, project
+from ..panorama.texels import (
+    CHUNK,
+    bilinear_weights,
+    blend,
+    gather,
+    is_valid,
+    make_projected,
+    project,
+    texels_around,
+)
 from .levenberg_marquardt import levenberg_marquardt
 from .normal_equations import COUNT, LOSS, block_adder
 
@@ -35,7 +44,7 @@ def geman_mcclure(square, inverse_scale2):
 
 @inline_kernel
 def beyond_chance(correlation):
-    """What a block's correlation has beyond what those of wrong poses reach, in [0, 1]."""
+    """A block's correlation beyond what those of wrong poses reach, in [0, 1]."""
     return max(correlation - CHANCE, 0.0) / (1.0 - CHANCE)
 
 
@@ -50,10 +59,11 @@ def channel_equations(problem, R_cam_from_world, center_world, sums):
     panorama's channels, scale of the loss [levels].
     """
     points, channels, weights, texels, width, scale = problem
-    colors = channels[0], channels[1], channels[2], weights
-    how = texels, width, R_cam_from_world, center_world, np.float32(1.0 / (scale * scale))
+    R, t = R_cam_from_world, center_world
+    colors = (channels[0], channels[1], channels[2], weights)
     sums[:] = 0.0
-    add_channels(points[0], points[1], points[2], colors, *how, sums)
+    xyz = (points[0], points[1], points[2])
+    add_channels(xyz, colors, texels, width, R, t, np.float32(1.0 / (scale * scale)), sums)
     total_weight = 0.0
     for n in range(len(weights)):
         total_weight += weights[n]
@@ -67,12 +77,14 @@ def equations_by_part(problem, R_cam_from_world, center_world, begins, sums):
     A part ends where the next begins (parts + 1,).
     """
     points, channels, weights, texels, width, scale = problem
-    how = texels, width, R_cam_from_world, center_world, np.float32(1.0 / (scale * scale))
+    R, t = R_cam_from_world, center_world
+    inverse_scale2 = np.float32(1.0 / (scale * scale))
     sums[:] = 0.0
     for k in range(len(sums)):
-        lo, hi = begins[k], begins[k + 1]
-        colors = channels[0][lo:hi], channels[1][lo:hi], channels[2][lo:hi], weights[lo:hi]
-        add_channels(points[0][lo:hi], points[1][lo:hi], points[2][lo:hi], colors, *how, sums[k])
+        part = slice(begins[k], begins[k + 1])
+        colors = (channels[0][part], channels[1][part], channels[2][part], weights[part])
+        xyz = (points[0][part], points[1][part], points[2][part])
+        add_channels(xyz, colors, texels, width, R, t, inverse_scale2, sums[k])
 
 
 descend_channels = kernel(levenberg_marquardt(channel_equations))
@@ -82,19 +94,26 @@ descend_channels = kernel(levenberg_marquardt(channel_equations))
 def correlate(points, channels, weights, blocks, texels, width, R_cam_from_world, center_world, sums):
     """Write, block by block (B, 4), product, energies and shared weight of points' and image's channels."""
     sums[:] = 0.0
-    p, found = make_projected(), np.empty((4, CHUNK), np.float32)
+    p = make_projected()
+    found = np.empty((4, CHUNK), np.float32)
     for lo in range(0, len(weights), CHUNK):
         hi = min(lo + CHUNK, len(weights))
-        x, y, z = points[0][lo:hi], points[1][lo:hi], points[2][lo:hi]
-        project(x, y, z, R_cam_from_world, center_world, width, p)
+        part = slice(lo, hi)
+        project(points[0][part], points[1][part], points[2][part], R_cam_from_world, center_world, width, p)
         gather(texels, width, p, hi - lo)
-        f0, f1, f2, weight = channels[0][lo:hi], channels[1][lo:hi], channels[2][lo:hi], weights[lo:hi]
+        f0 = channels[0][part]
+        f1 = channels[1][part]
+        f2 = channels[2][part]
+        weight = weights[part]
         for n in range(hi - lo):
             bilinear = bilinear_weights(p.fu[n], p.fv[n])
-            t00, t10, t01, t11 = p.t00[n], p.t10[n], p.t01[n], p.t11[n]
-            a0, b0 = f0[n] - ZERO, blend(t00, t10, t01, t11, bilinear, 0) - ZERO
-            a1, b1 = f1[n] - ZERO, blend(t00, t10, t01, t11, bilinear, 8) - ZERO
-            a2, b2 = f2[n] - ZERO, blend(t00, t10, t01, t11, bilinear, 16) - ZERO
+            t00, t10, t01, t11 = texels_around(p, n)
+            a0 = f0[n] - ZERO
+            a1 = f1[n] - ZERO
+            a2 = f2[n] - ZERO
+            b0 = blend(t00, t10, t01, t11, bilinear, 0) - ZERO
+            b1 = blend(t00, t10, t01, t11, bilinear, 8) - ZERO
+            b2 = blend(t00, t10, t01, t11, bilinear, 16) - ZERO
             w = weight[n] * is_valid(t00, t10, t01, t11)
             found[0, n] = w * (a0 * b0 + a1 * b1 + a2 * b2)
             found[1, n] = w * (a0 * a0 + a1 * a1 + a2 * a2)
@@ -117,6 +136,6 @@ def score(points, channels, weights, blocks, texels, width, R_cam_from_world, ce
     correlate(points, channels, weights, blocks, texels, width, R_cam_from_world, center_world, sums)
     total = 0.0
     for b in range(NUM_BLOCKS):
-        product, points_energy, image_energy, shared = sums[b, 0], sums[b, 1], sums[b, 2], sums[b, 3]
-        total += beyond_chance(product / math.sqrt(max(points_energy * image_energy, 1e-12))) * shared
+        correlation = sums[b, 0] / math.sqrt(max(sums[b, 1] * sums[b, 2], 1e-12))
+        total += beyond_chance(correlation) * sums[b, 3]
     return total

@@ -18,15 +18,8 @@ from ..geometry.pose import Pose, step
 from ..jobs.threads import Workers
 from ..panorama import Panorama
 from ..panorama.texels import Texels
-from ..views.surfel_renderer import (
-    checkerboard,
-    encode_image,
-    fill_holes,
-    render_surfels,
-    resized_rgb,
-    visible_indices,
-)
-from ..views.surfels import surfels_of
+from ..views.pictures import checkerboard, encode_image, fill_holes, resized_rgb
+from ..views.surfels import render_surfels, surfels_of, visible_indices
 from .refine import Refined, refine, sampling_loss_of
 from .settings import DescentSettings
 

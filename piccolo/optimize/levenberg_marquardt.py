@@ -9,9 +9,13 @@ import numpy as np
 from ..kernels.jit import copy_to, kernel
 from .normal_equations import GRADIENT, LOSS, MATRIX, NUM_SUMS
 
-MAX_TURN, MAX_MOVE = 0.15, 0.3  # [rad], [m] a step: farther away the matrix means nothing
-FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-6, 1e4  # of the diagonal
-FALL, RISE = 0.2, 8.0  # of the damping after a step that was taken, and one that was not
+MAX_TURN = 0.15  # [rad] a step: farther away the matrix means nothing
+MAX_MOVE = 0.3  # [m]
+FIRST_DAMPING = 1e-3  # of the diagonal
+LEAST_DAMPING = 1e-6
+MOST_DAMPING = 1e4
+FALL = 0.2  # of the damping after a step that was taken
+RISE = 8.0  # and one that was not
 # Float32 sums differ by this share from one pose to the next: what rises by less has not risen. Without it a
 # descent ends where rounding says, some hundredths of a millimetre from the minimum.
 ROUNDING = 1e-7
@@ -19,24 +23,32 @@ ROUNDING = 1e-7
 
 @kernel
 def retract(R_cam_from_world, center_world, step, R_new, center_new):
-    """Write R <- exp([w]x) R and t <- t + R^T d; returns how far the step went, limited, in rad + m."""
-    R, t = R_cam_from_world, center_world
+    """Write R <- exp([w]x) R and t <- t + R^T d; returns how far the step went, limited, in rad + m.
+
+    The exponential by its series, as `pose.exp_so3` is none for kernels: exact in float64 below MAX_TURN.
+    """
+    R = R_cam_from_world
     turn = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
     move = math.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
     limit = min(1.0, MAX_TURN / max(turn, 1e-30), MAX_MOVE / max(move, 1e-30))
     angle = turn * limit
-    wx, wy, wz = step[0] * limit, step[1] * limit, step[2] * limit
+    wx = step[0] * limit
+    wy = step[1] * limit
+    wz = step[2] * limit
     a = 1.0 - angle * angle / 6.0 + angle**4 / 120.0
     b = 0.5 - angle * angle / 24.0 + angle**4 / 720.0
     E = np.empty((3, 3))
     E[0, 0] = 1.0 - b * (wy * wy + wz * wz)
     E[1, 1] = 1.0 - b * (wx * wx + wz * wz)
     E[2, 2] = 1.0 - b * (wx * wx + wy * wy)
-    E[0, 1], E[1, 0] = b * wx * wy - a * wz, b * wx * wy + a * wz
-    E[0, 2], E[2, 0] = b * wx * wz + a * wy, b * wx * wz - a * wy
-    E[1, 2], E[2, 1] = b * wy * wz - a * wx, b * wy * wz + a * wx
+    E[0, 1] = b * wx * wy - a * wz
+    E[1, 0] = b * wx * wy + a * wz
+    E[0, 2] = b * wx * wz + a * wy
+    E[2, 0] = b * wx * wz - a * wy
+    E[1, 2] = b * wy * wz - a * wx
+    E[2, 1] = b * wy * wz + a * wx
     for i in range(3):
-        center_new[i] = t[i] + limit * (R[0, i] * step[3] + R[1, i] * step[4] + R[2, i] * step[5])
+        center_new[i] = center_world[i] + limit * (R[0, i] * step[3] + R[1, i] * step[4] + R[2, i] * step[5])
         for j in range(3):
             R_new[i, j] = E[i, 0] * R[0, j] + E[i, 1] * R[1, j] + E[i, 2] * R[2, j]
     return angle + move * limit
@@ -84,12 +96,18 @@ def levenberg_marquardt(equations: Any) -> Callable[..., float]:
     """
 
     def descend(problem, num_iterations, tolerance, R_cam_from_world, center_world):
-        R, t = R_cam_from_world, center_world
-        sums, new_sums, step = np.empty(NUM_SUMS), np.empty(NUM_SUMS), np.empty(6)
-        R_new, t_new = np.empty((3, 3)), np.empty(3)
+        R = R_cam_from_world
+        t = center_world
+        sums = np.empty(NUM_SUMS)
+        new_sums = np.empty(NUM_SUMS)
+        step = np.empty(6)
+        R_new = np.empty((3, 3))
+        t_new = np.empty(3)
         copy_to(R_new, R)
         copy_to(t_new, t)
-        sums[LOSS], damping, length = np.inf, FIRST_DAMPING / FALL, np.inf
+        sums[LOSS] = np.inf
+        damping = FIRST_DAMPING / FALL
+        length = np.inf
         # The equations stand in one place, as they are compiled into it; the start is accepted first.
         for left in range(num_iterations, -1, -1):
             equations(problem, R_new, t_new, new_sums)

@@ -12,10 +12,21 @@ import numpy as np
 
 from ..geometry.sphere import pixel_jacobian
 from ..kernels.jit import F0, inline_kernel, kernel
-from ..panorama.texels import CHUNK, blend_with_gradient, gather, is_valid, make_projected, project
+from ..panorama.texels import (
+    CHUNK,
+    blend_with_gradient,
+    gather,
+    is_valid,
+    make_projected,
+    project,
+    texels_around,
+)
 
 NUM_SUMS = 29  # loss, count, gradient (6), upper triangle of the normal matrix (21)
-LOSS, COUNT, GRADIENT, MATRIX = 0, 1, 2, 8  # where they begin
+LOSS = 0  # where they begin
+COUNT = 1
+GRADIENT = 2
+MATRIX = 8
 
 
 def block_adder(read_point: Any, robust: Any) -> Any:
@@ -30,15 +41,21 @@ def block_adder(read_point: Any, robust: Any) -> Any:
         a00 = a01 = a02 = a03 = a04 = a05 = a11 = a12 = a13 = a14 = a15 = a22 = a23 = a24 = a25 = F0
         a33 = a34 = a35 = a44 = a45 = a55 = g0 = g1 = g2 = g3 = g4 = g5 = total = loaded = F0
         for n in range(count):
-            x, y, z, fu, fv = points.x[n], points.y[n], points.z[n], points.fu[n], points.fv[n]
-            t00, t10, t01, t11 = points.t00[n], points.t10[n], points.t01[n], points.t11[n]
+            x = points.x[n]
+            y = points.y[n]
+            z = points.z[n]
+            fu = points.fu[n]
+            fv = points.fv[n]
+            t00, t10, t01, t11 = texels_around(points, n)
             rho2 = x * x + y * y
             c0, c1, c2, weight = read_point(colors, np.uintp(first + n))
             weight *= is_valid(t00, t10, t01, t11)
             e0, u0, v0 = blend_with_gradient(t00, t10, t01, t11, fu, fv, 0)
             e1, u1, v1 = blend_with_gradient(t00, t10, t01, t11, fu, fv, 8)
             e2, u2, v2 = blend_with_gradient(t00, t10, t01, t11, fu, fv, 16)
-            e0, e1, e2 = e0 - c0, e1 - c1, e2 - c2
+            e0 -= c0
+            e1 -= c1
+            e2 -= c2
             loss, w = robust(e0 * e0 + e1 * e1 + e2 * e2, scale)
             total += weight * loss
             loaded += weight
@@ -46,17 +63,32 @@ def block_adder(read_point: Any, robust: Any) -> Any:
             guu = w * (u0 * u0 + u1 * u1 + u2 * u2)
             guv = w * (u0 * v0 + u1 * v1 + u2 * v2)
             gvv = w * (v0 * v0 + v1 * v1 + v2 * v2)
-            bu, bv = w * (u0 * e0 + u1 * e1 + u2 * e2), w * (v0 * e0 + v1 * e1 + v2 * e2)
+            bu = w * (u0 * e0 + u1 * e1 + u2 * e2)
+            bv = w * (v0 * e0 + v1 * e1 + v2 * e2)
             ux, uy, vx, vy, vz = pixel_jacobian(x, y, z, rho2, width)
             # Rows [p x g, -g] of u and of v; du/dz is 0, and no turn about z moves v.
-            p0, p1, p2, p3, p4 = -z * uy, z * ux, x * uy - y * ux, -ux, -uy
-            q0, q1, q3, q4, q5 = y * vz - z * vy, z * vx - x * vz, -vx, -vy, -vz
-            l0, m0 = guu * p0 + guv * q0, guv * p0 + gvv * q0
-            l1, m1 = guu * p1 + guv * q1, guv * p1 + gvv * q1
-            l2, m2 = guu * p2, guv * p2
-            l3, m3 = guu * p3 + guv * q3, guv * p3 + gvv * q3
-            l4, m4 = guu * p4 + guv * q4, guv * p4 + gvv * q4
-            l5, m5 = guv * q5, gvv * q5
+            p0 = -z * uy
+            p1 = z * ux
+            p2 = x * uy - y * ux
+            p3 = -ux
+            p4 = -uy
+            q0 = y * vz - z * vy
+            q1 = z * vx - x * vz
+            q3 = -vx
+            q4 = -vy
+            q5 = -vz
+            l0 = guu * p0 + guv * q0
+            l1 = guu * p1 + guv * q1
+            l2 = guu * p2
+            l3 = guu * p3 + guv * q3
+            l4 = guu * p4 + guv * q4
+            l5 = guv * q5
+            m0 = guv * p0 + gvv * q0
+            m1 = guv * p1 + gvv * q1
+            m2 = guv * p2
+            m3 = guv * p3 + gvv * q3
+            m4 = guv * p4 + gvv * q4
+            m5 = gvv * q5
             a00 += p0 * l0 + q0 * m0
             a01 += p0 * l1 + q0 * m1
             a02 += p0 * l2 + q0 * m2
@@ -92,8 +124,9 @@ def block_adder(read_point: Any, robust: Any) -> Any:
             sums[m] += block[m]
 
     @kernel
-    def add_points(X, Y, Z, colors, texels, width, R_cam_from_world, center_world, scale, sums):
+    def add_points(xyz, colors, texels, width, R_cam_from_world, center_world, scale, sums):
         points = make_projected()
+        X, Y, Z = xyz
         for lo in range(0, len(X), CHUNK):
             hi = min(lo + CHUNK, len(X))
             project(X[lo:hi], Y[lo:hi], Z[lo:hi], R_cam_from_world, center_world, width, points)

@@ -23,7 +23,7 @@ Objective = Callable[[Pose], Equations]
 
 @dataclass(frozen=True)
 class Loss:
-    """What a pose is judged by: functions of the points that count and of the pose; small is good."""
+    """A loss of poses: functions of the points that count and of the pose; small is good."""
 
     value: Callable[[PackedPoints, Pose], float]
     equations: Callable[[PackedPoints, Pose], Equations]
@@ -41,18 +41,9 @@ def sampling_loss_of(texels: Texels) -> Loss:
 Watch = Callable[[int, Pose, float], None]
 
 
-@dataclass(frozen=True)
-class Refined:
-    """Where a descent arrived."""
-
-    pose: Pose
-    loss: float  # over the points seen from there
-    num_iterations: int
-
-
 @dataclass
-class Best:
-    """The best pose that a descent has passed."""
+class Refined:
+    """The best pose that a descent has passed; of `refine`, its loss over the points seen from there."""
 
     pose: Pose
     loss: float = np.inf
@@ -60,7 +51,8 @@ class Best:
     def offer(self, pose: Pose, loss: float) -> None:
         """Keep `pose` if it is better."""
         if loss < self.loss:
-            self.pose, self.loss = pose, loss
+            self.pose = pose
+            self.loss = loss
 
 
 @dataclass
@@ -91,9 +83,9 @@ class Adam:
         return np.asarray(-self.step_size * mean / (np.sqrt(mean_square) + 1e-8))
 
 
-def descend_adam(objective: Objective, pose: Pose, adam: Adam, num_iterations: int) -> Best:
+def descend_adam(objective: Objective, pose: Pose, adam: Adam, num_iterations: int) -> Refined:
     """The best pose of `num_iterations` steps of `adam`, which is left ready to go on."""
-    best = Best(pose)
+    best = Refined(pose)
     for _ in range(num_iterations):
         loss, gradient, _ = objective(pose)
         if not np.isfinite(loss):
@@ -103,14 +95,14 @@ def descend_adam(objective: Objective, pose: Pose, adam: Adam, num_iterations: i
     return best
 
 
-def descend_lbfgs(objective: Objective, start: Pose, num_iterations: int) -> Best:
+def descend_lbfgs(objective: Objective, start: Pose, num_iterations: int) -> Refined:
     """The best pose of at most `num_iterations` of SciPy's L-BFGS-B.
 
     Parameters are the rotation vector of a turn of the start, R = exp([w]x) R_start, and the camera's shift.
     """
     from scipy.optimize import minimize  # noqa: PLC0415  # Adam need not wait for it: 0.25 s
 
-    best = Best(start)
+    best = Refined(start)
 
     def value(parameters: Array) -> tuple[float, Array]:
         w = parameters[:3]
@@ -126,9 +118,9 @@ def descend_lbfgs(objective: Objective, start: Pose, num_iterations: int) -> Bes
     return best
 
 
-def descend_gauss_newton(objective: Objective, start: Pose, num_iterations: int) -> Best:
+def descend_gauss_newton(objective: Objective, start: Pose, num_iterations: int) -> Refined:
     """The best pose of at most `num_iterations` Levenberg-Marquardt steps on the reweighted least squares."""
-    best = Best(start)
+    best = Refined(start)
 
     def equations(_: None, R_cam_from_world: Array, center_world: Array, sums: Array) -> None:
         pose = Pose(orthonormal(R_cam_from_world), center_world.copy())
@@ -136,8 +128,8 @@ def descend_gauss_newton(objective: Objective, start: Pose, num_iterations: int)
         sums[MATRIX:] = matrix[np.triu_indices(6)]
         best.offer(pose, sums[LOSS])
 
-    R, t = start.R_cam_from_world.copy(), start.center_world.copy()
-    levenberg_marquardt(equations)(None, num_iterations, LEAST_STEP, R, t)
+    at = Pose(start.R_cam_from_world.copy(), start.center_world.copy())
+    levenberg_marquardt(equations)(None, num_iterations, LEAST_STEP, at.R_cam_from_world, at.center_world)
     return best
 
 
@@ -176,8 +168,7 @@ def refine(
         if settings.solver == "adam":
             adam.best_loss = np.inf
             pose = descend_adam(objective, pose, adam, num_iterations).pose
-        elif settings.solver == "lbfgs":
-            pose = descend_lbfgs(objective, pose, num_iterations).pose
         else:
-            pose = descend_gauss_newton(objective, pose, num_iterations).pose
-    return Refined(pose, loss.value(seen_from(pose), pose), settings.num_iterations)
+            descend = descend_lbfgs if settings.solver == "lbfgs" else descend_gauss_newton
+            pose = descend(objective, pose, num_iterations).pose
+    return Refined(pose, loss.value(seen_from(pose), pose))

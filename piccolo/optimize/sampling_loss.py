@@ -29,12 +29,13 @@ from ..panorama.texels import (
     is_valid,
     make_projected,
     project,
+    texels_around,
 )
 from .normal_equations import GRADIENT, MATRIX, NUM_SUMS, block_adder
 
 BLOCK = 4096
 # A pose that hides more of the cloud behind masked pixels has no loss. Of a panorama valid in part, the least
-# share of points that must show goes with the square of that part: a crop may face the nearer wall.
+# fraction of points that must show goes with the square of that part: a crop may face the nearer wall.
 MIN_SHOWN_SHARE = 0.5
 HALF_LEVEL = np.float32(0.5)  # a residual below half an 8-bit level has the weight of half a level
 TO_UNIT = 1.0 / 255.0
@@ -52,10 +53,11 @@ def loss_blocks(x, y, z, rgbx, R_cam_from_world, center_world, texels, width, fi
             hi = min(lo + CHUNK, end)
             project(x[lo:hi], y[lo:hi], z[lo:hi], R_cam_from_world, center_world, width, points)
             gather(texels, width, points, hi - lo)
-            colors, total, count = rgbx[lo:hi], F0, F0
+            colors = rgbx[lo:hi]
+            total = count = F0
             for n in range(hi - lo):
                 weights = bilinear_weights(points.fu[n], points.fv[n])
-                t00, t10, t01, t11 = points.t00[n], points.t10[n], points.t01[n], points.t11[n]
+                t00, t10, t01, t11 = texels_around(points, n)
                 c = colors[n]
                 dr = blend(t00, t10, t01, t11, weights, 0) - channel(c, 0)
                 dg = blend(t00, t10, t01, t11, weights, 8) - channel(c, 8)
@@ -90,10 +92,10 @@ def normal_blocks(x, y, z, rgbx, R_cam_from_world, center_world, texels, width, 
     R, t = R_cam_from_world, center_world
     for block in range(len(sums)):
         lo = (first_block + block) * BLOCK
-        hi = min(len(x), lo + BLOCK)
+        part = slice(lo, min(len(x), lo + BLOCK))
         sums[block] = 0.0
-        xs, ys, zs, cs = x[lo:hi], y[lo:hi], z[lo:hi], rgbx[lo:hi]
-        add_packed(xs, ys, zs, cs, texels, width, R, t, HALF_LEVEL, sums[block])
+        xyz = (x[part], y[part], z[part])
+        add_packed(xyz, rgbx[part], texels, width, R, t, HALF_LEVEL, sums[block])
 
 
 def _sum_blocks(
@@ -107,18 +109,23 @@ def _sum_blocks(
     bounds = np.linspace(0, num_blocks, num_threads + 1).astype(np.int64)
 
     def run(part: int) -> None:
-        lo, hi = bounds[part], bounds[part + 1]
-        p, R, t = points, pose.R_cam_from_world, pose.center_world
-        blocks(p.x, p.y, p.z, p.rgbx, R, t, texels.rgbx, texels.width, lo, sums[lo:hi])
+        lo, hi = bounds[part : part + 2]
+        R, t = pose.R_cam_from_world, pose.center_world
+        blocks(points.x, points.y, points.z, points.rgbx, R, t, texels.rgbx, texels.width, lo, sums[lo:hi])
 
     list(Workers(num_threads).map(run, range(num_threads), "blocks"))
     return np.asarray(sums.sum(axis=0))
 
 
+def _is_hidden(count: float, points: PackedPoints, texels: Texels) -> bool:
+    """True if masked pixels hide too many of the points for a loss."""
+    return bool(count <= MIN_SHOWN_SHARE * texels.valid_share**2 * len(points))
+
+
 def sampling_loss(points: PackedPoints, texels: Texels, pose: Pose, num_threads: int = 1) -> float:
     """The paper's Eq. 2 at `pose`, in [0, sqrt(3)]; inf where masked pixels hide too many of the points."""
     total, count = _sum_blocks(loss_blocks, points, texels, pose, num_threads)[:2]
-    if count <= MIN_SHOWN_SHARE * texels.valid_share**2 * len(points):
+    if _is_hidden(count, points, texels):
         return math.inf
     return float(total / count * TO_UNIT)
 
@@ -132,7 +139,7 @@ def sampling_equations(
     """
     sums = _sum_blocks(normal_blocks, points, texels, pose, num_threads)
     total, count = sums[:2]
-    if count <= MIN_SHOWN_SHARE * texels.valid_share**2 * len(points):
+    if _is_hidden(count, points, texels):
         return math.inf, np.zeros(6), np.eye(6)
     per_point = TO_UNIT / count
     matrix = np.zeros((6, 6))

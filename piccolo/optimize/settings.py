@@ -1,4 +1,4 @@
-"""How to descend on a loss."""
+"""Settings of a descent on a loss."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -8,9 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.sphere import pixel_rays, solid_angles
+from ..geometry.vectors import row
 from ..kernels.jit import F0, F1, HALF, copy_to, inline_kernel, kernel
 from . import Panorama
-from .texels import CHUNK, Texels, bilinear_weights, blend, gather, is_valid, make_projected, project
+from .texels import (
+    CHUNK,
+    Texels,
+    bilinear_weights,
+    blend,
+    gather,
+    is_valid,
+    make_projected,
+    project,
+    texels_around,
+)
 
 CLIP = 2.0  # deviations; what differs more from its surroundings counts no more
 MIN_DEVIATION = 0.03  # of a channel in [0, 1]: flatter surroundings are not amplified further
@@ -37,9 +48,10 @@ def zscore(value, mean, inverse_std):
 
 
 @inline_kernel
-def inverse_std(mean, mean_square):
-    """1 / standard deviation, bounded where nothing varies."""
-    return F1 / math.sqrt(max(mean_square - mean * mean, F0) + _MIN_VARIANCE)
+def mean_and_inverse_std(total, squares, per):
+    """Mean and 1 / standard deviation of weighted sums, `per` weight; bounded where nothing varies."""
+    mean = total * per
+    return mean, F1 / math.sqrt(max(squares * per - mean * mean, F0) + _MIN_VARIANCE)
 
 
 @lru_cache(maxsize=8)
@@ -74,7 +86,8 @@ def block_moments(channels, weight, moments):
             m0 = m1 = m2 = m3 = m4 = m5 = m6 = F0
             for k in range(i * step, (i + 1) * step):
                 for n in range(j * step, (j + 1) * step):
-                    w, a, b, c = weight[k, n], channels[k, n, 0], channels[k, n, 1], channels[k, n, 2]
+                    w = weight[k, n]
+                    a, b, c = row(channels[k], n)
                     m0 += w
                     m1 += w * a
                     m2 += w * b
@@ -83,13 +96,16 @@ def block_moments(channels, weight, moments):
                     m5 += w * b * b
                     m6 += w * c * c
             m = moments[i, j]
-            m[0], m[1], m[2], m[3], m[4], m[5], m[6] = m0, m1, m2, m3, m4, m5, m6
+            for k, total in enumerate((m0, m1, m2, m3, m4, m5, m6)):
+                m[k] = total
 
 
 @inline_kernel
 def interpolation_along(num, num_wider):
-    """Where each of `num` pixels lies among fewer, wider ones around a row: indices (num,) and fractions."""
-    left, right, fraction = np.empty(num, np.uintp), np.empty(num, np.uintp), np.empty(num, np.float32)
+    """Places of `num` pixels among fewer, wider ones around a row: indices (num,) and fractions."""
+    left = np.empty(num, np.uintp)
+    right = np.empty(num, np.uintp)
+    fraction = np.empty(num, np.float32)
     per = np.float32(num_wider) / np.float32(num)
     for j in range(num):
         u = (np.float32(j) + HALF) * per - HALF
@@ -115,9 +131,10 @@ def pack_normalized(channels, weight, stats, texels):
     and a row clamped on each side.
     """
     height, width = weight.shape
-    num_rows, num_columns = stats.shape[0], stats.shape[1]
+    num_rows, num_columns, _ = stats.shape
     left, right, fraction = interpolation_along(width, num_columns)
-    wide, along = np.empty((6, num_columns), np.float32), np.empty((6, width), np.float32)
+    wide = np.empty((6, num_columns), np.float32)
+    along = np.empty((6, width), np.float32)
     per = np.float32(num_columns) / np.float32(width)
     for i in range(height):
         v = min(max((np.float32(i) + HALF) * per - HALF, F0), np.float32(num_rows - 1))
@@ -137,7 +154,8 @@ def pack_normalized(channels, weight, stats, texels):
             texel |= as_texel_channel(planes[1, j], along[1, j], along[4, j], 8)
             texel |= as_texel_channel(planes[2, j], along[2, j], along[5, j], 16)
             row[j] = texel | (np.int32(1 << 24) if weight[i, j] > HALF else np.int32(0))
-        texels[i + 1, 0], texels[i + 1, width + 1] = texels[i + 1, width], texels[i + 1, 1]
+        texels[i + 1, 0] = texels[i + 1, width]
+        texels[i + 1, width + 1] = texels[i + 1, 1]
     copy_to(texels[0], texels[1])
     copy_to(texels[height + 1], texels[height])
 
@@ -150,8 +168,7 @@ def finish_statistics(sums):
             s = sums[i, j]
             per = F1 / max(s[0], LEAST_WEIGHT)
             for c in range(3):
-                s[1 + c] *= per
-                s[4 + c] = inverse_std(s[1 + c], s[4 + c] * per)
+                s[1 + c], s[4 + c] = mean_and_inverse_std(s[1 + c], s[4 + c], per)
 
 
 def opponent_channels(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -177,7 +194,8 @@ def normalize_locally(
     rgb: NDArray[np.float32], counts: NDArray[np.bool_], sigma_deg: float
 ) -> NDArray[np.float32]:
     """Opponent channels (H, W, 3) of an image, locally normalised over what `counts`; elsewhere 0."""
-    channels, weight = opponent_channels(rgb), counts.astype(np.float32)
+    channels = opponent_channels(rgb)
+    weight = counts.astype(np.float32)
     statistics = local_statistics(channels, weight, rgb.shape[1], sigma_deg)
     normalized = (channels - statistics[..., :3]) * statistics[..., 3:]
     return np.asarray(np.clip(normalized, -CLIP, CLIP) * weight[..., None])
@@ -203,19 +221,22 @@ def normalize_panorama(panorama: Panorama, cell_deg: float, sigma_deg: float) ->
 @kernel
 def sample_channels(texels, width, directions, rotations, samples, validity):
     """Write channels (rotations, 3, cells), less the zero level, and validity along each turned direction."""
-    p, center, zero = make_projected(), np.zeros(3), np.float32(ZERO_LEVEL)
+    p = make_projected()
+    center = np.zeros(3)
+    zero = np.float32(ZERO_LEVEL)
     axes = directions.T.copy()
-    X, Y, Z = axes[0], axes[1], axes[2]
     for k in range(len(rotations)):
-        for lo in range(0, len(X), CHUNK):
-            hi = min(lo + CHUNK, len(X))
-            project(X[lo:hi], Y[lo:hi], Z[lo:hi], rotations[k], center, width, p)
+        for lo in range(0, len(directions), CHUNK):
+            hi = min(lo + CHUNK, len(directions))
+            project(axes[0, lo:hi], axes[1, lo:hi], axes[2, lo:hi], rotations[k], center, width, p)
             gather(texels, width, p, hi - lo)
-            s0, s1, s2 = samples[k, 0, lo:hi], samples[k, 1, lo:hi], samples[k, 2, lo:hi]
+            s0 = samples[k, 0, lo:hi]
+            s1 = samples[k, 1, lo:hi]
+            s2 = samples[k, 2, lo:hi]
             valid = validity[k, lo:hi]
             for n in range(hi - lo):
                 bilinear = bilinear_weights(p.fu[n], p.fv[n])
-                t00, t10, t01, t11 = p.t00[n], p.t10[n], p.t01[n], p.t11[n]
+                t00, t10, t01, t11 = texels_around(p, n)
                 v = is_valid(t00, t10, t01, t11)
                 s0[n] = v * (blend(t00, t10, t01, t11, bilinear, 0) - zero)
                 s1[n] = v * (blend(t00, t10, t01, t11, bilinear, 8) - zero)

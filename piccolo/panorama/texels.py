@@ -16,8 +16,6 @@ from ..geometry.sphere import direction_to_pixel, solid_angles
 from ..kernels.jit import F1, HALF, inline_kernel
 
 BYTE = np.int32(255)
-
-
 CHUNK = 512  # points
 
 
@@ -152,6 +150,12 @@ def project(X, Y, Z, R_cam_from_world, center_world, width, projected):
         p.x[n] = x
         p.y[n] = y
         p.z[n] = z
+
+
+@inline_kernel
+def texels_around(projected, n):
+    """The four texels around a projected point that `gather` has written."""
+    return projected.t00[n], projected.t10[n], projected.t01[n], projected.t11[n]
 
 
 @inline_kernel

@@ -24,8 +24,8 @@ from ..result import FAILED, UNREADABLE, check_scan
 from ..scan import File, Scan
 from ..scan_map.open_map import CachePolicy, open_map
 from ..scan_map.scan_map import ScanMap
-from ..views.surfel_renderer import MAX_SURFELS, encode_image
-from ..views.surfels import Surfels, surfels_of
+from ..views.pictures import encode_image
+from ..views.surfels import MAX_SURFELS, Surfels, surfels_of
 from .entries import Entry, document_of_entry, names_of, read_entries, short_names_of
 from .pictures import make_pictures, read_options_of, taken_out
 from .plan_image import OwnPlan, PlanImage, draw_plan, own_plan

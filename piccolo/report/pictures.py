@@ -31,9 +31,8 @@ from ..panorama import Panorama, ReadOptions, read_panorama
 from ..panorama.model import shrink
 from ..panorama.video import frames_at
 from ..result import Result
-from ..views.field import cut
-from ..views.surfel_renderer import encode_image, fill_holes, render_surfels, visible_indices
-from ..views.surfels import Surfels
+from ..views.pictures import cut, encode_image, fill_holes
+from ..views.surfels import Surfels, render_surfels, visible_indices
 from ..views.zbuffer import View
 
 QUALITY = 80  # of JPEG

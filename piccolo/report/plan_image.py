@@ -19,7 +19,7 @@ from ..geometry.colors import unpack_rgb
 from ..geometry.pose import Array
 from ..panorama.picture import read_picture
 from ..scan_map.scan_map import ScanMap
-from ..views.surfel_renderer import fill_holes
+from ..views.pictures import fill_holes
 
 CUT = 1.9  # [m] above the floor: below ceilings and lintels, above most furniture
 BELOW_FLOOR = 0.4  # [m] that still belongs to the storey: steps, ramps

@@ -1,4 +1,4 @@
-"""Where a camera can be: free space at a camera's height above something that carries it."""
+"""Positions of a camera: free space at a camera's height above something that carries it."""
 
 import time
 from typing import Any, NamedTuple
@@ -18,7 +18,8 @@ MIN_COVERAGE = 0.55  # fraction of the sphere that shows something: flat ground 
 OPEN_COVERAGE = 0.3  # the same where hardly any place is closed in: open land
 MIN_ENCLOSED = 0.2  # fraction of the free places that are closed in, else the land counts as open
 FREE_SPACE_VIEW = ViewConfig(num_rings=12, stats_rings=12, sigma_deg=22.0, voxel_per_range=1 / 8)
-MIN_HEIGHT, MAX_HEIGHT = 0.3, 2.4  # [m] above a surface that can carry a tripod or a person
+MIN_HEIGHT = 0.3  # [m] above a surface that can carry a tripod or a person
+MAX_HEIGHT = 2.4
 SUPPORT_RADIUS = 0.9  # [m] the floor right below a scanner is never scanned
 STOREY = 2.6  # [m] a floor is not farther below a camera
 SURFACE_VOXEL = 0.16  # [m]
@@ -53,7 +54,7 @@ class Ball(NamedTuple):
     radius: float
 
     def holds(self, points: NDArray[np.floating[Any]], margin: float = 0.0) -> NDArray[np.bool_]:
-        """Which of some points (N, 3) or (N, 2) lie in it, or at most a margin [m] beside it."""
+        """Mask (N,) of points (N, 3) or (N, 2) that lie in it, or at most a margin [m] beside it."""
         distance = np.linalg.norm(points - self.center[: points.shape[1]], axis=1)
         return np.asarray(distance <= self.radius + margin)
 
@@ -65,7 +66,7 @@ class Box(NamedTuple):
     high: Array
 
     def holds(self, points: NDArray[np.floating[Any]], margin: float = 0.0) -> NDArray[np.bool_]:
-        """As of Ball."""
+        """Mask (N,) of points (N, 3) or (N, 2) that lie in it, or at most a margin [m] beside it."""
         k = points.shape[1]
         is_inside = (points >= self.low[:k] - margin) & (points <= self.high[:k] + margin)
         return np.asarray(is_inside.all(axis=1))
@@ -100,7 +101,8 @@ def supported_cells(surfaces: NDArray[np.float32], within: Ball | Box | None = N
     low = base.min(axis=0) - reach
     shape = base.max(axis=0) - low + reach + len(layers)
     weights = np.array([shape[1] * shape[2], shape[2], 1])  # one number a cell sorts as its three do
-    codes, found = np.unique((base - low) @ weights), np.empty(0, np.int64)
+    codes = np.unique((base - low) @ weights)
+    found = np.empty(0, np.int64)
     for begin in range(0, len(codes), BASES):
         around_some = np.unique(codes[begin : begin + BASES, None] + steps @ weights)
         cells = np.stack(np.unravel_index(around_some, shape), axis=1) + low
@@ -138,7 +140,8 @@ def nearest_distances(tree: Any, centers: NDArray[np.floating[Any]], workers: Wo
 
 def warn_if_long(octree: Octree, centers: NDArray[np.floating[Any]], workers: Workers) -> None:
     """Say about how many minutes the views from the centres (N, 3) take, by a sample of them."""
-    sample, alone = centers[:: 1 + len(centers) // BLOCK], Workers()
+    sample = centers[:: 1 + len(centers) // BLOCK]
+    alone = Workers()
     coverage(octree, sample[:1], alone)  # compiled
     begin = time.perf_counter()
     coverage(octree, sample, alone)

@@ -39,8 +39,10 @@ WANTED = "wanted a whole map by tools/prepare_map.py"
 ZIP_MAGIC = b"PK\x03\x04"
 COPIED_AT_ONCE = 1 << 22  # [byte]
 # The first member of a map: its name and where that stands, and the beginning of its value somewhere behind.
-FIRST_NAME, FIRST_NAME_AT = b"format.npy", 30
-FIRST_VALUE, FIRST_VALUE_WITHIN = FORMAT.partition("/")[0].encode("utf-32-le"), 512
+FIRST_NAME = b"format.npy"
+FIRST_NAME_AT = 30
+FIRST_VALUE = FORMAT.partition("/")[0].encode("utf-32-le")
+FIRST_VALUE_WITHIN = 512
 
 
 def save_map(scan_map: ScanMap, path: Path) -> None:
@@ -126,12 +128,8 @@ def load_map(path: Path, remembers: bool = False) -> ScanMap:
                 remember(what, archive.status, "")
         warnings = clean_warnings(path, arrays["warnings"])
     own: dict[str, Any] = {name: arrays[name] for name in ARRAYS if name not in ("has_labels", "scan_sha256")}
-    octree = Octree(
-        nodes=arrays["octree_nodes"],
-        first_child=arrays["octree_first_child"],
-        level_start=arrays["octree_level_start"],
-        leaf_size=float(arrays["octree_leaf_size"]),
-    )
+    parts: dict[str, Any] = {name: arrays[f"octree_{name}"] for name in Octree._fields}
+    octree = Octree(**{**parts, "leaf_size": float(arrays["octree_leaf_size"])})
     scan_map = ScanMap(
         octree=octree,
         views=CandidateViews(octree, arrays["centers"]),

@@ -1,4 +1,4 @@
-"""Whether the arrays of a map file are what `save_map` writes, before a search takes them.
+"""Checks of a map file's arrays: they are what `save_map` writes, before a search takes them.
 
 A map may come from anybody, and checksums are easily mended: every index that a kernel takes from a map is
 checked, every number bounded, and the octree compared with the grid that its voxels come from.
@@ -57,19 +57,22 @@ LAYOUT: dict[str, tuple[str, tuple[int | str, ...]]] = {
 SHA256 = re.compile("[0-9a-f]{64}")
 ROUNDING = 1e-9  # of a rotation
 LEAF_SIZES = 1e-3, 0.1  # [m] least and most
-FARTHEST_ORIGIN, MARGIN = 1e12, 10.0  # [m] of the world; around the voxels that are kept
+FARTHEST_ORIGIN = 1e12  # [m] of the world
+MARGIN = 10.0  # [m] around the voxels that are kept
 BRIGHTEST = np.float32(1.0 + 1e-6)
 LARGEST_DEVIATION = 1.0  # [m] of points from their surfaces
 MAX_CRS = 4 * 20_000  # [byte]
-MAX_WARNINGS, MAX_WARNING = 1000, 5000  # lines, and characters of a line
+MAX_WARNINGS = 1000  # lines
+MAX_WARNING = 5000  # characters of a line
 
 
 @inline_kernel
 def is_in_range(node, reach):
     """True if a node (6,) is not farther than `reach` from zero along any axis and its colour is one."""
-    x, y, z, r, g, b = node[0], node[1], node[2], node[3], node[4], node[5]
-    is_near = abs(x) <= reach and abs(y) <= reach and abs(z) <= reach
-    return is_near and F0 <= r <= BRIGHTEST and F0 <= g <= BRIGHTEST and F0 <= b <= BRIGHTEST
+    is_one = True
+    for k in range(3):
+        is_one = is_one and abs(node[k]) <= reach and F0 <= node[3 + k] <= BRIGHTEST
+    return is_one
 
 
 @kernel
@@ -123,6 +126,11 @@ def _refuse(path: Path, found: str) -> None:
     raise InputError(f"{path}: found {found}, wanted a map by tools/prepare_map.py; prepare it again")
 
 
+def _reach(arrays: Arrays) -> float:
+    """The most [m] that anything in a map is from the origin along an axis."""
+    return WINDOW * float(arrays["octree_leaf_size"]) + MARGIN
+
+
 def _check_frame(path: Path, arrays: Arrays) -> None:
     """The rotation and the variance are such, and the origin lies at whole metres of the map's axes."""
     R = checked_rotation(arrays["R_map_from_world"], ROUNDING, f"{path}: R_map_from_world of the map")
@@ -137,22 +145,22 @@ def _check_frame(path: Path, arrays: Arrays) -> None:
 
 def _check_octree(path: Path, arrays: Arrays) -> None:
     """Each level's children are the next level, one to eight a node, within its voxel of the grid."""
-    nodes, first_child = arrays["octree_nodes"], arrays["octree_first_child"]
-    start, leaf_size = arrays["octree_level_start"], float(arrays["octree_leaf_size"])
+    nodes = arrays["octree_nodes"]
+    first_child = arrays["octree_first_child"]
+    start = arrays["octree_level_start"]
+    leaf_size = float(arrays["octree_leaf_size"])
     if not LEAF_SIZES[0] <= leaf_size <= LEAF_SIZES[1]:
         _refuse(path, f"leaves of {leaf_size} m")
     if start[0] != 0 or start[-1] != len(nodes) or not (start[:-1] < start[1:]).all():
         _refuse(path, f"levels that begin at {start.tolist()} of {len(nodes)} nodes")
-    num_inner = start[-2]
     num_children = np.diff(first_child)
     is_tree = len(first_child) == len(nodes) + 1 and (first_child[start[:-1]] == start[1:]).all()
-    inner, leaves = num_children[:num_inner], num_children[num_inner:]
+    inner, leaves = np.split(num_children, [start[-2]])
     if not (is_tree and inner.min() >= 1 and inner.max() <= 8 and not leaves.any()):
-        _refuse(path, "links of an octree that are none")
+        _refuse(path, "invalid child links of the octree")
     origin_map = np.rint(arrays["R_map_from_world"] @ arrays["origin_world"])
     origin = origin_map + PHASE / (1 << QUANTUM_BITS) * leaf_size
-    reach = WINDOW * leaf_size + MARGIN
-    misplaced = first_misplaced(nodes, first_child, start, origin, leaf_size, reach)
+    misplaced = first_misplaced(nodes, first_child, start, origin, leaf_size, _reach(arrays))
     if misplaced >= 0:
         _refuse(path, f"an octree whose node {misplaced} is {nodes[misplaced].tolist()}")
 
@@ -160,32 +168,24 @@ def _check_octree(path: Path, arrays: Arrays) -> None:
 def _check_views(path: Path, arrays: Arrays) -> None:
     """Candidates and what they see are in range, and the sparse ones are those of the coarse grid."""
     centers = arrays["centers"]
-    reach = WINDOW * float(arrays["octree_leaf_size"]) + MARGIN
-    if not np.abs(centers).max(initial=0.0) <= reach:
+    if not np.abs(centers).max(initial=0.0) <= _reach(arrays):
         _refuse(path, "a candidate at no finite place or too far away")
-    if arrays["wide_features"].min(initial=0) < -127:
-        _refuse(path, "wide_features below -127")
+    for name, (dtype, _) in LAYOUT.items():
+        if dtype == "|i1" and arrays[name].min(initial=0) < -127:
+            _refuse(path, f"{name} below -127")
     if not np.array_equal(arrays["sparse"], sparse_candidates(centers)[0]):
         _refuse(path, "sparse candidates that are not those of the coarse grid")
 
 
 def _check_features(path: Path, arrays: Arrays) -> None:
     """Features lie where the scan is, and the lists hold each of them once."""
-    points, sizes, start = arrays["local_points"], arrays["local_sizes"], arrays["local_list_start"]
-    reach = WINDOW * float(arrays["octree_leaf_size"]) + 2.0 * MARGIN + MAX_RANGE
-    if not np.abs(points).max(initial=F0) <= reach:
+    points = arrays["local_points"]
+    sizes = arrays["local_sizes"]
+    start = arrays["local_list_start"]
+    if not np.abs(points).max(initial=F0) <= _reach(arrays) + MARGIN + MAX_RANGE:
         _refuse(path, "a feature at no finite place or too far away")
     if not (sizes.min(initial=F1) > F0 and sizes.max(initial=F0) <= MAX_RANGE):
         _refuse(path, f"features of {sizes.min()} to {sizes.max()} m")
-    for name in (
-        "local_directions",
-        "local_tangents",
-        "local_descriptors",
-        "local_components",
-        "local_middles",
-    ):
-        if arrays[name].min(initial=0) < -127:
-            _refuse(path, f"{name} below -127")
     if not 1 <= len(arrays["local_middles"]) == len(start) - 1 <= MAX_LISTS:
         _refuse(path, f"{len(arrays['local_middles'])} lists of features with {len(start)} beginnings")
     if start[0] != 0 or start[-1] != len(points) or (np.diff(start) < 0).any():
@@ -194,9 +194,9 @@ def _check_features(path: Path, arrays: Arrays) -> None:
 
 def _check_feature_views(path: Path, arrays: Arrays) -> None:
     """Each feature was seen from one of the views, all of which are where the scan is."""
-    centers, views = arrays["local_view_centers"], arrays["local_views"]
-    reach = WINDOW * float(arrays["octree_leaf_size"]) + MARGIN
-    if not np.abs(centers).max(initial=0.0) <= reach:
+    centers = arrays["local_view_centers"]
+    views = arrays["local_views"]
+    if not np.abs(centers).max(initial=0.0) <= _reach(arrays):
         _refuse(path, "a view at no finite place or too far away")
     if len(centers) > MOST_VIEWS or views.max(initial=0) >= max(len(centers), 1):
         _refuse(path, f"a feature of view {views.max(initial=0)} of {len(centers)}")
@@ -204,12 +204,13 @@ def _check_feature_views(path: Path, arrays: Arrays) -> None:
 
 def _check_scans(path: Path, arrays: Arrays) -> None:
     """Names are text, all different, and each candidate lies in the scan of one of them."""
-    found, index = arrays["scan_names"], arrays["scan_of_candidate"]
+    found = arrays["scan_names"]
+    index = arrays["scan_of_candidate"]
     if found.dtype.kind != "U" or found.ndim != 1 or len(found) > MAX_SCANS:
         _refuse(path, f"scan_names of type {found.dtype} and shape {found.shape}")
     names = list(map(str, found))
     if len(set(names)) < len(names) or not all(map(is_name, names)):
-        _refuse(path, "names of scans that are none, or twice the same")
+        _refuse(path, "invalid or duplicate names of scans")
     if index.max(initial=0) >= max(len(names), 1):
         _refuse(path, f"a candidate in scan {index.max()} of {len(names)}")
 

@@ -1,4 +1,4 @@
-"""Maps of several scans, buildings or storeys: their names, and in which of them a place lies."""
+"""Maps of several scans, buildings or storeys: their names, and in which of them a pose lies."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,7 +11,8 @@ from ..errors import InputError
 from ..geometry.pose import Array, Pose
 from .scan_map import ScanMap
 
-MAX_NAME, MAX_SCANS = 100, 1000  # characters; scans of a map
+MAX_NAME = 100  # characters
+MAX_SCANS = 1000  # of a map
 
 
 def is_name(name: str) -> bool:
@@ -52,30 +53,35 @@ def check_within(scan_map: ScanMap, within: Sequence[str]) -> None:
 
 
 def candidates_within(scan_map: ScanMap, within: Sequence[str]) -> NDArray[np.bool_]:
-    """Which candidates (N,) lie in the scans of these names."""
-    wanted = [k for k, name in enumerate(scan_map.scan_names) if name in within]
-    return np.isin(scan_map.scan_of_candidate, wanted)
+    """Mask (N,) of the candidates in the scans of these names."""
+    named_so = [k for k, name in enumerate(scan_map.scan_names) if name in within]
+    return np.isin(scan_map.scan_of_candidate, named_so)
 
 
 def scan_at(scan_map: ScanMap, center_map: Array) -> str | None:
     """The scan in which a place (3,) lies, that of the nearest candidate; None if there are no names."""
-    m = scan_map
-    if not (m.scan_names and len(m.centers)):
+    if not (scan_map.scan_names and len(scan_map.centers)):
         return None
-    if len(m.scan_names) == 1:
-        return m.scan_names[0]
-    offsets = m.centers - center_map
+    offsets = scan_map.centers - center_map
     nearest = np.einsum("ij,ij->i", offsets, offsets).argmin()
-    return m.scan_names[int(m.scan_of_candidate[nearest])]
+    return scan_map.scan_names[int(scan_map.scan_of_candidate[nearest])]
 
 
-def with_scans(scan_map: ScanMap, found: Localization) -> Localization:
-    """What was found, each pose with the scan in which it lies."""
-
-    def scan_of(pose: Pose) -> str | None:
-        return scan_at(scan_map, scan_map.from_world(pose).center_world)
-
-    if found.pose is None or not scan_map.scan_names:
+def with_places(scan_map: ScanMap, found: Localization) -> Localization:
+    """Return a result with the scans, the storey (from 1, the lowest) and the height above the floor."""
+    pose = found.pose
+    if pose is None:
         return found
-    alternatives = tuple(replace(a, scan=scan_of(a.pose)) for a in found.alternatives)
-    return replace(found, scan=scan_of(found.pose), alternatives=alternatives)
+    (storey,), (height,) = scan_map.storeys.at(scan_map.from_world(pose).center_world[None])
+    if storey >= 0:
+        found = replace(found, storey=int(storey) + 1, height_above_floor=round(float(height), 4))
+    if not scan_map.scan_names:
+        return found
+
+    alternatives = tuple(replace(a, scan=scan_of(scan_map, a.pose)) for a in found.alternatives)
+    return replace(found, scan=scan_of(scan_map, pose), alternatives=alternatives)
+
+
+def scan_of(scan_map: ScanMap, pose: Pose) -> str | None:
+    """The scan in which a pose of the world lies."""
+    return scan_at(scan_map, scan_map.from_world(pose).center_world)

@@ -19,9 +19,9 @@ from ..geometry.pose import rotate_points
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
 from ..local_features.feature_map import FeatureMap
-from ..scan_map.prior import NOTHING_KNOWN, Prior
 from .map_file import FORMAT, NAME, is_map_file, load_map, save_map
 from .named_scans import named
+from .prior import NOTHING_KNOWN, Prior
 from .scan_addition import add_scan
 from .scan_map import ScanMap, prepare_map, with_features
 
@@ -32,7 +32,7 @@ MAKERS = ("cloud", "geometry", "gravity", "local_features", "optimize", "panoram
 
 @dataclass(frozen=True)
 class CachePolicy:
-    """Where prepared maps are kept."""
+    """The place of prepared maps."""
 
     is_used: bool = True
     folder: Path | None = None  # None for the user's cache
@@ -69,8 +69,9 @@ def open_map(
     def build() -> ScanMap:
         with watch.stage("read"):
             cloud = open_cloud(paths, cloud_settings, workers.show)
-        how = cloud_settings.up, watch
-        scan_map = prepare_map(cloud, workers, *how, prior=prior, has_features=has_features)
+        scan_map = prepare_map(
+            cloud, workers, cloud_settings.up, watch, prior=prior, has_features=has_features
+        )
         has_labels = cloud_settings.labels is not None
         return replace(scan_map, has_labels=has_labels, scan_sha256=digest, crs=crs_of(paths))
 
@@ -137,10 +138,8 @@ def scan_sha256_of(paths: Sequence[Path], cache: CachePolicy) -> str:
 
 def content_key(scan_sha256: str, settings: CloudSettings) -> str:
     """Name for the map of a cloud's files: by what is in them and the settings, wherever they lie."""
-    digest = hashlib.sha256(
-        " ".join([FORMAT, digest_of_sources(MAKERS), repr(replace(settings, crs=None)), scan_sha256]).encode()
-    )
-    return digest.hexdigest()[:32]
+    parts = [FORMAT, digest_of_sources(MAKERS), repr(replace(settings, crs=None)), scan_sha256]
+    return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:32]
 
 
 def cached_map(
@@ -173,13 +172,12 @@ def cached_map(
         with watch.stage("prepare"):
             save_map(scan_map, path)
     except OSError as error:
-        warning = f"{kept_in}: {error.strerror or error}; the prepared map is not kept"
-        return scan_map, warning
+        return scan_map, f"{kept_in}: {error.strerror or error}; the prepared map is not kept"
     return kept_late(scan_map, path), warning
 
 
 def kept_late(scan_map: ScanMap, path: Path) -> ScanMap:
-    """The same; when its local features are made, the map is written once more, with them."""
+    """The map itself; when its local features are made, it is written once more, with them."""
 
     def look() -> FeatureMap | None:
         with suppress(OSError, InputError):
@@ -193,7 +191,8 @@ def kept_late(scan_map: ScanMap, path: Path) -> ScanMap:
             save_map(replace(scan_map, local_features=features), path)
 
     if scan_map.late:
-        scan_map.late.keep_by(look, keep)
+        scan_map.late.look = look
+        scan_map.late.keep = keep
     return scan_map
 
 

@@ -7,13 +7,14 @@ from ..cloud.crs import from_wgs84
 from ..errors import InputError
 from ..panorama.photo import GpsPosition
 
-DEFAULT_ACCURACY, LEAST_ACCURACY = 10.0, 5.0  # [m] where the file does not say, or says less
+DEFAULT_ACCURACY = 10.0  # [m] where the file does not say
+LEAST_ACCURACY = 5.0  # [m] where it says less
 SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What the user knows beforehand; each narrows the search."""
+    """Prior knowledge by the user; each narrows the search."""
 
     near_world: tuple[float, float, float | None] | None = None  # [m] within `radius`; None: any height
     radius: float | None = None  # [m]
@@ -42,7 +43,7 @@ NOTHING_KNOWN = Prior()
 
 @dataclass(frozen=True)
 class GpsPrior:
-    """Where a photo's GPS position lies in the scan."""
+    """A photo's GPS position in the scan."""
 
     center_world: tuple[float, float]  # [m] in the scan's coordinates, of any height
     radius: float  # [m] within which the camera is searched first

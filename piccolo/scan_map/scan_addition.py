@@ -1,4 +1,4 @@
-"""Another scan in a map: only what it changes is prepared anew.
+"""Another scan in a map: only what it changes is prepared again.
 
 Candidates stay where they are, views and local features are made anew where the new scan is seen, and all
 else keeps every bit.
@@ -15,23 +15,23 @@ from ..cloud.surface_noise import surface_variance
 from ..cloud.voxels import LEAF_SIZE, WINDOW, Voxels, join_voxels
 from ..errors import InputError
 from ..geometry.pose import Array
-from ..geometry.sphere import make_grid, whole_areas
+from ..geometry.sphere import whole_areas
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
 from ..local_features.feature_map import MOST_VIEWS, FeatureMap, extend_feature_map
 from ..local_features.view_positions import view_positions
-from ..views.candidate_views import SEARCH_VIEW, WIDE_RINGS, CandidateViews, WideViews, render_wide
+from ..views.candidate_views import SEARCH_VIEW, CandidateViews, WideViews, render_wide
 from ..views.view import BLOCK, ranges_around
-from .aligned_cloud import Voxelized
 from .camera_positions import CLEARANCE_VOXEL, MIN_CLEARANCE, Box, candidate_centers
 from .named_scans import check_name
-from .scan_map import ScanMap, seen_by, sparse_candidates
+from .scan_map import ScanMap, Voxelized, seen_by, sparse_candidates
 
 REACH = 3.0  # [m] beside the new scan there may be new places for a camera
 NEARER = 0.9  # of two scans the one in front is nearer by this
 # Fractions of the sphere in which a view shows the new scan, else it stays, or its features do: what they
 # miss, new views have from nearer.
-LEAST_CHANGED, LEAST_FOR_FEATURES = 0.01, 0.1
+LEAST_CHANGED = 0.01
+LEAST_FOR_FEATURES = 0.1
 FAR_APART = 500.0  # [m] between scans that perhaps have no common coordinates
 COARSE_VOXEL = 2.56  # [m]
 
@@ -58,8 +58,8 @@ def add_scan(old: ScanMap, cloud: Voxelized, name: str, workers: Workers, watch:
     for warning in warnings:
         workers.warn(warning)
     with watch.stage("prepare"):
-        leaves = old.octree.level(LEAF_SIZE), new.level(LEAF_SIZE)
-        octree = build_octree(join_voxels(*leaves, old.R_map_from_world @ old.origin_world))
+        own, added = (o.level(LEAF_SIZE) for o in (old.octree, new))
+        octree = build_octree(join_voxels(own, added, old.R_map_from_world @ old.origin_world))
         found = joined_candidates(old, new, octree, workers)
         sparse, _ = sparse_candidates(found.centers)
         wide = joined_views(old, octree, found, sparse, workers)
@@ -90,8 +90,9 @@ def read_beside(old: ScanMap, cloud: Voxelized) -> tuple[Octree, tuple[str, ...]
     if (farthest := float(np.abs(nodes[:, :3]).max())) > WINDOW * LEAF_SIZE:
         found = f"found a scan {farthest / 1000.0:.0f} km from the map's"
         raise InputError(f"--add: {found}, wanted one coordinate system")
-    first, second = old.octree.level(COARSE_VOXEL)[:, :3], nodes[:, :3]
-    gap = np.maximum(second.min(axis=0) - first.max(axis=0), first.min(axis=0) - second.max(axis=0))
+    own = old.octree.level(COARSE_VOXEL)[:, :3]
+    added = nodes[:, :3]
+    gap = np.maximum(added.min(axis=0) - own.max(axis=0), own.min(axis=0) - added.max(axis=0))
     warnings = voxels.warnings
     if (apart := float(np.linalg.norm(np.maximum(gap, 0.0)))) > FAR_APART:
         warnings += (f"the scan lies {apart:.0f} m from the map's; both need one coordinate system",)
@@ -137,7 +138,8 @@ def compared(new: Octree, old: Octree, centers: Array, workers: Workers) -> tupl
     def compare(lo: int) -> tuple[Array, Array]:
         some = centers[lo : lo + BLOCK]
         of_new, of_old = (ranges_around(octree, some, SEARCH_VIEW) for octree in (new, old))
-        of_new[of_new == 0.0], of_old[of_old == 0.0] = np.inf, np.inf
+        of_new[of_new == 0.0] = np.inf
+        of_old[of_old == 0.0] = np.inf
         return (of_new < NEARER * of_old) @ area, (of_old < NEARER * of_new) @ area
 
     parts = list(workers.map(compare, range(0, len(centers), BLOCK), "compare views"))
@@ -149,20 +151,20 @@ def joined_views(
     old: ScanMap, octree: Octree, found: Candidates, sparse: NDArray[np.int64], workers: Workers
 ) -> WideViews:
     """Wide views of the sparse candidates: the map's, and those that it lacks or that have changed anew."""
-    num_wide = len(make_grid(WIDE_RINGS))
-    joined = WideViews(
-        np.empty((len(sparse), 3 * num_wide), np.int8), np.empty((len(sparse), num_wide), np.uint8)
-    )
-    known, place = np.full(len(old.centers), -1), np.full(len(found.centers), -1)  # among those of the map
+    known = np.full(len(old.centers), -1)  # row among the map's views
     known[old.sparse] = np.arange(len(old.sparse))
+    place = np.full(len(found.centers), -1)
     place[: len(found.rows)] = known[found.rows]
     place[found.changed] = -1
     is_kept = place[sparse] >= 0
-    joined.features[is_kept] = old.wide_features[place[sparse[is_kept]]]
-    joined.seen[is_kept] = old.wide_seen[place[sparse[is_kept]]]
-    anew = render_wide(octree, found.centers[sparse[~is_kept]], SEARCH_VIEW, workers)
-    joined.features[~is_kept], joined.seen[~is_kept] = anew
-    return joined
+    joined = []
+    added = render_wide(octree, found.centers[sparse[~is_kept]], SEARCH_VIEW, workers)
+    for own, more in zip((old.wide_features, old.wide_seen), added, strict=True):
+        values = np.empty((len(sparse), own.shape[1]), own.dtype)
+        values[is_kept] = own[place[sparse[is_kept]]]
+        values[~is_kept] = more
+        joined.append(values)
+    return WideViews(*joined)
 
 
 def scans_of(old: ScanMap, found: Candidates) -> NDArray[np.uint16]:

@@ -1,27 +1,64 @@
-"""What is prepared once per cloud: octree, places where a camera can be, and coarsely what it sees there."""
+"""The map prepared once per cloud: octree, places where a camera can be, and coarsely what it sees there."""
 
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cloud.octree import Octree
-from ..cloud.settings import UpAxis
+from ..cloud.octree import Octree, build_octree
+from ..cloud.settings import R_z_from_axis, UpAxis
 from ..cloud.soa import PackedPoints, pack_points
 from ..cloud.surface_noise import surface_variance
+from ..cloud.voxels import Voxels
 from ..geometry.pose import Array, Pose
+from ..gravity.alignment import find_up
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
 from ..local_features.feature_map import FeatureMap, make_feature_map
 from ..local_features.view_positions import Look, view_positions
-from ..scan_map.prior import NOTHING_KNOWN, Prior
 from ..views.candidate_views import SEARCH_VIEW, CandidateViews, render_wide
 from ..views.view import ViewConfig, ranges_around
-from .aligned_cloud import AlignedCloud, Voxelized, read_aligned
 from .camera_positions import COARSE_SPACING, Ball, TooManyPositionsError, candidate_centers
-from .late_features import LateFeatures
+from .prior import NOTHING_KNOWN, Prior
 from .storeys import Storeys, find_storeys
+
+MAX_TILT = np.radians(5.0)  # of what seems to be up to what is taken for it, that goes without saying
+
+
+class Voxelized(Protocol):
+    """A cloud in memory, or in files that are read once more."""
+
+    @property
+    def up(self) -> UpAxis:
+        """The axis that points up by its file."""
+
+    def voxels(self, R_map_from_world: Array) -> Voxels:
+        """Its points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
+
+
+class LateFeatures:
+    """Local features that are made once, when a photo first needs them; threads that ask meanwhile wait."""
+
+    def __init__(self, make: Callable[[Workers], FeatureMap]) -> None:
+        self._make = make
+        self._made: FeatureMap | None = None
+        self._lock = threading.Lock()
+        # First what another process has kept; what is made is kept.
+        self.look: Callable[[], FeatureMap | None] = lambda: None
+        self.keep: Callable[[FeatureMap], None] = lambda features: None
+
+    def get(self, workers: Workers) -> FeatureMap:
+        """The features, made now if nobody has."""
+        with self._lock:
+            self._made = self._made or self.look()
+            if self._made is None:
+                self._made = self._make(workers)
+                self.keep(self._made)
+            return self._made
 
 
 @dataclass(frozen=True)
@@ -65,7 +102,7 @@ class ScanMap:
         return first[cell]
 
     def narrowed(self, is_kept: NDArray[np.bool_]) -> "ScanMap":
-        """The same in which some (sparse,) of the candidates are searched."""
+        """Return the map of which some (sparse,) of the candidates are searched."""
         return replace(
             self,
             sparse=self.sparse[is_kept],
@@ -107,19 +144,21 @@ def sparse_candidates(centers: NDArray[np.float64]) -> tuple[NDArray[np.int64], 
 
 
 def candidates_of(
-    aligned: AlignedCloud, prior: Prior, workers: Workers
+    octree: Octree, frame: tuple[Array, Array], prior: Prior, workers: Workers
 ) -> tuple[NDArray[np.float64], tuple[str, ...]]:
-    """Candidates (N, 3) [m]; of a scan too large as a whole those near the prior's place, and a warning."""
+    """Candidates (N, 3) [m]; of a scan too large as a whole those near the prior's place, and a warning.
+
+    The frame is R_map_from_world (3, 3) and origin_world (3,).
+    """
     try:
-        return candidate_centers(aligned.octree, workers), ()
+        return candidate_centers(octree, workers), ()
     except TooManyPositionsError:
         if prior.near_world is None or prior.radius is None:
             raise
-    near = aligned.R_map_from_world @ (np.array(prior.near_world) - aligned.origin_world)
-    centers = candidate_centers(aligned.octree, workers, Ball(near, prior.radius))
-    text = (
-        f"the scan is too large as a whole: prepared within {prior.radius:g} m of --near, for this run only"
-    )
+    near = frame[0] @ (np.array(prior.near_world) - frame[1])
+    text = f"prepared within {prior.radius:g} m of --near, for this run only"
+    text = f"the scan is too large as a whole: {text}"
+    centers = candidate_centers(octree, workers, Ball(near, prior.radius))
     workers.warn(text)
     return centers, (text,)
 
@@ -135,49 +174,67 @@ def prepare_map(
 ) -> ScanMap:
     """Everything about a cloud that does not depend on the panorama; local features may come late.
 
-    Of a scan too large as a whole, what the prior allows; TooManyPositionsError if it names no place.
+    The named axis is up, with `auto` the file's; or a rotation (3, 3) makes z up. Of a scan too large as a
+    whole, what is near the prior's place; TooManyPositionsError if it names none.
     """
     watch = watch or Stopwatch()
+    R_map_from_world = R_z_from_axis(up, cloud.up) if isinstance(up, str) else up
     with watch.stage("read"):
-        aligned = read_aligned(cloud, up)
-    for warning in aligned.warnings:  # now: a wrong unit makes what follows long
+        voxels = cloud.voxels(R_map_from_world)
+        octree = build_octree(voxels)
+        origin_world = R_map_from_world.T @ voxels.origin
+        warnings = voxels.warnings
+        if isinstance(up, str) and up == "auto":
+            warnings += doubts_about_up(octree, R_map_from_world, cloud.up)
+    for warning in warnings:  # now: a wrong unit makes what follows long
         workers.warn(warning)
     with watch.stage("prepare"):
-        octree = aligned.octree
-        centers, notes = candidates_of(aligned, prior, workers)
+        frame = (R_map_from_world, origin_world)
+        centers, notes = candidates_of(octree, frame, prior, workers)
         sparse, _ = sparse_candidates(centers)
         wide = render_wide(octree, centers[sparse], view, workers)
-        local_features = make_feature_map(octree, centers[:0], Workers())
-    scan_map = ScanMap(
-        octree=octree,
-        R_map_from_world=aligned.R_map_from_world,
-        origin_world=aligned.origin_world,
-        surface_variance=surface_variance(octree),
-        centers=centers,
-        scan_of_candidate=np.zeros(len(centers), np.uint16),
-        sparse=sparse,
-        wide_features=wide.features,
-        wide_seen=wide.seen,
-        views=CandidateViews(octree, centers, view),
-        local_features=local_features,
-        warnings=aligned.warnings + notes,
-        is_partial=bool(notes),
-    )
-    if not has_features:
-        return with_late_features(scan_map)
-    with watch.stage("prepare"):
-        return replace(scan_map, local_features=find_local_features(scan_map, workers))
+        scan_map = ScanMap(
+            octree=octree,
+            R_map_from_world=R_map_from_world,
+            origin_world=origin_world,
+            surface_variance=surface_variance(octree),
+            centers=centers,
+            scan_of_candidate=np.zeros(len(centers), np.uint16),
+            sparse=sparse,
+            wide_features=wide.features,
+            wide_seen=wide.seen,
+            views=CandidateViews(octree, centers, view),
+            local_features=make_feature_map(octree, centers[:0], Workers()),
+            warnings=warnings + notes,
+            is_partial=bool(notes),
+        )
+        scan_map = with_late_features(scan_map)
+        return with_features(scan_map, workers) if has_features else scan_map
+
+
+def doubts_about_up(octree: Octree, R_map_from_world: Array, taken: UpAxis) -> tuple[str, ...]:
+    """A line if the floors plainly face another way than the map's z, with the axis nearest to their way."""
+    axis, sense, reason, _ = find_up(octree)
+    cosine = sense * axis[2]
+    if sense == 0.0 or cosine > np.cos(MAX_TILT):
+        return ()
+    up_world = R_map_from_world.T @ (sense * axis)
+    k = int(np.abs(up_world).argmax())
+    nearest = f"{'-' if up_world[k] < 0.0 else ''}{'xyz'[k]}"
+    angle = np.degrees(np.arccos(max(cosine, -1.0)))
+    text = f"the floors face {angle:.0f} deg away from {taken}, which is taken for up ({reason})"
+    return (f"{text}; set up={nearest}, or turn the scan by tools/align_gravity.py",)
 
 
 def find_local_features(scan_map: ScanMap, workers: Workers) -> FeatureMap:
     """The features of the views from few of a map's candidates, chosen by what they see."""
-    octree, centers = scan_map.octree, scan_map.centers
-    chosen = view_positions(centers, seen_by(octree, centers), SEARCH_VIEW.num_rings)
-    return make_feature_map(octree, centers[chosen], workers)
+    centers = scan_map.centers
+    chosen = view_positions(centers, seen_by(scan_map.octree, centers), SEARCH_VIEW.num_rings)
+    return make_feature_map(scan_map.octree, centers[chosen], workers)
 
 
 def seen_by(octree: Octree, centers: NDArray[np.float64]) -> Look:
-    """How far one sees from each of some centres (N, 3), by its index."""
+    """Ranges seen from each of some centres (N, 3), by its index."""
     return lambda k: ranges_around(octree, centers[k : k + 1], SEARCH_VIEW)[0]
 
 

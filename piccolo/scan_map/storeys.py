@@ -14,16 +14,19 @@ from .camera_positions import SURFACE_VOXEL
 HEADROOM = 11  # voxels above a surface that are empty, 1.8 m
 THICKNESS = 1  # voxels up and down that are of one floor: noise, thresholds, ramps
 OPENING = 5  # [voxels] width of the disc that fits on a floor, 0.8 m: on shelves and steps it does not
-LEAST_AREA, LEAST_FRACTION = 3.0, 0.15  # of a storey's floor [m2], by the largest floor's area
+LEAST_AREA = 3.0  # of a storey's floor [m2]
+LEAST_FRACTION = 0.15  # of the largest floor's area
 LEAST_APART = 2.3  # [m] between the floors of two storeys
 LEAST_ABOVE = 1.0  # voxels a m2 of walls or furniture above a floor: a ceiling from above has none
 LEAST_OVERLAP = 0.15  # of the smaller floor; below, two are one storey on a slope or in two wings
 # [m] below and above a storey's levels lie its surfaces; farther below is the ceiling of the next one
-BELOW_LEVEL, ABOVE_LEVEL = 0.25, 0.5
+BELOW_LEVEL = 0.25
+ABOVE_LEVEL = 0.5
 GAP = 17  # [voxels] of a floor that furniture hid from the scanner, 2.7 m
 BESIDE = 1.5  # [m] a camera may be from the nearest scanned floor of its storey
 FIRST_REACH = 1.0  # [m] around a place, in which surfaces are looked for first
-NUM_NEAREST, LOW = 40, 10.0  # surfaces around a place, 0.6 m, and the percentile of them that is the floor
+NUM_NEAREST = 40  # surfaces around a place, 0.6 m
+LOW = 10.0  # percentile of them that is the floor
 
 
 class Storey(NamedTuple):
@@ -37,7 +40,8 @@ class Storey(NamedTuple):
 
         SciPy's tree finds them no faster for the few places of a photo, and takes 0.2 s to import.
         """
-        x, reach = self.surfaces[:, 0], FIRST_REACH
+        x = self.surfaces[:, 0]
+        reach = FIRST_REACH
         while True:
             begin, end = np.searchsorted(x, np.array([center[0] - reach, center[0] + reach], np.float32))
             near = self.surfaces[begin:end]
@@ -58,14 +62,16 @@ class Storeys(NamedTuple):
 
         The highest floor that is below a place and scanned around it; -1 and NaN where there is no storey.
         """
-        storey, height = np.full(len(centers), -1), np.full(len(centers), np.nan)
+        storey = np.full(len(centers), -1)
+        height = np.full(len(centers), np.nan)
         is_sure = np.zeros(len(centers), np.bool_)
         for k, one in enumerate(self.storeys):
             found = [one.nearest(center, NUM_NEAREST) for center in centers]
             above = centers[:, 2] - [np.percentile(heights, LOW) for _, heights in found]
             is_near = np.array([distance[0] < BESIDE for distance, _ in found], np.bool_)
             is_better = (above > 0.0) & (is_near | ~is_sure) | (storey < 0)
-            storey[is_better], height[is_better] = k, above[is_better]
+            storey[is_better] = k
+            height[is_better] = above[is_better]
             is_sure |= is_near & (above > 0.0)
         return storey, height
 
@@ -76,7 +82,8 @@ def find_storeys(octree: Octree) -> Storeys:
     ijk = np.floor(xyz / SURFACE_VOXEL).astype(np.int64)
     ijk -= ijk.min(axis=0) - 1
     is_top = _is_standable(ijk)
-    tops, top_xyz = ijk[is_top], xyz[is_top]
+    tops = ijk[is_top]
+    top_xyz = xyz[is_top]
     masks = _levels(ijk, tops)
     storeys = []
     for group in _united(masks):
@@ -91,7 +98,7 @@ def find_storeys(octree: Octree) -> Storeys:
 
 
 def _is_standable(ijk: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which voxels (N, 3) have room for a person above them."""
+    """Mask (N,) of the voxels (N, 3) with room for a person above them."""
     shape = ijk.max(axis=0, initial=0) + HEADROOM + 2
     code = (ijk[:, 0] * shape[1] + ijk[:, 1]) * shape[2] + ijk[:, 2]
     order = np.argsort(code)

@@ -1,4 +1,4 @@
-"""What a camera sees from a map's candidates: wide cells of all that are searched, fine ones of some.
+"""Views from a map's candidates: wide cells of all that are searched, fine ones of some.
 
 Wide cells are prepared with the map. A view of fine cells is made when a search first comes upon its
 candidate, and kept until there are many.
@@ -22,7 +22,7 @@ WIDE_RINGS = 12
 SEARCH_VIEW = ViewConfig(num_rings=SEARCH_RINGS, stats_rings=16, sigma_deg=22.0, voxel_per_range=1 / 15)
 WIDE_VOXEL_PER_RANGE = 1 / 8  # of the same view where it is averaged over wide cells
 BYTES_PER_CELL = 6 + 3 + 1  # of a view: offsets, channels, seen
-WIDE_BYTES_PER_CELL = 2 * (3 + 1)  # of a wide one, twice: in parts, and joined
+WIDE_BYTES_PER_CELL = 3 + 1  # of a wide one
 LEAST_ROOM = 256  # views
 MOST_KEPT = 1 << 15  # views, 0.24 GB
 
@@ -63,8 +63,7 @@ def render_views(octree: Octree, centers: NDArray[np.float64], config: ViewConfi
     views.centers[:] = centers
 
     def run(lo: int) -> None:
-        _, *out = (values[lo : lo + BLOCK] for values in views)
-        some = centers[lo : lo + BLOCK]
+        some, *out = (values[lo : lo + BLOCK] for values in views)
         render_block(octree, some, config.voxel_per_range, config.arrays, thread_scratch(), *out)
 
     list(workers.map(run, range(0, len(centers), BLOCK), "render views"))
@@ -74,27 +73,24 @@ def render_views(octree: Octree, centers: NDArray[np.float64], config: ViewConfi
 def render_wide(
     octree: Octree, centers: NDArray[np.float64], config: ViewConfig, workers: Workers
 ) -> WideViews:
-    """The views from some centres (n, 3) [m], averaged over wide cells; a killed process' work is kept.
+    """The views from some centres (n, 3) [m], averaged over wide cells.
 
     They are drawn of larger voxels than `config` has, as averages ask for no more.
     """
     config = replace(config, stats_rings=WIDE_RINGS, voxel_per_range=WIDE_VOXEL_PER_RANGE)
-    num_wide = len(make_grid(WIDE_RINGS))
-    what = f"the scan: {len(centers)} prepared views"
-    check_memory(len(centers) * WIDE_BYTES_PER_CELL * num_wide, what, "cut out a part of it")
+    num, num_wide = len(centers), len(make_grid(WIDE_RINGS))
+    check_memory(
+        num * WIDE_BYTES_PER_CELL * num_wide, f"the scan: {num} prepared views", "cut out a part of it"
+    )
+    features = np.empty((num, 3, num_wide), np.int8)
+    seen = np.empty((num, num_wide), np.uint8)
 
-    def run(lo: int) -> tuple[NDArray[np.int8], NDArray[np.uint8]]:
-        some = centers[lo : lo + BLOCK]
-        features = np.empty((len(some), 3, num_wide), np.int8)
-        seen = np.empty((len(some), num_wide), np.uint8)
-        how = config.voxel_per_range, config.arrays, thread_scratch()
-        render_wide_block(octree, some, *how, features, seen)
-        return features.reshape(len(some), -1), seen
+    def run(lo: int) -> None:
+        some, *out = (values[lo : lo + BLOCK] for values in (centers, features, seen))
+        render_wide_block(octree, some, config.voxel_per_range, config.arrays, thread_scratch(), *out)
 
-    parts = list(workers.map(run, range(0, len(centers), BLOCK), "render views"))
-    none = np.empty((0, 3 * num_wide), np.int8), np.empty((0, num_wide), np.uint8)
-    features, seen = (np.concatenate([part[k] for part in (none, *parts)]) for k in range(2))
-    return WideViews(features, seen)
+    list(workers.map(run, range(0, num, BLOCK), "render views"))
+    return WideViews(features.reshape(num, 3 * num_wide), seen)
 
 
 @dataclass(eq=False)
@@ -121,11 +117,9 @@ class CandidateViews:
         """The rows (n,) of some candidates (n,) among the views made, and these."""
         with self._lock:
             missing = np.unique(candidates[self._row[candidates] < 0])
-            if (
-                len(missing) and self.num_made + len(missing) > MOST_KEPT
-            ):  # who was given the old ones has them
+            if len(missing) and self.num_made + len(missing) > MOST_KEPT:
                 missing = np.unique(candidates)
-                self._forget()
+                self._forget()  # who was given the old ones has them
             if len(missing):
                 self._append(render_views(self.octree, self.centers[missing], self.config, workers))
                 self._row[missing] = np.arange(self.num_made - len(missing), self.num_made)
@@ -133,13 +127,14 @@ class CandidateViews:
 
     def _append(self, views: Views) -> None:
         """Put views behind those made, in arrays twice as long if there is no room: nobody's rows change."""
-        begin, end = self.num_made, self.num_made + len(views.centers)
-        if end > len(self.made.centers):
-            larger = empty_views(max(end, min(2 * begin, MOST_KEPT), LEAST_ROOM), self.made.is_seen.shape[1])
+        begin = self.num_made
+        self.num_made += len(views.centers)
+        if self.num_made > len(self.made.centers):
+            room = max(self.num_made, min(2 * begin, MOST_KEPT), LEAST_ROOM)
+            larger = empty_views(room, self.made.is_seen.shape[1])
             put_rows(larger, 0, [values[:begin] for values in self.made])
             self.made = larger
         put_rows(self.made, begin, views)
-        self.num_made = end
 
 
 def put_rows(wholes: Sequence[Any], begin: int, parts: Sequence[Any]) -> None:

@@ -1,18 +1,24 @@
 """The points that a camera sees around it, as fine as it can tell them apart: for the last millimetres."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..cloud.octree import Octree, collect
 from ..cloud.soa import PackedPoints
 from ..kernels.jit import F0, F1, HALF, inline_kernel, kernel
 from ..panorama.local_normalization import opponent, zscore
-from .cells import locate
-from .view import Cells, Center, ViewConfig, average_nodes, describe_cells, empty_cells, thread_scratch
+from .view import (
+    Cells,
+    Center,
+    ViewConfig,
+    average_nodes,
+    describe_cells,
+    empty_cells,
+    locate,
+    thread_scratch,
+)
+from .zbuffer import VISIBLE_OFFSET
 
-VISIBLE_OFFSET = np.float32(0.1)  # [m] of range noise
-U15, U16, LOW_32 = np.uint64(15), np.uint64(16), np.uint64(0xFFFFFFFF)
-MIX_1, MIX_2 = np.uint64(0x7FEB352D), np.uint64(0x846CA68B)
+LOW_32 = np.uint64(0xFFFFFFFF)
 OPAQUE = np.int32(1 << 24)  # the fourth of a packed point's bytes
 FILLED = 0.97  # of the room for points; the rest is for chance
 
@@ -21,9 +27,9 @@ FILLED = 0.97  # of the room for points; the rest is for chance
 def node_fraction(node):
     """A number in [0, 1) that is drawn from a node's index, always the same (lowbias32, Wellons 2018)."""
     h = np.uint64(node)
-    h = ((h ^ (h >> U16)) * MIX_1) & LOW_32
-    h = ((h ^ (h >> U15)) * MIX_2) & LOW_32
-    return np.float32(h ^ (h >> U16)) * np.float32(2.0**-32)
+    h = ((h ^ (h >> np.uint64(16))) * np.uint64(0x7FEB352D)) & LOW_32
+    h = ((h ^ (h >> np.uint64(15))) * np.uint64(0x846CA68B)) & LOW_32
+    return np.float32(h ^ (h >> np.uint64(16))) * np.float32(2.0**-32)
 
 
 @inline_kernel
@@ -48,10 +54,11 @@ def take_children(tree, nodes, kept, found):
     """
     count = 0
     for i in range(len(nodes)):
-        node = nodes[i]
-        first, last = tree.first_child[node], tree.first_child[node + 1]
+        first = tree.first_child[nodes[i]]
+        last = tree.first_child[nodes[i] + 1]
         if first == last:
-            first, last = node, node + 1
+            first = nodes[i]
+            last = first + 1
         for child in range(first, last):
             if node_fraction(child) < kept and count < len(found):
                 found[count] = child
@@ -60,14 +67,17 @@ def take_children(tree, nodes, kept, found):
 
 
 @kernel
-def render_points(tree, center, voxel_per_range, view, scratch, shown, offsets, channels, weights):
+def render_points(tree, center, voxel_per_range, view, shown, scratch, offsets, channels, weights):
     """The visible points in cells that are shown, thinned to what fits: as `normalize_cells`, with weight 1.
 
     Voxels twice as large tell what is in front, and how colours vary. Returns how many.
     """
-    num_cells, s = len(view.solid_angle), scratch
-    sums, stats = np.empty((num_cells, 8), np.float32), np.empty((6, num_cells), np.float32)
-    cell_offsets, cell_channels = np.empty((3, num_cells), np.float32), np.empty((3, num_cells), np.float32)
+    s = scratch
+    num_cells = len(view.solid_angle)
+    sums = np.empty((num_cells, 8), np.float32)
+    stats = np.empty((6, num_cells), np.float32)
+    cell_offsets = np.empty((3, num_cells), np.float32)
+    cell_channels = np.empty((3, num_cells), np.float32)
     cell_weights = np.empty(num_cells, np.float32)
     n = average_nodes(tree, center, 2.0 * voxel_per_range, view, scratch, sums)
     describe_cells(sums, view, shown, cell_offsets, cell_channels, cell_weights, stats)
@@ -80,14 +90,19 @@ def render_points(tree, center, voxel_per_range, view, scratch, shown, offsets, 
     for i in range(n):
         for k in range(3):
             offsets[k, i] = tree.nodes[found[i], k] - np.float32(center[k])
-    cells, ranges, turns = np.empty(n, np.int32), np.empty(n, np.float32), np.empty(n, np.float32)
-    x, y, z = offsets[0, :n], offsets[1, :n], offsets[2, :n]
+    cells = np.empty(n, np.int32)
+    ranges = np.empty(n, np.float32)
+    turns = np.empty(n, np.float32)
+    x = offsets[0, :n]
+    y = offsets[1, :n]
+    z = offsets[2, :n]
     locate(x, y, z, view.num_columns, view.first, cells, ranges, turns)
     count = 0
     for i in range(n):
-        node, c = found[i], cells[i]
+        c = cells[i]
         if ranges[i] <= sums[c, 7]:
-            colors = opponent(tree.nodes[node, 3], tree.nodes[node, 4], tree.nodes[node, 5])
+            node = tree.nodes[found[i]]
+            colors = opponent(node[3], node[4], node[5])
             for k in range(3):
                 offsets[k, count] = offsets[k, i]
                 channels[k, count] = zscore(colors[k], stats[k, c], stats[3 + k, c])
@@ -96,13 +111,16 @@ def render_points(tree, center, voxel_per_range, view, scratch, shown, offsets, 
     return count
 
 
-def visible_points(
-    octree: Octree, center_map: Center, config: ViewConfig, shown: NDArray[np.bool_], count: int
-) -> Cells:
-    """What is seen around a centre (3,) [m], as at most `count` points with equal weights, not as cells."""
+def visible_points(octree: Octree, center_map: Center, config: ViewConfig, shown: bytes, count: int) -> Cells:
+    """The scan seen from a centre (3,) [m], as at most `count` points with equal weights, not as cells.
+
+    In the cells that are shown: a byte each.
+    """
     *found, center = empty_cells(count, center_map)
-    how = config.voxel_per_range, config.arrays, thread_scratch(), shown
-    n = render_points(octree, center, *how, *found)
+    is_shown = np.frombuffer(shown, np.bool_)
+    n = render_points(
+        octree, center, config.voxel_per_range, config.arrays, is_shown, thread_scratch(), *found
+    )
     offsets, channels, weights = (values[..., :n].copy() for values in found)
     return Cells(offsets, channels, weights, center)
 
@@ -114,22 +132,25 @@ def in_8_bits(color, shift):
 
 
 @kernel
-def pack_nodes(nodes, found, x, y, z, rgbx):
-    """Write the positions of some nodes and their colours in 8 bits."""
+def pack_nodes(nodes, found, points, rgbx):
+    """Write the positions (3, N) of some nodes and their colours in 8 bits."""
     for i in range(len(found)):
         node = nodes[found[i]]
-        x[i], y[i], z[i] = node[0], node[1], node[2]
+        for k in range(3):
+            points[k, i] = node[k]
         rgbx[i] = np.int32(in_8_bits(node[3], 0) | in_8_bits(node[4], 8) | in_8_bits(node[5], 16) | OPAQUE)
 
 
-def points_around(octree: Octree, center_map: NDArray[np.float64], voxel_per_range: float) -> PackedPoints:
+def points_around(octree: Octree, center_map: Center, voxel_per_range: float) -> PackedPoints:
     """All nodes as coloured points, those far from a centre (3,) [m] as large as it is far to them.
 
     Of however large a scan, some hundred thousand.
     """
-    scratch, center = thread_scratch(), np.asarray(center_map, np.float64)
-    n = collect(octree, center, voxel_per_range, scratch.nodes, scratch.directions)
-    x, y, z = np.empty((3, n), np.float32)
-    points = PackedPoints(x, y, z, np.empty(n, np.int32))
-    pack_nodes(octree.nodes, scratch.nodes[:n], points.x, points.y, points.z, points.rgbx)
-    return points
+    scratch = thread_scratch()
+    n = collect(
+        octree, np.asarray(center_map, np.float64), voxel_per_range, scratch.nodes, scratch.directions
+    )
+    points = np.empty((3, n), np.float32)
+    rgbx = np.empty(n, np.int32)
+    pack_nodes(octree.nodes, scratch.nodes[:n], points, rgbx)
+    return PackedPoints(points[0], points[1], points[2], rgbx)

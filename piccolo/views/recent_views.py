@@ -1,61 +1,26 @@
-"""What is seen from places on a grid, the last few kept: a pose that hardly moves sees what it saw before."""
+"""Views from places on a grid, the last few kept: a pose that hardly moves sees what it saw before."""
 
 from functools import lru_cache, partial
-from typing import NamedTuple, Protocol
-
-import numpy as np
 
 from ..cloud.octree import Octree
-from ..cloud.soa import PackedPoints
 from ..geometry.pose import Pose
 from .points_around import points_around, visible_points
-from .view import Array32, Cells, ViewConfig, average_view
+from .view import average_view
 
 SPACING = 0.01  # [m] between places
-NUM_VIEWS, NUM_POINT_SETS, NUM_SURROUNDINGS = 32, 8, 2  # are kept: 12, 7 and 11 MB
+NUM_VIEWS = 32  # are kept: 12 MB
+NUM_POINT_SETS = 8  # 7 MB
+NUM_SURROUNDINGS = 2  # 11 MB
 Place = tuple[float, float, float]  # [m] in the map
 
 
-class AveragesFrom(Protocol):
-    """What `view.average_view` tells of a place."""
+class RecentViews:
+    """Views of one scan, each made when it is asked for and not among the last; from any thread."""
 
-    def __call__(self, place: Place, config: ViewConfig, /) -> Array32:
-        """Sums (cells, 8)."""
-
-
-class PointsFrom(Protocol):
-    """What `points_around.visible_points` tells of a place."""
-
-    def __call__(self, place: Place, config: ViewConfig, shown: bytes, count: int, /) -> Cells:
-        """At most `count` points, in the cells that are shown: a byte each."""
-
-
-class SurroundingsOf(Protocol):
-    """What `points_around.points_around` tells of a place."""
-
-    def __call__(self, place: Place, voxel_per_range: float, /) -> PackedPoints:
-        """Coloured points."""
-
-
-class RecentViews(NamedTuple):
-    """Views of one scan; from any thread."""
-
-    averages: AveragesFrom
-    points: PointsFrom
-    surroundings: SurroundingsOf
-
-
-def recent_views(octree: Octree) -> RecentViews:
-    """Views of a scan, each made when it is asked for and not among the last."""
-
-    def points(place: Place, config: ViewConfig, shown: bytes, count: int) -> Cells:
-        return visible_points(octree, place, config, np.frombuffer(shown, np.bool_), count)
-
-    def surroundings(place: Place, voxel_per_range: float) -> PackedPoints:
-        return points_around(octree, np.array(place), voxel_per_range)
-
-    averages = lru_cache(NUM_VIEWS)(partial(average_view, octree))
-    return RecentViews(averages, lru_cache(NUM_POINT_SETS)(points), lru_cache(NUM_SURROUNDINGS)(surroundings))
+    def __init__(self, octree: Octree) -> None:
+        self.averages = lru_cache(NUM_VIEWS)(partial(average_view, octree))
+        self.points = lru_cache(NUM_POINT_SETS)(partial(visible_points, octree))
+        self.surroundings = lru_cache(NUM_SURROUNDINGS)(partial(points_around, octree))
 
 
 def place_of(pose: Pose) -> Place:

@@ -1,4 +1,4 @@
-"""Surfels: discs that close the surface between points, with a radius and a normal from the neighbours.
+"""The cloud rendered at a pose as surfels: discs that close the surface between points, of their neighbours.
 
 They are drawn into rows of an equirectangular picture: nearest range first, then weighted colours near it. A
 pixel's ray sees a surfel where it meets the disc's plane within the radius; a surfel smaller than a pixel is
@@ -8,13 +8,17 @@ seen by the ray nearest to it.
 import math
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cloud.soa import PackedPoints
+from ..geometry.pose import Array, Pose
+from ..geometry.sphere import pixels_of, rays_of
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, F1, inline_kernel, kernel
 from ..panorama.texels import channel
+from .zbuffer import View, indices_in_front, nearest_depth
 
 NUM_NEIGHBORS = 10
 CHUNK = 65_536
@@ -31,7 +35,15 @@ BAND = np.float32(1.01)
 BAND_OFFSET = np.float32(0.02)  # [m]
 LEAST_WEIGHT = np.float32(1e-4)  # at the rim: whatever is seen has a colour
 MAX_SLOPE = np.float32(1.25)  # of the range within a surfel or a pixel
-TWO = np.float32(2.0)
+STRIP = 1 << 21  # pixels that one thread draws at a time
+MAX_SURFELS = 8_000_000  # of more points that may be seen, this many are drawn, evenly in space
+MAX_ANGLE = 0.3  # [rad] as which a surfel's radius is seen, at most
+MIN_COSINE = 0.15  # a surfel seen flatter than this is turned towards the camera: normals are not that sure
+# Rooms behind gaps leave lone points with large surfels. Large surfels far off are sparse surfaces.
+MAX_RADIUS = 1.5  # by the radius that 95 % of the surfels stay below
+MIN_RANGE = 1e-3  # [m] nearer to the camera nothing is drawn
+HIDING_WIDTHS = (360, 720)  # cells of 1 and 1/2 degrees; wider ones hide what is seen through a door ajar
+FAR_ANGLE = 0.02  # [rad] as which a far surfel's radius is seen
 
 
 class Surfels(NamedTuple):
@@ -51,7 +63,8 @@ def surfels_of(points: PackedPoints, workers: Workers) -> Surfels:
     from scipy.spatial import cKDTree  # noqa: PLC0415  # who draws no picture need not wait for it
 
     positions = np.stack([points.x, points.y, points.z], axis=1)
-    normals, radii = np.zeros_like(positions), np.zeros(len(positions), np.float32)
+    normals = np.zeros_like(positions)
+    radii = np.zeros(len(positions), np.float32)
     if len(positions) <= NUM_NEIGHBORS:
         return Surfels(points, normals, radii)
     tree = cKDTree(positions, balanced_tree=False, compact_nodes=False)
@@ -86,56 +99,59 @@ def hit(surfel, dx, dy, dz, px_angle2):
     x, y, z, nx, ny, nz, along, per_radius2, distance = surfel
     facing = nx * dx + ny * dy + nz * dz
     t = along / facing
-    ex, ey, ez = t * dx - x, t * dy - y, t * dz - z
-    q = (ex * ex + ey * ey + ez * ez) * per_radius2
+    q = ((t * dx - x) ** 2 + (t * dy - y) ** 2 + (t * dz - z) ** 2) * per_radius2
     if not facing * along > F0:  # a plane along the ray divides by zero: NaN is no hit
-        q, t = TWO, distance
+        q = F1 + F1
+        t = distance
     # What the ray meets beside the surfel, in the same pixel: the surface goes on, but nobody knows how far.
     t = min(max(t, distance / MAX_SLOPE), distance * MAX_SLOPE)
-    ex, ey, ez = dx - x / distance, dy - y / distance, dz - z / distance
-    return min(q, (ex * ex + ey * ey + ez * ez) / px_angle2), t
+    gap2 = (dx - x / distance) ** 2 + (dy - y / distance) ** 2 + (dz - z / distance) ** 2
+    return min(q, gap2 / px_angle2), t
 
 
 @inline_kernel
-def half_width(elevation, of_center, angle):
-    """Azimuths [rad] on a row to each side of a centre that are within `angle` of it; -1 if none are."""
-    over = math.sin(0.5 * angle) ** 2 - math.sin(0.5 * (elevation - of_center)) ** 2
+def half_width(rise, angle, cosines):
+    """Azimuths [rad] on a row to each side of a centre that are within `angle` of it; -1 if none are.
+
+    By how far the row is above the centre [rad], and the product of the cosines of their elevations.
+    """
+    over = math.sin(0.5 * angle) ** 2 - math.sin(0.5 * rise) ** 2
     if over < 0.0:
         return -1.0
-    fraction = over / max(math.cos(elevation) * math.cos(of_center), 1e-12)
+    fraction = over / max(cosines, 1e-12)
     return math.pi if fraction >= 1.0 else 2.0 * math.asin(math.sqrt(fraction))
 
 
 @kernel
-def splat(surfels, rgbx, directions, angles, first_row, depth, sums):
+def splat(surfels, rgbx, extents, columns, rows, first_row, depth, sums):
     """Draw surfels into the rows from `first_row` on: into `depth`, or into `sums` if that is not empty.
 
     surfels (N, 9): centre [m], normal, product of both, 1 / radius^2, range [m], in the camera's frame;
-    directions (N, 2): azimuth and elevation, angles (N,): radius as seen [rad].
-    The nearest range [m] is written into depth (rows, W), which holds inf before; then sums (rows, W, 5) gets
-    R, G, B [8-bit levels], range [m] and 1 of what is near that range, each times a weight, added.
+    extents (N, 3): column and row of the centre [px], radius as seen [rad]; columns (W, 2), rows (W / 2, 2):
+    cosines and sines of azimuths and elevations. The nearest range [m] is written into depth (n, W), which
+    holds inf before; then sums (n, W, 5) gets R, G, B [8-bit levels], range [m] and 1 of what is near that
+    range, each times a weight, added.
     """
     width = depth.shape[1]
     step = 2.0 * math.pi / width
     px_angle2 = np.float32((MIN_RADIUS_PX * step) ** 2)
-    cosines, sines = np.empty(width, np.float32), np.empty(width, np.float32)
-    for j in range(width):
-        cosines[j], sines[j] = math.cos(math.pi - (j + 0.5) * step), math.sin(math.pi - (j + 0.5) * step)
     for n in range(len(surfels)):
-        d, c = surfels[n], rgbx[n]
+        d = surfels[n]
+        c = rgbx[n]
         surfel = (d[0], d[1], d[2], d[3], d[4], d[5], d[6], d[7], d[8])
-        azimuth, elevation = directions[n, 0], directions[n, 1]
-        top = math.ceil((0.5 * math.pi - elevation - angles[n]) / step - 0.5) - first_row
-        bottom = math.floor((0.5 * math.pi - elevation + angles[n]) / step - 0.5) - first_row
-        for i in range(max(top, 0), min(bottom + 1, len(depth))):
-            of_row = 0.5 * math.pi - (first_row + i + 0.5) * step
-            half = half_width(of_row, elevation, angles[n])
-            left = math.ceil((math.pi - azimuth - half) / step - 0.5)
-            right = min(math.floor((math.pi - azimuth + half) / step - 0.5), left + width - 1)
-            cosine, sine = np.float32(math.cos(of_row)), np.float32(math.sin(of_row))
-            for at in range(left, right + 1):
+        level = math.hypot(d[0], d[1]) / d[8]
+        u = extents[n, 0] - 0.5
+        v = extents[n, 1] - 0.5 - first_row
+        angle = extents[n, 2]
+        reach = angle / step
+        for i in range(max(math.ceil(v - reach), 0), min(math.floor(v + reach) + 1, len(depth))):
+            cosine = rows[first_row + i, 0]
+            sine = rows[first_row + i, 1]
+            half = half_width((v - i) * step, angle, cosine * level) / step
+            left = math.ceil(u - half)
+            for at in range(left, min(math.floor(u + half), left + width - 1) + 1):
                 j = (at + width) % width
-                q, t = hit(surfel, cosine * cosines[j], cosine * sines[j], sine, px_angle2)
+                q, t = hit(surfel, cosine * columns[j, 0], cosine * columns[j, 1], sine, px_angle2)
                 if q >= F1:
                     continue
                 if len(sums) == 0:
@@ -148,3 +164,84 @@ def splat(surfels, rgbx, directions, angles, first_row, depth, sums):
                     s[2] += weight * channel(c, 16)
                     s[3] += weight * t
                     s[4] += weight
+
+
+def axes_of_pixels(width: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Cosines and sines of each column's azimuth (width, 2) and of each row's elevation (width / 2, 2)."""
+    columns = rays_of(np.arange(width) + 0.5, width / 4.0, width)[:, :2]
+    rows = rays_of(width / 2.0, np.arange(width // 2) + 0.5, width)[:, ::2]
+    return columns.astype(np.float32), rows.astype(np.float32)
+
+
+def render_points(points: PackedPoints, pose: Pose, width: int, workers: Workers) -> View:
+    """The cloud at `pose`, `width` x width / 2 pixels; colours in uint8."""
+    visible = points.take(visible_indices(points, pose.center_world)).subsample(MAX_SURFELS)
+    return render_surfels(surfels_of(visible, workers), pose, width, workers)
+
+
+def visible_indices(points: PackedPoints, center_world: Array) -> NDArray[np.int64]:
+    """Indices of all points but those behind a surface that goes on around them.
+
+    `visible_points` lets what is in front in a cell hide all of the cell: a rim of two degrees around
+    each thing would be missing in a picture. Here nine cells must agree, of one or the other size.
+    """
+    kept = np.arange(len(points))
+    for width in HIDING_WIDTHS:
+        depth = nearest_depth(points, Pose(np.eye(3), center_world), width)
+        around = np.pad(depth, ((1, 1), (1, 1)), mode="wrap")
+        around[[0, -1]] = -np.inf  # no row beyond a pole
+        farthest = cv2.dilate(around, np.ones((3, 3), np.uint8))[1:-1, 1:-1]
+        indices = indices_in_front(points, center_world, np.ascontiguousarray(farthest))
+        points = points.take(indices)
+        kept = kept[indices]
+    return kept
+
+
+def render_surfels(surfels: Surfels, pose: Pose, width: int, workers: Workers) -> View:
+    """The surfels seen from `pose`; colours in uint8."""
+    p = surfels.points
+    ranges = np.linalg.norm(np.stack([p.x, p.y, p.z], axis=1) - pose.center_world, axis=1)
+    largest = np.maximum(MAX_RADIUS * np.percentile(surfels.radii, 95.0), FAR_ANGLE * ranges)  # not lone
+    surfels = surfels.take(np.flatnonzero((surfels.radii <= largest) & (ranges > MIN_RANGE)))
+    packed, extents = _in_camera(surfels, pose, width)
+    columns, rows = axes_of_pixels(width)
+    rgb = np.zeros((width // 2, width, 3), np.uint8)
+    depth = np.full((width // 2, width), np.inf, np.float32)
+    num_rows = max(1, STRIP // width)
+    reach = extents[:, 2] * width / (2.0 * math.pi)
+
+    def run(first: int) -> None:
+        part = slice(first, first + num_rows)
+        inside = np.flatnonzero(
+            (extents[:, 1] + reach >= first) & (extents[:, 1] - reach <= first + num_rows)
+        )
+        some, colors, where = packed[inside], surfels.points.rgbx[inside], extents[inside]
+        sums = np.zeros((*depth[part].shape, 5), np.float32)
+        for drawn in (sums[:0], sums):
+            splat(some, colors, where, columns, rows, first, depth[part], drawn)
+        is_seen = sums[..., 4] > 0.0
+        means = sums[..., :4] / np.where(is_seen, sums[..., 4], np.float32(1.0))[..., None]
+        rgb[part] = np.rint(means[..., :3])
+        depth[part] = np.where(is_seen, means[..., 3], np.float32(np.inf))
+
+    list(workers.map(run, range(0, width // 2, num_rows), "draw"))
+    return View(depth, rgb)
+
+
+def _in_camera(surfels: Surfels, pose: Pose, width: int) -> tuple[NDArray[np.float32], Array]:
+    """Surfels (N, 9) and extents (N, 3) as `splat` reads them."""
+    p = surfels.points
+    x_cam = (np.stack([p.x, p.y, p.z], axis=1) - pose.center_world) @ pose.R_cam_from_world.T
+    ranges = np.linalg.norm(x_cam, axis=1)
+    rays = x_cam / ranges[:, None]
+    normals = surfels.normals @ pose.R_cam_from_world.T
+    cosine = np.einsum("ni,ni->n", normals, rays)
+    normals *= np.where(cosine < 0.0, -1.0, 1.0)[:, None]
+    # without a plane the normal is 0, and becomes the ray
+    normals += np.maximum(MIN_COSINE - np.abs(cosine), 0.0)[:, None] / (1.0 - MIN_COSINE) * rays
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    radii = np.clip(surfels.radii, 1e-9, MAX_ANGLE * ranges)
+    along = np.einsum("ni,ni->n", normals, x_cam)
+    packed = np.column_stack([x_cam, normals, along, 1.0 / radii**2, ranges]).astype(np.float32)
+    angles = np.maximum(np.arcsin(radii / ranges), MIN_RADIUS_PX * 2.0 * math.pi / width)
+    return packed, np.column_stack([*pixels_of(x_cam, width), angles])

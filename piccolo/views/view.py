@@ -12,19 +12,20 @@ from numpy.typing import NDArray
 
 from ..cloud.octree import MAX_NODES, Octree, collect
 from ..geometry.pose import Array
-from ..geometry.sphere import BLOCK_RINGS, cell_of, interpolation, make_grid, make_neighbors
+from ..geometry.sphere import BLOCK_RINGS, PI, atan2, cell_of, interpolation, make_grid, make_neighbors
 from ..kernels.jit import F0, F1, HALF, inline_kernel, kernel
-from ..panorama.local_normalization import LEVELS_PER_UNIT, zscore
-from .cells import average_cells, average_colors, local_statistics, locate
+from ..panorama.local_normalization import LEVELS_PER_UNIT, mean_and_inverse_std, opponent, zscore
+from .zbuffer import VISIBLE_FACTOR
 
 BLOCK = 64  # views that a thread makes at a time
+FAR = np.float32(1e30)
 
 Array32 = NDArray[np.float32]
 Center = Sequence[float] | Array
 
 
 class Cells(NamedTuple):
-    """What is seen around a centre, on cells of the sphere or as points."""
+    """The scan seen from a centre, on cells of the sphere or as points."""
 
     offsets: NDArray[np.float32]  # (3, N) [m] from the centre
     channels: NDArray[np.float32]  # (3, N) opponent colours, locally normalised [standard deviations]
@@ -32,7 +33,7 @@ class Cells(NamedTuple):
     center_map: Array  # (3,) [m]
 
     def around(self, center_map: Array) -> "Cells":
-        """The same with offsets from another centre (3,)."""
+        """Return the cells with offsets from another centre (3,)."""
         shift = np.asarray(center_map - self.center_map, np.float32)
         return self._replace(offsets=self.offsets - shift[:, None], center_map=center_map)
 
@@ -48,8 +49,8 @@ class ViewArrays(NamedTuple):
     neighbor_row: NDArray[np.int32]  # (wider cells + 1,) where each wider cell's neighbours begin
     neighbor_cell: NDArray[np.int32]  # wider cells
     neighbor_weight: NDArray[np.float32]
-    near_stats: NDArray[np.int32]  # (cells, 4) wider cells around each cell
-    near_weight: NDArray[np.float32]  # (cells, 4) of statistics there
+    near_stats: NDArray[np.int32]  # (cells, 4) wider cells around each cell's middle
+    near_weight: NDArray[np.float32]  # (cells, 4) of each: bilinear
     front: np.float32
     visible: np.float32
     blocks: NDArray[np.int32]  # (cells,) the block of the sphere that each lies in, for scores
@@ -67,18 +68,18 @@ class Scratch(NamedTuple):
 
 @dataclass(frozen=True)
 class ViewConfig:
-    """How a view is made: its cells, the neighbourhood that normalises colours, the voxels' angular size."""
+    """Settings of a view: its cells, the neighbourhood that normalises colours, the voxels' angular size."""
 
     num_rings: int
     stats_rings: int  # cells of these rings carry the local statistics: no wider than sigma
     sigma_deg: float
     voxel_per_range: float  # largest voxel size by its distance
     front: float = 1.15  # a cell's colour is the mean of points up to this times its nearest range
-    visible: float = 1.08  # a point is seen up to this times (and VISIBLE_OFFSET): grazing floors pass
+    visible: float = float(VISIBLE_FACTOR)  # a point is seen up to this times it and VISIBLE_OFFSET
 
     @cached_property
     def arrays(self) -> ViewArrays:
-        """What the kernels read."""
+        """The settings as kernels read them."""
         grid = make_grid(self.num_rings)
         neighbors = make_neighbors(self.stats_rings, self.sigma_deg)
         return ViewArrays(
@@ -98,22 +99,126 @@ class ViewConfig:
 
 
 @kernel
+def locate(X, Y, Z, num_columns, first, cells, ranges, turns):
+    """Write the cell and the range [m] of each position relative to the centre; `turns` is scratch."""
+    num_rings = np.float32(len(num_columns))
+    per_pi = np.float32(len(num_columns) / math.pi)
+    per_turn = np.float32(0.5 / math.pi)
+    # Two loops: the arithmetic is vectorised, the look-ups that follow can't be.
+    for i in range(len(cells)):
+        x = X[i]
+        y = Y[i]
+        z = Z[i]
+        rho2 = x * x + y * y
+        ring = (HALF * PI - atan2(z, math.sqrt(rho2))) * per_pi
+        cells[i] = np.int32(min(max(ring, F0), num_rings - F1))
+        turns[i] = atan2(y, x) * per_turn + HALF
+        ranges[i] = math.sqrt(rho2 + z * z)
+    for i in range(len(cells)):
+        ring = cells[i]
+        n = num_columns[ring]
+        cells[i] = first[ring] + min(np.int32(turns[i] * np.float32(n)), n - np.int32(1))
+
+
+@kernel
 def locate_nodes(tree, center, voxel_per_range, view, scratch):
     """Fill the scratch with the nodes to draw, their offsets, cells and ranges; returns how many."""
     s = scratch
     n = collect(tree, center, voxel_per_range, s.nodes, s.directions)
-    x, y, z = s.directions[0, :n], s.directions[1, :n], s.directions[2, :n]
+    x = s.directions[0, :n]  # a row each: of a cut of all three, the stride is unknown to the compiler
+    y = s.directions[1, :n]
+    z = s.directions[2, :n]
     locate(x, y, z, view.num_columns, view.first, s.cells[:n], s.ranges[:n], s.turns)
     return n
 
 
 @kernel
 def average_nodes(tree, center, voxel_per_range, view, scratch, sums):
-    """Write what `average_cells` makes of the nodes around a centre, which are in the scratch; how many."""
+    """Write (cells, 8): sums of x, y, z, r, g, b and the count of each cell's front, and its range.
+
+    Of the nodes around a centre, which are left in the scratch; returns how many these are.
+    """
     n = locate_nodes(tree, center, voxel_per_range, view, scratch)
     s = scratch
-    average_cells(tree.nodes, s.nodes, s.directions, s.cells[:n], s.ranges, view.front, sums)
+    cells = s.cells[:n]
+    sums[:] = F0
+    sums[:, 7] = FAR
+    for i in range(n):
+        cell = cells[i]
+        sums[cell, 7] = min(sums[cell, 7], s.ranges[i])
+    for i in range(n):
+        cell = cells[i]
+        if s.ranges[i] <= sums[cell, 7] * view.front:
+            node = s.nodes[i]
+            for k in range(3):
+                sums[cell, k] += s.directions[k, i]
+                sums[cell, k + 3] += tree.nodes[node, k + 3]
+            sums[cell, 6] += F1
     return n
+
+
+@kernel
+def average_colors(sums, view, shown, offsets, channels, weights, moments):
+    """Write relative positions, opponent channels and weights of the cells shown; add up their moments."""
+    moments[:] = F0
+    for c in range(len(sums)):
+        if shown[c] and sums[c, 6] > F0:
+            per = F1 / sums[c, 6]
+            for k in range(3):
+                offsets[k, c] = sums[c, k] * per
+            colors = opponent(sums[c, 3] * per, sums[c, 4] * per, sums[c, 5] * per)
+            w = view.solid_angle[c]
+            weights[c] = w
+            m = moments[view.stats_cell[c]]
+            m[0] += w
+            for k in range(3):
+                channels[k, c] = colors[k]
+                m[1 + k] += w * colors[k]
+                m[4 + k] += w * colors[k] * colors[k]
+        else:
+            weights[c] = F0
+            for k in range(3):
+                offsets[k, c] = F0
+                channels[k, c] = F0
+
+
+@kernel
+def cell_statistics(moments, view, weights, stats):
+    """Write the local means of the channels and 1 / deviations (6, cells) around cells of positive weight.
+
+    Taken at the wider cells that hold the moments, and interpolated between these.
+    """
+    coarse = np.zeros((view.num_stats, 8), np.float32)
+    around = np.empty(8, np.float32)
+    for c in range(view.num_stats):
+        s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = F0
+        for j in range(view.neighbor_row[c], view.neighbor_row[c + 1]):
+            w = view.neighbor_weight[j]
+            m = moments[view.neighbor_cell[j]]
+            s0 += w * m[0]
+            s1 += w * m[1]
+            s2 += w * m[2]
+            s3 += w * m[3]
+            s4 += w * m[4]
+            s5 += w * m[5]
+            s6 += w * m[6]
+            s7 += w * m[7]  # always 0: eight sums fill a vector register
+        per = F1 / s0 if s0 > F0 else F0
+        coarse[c, 0], coarse[c, 3] = mean_and_inverse_std(s1, s4, per)
+        coarse[c, 1], coarse[c, 4] = mean_and_inverse_std(s2, s5, per)
+        coarse[c, 2], coarse[c, 5] = mean_and_inverse_std(s3, s6, per)
+    for c in range(len(weights)):
+        if weights[c] > F0:
+            near = view.near_stats[c]
+            w = view.near_weight[c]
+            a = coarse[near[0]]
+            b = coarse[near[1]]
+            d = coarse[near[2]]
+            e = coarse[near[3]]
+            for k in range(8):  # two of them 0, as above; and stored apart, or each is read for itself
+                around[k] = w[0] * a[k] + w[1] * b[k] + w[2] * d[k] + w[3] * e[k]
+            for k in range(6):
+                stats[k, c] = around[k]
 
 
 @kernel
@@ -121,12 +226,12 @@ def describe_cells(sums, view, shown, offsets, channels, weights, stats):
     """Write position, opponent channels, weight and local statistics of each cell shown, by its sums."""
     moments = np.empty((view.num_stats, 8), np.float32)
     average_colors(sums, view, shown, offsets, channels, weights, moments)
-    local_statistics(moments, view, weights, stats)
+    cell_statistics(moments, view, weights, stats)
 
 
 @kernel
 def normalize_cells(sums, view, shown, offsets, channels, weights):
-    """The same with normalised channels."""
+    """Write position, locally normalised channels and weight of each cell shown, by its sums."""
     stats = np.empty((6, len(weights)), np.float32)
     describe_cells(sums, view, shown, offsets, channels, weights, stats)
     for k in range(3):
@@ -146,8 +251,11 @@ def as_level(channel):
 def render_block(tree, centers, voxel_per_range, view, scratch, offsets, unit, levels, is_seen):
     """Views from several centres in few bits: offsets in units of their own, channels in levels."""
     n = len(view.solid_angle)
-    points, channels = np.empty((3, n), np.float32), np.empty((3, n), np.float32)
-    weights, shown, sums = np.empty(n, np.float32), np.ones(n, np.bool_), np.empty((n, 8), np.float32)
+    points = np.empty((3, n), np.float32)
+    channels = np.empty((3, n), np.float32)
+    weights = np.empty(n, np.float32)
+    shown = np.ones(n, np.bool_)
+    sums = np.empty((n, 8), np.float32)
     for k in range(len(centers)):
         average_nodes(tree, centers[k], voxel_per_range, view, scratch, sums)
         normalize_cells(sums, view, shown, points, channels, weights)
@@ -171,10 +279,14 @@ def render_wide_block(tree, centers, voxel_per_range, view, scratch, features, s
     Channels (n, 3, wider cells) in levels, by the whole cell's area, and how much of it is seen (n, wider
     cells), 255 for all.
     """
-    n, m = len(view.solid_angle), view.num_stats
-    points, channels = np.empty((3, n), np.float32), np.empty((3, n), np.float32)
-    weights, shown, sums = np.empty(n, np.float32), np.ones(n, np.bool_), np.empty((n, 8), np.float32)
-    wide, area = np.empty((m, 4), np.float32), np.zeros(m, np.float32)
+    n = len(view.solid_angle)
+    points = np.empty((3, n), np.float32)
+    channels = np.empty((3, n), np.float32)
+    weights = np.empty(n, np.float32)
+    shown = np.ones(n, np.bool_)
+    sums = np.empty((n, 8), np.float32)
+    wide = np.empty((view.num_stats, 4), np.float32)
+    area = np.zeros(view.num_stats, np.float32)
     for c in range(n):
         area[view.stats_cell[c]] += view.solid_angle[c]
     for k in range(len(centers)):
@@ -187,7 +299,7 @@ def render_wide_block(tree, centers, voxel_per_range, view, scratch, features, s
                 for i in range(3):
                     total[i] += weights[c] * channels[i, c]
                 total[3] += weights[c]
-        for c in range(m):
+        for c in range(view.num_stats):
             for i in range(3):
                 features[k, i, c] = as_level(wide[c, i] / area[c])
             seen[k, c] = np.uint8(min(wide[c, 3] / area[c], F1) * np.float32(255) + HALF)
@@ -205,32 +317,21 @@ def nearest_ranges(tree, centers, voxel_per_range, view, scratch, ranges):
                 ranges[k, cell] = scratch.ranges[i]
 
 
-def make_scratch() -> Scratch:
-    """Arrays for the largest view."""
-    n = MAX_NODES
-    directions = np.empty((3, n), np.float32)
-    return Scratch(
-        np.empty(n, np.int32),
-        directions,
-        np.empty(n, np.int32),
-        np.empty(n, np.float32),
-        np.empty(n, np.float32),
-    )
-
-
 _local = threading.local()
 
 
 def thread_scratch() -> Scratch:
-    """The calling thread's own scratch: fresh memory costs as much as a view."""
+    """The calling thread's own scratch, for the largest view: fresh memory costs as much as a view."""
     if not hasattr(_local, "scratch"):
-        _local.scratch = make_scratch()
+        nodes, cells = np.empty((2, MAX_NODES), np.int32)
+        floats = np.empty((5, MAX_NODES), np.float32)
+        _local.scratch = Scratch(nodes, floats[:3], cells, floats[3], floats[4])
     scratch: Scratch = _local.scratch
     return scratch
 
 
 def average_view(octree: Octree, center_map: Center, config: ViewConfig) -> Array32:
-    """Sums (cells, 8), as `average_cells` writes them, of what is seen around a centre (3,) [m]."""
+    """Sums (cells, 8), as `average_nodes` writes them, of what is seen around a centre (3,) [m]."""
     sums = np.empty((len(make_grid(config.num_rings)), 8), np.float32)
     center = np.asarray(center_map, np.float64)
     average_nodes(octree, center, config.voxel_per_range, config.arrays, thread_scratch(), sums)
@@ -239,7 +340,7 @@ def average_view(octree: Octree, center_map: Center, config: ViewConfig) -> Arra
 
 def empty_cells(n: int, center_map: Center) -> Cells:
     """Room for some cells or points around a centre (3,) [m]."""
-    offsets, channels = np.empty((3, n), np.float32), np.empty((3, n), np.float32)
+    offsets, channels = np.empty((2, 3, n), np.float32)
     return Cells(offsets, channels, np.empty(n, np.float32), np.asarray(center_map, np.float64))
 
 
@@ -253,7 +354,7 @@ def normalized_view(sums: Array32, center_map: Center, config: ViewConfig, shown
 def ranges_around(
     octree: Octree, centers_map: NDArray[np.floating[Any]], config: ViewConfig
 ) -> NDArray[np.float32]:
-    """How far away (n, cells) [m] the nearest of what is seen from each centre (n, 3) is, 0 for nothing."""
+    """Ranges (n, cells) [m] of the nearest of what is seen from each centre (n, 3), 0 for nothing."""
     ranges = np.empty((len(centers_map), len(make_grid(config.num_rings))), np.float32)
     centers_map = np.ascontiguousarray(centers_map)  # one kernel for all
     nearest_ranges(octree, centers_map, config.voxel_per_range, config.arrays, thread_scratch(), ranges)

@@ -1,4 +1,4 @@
-"""What is known of the frames of a walk: poses that each may have, and how likely each of them is."""
+"""The frames of a walk: poses that each may have, and how likely each of them is."""
 
 import math
 from collections.abc import Sequence
@@ -19,14 +19,15 @@ How = Literal["alone", "near", "tracked", "none"]
 MOST_ODDS = 8.0  # [log] that one frame may add: what is surer is not so of errors that no model has
 COPY_LOG_ODDS = 4.0  # copies of a place differ by as much where one of them was scanned better
 OTHER_LOG_ODDS = 6.0  # behind the best: no copy
-MAX_SPEED, MAX_ACCELERATION = 2.0, 2.0  # [m/s], [m/s^2] of a walking person with a camera
+MAX_SPEED = 2.0  # [m/s] of a walking person with a camera
+MAX_ACCELERATION = 2.0  # [m/s^2]
 MAX_STEP = 5.0  # [m] from one frame to the next, if nothing is known
 NO_ACCELERATION = 1e3  # [m] of frames without times: nothing is known of it
 
 
 @dataclass(frozen=True)
 class Motion:
-    """How a camera is carried."""
+    """The motion of a camera that is carried."""
 
     max_speed: float = MAX_SPEED  # [m/s]; of frames without times [m] from one to the next
     max_acceleration: float = MAX_ACCELERATION  # [m/s^2] standard deviation along each axis
@@ -61,10 +62,20 @@ class Frame:
     how: How = "none"
     alone: Localization | None = None  # if it was searched without regard to the others
 
+    def put(self, states: list[State], how: How) -> None:
+        """Set its poses, and where they come from."""
+        self.states = states
+        self.how = how
+
     @property
     def is_credible(self) -> bool:
         """True if its poses are more likely than that it has none."""
-        return bool(np.logaddexp.reduce([state.log_odds for state in self.states]) > 0.0)
+        return self.log_odds > 0.0
+
+    @property
+    def log_odds(self) -> float:
+        """Log odds of its poses together against that it has none."""
+        return float(np.logaddexp.reduce([state.log_odds for state in self.states]))
 
     @property
     def is_telling(self) -> bool:
@@ -105,19 +116,14 @@ def states_of(scan_map: ScanMap, found: Localization) -> list[State]:
     if found.pose is None or found.probability_none is None or found.evidence is None:
         return []
     none = max(found.probability_none, 1e-9)
-    best = State(
-        scan_map.from_world(found.pose),
-        log_ratio(found.confidence, none),
-        found.evidence.score,
-        found.covariance,
-        found.evidence.num_matches,
-    )
-    others = [
-        State(
-            scan_map.from_world(a.pose), log_ratio(a.probability or 0.0, none), a.score, None, a.num_matches
-        )
-        for a in found.alternatives
-    ]
+    odds = log_ratio(found.confidence, none)
+    evidence = found.evidence
+    pose = scan_map.from_world(found.pose)
+    best = State(pose, odds, evidence.score, found.covariance, evidence.num_matches)
+    others = []
+    for a in found.alternatives:
+        odds = log_ratio(a.probability or 0.0, none)
+        others.append(State(scan_map.from_world(a.pose), odds, a.score, None, a.num_matches))
     return [best, *others]
 
 
@@ -147,13 +153,10 @@ def _state_json(state: State) -> dict[str, Any]:
 
 def _state_from_json(document: dict[str, Any]) -> State:
     """Read back what `Frame.to_json` wrote of a state."""
-    matrix = document["covariance"]
-    return State(
-        Pose(np.array(document["R_cam_from_map"]), np.array(document["center_map"])),
-        float(document["log_odds"]),
-        float(document["score"]),
-        None
-        if matrix is None
-        else PoseCovariance(np.array(matrix), str(document["least_constrained_direction"])),
-        document["num_matches"],
-    )
+    pose = Pose(np.array(document["R_cam_from_map"]), np.array(document["center_map"]))
+    covariance = None
+    if document["covariance"] is not None:
+        direction = str(document["least_constrained_direction"])
+        covariance = PoseCovariance(np.array(document["covariance"]), direction)
+    odds = float(document["log_odds"])
+    return State(pose, odds, float(document["score"]), covariance, document["num_matches"])

@@ -1,4 +1,4 @@
-"""How far it is to walk from place to place: through free space, never through a wall."""
+"""Distances to walk from place to place: through free space, never through a wall."""
 
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -16,11 +16,12 @@ from ..views.view import BLOCK, ranges_around
 REACH = 0.95  # [m] between neighbours in the grid of candidates, 0.6 m wide: across edges, not all corners
 SLACK = 0.1  # [m] by which a surface may be nearer than a neighbour, as views are coarse
 NEAR = 0.5  # [m] cameras keep 0.25 m from a wall: nearer ones have none between them
-DETOUR, ENDS = 1.1, 0.6  # paths along a grid are so much longer; and to its nodes [m]
+DETOUR = 1.1  # paths along a grid are so much longer
+ENDS = 0.6  # [m] to its nodes
 
 
 class _Reached(NamedTuple):
-    """What is within a limit [m] of a node: other nodes, rising, and the lengths of the ways there."""
+    """All within a limit [m] of a node: other nodes, rising, and the lengths of the ways there."""
 
     limit: float
     nodes: NDArray[np.int64]
@@ -31,7 +32,8 @@ class FreeSpace:
     """A map's candidates as a graph, with an edge where neighbours see each other."""
 
     def __init__(self, scan_map: ScanMap, workers: Workers) -> None:
-        self.scan_map, self.workers = scan_map, workers
+        self.scan_map = scan_map
+        self.workers = workers
         self._known: dict[int, _Reached] = {}
 
     @cached_property
@@ -45,7 +47,8 @@ class FreeSpace:
         """Sparse matrix (candidates, candidates) of lengths [m]."""
         from scipy.sparse import coo_matrix  # noqa: PLC0415
 
-        m, pairs = self.scan_map, self._tree.query_pairs(REACH, output_type="ndarray")
+        m = self.scan_map
+        pairs = self._tree.query_pairs(REACH, output_type="ndarray")
         both = np.concatenate([pairs, pairs[:, ::-1]])  # there and back
         order = np.argsort(both[:, 0], kind="stable")
         seen = np.empty(len(both), np.int64)
@@ -88,7 +91,7 @@ class FreeSpace:
 def looks(
     scan_map: ScanMap, first: NDArray[Any], second: NDArray[Any], workers: Workers
 ) -> NDArray[np.int64]:
-    """What candidates see (N,) in the direction of neighbours: 1 what lies behind them, 0 nothing, else -2.
+    """Return 1 (N,) where candidates see past their neighbours, 0 where they see nothing, else -2.
 
     A sum above 0 is a free way: nobody sees anything between, and somebody sees past. Both index candidates,
     the first rise.

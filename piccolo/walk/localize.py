@@ -1,4 +1,4 @@
-"""What a walk makes of its frames."""
+"""The results of a walk's frames."""
 
 import math
 from dataclasses import dataclass, replace
@@ -28,7 +28,7 @@ class Gap:
 
 @dataclass(frozen=True)
 class Alone:
-    """What a frame is without regard to the others."""
+    """The result of a frame without regard to the others."""
 
     status: str
     confidence: float
@@ -47,12 +47,12 @@ class WalkFrame:
 
 
 def localizations_of(tracker: Tracker, path: Path) -> list[tuple[Localization, WalkFrame]]:
-    """What a walk makes of each of its frames, poses smoothed together."""
+    """Return the result of each frame of a walk, poses smoothed together."""
     found = [
         localization_of(tracker, frame, probabilities, chosen)
         for frame, probabilities, chosen in zip(tracker.frames, path.probabilities, path.chosen, strict=True)
     ]
-    sure = [k for k, f in enumerate(found) if f.pose is not None and f.covariance is not None and _is_on(f)]
+    sure = [k for k, f in enumerate(found) if f.pose and f.covariance and f.confidence > SURE]
     located = [(f.pose, f.covariance) for k in sure if (f := found[k]).pose and f.covariance]
     begins = [0, *(n for n, k in enumerate(sure) if n and path.gaps[k]), len(sure)]
     for lo, hi in pairwise(begins):
@@ -67,13 +67,9 @@ def localizations_of(tracker: Tracker, path: Path) -> list[tuple[Localization, W
 
 
 def alone_of(frame: Frame) -> Alone | None:
-    """What a frame is without regard to the others, if it was searched so."""
+    """Return a frame's result without regard to the others, if it was searched so."""
     a = frame.alone
     return None if a is None else Alone(a.status, a.confidence, a.pose)
-
-
-def _is_on(found: Localization) -> bool:
-    return found.confidence > SURE
 
 
 def accuracy_of(frame: Frame) -> float:
@@ -81,8 +77,7 @@ def accuracy_of(frame: Frame) -> float:
 
     The frames around tell the place of one that is blurred or dark, but not where in it.
     """
-    odds = float(np.logaddexp.reduce([state.log_odds for state in frame.states]))
-    return 1.0 / (1.0 + math.exp(-odds))
+    return 1.0 / (1.0 + math.exp(-frame.log_odds))
 
 
 def localization_of(tracker: Tracker, frame: Frame, probabilities: Array, chosen: int | None) -> Localization:
@@ -90,13 +85,15 @@ def localization_of(tracker: Tracker, frame: Frame, probabilities: Array, chosen
     if not frame.states:
         return frame.alone or Localization()
     order = sorted(range(len(frame.states)), key=lambda j: (j != chosen, -probabilities[j]))
-    best, values = frame.states[order[0]], [float(probabilities[j]) for j in order]
+    best = frame.states[order[0]]
+    values = [float(probabilities[j]) for j in order]
     if best.covariance is not None:
         values[0] *= math.erf(MAX_DISTANCE / (best.covariance.largest_std * math.sqrt(2.0)))
     values[0] *= accuracy_of(frame)
     none = max(1.0 - sum(values), 0.0)
-    to_world, alone = tracker.scan_map.to_world, frame.alone
-    is_own = alone is not None and alone.pose is not None and order[0] == 0 and frame.how == "alone"
+    to_world = tracker.scan_map.to_world
+    is_own = frame.alone and frame.alone.pose is not None and order[0] == 0 and frame.how == "alone"
+    own = frame.alone if is_own and frame.alone else Localization()
     status = classify(np.array([*values, none]), tracker.settings.min_confidence)
     others = tuple(
         Alternative(to_world(s.pose), s.score, None, s.num_matches, p)
@@ -107,8 +104,8 @@ def localization_of(tracker: Tracker, frame: Frame, probabilities: Array, chosen
         values[0],
         none,
         to_world(best.pose),
-        alone.loss if is_own and alone else None,
-        alone.evidence if is_own and alone else None,
+        own.loss,
+        own.evidence,
         others[:MAX_ALTERNATIVES],
         best.covariance,
     )

@@ -22,8 +22,10 @@ from .free_space import FreeSpace
 
 SAME_PLACE = 1.5  # [m] poses nearer to each other are of one place, not of copies
 TELLING_DISTANCE = 2.0  # [m] after which a frame says something new of its place
-REACH_SLACK, REACH_SIGMA = 0.3, 0.25  # [m] beyond what a person walks; deviation of more
-GAP_LOG, UNTIMED_GAP_LOG = -9.0, -4.0  # a jump to any place: lift, cut, pocket; of frames without times
+REACH_SLACK = 0.3  # [m] beyond what a person walks
+REACH_SIGMA = 0.25  # [m] deviation of more
+GAP_LOG = -9.0  # a jump to any place: lift, cut, pocket
+UNTIMED_GAP_LOG = -4.0  # of frames without times
 JUMPED = -2.0  # less is a jump
 MOST_EXPECTED = 3.0  # [log] that a pose gains by being where it was to be expected
 MAX_SKIPPED = 25.0  # [log] frames that speak for their poses by more in all are not passed over
@@ -36,7 +38,7 @@ UNLISTED = -1  # in place of the number of a state
 
 
 class Path(NamedTuple):
-    """What the walk makes of its frames."""
+    """The likeliest way through a walk's frames."""
 
     chosen: list[int | None]  # the state of each frame on the likeliest way; None for no pose
     probabilities: list[Array]  # (S,) of each frame's states
@@ -48,21 +50,21 @@ def emissions(frames: Sequence[Frame]) -> list[Array]:
     found: list[Array] = []
     last: Frame | None = None
     for frame in frames:
-        odds, here = np.array([state.log_odds for state in frame.states]), centers_of(frame.states)
+        odds = np.array([state.log_odds for state in frame.states])
         if len(odds) == 0:
             found.append(odds)
             continue
         share = 1.0 if last is None else share_moved(last, frame)
         last = frame
         total = np.clip(np.logaddexp.reduce(odds), -MOST_ODDS, MOST_ODDS)
-        of_place = odds[places_of(odds, here)]
+        of_place = odds[places_of(odds, centers_of(frame.states))]
         behind = -new_differences(odds.max() - of_place, share) - (of_place - odds)
         found.append(total + behind - np.logaddexp.reduce(behind))
     return found
 
 
 def new_differences(behind: Array, share: float) -> Array:
-    """How much of what poses lack to the best (S,) [log] counts, in a frame that is new to a share.
+    """Log differences (S,) of poses to the best that count in a frame that is new to a share.
 
     Copies differ by a little for as long as the camera is in one of them; what is no copy is just worse.
     """
@@ -71,8 +73,8 @@ def new_differences(behind: Array, share: float) -> Array:
 
 
 def share_moved(before: Frame, frame: Frame) -> float:
-    """How much of a new place a frame shows, 0 to 1, by how far the camera has moved at least."""
-    starts, ends = centers_of(before.likely), centers_of(frame.likely)
+    """Fraction of a new place that a frame shows, by how far the camera has moved at least."""
+    starts, ends = (centers_of(f.likely) for f in (before, frame))
     moved = float(np.linalg.norm(ends[:, None] - starts[None], axis=2).min())
     return min(moved / TELLING_DISTANCE, 1.0)
 
@@ -132,7 +134,8 @@ class Lattice:
     """
 
     def __init__(self, space: FreeSpace, motion: Motion) -> None:
-        self.space, self.motion = space, motion
+        self.space = space
+        self.motion = motion
         self.frames: list[Frame] = []
         self.emitted: list[Array] = []
         self.steps: list[list[_Steps]] = []
@@ -151,8 +154,9 @@ class Lattice:
         self.steps.append(steps)
         before, begin = (self.unlisted[-1], (k - 1, UNLISTED)) if k else (_Unlisted(), None)
         self.unlisted.append(self._unlisted_at(k, before))
-        enter, num = entering(frame), len(frame.states)
-        sums, best = np.full(num, enter + before.forward), np.full(num, enter + before.best)
+        num = len(frame.states)
+        sums = np.full(num, entering(frame) + before.forward)
+        best = np.full(num, entering(frame) + before.best)
         back: list[tuple[int, int] | None] = [begin] * num
         for s in steps:
             sums = np.logaddexp(sums, np.logaddexp.reduce(self.forward[s.begin][:, None] + s.log, axis=0))
@@ -160,31 +164,35 @@ class Lattice:
             for j in range(num):
                 i = int(ways[:, j].argmax())
                 if ways[i, j] > best[j]:
-                    best[j], back[j] = ways[i, j], (s.begin, i)
+                    best[j] = ways[i, j]
+                    back[j] = (s.begin, i)
         self.forward.append(sums + self.emitted[k])
         self.ended = float(np.logaddexp(self.ended, np.logaddexp.reduce(self.forward[k])))
         self.best.append(best + self.emitted[k])
         self.back.append(back)
 
     def _unlisted_at(self, k: int, before: "_Unlisted") -> "_Unlisted":
-        """What a frame says for places that are not listed.
+        """Return what a frame says for places that are not listed.
 
         If it does not tell, as much as for the best that is listed.
         """
         gained = max([0.0, *(float(s.log.max()) for s in self.steps[k])])
         emitted = float(self.emitted[k].max(initial=-math.inf)) + gained
         emitted = max(emitted - self._telling(k) * (TELLING_LOG + gained), 0.0)
-        forward, best, back = before.forward, before.best, (k - 1, UNLISTED) if k else None
+        forward = before.forward
+        best = before.best
+        back = (k - 1, UNLISTED) if k else None
         for s in self.steps[k]:
             leave = left(s.log, self.frames[k])
             forward = float(np.logaddexp(forward, np.logaddexp.reduce(self.forward[s.begin] + leave)))
             ways = self.best[s.begin] + leave
             if ways.max() > best:
-                best, back = float(ways.max()), (s.begin, int(ways.argmax()))
+                best = float(ways.max())
+                back = (s.begin, int(ways.argmax()))
         return _Unlisted(emitted, forward + emitted, best + emitted, back)
 
     def _telling(self, k: int) -> float:
-        """How much of what a search of the whole scan can tell is new in a frame, 0 to 1."""
+        """Fraction of what a search of the whole scan can tell that is new in a frame."""
         frame = self.frames[k]
         if not frame.is_telling:
             return 0.0
@@ -192,13 +200,15 @@ class Lattice:
         return 1.0 if last is None else max(share_moved(last, frame), LEAST_TOLD)
 
     def _emission(self) -> Array:
-        """Of the last frame."""
+        """Log odds (S,) of the last frame's states."""
         before = next((f for f in reversed(self.frames[:-1]) if f.states), None)
         return emissions([before, self.frames[-1]] if before else self.frames[-1:])[-1]
 
     def _steps_to(self, k: int) -> list[_Steps]:
         """Steps from all earlier frames from which the way may lead to a frame."""
-        ends, steps, passed = centers_of(self.frames[k].states), list[_Steps](), 0.0
+        ends = centers_of(self.frames[k].states)
+        steps: list[_Steps] = []
+        passed = 0.0
         if len(ends) == 0:
             return []
         for m in range(k - 1, max(k - 1 - LONGEST_SKIP, -1), -1):
@@ -217,7 +227,7 @@ class Lattice:
         return steps
 
     def _expected(self, start: Array, reach: float) -> float:
-        """What a pose within a reach [m] gains: the more, the less of the map lies there.
+        """Log odds that a pose within a reach [m] gains: the more, the less of the map lies there.
 
         A frame's own odds hold where each place of the map is as likely as the others.
         """
@@ -233,9 +243,11 @@ class Lattice:
 
     def smoothed(self) -> Path:
         """The likeliest way, and the probability of each state by all frames."""
-        backward, unlisted = [np.zeros(len(f.states)) for f in self.frames], 0.0
+        backward = [np.zeros(len(f.states)) for f in self.frames]
+        unlisted = 0.0
         for k in range(len(self.frames) - 1, -1, -1):
-            onward, unlisted = self.emitted[k] + backward[k], self.unlisted[k].emitted + unlisted
+            onward = self.emitted[k] + backward[k]
+            unlisted += self.unlisted[k].emitted
             for s in self.steps[k]:
                 leave = left(s.log, self.frames[k]) + unlisted
                 ways = np.concatenate([s.log + onward[None], leave[:, None]], axis=1)
@@ -251,9 +263,8 @@ class Lattice:
         if not self.frames:
             return chosen
         ends = [(float(b.max()), (k, int(b.argmax()))) for k, b in enumerate(self.best) if len(b)]
-        at: tuple[int, int] | None = max([*ends, (self.unlisted[-1].best, (len(self.frames) - 1, UNLISTED))])[
-            1
-        ]
+        ends.append((self.unlisted[-1].best, (len(self.frames) - 1, UNLISTED)))
+        at: tuple[int, int] | None = max(ends)[1]
         while at is not None:
             k, j = at
             chosen[k] = None if j == UNLISTED else j
@@ -270,8 +281,8 @@ class Lattice:
                 m, i = before
                 log = next((s.log[i, j] for s in self.steps[k] if s.begin == m), GAP_LOG)
                 if log < JUMPED:
-                    there, here = self.frames[m].states[i].pose, self.frames[k].states[j].pose
-                    metres = float(np.linalg.norm(here.center_world - there.center_world))
+                    ends = centers_of([self.frames[m].states[i], self.frames[k].states[j]])
+                    metres = float(np.linalg.norm(ends[1] - ends[0]))
                     gaps[k] = metres, self.frames[k].time - self.frames[m].time
             before = k, j
         return gaps

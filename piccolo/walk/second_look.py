@@ -24,10 +24,13 @@ from .tracking import beside, found_near, is_same, states_at
 
 MAX_SWEEPS = 4
 FARTHEST = 12  # frames from one that is sure, in which lost ones are looked for
-SURE, CERTAIN, LEAST_ODDS = 0.5, 0.98, 0.0
+SURE = 0.5
+CERTAIN = 0.98
+LEAST_ODDS = 0.0
 MIN_GAIN = 1.1  # of the score, by which a pose replaces one nearby
 LEAST_STEP = 0.5  # [m] several photos of one place are no steps
-MOST_STEPS, LONGER = 0.9, 1.5  # of the steps found: the longest is so much longer than so many of them
+MOST_STEPS = 0.9  # of the steps found: the longest is LONGER than so many of them
+LONGER = 1.5
 MOST_RIVALS = 4  # places of a frame that are followed to its neighbours
 
 Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
@@ -88,10 +91,10 @@ def _is_certain(path: Path, k: int) -> bool:
 
 def _complete(tracker: Tracker, k: int, step: int, read: Read) -> None:
     """Give a frame the places of the frame a step before it that can be reached, and that it lacks."""
-    frame, m = tracker.frames[k], k - step
-    if not frame.states or not 0 <= m < len(tracker.frames):
+    frame = tracker.frames[k]
+    if not frame.states or not 0 <= k - step < len(tracker.frames):
         return
-    missing = [f for f in _rivals(tracker, m) if not _is_reached(tracker, f, k)]
+    missing = [f for f in _rivals(tracker, k - step) if not _is_reached(tracker, f, k)]
     panorama = read(k) if missing else None
     if panorama is None:
         return
@@ -111,8 +114,7 @@ def _rivals(tracker: Tracker, m: int) -> list[Follower]:
     odds = np.array([state.log_odds for state in likely])
     places = {int(j) for j in places_of(odds, centers_of(likely))}
     leaders = sorted(places, key=lambda j: (-odds[j], j))[:MOST_RIVALS]
-    time = tracker.frames[m].time
-    return [Follower(likely[j], time, None, 0.0) for j in leaders] if len(leaders) > 1 else []
+    return [Follower(likely[j], tracker.frames[m].time) for j in leaders] if len(leaders) > 1 else []
 
 
 def _is_reached(tracker: Tracker, f: Follower, k: int, least_odds: float = -math.inf) -> bool:
@@ -156,7 +158,7 @@ def _found_again(
     if found and frame.states:
         return _joined(query, frame, found[0])
     if found:
-        frame.states, frame.how = states_at(query, found), "tracked" if is_there else "near"
+        frame.put(states_at(query, found), "tracked" if is_there else "near")
     return len(found) > 0
 
 
@@ -182,7 +184,7 @@ def _searched_near(
     found = localize(tracker.scan_map, panorama, settings, tracker.workers, Stopwatch(), method)
     if found.status == NOT_LOCALIZED:
         return False
-    frame.states, frame.how = states_of(tracker.scan_map, found), "near"
+    frame.put(states_of(tracker.scan_map, found), "near")
     return True
 
 
@@ -198,20 +200,22 @@ def _is_sure(tracker: Tracker, path: Path, m: int) -> bool:
 
 def _state_on(tracker: Tracker, path: Path, m: int) -> State:
     """The state of a sure frame: on the path, or what was found last."""
-    states, chosen = tracker.frames[m].states, path.chosen[m]
+    states = tracker.frames[m].states
+    chosen = path.chosen[m]
     is_old = chosen is not None and len(path.probabilities[m]) == len(states)
     return states[chosen] if is_old and chosen is not None else states[-1]
 
 
 def _follower(tracker: Tracker, path: Path, m: int, step: int) -> Follower:
     """The pose of a sure frame, and of the one before it in the direction of the sweep."""
-    state, other = _state_on(tracker, path, m), m - step
+    state = _state_on(tracker, path, m)
+    other = m - step
     if _is_sure(tracker, path, other):
         earlier = _state_on(tracker, path, other)
         follower = Follower(state, tracker.frames[m].time, earlier.pose, tracker.frames[other].time)
         if _is_within(tracker, follower, earlier, tracker.frames[other].time):
             return follower
-    return Follower(state, tracker.frames[m].time, None, 0.0)
+    return Follower(state, tracker.frames[m].time)
 
 
 def _is_within(tracker: Tracker, f: Follower, state: State, time: float) -> bool:

@@ -30,7 +30,8 @@ def smoothed(located: Sequence[Located], times: Sequence[float], motion: Motion)
     if len(located) < 3:
         return list(located)
     own = [c.matrix[3:, 3:] + PRIOR_FLOOR * np.eye(3) for _, c in located]
-    information, right = np.zeros((BANDS + 3, 3 * len(located))), np.zeros(3 * len(located))
+    information = np.zeros((BANDS + 3, 3 * len(located)))
+    right = np.zeros(3 * len(located))
     for k, covariance in enumerate(own):
         _add(information, k, k, np.asarray(np.linalg.inv(covariance)))
     rows = acceleration_rows(times, motion)
@@ -53,7 +54,7 @@ def acceleration_rows(times: Sequence[float], motion: Motion) -> list[tuple[int,
     """First of three frames, and the factors (3,) of their positions in a_k / s."""
     rows = []
     for k in range(len(times) - 2):
-        before, after = times[k + 1] - times[k], times[k + 2] - times[k + 1]
+        before, after = np.diff(times[k : k + 3])
         if max(before, after) > LONGEST_STEP:
             continue
         row = np.array([1.0 / before, -1.0 / before - 1.0 / after, 1.0 / after]) * 2.0 / (before + after)
@@ -66,7 +67,8 @@ def marginal_covariances(information: NDArray[np.float64]) -> list[Array]:
     from scipy.linalg import cho_solve_banded, cholesky_banded  # noqa: PLC0415
 
     n = information.shape[1] // 3
-    factor, found = cholesky_banded(information), []
+    factor = cholesky_banded(information)
+    found = []
     for k in range(n):  # few hundred frames: a solution each
         right = np.zeros((3 * n, 3))
         right[3 * k : 3 * k + 3] = np.eye(3)
@@ -94,6 +96,6 @@ def _add(banded: NDArray[np.float64], k: int, j: int, block: Array) -> None:
     """Add a block (3, 3) of frames k <= j to a banded matrix in upper form."""
     for a in range(3):
         for b in range(3):
-            row, column = 3 * k + a, 3 * j + b
-            if row <= column:
-                banded[-1 + row - column, column] += block[a, b]
+            off = 3 * (j - k) + b - a
+            if off >= 0:
+                banded[-1 - off, 3 * j + b] += block[a, b]

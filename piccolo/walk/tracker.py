@@ -38,11 +38,14 @@ MOST_TRACKED = 6  # poses from which a frame is tracked
 MOST_SOUGHT = 3  # of those at which it is not, around which it is looked for
 LEAST_WEIGHT = 0.02  # of such a pose, by the likeliest
 MAX_RADIUS = 12.0  # [m] around its last pose in which a lost camera is looked for
-FIRST_SEARCH, LAST_SEARCH = 3, 48  # frames after which a lost camera is searched everywhere, and again
+FIRST_SEARCH = 3  # frames after which a lost camera is searched everywhere
+LAST_SEARCH = 48  # and again, at the latest
 SHORT = 1.5  # [m] that a camera may have gone: a descent from there does not end in a neighbouring minimum
 FAR = 3.0  # [m] from frame to frame, where each is searched in the whole scan
 USUAL = 0.95  # of the score of the frame before
-SURE, CHECKED_SURE, CHECKED_UNSURE = 0.9, 8.0, 4.0  # [m] walked, after which the whole scan is searched
+SURE = 0.9
+CHECKED_SURE = 8.0  # [m] walked, after which the whole scan is searched
+CHECKED_UNSURE = 4.0
 
 
 class Follower(NamedTuple):
@@ -50,8 +53,8 @@ class Follower(NamedTuple):
 
     state: State
     time: float
-    earlier: Pose | None
-    earlier_time: float
+    earlier: Pose | None = None
+    earlier_time: float = 0.0
 
 
 class Tracker:
@@ -66,10 +69,14 @@ class Tracker:
         space: FreeSpace | None = None,
     ) -> None:
         self.scan_map = apply_prior(scan_map, settings.prior)
-        self.settings, self.workers, self.motion = settings, workers, motion
+        self.settings = settings
+        self.workers = workers
+        self.motion = motion
         self.lattice = Lattice(space or FreeSpace(scan_map, workers), motion)
-        self.num_lost, self.next_search = 0, 1
-        self.walked, self.is_sure = 0.0, False  # [m] since the whole scan was searched
+        self.num_lost = 0
+        self.next_search = 1
+        self.walked = 0.0  # [m] since the whole scan was searched
+        self.is_sure = False
 
     @property
     def frames(self) -> list[Frame]:
@@ -111,7 +118,8 @@ class Tracker:
         if frame.how == "alone":
             self.walked = 0.0
         if frame.is_credible:
-            self.num_lost, self.next_search = 0, FIRST_SEARCH
+            self.num_lost = 0
+            self.next_search = FIRST_SEARCH
             self.is_sure = bool(self.lattice.filtered().max() >= SURE)
             return
         self.num_lost += 1
@@ -146,7 +154,7 @@ class Tracker:
             if radius <= MAX_RADIUS:
                 found += found_near(query, f.state.pose, radius, least)
         if found:
-            frame.states, frame.how = states_at(query, found), "tracked" if is_there else "near"
+            frame.put(states_at(query, found), "tracked" if is_there else "near")
 
     def followers(self) -> list[Follower]:
         """The poses from which the next frame may come: of the last that is credible, then of later ones."""
@@ -157,34 +165,34 @@ class Tracker:
 
     def _followers_of(self, k: int, known: list[int]) -> list[Follower]:
         """The poses of a frame, the likeliest first."""
-        last, weights = self.frames[k], self.lattice.forward[k]
+        last = self.frames[k]
+        weights = self.lattice.forward[k]
         earlier = next((self.frames[m] for m in reversed(known) if m < k), None)
         order = [int(i) for i in np.argsort(-weights, kind="stable")]
         order = [i for i in order if weights[i] > weights.max() + np.log(LEAST_WEIGHT)]
         return [self._follower(last, last.states[i], earlier) for i in order]
 
     def _follower(self, last: Frame, state: State, earlier: Frame | None) -> Follower:
-        pose, time = None, 0.0
         if earlier is not None and earlier.states:
             gaps = [np.linalg.norm(s.pose.center_world - state.pose.center_world) for s in earlier.states]
             k = int(np.argmin(gaps))
             if gaps[k] <= self.motion.max_speed * (last.time - earlier.time) + REACH_SLACK:
-                pose, time = earlier.states[k].pose, earlier.time
-        return Follower(state, last.time, pose, time)
+                return Follower(state, last.time, earlier.states[k].pose, earlier.time)
+        return Follower(state, last.time)
 
     def _check(self, query: Query, frame: Frame) -> None:
         """Look for a frame that is followed in the whole scan too."""
         found = found_everywhere(query, CLEAR_SCORE)
         if found:
-            frame.states, frame.how = merged(query, frame.states, found), "alone"
+            frame.put(merged(query, frame.states, found), "alone")
 
     def _search(self, query: Query, panorama: Panorama, frame: Frame) -> None:
         """Search the whole scan, and keep what was tracked beside."""
         alone = localize(self.scan_map, panorama, self.settings, self.workers, Stopwatch())
         tracked_to = [Hypothesis(state.pose, state.score) for state in frame.states]
         states = states_of(self.scan_map, alone)
-        frame.states = merged(query, states, tracked_to) if states else frame.states
-        frame.alone, frame.how = alone, "alone"
+        frame.put(merged(query, states, tracked_to) if states else frame.states, "alone")
+        frame.alone = alone
 
 
 def merged(query: Query, states: list[State], others: Sequence[Hypothesis]) -> list[State]:
@@ -207,8 +215,10 @@ def followed(query: Query, followers: Sequence[Follower], time: float, motion: M
 
 def follow(query: Query, f: Follower, time: float, motion: Motion) -> Hypothesis:
     """Descend from where a camera should be; farther around if it may be far, or explains less."""
-    least, seconds = least_score(f), time - f.time
-    starts, span = [f.state.pose], f.time - f.earlier_time
+    least = least_score(f)
+    seconds = time - f.time
+    starts = [f.state.pose]
+    span = f.time - f.earlier_time
     if f.earlier is not None and span != 0.0:
         reach = motion.max_speed * abs(seconds) + REACH_SLACK
         starts.insert(0, predicted(f.state.pose, f.earlier, seconds / span, reach))

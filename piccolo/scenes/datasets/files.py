@@ -13,7 +13,7 @@ from ...files.json_file import read_text
 from ...geometry.pose import Array, Pose, checked_rotation, orthonormal
 from ...geometry.rotations import CAMERA_AXES, OPENGL_FROM_CAM
 from ...panorama.picture import read_picture
-from ...views.surfel_renderer import encode_image
+from ...views.pictures import encode_image
 from .model import Labels
 
 SUFFIXES = frozenset().union(*(f.suffixes for f in FORMATS)) - {".csv"}  # as these hold poses too

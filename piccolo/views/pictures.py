@@ -1,0 +1,127 @@
+"""Pictures for people: holes filled, overlays, a camera's part of the sphere, files."""
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera import Camera
+from ..cloud.soa import PackedPoints
+from ..geometry.pose import Array, Pose
+from ..geometry.sphere import pixels_of
+from ..jobs.threads import Workers
+from ..panorama import Panorama
+from ..panorama.model import shrink
+from .surfels import render_points
+from .zbuffer import View
+
+OVERLAY_WIDTH = 1024
+NUM_TILES = 16  # columns of the checkerboard
+MAX_SPHERE_WIDTH = 8192  # [px]
+UPRIGHT = np.eye(3)
+
+
+def fill_holes(rgb: NDArray[np.uint8], is_seen: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """A picture (H, W, 3); what is not seen (H, W) takes colours around it, the farther away the smoother.
+
+    From the same at half the size, in bytes, as floating-point copies of a large picture would take
+    gigabytes. Black if nothing is seen at all.
+    """
+    height, width = is_seen.shape
+    if is_seen.all() or width == 1:
+        return rgb
+    counts = is_seen.view(np.uint8) * np.uint8(255)
+    masked = cv2.bitwise_and(rgb, rgb, mask=counts)
+    if height % 2 or width % 2:  # a row more counts nothing, a column more is the first again
+        counts = np.pad(np.pad(counts, ((0, height % 2), (0, 0))), ((0, 0), (0, width % 2)), mode="wrap")
+        masked = np.pad(masked, ((0, height % 2), (0, 0), (0, 0)))
+        masked = np.pad(masked, ((0, 0), (0, width % 2), (0, 0)), mode="wrap")
+    size = (counts.shape[1] // 2, counts.shape[0] // 2)
+    weights = cv2.resize(counts, size, interpolation=cv2.INTER_AREA)
+    total = cv2.resize(masked, size, interpolation=cv2.INTER_AREA)
+    del counts, masked
+    mean = cv2.divide(total, cv2.merge([weights, weights, weights]), scale=255.0)
+    coarse = fill_holes(np.asarray(mean, np.uint8), weights > 0)
+    around = np.concatenate([coarse[:, -1:], coarse, coarse[:, :1]], axis=1)
+    double = (2 * around.shape[1], 2 * len(around))
+    smooth = cv2.resize(around, double, interpolation=cv2.INTER_LINEAR)[:height, 2 : 2 + width]
+    np.copyto(smooth, rgb, where=is_seen[..., None])
+    return np.asarray(smooth, np.uint8)
+
+
+def encode_image(image: NDArray[np.uint8] | NDArray[np.uint16], suffix: str, quality: int = 95) -> bytes:
+    """Bytes of a file with an image (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) gray, as the suffix says.
+
+    The quality, up to 100, is that of a JPEG.
+    """
+    order = cv2.COLOR_RGBA2BGRA if image.ndim == 3 and image.shape[2] == 4 else cv2.COLOR_RGB2BGR
+    bgr = cv2.cvtColor(image, order) if image.ndim == 3 else image
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if suffix in (".jpg", ".jpeg") else []
+    is_encoded, content = cv2.imencode(suffix, bgr, options)
+    if not is_encoded:
+        raise OSError(f"an image of {image.shape[1]} x {image.shape[0]} could not be encoded as {suffix}")
+    return content.tobytes()
+
+
+def resized_rgb(panorama: Panorama, width: int) -> NDArray[np.uint8]:
+    """The panorama's colours, resized to (width / 2, width, 3)."""
+    rgb = shrink(panorama, width).rgb
+    return np.asarray(cv2.resize(rgb, (width, width // 2), interpolation=cv2.INTER_LINEAR), np.uint8)
+
+
+def checkerboard(photo: NDArray[np.uint8], cloud: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Two images (H, W, 3) and a checkerboard of both, one above the other (3 H, W, 3)."""
+    row, column = np.indices(photo.shape[:2]) // (photo.shape[1] // NUM_TILES)
+    mixed = np.where(((row + column) % 2 == 0)[..., None], photo, cloud)
+    return np.concatenate([photo, cloud, mixed])
+
+
+def overlay_png(points: PackedPoints, panorama: Panorama, pose: Pose, workers: Workers) -> bytes:
+    """PNG file of three images, one above the other: panorama, cloud from the pose, checkerboard of both.
+
+    A photo by one camera is shown in its own field, others as spheres.
+    """
+    if len(panorama.cameras) != 1:
+        view = render_points(points, pose, OVERLAY_WIDTH, workers)
+        cloud = fill_holes(view.rgb, view.is_seen)
+        return encode_image(checkerboard(resized_rgb(panorama, OVERLAY_WIDTH), cloud), ".png")
+    (mount,) = panorama.cameras
+    camera = mount.camera.scaled_to_width(OVERLAY_WIDTH)
+    view = render_points(points, mount.pose(pose), sphere_width_for(camera), workers)
+    cloud = cut(fill_holes(view.rgb, view.is_seen), camera)
+    photo = cut(panorama.rgb, camera, mount.rotation)
+    return encode_image(checkerboard(photo, cloud), ".png")
+
+
+def sphere_width_for(camera: Camera) -> int:
+    """Width [px], even, of the sphere that is as fine as the camera's picture at its axis, bounded."""
+    return min(2 * math.ceil(math.pi * camera.resolution), MAX_SPHERE_WIDTH)
+
+
+def cut(image: NDArray[np.uint8], camera: Camera, R_lens_from_cam: Array = UPRIGHT) -> NDArray[np.uint8]:
+    """A camera's picture (height, width, 3) of that of the sphere (H, W, 3); black where it shows nothing."""
+    u, v, is_in = _places(camera, image.shape[1], R_lens_from_cam)
+    around = np.concatenate([image[:, -1:], image, image[:, :1]], axis=1)
+    found = cv2.remap(around, u + np.float32(0.5), v - np.float32(0.5), cv2.INTER_LINEAR)
+    found[~is_in] = 0
+    return np.asarray(found, np.uint8)
+
+
+def cut_view(view: View, camera: Camera) -> View:
+    """A camera's view of that of the sphere; ranges of the nearest pixel, infinite where nothing is shown."""
+    width = view.depth.shape[1]
+    u, v, is_in = _places(camera, width, UPRIGHT)
+    rows = np.clip(v.astype(np.int64), 0, width // 2 - 1)
+    depth = np.where(is_in, view.depth[rows, u.astype(np.int64) % width], np.float32(np.inf))
+    return View(depth, cut(view.rgb, camera))
+
+
+def _places(
+    camera: Camera, width: int, R_lens_from_cam: Array
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Columns and rows of the sphere that pixels show (height, width), and which show any."""
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays, is_in = camera.rays(np.stack([u, v], axis=-1))
+    columns, rows = pixels_of(rays @ R_lens_from_cam, width)
+    return columns.astype(np.float32), rows.astype(np.float32), is_in
