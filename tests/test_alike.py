@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 from measuring import confidence
-from measuring.alike import ALIKE_KINDS, CHANGED, make_alike, thing_seeds
+from measuring.places import ALIKE_KINDS, CHANGED, make_alike, thing_seeds
 
 from piccolo.jobs.threads import Workers
 from piccolo.scenes.synthetic.world import World, make_query

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import rooms
-from measuring.damage import (
+from measuring.confidence import (
     MOST_RADIUS,
     occluded,
     outside_field,

@@ -82,7 +82,6 @@ def test_a_building_without_a_walk_has_single_panoramas(tmp_path, capsys):
         ("--bad-frames 0.1", "--bad-frames: goes with --walk"),
         ("--walk nan", "--walk: found nan, wanted up to 100000 m"),
         ("--walk 5 --labels", "--labels, --camera: not with --walk"),
-        ("--walk 5 --visit 2", "--visit: found room 2, wanted 0 to 1"),
         ("--walk 5 --variants tilt", "variants: found tilt, wanted clean or photo in a walk"),
         ("--walk 5 --frame-rate 0", "frame-rate: found 0.0, wanted 0.1 to 120 a second"),
         ("--walk 5 --bad-frames 2", "bad-frames: found 2.0, wanted 0 to 1"),

@@ -88,7 +88,8 @@ def size_and_opening(scan_map: ScanMap) -> tuple[str, str]:
 
 def measure(label: str, make: Callable[[], Case], results: "multiprocessing.Queue[str]") -> None:
     """Put one row of the table."""
-    (cloud, queries), workers = make(), Workers(num_cores())
+    cloud, queries = make()
+    workers = Workers(num_cores())
     every = max(1, len(cloud.points) // 20_000)
     small = Cloud(cloud.points[::every], cloud.colors[::every], cloud.origin_world)
     for gravity in GRAVITIES:  # compiles
@@ -97,19 +98,16 @@ def measure(label: str, make: Callable[[], Case], results: "multiprocessing.Queu
     before_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     begin = time.perf_counter()
     scan_map = prepare_map(cloud, workers, has_features=False)
-    columns = [
-        label,
-        str(len(cloud.points)),
-        str(len(scan_map.centers)),
-        f"{time.perf_counter() - begin:.1f}",
-    ]
+    columns = [label, str(len(cloud.points)), str(len(scan_map.centers))]
+    columns.append(f"{time.perf_counter() - begin:.1f}")
     columns += size_and_opening(scan_map)
     begin = time.perf_counter()
     scan_map.features_now(workers)
     columns.append(f"{time.perf_counter() - begin:.1f}")
     for gravity in GRAVITIES:
         settings = CoarseToFineSettings(gravity=gravity)
-        times, correct = [], 0
+        times = []
+        correct = 0
         for panorama, truth in queries:
             begin = time.perf_counter()
             found = localize(scan_map, panorama, settings, workers, Stopwatch())
