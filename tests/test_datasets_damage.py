@@ -53,7 +53,7 @@ FILES = {
 def read_poses(name, folder):
     options = ConvertOptions(folder, axes="optical" if name == "generic tum" else None)
     listed = DATASETS[name.split()[0]].list_scenes(options)
-    return [panorama.pose for spec in listed.specs for panorama in spec.read_panoramas()]
+    return [panorama.pose for spec in listed.specs for panorama in spec.panoramas]
 
 
 @pytest.fixture(scope="module", params=FILES)
