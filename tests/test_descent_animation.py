@@ -25,7 +25,7 @@ def points():
 def test_a_descent_with_history_is_the_descent(points, solver):
     query = rooms.query(SEED, "tilt")
     texels, goal = pack_texels(query.rgb), rooms.local(SEED, query.pose)
-    start = perturb_pose(goal, 0.15, 4.0, seed=1)
+    start = perturb_pose(goal, 0.15, 4.0)
     assert pose_errors(start, goal) == pytest.approx((0.15, np.radians(4.0)))
     how = DescentSettings(solver=solver, num_iterations=40, step_size=0.02)
     refined, history = refine_with_history(points, texels, start, how)
@@ -50,7 +50,4 @@ def test_animations_read_back(tmp_path):
         assert len(read) >= len(FRAMES)
         assert abs(read[0][13, 15, ::-1].astype(int) - FRAMES[0][13, 15]).max() < 12
         assert abs(read[-1][13, 15, ::-1].astype(int) - FRAMES[-1][13, 15]).max() < 12
-    write_animation(tmp_path / "frames", FRAMES, "")
-    names = [f"{k:04d}.png" for k in range(4)]
-    assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == names
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.gif", "a.mp4", "frames"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.gif", "a.mp4"]

@@ -13,6 +13,7 @@ from piccolo.cli import prepare_map, render_pose
 from piccolo.geometry.pose import T_world_from_cam
 from piccolo.geometry.rotations import heading_pitch_roll_deg
 from piccolo.optimize import descent_animation as animation
+from piccolo.optimize.settings import DescentSettings
 from piccolo.scenes.scene import read_scene
 
 
@@ -70,10 +71,6 @@ def test_the_same_pose_from_each_source_gives_the_same_picture(run, scene, tmp_p
         assert range_m.dtype == np.float32
         mask = cv2.imread(str(tmp_path / f"{name}_mask.png"), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(mask == 255, ~np.isfinite(range_m))
-    marked = tmp_path / "marked.png"
-    assert run(*sources["pose"], "--out", marked, "--width", 128, "--holes", "mark")[0] == 0
-    is_marked = (cv2.imread(str(marked))[..., ::-1] == render_pose.MAGENTA).all(axis=-1)
-    np.testing.assert_array_equal(is_marked, mask == 255)
 
 
 def test_depth_in_millimetres_and_a_prepared_map_in_place_of_the_cloud(run, scene, tmp_path):
@@ -93,20 +90,21 @@ def test_depth_in_millimetres_and_a_prepared_map_in_place_of_the_cloud(run, scen
 
 def test_a_descent_is_shown_with_where_it_ended(run, scene, tmp_path, monkeypatch):
     monkeypatch.setattr(animation, "MAX_FRAMES", 5)
-    pano = ["--queries", scene / "queries.json", "--pano", "clean_0.jpg", "--animate"]
-    seeded = [*pano, tmp_path / "a.gif", "--perturb", 0.1, 3, "--seed", 5, "--solver", "gauss-newton"]
-    code, (line,), err = run(*seeded)
+    monkeypatch.setattr(render_pose, "DESCENT", DescentSettings(solver="gauss-newton"))
+    arguments = [
+        "--queries",
+        scene / "queries.json",
+        "--pano",
+        "clean_0.jpg",
+        "--animate",
+        tmp_path / "a.gif",
+    ]
+    code, (line,), err = run(*arguments)
     assert (code, err) == (0, "")
-    assert line["start_distance"] == pytest.approx(0.1)
+    assert line["start_distance"] == pytest.approx(0.3)
     assert line["end_distance"] < 0.02
     assert line["frames"] == 5
-    content = (tmp_path / "a.gif").read_bytes()
-    assert run(*seeded)[1] == [line]
-    assert (tmp_path / "a.gif").read_bytes() == content
-    center = read_scene(scene).by_name["clean_0.jpg"].pose.center_world + np.array([0.1, 0.0, 0.0])
-    code, (line,), _ = run(*pano, tmp_path / "frames", "--start", *center, "--solver", "lbfgs")
-    assert (code, line["start_distance"]) == (0, pytest.approx(0.1))
-    assert len(list((tmp_path / "frames").iterdir())) == 5
+    assert (tmp_path / "a.gif").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(
@@ -118,9 +116,8 @@ def test_a_descent_is_shown_with_where_it_ended(run, scene, tmp_path, monkeypatc
         (["--at", 0, 0, 1, "--out", "a.png", "--depth", "a.exr"], "--depth a.exr: wanted"),
         (["--at", 0, 0, 1, "--out", "a", "--depth", "a.png"], "work with a single picture only"),
         (["--at", 0, 0, "nan", "--out", "a.png"], "must be finite"),
-        (["--at", 0, 0, 1, "--animate", "a.gif"], "--animate: no panorama"),
+        (["--at", 0, 0, 1, "--animate", "a.gif"], "--animate: only with --result or --queries"),
         (["--pose", "T.txt", "--heading", 3, "--out", "a.png"], "only with --at"),
-        (["--at", 0, 0, 1, "--out", "a.png", "--seed", -1], "--seed: found -1"),
         (["--at", 0, 0, 1, "--out", "a.png", "--scale", 0], "--scale: found 0"),
     ],
 )
@@ -141,7 +138,6 @@ def test_bad_input_leaves_nothing(run, scene, tmp_path):
         (["--pose", tmp_path / "T.txt", "--out", tmp_path / "a.png"], "wanted the 4 x 4 numbers"),
         (["--pose", tmp_path / "no.txt", "--out", tmp_path / "a.png"], "no.txt"),
         (["--at", 0, 0, 1e30, "--out", tmp_path / "a.png"], "found a camera at [0.0, 0.0, 1e+30]"),
-        (["--at", 0, 0, 1, "--photo", tmp_path / "no.jpg", "--animate", tmp_path / "a.gif"], "no.jpg"),
     ):
         code, lines, err = run(*arguments)
         assert (code, lines) == (3, []), arguments

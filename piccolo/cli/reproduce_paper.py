@@ -21,9 +21,8 @@ from ..scenes.evaluation.runner import input_files, open_run
 from ..scenes.reproduce_paper.experiments import EXPERIMENTS, Condition, Settings, plot_png, table
 from ..scenes.scene import Scene, find_scenes
 from .command import check_least, command, option
-from .errors import EXIT_BAD_INPUT, checking_options, print_error
+from .errors import EXIT_BAD_INPUT, print_error
 from .evaluating import resumed
-from .options import PAPER_OPTIONS, add_options, paper_settings_from
 from .outputs import check_distinct, check_folder_name
 
 _EXPERIMENTS = "\n".join(f"  {name:<15} {experiment.title}" for name, experiment in EXPERIMENTS.items())
@@ -38,7 +37,10 @@ experiments:
 Writes OUT/NAME.md, OUT/NAME.png and OUT/NAME/CONDITION_PRESET.jsonl, runs that tools/evaluate.py compares.
 The same command resumes an experiment that was stopped. Changed clouds and images are temporary.
 """
-PRESETS = ("paper", "default")
+PRESETS: dict[str, Settings] = {
+    "paper": PaperSettings(),
+    "default": CoarseToFineSettings(gravity="known"),
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,10 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--scenes FOLDER ...", required=True)
     option(parser, "--out FOLDER", "made if it is not there", required=True)
     option(parser, "--variants NAME ...", "only these splits", default=[])
-    option(parser, "--presets", nargs="+", choices=PRESETS, default=PRESETS)
+    option(parser, "--presets", nargs="+", choices=PRESETS, default=list(PRESETS))
     option(parser, "--jobs N", "processes", default=1)
-    group = parser.add_argument_group("preset paper, where the experiment does not vary it")
-    add_options(group, PAPER_OPTIONS, PaperSettings())
 
 
 def file_name(condition: Condition) -> str:
@@ -128,10 +128,7 @@ def main(arguments: argparse.Namespace) -> int:
     """Run the experiments one by one; returns the exit code."""
     check_least(arguments, jobs=1)
     check_folder_name("--out", arguments.out)
-    with checking_options():
-        paper = paper_settings_from(arguments)
-    settings: dict[str, Settings] = {"paper": paper, "default": CoarseToFineSettings(gravity="known")}
-    presets = [settings[name] for name in arguments.presets]
+    presets = [PRESETS[name] for name in arguments.presets]
     scenes = find_scenes(arguments.scenes)
     failed = [run_experiment(name, scenes, presets, arguments) for name in arguments.names]
     return EXIT_BAD_INPUT if any(failed) else 0

@@ -13,14 +13,13 @@ from PIL import Image
 
 from ..cloud.soa import PackedPoints
 from ..errors import InputError
-from ..files.atomic import replacing_folder, write_atomically
+from ..files.atomic import write_atomically
 from ..geometry.pose import Pose, step
 from ..jobs.threads import Workers
 from ..panorama import Panorama
 from ..panorama.texels import Texels
 from ..views.surfel_renderer import (
     checkerboard,
-    encode_image,
     fill_holes,
     render_surfels,
     resized_rgb,
@@ -48,9 +47,9 @@ class Iterate(NamedTuple):
     loss: float
 
 
-def perturb_pose(pose: Pose, distance: float, angle_deg: float, seed: int) -> Pose:
+def perturb_pose(pose: Pose, distance: float, angle_deg: float) -> Pose:
     """`pose` moved by `distance` [m] and turned by `angle_deg`, each in a direction drawn at random."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     turn, move = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     return step(pose, np.concatenate([np.radians(angle_deg) * turn, distance * move]))
 
@@ -59,19 +58,19 @@ def refine_with_history(
     points: PackedPoints, texels: Texels, start: Pose, settings: DescentSettings
 ) -> tuple[Refined, list[Iterate]]:
     """The result of `refine`, and its iterates without those that a line search or the damping rejected."""
-    history: list[Iterate] = []
-    num_tried, least, last_part = 0, np.inf, -1
+    tried: list[tuple[int, Iterate]] = []
 
     def watch(part: int, pose: Pose, loss: float) -> None:
-        nonlocal num_tried, least, last_part
-        least = loss if part != last_part else min(least, loss)
-        if settings.solver == "adam" or loss == least:
-            history.append(Iterate(num_tried, pose, loss))
-        num_tried, last_part = num_tried + 1, part
+        tried.append((part, Iterate(len(tried), pose, loss)))
 
     refined = refine(points, sampling_loss_of(texels), start, settings, watch)
-    history.append(Iterate(num_tried, refined.pose, refined.loss))
-    return refined, history
+    history = []
+    least: dict[int, float] = {}  # by the descent's part
+    for part, iterate in tried:
+        if settings.solver == "adam" or iterate.loss <= least.get(part, np.inf):
+            history.append(iterate)
+        least[part] = min(iterate.loss, least.get(part, np.inf))
+    return refined, [*history, Iterate(len(tried), refined.pose, refined.loss)]
 
 
 def frames_of(
@@ -94,19 +93,16 @@ def frames_of(
 
 
 def write_animation(path: Path, frames: Frames, kind: str) -> None:
-    """Write a GIF or an MP4, by its suffix, or else PNG files into a new folder; whole or not at all."""
-    if kind in (".gif", ".mp4"):
-        held = [*frames, *[frames[-1]] * NUM_LAST]
-        file = BytesIO()
-        if kind == ".gif":
-            first, *others = map(Image.fromarray, held)
-            duration = 1000 // FRAMES_PER_S
-            first.save(file, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
-        write_atomically(path, file.getvalue() or _mp4(path, held))
+    """Write a GIF or, where `kind` is ".mp4", an MP4, whole or not at all."""
+    held = [*frames, *[frames[-1]] * NUM_LAST]
+    if kind == ".mp4":
+        write_atomically(path, _mp4(path, held))
         return
-    with replacing_folder(path) as folder:
-        for k, frame in enumerate(frames):
-            (folder / f"{k:04d}.png").write_bytes(encode_image(frame, ".png"))
+    file = BytesIO()
+    first, *others = map(Image.fromarray, held)
+    duration = 1000 // FRAMES_PER_S
+    first.save(file, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
+    write_atomically(path, file.getvalue())
 
 
 def _mp4(path: Path, frames: Frames) -> bytes:
@@ -119,5 +115,5 @@ def _mp4(path: Path, frames: Frames) -> bytes:
         writer.release()
         content = part.read_bytes() if part.exists() else b""
     if not content:
-        raise InputError(f"{path}: this OpenCV has no MP4 encoder; write a .gif or a folder instead")
+        raise InputError(f"{path}: this OpenCV has no MP4 encoder; write a .gif instead")
     return content

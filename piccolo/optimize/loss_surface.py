@@ -73,22 +73,17 @@ class LossSurface(NamedTuple):
 
 
 def loss_surface(
-    points: PackedPoints,
-    texels: Texels,
-    grid: PoseGrid,
-    max_points: int,
-    use_visibility: bool,
-    workers: Workers,
+    points: PackedPoints, texels: Texels, grid: PoseGrid, max_points: int, workers: Workers
 ) -> LossSurface:
-    """The least loss over heights and rotations at each place, from at most `max_points` a position."""
-    pool = points.subsample(POOL_PER_POINT * max_points if use_visibility else max_points)
+    """The least loss over heights and rotations at each place, from at most `max_points` seen from it."""
+    pool = points.subsample(POOL_PER_POINT * max_points)
 
     def best(cell: int) -> tuple[float, float, int, bool]:
         row, column = divmod(cell, len(grid.x))
         tried = []
         for z in grid.heights:
             center = np.array([grid.x[column], grid.y[row], z])
-            seen = visible_points(pool, center) if use_visibility else pool
+            seen = visible_points(pool, center)
             is_free = is_free_space(seen, center, FREE_SPACE_WIDTH, MIN_CLEARANCE)
             some = seen.subsample(max_points)
             losses = [sampling_loss(some, texels, Pose(R, center)) for R in grid.R_cam_from_local]
@@ -153,26 +148,4 @@ def surface_png(
     figure.colorbar(mesh, ax=axes, label="least sampling loss over height and rotation", shrink=0.8)
     file = BytesIO()
     figure.savefig(file, format="png", dpi=120)
-    return file.getvalue()
-
-
-def surface_npz(surface: LossSurface, grid: PoseGrid, cloud: LocalCloud, known: KnownPoses) -> bytes:
-    """NPZ of the surface and the known poses."""
-    shift = plan_shift(cloud)
-    positions = {f"{name}_world": np.full(3, np.nan) for name in ("found", "true")}
-    positions |= {f"{name}_world": cloud.to_world(pose).center_world for name, pose in known.items()}
-    rotations = grid.R_cam_from_local @ cloud.R_local_from_world
-    file = BytesIO()
-    np.savez_compressed(
-        file,
-        x=grid.x + shift[0],
-        y=grid.y + shift[1],
-        loss=surface.loss,
-        height=surface.height + shift[2],
-        R_cam_from_world=rotations[surface.rotation],
-        is_free=surface.is_free,
-        R_plan_from_world=cloud.R_local_from_world,
-        allow_pickle=False,
-        **positions,
-    )
     return file.getvalue()
