@@ -6,6 +6,7 @@ import resource
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -86,8 +87,8 @@ def size_and_opening(scan_map: ScanMap) -> tuple[str, str]:
         return f"{path.stat().st_size / 1e6:.1f}", f"{1000.0 * (time.perf_counter() - begin):.0f}"
 
 
-def measure(label: str, make: Callable[[], Case], results: "multiprocessing.Queue[str]") -> None:
-    """Put one row of the table."""
+def measure(label: str, make: Callable[[], Case]) -> str:
+    """One row of the table."""
     cloud, queries = make()
     workers = Workers(num_cores())
     every = max(1, len(cloud.points) // 20_000)
@@ -115,7 +116,7 @@ def measure(label: str, make: Callable[[], Case], results: "multiprocessing.Queu
             correct += is_correct(found.pose, truth)
         columns += [f"{np.median(times):.2f}", f"{correct}/{len(queries)}"]
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    results.put(f"| {' | '.join([*columns, f'{peak_mb:.0f}', f'{before_mb:.0f}'])} |")
+    return f"| {' | '.join([*columns, f'{peak_mb:.0f}', f'{before_mb:.0f}'])} |"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -133,13 +134,8 @@ def run(arguments: argparse.Namespace) -> int:
     rows += [(f"{n} rooms", partial(rooms_case, n)) for n in arguments.rooms]
     print(f"| {' | '.join(COLUMNS)} |")
     print("|---" + "|---:" * (len(COLUMNS) - 1) + "|")
-    context = multiprocessing.get_context("spawn")
-    for label, make in rows:
-        results: multiprocessing.Queue[str] = context.Queue()
-        process = context.Process(target=measure, args=(label, make, results))
-        process.start()
-        process.join()
-        if process.exitcode != 0:
-            raise ChildProcessError(f"{label}: failed, see above")
-        print(results.get(), flush=True)
+    spawned = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=spawned, max_tasks_per_child=1) as processes:
+        for label, make in rows:
+            print(processes.submit(measure, label, make).result(), flush=True)
     return 0
