@@ -88,7 +88,8 @@ def with_pose(path: Path, data: bytes, angles_deg: tuple[float, float, float]) -
         first = takewhile(lambda pair: pair[0].marker == APP0 or pair[1].startswith(EXIF_MARK), pairs)
         place = max((segment.end for segment, _ in first), default=len(JPEG_MAGIC))
         edits = [(place, place, _segment(path, _with_fields(path, EMPTY_PACKET, angles_deg, size)))]
-    pieces, begin = [], 0
+    pieces = []
+    begin = 0
     for edit_begin, edit_end, new in edits:
         pieces += [data[begin:edit_begin], new]
         begin = edit_end
