@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import poses
@@ -103,8 +104,12 @@ def test_a_descent_is_shown_with_where_it_ended(run, scene, tmp_path, monkeypatc
     assert (code, err) == (0, "")
     assert line["start_distance"] == pytest.approx(0.3)
     assert line["end_distance"] < 0.02
-    assert line["frames"] == 5
+    assert line["frames"] == 5 + animation.NUM_LAST
     assert (tmp_path / "a.gif").stat().st_size > 10_000
+    assert run(*pano, "--animate", tmp_path / "a.mp4")[0] == 0
+    with av.open(tmp_path / "a.mp4") as video:
+        shown = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+    assert (len(shown), shown[0].shape[1]) == (line["frames"], animation.FRAME_WIDTH)
 
 
 @pytest.mark.parametrize(

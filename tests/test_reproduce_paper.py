@@ -123,7 +123,7 @@ def _command(names, scenes, out, *more):
     return reproduce_paper.main([*names.split(), "--scenes", str(scenes), "--out", str(out), *words])
 
 
-def test_the_tool_writes_table_plot_and_runs_and_resumes_them(rooms, tmp_path, capsys):
+def test_the_tool_writes_table_and_runs_and_resumes_them(rooms, tmp_path, capsys):
     out = tmp_path / "out"
     assert _command("labels variants", rooms, out, "--variants", "clean") == 0
     text = capsys.readouterr().out
@@ -131,7 +131,6 @@ def test_the_tool_writes_table_plot_and_runs_and_resumes_them(rooms, tmp_path, c
     assert "| labels | paper | 2 |" in text
     assert "| clean | paper | 2 |" in text
     assert "| tilt |" not in text
-    assert (out / "labels.png").read_bytes()[1:4] == b"PNG"
     rows = read_run(out / "labels" / "labels_paper.jsonl")[0]
     assert [row.scene for row in rows] == ["000", "001"]
     assert rows[0].result.pano.endswith("labels/clean_0.png")

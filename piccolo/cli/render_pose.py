@@ -20,17 +20,20 @@ from ..geometry.rotations import R_cam_from_angles
 from ..jobs.threads import Workers, num_cores
 from ..optimize.descent_animation import (
     FRAME_WIDTH,
+    FRAMES_PER_S,
     frames_of,
+    gif_of,
     perturb_pose,
     refine_with_history,
-    write_animation,
 )
 from ..optimize.settings import DescentSettings
+from ..optional import import_optional
 from ..panorama import read_panorama
 from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
 from ..result import read_results
 from ..scan_map.open_map import open_points
+from ..scenes.export.video import writing_video
 from ..scenes.scene import read_scene
 from ..views.field import cut_view, sphere_width_for
 from ..views.surfel_renderer import encode_image, fill_holes, render_points
@@ -52,7 +55,8 @@ millimetres, 0 where nothing is seen, 65535 for 65.535 m and farther. NPY: float
 is seen. --mask-out: white where nothing is seen, as --mask of localize.py takes it.
 An output - is stdout: PNG, of --animate GIF. One JSON object a picture on stdout, or stderr if that is taken.
 """
-MAX_WIDTH, MIN_WIDTH = 32_768, 16
+MAX_WIDTH = 32_768
+MIN_WIDTH = 16
 DESCENT_WIDTH = 1024  # of the panorama
 DESCENT = DescentSettings(solver="adam")
 START_DISTANCE = 0.3  # of a descent from the pose [m]
@@ -92,7 +96,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(group, "--camera FILE", text)
     option(group, "--depth FILE", ".png or .npy, see below")
     option(group, "--mask-out PNG", "where nothing is seen")
-    text = ".gif or .mp4: the descent on the sampling loss of a panorama, from a start near its pose"
+    text = ".gif or .mp4 (extra video): the descent on a panorama's sampling loss from near its pose"
     option(group, "--animate FILE", text)
 
 
@@ -112,6 +116,8 @@ def check_usage(arguments: argparse.Namespace) -> None:
         raise InputError("--heading, --pitch, --roll: only with --at")
     if arguments.animate and not (arguments.result or arguments.queries):
         raise InputError("--animate: only with --result or --queries, which name a panorama")
+    if arguments.animate and arguments.animate.suffix.lower() == ".mp4":
+        import_optional("--animate", "av", "video")
     if not np.isfinite([*(arguments.at or ()), *(angle or 0.0 for angle in angles)]).all():
         raise InputError("--at and angles must be finite numbers")
 
@@ -233,7 +239,13 @@ def animate(arguments: argparse.Namespace, cloud: LocalCloud, poses: list[Shot],
     texels = pack_texels(panorama.rgb, panorama.is_valid)
     refined, history = refine_with_history(cloud.points, texels, start, DESCENT)
     frames = frames_of(cloud.points, panorama, history, FRAME_WIDTH, workers)
-    write_animation(arguments.animate, frames, suffix_of(arguments, "animate"))
+    if suffix_of(arguments, "animate") == ".gif":
+        write_atomically(arguments.animate, gif_of(frames))
+    else:
+        height, width = frames[0].shape[:2]
+        with writing_video(arguments.animate, FRAMES_PER_S, (width, height)) as add:
+            for frame in frames:
+                add(frame)
     line: dict[str, object] = {"out": str(arguments.animate), "pano": name, "frames": len(frames)}
     for label, at in (("start", start), ("end", refined.pose)):
         distance, angle = pose_errors(at, goal)

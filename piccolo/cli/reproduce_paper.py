@@ -1,4 +1,4 @@
-"""The paper's experiments on scenes with true poses: a table beside the paper's figures, and a plot."""
+"""The paper's experiments on scenes with true poses: a table beside the paper's figures."""
 
 import argparse
 import tempfile
@@ -18,7 +18,7 @@ from ..paper.settings import PaperSettings
 from ..scan_map.open_map import CachePolicy
 from ..scenes.evaluation.query_result import QueryResult
 from ..scenes.evaluation.runner import input_files, open_run
-from ..scenes.reproduce_paper.experiments import EXPERIMENTS, Condition, Settings, plot_png, table
+from ..scenes.reproduce_paper.experiments import EXPERIMENTS, Condition, Settings, table
 from ..scenes.scene import Scene, find_scenes
 from .command import check_least, command, option
 from .errors import EXIT_BAD_INPUT, print_error
@@ -34,7 +34,7 @@ examples:
 experiments:
 {_EXPERIMENTS}
 
-Writes OUT/NAME.md, OUT/NAME.png and OUT/NAME/CONDITION_PRESET.jsonl, runs that tools/evaluate.py compares.
+Writes OUT/NAME.md and OUT/NAME/CONDITION_PRESET.jsonl, runs that tools/evaluate.py compares.
 The same command resumes an experiment that was stopped. Changed clouds and images are temporary.
 """
 PRESETS: dict[str, Settings] = {
@@ -63,7 +63,8 @@ def transformed_scenes(
     condition: Condition, scenes: Sequence[Scene], root: Path, report: Callable[[str], object]
 ) -> tuple[list[Scene], int]:
     """The scenes under a condition, and the number of queries of those that can't be so."""
-    transformed, num_failed = [], 0
+    transformed = []
+    num_failed = 0
     for number, scene in enumerate(scenes):
         folder = root / str(number)
         folder.mkdir()
@@ -96,16 +97,18 @@ def run_condition(
 def run_experiment(
     name: str, scenes: Sequence[Scene], presets: Sequence[Settings], arguments: argparse.Namespace
 ) -> int:
-    """All conditions of an experiment, its table and plot; returns how many queries were not localized."""
+    """All conditions of an experiment and its table; returns how many queries were not localized."""
     experiment = EXPERIMENTS[name]
     folder: Path = arguments.out / name
     variants = sorted({query.variant for scene in scenes for query in scene.queries})
     variants = [variant for variant in variants if not arguments.variants or variant in arguments.variants]
-    num_failed, found = 0, []
+    num_failed = 0
+    found = []
     conditions = experiment.conditions_of(presets, variants)
     files = [folder / file_name(condition) for condition in conditions]
-    files += [folder.with_name(f"{name}{suffix}") for suffix in (".md", ".png")]
-    check_distinct({file.name: file for file in files}, input_files(scenes))
+    check_distinct(
+        {file.name: file for file in (*files, folder.with_name(f"{name}.md"))}, input_files(scenes)
+    )
     folder.mkdir(parents=True, exist_ok=True)
     for condition in conditions:
         rows, num_failed_here = run_condition(condition, scenes, folder, arguments)
@@ -119,7 +122,6 @@ def run_experiment(
     text = table(title, found).markdown()
     print(text, flush=True)
     write_atomically(arguments.out / f"{name}.md", text.encode())
-    write_atomically(arguments.out / f"{name}.png", plot_png(experiment.title, found))
     return num_failed
 
 

@@ -1,19 +1,15 @@
 """A descent as an animation: panorama, cloud at each pose on the way, checkerboard of both."""
 
-import tempfile
 from collections.abc import Sequence
 from io import BytesIO
-from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image as pillow
 
 from ..cloud.soa import PackedPoints
-from ..errors import InputError
-from ..files.atomic import write_atomically
 from ..geometry.pose import Pose, step
 from ..jobs.threads import Workers
 from ..panorama import Panorama
@@ -36,7 +32,7 @@ MAX_FRAMES = 60  # of more poses, this many are drawn, evenly spaced
 FRAMES_PER_S = 8
 NUM_LAST = 12  # times that the last frame is repeated
 
-Frames = Sequence[NDArray[np.uint8]]  # (H, W, 3) RGB each, all of one size
+Image = NDArray[np.uint8]  # (H, W, 3) RGB
 
 
 class Iterate(NamedTuple):
@@ -75,45 +71,28 @@ def refine_with_history(
 
 def frames_of(
     points: PackedPoints, panorama: Panorama, history: Sequence[Iterate], width: int, workers: Workers
-) -> list[NDArray[np.uint8]]:
-    """One image (H, W, 3) for each pose, with iteration and loss written on top."""
+) -> list[Image]:
+    """One image for each pose, with iteration and loss written on top; the last one stays for a while."""
     ends = [visible_indices(points, p.pose.center_world) for p in (history[0], history[-1])]
     surfels = surfels_of(points.take(np.union1d(*ends)).subsample(MAX_SURFELS), workers)
     photo = resized_rgb(panorama, width)
     chosen = np.unique(np.linspace(0, len(history) - 1, min(MAX_FRAMES, len(history))).astype(int))
 
-    def frame(k: int) -> NDArray[np.uint8]:
+    def frame(k: int) -> Image:
         view = render_surfels(surfels, history[k].pose, width, Workers(1))
         bar = np.zeros((TEXT_HEIGHT, width, 3), np.uint8)
         text = f"iteration {history[k].iteration}   loss {history[k].loss:.4f}"
         cv2.putText(bar, text, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
         return np.concatenate([bar, checkerboard(photo, fill_holes(view.rgb, view.is_seen))])
 
-    return list(workers.map(frame, chosen.tolist(), "frames"))
+    frames = list(workers.map(frame, chosen.tolist(), "frames"))
+    return [*frames, *[frames[-1]] * NUM_LAST]
 
 
-def write_animation(path: Path, frames: Frames, kind: str) -> None:
-    """Write a GIF or, where `kind` is ".mp4", an MP4, whole or not at all."""
-    held = [*frames, *[frames[-1]] * NUM_LAST]
-    if kind == ".mp4":
-        write_atomically(path, _mp4(path, held))
-        return
+def gif_of(frames: Sequence[Image]) -> bytes:
+    """An animated GIF of frames."""
     file = BytesIO()
-    first, *others = map(Image.fromarray, held)
+    first, *others = map(pillow.fromarray, frames)
     duration = 1000 // FRAMES_PER_S
     first.save(file, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
-    write_atomically(path, file.getvalue())
-
-
-def _mp4(path: Path, frames: Frames) -> bytes:
-    height, width = (size // 2 * 2 for size in frames[0].shape[:2])  # the codec takes even sizes only
-    with tempfile.TemporaryDirectory() as folder:
-        part = Path(folder) / "part.mp4"
-        writer = cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*"mp4v"), FRAMES_PER_S, (width, height))
-        for frame in frames:
-            writer.write(cv2.cvtColor(frame[:height, :width], cv2.COLOR_RGB2BGR))
-        writer.release()
-        content = part.read_bytes() if part.exists() else b""
-    if not content:
-        raise InputError(f"{path}: this OpenCV has no MP4 encoder; write a .gif instead")
-    return content
+    return file.getvalue()

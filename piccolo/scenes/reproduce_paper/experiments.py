@@ -1,4 +1,4 @@
-"""The experiments: the conditions that each compares, what the paper found there, table and picture.
+"""The experiments: the conditions that each compares, what the paper found there, and the table.
 
 The paper's figures are of its own data (Stanford2D-3D-S, OmniScenes, MPO) on an RTX 2080 (Kim et al., ICCV
 2021): they say what to expect of a trend, and compare in full only on the same data.
@@ -10,10 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...files.figure import new_figure
 from ...localization.settings import CoarseToFineSettings
 from ...paper.settings import PaperSettings
-from ..evaluation.plots import figure_png
 from ..evaluation.query_result import QueryResult
 from ..evaluation.tables import Table, summarize
 from .transforms import SceneTransform, flipped, identity, with_count, with_fraction, with_random_rotation
@@ -169,29 +167,3 @@ def _median_of_correct(rows: Sequence[QueryResult]) -> float:
     """Median position error [m] of the correct poses, NaN if there are none."""
     errors = [row.position_error for row in rows if row.is_correct()]
     return float(np.median(errors)) if errors else float("nan")
-
-
-def plot_png(title: str, found: Sequence[tuple[Condition, Sequence[QueryResult]]]) -> bytes:
-    """Accuracy, median error of the correct poses and seconds over the conditions, a line a preset."""
-    names = list(dict.fromkeys(condition.name for condition, _ in found))
-    figure = new_figure(figsize=(13, 4.4), layout="constrained")
-    figure.suptitle(title)
-    panels = figure.subplots(1, 3)
-    for preset in dict.fromkeys(condition.preset for condition, _ in found):
-        own = [(names.index(condition.name), rows) for condition, rows in found if condition.preset == preset]
-        summaries = [summarize(rows) for _, rows in own]
-        values = (
-            [100.0 * summary.accuracy for summary in summaries],
-            [1000.0 * _median_of_correct(rows) for _, rows in own],
-            [summary.seconds for summary in summaries],
-        )
-        for axes, some in zip(panels, values, strict=True):
-            axes.plot([place for place, _ in own], some, "o-", label=preset)
-    for axes, label in zip(panels, ("correct [%]", "median error of correct [mm]", "seconds"), strict=True):
-        axes.set_xticks(range(len(names)), names, rotation=30, ha="right")
-        axes.set_ylabel(label)
-        axes.grid(alpha=0.3)
-        axes.legend()
-    panels[0].set_ylim(0, 103)
-    panels[2].set_ylim(bottom=0)
-    return figure_png(figure)
