@@ -92,15 +92,8 @@ def test_depth_in_millimetres_and_a_prepared_map_in_place_of_the_cloud(run, scen
 def test_a_descent_is_shown_with_where_it_ended(run, scene, tmp_path, monkeypatch):
     monkeypatch.setattr(animation, "MAX_FRAMES", 5)
     monkeypatch.setattr(render_pose, "DESCENT", DescentSettings(solver="gauss-newton"))
-    arguments = [
-        "--queries",
-        scene / "queries.json",
-        "--pano",
-        "clean_0.jpg",
-        "--animate",
-        tmp_path / "a.gif",
-    ]
-    code, (line,), err = run(*arguments)
+    pano = ["--queries", scene / "queries.json", "--pano", "clean_0.jpg"]
+    code, (line,), err = run(*pano, "--animate", tmp_path / "a.gif")
     assert (code, err) == (0, "")
     assert line["start_distance"] == pytest.approx(0.3)
     assert line["end_distance"] < 0.02

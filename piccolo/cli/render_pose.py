@@ -111,6 +111,11 @@ def check_usage(arguments: argparse.Namespace) -> None:
         raise InputError(f"--width {arguments.width}: wanted an even number, {MIN_WIDTH} to {MAX_WIDTH}")
     for name, path in outputs_of(arguments).items():
         check_suffix(name, path, SUFFIXES[name.removeprefix("--").replace("-", "_")])
+    check_pose_options(arguments)
+
+
+def check_pose_options(arguments: argparse.Namespace) -> None:
+    """Refuse options that do not go with where the pose is from."""
     angles = [arguments.heading, arguments.pitch, arguments.roll]
     if not arguments.at and any(angle is not None for angle in angles):
         raise InputError("--heading, --pitch, --roll: only with --at")

@@ -106,9 +106,8 @@ def run_experiment(
     found = []
     conditions = experiment.conditions_of(presets, variants)
     files = [folder / file_name(condition) for condition in conditions]
-    check_distinct(
-        {file.name: file for file in (*files, folder.with_name(f"{name}.md"))}, input_files(scenes)
-    )
+    files.append(arguments.out / f"{name}.md")
+    check_distinct({file.name: file for file in files}, input_files(scenes))
     folder.mkdir(parents=True, exist_ok=True)
     for condition in conditions:
         rows, num_failed_here = run_condition(condition, scenes, folder, arguments)

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import PIL.Image
 from numpy.typing import NDArray
-from PIL import Image as pillow
 
 from ..cloud.soa import PackedPoints
 from ..geometry.pose import Pose, step
@@ -92,7 +92,7 @@ def frames_of(
 def gif_of(frames: Sequence[Image]) -> bytes:
     """An animated GIF of frames."""
     file = BytesIO()
-    first, *others = map(pillow.fromarray, frames)
+    first, *others = map(PIL.Image.fromarray, frames)
     duration = 1000 // FRAMES_PER_S
     first.save(file, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
     return file.getvalue()
