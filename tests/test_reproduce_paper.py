@@ -19,8 +19,8 @@ from piccolo.panorama import read_panorama
 from piccolo.panorama.texels import pack_texels
 from piccolo.paper.settings import PaperSettings
 from piccolo.scenes.evaluation.runner import read_run
-from piccolo.scenes.reproduce_paper.experiments import EXPERIMENTS
-from piccolo.scenes.reproduce_paper.transforms import (
+from piccolo.scenes.reproduce_paper import (
+    EXPERIMENTS,
     flipped,
     identity,
     with_count,

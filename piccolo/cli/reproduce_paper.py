@@ -18,7 +18,7 @@ from ..paper.settings import PaperSettings
 from ..scan_map.open_map import CachePolicy
 from ..scenes.evaluation.query_result import QueryResult
 from ..scenes.evaluation.runner import input_files, open_run
-from ..scenes.reproduce_paper.experiments import EXPERIMENTS, Condition, Settings, table
+from ..scenes.reproduce_paper import EXPERIMENTS, Condition, Settings, table
 from ..scenes.scene import Scene, find_scenes
 from .command import check_least, command, option
 from .errors import EXIT_BAD_INPUT, print_error
