@@ -62,7 +62,7 @@ def test_rays_meet_what_is_nearest_among_hundreds_of_boxes():
             assert (labels > 0).all()
 
 
-@pytest.mark.parametrize("width_deg", [0.5, 20.0, 80.0, 100.0, 179.0])
+@pytest.mark.parametrize("width_deg", [0.5, 80.0, 179.0])
 def test_boxes_outside_a_cone_are_left_out_and_others_have_their_distance(width_deg):
     room = office().world.rooms[0]
     rng = np.random.default_rng(1)
@@ -166,13 +166,13 @@ def test_frames_show_the_scan_at_their_poses():
 
 
 def test_frames_are_the_same_at_any_number_of_threads_and_people_hide_a_part():
-    options = WalkOptions(0.2, "photo", 3, True, 0.3, 128)
+    options = WalkOptions(0.1, "photo", 3, True, 0.3, 128)
     one, two = (list(frames_of(office(), walk(), options, 0, Workers(n))) for n in (1, 2))
     for a, b in zip(one, two, strict=True):
         np.testing.assert_array_equal(a.rgb, b.rgb)
         np.testing.assert_array_equal(a.pose.center_world, b.pose.center_world)
         assert a.kind == b.kind
-    alone, among = frames(rate=0.2), frames(rate=0.2, num_people=6)
+    alone, among = frames(rate=0.1), frames(rate=0.1, num_people=6)
     hidden = [(a.rgb != b.rgb).any(axis=2).mean() for a, b in zip(alone, among, strict=True)]
     assert max(hidden) > 0.01
     assert max(hidden) < 0.5
@@ -192,7 +192,7 @@ def test_blur_is_the_mean_over_the_shutter():
 
 
 def test_bad_frames_are_black_mirrored_or_of_elsewhere():
-    good, some = frames(rate=0.4), frames(rate=0.4, bad_fraction=0.5)
+    good, some = frames(rate=0.2), frames(rate=0.2, bad_fraction=0.5)
     kinds = [frame.kind for frame in some]
     assert sum(kind in BAD_KINDS for kind in kinds) == round(0.5 * len(kinds))
     assert {*kinds} == {"clean", *BAD_KINDS}
