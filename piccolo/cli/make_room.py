@@ -128,22 +128,12 @@ def check_walk(arguments: argparse.Namespace) -> None:
 
 def walk_options(arguments: argparse.Namespace, variant: str) -> WalkOptions:
     """The options of walks of a variant."""
-    return WalkOptions(
-        arguments.frame_rate,
-        variant,
-        arguments.people,
-        arguments.blur,
-        arguments.bad_frames,
-        arguments.width,
-    )
+    a = arguments
+    return WalkOptions(a.frame_rate, variant, a.people, a.blur, a.bad_frames, a.width)
 
 
 def write_photos(
-    arguments: argparse.Namespace,
-    world: World,
-    folder: Path,
-    cameras: Calibration | None,
-    workers: Workers,
+    arguments: argparse.Namespace, world: World, folder: Path, cameras: Calibration | None, workers: Workers
 ) -> list[scenes.Query]:
     """Write single photos, of each variant as many; those of a rig are a folder."""
     queries = []
