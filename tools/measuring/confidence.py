@@ -24,9 +24,6 @@ from piccolo.jobs.threads import Workers, num_cores
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.opening import scan_of
 from piccolo.panorama import AS_STORED, read_panorama
-from piccolo.paper.settings import PaperSettings
-from piccolo.query_options import Settings
-from piccolo.result import Result
 from piccolo.scenes.scene import Scene, read_scene
 from piccolo.scenes.synthetic.room import PLAIN
 from piccolo.scenes.synthetic.world import VARIANTS, World, blur, make_query, make_world, scan_world
@@ -250,47 +247,36 @@ def all_trials(arguments: argparse.Namespace, workers: Workers) -> Iterator[tupl
             yield scene.name, points, trials
 
 
-def settings_of(preset: str, gravity: Gravity) -> Settings:
-    """The settings of a trial; the paper's method takes `auto` as `known`."""
-    if preset == "paper":
-        return PaperSettings(gravity="known" if gravity == "auto" else gravity)
-    return CoarseToFineSettings(gravity=gravity)
-
-
-def results_of(arguments: argparse.Namespace) -> Iterator[tuple[str, Trial, Result]]:
-    """Localize every trial; the scene's name, the trial and its result."""
-    workers = Workers(arguments.threads)
-    for name, (points, colors), trials in all_trials(arguments, workers):
-        cloud = stream_of(Path("trial"), RawCloud(points.astype(np.float64), colors))
-        settings = settings_of(arguments.preset, "auto")
-        scan = scan_of(cloud, name, IN_METRES, settings, workers, Stopwatch())
-        for trial in trials:
-            settings = settings_of(arguments.preset, trial.gravity)
-            yield name, trial, scan.localize_query(trial.rgb, AS_STORED, settings, trial.is_masked)
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
     option(parser, "--seeds FIRST END", required=True)
     option(parser, "--kinds KIND ...", "alike places", choices=ALIKE_KINDS, default=list(ALIKE_KINDS))
     option(parser, "--scenes FOLDER ...", default=[])
     option(parser, "--out FILE", "JSON lines, written as they come", required=True)
-    option(parser, "--preset", choices=["default", "paper"], default="default")
     option(parser, "--threads N", default=num_cores())
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Localize every trial, write its line, print the table."""
+    workers = Workers(arguments.threads)
     rows: list[Case] = []
     with arguments.out.open("w") as file:
-        for scene, trial, result in results_of(arguments):
-            pose = trial.true_pose
-            names = ("R_cam_from_world", "center_world")
-            ok = pose is not None and is_correct(result.best_pose, pose)
-            rows.append((trial.case, result.status, ok))
-            truth = pose and {name: getattr(pose, name).tolist() for name in names}
-            line = {"case": trial.case, "scene": scene, "truth": truth}
-            file.write(json.dumps(line | {"result": json.loads(result.to_json())}) + "\n")
-            file.flush()
-            print_note(arguments, f"{scene}: {trial.case}: {result.status}, {'right' if ok else 'wrong'}")
+        for scene, (points, colors), trials in all_trials(arguments, workers):
+            cloud = stream_of(Path("trial"), RawCloud(points.astype(np.float64), colors))
+            scan = scan_of(cloud, scene, IN_METRES, CoarseToFineSettings(), workers, Stopwatch())
+            for trial in trials:
+                settings = CoarseToFineSettings(gravity=trial.gravity)
+                result = scan.localize_query(trial.rgb, AS_STORED, settings, trial.is_masked)
+                truth = trial.true_pose
+                ok = truth is not None and is_correct(result.best_pose, truth)
+                rows.append((trial.case, result.status, ok))
+                line = {"case": trial.case, "scene": scene, "truth": truth and as_json(truth)}
+                file.write(json.dumps(line | {"result": json.loads(result.to_json())}) + "\n")
+                file.flush()
+                print_note(arguments, f"{scene}: {trial.case}: {result.status}, {'right' if ok else 'wrong'}")
     return 1 if print_cases("case", rows) else 0
+
+
+def as_json(pose: Pose) -> dict[str, object]:
+    """A pose as calibration reads it."""
+    return {name: getattr(pose, name).tolist() for name in ("R_cam_from_world", "center_world")}
