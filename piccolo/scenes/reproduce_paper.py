@@ -238,16 +238,18 @@ def table(title: str, found: Sequence[tuple[Condition, Sequence[QueryResult]]]) 
 
 def _cells(condition: Condition, rows: Sequence[QueryResult]) -> tuple[str, ...]:
     summary = summarize(rows)
-    errors = f"{summary.position_quartiles[1]:.4f}", f"{_median_of_correct(rows):.4f}"
-    angle = f"{np.degrees(summary.rotation_quartiles[1]):.3f}"
+    of_correct = [row.position_error for row in rows if row.is_correct()] or [np.nan]
     stages = [[row.result.seconds.get(stage, 0.0) for row in rows] for stage in ("search", "refine")]
-    seconds = [f"{np.median(stage):.2f}" for stage in stages]
-    counts = f"{summary.num_queries}", f"{summary.accuracy:.3f}"
-    verdicts = f"{summary.num_localized}", f"{summary.num_wrong}"
-    return (condition.name, condition.preset, *counts, *errors, angle, *seconds, *verdicts, condition.paper)
-
-
-def _median_of_correct(rows: Sequence[QueryResult]) -> float:
-    """Median position error [m] of the correct poses, NaN if there are none."""
-    errors = [row.position_error for row in rows if row.is_correct()]
-    return float(np.median(errors)) if errors else float("nan")
+    return (
+        condition.name,
+        condition.preset,
+        f"{summary.num_queries}",
+        f"{summary.accuracy:.3f}",
+        f"{summary.position_quartiles[1]:.4f}",
+        f"{np.median(of_correct):.4f}",
+        f"{np.degrees(summary.rotation_quartiles[1]):.3f}",
+        *(f"{np.median(stage):.2f}" for stage in stages),
+        f"{summary.num_localized}",
+        f"{summary.num_wrong}",
+        condition.paper,
+    )

@@ -51,6 +51,7 @@ FLATTENED = 0.4  # elevations of occluders: people and things stand around the c
 LIGHT_SCALE = 0.08  # of the width: patches of light and shade
 FIELDS = (120.0, 90.0, 65.0)  # of narrow photos [deg]
 ASPECT = 0.75  # height by width of a narrow photo
+POSE = ("R_cam_from_world", "center_world")
 Image = NDArray[np.uint8]
 Points = tuple[NDArray[np.floating], NDArray[np.uint8]]
 
@@ -270,13 +271,12 @@ def run(arguments: argparse.Namespace) -> int:
                 truth = trial.true_pose
                 ok = truth is not None and is_correct(result.best_pose, truth)
                 rows.append((trial.case, result.status, ok))
-                line = {"case": trial.case, "scene": scene, "truth": truth and as_json(truth)}
+                line = {
+                    "case": trial.case,
+                    "scene": scene,
+                    "truth": truth and {name: getattr(truth, name).tolist() for name in POSE},
+                }
                 file.write(json.dumps(line | {"result": json.loads(result.to_json())}) + "\n")
                 file.flush()
                 print_note(arguments, f"{scene}: {trial.case}: {result.status}, {'right' if ok else 'wrong'}")
     return 1 if print_cases("case", rows) else 0
-
-
-def as_json(pose: Pose) -> dict[str, object]:
-    """A pose as calibration reads it."""
-    return {name: getattr(pose, name).tolist() for name in ("R_cam_from_world", "center_world")}

@@ -1,7 +1,6 @@
 """Checks that the poses of a scene fit its panoramas, and finds the convention that fits better if not."""
 
 from collections import Counter
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -69,14 +68,10 @@ def check_scene(scene: Scene, num_queries: int, workers: Workers, show: Progress
         best = max(scores, key=lambda words: scores[words])
         return ConventionCheck(scene.name_of(query), scores[AS_GIVEN], scores[best], best)
 
-    chosen = evenly_spaced(scene.queries, num_queries)
+    count = len(scene.queries)
+    spaced = np.linspace(0, count - 1, min(num_queries, count)).round().astype(int)  # evenly
+    chosen = [scene.queries[k] for k in spaced]
     return Check(tuple(workers.map(check, chosen, f"{scene.name}: check")))
-
-
-def evenly_spaced(queries: Sequence[Query], count: int) -> list[Query]:
-    """Up to `count` of the queries, evenly spaced."""
-    indices = np.linspace(0, len(queries) - 1, min(count, len(queries))).round().astype(int)
-    return [queries[k] for k in indices]
 
 
 def convention_variants(pose: Pose, origin: Array) -> dict[str, Pose]:

@@ -1,6 +1,6 @@
 """What a camera that is carried through a building takes: blur, people in the way, useless frames."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -77,7 +77,8 @@ def frames_of(
         elif kind == "elsewhere":
             rgb = make_query(elsewhere, k, "clean", options.width, workers).rgb
         else:
-            rgb = _picture(with_people(office.world.rooms[0], people, time), walk, time, options, workers)
+            present = [part for person in people if (part := person.at(time)) is not None]
+            rgb = _picture(joined([office.world.rooms[0], *present]), walk, time, options, workers)
         if options.variant == "photo" and kind != "black":
             rgb = other_light(rgb, np.random.default_rng([seed, 55, number]))  # one light for the whole walk
         yield Frame(rgb[:, ::-1].copy() if kind == "mirrored" else rgb, pose, time, kind)
@@ -125,9 +126,3 @@ class Person:
         for (z, size), paint in zip(BODY, self.paints, strict=True):
             b.put([0.0, 0.0, z], size, paint, yaw)
         return b.room(np.zeros(3), feet + LAMP)
-
-
-def with_people(room: Room, people: Sequence[Person], time: float) -> Room:
-    """The room with those who are on the way at a time [s]."""
-    present = (person.at(time) for person in people)
-    return joined([room, *(part for part in present if part is not None)])
