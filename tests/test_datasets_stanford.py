@@ -186,7 +186,3 @@ def test_rooms_without_objects_have_no_labels(dataset, tmp_path, capsys):
     assert "wanted a list of names" in refusal()[1]
     names.unlink()
     assert "found no assets/semantic_labels.json" in refusal()[1]
-
-
-def test_wrong_usage(dataset, tmp_path, capsys):
-    assert made.run(capsys, "stanford2d3ds", dataset, tmp_path / "out", "--check", -1)[0] == 2

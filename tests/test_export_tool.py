@@ -163,15 +163,6 @@ def test_a_name_costs_at_most_its_own_picture(run, tmp_path, name):
     assert ("b c" in text) == (name in ("nerfstudio", "opensfm", "csv", "potree", "geojson", "gpx"))
 
 
-def test_a_reason_is_told_once_with_the_first_name(run, tmp_path):
-    write_results(tmp_path / "s.jsonl", [result(f"p/{k} \n.jpg", POSES[0]) for k in range(3)] + MIXED[:1])
-    words = ["--format", "colmap", "--size", "64", "32", "--out", tmp_path / "out"]
-    code, document, err = run(*words, results=["s.jsonl"])
-    assert (code, document["poses"]) == (1, 1)
-    why = r"left out 3, the first p/0 \n.jpg: colmap can't read ' ' in a name: rename the picture"
-    assert err.splitlines() == [f"export_poses.py: {why}"]
-
-
 def test_names_in_a_table_are_no_formulas_and_come_back(run, tmp_path):
     names = ["=cmd|' !A1.jpg", "+1.jpg", "-1.jpg", "@a.jpg", "'a.jpg", "p/=a.jpg", 'two\nlines, "q".jpg']
     write_results(tmp_path / "s.jsonl", [result(name, POSES[0], cloud="=b.ply") for name in names])
@@ -230,25 +221,15 @@ def test_results_of_another_content_of_the_cloud_are_refused(run, tmp_path):
 
 
 DOCUMENT = json.loads(MIXED[0].to_json())
-DAMAGED = {
-    "no JSON": "{",
-    "brackets": "[" * 100_000,
-    "half a character": json.dumps(DOCUMENT | {"pano": "\ud800.jpg"}),
-}
 
 
-@pytest.mark.parametrize("what", DAMAGED)
-def test_damaged_results_are_refused_with_file_and_line(tmp_path, what):
+def test_damaged_results_are_refused_with_file_and_line(tmp_path):
     path = tmp_path / "r.jsonl"
-    path.write_text(MIXED[0].to_json() + "\n\n" + DAMAGED[what] + "\n")
-    with pytest.raises(InputError, match=r"r\.jsonl, line 3: ") as caught:
-        read_results([path])
-    assert "\n" not in str(caught.value)
-    path.write_bytes(b"\xff\xfe")
-    with pytest.raises(InputError, match=r"r\.jsonl, line 1: "):
-        read_results([path])
-    with pytest.raises(InputError, match="not a file but a folder"):
-        read_results([tmp_path])
+    for damaged in ("{", "[" * 100_000, json.dumps(DOCUMENT | {"pano": "\ud800.jpg"})):
+        path.write_text(MIXED[0].to_json() + "\n\n" + damaged + "\n")
+        with pytest.raises(InputError, match=r"r\.jsonl, line 3: ") as caught:
+            read_results([path])
+        assert "\n" not in str(caught.value)
 
 
 @given(st.data())

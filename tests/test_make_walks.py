@@ -56,15 +56,6 @@ def test_a_video_without_its_library_is_refused_before_anything_is_made(tmp_path
     assert not (tmp_path / "r").exists()
 
 
-def test_equal_seeds_make_equal_bits(tmp_path):
-    for name in ("a", "b"):
-        assert written(tmp_path / name, "--walk 3 --people 1 --blur --variants photo") == 0
-    files = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*") if path.is_file())
-    assert len(files) > 4
-    for file in files:
-        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
-
-
 def test_a_building_without_a_walk_has_single_panoramas(tmp_path, capsys):
     assert written(tmp_path, "--storeys 2 --panoramas 2 --variants clean tilt --labels") == 0
     capsys.readouterr()

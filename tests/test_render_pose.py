@@ -145,17 +145,6 @@ def test_bad_input_leaves_nothing(run, scene, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["T.txt"]
 
 
-def test_interrupts_and_surprises_have_codes_of_their_own(run, tmp_path, monkeypatch):
-    for error, code in ((KeyboardInterrupt, 130), (ZeroDivisionError, 4)):
-
-        def fail(*arguments, error=error):
-            raise error
-
-        monkeypatch.setattr(render_pose, "render_points", fail)
-        assert run("--at", 1, 1, 1, "--out", tmp_path / "a.png")[0] == code
-    assert not list(tmp_path.iterdir())
-
-
 def test_pictures_on_stdout_are_those_of_files(scene, tmp_path, capfdbinary):
     arguments = ["--cloud", str(scene / "cloud.ply"), "--at", "3", "2", "1", "--width", "64", "--out"]
     depth = ["--depth", str(tmp_path / "depth.png")]
