@@ -93,13 +93,11 @@ def test_a_descent_is_shown_with_where_it_ended(run, scene, tmp_path, monkeypatc
     monkeypatch.setattr(animation, "MAX_FRAMES", 5)
     monkeypatch.setattr(render_pose, "DESCENT", DescentSettings(solver="gauss-newton"))
     pano = ["--queries", scene / "queries.json", "--pano", "clean_0.jpg"]
-    code, (line,), err = run(*pano, "--animate", tmp_path / "a.gif")
+    code, (line,), err = run(*pano, "--animate", tmp_path / "a.mp4")
     assert (code, err) == (0, "")
     assert line["start_distance"] == pytest.approx(0.3)
     assert line["end_distance"] < 0.02
     assert line["frames"] == 5 + animation.NUM_LAST
-    assert (tmp_path / "a.gif").stat().st_size > 10_000
-    assert run(*pano, "--animate", tmp_path / "a.mp4")[0] == 0
     with av.open(tmp_path / "a.mp4") as video:
         shown = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
     assert (len(shown), shown[0].shape[1]) == (line["frames"], animation.FRAME_WIDTH)
