@@ -54,7 +54,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def add_own_options(parser: argparse.ArgumentParser, dataset: str) -> None:
-    """What one dataset alone has; of `generic` the poses' convention, where the list has no column for it."""
+    """Add the options of one dataset alone; of `generic` those where the list has no column."""
     if dataset == "stanford2d3ds":
         option(parser, "--areas 1-6 ...", "only these", default=[])
         text = "clouds from Annotations with a label a point, and labels/ of the panoramas"

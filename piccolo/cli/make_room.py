@@ -3,12 +3,10 @@
 import argparse
 import itertools
 import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..camera import Calibration
 from ..camera.files import read_cameras
@@ -171,26 +169,19 @@ def write_walks(
         walk = walker.walk(arguments.walk, rng)
         frames = frames_of(office, walk, options, number, Workers(workers.num_threads))
         rows = []
-        with _video(arguments, folder / f"{name}.mp4") as add:
+        size = (arguments.width, arguments.width // 2)
+        video = writing_video(folder / f"{name}.mp4", arguments.frame_rate, size)
+        with video if arguments.video else nullcontext() as add:
             for k, frame in enumerate(workers.show(frames, walk.num_frames(options.rate), name)):
                 image = folder / "images" / f"{name}_{k:05}.jpg"
                 write_atomically(image, encode_image(frame.rgb, ".jpg", WALK_QUALITY))
-                add(frame.rgb)
+                if add is not None:
+                    add(frame.rgb)
                 about = {"walk": name, "time": frame.time, "is_answerable": frame.kind not in BAD_KINDS}
                 queries.append(scenes.Query(image, frame.kind, frame.pose, **about))
                 rows.append((repr(frame.time), frame.pose))
         write_lines(folder / f"{name}_poses.tum", tum_lines(rows, "optical"))
     return queries
-
-
-@contextmanager
-def _video(arguments: argparse.Namespace, path: Path) -> Iterator[Callable[[NDArray[np.uint8]], object]]:
-    """What takes the frames of a video; if none was asked for they go nowhere."""
-    if not arguments.video:
-        yield lambda rgb: None
-        return
-    with writing_video(path, arguments.frame_rate, (arguments.width, arguments.width // 2)) as add:
-        yield add
 
 
 def write_scene(

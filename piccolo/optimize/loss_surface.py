@@ -42,7 +42,7 @@ class PoseGrid(NamedTuple):
 
     @property
     def num_poses(self) -> int:
-        """How many there are."""
+        """The number of poses."""
         return len(self.x) * len(self.y) * len(self.heights) * len(self.R_cam_from_local)
 
 

@@ -127,7 +127,7 @@ def print_cases(title: str, rows: Sequence[Case]) -> int:
 
 
 def print_reliability(title: str, stated: Array, right: NDArray[np.bool_]) -> None:
-    """How many of the poses listed, and of the answers none, were right in each tenth of the probability."""
+    """Print how many poses, and answers none, were right in each tenth of the probability."""
     rows = []
     for low in np.arange(10) / 10:
         some = (stated >= low) & ((stated < low + 0.1) | (low == 0.9))

@@ -92,7 +92,7 @@ def unevenly_lit(rgb: Image, stops: float, rng: np.random.Generator) -> Image:
 
 
 def outside_field(width: int, fov_deg: float, yaw: float) -> NDArray[np.bool_]:
-    """Where (H, W) a sphere lies outside a level pinhole photo this wide that looks along azimuth `yaw`."""
+    """Mask (H, W) of a sphere outside a level pinhole photo this wide that looks along azimuth `yaw`."""
     x, y, z = np.moveaxis(pixel_rays(width), -1, 0)
     forward = math.cos(yaw) * x + math.sin(yaw) * y
     left = math.cos(yaw) * y - math.sin(yaw) * x

@@ -23,7 +23,7 @@ AS_GIVEN = "as given"
 
 
 class ConventionCheck(NamedTuple):
-    """How well a panorama fits the cloud at its pose, by this convention and by others."""
+    """The fit of a panorama to the cloud at its pose, by this convention and by others."""
 
     image: str  # as queries.json has it
     score: float  # of the pose as given, [-1, 1], by confidence/score.py
@@ -44,7 +44,7 @@ class Check(NamedTuple):
 
     @property
     def advice(self) -> str:
-        """What is wrong, for the user."""
+        """A line for the user that says what is wrong."""
         (best, count), *_ = Counter(check.best for check in self.panoramas).most_common()
         scores = ", ".join(f"{check.score:.2f}" for check in self.panoramas)
         text = f"the poses don't fit the panoramas: scores {scores}, wanted {MIN_SCORE} and more"

@@ -1,4 +1,4 @@
-"""What the readers share: the one cloud of a folder, matrices and poses, and pictures of labels."""
+"""Files of all datasets: the one cloud of a folder, matrices and poses, and pictures of labels."""
 
 from pathlib import Path
 

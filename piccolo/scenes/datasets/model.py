@@ -33,7 +33,7 @@ class ConvertOptions:
 
     @cached_property
     def _roots(self) -> list[str]:
-        """What the user named, which may be links themselves, without links."""
+        """The paths that the user named, which may be links themselves, without links."""
         named = self.folder, self.poses and self.poses.parent, self.cloud, self.images
         return [os.path.realpath(path) for path in named if path]
 

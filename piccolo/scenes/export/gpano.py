@@ -20,7 +20,9 @@ from ...panorama.picture import WANTED, opened
 from .posed_images import Format, Options, PosedImage, check_size
 
 JPEG_MAGIC = b"\xff\xd8"
-APP0, APP1, SCAN = 0xE0, 0xE1, 0xDA
+APP0 = 0xE0
+APP1 = 0xE1
+SCAN = 0xDA
 MARKER = re.compile(rb"\xff+")
 EXIF_MARK, XMP_MARK = b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0"
 MAX_BODY_SIZE = 0xFFFF - 2

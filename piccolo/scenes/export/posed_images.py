@@ -39,7 +39,7 @@ class PosedImage(NamedTuple):
 
 @dataclass(frozen=True)
 class Options:
-    """What the user chooses; a format takes some of these."""
+    """Choices of the user; a format takes some of these."""
 
     images: Path | None = None  # folder to which names are relative; None: as the result has them
     size: tuple[int, int] | None = None  # W, H [px] of all pictures; None: read from each
@@ -57,7 +57,7 @@ class Options:
 
 
 class Format(NamedTuple):
-    """How the poses are written in one format."""
+    """A format of poses."""
 
     name: str
     description: str  # what reads it, and what `out` is

@@ -67,7 +67,7 @@ class Flight(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """How many of everything, and where it stands."""
+    """The places of rooms, corridors and stairs."""
 
     size: Array  # (3,) of a room [m]
     num_rooms: int
@@ -293,15 +293,16 @@ def _put_slab(
 ) -> None:
     """A floor or ceiling between two heights, open above a flight of stairs."""
     d = WALL_THICKNESS
-    west, east, south, north = (-d, size[0] + d, -d, size[1] + d)
-    pieces = [(west, east, south, north)]
+    east = size[0] + d
+    north = size[1] + d
+    pieces = [(-d, east, -d, north)]
     if hole is not None:
         left = hole.foot[0] - FLIGHT_WIDTH / 2 - b.corner[0]
         right = hole.foot[0] + FLIGHT_WIDTH / 2 - b.corner[0]
         near = hole.foot[1] - b.corner[1]
         far = hole.top[1] - b.corner[1]
-        pieces = [(west, left, south, north), (right, east, south, north)]
-        pieces += [(left, right, south, near), (left, right, far, north)]
+        pieces = [(-d, left, -d, north), (right, east, -d, north)]
+        pieces += [(left, right, -d, near), (left, right, far, north)]
     for x0, x1, y0, y1 in pieces:
         b.put([(x0 + x1) / 2, (y0 + y1) / 2, sum(ends) / 2], [x1 - x0, y1 - y0, ends[1] - ends[0]], paint)
 

@@ -1,4 +1,4 @@
-"""What a camera that is carried through a building takes: blur, people in the way, useless frames."""
+"""Pictures by a camera that is carried through a building: blur, people in the way, useless frames."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ BODY = ((0.4, (0.2, 0.32, 0.8)), (1.12, (0.26, 0.46, 0.64)), (1.6, (0.2, 0.18, 0
 
 @dataclass(frozen=True)
 class WalkOptions:
-    """How a walk is taken."""
+    """Settings of a walk."""
 
     rate: float = 2.0  # frames a second
     variant: str = "clean"  # one of WALK_VARIANTS

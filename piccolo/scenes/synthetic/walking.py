@@ -46,14 +46,14 @@ Cells = NDArray[np.int64]
 
 
 class Reach(NamedTuple):
-    """What can be reached from a cell."""
+    """The cheapest ways from a cell to all others."""
 
     costs: Array  # (N,) inf for what can't
     before: NDArray[np.int32]  # (N,) the cell before each on its way, negative at the start
 
 
 class Floors:
-    """Where a person can walk in a building, and at what cost from cell to cell."""
+    """The floors on which a person can walk in a building, and the costs from cell to cell."""
 
     def __init__(self, office: Office) -> None:
         rooms = office.world.rooms
@@ -165,7 +165,7 @@ class Walk:
         return TICK * (len(self.feet) - 1)
 
     def num_frames(self, rate: float) -> int:
-        """How many frames are taken, `rate` a second from the beginning on."""
+        """The number of frames, `rate` a second from the beginning on."""
         return int(self.duration * rate + 1e-9) + 1
 
     def _at(self, values: Array, time: float) -> Array:
@@ -175,11 +175,11 @@ class Walk:
         return np.asarray((1.0 - f) * values[k] + f * values[k + 1])
 
     def foot(self, time: float) -> Array:
-        """Where the person stands (3,) [m]."""
+        """The place on which the person stands (3,) [m]."""
         return self._at(self.feet, time)
 
     def yaw(self, time: float) -> float:
-        """Where the person looks [rad]."""
+        """The heading of the camera [rad]."""
         return float(self._at(self.yaws, time))
 
     def pose(self, time: float) -> Pose:

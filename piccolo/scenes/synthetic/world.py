@@ -105,7 +105,7 @@ def photograph(
 
 
 def picture_by(mount: Mount, room: Room, pose: Pose, workers: Workers) -> NDArray[np.uint8]:
-    """What a camera takes (H, W, 3) of a room with its rig at `pose`; black where it shows nothing."""
+    """The picture (H, W, 3) by a camera of a room, its rig at `pose`; black where it shows nothing."""
     camera = mount.camera
     u = (np.arange(SUPERSAMPLING * camera.width) + 0.5) / SUPERSAMPLING
     v = (np.arange(SUPERSAMPLING * camera.height) + 0.5) / SUPERSAMPLING
