@@ -121,8 +121,6 @@ def check_pose_options(arguments: argparse.Namespace) -> None:
         raise InputError("--heading, --pitch, --roll: only with --at")
     if arguments.animate and not (arguments.result or arguments.queries):
         raise InputError("--animate: only with --result or --queries, which name a panorama")
-    if arguments.animate and arguments.animate.suffix.lower() == ".mp4":
-        import_optional("--animate", "av", "video")
     if not np.isfinite([*(arguments.at or ()), *(angle or 0.0 for angle in angles)]).all():
         raise InputError("--at and angles must be finite numbers")
 
@@ -264,6 +262,8 @@ def main(arguments: argparse.Namespace) -> int:
     """Read, draw, write."""
     with checking_options():
         check_usage(arguments)
+    if arguments.animate and suffix_of(arguments, "animate") == ".mp4":
+        import_optional("--animate", "av", "video")
     poses = poses_from(arguments)
     check_files(arguments, poses)
 
