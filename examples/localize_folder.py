@@ -11,8 +11,6 @@ from pathlib import Path
 import piccolo
 from piccolo.scan import QueryOptions
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
-
 
 def read_priors(path: str) -> dict[str, QueryOptions]:
     """The options of `Scan.localize` by the photo's name."""
@@ -26,9 +24,10 @@ def read_priors(path: str) -> dict[str, QueryOptions]:
 
 def main(scan_path: str, folder: str, priors_path: str) -> None:
     """Print a line of CSV a photo; one that can't be read is named on stderr, and the others go on."""
-    scan, priors = piccolo.open_scan(scan_path), read_priors(priors_path)
+    scan = piccolo.open_scan(scan_path)
+    priors = read_priors(priors_path)
     print("name,status,confidence,x,y,z")
-    for photo in sorted(path for path in Path(folder).iterdir() if path.suffix.lower() in SUFFIXES):
+    for photo in sorted(Path(folder).iterdir()):
         try:
             result = scan.localize(photo, **priors.get(photo.name, {}))
         except piccolo.InputError as error:

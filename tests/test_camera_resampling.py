@@ -17,8 +17,7 @@ from piccolo.geometry.pose import exp_so3
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.panorama import read_panorama
-from piccolo.scenes.synthetic.photographs import picture_by, picture_of_all
-from piccolo.scenes.synthetic.world import make_query, photograph, room_of_query
+from piccolo.scenes.synthetic.world import make_query, photograph, picture_by, picture_of_all, room_of_query
 
 BACK = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
 TILT = tuple(map(tuple, exp_so3(np.array([0.3, -0.2, 2.0])).tolist()))

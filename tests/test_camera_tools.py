@@ -17,8 +17,7 @@ from piccolo.geometry.pose import exp_so3
 from piccolo.jobs.threads import Workers
 from piccolo.result import read_results
 from piccolo.scenes.scene import read_scene
-from piccolo.scenes.synthetic.photographs import picture_by
-from piccolo.scenes.synthetic.world import make_world, photograph, pose_of_query
+from piccolo.scenes.synthetic.world import make_world, photograph, picture_by, pose_of_query
 from piccolo.views.pictures import cut, sphere_width_for
 
 WIDE = Camera("OPENCV", 480, 400, (150.0, 152.0, 245.0, 198.0, -0.02, 0.001, 1e-3, -1e-3))

@@ -55,9 +55,3 @@ def test_advice_names_the_way_that_fits_most():
     assert "scores 0.02, 0.02, 0.10, wanted 0.1 and more; 0.60 if the camera's x, y, z are z, x, y" in advice
     fits = wrong, fit(0.02), fit(0.05, "others", 0.06)
     assert checking.Check(fits).advice.endswith("no other axes fit better")
-
-
-def test_spread_is_even():
-    assert checking.evenly_spaced(list(range(10)), 3) == [0, 4, 9]
-    assert checking.evenly_spaced(list(range(2)), 5) == [0, 1]
-    assert checking.evenly_spaced(list(range(9)), 1) == [0]

@@ -1,14 +1,12 @@
 """Descents with their history, and the animations of them."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 import rooms
 
 from piccolo.geometry.pose import pose_errors
-from piccolo.optimize.descent_animation import perturb_pose, refine_with_history, write_animation
+from piccolo.optimize.descent_animation import gif_of, perturb_pose, refine_with_history
 from piccolo.optimize.refine import refine, sampling_loss_of
 from piccolo.optimize.settings import DescentSettings
 from piccolo.panorama.texels import pack_texels
@@ -25,7 +23,7 @@ def points():
 def test_a_descent_with_history_is_the_descent(points, solver):
     query = rooms.query(SEED, "tilt")
     texels, goal = pack_texels(query.rgb), rooms.local(SEED, query.pose)
-    start = perturb_pose(goal, 0.15, 4.0, seed=1)
+    start = perturb_pose(goal, 0.15, 4.0)
     assert pose_errors(start, goal) == pytest.approx((0.15, np.radians(4.0)))
     how = DescentSettings(solver=solver, num_iterations=40, step_size=0.02)
     refined, history = refine_with_history(points, texels, start, how)
@@ -39,18 +37,11 @@ def test_a_descent_with_history_is_the_descent(points, solver):
         assert pose_errors(refined.pose, goal)[0] < 0.02
 
 
-FRAMES = [np.full((26, 30, 3), (40 * k, 255 - 40 * k, 90), np.uint8) for k in range(4)]
-
-
-def test_animations_read_back(tmp_path):
-    for name in ("a.gif", "a.mp4"):
-        write_animation(tmp_path / name, FRAMES, Path(name).suffix)
-        video = cv2.VideoCapture(str(tmp_path / name))
-        read = [frame for is_read, frame in iter(video.read, (False, None)) if is_read]
-        assert len(read) >= len(FRAMES)
-        assert abs(read[0][13, 15, ::-1].astype(int) - FRAMES[0][13, 15]).max() < 12
-        assert abs(read[-1][13, 15, ::-1].astype(int) - FRAMES[-1][13, 15]).max() < 12
-    write_animation(tmp_path / "frames", FRAMES, "")
-    names = [f"{k:04d}.png" for k in range(4)]
-    assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == names
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.gif", "a.mp4", "frames"]
+def test_a_gif_reads_back(tmp_path):
+    frames = [np.full((26, 30, 3), (40 * k, 255 - 40 * k, 90), np.uint8) for k in range(4)]
+    (tmp_path / "a.gif").write_bytes(gif_of(frames))
+    video = cv2.VideoCapture(str(tmp_path / "a.gif"))
+    read = [frame for is_read, frame in iter(video.read, (False, None)) if is_read]
+    assert len(read) >= len(frames)
+    assert abs(read[0][13, 15, ::-1].astype(int) - frames[0][13, 15]).max() < 12
+    assert abs(read[-1][13, 15, ::-1].astype(int) - frames[-1][13, 15]).max() < 12

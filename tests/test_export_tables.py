@@ -1,7 +1,6 @@
 """Exports that are lists of poses: trajectories, tables, maps."""
 
 import csv
-import sys
 from dataclasses import replace
 from importlib import import_module
 from xml.etree import ElementTree
@@ -211,9 +210,3 @@ def test_geojson_takes_what_is_near_the_area_of_a_system(tmp_path, crs, x, y):
     export([one], "geojson", tmp_path / "p.geojson", Options(crs=crs))
     (longitude, _) = json_of(tmp_path / "p.geojson")["features"][0]["geometry"]["coordinates"]
     assert -180.0 <= longitude <= 180.0
-
-
-def test_geojson_without_the_library_says_how_to_get_it(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pyproj", None)
-    with pytest.raises(InputError, match=r"needs pyproj, .*requirements-tools"):
-        export(_results(), "geojson", tmp_path / "p.geojson", Options(crs="EPSG:32632"))

@@ -3,7 +3,6 @@
 import csv
 import hashlib
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +16,6 @@ from refusals import mutated, read_or_refused
 
 from piccolo.cli import export_poses
 from piccolo.errors import InputError
-from piccolo.files.atomic import check_output_folder, replacing_folder
 from piccolo.result import Source, read_results
 from piccolo.scenes.datasets.generic import _table
 from piccolo.scenes.export import FORMATS, select
@@ -165,15 +163,6 @@ def test_a_name_costs_at_most_its_own_picture(run, tmp_path, name):
     assert ("b c" in text) == (name in ("nerfstudio", "opensfm", "csv", "potree", "geojson", "gpx"))
 
 
-def test_a_reason_is_told_once_with_the_first_name(run, tmp_path):
-    write_results(tmp_path / "s.jsonl", [result(f"p/{k} \n.jpg", POSES[0]) for k in range(3)] + MIXED[:1])
-    words = ["--format", "colmap", "--size", "64", "32", "--out", tmp_path / "out"]
-    code, document, err = run(*words, results=["s.jsonl"])
-    assert (code, document["poses"]) == (1, 1)
-    why = r"left out 3, the first p/0 \n.jpg: colmap can't read ' ' in a name: rename the picture"
-    assert err.splitlines() == [f"export_poses.py: {why}"]
-
-
 def test_names_in_a_table_are_no_formulas_and_come_back(run, tmp_path):
     names = ["=cmd|' !A1.jpg", "+1.jpg", "-1.jpg", "@a.jpg", "'a.jpg", "p/=a.jpg", 'two\nlines, "q".jpg']
     write_results(tmp_path / "s.jsonl", [result(name, POSES[0], cloud="=b.ply") for name in names])
@@ -232,36 +221,15 @@ def test_results_of_another_content_of_the_cloud_are_refused(run, tmp_path):
 
 
 DOCUMENT = json.loads(MIXED[0].to_json())
-DAMAGED = {
-    "no JSON": "{",
-    "brackets": "[" * 100_000,
-    "other format": json.dumps(DOCUMENT | {"format": "x"}),
-    "ragged": json.dumps(DOCUMENT | {"R_cam_from_world": [[1, 0], [0, 1, 0], [0]]}),
-    "text": json.dumps(DOCUMENT | {"center_world": ["a", "b", "c"]}),
-    "null": json.dumps(DOCUMENT | {"center_world": None}),
-    "infinite": json.dumps(DOCUMENT | {"center_world": [1, 2, float("inf")]}),
-    "mirrored": json.dumps(DOCUMENT | {"R_cam_from_world": np.diag([1.0, 1.0, -1.0]).tolist()}),
-    "NaN": json.dumps(DOCUMENT | {"R_cam_from_world": np.full((3, 3), np.nan).tolist()}),
-    "number as name": json.dumps(DOCUMENT | {"pano": 7}),
-    "half a character": json.dumps(DOCUMENT | {"pano": "\ud800.jpg"}),
-    "infinite score": json.dumps(DOCUMENT | {"evidence": DOCUMENT["evidence"] | {"score": float("inf")}}),
-    "confidence in words": json.dumps(DOCUMENT | {"confidence": "high"}),
-    "list": json.dumps(DOCUMENT | {"evidence": [1]}),
-}
 
 
-@pytest.mark.parametrize("what", DAMAGED)
-def test_damaged_results_are_refused_with_file_and_line(tmp_path, what):
+def test_damaged_results_are_refused_with_file_and_line(tmp_path):
     path = tmp_path / "r.jsonl"
-    path.write_text(MIXED[0].to_json() + "\n\n" + DAMAGED[what] + "\n")
-    with pytest.raises(InputError, match=r"r\.jsonl, line 3: ") as caught:
-        read_results([path])
-    assert "\n" not in str(caught.value)
-    path.write_bytes(b"\xff\xfe")
-    with pytest.raises(InputError, match=r"r\.jsonl, line 1: "):
-        read_results([path])
-    with pytest.raises(InputError, match="not a file but a folder"):
-        read_results([tmp_path])
+    for damaged in ("{", "[" * 100_000, json.dumps(DOCUMENT | {"pano": "\ud800.jpg"})):
+        path.write_text(MIXED[0].to_json() + "\n\n" + damaged + "\n")
+        with pytest.raises(InputError, match=r"r\.jsonl, line 3: ") as caught:
+            read_results([path])
+        assert "\n" not in str(caught.value)
 
 
 @given(st.data())
@@ -274,33 +242,6 @@ def test_any_damage_of_results_is_refused_or_harmless(tmp_path_factory, data):
     for r in results or []:
         R = r.best_pose.R_cam_from_world if r.best_pose else np.eye(3)
         np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-5)
-
-
-def test_folder_is_whole_or_not_there(tmp_path):
-    before = os.umask(0o027)
-    try:
-        (tmp_path / "empty").mkdir()
-        for name in ("empty", "new"):
-            check_output_folder(tmp_path / name)
-            with replacing_folder(tmp_path / name) as folder:
-                (folder / "a").touch()
-                assert not (tmp_path / name / "a").exists()
-            assert (tmp_path / name / "a").exists()
-            assert (tmp_path / name).stat().st_mode & 0o777 == 0o750
-    finally:
-        os.umask(before)
-    with pytest.raises(FileNotFoundError), replacing_folder(tmp_path / "broken") as folder:
-        Path(folder, "no", "a").touch()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "new"]
-
-
-def test_help_names_every_format(capsys):
-    for arguments, code in ((["--help"], 0), (["--format", "xyz"], 2)):
-        with pytest.raises(SystemExit) as caught:
-            export_poses.main(arguments)
-        assert caught.value.code == code
-    text = capsys.readouterr().out
-    assert all(name in text for name in FORMATS)
 
 
 def test_true_poses_are_written_as_a_reference(tmp_path, capsys):

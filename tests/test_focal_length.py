@@ -21,7 +21,7 @@ from piccolo.localization.localize import likeliest
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import ReadOptions, panorama_of_array
-from piccolo.scenes.synthetic.photographs import picture_by
+from piccolo.scenes.synthetic.world import picture_by
 
 TRUE = 320.0  # [px] of the photos here, 640 x 480
 

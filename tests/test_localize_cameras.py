@@ -24,8 +24,7 @@ from piccolo.jobs.threads import Workers
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.result import Result, read_results
 from piccolo.scan import Scan
-from piccolo.scenes.synthetic.photographs import picture_by, picture_of_all
-from piccolo.scenes.synthetic.world import make_query, photograph, room_of_query
+from piccolo.scenes.synthetic.world import make_query, photograph, picture_by, picture_of_all, room_of_query
 
 BACK = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
 FISHEYE = Camera("OPENCV_FISHEYE", 512, 512, (150.0, 150.0, 256.0, 256.0, 0.01, -0.003, 0.0, 0.0), 95.0)

@@ -3,9 +3,11 @@
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 import textwrap
+from importlib import import_module
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -18,19 +20,27 @@ def _readme_commands():
     return [block.strip().splitlines() for block in blocks if "make_room" in block]
 
 
-def _run_all(commands, folder):
-    printed = []
+def _expanded(word):
+    return sorted(map(str, Path().glob(word)))
+
+
+def _run_all(commands, folder, monkeypatch, capsys):
+    """Run commands as a shell would do it in a folder, but in this process; returns what they print."""
+    monkeypatch.chdir(folder)
     for command in commands:
-        script = re.sub("^python ", f"'{sys.executable}' '{ROOT}'/", command.strip())
-        done = subprocess.run(["bash", "-c", script], cwd=folder, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-        printed.append(done.stdout)
-    return "".join(printed)
+        program, *words = shlex.split(command.partition(" > ")[0].strip().removeprefix("python "))
+        words = [name for word in words for name in (_expanded(word) if "*" in word else [word])]
+        if program == "mkdir":
+            Path(*words).mkdir()
+        else:
+            main = import_module(f"piccolo.cli.{Path(program).stem}").main
+            assert main(words) == 0, capsys.readouterr().err
+    return capsys.readouterr().out
 
 
-def test_readme_python_prints_what_it_says_in_the_demo(tmp_path):
+def test_readme_python_prints_what_it_says_in_the_demo(tmp_path, monkeypatch, capsys):
     (demo,) = re.findall(r"tools/make_room.py .* > /dev/null", (ROOT / "Makefile").read_text())
-    _run_all([f"python {demo}"], tmp_path)
+    _run_all([demo], tmp_path, monkeypatch, capsys)
     lines = re.search(r"^    import piccolo\n(?:    .*\n)+", README, flags=re.MULTILINE)[0]
     command = [sys.executable, "-c", textwrap.dedent(lines)]
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -41,16 +51,16 @@ def test_readme_python_prints_what_it_says_in_the_demo(tmp_path):
     assert all(f'"{key}": ' in README for key in json.loads(document))
 
 
-def test_readme_room_runs_as_written(tmp_path):
+def test_readme_room_runs_as_written(tmp_path, monkeypatch, capsys):
     room, _ = _readme_commands()
-    assert "| all | 2 | 2 | 1.000 |" in _run_all(room, tmp_path)
+    assert "| all | 2 | 2 | 1.000 |" in _run_all(room, tmp_path, monkeypatch, capsys)
     assert (tmp_path / "room" / "risk.png").read_bytes().startswith(b"\x89PNG")
     assert len((tmp_path / "room" / "poses.csv").read_text().splitlines()) == 3
 
 
-def test_readme_pipeline_runs_as_written(tmp_path):
+def test_readme_pipeline_runs_as_written(tmp_path, monkeypatch, capsys):
     _, pipeline = _readme_commands()
-    printed = _run_all(pipeline, tmp_path)
+    printed = _run_all(pipeline, tmp_path, monkeypatch, capsys)
     assert len((tmp_path / "poses.jsonl").read_text().splitlines()) == 2
     assert '"fits": true' in printed
     assert '"status": "aligned"' in printed

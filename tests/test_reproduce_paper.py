@@ -11,7 +11,6 @@ from rooms import write_room
 from piccolo.cli import reproduce_paper
 from piccolo.cloud import read_cloud
 from piccolo.cloud.soa import pack_points
-from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, angle_between
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.optimize.sampling_loss import sampling_loss
@@ -19,8 +18,8 @@ from piccolo.panorama import read_panorama
 from piccolo.panorama.texels import pack_texels
 from piccolo.paper.settings import PaperSettings
 from piccolo.scenes.evaluation.runs import read_run
-from piccolo.scenes.reproduce_paper.experiments import EXPERIMENTS
-from piccolo.scenes.reproduce_paper.transforms import (
+from piccolo.scenes.reproduce_paper import (
+    EXPERIMENTS,
     flipped,
     identity,
     with_count,
@@ -31,6 +30,12 @@ from piccolo.scenes.scene import Query, read_scene, write_queries
 from piccolo.views.zbuffer import visible_points
 
 PRESETS = [PaperSettings(), CoarseToFineSettings()]
+QUICK = PaperSettings(num_translations=8, num_iterations=20)
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch):
+    monkeypatch.setitem(reproduce_paper.PRESETS, "paper", QUICK)
 
 
 @pytest.fixture(scope="module")
@@ -98,11 +103,6 @@ def test_pictures_beside_the_scene_and_masked_ones_are_flipped_too(rooms, tmp_pa
     assert not is_valid[44:].any()
 
 
-def test_too_few_points_are_told(rooms, tmp_path):
-    with pytest.raises(InputError, match=r"cloud\.ply: found 40000 points, wanted at least 1000000"):
-        with_count(1_000_000)(read_scene(rooms / "000"), tmp_path)
-
-
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_conditions_differ_and_have_files_of_their_own(name):
     conditions = EXPERIMENTS[name].conditions_of(PRESETS, ["change", "clean"])
@@ -113,11 +113,11 @@ def test_conditions_differ_and_have_files_of_their_own(name):
 
 
 def _command(names, scenes, out, *more):
-    words = ["--presets", "paper", "--settings", "num_translations=8", "num_iterations=20", "--quiet", *more]
+    words = ["--presets", "paper", "--quiet", *more]
     return reproduce_paper.main([*names.split(), "--scenes", str(scenes), "--out", str(out), *words])
 
 
-def test_the_tool_writes_table_plot_and_runs_and_resumes_them(rooms, tmp_path, capsys):
+def test_the_tool_writes_table_and_runs_and_resumes_them(rooms, tmp_path, capsys):
     out = tmp_path / "out"
     assert _command("labels variants", rooms, out, "--variants", "clean") == 0
     text = capsys.readouterr().out
@@ -125,7 +125,6 @@ def test_the_tool_writes_table_plot_and_runs_and_resumes_them(rooms, tmp_path, c
     assert "| labels | paper | 2 |" in text
     assert "| clean | paper | 2 |" in text
     assert "| tilt |" not in text
-    assert (out / "labels.png").read_bytes()[1:4] == b"PNG"
     rows = read_run(out / "labels" / "labels_paper.jsonl")[0]
     assert [row.scene for row in rows] == ["000", "001"]
     assert rows[0].result.pano.endswith("labels/clean_0.png")
@@ -151,5 +150,4 @@ def test_what_cannot_be_localized_is_named(rooms, tmp_path, capsys):
     assert "| 10000 points | paper | 2 |" in out
     assert _command("variants", scene, tmp_path / "out", "--variants", "none") == 3
     assert "variants: no query could be localized" in capsys.readouterr().err
-    for wrong in (["--jobs", "0"], ["--settings", "num_by_loss=0"]):
-        assert _command("variants", scene, tmp_path / "out", *wrong) == 2
+    assert _command("variants", scene, tmp_path / "out", "--jobs", "0") == 2

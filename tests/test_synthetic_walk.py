@@ -12,7 +12,7 @@ from piccolo.scenes.synthetic.office import make_office
 from piccolo.scenes.synthetic.raycast import cast_rays, ranges_ahead
 from piccolo.scenes.synthetic.walk_frames import BAD_KINDS, WalkOptions, frames_of
 from piccolo.scenes.synthetic.walking import HEIGHT, Walker
-from piccolo.scenes.synthetic.world import exposed, scan_world
+from piccolo.scenes.synthetic.world import photograph, scan_world
 
 SIZE = np.array([4.0, 3.2, 2.5])
 WORKERS = Workers(2)
@@ -30,7 +30,7 @@ def walker():
 
 @functools.lru_cache
 def walk(number=0):
-    return walker().walk(60.0, (5, 0), np.random.default_rng(number))
+    return walker().walk(60.0, np.random.default_rng(number))
 
 
 def frames(number=0, **options):
@@ -62,7 +62,7 @@ def test_rays_meet_what_is_nearest_among_hundreds_of_boxes():
             assert (labels > 0).all()
 
 
-@pytest.mark.parametrize("width_deg", [0.5, 20.0, 80.0, 100.0, 179.0])
+@pytest.mark.parametrize("width_deg", [0.5, 80.0, 179.0])
 def test_boxes_outside_a_cone_are_left_out_and_others_have_their_distance(width_deg):
     room = office().world.rooms[0]
     rng = np.random.default_rng(1)
@@ -107,8 +107,9 @@ def test_a_person_can_walk_into_every_room(num_rooms, num_storeys):
     assert len(made.levels) == num_storeys
     cells = made.world.rooms[:num_rooms]
     assert len({tuple(cell.corner) for cell in cells}) == num_rooms
-    reach = Walker(made).everywhere
-    assert all(np.isfinite(reach.costs[reach.space.cells_of_room(k)]).any() for k in range(num_rooms))
+    walker = Walker(made)
+    cells_of_room = walker.floors.cells_of_room
+    assert all(np.isfinite(walker.everywhere.costs[cells_of_room(k)]).any() for k in range(num_rooms))
 
 
 def test_walk_goes_through_doors_and_over_stairs_and_never_through_things():
@@ -165,13 +166,13 @@ def test_frames_show_the_scan_at_their_poses():
 
 
 def test_frames_are_the_same_at_any_number_of_threads_and_people_hide_a_part():
-    options = WalkOptions(0.2, "photo", 3, True, 0.3, 128)
+    options = WalkOptions(0.1, "photo", 3, True, 0.3, 128)
     one, two = (list(frames_of(office(), walk(), options, 0, Workers(n))) for n in (1, 2))
     for a, b in zip(one, two, strict=True):
         np.testing.assert_array_equal(a.rgb, b.rgb)
         np.testing.assert_array_equal(a.pose.center_world, b.pose.center_world)
         assert a.kind == b.kind
-    alone, among = frames(rate=0.2), frames(rate=0.2, num_people=6)
+    alone, among = frames(rate=0.1), frames(rate=0.1, num_people=6)
     hidden = [(a.rgb != b.rgb).any(axis=2).mean() for a, b in zip(alone, among, strict=True)]
     assert max(hidden) > 0.01
     assert max(hidden) < 0.5
@@ -181,7 +182,7 @@ def test_blur_is_the_mean_over_the_shutter():
     """Turning on the spot blurs across: the upright edges of a picture lose, the level ones stay."""
     room, center = office().world.rooms[0], office().world.rooms[0].corner + SIZE * [0.3, 0.4, 0.62]
     poses = [Pose(yaw_rotation(angle), center) for angle in np.radians(np.linspace(-6.0, 6.0, 8))]
-    sharp, blurred = (exposed(room, some, 256, WORKERS).astype(float) for some in ([poses[3]], poses))
+    sharp, blurred = (photograph(room, poses[3], 256, WORKERS, some).astype(float) for some in ([], poses))
     upright, level = (
         [np.abs(np.diff(rgb[48:80], axis=axis)).mean() for rgb in (sharp, blurred)] for axis in (1, 0)
     )
@@ -191,7 +192,7 @@ def test_blur_is_the_mean_over_the_shutter():
 
 
 def test_bad_frames_are_black_mirrored_or_of_elsewhere():
-    good, some = frames(rate=0.4), frames(rate=0.4, bad_fraction=0.5)
+    good, some = frames(rate=0.2), frames(rate=0.2, bad_fraction=0.5)
     kinds = [frame.kind for frame in some]
     assert sum(kind in BAD_KINDS for kind in kinds) == round(0.5 * len(kinds))
     assert {*kinds} == {"clean", *BAD_KINDS}

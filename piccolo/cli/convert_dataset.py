@@ -43,17 +43,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         text = "only these, by the last part of a scene's name: office_1, weddingHall_1, a house"
         option(one, "--rooms NAME ...", text, default=[])
         option(one, "--check N", "compare N panoramas of each scene with its cloud", default=0)
-        images = one.add_mutually_exclusive_group()
-        const = {"action": "store_const", "dest": "transfer"}
-        text = "link to the panoramas where they are (default: a copy can take 100 GB)"
-        option(images, "--link", text, const="symlink", default="symlink", **const)
-        option(images, "--copy", "copy them, so that the dataset can be removed", const="copy", **const)
+        text = "copy the panoramas, so that the dataset can be removed (default: link to them)"
+        option(one, "--copy", text)
         add_own_options(one, name)
         add_run_options(one)
 
 
 def add_own_options(parser: argparse.ArgumentParser, dataset: str) -> None:
-    """What one dataset alone has; of `generic` the poses' convention, where the list has no column for it."""
+    """Add the options of one dataset alone; of `generic` those where the list has no column."""
     if dataset == "stanford2d3ds":
         option(parser, "--areas 1-6 ...", "only these", default=[])
         text = "clouds from Annotations with a label a point, and labels/ of the panoramas"
@@ -103,7 +100,7 @@ def main(arguments: argparse.Namespace) -> int:
 def convert_scene(spec: SceneSpec, arguments: argparse.Namespace, show: Progress) -> int:
     """Write a scene, check it, and print its line; returns the exit code."""
     try:
-        written = write_scene(spec, arguments.out, arguments.transfer, show)
+        written = write_scene(spec, arguments.out, arguments.copy, show)
         check = None
         if arguments.check:
             scene = read_scene(written.folder, spec.name)

@@ -46,12 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--out FILE", "a new folder for colmap and gpano", required=True)
     option(parser, "--images FOLDER", "pictures' names are relative to it (default: as in the results)")
     option(parser, "--all", "write ambiguous and not localized poses too")
-    option(
-        parser,
-        "--cloud PATH ...",
-        "only results of these clouds",
-        default=[],
-    )
+    option(parser, "--cloud PATH ...", "only results of these clouds", default=[])
     option(parser, "--force", "take results of other content than --cloud has")
     group = parser.add_argument_group("of some formats")
     option(group, "--size W H", f"of all pictures, not read from each ({_takers('size')})")

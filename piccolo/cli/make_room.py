@@ -3,8 +3,8 @@
 import argparse
 import itertools
 import json
+from contextlib import nullcontext
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,30 +16,36 @@ from ..jobs.threads import Workers, num_cores
 from ..optional import import_optional
 from ..scenes import scene as scenes
 from ..scenes.datasets.files import write_labels
-from ..scenes.synthetic.office import Office
-from ..scenes.synthetic.photographs import check_can_be_made, make_photos
+from ..scenes.export.formats import tum_lines, write_lines
+from ..scenes.export.video import writing_video
+from ..scenes.synthetic.office import Office, make_office
+from ..scenes.synthetic.walk_frames import BAD_KINDS, WalkOptions, frames_of
+from ..scenes.synthetic.walking import Walker
 from ..scenes.synthetic.world import (
     VARIANTS,
     World,
+    check_cameras,
     check_num_points,
     check_width,
     make_labels,
+    make_photos,
     make_query,
     make_world,
     scan_world,
 )
 from ..views.pictures import encode_image
 from .command import check_least, command, option
-from .errors import checking_options
-from .making_walks import add_walk_options, building_of, check_walk_usage, write_walks
+from .errors import UsageError, checking_options
 from .outputs import check_folder_name
 from .progress import progress_bar
 
-QUALITY = {"photo": 70}  # of a variant's JPEGs
+QUALITY = {"photo": 70}  # of a variant's JPEGs; else 95
+WALK_QUALITY = 95
 ROOM_POINTS = 300_000  # of all rooms side by side
-PART_POINTS = (
-    120_000  # of each part of a building; with 30,000 the better scanned of exact twins was called sure
-)
+# of each part of a building; with 30,000 the better scanned of exact twins was called sure
+PART_POINTS = 120_000
+MAX_LENGTH = 100_000.0  # [m]
+OF_WALKS = ("people", "blur", "bad_frames", "video")  # options that nothing else takes
 EPILOG = """\
 examples:
   python tools/make_room.py --out room --seed 3
@@ -59,14 +65,6 @@ each a variant, with "answerable": false: right is to refuse them.
 """
 
 
-class Made(NamedTuple):
-    """What a scene is made of."""
-
-    world: World
-    office: Office | None  # that the world is of
-    num_points: int
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
     option(parser, "--out FOLDER", "made if it is not there", required=True)
@@ -82,94 +80,154 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--rooms N", "at most 256", default=1)
     option(parser, "--labels", "label points and pixels by their kind of surface, for localize.py --labels")
     option(parser, "--scenes N", "write N scenes, FOLDER/000 on, of the seeds from --seed on", default=0)
-    add_walk_options(parser)
+    group = parser.add_argument_group("buildings and walks")
+    text = "a building: corridors, halls and stairs join the rooms (1 with --walk)"
+    option(group, "--storeys N", text, default=0)
+    option(group, "--twins FRACTION", "of a building's rooms that are exact copies of others", default=0.0)
+    text = "in place of panoramas, a walk of this length through a building [m]"
+    option(group, "--walk M", text, default=0.0)
+    option(group, "--walks N", "of each variant, which are clean or photo", default=1)
+    option(group, "--frame-rate HZ", "frames a second", default=2.0)
+    option(group, "--people N", "who walk the same way", default=0)
+    option(group, "--blur", "of the camera's motion while the shutter is open")
+    option(group, "--bad-frames FRACTION", f"that are {', '.join(BAD_KINDS)}", default=0.0)
+    option(group, "--video", "FOLDER/VARIANT_walk_K.mp4 too")
 
 
-def write_panorama(
-    arguments: argparse.Namespace, world: World, folder: Path, number: tuple[str, int], workers: Workers
-) -> scenes.Query:
-    """Write a sphere, variant and index its `number`, with its labels if asked for."""
-    v, k = number
-    query = make_query(world, k, v, arguments.width, workers)
-    image, path = folder / "images" / f"{v}_{k}.jpg", folder / "labels" / f"{v}_{k}.png"
-    write_atomically(image, encode_image(query.rgb, ".jpg", QUALITY.get(v, 95)))
-    if arguments.labels:
-        path.parent.mkdir(exist_ok=True)
-        write_labels(path, make_labels(world, k, query, workers))
-    return scenes.Query(image, v, query.pose, path if arguments.labels else None)
+def is_building(arguments: argparse.Namespace) -> bool:
+    """True if the rooms are to be joined."""
+    return bool(arguments.storeys or arguments.walk)
 
 
-def write_photo(
-    cameras: Calibration, world: World, folder: Path, number: tuple[str, int], workers: Workers
-) -> scenes.Query:
-    """Write what a camera takes, or of a rig the pictures of one instant, as a folder."""
-    v, k = number
-    pictures, pose = make_photos(world, number, cameras, workers)
-    image = folder / "images" / (f"{v}_{k}" if cameras.is_rig else f"{v}_{k}.jpg")
-    for name, rgb in pictures:
-        path = image / name if name else image
-        path.parent.mkdir(exist_ok=True)
-        write_atomically(path, encode_image(rgb, path.suffix, QUALITY.get(v, 95)))
-    return scenes.Query(image, v, pose, cameras=cameras.mounts)
+def check_usage(arguments: argparse.Namespace) -> None:
+    """Refuse options that do not go together."""
+    check_least(arguments, panoramas=0, seed=0, scenes=0, storeys=0, walks=1)
+    if arguments.twins and not is_building(arguments):
+        raise UsageError("--twins: goes with --storeys or --walk")
+    if is_building(arguments) and "change" in arguments.variants:
+        raise UsageError("--variants: found change, which a building has not")
+    if arguments.labels and arguments.camera:
+        raise UsageError("--labels: not with --camera")
+    if arguments.walk:
+        check_walk(arguments)
+    elif given := [name for name in OF_WALKS if getattr(arguments, name)]:
+        raise UsageError(f"--{given[0].replace('_', '-')}: goes with --walk")
 
 
-def write_queries(
+def check_walk(arguments: argparse.Namespace) -> None:
+    """Refuse walks that can't be made."""
+    if not 0.0 < arguments.walk <= MAX_LENGTH:
+        raise UsageError(f"--walk: found {arguments.walk}, wanted up to {MAX_LENGTH:g} m")
+    if arguments.labels or arguments.camera:
+        raise UsageError("--labels, --camera: not with --walk")
+    for variant in arguments.variants:
+        walk_options(arguments, variant)
+
+
+def walk_options(arguments: argparse.Namespace, variant: str) -> WalkOptions:
+    """The options of walks of a variant."""
+    a = arguments
+    return WalkOptions(a.frame_rate, variant, a.people, a.blur, a.bad_frames, a.width)
+
+
+def write_photos(
     arguments: argparse.Namespace, world: World, folder: Path, cameras: Calibration | None, workers: Workers
 ) -> list[scenes.Query]:
-    """Write single photos, of each variant as many."""
-    numbers = list(itertools.product(dict.fromkeys(arguments.variants), range(arguments.panoramas)))
-    if cameras is None:
-        return [write_panorama(arguments, world, folder, number, workers) for number in numbers]
-    return [write_photo(cameras, world, folder, number, workers) for number in numbers]
+    """Write single photos, of each variant as many; those of a rig are a folder."""
+    queries = []
+    for v, k in itertools.product(dict.fromkeys(arguments.variants), range(arguments.panoramas)):
+        image = folder / "images" / (f"{v}_{k}" if cameras and cameras.is_rig else f"{v}_{k}.jpg")
+        labels = None
+        if cameras is not None:
+            pictures, pose = make_photos(world, k, v, cameras, workers)
+        else:
+            query = make_query(world, k, v, arguments.width, workers)
+            pictures = [("", query.rgb)]
+            pose = query.pose
+            if arguments.labels:
+                labels = folder / "labels" / f"{v}_{k}.png"
+                labels.parent.mkdir(exist_ok=True)
+                write_labels(labels, make_labels(world, k, query, workers))
+        for name, rgb in pictures:
+            path = image / name
+            path.parent.mkdir(exist_ok=True)
+            write_atomically(path, encode_image(rgb, path.suffix, QUALITY.get(v, 95)))
+        queries.append(scenes.Query(image, v, pose, labels, cameras.mounts if cameras else ()))
+    return queries
 
 
-def write_world(
-    arguments: argparse.Namespace, made: Made, folder: Path, cameras: Calibration | None, workers: Workers
+def write_walks(
+    arguments: argparse.Namespace, office: Office, folder: Path, workers: Workers
+) -> list[scenes.Query]:
+    """Write the frames, poses and videos of all walks."""
+    walker = Walker(office)
+    queries: list[scenes.Query] = []
+    for variant, number in itertools.product(dict.fromkeys(arguments.variants), range(arguments.walks)):
+        name = f"{variant}_walk_{number}"
+        options = walk_options(arguments, variant)
+        rng = np.random.default_rng([office.world.seed, 53, number])
+        walk = walker.walk(arguments.walk, rng)
+        frames = frames_of(office, walk, options, number, Workers(workers.num_threads))
+        rows = []
+        size = (arguments.width, arguments.width // 2)
+        video = writing_video(folder / f"{name}.mp4", arguments.frame_rate, size)
+        with video if arguments.video else nullcontext() as add:
+            for k, frame in enumerate(workers.show(frames, walk.num_frames(options.rate), name)):
+                image = folder / "images" / f"{name}_{k:05}.jpg"
+                write_atomically(image, encode_image(frame.rgb, ".jpg", WALK_QUALITY))
+                if add is not None:
+                    add(frame.rgb)
+                about = {"walk": name, "time": frame.time, "is_answerable": frame.kind not in BAD_KINDS}
+                queries.append(scenes.Query(image, frame.kind, frame.pose, **about))
+                rows.append((repr(frame.time), frame.pose))
+        write_lines(folder / f"{name}_poses.tum", tum_lines(rows, "optical"))
+    return queries
+
+
+def write_scene(
+    arguments: argparse.Namespace, seed: int, folder: Path, cameras: Calibration | None, workers: Workers
 ) -> dict[str, object]:
-    """Write one scene and return what was written."""
-    world, office = made.world, made.office
+    """Make and write one scene; returns what was written."""
+    office = None
+    size = np.array(arguments.size)
+    with checking_options():
+        check_width(arguments.width)
+        if is_building(arguments):
+            office = make_office(seed, size, arguments.rooms, max(1, arguments.storeys), arguments.twins)
+        world = office.world if office else make_world(seed, size, arguments.rooms)
+        usual = PART_POINTS * len(world.rooms) if office else ROOM_POINTS
+        num_points = usual if arguments.points is None else arguments.points
+        check_num_points(world, num_points)
     (folder / "images").mkdir(parents=True, exist_ok=True)
-    points, colors, labels = scan_world(world, made.num_points, workers)
+    points, colors, labels = scan_world(world, num_points, workers)
     rows = vertex_rows(points, colors, labels.astype(np.int32) if arguments.labels else None)
     write_ply(folder / scenes.CLOUD_NAME, rows)
     if office is not None and arguments.walk:
         queries = write_walks(arguments, office, folder, workers)
     else:
-        queries = write_queries(arguments, world, folder, cameras, workers)
-    corners = [room.corner.tolist() for room in world.rooms[: office.num_rooms]] if office else []
-    source = {"source": {"corners": corners, "copies": office.copies.tolist()}} if office else {}
+        queries = write_photos(arguments, world, folder, cameras, workers)
+    source: dict[str, object] = {}
+    if office is not None:
+        corners = [room.corner.tolist() for room in world.rooms[: office.num_rooms]]
+        source["source"] = {"corners": corners, "copies": office.copies.tolist()}
     scenes.write_queries(folder, queries, **source)
-    return {"folder": str(folder), "points": len(points), "queries": len(queries), "seed": world.seed}
-
-
-def made_of(arguments: argparse.Namespace, seed: int) -> Made:
-    """The rooms of a seed, and what was asked for of them; a UsageError if that makes no sense."""
-    with checking_options():
-        check_width(arguments.width)
-        office = building_of(arguments, seed)
-        world = office.world if office else make_world(seed, np.array(arguments.size), arguments.rooms)
-        num_points = PART_POINTS * len(world.rooms) if office else ROOM_POINTS
-        num_points = num_points if arguments.points is None else arguments.points
-        check_num_points(world, num_points)
-    return Made(world, office, num_points)
+    return {"folder": str(folder), "points": len(points), "queries": len(queries), "seed": seed}
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
 def main(arguments: argparse.Namespace) -> int:
     """Make and write all scenes."""
-    check_least(arguments, panoramas=0, seed=0, scenes=0, storeys=0, walks=1)
     check_folder_name("--out", arguments.out)
     cameras = read_cameras(arguments.camera) if arguments.camera else None
-    if cameras is not None:
-        with checking_options():
-            check_can_be_made(cameras, arguments.labels)
     with checking_options():
-        check_walk_usage(arguments)
+        check_usage(arguments)
+        if cameras is not None:
+            check_cameras(cameras)
     if arguments.video:
         import_optional("--video", "av", "video")
     workers = Workers(num_cores(), progress_bar(arguments.quiet))
     for number in range(max(1, arguments.scenes)):
-        made = made_of(arguments, arguments.seed + number)
         folder = arguments.out / f"{number:03}" if arguments.scenes else arguments.out
-        print(json.dumps(write_world(arguments, made, folder, cameras, workers)), flush=True)
+        line = write_scene(arguments, arguments.seed + number, folder, cameras, workers)
+        print(json.dumps(line), flush=True)
     return 0

@@ -20,21 +20,24 @@ from ..geometry.rotations import R_cam_from_angles
 from ..jobs.threads import Workers, num_cores
 from ..optimize.descent_animation import (
     FRAME_WIDTH,
+    FRAMES_PER_S,
     frames_of,
+    gif_of,
     perturb_pose,
     refine_with_history,
-    write_animation,
 )
 from ..optimize.settings import DescentSettings
+from ..optional import import_optional
 from ..panorama import read_panorama
 from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
 from ..result import read_results
 from ..scan_map.open_map import open_points
+from ..scenes.export.video import writing_video
 from ..scenes.scene import read_scene
 from ..views.pictures import cut_view, encode_image, fill_holes, sphere_width_for
 from ..views.surfels import render_points
-from .command import check_least, command, option, print_warnings
+from .command import command, option, print_warnings
 from .errors import checking_options
 from .options import add_cloud_options, cloud_settings_from
 from .outputs import check_distinct, check_suffix, print_report
@@ -44,23 +47,26 @@ from .transform_file import read_pose_matrix
 EPILOG = """\
 examples:
   python tools/render_pose.py --cloud scan.ply --result pose.json --out seen.png --depth depth.png
-  python tools/render_pose.py --cloud scan.ply --at 3 2 1.5 --heading 90 --holes mark --out east.png
-  python tools/render_pose.py --cloud scan.ply --result pose.json --animate descent.gif --perturb 0.3 8
+  python tools/render_pose.py --cloud scan.ply --at 3 2 1.5 --heading 90 --out east.png
+  python tools/render_pose.py --cloud scan.ply --result pose.json --animate descent.gif
 
 Angles as in docs/CONVENTIONS.md, Exports: heading clockwise from the world's +y. Each point is a disc over
-its nearest neighbours; what no disc covers is a hole. --depth: range along the ray. PNG: 16 bit,
+its nearest neighbours; what no disc covers is filled from around. --depth: range along the ray. PNG: 16 bit,
 millimetres, 0 where nothing is seen, 65535 for 65.535 m and farther. NPY: float32, metres, inf where nothing
 is seen. --mask-out: white where nothing is seen, as --mask of localize.py takes it.
 An output - is stdout: PNG, of --animate GIF. One JSON object a picture on stdout, or stderr if that is taken.
 """
-MAX_WIDTH, MIN_WIDTH = 32_768, 16
-MAGENTA = (255, 0, 255)  # a colour that scans do not have
+MAX_WIDTH = 32_768
+MIN_WIDTH = 16
 DESCENT_WIDTH = 1024  # of the panorama
+DESCENT = DescentSettings(solver="adam")
+START_DISTANCE = 0.3  # of a descent from the pose [m]
+START_ANGLE_DEG = 8.0
 SUFFIXES = {  # of outputs, those of stdout and devices first; "" is a folder
     "out": (".png", ".jpg", ".jpeg", ""),
     "depth": (".png", ".npy"),
     "mask_out": (".png",),
-    "animate": (".gif", ".mp4", ""),
+    "animate": (".gif", ".mp4"),
 }
 
 
@@ -89,18 +95,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(group, "--width PX", "of a sphere twice the height", default=2048)
     text = "draw what this camera sees (docs/CAMERAS.md; default: that of --result, or else the sphere)"
     option(group, "--camera FILE", text)
-    text = "fill them from around, mark them magenta, or leave them black"
-    option(group, "--holes", text, choices=["close", "mark", "black"], default="close")
     option(group, "--depth FILE", ".png or .npy, see below")
     option(group, "--mask-out PNG", "where nothing is seen")
-    group = parser.add_argument_group("descent")
-    text = ".gif, .mp4 or a new folder: the descent on the sampling loss, from a start near the pose"
+    text = ".gif or .mp4 (extra video): the descent on a panorama's sampling loss from near its pose"
     option(group, "--animate FILE", text)
-    option(group, "--photo FILE", "panorama (default: that of the result)")
-    option(group, "--start X Y Z", "begin here, turned as the pose (default: at the pose, perturbed)")
-    option(group, "--perturb M DEG", "distance and angle of the start from the pose", default=(0.3, 8.0))
-    option(group, "--seed N", "of the directions of --perturb", default=0)
-    option(group, "--solver", choices=["adam", "lbfgs", "gauss-newton"], default="adam")
 
 
 def check_usage(arguments: argparse.Namespace) -> None:
@@ -118,16 +116,14 @@ def check_usage(arguments: argparse.Namespace) -> None:
 
 
 def check_pose_options(arguments: argparse.Namespace) -> None:
-    """The same of the options that say where the camera is."""
-    angles = arguments.heading, arguments.pitch, arguments.roll
+    """Refuse options that do not go with where the pose is from."""
+    angles = [arguments.heading, arguments.pitch, arguments.roll]
     if not arguments.at and any(angle is not None for angle in angles):
         raise InputError("--heading, --pitch, --roll: only with --at")
-    if (arguments.at or arguments.pose) and arguments.animate and not arguments.photo:
-        raise InputError("--animate: no panorama; name it with --photo")
-    numbers = [*(arguments.at or ()), *(arguments.start or ()), *(angle or 0.0 for angle in angles)]
-    if not np.isfinite([*numbers, *arguments.perturb]).all():
-        raise InputError("--at, --start, --perturb and angles must be finite numbers")
-    check_least(arguments, seed=0)
+    if arguments.animate and not (arguments.result or arguments.queries):
+        raise InputError("--animate: only with --result or --queries, which name a panorama")
+    if not np.isfinite([*(arguments.at or ()), *(angle or 0.0 for angle in angles)]).all():
+        raise InputError("--at and angles must be finite numbers")
 
 
 def outputs_of(arguments: argparse.Namespace) -> dict[str, Path | None]:
@@ -148,17 +144,19 @@ def suffix_of(arguments: argparse.Namespace, name: str) -> str:
 
 def check_files(arguments: argparse.Namespace, poses: list[Shot]) -> None:
     """Refuse, before any work, what could not be written, or would replace an input."""
-    given = arguments.result, arguments.queries, arguments.pose, arguments.photo, arguments.camera
+    given = (arguments.result, arguments.queries, arguments.pose, arguments.camera)
     photos = [photo_of(arguments, shot.pano) for shot in poses]
     check_distinct(outputs_of(arguments), [*arguments.cloud, *filter(None, given), *photos])
     for path in filter(None, outputs_of(arguments).values()):
-        (check_output_folder if is_folder(path) else check_output)(path)
+        if is_folder(path):
+            check_output_folder(path)
+        else:
+            check_output(path)
 
 
 def photo_of(arguments: argparse.Namespace, name: str) -> Path:
-    """The panorama of a pose: the one given, or the one that the pose's file names."""
-    folder = arguments.queries.parent / "images" if arguments.queries else Path()
-    return arguments.photo or folder / name
+    """The panorama that a pose's file names."""
+    return arguments.queries.parent / "images" / name if arguments.queries else Path(name)
 
 
 def poses_from(arguments: argparse.Namespace) -> list[Shot]:
@@ -216,10 +214,7 @@ def draw_pictures(
         camera = shot.camera and shot.camera.scaled_to_width(arguments.width)
         width = sphere_width_for(camera) if camera else arguments.width
         view = render_points(cloud.points, cloud.from_world(shot.pose), width, workers)
-        if arguments.holes == "mark":
-            view.rgb[~view.is_seen] = MAGENTA
-        elif arguments.holes == "close":
-            view = view._replace(rgb=fill_holes(view.rgb, view.is_seen))
+        view = view._replace(rgb=fill_holes(view.rgb, view.is_seen))
         view = cut_view(view, camera) if camera else view
         seen_fraction = round(float(view.is_seen.mean()), 6)
         if arguments.depth:
@@ -244,16 +239,17 @@ def animate(arguments: argparse.Namespace, cloud: LocalCloud, poses: list[Shot],
         raise InputError(f"{name}: found a photo by the model {camera.model}, --animate wanted a sphere")
     panorama = shrink(read_panorama(photo_of(arguments, name)), DESCENT_WIDTH)
     goal = cloud.from_world(pose)
-    if arguments.start:
-        start = cloud.from_world(Pose(pose.R_cam_from_world, np.array(arguments.start)))
-    else:
-        distance, angle_deg = arguments.perturb
-        start = perturb_pose(goal, distance, angle_deg, arguments.seed)
+    start = perturb_pose(goal, START_DISTANCE, START_ANGLE_DEG)
     texels = pack_texels(panorama.rgb, panorama.is_valid)
-    settings = DescentSettings(solver=arguments.solver)
-    refined, history = refine_with_history(cloud.points, texels, start, settings)
+    refined, history = refine_with_history(cloud.points, texels, start, DESCENT)
     frames = frames_of(cloud.points, panorama, history, FRAME_WIDTH, workers)
-    write_animation(arguments.animate, frames, suffix_of(arguments, "animate"))
+    if suffix_of(arguments, "animate") == ".gif":
+        write_atomically(arguments.animate, gif_of(frames))
+    else:
+        height, width = frames[0].shape[:2]
+        with writing_video(arguments.animate, FRAMES_PER_S, (width, height)) as add:
+            for frame in frames:
+                add(frame)
     line: dict[str, object] = {"out": str(arguments.animate), "pano": name, "frames": len(frames)}
     for label, at in (("start", start), ("end", refined.pose)):
         distance, angle = pose_errors(at, goal)
@@ -267,6 +263,8 @@ def main(arguments: argparse.Namespace) -> int:
     """Read, draw, write."""
     with checking_options():
         check_usage(arguments)
+    if arguments.animate and suffix_of(arguments, "animate") == ".mp4":
+        import_optional("--animate", "av", "video")
     poses = poses_from(arguments)
     check_files(arguments, poses)
 

@@ -1,4 +1,4 @@
-"""The paper's experiments on scenes with true poses: a table beside the paper's figures, and a plot."""
+"""The paper's experiments on scenes with true poses: a table beside the paper's figures."""
 
 import argparse
 import tempfile
@@ -18,13 +18,13 @@ from ..paper.settings import PaperSettings
 from ..scan_map.open_map import CachePolicy
 from ..scenes.evaluation.query_result import QueryResult
 from ..scenes.evaluation.runs import input_files
-from ..scenes.reproduce_paper.experiments import EXPERIMENTS, Condition, Settings, plot_png, table
+from ..scenes.reproduce_paper import EXPERIMENTS, Condition, Settings, table
 from ..scenes.scene import Scene, find_scenes
 from .command import check_least, command, option
 from .errors import EXIT_BAD_INPUT, checking_options, print_error
 from .evaluating import run_scenes
 from .executing import check_execution
-from .options import add_execution_options, parse_settings
+from .options import add_execution_options
 from .outputs import check_distinct, check_folder_name
 
 _EXPERIMENTS = "\n".join(f"  {name:<15} {experiment.title}" for name, experiment in EXPERIMENTS.items())
@@ -36,10 +36,13 @@ examples:
 experiments:
 {_EXPERIMENTS}
 
-Writes OUT/NAME.md, OUT/NAME.png and OUT/NAME/CONDITION_PRESET.jsonl, runs that tools/evaluate.py compares.
+Writes OUT/NAME.md and OUT/NAME/CONDITION_PRESET.jsonl, runs that tools/evaluate.py compares.
 The same command resumes an experiment that was stopped. Changed clouds and images are temporary.
 """
-PRESETS = ("paper", "default")
+PRESETS: dict[str, Settings] = {
+    "paper": PaperSettings(),
+    "default": CoarseToFineSettings(gravity="known"),
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,11 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--scenes FOLDER ...", required=True)
     option(parser, "--out FOLDER", "made if it is not there", required=True)
     option(parser, "--variants NAME ...", "only these splits", default=[])
-    option(parser, "--presets", nargs="+", choices=PRESETS, default=PRESETS)
-    text = (
-        "settings of the preset paper, where the experiment does not vary them, such as num_translations=100"
-    )
-    option(parser, "--settings NAME=VALUE ...", text, default=[])
+    option(parser, "--presets", nargs="+", choices=PRESETS, default=list(PRESETS))
     add_execution_options(parser)
     parser.set_defaults(jobs=1, mask=None)
 
@@ -100,7 +99,7 @@ def run_condition(
 def run_experiment(
     name: str, scenes: Sequence[Scene], presets: Sequence[Settings], arguments: argparse.Namespace
 ) -> int:
-    """All conditions of an experiment, its table and plot; returns how many queries were not localized."""
+    """All conditions of an experiment and its table; returns how many queries were not localized."""
     experiment = EXPERIMENTS[name]
     folder: Path = arguments.out / name
     variants = sorted({query.variant for scene in scenes for query in scene.queries})
@@ -109,7 +108,7 @@ def run_experiment(
     found = []
     conditions = experiment.conditions_of(presets, variants)
     files = [folder / file_name(condition) for condition in conditions]
-    files += [folder.with_name(f"{name}{suffix}") for suffix in (".md", ".png")]
+    files.append(arguments.out / f"{name}.md")
     check_distinct({file.name: file for file in files}, input_files(scenes))
     folder.mkdir(parents=True, exist_ok=True)
     for condition in conditions:
@@ -124,7 +123,6 @@ def run_experiment(
     text = table(title, found).markdown()
     print(text, flush=True)
     write_atomically(arguments.out / f"{name}.md", text.encode())
-    write_atomically(arguments.out / f"{name}.png", plot_png(experiment.title, found))
     return num_failed
 
 
@@ -136,9 +134,7 @@ def main(arguments: argparse.Namespace) -> int:
     with checking_options():
         check_execution(arguments)
         limit_memory(arguments.max_memory)
-        paper = PaperSettings(**parse_settings("paper", arguments.settings))
-    settings: dict[str, Settings] = {"paper": paper, "default": CoarseToFineSettings(gravity="known")}
-    presets = [settings[name] for name in arguments.presets]
+    presets = [PRESETS[name] for name in arguments.presets]
     scenes = find_scenes(arguments.scenes)
     failed = [run_experiment(name, scenes, presets, arguments) for name in arguments.names]
     return EXIT_BAD_INPUT if any(failed) else 0

@@ -1,24 +1,20 @@
 """A descent as an animation: panorama, cloud at each pose on the way, checkerboard of both."""
 
-import tempfile
 from collections.abc import Sequence
 from io import BytesIO
-from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
+import PIL.Image
 from numpy.typing import NDArray
-from PIL import Image
 
 from ..cloud.soa import PackedPoints
-from ..errors import InputError
-from ..files.atomic import replacing_folder, write_atomically
 from ..geometry.pose import Pose, step
 from ..jobs.threads import Workers
 from ..panorama import Panorama
 from ..panorama.texels import Texels
-from ..views.pictures import checkerboard, encode_image, fill_holes, resized_rgb
+from ..views.pictures import checkerboard, fill_holes, resized_rgb
 from ..views.surfels import render_surfels, surfels_of, visible_indices
 from .refine import Refined, refine, sampling_loss_of
 from .settings import DescentSettings
@@ -30,7 +26,7 @@ MAX_FRAMES = 60  # of more poses, this many are drawn, evenly spaced
 FRAMES_PER_S = 8
 NUM_LAST = 12  # times that the last frame is repeated
 
-Frames = Sequence[NDArray[np.uint8]]  # (H, W, 3) RGB each, all of one size
+Image = NDArray[np.uint8]  # (H, W, 3) RGB
 
 
 class Iterate(NamedTuple):
@@ -41,9 +37,9 @@ class Iterate(NamedTuple):
     loss: float
 
 
-def perturb_pose(pose: Pose, distance: float, angle_deg: float, seed: int) -> Pose:
+def perturb_pose(pose: Pose, distance: float, angle_deg: float) -> Pose:
     """`pose` moved by `distance` [m] and turned by `angle_deg`, each in a direction drawn at random."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     turn, move = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     return step(pose, np.concatenate([np.radians(angle_deg) * turn, distance * move]))
 
@@ -52,65 +48,45 @@ def refine_with_history(
     points: PackedPoints, texels: Texels, start: Pose, settings: DescentSettings
 ) -> tuple[Refined, list[Iterate]]:
     """The result of `refine`, and its iterates without those that a line search or the damping rejected."""
-    history: list[Iterate] = []
-    num_tried, least, last_part = 0, np.inf, -1
+    tried: list[tuple[int, Iterate]] = []
 
     def watch(part: int, pose: Pose, loss: float) -> None:
-        nonlocal num_tried, least, last_part
-        least = loss if part != last_part else min(least, loss)
-        if settings.solver == "adam" or loss == least:
-            history.append(Iterate(num_tried, pose, loss))
-        num_tried, last_part = num_tried + 1, part
+        tried.append((part, Iterate(len(tried), pose, loss)))
 
     refined = refine(points, sampling_loss_of(texels), start, settings, watch)
-    history.append(Iterate(num_tried, refined.pose, refined.loss))
-    return refined, history
+    history = []
+    least: dict[int, float] = {}  # by the descent's part
+    for part, iterate in tried:
+        if settings.solver == "adam" or iterate.loss <= least.get(part, np.inf):
+            history.append(iterate)
+        least[part] = min(iterate.loss, least.get(part, np.inf))
+    return refined, [*history, Iterate(len(tried), refined.pose, refined.loss)]
 
 
 def frames_of(
     points: PackedPoints, panorama: Panorama, history: Sequence[Iterate], width: int, workers: Workers
-) -> list[NDArray[np.uint8]]:
-    """One image (H, W, 3) for each pose, with iteration and loss written on top."""
+) -> list[Image]:
+    """One image for each pose, with iteration and loss written on top; the last one stays for a while."""
     ends = [visible_indices(points, p.pose.center_world) for p in (history[0], history[-1])]
     surfels = surfels_of(points.take(np.union1d(*ends)).subsample(MAX_SURFELS), workers)
     photo = resized_rgb(panorama, width)
     chosen = np.unique(np.linspace(0, len(history) - 1, min(MAX_FRAMES, len(history))).astype(int))
 
-    def frame(k: int) -> NDArray[np.uint8]:
+    def frame(k: int) -> Image:
         view = render_surfels(surfels, history[k].pose, width, Workers(1))
         bar = np.zeros((TEXT_HEIGHT, width, 3), np.uint8)
         text = f"iteration {history[k].iteration}   loss {history[k].loss:.4f}"
         cv2.putText(bar, text, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
         return np.concatenate([bar, checkerboard(photo, fill_holes(view.rgb, view.is_seen))])
 
-    return list(workers.map(frame, chosen.tolist(), "frames"))
+    frames = list(workers.map(frame, chosen.tolist(), "frames"))
+    return [*frames, *[frames[-1]] * NUM_LAST]
 
 
-def write_animation(path: Path, frames: Frames, kind: str) -> None:
-    """Write a GIF or an MP4, by its suffix, or else PNG files into a new folder; whole or not at all."""
-    if kind in (".gif", ".mp4"):
-        held = [*frames, *[frames[-1]] * NUM_LAST]
-        file = BytesIO()
-        if kind == ".gif":
-            first, *others = map(Image.fromarray, held)
-            duration = 1000 // FRAMES_PER_S
-            first.save(file, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
-        write_atomically(path, file.getvalue() or _mp4(path, held))
-        return
-    with replacing_folder(path) as folder:
-        for k, frame in enumerate(frames):
-            (folder / f"{k:04d}.png").write_bytes(encode_image(frame, ".png"))
-
-
-def _mp4(path: Path, frames: Frames) -> bytes:
-    height, width = (size // 2 * 2 for size in frames[0].shape[:2])  # the codec takes even sizes only
-    with tempfile.TemporaryDirectory() as folder:
-        part = Path(folder) / "part.mp4"
-        writer = cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*"mp4v"), FRAMES_PER_S, (width, height))
-        for frame in frames:
-            writer.write(cv2.cvtColor(frame[:height, :width], cv2.COLOR_RGB2BGR))
-        writer.release()
-        content = part.read_bytes() if part.exists() else b""
-    if not content:
-        raise InputError(f"{path}: this OpenCV has no MP4 encoder; write a .gif or a folder instead")
-    return content
+def gif_of(frames: Sequence[Image]) -> bytes:
+    """An animated GIF of frames."""
+    file = BytesIO()
+    first, *others = map(PIL.Image.fromarray, frames)
+    duration = 1000 // FRAMES_PER_S
+    first.save(file, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
+    return file.getvalue()

@@ -26,8 +26,7 @@ from .sampling_loss import sampling_loss
 POOL_PER_POINT = 8  # points that may be visible, for one that is used
 FREE_SPACE_WIDTH = 32  # [px] of the view that tests for free space
 MIN_CLEARANCE = 0.2  # [m] to the nearest point
-MAX_PIXELS = 1500  # of the plan, the longer way
-MIN_PIXEL = 0.03  # [m]
+WALL_POINTS = 200_000  # of the cloud that are drawn
 MARKS = {"true": ("*", "white", 260), "found": ("X", "red", 110), "lowest": ("o", "none", 130)}
 
 KnownPoses = dict[str, Pose]  # in the frame of the points, by "true" and "found", as far as they are known
@@ -43,7 +42,7 @@ class PoseGrid(NamedTuple):
 
     @property
     def num_poses(self) -> int:
-        """How many there are."""
+        """The number of poses."""
         return len(self.x) * len(self.y) * len(self.heights) * len(self.R_cam_from_local)
 
 
@@ -73,22 +72,17 @@ class LossSurface(NamedTuple):
 
 
 def loss_surface(
-    points: PackedPoints,
-    texels: Texels,
-    grid: PoseGrid,
-    max_points: int,
-    use_visibility: bool,
-    workers: Workers,
+    points: PackedPoints, texels: Texels, grid: PoseGrid, max_points: int, workers: Workers
 ) -> LossSurface:
-    """The least loss over heights and rotations at each place, from at most `max_points` a position."""
-    pool = points.subsample(POOL_PER_POINT * max_points if use_visibility else max_points)
+    """The least loss over heights and rotations at each place, from at most `max_points` seen from it."""
+    pool = points.subsample(POOL_PER_POINT * max_points)
 
     def best(cell: int) -> tuple[float, float, int, bool]:
         row, column = divmod(cell, len(grid.x))
         tried = []
         for z in grid.heights:
             center = np.array([grid.x[column], grid.y[row], z])
-            seen = visible_points(pool, center) if use_visibility else pool
+            seen = visible_points(pool, center)
             is_free = is_free_space(seen, center, FREE_SPACE_WIDTH, MIN_CLEARANCE)
             some = seen.subsample(max_points)
             losses = [sampling_loss(some, texels, Pose(R, center)) for R in grid.R_cam_from_local]
@@ -106,39 +100,26 @@ def plan_shift(cloud: LocalCloud) -> Array:
     return np.asarray(cloud.R_local_from_world @ cloud.origin_world)
 
 
-def plan_of(cloud: LocalCloud, grid: PoseGrid) -> tuple[NDArray[np.float32], tuple[float, ...]]:
-    """Where walls and furniture are, (rows, columns) in [0, 1] from -y, and the edges x0, x1, y0, y1 [m]."""
-    p = cloud.points
-    floor, ceiling = np.percentile(p.z, [1.0, 99.0])
-    inside = (p.z > floor + 0.15 * (ceiling - floor)) & (p.z < ceiling - 0.15 * (ceiling - floor))
-    edges = (grid.x[0], grid.x[-1], grid.y[0], grid.y[-1])
-    pixel = max(MIN_PIXEL, (edges[1] - edges[0]) / MAX_PIXELS, (edges[3] - edges[2]) / MAX_PIXELS)
-    bins = [max(1, round((edges[k + 1] - edges[k]) / pixel)) for k in (0, 2)]
-    limits = ((edges[0], edges[1] + 1e-6), (edges[2], edges[3] + 1e-6))
-    counts = np.histogram2d(p.x[inside], p.y[inside], bins=bins, range=limits)[0].T
-    many = max(float(np.percentile(counts[counts > 0], 90.0)) if counts.any() else 1.0, 1.0)
-    return np.minimum(counts / many, 1.0).astype(np.float32), edges
-
-
 def surface_png(
     surface: LossSurface, grid: PoseGrid, cloud: LocalCloud, known: KnownPoses, title: str
 ) -> bytes:
     """PNG of the surface over the plan, with the known poses marked."""
     shift = plan_shift(cloud)
-    plan, edges = plan_of(cloud, grid)
-    extent = np.array(edges) + shift[[0, 0, 1, 1]]
-    aspect = (extent[3] - extent[2] + 1.0) / (extent[1] - extent[0] + 1.0)
+    x = grid.x + shift[0]
+    y = grid.y + shift[1]
+    aspect = (y[-1] - y[0] + 1.0) / (x[-1] - x[0] + 1.0)
     figure = new_figure(figsize=(10.0, float(np.clip(8.5 * aspect + 1.0, 4.0, 16.0))), layout="constrained")
     axes = figure.add_subplot()
     loss = np.where(np.isfinite(surface.loss), surface.loss, np.nan)
-    x, y = grid.x + shift[0], grid.y + shift[1]
     mesh = axes.pcolormesh(x, y, loss, cmap="viridis", shading="nearest")
     pale = np.zeros((*surface.is_free.shape, 4))
     pale[~surface.is_free] = (1.0, 1.0, 1.0, 0.55)
     axes.pcolormesh(x, y, pale, shading="nearest")
-    walls = np.zeros((*plan.shape, 4), np.float32)
-    walls[..., 3] = plan
-    axes.imshow(walls, extent=extent.tolist(), origin="lower", interpolation="nearest", zorder=2)
+    p = cloud.points.subsample(WALL_POINTS)
+    floor, ceiling = np.percentile(p.z, [1.0, 99.0])
+    is_wall = np.abs(p.z - (floor + ceiling) / 2) < 0.35 * (ceiling - floor)  # walls and furniture
+    axes.plot(p.x[is_wall] + shift[0], p.y[is_wall] + shift[1], "k,", alpha=0.3, zorder=2)
+    axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
     row, column = surface.lowest()
     marks = {"lowest": (x[column], y[row])}
     for name in ("found", "true"):
@@ -153,26 +134,4 @@ def surface_png(
     figure.colorbar(mesh, ax=axes, label="least sampling loss over height and rotation", shrink=0.8)
     file = BytesIO()
     figure.savefig(file, format="png", dpi=120)
-    return file.getvalue()
-
-
-def surface_npz(surface: LossSurface, grid: PoseGrid, cloud: LocalCloud, known: KnownPoses) -> bytes:
-    """NPZ of the surface and the known poses."""
-    shift = plan_shift(cloud)
-    positions = {f"{name}_world": np.full(3, np.nan) for name in ("found", "true")}
-    positions |= {f"{name}_world": cloud.to_world(pose).center_world for name, pose in known.items()}
-    rotations = grid.R_cam_from_local @ cloud.R_local_from_world
-    file = BytesIO()
-    np.savez_compressed(
-        file,
-        x=grid.x + shift[0],
-        y=grid.y + shift[1],
-        loss=surface.loss,
-        height=surface.height + shift[2],
-        R_cam_from_world=rotations[surface.rotation],
-        is_free=surface.is_free,
-        R_plan_from_world=cloud.R_local_from_world,
-        allow_pickle=False,
-        **positions,
-    )
     return file.getvalue()

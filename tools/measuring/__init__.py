@@ -1,1 +1,1 @@
-"""What tools/benchmark.py measures, a subcommand a module, and the made-up places that it needs."""
+"""The measurements of tools/benchmark.py, a subcommand a module, and the made-up places that it needs."""

@@ -62,7 +62,8 @@ def row(part: str, scenes: list[tuple[Scene, Cloud]]) -> str:
     """One line of the table."""
     counts = dict.fromkeys(VARIANTS, 0)
     totals = dict.fromkeys(VARIANTS, 0)
-    seconds, errors = [], []
+    seconds = []
+    errors = []
     workers = Workers(num_cores())
     method, search_view, max_starts = PARTS[part]
     for scene, cloud in scenes:

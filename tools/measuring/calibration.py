@@ -18,6 +18,7 @@ from piccolo.confidence.confidence import (
     FEATURES,
     LOCALIZED,
     MIN_CONFIDENCE,
+    MODEL,
     NONE_FEATURES,
     ChoiceModel,
     Standing,
@@ -30,6 +31,7 @@ from piccolo.confidence.covariance import PoseCovariance
 from piccolo.files.json_file import parse_lines, read_bytes
 from piccolo.geometry.pose import Pose, is_correct, log_so3
 from piccolo.result import Result
+from piccolo.scenes.evaluation.tables import Table
 
 EPILOG = """\
 example:
@@ -41,6 +43,7 @@ just learnt or else the one in use, and the fraction of true poses in the region
 """
 PENALTY = 0.05  # on squared weights of features of deviation 1: without, easy trials ask for ever larger ones
 Array = NDArray[np.float64]
+Case = tuple[str, str, bool]  # what was tried, the status, and whether the best pose is right
 
 
 class Outcome(NamedTuple):
@@ -50,48 +53,37 @@ class Outcome(NamedTuple):
     standings: list[Standing]  # the best first
     covariance: PoseCovariance | None
     right: int  # of the poses, or their number if none is
-    probabilities: Array  # (K + 1,) as the result has them
+    is_refused: bool  # as mirrored: no choice was made
     error: Array  # (6,) of the best pose, as PoseCovariance has it; NaN without truth
 
-    @property
-    def is_correct(self) -> bool:
-        """True if the best pose is right."""
-        return self.right == 0
-
-
-def read_outcomes(paths: Sequence[Path]) -> list[Outcome]:
-    """The trials of some files that came to a pose."""
-    wanted = "wanted a file of tools/benchmark.py confidence"
-    lines = [line for path in paths for line in parse_lines(path, read_bytes(path, wanted), outcome_of)]
-    return [outcome for outcome in lines if outcome is not None]
+    def probabilities(self, model: ChoiceModel) -> Array:
+        """Of each pose and of none (K + 1,)."""
+        if self.is_refused:
+            return np.append(np.zeros(len(self.standings)), 1.0)
+        return posterior(self.standings, self.covariance, model)
 
 
 def outcome_of(line: str) -> Outcome | None:
     """One line of tools/benchmark.py confidence; None if no pose was found, or one without probabilities."""
     trial = json.loads(line)
-    result, truth = Result.from_json(json.dumps(trial["result"])), trial["truth"]
+    result = Result.from_json(json.dumps(trial["result"]))
+    truth = trial["truth"]
     if result.best_pose is None or result.evidence is None or result.probability_none is None:
         return None
-    e, poses = result.evidence, [result.best_pose, *(a.pose for a in result.alternatives)]
-    standings = [Standing(1.0, e.score, CLEAR_MATCHES if e.num_matches is None else e.num_matches)]
-    standings += [
-        Standing(a.share or 0.0, a.score, CLEAR_MATCHES if a.num_matches is None else a.num_matches)
-        for a in result.alternatives
-    ]
-    error, right = np.full(6, np.nan), len(poses)
+    e = result.evidence
+    rows = [(1.0, e.score, e.num_matches)]
+    rows += [(a.share or 0.0, a.score, a.num_matches) for a in result.alternatives]
+    standings = [Standing(share, score, CLEAR_MATCHES if n is None else n) for share, score, n in rows]
+    poses = [result.best_pose, *(a.pose for a in result.alternatives)]
+    error = np.full(6, np.nan)
+    right = len(poses)
     if isinstance(truth, dict):
         true_pose = Pose(np.array(truth["R_cam_from_world"]), np.array(truth["center_world"]))
         turn = log_so3(true_pose.R_cam_from_world @ result.best_pose.R_cam_from_world.T)
         error = np.concatenate([turn, true_pose.center_world - result.best_pose.center_world])
         right = next((k for k, pose in enumerate(poses) if is_correct(pose, true_pose)), right)
-    stated = [result.confidence, *(a.probability or 0.0 for a in result.alternatives)]
-    is_refused = (
-        result.confidence == 0.0 and result.probability_none == 1.0
-    )  # as mirrored: no choice was made
-    probabilities = posterior(standings, result.covariance)
-    if is_refused:
-        probabilities = np.array([*stated, 1.0])
-    return Outcome(str(trial["case"]), standings, result.covariance, right, probabilities, error)
+    is_refused = result.confidence == 0.0 and result.probability_none == 1.0
+    return Outcome(str(trial["case"]), standings, result.covariance, right, is_refused, error)
 
 
 def fit(outcomes: Sequence[Outcome]) -> ChoiceModel:
@@ -101,7 +93,8 @@ def fit(outcomes: Sequence[Outcome]) -> ChoiceModel:
     deviations = np.concatenate([np.concatenate(poses).std(axis=0), [1.0, max(nones[:, 1].std(), 1e-9)]])
 
     def loss(w: Array) -> tuple[float, Array]:
-        total, gradient = 0.5 * PENALTY * w @ w, PENALTY * w
+        total = 0.5 * PENALTY * w @ w
+        gradient = PENALTY * w
         v = w / deviations
         for features, none, o in zip(poses, nones, outcomes, strict=True):
             logits = np.append(features @ v[:-2], none @ v[-2:])
@@ -117,53 +110,51 @@ def fit(outcomes: Sequence[Outcome]) -> ChoiceModel:
     return ChoiceModel(tuple(v[:-2].tolist()), (float(v[-2]), float(v[-1])))
 
 
-def with_model(outcome: Outcome, model: ChoiceModel) -> Outcome:
-    """The same by another model, but for photos that were refused before any choice."""
-    is_refused = outcome.probabilities[-1] == 1.0
-    chosen = posterior(outcome.standings, outcome.covariance, model)
-    return outcome if is_refused else outcome._replace(probabilities=chosen)
+def print_cases(title: str, rows: Sequence[Case]) -> int:
+    """Print the statuses of each case; returns the number of false answers."""
+    table = []
+    num_false = 0
+    for case in dict.fromkeys(case for case, _, _ in rows):
+        own = [(status, is_right) for other, status, is_right in rows if other == case]
+        statuses = [status for status, _ in own]
+        false = own.count((LOCALIZED, False))
+        right = sum(is_right for _, is_right in own)
+        counts = (len(own), right, statuses.count(LOCALIZED), statuses.count(AMBIGUOUS), false)
+        table.append((case, *map(str, counts)))
+        num_false += false
+    print(Table("", (title, "trials", "right", "localized", "ambiguous", "false"), tuple(table)).markdown())
+    return num_false
 
 
-def print_reliability(name: str, outcomes: Sequence[Outcome]) -> None:
-    """How many of the poses listed, and of the answers none, were right in each tenth of the probability."""
-    stated = np.concatenate([o.probabilities for o in outcomes])
-    right = np.concatenate([np.arange(len(o.probabilities)) == o.right for o in outcomes])
-    print(f"\n| probability, {name} | answers | mean stated | right |")
-    print("|---|---:|---:|---:|")
+def print_reliability(title: str, stated: Array, right: NDArray[np.bool_]) -> None:
+    """Print how many poses, and answers none, were right in each tenth of the probability."""
+    rows = []
     for low in np.arange(10) / 10:
         some = (stated >= low) & ((stated < low + 0.1) | (low == 0.9))
         if some.any():
-            means = f"{stated[some].mean():.3f} | {right[some].mean():.3f}"
-            print(f"| {low:.1f} to {low + 0.1:.1f} | {some.sum()} | {means} |")
+            means = (f"{stated[some].mean():.3f}", f"{right[some].mean():.3f}")
+            rows.append((f"{low:.1f} to {low + 0.1:.1f}", str(some.sum()), *means))
+    print(Table("", (title, "answers", "mean stated", "right"), tuple(rows)).markdown())
 
 
-def print_cases(name: str, outcomes: Sequence[Outcome]) -> None:
-    """The statuses of each case with the model in use."""
-    print(f"\n| case, {name} | trials | right | localized | ambiguous | false |")
-    print("|---|---:|---:|---:|---:|---:|")
-    for case in dict.fromkeys(o.case for o in outcomes):
-        some = [o for o in outcomes if o.case == case]
-        called = [classify(o.probabilities, MIN_CONFIDENCE) for o in some]
-        false = sum(s == LOCALIZED and not o.is_correct for s, o in zip(called, some, strict=True))
-        counts = sum(o.is_correct for o in some), called.count(LOCALIZED), called.count(AMBIGUOUS), false
-        print(f"| {case} | {len(some)} | {' | '.join(map(str, counts))} |")
-
-
-def print_coverage(name: str, outcomes: Sequence[Outcome]) -> None:
-    """The fraction of right poses whose error lies in the covariance's 95 % region."""
-    some = [o for o in outcomes if o.is_correct and o.covariance is not None]
-    if not some:
+def print_coverage(title: str, outcomes: Sequence[Outcome]) -> None:
+    """The fraction of right poses whose error lies in the covariance's regions."""
+    known = [(o.error, o.covariance.matrix) for o in outcomes if o.right == 0 and o.covariance is not None]
+    if not known:
         return
-    print(f"\n| covariance, {name} | right poses | in the 95 % region | in the 50 % region |")
-    print("|---|---:|---:|---:|")
-    errors = np.array([o.error for o in some])
-    matrices = np.array([o.covariance.matrix for o in some if o.covariance is not None])
-    parts = {"rotation and position": slice(6), "rotation": slice(3), "position": slice(3, 6)}
-    for part, rows in parts.items():
-        e = errors[:, rows, None]
-        squares = np.sum(e * np.linalg.solve(matrices[:, rows, rows], e), axis=(1, 2))
-        fractions = [np.mean(squares < chi2.ppf(p, e.shape[1])) for p in (0.95, 0.5)]
-        print(f"| {part} | {len(some)} | {fractions[0]:.3f} | {fractions[1]:.3f} |")
+    errors, matrices = (np.array(values) for values in zip(*known, strict=True))
+    rows = []
+    for part, own in {
+        "rotation and position": slice(6),
+        "rotation": slice(3),
+        "position": slice(3, 6),
+    }.items():
+        e = errors[:, own, None]
+        squares = np.sum(e * np.linalg.solve(matrices[:, own, own], e), axis=(1, 2))
+        fractions = [f"{np.mean(squares < chi2.ppf(p, e.shape[1])):.3f}" for p in (0.95, 0.5)]
+        rows.append((part, str(len(known)), *fractions))
+    columns = (title, "right poses", "in the 95 % region", "in the 50 % region")
+    print(Table("", columns, tuple(rows)).markdown())
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -175,16 +166,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Fit the weights, print the tables."""
-    sets = {"learnt from": read_outcomes(arguments.fit), "others": read_outcomes(arguments.check)}
-    sets = {k: [o for o in rows if o.case not in arguments.without] for k, rows in sets.items()}
+
+    def read(paths: Sequence[Path]) -> list[Outcome]:
+        wanted = "wanted a file of tools/benchmark.py confidence"
+        found = [o for path in paths for o in parse_lines(path, read_bytes(path, wanted), outcome_of)]
+        return [o for o in found if o is not None and o.case not in arguments.without]
+
+    learnt = read(arguments.fit)
+    sets = {"learnt from": learnt, "others": read(arguments.check)}
+    model = MODEL
     if arguments.fit:
-        model = fit(sets["learnt from"])
+        model = fit(learnt)
         for names, weights in ((FEATURES, model.weights), (NONE_FEATURES, model.none_weights)):
             print(", ".join(f"{name} {w:.2f}" for name, w in zip(names, weights, strict=True)))
-        sets = {k: [with_model(o, model) for o in rows] for k, rows in sets.items()}
     for name, outcomes in sets.items():
-        if outcomes:
-            print_cases(name, outcomes)
-            print_reliability(name, outcomes)
-            print_coverage(name, outcomes)
+        if not outcomes:
+            continue
+        stated = [o.probabilities(model) for o in outcomes]
+        right = [np.arange(len(p)) == o.right for p, o in zip(stated, outcomes, strict=True)]
+        called = [classify(p, MIN_CONFIDENCE) for p in stated]
+        rows = [(o.case, status, o.right == 0) for o, status in zip(outcomes, called, strict=True)]
+        print_cases(f"case, {name}", rows)
+        print_reliability(f"probability, {name}", np.concatenate(stated), np.concatenate(right))
+        print_coverage(f"covariance, {name}", outcomes)
     return 0

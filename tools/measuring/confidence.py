@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
@@ -12,34 +13,23 @@ from numpy.typing import NDArray
 
 from piccolo.cli.command import option
 from piccolo.cli.errors import print_note
-from piccolo.cloud import CloudStream, read_cloud, stream_of
+from piccolo.cloud import read_cloud, stream_of
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import IN_METRES
-from piccolo.confidence.confidence import AMBIGUOUS, LOCALIZED
 from piccolo.geometry.pose import Pose, is_correct
 from piccolo.geometry.rotations import Gravity
+from piccolo.geometry.sphere import pixel_rays, solid_angles
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers, num_cores
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.opening import scan_of
 from piccolo.panorama import AS_STORED, read_panorama
-from piccolo.paper.settings import PaperSettings
-from piccolo.result import Result
-from piccolo.scan import Settings
 from piccolo.scenes.scene import Scene, read_scene
-from piccolo.scenes.synthetic.world import (
-    VARIANTS,
-    World,
-    blur,
-    make_query,
-    make_world,
-    random_size,
-    scan_world,
-)
+from piccolo.scenes.synthetic.room import PLAIN
+from piccolo.scenes.synthetic.world import VARIANTS, World, blur, make_query, make_world, scan_world
 
-from .alike import ALIKE_KINDS, CHANGED, make_alike
-from .damage import occluded, outside_field, unevenly_lit, without_texture
-from .repeated import REPEATED_KINDS, make_repeated
+from .calibration import Case, print_cases
+from .places import ALIKE_KINDS, CHANGED, REPEATED_KINDS, make_alike, make_repeated
 
 EPILOG = """\
 example:
@@ -54,6 +44,14 @@ POINTS_PER_ROOM = 120_000
 SPARSE_FRACTION = 0.05
 WALL_DEPTH = 0.15  # [m]
 BLUR = 0.02  # of the width: blurred beyond recognition
+OCCLUSIONS = (0.2, 0.4, 0.6)  # of the sphere
+LEAST_RADIUS = math.radians(8.0)  # of an occluder
+MOST_RADIUS = math.radians(28.0)
+FLATTENED = 0.4  # elevations of occluders: people and things stand around the camera
+LIGHT_SCALE = 0.08  # of the width: patches of light and shade
+FIELDS = (120.0, 90.0, 65.0)  # of narrow photos [deg]
+ASPECT = 0.75  # height by width of a narrow photo
+POSE = ("R_cam_from_world", "center_world")
 Image = NDArray[np.uint8]
 Points = tuple[NDArray[np.floating], NDArray[np.uint8]]
 
@@ -68,11 +66,50 @@ class Trial(NamedTuple):
     is_masked: NDArray[np.bool_] | None = None  # (H, W) what the photo does not show
 
 
-OCCLUSIONS, FIELDS = (0.2, 0.4, 0.6), (120.0, 90.0, 65.0)  # of the sphere; of narrow photos [deg]
+def occluded(rgb: Image, other: Image, fraction: float, rng: np.random.Generator) -> Image:
+    """The photo (H, W, 3) behind round pieces of another, over a fraction of the sphere."""
+    height, width = rgb.shape[:2]
+    rays = pixel_rays(width)
+    areas = solid_angles(width)[:, None] / (4.0 * math.pi)
+    is_hidden = np.zeros((height, width), np.bool_)
+    shown = rgb.copy()
+    while float((is_hidden * areas).sum()) < fraction:
+        direction = rng.normal(size=3) * [1.0, 1.0, FLATTENED]
+        radius = rng.uniform(LEAST_RADIUS, MOST_RADIUS)
+        is_new = (rays @ (direction / np.linalg.norm(direction)) > math.cos(radius)) & ~is_hidden
+        moved = np.roll(other, rng.integers(width), axis=1)[:: int(rng.choice([-1, 1]))]
+        shown[is_new] = moved[is_new]
+        is_hidden |= is_new
+    return shown
+
+
+def unevenly_lit(rgb: Image, stops: float, rng: np.random.Generator) -> Image:
+    """The photo (H, W, 3) under patches of light that differ by some stops."""
+    noise = blur(rng.normal(size=rgb.shape[:2])[..., None], LIGHT_SCALE * rgb.shape[1])
+    gain = 2.0 ** (0.5 * stops * noise / noise.std())
+    linear = (rgb / 255.0) ** 2.2 * gain
+    return np.asarray(255.0 * linear.clip(0.0, 1.0) ** (1.0 / 2.2), np.uint8)
+
+
+def outside_field(width: int, fov_deg: float, yaw: float) -> NDArray[np.bool_]:
+    """Mask (H, W) of a sphere outside a level pinhole photo this wide that looks along azimuth `yaw`."""
+    x, y, z = np.moveaxis(pixel_rays(width), -1, 0)
+    forward = math.cos(yaw) * x + math.sin(yaw) * y
+    left = math.cos(yaw) * y - math.sin(yaw) * x
+    reach = math.tan(math.radians(fov_deg / 2.0)) * forward
+    return np.asarray((forward <= 0.0) | (np.abs(left) > reach) | (np.abs(z) > ASPECT * reach))
+
+
+def without_texture(world: World) -> World:
+    """Rooms with every surface in one colour."""
+    plain = [(room, room.materials.copy()) for room in world.rooms]
+    for _, materials in plain:
+        materials[:, 0] = PLAIN
+    return world._replace(rooms=tuple(room._replace(materials=m) for room, m in plain))
 
 
 def damaged(trial: Trial, other: Image, rng: np.random.Generator) -> Iterator[Trial]:
-    """The same photo half hidden, in uneven light, narrow, and mirrored."""
+    """A photo half hidden, in uneven light, narrow, and mirrored."""
     for fraction in OCCLUSIONS:
         hidden = occluded(trial.rgb, other, fraction, rng)
         yield trial._replace(case=f"{trial.case}, hidden {fraction:.0%}", rgb=hidden)
@@ -87,13 +124,15 @@ def damaged(trial: Trial, other: Image, rng: np.random.Generator) -> Iterator[Tr
     yield Trial(f"{trial.case}, mirrored", mirrored, None, "unknown")
 
 
-def without_scene(rgb: Image, rng: np.random.Generator) -> Iterator[tuple[str, Image]]:
-    """Images of the same size that show no place."""
-    yield "black", np.zeros_like(rgb)
-    yield "white", np.full_like(rgb, 255)
-    yield "noise", rng.integers(0, 256, rgb.shape, dtype=np.uint8)
-    yield "cloudy", fractal_noise(rgb.shape, rng)
-    yield "blurred", np.asarray(blur(rgb.astype(float), BLUR * rgb.shape[1]), np.uint8)
+def without_scene(trial: Trial, rng: np.random.Generator) -> Iterator[Trial]:
+    """Images like a photo's that show no place; a blurred panorama keeps its true pose."""
+    rgb = trial.rgb
+    yield Trial("black", np.zeros_like(rgb), None)
+    yield Trial("white", np.full_like(rgb, 255), None)
+    yield Trial("noise", rng.integers(0, 256, rgb.shape, dtype=np.uint8), None)
+    yield Trial("cloudy", fractal_noise(rgb.shape, rng), None)
+    blurred = np.asarray(blur(rgb.astype(float), BLUR * rgb.shape[1]), np.uint8)
+    yield Trial("blurred", blurred, trial.true_pose)
 
 
 def fractal_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Image:
@@ -106,13 +145,25 @@ def fractal_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Image:
 
 
 def upside_down(trial: Trial) -> Trial:
-    """The same panorama held by a camera turned over, searched as if it were upright."""
+    """A panorama held by a camera turned over, searched as if it were upright."""
     rgb = np.ascontiguousarray(trial.rgb[::-1, ::-1])
     if trial.true_pose is None:
         return Trial("upside down", rgb, None, "known")
     turn = np.diag([1.0, -1.0, -1.0])  # half a turn about the image centre: columns and rows run backwards
     pose = Pose(turn @ trial.true_pose.R_cam_from_world, trial.true_pose.center_world)
     return Trial("upside down", rgb, pose, "known")
+
+
+def thinned(points: Points, rng: np.random.Generator) -> Points:
+    """A few of the points, in order."""
+    count = len(points[0])
+    chosen = np.sort(rng.choice(count, int(SPARSE_FRACTION * count), replace=False))
+    return points[0][chosen], points[1][chosen]
+
+
+def random_size(rng: np.random.Generator) -> NDArray[np.float64]:
+    """Size (3,) of a room [m], from a box room to a hall."""
+    return rng.uniform([3.5, 3.0, 2.3], [9.0, 7.0, 3.4])
 
 
 def room_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[Trial]]]:
@@ -122,23 +173,22 @@ def room_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[Tria
     world = make_world(seed, size, int(rng.integers(1, 4)))
     other = make_world(seed + 100_000, size, 1)  # of the same shape
     if seed % 3 == 2:  # a third of the rooms
-        world, other = without_texture(world), without_texture(other)
+        world = without_texture(world)
+        other = without_texture(other)
     cloud = scan_world(world, POINTS_PER_ROOM * len(world.rooms), workers)[:2]
     right = [_trial(world, variant, variant, workers) for variant in VARIANTS]
-    trials = [*right, Trial("elsewhere", _trial(other, "", "clean", workers).rgb, None)]
-    trials.append(Trial("elsewhere", _trial(other, "", "photo", workers).rgb, None))
-    for name, rgb in without_scene(right[0].rgb, rng):  # a blurred panorama keeps its true pose
-        trials.append(Trial(name, rgb, right[0].true_pose if name == "blurred" else None))
+    elsewhere = [_trial(other, "elsewhere", variant, workers) for variant in ("clean", "photo")]
+    trials = [*right, *(trial._replace(true_pose=None) for trial in elsewhere)]
+    trials += without_scene(right[0], rng)
     trials.append(upside_down(right[0]))
     another = _trial(other, "another place", "clean", workers, 1)._replace(true_pose=None)
     for trial in (right[0], another):
         trials += damaged(trial, _trial(other, "", "clean", workers, 2).rgb, rng)
     yield cloud, trials
-    sparse = np.sort(rng.choice(len(cloud[0]), int(SPARSE_FRACTION * len(cloud[0])), replace=False))
-    thin = Trial("sparse", right[0].rgb, right[0].true_pose), Trial("sparse, elsewhere", trials[4].rgb, None)
-    yield (cloud[0][sparse], cloud[1][sparse]), list(thin)
+    thin = [right[0]._replace(case="sparse"), trials[4]._replace(case="sparse, elsewhere")]
+    yield thinned(cloud, rng), thin
     wall = np.flatnonzero(cloud[0][:, 0] < cloud[0][:, 0].min() + WALL_DEPTH)
-    yield (cloud[0][wall], cloud[1][wall]), [Trial("one wall", r.rgb, r.true_pose) for r in right[:2]]
+    yield (cloud[0][wall], cloud[1][wall]), [r._replace(case="one wall") for r in right[:2]]
 
 
 def repeated_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[Trial]]]:
@@ -171,70 +221,31 @@ def _trial(world: World, case: str, variant: str, workers: Workers, index: int =
     return Trial(case, query.rgb, query.pose)
 
 
-def cloud_of(points: Points) -> CloudStream:
-    """Points as a stream, as if read from a file."""
-    return stream_of(Path("trial"), RawCloud(points[0].astype(np.float64), points[1]))
-
-
-def scene_trials(scene: Scene, others: Sequence[Scene]) -> Iterator[tuple[CloudStream, list[Trial]]]:
+def scene_trials(scene: Scene, others: Sequence[Scene]) -> Iterator[tuple[Points, list[Trial]]]:
     """Every panorama of every scene in one scene's cloud; its own also spoilt, and in a thinned cloud."""
     cloud = read_cloud(scene.cloud)
     rng = np.random.default_rng([len(scene.queries), 52])
     own = [Trial(query.variant, read_panorama(query.image).rgb, query.pose) for query in scene.queries]
     upright = [trial for trial in own if trial.case == "clean"]
-    spoilt = [Trial(name, rgb, t.true_pose if name == "blurred" else None)
-              for t in upright[:2] for name, rgb in without_scene(t.rgb, rng)]  # fmt: skip
+    spoilt = [spoilt for trial in upright[:2] for spoilt in without_scene(trial, rng)]
     foreign = [query.image for other in others for query in other.queries]
     elsewhere = [Trial("elsewhere", read_panorama(image).rgb, None) for image in foreign]
-    points_world = cloud.points + cloud.origin_world
-    yield cloud_of((points_world, cloud.colors)), [*own, *elsewhere, *spoilt, *map(upside_down, upright)]
-    sparse = np.sort(rng.choice(len(points_world), int(SPARSE_FRACTION * len(points_world)), replace=False))
-    thinned = cloud_of((points_world[sparse], cloud.colors[sparse]))
-    yield thinned, [Trial("sparse", t.rgb, t.true_pose) for t in upright]
+    points = (cloud.points + cloud.origin_world, cloud.colors)
+    yield points, [*own, *elsewhere, *spoilt, *map(upside_down, upright)]
+    yield thinned(points, rng), [trial._replace(case="sparse") for trial in upright]
 
 
-def all_trials(
-    arguments: argparse.Namespace, workers: Workers
-) -> Iterator[tuple[str, CloudStream, list[Trial]]]:
-    """Name of a scene, its cloud, its trials."""
+def all_trials(arguments: argparse.Namespace, workers: Workers) -> Iterator[tuple[str, Points, list[Trial]]]:
+    """Name of a scene, its points, its trials."""
     for seed in range(*arguments.seeds):
         alike = alike_trials(seed, arguments.kinds, workers)
         for points, trials in chain(room_trials(seed, workers), repeated_trials(seed, workers), alike):
-            yield f"seed {seed}", cloud_of(points), trials
+            yield f"seed {seed}", points, trials
     scenes = [read_scene(folder) for folder in arguments.scenes]
     for scene in scenes:
         others = [other for other in scenes if other is not scene]
-        for cloud, trials in scene_trials(scene, others):
-            yield scene.name, cloud, trials
-
-
-def settings_of(preset: str, gravity: Gravity) -> Settings:
-    """The settings of a trial; the paper's method takes `auto` as `known`."""
-    if preset == "paper":
-        return PaperSettings(gravity="known" if gravity == "auto" else gravity)
-    return CoarseToFineSettings(gravity=gravity)
-
-
-def results_of(arguments: argparse.Namespace) -> Iterator[tuple[str, Trial, Result]]:
-    """Localize every trial; the scene's name, the trial and its result."""
-    workers = Workers(arguments.threads)
-    for name, cloud, trials in all_trials(arguments, workers):
-        settings = settings_of(arguments.preset, "auto")
-        scan = scan_of(cloud, name, IN_METRES, settings, workers, Stopwatch())
-        for trial in trials:
-            settings = settings_of(arguments.preset, trial.gravity)
-            yield name, trial, scan.localize_query(trial.rgb, AS_STORED, settings, trial.is_masked)
-
-
-def print_table(counts: dict[str, list[tuple[str, bool]]]) -> int:
-    """One line a case; returns the number of false answers."""
-    print("| case | trials | correct | localized | ambiguous | false |")
-    print("|---|---:|---:|---:|---:|---:|")
-    for case, rows in counts.items():
-        statuses, is_right = zip(*rows, strict=True)
-        numbers = len(rows), sum(is_right), statuses.count(LOCALIZED), statuses.count(AMBIGUOUS)
-        print(f"| {case} | {' | '.join(map(str, numbers))} | {rows.count((LOCALIZED, False))} |")
-    return sum(rows.count((LOCALIZED, False)) for rows in counts.values())
+        for points, trials in scene_trials(scene, others):
+            yield scene.name, points, trials
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -243,21 +254,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--kinds KIND ...", "alike places", choices=ALIKE_KINDS, default=list(ALIKE_KINDS))
     option(parser, "--scenes FOLDER ...", default=[])
     option(parser, "--out FILE", "JSON lines, written as they come", required=True)
-    option(parser, "--preset", choices=["default", "paper"], default="default")
     option(parser, "--threads N", default=num_cores())
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Localize every trial, write its line, print the table."""
-    counts: dict[str, list[tuple[str, bool]]] = {}
+    workers = Workers(arguments.threads)
+    rows: list[Case] = []
     with arguments.out.open("w") as file:
-        for scene, trial, result in results_of(arguments):
-            pose, names = trial.true_pose, ("R_cam_from_world", "center_world")
-            ok = pose is not None and is_correct(result.best_pose, pose)
-            counts.setdefault(trial.case, []).append((result.status, ok))
-            truth = pose and {name: getattr(pose, name).tolist() for name in names}
-            line = {"case": trial.case, "scene": scene, "truth": truth}
-            file.write(json.dumps(line | {"result": json.loads(result.to_json())}) + "\n")
-            file.flush()
-            print_note(arguments, f"{scene}: {trial.case}: {result.status}, {'right' if ok else 'wrong'}")
-    return 1 if print_table(counts) else 0
+        for scene, (points, colors), trials in all_trials(arguments, workers):
+            cloud = stream_of(Path("trial"), RawCloud(points.astype(np.float64), colors))
+            scan = scan_of(cloud, scene, IN_METRES, CoarseToFineSettings(), workers, Stopwatch())
+            for trial in trials:
+                settings = CoarseToFineSettings(gravity=trial.gravity)
+                result = scan.localize_query(trial.rgb, AS_STORED, settings, trial.is_masked)
+                truth = trial.true_pose
+                ok = truth is not None and is_correct(result.best_pose, truth)
+                rows.append((trial.case, result.status, ok))
+                line = {
+                    "case": trial.case,
+                    "scene": scene,
+                    "truth": truth and {name: getattr(truth, name).tolist() for name in POSE},
+                }
+                file.write(json.dumps(line | {"result": json.loads(result.to_json())}) + "\n")
+                file.flush()
+                print_note(arguments, f"{scene}: {trial.case}: {result.status}, {'right' if ok else 'wrong'}")
+    return 1 if print_cases("case", rows) else 0

@@ -3,7 +3,6 @@
 import argparse
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,10 +15,11 @@ from piccolo.cloud.soa import PackedPoints, pack_points
 from piccolo.cloud.voxels import morton_order
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, yaw_rotation
-from piccolo.jobs.threads import num_cores
+from piccolo.jobs.threads import Workers, num_cores
 from piccolo.optimize.sampling_loss import sampling_equations, sampling_loss
 from piccolo.panorama import read_panorama
 from piccolo.panorama.texels import pack_texels
+from piccolo.scenes.synthetic.world import make_query, make_world, scan_world
 
 EPILOG = """\
 example:
@@ -32,31 +32,27 @@ The reference is cv2.remap: 8-bit, 3 channels, bilinear, one thread, a coherent 
 Case = tuple[PackedPoints, NDArray[np.uint8], Pose]  # what is timed: points, image (H, W, 3), pose
 
 
-def box_case(num_points: int, width: int) -> Case:
-    """Seeded points on the walls of a box, in Morton order, and a smooth image."""
-    rng = np.random.default_rng(0)
-    size = np.array([8.0, 6.0, 3.0])
-    points = rng.uniform(0.0, 1.0, (num_points, 3))
-    axis = rng.integers(0, 3, num_points)
-    points[np.arange(num_points), axis] = rng.integers(0, 2, num_points)
-    points = ((points - 0.5) * size).astype(np.float32)
-    colors = rng.integers(0, 256, (num_points, 3), dtype=np.uint8)
-    order = morton_order(points, colors)
-    noise = rng.integers(0, 256, (width // 2, width, 3), dtype=np.uint8)
-    rgb = np.asarray(cv2.GaussianBlur(noise, (0, 0), 2.0), dtype=np.uint8)
-    pose = Pose(yaw_rotation(0.7), np.array([0.5, -0.3, 0.1]))
-    return pack_points(points[order], colors[order]), rgb, pose
-
-
-def file_case(cloud_path: Path, pano_path: Path, num_points: int) -> Case:
-    """A user's cloud, `num_points` of it, and panorama, the camera at the middle of the cloud."""
-    cloud = read_cloud(cloud_path)
-    if len(cloud.points) < num_points:
-        raise InputError(f"{cloud_path}: found {len(cloud.points)} points, wanted --points {num_points}")
-    chosen = np.linspace(0, len(cloud.points) - 1, num_points).astype(np.int64)
-    pose = Pose(yaw_rotation(0.7), np.median(cloud.points, axis=0).astype(np.float64))
-    points = pack_points(cloud.points[chosen], cloud.colors[chosen])
-    return points, read_panorama(pano_path).rgb, pose
+def case_of(arguments: argparse.Namespace) -> Case:
+    """A user's scan and panorama, or those of a made room; the camera at the middle of the points."""
+    if arguments.cloud:
+        cloud = read_cloud(arguments.cloud)
+        points = cloud.points
+        colors = cloud.colors
+        rgb = read_panorama(arguments.pano).rgb
+    else:
+        workers = Workers(num_cores())
+        world = make_world(0, np.array([8.0, 6.0, 3.0]))
+        points, colors, _ = scan_world(world, arguments.points, workers)
+        rgb = make_query(world, 0, "clean", 1024, workers).rgb
+        order = morton_order(points, colors)
+        points = points[order]
+        colors = colors[order]
+    num_points = arguments.points
+    if len(points) < num_points:
+        raise InputError(f"{arguments.cloud}: found {len(points)} points, wanted --points {num_points}")
+    chosen = np.linspace(0, len(points) - 1, num_points).astype(np.int64)
+    pose = Pose(yaw_rotation(0.7), np.median(points, axis=0).astype(np.float64))
+    return pack_points(points[chosen], colors[chosen]), rgb, pose
 
 
 def coherent_map(num_pixels: int, width: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -110,7 +106,7 @@ def run_kernels(case: Case, num_rounds: int) -> None:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
-    option(parser, "--cloud FILE", "a scan (default: a box with seeded points)")
+    option(parser, "--cloud FILE", "a scan (default: a made room)")
     option(parser, "--pano FILE", "a panorama, with --cloud")
     option(parser, "--points N", default=1_000_000)
     option(parser, "--rounds N", "at least 7", default=15)
@@ -122,9 +118,5 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("--cloud and --pano go together")
     if arguments.rounds < 7 or arguments.points < 1000:
         raise UsageError("wanted --rounds of at least 7 and --points of at least 1000")
-    if arguments.cloud:
-        case = file_case(arguments.cloud, arguments.pano, arguments.points)
-    else:
-        case = box_case(arguments.points, 2048)
-    run_kernels(case, arguments.rounds)
+    run_kernels(case_of(arguments), arguments.rounds)
     return 0

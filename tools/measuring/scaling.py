@@ -6,6 +6,7 @@ import resource
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -86,9 +87,10 @@ def size_and_opening(scan_map: ScanMap) -> tuple[str, str]:
         return f"{path.stat().st_size / 1e6:.1f}", f"{1000.0 * (time.perf_counter() - begin):.0f}"
 
 
-def measure(label: str, make: Callable[[], Case], results: "multiprocessing.Queue[str]") -> None:
-    """Put one row of the table."""
-    (cloud, queries), workers = make(), Workers(num_cores())
+def measure(label: str, make: Callable[[], Case]) -> str:
+    """One row of the table."""
+    cloud, queries = make()
+    workers = Workers(num_cores())
     every = max(1, len(cloud.points) // 20_000)
     small = Cloud(cloud.points[::every], cloud.colors[::every], cloud.origin_world)
     for gravity in GRAVITIES:  # compiles
@@ -97,19 +99,16 @@ def measure(label: str, make: Callable[[], Case], results: "multiprocessing.Queu
     before_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     begin = time.perf_counter()
     scan_map = prepare_map(cloud, workers, has_features=False)
-    columns = [
-        label,
-        str(len(cloud.points)),
-        str(len(scan_map.centers)),
-        f"{time.perf_counter() - begin:.1f}",
-    ]
+    columns = [label, str(len(cloud.points)), str(len(scan_map.centers))]
+    columns.append(f"{time.perf_counter() - begin:.1f}")
     columns += size_and_opening(scan_map)
     begin = time.perf_counter()
     scan_map.features_now(workers)
     columns.append(f"{time.perf_counter() - begin:.1f}")
     for gravity in GRAVITIES:
         settings = CoarseToFineSettings(gravity=gravity)
-        times, correct = [], 0
+        times = []
+        correct = 0
         for panorama, truth in queries:
             begin = time.perf_counter()
             found = localize(scan_map, panorama, settings, workers, Stopwatch())
@@ -117,7 +116,7 @@ def measure(label: str, make: Callable[[], Case], results: "multiprocessing.Queu
             correct += is_correct(found.pose, truth)
         columns += [f"{np.median(times):.2f}", f"{correct}/{len(queries)}"]
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    results.put(f"| {' | '.join([*columns, f'{peak_mb:.0f}', f'{before_mb:.0f}'])} |")
+    return f"| {' | '.join([*columns, f'{peak_mb:.0f}', f'{before_mb:.0f}'])} |"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -135,13 +134,8 @@ def run(arguments: argparse.Namespace) -> int:
     rows += [(f"{n} rooms", partial(rooms_case, n)) for n in arguments.rooms]
     print(f"| {' | '.join(COLUMNS)} |")
     print("|---" + "|---:" * (len(COLUMNS) - 1) + "|")
-    context = multiprocessing.get_context("spawn")
-    for label, make in rows:
-        results: multiprocessing.Queue[str] = context.Queue()
-        process = context.Process(target=measure, args=(label, make, results))
-        process.start()
-        process.join()
-        if process.exitcode != 0:
-            raise ChildProcessError(f"{label}: failed, see above")
-        print(results.get(), flush=True)
+    spawned = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=spawned, max_tasks_per_child=1) as processes:
+        for label, make in rows:
+            print(processes.submit(measure, label, make).result(), flush=True)
     return 0

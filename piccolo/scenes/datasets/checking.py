@@ -1,7 +1,6 @@
 """Checks that the poses of a scene fit its panoramas, and finds the convention that fits better if not."""
 
 from collections import Counter
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +23,7 @@ AS_GIVEN = "as given"
 
 
 class ConventionCheck(NamedTuple):
-    """How well a panorama fits the cloud at its pose, by this convention and by others."""
+    """The fit of a panorama to the cloud at its pose, by this convention and by others."""
 
     image: str  # as queries.json has it
     score: float  # of the pose as given, [-1, 1], by confidence/score.py
@@ -45,7 +44,7 @@ class Check(NamedTuple):
 
     @property
     def advice(self) -> str:
-        """What is wrong, for the user."""
+        """A line for the user that says what is wrong."""
         (best, count), *_ = Counter(check.best for check in self.panoramas).most_common()
         scores = ", ".join(f"{check.score:.2f}" for check in self.panoramas)
         text = f"the poses don't fit the panoramas: scores {scores}, wanted {MIN_SCORE} and more"
@@ -69,14 +68,10 @@ def check_scene(scene: Scene, num_queries: int, workers: Workers, show: Progress
         best = max(scores, key=lambda words: scores[words])
         return ConventionCheck(scene.name_of(query), scores[AS_GIVEN], scores[best], best)
 
-    chosen = evenly_spaced(scene.queries, num_queries)
+    count = len(scene.queries)
+    spaced = np.linspace(0, count - 1, min(num_queries, count)).round().astype(int)  # evenly
+    chosen = [scene.queries[k] for k in spaced]
     return Check(tuple(workers.map(check, chosen, f"{scene.name}: check")))
-
-
-def evenly_spaced(queries: Sequence[Query], count: int) -> list[Query]:
-    """Up to `count` of the queries, evenly spaced."""
-    indices = np.linspace(0, len(queries) - 1, min(count, len(queries))).round().astype(int)
-    return [queries[k] for k in indices]
 
 
 def convention_variants(pose: Pose, origin: Array) -> dict[str, Pose]:

@@ -1,4 +1,4 @@
-"""What the readers share: the one cloud of a folder, matrices and poses, and pictures of labels."""
+"""Files of all datasets: the one cloud of a folder, matrices and poses, and pictures of labels."""
 
 from pathlib import Path
 
@@ -20,7 +20,9 @@ SUFFIXES = frozenset().union(*(f.suffixes for f in FORMATS)) - {".csv"}  # as th
 AXES = {**CAMERA_AXES, "opengl": OPENGL_FROM_CAM}  # a pose file's camera axes from ours, by name
 MAX_MATRIX_SIZE = 1 << 16  # [byte] of a file
 MAX_SKEW = 1e-2  # of R R^T from the identity: some files have three decimals
-WORLD_FROM_CAM, CAM_FROM_WORLD = DIRECTIONS = ("world_from_cam", "cam_from_world")
+WORLD_FROM_CAM = "world_from_cam"
+CAM_FROM_WORLD = "cam_from_world"
+DIRECTIONS = (WORLD_FROM_CAM, CAM_FROM_WORLD)
 
 
 def is_cloud(path: Path) -> bool:
@@ -66,7 +68,8 @@ def check_transform(where: str, R: Array, t: Array) -> None:
 
 def pose_of_transform(where: str, T: Array, direction: str, axes: str) -> Pose:
     """The pose in a matrix (3 or 4, 4) [R | t] that takes camera coordinates to the world's, or back."""
-    R, t = T[:3, :3], T[:3, 3]
+    R = T[:3, :3]
+    t = T[:3, 3]
     check_transform(where, R, t)
     if direction == CAM_FROM_WORLD:
         return checked_pose(where, R, -R.T @ t, axes)

@@ -11,6 +11,7 @@ import numpy as np
 from ...errors import InputError
 from ...files.json_file import read_json, read_text
 from ...geometry.pose import Pose, rotation_from_quaternion_wxyz
+from ...panorama.cube import SUFFIXES
 from .files import AXES, DIRECTIONS, WORLD_FROM_CAM, only_cloud_in, pose_of_transform
 from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec
 
@@ -18,10 +19,8 @@ NAME = "generic"
 LISTS = ("poses.csv", "poses.json", "poses.txt", "poses.tum")
 NUMBERS = ("tx", "ty", "tz", "qw", "qx", "qy", "qz")
 TUM_COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 OWN_QUATERNION = {f"quaternion_{letter}" for letter in "wxyz"}  # of R_cam_from_world, in a CSV of ours
 MAX_LENGTH_ERROR = 1e-2  # of a quaternion
-VARIANT = "generic"
 WANTED = f"wanted rows with image, {', '.join(NUMBERS)}, direction, axes"
 
 Row = Mapping[str, str]
@@ -90,7 +89,8 @@ def _trajectory(path: Path, options: ConvertOptions, notes: list[str]) -> list[d
         raise InputError(f"{folder}: no such folder, wanted pictures named by the times in {path.name}")
     pictures = {file.stem: file for file in sorted(folder.iterdir()) if file.suffix.lower() in SUFFIXES}
     lines = [line.split() for line in read_text(path, WANTED).splitlines()]
-    lines, rows = [fields for fields in lines if fields and not fields[0].startswith("#")], []
+    lines = [fields for fields in lines if fields and not fields[0].startswith("#")]
+    rows = []
     for fields in lines:
         if len(fields) != len(TUM_COLUMNS):
             found = " ".join(fields)[:60]
@@ -112,14 +112,15 @@ def _entry(where: str, path: Path, row: Row, options: ConvertOptions) -> tuple[s
     room = row.get("room", options.folder.resolve().name)
     if room != Path(room).name or room.startswith(".") or not room.isprintable():
         raise InputError(f"{where}: found the room {room!r}, wanted a name for a folder")
-    variant, pose = row.get("variant", VARIANT), _pose(where, row, options)
+    pose = _pose(where, row, options)
     cloud = options.inside(path.parent / row["cloud"], where) if "cloud" in row else None
-    return room, (cloud, PosedPanorama(image.name, {image.name: image}, variant, pose))
+    return room, (cloud, PosedPanorama(image.name, {image.name: image}, row.get("variant", NAME), pose))
 
 
 def _pose(where: str, row: Row, options: ConvertOptions) -> Pose:
     """The pose in a row, its direction and axes by the row or by the options, and never by guessing."""
-    axes, direction = row.get("axes", options.axes), row.get("direction", options.direction)
+    axes = row.get("axes", options.axes)
+    direction = row.get("direction", options.direction)
     for name, value, known in (("axes", axes, AXES), ("direction", direction, DIRECTIONS)):
         if value not in known:
             wanted = f"wanted one of {', '.join(known)} in the list or by --{name}"
@@ -145,11 +146,11 @@ def _scene_spec(room: str, entries: list[Entry], options: ConvertOptions) -> Sce
         raise InputError(f"room {room}: found the clouds {names}, wanted one")
     panoramas = _with_unique_names([panorama for _, panorama in entries])
     parts = tuple(CloudPart(cloud) for cloud in clouds if cloud)
-    return SceneSpec(room, parts, lambda: panoramas, source={"dataset": NAME})
+    return SceneSpec(NAME, room, parts, panoramas)
 
 
 def _with_unique_names(panoramas: list[PosedPanorama]) -> list[PosedPanorama]:
-    """The same, where pictures of several folders have one name with their number before it."""
+    """Panoramas whose pictures have names of their own, else with their number before it."""
     if len({panorama.name for panorama in panoramas}) == len(panoramas):
         return panoramas
     return [

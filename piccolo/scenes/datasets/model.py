@@ -1,8 +1,8 @@
 """The scenes that are found in a dataset, before they are written."""
 
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -33,7 +33,7 @@ class ConvertOptions:
 
     @cached_property
     def _roots(self) -> list[str]:
-        """What the user named, which may be links themselves, without links."""
+        """The paths that the user named, which may be links themselves, without links."""
         named = self.folder, self.poses and self.poses.parent, self.cloud, self.images
         return [os.path.realpath(path) for path in named if path]
 
@@ -57,7 +57,7 @@ class CloudPart(NamedTuple):
     """A file with points of a scene, in any format of piccolo.cloud."""
 
     path: Path
-    label: int = 0  # of all its points
+    label: int | None = None  # of all its points
 
 
 class PosedPanorama(NamedTuple):
@@ -81,21 +81,25 @@ class RigidTransform(NamedTuple):
         return rotate_points(points, self.R_written_from_dataset) + self.shift
 
     def of_pose(self, pose: Pose) -> Pose:
-        """The same camera, transformed with the points."""
+        """A camera transformed with the points."""
         center_world = self.R_written_from_dataset @ pose.center_world + self.shift
         return Pose(pose.R_cam_from_world @ self.R_written_from_dataset.T, center_world)
 
 
-@dataclass(frozen=True)
-class SceneSpec:
+class SceneSpec(NamedTuple):
     """A scene to be written; its files are opened only then."""
 
+    dataset: str
     name: str  # its folder below the output: a room, or area/room
     cloud: tuple[CloudPart, ...]
-    read_panoramas: Callable[[], list[PosedPanorama]]  # InputError naming the file where a pose is damaged
+    panoramas: Iterable[PosedPanorama]  # read as they come: InputError naming the file of a damaged pose
     transform: RigidTransform | None = None
-    has_labels: bool = False
-    source: dict[str, object] = field(default_factory=dict)  # for queries.json: how it was made
+    settings: Mapping[str, object] = {}  # how it was made
+
+    @property
+    def source(self) -> dict[str, object]:
+        """The data set and the settings, for queries.json."""
+        return {"dataset": self.dataset, **self.settings}
 
 
 class SceneList(NamedTuple):

@@ -3,7 +3,7 @@
 import json
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -57,14 +57,18 @@ class Picture(NamedTuple):
 def list_scenes(options: ConvertOptions) -> SceneList:
     """The rooms for which there are panoramas and a cloud."""
     table = _read_table(options) if options.labels else None
-    specs, missing = [], []
+    specs = []
+    missing = []
     for (area, room), pictures in sorted(_pictures(options.folder).items()):
         if options.areas and area not in options.areas:
             continue
         name = f"area_{area}/{room}"
         if parts := _cloud_of(options.folder, area, room, options.labels):
-            read_panoramas = partial(_posed_panoramas, options, pictures, table)
-            specs.append(_scene_spec(name, parts, read_panoramas, table is not None))
+            settings: dict[str, object] = {"labels": options.labels}
+            if options.labels:
+                settings["label_names"] = ["unknown", *CLASSES]
+            panoramas = _panoramas(options, pictures, table)
+            specs.append(SceneSpec(NAME, name, parts, panoramas, settings=settings))
         else:
             missing.append(name)
     layout = f"room with panoramas ({PANORAMAS[0]}) and a cloud ({CLOUDS[0]}, with --labels Annotations)"
@@ -81,11 +85,12 @@ def _pictures(folder: Path) -> dict[tuple[str, str], list[Picture]]:
         if not match:
             continue
         folders = (rgb.parent, "") if is_original else (folder, area_folder.name)
-        pose, semantic = (folders[0] / name / folders[1] for name in ("pose", "semantic"))
+        pose = folders[0] / "pose" / folders[1]
+        semantic = folders[0] / "semantic" / folders[1]
         for path in sorted(rgb.glob("camera_*_rgb.png")):
             if room := PICTURE.match(path.name):
                 stem = path.name.removesuffix("_rgb.png")
-                files = pose / f"{stem}_pose.json", semantic / f"{stem}_semantic.png"
+                files = (pose / f"{stem}_pose.json", semantic / f"{stem}_semantic.png")
                 pictures[match[1], room[1]].append(Picture(path, match[1] + match[2], *files))
     return pictures
 
@@ -107,29 +112,16 @@ def _cloud_of(folder: Path, area: str, room: str, has_labels: bool) -> tuple[Clo
     return tuple(CloudPart(path, NUMBERS.get(path.name.split("_")[0], 0)) for path in objects)
 
 
-def _scene_spec(
-    name: str,
-    parts: tuple[CloudPart, ...],
-    read_panoramas: Callable[[], list[PosedPanorama]],
-    has_labels: bool,
-) -> SceneSpec:
-    source: dict[str, object] = {"dataset": NAME, "labels": has_labels}
-    if has_labels:
-        source["label_names"] = ["unknown", *CLASSES]
-    return SceneSpec(name, parts, read_panoramas, has_labels=has_labels, source=source)
-
-
-def _posed_panoramas(
+def _panoramas(
     options: ConvertOptions, pictures: list[Picture], table: NDArray[np.uint16] | None
-) -> list[PosedPanorama]:
-    panoramas = []
+) -> Iterator[PosedPanorama]:
     for picture in pictures:
-        options.inside(picture.pose)
         semantic = options.inside(picture.semantic)
+        options.inside(picture.pose)
         read_labels = None if table is None else partial(labels_by_index, semantic, table)
-        files, variant = {picture.path.name: picture.path}, f"area_{picture.part}"
-        panoramas.append(PosedPanorama(picture.path.name, files, variant, _read_pose(picture), read_labels))
-    return panoramas
+        name = picture.path.name
+        variant = f"area_{picture.part}"
+        yield PosedPanorama(name, {name: picture.path}, variant, _read_pose(picture), read_labels)
 
 
 def _read_pose(picture: Picture) -> Pose:

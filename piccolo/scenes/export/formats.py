@@ -57,10 +57,11 @@ def offset_file(out: Path) -> Path:
 
 def write_offset_beside(out: Path, options: Options) -> None:
     """Write <name>.offset.txt with the offset's three numbers, if there is an offset."""
-    if options.offset is not None:
-        if is_stream(out):
-            raise InputError(f"--offset: nothing can be written beside {out}, wanted a file as --out")
-        write_lines(offset_file(out), [*offset_comment(options), numbers(options.offset)])
+    if options.offset is None:
+        return
+    if is_stream(out):
+        raise InputError(f"--offset: nothing can be written beside {out}, wanted a file as --out")
+    write_lines(offset_file(out), [*offset_comment(options), numbers(options.offset)])
 
 
 def cell(text: str) -> str:
@@ -74,9 +75,10 @@ def write_csv(images: Sequence[PosedImage], out: Path, options: Options) -> None
     table = csv.writer(text, lineterminator="\n")
     table.writerow(COLUMNS)
     for image in images:
-        result, pose = image.result, image.pose
+        result = image.result
+        pose = image.pose
         score = result.evidence.score if result.evidence else None
-        words = cell(image.name), cell(result.cloud_name), result.status, result.confidence, score
+        words = (cell(image.name), cell(result.cloud_name), result.status, result.confidence, score)
         wxyz = quaternion_wxyz(pose.R_cam_from_world).tolist()
         table.writerow([*words, *pose.center_world.tolist(), *wxyz, *heading_pitch_roll_deg(pose)])
     write_offset_beside(out, options)
@@ -137,10 +139,7 @@ def write_colmap(images: Sequence[PosedImage], out: Path, options: Options) -> N
     for i, (image, text) in enumerate(zip(images, texts, strict=True), 1):
         pose = turned(image.pose, OPTICAL_FROM_CAM)
         values = numbers([*quaternion_wxyz(pose.R_cam_from_world), *translation(pose)])
-        lines += [
-            f"{i} {values} {camera_ids[text]} {image.name}",
-            "",
-        ]  # a line of points follows
+        lines += [f"{i} {values} {camera_ids[text]} {image.name}", ""]  # a line of points follows
     offset = offset_comment(options)
     with replacing_folder(out) as folder:
         comment = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"
@@ -193,14 +192,19 @@ def write_opensfm(images: Sequence[PosedImage], out: Path, options: Options) -> 
     https://opensfm.org/docs/geometry.html: rotation is an angle-axis vector and translation t of
     x_cam = R x_world + t. Its spherical camera takes the sphere to be W = 2 H exactly.
     """
-    cameras, shots = {}, {}
+    cameras = {}
+    shots = {}
     for image in images:
         width, height = image.size
         camera = f"spherical {width} {height}"
         cameras[camera] = {"projection_type": "spherical", "width": width, "height": height}
         pose = turned(image.pose, OPTICAL_FROM_CAM)
-        rotation, t = log_so3(pose.R_cam_from_world).tolist(), translation(pose).tolist()
-        shots[image.name] = {"rotation": rotation, "translation": t, "camera": camera}
+        rotation = log_so3(pose.R_cam_from_world).tolist()
+        shots[image.name] = {
+            "rotation": rotation,
+            "translation": translation(pose).tolist(),
+            "camera": camera,
+        }
     write_offset_beside(out, options)
     write_json(out, [{"cameras": cameras, "shots": shots, "points": {}}])
 
@@ -217,7 +221,8 @@ def write_json(out: Path, document: object) -> None:
     write_atomically(out, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
 
 
-OFFSET, MODEL = frozenset({"offset"}), frozenset({"size", "offset"})
+OFFSET = frozenset({"offset"})
+MODEL = OFFSET | {"size"}
 COLMAP_TEXT = "text model of COLMAP 4 and pycolmap; --out is a new folder"
 NERFSTUDIO_TEXT = "transforms.json of nerfstudio, in the folder that --images names"
 POTREE_TEXT = "coordinates.txt of Potree's 360 images, in the folder that --images names"

@@ -20,7 +20,9 @@ from ...panorama.picture import WANTED, opened
 from .posed_images import Format, Options, PosedImage, check_size
 
 JPEG_MAGIC = b"\xff\xd8"
-APP0, APP1, SCAN = 0xE0, 0xE1, 0xDA
+APP0 = 0xE0
+APP1 = 0xE1
+SCAN = 0xDA
 MARKER = re.compile(rb"\xff+")
 EXIF_MARK, XMP_MARK = b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0"
 MAX_BODY_SIZE = 0xFFFF - 2
@@ -88,7 +90,8 @@ def with_pose(path: Path, data: bytes, angles_deg: tuple[float, float, float]) -
         first = takewhile(lambda pair: pair[0].marker == APP0 or pair[1].startswith(EXIF_MARK), pairs)
         place = max((segment.end for segment, _ in first), default=len(JPEG_MAGIC))
         edits = [(place, place, _segment(path, _with_fields(path, EMPTY_PACKET, angles_deg, size)))]
-    pieces, begin = [], 0
+    pieces = []
+    begin = 0
     for edit_begin, edit_end, new in edits:
         pieces += [data[begin:edit_begin], new]
         begin = edit_end

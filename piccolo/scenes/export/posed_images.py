@@ -39,7 +39,7 @@ class PosedImage(NamedTuple):
 
 @dataclass(frozen=True)
 class Options:
-    """What the user chooses; a format takes some of these."""
+    """Choices of the user; a format takes some of these."""
 
     images: Path | None = None  # folder to which names are relative; None: as the result has them
     size: tuple[int, int] | None = None  # W, H [px] of all pictures; None: read from each
@@ -57,7 +57,7 @@ class Options:
 
 
 class Format(NamedTuple):
-    """How the poses are written in one format."""
+    """A format of poses."""
 
     name: str
     description: str  # what reads it, and what `out` is
@@ -104,7 +104,8 @@ def select(results: Sequence[Result], clouds: Sequence[str] = (), use_all: bool 
     if missing := [cloud for cloud in clouds if cloud not in known]:
         wanted = ", ".join(sorted(known))
         raise InputError(f"--cloud: found no result for {missing[0]}, wanted one of {wanted}")
-    chosen, left_out = [], Counter[str]()
+    chosen = []
+    left_out = Counter[str]()
     for result in results:
         if clouds and result.cloud_name not in clouds:
             left_out["other clouds"] += 1
@@ -148,26 +149,42 @@ def posed_images(
 
 def _images_of(result: Result, index: int, form: Format, options: Options) -> list[PosedImage]:
     """The pictures of a result, each as the format can hold it; InputError if it can't hold one."""
+    pose = result.best_pose
+    if pose is None:
+        raise InputError(f"{result.pano}: this result has no pose to write")
+    pose = replace(pose, center_world=pose.center_world - np.array(options.offset or (0.0, 0.0, 0.0)))
     images = []
     for path, mount in _pictures(result, form):
-        image = _posed_image(result, path, mount, form, options)
-        if options.timestamps == "index":
-            image = image._replace(time=str(index))
-        elif options.timestamps == "walk":
-            if result.walk is None:
-                raise InputError(f"{path}: found no frame of a walk, as --timestamps walk needs")
-            image = image._replace(time=repr(result.walk.time))
-        elif not TIMESTAMP.fullmatch(image.time):
-            raise InputError(f"{path}: its name {path.stem!r} is no number, as --timestamps name needs")
+        name = _name(path, options.images)
+        if form.forbidden and (found := re.search(form.forbidden, name)):
+            raise InputError(f"{path}: {form.name} can't read {found[0]!r} in a name: rename the picture")
+        size = _size(path, options) if mount is None and "size" in form.options else (0, 0)
+        image = PosedImage(name, path, _time(result, path, index, options), pose, size, result)
+        if mount is not None:
+            image = image._replace(pose=mount.pose(pose), camera=mount.camera)
         if form.check is not None:
             form.check(image)
         images.append(image)
     return images
 
 
+def _time(result: Result, path: Path, index: int, options: Options) -> str:
+    """The timestamp of a picture, a number as text."""
+    if options.timestamps == "index":
+        return str(index)
+    if options.timestamps == "walk":
+        if result.walk is None:
+            raise InputError(f"{path}: found no frame of a walk, as --timestamps walk needs")
+        return repr(result.walk.time)
+    if not TIMESTAMP.fullmatch(path.stem):
+        raise InputError(f"{path}: its name {path.stem!r} is no number, as --timestamps name needs")
+    return path.stem
+
+
 def _pictures(result: Result, form: Format) -> list[tuple[Path, Mount | None]]:
     """The files of a result that a format writes, with the camera of those that are no sphere."""
-    path, mounts = Path(result.pano), result.cameras
+    path = Path(result.pano)
+    mounts = result.cameras
     if not mounts or form.cameras == "any":
         return [(path, None)]
     if form.cameras == "spheres":
@@ -178,24 +195,6 @@ def _pictures(result: Result, form: Format) -> list[tuple[Path, Mount | None]]:
     if len(mounts) > 1:
         raise InputError(f"{path}: found {len(mounts)} cameras in one picture, wanted one for {form.name}")
     return [(path, mounts[0])]
-
-
-def _posed_image(
-    result: Result, path: Path, mount: Mount | None, form: Format, options: Options
-) -> PosedImage:
-    """One picture; its time is its name."""
-    pose = result.best_pose
-    if pose is None:
-        raise InputError(f"{path}: this result has no pose to write")
-    name = _name(path, options.images)
-    if form.forbidden and (found := re.search(form.forbidden, name)):
-        raise InputError(f"{path}: {form.name} can't read {found[0]!r} in a name: rename the picture")
-    pose = replace(pose, center_world=pose.center_world - np.array(options.offset or (0.0, 0.0, 0.0)))
-    if mount is not None:
-        size = mount.camera.width, mount.camera.height
-        return PosedImage(name, path, path.stem, mount.pose(pose), size, result, mount.camera)
-    size = _size(path, options) if "size" in form.options else (0, 0)
-    return PosedImage(name, path, path.stem, pose, size, result)
 
 
 def _size(path: Path, options: Options) -> tuple[int, int]:

@@ -19,15 +19,16 @@ MAX_DENOMINATOR = 1001  # of a frame rate
 def writing_video(
     path: Path, rate: float, size: tuple[int, int]
 ) -> Iterator[Callable[[NDArray[np.uint8]], None]]:
-    """What takes the frames (H, W, 3) of an MP4 video (H.264), `rate` a second, of `size` (W, H), both even.
+    """Yield a function that takes the frames (H, W, 3) of an MP4 video (H.264), `rate` a second.
 
-    Raises InputError if PyAV is not there.
+    `size` (W, H) is even both ways. Raises InputError if PyAV is not there.
     """
     av = import_optional("video", "av", "video")
     with replacing(path) as file, av.open(file, "w", format="mp4") as container:
         stream = container.add_stream("libx264", Fraction(rate).limit_denominator(MAX_DENOMINATOR))
         stream.width, stream.height = size
-        stream.pix_fmt, stream.options = "yuv420p", {"crf": QUALITY}
+        stream.pix_fmt = "yuv420p"
+        stream.options = {"crf": QUALITY}
 
         def add(rgb: NDArray[np.uint8]) -> None:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(rgb, format="rgb24")))

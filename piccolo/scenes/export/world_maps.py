@@ -46,7 +46,8 @@ def write_gpx(images: Sequence[PosedImage], out: Path, options: Options) -> None
 
 def _in_degrees(what: str, images: Sequence[PosedImage], options: Options) -> tuple[Any, Any, str]:
     """The ellipsoid, what turns positions into longitude and latitude, and the system's name."""
-    pyproj, crs = import_optional(what, "pyproj", "tools"), options.crs
+    pyproj = import_optional(what, "pyproj", "tools")
+    crs = options.crs
     if crs is None:
         raise InputError("--crs: not given, wanted the cloud's coordinate system, such as EPSG:25832")
     try:
@@ -86,16 +87,24 @@ def _is_in(area: Any, longitude: float, latitude: float, x: float, y: float) -> 
 
 def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[str, object]:
     """The point without a height, which would have to be above WGS84's ellipsoid: z is a property."""
-    result, (x, y, z) = image.result, image.pose.center_world.tolist()
+    result = image.result
+    x, y, z = image.pose.center_world.tolist()
     heading, pitch, roll = heading_pitch_roll_deg(image.pose)
     ahead = np.radians(heading)
-    eastings, northings = [x, x + STEP * np.sin(ahead)], [y, y + STEP * np.cos(ahead)]
+    eastings = [x, x + STEP * np.sin(ahead)]
+    northings = [y, y + STEP * np.cos(ahead)]
     longitudes, latitudes = transformer.transform(eastings, northings)
     true_heading, _, _ = geod.inv(longitudes[0], latitudes[0], longitudes[1], latitudes[1])
-    properties: dict[str, object] = {"image": image.name, "cloud": result.cloud_name, "status": result.status}
-    properties |= {"confidence": result.confidence, "score": result.evidence and result.evidence.score}
-    properties |= {"crs": crs, "x": x, "y": y, "z": z, "heading_deg": heading}
-    properties |= {"heading_true_deg": true_heading % 360.0, "pitch_deg": pitch, "roll_deg": roll}
+    properties = {
+        "image": image.name,
+        "cloud": result.cloud_name,
+        "status": result.status,
+        "confidence": result.confidence,
+        "score": result.evidence and result.evidence.score,
+        **{"crs": crs, "x": x, "y": y, "z": z},
+        **{"heading_deg": heading, "heading_true_deg": true_heading % 360.0},
+        **{"pitch_deg": pitch, "roll_deg": roll},
+    }
     point = {"type": "Point", "coordinates": [longitudes[0], latitudes[0]]}
     return {"type": "Feature", "geometry": point, "properties": properties}
 

@@ -10,7 +10,9 @@ from ...jobs.threads import Workers
 from ...kernels.jit import inline_kernel, kernel
 from .room import Room
 
-AMBIENT, LAMP, LAMP_DECAY = 0.55, 0.9, 0.15  # of a surface's colour; the decay [1/m2]
+AMBIENT = 0.55  # of a surface's colour
+LAMP = 0.9  # of it, head on and near
+LAMP_DECAY = 0.15  # [1/m2]
 CHUNK = 4_096  # rays
 NUM_FIRST = 32  # boxes
 MARGIN = 1e-6  # of a cone around rays [rad], and of a range [m]
@@ -28,10 +30,14 @@ def hash_unit(i, j, seed):
 @inline_kernel
 def value_noise(s, t, seed):
     """Smooth noise in [0, 1] with cells of size 1."""
-    i, j = math.floor(s), math.floor(t)
-    x, y = s - i, t - j
-    x, y = x * x * (3.0 - 2.0 * x), y * y * (3.0 - 2.0 * y)
-    i, j = np.int64(i), np.int64(j)
+    i = math.floor(s)
+    j = math.floor(t)
+    x = s - i
+    y = t - j
+    x = x * x * (3.0 - 2.0 * x)
+    y = y * y * (3.0 - 2.0 * y)
+    i = np.int64(i)
+    j = np.int64(j)
     top = hash_unit(i, j, seed) * (1.0 - x) + hash_unit(i + 1, j, seed) * x
     bottom = hash_unit(i, j + 1, seed) * (1.0 - x) + hash_unit(i + 1, j + 1, seed) * x
     return top * (1.0 - y) + bottom * y
@@ -40,15 +46,18 @@ def value_noise(s, t, seed):
 @inline_kernel
 def cloudy(s, t, seed):
     """Noise in [0, 1] of three scales: 1 m, 0.25 m, 0.06 m."""
-    coarse, middle = value_noise(s, t, seed), value_noise(4.0 * s, 4.0 * t, seed + 1)
+    coarse = value_noise(s, t, seed)
+    middle = value_noise(4.0 * s, 4.0 * t, seed + 1)
     return 0.55 * coarse + 0.3 * middle + 0.15 * value_noise(16.0 * s, 16.0 * t, seed + 2)
 
 
 @inline_kernel
 def second_color_fraction(pattern, s, t, scale, seed):
     """Fraction in [0, 1] of the second colour at (s, t) [m]; patterns as in room.py."""
-    i, j = np.int64(math.floor(s / scale)), np.int64(math.floor(t / scale))
-    x, y = s / scale - math.floor(s / scale), t / scale - math.floor(t / scale)
+    i = np.int64(math.floor(s / scale))
+    j = np.int64(math.floor(t / scale))
+    x = s / scale - math.floor(s / scale)
+    y = t / scale - math.floor(t / scale)
     noise = cloudy(s, t, seed)
     if pattern == 0:  # plain
         return 0.35 * noise
@@ -75,16 +84,30 @@ def hit_boxes(origin, directions, boxes, ranges, hits):
     ranges[:] = np.inf
     hits[:] = -1
     for b in range(len(boxes)):
-        ox, oy, oz = origin[0] - boxes[b, 0], origin[1] - boxes[b, 1], origin[2] - boxes[b, 2]
-        c, s = math.cos(boxes[b, 6]), math.sin(boxes[b, 6])
-        px, py = c * ox + s * oy, c * oy - s * ox
-        half_x, half_y, half_z = boxes[b, 3], boxes[b, 4], boxes[b, 5]
+        ox = origin[0] - boxes[b, 0]
+        oy = origin[1] - boxes[b, 1]
+        oz = origin[2] - boxes[b, 2]
+        c = math.cos(boxes[b, 6])
+        s = math.sin(boxes[b, 6])
+        px = c * ox + s * oy
+        py = c * oy - s * ox
+        half_x = boxes[b, 3]
+        half_y = boxes[b, 4]
+        half_z = boxes[b, 5]
         for n in range(len(directions)):
-            dx, dy, dz = directions[n, 0], directions[n, 1], directions[n, 2]
+            dx = directions[n, 0]
+            dy = directions[n, 1]
+            dz = directions[n, 2]
             # A ray along a face divides by zero on purpose: infinities compare as they should.
-            ix, iy, iz = 1.0 / (c * dx + s * dy), 1.0 / (c * dy - s * dx), 1.0 / dz
-            hx, hy, hz = half_x * abs(ix), half_y * abs(iy), half_z * abs(iz)
-            near_x, near_y, near_z = -px * ix - hx, -py * iy - hy, -oz * iz - hz
+            ix = 1.0 / (c * dx + s * dy)
+            iy = 1.0 / (c * dy - s * dx)
+            iz = 1.0 / dz
+            hx = half_x * abs(ix)
+            hy = half_y * abs(iy)
+            hz = half_z * abs(iz)
+            near_x = -px * ix - hx
+            near_y = -py * iy - hy
+            near_z = -oz * iz - hz
             near = max(near_x, near_y, near_z)
             far = min(hx - px * ix, hy - py * iy, hz - oz * iz)
             face = 0 if near == near_x else 1 if near == near_y else 2
@@ -100,17 +123,24 @@ def shade(origin, directions, ranges, hits, boxes, materials, lights, rgb):
         rgb[n, :] = 0.0
         if hits[n] < 0:
             continue
-        b, axis = hits[n] // 3, hits[n] % 3
+        b = hits[n] // 3
+        axis = hits[n] % 3
         x = origin[0] + ranges[n] * directions[n, 0]
         y = origin[1] + ranges[n] * directions[n, 1]
         z = origin[2] + ranges[n] * directions[n, 2]
-        c, s = math.cos(boxes[b, 6]), math.sin(boxes[b, 6])
-        ox, oy, oz = x - boxes[b, 0], y - boxes[b, 1], z - boxes[b, 2]
-        px, py = c * ox + s * oy, c * oy - s * ox
+        c = math.cos(boxes[b, 6])
+        s = math.sin(boxes[b, 6])
+        ox = x - boxes[b, 0]
+        oy = y - boxes[b, 1]
+        oz = z - boxes[b, 2]
+        px = c * ox + s * oy
+        py = c * oy - s * ox
         along, up = (py, oz) if axis == 0 else (px, oz) if axis == 1 else (px, py)
         m = materials[b]
         fraction = second_color_fraction(np.int64(m[0]), along, up, m[1], np.int64(m[8]) + axis)
-        lx, ly, lz = lights[b, 0] - x, lights[b, 1] - y, lights[b, 2] - z
+        lx = lights[b, 0] - x
+        ly = lights[b, 1] - y
+        lz = lights[b, 2] - z
         distance2 = lx * lx + ly * ly + lz * lz
         towards = abs((c * lx + s * ly) if axis == 0 else (c * ly - s * lx) if axis == 1 else lz)
         lit = AMBIENT + LAMP * towards / math.sqrt(distance2) / (1.0 + LAMP_DECAY * distance2)
@@ -124,10 +154,15 @@ def ranges_ahead(origin, axis, cone_width, boxes, least):
 
     The cone is around the unit `axis` (3,), its half width [rad].
     """
-    cone_cos, cone_sin = math.cos(cone_width), math.sin(cone_width)
+    cone_cos = math.cos(cone_width)
+    cone_sin = math.sin(cone_width)
     for b in range(len(boxes)):
-        ox, oy, oz = boxes[b, 0] - origin[0], boxes[b, 1] - origin[1], boxes[b, 2] - origin[2]
-        half_x, half_y, half_z = boxes[b, 3], boxes[b, 4], boxes[b, 5]
+        ox = boxes[b, 0] - origin[0]
+        oy = boxes[b, 1] - origin[1]
+        oz = boxes[b, 2] - origin[2]
+        half_x = boxes[b, 3]
+        half_y = boxes[b, 4]
+        half_z = boxes[b, 5]
         radius = math.sqrt(half_x * half_x + half_y * half_y + half_z * half_z)
         distance = math.sqrt(ox * ox + oy * oy + oz * oz)
         if distance > radius:
@@ -140,7 +175,8 @@ def ranges_ahead(origin, axis, cone_width, boxes, least):
             ):
                 least[b] = np.inf
                 continue
-        c, s = math.cos(boxes[b, 6]), math.sin(boxes[b, 6])
+        c = math.cos(boxes[b, 6])
+        s = math.sin(boxes[b, 6])
         x = max(abs(c * ox + s * oy) - half_x, 0.0)
         y = max(abs(c * oy - s * ox) - half_y, 0.0)
         z = max(abs(oz) - half_z, 0.0)
@@ -153,7 +189,8 @@ def boxes_ahead(
     """Which boxes (B, 7) unit `directions` (N, 3) may hit, by their cone, and from what range on [m]."""
     axis = directions.mean(axis=0)
     axis /= max(float(np.linalg.norm(axis)), 1e-12)  # of opposite rays, for which the cone is the sphere
-    width, least = math.acos(np.clip((directions @ axis).min(), -1.0, 1.0)) + MARGIN, np.empty(len(boxes))
+    width = math.acos(np.clip((directions @ axis).min(), -1.0, 1.0)) + MARGIN
+    least = np.empty(len(boxes))
     ranges_ahead(origin, axis, width, boxes, least)
     ahead = np.flatnonzero(least < np.inf)
     return ahead, least[ahead]
@@ -167,19 +204,22 @@ def cast_rays(
     Where nothing is hit the range is inf, the colour black and the label 0. Quickest where directions that
     follow each other are near each other: what lies elsewhere is not asked.
     """
-    ranges, rgb = np.empty(len(directions)), np.empty((len(directions), 3))
+    ranges = np.empty(len(directions))
+    rgb = np.empty((len(directions), 3))
     labels = np.zeros(len(directions), dtype=np.int64)
     lights = np.broadcast_to(room.light, (len(room.boxes), 3))
 
     def run(lo: int) -> None:
         part = slice(lo, lo + CHUNK)
-        rays, hits = directions[part], np.empty(len(ranges[part]), dtype=np.int64)
+        rays = directions[part]
+        hits = np.empty(len(ranges[part]), dtype=np.int64)
         ahead, least = boxes_ahead(origin, rays, room.boxes)
         if len(ahead) > NUM_FIRST:  # what the nearest boxes hide needs no look
             nearest = np.argpartition(least, NUM_FIRST)[:NUM_FIRST]
             hit_boxes(origin, rays, room.boxes[ahead[nearest]], ranges[part], hits)
             ahead = ahead[least <= ranges[part].max() + MARGIN]
-        boxes, materials = room.boxes[ahead], room.materials[ahead]
+        boxes = room.boxes[ahead]
+        materials = room.materials[ahead]
         hit_boxes(origin, rays, boxes, ranges[part], hits)
         shade(origin, rays, ranges[part], hits, boxes, materials, lights[ahead], rgb[part])
         is_hit = hits >= 0

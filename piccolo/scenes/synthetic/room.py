@@ -1,4 +1,4 @@
-"""The seeded layout of a room: boxes, each with a material; places that look the same from several poses."""
+"""The seeded layout of a room: boxes, each with a material."""
 
 import itertools
 from collections.abc import Sequence
@@ -19,6 +19,11 @@ LABEL_NAMES = (  # kinds of surfaces; a label is the place in this list, and 0 i
 Pair = tuple[float, float]
 SATURATION = 0.5  # paints are paler than colours drawn at random
 DOOR_ROOM = 1.2  # left free before an open door [m]
+HANGINGS = {  # on walls: their patterns, and the least and greatest colour
+    "picture": ((PICTURE,), 0.1, 1.0),
+    "window": ((CHECKS,), 0.7, 1.0),
+    "door": ((PLAIN, PLANKS), 0.2, 0.6),
+}
 
 
 @dataclass
@@ -33,26 +38,31 @@ class RoomBuilder:
     kind: str = "nothing"  # of what is put next, one of LABEL_NAMES
     clear: list[tuple[Array, Array]] = field(default_factory=list)  # low, high (3,) of places to be left free
 
-    def material(self, pattern: int, scale: float, colors: tuple[Array, Array]) -> Array:
-        """A material row."""
-        return np.array([pattern, scale, *colors[0], *colors[1], self.rng.integers(1, 1 << 20)], dtype=float)
-
     def paint(self, patterns: tuple[int, ...], low: float, high: float) -> Array:
-        """A material of a random pattern in two related colours whose channels lie in [low, high]."""
+        """A row of Room.materials: a random pattern in two related colours with channels in [low, high]."""
         base = self.rng.uniform(low, high, 3)
         base = base.mean() + SATURATION * (base - base.mean())
         other = np.clip(base * self.rng.uniform(0.55, 0.9) + self.rng.normal(0, 0.05, 3), 0, 1)
-        pattern, scale = int(self.rng.choice(patterns)), float(self.rng.uniform(0.12, 0.5))
-        return self.material(pattern, scale, (base, other))
+        pattern = self.rng.choice(patterns)
+        scale = self.rng.uniform(0.12, 0.5)
+        return np.array([pattern, scale, *base, *other, self.rng.integers(1, 1 << 20)], dtype=float)
 
     def put(
-        self, center: ArrayLike, size: ArrayLike, material: Array, yaw: float = 0.0, offset: Pair = (0.0, 0.0)
+        self,
+        center: ArrayLike,
+        size: ArrayLike,
+        material: Array,
+        yaw: float = 0.0,
+        offset: Pair = (0.0, 0.0),
+        kind: str | None = None,
     ) -> None:
         """Add a box of `size` (3,) [m] turned by `yaw` at `center` (3,), relative to the corner [m].
 
-        The `offset` of the centre is along the box's own x and y [m].
+        The `offset` of the centre is along the box's own x and y [m]; a `kind` is that of what follows too.
         """
-        along, across = np.array([np.cos(yaw), np.sin(yaw), 0.0]), np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+        self.kind = kind or self.kind
+        along = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+        across = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
         middle = np.asarray(center) + offset[0] * along + offset[1] * across + self.corner
         self.boxes.append(np.array([*middle, *(np.asarray(size) / 2), yaw]))
         self.materials.append(material)
@@ -61,12 +71,18 @@ class RoomBuilder:
     def leave_clear(self, first: int) -> None:
         """Take back the boxes from number `first` on if one of them is in a place that is to be left free."""
         for box in self.boxes[first:]:
-            c, s = abs(np.cos(box[6])), abs(np.sin(box[6]))
+            c = abs(np.cos(box[6]))
+            s = abs(np.sin(box[6]))
             half = np.array([c * box[3] + s * box[4], s * box[3] + c * box[4], box[5]])
             middle = box[:3] - self.corner
             if any(((middle - half < high) & (middle + half > low)).all() for low, high in self.clear):
                 del self.boxes[first:], self.materials[first:], self.labels[first:]
                 return
+
+    def room(self, size: Array, light: Array) -> "Room":
+        """The room of `size` (3,) [m] of all boxes, its lamp at `light` (3,) [m]."""
+        boxes = np.stack(self.boxes)
+        return Room(self.corner, size, boxes, np.stack(self.materials), light, np.array(self.labels))
 
 
 class Door(NamedTuple):
@@ -80,10 +96,13 @@ class Door(NamedTuple):
 
     def clear(self, size: Array, depth: float) -> tuple[Array, Array]:
         """Least and greatest corner (3,) of what is in the door and up to `depth` [m] before it."""
-        low, high = np.array([0.0, 0.0, 0.02]), np.full(3, self.height)
-        wall, along = self.axis, 1 - self.axis
-        low[along], high[along] = self.middle - 0.5 * self.width - 0.1, self.middle + 0.5 * self.width + 0.1
-        low[wall], high[wall] = (size[wall] - depth, size[wall] + 0.2) if self.is_far else (-0.2, depth)
+        wall = self.axis
+        low = np.array([0.0, 0.0, 0.02])
+        high = np.full(3, self.height)
+        low[1 - wall] = self.middle - 0.5 * self.width - 0.1
+        high[1 - wall] = self.middle + 0.5 * self.width + 0.1
+        low[wall] = size[wall] - depth if self.is_far else -0.2
+        high[wall] = size[wall] + 0.2 if self.is_far else depth
         return low, high
 
 
@@ -100,10 +119,13 @@ class Room(NamedTuple):
     def clearance(self, position: Array) -> float:
         """Distance [m] from `position` (3,) to the nearest surface; negative inside a box, unseen by rays."""
         offset = position - self.boxes[:, :3]
-        c, s = np.cos(self.boxes[:, 6]), np.sin(self.boxes[:, 6])
-        along, across = c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]
+        c = np.cos(self.boxes[:, 6])
+        s = np.sin(self.boxes[:, 6])
+        along = c * offset[:, 0] + s * offset[:, 1]
+        across = c * offset[:, 1] - s * offset[:, 0]
         beyond = np.abs(np.stack([along, across, offset[:, 2]], axis=1)) - self.boxes[:, 3:6]
-        outside, inside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1), np.minimum(beyond.max(axis=1), 0.0)
+        outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
+        inside = np.minimum(beyond.max(axis=1), 0.0)
         return float((outside + inside).min())
 
 
@@ -112,10 +134,9 @@ def put_shell(b: RoomBuilder, size: Array, doors: Sequence[Door] = ()) -> None:
     x, y, z = size
     d = WALL_THICKNESS
     ceiling = b.paint((PLAIN,), 0.75, 0.95)
-    b.kind = "floor"
-    b.put([x / 2, y / 2, -d / 2], [x + 2 * d, y + 2 * d, d], b.paint((PLANKS, TILES), 0.35, 0.75))
-    b.kind = "ceiling"
-    b.put([x / 2, y / 2, z + d / 2], [x + 2 * d, y + 2 * d, d], ceiling)
+    extent = [x + 2 * d, y + 2 * d, d]
+    b.put([x / 2, y / 2, -d / 2], extent, b.paint((PLANKS, TILES), 0.35, 0.75), kind="floor")
+    b.put([x / 2, y / 2, z + d / 2], extent, ceiling, kind="ceiling")
     put_walls(b, size, doors)
 
 
@@ -135,18 +156,19 @@ def put_wall(
     along = 1 - axis
 
     def put_piece(begin: float, end: float, bottom: float) -> None:
-        center, extent = size / 2, size.copy()
-        center[axis], extent[axis] = (
-            size[axis] + WALL_THICKNESS / 2 if is_far else -WALL_THICKNESS / 2,
-            WALL_THICKNESS,
-        )
-        center[along], extent[along] = (begin + end) / 2, end - begin
-        center[2], extent[2] = (bottom + size[2]) / 2, size[2] - bottom
+        center = size / 2
+        center[axis] = size[axis] + WALL_THICKNESS / 2 if is_far else -WALL_THICKNESS / 2
+        center[along] = (begin + end) / 2
+        center[2] = (bottom + size[2]) / 2
+        extent = np.full(3, WALL_THICKNESS)
+        extent[along] = end - begin
+        extent[2] = size[2] - bottom
         b.put(center, extent, paint)
 
     begin = 0.0
     for door in sorted(doors, key=lambda door: door.middle):
-        left, right = door.middle - door.width / 2, door.middle + door.width / 2
+        left = door.middle - door.width / 2
+        right = door.middle + door.width / 2
         put_piece(begin, left, 0.0)
         put_piece(left, right, door.height)
         begin = right
@@ -164,14 +186,13 @@ def put_hangings(b: RoomBuilder, size: Array) -> None:
                     "window": (b.rng.uniform(0.8, 1.4), b.rng.uniform(0.8, 1.1), 1.5),
                     "door": (0.9, 2.0, 1.0),
                 }[kind]
-                center, extent = np.zeros(3), np.full(3, 0.03)
-                center[axis], center[2] = side, min(middle, size[2] - height / 2)
+                center = np.full(3, min(middle, size[2] - height / 2))
+                center[axis] = side
                 center[along] = b.rng.uniform(width / 2, size[along] - width / 2)
-                extent[along], extent[2] = width, height
-                patterns = {"picture": (PICTURE,), "window": (CHECKS,), "door": (PLAIN, PLANKS)}[kind]
-                b.kind = str(kind)
-                low, high = {"picture": (0.1, 1.0), "window": (0.7, 1.0), "door": (0.2, 0.6)}[kind]
-                b.put(center, extent, b.paint(patterns, low, high))
+                extent = np.full(3, 0.03)
+                extent[along] = width
+                extent[2] = height
+                b.put(center, extent, b.paint(*HANGINGS[kind]), kind=str(kind))
                 b.leave_clear(len(b.boxes) - 1)
 
 
@@ -180,8 +201,8 @@ def put_table(b: RoomBuilder, at: Array, yaw: float) -> None:
     length, width, height = b.rng.uniform([0.9, 0.6, 0.5], [1.6, 0.9, 0.8])
     wood = b.paint((PLANKS, PLAIN), 0.2, 0.7)
     b.put([*at, height], [length, width, 0.04], wood, yaw)
-    x, y = length / 2 - 0.05, width / 2 - 0.05
-    for offset in ((-x, -y), (-x, y), (x, -y), (x, y)):
+    for x, y in itertools.product((-1, 1), (-1, 1)):
+        offset = (x * (length / 2 - 0.05), y * (width / 2 - 0.05))
         b.put([*at, height / 2], [0.06, 0.06, height], wood, yaw, offset)
     b.put([*at, height + 0.12], b.rng.uniform(0.1, 0.25, 3), b.paint((CHECKS, PICTURE), 0.1, 1.0), yaw)
 
@@ -219,8 +240,7 @@ def put_furniture(
     num_pieces = max(3, round(size[0] * size[1] / area))
     seeds = b.rng.integers(0, 1 << 30, num_pieces)
     rug = [size[0] * b.rng.uniform(0.3, 0.6), size[1] * b.rng.uniform(0.3, 0.6), 0.01]
-    b.kind = "rug"
-    b.put([size[0] / 2, size[1] / 2, 0.005], rug, b.paint((CHECKS, STRIPES, PICTURE), 0.1, 0.8))
+    b.put([size[0] / 2, size[1] / 2, 0.005], rug, b.paint((CHECKS, STRIPES, PICTURE), 0.1, 0.8), kind="rug")
     b.leave_clear(len(b.boxes) - 1)
     pieces = {"table": put_table, "shelf": put_shelf, "sofa": put_sofa, "crate": put_crate}
     kinds = ("table", "shelf", "sofa", "crate", "crate")
@@ -237,18 +257,28 @@ def put_furniture(
 
 def make_room(seed: int, size: Array, corner: Array, changed: int = 0, doors: Sequence[Door] = ()) -> Room:
     """The room of `seed`; the same shell with other furniture and more crates for each `changed` above 0."""
-    fixed = RoomBuilder(np.random.default_rng([seed, 0]), np.asarray(corner, dtype=float))
+    shell_rng = np.random.default_rng([seed, 0])
+    b = RoomBuilder(shell_rng, np.asarray(corner, dtype=float))
     size = np.asarray(size, dtype=float)
-    fixed.clear = [door.clear(size, DOOR_ROOM) for door in doors]
-    put_shell(fixed, size, doors)
-    put_hangings(fixed, size)
-    loose = RoomBuilder(np.random.default_rng([seed, 1]), fixed.corner, clear=fixed.clear)
+    b.clear = [door.clear(size, DOOR_ROOM) for door in doors]
+    put_shell(b, size, doors)
+    put_hangings(b, size)
+    b.rng = np.random.default_rng([seed, 1])
     moves = np.random.default_rng([seed, 2, changed]) if changed else None
-    put_furniture(loose, size, moves)
+    put_furniture(b, size, moves)
     if moves is not None:
-        loose.rng, loose.kind = moves, "crate"
+        b.rng = moves
+        b.kind = "crate"
         for _ in range(3):
-            put_crate(loose, moves.uniform([0.5, 0.5], size[:2] - 0.5), float(moves.uniform(0, np.pi)))
-    light = fixed.corner + size * [*fixed.rng.uniform(0.35, 0.65, 2), 0.93]
-    boxes, materials = np.stack(fixed.boxes + loose.boxes), np.stack(fixed.materials + loose.materials)
-    return Room(fixed.corner, size, boxes, materials, light, np.array(fixed.labels + loose.labels))
+            put_crate(b, moves.uniform([0.5, 0.5], size[:2] - 0.5), float(moves.uniform(0, np.pi)))
+    return b.room(size, b.corner + size * [*shell_rng.uniform(0.35, 0.65, 2), 0.93])
+
+
+def joined(rooms: Sequence[Room]) -> Room:
+    """The first of some rooms with the boxes of all, each lit as in its own."""
+    return rooms[0]._replace(
+        boxes=np.concatenate([room.boxes for room in rooms]),
+        materials=np.concatenate([room.materials for room in rooms]),
+        light=np.concatenate([np.broadcast_to(room.light, (len(room.boxes), 3)) for room in rooms]),
+        labels=np.concatenate([room.labels for room in rooms]),
+    )

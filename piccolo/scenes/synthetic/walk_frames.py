@@ -1,33 +1,36 @@
-"""What a camera that is carried through a building takes: blur, people in the way, useless frames."""
+"""Pictures by a camera that is carried through a building: blur, people in the way, useless frames."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...geometry.pose import Array, Pose
+from ...geometry.pose import Pose
 from ...jobs.threads import Workers
 from .office import Office
-from .room import CHECKS, PLAIN, STRIPES, Room, RoomBuilder
+from .room import CHECKS, PLAIN, STRIPES, Room, RoomBuilder, joined
 from .walking import Walk
-from .world import exposed, make_query, make_world, other_light
+from .world import make_query, make_world, other_light, photograph
 
 BAD_KINDS = ("black", "mirrored", "elsewhere")
 WALK_VARIANTS = ("clean", "photo")
-SHUTTER, NUM_EXPOSURES = 1.0 / 30.0, 8  # how long it is open [s], and poses meanwhile
+SHUTTER = 1.0 / 30.0  # how long it is open [s]
+NUM_EXPOSURES = 8  # poses meanwhile
 DISTANCES = (1.5, 6.0)  # of people before and after the camera [s]
 ASIDE = 0.25  # of people off the way, at most [m]
 LEAST_DISTANCE = 0.8  # of a person from the camera [m]
 MAX_PEOPLE = 20
 NUM_ELSEWHERE = 8  # rooms of another building
 LAMP = np.array([0.0, 0.5, 2.4])  # above a person's feet [m]
+BODY = ((0.4, (0.2, 0.32, 0.8)), (1.12, (0.26, 0.46, 0.64)), (1.6, (0.2, 0.18, 0.26)))  # height, size [m]
 
 
 @dataclass(frozen=True)
 class WalkOptions:
-    """How a walk is taken."""
+    """Settings of a walk."""
 
     rate: float = 2.0  # frames a second
     variant: str = "clean"  # one of WALK_VARIANTS
@@ -48,8 +51,7 @@ class WalkOptions:
             raise InputError(f"people: found {self.num_people}, wanted 0 to {MAX_PEOPLE}")
 
 
-@dataclass(frozen=True)
-class Frame:
+class Frame(NamedTuple):
     """One picture of a walk."""
 
     rgb: NDArray[np.uint8]  # (H, W, 3)
@@ -75,7 +77,8 @@ def frames_of(
         elif kind == "elsewhere":
             rgb = make_query(elsewhere, k, "clean", options.width, workers).rgb
         else:
-            rgb = _picture(with_people(office.world.rooms[0], people, time), walk, time, options, workers)
+            present = [part for person in people if (part := person.at(time)) is not None]
+            rgb = _picture(joined([office.world.rooms[0], *present]), walk, time, options, workers)
         if options.variant == "photo" and kind != "black":
             rgb = other_light(rgb, np.random.default_rng([seed, 55, number]))  # one light for the whole walk
         yield Frame(rgb[:, ::-1].copy() if kind == "mirrored" else rgb, pose, time, kind)
@@ -92,25 +95,26 @@ def _kinds(count: int, options: WalkOptions, rng: np.random.Generator) -> list[s
 def _picture(
     room: Room, walk: Walk, time: float, options: WalkOptions, workers: Workers
 ) -> NDArray[np.uint8]:
-    poses = [walk.pose(time)]
+    meanwhile: list[Pose] = []
     if options.is_blurred:
         moments = time + SHUTTER * (np.arange(NUM_EXPOSURES) + 0.5 - NUM_EXPOSURES / 2) / NUM_EXPOSURES
-        poses = [walk.pose(float(moment)) for moment in np.clip(moments, 0.0, walk.duration)]
-    return exposed(room, poses, options.width, workers)
+        meanwhile = [walk.pose(float(moment)) for moment in np.clip(moments, 0.0, walk.duration)]
+    return photograph(room, walk.pose(time), options.width, workers, meanwhile)
 
 
 class Person:
     """Somebody who walks a camera's way, some seconds before or after it."""
 
     def __init__(self, walk: Walk, rng: np.random.Generator) -> None:
-        self.walk, self.rng = walk, rng
+        self.walk = walk
         self.delay = float(rng.uniform(*DISTANCES) * rng.choice([-1.0, 1.0]))
         self.aside = float(rng.uniform(-ASIDE, ASIDE))
+        self.rng = rng
         b = RoomBuilder(rng, np.zeros(3))
         self.paints = [b.paint(p, 0.1, 0.9) for p in ((PLAIN,), (STRIPES, CHECKS, PLAIN), (PLAIN,))]
 
-    def boxes_at(self, time: float) -> tuple[Array, Array] | None:
-        """Where the feet are (3,), and the boxes (3, 7): legs, trunk and head; None if not on the way."""
+    def at(self, time: float) -> Room | None:
+        """The boxes of legs, trunk and head, and their lamp; None if not on the way."""
         moment = time - self.delay
         if not 0.0 <= moment <= self.walk.duration:
             return None
@@ -119,31 +123,6 @@ class Person:
         if np.linalg.norm(feet[:2] - self.walk.foot(time)[:2]) < LEAST_DISTANCE:
             return None
         b = RoomBuilder(self.rng, feet)
-        for z, size, paint in zip(
-            (0.4, 1.12, 1.6),
-            ([0.2, 0.32, 0.8], [0.26, 0.46, 0.64], [0.2, 0.18, 0.26]),
-            self.paints,
-            strict=True,
-        ):
+        for (z, size), paint in zip(BODY, self.paints, strict=True):
             b.put([0.0, 0.0, z], size, paint, yaw)
-        return feet, np.stack(b.boxes)
-
-
-def with_people(room: Room, people: Sequence[Person], time: float) -> Room:
-    """The room with those who are on the way at a time [s]."""
-    light = np.broadcast_to(room.light, (len(room.boxes), 3))
-    boxes, materials, lights = [room.boxes], [room.materials], [light]
-    for person in people:
-        if (found := person.boxes_at(time)) is not None:
-            feet, own = found
-            boxes.append(own)
-            materials.append(np.stack(person.paints))
-            lights.append(np.tile(feet + LAMP, (len(own), 1)))
-    labels = np.zeros(sum(map(len, boxes)), np.int64)
-    labels[: len(room.labels)] = room.labels
-    return room._replace(
-        boxes=np.concatenate(boxes),
-        materials=np.concatenate(materials),
-        light=np.concatenate(lights),
-        labels=labels,
-    )
+        return b.room(np.zeros(3), feet + LAMP)

@@ -1,17 +1,20 @@
-"""Rooms side by side with their scan, and queries with true poses.
+"""Rooms side by side with their scan, and panoramas and photos with true poses.
 
 The scanner has noise, shadows and uneven density; light, lens and file change the panoramas.
 """
 
 import itertools
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from ...camera import Calibration, Mount
+from ...camera.rig import extent_of
 from ...errors import InputError
 from ...geometry.pose import Array, Pose, exp_so3, yaw_rotation
 from ...geometry.rotations import uniform_rotations
@@ -28,19 +31,14 @@ MIN_CLEARANCE = 0.35  # of a station or camera [m]
 NUM_TRIES = 2000
 VARIANTS = ("clean", "tilt", "photo", "change")
 GAP = 0.4  # between rooms [m]
-MIN_SIZE, MAX_SIZE = 2.0, 50.0  # of a room, each way [m]
+MIN_SIZE = 2.0  # of a room, each way [m]
+MAX_SIZE = 50.0
 MAX_ROOMS = 256
 SEED_STEP = 64  # between the rooms of two seeds; larger buildings share rooms with the next seed
 MIN_POINTS = 1000  # of a room
+MAX_SIDE = 4096  # [px] of a camera's picture
 
-
-Tile = tuple[slice, slice]  # rows and columns of an image
-
-
-def tiles(width: int) -> list[Tile]:
-    """The tiles of an image (width / 2, width)."""
-    corners = itertools.product(range(0, width // 2, TILE), range(0, width, TILE))
-    return [(slice(top, top + TILE), slice(left, left + TILE)) for top, left in corners]
+Named = list[tuple[str, NDArray[np.uint8]]]  # pictures (H, W, 3) by file name; "" of one that stands alone
 
 
 def free_position(room: Room, rng: np.random.Generator, heights: tuple[float, float]) -> Array:
@@ -64,7 +62,9 @@ def scan_room(
     """Points (N, 3) [m], colours (N, 3) and labels (N,) of a room, N = num_points, from three stations."""
     num_stations = 3
     width = 2 * int(np.ceil(np.sqrt(1.15 * num_points / num_stations / 2.0)))
-    points, colors, labels = [], [], []
+    points = []
+    colors = []
+    labels = []
     for station in range(num_stations):
         position = free_position(room, rng, (1.2, 1.8))
         rays = pixel_rays(width).reshape(-1, 3) @ yaw_rotation(rng.uniform(0, 2 * np.pi))
@@ -78,43 +78,55 @@ def scan_room(
     return np.concatenate(points)[chosen], np.concatenate(colors)[chosen], np.concatenate(labels)[chosen]
 
 
-def photograph(room: Room, pose: Pose, width: int, workers: Workers) -> NDArray[np.uint8]:
-    """Equirectangular image (width / 2, width, 3) of a room at `pose`."""
-    return exposed(room, [pose], width, workers)
+def photograph(
+    room: Room, pose: Pose, width: int, workers: Workers, meanwhile: Sequence[Pose] = ()
+) -> NDArray[np.uint8]:
+    """Equirectangular image (width / 2, width, 3) of a room at `pose`.
 
-
-def exposed(room: Room, poses: Sequence[Pose], width: int, workers: Workers) -> NDArray[np.uint8]:
-    """Equirectangular image (width / 2, width, 3): the mean over poses, one or a multiple of four."""
+    With poses that the camera has `meanwhile`, a multiple of four of them, it is the mean over these.
+    """
     rays_cam = pixel_rays(SUPERSAMPLING * width)
     rgb = np.empty((width // 2, width, 3), np.uint8)
     parts = [divmod(k, SUPERSAMPLING) for k in range(SUPERSAMPLING**2)]
-    samples = [
-        (pose, parts[k % len(parts)]) for k, pose in enumerate([*poses] * (len(parts) // len(poses) or 1))
-    ]
+    samples = [(each, parts[k % len(parts)]) for k, each in enumerate(meanwhile or [pose] * len(parts))]
 
-    def run(tile: Tile) -> None:
-        total = np.zeros((rgb[tile].size // 3, 3))
-        for pose, (row, column) in samples:
-            rays = rays_cam[row::SUPERSAMPLING, column::SUPERSAMPLING][tile].reshape(-1, 3)
-            total += cast_rays(room, pose.center_world, rays @ pose.R_cam_from_world, Workers(), "tile")[1]
-        rgb[tile] = np.round(255.0 / len(samples) * total).reshape(rgb[tile].shape)
+    def run(corner: tuple[int, int]) -> None:
+        rows, columns = (slice(begin, begin + TILE) for begin in corner)
+        tile = rgb[rows, columns]
+        total = np.zeros((tile.size // 3, 3))
+        for each, (row, column) in samples:
+            rays = rays_cam[row::SUPERSAMPLING, column::SUPERSAMPLING][rows, columns].reshape(-1, 3)
+            total += cast_rays(room, each.center_world, rays @ each.R_cam_from_world, Workers(), "tile")[1]
+        tile[:] = np.round(255.0 / len(samples) * total).reshape(tile.shape)
 
-    list(workers.map(run, tiles(width), "panorama"))
+    corners = itertools.product(range(0, width // 2, TILE), range(0, width, TILE))
+    list(workers.map(run, list(corners), "panorama"))
     return rgb
 
 
-def label_image(room: Room, pose: Pose, width: int, workers: Workers) -> NDArray[np.uint16]:
-    """Equirectangular image (width / 2, width) of a room's labels at `pose`, of pixels' centres."""
-    rays_cam = pixel_rays(width)
-    labels = np.empty((width // 2, width), np.uint16)
+def picture_by(mount: Mount, room: Room, pose: Pose, workers: Workers) -> NDArray[np.uint8]:
+    """The picture (H, W, 3) by a camera of a room, its rig at `pose`; black where it shows nothing."""
+    camera = mount.camera
+    u = (np.arange(SUPERSAMPLING * camera.width) + 0.5) / SUPERSAMPLING
+    v = (np.arange(SUPERSAMPLING * camera.height) + 0.5) / SUPERSAMPLING
+    rays, is_seen = camera.rays(np.stack(np.meshgrid(u, v), axis=-1))
+    own = mount.pose(pose)
+    rgb = np.zeros((*is_seen.shape, 3), np.float32)
+    rays_world = rays[is_seen] @ own.R_cam_from_world
+    rgb[is_seen] = cast_rays(room, own.center_world, rays_world, workers, "photo")[1]
+    small = cv2.resize(rgb, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    return np.asarray(np.round(small * 255.0), np.uint8)
 
-    def run(tile: Tile) -> None:
-        rays = rays_cam[tile].reshape(-1, 3) @ pose.R_cam_from_world
-        found = cast_rays(room, pose.center_world, rays, Workers(), "tile")[2]
-        labels[tile] = found.reshape(labels[tile].shape)
 
-    list(workers.map(run, tiles(width), "labels"))
-    return labels
+def picture_of_all(mounts: Sequence[Mount], room: Room, pose: Pose, workers: Workers) -> NDArray[np.uint8]:
+    """The one picture in which cameras have their parts, such as a dual fisheye."""
+    width, height = extent_of(mounts)
+    rgb = np.zeros((height, width, 3), np.uint8)
+    for mount in mounts:
+        left, top = mount.offset
+        camera = mount.camera
+        rgb[top : top + camera.height, left : left + camera.width] = picture_by(mount, room, pose, workers)
+    return rgb
 
 
 def blur(image: Array, sigma: float) -> Array:
@@ -137,8 +149,7 @@ class World(NamedTuple):
     rooms: tuple[Room, ...]
 
 
-@dataclass(frozen=True)
-class Query:
+class Query(NamedTuple):
     """A panorama with the pose at which it was taken."""
 
     rgb: NDArray[np.uint8]  # (H, W, 3)
@@ -159,11 +170,6 @@ def make_world(seed: int, size: Array, num_rooms: int = 1) -> World:
         corner = np.array([*((size[:2] + GAP) * divmod(k, columns)), 0.0])
         rooms.append(make_room(seed * SEED_STEP + k, size, corner))
     return World(seed, tuple(rooms))
-
-
-def random_size(rng: np.random.Generator) -> Array:
-    """Size (3,) of a room [m], from a box room to a hall."""
-    return rng.uniform([3.5, 3.0, 2.3], [9.0, 7.0, 3.4])
 
 
 def check_num_points(world: World, num_points: int) -> None:
@@ -221,6 +227,36 @@ def pose_of_query(world: World, index: int, variant: str) -> tuple[Room, Pose, n
 
 
 def make_labels(world: World, index: int, query: Query, workers: Workers) -> NDArray[np.uint16]:
-    """Image (H, W) of the labels that query number `index` of its variant shows."""
+    """Image (H, W) of the labels that query number `index` of its variant shows, of pixels' centres."""
     room, _ = room_of_query(world, index, query.variant)
-    return label_image(room, query.pose, query.rgb.shape[1], workers)
+    shape = query.rgb.shape[:2]
+    rays = pixel_rays(shape[1]).reshape(-1, 3) @ query.pose.R_cam_from_world
+    labels = cast_rays(room, query.pose.center_world, rays, workers, "labels")[2]
+    return labels.astype(np.uint16).reshape(shape)
+
+
+def check_cameras(cameras: Calibration) -> None:
+    """Refuse, before any work is done, cameras whose pictures can't be made, naming the option."""
+    path = cameras.path
+    mounts = cameras.mounts
+    if cameras.is_choice and len(mounts) > 1:
+        raise InputError(f"--camera: found {len(mounts)} cameras in {path}, wanted one, or those of a rig")
+    if not cameras.has_sizes or max(extent_of(mounts)) > MAX_SIDE:
+        raise InputError(f"--camera: found pictures of no size in {path}, or over {MAX_SIDE} px")
+    names = [mount.image for mount in mounts if mount.image is not None]
+    if any(re.search(r"[*?|\[/]", name) or not name.endswith((".jpg", ".png")) for name in names):
+        raise InputError(f"--camera: found images {names} in {path}, wanted names of .jpg or .png files")
+
+
+def make_photos(
+    world: World, index: int, variant: str, cameras: Calibration, workers: Workers
+) -> tuple[Named, Pose]:
+    """The pictures by these cameras of query number `index` of a variant, and the pose of the whole."""
+    room, pose, rng = pose_of_query(world, index, variant)
+    if cameras.is_rig:
+        pictures = [(m.image or "", picture_by(m, room, pose, workers)) for m in cameras.mounts]
+    else:
+        pictures = [("", picture_of_all(cameras.mounts, room, pose, workers))]
+    if variant == "photo":
+        pictures = [(name, other_light(rgb, rng)) for name, rgb in pictures]
+    return pictures, pose

@@ -1,4 +1,4 @@
-"""The experiments: the conditions that each compares, what the paper found there, table and picture.
+"""The paper's experiments: what is varied, on transformed copies of scenes, beside the paper's figures.
 
 The paper's figures are of its own data (Stanford2D-3D-S, OmniScenes, MPO) on an RTX 2080 (Kim et al., ICCV
 2021): they say what to expect of a trend, and compare in full only on the same data.
@@ -6,17 +6,99 @@ The paper's figures are of its own data (Stanford2D-3D-S, OmniScenes, MPO) on an
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
+from zlib import crc32
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from ...localization.settings import CoarseToFineSettings
-from ...optional import new_figure
-from ...paper.settings import PaperSettings
-from ..evaluation.plots import figure_png
-from ..evaluation.query_result import QueryResult
-from ..evaluation.tables import Table, summarize
-from .transforms import SceneTransform, flipped, identity, with_count, with_fraction, with_random_rotation
+from ..cloud import read_cloud
+from ..cloud.ply_writer import vertex_rows, write_ply
+from ..errors import InputError
+from ..files.atomic import write_atomically
+from ..geometry.pose import Array, Pose
+from ..geometry.rotations import random_rotation
+from ..localization.settings import CoarseToFineSettings
+from ..panorama import read_panorama
+from ..paper.settings import PaperSettings
+from .datasets.model import RigidTransform
+from .evaluation.query_result import QueryResult
+from .evaluation.tables import Table, summarize
+from .scene import CLOUD_NAME, Query, Scene
+
+# A transformed copy of a scene; the folder, which is there, is for its files alone.
+SceneTransform = Callable[[Scene, Path], Scene]
+UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])  # half a turn about the view axis
+
+
+def identity(scene: Scene, folder: Path) -> Scene:
+    """The scene itself."""
+    return scene
+
+
+def with_fraction(fraction: float) -> SceneTransform:
+    """A transform that keeps a fraction of the points, drawn at random."""
+    return lambda scene, folder: _thinned(scene, folder, lambda count: max(1, round(fraction * count)))
+
+
+def with_count(num_points: int) -> SceneTransform:
+    """A transform that keeps a number of points, drawn at random; InputError where there are fewer."""
+    return lambda scene, folder: _thinned(scene, folder, lambda _: num_points)
+
+
+def _thinned(scene: Scene, folder: Path, num_kept: Callable[[int], int]) -> Scene:
+    cloud = read_cloud(scene.cloud)
+    count = num_kept(len(cloud.points))
+    if count > len(cloud.points):
+        raise InputError(f"{scene.cloud}: found {len(cloud.points)} points, wanted at least {count}")
+    chosen = np.sort(_rng(scene).choice(len(cloud.points), count, replace=False))
+    points = cloud.points[chosen].astype(np.float64) + cloud.origin_world
+    return replace(scene, cloud=_written(folder, points, cloud.colors[chosen]))
+
+
+def with_random_rotation(scene: Scene, folder: Path) -> Scene:
+    """The cloud turned by a rotation drawn from all of SO(3), the true poses with it."""
+    cloud = read_cloud(scene.cloud)
+    turn = RigidTransform(random_rotation(_rng(scene)), np.zeros(3))
+    points = turn.of_points(cloud.points.astype(np.float64) + cloud.origin_world)
+    queries = tuple(replace(query, pose=turn.of_pose(query.pose)) for query in scene.queries)
+    return replace(scene, cloud=_written(folder, points, cloud.colors), queries=queries)
+
+
+def _written(folder: Path, points: Array, colors: NDArray[np.uint8]) -> Path:
+    path = folder / CLOUD_NAME
+    write_ply(path, vertex_rows(points, colors))
+    return path
+
+
+def flipped(scene: Scene, folder: Path) -> Scene:
+    """Every picture taken with the camera upside down: turned by half a turn about the view axis.
+
+    They are PNG under the scene's own names, so that results of both can be compared by name.
+    """
+    names = [scene.name_of(query) for query in scene.queries]
+    depth = max(Path(name).parts.count("..") for name in names) if names else 0
+    inner = folder.joinpath(*["in"] * depth)  # so deep that no name leads out of the folder
+    inner.mkdir(parents=True, exist_ok=True)
+    queries = []
+    for name, query in zip(names, scene.queries, strict=True):
+        image = inner / name
+        image.parent.mkdir(parents=True, exist_ok=True)
+        panorama = read_panorama(query.image)
+        bgra = cv2.cvtColor(panorama.rgb, cv2.COLOR_RGB2BGRA)
+        bgra[..., 3] = np.where(panorama.is_valid, 255, 0)  # transparent where it shows nothing
+        write_atomically(image, bytes(cv2.imencode(".png", bgra[::-1, ::-1])[1]))
+        pose = Pose(UPSIDE_DOWN @ query.pose.R_cam_from_world, query.pose.center_world)
+        queries.append(Query(image, query.variant, pose))
+    return Scene(scene.name, inner, scene.cloud, tuple(queries))
+
+
+def _rng(scene: Scene) -> np.random.Generator:
+    """A generator seeded by the scene's name: the same draw whatever else is run."""
+    return np.random.default_rng([crc32(scene.name.encode()), len(scene.queries)])
+
 
 Settings = CoarseToFineSettings | PaperSettings
 NO_FIGURE = "-"
@@ -156,42 +238,18 @@ def table(title: str, found: Sequence[tuple[Condition, Sequence[QueryResult]]]) 
 
 def _cells(condition: Condition, rows: Sequence[QueryResult]) -> tuple[str, ...]:
     summary = summarize(rows)
-    errors = f"{summary.position_quartiles[1]:.4f}", f"{_median_of_correct(rows):.4f}"
-    angle = f"{np.degrees(summary.rotation_quartiles[1]):.3f}"
+    of_correct = [row.position_error for row in rows if row.is_correct()] or [np.nan]
     stages = [[row.result.seconds.get(stage, 0.0) for row in rows] for stage in ("search", "refine")]
-    seconds = [f"{np.median(stage):.2f}" for stage in stages]
-    counts = f"{summary.num_queries}", f"{summary.accuracy:.3f}"
-    verdicts = f"{summary.num_localized}", f"{summary.num_wrong}"
-    return (condition.name, condition.preset, *counts, *errors, angle, *seconds, *verdicts, condition.paper)
-
-
-def _median_of_correct(rows: Sequence[QueryResult]) -> float:
-    """Median position error [m] of the correct poses, NaN if there are none."""
-    errors = [row.position_error for row in rows if row.is_correct()]
-    return float(np.median(errors)) if errors else float("nan")
-
-
-def plot_png(title: str, found: Sequence[tuple[Condition, Sequence[QueryResult]]]) -> bytes:
-    """Accuracy, median error of the correct poses and seconds over the conditions, a line a preset."""
-    names = list(dict.fromkeys(condition.name for condition, _ in found))
-    figure = new_figure(figsize=(13, 4.4), layout="constrained")
-    figure.suptitle(title)
-    panels = figure.subplots(1, 3)
-    for preset in dict.fromkeys(condition.preset for condition, _ in found):
-        own = [(names.index(condition.name), rows) for condition, rows in found if condition.preset == preset]
-        summaries = [summarize(rows) for _, rows in own]
-        values = (
-            [100.0 * summary.accuracy for summary in summaries],
-            [1000.0 * _median_of_correct(rows) for _, rows in own],
-            [summary.seconds for summary in summaries],
-        )
-        for axes, some in zip(panels, values, strict=True):
-            axes.plot([place for place, _ in own], some, "o-", label=preset)
-    for axes, label in zip(panels, ("correct [%]", "median error of correct [mm]", "seconds"), strict=True):
-        axes.set_xticks(range(len(names)), names, rotation=30, ha="right")
-        axes.set_ylabel(label)
-        axes.grid(alpha=0.3)
-        axes.legend()
-    panels[0].set_ylim(0, 103)
-    panels[2].set_ylim(bottom=0)
-    return figure_png(figure)
+    return (
+        condition.name,
+        condition.preset,
+        f"{summary.num_queries}",
+        f"{summary.accuracy:.3f}",
+        f"{summary.position_quartiles[1]:.4f}",
+        f"{np.median(of_correct):.4f}",
+        f"{np.degrees(summary.rotation_quartiles[1]):.3f}",
+        *(f"{np.median(stage):.2f}" for stage in stages),
+        f"{summary.num_localized}",
+        f"{summary.num_wrong}",
+        condition.paper,
+    )
