@@ -38,13 +38,6 @@ def opened(tmp_path):
     return open_it
 
 
-def test_late_features_are_those_of_a_map_that_has_them():
-    whole = rooms.scan_map(1)
-    late = scan_map.with_late_features(replace(whole, local_features=None))
-    for own, other in zip(late.features_now(WORKERS), whole.local_features, strict=True):
-        np.testing.assert_array_equal(own, other)
-
-
 def test_they_are_made_once_and_threads_wait_for_them():
     made, threads, got = [], [], []
     started, go_on = threading.Event(), threading.Event()

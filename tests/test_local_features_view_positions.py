@@ -2,13 +2,10 @@
 
 import naive
 import numpy as np
-import rooms
 
 from piccolo.geometry.sphere import make_grid
 from piccolo.local_features import view_positions as view_positions_module
 from piccolo.local_features.view_positions import cell_table, view_positions
-from piccolo.views.candidate_views import SEARCH_VIEW
-from piccolo.views.view import ranges_around
 
 RINGS = 24
 CELLS = len(make_grid(RINGS))
@@ -56,19 +53,6 @@ def test_known_positions_spare_others_and_are_not_named_again():
     assert more.min() >= 4
     assert (more - 4).tolist() == alone[4:].tolist()
     assert len(_positions(np.concatenate([centers[alone], centers]), _open(200), len(alone))) == 0
-
-
-def test_positions_a_metre_above_the_lowest_come_first():
-    centers = np.array([[1.0, 1, 0.3], [1.0, 1, 1.3], [1.0, 1, 2.3]])
-    assert _positions(centers, _open(3)).tolist() == [1]
-
-
-def test_a_small_room_takes_few():
-    m = rooms.scan_map(1)
-    chosen = _positions(m.centers, ranges_around(m.octree, m.centers, SEARCH_VIEW))
-    assert 2 <= len(chosen) <= 16
-    distance = np.linalg.norm(m.centers[:, None, :2] - m.centers[chosen][:, :2], axis=2).min(axis=1)
-    assert distance.max() < 2.5
 
 
 def test_positions_are_bounded(monkeypatch):

@@ -6,7 +6,7 @@ import rooms
 from rooms import errors
 
 from piccolo.geometry.pose import Pose, step, yaw_rotation
-from piccolo.optimize.refine import Adam, Refined, descend_lbfgs, refine, sampling_loss_of
+from piccolo.optimize.refine import Adam, descend_lbfgs, refine, sampling_loss_of
 from piccolo.panorama.texels import pack_texels
 from piccolo.paper.settings import PaperSettings
 
@@ -42,14 +42,6 @@ def test_adam_decays_after_patience_stalled_losses():
 def test_adams_first_step_is_the_step_size_against_the_gradient():
     delta = Adam(0.1, 0.8, 5).update(1.0, np.array([3.0, -0.001, 0, 0, 0, 7.0]))
     np.testing.assert_allclose(delta, [-0.1, 0.1, 0, 0, 0, -0.1], rtol=1e-4)
-
-
-def test_best_iterate_is_kept_not_the_last():
-    best = Refined(Pose(np.eye(3), np.zeros(3)))
-    for x, loss in ((1.0, 0.5), (2.0, 0.3), (3.0, 0.4)):
-        best.offer(Pose(np.eye(3), np.array([x, 0, 0])), loss)
-    assert best.loss == 0.3
-    assert best.pose.center_world[0] == 2.0
 
 
 def test_lbfgs_follows_a_gradient_in_steps_of_the_camera():

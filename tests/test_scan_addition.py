@@ -184,14 +184,11 @@ def test_joined_voxels_are_those_of_each_and_means_where_both_are():
     np.testing.assert_array_equal(join_voxels(a.nodes, a.nodes[:0], a.origin).codes, a.codes)
 
 
-@pytest.mark.parametrize("name", ["", " A", "A\n", "x" * 101, "\x1b[31m"])
-def test_what_is_no_name_is_refused(name):
-    with pytest.raises(InputError, match=r"^--name: found .*, wanted 1 to 100 printable characters$"):
-        named(rooms.scan_map(1), name)
-
-
 def test_what_can_not_be_added_is_refused():
     cloud = rooms.room(2)[1]
+    for name in ("", " A", "A\n", "x" * 101, "\x1b[31m"):
+        with pytest.raises(InputError, match=r"^--name: found .*, wanted 1 to 100 printable characters$"):
+            named(rooms.scan_map(1), name)
     with pytest.raises(InputError, match=r"^--name: found 'A', which the map has already: 'A'$"):
         _added(first(), cloud, "A")
     with pytest.raises(InputError, match=r"^--add: found a scan 30 km from the map's, wanted one coordinate"):

@@ -37,10 +37,6 @@ def _storeys(*parts):
     return floors, lambda places: storeys.at(np.array(places) - origin)
 
 
-def test_a_room_is_one_storey_and_its_ceiling_none():
-    assert _storeys(_box(0, 0, 6, 5, 0.0, 2.6))[0] == pytest.approx([0.0], abs=0.05)
-
-
 def test_storeys_one_above_the_other_lowest_first():
     floors, at = _storeys(*(_box(0, 0, 6, 5, low, low + 2.5) for low in (-2.9, 0.0, 2.9)))
     assert floors == pytest.approx([-2.9, 0.0, 2.9], abs=0.05)

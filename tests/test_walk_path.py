@@ -199,11 +199,6 @@ def test_what_tells_copies_apart_counts_as_far_as_the_camera_has_moved():
     assert behind(0.0, OTHER_LOG_ODDS) == pytest.approx([OTHER_LOG_ODDS, OTHER_LOG_ODDS])
 
 
-def test_a_worse_pose_in_the_same_place_is_no_copy():
-    (odds,) = emissions([_frame(0, ((0, 0, 0), 5.0), ((0.6, 0, 0), 1.0))])
-    assert odds[0] - odds[1] == pytest.approx(4.0)
-
-
 def test_a_jump_has_a_price_and_is_reported():
     frames = [
         *(_frame(k, ((k, 0, 0), 5.0)) for k in range(4)),

@@ -47,14 +47,6 @@ def test_positions_and_deviations_are_those_of_dense_least_squares():
     np.testing.assert_allclose(variances, np.diag(covariance), rtol=1e-8)
 
 
-def test_a_straight_walk_stays_as_it_is():
-    times = np.array([0.0, 0.5, 1.5, 1.8, 3.0])
-    located = _located(np.outer(times, [1.0, 0.5, 0.0]), [0.01] * 5)
-    for (pose, covariance), (before, own) in zip(smoothed(located, times, MOTION), located, strict=True):
-        np.testing.assert_allclose(pose.center_world, before.center_world, atol=1e-9)
-        assert covariance.matrix[3, 3] <= own.matrix[3, 3] + PRIOR_FLOOR
-
-
 def test_an_uncertain_frame_comes_to_the_others_and_turns_with_its_place():
     times = np.arange(5.0) / 4
     centers = np.outer(times, [1.0, 0.0, 0.0])

@@ -6,34 +6,24 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
 
 from tqdm import tqdm
 
-from ..confidence.confidence import LOCALIZED
 from ..errors import InputError, printable, text_of
 from ..jobs.memory import is_shortage
-from ..result import FAILED, UNREADABLE
 from .progress import log_shown
 from .start import EXIT_INTERRUPTED, EXIT_TERMINATED, as_started
 
-EXIT_SOME_NOT = 1
 EXIT_BAD_USAGE = 2
 EXIT_BAD_INPUT = 3
 EXIT_INTERNAL = 4
 EXIT_BROKEN_PIPE = 141
 RETRY = 0.1  # [s] after which a signal is sent again
 SHORTAGE = "not enough memory ({}); set --max-memory or fewer --threads, or thin the scan"
-
-
-def exit_code_of(statuses: Collection[str]) -> int:
-    """Return 0 if all photos are localized, 3 if one can't be read or has failed, else 1."""
-    if UNREADABLE in statuses or FAILED in statuses:
-        return EXIT_BAD_INPUT
-    return 0 if set(statuses) <= {LOCALIZED} else EXIT_SOME_NOT
 
 
 class UsageError(InputError):

@@ -41,26 +41,25 @@ def run_scenes(
     with locked(path) as file, ExitStack() as stack:
         rows, size = read_run(path)
         check_run(path, rows, scenes, {"settings": json.loads(json.dumps(settings))})
-        done = {row.key for row in rows}
-        wanted = {
-            scene.name: [q for q in scene.queries if not variants or q.variant in variants]
+        keys = {
+            (scene.name, scene.name_of(query))
             for scene in scenes
+            for query in scene.queries
+            if not variants or query.variant in variants
         }
-        left = {
-            scene.name: [q for q in wanted[scene.name] if (scene.name, scene.name_of(q)) not in done]
-            for scene in scenes
-        }
+        open_keys = keys - {row.key for row in rows}
+        found = ((s, [q for q in s.queries if (s.name, s.name_of(q)) in open_keys]) for s in scenes)
+        left = [(scene, queries) for scene, queries in found if queries]
         evaluation = Evaluation(arguments, config, file, rows)
-        if any(left.values()):
+        if left:
             file.cut(size)
-            num_jobs = count_jobs(arguments, max(map(len, left.values())))
+            num_jobs = count_jobs(arguments, max(len(queries) for _, queries in left))
             cluster = stack.enter_context(connecting(arguments, num_jobs))
             with interruptible() as interruption:
-                for scene in scenes:
-                    if left[scene.name] and not interruption.number:
-                        evaluation.localize(scene, left[scene.name], cluster, interruption)
+                for scene, queries in left:
+                    if not interruption.number:
+                        evaluation.localize(scene, queries, cluster, interruption)
             interruption.raise_again()
-    keys = {(scene.name, scene.name_of(query)) for scene in scenes for query in wanted[scene.name]}
     return [row for row in evaluation.rows if row.key in keys], evaluation.num_failed
 
 

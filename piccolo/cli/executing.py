@@ -3,7 +3,7 @@
 import argparse
 import os
 import signal
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,23 +13,33 @@ from types import FrameType
 from typing import TypeVar
 
 from ..batch.localizer import Localizer
+from ..confidence.confidence import LOCALIZED
 from ..errors import InputError
 from ..jobs.cluster import LOCAL, Cluster, connected
 from ..jobs.memory import GB, memory_left, memory_taken
 from ..jobs.processes import Processes
 from ..jobs.tasks import Here
 from ..jobs.threads import num_cores
+from ..result import FAILED, UNREADABLE
 from ..scan import Scan
 from ..scan_map.map_file import save_map
 from ..scan_map.open_map import CachePolicy
 from ..scan_map.scan_map import ScanMap
-from .errors import Terminated, UsageError
+from .errors import EXIT_BAD_INPUT, Terminated, UsageError
 from .options import PHOTOS_OF_A_JOB
 
+EXIT_SOME_NOT = 1
 QUERY_MEMORY = 0.5e9  # [byte] of a process beside the map
 SIGNALS: dict[int, str] = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 Item = TypeVar("Item")
 Executor = Here | Processes | Cluster
+
+
+def exit_code_of(statuses: Collection[str]) -> int:
+    """Return 0 if all photos are localized, 3 if one can't be read or has failed, else 1."""
+    if UNREADABLE in statuses or FAILED in statuses:
+        return EXIT_BAD_INPUT
+    return 0 if set(statuses) <= {LOCALIZED} else EXIT_SOME_NOT
 
 
 def check_execution(arguments: argparse.Namespace) -> None:

@@ -33,7 +33,7 @@ from ..scan import Scan
 from ..scan_map.open_map import scan_sha256_of
 from ..scan_map.scan_map import ScanMap
 from .command import command
-from .errors import EXIT_BAD_INPUT, UsageError, checking_options, exit_code_of, print_error, print_note
+from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error, print_note
 from .executing import (
     SIGNALS,
     Executor,
@@ -42,6 +42,7 @@ from .executing import (
     connecting,
     count_jobs,
     executing,
+    exit_code_of,
     interruptible,
 )
 from .options import (

@@ -33,8 +33,8 @@ from ..scan import Scan
 from ..scan_map.scan_map import ScanMap
 from ..scan_walk import Walk
 from ..walk.frames import MAX_ACCELERATION, MAX_SPEED, MAX_STEP, NO_ACCELERATION, Motion
-from .errors import EXIT_BAD_INPUT, UsageError, exit_code_of, print_error, print_note
-from .executing import SIGNALS, Interruption, interruptible
+from .errors import EXIT_BAD_INPUT, UsageError, print_error, print_note
+from .executing import SIGNALS, Interruption, exit_code_of, interruptible
 from .options import DEFAULT_EVERY
 from .outputs import check_suffix
 from .progress import progress_bar, shown

@@ -1,7 +1,7 @@
 """From starts to poses: descents on the cells of ever finer views, successive halving, and perturbations."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -63,21 +63,19 @@ class Fit(Scored):
 
 def refine(query: Query, starts: Starts, beam: Beam) -> list[Hypothesis]:
     """Successive halving from the starts to a few poses on fine cells, and the best elsewhere; best first."""
-
-    def each(descend_on: Callable[[Query, Pose], Fit], poses: Sequence[Pose]) -> list[Fit]:
-        return query.workers.map(partial(descend_on, query), poses, "descend")
-
+    workers = query.workers
     coarse = descend_prepared(query, starts, FIRST_ITERATIONS, beam.num_coarse)
     coarse = descend_prepared(query, coarse, SECOND_ITERATIONS, beam.num_middle)
-    middle = each(descend_middle, coarse.poses())
-    perturbed = each(perturb_middle, narrow(middle, beam.num_fine))
-    fine = each(descend_fine, narrow(perturbed, beam.num_fine))
+    middle = workers.map(partial(descend_middle, query), coarse.poses(), "descend")
+    narrowed = narrow(middle, beam.num_fine)
+    perturbed = workers.map(partial(perturb_middle, query), narrowed, "descend")
+    fine = workers.map(partial(descend_fine, query), narrow(perturbed, beam.num_fine), "descend")
     best = best_distinct(fine, beam.num_perturbed, CLOSE_DISTANCE, SAME_ANGLE)
     others = plain(distinct(fine, middle))[len(best) :]  # which most likely stay
-    with query.workers.beside(*(partial(compare, query, f.pose) for f in others)):
-        ends = query.workers.map(partial(refine_by_perturbation, query), best, "descend")
+    with workers.beside(*(partial(compare, query, f.pose) for f in others)):
+        ends = workers.map(partial(refine_by_perturbation, query), best, "descend")
     poses = [f.pose for f in plain(distinct([*ends, *fine], middle))]
-    return by_score(query.workers.map(partial(score_pose, query), poses, "descend"))
+    return by_score(workers.map(partial(score_pose, query), poses, "descend"))
 
 
 def refine_matches(query: Query, poses: Sequence[Pose]) -> list[Hypothesis]:

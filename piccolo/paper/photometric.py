@@ -52,7 +52,7 @@ def photometric_equations(points: PackedPoints, panorama: Panorama, pose: Pose) 
     by_u, by_v = (gradient[counts] for gradient in view_gradient(view))
     rows_u, rows_v = pixel_motion(view.depth, counts)
     weights = 1.0 / np.maximum(norms, LEAST_NORM)
-    e_u, e_v = weights * (by_u * residuals).sum(axis=1), weights * (by_v * residuals).sum(axis=1)
+    e_u, e_v = (weights * (by * residuals).sum(axis=1) for by in (by_u, by_v))
     gradient = -(e_u @ rows_u + e_v @ rows_v)
     a_uu, a_uv, a_vv = (weights * (a * b).sum(axis=1) for a, b in ((by_u, by_u), (by_u, by_v), (by_v, by_v)))
     cross = (rows_u * a_uv[:, None]).T @ rows_v
@@ -86,7 +86,8 @@ def view_gradient(view: View) -> tuple[Image, Image]:
         ahead, behind = (np.roll(view.rgb, -step, axis=axis) for step in (1, -1))
         has_ahead, has_behind = (np.roll(seen, -step, axis=axis) for step in (1, -1))
         if axis == 0:  # rows do not wrap
-            has_ahead[-1], has_behind[0] = 0.0, 0.0
+            has_ahead[-1] = 0.0
+            has_behind[0] = 0.0
         total = (ahead - view.rgb) * has_ahead + (view.rgb - behind) * has_behind
         gradients.append(total / np.maximum(has_ahead + has_behind, 1.0))
     return gradients[0], gradients[1]

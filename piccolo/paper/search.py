@@ -52,7 +52,9 @@ def free_grid(points: PackedPoints, num_translations: int, margin: float) -> NDA
     """
     low = np.array([points.x.min(), points.y.min(), points.z.min()], dtype=np.float64)
     high = np.array([points.x.max(), points.y.max(), points.z.max()], dtype=np.float64)
-    low, high = low + margin * (high - low), high - margin * (high - low)
+    inset = margin * (high - low)
+    low += inset
+    high -= inset
     probed = points.take(slice(None, None, max(1, len(points) // PROBE_POINTS)))
     free = np.empty((0, 3))
     for growth in (1.0, 1.5, 2.25, 3.4, 5.0, 7.6, 11.4, 17.0, 26.0):
@@ -108,7 +110,7 @@ def search(
 ) -> list[Hypothesis]:
     """The K2 poses to descend from, of all positions (N_t, 3) and rotations (N_r, 3, 3) of `grid`."""
     positions, rotations = grid
-    distance, angle = settings.min_distance, np.radians(settings.min_angle_deg)
+    near = (settings.min_distance, np.radians(settings.min_angle_deg))
 
     def losses(center_world: Array) -> list[Hypothesis]:
         seen = visible_points(points, center_world) if settings.use_visibility else points
@@ -116,12 +118,12 @@ def search(
 
     scored = [h for batch in workers.map(losses, list(positions), "search") for h in batch]
     if settings.initialization == "loss-only":
-        return best_distinct(scored, settings.num_by_histogram, distance, angle)
-    by_loss = best_distinct(scored, settings.num_by_loss, distance, angle)
+        return best_distinct(scored, settings.num_by_histogram, *near)
+    by_loss = best_distinct(scored, settings.num_by_loss, *near)
     small = shrink(panorama, settings.histogram_width)
 
     def rescored(h: Hypothesis) -> Hypothesis:
         return Hypothesis(h.pose, histogram_similarity(points, small, h.pose, settings.histogram_bins))
 
     by_histogram = list(workers.map(rescored, by_loss, "compare colours"))
-    return best_distinct(by_histogram, settings.num_by_histogram, distance, angle)
+    return best_distinct(by_histogram, settings.num_by_histogram, *near)
