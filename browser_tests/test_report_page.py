@@ -6,8 +6,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from piccolo.views.field import cut
-from piccolo.views.surfel_renderer import fill_holes, render_points
 from report_scenes import HOSTILE
 
 from piccolo.camera.model import pinhole
@@ -15,6 +13,8 @@ from piccolo.cloud.settings import IN_METRES
 from piccolo.jobs.threads import Workers
 from piccolo.result import read_results
 from piccolo.scan_map.open_map import open_points
+from piccolo.views.pictures import cut, fill_holes
+from piccolo.views.surfels import render_points
 
 AXE = Path(__file__).resolve().parents[1] / "page" / "node_modules" / "axe-core" / "axe.min.js"
 LOOKS = [(0, 0), (75, -20), (150, 25), (225, -45), (300, 10)]  # heading and pitch [deg]
