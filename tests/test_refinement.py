@@ -20,7 +20,6 @@ from piccolo.localization.query import Cache, Images, prepare_query
 from piccolo.localization.refinement import Fit, best_and_alternatives, narrow
 from piccolo.localization.search import Starts
 from piccolo.localization.settings import METHOD, Beam, CoarseToFineSettings
-from piccolo.views.recent_views import RecentViews
 from piccolo.views.view import Cells
 
 FINE_BLOCKS = METHOD.fine_view.arrays.blocks
@@ -227,7 +226,9 @@ def test_cells_and_points_are_those_that_the_photo_shows(monkeypatch):
     is_inside = np.abs((azimuth - 78.75 + 180) % 360 - 180) < 33.75
     assert (shown == is_inside).mean() > 0.98
     monkeypatch.setattr(query_module, "normalized_view", lambda sums, center, config, shown: shown)
-    views = RecentViews(lambda *_: None, lambda place, config, shown, count: (shown, count), lambda *_: None)
+    views = SimpleNamespace(
+        averages=lambda *_: None, points=lambda place, config, shown, count: (shown, count)
+    )
     asked = replace(narrow, cache=Cache(views))
     assert (asked.view_at(pose, METHOD.full_view) == shown).all()
     assert asked.points_at(pose) == (shown.tobytes(), 30_000)
