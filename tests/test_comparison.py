@@ -7,7 +7,7 @@ import naive
 import numpy as np
 import pytest
 import rooms
-from measuring.damage import occluded, outside_field
+from measuring.confidence import occluded, outside_field
 
 from piccolo.confidence.score import Evidence
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rooms
-from measuring.repeated import REPEATED_KINDS, make_repeated
+from measuring.places import REPEATED_KINDS, make_repeated
 from rooms import as_panorama, errors, query
 
 from piccolo.cloud import stream_of
