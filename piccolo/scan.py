@@ -76,15 +76,15 @@ def parse_options(
     options: QueryOptions, settings: Settings, cloud_settings: CloudSettings
 ) -> tuple[ReadOptions, Settings, NDArray[np.bool_] | None]:
     """Return options of a photo as objects, beside the settings of all; and the mask, if it is an array."""
+    known = QueryOptions.__annotations__
+    if unknown := sorted(options.keys() - known.keys()):
+        raise TypeError(f"found no option {unknown[0]!r}, wanted one of {', '.join(known)}")
     given: dict[str, Any] = dict(options)
     is_masked = given.pop("mask") if isinstance(given.get("mask"), np.ndarray) else None
     if "mask" in given:
         given["mask"] = Path(given["mask"])
-    prior = {k: given.pop(k) for k in PRIOR_FIELDS & given.keys()}
-    if isinstance(prior.get("within"), str):
-        raise InputError(f"within: found the text {prior['within']!r}, wanted a list of names")
-    if prior:
-        given["prior"] = Prior(**prior | {"within": tuple(prior.get("within", ()))})
+    if prior := {name: given.pop(name) for name in PRIOR_FIELDS & given.keys()}:
+        given["prior"] = _make_prior(prior, settings)
     if "camera" in given and "rig" in given:
         raise InputError("camera, rig: wanted only one of them")
     if "camera" in given:
@@ -95,6 +95,16 @@ def parse_options(
         labels=cloud_settings.labels, **{k: given.pop(k) for k in READ_FIELDS & given.keys()}
     )
     return read_options, replace(settings, **given), is_masked
+
+
+def _make_prior(given: dict[str, Any], settings: Settings) -> Prior:
+    """Return the prior of some options; InputError if the method has none, or they mean nothing."""
+    if not isinstance(settings, CoarseToFineSettings):
+        raise InputError(f"{min(given)}: not an option of the preset paper")
+    within = given.get("within", ())
+    if isinstance(within, str):
+        raise InputError(f"within: found the text {within!r}, wanted a list of names")
+    return Prior(**given | {"within": tuple(within)})
 
 
 @dataclass(frozen=True)
@@ -179,7 +189,9 @@ class Scan:
         **options
             As in `localize`, of all frames; not `refine_focal`, and `mask` as a path.
         """
-        read_options, settings, _ = parse_options(options, self.settings, self.cloud_settings)
+        read_options, settings, is_masked = parse_options(options, self.settings, self.cloud_settings)
+        if is_masked is not None:
+            raise InputError("mask: found an array, wanted the path of a picture in a walk")
         speed = MAX_SPEED if max_speed is None else max_speed
         motion = Motion(speed, max_acceleration, is_guess=max_speed is None)
         return self.walk(read_options, settings, motion)

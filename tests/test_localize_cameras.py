@@ -2,6 +2,7 @@
 
 import functools
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,13 +16,14 @@ from rooms import room, scan_map, write_room
 
 import piccolo
 from piccolo.camera import Mount
-from piccolo.camera.files import document_of
+from piccolo.camera.files import document_of, read_rig
 from piccolo.camera.model import Camera, pinhole
 from piccolo.cli.localize import main
 from piccolo.cloud.settings import CloudSettings
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors
 from piccolo.jobs.threads import Workers
 from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.panorama import ReadOptions, read_panorama
 from piccolo.result import Result, read_results
 from piccolo.scan import Scan
 from piccolo.scenes.synthetic.world import make_query, photograph, picture_by, picture_of_all, room_of_query
@@ -113,6 +115,27 @@ def test_arrays_of_photos_need_a_camera():
         scan().localize(rgb)
     with pytest.raises(piccolo.InputError, match="camera, rig: wanted only one of them"):
         scan().localize(rgb, camera="a.json", rig="b.json")
+
+
+def test_spheres_masks_of_each_picture_of_a_rig_count_together(tmp_path):
+    mounts = tuple(m.with_camera(pinhole(160, 160, 80.0)) for m in four_sides())
+    rig = read_rig(write(tmp_path / "rig.json", json.dumps(document_of(mounts)).encode()))
+    folder, masks = tmp_path / "instant", tmp_path / "masks"
+    for name in (folder, masks):
+        name.mkdir()
+    for k, mount in enumerate(mounts):
+        write(folder / mount.image, encoded(np.full((160, 160, 3), 128, np.uint8), ".png"))
+        mask = np.zeros((128, 256), np.uint8)
+        mask[60:68, 40 * k : 40 * k + 20] = 255
+        write(masks / f"{Path(mount.image).stem}.png", encoded(mask, ".png"))
+    options = ReadOptions(calibration=rig)
+    is_valid = read_panorama(folder, options).is_valid
+    seen = read_panorama(folder, replace(options, mask=masks)).is_valid
+    white = sum(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in masks.iterdir())
+    is_masked = cv2.resize(white, is_valid.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+    assert is_masked.sum() > 400
+    assert not seen[is_masked].any()
+    assert seen[~is_masked].sum() > 0.95 * is_valid[~is_masked].sum()
 
 
 def test_rigs_and_phone_photos_on_the_command_line(tmp_path, capsys):

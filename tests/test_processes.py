@@ -46,6 +46,17 @@ def _refused():
     raise InputError("no scan")
 
 
+class _OddError(Exception):
+    """Can be pickled, but not made again."""
+
+    def __init__(self, first, second):
+        super().__init__(first + second)
+
+
+def _odd():
+    raise _OddError("no ", "scan")
+
+
 def _sleeping():
     os.write(1, f"{os.getpid()}\n".encode())
     return time.sleep
@@ -128,12 +139,16 @@ def test_the_first_process_of_all_leaves_signals_to_its_parent_too():
 
 @pytest.mark.parametrize(
     ("opening", "message"),
-    [(_refused, "no scan"), (_die, "a process was killed by SIGKILL while it opened the scan")],
+    [
+        (_refused, "no scan"),
+        (_die, "a process was killed by SIGKILL while it opened the scan"),
+        (_odd, "_OddError.*no scan"),
+    ],
 )
 def test_what_cannot_be_opened_is_an_error(opening, message):
     with closing(Processes(opening, 1)) as processes:
         ((_, wait),) = processes.values(iter([1]))
-        with pytest.raises(InputError, match=message):
+        with pytest.raises((InputError, RuntimeError), match=message):
             wait()
 
 

@@ -30,13 +30,15 @@ def test_options_that_are_none_are_named(scan):
     with pytest.raises(piccolo.InputError, match="found no file"):
         piccolo.open_scan([])
     for options, error, text in (
-        ({"foo": 3}, TypeError, "unexpected keyword argument 'foo'"),
+        ({"foo": 3}, TypeError, "found no option 'foo', wanted one of mask, mask_nadir_deg"),
         ({"gravity": "Known"}, piccolo.InputError, "gravity: found 'Known', wanted one of auto"),
         ({"mask": np.ones((3, 3), bool)}, piccolo.InputError, "mask: wanted an array"),
         ({"fov_deg": 90.0}, piccolo.InputError, "go with files"),
     ):
         with pytest.raises(error, match=text):
             scan.localize(np.zeros((64, 128, 3), np.uint8), **options)
+    with pytest.raises(piccolo.InputError, match="mask: found an array, wanted the path"):
+        scan.track(mask=np.zeros((3, 3), bool))
     with pytest.raises(piccolo.InputError, match="panorama: found float64 of shape"):
         scan.localize(np.zeros((64, 128, 3)))
 

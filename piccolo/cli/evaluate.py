@@ -74,8 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_cloud_reading_options(parser.add_argument_group("clouds"))
     add_panorama_reading_options(parser.add_argument_group("panoramas"))
     add_method_options(parser)
-    add_execution_options(parser)
-    parser.set_defaults(jobs=1)
+    add_execution_options(parser, default_jobs=1)
 
 
 def check_usage(arguments: argparse.Namespace) -> None:

@@ -85,12 +85,11 @@ class Evaluation:
             are_inside.extend(is_in_box(scan, query.pose) for query in queries)
             return scan
 
+        if cluster:
+            cluster.forget()  # a worker may not have room for the last scene's map and this one's
         localizer = replace(self.config, paths=(scene.cloud,))
         if has_labels := localizer.read_options.labels is not None:
-            for query in queries:
-                if query.labels is None:
-                    self.report(f"{scene.folder}: {scene.name_of(query)} has no labels in queries.json")
-            queries = [query for query in queries if query.labels]
+            queries = self.labelled(scene, queries)
         num_jobs = count_jobs(self.arguments, len(queries))
         with ExitStack() as stack:
             place = executing(self.arguments, localizer, num_jobs, cluster, open_scan)
@@ -109,6 +108,13 @@ class Evaluation:
                 except WorkerLostError as error:
                     result = localizer.lost(task, error, None).result
                 self.record(scene, query, result, is_inside)
+
+    def labelled(self, scene: Scene, queries: Sequence[Query]) -> list[Query]:
+        """Return the queries that have labels; the others are reported."""
+        for query in queries:
+            if query.labels is None:
+                self.report(f"{scene.folder}: {scene.name_of(query)} has no labels in queries.json")
+        return [query for query in queries if query.labels]
 
     def record(self, scene: Scene, query: Query, result: Result, is_inside: bool) -> None:
         """Append the line of a query, or say why it has none."""

@@ -171,12 +171,14 @@ def add_walk_options(parser: argparse.ArgumentParser) -> None:
     option(group, "--plan FILE", text)
 
 
-def add_execution_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of processes, threads and memory."""
+def add_execution_options(parser: argparse.ArgumentParser, default_jobs: int | None = None) -> None:
+    """Add the options of processes, threads and memory; by default as many processes as are worth it."""
     group = parser.add_argument_group("execution")
-    text = "processes over one prepared map (default one a core, where memory is enough and each has "
-    text += f"{PHOTOS_OF_A_JOB} photos or more; 1 with names on stdin or --threads)"
-    option(group, "--jobs N", text)
+    text = "1"
+    if default_jobs is None:
+        text = f"one a core, where memory is enough and each has {PHOTOS_OF_A_JOB} photos or more; "
+        text += "1 with names on stdin or --threads"
+    option(group, "--jobs N", f"processes over one prepared map (default {text})", default=default_jobs)
     text = "work on a Dask cluster: its scheduler's address or file, or local, of --jobs processes here"
     option(group, "--dask ADDRESS", text)
     option(group, "--threads N", "of each process (default the cores, divided among --jobs)")

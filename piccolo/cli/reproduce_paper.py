@@ -52,8 +52,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--out FOLDER", "made if it is not there", required=True)
     option(parser, "--variants NAME ...", "only these splits", default=[])
     option(parser, "--presets", nargs="+", choices=PRESETS, default=list(PRESETS))
-    add_execution_options(parser)
-    parser.set_defaults(jobs=1, mask=None)
+    add_execution_options(parser, default_jobs=1)
+    parser.set_defaults(mask=None)
 
 
 def file_name(condition: Condition) -> str:

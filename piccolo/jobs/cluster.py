@@ -64,7 +64,8 @@ def connected(address: str, num_processes: int, num_threads: int) -> Iterator["C
         try:
             yield cluster
         finally:
-            cluster.forget()
+            if address != LOCAL:
+                cluster.forget()
 
 
 def _scheduler_at(address: str) -> str:
@@ -96,7 +97,7 @@ def _local_cluster(distributed: Any, num_processes: int, num_threads: int) -> It
             threads_per_worker=1,
             processes=True,
             host=HOST,
-            dashboard_address=None,
+            dashboard_address=f"{HOST}:0",  # a port that is free: its pages are of no use here
             memory_limit=0,  # piccolo itself refuses what is too much
             silence_logs=logging.CRITICAL,
         )
@@ -143,11 +144,12 @@ class Cluster:
 
     def forget(self) -> None:
         """Let the workers, which go on, drop what was sent and opened; nothing if they are lost."""
-        if self.address != LOCAL and self._client.status == "running":
+        if self._client.status == "running":
             with suppress(OSError, self._distributed.client.FutureCancelledError):
                 for name in self._sent:
                     self._client.unregister_worker_plugin(name)
                 self._client.run(_forget, self._sent)
+                self._sent.clear()
 
     def executor(self, opening: Opening) -> "Cluster":
         """Return what works on items by the function that `opening` gives."""

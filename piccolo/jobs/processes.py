@@ -5,6 +5,7 @@ Each process is a pool of its own (concurrent.futures), so that the end of one c
 
 import multiprocessing
 import os
+import pickle
 import signal
 import threading
 from collections.abc import Iterator
@@ -136,11 +137,26 @@ def _begin(opening: Opening) -> None:
 
 
 def _open() -> None:
-    _Own.function = _Own.opening()
+    with _raising_what_can_be_sent():
+        _Own.function = _Own.opening()
 
 
 def _value_of(item: object) -> Any:
-    return _Own.function(item)
+    with _raising_what_can_be_sent():
+        return _Own.function(item)
+
+
+@contextmanager
+def _raising_what_can_be_sent() -> Iterator[None]:
+    """Raise RuntimeError with its words in place of an exception that can't be pickled and made again."""
+    try:
+        yield
+    except Exception as error:
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:
+            raise RuntimeError(repr(error)) from None
+        raise
 
 
 def _end_with_parent() -> None:

@@ -122,7 +122,8 @@ def _on_sphere(
     counts = None
     for file, picture, mounts in shots:
         masks = _user_masks(file, [picture.size, (width, width // 2)], options, notes)
-        counts = masks.get(1, counts)
+        if 1 in masks:
+            counts = masks[1] if counts is None else counts & masks[1]
         is_valid = picture.is_valid & masks[0] if 0 in masks else picture.is_valid
         found, more = views_of(file, picture, mounts, is_valid)
         views += found

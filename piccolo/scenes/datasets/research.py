@@ -165,7 +165,8 @@ def list_mpo(options: ConvertOptions) -> SceneList:
     num_alone = 0
     for stem, found in files.items():
         clouds = [path for path in found if is_cloud(path)]
-        picture = next((path for path in found if path.suffix.lower() in SUFFIXES), None)
+        pictures = [path for path in found if path.suffix.lower() in SUFFIXES]
+        picture = min(pictures, key=lambda path: path.suffix.lower() not in (".jpg", ".jpeg"), default=None)
         if not clouds or picture is None:
             num_alone += len(clouds[:1])
             continue
