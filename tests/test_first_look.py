@@ -74,12 +74,6 @@ def test_clear_are_score_and_margin(monkeypatch, score, margin, expected):
     assert is_clear(asked, [at(0.0, score), at(3.0, other)]) == expected
 
 
-@pytest.mark.parametrize(("first", "is_mirrored"), [(0.221, False), (0.21, True)])
-def test_a_photo_is_rather_mirrored_unless_it_fits_better_by_a_tenth(monkeypatch, first, is_mirrored):
-    monkeypatch.setattr(attempts, "first_score", lambda query, starts: first)
-    assert attempts.is_rather_mirrored(None, None, 0.2) == is_mirrored
-
-
 def test_the_mirrored_query_is_that_of_the_mirrored_photo():
     """Its tilt is mirrored with it; where it heads, nothing is known."""
     panorama = rooms.as_panorama(rooms.query(1).rgb)

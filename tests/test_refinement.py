@@ -12,8 +12,7 @@ from made_up import QUERY, VIEWS, at, place
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.geometry.pose import Pose, step
 from piccolo.geometry.sphere import make_grid
-from piccolo.jobs.once import Once
-from piccolo.jobs.threads import Workers
+from piccolo.jobs.threads import Once, Workers
 from piccolo.localization import last_descent, refinement
 from piccolo.localization import query as query_module
 from piccolo.localization.query import Cache, Images, prepare_query

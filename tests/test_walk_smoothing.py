@@ -4,7 +4,7 @@ import pytest
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.geometry.pose import Pose, exp_so3, log_so3
 from piccolo.walk.frames import Motion
-from piccolo.walk.smoothing import PRIOR_FLOOR, smoothed
+from piccolo.walk.localize import PRIOR_FLOOR, smoothed
 
 MOTION = Motion(2.0, 0.5)
 TURN = exp_so3(np.array([0.1, -0.3, 1.0]))

@@ -7,7 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 from ..errors import InputError
 from .memory import check_address_space
@@ -148,3 +148,20 @@ def submitted(num_threads: int, tasks: Sequence[Callable[[], Value]]) -> Iterato
             for future in futures:
                 future.cancel()
             wait(futures)
+
+
+class Once(Generic[Value]):
+    """A value that is worked out by the first thread that asks; others wait for it."""
+
+    def __init__(self, function: Callable[[], Value]) -> None:
+        self._function: Callable[[], Value] | None = function
+        self._lock = threading.Lock()
+        self._value: Value
+
+    def __call__(self) -> Value:
+        """The value. What the function raises is raised, and it is asked again by the next."""
+        with self._lock:
+            if self._function is not None:
+                self._value = self._function()
+                self._function = None  # what it holds may be large
+        return self._value

@@ -16,8 +16,8 @@ from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import CLEAR_MATCHES
 from ..geometry.pose import Pose
 from ..geometry.rotations import Gravity
-from ..jobs.once import Once
 from ..jobs.stopwatch import Stopwatch
+from ..jobs.threads import Once
 from ..local_features.hypotheses import count_matches, poses_of
 from ..local_features.keypoints import HALVES
 from ..panorama.texels import Texels
@@ -81,7 +81,7 @@ def look_first(query: Query, attempt: Attempt, known: list[Hypothesis], watch: S
             starts = search_poses(first, attempt.gravity)
         with watch.stage("refine"):
             found = known + refine(first, starts, FIRST_BEAM)
-            return found, is_clear(query, found) and not is_rather_mirrored(first, starts, of_mirror())
+            return found, is_clear(query, found) and first_score(first, starts) >= MIRROR_RATIO * of_mirror()
 
 
 def search_matches(query: Query, attempt: Attempt, known: list[Hypothesis], watch: Stopwatch) -> Found:
@@ -156,11 +156,6 @@ def tilted_query(query: Query) -> Query:
     is_even = (cells.sum(axis=1) % 2 == 0) | (len(cells) < FEW_CELLS)
     settings = replace(brief.settings, num_rotations=min(FIRST_ROTATIONS, query.settings.num_rotations))
     return replace(brief, scan_map=query.scan_map.narrowed(is_even), settings=settings)
-
-
-def is_rather_mirrored(query: Query, starts: Starts, of_mirror: float) -> bool:
-    """True if the mirrored photo, by its `mirror_score`, fits nearly as well as the photo itself."""
-    return first_score(query, starts) < MIRROR_RATIO * of_mirror
 
 
 def mirror_score(query: Query) -> float:

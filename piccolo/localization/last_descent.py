@@ -14,6 +14,7 @@ from .refinement import (
     FULL_LOSS,
     MIN_GAIN,
     Fit,
+    Limits,
     descend,
     descend_fine,
     perturb_middle,
@@ -108,9 +109,7 @@ def settle(query: Query, h: Hypothesis) -> Hypothesis:
     return settled if settled.score > MIN_SCORE_LEFT * h.score else h
 
 
-def descend_on_points(
-    query: Query, pose: Pose, limits: tuple[float, int, float], num_rounds: int, arrived: float
-) -> Pose:
+def descend_on_points(query: Query, pose: Pose, limits: Limits, num_rounds: int, arrived: float) -> Pose:
     """Descend on the points seen from a pose, and again from where it ends until it moves less than [m]."""
     for _ in range(num_rounds):
         center = pose.center_world
@@ -123,7 +122,7 @@ def descend_on_points(
 def settle_best(query: Query, found: Selection) -> Selection:
     """Bring the best pose to rest, and if it is not the best any more then, the one that is."""
     at_rest: list[Hypothesis] = []
-    with query.workers.beside(*query.surroundings_at(found.best.pose)):  # it hardly moves
+    with query.workers.beside(partial(query.surroundings_at, found.best.pose)):  # it hardly moves
         for _ in range(1 + len(found.alternatives)):
             best = settle(query, found.best)
             at_rest.append(best)
