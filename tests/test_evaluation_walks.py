@@ -146,10 +146,3 @@ def test_a_photo_without_an_answer_has_no_errors_and_is_read_back_without(tmp_pa
     assert (again.position_error, again.rotation_error) == (np.inf, np.inf)
     assert again.result.best_pose is not None
     assert not again.has_errors
-
-
-def test_single_photos_are_no_walk(tmp_path):
-    frame = walk_of(tmp_path)[0]
-    query = dataclasses.replace(frame, walk=None, time=None)
-    scene = Scene("hall", tmp_path, tmp_path / "cloud.ply", (query,))
-    assert walks_of([scene], [query_result_of(scene, query, found(frame), None)]) == {}

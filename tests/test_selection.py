@@ -76,13 +76,6 @@ def test_a_faint_pose_beside_one_with_matches_is_refined_with_it(monkeypatch, do
     assert places([refine_to_the_end(query, [at(0.0, 0.09), at(3.0, 0.06)]).best]) == [3.01]
 
 
-def test_a_faint_pose_that_moves_to_an_alternative_is_not_its_own(monkeypatch):
-    query = compared(monkeypatch, dict.fromkeys((3.01, 3.0, 6.0), 0.09), {})
-    monkeypatch.setattr(last_descent, "refine_unoccluded", lambda query, pose: (query, at(3.01, 0.09)))
-    found = refine_to_the_end(query, [at(0.0, 0.09), at(3.0, 0.08), at(6.0, 0.05)])
-    assert places([found.best, *found.alternatives]) == [3.01, 6.0]
-
-
 @pytest.mark.parametrize(
     ("best", "num_matches", "expected"),
     [

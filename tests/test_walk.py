@@ -298,11 +298,7 @@ REFUSED = {
     "every": (["--walk", "--pano", "a.jpg", "--every", "1s"], 2, "--every: only with --video"),
     "step": (["--video", "a.mp4", "--every", "fast"], 2, "--every: found 'fast', wanted seconds or metres"),
     "paper": (["--walk", "--pano", "a.jpg", "--preset", "paper"], 2, "not options of the preset paper"),
-    "no step": (
-        ["--walk", "--pano", "a.jpg", "--max-speed", "0"],
-        2,
-        "--max-speed: found 0.0, wanted",
-    ),
+    "no step": (["--walk", "--pano", "a.jpg", "--max-speed", "0"], 2, "--max-speed: found 0.0, wanted"),
     "plan alone": (["--pano", "a.jpg", "--plan", "a.png"], 2, "--plan: only with --walk or --video"),
     "plan of a kind": (
         ["--walk", "--pano", "a.jpg", "--plan", "a.jpg"],

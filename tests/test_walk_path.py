@@ -148,16 +148,6 @@ def test_what_is_only_followed_tells_nothing_of_places_that_are_not_listed():
     assert min(p[0] for p in told.probabilities) > 0.9
 
 
-def test_a_list_that_ends_in_a_copy_tells_as_little():
-    here = ((0, 0, 0), 4.0)
-    full, short = _frame(0, here, *COPIES), _frame(0, *COPIES)
-    assert not full.is_telling
-    assert short.is_telling
-    assert _frame(0, ((0, 0, 0), -2.0), *COPIES).is_telling
-    assert lattice_of([full], Open(), MOTION).filtered().sum() < 0.9
-    assert lattice_of([short], Open(), MOTION).filtered().sum() > 0.9
-
-
 def test_a_wrong_copy_that_was_followed_ends_where_the_scan_is_searched():
     """The true place was lost for a while, and a copy of it was followed; then a place that there is once."""
     true = [_frame(k, ((k, 0, 0), 6.0)) for k in range(5)]

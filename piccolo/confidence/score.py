@@ -66,6 +66,5 @@ def agreement_at(points: PackedPoints, panorama: Panorama, pose: Pose) -> Agreem
 
     energy = math.sqrt(total(of_view**2) * total(of_panorama**2))
     return Agreement(
-        correlation=total(of_view * of_panorama) / max(energy, 1e-9),
-        seen_fraction=float(weights.sum()),
+        correlation=total(of_view * of_panorama) / max(energy, 1e-9), seen_fraction=float(weights.sum())
     )

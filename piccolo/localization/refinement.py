@@ -7,15 +7,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from ..confidence.alternatives import (
-    MIN_ANGLE,
-    MIN_DISTANCE,
-    Hypothesis,
-    Scored,
-    best_distinct,
-    by_score,
-    suppressed,
-)
+from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE, Hypothesis, best_distinct, by_score, suppressed
 from ..geometry.pose import Pose, orthonormal
 from ..geometry.suppression import non_maximum_suppression
 from ..jobs.threads import Workers
@@ -59,9 +51,7 @@ CLOSE_DISTANCE = 0.1  # [m] the same after the descent on middle cells
 
 Limits = tuple[float, int, float]  # scale of the loss [standard deviations], iterations, least step [rad + m]
 
-
-class Fit(Scored):
-    """A pose on its way down; its score is `channel_loss.score` on the cells on which it descended."""
+Fit = Hypothesis  # on its way down: its score is `channel_loss.score` on the cells on which it descended
 
 
 def refine(query: Query, starts: Starts, beam: Beam) -> list[Hypothesis]:
@@ -265,7 +255,7 @@ def descend_all(
 
 
 def descend(cells: Cells, image: Texels, pose: Pose, limits: Limits) -> Pose:
-    """The pose where a descent from `pose` ends. Coordinates relative to the cells' centre keep float32 exact."""
+    """The pose where a descent ends; coordinates relative to the cells' centre keep float32 exact."""
     loss_scale, num_iterations, tolerance = limits
     R = pose.R_cam_from_world.copy()
     t = pose.center_world - cells.center_map
