@@ -80,7 +80,6 @@ def _assert_right(results, queries):
 
 
 def test_a_walk_with_bad_frames_between(scan, building):
-    """The lost ones are refused, and break the path of nobody else."""
     _, queries = building
     frames = [cv2.imread(str(q.image))[..., ::-1].copy() for q in queries]
     noise = np.random.default_rng(0).integers(0, 255, frames[0].shape, dtype=np.uint8)
@@ -97,9 +96,7 @@ def test_a_walk_with_bad_frames_between(scan, building):
     assert {results[k].walk.how for k in good[1:]} <= {"tracked", "near"}
     assert all(result.walk.gap is None for result in results)
     assert all(results[k].covariance is not None for k in good)
-    again = piccolo.Result.from_json(results[0].to_json())
-    assert again.walk.alone.pose.center_world.tolist() == results[0].walk.alone.pose.center_world.tolist()
-    assert again.to_json() == results[0].to_json()
+    assert piccolo.Result.from_json(results[0].to_json()).to_json() == results[0].to_json()
 
 
 def test_a_walk_keeps_within_a_prior(scan, building):
@@ -146,10 +143,6 @@ def test_a_walk_is_done_again_from_a_frame_that_was_missing_or_failed(
     assert _command(folder, *command) == 0
     assert prepared == frames[1:]
     assert [r.status for r in read_results([out])] == ["localized"] * 3
-    others = ["--walk", "--pano", str(queries[3].image), "--times", "order", "--out", str(out)]
-    capsys.readouterr()
-    assert _command(folder, *others) == 3
-    assert "is of a panorama that this command names; --overwrite" in capsys.readouterr().err
 
 
 def _short_at(path):
@@ -173,7 +166,6 @@ def test_live_results_come_frame_by_frame_and_need_no_times(scan, building):
 
 
 def test_photos_in_any_order_are_each_searched_in_the_whole_scan(scan, building):
-    """Without times, and where nobody says how far apart: no worse than each alone."""
     _, queries = building
     some = [queries[k] for k in (5, 0, 7, 2)]
     results = scan.localize_walk([q.image for q in some], gravity="known")

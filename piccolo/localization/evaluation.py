@@ -14,6 +14,7 @@ from ..confidence.localization import Alternative, Localization
 from ..confidence.occlusion import occlusion_at
 from ..confidence.score import Agreement, Evidence, agreement_at
 from ..local_features.hypotheses import count_matches, poses_of
+from ..local_features.keypoints import joined_keypoints
 from ..local_features.matching import match
 from ..optimize.refine import refine, sampling_loss_of
 from ..optimize.sampling_loss import sampling_loss
@@ -123,6 +124,7 @@ def is_mirrored(query: Query, evidence: Evidence) -> bool:
     """
     if evidence.score >= ENOUGH_EXPLAINED or evidence.num_matches is None:
         return False
-    matches = match(query.keypoints.mirrored(), query.scan_map.features_now(query.workers), query.workers)
+    keypoints = joined_keypoints([half().keypoints for half in query.features[: query.num_halves]])
+    matches = match(keypoints.mirrored(), query.scan_map.features_now(query.workers), query.workers)
     found = poses_of(matches, None, 1, query.workers)
     return len(found) > 0 and found[0].num_matches > max(MIRROR_RATIO * evidence.num_matches, SURE_MATCHES)

@@ -80,14 +80,6 @@ def alone_of(frame: Frame) -> Alone | None:
     return None if a is None else Alone(a.status, a.confidence, a.pose)
 
 
-def accuracy_of(frame: Frame) -> float:
-    """Probability that a frame has come to the very pose, if it is at the place where the walk has it.
-
-    The frames around tell the place of one that is blurred or dark, but not where in it.
-    """
-    return 1.0 / (1.0 + math.exp(-frame.log_odds))
-
-
 def localization_of(tracker: Tracker, frame: Frame, probabilities: Array, chosen: int | None) -> Localization:
     """A frame with the probabilities that a walk gives its poses."""
     if not frame.states:
@@ -97,7 +89,8 @@ def localization_of(tracker: Tracker, frame: Frame, probabilities: Array, chosen
     values = [float(probabilities[j]) for j in order]
     if best.covariance is not None:
         values[0] *= math.erf(MAX_DISTANCE / (best.covariance.largest_std * math.sqrt(2.0)))
-    values[0] *= accuracy_of(frame)
+    # the frames around tell the place of one that is blurred or dark, but not where in it
+    values[0] *= 1.0 / (1.0 + math.exp(-frame.log_odds))
     none = max(1.0 - sum(values), 0.0)
     to_world = tracker.scan_map.to_world
     is_own = frame.alone and frame.alone.pose is not None and order[0] == 0 and frame.how == "alone"

@@ -112,7 +112,7 @@ class Tracker:
         """Find the next frame, whose query is prepared."""
         frame = Frame(time)
         if panorama.is_valid.any() and len(self.scan_map.centers) > 0:
-            is_far = self._reach(frame) >= FAR
+            is_far = bool(self.frames) and self.motion.max_speed * (time - self.frames[-1].time) >= FAR
             self._follow(query, frame, not is_far)
             is_lost = self.num_lost + 1 >= self.next_search
             is_due = self.walked + self._moved(frame) >= (CHECKED_SURE if self.is_sure else CHECKED_UNSURE)
@@ -137,11 +137,6 @@ class Tracker:
         self.num_lost += 1
         if frame.how == "alone":
             self.next_search = self.num_lost + min(max(self.num_lost, FIRST_SEARCH), LAST_SEARCH)
-
-    def _reach(self, frame: Frame) -> float:
-        """Metres that the camera may have gone since the frame before."""
-        seconds = frame.time - self.frames[-1].time if self.frames else 0.0
-        return self.motion.max_speed * seconds
 
     def _moved(self, frame: Frame) -> float:
         """Metres from the frame before, from its nearest pose; 0 if one of the two has none."""
