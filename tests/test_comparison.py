@@ -9,7 +9,7 @@ import pytest
 import rooms
 from measuring.confidence import occluded, outside_field
 
-from piccolo.confidence.score import Evidence
+from piccolo.confidence.localization import Evidence
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.sphere import cell_of, pixel_rays, solid_angles
 from piccolo.jobs.threads import Workers

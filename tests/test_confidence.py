@@ -10,7 +10,7 @@ from piccolo.confidence import alternatives
 from piccolo.confidence import confidence as rule
 from piccolo.confidence.confidence import Standing, classify, posterior
 from piccolo.confidence.covariance import PoseCovariance, least_constrained_direction
-from piccolo.confidence.score import Agreement, agreement_at
+from piccolo.confidence.occlusion import Agreement, agreement_at
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, step, yaw_rotation
 from piccolo.localization.settings import CoarseToFineSettings

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from made_up import at, compared, place, places
 
-from piccolo.confidence.score import Agreement
+from piccolo.confidence.occlusion import Agreement
 from piccolo.localization import evaluation, last_descent, refinement, selection
 from piccolo.localization.last_descent import refine_to_the_end
 from piccolo.localization.selection import Selection

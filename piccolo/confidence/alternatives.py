@@ -19,7 +19,7 @@ class Hypothesis:
     """A pose that may be right."""
 
     pose: Pose
-    score: float  # more is better; in the end what of the panorama it explains, as in `score.Evidence`
+    score: float  # more is better; in the end what of the panorama it explains, as in `localization.Evidence`
 
 
 def by_score(poses: Sequence[Hypothesis]) -> list[Hypothesis]:

@@ -10,9 +10,8 @@ import numpy as np
 
 from ..confidence.alternatives import MAX_ALTERNATIVES
 from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED, classify, posterior
-from ..confidence.localization import Alternative, Localization
-from ..confidence.occlusion import occlusion_at
-from ..confidence.score import Agreement, Evidence, agreement_at
+from ..confidence.localization import Alternative, Evidence, Localization
+from ..confidence.occlusion import Agreement, agreement_at, occlusion_at
 from ..local_features.hypotheses import count_matches, poses_of
 from ..local_features.keypoints import joined_keypoints
 from ..local_features.matching import match

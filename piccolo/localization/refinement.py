@@ -113,10 +113,7 @@ def perturb_middle(query: Query, pose: Pose) -> Fit:
 
 
 def refine_by_perturbation(query: Query, fit: Fit) -> Fit:
-    """Perturb and refine for as long as the score rises: a pose that stopped short creeps on.
-
-    Where that has ended before, it has ended.
-    """
+    """Perturb and refine for as long as the score rises: a pose that stopped short creeps on."""
     if fit.pose.key in query.cache.ends:
         return fit
     config = query.method.fine_view
