@@ -13,7 +13,6 @@ from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED, classify, posterio
 from ..confidence.localization import Alternative, Evidence, Localization
 from ..confidence.occlusion import Agreement, agreement_at, occlusion_at
 from ..local_features.hypotheses import count_matches, poses_of
-from ..local_features.keypoints import joined_keypoints
 from ..local_features.matching import match
 from ..optimize.refine import refine, sampling_loss_of
 from ..optimize.sampling_loss import sampling_loss
@@ -123,7 +122,6 @@ def is_mirrored(query: Query, evidence: Evidence) -> bool:
     """
     if evidence.score >= ENOUGH_EXPLAINED or evidence.num_matches is None:
         return False
-    keypoints = joined_keypoints([half().keypoints for half in query.features[: query.num_halves]])
-    matches = match(keypoints.mirrored(), query.scan_map.features_now(query.workers), query.workers)
+    matches = match(query.keypoints.mirrored(), query.scan_map.features_now(query.workers), query.workers)
     found = poses_of(matches, None, 1, query.workers)
     return len(found) > 0 and found[0].num_matches > max(MIRROR_RATIO * evidence.num_matches, SURE_MATCHES)

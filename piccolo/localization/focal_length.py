@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..camera import Camera
+from ..camera import Camera, Mount
 from ..camera.model import MODELS
 from ..confidence.localization import FocalLength
 from ..geometry.pose import Array, Pose, exp_so3, log_so3, rotate_points
@@ -274,16 +274,18 @@ def recalibrate(query: Query, change: Array) -> Query:
     after = before.with_camera(change_camera(before.camera, change))
     taken = given.retaken(after.camera, given.rgb.shape[1])
     fresh = prepare_query(taken, query.scan_map, query.settings, query.workers, query.method)
-
-    def turn(rays: NDArray[np.float32]) -> NDArray[np.float32]:
-        pixels, _ = before.camera.pixels(rotate_points(rays.astype(np.float64), before.rotation))
-        found, _ = after.camera.rays(pixels)
-        return np.asarray(rotate_points(found, before.rotation.T), np.float32)
-
-    def turn_features(half: Once[Features]) -> Features:
-        found = half()
-        matches = found.matches._replace(rays=turn(found.matches.rays))
-        return Features(found.keypoints._replace(rays=turn(found.keypoints.rays)), matches)
-
-    features = tuple(Once(partial(turn_features, half)) for half in query.features)
+    features = tuple(Once(partial(_turn_features, half, before, after)) for half in query.features)
     return replace(fresh, features=features, num_halves=query.num_halves)
+
+
+def _turn_features(half: Once[Features], before: Mount, after: Mount) -> Features:
+    """Features with the rays that another calibration gives their pixels."""
+    found = half()
+    keypoints = found.keypoints._replace(rays=_turn_rays(found.keypoints.rays, before, after))
+    return Features(keypoints, found.matches._replace(rays=_turn_rays(found.matches.rays, before, after)))
+
+
+def _turn_rays(rays: NDArray[np.float32], before: Mount, after: Mount) -> NDArray[np.float32]:
+    pixels, _ = before.camera.pixels(rotate_points(rays.astype(np.float64), before.rotation))
+    found, _ = after.camera.rays(pixels)
+    return np.asarray(rotate_points(found, before.rotation.T), np.float32)

@@ -14,7 +14,7 @@ from ..cloud.soa import PackedPoints
 from ..geometry.pose import Array, Pose, rotate_points
 from ..geometry.sphere import indices_of, make_grid
 from ..jobs.threads import Once, Workers
-from ..local_features.keypoints import HALVES, Keypoints, find_keypoints
+from ..local_features.keypoints import HALVES, Keypoints, find_keypoints, joined_keypoints
 from ..local_features.matching import Matches, joined_matches, match
 from ..panorama import Panorama
 from ..panorama.gpano import rotation_to_level
@@ -102,6 +102,11 @@ class Query:
     features: tuple[Once[Features], ...]  # of half of the photo's views each
     cache: Cache
     num_halves: int = len(HALVES)  # of the features, that are asked; none where whole views alone are
+
+    @cached_property
+    def keypoints(self) -> Keypoints:
+        """The photo's keypoints."""
+        return joined_keypoints([half().keypoints for half in self.features[: self.num_halves]])
 
     @cached_property
     def matches(self) -> Matches:
