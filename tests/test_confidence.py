@@ -1,9 +1,9 @@
-import itertools
 import math
 
 import numpy as np
 import pytest
 import rooms
+from made_up import at
 from rooms import as_panorama
 
 from piccolo.confidence import alternatives
@@ -12,7 +12,7 @@ from piccolo.confidence.confidence import Standing, classify, posterior
 from piccolo.confidence.covariance import PoseCovariance, least_constrained_direction
 from piccolo.confidence.occlusion import Agreement, agreement_at
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose, exp_so3, step, yaw_rotation
+from piccolo.geometry.pose import exp_so3, step
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.paper.settings import PaperSettings
 
@@ -56,15 +56,7 @@ def test_copies_share_the_probability_alike_and_none_of_them_is_localized(copies
     assert classify(p, 0.9) == rule.AMBIGUOUS
 
 
-def test_what_a_copy_explains_less_makes_it_less_likely():
-    shares = (1.0, 0.95, 0.8, 0.6, 0.3)
-    best = [posterior([RIGHT, RIGHT._replace(share=share)], SURE)[0] for share in shares]
-    assert all(a < b for a, b in itertools.pairwise(best))
-    assert best[0] < 0.51
-    assert best[-1] > 0.9
-
-
-@pytest.mark.parametrize(("name", "more"), [("score", 0.1), ("num_matches", 5)])
+@pytest.mark.parametrize(("name", "more"), [("score", 0.1), ("num_matches", 5), ("share", 0.1)])
 def test_more_evidence_is_more_probability(name, more):
     middling = Standing(1.0, 0.15, 8)
     stronger = middling._replace(**{name: getattr(middling, name) + more})
@@ -107,20 +99,16 @@ def test_lines_that_mean_nothing_are_refused(settings, value):
     assert settings(min_confidence=0.01).min_confidence == 0.01
 
 
-def _at(x, score, yaw_deg=0.0):
-    return alternatives.Hypothesis(Pose(yaw_rotation(np.radians(yaw_deg)), np.array([x, 0.0, 0.0])), score)
-
-
 def test_alternatives_are_apart_from_the_best_and_from_each_other():
-    best = _at(0.0, 0.9)
-    near, turned, far, beside_far = _at(0.4, 0.8), _at(0.1, 0.3, 20.0), _at(3.0, 0.5), _at(3.2, 0.4)
+    best = at(0.0, 0.9)
+    near, turned, far, beside_far = at(0.4, 0.8), at(0.1, 0.3, 20.0), at(3.0, 0.5), at(3.2, 0.4)
     assert alternatives.alternative_poses(best.pose, [best, near, turned, far, beside_far]) == [far, turned]
-    found = alternatives.alternative_poses(_at(0, 1.0).pose, [_at(2.0 * k, 0.5) for k in range(1, 20)])
+    found = alternatives.alternative_poses(at(0, 1.0).pose, [at(2.0 * k, 0.5) for k in range(1, 20)])
     assert len(found) == alternatives.MAX_ALTERNATIVES
 
 
 def test_best_distinct_keeps_the_better_of_two_that_are_near():
-    a, b, c = _at(0.0, 0.5), _at(0.05, 0.6), _at(1.0, 0.1)
+    a, b, c = at(0.0, 0.5), at(0.05, 0.6), at(1.0, 0.1)
     assert alternatives.best_distinct([a, b, c], 5, 0.1, 0.1) == [b, c]
     assert alternatives.best_distinct([a, b, c], 1, 0.1, 0.1) == [b]
 
@@ -178,7 +166,6 @@ def test_true_pose_scores_high_and_explains_most_of_the_panorama(scene):
     assert agreement_at(points, panorama, true_pose).score > 0.5
     for delta in ([0, 0, 1.0, 0, 0, 0], [0, 0, 0, 1.0, 0.5, 0]):
         assert agreement_at(points, panorama, step(true_pose, np.array(delta))).score < 0.25
-    points, panorama, true_pose = scene
     right = agreement_at(points, panorama, true_pose)
     wrong = agreement_at(points, panorama, step(true_pose, np.array([0, 0, 1.0, 0, 0, 0])))
     assert right.correlation > 0.5 > wrong.correlation
@@ -190,13 +177,6 @@ def test_a_blank_wall_can_not_win(scene, level):
     points, panorama, true_pose = scene
     blank = as_panorama(np.full_like(panorama.rgb, level))
     assert abs(agreement_at(points, blank, true_pose).score) < 0.05
-
-
-def test_exposure_and_white_balance_change_little(scene):
-    points, panorama, true_pose = scene
-    darker = as_panorama((panorama.rgb * np.array([0.6, 0.5, 0.4])).astype(np.uint8))
-    difference = np.diff([agreement_at(points, p, true_pose).score for p in (panorama, darker)])
-    assert abs(difference) < 0.12
 
 
 def test_score_and_value_charge_a_view_of_which_little_is_seen():

@@ -148,20 +148,6 @@ def test_what_is_only_followed_tells_nothing_of_places_that_are_not_listed():
     assert min(p[0] for p in told.probabilities) > 0.9
 
 
-def test_a_wrong_copy_that_was_followed_ends_where_the_scan_is_searched():
-    """The true place was lost for a while, and a copy of it was followed; then a place that there is once."""
-    true = [_frame(k, ((k, 0, 0), 6.0)) for k in range(5)]
-    lost = [Frame(float(k)) for k in range(5, 9)]
-    found = _frame(9, *(((x, y, z + 40), o) for (x, y, z), o in COPIES), ((0, 0, 40), 4.0))
-    wrong = [found, *(_followed(k, ((k, 0, 40), 6.0)) for k in range(10, 20))]
-    before = lattice_of([*true, *lost, *wrong], Open(), MOTION).smoothed()
-    assert max(float(p.max()) for p in before.probabilities[9:]) < 0.6
-    once = [_frame(k, ((k, 0, 0), 6.0)) for k in range(20, 23)]
-    after = lattice_of([*true, *lost, *wrong, *once], Open(), MOTION).smoothed()
-    assert max(float(p.max()) for p in after.probabilities[9:20]) < 0.1
-    assert min(float(p[0]) for p in [*after.probabilities[:5], *after.probabilities[20:]]) > 0.9
-
-
 def test_what_copies_say_of_each_other_does_not_add_up():
     """Twenty frames in twin rooms, each a little for the wrong one; then a place that there is once."""
     twins = [
