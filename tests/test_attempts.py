@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rooms
-from made_up import QUERY, at, places
+from made_up import QUERY, at, compared, places
 
 from piccolo.confidence.confidence import LOCALIZED
 from piccolo.geometry.pose import exp_so3, is_correct
@@ -16,6 +16,7 @@ from piccolo.localization import attempts, query
 from piccolo.localization import localize as method
 from piccolo.localization.query import prepare_query
 from piccolo.localization.search import search_poses
+from piccolo.localization.selection import is_clear
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.scan_map.prior import Prior
 
@@ -62,6 +63,15 @@ def test_features_are_asked_of_what_is_not_clear(how):
     found = _localized(panorama, settings)
     assert isinstance(found.evidence.num_matches, int)
     assert (found.status == LOCALIZED) == (how != "mirrored")
+
+
+@pytest.mark.parametrize(
+    ("score", "margin", "expected"), [(0.3, 0.51, True), (0.29, 0.51, False), (0.3, 0.49, False)]
+)
+def test_clear_are_score_and_margin(monkeypatch, score, margin, expected):
+    other = score * (1.0 - margin)
+    asked = replace(compared(monkeypatch, {0.0: score, 3.0: other}, {}), num_halves=0)
+    assert is_clear(asked, [at(0.0, score), at(3.0, other)]) == expected
 
 
 def test_the_mirrored_query_is_that_of_the_mirrored_photo():

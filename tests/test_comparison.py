@@ -41,7 +41,6 @@ def _query(rgb, is_hidden=None):
 
 @functools.lru_cache
 def _clean():
-    """The comparison at the true pose of a room's photo, with that pose."""
     true_pose = rooms.scene(1)[2]
     return compare(_query(rooms.query(1).rgb), true_pose), true_pose
 

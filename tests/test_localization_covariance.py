@@ -24,7 +24,6 @@ SETTINGS = CoarseToFineSettings(gravity="known")
 
 @pytest.fixture(scope="module")
 def found():
-    """The query of a panorama in a room, and the pose found in the map's frame."""
     scan_map, panorama = rooms.scan_map(2), as_panorama(query(2).rgb)
     prepared = prepare_query(panorama, scan_map, SETTINGS, Workers(2))
     result = localize(scan_map, panorama, SETTINGS, Workers(2), Stopwatch())
@@ -38,7 +37,6 @@ def _points(prepared, pose):
 
 
 def test_gradients_as_left_out_are_those_at_the_pose_without_the_block():
-    """Of a linear problem, solved with and without each block."""
     rng = np.random.default_rng(1)
     rows, wanted = rng.normal(size=(20, 4, 6)), rng.normal(size=(20, 4))
     matrices = np.swapaxes(rows, 1, 2) @ rows
@@ -81,7 +79,6 @@ def test_no_covariance_without_a_minimum_or_with_few_blocks():
 
 
 def test_covariance_is_in_the_worlds_axes(found):
-    """A map turned against the world: the same deviations, turned along."""
     prepared, pose, result = found
     R = exp_so3(np.array([0.2, -0.5, 1.1]))
     turned = replace(prepared, scan_map=replace(prepared.scan_map, R_map_from_world=R))

@@ -178,7 +178,6 @@ def test_the_end_hardly_depends_on_where_the_descent_begins(seed, most):
 
 @functools.lru_cache
 def _fine():
-    """Fine cells about the true camera of a room, and its true pose."""
     true_pose = rooms.scene(1)[2]
     return rooms.view(rooms.scan_map(1).octree, true_pose.center_world, METHOD.fine_view, ALL), true_pose
 

@@ -122,7 +122,6 @@ def test_sums_of_a_search_are_exact():
 
 @pytest.mark.parametrize(("gravity", "most"), [("known", 10), ("unknown", 100)])
 def test_best_score_is_near_the_true_pose(gravity, most):
-    """Among wide cells, and among the starts, which fine cells put in order."""
     true_pose, scan_map = rooms.scene(1)[2], rooms.scan_map(1)
     rotations = uniform_yaws(48) if gravity == "known" else uniform_rotations(2000)
     samples, validity = search.turn_panorama(_query().photo.images.search(), rotations)

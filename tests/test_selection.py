@@ -15,7 +15,6 @@ from piccolo.localization.selection import Selection
 
 
 def test_of_poses_that_matches_gave_the_better_end_is_taken(monkeypatch):
-    """As found, or after a descent on fine cells, whichever explains more."""
     query = compared(monkeypatch, {0.0: 0.3, 1.0: 0.5, 5.0: 0.6, 6.0: 0.2}, {})
     monkeypatch.setattr(refinement, "descend_fine", lambda query, pose: at(place(pose) + 1.0, 0.9))
     found = refinement.refine_matches(query, [at(0.0, 0).pose, at(5.0, 0).pose])

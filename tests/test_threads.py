@@ -56,7 +56,6 @@ def test_threads_are_kept_and_work_within_work_is_done_by_the_same_one():
 
 
 def test_one_callers_work_may_wait_for_anothers():
-    """Two tasks that fill a pool wait for what another caller's tasks do."""
     is_done, workers = threading.Event(), Workers(2)
 
     def other():

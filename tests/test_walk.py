@@ -29,8 +29,6 @@ NUM_FRAMES, STEP_S = 8, 0.5
 
 
 class Taken(NamedTuple):
-    """A frame of the walk, as a scene on disk has it."""
-
     image: Path
     pose: Pose
     time: float
@@ -67,12 +65,10 @@ def building(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def scan(building):
-    """The room's scan."""
     return piccolo.open_scan(building[0] / "cloud.ply", cache=False, num_threads=2)
 
 
 def _assert_right(results, queries):
-    """All frames are localized, each where it was taken."""
     assert [result.status for result in results] == ["localized"] * len(queries)
     errors = [pose_errors(r.pose, q.pose) for r, q in zip(results, queries, strict=True)]
     assert max(distance for distance, _ in errors) < 0.03
@@ -100,7 +96,6 @@ def test_a_walk_with_bad_frames_between(scan, building):
 
 
 def test_a_walk_keeps_within_a_prior(scan, building):
-    """Which narrows the map, as looking near a place or in the whole scan does once more."""
     queries = building[1]
     x, y, z = np.mean([q.pose.center_world for q in queries], axis=0)
     frames = [q.image for q in queries]
@@ -146,7 +141,6 @@ def test_a_walk_is_done_again_from_a_frame_that_was_missing_or_failed(
 
 
 def _short_at(path):
-    """A check of memory that fails for one picture."""
 
     def check(num_bytes, purpose, advice):
         memory.check_memory(1e15 if purpose.startswith(str(path)) else num_bytes, purpose, advice)
@@ -198,13 +192,11 @@ def test_a_walk_is_the_same_with_any_number_of_threads(building):
 
 
 def _command(folder, *words):
-    """A command line over the building's frames."""
     common = ["--cloud", str(folder / "cloud.ply"), "--cache", str(folder), "--gravity", "known", "--quiet"]
     return localize_command.main([*common, *words])
 
 
 def _times(folder, queries):
-    """A table of times."""
     lines = ["name,time", *(f"{q.image.name},{q.time + 100.0}" for q in queries)]
     (folder / "times.csv").write_text("\n".join(lines))
     return str(folder / "times.csv")

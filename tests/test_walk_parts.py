@@ -31,7 +31,6 @@ def _located(centers, stds, coupling=0.0):
 
 
 def _dense(located, times, s):
-    """Positions (N, 3), and their covariance along one axis (N, N), by dense least squares."""
     n = len(located)
     A = np.zeros((n - 2, n))
     for k in range(n - 2):

@@ -22,18 +22,14 @@ MOTION = Motion(max_speed=1.0)
 
 
 class Open:
-    """Free space without walls."""
-
     def __init__(self, share=0.01):
         self.share = share
 
     def distance(self, start, ends, limit):
-        """Straight."""
         straight = np.linalg.norm(ends - start, axis=1)
         return np.where(straight > limit, np.inf, straight)
 
     def share_within(self, center, radius):
-        """Any place is as good as another, or what a test says."""
         return self.share
 
 
@@ -75,7 +71,6 @@ class Logs:
         return log_transition(gaps, seconds, MOTION, self.expected)
 
     def unlisted(self, k):
-        """What a frame says for what is not listed."""
         if len(self.emitted[k]) == 0:
             return 0.0
         telling = [m for m in range(k) if self.frames[m].is_telling]
@@ -89,7 +84,6 @@ class Logs:
         return max(self.emitted[k].max() + gained - share * (TELLING_LOG + gained), 0.0)
 
     def of(self, way):
-        """The log of a way."""
         log, before = 0.0, None
         for k, j in ((k, j) for k, j in enumerate(way) if j is not None):
             log += self.unlisted(k) if j == UNLISTED else self.emitted[k][j]
