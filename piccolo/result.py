@@ -16,8 +16,7 @@ from .camera.files import document_of as camera_document
 from .camera.files import mounts_of
 from .confidence.confidence import AMBIGUOUS, LOCALIZED
 from .confidence.covariance import PoseCovariance
-from .confidence.localization import Alternative, FocalLength, Localization
-from .confidence.score import Evidence
+from .confidence.localization import Alternative, Evidence, FocalLength, Localization
 from .errors import UNPRINTABLE, InputError, is_passing, printable, text_of
 from .files.json_file import document_of, parse_lines, read_bytes
 from .geometry.pose import Pose, T_world_from_cam, checked_rotation, quaternion_wxyz

@@ -5,7 +5,7 @@ import json
 import cv2
 import numpy as np
 
-from piccolo.confidence.score import Evidence
+from piccolo.confidence.localization import Evidence
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.result import Result

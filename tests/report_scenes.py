@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from piccolo.confidence.covariance import PoseCovariance
-from piccolo.confidence.localization import Alternative
-from piccolo.confidence.score import Evidence
+from piccolo.confidence.localization import Alternative, Evidence
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.result import Result, Source, unreadable_result

@@ -34,7 +34,6 @@ def room(seed):
 
 @functools.lru_cache
 def scan_map(seed):
-    """The prepared map of a room."""
     return replace(prepare_map(room(seed)[1], Workers(2)), scan_sha256=64 * "0")
 
 
@@ -61,7 +60,6 @@ def local(seed, pose):
 
 
 def packed(seed):
-    """A room's points as kernels read them."""
     cloud = room(seed)[1]
     return pack_points(cloud.points, cloud.colors)
 

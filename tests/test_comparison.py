@@ -9,7 +9,7 @@ import pytest
 import rooms
 from measuring.confidence import occluded, outside_field
 
-from piccolo.confidence.score import Evidence
+from piccolo.confidence.localization import Evidence
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.sphere import cell_of, pixel_rays, solid_angles
 from piccolo.jobs.threads import Workers
@@ -41,7 +41,6 @@ def _query(rgb, is_hidden=None):
 
 @functools.lru_cache
 def _clean():
-    """The comparison at the true pose of a room's photo, with that pose."""
     true_pose = rooms.scene(1)[2]
     return compare(_query(rooms.query(1).rgb), true_pose), true_pose
 

@@ -1,13 +1,18 @@
-import itertools
 import math
 
 import numpy as np
 import pytest
+import rooms
+from made_up import at
+from rooms import as_panorama
 
+from piccolo.confidence import alternatives
 from piccolo.confidence import confidence as rule
 from piccolo.confidence.confidence import Standing, classify, posterior
-from piccolo.confidence.covariance import PoseCovariance
+from piccolo.confidence.covariance import PoseCovariance, least_constrained_direction
+from piccolo.confidence.occlusion import Agreement, agreement_at
 from piccolo.errors import InputError
+from piccolo.geometry.pose import exp_so3, step
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.paper.settings import PaperSettings
 
@@ -26,11 +31,7 @@ def test_probabilities_are_those_of_the_formula_and_add_up_to_one():
     """A conditional logit by a pocket calculator, with made-up weights."""
     p = posterior([Standing(1.0, 0.5, 12), Standing(0.5, 0.1, 2)], _covariance(0.01), MODEL)
     e = math.exp
-    odds = [
-        0.5 * 20.0**2,
-        0.5**3 * 0.1 * 10.0**2,
-        e(10.0 - 2.0 * 2.0),
-    ]
+    odds = [0.5 * 20.0**2, 0.5**3 * 0.1 * 10.0**2, e(10.0 - 2.0 * 2.0)]
     doubt = math.erf(0.1 / (0.01 * math.sqrt(2.0)))
     expected = [doubt * odds[0] / sum(odds), doubt * odds[1] / sum(odds)]
     np.testing.assert_allclose(p, [*expected, 1.0 - sum(expected)], rtol=1e-12)
@@ -55,15 +56,7 @@ def test_copies_share_the_probability_alike_and_none_of_them_is_localized(copies
     assert classify(p, 0.9) == rule.AMBIGUOUS
 
 
-def test_what_a_copy_explains_less_makes_it_less_likely():
-    shares = (1.0, 0.95, 0.8, 0.6, 0.3)
-    best = [posterior([RIGHT, RIGHT._replace(share=share)], SURE)[0] for share in shares]
-    assert all(a < b for a, b in itertools.pairwise(best))
-    assert best[0] < 0.51
-    assert best[-1] > 0.9
-
-
-@pytest.mark.parametrize(("name", "more"), [("score", 0.1), ("num_matches", 5)])
+@pytest.mark.parametrize(("name", "more"), [("score", 0.1), ("num_matches", 5), ("share", 0.1)])
 def test_more_evidence_is_more_probability(name, more):
     middling = Standing(1.0, 0.15, 8)
     stronger = middling._replace(**{name: getattr(middling, name) + more})
@@ -104,3 +97,89 @@ def test_lines_that_mean_nothing_are_refused(settings, value):
     with pytest.raises(InputError, match=f"--min-confidence: found {value}, wanted above 0 and below 1"):
         settings(min_confidence=value)
     assert settings(min_confidence=0.01).min_confidence == 0.01
+
+
+def test_alternatives_are_apart_from_the_best_and_from_each_other():
+    best = at(0.0, 0.9)
+    near, turned, far, beside_far = at(0.4, 0.8), at(0.1, 0.3, 20.0), at(3.0, 0.5), at(3.2, 0.4)
+    assert alternatives.alternative_poses(best.pose, [best, near, turned, far, beside_far]) == [far, turned]
+    found = alternatives.alternative_poses(at(0, 1.0).pose, [at(2.0 * k, 0.5) for k in range(1, 20)])
+    assert len(found) == alternatives.MAX_ALTERNATIVES
+
+
+def test_best_distinct_keeps_the_better_of_two_that_are_near():
+    a, b, c = at(0.0, 0.5), at(0.05, 0.6), at(1.0, 0.1)
+    assert alternatives.best_distinct([a, b, c], 5, 0.1, 0.1) == [b, c]
+    assert alternatives.best_distinct([a, b, c], 1, 0.1, 0.1) == [b]
+
+
+BOX = np.random.default_rng(3).uniform(-1, 1, (2, 4000))
+
+
+def _words(std_ratio=3.0, tilt_deg=0.0, reach=12.0, elevation_deg=0.0, turn=0.0):
+    """Words for a camera least sure along heading 50 deg, in a cloud `reach` times as long that way."""
+    R = exp_so3(np.array([0.0, 0.0, np.radians(40.0)]))
+    direction = R @ exp_so3(np.array([0.0, -np.radians(tilt_deg), 0.0]))[:, 0]
+    covariance = 1e-6 * (np.eye(3) + (std_ratio**2 - 1.0) * np.outer(direction, direction))
+    x, y = BOX * [[reach], [1.0]]
+    seen = R @ np.stack([x, y, np.tan(np.radians(elevation_deg)) * np.hypot(x, y)])
+    R_world_from_map = exp_so3(np.array([0.0, 0.0, turn]))
+    in_world = R_world_from_map @ covariance @ R_world_from_map.T
+    return least_constrained_direction(covariance, in_world, seen.astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("case", "expected"),
+    [
+        ({"std_ratio": 1.45}, "much the same in all directions"),
+        ({"std_ratio": 1.55}, "along the corridor, heading 50 or 230 deg"),
+        ({"tilt_deg": 61.0}, "up and down"),
+        ({"tilt_deg": 59.0}, "along the corridor, heading 50 or 230 deg"),
+        ({"reach": 2.4}, "heading 50 or 230 deg"),
+        ({"reach": 2.6}, "along the corridor, heading 50 or 230 deg"),
+        ({"elevation_deg": 31.0}, "heading 50 or 230 deg"),  # no walls
+        ({"elevation_deg": 29.0}, "along the corridor, heading 50 or 230 deg"),
+        (
+            {"turn": np.radians(-90.0)},
+            "along the corridor, heading 140 or 320 deg",
+        ),  # the world's, not the map's
+    ],
+)
+def test_direction_in_words(case, expected):
+    assert _words(**case) == expected
+
+
+def test_deviations():
+    covariance = PoseCovariance(np.diag([1e-4, 4e-4, 9e-4, 1e-6, 4e-6, 9e-6]), "")
+    np.testing.assert_allclose(covariance.std_deg, np.degrees([0.01, 0.02, 0.03]))
+    np.testing.assert_allclose(covariance.std_mm, [1.0, 2.0, 3.0])
+    assert np.isclose(covariance.largest_std, 0.003)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return rooms.scene(1)
+
+
+def test_true_pose_scores_high_and_explains_most_of_the_panorama(scene):
+    points, panorama, true_pose = scene
+    assert agreement_at(points, panorama, true_pose).score > 0.5
+    for delta in ([0, 0, 1.0, 0, 0, 0], [0, 0, 0, 1.0, 0.5, 0]):
+        assert agreement_at(points, panorama, step(true_pose, np.array(delta))).score < 0.25
+    right = agreement_at(points, panorama, true_pose)
+    wrong = agreement_at(points, panorama, step(true_pose, np.array([0, 0, 1.0, 0, 0, 0])))
+    assert right.correlation > 0.5 > wrong.correlation
+    assert 0.9 < right.seen_fraction <= 1.0
+
+
+@pytest.mark.parametrize("level", [0, 128, 255])
+def test_a_blank_wall_can_not_win(scene, level):
+    points, panorama, true_pose = scene
+    blank = as_panorama(np.full_like(panorama.rgb, level))
+    assert abs(agreement_at(points, blank, true_pose).score) < 0.05
+
+
+def test_score_and_value_charge_a_view_of_which_little_is_seen():
+    for seen, value, score in ((0.25, 0.3, 0.3), (0.64, 0.6, 0.48), (1.0, 0.6, 0.6)):
+        agreement = Agreement(correlation=0.6, seen_fraction=seen)
+        assert (agreement.value, agreement.score) == (pytest.approx(value), pytest.approx(score))

@@ -52,7 +52,6 @@ def frames_of(tmp_path, changes, **more):
 
 
 def test_path_errors_equal_evo(tmp_path):
-    """Of a walk whose frames are all localized but the first."""
     ((_, frames),) = frames_of(
         tmp_path, {0: {"status": "ambiguous"}, 5: {"distance": 0.3, "angle_deg": 20.0}}
     ).items()
@@ -74,9 +73,8 @@ def test_path_errors_equal_evo(tmp_path):
 
 
 def test_frames_of_a_video_are_those_of_the_walk_of_its_name(tmp_path):
-    queries = walk_of(tmp_path)
-    scene = Scene("hall", tmp_path, tmp_path / "cloud.ply", tuple([*queries, *walk_of(tmp_path, "other")]))
-
+    queries = [*walk_of(tmp_path), *walk_of(tmp_path, "other")]
+    scene = Scene("hall", tmp_path, tmp_path / "cloud.ply", tuple(queries))
     told = []
 
     def matched(pano):
@@ -146,10 +144,3 @@ def test_a_photo_without_an_answer_has_no_errors_and_is_read_back_without(tmp_pa
     assert (again.position_error, again.rotation_error) == (np.inf, np.inf)
     assert again.result.best_pose is not None
     assert not again.has_errors
-
-
-def test_single_photos_are_no_walk(tmp_path):
-    frame = walk_of(tmp_path)[0]
-    query = dataclasses.replace(frame, walk=None, time=None)
-    scene = Scene("hall", tmp_path, tmp_path / "cloud.ply", (query,))
-    assert walks_of([scene], [query_result_of(scene, query, found(frame), None)]) == {}

@@ -12,8 +12,7 @@ import piccolo
 from piccolo.camera import Calibration, Camera, Mount
 from piccolo.camera.model import pinhole
 from piccolo.camera.resampling import View, sphere_of
-from piccolo.confidence.localization import Localization
-from piccolo.confidence.score import Evidence
+from piccolo.confidence.localization import Evidence, Localization
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.jobs.threads import Workers
 from piccolo.localization import focal_length as focal

@@ -13,7 +13,6 @@ from piccolo.walk.free_space import FreeSpace
 
 @pytest.fixture(scope="module")
 def two_rooms():
-    """Two rooms side by side, and their map."""
     world = make_world(5, np.array(rooms.SIZE), 2)
     points, colors, _ = scan_world(world, 80_000, Workers(2))
     cloud = stream_of_arrays(points.astype(np.float64), colors)
@@ -21,7 +20,6 @@ def two_rooms():
 
 
 def test_nobody_walks_through_a_wall(two_rooms):
-    """Places at a camera's height in one room and in the other, which have no door."""
     world, scan_map = two_rooms
     centers = scan_map.centers + scan_map.origin_world
     is_high = np.abs(centers[:, 2] - 1.6) < 0.4

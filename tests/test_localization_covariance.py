@@ -24,7 +24,6 @@ SETTINGS = CoarseToFineSettings(gravity="known")
 
 @pytest.fixture(scope="module")
 def found():
-    """The query of a panorama in a room, and the pose found in the map's frame."""
     scan_map, panorama = rooms.scan_map(2), as_panorama(query(2).rgb)
     prepared = prepare_query(panorama, scan_map, SETTINGS, Workers(2))
     result = localize(scan_map, panorama, SETTINGS, Workers(2), Stopwatch())
@@ -37,19 +36,7 @@ def _points(prepared, pose):
     return points._replace(channels=covariance.as_levels(points.channels))
 
 
-def test_gradients_of_blocks_add_up(found, monkeypatch):
-    prepared, pose, _ = found
-    points = _points(prepared, pose)
-    total = covariance.gradient_at(prepared.photo.images.full(), points, pose)
-    monkeypatch.setattr(covariance, "MOST_SHARE", 1e9)  # so that no block's share counts
-    parts = 1e9 * covariance.block_gradients(prepared.photo.images.full(), points, pose)
-    assert len(parts) > 100
-    tolerance = 1e-3 * np.abs(parts).sum(axis=0).max()
-    np.testing.assert_allclose(parts.sum(axis=0), total, rtol=1e-3, atol=tolerance)
-
-
 def test_gradients_as_left_out_are_those_at_the_pose_without_the_block():
-    """Of a linear problem, solved with and without each block."""
     rng = np.random.default_rng(1)
     rows, wanted = rng.normal(size=(20, 4, 6)), rng.normal(size=(20, 4))
     matrices = np.swapaxes(rows, 1, 2) @ rows
@@ -92,7 +79,6 @@ def test_no_covariance_without_a_minimum_or_with_few_blocks():
 
 
 def test_covariance_is_in_the_worlds_axes(found):
-    """A map turned against the world: the same deviations, turned along."""
     prepared, pose, result = found
     R = exp_so3(np.array([0.2, -0.5, 1.1]))
     turned = replace(prepared, scan_map=replace(prepared.scan_map, R_map_from_world=R))
@@ -120,13 +106,7 @@ def test_deviations_are_of_the_size_of_the_errors():
 def test_where_the_finest_images_have_no_minimum_the_next_one_tells(found, monkeypatch, num_rough):
     prepared, pose, _ = found
     images, asked = [image() for image in prepared.photo.images], []
-    ways = list(
-        zip(
-            images[:3],
-            (*covariance.STEPS, covariance.ROUGH_STEPS),
-            strict=True,
-        )
-    )
+    ways = list(zip(images[:3], (*covariance.STEPS, covariance.ROUGH_STEPS), strict=True))
 
     def hessian(image, points, pose, steps):
         asked.append((image, steps))

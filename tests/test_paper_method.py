@@ -5,7 +5,7 @@ import pytest
 from golden_poses import check_golden_poses
 from rooms import as_panorama, errors, query, room
 
-from piccolo.confidence.score import Evidence
+from piccolo.confidence.localization import Evidence
 from piccolo.errors import InputError
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from piccolo.confidence.covariance import PoseCovariance
-from piccolo.confidence.localization import Alternative
-from piccolo.confidence.score import Evidence
+from piccolo.confidence.localization import Alternative, Evidence
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.result import Result, Source, read_results, unreadable_result

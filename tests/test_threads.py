@@ -7,33 +7,22 @@ from contextlib import ExitStack
 import pytest
 
 from piccolo.jobs import threads
-from piccolo.jobs.threads import Workers
+from piccolo.jobs.threads import Once, Workers
 
 
 @pytest.mark.parametrize("num_threads", [1, 3])
-def test_results_come_in_order_and_pass_the_display(num_threads):
-    seen = []
-
-    def show(values, total, label):
-        seen.append((total, label))
-        return values
-
-    squares = Workers(num_threads, show).map(lambda i: i * i, range(20), "squares")
-    assert list(squares) == [i * i for i in range(20)]
-    assert seen == [(20, "squares")]
-
-
-@pytest.mark.parametrize("num_threads", [1, 2])
-def test_an_error_ends_the_display_before_it_is_raised(num_threads):
+def test_results_come_in_order_and_an_error_ends_the_display_before_it_is_raised(num_threads):
     seen = []
 
     def show(values, total, label):
         yield from values
-        seen.append("end")
+        seen.append((total, label))
 
+    workers = Workers(num_threads, show)
+    assert workers.map(lambda i: i * i, range(20), "squares") == [i * i for i in range(20)]
     with pytest.raises(ZeroDivisionError):
-        Workers(num_threads, show).map(lambda i: 1 // i, [2, 1, 0, 3], "work")
-    assert seen == ["end"]
+        workers.map(lambda i: 1 // i, [2, 1, 0, 3], "work")
+    assert seen == [(20, "squares"), (4, "work")]
 
 
 def test_an_error_drops_what_has_not_begun():
@@ -67,7 +56,6 @@ def test_threads_are_kept_and_work_within_work_is_done_by_the_same_one():
 
 
 def test_one_callers_work_may_wait_for_anothers():
-    """Two tasks that fill a pool wait for what another caller's tasks do."""
     is_done, workers = threading.Event(), Workers(2)
 
     def other():
@@ -106,3 +94,79 @@ def test_a_burst_of_callers_leaves_no_more_threads_than_the_cores_have_use_for(m
     assert len(threads._idle[2]) == 2
     with threads.pool_of(2) as pool:
         assert pool.submit(abs, -1).result() == 1
+
+
+def test_a_value_is_worked_out_once_whoever_asks():
+    asked, may_end = [], threading.Event()
+
+    def work():
+        asked.append(threading.current_thread())
+        may_end.wait(10.0)
+        return object()
+
+    once, found = Once(work), []
+    threads = [threading.Thread(target=lambda: found.append(once())) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    may_end.set()
+    for thread in threads:
+        thread.join()
+    assert len(asked) == 1
+    assert len(found) == 8
+    assert all(value is found[0] for value in [*found, once()])
+
+
+def test_what_is_raised_is_raised_and_asked_again():
+    left = [ValueError("no"), None]
+
+    def work():
+        if error := left.pop(0):
+            raise error
+        return 7
+
+    once = Once(work)
+    with pytest.raises(ValueError, match="no"):
+        once()
+    assert once() == once() == 7
+
+
+def test_values_are_worked_out_beside_other_work_and_none_is_left_running():
+    begun, may_end, by = threading.Event(), threading.Event(), []
+
+    def first():
+        begun.set()
+        may_end.wait(10.0)
+        by.append(threading.current_thread())
+
+    values = Once(first), Once(lambda: by.append("second"))
+    with Workers(2).beside(*values):
+        assert begun.wait(10.0)
+        may_end.set()
+        values[1]()  # whoever comes first
+    assert by.count("second") == 1
+    assert [each for each in by if each != "second"] != [threading.current_thread()]
+    assert len(by) == 2
+
+
+def test_one_thread_works_out_nothing_that_nobody_asks_for():
+    asked = []
+    with Workers(1).beside(Once(lambda: asked.append(1))):
+        pass
+    list(Workers(2).map(lambda k: _inside(asked), range(2), "nested"))
+    assert asked == []
+
+
+def _inside(asked):
+    with Workers(2).beside(Once(lambda: asked.append(2))):
+        pass
+
+
+def test_an_error_beside_other_work_reaches_who_asks_alone():
+    def fail():
+        raise ValueError("beside")
+
+    once = Once(fail)
+    with Workers(2).beside(once):
+        pass
+    with pytest.raises(ValueError, match="beside"):
+        once()

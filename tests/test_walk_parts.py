@@ -1,4 +1,4 @@
-"""Parts of a walk: its longest step, how sure a frame is, times from names, tables and EXIF."""
+"""Parts of a walk: its longest step, positions smoothed together, times from names, tables and EXIF."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -7,12 +7,77 @@ import numpy as np
 import pytest
 
 from piccolo.batch.frame_times import times_of
+from piccolo.confidence.covariance import PoseCovariance
 from piccolo.confidence.localization import Localization
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose
-from piccolo.walk.frames import MAX_STEP, NO_ACCELERATION, Frame, Motion, State
-from piccolo.walk.localize import accuracy_of
+from piccolo.geometry.pose import Pose, exp_so3, log_so3
+from piccolo.walk.frames import MAX_STEP, NO_ACCELERATION, Frame, Motion
+from piccolo.walk.localize import PRIOR_FLOOR, smoothed
 from piccolo.walk.second_look import motion_of
+
+MOTION = Motion(2.0, 0.5)
+TURN = exp_so3(np.array([0.1, -0.3, 1.0]))
+
+
+def _located(centers, stds, coupling=0.0):
+    """Poses at centres (N, 3), with deviations (N,) [m] and a correlation of turn and place."""
+    found = []
+    for center, std in zip(centers, stds, strict=True):
+        matrix = np.diag([0.01**2] * 3 + [std**2] * 3)
+        for k in range(3):
+            matrix[k, 3 + k] = matrix[3 + k, k] = coupling * 0.01 * std
+        found.append((Pose(TURN, np.array(center, float)), PoseCovariance(matrix, "")))
+    return found
+
+
+def _dense(located, times, s):
+    n = len(located)
+    A = np.zeros((n - 2, n))
+    for k in range(n - 2):
+        before, after = times[k + 1] - times[k], times[k + 2] - times[k + 1]
+        A[k, k : k + 3] = (
+            2.0 / (before + after) * np.array([1 / before, -1 / before - 1 / after, 1 / after]) / s
+        )
+    own = np.diag([1.0 / (c.matrix[3, 3] + PRIOR_FLOOR) for _, c in located])
+    centers = np.array([pose.center_world for pose, _ in located])
+    covariance = np.linalg.inv(own + A.T @ A)
+    return covariance @ own @ centers, covariance
+
+
+def test_positions_and_deviations_are_those_of_dense_least_squares():
+    rng = np.random.default_rng(3)
+    times = np.cumsum(rng.uniform(0.3, 0.8, 12))
+    located = _located(rng.normal(0.0, 0.3, (12, 3)) + times[:, None], rng.uniform(0.01, 0.4, 12))
+    centers, covariance = _dense(located, times, MOTION.max_acceleration)
+    found = smoothed(located, times, MOTION)
+    np.testing.assert_allclose([pose.center_world for pose, _ in found], centers, atol=1e-8)
+    variances = [c.matrix[4, 4] for _, c in found]
+    np.testing.assert_allclose(variances, np.diag(covariance), rtol=1e-8)
+
+
+def test_an_uncertain_frame_comes_to_the_others_and_turns_with_its_place():
+    times = np.arange(5.0) / 4
+    centers = np.outer(times, [1.0, 0.0, 0.0])
+    centers[2, 1] += 0.2
+    located = _located(centers, [0.005, 0.005, 0.3, 0.005, 0.005], coupling=0.9)
+    pose, covariance = smoothed(located, times, MOTION)[2]
+    assert abs(pose.center_world[1]) < 0.02
+    assert covariance.std_mm[1] < 40.0
+    turn = log_so3(pose.R_cam_from_world @ TURN.T)
+    np.testing.assert_allclose(turn[1], 0.9 * 0.01 / 0.3 * (pose.center_world[1] - 0.2), rtol=1e-3)
+    assert np.linalg.eigvalsh(covariance.matrix)[0] > 0.0
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_few_frames_stay_as_they_are(count):
+    located = _located(np.zeros((count, 3)), [0.1] * count)
+    assert smoothed(located, np.arange(count), MOTION) == located
+
+
+def test_frames_far_apart_say_nothing_of_each_other():
+    located = _located([[0, 0, 0], [0, 1, 0], [0, 0, 0]], [0.1] * 3)
+    found = smoothed(located, [0.0, 10.0, 20.0], MOTION)
+    np.testing.assert_allclose([pose.center_world[1] for pose, _ in found], [0, 1, 0], atol=1e-12)
 
 
 def test_the_longest_step_is_told_by_the_frames_that_are_localized_alone():
@@ -35,16 +100,6 @@ def test_the_longest_step_is_told_by_the_frames_that_are_localized_alone():
     assert longest(guess, [Frame(0.0)]) == MAX_STEP
     assert longest(replace(guess, is_guess=False), frames) == MAX_STEP
     assert longest(replace(guess, is_timed=True), frames) == MAX_STEP
-
-
-def test_a_frame_is_as_sure_as_its_own_picture():
-    """Those around it tell the place of a blurred frame, but not where in it."""
-
-    def state(odds):
-        return State(Pose(np.eye(3), np.zeros(3)), odds, 0.5)
-
-    assert accuracy_of(Frame(0.0, [state(0.0)])) == pytest.approx(0.5)
-    assert accuracy_of(Frame(0.0, [state(2.0), state(2.0)])) == pytest.approx(1 / (1 + np.exp(-2.0) / 2))
 
 
 def test_times_by_names_tables_and_exif(tmp_path):

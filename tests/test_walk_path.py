@@ -22,18 +22,14 @@ MOTION = Motion(max_speed=1.0)
 
 
 class Open:
-    """Free space without walls."""
-
     def __init__(self, share=0.01):
         self.share = share
 
     def distance(self, start, ends, limit):
-        """Straight."""
         straight = np.linalg.norm(ends - start, axis=1)
         return np.where(straight > limit, np.inf, straight)
 
     def share_within(self, center, radius):
-        """Any place is as good as another, or what a test says."""
         return self.share
 
 
@@ -75,7 +71,6 @@ class Logs:
         return log_transition(gaps, seconds, MOTION, self.expected)
 
     def unlisted(self, k):
-        """What a frame says for what is not listed."""
         if len(self.emitted[k]) == 0:
             return 0.0
         telling = [m for m in range(k) if self.frames[m].is_telling]
@@ -89,7 +84,6 @@ class Logs:
         return max(self.emitted[k].max() + gained - share * (TELLING_LOG + gained), 0.0)
 
     def of(self, way):
-        """The log of a way."""
         log, before = 0.0, None
         for k, j in ((k, j) for k, j in enumerate(way) if j is not None):
             log += self.unlisted(k) if j == UNLISTED else self.emitted[k][j]
@@ -146,30 +140,6 @@ def test_what_is_only_followed_tells_nothing_of_places_that_are_not_listed():
     told = lattice_of(searched, Open(), MOTION).smoothed()
     assert told.chosen == [0] * 23
     assert min(p[0] for p in told.probabilities) > 0.9
-
-
-def test_a_list_that_ends_in_a_copy_tells_as_little():
-    here = ((0, 0, 0), 4.0)
-    full, short = _frame(0, here, *COPIES), _frame(0, *COPIES)
-    assert not full.is_telling
-    assert short.is_telling
-    assert _frame(0, ((0, 0, 0), -2.0), *COPIES).is_telling
-    assert lattice_of([full], Open(), MOTION).filtered().sum() < 0.9
-    assert lattice_of([short], Open(), MOTION).filtered().sum() > 0.9
-
-
-def test_a_wrong_copy_that_was_followed_ends_where_the_scan_is_searched():
-    """The true place was lost for a while, and a copy of it was followed; then a place that there is once."""
-    true = [_frame(k, ((k, 0, 0), 6.0)) for k in range(5)]
-    lost = [Frame(float(k)) for k in range(5, 9)]
-    found = _frame(9, *(((x, y, z + 40), o) for (x, y, z), o in COPIES), ((0, 0, 40), 4.0))
-    wrong = [found, *(_followed(k, ((k, 0, 40), 6.0)) for k in range(10, 20))]
-    before = lattice_of([*true, *lost, *wrong], Open(), MOTION).smoothed()
-    assert max(float(p.max()) for p in before.probabilities[9:]) < 0.6
-    once = [_frame(k, ((k, 0, 0), 6.0)) for k in range(20, 23)]
-    after = lattice_of([*true, *lost, *wrong, *once], Open(), MOTION).smoothed()
-    assert max(float(p.max()) for p in after.probabilities[9:20]) < 0.1
-    assert min(float(p[0]) for p in [*after.probabilities[:5], *after.probabilities[20:]]) > 0.9
 
 
 def test_what_copies_say_of_each_other_does_not_add_up():

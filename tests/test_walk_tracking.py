@@ -11,8 +11,15 @@ from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.walk import tracker as tracker_module
 from piccolo.walk.frames import Motion, State
-from piccolo.walk.tracker import Follower, follow
-from piccolo.walk.tracking import found_everywhere, found_near, predicted, tracked, tracked_on
+from piccolo.walk.tracker import (
+    Follower,
+    follow,
+    found_everywhere,
+    found_near,
+    predicted,
+    tracked,
+    tracked_on,
+)
 
 SEED = 1
 

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
@@ -16,28 +15,21 @@ MAX_ALTERNATIVES = 5  # reported
 
 
 @dataclass(frozen=True)
-class Scored:
-    """A pose with a score: more is better."""
+class Hypothesis:
+    """A pose that may be right."""
 
     pose: Pose
-    score: float
+    score: float  # more is better; in the end what of the panorama it explains, as in `localization.Evidence`
 
 
-class Hypothesis(Scored):
-    """A pose that may be right; its score is what of the panorama it explains, as in `score.Evidence`."""
-
-
-AnyScored = TypeVar("AnyScored", bound=Scored)
-
-
-def by_score(poses: Sequence[AnyScored]) -> list[AnyScored]:
+def by_score(poses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """The best first; of equal ones, the first."""
     return sorted(poses, key=lambda p: -p.score)
 
 
 def suppressed(
-    ranked: Sequence[AnyScored], count: int, min_distance: float, min_angle: float
-) -> list[AnyScored]:
+    ranked: Sequence[Hypothesis], count: int, min_distance: float, min_angle: float
+) -> list[Hypothesis]:
     """The first `count` poses that are near (distance [m] and angle [rad]) none before."""
     if not ranked:
         return []
@@ -47,8 +39,8 @@ def suppressed(
 
 
 def best_distinct(
-    poses: Sequence[AnyScored], count: int, min_distance: float, min_angle: float
-) -> list[AnyScored]:
+    poses: Sequence[Hypothesis], count: int, min_distance: float, min_angle: float
+) -> list[Hypothesis]:
     """At most `count` by falling score, none within distance [m] and angle [rad] of a better one."""
     return suppressed(by_score(poses), count, min_distance, min_angle)
 

@@ -5,13 +5,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..geometry.pose import MAX_DISTANCE
+from ..geometry.pose import MAX_DISTANCE, Array
 from .covariance import PoseCovariance
 
-Array = NDArray[np.float64]
 LOCALIZED = "localized"
 AMBIGUOUS = "ambiguous"
 NOT_LOCALIZED = "not_localized"

@@ -6,7 +6,22 @@ from ..camera import Mount
 from ..geometry.pose import Pose
 from .confidence import NOT_LOCALIZED
 from .covariance import PoseCovariance
-from .score import Evidence
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a confidence rests on."""
+
+    score: float  # [0, 1] what the photo's blocks explain beyond chance; of preset paper, Agreement.score
+    # lead over the best pose elsewhere in what both views show, by what it explains; 1 if there is none;
+    # of preset paper, score less that of the best pose elsewhere
+    margin: float
+    agreement: float  # correlation over what both show, charged where that is under half of the sphere
+    explained_fraction: float  # of what the panorama shows, by solid angle, see Occlusion
+    seen_fraction: float  # of the sphere, on which both show anything
+    contradicted_fraction: float = 0.0  # of what the panorama shows; what is left was not scanned
+    num_matches: int | None = None  # local features of the photo that agree with the pose; None: not asked
+    alternative_matches: int | None = None  # the most that agree with a pose elsewhere
 
 
 @dataclass(frozen=True)

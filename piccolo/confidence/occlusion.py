@@ -2,6 +2,7 @@
 
 Photo and scan are compared by local contrast, as the exposure differs. An occluder pollutes mean and
 deviation around it: they are taken again over what agrees, the whole photo's at first, then more local ones.
+Their agreement is a correlation that a blank wall can't win.
 """
 
 import math
@@ -17,14 +18,21 @@ from ..geometry.pose import Pose
 from ..geometry.sphere import solid_angles
 from ..kernels.jit import F0, F1, kernel
 from ..panorama import Panorama
-from ..panorama.local_normalization import block_moments, blur_sphere, finish_statistics, opponent_channels
-from ..panorama.model import resize
+from ..panorama.local_normalization import (
+    block_moments,
+    blur_sphere,
+    finish_statistics,
+    normalize_locally,
+    opponent_channels,
+)
+from ..panorama.model import resize, shrink
 from ..views.zbuffer import View, render_view
 
 WIDTHS = (256, 128, 64)  # [px] of the comparison, cells of 1.4 degrees and more: where the scan is sparse
 LEAST_FILLED = 0.75  # of the cells twice as wide in which anything is seen: less is sparse
 STATS_WIDTH = 64  # [px] of local means
 SIGMA_DEG = 15.0  # of the Gaussian for contrast
+VIEW_WIDTH = 96  # [px] of the agreement, cells of 3.75 degrees
 SMOOTHING = 0.9  # [cells] of that for the difference
 GLOBAL_WEIGHTS = (10.0, 1.0, 0.3)  # round by round, of the whole photo beside a full neighbourhood
 FLAT_VARIANCE = np.float32(0.08**2)  # of a channel in [0, 1]: where it is less, a difference counts less
@@ -187,3 +195,39 @@ def _enlarged(small: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
     size = (shape[1] + 2 * border, shape[0])
     enlarged = cv2.resize(padded, size, interpolation=cv2.INTER_LINEAR)
     return np.ascontiguousarray(enlarged[:, border : border + shape[1]])
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Cloud and panorama compared at a pose, by cells of the sphere."""
+
+    correlation: float  # of locally normalised colours over what both show
+    seen_fraction: float  # of the sphere, what both show
+
+    @property
+    def value(self) -> float:
+        """The correlation; a view of which little is seen is charged below half a sphere."""
+        return self.correlation * min(1.0, 2.0 * self.seen_fraction)
+
+    @property
+    def score(self) -> float:
+        """The correlation times the root of the fraction that both show."""
+        return self.correlation * math.sqrt(self.seen_fraction)
+
+
+def agreement_at(points: PackedPoints, panorama: Panorama, pose: Pose) -> Agreement:
+    """How well the cloud at `pose` explains the panorama."""
+    small = shrink(panorama, VIEW_WIDTH)
+    view = render_view(points, pose, VIEW_WIDTH)
+    is_shared = view.is_seen & small.is_valid
+    weights = is_shared * (solid_angles(VIEW_WIDTH)[:, None] / (4.0 * math.pi))
+    of_view = normalize_locally(view.rgb, is_shared, SIGMA_DEG)
+    of_panorama = normalize_locally(small.rgb.astype(np.float32) / np.float32(255.0), is_shared, SIGMA_DEG)
+
+    def total(values: NDArray[np.float32]) -> float:
+        return float((weights[..., None] * values).sum(dtype=np.float64))
+
+    energy = math.sqrt(total(of_view**2) * total(of_panorama**2))
+    return Agreement(
+        correlation=total(of_view * of_panorama) / max(energy, 1e-9), seen_fraction=float(weights.sum())
+    )

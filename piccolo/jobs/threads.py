@@ -7,7 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 from ..errors import InputError
 from .memory import check_address_space
@@ -22,19 +22,7 @@ def num_cores() -> int:
     return min(len(os.sched_getaffinity(0)), MAX_THREADS)
 
 
-class _Thread(threading.local):
-    """What is known of the calling thread."""
-
-    is_of_pool = False
-
-
-_thread = _Thread()
-
-
-def _begin_thread() -> None:
-    _thread.is_of_pool = True
-
-
+_thread = threading.local()  # has `is_of_pool` in the threads of a pool
 _idle: dict[int, list[ThreadPoolExecutor]] = {}  # pools by their number of threads
 os.register_at_fork(after_in_child=_idle.clear)  # a child has none of its parent's threads
 
@@ -49,7 +37,7 @@ def pool_of(num_threads: int) -> Iterator[ThreadPoolExecutor]:
     try:
         pool = idle.pop()
     except IndexError:
-        pool = ThreadPoolExecutor(num_threads, "piccolo", _begin_thread)
+        pool = ThreadPoolExecutor(num_threads, "piccolo", setattr, (_thread, "is_of_pool", True))
     try:
         yield pool
     finally:
@@ -111,7 +99,7 @@ class Workers:
         values: list[Value] = []
         shown = self.show(iter(values), len(items), label)  # which is moved on as they come
         try:
-            if self.num_threads == 1 or len(items) < 2 or _thread.is_of_pool:
+            if self.num_threads == 1 or len(items) < 2 or hasattr(_thread, "is_of_pool"):
                 for item in items:
                     values.append(function(item))
                     next(shown)
@@ -130,7 +118,7 @@ class Workers:
 
         At its end, those that have not begun are left. What they raise is left to who asks for the value.
         """
-        if self.num_threads == 1 or _thread.is_of_pool:
+        if self.num_threads == 1 or hasattr(_thread, "is_of_pool"):
             yield
             return
         with submitted(1, functions):
@@ -148,3 +136,20 @@ def submitted(num_threads: int, tasks: Sequence[Callable[[], Value]]) -> Iterato
             for future in futures:
                 future.cancel()
             wait(futures)
+
+
+class Once(Generic[Value]):
+    """A value that is worked out by the first thread that asks; others wait for it."""
+
+    def __init__(self, function: Callable[[], Value]) -> None:
+        self._function: Callable[[], Value] | None = function
+        self._lock = threading.Lock()
+        self._value: Value
+
+    def __call__(self) -> Value:
+        """The value. What the function raises is raised, and it is asked again by the next."""
+        with self._lock:
+            if self._function is not None:
+                self._value = self._function()
+                self._function = None  # what it holds may be large
+        return self._value

@@ -1,14 +1,12 @@
 """Searches for a photo, each with its refinement, in the order in which they are tried.
 
-Most photos of the whole sphere, upright, fit one view and no other, and need no local features: a first look,
-brief, by whole views alone, finds them. What features would tell more is whether the photo is mirrored: its
-mirrored picture is searched too, as far as is cheap.
+Most photos of the whole sphere, upright, need no local features: a first look by whole views finds them. That
+a photo is mirrored, features would tell: its mirrored picture is searched too, as far as is cheap.
 """
 
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,8 +14,8 @@ from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import CLEAR_MATCHES
 from ..geometry.pose import Pose
 from ..geometry.rotations import Gravity
-from ..jobs.once import Once
 from ..jobs.stopwatch import Stopwatch
+from ..jobs.threads import Once
 from ..local_features.hypotheses import count_matches, poses_of
 from ..local_features.keypoints import HALVES
 from ..panorama.texels import Texels
@@ -42,19 +40,12 @@ ALL_HALVES = len(HALVES)
 NUM_MATCHED = 6  # poses from matches that are refined
 
 Found = tuple[list[Hypothesis], bool]  # and whether no more attempts need be made
+# one search with its refinement, which adds to what is known
+Attempt = Callable[[Query, list[Hypothesis], Stopwatch], Found]
 
 
-class Attempt(NamedTuple):
-    """One search with its refinement."""
-
-    run: Callable[[Query, "Attempt", list[Hypothesis], Stopwatch], Found]  # which adds to what is known
-    num_halves: int  # of the photo's features that are asked; 0: whole views alone
-    gravity: Gravity = "known"  # with which whole views are searched
-    is_brief: bool = False  # whole views from few starts
-
-
-def attempts_for(query: Query) -> list[Attempt]:
-    """Searches for a photo, in order, each to be made where those before leave doubt.
+def attempts_for(query: Query) -> list[tuple[int, Attempt]]:
+    """Searches for a photo, in order, and how many halves of its features each asks: 0, whole views alone.
 
     A whole upright sphere that is clear by whole views needs no more. Else come the poses that matches vote
     for, of half of the views first, and then whole views: with the gravity `auto` as known, then as unknown
@@ -62,36 +53,37 @@ def attempts_for(query: Query) -> list[Attempt]:
     """
     method = query.method
     looks_first = method.uses_features and method.uses_search and is_whole(query)
-    attempts = [Attempt(look_first, 0)] if looks_first else []
+    attempts: list[tuple[int, Attempt]] = [(0, look_first)] if looks_first else []
     if method.uses_features:
-        attempts += [Attempt(search_matches, num_halves) for num_halves in (1, ALL_HALVES)]
+        attempts += [(num_halves, search_matches) for num_halves in (1, ALL_HALVES)]
     if method.uses_search and query.settings.gravity != "unknown":
-        attempts.append(Attempt(search_views, ALL_HALVES))
+        attempts.append((ALL_HALVES, search_views))
     if method.uses_search and query.settings.gravity != "known":
-        attempts.append(Attempt(search_views, ALL_HALVES, "unknown", is_brief=looks_first))
+        with_any_tilt = partial(search_views, gravity="unknown", is_brief=looks_first)
+        attempts.append((ALL_HALVES, with_any_tilt))
     return attempts
 
 
-def look_first(query: Query, attempt: Attempt, known: list[Hypothesis], watch: Stopwatch) -> Found:
+def look_first(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Found:
     """Where brief whole views lead; True if one pose explains the photo, no other does, nor its mirror."""
     first = brief_query(query)
     of_mirror = Once(partial(mirror_score, query))
     with query.workers.beside(of_mirror):
         with watch.stage("search"):
-            starts = search_poses(first, attempt.gravity)
+            starts = search_poses(first, "known")
         with watch.stage("refine"):
             found = known + refine(first, starts, FIRST_BEAM)
-            return found, is_clear(query, found) and not is_rather_mirrored(first, starts, of_mirror())
+            return found, is_clear(query, found) and first_score(first, starts) >= MIRROR_RATIO * of_mirror()
 
 
-def search_matches(query: Query, attempt: Attempt, known: list[Hypothesis], watch: Stopwatch) -> Found:
+def search_matches(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Found:
     """Hypotheses, and the poses that matches vote for; True if these leave no doubt.
 
     Half of the features count for nothing if they leave any: all give the same poses then, and better ones.
     """
     with watch.stage("match"):
         poses = matched_poses(query)
-        is_half = attempt.num_halves < ALL_HALVES
+        is_half = query.num_halves < ALL_HALVES
         if is_half and (not poses or count_matches(query.matches, poses[0]) < CLEAR_MATCHES):
             return known, False
         found = known + refine_matches(query, poses)
@@ -99,13 +91,19 @@ def search_matches(query: Query, attempt: Attempt, known: list[Hypothesis], watc
         return known if is_half and not is_enough else found, is_enough
 
 
-def search_views(query: Query, attempt: Attempt, known: list[Hypothesis], watch: Stopwatch) -> Found:
+def search_views(
+    query: Query,
+    known: list[Hypothesis],
+    watch: Stopwatch,
+    gravity: Gravity = "known",
+    is_brief: bool = False,
+) -> Found:
     """Hypotheses, and where whole views lead; True if these leave no doubt."""
-    asked = tilted_query(query) if attempt.is_brief else query
+    asked = tilted_query(query) if is_brief else query
     with watch.stage("search"):
-        starts = search_poses(asked, attempt.gravity)
+        starts = search_poses(asked, gravity)
     with watch.stage("refine"):
-        found = known + refine(asked, starts, FIRST_BEAM if attempt.is_brief else query.method.beam)
+        found = known + refine(asked, starts, FIRST_BEAM if is_brief else query.method.beam)
         return found, is_sure(query, found)
 
 
@@ -123,10 +121,7 @@ def search_beyond_prior(query: Query, scan_map: ScanMap, watch: Stopwatch) -> li
 
 
 def matched_poses(query: Query) -> list[Pose]:
-    """Return the poses that matches vote for, best first.
-
-    Where whole views are not asked, only those that the prior allows.
-    """
+    """Return the poses that matches vote for, best first; without whole views, what the prior allows."""
     level = query.photo.R_cam_from_level if query.settings.gravity == "known" else None
     poses = [f.pose for f in poses_of(query.matches, level, NUM_MATCHED, query.workers)]
     if query.method.uses_search:
@@ -156,11 +151,6 @@ def tilted_query(query: Query) -> Query:
     is_even = (cells.sum(axis=1) % 2 == 0) | (len(cells) < FEW_CELLS)
     settings = replace(brief.settings, num_rotations=min(FIRST_ROTATIONS, query.settings.num_rotations))
     return replace(brief, scan_map=query.scan_map.narrowed(is_even), settings=settings)
-
-
-def is_rather_mirrored(query: Query, starts: Starts, of_mirror: float) -> bool:
-    """True if the mirrored photo, by its `mirror_score`, fits nearly as well as the photo itself."""
-    return first_score(query, starts) < MIRROR_RATIO * of_mirror
 
 
 def mirror_score(query: Query) -> float:

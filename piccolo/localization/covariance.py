@@ -1,7 +1,6 @@
 """Covariance of a pose from blocks of the sphere."""
 
 import math
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -136,19 +135,17 @@ def covariance_at(query: Query, points: Cells, pose: Pose) -> Array | None:
     Noise and stitching roughen the loss in the finest image; the next one is smoother. Where both are too
     rough, a third tells.
     """
-    by = partial(covariance_by, query, points, pose)
+
+    def by(steps: DifferenceSteps) -> Array | None:
+        image = query.photo.images[steps.scale]()
+        hessian = hessian_at(image, points, pose, steps)
+        covariance = covariance_of(hessian, block_gradients(image, points, pose))
+        return covariance if covariance is None else steps.inflation * covariance
+
     found = [c for c in query.workers.map(by, STEPS, "covariance") if c is not None]
     if not found:
         return by(ROUGH_STEPS)
     return min(found, key=lambda c: float(np.linalg.eigvalsh(c[3:, 3:])[-1]))
-
-
-def covariance_by(query: Query, points: Cells, pose: Pose, steps: DifferenceSteps) -> Array | None:
-    """Covariance (6, 6) in the camera's frame by one of the photo's images; None where it is too rough."""
-    image = query.photo.images[steps.scale]()
-    hessian = hessian_at(image, points, pose, steps)
-    covariance = covariance_of(hessian, block_gradients(image, points, pose))
-    return covariance if covariance is None else steps.inflation * covariance
 
 
 def errors_of_source(query: Query, points: Cells, pixel_share: float) -> Array:

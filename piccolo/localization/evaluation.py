@@ -10,9 +10,8 @@ import numpy as np
 
 from ..confidence.alternatives import MAX_ALTERNATIVES
 from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED, classify, posterior
-from ..confidence.localization import Alternative, Localization
-from ..confidence.occlusion import occlusion_at
-from ..confidence.score import Agreement, Evidence, agreement_at
+from ..confidence.localization import Alternative, Evidence, Localization
+from ..confidence.occlusion import Agreement, agreement_at, occlusion_at
 from ..local_features.hypotheses import count_matches, poses_of
 from ..local_features.matching import match
 from ..optimize.refine import refine, sampling_loss_of
@@ -46,12 +45,12 @@ def evaluate(query: Query, found: Selection, fit: FocalFit | None = None) -> Loc
     points, coarse = query.surroundings_at(pose)
     if settings.solver != "gauss-newton":
         how = DescentSettings(solver=settings.solver, step_size=LAST_STEP)
-        pose = refine(points(), sampling_loss_of(query.photo.colors()), pose, how).pose
+        pose = refine(points, sampling_loss_of(query.photo.colors()), pose, how).pose
     asked: list[Callable[[], Any]] = [
         partial(estimate_covariance, query, pose, fit and fit.pose_covariance),  # takes longest
-        lambda: occlusion_at(points(), query.photo.given, pose).fractions(),
-        lambda: sampling_loss(visible_points(points(), pose.center_world), query.photo.colors(), pose),
-        lambda: agreement_at(coarse(), query.photo.panorama, pose),
+        lambda: occlusion_at(points, query.photo.given, pose).fractions(),
+        lambda: sampling_loss(visible_points(points, pose.center_world), query.photo.colors(), pose),
+        lambda: agreement_at(coarse, query.photo.panorama, pose),
     ]
     covariance, fractions, loss, agreement = query.workers.map(operator.call, asked, "evaluate")
     if not math.isfinite(loss):

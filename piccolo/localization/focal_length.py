@@ -22,7 +22,7 @@ from ..camera.model import MODELS
 from ..confidence.localization import FocalLength
 from ..geometry.pose import Array, Pose, exp_so3, log_so3, rotate_points
 from ..geometry.sphere import indices_of
-from ..jobs.once import Once
+from ..jobs.threads import Once
 from ..optimize.normal_equations import LOSS
 from ..panorama import Panorama
 from ..views.view import Cells

@@ -14,6 +14,7 @@ from .refinement import (
     FULL_LOSS,
     MIN_GAIN,
     Fit,
+    Limits,
     descend,
     descend_fine,
     perturb_middle,
@@ -91,39 +92,38 @@ def refine_unoccluded(query: Query, pose: Pose) -> tuple[Query, Hypothesis]:
 
 
 def refine_full_resolution(query: Query, pose: Pose) -> Hypothesis:
-    """Descend on the visible points themselves in the finest image, unless the score falls.
-
-    In each round the points are those seen from where the pose is then, unless it has hardly moved.
-    """
-    shown, before = refine_unoccluded(query, pose)
-    pose = descend_on_points(shown, before.pose, FULL_LIMITS, NUM_ROUNDS, NEARLY)
-    after = score_pose(query, pose)
-    return after if after.score > MIN_SCORE_LEFT * before.score else before
+    """Descend on the visible points themselves in the finest image."""
+    shown, h = refine_unoccluded(query, pose)
+    return descend_on_points(query, shown, h, FULL_LIMITS, NUM_ROUNDS, NEARLY)
 
 
 def settle(query: Query, h: Hypothesis) -> Hypothesis:
     """Descend until the pose moves no more, so that it does not depend on where the search began."""
     shown = without_occluders(query, h.pose)
-    settled = score_pose(query, descend_on_points(shown, h.pose, LAST_LIMITS, MAX_LAST_ROUNDS, SETTLED))
-    return settled if settled.score > MIN_SCORE_LEFT * h.score else h
+    return descend_on_points(query, shown, h, LAST_LIMITS, MAX_LAST_ROUNDS, SETTLED)
 
 
 def descend_on_points(
-    query: Query, pose: Pose, limits: tuple[float, int, float], num_rounds: int, arrived: float
-) -> Pose:
-    """Descend on the points seen from a pose, and again from where it ends until it moves less than [m]."""
+    query: Query, shown: Query, h: Hypothesis, limits: Limits, num_rounds: int, arrived: float
+) -> Hypothesis:
+    """Descend on the points seen from a pose, and again from where it ends until it moves less than [m].
+
+    By what of the photo is `shown`; an end at which the score of all of it falls is not taken.
+    """
+    pose = h.pose
     for _ in range(num_rounds):
         center = pose.center_world
-        pose = descend(query.points_at(pose), query.photo.images.full(), pose, limits)
+        pose = descend(shown.points_at(pose), shown.photo.images.full(), pose, limits)
         if math.dist(pose.center_world, center) < arrived:
             break
-    return pose
+    end = score_pose(query, pose)
+    return end if end.score > MIN_SCORE_LEFT * h.score else h
 
 
 def settle_best(query: Query, found: Selection) -> Selection:
     """Bring the best pose to rest, and if it is not the best any more then, the one that is."""
     at_rest: list[Hypothesis] = []
-    with query.workers.beside(*query.surroundings_at(found.best.pose)):  # it hardly moves
+    with query.workers.beside(partial(query.surroundings_at, found.best.pose)):  # it hardly moves
         for _ in range(1 + len(found.alternatives)):
             best = settle(query, found.best)
             at_rest.append(best)

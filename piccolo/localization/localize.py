@@ -46,9 +46,9 @@ def localize(
     images = query.photo.images
     with workers.beside(images.middle, images.fine, images.full, query.photo.colors):
         hypotheses: list[Hypothesis] = []
-        for attempt in attempts_for(query):
-            query = replace(query, num_halves=attempt.num_halves)
-            hypotheses, is_enough = attempt.run(query, attempt, hypotheses, watch)
+        for num_halves, attempt in attempts_for(query):
+            query = replace(query, num_halves=num_halves)
+            hypotheses, is_enough = attempt(query, hypotheses, watch)
             if is_enough:
                 break
         hypotheses += search_beyond_prior(query, scan_map, watch)

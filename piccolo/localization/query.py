@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from ..cloud.soa import PackedPoints
 from ..geometry.pose import Array, Pose, rotate_points
 from ..geometry.sphere import indices_of, make_grid
-from ..jobs.once import Once
-from ..jobs.threads import Workers
+from ..jobs.threads import Once, Workers
 from ..local_features.keypoints import HALVES, Keypoints, find_keypoints, joined_keypoints
 from ..local_features.matching import Matches, joined_matches, match
 from ..panorama import Panorama
@@ -64,11 +63,6 @@ class Photo:
     colors: Once[Texels]  # at the size at which the loss is taken
     R_cam_from_level: Array  # (3, 3) how the camera was tilted where gravity is known
     pixel: float  # [rad] of the photo as it was given, but none finer than those that are compared
-
-    def make_images(self) -> None:
-        """Make what descents need, before they ask for it."""
-        for image in self.images:
-            image()
 
     def shown_cells(self, num_rings: int, pose: Pose) -> NDArray[np.bool_]:
         """Which cells (N,) of a grid around a pose in the map the photo shows; all, if it shows a sphere."""
@@ -142,10 +136,10 @@ class Query:
         shown = self.photo.shown_cells(config.num_rings, pose)
         return self.cache.views.points(place_of(pose), config, shown.tobytes(), NUM_POINTS)
 
-    def surroundings_at(self, pose: Pose) -> tuple[Once[PackedPoints], Once[PackedPoints]]:
+    def surroundings_at(self, pose: Pose) -> tuple[PackedPoints, PackedPoints]:
         """Points around a pose with which the photo is compared, and coarser ones."""
         around = partial(self.cache.views.surroundings, place_of(pose))
-        return Once(partial(around, VOXEL_PER_RANGE)), Once(partial(around, COARSE_VOXEL_PER_RANGE))
+        return around(VOXEL_PER_RANGE), around(COARSE_VOXEL_PER_RANGE)
 
 
 def prepare_query(

@@ -7,15 +7,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from ..confidence.alternatives import (
-    MIN_ANGLE,
-    MIN_DISTANCE,
-    Hypothesis,
-    Scored,
-    best_distinct,
-    by_score,
-    suppressed,
-)
+from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE, Hypothesis, best_distinct, by_score, suppressed
 from ..geometry.pose import Pose, orthonormal
 from ..geometry.suppression import non_maximum_suppression
 from ..jobs.threads import Workers
@@ -26,7 +18,7 @@ from ..panorama.local_normalization import LEVELS_PER_UNIT, ZERO_LEVEL
 from ..panorama.texels import Texels
 from ..scan_map.scan_map import ScanMap
 from ..views.candidate_views import SEARCH_VIEW
-from ..views.view import Cells
+from ..views.view import Cells, ViewConfig
 from .comparison import compare, score_pose
 from .query import Query
 from .search import Starts
@@ -57,8 +49,9 @@ SAME_ANGLE = math.radians(5.0)  # and this are one
 CLOSE_DISTANCE = 0.1  # [m] the same after the descent on middle cells
 
 
-class Fit(Scored):
-    """A pose on its way down; its score is `channel_loss.score` on the cells on which it descended."""
+Limits = tuple[float, int, float]  # scale of the loss [standard deviations], iterations, least step [rad + m]
+
+Fit = Hypothesis  # on its way down: its score is `channel_loss.score` on the cells on which it descended
 
 
 def refine(query: Query, starts: Starts, beam: Beam) -> list[Hypothesis]:
@@ -97,10 +90,18 @@ def descend_prepared(query: Query, starts: Starts, num_iterations: int, count: i
 
 def descend_middle(query: Query, pose: Pose) -> Fit:
     """Descend on middle cells, seen from where the pose is now."""
-    config = query.method.middle_view
-    image = query.photo.images.middle()
+    return descend_view(query, query.method.middle_view, query.photo.images.middle(), pose, MIDDLE_LIMITS)
+
+
+def descend_fine(query: Query, pose: Pose) -> Fit:
+    """Descend on fine cells, seen from where the pose is now."""
+    return descend_view(query, query.method.fine_view, query.photo.images.fine(), pose, FINE_LIMITS)
+
+
+def descend_view(query: Query, config: ViewConfig, image: Texels, pose: Pose, limits: Limits) -> Fit:
+    """Descend on the cells seen from a pose, with the score on them where it ends."""
     cells = query.view_at(pose, config)
-    return fit_on(cells, config.arrays.blocks, image, descend(cells, image, pose, MIDDLE_LIMITS))
+    return fit_on(cells, config.arrays.blocks, image, descend(cells, image, pose, limits))
 
 
 def perturb_middle(query: Query, pose: Pose) -> Fit:
@@ -111,19 +112,8 @@ def perturb_middle(query: Query, pose: Pose) -> Fit:
     return descend_around(cells, config.arrays.blocks, images, pose, 1.0, query.workers)
 
 
-def descend_fine(query: Query, pose: Pose) -> Fit:
-    """Descend on fine cells, seen from where the pose is now."""
-    config = query.method.fine_view
-    image = query.photo.images.fine()
-    cells = query.view_at(pose, config)
-    return fit_on(cells, config.arrays.blocks, image, descend(cells, image, pose, FINE_LIMITS))
-
-
 def refine_by_perturbation(query: Query, fit: Fit) -> Fit:
-    """Perturb and refine for as long as the score rises: a pose that stopped short creeps on.
-
-    Where that has ended before, it has ended.
-    """
+    """Perturb and refine for as long as the score rises: a pose that stopped short creeps on."""
     if fit.pose.key in query.cache.ends:
         return fit
     config = query.method.fine_view
@@ -261,12 +251,8 @@ def descend_all(
     return Starts(R, t, starts.candidate).take(order), scores[order]
 
 
-def descend(cells: Cells, image: Texels, pose: Pose, limits: tuple[float, int, float]) -> Pose:
-    """The pose where a descent from `pose` ends.
-
-    Limits are the loss' scale [standard deviations], the iterations, the least step [rad + m]. Coordinates
-    relative to the cells' centre keep float32 exact.
-    """
+def descend(cells: Cells, image: Texels, pose: Pose, limits: Limits) -> Pose:
+    """The pose where a descent ends; coordinates relative to the cells' centre keep float32 exact."""
     loss_scale, num_iterations, tolerance = limits
     R = pose.R_cam_from_world.copy()
     t = pose.center_world - cells.center_map

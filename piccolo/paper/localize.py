@@ -10,9 +10,8 @@ from ..cloud.soa import LocalCloud, PackedPoints, pack_points
 from ..cloud.stream import Cloud
 from ..confidence.alternatives import Hypothesis, alternative_poses
 from ..confidence.confidence import AMBIGUOUS, LEAST_SCORE, LOCALIZED, NOT_LOCALIZED
-from ..confidence.localization import Alternative, Localization
-from ..confidence.occlusion import occlusion_at
-from ..confidence.score import Evidence, agreement_at
+from ..confidence.localization import Alternative, Evidence, Localization
+from ..confidence.occlusion import agreement_at, occlusion_at
 from ..geometry.rotations import uniform_rotations, uniform_yaws
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers

@@ -149,14 +149,15 @@ class Lattice:
         """The next frame in time."""
         self.frames.append(frame)
         k = len(self.frames) - 1
-        self.emitted.append(self._emission())
+        before = next((f for f in reversed(self.frames[:-1]) if f.states), None)
+        self.emitted.append(emissions([before, frame] if before else [frame])[-1])
         steps = self._steps_to(k)
         self.steps.append(steps)
-        before, begin = (self.unlisted[-1], (k - 1, UNLISTED)) if k else (_Unlisted(), None)
-        self.unlisted.append(self._unlisted_at(k, before))
+        unlisted, begin = (self.unlisted[-1], (k - 1, UNLISTED)) if k else (_Unlisted(), None)
+        self.unlisted.append(self._unlisted_at(k, unlisted))
         num = len(frame.states)
-        sums = np.full(num, entering(frame) + before.forward)
-        best = np.full(num, entering(frame) + before.best)
+        sums = np.full(num, entering(frame) + unlisted.forward)
+        best = np.full(num, entering(frame) + unlisted.best)
         back: list[tuple[int, int] | None] = [begin] * num
         for s in steps:
             sums = np.logaddexp(sums, np.logaddexp.reduce(self.forward[s.begin][:, None] + s.log, axis=0))
@@ -198,11 +199,6 @@ class Lattice:
             return 0.0
         last = next((f for f in reversed(self.frames[:k]) if f.is_telling), None)
         return 1.0 if last is None else max(share_moved(last, frame), LEAST_TOLD)
-
-    def _emission(self) -> Array:
-        """Log odds (S,) of the last frame's states."""
-        before = next((f for f in reversed(self.frames[:-1]) if f.states), None)
-        return emissions([before, self.frames[-1]] if before else self.frames[-1:])[-1]
 
     def _steps_to(self, k: int) -> list[_Steps]:
         """Steps from all earlier frames from which the way may lead to a frame."""

@@ -19,8 +19,18 @@ from ..localization.settings import METHOD
 from ..panorama import Panorama
 from .frames import MAX_STEP, Frame, Motion, State, centers_of, states_of
 from .path import REACH_SLACK, Path, lattice_of, places_of
-from .tracker import MAX_RADIUS, Follower, Tracker, follow, followed, least_score
-from .tracking import beside, found_near, is_same, states_at
+from .tracker import (
+    MAX_RADIUS,
+    Follower,
+    Tracker,
+    beside,
+    follow,
+    followed,
+    found_near,
+    is_same,
+    least_score,
+    states_at,
+)
 
 MAX_SWEEPS = 4
 FARTHEST = 12  # frames from one that is sure, in which lost ones are looked for
@@ -98,8 +108,7 @@ def _complete(tracker: Tracker, k: int, step: int, read: Read) -> None:
     panorama = read(k) if missing else None
     if panorama is None:
         return
-    query = prepare_query(panorama, tracker.scan_map, tracker.settings, tracker.workers)
-    query.photo.make_images()
+    query = tracker.prepared(panorama)
     for follower, end in zip(missing, followed(query, missing, frame.time, tracker.motion), strict=True):
         more = beside(query, frame.states, end)
         if more is not None and _is_within(tracker, follower, more, frame.time):

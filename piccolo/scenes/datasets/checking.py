@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from ...cloud import open_cloud
 from ...cloud.octree import build_octree
 from ...cloud.soa import pack_points
-from ...confidence.score import VIEW_WIDTH, agreement_at
+from ...confidence.occlusion import VIEW_WIDTH, agreement_at
 from ...geometry.pose import Array, Pose
 from ...jobs.threads import Progress, Workers, no_progress
 from ...panorama import read_panorama
@@ -26,7 +26,7 @@ class ConventionCheck(NamedTuple):
     """The fit of a panorama to the cloud at its pose, by this convention and by others."""
 
     image: str  # as queries.json has it
-    score: float  # of the pose as given, [-1, 1], by confidence/score.py
+    score: float  # of the pose as given, [-1, 1], by confidence/occlusion.py
     best_score: float  # the highest score by any convention
     best: str  # that convention in words
 

@@ -1,11 +1,11 @@
-"""The first look: which photos whole views alone are enough for, and what the result then says."""
+"""Which photos whole views alone are enough for, how much search others need, and what the result says."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import rooms
-from made_up import at, compared
+from made_up import QUERY, at, compared, places
 
 from piccolo.confidence.confidence import LOCALIZED
 from piccolo.geometry.pose import exp_so3, is_correct
@@ -17,7 +17,7 @@ from piccolo.localization import localize as method
 from piccolo.localization.query import prepare_query
 from piccolo.localization.search import search_poses
 from piccolo.localization.selection import is_clear
-from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.scan_map.prior import Prior
 
 KNOWN = CoarseToFineSettings(gravity="known")
@@ -74,12 +74,6 @@ def test_clear_are_score_and_margin(monkeypatch, score, margin, expected):
     assert is_clear(asked, [at(0.0, score), at(3.0, other)]) == expected
 
 
-@pytest.mark.parametrize(("first", "is_mirrored"), [(0.221, False), (0.21, True)])
-def test_a_photo_is_rather_mirrored_unless_it_fits_better_by_a_tenth(monkeypatch, first, is_mirrored):
-    monkeypatch.setattr(attempts, "first_score", lambda query, starts: first)
-    assert attempts.is_rather_mirrored(None, None, 0.2) == is_mirrored
-
-
 def test_the_mirrored_query_is_that_of_the_mirrored_photo():
     """Its tilt is mirrored with it; where it heads, nothing is known."""
     panorama = rooms.as_panorama(rooms.query(1).rgb)
@@ -106,8 +100,7 @@ def test_the_first_score_tells_a_photo_from_its_mirror():
 
 
 @pytest.mark.parametrize(
-    ("gravity", "brief"),
-    [("auto", {"num_rotations": 1000, "max_starts": 300}), ("unknown", {})],
+    ("gravity", "brief"), [("auto", {"num_rotations": 1000, "max_starts": 300}), ("unknown", {})]
 )
 def test_a_tilted_sphere_without_features_is_found_by_whole_views(monkeypatch, gravity, brief):
     """With the gravity `auto`, where the upright search came first, by a brief search."""
@@ -134,3 +127,72 @@ def test_a_brief_search_keeps_what_little_a_prior_leaves():
     asked = _query(rooms.as_panorama(rooms.query(1).rgb))
     assert attempts.tilted_query(replace(asked, scan_map=few)).scan_map.sparse.tolist() == few.sparse.tolist()
     assert 0.3 < len(attempts.tilted_query(asked).scan_map.sparse) / len(whole.sparse) < 0.7
+
+
+LOOK = (0, "look_first")
+HALF = (1, "search_matches")
+ALL = (2, "search_matches")
+UPRIGHT = (2, "search_views")
+TILTED = (2, {"gravity": "unknown", "is_brief": False})
+BRIEFLY = (2, {"gravity": "unknown", "is_brief": True})
+
+
+@pytest.mark.parametrize(
+    ("is_whole", "gravity", "parts", "expected"),
+    [
+        (True, "auto", {}, [LOOK, HALF, ALL, UPRIGHT, BRIEFLY]),
+        (True, "known", {}, [LOOK, HALF, ALL, UPRIGHT]),
+        (False, "auto", {}, [HALF, ALL, UPRIGHT, TILTED]),
+        (False, "unknown", {}, [HALF, ALL, TILTED]),
+        (True, "auto", {"uses_features": False}, [UPRIGHT, TILTED]),
+        (True, "auto", {"uses_search": False}, [HALF, ALL]),
+    ],
+)
+def test_attempts_are_made_in_this_order(monkeypatch, is_whole, gravity, parts, expected):
+    monkeypatch.setattr(attempts, "is_whole", lambda query: is_whole)
+    settings = CoarseToFineSettings(gravity=gravity)
+    found = attempts.attempts_for(replace(QUERY, method=METHOD._replace(**parts), settings=settings))
+    assert [(num, getattr(run, "__name__", None) or run.keywords) for num, run in found] == expected
+
+
+@pytest.mark.parametrize(("sure", "num_made"), [(1, 1), (2, 2), (None, 3)])
+def test_attempts_are_made_until_one_is_sure(monkeypatch, sure, num_made):
+    """What is found adds up, and as many features are asked in the end as in the last attempt."""
+
+    def run(query, hypotheses, watch):
+        return [*hypotheses, at(query.num_halves, 0.5)], query.num_halves == sure
+
+    made = [(k, run) for k in (1, 2, 0)]
+    monkeypatch.setattr(method, "attempts_for", lambda query: made)
+    monkeypatch.setattr(method, "refine_to_the_end", lambda query, found: found)
+    monkeypatch.setattr(method, "evaluate", lambda query, found: (query.num_halves, found))
+    how = CoarseToFineSettings(), Workers(1), Stopwatch()
+    num_halves, found = method.localize(rooms.scan_map(1), rooms.scene(1)[1], *how)
+    assert places(found) == [1, 2, 0][:num_made]
+    assert num_halves == places(found)[-1]
+
+
+@pytest.mark.parametrize(
+    ("num_halves", "num_matches", "is_sure", "kept"),
+    [
+        (1, 40, True, [9, 1]),
+        (1, 39, True, [9]),
+        (1, 40, False, [9]),
+        (1, None, True, [9]),
+        (2, 39, False, [9, 2]),
+        (2, 5, True, [9, 2]),
+    ],
+)
+def test_half_of_the_features_count_where_these_leave_no_doubt(
+    monkeypatch, num_halves, num_matches, is_sure, kept
+):
+    """As many matches as a clear whole view is worth, and no pose of the first look near it."""
+    looked = at(9, 0.2)
+    monkeypatch.setattr(attempts, "matched_poses", lambda query: [] if num_matches is None else ["pose"])
+    monkeypatch.setattr(attempts, "count_matches", lambda matches, pose: num_matches)
+    monkeypatch.setattr(attempts, "is_sure", lambda query, found: found[0] is looked and is_sure)
+    monkeypatch.setattr(attempts, "refine_matches", lambda query, poses: [at(query.num_halves, 0.5)])
+    query = replace(QUERY, num_halves=num_halves)
+    found, is_enough = attempts.search_matches(query, [looked], Stopwatch())
+    assert places(found) == kept
+    assert is_enough == (is_sure and len(kept) == 2)
