@@ -3,7 +3,7 @@
 import numpy as np
 import pycolmap
 import pytest
-from poses import CENTER, SIZE, WIDTH, jpeg, json_of, lines_of, pixels_and_points, result, tilted_poses
+from poses import SIZE, WIDTH, jpeg, json_of, lines_of, pixels_and_points, result, tilted_poses
 
 from piccolo.camera import Camera, Mount
 from piccolo.camera.model import pinhole
@@ -31,11 +31,7 @@ def _check_pixels(found, wanted):
 
 
 def nerfstudio_pixels(document, frame, points):
-    """Pixels by the rays of EQUIRECTANGULAR in nerfstudio/cameras/cameras.py, solved for x and y.
-
-    theta = -pi (x - cx) / fx, phi = pi (0.5 - coord_y) with coord_y = -(y - cy) / fy;
-    direction = (-sin(theta) sin(phi), cos(phi), -cos(theta) sin(phi)), turned by camera_to_world.
-    """
+    """Pixels by the rays of EQUIRECTANGULAR in nerfstudio/cameras/cameras.py, solved for x and y."""
     T = np.array(frame["transform_matrix"])
     d = (points - T[:3, 3]) @ T[:3, :3]
     theta = np.arctan2(-d[:, 0], -d[:, 2])
@@ -126,19 +122,18 @@ def test_colmap_has_the_camera_of_a_photo_and_of_each_picture_of_a_rig(tmp_path)
         assert np.abs(found - pixels).max() < TOLERANCE
 
 
-@pytest.mark.parametrize("name", ["nerfstudio", "opensfm", "potree", "gpano"])
-def test_photos_are_refused_by_formats_of_spheres(tmp_path, name):
-    photo = result(tmp_path / "a.jpg", POSES[0], cameras=(Mount(CAMERA),))
-    with pytest.raises(InputError, match=r"a.jpg: found a photo by the model OPENCV, wanted a sphere for"):
+@pytest.mark.parametrize("name", ["nerfstudio", "opensfm", "potree", "gpano", "colmap"])
+def test_photos_are_refused_by_formats_of_spheres_and_two_in_a_picture_by_colmap(tmp_path, name):
+    cameras = [Mount(CAMERA), Mount(CAMERA, TILTED, offset=(640, 0))]
+    message = "found 2 cameras in one picture, wanted one for colmap"
+    if name != "colmap":
+        cameras.pop()
+        message = "a.jpg: found a photo by the model OPENCV, wanted a sphere for"
+    photo = result(tmp_path / "a.jpg", POSES[0], cameras=tuple(cameras))
+    with pytest.raises(InputError, match=message):
         export([photo], name, tmp_path / "out", Options())
     export([photo], "csv", tmp_path / "poses.csv", Options())
     assert len(lines_of(tmp_path / "poses.csv")) == 2
-
-
-def test_two_cameras_in_one_picture_are_refused_by_colmap(tmp_path):
-    two = (Mount(CAMERA), Mount(CAMERA, TILTED, offset=(640, 0)))
-    with pytest.raises(InputError, match="found 2 cameras in one picture, wanted one for colmap"):
-        export([result(tmp_path / "a.jpg", POSES[0], cameras=two)], "colmap", tmp_path / "out", Options())
 
 
 def test_colmap_has_a_camera_a_size_and_refuses_blanks_in_names(tmp_path):
@@ -146,8 +141,6 @@ def test_colmap_has_a_camera_a_size_and_refuses_blanks_in_names(tmp_path):
     jpeg(tmp_path / "b.jpg", (256, 128))
     results = [result(tmp_path / name, POSES[0]) for name in ("a.jpg", "b.jpg")]
     export(results, "colmap", tmp_path / "model", Options(images=tmp_path))
-    cameras = [line.split() for line in lines_of(tmp_path / "model" / "cameras.txt")[1:]]
-    assert [words[2:] for words in cameras] == [["512", "256"] * 2, ["256", "128"] * 2]
     model = pycolmap.Reconstruction(str(tmp_path / "model"))
     assert {image.name: image.camera.width for image in model.images.values()} == {"a.jpg": 512, "b.jpg": 256}
     # macOS has \u202f in names: COLMAP reads over it, but readers in Python end the name there
@@ -225,13 +218,9 @@ def test_the_offset_is_written_beside_what_has_no_place_for_it(tmp_path):
     written = np.array(lines_of(tmp_path / "r.json.offset.txt")[1].split(), float)
     np.testing.assert_array_equal(written, offset)
     (reconstruction,) = json_of(tmp_path / "r.json")
-    for i, pose in enumerate(POSES):
-        pixels, points = pixels_and_points(pose)
-        _check_pixels(opensfm_pixels(reconstruction, f"photos/{i}.jpg", points - written), pixels)
+    pixels, points = pixels_and_points(POSES[2])
+    _check_pixels(opensfm_pixels(reconstruction, "photos/2.jpg", points - written), pixels)
     export(_results(), "colmap", tmp_path / "model", Options(size=SIZE, offset=offset))
-    assert "# world position = position here + 500000.0 5400000.0 0.1" in lines_of(
-        tmp_path / "model/images.txt"
-    )
+    assert "position here + 500000.0 5400000.0 0.1" in (tmp_path / "model" / "images.txt").read_text()
     image = pycolmap.Reconstruction(str(tmp_path / "model")).images[1]
     np.testing.assert_allclose(image.projection_center(), POSES[0].center_world - offset, atol=1e-9)
-    assert np.linalg.norm(image.projection_center()) < 0.01 * np.linalg.norm(CENTER)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from piccolo.cli import make_room as tool
-from piccolo.errors import InputError
 from piccolo.geometry.pose import rotation_from_quaternion_wxyz
 from piccolo.geometry.rotations import OPTICAL_FROM_CAM
 from piccolo.scenes.scene import read_scene
@@ -94,24 +93,3 @@ def test_command_line_refuses_in_one_line_before_anything_is_written(words, mess
     assert written(tmp_path / "r", words) == 2
     assert capsys.readouterr() == ("", f"make_room.py: {message}\n")
     assert not (tmp_path / "r").exists()
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "message"),
-    [
-        ("walk", None, "a walk without a time"),
-        ("walk", 3, "a walk that is no plain text"),
-        ("time", "soon", "a time that is no finite number"),
-        ("time", True, "a time that is no finite number"),
-        ("answerable", 1, "an answerable that is not true or false"),
-    ],
-)
-def test_damaged_frames_in_a_scene_are_refused(field, value, message, tmp_path):
-    pose = {"R_cam_from_world": np.eye(3).tolist(), "center_world": [0, 0, 0]}
-    entry = {"image": "a.jpg", "variant": "clean", **pose, "walk": "w", "time": 1.5, "answerable": True}
-    (tmp_path / "queries.json").write_text(json.dumps({"queries": [entry]}))
-    (query,) = read_scene(tmp_path).queries
-    assert (query.walk, query.time, query.is_answerable) == ("w", 1.5, True)
-    (tmp_path / "queries.json").write_text(json.dumps({"queries": [entry | {field: value}]}))
-    with pytest.raises(InputError, match=message):
-        read_scene(tmp_path)
