@@ -15,7 +15,6 @@ from ..files.atomic import write_atomically
 from ..jobs.threads import Workers, num_cores
 from ..optional import import_optional
 from ..scenes import scene as scenes
-from ..scenes.datasets.files import write_labels
 from ..scenes.export.formats import tum_lines, write_lines
 from ..scenes.export.video import writing_video
 from ..scenes.synthetic.office import Office, make_office
@@ -147,7 +146,7 @@ def write_photos(
             if arguments.labels:
                 labels = folder / "labels" / f"{v}_{k}.png"
                 labels.parent.mkdir(exist_ok=True)
-                write_labels(labels, make_labels(world, k, query, workers))
+                write_atomically(labels, encode_image(make_labels(world, k, query, workers), ".png"))
         for name, rgb in pictures:
             path = image / name
             path.parent.mkdir(exist_ok=True)

@@ -24,6 +24,7 @@ from piccolo.jobs.threads import Workers, num_cores
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.opening import scan_of
 from piccolo.panorama import AS_STORED, read_panorama
+from piccolo.scenes.reproduce_paper import UPSIDE_DOWN
 from piccolo.scenes.scene import Scene, read_scene
 from piccolo.scenes.synthetic.room import PLAIN
 from piccolo.scenes.synthetic.world import VARIANTS, World, blur, make_query, make_world, scan_world
@@ -51,7 +52,6 @@ FLATTENED = 0.4  # elevations of occluders: people and things stand around the c
 LIGHT_SCALE = 0.08  # of the width: patches of light and shade
 FIELDS = (120.0, 90.0, 65.0)  # of narrow photos [deg]
 ASPECT = 0.75  # height by width of a narrow photo
-POSE = ("R_cam_from_world", "center_world")
 Image = NDArray[np.uint8]
 Points = tuple[NDArray[np.floating], NDArray[np.uint8]]
 
@@ -146,12 +146,10 @@ def fractal_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Image:
 
 def upside_down(trial: Trial) -> Trial:
     """A panorama held by a camera turned over, searched as if it were upright."""
-    rgb = np.ascontiguousarray(trial.rgb[::-1, ::-1])
-    if trial.true_pose is None:
-        return Trial("upside down", rgb, None, "known")
-    turn = np.diag([1.0, -1.0, -1.0])  # half a turn about the image centre: columns and rows run backwards
-    pose = Pose(turn @ trial.true_pose.R_cam_from_world, trial.true_pose.center_world)
-    return Trial("upside down", rgb, pose, "known")
+    pose = trial.true_pose
+    if pose is not None:
+        pose = Pose(UPSIDE_DOWN @ pose.R_cam_from_world, pose.center_world)
+    return Trial("upside down", np.ascontiguousarray(trial.rgb[::-1, ::-1]), pose, "known")
 
 
 def thinned(points: Points, rng: np.random.Generator) -> Points:
@@ -271,12 +269,9 @@ def run(arguments: argparse.Namespace) -> int:
                 truth = trial.true_pose
                 ok = truth is not None and is_correct(result.best_pose, truth)
                 rows.append((trial.case, result.status, ok))
-                line = {
-                    "case": trial.case,
-                    "scene": scene,
-                    "truth": truth and {name: getattr(truth, name).tolist() for name in POSE},
-                }
-                file.write(json.dumps(line | {"result": json.loads(result.to_json())}) + "\n")
+                line = {"case": trial.case, "scene": scene, "result": json.loads(result.to_json())}
+                line["truth"] = truth and {name: array.tolist() for name, array in vars(truth).items()}
+                file.write(json.dumps(line) + "\n")
                 file.flush()
                 print_note(arguments, f"{scene}: {trial.case}: {result.status}, {'right' if ok else 'wrong'}")
     return 1 if print_cases("case", rows) else 0

@@ -24,10 +24,7 @@ def export(results: Sequence[Result], name: str, out: Path, options: Options) ->
     Raises InputError if no pose is left, or `out` can't be written.
     """
     form = FORMATS[name]
-    if form.is_folder:
-        check_output_folder(out)
-    else:
-        check_output(out)
+    (check_output_folder if form.is_folder else check_output)(out)
     if not results:
         raise InputError(f"{out}: there is no pose to write; --all also writes those that are not localized")
     images, left_out = posed_images(results, form, options)

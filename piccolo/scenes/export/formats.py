@@ -151,11 +151,10 @@ def write_colmap(images: Sequence[PosedImage], out: Path, options: Options) -> N
 
 def _colmap_camera(image: PosedImage) -> str:
     """Model, size and parameters."""
-    if image.camera is None:
-        w, h = image.size
-        return f"EQUIRECTANGULAR {w} {h} {w} {h}"
-    camera = image.camera
-    return f"{camera.model} {camera.width} {camera.height} {numbers(camera.params)}"
+    if camera := image.camera:
+        return f"{camera.model} {camera.width} {camera.height} {numbers(camera.params)}"
+    w, h = image.size
+    return f"EQUIRECTANGULAR {w} {h} {w} {h}"
 
 
 def write_nerfstudio(images: Sequence[PosedImage], out: Path, options: Options) -> None:
@@ -200,11 +199,8 @@ def write_opensfm(images: Sequence[PosedImage], out: Path, options: Options) -> 
         cameras[camera] = {"projection_type": "spherical", "width": width, "height": height}
         pose = turned(image.pose, OPTICAL_FROM_CAM)
         rotation = log_so3(pose.R_cam_from_world).tolist()
-        shots[image.name] = {
-            "rotation": rotation,
-            "translation": translation(pose).tolist(),
-            "camera": camera,
-        }
+        shot = {"rotation": rotation, "translation": translation(pose).tolist(), "camera": camera}
+        shots[image.name] = shot
     write_offset_beside(out, options)
     write_json(out, [{"cameras": cameras, "shots": shots, "points": {}}])
 

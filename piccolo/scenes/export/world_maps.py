@@ -47,9 +47,7 @@ def write_gpx(images: Sequence[PosedImage], out: Path, options: Options) -> None
 def _in_degrees(what: str, images: Sequence[PosedImage], options: Options) -> tuple[Any, Any, str]:
     """The ellipsoid, what turns positions into longitude and latitude, and the system's name."""
     pyproj = import_optional(what, "pyproj", "tools")
-    crs = options.crs
-    if crs is None:
-        raise InputError("--crs: not given, wanted the cloud's coordinate system, such as EPSG:25832")
+    crs = str(options.crs)
     try:
         system = pyproj.CRS.from_user_input(crs)
     except pyproj.exceptions.CRSError as error:

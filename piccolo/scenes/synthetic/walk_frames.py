@@ -78,7 +78,9 @@ def frames_of(
             rgb = make_query(elsewhere, k, "clean", options.width, workers).rgb
         else:
             present = [part for person in people if (part := person.at(time)) is not None]
-            rgb = _picture(joined([office.world.rooms[0], *present]), walk, time, options, workers)
+            meanwhile = _exposures(walk, time) if options.is_blurred else []
+            room = joined([office.world.rooms[0], *present])
+            rgb = photograph(room, pose, options.width, workers, meanwhile)
         if options.variant == "photo" and kind != "black":
             rgb = other_light(rgb, np.random.default_rng([seed, 55, number]))  # one light for the whole walk
         yield Frame(rgb[:, ::-1].copy() if kind == "mirrored" else rgb, pose, time, kind)
@@ -92,14 +94,10 @@ def _kinds(count: int, options: WalkOptions, rng: np.random.Generator) -> list[s
     return kinds
 
 
-def _picture(
-    room: Room, walk: Walk, time: float, options: WalkOptions, workers: Workers
-) -> NDArray[np.uint8]:
-    meanwhile: list[Pose] = []
-    if options.is_blurred:
-        moments = time + SHUTTER * (np.arange(NUM_EXPOSURES) + 0.5 - NUM_EXPOSURES / 2) / NUM_EXPOSURES
-        meanwhile = [walk.pose(float(moment)) for moment in np.clip(moments, 0.0, walk.duration)]
-    return photograph(room, walk.pose(time), options.width, workers, meanwhile)
+def _exposures(walk: Walk, time: float) -> list[Pose]:
+    """The camera while the shutter is open."""
+    moments = time + SHUTTER * (np.arange(NUM_EXPOSURES) + 0.5 - NUM_EXPOSURES / 2) / NUM_EXPOSURES
+    return [walk.pose(float(moment)) for moment in np.clip(moments, 0.0, walk.duration)]
 
 
 class Person:

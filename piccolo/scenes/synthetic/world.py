@@ -38,8 +38,6 @@ SEED_STEP = 64  # between the rooms of two seeds; larger buildings share rooms w
 MIN_POINTS = 1000  # of a room
 MAX_SIDE = 4096  # [px] of a camera's picture
 
-Named = list[tuple[str, NDArray[np.uint8]]]  # pictures (H, W, 3) by file name; "" of one that stands alone
-
 
 def free_position(room: Room, rng: np.random.Generator, heights: tuple[float, float]) -> Array:
     """A random position (3,) at least MIN_CLEARANCE from every surface, at a height [m] above the floor.
@@ -62,20 +60,18 @@ def scan_room(
     """Points (N, 3) [m], colours (N, 3) and labels (N,) of a room, N = num_points, from three stations."""
     num_stations = 3
     width = 2 * int(np.ceil(np.sqrt(1.15 * num_points / num_stations / 2.0)))
-    points = []
-    colors = []
-    labels = []
+    parts = []
     for station in range(num_stations):
         position = free_position(room, rng, (1.2, 1.8))
         rays = pixel_rays(width).reshape(-1, 3) @ yaw_rotation(rng.uniform(0, 2 * np.pi))
         ranges, rgb, kinds = cast_rays(room, position, rays, workers, f"scan, station {station + 1}")
         ranges = ranges + rng.normal(0.0, RANGE_NOISE, len(ranges))
-        points.append((position + ranges[:, None] * rays).astype(np.float32))
-        colors.append(np.round(rgb * 255.0).astype(np.uint8))
-        labels.append(kinds)
-    is_hit = np.isfinite(np.concatenate(points)).all(axis=1)
+        points = (position + ranges[:, None] * rays).astype(np.float32)
+        parts.append((points, np.round(rgb * 255.0).astype(np.uint8), kinds))
+    points, colors, labels = map(np.concatenate, zip(*parts, strict=True))
+    is_hit = np.isfinite(points).all(axis=1)
     chosen = np.sort(rng.choice(np.flatnonzero(is_hit), num_points, replace=False))
-    return np.concatenate(points)[chosen], np.concatenate(colors)[chosen], np.concatenate(labels)[chosen]
+    return points[chosen], colors[chosen], labels[chosen]
 
 
 def photograph(
@@ -250,8 +246,11 @@ def check_cameras(cameras: Calibration) -> None:
 
 def make_photos(
     world: World, index: int, variant: str, cameras: Calibration, workers: Workers
-) -> tuple[Named, Pose]:
-    """The pictures by these cameras of query number `index` of a variant, and the pose of the whole."""
+) -> tuple[list[tuple[str, NDArray[np.uint8]]], Pose]:
+    """The pictures (H, W, 3) by these cameras of query number `index` of a variant, and their rig's pose.
+
+    Each picture has a file name, "" of one that stands alone.
+    """
     room, pose, rng = pose_of_query(world, index, variant)
     if cameras.is_rig:
         pictures = [(m.image or "", picture_by(m, room, pose, workers)) for m in cameras.mounts]
