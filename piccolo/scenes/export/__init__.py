@@ -6,10 +6,9 @@ from pathlib import Path
 from ...errors import InputError
 from ...files.atomic import check_output, check_output_folder
 from ...result import Result
-from .formats import COLMAP, CSV, KITTI, NERFSTUDIO, OPENSFM, POTREE, TUM
+from .formats import COLMAP, CSV, GEOJSON, GPX, KITTI, NERFSTUDIO, OPENSFM, POTREE, TUM
 from .gpano import GPANO
 from .posed_images import Format, LeftOut, Options, Selection, posed_images, select, true_results
-from .world_maps import GEOJSON, GPX
 
 __all__ = ["FORMATS", "Format", "Options", "Selection", "export", "select", "true_results"]
 

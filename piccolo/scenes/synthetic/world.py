@@ -192,16 +192,6 @@ def scan_world(
     return np.concatenate(points), np.concatenate(colors), np.concatenate(labels)
 
 
-def room_of_query(world: World, index: int, variant: str) -> tuple[Room, np.random.Generator]:
-    """The room as query number `index` of a variant finds it, and what else of the query is drawn from."""
-    rng = np.random.default_rng([world.seed, 20, VARIANTS.index(variant), index])
-    number = int(rng.integers(len(world.rooms)))
-    room = world.rooms[number]
-    if variant == "change":
-        room = make_room(world.seed * SEED_STEP + number, room.size, room.corner, changed=index + 1)
-    return room, rng
-
-
 def make_query(world: World, index: int, variant: str, width: int, workers: Workers) -> Query:
     """Query number `index` of a variant: upright but for `tilt`, in a room drawn at random."""
     check_width(width)
@@ -214,7 +204,11 @@ def pose_of_query(world: World, index: int, variant: str) -> tuple[Room, Pose, n
     """The room, the camera in it, and what else is drawn from, of query number `index` of a variant."""
     if variant not in VARIANTS:
         raise InputError(f"variant: {variant!r} is not one of {', '.join(VARIANTS)}")
-    room, rng = room_of_query(world, index, variant)
+    rng = np.random.default_rng([world.seed, 20, VARIANTS.index(variant), index])
+    number = int(rng.integers(len(world.rooms)))
+    room = world.rooms[number]
+    if variant == "change":
+        room = make_room(world.seed * SEED_STEP + number, room.size, room.corner, changed=index + 1)
     center_world = free_position(room, rng, (1.0, min(1.9, float(room.size[2]) - 0.4)))
     R_cam_from_world = yaw_rotation(rng.uniform(0, 2 * np.pi))
     if variant == "tilt":
@@ -224,7 +218,7 @@ def pose_of_query(world: World, index: int, variant: str) -> tuple[Room, Pose, n
 
 def make_labels(world: World, index: int, query: Query, workers: Workers) -> NDArray[np.uint16]:
     """Image (H, W) of the labels that query number `index` of its variant shows, of pixels' centres."""
-    room, _ = room_of_query(world, index, query.variant)
+    room, _, _ = pose_of_query(world, index, query.variant)
     shape = query.rgb.shape[:2]
     rays = pixel_rays(shape[1]).reshape(-1, 3) @ query.pose.R_cam_from_world
     labels = cast_rays(room, query.pose.center_world, rays, workers, "labels")[2]
