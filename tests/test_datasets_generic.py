@@ -107,12 +107,10 @@ def test_wrong_axes_fail_the_check_with_advice(folder, tmp_path, capsys):
     ("change", "message"),
     [
         ({"qw": 3.0}, "found a quaternion of length"),
-        ({"qw": "nan"}, "found a quaternion of length nan"),
         ({"tx": "inf"}, "not finite"),
         ({"tx": "one"}, "could not convert"),
         ({"tx": ""}, "found no tx"),
         ({"axes": "blender"}, "found the axes blender"),
-        ({"axes": ""}, "found the axes None"),
         ({"direction": "up"}, "found the direction up"),
         ({"room": "../there"}, "wanted a name for a folder"),
         ({"image": "images/none.png"}, "no such panorama"),

@@ -30,8 +30,12 @@ def _check_pixels(found, wanted):
     assert difference.max() < TOLERANCE
 
 
-def nerfstudio_pixels(document, frame, points):
+def nerfstudio_pixels(path, number, points):
     """Pixels by the rays of EQUIRECTANGULAR in nerfstudio/cameras/cameras.py, solved for x and y."""
+    document = json_of(path)
+    assert document["camera_model"] == "EQUIRECTANGULAR"
+    frame = document["frames"][number]
+    assert frame["file_path"] == f"photos/{number}.jpg"
     T = np.array(frame["transform_matrix"])
     d = (points - T[:3, 3]) @ T[:3, :3]
     theta = np.arctan2(-d[:, 0], -d[:, 2])
@@ -41,13 +45,14 @@ def nerfstudio_pixels(document, frame, points):
     return np.stack([x, y], axis=1)
 
 
-def opensfm_pixels(reconstruction, name, points):
+def opensfm_pixels(path, number, points):
     """Pixels by opensfm.org/docs/geometry.html, "Spherical Camera" and "Pixel Coordinates".
 
     u = lon / 2 pi, v = -lat / 2 pi in units of the larger side from the middle; its pixel coordinates begin
     at the centre of the first pixel, ours at its corner.
     """
-    shot = reconstruction["shots"][name]
+    (reconstruction,) = json_of(path)
+    shot = reconstruction["shots"][f"photos/{number}.jpg"]
     camera = reconstruction["cameras"][shot["camera"]]
     assert camera["projection_type"] == "spherical"
     x, y, z = exp_so3(np.array(shot["rotation"])) @ points.T + np.array(shot["translation"])[:, None]
@@ -57,14 +62,18 @@ def opensfm_pixels(reconstruction, name, points):
     return max(w, h) * normalized + [(w - 1) / 2, (h - 1) / 2] + 0.5
 
 
-def potree_pixels(row, points):
+def potree_pixels(path, number, points):
     """Pixels by potree/src/modules/Images360/Images360.js and three.js' SphereGeometry and Euler.
 
     sphere.rotation.set(roll + 90, -pitch, -course + 90, "ZYX") is R_z R_y R_x; a vertex at (u, v) is
     (-cos(2 pi u) sin(pi v), cos(pi v), sin(2 pi u) sin(pi v)) with texture coordinates (u, 1 - v), v from the
     picture's top; texture.repeat.x = -1 mirrors u.
     """
-    x, y, z, course, pitch, roll = map(float, row.split("\t")[2:])
+    first, *rows = lines_of(path)
+    assert first == ""  # skipped as a header by Potree 1.8, as an empty line by later versions
+    name, time, *values = rows[number].split("\t")
+    assert (name, time) == (f"photos/{number}.jpg", str(number))
+    x, y, z, course, pitch, roll = map(float, values)
     R_world_from_sphere = _rotation("z", -course + 90) @ _rotation("y", -pitch) @ _rotation("x", roll + 90)
     d = (points - [x, y, z]) @ R_world_from_sphere
     u = np.arctan2(d[:, 2], -d[:, 0]) / (2.0 * np.pi) % 1.0
@@ -154,16 +163,19 @@ def test_colmap_has_a_camera_a_size_and_refuses_blanks_in_names(tmp_path):
     assert not (tmp_path / "other").exists()
 
 
-def test_nerfstudio_projects_to_our_pixels(tmp_path):
-    export(_results(), "nerfstudio", tmp_path / "transforms.json", SIZED)
-    document = json_of(tmp_path / "transforms.json")
-    assert document["camera_model"] == "EQUIRECTANGULAR"
-    assert [frame["file_path"] for frame in document["frames"]] == [f"photos/{i}.jpg" for i in range(4)]
-    for pose, frame in zip(POSES, document["frames"], strict=True):
+@pytest.mark.parametrize(
+    ("name", "pixels_of", "options"),
+    [
+        ("nerfstudio", nerfstudio_pixels, SIZED),
+        ("opensfm", opensfm_pixels, SIZED),
+        ("potree", potree_pixels, Options()),
+    ],
+)
+def test_readers_project_to_our_pixels(tmp_path, name, pixels_of, options):
+    export(_results(), name, tmp_path / "out", options)
+    for number, pose in enumerate(POSES):
         pixels, points = pixels_and_points(pose)
-        _check_pixels(nerfstudio_pixels(document, frame, points), pixels)
-        back = np.array(frame["transform_matrix"])[:3, 2]
-        np.testing.assert_allclose(back, -pose.R_cam_from_world[0], atol=1e-15)  # -z is the image centre
+        _check_pixels(pixels_of(tmp_path / "out", number, points), pixels)
 
 
 def test_nerfstudio_with_two_sizes_and_an_offset(tmp_path):
@@ -182,16 +194,6 @@ def test_nerfstudio_with_two_sizes_and_an_offset(tmp_path):
         np.testing.assert_allclose(applied @ [*POSES[1].center_world, 1.0], moved, atol=1e-9)
 
 
-def test_opensfm_projects_to_our_pixels(tmp_path):
-    export(_results(), "opensfm", tmp_path / "reconstruction.json", SIZED)
-    (reconstruction,) = json_of(tmp_path / "reconstruction.json")
-    for i, pose in enumerate(POSES):
-        pixels, points = pixels_and_points(pose)
-        _check_pixels(opensfm_pixels(reconstruction, f"photos/{i}.jpg", points), pixels)
-    with pytest.raises(InputError, match="wanted W = 2 H exactly"):
-        export(_results(), "opensfm", tmp_path / "r.json", Options(size=(512, 257)))
-
-
 def test_rotation_vectors_at_all_angles():
     axis = np.array([2.0, -1.0, 2.0]) / 3.0
     for angle in (0.0, 1e-9, 1e-4, 1.0, np.pi - 1e-9, np.pi):
@@ -200,26 +202,15 @@ def test_rotation_vectors_at_all_angles():
         assert np.linalg.norm(log_so3(R)) == pytest.approx(angle, abs=1e-15)
 
 
-def test_potree_projects_to_our_pixels(tmp_path):
-    export(_results(), "potree", tmp_path / "coordinates.txt", Options())
-    first, *rows = lines_of(tmp_path / "coordinates.txt")
-    assert first == ""  # skipped as a header by Potree 1.8, as an empty line by later versions
-    for i, (pose, row) in enumerate(zip(POSES, rows, strict=True)):
-        assert row.split("\t")[:2] == [f"photos/{i}.jpg", str(i)]
-        pixels, points = pixels_and_points(pose)
-        _check_pixels(potree_pixels(row, points), pixels)
-    with pytest.raises(InputError, match="can't read '\"' in a name"):
-        export([result('a".jpg', POSES[0])], "potree", tmp_path / "c.txt", Options())
-
-
 def test_the_offset_is_written_beside_what_has_no_place_for_it(tmp_path):
     offset = (500_000.0, 5_400_000.0, 0.1)
     export(_results(), "opensfm", tmp_path / "r.json", Options(size=SIZE, offset=offset))
     written = np.array(lines_of(tmp_path / "r.json.offset.txt")[1].split(), float)
     np.testing.assert_array_equal(written, offset)
-    (reconstruction,) = json_of(tmp_path / "r.json")
     pixels, points = pixels_and_points(POSES[2])
-    _check_pixels(opensfm_pixels(reconstruction, "photos/2.jpg", points - written), pixels)
+    _check_pixels(opensfm_pixels(tmp_path / "r.json", 2, points - written), pixels)
+    with pytest.raises(InputError, match="wanted W = 2 H exactly"):
+        export(_results(), "opensfm", tmp_path / "wide.json", Options(size=(512, 257)))
     export(_results(), "colmap", tmp_path / "model", Options(size=SIZE, offset=offset))
     assert "position here + 500000.0 5400000.0 0.1" in (tmp_path / "model" / "images.txt").read_text()
     image = pycolmap.Reconstruction(str(tmp_path / "model")).images[1]

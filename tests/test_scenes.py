@@ -15,9 +15,9 @@ from piccolo.scenes.scene import Query, find_scenes, read_scene, write_queries
 POSE = Pose(exp_so3(np.array([0.3, -1.2, 2.0])), np.array([500_123.25, -3.5, 1.125]))
 
 
-def _written(folder, names=("images/a.jpg",), **more):
+def _written(folder, names=("images/a.jpg",)):
     folder.mkdir(parents=True, exist_ok=True)
-    write_queries(folder, [Query(folder / name, "robot", POSE) for name in names], **more)
+    write_queries(folder, [Query(folder / name, "robot", POSE) for name in names])
     return folder
 
 
