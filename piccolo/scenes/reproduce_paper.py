@@ -93,7 +93,6 @@ def _rng(scene: Scene) -> np.random.Generator:
 
 
 Settings = CoarseToFineSettings | PaperSettings
-NO_FIGURE = "-"
 COLUMNS = ("", "preset", "queries", "accuracy", "t 50 % [m]", "t of correct [m]", "R 50 % [deg]")
 
 
@@ -105,7 +104,7 @@ class Condition(NamedTuple):
     transform: SceneTransform = identity
     variants: tuple[str, ...] = ()  # the queries that it is about; empty for all
     use_labels: bool = False
-    paper: str = NO_FIGURE  # what the paper has in this place
+    paper: str = "-"  # what the paper has in this place
 
     @property
     def preset(self) -> str:
@@ -155,7 +154,7 @@ def _variants(presets: Sequence[Settings], variants: Sequence[str]) -> list[Cond
     # Splits may be tilted. The paper's preset needs one of known and unknown; the default tries both.
     tried = [replace(s, gravity="auto") if isinstance(s, CoarseToFineSettings) else s for s in presets]
     return [
-        Condition(variant, settings, variants=(variant,), paper=figures.get(variant, NO_FIGURE))
+        Condition(variant, settings, variants=(variant,), paper=figures.get(variant, "-"))
         for variant in variants
         for settings in tried
     ]

@@ -35,7 +35,6 @@ MIN_SIZE = 2.0  # of a room, each way [m]
 MAX_SIZE = 50.0
 MAX_ROOMS = 256
 SEED_STEP = 64  # between the rooms of two seeds; larger buildings share rooms with the next seed
-MIN_POINTS = 1000  # of a room
 MAX_SIDE = 4096  # [px] of a camera's picture
 
 
@@ -168,23 +167,10 @@ def make_world(seed: int, size: Array, num_rooms: int = 1) -> World:
     return World(seed, tuple(rooms))
 
 
-def check_num_points(world: World, num_points: int) -> None:
-    """Refuse, before any work is done, a scan too sparse to show the rooms."""
-    if num_points < MIN_POINTS * len(world.rooms):
-        raise InputError(f"points: {num_points} are too few, use at least {MIN_POINTS} a room")
-
-
-def check_width(width: int) -> None:
-    """Refuse, before any work is done, a panorama too small or of an odd width [px]."""
-    if width < 128 or width % 2:
-        raise InputError(f"width: {width} is not an even number of at least 128")
-
-
 def scan_world(
     world: World, num_points: int, workers: Workers
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int64]]:
     """Points (num_points, 3) [m], colours (num_points, 3) and labels (num_points,) of all rooms."""
-    check_num_points(world, num_points)
     counts = np.diff(np.linspace(0, num_points, len(world.rooms) + 1).astype(int))
     rng = np.random.default_rng([world.seed, 10])
     parts = [scan_room(room, int(n), rng, workers) for room, n in zip(world.rooms, counts, strict=True)]
@@ -194,7 +180,6 @@ def scan_world(
 
 def make_query(world: World, index: int, variant: str, width: int, workers: Workers) -> Query:
     """Query number `index` of a variant: upright but for `tilt`, in a room drawn at random."""
-    check_width(width)
     room, pose, rng = pose_of_query(world, index, variant)
     rgb = photograph(room, pose, width, workers)
     return Query(other_light(rgb, rng) if variant == "photo" else rgb, pose, variant)
