@@ -17,7 +17,6 @@ LABEL_NAMES = (  # kinds of surfaces; a label is the place in this list, and 0 i
     *("rug", "table", "shelf", "sofa", "crate"),
 )
 Pair = tuple[float, float]
-SATURATION = 0.5  # paints are paler than colours drawn at random
 DOOR_ROOM = 1.2  # left free before an open door [m]
 
 
@@ -36,7 +35,7 @@ class RoomBuilder:
     def paint(self, patterns: tuple[int, ...], low: float, high: float) -> Array:
         """A row of Room.materials: a random pattern in two related colours with channels in [low, high]."""
         base = self.rng.uniform(low, high, 3)
-        base = base.mean() + SATURATION * (base - base.mean())
+        base = base.mean() + 0.5 * (base - base.mean())  # paints are paler than colours drawn at random
         other = np.clip(base * self.rng.uniform(0.55, 0.9) + self.rng.normal(0, 0.05, 3), 0, 1)
         pattern = self.rng.choice(patterns)
         scale = self.rng.uniform(0.12, 0.5)

@@ -23,7 +23,6 @@ DISTANCES = (1.5, 6.0)  # of people before and after the camera [s]
 ASIDE = 0.25  # of people off the way, at most [m]
 LEAST_DISTANCE = 0.8  # of a person from the camera [m]
 MAX_PEOPLE = 20
-NUM_ELSEWHERE = 8  # rooms of another building
 LAMP = np.array([0.0, 0.5, 2.4])  # above a person's feet [m]
 BODY = ((0.4, (0.2, 0.32, 0.8)), (1.12, (0.26, 0.46, 0.64)), (1.6, (0.2, 0.18, 0.26)))  # height, size [m]
 
@@ -69,7 +68,7 @@ def frames_of(
     rng = np.random.default_rng([seed, 54, number])
     kinds = _kinds(len(times), options, rng)
     people = [Person(walk, rng) for _ in range(options.num_people)]
-    elsewhere = make_world(seed + 1_000_003, office.world.rooms[0].size, NUM_ELSEWHERE)
+    elsewhere = make_world(seed + 1_000_003, office.world.rooms[0].size, num_rooms=8)
     for k, (time, kind) in enumerate(zip(times, kinds, strict=True)):
         pose = walk.pose(time)
         if kind == "black":

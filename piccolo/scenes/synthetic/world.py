@@ -28,7 +28,6 @@ TILE = 64  # side [px] of what is cast at once: rays near each other meet few bo
 
 RANGE_NOISE = 0.003  # of the scanner, standard deviation [m]
 MIN_CLEARANCE = 0.35  # of a station or camera [m]
-NUM_TRIES = 2000
 VARIANTS = ("clean", "tilt", "photo", "change")
 GAP = 0.4  # between rooms [m]
 MIN_SIZE = 2.0  # of a room, each way [m]
@@ -43,7 +42,7 @@ def free_position(room: Room, rng: np.random.Generator, heights: tuple[float, fl
 
     Raises InputError if the room is so full that none is found.
     """
-    for _ in range(NUM_TRIES):
+    for _ in range(2000):
         low = np.array([MIN_CLEARANCE, MIN_CLEARANCE, heights[0]])
         high = np.array([*(room.size[:2] - MIN_CLEARANCE), heights[1]])
         position = room.corner + rng.uniform(low, high)
