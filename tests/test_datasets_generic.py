@@ -52,8 +52,7 @@ def rows_of(folder):
 
 
 def test_csv_in_all_axes_and_directions(folder, tmp_path, capsys):
-    rows = [{**row, "variant": "tripod"} for row in rows_of(folder)]
-    write_csv(folder / "poses.csv", rows)
+    write_csv(folder / "poses.csv", [{**row, "variant": "tripod"} for row in rows_of(folder)])
     code, (line,), err = made.run(capsys, "generic", folder, tmp_path / "out", "--check", 6)
     assert (code, err) == (0, "")
     assert (line["scene"], line["queries"], line["fits"]) == ("my photos", 6, True)
@@ -94,8 +93,7 @@ def test_trajectory_with_pictures_named_by_time(folder, tmp_path, capsys):
 
 
 def test_wrong_axes_fail_the_check_with_advice(folder, tmp_path, capsys):
-    rows = [{**row, "axes": "piccolo"} for row in rows_of(folder)[:2]]  # optical in truth
-    write_csv(folder / "poses.csv", rows)
+    write_csv(folder / "poses.csv", [{**row, "axes": "piccolo"} for row in rows_of(folder)[:2]])  # optical
     code, (line,), err = made.run(capsys, "generic", folder, tmp_path / "out", "--check", 2)
     assert (code, line["fits"]) == (1, False)
     assert "if the camera's x, y, z are z, -x, -y" in err

@@ -38,13 +38,13 @@ def needed(name):
 
 @pytest.fixture
 def run(tmp_path, capsys):
-    """Run the tool on MIXED; returns exit code, stdout as JSON and stderr."""
-    write_results(tmp_path / "1.jsonl", MIXED[:3])
-    write_results(tmp_path / "2.jsonl", MIXED[3:])
+    """Run the tool on results; returns exit code, stdout as JSON and stderr."""
 
-    def call(*arguments, results=("1.jsonl", "2.jsonl")):
-        paths = [str(tmp_path / name) for name in results]
-        code = export_poses.main(["--results", *paths, *map(str, arguments)])
+    def call(*arguments, results=MIXED):
+        paths = [write_results(tmp_path / "1.jsonl", results[:3])]
+        if results[3:]:
+            paths.append(write_results(tmp_path / "2.jsonl", results[3:]))
+        code = export_poses.main(["--results", *map(str, [*paths, *arguments])])
         out, err = capsys.readouterr()
         return code, json.loads(out) if out else None, err
 
@@ -76,9 +76,8 @@ def test_every_format_writes_whole_files_and_nothing_else(run, tmp_path, name, m
     Path("p").mkdir()
     for picture in ("a", "e"):
         jpeg(Path("p", f"{picture}.jpg"))
-    before = {path.name for path in tmp_path.iterdir()}
     assert run("--format", name, "--images", "p", "--out", "made", *needed(name))[0] == 0
-    assert {path.name for path in tmp_path.iterdir()} == before | {"made"}
+    assert {path.name for path in tmp_path.iterdir()} == {"p", "1.jsonl", "2.jsonl", "made"}
     assert Path("made").is_dir() == FORMATS[name].is_folder
     files = Path("made").rglob("*") if FORMATS[name].is_folder else [Path("made")]
     content = b"".join(path.read_bytes() for path in files)
@@ -117,21 +116,22 @@ def test_bad_input(run, tmp_path):
         code, document, err = run(*arguments)
         assert (code, document) == (3, None), arguments
         assert message in err
-    code, _, err = run("--format", "csv", "--out", tmp_path / "x", results=("full/x",))
-    assert (code, "found no result, wanted JSON lines" in err) == (3, True)
-    write_results(tmp_path / "none.jsonl", MIXED[3:4])
-    code, _, err = run("--format", "csv", "--out", tmp_path / "x", results=("none.jsonl",))
-    assert (code, "there is no pose to write" in err) == (3, True)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["1.jsonl", "2.jsonl", "full", "none.jsonl"]
+    for results, message in (
+        ([], "found no result, wanted JSON lines"),
+        (MIXED[3:4], "there is no pose to write"),
+    ):
+        code, _, err = run("--format", "csv", "--out", tmp_path / "x", results=results)
+        assert (code, message in err) == (3, True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["1.jsonl", "2.jsonl", "full"]
 
 
 def test_two_results_of_one_picture_are_refused_where_the_name_is_the_key(run, tmp_path):
-    write_results(tmp_path / "3.jsonl", [MIXED[0], replace(MIXED[0], cloud="b.ply")])
+    results = [MIXED[0], replace(MIXED[0], cloud="b.ply")]
     out = tmp_path / "out"
-    code, _, err = run("--format", "opensfm", "--size", "64", "32", "--out", out, results=["3.jsonl"])
+    code, _, err = run("--format", "opensfm", "--size", "64", "32", "--out", out, results=results)
     assert code == 3
     assert "p/a.jpg: has two results (clouds a.ply, b.ply); --cloud chooses one" in err
-    assert run("--format", "csv", "--out", out, results=["3.jsonl"])[1]["poses"] == 2
+    assert run("--format", "csv", "--out", out, results=results)[1]["poses"] == 2
 
 
 STRANGE = {
@@ -148,11 +148,10 @@ STRANGE = {
 @pytest.mark.parametrize("name", [name for name in FORMATS if name != "gpano"])
 def test_a_name_costs_at_most_its_own_picture(run, tmp_path, name):
     results = [result(pano, POSES[0]) for pano in ("p/a.jpg", *STRANGE)]
-    write_results(tmp_path / "s.jsonl", results)
     out = tmp_path / "out"
     if not FORMATS[name].is_folder:
         out.touch()
-    code, document, err = run("--format", name, "--out", out, *needed(name), results=["s.jsonl"])
+    code, document, err = run("--format", name, "--out", out, *needed(name), results=results)
     left_out = [pano for pano, formats in STRANGE.items() if name in formats]
     assert code == bool(left_out)
     assert document["poses"] == len(results) - len(left_out)
@@ -164,8 +163,8 @@ def test_a_name_costs_at_most_its_own_picture(run, tmp_path, name):
 
 def test_names_in_a_table_are_no_formulas_and_come_back(run, tmp_path):
     names = ["=cmd|' !A1.jpg", "+1.jpg", "-1.jpg", "@a.jpg", "'a.jpg", "p/=a.jpg", 'two\nlines, "q".jpg']
-    write_results(tmp_path / "s.jsonl", [result(name, POSES[0], cloud="=b.ply") for name in names])
-    assert run("--format", "csv", "--out", tmp_path / "poses.csv", results=["s.jsonl"])[0] == 0
+    results = [result(name, POSES[0], cloud="=b.ply") for name in names]
+    assert run("--format", "csv", "--out", tmp_path / "poses.csv", results=results)[0] == 0
     with (tmp_path / "poses.csv").open(newline="") as file:
         cells = [row["image"] for row in csv.DictReader(file)]
     assert cells == [*(f"'{name}" for name in names[:5]), *names[5:]]
@@ -178,23 +177,22 @@ def test_a_picture_stored_turned_is_left_out(run, tmp_path):
         exif = Image.Exif()
         exif[0x0112] = orientation
         Image.new("RGB", size).save(tmp_path / "p" / f"{name}.jpg", exif=exif)
-    write_results(tmp_path / "s.jsonl", [result(tmp_path / "p" / f"{n}.jpg", POSES[0]) for n in "abc"])
+    results = [result(tmp_path / "p" / f"{n}.jpg", POSES[0]) for n in "abc"]
     for name in ("nerfstudio", "opensfm", "colmap"):
         words = ["--format", name, "--out", tmp_path / name]
-        code, document, err = run(*words, results=["s.jsonl"])
+        code, document, err = run(*words, results=results)
         assert (code, document["poses"]) == (1, 1)
         assert "b.jpg: found it stored turned (EXIF orientation 6), wanted it upright" in err
         words = ["--format", name, "--out", tmp_path / f"{name}-sized", "--size", "64", "32"]
-        assert run(*words, results=["s.jsonl"])[1]["poses"] == 3
+        assert run(*words, results=results)[1]["poses"] == 3
 
 
 def test_one_png_among_jpegs_is_left_out_of_gpano(run, tmp_path):
     (tmp_path / "p").mkdir()
     jpeg(tmp_path / "p" / "a.jpg")
     Image.new("RGB", SIZE).save(tmp_path / "p" / "b.png")
-    names = ("a.jpg", "b.png", "gone.jpg")
-    write_results(tmp_path / "s.jsonl", [result(tmp_path / "p" / name, POSES[0]) for name in names])
-    code, document, err = run("--format", "gpano", "--out", tmp_path / "out", results=["s.jsonl"])
+    results = [result(tmp_path / "p" / name, POSES[0]) for name in ("a.jpg", "b.png", "gone.jpg")]
+    code, document, err = run("--format", "gpano", "--out", tmp_path / "out", results=results)
     assert (code, document["poses"], len(document["left_out"])) == (1, 1, 2)
     assert "b.png: no JPEG" in err
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.jpg"]
@@ -207,17 +205,14 @@ def test_results_of_another_content_of_the_cloud_are_refused(run, tmp_path):
     sources = [Source(cloud_sha256=digest) for digest in (right, wrong, None)]
     panos = [f"{k}.jpg" for k in range(3)]
     results = [result(p, POSES[0], cloud=str(cloud), source=s) for p, s in zip(panos, sources, strict=True)]
-    write_results(tmp_path / "s.jsonl", results)
     words = ["--format", "csv", "--out", tmp_path / "p.csv", "--cloud", cloud]
-    code, _, err = run(*words, results=["s.jsonl"])
+    code, _, err = run(*words, results=results)
     assert code == 3
     assert f"1.jpg: found 1 of 3 results of another scan than {cloud}, the first of {cloud}" in err
-    code, document, err = run(*words, "--force", results=["s.jsonl"])
+    code, document, err = run(*words, "--force", results=results)
     assert (code, document["poses"]) == (0, 3)
     assert "found 1 of 3 results of another scan" in err
-    assert (
-        "poses in 3 clouds are taken as in one coordinate system" in run(*words[:4], results=["s.jsonl"])[2]
-    )
+    assert "poses in 3 clouds are taken as in one coordinate system" in run(*words[:4], results=results)[2]
 
 
 def test_damaged_results_are_refused_with_file_and_line(tmp_path):
