@@ -92,8 +92,8 @@ def test_trajectory_with_pictures_named_by_time(folder, tmp_path, capsys):
     assert "no such folder, wanted pictures" in made.run(capsys, "generic", folder, tmp_path / "out2")[2]
 
 
-def test_wrong_axes_fail_the_check_with_advice(folder, tmp_path, capsys):
-    write_csv(folder / "poses.csv", [{**row, "axes": "piccolo"} for row in rows_of(folder)[:2]])  # optical
+def test_optical_axes_called_piccolo_fail_the_check_with_advice(folder, tmp_path, capsys):
+    write_csv(folder / "poses.csv", [{**row, "axes": "piccolo"} for row in rows_of(folder)[:2]])
     code, (line,), err = made.run(capsys, "generic", folder, tmp_path / "out", "--check", 2)
     assert (code, line["fits"]) == (1, False)
     assert "if the camera's x, y, z are z, -x, -y" in err

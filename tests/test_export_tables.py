@@ -90,7 +90,8 @@ def test_table_has_every_number_to_the_last_bit(tmp_path):
 )
 def test_heading_is_clockwise_from_y_and_pitch_upwards(direction, angles):
     forward = np.array(direction) / np.linalg.norm(direction)
-    left = np.cross([0.0, 0.0, 1.0], forward) / np.linalg.norm(np.cross([0.0, 0.0, 1.0], forward))
+    left = np.cross([0.0, 0.0, 1.0], forward)
+    left /= np.linalg.norm(left)
     pose = Pose(np.stack([forward, left, np.cross(forward, left)]), np.zeros(3))
     assert heading_pitch_roll_deg(pose) == pytest.approx(angles, abs=1e-9)
 

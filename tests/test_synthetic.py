@@ -25,17 +25,6 @@ from piccolo.scenes.synthetic.world import (
 SMALL = np.array([3.0, 3.0, 2.4])
 
 
-def test_rays_equal_their_twin():
-    this = make_room(5, SMALL, np.zeros(3))
-    rays = np.random.default_rng(0).normal(size=(2000, 3))
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    origin = np.array([1.4, 1.6, 1.7])
-    ranges, rgb, _ = cast_rays(this, origin, rays, Workers(), "")
-    np.testing.assert_allclose(ranges, naive.nearest_box(origin, rays, this.boxes), rtol=1e-9)
-    assert ((rgb >= 0) & (rgb <= 1)).all()
-    assert (rgb.max(axis=1) > 0.02).mean() > 0.99
-
-
 def test_clearance_is_the_distance_to_the_nearest_surface():
     """Negative inside a box, where rays see no surface: a camera was put into a crate because of that."""
     this = make_room(5, SMALL, np.zeros(3))
@@ -58,16 +47,14 @@ def test_room_without_a_free_place_and_an_unknown_variant_are_refused():
 
 
 def test_scan_lies_on_surfaces_inside_the_walls_and_keeps_rooms_apart():
-    world = make_world(3, SMALL)
-    points, *_ = scan_world(world, 2000, Workers(2))
-    distances = [abs(world.rooms[0].clearance(point)) for point in points.astype(float)]
-    assert max(distances) < 5 * RANGE_NOISE
     world = make_world(2, SMALL, num_rooms=2)
-    points, *_ = scan_world(world, 8000, Workers(2))
+    points, *_ = scan_world(world, 4000, Workers(2))
+    distances = [min(abs(room.clearance(point)) for room in world.rooms) for point in points.astype(float)]
+    assert max(distances) < 5 * RANGE_NOISE
     walls = [(r.corner - 0.03, r.corner + r.size + 0.03) for r in world.rooms]
     inside = [((points > low) & (points < high)).all(axis=1) for low, high in walls]
     assert (inside[0] | inside[1]).all()
-    assert inside[0].sum() == inside[1].sum() == 4000
+    assert inside[0].sum() == inside[1].sum() == 2000
 
 
 def test_same_seed_same_bits_at_any_number_of_threads():

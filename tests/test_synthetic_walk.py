@@ -46,10 +46,12 @@ def test_rays_meet_what_is_nearest_among_hundreds_of_boxes():
     for cell in (0, 3, 7, 10):
         origin = office().world.rooms[cell].corner + np.array([1.0, 1.1, 1.9])
         for rays in (around, pixel_rays(128)[20:40, 30:50].reshape(-1, 3)):
-            ranges, _, labels = cast_rays(room, origin, rays, WORKERS, "")
+            ranges, rgb, labels = cast_rays(room, origin, rays, WORKERS, "")
             np.testing.assert_allclose(ranges, naive.nearest_box(origin, rays, room.boxes), rtol=1e-9)
             assert np.isfinite(ranges).all(), "the building is not closed"
             assert (labels > 0).all()
+            assert ((rgb >= 0) & (rgb <= 1)).all()
+            assert (rgb.max(axis=1) > 0.02).mean() > 0.99
 
 
 def test_copies_are_exact_and_others_are_not():
