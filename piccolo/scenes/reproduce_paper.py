@@ -93,7 +93,6 @@ def _rng(scene: Scene) -> np.random.Generator:
 
 
 Settings = CoarseToFineSettings | PaperSettings
-COLUMNS = ("", "preset", "queries", "accuracy", "t 50 % [m]", "t of correct [m]", "R 50 % [deg]")
 
 
 class Condition(NamedTuple):
@@ -225,24 +224,24 @@ EXPERIMENTS = {
 
 def table(title: str, found: Sequence[tuple[Condition, Sequence[QueryResult]]]) -> Table:
     """A line a condition, the paper's figure at its end."""
-    columns = (*COLUMNS, "search s", "refine s", "localized", "wrong of these", "the paper")
-    return Table(title, columns, tuple(_cells(condition, rows) for condition, rows in found), 2)
+    lines = [_cells(condition, rows) for condition, rows in found]
+    return Table(title, tuple(lines[0]), tuple(tuple(line.values()) for line in lines), 2)
 
 
-def _cells(condition: Condition, rows: Sequence[QueryResult]) -> tuple[str, ...]:
+def _cells(condition: Condition, rows: Sequence[QueryResult]) -> dict[str, str]:
     summary = summarize(rows)
     of_correct = [row.position_error for row in rows if row.is_correct()] or [np.nan]
-    stages = [[row.result.seconds.get(stage, 0.0) for row in rows] for stage in ("search", "refine")]
-    return (
-        condition.name,
-        condition.preset,
-        f"{summary.num_queries}",
-        f"{summary.accuracy:.3f}",
-        f"{summary.position_quartiles[1]:.4f}",
-        f"{np.median(of_correct):.4f}",
-        f"{np.degrees(summary.rotation_quartiles[1]):.3f}",
-        *(f"{np.median(stage):.2f}" for stage in stages),
-        f"{summary.num_localized}",
-        f"{summary.num_wrong}",
-        condition.paper,
-    )
+    seconds = {s: [row.result.seconds.get(s, 0.0) for row in rows] for s in ("search", "refine")}
+    return {
+        "": condition.name,
+        "preset": condition.preset,
+        "queries": f"{summary.num_queries}",
+        "accuracy": f"{summary.accuracy:.3f}",
+        "t 50 % [m]": f"{summary.position_quartiles[1]:.4f}",
+        "t of correct [m]": f"{np.median(of_correct):.4f}",
+        "R 50 % [deg]": f"{np.degrees(summary.rotation_quartiles[1]):.3f}",
+        **{f"{stage} s": f"{np.median(values):.2f}" for stage, values in seconds.items()},
+        "localized": f"{summary.num_localized}",
+        "wrong of these": f"{summary.num_wrong}",
+        "the paper": condition.paper,
+    }
