@@ -5,7 +5,6 @@ Nothing here takes a pose or a pixel from the code under test: the rays of a pan
 
 import json
 
-import naive
 import numpy as np
 import rooms
 from pictures import encoded
@@ -117,9 +116,3 @@ def assert_fits(folder, max_loss=0.13):
         assert loss < max_loss
         assert loss < 0.5 * wrong
     return scene
-
-
-def pixels_of(query, points, width):
-    """Row and column of each point at the query's pose, by the twin's own projection."""
-    u, v = naive.project(points, query.pose.R_cam_from_world, query.pose.center_world, width).T
-    return np.minimum(v.astype(int), width // 2 - 1), np.minimum(u.astype(int), width - 1)

@@ -29,6 +29,20 @@ def sample(image, pixels):
     return (1 - fv) * top + fv * bottom
 
 
+def color_differences(points, colors, pose, rgb, num_columns, slack):
+    """How much the colours (M, 3) of the points that an image shows differ from its own.
+
+    Shown are those at most a fraction `slack`, and as many metres, behind the nearest in their cell.
+    """
+    R_cam_from_world, center_world = pose.R_cam_from_world, pose.center_world
+    depth = nearest_depth(points, R_cam_from_world, center_world, num_columns)
+    pixels = project(points, R_cam_from_world, center_world, rgb.shape[1])
+    cells = (pixels * num_columns / rgb.shape[1]).astype(int)
+    u, v = np.minimum(cells, [num_columns - 1, num_columns // 2 - 1]).T
+    is_shown = np.linalg.norm(points - center_world, axis=1) <= depth[v, u] * (1.0 + slack) + slack
+    return np.abs(sample(rgb, pixels[is_shown]) - colors[is_shown])
+
+
 def sampling_loss(points, colors, image, is_valid, R_cam_from_world, center_world):
     """Eq. 2 of the paper; `image` (H, W, 3) and `colors` (N, 3) are 8-bit, the loss is in units of 1."""
     pixels = project(points, R_cam_from_world, center_world, image.shape[1])

@@ -17,7 +17,7 @@ from piccolo.geometry.pose import exp_so3
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.panorama import read_panorama
-from piccolo.scenes.synthetic.world import make_query, photograph, picture_by, picture_of_all, room_of_query
+from piccolo.scenes.synthetic.world import make_query, photograph, picture_by, picture_of_all, pose_of_query
 
 BACK = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
 TILT = tuple(map(tuple, exp_so3(np.array([0.3, -0.2, 2.0])).tolist()))
@@ -35,7 +35,7 @@ def place():
     """A room, a pose in it, and its panorama there."""
     world, workers = room(5)[0], Workers(2)
     pose = make_query(world, 0, "tilt", 128, workers).pose
-    this, _ = room_of_query(world, 0, "tilt")
+    this, _, _ = pose_of_query(world, 0, "tilt")
     return this, pose, photograph(this, pose, 2048, workers)
 
 

@@ -1,6 +1,7 @@
 """Lists of anybody's panoramas: columns, directions, axes, and what is refused."""
 
 import json
+from pathlib import Path
 
 import dataset_rooms as made
 import numpy as np
@@ -19,7 +20,7 @@ def entry(image, camera, direction, axes):
     R_world_from_cam, center = camera
     R, t = R_world_from_cam, center
     if direction == "cam_from_world":
-        R, t = R_world_from_cam.T, -R_world_from_cam.T @ center
+        R, t = R.T, -R.T @ center
     x, y, z, w = Rotation.from_matrix(R).as_quat()
     numbers = dict(zip(COLUMNS[1:8], [*t, w, x, y, z], strict=True))
     return {"image": image, **numbers, "direction": direction, "axes": axes}
@@ -51,8 +52,7 @@ def rows_of(folder):
 
 
 def test_csv_in_all_axes_and_directions(folder, tmp_path, capsys):
-    rows = [{**row, "variant": "tripod"} for row in rows_of(folder)]
-    write_csv(folder / "poses.csv", rows)
+    write_csv(folder / "poses.csv", [{**row, "variant": "tripod"} for row in rows_of(folder)])
     code, (line,), err = made.run(capsys, "generic", folder, tmp_path / "out", "--check", 6)
     assert (code, err) == (0, "")
     assert (line["scene"], line["queries"], line["fits"]) == ("my photos", 6, True)
@@ -64,6 +64,9 @@ def test_json_with_rooms_and_clouds(folder, tmp_path, capsys):
     (folder / "clouds").mkdir()
     (folder / "scan.xyz").rename(folder / "clouds" / "a.xyz")
     rows = rows_of(folder)
+    (folder / "more").mkdir()  # with a picture of a name that another has
+    (folder / rows[3]["image"]).rename(folder / "more" / Path(rows[1]["image"]).name)
+    rows[3]["image"] = f"more/{Path(rows[1]['image']).name}"
     for k, row in enumerate(rows):
         row |= {"room": f"room {k % 2}", "cloud": "clouds/a.xyz", "variant": None}
     (folder / "poses.json").write_text(json.dumps(rows))
@@ -89,9 +92,8 @@ def test_trajectory_with_pictures_named_by_time(folder, tmp_path, capsys):
     assert "no such folder, wanted pictures" in made.run(capsys, "generic", folder, tmp_path / "out2")[2]
 
 
-def test_wrong_axes_fail_the_check_with_advice(folder, tmp_path, capsys):
-    rows = [{**row, "axes": "piccolo"} for row in rows_of(folder)[:2]]  # optical in truth
-    write_csv(folder / "poses.csv", rows)
+def test_optical_axes_called_piccolo_fail_the_check_with_advice(folder, tmp_path, capsys):
+    write_csv(folder / "poses.csv", [{**row, "axes": "piccolo"} for row in rows_of(folder)[:2]])
     code, (line,), err = made.run(capsys, "generic", folder, tmp_path / "out", "--check", 2)
     assert (code, line["fits"]) == (1, False)
     assert "if the camera's x, y, z are z, -x, -y" in err
@@ -99,26 +101,14 @@ def test_wrong_axes_fail_the_check_with_advice(folder, tmp_path, capsys):
     assert (code, line["status"]) == (1, "there already")
 
 
-def test_pictures_of_one_name_are_told_apart(folder, tmp_path, capsys):
-    (folder / "more").mkdir()
-    rows = rows_of(folder)[:2]
-    (folder / rows[1]["image"]).rename(folder / "more" / "100.5.png")
-    rows[1]["image"] = "more/100.5.png"
-    write_csv(folder / "poses.csv", rows)
-    assert made.run(capsys, "generic", folder, tmp_path / "out")[0] == 0
-    made.assert_fits(tmp_path / "out" / "my photos")
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"qw": 3.0}, "found a quaternion of length"),
-        ({"qw": "nan"}, "found a quaternion of length nan"),
         ({"tx": "inf"}, "not finite"),
         ({"tx": "one"}, "could not convert"),
         ({"tx": ""}, "found no tx"),
         ({"axes": "blender"}, "found the axes blender"),
-        ({"axes": ""}, "found the axes None"),
         ({"direction": "up"}, "found the direction up"),
         ({"room": "../there"}, "wanted a name for a folder"),
         ({"image": "images/none.png"}, "no such panorama"),
@@ -142,14 +132,13 @@ def test_refused_lists_and_clouds(folder, tmp_path, capsys):
     assert "found the clouds scan.xyz, second.xyz" in made.run(capsys, "generic", folder, out)[2]
     code, (line,), _ = made.run(capsys, "generic", folder, out, "--cloud", folder / "scan.xyz")
     assert (code, line["queries"]) == (0, 6)
-    (folder / "poses.csv").write_bytes(b"\xff\xfe")
-    assert "bytes that are no text" in made.run(capsys, "generic", folder, out)[2]
-    (folder / "poses.csv").write_text("image,tx\n")
-    assert "found no row with a picture" in made.run(capsys, "generic", folder, out)[2]
-    assert "cannot be read" in made.run(capsys, "generic", folder, out, "--poses", folder / "no.csv")[2]
-    no_list = folder / "list.json"
-    no_list.write_text("{}")
-    assert "found no list of objects" in made.run(capsys, "generic", folder, out, "--poses", no_list)[2]
+    for name, content, message in (
+        ("a.csv", b"\xff\xfe", "bytes that are no text"),
+        ("b.csv", b"image,tx\n", "found no row with a picture"),
+        ("c.json", b"{}", "found no list of objects"),
+    ):
+        (folder / name).write_bytes(content)
+        made.assert_refused(message, capsys, "generic", folder, out, "--poses", folder / name)
 
 
 def test_files_elsewhere_are_read_only_where_an_option_names_them(folder, tmp_path, capsys):
@@ -177,7 +166,6 @@ def test_a_table_of_exported_poses_comes_back(folder, tmp_path, capsys):
     code, _, err = made.run(capsys, "generic", folder, tmp_path / "second", "--poses", table)
     assert (code, err) == (0, "")
     second = made.assert_fits(tmp_path / "second" / "my photos").queries
-    pairs = zip(read_scene(first).queries, second, strict=True)
-    for one, other in pairs:
+    for one, other in zip(read_scene(first).queries, second, strict=True):
         np.testing.assert_allclose(other.pose.R_cam_from_world, one.pose.R_cam_from_world, atol=1e-14)
         assert np.array_equal(other.pose.center_world, one.pose.center_world)

@@ -3,7 +3,7 @@
 import numpy as np
 import pycolmap
 import pytest
-from poses import CENTER, SIZE, WIDTH, jpeg, json_of, lines_of, pixels_and_points, result, tilted_poses
+from poses import SIZE, WIDTH, jpeg, json_of, lines_of, pixels_and_points, result, tilted_poses
 
 from piccolo.camera import Camera, Mount
 from piccolo.camera.model import pinhole
@@ -30,12 +30,12 @@ def _check_pixels(found, wanted):
     assert difference.max() < TOLERANCE
 
 
-def nerfstudio_pixels(document, frame, points):
-    """Pixels by the rays of EQUIRECTANGULAR in nerfstudio/cameras/cameras.py, solved for x and y.
-
-    theta = -pi (x - cx) / fx, phi = pi (0.5 - coord_y) with coord_y = -(y - cy) / fy;
-    direction = (-sin(theta) sin(phi), cos(phi), -cos(theta) sin(phi)), turned by camera_to_world.
-    """
+def nerfstudio_pixels(path, number, points):
+    """Pixels by the rays of EQUIRECTANGULAR in nerfstudio/cameras/cameras.py, solved for x and y."""
+    document = json_of(path)
+    assert document["camera_model"] == "EQUIRECTANGULAR"
+    frame = document["frames"][number]
+    assert frame["file_path"] == f"photos/{number}.jpg"
     T = np.array(frame["transform_matrix"])
     d = (points - T[:3, 3]) @ T[:3, :3]
     theta = np.arctan2(-d[:, 0], -d[:, 2])
@@ -45,13 +45,14 @@ def nerfstudio_pixels(document, frame, points):
     return np.stack([x, y], axis=1)
 
 
-def opensfm_pixels(reconstruction, name, points):
+def opensfm_pixels(path, number, points):
     """Pixels by opensfm.org/docs/geometry.html, "Spherical Camera" and "Pixel Coordinates".
 
     u = lon / 2 pi, v = -lat / 2 pi in units of the larger side from the middle; its pixel coordinates begin
     at the centre of the first pixel, ours at its corner.
     """
-    shot = reconstruction["shots"][name]
+    (reconstruction,) = json_of(path)
+    shot = reconstruction["shots"][f"photos/{number}.jpg"]
     camera = reconstruction["cameras"][shot["camera"]]
     assert camera["projection_type"] == "spherical"
     x, y, z = exp_so3(np.array(shot["rotation"])) @ points.T + np.array(shot["translation"])[:, None]
@@ -61,14 +62,18 @@ def opensfm_pixels(reconstruction, name, points):
     return max(w, h) * normalized + [(w - 1) / 2, (h - 1) / 2] + 0.5
 
 
-def potree_pixels(row, points):
+def potree_pixels(path, number, points):
     """Pixels by potree/src/modules/Images360/Images360.js and three.js' SphereGeometry and Euler.
 
     sphere.rotation.set(roll + 90, -pitch, -course + 90, "ZYX") is R_z R_y R_x; a vertex at (u, v) is
     (-cos(2 pi u) sin(pi v), cos(pi v), sin(2 pi u) sin(pi v)) with texture coordinates (u, 1 - v), v from the
     picture's top; texture.repeat.x = -1 mirrors u.
     """
-    x, y, z, course, pitch, roll = map(float, row.split("\t")[2:])
+    first, *rows = lines_of(path)
+    assert first == ""  # skipped as a header by Potree 1.8, as an empty line by later versions
+    name, time, *values = rows[number].split("\t")
+    assert (name, time) == (f"photos/{number}.jpg", str(number))
+    x, y, z, course, pitch, roll = map(float, values)
     R_world_from_sphere = _rotation("z", -course + 90) @ _rotation("y", -pitch) @ _rotation("x", roll + 90)
     d = (points - [x, y, z]) @ R_world_from_sphere
     u = np.arctan2(d[:, 2], -d[:, 0]) / (2.0 * np.pi) % 1.0
@@ -126,19 +131,18 @@ def test_colmap_has_the_camera_of_a_photo_and_of_each_picture_of_a_rig(tmp_path)
         assert np.abs(found - pixels).max() < TOLERANCE
 
 
-@pytest.mark.parametrize("name", ["nerfstudio", "opensfm", "potree", "gpano"])
-def test_photos_are_refused_by_formats_of_spheres(tmp_path, name):
-    photo = result(tmp_path / "a.jpg", POSES[0], cameras=(Mount(CAMERA),))
-    with pytest.raises(InputError, match=r"a.jpg: found a photo by the model OPENCV, wanted a sphere for"):
+@pytest.mark.parametrize("name", ["nerfstudio", "opensfm", "potree", "gpano", "colmap"])
+def test_photos_are_refused_by_formats_of_spheres_and_two_in_a_picture_by_colmap(tmp_path, name):
+    cameras = [Mount(CAMERA), Mount(CAMERA, TILTED, offset=(640, 0))]
+    message = "found 2 cameras in one picture, wanted one for colmap"
+    if name != "colmap":
+        cameras.pop()
+        message = "a.jpg: found a photo by the model OPENCV, wanted a sphere for"
+    photo = result(tmp_path / "a.jpg", POSES[0], cameras=tuple(cameras))
+    with pytest.raises(InputError, match=message):
         export([photo], name, tmp_path / "out", Options())
     export([photo], "csv", tmp_path / "poses.csv", Options())
     assert len(lines_of(tmp_path / "poses.csv")) == 2
-
-
-def test_two_cameras_in_one_picture_are_refused_by_colmap(tmp_path):
-    two = (Mount(CAMERA), Mount(CAMERA, TILTED, offset=(640, 0)))
-    with pytest.raises(InputError, match="found 2 cameras in one picture, wanted one for colmap"):
-        export([result(tmp_path / "a.jpg", POSES[0], cameras=two)], "colmap", tmp_path / "out", Options())
 
 
 def test_colmap_has_a_camera_a_size_and_refuses_blanks_in_names(tmp_path):
@@ -146,8 +150,6 @@ def test_colmap_has_a_camera_a_size_and_refuses_blanks_in_names(tmp_path):
     jpeg(tmp_path / "b.jpg", (256, 128))
     results = [result(tmp_path / name, POSES[0]) for name in ("a.jpg", "b.jpg")]
     export(results, "colmap", tmp_path / "model", Options(images=tmp_path))
-    cameras = [line.split() for line in lines_of(tmp_path / "model" / "cameras.txt")[1:]]
-    assert [words[2:] for words in cameras] == [["512", "256"] * 2, ["256", "128"] * 2]
     model = pycolmap.Reconstruction(str(tmp_path / "model"))
     assert {image.name: image.camera.width for image in model.images.values()} == {"a.jpg": 512, "b.jpg": 256}
     # macOS has \u202f in names: COLMAP reads over it, but readers in Python end the name there
@@ -161,16 +163,19 @@ def test_colmap_has_a_camera_a_size_and_refuses_blanks_in_names(tmp_path):
     assert not (tmp_path / "other").exists()
 
 
-def test_nerfstudio_projects_to_our_pixels(tmp_path):
-    export(_results(), "nerfstudio", tmp_path / "transforms.json", SIZED)
-    document = json_of(tmp_path / "transforms.json")
-    assert document["camera_model"] == "EQUIRECTANGULAR"
-    assert [frame["file_path"] for frame in document["frames"]] == [f"photos/{i}.jpg" for i in range(4)]
-    for pose, frame in zip(POSES, document["frames"], strict=True):
+@pytest.mark.parametrize(
+    ("name", "pixels_of", "options"),
+    [
+        ("nerfstudio", nerfstudio_pixels, SIZED),
+        ("opensfm", opensfm_pixels, SIZED),
+        ("potree", potree_pixels, Options()),
+    ],
+)
+def test_readers_project_to_our_pixels(tmp_path, name, pixels_of, options):
+    export(_results(), name, tmp_path / "out", options)
+    for number, pose in enumerate(POSES):
         pixels, points = pixels_and_points(pose)
-        _check_pixels(nerfstudio_pixels(document, frame, points), pixels)
-        back = np.array(frame["transform_matrix"])[:3, 2]
-        np.testing.assert_allclose(back, -pose.R_cam_from_world[0], atol=1e-15)  # -z is the image centre
+        _check_pixels(pixels_of(tmp_path / "out", number, points), pixels)
 
 
 def test_nerfstudio_with_two_sizes_and_an_offset(tmp_path):
@@ -189,16 +194,6 @@ def test_nerfstudio_with_two_sizes_and_an_offset(tmp_path):
         np.testing.assert_allclose(applied @ [*POSES[1].center_world, 1.0], moved, atol=1e-9)
 
 
-def test_opensfm_projects_to_our_pixels(tmp_path):
-    export(_results(), "opensfm", tmp_path / "reconstruction.json", SIZED)
-    (reconstruction,) = json_of(tmp_path / "reconstruction.json")
-    for i, pose in enumerate(POSES):
-        pixels, points = pixels_and_points(pose)
-        _check_pixels(opensfm_pixels(reconstruction, f"photos/{i}.jpg", points), pixels)
-    with pytest.raises(InputError, match="wanted W = 2 H exactly"):
-        export(_results(), "opensfm", tmp_path / "r.json", Options(size=(512, 257)))
-
-
 def test_rotation_vectors_at_all_angles():
     axis = np.array([2.0, -1.0, 2.0]) / 3.0
     for angle in (0.0, 1e-9, 1e-4, 1.0, np.pi - 1e-9, np.pi):
@@ -207,31 +202,16 @@ def test_rotation_vectors_at_all_angles():
         assert np.linalg.norm(log_so3(R)) == pytest.approx(angle, abs=1e-15)
 
 
-def test_potree_projects_to_our_pixels(tmp_path):
-    export(_results(), "potree", tmp_path / "coordinates.txt", Options())
-    first, *rows = lines_of(tmp_path / "coordinates.txt")
-    assert first == ""  # skipped as a header by Potree 1.8, as an empty line by later versions
-    for i, (pose, row) in enumerate(zip(POSES, rows, strict=True)):
-        assert row.split("\t")[:2] == [f"photos/{i}.jpg", str(i)]
-        pixels, points = pixels_and_points(pose)
-        _check_pixels(potree_pixels(row, points), pixels)
-    with pytest.raises(InputError, match="can't read '\"' in a name"):
-        export([result('a".jpg', POSES[0])], "potree", tmp_path / "c.txt", Options())
-
-
 def test_the_offset_is_written_beside_what_has_no_place_for_it(tmp_path):
     offset = (500_000.0, 5_400_000.0, 0.1)
     export(_results(), "opensfm", tmp_path / "r.json", Options(size=SIZE, offset=offset))
     written = np.array(lines_of(tmp_path / "r.json.offset.txt")[1].split(), float)
     np.testing.assert_array_equal(written, offset)
-    (reconstruction,) = json_of(tmp_path / "r.json")
-    for i, pose in enumerate(POSES):
-        pixels, points = pixels_and_points(pose)
-        _check_pixels(opensfm_pixels(reconstruction, f"photos/{i}.jpg", points - written), pixels)
+    pixels, points = pixels_and_points(POSES[2])
+    _check_pixels(opensfm_pixels(tmp_path / "r.json", 2, points - written), pixels)
+    with pytest.raises(InputError, match="wanted W = 2 H exactly"):
+        export(_results(), "opensfm", tmp_path / "wide.json", Options(size=(512, 257)))
     export(_results(), "colmap", tmp_path / "model", Options(size=SIZE, offset=offset))
-    assert "# world position = position here + 500000.0 5400000.0 0.1" in lines_of(
-        tmp_path / "model/images.txt"
-    )
+    assert "position here + 500000.0 5400000.0 0.1" in (tmp_path / "model" / "images.txt").read_text()
     image = pycolmap.Reconstruction(str(tmp_path / "model")).images[1]
     np.testing.assert_allclose(image.projection_center(), POSES[0].center_world - offset, atol=1e-9)
-    assert np.linalg.norm(image.projection_center()) < 0.01 * np.linalg.norm(CENTER)

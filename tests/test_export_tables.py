@@ -86,16 +86,12 @@ def test_table_has_every_number_to_the_last_bit(tmp_path):
 
 @pytest.mark.parametrize(
     ("direction", "angles"),
-    [
-        ((0, 1, 0), (0, 0, 0)),
-        ((1, 0, 0), (90, 0, 0)),
-        ((-1, 0, 1), (270, 45, 0)),
-        ((0, -1, -1), (180, -45, 0)),
-    ],
+    [((0, 1, 0), (0, 0, 0)), ((-1, 0, 1), (270, 45, 0)), ((0, -1, -1), (180, -45, 0))],
 )
 def test_heading_is_clockwise_from_y_and_pitch_upwards(direction, angles):
     forward = np.array(direction) / np.linalg.norm(direction)
-    left = np.cross([0.0, 0.0, 1.0], forward) / np.linalg.norm(np.cross([0.0, 0.0, 1.0], forward))
+    left = np.cross([0.0, 0.0, 1.0], forward)
+    left /= np.linalg.norm(left)
     pose = Pose(np.stack([forward, left, np.cross(forward, left)]), np.zeros(3))
     assert heading_pitch_roll_deg(pose) == pytest.approx(angles, abs=1e-9)
 
@@ -123,14 +119,11 @@ def test_angles_give_the_pose_back_at_the_zenith_too(pitch):
 
 def test_geojson_is_in_wgs84(tmp_path):
     # Zone 32 has its meridian at 9 degrees east, where x is 500,000 and grid north is true north.
-    on_meridian = Pose(rotation(75.0, 10.0, -5.0).T, np.array([500_000.0, 5_538_630.7026, 80.5]))
-    east_of_it = Pose(rotation(75.0, 10.0, -5.0).T, np.array([700_000.0, 5_538_630.7026, 80.5]))
-    results = [result("a.jpg", on_meridian), result("b.jpg", east_of_it)]
+    R_cam_from_world = rotation(75.0, 10.0, -5.0).T
+    places = [np.array([x, 5_538_630.7026, 80.5]) for x in (500_000.0, 700_000.0)]
+    results = [result("a.jpg", Pose(R_cam_from_world, place)) for place in places]
     export(results, "geojson", tmp_path / "p.geojson", Options(crs="EPSG:32632"))
-    document = json_of(tmp_path / "p.geojson")
-    assert document["type"] == "FeatureCollection"
-    first, second = document["features"]
-    assert first["geometry"]["type"] == "Point"
+    first, second = json_of(tmp_path / "p.geojson")["features"]
     np.testing.assert_allclose(first["geometry"]["coordinates"], [9.0, 50.0], atol=1e-8)
     assert first["properties"]["heading_deg"] == pytest.approx(75.0)
     assert first["properties"]["heading_true_deg"] == pytest.approx(75.0, abs=1e-3)
@@ -142,19 +135,15 @@ def test_geojson_is_in_wgs84(tmp_path):
     assert second["properties"]["heading_true_deg"] == pytest.approx(75.0 + convergence, abs=0.01)
 
 
-def _frame(number, time, gap=None):
-    """What a walk says of a frame."""
-    return WalkFrame(time, number, "tracked", None, gap)
-
-
 def test_gpx_is_a_track_with_a_segment_behind_each_gap(tmp_path):
-    places = [np.array([500_000.0 + 10.0 * k, 5_538_630.7026, 80.5]) for k in range(4)]
-    results = [
-        result(f"{k}.jpg", Pose(EYE, place), walk=_frame(k, 0.5 * k, Gap(30.0, 1.0) if k == 2 else None))
-        for k, place in enumerate(places)
-    ]
-    taken = replace(results[0], source=Source(capture_time="2026-11-22T10:00:00+01:00"))
-    export([taken, *results[1:]], "gpx", tmp_path / "p.gpx", Options(crs="EPSG:32632"))
+    sources = [Source(capture_time="2026-11-22T10:00:00+01:00"), Source(), Source(), Source()]
+    gaps = [None, None, Gap(30.0, 1.0), None]
+    results = []
+    for k, (source, gap) in enumerate(zip(sources, gaps, strict=True)):
+        pose = Pose(EYE, np.array([500_000.0 + 10.0 * k, 5_538_630.7026, 80.5]))
+        frame = WalkFrame(0.5 * k, k, "tracked", None, gap)
+        results.append(result(f"{k}.jpg", pose, source=source, walk=frame))
+    export(results, "gpx", tmp_path / "p.gpx", Options(crs="EPSG:32632"))
     root = ElementTree.parse(tmp_path / "p.gpx").getroot()
     names = {"g": "http://www.topografix.com/GPX/1/1"}
     segments = root.findall("g:trk/g:trkseg", names)
@@ -167,10 +156,10 @@ def test_gpx_is_a_track_with_a_segment_behind_each_gap(tmp_path):
 
 
 def test_tum_has_the_times_of_a_walk(tmp_path):
-    walked = [replace(r, walk=_frame(k, 0.25 * k)) for k, r in enumerate(_results())]
+    frames = [WalkFrame(0.25 * k, k, "tracked", None, None) for k in range(4)]
+    walked = [replace(r, walk=frame) for r, frame in zip(_results(), frames, strict=True)]
     export(walked, "tum", tmp_path / "p.tum", Options(timestamps="walk"))
-    poses = [line.split() for line in lines_of(tmp_path / "p.tum") if not line.startswith("#")]
-    assert [float(pose[0]) for pose in poses] == [0.0, 0.25, 0.5, 0.75]
+    assert np.loadtxt(tmp_path / "p.tum")[:, 0].tolist() == [0.0, 0.25, 0.5, 0.75]
     with pytest.raises(InputError, match=r"^a\.jpg: found no frame of a walk, as --timestamps walk needs$"):
         export(_results(), "tum", tmp_path / "q.tum", Options(timestamps="walk"))
 
@@ -185,8 +174,6 @@ def test_tum_has_the_times_of_a_walk(tmp_path):
         ("EPSG:32632", (3.5, -2.0, 1.0), r"a\.jpg: found a camera at \(3\.5, -2\), .* 6 to 12 E, 0 to 84 N"),
         ("EPSG:25832+5783", (3.5, 2.0, 1.0), "wanted one where EPSG:25832"),
         ("EPSG:25832", (690_000.0, 3_500_000.0, 0), "6 to 12.01 E, 36.53 to 84.01 N"),  # 31.6 N
-        ("EPSG:25832", (1_100_000.0, 5_600_000.0, 0), "wanted one where EPSG:25832"),  # 17.5 E
-        ("EPSG:2193", (1_500_000.0, 900_000.0, 0), "wanted one where EPSG:2193"),
     ],
 )
 def test_geojson_refuses_systems_and_places_that_do_not_fit(tmp_path, crs, center, message):
@@ -201,7 +188,6 @@ def test_geojson_refuses_systems_and_places_that_do_not_fit(tmp_path, crs, cente
     [
         ("EPSG:25832", 915_000.0, 5_680_000.0),  # in Saxony, which is in the next zone
         ("EPSG:3832", 3_400_000.0, -1_900_000.0),  # about the Pacific, across 180 E
-        ("EPSG:3857", 0.0, 0.0),
         ("+proj=utm +zone=32 +datum=WGS84", 0.0, 0.0),  # says no area
     ],
 )

@@ -26,7 +26,7 @@ from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import ReadOptions, read_panorama
 from piccolo.result import Result, read_results
 from piccolo.scan import Scan
-from piccolo.scenes.synthetic.world import make_query, photograph, picture_by, picture_of_all, room_of_query
+from piccolo.scenes.synthetic.world import make_query, photograph, picture_by, picture_of_all, pose_of_query
 
 BACK = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
 FISHEYE = Camera("OPENCV_FISHEYE", 512, 512, (150.0, 150.0, 256.0, 256.0, 0.01, -0.003, 0.0, 0.0), 95.0)
@@ -43,7 +43,7 @@ def scan():
 def place(index=0):
     """The room as a query finds it, and the query's pose in the world."""
     world = room(SEED)[0]
-    this, _ = room_of_query(world, index, "clean")
+    this, _, _ = pose_of_query(world, index, "clean")
     return this, make_query(world, index, "clean", 128, Workers(2)).pose
 
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from piccolo.cli import make_room as tool
-from piccolo.errors import InputError
 from piccolo.geometry.pose import rotation_from_quaternion_wxyz
 from piccolo.geometry.rotations import OPTICAL_FROM_CAM
 from piccolo.scenes.scene import read_scene
@@ -67,6 +66,11 @@ def test_a_building_without_a_walk_has_single_panoramas(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        ("--points 10", "points: 10 are too few, use at least 1000 a room"),
+        ("--width 127", "width: 127 is not an even number of at least 128"),
+        ("--size nan 3 2.4", "size: [nan, 3.0, 2.4] is not between 2.0 and 50.0 m each way"),
+        ("--rooms 257", "rooms: 257 is not between 1 and 256"),
+        ("--seed -1", "--seed: found -1, wanted at least 0"),
         ("--twins 0.5", "--twins: goes with --storeys or --walk"),
         ("--storeys 2 --variants change", "--variants: found change, which a building has not"),
         ("--people 2", "--people: goes with --walk"),
@@ -80,38 +84,13 @@ def test_a_building_without_a_walk_has_single_panoramas(tmp_path, capsys):
         ("--walk 5 --twins 1", "twins: found 1.0, wanted at least 0 and less than 1"),
         ("--storeys 5", "storeys: found 5, wanted 1 to 4"),
         ("--storeys 3", "rooms: found 2, wanted one a storey to 256"),
-        (
-            "--storeys 1 --size 2.5 4 3",
-            "size: found [2.5, 4.0, 3.0], wanted [2.6, 2.6, 2.3] to 50.0 m in a building",
-        ),
-        (
-            "--storeys 2 --size 4 4 9",
-            "size: rooms of [4.0, 4.0, 9.0] m are too high for stairs in the halls between them",
-        ),
+        ("--storeys 1 --size 2.5 4 3", "size: found [2.5, 4.0, 3.0], wanted [2.6, 2.6, 2.3] to 50.0 m"),
+        ("--storeys 2 --size 4 4 9", "size: rooms of [4.0, 4.0, 9.0] m are too high for stairs"),
     ],
 )
 def test_command_line_refuses_in_one_line_before_anything_is_written(words, message, tmp_path, capsys):
     assert written(tmp_path / "r", words) == 2
-    assert capsys.readouterr() == ("", f"make_room.py: {message}\n")
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert err.startswith(f"make_room.py: {message}")
     assert not (tmp_path / "r").exists()
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "message"),
-    [
-        ("walk", None, "a walk without a time"),
-        ("walk", 3, "a walk that is no plain text"),
-        ("time", "soon", "a time that is no finite number"),
-        ("time", True, "a time that is no finite number"),
-        ("answerable", 1, "an answerable that is not true or false"),
-    ],
-)
-def test_damaged_frames_in_a_scene_are_refused(field, value, message, tmp_path):
-    pose = {"R_cam_from_world": np.eye(3).tolist(), "center_world": [0, 0, 0]}
-    entry = {"image": "a.jpg", "variant": "clean", **pose, "walk": "w", "time": 1.5, "answerable": True}
-    (tmp_path / "queries.json").write_text(json.dumps({"queries": [entry]}))
-    (query,) = read_scene(tmp_path).queries
-    assert (query.walk, query.time, query.is_answerable) == ("w", 1.5, True)
-    (tmp_path / "queries.json").write_text(json.dumps({"queries": [entry | {field: value}]}))
-    with pytest.raises(InputError, match=message):
-        read_scene(tmp_path)

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -18,14 +19,7 @@ from piccolo.panorama import read_panorama
 from piccolo.panorama.texels import pack_texels
 from piccolo.paper.settings import PaperSettings
 from piccolo.scenes.evaluation.runs import read_run
-from piccolo.scenes.reproduce_paper import (
-    EXPERIMENTS,
-    flipped,
-    identity,
-    with_count,
-    with_fraction,
-    with_random_rotation,
-)
+from piccolo.scenes.reproduce_paper import EXPERIMENTS, flipped, identity, thin, with_random_rotation
 from piccolo.scenes.scene import Query, read_scene, write_queries
 from piccolo.views.zbuffer import visible_points
 
@@ -54,7 +48,8 @@ def _loss(scene, number):
 
 
 @pytest.mark.parametrize(
-    "transform", [identity, with_random_rotation, flipped, with_fraction(0.5), with_count(9000)]
+    "transform",
+    [identity, with_random_rotation, flipped, partial(thin, fraction=0.5), partial(thin, num_points=9000)],
 )
 @pytest.mark.parametrize("number", [0, 1])
 def test_a_transformed_scene_fits_its_true_poses(rooms, tmp_path, transform, number):
@@ -83,7 +78,7 @@ def test_what_a_transform_leaves_alone(rooms, tmp_path):
     assert [changed.name_of(q) for q in changed.queries] == [scene.name_of(q) for q in scene.queries]
     up_in_camera = changed.queries[0].pose.R_cam_from_world @ [0.0, 0.0, 1.0]
     np.testing.assert_allclose(up_in_camera, [0.0, 0.0, -1.0], atol=1e-12)
-    assert len(read_cloud(with_fraction(0.1)(scene, folders[3]).cloud).points) == 4000
+    assert len(read_cloud(thin(scene, folders[3], 0.1).cloud).points) == 4000
 
 
 def test_pictures_beside_the_scene_and_masked_ones_are_flipped_too(rooms, tmp_path):

@@ -3,13 +3,14 @@ import json
 import naive
 import numpy as np
 import pytest
-from rooms import WIDTH, query, room
+from rooms import query, room
 
 from piccolo.cli import make_room as tool
 from piccolo.cloud import read_cloud
 from piccolo.errors import InputError
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
+from piccolo.scenes.scene import read_scene
 from piccolo.scenes.synthetic.raycast import cast_rays
 from piccolo.scenes.synthetic.room import make_room
 from piccolo.scenes.synthetic.world import (
@@ -22,18 +23,6 @@ from piccolo.scenes.synthetic.world import (
 )
 
 SMALL = np.array([3.0, 3.0, 2.4])
-
-
-def test_rays_equal_their_twin():
-    this = make_room(5, SMALL, np.zeros(3))
-    rng = np.random.default_rng(0)
-    rays = rng.normal(size=(2000, 3))
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    origin = np.array([1.4, 1.6, 1.7])
-    ranges, rgb, _ = cast_rays(this, origin, rays, Workers(), "")
-    np.testing.assert_allclose(ranges, naive.nearest_box(origin, rays, this.boxes), rtol=1e-9)
-    assert ((rgb >= 0) & (rgb <= 1)).all()
-    assert (rgb.max(axis=1) > 0.02).mean() > 0.99
 
 
 def test_clearance_is_the_distance_to_the_nearest_surface():
@@ -58,16 +47,14 @@ def test_room_without_a_free_place_and_an_unknown_variant_are_refused():
 
 
 def test_scan_lies_on_surfaces_inside_the_walls_and_keeps_rooms_apart():
-    world = make_world(3, SMALL)
-    points, *_ = scan_world(world, 2000, Workers(2))
-    distances = [abs(world.rooms[0].clearance(point)) for point in points.astype(float)]
-    assert max(distances) < 5 * RANGE_NOISE
     world = make_world(2, SMALL, num_rooms=2)
-    points, *_ = scan_world(world, 8000, Workers(2))
+    points, *_ = scan_world(world, 4000, Workers(2))
+    distances = [min(abs(room.clearance(point)) for room in world.rooms) for point in points.astype(float)]
+    assert max(distances) < 5 * RANGE_NOISE
     walls = [(r.corner - 0.03, r.corner + r.size + 0.03) for r in world.rooms]
     inside = [((points > low) & (points < high)).all(axis=1) for low, high in walls]
     assert (inside[0] | inside[1]).all()
-    assert inside[0].sum() == inside[1].sum() == 4000
+    assert inside[0].sum() == inside[1].sum() == 2000
 
 
 def test_same_seed_same_bits_at_any_number_of_threads():
@@ -86,26 +73,18 @@ def test_panorama_shows_the_scans_colours_where_the_convention_puts_them(variant
     """A wrong frame, a mirrored axis or a seam half a turn off would make the colours disagree."""
     cloud = room(1)[1]
     taken = query(1, variant)
-    points = cloud.points + cloud.origin_world
-    pose = taken.pose
-    depth = naive.nearest_depth(points, pose.R_cam_from_world, pose.center_world, 180)
-    pixels = naive.project(points, pose.R_cam_from_world, pose.center_world, WIDTH)
-    cells = np.minimum((pixels * 180 / WIDTH).astype(int), [179, 89])
-    ranges = np.linalg.norm(points - pose.center_world, axis=1)
-    visible = ranges <= depth[cells[:, 1], cells[:, 0]] * 1.05 + 0.05
-    difference = np.abs(naive.sample(taken.rgb, pixels[visible]) - cloud.colors[visible])
-    assert visible.mean() > 0.3
+    difference = naive.color_differences(
+        cloud.points + cloud.origin_world, cloud.colors, taken.pose, taken.rgb, 180, 0.05
+    )
+    assert len(difference) > 0.3 * len(cloud.points)
     assert np.median(difference) < 4.0
 
 
-def test_change_alters_a_part_of_the_sphere_and_photo_all_of_it():
-    world = make_world(4, SMALL)
+def test_change_alters_a_part_of_the_sphere():
     rays = pixel_rays(128).reshape(-1, 3)
     before, after = (make_room(4 * 64, SMALL, np.zeros(3), changed) for changed in (0, 1))
     a, b = (cast_rays(r, SMALL / 2, rays, Workers(), "")[1] for r in (before, after))
     assert 0.05 < (np.abs(a - b).max(axis=1) > 0.02).mean() < 0.7
-    clean, photo = (make_query(world, 0, v, 128, Workers()).rgb for v in ("clean", "photo"))
-    assert clean.shape == photo.shape == (64, 128, 3)
 
 
 def test_command_line_writes_a_world_that_reads_back(tmp_path, capsys):
@@ -113,26 +92,8 @@ def test_command_line_writes_a_world_that_reads_back(tmp_path, capsys):
     options = "--points 3000 --width 128 --panoramas 2 --size 3 3 2.4 --variants clean photo clean --quiet"
     assert tool.main(["--out", str(folder), *options.split()]) == 0
     out, err = capsys.readouterr()
-    assert json.loads(out)["queries"] == 4
-    assert err == ""
+    assert (json.loads(out)["queries"], err) == (4, "")
     assert len(read_cloud(folder / "cloud.ply").points) == 3000
-    document = json.loads((folder / "queries.json").read_text())
-    names = [f"images/{v}_{k}.jpg" for v in ("clean", "photo") for k in (0, 1)]
-    assert [e["image"] for e in document["queries"]] == names
-    assert all((folder / e["image"]).is_file() for e in document["queries"])
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ("--points 10", "points: 10 are too few, use at least 1000 a room"),
-        ("--width 127", "width: 127 is not an even number of at least 128"),
-        ("--size nan 3 2.4", "size: [nan, 3.0, 2.4] is not between 2.0 and 50.0 m each way"),
-        ("--rooms 257", "rooms: 257 is not between 1 and 256"),
-        ("--seed -1", "--seed: found -1, wanted at least 0"),
-    ],
-)
-def test_command_line_refuses_in_one_line_before_anything_is_written(options, message, tmp_path, capsys):
-    assert tool.main(["--out", str(tmp_path / "r"), *options.split()]) == 2
-    assert capsys.readouterr() == ("", f"make_room.py: {message}\n")
-    assert not (tmp_path / "r").exists()
+    images = [folder / "images" / f"{v}_{k}.jpg" for v in ("clean", "photo") for k in (0, 1)]
+    assert [query.image for query in read_scene(folder).queries] == images
+    assert all(image.is_file() for image in images)

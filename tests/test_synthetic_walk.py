@@ -9,7 +9,7 @@ from piccolo.geometry.pose import Pose, angle_between, yaw_rotation
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.scenes.synthetic.office import make_office
-from piccolo.scenes.synthetic.raycast import cast_rays, ranges_ahead
+from piccolo.scenes.synthetic.raycast import cast_rays
 from piccolo.scenes.synthetic.walk_frames import BAD_KINDS, WalkOptions, frames_of
 from piccolo.scenes.synthetic.walking import HEIGHT, Walker
 from piccolo.scenes.synthetic.world import photograph, scan_world
@@ -19,32 +19,22 @@ WORKERS = Workers(2)
 
 
 @functools.lru_cache
-def office(num_rooms=6, num_storeys=2, twins=0.4):
-    return make_office(5, SIZE, num_rooms, num_storeys, twins)
+def office():
+    return make_office(5, SIZE, num_rooms=6, num_storeys=2, twins=0.4)
 
 
 @functools.lru_cache
-def walker():
-    return Walker(office())
+def walk():
+    return Walker(office()).walk(60.0, np.random.default_rng(0))
 
 
-@functools.lru_cache
-def walk(number=0):
-    return walker().walk(60.0, np.random.default_rng(number))
-
-
-def frames(number=0, **options):
-    return list(frames_of(office(), walk(), WalkOptions(width=128, **options), number, WORKERS))
-
-
-def ticks(step=10):
-    return np.arange(0, len(walk().feet), step)
+def frames(**options):
+    return list(frames_of(office(), walk(), WalkOptions(width=128, **options), 0, WORKERS))
 
 
 def is_in_room(number, feet):
     room = office().world.rooms[number]
-    low, high = room.corner - 0.01, room.corner + room.size
-    return ((feet >= low) & (feet <= high)).all(axis=-1)
+    return ((feet >= room.corner - 0.01) & (feet <= room.corner + room.size)).all(axis=-1)
 
 
 def test_rays_meet_what_is_nearest_among_hundreds_of_boxes():
@@ -56,30 +46,12 @@ def test_rays_meet_what_is_nearest_among_hundreds_of_boxes():
     for cell in (0, 3, 7, 10):
         origin = office().world.rooms[cell].corner + np.array([1.0, 1.1, 1.9])
         for rays in (around, pixel_rays(128)[20:40, 30:50].reshape(-1, 3)):
-            ranges, _, labels = cast_rays(room, origin, rays, WORKERS, "")
+            ranges, rgb, labels = cast_rays(room, origin, rays, WORKERS, "")
             np.testing.assert_allclose(ranges, naive.nearest_box(origin, rays, room.boxes), rtol=1e-9)
             assert np.isfinite(ranges).all(), "the building is not closed"
             assert (labels > 0).all()
-
-
-@pytest.mark.parametrize("width_deg", [0.5, 80.0, 179.0])
-def test_boxes_outside_a_cone_are_left_out_and_others_have_their_distance(width_deg):
-    room = office().world.rooms[0]
-    rng = np.random.default_rng(1)
-    origin, axis = room.corner + np.array([1.0, 1.1, 1.9]), np.array([0.48, -0.6, 0.64])
-    angles, turns = np.radians(width_deg) * np.sqrt(rng.random(4000)), rng.uniform(0.0, 2.0 * np.pi, 4000)
-    across = np.linalg.svd(axis[None])[2][1:]
-    around = np.column_stack([np.cos(turns), np.sin(turns)]) @ across
-    rays = np.cos(angles)[:, None] * axis + np.sin(angles)[:, None] * around
-    least = np.empty(len(room.boxes))
-    ranges_ahead(origin, axis, np.radians(width_deg), room.boxes, least)
-    alone = [room._replace(boxes=room.boxes[b : b + 1]) for b in range(len(room.boxes))]
-    is_hit = [np.isfinite(naive.nearest_box(origin, rays, box.boxes)).any() for box in alone]
-    assert np.isfinite(least[is_hit]).all()
-    distances = [max(box.clearance(origin), 0.0) for box in alone]
-    is_ahead = np.isfinite(least)
-    np.testing.assert_allclose(least[is_ahead], np.array(distances)[is_ahead], atol=1e-9)
-    assert (is_ahead.sum() < 0.5 * len(least)) == (width_deg < 45.0)
+            assert ((rgb >= 0) & (rgb <= 1)).all()
+            assert (rgb.max(axis=1) > 0.02).mean() > 0.99
 
 
 def test_copies_are_exact_and_others_are_not():
@@ -113,7 +85,7 @@ def test_a_person_can_walk_into_every_room(num_rooms, num_storeys):
 
 
 def test_walk_goes_through_doors_and_over_stairs_and_never_through_things():
-    feet = walk().feet[ticks()]
+    feet = walk().feet[::10]
     length = np.linalg.norm(np.diff(walk().feet[:, :2], axis=0), axis=1).sum()
     assert 55.0 < length < 62.0
     assert is_in_room(5, feet[0])
@@ -123,7 +95,7 @@ def test_walk_goes_through_doors_and_over_stairs_and_never_through_things():
     room = office().world.rooms[0]
     centers = [walk().pose(time).center_world for time in np.arange(0.0, walk().duration, 0.25)]
     assert min(room.clearance(center) for center in centers) > 0.2
-    for foot, center in zip(walk().feet[ticks(50)], centers[::4], strict=False):
+    for foot, center in zip(walk().feet[::50], centers[::4], strict=False):
         below = cast_rays(room, center, np.array([[0.001, 0.002, -1.0]]), WORKERS, "")[0][0]
         assert abs(below - HEIGHT) < 0.35, "stairs are walked on, not through"
         assert abs(center[2] - foot[2] - HEIGHT) < 0.03
@@ -135,8 +107,7 @@ def test_walk_has_a_persons_speed_and_looks_where_it_goes():
     centers = np.array([pose.center_world for pose in poses])
     steps = np.diff(centers[:, :2], axis=0)
     speed = np.linalg.norm(steps, axis=1) / 0.1
-    assert 0.5 < speed.mean() < 1.4
-    assert speed.max() < 1.5
+    assert 0.5 < speed.mean() < speed.max() < 1.5
     assert (speed < 0.05).mean() > 0.02, "pauses"
     turns = [angle_between(a.R_cam_from_world, b.R_cam_from_world) for a, b in itertools.pairwise(poses)]
     assert np.degrees(max(turns)) / 0.1 < 200.0
@@ -145,8 +116,8 @@ def test_walk_has_a_persons_speed_and_looks_where_it_goes():
     along = (ahead * steps).sum(axis=1)[is_quick] / (0.1 * speed[is_quick])
     assert np.median(along) > 0.95
     level = np.array([pose.R_cam_from_world[2, 2] for pose in poses])
-    assert np.degrees(np.arccos(level.min())) < 8.0
-    assert np.degrees(np.arccos(level)).mean() > 0.5
+    tilts = np.degrees(np.arccos(level))
+    assert 0.5 < tilts.mean() < tilts.max() < 8.0
 
 
 def test_frames_show_the_scan_at_their_poses():
@@ -154,14 +125,10 @@ def test_frames_show_the_scan_at_their_poses():
     taken = frames(rate=0.1)
     assert [frame.time for frame in taken] == pytest.approx(np.arange(len(taken)) * 10.0)
     for frame in taken[1:4]:
-        pose = frame.pose
-        depth = naive.nearest_depth(points, pose.R_cam_from_world, pose.center_world, 64)
-        pixels = naive.project(points, pose.R_cam_from_world, pose.center_world, 128)
-        cells = np.minimum((pixels * 64 / 128).astype(int), [63, 31])
-        ranges = np.linalg.norm(points - pose.center_world, axis=1)
-        is_visible = (ranges <= depth[cells[:, 1], cells[:, 0]] * 1.03 + 0.03) & (ranges < 3.0)
-        difference = np.abs(naive.sample(frame.rgb, pixels[is_visible]) - colors[is_visible])
-        assert is_visible.sum() > 300
+        is_near = np.linalg.norm(points - frame.pose.center_world, axis=1) < 3.0
+        near = points[is_near], colors[is_near]
+        difference = naive.color_differences(*near, frame.pose, frame.rgb, 64, 0.03)
+        assert len(difference) > 300
         assert np.median(difference) < 6.0
 
 
@@ -174,13 +141,13 @@ def test_frames_are_the_same_at_any_number_of_threads_and_people_hide_a_part():
         assert a.kind == b.kind
     alone, among = frames(rate=0.1), frames(rate=0.1, num_people=6)
     hidden = [(a.rgb != b.rgb).any(axis=2).mean() for a, b in zip(alone, among, strict=True)]
-    assert max(hidden) > 0.01
-    assert max(hidden) < 0.5
+    assert 0.01 < max(hidden) < 0.5
 
 
 def test_blur_is_the_mean_over_the_shutter():
     """Turning on the spot blurs across: the upright edges of a picture lose, the level ones stay."""
-    room, center = office().world.rooms[0], office().world.rooms[0].corner + SIZE * [0.3, 0.4, 0.62]
+    room = office().world.rooms[0]
+    center = room.corner + SIZE * [0.3, 0.4, 0.62]
     poses = [Pose(yaw_rotation(angle), center) for angle in np.radians(np.linspace(-6.0, 6.0, 8))]
     sharp, blurred = (photograph(room, poses[3], 256, WORKERS, some).astype(float) for some in ([], poses))
     upright, level = (

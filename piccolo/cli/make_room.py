@@ -15,7 +15,6 @@ from ..files.atomic import write_atomically
 from ..jobs.threads import Workers, num_cores
 from ..optional import import_optional
 from ..scenes import scene as scenes
-from ..scenes.datasets.files import write_labels
 from ..scenes.export.formats import tum_lines, write_lines
 from ..scenes.export.video import writing_video
 from ..scenes.synthetic.office import Office, make_office
@@ -25,8 +24,6 @@ from ..scenes.synthetic.world import (
     VARIANTS,
     World,
     check_cameras,
-    check_num_points,
-    check_width,
     make_labels,
     make_photos,
     make_query,
@@ -44,6 +41,7 @@ WALK_QUALITY = 95
 ROOM_POINTS = 300_000  # of all rooms side by side
 # of each part of a building; with 30,000 the better scanned of exact twins was called sure
 PART_POINTS = 120_000
+MIN_POINTS = 1000  # a room, so that they show it
 MAX_LENGTH = 100_000.0  # [m]
 OF_WALKS = ("people", "blur", "bad_frames", "video")  # options that nothing else takes
 EPILOG = """\
@@ -147,7 +145,7 @@ def write_photos(
             if arguments.labels:
                 labels = folder / "labels" / f"{v}_{k}.png"
                 labels.parent.mkdir(exist_ok=True)
-                write_labels(labels, make_labels(world, k, query, workers))
+                write_atomically(labels, encode_image(make_labels(world, k, query, workers), ".png"))
         for name, rgb in pictures:
             path = image / name
             path.parent.mkdir(exist_ok=True)
@@ -191,13 +189,15 @@ def write_scene(
     office = None
     size = np.array(arguments.size)
     with checking_options():
-        check_width(arguments.width)
+        if arguments.width < 128 or arguments.width % 2:
+            raise UsageError(f"width: {arguments.width} is not an even number of at least 128")
         if is_building(arguments):
             office = make_office(seed, size, arguments.rooms, max(1, arguments.storeys), arguments.twins)
         world = office.world if office else make_world(seed, size, arguments.rooms)
         usual = PART_POINTS * len(world.rooms) if office else ROOM_POINTS
         num_points = usual if arguments.points is None else arguments.points
-        check_num_points(world, num_points)
+        if num_points < MIN_POINTS * len(world.rooms):
+            raise UsageError(f"points: {num_points} are too few, use at least {MIN_POINTS} a room")
     (folder / "images").mkdir(parents=True, exist_ok=True)
     points, colors, labels = scan_world(world, num_points, workers)
     rows = vertex_rows(points, colors, labels.astype(np.int32) if arguments.labels else None)

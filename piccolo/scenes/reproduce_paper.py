@@ -6,6 +6,7 @@ The paper's figures are of its own data (Stanford2D-3D-S, OmniScenes, MPO) on an
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 from zlib import crc32
@@ -38,19 +39,10 @@ def identity(scene: Scene, folder: Path) -> Scene:
     return scene
 
 
-def with_fraction(fraction: float) -> SceneTransform:
-    """A transform that keeps a fraction of the points, drawn at random."""
-    return lambda scene, folder: _thinned(scene, folder, lambda count: max(1, round(fraction * count)))
-
-
-def with_count(num_points: int) -> SceneTransform:
-    """A transform that keeps a number of points, drawn at random; InputError where there are fewer."""
-    return lambda scene, folder: _thinned(scene, folder, lambda _: num_points)
-
-
-def _thinned(scene: Scene, folder: Path, num_kept: Callable[[int], int]) -> Scene:
+def thin(scene: Scene, folder: Path, fraction: float = 1.0, num_points: int | None = None) -> Scene:
+    """A number or a fraction of the points, drawn at random; InputError where there are fewer."""
     cloud = read_cloud(scene.cloud)
-    count = num_kept(len(cloud.points))
+    count = num_points or max(1, round(fraction * len(cloud.points)))
     if count > len(cloud.points):
         raise InputError(f"{scene.cloud}: found {len(cloud.points)} points, wanted at least {count}")
     chosen = np.sort(_rng(scene).choice(len(cloud.points), count, replace=False))
@@ -101,9 +93,6 @@ def _rng(scene: Scene) -> np.random.Generator:
 
 
 Settings = CoarseToFineSettings | PaperSettings
-NO_FIGURE = "-"
-RUNTIMES = {10_000: "1.77 s + 0.01 s", 100_000: "1.90 s + 0.01 s", 1_000_000: "3.74 s + 0.02 s"}
-COLUMNS = ("", "preset", "queries", "accuracy", "t 50 % [m]", "t of correct [m]", "R 50 % [deg]")
 
 
 class Condition(NamedTuple):
@@ -114,7 +103,7 @@ class Condition(NamedTuple):
     transform: SceneTransform = identity
     variants: tuple[str, ...] = ()  # the queries that it is about; empty for all
     use_labels: bool = False
-    paper: str = NO_FIGURE  # what the paper has in this place
+    paper: str = "-"  # what the paper has in this place
 
     @property
     def preset(self) -> str:
@@ -164,7 +153,7 @@ def _variants(presets: Sequence[Settings], variants: Sequence[str]) -> list[Cond
     # Splits may be tilted. The paper's preset needs one of known and unknown; the default tries both.
     tried = [replace(s, gravity="auto") if isinstance(s, CoarseToFineSettings) else s for s in presets]
     return [
-        Condition(variant, settings, variants=(variant,), paper=figures.get(variant, NO_FIGURE))
+        Condition(variant, settings, variants=(variant,), paper=figures.get(variant, "-"))
         for variant in variants
         for settings in tried
     ]
@@ -181,8 +170,9 @@ LABEL_CASES: dict[str, dict[str, Any]] = {
     "RGB": {"paper": "0.03 m, 0.66 deg (Stanford2D-3D-S, all areas)"},
     "labels": {"use_labels": True, "paper": "0.01 m, 0.28 deg (Stanford2D-3D-S, all areas)"},
 }
+RUNTIMES = {10_000: "1.77 s + 0.01 s", 100_000: "1.90 s + 0.01 s", 1_000_000: "3.74 s + 0.02 s"}
 RUNTIME_CASES = {
-    f"{count} points": {"transform": with_count(count), "paper": f"{seconds} (RTX 2080)"}
+    f"{count} points": {"transform": partial(thin, num_points=count), "paper": f"{seconds} (RTX 2080)"}
     for count, seconds in RUNTIMES.items()
 }
 EXPERIMENTS = {
@@ -214,7 +204,9 @@ EXPERIMENTS = {
     "density": Experiment(
         "density of the cloud",
         "points are left out at random",
-        _each_preset({f"{p:g} % of the points": {"transform": with_fraction(p / 100)} for p in PERCENTS}),
+        _each_preset(
+            {f"{p:g} % of the points": {"transform": partial(thin, fraction=p / 100)} for p in PERCENTS}
+        ),
     ),
     "labels": Experiment(
         "semantic labels as colours",
@@ -232,24 +224,24 @@ EXPERIMENTS = {
 
 def table(title: str, found: Sequence[tuple[Condition, Sequence[QueryResult]]]) -> Table:
     """A line a condition, the paper's figure at its end."""
-    columns = (*COLUMNS, "search s", "refine s", "localized", "wrong of these", "the paper")
-    return Table(title, columns, tuple(_cells(condition, rows) for condition, rows in found), 2)
+    lines = [_cells(condition, rows) for condition, rows in found]
+    return Table(title, tuple(lines[0]), tuple(tuple(line.values()) for line in lines), 2)
 
 
-def _cells(condition: Condition, rows: Sequence[QueryResult]) -> tuple[str, ...]:
+def _cells(condition: Condition, rows: Sequence[QueryResult]) -> dict[str, str]:
     summary = summarize(rows)
     of_correct = [row.position_error for row in rows if row.is_correct()] or [np.nan]
-    stages = [[row.result.seconds.get(stage, 0.0) for row in rows] for stage in ("search", "refine")]
-    return (
-        condition.name,
-        condition.preset,
-        f"{summary.num_queries}",
-        f"{summary.accuracy:.3f}",
-        f"{summary.position_quartiles[1]:.4f}",
-        f"{np.median(of_correct):.4f}",
-        f"{np.degrees(summary.rotation_quartiles[1]):.3f}",
-        *(f"{np.median(stage):.2f}" for stage in stages),
-        f"{summary.num_localized}",
-        f"{summary.num_wrong}",
-        condition.paper,
-    )
+    seconds = {s: [row.result.seconds.get(s, 0.0) for row in rows] for s in ("search", "refine")}
+    return {
+        "": condition.name,
+        "preset": condition.preset,
+        "queries": f"{summary.num_queries}",
+        "accuracy": f"{summary.accuracy:.3f}",
+        "t 50 % [m]": f"{summary.position_quartiles[1]:.4f}",
+        "t of correct [m]": f"{np.median(of_correct):.4f}",
+        "R 50 % [deg]": f"{np.degrees(summary.rotation_quartiles[1]):.3f}",
+        **{f"{stage} s": f"{np.median(values):.2f}" for stage, values in seconds.items()},
+        "localized": f"{summary.num_localized}",
+        "wrong of these": f"{summary.num_wrong}",
+        "the paper": condition.paper,
+    }

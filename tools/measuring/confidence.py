@@ -24,6 +24,7 @@ from piccolo.jobs.threads import Workers, num_cores
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.opening import scan_of
 from piccolo.panorama import AS_STORED, read_panorama
+from piccolo.scenes.reproduce_paper import UPSIDE_DOWN
 from piccolo.scenes.scene import Scene, read_scene
 from piccolo.scenes.synthetic.room import PLAIN
 from piccolo.scenes.synthetic.world import VARIANTS, World, blur, make_query, make_world, scan_world
@@ -41,17 +42,9 @@ over 0.1 m or 5 degrees off. Each trial is a line {"case", "scene", "truth", "re
 """
 WIDTH = 1024  # of the panoramas [px]
 POINTS_PER_ROOM = 120_000
-SPARSE_FRACTION = 0.05
-WALL_DEPTH = 0.15  # [m]
-BLUR = 0.02  # of the width: blurred beyond recognition
-OCCLUSIONS = (0.2, 0.4, 0.6)  # of the sphere
 LEAST_RADIUS = math.radians(8.0)  # of an occluder
 MOST_RADIUS = math.radians(28.0)
-FLATTENED = 0.4  # elevations of occluders: people and things stand around the camera
-LIGHT_SCALE = 0.08  # of the width: patches of light and shade
-FIELDS = (120.0, 90.0, 65.0)  # of narrow photos [deg]
 ASPECT = 0.75  # height by width of a narrow photo
-POSE = ("R_cam_from_world", "center_world")
 Image = NDArray[np.uint8]
 Points = tuple[NDArray[np.floating], NDArray[np.uint8]]
 
@@ -74,7 +67,7 @@ def occluded(rgb: Image, other: Image, fraction: float, rng: np.random.Generator
     is_hidden = np.zeros((height, width), np.bool_)
     shown = rgb.copy()
     while float((is_hidden * areas).sum()) < fraction:
-        direction = rng.normal(size=3) * [1.0, 1.0, FLATTENED]
+        direction = rng.normal(size=3) * [1.0, 1.0, 0.4]  # people and things stand around the camera
         radius = rng.uniform(LEAST_RADIUS, MOST_RADIUS)
         is_new = (rays @ (direction / np.linalg.norm(direction)) > math.cos(radius)) & ~is_hidden
         moved = np.roll(other, rng.integers(width), axis=1)[:: int(rng.choice([-1, 1]))]
@@ -85,7 +78,7 @@ def occluded(rgb: Image, other: Image, fraction: float, rng: np.random.Generator
 
 def unevenly_lit(rgb: Image, stops: float, rng: np.random.Generator) -> Image:
     """The photo (H, W, 3) under patches of light that differ by some stops."""
-    noise = blur(rng.normal(size=rgb.shape[:2])[..., None], LIGHT_SCALE * rgb.shape[1])
+    noise = blur(rng.normal(size=rgb.shape[:2])[..., None], 0.08 * rgb.shape[1])
     gain = 2.0 ** (0.5 * stops * noise / noise.std())
     linear = (rgb / 255.0) ** 2.2 * gain
     return np.asarray(255.0 * linear.clip(0.0, 1.0) ** (1.0 / 2.2), np.uint8)
@@ -110,12 +103,12 @@ def without_texture(world: World) -> World:
 
 def damaged(trial: Trial, other: Image, rng: np.random.Generator) -> Iterator[Trial]:
     """A photo half hidden, in uneven light, narrow, and mirrored."""
-    for fraction in OCCLUSIONS:
+    for fraction in (0.2, 0.4, 0.6):
         hidden = occluded(trial.rgb, other, fraction, rng)
         yield trial._replace(case=f"{trial.case}, hidden {fraction:.0%}", rgb=hidden)
     lit = occluded(unevenly_lit(trial.rgb, 2.0, rng), other, 0.3, rng)
     yield trial._replace(case=f"{trial.case}, uneven light, hidden 30%", rgb=lit)
-    for fov_deg in FIELDS:
+    for fov_deg in (120.0, 90.0, 65.0):
         outside = outside_field(trial.rgb.shape[1], fov_deg, float(rng.uniform(0.0, 2.0 * np.pi)))
         for gravity in ("known", "unknown"):
             case = f"{trial.case}, {fov_deg:.0f} deg, gravity {gravity}"
@@ -131,7 +124,7 @@ def without_scene(trial: Trial, rng: np.random.Generator) -> Iterator[Trial]:
     yield Trial("white", np.full_like(rgb, 255), None)
     yield Trial("noise", rng.integers(0, 256, rgb.shape, dtype=np.uint8), None)
     yield Trial("cloudy", fractal_noise(rgb.shape, rng), None)
-    blurred = np.asarray(blur(rgb.astype(float), BLUR * rgb.shape[1]), np.uint8)
+    blurred = np.asarray(blur(rgb.astype(float), 0.02 * rgb.shape[1]), np.uint8)
     yield Trial("blurred", blurred, trial.true_pose)
 
 
@@ -146,18 +139,16 @@ def fractal_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Image:
 
 def upside_down(trial: Trial) -> Trial:
     """A panorama held by a camera turned over, searched as if it were upright."""
-    rgb = np.ascontiguousarray(trial.rgb[::-1, ::-1])
-    if trial.true_pose is None:
-        return Trial("upside down", rgb, None, "known")
-    turn = np.diag([1.0, -1.0, -1.0])  # half a turn about the image centre: columns and rows run backwards
-    pose = Pose(turn @ trial.true_pose.R_cam_from_world, trial.true_pose.center_world)
-    return Trial("upside down", rgb, pose, "known")
+    pose = trial.true_pose
+    if pose is not None:
+        pose = Pose(UPSIDE_DOWN @ pose.R_cam_from_world, pose.center_world)
+    return Trial("upside down", np.ascontiguousarray(trial.rgb[::-1, ::-1]), pose, "known")
 
 
 def thinned(points: Points, rng: np.random.Generator) -> Points:
     """A few of the points, in order."""
     count = len(points[0])
-    chosen = np.sort(rng.choice(count, int(SPARSE_FRACTION * count), replace=False))
+    chosen = np.sort(rng.choice(count, int(0.05 * count), replace=False))
     return points[0][chosen], points[1][chosen]
 
 
@@ -187,7 +178,7 @@ def room_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[Tria
     yield cloud, trials
     thin = [right[0]._replace(case="sparse"), trials[4]._replace(case="sparse, elsewhere")]
     yield thinned(cloud, rng), thin
-    wall = np.flatnonzero(cloud[0][:, 0] < cloud[0][:, 0].min() + WALL_DEPTH)
+    wall = np.flatnonzero(cloud[0][:, 0] < cloud[0][:, 0].min() + 0.15)
     yield (cloud[0][wall], cloud[1][wall]), [r._replace(case="one wall") for r in right[:2]]
 
 
@@ -271,12 +262,9 @@ def run(arguments: argparse.Namespace) -> int:
                 truth = trial.true_pose
                 ok = truth is not None and is_correct(result.best_pose, truth)
                 rows.append((trial.case, result.status, ok))
-                line = {
-                    "case": trial.case,
-                    "scene": scene,
-                    "truth": truth and {name: getattr(truth, name).tolist() for name in POSE},
-                }
-                file.write(json.dumps(line | {"result": json.loads(result.to_json())}) + "\n")
+                line = {"case": trial.case, "scene": scene, "result": json.loads(result.to_json())}
+                line["truth"] = truth and {name: array.tolist() for name, array in vars(truth).items()}
+                file.write(json.dumps(line) + "\n")
                 file.flush()
                 print_note(arguments, f"{scene}: {trial.case}: {result.status}, {'right' if ok else 'wrong'}")
     return 1 if print_cases("case", rows) else 0

@@ -47,10 +47,9 @@ def case_of(arguments: argparse.Namespace) -> Case:
         order = morton_order(points, colors)
         points = points[order]
         colors = colors[order]
-    num_points = arguments.points
-    if len(points) < num_points:
-        raise InputError(f"{arguments.cloud}: found {len(points)} points, wanted --points {num_points}")
-    chosen = np.linspace(0, len(points) - 1, num_points).astype(np.int64)
+    if len(points) < arguments.points:
+        raise InputError(f"{arguments.cloud}: found {len(points)} points, wanted --points {arguments.points}")
+    chosen = np.linspace(0, len(points) - 1, arguments.points).astype(np.int64)
     pose = Pose(yaw_rotation(0.7), np.median(points, axis=0).astype(np.float64))
     return pack_points(points[chosen], colors[chosen]), rgb, pose
 

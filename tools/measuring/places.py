@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from piccolo.geometry.pose import Array
-from piccolo.scenes.synthetic.office import CORRIDOR_WIDTH
+from piccolo.scenes.synthetic.office import CORRIDOR_WIDTH, placed
 from piccolo.scenes.synthetic.room import (
     CHECKS,
     PICTURE,
@@ -30,7 +30,6 @@ ALIKE_KINDS = ("hotel", "doors", "cubicles", "racks")  # some of whose things ar
 CHANGED = (0.0, 0.05, 0.1, 0.2, 0.5)  # fractions of a unit's things
 PIECES = (put_table, put_shelf, put_sofa, put_crate, put_crate)
 NUM_DOORS = 6
-DOOR_DISTANCE = 3.0  # [m]
 
 Thing = tuple[Sequence[float], Sequence[float], tuple[int, ...]]  # centre (3,), size (3,) [m], patterns
 
@@ -38,16 +37,9 @@ Thing = tuple[Sequence[float], Sequence[float], tuple[int, ...]]  # centre (3,),
 def make_repeated(kind: str, seed: int, size: Array) -> tuple[Room, ...]:
     """Rooms of one of REPEATED_KINDS; a corridor has a length and a width of its own."""
     if kind == "twins":
-        return twin_rooms(seed, size)
+        room = make_room(seed, size, np.zeros(3))
+        return room, placed(room, np.array([room.size[0] + GAP, 0.0, 0.0]), is_turned=False)
     return (symmetric_hall(seed, size) if kind == "hall" else corridor(seed, float(size[2])),)
-
-
-def twin_rooms(seed: int, size: Array) -> tuple[Room, Room]:
-    """One furnished room twice, side by side."""
-    room = make_room(seed, size, np.zeros(3))
-    shift = np.array([room.size[0] + GAP, 0.0, 0.0])
-    boxes = room.boxes + np.array([*shift, 0.0, 0.0, 0.0, 0.0])
-    return room, room._replace(corner=room.corner + shift, boxes=boxes, light=room.light + shift)
 
 
 def symmetric_hall(seed: int, size: Array) -> Room:
@@ -59,13 +51,9 @@ def symmetric_hall(seed: int, size: Array) -> Room:
     boxes[is_long, 0] = 0.25 * x - 0.5 * WALL_THICKNESS
     boxes[is_long, 3] = 0.25 * x + 0.5 * WALL_THICKNESS
     is_kept = boxes[:, 0] < 0.5 * x
-    half = boxes[is_kept]
-    turned = half.copy()
-    turned[:, 0] = x - half[:, 0]
-    turned[:, 1] = y - half[:, 1]
-    turned[:, 6] = half[:, 6] + np.pi
+    half = room._replace(boxes=boxes[is_kept])
     return room._replace(
-        boxes=np.vstack([half, turned]),
+        boxes=np.vstack([half.boxes, placed(half, np.zeros(3), is_turned=True).boxes]),
         materials=np.tile(room.materials[is_kept], (2, 1)),
         light=np.array([0.5 * x, 0.5 * y, room.light[2]]),
         labels=np.tile(room.labels[is_kept], 2),
@@ -75,7 +63,7 @@ def symmetric_hall(seed: int, size: Array) -> Room:
 def corridor(seed: int, height: float) -> Room:
     """A corridor whose doors and pictures repeat; both ends are alike."""
     b = RoomBuilder(np.random.default_rng([seed, 3]), np.zeros(3))
-    length = DOOR_DISTANCE
+    length = 3.0  # from door to door [m]
     width = CORRIDOR_WIDTH
     d = WALL_THICKNESS
     floor = b.paint((PLANKS, TILES), 0.3, 0.7)

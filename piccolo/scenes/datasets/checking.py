@@ -17,7 +17,6 @@ from ...panorama.model import shrink
 from ..scene import Query, Scene
 from .files import AXES
 
-VOXEL_SIZE = 0.08  # [m] enough for views of a few degrees
 MIN_SCORE = 0.1  # other views of the same place may have as much, but seldom more than the right one
 AS_GIVEN = "as given"
 
@@ -57,7 +56,7 @@ class Check(NamedTuple):
 def check_scene(scene: Scene, num_queries: int, workers: Workers, show: Progress = no_progress) -> Check:
     """Score some panoramas of a scene, evenly spaced over the list, against its cloud at their poses."""
     voxels = open_cloud([scene.cloud], show=show).voxels(np.eye(3))
-    nodes = build_octree(voxels).level(VOXEL_SIZE)
+    nodes = build_octree(voxels).level(0.08)  # [m] enough for views of a few degrees
     points = pack_points(nodes[:, :3], np.round(nodes[:, 3:] * 255.0).astype(np.uint8))
 
     def check(query: Query) -> ConventionCheck:

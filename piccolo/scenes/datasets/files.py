@@ -8,17 +8,14 @@ from numpy.typing import NDArray
 from ...cloud import FORMATS
 from ...cloud.stream import MAX_COORDINATE
 from ...errors import InputError
-from ...files.atomic import write_atomically
 from ...files.json_file import read_text
 from ...geometry.pose import Array, Pose, checked_rotation, orthonormal
 from ...geometry.rotations import CAMERA_AXES, OPENGL_FROM_CAM
 from ...panorama.picture import read_picture
-from ...views.pictures import encode_image
 from .model import Labels
 
 SUFFIXES = frozenset().union(*(f.suffixes for f in FORMATS)) - {".csv"}  # as these hold poses too
 AXES = {**CAMERA_AXES, "opengl": OPENGL_FROM_CAM}  # a pose file's camera axes from ours, by name
-MAX_MATRIX_SIZE = 1 << 16  # [byte] of a file
 MAX_SKEW = 1e-2  # of R R^T from the identity: some files have three decimals
 WORLD_FROM_CAM = "world_from_cam"
 CAM_FROM_WORLD = "cam_from_world"
@@ -43,7 +40,7 @@ def only_cloud_in(folder: Path) -> Path | None:
 def read_matrix(path: Path, num_rows: int) -> Array:
     """The matrix (num_rows, 4) that is all of a text file."""
     wanted = f"wanted {num_rows} x 4 numbers"
-    words = read_text(path, wanted, MAX_MATRIX_SIZE).split()
+    words = read_text(path, wanted, max_size=1 << 16).split()
     try:
         numbers = np.array([float(word) for word in words[: 4 * num_rows + 1]])
     except ValueError as error:
@@ -80,10 +77,4 @@ def labels_by_index(path: Path, table: NDArray[np.uint16]) -> Labels:
     """The labels (H, W) of a picture whose colours are indices R 2^16 + G 2^8 + B into a table; 0 beyond."""
     rgb = read_picture(path).rgb.astype(np.uint32)
     index = rgb[..., 0] << 16 | rgb[..., 1] << 8 | rgb[..., 2]
-    beyond = len(table)
-    return np.asarray(np.append(table, np.uint16(0))[np.minimum(index, beyond)], dtype=np.uint16)
-
-
-def write_labels(path: Path, labels: Labels) -> None:
-    """Write labels (H, W) as a 16-bit PNG with one channel."""
-    write_atomically(path, encode_image(labels, ".png"))
+    return np.asarray(np.append(table, np.uint16(0))[np.minimum(index, len(table))], dtype=np.uint16)

@@ -20,7 +20,6 @@ LISTS = ("poses.csv", "poses.json", "poses.txt", "poses.tum")
 NUMBERS = ("tx", "ty", "tz", "qw", "qx", "qy", "qz")
 TUM_COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 OWN_QUATERNION = {f"quaternion_{letter}" for letter in "wxyz"}  # of R_cam_from_world, in a CSV of ours
-MAX_LENGTH_ERROR = 1e-2  # of a quaternion
 WANTED = f"wanted rows with image, {', '.join(NUMBERS)}, direction, axes"
 
 Row = Mapping[str, str]
@@ -130,7 +129,7 @@ def _pose(where: str, row: Row, options: ConvertOptions) -> Pose:
     except ValueError as error:
         raise InputError(f"{where}: found {error}, wanted numbers") from error
     length = float(np.linalg.norm(numbers[3:]))
-    if not abs(length - 1.0) < MAX_LENGTH_ERROR:
+    if not abs(length - 1.0) < 1e-2:
         raise InputError(f"{where}: found a quaternion of length {length:.3g}, wanted 1")
     T = np.column_stack([rotation_from_quaternion_wxyz(numbers[3:]), numbers[:3]])
     return pose_of_transform(where, T, str(direction), str(axes))

@@ -25,9 +25,7 @@ MATTERPORT = "matterport3d"
 SKYBOXES = "matterport_skybox_images"
 MAX_DEPTH = 5  # v1/scans/HOUSE/HOUSE/matterport_skybox_images
 FACE = re.compile(r"([0-9a-f]+)_skybox([0-5])_sami\.jpg$")
-NUM_FACES = 6
 POSE_FILES = "matterport_camera_poses/{}_pose_1_{}.txt"  # 1: the level camera of three, 0 looks up, 2 down
-NUM_YAWS = 6
 SKYBOX_YAW = 5  # the stop at which that camera looks through the middle of skybox 1
 # House by house the first of these that is there. Coloured vertices come first: they are quick to read.
 MESHES = ("house_segmentations/*.ply", "region_segmentations/region*.ply", "matterport_mesh/**/*.obj")
@@ -37,7 +35,6 @@ PANORAMAS = ("*_pano", "*/*_pano")  # change_handheld_pano, turtlebot_pano ...
 SEQUENCE = re.compile(r"[A-Za-z]+_([A-Za-z]+_\d+)_scene_\d+$")  # handheld_weddingHall_1_scene_2
 
 MPO = "mpo"
-MAX_SHIFT = 3.0  # [m] along each axis
 
 
 def list_360loc(options: ConvertOptions) -> SceneList:
@@ -94,7 +91,7 @@ def list_matterport(options: ConvertOptions) -> SceneList:
         posed = {
             place: files
             for place, files in places.items()
-            if len(files) == NUM_FACES and (folder / POSE_FILES.format(place, SKYBOX_YAW)).exists()
+            if len(files) == 6 and (folder / POSE_FILES.format(place, SKYBOX_YAW)).exists()
         }
         if len(posed) < len(places):
             count = len(places) - len(posed)
@@ -114,7 +111,7 @@ def _matterport_panoramas(
     The camera's axes are right, down, forward; skybox 1 is what our cubes have in front.
     """
     for place, files in places.items():
-        paths = [folder / POSE_FILES.format(place, yaw) for yaw in range(NUM_YAWS)]
+        paths = [folder / POSE_FILES.format(place, yaw) for yaw in range(6)]
         matrices = {path: read_matrix(options.inside(path), 4) for path in paths if path.exists()}
         T_world_from_skybox = matrices[paths[SKYBOX_YAW]].copy()
         T_world_from_skybox[:3, 3] = np.mean([matrix[:3, 3] for matrix in matrices.values()], axis=0)
@@ -175,7 +172,7 @@ def list_mpo(options: ConvertOptions) -> SceneList:
         name = stem.relative_to(options.folder).as_posix()
         rng = np.random.default_rng([options.seed, zlib.crc32(name.encode())])
         turn = yaw_rotation(rng.uniform(0.0, math.pi)).T
-        transform = RigidTransform(turn, rng.uniform(0.0, MAX_SHIFT, 3))
+        transform = RigidTransform(turn, rng.uniform(0.0, 3.0, 3))
         pose = Pose(np.eye(3), np.zeros(3))  # at the scanner's origin, with the scanner's axes
         panorama = PosedPanorama(picture.name, {picture.name: picture}, "moved", pose)
         source: dict[str, object] = {"seed": options.seed}

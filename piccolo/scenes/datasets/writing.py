@@ -14,13 +14,11 @@ from ...cloud.ply_writer import vertex_rows, writing_ply
 from ...cloud.readers.reader import CHUNK
 from ...cloud.stream import PointValidator
 from ...errors import InputError, unreadable
-from ...files.atomic import check_output_folder, replacing_folder
+from ...files.atomic import check_output_folder, replacing_folder, write_atomically
 from ...jobs.threads import Progress, no_progress
+from ...views.pictures import encode_image
 from ..scene import CLOUD_NAME, QUERIES_NAME, Query, read_scene, write_queries
-from .files import write_labels
 from .model import PosedPanorama, SceneSpec
-
-NOTHING = (np.empty((0, 3)), np.empty((0, 3), np.uint8))  # points and colours
 
 
 class Written(NamedTuple):
@@ -63,7 +61,8 @@ def _write_cloud(spec: SceneSpec, path: Path, show: Progress) -> tuple[int, list
     validator = PointValidator(spec.cloud[0].path, 1.0)  # one for all files, as an object may be small
     warnings: list[str] = []
     has_labels = spec.cloud[0].label is not None
-    dtype = vertex_rows(*NOTHING, np.empty(0, np.int32) if has_labels else None).dtype
+    no_labels = np.empty(0, np.int32) if has_labels else None
+    dtype = vertex_rows(np.empty((0, 3)), np.empty((0, 3), np.uint8), no_labels).dtype
     with writing_ply(path, dtype) as writer:
         for part in spec.cloud:
             source = open_source(part.path)
@@ -96,6 +95,6 @@ def _write_panorama(spec: SceneSpec, panorama: PosedPanorama, folder: Path, copi
     if panorama.read_labels is not None:
         labels = (folder / "labels" / panorama.name).with_suffix(".png")
         labels.parent.mkdir(parents=True, exist_ok=True)
-        write_labels(labels, panorama.read_labels())
+        write_atomically(labels, encode_image(panorama.read_labels(), ".png"))  # 16 bits, one channel
     pose = panorama.pose if spec.transform is None else spec.transform.of_pose(panorama.pose)
     return Query(folder / "images" / panorama.name, panorama.variant, pose, labels)

@@ -6,10 +6,9 @@ from pathlib import Path
 from ...errors import InputError
 from ...files.atomic import check_output, check_output_folder
 from ...result import Result
-from .formats import COLMAP, CSV, KITTI, NERFSTUDIO, OPENSFM, POTREE, TUM
+from .formats import COLMAP, CSV, GEOJSON, GPX, KITTI, NERFSTUDIO, OPENSFM, POTREE, TUM
 from .gpano import GPANO
 from .posed_images import Format, LeftOut, Options, Selection, posed_images, select, true_results
-from .world_maps import GEOJSON, GPX
 
 __all__ = ["FORMATS", "Format", "Options", "Selection", "export", "select", "true_results"]
 
@@ -24,10 +23,7 @@ def export(results: Sequence[Result], name: str, out: Path, options: Options) ->
     Raises InputError if no pose is left, or `out` can't be written.
     """
     form = FORMATS[name]
-    if form.is_folder:
-        check_output_folder(out)
-    else:
-        check_output(out)
+    (check_output_folder if form.is_folder else check_output)(out)
     if not results:
         raise InputError(f"{out}: there is no pose to write; --all also writes those that are not localized")
     images, left_out = posed_images(results, form, options)

@@ -1,4 +1,4 @@
-"""Poses as text: tables, trajectories, Potree's images, COLMAP, nerfstudio, OpenSfM, and points on maps.
+"""Poses as text: tables, trajectories, Potree, COLMAP, nerfstudio, OpenSfM, points and tracks on maps.
 
 Numbers are written so that the same float64 is read back. Where a format has no place for the offset, it is
 written beside it: <name>.offset.txt.
@@ -10,10 +10,12 @@ import json
 from collections.abc import Iterable, Sequence
 from decimal import Decimal
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
-from ...errors import InputError
+from ...errors import InputError, printable
 from ...files.atomic import is_stream, replacing_folder, write_atomically
 from ...geometry.pose import Pose, T_world_from_cam, log_so3, quaternion_wxyz
 from ...geometry.rotations import (
@@ -24,6 +26,7 @@ from ...geometry.rotations import (
     translation,
     turned,
 )
+from ...optional import import_optional
 from .posed_images import NO_UTF8, Format, Options, PosedImage
 
 COLUMNS = (
@@ -31,6 +34,12 @@ COLUMNS = (
     *("quaternion_w", "quaternion_x", "quaternion_y", "quaternion_z"),  # of R_cam_from_world
     *("heading_deg", "pitch_deg", "roll_deg"),
 )
+
+
+STEP = 10.0  # [m] ahead, to find true north
+MARGIN_DEG = 3.0  # around a system's area: a country that spans two zones often uses one for both
+LOCAL = 10_000.0  # [m] from (0, 0): without a margin, as scans with coordinates of their own lie there
+GPX_NAMESPACE = "http://www.topografix.com/GPX/1/1"
 
 
 def numbers(values: Iterable[float], separator: str = " ") -> str:
@@ -151,11 +160,10 @@ def write_colmap(images: Sequence[PosedImage], out: Path, options: Options) -> N
 
 def _colmap_camera(image: PosedImage) -> str:
     """Model, size and parameters."""
-    if image.camera is None:
-        w, h = image.size
-        return f"EQUIRECTANGULAR {w} {h} {w} {h}"
-    camera = image.camera
-    return f"{camera.model} {camera.width} {camera.height} {numbers(camera.params)}"
+    if camera := image.camera:
+        return f"{camera.model} {camera.width} {camera.height} {numbers(camera.params)}"
+    w, h = image.size
+    return f"EQUIRECTANGULAR {w} {h} {w} {h}"
 
 
 def write_nerfstudio(images: Sequence[PosedImage], out: Path, options: Options) -> None:
@@ -200,11 +208,8 @@ def write_opensfm(images: Sequence[PosedImage], out: Path, options: Options) -> 
         cameras[camera] = {"projection_type": "spherical", "width": width, "height": height}
         pose = turned(image.pose, OPTICAL_FROM_CAM)
         rotation = log_so3(pose.R_cam_from_world).tolist()
-        shots[image.name] = {
-            "rotation": rotation,
-            "translation": translation(pose).tolist(),
-            "camera": camera,
-        }
+        shot = {"rotation": rotation, "translation": translation(pose).tolist(), "camera": camera}
+        shots[image.name] = shot
     write_offset_beside(out, options)
     write_json(out, [{"cameras": cameras, "shots": shots, "points": {}}])
 
@@ -219,6 +224,93 @@ def _check_shape(image: PosedImage) -> None:
 def write_json(out: Path, document: object) -> None:
     """Write a JSON file."""
     write_atomically(out, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
+
+
+def write_geojson(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write a FeatureCollection (RFC 7946) with a point a result: longitude and latitude in WGS84."""
+    geod, transformer, crs = _in_degrees("GeoJSON", images, options)
+    features = [_feature(image, transformer, geod, crs) for image in images]
+    write_json(out, {"type": "FeatureCollection", "features": features})
+
+
+def write_gpx(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write a track (GPX 1.1) with a point a result, in order; a new segment behind each gap of a walk."""
+    _, transformer, _ = _in_degrees("GPX", images, options)
+    root = ElementTree.Element("gpx", version="1.1", creator="piccolo", xmlns=GPX_NAMESPACE)
+    track = ElementTree.SubElement(root, "trk")
+    segment = ElementTree.SubElement(track, "trkseg")
+    for image in images:
+        if image.result.walk is not None and image.result.walk.gap is not None:
+            segment = ElementTree.SubElement(track, "trkseg")
+        longitude, latitude = transformer.transform(*image.pose.center_world[:2].tolist())
+        point = ElementTree.SubElement(segment, "trkpt", lat=repr(latitude), lon=repr(longitude))
+        if taken := image.result.source.capture_time:
+            ElementTree.SubElement(point, "time").text = taken
+        ElementTree.SubElement(point, "name").text = printable(image.name)
+    write_atomically(out, ElementTree.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
+
+
+def _in_degrees(what: str, images: Sequence[PosedImage], options: Options) -> tuple[Any, Any, str]:
+    """The ellipsoid, what turns positions into longitude and latitude, and the system's name."""
+    pyproj = import_optional(what, "pyproj", "tools")
+    crs = str(options.crs)
+    try:
+        system = pyproj.CRS.from_user_input(crs)
+    except pyproj.exceptions.CRSError as error:
+        raise InputError(f"--crs: found {crs!r}, wanted a coordinate system such as EPSG:25832") from error
+    units = {axis.unit_name for axis in system.axis_info[:2]}
+    if not system.is_projected or units != {"metre"}:
+        raise InputError(f"--crs: found {crs} ({system.name}), wanted a projected system in metres")
+    transformer = pyproj.Transformer.from_crs(system, "EPSG:4326", always_xy=True)
+    for image in images:
+        _check_place(image, system, transformer, crs)
+    return pyproj.Geod(ellps="WGS84"), transformer, crs
+
+
+def _check_place(image: PosedImage, system: Any, transformer: Any, crs: str) -> None:
+    """Refuse a camera outside of the area where the system is used, as far as the system says it."""
+    x, y = image.pose.center_world[:2].tolist()
+    longitude, latitude = transformer.transform(x, y)
+    parts = [system, *system.sub_crs_list]  # a system with a height says it of its parts
+    area = next((part.area_of_use for part in parts if part.area_of_use), None)
+    if not np.isfinite([longitude, latitude]).all() or (area and not _is_in(area, longitude, latitude, x, y)):
+        name = str(system.name)
+        if area:
+            name += f", {area.west:g} to {area.east:g} E, {area.south:g} to {area.north:g} N"
+        found = f"found a camera at ({x:g}, {y:g})"
+        raise InputError(f"{image.path}: {found}, wanted one where {crs} holds ({name})")
+
+
+def _is_in(area: Any, longitude: float, latitude: float, x: float, y: float) -> bool:
+    """True if a place [deg], (x, y) [m] in the system, is in its area with a margin; some cross 180 E."""
+    margin = 0.0 if np.hypot(x, y) < LOCAL else MARGIN_DEG
+    width = 360.0 if area.east - area.west >= 360.0 else (area.east - area.west) % 360.0
+    is_between = (longitude - area.west + margin) % 360.0 <= width + 2.0 * margin
+    return bool(is_between and area.south - margin <= latitude <= area.north + margin)
+
+
+def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[str, object]:
+    """The point without a height, which would have to be above WGS84's ellipsoid: z is a property."""
+    result = image.result
+    x, y, z = image.pose.center_world.tolist()
+    heading, pitch, roll = heading_pitch_roll_deg(image.pose)
+    ahead = np.radians(heading)
+    eastings = [x, x + STEP * np.sin(ahead)]
+    northings = [y, y + STEP * np.cos(ahead)]
+    longitudes, latitudes = transformer.transform(eastings, northings)
+    true_heading, _, _ = geod.inv(longitudes[0], latitudes[0], longitudes[1], latitudes[1])
+    properties = {
+        "image": image.name,
+        "cloud": result.cloud_name,
+        "status": result.status,
+        "confidence": result.confidence,
+        "score": result.evidence and result.evidence.score,
+        **{"crs": crs, "x": x, "y": y, "z": z},
+        **{"heading_deg": heading, "heading_true_deg": true_heading % 360.0},
+        **{"pitch_deg": pitch, "roll_deg": roll},
+    }
+    point = {"type": "Point", "coordinates": [longitudes[0], latitudes[0]]}
+    return {"type": "Feature", "geometry": point, "properties": properties}
 
 
 OFFSET = frozenset({"offset"})
@@ -239,3 +331,7 @@ NOT_IN_POTREE = rf"[\"\t\n\r]|{NO_UTF8}"
 POTREE = Format(
     "potree", POTREE_TEXT, write_potree, OFFSET | {"timestamps"}, forbidden=NOT_IN_POTREE, cameras="spheres"
 )
+GEOJSON_TEXT = "points for maps, in WGS84; needs --crs and the library pyproj"
+GEOJSON = Format("geojson", GEOJSON_TEXT, write_geojson, frozenset({"crs"}), has_unique_names=False)
+GPX_TEXT = "track of the positions in WGS84; needs --crs and the library pyproj"
+GPX = Format("gpx", GPX_TEXT, write_gpx, frozenset({"crs"}), has_unique_names=False, forbidden="")

@@ -20,7 +20,6 @@ from ...panorama.gpano import ASPECT_TOLERANCE
 from ...result import Result
 from ..scene import Scene
 
-TIMESTAMP = re.compile(r"\d+(\.\d+)?")
 NO_UTF8 = "[\ud800-\udfff]"  # in a name
 LeftOut = dict[str, list[str]]  # names of pictures that a format can't hold, by why
 
@@ -176,7 +175,7 @@ def _time(result: Result, path: Path, index: int, options: Options) -> str:
         if result.walk is None:
             raise InputError(f"{path}: found no frame of a walk, as --timestamps walk needs")
         return repr(result.walk.time)
-    if not TIMESTAMP.fullmatch(path.stem):
+    if not re.fullmatch(r"\d+(\.\d+)?", path.stem):
         raise InputError(f"{path}: its name {path.stem!r} is no number, as --timestamps name needs")
     return path.stem
 

@@ -11,9 +11,6 @@ from numpy.typing import NDArray
 from ...files.atomic import replacing
 from ...optional import import_optional
 
-QUALITY = "18"  # CRF of H.264: nothing to be seen is lost
-MAX_DENOMINATOR = 1001  # of a frame rate
-
 
 @contextmanager
 def writing_video(
@@ -25,10 +22,10 @@ def writing_video(
     """
     av = import_optional("video", "av", "video")
     with replacing(path) as file, av.open(file, "w", format="mp4") as container:
-        stream = container.add_stream("libx264", Fraction(rate).limit_denominator(MAX_DENOMINATOR))
+        stream = container.add_stream("libx264", Fraction(rate).limit_denominator(1001))
         stream.width, stream.height = size
         stream.pix_fmt = "yuv420p"
-        stream.options = {"crf": QUALITY}
+        stream.options = {"crf": "18"}  # nothing to be seen is lost
 
         def add(rgb: NDArray[np.uint8]) -> None:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(rgb, format="rgb24")))

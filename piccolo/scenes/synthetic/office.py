@@ -48,7 +48,6 @@ FLIGHT_WIDTH = 1.4  # [m]
 FLIGHT_BEGIN = 1.3  # of stairs, from the hall's south wall [m]
 RAIL_THICKNESS = 0.06  # [m]
 RAIL_HEIGHT = 1.0  # [m]
-HALL_AREA = 8.0  # for a piece of furniture [m2]
 LAMP_DISTANCE = 6.0  # [m]
 
 Slot = tuple[int, int, int, bool]  # storey, corridor, column of a room, and whether it is south
@@ -274,7 +273,7 @@ def halls(seed: int, plan: Plan) -> Iterator[Room]:
         _put_slab(b, size, ends, up, b.paint((PLAIN,), 0.75, 0.95))
         put_walls(b, size, doors)
         put_hangings(b, size)
-        put_furniture(b, size, area=HALL_AREA)
+        put_furniture(b, size, area=8.0)
         if up is not None:
             _put_steps(b, up)
         if down is not None:

@@ -17,13 +17,7 @@ LABEL_NAMES = (  # kinds of surfaces; a label is the place in this list, and 0 i
     *("rug", "table", "shelf", "sofa", "crate"),
 )
 Pair = tuple[float, float]
-SATURATION = 0.5  # paints are paler than colours drawn at random
 DOOR_ROOM = 1.2  # left free before an open door [m]
-HANGINGS = {  # on walls: their patterns, and the least and greatest colour
-    "picture": ((PICTURE,), 0.1, 1.0),
-    "window": ((CHECKS,), 0.7, 1.0),
-    "door": ((PLAIN, PLANKS), 0.2, 0.6),
-}
 
 
 @dataclass
@@ -41,7 +35,7 @@ class RoomBuilder:
     def paint(self, patterns: tuple[int, ...], low: float, high: float) -> Array:
         """A row of Room.materials: a random pattern in two related colours with channels in [low, high]."""
         base = self.rng.uniform(low, high, 3)
-        base = base.mean() + SATURATION * (base - base.mean())
+        base = base.mean() + 0.5 * (base - base.mean())  # paints are paler than colours drawn at random
         other = np.clip(base * self.rng.uniform(0.55, 0.9) + self.rng.normal(0, 0.05, 3), 0, 1)
         pattern = self.rng.choice(patterns)
         scale = self.rng.uniform(0.12, 0.5)
@@ -177,14 +171,15 @@ def put_wall(
 
 def put_hangings(b: RoomBuilder, size: Array) -> None:
     """Pictures, a door and windows: thin boxes on the walls."""
+    draw = b.rng.uniform
     for axis in (0, 1):
         along = 1 - axis
         for side in (0.0, size[axis]):
             for kind in b.rng.permutation(["picture", "picture", "window", "door"])[: b.rng.integers(2, 5)]:
-                width, height, middle = {
-                    "picture": (b.rng.uniform(0.4, 1.1), b.rng.uniform(0.3, 0.8), b.rng.uniform(1.3, 1.8)),
-                    "window": (b.rng.uniform(0.8, 1.4), b.rng.uniform(0.8, 1.1), 1.5),
-                    "door": (0.9, 2.0, 1.0),
+                width, height, middle, patterns, low, high = {
+                    "picture": (draw(0.4, 1.1), draw(0.3, 0.8), draw(1.3, 1.8), (PICTURE,), 0.1, 1.0),
+                    "window": (draw(0.8, 1.4), draw(0.8, 1.1), 1.5, (CHECKS,), 0.7, 1.0),
+                    "door": (0.9, 2.0, 1.0, (PLAIN, PLANKS), 0.2, 0.6),
                 }[kind]
                 center = np.full(3, min(middle, size[2] - height / 2))
                 center[axis] = side
@@ -192,7 +187,7 @@ def put_hangings(b: RoomBuilder, size: Array) -> None:
                 extent = np.full(3, 0.03)
                 extent[along] = width
                 extent[2] = height
-                b.put(center, extent, b.paint(*HANGINGS[kind]), kind=str(kind))
+                b.put(center, extent, b.paint(patterns, low, high), kind=str(kind))
                 b.leave_clear(len(b.boxes) - 1)
 
 

@@ -23,7 +23,6 @@ DISTANCES = (1.5, 6.0)  # of people before and after the camera [s]
 ASIDE = 0.25  # of people off the way, at most [m]
 LEAST_DISTANCE = 0.8  # of a person from the camera [m]
 MAX_PEOPLE = 20
-NUM_ELSEWHERE = 8  # rooms of another building
 LAMP = np.array([0.0, 0.5, 2.4])  # above a person's feet [m]
 BODY = ((0.4, (0.2, 0.32, 0.8)), (1.12, (0.26, 0.46, 0.64)), (1.6, (0.2, 0.18, 0.26)))  # height, size [m]
 
@@ -69,7 +68,7 @@ def frames_of(
     rng = np.random.default_rng([seed, 54, number])
     kinds = _kinds(len(times), options, rng)
     people = [Person(walk, rng) for _ in range(options.num_people)]
-    elsewhere = make_world(seed + 1_000_003, office.world.rooms[0].size, NUM_ELSEWHERE)
+    elsewhere = make_world(seed + 1_000_003, office.world.rooms[0].size, num_rooms=8)
     for k, (time, kind) in enumerate(zip(times, kinds, strict=True)):
         pose = walk.pose(time)
         if kind == "black":
@@ -78,7 +77,9 @@ def frames_of(
             rgb = make_query(elsewhere, k, "clean", options.width, workers).rgb
         else:
             present = [part for person in people if (part := person.at(time)) is not None]
-            rgb = _picture(joined([office.world.rooms[0], *present]), walk, time, options, workers)
+            meanwhile = _exposures(walk, time) if options.is_blurred else []
+            room = joined([office.world.rooms[0], *present])
+            rgb = photograph(room, pose, options.width, workers, meanwhile)
         if options.variant == "photo" and kind != "black":
             rgb = other_light(rgb, np.random.default_rng([seed, 55, number]))  # one light for the whole walk
         yield Frame(rgb[:, ::-1].copy() if kind == "mirrored" else rgb, pose, time, kind)
@@ -92,14 +93,10 @@ def _kinds(count: int, options: WalkOptions, rng: np.random.Generator) -> list[s
     return kinds
 
 
-def _picture(
-    room: Room, walk: Walk, time: float, options: WalkOptions, workers: Workers
-) -> NDArray[np.uint8]:
-    meanwhile: list[Pose] = []
-    if options.is_blurred:
-        moments = time + SHUTTER * (np.arange(NUM_EXPOSURES) + 0.5 - NUM_EXPOSURES / 2) / NUM_EXPOSURES
-        meanwhile = [walk.pose(float(moment)) for moment in np.clip(moments, 0.0, walk.duration)]
-    return photograph(room, walk.pose(time), options.width, workers, meanwhile)
+def _exposures(walk: Walk, time: float) -> list[Pose]:
+    """The camera while the shutter is open."""
+    moments = time + SHUTTER * (np.arange(NUM_EXPOSURES) + 0.5 - NUM_EXPOSURES / 2) / NUM_EXPOSURES
+    return [walk.pose(float(moment)) for moment in np.clip(moments, 0.0, walk.duration)]
 
 
 class Person:

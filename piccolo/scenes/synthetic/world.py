@@ -28,17 +28,13 @@ TILE = 64  # side [px] of what is cast at once: rays near each other meet few bo
 
 RANGE_NOISE = 0.003  # of the scanner, standard deviation [m]
 MIN_CLEARANCE = 0.35  # of a station or camera [m]
-NUM_TRIES = 2000
 VARIANTS = ("clean", "tilt", "photo", "change")
 GAP = 0.4  # between rooms [m]
 MIN_SIZE = 2.0  # of a room, each way [m]
 MAX_SIZE = 50.0
 MAX_ROOMS = 256
 SEED_STEP = 64  # between the rooms of two seeds; larger buildings share rooms with the next seed
-MIN_POINTS = 1000  # of a room
 MAX_SIDE = 4096  # [px] of a camera's picture
-
-Named = list[tuple[str, NDArray[np.uint8]]]  # pictures (H, W, 3) by file name; "" of one that stands alone
 
 
 def free_position(room: Room, rng: np.random.Generator, heights: tuple[float, float]) -> Array:
@@ -46,7 +42,7 @@ def free_position(room: Room, rng: np.random.Generator, heights: tuple[float, fl
 
     Raises InputError if the room is so full that none is found.
     """
-    for _ in range(NUM_TRIES):
+    for _ in range(2000):
         low = np.array([MIN_CLEARANCE, MIN_CLEARANCE, heights[0]])
         high = np.array([*(room.size[:2] - MIN_CLEARANCE), heights[1]])
         position = room.corner + rng.uniform(low, high)
@@ -62,20 +58,18 @@ def scan_room(
     """Points (N, 3) [m], colours (N, 3) and labels (N,) of a room, N = num_points, from three stations."""
     num_stations = 3
     width = 2 * int(np.ceil(np.sqrt(1.15 * num_points / num_stations / 2.0)))
-    points = []
-    colors = []
-    labels = []
+    parts = []
     for station in range(num_stations):
         position = free_position(room, rng, (1.2, 1.8))
         rays = pixel_rays(width).reshape(-1, 3) @ yaw_rotation(rng.uniform(0, 2 * np.pi))
         ranges, rgb, kinds = cast_rays(room, position, rays, workers, f"scan, station {station + 1}")
         ranges = ranges + rng.normal(0.0, RANGE_NOISE, len(ranges))
-        points.append((position + ranges[:, None] * rays).astype(np.float32))
-        colors.append(np.round(rgb * 255.0).astype(np.uint8))
-        labels.append(kinds)
-    is_hit = np.isfinite(np.concatenate(points)).all(axis=1)
+        points = (position + ranges[:, None] * rays).astype(np.float32)
+        parts.append((points, np.round(rgb * 255.0).astype(np.uint8), kinds))
+    points, colors, labels = map(np.concatenate, zip(*parts, strict=True))
+    is_hit = np.isfinite(points).all(axis=1)
     chosen = np.sort(rng.choice(np.flatnonzero(is_hit), num_points, replace=False))
-    return np.concatenate(points)[chosen], np.concatenate(colors)[chosen], np.concatenate(labels)[chosen]
+    return points[chosen], colors[chosen], labels[chosen]
 
 
 def photograph(
@@ -172,23 +166,10 @@ def make_world(seed: int, size: Array, num_rooms: int = 1) -> World:
     return World(seed, tuple(rooms))
 
 
-def check_num_points(world: World, num_points: int) -> None:
-    """Refuse, before any work is done, a scan too sparse to show the rooms."""
-    if num_points < MIN_POINTS * len(world.rooms):
-        raise InputError(f"points: {num_points} are too few, use at least {MIN_POINTS} a room")
-
-
-def check_width(width: int) -> None:
-    """Refuse, before any work is done, a panorama too small or of an odd width [px]."""
-    if width < 128 or width % 2:
-        raise InputError(f"width: {width} is not an even number of at least 128")
-
-
 def scan_world(
     world: World, num_points: int, workers: Workers
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int64]]:
     """Points (num_points, 3) [m], colours (num_points, 3) and labels (num_points,) of all rooms."""
-    check_num_points(world, num_points)
     counts = np.diff(np.linspace(0, num_points, len(world.rooms) + 1).astype(int))
     rng = np.random.default_rng([world.seed, 10])
     parts = [scan_room(room, int(n), rng, workers) for room, n in zip(world.rooms, counts, strict=True)]
@@ -196,19 +177,8 @@ def scan_world(
     return np.concatenate(points), np.concatenate(colors), np.concatenate(labels)
 
 
-def room_of_query(world: World, index: int, variant: str) -> tuple[Room, np.random.Generator]:
-    """The room as query number `index` of a variant finds it, and what else of the query is drawn from."""
-    rng = np.random.default_rng([world.seed, 20, VARIANTS.index(variant), index])
-    number = int(rng.integers(len(world.rooms)))
-    room = world.rooms[number]
-    if variant == "change":
-        room = make_room(world.seed * SEED_STEP + number, room.size, room.corner, changed=index + 1)
-    return room, rng
-
-
 def make_query(world: World, index: int, variant: str, width: int, workers: Workers) -> Query:
     """Query number `index` of a variant: upright but for `tilt`, in a room drawn at random."""
-    check_width(width)
     room, pose, rng = pose_of_query(world, index, variant)
     rgb = photograph(room, pose, width, workers)
     return Query(other_light(rgb, rng) if variant == "photo" else rgb, pose, variant)
@@ -218,7 +188,11 @@ def pose_of_query(world: World, index: int, variant: str) -> tuple[Room, Pose, n
     """The room, the camera in it, and what else is drawn from, of query number `index` of a variant."""
     if variant not in VARIANTS:
         raise InputError(f"variant: {variant!r} is not one of {', '.join(VARIANTS)}")
-    room, rng = room_of_query(world, index, variant)
+    rng = np.random.default_rng([world.seed, 20, VARIANTS.index(variant), index])
+    number = int(rng.integers(len(world.rooms)))
+    room = world.rooms[number]
+    if variant == "change":
+        room = make_room(world.seed * SEED_STEP + number, room.size, room.corner, changed=index + 1)
     center_world = free_position(room, rng, (1.0, min(1.9, float(room.size[2]) - 0.4)))
     R_cam_from_world = yaw_rotation(rng.uniform(0, 2 * np.pi))
     if variant == "tilt":
@@ -228,7 +202,7 @@ def pose_of_query(world: World, index: int, variant: str) -> tuple[Room, Pose, n
 
 def make_labels(world: World, index: int, query: Query, workers: Workers) -> NDArray[np.uint16]:
     """Image (H, W) of the labels that query number `index` of its variant shows, of pixels' centres."""
-    room, _ = room_of_query(world, index, query.variant)
+    room, _, _ = pose_of_query(world, index, query.variant)
     shape = query.rgb.shape[:2]
     rays = pixel_rays(shape[1]).reshape(-1, 3) @ query.pose.R_cam_from_world
     labels = cast_rays(room, query.pose.center_world, rays, workers, "labels")[2]
@@ -250,8 +224,11 @@ def check_cameras(cameras: Calibration) -> None:
 
 def make_photos(
     world: World, index: int, variant: str, cameras: Calibration, workers: Workers
-) -> tuple[Named, Pose]:
-    """The pictures by these cameras of query number `index` of a variant, and the pose of the whole."""
+) -> tuple[list[tuple[str, NDArray[np.uint8]]], Pose]:
+    """The pictures (H, W, 3) by these cameras of query number `index` of a variant, and their rig's pose.
+
+    Each picture has a file name, "" of one that stands alone.
+    """
     room, pose, rng = pose_of_query(world, index, variant)
     if cameras.is_rig:
         pictures = [(m.image or "", picture_by(m, room, pose, workers)) for m in cameras.mounts]
