@@ -7,31 +7,20 @@ import hashlib
 import json
 import os
 import signal
-import subprocess
 import sys
 from collections import Counter
 from pathlib import Path
 from typing import ClassVar
 
 import pytest
-from rooms import write_room
+from batches import PAPER, ROOT, run, start_localize
 
 from piccolo.batch import localizer as module
 from piccolo.batch.inputs import panoramas_of
 from piccolo.cli import localize
 from piccolo.errors import InputError
 from piccolo.files.line_file import locked, whole_lines, whole_size
-from piccolo.result import Result, read_results
-
-ROOT = Path(__file__).resolve().parents[1]
-PAPER = ["--preset", "paper", "num_translations=4", "num_iterations=5", "max_points=5000"]
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """A room's cloud and three panoramas in a folder of their own."""
-    words = "--seed 7 --size 4.5 3.5 2.5 --points 60000 --panoramas 3 --width 512"
-    return write_room(tmp_path_factory.mktemp("a batch"), words)
+from piccolo.result import read_results
 
 
 @pytest.fixture
@@ -73,11 +62,8 @@ def test_folders_lists_and_standard_input_name_panoramas(scene, tmp_path):
         (cube / f"{face}.png").touch()
     (tmp_path / "photos" / "a.webp").touch()
     (tmp_path / "photos" / ".hidden.jpg").touch()
-    assert list(panoramas_of([str(tmp_path / "photos")], None, Counter())) == [
-        tmp_path / "photos/a.webp",
-        cube,
-    ]
-    assert list(panoramas_of([str(cube)], None, Counter())) == [cube]
+    found = panoramas_of([str(tmp_path / "photos"), str(cube)], None, Counter())
+    assert list(found) == [tmp_path / "photos/a.webp", cube, cube]
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="empty: a folder without a JPEG"):
         list(panoramas_of([str(tmp_path / "empty")], None, Counter()))
@@ -122,17 +108,14 @@ def test_a_file_of_another_run_is_refused_with_both_ways(scene, tmp_path, change
     photo.write_bytes(second.read_bytes())
     out, panos = tmp_path / "poses.jsonl", [str(first), str(photo)]
     assert _run(scene, out, "--quiet", pano=panos) == 0
+    (tmp_path / "other.ply").write_bytes((scene / "cloud.ply").read_bytes() + b"\0")
     more = []
     if isinstance(change, bytes):
         out.write_bytes(change)
-    elif change[0] == "--cloud":
-        other = tmp_path / "other.ply"
-        other.write_bytes((scene / "cloud.ply").read_bytes() + b"\0")
-        more = ["--cloud", str(other)]
     elif change[0] == "--pano":
         panos = [str(scene / "images" / change[1])]
     else:
-        more = change
+        more = [word.replace("other", str(tmp_path / "other.ply")) for word in change]
     before = out.read_bytes()
     assert _run(scene, out, "--quiet", *more, pano=panos) == 3
     err = capsys.readouterr().err
@@ -161,10 +144,7 @@ def test_an_unreadable_photo_is_a_line_until_its_file_is_another(scene, tmp_path
     assert {line["status"] for line in _lines(out)} == {"localized"}
 
 
-def test_photos_added_removed_changed_and_reordered_cost_only_their_own_lines(
-    scene, tmp_path, counted, capsys
-):
-    """The file is that of a new run, though each run does only what the one before has not done."""
+def test_photos_added_removed_or_changed_cost_only_their_own_lines(scene, tmp_path, counted, capsys):
     photos, out, whole = tmp_path / "photos", tmp_path / "poses.jsonl", tmp_path / "whole.jsonl"
     images = [(scene / "images" / f"clean_{k}.jpg").read_bytes() for k in range(3)]
     photos.mkdir()
@@ -197,29 +177,20 @@ def test_photos_added_removed_changed_and_reordered_cost_only_their_own_lines(
     assert (counted, _lines(out)) == ([], before)
 
 
-def test_a_batch_that_is_stopped_between_keeps_all_that_it_had(scene, tmp_path, counted):
-    """Lines that the panoramas of now do not need stay until all of these are done."""
+def test_names_that_come_on_standard_input_take_what_is_done_and_drop_nothing(
+    scene, tmp_path, monkeypatch, capsys
+):
     names = [str(scene / "images" / f"clean_{k}.jpg") for k in range(3)]
-    whole, out = tmp_path / "whole.jsonl", tmp_path / "poses.jsonl"
-    assert _run(scene, whole, *PAPER, pano=names) < 2
-    lines = whole.read_bytes().splitlines(keepends=True)
-    out.write_bytes(lines[2] + lines[0] + lines[1][:99])  # torn, while the second was written
-    assert _run(scene, out, *PAPER, pano=names[:2]) < 2
-    assert counted[3:] == ["clean_1.jpg"]
-    assert _lines(out) == _lines(whole)[:2]
-
-
-def test_names_that_come_on_standard_input_take_what_is_done_and_drop_nothing(scene, tmp_path):
-    names = [str(scene / "images" / f"clean_{k}.jpg") for k in range(3)]
-    out = tmp_path / "poses.jsonl"
-    command = [sys.executable, str(ROOT / "localize.py"), "--cloud", str(scene / "cloud.ply"), *PAPER]
-    command += ["--pano", "-", "--out", str(out)]
+    out, stdin = tmp_path / "poses.jsonl", tmp_path / "stdin"
     for given, left in ((names[:2], names[:2]), ([names[2], names[1]], [names[0], names[2], names[1]])):
         before = out.read_text().splitlines() if out.exists() else []
-        done = subprocess.run(command, input="\n".join(given), text=True, capture_output=True, check=False)
-        assert done.returncode < 2
-        assert f"{len(given)} panoramas in" in done.stderr
-        assert "dropped" not in done.stderr
+        stdin.write_text("\n".join(given))
+        with stdin.open() as file:
+            monkeypatch.setattr(sys, "stdin", file)
+            assert _run(scene, out, *PAPER, pano=["-"]) < 2
+        err = capsys.readouterr().err
+        assert f"{len(given)} panoramas in" in err
+        assert "dropped" not in err
         after = out.read_text().splitlines()
         assert [json.loads(line)["pano"] for line in after] == left
         assert set(before) <= set(after)
@@ -310,21 +281,22 @@ def test_any_name_that_a_file_may_have_is_localized(scene, tmp_path, more, capsy
     assert "Errno" not in err
 
 
-def test_any_name_in_a_list_or_on_standard_input_costs_its_own_line_at_most(scene, tmp_path):
+@pytest.mark.parametrize(("word", "begin"), [("@", b"\xef\xbb\xbf"), ("-", b"")])
+def test_any_name_in_a_list_or_on_standard_input_costs_its_own_line_at_most(
+    scene, tmp_path, monkeypatch, capsys, word, begin
+):
     image = (scene / "images" / "clean_0.jpg").read_bytes()
-    (tmp_path / os.fsdecode(b"caf\xe9.jpg")).write_bytes(image)
-    names = b"\xef\xbb\xbfx\0y.jpg\n" + b"z" * 5000 + b"\n\ncaf\xe9.jpg\r\n"
-    (tmp_path / "list.txt").write_bytes(names)
-    command = [sys.executable, str(ROOT / "localize.py"), "--cloud", str(scene / "cloud.ply"), *PAPER]
-    for word, given in (("@list.txt", b""), ("-", names[3:])):
-        done = subprocess.run(
-            [*command, "--pano", word], cwd=tmp_path, input=given, capture_output=True, check=False
-        )
-        found = [Result.from_json(line) for line in done.stdout.decode("ascii").splitlines()]
-        assert [os.fsencode(result.pano) for result in found] == [b"x\0y.jpg", b"z" * 5000, b"caf\xe9.jpg"]
-        assert [result.status == "unreadable" for result in found] == [True, True, False]
-        assert done.returncode == 3
-        assert b"embedded null byte" in done.stderr
+    names = [b"x\0y.jpg", b"z" * 5000, os.fsencode(tmp_path) + b"/caf\xe9.jpg"]
+    Path(os.fsdecode(names[2])).write_bytes(image)
+    given, out = tmp_path / "list.txt", tmp_path / "poses.jsonl"
+    given.write_bytes(begin + b"%s\n%s\n\n%s\r\n" % tuple(names))
+    with given.open() as file:
+        monkeypatch.setattr(sys, "stdin", file)
+        assert _run(scene, out, *PAPER, pano=["@" + str(given) if word == "@" else word]) == 3
+    found = read_results([out])
+    assert [os.fsencode(result.pano) for result in found] == names
+    assert [result.status == "unreadable" for result in found] == [True, True, False]
+    assert "embedded null byte" in capsys.readouterr().err
 
 
 def test_files_left_out_are_counted_and_links_to_folders_searched(scene, tmp_path, capsys):
@@ -350,32 +322,18 @@ def test_files_left_out_are_counted_and_links_to_folders_searched(scene, tmp_pat
         list(panoramas_of([str(tmp_path / "few")], None, Counter()))
 
 
-def _process(scene, out, panos, **options):
-    command = [
-        sys.executable,
-        str(ROOT / "localize.py"),
-        "--cloud",
-        str(scene / "cloud.ply"),
-        "--pano",
-        *panos,
-    ]
-    command += ["--out", str(out)] if out else []
-    return subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
-
-
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_ends_a_batch_after_the_photo_at_work(scene, tmp_path, number, code):
+def test_a_signal_ends_a_batch_after_the_photo_at_work(scene, tmp_path):
     out, name = tmp_path / "poses.jsonl", str(scene / "images" / "clean_0.jpg")
-    process = _process(scene, out, [name] * 30)
-    while "localized at" not in process.stderr.readline():
-        pass
-    process.send_signal(number)
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == code
+    words = ["--cloud", str(scene / "cloud.ply"), "--pano", *[name] * 30, "--out", str(out)]
+    with start_localize(words) as process:
+        while "localized at" not in process.stderr.readline():
+            pass
+        process.send_signal(signal.SIGINT)
+        err = process.stderr.read()
+    assert process.returncode == 130
     assert "the same command goes on from here" in err
     assert "Traceback" not in err
-    done = _lines(out)
-    assert 1 <= len(done) < 30
+    assert 1 <= len(_lines(out)) < 30
     assert out.read_bytes().endswith(b"\n")
 
 
@@ -409,19 +367,17 @@ def test_a_file_that_was_removed_before_it_was_locked_is_opened_again(tmp_path, 
 
 
 def test_a_full_disk_keeps_the_lines_before(tmp_path):
-    code = (
-        "import resource, sys\n"
-        "from pathlib import Path\n"
-        "from piccolo.files.line_file import locked\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
-        "with locked(Path(sys.argv[1])) as file:\n"
-        "    for k in range(9):\n"
-        "        file.append(str(k) * 300)\n"
-    )
+    code = """
+import resource, sys
+from pathlib import Path
+from piccolo.files.line_file import locked
+resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+with locked(Path(sys.argv[1])) as file:
+    for k in range(9):
+        file.append(str(k) * 300)
+"""
     out = tmp_path / "lines"
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(out)], cwd=ROOT, capture_output=True, text=True, check=False
-    )
+    done = run([sys.executable, "-c", code, str(out)], cwd=ROOT)
     assert "File too large" in done.stderr
     assert out.read_text() == "".join(f"{str(k) * 300}\n" for k in range(3))
 

@@ -44,9 +44,7 @@ def test_the_least_loss_is_at_the_true_pose():
     assert surface.height[3, 3] == pose.center_world[2]
     assert surface.rotation[3, 3] == 0
     assert surface.loss[3, 3] < 0.8 * np.median(surface.loss)
-    assert surface.is_free[3, 3]
     assert 1 <= surface.num_minima() < 12
-    assert grid.num_poses == 7 * 7 * 3 * 24
 
 
 def test_a_place_has_the_least_of_its_losses_with_the_same_bits_on_any_number_of_threads():
@@ -146,25 +144,22 @@ def test_a_cloud_with_another_axis_up(run, scene, tmp_path):
     R_z_up = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     turned = Pose(truth.R_cam_from_world @ R_z_up, R_z_up.T @ truth.center_world)
     poses.write_results(tmp_path / "pose.json", [poses.result("clean_0.jpg", turned)])
-    arguments = ["--up", "y", "--result", tmp_path / "pose.json", "--step", STEP]
-    code, told, err = run("--cloud", cloud, *arguments, "--out", tmp_path / "a.png")
+    files = ["--cloud", cloud, "--result", tmp_path / "pose.json", "--out", tmp_path / "a.png"]
+    code, told, err = run(*files, "--up", "y", "--step", STEP)
     assert (code, err) == (0, "")
     assert told["distance_to_found"] < STEP
     assert np.linalg.norm(told["lowest_world"] - turned.center_world) < STEP
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--out", "a.jpg"], "--out a.jpg: wanted a name that ends with .png"),
-        (["--out", "a.png", "--step", 0], "--step 0.0: wanted metres above 0"),
-        (["--out", "a.png", "--step", "nan"], "--step nan"),
-    ],
-)
-def test_wrong_usage(run, arguments, message):
-    code, told, err = run(*arguments)
-    assert (code, told) == (2, None)
-    assert message in err
+def test_wrong_usage(run):
+    for words, message in (
+        ("--out a.jpg", "--out a.jpg: wanted a name that ends with .png"),
+        ("--out a.png --step 0", "--step 0.0: wanted metres above 0"),
+        ("--out a.png --step nan", "--step nan"),
+    ):
+        code, told, err = run(*words.split())
+        assert (code, told) == (2, None)
+        assert message in err
 
 
 def test_bad_input_leaves_nothing(run, scene, tmp_path):
