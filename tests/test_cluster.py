@@ -22,9 +22,8 @@ def _dask(log, *words):
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "dask", *words, "--host", "127.0.0.1", "--no-dashboard"]
     with log.open("w") as file:
-        return subprocess.Popen(
-            command, cwd=log.parent, env=environment, stdout=file, stderr=subprocess.STDOUT
-        )
+        options = {"cwd": log.parent, "env": environment, "stdout": file, "stderr": subprocess.STDOUT}
+        return subprocess.Popen(command, **options)
 
 
 @pytest.fixture(scope="module")

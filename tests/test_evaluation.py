@@ -64,10 +64,8 @@ def test_errors_of_a_query_and_the_thresholds_of_the_paper(tmp_path):
     assert row.is_correct()
     assert not row.is_correct(Thresholds(max_distance=0.04))
     assert not row.is_correct(Thresholds(max_angle=np.radians(2.0)))
-    found = [
-        is_correct(pose, TRUE_POSE) for pose in (_pose(0.09, 4.9), _pose(0.11, 0.0), _pose(0.0, 5.1), None)
-    ]
-    assert found == [True, False, False, False]
+    poses = _pose(0.09, 4.9), _pose(0.11, 0.0), _pose(0.0, 5.1), None
+    assert [is_correct(pose, TRUE_POSE) for pose in poses] == [True, False, False, False]
 
 
 @pytest.mark.parametrize("row", ROWS)
@@ -107,14 +105,11 @@ def test_summary_accuracies_and_quartiles_of_errors_some_of_which_are_infinite()
     assert (summary.num_queries, summary.num_correct, summary.num_localized) == (4, 2, 2)
     assert (summary.num_wrong, summary.accuracy) == (1, 0.5)
     assert summary.position_quartiles[1] == pytest.approx(0.06)
-    assert tables.accuracies(ROWS, np.radians(10.0)) == [0.25, 0.5, 0.75, 0.75, 0.75, 0.75]
 
 
 def test_risk_over_coverage():
-    rows = [
-        _row(f"{k}.jpg", 0.0 if is_right else 1.0, 0.0, confidence=confidence)
-        for k, (confidence, is_right) in enumerate([(0.9, True), (0.5, False), (0.95, True), (0.5, True)])
-    ]
+    errors = {"a": (0.9, 0.0), "b": (0.5, 1.0), "c": (0.95, 0.0), "d": (0.5, 0.0)}
+    rows = [_row(name, error, 0.0, confidence=sure) for name, (sure, error) in errors.items()]
     points = tables.risk_and_coverage(rows)
     found = [(p.confidence, p.coverage, p.num_wrong) for p in points]
     assert found == [(0.95, 0.25, 0), (0.9, 0.5, 0), (0.5, 1.0, 1)]
@@ -130,7 +125,11 @@ def test_tables_have_a_line_a_split_a_room_and_all():
     names = [line.split(" | ")[0] for line in text.splitlines()[4:]]
     assert names == ["| clean", "| photo", "| hall", "| room", "| all"]
     assert text.splitlines()[7].startswith("| room | 2 | 2 | 1.000 | 0.0150 | 0.0200 | 0.0250 | 0.250 | 0.3")
-    assert "| all | 0.250 | 0.500 | 0.500 |" in tables.threshold_table(ROWS, PAPER_THRESHOLDS).markdown()
+    for angle_deg, line in (
+        (5.0, "| all | 0.250 | 0.500 | 0.500 |"),
+        (10.0, "| all | 0.250 | 0.500 | 0.750 |"),
+    ):
+        assert line in tables.threshold_table(ROWS, Thresholds(max_angle=np.radians(angle_deg))).markdown()
     assert "| hall | d.jpg | not_localized | inf | inf | 0.000 |" in tables.per_query(ROWS).markdown()
 
 
@@ -183,7 +182,7 @@ def test_a_run_is_resumed_after_its_last_whole_line(tmp_path):
     path = tmp_path / "run.jsonl"
     path.write_text("".join(row.to_json() + "\n" for row in ROWS[:2]) + ROWS[2].to_json()[:50])
     rows, size = read_run(path)
-    assert [row.image for row in rows] == ["a.jpg", "b.jpg"]
+    assert len(rows) == 2
     assert path.read_bytes()[size:] == ROWS[2].to_json()[:50].encode()
     path.write_text('{"my": "notes"}')
     assert_refused("its end is no line of a run of tools/evaluate.py", read_run, path)

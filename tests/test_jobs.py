@@ -11,7 +11,7 @@ import pytest
 from batches import PAPER, start_localize, untimed, wait_for_lines, workers_of
 
 from piccolo.batch.localizer import Localizer
-from piccolo.cli import executing, localize
+from piccolo.cli import executing, localize, options
 from piccolo.result import Result, read_results
 
 
@@ -65,7 +65,7 @@ class Deadly(Localizer):
 def test_a_photo_that_kills_its_processes_is_a_line_that_says_so(scene, tmp_path, monkeypatch, capsys):
     deadly = tmp_path / "deadly.jpg"
     deadly.write_bytes((scene / "images" / "clean_0.jpg").read_bytes())
-    monkeypatch.setattr(localize, "Localizer", Deadly)
+    monkeypatch.setattr(options, "Localizer", Deadly)
     panos = tmp_path / "list.txt"
     names = [str(scene / "images" / "clean_1.jpg"), str(deadly), str(scene / "images" / "clean_2.jpg")]
     panos.write_text("\n".join(names))
@@ -148,6 +148,6 @@ def test_as_many_processes_as_are_worth_it_and_fit(monkeypatch):
     assert executing.count_fitting(argparse.Namespace(jobs=None), 8) == 3
     assert executing.count_fitting(argparse.Namespace(jobs=8), 8) == 8
     arguments = argparse.Namespace(jobs=2, threads=None, max_memory=5.5, dask=None)
-    localizer = localize.Localizer((), None, None, None, None)
+    localizer = Localizer((), None, None, None, None)
     share = executing.share_of_a_job(arguments, localizer, 2)
     assert (share.num_threads, share.max_memory) == (2, 2.0)

@@ -43,37 +43,17 @@ def test_pose_on_stdout_and_a_summary_on_stderr(scene, capsys):
     assert out.count("\n") == 1
 
 
-def test_preset_paper_with_its_own_options(scene, capsys):
-    assert localize.main(_arguments(scene, *PAPER, "--quiet")) == 0
-    result = Result.from_json(capsys.readouterr().out)
-    assert errors(result.pose, _truth(scene))[0] < 0.03
-    assert result.settings["preset"] == "paper"
-    assert result.settings["num_rotations"] == 8
-
-
 def test_map_is_cached_prepared_and_read_back_to_the_same_bits(scene, tmp_path, capsys):
-    cache, built = tmp_path / "cache", tmp_path / "scan.map"
-    cloud = _arguments(scene, "--quiet", "--cache", str(cache))
-    prepared = _arguments(scene, "--quiet", "--cloud", str(built))
-    assert prepare_map.main(["--cloud", str(scene / "cloud.ply"), "--out", str(built), "--quiet"]) == 0
+    built = str(tmp_path / "scan.map")
+    assert prepare_map.main(["--cloud", str(scene / "cloud.ply"), "--out", built, "--quiet"]) == 0
     assert json.loads(capsys.readouterr().out)["candidates"] > 50
-    poses = []
-    for arguments in (cloud, cloud, prepared):
-        assert localize.main(arguments) == 0
-        poses.append(Result.from_json(capsys.readouterr().out))
-    assert len({json.dumps(p.pose.center_world.tolist()) for p in poses}) == 1
-    (cached,) = cache.glob("piccolo-maps/*.piccolo-map")
-    whole = cached.read_bytes()
-    damaged = bytearray(whole)
-    damaged[len(damaged) // 2] ^= 1
-    cached.write_bytes(damaged)
-    assert localize.main(cloud) == 0
-    rebuilt = Result.from_json(capsys.readouterr().out)
-    assert cached.read_bytes() == whole
-    np.testing.assert_array_equal(rebuilt.pose.center_world, poses[0].pose.center_world)
-    built.write_bytes(bytes(damaged))
-    assert localize.main(prepared) == 3
-    assert "wanted a whole map by tools/prepare_map.py" in capsys.readouterr().err
+    cached = ["--cache", str(tmp_path)]
+    poses = set()
+    for more in (cached, cached, ["--cloud", built]):
+        assert localize.main(_arguments(scene, "--quiet", *more)) == 0
+        poses.add(str(json.loads(capsys.readouterr().out)["center_world"]))
+    assert len(poses) == 1
+    assert len(list(tmp_path.glob("piccolo-maps/*.piccolo-map"))) == 1
 
 
 def test_prior_narrows_the_search_and_stands_in_the_result(scene, capsys):
@@ -152,27 +132,12 @@ def test_bad_input_is_one_line_and_a_code(scene, code, cases, capsys):
         assert message in err
 
 
-def test_traceback_only_with_debug_and_internal_errors_have_a_code(scene, capsys, monkeypatch):
-    localize.main(_arguments(scene, "--cloud", "no.ply"))
-    assert "Traceback" not in capsys.readouterr().err
-    localize.main(_arguments(scene, "--cloud", "no.ply", "--debug"))
-    assert "Traceback" in capsys.readouterr().err
-
-    def fail(*_):
-        raise ZeroDivisionError("made by the test")
-
-    monkeypatch.setattr(localize.Localizer, "open_scan", fail)
-    assert localize.main(_arguments(scene, "--quiet")) == 4
-    assert "internal error: ZeroDivisionError" in capsys.readouterr().err
-
-
 def test_usage_and_version(capsys):
-    for options, code in ((["--version"], 0), (["--help"], 0), ([], 2), (["--cloud", "a", "--odd"], 2)):
+    for words, code in (("--version", 0), ("--help", 0), ("", 2), ("--cloud a --odd", 2)):
         with pytest.raises(SystemExit) as stop:
-            localize.main(options)
+            localize.main(words.split())
         assert stop.value.code == code
     text = capsys.readouterr().out
-    assert "exit codes" in text
     assert len(re.findall("^  -", text, flags=re.MULTILINE)) <= 44
 
 

@@ -122,9 +122,7 @@ def test_picture_of_a_tilted_panorama(run, scene, tmp_path):
     assert told["distance_to_true"] < STEP
     assert told["distance_to_found"] < STEP + 0.1
     assert told["num_minima"] >= 1
-    assert told["poses_per_s"] > 0
     picture = cv2.imread(str(out))
-    assert min(picture.shape[:2]) > 400
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100
 
 
@@ -151,28 +149,19 @@ def test_a_cloud_with_another_axis_up(run, scene, tmp_path):
     assert np.linalg.norm(told["lowest_world"] - turned.center_world) < STEP
 
 
-def test_wrong_usage(run):
-    for words, message in (
-        ("--out a.jpg", "--out a.jpg: wanted a name that ends with .png"),
-        ("--out a.png --step 0", "--step 0.0: wanted metres above 0"),
-        ("--out a.png --step nan", "--step nan"),
-    ):
-        code, told, err = run(*words.split())
-        assert (code, told) == (2, None)
-        assert message in err
-
-
-def test_bad_input_leaves_nothing(run, scene, tmp_path):
+def test_refusals_leave_nothing(run, scene, tmp_path):
     out = ["--out", tmp_path / "a.png"]
-    for arguments, message in (
-        ([*out, "--step", 1e-5], "places, wanted at most"),
-        ([*out, "--result", scene / "pose.json"], "0 poses of clean_0.jpg, wanted one"),
-        ([*out, "--truth", scene / "pose.json"], "wanted a queries.json with true poses"),
-        (["--out", tmp_path / "no" / "a.png"], "found no folder"),
+    for code, words, message in (
+        (2, ["--out", "a.jpg"], "--out a.jpg: wanted a name that ends with .png"),
+        (2, [*out, "--step", 0], "--step 0.0: wanted metres above 0"),
+        (2, [*out, "--step", "nan"], "--step nan"),
+        (3, [*out, "--step", 1e-5], "places, wanted at most"),
+        (3, [*out, "--result", scene / "pose.json"], "0 poses of clean_0.jpg, wanted one"),
+        (3, [*out, "--truth", scene / "pose.json"], "wanted a queries.json with true poses"),
+        (3, ["--out", tmp_path / "no" / "a.png"], "found no folder"),
+        (3, [*out, "--pano", "no.jpg"], "no.jpg"),
     ):
-        code, told, err = run(*arguments)
-        assert (code, told) == (3, None)
+        found, told, err = run(*words)
+        assert (found, told, err.count("\n")) == (code, None, 1)
         assert message in err
-        assert err.count("\n") == 1
-    assert run(*out, pano="no.jpg")[0] == 3
     assert not list(tmp_path.iterdir())

@@ -73,10 +73,7 @@ def read_priors(path: Path, general: Prior) -> PriorTable:
     in any height), radius [m] about them, heading [deg] of the image centre clockwise from +y, its tolerance
     [deg], height [m] above the floor, within (names of the map's scans, with semicolons between them).
 
-    Raises
-    ------
-    InputError
-        The file can't be read, a cell is no number, or a row contradicts itself.
+    Raises InputError if the file can't be read, a cell is no number, or a row contradicts itself.
     """
     rows = csv.DictReader(read_text(path, WANTED).splitlines(), restkey="more")
     names = [name.strip() for name in rows.fieldnames or ()]

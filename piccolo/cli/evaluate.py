@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ..batch.localizer import Localizer
 from ..errors import InputError
 from ..files.atomic import is_stream, write_atomically
 from ..jobs.memory import limit_memory
@@ -29,9 +28,7 @@ from .options import (
     add_method_options,
     add_panorama_reading_options,
     cache_from,
-    cloud_settings_from,
-    read_options_from,
-    settings_from,
+    localizer_from,
 )
 from .outputs import check_distinct, check_outputs, check_suffix, print_report
 
@@ -167,13 +164,7 @@ def main(arguments: argparse.Namespace) -> int:
     check_usage(arguments)
     with checking_options():
         limit_memory(arguments.max_memory)
-        config = Localizer(
-            (),
-            settings_from(arguments),
-            cloud_settings_from(arguments),
-            read_options_from(arguments),
-            cache_from(arguments),
-        )
+        config = localizer_from(arguments)
     thresholds = Thresholds(arguments.max_distance, float(np.radians(arguments.max_angle)))
     scenes = find_scenes(arguments.scenes or [])
     check_files(arguments, input_files(scenes))

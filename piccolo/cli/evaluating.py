@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import signal
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -18,7 +19,7 @@ from ..scan import Scan, settings_json
 from ..scenes.evaluation.query_result import QueryResult, is_in_box, query_result_of
 from ..scenes.evaluation.runs import check_run, check_variants, read_run
 from ..scenes.scene import Query, Scene
-from .errors import EXIT_BAD_INPUT, print_error
+from .errors import EXIT_BAD_INPUT, Terminated, print_error
 from .executing import Interruption, connecting, count_jobs, executing, interruptible
 from .progress import progress_bar
 
@@ -41,12 +42,8 @@ def run_scenes(
     with locked(path) as file, ExitStack() as stack:
         rows, size = read_run(path)
         check_run(path, rows, scenes, {"settings": json.loads(json.dumps(settings))})
-        keys = {
-            (scene.name, scene.name_of(query))
-            for scene in scenes
-            for query in scene.queries
-            if not variants or query.variant in variants
-        }
+        pairs = [(scene, query) for scene in scenes for query in scene.queries]
+        keys = {(s.name, s.name_of(q)) for s, q in pairs if not variants or q.variant in variants}
         open_keys = keys - {row.key for row in rows}
         found = ((s, [q for q in s.queries if (s.name, s.name_of(q)) in open_keys]) for s in scenes)
         left = [(scene, queries) for scene, queries in found if queries]
@@ -59,7 +56,8 @@ def run_scenes(
                 for scene, queries in left:
                     if not interruption.number:
                         evaluation.localize(scene, queries, cluster, interruption)
-            interruption.raise_again()
+            if interruption.number:
+                raise Terminated if interruption.number == signal.SIGTERM else KeyboardInterrupt
     return [row for row in evaluation.rows if row.key in keys], evaluation.num_failed
 
 

@@ -127,9 +127,8 @@ def main(arguments: argparse.Namespace) -> int:
     with checking_options():
         check_usage(arguments)
     outputs = {"--out": arguments.out}
-    check_outputs(
-        outputs, [*arguments.cloud, arguments.pano, *filter(None, (arguments.result, arguments.truth))]
-    )
+    inputs = [*arguments.cloud, arguments.pano, arguments.result, arguments.truth]
+    check_outputs(outputs, filter(None, inputs))
     new_figure()  # now: where matplotlib is missing, the work would be lost
 
     workers = Workers(num_cores(), progress_bar(arguments.quiet))

@@ -15,7 +15,8 @@ from ..camera.files import read_calibration
 from ..cloud.soa import LocalCloud
 from ..errors import InputError
 from ..files.atomic import check_output, check_output_folder, is_stream, replacing_folder, write_atomically
-from ..geometry.pose import Pose, pose_errors
+from ..files.json_file import read_text
+from ..geometry.pose import Pose, checked_rotation, orthonormal, pose_errors
 from ..geometry.rotations import R_cam_from_angles
 from ..jobs.threads import Workers, num_cores
 from ..optimize.descent_animation import (
@@ -42,7 +43,6 @@ from .errors import checking_options
 from .options import add_cloud_options, cloud_settings_from
 from .outputs import check_distinct, check_suffix, print_report
 from .progress import progress_bar
-from .transform_file import read_pose_matrix
 
 EPILOG = """\
 examples:
@@ -58,6 +58,8 @@ An output - is stdout: PNG, of --animate GIF. One JSON object a picture on stdou
 """
 MAX_WIDTH = 32_768
 MIN_WIDTH = 16
+MAX_POSE_FILE = 65_536  # [byte] sixteen numbers and some comments
+MAX_SKEW = 1e-3  # off a rotation, for matrices written with few digits
 DESCENT_WIDTH = 1024  # of the panorama
 DESCENT = DescentSettings(solver="adam")
 START_DISTANCE = 0.3  # of a descent from the pose [m]
@@ -183,6 +185,24 @@ def poses_from(arguments: argparse.Namespace) -> list[Shot]:
     if len(found) > 1 and (arguments.animate or not is_folder(arguments.out)):
         raise InputError(f"{file}: {len(found)} poses; choose one with --pano NAME, or give --out FOLDER")
     return found
+
+
+def read_pose_matrix(path: Path) -> Pose:
+    """Return the pose of T_world_from_cam, 4 x 4 numbers in a text file; comments begin with #."""
+    wanted = "wanted the 4 x 4 numbers of T_world_from_cam"
+    lines = read_text(path, wanted, MAX_POSE_FILE).splitlines()
+    rows = [line.replace(",", " ").split() for line in lines if line.split("#")[0].strip()]
+    try:
+        T = np.array(rows, dtype=np.float64)
+    except ValueError as error:  # words, lines of several lengths
+        raise InputError(f"{path}: found {error}, {wanted}") from error
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        shape = " x ".join(map(str, T.shape))
+        raise InputError(f"{path}: found {shape} numbers, not all finite or not as many, {wanted}")
+    if not np.allclose(T[3], [0.0, 0.0, 0.0, 1.0]):
+        raise InputError(f"{path}: the last row is not 0 0 0 1, {wanted}")
+    R_world_from_cam = checked_rotation(T[:3, :3], MAX_SKEW, f"{path}: the matrix on the left")
+    return Pose(orthonormal(R_world_from_cam).T, T[:3, 3])
 
 
 def shot_of(pano: str, pose: Pose, mounts: tuple[Mount, ...]) -> Shot:

@@ -39,10 +39,7 @@ experiments:
 Writes OUT/NAME.md and OUT/NAME/CONDITION_PRESET.jsonl, runs that tools/evaluate.py compares.
 The same command resumes an experiment that was stopped. Changed clouds and images are temporary.
 """
-PRESETS: dict[str, Settings] = {
-    "paper": PaperSettings(),
-    "default": CoarseToFineSettings(gravity="known"),
-}
+PRESETS: dict[str, Settings] = {"paper": PaperSettings(), "default": CoarseToFineSettings(gravity="known")}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -39,10 +39,9 @@ def check_memory(num_bytes: float, purpose: str, advice: str) -> None:
     """Refuse what needs more bytes than may still be taken; `purpose` begins the line, `advice` ends it."""
     room = memory_left()
     if num_bytes > room:
+        needs = f"{purpose} needs {num_bytes / GB:.2g} GB of memory"
         left = f"{max(room, 0.0) / GB:.2g} GB may be taken"
-        raise ResourceError(
-            f"{purpose} needs {num_bytes / GB:.2g} GB of memory, {left}; {advice}, or raise --max-memory"
-        )
+        raise ResourceError(f"{needs}, {left}; {advice}, or raise --max-memory")
 
 
 def memory_left() -> float:
@@ -62,9 +61,8 @@ def check_address_space() -> None:
     """Raise a MemoryError where `ulimit -v` leaves too little for errors to be raised as they should."""
     left = free_of_process()
     if left < LEAST_LEFT:
-        raise MemoryError(
-            f"ulimit -v leaves {max(left, 0.0) / GB:.2g} GB, wanted {LEAST_LEFT / GB:g} or more"
-        )
+        wanted = f"wanted {LEAST_LEFT / GB:g} or more"
+        raise MemoryError(f"ulimit -v leaves {max(left, 0.0) / GB:.2g} GB, {wanted}")
 
 
 def free_of_machine() -> float:

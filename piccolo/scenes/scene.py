@@ -124,9 +124,8 @@ def _walk_of(entry: dict[str, Any]) -> tuple[str | None, float | None, bool]:
     """A frame's walk and time, and whether it has an answer; ValueError if they are none."""
     walk, time, is_answerable = entry.get("walk"), entry.get("time"), entry.get("answerable", True)
     if (walk is None) != (time is None) or not isinstance(is_answerable, bool):
-        raise ValueError(
-            f"{entry['image']}: a walk without a time, or an answerable that is not true or false"
-        )
+        text = "a walk without a time, or an answerable that is not true or false"
+        raise ValueError(f"{entry['image']}: {text}")
     if walk is None:
         return None, None, is_answerable
     if not isinstance(walk, str) or not walk.isprintable():

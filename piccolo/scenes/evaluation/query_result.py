@@ -110,11 +110,8 @@ def frames_of_video(pairs: Sequence[tuple[Scene, Query]], pano: str) -> list[tup
         return []
     walk = Path(found[1]).stem
     time = float(found[2])
-    return [
-        pair
-        for pair in pairs
-        if pair[1].walk == walk and abs((pair[1].time or 0.0) - time) < MAX_TIME_DIFFERENCE
-    ]
+    of_walk = [pair for pair in pairs if pair[1].walk == walk]
+    return [pair for pair in of_walk if abs((pair[1].time or 0.0) - time) < MAX_TIME_DIFFERENCE]
 
 
 def match_results(

@@ -31,9 +31,7 @@ def check_run(
     path: Path, rows: Sequence[QueryResult], scenes: Sequence[Scene], expected: Mapping[str, Any]
 ) -> None:
     """Refuse rows that were made with other settings than the expected, other true poses or other scenes."""
-    queries = {
-        (scene.name, scene.name_of(query)): (scene, query) for scene in scenes for query in scene.queries
-    }
+    queries = {(s.name, s.name_of(query)): (s, query) for s in scenes for query in s.queries}
     for row in rows:
         found = {"line": path, "settings": row.result.settings}
         check_as_expected(found, expected, "choose another file")
