@@ -163,10 +163,8 @@ class Interruption:
                 self.is_at_work = False
                 if self.number:
                     break
-            for item in after:
-                self.is_at_work = True
-                yield item
-                self.is_at_work = False
+            self.is_at_work = True
+            yield from after
         finally:
             self.is_at_work = False
 
