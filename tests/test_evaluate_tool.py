@@ -17,7 +17,7 @@ from piccolo.cli import evaluate
 from piccolo.jobs import memory
 from piccolo.panorama import picture
 from piccolo.result import Source
-from piccolo.scenes.evaluation.runs import read_run
+from piccolo.scenes.evaluation.query_result import read_run
 from piccolo.scenes.scene import Query, read_scene, write_queries
 
 QUICK = ["--quiet", "--preset", "paper", "max_points=20000", "num_translations=12", "num_iterations=30"]

@@ -19,8 +19,8 @@ from piccolo.scenes.evaluation.query_result import (
     Thresholds,
     match_results,
     query_result_of,
+    read_run,
 )
-from piccolo.scenes.evaluation.runs import read_run
 from piccolo.scenes.scene import Query, Scene
 
 TRUE_POSE = Pose(exp_so3(np.array([0.4, 0.1, -2.0])), np.array([10.0, -4.0, 1.5]))

@@ -8,7 +8,7 @@ from rooms import errors, write_room
 
 from piccolo.cli import evaluate, localize, prepare_map
 from piccolo.result import Result
-from piccolo.scenes.evaluation.runs import read_run
+from piccolo.scenes.evaluation.query_result import read_run
 from piccolo.scenes.scene import read_scene
 from piccolo.scenes.synthetic.room import LABEL_NAMES
 

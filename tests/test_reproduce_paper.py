@@ -17,7 +17,7 @@ from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama import read_panorama
 from piccolo.panorama.texels import pack_texels
 from piccolo.paper.settings import PaperSettings
-from piccolo.scenes.evaluation.runs import read_run
+from piccolo.scenes.evaluation.query_result import read_run
 from piccolo.scenes.reproduce_paper import (
     EXPERIMENTS,
     flipped,

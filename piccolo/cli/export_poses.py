@@ -10,7 +10,7 @@ from ..errors import InputError
 from ..geometry.rotations import CAMERA_AXES
 from ..result import Result, check_scan, read_results
 from ..scan_map.open_map import CachePolicy, scan_sha256_of
-from ..scenes.evaluation.runs import input_files
+from ..scenes.evaluation.query_result import input_files
 from ..scenes.export import FORMATS, Options, Selection, export, select, true_results
 from ..scenes.export.formats import offset_file
 from ..scenes.scene import find_scenes

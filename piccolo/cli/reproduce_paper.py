@@ -15,13 +15,12 @@ from ..localization.settings import CoarseToFineSettings
 from ..panorama import ReadOptions
 from ..paper.settings import PaperSettings
 from ..scan_map.open_map import CachePolicy
-from ..scenes.evaluation.query_result import QueryResult
-from ..scenes.evaluation.runs import input_files
+from ..scenes.evaluation.query_result import QueryResult, input_files
 from ..scenes.reproduce_paper import EXPERIMENTS, Condition, Settings, table
 from ..scenes.scene import Scene, find_scenes
 from .command import check_least, command, option
 from .errors import EXIT_BAD_INPUT, checking_options, print_error
-from .evaluating import run_scenes
+from .evaluate import run_scenes
 from .executing import check_execution
 from .options import add_execution_options
 from .outputs import check_distinct, check_folder_name
