@@ -169,10 +169,12 @@ class Result:
             matrix = document["covariance"]
             about = document["least_constrained_direction"]
             gps = document["gps_prior"]
+            source = {f.name: document[f.name] for f in fields(Source)}
+            size = source.pop("image_size")
             given: dict[str, Any] = {
                 "cloud": cloud if isinstance(cloud, str) else _paths(cloud),
                 "best_pose": None if best is None else _pose_from_json(best),
-                "source": _source_from_json(document),
+                "source": Source(image_size=size and tuple(size), **source),
                 "cameras": mounts_of(document["camera"]) if document.get("camera") else (),
                 "focal_length": document["focal_length"] and FocalLength(**document["focal_length"]),
                 "gps_prior": gps and GpsPrior(**gps | {"center_world": tuple(gps["center_world"])}),
@@ -236,7 +238,6 @@ def _pose_json(pose: Pose | None) -> dict[str, object] | None:
 
 
 def _alternative_json(alternative: Alternative) -> dict[str, object]:
-    """An alternative: its pose as rotation and centre, and what speaks for it."""
     numbers = {f.name: getattr(alternative, f.name) for f in fields(alternative) if f.name != "pose"}
     return _rotation_and_center(alternative.pose) | numbers
 
@@ -262,11 +263,6 @@ def _walk_from_json(value: dict[str, Any]) -> WalkFrame:
         pose = None if alone["R_cam_from_world"] is None else _pose_from_json(alone)
         alone = Alone(alone["status"], alone["confidence"], pose)
     return WalkFrame(value["time"], value["frame"], value["how"], alone, gap and Gap(**gap))
-
-
-def _source_from_json(document: dict[str, Any]) -> Source:
-    values = {f.name: document[f.name] for f in fields(Source)}
-    return Source(**values | {"image_size": values["image_size"] and tuple(values["image_size"])})
 
 
 def _place(alternative: Alternative) -> str:

@@ -36,7 +36,7 @@ def system(tmp_path, monkeypatch):
     (tmp_path / "self/statm").write_text(f"500000 {10**9 // resource.getpagesize()} 9\n")
     monkeypatch.setattr(memory, "PROC", tmp_path)
     monkeypatch.setattr(memory, "CGROUPS", tmp_path / "cgroup")
-    monkeypatch.setattr(memory, "LIMIT", memory.Limit())
+    monkeypatch.setattr(memory, "LIMIT", [])
     return tmp_path
 
 

@@ -31,11 +31,9 @@ class PriorTable:
 
     def prior_of(self, pano: Path, general: Prior) -> Prior:
         """Return the prior of a panorama, found by its path as given, or else by its file name."""
-        name = next((name for name in (str(pano), pano.name) if name in self.by_name), None)
-        if name is None:
-            return general
+        name = str(pano) if str(pano) in self.by_name else pano.name
         self.used.add(name)
-        return self.by_name[name]
+        return self.by_name.get(name, general)
 
     def check_scans(self, scan_map: ScanMap) -> None:
         """Refuse names that no scan of a map has."""

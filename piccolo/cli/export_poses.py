@@ -81,8 +81,7 @@ def notes_on(selection: Selection) -> Iterable[str]:
         num_left_out = sum(selection.left_out.values())
         reasons = ", ".join(f"{count} {reason}" for reason, count in selection.left_out.items())
         yield f"left out {num_left_out} of {num_left_out + len(selection.results)} results: {reasons}"
-    if len(selection.clouds) > 1:
-        num_clouds = len(selection.clouds)
+    if (num_clouds := len(selection.clouds)) > 1:
         yield f"poses in {num_clouds} clouds are taken as in one coordinate system; --cloud chooses"
 
 

@@ -116,8 +116,7 @@ def _query(folder: Path, number: int, entry: dict[str, Any]) -> Query:
     labels = folder / entry["labels"] if entry.get("labels") else None
     cameras = mounts_of(entry["camera"]) if entry.get("camera") else ()
     pose = Pose(R_cam_from_world, center_world)
-    more = _walk_of(entry)
-    return Query(folder / entry["image"], entry["variant"], pose, labels, cameras, *more)
+    return Query(folder / entry["image"], entry["variant"], pose, labels, cameras, *_walk_of(entry))
 
 
 def _walk_of(entry: dict[str, Any]) -> tuple[str | None, float | None, bool]:
