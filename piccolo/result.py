@@ -4,7 +4,7 @@ import json
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -73,9 +73,7 @@ class Result:
     probability_none: float | None = None  # that neither the pose nor an alternative is right, if known
     storey: int | None = None  # in which the best pose lies, 1 the lowest; None where no floor was found
     height_above_floor: float | None = None  # [m] of the best pose, above the floor there
-    walk: WalkFrame | None = (
-        None  # of a frame of a walk, whose status, pose and covariance are then the walk's
-    )
+    walk: WalkFrame | None = None  # of a frame of one, whose status, pose and covariance are then the walk's
 
     @property
     def is_calibrated(self) -> bool:
@@ -118,9 +116,8 @@ class Result:
         if self.covariance is not None:
             mm = 1000.0 * self.covariance.largest_std
             deg = self.covariance.std_deg.max()
-            lines.append(
-                f"  one sigma {mm:.1f} mm ({self.covariance.least_constrained_direction}), {deg:.2f} deg"
-            )
+            direction = self.covariance.least_constrained_direction
+            lines.append(f"  one sigma {mm:.1f} mm ({direction}), {deg:.2f} deg")
         if self.status == AMBIGUOUS:
             lines += [f"  or {_place(h)}" for h in self.alternatives]
         return "\n".join(lines)
@@ -167,21 +164,28 @@ class Result:
         """Read back what `to_json` wrote; any other text is an InputError."""
         with document_of(text, FORMAT, "result") as document:
             cloud = document.pop("cloud")
-            return cls(
-                cloud=cloud if isinstance(cloud, str) else _paths(cloud),
-                best_pose=_best_pose_from_json(document),
-                source=_source_from_json(document),
-                cameras=mounts_of(document["camera"]) if document.get("camera") else (),
-                focal_length=document["focal_length"] and FocalLength(**document["focal_length"]),
-                gps_prior=_gps_prior_from_json(document["gps_prior"]),
-                evidence=document["evidence"] and Evidence(**document["evidence"]),
-                alternatives=tuple(map(_alternative_from_json, document["alternatives"])),
-                covariance=_covariance_from_json(document),
-                height_above_floor=document["height_above_floor_m"],
-                walk=document["walk"] and _walk_from_json(document["walk"]),
-                warnings=tuple(document["warnings"]),
-                **{name: document[name] for name in _PLAIN_FIELDS},
-            )
+            best = document if document["status"] == LOCALIZED else document["best_guess"]
+            matrix = document["covariance"]
+            about = document["least_constrained_direction"]
+            gps = document["gps_prior"]
+            source = {f.name: document[f.name] for f in fields(Source)}
+            size = source.pop("image_size")
+            given: dict[str, Any] = {
+                "cloud": cloud if isinstance(cloud, str) else _paths(cloud),
+                "best_pose": None if best is None else _pose_from_json(best),
+                "source": Source(image_size=size and tuple(size), **source),
+                "cameras": mounts_of(document["camera"]) if document.get("camera") else (),
+                "focal_length": document["focal_length"] and FocalLength(**document["focal_length"]),
+                "gps_prior": gps and GpsPrior(**gps | {"center_world": tuple(gps["center_world"])}),
+                "evidence": document["evidence"] and Evidence(**document["evidence"]),
+                "alternatives": tuple(map(_alternative_from_json, document["alternatives"])),
+                "covariance": None if matrix is None else PoseCovariance(np.array(matrix), about),
+                "height_above_floor": document["height_above_floor_m"],
+                "walk": document["walk"] and _walk_from_json(document["walk"]),
+                "warnings": tuple(document["warnings"]),
+            }
+            plain = {f.name: document[f.name] for f in fields(cls) if f.name not in given}
+            return cls(**given, **plain)
 
 
 def result_of(found: Localization, warnings: tuple[str, ...] = (), **about: Any) -> Result:
@@ -215,26 +219,6 @@ def unreadable_result(
     return Result(status, 0.0, cloud, pano, None, None, None, (), None, {}, error=error, **more)
 
 
-def named(result: Result, path: Path, pano: Path) -> Result:
-    """The result of a photo that was read at `path` under the name that was given for it."""
-    warnings = tuple(warning.replace(str(path), str(pano)) for warning in result.warnings)
-    return replace(result, pano=str(pano), warnings=warnings)
-
-
-_PLAIN_FIELDS = (
-    "status",
-    "confidence",
-    "probability_none",
-    "pano",
-    "scan",
-    "storey",
-    "loss",
-    "seconds",
-    "settings",
-    "error",
-)
-
-
 def _rotation_and_center(pose: Pose) -> dict[str, object]:
     return {"R_cam_from_world": pose.R_cam_from_world.tolist(), "center_world": pose.center_world.tolist()}
 
@@ -247,38 +231,19 @@ def _pose_json(pose: Pose | None) -> dict[str, object] | None:
     """A pose in all its forms, POSE_FIELDS."""
     if pose is None:
         return None
-    return {
-        **_rotation_and_center(pose),
-        "quaternion_wxyz": quaternion_wxyz(pose.R_cam_from_world).tolist(),
-        "T_world_from_cam": T_world_from_cam(pose).tolist(),
-    }
-
-
-def _gps_prior_from_json(value: dict[str, Any] | None) -> GpsPrior | None:
-    return (
-        None if value is None else GpsPrior(tuple(value["center_world"]), value["radius"], value["is_used"])
-    )
-
-
-def _covariance_from_json(document: dict[str, Any]) -> PoseCovariance | None:
-    """The covariance in the fields of a result."""
-    matrix = document["covariance"]
-    return (
-        None if matrix is None else PoseCovariance(np.array(matrix), document["least_constrained_direction"])
-    )
+    quaternion = quaternion_wxyz(pose.R_cam_from_world).tolist()
+    others = {"quaternion_wxyz": quaternion, "T_world_from_cam": T_world_from_cam(pose).tolist()}
+    return _rotation_and_center(pose) | others
 
 
 def _alternative_json(alternative: Alternative) -> dict[str, object]:
-    """An alternative: its pose as rotation and centre, and what speaks for it."""
     numbers = {f.name: getattr(alternative, f.name) for f in fields(alternative) if f.name != "pose"}
     return _rotation_and_center(alternative.pose) | numbers
 
 
 def _alternative_from_json(document: dict[str, Any]) -> Alternative:
-    return Alternative(
-        _pose_from_json(document),
-        **{f.name: document[f.name] for f in fields(Alternative) if f.name != "pose"},
-    )
+    numbers = {f.name: document[f.name] for f in fields(Alternative) if f.name != "pose"}
+    return Alternative(_pose_from_json(document), **numbers)
 
 
 def _walk_json(walk: WalkFrame) -> dict[str, object]:
@@ -286,13 +251,8 @@ def _walk_json(walk: WalkFrame) -> dict[str, object]:
     if walk.alone is not None:
         about = {"status": walk.alone.status, "confidence": walk.alone.confidence}
         alone = {**about, **(_pose_json(walk.alone.pose) or dict.fromkeys(POSE_FIELDS))}
-    return {
-        "frame": walk.frame,
-        "time": walk.time,
-        "how": walk.how,
-        "alone": alone,
-        "gap": walk.gap and asdict(walk.gap),
-    }
+    plain = {"frame": walk.frame, "time": walk.time, "how": walk.how}
+    return {**plain, "alone": alone, "gap": walk.gap and asdict(walk.gap)}
 
 
 def _walk_from_json(value: dict[str, Any]) -> WalkFrame:
@@ -302,16 +262,6 @@ def _walk_from_json(value: dict[str, Any]) -> WalkFrame:
         pose = None if alone["R_cam_from_world"] is None else _pose_from_json(alone)
         alone = Alone(alone["status"], alone["confidence"], pose)
     return WalkFrame(value["time"], value["frame"], value["how"], alone, gap and Gap(**gap))
-
-
-def _source_from_json(document: dict[str, Any]) -> Source:
-    values = {f.name: document[f.name] for f in fields(Source)}
-    return Source(**values | {"image_size": values["image_size"] and tuple(values["image_size"])})
-
-
-def _best_pose_from_json(document: dict[str, Any]) -> Pose | None:
-    own = document if document["status"] == LOCALIZED else document["best_guess"]
-    return None if own is None else _pose_from_json(own)
 
 
 def _place(alternative: Alternative) -> str:
@@ -335,10 +285,7 @@ def _paths(value: object) -> tuple[str, ...]:
 def read_results(paths: Sequence[Path]) -> list[Result]:
     """The results in files of JSON lines, their poses checked.
 
-    Raises
-    ------
-    InputError
-        A line is no result, or a file has none.
+    Raises InputError if a line is no result, or a file has none.
     """
     results = []
     for path in paths:

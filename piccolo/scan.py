@@ -91,10 +91,8 @@ def parse_options(
         given["calibration"] = read_calibration(Path(given.pop("camera")))
     if "rig" in given:
         given["calibration"] = read_rig(Path(given.pop("rig")))
-    read_options = ReadOptions(
-        labels=cloud_settings.labels, **{k: given.pop(k) for k in READ_FIELDS & given.keys()}
-    )
-    return read_options, replace(settings, **given), is_masked
+    reading = {k: given.pop(k) for k in READ_FIELDS & given.keys()}
+    return ReadOptions(labels=cloud_settings.labels, **reading), replace(settings, **given), is_masked
 
 
 def _make_prior(given: dict[str, Any], settings: Settings) -> Prior:
@@ -274,6 +272,7 @@ class Scan:
             found = localize_by_paper(self.prepared, picture, settings, self.workers, watch)
         else:
             raise InputError("settings: of another method than the one that the scan was prepared for")
+        digest = self.prepared.scan_sha256 or None
         return result_of(
             found,
             cloud=self.name,
@@ -281,9 +280,7 @@ class Scan:
             seconds=watch.seconds,
             settings=repeated,
             warnings=self.warnings + picture.warnings + ((LABELS_WARNING,) if read_options.labels else ()),
-            source=Source(
-                self.prepared.scan_sha256 or None, photo.sha256, photo.image_size, photo.capture_time
-            ),
+            source=Source(digest, photo.sha256, photo.image_size, photo.capture_time),
             gps_prior=gps,
             cameras=found.cameras or picture.cameras,
         )

@@ -1,8 +1,30 @@
 """Batches in processes of their own, watched by tests."""
 
 import re
+import subprocess
+import sys
 import time
 from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+PAPER = ["--preset", "paper", "num_translations=4", "num_iterations=5", "max_points=5000"]
+
+
+def command_of(script, *words):
+    """The command line of a script of the checkout."""
+    return [sys.executable, str(ROOT / script), *map(str, words)]
+
+
+def start_localize(words, **options):
+    """A process of localize.py whose messages can be read."""
+    return subprocess.Popen(
+        command_of("localize.py", *words), stderr=subprocess.PIPE, text=True, bufsize=1, **options
+    )
+
+
+def run(command, **options):
+    """A command that has ended, with what it printed."""
+    return subprocess.run(command, capture_output=True, text=True, check=False, **options)
 
 
 def untimed(out):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import jsonschema
 import pytest
+from rooms import write_room
 
 from piccolo.result import Result
 
@@ -30,3 +31,10 @@ def _checked_results():
     patch.setattr(Result, "to_json", checked)
     yield
     patch.undo()
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory):
+    """A room's cloud and three panoramas, in a folder with a blank in its name; only to be read."""
+    words = "--seed 7 --points 60000 --panoramas 3 --width 512"
+    return write_room(tmp_path_factory.mktemp("a scene"), words)

@@ -7,31 +7,32 @@ import hashlib
 import json
 import os
 import signal
-import subprocess
 import sys
 from collections import Counter
 from pathlib import Path
 from typing import ClassVar
 
 import pytest
-from rooms import write_room
+from batches import PAPER, ROOT, run, start_localize
 
 from piccolo.batch import localizer as module
 from piccolo.batch.inputs import panoramas_of
-from piccolo.cli import localize
+from piccolo.cli import localize, options
 from piccolo.errors import InputError
 from piccolo.files.line_file import locked, whole_lines, whole_size
-from piccolo.result import Result, read_results
-
-ROOT = Path(__file__).resolve().parents[1]
-PAPER = ["--preset", "paper", "num_translations=4", "num_iterations=5", "max_points=5000"]
+from piccolo.result import read_results
+from piccolo.scenes.scene import read_scene
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """A room's cloud and three panoramas in a folder of their own."""
-    words = "--seed 7 --size 4.5 3.5 2.5 --points 60000 --panoramas 3 --width 512"
-    return write_room(tmp_path_factory.mktemp("a batch"), words)
+@pytest.fixture
+def out(tmp_path):
+    return tmp_path / "poses.jsonl"
+
+
+@pytest.fixture
+def images(scene):
+    """The content of the three photos."""
+    return [(scene / "images" / f"clean_{k}.jpg").read_bytes() for k in range(3)]
 
 
 @pytest.fixture
@@ -60,31 +61,28 @@ def _lines(out):
 def test_folders_lists_and_standard_input_name_panoramas(scene, tmp_path):
     names = ["clean_0.jpg", "clean_1.jpg", "clean_2.jpg"]
     listed = tmp_path / "list.txt"
-    listed.write_text("b c.jpg\n\nd.png\n")
+    listed.write_bytes(b"\xef\xbb\xbfb c.jpg\n\ncaf\xe9.png\r\n")
     with (tmp_path / "stdin").open("w+") as stdin:
         stdin.write("e.jpg\r\n\nf.jpg")
         stdin.seek(0)
         found = list(panoramas_of([str(scene), "a.jpg", f"@{listed}", "-"], stdin, Counter()))
     assert found[:3] == [scene / "images" / name for name in names]
-    assert [str(path) for path in found[3:]] == ["a.jpg", "b c.jpg", "d.png", "e.jpg", "f.jpg"]
+    assert [str(path) for path in found[3:]] == ["a.jpg", "b c.jpg", "caf\udce9.png", "e.jpg", "f.jpg"]
     cube = tmp_path / "photos" / "cube"
     cube.mkdir(parents=True)
     for face in ("px", "nx", "py", "ny", "pz", "nz"):
         (cube / f"{face}.png").touch()
     (tmp_path / "photos" / "a.webp").touch()
     (tmp_path / "photos" / ".hidden.jpg").touch()
-    assert list(panoramas_of([str(tmp_path / "photos")], None, Counter())) == [
-        tmp_path / "photos/a.webp",
-        cube,
-    ]
-    assert list(panoramas_of([str(cube)], None, Counter())) == [cube]
+    found = panoramas_of([str(tmp_path / "photos"), str(cube)], None, Counter())
+    assert list(found) == [tmp_path / "photos/a.webp", cube, cube]
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="empty: a folder without a JPEG"):
         list(panoramas_of([str(tmp_path / "empty")], None, Counter()))
 
 
-def test_a_batch_goes_on_where_it_was_stopped(scene, tmp_path, counted, capsys):
-    whole, out = tmp_path / "whole.jsonl", tmp_path / "poses.jsonl"
+def test_a_batch_goes_on_where_it_was_stopped(scene, tmp_path, out, counted, capsys):
+    whole = tmp_path / "whole.jsonl"
     assert _run(scene, whole) == 0
     assert "3 panoramas in" in (err := capsys.readouterr().err)
     assert "3 localized, 0 ambiguous, 0 not localized, 0 unreadable" in err
@@ -116,23 +114,21 @@ def test_a_batch_goes_on_where_it_was_stopped(scene, tmp_path, counted, capsys):
         (b'{"format": "piccolo-pose/3"}\n', "line 1: of format 'piccolo-pose/3'"),
     ],
 )
-def test_a_file_of_another_run_is_refused_with_both_ways(scene, tmp_path, change, message, capsys):
-    first, second = (scene / "images" / f"clean_{k}.jpg" for k in (0, 1))
+def test_a_file_of_another_run_is_refused_with_both_ways(
+    scene, tmp_path, out, images, change, message, capsys
+):
     photo = tmp_path / "clean_1.jpg"
-    photo.write_bytes(second.read_bytes())
-    out, panos = tmp_path / "poses.jsonl", [str(first), str(photo)]
+    photo.write_bytes(images[1])
+    panos = [str(scene / "images" / "clean_0.jpg"), str(photo)]
     assert _run(scene, out, "--quiet", pano=panos) == 0
+    (tmp_path / "other.ply").write_bytes((scene / "cloud.ply").read_bytes() + b"\0")
     more = []
     if isinstance(change, bytes):
         out.write_bytes(change)
-    elif change[0] == "--cloud":
-        other = tmp_path / "other.ply"
-        other.write_bytes((scene / "cloud.ply").read_bytes() + b"\0")
-        more = ["--cloud", str(other)]
     elif change[0] == "--pano":
         panos = [str(scene / "images" / change[1])]
     else:
-        more = change
+        more = [word.replace("other", str(tmp_path / "other.ply")) for word in change]
     before = out.read_bytes()
     assert _run(scene, out, "--quiet", *more, pano=panos) == 3
     err = capsys.readouterr().err
@@ -142,8 +138,10 @@ def test_a_file_of_another_run_is_refused_with_both_ways(scene, tmp_path, change
     assert out.read_bytes() == before
 
 
-def test_an_unreadable_photo_is_a_line_until_its_file_is_another(scene, tmp_path, counted, capsys):
-    bad, out = tmp_path / "bad.jpg", tmp_path / "poses.jsonl"
+def test_an_unreadable_photo_is_a_line_until_its_file_is_another(
+    scene, tmp_path, out, images, counted, capsys
+):
+    bad = tmp_path / "bad.jpg"
     bad.write_bytes(b"\xff\xd8\xff nothing more")
     panos = [str(bad), str(tmp_path / "missing.jpg"), str(scene / "images" / "clean_0.jpg")]
     for expected in (["bad.jpg", "missing.jpg", "clean_0.jpg"], []):
@@ -154,19 +152,17 @@ def test_an_unreadable_photo_is_a_line_until_its_file_is_another(scene, tmp_path
     assert "1 localized, 0 ambiguous, 0 not localized, 2 unreadable" in capsys.readouterr().err
     for name in ("bad.jpg", "missing.jpg"):
         counted.clear()
-        (tmp_path / name).write_bytes((scene / "images" / "clean_1.jpg").read_bytes())
+        (tmp_path / name).write_bytes(images[1])
         assert _run(scene, out, pano=panos) == (3 if name == "bad.jpg" else 0)
         assert counted == [name]
     assert [line["pano"] for line in _lines(out)] == panos
     assert {line["status"] for line in _lines(out)} == {"localized"}
 
 
-def test_photos_added_removed_changed_and_reordered_cost_only_their_own_lines(
-    scene, tmp_path, counted, capsys
+def test_photos_added_removed_or_changed_cost_only_their_own_lines(
+    scene, tmp_path, out, images, counted, capsys
 ):
-    """The file is that of a new run, though each run does only what the one before has not done."""
-    photos, out, whole = tmp_path / "photos", tmp_path / "poses.jsonl", tmp_path / "whole.jsonl"
-    images = [(scene / "images" / f"clean_{k}.jpg").read_bytes() for k in range(3)]
+    photos, whole = tmp_path / "photos", tmp_path / "whole.jsonl"
     photos.mkdir()
 
     def written(contents, *panos):
@@ -197,29 +193,20 @@ def test_photos_added_removed_changed_and_reordered_cost_only_their_own_lines(
     assert (counted, _lines(out)) == ([], before)
 
 
-def test_a_batch_that_is_stopped_between_keeps_all_that_it_had(scene, tmp_path, counted):
-    """Lines that the panoramas of now do not need stay until all of these are done."""
+def test_names_that_come_on_standard_input_take_what_is_done_and_drop_nothing(
+    scene, tmp_path, out, monkeypatch, capsys
+):
     names = [str(scene / "images" / f"clean_{k}.jpg") for k in range(3)]
-    whole, out = tmp_path / "whole.jsonl", tmp_path / "poses.jsonl"
-    assert _run(scene, whole, *PAPER, pano=names) < 2
-    lines = whole.read_bytes().splitlines(keepends=True)
-    out.write_bytes(lines[2] + lines[0] + lines[1][:99])  # torn, while the second was written
-    assert _run(scene, out, *PAPER, pano=names[:2]) < 2
-    assert counted[3:] == ["clean_1.jpg"]
-    assert _lines(out) == _lines(whole)[:2]
-
-
-def test_names_that_come_on_standard_input_take_what_is_done_and_drop_nothing(scene, tmp_path):
-    names = [str(scene / "images" / f"clean_{k}.jpg") for k in range(3)]
-    out = tmp_path / "poses.jsonl"
-    command = [sys.executable, str(ROOT / "localize.py"), "--cloud", str(scene / "cloud.ply"), *PAPER]
-    command += ["--pano", "-", "--out", str(out)]
+    stdin = tmp_path / "stdin"
     for given, left in ((names[:2], names[:2]), ([names[2], names[1]], [names[0], names[2], names[1]])):
         before = out.read_text().splitlines() if out.exists() else []
-        done = subprocess.run(command, input="\n".join(given), text=True, capture_output=True, check=False)
-        assert done.returncode < 2
-        assert f"{len(given)} panoramas in" in done.stderr
-        assert "dropped" not in done.stderr
+        stdin.write_text("\n".join(given))
+        with stdin.open() as file:
+            monkeypatch.setattr(sys, "stdin", file)
+            assert _run(scene, out, *PAPER, pano=["-"]) < 2
+        err = capsys.readouterr().err
+        assert f"{len(given)} panoramas in" in err
+        assert "dropped" not in err
         after = out.read_text().splitlines()
         assert [json.loads(line)["pano"] for line in after] == left
         assert set(before) <= set(after)
@@ -242,9 +229,9 @@ class Short(module.Localizer):
         return type("Scan", (type(scan),), {"localize_query": localize_query})(**vars(scan))
 
 
-def test_what_the_system_did_to_a_photo_is_tried_again(scene, tmp_path, counted, monkeypatch, capsys):
-    out, names = tmp_path / "poses.jsonl", ["clean_0.jpg", "clean_1.jpg", "clean_2.jpg"]
-    monkeypatch.setattr(localize, "Localizer", Short)
+def test_what_the_system_did_to_a_photo_is_tried_again(scene, out, counted, monkeypatch, capsys):
+    names = ["clean_0.jpg", "clean_1.jpg", "clean_2.jpg"]
+    monkeypatch.setattr(options, "Localizer", Short)
     Short.errors.update({names[0]: MemoryError(), names[2]: OSError(errno.EIO, "Input/output error", "x")})
     assert _run(scene, out, *PAPER) == 3
     err = capsys.readouterr().err
@@ -258,20 +245,19 @@ def test_what_the_system_did_to_a_photo_is_tried_again(scene, tmp_path, counted,
     assert "failed" not in {line["status"] for line in _lines(out)}
 
 
-def test_a_photo_is_read_once_so_that_its_digest_is_of_its_pixels(scene, tmp_path, monkeypatch):
-    photo, out = tmp_path / "a.jpg", tmp_path / "poses.jsonl"
-    first, second = ((scene / "images" / f"clean_{k}.jpg").read_bytes() for k in (0, 1))
+def test_a_photo_is_read_once_so_that_its_digest_is_of_its_pixels(scene, tmp_path, out, images, monkeypatch):
+    photo = tmp_path / "a.jpg"
     read, reads = Path.read_bytes, []
 
     def read_and_replaced(path):
         content = read(path)
         if path == photo:
             reads.append(path)
-            photo.write_bytes(second)
+            photo.write_bytes(images[1])
         return content
 
     monkeypatch.setattr(Path, "read_bytes", read_and_replaced)
-    for content in (first, first[:2000]):
+    for content in (images[0], images[0][:2000]):
         photo.write_bytes(content)
         _run(scene, out, *PAPER, "--overwrite", pano=[str(photo)])
         assert _lines(out)[0]["pano_sha256"] == hashlib.sha256(content).hexdigest()
@@ -279,69 +265,46 @@ def test_a_photo_is_read_once_so_that_its_digest_is_of_its_pixels(scene, tmp_pat
     assert _lines(out)[0]["status"] == "unreadable"
 
 
-ODD = [
-    b"a\nb.jpg",
-    b"a\tb.jpg",
-    b"caf\xe9.jpg",
-    b"\x1b[31m.jpg",
-    "x\u2028\x85y.jpg".encode(),
-    b"y" * 251 + b".jpg",
-]
+ODD = [b"a\nb.jpg", b"a\tb.jpg", b"caf\xe9.jpg", b"\x1b[31m.jpg", b"x\xe2\x80\xa8y.jpg", b"y" * 251 + b".jpg"]
 
 
 @pytest.mark.parametrize("more", [["--jobs", "2"], ["--walk", "--times", "order"]])
-def test_any_name_that_a_file_may_have_is_localized(scene, tmp_path, more, capsys):
-    photos, out, overlays = tmp_path / "photos", tmp_path / "poses.jsonl", tmp_path / "overlays"
+def test_any_name_that_a_file_may_have_is_localized(scene, tmp_path, out, images, more, capsys):
+    photos, overlays = tmp_path / "photos", tmp_path / "overlays"
     photos.mkdir()
     overlays.mkdir()
-    image = (scene / "images" / "clean_0.jpg").read_bytes()
     for name in ODD:
-        (photos / os.fsdecode(name)).write_bytes(image)
-    (photos / "bad\n.jpg").write_bytes(image[:999])
+        (photos / os.fsdecode(name)).write_bytes(images[0])
+    (photos / "bad\n.jpg").write_bytes(images[0][:999])
     more = more if "--walk" in more else [*more, *PAPER, "--overlay", str(overlays)]
-    assert _run(scene, out, *more, pano=[str(photos), "z" * 5000]) == 3
+    assert _run(scene, out, *more, pano=[str(photos), "z" * 5000, "x\0y.jpg"]) == 3
     found = {os.fsencode(Path(result.pano).name): result.status for result in read_results([out])}
-    assert set(found) == {*ODD, b"bad\n.jpg", b"z" * 5000}
-    assert [name for name, status in found.items() if status == "unreadable"] == [b"bad\n.jpg", b"z" * 5000]
+    unreadable = [b"bad\n.jpg", b"z" * 5000, b"x\0y.jpg"]
+    assert set(found) == {*ODD, *unreadable}
+    assert [name for name, status in found.items() if status == "unreadable"] == unreadable
     err = capsys.readouterr().err
     assert "bad\\n.jpg: " in err
     assert "File name too long" in err
+    assert "embedded null byte" in err
     assert "\x1b" not in err
     assert "Errno" not in err
 
 
-def test_any_name_in_a_list_or_on_standard_input_costs_its_own_line_at_most(scene, tmp_path):
-    image = (scene / "images" / "clean_0.jpg").read_bytes()
-    (tmp_path / os.fsdecode(b"caf\xe9.jpg")).write_bytes(image)
-    names = b"\xef\xbb\xbfx\0y.jpg\n" + b"z" * 5000 + b"\n\ncaf\xe9.jpg\r\n"
-    (tmp_path / "list.txt").write_bytes(names)
-    command = [sys.executable, str(ROOT / "localize.py"), "--cloud", str(scene / "cloud.ply"), *PAPER]
-    for word, given in (("@list.txt", b""), ("-", names[3:])):
-        done = subprocess.run(
-            [*command, "--pano", word], cwd=tmp_path, input=given, capture_output=True, check=False
-        )
-        found = [Result.from_json(line) for line in done.stdout.decode("ascii").splitlines()]
-        assert [os.fsencode(result.pano) for result in found] == [b"x\0y.jpg", b"z" * 5000, b"caf\xe9.jpg"]
-        assert [result.status == "unreadable" for result in found] == [True, True, False]
-        assert done.returncode == 3
-        assert b"embedded null byte" in done.stderr
-
-
-def test_files_left_out_are_counted_and_links_to_folders_searched(scene, tmp_path, capsys):
+def test_files_left_out_are_counted_and_links_to_folders_searched(scene, tmp_path, out, images, capsys):
     photos, elsewhere = tmp_path / "photos", tmp_path / "elsewhere"
     (elsewhere / "inner").mkdir(parents=True)
     photos.mkdir()
     (photos / "link").symlink_to(elsewhere)
     (elsewhere / "inner" / "loop").symlink_to(photos)
     (photos / "self").symlink_to("self")
-    (elsewhere / "inner" / "a.jpg").write_bytes((scene / "images" / "clean_0.jpg").read_bytes())
+    (elsewhere / "inner" / "a.jpg").write_bytes(images[0])
     left_out = Counter()
     found = list(panoramas_of([str(photos)], None, left_out))
     assert found == [photos / "link" / "inner" / "a.jpg"]
     assert left_out == Counter({"": 1})  # the link that leads to itself
     for name in ("a.GIF", "b.gif", "c.bmp", "d"):
         (photos / name).touch()
-    assert _run(scene, tmp_path / "poses.jsonl", *PAPER, pano=[str(photos)]) < 2
+    assert _run(scene, out, *PAPER, pano=[str(photos)]) < 2
     assert "; 5 files left out: 2 without an ending, 2 .gif, 1 .bmp\n" in capsys.readouterr().err
     (tmp_path / "few").mkdir()
     for name in "abcdefg":
@@ -350,37 +313,22 @@ def test_files_left_out_are_counted_and_links_to_folders_searched(scene, tmp_pat
         list(panoramas_of([str(tmp_path / "few")], None, Counter()))
 
 
-def _process(scene, out, panos, **options):
-    command = [
-        sys.executable,
-        str(ROOT / "localize.py"),
-        "--cloud",
-        str(scene / "cloud.ply"),
-        "--pano",
-        *panos,
-    ]
-    command += ["--out", str(out)] if out else []
-    return subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
-
-
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_ends_a_batch_after_the_photo_at_work(scene, tmp_path, number, code):
-    out, name = tmp_path / "poses.jsonl", str(scene / "images" / "clean_0.jpg")
-    process = _process(scene, out, [name] * 30)
-    while "localized at" not in process.stderr.readline():
-        pass
-    process.send_signal(number)
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == code
+def test_a_signal_ends_a_batch_after_the_photo_at_work(scene, out):
+    name = str(scene / "images" / "clean_0.jpg")
+    words = ["--cloud", str(scene / "cloud.ply"), "--pano", *[name] * 30, "--out", str(out)]
+    with start_localize(words) as process:
+        while "localized at" not in process.stderr.readline():
+            pass
+        process.send_signal(signal.SIGINT)
+        err = process.stderr.read()
+    assert process.returncode == 130
     assert "the same command goes on from here" in err
     assert "Traceback" not in err
-    done = _lines(out)
-    assert 1 <= len(done) < 30
+    assert 1 <= len(_lines(out)) < 30
     assert out.read_bytes().endswith(b"\n")
 
 
-def test_two_processes_do_not_write_one_file(tmp_path):
-    out = tmp_path / "poses.jsonl"
+def test_two_processes_do_not_write_one_file(tmp_path, out):
     for line in ('{"a": 1}', '{"b": 2}'):
         with locked(out) as file:
             file.append(line)
@@ -392,10 +340,9 @@ def test_two_processes_do_not_write_one_file(tmp_path):
     assert not (tmp_path / "new").exists()
 
 
-def test_a_file_that_was_removed_before_it_was_locked_is_opened_again(tmp_path, monkeypatch):
+def test_a_file_that_was_removed_before_it_was_locked_is_opened_again(out, monkeypatch):
     """The first of two writes nothing and removes the file, which the second has opened before."""
-    out, flock = tmp_path / "poses.jsonl", fcntl.flock
-    first = contextlib.ExitStack()
+    flock, first = fcntl.flock, contextlib.ExitStack()
     first.enter_context(locked(out))
 
     def flock_late(handle, how):
@@ -408,20 +355,17 @@ def test_a_file_that_was_removed_before_it_was_locked_is_opened_again(tmp_path, 
     assert out.read_text() == "{}\n"
 
 
-def test_a_full_disk_keeps_the_lines_before(tmp_path):
-    code = (
-        "import resource, sys\n"
-        "from pathlib import Path\n"
-        "from piccolo.files.line_file import locked\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
-        "with locked(Path(sys.argv[1])) as file:\n"
-        "    for k in range(9):\n"
-        "        file.append(str(k) * 300)\n"
-    )
-    out = tmp_path / "lines"
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(out)], cwd=ROOT, capture_output=True, text=True, check=False
-    )
+def test_a_full_disk_keeps_the_lines_before(out):
+    code = """
+import resource, sys
+from pathlib import Path
+from piccolo.files.line_file import locked
+resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+with locked(Path(sys.argv[1])) as file:
+    for k in range(9):
+        file.append(str(k) * 300)
+"""
+    done = run([sys.executable, "-c", code, str(out)], cwd=ROOT)
     assert "File too large" in done.stderr
     assert out.read_text() == "".join(f"{str(k) * 300}\n" for k in range(3))
 
@@ -431,13 +375,11 @@ def test_a_full_device_is_named(scene, capsys):
     assert capsys.readouterr().err == "localize.py: /dev/full: cannot be used (No space left on device)\n"
 
 
-def test_priors_of_a_table_go_before_the_general_one(scene, tmp_path, capsys):
-    truth = json.loads((scene / "queries.json").read_text())["queries"]
-    x, y, _ = truth[0]["center_world"]
-    table, out = tmp_path / "priors.csv", tmp_path / "poses.jsonl"
-    table.write_text(
-        f"name,x,y,radius,height\nclean_0.jpg,{x},{y},0.5,1.5\nclean_9.jpg,1,2,,\nclean_1.jpg,,,,\n"
-    )
+def test_priors_of_a_table_go_before_the_general_one(scene, tmp_path, out, capsys):
+    x, y, _ = read_scene(scene).by_name["clean_0.jpg"].pose.center_world
+    table = tmp_path / "priors.csv"
+    rows = f"clean_0.jpg,{x},{y},0.5,1.5\nclean_9.jpg,1,2,,\nclean_1.jpg,,,,\n"
+    table.write_text(f"name,x,y,radius,height\n{rows}")
     assert _run(scene, out, "--priors", str(table), "--height", "0.2", "2.2") == 0
     err = capsys.readouterr().err
     assert "1 names of no panorama here, such as clean_9.jpg" in err.splitlines()[0]  # before the work

@@ -1,41 +1,19 @@
 """Batches on a Dask cluster: the same files, whichever worker is killed; on 127.0.0.1 only."""
 
-import json
 import os
 import signal
 import socket
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
-from batches import untimed, wait_for_lines, workers_of
-from rooms import write_room
+from batches import PAPER, ROOT, start_localize, untimed, wait_for_lines, workers_of
 
 from piccolo.cli import evaluate, localize
 from piccolo.jobs import cluster
 
-ROOT = Path(__file__).resolve().parents[1]
-PAPER = ["--preset", "paper", "num_translations=4", "num_iterations=5", "max_points=5000"]
-NUM_PHOTOS = 12
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """A scene of a few photos under many names."""
-    words = "--seed 7 --size 4.5 3.5 2.5 --points 60000 --panoramas 2 --width 512"
-    folder = write_room(tmp_path_factory.mktemp("a cluster"), words)
-    document = json.loads((folder / "queries.json").read_text())
-    queries = []
-    for k in range(NUM_PHOTOS):
-        query = document["queries"][k % 2]
-        (folder / "images" / f"{k:02d}.jpg").hardlink_to(folder / query["image"])
-        queries.append({**query, "image": f"images/{k:02d}.jpg"})
-    for name in ("clean_0.jpg", "clean_1.jpg"):
-        (folder / "images" / name).unlink()
-    (folder / "queries.json").write_text(json.dumps({**document, "queries": queries}))
-    return folder
+PANOS = [f"images/clean_{k % 3}.jpg" for k in range(12)]
 
 
 def _dask(log, *words):
@@ -44,9 +22,8 @@ def _dask(log, *words):
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "dask", *words, "--host", "127.0.0.1", "--no-dashboard"]
     with log.open("w") as file:
-        return subprocess.Popen(
-            command, cwd=log.parent, env=environment, stdout=file, stderr=subprocess.STDOUT
-        )
+        options = {"cwd": log.parent, "env": environment, "stdout": file, "stderr": subprocess.STDOUT}
+        return subprocess.Popen(command, **options)
 
 
 @pytest.fixture(scope="module")
@@ -69,24 +46,13 @@ def scheduler(tmp_path_factory):
 def test_a_local_cluster_loses_a_worker_is_interrupted_and_goes_on(scene, tmp_path, monkeypatch):
     """However fast it is, it can't come to its end: it waits for names on standard input."""
     monkeypatch.chdir(scene)
-    names = ["missing.jpg", *(f"images/{k:02d}.jpg" for k in range(NUM_PHOTOS))]
+    names = ["missing.jpg", *PANOS]
     whole, out = tmp_path / "whole.jsonl", tmp_path / "poses.jsonl"
     words = ["--cloud", "cloud.ply", "--quiet", *PAPER]
     assert localize.main([*words, "--pano", *names, "--out", str(whole), "--jobs", "1"]) == 3
     words += ["--out", str(out)]
-    command = [
-        sys.executable,
-        str(ROOT / "localize.py"),
-        *words,
-        "--pano",
-        "-",
-        "--jobs",
-        "2",
-        "--dask",
-        "local",
-    ]
-    streams = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "bufsize": 1}
-    with subprocess.Popen(command, **streams, start_new_session=True) as process:
+    dask = ["--pano", "-", "--jobs", "2", "--dask", "local"]
+    with start_localize([*words, *dask], stdin=subprocess.PIPE, start_new_session=True) as process:
         process.stdin.writelines(f"{name}\n" for name in names[:4])
         wait_for_lines(process, out, 2)
         workers = workers_of(process)
@@ -107,8 +73,7 @@ def test_a_local_cluster_loses_a_worker_is_interrupted_and_goes_on(scene, tmp_pa
 def test_workers_elsewhere_open_the_scan_or_are_sent_it(scene, scheduler, tmp_path, monkeypatch, shared):
     monkeypatch.chdir(scene)
     preset = ["--gravity", "known"]
-    names = [f"images/{k:02d}.jpg" for k in range(3)]
-    words = ["--cloud", "cloud.ply", "--pano", "missing.jpg", *names, "--quiet", *preset]
+    words = ["--cloud", "cloud.ply", "--pano", "missing.jpg", *PANOS[:3], "--quiet", *preset]
     whole, out = tmp_path / "whole.jsonl", tmp_path / "poses.jsonl"
     assert localize.main([*words, "--out", str(whole), "--jobs", "1"]) == 3
     if not shared:
@@ -117,10 +82,8 @@ def test_workers_elsewhere_open_the_scan_or_are_sent_it(scene, scheduler, tmp_pa
     assert untimed(out) == untimed(whole)
     assert list(scheduler.parent.rglob("*.piccolo-map")) == []  # what was sent is gone
     if not shared:
-        paper = [word for word in words if word not in preset]
-        assert (
-            localize.main([*paper, *PAPER, "--overwrite", "--out", str(out), "--dask", str(scheduler)]) == 3
-        )
+        paper = [*(word for word in words if word not in preset), *PAPER]
+        assert localize.main([*paper, "--overwrite", "--out", str(out), "--dask", str(scheduler)]) == 3
 
 
 def test_an_evaluation_on_a_cluster_gives_the_same(scene, scheduler, tmp_path, monkeypatch, capsys):

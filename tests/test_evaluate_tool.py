@@ -5,7 +5,7 @@ import json
 import os
 import shutil
 import signal
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,12 +17,10 @@ from piccolo.cli import evaluate
 from piccolo.jobs import memory
 from piccolo.panorama import picture
 from piccolo.result import Source
-from piccolo.scenes.evaluation.runs import read_run
+from piccolo.scenes.evaluation.query_result import read_run
 from piccolo.scenes.scene import Query, read_scene, write_queries
 
-ROOT = Path(__file__).resolve().parents[1]
-QUICK = ["--quiet", "--preset", "paper", "max_points=20000"]
-QUICK += ["num_translations=12", "num_iterations=30"]
+QUICK = ["--quiet", "--preset", "paper", "max_points=20000", "num_translations=12", "num_iterations=30"]
 
 
 @pytest.fixture(scope="module")
@@ -33,8 +31,7 @@ def scenes(tmp_path_factory):
         write_room(root / name, f"--seed {seed} --points 20000 --panoramas 2 --width 256")
     scene = read_scene(root / "hall 2")
     shutil.copy(root / "room" / "images" / "clean_0.jpg", root / "hall 2" / "images" / "far.jpg")
-    pose = scene.queries[0].pose
-    far_pose = type(pose)(pose.R_cam_from_world, np.full(3, 99.0))
+    far_pose = replace(scene.queries[0].pose, center_world=np.full(3, 99.0))
     far = Query(scene.folder / "images" / "far.jpg", "far", far_pose)
     write_queries(scene.folder, [*scene.queries, far])
     return root
@@ -42,6 +39,16 @@ def scenes(tmp_path_factory):
 
 def _run(scenes, out, *more):
     return evaluate.main(["--scenes", str(scenes), "--out", str(out), *QUICK, *more])
+
+
+def _changed(scenes, tmp_path, change):
+    """A copy of the scene `room` whose queries are changed."""
+    folder = tmp_path / "room"
+    shutil.copytree(scenes / "room", folder)
+    document = json.loads((folder / "queries.json").read_text())
+    change(folder, document["queries"])
+    (folder / "queries.json").write_text(json.dumps(document))
+    return folder
 
 
 def test_a_run_its_tables_and_files(scenes, tmp_path, capsys):
@@ -81,25 +88,16 @@ def test_a_stopped_run_is_taken_up_and_gives_the_same(scenes, tmp_path, capsys):
     assert text.rstrip().endswith("|---|---|---|---|---|")  # no query has changed
 
 
-def test_other_settings_do_not_go_into_the_same_file(scenes, tmp_path, capsys):
-    out = tmp_path / "run.jsonl"
-    assert _run(scenes, out, "--variants", "far") == 0
-    before = out.read_bytes()
-    assert _run(scenes, out, "--preset", *QUICK[2:], "solver=lbfgs") == 3
-    assert "run.jsonl: made with solver 'adam', not 'lbfgs'" in capsys.readouterr().err
-    assert out.read_bytes() == before
+def test_other_settings_or_poses_do_not_go_into_the_same_file(scenes, tmp_path, capsys):
+    def move(_, queries):
+        queries[0]["center_world"][0] += 0.5
 
-
-def test_another_scene_of_the_same_name_does_not_go_into_the_same_file(scenes, tmp_path, capsys):
     out = tmp_path / "run.jsonl"
     assert _run(scenes / "room", out) == 0
-    other = tmp_path / "room"
-    shutil.copytree(scenes / "room", other)
-    document = json.loads((other / "queries.json").read_text())
-    document["queries"][0]["center_world"][0] += 0.5
-    (other / "queries.json").write_text(json.dumps(document))
     before = out.read_bytes()
-    assert _run(other, out) == 3
+    assert _run(scenes / "room", out, "--preset", *QUICK[2:], "solver=lbfgs") == 3
+    assert "run.jsonl: made with solver 'adam', not 'lbfgs'" in capsys.readouterr().err
+    assert _run(_changed(scenes, tmp_path, move), out) == 3
     assert "made with another true pose or another scene of this name" in capsys.readouterr().err
     assert out.read_bytes() == before
 
@@ -110,16 +108,13 @@ def test_results_of_localize_are_those_of_the_scene_s_cloud(scenes, tmp_path, ca
     lines = tmp_path / "poses.jsonl"
     words = ["--scenes", str(scenes / "room"), "--results", str(lines)]
 
-    def run(digest, *more):
-        digests = (right, digest)
-        results = [
-            result(q.image, q.pose, source=Source(cloud_sha256=d))
-            for q, d in zip(queries, digests, strict=True)
-        ]
-        strangers = [result(name, queries[0].pose) for name in ("new\nline\udcff.jpg", "NUL\0.jpg")]
-        write_results(lines, [*strangers, *results] if more == ("strangers",) else results)
-        code = evaluate.main([*words, *(word for word in more if word != "strangers")])
-        return code, *capsys.readouterr()
+    def run(digest, *more, strangers=()):
+        first, second = queries
+        results = [result(name, first.pose) for name in strangers]
+        results.append(result(first.image, first.pose, source=Source(cloud_sha256=right)))
+        results.append(result(second.image, second.pose, source=Source(cloud_sha256=digest)))
+        write_results(lines, results)
+        return evaluate.main([*words, *more]), *capsys.readouterr()
 
     assert run(right)[0] == 0
     code, out, err = run("0" * 64)
@@ -128,7 +123,7 @@ def test_results_of_localize_are_those_of_the_scene_s_cloud(scenes, tmp_path, ca
     code, out, err = run("0" * 64, "--force")
     assert (code, "all 2 queries" in out) == (0, True)
     assert "warning: found 1 of 2 results of another scan" in err
-    code, out, err = run(right, "strangers")
+    code, out, err = run(right, strangers=["new\nline\udcff.jpg", "NUL\0.jpg"])
     assert (code, "all 2 queries" in out) == (3, True)
     first, second = err.splitlines()
     assert r"evaluate.py: new\nline\udcff.jpg: found a result without a true pose" in first
@@ -136,36 +131,41 @@ def test_results_of_localize_are_those_of_the_scene_s_cloud(scenes, tmp_path, ca
 
 
 def test_no_output_replaces_an_input_or_another_output(scenes, tmp_path, capsys):
-    option = "--errors"
-    truth = scenes / "room" / "queries.json"
+    truth, link, out = scenes / "room" / "queries.json", tmp_path / "link.png", tmp_path / "run.png"
     before = truth.read_bytes()
-    link, out = tmp_path / "link.png", tmp_path / "run.png"
     link.hardlink_to(truth)
-    assert _run(scenes / "room", out, option, str(link)) == 2
-    assert "found an input as the output" in capsys.readouterr().err
+    for run, errors, message in (
+        (out, link, "found an input as the output"),
+        (out, f"{tmp_path}/../{tmp_path.name}/run.png", "found the same output as --out for --errors"),
+        ("-", out, "a run is read again to be resumed"),
+    ):
+        assert _run(scenes / "room", run, "--errors", str(errors)) == 2
+        assert message in capsys.readouterr().err
     assert truth.read_bytes() == before
-    assert _run(scenes / "room", out, option, f"{tmp_path}/../{tmp_path.name}/run.png") == 2
-    assert f"found the same output as --out for {option}" in capsys.readouterr().err
-    assert _run(scenes / "room", "-", option, str(out)) == 2
-    assert "a run is read again to be resumed" in capsys.readouterr().err
     assert not out.exists()
 
 
-def test_an_unknown_variant_is_refused_and_runs_of_other_scenes_do_not_compare(scenes, tmp_path, capsys):
-    assert _run(scenes, tmp_path / "run.jsonl", "--variants", "nope") == 3
-    assert "--variants: found no nope, wanted some of clean, far" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-    (tmp_path / "odd.json").write_text("{}")
-    (tmp_path / "a").write_text("")
-    for words, message in (
-        (["--scenes", str(tmp_path / "odd.json"), "--results", "a"], "wanted a queries.json"),
-        (["--scenes", str(scenes), "--results", str(tmp_path / "a")], "found no result"),
+def test_refusals(scenes, tmp_path, capsys):
+    odd, empty, other = (tmp_path / name for name in ("odd.json", "a", "b"))
+    odd.write_text("{}")
+    empty.touch()
+    other.touch()
+    run = ["--scenes", scenes, "--out", tmp_path / "c"]
+    for code, words, message in (
+        (2, ["--out", "x"], "--scenes goes with --out or --results"),
+        (2, ["--scenes", "x", "--compare", "a", "b"], "--scenes goes with --out or --results"),
+        (2, [*run, "--jobs", 0], "--jobs: found 0"),
+        (2, [*run, "--max-distance", -1], "--max-distance, --max-angle: wanted numbers above 0"),
+        (2, ["--compare", "a", "b", "--csv", "c"], "--csv, --risk: not with --compare"),
+        (2, [*run, "--preset", "paper", "--refine-focal"], "not an option of the preset paper"),
+        (3, [*run, "--variants", "nope"], "wanted some of clean, far"),
+        (3, ["--scenes", odd, "--results", "a"], "wanted a queries.json"),
+        (3, ["--scenes", scenes, "--results", empty], "found no result"),
+        (3, ["--compare", empty, other], "no query in common"),
     ):
-        assert evaluate.main(words) == 3
+        assert evaluate.main(list(map(str, words))) == code
         assert message in capsys.readouterr().err
-    (tmp_path / "b").write_text("")
-    assert evaluate.main(["--compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 3
-    assert "no query in common" in capsys.readouterr().err
+    assert not (tmp_path / "c").exists()
 
 
 def test_what_cannot_be_read_is_named_and_the_rest_done(scenes, tmp_path, capsys):
@@ -184,37 +184,30 @@ def test_what_cannot_be_read_is_named_and_the_rest_done(scenes, tmp_path, capsys
 
 
 def test_any_name_that_a_file_may_have_costs_its_own_line_at_most(scenes, tmp_path, capsys):
-    folder, out, csv = tmp_path / "room", tmp_path / "run.jsonl", tmp_path / "table.csv"
-    shutil.copytree(scenes / "room", folder)
-    document = json.loads((folder / "queries.json").read_text())
     names = ["a\nb.jpg", os.fsdecode(b"caf\xe9.jpg")]
-    for query, name in zip(document["queries"], names, strict=True):
-        (folder / query["image"]).rename(folder / name)
-        query["image"] = name
-    document["queries"].append({**query, "image": "z" * 5000 + ".jpg"})
-    (folder / "queries.json").write_text(json.dumps(document))
+
+    def rename(folder, queries):
+        for query, name in zip(queries, names, strict=True):
+            (folder / query["image"]).rename(folder / name)
+            query["image"] = name
+        queries.append({**queries[0], "image": "z" * 5000 + ".jpg"})
+
+    folder, out, csv = _changed(scenes, tmp_path, rename), tmp_path / "run.jsonl", tmp_path / "table.csv"
     assert _run(folder, out, "--csv", str(csv)) == 3
     text, err = capsys.readouterr()
     assert [row.key[1] for row in read_run(out)[0]] == names
     assert (err.count("\n"), "File name too long" in err) == (1, True)
     assert "| a\\nb.jpg |" in text
-    assert [line.split(",")[1] for line in csv.read_text().splitlines()[1:]] == [
-        "a\\nb.jpg",
-        "caf\\udce9.jpg",
-    ]
-    capsys.readouterr()
-    results = tmp_path / "poses.jsonl"
-    results.write_text("".join(f"{row.result.to_json()}\n" for row in read_run(out)[0]))
-    assert evaluate.main(["--scenes", str(folder), "--results", str(results)]) == 0
+    cells = [line.split(",")[1] for line in csv.read_text().splitlines()[1:]]
+    assert cells == ["a\\nb.jpg", "caf\\udce9.jpg"]
 
 
 def test_what_the_system_did_is_no_refusal_of_a_photo_without_an_answer(scenes, tmp_path, monkeypatch):
-    folder, out = tmp_path / "room", tmp_path / "run.jsonl"
-    shutil.copytree(scenes / "room", folder)
-    document = json.loads((folder / "queries.json").read_text())
-    for query in document["queries"]:
-        query["answerable"] = False
-    (folder / "queries.json").write_text(json.dumps(document))
+    def refuse(_, queries):
+        for query in queries:
+            query["answerable"] = False
+
+    folder, out = _changed(scenes, tmp_path, refuse), tmp_path / "run.jsonl"
     with monkeypatch.context() as patched:
         patched.setattr(picture, "check_memory", lambda *given: memory.check_memory(1e15, *given[1:]))
         assert _run(folder, out) == 3
@@ -222,9 +215,7 @@ def test_what_the_system_did_is_no_refusal_of_a_photo_without_an_answer(scenes, 
     assert _run(folder, out) == 0
 
 
-def test_a_signal_ends_a_run_after_the_photo_at_work_and_the_same_command_goes_on(
-    scenes, tmp_path, monkeypatch, capsys
-):
+def test_a_signal_ends_a_run_after_the_photo_at_work(scenes, tmp_path, monkeypatch, capsys):
     out, answer = tmp_path / "run.jsonl", Localizer.answer
 
     def answer_late(self, scan, task):
@@ -238,22 +229,6 @@ def test_a_signal_ends_a_run_after_the_photo_at_work_and_the_same_command_goes_o
     assert [row.key for row in read_run(out)[0]] == [("hall 2", "images/clean_0.jpg")]
     assert _run(scenes, out) == 0
     assert len(read_run(out)[0]) == 5
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--out x", "--scenes goes with --out or --results"),
-        ("--scenes x --compare a b", "--scenes goes with --out or --results"),
-        ("--scenes x --out y --jobs 0", "--jobs: found 0"),
-        ("--scenes x --out y --max-distance -1", "--max-distance, --max-angle: wanted numbers above 0"),
-        ("--compare a b --csv c", "--csv, --risk: not with --compare"),
-        ("--scenes x --out y --preset paper --refine-focal", "not an option of the preset paper"),
-    ],
-)
-def test_wrong_usage(words, message, capsys):
-    assert evaluate.main(words.split()) == 2
-    assert message in capsys.readouterr().err
 
 
 def test_walks_have_a_line_each_and_what_shows_nothing_is_refused(tmp_path, capsys):
@@ -273,11 +248,9 @@ def test_walks_have_a_line_each_and_what_shows_nothing_is_refused(tmp_path, caps
     table = text[text.index("walks; correct: under 0.1 m and 5 deg") :].splitlines()
     names = [line.split(" | ")[0].strip("| ") for line in table[4:7]]
     assert names == ["walk clean_walk_0", "walk clean_walk_1", "all"]
-    counts = [int(line.split(" | ")[1]) for line in table[4:7]]
-    assert counts == [counts[0], counts[1], len(rows)]
-    assert sum(counts[:2]) == len(rows)
+    first, second, total = (int(line.split(" | ")[1]) for line in table[4:7])
+    assert first + second == total == len(rows)
     before = out.read_bytes()
     assert _run(folder, out) == 0
     assert out.read_bytes() == before
-    again = capsys.readouterr().out
-    assert again == text
+    assert capsys.readouterr().out == text

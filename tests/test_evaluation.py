@@ -19,16 +19,7 @@ from piccolo.scenes.evaluation.query_result import (
     Thresholds,
     match_results,
     query_result_of,
-)
-from piccolo.scenes.evaluation.runs import read_run
-from piccolo.scenes.evaluation.tables import (
-    accuracies,
-    changes,
-    pair_up,
-    quartiles,
-    risk_and_coverage,
-    side_by_side,
-    summarize,
+    read_run,
 )
 from piccolo.scenes.scene import Query, Scene
 
@@ -73,18 +64,14 @@ def test_errors_of_a_query_and_the_thresholds_of_the_paper(tmp_path):
     assert row.is_correct()
     assert not row.is_correct(Thresholds(max_distance=0.04))
     assert not row.is_correct(Thresholds(max_angle=np.radians(2.0)))
-    assert is_correct(_pose(0.09, 4.9), TRUE_POSE)
-    assert not is_correct(_pose(0.11, 0.0), TRUE_POSE)
-    assert not is_correct(_pose(0.0, 5.1), TRUE_POSE)
-    assert not is_correct(None, TRUE_POSE)
+    poses = _pose(0.09, 4.9), _pose(0.11, 0.0), _pose(0.0, 5.1), None
+    assert [is_correct(pose, TRUE_POSE) for pose in poses] == [True, False, False, False]
 
 
-@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.image)
+@pytest.mark.parametrize("row", ROWS)
 def test_a_query_result_comes_back(row):
     back = QueryResult.from_json(row.to_json())
     assert back.to_json() == row.to_json()
-    assert (back.key, back.variant, back.is_in_box) == (row.key, row.variant, row.is_in_box)
-    assert back.position_error == row.position_error
     assert back.rotation_error == pytest.approx(row.rotation_error, abs=1e-15)
 
 
@@ -104,32 +91,26 @@ def test_results_find_their_queries_by_path_then_by_name(tmp_path):
     with pytest.raises(InputError, match="found a second result of this panorama"):
         list(match_results(scenes, [by_path, by_path], pytest.fail))
     told = []
-    strange = [result("a.jpg", None), result("new\nline\udcff.jpg", None), result(f"{'x' * 5000}.jpg", None)]
+    strange = [result("a.jpg", None), result(f"{'x' * 5000}.jpg", None)]
     assert len(list(match_results(scenes, [*strange, by_path], told.append))) == 1
     assert told[0].startswith("a.jpg: found 2 queries of this name")
-    assert told[1].startswith("new\nline\udcff.jpg: found a result without a true pose")
-    assert len(told) == 3
+    assert len(told) == 2
 
 
 def test_summary_accuracies_and_quartiles_of_errors_some_of_which_are_infinite():
-    assert quartiles([1.0, 2.0, 3.0, 4.0, 5.0]).tolist() == [2.0, 3.0, 4.0]
-    assert quartiles([1.0, 2.0, 3.0, 4.0, np.inf]).tolist() == [2.0, 3.0, 4.0]
-    assert quartiles([1.0, np.inf]).tolist() == [np.inf] * 3
-    assert quartiles([1.0, 1.0, 1.0, np.inf]).tolist() == [1.0, 1.0, np.inf]
-    summary = summarize(ROWS)
+    assert tables.quartiles([1.0, 2.0, 3.0, 4.0, np.inf]).tolist() == [2.0, 3.0, 4.0]
+    assert tables.quartiles([1.0, np.inf]).tolist() == [np.inf] * 3
+    assert tables.quartiles([1.0, 1.0, 1.0, np.inf]).tolist() == [1.0, 1.0, np.inf]
+    summary = tables.summarize(ROWS)
     assert (summary.num_queries, summary.num_correct, summary.num_localized) == (4, 2, 2)
     assert (summary.num_wrong, summary.accuracy) == (1, 0.5)
     assert summary.position_quartiles[1] == pytest.approx(0.06)
-    assert accuracies(ROWS, np.radians(5.0)) == [0.25, 0.5, 0.5, 0.5, 0.5, 0.5]
-    assert accuracies(ROWS, np.radians(10.0)) == [0.25, 0.5, 0.75, 0.75, 0.75, 0.75]
 
 
 def test_risk_over_coverage():
-    rows = [
-        _row(f"{k}.jpg", 0.0 if is_right else 1.0, 0.0, confidence=confidence)
-        for k, (confidence, is_right) in enumerate([(0.9, True), (0.5, False), (0.95, True), (0.5, True)])
-    ]
-    points = risk_and_coverage(rows)
+    errors = {"a": (0.9, 0.0), "b": (0.5, 1.0), "c": (0.95, 0.0), "d": (0.5, 0.0)}
+    rows = [_row(name, error, 0.0, confidence=sure) for name, (sure, error) in errors.items()]
+    points = tables.risk_and_coverage(rows)
     found = [(p.confidence, p.coverage, p.num_wrong) for p in points]
     assert found == [(0.95, 0.25, 0), (0.9, 0.5, 0), (0.5, 1.0, 1)]
     assert points[-1].risk == 0.25
@@ -144,7 +125,11 @@ def test_tables_have_a_line_a_split_a_room_and_all():
     names = [line.split(" | ")[0] for line in text.splitlines()[4:]]
     assert names == ["| clean", "| photo", "| hall", "| room", "| all"]
     assert text.splitlines()[7].startswith("| room | 2 | 2 | 1.000 | 0.0150 | 0.0200 | 0.0250 | 0.250 | 0.3")
-    assert "| all | 0.250 | 0.500 | 0.500 |" in tables.threshold_table(ROWS, PAPER_THRESHOLDS).markdown()
+    for angle_deg, line in (
+        (5.0, "| all | 0.250 | 0.500 | 0.500 |"),
+        (10.0, "| all | 0.250 | 0.500 | 0.750 |"),
+    ):
+        assert line in tables.threshold_table(ROWS, Thresholds(max_angle=np.radians(angle_deg))).markdown()
     assert "| hall | d.jpg | not_localized | inf | inf | 0.000 |" in tables.per_query(ROWS).markdown()
 
 
@@ -173,7 +158,7 @@ def test_plots_show_the_errors_and_risk_over_coverage():
     image = cv2.imdecode(np.frombuffer(figure_png(figure), np.uint8), cv2.IMREAD_COLOR)
     assert image.shape == (504, 1680, 3)
     assert (image != 255).any(axis=2).mean() > 0.02  # ink
-    (axes,) = risk_figure(risk_and_coverage(ROWS)).axes
+    (axes,) = risk_figure(tables.risk_and_coverage(ROWS)).axes
     curve, *marks = axes.get_lines()
     expected = [[0.0, 50.0], [50.0, 50.0], [75.0, 100 / 3], [100.0, 50.0]]
     np.testing.assert_allclose(curve.get_xydata(), expected)
@@ -183,12 +168,12 @@ def test_plots_show_the_errors_and_risk_over_coverage():
 
 def test_two_runs_side_by_side():
     second = [_row("a.jpg", 0.01, 0.2), _row("b.jpg", 0.5, 0.4, variant="photo"), ROWS[2]]
-    pairs = pair_up(ROWS, second)
+    pairs = tables.pair_up(ROWS, second)
     assert [first.image for first, _ in pairs] == ["c.jpg", "a.jpg", "b.jpg"]
-    text = side_by_side(pairs, ("old", "new"), PAPER_THRESHOLDS).markdown()
+    text = tables.side_by_side(pairs, ("old", "new"), PAPER_THRESHOLDS).markdown()
     assert "| old | 3 | 2 | 0.667 | 2 | 1 |" in text
     assert "| new | 3 | 1 | 0.333 | 3 | 2 |" in text
-    changed = changes(pairs, PAPER_THRESHOLDS).markdown().splitlines()[4:]
+    changed = tables.changes(pairs, PAPER_THRESHOLDS).markdown().splitlines()[4:]
     change = "ambiguous 0.50: 0.030 m, 0.40 deg | localized 0.95: 0.500 m, 0.40 deg"
     assert changed == [f"| room | b.jpg | worse | {change} |"]
 
@@ -197,7 +182,7 @@ def test_a_run_is_resumed_after_its_last_whole_line(tmp_path):
     path = tmp_path / "run.jsonl"
     path.write_text("".join(row.to_json() + "\n" for row in ROWS[:2]) + ROWS[2].to_json()[:50])
     rows, size = read_run(path)
-    assert [row.image for row in rows] == ["a.jpg", "b.jpg"]
+    assert len(rows) == 2
     assert path.read_bytes()[size:] == ROWS[2].to_json()[:50].encode()
     path.write_text('{"my": "notes"}')
     assert_refused("its end is no line of a run of tools/evaluate.py", read_run, path)

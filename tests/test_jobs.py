@@ -1,36 +1,23 @@
 """Batches in several processes: the same files, whoever is killed."""
 
 import argparse
-import json
 import os
 import re
 import signal
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from batches import untimed, wait_for_lines, workers_of
-from rooms import write_room
+from batches import PAPER, start_localize, untimed, wait_for_lines, workers_of
 
 from piccolo.batch.localizer import Localizer
-from piccolo.cli import evaluate, executing, localize
-from piccolo.result import Result
-
-ROOT = Path(__file__).resolve().parents[1]
-PAPER = ["--preset", "paper", "num_translations=4", "num_iterations=5", "max_points=5000"]
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """A room's cloud and three panoramas in a folder of their own."""
-    words = "--seed 7 --size 4.5 3.5 2.5 --points 60000 --panoramas 3 --width 512"
-    return write_room(tmp_path_factory.mktemp("a batch"), words)
+from piccolo.cli import executing, localize, options
+from piccolo.result import Result, read_results
 
 
 @pytest.fixture(scope="module")
 def many(scene, tmp_path_factory):
-    """A list that names two dozen panoramas, and the file of their results by one process."""
+    """A list that names two dozen panoramas, and their results by one process."""
     folder = tmp_path_factory.mktemp("many")
     panos = [str(scene / "images" / f"clean_{k % 3}.jpg") for k in range(24)]
     (folder / "list.txt").write_text("\n".join(panos))
@@ -43,17 +30,12 @@ def _words(scene, pano, *more):
     return ["--cloud", str(scene / "cloud.ply"), "--pano", pano, "--quiet", *PAPER, *more]
 
 
-def _process(words, **options):
-    command = [sys.executable, str(ROOT / "localize.py"), *words]
-    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **options)
-
-
 def test_several_processes_write_the_same_files(scene, tmp_path, capsys):
     bad = tmp_path / "bad.jpg"
     bad.write_bytes(b"\xff\xd8\xff nothing more")
     table = tmp_path / "priors.csv"
     table.write_text("name,height\nclean_1.jpg,1.5\nclean_9.jpg,1\n")
-    found = {}
+    found = []
     for jobs in ("1", "2"):
         folder = tmp_path / jobs
         pictures = [folder / "overlays", folder / "changes"]
@@ -64,15 +46,11 @@ def test_several_processes_write_the_same_files(scene, tmp_path, capsys):
         words += ["--occlusion-mask", str(pictures[1]), "--cache", "none", "--max-memory", "8"]
         assert localize.main([*words, "--jobs", jobs]) == 3
         err = re.sub(r" in [0-9.]+ s", "", capsys.readouterr().err)
-        lines = [line for line in err.splitlines() if "%|" not in line]
+        lines = [line for line in err.splitlines() if re.search("clean|bad|names", line)]
         files = {path.name: path.read_bytes() for folder_ in pictures for path in folder_.iterdir()}
-        found[jobs] = untimed(folder / "out"), files, [line for line in lines if line.strip()]
-    assert found["1"][0] == found["2"][0]
-    assert found["1"][1] == found["2"][1]
-    assert len(found["1"][1]) == 3
-    assert [line for line in found["2"][2] if "clean" in line or "bad" in line or "names" in line] == [
-        line for line in found["1"][2] if "clean" in line or "bad" in line or "names" in line
-    ]
+        found.append((untimed(folder / "out"), files, lines))
+    assert found[0] == found[1]
+    assert len(found[0][1]) == 3
 
 
 class Deadly(Localizer):
@@ -87,7 +65,7 @@ class Deadly(Localizer):
 def test_a_photo_that_kills_its_processes_is_a_line_that_says_so(scene, tmp_path, monkeypatch, capsys):
     deadly = tmp_path / "deadly.jpg"
     deadly.write_bytes((scene / "images" / "clean_0.jpg").read_bytes())
-    monkeypatch.setattr(localize, "Localizer", Deadly)
+    monkeypatch.setattr(options, "Localizer", Deadly)
     panos = tmp_path / "list.txt"
     names = [str(scene / "images" / "clean_1.jpg"), str(deadly), str(scene / "images" / "clean_2.jpg")]
     panos.write_text("\n".join(names))
@@ -95,13 +73,13 @@ def test_a_photo_that_kills_its_processes_is_a_line_that_says_so(scene, tmp_path
     assert localize.main(_words(scene, f"@{panos}", "--out", str(out), "--jobs", "2")) == 3
     error = f"{deadly}: each of 2 processes at work on it was killed by SIGKILL"
     assert capsys.readouterr().err == f"localize.py: {error}\n"
-    results = [Result.from_json(line) for line in out.read_text().splitlines()]
+    results = read_results([out])
     assert [result.pano for result in results] == names
     assert [result.status == "failed" for result in results] == [False, True, False]
     assert results[1].error == error
     monkeypatch.undo()
     assert localize.main(_words(scene, f"@{panos}", "--out", str(out), "--jobs", "1")) < 2  # it once more
-    results = [Result.from_json(line) for line in out.read_text().splitlines()]
+    results = read_results([out])
     assert [result.pano for result in results] == names
     assert "failed" not in {result.status for result in results}
 
@@ -111,7 +89,7 @@ def test_a_signal_ends_all_and_the_same_command_goes_on(scene, many, tmp_path):
     temporary.mkdir()
     words = _words(scene, many[0], "--out", str(out), "--jobs", "2", "--cache", "none")
     options = {"env": {**os.environ, "TMPDIR": str(temporary)}, "start_new_session": True}
-    with _process(words, **options) as process:
+    with start_localize(words, **options) as process:
         wait_for_lines(process, out, 2)
         os.killpg(process.pid, signal.SIGTERM)
         err = process.stderr.read()
@@ -129,7 +107,7 @@ def test_a_signal_ends_all_and_the_same_command_goes_on(scene, many, tmp_path):
 def test_a_killed_process_costs_nothing_and_a_killed_parent_leaves_whole_lines(scene, many, tmp_path):
     out = tmp_path / "poses.jsonl"
     words = _words(scene, many[0], "--out", str(out), "--jobs", "2")
-    with _process(words) as process:
+    with start_localize(words) as process:
         wait_for_lines(process, out, 2)
         os.kill(workers_of(process)[0], signal.SIGKILL)
         wait_for_lines(process, out, 9)
@@ -145,7 +123,7 @@ def test_a_killed_process_costs_nothing_and_a_killed_parent_leaves_whole_lines(s
 def test_names_on_standard_input_are_answered_as_they_come(scene):
     name = str(scene / "images" / "clean_1.jpg")
     words = _words(scene, "-", "--jobs", "2")
-    with _process(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=1) as process:
+    with start_localize(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         for word in (name, "missing.jpg", name):
             process.stdin.write(word + "\n")
             process.stdin.flush()
@@ -163,39 +141,13 @@ def test_as_many_processes_as_are_worth_it_and_fit(monkeypatch):
         return executing.count_jobs(argparse.Namespace(jobs=jobs, threads=threads), num_left)
 
     assert [wanted(count) for count in (1, 15, 16, 31, 32, 1000, None)] == [1, 1, 2, 3, 4, 4, 1]
-    assert [wanted(1000, threads=2), wanted(3, jobs=8), wanted(None, jobs=8), wanted(0, jobs=2)] == [
-        1,
-        3,
-        8,
-        2,
-    ]
+    given = wanted(1000, threads=2), wanted(3, jobs=8), wanted(None, jobs=8), wanted(0, jobs=2)
+    assert given == (1, 3, 8, 2)
     monkeypatch.setattr(executing, "memory_taken", lambda: 1.5e9)
     monkeypatch.setattr(executing, "memory_left", lambda: 4.6e9)
     assert executing.count_fitting(argparse.Namespace(jobs=None), 8) == 3
     assert executing.count_fitting(argparse.Namespace(jobs=8), 8) == 8
     arguments = argparse.Namespace(jobs=2, threads=None, max_memory=5.5, dask=None)
-    localizer = localize.Localizer((), None, None, None, None)
+    localizer = Localizer((), None, None, None, None)
     share = executing.share_of_a_job(arguments, localizer, 2)
     assert (share.num_threads, share.max_memory) == (2, 2.0)
-
-
-def test_an_evaluation_survives_a_killed_process(scene, tmp_path, capsys):
-    whole, out, many = tmp_path / "whole.jsonl", tmp_path / "run.jsonl", tmp_path / "scene"
-    many.mkdir()
-    document = json.loads((scene / "queries.json").read_text())
-    (many / "cloud.ply").hardlink_to(scene / "cloud.ply")
-    queries = []
-    for k in range(16):
-        query = dict(document["queries"][k % 3])
-        (many / f"{k}.jpg").hardlink_to(scene / query["image"])
-        queries.append({**query, "image": f"{k}.jpg"})
-    (many / "queries.json").write_text(json.dumps({**document, "queries": queries}))
-    words = ["--scenes", str(many), "--quiet", *PAPER]
-    assert evaluate.main([*words, "--out", str(whole)]) == 0
-    tool = [sys.executable, str(ROOT / "tools" / "evaluate.py"), *words, "--out", str(out), "--jobs", "2"]
-    with subprocess.Popen(tool, stdout=subprocess.DEVNULL) as process:
-        wait_for_lines(process, out, 1)
-        os.kill(workers_of(process)[0], signal.SIGKILL)
-        assert process.wait() == 0
-    assert untimed(out) == untimed(whole)
-    assert untimed(whole).count("\n") == 16

@@ -7,46 +7,35 @@ import pty
 import re
 import signal
 import subprocess
-import sys
 import termios
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from rooms import errors, query, write_room
+from batches import command_of, start_localize
+from rooms import errors, query
 
 from piccolo.cli import localize, prepare_map
-from piccolo.geometry.pose import Pose
 from piccolo.result import Result
+from piccolo.scenes.scene import read_scene
 
-ROOT = Path(__file__).resolve().parents[1]
-QUICK = ["--cache", "none"]
 PAPER = ["--preset", "paper", "num_translations=30", "num_iterations=60", "max_points=30000"]
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """A folder, with a space in its name, of one room and two panoramas."""
-    words = "--seed 7 --size 4.5 3.5 2.5 --points 60000 --panoramas 2 --width 512"
-    return write_room(tmp_path_factory.mktemp("a scene"), words)
 
 
 def _arguments(scene, *more):
     pano = str(scene / "images" / "clean_0.jpg")
-    return ["--cloud", str(scene / "cloud.ply"), "--pano", pano, *QUICK, *more]
+    return ["--cloud", str(scene / "cloud.ply"), "--pano", pano, "--cache", "none", *more]
 
 
-def _truth(scene, k):
-    entry = json.loads((scene / "queries.json").read_text())["queries"][k]
-    return Pose(np.array(entry["R_cam_from_world"]), np.array(entry["center_world"]))
+def _truth(scene):
+    return read_scene(scene).by_name["clean_0.jpg"].pose
 
 
 def test_pose_on_stdout_and_a_summary_on_stderr(scene, capsys):
     assert localize.main(_arguments(scene)) == 0
     out, err = capsys.readouterr()
     result = Result.from_json(out)
-    distance, angle_deg = errors(result.pose, _truth(scene, 0))
+    distance, angle_deg = errors(result.pose, _truth(scene))
     assert distance < 0.03
     assert angle_deg < 0.5
     assert set(result.seconds) == {"read", "search", "refine"}  # a clear photo: no features are matched
@@ -54,45 +43,25 @@ def test_pose_on_stdout_and_a_summary_on_stderr(scene, capsys):
     assert out.count("\n") == 1
 
 
-def test_preset_paper_with_its_own_options(scene, capsys):
-    paper = ["--cloud", str(scene / "cloud.ply"), "--pano", str(scene / "images" / "clean_0.jpg"), *PAPER]
-    assert localize.main([*paper, "--quiet"]) == 0
-    result = Result.from_json(capsys.readouterr().out)
-    assert errors(result.pose, _truth(scene, 0))[0] < 0.03
-    assert result.settings["preset"] == "paper"
-    assert result.settings["num_rotations"] == 8
-
-
 def test_map_is_cached_prepared_and_read_back_to_the_same_bits(scene, tmp_path, capsys):
-    pano, cache, built = str(scene / "images" / "clean_0.jpg"), tmp_path / "cache", tmp_path / "scan.map"
-    cloud = ["--cloud", str(scene / "cloud.ply"), "--pano", pano, "--quiet", "--cache", str(cache)]
-    assert prepare_map.main(["--cloud", str(scene / "cloud.ply"), "--out", str(built), "--quiet"]) == 0
+    built = str(tmp_path / "scan.map")
+    assert prepare_map.main(["--cloud", str(scene / "cloud.ply"), "--out", built, "--quiet"]) == 0
     assert json.loads(capsys.readouterr().out)["candidates"] > 50
-    poses = []
-    for arguments in (cloud, cloud, ["--cloud", str(built), "--pano", pano, "--quiet"]):
-        assert localize.main(arguments) == 0
-        poses.append(Result.from_json(capsys.readouterr().out))
-    assert len({json.dumps(p.pose.center_world.tolist()) for p in poses}) == 1
-    (cached,) = cache.glob("piccolo-maps/*.piccolo-map")
-    whole = cached.read_bytes()
-    damaged = bytearray(whole)
-    damaged[len(damaged) // 2] ^= 1
-    cached.write_bytes(damaged)
-    assert localize.main(cloud) == 0
-    rebuilt = Result.from_json(capsys.readouterr().out)
-    assert cached.read_bytes() == whole
-    np.testing.assert_array_equal(rebuilt.pose.center_world, poses[0].pose.center_world)
-    built.write_bytes(bytes(damaged))
-    assert localize.main(["--cloud", str(built), "--pano", pano, "--quiet"]) == 3
-    assert "wanted a whole map by tools/prepare_map.py" in capsys.readouterr().err
+    cached = ["--cache", str(tmp_path)]
+    poses = set()
+    for more in (cached, cached, ["--cloud", built]):
+        assert localize.main(_arguments(scene, "--quiet", *more)) == 0
+        poses.add(str(json.loads(capsys.readouterr().out)["center_world"]))
+    assert len(poses) == 1
+    assert len(list(tmp_path.glob("piccolo-maps/*.piccolo-map"))) == 1
 
 
 def test_prior_narrows_the_search_and_stands_in_the_result(scene, capsys):
-    x, y, z = _truth(scene, 0).center_world
+    x, y, z = _truth(scene).center_world
     near = ["--near", f"{x + 0.4:.2f}", f"{y:.2f}", f"{z:.2f}", "1", "--height", "0.5", "2"]
     assert localize.main(_arguments(scene, "--quiet", *near)) == 0
     result = Result.from_json(capsys.readouterr().out)
-    assert errors(result.pose, _truth(scene, 0))[0] < 0.03
+    assert errors(result.pose, _truth(scene))[0] < 0.03
     assert result.settings["prior"]["radius"] == 1.0
     assert localize.main(_arguments(scene, "--quiet", "--near", "900", "0", "0", "1")) == 1
     nothing = json.loads(capsys.readouterr().out)
@@ -120,92 +89,63 @@ def test_files_are_written_and_look_right(scene, tmp_path, capsys):
 def test_panorama_from_elsewhere_exits_with_one(scene, tmp_path, capsys):
     elsewhere = tmp_path / "elsewhere.png"
     cv2.imwrite(str(elsewhere), query(1).rgb)
-    code = localize.main(["--cloud", str(scene / "cloud.ply"), "--pano", str(elsewhere), *PAPER, "--quiet"])
-    assert code == 1
+    assert localize.main(_arguments(scene, "--pano", str(elsewhere), *PAPER, "--quiet")) == 1
     assert json.loads(capsys.readouterr().out)["status"] == "not_localized"
 
 
-@pytest.mark.parametrize(
-    ("options", "code", "message"),
-    [
-        (["--threads", "0"], 2, "--threads: found 0, wanted at least 1"),
-        (["--units", "-1"], 2, "--units: found -1.0"),
-        (["--preset", "odd"], 2, "--preset: found 'odd', wanted default or paper"),
-        (["--preset", "paper", "num_translations=0"], 2, "num_translations: found 0"),
-        (
-            ["--preset", "default", "num_translations=9"],
-            2,
-            "found 'num_translations=9', wanted NAME",
-        ),
-        (["--preset", "paper", "loss=both"], 2, "found 'loss=both', wanted one of sampling, photometric"),
-        (["--preset", "paper", "use_visibility=no"], 2, "found 'use_visibility=no', wanted one of true, fal"),
-        (["--preset", "paper", "max_points=many"], 2, "found 'max_points=many', wanted int"),
-        (["--preset", "paper", "--near", "0", "0", "0", "1"], 2, "--near: not an option of the preset paper"),
-        (["--preset", "paper", "--up", "-y"], 2, "--up: not an option of the preset paper"),
-        (["--preset", "paper", "--refine-focal"], 2, "--refine-focal: not an option of the preset paper"),
-        (["--preset", "paper", "--gravity", "auto"], 2, "gravity: found auto"),
-        (["--height", "2", "1"], 2, "--height: found [2.0, 1.0]"),
-        (["--preset", "default", "num_yaws=1000000"], 2, "num_yaws: found 1000000, wanted 1 to 3600"),
-        (["--near", "nan", "0", "0", "1"], 2, "found nan or inf, wanted finite numbers"),
-        (
-            ["--overlay", "x.png", "--pano", "a", "b"],
-            2,
-            "--overlay: found 2 panoramas, wanted one panorama or a folder",
-        ),
-        (["--occlusion-mask", "x.jpg"], 2, "--occlusion-mask x.jpg: wanted a name that ends with .png"),
-        (["--occlusion-mask", "x.png", "--overlay", "x.png"], 2, "the same output as --overlay"),
-        (["--pano", "@no such.txt"], 3, "no such.txt"),
-        (["--priors", "no such.csv"], 3, "no such.csv"),
-        (["--overwrite"], 2, "--overwrite: only with --out"),
-        (["--cloud", "no such.ply"], 3, "no such.ply"),
-        (["--out", "/no such folder/pose.json"], 3, "found no folder /no such folder"),
-    ],
-)
-def test_bad_input_is_one_line_and_a_code(scene, options, code, message, capsys):
-    assert localize.main(_arguments(scene, "--quiet", *options)) == code
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.count("\n") == 1
-    assert err.startswith("localize.py: ")
-    assert message in err
+USAGE = [
+    ("--threads 0", "--threads: found 0, wanted at least 1"),
+    ("--units -1", "--units: found -1.0"),
+    ("--preset odd", "--preset: found 'odd', wanted default or paper"),
+    ("--preset paper num_translations=0", "num_translations: found 0"),
+    ("--preset default num_translations=9", "found 'num_translations=9', wanted NAME"),
+    ("--preset paper loss=both", "found 'loss=both', wanted one of sampling, photometric"),
+    ("--preset paper use_visibility=no", "found 'use_visibility=no', wanted one of true, fal"),
+    ("--preset paper max_points=many", "found 'max_points=many', wanted int"),
+    ("--preset paper --near 0 0 0 1", "--near: not an option of the preset paper"),
+    ("--preset paper --up -y", "--up: not an option of the preset paper"),
+    ("--preset paper --refine-focal", "--refine-focal: not an option of the preset paper"),
+    ("--preset paper --gravity auto", "gravity: found auto"),
+    ("--height 2 1", "--height: found [2.0, 1.0]"),
+    ("--preset default num_yaws=1000000", "num_yaws: found 1000000, wanted 1 to 3600"),
+    ("--near nan 0 0 1", "found nan or inf, wanted finite numbers"),
+    ("--overlay x.png --pano a b", "found 2 panoramas, wanted one panorama or a folder"),
+    ("--occlusion-mask x.jpg", "--occlusion-mask x.jpg: wanted a name that ends with .png"),
+    ("--occlusion-mask x.png --overlay x.png", "the same output as --overlay"),
+    ("--overwrite", "--overwrite: only with --out"),
+]
+FILES = [
+    ("--pano @no-such.txt", "no-such.txt"),
+    ("--priors no-such.csv", "no-such.csv"),
+    ("--cloud no-such.ply", "no-such.ply"),
+    ("--out /no-such/pose.json", "found no folder /no-such"),
+]
 
 
-def test_traceback_only_with_debug_and_internal_errors_have_a_code(scene, capsys, monkeypatch):
-    localize.main(_arguments(scene, "--cloud", "no.ply"))
-    assert "Traceback" not in capsys.readouterr().err
-    localize.main(_arguments(scene, "--cloud", "no.ply", "--debug"))
-    assert "Traceback" in capsys.readouterr().err
-
-    def fail(*_):
-        raise ZeroDivisionError("made by the test")
-
-    monkeypatch.setattr(localize.Localizer, "open_scan", fail)
-    assert localize.main(_arguments(scene, "--quiet")) == 4
-    assert "internal error: ZeroDivisionError" in capsys.readouterr().err
+@pytest.mark.parametrize(("code", "cases"), [(2, USAGE), (3, FILES)])
+def test_bad_input_is_one_line_and_a_code(scene, code, cases, capsys):
+    for options, message in cases:
+        assert localize.main(_arguments(scene, "--quiet", *options.split())) == code, options
+        out, err = capsys.readouterr()
+        assert (out, err.count("\n")) == ("", 1)
+        assert err.startswith("localize.py: ")
+        assert message in err
 
 
 def test_usage_and_version(capsys):
-    for options, code in ((["--version"], 0), (["--help"], 0), ([], 2), (["--cloud", "a", "--odd"], 2)):
+    for words, code in (("--version", 0), ("--help", 0), ("", 2), ("--cloud a --odd", 2)):
         with pytest.raises(SystemExit) as stop:
-            localize.main(options)
+            localize.main(words.split())
         assert stop.value.code == code
     text = capsys.readouterr().out
-    assert "exit codes" in text
     assert len(re.findall("^  -", text, flags=re.MULTILINE)) <= 44
 
 
-def _process(arguments, **options):
-    command = [sys.executable, str(ROOT / "localize.py"), *arguments]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
-
-
 def test_a_signal_leaves_nothing_half_written(scene, tmp_path):
-    out = tmp_path / "pose.json"
-    arguments = _arguments(scene, "--out", str(out))
+    arguments = _arguments(scene, "--out", str(tmp_path / "pose.json"), *PAPER, "num_translations=5000")
     terminal, stderr = pty.openpty()
     termios.tcsetwinsize(terminal, (24, 80))
-    command = [sys.executable, str(ROOT / "localize.py"), *arguments, *PAPER, "num_translations=5000"]
-    with subprocess.Popen(command, stderr=stderr, cwd=tmp_path) as process:
+    with subprocess.Popen(command_of("localize.py", *arguments), stderr=stderr, cwd=tmp_path) as process:
         os.close(stderr)
         err = os.read(terminal, 1)  # the bar of the search, which a terminal gets: imports are over
         process.send_signal(signal.SIGTERM)
@@ -220,7 +160,7 @@ def test_a_signal_leaves_nothing_half_written(scene, tmp_path):
 
 
 def test_closed_pipe_is_no_error_message(scene):
-    with _process(_arguments(scene, "--quiet")) as process:
+    with start_localize(_arguments(scene, "--quiet"), stdout=subprocess.PIPE) as process:
         process.stdout.close()
         assert process.stderr.read() == ""
     assert process.returncode == 141
@@ -228,8 +168,9 @@ def test_closed_pipe_is_no_error_message(scene):
 
 def test_first_use_is_announced_and_two_processes_may_share_it(scene, tmp_path):
     """The first one waits, where it begins to compile, until the second has come as far."""
-    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
-    first, second = (_process([*_arguments(scene), *PAPER], env=environment) for _ in range(2))
+    options = {"env": {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}, "stdout": subprocess.PIPE}
+    arguments = _arguments(scene, *PAPER)
+    first, second = (start_localize(arguments, **options) for _ in range(2))
     try:
         assert any("compiling kernels, once" in line for line in first.stderr)
         first.send_signal(signal.SIGSTOP)
@@ -238,7 +179,6 @@ def test_first_use_is_announced_and_two_processes_may_share_it(scene, tmp_path):
         first.send_signal(signal.SIGCONT)
     poses = [json.loads(process.communicate(timeout=120)[0])["center_world"] for process in (first, second)]
     assert poses[0] == poses[1]
-    again = _process([*_arguments(scene), *PAPER], env=environment)
-    out, err = again.communicate(timeout=60)
+    out, err = start_localize(arguments, **options).communicate(timeout=60)
     assert "compiling" not in err
     assert json.loads(out)["center_world"] == poses[0]

@@ -83,9 +83,8 @@ def test_a_dual_fisheye_is_localized(tmp_path):
     this, pose = place()
     rgb = picture_of_all(DUAL, this, pose, Workers(2))
     calibration = write(tmp_path / "dual.json", json.dumps(document_of(DUAL)).encode())
-    result = scan().localize(
-        write(tmp_path / "a.png", encoded(rgb, ".png")), camera=calibration, gravity="unknown"
-    )
+    photo = write(tmp_path / "a.png", encoded(rgb, ".png"))
+    result = scan().localize(photo, camera=calibration, gravity="unknown")
     distance, angle = pose_errors(result.best_pose, pose)
     assert distance < 0.01
     assert np.degrees(angle) < 0.2

@@ -44,9 +44,7 @@ def test_the_least_loss_is_at_the_true_pose():
     assert surface.height[3, 3] == pose.center_world[2]
     assert surface.rotation[3, 3] == 0
     assert surface.loss[3, 3] < 0.8 * np.median(surface.loss)
-    assert surface.is_free[3, 3]
     assert 1 <= surface.num_minima() < 12
-    assert grid.num_poses == 7 * 7 * 3 * 24
 
 
 def test_a_place_has_the_least_of_its_losses_with_the_same_bits_on_any_number_of_threads():
@@ -124,9 +122,7 @@ def test_picture_of_a_tilted_panorama(run, scene, tmp_path):
     assert told["distance_to_true"] < STEP
     assert told["distance_to_found"] < STEP + 0.1
     assert told["num_minima"] >= 1
-    assert told["poses_per_s"] > 0
     picture = cv2.imread(str(out))
-    assert min(picture.shape[:2]) > 400
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100
 
 
@@ -146,38 +142,26 @@ def test_a_cloud_with_another_axis_up(run, scene, tmp_path):
     R_z_up = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     turned = Pose(truth.R_cam_from_world @ R_z_up, R_z_up.T @ truth.center_world)
     poses.write_results(tmp_path / "pose.json", [poses.result("clean_0.jpg", turned)])
-    arguments = ["--up", "y", "--result", tmp_path / "pose.json", "--step", STEP]
-    code, told, err = run("--cloud", cloud, *arguments, "--out", tmp_path / "a.png")
+    files = ["--cloud", cloud, "--result", tmp_path / "pose.json", "--out", tmp_path / "a.png"]
+    code, told, err = run(*files, "--up", "y", "--step", STEP)
     assert (code, err) == (0, "")
     assert told["distance_to_found"] < STEP
     assert np.linalg.norm(told["lowest_world"] - turned.center_world) < STEP
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--out", "a.jpg"], "--out a.jpg: wanted a name that ends with .png"),
-        (["--out", "a.png", "--step", 0], "--step 0.0: wanted metres above 0"),
-        (["--out", "a.png", "--step", "nan"], "--step nan"),
-    ],
-)
-def test_wrong_usage(run, arguments, message):
-    code, told, err = run(*arguments)
-    assert (code, told) == (2, None)
-    assert message in err
-
-
-def test_bad_input_leaves_nothing(run, scene, tmp_path):
+def test_refusals_leave_nothing(run, scene, tmp_path):
     out = ["--out", tmp_path / "a.png"]
-    for arguments, message in (
-        ([*out, "--step", 1e-5], "places, wanted at most"),
-        ([*out, "--result", scene / "pose.json"], "0 poses of clean_0.jpg, wanted one"),
-        ([*out, "--truth", scene / "pose.json"], "wanted a queries.json with true poses"),
-        (["--out", tmp_path / "no" / "a.png"], "found no folder"),
+    for code, words, message in (
+        (2, ["--out", "a.jpg"], "--out a.jpg: wanted a name that ends with .png"),
+        (2, [*out, "--step", 0], "--step 0.0: wanted metres above 0"),
+        (2, [*out, "--step", "nan"], "--step nan"),
+        (3, [*out, "--step", 1e-5], "places, wanted at most"),
+        (3, [*out, "--result", scene / "pose.json"], "0 poses of clean_0.jpg, wanted one"),
+        (3, [*out, "--truth", scene / "pose.json"], "wanted a queries.json with true poses"),
+        (3, ["--out", tmp_path / "no" / "a.png"], "found no folder"),
+        (3, [*out, "--pano", "no.jpg"], "no.jpg"),
     ):
-        code, told, err = run(*arguments)
-        assert (code, told) == (3, None)
+        found, told, err = run(*words)
+        assert (found, told, err.count("\n")) == (code, None, 1)
         assert message in err
-        assert err.count("\n") == 1
-    assert run(*out, pano="no.jpg")[0] == 3
     assert not list(tmp_path.iterdir())

@@ -5,18 +5,15 @@ import queue
 import signal
 import subprocess
 import sys
-import time
 from contextlib import closing
 from functools import partial
-from pathlib import Path
 
 import pytest
+from batches import ROOT
 
 from piccolo.errors import InputError
 from piccolo.jobs.processes import IN_FLIGHT, Processes
 from piccolo.jobs.tasks import Here, WorkerLostError
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 def _die():
@@ -57,11 +54,6 @@ def _odd():
     raise _OddError("no ", "scan")
 
 
-def _sleeping():
-    os.write(1, f"{os.getpid()}\n".encode())
-    return time.sleep
-
-
 def _outcome(wait):
     try:
         return wait()
@@ -76,7 +68,6 @@ def test_values_come_in_order_and_a_killed_process_costs_one_at_most(tmp_path):
     with closing(Processes(partial(_squares, tmp_path), 2)) as processes:
         pairs = [(item, _outcome(wait)) for item, wait in processes.values(iter(range(12)))]
     assert pairs == list(enumerate(expected))
-    (tmp_path / "seven").touch()
     here = Here(_squares(tmp_path)).values(iter([1, 9, 2]))
     assert [_outcome(wait) for _, wait in here] == [1, "InputError: nine", 4]
     assert list(here.finished()) == []
@@ -122,17 +113,16 @@ def test_what_is_done_behind_the_last_value_taken_can_be_had(tmp_path):
         assert [(item, wait()) for item, wait in values.finished()] == [(2, 4), (3, 9), (4, 16)]
 
 
-def test_processes_have_their_threads_and_leave_signals_to_their_parent():
+def check_threads_and_signals():
+    """Processes have their threads, and leave signals to their parent."""
     with closing(Processes(_told, 1, num_threads=3)) as processes:
         names = ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"]
         found = [wait() for _, wait in processes.values(iter(names))]
     assert found == [(os.environ.get(name, "3"), True, True) for name in names]
 
 
-def test_the_first_process_of_all_leaves_signals_to_its_parent_too():
-    code = (
-        "import test_processes as t; t.test_processes_have_their_threads_and_leave_signals_to_their_parent()"
-    )
+def test_processes_leave_signals_to_their_parent_from_the_first_of_all_on():
+    code = "import test_processes as t; t.check_threads_and_signals()"
     environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}
     subprocess.run([sys.executable, "-c", code], env=environment, check=True)
 
@@ -150,16 +140,3 @@ def test_what_cannot_be_opened_is_an_error(opening, message):
         ((_, wait),) = processes.values(iter([1]))
         with pytest.raises((InputError, RuntimeError), match=message):
             wait()
-
-
-def test_processes_end_with_a_parent_that_is_killed():
-    code = "import test_processes as t; from piccolo.jobs.processes import Processes\n"
-    code += "for _, p in Processes(t._sleeping, 1).values(iter([600])): p.result()"
-    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}
-    with subprocess.Popen(
-        [sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True
-    ) as parent:
-        worker = int(parent.stdout.readline())
-        parent.kill()
-        assert parent.stdout.read() == ""  # until the worker, which has it open too, has ended
-    assert not Path(f"/proc/{worker}/exe").exists()

@@ -24,10 +24,3 @@ def test_progress_says_step_and_time_left(capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: False)
     assert list(show(iter([1, 2]), 2, "write")) == [1, 2]
     assert capsys.readouterr().err == ""
-
-
-def test_a_warning_is_printed_once_and_names_the_option_of_the_command(capsys):
-    warn = progress.warn_once(is_quiet=False)
-    warn("set up=-y, or turn the scan")
-    warn("set up=-y, or turn the scan")
-    assert capsys.readouterr().err == "warning: set --up -y, or turn the scan\n"

@@ -103,43 +103,31 @@ def test_a_descent_is_shown_with_where_it_ended(run, scene, tmp_path, monkeypatc
     assert (len(shown), shown[0].shape[1]) == (line["frames"], animation.FRAME_WIDTH)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--at", 0, 0, 1], "give --out, --animate or both"),
-        (["--at", 0, 0, 1, "--out", "a.png", "--width", 101], "--width 101: wanted an even number"),
-        (["--at", 0, 0, 1, "--out", "a.bmp"], "--out a.bmp: wanted a name that ends with .png, .jpg"),
-        (["--at", 0, 0, 1, "--out", "a.png", "--depth", "a.exr"], "--depth a.exr: wanted"),
-        (["--at", 0, 0, 1, "--out", "a", "--depth", "a.png"], "work with a single picture only"),
-        (["--at", 0, 0, "nan", "--out", "a.png"], "must be finite"),
-        (["--at", 0, 0, 1, "--animate", "a.gif"], "--animate: only with --result or --queries"),
-        (["--pose", "T.txt", "--heading", 3, "--out", "a.png"], "only with --at"),
-        (["--at", 0, 0, 1, "--out", "a.png", "--units", 0], "--units: found 0"),
-    ],
-)
-def test_wrong_usage(run, arguments, message):
-    code, lines, err = run(*arguments)
-    assert (code, lines) == (2, [])
-    assert message in err
-
-
-def test_bad_input_leaves_nothing(run, scene, tmp_path):
+def test_refusals_leave_nothing(run, scene, tmp_path):
     (tmp_path / "T.txt").write_text("1 2 3\n")
-    result = ["--result", scene / "poses.jsonl"]
-    for arguments, message in (
-        ([*result, "--out", tmp_path / "a.png"], "2 poses; choose one"),
-        ([*result, "--pano", "x.jpg", "--out", tmp_path / "a.png"], "no pose of x.jpg"),
-        ([*result, "--out", scene], "found a folder that is not empty"),
-        (["--at", 0, 0, 1, "--out", tmp_path / "no" / "a.png"], "found no folder"),
-        (["--pose", tmp_path / "T.txt", "--out", tmp_path / "a.png"], "wanted the 4 x 4 numbers"),
-        (["--pose", tmp_path / "no.txt", "--out", tmp_path / "a.png"], "no.txt"),
-        (["--at", 0, 0, 1e30, "--out", tmp_path / "a.png"], "found a camera at [0.0, 0.0, 1e+30]"),
+    result, out, at = ["--result", scene / "poses.jsonl"], ["--out", tmp_path / "a.png"], ["--at", 0, 0, 1]
+    for code, arguments, message in (
+        (2, at, "give --out, --animate or both"),
+        (2, [*at, *out, "--width", 101], "--width 101: wanted an even number"),
+        (2, [*at, "--out", "a.bmp"], "--out a.bmp: wanted a name that ends with .png, .jpg"),
+        (2, [*at, *out, "--depth", "a.exr"], "--depth a.exr: wanted"),
+        (2, [*at, "--out", "a", "--depth", "a.png"], "work with a single picture only"),
+        (2, [*at, *out, "--heading", "nan"], "must be finite"),
+        (2, [*at, "--animate", "a.gif"], "--animate: only with --result or --queries"),
+        (2, ["--pose", "T.txt", *out, "--heading", 3], "only with --at"),
+        (2, [*at, *out, "--units", 0], "--units: found 0"),
+        (3, [*result, *out], "2 poses; choose one"),
+        (3, [*result, "--pano", "x.jpg", *out], "no pose of x.jpg"),
+        (3, [*result, "--out", scene], "found a folder that is not empty"),
+        (3, [*at, "--out", tmp_path / "no" / "a.png"], "found no folder"),
+        (3, ["--pose", tmp_path / "T.txt", *out], "wanted the 4 x 4 numbers"),
+        (3, ["--pose", tmp_path / "no.txt", *out], "no.txt"),
+        (3, ["--at", 0, 0, 1e30, *out], "found a camera at [0.0, 0.0, 1e+30]"),
+        (3, [*at, *out, "--cloud", "no.ply"], "no.ply"),
     ):
-        code, lines, err = run(*arguments)
-        assert (code, lines) == (3, []), arguments
+        found, lines, err = run(*arguments)
+        assert (found, lines, err.count("\n")) == (code, [], 1), arguments
         assert message in err
-        assert err.count("\n") == 1
-    assert run(*result, "--out", tmp_path / "a", cloud="no.ply")[0] == 3
     assert [path.name for path in tmp_path.iterdir()] == ["T.txt"]
 
 

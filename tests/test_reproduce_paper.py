@@ -18,7 +18,7 @@ from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama import read_panorama
 from piccolo.panorama.texels import pack_texels
 from piccolo.paper.settings import PaperSettings
-from piccolo.scenes.evaluation.runs import read_run
+from piccolo.scenes.evaluation.query_result import read_run
 from piccolo.scenes.reproduce_paper import EXPERIMENTS, flipped, identity, thin, with_random_rotation
 from piccolo.scenes.scene import Query, read_scene, write_queries
 from piccolo.views.zbuffer import visible_points
@@ -65,14 +65,13 @@ def test_what_a_transform_leaves_alone(rooms, tmp_path):
     folders = [tmp_path / name for name in ("turned", "again", "flipped", "thinned")]
     for folder in folders:
         folder.mkdir()
-    turned = with_random_rotation(scene, folders[0])
+    turned, again = (with_random_rotation(scene, folder) for folder in folders[:2])
     rotations = [[q.pose.R_cam_from_world for q in s.queries] for s in (scene, turned)]
     angles = list(map(angle_between, *rotations))
     assert angles == pytest.approx([angles[0]] * 2, abs=1e-7)
     assert np.degrees(angles[0]) > 1.0
     assert turned.queries[0].image == scene.queries[0].image
-    with_random_rotation(scene, folders[1])
-    assert (folders[0] / "cloud.ply").read_bytes() == (folders[1] / "cloud.ply").read_bytes()
+    assert turned.cloud.read_bytes() == again.cloud.read_bytes()
     changed = flipped(scene, folders[2])
     assert changed.cloud == scene.cloud
     assert [changed.name_of(q) for q in changed.queries] == [scene.name_of(q) for q in scene.queries]
@@ -82,18 +81,18 @@ def test_what_a_transform_leaves_alone(rooms, tmp_path):
 
 
 def test_pictures_beside_the_scene_and_masked_ones_are_flipped_too(rooms, tmp_path):
+    for name in ("raw", "room", "new"):
+        (tmp_path / name).mkdir()
     rgba = np.full((64, 128, 4), 200, np.uint8)
     rgba[:20, :, 3] = 0
-    (tmp_path / "raw").mkdir()
     cv2.imwrite(str(tmp_path / "raw" / "a.png"), rgba)
     pose = read_scene(rooms / "000").queries[0].pose
-    (tmp_path / "room").mkdir()
     write_queries(tmp_path / "room", [Query(tmp_path / "raw" / "a.png", "clean", pose)])
-    (tmp_path / "new").mkdir()
     transformed = flipped(read_scene(tmp_path / "room"), tmp_path / "new")
-    assert transformed.name_of(transformed.queries[0]) == "../raw/a.png"
-    assert transformed.queries[0].image.resolve().is_relative_to(tmp_path / "new")
-    is_valid = read_panorama(transformed.queries[0].image).is_valid
+    (query,) = transformed.queries
+    assert transformed.name_of(query) == "../raw/a.png"
+    assert query.image.resolve().is_relative_to(tmp_path / "new")
+    is_valid = read_panorama(query.image).is_valid
     assert is_valid[:44].all()
     assert not is_valid[44:].any()
 
@@ -116,9 +115,7 @@ def test_the_tool_writes_table_and_runs_and_resumes_them(rooms, tmp_path, capsys
     out = tmp_path / "out"
     assert _command("labels variants", rooms, out, "--variants", "clean") == 0
     text = capsys.readouterr().out
-    assert "| RGB | paper | 2 |" in text
-    assert "| labels | paper | 2 |" in text
-    assert "| clean | paper | 2 |" in text
+    assert all(f"| {name} | paper | 2 |" in text for name in ("RGB", "labels", "clean"))
     assert "| tilt |" not in text
     rows = read_run(out / "labels" / "labels_paper.jsonl")[0]
     assert [row.scene for row in rows] == ["000", "001"]

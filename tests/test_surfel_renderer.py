@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import mutated, read_or_refused
 
-from piccolo.cli.transform_file import read_pose_matrix
+from piccolo.cli.render_pose import read_pose_matrix
 from piccolo.cloud.soa import LocalCloud, pack_points
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, T_world_from_cam, angle_between, exp_so3, step

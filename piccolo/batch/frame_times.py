@@ -25,10 +25,7 @@ def times_of(frames: Sequence[Path], source: str | None) -> list[float] | None:
     By EXIF, by the last number in each name, or by a table; without a source by EXIF if it tells the times of
     all frames, one after another.
 
-    Raises
-    ------
-    InputError
-        The source lacks a frame, or its times do not rise.
+    Raises InputError if the source lacks a frame, or its times do not rise.
     """
     if source == ORDER:
         return None
@@ -75,8 +72,8 @@ def _times_in(path: Path, frames: Sequence[Path]) -> list[float]:
         raise InputError(f"{path}: found {type(error).__name__} {error}, {WANTED}") from error
     times = []
     for frame in frames:
-        name = next((name for name in (str(frame), frame.name) if name in by_name), None)
-        if name is None:
+        time = by_name.get(str(frame), by_name.get(frame.name))
+        if time is None:
             raise InputError(f"{path}: found no time of {frame}, {WANTED}")
-        times.append(by_name[name])
+        times.append(time)
     return times

@@ -29,10 +29,7 @@ def panoramas_of(
     A folder is one panorama if it holds the six faces of a cube, or what else `is_panorama` tells, else all
     pictures in it and in its folders, sorted by path; its other files are counted in `left_out` by suffix.
 
-    Raises
-    ------
-    InputError
-        A list can't be read, or a folder holds no picture.
+    Raises InputError if a list can't be read, or a folder holds no picture.
     """
     for word in words:
         if word == STDIN:

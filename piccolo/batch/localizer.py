@@ -21,7 +21,7 @@ from ..localization.settings import CoarseToFineSettings
 from ..opening import open_files
 from ..panorama import ReadOptions, read_panorama
 from ..panorama.photo import sha256_of
-from ..result import Failure, Result, Source, failure_of, named, unreadable_result
+from ..result import Failure, Result, Source, failure_of, unreadable_result
 from ..scan import Scan, Settings, settings_json
 from ..scan_map.map_file import load_map
 from ..scan_map.open_map import CachePolicy
@@ -131,17 +131,17 @@ class Localizer:
         """Localize one panorama, and make the pictures asked for; of one that can't be read say why."""
         with task.placed(self.folder) as path, reading_once():
             try:
-                found = scan.localize_query(
-                    path, self.read_options, task.settings, calibration=task.calibration
-                )
+                found = scan.localize_query(path, self.read_options, task.settings, None, task.calibration)
                 overlay, mask = self._pictures(scan, path, found)
             except Exception as error:
                 text, is_passing = failure_of(error)
                 failure = Failure(text.replace(str(path), str(task.pano)), is_passing)
                 source = Source(scan.prepared.scan_sha256 or None, sha256_of(path, self.read_options.rig))
                 return self._failed(task, failure, source)
-        result = named(found, path, task.pano)
-        return Answer(result, result.warnings[len(scan.warnings) :], overlay, mask)
+        name = str(task.pano)
+        warnings = tuple(warning.replace(str(path), name) for warning in found.warnings)
+        result = replace(found, pano=name, warnings=warnings)
+        return Answer(result, warnings[len(scan.warnings) :], overlay, mask)
 
     def lost(self, task: Task, error: WorkerLostError, cloud_sha256: str | None) -> Answer:
         """Return the answer to a task whose workers were lost."""
@@ -154,11 +154,11 @@ class Localizer:
 
     def _pictures(self, scan: Scan, pano: Path, result: Result) -> tuple[bytes | None, bytes | None]:
         """Overlay and occlusion mask as PNG, where they are asked for and there is a pose."""
-        pose = result.best_pose
         overlay = None
         mask = None
+        pose = result.best_pose
         if pose is None:
-            return None, None
+            return overlay, mask
         read_options = self.read_options.refined(result.cameras)
         if self.makes_overlays:
             panorama = read_panorama(pano, read_options)

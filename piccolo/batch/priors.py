@@ -31,11 +31,9 @@ class PriorTable:
 
     def prior_of(self, pano: Path, general: Prior) -> Prior:
         """Return the prior of a panorama, found by its path as given, or else by its file name."""
-        name = next((name for name in (str(pano), pano.name) if name in self.by_name), None)
-        if name is None:
-            return general
+        name = str(pano) if str(pano) in self.by_name else pano.name
         self.used.add(name)
-        return self.by_name[name]
+        return self.by_name.get(name, general)
 
     def check_scans(self, scan_map: ScanMap) -> None:
         """Refuse names that no scan of a map has."""
@@ -73,10 +71,7 @@ def read_priors(path: Path, general: Prior) -> PriorTable:
     in any height), radius [m] about them, heading [deg] of the image centre clockwise from +y, its tolerance
     [deg], height [m] above the floor, within (names of the map's scans, with semicolons between them).
 
-    Raises
-    ------
-    InputError
-        The file can't be read, a cell is no number, or a row contradicts itself.
+    Raises InputError if the file can't be read, a cell is no number, or a row contradicts itself.
     """
     rows = csv.DictReader(read_text(path, WANTED).splitlines(), restkey="more")
     names = [name.strip() for name in rows.fieldnames or ()]

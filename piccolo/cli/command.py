@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from ..jobs.memory import check_address_space
-from .errors import UsageError, handling_errors, print_note
+from .errors import UsageError, print_note, run_command
 from .start import as_started
 
 KINDS: dict[str, type] = {  # of the values, by the first metavar; of others text
@@ -33,9 +32,7 @@ def new_parser(
     """Return a parser of the command `name` with the options of all; `exit_codes` are its own, below 2."""
     program = as_started(f"{name}.py")
     epilog += f"exit codes: {exit_codes}, {EXIT_CODES}"
-    parser = argparse.ArgumentParser(
-        program, description=description, epilog=epilog, formatter_class=HelpFormatter
-    )
+    parser = argparse.ArgumentParser(program, None, description, epilog, formatter_class=HelpFormatter)
     parser.set_defaults(program=program, quiet=False, debug=False)
     add_run_options(parser)
     return parser
@@ -43,12 +40,9 @@ def new_parser(
 
 def add_run_options(parser: argparse.ArgumentParser) -> None:
     """Add --quiet and --debug to a parser, or to one of its subcommands."""
-    flag: dict[str, Any] = {
-        "action": "store_true",
-        "default": argparse.SUPPRESS,
-    }  # a subcommand keeps what stood before it
-    parser.add_argument("--quiet", help="nothing on stderr but errors", **flag)
-    parser.add_argument("--debug", help="show the traceback of an error", **flag)
+    unless_given = argparse.SUPPRESS  # a subcommand keeps what stood before it
+    option(parser, "--quiet", "nothing on stderr but errors", default=unless_given)
+    option(parser, "--debug", "show the traceback of an error", default=unless_given)
 
 
 def parse(parser: argparse.ArgumentParser, argv: list[str] | None) -> argparse.Namespace:
@@ -77,7 +71,7 @@ def option(group: argparse._ActionsContainer, usage: str, text: str = "", **more
         more.setdefault("nargs", "+")
     elif len(metavars) > 1:
         more["nargs"] = len(metavars)
-    if (default := more.get("default")) not in (None, [], False):
+    if (default := more.get("default")) not in (None, [], False, argparse.SUPPRESS):
         shown = " ".join(map(str, default)) if isinstance(default, list | tuple) else default
         text = f"{text} (default {shown})".lstrip()
     group.add_argument(name, help=text, **more)
@@ -113,11 +107,7 @@ def command(
         def main(argv: list[str] | None = None) -> int:
             parser = new_parser(Path(file).stem, description, epilog, exit_codes)
             add_options(parser)
-            arguments = parse(parser, argv)
-            with handling_errors(arguments) as outcome:
-                check_address_space()
-                outcome.exit_code = run(arguments)
-            return outcome.exit_code
+            return run_command(parse(parser, argv), run)
 
         return main
 

@@ -78,9 +78,7 @@ def chosen(specs: tuple[SceneSpec, ...], rooms: list[str]) -> list[SceneSpec]:
     return [spec for spec in specs if not rooms or spec.name.split("/")[-1] in rooms]
 
 
-@command(
-    __file__, __doc__, EPILOG, add_arguments, "0 done, 1 --check found poses that don't fit the panoramas"
-)
+@command(__file__, __doc__, EPILOG, add_arguments, "0 done, 1 --check found poses that don't fit")
 def main(arguments: argparse.Namespace) -> int:
     """Write the scenes one by one; returns the exit code."""
     check_least(arguments, check=0, seed=0)

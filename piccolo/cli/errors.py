@@ -6,15 +6,14 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from types import FrameType
 
 from tqdm import tqdm
 
 from ..errors import InputError, printable, text_of
-from ..jobs.memory import is_shortage
+from ..jobs.memory import check_address_space, is_shortage
 from .progress import log_shown
 from .start import EXIT_INTERRUPTED, EXIT_TERMINATED, as_started
 
@@ -43,33 +42,25 @@ def checking_options() -> Iterator[None]:
         raise UsageError(str(error)) from error
 
 
-@dataclass
-class Outcome:
-    """The end of a command."""
-
-    exit_code: int = 0
-
-
-@contextmanager
-def handling_errors(arguments: argparse.Namespace) -> Iterator[Outcome]:
-    """Within this a command runs; an error that ends it is printed, and gives the exit code."""
-    outcome = Outcome()
+def run_command(arguments: argparse.Namespace, run: Callable[[argparse.Namespace], int]) -> int:
+    """Run a command and return its exit code; an error that ends it is printed."""
     lost: list[KeyboardInterrupt] = []
     try:
         with log_shown(arguments.quiet), raising_signals(lost):
-            yield outcome
+            check_address_space()
+            exit_code = run(arguments)
             sys.stdout.flush()  # here, where a closed pipe is caught
+            return exit_code
     except KeyboardInterrupt as stop:
-        outcome.exit_code = _stopped(arguments, stop)
+        return _stopped(arguments, stop)
     except (OSError, InputError) as error:
         discard_stdout()
         if isinstance(error, BrokenPipeError) and not error.filename:  # stdout's reader has gone: say nothing
-            outcome.exit_code = EXIT_BROKEN_PIPE
-        else:
-            code = EXIT_BAD_USAGE if isinstance(error, UsageError) else EXIT_BAD_INPUT
-            outcome.exit_code = print_error(arguments, text_of(error), code)
+            return EXIT_BROKEN_PIPE
+        code = EXIT_BAD_USAGE if isinstance(error, UsageError) else EXIT_BAD_INPUT
+        return print_error(arguments, text_of(error), code)
     except Exception as error:  # the last line of defence: a code and one line for the shell
-        outcome.exit_code = _unforeseen(arguments, error, lost)
+        return _unforeseen(arguments, error, lost)
 
 
 def _unforeseen(arguments: argparse.Namespace, error: Exception, lost: list[KeyboardInterrupt]) -> int:

@@ -4,7 +4,7 @@ import argparse
 import os
 import signal
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from ..scan import Scan
 from ..scan_map.map_file import save_map
 from ..scan_map.open_map import CachePolicy
 from ..scan_map.scan_map import ScanMap
-from .errors import EXIT_BAD_INPUT, Terminated, UsageError
+from .errors import EXIT_BAD_INPUT, UsageError, print_error
 from .options import PHOTOS_OF_A_JOB
 
 EXIT_SOME_NOT = 1
@@ -77,21 +77,18 @@ def share_of_a_job(arguments: argparse.Namespace, localizer: Localizer, num_jobs
     if is_remote(arguments):
         return replace(localizer, num_threads=arguments.threads or 1, max_memory=arguments.max_memory)
     num_threads = arguments.threads or max(1, num_cores() // num_jobs)
-    if arguments.max_memory is None:
-        return replace(localizer, num_threads=num_threads)
-    memory = (arguments.max_memory - memory_taken() / GB) / num_jobs
+    memory = arguments.max_memory
+    if memory is not None:
+        memory = (memory - memory_taken() / GB) / num_jobs
     return replace(localizer, num_threads=num_threads, max_memory=memory)
 
 
-@contextmanager
-def connecting(arguments: argparse.Namespace, num_jobs: int) -> Iterator[Cluster | None]:
-    """The cluster of --dask; None without."""
+def connecting(arguments: argparse.Namespace, num_jobs: int) -> AbstractContextManager[Cluster | None]:
+    """Return the cluster of --dask; None without."""
     if not arguments.dask:
-        yield None
-        return
+        return nullcontext()
     num_threads = arguments.threads or (1 if is_remote(arguments) else max(1, num_cores() // num_jobs))
-    with connected(arguments.dask, num_jobs, num_threads) as cluster:
-        yield cluster
+    return connected(arguments.dask, num_jobs, num_threads)
 
 
 @contextmanager
@@ -154,11 +151,6 @@ class Interruption:
     number: int = 0  # of the signal
     is_at_work: bool = False
 
-    @property
-    def exit_code(self) -> int:
-        """The code that a shell expects of a program that a signal has ended."""
-        return 128 + self.number
-
     def each(self, items: Iterable[Item], after: Iterable[Item] = ()) -> Iterator[Item]:
         """Yield items until a signal ends it, and then those `after`.
 
@@ -171,17 +163,15 @@ class Interruption:
                 self.is_at_work = False
                 if self.number:
                     break
-            for item in after:
-                self.is_at_work = True
-                yield item
-                self.is_at_work = False
+            self.is_at_work = True
+            yield from after
         finally:
             self.is_at_work = False
 
-    def raise_again(self) -> None:
-        """Raise what the signal that has ended a batch would have raised outside of one."""
-        if self.number:
-            raise Terminated if self.number == signal.SIGTERM else KeyboardInterrupt
+    def stop(self, arguments: argparse.Namespace, done: str, how: str) -> int:
+        """Say what a signal has ended and how to go on; returns the code that a shell expects of that."""
+        text = f"ended by {SIGNALS[self.number]} after {done}; {how}"
+        return print_error(arguments, text, 128 + self.number)
 
     def handle(self, number: int, _frame: FrameType | None) -> None:
         """Note a signal; raises Stopped where it ends the work at once."""

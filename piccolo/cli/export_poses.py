@@ -10,7 +10,7 @@ from ..errors import InputError
 from ..geometry.rotations import CAMERA_AXES
 from ..result import Result, check_scan, read_results
 from ..scan_map.open_map import CachePolicy, scan_sha256_of
-from ..scenes.evaluation.runs import input_files
+from ..scenes.evaluation.query_result import input_files
 from ..scenes.export import FORMATS, Options, Selection, export, select, true_results
 from ..scenes.export.formats import offset_file
 from ..scenes.scene import find_scenes
@@ -81,8 +81,7 @@ def notes_on(selection: Selection) -> Iterable[str]:
         num_left_out = sum(selection.left_out.values())
         reasons = ", ".join(f"{count} {reason}" for reason, count in selection.left_out.items())
         yield f"left out {num_left_out} of {num_left_out + len(selection.results)} results: {reasons}"
-    if len(selection.clouds) > 1:
-        num_clouds = len(selection.clouds)
+    if (num_clouds := len(selection.clouds)) > 1:
         yield f"poses in {num_clouds} clouds are taken as in one coordinate system; --cloud chooses"
 
 

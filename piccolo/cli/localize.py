@@ -7,7 +7,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -35,7 +35,6 @@ from ..scan_map.scan_map import ScanMap
 from .command import command
 from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error, print_note
 from .executing import (
-    SIGNALS,
     Executor,
     Interruption,
     check_execution,
@@ -45,16 +44,7 @@ from .executing import (
     exit_code_of,
     interruptible,
 )
-from .options import (
-    DESCRIPTION,
-    EPILOG,
-    add_arguments,
-    cache_from,
-    check_arguments,
-    cloud_settings_from,
-    read_options_from,
-    settings_from,
-)
+from .options import DESCRIPTION, EPILOG, add_arguments, check_arguments, localizer_from
 from .outputs import check_distinct, check_suffix
 from .progress import progress_bar, shown, warn_once
 from .walking import check_plan, check_walk_options, run_walk, walk_inputs
@@ -79,8 +69,8 @@ class Run:
 
 def check_files(arguments: argparse.Namespace, panoramas: list[Path], total: int | None) -> None:
     """Refuse, before any work, what could not be written, or would replace an input or another output."""
-    files = arguments.mask, arguments.priors, arguments.camera, arguments.rig, arguments.video
-    given = filter(None, files)
+    a = arguments
+    given = filter(None, (a.mask, a.priors, a.camera, a.rig, a.video))
     lists = [Path(word[1:]) for word in arguments.pano if word.startswith("@")]
     pictures = {"--overlay": arguments.overlay, "--occlusion-mask": arguments.occlusion_mask}
     outputs = {"--out": arguments.out or STDOUT, "--plan": arguments.plan, **pictures}
@@ -105,25 +95,17 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
         check_walk_options(arguments)
         check_execution(arguments)
         limit_memory(arguments.max_memory)
-        settings = settings_from(arguments)
-        read_options = read_options_from(arguments)
-        cloud_settings = cloud_settings_from(arguments)
+        localizer = localizer_from(arguments, tuple(arguments.cloud))
     priors = None
     if arguments.priors:
-        if not isinstance(settings, CoarseToFineSettings):
+        if not isinstance(localizer.settings, CoarseToFineSettings):
             raise UsageError("--priors: not an option of the preset paper")
-        priors = read_priors(arguments.priors, settings.prior)
-    localizer = Localizer(
-        tuple(arguments.cloud),
-        settings,
-        cloud_settings,
-        read_options,
-        cache_from(arguments),
-        priors,
-        makes_overlays=arguments.overlay is not None,
-        makes_occlusion_masks=arguments.occlusion_mask is not None,
-    )
-    is_one = read_options.rig.is_instant if read_options.rig else is_cube
+        priors = read_priors(arguments.priors, localizer.settings.prior)
+    masks = arguments.occlusion_mask is not None
+    overlays = arguments.overlay is not None
+    localizer = replace(localizer, priors=priors, makes_overlays=overlays, makes_occlusion_masks=masks)
+    rig = localizer.read_options.rig
+    is_one = rig.is_instant if rig else is_cube
     left_out = Counter[str]()
     named = panoramas_of(arguments.pano, sys.stdin, left_out, is_one)
     if is_from_stdin(arguments.pano):
@@ -179,20 +161,15 @@ def take_up_results(run: Run, file: LineFile | None) -> Records:
     return records
 
 
-def write_picture(path: Path, pano: Path, png: bytes) -> None:
-    """Write a PNG of a panorama to a file, or into a folder under the panorama's name."""
-    name = os.fsdecode(os.fsencode(pano.stem)[:MAX_STEM])
-    write_atomically(path / f"{name}.png" if path.is_dir() else path, png)
-
-
 def record(run: Run, answer: Answer, write: Write) -> None:
     """Write the pictures asked for and the result, and say what was found."""
     arguments = run.arguments
     result = answer.result
+    name = os.fsdecode(os.fsencode(Path(result.pano).stem)[:MAX_STEM])
     pictures = (arguments.overlay, answer.overlay), (arguments.occlusion_mask, answer.occlusion_mask)
     for path, png in pictures:
         if path and png is not None:
-            write_picture(path, Path(result.pano), png)
+            write_atomically(path / f"{name}.png" if path.is_dir() else path, png)
     if result.error is not None:
         print_error(arguments, result.error, EXIT_BAD_INPUT)
     elif not arguments.quiet:
@@ -239,8 +216,7 @@ def finish(
         print_note(arguments, "; ".join(filter(None, (note, dropped, describe_left_out(run.left_out)))))
     if interruption.number:
         how = "the same command goes on from here" if file else "with --out FILE the same command goes on"
-        text = f"ended by {SIGNALS[interruption.number]} after {counts.total()} results; {how}"
-        return print_error(arguments, text, interruption.exit_code)
+        return interruption.stop(arguments, f"{counts.total()} results", how)
     if run.total is None:
         note_unused_priors(arguments, run.localizer)
     return exit_code_of(counts)

@@ -56,14 +56,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--gravity", "yaws, or all of SO(3)", choices=["known", "unknown"], default="known")
 
 
-def check_usage(arguments: argparse.Namespace) -> None:
-    """Refuse options that make no sense, whatever the files hold."""
-    cloud_settings_from(arguments)
-    check_suffix("--out", arguments.out, (".png",))
-    if not 0.0 < arguments.step < np.inf:
-        raise InputError(f"--step {arguments.step}: wanted metres above 0")
-
-
 def known_poses(arguments: argparse.Namespace, cloud: LocalCloud) -> KnownPoses:
     """The pose found and the true one of the panorama, as far as files are given."""
     name = arguments.pano.name
@@ -125,17 +117,19 @@ def summary(surface: LossSurface, grid: PoseGrid, cloud: LocalCloud, known: Know
 def main(arguments: argparse.Namespace) -> int:
     """Read, compute, write."""
     with checking_options():
-        check_usage(arguments)
+        cloud_settings = cloud_settings_from(arguments)
+        check_suffix("--out", arguments.out, (".png",))
+        if not 0.0 < arguments.step < np.inf:
+            raise InputError(f"--step {arguments.step}: wanted metres above 0")
     outputs = {"--out": arguments.out}
-    check_outputs(
-        outputs, [*arguments.cloud, arguments.pano, *filter(None, (arguments.result, arguments.truth))]
-    )
+    inputs = [*arguments.cloud, arguments.pano, arguments.result, arguments.truth]
+    check_outputs(outputs, filter(None, inputs))
     new_figure()  # now: where matplotlib is missing, the work would be lost
 
     workers = Workers(num_cores(), progress_bar(arguments.quiet))
     panorama = shrink(read_panorama(arguments.pano), WIDTH)
     texels = pack_texels(panorama.rgb, panorama.is_valid)
-    cloud = open_points(arguments.cloud, cloud_settings_from(arguments), workers)
+    cloud = open_points(arguments.cloud, cloud_settings, workers)
     print_warnings(arguments, cloud.warnings)
     known = known_poses(arguments, cloud)
     grid = grid_from(arguments, cloud, known)
@@ -145,7 +139,7 @@ def main(arguments: argparse.Namespace) -> int:
     if not np.isfinite(surface.loss).any():
         raise InputError(f"{arguments.pano}: the loss is infinite at all poses; mask less of the panorama")
     write_atomically(arguments.out, surface_png(surface, grid, cloud, known, arguments.pano.name))
-    line = {"seconds": round(seconds, 3), "poses_per_s": round(grid.num_poses / seconds)}
-    report = {"out": str(arguments.out)} | summary(surface, grid, cloud, known) | line
+    report = {"out": str(arguments.out)} | summary(surface, grid, cloud, known)
+    report |= {"seconds": round(seconds, 3), "poses_per_s": round(grid.num_poses / seconds)}
     print_report(arguments, outputs, json.dumps(report))
     return 0

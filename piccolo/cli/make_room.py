@@ -106,20 +106,15 @@ def check_usage(arguments: argparse.Namespace) -> None:
         raise UsageError("--variants: found change, which a building has not")
     if arguments.labels and arguments.camera:
         raise UsageError("--labels: not with --camera")
-    if arguments.walk:
-        check_walk(arguments)
-    elif given := [name for name in OF_WALKS if getattr(arguments, name)]:
+    given = [name for name in OF_WALKS if getattr(arguments, name)]
+    if given and not arguments.walk:
         raise UsageError(f"--{given[0].replace('_', '-')}: goes with --walk")
-
-
-def check_walk(arguments: argparse.Namespace) -> None:
-    """Refuse walks that can't be made."""
-    if not 0.0 < arguments.walk <= MAX_LENGTH:
+    if not 0.0 <= arguments.walk <= MAX_LENGTH:
         raise UsageError(f"--walk: found {arguments.walk}, wanted up to {MAX_LENGTH:g} m")
-    if arguments.labels or arguments.camera:
+    if arguments.walk and (arguments.labels or arguments.camera):
         raise UsageError("--labels, --camera: not with --walk")
-    for variant in arguments.variants:
-        walk_options(arguments, variant)
+    for variant in arguments.variants if arguments.walk else ():
+        walk_options(arguments, variant)  # refuses what can't be made
 
 
 def walk_options(arguments: argparse.Namespace, variant: str) -> WalkOptions:

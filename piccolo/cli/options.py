@@ -7,6 +7,7 @@ from typing import Any, get_args, get_type_hints
 
 from .. import __version__
 from ..batch.frame_times import EXIF, NAMES, ORDER
+from ..batch.localizer import Localizer
 from ..camera.files import read_calibration, read_rig
 from ..cloud.crs import check_crs
 from ..cloud.settings import METRES, CloudSettings, UpAxis
@@ -119,12 +120,9 @@ def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
     option(group, "--mask FILE", text)
     text = "ignore the cap of this half angle straight down: tripod, car roof"
     group.add_argument("--mask-nadir", type=float, default=0.0, metavar="DEG", help=text)
-    text = (
-        "the cloud's system, such as EPSG:25832, for photos with GPS, each of which is searched about first "
-    )
-    option(
-        group, "--crs CRS", f"{text}(default: what LAS, LAZ or E57 say); {NONE}: leave GPS positions aside"
-    )
+    text = "the cloud's system, such as EPSG:25832, for photos with GPS, which are searched about it first"
+    default = f"(default: what LAS, LAZ or E57 say); {NONE}: leave GPS positions aside"
+    option(group, "--crs CRS", f"{text} {default}")
 
 
 def add_method_options(parser: argparse.ArgumentParser) -> None:
@@ -163,10 +161,8 @@ def add_walk_options(parser: argparse.ArgumentParser) -> None:
     text = f"of the frames: {EXIF}, {NAMES} (the last number in each, seconds), {ORDER}, or a CSV file with "
     text += f"columns name and time [s] (default {EXIF} if it tells them apart, else {ORDER})"
     option(group, "--times SOURCE", text)
-    text = (
-        f"of the camera [m/s] (default {MAX_SPEED:g}); where only the order of the frames is known, [m] from "
-    )
-    option(group, "--max-speed X", text + "one to the next (default by what is found of them)")
+    text = f"of the camera [m/s] (default {MAX_SPEED:g}); where only the order of the frames is known, [m] "
+    option(group, "--max-speed X", text + "from one to the next (default by what is found of them)")
     text = "the path on the scan from above, coloured by its frames' confidence: .png, .svg, .pdf or .dxf"
     option(group, "--plan FILE", text)
 
@@ -229,6 +225,13 @@ def cache_from(arguments: argparse.Namespace) -> CachePolicy:
     return CachePolicy(is_used, arguments.cache if is_used else None)
 
 
+def localizer_from(arguments: argparse.Namespace, paths: tuple[Path, ...] = ()) -> Localizer:
+    """Return what localizes photos in the scan of some files as the options ask for."""
+    settings = settings_from(arguments)
+    cloud_settings = cloud_settings_from(arguments)
+    return Localizer(paths, settings, cloud_settings, read_options_from(arguments), cache_from(arguments))
+
+
 def settings_from(arguments: argparse.Namespace) -> Settings:
     """Return the settings that the options ask for; an option of the other preset is refused."""
     name, *words = arguments.preset
@@ -250,10 +253,8 @@ def settings_from(arguments: argparse.Namespace) -> Settings:
 
 def prior_from(options: dict[str, Any]) -> Prior:
     """Return what the options of add_prior_options say of all photos; nothing of a command without them."""
-    given: dict[str, Any] = {
-        "within": tuple(options.get("within") or ()),
-        "heading_deg": options.get("heading"),
-    }
+    within = tuple(options.get("within") or ())
+    given: dict[str, Any] = {"within": within, "heading_deg": options.get("heading")}
     if near := options.get("near"):
         given |= {"near_world": tuple(near[:3]), "radius": near[3]}
     if height := options.get("height"):

@@ -33,9 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_cloud_options(parser, "coloured scan, as for localize.py")
     text = "put the scan into this map, whose coordinates it has; only what it changes is prepared again"
     option(parser, "--add FILE", text)
-    text = (
-        "of the scan: building, storey, room; for results and localize.py --within (default the file's stem)"
-    )
+    text = "of the scan: building, storey, room; for results and --within (default the file's stem)"
     option(parser, "--name NAME", text)
     option(parser, "--out FILE", "the map; - is stdout", required=True)
 
@@ -54,20 +52,18 @@ def main(arguments: argparse.Namespace) -> int:
     if arguments.add:
         scan_map = extended_map(arguments.add, arguments.cloud, cloud_settings, name, workers, watch)
     else:
-        how = CachePolicy(is_used=False), workers, watch
-        scan_map = open_map(arguments.cloud, cloud_settings, *how, has_features=True)
+        no_cache = CachePolicy(is_used=False)
+        scan_map = open_map(arguments.cloud, cloud_settings, no_cache, workers, watch, has_features=True)
         if arguments.name is not None or not scan_map.scan_names:  # a map keeps its names
             scan_map = named(scan_map, name)
     save_map(with_features(scan_map, workers), arguments.out)
-    seconds = {stage: round(seconds, 3) for stage, seconds in watch.seconds.items()}
-    counts = {"points": len(scan_map.points), "candidates": len(scan_map.centers)}
-    warnings = list(scan_map.warnings)
     report = {
         "map": str(arguments.out),
         "scans": scan_map.scan_names,
-        **counts,
-        "seconds": seconds,
-        "warnings": warnings,
+        "points": len(scan_map.points),
+        "candidates": len(scan_map.centers),
+        "seconds": {stage: round(seconds, 3) for stage, seconds in watch.seconds.items()},
+        "warnings": list(scan_map.warnings),
     }
     print_report(arguments, outputs, json.dumps(report))
     return 0

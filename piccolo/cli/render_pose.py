@@ -15,7 +15,8 @@ from ..camera.files import read_calibration
 from ..cloud.soa import LocalCloud
 from ..errors import InputError
 from ..files.atomic import check_output, check_output_folder, is_stream, replacing_folder, write_atomically
-from ..geometry.pose import Pose, pose_errors
+from ..files.json_file import read_text
+from ..geometry.pose import Pose, checked_rotation, orthonormal, pose_errors
 from ..geometry.rotations import R_cam_from_angles
 from ..jobs.threads import Workers, num_cores
 from ..optimize.descent_animation import (
@@ -42,7 +43,6 @@ from .errors import checking_options
 from .options import add_cloud_options, cloud_settings_from
 from .outputs import check_distinct, check_suffix, print_report
 from .progress import progress_bar
-from .transform_file import read_pose_matrix
 
 EPILOG = """\
 examples:
@@ -58,15 +58,17 @@ An output - is stdout: PNG, of --animate GIF. One JSON object a picture on stdou
 """
 MAX_WIDTH = 32_768
 MIN_WIDTH = 16
+MAX_POSE_FILE = 65_536  # [byte] sixteen numbers and some comments
+MAX_SKEW = 1e-3  # off a rotation, for matrices written with few digits
 DESCENT_WIDTH = 1024  # of the panorama
 DESCENT = DescentSettings(solver="adam")
 START_DISTANCE = 0.3  # of a descent from the pose [m]
 START_ANGLE_DEG = 8.0
 SUFFIXES = {  # of outputs, those of stdout and devices first; "" is a folder
-    "out": (".png", ".jpg", ".jpeg", ""),
-    "depth": (".png", ".npy"),
-    "mask_out": (".png",),
-    "animate": (".gif", ".mp4"),
+    "--out": (".png", ".jpg", ".jpeg", ""),
+    "--depth": (".png", ".npy"),
+    "--mask-out": (".png",),
+    "--animate": (".gif", ".mp4"),
 }
 
 
@@ -111,7 +113,7 @@ def check_usage(arguments: argparse.Namespace) -> None:
     if not MIN_WIDTH <= arguments.width <= MAX_WIDTH or arguments.width % 2:
         raise InputError(f"--width {arguments.width}: wanted an even number, {MIN_WIDTH} to {MAX_WIDTH}")
     for name, path in outputs_of(arguments).items():
-        check_suffix(name, path, SUFFIXES[name.removeprefix("--").replace("-", "_")])
+        check_suffix(name, path, SUFFIXES[name])
     check_pose_options(arguments)
 
 
@@ -128,7 +130,7 @@ def check_pose_options(arguments: argparse.Namespace) -> None:
 
 def outputs_of(arguments: argparse.Namespace) -> dict[str, Path | None]:
     """The outputs by option."""
-    return {f"--{name.replace('_', '-')}": getattr(arguments, name) for name in SUFFIXES}
+    return {name: getattr(arguments, name[2:].replace("-", "_")) for name in SUFFIXES}
 
 
 def is_folder(path: Path) -> bool:
@@ -136,10 +138,9 @@ def is_folder(path: Path) -> bool:
     return not path.suffix and not is_stream(path)
 
 
-def suffix_of(arguments: argparse.Namespace, name: str) -> str:
-    """The suffix that says in which format an output is written."""
-    path: Path = getattr(arguments, name)
-    return SUFFIXES[name][0] if is_stream(path) else path.suffix.lower()
+def suffix_of(option: str, path: Path) -> str:
+    """Return the suffix that says in which format an output is written."""
+    return SUFFIXES[option][0] if is_stream(path) else path.suffix.lower()
 
 
 def check_files(arguments: argparse.Namespace, poses: list[Shot]) -> None:
@@ -148,10 +149,7 @@ def check_files(arguments: argparse.Namespace, poses: list[Shot]) -> None:
     photos = [photo_of(arguments, shot.pano) for shot in poses]
     check_distinct(outputs_of(arguments), [*arguments.cloud, *filter(None, given), *photos])
     for path in filter(None, outputs_of(arguments).values()):
-        if is_folder(path):
-            check_output_folder(path)
-        else:
-            check_output(path)
+        (check_output_folder if is_folder(path) else check_output)(path)
 
 
 def photo_of(arguments: argparse.Namespace, name: str) -> Path:
@@ -185,6 +183,24 @@ def poses_from(arguments: argparse.Namespace) -> list[Shot]:
     return found
 
 
+def read_pose_matrix(path: Path) -> Pose:
+    """Return the pose of T_world_from_cam, 4 x 4 numbers in a text file; comments begin with #."""
+    wanted = "wanted the 4 x 4 numbers of T_world_from_cam"
+    lines = read_text(path, wanted, MAX_POSE_FILE).splitlines()
+    rows = [line.replace(",", " ").split() for line in lines if line.split("#")[0].strip()]
+    try:
+        T = np.array(rows, dtype=np.float64)
+    except ValueError as error:  # words, lines of several lengths
+        raise InputError(f"{path}: found {error}, {wanted}") from error
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        shape = " x ".join(map(str, T.shape))
+        raise InputError(f"{path}: found {shape} numbers, not all finite or not as many, {wanted}")
+    if not np.allclose(T[3], [0.0, 0.0, 0.0, 1.0]):
+        raise InputError(f"{path}: the last row is not 0 0 0 1, {wanted}")
+    R_world_from_cam = checked_rotation(T[:3, :3], MAX_SKEW, f"{path}: the matrix on the left")
+    return Pose(orthonormal(R_world_from_cam).T, T[:3, 3])
+
+
 def shot_of(pano: str, pose: Pose, mounts: tuple[Mount, ...]) -> Shot:
     """The picture of a pose by its one camera, if it has one; a rig's is the sphere."""
     return Shot(pano, mounts[0].pose(pose), mounts[0].camera) if len(mounts) == 1 else Shot(pano, pose, None)
@@ -206,7 +222,7 @@ def draw_pictures(
     """Write the pictures; one JSON line each."""
     is_many = is_folder(arguments.out)
     names = [f"{Path(shot.pano).stem}.png" for shot in poses] if is_many else [arguments.out.name]
-    suffix = ".png" if is_many else suffix_of(arguments, "out")
+    suffix = ".png" if is_many else suffix_of("--out", arguments.out)
     if len(set(names)) < len(names):
         raise InputError(f"{arguments.out}: panoramas of the same name; choose one with --pano")
 
@@ -218,7 +234,7 @@ def draw_pictures(
         view = cut_view(view, camera) if camera else view
         seen_fraction = round(float(view.is_seen.mean()), 6)
         if arguments.depth:
-            write_atomically(arguments.depth, depth_file(view.depth, suffix_of(arguments, "depth")))
+            write_atomically(arguments.depth, depth_file(view.depth, suffix_of("--depth", arguments.depth)))
         if arguments.mask_out:
             nothing = np.where(view.is_seen, 0, 255).astype(np.uint8)
             write_atomically(arguments.mask_out, encode_image(nothing, ".png"))
@@ -243,7 +259,7 @@ def animate(arguments: argparse.Namespace, cloud: LocalCloud, poses: list[Shot],
     texels = pack_texels(panorama.rgb, panorama.is_valid)
     refined, history = refine_with_history(cloud.points, texels, start, DESCENT)
     frames = frames_of(cloud.points, panorama, history, FRAME_WIDTH, workers)
-    if suffix_of(arguments, "animate") == ".gif":
+    if suffix_of("--animate", arguments.animate) == ".gif":
         write_atomically(arguments.animate, gif_of(frames))
     else:
         height, width = frames[0].shape[:2]
@@ -263,7 +279,7 @@ def main(arguments: argparse.Namespace) -> int:
     """Read, draw, write."""
     with checking_options():
         check_usage(arguments)
-    if arguments.animate and suffix_of(arguments, "animate") == ".mp4":
+    if arguments.animate and suffix_of("--animate", arguments.animate) == ".mp4":
         import_optional("--animate", "av", "video")
     poses = poses_from(arguments)
     check_files(arguments, poses)

@@ -2,8 +2,7 @@
 
 import argparse
 import tempfile
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 
 from ..batch.localizer import Localizer
@@ -16,13 +15,12 @@ from ..localization.settings import CoarseToFineSettings
 from ..panorama import ReadOptions
 from ..paper.settings import PaperSettings
 from ..scan_map.open_map import CachePolicy
-from ..scenes.evaluation.query_result import QueryResult
-from ..scenes.evaluation.runs import input_files
+from ..scenes.evaluation.query_result import QueryResult, input_files
 from ..scenes.reproduce_paper import EXPERIMENTS, Condition, Settings, table
 from ..scenes.scene import Scene, find_scenes
 from .command import check_least, command, option
 from .errors import EXIT_BAD_INPUT, checking_options, print_error
-from .evaluating import run_scenes
+from .evaluate import run_scenes
 from .executing import check_execution
 from .options import add_execution_options
 from .outputs import check_distinct, check_folder_name
@@ -39,10 +37,7 @@ experiments:
 Writes OUT/NAME.md and OUT/NAME/CONDITION_PRESET.jsonl, runs that tools/evaluate.py compares.
 The same command resumes an experiment that was stopped. Changed clouds and images are temporary.
 """
-PRESETS: dict[str, Settings] = {
-    "paper": PaperSettings(),
-    "default": CoarseToFineSettings(gravity="known"),
-}
+PRESETS: dict[str, Settings] = {"paper": PaperSettings(), "default": CoarseToFineSettings(gravity="known")}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -62,34 +57,24 @@ def file_name(condition: Condition) -> str:
     return "".join(c if c.isalnum() else "_" for c in words) + ".jsonl"
 
 
-def transformed_scenes(
-    condition: Condition, scenes: Sequence[Scene], root: Path, report: Callable[[str], object]
-) -> tuple[list[Scene], int]:
-    """The scenes under a condition, and the number of queries of those that can't be so."""
-    transformed = []
-    num_failed = 0
-    for number, scene in enumerate(scenes):
-        folder = root / str(number)
-        folder.mkdir()
-        try:
-            transformed.append(condition.transform(scene, folder))
-        except InputError as error:
-            report(str(error))
-            num_failed += len(scene.queries)
-    return transformed, num_failed
-
-
 def run_condition(
     condition: Condition, scenes: Sequence[Scene], out: Path, arguments: argparse.Namespace
 ) -> tuple[list[QueryResult], int]:
     """The results under one condition, and how many queries could not be localized."""
-    report = partial(print_error, arguments, exit_code=EXIT_BAD_INPUT)
     labels = Labels() if condition.use_labels else None
     reading = CloudSettings(labels=labels), ReadOptions(labels=labels)
+    transformed = []
+    num_failed = 0
     with tempfile.TemporaryDirectory(prefix="piccolo-") as temporary:
-        transformed, num_failed = transformed_scenes(condition, scenes, Path(temporary), report)
-        cache = CachePolicy(True, Path(temporary))
-        config = Localizer((), condition.settings, *reading, cache)
+        for number, scene in enumerate(scenes):
+            folder = Path(temporary) / str(number)
+            folder.mkdir()
+            try:
+                transformed.append(condition.transform(scene, folder))
+            except InputError as error:
+                print_error(arguments, str(error), EXIT_BAD_INPUT)
+                num_failed += len(scene.queries)
+        config = Localizer((), condition.settings, *reading, CachePolicy(True, Path(temporary)))
         variants = condition.variants or arguments.variants  # those of a condition are of the wanted
         path = out / file_name(condition)
         rows, num_failed_later = run_scenes(arguments, path, config, transformed, variants)
@@ -102,13 +87,13 @@ def run_experiment(
     """All conditions of an experiment and its table; returns how many queries were not localized."""
     experiment = EXPERIMENTS[name]
     folder: Path = arguments.out / name
+    page: Path = arguments.out / f"{name}.md"
     variants = sorted({query.variant for scene in scenes for query in scene.queries})
     variants = [variant for variant in variants if not arguments.variants or variant in arguments.variants]
     num_failed = 0
     found = []
     conditions = experiment.conditions_of(presets, variants)
-    files = [folder / file_name(condition) for condition in conditions]
-    files.append(arguments.out / f"{name}.md")
+    files = [page, *(folder / file_name(condition) for condition in conditions)]
     check_distinct({file.name: file for file in files}, input_files(scenes))
     folder.mkdir(parents=True, exist_ok=True)
     for condition in conditions:
@@ -122,7 +107,7 @@ def run_experiment(
     title = f"{experiment.title}: {experiment.note}; {num_scenes} scenes"
     text = table(title, found).markdown()
     print(text, flush=True)
-    write_atomically(arguments.out / f"{name}.md", text.encode())
+    write_atomically(page, text.encode())
     return num_failed
 
 

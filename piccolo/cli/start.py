@@ -48,9 +48,8 @@ def run(name: str) -> int:
     share_arenas()
     space, _ = resource.getrlimit(resource.RLIMIT_AS)
     if 0 <= space < LEAST_ADDRESS_SPACE:
-        print_line(
-            f"found ulimit -v {space >> 10}, wanted {LEAST_ADDRESS_SPACE >> 10} or more on this machine"
-        )
+        wanted = f"wanted {LEAST_ADDRESS_SPACE >> 10} or more on this machine"
+        print_line(f"found ulimit -v {space >> 10}, {wanted}")
         return EXIT_CANNOT_START
     handler = signal.getsignal(signal.SIGINT)
     is_ignored = handler is not signal.default_int_handler  # by nohup, or a shell's &

@@ -34,7 +34,7 @@ from ..scan_map.scan_map import ScanMap
 from ..scan_walk import Walk
 from ..walk.frames import MAX_ACCELERATION, MAX_SPEED, MAX_STEP, NO_ACCELERATION, Motion
 from .errors import EXIT_BAD_INPUT, UsageError, print_error, print_note
-from .executing import SIGNALS, Interruption, exit_code_of, interruptible
+from .executing import Interruption, exit_code_of, interruptible
 from .options import DEFAULT_EVERY
 from .outputs import check_suffix
 from .progress import progress_bar, shown
@@ -77,10 +77,8 @@ def check_walk_options(arguments: argparse.Namespace) -> None:
         "--every: only with --video": not is_video and arguments.every is not None,
         "--times: not with --video, which knows its times": is_video and arguments.times is not None,
     }
-    wrong |= {
-        f"--{name.replace('_', '-')}: not with a walk": getattr(arguments, name) not in (None, False)
-        for name in NOT_WITH
-    }
+    for name in NOT_WITH:
+        wrong[f"--{name.replace('_', '-')}: not with a walk"] = getattr(arguments, name) not in (None, False)
     for text, is_so in wrong.items():
         if is_so:
             raise UsageError(text)
@@ -118,10 +116,8 @@ def walk_inputs(arguments: argparse.Namespace, panoramas: Sequence[Path]) -> Ite
     with temporary_folder() as folder:
         found = frames_of(arguments.video, seconds, folder)
         bar = {"desc": "read the video", "unit": " frames", "leave": False}
-        frames = [
-            WalkInput(f.path, f.time, f"{arguments.video}#t={f.time:.3f}")
-            for f in shown(found, arguments.quiet, **bar)
-        ]
+        shots = shown(found, arguments.quiet, **bar)
+        frames = [WalkInput(f.path, f.time, f"{arguments.video}#t={f.time:.3f}") for f in shots]
         yield WalkInputs(frames, motion, metres)
 
 
@@ -144,9 +140,8 @@ def run_walk(
     with watch.stage("all"):
         interruption = follow_all(arguments, walk, inputs.frames, json.dumps(key))
         if interruption.number:
-            kept = "the same command goes on" if kept_in(arguments.out) else "with --out FILE it would go on"
-            text = f"ended by {SIGNALS[interruption.number]} after {len(walk.taken)} frames; {kept}"
-            return print_error(arguments, text, interruption.exit_code)
+            how = "the same command goes on" if kept_in(arguments.out) else "with --out FILE it would go on"
+            return interruption.stop(arguments, f"{len(walk.taken)} frames", how)
         results = keep_spaced(walk.finish(progress_bar(arguments.quiet)), inputs.min_distance)
     write_all(arguments.out, results)
     write_plan(arguments.plan, scan, results)

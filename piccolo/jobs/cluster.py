@@ -43,10 +43,7 @@ _opening = threading.Lock()
 def connected(address: str, num_processes: int, num_threads: int) -> Iterator["Cluster"]:
     """The cluster of a scheduler's address or file; or of so many processes here, if it is "local".
 
-    Raises
-    ------
-    InputError
-        dask.distributed is missing, no scheduler answers, or it has no worker with this version of piccolo.
+    Raises InputError if dask.distributed is missing, or no scheduler or worker of this version answers.
     """
     import_optional("--dask", "dask", "distributed").config.set(SETTINGS)
     distributed = import_optional("--dask", "distributed", "distributed")

@@ -3,7 +3,6 @@
 import os
 import resource
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import InputError, ResourceError
@@ -18,39 +17,29 @@ OPENCV_NO_MEMORY = -4  # `code` of a cv2.error
 LEAST_LEFT = 200e6  # [byte] of address space: with less, Python may abort where it should raise
 
 
-@dataclass
-class Limit:
-    """The user's limit, of this process."""
-
-    num_bytes: float | None = None
-
-
-LIMIT = Limit()
+LIMIT: list[float] = []  # [byte] of this process, if the user sets one
 
 
 def limit_memory(gigabytes: float | None) -> None:
     """Set the memory [10^9 byte] that this process may take in all; None for a part of what is free."""
     if gigabytes is not None and not gigabytes > 0.0:
         raise InputError(f"--max-memory: found {gigabytes:g}, wanted gigabytes above 0")
-    LIMIT.num_bytes = None if gigabytes is None else gigabytes * GB
+    LIMIT[:] = [] if gigabytes is None else [gigabytes * GB]
 
 
 def check_memory(num_bytes: float, purpose: str, advice: str) -> None:
     """Refuse what needs more bytes than may still be taken; `purpose` begins the line, `advice` ends it."""
     room = memory_left()
     if num_bytes > room:
+        needs = f"{purpose} needs {num_bytes / GB:.2g} GB of memory"
         left = f"{max(room, 0.0) / GB:.2g} GB may be taken"
-        raise ResourceError(
-            f"{purpose} needs {num_bytes / GB:.2g} GB of memory, {left}; {advice}, or raise --max-memory"
-        )
+        raise ResourceError(f"{needs}, {left}; {advice}, or raise --max-memory")
 
 
 def memory_left() -> float:
     """Bytes that this process may still take: of the user's limit, or a part of what is free."""
     free = min(free_of_machine(), free_of_cgroup(), free_of_process())
-    if LIMIT.num_bytes is None:
-        return DEFAULT_FRACTION * free
-    return min(LIMIT.num_bytes - memory_taken(), free)
+    return min(LIMIT[0] - memory_taken(), free) if LIMIT else DEFAULT_FRACTION * free
 
 
 def memory_taken() -> float:
@@ -62,9 +51,8 @@ def check_address_space() -> None:
     """Raise a MemoryError where `ulimit -v` leaves too little for errors to be raised as they should."""
     left = free_of_process()
     if left < LEAST_LEFT:
-        raise MemoryError(
-            f"ulimit -v leaves {max(left, 0.0) / GB:.2g} GB, wanted {LEAST_LEFT / GB:g} or more"
-        )
+        wanted = f"wanted {LEAST_LEFT / GB:g} or more"
+        raise MemoryError(f"ulimit -v leaves {max(left, 0.0) / GB:.2g} GB, {wanted}")
 
 
 def free_of_machine() -> float:

@@ -116,17 +116,15 @@ def _query(folder: Path, number: int, entry: dict[str, Any]) -> Query:
     labels = folder / entry["labels"] if entry.get("labels") else None
     cameras = mounts_of(entry["camera"]) if entry.get("camera") else ()
     pose = Pose(R_cam_from_world, center_world)
-    more = _walk_of(entry)
-    return Query(folder / entry["image"], entry["variant"], pose, labels, cameras, *more)
+    return Query(folder / entry["image"], entry["variant"], pose, labels, cameras, *_walk_of(entry))
 
 
 def _walk_of(entry: dict[str, Any]) -> tuple[str | None, float | None, bool]:
     """A frame's walk and time, and whether it has an answer; ValueError if they are none."""
     walk, time, is_answerable = entry.get("walk"), entry.get("time"), entry.get("answerable", True)
     if (walk is None) != (time is None) or not isinstance(is_answerable, bool):
-        raise ValueError(
-            f"{entry['image']}: a walk without a time, or an answerable that is not true or false"
-        )
+        text = "a walk without a time, or an answerable that is not true or false"
+        raise ValueError(f"{entry['image']}: {text}")
     if walk is None:
         return None, None, is_answerable
     if not isinstance(walk, str) or not walk.isprintable():

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from io import BytesIO
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
@@ -10,23 +10,21 @@ from ...optional import new_figure
 from .query_result import QueryResult, Thresholds
 from .tables import Point
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+Figure = Any  # of matplotlib, which is imported when one is drawn
 
 POSITIONS = (1e-4, 30.0)  # of the axis [m]
 ROTATIONS_DEG = (1e-3, 180.0)
 SHOWN_ANGLES_DEG = (1.0, 5.0, 10.0)  # at which recall over distance is drawn
 
 
-def figure_png(figure: "Figure") -> bytes:
+def figure_png(figure: Figure) -> bytes:
     """A figure as a PNG file."""
     file = BytesIO()
     figure.savefig(file, format="png", dpi=120)
     return file.getvalue()
 
 
-def _fraction_below(axes: "Axes", errors: Sequence[float], label: str) -> None:
+def _fraction_below(axes: Any, errors: Sequence[float], label: str) -> None:
     """Draw the fraction of the errors below each value; queries without a pose never count."""
     finite = np.sort([error for error in errors if np.isfinite(error)])
     fractions = 100.0 * np.arange(1, len(finite) + 1) / max(len(errors), 1)
@@ -34,7 +32,7 @@ def _fraction_below(axes: "Axes", errors: Sequence[float], label: str) -> None:
     axes.step([1e-9, *finite, 1e9], [0.0, *fractions, last], where="post", label=label)
 
 
-def errors_figure(runs: Mapping[str, Sequence[QueryResult]], thresholds: Thresholds) -> "Figure":
+def errors_figure(runs: Mapping[str, Sequence[QueryResult]], thresholds: Thresholds) -> Figure:
     """Position and rotation error over the fraction of queries, and recall over thresholds, a line a run."""
     figure = new_figure(figsize=(14, 4.2), layout="constrained")
     position, rotation, recall = figure.subplots(1, 3)
@@ -58,7 +56,7 @@ def errors_figure(runs: Mapping[str, Sequence[QueryResult]], thresholds: Thresho
     return figure
 
 
-def risk_figure(points: Sequence[Point]) -> "Figure":
+def risk_figure(points: Sequence[Point]) -> Figure:
     """The fraction that is wrong over the fraction that is accepted."""
     figure = new_figure(figsize=(6, 4), layout="constrained")
     axes = figure.add_subplot()

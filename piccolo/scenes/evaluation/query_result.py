@@ -1,22 +1,27 @@
-"""The errors of one result against the true pose."""
+"""Results of queries with their errors against the true poses, and runs: files with one on each line."""
 
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...batch.results_file import check_as_expected
 from ...errors import InputError, printable
-from ...files.json_file import document_of
+from ...files.json_file import document_of, parse_lines, read_bytes
+from ...files.line_file import whole_size
 from ...geometry.pose import MAX_ANGLE, MAX_DISTANCE, Array, Pose, pose_errors
 from ...result import Result
 from ...scan import Scan
-from ..scene import Query, Scene
+from ..scene import QUERIES_NAME, Query, Scene
 
 FORMAT = "piccolo-evaluation/1"
+WANTED = "wanted a run of tools/evaluate.py"
+LINE_BEGINS = f'{{"format": "{FORMAT}"'.encode()
+MAX_DIFFERENCE = 1e-6  # [m], [rad] between errors of the same poses
 VIDEO_FRAME = re.compile(r"(.+)#t=(\d+\.\d+)")
 MAX_TIME_DIFFERENCE = 2e-3  # [s] of a video's frame from a walk's
 
@@ -110,11 +115,8 @@ def frames_of_video(pairs: Sequence[tuple[Scene, Query]], pano: str) -> list[tup
         return []
     walk = Path(found[1]).stem
     time = float(found[2])
-    return [
-        pair
-        for pair in pairs
-        if pair[1].walk == walk and abs((pair[1].time or 0.0) - time) < MAX_TIME_DIFFERENCE
-    ]
+    of_walk = [pair for pair in pairs if pair[1].walk == walk]
+    return [pair for pair in of_walk if abs((pair[1].time or 0.0) - time) < MAX_TIME_DIFFERENCE]
 
 
 def match_results(
@@ -146,3 +148,48 @@ def match_results(
             raise InputError(f"{result.pano}: found a second result of this panorama, wanted one")
         done.add(row.key)
         yield row
+
+
+def read_run(path: Path) -> tuple[list[QueryResult], int]:
+    """Return the queries of a run, and the size [byte] of the file up to its last whole line.
+
+    Raises InputError if a line is none of a run; an unfinished last line was being written, and is left out.
+    """
+    content = read_bytes(path, WANTED)
+    size = whole_size(path, LINE_BEGINS, "a run of tools/evaluate.py")
+    rows = parse_lines(path, content[:size], QueryResult.from_json)
+    return list({row.key: row for row in rows}.values()), size
+
+
+def check_run(
+    path: Path, rows: Sequence[QueryResult], scenes: Sequence[Scene], expected: Mapping[str, Any]
+) -> None:
+    """Refuse rows that were made with other settings than the expected, other true poses or other scenes."""
+    queries = {(s.name, s.name_of(query)): (s, query) for s in scenes for query in s.queries}
+    for row in rows:
+        found = {"line": path, "settings": row.result.settings}
+        check_as_expected(found, expected, "choose another file")
+        if row.key in queries and not _is_of(row, *queries[row.key]):
+            text = "made with another true pose or another scene of this name; choose another file"
+            raise InputError(f"{path}: found a result of {row.scene}, {row.image} {text}")
+
+
+def _is_of(row: QueryResult, scene: Scene, query: Query) -> bool:
+    """True if a result's errors are those of its pose against this query's true pose."""
+    again = query_result_of(scene, query, row.result, row.is_in_box)
+    pairs = (row.position_error, again.position_error), (row.rotation_error, again.rotation_error)
+    return all(a == b or abs(a - b) < MAX_DIFFERENCE for a, b in pairs)
+
+
+def check_variants(scenes: Sequence[Scene], variants: Sequence[str]) -> None:
+    """Refuse variants that no query of the scenes has."""
+    known = {query.variant for scene in scenes for query in scene.queries}
+    if missing := [variant for variant in variants if variant not in known]:
+        raise InputError(f"--variants: found no {missing[0]}, wanted some of {', '.join(sorted(known))}")
+
+
+def input_files(scenes: Sequence[Scene]) -> list[Path]:
+    """Return the files of scenes, which no output may replace."""
+    of_all = [path for scene in scenes for path in (scene.folder / QUERIES_NAME, scene.cloud)]
+    queries = [query for scene in scenes for query in scene.queries]
+    return of_all + [path for query in queries for path in (query.image, query.labels) if path]

@@ -57,12 +57,6 @@ def summarize(rows: Sequence[QueryResult], thresholds: Thresholds = PAPER_THRESH
     )
 
 
-def accuracies(rows: Sequence[QueryResult], max_angle: float) -> list[float]:
-    """The fraction of queries below each of ACCURACY_DISTANCES [m] and below an angle [rad]."""
-    levels = [Thresholds(distance, max_angle) for distance in ACCURACY_DISTANCES]
-    return [sum(row.is_correct(level) for row in rows) / len(rows) for level in levels]
-
-
 class Point(NamedTuple):
     """One point of the curve of risk over coverage."""
 
@@ -146,9 +140,12 @@ def summary_table(rows: Sequence[QueryResult], thresholds: Thresholds, title: st
 def threshold_table(rows: Sequence[QueryResult], thresholds: Thresholds) -> Table:
     """Accuracy at several distances."""
     title = f"accuracy: fraction under the distance and {np.degrees(thresholds.max_angle):g} deg"
-    fractions = [(name, accuracies(some, thresholds.max_angle)) for name, some in groups(rows)]
-    cells = tuple((name, *(f"{value:.3f}" for value in values)) for name, values in fractions)
-    return Table(title, ("queries", *(f"{line:g} m" for line in ACCURACY_DISTANCES)), cells)
+    cells = []
+    for name, some in groups(rows):
+        levels = [Thresholds(distance, thresholds.max_angle) for distance in ACCURACY_DISTANCES]
+        fractions = [sum(row.is_correct(level) for row in some) / len(some) for level in levels]
+        cells.append((name, *(f"{fraction:.3f}" for fraction in fractions)))
+    return Table(title, ("queries", *(f"{line:g} m" for line in ACCURACY_DISTANCES)), tuple(cells))
 
 
 def risk_table(points: Sequence[Point]) -> Table:

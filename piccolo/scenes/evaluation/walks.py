@@ -37,9 +37,7 @@ class WalkSummary(NamedTuple):
     num_refused: int  # of these: not localized
     squared_errors: Array  # (N,) of the positions of localized frames [m2]
     squared_steps: Array  # (M, 2) of the motion between neighbours both localized: [m2], [rad2]
-    first_sure: (
-        float | None
-    )  # when the first frame is localized, from the first frame on [s]; None if none is
+    first_sure: float | None  # [s] from the first frame to the first that is localized; None if none is
 
     @property
     def ate(self) -> float:
@@ -119,9 +117,7 @@ def summarize_all(summaries: Sequence[WalkSummary]) -> WalkSummary:
 
 def walk_table(walks: dict[tuple[str, str], list[Frame]], thresholds: Thresholds) -> Table:
     """A line a walk, and one of all."""
-    summaries = {
-        f"{scene} {walk}": summarize_walk(frames, thresholds) for (scene, walk), frames in walks.items()
-    }
+    summaries = {" ".join(name): summarize_walk(frames, thresholds) for name, frames in walks.items()}
     if len(summaries) > 1:
         summaries[ALL] = summarize_all(list(summaries.values()))
     title = f"walks; correct: {thresholds}; ATE, RPE: RMSE of localized frames"
