@@ -7,8 +7,7 @@ import rooms
 
 from piccolo.geometry.pose import pose_errors
 from piccolo.optimize.descent_animation import gif_of, perturb_pose, refine_with_history
-from piccolo.optimize.refine import refine, sampling_loss_of
-from piccolo.optimize.settings import DescentSettings
+from piccolo.optimize.refine import DescentSettings, refine, sampling_loss_of
 from piccolo.panorama.texels import pack_texels
 
 SEED = 3

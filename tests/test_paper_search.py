@@ -19,7 +19,6 @@ from piccolo.paper.search import (
     color_histogram,
     farthest_point_sampling,
     free_grid,
-    histogram_intersection,
     histogram_similarity,
     losses_at,
 )
@@ -93,17 +92,12 @@ def test_rotations_cover_so3_evenly(count):
     assert nearest.max() < 2.0 * ideal
 
 
-def test_histogram_counts_solid_angle_and_intersection_is_one_for_equal_ones():
+def test_histogram_counts_solid_angle():
     rgb = np.zeros((64, 128, 3), dtype=np.float32)
     rgb[:16] = 1.0  # a quarter of the rows, about the zenith: (1 - cos 45 deg) / 2 of the sphere
     histogram = color_histogram(rgb, np.ones((64, 128), dtype=bool), 4)
     assert histogram.sum() == pytest.approx(1.0)
     assert histogram[-1] == pytest.approx((1 - np.cos(np.pi / 4)) / 2, rel=1e-6)
-    everywhere = np.ones((16, 32), dtype=bool)
-    black = color_histogram(np.zeros((16, 32, 3), dtype=np.float32), everywhere, 8)
-    white = color_histogram(np.ones((16, 32, 3), dtype=np.float32), everywhere, 8)
-    assert histogram_intersection(black, black) == pytest.approx(1.0)
-    assert histogram_intersection(black, white) == 0.0
     histogram = color_histogram(np.ones((16, 32, 3), np.float32), np.zeros((16, 32), bool), 8)
     assert histogram.sum() == 0.0
 

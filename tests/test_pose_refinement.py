@@ -6,8 +6,8 @@ import pytest
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors, step
 from piccolo.geometry.rotations import random_rotation
 from piccolo.jobs.threads import Workers
+from piccolo.local_features.hypotheses import angular_equations, descend_matches
 from piccolo.local_features.p3p import p3p
-from piccolo.local_features.pose_refinement import angular_equations, descend_matches
 from piccolo.optimize.normal_equations import COUNT, GRADIENT, LOSS, MATRIX, NUM_SUMS
 
 TILTED = Pose(exp_so3(np.array([0.4, -1.1, 0.7])), np.array([0.2, -0.3, 0.1]))

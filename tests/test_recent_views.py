@@ -9,7 +9,7 @@ from piccolo.geometry.sphere import make_grid
 from piccolo.jobs.threads import Workers
 from piccolo.localization.query import COARSE_VOXEL_PER_RANGE, VOXEL_PER_RANGE, prepare_query
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
-from piccolo.views import recent_views
+from piccolo.views import points_around
 from piccolo.views.points_around import visible_points
 
 SCALES = VOXEL_PER_RANGE, COARSE_VOXEL_PER_RANGE
@@ -28,7 +28,7 @@ def _query():
 def test_a_place_is_within_half_a_centimetre_along_each_axis():
     rng = np.random.default_rng(0)
     for center in rng.uniform(-50.0, 50.0, (200, 3)):
-        place = np.array(recent_views.place_of(_pose(*center)))
+        place = np.array(points_around.place_of(_pose(*center)))
         assert np.abs(place - center).max() <= 0.005 + 1e-12
         np.testing.assert_allclose(place / 0.01, np.rint(place / 0.01), atol=1e-9)
 
@@ -41,24 +41,24 @@ def test_poses_near_one_place_share_what_is_drawn_and_no_others(monkeypatch):
         drawn.append((place, config))
         return original(octree, place, config)
 
-    original = recent_views.average_view
-    monkeypatch.setattr(recent_views, "average_view", average_view)
-    views = recent_views.RecentViews(octree)
+    original = points_around.average_view
+    monkeypatch.setattr(points_around, "average_view", average_view)
+    views = points_around.RecentViews(octree)
     here, near, far = _pose(0.296, 0.2, 0.3), _pose(0.304, 0.197, 0.304), _pose(0.306, 0.2, 0.3)
-    places = [recent_views.place_of(pose) for pose in (here, near, far)]
+    places = [points_around.place_of(pose) for pose in (here, near, far)]
     assert places[0] == places[1] != places[2]
     sums = [views.averages(place, FINE) for place in places]
     assert sums[0] is sums[1]
     assert len(drawn) == 2
     np.testing.assert_array_equal(sums[0], original(octree, places[0], FINE))
-    for k in range(recent_views.NUM_VIEWS):
+    for k in range(points_around.NUM_VIEWS):
         views.averages((0.01 * k, 0.5, 0.3), FINE)
     assert views.averages(places[0], FINE) is not sums[0]  # only the last are kept
 
 
 def test_views_and_points_count_from_their_place():
     query, pose = _query(), _pose(0.307, 0.191, 0.304)
-    place = recent_views.place_of(pose)
+    place = points_around.place_of(pose)
     expected = rooms.view(query.scan_map.octree, place, FINE, ALL)
     points = visible_points(query.scan_map.octree, place, FULL, ALL.tobytes(), 30_000)
     for found, wanted in ((query.view_at(pose, FINE), expected), (query.points_at(pose), points)):

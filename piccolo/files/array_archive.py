@@ -68,22 +68,23 @@ class ArrayArchive:
     ValueError, and what zipfile raises, for an archive that `write_archive` can't have written.
     """
 
-    def __init__(self, file: IO[bytes], is_mapped: bool) -> None:
+    def __init__(self, path: Path, is_mapped: bool = False) -> None:
         """Read the directory. What may be cut off while it is mapped kills the process (SIGBUS)."""
-        self.status = os.fstat(file.fileno())
-        with zipfile.ZipFile(file) as archive:
-            infos = archive.infolist()
-        self.members = {info.filename.removesuffix(".npy"): info for info in infos}
-        if is_mapped:
-            self.content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
-        else:
-            check_memory(self.status.st_size, file.name, "keep it in the cache")
-            self.content = mmap.mmap(-1, self.status.st_size)
-            file.seek(0)
-            with memoryview(self.content) as whole:
-                done = 0
-                while count := file.readinto(whole[done:]):  # type: ignore[attr-defined]
-                    done += count
+        with path.open("rb") as file:
+            self.status = os.fstat(file.fileno())
+            with zipfile.ZipFile(file) as archive:
+                infos = archive.infolist()
+            self.members = {info.filename.removesuffix(".npy"): info for info in infos}
+            if is_mapped:
+                self.content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+            else:
+                check_memory(self.status.st_size, file.name, "keep it in the cache")
+                self.content = mmap.mmap(-1, self.status.st_size)
+                file.seek(0)
+                with memoryview(self.content) as whole:
+                    done = 0
+                    while count := file.readinto(whole[done:]):
+                        done += count
         size = sum(info.file_size for info in infos)
         if size > len(self.content) or len(self.members) != len(infos):
             raise ValueError(f"arrays of {size} bytes")
@@ -123,9 +124,3 @@ class ArrayArchive:
         if promised == 0:
             return np.empty(shape, dtype)
         return np.frombuffer(self.content, dtype, math.prod(shape), first).reshape(shape)
-
-
-def open_archive(path: Path, is_mapped: bool = False) -> ArrayArchive:
-    """The arrays of an archive that `write_archive` wrote."""
-    with path.open("rb") as file:
-        return ArrayArchive(file, is_mapped)

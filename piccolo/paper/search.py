@@ -77,11 +77,6 @@ def color_histogram(rgb: NDArray[np.float32], counts: NDArray[np.bool_], bins: i
     return np.asarray(histogram / max(histogram.sum(), 1e-12))
 
 
-def histogram_intersection(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """Overlap in [0, 1] of two histograms that each sum to 1 (Swain and Ballard, 1991)."""
-    return float(np.minimum(a, b).sum())
-
-
 def losses_at(
     points: PackedPoints, loss: Loss, center_world: Array, rotations: NDArray[np.float64]
 ) -> list[Hypothesis]:
@@ -92,12 +87,15 @@ def losses_at(
 
 
 def histogram_similarity(points: PackedPoints, panorama: Panorama, pose: Pose, bins: int) -> float:
-    """Histogram intersection [0, 1] of panorama and cloud at `pose`, where both show something."""
+    """Histogram intersection [0, 1] of panorama and cloud at `pose`, where both show something.
+
+    The overlap of two histograms that each sum to 1 (Swain and Ballard, 1991).
+    """
     view = render_view(points, pose, panorama.rgb.shape[1])
     counts = view.is_seen & panorama.is_valid
     of_cloud = color_histogram(view.rgb, counts, bins)
     of_panorama = color_histogram(panorama.rgb.astype(np.float32) / 255.0, counts, bins)
-    return histogram_intersection(of_cloud, of_panorama)
+    return float(np.minimum(of_cloud, of_panorama).sum())
 
 
 def search(

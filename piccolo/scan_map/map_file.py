@@ -21,7 +21,7 @@ from .. import __version__
 from ..cloud.octree import Octree
 from ..cloud.readers.npz import damage_named
 from ..errors import InputError
-from ..files.array_archive import open_archive, write_archive
+from ..files.array_archive import ArrayArchive, write_archive
 from ..files.atomic import replacing
 from ..files.cache import WRITABLE, is_own, mark_used, own_names, private_folder
 from ..files.digest import key_of, recall, remember
@@ -113,7 +113,7 @@ def load_map(path: Path, remembers: bool = False) -> ScanMap:
     """
     what = f"checked as {FORMAT} by {__version__}"
     with damage_named(path, WANTED), lasting(path, remembers) as place:
-        archive = open_archive(place or path, is_mapped=place is not None)
+        archive = ArrayArchive(place or path, is_mapped=place is not None)
         if "format" in archive.members and (found := str(archive.array("format"))) != FORMAT:
             text = f"a map of format {found[:40]!r}, but this version reads {FORMAT}; prepare it again"
             raise InputError(f"{path}: {text}")
