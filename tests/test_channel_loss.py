@@ -5,13 +5,7 @@ import numpy as np
 import pytest
 
 from piccolo.geometry.pose import Pose, exp_so3, step
-from piccolo.optimize.channel_loss import (
-    CHANCE,
-    NUM_BLOCKS,
-    channel_equations,
-    correlate,
-    score,
-)
+from piccolo.optimize.channel_loss import CHANCE, NUM_BLOCKS, channel_equations, correlate, score
 from piccolo.optimize.normal_equations import COUNT, GRADIENT, LOSS, MATRIX, NUM_SUMS
 from piccolo.panorama.texels import pack_texels
 

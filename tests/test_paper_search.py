@@ -1,27 +1,14 @@
 """The paper's starts: positions in free space, rotations, histograms, losses."""
 
-import math
-
 import numpy as np
 import pytest
 import rooms
 
 from piccolo.cloud.soa import pack_points
-from piccolo.geometry.pose import Pose, angle_between, yaw_rotation
-from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
-from piccolo.optimize.refine import Loss, sampling_loss_of
+from piccolo.geometry.pose import Pose
+from piccolo.geometry.rotations import uniform_rotations
 from piccolo.panorama.model import shrink
-from piccolo.panorama.texels import pack_texels
-from piccolo.paper.search import (
-    MIN_CLEARANCE,
-    PROBE_WIDTH,
-    box_grid,
-    color_histogram,
-    farthest_point_sampling,
-    free_grid,
-    histogram_similarity,
-    losses_at,
-)
+from piccolo.paper.search import MIN_CLEARANCE, PROBE_WIDTH, color_histogram, free_grid, histogram_similarity
 from piccolo.views.zbuffer import is_free_space
 
 AT = np.array([1.0, 2.0, 1.5])
@@ -64,20 +51,6 @@ def test_free_grid_gives_the_number_asked_for_all_free(num_translations):
     assert len(np.unique(grid, axis=0)) == num_translations
 
 
-def test_grid_and_yaws_are_even_and_sampling_keeps_far_ones():
-    grid = box_grid(np.zeros(3), np.array([20.0, 10.0, 2.5]), 50)
-    assert 35 <= len(grid) <= 70
-    assert (grid > 0).all()
-    assert (grid < [20.0, 10.0, 2.5]).all()
-    np.testing.assert_allclose(np.diff(np.unique(grid[:, 0])), np.diff(np.unique(grid[:, 0]))[0])
-    line = np.column_stack([np.arange(11.0), np.zeros(11), np.zeros(11)])
-    np.testing.assert_array_equal(farthest_point_sampling(line, 3)[:, 0], [0, 5, 10])
-    assert farthest_point_sampling(line, 20) is line
-    yaws = uniform_yaws(8)
-    assert angle_between(yaws[0], yaws[1]) == pytest.approx(np.pi / 4)
-    assert angle_between(yaws[7], yaws[0]) == pytest.approx(np.pi / 4)
-
-
 @pytest.mark.parametrize("count", [32, 500])
 def test_rotations_cover_so3_evenly(count):
     rotations = uniform_rotations(count)
@@ -100,19 +73,6 @@ def test_histogram_counts_solid_angle():
     assert histogram[-1] == pytest.approx((1 - np.cos(np.pi / 4)) / 2, rel=1e-6)
     histogram = color_histogram(np.ones((16, 32, 3), np.float32), np.zeros((16, 32), bool), 8)
     assert histogram.sum() == 0.0
-
-
-def test_rotation_without_a_loss_is_no_hypothesis():
-    loss = Loss(
-        lambda points, pose: pose.R_cam_from_world[0, 0] if pose.R_cam_from_world[0, 0] > 0 else math.inf,
-        None,
-    )
-    turns = np.stack([yaw_rotation(a) for a in np.radians([60, 0, 180])])
-    np.testing.assert_allclose([h.score for h in losses_at(None, loss, AT, turns)], [-0.5, -1.0])
-    points, panorama, true_pose = rooms.scene(1)
-    turns = uniform_yaws(8) @ true_pose.R_cam_from_world
-    scored = losses_at(points, sampling_loss_of(pack_texels(panorama.rgb)), true_pose.center_world, turns)
-    assert np.argmax([h.score for h in scored]) == 0
 
 
 def test_histograms_agree_best_at_the_true_place():

@@ -5,9 +5,7 @@ import pytest
 
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors, step
 from piccolo.geometry.rotations import random_rotation
-from piccolo.jobs.threads import Workers
 from piccolo.local_features.hypotheses import angular_equations, descend_matches
-from piccolo.local_features.p3p import p3p
 from piccolo.optimize.normal_equations import COUNT, GRADIENT, LOSS, MATRIX, NUM_SUMS
 
 TILTED = Pose(exp_so3(np.array([0.4, -1.1, 0.7])), np.array([0.2, -0.3, 0.1]))
@@ -90,24 +88,6 @@ def test_wrong_matches_hardly_count():
         errors.append(pose_errors(narrow, TILTED))
     assert np.max(errors, axis=0)[0] < 0.01
     assert np.max(errors, axis=0)[1] < np.radians(0.2)
-
-
-def _pose_of(seed):
-    """A pose by the first three of noisy matches, refined on all: its bits."""
-    rng = np.random.default_rng(seed)
-    pose = Pose(random_rotation(rng), rng.normal(size=3) * 5.0)
-    bearings, points = _matches(rng, pose, 30, noise=1e-3)
-    rotations, centers = np.empty((4, 3, 3)), np.empty((4, 3))
-    count = p3p(bearings[:3], points[:3], rotations, centers)
-    for R, center in zip(rotations[:count], centers[:count], strict=True):
-        descend_matches((bearings, points, 0.1), 30, 1e-7, R, center)
-    return rotations[:count].tobytes() + centers[:count].tobytes()
-
-
-def test_threads_change_no_bit():
-    alone, together = ([*Workers(n).map(_pose_of, range(200), "poses")] for n in (1, 4))
-    assert alone == together
-    assert len(set(alone)) > 190  # each has poses of its own
 
 
 def test_a_point_at_the_camera_and_too_few_matches_leave_a_finite_pose():

@@ -19,7 +19,7 @@ from piccolo.localization import query as query_module
 from piccolo.localization.query import Cache, Images, prepare_query
 from piccolo.localization.refinement import Fit, best_and_alternatives, narrow
 from piccolo.localization.search import Starts
-from piccolo.localization.settings import METHOD, Beam, CoarseToFineSettings
+from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.views.view import Cells
 
 FINE_BLOCKS = METHOD.fine_view.arrays.blocks
@@ -85,38 +85,6 @@ def test_narrow_ranks_poses_first(monkeypatch):
     assert refinement.descend_prepared(_asked(), starts, 5, 8).candidate.tolist() == [0, 2]
 
 
-def test_halving_keeps_as_many_as_the_beam_says(monkeypatch):
-    calls = []
-
-    def descend_prepared(query, starts, num_iterations, count):
-        calls.append((num_iterations, count))
-        return starts.take(np.arange(min(count, len(starts.candidate))))
-
-    def scoring(name, score):
-        def function(query, pose):
-            calls.append(name)
-            return Fit(pose, score - 0.01 * place(pose))
-
-        return function
-
-    def perturb(query, fit):
-        calls.append("perturb")
-        return Fit(fit.pose, fit.score + 0.5)
-
-    monkeypatch.setattr(refinement, "descend_prepared", descend_prepared)
-    for name, score in (("descend_middle", 0.6), ("perturb_middle", 0.7), ("descend_fine", 0.8)):
-        monkeypatch.setattr(refinement, name, scoring(name, score))
-    monkeypatch.setattr(refinement, "refine_by_perturbation", perturb)
-    monkeypatch.setattr(refinement, "score_pose", scoring("score_pose", 0.9))
-    centers = np.outer(np.arange(40.0), [1.0, 0, 0])
-    starts = Starts(np.repeat(np.eye(3)[None], 40, axis=0), centers, np.arange(40))
-    found = refinement.refine(QUERY, starts, Beam(30, 20, 5, 2))
-    assert calls[:2] == [(5, 30), (12, 20)]
-    stages = ("descend_middle", "perturb_middle", "descend_fine", "perturb", "score_pose")
-    assert [calls.count(name) for name in stages] == [20, 5, 5, 2, 12]
-    assert [place(h.pose) for h in found] == [*range(12)]  # each answer once, the last from middle cells
-
-
 # Perturbations and the last millimetres
 
 
@@ -166,52 +134,6 @@ def test_full_resolution_is_taken_back_where_the_score_falls(monkeypatch, after,
     assert asked == [0.0, 0.04]  # the points are taken again from where the pose is
     assert last_descent.settle(query, start) == expected
     assert len(asked) == len(descents) == 4  # the second round of settling moves nothing
-    monkeypatch.setattr(last_descent, "descend", lambda *_: at(len(asked), 0.0).pose)
-    last_descent.settle(query, start)
-    assert len(asked) == 10  # six rounds at most
-    monkeypatch.setattr(last_descent, "descend", lambda *_: at(0.019, 0.0).pose)
-    last_descent.refine_full_resolution(query, start.pose)
-    assert len(asked) == 11  # so near by it sees the same points
-
-
-@pytest.mark.parametrize(
-    ("hidden", "gains", "expected"),
-    [
-        ([None], [0.1], (0.6, None, 1)),
-        (["a", "b"], [0.1, 0.1], (0.7, "b", 2)),
-        (["a"], [0.01], (0.51, "a", 1)),
-        (["a"], [-0.2], (0.5, "a", 1)),
-        (["a", None], [0.1, 0.1], (0.7, None, 2)),
-    ],
-)
-def test_occluders_are_masked_twice_at_most_and_while_that_helps(monkeypatch, hidden, gains, expected):
-    """What is hidden at each look, what is gained; the score, what is hidden at last, the looks."""
-    score, looks, left = [0.5], [], list(hidden)
-    query = replace(QUERY, photo=None)
-
-    def without_occluders(asked, pose):
-        assert asked is query  # always of the whole photo
-        looks.append(left.pop(0))
-        return query if looks[-1] is None else replace(query, photo=looks[-1])
-
-    def perturbed(shown, fit):
-        assert shown.photo == looks[-1]
-        score[0] = max(score[0], h[0].score) + gains[len(looks) - 1]
-        return fit
-
-    def score_pose(asked, pose):
-        assert asked is query
-        h[0] = Hypothesis(pose, score[0])
-        return h[0]
-
-    h = [None]
-    monkeypatch.setattr(last_descent, "without_occluders", without_occluders)
-    monkeypatch.setattr(last_descent, "refine_by_perturbation", perturbed)
-    monkeypatch.setattr(last_descent, "score_pose", score_pose)
-    for name in ("perturb_middle", "descend_fine"):
-        monkeypatch.setattr(last_descent, name, lambda shown, pose: Fit(pose, 0.0))
-    shown, found = last_descent.refine_unoccluded(query, at(0.0, 0.0).pose)
-    assert (pytest.approx(found.score), shown.photo, len(looks)) == expected
 
 
 def test_cells_and_points_are_those_that_the_photo_shows(monkeypatch):
@@ -258,17 +180,6 @@ def _fine():
     """Fine cells about the true camera of a room, and its true pose."""
     true_pose = rooms.scene(1)[2]
     return rooms.view(rooms.scan_map(1).octree, true_pose.center_world, METHOD.fine_view, ALL), true_pose
-
-
-def test_channels_in_levels_and_perturbations_to_the_corners_of_a_cube():
-    np.testing.assert_allclose(refinement.as_levels(np.array([-2, 0, 2], np.float32)), [0, 127.5, 255])
-    steps = refinement.perturbations(0.5)
-    assert steps.shape == (9, 6)
-    assert (steps[0] == 0).all()
-    np.testing.assert_allclose(np.degrees(np.linalg.norm(steps[1:, :3], axis=1)), 4.0)
-    np.testing.assert_allclose(np.linalg.norm(steps[1:, 3:], axis=1), 0.125)
-    assert len(np.unique(np.sign(steps[1:, 3:]), axis=0)) == 8
-    assert (np.sign(steps[1:, 3:]) == np.sign(steps[1:, 2::-1])).all()
 
 
 def test_descent_finds_the_true_pose_again():

@@ -43,21 +43,6 @@ def test_arctangent_polynomial_error():
     assert sphere.atan2(np.float32(0), np.float32(0)) == 0.0
 
 
-@pytest.mark.parametrize(
-    ("direction", "pixel"),
-    [
-        ((1, 0, 0), (1024, 512)),
-        ((0, 1, 0), (512, 512)),
-        ((0, -1, 0), (1536, 512)),
-        ((1, 0, 1), (1024, 256)),
-        ((1, 0, -1), (1024, 768)),
-    ],
-)
-def test_axes_fall_where_the_convention_says(direction, pixel):
-    at = _pixels(np.array([direction], dtype=np.float64), np.eye(3), np.zeros(3))
-    np.testing.assert_allclose(at[0], pixel, atol=1e-3)
-
-
 def test_seam_has_both_sides():
     left = _pixels(np.array([[-1.0, 1e-4, 0.0]]), np.eye(3), np.zeros(3))[0, 0]
     right = _pixels(np.array([[-1.0, -1e-4, 0.0]]), np.eye(3), np.zeros(3))[0, 0]

@@ -77,15 +77,6 @@ def color_histogram(rgb: NDArray[np.float32], counts: NDArray[np.bool_], bins: i
     return np.asarray(histogram / max(histogram.sum(), 1e-12))
 
 
-def losses_at(
-    points: PackedPoints, loss: Loss, center_world: Array, rotations: NDArray[np.float64]
-) -> list[Hypothesis]:
-    """Every rotation (N, 3, 3) at one position (3,) that has a loss; the score is its negative."""
-    poses = [Pose(R_cam_from_world, center_world) for R_cam_from_world in rotations]
-    scored = [Hypothesis(pose, -loss.value(points, pose)) for pose in poses]
-    return [h for h in scored if np.isfinite(h.score)]
-
-
 def histogram_similarity(points: PackedPoints, panorama: Panorama, pose: Pose, bins: int) -> float:
     """Histogram intersection [0, 1] of panorama and cloud at `pose`, where both show something.
 
@@ -112,7 +103,9 @@ def search(
 
     def losses(center_world: Array) -> list[Hypothesis]:
         seen = visible_points(points, center_world) if settings.use_visibility else points
-        return losses_at(seen, loss, center_world, rotations)
+        poses = [Pose(R_cam_from_world, center_world) for R_cam_from_world in rotations]
+        found = [Hypothesis(pose, -loss.value(seen, pose)) for pose in poses]
+        return [h for h in found if np.isfinite(h.score)]
 
     scored = [h for batch in workers.map(losses, list(positions), "search") for h in batch]
     if settings.initialization == "loss-only":
