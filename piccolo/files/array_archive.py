@@ -25,7 +25,6 @@ from ..jobs.memory import check_memory
 ALIGNMENT = 64  # [byte]
 PADDING_ID = 0xD935  # of the extra field of a member's header, as zipalign has it
 LOCAL_HEADER = struct.Struct("<4s22xHH")  # magic, lengths of the name and of the extra field behind it
-MEMBER_MAGIC = b"PK\x03\x04"
 MAX_HEADER_SIZE = 4096  # [byte] of an array's header
 MAX_HEAD_SIZE = MAX_HEADER_SIZE + 12  # with what stands before it
 QUOTED = re.compile(rb"'[^']*'|\"[^\"]*\"")
@@ -96,7 +95,7 @@ class ArrayArchive:
         begin = info.header_offset + LOCAL_HEADER.size + int(name_size) + int(extra_size)
         is_stored = info.compress_type == zipfile.ZIP_STORED and info.compress_size == info.file_size
         is_inside = info.header_offset >= 0 and begin + info.file_size <= len(self.content)
-        if magic != MEMBER_MAGIC or not is_stored or not is_inside or info.flag_bits & 1:
+        if magic != b"PK\x03\x04" or not is_stored or not is_inside or info.flag_bits & 1:
             raise ValueError(f"{info.filename} in another way than a prepared map has it")
         return begin
 

@@ -20,9 +20,6 @@ from .cache import mark_used, own_names, private_folder
 
 NAME = own_names("fact")
 MAX_SIZE = 200  # [byte] of a fact
-
-
-DIGEST = "sha256"
 TICK_NS = 50_000_000  # the clock of files moves on every 1 to 10 ms
 
 
@@ -70,14 +67,14 @@ def sha256_of_files(paths: Sequence[Path], remembers: bool = False) -> str:
 def _sha256_of_file(path: Path, remembers: bool) -> str:
     with path.open("rb") as file:
         status = os.fstat(file.fileno())
-        if remembers and (known := recall(DIGEST, status)) is not None:
+        if remembers and (known := recall("sha256", status)) is not None:
             return known
         digest = hashlib.file_digest(file, "sha256").hexdigest()
         # A file that changed a moment ago may change again before the clock of its times moves on.
         is_same = os.fstat(file.fileno()).st_ctime_ns == status.st_ctime_ns
         is_settled = is_same and time.time_ns() - status.st_ctime_ns > TICK_NS
     if remembers and is_settled:
-        remember(DIGEST, status, digest)
+        remember("sha256", status, digest)
     return digest
 
 

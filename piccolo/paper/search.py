@@ -15,7 +15,6 @@ from ..views.zbuffer import is_free_space, render_view, visible_points
 from .settings import PaperSettings
 
 MIN_CLEARANCE = 0.25  # a camera is not nearer to a surface than this [m]
-PROBE_POINTS = 200_000  # about this many points are asked, evenly in space
 PROBE_WIDTH = 48  # cells of 7.5 degrees for the two tests
 
 
@@ -55,7 +54,7 @@ def free_grid(points: PackedPoints, num_translations: int, margin: float) -> NDA
     inset = margin * (high - low)
     low += inset
     high -= inset
-    probed = points.take(slice(None, None, max(1, len(points) // PROBE_POINTS)))
+    probed = points.take(slice(None, None, max(1, len(points) // 200_000)))  # evenly in space
     free = np.empty((0, 3))
     for growth in (1.0, 1.5, 2.25, 3.4, 5.0, 7.6, 11.4, 17.0, 26.0):
         grid = box_grid(low, high, round(num_translations * growth))

@@ -36,13 +36,6 @@ OTHERS = ("octree", "local_features", "scan_names", "warnings", "crs", "is_parti
 ARRAYS = [f.name for f in fields(ScanMap) if f.name not in OTHERS]
 MEMBERS = {*LAYOUT, "format", "scan_names", "warnings"}
 WANTED = "wanted a whole map by tools/prepare_map.py"
-ZIP_MAGIC = b"PK\x03\x04"
-COPIED_AT_ONCE = 1 << 22  # [byte]
-# The first member of a map: its name and where that stands, and the beginning of its value somewhere behind.
-FIRST_NAME = b"format.npy"
-FIRST_NAME_AT = 30
-FIRST_VALUE = FORMAT.partition("/")[0].encode("utf-32-le")
-FIRST_VALUE_WITHIN = 512
 
 
 def save_map(scan_map: ScanMap, path: Path) -> None:
@@ -66,9 +59,10 @@ def is_map_file(path: Path) -> bool:
     The first member's name or its value is enough, so that a damaged map is still refused as a map.
     """
     with path.open("rb") as file:
-        head = file.read(FIRST_VALUE_WITHIN)
-    has_name = head.startswith(FIRST_NAME, FIRST_NAME_AT)
-    return head.startswith(ZIP_MAGIC) and (has_name or FIRST_VALUE in head)
+        head = file.read(512)
+    has_name = head.startswith(b"format.npy", 30)  # behind its header
+    has_value = FORMAT.partition("/")[0].encode("utf-32-le") in head
+    return head.startswith(b"PK\x03\x04") and (has_name or has_value)
 
 
 @contextmanager
@@ -99,7 +93,7 @@ def copied(path: Path, folder: Path) -> Path | None:
         try:
             if not copy.exists():
                 with replacing(copy) as out:
-                    shutil.copyfileobj(file, out, COPIED_AT_ONCE)
+                    shutil.copyfileobj(file, out, 1 << 22)
         except OSError:  # as where the disk is full: it is read instead
             return None
     mark_used(copy)
