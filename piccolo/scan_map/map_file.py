@@ -23,8 +23,7 @@ from ..cloud.readers.npz import damage_named
 from ..errors import InputError
 from ..files.array_archive import ArrayArchive, write_archive
 from ..files.atomic import replacing
-from ..files.cache import WRITABLE, is_own, mark_used, own_names, private_folder
-from ..files.digest import key_of, recall, remember
+from ..files.cache import WRITABLE, is_own, key_of, mark_used, own_names, private_folder, recall, remember
 from ..local_features.feature_map import FeatureMap
 from ..views.candidate_views import CandidateViews
 from .map_validation import LAYOUT, check_arrays, clean_warnings

@@ -13,8 +13,7 @@ from ..cloud.crs import crs_of
 from ..cloud.settings import IN_METRES, CloudSettings, R_z_from_axis
 from ..cloud.soa import LocalCloud, pack_points
 from ..errors import InputError
-from ..files.cache import cache_root, digest_of_sources, in_words, mark_used, own_folder
-from ..files.digest import sha256_of_files
+from ..files.cache import cache_root, digest_of_sources, in_words, mark_used, own_folder, sha256_of_files
 from ..geometry.pose import rotate_points
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers

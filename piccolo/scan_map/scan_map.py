@@ -18,8 +18,7 @@ from ..geometry.pose import Array, Pose
 from ..gravity.alignment import find_up
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
-from ..local_features.feature_map import FeatureMap, make_feature_map
-from ..local_features.view_positions import Look, view_positions
+from ..local_features.feature_map import FeatureMap, Look, make_feature_map, view_positions
 from ..views.candidate_views import SEARCH_VIEW, CandidateViews, render_wide
 from ..views.view import ViewConfig, ranges_around
 from .camera_positions import COARSE_SPACING, Ball, TooManyPositionsError, candidate_centers
