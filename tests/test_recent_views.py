@@ -7,14 +7,13 @@ import rooms
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.geometry.sphere import make_grid
 from piccolo.jobs.threads import Workers
-from piccolo.localization.query import COARSE_VOXEL_PER_RANGE, VOXEL_PER_RANGE, prepare_query
+from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.views import points_around
 from piccolo.views.points_around import visible_points
 
-SCALES = VOXEL_PER_RANGE, COARSE_VOXEL_PER_RANGE
 FINE, FULL = METHOD.fine_view, METHOD.full_view
-ALL = np.ones(len(make_grid(FINE.num_rings)), bool)
+FINE_CELLS = np.ones(len(make_grid(FINE.num_rings)), bool)
 
 
 def _pose(*center):
@@ -51,8 +50,8 @@ def test_poses_near_one_place_share_what_is_drawn_and_no_others(monkeypatch):
 def test_views_and_points_count_from_their_place():
     query, pose = _query(), _pose(0.307, 0.191, 0.304)
     place = points_around.place_of(pose)
-    expected = rooms.view(query.scan_map.octree, place, FINE, ALL)
-    points = visible_points(query.scan_map.octree, place, FULL, ALL.tobytes(), 30_000)
+    expected = rooms.view(query.scan_map.octree, place, FINE, FINE_CELLS)
+    points = visible_points(query.scan_map.octree, place, FULL, FINE_CELLS.tobytes(), 30_000)
     for found, wanted in ((query.view_at(pose, FINE), expected), (query.points_at(pose), points)):
         for values, others in zip(found, wanted, strict=True):
             np.testing.assert_array_equal(values, others)
