@@ -28,13 +28,18 @@ def finding(monkeypatch):
     return asked
 
 
+@pytest.fixture(scope="module")
+def cloud(tmp_path_factory):
+    folder = rooms.write_room(tmp_path_factory.mktemp("room"), "--seed 3 --points 40000 --panoramas 1")
+    return folder / "cloud.ply"
+
+
 @pytest.fixture
-def opened(tmp_path):
-    folder = rooms.write_room(tmp_path / "room", "--seed 3 --points 40000 --panoramas 1")
+def opened(tmp_path, cloud):
     cache = CachePolicy(folder=tmp_path / "cache")
 
     def open_it():
-        return open_map.open_map([folder / "cloud.ply"], IN_METRES, cache, WORKERS, Stopwatch())
+        return open_map.open_map([cloud], IN_METRES, cache, WORKERS, Stopwatch())
 
     return open_it
 
