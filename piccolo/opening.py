@@ -13,7 +13,7 @@ from .cloud import open_cloud
 from .cloud.settings import METRES, CloudSettings, UpAxis
 from .cloud.stream import ARRAYS, CloudStream, stream_of_arrays
 from .errors import InputError
-from .files.digest import sha256_of_files
+from .files.cache import sha256_of_files
 from .jobs.stopwatch import Stopwatch
 from .jobs.threads import ProgressCallback, Workers, no_progress, num_cores, progress_to
 from .localization.settings import CoarseToFineSettings

@@ -23,7 +23,7 @@ from .jobs.stopwatch import Stopwatch
 from .jobs.threads import Workers
 from .localization.localize import has_guessed_focal, localize, localize_guessed
 from .localization.settings import CoarseToFineSettings
-from .optimize.settings import Solver
+from .optimize.refine import Solver
 from .panorama import ReadOptions, read_query
 from .panorama.model import Projection
 from .panorama.photo import Photo

@@ -275,14 +275,6 @@ def test_who_waits_for_kernels_is_told(monkeypatch, capsys):
     assert logging.getLogger("piccolo").level == logging.NOTSET
 
 
-def test_a_logged_warning_is_one_line_and_quiet_is_quiet(capsys):
-    for is_quiet in (False, True):
-        with progress.log_shown(is_quiet):
-            for _ in range(3):
-                jit.log.warning("%s: damaged", "a")
-        assert capsys.readouterr().err == ("" if is_quiet else "warning: a: damaged\n")
-
-
 def test_importing_writes_nothing(tmp_path):
     folders = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
     environment = {**os.environ, **folders, "PYTHONDONTWRITEBYTECODE": "1"}

@@ -1,16 +1,20 @@
-"""What is seen from a map's candidates: wide cells prepared, fine ones made when they are asked for."""
+"""What is seen from a map's candidates, and near a pose: made when it is asked for, and kept."""
 
-import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import rooms
 
+from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
 from piccolo.jobs.threads import Workers
+from piccolo.localization.query import prepare_query
+from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.panorama.local_normalization import LEVELS_PER_UNIT
-from piccolo.views import candidate_views
+from piccolo.views import candidate_views, points_around
 from piccolo.views.candidate_views import SEARCH_VIEW, CandidateViews, render_views, render_wide
+from piccolo.views.points_around import visible_points
 
 ALL = np.ones(len(make_grid(24)), bool)
 
@@ -65,25 +69,17 @@ def test_no_more_than_so_many_are_kept_and_those_given_out_stay(monkeypatch):
 
 def test_threads_may_ask_at_once():
     m, kept = _views()
-    found, errors = {}, []
 
     def ask(seed):
         candidates = np.random.default_rng(seed).permutation(len(m.centers))[:200]
-        try:
-            for part in np.split(candidates, 20):
-                rows, views = kept.at(part, Workers(1))
-                np.testing.assert_array_equal(views.centers[rows], m.centers[part])
-        except AssertionError as error:
-            errors.append(error)
-        found[seed] = candidates
+        for part in np.split(candidates, 20):
+            rows, views = kept.at(part, Workers(1))
+            np.testing.assert_array_equal(views.centers[rows], m.centers[part])
+        return candidates
 
-    threads = [threading.Thread(target=ask, args=(seed,)) for seed in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert errors == []
-    assert kept.num_made == len(np.unique(np.concatenate(list(found.values()))))
+    with ThreadPoolExecutor(4) as pool:
+        asked = list(pool.map(ask, range(4)))
+    assert kept.num_made == len(np.unique(asked))
 
 
 def test_wide_views_are_averages_of_fine_ones():
@@ -108,3 +104,64 @@ def test_views_have_the_same_bits_for_any_number_of_threads(render, count):
     for a, b in zip(one, two, strict=True):
         assert len(a) == count
         np.testing.assert_array_equal(a, b)
+
+
+FINE, FULL = METHOD.fine_view, METHOD.full_view
+FINE_CELLS = np.ones(len(make_grid(FINE.num_rings)), bool)
+
+
+def _pose(*center):
+    return Pose(yaw_rotation(0.3), np.array(center))
+
+
+def _query():
+    return prepare_query(rooms.scene(1)[1], rooms.scan_map(1), CoarseToFineSettings(), Workers(1))
+
+
+def test_poses_near_one_place_share_what_is_drawn_and_no_others(monkeypatch):
+    query, drawn = _query(), []
+    octree = query.scan_map.octree
+
+    def average_view(octree, place, config):
+        drawn.append((place, config))
+        return original(octree, place, config)
+
+    original = points_around.average_view
+    monkeypatch.setattr(points_around, "average_view", average_view)
+    views = points_around.RecentViews(octree)
+    here, near, far = _pose(0.296, 0.2, 0.3), _pose(0.304, 0.197, 0.304), _pose(0.306, 0.2, 0.3)
+    places = [points_around.place_of(pose) for pose in (here, near, far)]
+    assert places[0] == places[1] != places[2]
+    sums = [views.averages(place, FINE) for place in places]
+    assert sums[0] is sums[1]
+    assert len(drawn) == 2
+    np.testing.assert_array_equal(sums[0], original(octree, places[0], FINE))
+    for k in range(points_around.NUM_VIEWS):
+        views.averages((0.01 * k, 0.5, 0.3), FINE)
+    assert views.averages(places[0], FINE) is not sums[0]  # only the last are kept
+
+
+def test_views_and_points_count_from_their_place():
+    query, pose = _query(), _pose(0.307, 0.191, 0.304)
+    place = points_around.place_of(pose)
+    expected = rooms.view(query.scan_map.octree, place, FINE, FINE_CELLS)
+    points = visible_points(query.scan_map.octree, place, FULL, FINE_CELLS.tobytes(), 30_000)
+    for found, wanted in ((query.view_at(pose, FINE), expected), (query.points_at(pose), points)):
+        for values, others in zip(found, wanted, strict=True):
+            np.testing.assert_array_equal(values, others)
+    assert query.points_at(pose) is query.points_at(_pose(0.3135, 0.1875, 0.302))
+    moved = expected.around(pose.center_world)
+    at, there = (cells.center_map[:, None] + cells.offsets for cells in (expected, moved))
+    np.testing.assert_allclose(at, there, atol=1e-6)
+    np.testing.assert_array_equal(moved.center_map, pose.center_world)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.008])
+def test_points_depend_on_what_the_photo_shows(shift):
+    query, pose = _query(), _pose(0.3 + shift, 0.2, 0.3)
+    height, width = query.photo.panorama.is_valid.shape
+    half = query.without(np.arange(width)[None] < np.full((height, 1), width // 2))
+    assert half.cache.views is query.cache.views
+    assert 0.3 < len(half.points_at(pose).weights) / len(query.points_at(pose).weights) <= 1.01
+    azimuth = np.arctan2(*(pose.R_cam_from_world @ half.points_at(pose).offsets)[1::-1])
+    assert (azimuth < 0.1).mean() > 0.98

@@ -9,7 +9,7 @@ import pytest
 from rooms import scan_map
 
 from piccolo.errors import InputError
-from piccolo.files import cache, digest
+from piccolo.files import cache
 from piccolo.scan_map import map_file
 from piccolo.scan_map.map_file import save_map
 
@@ -23,7 +23,7 @@ def facts(tmp_path, monkeypatch):
     folder = tmp_path / "facts"
     for each in (folder, tmp_path / "maps"):
         each.mkdir(mode=0o700)
-    monkeypatch.setattr(digest, "private_folder", lambda *_: folder)
+    monkeypatch.setattr(cache, "private_folder", lambda *_: folder)
     monkeypatch.setattr(map_file, "private_folder", lambda *_: tmp_path / "maps")
     return folder
 
@@ -32,39 +32,39 @@ def test_a_fact_holds_until_its_file_changes_in_any_way(facts, tmp_path):
     path = tmp_path / "a"
     path.write_bytes(b"one")
     before = path.stat()
-    assert digest.recall("what", before) is None
-    digest.remember("what", before, "a fact")
-    assert digest.recall("what", path.stat()) == "a fact"
-    assert digest.recall("another", path.stat()) is None
+    assert cache.recall("what", before) is None
+    cache.remember("what", before, "a fact")
+    assert cache.recall("what", path.stat()) == "a fact"
+    assert cache.recall("another", path.stat()) is None
     path.write_bytes(b"two")
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))  # its time is put back, by who changed it
     assert path.stat().st_mtime_ns == before.st_mtime_ns
-    assert digest.recall("what", path.stat()) is None
+    assert cache.recall("what", path.stat()) is None
 
 
 def test_facts_that_can_not_be_kept_or_read_are_lost(facts, tmp_path, monkeypatch):
     status = tmp_path.stat()
-    digest.remember("what", status, "a fact")
+    cache.remember("what", status, "a fact")
     (kept,) = facts.iterdir()
     kept.write_bytes(b"\xff\xff")
-    assert digest.recall("what", status) is None
-    monkeypatch.setattr(digest, "write_atomically", _full)
-    digest.remember("other", status, "a fact")
-    monkeypatch.setattr(digest, "private_folder", lambda *_: None)
-    digest.remember("more", status, "a fact")
-    assert digest.recall("more", status) is None
+    assert cache.recall("what", status) is None
+    monkeypatch.setattr(cache, "write_atomically", _full)
+    cache.remember("other", status, "a fact")
+    monkeypatch.setattr(cache, "private_folder", lambda *_: None)
+    cache.remember("more", status, "a fact")
+    assert cache.recall("more", status) is None
     assert [entry.name for entry in facts.iterdir()] == [kept.name]
 
 
 def test_facts_are_kept_where_nobody_else_can_write(tmp_path, monkeypatch):
     monkeypatch.setattr(cache, "cache_root", lambda: tmp_path)
     kept = cache.private_folder.__wrapped__
-    assert kept("facts", digest.NAME) == tmp_path / "facts"
+    assert kept("facts", cache.FACT_NAME) == tmp_path / "facts"
     assert (tmp_path / "facts").stat().st_mode & 0o777 == 0o700
     (tmp_path / "facts").chmod(0o777)
-    assert kept("facts", digest.NAME) is None
+    assert kept("facts", cache.FACT_NAME) is None
     (tmp_path / "file").touch()
-    assert kept("file", digest.NAME) is None
+    assert kept("file", cache.FACT_NAME) is None
 
 
 def test_a_digest_is_taken_once_and_anew_when_the_file_changes(facts, tmp_path, monkeypatch):
@@ -72,17 +72,17 @@ def test_a_digest_is_taken_once_and_anew_when_the_file_changes(facts, tmp_path, 
     path.write_bytes(b"one")
     of_file = hashlib.file_digest
     monkeypatch.setattr(hashlib, "file_digest", lambda *args: read.append(args) or of_file(*args))
-    monkeypatch.setattr(digest, "TICK_NS", 10**15)
-    assert digest.sha256_of_files([path], True) == hashlib.sha256(b"one").hexdigest()
+    monkeypatch.setattr(cache, "TICK_NS", 10**15)
+    assert cache.sha256_of_files([path], True) == hashlib.sha256(b"one").hexdigest()
     assert list(facts.iterdir()) == []  # it has changed just now, and may once more
-    monkeypatch.setattr(digest, "TICK_NS", -(10**15))
+    monkeypatch.setattr(cache, "TICK_NS", -(10**15))
     for _ in range(2):
-        assert digest.sha256_of_files([path], True) == hashlib.sha256(b"one").hexdigest()
+        assert cache.sha256_of_files([path], True) == hashlib.sha256(b"one").hexdigest()
     assert len(read) == 2
-    assert digest.sha256_of_files([path]) == hashlib.sha256(b"one").hexdigest()
+    assert cache.sha256_of_files([path]) == hashlib.sha256(b"one").hexdigest()
     assert len(read) == 3
     path.write_bytes(b"two!")
-    assert digest.sha256_of_files([path], True) == hashlib.sha256(b"two!").hexdigest()
+    assert cache.sha256_of_files([path], True) == hashlib.sha256(b"two!").hexdigest()
 
 
 def test_a_map_is_checked_once_by_who_remembers_it(facts, tmp_path, monkeypatch):

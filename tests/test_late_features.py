@@ -1,6 +1,7 @@
 """Local features that are made when a photo first needs them, by whom, and what is kept of them."""
 
-import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -27,36 +28,34 @@ def finding(monkeypatch):
     return asked
 
 
+@pytest.fixture(scope="module")
+def cloud(tmp_path_factory):
+    folder = rooms.write_room(tmp_path_factory.mktemp("room"), "--seed 3 --points 40000 --panoramas 1")
+    return folder / "cloud.ply"
+
+
 @pytest.fixture
-def opened(tmp_path):
-    folder = rooms.write_room(tmp_path / "room", "--seed 3 --points 40000 --panoramas 1")
+def opened(tmp_path, cloud):
     cache = CachePolicy(folder=tmp_path / "cache")
 
     def open_it():
-        return open_map.open_map([folder / "cloud.ply"], IN_METRES, cache, WORKERS, Stopwatch())
+        return open_map.open_map([cloud], IN_METRES, cache, WORKERS, Stopwatch())
 
     return open_it
 
 
 def test_they_are_made_once_and_threads_wait_for_them():
-    made, threads, got = [], [], []
-    started, go_on = threading.Event(), threading.Event()
+    made = []
 
     def make(workers):
         made.append(workers)
-        started.set()
-        assert go_on.wait(60)
+        time.sleep(0.2)
         return "features"
 
     late = scan_map.LateFeatures(make)
-    for _ in range(3):
-        threads.append(threading.Thread(target=lambda: got.append(late.get(WORKERS))))
-        threads[-1].start()
-    assert started.wait(60)
-    go_on.set()
-    for thread in threads:
-        thread.join(60)
-    assert (got, len(made)) == (["features"] * 3, 1)
+    with ThreadPoolExecutor(3) as pool:
+        assert list(pool.map(late.get, [WORKERS] * 3)) == ["features"] * 3
+    assert made == [WORKERS]
 
 
 def test_the_cache_keeps_them_for_the_next_process(opened, finding):

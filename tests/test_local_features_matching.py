@@ -20,7 +20,7 @@ from piccolo.local_features.feature_map import (
     project,
 )
 from piccolo.local_features.keypoints import Keypoints
-from piccolo.local_features.matching import APART, FAR, NUM_NEIGHBORS, match, nearest_lists, search_lists
+from piccolo.local_features.matching import FAR, NUM_NEIGHBORS, match, nearest_lists, search_lists
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
 
@@ -60,22 +60,6 @@ def test_lists_equal_a_search_of_all_where_all_are_looked_through():
     assert (distances[of_list[:, 0]] == FAR).all()
     lists = np.searchsorted(start, found, side="right") - 1
     assert ((lists == probes[:, :1]) | (found < 0)).all()
-
-
-def test_two_places_nearer_than_apart_count_once():
-    descriptors = np.zeros((1, NUM_COMPONENTS), np.int8)
-    in_map = np.zeros((4, NUM_COMPONENTS), np.int8)
-    in_map[:, 0] = [5, 4, 6, 9]
-    for gap, order in ((0.9 * APART, [1, 2, 3]), (1.1 * APART, [1, 0, 3])):
-        x = np.array([0.0, gap, -gap / 3, 50.0], np.float32)
-        points = np.stack([x, 0 * x, 0 * x], axis=1)
-        found, distances = np.empty((1, 5), np.int32), np.empty((1, 5), np.int32)
-        start = np.array([0, 4], np.int32)
-        search_lists(descriptors, np.zeros((1, 1), np.int32), in_map, start, points, found, distances)
-        kept = found[found >= 0].tolist()
-        assert kept == order
-        assert distances[0, : len(kept)].tolist() == [int(in_map[k, 0]) ** 2 for k in kept]
-        assert (distances[0, len(kept) :] == FAR).all()
 
 
 def test_nearest_lists_and_middles_by_brute_force():

@@ -4,8 +4,8 @@ import naive
 import numpy as np
 
 from piccolo.geometry.sphere import make_grid
-from piccolo.local_features import view_positions as view_positions_module
-from piccolo.local_features.view_positions import cell_table, view_positions
+from piccolo.local_features import feature_map
+from piccolo.local_features.feature_map import cell_table, view_positions
 
 RINGS = 24
 CELLS = len(make_grid(RINGS))
@@ -59,5 +59,5 @@ def test_positions_are_bounded(monkeypatch):
     centers = np.stack(np.meshgrid(np.arange(30) * 3.0, np.arange(30) * 3.0, [1.5]), axis=-1).reshape(-1, 3)
     ranges = _open(len(centers))
     assert len(_positions(centers, ranges)) == 900
-    monkeypatch.setattr(view_positions_module, "MAX_VIEWS", 300)
+    monkeypatch.setattr(feature_map, "MAX_VIEWS", 300)
     assert 50 < len(_positions(centers, ranges)) <= 300

@@ -5,6 +5,8 @@ from hypothesis import strategies as st
 
 from piccolo.errors import InputError
 from piccolo.geometry import pose as poses
+from piccolo.geometry.rotations import uniform_yaws
+from piccolo.geometry.suppression import non_maximum_suppression
 
 VECTORS = [np.zeros(3), np.array([1e-9, 0, 0]), np.array([0.3, -0.2, 0.9]), np.array([0.0, 3.14159, 0.0])]
 
@@ -99,3 +101,11 @@ def test_rotation_near_the_poles(tiny):
     np.testing.assert_allclose(R @ [0.0, 0.0, -1.0], [0.0, 0.0, 1.0], atol=2e-12)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(R) == pytest.approx(1.0)
+
+
+def test_kept_poses_are_the_first_of_their_neighbourhood():
+    centers = np.array([[0.0, 0, 0], [0.1, 0, 0], [2, 0, 0], [0.1, 0, 0]])
+    rotations = np.stack([uniform_yaws(36)[k] for k in (0, 1, 0, 9)])
+    assert non_maximum_suppression(rotations, centers, 9, 0.5, np.radians(20)).tolist() == [0, 2, 3]
+    assert non_maximum_suppression(rotations, centers, 2, 0.5, np.radians(20)).tolist() == [0, 2]
+    assert non_maximum_suppression(rotations, centers, 9, 0.5, np.radians(5)).tolist() == [0, 1, 2, 3]

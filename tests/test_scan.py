@@ -7,7 +7,7 @@ import pytest
 import rooms
 
 import piccolo
-from piccolo.files.digest import sha256_of_arrays
+from piccolo.files.cache import sha256_of_arrays
 from piccolo.paper.settings import PaperSettings
 
 

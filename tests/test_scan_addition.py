@@ -20,7 +20,6 @@ from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
 from piccolo.localization.localize import localize
 from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.scan_map import scan_addition
 from piccolo.scan_map.camera_positions import MIN_CLEARANCE
 from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.named_scans import named, scan_at, with_places
@@ -239,18 +238,3 @@ def test_a_map_of_two_scans_by_the_command_line(tmp_path, capsys):
     assert capsys.readouterr().err.endswith(wanted)
     assert localize_command.main(["--cloud", cloud, *query[2:], "--within", "Storey 2"]) == 3
     assert "--within: found a scan without names, wanted a map by" in capsys.readouterr().err
-
-
-def test_a_box_takes_no_more_of_the_sphere_than_the_cap_around_it():
-    """By directions drawn at random that meet the box; within the cap's ball it may be half of the sphere."""
-    rng = np.random.default_rng(0)
-    box = scan_addition.Box(np.array([1.0, -2.0, 0.0]), np.array([3.0, 1.0, 2.0]))
-    rays = rng.normal(size=(20_000, 3))
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    for center in ([9.0, 0.0, 1.0], [40.0, 3.0, 1.0], [2.0, -6.0, 4.0], [2.0, -0.5, 1.0]):
-        with np.errstate(divide="ignore"):
-            low, high = ((edge - center) / rays for edge in (box.low, box.high))
-        first, last = np.minimum(low, high).max(axis=1), np.maximum(low, high).min(axis=1)
-        taken = ((first < last) & (last > 0.0)).mean()
-        (most,) = scan_addition.most_of_sphere(box, np.array([center]))
-        assert most == 0.5 if center == [2.0, -0.5, 1.0] else taken - 0.005 < most < 4.0 * taken + 0.005

@@ -8,6 +8,14 @@ from hypothesis import strategies as st
 
 from piccolo.geometry import sphere
 from piccolo.geometry.pose import exp_so3
+from piccolo.geometry.sphere import (
+    cell_of,
+    interpolation,
+    make_grid,
+    make_neighbors,
+    whole_areas,
+    wider_cells,
+)
 
 TILTED = exp_so3(np.array([0.4, -1.1, 0.7]))
 CENTER = np.array([0.3, -0.2, 1.5])
@@ -41,21 +49,6 @@ def test_arctangent_polynomial_error():
     theirs = np.arctan2(y[::50].astype(np.float64), x[::50].astype(np.float64))
     assert np.abs(ours - theirs).max() < 6e-7
     assert sphere.atan2(np.float32(0), np.float32(0)) == 0.0
-
-
-@pytest.mark.parametrize(
-    ("direction", "pixel"),
-    [
-        ((1, 0, 0), (1024, 512)),
-        ((0, 1, 0), (512, 512)),
-        ((0, -1, 0), (1536, 512)),
-        ((1, 0, 1), (1024, 256)),
-        ((1, 0, -1), (1024, 768)),
-    ],
-)
-def test_axes_fall_where_the_convention_says(direction, pixel):
-    at = _pixels(np.array([direction], dtype=np.float64), np.eye(3), np.zeros(3))
-    np.testing.assert_allclose(at[0], pixel, atol=1e-3)
 
 
 def test_seam_has_both_sides():
@@ -111,3 +104,55 @@ def test_pixel_centres_come_back_from_their_rays():
     rows, columns = sphere.indices_of(np.array([[0.0, 0, 1], [0, 0, -1], [-1, 0, 0], [-1, -0.0, 0]]), 8)
     assert rows.tolist() == [0, 3, 2, 2]
     assert set(columns[2:]) <= {0, 7}
+
+
+@pytest.mark.parametrize("num_rings", [12, 24, 96])
+def test_cells_share_the_sphere_nearly_evenly(num_rings):
+    grid = make_grid(num_rings)
+    assert grid.solid_angle.sum() == pytest.approx(1.0, abs=1e-5)
+    assert grid.solid_angle.max() / grid.solid_angle.min() < 2.0
+    np.testing.assert_allclose(np.linalg.norm(grid.directions, axis=1), 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("num_rings", [12, 24])
+def test_a_cells_centre_lies_in_it(num_rings):
+    grid = make_grid(num_rings)
+    np.testing.assert_array_equal(cell_of(grid.directions, num_rings), np.arange(len(grid)))
+
+
+def test_neighbours_are_near_and_weighted_by_a_gaussian():
+    near, grid = make_neighbors(24, 14.0), make_grid(24)
+    for cell in (0, len(grid) // 2, len(grid) - 1):
+        rows = slice(near.row[cell], near.row[cell + 1])
+        angle = np.arccos(np.clip(grid.directions[near.cell[rows]] @ grid.directions[cell], -1, 1))
+        assert np.degrees(angle.max()) < 2.4 * 14.0
+        gaussian = np.exp((np.cos(angle) - 1) / np.radians(14.0) ** 2) * grid.solid_angle[near.cell[rows]]
+        np.testing.assert_allclose(near.weight[rows], gaussian, rtol=1e-3)
+
+
+@pytest.mark.parametrize(("num_rings", "coarse_rings"), [(24, 12), (96, 24), (24, 16), (12, 12)])
+def test_interpolated_values_are_those_of_a_smooth_field(num_rings, coarse_rings):
+    fine, coarse = make_grid(num_rings), make_grid(coarse_rings)
+    cells, weights = interpolation(num_rings, coarse_rings)
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0, atol=1e-6)
+    assert weights.min() >= 0.0
+    width = np.pi / coarse_rings
+    for axis in np.eye(3):
+        found = (weights * (coarse.directions @ axis)[cells]).sum(axis=1)
+        off = np.abs(found - fine.directions @ axis)
+        assert np.median(off) < width**2 / 8
+        assert off.max() < width / 4  # three cells around a pole
+    apart = np.arccos(np.clip((coarse.directions[cells] * fine.directions[:, None]).sum(axis=2), -1.0, 1.0))
+    assert (apart[weights > 1e-6]).max() < 2.0 * width
+
+
+def test_wider_cells_add_up_the_solid_angle_in_whole_numbers():
+    (cells, areas), wide = wider_cells(12), make_grid(12)
+    np.testing.assert_array_equal(areas, np.rint(areas))
+    np.testing.assert_array_equal(np.unique(cells), np.arange(len(wide)))
+    apart = np.arccos(np.sum(wide.directions[cells] * make_grid(24).directions, axis=1))
+    assert apart.max() < np.pi / 12
+    area, units = make_grid(24).solid_angle, whole_areas(24)
+    np.testing.assert_allclose(units, 1000 * area / area.max(), atol=0.51)
+    np.testing.assert_array_equal(areas, [units[cells == k].sum() for k in range(len(wide))])
+    np.testing.assert_allclose(areas / areas.sum(), wide.solid_angle, rtol=0.5)

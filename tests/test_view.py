@@ -118,12 +118,6 @@ def test_every_other_centre_is_seen_by_the_kernel_that_sees_all(octree):
     assert view.nearest_ranges.signatures == compiled
 
 
-def test_coverage_is_all_inside_and_little_outside(octree):
-    share = camera_positions.coverage(octree, np.array([[0.3, 0.2, 0.3], [30.0, 0.0, 0.0]]), Workers(1))
-    assert share[0] > 0.9
-    assert share[1] < 0.2
-
-
 def test_points_around_are_all_near_ones_and_fewer_far_ones(octree):
     """The leaves where these are as large as asked, and means of theirs that grow with the distance."""
     center = rooms.scene(1)[2].center_world

@@ -32,13 +32,6 @@ def test_depth_equals_its_twin():
     assert np.isclose(depth, expected, rtol=1e-5).mean() > 0.995
 
 
-def test_nearer_wall_hides_the_farther():
-    points, colors = _two_walls()
-    visible = visible_points(pack_points(points, colors), np.zeros(3))
-    assert 0.9 * 201 * 201 < len(visible) <= 1.02 * 201 * 201
-    assert visible.x.max() < 2.5 or (visible.x > 2.5).mean() < 0.02
-
-
 def test_range_noise_and_grazing_surfaces_hide_nothing():
     """Behind a point at 0.5 m or at 10 m, as far as a tenth of a metre and 8 % more, and beyond."""
     for distance, gap, is_seen in ((0.5, 0.13, 1), (0.5, 0.15, 0), (10.0, 0.89, 1), (10.0, 0.91, 0)):

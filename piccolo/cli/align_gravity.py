@@ -3,17 +3,19 @@
 import argparse
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from ..cloud import CloudStream, open_cloud
+from ..cloud.octree import build_octree
 from ..cloud.ply_writer import write_transformed
-from ..cloud.settings import CloudSettings
+from ..cloud.settings import CloudSettings, R_z_from_axis
 from ..confidence.confidence import LOCALIZED
 from ..errors import InputError
 from ..files.atomic import is_stream, write_atomically
-from ..geometry.pose import Array, move, rotation_to_z
-from ..gravity.alignment import find_alignment
+from ..geometry.pose import Array, move, orthonormal, rotation_to_z, yaw_rotation
+from ..gravity.alignment import MAX_LEAN, dot, find_up, level, wall_yaw
 from ..jobs.threads import Workers, num_cores
 from ..localization.settings import CoarseToFineSettings
 from ..panorama import read_panorama
@@ -65,33 +67,63 @@ def check_arguments(a: argparse.Namespace) -> None:
     check_suffix("--out", a.out, (".ply",))
 
 
+def find_known_up(
+    arguments: argparse.Namespace, cloud: CloudStream, evident: Array | None, reason: str
+) -> tuple[Array | None, str]:
+    """Return the direction (3,) that is up, None if that is not known, and why.
+
+    By a named axis, but for the file's own (`auto`) where plain evidence (3,), for a reason, is against it.
+    """
+    if not arguments.assume_nothing:
+        named = R_z_from_axis(arguments.up, cloud.up)[2]
+        if arguments.up == "auto" and evident is not None and evident @ named < np.cos(MAX_LEAN):
+            return None, f"the floors do not face {cloud.up}, by their {reason}"
+        return named, "up is the named axis"
+    scanners = cloud.station_axes
+    if len(scanners) and dot(scanners, scanners[0]).min() > np.cos(MAX_LEAN):
+        return scanners[0], "the scanners stood upright"
+    return evident, reason
+
+
+def find_up_by_photo(photo: Path, cloud: CloudStream, axis: Array) -> tuple[Array | None, str]:
+    """Return up (3,) by a photo, localized in the scan turned by its vertical; None if it isn't; and why."""
+    workers = Workers(num_cores(), cloud.show)
+    settings = CoarseToFineSettings(gravity="unknown")
+    scan_map = prepare_map(cloud, workers, rotation_to_z(axis))
+    result = Scan(scan_map, cloud.label, CloudSettings(), settings, workers, {}).localize(photo)
+    up = result.pose.R_cam_from_world[2] if result.pose and result.status == LOCALIZED else None
+    return up, f"{photo} is {result.status}"
+
+
 def find(arguments: argparse.Namespace, cloud: CloudStream) -> tuple[Array, dict[str, object], str]:
-    """Return the transform (4, 4) in the scan's unit; what is known of it; why it can't be relied on."""
+    """Return the transform (4, 4) in the scan's unit; what is known of it; why it can't be relied on.
 
-    def up_by_photo(axis: Array) -> tuple[Array | None, str]:
-        workers = Workers(num_cores(), cloud.show)
-        scan_map = prepare_map(cloud, workers, rotation_to_z(axis))
-        settings = CoarseToFineSettings(gravity="unknown")
-        result = Scan(scan_map, cloud.label, CloudSettings(), settings, workers, {}).localize(arguments.pano)
-        up = result.pose.R_cam_from_world[2] if result.pose and result.status == LOCALIZED else None
-        return up, f"{arguments.pano} is {result.status}"
-
-    up = None if arguments.assume_nothing else arguments.up
-    found = find_alignment(cloud, up, up_by_photo if arguments.pano else None, arguments.yaw_walls)
-    print_warnings(arguments, found.warnings)
-    T = found.T_aligned_from_scan
-    is_known = found.up_scan is not None
-    doubt = "" if is_known else f"up is not known: {found.reason}"
-    if arguments.yaw_walls and found.yaw is None:
+    It is the least turn that makes z up, and with --yaw-walls the least further one about z, about the middle
+    of the cloud's box in whole metres.
+    """
+    voxels = cloud.voxels(np.eye(3))
+    axis, sense, reason, planes = find_up(build_octree(voxels))
+    if arguments.pano:
+        up, reason = find_up_by_photo(arguments.pano, cloud, axis)
+    else:
+        up, reason = find_known_up(arguments, cloud, sense * axis if sense else None, reason)
+    print_warnings(arguments, voxels.warnings)
+    doubt = "" if up is not None else f"up is not known: {reason}"
+    R = np.eye(3) if up is None else rotation_to_z(level(planes, up))
+    yaw = wall_yaw(planes, R) if arguments.yaw_walls else None
+    if arguments.yaw_walls and yaw is None:
         doubt = doubt or "--yaw-walls: no wall is among the dominant planes"
+    R = orthonormal(R if yaw is None else yaw_rotation(-yaw) @ R) + 0.0
     report = {
         "status": "uncertain" if doubt else "aligned",
-        "explanation": found.reason,
-        "up_scan": T[2, :3].tolist() if is_known else None,
-        "tilt_deg": float(np.degrees(np.arccos(min(T[2, 2], 1.0)))) if is_known else None,
-        "yaw_deg": None if found.yaw is None else float(np.degrees(found.yaw)),
+        "explanation": reason,
+        "up_scan": None if up is None else R[2].tolist(),
+        "tilt_deg": None if up is None else float(np.degrees(np.arccos(min(R[2, 2], 1.0)))),
+        "yaw_deg": None if yaw is None else float(np.degrees(yaw)),
     }
-    T[:3, 3] /= cloud.scale
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = (voxels.origin - np.einsum("ij,j->i", R, voxels.origin) + 0.0) / cloud.scale
     return T, report, doubt
 
 

@@ -27,7 +27,7 @@ from ..optimize.descent_animation import (
     perturb_pose,
     refine_with_history,
 )
-from ..optimize.settings import DescentSettings
+from ..optimize.refine import DescentSettings
 from ..optional import import_optional
 from ..panorama import read_panorama
 from ..panorama.model import shrink

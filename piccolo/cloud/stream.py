@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..files.digest import sha256_of_arrays
+from ..files.cache import sha256_of_arrays
 from ..geometry.pose import Array, rotate_points
 from ..jobs.memory import check_address_space
 from ..jobs.threads import Progress, no_progress

@@ -25,7 +25,6 @@ from ..jobs.memory import check_memory
 ALIGNMENT = 64  # [byte]
 PADDING_ID = 0xD935  # of the extra field of a member's header, as zipalign has it
 LOCAL_HEADER = struct.Struct("<4s22xHH")  # magic, lengths of the name and of the extra field behind it
-MEMBER_MAGIC = b"PK\x03\x04"
 MAX_HEADER_SIZE = 4096  # [byte] of an array's header
 MAX_HEAD_SIZE = MAX_HEADER_SIZE + 12  # with what stands before it
 QUOTED = re.compile(rb"'[^']*'|\"[^\"]*\"")
@@ -68,22 +67,23 @@ class ArrayArchive:
     ValueError, and what zipfile raises, for an archive that `write_archive` can't have written.
     """
 
-    def __init__(self, file: IO[bytes], is_mapped: bool) -> None:
+    def __init__(self, path: Path, is_mapped: bool = False) -> None:
         """Read the directory. What may be cut off while it is mapped kills the process (SIGBUS)."""
-        self.status = os.fstat(file.fileno())
-        with zipfile.ZipFile(file) as archive:
-            infos = archive.infolist()
-        self.members = {info.filename.removesuffix(".npy"): info for info in infos}
-        if is_mapped:
-            self.content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
-        else:
-            check_memory(self.status.st_size, file.name, "keep it in the cache")
-            self.content = mmap.mmap(-1, self.status.st_size)
-            file.seek(0)
-            with memoryview(self.content) as whole:
-                done = 0
-                while count := file.readinto(whole[done:]):  # type: ignore[attr-defined]
-                    done += count
+        with path.open("rb") as file:
+            self.status = os.fstat(file.fileno())
+            with zipfile.ZipFile(file) as archive:
+                infos = archive.infolist()
+            self.members = {info.filename.removesuffix(".npy"): info for info in infos}
+            if is_mapped:
+                self.content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+            else:
+                check_memory(self.status.st_size, file.name, "keep it in the cache")
+                self.content = mmap.mmap(-1, self.status.st_size)
+                file.seek(0)
+                with memoryview(self.content) as whole:
+                    done = 0
+                    while count := file.readinto(whole[done:]):
+                        done += count
         size = sum(info.file_size for info in infos)
         if size > len(self.content) or len(self.members) != len(infos):
             raise ValueError(f"arrays of {size} bytes")
@@ -95,7 +95,7 @@ class ArrayArchive:
         begin = info.header_offset + LOCAL_HEADER.size + int(name_size) + int(extra_size)
         is_stored = info.compress_type == zipfile.ZIP_STORED and info.compress_size == info.file_size
         is_inside = info.header_offset >= 0 and begin + info.file_size <= len(self.content)
-        if magic != MEMBER_MAGIC or not is_stored or not is_inside or info.flag_bits & 1:
+        if magic != b"PK\x03\x04" or not is_stored or not is_inside or info.flag_bits & 1:
             raise ValueError(f"{info.filename} in another way than a prepared map has it")
         return begin
 
@@ -123,9 +123,3 @@ class ArrayArchive:
         if promised == 0:
             return np.empty(shape, dtype)
         return np.frombuffer(self.content, dtype, math.prod(shape), first).reshape(shape)
-
-
-def open_archive(path: Path, is_mapped: bool = False) -> ArrayArchive:
-    """The arrays of an archive that `write_archive` wrote."""
-    with path.open("rb") as file:
-        return ArrayArchive(file, is_mapped)

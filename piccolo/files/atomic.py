@@ -16,8 +16,6 @@ from ..errors import InputError
 
 STDOUT = Path("-")
 WRITE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EPIPE}  # that name no file
-NEW_FILE = 0o666  # mode, less the umask
-NEW_FOLDER = 0o777
 
 
 def is_stdout(path: Path) -> bool:
@@ -108,7 +106,7 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
     try:
         with _naming(path, temporary):
             old = target.stat() if target.exists() else None
-            mode = stat.S_IMODE(old.st_mode) if old else NEW_FILE
+            mode = stat.S_IMODE(old.st_mode) if old else 0o666
             handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, mode)
             with os.fdopen(handle, "w+b") as file:
                 yield file
@@ -171,7 +169,7 @@ def replacing_folder(path: Path) -> Iterator[Path]:
     temporary = _temporary_beside(target)
     try:
         with _naming(path, temporary):
-            temporary.mkdir(NEW_FOLDER)
+            temporary.mkdir()
             yield temporary
             if target.exists():
                 temporary.chmod(stat.S_IMODE(target.stat().st_mode))

@@ -1,58 +1,36 @@
-"""The transform that turns a scan upright: vertical and walls by its planes, up by word or by evidence.
+"""The vertical and the walls of a scan by its planes, and which end of the vertical is up by evidence.
 
 Planes are found by RANSAC. The evidence is what people do over floors and not below ceilings: seats, tables
 and shelves are above floors as high as people reach, and people walk from room to room over floors, while
 lintels, beams and walls divide the space below ceilings. Each cue is the logarithm of a ratio.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cloud import CloudStream
-from ..cloud.octree import Octree, build_octree
-from ..cloud.settings import R_z_from_axis, UpAxis
-from ..geometry.pose import Array, orthonormal, rotation_to_z, yaw_rotation
+from ..cloud.octree import Octree
+from ..geometry.pose import Array
 
 # Chosen by hand; the noise of scanners (2 to 5 mm) is far below the spacing of the points
 SPACING = 0.08  # of the points that are used [m]
 MAX_POINTS = 40_000  # that get a normal: a plane of 1 % of the cloud still has 400
 NUM_NEIGHBORS = 24  # with the point itself: at 8 cm a disc of radius 0.22 m
-MAX_THICKNESS = 0.05  # of a flat neighbourhood: variance across it to the lesser variance along it
-MIN_WIDTH = 0.1  # of a flat neighbourhood: lesser to larger variance along it; below, it is a line
-SEED = 20  # of the draws
-MAX_PLANES = 24
 MIN_FRACTION = 0.01  # of all points, of a dominant plane
 NUM_HYPOTHESES = 200  # for each plane: one lies on a plane of 2 % of the points in 98 % of draws
-NUM_SCORING_POINTS = 2000  # drawn, on which a hypothesis is scored: a plane of 1 % has 20 of them
 TOLERANCE = 0.03  # of an inlier, from the plane: six times a scanner's noise of 5 mm [m]
 INLIER_ANGLE = np.radians(15.0)  # of its normal, loose since normals near edges lean
-NUM_REFITS = 4  # by least squares, until the inliers stay the same
 MAX_LEAN = np.radians(15.0)  # of the vertical to a direction that is said to be up
-SNAP_ANGLE = np.radians(0.2)  # of the vertical to such a direction that is then taken itself
 AGREE_ANGLE = np.radians(3.0)  # of a plane to level or upright, that counts for the vertical
 MIN_ALIGNED = 0.6  # fraction of the planes' area that is level or upright: roofs are neither
-MAX_FLATNESS = 0.75  # height to the lesser width of a scan, above which a wall may be its floor
 LEVEL_ANGLE = np.radians(8.0)  # of a level surface's normal to the vertical: ramps up to 1 : 7 are floors
-MIN_LEVEL = 0.3  # area of a floor or ceiling to that of the largest: tables have less
 HEADROOM = 1.9  # of a person [m]
 FURNITURE = 0.3, 1.2  # heights of seats, tables, counters, shelves above the floor [m]
-SHEET = 0.12  # half of a floor's thickness [m]
 STEP = 0.3  # what is lower does not keep anybody from walking [m]
-CELL = 0.25  # of the grid in which people walk [m]
-MAX_CELLS = 4e6  # of a grid: of wider scans the cells are larger
+CELL = 0.25  # of the grid in which people walk [m], or larger in wide scans
 REACH = 2  # cells between the points of a floor, or between free space and the next thing over a floor
-MIN_PIECE = 8  # cells of free space in one piece
-FEW_POINTS = 0.001  # added to both counts of a ratio, so that a handful says little
-FEW_CELLS = 20.0  # as well
-PLAIN = 1.0  # sum of both cues from which on they decide: a ratio of e
-LEAST = -0.5  # of the lesser cue, below which they disagree
-HIGH = 4.0  # a storey from which on [m] trusses look like tables
-LEAST_IN_HIGH = 0.3  # there both cues must agree
-# up (3,) by a photo in the scan turned by its vertical (3,), None if it isn't localized; and why
-FindByPhoto = Callable[[Array], tuple[Array | None, str]]
+FEW_CELLS = 20.0  # added to both counts of a ratio, so that a handful says little
 
 
 class PointNormals(NamedTuple):
@@ -86,23 +64,23 @@ def estimate_normals(points: NDArray[np.float32]) -> PointNormals:
     neighbors -= neighbors.mean(axis=1, keepdims=True)
     variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", neighbors, neighbors))
     across, narrow, wide = variances.T
-    is_flat = (across < MAX_THICKNESS * narrow) & (narrow > MIN_WIDTH * wide)
+    is_flat = (across < 0.05 * narrow) & (narrow > 0.1 * wide)  # thin, and no line
     return PointNormals(sample, axes[:, :, 0], is_flat)
 
 
 def ransac_planes(cloud: PointNormals) -> Planes:
     """Return the dominant planes: RANSAC on flat points, least squares on all inliers."""
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(20)
     left = np.flatnonzero(cloud.is_flat)
     found: list[tuple[Array, Array, float]] = []
     least = max(MIN_FRACTION * len(cloud.points), 3)
-    while len(found) < MAX_PLANES and len(left) > least:
+    while len(found) < 24 and len(left) > least:
         drawn = rng.choice(left, NUM_HYPOTHESES)
-        scoring = rng.choice(left, NUM_SCORING_POINTS)
+        scoring = rng.choice(left, 2000)  # a plane of 1 % has 20 of them
         votes = _are_inliers(cloud, scoring, cloud.normals[drawn], cloud.points[drawn]).sum(axis=1)
         normal = cloud.normals[drawn[votes.argmax()]]
         center = cloud.points[drawn[votes.argmax()]]
-        for _ in range(NUM_REFITS):
+        for _ in range(4):  # refits, until the inliers stay the same
             is_inlier = _are_inliers(cloud, left, normal[None], center[None])[0]
             inliers = cloud.points[left[is_inlier]]
             if len(inliers) < least:
@@ -128,50 +106,6 @@ def _are_inliers(
     return np.asarray((np.abs(distances) < TOLERANCE) & (np.abs(cosines) > np.cos(INLIER_ANGLE)))
 
 
-class Alignment(NamedTuple):
-    """A rigid transform of a scan, and what it is based on."""
-
-    T_aligned_from_scan: Array  # (4, 4) [m], about the middle of the cloud's box in whole metres
-    up_scan: Array | None  # (3,) unit; None where it isn't known
-    reason: str  # one line
-    yaw: float | None  # turn about z that puts the dominant walls along x and y [rad]; None without walls
-    warnings: tuple[str, ...]
-
-
-def find_alignment(
-    cloud: CloudStream, up: UpAxis | None, find_by_photo: FindByPhoto | None, along_walls: bool
-) -> Alignment:
-    """Return the least turn that makes z up, and with `along_walls` the least further one about z.
-
-    Up is told by a photo; or by a named axis, but for the file's own (`auto`) where plain evidence is against
-    it; or, with None, by the scanners' poses or plain evidence.
-    """
-    voxels = cloud.voxels(np.eye(3))
-    axis, sense, reason, planes = find_up(build_octree(voxels))
-    scanners = cloud.station_axes
-    said: Array | None = sense * axis if sense else None
-    if find_by_photo:
-        said, reason = find_by_photo(axis)
-    elif up:
-        named = R_z_from_axis(up, cloud.up)[2]
-        if up == "auto" and said is not None and said @ named < np.cos(MAX_LEAN):
-            said = None
-            reason = f"the floors do not face {cloud.up}, by their {reason}"
-        else:
-            said = named
-            reason = "up is the named axis"
-    elif len(scanners) and dot(scanners, scanners[0]).min() > np.cos(MAX_LEAN):
-        said = scanners[0]
-        reason = "the scanners stood upright"
-    up_scan = None if said is None else level(planes, said)
-    R = np.eye(3) if up_scan is None else rotation_to_z(up_scan)
-    yaw = wall_yaw(planes, R) if along_walls else None
-    T = np.eye(4)
-    T[:3, :3] = orthonormal(R if yaw is None else yaw_rotation(-yaw) @ R) + 0.0
-    T[:3, 3] = voxels.origin - np.einsum("ij,j->i", T[:3, :3], voxels.origin) + 0.0
-    return Alignment(T, up_scan, reason, yaw, voxels.warnings)
-
-
 def find_up(octree: Octree) -> tuple[Array, float, str, Planes]:
     """Return a scan's vertical (3,), the sign of up along it or 0 if that is not plain, why, and the planes.
 
@@ -184,14 +118,15 @@ def find_up(octree: Octree) -> tuple[Array, float, str, Planes]:
     level_areas, aligned_areas = _areas_by(planes)
     largest = int(level_areas.argmax())
     axis = _refine(planes, planes.normals[largest])
+    heights = dot(cloud.points, axis)
     places = np.einsum("ni,ji->nj", cloud.points, np.linalg.svd(axis[None])[2][1:])
     across = places @ np.linalg.eigh(np.cov(places.T))[1][:, 0]
-    height, width = (np.ptp(np.quantile(x, [0.01, 0.99])) for x in (dot(cloud.points, axis), across))
+    height, width = (np.ptp(np.quantile(x, [0.01, 0.99])) for x in (heights, across))
     if aligned_areas[largest] < MIN_ALIGNED:
         return axis, 0.0, "too many planes are neither level nor upright", planes
-    if height > MAX_FLATNESS * width:
+    if height > 0.75 * width:
         return axis, 0.0, f"{height:.1f} m high and {width:.1f} m wide, a wall may be the floor", planes
-    return axis, *find_sense(cloud, planes, axis), planes
+    return axis, *find_sense(cloud, find_levels(planes, axis), axis, heights, places), planes
 
 
 def level(planes: Planes, said: Array) -> Array:
@@ -202,7 +137,7 @@ def level(planes: Planes, said: Array) -> Array:
         return said
     axis = _refine(planes, planes.normals[is_vertical.argmax()])
     cosine = float(axis @ said)
-    return said if abs(cosine) > np.cos(SNAP_ANGLE) else axis * np.sign(cosine)
+    return said if abs(cosine) > np.cos(np.radians(0.2)) else axis * np.sign(cosine)
 
 
 def _areas_by(planes: Planes) -> tuple[Array, Array]:
@@ -232,19 +167,22 @@ def wall_yaw(planes: Planes, R_level_from_scan: Array) -> float | None:
     return float(turns - np.ceil(turns - 0.5)) * 0.5 * np.pi
 
 
-def find_sense(cloud: PointNormals, planes: Planes, axis: Array) -> tuple[float, str]:
-    """Return 1 if up is along a vertical (3,), -1 if against it, 0 if that is not plain; and why."""
-    levels = find_levels(planes, axis)
+def find_sense(
+    cloud: PointNormals, levels: Array, axis: Array, heights: Array, places: Array
+) -> tuple[float, str]:
+    """Return 1 if up is along a vertical (3,), -1 if against it, 0 if that is not plain; and why.
+
+    By levels (L,) of floors and ceilings, the points' heights (M,) and places (M, 2) in the plan.
+    """
     if len(levels) < 2:
         return 0.0, "a floor and a ceiling are not both among the dominant planes"
-    heights = dot(cloud.points, axis)
     is_level = cloud.is_flat & (np.abs(dot(cloud.normals, axis)) > np.cos(LEVEL_ANGLE))
-    places = np.einsum("ni,ji->nj", cloud.points, np.linalg.svd(axis[None])[2][1:])
     passages = passage_cue(heights, is_level, levels, places)
     cues = np.array([furniture_cue(heights, is_level, levels), passages])
     sense = float(np.sign(cues.sum()))
-    least = LEAST_IN_HIGH if np.diff(levels).max() > HIGH else LEAST
-    is_plain = sense * cues.sum() > PLAIN and (sense * cues).min() > least
+    # the least lesser cue: in high storeys, whose trusses look like tables, both cues must agree
+    least = 0.3 if np.diff(levels).max() > 4.0 else -0.5
+    is_plain = sense * cues.sum() > 1.0 and (sense * cues).min() > least
     reason = "furniture {:+.1f}, free ways {:+.1f}".format(*sense * cues)
     return (sense, reason) if is_plain else (0.0, f"floor and ceiling look alike: {reason}")
 
@@ -254,7 +192,7 @@ def find_levels(planes: Planes, axis: Array) -> Array:
     is_level = np.abs(dot(planes.normals, axis)) > np.cos(LEVEL_ANGLE)
     levels: list[float] = []
     for height, area in zip(dot(planes.centers, axis)[is_level], planes.areas[is_level], strict=True):
-        is_large = area > MIN_LEVEL * planes.areas[is_level][0]
+        is_large = area > 0.3 * planes.areas[is_level][0]  # tables have less
         if is_large and all(abs(height - other) > HEADROOM for other in levels):
             levels.append(float(height))
     return np.array(sorted(levels))
@@ -266,7 +204,7 @@ def furniture_cue(heights: Array, is_level: NDArray[np.bool_], levels: Array) ->
     above = heights[is_level] - np.append(-np.inf, levels)[next_level]
     below = np.append(levels, np.inf)[next_level] - heights[is_level]
     low, high = FURNITURE
-    few = FEW_POINTS * len(heights)
+    few = 0.001 * len(heights)  # as FEW_CELLS
     standing = np.count_nonzero((above > low) & (above < np.minimum(high, below)))
     hanging = np.count_nonzero((below > low) & (below < np.minimum(high, above)))
     return float(np.log((standing + few) / (hanging + few)))
@@ -280,7 +218,7 @@ def passage_cue(heights: Array, is_level: NDArray[np.bool_], levels: Array, plac
     from scipy import ndimage  # noqa: PLC0415  # only who asks for up waits for it
 
     low, high = np.quantile(places, [0.001, 0.999], axis=0)
-    cell = max(CELL, float(np.sqrt(np.prod(high - low) / MAX_CELLS)))
+    cell = max(CELL, float(np.sqrt(np.prod(high - low) / 4e6)))
     edges = [np.arange(a, b + cell, cell) for a, b in zip(low, high, strict=True)]
 
     def grid(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -288,13 +226,13 @@ def passage_cue(heights: Array, is_level: NDArray[np.bool_], levels: Array, plac
 
     pieces = np.full((2, 2), FEW_CELLS)  # above, below: free cells times their piece's fraction; free cells
     for level in levels:
-        sheet = np.pad(grid(is_level & (np.abs(heights - level) < SHEET)), REACH)
+        sheet = np.pad(grid(is_level & (np.abs(heights - level) < 0.12)), REACH)
         sheet = ndimage.binary_closing(sheet, iterations=REACH)[REACH:-REACH, REACH:-REACH]
         for k, off in enumerate((heights - level, level - heights)):
             is_free = sheet & ~grid((off > STEP) & (off < HEADROOM))
             is_free &= ndimage.binary_dilation(grid(off > STEP), iterations=REACH)
             areas = np.bincount(ndimage.label(is_free)[0].ravel())[1:]
-            areas = areas[areas > MIN_PIECE]
+            areas = areas[areas > 8]  # cells of one piece
             pieces[k] += (areas**2).sum() / max(areas.sum(), 1), areas.sum()
     above, below = pieces[:, 0] / pieces[:, 1]
     return float(np.log(above / below))

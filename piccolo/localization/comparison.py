@@ -18,7 +18,7 @@ from ..kernels.jit import F0, copy_to, kernel
 from ..optimize.channel_loss import CHANCE, NUM_BLOCKS
 from ..panorama.local_normalization import opponent, zscore
 from ..panorama.texels import CHUNK, bilinear_weights, blend, gather, is_valid, make_projected, project
-from ..views.recent_views import place_of
+from ..views.points_around import place_of
 from ..views.view import average_colors, cell_statistics, empty_cells, locate
 from .query import Query
 

@@ -14,9 +14,8 @@ from ..confidence.localization import Alternative, Evidence, Localization
 from ..confidence.occlusion import Agreement, agreement_at, occlusion_at
 from ..local_features.hypotheses import count_matches, poses_of
 from ..local_features.matching import match
-from ..optimize.refine import refine, sampling_loss_of
+from ..optimize.refine import DescentSettings, refine, sampling_loss_of
 from ..optimize.sampling_loss import sampling_loss
-from ..optimize.settings import DescentSettings
 from ..panorama import Panorama
 from ..views.zbuffer import visible_points
 from .covariance import estimate_covariance

@@ -22,7 +22,7 @@ from ..panorama.local_normalization import normalize_panorama
 from ..panorama.model import resize, shrink
 from ..panorama.texels import Texels, pack_texels
 from ..scan_map.scan_map import ScanMap
-from ..views.recent_views import RecentViews, place_of
+from ..views.points_around import RecentViews, place_of
 from ..views.view import Cells, ViewConfig, normalized_view
 from .settings import METHOD, CoarseToFineSettings, ImageScales, MethodConfig
 

@@ -6,7 +6,7 @@ from typing import NamedTuple, get_args
 from ..confidence.confidence import MIN_CONFIDENCE, check_confidence
 from ..errors import InputError
 from ..geometry.rotations import Gravity
-from ..optimize.settings import Solver
+from ..optimize.refine import Solver
 from ..scan_map.prior import NOTHING_KNOWN, Prior
 from ..views.candidate_views import SEARCH_VIEW
 from ..views.view import ViewConfig

@@ -16,8 +16,7 @@ from ..panorama import Panorama
 from ..panorama.texels import Texels
 from ..views.pictures import checkerboard, fill_holes, resized_rgb
 from ..views.surfels import render_surfels, surfels_of, visible_indices
-from .refine import Refined, refine, sampling_loss_of
-from .settings import DescentSettings
+from .refine import DescentSettings, Refined, refine, sampling_loss_of
 
 FRAME_WIDTH = 512
 TEXT_HEIGHT = 24

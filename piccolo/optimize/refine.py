@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Literal
 
 import numpy as np
 
@@ -13,12 +14,27 @@ from ..views.zbuffer import visible_points
 from .levenberg_marquardt import levenberg_marquardt
 from .normal_equations import GRADIENT, LOSS, MATRIX
 from .sampling_loss import sampling_equations, sampling_loss
-from .settings import DescentSettings
 
 LEAST_STEP = 1e-7  # [rad + m] of Gauss-Newton: a shorter one ends the descent
 
 Equations = tuple[float, Array, Array]  # loss, its gradient (6,) by a step, normal matrix (6, 6)
 Objective = Callable[[Pose], Equations]
+# is told the part of the descent, a pose tried, and the loss there
+Watch = Callable[[int, Pose, float], None]
+Solver = Literal["gauss-newton", "lbfgs", "adam"]
+
+
+@dataclass(frozen=True)
+class DescentSettings:
+    """A descent on a loss; the paper's names in brackets."""
+
+    solver: Solver = "adam"
+    num_iterations: int = 100  # [N_iter] of the solver
+    step_size: float = 0.1  # Adam's first step [rad, m]
+    step_decay: float = 0.8  # factor on the step whenever the loss has not fallen for `patience` iterations
+    patience: int = 5
+    use_visibility: bool = True  # leave out the points that the camera can't see
+    num_culls: int = 4  # times during the descent at which hidden points are left out anew
 
 
 @dataclass(frozen=True)
@@ -35,10 +51,6 @@ def sampling_loss_of(texels: Texels) -> Loss:
         lambda points, pose: sampling_loss(points, texels, pose),
         lambda points, pose: sampling_equations(points, texels, pose),
     )
-
-
-# is told the part of the descent, a pose tried, and the loss there
-Watch = Callable[[int, Pose, float], None]
 
 
 @dataclass
@@ -133,23 +145,8 @@ def descend_gauss_newton(objective: Objective, start: Pose, num_iterations: int)
     return best
 
 
-def watched(objective: Objective, watch: Callable[[Pose, float], None]) -> Objective:
-    """The objective, which tells of every place where it is asked."""
-
-    def value(pose: Pose) -> Equations:
-        found = objective(pose)
-        watch(pose, found[0])
-        return found
-
-    return value
-
-
-def unwatched(part: int, pose: Pose, loss: float) -> None:
-    """A descent that nobody watches."""
-
-
 def refine(
-    points: PackedPoints, loss: Loss, start: Pose, settings: DescentSettings, watch: Watch = unwatched
+    points: PackedPoints, loss: Loss, start: Pose, settings: DescentSettings, watch: Watch = lambda *_: None
 ) -> Refined:
     """Descend from `start`; the points that the camera does not see are left out anew `num_culls` times.
 
@@ -163,12 +160,17 @@ def refine(
     def seen_from(at: Pose) -> PackedPoints:
         return visible_points(points, at.center_world) if settings.use_visibility else points
 
+    def objective(part: int, seen: PackedPoints, at: Pose) -> Equations:
+        found = loss.equations(seen, at)
+        watch(part, at, found[0])
+        return found
+
     for part, num_iterations in enumerate(np.diff(bounds).tolist()):
-        objective = watched(partial(loss.equations, seen_from(pose)), partial(watch, part))
+        of_part = partial(objective, part, seen_from(pose))
         if settings.solver == "adam":
             adam.best_loss = np.inf
-            pose = descend_adam(objective, pose, adam, num_iterations).pose
+            pose = descend_adam(of_part, pose, adam, num_iterations).pose
         else:
             descend = descend_lbfgs if settings.solver == "lbfgs" else descend_gauss_newton
-            pose = descend(objective, pose, num_iterations).pose
+            pose = descend(of_part, pose, num_iterations).pose
     return Refined(pose, loss.value(seen_from(pose), pose))

@@ -20,7 +20,7 @@ from PIL.ExifTags import GPS, IFD, Base
 
 from ..camera import Calibration
 from ..errors import InputError
-from ..files.digest import sha256_of_arrays
+from ..files.cache import sha256_of_arrays
 from ..files.json_file import read_bytes, reading_once
 from .cube import face_paths
 from .picture import PNG_MAGIC, WANTED, opened

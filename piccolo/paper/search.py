@@ -15,7 +15,6 @@ from ..views.zbuffer import is_free_space, render_view, visible_points
 from .settings import PaperSettings
 
 MIN_CLEARANCE = 0.25  # a camera is not nearer to a surface than this [m]
-PROBE_POINTS = 200_000  # about this many points are asked, evenly in space
 PROBE_WIDTH = 48  # cells of 7.5 degrees for the two tests
 
 
@@ -55,7 +54,7 @@ def free_grid(points: PackedPoints, num_translations: int, margin: float) -> NDA
     inset = margin * (high - low)
     low += inset
     high -= inset
-    probed = points.take(slice(None, None, max(1, len(points) // PROBE_POINTS)))
+    probed = points.take(slice(None, None, max(1, len(points) // 200_000)))  # evenly in space
     free = np.empty((0, 3))
     for growth in (1.0, 1.5, 2.25, 3.4, 5.0, 7.6, 11.4, 17.0, 26.0):
         grid = box_grid(low, high, round(num_translations * growth))
@@ -77,27 +76,16 @@ def color_histogram(rgb: NDArray[np.float32], counts: NDArray[np.bool_], bins: i
     return np.asarray(histogram / max(histogram.sum(), 1e-12))
 
 
-def histogram_intersection(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """Overlap in [0, 1] of two histograms that each sum to 1 (Swain and Ballard, 1991)."""
-    return float(np.minimum(a, b).sum())
-
-
-def losses_at(
-    points: PackedPoints, loss: Loss, center_world: Array, rotations: NDArray[np.float64]
-) -> list[Hypothesis]:
-    """Every rotation (N, 3, 3) at one position (3,) that has a loss; the score is its negative."""
-    poses = [Pose(R_cam_from_world, center_world) for R_cam_from_world in rotations]
-    scored = [Hypothesis(pose, -loss.value(points, pose)) for pose in poses]
-    return [h for h in scored if np.isfinite(h.score)]
-
-
 def histogram_similarity(points: PackedPoints, panorama: Panorama, pose: Pose, bins: int) -> float:
-    """Histogram intersection [0, 1] of panorama and cloud at `pose`, where both show something."""
+    """Histogram intersection [0, 1] of panorama and cloud at `pose`, where both show something.
+
+    The overlap of two histograms that each sum to 1 (Swain and Ballard, 1991).
+    """
     view = render_view(points, pose, panorama.rgb.shape[1])
     counts = view.is_seen & panorama.is_valid
     of_cloud = color_histogram(view.rgb, counts, bins)
     of_panorama = color_histogram(panorama.rgb.astype(np.float32) / 255.0, counts, bins)
-    return histogram_intersection(of_cloud, of_panorama)
+    return float(np.minimum(of_cloud, of_panorama).sum())
 
 
 def search(
@@ -114,7 +102,9 @@ def search(
 
     def losses(center_world: Array) -> list[Hypothesis]:
         seen = visible_points(points, center_world) if settings.use_visibility else points
-        return losses_at(seen, loss, center_world, rotations)
+        poses = [Pose(R_cam_from_world, center_world) for R_cam_from_world in rotations]
+        found = [Hypothesis(pose, -loss.value(seen, pose)) for pose in poses]
+        return [h for h in found if np.isfinite(h.score)]
 
     scored = [h for batch in workers.map(losses, list(positions), "search") for h in batch]
     if settings.initialization == "loss-only":

@@ -6,7 +6,7 @@ from typing import Literal
 from ..confidence.confidence import MIN_CONFIDENCE, check_confidence
 from ..errors import InputError
 from ..geometry.rotations import Gravity
-from ..optimize.settings import DescentSettings
+from ..optimize.refine import DescentSettings
 from ..views.zbuffer import MAX_VIEW_WIDTH, MIN_VIEW_WIDTH
 
 PoseLoss = Literal["sampling", "photometric"]

@@ -21,10 +21,9 @@ from .. import __version__
 from ..cloud.octree import Octree
 from ..cloud.readers.npz import damage_named
 from ..errors import InputError
-from ..files.array_archive import open_archive, write_archive
+from ..files.array_archive import ArrayArchive, write_archive
 from ..files.atomic import replacing
-from ..files.cache import WRITABLE, is_own, mark_used, own_names, private_folder
-from ..files.digest import key_of, recall, remember
+from ..files.cache import WRITABLE, is_own, key_of, mark_used, own_names, private_folder, recall, remember
 from ..local_features.feature_map import FeatureMap
 from ..views.candidate_views import CandidateViews
 from .map_validation import LAYOUT, check_arrays, clean_warnings
@@ -36,13 +35,6 @@ OTHERS = ("octree", "local_features", "scan_names", "warnings", "crs", "is_parti
 ARRAYS = [f.name for f in fields(ScanMap) if f.name not in OTHERS]
 MEMBERS = {*LAYOUT, "format", "scan_names", "warnings"}
 WANTED = "wanted a whole map by tools/prepare_map.py"
-ZIP_MAGIC = b"PK\x03\x04"
-COPIED_AT_ONCE = 1 << 22  # [byte]
-# The first member of a map: its name and where that stands, and the beginning of its value somewhere behind.
-FIRST_NAME = b"format.npy"
-FIRST_NAME_AT = 30
-FIRST_VALUE = FORMAT.partition("/")[0].encode("utf-32-le")
-FIRST_VALUE_WITHIN = 512
 
 
 def save_map(scan_map: ScanMap, path: Path) -> None:
@@ -66,9 +58,10 @@ def is_map_file(path: Path) -> bool:
     The first member's name or its value is enough, so that a damaged map is still refused as a map.
     """
     with path.open("rb") as file:
-        head = file.read(FIRST_VALUE_WITHIN)
-    has_name = head.startswith(FIRST_NAME, FIRST_NAME_AT)
-    return head.startswith(ZIP_MAGIC) and (has_name or FIRST_VALUE in head)
+        head = file.read(512)
+    has_name = head.startswith(b"format.npy", 30)  # behind its header
+    has_value = FORMAT.partition("/")[0].encode("utf-32-le") in head
+    return head.startswith(b"PK\x03\x04") and (has_name or has_value)
 
 
 @contextmanager
@@ -99,7 +92,7 @@ def copied(path: Path, folder: Path) -> Path | None:
         try:
             if not copy.exists():
                 with replacing(copy) as out:
-                    shutil.copyfileobj(file, out, COPIED_AT_ONCE)
+                    shutil.copyfileobj(file, out, 1 << 22)
         except OSError:  # as where the disk is full: it is read instead
             return None
     mark_used(copy)
@@ -113,7 +106,7 @@ def load_map(path: Path, remembers: bool = False) -> ScanMap:
     """
     what = f"checked as {FORMAT} by {__version__}"
     with damage_named(path, WANTED), lasting(path, remembers) as place:
-        archive = open_archive(place or path, is_mapped=place is not None)
+        archive = ArrayArchive(place or path, is_mapped=place is not None)
         if "format" in archive.members and (found := str(archive.array("format"))) != FORMAT:
             text = f"a map of format {found[:40]!r}, but this version reads {FORMAT}; prepare it again"
             raise InputError(f"{path}: {text}")

@@ -113,7 +113,6 @@ def check_arrays(path: Path, arrays: Arrays) -> None:
     _check_octree(path, arrays)
     _check_views(path, arrays)
     _check_features(path, arrays)
-    _check_feature_views(path, arrays)
     _check_scans(path, arrays)
     if not SHA256.fullmatch(str(arrays["scan_sha256"])):
         _refuse(path, "a scan_sha256 that is no digest")
@@ -166,14 +165,21 @@ def _check_octree(path: Path, arrays: Arrays) -> None:
 
 
 def _check_views(path: Path, arrays: Arrays) -> None:
-    """Candidates and what they see are in range, and the sparse ones are those of the coarse grid."""
-    centers = arrays["centers"]
-    if not np.abs(centers).max(initial=0.0) <= _reach(arrays):
-        _refuse(path, "a candidate at no finite place or too far away")
+    """Candidates and views are where the scan is, what they see is in range, each feature is of a view.
+
+    The sparse candidates are those of the coarse grid.
+    """
+    for what, centers in (("view", arrays["local_view_centers"]), ("candidate", arrays["centers"])):
+        if not np.abs(centers).max(initial=0.0) <= _reach(arrays):
+            _refuse(path, f"a {what} at no finite place or too far away")
+    num_views = len(arrays["local_view_centers"])
+    last_view = arrays["local_views"].max(initial=0)
+    if num_views > MOST_VIEWS or last_view >= max(num_views, 1):
+        _refuse(path, f"a feature of view {last_view} of {num_views}")
     for name, (dtype, _) in LAYOUT.items():
         if dtype == "|i1" and arrays[name].min(initial=0) < -127:
             _refuse(path, f"{name} below -127")
-    if not np.array_equal(arrays["sparse"], sparse_candidates(centers)[0]):
+    if not np.array_equal(arrays["sparse"], sparse_candidates(arrays["centers"])[0]):
         _refuse(path, "sparse candidates that are not those of the coarse grid")
 
 
@@ -190,16 +196,6 @@ def _check_features(path: Path, arrays: Arrays) -> None:
         _refuse(path, f"{len(arrays['local_middles'])} lists of features with {len(start)} beginnings")
     if start[0] != 0 or start[-1] != len(points) or (np.diff(start) < 0).any():
         _refuse(path, "lists of features that do not follow each other")
-
-
-def _check_feature_views(path: Path, arrays: Arrays) -> None:
-    """Each feature was seen from one of the views, all of which are where the scan is."""
-    centers = arrays["local_view_centers"]
-    views = arrays["local_views"]
-    if not np.abs(centers).max(initial=0.0) <= _reach(arrays):
-        _refuse(path, "a view at no finite place or too far away")
-    if len(centers) > MOST_VIEWS or views.max(initial=0) >= max(len(centers), 1):
-        _refuse(path, f"a feature of view {views.max(initial=0)} of {len(centers)}")
 
 
 def _check_scans(path: Path, arrays: Arrays) -> None:

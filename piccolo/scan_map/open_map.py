@@ -13,8 +13,7 @@ from ..cloud.crs import crs_of
 from ..cloud.settings import IN_METRES, CloudSettings, R_z_from_axis
 from ..cloud.soa import LocalCloud, pack_points
 from ..errors import InputError
-from ..files.cache import cache_root, digest_of_sources, in_words, mark_used, own_folder
-from ..files.digest import sha256_of_files
+from ..files.cache import cache_root, digest_of_sources, in_words, mark_used, own_folder, sha256_of_files
 from ..geometry.pose import rotate_points
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
@@ -23,7 +22,7 @@ from .map_file import FORMAT, NAME, is_map_file, load_map, save_map
 from .named_scans import named
 from .prior import NOTHING_KNOWN, Prior
 from .scan_addition import add_scan
-from .scan_map import ScanMap, prepare_map, with_features
+from .scan_map import LateFeatures, ScanMap, prepare_map, with_features
 
 FOLDER = "piccolo-maps"  # within the folder that the user names
 # What makes a map: folders of the package. The cache makes maps anew when one of their files has changed.
@@ -177,23 +176,22 @@ def cached_map(
 
 
 def kept_late(scan_map: ScanMap, path: Path) -> ScanMap:
-    """The map itself; when its local features are made, it is written once more, with them."""
+    """The map; when its local features are made, it is written once more, if no other process has done so."""
+    late = scan_map.late
+    if late is None:
+        return scan_map
 
-    def look() -> FeatureMap | None:
+    def make(workers: Workers) -> FeatureMap:
         with suppress(OSError, InputError):
             found = load_map(path, remembers=True)
             if found.scan_sha256 == scan_map.scan_sha256 and not found.lacks_features:
                 return found.local_features
-        return None
-
-    def keep(features: FeatureMap) -> None:
+        features = late.get(workers)
         with suppress(OSError):  # they are made again by the next process
             save_map(replace(scan_map, local_features=features), path)
+        return features
 
-    if scan_map.late:
-        scan_map.late.look = look
-        scan_map.late.keep = keep
-    return scan_map
+    return replace(scan_map, late=LateFeatures(make))
 
 
 def open_points(paths: Sequence[Path], settings: CloudSettings, workers: Workers) -> LocalCloud:

@@ -7,10 +7,6 @@ from ..cloud.crs import from_wgs84
 from ..errors import InputError
 from ..panorama.photo import GpsPosition
 
-DEFAULT_ACCURACY = 10.0  # [m] where the file does not say
-LEAST_ACCURACY = 5.0  # [m] where it says less
-SIGMAS = 3.0
-
 
 @dataclass(frozen=True)
 class Prior:
@@ -59,5 +55,5 @@ def gps_prior(gps: GpsPosition, crs: str, metres_per_unit: float) -> GpsPrior | 
     place = from_wgs84(crs, gps.latitude_deg, gps.longitude_deg)
     if place is None:
         return None
-    radius = SIGMAS * max(gps.accuracy or DEFAULT_ACCURACY, LEAST_ACCURACY)
+    radius = 3.0 * max(gps.accuracy or 10.0, 5.0)  # [m] three sigmas; 10 m where the file does not say
     return GpsPrior((place[0] * metres_per_unit, place[1] * metres_per_unit), radius)

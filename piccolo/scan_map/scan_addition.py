@@ -18,8 +18,7 @@ from ..geometry.pose import Array
 from ..geometry.sphere import whole_areas
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
-from ..local_features.feature_map import MOST_VIEWS, FeatureMap, extend_feature_map
-from ..local_features.view_positions import view_positions
+from ..local_features.feature_map import MOST_VIEWS, FeatureMap, extend_feature_map, view_positions
 from ..views.candidate_views import SEARCH_VIEW, CandidateViews, WideViews, render_wide
 from ..views.view import BLOCK, ranges_around
 from .camera_positions import CLEARANCE_VOXEL, MIN_CLEARANCE, Box, candidate_centers

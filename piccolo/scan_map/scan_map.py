@@ -18,8 +18,7 @@ from ..geometry.pose import Array, Pose
 from ..gravity.alignment import find_up
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
-from ..local_features.feature_map import FeatureMap, make_feature_map
-from ..local_features.view_positions import Look, view_positions
+from ..local_features.feature_map import FeatureMap, Look, make_feature_map, view_positions
 from ..views.candidate_views import SEARCH_VIEW, CandidateViews, render_wide
 from ..views.view import ViewConfig, ranges_around
 from .camera_positions import COARSE_SPACING, Ball, TooManyPositionsError, candidate_centers
@@ -47,17 +46,11 @@ class LateFeatures:
         self._make = make
         self._made: FeatureMap | None = None
         self._lock = threading.Lock()
-        # First what another process has kept; what is made is kept.
-        self.look: Callable[[], FeatureMap | None] = lambda: None
-        self.keep: Callable[[FeatureMap], None] = lambda features: None
 
     def get(self, workers: Workers) -> FeatureMap:
         """The features, made now if nobody has."""
         with self._lock:
-            self._made = self._made or self.look()
-            if self._made is None:
-                self._made = self._make(workers)
-                self.keep(self._made)
+            self._made = self._made or self._make(workers)
             return self._made
 
 
@@ -156,8 +149,8 @@ def candidates_of(
         if prior.near_world is None or prior.radius is None:
             raise
     near = frame[0] @ (np.array(prior.near_world) - frame[1])
-    text = f"prepared within {prior.radius:g} m of --near, for this run only"
-    text = f"the scan is too large as a whole: {text}"
+    how = f"prepared within {prior.radius:g} m of --near, for this run only"
+    text = f"the scan is too large as a whole: {how}"
     centers = candidate_centers(octree, workers, Ball(near, prior.radius))
     workers.warn(text)
     return centers, (text,)

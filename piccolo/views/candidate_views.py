@@ -21,8 +21,6 @@ from .view import BLOCK, ViewConfig, render_block, render_wide_block, thread_scr
 WIDE_RINGS = 12
 SEARCH_VIEW = ViewConfig(num_rings=SEARCH_RINGS, stats_rings=16, sigma_deg=22.0, voxel_per_range=1 / 15)
 WIDE_VOXEL_PER_RANGE = 1 / 8  # of the same view where it is averaged over wide cells
-BYTES_PER_CELL = 6 + 3 + 1  # of a view: offsets, channels, seen
-WIDE_BYTES_PER_CELL = 3 + 1  # of a wide one
 LEAST_ROOM = 256  # views
 MOST_KEPT = 1 << 15  # views, 0.24 GB
 
@@ -47,7 +45,8 @@ class WideViews(NamedTuple):
 def empty_views(num: int, num_cells: int) -> Views:
     """Room for some views."""
     if num:
-        check_memory(num * num_cells * BYTES_PER_CELL, f"the scan: {num} views", "cut out a part of it")
+        bytes_per_cell = 6 + 3 + 1  # offsets, channels, seen
+        check_memory(num * num_cells * bytes_per_cell, f"the scan: {num} views", "cut out a part of it")
     return Views(
         np.empty((num, 3)),
         np.empty((num, 3, num_cells), np.int16),
@@ -79,9 +78,7 @@ def render_wide(
     """
     config = replace(config, stats_rings=WIDE_RINGS, voxel_per_range=WIDE_VOXEL_PER_RANGE)
     num, num_wide = len(centers), len(make_grid(WIDE_RINGS))
-    check_memory(
-        num * WIDE_BYTES_PER_CELL * num_wide, f"the scan: {num} prepared views", "cut out a part of it"
-    )
+    check_memory(num * num_wide * 4, f"the scan: {num} prepared views", "cut out a part of it")
     features = np.empty((num, 3, num_wide), np.int8)
     seen = np.empty((num, num_wide), np.uint8)
 

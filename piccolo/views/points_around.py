@@ -1,9 +1,15 @@
-"""The points that a camera sees around it, as fine as it can tell them apart: for the last millimetres."""
+"""The points that a camera sees around it, as fine as it can tell them apart: for the last millimetres.
+
+And views from places on a grid, the last few kept: a pose that hardly moves sees what it saw before.
+"""
+
+from functools import lru_cache, partial
 
 import numpy as np
 
 from ..cloud.octree import Octree, collect
-from ..cloud.soa import PackedPoints
+from ..cloud.soa import PackedPoints, pack_points
+from ..geometry.pose import Pose
 from ..kernels.jit import F0, F1, HALF, inline_kernel, kernel
 from ..panorama.local_normalization import opponent, zscore
 from .view import (
@@ -11,6 +17,7 @@ from .view import (
     Center,
     ViewConfig,
     average_nodes,
+    average_view,
     describe_cells,
     empty_cells,
     locate,
@@ -19,8 +26,11 @@ from .view import (
 from .zbuffer import VISIBLE_OFFSET
 
 LOW_32 = np.uint64(0xFFFFFFFF)
-OPAQUE = np.int32(1 << 24)  # the fourth of a packed point's bytes
 FILLED = 0.97  # of the room for points; the rest is for chance
+PLACE_SPACING = 0.01  # [m] between places
+NUM_VIEWS = 32  # are kept: 12 MB
+NUM_POINT_SETS = 8  # 7 MB
+NUM_SURROUNDINGS = 2  # 11 MB
 
 
 @inline_kernel
@@ -125,22 +135,6 @@ def visible_points(octree: Octree, center_map: Center, config: ViewConfig, shown
     return Cells(offsets, channels, weights, center)
 
 
-@inline_kernel
-def in_8_bits(color, shift):
-    """A colour in [0, 1], rounded, at its place among 32 bits."""
-    return np.int32(np.int32(color * np.float32(255.0) + HALF) << np.int32(shift))
-
-
-@kernel
-def pack_nodes(nodes, found, points, rgbx):
-    """Write the positions (3, N) of some nodes and their colours in 8 bits."""
-    for i in range(len(found)):
-        node = nodes[found[i]]
-        for k in range(3):
-            points[k, i] = node[k]
-        rgbx[i] = np.int32(in_8_bits(node[3], 0) | in_8_bits(node[4], 8) | in_8_bits(node[5], 16) | OPAQUE)
-
-
 def points_around(octree: Octree, center_map: Center, voxel_per_range: float) -> PackedPoints:
     """All nodes as coloured points, those far from a centre (3,) [m] as large as it is far to them.
 
@@ -150,7 +144,21 @@ def points_around(octree: Octree, center_map: Center, voxel_per_range: float) ->
     n = collect(
         octree, np.asarray(center_map, np.float64), voxel_per_range, scratch.nodes, scratch.directions
     )
-    points = np.empty((3, n), np.float32)
-    rgbx = np.empty(n, np.int32)
-    pack_nodes(octree.nodes, scratch.nodes[:n], points, rgbx)
-    return PackedPoints(points[0], points[1], points[2], rgbx)
+    nodes = octree.nodes[scratch.nodes[:n]]
+    # rounded so that half a level goes up
+    return pack_points(nodes[:, :3], (nodes[:, 3:] * np.float32(255.0) + HALF).astype(np.uint8))
+
+
+class RecentViews:
+    """Views of one scan, each made when it is asked for and not among the last; from any thread."""
+
+    def __init__(self, octree: Octree) -> None:
+        self.averages = lru_cache(NUM_VIEWS)(partial(average_view, octree))
+        self.points = lru_cache(NUM_POINT_SETS)(partial(visible_points, octree))
+        self.surroundings = lru_cache(NUM_SURROUNDINGS)(partial(points_around, octree))
+
+
+def place_of(pose: Pose) -> tuple[float, float, float]:
+    """The place [m] nearest to a pose of the map."""
+    x, y, z = (round(float(value) / PLACE_SPACING) * PLACE_SPACING for value in pose.center_world)
+    return x, y, z
