@@ -31,7 +31,6 @@ def write_scan(path, points, dtype="<f4", **options):
 
 
 def write_scalars(path, points, name, values, kind="i4", text=False):
-    """A PLY of points (N, 3) in float64 and one number of each."""
     rows = np.zeros(len(points), [(n, "f8") for n in "xyz"] + [(name, kind)])
     for k, n in enumerate("xyz"):
         rows[n] = points[:, k]

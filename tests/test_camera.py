@@ -49,7 +49,6 @@ def camera(model, **more):
 
 
 def points(count=5000):
-    """Pixels (count, 2) all over the picture."""
     return NOISE.uniform(0.0, 1.0, (count, 2)) * SIZE
 
 
@@ -194,7 +193,6 @@ LENSES = {
 
 @functools.lru_cache
 def place():
-    """A room, a pose in it, and its panorama there."""
     world, workers = room(5)[0], Workers(2)
     pose = make_query(world, 0, "tilt", 128, workers).pose
     this, _ = room_of_query(world, 0, "tilt")

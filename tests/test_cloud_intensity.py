@@ -10,7 +10,7 @@ from scans import write_scalars
 from test_cloud_morton import seeded_cloud, whole
 from test_cloud_pcd import content_of
 
-from piccolo.cloud import open_cloud, read_cloud
+from piccolo.cloud import open_cloud
 from piccolo.cloud.readers.e57 import open_e57
 from piccolo.cloud.readers.las import open_las
 from piccolo.cloud.readers.pcd import open_pcd
@@ -42,6 +42,13 @@ def _in_gray(intensity, points=POINTS, chunk=701):
             yield points[lo : lo + chunk], intensity[lo : lo + chunk]
 
     return np.concatenate([raw.colors for raw in intensity_reader("a", read)()])
+
+
+def assert_gray(open_file, path, intensity, points_world=POINTS, atol=1e-9):
+    read = whole(open_file, path, GRAY)
+    np.testing.assert_array_equal(read.colors, _in_gray(intensity))
+    np.testing.assert_allclose(read.points_world, points_world, atol=atol)
+    assert_refused(r"has intensity and no colours.*--intensity-as-gray", open_file, path)
 
 
 @pytest.mark.parametrize("kind", ["bytes", "16 bits", "decibels", "mirrors"])
@@ -85,8 +92,7 @@ def _ply(path, name, kind="f4", text=False):
 @pytest.mark.parametrize(("kind", "text"), [("u2", False), ("f4", False), ("f8", True)])
 def test_ply(tmp_path, name, kind, text):
     path = _ply(tmp_path / "a.ply", name, kind, text)
-    np.testing.assert_array_equal(whole(open_ply, path, GRAY).colors, _in_gray(_measured(5, "16 bits")))
-    assert_refused(r"has intensity and no colours.*--intensity-as-gray", read_cloud, path)
+    assert_gray(open_ply, path, _measured(5, "16 bits"))
 
 
 LAYOUTS = {
@@ -101,10 +107,7 @@ def test_text(tmp_path, name):
     path = tmp_path / name
     intensity = _measured(6, "decibels")
     path.write_text("\n".join(LAYOUTS[name](np.column_stack([POINTS, intensity]).tolist())))
-    read = whole(open_text, path, GRAY)
-    np.testing.assert_allclose(read.points_world, POINTS, rtol=1e-14)
-    np.testing.assert_array_equal(read.colors, _in_gray(intensity))
-    assert_refused(r"has intensity and no colours.*--intensity-as-gray", read_cloud, path)
+    assert_gray(open_text, path, intensity)
 
 
 def test_colours_come_first_and_the_map_is_gray(tmp_path):
@@ -124,10 +127,7 @@ def test_las(tmp_path, point_format, is_compressed):
     content = las_bytes(raw, point_format, intensity=intensity.astype(np.uint16))
     path = tmp_path / "a.las"
     path.write_bytes(laz_bytes(content, chunk=700) if is_compressed else content)
-    read = whole(open_las, path, GRAY)
-    np.testing.assert_array_equal(read.colors, _in_gray(intensity))
-    np.testing.assert_allclose(read.points_world, raw.points_world, atol=0.002)
-    assert_refused(r"has intensity and no colours.*--intensity-as-gray", read_cloud, path)
+    assert_gray(open_las, path, intensity, raw.points_world, atol=0.002)
 
 
 def test_ptx_at_its_pose_without_beams_that_did_not_return(tmp_path):
@@ -139,10 +139,7 @@ def test_ptx_at_its_pose_without_beams_that_did_not_return(tmp_path):
     lines = [*header, *matrix, "0 0 0 0.5", *(" ".join(map(repr, row)) for row in rows)]
     path = tmp_path / "a.ptx"
     path.write_text("\n".join(lines) + "\n")
-    read = whole(open_ptx, path, GRAY)
-    np.testing.assert_array_equal(read.colors, _in_gray(intensity))
-    np.testing.assert_allclose(read.points_world, POINTS @ R.T + [5.0, 6.0, 7.0], atol=1e-9)
-    assert_refused(r"has intensity and no colours.*--intensity-as-gray", read_cloud, path)
+    assert_gray(open_ptx, path, intensity, POINTS @ R.T + [5.0, 6.0, 7.0])
 
 
 def _e57_scan(points, **more):
@@ -154,10 +151,7 @@ def test_e57_scans_have_one_gray_for_all(tmp_path):
     intensity = _measured(9, "decibels")
     halves = [_e57_scan(POINTS[part], intensity=intensity[part]) for part in (slice(1000), slice(1000, None))]
     path = write_e57(tmp_path / "a.e57", halves)
-    read = whole(open_e57, path, GRAY)
-    np.testing.assert_array_equal(read.colors, _in_gray(intensity))
-    np.testing.assert_allclose(read.points_world, POINTS * [-1, -1, 1] + [1.0, 2.0, 3.0], atol=1e-9)
-    assert_refused(r"has intensity and no colours.*--intensity-as-gray", read_cloud, path)
+    assert_gray(open_e57, path, intensity, POINTS * [-1, -1, 1] + [1.0, 2.0, 3.0])
     bare = write_e57(tmp_path / "b.e57", [_e57_scan(POINTS)])
     assert_refused("has no colours, wanted scans with", open_e57, bare, GRAY)
 
@@ -190,7 +184,4 @@ def test_pcd(tmp_path, encoding):
     ]
     path = tmp_path / "a.pcd"
     path.write_bytes(content_of(fields, encoding, 3000))
-    read = whole(open_pcd, path, GRAY)
-    np.testing.assert_array_equal(read.colors, _in_gray(intensity.astype(float)))
-    np.testing.assert_allclose(read.points_world, table[:, :3], rtol=1e-6)
-    assert_refused(r"has intensity and no colours.*--intensity-as-gray", open_pcd, path)
+    assert_gray(open_pcd, path, intensity.astype(float), table[:, :3])

@@ -218,7 +218,6 @@ def test_damaged_chunk_tables_are_refused(tmp_path):
 
 
 def test_a_chunk_table_may_be_named_at_the_end_and_fill_no_memory(tmp_path, monkeypatch):
-    """As writers do that can't go back."""
     content = laz_bytes(las_bytes(RAW), 600)
     (begin,) = struct.unpack_from("<I", content, POINTS_OFFSET)
     assert_read_as_written(write(tmp_path, patched(content, begin, "<q", -1) + content[begin : begin + 8]))

@@ -20,7 +20,6 @@ from piccolo.errors import InputError
 
 
 def refusal(path, read=read_cloud):
-    """The line with which a file is refused."""
     _, message = read_or_refused(read, path)
     assert message
     return message
@@ -270,7 +269,6 @@ def test_mutated_meshes_raise_nothing_but_input_error(name, data, tmp_path_facto
 
 
 def test_one_changed_number_of_the_json(tmp_path):
-    """Every entry of the JSON in turn becomes something else."""
 
     def entries(part, path=()):
         for key, entry in list(part.items() if isinstance(part, dict) else enumerate(part)):

@@ -95,7 +95,6 @@ TURN = np.array([[0.9397, -0.342, 0.0], [0.342, 0.9397, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _room(count, seed=0):
-    """Points (N, 3) [m] on the six sides of a room."""
     rng = np.random.default_rng(seed)
     points = rng.random((count, 3)) * SIZE
     axis = rng.integers(0, 3, count)

@@ -1,5 +1,3 @@
-"""LZF, as binary_compressed PCD files have it."""
-
 import struct
 
 import numpy as np

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from refusals import assert_refused
 from test_cloud_morton import read, seeded_cloud
+from test_cloud_text import write
 
 from piccolo.cloud import open_source, read_cloud
 from piccolo.cloud.readers import reader as raw
@@ -41,7 +42,6 @@ def in_scanner(points_world, matrix):
 
 
 def scan(points_world, colors, matrix=HERE, count=None):
-    """The lines of a scan whose points are given in the world."""
     header = [*np.vstack([matrix[3, :3], matrix[:3, :3]]), *matrix]
     return [
         f"{len(colors) if count is None else count}",
@@ -49,11 +49,6 @@ def scan(points_world, colors, matrix=HERE, count=None):
         *(" ".join(map(repr, line.tolist())) for line in header),
         *points_of(in_scanner(points_world, matrix), colors),
     ]
-
-
-def write(path, lines, end="\n"):
-    path.write_bytes((end.join(lines) + end).encode())
-    return path
 
 
 def assert_read_as_written(path, raw_cloud=RAW, atol=1e-12):

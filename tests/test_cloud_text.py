@@ -121,7 +121,6 @@ def test_other_content_is_refused(tmp_path, content, message):
 
 @pytest.fixture
 def small(monkeypatch):
-    """Blocks of two or three lines, chunks of a few blocks."""
     monkeypatch.setattr(text, "BLOCK", 101)
     monkeypatch.setattr(reader, "CHUNK", 13)
 

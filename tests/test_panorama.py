@@ -102,7 +102,6 @@ def test_other_shapes_are_refused(tmp_path, width, height):
 
 
 def resized_jpeg(width, height):
-    """A JPEG whose header claims another size."""
     content = encoded(RGB, ".jpg")
     place = content.index(b"\xff\xc0") + 5
     return content[:place] + struct.pack(">HH", height, width) + content[place + 4 :]
@@ -149,7 +148,6 @@ PNG = encoded(RGB, ".png")
 
 
 def png_of(packed):
-    """A PNG of RGB's size with these packed bytes and right checksums."""
     return PNG[:PNG_HEADER_SIZE] + png_chunk(b"IDAT", packed) + png_chunk(b"IEND", b"")
 
 

@@ -20,7 +20,6 @@ PHOTO = smooth_rgb(360, 480)
 
 
 def photo(path, tags=None, orientation=1, size=(480, 360)):
-    """A JPEG of PHOTO with EXIF."""
     exif = Image.Exif()
     exif[Base.Orientation] = orientation
     exif.get_ifd(IFD.Exif).update(tags or {})

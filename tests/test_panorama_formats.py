@@ -1,4 +1,4 @@
-"""Photos of phones in HEIC, and of cameras with a JPEG under another name."""
+"""Panoramas in TIFF, WebP, HEIC, palettes and CMYK: read exactly, or refused by name."""
 
 import io
 import sys
