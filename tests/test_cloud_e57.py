@@ -118,7 +118,6 @@ def test_invalid_points_of_any_color_and_invalid_colors_are_left_out(tmp_path):
     ("dtype", "low", "high", "limits"),
     [
         (np.int64, 0, 65535, None),
-        (np.int64, -100, 900, None),
         (np.float32, 0.0, 1.0, None),
         (np.float64, 0.25, 0.75, None),
         (np.int64, 0, 1000, (0, 1000)),

@@ -140,7 +140,6 @@ def test_nan_points_of_a_grid_need_no_color(tmp_path, encoding, kind):
         (None, {"COUNT": "1 1 1 \u00b2"}, "COUNT 'rgb 4 U"),
         (None, {"COUNT": "1 1 1 999999"}, "promises 4000008 bytes a point"),
         (None, {"POINTS": "-5"}, "counts the points by 'WIDTH 600 HEIGHT 2 POINTS -5'"),
-        (None, {"POINTS": None, "WIDTH": None, "HEIGHT": None}, "counts the points by ''"),
         (None, {"POINTS": "1201"}, "promises 1201 points in a grid of 1200"),
         (None, {"POINTS": "1201", "WIDTH": "1201", "HEIGHT": "1"}, "promises 1201 points in 19216 bytes"),
         (None, {"DATA": "zip"}, "DATA is 'zip', wanted ascii, binary, binary_compressed"),
