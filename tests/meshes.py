@@ -46,8 +46,6 @@ def write_obj(folder, texture=None, mtl="newmtl wall\nmap_Kd wall.png\n", **opti
 
 
 class Gltf:
-    """A glTF file that grows by accessors."""
-
     def __init__(self):
         self.data = b""
         self.tree = {

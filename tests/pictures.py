@@ -25,14 +25,12 @@ def encoded(rgb, suffix, options=()):
 
 
 def saved(pixels, kind, mode="RGB", **options):
-    """The file that Pillow makes of pixels."""
     file = BytesIO()
     Image.frombytes(mode, pixels.shape[1::-1], pixels.tobytes()).save(file, kind, **options)
     return file.getvalue()
 
 
 def animation(kind):
-    """An animated PNG or WebP of two pictures."""
     return saved(smooth_rgb(), kind, save_all=True, append_images=[Image.fromarray(255 - smooth_rgb())])
 
 
@@ -46,7 +44,6 @@ def png_chunk(kind, content):
 
 
 def exif(orientation):
-    """EXIF's body with nothing but the orientation."""
     return b"MM\0*\0\0\0\x08" + struct.pack(">HHHIHHI", 1, 0x112, 3, 1, orientation, 0, 0)
 
 
@@ -64,7 +61,6 @@ def xmp_packet(fields, form="attributes", prefix="GPano"):
 
 
 def crop_fields(left, top, width, height, full=(400, 200)):
-    """Photo Sphere fields of a crop."""
     return {
         "ProjectionType": "equirectangular",
         "CroppedAreaLeftPixels": left,

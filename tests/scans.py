@@ -30,6 +30,15 @@ def write_scan(path, points, dtype="<f4", **options):
     PlyData([PlyElement.describe(rows, "vertex")], **options).write(path)
 
 
+def write_scalars(path, points, name, values, kind="i4", text=False):
+    rows = np.zeros(len(points), [(n, "f8") for n in "xyz"] + [(name, kind)])
+    for k, n in enumerate("xyz"):
+        rows[n] = points[:, k]
+    rows[name] = values
+    PlyData([PlyElement.describe(rows, "vertex")], text=text).write(path)
+    return path
+
+
 def points_of(path):
     vertex = PlyData.read(path)["vertex"]
     return np.stack([vertex["x"], vertex["y"], vertex["z"]], axis=1).astype(np.float64)

@@ -54,17 +54,8 @@ def test_one_camera_is_scaled_to_another_size_of_its_shape(tmp_path):
 OPENSFM = {
     "perspective": ({"focal": 0.8, "k1": 0.1, "k2": -0.02}, "RADIAL", (800, 500, 400, 0.1, -0.02)),
     "brown": (
-        {
-            "focal_x": 0.8,
-            "focal_y": 0.9,
-            "c_x": 0.01,
-            "c_y": -0.02,
-            "k1": 1,
-            "k2": 2,
-            "k3": 3,
-            "p1": 4,
-            "p2": 5,
-        },
+        {"focal_x": 0.8, "focal_y": 0.9, "c_x": 0.01, "c_y": -0.02}
+        | {"k1": 1, "k2": 2, "k3": 3, "p1": 4, "p2": 5},
         "FULL_OPENCV",
         (800, 900, 510, 380, 1, 2, 4, 5, 3, 0, 0, 0),
     ),
@@ -168,13 +159,8 @@ def test_files_of_a_rig_are_told_by_their_names(tmp_path):
     )
 
 
-GOOD = {
-    "format": "piccolo-camera/1",
-    "model": "SIMPLE_PINHOLE",
-    "width": 64,
-    "height": 48,
-    "params": [60, 32, 24],
-}
+SIZE = {"width": 64, "height": 48}
+GOOD = {"format": "piccolo-camera/1", "model": "SIMPLE_PINHOLE", **SIZE, "params": [60, 32, 24]}
 
 
 @pytest.mark.parametrize(
@@ -183,18 +169,14 @@ GOOD = {
         ("", "found no camera"),
         ("1 PINHOLE 640 480 600", "line 1: found .* as parameters of PINHOLE, wanted 4 finite"),
         ("1 PINHOLE wide 480 600", "line 1: invalid literal"),
-        ("PINHOLE 640", "line 1: not enough values"),
         ("{", "JSON|Expecting"),
-        ("[]", "wanted COLMAP's cameras.txt"),
         ({"a": {"projection_type": "dual", "width": 9, "height": 9}}, "the projection 'dual', not one of"),
         ({"a": {"projection_type": "brown", "width": 9, "height": 9}}, "KeyError"),
         ({**GOOD, "format": "piccolo-camera/9"}, "format 'piccolo-camera/9', not 'piccolo-camera/1'"),
         ({**GOOD, "width": 64.5}, "64.5, no whole number"),
         ({**GOOD, "colour": 1}, "a field 'colour' that is none of"),
         ({**GOOD, "R_lens_from_cam": [[1, 0, 0], [0, 1, 0], [0, 0, 2]]}, "R_lens_from_cam is no rotation"),
-        ({**GOOD, "R_lens_from_cam": [[1, 0], [0, 1]]}, "R_lens_from_cam is no rotation"),
         ({**GOOD, "center_cam": [0, 0]}, "found center_cam"),
-        ({**GOOD, "center_cam": [0, 0, float("inf")]}, "found center_cam"),
         ({**GOOD, "offset": [-1, 0]}, "found offset"),
         ({**GOOD, "image": 7}, "an image 7 that is no name"),
         ({**GOOD, "params": None}, "TypeError"),
@@ -211,7 +193,6 @@ def test_damaged_files_are_refused(tmp_path, content, message):
         ("{", "Expecting"),
         ([{"cameras": [{"image_prefix": "a/"}]}], "no camera_model_name or camera_params for 'a/'"),
         ([{"cameras": [{"image_prefix": "a/"}]}, {}], "found 2 rigs, wanted one"),
-        ([], "IndexError"),
         ([7], "TypeError"),
     ],
 )
@@ -238,7 +219,6 @@ def test_mutated_files_are_read_or_refused(name, data, tmp_path_factory):
     assert (found is None) == bool(message)
 
 
-SIZE = {"width": 64, "height": 48}
 ANY = st.one_of(st.floats(-3.0, 3.0), st.floats(-1e6, 1e6), st.just(0.0))
 
 

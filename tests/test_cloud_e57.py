@@ -118,7 +118,6 @@ def test_invalid_points_of_any_color_and_invalid_colors_are_left_out(tmp_path):
     ("dtype", "low", "high", "limits"),
     [
         (np.int64, 0, 65535, None),
-        (np.int64, -100, 900, None),
         (np.float32, 0.0, 1.0, None),
         (np.float64, 0.25, 0.75, None),
         (np.int64, 0, 1000, (0, 1000)),
@@ -193,12 +192,9 @@ CUT, LONG = "the file is cut off or broken", 1 << 40
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda content: content[:-1024], CUT),
         (lambda content: content[:30], "and 30 bytes, wanted 'ASTM-E57'"),
         (lambda content: b"ASTM-E58" + content[8:], "unknown format|begins with b'ASTM-E58'"),
-        (lambda content: with_header(content, 16, LONG), CUT),
         (lambda content: with_header(content, 24, LONG), "bytes of XML from byte 1099511627776 on, wanted"),
-        (lambda content: with_header(content, 32, LONG), "promises 1099511627776 bytes of XML"),
         (lambda content: with_header(content, 40, 4096), "in pages of 4096 bytes, wanted 1 and 1024"),
         (lambda content: content[:300] + bytes([content[300] ^ 1]) + content[301:], "checksum mismatch"),
     ],
@@ -217,13 +213,10 @@ BOMB = b'<?xml version="1.0"?><!DOCTYPE e [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&
     [
         (b'recordCount="1200"', b'recordCount="1201"', "promises 1201 points, found 1200|broken E57 file"),
         (b'recordCount="1200"', b'recordCount="9999999999999"', "promises 9999999999999 points of 216 bits"),
-        (b'recordCount="1200"', b'recordCount="' + b"9" * 5000 + b'"', "wanted an integer"),
         (b'recordCount="1200"', b'recordCount="many"', "found 'many' in the XML section, wanted an integer"),
-        (b'recordCount="1200"', b'recordCount="+-5"', "wanted an integer"),
         (b'recordCount="1200"', b'recordCount="-5"', r"scan 1 of 1 \('a scan'\) has -5 points"),
         (b'maximum="255"', b'maximum="0"', "colours without a range: colorRed is declared 0 to 0"),
         (b'<?xml version="1.0" encoding="UTF-8"?>\n<e57Root', BOMB, "a document type definition"),
-        (b"<e57Root", b'<e57Root xsi:noNamespaceSchemaLocation="/etc/x"', "XML section is broken"),
         (
             b"<e57Root",
             b'<e57Root xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance" '
@@ -243,10 +236,7 @@ BOMB = b'<?xml version="1.0"?><!DOCTYPE e [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&
 def test_damaged_xml_is_refused(tmp_path, old, new, message):
     path = write(tmp_path / "a.e57", [scan(rotation_wxyz=(0.25, 0.0, 0.0, 0.0))])
     path.write_bytes(with_xml(path.read_bytes(), old, new))
-    with pytest.raises(InputError, match=message) as error:
-        read(path)
-    assert str(path) in str(error.value)
-    assert len(str(error.value)) < 500 + len(str(path))
+    assert_refused(message, read, path)
 
 
 def test_limits_of_the_xml_section(tmp_path, monkeypatch):
@@ -332,21 +322,10 @@ def test_images_are_written_as_files(tmp_path, capsys):
     assert rows[0]["file"] == str(folder / "a_scan_0.jpg")
 
 
-def test_the_tool_names_its_errors_by_exit_codes(tmp_path, capsys):
-    assert e57_images.main([str(tmp_path / "none.e57")]) == 3
-    (tmp_path / "a.e57").write_bytes(b"ASTM-E57")
-    assert e57_images.main([str(tmp_path / "a.e57")]) == 3
-    assert "e57_images.py: " in capsys.readouterr().err
-    with pytest.raises(SystemExit) as stop:
-        e57_images.main([])
-    assert stop.value.code == 2
-
-
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         (b'length="25"', b'length="99999999"', "image 0 promises 99999999 bytes, found"),
-        (b'length="25"', b'length="-1"', "image 0 promises -1 bytes, found"),
         (b'length="25"', 'length="²"'.encode(), "wanted an integer"),
         (b">30</imageWidth>", b">0</imageWidth>", "an image's imageWidth is 0, wanted 1 to"),
         (b">30</imageWidth>", b">1e999</imageWidth>", "found '1e999' in the XML section"),

@@ -5,10 +5,10 @@ import sys
 import numpy as np
 import pytest
 from las_files import OFFSETS, SCALES, las_bytes, laz_bytes
-from refusals import assert_refused, read_or_refused
+from refusals import assert_refused
 from test_cloud_morton import read, seeded_cloud
 
-from piccolo.cloud import open_source, read_cloud
+from piccolo.cloud import open_source
 from piccolo.cloud.readers import las
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.errors import InputError
@@ -47,16 +47,6 @@ def test_point_formats_with_colors(tmp_path, point_format, extra_bytes):
     assert_read_as_written(write(tmp_path, laz_bytes(content, 500), "b.laz"))
     assert_read_as_written(write(tmp_path, laz_bytes(content, 1200), "c.laz"))
     assert_read_as_written(write(tmp_path, laz_bytes(content, cuts=(1, 2, 700, 701)), "copc.laz"))
-
-
-def test_utm_coordinates_lose_nothing(tmp_path):
-    cloud = read_cloud(write(tmp_path, las_bytes(RAW)))
-    # the middle of the box, in whole metres
-    expected = np.round(0.5 * (RAW.points_world.min(axis=0) + RAW.points_world.max(axis=0)))
-    np.testing.assert_array_equal(cloud.origin_world, expected)
-    assert abs(cloud.points).max() < 4.0
-    steps = (cloud.points.astype(np.float64) + cloud.origin_world - OFFSETS) / SCALES
-    np.testing.assert_allclose(steps, np.rint(steps), atol=5e-3)
 
 
 @pytest.mark.parametrize("chunk", [1, 7, 500, 1199, 1200, 1201])
@@ -124,22 +114,6 @@ def test_the_sample_is_spread_over_the_file(tmp_path, monkeypatch, is_compressed
     assert_refused("a colour of 40000 in a file whose other colours are 8-bit", read, path)
 
 
-def test_files_without_colors_are_refused(tmp_path, monkeypatch):
-    black = las_bytes(RAW, colors=np.zeros((1200, 3), np.uint16), intensity=INTENSITY)
-    for content in (black, laz_bytes(black, 500)):
-        with pytest.raises(InputError, match="no colours: red green blue are 0 in all 1200 points looked at"):
-            open_source(write(tmp_path, content))
-    black = las_bytes(RAW, colors=np.zeros((1200, 3), np.uint16), intensity=INTENSITY + 1)
-    monkeypatch.setattr(las, "MAX_SAMPLES", 64)  # a larger file is not read to its end
-    assert_refused("are 0 in all 64 points looked at", open_source, write(tmp_path, black))
-
-
-@pytest.mark.parametrize("point_format", [0, 1, 4, 6, 9])
-def test_formats_without_color_fields_are_refused(tmp_path, point_format):
-    with pytest.raises(InputError, match=f"no colours: point format {point_format} has intensity only"):
-        open_source(write(tmp_path, las_bytes(RAW, point_format, intensity=INTENSITY)))
-
-
 @pytest.mark.parametrize("point_format", [1, 3, 6, 7])
 def test_an_intensity_of_0_is_not_recommended(tmp_path, point_format):
     black = np.zeros((1200, 3), np.uint16)
@@ -149,6 +123,8 @@ def test_an_intensity_of_0_is_not_recommended(tmp_path, point_format):
             with pytest.raises(InputError) as error:
                 open_source(write(tmp_path, content))
             is_there = bool(intensity.any())
+            why = "point format" if point_format in (1, 6) else "red green blue are 0 in all 1200 points"
+            assert why in str(error.value)
             assert ("--intensity-as-gray" in str(error.value)) == is_there
             assert ("its intensity is 0 in all 1200 points looked at, wanted" in str(error.value)) != is_there
 
@@ -168,34 +144,19 @@ CUT = "the file is cut off or broken"
         (0, "4s", b"LASX", "begins with b'LASX'"),
         (24, "B", 2, r"found LAS 2\.3, wanted LAS 1\.0 to 1\.5"),
         (94, "<H", 100, "a header of 100 bytes and points from byte"),
-        (POINTS_OFFSET, "<I", 0, "and points from byte 0 on, wanted"),
         (POINTS_OFFSET, "<I", 0xFFFFFFFF, "and points from byte 4294967295 on, wanted"),
         (FORMAT, "B", 11, "unknown point format 11, wanted LAS or LAZ"),
-        (FORMAT, "B", 0x43, "unknown point format 67, wanted LAS or LAZ"),
         (FORMAT, "B", 0x83, "compressed, but no record says how"),
         (RECORD_SIZE, "<H", 33, "records of 33 bytes, wanted 34 or more in point format 3"),
-        (RECORD_SIZE, "<H", 65535, f"promises 1200 points of 65535 bytes, found room for 0; {CUT}"),
         (COUNT, "<I", 1201, f"promises 1201 points of 34 bytes, found room for 1200; {CUT}"),
-        (COUNT, "<I", 0xFFFFFFFF, "promises 4294967295 points of 34 bytes"),
         (COUNT, "<I", 0, "promises 0 points"),
         (SCALE_X, "<d", 0.0, r"scales \[.*\] and offsets .*, wanted finite ones and no scale of 0"),
-        (SCALE_X, "<d", float("nan"), r"scales \[ *nan"),
         (SCALE_X + 24, "<d", float("inf"), r"offsets \[ *inf"),
     ],
 )
 def test_damaged_headers_are_refused(tmp_path, position, form, value, message):
     path = write(tmp_path, patched(las_bytes(RAW), position, form, value))
-    with pytest.raises(InputError, match=message) as error:
-        las.open_las(path)
-    assert str(path) in str(error.value)
-    assert len(str(error.value)) < 400 + len(str(path))
-
-
-@pytest.mark.parametrize("length", [3, 150, 230, 5000])
-def test_cut_files_are_refused(tmp_path, length):
-    for content in (las_bytes(RAW, 7), laz_bytes(las_bytes(RAW, 7), 500), laz_bytes(las_bytes(RAW, 3), 500)):
-        with pytest.raises(InputError):
-            las.open_las(write(tmp_path, content[:length]))
+    assert_refused(message, las.open_las, path)
 
 
 @pytest.mark.parametrize("count", [1201, 10**15, 2**64 - 1])
@@ -228,12 +189,9 @@ def test_a_missing_library_is_named(tmp_path, monkeypatch):
     ("position", "form", "value", "message"),
     [
         (0, "<H", 1, "LASzip's record is not that of point format 3 in 34 bytes"),
-        (0, "<H", 3, "LASzip's record is not that of point format 3"),
         (12, "<I", 0, "chunk 1 of 0 points|the compressed points are broken"),
         (12, "<I", 400, "promises 1200 points, the chunk table has 800|chunk table promises"),
         (32, "<H", 2, "LASzip's record is not"),
-        (32, "<H", 65535, "LASzip's record is not"),
-        (34, "<H", 10, "LASzip's record is not"),
         (36, "<H", 21, "LASzip's record is not"),
         (38, "<H", 9, "the compressed points are broken"),  # an item's version
     ],
@@ -253,7 +211,6 @@ def test_damaged_chunk_tables_are_refused(tmp_path):
         (patched(content, table + 4, "<I", 0), r"promises 0 chunks, wanted 1 to"),
         (patched(content, table + 4, "<I", 1), "promises 1200 points, the chunk table has 600"),
         (patched(content, begin, "<q", 1 << 60), "no chunk table within the file; it is cut off or broken"),
-        (patched(content, begin, "<q", -1), "no chunk table within the file; it is cut off or broken"),
         (content[: table + 9], "the compressed points are broken"),
         (patched(content, table + 8, "4s", b"\xff" * 4), "the chunk table is broken"),
     ]:
@@ -261,7 +218,6 @@ def test_damaged_chunk_tables_are_refused(tmp_path):
 
 
 def test_a_chunk_table_may_be_named_at_the_end_and_fill_no_memory(tmp_path, monkeypatch):
-    """As writers do that can't go back."""
     content = laz_bytes(las_bytes(RAW), 600)
     (begin,) = struct.unpack_from("<I", content, POINTS_OFFSET)
     assert_read_as_written(write(tmp_path, patched(content, begin, "<q", -1) + content[begin : begin + 8]))
@@ -280,15 +236,6 @@ def test_layers_larger_than_their_chunk_are_refused(tmp_path, point_format):
         position = begin + las.OFFSET_SIZE + record_size + 4 + 4 * layer
         with pytest.raises(InputError, match=r"a chunk of 600 points with layers of \d+ bytes, wanted 600"):
             open_source(write(tmp_path, patched(content, position, "<I", 0xFFFFFFFF)))
-
-
-def test_broken_points_are_refused(tmp_path):
-    content = laz_bytes(las_bytes(RAW, 3), 600)
-    (begin,) = struct.unpack_from("<I", content, POINTS_OFFSET)
-    (table,) = struct.unpack_from("<q", content, begin)
-    path = write(tmp_path, content[: begin + 100] + bytes(table - begin - 100) + content[table:])
-    result, message = read_or_refused(read, path)
-    assert result is not None or "the compressed points are broken" in message
 
 
 def test_panics_of_lazrs_are_refused(tmp_path, monkeypatch):

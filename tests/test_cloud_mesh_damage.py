@@ -16,12 +16,10 @@ from refusals import mutated, read_or_refused
 from piccolo.cloud import open_cloud, read_cloud
 from piccolo.cloud.readers import mesh_files
 from piccolo.cloud.readers.mesh import open_mesh
-from piccolo.cloud.readers.ply import open_ply
 from piccolo.errors import InputError
 
 
 def refusal(path, read=read_cloud):
-    """The line with which a file is refused."""
     _, message = read_or_refused(read, path)
     assert message
     return message
@@ -133,28 +131,19 @@ BASE = ("materials", 0, "pbrMetallicRoughness")
     ("path", "value"),
     [
         (("accessors", 0, "count"), 10**12),
-        (("accessors", 0, "count"), -1),
-        (("accessors", 0, "count"), 1e300),
         (("accessors", 0, "byteOffset"), 8),
-        (("accessors", 0, "byteOffset"), -12),
         (("accessors", 0, "componentType"), 5123),
         (("accessors", 0, "bufferView"), None),
         (("accessors", 0, "sparse"), {"count": 1}),
         (("bufferViews", 0, "byteLength"), 10**9),
-        (("bufferViews", 0, "byteLength"), 3000),
         (("bufferViews", 1, "byteStride"), 0),
-        (("bufferViews", 1, "byteStride"), 4),
         (("bufferViews", 0, "buffer"), 7),
         (("nodes", 0, "children"), [0]),
         (("scenes", 0, "nodes"), [0, 0]),
-        (("scenes", 0, "nodes"), [5]),
         (("scenes", 0, "nodes"), []),
         (("nodes", 0, "mesh"), 3),
-        (("nodes", 0, "mesh"), -1),
         (("nodes", 0, "scale"), [0, 0, 0]),
-        (("nodes", 0, "scale"), [1e-9, 1e-9, 1]),
         ((*PRIMITIVE, "mode"), 6),
-        ((*PRIMITIVE, "mode"), 0),
         ((*PRIMITIVE, "material"), 1),
         ((*PRIMITIVE, "attributes", "TEXCOORD_0"), None),
         ((*BASE, "baseColorTexture", "texCoord"), 1),
@@ -236,15 +225,6 @@ def test_cut_gltf_buffers_are_refused(tmp_path):
     assert f"the buffer 'a b.bin' has {len(content) - 1} of {len(content)} bytes" in refusal(path)
 
 
-@pytest.mark.parametrize("text", [False, True])
-def test_cut_ply_meshes_are_refused(tmp_path, text):
-    path = made.write_ply(tmp_path / "a.ply", colors=made.CORNER_COLORS, options={"text": text})
-    content = path.read_bytes()
-    for size in (len(content) - 9, content.index(b"end_header") + 30):
-        path.write_bytes(content[:size])
-        refusal(path, open_ply)
-
-
 def write_colored_obj(folder):
     path = folder / "colored.obj"
     vertices = np.concatenate([SQUARE, CORNER_COLORS / 255], axis=1)
@@ -289,7 +269,6 @@ def test_mutated_meshes_raise_nothing_but_input_error(name, data, tmp_path_facto
 
 
 def test_one_changed_number_of_the_json(tmp_path):
-    """Every entry of the JSON in turn becomes something else."""
 
     def entries(part, path=()):
         for key, entry in list(part.items() if isinstance(part, dict) else enumerate(part)):

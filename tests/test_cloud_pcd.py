@@ -1,5 +1,3 @@
-"""LZF, as binary_compressed PCD files have it."""
-
 import struct
 
 import numpy as np
@@ -40,7 +38,9 @@ def content_of(fields, encoding, num_points=1200, **lines):
         "DATA": encoding,
     } | lines
     text = "".join(f"{name} {value}\n" for name, value in header.items() if value is not None)
-    columns = [np.asarray(values).reshape(1200, -1).astype("<" + type_) for _, type_, _, values in fields]
+    columns = [
+        np.asarray(values).reshape(num_points, -1).astype("<" + type_) for _, type_, _, values in fields
+    ]
     if encoding == "ascii":
         types = [type_ for _, type_, *_ in fields]
         rows = zip(*columns, strict=True)
@@ -131,23 +131,17 @@ def test_nan_points_of_a_grid_need_no_color(tmp_path, encoding, kind):
     ("fields", "lines", "message"),
     [
         (XYZ, {}, "the fields are 'x y z', wanted a PCD file with the fields x y z and rgb"),
-        ([*XYZ[:2], ("rgb", "u4", 1, PACKED)], {}, "the fields are 'x y rgb'"),
         ([*XYZ, *XYZ[:1], ("rgb", "u4", 1, PACKED)], {}, "the fields are 'x y z x rgb'"),
         ([*XYZ, ("rgb", "f8", 1, PACKED)], {}, "'rgb' is of type f8, wanted uint32, int32 or float32"),
         (separate("i4", 255), {}, "of type i4 i4 i4, wanted uint8 0-255, uint16 0-65535 or float 0-1"),
-        ([*separate("u1", 255)[:5], ("b", "u2", 1, PACKED)], {}, "the colours are of type u1 u1 u2, wanted"),
         ([("x", "i2", 1, PACKED), *XYZ[1:], ("rgb", "u4", 1, PACKED)], {}, "'x' is of type i2, wanted float"),
         (None, {"SIZE": "4 4 4"}, "4 FIELDS, 3 of SIZE, 4 of TYPE"),
         (None, {"SIZE": "4 4 4 3"}, "'rgb 3 U 1', wanted SIZE 1 2 4 or 8"),
-        (None, {"TYPE": "F F F X"}, "'rgb 4 X 1', wanted SIZE"),
-        (None, {"COUNT": "1 1 1 -1"}, "'rgb 4 U -1', wanted SIZE"),
         (None, {"COUNT": "1 1 1 \u00b2"}, "COUNT 'rgb 4 U"),
         (None, {"COUNT": "1 1 1 999999"}, "promises 4000008 bytes a point"),
         (None, {"POINTS": "-5"}, "counts the points by 'WIDTH 600 HEIGHT 2 POINTS -5'"),
-        (None, {"POINTS": None, "WIDTH": None, "HEIGHT": None}, "counts the points by ''"),
         (None, {"POINTS": "1201"}, "promises 1201 points in a grid of 1200"),
         (None, {"POINTS": "1201", "WIDTH": "1201", "HEIGHT": "1"}, "promises 1201 points in 19216 bytes"),
-        (None, {"POINTS": "9999999999", "WIDTH": None}, "promises 9999999999 points in 1599"),
         (None, {"DATA": "zip"}, "DATA is 'zip', wanted ascii, binary, binary_compressed"),
         (None, {"DATA": None}, "no lines FIELDS and DATA"),
     ],
@@ -162,9 +156,7 @@ def test_broken_headers_are_refused(tmp_path, fields, lines, message):
     ("old", "new", "message"),
     [
         (b"", b" 1", "line 12: 5 instead of 4 columns"),
-        (b"", b" x", "line 12: 5 instead of 4 columns"),
         (b"4294967296", None, "point 1 has the colour 4.29497e.09, wanted 32 bits of type u4"),
-        (b"1.5", None, "point 1 has the colour 1.5, wanted 32 bits"),
         (b"nan", None, "point 1 has the colour nan, wanted 32 bits"),
         (b"red", None, "line 12: 'red' is not a number"),
     ],
@@ -187,14 +179,6 @@ def test_cut_text_and_a_colour_that_it_has_lost_are_refused(tmp_path):
     path = write(tmp_path / "a.pcd", [*XYZ, ("rgb", "u4", 1, PACKED)], "ascii")
     path.write_bytes(b"\n".join(path.read_bytes().split(b"\n")[:-3]))
     assert_refused("found 1197 of 1200 points; the file is cut off", read, path)
-
-
-@pytest.mark.parametrize("encoding", ENCODINGS)
-def test_float_colors_out_of_range_are_refused(tmp_path, encoding):
-    fields = separate("f4", 1)
-    fields[4][3][7] = 1.5
-    with pytest.raises(InputError, match=r"point 8 has the colour .* wanted 0 to 1"):
-        read(write(tmp_path / "a.pcd", fields, encoding))
 
 
 @pytest.mark.parametrize(

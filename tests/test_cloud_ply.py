@@ -75,23 +75,9 @@ def test_line_ends_and_foreign_comments(tmp_path, end):
     assert_read_as_written(path)
 
 
-def test_content_comes_before_extension_and_doubles_are_shifted_before_they_are_rounded(tmp_path):
+def test_content_comes_before_extension(tmp_path):
     path = write(tmp_path / "cloud with space.txt", vertices())
     np.testing.assert_array_equal(read_cloud(path).colors, read_cloud(path.rename(tmp_path / "b")).colors)
-    far = type(RAW)(RAW.points_world + np.array([637_012.0, 5_849_028.0, 431.0]), RAW.colors)
-    cloud = read_cloud(write(tmp_path / "a.ply", vertices(far, coordinate="f8")))
-    near = read_cloud(write(tmp_path / "b.ply", vertices(coordinate="f8")))
-    assert (cloud.origin_world - near.origin_world).tolist() == [637_012.0, 5_849_028.0, 431.0]
-    np.testing.assert_allclose(cloud.points, near.points, atol=1e-6)
-
-
-def test_nan_vertices_are_dropped_whatever_their_color(tmp_path):
-    element = vertices(color="f4", brightest=1)
-    element.data["x"][:3] = np.nan
-    element.data["red"][:3] = np.nan
-    cloud = read_cloud(write(tmp_path / "a.ply", element))
-    assert (cloud.num_dropped, len(cloud.points)) == (3, 1197)
-    assert "3 points with NaN or infinite coordinates left out" in cloud.warnings[0]
 
 
 @pytest.mark.parametrize("brightness", [1.5, -0.1, np.nan])
@@ -111,13 +97,6 @@ def test_promises_of_more_vertices_are_refused_before_memory_is_taken(tmp_path, 
     assert_refused(f"promises {count} vertices|found 1200 of {count} points", read_cloud, path)
 
 
-@pytest.mark.parametrize("text", [False, True])
-def test_cut_files_are_refused(tmp_path, text):
-    path = tmp_path / "a.ply"
-    path.write_bytes(content_of(tmp_path, text=text)[:-40])
-    assert_refused(r"promises 1200 vertices|instead of 6 columns|found 1199 of 1200", read_cloud, path)
-
-
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -128,16 +107,11 @@ def test_cut_files_are_refused(tmp_path, text):
         (b"property float x", b"property float y", "broken header .*two properties with same name"),
         (b"property float x", b"property list uchar float x", "'vertex' has the list property 'x'"),
         (b"element vertex 1200", b"element vertex -1", "the header counts '-1' elements"),
-        (b"element vertex 1200", b"element vertex " + b"9" * 5000, "the header counts '9999"),
         (b"element vertex 1200", b"element points 1200", "no element 'vertex'"),
-        (b"element vertex 1200", b"element vertex 1 200", "broken header"),
         (b"element vertex 1200", b"element vertex 0", "found 0 finite points"),
-        (b"property uchar red", b"property uchar label", "vertices have x y z label green blue, wanted"),
         (b"property float z", b"property float h", "vertices have x y h red green blue, wanted"),
         (b"property uchar red", b"property int red", "the colours are of type i4 u1 u1, wanted uint8"),
-        (b"property float z\n", b"", "vertices have x y red"),
         (b"end_header\n", b"end_header\n1 2 3 4 5 6 7\n", "line 11: 7 instead of 6 columns"),
-        (b"end_header\n", b"end_header\n1 2 3 4 5\n", "line 11: 5 instead of 6 columns"),
         (b"end_header\n", b"end_header\n1 2 3 4 \x7f 5\n", r"line 11: '\\x7f' is not a number"),
         (b"end_header\n", b"end_header\n1 2 3 4 5 256\n", "point 1 has the colour 4 5 256, wanted"),
     ],
@@ -145,10 +119,7 @@ def test_cut_files_are_refused(tmp_path, text):
 def test_broken_files_are_refused(tmp_path, old, new, message):
     path = tmp_path / "a.ply"
     path.write_bytes(content_of(tmp_path, text=True).replace(old, new, 1))
-    with pytest.raises(InputError, match=message) as error:
-        read_cloud(path)
-    assert str(path) in str(error.value)
-    assert len(str(error.value)) < 500 + len(str(path))
+    assert_refused(message, read_cloud, path)
 
 
 def test_gaussian_splats_and_lists_before_the_vertices_are_refused(tmp_path):

@@ -9,8 +9,10 @@ from las_files import OFFSETS, las_bytes, laz_bytes
 from pictures import write
 from plyfile import PlyData, PlyElement
 from refusals import assert_refused
+from scans import write_scalars
 from scipy.spatial.distance import pdist
 from test_cloud_morton import seeded_cloud, whole
+from test_cloud_pcd import content_of
 
 from piccolo.cloud import open_cloud, open_source
 from piccolo.cloud.readers.reader import RawCloud
@@ -41,13 +43,8 @@ def test_no_color_is_black_and_a_label_alone_decides():
         assert len(np.unique(colors_of(step * np.arange(256)), axis=0)) == 256
 
 
-def _ply(path, name="label", kind="i4", text=False, values=LABELS):
-    table = np.zeros(len(POINTS), [(n, "f8") for n in "xyz"] + [("red", "u1"), (name, kind)])
-    for k, n in enumerate("xyz"):
-        table[n] = POINTS[:, k]
-    table[name] = values
-    PlyData([PlyElement.describe(table, "vertex")], text=text).write(str(path))
-    return path
+def _ply(path, name="label", kind="i4", text=False, values=LABELS, points=POINTS):
+    return write_scalars(path, points, name, values, kind, text)
 
 
 @pytest.mark.parametrize(
@@ -78,11 +75,11 @@ def test_labels_that_are_no_whole_numbers_are_refused(tmp_path, wrong):
         whole(open_source, path, READ)
 
 
-def test_points_without_a_position_need_no_label(tmp_path, monkeypatch):
+def test_points_without_a_position_need_no_label(tmp_path):
     broken = POINTS.copy()
     broken[5] = np.nan
-    monkeypatch.setattr("test_labels.POINTS", broken)
-    path = _ply(tmp_path / "a.ply", kind="f4", values=np.where(np.arange(3000) == 5, np.nan, LABELS))
+    values = np.where(np.arange(3000) == 5, np.nan, LABELS)
+    path = _ply(tmp_path / "a.ply", kind="f4", values=values, points=broken)
     cloud = open_cloud([path], CloudSettings(labels=Labels())).read()
     assert (len(cloud.points), cloud.num_dropped) == (2999, 1)
 
@@ -100,22 +97,15 @@ def test_las(tmp_path, point_format, most, is_compressed):
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary"])
 def test_pcd(tmp_path, encoding):
-    table = np.zeros(3000, [*((axis, "<f4") for axis in "xyz"), ("label", "<u4")])
-    for k, axis in enumerate("xyz"):
-        table[axis] = POINTS[:, k]
-    table["label"] = LABELS
-    header = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z label\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\n"
-    header += f"WIDTH 3000\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3000\nDATA {encoding}\n"
-    rows = "\n".join(" ".join(map(str, row)) for row in table.tolist()) + "\n"
-    body = rows.encode() if encoding == "ascii" else table.tobytes()
-    path = write(tmp_path / "a.pcd", header.encode() + body)
+    fields = [*((axis, "f4", 1, POINTS[:, k]) for k, axis in enumerate("xyz")), ("label", "u4", 1, LABELS)]
+    path = write(tmp_path / "a.pcd", content_of(fields, encoding, 3000))
     np.testing.assert_array_equal(whole(open_source, path, READ).colors, colors_of(LABELS))
     write(path, path.read_bytes().replace(b"label", b"ring_"))
     assert_refused("the fields are 'x y z ring_', wanted x y z and label", open_source, path, READ)
 
 
 def test_clouds_without_labels_are_refused(tmp_path):
-    with pytest.raises(InputError, match="the vertices have x y z red thing, wanted x y z and a label"):
+    with pytest.raises(InputError, match="the vertices have x y z thing, wanted x y z and a label"):
         open_source(_ply(tmp_path / "a.ply", "thing"), READ)
     with pytest.raises(InputError, match=r"a.pts: labels are not read from PTS, wanted PLY, LAS, LAZ, PCD"):
         open_source(write(tmp_path / "a.pts", b"3\n1 2 3 9 1 1 1\n"), READ)

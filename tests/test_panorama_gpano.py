@@ -4,8 +4,6 @@ import zlib
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from pictures import (
     XMP_NAMESPACE,
     crop_fields,
@@ -20,7 +18,6 @@ from pictures import (
 from refusals import assert_refused, read_or_refused
 
 from piccolo.errors import InputError
-from piccolo.geometry.sphere import pixel_rays
 from piccolo.panorama import GPano, ReadOptions, read_panorama
 from piccolo.panorama.gpano import gpano_fields, rotation_to_level
 
@@ -89,10 +86,7 @@ def test_a_crop_over_the_seam_goes_on_at_the_other_side(tmp_path, left):
     "fields",
     [
         crop_fields(0, 0, 0, 0),
-        crop_fields(0, 0, -400, -200),
         crop_fields(0, 0, "nan", "nan"),
-        crop_fields(0, 0, "inf", 200),
-        crop_fields(0, 0, 1e300, 200),
         crop_fields(0, 0, "many", 200),
         crop_fields(0, 150, 400, 200, (800, 300)),
         crop_fields(999, 0, 400, 200),
@@ -158,13 +152,6 @@ def test_the_order_is_heading_pitch_roll_about_the_cameras_axes(pitch, roll):
     assert left[2] == pytest.approx(np.sin(np.radians(roll)) * np.cos(np.radians(pitch)))
 
 
-def test_the_horizon_turns_counterclockwise_in_the_image_as_roll_grows():
-    R_level_from_cam = rotation_to_level(GPano(roll_deg=10.0))
-    is_below = pixel_rays(360) @ R_level_from_cam[2] < 0  # in the image, row by row downwards
-    horizon = is_below.argmax(axis=0)
-    assert horizon[180 - 60] > horizon[180] > horizon[180 + 60]  # lower at the left, higher at the right
-
-
 def test_a_field_of_view_is_centred_on_the_horizon(tmp_path):
     path = write(tmp_path / "a.png", encoded(RGB[60:140, 100:300], ".png"))
     assert_refused(r"found 200 x 80, wanted width = 2 x height .* field of view", read_panorama, path)
@@ -183,19 +170,6 @@ def test_a_field_of_view_is_centred_on_the_horizon(tmp_path):
 def test_other_fields_of_view_are_refused(fov_deg):
     with pytest.raises(InputError, match=r"--fov: found .*, wanted above 0 and at most 360"):
         ReadOptions(fov_deg=fov_deg)
-
-
-NUMBERS = st.integers(-10, 2**31) | st.floats() | st.text(max_size=9) | st.sampled_from([200, 400, 32768])
-
-
-@settings(deadline=None, max_examples=50)
-@given(values=st.lists(NUMBERS, min_size=6, max_size=6), width=st.sampled_from([300, 400]))
-def test_any_numbers_in_a_crop_are_read_or_refused(values, width, tmp_path_factory):
-    fields = dict(zip(list(crop_fields(0, 0, 1, 1))[1:], values, strict=True))
-    path = tmp_path_factory.getbasetemp() / "crop.png"
-    panorama, _ = read_or_refused(read_panorama, write(path, file_of(RGB[:, :width], fields)))
-    assert panorama is None or panorama.rgb.shape[1] == 2 * panorama.rgb.shape[0]
-    assert panorama is None or panorama.is_valid.mean() > 0.015
 
 
 def test_many_prefixes_of_the_namespace_cost_no_time():

@@ -16,7 +16,6 @@ WIDTH, HEIGHT = 1024, 512
 
 @functools.lru_cache
 def room(seed=0, level=140.0, contrast=60.0, noise=2.0, tilt=0.0):
-    """Walls, floor and ceiling of a box, each with a pattern, seen from inside."""
     rays = pixel_rays(WIDTH) @ exp_so3(np.array([0.3, tilt, 0.1]) * tilt)
     rng = np.random.default_rng(seed)
     near = np.array([2.0, 1.4, 1.3]) + rng.uniform(-0.3, 0.3, 3)
@@ -80,7 +79,6 @@ def test_nothing_is_masked_in_pictures_of_rooms(tmp_path, image):
 
 
 def logo(image):
-    """A bright disc with dark letters."""
     changed = np.full_like(image, 235.0)
     changed[::7, ::5] = 20.0
     return changed

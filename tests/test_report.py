@@ -29,7 +29,6 @@ def house(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def made(house, tmp_path_factory):
-    """A report of it, in a folder."""
     out = tmp_path_factory.mktemp("made") / "report"
     assert _run(house, out, *STOREYS, "--title", "12 High Street") == 0
     return out

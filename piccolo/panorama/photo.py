@@ -28,8 +28,6 @@ from .picture import PNG_MAGIC, WANTED, opened
 TIME = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)")
 OFFSET = re.compile(r"[+-]\d\d:\d\d")
 DEGREE_PARTS = 1.0, 60.0, 3600.0  # degrees, minutes, seconds
-
-
 FILM_DIAGONAL = math.hypot(36.0, 24.0)  # [mm]
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of FocalPlaneResolutionUnit; 2 where it is missing
 MIN_FILM, MAX_FILM = 8.0, 800.0  # [mm] what is wider is no photo by a plain lens
@@ -78,10 +76,7 @@ def _digest(files: list[Path]) -> str:
 def photo_of(path: Path, rig: Calibration | None = None) -> Photo:
     """What a photo's file, or the first of a folder of cube faces or of a rig's pictures, says of itself.
 
-    Raises
-    ------
-    InputError
-        The file is missing or no picture. Metadata that are damaged count as missing.
+    InputError if the file is missing or no picture. Metadata that are damaged count as missing.
     """
     files = _files_of(path, rig)
     with reading_once(), opened(files[0], content := read_bytes(files[0], WANTED)) as image:

@@ -47,11 +47,8 @@ def read_panorama(path: Path, options: ReadOptions = AS_STORED) -> Panorama:
     valid are pixels of alpha 0, what a crop leaves open, masks, black borders and discs put over a pole.
     Labels become colours, and only masks and ignored labels are not valid.
 
-    Raises
-    ------
-    InputError
-        The file is missing or damaged, of another format or projection, its size is out of range, or nothing
-        tells which part of the sphere it shows.
+    InputError if the file is missing or damaged, of another format or projection, its size is out of range,
+    or nothing tells which part of the sphere it shows.
     """
     path = Path(path)
     if options.labels:

@@ -29,10 +29,7 @@ class VideoFrame(NamedTuple):
 def frames_of(video: Path, every: float, folder: Path) -> Iterator[VideoFrame]:
     """Write a frame every so many seconds into a folder, the sharpest around each.
 
-    Raises
-    ------
-    InputError
-        The file is no video or is damaged, or PyAV is not there.
+    InputError if the file is no video or is damaged, or PyAV is not there.
     """
     best: tuple[float, float, NDArray[np.uint8]] | None = None  # sharpness, time, RGB
     slot = 0
@@ -41,7 +38,7 @@ def frames_of(video: Path, every: float, folder: Path) -> Iterator[VideoFrame]:
             if best is not None:
                 yield _written(video, folder, best)
             best = None
-            slot = slot + 1
+            slot += 1
         if time >= (slot - NEIGHBORHOOD) * every:
             rgb = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
             sharpness = sharpness_of(rgb)

@@ -208,14 +208,8 @@ def write_plan(plan: PlanImage, folder: Path) -> dict[str, Any]:
     key = hashlib.sha256(content).hexdigest()[:32]
     write_atomically(picture_path(folder, "plans", key), content)
     height, width = plan.pixels.shape[:2]
-    pixel = float(np.hypot(plan.matrix[0], plan.matrix[1]))
-    return {
-        "file": f"plans/{key}.png",
-        "width": width,
-        "height": height,
-        "matrix": plan.matrix,
-        "pixel": pixel,
-    }
+    size = {"width": width, "height": height, "pixel": float(np.hypot(plan.matrix[0], plan.matrix[1]))}
+    return {"file": f"plans/{key}.png", "matrix": plan.matrix, **size}
 
 
 def write_report(  # noqa: PLR0913  options by name

@@ -48,8 +48,6 @@ MAX_ALTERNATIVES = 3
 MAX_WIDTH = 8192  # [px] of a sphere at full size
 GAP = 0.004  # by the width: wider gaps are marked as not scanned
 UNSCANNED = np.array([96, 100, 106], np.float32)
-
-
 FRAME = re.compile(r"(?P<video>.+)#t=(?P<time>\d+\.\d{3})", re.DOTALL)
 
 
@@ -59,12 +57,8 @@ def read_options_of(result: Result) -> ReadOptions:
     labels = Labels(tuple(how["labels"]["ignored"])) if how.get("labels") else None
     if result.cameras:
         return ReadOptions(labels=labels, calibration=Calibration("the result", result.cameras))
-    return ReadOptions(
-        labels=labels,
-        fov_deg=how.get("fov_deg"),
-        projection=how.get("projection"),
-        cube_order=how.get("cube_order"),
-    )
+    names = "fov_deg", "projection", "cube_order"
+    return ReadOptions(labels=labels, **{name: how.get(name) for name in names})
 
 
 def make_pictures(
@@ -95,11 +89,9 @@ def make_pictures(
 
 def _shown(result: Result) -> list[bool]:
     """Which alternatives are worth a picture."""
-    likely = [(a.probability or 0.0) >= LEAST_PROBABILITY for a in result.alternatives]
-    return [
-        result.status == AMBIGUOUS and is_likely and k < MAX_ALTERNATIVES
-        for k, is_likely in enumerate(likely)
-    ]
+    most = MAX_ALTERNATIVES if result.status == AMBIGUOUS else 0
+    shares = [other.probability or 0.0 for other in result.alternatives]
+    return [share >= LEAST_PROBABILITY and k < most for k, share in enumerate(shares)]
 
 
 def scan_view(surfels: Surfels, pose: Pose, width: int) -> View:

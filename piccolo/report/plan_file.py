@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterator, Sequence
 from itertools import groupby, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -21,9 +21,6 @@ from .build import ReportSettings, Task, check_settings, document_of
 from .entries import Entry
 from .site import begin_folder
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 DXF = ".dxf"
 SUFFIXES = (".png", ".svg", ".pdf", DXF)
 COLORS = {LOCALIZED: (8, 120, 76), AMBIGUOUS: (166, 83, 0), NOT_LOCALIZED: (193, 37, 45)}
@@ -38,8 +35,6 @@ HEADING = 0.5  # [m] length of the line from a mark
 FRAME_HEADING = 0.2  # [m]
 TEXT_HEIGHT = 0.12  # [m] of the DXF
 BARS = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # [m] of the scale
-
-
 LEAST_ON_PATH = 0.5  # frames that are less likely right are passed over
 EVERY_NUMBER = 20  # of a walk's frames are numbered
 
@@ -109,7 +104,7 @@ def shapes_of(document: dict[str, Any], index: int) -> Iterator[Shape]:
         if photo["spread"]:
             a, b, degrees = photo["spread"]["ellipse"]
             yield Ellipse(center, (a, b), math.radians(degrees), color)
-        text = str(number) if is_numbered(number, photo) else ""
+        text = "" if is_frame and number % EVERY_NUMBER != 1 else str(number)
         yield Mark(center, photo["status"], FRAME_SIZE if is_frame else SIZE, text, photo["name"])
 
 
@@ -137,7 +132,7 @@ def figure_of(document: dict[str, Any], folder: Path, form: str) -> bytes:
     return file.getvalue()
 
 
-def _draw_plan(axes: "Axes", storey: dict[str, Any], folder: Path) -> None:
+def _draw_plan(axes: Any, storey: dict[str, Any], folder: Path) -> None:
     """The plan of a storey with its name and scale, in metres of the map's frame."""
     from matplotlib.transforms import Affine2D  # noqa: PLC0415  # as of new_figure
 
@@ -158,7 +153,7 @@ def _draw_plan(axes: "Axes", storey: dict[str, Any], folder: Path) -> None:
     axes.annotate(f"{metres:g} m", (left + metres, bottom), (4, 2), textcoords="offset points")
 
 
-def _draw_scale(axes: "Axes") -> None:
+def _draw_scale(axes: Any) -> None:
     """The colours of a walk's path."""
     from matplotlib.cm import ScalarMappable  # noqa: PLC0415
     from matplotlib.colors import Normalize  # noqa: PLC0415
@@ -170,7 +165,7 @@ def _draw_scale(axes: "Axes") -> None:
     axes.text(0.71, 1.02, "confidence", transform=axes.transAxes, ha="right")
 
 
-def _draw(axes: "Axes", shape: Shape) -> None:
+def _draw(axes: Any, shape: Shape) -> None:
     from matplotlib import patches  # noqa: PLC0415
 
     if isinstance(shape, Line):
@@ -262,8 +257,3 @@ def color_of(confidence: float) -> tuple[int, int, int]:
     level = np.array([[round(255 * share)]], np.uint8)
     blue, green, red = cv2.applyColorMap(level, cv2.COLORMAP_VIRIDIS)[0, 0]
     return int(red), int(green), int(blue)
-
-
-def is_numbered(number: int, photo: dict[str, Any]) -> bool:
-    """True for a photo that stands alone, and for some of a walk's frames."""
-    return photo["walk"] is None or number % EVERY_NUMBER == 1

@@ -40,11 +40,9 @@ PALENESS = 0.25  # of the colours, so that what is drawn on them is seen
 GAP = 13  # [px] that is closed
 SHADOW = 0.35  # of walls on the floor: strength
 SHADOW_WIDTH = 0.25  # [m]
-
-
 COLUMNS = ("u", "v", "x", "y")
 WANTED = "wanted a CSV file with the columns u, v [px] and x, y [m], and two rows or more"
-MAX_SIDE = 4096  # [px]
+MAX_OWN_SIDE = 4096  # [px]
 LEAST_SPREAD = 1e-6  # of the control points, by their distance: less is one point, or a line of three
 
 
@@ -52,9 +50,8 @@ class PlanImage(NamedTuple):
     """A plan in pixels."""
 
     pixels: NDArray[np.uint8]  # (H, W, 4) RGBA, transparent where nothing is; or (H, W, 3)
-    matrix: tuple[
-        float, ...
-    ]  # a, b, c, d, e, f of x = a u + c v + e, y = b u + d v + f [m, map], of pixels (u, v)
+    # a, b, c, d, e, f of x = a u + c v + e, y = b u + d v + f [m, map], of pixels (u, v)
+    matrix: tuple[float, ...]
 
 
 def draw_plan(points: PackedPoints, places: Array, floors: Array) -> PlanImage | None:
@@ -209,7 +206,7 @@ def own_plan(plan: OwnPlan, scan_map: ScanMap) -> PlanImage:
     world = np.column_stack([points[:, 2:], np.full(len(points), scan_map.origin_world[2])])
     places = ((world - scan_map.origin_world) @ scan_map.R_map_from_world.T)[:, :2]
     rgb: NDArray[np.uint8] = read_picture(plan.image).rgb
-    scale = min(1.0, MAX_SIDE / max(rgb.shape[:2]))
+    scale = min(1.0, MAX_OWN_SIDE / max(rgb.shape[:2]))
     size = math.ceil(rgb.shape[1] * scale), math.ceil(rgb.shape[0] * scale)
     if scale < 1.0:
         rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -87,13 +87,10 @@ def open_e57(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     if scans:
         read_chunks = partial(_read_colored, path, scans)
     poses = [scan.pose for scan in scans or measured if scan.pose is not None]
-    axes = [pose.R_cam_from_world[2] for pose in poses if not _is_identity(pose)]
-    return PointSource(path, read_chunks, num_points, warnings, tuple(axes))
-
-
-def _is_identity(pose: Pose) -> bool:
-    """Whether a pose is what programs write that know of no scanner."""
-    return bool(np.array_equal(pose.R_cam_from_world, np.eye(3)) and not pose.center_world.any())
+    # programs that know of no scanner write the identity
+    placed = [p for p in poses if not np.array_equal(p.R_cam_from_world, np.eye(3)) or p.center_world.any()]
+    axes = tuple(pose.R_cam_from_world[2] for pose in placed)
+    return PointSource(path, read_chunks, num_points, warnings, axes)
 
 
 def _scans(file: E57File, channels: tuple[str, ...]) -> tuple[list[E57Scan], list[str]]:

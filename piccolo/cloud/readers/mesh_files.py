@@ -24,8 +24,6 @@ from ...errors import InputError
 MAX_TEXELS = 1 << 28  # 16,384 x 16,384: 1 GiB while it is looked up, three while it is decoded
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "TGA", "GIF")
 MODES = frozenset({"1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr"})  # 8 bits a channel or less
-
-
 GLB_MAGIC = b"glTF"
 WANTED = "wanted a whole glTF 2.0 mesh"
 KNOWN_EXTENSIONS = frozenset({"KHR_materials_unlit", "EXT_texture_webp"})  # of those a file may require
