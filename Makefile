@@ -29,8 +29,7 @@ test: $(VENV)/ready
 	$(BIN)/python -m pytest -n auto --dist loadfile
 
 # of the tests of kernels, those that need seconds in plain Python
-KERNELS := channel_loss cloud_morton cloud_octree cloud_voxels levenberg_marquardt p3p pose pose_refinement \
-	sampling_loss sphere sphere_grid suppression zbuffer
+KERNELS := channel_loss cloud_morton cloud_octree cloud_voxels p3p pose sampling_loss sphere zbuffer
 
 test-kernels: $(VENV)/ready
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest $(KERNELS:%=tests/test_%.py)

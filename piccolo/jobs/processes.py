@@ -8,6 +8,7 @@ import os
 import pickle
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -23,6 +24,8 @@ from .tasks import Function, InFlight, Opening, WorkerLostError
 ATTEMPTS = 2  # to work on an item, or to open
 IN_FLIGHT = 4  # items a process, so that none waits for a slow one before
 PARENT_LOST = 1  # exit code
+POLL_S = 0.001
+MAX_POLLS = 1000
 # Not fork: the child would have the threads of this process stand still in the middle of their work.
 CONTEXT = multiprocessing.get_context("spawn")
 SIGNALS = {signal.SIGINT, signal.SIGTERM}  # are for this process, which ends the others
@@ -102,9 +105,18 @@ class Processes:
                 raise CancelledError
             self._children.remove(child)
         vars(self._own).pop("worker", None)
-        child.join()
-        code = child.exitcode or 0
+        code = _exit_code_of(child)
         return f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+
+
+def _exit_code_of(child: BaseProcess) -> int:
+    """Wait for a process; its pool's thread, which waits too, may have its exit code a moment earlier."""
+    child.join()
+    for _ in range(MAX_POLLS):
+        if child.exitcode is not None:
+            return child.exitcode
+        time.sleep(POLL_S)
+    return 0
 
 
 def _block_signals() -> None:
