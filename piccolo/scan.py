@@ -24,9 +24,9 @@ from .jobs.threads import Workers
 from .localization.localize import has_guessed_focal, localize, localize_guessed
 from .localization.settings import CoarseToFineSettings
 from .optimize.refine import Solver
-from .panorama import ReadOptions, read_query
+from .panorama import ReadOptions, read_photo
 from .panorama.model import Projection
-from .panorama.photo import Photo
+from .panorama.photo import PhotoFacts
 from .paper.localize import PaperMap
 from .paper.localize import localize as localize_by_paper
 from .paper.settings import PaperSettings
@@ -234,7 +234,7 @@ class Scan:
 
         255 where it contradicts, 0 where the scan explains it, 128 where one of them shows nothing.
         """
-        picture = read_query(panorama, read_options or ReadOptions(labels=self.cloud_settings.labels))
+        picture = read_photo(panorama, read_options or ReadOptions(labels=self.cloud_settings.labels))
         return occlusion_mask(self.points, picture, self.from_world(pose))
 
     def localize_query(
@@ -251,7 +251,7 @@ class Scan:
         if calibration is not None and read_options.calibration is None:
             read_options = replace(read_options, calibration=calibration)
         with watch.stage("read"), reading_once():
-            picture = read_query(panorama, read_options, is_masked)
+            picture = read_photo(panorama, read_options, is_masked)
             photo = photo_facts(panorama, read_options.rig)
         gps = None
         if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
@@ -285,7 +285,7 @@ class Scan:
             cameras=found.cameras or picture.cameras,
         )
 
-    def gps_prior_of(self, photo: Photo, settings: CoarseToFineSettings) -> GpsPrior | None:
+    def gps_prior_of(self, photo: PhotoFacts, settings: CoarseToFineSettings) -> GpsPrior | None:
         """The photo's GPS position in the scan; None if it has none, or a position is given anyway."""
         crs = self.cloud_settings.crs or getattr(self.prepared, "crs", "")
         if photo.gps is None or not crs or settings.prior.near_world is not None:

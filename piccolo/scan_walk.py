@@ -15,8 +15,8 @@ from .files.json_file import reading_once
 from .jobs.stopwatch import Stopwatch
 from .jobs.threads import Progress, no_progress
 from .localization.query import Query
-from .panorama import Panorama, ReadOptions, read_query
-from .panorama.photo import Photo, photo_of, photo_of_array, sha256_of
+from .panorama import Panorama, ReadOptions, read_photo
+from .panorama.photo import PhotoFacts, photo_of, photo_of_array, sha256_of
 from .result import Failure, Result, Source, failure_of, result_of, unreadable_result
 from .scan_map.named_scans import with_places
 from .walk.frames import Frame, checked_times
@@ -42,7 +42,7 @@ class Taken:
 
     picture: Picture
     name: str
-    photo: Photo | None  # None of one that can't be read
+    photo: PhotoFacts | None  # None of one that can't be read
     seconds: dict[str, float]
     warnings: tuple[str, ...] = ()
     sha256: str | None = None  # of a photo that can't be read
@@ -57,7 +57,7 @@ class Prepared(NamedTuple):
     query: Query | None
 
 
-def photo_facts(picture: Picture, rig: Calibration | None) -> Photo:
+def photo_facts(picture: Picture, rig: Calibration | None) -> PhotoFacts:
     """Return what is known of a photo beside its pixels."""
     return photo_of_array(picture) if isinstance(picture, np.ndarray) else photo_of(Path(picture), rig)
 
@@ -86,7 +86,7 @@ class Walk:
         with reading_once():
             try:
                 with watch.stage("read"):
-                    panorama = replace(read_query(frame, self.read_options), focal_prior=None)  # as exact
+                    panorama = replace(read_photo(frame, self.read_options), focal_prior=None)  # as exact
                     photo = photo_facts(frame, self.read_options.rig)
             except Exception as error:
                 text, is_passing = failure_of(error)
@@ -146,7 +146,7 @@ class Walk:
         photo = None
         if document["photo"]:
             (width, height), capture_time = document["photo"][1:]
-            photo = Photo(digest, (width, height), capture_time, None)
+            photo = PhotoFacts(digest, (width, height), capture_time, None)
         warnings = tuple(document["warnings"])
         taken = Taken(picture, name, photo, document["seconds"], warnings, document["sha256"], failure)
         alone = document["alone"] and localization_in(Result.from_json(document["alone"]))
@@ -173,7 +173,7 @@ class Walk:
         taken = self.taken[k]
         if taken.failure is not None:
             return None
-        return replace(read_query(taken.picture, self.read_options), focal_prior=None)
+        return replace(read_photo(taken.picture, self.read_options), focal_prior=None)
 
     def _result(self, taken: Taken, found: Localization, walk: WalkFrame | None) -> Result:
         """The result of a frame; one that can't be read keeps its place in the walk."""

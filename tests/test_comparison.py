@@ -22,9 +22,9 @@ from piccolo.localization.comparison import (
     sample_photo,
     without_occluders,
 )
-from piccolo.localization.evaluation import is_mirrored
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.localization.verdict import is_mirrored
 from piccolo.optimize.channel_loss import BLOCK_RINGS, CHANCE, NUM_BLOCKS
 from piccolo.panorama import Panorama
 from piccolo.panorama.texels import pack_texels

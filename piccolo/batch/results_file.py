@@ -104,7 +104,7 @@ class Records:
             text = f"none of its results is of a panorama that this command names; {WAYS}"
             raise InputError(f"{self.path}: {text}")
 
-    def left(self, panoramas: Iterable[Name], digest_of: Callable[[Name], str | None]) -> Iterator[Name]:
+    def remaining(self, panoramas: Iterable[Name], digest_of: Callable[[Name], str | None]) -> Iterator[Name]:
         """Yield the panoramas without a result, as they come.
 
         One has a result if its file is as it was, by its digest, or can't be read now, and did not fail.

@@ -248,7 +248,7 @@ def main(arguments: argparse.Namespace) -> int:
         panoramas = iter(run.panoramas)
         if run.total is not None:
             panoramas = progress_bar(arguments.quiet)(panoramas, run.total, "check what is finished")
-        left = records.left(panoramas, lambda pano: sha256_of(pano, rig))
+        left = records.remaining(panoramas, lambda pano: sha256_of(pano, rig))
         num_left = None
         if run.total is not None:
             known = list(left)

@@ -259,7 +259,7 @@ def count_finished(
     records = Records(out)
     records.read(lambda name: key, paths)
     names = [name for name in paths if name in records.names or not inputs.min_distance]
-    left = list(records.left(names, lambda name: sha256_of(paths[name], rig)))
+    left = list(records.remaining(names, lambda name: sha256_of(paths[name], rig)))
     return None if left or not records.is_in_order else records.counts
 
 

@@ -15,12 +15,12 @@ from ..jobs.threads import Workers
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
 from .attempts import attempts_for, search_beyond_prior
-from .evaluation import evaluate
 from .focal_length import WIDE, calibrate, change_camera
 from .last_descent import HOPELESS_SCORE, refine_to_the_end
 from .prior import apply_prior, nothing_allowed
 from .query import prepare_query
 from .settings import METHOD, CoarseToFineSettings, MethodConfig
+from .verdict import judge
 
 GUESSES = (0.0, -0.15, 0.15)  # of the logarithm of a focal length: a fifth off is within reach of one of them
 NO_PIXEL = "the panorama: no pixel counts, all are masked"
@@ -35,15 +35,16 @@ def localize(
     watch: Stopwatch,
     method: MethodConfig = METHOD,
 ) -> Localization:
-    """Where a panorama was taken: attempts until one is sure; the best, refined to the end, is evaluated."""
-    candidates = apply_prior(scan_map, settings.prior)
-    if len(candidates.sparse) == 0:
+    """Localize a panorama: attempts until one is sure; the best, refined to the end, is judged."""
+    allowed_map = apply_prior(scan_map, settings.prior)
+    if len(allowed_map.sparse) == 0:
         return Localization(warnings=(nothing_allowed(scan_map, settings.prior),))
     if not panorama.is_valid.any():
         return Localization(warnings=(NO_PIXEL,))
     with watch.stage("search"):
-        query = prepare_query(panorama, candidates, settings, workers, method)
+        query = prepare_query(panorama, allowed_map, settings, workers, method)
     images = query.photo.images
+    # a core that is idle meanwhile makes what later steps need
     with workers.beside(images.middle, images.fine, images.full, query.photo.colors):
         hypotheses: list[Hypothesis] = []
         for num_halves, attempt in attempts_for(query):
@@ -55,8 +56,8 @@ def localize(
         with watch.stage("refine"):
             found = refine_to_the_end(query, hypotheses)
             if panorama.focal_prior is None or found.best.score < HOPELESS_SCORE:
-                return evaluate(query, found)
-            return evaluate(*calibrate(query, found))
+                return judge(query, found)
+            return judge(*calibrate(query, found))
 
 
 def has_guessed_focal(panorama: Panorama) -> bool:

@@ -45,7 +45,7 @@ class GpsPosition(NamedTuple):
     accuracy: float | None  # [m] horizontal, None if the file does not say
 
 
-class Photo(NamedTuple):
+class PhotoFacts(NamedTuple):
     """A photo's file without its pixels."""
 
     sha256: str  # of the file; of several, of their digests in the order of FACE_LETTERS or rig, one a line
@@ -73,7 +73,7 @@ def _digest(files: list[Path]) -> str:
     return digests[0] if len(files) == 1 else hashlib.sha256("\n".join(digests).encode()).hexdigest()
 
 
-def photo_of(path: Path, rig: Calibration | None = None) -> Photo:
+def photo_of(path: Path, rig: Calibration | None = None) -> PhotoFacts:
     """What a photo's file, or the first of a folder of cube faces or of a rig's pictures, says of itself.
 
     InputError if the file is missing or no picture. Metadata that are damaged count as missing.
@@ -90,7 +90,7 @@ def photo_of(path: Path, rig: Calibration | None = None) -> Photo:
         except Exception:  # Pillow raises whatever damaged metadata bring
             exif = {}
             gps = {}
-        return Photo(_digest(files), image.size, _capture_time(exif), _gps_position(gps))
+        return PhotoFacts(_digest(files), image.size, _capture_time(exif), _gps_position(gps))
 
 
 def _exif_chunk(content: bytes) -> bytes:
@@ -104,10 +104,10 @@ def _exif_chunk(content: bytes) -> bytes:
     return b""
 
 
-def photo_of_array(rgb: NDArray[np.uint8]) -> Photo:
+def photo_of_array(rgb: NDArray[np.uint8]) -> PhotoFacts:
     """The same of pixels (H, W, 3): their digest and size."""
     height, width = rgb.shape[:2]
-    return Photo(sha256_of_arrays(rgb), (width, height), None, None)
+    return PhotoFacts(sha256_of_arrays(rgb), (width, height), None, None)
 
 
 def _capture_time(exif: Mapping[int, Any]) -> str | None:

@@ -243,7 +243,7 @@ def _sphere_fraction(is_there: NDArray[np.bool_], region: CropRegion) -> float:
     return float(per_row.mean() * region.width * region.height * np.pi / 2.0)
 
 
-def read_query(
+def read_photo(
     panorama: str | PathLike[str] | NDArray[np.uint8],
     options: ReadOptions,
     is_masked: NDArray[np.bool_] | None = None,

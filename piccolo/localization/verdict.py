@@ -1,4 +1,4 @@
-"""What speaks for the pose that was found and against it, and the status that follows."""
+"""The evidence for and against the pose that was found, and the status that follows."""
 
 import math
 import operator
@@ -32,7 +32,7 @@ TELLING_STD = 0.03  # [m] of a position: what a focal length adds beyond it is t
 LAST_STEP = 0.01  # [rad, m] of Adam and the first of L-BFGS, where they take the last descent
 
 
-def evaluate(query: Query, found: Selection, fit: FocalFit | None = None) -> Localization:
+def judge(query: Query, found: Selection, fit: FocalFit | None = None) -> Localization:
     """The pose found in world coordinates, after the descent that the solver asks for, with its evidence.
 
     `fit` is that of the focal length, of a photo whose is not exact.
