@@ -6,7 +6,9 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from .errors import UsageError, print_note, run_command
+from ..jobs.memory import check_address_space
+from .errors import UsageError, print_note, raising_signals, report_error
+from .progress import log_shown
 from .start import as_started
 
 KINDS: dict[str, type] = {  # of the values, by the first metavar; of others text
@@ -107,7 +109,16 @@ def command(
         def main(argv: list[str] | None = None) -> int:
             parser = new_parser(Path(file).stem, description, epilog, exit_codes)
             add_options(parser)
-            return run_command(parse(parser, argv), run)
+            arguments = parse(parser, argv)
+            lost: list[KeyboardInterrupt] = []
+            try:
+                with log_shown(arguments.quiet), raising_signals(lost):
+                    check_address_space()
+                    exit_code = run(arguments)
+                    sys.stdout.flush()  # here, where a closed pipe is caught
+                    return exit_code
+            except (Exception, KeyboardInterrupt) as error:
+                return report_error(arguments, error, lost)
 
         return main
 

@@ -6,15 +6,14 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
 from tqdm import tqdm
 
 from ..errors import InputError, printable, text_of
-from ..jobs.memory import check_address_space, is_shortage
-from .progress import log_shown
+from ..jobs.memory import is_shortage
 from .start import EXIT_INTERRUPTED, EXIT_TERMINATED, as_started
 
 EXIT_BAD_USAGE = 2
@@ -42,25 +41,19 @@ def checking_options() -> Iterator[None]:
         raise UsageError(str(error)) from error
 
 
-def run_command(arguments: argparse.Namespace, run: Callable[[argparse.Namespace], int]) -> int:
-    """Run a command and return its exit code; an error that ends it is printed."""
-    lost: list[KeyboardInterrupt] = []
-    try:
-        with log_shown(arguments.quiet), raising_signals(lost):
-            check_address_space()
-            exit_code = run(arguments)
-            sys.stdout.flush()  # here, where a closed pipe is caught
-            return exit_code
-    except KeyboardInterrupt as stop:
-        return _stopped(arguments, stop)
-    except (OSError, InputError) as error:
-        discard_stdout()
-        if isinstance(error, BrokenPipeError) and not error.filename:  # stdout's reader has gone: say nothing
-            return EXIT_BROKEN_PIPE
-        code = EXIT_BAD_USAGE if isinstance(error, UsageError) else EXIT_BAD_INPUT
-        return print_error(arguments, text_of(error), code)
-    except Exception as error:  # the last line of defence: a code and one line for the shell
-        return _unforeseen(arguments, error, lost)
+def report_error(
+    arguments: argparse.Namespace, error: Exception | KeyboardInterrupt, lost: list[KeyboardInterrupt]
+) -> int:
+    """Print the error that ended a command, and return its exit code; `lost` is that of raising_signals."""
+    if isinstance(error, KeyboardInterrupt):
+        return _stopped(arguments, error)
+    if not isinstance(error, OSError | InputError):
+        return _unforeseen(arguments, error, lost)  # the last line of defence: a code and one line
+    discard_stdout()
+    if isinstance(error, BrokenPipeError) and not error.filename:  # stdout's reader has gone: say nothing
+        return EXIT_BROKEN_PIPE
+    code = EXIT_BAD_USAGE if isinstance(error, UsageError) else EXIT_BAD_INPUT
+    return print_error(arguments, text_of(error), code)
 
 
 def _unforeseen(arguments: argparse.Namespace, error: Exception, lost: list[KeyboardInterrupt]) -> int:
