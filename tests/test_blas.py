@@ -55,7 +55,7 @@ def test_an_error_gives_them_back(three_threads):
 
 def test_a_photo_is_localized_with_one(three_threads, monkeypatch):
     seen = []
-    monkeypatch.setattr(method, "evaluate", lambda *_: seen.append(_threads()))
+    monkeypatch.setattr(method, "judge", lambda *_: seen.append(_threads()))
     settings = CoarseToFineSettings(gravity="known")
     method.localize(rooms.scan_map(1), rooms.scene(1)[1], settings, Workers(2), Stopwatch())
     assert seen == [{1}]

@@ -9,7 +9,7 @@ import pytest
 from made_up import at, compared, place, places
 
 from piccolo.confidence.occlusion import Agreement
-from piccolo.localization import evaluation, last_descent, refinement, selection
+from piccolo.localization import last_descent, refinement, selection, verdict
 from piccolo.localization.last_descent import refine_to_the_end
 from piccolo.localization.selection import Selection
 
@@ -172,9 +172,9 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
         "estimate_covariance": lambda *_: None,
         "is_mirrored": lambda *_: False,
     }.items():
-        monkeypatch.setattr(evaluation, name, value)
+        monkeypatch.setattr(verdict, name, value)
     alternatives = at(1.0, 0.3), at(2.0, 0.2)
-    found = evaluation.evaluate(query, Selection(at(0.0, 0.6), alternatives, 0.7))
+    found = verdict.judge(query, Selection(at(0.0, 0.6), alternatives, 0.7))
     e = found.evidence
     assert (e.score, e.agreement, e.seen_fraction) == (0.6, 0.8, 1.0)
     assert (e.explained_fraction, e.contradicted_fraction) == (0.6, 0.3)
@@ -187,7 +187,7 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
     stated = [found.confidence, *(a.probability for a in found.alternatives), found.probability_none]
     assert sum(stated) == pytest.approx(1.0)
     assert stated[0] > stated[1] > stated[2]
-    alone = evaluation.evaluate(query, Selection(at(0.0, 0.6), ()))
+    alone = verdict.judge(query, Selection(at(0.0, 0.6), ()))
     assert (alone.evidence.margin, alone.evidence.alternative_matches) == (1.0, 0)
-    monkeypatch.setattr(evaluation, "sampling_loss", lambda *_: np.inf)
-    assert evaluation.evaluate(query, Selection(at(0.0, 0.6), ())).pose is None
+    monkeypatch.setattr(verdict, "sampling_loss", lambda *_: np.inf)
+    assert verdict.judge(query, Selection(at(0.0, 0.6), ())).pose is None
