@@ -10,7 +10,7 @@ from .covariance import PoseCovariance
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a confidence rests on."""
+    """The measurements that a confidence rests on."""
 
     score: float  # [0, 1] what the photo's blocks explain beyond chance; of preset paper, Agreement.score
     # lead over the best pose elsewhere in what both views show, by what it explains; 1 if there is none;

@@ -216,7 +216,7 @@ class Agreement:
 
 
 def agreement_at(points: PackedPoints, panorama: Panorama, pose: Pose) -> Agreement:
-    """How well the cloud at `pose` explains the panorama."""
+    """Measure the agreement of the panorama with the cloud seen from `pose`."""
     small = shrink(panorama, VIEW_WIDTH)
     view = render_view(points, pose, VIEW_WIDTH)
     is_shared = view.is_seen & small.is_valid

@@ -1,4 +1,4 @@
-"""What is kept between runs: the folders of compiled kernels and prepared maps, and facts of files.
+"""Caches kept between runs: the folders of compiled kernels and prepared maps, and facts of files.
 
 Nothing is deleted but files that have a name of ours, in a folder that this program has made and marked.
 
@@ -152,7 +152,7 @@ def _path_of(what: str, status: os.stat_result) -> Path | None:
 
 
 def recall(what: str, status: os.stat_result) -> str | None:
-    """What was remembered of a file by its status; None if nothing was, or the file has changed since."""
+    """Recall facts of a file by its status; None if none are kept, or the file has changed since."""
     path = _path_of(what, status)
     if path is None:
         return None

@@ -84,7 +84,7 @@ def sources_digest() -> str:
 
 @dataclass
 class Compiling:
-    """What this process has compiled, told to those who wait as the log's INFO."""
+    """The kernels that this process has compiled, reported as the log's INFO."""
 
     count: int = 0
     told: float = 0.0  # [s] when the first kernel was asked for and not found, or a line was last logged

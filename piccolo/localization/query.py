@@ -82,7 +82,7 @@ class Features(NamedTuple):
 
 @dataclass(frozen=True)
 class Cache:
-    """What has been worked out of one photo in one map; copies of a query share it, and threads."""
+    """Results that are computed once for one photo in one map; copies of a query share it, and threads."""
 
     views: RecentViews  # of the map
     comparisons: dict[bytes, Any] = field(default_factory=dict)  # `comparison.compare`, by the pose's key

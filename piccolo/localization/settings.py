@@ -44,7 +44,7 @@ class CoarseToFineSettings:
 
 
 class Beam(NamedTuple):
-    """How many poses go on to each stage."""
+    """The number of poses that go on to each stage."""
 
     num_coarse: int  # after a short descent from each start
     num_middle: int  # after the descent on prepared views

@@ -88,7 +88,7 @@ def write_plan_file(entries: Sequence[Entry], scan_map: ScanMap, out: Path, sett
 
 
 def shapes_of(document: dict[str, Any], index: int) -> Iterator[Shape]:
-    """What is drawn of a storey, in the map's frame: paths first, marks last."""
+    """The shapes drawn of a storey, in the map's frame: paths first, marks last."""
     numbered = enumerate(document["photos"], 1)
     photos = [(n, photo) for n, photo in numbered if photo["isOnPlan"] and photo["storey"] in (index, None)]
     for s in segments_of([photo for _, photo in photos]):

@@ -1,1 +1,1 @@
-"""What is prepared of a scan once, its file, and what is looked up in it."""
+"""The prepared scan, its file, and lookups in it."""

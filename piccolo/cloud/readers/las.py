@@ -141,7 +141,7 @@ def read_header(path: Path) -> LasHeader:
 
 
 class LasLayout(NamedTuple):
-    """Where a file's chunks are and how to read them."""
+    """The chunks of a file and their layout."""
 
     offset: int  # [byte] of the first chunk
     chunks: tuple[LazChunk, ...]
@@ -199,7 +199,7 @@ def _without_versions(laszip: bytes) -> list[bytes]:
 
 
 def _table(header: LasHeader, file: BinaryIO) -> tuple[int, bytes]:
-    """Where the compressed chunk table begins, and its bytes, if the file has room for what it promises.
+    """The start and bytes of the compressed chunk table, if the file has room for what it promises.
 
     A writer that could not go back says in the file's last bytes where it begins.
     """

@@ -1,4 +1,4 @@
-"""What the readers share: chunks of points as they stand in a file, and points from columns of numbers.
+"""Parts of all readers: chunks of points as they stand in a file, and points from columns of numbers.
 
 Columns are arrays (N,) of x, y, z and red, green, blue, or of x, y, z and a scalar. Colours of any type
 become 8 bits; their range follows from the declared type and is never guessed. Labels become colours in place
@@ -184,7 +184,7 @@ def _with_scalar(read_columns: ColumnReader) -> Iterator[PointsWithScalar]:
 
 
 def intensity_reader(path: Path, read_scalar: ScalarReader) -> ChunkReader:
-    """What a PointSource wants as `read_chunks`, of a reader of points and their intensity."""
+    """Return `read_chunks` of a PointSource for a reader of points and their intensity."""
     limits = functools.cache(lambda: _limits(path, read_scalar()))
 
     def read_chunks() -> Iterator[RawCloud]:
@@ -238,7 +238,7 @@ def _lower_edge(index: int) -> float:
 
 
 def label_reader(path: Path, read_scalar: ScalarReader, labels: Labels) -> ChunkReader:
-    """What a PointSource wants as `read_chunks`, of a reader of points and their labels."""
+    """Return `read_chunks` of a PointSource for a reader of points and their labels."""
 
     def read_chunks() -> Iterator[RawCloud]:
         for points, found in read_scalar():

@@ -43,7 +43,7 @@ PTS_WANTED = "wanted lines x y z intensity r g b or x y z r g b, colours 0-255"
 
 
 class LineLayout(NamedTuple):
-    """Where the lines of numbers begin, and what is in one."""
+    """The first line of numbers, and the columns of each."""
 
     columns: tuple[int, ...] = ()  # that are read
     num_columns: int | None = None  # of each line; None: there may be any more than those read
@@ -168,14 +168,14 @@ class NumberLines:
                     yield number, kept
 
     def _complaint(self, otherwise: str) -> str:
-        """What is wrong with the first broken line behind those taken, or `otherwise` if all seem right."""
+        """Describe the first broken line behind those taken, or return `otherwise` if all seem right."""
         for number, line in islice(self._numbered(), self.num_taken, None):
             if fault := self._fault(line):
                 return f"{self.path}: line {number}: {fault} ({quoted(line)}), {self.wanted}"
         return f"{self.path}: {otherwise}, {self.wanted}"
 
     def _fault(self, line: bytes) -> str:
-        """What is wrong with a line; empty if nothing is."""
+        """Describe a broken line; empty for one that is right."""
         fields = line.decode("latin-1").split(self.layout.delimiter)
         exact = self.layout.num_columns
         columns = self.layout.columns
