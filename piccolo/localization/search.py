@@ -162,7 +162,7 @@ _local = threading.local()
 
 
 def thread_block(num_views: int, num_cells: int) -> list[Samples]:
-    """Return room for `unpack_views` in the thread's own arrays: fresh memory costs as much as the products."""
+    """Return room for `unpack_views`, the thread's own: fresh memory costs as much as the products."""
     kept: list[Samples] = getattr(_local, "block", [])
     if not kept or len(kept[0]) < num_views or kept[1].shape[1] != num_cells:
         num_rows = max(BLOCK, num_views)
