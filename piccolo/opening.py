@@ -45,7 +45,7 @@ def open_scan(  # noqa: PLR0913  options by name
     Parameters
     ----------
     source
-        Path of a scan in any format of the README, or of a map by tools/prepare_map.py; or several paths,
+        Path of a scan in any format of docs/USAGE.md, or of a map by tools/prepare_map.py; or several paths,
         which are one scan; or points (N, 3) [m].
     colors
         With points: (N, 3) RGB, uint8, uint16, or floats in [0, 1].
