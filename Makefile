@@ -1,4 +1,4 @@
-# make demo          set up, make a room, localize panoramas in it, print the errors against the truth, write a report
+# make demo          set up, localize the photos of examples/flat, print the errors against the true poses, write a report
 # make test          set up, run every test but those of the report's page
 # make test-kernels  set up, run the numerical tests once without compiling and once with array bounds checked
 # make test-browser  set up, run the tests of the report's page in Chromium (apt-get install chromium npm)
@@ -19,11 +19,12 @@ $(VENV)/ready: requirements.lock requirements-formats.lock requirements-tools.lo
 	@touch $@
 
 demo: $(VENV)/ready
-	$(BIN)/python tools/make_room.py --out demo --seed 7 --points 200000 --panoramas 3 > /dev/null
-	$(BIN)/python localize.py --cloud demo/cloud.ply --pano demo/images/clean_0.jpg --out demo/pose.json --overwrite --overlay demo/overlay.png
-	$(BIN)/python localize.py --cloud demo/cloud.ply --pano demo/images --out demo/poses.jsonl --overwrite --quiet
-	$(BIN)/python tools/evaluate.py --scenes demo --results demo/poses.jsonl
-	$(BIN)/python tools/report.py --results demo/poses.jsonl --cloud demo/cloud.ply --out demo/report --title "Demo room"
+	@mkdir -p demo
+	$(BIN)/python localize.py --cloud examples/flat/cloud.ply --pano examples/flat/images/living_room.jpg --out demo/pose.json --overwrite --overlay demo/overlay.png
+	$(BIN)/python localize.py --cloud examples/flat/cloud.ply --pano examples/flat/images --out demo/poses.jsonl --overwrite --quiet
+	$(BIN)/python tools/evaluate.py --scenes examples/flat --results demo/poses.jsonl
+	$(BIN)/python tools/report.py --results demo/poses.jsonl --cloud examples/flat/cloud.ply --out demo/report --plan demo/plan.png --title "Sample flat"
+	@echo "Done: open demo/report/index.html in a browser; demo/overlay.png compares one photo with the scan."
 
 test: $(VENV)/ready
 	$(BIN)/python -m pytest -n auto --dist loadfile
