@@ -9,16 +9,17 @@ import sys
 from pathlib import Path
 
 import piccolo
-from piccolo.scan import QueryOptions
+
+Place = tuple[float, float, float]
 
 
-def read_priors(path: str) -> dict[str, QueryOptions]:
-    """The options of `Scan.localize` by the photo's name."""
-    priors: dict[str, QueryOptions] = {}
+def read_priors(path: str) -> dict[str, tuple[Place, float]]:
+    """Return the place and its radius by the photo's name."""
+    priors: dict[str, tuple[Place, float]] = {}
     with Path(path).open(newline="") as file:
         for row in csv.DictReader(file):
             near_world = float(row["x"]), float(row["y"]), float(row["z"])
-            priors[row["name"]] = {"near_world": near_world, "radius": float(row["radius"])}
+            priors[row["name"]] = near_world, float(row["radius"])
     return priors
 
 
@@ -29,7 +30,8 @@ def main(scan_path: str, folder: str, priors_path: str) -> None:
     print("name,status,confidence,x,y,z")
     for photo in sorted(Path(folder).iterdir()):
         try:
-            result = scan.localize(photo, **priors.get(photo.name, {}))
+            near_world, radius = priors.get(photo.name, (None, None))
+            result = scan.localize(photo, near_world=near_world, radius=radius)
         except piccolo.InputError as error:
             print(error, file=sys.stderr)
             continue

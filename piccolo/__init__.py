@@ -17,20 +17,59 @@ from typing import TYPE_CHECKING
 from .errors import InputError
 
 if TYPE_CHECKING:
+    from .confidence.covariance import PoseCovariance
+    from .confidence.localization import Alternative, Evidence, FocalLength
     from .geometry.pose import Pose
+    from .localization.settings import CoarseToFineSettings
     from .opening import open_scan
+    from .paper.settings import PaperSettings
     from .report.build import write_report
-    from .result import Result
+    from .result import Result, Source
     from .scan import Scan
+    from .scan_map.prior import GpsPrior
+    from .scan_walk import Walk
+    from .walk.localize import Alone, Gap, WalkFrame
 
-__all__ = ["InputError", "Pose", "Result", "Scan", "__version__", "open_scan", "write_report"]
 MODULES = {
+    "Alone": ".walk.localize",
+    "Alternative": ".confidence.localization",
+    "CoarseToFineSettings": ".localization.settings",
+    "Evidence": ".confidence.localization",
+    "FocalLength": ".confidence.localization",
+    "Gap": ".walk.localize",
+    "GpsPrior": ".scan_map.prior",
+    "PaperSettings": ".paper.settings",
     "Pose": ".geometry.pose",
+    "PoseCovariance": ".confidence.covariance",
     "Result": ".result",
     "Scan": ".scan",
+    "Source": ".result",
+    "Walk": ".scan_walk",
+    "WalkFrame": ".walk.localize",
     "open_scan": ".opening",
     "write_report": ".report.build",
 }
+__all__ = [
+    "Alone",
+    "Alternative",
+    "CoarseToFineSettings",
+    "Evidence",
+    "FocalLength",
+    "Gap",
+    "GpsPrior",
+    "InputError",
+    "PaperSettings",
+    "Pose",
+    "PoseCovariance",
+    "Result",
+    "Scan",
+    "Source",
+    "Walk",
+    "WalkFrame",
+    "__version__",
+    "open_scan",
+    "write_report",
+]
 
 
 def __getattr__(name: str) -> object:

@@ -9,21 +9,25 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from .arguments import check_arguments
 from .cloud import open_cloud
 from .cloud.settings import METRES, CloudSettings, UpAxis
 from .cloud.stream import ARRAYS, CloudStream, stream_of_arrays
 from .errors import InputError
 from .files.cache import sha256_of_files
+from .geometry.colors import Labels
 from .jobs.stopwatch import Stopwatch
 from .jobs.threads import ProgressCallback, Workers, no_progress, num_cores, progress_to
 from .localization.settings import CoarseToFineSettings
+from .opened_scan import File, OpenedScan, Settings
 from .paper.localize import PaperMap
 from .paper.localize import prepare as prepare_by_paper
-from .scan import File, Scan, Settings
+from .scan import Scan
 from .scan_map.named_scans import check_within
 from .scan_map.open_map import CachePolicy, open_map, prepared_map_among
 from .scan_map.scan_map import ScanMap, prepare_map
 
+Units = Literal["mm", "cm", "m", "ft", "us-ft"]
 DEFAULT = CoarseToFineSettings()
 
 
@@ -31,9 +35,11 @@ def open_scan(  # noqa: PLR0913  options by name
     source: File | Sequence[File] | NDArray[np.floating[Any]],
     colors: NDArray[Any] | None = None,
     *,
-    units: Literal["mm", "cm", "m", "ft", "us-ft"] = "m",
+    units: Units = "m",
     up: UpAxis = "auto",
     intensity_as_gray: bool = False,
+    labels: bool = False,
+    ignore_labels: Sequence[int] = (),
     crs: str | None = None,
     cache: bool | File = True,
     num_threads: int | None = None,
@@ -55,6 +61,10 @@ def open_scan(  # noqa: PLR0913  options by name
         The axis that points up; "auto" is the file's: z, in glTF y.
     intensity_as_gray
         For files without colours.
+    labels
+        Semantic labels replace colours, in the scan's files and in panoramas.
+    ignore_labels
+        Labels left out of the scan, and masked in panoramas.
     crs
         Coordinate system, such as EPSG:25832, for photos with GPS; by default what the file names.
     cache
@@ -80,21 +90,28 @@ def open_scan(  # noqa: PLR0913  options by name
     room/images/clean_0.jpg localized
     room/images/clean_1.jpg localized
     """
-    if units not in METRES:
-        raise InputError(f"units: found {units!r}, wanted one of {', '.join(METRES)}")
+    check_arguments(open_scan, locals())
     show = progress_to(progress) if progress else no_progress
     workers = Workers(num_cores() if num_threads is None else num_threads, show)
-    cloud_settings = CloudSettings(METRES[units], up, intensity_as_gray, crs=crs)
+    cloud_settings = CloudSettings(
+        METRES[units], up, intensity_as_gray, _make_labels(labels, ignore_labels), crs
+    )
     if isinstance(source, np.ndarray):
         cloud = stream_of_arrays(source, colors)
-        return scan_of(cloud, str(ARRAYS), cloud_settings, settings, workers, Stopwatch())
+        return Scan(scan_of(cloud, str(ARRAYS), cloud_settings, settings, workers, Stopwatch()))
     if colors is not None:
         raise InputError("colors: given beside files, wanted with an array of points only")
     paths = [Path(source)] if isinstance(source, str | PathLike) else [Path(path) for path in source]
     if not paths:
         raise InputError("open_scan: found no file, wanted a scan's path")
     policy = CachePolicy(cache is not False, None if isinstance(cache, bool) else Path(cache))
-    return open_files(paths, cloud_settings, settings, policy, workers)
+    return Scan(open_files(paths, cloud_settings, settings, policy, workers))
+
+
+def _make_labels(labels: bool, ignore_labels: Sequence[int]) -> Labels | None:
+    if ignore_labels and not labels:
+        raise InputError("`ignore_labels`: only with `labels`")
+    return Labels(tuple(sorted({int(label) for label in ignore_labels}))) if labels else None
 
 
 def open_files(
@@ -103,14 +120,14 @@ def open_files(
     settings: Settings,
     cache: CachePolicy,
     workers: Workers,
-) -> Scan:
+) -> OpenedScan:
     """Open the files of a scan; all options are objects."""
     watch = Stopwatch()
     name = str(paths[0]) if len(paths) == 1 else tuple(map(str, paths))
     if isinstance(settings, CoarseToFineSettings):
         scan_map = open_map(paths, cloud_settings, cache, workers, watch, settings.prior)
         check_within(scan_map, settings.prior.within)
-        return Scan(scan_map, name, cloud_settings, settings, workers, watch.seconds)
+        return OpenedScan(scan_map, name, cloud_settings, settings, workers, watch.seconds)
     if map_path := prepared_map_among(paths):
         raise InputError(f"{map_path}: a prepared map; the preset paper needs the cloud itself")
     with watch.stage("read"):
@@ -126,7 +143,7 @@ def scan_of(
     settings: Settings,
     workers: Workers,
     watch: Stopwatch,
-) -> Scan:
+) -> OpenedScan:
     """Prepare a scan for the method of the settings."""
     prepared: ScanMap | PaperMap
     if isinstance(settings, CoarseToFineSettings):
@@ -140,4 +157,4 @@ def scan_of(
         with watch.stage("prepare"):
             prepared = prepare_by_paper(points, settings)
     prepared = replace(prepared, scan_sha256=cloud.sha256)
-    return Scan(prepared, name, cloud_settings, settings, workers, watch.seconds)
+    return OpenedScan(prepared, name, cloud_settings, settings, workers, watch.seconds)

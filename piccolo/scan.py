@@ -1,145 +1,155 @@
-"""A scan that photos are localized in: what `import piccolo` gives."""
+"""A scan that photos are localized in: `import piccolo` gives it."""
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
-from os import PathLike
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, TypedDict, Unpack
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .camera import Calibration
+from .arguments import check_arguments
 from .camera.files import read_calibration, read_rig
-from .cloud.settings import CloudSettings
 from .cloud.soa import PackedPoints
-from .confidence.confidence import LOCALIZED
-from .confidence.occlusion import occlusion_mask
 from .errors import InputError
-from .files.json_file import reading_once
 from .geometry.pose import Pose
 from .geometry.rotations import Gravity
-from .jobs.stopwatch import Stopwatch
-from .jobs.threads import Workers
-from .localization.localize import has_guessed_focal, localize, localize_guessed
 from .localization.settings import CoarseToFineSettings
+from .opened_scan import File, OpenedScan, Settings, failed_result
 from .optimize.refine import Solver
-from .panorama import ReadOptions, read_photo
+from .panorama import ReadOptions
 from .panorama.model import Projection
-from .panorama.photo import PhotoFacts
-from .paper.localize import PaperMap
-from .paper.localize import localize as localize_by_paper
-from .paper.settings import PaperSettings
-from .result import Result, Source, result_of
-from .scan_map.named_scans import check_within, with_places
-from .scan_map.prior import GpsPrior, Prior, gps_prior
+from .result import Result
+from .scan_map.open_map import write_map
+from .scan_map.prior import Prior
 from .scan_map.scan_map import ScanMap
-from .scan_walk import Walk, WalkAbout, photo_facts
+from .scan_walk import Walk
 from .walk.frames import MAX_ACCELERATION, MAX_SPEED, Motion
-from .walk.tracker import Tracker
 
-LABELS_WARNING = "labels: the confidence was learnt on colours, and is a rough guide only"
-File = str | PathLike[str]
-Settings = CoarseToFineSettings | PaperSettings
-
-
-class QueryOptions(TypedDict, total=False):
-    """Options of `Scan.localize` about a photo; all may be left out."""
-
-    mask: File | NDArray[np.bool_]  # what is to be ignored: white pixels of a picture, True of an array
-    mask_nadir_deg: float  # the cap of this half angle about the camera's down axis is ignored
-    fov_deg: float  # horizontal field of view of a picture that is a part of the sphere
-    projection: Projection  # of the picture: "equirectangular", "pinhole" or "fisheye"
-    focal_px: float  # focal length of a pinhole photo [px]
-    camera: File  # calibration of the camera, see docs/CAMERAS.md
-    rig: File  # the same of several cameras; the panorama is the folder of one instant's pictures
-    gravity_vector: tuple[float, float, float]  # down, in the camera's axes
-    refine_focal: bool  # the focal length is a first guess
-    cube_order: str  # the picture is six cube faces in this order, such as "rludfb"
-    use_gps: bool  # a GPS position in the file narrows the search (default), or not
-    gravity: Gravity  # "known": upright camera, "unknown": any rotation, "auto": both are tried
-    solver: Solver  # of the last descent
-    near_world: tuple[float, float, float]  # [m] the camera is within `radius` of this
-    radius: float  # [m]
-    height: tuple[float, float]  # [m] least and most above the floor
-    heading_deg: float  # of the image centre, clockwise from the cloud's +y
-    heading_tolerance_deg: float
-    within: tuple[str, ...]  # names of the map's scans that the camera may be in
-    min_confidence: float  # below it a pose is not called localized
-
-
+Image = NDArray[np.uint8]  # (H, W, 3) RGB
+Mask = NDArray[np.bool_]  # (H, W)
 READ_FIELDS = {f.name for f in fields(ReadOptions)}
 PRIOR_FIELDS = {f.name for f in fields(Prior)}
+SETTINGS_FIELDS = {"gravity", "solver", "min_confidence"}
 
 
-def parse_options(
-    options: QueryOptions, settings: Settings, cloud_settings: CloudSettings
-) -> tuple[ReadOptions, Settings, NDArray[np.bool_] | None]:
-    """Return options of a photo as objects, beside the settings of all; and the mask, if it is an array."""
-    known = QueryOptions.__annotations__
-    if unknown := sorted(options.keys() - known.keys()):
-        raise TypeError(f"found no option {unknown[0]!r}, wanted one of {', '.join(known)}")
-    given: dict[str, Any] = dict(options)
-    is_masked = given.pop("mask") if isinstance(given.get("mask"), np.ndarray) else None
-    if "mask" in given:
-        given["mask"] = Path(given["mask"])
-    if prior := {name: given.pop(name) for name in PRIOR_FIELDS & given.keys()}:
-        given["prior"] = _make_prior(prior, settings)
-    if "camera" in given and "rig" in given:
-        raise InputError("camera, rig: wanted only one of them")
-    if "camera" in given:
-        given["calibration"] = read_calibration(Path(given.pop("camera")))
-    if "rig" in given:
-        given["calibration"] = read_rig(Path(given.pop("rig")))
-    reading = {k: given.pop(k) for k in READ_FIELDS & given.keys()}
-    return ReadOptions(labels=cloud_settings.labels, **reading), replace(settings, **given), is_masked
-
-
-def _make_prior(given: dict[str, Any], settings: Settings) -> Prior:
-    """Return the prior of some options; InputError if the method has none, or they mean nothing."""
-    if not isinstance(settings, CoarseToFineSettings):
-        raise InputError(f"{min(given)}: not an option of the preset paper")
-    within = given.get("within", ())
-    if isinstance(within, str):
-        raise InputError(f"within: found the text {within!r}, wanted a list of names")
-    return Prior(**given | {"within": tuple(within)})
-
-
-@dataclass(frozen=True)
 class Scan:
     """A prepared scan. `open_scan` makes one; it may be used from several threads at once."""
 
-    prepared: ScanMap | PaperMap = field(repr=False)
-    name: str | tuple[str, ...]  # path as given, or the paths of several files that are one scan
-    cloud_settings: CloudSettings
-    settings: Settings  # of photos that say nothing else
-    workers: Workers
-    seconds: dict[str, float]  # spent once, on the scan
+    def __init__(self, opened: OpenedScan) -> None:
+        self._opened = opened
+
+    def __repr__(self) -> str:
+        """Return the scan's name."""
+        return f"Scan({self.name!r})"
+
+    @property
+    def name(self) -> str | tuple[str, ...]:
+        """Path as given, or the paths of several files that are one scan."""
+        return self._opened.name
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Seconds spent on the scan, by stage."""
+        return self._opened.seconds
 
     @property
     def points(self) -> PackedPoints:
         """Coloured points of the scan, in the frame of `from_world`, for pictures."""
-        return self.prepared.points
+        return self._opened.points
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Lines that the user should read about the scan."""
-        return self.prepared.warnings
+        return self._opened.warnings
 
     def from_world(self, pose: Pose) -> Pose:
-        """A pose of the world in the frame of `points`."""
-        return self.prepared.from_world(pose)
+        """Return a pose of the world in the frame of `points`."""
+        return self._opened.from_world(pose)
 
-    def localize(self, panorama: File | NDArray[np.uint8], **options: Unpack[QueryOptions]) -> Result:
+    def save(self, path: File) -> None:
+        """Write the prepared map, which `open_scan` opens in place of the scan's files.
+
+        Raises InputError for the preset paper, and for a part of a scan too large to prepare as a whole.
+        """
+        check_arguments(Scan.save, locals())
+        if not isinstance(self._opened.prepared, ScanMap):
+            raise InputError("save: found a scan of the preset paper, wanted one of the default method")
+        write_map(self._opened.prepared, Path(path), self._opened.workers)
+
+    def localize(  # noqa: PLR0913  options by name
+        self,
+        panorama: File | Image,
+        *,
+        mask: File | Mask | None = None,
+        mask_nadir_deg: float | None = None,
+        fov_deg: float | None = None,
+        projection: Projection | None = None,
+        focal_px: float | None = None,
+        camera: File | None = None,
+        rig: File | None = None,
+        gravity_vector: tuple[float, float, float] | None = None,
+        refine_focal: bool | None = None,
+        cube_order: str | None = None,
+        use_gps: bool | None = None,
+        gravity: Gravity | None = None,
+        solver: Solver | None = None,
+        near_world: tuple[float, float, float | None] | None = None,
+        radius: float | None = None,
+        height: tuple[float, float] | None = None,
+        heading_deg: float | None = None,
+        heading_tolerance_deg: float | None = None,
+        within: Sequence[str] | None = None,
+        min_confidence: float | None = None,
+    ) -> Result:
         """Find where a 360-degree photo was taken.
+
+        An option that is None is as in the settings of `open_scan`, or as the photo's file says.
 
         Parameters
         ----------
         panorama
             Path of a picture (JPEG, PNG, TIFF, WebP, HEIC) or of a folder of six cube faces; or an
             equirectangular image (H, W, 3), W = 2 H, RGB in 8 bits.
-        **options
-            See QueryOptions; what is not given is as in `settings`.
+        mask
+            White pixels of a picture, or True of an array, are ignored. Masks of COLMAP, OpenSfM and
+            nerfstudio are the other way round (black is ignored): invert them.
+        mask_nadir_deg
+            The cap of this half angle about the camera's down axis is ignored.
+        fov_deg
+            Horizontal field of view of a picture that is a part of the sphere.
+        projection
+            Of the picture.
+        focal_px
+            Focal length of a pinhole photo [px].
+        camera
+            Calibration of the camera, see docs/CAMERAS.md.
+        rig
+            Calibration of several cameras; `panorama` is the folder of one instant's pictures.
+        gravity_vector
+            Down, in the camera's axes.
+        refine_focal
+            The focal length is a first guess.
+        cube_order
+            The picture is six cube faces in this order, such as "rludfb".
+        use_gps
+            A GPS position in the file narrows the search (default), or not.
+        gravity
+            "known": upright camera; "unknown": any rotation; "auto": both are tried.
+        solver
+            Of the last descent.
+        near_world, radius
+            The camera is within `radius` [m] of this place [m]; a z of None is any height.
+        height
+            Least and most [m] above the floor.
+        heading_deg
+            Of the image centre, clockwise from the scan's +y.
+        heading_tolerance_deg
+            Largest error of `heading_deg`.
+        within
+            Names of the map's scans that the camera may be in.
+        min_confidence
+            A pose with less is not called localized.
 
         Returns
         -------
@@ -150,7 +160,7 @@ class Scan:
         Raises
         ------
         InputError
-            The picture can't be read, or an option means nothing.
+            The picture can't be read, or an option is invalid.
 
         Examples
         --------
@@ -159,143 +169,193 @@ class Scan:
         >>> result.status, result.pose.center_world.round(2)
         ('localized', array([2.6 , 3.17, 1.21]))
         """
-        parsed = parse_options(options, self.settings, self.cloud_settings)
-        return self.localize_query(panorama, *parsed)
+        read_options, settings, is_masked = self._parse(check_arguments(Scan.localize, locals()))
+        return self._opened.localize_query(panorama, read_options, settings, is_masked)
 
-    def localize_many(
-        self, panoramas: Iterable[File | NDArray[np.uint8]], **options: Unpack[QueryOptions]
-    ) -> Iterator[Result]:
-        """Yield the result of each panorama in order, as it comes; options as in `localize`."""
-        for panorama in panoramas:
-            yield self.localize(panorama, **options)
-
-    def track(
+    def localize_many(  # noqa: PLR0913  options by name
         self,
+        panoramas: Iterable[File | Image],
+        *,
+        mask: File | Mask | None = None,
+        mask_nadir_deg: float | None = None,
+        fov_deg: float | None = None,
+        projection: Projection | None = None,
+        focal_px: float | None = None,
+        camera: File | None = None,
+        rig: File | None = None,
+        gravity_vector: tuple[float, float, float] | None = None,
+        refine_focal: bool | None = None,
+        cube_order: str | None = None,
+        use_gps: bool | None = None,
+        gravity: Gravity | None = None,
+        solver: Solver | None = None,
+        near_world: tuple[float, float, float | None] | None = None,
+        radius: float | None = None,
+        height: tuple[float, float] | None = None,
+        heading_deg: float | None = None,
+        heading_tolerance_deg: float | None = None,
+        within: Sequence[str] | None = None,
+        min_confidence: float | None = None,
+    ) -> Iterator[Result]:
+        """Return an iterator over the results of panoramas, in order; options as in `localize`.
+
+        The status of a photo that can't be read is "unreadable", or "failed" if another try may succeed.
+        """
+        read_options, settings, is_masked = self._parse(check_arguments(Scan.localize_many, locals()))
+        self._opened.check_options(read_options, settings)
+
+        def localize(panorama: File | Image) -> Result:
+            try:
+                return self._opened.localize_query(panorama, read_options, settings, is_masked)
+            except Exception as error:
+                return failed_result(self._opened, panorama, error, read_options, settings)
+
+        return map(localize, panoramas)
+
+    def track(  # noqa: PLR0913  options by name
+        self,
+        *,
         max_speed: float | None = None,
         max_acceleration: float = MAX_ACCELERATION,
-        **options: Unpack[QueryOptions],
+        mask: File | None = None,
+        mask_nadir_deg: float | None = None,
+        fov_deg: float | None = None,
+        projection: Projection | None = None,
+        focal_px: float | None = None,
+        camera: File | None = None,
+        rig: File | None = None,
+        gravity_vector: tuple[float, float, float] | None = None,
+        cube_order: str | None = None,
+        use_gps: bool | None = None,
+        gravity: Gravity | None = None,
+        solver: Solver | None = None,
+        near_world: tuple[float, float, float | None] | None = None,
+        radius: float | None = None,
+        height: tuple[float, float] | None = None,
+        heading_deg: float | None = None,
+        heading_tolerance_deg: float | None = None,
+        within: Sequence[str] | None = None,
+        min_confidence: float | None = None,
     ) -> Walk:
         """Follow a camera that is carried through the scan: `add` each frame as it comes.
 
         Parameters
         ----------
         max_speed
-            [m/s] at which it is carried at most (2 by default); where frames have no times, [m] from one to
-            the next, by default as the poses found of them tell.
+            Largest speed [m/s] (2 by default); for frames without times, the largest distance [m] between
+            consecutive frames, by default estimated from their poses.
         max_acceleration
-            [m/s^2] standard deviation along each axis; it smooths the path of `finish`.
-        **options
-            As in `localize`, of all frames; not `refine_focal`, and `mask` as a path.
+            Standard deviation [m/s^2] along each axis; it smooths the path of `finish`.
+        mask
+            As in `localize`, like all other parameters; of all frames.
         """
-        read_options, settings, is_masked = parse_options(options, self.settings, self.cloud_settings)
-        if is_masked is not None:
-            raise InputError("mask: found an array, wanted the path of a picture in a walk")
-        speed = MAX_SPEED if max_speed is None else max_speed
-        motion = Motion(speed, max_acceleration, is_guess=max_speed is None)
-        return self.walk(read_options, settings, motion)
+        given = check_arguments(Scan.track, locals())
+        return self._track(given)
 
-    def localize_walk(
+    def localize_walk(  # noqa: PLR0913  options by name
         self,
-        frames: Iterable[File | NDArray[np.uint8]],
-        times: Sequence[float] | None = None,
+        frames: Iterable[File | Image],
+        times: Sequence[float] | NDArray[np.floating[Any]] | None = None,
+        *,
         max_speed: float | None = None,
         max_acceleration: float = MAX_ACCELERATION,
-        **options: Unpack[QueryOptions],
+        mask: File | None = None,
+        mask_nadir_deg: float | None = None,
+        fov_deg: float | None = None,
+        projection: Projection | None = None,
+        focal_px: float | None = None,
+        camera: File | None = None,
+        rig: File | None = None,
+        gravity_vector: tuple[float, float, float] | None = None,
+        cube_order: str | None = None,
+        use_gps: bool | None = None,
+        gravity: Gravity | None = None,
+        solver: Solver | None = None,
+        near_world: tuple[float, float, float | None] | None = None,
+        radius: float | None = None,
+        height: tuple[float, float] | None = None,
+        heading_deg: float | None = None,
+        heading_tolerance_deg: float | None = None,
+        within: Sequence[str] | None = None,
+        min_confidence: float | None = None,
     ) -> list[Result]:
         """Return the results of a walk's frames, in order, each of which narrows the others.
 
         `times` [s] rise; without them only the order counts. The others are as in `track`.
         """
-        walk = self.track(max_speed, max_acceleration, **options)
+        given = check_arguments(Scan.localize_walk, locals())
+        given.pop("frames")
+        given.pop("times", None)
+        walk = self._track(given)
         taken = list(frames)
         if times is not None and len(times) != len(taken):
-            raise InputError(f"times: found {len(times)} of {len(taken)} frames, wanted one of each")
+            raise InputError(f"`times`: found {len(times)} of {len(taken)} frames, wanted one of each")
         for k, frame in enumerate(taken):
             walk.add(frame, None if times is None else times[k])
         return walk.finish()
 
-    def walk(self, read_options: ReadOptions, settings: Settings, motion: Motion) -> Walk:
-        """Return a walk with all options as objects, as `track` does."""
-        if not isinstance(self.prepared, ScanMap) or not isinstance(settings, CoarseToFineSettings):
-            raise InputError("walks: not of the preset paper")
-        if read_options.refine_focal:
-            raise InputError("--refine-focal: not an option of walks; refine it with one photo")
-        check_within(self.prepared, settings.prior.within)
-        quiet = Workers(self.workers.num_threads, warn=self.workers.warn)
-        tracker = Tracker(self.prepared, settings, quiet, motion)
-        repeated = settings_json(settings, self.cloud_settings, read_options)
-        about = WalkAbout(self.name, self.warnings, {**repeated, "walk": asdict(motion)})
-        return Walk(tracker, read_options, about)
-
-    def occlusion_mask(
-        self, panorama: File | NDArray[np.uint8], pose: Pose, read_options: ReadOptions | None = None
+    def occlusion_mask(  # noqa: PLR0913  options by name
+        self,
+        panorama: File | Image,
+        pose: Pose,
+        *,
+        mask: File | Mask | None = None,
+        mask_nadir_deg: float | None = None,
+        fov_deg: float | None = None,
+        projection: Projection | None = None,
+        focal_px: float | None = None,
+        camera: File | None = None,
+        rig: File | None = None,
+        gravity_vector: tuple[float, float, float] | None = None,
+        refine_focal: bool | None = None,
+        cube_order: str | None = None,
     ) -> NDArray[np.uint8]:
         """Return the pixels of a photo that contradict the scan at a pose: (H, W), of the full sphere.
 
-        255 where it contradicts, 0 where the scan explains it, 128 where one of them shows nothing.
+        255 where it contradicts, 0 where the scan explains it, 128 where one of them shows nothing. Options
+        are as in `localize`.
         """
-        picture = read_photo(panorama, read_options or ReadOptions(labels=self.cloud_settings.labels))
-        return occlusion_mask(self.points, picture, self.from_world(pose))
+        given = check_arguments(Scan.occlusion_mask, locals())
+        given.pop("pose")
+        read_options, _, is_masked = self._parse(given)
+        return self._opened.occlusion_mask(panorama, pose, read_options, is_masked)
 
-    def localize_query(
-        self,
-        panorama: File | NDArray[np.uint8],
-        read_options: ReadOptions,
-        settings: Settings,
-        is_masked: NDArray[np.bool_] | None = None,
-        calibration: Calibration | None = None,
-    ) -> Result:
-        """Localize a photo, all options as objects; apart a mask that is an array, and the photo's camera."""
-        watch = Stopwatch()
-        repeated = settings_json(settings, self.cloud_settings, read_options)
-        if calibration is not None and read_options.calibration is None:
-            read_options = replace(read_options, calibration=calibration)
-        with watch.stage("read"), reading_once():
-            picture = read_photo(panorama, read_options, is_masked)
-            photo = photo_facts(panorama, read_options.rig)
-        gps = None
-        if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
-            check_within(self.prepared, settings.prior.within)
-            attempts: list[tuple[CoarseToFineSettings, GpsPrior | None]] = [(settings, None)]
-            if read_options.use_gps and (gps := self.gps_prior_of(photo, settings)):
-                near = replace(settings, prior=gps.applied_to(settings.prior))
-                attempts = [(near, gps), (settings, replace(gps, is_used=False))]
-            run = localize_guessed if has_guessed_focal(picture) else localize
-            for tried, gps in attempts:  # noqa: B007  near the GPS position, or else anywhere
-                found = run(self.prepared, picture, tried, self.workers, watch)
-                if found.status == LOCALIZED:
-                    break
-            found = with_places(self.prepared, found)
-        elif isinstance(self.prepared, PaperMap) and isinstance(settings, PaperSettings):
-            if read_options.refine_focal:
-                raise InputError("--refine-focal: not an option of the preset paper")
-            found = localize_by_paper(self.prepared, picture, settings, self.workers, watch)
-        else:
-            raise InputError("settings: of another method than the one that the scan was prepared for")
-        digest = self.prepared.scan_sha256 or None
-        return result_of(
-            found,
-            cloud=self.name,
-            pano="array" if isinstance(panorama, np.ndarray) else str(panorama),
-            seconds=watch.seconds,
-            settings=repeated,
-            warnings=self.warnings + picture.warnings + ((LABELS_WARNING,) if read_options.labels else ()),
-            source=Source(digest, photo.sha256, photo.image_size, photo.capture_time),
-            gps_prior=gps,
-            cameras=found.cameras or picture.cameras,
-        )
+    def _track(self, given: dict[str, Any]) -> Walk:
+        speed = given.pop("max_speed", None)
+        acceleration = given.pop("max_acceleration")
+        read_options, settings, _ = self._parse(given)
+        motion = Motion(MAX_SPEED if speed is None else speed, acceleration, is_guess=speed is None)
+        return self._opened.walk(read_options, settings, motion)
 
-    def gps_prior_of(self, photo: PhotoFacts, settings: CoarseToFineSettings) -> GpsPrior | None:
-        """The photo's GPS position in the scan; None if it has none, or a position is given anyway."""
-        crs = self.cloud_settings.crs or getattr(self.prepared, "crs", "")
-        if photo.gps is None or not crs or settings.prior.near_world is not None:
-            return None
-        return gps_prior(photo.gps, crs, self.cloud_settings.scale)
+    def _parse(self, given: Mapping[str, Any]) -> tuple[ReadOptions, Settings, Mask | None]:
+        """Return options of a photo as objects; and the mask, if it is an array."""
+        reading = {name: given[name] for name in READ_FIELDS & given.keys()}
+        mask = reading.pop("mask", None)
+        is_masked = mask if isinstance(mask, np.ndarray) else None
+        if mask is not None and is_masked is None:
+            reading["mask"] = Path(mask)
+        if "camera" in given and "rig" in given:
+            raise InputError("`camera`, `rig`: found both, wanted one of them")
+        if "camera" in given:
+            reading["calibration"] = read_calibration(Path(given["camera"]))
+        if "rig" in given:
+            reading["calibration"] = read_rig(Path(given["rig"]))
+        opened = self._opened
+        settings = {name: given[name] for name in SETTINGS_FIELDS & given.keys()}
+        if prior := {name: given[name] for name in PRIOR_FIELDS & given.keys()}:
+            settings["prior"] = _make_prior(prior, opened.settings)
+        read_options = ReadOptions(labels=opened.cloud_settings.labels, **reading)
+        return read_options, _replace_settings(opened.settings, settings), is_masked
 
 
-def settings_json(
-    settings: Settings, cloud_settings: CloudSettings, read_options: ReadOptions
-) -> dict[str, object]:
-    """Return the settings that a result repeats."""
-    how = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(read_options).items()}
-    return {**settings.to_json(), "cloud": asdict(cloud_settings), "panorama": how}
+def _replace_settings(settings: Settings, given: dict[str, Any]) -> Settings:
+    if unknown := given.keys() - {f.name for f in fields(settings)}:
+        raise InputError(f"`{min(unknown)}`: not an option of the preset paper")
+    return replace(settings, **given)
+
+
+def _make_prior(given: dict[str, Any], settings: Settings) -> Prior:
+    """Return the prior of some options; InputError if the method has none, or they mean nothing."""
+    if not isinstance(settings, CoarseToFineSettings):
+        raise InputError(f"`{min(given)}`: not an option of the preset paper")
+    return Prior(**given | {"within": tuple(given.get("within", ()))})

@@ -22,6 +22,7 @@ LAYERS = [
     "batch",
     "opening",
     "scan",
+    "opened_scan",
     "scan_walk",
     "result",
     "walk",
@@ -41,6 +42,7 @@ LAYERS = [
     "files",
     "jobs",
     "optional",
+    "arguments",
     "errors",
 ]
 

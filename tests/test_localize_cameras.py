@@ -23,6 +23,7 @@ from piccolo.cloud.settings import CloudSettings
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors
 from piccolo.jobs.threads import Workers
 from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.opened_scan import OpenedScan
 from piccolo.panorama import ReadOptions, read_panorama
 from piccolo.result import Result, read_results
 from piccolo.scan import Scan
@@ -36,7 +37,7 @@ SEED = 5
 
 @functools.lru_cache
 def scan():
-    return Scan(scan_map(SEED), "room", CloudSettings(), CoarseToFineSettings(), Workers(2), {})
+    return Scan(OpenedScan(scan_map(SEED), "room", CloudSettings(), CoarseToFineSettings(), Workers(2), {}))
 
 
 @functools.lru_cache

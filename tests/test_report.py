@@ -15,7 +15,7 @@ from report_scenes import HOSTILE, STOREY, House, lifted, mixed_house
 import piccolo
 from piccolo.cli import report
 from piccolo.errors import InputError
-from piccolo.report.entries import names_of, read_entries, short_names_of
+from piccolo.report.entries import entries_of, names_of, short_names_of
 from piccolo.scenes.export.video import writing_video
 
 STOREYS = ["--storeys", "Ground floor", "First floor"]
@@ -223,7 +223,7 @@ def test_names_are_short_and_different(tmp_path):
     house = House(tmp_path, 128)
     for name in ("a.jpg", "b.jpg", "a.jpg"):
         house.add(0, name)
-    assert names_of(read_entries([house.write_results()])) == ["a.jpg", "b.jpg", "a.jpg (2)"]
+    assert names_of(entries_of([house.write_results()])) == ["a.jpg", "b.jpg", "a.jpg (2)"]
 
 
 def test_short_names_have_folders_where_they_would_repeat():

@@ -1,6 +1,8 @@
 """The API: what options mean, and what is refused. docs/API.md and examples/ are run by test_examples.py."""
 
+import dataclasses
 import hashlib
+import inspect
 
 import numpy as np
 import pytest
@@ -21,8 +23,8 @@ def test_options_that_are_none_are_named(scan):
     points = np.zeros((2, 3))
     for options, error, text in (
         ({"foo": 3}, TypeError, "unexpected keyword argument 'foo'"),
-        ({"units": "inch"}, piccolo.InputError, "units: found 'inch', wanted one of mm, cm, m"),
-        ({"up": "w"}, piccolo.InputError, "up: found 'w', wanted one of auto, z"),
+        ({"units": "inch"}, piccolo.InputError, "`units`: found 'inch', wanted one of mm, cm, m"),
+        ({"up": "w"}, piccolo.InputError, "`up`: found 'w', wanted one of auto, z"),
         ({"num_threads": 0}, piccolo.InputError, "num_threads: found 0"),
     ):
         with pytest.raises(error, match=text):
@@ -30,14 +32,14 @@ def test_options_that_are_none_are_named(scan):
     with pytest.raises(piccolo.InputError, match="found no file"):
         piccolo.open_scan([])
     for options, error, text in (
-        ({"foo": 3}, TypeError, "found no option 'foo', wanted one of mask, mask_nadir_deg"),
-        ({"gravity": "Known"}, piccolo.InputError, "gravity: found 'Known', wanted one of auto"),
+        ({"foo": 3}, TypeError, "unexpected keyword argument 'foo'"),
+        ({"gravity": "Known"}, piccolo.InputError, "`gravity`: found 'Known', wanted one of auto"),
         ({"mask": np.ones((3, 3), bool)}, piccolo.InputError, "mask: wanted an array"),
         ({"fov_deg": 90.0}, piccolo.InputError, "go with files"),
     ):
         with pytest.raises(error, match=text):
             scan.localize(np.zeros((64, 128, 3), np.uint8), **options)
-    with pytest.raises(piccolo.InputError, match="mask: found an array, wanted the path"):
+    with pytest.raises(piccolo.InputError, match=r"`mask`: found bool of shape \(3, 3\), wanted a path"):
         scan.track(mask=np.zeros((3, 3), bool))
     with pytest.raises(piccolo.InputError, match="panorama: found float64 of shape"):
         scan.localize(np.zeros((64, 128, 3)))
@@ -63,7 +65,84 @@ def test_a_scan_is_known_by_its_bytes(tmp_path, scan):
     np.savetxt(path, np.hstack([cloud.points[::50], cloud.colors[::50]]), fmt="%.3f")
     expected = hashlib.sha256(path.read_bytes()).hexdigest()
     for options in ({"cache": False}, {"settings": PaperSettings()}):
-        assert piccolo.open_scan(path, **options).prepared.scan_sha256 == expected
-    digest = scan.prepared.scan_sha256
+        assert piccolo.open_scan(path, **options)._opened.prepared.scan_sha256 == expected
+    digest = scan._opened.prepared.scan_sha256
     assert digest == sha256_of_arrays(cloud.points + cloud.origin_world, cloud.colors)
     assert len({digest, sha256_of_arrays(cloud.points), sha256_of_arrays(cloud.points.T.copy())}) == 3
+
+
+def test_a_signature_shows_every_option():
+    options = inspect.signature(piccolo.open_scan).parameters
+    assert {"labels", "ignore_labels", "units", "crs", "settings"} <= options.keys()
+    for method in (piccolo.Scan.localize, piccolo.Scan.localize_many):
+        given = inspect.signature(method).parameters.values()
+        assert [p.kind for p in given][2:] == [inspect.Parameter.KEYWORD_ONLY] * 20
+    assert not [name for name in dir(piccolo.Scan) if name in ("prepared", "workers", "settings", "walk")]
+    assert all(getattr(piccolo, name) is not None for name in piccolo.__all__)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"height": 1.5}, "`height`: found 1.5, wanted 2 numbers"),
+        ({"near_world": (1, 2), "radius": 1.0}, r"`near_world`: found \(1, 2\), wanted 3 numbers"),
+        ({"within": "x"}, "`within`: found 'x', wanted a list, each a text"),
+        ({"heading_deg": "12"}, "`heading_deg`: found '12', wanted a number"),
+        ({"use_gps": 1}, "`use_gps`: found 1, wanted True or False"),
+        ({"solver": "newton"}, "`solver`: found 'newton', wanted one of"),
+        ({"camera": 3}, "`camera`: found 3, wanted a path"),
+    ],
+)
+def test_an_option_of_another_type_is_refused(scan, options, text):
+    with pytest.raises(piccolo.InputError, match=text):
+        scan.localize("a.jpg", **options)
+    with pytest.raises(piccolo.InputError, match=text):
+        scan.localize_many([], **options)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"units": ["m"]}, r"`units`: found \['m'\], wanted one of mm"),
+        ({"settings": "paper"}, "`settings`: found 'paper', wanted CoarseToFineSettings or PaperSettings"),
+        ({"crs": 12}, "`crs`: found 12, wanted a text"),
+        ({"num_threads": "2"}, "`num_threads`: found '2', wanted a whole number"),
+        ({"colors": [1, 2, 3]}, "`colors`: found .*, wanted an array"),
+        ({"colors": np.zeros((1, 3))}, "colors: found shapes"),
+        ({"ignore_labels": [1]}, "`ignore_labels`: only with `labels`"),
+        ({"progress": 1}, "`progress`: found 1, wanted a function"),
+    ],
+)
+def test_an_option_of_a_scan_of_another_type_is_refused(options, text):
+    with pytest.raises(piccolo.InputError, match=text):
+        piccolo.open_scan(np.zeros((2, 3)), **{"colors": np.zeros((2, 3))} | options)
+    with pytest.raises(piccolo.InputError, match="`source`: found 3, wanted"):
+        piccolo.open_scan(3)
+
+
+def test_a_saved_scan_gives_the_same_bits(tmp_path, scan):
+    image = rooms.query(1).rgb
+    scan.save(tmp_path / "room.map")
+    again = piccolo.open_scan(tmp_path / "room.map").localize(image)
+    result = scan.localize(image)
+    assert again.pose.key == result.pose.key
+    assert (again.confidence, again.loss) == (result.confidence, result.loss)
+    assert np.array_equal(again.covariance.matrix, result.covariance.matrix)
+    partial_map = dataclasses.replace(scan._opened.prepared, is_partial=True)
+    partial = piccolo.Scan(dataclasses.replace(scan._opened, prepared=partial_map))
+    with pytest.raises(piccolo.InputError, match="prepared within `near_world` only"):
+        partial.save(tmp_path / "part.map")
+    cloud = rooms.room(1)[1]
+    paper = piccolo.open_scan(cloud.points, cloud.colors, settings=PaperSettings())
+    with pytest.raises(piccolo.InputError, match="found a scan of the preset paper"):
+        paper.save(tmp_path / "paper.map")
+    assert [path.name for path in tmp_path.iterdir()] == ["room.map"]
+
+
+def test_a_photo_that_cannot_be_read_is_a_result_among_many(tmp_path, scan):
+    (tmp_path / "bad.jpg").write_bytes(b"no picture")
+    results = list(scan.localize_many([tmp_path / "bad.jpg", rooms.query(1).rgb], gravity="known"))
+    assert [result.status for result in results] == ["unreadable", "localized"]
+    assert str(tmp_path / "bad.jpg") in results[0].error
+    assert results[0].source.pano_sha256 == hashlib.sha256(b"no picture").hexdigest()
+    assert results[0].settings["gravity"] == "known"

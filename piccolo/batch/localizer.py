@@ -18,11 +18,10 @@ from ..jobs.memory import limit_memory
 from ..jobs.tasks import WorkerLostError
 from ..jobs.threads import Workers
 from ..localization.settings import CoarseToFineSettings
+from ..opened_scan import OpenedScan, Settings, failed_result, settings_json
 from ..opening import open_files
 from ..panorama import ReadOptions, read_panorama
-from ..panorama.photo import sha256_of
-from ..result import Failure, Result, Source, failure_of, unreadable_result
-from ..scan import Scan, Settings, settings_json
+from ..result import Result, Source, unreadable_result
 from ..scan_map.map_file import load_map
 from ..scan_map.open_map import CachePolicy
 from ..views.pictures import encode_image, overlay_png
@@ -118,26 +117,24 @@ class Localizer:
         limit_memory(self.max_memory)
         return partial(self.answer, self.open_scan(Workers(self.num_threads)))
 
-    def open_scan(self, workers: Workers) -> Scan:
+    def open_scan(self, workers: Workers) -> OpenedScan:
         """Read and prepare the scan."""
         if self.map_name:
             scan_map = load_map(sent_file(self.map_name))
-            return Scan(scan_map, self.name, self.cloud_settings, self.settings, workers, {})
+            return OpenedScan(scan_map, self.name, self.cloud_settings, self.settings, workers, {})
         paths = [self.folder / path for path in self.paths]
         scan = open_files(paths, self.cloud_settings, self.settings, self.cache, workers)
         return replace(scan, name=self.name)
 
-    def answer(self, scan: Scan, task: Task) -> Answer:
+    def answer(self, scan: OpenedScan, task: Task) -> Answer:
         """Localize one panorama, and make the pictures asked for; of one that can't be read say why."""
         with task.placed(self.folder) as path, reading_once():
             try:
                 found = scan.localize_query(path, self.read_options, task.settings, None, task.calibration)
                 overlay, mask = self._pictures(scan, path, found)
             except Exception as error:
-                text, is_passing = failure_of(error)
-                failure = Failure(text.replace(str(path), str(task.pano)), is_passing)
-                source = Source(scan.prepared.scan_sha256 or None, sha256_of(path, self.read_options.rig))
-                return self._failed(task, failure, source)
+                name = str(task.pano)
+                return Answer(failed_result(scan, path, error, self.read_options, task.settings, name))
         name = str(task.pano)
         warnings = tuple(warning.replace(str(path), name) for warning in found.warnings)
         result = replace(found, pano=name, warnings=warnings)
@@ -145,14 +142,14 @@ class Localizer:
 
     def lost(self, task: Task, error: WorkerLostError, cloud_sha256: str | None) -> Answer:
         """Return the answer to a task whose workers were lost."""
-        return self._failed(task, Failure(f"{task.pano}: {error}", is_passing=True), Source(cloud_sha256))
+        about = {
+            "settings": settings_json(task.settings, self.cloud_settings, self.read_options),
+            "source": Source(cloud_sha256),
+        }
+        text = f"{task.pano}: {error}"
+        return Answer(unreadable_result(text, self.name, str(task.pano), is_passing=True, **about))
 
-    def _failed(self, task: Task, failure: Failure, source: Source) -> Answer:
-        repeated = settings_json(task.settings, self.cloud_settings, self.read_options)
-        about = {"settings": repeated, "source": source}
-        return Answer(unreadable_result(failure.text, self.name, str(task.pano), failure.is_passing, **about))
-
-    def _pictures(self, scan: Scan, pano: Path, result: Result) -> tuple[bytes | None, bytes | None]:
+    def _pictures(self, scan: OpenedScan, pano: Path, result: Result) -> tuple[bytes | None, bytes | None]:
         """Overlay and occlusion mask as PNG, where they are asked for and there is a pose."""
         overlay = None
         mask = None

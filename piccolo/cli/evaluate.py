@@ -19,8 +19,8 @@ from ..jobs.cluster import Cluster
 from ..jobs.memory import limit_memory
 from ..jobs.tasks import WorkerLostError
 from ..jobs.threads import Workers
+from ..opened_scan import OpenedScan, settings_json
 from ..result import UNREADABLE, Result, check_scan, failure_of, read_results
-from ..scan import Scan, settings_json
 from ..scan_map.open_map import scan_sha256_of
 from ..scenes.evaluation import tables
 from ..scenes.evaluation.plots import errors_figure, figure_png, risk_figure
@@ -230,7 +230,7 @@ class Evaluation:
         show = progress_bar(self.arguments.quiet)
         are_inside: list[bool] = []  # the cloud's box
 
-        def open_scan(localizer: Localizer, num_threads: int) -> Scan:
+        def open_scan(localizer: Localizer, num_threads: int) -> OpenedScan:
             scan = localizer.open_scan(Workers(num_threads, show))
             are_inside.extend(is_in_box(scan, query.pose) for query in queries)
             return scan

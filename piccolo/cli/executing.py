@@ -20,8 +20,8 @@ from ..jobs.memory import GB, memory_left, memory_taken
 from ..jobs.processes import Processes
 from ..jobs.tasks import Here
 from ..jobs.threads import num_cores
+from ..opened_scan import OpenedScan
 from ..result import FAILED, UNREADABLE
-from ..scan import Scan
 from ..scan_map.map_file import save_map
 from ..scan_map.open_map import CachePolicy
 from ..scan_map.scan_map import ScanMap
@@ -97,7 +97,7 @@ def executing(
     localizer: Localizer,
     num_jobs: int,
     cluster: Cluster | None,
-    open_scan: Callable[[Localizer, int], Scan],
+    open_scan: Callable[[Localizer, int], OpenedScan],
 ) -> Iterator[tuple[Executor, Localizer]]:
     """An executor, and the localizer for it; `open_scan` prepares the scan before, with so many threads."""
     is_kept = localizer.cache.is_used
@@ -121,7 +121,7 @@ def executing(
 
 
 def at_the_workers(
-    arguments: argparse.Namespace, cluster: Cluster, localizer: Localizer, scan: Scan, is_kept: bool
+    arguments: argparse.Namespace, cluster: Cluster, localizer: Localizer, scan: OpenedScan, is_kept: bool
 ) -> Localizer:
     """Return a localizer whose scan a cluster's workers can open: at its path, or sent to them."""
     here = Path.cwd()

@@ -26,10 +26,10 @@ from ..jobs.stopwatch import Stopwatch
 from ..jobs.tasks import WorkerLostError
 from ..jobs.threads import Workers, num_cores
 from ..localization.settings import CoarseToFineSettings
+from ..opened_scan import OpenedScan
 from ..panorama.cube import is_cube
 from ..panorama.photo import sha256_of
 from ..result import FAILED, UNREADABLE
-from ..scan import Scan
 from ..scan_map.open_map import scan_sha256_of
 from ..scan_map.scan_map import ScanMap
 from .command import command
@@ -126,7 +126,7 @@ def note_unused_priors(arguments: argparse.Namespace, localizer: Localizer) -> N
         print_note(arguments, f"warning: {localizer.priors.path}: {note}")
 
 
-def open_scan(run: Run, localizer: Localizer, num_threads: int) -> Scan:
+def open_scan(run: Run, localizer: Localizer, num_threads: int) -> OpenedScan:
     """Read and prepare the scan."""
     arguments = run.arguments
     workers = Workers(num_threads, progress_bar(arguments.quiet), warn_once(arguments.quiet))

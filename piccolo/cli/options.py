@@ -14,10 +14,10 @@ from ..cloud.settings import METRES, CloudSettings, UpAxis
 from ..errors import InputError
 from ..geometry.colors import Labels
 from ..localization.settings import CoarseToFineSettings
+from ..opened_scan import Settings
 from ..panorama import ReadOptions
 from ..panorama.model import Projection
 from ..paper.settings import PaperSettings
-from ..scan import Settings
 from ..scan_map.open_map import CachePolicy
 from ..scan_map.prior import Prior
 from ..walk.frames import MAX_SPEED

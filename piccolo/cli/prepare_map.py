@@ -5,10 +5,8 @@ import json
 
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers, num_cores
-from ..scan_map.map_file import save_map
 from ..scan_map.named_scans import check_name, named
-from ..scan_map.open_map import CachePolicy, extended_map, open_map
-from ..scan_map.scan_map import with_features
+from ..scan_map.open_map import CachePolicy, extended_map, open_map, write_map
 from .command import command, option
 from .errors import checking_options
 from .options import add_cloud_options, cloud_settings_from
@@ -56,7 +54,7 @@ def main(arguments: argparse.Namespace) -> int:
         scan_map = open_map(arguments.cloud, cloud_settings, no_cache, workers, watch, has_features=True)
         if arguments.name is not None or not scan_map.scan_names:  # a map keeps its names
             scan_map = named(scan_map, name)
-    save_map(with_features(scan_map, workers), arguments.out)
+    write_map(scan_map, arguments.out, workers)
     report = {
         "map": str(arguments.out),
         "scans": scan_map.scan_names,

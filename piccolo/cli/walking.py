@@ -24,12 +24,12 @@ from ..files.temporary import temporary_folder
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.tasks import InFlight
 from ..localization.settings import CoarseToFineSettings
+from ..opened_scan import OpenedScan
 from ..optional import import_optional
 from ..panorama import ReadOptions
 from ..panorama.photo import sha256_of
 from ..panorama.video import frames_of
 from ..result import FAILED, Result, read_results
-from ..scan import Scan
 from ..scan_map.scan_map import ScanMap
 from ..scan_walk import Walk
 from ..walk.frames import MAX_ACCELERATION, MAX_SPEED, MAX_STEP, NO_ACCELERATION, Motion
@@ -126,7 +126,7 @@ def run_walk(
     inputs: WalkInputs,
     settings: CoarseToFineSettings,
     read_options: ReadOptions,
-    open_scan: Callable[[], Scan],
+    open_scan: Callable[[], OpenedScan],
 ) -> int:
     """Localize a walk, write its results, return the exit code."""
     watch = Stopwatch()
@@ -163,7 +163,7 @@ def check_plan(path: Path) -> None:
     import_optional("--plan", "ezdxf" if path.suffix.lower() == DXF else "matplotlib", "tools")
 
 
-def write_plan(path: Path | None, scan: Scan, results: Sequence[Result]) -> None:
+def write_plan(path: Path | None, scan: OpenedScan, results: Sequence[Result]) -> None:
     """Draw the path on the scan from above, if asked for."""
     if path is None or not isinstance(scan.prepared, ScanMap):
         return

@@ -1,7 +1,7 @@
 """A report of results in a scan: facts, plans, and the pictures of each photo, taken up where stopped."""
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from os import PathLike
@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .. import __version__
+from ..arguments import check_arguments
 from ..cloud.settings import METRES, CloudSettings, UpAxis
 from ..errors import InputError
 from ..files.atomic import write_atomically
@@ -19,14 +20,16 @@ from ..files.temporary import temporary_folder
 from ..geometry.pose import Pose
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import ProgressCallback, Workers, no_progress, num_cores, progress_to
+from ..opened_scan import File
+from ..opening import Units
 from ..panorama.photo import photo_of
-from ..result import FAILED, UNREADABLE, check_scan
-from ..scan import File, Scan
+from ..result import FAILED, UNREADABLE, Result, check_scan
+from ..scan import Scan
 from ..scan_map.open_map import CachePolicy, open_map
 from ..scan_map.scan_map import ScanMap
 from ..views.pictures import encode_image
 from ..views.surfels import MAX_SURFELS, Surfels, surfels_of
-from .entries import Entry, document_of_entry, names_of, read_entries, short_names_of
+from .entries import Entry, document_of_entry, entries_of, names_of, short_names_of
 from .pictures import make_pictures, read_options_of, taken_out
 from .plan_image import OwnPlan, PlanImage, draw_plan, own_plan
 from .site import begin_folder, check_folder, finish_folder, picture_path, self_contained, write_photo_script
@@ -213,7 +216,7 @@ def write_plan(plan: PlanImage, folder: Path) -> dict[str, Any]:
 
 
 def write_report(  # noqa: PLR0913  options by name
-    results: File | Sequence[File],
+    results: File | Iterable[File | Result],
     scan: File | Sequence[File] | Scan,
     out: File,
     *,
@@ -225,7 +228,7 @@ def write_report(  # noqa: PLR0913  options by name
     own_plans: Mapping[int, tuple[File, File]] | None = None,
     crs: str = "",
     force: bool = False,
-    units: str = "m",
+    units: Units = "m",
     up: UpAxis = "auto",
     cache: bool | File = True,
     num_threads: int | None = None,
@@ -236,7 +239,7 @@ def write_report(  # noqa: PLR0913  options by name
     Parameters
     ----------
     results
-        Path of a file of JSON lines by localize.py, or several.
+        Results, or paths of files of JSON lines by localize.py; or one path.
     scan
         Path of the scan, or of a map by tools/prepare_map.py, or several; or a Scan that is open.
     out
@@ -271,10 +274,10 @@ def write_report(  # noqa: PLR0913  options by name
     >>> import piccolo
     >>> scan = piccolo.open_scan("room/cloud.ply")
     >>> result = scan.localize("room/images/clean_0.jpg")
-    >>> _ = Path("one.jsonl").write_text(result.to_json())
-    >>> piccolo.write_report("one.jsonl", scan, "report", storeys=["Ground floor"])
+    >>> piccolo.write_report([result], scan, "report", storeys=["Ground floor"])
     PosixPath('report/index.html')
     """
+    check_arguments(write_report, locals())
     show = progress_to(progress) if progress else no_progress
     workers = Workers(num_cores() if num_threads is None else num_threads, show)
     settings = ReportSettings(
@@ -288,15 +291,18 @@ def write_report(  # noqa: PLR0913  options by name
         is_forced=force,
     )
     if isinstance(scan, Scan):
-        scan_map = scan.prepared
+        scan_map = scan._opened.prepared
     else:
-        if units not in METRES:
-            raise InputError(f"units: found {units!r}, wanted one of {', '.join(METRES)}")
         policy = CachePolicy(cache is not False, None if isinstance(cache, bool) else Path(cache))
         scan_map = open_map(_paths(scan), CloudSettings(METRES[units], up), policy, workers, Stopwatch())
     if not isinstance(scan_map, ScanMap):
         raise InputError("write_report: found a scan of the preset paper, wanted one of the default method")
-    return build_report(read_entries(_paths(results)), scan_map, Path(out), settings, workers).page
+    return build_report(entries_of(_items(results)), scan_map, Path(out), settings, workers).page
+
+
+def _items(results: File | Iterable[File | Result]) -> list[Path | Result]:
+    several = [results] if isinstance(results, str | PathLike) else results
+    return [item if isinstance(item, Result) else Path(item) for item in several]
 
 
 def _paths(files: File | Sequence[File]) -> list[Path]:

@@ -34,13 +34,15 @@ class Entry(NamedTuple):
     time: float  # [s] by which a walk's photos are in order; else its place in the files
 
 
-def read_entries(paths: Sequence[Path]) -> list[Entry]:
-    """The results in files of JSON lines, in their order; each file with walks is one walk."""
+def entries_of(items: Sequence[Path | Result]) -> list[Entry]:
+    """Return the results given and those in files; the frames of a file, or those given, are one walk."""
     entries: list[Entry] = []
-    for number, path in enumerate(paths):
-        for result in read_results([path]):
+    for number, item in enumerate(items):
+        is_given = isinstance(item, Result)
+        for result in [item] if isinstance(item, Result) else read_results([item]):
             time = result.walk.time if result.walk else float(len(entries))
-            entries.append(Entry(result, number if result.walk else None, time))
+            walk = -1 if is_given else number
+            entries.append(Entry(result, walk if result.walk else None, time))
     return entries
 
 

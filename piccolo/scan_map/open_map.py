@@ -84,6 +84,13 @@ def open_map(
     return replace(scan_map, warnings=(*scan_map.warnings, warning))
 
 
+def write_map(scan_map: ScanMap, path: Path, workers: Workers) -> None:
+    """Write a map with its local features; InputError if it is of a part of a scan."""
+    if scan_map.is_partial:
+        raise InputError(f"{path}: found a map prepared within `near_world` only, wanted a whole map")
+    save_map(with_features(scan_map, workers), path)
+
+
 def extended_map(
     map_path: Path,
     paths: Sequence[Path],

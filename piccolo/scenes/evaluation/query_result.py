@@ -14,8 +14,8 @@ from ...errors import InputError, printable
 from ...files.json_file import document_of, parse_lines, read_bytes
 from ...files.line_file import whole_size
 from ...geometry.pose import MAX_ANGLE, MAX_DISTANCE, Array, Pose, pose_errors
+from ...opened_scan import OpenedScan
 from ...result import Result
-from ...scan import Scan
 from ..scene import QUERIES_NAME, Query, Scene
 
 FORMAT = "piccolo-evaluation/1"
@@ -100,7 +100,7 @@ def query_result_of(scene: Scene, query: Query, result: Result, is_in_box: bool 
     return QueryResult(scene.name, scene.name_of(query), query.variant, is_in_box, *errors, result)
 
 
-def is_in_box(scan: Scan, pose: Pose) -> bool:
+def is_in_box(scan: OpenedScan, pose: Pose) -> bool:
     """True if a pose's position lies in the bounding box of a localizer's cloud (the paper's protocol)."""
     points = scan.points
     center: Array = scan.from_world(pose).center_world

@@ -1,0 +1,104 @@
+"""Check of the arguments of the API's functions by their annotations."""
+
+import inspect
+import types
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from os import PathLike
+from typing import Any, Literal, Union, get_args, get_origin
+
+import numpy as np
+
+from .errors import InputError
+
+WORDS = {
+    str: "a text",
+    PathLike: "a path",
+    types.NoneType: "None",
+    bool: "True or False",
+    int: "a whole number",
+    float: "a number",
+}
+NUMBERS = {bool: bool | np.bool_, int: int | np.integer, float: float | int | np.floating | np.integer}
+
+
+def check_arguments(function: Callable[..., object], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a function's arguments among some values, without those that are None.
+
+    Arrays of numbers become tuples. Raises InputError if one is not as its annotation says.
+    """
+    given: dict[str, Any] = {}
+    for name, kind in inspect.get_annotations(function).items():
+        if name == "return" or values[name] is None:
+            continue
+        if not is_of_kind(values[name], kind):
+            raise InputError(f"`{name}`: found {found_text(values[name])}, wanted {describe(kind)}")
+        given[name] = plain(values[name], kind)
+    return given
+
+
+def is_of_kind(value: object, kind: Any) -> bool:
+    """Return whether a value is as an annotation says; the dtype of an array is not looked at."""
+    origin = get_origin(kind) or kind
+    parts = get_args(kind)
+    if origin in (Union, types.UnionType):
+        return any(is_of_kind(value, part) for part in parts)
+    if origin is Literal:
+        return isinstance(value, str) and value in parts
+    if kind in NUMBERS:
+        return isinstance(value, NUMBERS[kind]) and (kind is bool or not isinstance(value, bool))
+    if parts and origin is not np.ndarray:
+        return callable(value) if origin is Callable else is_collection(value, origin, parts)
+    return isinstance(value, origin)
+
+
+def is_collection(value: object, origin: Any, parts: tuple[Any, ...]) -> bool:
+    """Return whether a value is a collection as an annotation says; the items of an iterator are not read."""
+    if isinstance(value, str | bytes):
+        return False
+    if origin is tuple:
+        is_row = isinstance(value, tuple | list) or (isinstance(value, np.ndarray) and value.ndim == 1)
+        return is_row and len(value) == len(parts) and all(map(is_of_kind, value, parts))
+    if not isinstance(value, origin):
+        return False
+    if isinstance(value, Mapping):
+        return all(is_of_kind(item, parts[1]) for item in value.values())
+    return not isinstance(value, Sequence) or all(is_of_kind(item, parts[0]) for item in value)
+
+
+def describe(kind: Any) -> str:
+    """Return the words for an annotation."""
+    origin = get_origin(kind) or kind
+    parts = get_args(kind)
+    if origin in (Union, types.UnionType):
+        words = dict.fromkeys(describe(part) for part in parts if part is not types.NoneType)
+        if "a path" in words:
+            words.pop("a text", None)
+        return " or ".join(words)
+    if origin is Literal:
+        return f"one of {', '.join(parts)}"
+    if origin is tuple:
+        return f"{len(parts)} numbers" if float in parts else f"{len(parts)} values"
+    if origin in (Sequence, Iterable):
+        return f"a list, each {describe(parts[0])}"
+    if origin is np.ndarray:
+        return "an array"
+    return WORDS.get(origin, "a function" if origin is Callable else origin.__name__)
+
+
+def found_text(value: object) -> str:
+    """Return a value in a message: the type and shape of an array."""
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype} of shape {value.shape}"
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def plain(value: Any, kind: Any) -> Any:
+    """Return a value without types of NumPy, a list of an annotated tuple as a tuple."""
+    origin = get_origin(kind)
+    kinds = get_args(kind) if origin in (Union, types.UnionType) else (kind,)
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, list | np.ndarray | tuple) and any(get_origin(k) is tuple for k in kinds):
+        return tuple(item.item() if isinstance(item, np.generic) else item for item in value)
+    return value

@@ -1,0 +1,185 @@
+"""A scan with all options as objects: `Scan`, the commands and the batches localize photos in it."""
+
+from dataclasses import asdict, dataclass, field, replace
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .camera import Calibration
+from .cloud.settings import CloudSettings
+from .cloud.soa import PackedPoints
+from .confidence.confidence import LOCALIZED
+from .confidence.occlusion import occlusion_mask
+from .errors import InputError
+from .files.json_file import reading_once
+from .geometry.pose import Pose
+from .jobs.stopwatch import Stopwatch
+from .jobs.threads import Workers
+from .localization.localize import has_guessed_focal, localize, localize_guessed
+from .localization.settings import CoarseToFineSettings
+from .panorama import ReadOptions, read_photo
+from .panorama.photo import PhotoFacts, sha256_of
+from .paper.localize import PaperMap
+from .paper.localize import localize as localize_by_paper
+from .paper.settings import PaperSettings
+from .result import Result, Source, failure_of, result_of, unreadable_result
+from .scan_map.named_scans import check_within, with_places
+from .scan_map.prior import GpsPrior, gps_prior
+from .scan_map.scan_map import ScanMap
+from .scan_walk import Walk, WalkAbout, photo_facts
+from .walk.frames import Motion
+from .walk.tracker import Tracker
+
+OTHER_METHOD = "`settings`: of another method than the one that the scan was prepared for"
+LABELS_WARNING = "`labels`: the confidence was learnt on colours, and is a rough guide only"
+File = str | PathLike[str]
+Settings = CoarseToFineSettings | PaperSettings
+
+
+@dataclass(frozen=True)
+class OpenedScan:
+    """A scan that is prepared for a method; it may be used from several threads at once."""
+
+    prepared: ScanMap | PaperMap = field(repr=False)
+    name: str | tuple[str, ...]  # path as given, or the paths of several files that are one scan
+    cloud_settings: CloudSettings
+    settings: Settings  # of photos that say nothing else
+    workers: Workers
+    seconds: dict[str, float]  # spent once, on the scan
+
+    @property
+    def points(self) -> PackedPoints:
+        """Coloured points of the scan, in the frame of `from_world`, for pictures."""
+        return self.prepared.points
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Lines that the user should read about the scan."""
+        return self.prepared.warnings
+
+    def from_world(self, pose: Pose) -> Pose:
+        """A pose of the world in the frame of `points`."""
+        return self.prepared.from_world(pose)
+
+    def walk(self, read_options: ReadOptions, settings: Settings, motion: Motion) -> Walk:
+        """Return a walk with all options as objects, as `track` does."""
+        if not isinstance(self.prepared, ScanMap) or not isinstance(settings, CoarseToFineSettings):
+            raise InputError("walks: not of the preset paper")
+        if read_options.refine_focal:
+            raise InputError("`refine_focal`: not an option of walks; refine it with one photo")
+        check_within(self.prepared, settings.prior.within)
+        quiet = Workers(self.workers.num_threads, warn=self.workers.warn)
+        tracker = Tracker(self.prepared, settings, quiet, motion)
+        repeated = settings_json(settings, self.cloud_settings, read_options)
+        about = WalkAbout(self.name, self.warnings, {**repeated, "walk": asdict(motion)})
+        return Walk(tracker, read_options, about)
+
+    def occlusion_mask(
+        self,
+        panorama: File | NDArray[np.uint8],
+        pose: Pose,
+        read_options: ReadOptions,
+        is_masked: NDArray[np.bool_] | None = None,
+    ) -> NDArray[np.uint8]:
+        """Return the pixels of a photo that contradict the scan at a pose, as `Scan.occlusion_mask`."""
+        picture = read_photo(panorama, read_options, is_masked)
+        return occlusion_mask(self.points, picture, self.from_world(pose))
+
+    def localize_query(
+        self,
+        panorama: File | NDArray[np.uint8],
+        read_options: ReadOptions,
+        settings: Settings,
+        is_masked: NDArray[np.bool_] | None = None,
+        calibration: Calibration | None = None,
+    ) -> Result:
+        """Localize a photo, all options as objects; apart a mask that is an array, and the photo's camera."""
+        watch = Stopwatch()
+        self.check_options(read_options, settings)
+        repeated = settings_json(settings, self.cloud_settings, read_options)
+        if calibration is not None and read_options.calibration is None:
+            read_options = replace(read_options, calibration=calibration)
+        with watch.stage("read"), reading_once():
+            picture = read_photo(panorama, read_options, is_masked)
+            photo = photo_facts(panorama, read_options.rig)
+        gps = None
+        if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
+            attempts: list[tuple[CoarseToFineSettings, GpsPrior | None]] = [(settings, None)]
+            if read_options.use_gps and (gps := self.gps_prior_of(photo, settings)):
+                near = replace(settings, prior=gps.applied_to(settings.prior))
+                attempts = [(near, gps), (settings, replace(gps, is_used=False))]
+            run = localize_guessed if has_guessed_focal(picture) else localize
+            for tried, gps in attempts:  # noqa: B007  near the GPS position, or else anywhere
+                found = run(self.prepared, picture, tried, self.workers, watch)
+                if found.status == LOCALIZED:
+                    break
+            found = with_places(self.prepared, found)
+        elif isinstance(self.prepared, PaperMap) and isinstance(settings, PaperSettings):
+            found = localize_by_paper(self.prepared, picture, settings, self.workers, watch)
+        else:
+            raise InputError(OTHER_METHOD)
+        digest = self.prepared.scan_sha256 or None
+        return result_of(
+            found,
+            cloud=self.name,
+            pano="array" if isinstance(panorama, np.ndarray) else str(panorama),
+            seconds=watch.seconds,
+            settings=repeated,
+            warnings=self.warnings + picture.warnings + ((LABELS_WARNING,) if read_options.labels else ()),
+            source=Source(digest, photo.sha256, photo.image_size, photo.capture_time),
+            gps_prior=gps,
+            cameras=found.cameras or picture.cameras,
+        )
+
+    def check_options(self, read_options: ReadOptions, settings: Settings) -> None:
+        """Refuse options that this scan does not have."""
+        if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
+            check_within(self.prepared, settings.prior.within)
+        elif read_options.refine_focal:
+            raise InputError("`refine_focal`: not an option of the preset paper")
+
+    def gps_prior_of(self, photo: PhotoFacts, settings: CoarseToFineSettings) -> GpsPrior | None:
+        """The photo's GPS position in the scan; None if it has none, or a position is given anyway."""
+        crs = self.cloud_settings.crs or getattr(self.prepared, "crs", "")
+        if photo.gps is None or not crs or settings.prior.near_world is not None:
+            return None
+        return gps_prior(photo.gps, crs, self.cloud_settings.scale)
+
+
+def settings_json(
+    settings: Settings, cloud_settings: CloudSettings, read_options: ReadOptions
+) -> dict[str, object]:
+    """Return the settings that a result repeats."""
+    reading = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(read_options).items()}
+    return {**settings.to_json(), "cloud": asdict(cloud_settings), "panorama": reading}
+
+
+def failed_result(
+    scan: OpenedScan,
+    panorama: File | NDArray[np.uint8],
+    error: Exception,
+    read_options: ReadOptions,
+    settings: Settings,
+    name: str | None = None,
+) -> Result:
+    """Return the result of a photo that raised an error, which is raised if it is not the photo's.
+
+    `name` replaces the photo's path.
+    """
+    text, is_passing = failure_of(error)
+    digest = None
+    path = "array"
+    if not isinstance(panorama, np.ndarray):
+        path = str(panorama)
+        digest = sha256_of(Path(panorama), read_options.rig)
+    name = name or path
+    return unreadable_result(
+        text.replace(path, name),
+        scan.name,
+        name,
+        is_passing,
+        settings=settings_json(settings, scan.cloud_settings, read_options),
+        source=Source(scan.prepared.scan_sha256 or None, digest),
+    )
