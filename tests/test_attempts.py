@@ -74,6 +74,25 @@ def test_clear_are_score_and_margin(monkeypatch, score, margin, expected):
     assert is_clear(asked, [at(0.0, score), at(3.0, other)]) == expected
 
 
+@pytest.mark.parametrize(
+    ("is_clear", "own", "is_enough", "num_asked"),
+    [(True, 0.55, True, 1), (True, 0.54, False, 1), (False, 0.9, False, 0)],
+)
+def test_of_a_clear_photo_the_mirrored_one_must_start_a_tenth_worse(
+    monkeypatch, is_clear, own, is_enough, num_asked
+):
+    """It is searched only where the photo is clear."""
+    asked = []
+    monkeypatch.setattr(attempts, "search_poses", lambda query, gravity: None)
+    monkeypatch.setattr(attempts, "refine", lambda query, starts, beam: [at(3.0, 0.5)])
+    monkeypatch.setattr(attempts, "is_clear", lambda query, found: is_clear)
+    monkeypatch.setattr(attempts, "first_score", lambda query, starts: own)
+    monkeypatch.setattr(attempts, "mirror_score", lambda query: asked.append(query) or 0.5)
+    found, is_done = attempts.look_first(QUERY, [at(0.0, 0.2)], Stopwatch())
+    assert places(found) == [0.0, 3.0]
+    assert (is_done, asked) == (is_enough, [QUERY] * num_asked)
+
+
 def test_the_mirrored_query_is_that_of_the_mirrored_photo():
     """Its tilt is mirrored with it; where it heads, nothing is known."""
     panorama = rooms.as_panorama(rooms.query(1).rgb)

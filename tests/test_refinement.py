@@ -1,5 +1,6 @@
 """Descents on the views of a room, and decisions of the refinement, each in a made-up case."""
 
+import collections
 import functools
 from dataclasses import replace
 from types import SimpleNamespace
@@ -80,6 +81,29 @@ def test_narrow_ranks_poses_first():
     assert narrow(turned, 8) == [turned[k].pose for k in (0, 2, 4)]
 
 
+def test_the_beam_narrows_from_stage_to_stage(monkeypatch):
+    """From 500 starts to 400, 48 and 8 poses, of which two are perturbed for as long as that helps."""
+    made = collections.Counter()
+
+    def descend_all(scan_map, image, starts, num_iterations, workers):
+        made[num_iterations] += len(starts.candidate)
+        return starts, None
+
+    def stage(name, query, found):
+        made[name] += 1
+        pose = getattr(found, "pose", found)
+        return Hypothesis(pose, 0.1 - 1e-5 * place(pose))
+
+    monkeypatch.setattr(refinement, "descend_all", descend_all)
+    for name in ("descend_middle", "perturb_middle", "descend_fine", "refine_by_perturbation", "score_pose"):
+        monkeypatch.setattr(refinement, name, functools.partial(stage, name))
+    centers = np.outer(np.arange(500), [1.0, 0.0, 0.0])
+    starts = Starts(np.repeat(np.eye(3)[None], 500, axis=0), centers, np.arange(500))
+    found = refinement.refine(_asked(), starts, METHOD.beam)
+    assert list(made.values()) == [500, 400, 48, 8, 8, 2, 12]
+    assert [place(h.pose) for h in found] == list(range(12))
+
+
 # Perturbations and the last millimetres
 
 
@@ -111,6 +135,35 @@ def test_poses_are_perturbed_for_as_long_as_that_helps(monkeypatch, gains, round
     again = Fit(found.pose, 0.3)
     assert refinement.refine_by_perturbation(query, again) is again
     assert sizes == [0.4] * rounds
+
+
+@pytest.mark.parametrize(
+    ("is_masked", "scores", "rounds", "end"),
+    [
+        (True, [0.5, 0.6, 0.7, 0.8], 2, 2),  # two rounds at most
+        (True, [0.5, 0.511, 0.6], 2, 2),
+        (True, [0.5, 0.509, 0.6], 1, 1),  # a gain of less than a fiftieth ends them
+        (True, [0.5, 0.4, 0.6], 1, 0),
+        (False, [0.5, 0.6, 0.7], 1, 1),  # nothing to mask
+    ],
+)
+def test_occluders_are_masked_again_where_that_gains(monkeypatch, is_masked, scores, rounds, end):
+    query, masked, made = _asked(), _asked(), []
+    monkeypatch.setattr(
+        last_descent, "score_pose", lambda query, pose: at(place(pose), scores[int(place(pose))])
+    )
+    monkeypatch.setattr(last_descent, "without_occluders", lambda query, pose: masked if is_masked else query)
+    for name in ("perturb_middle", "descend_fine"):
+        monkeypatch.setattr(last_descent, name, lambda shown, pose: made.append(shown) or Fit(pose, 0.0))
+    monkeypatch.setattr(
+        last_descent,
+        "refine_by_perturbation",
+        lambda shown, fit: made.append(shown) or at(place(fit.pose) + 1, 0),
+    )
+    shown, found = last_descent.refine_unoccluded(query, at(0.0, 0.0).pose)
+    assert made == ([masked] * 3 * rounds if is_masked else [query])
+    assert shown is made[-1]
+    assert (place(found.pose), found.score) == (end, scores[end])
 
 
 @pytest.mark.parametrize(("after", "is_taken"), [(0.60, True), (0.495, True), (0.485, False), (0.1, False)])

@@ -1,7 +1,7 @@
-"""Searches for a photo, each with its refinement, in the order in which they are tried.
+"""The searches that are tried for a photo, in order, each with its refinement.
 
-Most photos of the whole sphere, upright, need no local features: a first look by whole views finds them. That
-a photo is mirrored, features would tell: its mirrored picture is searched too, as far as is cheap.
+A first look by whole views finds most upright photos of the whole sphere, without local features. As only
+features would show that a photo is mirrored, the first look briefly searches its mirror image too.
 """
 
 from collections.abc import Callable
@@ -29,27 +29,27 @@ from .search import Starts, search_poses
 from .selection import is_clear, is_sure
 from .settings import Beam
 
-WHOLE = 0.9  # of the sphere that the photo shows, at least
-MIRROR_RATIO = 1.1  # of the first scores, the photo as it is by its mirrored picture
-FIRST_STARTS = 300  # few: what is clear is found by them
+WHOLE = 0.9  # least fraction of the sphere that a whole photo shows
+MIRROR_RATIO = 1.1  # least ratio of first scores, photo to mirrored photo
+FIRST_STARTS = 300  # few are enough for a clear photo
 FIRST_BEAM = Beam(100, 12, 4, 1)
 FIRST_ROTATIONS = 1000  # of SO(3)
-FEW_CELLS = 200  # of the grid: fewer, which a prior has left, are all searched
-NUM_SCORED = 64  # starts, where only the best score is asked for
+FEW_CELLS = 200  # of the grid; if a prior leaves fewer, all of them are searched
+NUM_SCORED = 64  # starts, if only the best score is needed
 ALL_HALVES = len(HALVES)
 NUM_MATCHED = 6  # poses from matches that are refined
 
-Found = tuple[list[Hypothesis], bool]  # and whether no more attempts need be made
-# one search with its refinement, which adds to what is known
+Found = tuple[list[Hypothesis], bool]  # hypotheses, and whether they make further attempts needless
+# one search with its refinement, which adds to the known hypotheses
 Attempt = Callable[[Query, list[Hypothesis], Stopwatch], Found]
 
 
 def attempts_for(query: Query) -> list[tuple[int, Attempt]]:
-    """Searches for a photo, in order, and how many halves of its features each asks: 0, whole views alone.
+    """Return the searches for a photo in order, each with the number of feature halves that it matches.
 
-    A whole upright sphere that is clear by whole views needs no more. Else come the poses that matches vote
-    for, of half of the views first, and then whole views: with the gravity `auto` as known, then as unknown
-    (briefly, of a whole sphere).
+    A first look by whole views (0 halves) may settle a whole upright sphere. Then come poses from feature
+    matches, first of one half of the views, then of both, and at last searches by whole views: with gravity
+    `auto` as known, then as unknown (briefly, for a whole sphere).
     """
     method = query.method
     looks_first = method.uses_features and method.uses_search and is_whole(query)
@@ -65,7 +65,7 @@ def attempts_for(query: Query) -> list[tuple[int, Attempt]]:
 
 
 def look_first(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Found:
-    """Where brief whole views lead; True if one pose explains the photo, no other does, nor its mirror."""
+    """Search briefly by whole views; True if one pose alone is clear and beats the mirrored photo."""
     first = brief_query(query)
     of_mirror = Once(partial(mirror_score, query))
     with query.workers.beside(of_mirror):
@@ -77,9 +77,9 @@ def look_first(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Found
 
 
 def search_matches(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Found:
-    """Hypotheses, and the poses that matches vote for; True if these leave no doubt.
+    """Refine the poses that feature matches vote for; True if the result is sure.
 
-    Half of the features count for nothing if they leave any: all give the same poses then, and better ones.
+    Poses from half of the features are dropped unless they are sure: all features find better ones.
     """
     with watch.stage("match"):
         poses = matched_poses(query)
@@ -98,7 +98,7 @@ def search_views(
     gravity: Gravity = "known",
     is_brief: bool = False,
 ) -> Found:
-    """Hypotheses, and where whole views lead; True if these leave no doubt."""
+    """Search by whole views and refine; True if the result is sure."""
     asked = tilted_query(query) if is_brief else query
     with watch.stage("search"):
         starts = search_poses(asked, gravity)
@@ -108,7 +108,7 @@ def search_views(
 
 
 def search_beyond_prior(query: Query, scan_map: ScanMap, watch: Stopwatch) -> list[Hypothesis]:
-    """Search a whole photo in all of the map: what the prior leaves must be better than what it excludes."""
+    """Search a whole photo without the prior: poses that agree with it must beat those that it excludes."""
     is_asked = query.settings.prior != NOTHING_KNOWN and query.method.uses_search and is_whole(query)
     if not is_asked:
         return []
@@ -121,7 +121,7 @@ def search_beyond_prior(query: Query, scan_map: ScanMap, watch: Stopwatch) -> li
 
 
 def matched_poses(query: Query) -> list[Pose]:
-    """Return the poses that matches vote for, best first; without whole views, what the prior allows."""
+    """Return poses from feature matches, best first; without whole views, those that the prior allows."""
     level = query.photo.R_cam_from_level if query.settings.gravity == "known" else None
     poses = [f.pose for f in poses_of(query.matches, level, NUM_MATCHED, query.workers)]
     if query.method.uses_search:
@@ -130,21 +130,21 @@ def matched_poses(query: Query) -> list[Pose]:
 
 
 def is_whole(query: Query) -> bool:
-    """True if the photo shows nearly the whole sphere, upright or at a known tilt."""
+    """Return True if the photo shows nearly the whole sphere, upright or at a known tilt."""
     return query.settings.gravity != "unknown" and query.photo.small.valid_share >= WHOLE
 
 
 def brief_query(query: Query) -> Query:
-    """The query from few starts."""
+    """Return the query with fewer starts."""
     settings = replace(query.settings, max_starts=min(FIRST_STARTS, query.settings.max_starts))
     return replace(query, settings=settings)
 
 
 def tilted_query(query: Query) -> Query:
-    """The brief query of a whole photo that was searched as upright, now with any tilt.
+    """Return a brief query with any tilt, for a whole photo that was searched as upright.
 
-    In every other cell of the grid, by few rotations. Tilted photos that hide nothing are found so, others by
-    their features.
+    It searches every other cell of the grid, with few rotations. That finds tilted photos without
+    occluders; features find the others.
     """
     brief = brief_query(query)
     cells = np.floor(query.scan_map.centers[query.scan_map.sparse] / COARSE_SPACING).astype(np.int64)
@@ -154,21 +154,21 @@ def tilted_query(query: Query) -> Query:
 
 
 def mirror_score(query: Query) -> float:
-    """The first score of the mirrored photo, by a search of its own."""
+    """Search the mirrored photo, and return its first score."""
     mirror = mirrored(query)
     return first_score(mirror, search_poses(mirror, "known"))
 
 
 def first_score(query: Query, starts: Starts) -> float:
-    """The best score after a short descent from the best starts on their candidates' prepared views."""
-    some = starts.take(np.arange(min(NUM_SCORED, len(starts.candidate))))
+    """Return the best score after short descents from the best starts on prepared views."""
+    best = starts.take(np.arange(min(NUM_SCORED, len(starts.candidate))))
     image = query.photo.images.search()
-    _, scores = descend_all(query.scan_map, image, some, FIRST_ITERATIONS, query.workers)
+    _, scores = descend_all(query.scan_map, image, best, FIRST_ITERATIONS, query.workers)
     return float(scores.max(initial=0.0))
 
 
 def mirrored(query: Query) -> Query:
-    """The query of the photo turned over, left for right, for a first score; no heading is known of it."""
+    """Return the query of the photo mirrored left to right, without the heading prior, for a first score."""
     search = query.photo.images.search()
     rgbx = np.ascontiguousarray(search.rgbx.reshape(-1, search.width + 2)[:, ::-1]).reshape(-1)
     images = query.photo.images._replace(search=Once(lambda: Texels(rgbx, search.width)))

@@ -1,7 +1,7 @@
-"""The scan at a pose and the photo compared block by block of the sphere, over what both show.
+"""Comparison of the scan at a pose with the photo, in blocks of the sphere, over what both show.
 
-An occluder costs what it hides and no more: a right pose explains some blocks well and the rest not at all, a
-wrong one explains all of them a little.
+An occluder costs the blocks that it hides and no more: a right pose explains some blocks well and others not
+at all, a wrong one explains all of them a little.
 """
 
 import math
@@ -22,14 +22,14 @@ from ..views.points_around import place_of
 from ..views.view import average_colors, cell_statistics, empty_cells, locate
 from .query import Query
 
-CONTRADICTS = 0.1  # a block of less is left out of the local means and deviations
-LEAST_SHARED = 0.3  # of what the poorer view shows
+CONTRADICTS = 0.1  # a block with a lower correlation is left out of the local means and deviations
+LEAST_SHARED = 0.3  # fraction of what the poorer view shows
 MASK_WIDTH = 256  # [px] of the mask of blocks that contradict
 PER_LEVEL = np.float32(1.0 / 255.0)
 
 
 class Comparison(NamedTuple):
-    """What speaks for a pose, by blocks of the photo."""
+    """Agreement of photo and scan at a pose, by blocks of the photo."""
 
     correlation: NDArray[np.float64]  # (blocks,) of locally normalised colours, 0 where nothing is shared
     area: NDArray[np.float64]  # (blocks,) fractions of the sphere that both show and do not contradict
@@ -38,15 +38,15 @@ class Comparison(NamedTuple):
 
     @property
     def score(self) -> float:
-        """What blocks explain beyond chance, by what the photo shows, in [0, 1]."""
+        """Area explained beyond chance, divided by the area that the photo shows, in [0, 1]."""
         beyond = np.maximum(self.correlation - CHANCE, 0.0) / (1.0 - CHANCE)
         return float(beyond @ self.area) / max(self.valid_area, 1e-9)
 
     def ratio_to(self, other: "Comparison") -> float:
-        """What this pose explains by what another does, over the blocks that both views show.
+        """Return what this pose explains divided by what another does, over blocks that both views show.
 
-        Over all blocks, a pose from which more was scanned would gain by that alone. 0 where hardly any is
-        shared.
+        Over all blocks, a pose from which more was scanned would gain by that alone. 0 if hardly any block
+        is shared.
         """
         shared = np.minimum(self.visible_area, other.visible_area)
         if shared.sum() < LEAST_SHARED * min(self.visible_area.sum(), other.visible_area.sum()):
@@ -155,7 +155,7 @@ def compare_cells(
 
 
 def compare(query: Query, pose: Pose) -> Comparison:
-    """The scan as seen from a pose and the photo, by blocks; worked out once a pose."""
+    """Compare the scan as seen from a pose with the photo, by blocks; cached by the pose."""
     kept = query.cache.comparisons
     if pose.key not in kept:
         config = query.method.fine_view
@@ -183,12 +183,12 @@ def compare(query: Query, pose: Pose) -> Comparison:
 
 
 def score_pose(query: Query, pose: Pose) -> Hypothesis:
-    """A pose with the score by which poses are selected."""
+    """Score a pose as poses are selected."""
     return Hypothesis(pose, compare(query, pose).score)
 
 
 def without_occluders(query: Query, pose: Pose) -> Query:
-    """The query without the photo's blocks that contradict the scan at a pose; itself if there are none."""
+    """Mask the photo's blocks that contradict the scan at a pose; the query itself if there are none."""
     seen = compare(query, pose)
     contradicts = (seen.correlation < CONTRADICTS) & (seen.visible_area > 0.0)
     if not contradicts.any():
@@ -201,6 +201,6 @@ def without_occluders(query: Query, pose: Pose) -> Query:
 
 @lru_cache(maxsize=1)
 def pixel_blocks() -> NDArray[np.int32]:
-    """The block in which each pixel (h, 2 h) of a mask lies."""
+    """Return the block in which each pixel (h, 2 h) of a mask lies."""
     rays = pixel_rays(MASK_WIDTH).astype(np.float32)
     return cell_of(rays.reshape(-1, 3), BLOCK_RINGS).reshape(rays.shape[:2])

@@ -19,15 +19,15 @@ from .query import Query
 from .refinement import FULL_LOSS, as_levels
 
 ERROR_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
-MOST_SHARE = 1.001  # of a block in what fixes the pose, a little above 1 for one that does alone
+MOST_SHARE = 1.001  # above 1, so that one block may hold all information
 PIXEL_SHARE = 0.04  # of a pixel that is left in a pose, by trials with photos of 256 and 2048 px
-UNCALIBRATED_SHARE = 0.15  # the same of a photo whose principal point and distortion nobody measured
+UNCALIBRATED_SHARE = 0.15  # PIXEL_SHARE of a photo with unknown principal point and distortion
 POLE_DEG = 2.0  # around the photo's poles pixels are so narrow that one point's errors outweigh all others
 SCALE = FULL_LOSS * LEVELS_PER_UNIT
 
 
 class DifferenceSteps(NamedTuple):
-    """At what detail the loss is differentiated for a covariance."""
+    """Image scale and steps with which the loss is differentiated for a covariance."""
 
     scale: int  # of the photo's images: 0 the finest
     turn: float  # step of the differences [rad]
@@ -44,7 +44,7 @@ ROUGH_STEPS = DifferenceSteps(2, math.radians(0.3), 0.015, 1.0)
 
 
 def gradient_at(image: Texels, points: Cells, pose: Pose) -> Array:
-    """Gradient (6,) of the robust loss, in the camera's frame."""
+    """Return the gradient (6,) of the robust loss, in the camera's frame."""
     sums = np.empty(NUM_SUMS)
     center = pose.center_world - points.center_map
     channel_equations((*points[:3], image.rgbx, image.width, SCALE), pose.R_cam_from_world, center, sums)
@@ -52,7 +52,7 @@ def gradient_at(image: Texels, points: Cells, pose: Pose) -> Array:
 
 
 def symmetric(upper: Array) -> Array:
-    """Symmetric matrices (..., 6, 6) of their upper triangles (..., 21), row by row."""
+    """Return symmetric matrices (..., 6, 6) from their upper triangles (..., 21), row by row."""
     matrix = np.zeros((*upper.shape[:-1], 6, 6))
     rows, columns = np.triu_indices(6)
     matrix[..., rows, columns] = matrix[..., columns, rows] = upper
@@ -60,7 +60,7 @@ def symmetric(upper: Array) -> Array:
 
 
 def without_poles(points: Cells, pose: Pose) -> Cells:
-    """The points around a pose that are not within POLE_DEG of the photo's poles."""
+    """Remove the points around a pose that lie within POLE_DEG of the photo's poles."""
     heights = pose.R_cam_from_world[2] @ points.offsets
     ranges = np.linalg.norm(points.offsets, axis=0)
     is_kept = np.abs(heights) < math.cos(math.radians(POLE_DEG)) * ranges
@@ -69,9 +69,9 @@ def without_poles(points: Cells, pose: Pose) -> Cells:
 
 
 def hessian_at(image: Texels, points: Cells, pose: Pose, steps: DifferenceSteps) -> Array:
-    """Hessian (6, 6) of the robust loss, by central differences over steps as large as errors are.
+    """Return the Hessian (6, 6) of the robust loss, by differences over steps as large as errors are.
 
-    The Gauss-Newton matrix leaves out that the loss flattens: with it, deviations come out several times too
+    The Gauss-Newton matrix ignores that the loss flattens, and would make deviations several times too
     small.
     """
     rows = []
@@ -82,7 +82,7 @@ def hessian_at(image: Texels, points: Cells, pose: Pose, steps: DifferenceSteps)
 
 
 def equations_by_block(image: Texels, points: Cells, pose: Pose, block: NDArray[np.integer]) -> Array:
-    """Sums (B, 29) of the normal equations over the points (N,) of each block; the camera is their centre."""
+    """Sum the normal equations (B, 29) over the points (N,) of each block, the camera at their centre."""
     order = np.argsort(block, kind="stable")
     counts = np.bincount(block)
     offsets, levels, weights = (np.ascontiguousarray(values[..., order]) for values in points[:3])
@@ -94,22 +94,22 @@ def equations_by_block(image: Texels, points: Cells, pose: Pose, block: NDArray[
 
 
 def blocks_of(points: Cells) -> NDArray[np.integer]:
-    """The block (N,) of the sphere in which each point lies."""
+    """Return the block (N,) of the sphere in which each point lies."""
     return cell_of(points.offsets.T / np.linalg.norm(points.offsets, axis=0)[:, None], ERROR_RINGS)
 
 
 def block_gradients(image: Texels, points: Cells, pose: Pose) -> Array:
-    """Gradients (B, 6), in the camera's frame, of the points in each block around it, as if left out."""
+    """Return jackknife gradients (B, 6), in the camera's frame, of the blocks around it."""
     sums = equations_by_block(image, points, pose, blocks_of(points))
     shown = sums[sums[:, GRADIENT:MATRIX].any(axis=1)]  # of what the photo shows
     return as_left_out(shown[:, GRADIENT:MATRIX], symmetric(shown[:, MATRIX:]))
 
 
 def as_left_out(gradients: Array, matrices: Array) -> Array:
-    """Gradients (B, 6) of blocks as they would be at a pose found without the block, by matrices (B, 6, 6).
+    """Return gradients (B, 6) as at a pose found without each block, by matrices (B, 6, 6).
 
-    The more of what fixes the pose lies in one block, the more the pose has followed its errors, and the less
-    of them its gradient shows: g <- (I - A_b A^-1)^-1 g, of the block's part A_b of the Gauss-Newton matrix A
+    The more information one block holds, the more the pose has followed its errors, and the less of them its
+    gradient shows: g <- (I - A_b A^-1)^-1 g, of the block's part A_b of the Gauss-Newton matrix A
     (the estimate CR3 of Bell and McCaffrey, 2002).
     """
     shares = matrices @ np.linalg.pinv(matrices.sum(axis=0))
@@ -117,7 +117,7 @@ def as_left_out(gradients: Array, matrices: Array) -> Array:
 
 
 def covariance_of(hessian: Array, gradients: Array) -> Array | None:
-    """Covariance (6, 6) [rad, m] in the camera's frame, robust to errors that go together within a block.
+    """Return the covariance (6, 6) [rad, m] in the camera's frame, for errors correlated within blocks.
 
     The sandwich H^-1 (sum g g^T) H^-1 (Huber 1967; Liang and Zeger 1986 for clusters). None where the points
     do not fix the pose.
@@ -130,10 +130,10 @@ def covariance_of(hessian: Array, gradients: Array) -> Array | None:
 
 
 def covariance_at(query: Query, points: Cells, pose: Pose) -> Array | None:
-    """Covariance (6, 6) [rad, m] in the camera's frame, by the image in which the pose is best determined.
+    """Return the covariance (6, 6) [rad, m] in the camera's frame, by the image that determines it best.
 
-    Noise and stitching roughen the loss in the finest image; the next one is smoother. Where both are too
-    rough, a third tells.
+    Noise and stitching roughen the loss in the finest image; the next one is smoother. If both are too
+    rough, a third is used.
     """
 
     def by(steps: DifferenceSteps) -> Array | None:
@@ -149,10 +149,10 @@ def covariance_at(query: Query, points: Cells, pose: Pose) -> Array | None:
 
 
 def errors_of_source(query: Query, points: Cells, pixel_share: float) -> Array:
-    """What the errors of the photo and of the scan add to a covariance (6, 6) [rad, m] in the map's axes.
+    """Return the covariance (6, 6) [rad, m], in the map's axes, of errors of the photo and of the scan.
 
-    They go together over many blocks: a photo's grid and stitching by its pixels, a scan's noise and doubled
-    surfaces by what `surface_noise` tells. At the median range an angle and a displacement are one.
+    These are correlated over many blocks: a photo's grid and stitching, in pixels, and a scan's noise and
+    doubled surfaces, by `surface_noise`. The median range converts angles to displacements.
     """
     median_range = float(np.median(np.linalg.norm(points.offsets, axis=0)))
     turn = pixel_share * query.photo.pixel
@@ -164,9 +164,9 @@ def errors_of_source(query: Query, points: Cells, pixel_share: float) -> Array:
 
 
 def estimate_covariance(query: Query, pose: Pose, of_camera: Array | None = None) -> PoseCovariance | None:
-    """The covariance of a pose, in world axes; None where the points do not fix it.
+    """Estimate the covariance of a pose, in world axes; None where the points do not fix it.
 
-    `of_camera` (6, 6), in the map's axes, is what the uncertainty of the calibration adds.
+    `of_camera` (6, 6), in the map's axes, is the covariance added by the calibration.
     """
     query = without_occluders(query, pose)
     points = without_poles(query.points_at(pose).around(pose.center_world), pose)

@@ -1,9 +1,9 @@
-"""The focal length of a photo, fitted with its pose: by the scan, and by what is known of it beforehand.
+"""The focal length of a photo, fitted with its pose: by the scan and by prior knowledge.
 
-The photo is put on the sphere again for each of several focal lengths (and of k1, where a guessed camera has
-it), and the pose refined for each. The losses of these ends are the profile of the loss: its crest is the
-focal length that photo and scan agree on, and how each block of the sphere pulls at the crest is its
-covariance. That of the pose is the marginal one: what a focal length that is off does to a pose is added.
+The photo is projected again for each of several focal lengths (and of k1, if a guessed camera has it),
+and the pose refined with each. The losses at the ends are the profile of the loss. Its crest is the focal
+length on which photo and scan agree; the slopes of the blocks' losses at the crest give its covariance. The
+covariance of the pose is marginal: it includes the error by the focal length.
 """
 
 import itertools
@@ -35,20 +35,20 @@ from .selection import Selection
 
 FOCALS = "f", "fx", "fy"
 RADIAL = "k1"
-WIDE = 0.05  # a focal length that is known worse is a guess: k1 is fitted too
+WIDE = 0.05  # a focal length with a larger deviation is a guess: k1 is fitted too
 K1_DEVIATION = 0.05  # of k1 where the camera is a guess
 NUM_VALUES = 7  # of the parameter in a design of one
 NUM_VALUES_OF_TWO = 4  # of each parameter in one of two
 FIRST_REACH = (0.04, 0.1)  # of a design to either side: at first, least and most
 LAST_REACH = 0.02
-K1_PER_FOCAL = 1.0  # reach in k1 by that in the focal length's logarithm
+K1_PER_FOCAL = 1.0  # reach in k1 divided by that in the focal length's logarithm
 MOST_DESIGNS = 6
 INFLATION = 4.0  # of the covariance, so that 95 % of true focal lengths lie within two deviations
 EDGE_ERROR = 0.4  # [px] of the sphere at the picture's edge, which all blocks may have in common
-LEAST_BLOCKS = 4  # of the sphere that a picture shows, by parameter: fewer tell nothing of a deviation
+LEAST_BLOCKS = 4  # shown by a picture, per parameter: fewer give no deviation
 MOST_SHARE = 0.7  # of a block in what fixes the focal length
-AT_REST = 0.25  # deviations that change no more
-LEAST_CHANGE = 5e-4  # part of a focal length that does not
+AT_REST = 0.25  # deviations: a smaller change ends the fit
+LEAST_CHANGE = 5e-4  # and so does a smaller fraction of the focal length
 MAX_CALIBRATIONS = 4  # fits of a focal length
 EDGE = 5  # [px] within the picture's edge that no point may come near
 NEARBY = (FINE_LOSS, 12, 1e-4)
@@ -70,22 +70,22 @@ class FocalFit(NamedTuple):
 
     @property
     def is_at_rest(self) -> bool:
-        """True if the photo need not be put on the sphere again for what is left of the change."""
+        """True if the remaining change is too small to put the photo on the sphere again."""
         deviations = np.sqrt(np.diag(self.covariance))
         return bool(np.all(np.abs(self.change) <= np.maximum(AT_REST * deviations, LEAST_CHANGE)))
 
     @property
     def pose_covariance(self) -> Array:
-        """Covariance (6, 6) that a pose has by that of the calibration: rotation, then centre in the map."""
+        """Covariance (6, 6) of a pose by that of the calibration: rotation, then centre in the map."""
         return np.asarray(self.motion @ self.covariance @ self.motion.T)
 
     def moved(self, pose: Pose) -> Pose:
-        """A pose in the map as it follows the change."""
+        """Move a pose in the map with the change."""
         delta = self.motion @ self.change
         return Pose(exp_so3(delta[:3]) @ pose.R_cam_from_world, pose.center_world + delta[3:])
 
     def focal_length(self, panorama: Panorama) -> FocalLength:
-        """The focal length of a photo with its deviation, and what was known of it."""
+        """Return the focal length of a photo with its deviation, and its prior."""
         prior = panorama.focal_prior
         focal = panorama.cameras[0].camera.focal[0]
         assert prior is not None
@@ -113,9 +113,9 @@ class Crest(NamedTuple):
 
 
 def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
-    """Fit the focal length of a photo with a focal_prior whose pose in the map is about known.
+    """Fit the focal length of a photo with a focal_prior whose pose in the map is roughly known.
 
-    Not first, the focal length is about known too.
+    Later fits (`is_first` false) begin from a focal length that is roughly known too.
     """
     prior = query.photo.given.focal_prior
     camera = query.photo.given.cameras[0].camera
@@ -144,9 +144,9 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
 
 
 def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
-    """Search the crest of the profile about a pose in ever narrower designs, and move those that miss it.
+    """Search the crest of the profile about a pose in ever narrower designs, moved if they miss it.
 
-    Its information is 0 where no design has a crest: the picture does not tell the calibration.
+    Its information is 0 if no design has a crest: the picture does not determine the calibration.
     """
     middle = np.zeros(num)
     found: Crest | None = None
@@ -169,7 +169,7 @@ def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
 
 
 def design(num: int, reach: float) -> Array:
-    """Changes (K, num) of a camera on a grid within a reach on either side."""
+    """Return changes (K, num) of a camera on a grid within a reach on either side."""
     values = np.linspace(-reach, reach, NUM_VALUES if num == 1 else NUM_VALUES_OF_TWO)
     scales = [values, values * K1_PER_FOCAL]
     return np.array(list(itertools.product(*scales[:num])))
@@ -185,11 +185,11 @@ def take_profile(query: Query, pose: Pose, changes: Array) -> tuple[Array, list[
     whole = query.photo.panorama
     is_left = shown.photo.panorama.is_valid | ~whole.is_valid  # what does not contradict the scan
 
-    def taken(change: Array) -> Panorama:
+    def retake(change: Array) -> Panorama:
         found = given.retaken(change_camera(given.cameras[0].camera, change), whole.rgb.shape[1])
         return replace(found, is_valid=found.is_valid & is_left)
 
-    narrowest = taken(changes.max(axis=0)).is_valid
+    narrowest = retake(changes.max(axis=0)).is_valid
     points = within(shown.points_at(pose), pose, narrowest)
     fine = shown.view_at(pose, query.method.fine_view)
     around = without_poles(points.around(pose.center_world), pose)
@@ -197,7 +197,7 @@ def take_profile(query: Query, pose: Pose, changes: Array) -> tuple[Array, list[
     middle = changes.mean(axis=0)
 
     def end_with(change: Array) -> tuple[Pose, Array]:
-        images = images_of(taken(change), query.method.scales)
+        images = images_of(retake(change), query.method.scales)
         is_near = abs(changes - middle).max() <= 1.001 * LAST_REACH
         near = pose if is_near else descend(fine, images.fine(), pose, NEARBY)
         end = descend(points, images.full(), near, CLOSE)
@@ -210,7 +210,7 @@ def take_profile(query: Query, pose: Pose, changes: Array) -> tuple[Array, list[
 
 
 def within(points: Cells, pose: Pose, is_valid: NDArray[np.bool_]) -> Cells:
-    """Points with those left out that come near the edge of what a photo (H, W) shows."""
+    """Remove the points near the edge of what a photo (H, W) shows."""
     inner = cv2.erode(is_valid.view(np.uint8), np.ones((EDGE, EDGE), np.uint8))
     offsets = points.around(pose.center_world).offsets.T.astype(np.float64)
     rays = rotate_points(offsets / np.linalg.norm(offsets, axis=1, keepdims=True), pose.R_cam_from_world)
@@ -268,7 +268,7 @@ def calibrate(query: Query, found: Selection) -> tuple[Query, Selection, FocalFi
 
 
 def recalibrate(query: Query, change: Array) -> Query:
-    """The query of a photo with another calibration; its matches stay, and their rays follow."""
+    """Prepare the query again with another calibration; its matches stay, and their rays follow."""
     given = query.photo.given
     before = given.cameras[0]
     after = before.with_camera(change_camera(before.camera, change))
@@ -279,7 +279,7 @@ def recalibrate(query: Query, change: Array) -> Query:
 
 
 def _turn_features(half: Once[Features], before: Mount, after: Mount) -> Features:
-    """Features with the rays that another calibration gives their pixels."""
+    """Turn the rays of features to those that another calibration gives their pixels."""
     found = half()
     keypoints = found.keypoints._replace(rays=_turn_rays(found.keypoints.rays, before, after))
     return Features(keypoints, found.matches._replace(rays=_turn_rays(found.matches.rays, before, after)))

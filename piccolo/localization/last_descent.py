@@ -1,4 +1,4 @@
-"""The last millimetres: the best poses, without what occludes the scan, on its points, until they rest."""
+"""The last descent: mask occluders, descend on the points of the scan, repeat until the pose rests."""
 
 import math
 from collections.abc import Sequence
@@ -22,25 +22,26 @@ from .refinement import (
 )
 from .selection import SURE_MATCHES, Selection, rank, select
 
-HOPELESS_SCORE = 0.02  # of black, white and noisy pictures, and of most views of other places
-FAINT_SCORE, FAINT_MATCHES = 0.1, 6  # nothing that has less of both is ever localized
-NEAR_SCORE = 0.6  # an alternative with this part of the best score is refined as carefully as the best
-NEAR_MATCHES = 0.5  # and so is one with this part of its matches
+HOPELESS_SCORE = 0.02  # black, white and noisy pictures, and most photos of other places, have less
+FAINT_SCORE = 0.1  # a pose with less, and fewer matches than the next line, is never localized
+FAINT_MATCHES = 6
+NEAR_SCORE = 0.6  # an alternative with this fraction of the best score is refined like the best
+NEAR_MATCHES = 0.5  # and so is one with this fraction of its matches
 MAX_REFINED = 4  # alternatives
-MAX_UNOCCLUDED = 2  # times that occluders are looked for
+MAX_UNOCCLUDED = 2  # rounds that mask occluders
 NUM_ROUNDS = 2  # of the descent at full resolution
 FULL_LIMITS = (FULL_LOSS, 10, 1e-4)
 LAST_LIMITS = (FULL_LOSS, 30, 1e-7)
-NEARLY = 0.02  # [m] a camera that moves by less in a round sees the same points
+NEARLY = 0.02  # [m] after a smaller move the camera sees the same points
 MAX_LAST_ROUNDS = 6
-SETTLED = 1e-4  # [m] one that does by less has arrived
-MIN_SCORE_LEFT = 0.94  # of the score, in exchange for millimetres
+SETTLED = 1e-4  # [m] a smaller move ends the last rounds
+MIN_SCORE_LEFT = 0.94  # fraction of the score that a descent on points must keep
 
 
 def refine_to_the_end(query: Query, hypotheses: Sequence[Hypothesis]) -> Selection:
-    """The best of some hypotheses, and the best elsewhere, those near it refined to the same end.
+    """Refine the best hypothesis and the alternatives that come near it, and select the best.
 
-    Where all are faint, the best is refined on fine cells by itself first: if it stays so, no more is asked.
+    If all are faint, only the best is refined first, on fine cells; if it stays faint, that is all.
     """
     found = rank(hypotheses)
     if found.best.score < HOPELESS_SCORE:
@@ -65,7 +66,7 @@ def refine_to_the_end(query: Query, hypotheses: Sequence[Hypothesis]) -> Selecti
 
 
 def is_faint(query: Query, found: Selection) -> bool:
-    """True if neither the best nor any alternative explains much, or has matches that agree with it."""
+    """Return True if the best pose and all alternatives have a low score and few matches."""
     return all(
         h.score < FAINT_SCORE and count_matches(query.matches, h.pose) < FAINT_MATCHES
         for h in (found.best, *found.alternatives)
@@ -73,9 +74,9 @@ def is_faint(query: Query, found: Selection) -> bool:
 
 
 def refine_unoccluded(query: Query, pose: Pose) -> tuple[Query, Hypothesis]:
-    """A pose refined by what of the photo does not contradict it; the query of just that, and the pose.
+    """Mask occluders and refine the pose, in rounds; return the masked query and the pose.
 
-    Its score is that of the whole photo.
+    The score of the pose is that of the whole photo.
     """
     h = score_pose(query, pose)
     for _ in range(MAX_UNOCCLUDED):
@@ -92,13 +93,13 @@ def refine_unoccluded(query: Query, pose: Pose) -> tuple[Query, Hypothesis]:
 
 
 def refine_full_resolution(query: Query, pose: Pose) -> Hypothesis:
-    """Descend on the visible points themselves in the finest image."""
+    """Mask occluders, then descend on the visible points in the finest image."""
     shown, h = refine_unoccluded(query, pose)
     return descend_on_points(query, shown, h, FULL_LIMITS, NUM_ROUNDS, NEARLY)
 
 
 def settle(query: Query, h: Hypothesis) -> Hypothesis:
-    """Descend until the pose moves no more, so that it does not depend on where the search began."""
+    """Descend until the pose rests, so that it does not depend on where the search began."""
     shown = without_occluders(query, h.pose)
     return descend_on_points(query, shown, h, LAST_LIMITS, MAX_LAST_ROUNDS, SETTLED)
 
@@ -106,9 +107,9 @@ def settle(query: Query, h: Hypothesis) -> Hypothesis:
 def descend_on_points(
     query: Query, shown: Query, h: Hypothesis, limits: Limits, num_rounds: int, arrived: float
 ) -> Hypothesis:
-    """Descend on the points seen from a pose, and again from where it ends until it moves less than [m].
+    """Descend on the points visible from the pose, until a round moves it by less than `arrived` [m].
 
-    By what of the photo is `shown`; an end at which the score of all of it falls is not taken.
+    The descent uses the masked query `shown`; the result is discarded if the whole photo's score falls.
     """
     pose = h.pose
     for _ in range(num_rounds):
@@ -121,7 +122,7 @@ def descend_on_points(
 
 
 def settle_best(query: Query, found: Selection) -> Selection:
-    """Bring the best pose to rest, and if it is not the best any more then, the one that is."""
+    """Refine the best pose to convergence; repeat if another becomes the best."""
     at_rest: list[Hypothesis] = []
     with query.workers.beside(partial(query.surroundings_at, found.best.pose)):  # it hardly moves
         for _ in range(1 + len(found.alternatives)):

@@ -1,4 +1,4 @@
-"""The default method in order, one line a step: one panorama in a prepared map."""
+"""The default method, one line a step: localize one panorama in a prepared map."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,7 +22,11 @@ from .query import prepare_query
 from .settings import METHOD, CoarseToFineSettings, MethodConfig
 from .verdict import judge
 
-GUESSES = (0.0, -0.15, 0.15)  # of the logarithm of a focal length: a fifth off is within reach of one of them
+GUESSES = (
+    0.0,
+    -0.15,
+    0.15,
+)  # added to the log of the focal length: one comes near enough to any that is 20 % off
 NO_PIXEL = "the panorama: no pixel counts, all are masked"
 
 
@@ -35,7 +39,7 @@ def localize(
     watch: Stopwatch,
     method: MethodConfig = METHOD,
 ) -> Localization:
-    """Localize a panorama: attempts until one is sure; the best, refined to the end, is judged."""
+    """Localize a panorama: search until one attempt is sure, refine the best poses, judge the best one."""
     allowed_map = apply_prior(scan_map, settings.prior)
     if len(allowed_map.sparse) == 0:
         return Localization(warnings=(nothing_allowed(scan_map, settings.prior),))
@@ -44,7 +48,7 @@ def localize(
     with watch.stage("search"):
         query = prepare_query(panorama, allowed_map, settings, workers, method)
     images = query.photo.images
-    # a core that is idle meanwhile makes what later steps need
+    # idle cores prepare the images that later steps need
     with workers.beside(images.middle, images.fine, images.full, query.photo.colors):
         hypotheses: list[Hypothesis] = []
         for num_halves, attempt in attempts_for(query):
@@ -61,14 +65,14 @@ def localize(
 
 
 def has_guessed_focal(panorama: Panorama) -> bool:
-    """True for a photo whose focal length is a guess: `localize_guessed` is to be asked."""
+    """Return True if the focal length is a guess, so that `localize_guessed` should try several."""
     return panorama.focal_prior is not None and panorama.focal_prior.deviation > WIDE
 
 
 def localize_guessed(
     scan_map: ScanMap, panorama: Panorama, settings: CoarseToFineSettings, workers: Workers, watch: Stopwatch
 ) -> Localization:
-    """Localize a photo whose focal length is a guess with several, and return the likeliest result."""
+    """Localize a photo with several focal lengths around a guess, and return the most confident result."""
     camera = panorama.cameras[0].camera
     width = panorama.rgb.shape[1]
     taken = [panorama.retaken(change_camera(camera, np.array([guess])), width) for guess in GUESSES]
@@ -76,24 +80,28 @@ def localize_guessed(
 
 
 def likeliest(found: Sequence[Localization], settings: CoarseToFineSettings) -> Localization:
-    """Return the most confident of several results; it shares its probability with those of other poses."""
+    """Return the most confident of several results, its confidence reduced by results at other poses."""
     ranked = sorted(found, key=lambda f: -f.confidence)
     best = ranked[0]
-    rivals: list[Localization] = []
+    others_found: list[Localization] = []
     for other in ranked[1:]:
-        if other.pose and other.evidence and not any(is_correct(f.pose, other.pose) for f in (best, *rivals)):
-            rivals.append(other)
-    total = best.confidence + sum(f.confidence for f in rivals)
+        if (
+            other.pose
+            and other.evidence
+            and not any(is_correct(f.pose, other.pose) for f in (best, *others_found))
+        ):
+            others_found.append(other)
+    total = best.confidence + sum(f.confidence for f in others_found)
     if total <= best.confidence:
         return best
-    share = best.confidence / total
+    fraction = best.confidence / total
     others = [
-        Alternative(f.pose, f.evidence.score, None, f.evidence.num_matches, share * f.confidence)
-        for f in rivals
+        Alternative(f.pose, f.evidence.score, None, f.evidence.num_matches, fraction * f.confidence)
+        for f in others_found
         if f.pose and f.evidence
     ]
     listed = [*others, *best.alternatives][:MAX_ALTERNATIVES]
-    confidence = share * best.confidence
+    confidence = fraction * best.confidence
     none = 1.0 - confidence - sum(a.probability or 0.0 for a in listed)
     probabilities = np.array([confidence, *(a.probability or 0.0 for a in listed), none])
     status = classify(probabilities, settings.min_confidence)

@@ -1,4 +1,4 @@
-"""A query: a photo at several scales, the map in which it is searched, and what is known of both so far."""
+"""A query: a photo at several scales, the map in which it is searched, and cached results."""
 
 import math
 from collections.abc import Sequence
@@ -27,9 +27,9 @@ from ..views.view import Cells, ViewConfig, normalized_view
 from .settings import METHOD, CoarseToFineSettings, ImageScales, MethodConfig
 
 COMPARED_WIDTH = 256  # [px]
-MAX_WIDTH = 4096  # [px] of the photo that the loss is taken from: more costs seconds and tells nothing
-MOST_SHARE = 0.98  # of the sphere: of a photo that shows more, all cells are shown
-NUM_POINTS = 30_000  # for the last millimetres, in what the photo shows
+MAX_WIDTH = 4096  # [px] of the photo for the loss: more costs seconds and gains nothing
+MOST_SHARE = 0.98  # of the sphere: a photo that shows more counts as showing all cells
+NUM_POINTS = 30_000  # of the last descent, among those that the photo shows
 VOXEL_PER_RANGE = 1 / 150  # of points around a pose, with which the photo is compared
 COARSE_VOXEL_PER_RANGE = 1 / 40  # of coarser ones
 
@@ -44,7 +44,7 @@ class Images(NamedTuple):
 
 
 def images_of(panorama: Panorama, scales: ImageScales) -> Images:
-    """The images of a panorama, each resized from the one before."""
+    """Return the images of a panorama, each resized from the one before."""
     images = []
     for scale in scales:
         panorama = resize(panorama, scale.width)
@@ -65,7 +65,7 @@ class Photo:
     pixel: float  # [rad] of the photo as it was given, but none finer than those that are compared
 
     def shown_cells(self, num_rings: int, pose: Pose) -> NDArray[np.bool_]:
-        """Which cells (N,) of a grid around a pose in the map the photo shows; all, if it shows a sphere."""
+        """Return a mask (N,) of the grid cells around a pose that the photo shows."""
         grid = make_grid(num_rings)
         if self.small.valid_share > MOST_SHARE:
             return np.ones(len(grid), np.bool_)
@@ -115,7 +115,7 @@ class Query:
         return joined_matches([h.matches for h in halves], [len(h.keypoints.rays) for h in halves])
 
     def without(self, is_hidden: NDArray[np.bool_]) -> "Query":
-        """The query of the photo without some pixels (h, 2 h), the contrast of the rest taken again."""
+        """Mask pixels (h, 2 h) of the photo, and normalise the rest again."""
         panorama = self.photo.panorama
         height, width = panorama.is_valid.shape
         enlarged = cv2.resize(is_hidden.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
@@ -125,19 +125,19 @@ class Query:
         return replace(self, photo=photo, cache=Cache(self.cache.views))
 
     def view_at(self, pose: Pose, config: ViewConfig) -> Cells:
-        """The cells seen from about a pose that the photo shows."""
+        """Return the cells seen from near a pose that the photo shows."""
         place = place_of(pose)
         shown = self.photo.shown_cells(config.num_rings, pose)
         return normalized_view(self.cache.views.averages(place, config), place, config, shown)
 
     def points_at(self, pose: Pose) -> Cells:
-        """The points that the last descent goes by: seen from about a pose, and shown by the photo."""
+        """Return the points of the last descent: seen from near a pose, and shown by the photo."""
         config = self.method.full_view
         shown = self.photo.shown_cells(config.num_rings, pose)
         return self.cache.views.points(place_of(pose), config, shown.tobytes(), NUM_POINTS)
 
     def surroundings_at(self, pose: Pose) -> tuple[PackedPoints, PackedPoints]:
-        """Points around a pose with which the photo is compared, and coarser ones."""
+        """Return the points around a pose with which the photo is compared, and coarser ones."""
         around = partial(self.cache.views.surroundings, place_of(pose))
         return around(VOXEL_PER_RANGE), around(COARSE_VOXEL_PER_RANGE)
 
@@ -149,7 +149,7 @@ def prepare_query(
     workers: Workers,
     method: MethodConfig = METHOD,
 ) -> Query:
-    """The query of a panorama among a map's candidates; its metadata say how the camera was tilted."""
+    """Prepare a panorama for the search in a map; its metadata give the camera's tilt."""
     R_level_from_cam = rotation_to_level(panorama.gpano) if panorama.gpano else None
     width = method.scales.full.width
     resized = resize(panorama, width)
@@ -162,19 +162,19 @@ def prepare_query(
         np.eye(3) if R_level_from_cam is None else R_level_from_cam.T,
         math.tau / min(panorama.rgb.shape[1], width),
     )
-    photo.images.search()  # with which each search begins
+    photo.images.search()  # each search begins with it
     features = tuple(Once(partial(features_of, resized, scan_map, workers, views)) for views in HALVES)
     return Query(photo, scan_map, settings, workers, method, features, Cache(RecentViews(scan_map.octree)))
 
 
 def features_of(panorama: Panorama, scan_map: ScanMap, workers: Workers, views: Sequence[int]) -> Features:
-    """The features of some views of a panorama."""
+    """Find the features in several views of a panorama, and match them to the map."""
     gray = np.asarray(cv2.cvtColor(panorama.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
     keypoints = find_keypoints(gray, panorama.is_valid, workers, views)
     return Features(keypoints, match(keypoints, scan_map.features_now(workers), workers))
 
 
 def texels_of(panorama: Panorama) -> Texels:
-    """A panorama as texels, at most MAX_WIDTH wide."""
+    """Pack a panorama into texels, at most MAX_WIDTH wide."""
     panorama = shrink(panorama, MAX_WIDTH)
     return pack_texels(panorama.rgb, panorama.is_valid)

@@ -1,4 +1,4 @@
-"""From starts to poses: descents on the cells of ever finer views, successive halving, and perturbations."""
+"""From starts to poses: descents on ever finer views, with successive halving, and perturbations."""
 
 import math
 from collections.abc import Sequence
@@ -28,34 +28,34 @@ COARSE_LOSS = 1.2  # scale of the loss [standard deviations]
 FINE_LOSS = 1.0
 FULL_LOSS = 0.7
 START_TOLERANCE = 2e-3  # [rad + m] a shorter step ends a descent from a start
-PERTURBED_TOLERANCE = 1e-3  # and one from around a pose
-WIDE_ITERATIONS = 6  # of a descent from around a pose, on the wide image
-NARROW_ITERATIONS = 8  # on the other
+PERTURBED_TOLERANCE = 1e-3  # and one from a perturbed pose
+WIDE_ITERATIONS = 6  # of a descent from a perturbed pose, on the wide image
+NARROW_ITERATIONS = 8  # then on the narrow one
 PERTURBED_DISTANCE = 0.25  # [m]
 PERTURBED_ANGLE = math.radians(8.0)
 BATCH = 16  # starts that a thread takes at a time
-PERTURBED_BATCH = 3  # of those around a pose
+PERTURBED_BATCH = 3  # perturbed poses that a thread takes
 FIRST_ITERATIONS = 5  # of the first descents on prepared views
 SECOND_ITERATIONS = 12
 MIDDLE_LIMITS = (COARSE_LOSS, 12, 1e-3)
 FINE_LIMITS = (FINE_LOSS, 12, 1e-4)
-PERTURBATION = 0.4  # of that on middle cells, on fine ones
+PERTURBATION = 0.4  # size of the perturbations on fine cells, relative to middle ones
 MAX_PERTURBATIONS = 5  # rounds
-MIN_GAIN = 0.02  # by the score in a round; else it was the last
+MIN_GAIN = 0.02  # of the score in a round, relative; a round with less is the last
 NUM_FOUND = 12  # poses of a search, at most
-PLAIN_SCORE, FAINT_PART = 0.2, 0.25  # where the best has this score, no more is asked of what has less of it
+PLAIN_SCORE = 0.2  # if the best has this score, poses with less than FAINT_PART of it are dropped
+FAINT_PART = 0.25
 SAME_DISTANCE = 0.15  # [m] poses on their way down nearer than this
 SAME_ANGLE = math.radians(5.0)  # and this are one
-CLOSE_DISTANCE = 0.1  # [m] the same after the descent on middle cells
-
+CLOSE_DISTANCE = 0.1  # [m] SAME_DISTANCE after the descent on middle cells
 
 Limits = tuple[float, int, float]  # scale of the loss [standard deviations], iterations, least step [rad + m]
 
-Fit = Hypothesis  # on its way down: its score is `channel_loss.score` on the cells on which it descended
+Fit = Hypothesis  # during descent: its score is `channel_loss.score` on the cells of its last view
 
 
 def refine(query: Query, starts: Starts, beam: Beam) -> list[Hypothesis]:
-    """Successive halving from the starts to a few poses on fine cells, and the best elsewhere; best first."""
+    """Refine the starts by successive halving to a few distinct poses on fine cells, best first."""
     workers = query.workers
     coarse = descend_prepared(query, starts, FIRST_ITERATIONS, beam.num_coarse)
     coarse = descend_prepared(query, coarse, SECOND_ITERATIONS, beam.num_middle)
@@ -64,7 +64,7 @@ def refine(query: Query, starts: Starts, beam: Beam) -> list[Hypothesis]:
     perturbed = workers.map(partial(perturb_middle, query), narrowed, "descend")
     fine = workers.map(partial(descend_fine, query), narrow(perturbed, beam.num_fine), "descend")
     best = best_distinct(fine, beam.num_perturbed, CLOSE_DISTANCE, SAME_ANGLE)
-    others = plain(distinct(fine, middle))[len(best) :]  # which most likely stay
+    others = plain(distinct(fine, middle))[len(best) :]  # these most likely stay
     with workers.beside(*(partial(compare, query, f.pose) for f in others)):
         ends = workers.map(partial(refine_by_perturbation, query), best, "descend")
     poses = [f.pose for f in plain(distinct([*ends, *fine], middle))]
@@ -72,7 +72,7 @@ def refine(query: Query, starts: Starts, beam: Beam) -> list[Hypothesis]:
 
 
 def refine_matches(query: Query, poses: Sequence[Pose]) -> list[Hypothesis]:
-    """Poses that matches gave, each as found or after a descent on fine cells; the best first."""
+    """Descend on fine cells from poses of matches; keep the better of each start and end, best first."""
 
     def refine_match(pose: Pose) -> Hypothesis:
         end = descend_fine(query, pose).pose
@@ -89,23 +89,23 @@ def descend_prepared(query: Query, starts: Starts, num_iterations: int, count: i
 
 
 def descend_middle(query: Query, pose: Pose) -> Fit:
-    """Descend on middle cells, seen from where the pose is now."""
+    """Descend on the middle cells seen from the pose."""
     return descend_view(query, query.method.middle_view, query.photo.images.middle(), pose, MIDDLE_LIMITS)
 
 
 def descend_fine(query: Query, pose: Pose) -> Fit:
-    """Descend on fine cells, seen from where the pose is now."""
+    """Descend on the fine cells seen from the pose."""
     return descend_view(query, query.method.fine_view, query.photo.images.fine(), pose, FINE_LIMITS)
 
 
 def descend_view(query: Query, config: ViewConfig, image: Texels, pose: Pose, limits: Limits) -> Fit:
-    """Descend on the cells seen from a pose, with the score on them where it ends."""
+    """Descend on the cells seen from a pose, and score the end on them."""
     cells = query.view_at(pose, config)
     return fit_on(cells, config.arrays.blocks, image, descend(cells, image, pose, limits))
 
 
 def perturb_middle(query: Query, pose: Pose) -> Fit:
-    """Descend again from around a pose on middle cells."""
+    """Perturb a pose and descend again on middle cells."""
     config = query.method.middle_view
     images = query.photo.images.search(), query.photo.images.middle()
     cells = query.view_at(pose, config)
@@ -113,7 +113,7 @@ def perturb_middle(query: Query, pose: Pose) -> Fit:
 
 
 def refine_by_perturbation(query: Query, fit: Fit) -> Fit:
-    """Perturb and refine for as long as the score rises: a pose that stopped short creeps on."""
+    """Perturb and refine for as long as the score rises. Poses already converged are returned unchanged."""
     if fit.pose.key in query.cache.ends:
         return fit
     config = query.method.fine_view
@@ -136,9 +136,9 @@ def refine_by_perturbation(query: Query, fit: Fit) -> Fit:
 def best_and_alternatives(
     rotations: NDArray[np.float64], centers: NDArray[np.float64], count: int, min_distance: float
 ) -> NDArray[np.int64]:
-    """Indices of `count` of the poses (n, 3, 3), (n, 3), best first, which are in order again.
+    """Return indices of `count` of the poses (n, 3, 3), (n, 3), which come best first, in rising order.
 
-    The best that differ a little and, in a quarter of the places, the best that lie far apart.
+    Three quarters are the best poses that differ a little, a quarter the best that lie far apart.
     """
     near = non_maximum_suppression(rotations, centers, count - count // 4, min_distance, SAME_ANGLE)
     apart = non_maximum_suppression(rotations, centers, count, MIN_DISTANCE, MIN_ANGLE)
@@ -147,7 +147,7 @@ def best_and_alternatives(
 
 
 def narrow(fits: Sequence[Fit], count: int) -> list[Pose]:
-    """The `best_and_alternatives` of poses by their scores."""
+    """Return the `best_and_alternatives` of the fits, ranked by score."""
     ranked = [f.pose for f in by_score(fits)]
     rotations = np.array([pose.R_cam_from_world for pose in ranked])
     centers = np.array([pose.center_world for pose in ranked])
@@ -155,12 +155,12 @@ def narrow(fits: Sequence[Fit], count: int) -> list[Pose]:
 
 
 def distinct(fine: Sequence[Fit], middle: Sequence[Fit]) -> list[Fit]:
-    """The best on fine cells, and the best of those on middle cells, none near another."""
+    """Return the best poses of fine cells, then of middle cells, by non-maximum suppression."""
     return suppressed([*by_score(fine), *by_score(middle)], NUM_FOUND, MIN_DISTANCE, MIN_ANGLE)
 
 
 def plain(ranked: Sequence[Fit]) -> list[Fit]:
-    """Those that a comparison could bring near the best: all, unless it is good and they are far from it."""
+    """Drop the fits that score far below a good best: a comparison could not bring them near it."""
     best = max((f.score for f in ranked), default=0.0)
     least = FAINT_PART * best if best >= PLAIN_SCORE else -math.inf
     return [f for f in ranked if f.score >= least]
@@ -199,9 +199,9 @@ def descend_starts(views, cells, image, scale, num_iterations, row, R_cam_from_m
 def descend_perturbed(
     points, levels, weights, blocks, wide, narrow, scale, steps, R_cam_from_map, center, scores
 ):
-    """Descend from each step (n, 6) away from (n, 3, 3), (n, 3): on the wide image, then on the other.
+    """Descend from each step (n, 6) away from (n, 3, 3), (n, 3): on the wide image, then on the narrow.
 
-    A step that is none is taken on the other alone.
+    The zero step skips the wide image.
     """
     R = R_cam_from_map
     t = center
@@ -219,12 +219,12 @@ def descend_perturbed(
 
 
 def as_levels(channels: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Channels in standard deviations as 8-bit levels, not rounded."""
+    """Convert channels in standard deviations to 8-bit levels, not rounded."""
     return np.asarray(channels * np.float32(LEVELS_PER_UNIT) + np.float32(ZERO_LEVEL))
 
 
 def perturbations(size: float) -> NDArray[np.float64]:
-    """Steps (9, 6), rotation [rad] and translation [m]: none, then to the corners of a cube."""
+    """Return steps (9, 6), rotation [rad] and translation [m]: zero, then to the corners of a cube."""
     signs = np.array([(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) / math.sqrt(3.0)
     steps = np.concatenate([signs[:, ::-1] * PERTURBED_ANGLE, signs * PERTURBED_DISTANCE], axis=1) * size
     return np.concatenate([np.zeros((1, 6)), steps])
@@ -233,7 +233,7 @@ def perturbations(size: float) -> NDArray[np.float64]:
 def descend_all(
     scan_map: ScanMap, image: Texels, starts: Starts, num_iterations: int, workers: Workers
 ) -> tuple[Starts, NDArray[np.float64]]:
-    """Where descents from starts end, on their candidates' prepared views, best first; with their scores."""
+    """Descend from all starts on their candidates' prepared views; return ends and scores, best first."""
     R = starts.R_cam_from_map.copy()
     t = starts.center_map.copy()
     scores = np.empty(len(t))
@@ -243,8 +243,8 @@ def descend_all(
 
     def run(lo: int) -> None:
         part = slice(lo, lo + BATCH)
-        some = row[part], R[part], t[part], scores[part]
-        descend_starts(views, cells, (image.rgbx, image.width), scale, num_iterations, *some)
+        texels = (image.rgbx, image.width)
+        descend_starts(views, cells, texels, scale, num_iterations, row[part], R[part], t[part], scores[part])
 
     workers.map(run, range(0, len(t), BATCH), "descend")
     order = np.argsort(-scores, kind="stable")
@@ -252,7 +252,7 @@ def descend_all(
 
 
 def descend(cells: Cells, image: Texels, pose: Pose, limits: Limits) -> Pose:
-    """The pose where a descent ends; coordinates relative to the cells' centre keep float32 exact."""
+    """Descend on cells; coordinates relative to the cells' centre keep float32 exact."""
     loss_scale, num_iterations, tolerance = limits
     R = pose.R_cam_from_world.copy()
     t = pose.center_world - cells.center_map
@@ -263,7 +263,7 @@ def descend(cells: Cells, image: Texels, pose: Pose, limits: Limits) -> Pose:
 
 
 def fit_on(cells: Cells, blocks: NDArray[np.int32], image: Texels, pose: Pose) -> Fit:
-    """A pose with its score on cells, each in its block of the sphere."""
+    """Score a pose on cells, each in its block of the sphere."""
     t = pose.center_world - cells.center_map
     shown = cells.offsets, as_levels(cells.channels), cells.weights
     return Fit(pose, float(score(*shown, blocks, image.rgbx, image.width, pose.R_cam_from_world, t)))
@@ -277,7 +277,7 @@ def descend_around(
     size: float,
     workers: Workers,
 ) -> Fit:
-    """The best end of descents from around a pose, the wider image first, and from the pose itself."""
+    """Return the best end of descents from a pose and around it, on the wider image first."""
     steps = perturbations(size)
     R = np.repeat(pose.R_cam_from_world[None], len(steps), axis=0)
     t = np.repeat((pose.center_world - cells.center_map)[None], len(steps), axis=0)

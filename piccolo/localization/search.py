@@ -41,7 +41,7 @@ START_DISTANCE, START_ANGLE = 0.5, math.radians(20.0)  # [m], [rad] starts neare
 
 
 class TurnedPanorama(NamedTuple):
-    """The panorama on the cells of the sphere, turned many ways; whole numbers."""
+    """Panorama on the cells of the sphere in many rotations; whole numbers."""
 
     samples: Samples  # (rotations, 3, cells) channels times solid angle
     energy: Samples  # (rotations, cells) squared channels times solid angle, 0 where nothing is shown
@@ -49,17 +49,17 @@ class TurnedPanorama(NamedTuple):
 
 
 def whole(values: Samples, most: float, most_other: int, num_terms: int) -> Samples:
-    """Values up to `most`, scaled and rounded: sums of products with numbers up to another are exact."""
+    """Scale and round values up to `most`, so that sums of products with numbers up to another are exact."""
     return np.asarray(np.rint(values * whole_scale(most, most_other, num_terms)))
 
 
 def whole_scale(most: float, most_other: int, num_terms: int) -> np.float32:
-    """The factor for `whole`."""
+    """Return the factor of `to_whole_numbers`."""
     return np.float32(EXACT // (most_other * num_terms) / most)
 
 
 def turned(samples: Samples, validity: Samples, area: Samples, most_seen: int) -> TurnedPanorama:
-    """Channels (rotations, 3, cells) [levels] and validity (rotations, cells) by area, as whole numbers."""
+    """Weight channels (rotations, 3, cells) [levels] by area, as whole numbers."""
     num_cells = len(area)
     relative = area / area.max()
     energy = np.square(samples).sum(axis=1) * relative
@@ -71,7 +71,7 @@ def turned(samples: Samples, validity: Samples, area: Samples, most_seen: int) -
 
 
 def turn_panorama(texels: Texels, rotations: NDArray[np.float64]) -> tuple[Samples, Samples]:
-    """Channels (rotations, 3, cells) of the search grid, in levels, and validity (rotations, cells)."""
+    """Sample channels (rotations, 3, cells) of the search grid [levels], and validity (rotations, cells)."""
     grid = make_grid(SEARCH_RINGS)
     samples = np.empty((len(rotations), 3, len(grid)), np.float32)
     validity = np.empty((len(rotations), len(grid)), np.float32)
@@ -84,7 +84,7 @@ def turn_panorama(texels: Texels, rotations: NDArray[np.float64]) -> tuple[Sampl
 def widen(samples, validity, cells, cell_areas, areas, wide_samples, wide_validity):
     """Write the averages of rounded channels (n, 3, cells) and of validity by area, over wider cells.
 
-    `cells` and `cell_areas` (cells,) tell the wider cell of each and its part of that cell's, of `areas`.
+    `cells` and `cell_areas` (cells,) are the wider cell of each and its part of that cell's area in `areas`.
     Validity is rounded.
     """
     for k in range(len(samples)):
@@ -105,7 +105,7 @@ def widen(samples, validity, cells, cell_areas, areas, wide_samples, wide_validi
 
 
 def widened(samples: Samples, validity: Samples, workers: Workers) -> tuple[Samples, Samples]:
-    """Averages (rotations, 3, wide cells) [levels] of channels of the search grid, and of validity."""
+    """Average channels of the search grid to (rotations, 3, wide cells) [levels], and validity."""
     cells, areas = wider_cells(WIDE_RINGS)
     parts = cells, whole_areas(SEARCH_RINGS), areas
     wide = np.empty((len(samples), 3, len(areas)), np.float32)
@@ -128,11 +128,11 @@ class Starts:
     candidate: NDArray[np.int64]  # (n,)
 
     def take(self, indices: NDArray[np.int64]) -> "Starts":
-        """The starts at `indices`, in that order."""
+        """Select the starts at `indices`, in that order."""
         return Starts(*(values[indices] for values in vars(self).values()))
 
     def poses(self) -> list[Pose]:
-        """One object each."""
+        """Return the poses as objects."""
         return [Pose(R, center) for R, center in zip(self.R_cam_from_map, self.center_map, strict=True)]
 
 
@@ -178,9 +178,9 @@ def masked_correlation(
     panorama: TurnedPanorama,
     workers: Workers,
 ) -> Samples:
-    """Correlation (views, rotations), up to a factor, over the cells that both show.
+    """Return the correlation (views, rotations), up to a factor, over the cells that both show.
 
-    Views (views, 3 * cells) in 8 bits; seen (views, cells) is how much of each cell is seen.
+    Views (views, 3 * cells) are in 8 bits; seen (views, cells) is the fraction seen of each cell.
     """
     weighted = panorama.samples.reshape(len(panorama.samples), -1)
     num_cells = len(area)
@@ -206,9 +206,9 @@ def masked_correlation(
 def best_poses_wide(
     scan_map: ScanMap, samples: Samples, validity: Samples, pool: int, workers: Workers
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Samples]:
-    """As `best_poses`, by the masked correlation of wide views with the turned panorama, its cells averaged.
+    """Return `best_poses` by the masked correlation of wide views with the averaged panorama.
 
-    Of some candidates at a time: scores of all are a gigabyte where a campus meets all rotations.
+    In parts of the candidates: a campus in all rotations would have a gigabyte of scores.
     """
     area = wider_cells(WIDE_RINGS)[1]
     panorama = turned(*widened(samples, validity, workers), area, 255)
@@ -258,9 +258,9 @@ def correlate_pairs(features, is_seen, area, panorama, row, rotation, scores):
 def best_poses(
     scores: Samples, pool: int, least: np.float32 = LOWEST
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Samples]:
-    """Candidates, rotations and scores of the best `pool` poses that have more than `least`, best first.
+    """Return candidates, rotations and scores of the best `pool` poses above `least`, best first.
 
-    Of equal ones, the first. Where many have more, those that are sorted are few: a sample tells which.
+    Of equal scores, the first. A threshold from a sample of the scores keeps the sorted part small.
     """
     flat = scores.ravel()
     pool = min(pool, flat.size)
@@ -271,7 +271,7 @@ def best_poses(
         rank = len(sample) - 1 - int(min(2 * pool / step + 20, len(sample) - 1))
         threshold = max(np.partition(sample, rank)[rank] if rank > 0 else LOWEST, least)
     top = np.flatnonzero(flat > threshold)
-    if len(top) < pool and threshold > least:  # many fit alike: a scan of one colour
+    if len(top) < pool and threshold > least:  # many score alike: a scan of one colour
         alike = np.flatnonzero(flat == threshold)[: pool - len(top)]
         top = np.concatenate([top, alike])
     top = top[np.lexsort((top, -flat[top]))][:pool]
@@ -279,9 +279,9 @@ def best_poses(
 
 
 def search_poses(query: Query, gravity: Gravity) -> Starts:
-    """The distinct best of all candidates with all rotations, in two stages.
+    """Search all candidates with all rotations in two stages; return the distinct best.
 
-    Wide cells of the sparse candidates, as matrix products; then fine cells of the poses that are left.
+    Wide cells of the sparse candidates, by matrix products; then fine cells of the remaining poses.
     """
     m = query.scan_map
     settings = query.settings
@@ -292,8 +292,8 @@ def search_poses(query: Query, gravity: Gravity) -> Starts:
     rotations = allowed_rotations(rotations @ m.R_map_from_world, settings.prior) @ m.R_map_from_world.T
     num_views = min(views_at_once(len(rotations)), len(m.sparse))
     num_bytes = len(rotations) * (len(make_grid(SEARCH_RINGS)) * TURNED_BYTES + 4 * num_views)
-    what = f"a search of {len(m.sparse)} positions in {len(rotations)} rotations"
-    check_memory(num_bytes, what, "set fewer num_yaws or num_rotations")
+    task = f"a search of {len(m.sparse)} positions in {len(rotations)} rotations"
+    check_memory(num_bytes, task, "set fewer `num_yaws` or `num_rotations`")
     samples, validity = turn_panorama(query.photo.images.search(), rotations)
     num_starts = max(len(m.sparse) // CANDIDATES_PER_START, query.method.min_starts)
     num_starts = min(num_starts, settings.max_starts)

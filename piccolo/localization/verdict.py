@@ -24,18 +24,18 @@ from .prior import contradictions
 from .query import Query
 from .selection import SURE_MATCHES, Selection, standings_of
 
-ENOUGH_EXPLAINED = 0.7  # score from which a photo is not mirrored
-MIRROR_RATIO = 1.2  # of matches, mirrored by not
+ENOUGH_EXPLAINED = 0.7  # with this score a photo is not mirrored
+MIRROR_RATIO = 1.2  # least ratio of matches, mirrored photo to photo
 MIRRORED = "the photo fits the scan better mirrored, left for right: turn it over and try again"
 MOST_CONFLICT = 4.0  # deviations between the focal length found and that given
-TELLING_STD = 0.03  # [m] of a position: what a focal length adds beyond it is told
+TELLING_STD = 0.03  # [m] of the position by the focal length: more is reported
 LAST_STEP = 0.01  # [rad, m] of Adam and the first of L-BFGS, where they take the last descent
 
 
 def judge(query: Query, found: Selection, fit: FocalFit | None = None) -> Localization:
-    """The pose found in world coordinates, after the descent that the solver asks for, with its evidence.
+    """Return the result for the best pose: evidence, covariance, probabilities and status.
 
-    `fit` is that of the focal length, of a photo whose is not exact.
+    `fit` is the fitted focal length, if the photo's is not exact.
     """
     if found.best.score < 0.0:
         return Localization()
@@ -43,15 +43,15 @@ def judge(query: Query, found: Selection, fit: FocalFit | None = None) -> Locali
     pose = found.best.pose
     points, coarse = query.surroundings_at(pose)
     if settings.solver != "gauss-newton":
-        how = DescentSettings(solver=settings.solver, step_size=LAST_STEP)
-        pose = refine(points, sampling_loss_of(query.photo.colors()), pose, how).pose
-    asked: list[Callable[[], Any]] = [
+        descent = DescentSettings(solver=settings.solver, step_size=LAST_STEP)
+        pose = refine(points, sampling_loss_of(query.photo.colors()), pose, descent).pose
+    measures: list[Callable[[], Any]] = [
         partial(estimate_covariance, query, pose, fit and fit.pose_covariance),  # takes longest
         lambda: occlusion_at(points, query.photo.given, pose).fractions(),
         lambda: sampling_loss(visible_points(points, pose.center_world), query.photo.colors(), pose),
         lambda: agreement_at(coarse, query.photo.panorama, pose),
     ]
-    covariance, fractions, loss, agreement = query.workers.map(operator.call, asked, "evaluate")
+    covariance, fractions, loss, agreement = query.workers.map(operator.call, measures, "evaluate")
     if not math.isfinite(loss):
         return Localization()
     evidence = evidence_of(query, found, agreement, fractions)
@@ -86,7 +86,7 @@ def judge(query: Query, found: Selection, fit: FocalFit | None = None) -> Locali
 
 
 def doubts_of(panorama: Panorama, fit: FocalFit) -> tuple[str, ...]:
-    """Say what a focal length has to do with a pose that is not sure."""
+    """Explain how the focal length makes a pose doubtful, as warnings."""
     focal = fit.focal_length(panorama)
     found = f"focal length: found {focal.px:.0f} px within {focal.std_px:.0f}"
     given = f"given {focal.given_px:.0f} px within {focal.given_std_px:.0f}"
@@ -99,7 +99,7 @@ def doubts_of(panorama: Panorama, fit: FocalFit) -> tuple[str, ...]:
 def evidence_of(
     query: Query, found: Selection, agreement: Agreement, fractions: tuple[float, float]
 ) -> Evidence:
-    """What a result tells of its pose: fractions of the photo are explained and contradicted."""
+    """Collect the evidence for the best pose, from the fractions explained and contradicted."""
     num_matches = [count_matches(query.matches, h.pose) for h in (found.best, *found.alternatives)]
     return Evidence(
         score=found.best.score,
@@ -114,10 +114,10 @@ def evidence_of(
 
 
 def is_mirrored(query: Query, evidence: Evidence) -> bool:
-    """True if more features of the mirrored photo agree with one pose than of the photo.
+    """Return True if the mirrored photo's features agree with a pose better than the photo's.
 
-    Symmetric things match in a mirror too, but not more of them. A pose that explains nearly all needs none,
-    and a first look has asked.
+    Symmetric things match in a mirror too, but no better. A pose that explains nearly all of the photo is
+    not asked, nor one of the first look, which has compared the mirrored photo itself.
     """
     if evidence.score >= ENOUGH_EXPLAINED or evidence.num_matches is None:
         return False
