@@ -363,10 +363,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--only PART ...", "measure these parts alone", choices=PARTS, default=list(PARTS))
     option(parser, "--damaged N", "panoramas of each scene that are damaged", default=4)
     option(parser, "--photos N", "phone photos cut out of the panoramas of each scene", default=12)
-    option(
-        parser, "--points N ...", "sizes of the first scene, resampled", default=[10_000, 100_000, 1_000_000]
-    )
-    option(parser, "--rooms N ...", "made rooms, 1 to 256", default=[1, 16, 64])
+    sizes = [10_000, 100_000, 1_000_000]
+    option(parser, "--points N ...", "of the first scene, resampled", nargs="*", default=sizes)
+    option(parser, "--rooms N ...", "made rooms, 1 to 256", nargs="*", default=[1, 16, 64])
     option(parser, "--out FILE", "the page; by default it is printed")
 
 
