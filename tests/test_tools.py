@@ -44,7 +44,7 @@ def test_the_page_of_a_scene_says_what_was_measured(scene, tmp_path, monkeypatch
     assert len(text.splitlines()) <= 200
     commit = run(["git", "-C", str(ROOT), "describe", "--always", "--abbrev=12"]).stdout.strip()
     assert f"Measured on {datetime.datetime.now(datetime.UTC).date()} at commit {commit or 'unknown'}" in text
-    assert f"NumPy {np.__version__}, Numba {numba.__version__}, OpenCV {cv2.__version__}; " in text
+    assert f"NumPy {np.__version__}, Numba {numba.__version__}, OpenCV {cv2.__version__};\n" in text
     row = table_of(text, page.PANORAMAS)[f"{scene.name}, clean"]
     assert row["queries"] == row["right"] == row["localized"] == "1"
     assert row["wrong of these"] == "0"

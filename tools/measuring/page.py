@@ -86,8 +86,10 @@ PARTS = {
 HEAD = """\
 # Benchmark
 
-Measured on {date} at commit {commit} by `python tools/benchmark.py {words}`:
-Python {python}, NumPy {numpy}, Numba {numba}, OpenCV {opencv}; {processor}, {cores} cores.
+    python tools/benchmark.py {words}
+
+Measured on {date} at commit {commit}, Python {python}, NumPy {numpy}, Numba {numba}, OpenCV {opencv};
+{processor}, {cores} cores.
 
 Right: under 0.1 m and 5 degrees. Wrong of these: localized, but not right. Outside: localized, and the true
 pose is not in the 95 % region of the covariance. mm, deg: median errors of the right poses. s: median seconds
@@ -342,12 +344,15 @@ def processor_name() -> str:
     return names[0] if names else platform.processor() or platform.machine()
 
 
-def page_head(scenes: Sequence[Path]) -> str:
-    """Return title, date, commit, versions and machine."""
+def page_head(arguments: argparse.Namespace) -> str:
+    """Return title, date, commit, options, versions and machine."""
+    words = ["all", "--scenes", *(folder.resolve().name for folder in arguments.scenes)]
+    for name in ("only", "damaged", "photos", "points", "rooms"):
+        words += [f"--{name}", *map(str, np.atleast_1d(getattr(arguments, name)))]
     return HEAD.format(
         date=datetime.datetime.now(datetime.UTC).date().isoformat(),
         commit=git_commit(),
-        words=f"all --scenes {' '.join(folder.resolve().name for folder in scenes)}",
+        words=" ".join(words),
         python=platform.python_version(),
         numpy=np.__version__,
         numba=numba.__version__,
@@ -372,7 +377,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Measure, and write the page."""
     check_least(arguments, damaged=0, photos=0)
-    head = page_head(arguments.scenes)
+    head = page_head(arguments)
     bench = Bench(arguments)
     bench.measure()
     page = "\n".join(chain([head], bench.sections())).rstrip("\n") + "\n"
