@@ -117,7 +117,7 @@ def test_wrong_answers_are_listed():
     assert page.row_cells(rows) == ("25", "0", "25", "25", "0", "-", "-", "1.00")
     first, second, *_, last = page.wrong_lines(rows).splitlines()
     assert first == "25 of 25 were localized and are not right."
-    assert second == "- night, a.jpg: 0.50 m, 0.0 deg; confidence 0.950"
+    assert second == "- night, a.jpg: 0.50 m off; confidence 0.950"
     assert last == "- and 5 more"
 
 

@@ -79,7 +79,7 @@ def outcome_of(line: str) -> Outcome | None:
     e = result.evidence
     rows = [(1.0, e.score, e.num_matches)]
     rows += [(a.share or 0.0, a.score, a.num_matches) for a in result.alternatives]
-    standings = [Standing(share, score, CLEAR_MATCHES if n is None else n) for share, score, n in rows]
+    standings = [Standing(ratio, score, CLEAR_MATCHES if n is None else n) for ratio, score, n in rows]
     poses = [result.best_pose, *(a.pose for a in result.alternatives)]
     error = np.full(6, np.nan)
     right = len(poses)

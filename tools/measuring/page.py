@@ -21,7 +21,7 @@ from piccolo.cli.errors import print_note
 from piccolo.cloud import read_cloud
 from piccolo.confidence.confidence import LOCALIZED
 from piccolo.files.atomic import write_atomically
-from piccolo.geometry.pose import Pose, angle_between, is_correct
+from piccolo.geometry.pose import Array, Pose, is_correct
 from piccolo.jobs.threads import Workers, num_cores
 from piccolo.panorama import read_panorama
 from piccolo.paper.settings import PaperSettings
@@ -117,22 +117,20 @@ class Row(NamedTuple):
         return self.result.status == LOCALIZED
 
     @property
-    def errors(self) -> tuple[float, float]:
-        """Position error [m] and rotation error [rad], infinite without an answer."""
+    def error(self) -> Array:
+        """Error (6,) of the best pose, rotation [rad] and position [m]; infinite without a right answer."""
         pose = self.result.best_pose
         if pose is None or self.true_pose is None:
-            return np.inf, np.inf
-        distance = float(np.linalg.norm(pose.center_world - self.true_pose.center_world))
-        return distance, angle_between(pose.R_cam_from_world, self.true_pose.R_cam_from_world)
+            return np.full(6, np.inf)
+        return pose_error(pose, self.true_pose)
 
     @property
     def is_outside(self) -> bool:
         """True if the true pose lies outside of the 95 % region of the covariance."""
         covariance = self.result.covariance
-        if self.result.best_pose is None or self.true_pose is None or covariance is None:
+        if covariance is None or not np.isfinite(self.error).all():
             return False
-        error = pose_error(self.result.best_pose, self.true_pose)
-        return bool(error @ np.linalg.solve(covariance.matrix, error) > chi2.ppf(0.95, 6))
+        return bool(self.error @ np.linalg.solve(covariance.matrix, self.error) > chi2.ppf(0.95, 6))
 
     @property
     def seconds(self) -> float:
@@ -142,13 +140,13 @@ class Row(NamedTuple):
 
 def row_cells(rows: Sequence[Row]) -> tuple[str, ...]:
     """Return the statistics of some queries, as COLUMNS."""
-    right = [row.errors for row in rows if row.is_right]
+    right = [row.error for row in rows if row.is_right]
     localized = [row for row in rows if row.is_localized]
-    distance, angle = np.median(right, axis=0) if right else (np.nan, np.nan)
     counts = (len(rows), len(right), len(localized), sum(not row.is_right for row in localized))
     outside = sum(row.is_outside for row in localized)
-    medians = (f"{1000.0 * distance:.1f}", f"{np.degrees(angle):.3f}") if right else ("-", "-")
-    return (*map(str, (*counts, outside)), *medians, f"{np.median([row.seconds for row in rows]):.2f}")
+    mm = f"{1000.0 * np.median([np.linalg.norm(e[3:]) for e in right]):.1f}" if right else "-"
+    deg = f"{np.degrees(np.median([np.linalg.norm(e[:3]) for e in right])):.3f}" if right else "-"
+    return (*map(str, (*counts, outside)), mm, deg, f"{np.median([row.seconds for row in rows]):.2f}")
 
 
 def accuracy_table(rows: Sequence[Row]) -> Table:
@@ -319,10 +317,8 @@ def wrong_lines(rows: Sequence[Row]) -> str:
     wrong = [row for row in rows if row.is_localized and not row.is_right]
     lines = [f"{len(wrong)} of {len(rows)} were localized and are not right."]
     for row in wrong[:MAX_WRONG]:
-        distance, angle = row.errors
-        error = (
-            f"{distance:.2f} m, {np.degrees(angle):.1f} deg" if np.isfinite(distance) else "no right answer"
-        )
+        distance = np.linalg.norm(row.error[3:])
+        error = f"{distance:.2f} m off" if np.isfinite(distance) else "no right answer"
         lines.append(f"- {row.label}, {row.query}: {error}; confidence {row.result.confidence:.3f}")
     if len(wrong) > MAX_WRONG:
         lines.append(f"- and {len(wrong) - MAX_WRONG} more")
