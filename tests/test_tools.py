@@ -86,6 +86,9 @@ def test_parts_of_the_page_and_its_refusals(scene, tmp_path, capsys):
     assert [line for line in text.splitlines() if line.startswith("## ")] == [f"## {page.KERNELS}"]
     assert "40,000 points, 512 x 256 image" in text
     assert benchmark.main(["all", "--scenes", str(scene / "no")]) == 3
+    write_queries(tmp_path, [])
+    assert benchmark.main(["all", "--scenes", str(tmp_path)]) == 3
+    assert "found no queries, wanted pictures with true poses" in capsys.readouterr().err
     assert benchmark.main(["all", "--scenes", str(scene), "--photos", "-1"]) == 2
 
 

@@ -20,6 +20,7 @@ from piccolo.cli.command import check_least, option
 from piccolo.cli.errors import print_note
 from piccolo.cloud import read_cloud
 from piccolo.confidence.confidence import LOCALIZED
+from piccolo.errors import InputError
 from piccolo.files.atomic import write_atomically
 from piccolo.geometry.pose import Array, Pose, is_correct
 from piccolo.jobs.threads import Workers, num_cores
@@ -34,7 +35,7 @@ from .calibration import pose_error
 from .confidence import Image, Points
 from .damage import DAMAGED_SCANS, PHOTO_FOV_DEG, cut_photo, damage_panorama
 from .kernels import kernel_table
-from .scaling import size_table
+from .scaling import clean_queries, size_table
 
 EPILOG = """\
 examples:
@@ -72,7 +73,7 @@ EXIF has the focal length in whole millimetres. Photos of a scene's own come wit
 The same panoramas by both methods, gravity known. The preset is Algorithm 1 of the paper.""",
     SIZE: """\
 Each row is measured in a process of its own, gravity known and unknown. A scene is resampled; rooms are those
-of `tools/make_room.py`, 50,000 points each.""",
+of `tools/make_room.py`, 50,000 points each. The peak of memory is that of the whole process.""",
     KERNELS: "The reference is `cv2.remap`, one thread: 8 bits, 3 channels, bilinear, a pixel a point.",
 }
 PARTS = {
@@ -174,18 +175,14 @@ def camera_path(scene: Scene, query: Query) -> Path:
     return scene.folder / "cameras" / f"{query.image.stem}.camera.json"
 
 
-def clean_queries(scene: Scene, count: int) -> list[Query]:
-    """Return the first queries of the variant clean, or of all if there is none."""
-    clean = [query for query in scene.queries if query.variant == "clean"]
-    return (clean or list(scene.queries))[:count]
-
-
 class Bench:
     """Measurements of one run of the command."""
 
     def __init__(self, arguments: argparse.Namespace) -> None:
         self.arguments = arguments
         scenes = [read_scene(folder) for folder in arguments.scenes]
+        if empty := [scene for scene in scenes if not scene.queries]:
+            raise InputError(f"{empty[0].folder}: found no queries, wanted pictures with true poses")
         self.of_photos = [scene for scene in scenes if camera_path(scene, scene.queries[0]).exists()]
         self.of_panoramas = [scene for scene in scenes if scene not in self.of_photos]
         self.rows: list[Row] = []

@@ -23,7 +23,7 @@ from piccolo.panorama import Panorama, read_panorama
 from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.scan_map import ScanMap, prepare_map
 from piccolo.scenes.evaluation.tables import Table
-from piccolo.scenes.scene import Scene
+from piccolo.scenes.scene import Query, Scene
 from piccolo.scenes.synthetic.world import make_query, make_world, scan_world
 
 NUM_QUERIES = 6
@@ -36,6 +36,12 @@ COLUMNS = (
 Case = tuple[Cloud, list[tuple[Panorama, Pose]]]  # a cloud, and panoramas in it with their true poses
 
 
+def clean_queries(scene: Scene, count: int) -> list[Query]:
+    """Return the first queries of the variant clean, or of all if there is none."""
+    clean = [query for query in scene.queries if query.variant == "clean"]
+    return (clean or list(scene.queries))[:count]
+
+
 def scene_case(scene: Scene, num_points: int) -> Case:
     """Resample a scene to `num_points` points: leave some out, or repeat them with 5 mm noise."""
     cloud = read_cloud(scene.cloud)
@@ -46,7 +52,7 @@ def scene_case(scene: Scene, num_points: int) -> Case:
     points = cloud.points[index]
     if num_points > len(cloud.points):
         points = points + rng.normal(0.0, 0.005, points.shape).astype(np.float32)
-    taken = [query for query in scene.queries if query.variant == "clean"][:NUM_QUERIES]
+    taken = clean_queries(scene, NUM_QUERIES)
     queries = [(read_panorama(query.image), query.pose) for query in taken]
     raw = RawCloud(points + cloud.origin_world, cloud.colors[index])
     return stream_of(scene.cloud, raw).read(), queries
