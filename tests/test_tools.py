@@ -1,13 +1,23 @@
 """The measuring tools, on small cases: that they run, and that their tables say what was measured."""
 
+import datetime
 import json
 import re
 
 import benchmark
+import cv2
+import numba
+import numpy as np
 import pytest
-from batches import command_of, run
-from measuring import ablation, confidence, scaling
+from batches import ROOT, command_of, run
+from measuring import confidence, damage, page, scaling
 from rooms import write_room
+
+from piccolo.geometry.pose import Pose
+from piccolo.panorama import read_panorama
+from piccolo.paper.settings import PaperSettings
+from piccolo.result import Result
+from piccolo.scenes.scene import Query, read_scene, write_queries
 
 
 @pytest.fixture(scope="module")
@@ -15,44 +25,103 @@ def scene(tmp_path_factory):
     return write_room(tmp_path_factory.mktemp("scene"), "--seed 7 --points 40000 --panoramas 1 --width 512")
 
 
-def test_benchmark_prints_ratios_of_one_run(capsys):
-    assert benchmark.main(["kernels", "--points", "20000", "--rounds", "7"]) == 0
-    table = capsys.readouterr().out
-    assert re.search(r"\| cv2.remap, 1 thread \| \d+ \| 1.00 \| 1.00 \|", table)
-    assert re.search(r"normal matrix, 2 threads \| \d+ \| \d+\.\d\d \| \d+\.\d\d \|", table)
-    assert "same bits with 1 and 2 threads: yes" in table
+def table_of(page, title):
+    """The rows of a section's table by their first cell, each a dict by column."""
+    lines = page.split(f"## {title}\n")[1].split("\n## ")[0].splitlines()
+    head, _, *rows = (
+        [cell.strip() for cell in line.strip("|").split("|")] for line in lines if line[:1] == "|"
+    )
+    return {cells[0]: dict(zip(head[1:], cells[1:], strict=True)) for cells in rows}
 
 
-def test_benchmark_of_a_users_files_and_its_refusals(scene, capsys):
-    pano = scene / "images" / "clean_0.jpg"
-    files = ["--cloud", str(scene / "cloud.ply"), "--pano", str(pano), "--rounds", "7"]
-    assert benchmark.main(["kernels", *files, "--points", "20000"]) == 0
-    assert "20000 points, 512 x 256 image" in capsys.readouterr().out
-    assert benchmark.main(["kernels", *files, "--points", "50000"]) == 3
-    assert "found 40000 points, wanted --points 50000" in capsys.readouterr().err
-    assert benchmark.main(["kernels", "--rounds", "3"]) == 2
-    assert benchmark.main(["kernels", "--cloud", "a.ply"]) == 2
+def test_the_page_of_a_scene_says_what_was_measured(scene, tmp_path, monkeypatch):
+    small = PaperSettings(num_translations=4, num_iterations=5, max_points=5000)
+    monkeypatch.setattr(page, "PAPER_SETTINGS", small)
+    out = tmp_path / "page.md"
+    sizes = ["--damaged", "1", "--photos", "1", "--points", "20000", "--rooms"]
+    assert benchmark.main(["all", "--scenes", str(scene), *sizes, "--quiet", "--out", str(out)]) == 0
+    text = out.read_text()
+    assert len(text.splitlines()) <= 200
+    commit = run(["git", "-C", str(ROOT), "describe", "--always", "--abbrev=12"]).stdout.strip()
+    assert f"Measured on {datetime.datetime.now(datetime.UTC).date()} at commit {commit or 'unknown'}" in text
+    assert f"NumPy {np.__version__}, Numba {numba.__version__}, OpenCV {cv2.__version__};\n" in text
+    row = table_of(text, page.PANORAMAS)[f"{scene.name}, clean"]
+    assert row["queries"] == row["right"] == row["localized"] == "1"
+    assert row["wrong of these"] == "0"
+    assert 0.0 < float(row["mm"]) < 20.0
+    assert 0.0 < float(row["deg"]) < 0.5
+    damaged = table_of(text, page.DAMAGE)
+    assert {row["queries"] for row in damaged.values()} == {"1"}
+    assert [damaged[name]["right"] for name in ("as taken", "20% hidden by objects", "night")] == 3 * ["1"]
+    for name in ("mirrored", "another place"):
+        assert [damaged[name][column] for column in ("right", "localized", "mm")] == ["0", "0", "-"]
+    assert set(damage.DAMAGED_SCANS) < set(damaged)
+    photos = table_of(text, page.PHOTOS)
+    assert [row["queries"] for row in photos.values()] == ["1", "1"]
+    paper = table_of(text, page.PAPER)
+    ratio = float(paper["preset paper"]["s"]) / float(paper["default method"]["s"])
+    stated = float(re.search(r"The preset takes (\d+\.\d) times as long", text)[1])
+    assert stated == pytest.approx(ratio, abs=0.1)
+    confidences = table_of(text, "Confidences")
+    assert sum(int(row["queries"]) for row in confidences.values()) == 1 + len(damaged) + 2
+    assert f"0 of {1 + len(damaged) + 2} were localized and are not right." in text
+    sizes = table_of(text, page.SIZE)
+    assert [row["points"] for row in sizes.values()] == ["20,000"]
+    assert re.fullmatch("[01]/1", sizes[f"{scene.name}, resampled"]["right"])
+    speeds = table_of(text, page.KERNELS)
+    assert speeds["cv2.remap, 1 thread"]["of cv2.remap"] == "1.00"
+    assert float(speeds["loss, 2 threads"]["of its one thread"]) > 0.0
 
 
-def test_ablation_has_a_row_a_part(scene, capsys, monkeypatch):
-    parts = {name: ablation.PARTS[name] for name in ("all of it", "no visibility")}
-    monkeypatch.setattr(ablation, "PARTS", parts)
-    assert benchmark.main(["ablation", str(scene)]) == 0
-    rows = capsys.readouterr().out.splitlines()[2:]
-    assert [row.split(" | ")[0] for row in rows] == [f"| {part}" for part in parts]
-    assert rows[0].startswith("| all of it | 1/1 | 0/0 | 0/0 | 0/0 |")
-    assert benchmark.main(["ablation", str(scene / "no")]) == 3
-
-
-def test_scaling_measures_points_and_rooms(scene, capsys, monkeypatch):
-    assert benchmark.main(["scaling", "--scene", str(scene), "--points", "50000"]) == 0  # its own process
-    (row,) = capsys.readouterr().out.splitlines()[2:]
-    monkeypatch.setattr(scaling, "NUM_QUERIES", 1)
-    cells = row.split(" | ")
-    assert (cells[:2], cells[8]) == (["| 50000 points", "50000"], "1/1")
-    cloud, queries = scaling.rooms_case(1)
+def test_sizes_are_those_asked_for(scene):
+    cloud, queries = scaling.scene_case(read_scene(scene), 50_000)  # more than it has
     assert (len(cloud.points), len(queries)) == (50_000, 1)
-    assert benchmark.main(["scaling", "--points", "1000"]) == 2
+    cloud, queries = scaling.rooms_case(1)
+    assert (len(cloud.points), len(queries)) == (50_000, scaling.NUM_QUERIES)
+
+
+def test_parts_of_the_page_and_its_refusals(scene, tmp_path, capsys):
+    assert benchmark.main(["all", "--scenes", str(scene), "--only", "kernels"]) == 0
+    text = capsys.readouterr().out
+    assert [line for line in text.splitlines() if line.startswith("## ")] == [f"## {page.KERNELS}"]
+    assert "40,000 points, 512 x 256 image" in text
+    assert benchmark.main(["all", "--scenes", str(scene / "no")]) == 3
+    write_queries(tmp_path, [])
+    assert benchmark.main(["all", "--scenes", str(tmp_path)]) == 3
+    assert "found no queries, wanted pictures with true poses" in capsys.readouterr().err
+    assert benchmark.main(["all", "--scenes", str(scene), "--photos", "-1"]) == 2
+
+
+def test_photos_of_a_scene_come_with_their_calibrations(tmp_path, capsys):
+    write_room(tmp_path, "--seed 7 --points 40000 --panoramas 1 --width 512 --variants clean")
+    (query,) = read_scene(tmp_path).queries
+    photo = damage.cut_photo(
+        read_panorama(query.image).rgb, query.pose, np.random.default_rng(3), tmp_path / "images" / "a.jpg"
+    )
+    camera = {"format": "piccolo-camera/1", "model": "SIMPLE_PINHOLE", "width": 1024, "height": 768}
+    (tmp_path / "cameras").mkdir()
+    params = {"params": [photo.focal_px, 512, 384]}
+    (tmp_path / "cameras" / "a.camera.json").write_text(json.dumps(camera | params))
+    write_queries(tmp_path, [Query(photo.path, "own", photo.pose)])
+    assert benchmark.main(["all", "--scenes", str(tmp_path)]) == 0
+    text = capsys.readouterr().out
+    assert [line for line in text.splitlines() if line.startswith("## ")] == [
+        f"## {page.PHOTOS}",
+        "## Confidences",
+    ]
+    assert table_of(text, page.PHOTOS)[f"{tmp_path.name}, own photos"]["right"] == "1"
+
+
+def test_wrong_answers_are_listed():
+    pose = Pose(np.eye(3), np.zeros(3))
+    found = Pose(np.eye(3), np.array([0.5, 0.0, 0.0]))
+    result = Result("localized", 0.95, "a.ply", "a.jpg", found, None, None, (), None, {"search": 1.0}, {})
+    rows = [page.Row("", "night", "a.jpg", pose, result)] * 25
+    assert page.row_cells(rows) == ("25", "0", "25", "25", "0", "-", "-", "1.00")
+    first, second, *_, last = page.wrong_lines(rows).splitlines()
+    assert first == "25 of 25 were localized and are not right."
+    assert second == "- night, a.jpg: 0.50 m off; confidence 0.950"
+    assert last == "- and 5 more"
 
 
 def test_trials_of_a_scene_and_what_is_learnt_from_them(scene, tmp_path, capsys, monkeypatch):

@@ -1,20 +1,19 @@
 #!/usr/bin/env python3
-"""Measure the method: its kernels, its parts, time and memory by size, and how far its confidences hold."""
+"""Measure the method, write the page of figures, and learn the confidence."""
 
 import argparse
 import sys
 
 import _checkout  # noqa: F401
-from measuring import ablation, calibration, confidence, kernels, scaling
+from measuring import calibration, confidence, page
 
 from piccolo.cli.command import HelpFormatter, add_run_options, command
 
-MODULES = kernels, scaling, ablation, confidence, calibration
-MEASUREMENTS = {module.__name__.rpartition(".")[2]: module for module in MODULES}
+MEASUREMENTS = {"all": page, "confidence": confidence, "calibration": calibration}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """A subcommand a measurement."""
+    """Add a subcommand for each measurement."""
     subparsers = parser.add_subparsers(dest="measurement", required=True)
     for name, module in MEASUREMENTS.items():
         lines = {"help": module.__doc__, "description": module.__doc__, "epilog": module.EPILOG}
@@ -23,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         add_run_options(subparser)
 
 
-@command(__file__, __doc__, "", add_arguments, "0 done, 1 a false answer")
+@command(__file__, __doc__, "", add_arguments, "0 done, 1 a false answer of confidence")
 def main(arguments: argparse.Namespace) -> int:
     """Run the measurement asked for; returns the exit code."""
     return int(MEASUREMENTS[arguments.measurement].run(arguments))

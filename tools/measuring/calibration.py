@@ -57,14 +57,20 @@ class Outcome(NamedTuple):
     error: Array  # (6,) of the best pose, as PoseCovariance has it; NaN without truth
 
     def probabilities(self, model: ChoiceModel) -> Array:
-        """Of each pose and of none (K + 1,)."""
+        """Return the probability of each pose, and of none (K + 1,)."""
         if self.is_refused:
             return np.append(np.zeros(len(self.standings)), 1.0)
         return posterior(self.standings, self.covariance, model)
 
 
+def pose_error(pose: Pose, true_pose: Pose) -> Array:
+    """Return the error (6,) of a pose as PoseCovariance has it: rotation [rad], then position [m]."""
+    turn = log_so3(true_pose.R_cam_from_world @ pose.R_cam_from_world.T)
+    return np.concatenate([turn, true_pose.center_world - pose.center_world])
+
+
 def outcome_of(line: str) -> Outcome | None:
-    """One line of tools/benchmark.py confidence; None if no pose was found, or one without probabilities."""
+    """Read a line of tools/benchmark.py confidence; None if it has no pose or no probabilities."""
     trial = json.loads(line)
     result = Result.from_json(json.dumps(trial["result"]))
     truth = trial["truth"]
@@ -73,21 +79,20 @@ def outcome_of(line: str) -> Outcome | None:
     e = result.evidence
     rows = [(1.0, e.score, e.num_matches)]
     rows += [(a.share or 0.0, a.score, a.num_matches) for a in result.alternatives]
-    standings = [Standing(share, score, CLEAR_MATCHES if n is None else n) for share, score, n in rows]
+    standings = [Standing(ratio, score, CLEAR_MATCHES if n is None else n) for ratio, score, n in rows]
     poses = [result.best_pose, *(a.pose for a in result.alternatives)]
     error = np.full(6, np.nan)
     right = len(poses)
     if isinstance(truth, dict):
         true_pose = Pose(np.array(truth["R_cam_from_world"]), np.array(truth["center_world"]))
-        turn = log_so3(true_pose.R_cam_from_world @ result.best_pose.R_cam_from_world.T)
-        error = np.concatenate([turn, true_pose.center_world - result.best_pose.center_world])
+        error = pose_error(result.best_pose, true_pose)
         right = next((k for k, pose in enumerate(poses) if is_correct(pose, true_pose)), right)
     is_refused = result.confidence == 0.0 and result.probability_none == 1.0
     return Outcome(str(trial["case"]), standings, result.covariance, right, is_refused, error)
 
 
 def fit(outcomes: Sequence[Outcome]) -> ChoiceModel:
-    """The weights of the greatest penalised likelihood."""
+    """Return the weights of the greatest penalised likelihood."""
     poses = [np.array([features_of(s) for s in o.standings]) for o in outcomes]
     nones = np.array([none_features_of(o.covariance) for o in outcomes])
     deviations = np.concatenate([np.concatenate(poses).std(axis=0), [1.0, max(nones[:, 1].std(), 1e-9)]])
@@ -138,7 +143,7 @@ def print_reliability(title: str, stated: Array, right: NDArray[np.bool_]) -> No
 
 
 def print_coverage(title: str, outcomes: Sequence[Outcome]) -> None:
-    """The fraction of right poses whose error lies in the covariance's regions."""
+    """Print the fraction of right poses whose error lies in the covariance's regions."""
     known = [(o.error, o.covariance.matrix) for o in outcomes if o.right == 0 and o.covariance is not None]
     if not known:
         return
@@ -158,7 +163,7 @@ def print_coverage(title: str, outcomes: Sequence[Outcome]) -> None:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """All options."""
+    """Add all options."""
     option(parser, "--fit FILE ...", "trials to learn from", default=[])
     option(parser, "--check FILE ...", "other trials", default=[])
     option(parser, "--without CASE ...", "leave these cases out", default=[])

@@ -60,7 +60,7 @@ class Trial(NamedTuple):
 
 
 def occluded(rgb: Image, other: Image, fraction: float, rng: np.random.Generator) -> Image:
-    """The photo (H, W, 3) behind round pieces of another, over a fraction of the sphere."""
+    """Hide a fraction of the sphere of a photo (H, W, 3) behind round pieces of another."""
     height, width = rgb.shape[:2]
     rays = pixel_rays(width)
     areas = solid_angles(width)[:, None] / (4.0 * math.pi)
@@ -77,7 +77,7 @@ def occluded(rgb: Image, other: Image, fraction: float, rng: np.random.Generator
 
 
 def unevenly_lit(rgb: Image, stops: float, rng: np.random.Generator) -> Image:
-    """The photo (H, W, 3) under patches of light that differ by some stops."""
+    """Put a photo (H, W, 3) under patches of light that differ by some stops."""
     noise = blur(rng.normal(size=rgb.shape[:2])[..., None], 0.08 * rgb.shape[1])
     gain = 2.0 ** (0.5 * stops * noise / noise.std())
     linear = (rgb / 255.0) ** 2.2 * gain
@@ -85,7 +85,7 @@ def unevenly_lit(rgb: Image, stops: float, rng: np.random.Generator) -> Image:
 
 
 def outside_field(width: int, fov_deg: float, yaw: float) -> NDArray[np.bool_]:
-    """Mask (H, W) of a sphere outside a level pinhole photo this wide that looks along azimuth `yaw`."""
+    """Return the mask (H, W) of a sphere outside a level pinhole photo that looks along azimuth `yaw`."""
     x, y, z = np.moveaxis(pixel_rays(width), -1, 0)
     forward = math.cos(yaw) * x + math.sin(yaw) * y
     left = math.cos(yaw) * y - math.sin(yaw) * x
@@ -94,7 +94,7 @@ def outside_field(width: int, fov_deg: float, yaw: float) -> NDArray[np.bool_]:
 
 
 def without_texture(world: World) -> World:
-    """Rooms with every surface in one colour."""
+    """Return the rooms with every surface in one colour."""
     plain = [(room, room.materials.copy()) for room in world.rooms]
     for _, materials in plain:
         materials[:, 0] = PLAIN
@@ -102,7 +102,7 @@ def without_texture(world: World) -> World:
 
 
 def damaged(trial: Trial, other: Image, rng: np.random.Generator) -> Iterator[Trial]:
-    """A photo half hidden, in uneven light, narrow, and mirrored."""
+    """Yield a photo half hidden, in uneven light, narrow, and mirrored."""
     for fraction in (0.2, 0.4, 0.6):
         hidden = occluded(trial.rgb, other, fraction, rng)
         yield trial._replace(case=f"{trial.case}, hidden {fraction:.0%}", rgb=hidden)
@@ -118,7 +118,7 @@ def damaged(trial: Trial, other: Image, rng: np.random.Generator) -> Iterator[Tr
 
 
 def without_scene(trial: Trial, rng: np.random.Generator) -> Iterator[Trial]:
-    """Images like a photo's that show no place; a blurred panorama keeps its true pose."""
+    """Yield images that show no place, and the photo blurred, which keeps its true pose."""
     rgb = trial.rgb
     yield Trial("black", np.zeros_like(rgb), None)
     yield Trial("white", np.full_like(rgb, 255), None)
@@ -129,7 +129,7 @@ def without_scene(trial: Trial, rng: np.random.Generator) -> Iterator[Trial]:
 
 
 def fractal_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Image:
-    """Smooth noise of several scales (H, W, 3), with the contrast of a photo."""
+    """Draw smooth noise of several scales (H, W, 3), with the contrast of a photo."""
     total = np.zeros(shape)
     for scale in (0.004, 0.015, 0.06):
         noise = blur(rng.normal(size=shape), scale * shape[1])
@@ -138,7 +138,7 @@ def fractal_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Image:
 
 
 def upside_down(trial: Trial) -> Trial:
-    """A panorama held by a camera turned over, searched as if it were upright."""
+    """Turn the camera over, and search for it as if it were upright."""
     pose = trial.true_pose
     if pose is not None:
         pose = Pose(UPSIDE_DOWN @ pose.R_cam_from_world, pose.center_world)
@@ -146,19 +146,19 @@ def upside_down(trial: Trial) -> Trial:
 
 
 def thinned(points: Points, rng: np.random.Generator) -> Points:
-    """A few of the points, in order."""
+    """Draw one of twenty points, in order."""
     count = len(points[0])
     chosen = np.sort(rng.choice(count, int(0.05 * count), replace=False))
     return points[0][chosen], points[1][chosen]
 
 
 def random_size(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Size (3,) of a room [m], from a box room to a hall."""
+    """Draw the size (3,) of a room [m], from a box room to a hall."""
     return rng.uniform([3.5, 3.0, 2.3], [9.0, 7.0, 3.4])
 
 
 def room_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[Trial]]]:
-    """Clouds of one to three rooms, whole, thinned and cut down, each with its trials."""
+    """Yield clouds of one to three rooms, whole, thinned and cut down, each with its trials."""
     rng = np.random.default_rng([seed, 50])
     size = random_size(rng)
     world = make_world(seed, size, int(rng.integers(1, 4)))
@@ -183,7 +183,7 @@ def room_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[Tria
 
 
 def repeated_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[Trial]]]:
-    """A place that looks the same from several positions, of each kind."""
+    """Yield a place of each kind that looks the same from several positions, with its trials."""
     rng = np.random.default_rng([seed, 51])
     for kind in REPEATED_KINDS:
         world = World(seed, make_repeated(kind, seed, random_size(rng)))
@@ -192,7 +192,7 @@ def repeated_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[
 
 
 def alike_trials(seed: int, kinds: Sequence[str], workers: Workers) -> Iterator[tuple[Points, list[Trial]]]:
-    """Places alike to a degree: photos of them, one half hidden, and one of another place of the kind."""
+    """Yield places alike to a degree: photos of them, one half hidden, and one of another such place."""
     for kind in kinds:
         rng = np.random.default_rng([seed, 53, ALIKE_KINDS.index(kind)])
         elsewhere = World(seed, make_alike(kind, seed + 100_000, 0.2))
@@ -213,7 +213,7 @@ def _trial(world: World, case: str, variant: str, workers: Workers, index: int =
 
 
 def scene_trials(scene: Scene, others: Sequence[Scene]) -> Iterator[tuple[Points, list[Trial]]]:
-    """Every panorama of every scene in one scene's cloud; its own also spoilt, and in a thinned cloud."""
+    """Try every panorama of every scene in one scene's cloud; its own also spoilt, and in a thinned cloud."""
     cloud = read_cloud(scene.cloud)
     rng = np.random.default_rng([len(scene.queries), 52])
     own = [Trial(query.variant, read_panorama(query.image).rgb, query.pose) for query in scene.queries]
@@ -227,7 +227,7 @@ def scene_trials(scene: Scene, others: Sequence[Scene]) -> Iterator[tuple[Points
 
 
 def all_trials(arguments: argparse.Namespace, workers: Workers) -> Iterator[tuple[str, Points, list[Trial]]]:
-    """Name of a scene, its points, its trials."""
+    """Yield the name of a scene, its points, its trials."""
     for seed in range(*arguments.seeds):
         alike = alike_trials(seed, arguments.kinds, workers)
         for points, trials in chain(room_trials(seed, workers), repeated_trials(seed, workers), alike):
@@ -240,7 +240,7 @@ def all_trials(arguments: argparse.Namespace, workers: Workers) -> Iterator[tupl
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """All options."""
+    """Add all options."""
     option(parser, "--seeds FIRST END", required=True)
     option(parser, "--kinds KIND ...", "alike places", choices=ALIKE_KINDS, default=list(ALIKE_KINDS))
     option(parser, "--scenes FOLDER ...", default=[])

@@ -35,7 +35,7 @@ Thing = tuple[Sequence[float], Sequence[float], tuple[int, ...]]  # centre (3,),
 
 
 def make_repeated(kind: str, seed: int, size: Array) -> tuple[Room, ...]:
-    """Rooms of one of REPEATED_KINDS; a corridor has a length and a width of its own."""
+    """Make rooms of one of REPEATED_KINDS; a corridor has a length and a width of its own."""
     if kind == "twins":
         room = make_room(seed, size, np.zeros(3))
         return room, placed(room, np.array([room.size[0] + GAP, 0.0, 0.0]), is_turned=False)
@@ -43,7 +43,7 @@ def make_repeated(kind: str, seed: int, size: Array) -> tuple[Room, ...]:
 
 
 def symmetric_hall(seed: int, size: Array) -> Room:
-    """A room that half a turn about its middle takes to itself."""
+    """Make a room that half a turn about its middle takes to itself."""
     room = make_room(seed, size, np.zeros(3))
     x, y, _ = room.size
     is_long = room.boxes[:, 3] > 0.45 * x  # floor, ceiling and two of the walls: their half
@@ -61,7 +61,7 @@ def symmetric_hall(seed: int, size: Array) -> Room:
 
 
 def corridor(seed: int, height: float) -> Room:
-    """A corridor whose doors and pictures repeat; both ends are alike."""
+    """Make a corridor whose doors and pictures repeat; both ends are alike."""
     b = RoomBuilder(np.random.default_rng([seed, 3]), np.zeros(3))
     length = 3.0  # from door to door [m]
     width = CORRIDOR_WIDTH
@@ -86,13 +86,13 @@ def corridor(seed: int, height: float) -> Room:
 
 
 def make_alike(kind: str, seed: int, changed: float) -> tuple[Room, ...]:
-    """Rooms of one of ALIKE_KINDS, a fraction of the things of each of their units unlike the others'."""
+    """Make rooms of one of ALIKE_KINDS, in each of whose units a fraction of the things is changed."""
     makers = {"hotel": hotel, "doors": doors, "cubicles": cubicles, "racks": racks}
     return makers[kind](seed, changed)
 
 
 def thing_seeds(seed: int, unit: int, count: int, changed: float) -> Iterator[list[int]]:
-    """The seed of each thing of a unit: that of all units, or of a changed thing its own."""
+    """Yield the seed of each thing of a unit: shared by all units, or its own if the thing is changed."""
     rng = np.random.default_rng([seed, 40, unit])
     for number in range(count):
         yield [seed, 41, number, 1 + unit if rng.random() < changed else 0]
@@ -110,7 +110,7 @@ def put_things(
 
 
 def hotel(seed: int, changed: float) -> tuple[Room, ...]:
-    """Five rooms in a row, with beds, shelves and pictures at the same places."""
+    """Make five rooms in a row, with furniture and pictures at the same places."""
     size = np.random.default_rng([seed, 42]).uniform([3.5, 3.5, 2.4], [5.0, 5.5, 2.8])
     rooms = []
     for unit in range(5):
@@ -134,7 +134,7 @@ def hotel(seed: int, changed: float) -> tuple[Room, ...]:
 
 
 def doors(seed: int, changed: float) -> tuple[Room, ...]:
-    """A corridor of eight doors, each with a sign, a mat, a lamp and a picture opposite."""
+    """Make a corridor of eight doors, each with a sign, a mat, a lamp and a picture opposite."""
     b = RoomBuilder(np.random.default_rng([seed, 44]), np.zeros(3))
     count = 8
     step = 2.6
@@ -154,7 +154,7 @@ def doors(seed: int, changed: float) -> tuple[Room, ...]:
 
 
 def cubicles(seed: int, changed: float) -> tuple[Room, ...]:
-    """An open office of ten cubicles on both sides of an aisle."""
+    """Make an open office of ten cubicles on both sides of an aisle."""
     b = RoomBuilder(np.random.default_rng([seed, 45]), np.zeros(3))
     columns = 5
     cell = 2.6
@@ -180,7 +180,7 @@ def cubicles(seed: int, changed: float) -> tuple[Room, ...]:
 
 
 def racks(seed: int, changed: float) -> tuple[Room, ...]:
-    """A store of four racks, each of six bays with boxes on three levels."""
+    """Make a store of four racks, each of six bays with boxes on three levels."""
     b = RoomBuilder(np.random.default_rng([seed, 46]), np.zeros(3))
     rows = 4
     bays = 6
